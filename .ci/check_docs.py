@@ -190,7 +190,8 @@ def main() -> int:
         faults += source_faults(path.relative_to(ROOT).as_posix(), path.read_text(encoding="utf-8"))
     calls = 0
     for page in pages():
-        where, text = page.relative_to(ROOT).as_posix(), page.read_text(encoding="utf-8")
+        where = page.relative_to(ROOT).as_posix()
+        text = page.read_text(encoding="utf-8")
         faults += term_faults(where, text)
         for line, words in commands(text):
             calls += 1

@@ -48,7 +48,8 @@ def main() -> None:
 def rounds(vertices: np.ndarray, faces: np.ndarray) -> None:
     """Print the distortion of every round for both kinds of weights."""
     loops = outline_first(vertices, boundary_loops(faces))
-    capped, rim = atlas._cap_holes(vertices, faces, loops[1:]), atlas._circle(vertices[loops[0]])
+    capped = atlas._cap_holes(vertices, faces, loops[1:])
+    rim = atlas._circle(vertices[loops[0]])
     surface = atlas.Surface(*capped, len(faces), loops[0], rim)
     for kind in ("intrinsic", "mean_value"):
         weights = getattr(atlas, f"_{kind}_weights")(surface.points, surface.faces)

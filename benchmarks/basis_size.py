@@ -21,8 +21,12 @@ from skindb.optics.brdf_table import TableGrid
 from skindb.optics.dictionary import embedded_dictionary
 from skindb.optics.rows import basis_rows
 
-SIZES, NOISES, LARGEST = (4, 6, 8), (0.01, 0.03, 0.05), 12
-NEEDED, MATTERS, TRIES = 1.2, 1.05, 100
+SIZES = (4, 6, 8)
+NOISES = (0.01, 0.03, 0.05)
+LARGEST = 12
+NEEDED = 1.2
+MATTERS = 1.05
+TRIES = 100
 MATTE = np.array([0.5, 0.3, 0.2]) / np.pi  # diffuse term; its noise remains in the samples after it is subtracted
 
 
@@ -39,8 +43,10 @@ def planted(size, noise, seed, *, surfels=300, lights=40, cameras=4):
     rows, offsets, index = basis_rows(tables, TableGrid(*tables.shape[:3]), normal, *away, everything)
     surfel = np.repeat(np.arange(surfels), np.diff(offsets))
     matte = np.einsum("nc,nc->n", normal[surfel], away[0][surfel, index[:, 0]])[:, None] * MATTE
-    level, few = np.sqrt((rows.astype(np.float64) ** 2).mean(axis=0)), offsets[60]
-    best, H = (0.0, np.empty(0), np.empty(0)), np.stack([_mixture(rng, level) for _ in range(size)])
+    level = np.sqrt((rows.astype(np.float64) ** 2).mean(axis=0))
+    few = offsets[60]
+    best = (0.0, np.empty(0), np.empty(0))
+    H = np.stack([_mixture(rng, level) for _ in range(size)])
     for _ in range(TRIES):
         x = rng.gamma(0.7, 0.02, (surfels, size)) @ H
         value = np.einsum("nm,nm->n", rows, x[surfel].astype(np.float32))[:, None] + matte

@@ -17,7 +17,9 @@ from skindb.ingest.sensor import SensorRecord
 
 SIDE = 512  # px
 SENSOR = SensorRecord(FrameKind(SIDE, SIDE, 16), 1024.0, 65520.0, 6.0, 20000 / (65520.0 - 1024.0), 16.0)
-LONGEST, RANGE = 0.04, 64.0  # s; longest over shortest exposure
+# s; longest over shortest exposure
+LONGEST = 0.04
+RANGE = 64.0
 COUNTS = (1, 2, 3, 4, 7, 13)
 
 

@@ -26,7 +26,8 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from bucket_server import new_bucket, s3_server, settings
 from faulty_proxy import faulty_proxy
 
-LIGHTS, CAMERAS = 150, 16
+LIGHTS = 150
+CAMERAS = 16
 NAME = "samples/reflectance_sample"
 
 
@@ -43,7 +44,8 @@ def samples(surfels: int) -> np.ndarray:
 def steps(url: str, values: np.ndarray):
     """Yield name and duration of every step."""
     clock = time.perf_counter
-    begin, db = clock(), Database(url)
+    begin = clock()
+    db = Database(url)
     with db.stage("capture", "A1") as stage:
         stage.write({"samples": dataset({"reflectance_sample": values})})
         stage.commit({})
@@ -51,7 +53,8 @@ def steps(url: str, values: np.ndarray):
     begin = clock()
     Database(url).read("capture", "A1")[NAME].count().compute()
     yield "read all", clock() - begin
-    begin, some = clock(), Database(url).read("capture", "A1")[NAME]
+    begin = clock()
+    some = Database(url).read("capture", "A1")[NAME]
     some[:: SHARD // 2, :3].compute()
     yield "read two chunks of every shard", clock() - begin
     begin = clock()
@@ -82,7 +85,8 @@ def main() -> None:
                             proxy.requests.clear()
     print(f"{values.nbytes / 1e6:.0f} MB of samples, {args.delay_ms:g} ms delay per request")
     for step, count in requests.items():
-        folder, bucket = median(found[step, "folder"]), median(found[step, "bucket"])
+        folder = median(found[step, "folder"])
+        bucket = median(found[step, "bucket"])
         print(
             f"{step:32} folder {folder:6.2f} s  bucket {bucket:6.2f} s  ratio {bucket / folder:5.1f}  {count} requests"
         )

@@ -59,7 +59,8 @@ def _rows(folder: Path) -> Iterator[list[str]]:
             _, clear, pixels = camera_visibility(surfels, planted.cameras, scene, pool)
             check = CalibrationCheck(planted, surfels, lit, clear, pixels, intensity)
             found = check.evaluate({pair: check.reduce(pair[1], pictures(*pair)) for pair in check.pairs})
-            faults, notes = calibration_faults(planted, found), calibration_notes(planted, found)
+            faults = calibration_faults(planted, found)
+            notes = calibration_notes(planted, found)
             said = f"refused: {faults[0].found}" if faults else f"warned: {notes[0]}" if notes else "nothing"
             agreement = f"{np.nanmin(found.camera_agreement):.2f}, {np.nanmin(found.light_agreement):.2f}"
             yield [folder.name, name, f"{np.nanmax(found.camera_offset):.1f}", agreement, said]
@@ -96,7 +97,8 @@ def _cases(dome: DomeRecord, surfels: SurfelSet, picture: Pictures) -> Iterator[
         ("scan mirrored", np.diag([-1, 1, 1]), [0, 0, 0]),
     ):
         faces = surfels.faces if np.linalg.det(rotation) > 0 else surfels.faces[:, ::-1].copy()
-        position, normal = surfels.position @ rotation.T + move, surfels.normal @ rotation.T
+        position = surfels.position @ rotation.T + move
+        normal = surfels.normal @ rotation.T
         yield name, dome, replace(surfels, position=position, normal=normal, faces=faces), picture
     places = np.array([light.position for light in dome.lights])
     far = np.linalg.norm(places - places[3], axis=1)

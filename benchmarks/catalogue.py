@@ -45,15 +45,20 @@ QUERIES: dict[str, Callable[[Database], Any]] = {
 
 def about(number: int) -> dict[str, Any]:
     """Take and provenance of a capture."""
-    subject, condition = f"S{number // 2:04d}", ("normal", "lotion")[number % 2]
+    subject = f"S{number // 2:04d}"
+    condition = ("normal", "lotion")[number % 2]
     take = subject if condition == "normal" else f"{subject}.{condition}"
     traits = {"age": 20 + number % 60, "gender": ("female", "male")[number % 3 % 2], "hair": "dark"}
     scope = ["fit", "statistics"]
     padding = {"digests": {f"file{i}": "0" * 64 for i in range(100)}}
     return {
-        "subject": subject, "condition": condition, "take": take, "consent_scope": scope, "traits": traits,
+        "subject": subject,
+        "condition": condition,
+        "take": take,
+        "consent_scope": scope,
+        "traits": traits,
         "summary": padding,
-    }  # fmt: skip
+    }
 
 
 def refit(db: Database, number: int) -> None:
@@ -75,14 +80,17 @@ def fill(db: Database, takes: int) -> None:
 
 def copied(folder: Path, url: str) -> None:
     """Put every file of a database into a bucket."""
-    place, names = Bucket(url), [path for path in folder.rglob("*") if path.is_file() and path.name != CATALOGUE]
+    place = Bucket(url)
+    names = [path for path in folder.rglob("*") if path.is_file() and path.name != CATALOGUE]
     with ThreadPoolExecutor(8) as pool:
         list(pool.map(lambda path: place.replace(path.relative_to(folder).as_posix(), path.read_bytes()), names))
 
 
 def query(url: str, name: str) -> None:
     """Run a query in this process, and print its time."""
-    db, wall, cpu = skindb.open(url), time.perf_counter(), time.process_time()
+    db = skindb.open(url)
+    wall = time.perf_counter()
+    cpu = time.process_time()
     QUERIES[name](db)
     print(json.dumps({"wall": time.perf_counter() - wall, "cpu": time.process_time() - cpu}))
 

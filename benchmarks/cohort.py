@@ -27,7 +27,8 @@ CHANNELS = ("R", "G", "B")
 def truth_of(path: Path, cohort: xr.Dataset) -> xr.Dataset:
     """True means of regions and sites of a take, in the layout of the cohort."""
     held = np.load(path)
-    names, sites = held["region_names"].tolist(), held["site_names"].tolist()
+    names = held["region_names"].tolist()
+    sites = held["site_names"].tolist()
     regions = np.full((cohort.sizes["region"], 3), np.nan)
     for i, name in enumerate(cohort["region"].values.tolist()):
         inside = np.ones(len(held["vertices"]), bool) if name == "face" else None
@@ -70,9 +71,11 @@ def main() -> None:
         for quantity in found["quantity"].values.tolist():
             if quantity.startswith("surface"):
                 continue
-            est, true_effect = found.sel(contrast=contrast, quantity=quantity), want.sel(contrast=contrast)
+            est = found.sel(contrast=contrast, quantity=quantity)
+            true_effect = want.sel(contrast=contrast)
             truth = float(true_effect["effect"].sel(quantity=quantity))
-            low, high = float(est["effect_low"]), float(est["effect_high"])
+            low = float(est["effect_low"])
+            high = float(est["effect_high"])
             inside.append(low <= truth <= high)
             means = [_mean(one, quantity) for one in (planted, cohort)]
             numbers = f"{means[0]:.3f} | {means[1]:.3f} | {truth:.4f} | {float(est['effect']):.4f}"

@@ -53,7 +53,9 @@ WAYS = {  # file, what is connected, and the picture of skindb that it is compar
 }
 SHOWN = ("model.glb", "the same, translucency.exr")  # in the picture for the documentation
 # light under the skin on plates: albedos, half of the width [mm], and radii [mm] for diffusion lengths of about 1 mm
-PLATES, HALF, PIXELS = ((0.5, 0.3, 0.2), (0.7, 0.4, 0.1)), 10.0, 80
+PLATES = ((0.5, 0.3, 0.2), (0.7, 0.4, 0.1))
+HALF = 10.0
+PIXELS = 80
 SPREADS = {
     "RANDOM_WALK_SKIN": ((2.0, 2.0, 2.0), (2.0, 2.0, 2.0)),
     "RANDOM_WALK": ((6.7, 12.7, 18.0), (3.2, 9.2, 26.0)),
@@ -78,7 +80,8 @@ def set_stage(model) -> Stage:
     K = camera.K.copy()
     K[0, 0] = K[1, 1] = (K[0, 0] + K[1, 1]) / 2
     camera = replace(camera, K=K, distortion=np.zeros(5))
-    surface, fitted = from_model(model, fill=True), model["fitted"].to_dataset()
+    surface = from_model(model, fill=True)
+    fitted = model["fitted"].to_dataset()
     scene = RayScene(surface.vertices, surface.faces)
     view = trace_view(surface, camera, samples=4, scene=scene)
     trust = view.image(view.interpolate(surfel_confidence(fitted)[:, None].astype(float)))[..., 0]
@@ -107,7 +110,8 @@ def pictures(stage: Stage, light: Lights) -> dict[str, np.ndarray]:
 def point_lights(model, view: View) -> dict[int, Lights]:
     """The lights of the dome nearest to the angles, as points."""
     lights = lights_from_dome(model["dome"].to_dataset().load())
-    way, ahead = lights.position / np.linalg.norm(lights.position, axis=1, keepdims=True), view.camera.centre
+    way = lights.position / np.linalg.norm(lights.position, axis=1, keepdims=True)
+    ahead = view.camera.centre
     angle = np.degrees(np.arccos(way @ ahead / np.linalg.norm(ahead)))
     points = replace(lights, disc_radius=0 * lights.disc_radius, falloff=0 * lights.falloff)
     return {round(angle[i]): points.select(i) for i in (int(np.argmin(np.abs(angle - a))) for a in ANGLES)}
@@ -126,7 +130,8 @@ def difference(found: np.ndarray, true: np.ndarray, mask: np.ndarray) -> dict[st
     def rms(a: np.ndarray, b: np.ndarray) -> float:
         return float(np.sqrt(np.mean((a - b) ** 2) / np.mean(b**2)))
 
-    a, b = found[mask], true[mask]
+    a = found[mask]
+    b = true[mask]
     ratio = [round(float(x), 4) for x in np.median(a / np.maximum(b, 1e-12), axis=0)]
     return {"median_ratio": ratio, "rms": rms(a, b), "rms_perceptual": rms(np.cbrt(a), np.cbrt(b))}
 
@@ -157,7 +162,8 @@ def controls(stage: Stage, path: Path) -> None:
         return np.stack([x, z, -y], axis=-1)
 
     apart = np.linalg.norm(1000 * upright("Position") - stage.view.image(stage.view.position), axis=-1)[stage.good]
-    a, b = upright("Normal")[stage.good], stage.view.image(stage.view.normal)[stage.good]
+    a = upright("Normal")[stage.good]
+    b = stage.view.image(stage.view.normal)[stage.good]
     cosine = (a * b).sum(axis=1) / np.linalg.norm(a, axis=1) / np.linalg.norm(b, axis=1)
     angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
     print(
@@ -169,7 +175,8 @@ def controls(stage: Stage, path: Path) -> None:
 def edge(albedo: float, length: float, across: np.ndarray) -> np.ndarray:
     """Light that leaves a plate at these distances [mm] from the edge of a shadow, by the dipole; 1 is full light."""
     absorption, scattering = scattering_coefficients(dipole_s(np.array(albedo), eta=1.3)[0], np.array(1 / length))
-    line, along = np.linspace(0, 15, 601), np.concatenate([[0], np.geomspace(1e-4, 60, 2000)])
+    line = np.linspace(0, 15, 601)
+    along = np.concatenate([[0], np.geomspace(1e-4, 60, 2000)])
     far = np.hypot(line[:, None], along)
     spread = 2 * np.trapezoid(dipole_profile(far, float(absorption), float(scattering), eta=1.3), along, axis=1)
     half = np.concatenate([[0], np.cumsum((spread[1:] + spread[:-1]) / 2)])
@@ -180,12 +187,21 @@ def edge(albedo: float, length: float, across: np.ndarray) -> np.ndarray:
 def spread_jobs(folder: Path) -> list[dict]:
     """Plates in even light and half in shadow, for each method of Blender."""
     return [
-        {"plate": {"albedo": PLATES[i], "method": method, "radius": [x / 1000 for x in radii[i]], "blocked": blocked},
-         "size": [PIXELS, 8], "samples": 1024 if blocked else 256, "out": str(folder / f"{method}_{i}_{blocked}.exr")}
+        {
+            "plate": {
+                "albedo": PLATES[i],
+                "method": method,
+                "radius": [x / 1000 for x in radii[i]],
+                "blocked": blocked,
+            },
+            "size": [PIXELS, 8],
+            "samples": 1024 if blocked else 256,
+            "out": str(folder / f"{method}_{i}_{blocked}.exr"),
+        }
         for method, radii in SPREADS.items()
         for i in range(len(PLATES))
         for blocked in (False, True)
-    ]  # fmt: skip
+    ]
 
 
 def report_spread(folder: Path) -> None:
@@ -227,7 +243,9 @@ def run(python: str, program: str, jobs: list[dict], folder: Path) -> None:
 
 def described(camera: Camera, light: Lights) -> dict:
     """Camera and light for other programs."""
-    K, R, centre = camera.K.tolist(), camera.R.tolist(), camera.centre.tolist()
+    K = camera.K.tolist()
+    R = camera.R.tolist()
+    centre = camera.centre.tolist()
     about = {"K": K, "R": R, "centre": centre, "width": camera.width, "height": camera.height}
     lamp = {"position": light.position[0].tolist(), "intensity": light.intensity[0].tolist()}
     return {"camera": about, "light": lamp, "size": [camera.width, camera.height], "samples": SAMPLES}
@@ -249,7 +267,8 @@ def main() -> None:
     db = skindb.open(options.db)
     model = db.read("model", options.take or db.takes("model")[0])
     bundle = export_bundle(model, out / "bundle", merl=False).parent
-    stage, figures = set_stage(model), {}
+    stage = set_stage(model)
+    figures = {}
     for angle, light in point_lights(model, stage.view).items():
         print(f"light at {angle} degrees from the camera")
         true = pictures(stage, light)

@@ -76,9 +76,12 @@ def add(name: str, data):
 def add_camera(about) -> None:
     """A pinhole camera from its matrices in the frame of the subject."""
     data, (K, width, height) = bpy.data.cameras.new("camera"), (about["K"], about["width"], about["height"])
-    data.sensor_fit, data.sensor_width, data.clip_start = "HORIZONTAL", 36, 0.01
+    data.sensor_fit = "HORIZONTAL"
+    data.sensor_width = 36
+    data.clip_start = 0.01
     data.lens = K[0][0] * data.sensor_width / width
-    data.shift_x, data.shift_y = (width / 2 - K[0][2]) / width, (K[1][2] - height / 2) / width
+    data.shift_x = (width / 2 - K[0][2]) / width
+    data.shift_y = (K[1][2] - height / 2) / width
     turn = UPRIGHT @ Matrix(about["R"]).transposed() @ Matrix.Diagonal((1, -1, -1))
     placed = turn.to_4x4()
     placed.translation = UPRIGHT @ Vector(about["centre"]) * MM
@@ -89,8 +92,10 @@ def add_camera(about) -> None:
 
 def add_light(about) -> None:
     """A point light; Blender's watts are 4 pi times the radiant intensity."""
-    data, top = bpy.data.lights.new("light", "POINT"), max(about["intensity"])
-    data.shadow_soft_size, data.energy = 0, 4 * math.pi * top * MM**2
+    data = bpy.data.lights.new("light", "POINT")
+    top = max(about["intensity"])
+    data.shadow_soft_size = 0
+    data.energy = 4 * math.pi * top * MM**2
     data.color = [x / top for x in about["intensity"]]
     add("light", data).location = UPRIGHT @ Vector(about["position"]) * MM
 
@@ -113,10 +118,12 @@ def half_lit(albedo, method: str, radius, blocked: bool) -> None:
         bpy.ops.mesh.primitive_plane_add(size=1, location=(0.5, 0, 0.05))
         bpy.context.object.visible_camera = bpy.context.object.visible_diffuse = False
     sun = bpy.data.lights.new("sun", "SUN")
-    sun.energy, sun.angle = math.pi, 0
+    sun.energy = math.pi
+    sun.angle = 0
     add("sun", sun)
     data = bpy.data.cameras.new("camera")
-    data.type, data.ortho_scale = "ORTHO", 0.02
+    data.type = "ORTHO"
+    data.ortho_scale = 0.02
     camera = add("camera", data)
     camera.location = (0, 0, 0.3)
     bpy.context.scene.camera = camera
@@ -126,7 +133,9 @@ def write(path: str, width: int, height: int, samples: int) -> None:
     """Render by direct light, because skindb does not follow light between parts of the face either."""
     scene = bpy.context.scene
     scene.render.engine, cycles = "CYCLES", scene.cycles
-    cycles.device, cycles.samples, cycles.max_bounces = "CPU", samples, 0
+    cycles.device = "CPU"
+    cycles.samples = samples
+    cycles.max_bounces = 0
     cycles.use_adaptive_sampling = cycles.use_denoising = False
     cycles.pixel_filter_type = "BOX"
     scene.render.film_transparent = True

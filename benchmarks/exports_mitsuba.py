@@ -23,16 +23,21 @@ def main() -> None:
 
     for job in jobs:
         camera, (width, height) = job["camera"], job["size"]
-        K, R = np.array(camera["K"]), np.array(camera["R"])
+        K = np.array(camera["K"])
+        R = np.array(camera["R"])
         to_world = np.eye(4)
         to_world[:3, :3], to_world[:3, 3] = R.T @ np.diag([-1.0, -1.0, 1.0]), camera["centre"]
         sensor = {
-            "type": "perspective", "fov": float(np.degrees(2 * np.arctan(width / 2 / K[0, 0]))), "fov_axis": "x",
+            "type": "perspective",
+            "fov": float(np.degrees(2 * np.arctan(width / 2 / K[0, 0]))),
+            "fov_axis": "x",
             "principal_point_offset_x": float((width / 2 - K[0, 2]) / width),
             "principal_point_offset_y": float((height / 2 - K[1, 2]) / height),
-            "to_world": mitsuba.ScalarTransform4f(to_world), "near_clip": 1.0, "far_clip": 1e5,
+            "to_world": mitsuba.ScalarTransform4f(to_world),
+            "near_clip": 1.0,
+            "far_clip": 1e5,
             "film": {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"}},
-        }  # fmt: skip
+        }
         lamp = {
             "type": "point",
             "position": job["light"]["position"],

@@ -79,7 +79,8 @@ def turns(repeats: int, side: Callable[[str], dict[str, Any]]) -> dict[str, list
 
 def differences(before: xr.DataTree, after: xr.DataTree) -> dict[str, float]:
     """Medians over surfels, or over sites and channels, of the change divided by the stated error."""
-    old, new = before["fitted"].to_dataset(), after["fitted"].to_dataset()
+    old = before["fitted"].to_dataset()
+    new = after["fitted"].to_dataset()
     good = (old["fit_status"].values == FitStatus.FITTED) & (new["fit_status"].values == FitStatus.FITTED)
     cosine = (old["shading_normal"].values.astype(float) * new["shading_normal"].values).sum(1)
     lengths = [np.linalg.norm(one["shading_normal"].values.astype(float), axis=1) for one in (old, new)]
@@ -100,7 +101,9 @@ def differences(before: xr.DataTree, after: xr.DataTree) -> dict[str, float]:
 
 def report(results: dict[str, Any]) -> str:
     """Markdown tables of all results."""
-    runs, old, new = results["fits"], results["parts"]["before"], results["parts"]["after"]
+    runs = results["fits"]
+    old = results["parts"]["before"]
+    new = results["parts"]["after"]
     lines = ["| stage | CPU before, after [s] | wall before, after [s] |", "|---|---|---|"]
     for stage in STAGES:
         cells = [", ".join(f"{medians(runs[s], stage, what):.1f}" for s in SIDES) for what in ("cpu", "wall")]

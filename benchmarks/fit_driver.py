@@ -95,7 +95,8 @@ def parts(db: Any, take: str) -> dict[str, float]:
     whole = lumitexels(capture)
     seen = np.flatnonzero(capture["samples"]["sample_count"].values > 0)
     chosen = seen[np.linspace(0, len(seen) - 1, min(SURFELS, len(seen))).astype(int)]
-    work, spent = whole.isel(surfel=chosen).load(), {}
+    work = whole.isel(surfel=chosen).load()
+    spent = {}
     tables = _tables(whole)
 
     def timed(name: str, part: Callable[[], Any]) -> Any:
@@ -144,7 +145,8 @@ def _second_pass(known: xr.Dataset, held: np.ndarray, basis: xr.Dataset) -> Call
         return lambda: refit_and_evaluate(known, held_out=held_out, basis=basis, mode="perceptual", eta=1.3)
     from skindb.fit import find_outliers, held_out_error, refit
 
-    work, away = known.isel(light=~held), known.isel(light=held)
+    work = known.isel(light=~held)
+    away = known.isel(light=held)
 
     def after() -> None:
         found = refit(work, basis=basis)

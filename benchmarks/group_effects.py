@@ -25,7 +25,8 @@ from skindb.analysis import group_effects
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from planted_tables import planted_tables
 
-R_D, SIGMA_TR = "R_d face G", "sigma_tr cheek G"
+R_D = "R_d face G"
+SIGMA_TR = "sigma_tr cheek G"
 
 
 def cohort_of_two(n: int, seed: int, difference: float = 0.0, log_tr: float = 0.0, spread: float = 2.0) -> xr.Dataset:
@@ -49,7 +50,8 @@ def confounded(n: int, seed: int) -> xr.Dataset:
 def paired(n: int, seed: int) -> xr.Dataset:
     """All subjects in two conditions, with a mean change of 0.001 that differs between subjects."""
     rng = np.random.default_rng([3, seed])
-    who, conditions = np.repeat(np.arange(n), 2), np.tile(["normal", "lotion"], n)
+    who = np.repeat(np.arange(n), 2)
+    conditions = np.tile(["normal", "lotion"], n)
     change = np.repeat(rng.normal(0.001, 0.003, n), 2) * (conditions == "lotion")
     return planted_tables([f"S{i}" for i in who], conditions=list(conditions), albedo=change, seed=seed, spread=0.1)
 

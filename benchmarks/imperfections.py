@@ -101,7 +101,8 @@ def main() -> None:
     )
     parser.add_argument("--json", type=Path, help="File for all results.")
     args = parser.parse_args()
-    db, results = skindb.open(args.db), []
+    db = skindb.open(args.db)
+    results = []
     print(header(*COLUMNS))
     for folder in args.captures:
         try:
@@ -111,7 +112,8 @@ def main() -> None:
         print(row(results[-1]), flush=True)
     share = np.array([r["coverage"] for r in results if "coverage" in r])
     if len(share):
-        each, width = share.mean(axis=1), np.median([r["half_width"] for r in results if "coverage" in r], axis=0)
+        each = share.mean(axis=1)
+        width = np.median([r["half_width"] for r in results if "coverage" in r], axis=0)
         print(f"\nIn the 95 % interval of R_d: {100 * share.mean():.1f} % of all; lowest {100 * each.min():.0f} %")
         print(f"Median half-width of the interval, R G B: {numbers(100 * width, '.0f')} %")
     if args.json:

@@ -28,7 +28,8 @@ SPREADS = (0.0, 0.05, 0.15)
 
 def planted(capture: xr.DataTree, gain: np.ndarray[Any, Any]) -> xr.DataTree:
     """The capture with the samples of each light multiplied by its gain."""
-    samples, out = capture["samples"].to_dataset(), capture.copy()
+    samples = capture["samples"].to_dataset()
+    out = capture.copy()
     sample = samples["reflectance_sample"]
     brighter = (sample.astype(np.float32) * xr.Variable("light", gain.astype(np.float32))).astype(sample.dtype)
     out["samples"] = samples.assign(reflectance_sample=brighter.transpose(*sample.dims).assign_attrs(sample.attrs))

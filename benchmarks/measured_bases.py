@@ -65,7 +65,8 @@ def embedded() -> None:
     ):
         start = process_time()
         convolve_disc(embedded_dictionary(), DISC, far=far, near=near)
-        spent, found = process_time() - start, _disc(pairs, far, near)
+        spent = process_time() - start
+        found = _disc(pairs, far, near)
         cells = [_above(found, exact, *pairs, lowest) for lowest in (0.1, 0.2, 0.3, 0.5)]
         worst = " | ".join(f"{100 * error.max():.2f} %" for error in cells)
         print(f"| {far}, {near} | {spent:.1f} | {100 * np.median(cells[0]):.4f} % | {worst} |")
@@ -114,7 +115,8 @@ def grid() -> None:
 
 def merl(folder: Path) -> None:
     """Read reconstructions of the 59 with the MERL reader, and compare them with slices and with the embedded set."""
-    networks, slices = np.load(folder / "nbrdf_weights.npz"), np.load(folder / "merl_slices_phid90.npz")
+    networks = np.load(folder / "nbrdf_weights.npz")
+    slices = np.load(folder / "merl_slices_phid90.npz")
     with tempfile.TemporaryDirectory() as scratch:
         for name in PARAMETERS:  # 35 MB each
             write_merl(Path(scratch) / f"{name}.binary", reconstruction(networks[f"merl/{name}"]))
@@ -133,7 +135,8 @@ def compare(files: Path, slices) -> None:
     td, th = np.meshgrid(slices["theta_d_rad"], slices["theta_h_rad"], indexing="ij")
     wi, wo = directions(th, td, np.pi / 2)
     up = np.minimum(wi[..., 2], wo[..., 2]) > 0.2
-    want, abc = measured[up], evaluate_abc(ROWS, wi[up], wo[up])
+    want = measured[up]
+    abc = evaluate_abc(ROWS, wi[up], wo[up])
     angles = th[up], td[up], np.full(up.sum(), np.pi / 2)
     print("\n| against the measured slices, above 12 degrees | median of the medians | worst median |\n|---|---|---|")
     for name, found in (("tables read from MERL binaries", lookup(dictionary.table, *angles)), ("ABC formula", abc)):
@@ -151,7 +154,8 @@ def _mixtures(dictionary) -> None:
     for lowest, degrees in ((0.1, 6), (0.3, 17), (0.5, 30)):
         pairs = sample_pairs(6000, lowest)
         angles = half_difference(*pairs)
-        want, bases = lookup(dictionary.table, *angles), lookup(embedded_dictionary().table, *angles)
+        want = lookup(dictionary.table, *angles)
+        bases = lookup(embedded_dictionary().table, *angles)
         others = [np.delete(bases, m, axis=1) for m in range(want.shape[1])]
         own = weighted_error(bases, want, *pairs)
         rows = {

@@ -47,7 +47,8 @@ def main() -> None:
     parser.add_argument("--hold-out-lights", type=float, default=0.1)
     args = parser.parse_args()
     capture = repeated(skindb.open(args.db).read("capture", args.take), args.surfels)
-    parameters, before = FitParameters(hold_out_lights=args.hold_out_lights), peak()
+    parameters = FitParameters(hold_out_lights=args.hold_out_lights)
+    before = peak()
     with tempfile.TemporaryDirectory() as folder, Stages() as stages:
         model = fit_model(capture, parameters, progress=stages)
         stages.end("rest")

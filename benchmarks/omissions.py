@@ -32,11 +32,16 @@ DIRECTIONS = 300  # of views around the face
 
 def made(surface, camera, lighting, scene, quality, *, planned):
     """CPU time [s], the picture, and what was skipped."""
-    started, pixels, omissions = time.process_time(), None, ()
+    started = time.process_time()
+    pixels = None
+    omissions = ()
     if planned:
         options = {"subsurface": quality.subsurface, "error": quality.error}
         plan = plan_scene(surface, camera, lighting, scene, **options)
-        surface, lighting, pixels, omissions = plan.surface, plan.lighting, plan.pixels, plan.omissions
+        surface = plan.surface
+        lighting = plan.lighting
+        pixels = plan.pixels
+        omissions = plan.omissions
     picture = render_monte_carlo(
         surface, camera, lighting, quality, rng=np.random.default_rng(1), scene=scene, pixels=pixels
     )
@@ -47,7 +52,9 @@ def pictures(surface, camera, lights, scene) -> None:
     """Pictures with and without their plan."""
     strong = lights.intensity.copy()
     strong[0] *= DOMINANT
-    dominated, whole, room = replace(lights, intensity=strong), Lighting(lights), Lighting(None, sky())
+    dominated = replace(lights, intensity=strong)
+    whole = Lighting(lights)
+    room = Lighting(None, sky())
     cases = {
         "one light": (Lighting(lights.select([0])), Quality(64)),
         "dome": (whole, Quality(64)),
@@ -62,8 +69,10 @@ def pictures(surface, camera, lights, scene) -> None:
         first, second = (min(run[i][0] for run in runs) for i in (0, 1))
         (_, without, _), (_, found, omissions) = runs[0]
         gap = np.sqrt(np.mean((found.radiance - without.radiance) ** 2) / np.mean(without.radiance**2))
-        print(f"{name}: {first:.1f} s, with its plan {second:.1f} s; pictures differ by {gap:.2%}, noise "
-              f"{found.relative_error:.2%}")  # fmt: skip
+        print(
+            f"{name}: {first:.1f} s, with its plan {second:.1f} s; pictures differ by {gap:.2%}, noise "
+            f"{found.relative_error:.2%}"
+        )
         print("".join(f"    {one}\n" for one in omissions), end="")
 
 
@@ -82,7 +91,8 @@ def bases(surface, camera, lights, scene) -> None:
 def behind(surface, scene) -> None:
     """Error of a close-up with the sun behind it, with and without the light below all horizons."""
     front = surface.vertices[surface.vertices[:, 2].argmax()] + [0, 60, 0]
-    R, K = np.diag([1.0, -1, -1]), np.array([[3000.0, 0, 100], [0, 3000, 100], [0, 0, 1]])
+    R = np.diag([1.0, -1, -1])
+    K = np.array([[3000.0, 0, 100], [0, 3000, 100], [0, 0, 1]])
     camera = Camera(K, R, -R @ (front + np.array([0, 0, 300])), np.zeros(5), 200, 200)
     room = np.full((64, 128, 3), 0.3)
     room[32, :2] = 2e4
@@ -95,14 +105,17 @@ def behind(surface, scene) -> None:
         ).relative_error
         for one in (room, dark)
     ]
-    print(f"close-up, sun behind (normals face it by at most {-lowest:.2f}): noise {found[0]:.2%}, without it "
-          f"{found[1]:.2%}")  # fmt: skip
+    print(
+        f"close-up, sun behind (normals face it by at most {-lowest:.2f}): noise {found[0]:.2%}, without it "
+        f"{found[1]:.2%}"
+    )
 
 
 def hidden(surface, scene) -> None:
     """Surfels that no direction shows, and directions that are below the horizon of all surfels."""
     k = np.arange(DIRECTIONS) + 0.5
-    z, turn = 1 - 2 * k / DIRECTIONS, k * np.pi * (3 - 5**0.5)
+    z = 1 - 2 * k / DIRECTIONS
+    turn = k * np.pi * (3 - 5**0.5)
     way = np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], axis=1)
     seen = np.zeros(len(surface.vertices), bool)
     for one in way:
@@ -117,7 +130,9 @@ def nodes(tables) -> None:
     """Relative RMS error of tables with half as many nodes along each axis, weighted as a picture sees them."""
     tables = tables.astype(np.float64)
     shape = tables.shape[:3]
-    h, d, p = np.linspace(0, 1, shape[0]) ** 2 * np.pi / 2, np.linspace(0, np.pi / 2, shape[1]), np.arange(shape[2])
+    h = np.linspace(0, 1, shape[0]) ** 2 * np.pi / 2
+    d = np.linspace(0, np.pi / 2, shape[1])
+    p = np.arange(shape[2])
     angles = [x.ravel() for x in np.meshgrid(h, d, p * np.pi / shape[2], indexing="ij")]
     wi, wo = directions(*angles)
     weight = np.clip(wi[:, 2], 0, 1) ** 2 * np.clip(wo[:, 2], 0, 1) * np.sin(angles[0]) * np.sqrt(angles[0])

@@ -95,7 +95,8 @@ def lafortune(parameters: Array, normal: Array, light: Array) -> Array:
     seen = (normal @ VIEW)[:, None]
     level = lit * seen
     flat = light @ VIEW - level
-    across, along = np.exp(parameters[:, 1:2]), np.exp(parameters[:, 2:3])
+    across = np.exp(parameters[:, 1:2])
+    along = np.exp(parameters[:, 2:3])
     base = np.maximum(along * level - across * flat, 1e-6)
     lobe = base ** np.exp(parameters[:, 3:4]) * np.maximum(lit, 0.0)
     return lambert(parameters, normal, light) + lobe

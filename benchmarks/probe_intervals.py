@@ -14,14 +14,17 @@ from skindb.optics.transport import transport_profile
 from skindb.schema import ProbeStatus
 
 DISTANCE = 1 + 0.5 * np.arange(28)  # mm
-RELATIVE, FLOOR = (0.004, 0.02), (3e-9, 3e-7)  # errors of the fibres: a fraction of the profile, and mm^-2
+# errors of the fibres: a fraction of the profile, and mm^-2
+RELATIVE = (0.004, 0.02)
+FLOOR = (3e-9, 3e-7)
 
 
 def draws(count, *, relative, floor, free, seed=1):
     """Fits and true sigma_tr of `count` media: sigma_s' 1.5 mm^-1 within a factor of e^0.5, sigma_tr 0.3 to 2.4."""
     rng = np.random.default_rng([seed, round(1e4 * relative), round(1e10 * floor)])
     for _ in range(count):
-        s, true = 1.5 * np.exp(0.5 * rng.normal()), np.exp(rng.uniform(np.log(0.3), np.log(2.4)))
+        s = 1.5 * np.exp(0.5 * rng.normal())
+        true = np.exp(rng.uniform(np.log(0.3), np.log(2.4)))
         a = (np.sqrt(s * s + 4 * true**2 / 3) - s) / 2
         value = transport_profile(DISTANCE, a, s, eta=1.3)
         error = np.hypot(relative * value, floor)

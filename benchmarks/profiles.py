@@ -45,7 +45,9 @@ def work_precision(*, eta: float = 1.3, seed: int = 0, share: float = 1.0) -> li
 
 def _compare(walk, albedo, eta):
     """Compare every model at every distance; sigma_s' = 1, so that a mean free path is `albedo`."""
-    ratio, middle, rows = (1 - albedo) / albedo, np.array(DISTANCE) * albedo, []
+    ratio = (1 - albedo) / albedo
+    middle = np.array(DISTANCE) * albedo
+    rows = []
     value, noise = rings(walk, ratio, middle, WIDTH)
     for name, model in MODELS.items():
         mean = ring_mean(model.profile(across(middle, WIDTH), ratio, 1.0, eta=eta), middle, WIDTH)

@@ -34,14 +34,17 @@ def radiance_biases(capture, folder):
 
     With a recovered response the unit of radiance is free in each channel; it is set by the median of bright octaves.
     """
-    dome, faults = capture.dome, []
+    dome = capture.dome
+    faults = []
     mergers = frame_mergers(dome, faults)
-    sensor, seconds = dome.cameras[0].sensor, tuple(dome.exposures.values())
+    sensor = dome.cameras[0].sensor
+    seconds = tuple(dome.exposures.values())
     views = [np.stack(read_view(dome, light.id, c)) for c in dome.cameras for light in dome.lights]
     response = recover_response(np.concatenate(views, axis=1), seconds, black=sensor.black, white=sensor.white)
     biases = []
     for own in (sensor, replace(sensor, response=response.table)):
-        merged, truth = [], []
+        merged = []
+        truth = []
         for path in sorted(folder.glob("*.exr")):
             light, name = path.stem.split("_")
             camera = next(c for c in dome.cameras if c.id == name)
@@ -66,7 +69,8 @@ def _octave_biases(merged, truth, longest):
 
 def light_errors(capture, truth):
     """Relative errors of the intensities from `light_intensities` and from `fit_light`, and the fitted fall-off."""
-    dome, faults = capture.dome, []
+    dome = capture.dome
+    faults = []
     mergers = frame_mergers(dome, faults)
     with ThreadPoolExecutor(2) as pool:
         used = light_intensities(dome, mergers, pool) / truth["light_intensity"] - 1
@@ -139,7 +143,8 @@ def main() -> None:
     print("|---" * 5 + "|")
     curved = {}
     for folder in arguments.captures:
-        capture, truth = read_capture(folder), np.load(folder.with_name(folder.name + ".truth.npz"))
+        capture = read_capture(folder)
+        truth = np.load(folder.with_name(folder.name + ".truth.npz"))
         used, own, falloff = light_errors(capture, truth)
         if capture.dome.cameras[0].sensor.response is not None:
             curved[folder.name] = radiance_biases(capture, folder.with_name(folder.name + ".truth"))

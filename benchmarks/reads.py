@@ -24,7 +24,9 @@ from skindb.store import Database
 from skindb.store import stage as stage_module
 from skindb.store.verified import VerifiedStore
 
-LIGHTS, CAMERAS, CHUNK = 150, 16, 256
+LIGHTS = 150
+CAMERAS = 16
+CHUNK = 256
 NAME = "samples/reflectance_sample"
 
 
@@ -42,9 +44,15 @@ def write_checksums(root: Path, values: np.ndarray) -> Path:
     """Write the samples in the layout of the store, with a checksum in every chunk."""
     layout = stage_module._encoding(dataset({"reflectance_sample": values})["reflectance_sample"])
     array = zarr.create_array(
-        LocalStore(root), name=NAME, shape=values.shape, dtype=values.dtype, chunks=layout["chunks"],
-        shards=layout["shards"], filters=layout["filters"], compressors=[*layout["compressors"], Crc32cCodec()],
-    )  # fmt: skip
+        LocalStore(root),
+        name=NAME,
+        shape=values.shape,
+        dtype=values.dtype,
+        chunks=layout["chunks"],
+        shards=layout["shards"],
+        filters=layout["filters"],
+        compressors=[*layout["compressors"], Crc32cCodec()],
+    )
     for start in range(0, len(values), stage_module.SHARD):
         array[start : start + stage_module.SHARD] = values[start : start + stage_module.SHARD]
     return root
@@ -71,7 +79,8 @@ def main() -> None:
     zarr.config.set({"array.order": "F"})
     with tempfile.TemporaryDirectory() as folder:
         values = samples(args.surfels)
-        summed, db = write_checksums(Path(folder) / "crc32c", values), Database(Path(folder) / "db")
+        summed = write_checksums(Path(folder) / "crc32c", values)
+        db = Database(Path(folder) / "db")
         with db.stage("capture", "A1") as stage:
             stage.write({"samples": dataset({"reflectance_sample": values})})
             record = stage.commit({})

@@ -43,14 +43,17 @@ Mask = NDArray[np.bool_]
 
 FAR_MM = 1e6  # distance of lights and camera; pixels have a spacing of 1 mm
 NO_SCAN_DEGREES = 60.0  # error of the scan's normals for which their prior has no effect
-SKIN, PLASTER = 1.3, 1.0  # refractive indices; matt plaster has no smooth boundary
+# refractive indices; matt plaster has no smooth boundary
+SKIN = 1.3
+PLASTER = 1.0
 ISOTROPIC_95 = float(np.sqrt(-np.log(0.05)))  # 95 % of the angles of two equal axes, over their RMS
 MIN_PREDICTED = 0.01  # of a white facing surface times pi; smaller predictions tell nothing about gains
 GAIN_ROUNDS = 3
 LIGHT_COUNTS = (4, 6, 8, 12, 24)
 PARTS = ("faces", "cat", "lights", "sphere", "brdfs")
 
-ANGLE, COVERAGE = "normals, mean, median [deg]", "within the stated error, the total error [%]"
+ANGLE = "normals, mean, median [deg]"
+COVERAGE = "within the stated error, the total error [%]"
 
 Method = Callable[[Photographs, Mask], "Fitted"]
 

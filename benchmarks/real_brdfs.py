@@ -113,7 +113,8 @@ def _one_ggx(theta_h: Array, theta_d: Array, wi: Array, wo: Array):
 
 def _cook_torrance(theta_h: Array, theta_d: Array, wi: Array, wo: Array):
     """Beckmann distribution with the shadowing of Cook and Torrance (1982)."""
-    across, towards = np.cos(theta_h), np.maximum(np.cos(theta_d), 1e-3)
+    across = np.cos(theta_h)
+    towards = np.maximum(np.cos(theta_d), 1e-3)
     shadowed = np.minimum(1, 2 * across * np.minimum(wi[:, 2], wo[:, 2]) / towards)
 
     def shade(p: Array) -> Array:
@@ -129,7 +130,8 @@ def _cook_torrance(theta_h: Array, theta_d: Array, wi: Array, wo: Array):
 
 
 def _lafortune(wi: Array, wo: Array):
-    flat, level = (wi[:, :2] * wo[:, :2]).sum(axis=1), wi[:, 2] * wo[:, 2]
+    flat = (wi[:, :2] * wo[:, :2]).sum(axis=1)
+    level = wi[:, 2] * wo[:, 2]
 
     def shade(p: Array) -> Array:
         p = np.clip(p, -20, 6)

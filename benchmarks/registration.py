@@ -51,7 +51,8 @@ def scanned(folder: Path, spacing_mm: float) -> xr.DataTree:
 
 def with_landmarks(models: Models, chosen: NDArray[np.int64], *, click: float = 0.0, seed: int = 0) -> Models:
     """The takes with some of their landmarks, each displaced by a random error of `click` mm."""
-    rng, out = np.random.default_rng(seed), {}
+    rng = np.random.default_rng(seed)
+    out = {}
     for take, model in models.items():
         mesh = model["mesh"].to_dataset().isel(landmark=chosen)
         moved = mesh["landmark_position"] + click * rng.normal(size=mesh["landmark_position"].shape)
@@ -75,10 +76,12 @@ def cut_differently(models: Models) -> Models:
         kept = (corners[..., 1].min(axis=1) > low) & (corners[..., 2].min(axis=1) > position[:, 2].min() + BACK)
         piece = clean_mesh(position, mesh["triangle"].values[kept].astype(np.int64))
         uv, _ = disc_atlas(piece.vertices, piece.faces)
-        out[take] = xr.DataTree.from_dict({
-            "fitted": dataset({"surfel_position": piece.vertices, "surfel_uv": uv}),
-            "mesh": mesh[["landmark_position"]].merge(dataset({"triangle": piece.faces})),
-        })  # fmt: skip
+        out[take] = xr.DataTree.from_dict(
+            {
+                "fitted": dataset({"surfel_position": piece.vertices, "surfel_uv": uv}),
+                "mesh": mesh[["landmark_position"]].merge(dataset({"triangle": piece.faces})),
+            }
+        )
     return out
 
 
@@ -120,7 +123,9 @@ def against(models: Models, points: Mapping[str, Array], face: NDArray[np.bool_]
     print("\n| landmarks | click [mm] | smoothing | warp | condition | face [mm] | all [mm] | anchors | flipped |")
     print("|---|" + 8 * "---|")
     for case in cases:
-        count, click, smoothing = case.get("count", len(order)), case.get("click", 0.0), case.get("smoothing")
+        count = case.get("count", len(order))
+        click = case.get("click", 0.0)
+        smoothing = case.get("smoothing")
         takes = with_landmarks(models, np.sort(order[:count]), click=click)
         found = register(takes, smoothing=smoothing)
         error = correspondence_error(takes, found, points)
@@ -139,8 +144,10 @@ def regions(models: Models, registered: Mapping[str, xr.Dataset]) -> None:
     print("|---|---|---|")
     rows: dict[str, list[float]] = {}
     for take, model in models.items():
-        fitted, one = model["fitted"].to_dataset(), registered[take]
-        own, area = own_masks(fitted), fitted["surfel_area"].values
+        fitted = model["fitted"].to_dataset()
+        one = registered[take]
+        own = own_masks(fitted)
+        area = fitted["surfel_area"].values
         named = {str(n): one["common_landmark"].sel(landmark=n).values for n in one["landmark"].values}
         for name, mask in region_masks(one["common_uv"].values, named).items():
             parts = [own[part] for part in BESIDE.get(name, (name,)) if part in own]
@@ -163,7 +170,8 @@ def main() -> None:
     parser.add_argument("--brief", action="store_true", help="Skip the table by landmarks and smoothing.")
     args = parser.parse_args()
     models = {folder.name: scanned(folder, args.spacing) for folder in args.capture}
-    points, region = {}, np.zeros(0, str)
+    points = {}
+    region = np.zeros(0, str)
     for folder in args.capture:
         with np.load(f"{folder}.truth.npz") as truth:
             points[folder.name] = truth["vertices"][: args.shared : args.every].astype(np.float64)

@@ -33,7 +33,8 @@ OPENINGS = (1.0, 0.5, 0.2, 0.1, 0.05)
 def sky() -> Environment:
     """An overcast sky that is bluer towards the zenith, with a sun of 12 texels."""
     row, column = np.mgrid[:64, :128]
-    theta, phi = np.pi * (row + 0.5) / 64, 2 * np.pi * ((column + 0.5) / 128 - 0.5)
+    theta = np.pi * (row + 0.5) / 64
+    phi = 2 * np.pi * ((column + 0.5) / 128 - 0.5)
     way = np.stack([np.sin(theta) * np.sin(phi), np.cos(theta), np.sin(theta) * np.cos(phi)], axis=-1)
     dome = 0.3 + 0.7 * np.clip(way[..., 1:2], 0, 1) * np.array([0.6, 0.8, 1.2])
     return Environment(dome + 400 * (way @ np.array([0.6, 0.6, 0.53]) > 0.9985)[..., None] * np.array([1.2, 1.0, 0.8]))
@@ -53,7 +54,8 @@ def by_samples(surface, camera, lighting, **options):
     plan = plan_scene(surface, camera, lighting, scene, **options)
 
     def made(samples, seed):
-        quality, rng = Quality(samples=samples, **options), np.random.default_rng(seed)
+        quality = Quality(samples=samples, **options)
+        rng = np.random.default_rng(seed)
         return render_monte_carlo(
             plan.surface, camera, plan.lighting, quality, rng=rng, scene=scene, pixels=plan.pixels
         )
@@ -98,23 +100,34 @@ def against_mitsuba(surface, camera, lighting):
     with tempfile.TemporaryDirectory() as folder:
         mesh = trimesh.Trimesh(matte.vertices, matte.faces, vertex_normals=matte.normals, process=False)
         mesh.export(f"{folder}/mesh.ply", vertex_normal=True)
-        K, width, height = camera.K, camera.width, camera.height
+        K = camera.K
+        width = camera.width
+        height = camera.height
         to_world = np.eye(4)
         to_world[:3, :3] = camera.R.T @ np.diag([-1.0, -1.0, 1.0])  # Mitsuba: +x left, +y up, +z forward
         to_world[:3, 3] = camera.centre
         sensor = {
-            "type": "perspective", "fov": float(np.degrees(2 * np.arctan(width / 2 / K[0, 0]))), "fov_axis": "x",
+            "type": "perspective",
+            "fov": float(np.degrees(2 * np.arctan(width / 2 / K[0, 0]))),
+            "fov_axis": "x",
             "principal_point_offset_x": float((width / 2 - K[0, 2]) / width),
             "principal_point_offset_y": float((height / 2 - K[1, 2]) / height),
-            "near_clip": 1.0, "far_clip": 1e5, "to_world": T(to_world),
+            "near_clip": 1.0,
+            "far_clip": 1e5,
+            "to_world": T(to_world),
             "film": {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"}},
             "sampler": {"type": "independent", "sample_count": 256},
-        }  # fmt: skip
+        }
         scene = {
-            "type": "scene", "integrator": {"type": "direct"}, "sensor": sensor,
-            "face": {"type": "ply", "filename": f"{folder}/mesh.ply",
-                     "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}},
-        }  # fmt: skip
+            "type": "scene",
+            "integrator": {"type": "direct"},
+            "sensor": sensor,
+            "face": {
+                "type": "ply",
+                "filename": f"{folder}/mesh.ply",
+                "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}},
+            },
+        }
         if lighting.environment is not None:
             # Mitsuba's columns have the opposite order
             write_exr(f"{folder}/sky.exr", np.float32(lighting.environment.radiance[:, ::-1]))

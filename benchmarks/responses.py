@@ -14,7 +14,8 @@ import numpy as np
 
 from skindb.ingest.response import recover_response
 
-BLACK, WHITE = 1024.0, 65520.0
+BLACK = 1024.0
+WHITE = 65520.0
 OCTAVES = np.arange(9, -1, -1)
 EXPOSURES = {2: (0.04, 0.005), 4: (0.04, 0.02, 0.01, 0.005), 8: tuple(0.08 / 2.0**i for i in range(8))}
 
@@ -45,7 +46,8 @@ def photograph(radiance, seconds, form, noise, rng):
 
 def errors(form, seconds, noise):
     """Root mean square (octave,) of the relative error."""
-    exposure, found = 0.98 * 2.0**-OCTAVES, []
+    exposure = 0.98 * 2.0**-OCTAVES
+    found = []
     for seed in (100, 101):
         rng = np.random.default_rng(seed)
         patches = np.exp(rng.uniform(np.log(0.01), np.log(300), (40, 40)))

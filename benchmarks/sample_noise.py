@@ -53,7 +53,8 @@ def expose_again(source: Path, target: Path, electrons: float, rng: np.random.Ge
     file = target / "dome/dome.json"
     dome = json.loads(file.read_text())
     for camera in dome["cameras"]:
-        black, white = camera["black_level"], camera["white_level"]
+        black = camera["black_level"]
+        white = camera["white_level"]
         per_value = electrons / (white - black)
         camera |= {"electrons_per_dn": per_value, "read_noise_e": READ_NOISE}
         for path in sorted((target / "dome/frames").glob(f"*/*_{camera['id']}.png")):
@@ -79,7 +80,9 @@ def groups(clean: xr.Dataset, noisy: xr.Dataset) -> Iterator[tuple[str, np.ndarr
     z = (noisy["reflectance_sample"].values - true) / np.sqrt(variance)
     pixels = np.broadcast_to(noisy["effective_pixels"].values[:, None, :, None], z.shape)
     known = np.isfinite(z)
-    z, true, pixels = z[known], true[known], pixels[known]
+    z = z[known]
+    true = true[known]
+    pixels = pixels[known]
     yield "all", z
     for kind, values, bounds, unit in (("effective pixels", pixels, PIXELS, ""), ("value", true, VALUES, " / sr")):
         for low, high in bounds:

@@ -32,7 +32,9 @@ import skindb
 from skindb import workflow
 
 GIVEN = {"k": 4, "hold_out_lights": 0.1, "hold_out_cameras": 0.0, "seed": 0}
-MAX_TASKS, MAX_MEMORY_MB, MAX_BYTES = 2.0, 300.0, 4096.0
+MAX_TASKS = 2.0
+MAX_MEMORY_MB = 300.0
+MAX_BYTES = 4096.0
 START_SECONDS = 60.0
 
 
@@ -119,8 +121,10 @@ def wait_until(is_done: Callable[[], bool]) -> None:
 def run(client: Client, scheduler: int, db: skindb.Database) -> dict[str, float]:
     """Send every take and measure."""
     client.register_plugin(CountTasks())
-    takes, call = db.takes(), partial(look_up, fit_call(db))
-    before, sent = memory_mb(scheduler), client.scheduler_comm.byte_count
+    takes = db.takes()
+    call = partial(look_up, fit_call(db))
+    before = memory_mb(scheduler)
+    sent = client.scheduler_comm.byte_count
     begin = time.perf_counter()
     outcomes = list(workflow.map_takes(call, takes, client=client, shared=db.folder))
     seconds = time.perf_counter() - begin

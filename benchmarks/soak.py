@@ -36,14 +36,22 @@ GIVEN = {"k": 3, "hold_out_lights": 0.1}
 
 def people(subjects: int) -> list[Person]:
     """Every subject in two conditions."""
-    rng, found = np.random.default_rng(87), []
+    rng = np.random.default_rng(87)
+    found = []
     for i in range(subjects):
         male = bool(rng.random() < 0.7)
         one = Person(
-            f"P{i:03d}", float(rng.integers(13, 75)), "male" if male else "female", ANCESTRIES[i % 4], 1000 + i,
-            beard_density=float(rng.uniform(0, 0.8)) if male else 0.0, freckles=float(rng.uniform(0, 0.6)),
-            melanin=float(rng.normal(0, 0.5)), blood=float(rng.normal(0, 0.4)), fullness=float(rng.uniform(0.3, 0.7)),
-        )  # fmt: skip
+            f"P{i:03d}",
+            float(rng.integers(13, 75)),
+            "male" if male else "female",
+            ANCESTRIES[i % 4],
+            1000 + i,
+            beard_density=float(rng.uniform(0, 0.8)) if male else 0.0,
+            freckles=float(rng.uniform(0, 0.6)),
+            melanin=float(rng.normal(0, 0.5)),
+            blood=float(rng.normal(0, 0.4)),
+            fullness=float(rng.uniform(0.3, 0.7)),
+        )
         found += [one, Person(**{**vars(one), "condition": "lotion"})]
     return found
 
@@ -86,7 +94,8 @@ def fitted(db: Any, take: str) -> dict[str, Any]:
 
 def timed(call: Callable[[Any], Any], item: Any) -> dict[str, Any]:
     """Result of a call, its times, and process, open files and memory at its end."""
-    begin, cpu = time.perf_counter(), time.process_time()
+    begin = time.perf_counter()
+    cpu = time.process_time()
     value = call(item)
     seconds = {"wall": time.perf_counter() - begin, "cpu": time.process_time() - cpu}
     files = len(os.listdir("/proc/self/fd"))  # noqa: PTH208
@@ -98,7 +107,8 @@ class Watch:
 
     def __init__(self) -> None:
         self.samples: list[dict[str, Any]] = []
-        self.stage, self._stop = "", threading.Event()
+        self.stage = ""
+        self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
 
     def __enter__(self) -> Watch:
@@ -165,7 +175,8 @@ def growth(tasks: list[dict[str, Any]]) -> dict[str, float]:
     """Anonymous memory of workers [MiB] at the end of their takes: medians of the second and of the last quarter."""
     memory = [task["anonymous"] for task in sorted(tasks, key=lambda one: one["end"])]
     quarter = max(1, len(memory) // 4)
-    early, late = memory[quarter : 2 * quarter] or memory, memory[-quarter:]
+    early = memory[quarter : 2 * quarter] or memory
+    late = memory[-quarter:]
     return {"early": float(np.median(early)), "late": float(np.median(late)), "largest": max(memory)}
 
 
@@ -173,7 +184,8 @@ def summary(name: str, stage: dict[str, Any]) -> str:
     """Row of the table for a stage."""
     tasks = stage["tasks"]
     wall, cpu = (np.array([task[key] for task in tasks]) for key in ("wall", "cpu"))
-    memory, files = growth(tasks), max(task["files"] for task in tasks)
+    memory = growth(tasks)
+    files = max(task["files"] for task in tasks)
     return (
         f"{name:<10} {len(tasks):>5} {len(stage['failures']):>4} {stage['wall']:>7.0f} {np.median(wall):>7.2f} "
         f"{np.quantile(wall, 0.95):>7.2f} {np.median(cpu):>7.2f} {memory['early']:>7.0f} {memory['late']:>7.0f} "
@@ -199,7 +211,10 @@ def main() -> None:
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     size = {name: getattr(args, name) for name in ("lights", "cameras", "width", "height")}
-    db, persons, studies, stages = skindb.open(str(args.out.absolute() / "db")), people(args.subjects), {}, {}
+    db = skindb.open(str(args.out.absolute() / "db"))
+    persons = people(args.subjects)
+    studies = {}
+    stages = {}
     captures = args.out.absolute() / "captures"
     with Watch() as watch, workflow.connected(args.scheduler) if args.scheduler else nullcontext() as client:
         where = {"client": client} if client else {"workers": args.workers}

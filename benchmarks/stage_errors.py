@@ -29,7 +29,9 @@ from skindb.render.image import read_exr
 from skindb.virtual.truth import recovered_against_true
 
 LIT = 0.02  # fraction of the 99.9 % quantile of a frame's radiance, below which relative errors are not computed
-NEAR, TURNED = 0.5, 0.9  # mm and cosine, within which a vertex and a surfel are the same place
+# mm and cosine, within which a vertex and a surfel are the same place
+NEAR = 0.5
+TURNED = 0.9
 STEEP = 0.1  # smallest cosine to a light or camera
 SOME = 20_000  # number of surfels whose distance is measured
 Row = tuple[str, str, str]
@@ -46,7 +48,8 @@ def main() -> None:
     record = read_capture(folder)
     assert record.dome is not None
     db = skindb.open(args.db)
-    capture, model = db.read("capture", record.take), db.read("model", record.take)
+    capture = db.read("capture", record.take)
+    model = db.read("model", record.take)
     print("| stage | error | of what |\n|---|---|---|")
     for row in rows(record.dome, capture, model, truth, folder.with_name(folder.name + ".truth")):
         print("| " + " | ".join(row) + " |", flush=True)
@@ -60,10 +63,12 @@ def rows(
     some = np.random.default_rng(0).choice(len(position), min(SOME, len(position)), replace=False)
     _, _, distance = closest_on_mesh(truth["vertices"].astype(float), truth["faces"].astype(int), position[some])
     yield "scan, subdivision", f"{quantiles(distance)} mm", f"distance of {len(some):,} surfels from the true surface"
-    found, true = capture["dome/light_intensity"].values, truth["light_intensity"]
+    found = capture["dome/light_intensity"].values
+    true = truth["light_intensity"]
     off = found / true - 1
     yield "white target", f"{100 * np.sqrt(np.mean(off**2)):.3f} % rms", f"intensity of {len(off)} lights"
-    merged, sampled = [], []
+    merged = []
+    sampled = []
     mergers = frame_mergers(dome, faults := [])
     assert not faults
     lights = {light.id: j for j, light in enumerate(dome.lights)}
@@ -80,9 +85,11 @@ def rows(
         yield "samples", relative(np.concatenate(sampled)), "the same frames at the same pixels, noise-free"
     yield from of_visibility(surfels, truth, dome)
     summary = recovered_against_true(model, truth).summary()
-    median, worst = summary["normal_median_deg"], summary["normal_95_deg"]
+    median = summary["normal_median_deg"]
+    worst = summary["normal_95_deg"]
     yield "normals", f"{median} deg median, {worst} at 95 %", "fitted surfels"
-    diffuse, bias = summary["diffuse_median_percent"], summary["diffuse_bias_percent"]
+    diffuse = summary["diffuse_median_percent"]
+    bias = summary["diffuse_bias_percent"]
     yield "diffuse albedo", f"{diffuse} % median, bias {bias} %", "fitted surfels, R G B"
     if "held_out_error" in model["fitted"]:
         held = model["fitted/held_out_error"].values
@@ -101,7 +108,8 @@ def of_samples(
     stored = capture["samples/reflectance_sample"].isel(light=light, camera=camera).values.astype(float)
     at = np.flatnonzero(np.isfinite(stored).all(axis=1))
     position = capture["surfels/surfel_position"].values[at].astype(float)
-    seen, shone = dome.cameras[camera], dome.lights[light]
+    seen = dome.cameras[camera]
+    shone = dome.lights[light]
     pixels, _ = project(position, seen.K, seen.R, seen.t, seen.distortion)
     square, falloff = light_falloff(shone, position)
     true = bilinear(image, pixels) * (square / falloff)[:, None] / intensity[light]
@@ -111,7 +119,8 @@ def of_samples(
 
 def of_visibility(surfels: xr.Dataset, truth: dict[str, NDArray], dome: DomeRecord) -> Iterator[Row]:
     """Errors of the visibility of light centres and cameras, at the surfels nearest to true vertices."""
-    vertices, normals = truth["vertices"].astype(float), truth["normals"].astype(float)
+    vertices = truth["vertices"].astype(float)
+    normals = truth["normals"].astype(float)
     distance, nearest = cKDTree(surfels["surfel_position"].values).query(vertices, workers=1)
     same = (distance < NEAR) & (np.einsum("ni,ni->n", surfels["surfel_normal"].values[nearest], normals) > TURNED)
     for kind, devices in (("light", dome.lights), ("camera", dome.cameras)):

@@ -23,7 +23,9 @@ class Stages:
 
     def __init__(self) -> None:
         self.spent: dict[str, Spent] = {}
-        self._peak, self._stop, self._last = 0.0, threading.Event(), (time.monotonic(), time.process_time())
+        self._peak = 0.0
+        self._stop = threading.Event()
+        self._last = (time.monotonic(), time.process_time())
         self._thread = threading.Thread(target=self._watch, daemon=True)
 
     def __enter__(self) -> Stages:
@@ -43,8 +45,10 @@ class Stages:
         """Assign the time since the last end to this stage."""
         now = (time.monotonic(), time.process_time())
         one = self.spent.setdefault(stage, Spent())
-        one.wall, one.cpu = one.wall + now[0] - self._last[0], one.cpu + now[1] - self._last[1]
-        one.anonymous, self._peak = max(one.anonymous, self._peak, anonymous()), 0.0
+        one.wall = one.wall + now[0] - self._last[0]
+        one.cpu = one.cpu + now[1] - self._last[1]
+        one.anonymous = max(one.anonymous, self._peak, anonymous())
+        self._peak = 0.0
         self._last = now
 
     def table(self) -> dict[str, dict[str, float]]:

@@ -59,7 +59,8 @@ def albedo_and_normals(rng: np.random.Generator, surfels: int, domes: tuple[tupl
                 skin = model_samples(
                     rng, surfels=surfels, lights=lights, cameras=cameras, noise=noise, gloss=gloss, floor=floor
                 )
-                sets, shares = known_normals(skin), []
+                sets = known_normals(skin)
+                shares = []
                 cosine = (sets["found"]["shading_normal"].values * skin.normal).sum(1).clip(-1, 1)
                 angle = np.degrees(np.arccos(cosine)) < ISOTROPIC_95 * sets["found"]["normal_error"].values
                 for lumitexels in sets.values():
@@ -73,15 +74,22 @@ def weights(rng: np.random.Generator, surfels: int, domes: tuple[tuple[int, int]
     """Print the coverage of the active weights of two lobes and of the surface reflectance."""
     table, _ = surface_lobes()
     table = np.ascontiguousarray(table[..., list(BROAD_AND_NARROW)])
-    basis, strength = dataset({"basis_brdf": stored_brdf(table)}), directional_albedo(table, [1.0])[0]
+    basis = dataset({"basis_brdf": stored_brdf(table)})
+    strength = directional_albedo(table, [1.0])[0]
     print("\n| dome | noise, floor | mode | known | broad lobe | narrow lobe | surface reflectance | active |")
     print("|---|---|---|---|---|---|---|---|")
     for lights, cameras in domes:
         for noise, floor in ((0.002, 0.0), *NOISES):
             skin = model_samples(
-                rng, surfels=surfels, lights=lights, cameras=cameras, noise=noise, gloss=0.2, floor=floor,
+                rng,
+                surfels=surfels,
+                lights=lights,
+                cameras=cameras,
+                noise=noise,
+                gloss=0.2,
+                floor=floor,
                 lobes=BROAD_AND_NARROW,
-            )  # fmt: skip
+            )
             truth = skin.weight[:, list(BROAD_AND_NARROW)]
             sets = known_normals(skin)
             true = sets["true"].assign(diffuse_reflectance=label("diffuse_reflectance", skin.diffuse))
@@ -91,7 +99,8 @@ def weights(rng: np.random.Generator, surfels: int, domes: tuple[tuple[int, int]
             for mode in ("linear", "perceptual"):
                 for name, lumitexels in cases.items():
                     r = refit(lumitexels, basis=basis, mode=mode, eta=ETA)
-                    x, error = r["basis_weight"].values, r["basis_weight_error"].values
+                    x = r["basis_weight"].values
+                    error = r["basis_weight_error"].values
                     shares = [inside(x[:, k], truth[:, k], error[:, k]) for k in range(2)]
                     shares.append(inside(r["surface_reflectance"], truth @ strength, r["surface_reflectance_error"]))
                     case = f"| {lights} x {cameras} | {noise:.1%}, {floor:g} | {mode} | {name} |"

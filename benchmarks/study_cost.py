@@ -35,7 +35,8 @@ def subdivided(groups: dict[str, xr.Dataset]) -> dict[str, xr.Dataset]:
     triangle = groups["mesh"]["triangle"].values.astype(np.int64)
     edges = np.sort(triangle[:, [[0, 1], [1, 2], [2, 0]]], axis=2).reshape(-1, 2)
     edges, index = np.unique(edges, axis=0, return_inverse=True)
-    fitted, middle = groups["fitted"], index.reshape(-1, 3) + groups["fitted"].sizes["surfel"]
+    fitted = groups["fitted"]
+    middle = index.reshape(-1, 3) + groups["fitted"].sizes["surfel"]
     new = fitted.isel(surfel=edges[:, 0])
     for name in ("surfel_position", "surfel_uv", "diffuse_reflectance"):
         new[name] = (new[name] + fitted[name].isel(surfel=edges[:, 1])) / 2
@@ -76,7 +77,8 @@ def grow(source: Database, target: Database, takes: int, subdivide: int) -> None
 def measure(url: str, step: str, takes: int) -> None:
     """Run one step on the first takes, and print its wall time and peak memory."""
     db = skindb.open(url)
-    names, start = db.takes("model")[:takes], time.perf_counter()
+    names = db.takes("model")[:takes]
+    start = time.perf_counter()
     if step == "register":
         register_takes(db, takes=names)
     else:

@@ -23,7 +23,8 @@ from skindb.optics.angles import half_difference
 from skindb.optics.dictionary import embedded_dictionary
 from skindb.schema import dataset
 
-MODES, SIZES = ("linear", "perceptual", "paper"), range(1, 9)
+MODES = ("linear", "perceptual", "paper")
+SIZES = range(1, 9)
 LAYERS = ((6, 21), (21, 21), (21, 3))
 Target = Callable[[np.ndarray, np.ndarray], np.ndarray]  # BRDF (..., 3) sr^-1 of local directions
 
@@ -46,7 +47,8 @@ def lafortune(path: Path) -> Target:
 
 def network(weights: np.ndarray) -> Target:
     """Network 6-21-21-3 on half and difference vector, with ReLU and at the end max(exp(x) - 1, 0)."""
-    parts, at = [], 0
+    parts = []
+    at = 0
     for a, b in LAYERS:
         parts.append((weights[at : at + a * b].reshape(a, b), weights[at + a * b : at + a * b + b]))
         at += a * b + b
@@ -78,7 +80,8 @@ def read_targets(paths: list[Path], words: list[str]) -> dict[str, Target]:
 def sampled(target: Target, *, surfels: int, noise: float, seed: int = 0) -> xr.Dataset:
     """Samples f cos(theta_i) of a ball in a dome, with true normals; every target has the same geometry."""
     rng = np.random.default_rng(seed)
-    light, camera = _spiral(150, 1000.0, 1.0), _spiral(16, 1200.0, 0.8)
+    light = _spiral(150, 1000.0, 1.0)
+    camera = _spiral(16, 1200.0, 0.8)
     normal = rng.normal(size=(surfels, 3)) * [0.5, 0.5, 0] + [0, 0, 1]
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     sample = np.full((surfels, len(light), len(camera), 3), np.nan, np.float16)
@@ -104,7 +107,8 @@ def sampled(target: Target, *, surfels: int, noise: float, seed: int = 0) -> xr.
 
 def _spiral(count, radius, share):
     z = 1 - (np.arange(count) + 0.5) / count * share
-    phi, s = np.pi * (1 + 5**0.5) * np.arange(count), np.sqrt(1 - z * z)
+    phi = np.pi * (1 + 5**0.5) * np.arange(count)
+    s = np.sqrt(1 - z * z)
     return radius * np.stack([s * np.cos(phi), s * np.sin(phi), z], axis=-1)
 
 
@@ -131,7 +135,8 @@ def main() -> None:
         name: sampled(target, surfels=args.surfels, noise=args.noise)
         for name, target in read_targets(args.path, args.only).items()
     }
-    rows, weights = [], {}
+    rows = []
+    weights = {}
     for name, ds in samples.items():
         fits = {mode: fit_surface(ds, dictionary=dictionary, mode=mode) for mode in MODES}
         weights[name] = fits["perceptual"]

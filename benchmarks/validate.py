@@ -75,7 +75,8 @@ def error_row(r: dict[str, Any]) -> str:
 def time_row(r: dict[str, Any]) -> str:
     """Row of the table of surfels by status, CPU times and memory."""
     status = ", ".join(f"{name.replace('_', ' ')} {100 * share:.1f}" for name, share in r["status"].items())
-    ingest, fit = r["stages"]["ingest"], r["stages"]["fit"]
+    ingest = r["stages"]["ingest"]
+    fit = r["stages"]["fit"]
     seconds = [ingest["all"]["cpu"], *(fit[name]["cpu"] if name in fit else 0.0 for name in STAGES)]
     peak = max(ingest["all"]["anonymous"], fit["all"]["anonymous"]) / 1024
     cells = (f"{r['surfels']:,}", status, *(f"{s:.1f}" for s in seconds), f"{peak:.1f}")
@@ -97,7 +98,8 @@ def main() -> None:
     parser.add_argument("--stages", action="store_true", help="Print time and memory of every stage to standard error.")
     parser.add_argument("--json", type=Path, help="File for all results.")
     args = parser.parse_args()
-    db, results = skindb.open(args.db), []
+    db = skindb.open(args.db)
+    results = []
     parameters = FitParameters(hold_out_lights=args.hold_out_lights, hold_out_cameras=args.hold_out_cameras)
     print(header(*COLUMNS))
     for folder in args.captures:

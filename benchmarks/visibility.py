@@ -31,11 +31,16 @@ from skindb.ingest.folder import read_capture
 from skindb.ingest.surfels import SurfelSet, build_surfels
 from skindb.ingest.visibility import camera_visibility, disc_points, light_visibility
 
-STEEP, RINGS = 0.1, 3  # cosine, and neighbours from the edge of a shadow, beyond which the methods should agree
+# cosine, and neighbours from the edge of a shadow, beyond which the methods should agree
+STEEP = 0.1
+RINGS = 3
 DENSE = 200  # points of a disc for the reference
 UNDERSIDE = -0.5  # y of a normal that points down
-NEAREST, TURNED = 1.0, 0.85  # mm and cosine between a surfel and the true vertex with which it is compared
-WIDTH, HEIGHT = 1300, 1030
+# mm and cosine between a surfel and the true vertex with which it is compared
+NEAREST = 1.0
+TURNED = 0.85
+WIDTH = 1300
+HEIGHT = 1030
 
 
 def main() -> None:
@@ -67,7 +72,8 @@ def say(**figures: Any) -> None:
 
 @contextmanager
 def clock(what: str, **figures: Any) -> Iterator[None]:
-    wall, cpu = time.perf_counter(), time.process_time()
+    wall = time.perf_counter()
+    cpu = time.process_time()
     yield
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     say(what=what, wall=time.perf_counter() - wall, cpu=time.process_time() - cpu, peak_gib=peak, **figures)
@@ -81,7 +87,8 @@ def enlarged(camera: CameraRecord) -> CameraRecord:
 def timings(surfels: SurfelSet, scene: RayScene, lights: tuple[LightRecord, ...], cameras: list[CameraRecord]) -> None:
     """Time all lights and cameras on two threads, after a small run that compiles the kernels."""
     points = [replace(light, disc_radius=0.0) for light in lights]
-    small, size = replace(cameras[0], width=8, height=8), {"surfels": len(surfels.position), "lights": len(lights)}
+    small = replace(cameras[0], width=8, height=8)
+    size = {"surfels": len(surfels.position), "lights": len(lights)}
     with ThreadPoolExecutor(2) as pool:
         for method in ("rays", "splats"):
             light_visibility(surfels, points[:1], scene, pool, method=method)
@@ -101,8 +108,13 @@ def facing(surfels: SurfelSet, place: Any) -> Any:
 
 def compare(surfels: SurfelSet, scene: RayScene, lights: tuple[LightRecord, ...]) -> None:
     """Compare splats with rays for several map sizes, and the five points of a disc with DENSE points."""
-    differing, faced, errors, soft = 0, 0, [], 0
-    seen, sure, steep = [], [], []
+    differing = 0
+    faced = 0
+    errors = []
+    soft = 0
+    seen = []
+    sure = []
+    steep = []
     with ThreadPoolExecutor(1) as pool:
         shares = light_visibility(surfels, lights, scene, pool)
     for light, share in zip(lights, shares.T, strict=True):
@@ -114,7 +126,8 @@ def compare(surfels: SurfelSet, scene: RayScene, lights: tuple[LightRecord, ...]
         ]
         rays[at] = by_point[0]
         expected = np.mean(by_point, axis=0).astype(np.float16)
-        differing, faced = differing + int((share[at] != expected).sum()), faced + len(at)
+        differing = differing + int((share[at] != expected).sum())
+        faced = faced + len(at)
         inside = at[(expected > 0) & (expected < 1)]
         soft += len(inside)
         errors.append(share[inside].astype(float) - dense_share(scene, surfels, inside, light))
@@ -147,7 +160,8 @@ def dense_share(scene: RayScene, surfels: SurfelSet, at: Any, light: LightRecord
     k = np.arange(DENSE) + 0.5
     centre, *ring = disc_points(light)
     u, v = (np.asarray(p - centre) / np.sqrt(0.6) for p in ring[:2])
-    radius, angle = np.sqrt(k / DENSE), k * np.pi * (3 - np.sqrt(5))
+    radius = np.sqrt(k / DENSE)
+    angle = k * np.pi * (3 - np.sqrt(5))
     points = centre + (radius * np.cos(angle))[:, None] * u + (radius * np.sin(angle))[:, None] * v
     return np.mean([~scene.occluded(surfels.position[at], p[None], normal=surfels.normal[at]) for p in points], axis=0)
 
@@ -155,12 +169,14 @@ def dense_share(scene: RayScene, surfels: SurfelSet, at: Any, light: LightRecord
 def against_truth(surfels: SurfelSet, scene: RayScene, lights: tuple[LightRecord, ...], every: int, path: Path) -> None:
     """Compare both methods with the truth by region, at the surfels nearest to true vertices that face the light."""
     truth = np.load(path)
-    vertices, normals = truth["vertices"].astype(float), truth["normals"].astype(float)
+    vertices = truth["vertices"].astype(float)
+    normals = truth["normals"].astype(float)
     distance, nearest = cKDTree(surfels.position).query(vertices, workers=1)
     good = (distance < NEAREST) & (np.einsum("ni,ni->n", surfels.normal[nearest], normals) > TURNED)
     taken = np.unique(nearest[good])
     place = np.searchsorted(taken, nearest)
-    names, region = [str(n) for n in truth["region_names"]], truth["region"]
+    names = [str(n) for n in truth["region_names"]]
+    region = truth["region"]
     down = normals[:, 1] < UNDERSIDE
     groups = {name: region == i for i, name in enumerate(names)}
     groups["nose, underside"] = groups["nose"] & down
@@ -212,7 +228,8 @@ def draw(surfels: SurfelSet, scene: RayScene, lights: tuple[LightRecord, ...], p
     light = lights[int((towards @ wanted / np.linalg.norm(towards, axis=1)).argmax())]
     with ThreadPoolExecutor(1) as pool:
         shares = [light_visibility(surfels, [light], scene, pool, method=m)[:, 0] for m in ("rays", "splats")]
-    low, high = surfels.position.min(axis=0), surfels.position.max(axis=0)
+    low = surfels.position.min(axis=0)
+    high = surfels.position.max(axis=0)
     eye = np.array([(low[0] + high[0]) / 2 + 250, (low[1] + high[1]) / 2, high[2] + 700])
     x, y = np.meshgrid(np.linspace(low[0] - 20, high[0] + 40, 640), np.linspace(high[1] + 5, low[1] - 5, 720))
     target = np.stack([x, y, np.full(x.shape, middle[2])], axis=-1).reshape(-1, 3)

@@ -16,7 +16,10 @@ from skindb.ingest.response import recover_response
 from skindb.ingest.vignette import fit_vignette
 
 PICTURES = Path(__file__).parent / "pictures"
-BLACK, WHITE, FULL, READ = 1024.0, 65520.0, 20000.0, 6.0
+BLACK = 1024.0
+WHITE = 65520.0
+FULL = 20000.0
+READ = 6.0
 STACKS = {2: (0.04, 0.005), 4: (0.04, 0.02, 0.01, 0.005), 8: tuple(0.08 / 2.0**i for i in range(8))}
 
 
@@ -30,7 +33,8 @@ def main() -> None:
 
 def encoded(exposure):
     """Response with a gamma of 2.2 and a linear toe below 0.004."""
-    power, toe = 1 / 2.2, 0.004
+    power = 1 / 2.2
+    toe = 0.004
     slope = power * toe ** (power - 1)
     lift = toe**power - slope * toe
     return np.where(exposure < toe, slope * exposure, np.maximum(exposure, toe) ** power - lift) / (1 - lift)
@@ -107,7 +111,8 @@ def draw_residuals(rng) -> None:
 
 def draw_isotropy(rng) -> None:
     """Draw sixteen profiles of isotropic and of anisotropic tissue, and their decay."""
-    distance, azimuth = 1 + 0.5 * np.arange(28), 2 * np.pi * np.arange(16) / 16
+    distance = 1 + 0.5 * np.arange(28)
+    azimuth = 2 * np.pi * np.arange(16) / 16
     figure, axes = plt.subplots(1, 2, figsize=(8, 3.3), layout="constrained")
     for stretch, name in ((0.0, "isotropic"), (0.1, "10 % anisotropic")):
         decay = 0.9 * (1 - stretch * np.cos(2 * (azimuth - 0.7)))

@@ -51,7 +51,8 @@ def open_regular(path: Path, most_bytes: int) -> BufferedReader:
         if not stat.S_ISREG(status.st_mode):
             raise _of_kind(where, status.st_mode)
         if status.st_size > most_bytes:
-            rule, found = f"the file must be at most {_size(most_bytes)}", _size(status.st_size)
+            rule = f"the file must be at most {_size(most_bytes)}"
+            found = _size(status.st_size)
             raise InputError(Fault(where, rule, found, "check that it is the right file, or make it smaller"))
         return open(path, "rb", opener=lambda *_: number)  # keeps the name, which readers of TIFF use
     except BaseException:

@@ -20,11 +20,13 @@ def median_of(values: Any, bits: Any, n: int, count: int) -> float:
     """
     if count == 0:
         return 0.0
-    low, high = INFINITE, np.int32(0)
+    low = INFINITE
+    high = np.int32(0)
     for i in range(n):
         low = min(low, bits[i])
         high = max(high, bits[i] if bits[i] < INFINITE else np.int32(0))
-    k, low = np.int32((count - 1) // 2), np.int32(low - 1)
+    k = np.int32((count - 1) // 2)
+    low = np.int32(low - 1)
     while high - low > WINDOW:  # at most k values are below or at `low`, more than k below or at `high`
         middle = np.int32(low + (high - low) // 2)
         below = np.int32(0)
@@ -34,7 +36,9 @@ def median_of(values: Any, bits: Any, n: int, count: int) -> float:
             high = middle
         else:
             low = middle
-    below, first, second = np.int32(0), np.float32(np.inf), np.float32(np.inf)
+    below = np.int32(0)
+    first = np.float32(np.inf)
+    second = np.float32(np.inf)
     for i in range(n):
         below += np.int32(bits[i] <= high)
         first = min(first, values[i] if bits[i] > low else np.float32(np.inf))
@@ -47,7 +51,8 @@ def median_of(values: Any, bits: Any, n: int, count: int) -> float:
 @fast_kernel
 def _exchange(first: Any, second: Any, n: int) -> None:
     for i in range(n):
-        a, b = first[i], second[i]
+        a = first[i]
+        b = second[i]
         first[i] = a if a < b else b
         second[i] = b if a < b else a
 
@@ -63,12 +68,16 @@ def sort_columns(x: Any, rows: int, n: int) -> None:
         top *= 2
     p = top
     while p > 0 and rows > 1:
-        q, r, d = top, 0, p
+        q = top
+        r = 0
+        d = p
         while True:
             for i in range(rows - d):
                 if i & p == r:
                     _exchange(x[i], x[i + d], n)
             if q == p:
                 break
-            d, q, r = q - p, q // 2, p
+            d = q - p
+            q = q // 2
+            r = p
         p //= 2

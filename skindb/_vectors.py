@@ -35,7 +35,8 @@ def _store(builder: Any, value: Any, pointer: Any) -> None:
 
 def _spread(builder: Any, value: Any) -> Any:
     """A vector with one value in all lanes."""
-    lanes, empty = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES), ir.Constant(VECTOR, ir.Undefined)
+    lanes = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
+    empty = ir.Constant(VECTOR, ir.Undefined)
     first = builder.insert_element(empty, value, ir.Constant(ir.IntType(32), 0))
     return builder.shuffle_vector(first, empty, lanes)
 
@@ -55,7 +56,8 @@ def vector_blend(_typing: Any, table: Any, places: Any, weights: Any, rows: Any,
         factors = [_spread(builder, weight) for weight in cgutils.unpack_tuple(builder, arguments[2])]
         begin = builder.mul(arguments[4], width)
         with cgutils.for_range(builder, builder.udiv(width, STEP)) as loop:
-            at, total = builder.mul(loop.index, STEP), None
+            at = builder.mul(loop.index, STEP)
+            total = None
             for start, factor in zip(starts, factors, strict=True):
                 value = _load(builder, builder.gep(source.data, [builder.add(start, at)]))
                 part = builder.fmul(value, factor, flags=FUSED)
@@ -111,7 +113,8 @@ def vector_dots(_typing: Any, rows: Any, factors: Any, count: Any, out: Any) -> 
         source, other, target = (
             context.make_array(signature.args[k])(context, builder, arguments[k]) for k in (0, 1, 3)
         )
-        width, total = cgutils.unpack_tuple(builder, source.shape, 2)[1], cgutils.alloca_once(builder, VECTOR)
+        width = cgutils.unpack_tuple(builder, source.shape, 2)[1]
+        total = cgutils.alloca_once(builder, VECTOR)
         kind = ir.FunctionType(ir.FloatType(), [ir.FloatType(), VECTOR])
         reduce = cgutils.get_or_insert_function(builder.module, kind, "llvm.vector.reduce.fadd.v8f32")
         with cgutils.for_range(builder, arguments[2]) as rows_loop:
@@ -143,7 +146,8 @@ def vector_half(_typing: Any, bits: Any) -> Any:
 @inline_fast_kernel
 def plain_blend(table: Any, places: Any, weights: Any, rows: Any, row: Any) -> None:
     """`vector_blend` as loops."""
-    width, flat = rows.shape[1], table.reshape(-1)
+    width = rows.shape[1]
+    flat = table.reshape(-1)
     for j in range(width):
         rows[row, j] = np.float32(0)
     for c in range(len(places)):

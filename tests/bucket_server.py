@@ -16,7 +16,9 @@ from pathlib import Path
 
 from skindb._cache import cache_folder
 
-KEY, SECRET = "planted-key", "planted-secret"  # the servers accept any
+# the servers accept any
+KEY = "planted-key"
+SECRET = "planted-secret"
 START_S = 30.0
 COMMANDS = {
     "moto": ["-m", "moto.server", "-H", "127.0.0.1", "-p"],

@@ -43,15 +43,20 @@ class FaultyProxy(ThreadingHTTPServer):
         self, target: str, *, fraction=0.0, faults=FAULTS, seed=0, late_s=1.0, delay_s=0.0, without=()
     ) -> None:
         super().__init__(("127.0.0.1", 0), _Handler)
-        self.target, self.fraction, self.faults, self.without = urlsplit(target), fraction, faults, without
-        self.late_s, self.delay_s = late_s, delay_s
+        self.target = urlsplit(target)
+        self.fraction = fraction
+        self.faults = faults
+        self.without = without
+        self.late_s = late_s
+        self.delay_s = delay_s
         self.address = f"http://127.0.0.1:{self.server_port}"
         self.requests: list[tuple[str, str]] = []  # method and path
         self.next: list[str] = []  # faults of the next requests
         self.part = ""  # only requests whose path contains it may fail
         self.headers: dict[str, str] = {}  # headers of the latest request
         self.failed = Counter[str]()
-        self._random, self._lock = random.Random(seed), threading.Lock()
+        self._random = random.Random(seed)
+        self._lock = threading.Lock()
 
     def fault(self, method: str, path: str) -> str:
         """Fault of this request; empty if it must not fail."""

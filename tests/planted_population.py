@@ -41,13 +41,20 @@ def model_of(
     position = unit(rng.normal(size=(N, 3)) * [1, 1, 0.3] + [0, 0, 1]) * 80
     fitted = dataset(
         {
-            "dictionary_weight": weight, "diffuse_reflectance": colour, "dipole_s": np.full((N, 3), 0.5),
-            "basis_weight": weight[:, :2], "surfel_area": rng.uniform(0.5, 1.5, N), "fit_status": status,
-            "surfel_position": position, "shading_normal": unit(position),
-            "sigma_tr": np.full((N, 3), 1.0), "region_mask": rng.random((N, 1)) < 0.4, "refractive_index": 1.3,
+            "dictionary_weight": weight,
+            "diffuse_reflectance": colour,
+            "dipole_s": np.full((N, 3), 0.5),
+            "basis_weight": weight[:, :2],
+            "surfel_area": rng.uniform(0.5, 1.5, N),
+            "fit_status": status,
+            "surfel_position": position,
+            "shading_normal": unit(position),
+            "sigma_tr": np.full((N, 3), 1.0),
+            "region_mask": rng.random((N, 1)) < 0.4,
+            "refractive_index": 1.3,
         },
         coords={"dictionary": NAMES, "region": ["beard"], "component": ["component0", "component1"]},
-    )  # fmt: skip
+    )
     brdf = stored_brdf(TABLES[..., :2])
     groups = {"fitted": fitted, "basis": dataset({"basis_brdf": brdf, "disc_angular_radius": 0.0})}
     if probe:

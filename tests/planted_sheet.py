@@ -15,11 +15,20 @@ NAMES = [f"point{i}" for i in range(9)]
 STORED = 1e-6  # single precision of coordinates below 2
 PLACES = np.stack(np.meshgrid([0.2, 0.5, 0.8], [0.2, 0.5, 0.8]), axis=-1).reshape(-1, 2) + 0.01
 FACE = {
-    "forehead_centre": (0.50, 0.12), "forehead_right": (0.35, 0.15), "brow_right": (0.385, 0.25), "nasion": (0.5, 0.33),
-    "nose_tip": (0.5, 0.43), "subnasale": (0.5, 0.53), "ala_right": (0.41, 0.52), "eye_outer_right": (0.32, 0.37),
-    "eye_inner_right": (0.41, 0.355), "mouth_corner_right": (0.372, 0.595), "lip_upper": (0.5, 0.554),
-    "chin": (0.5, 0.712), "jaw_right": (0.231, 0.676),
-}  # fmt: skip
+    "forehead_centre": (0.50, 0.12),
+    "forehead_right": (0.35, 0.15),
+    "brow_right": (0.385, 0.25),
+    "nasion": (0.5, 0.33),
+    "nose_tip": (0.5, 0.43),
+    "subnasale": (0.5, 0.53),
+    "ala_right": (0.41, 0.52),
+    "eye_outer_right": (0.32, 0.37),
+    "eye_inner_right": (0.41, 0.355),
+    "mouth_corner_right": (0.372, 0.595),
+    "lip_upper": (0.5, 0.554),
+    "chin": (0.5, 0.712),
+    "jaw_right": (0.231, 0.676),
+}
 FACE |= {name.replace("right", "left"): (1 - u, v) for name, (u, v) in FACE.items() if "right" in name}
 
 
@@ -35,7 +44,8 @@ def sheet() -> tuple[np.ndarray, np.ndarray]:
 
 def lifted(uv: np.ndarray) -> np.ndarray:
     """Positions [mm] of a face at (u, v): a shallow cap 160 mm wide."""
-    x, y = 160 * (uv[:, 0] - 0.5), -160 * (uv[:, 1] - 0.5)
+    x = 160 * (uv[:, 0] - 0.5)
+    y = -160 * (uv[:, 1] - 0.5)
     return np.column_stack([x, y, -(x**2 + y**2) / 400])
 
 
@@ -43,10 +53,14 @@ def sheet_take(uv: np.ndarray, landmarks: np.ndarray, names=NAMES, size=1.0, **a
     """A take with surfels at the points of the sheet, the given texture coordinates, and landmarks on the sheet."""
     plane, faces = sheet()
     fitted = {
-        "surfel_position": lifted(plane) * size, "surfel_uv": uv, "surfel_area": np.ones(len(uv)),
-        "fit_status": np.full(len(plane), FitStatus.FITTED), "diffuse_reflectance": plane[:, [0, 1, 0]] / 2 + 0.2,
-        "shading_normal": np.tile([0.0, 0, 1], (len(plane), 1)), "basis_weight": np.full((len(plane), 1), 0.1),
-    }  # fmt: skip
+        "surfel_position": lifted(plane) * size,
+        "surfel_uv": uv,
+        "surfel_area": np.ones(len(uv)),
+        "fit_status": np.full(len(plane), FitStatus.FITTED),
+        "diffuse_reflectance": plane[:, [0, 1, 0]] / 2 + 0.2,
+        "shading_normal": np.tile([0.0, 0, 1], (len(plane), 1)),
+        "basis_weight": np.full((len(plane), 1), 0.1),
+    }
     groups = {
         "basis": dataset({"disc_angular_radius": 0.0}),
         "fitted": dataset(fitted),
@@ -70,7 +84,8 @@ def nodes() -> np.ndarray:
 
 def planted_uv(seed: int, by: float = 0.03) -> np.ndarray:
     """Texture coordinates of the sheet's points after a warp that moves the landmarks but not the rim."""
-    plane, moved = sheet()[0], nodes() + np.random.default_rng(seed).normal(size=(9, 2)) * by
+    plane = sheet()[0]
+    moved = nodes() + np.random.default_rng(seed).normal(size=(9, 2)) * by
     window = 4 * np.sqrt((plane * (1 - plane)).prod(axis=1, keepdims=True))
     return plane + window * (apply_warp(fit_warp(nodes(), moved), plane) - plane)
 

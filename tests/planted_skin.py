@@ -32,7 +32,8 @@ def _transmitted(cosine):
     """Fresnel transmittance from Snell's law and the two polarisations."""
     c = np.clip(cosine, 1e-9, 1)
     t = np.sqrt(1 - (1 - c**2) / ETA**2)
-    s, p = (c - ETA * t) / (c + ETA * t), (t - ETA * c) / (t + ETA * c)
+    s = (c - ETA * t) / (c + ETA * t)
+    p = (t - ETA * c) / (t + ETA * c)
     return 1 - (s**2 + p**2) / 2
 
 
@@ -52,11 +53,14 @@ def make_skin(
     rng = np.random.default_rng(seed)
     normal = _unit(_fibonacci(surfels, 0.6) + 0.05 * rng.normal(size=(surfels, 3)))
     position = 80 * _fibonacci(surfels, 0.6)
-    light, camera = 880 * _fibonacci(lights, 0.1), 830 * _fibonacci(cameras, 0.5)
+    light = 880 * _fibonacci(lights, 0.1)
+    camera = 830 * _fibonacci(cameras, 0.5)
     base = np.array([0.45, 0.45, 0.45]) if grey else np.array([0.5, 0.33, 0.24])
     diffuse = base * rng.uniform(0.7, 1.2, (surfels, 1)) * rng.uniform(0.95, 1.05, (surfels, 3))
-    wi, wo = _unit(light[None] - position[:, None]), _unit(camera[None] - position[:, None])
-    ci, co = np.einsum("nk,ntk->nt", normal, wi), np.einsum("nk,ntk->nt", normal, wo)
+    wi = _unit(light[None] - position[:, None])
+    wo = _unit(camera[None] - position[:, None])
+    ci = np.einsum("nk,ntk->nt", normal, wi)
+    co = np.einsum("nk,ntk->nt", normal, wo)
     half = _unit(wi[:, :, None] + wo[:, None])
     lobe = np.clip(np.einsum("nk,nlck->nlc", normal, half), 0, 1) ** sharpness * (sharpness + 8) / (8 * np.pi)
     body = (_transmitted(ci)[:, :, None] * _transmitted(co)[:, None] / np.pi)[..., None] * diffuse[:, None, None]
@@ -90,9 +94,11 @@ def plant_skin(skin, dictionary, rng, *, noise=0.0, scale=0.3):
     position = ds["surfel_position"].values.astype(float)
     wi = ds["light_position"].values - position[:, None]
     wo = ds["camera_position"].values - position[:, None]
-    wi, wo = wi / np.linalg.norm(wi, axis=-1, keepdims=True), wo / np.linalg.norm(wo, axis=-1, keepdims=True)
+    wi = wi / np.linalg.norm(wi, axis=-1, keepdims=True)
+    wo = wo / np.linalg.norm(wo, axis=-1, keepdims=True)
     normal = skin.normal
-    ci, co = np.einsum("nk,ntk->nt", normal, wi), np.einsum("nk,ntk->nt", normal, wo)
+    ci = np.einsum("nk,ntk->nt", normal, wi)
+    co = np.einsum("nk,ntk->nt", normal, wo)
     weight = rng.uniform(0, scale, (len(normal), len(dictionary.names))) * (
         rng.uniform(size=len(dictionary.names)) < 0.7
     )
@@ -113,16 +119,19 @@ def plant_skin(skin, dictionary, rng, *, noise=0.0, scale=0.3):
     ), weight
 
 
-SIGMA_A, SIGMA_S = np.array([0.05, 0.17, 0.36]), np.array([2.4, 2.3, 2.9])
+SIGMA_A = np.array([0.05, 0.17, 0.36])
+SIGMA_S = np.array([2.4, 2.3, 2.9])
 
 
 def capture_of(skin, *, scope=("fit",), probe=True, unseen=(), **attrs):
     """Capture with the lumitexels of a skin; surfels in `unseen` have no samples."""
     ds = skin.lumitexels.copy(deep=True)
     ds["reflectance_sample"].values[list(unseen)] = np.nan
-    sample, n = ds["reflectance_sample"].values, ds.sizes["surfel"]
+    sample = ds["reflectance_sample"].values
+    n = ds.sizes["surfel"]
     coords = {name: ds[name].values for name in ("light", "camera", "channel")}
-    lit, seen = np.isfinite(sample).any((2, 3)), np.isfinite(sample).any((1, 3))
+    lit = np.isfinite(sample).any((2, 3))
+    seen = np.isfinite(sample).any((1, 3))
     count = {"sample_count": np.isfinite(sample).all(-1).sum((1, 2))}
     flags = {
         "surfel_uv": np.zeros((n, 2)),

@@ -10,7 +10,9 @@ from skindb.optics.diffuse import dipole_s
 from skindb.schema import dataset
 from skindb.schema.brdf import stored_brdf
 
-SIDE, SIZE = 120, 60.0  # vertices and mm along each axis
+# vertices and mm along each axis
+SIDE = 120
+SIZE = 60.0
 LIGHTS = np.array([[200.0, 150, 500], [-300, 50, 400], [0, -350, 350]])
 
 
@@ -34,26 +36,37 @@ def small_face(albedo=(0.6, 0.4, 0.3), components=3) -> xr.DataTree:
     for k in range(3):
         np.add.at(normal, faces[:, k], np.cross(b - a, c - a))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    count, rng = len(position), np.random.default_rng(0)
+    count = len(position)
+    rng = np.random.default_rng(0)
     colour = np.array(albedo) * (1 + 0.15 * np.sin(12 * u) * np.cos(9 * v))[:, None]
     grid = TableGrid(30, 30, 8)
     tables = tabulate(lobes, grid)[..., :components]
     values = {
-        "surfel_position": position, "shading_normal": normal, "diffuse_reflectance": colour,
-        "dipole_s": dipole_s(colour, eta=1.3)[0], "sigma_tr": np.tile([0.5, 0.9, 1.4], (count, 1)),
+        "surfel_position": position,
+        "shading_normal": normal,
+        "diffuse_reflectance": colour,
+        "dipole_s": dipole_s(colour, eta=1.3)[0],
+        "sigma_tr": np.tile([0.5, 0.9, 1.4], (count, 1)),
         "basis_weight": rng.uniform(0.1, 0.3, (1, components)) * np.ones((count, 1)),
-        "surfel_uv": np.stack([(u + 1) / 2, (v + 1) / 2], axis=1), "fit_status": np.zeros(count),
+        "surfel_uv": np.stack([(u + 1) / 2, (v + 1) / 2], axis=1),
+        "fit_status": np.zeros(count),
         "refractive_index": 1.3,
-    }  # fmt: skip
+    }
     K = np.array([[400.0, 0, 128], [0, 400, 128], [0, 0, 1]])
     R = np.diag([1.0, -1, -1])
     dome = {
-        "camera_matrix": K[None], "camera_rotation": R[None], "camera_translation": np.array([[0.0, 0, 400]]),
-        "camera_distortion": np.zeros((1, 5)), "camera_size": np.array([[256, 256]]),
-        "camera_position": np.array([[0.0, 0, 400]]), "light_position": LIGHTS,
-        "light_intensity": np.full((3, 3), 5e5) * [1.0, 0.95, 0.9], "light_disc_radius": np.full(3, 3.0),
-        "light_axis": -LIGHTS / np.linalg.norm(LIGHTS, axis=1, keepdims=True), "light_falloff": np.zeros(3),
-    }  # fmt: skip
+        "camera_matrix": K[None],
+        "camera_rotation": R[None],
+        "camera_translation": np.array([[0.0, 0, 400]]),
+        "camera_distortion": np.zeros((1, 5)),
+        "camera_size": np.array([[256, 256]]),
+        "camera_position": np.array([[0.0, 0, 400]]),
+        "light_position": LIGHTS,
+        "light_intensity": np.full((3, 3), 5e5) * [1.0, 0.95, 0.9],
+        "light_disc_radius": np.full(3, 3.0),
+        "light_axis": -LIGHTS / np.linalg.norm(LIGHTS, axis=1, keepdims=True),
+        "light_falloff": np.zeros(3),
+    }
     groups = {
         "/fitted": dataset(values),
         "/mesh": dataset({"triangle": faces}),

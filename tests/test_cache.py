@@ -34,7 +34,8 @@ def _get(make, argument=1):
 
 def test_cached_arrays__are_made_once(folder):
     make = Maker()
-    first, again = _get(make), _get(make)
+    first = _get(make)
+    again = _get(make)
     assert make.calls == 1
     for found in (first, again):
         assert found["error"].shape == ()

@@ -40,7 +40,8 @@ def _run_apart(*args: str) -> subprocess.CompletedProcess[str]:
 
 def _run(*args: str) -> subprocess.CompletedProcess[str]:
     """Same result as `_run_apart`, but in this process, without new imports and tables for each call."""
-    out, err = io.TextIOWrapper(io.BytesIO()), io.TextIOWrapper(io.BytesIO())
+    out = io.TextIOWrapper(io.BytesIO())
+    err = io.TextIOWrapper(io.BytesIO())
     code: int | str | None = 0
     with mock.patch.object(sys, "argv", ["skindb", *args]), redirect_stdout(out), redirect_stderr(err):
         try:
@@ -59,7 +60,8 @@ def _run(*args: str) -> subprocess.CompletedProcess[str]:
 def test_cli__a_call_gives_the_result_of_a_process(tmp_path, args):
     """The results are the same except for the name of the program."""
     args = [a.format(tmp=tmp_path) for a in args]
-    call, process = _run(*args), _run_apart(*args)
+    call = _run(*args)
+    process = _run_apart(*args)
     assert (call.returncode, call.stdout) == (process.returncode, process.stdout)
     assert call.stderr.splitlines()[-1:] == process.stderr.splitlines()[-1:]
 
@@ -188,8 +190,20 @@ def small_database(tmp_path_factory):
     """A database with a simulated take that was fitted by the command line."""
     out = tmp_path_factory.mktemp("cli")
     db = str(out / "db")
-    made = _run("simulate", str(out / "c"), "--takes", "1", "--cameras", "4", "--lights", "16", "--width", "64",
-                "--height", "80")  # fmt: skip
+    made = _run(
+        "simulate",
+        str(out / "c"),
+        "--takes",
+        "1",
+        "--cameras",
+        "4",
+        "--lights",
+        "16",
+        "--width",
+        "64",
+        "--height",
+        "80",
+    )
     assert made.returncode == 0, made.stderr
     taken = _run("ingest", db, str(out / "c/V001"), "--spacing", "4", "--soft", "keep")
     assert taken.returncode == 0
@@ -286,7 +300,8 @@ def test_cli__a_variable_is_drawn_from_the_model_or_else_the_capture(small_datab
 @pytest.mark.slow
 def test_cli__many_takes_at_a_time(tmp_path):
     """From simulation to pictures in two processes; a failing take does not stop the others; a refit resumes."""
-    db, two = str(tmp_path / "db"), ("--workers", "2")
+    db = str(tmp_path / "db")
+    two = ("--workers", "2")
     size = ("--takes", "2", "--cameras", "3", "--lights", "12", "--width", "48", "--height", "60")
     folders = json.loads(_run("simulate", str(tmp_path / "c"), *size, *two, "--json").stdout)
     assert [folder.rpartition("/")[2] for folder in folders] == ["V001", "V001.lotion"]
@@ -487,9 +502,14 @@ def test_cli__an_earlier_generation_is_shown(small_database, tmp_path):
 @pytest.mark.parametrize(("median", "said"), [(0.05, False), (0.5, True)])
 def test_fit_lines__a_model_that_does_not_explain_the_photographs_is_reported(median, said):
     report = {
-        "seconds": {"surface": 1.0}, "status": {"fitted": 0.9}, "generation": 1, "surfels": 9, "suspects": [],
-        "skipped": [], "fit_residual": {"median": median, "p95": 0.9},
-    }  # fmt: skip
+        "seconds": {"surface": 1.0},
+        "status": {"fitted": 0.9},
+        "generation": 1,
+        "surfels": 9,
+        "suspects": [],
+        "skipped": [],
+        "fit_residual": {"median": median, "p95": 0.9},
+    }
     with click.Context(click.Command("fit")) as context:
         context.meta["verbose"] = False
         lines = _fit_lines("A", report)

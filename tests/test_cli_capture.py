@@ -231,8 +231,11 @@ def test_capture__an_unfinished_capture_is_continued_for_the_same_subject_only(r
     out, result = _again(rehearsal, tmp_path, "--fault", "dome.open_interlock_at=20")
     assert "must run to its end" in str(result.exception)
     before = json.loads((out / "unfinished.json").read_text())
-    for name, options in {"subject": ["--subject", "S2"], "condition": ["--condition", "lotion"],
-                          "steady lamp": ["--base-light", "10", "--operator", "OP-1"]}.items():  # fmt: skip
+    for name, options in {
+        "subject": ["--subject", "S2"],
+        "condition": ["--condition", "lotion"],
+        "steady lamp": ["--base-light", "10", "--operator", "OP-1"],
+    }.items():
         _, result = _again(rehearsal, tmp_path, *options)
         assert f"an unfinished capture must be resumed with the same {name}" in str(result.exception)
         assert json.loads((out / "unfinished.json").read_text()) == before
@@ -338,10 +341,20 @@ def test_capture__a_full_disk_is_found_before_a_light_is_switched_on(rehearsal, 
 
 @pytest.mark.parametrize(
     "fault",
-    ["dropped_frame=c99:1", "dropped_frame=c02:-1", "hot_pixels=-3", "dome.garbage=1.5", "dome.garbage=nan",
-     "dome.delay=inf", "dome.lost_triggers=-4", "dome.dead_light=l999", "probe.leak=-1", "probe.gauge=odd",
-     "lamp=-1"],
-)  # fmt: skip
+    [
+        "dropped_frame=c99:1",
+        "dropped_frame=c02:-1",
+        "hot_pixels=-3",
+        "dome.garbage=1.5",
+        "dome.garbage=nan",
+        "dome.delay=inf",
+        "dome.lost_triggers=-4",
+        "dome.dead_light=l999",
+        "probe.leak=-1",
+        "probe.gauge=odd",
+        "lamp=-1",
+    ],
+)
 def test_capture__a_fault_that_cannot_happen_is_refused(rehearsal, tmp_path, fault):
     _, result = _again(rehearsal, tmp_path, "--fault", fault)
     assert f"found '{fault}'" in str(result.exception)

@@ -13,9 +13,27 @@ from hypothesis import strategies as st
 from skindb._csv import csv_text
 
 FORMULAS = [
-    "=1+1", "+1+cmd|' /C calc'!A0", "-1+1", "@SUM(A1)", "\t=1+1", "\r=1", "\n=1", "  =1+1", "=HYPERLINK(\"http://x\")",
-    "\uff1d1+1", "\uff0b1", "\uff0d1", "\uff20A1", "-", "+", "-0.5x", "--1", "-inf", "+1 555 0100", "-0,5",
-]  # fmt: skip
+    "=1+1",
+    "+1+cmd|' /C calc'!A0",
+    "-1+1",
+    "@SUM(A1)",
+    "\t=1+1",
+    "\r=1",
+    "\n=1",
+    "  =1+1",
+    '=HYPERLINK("http://x")',
+    "\uff1d1+1",
+    "\uff0b1",
+    "\uff0d1",
+    "\uff20A1",
+    "-",
+    "+",
+    "-0.5x",
+    "--1",
+    "-inf",
+    "+1 555 0100",
+    "-0,5",
+]
 
 
 def read(text):

@@ -138,9 +138,24 @@ def test_writers__their_files_are_private(tmp_path, model, write, monkeypatch):
 
 
 CALLS = {
-    "write_text", "write_bytes", "savefig", "savez", "savetxt", "np.save", "imwrite", "imsave", "to_csv", "shutil.copy",
-    "copyfile", "copy2", "copytree", "mkdir", "makedirs", "touch", "export",
-}  # fmt: skip
+    "write_text",
+    "write_bytes",
+    "savefig",
+    "savez",
+    "savetxt",
+    "np.save",
+    "imwrite",
+    "imsave",
+    "to_csv",
+    "shutil.copy",
+    "copyfile",
+    "copy2",
+    "copytree",
+    "mkdir",
+    "makedirs",
+    "touch",
+    "export",
+}
 # reasons why a call that writes does not name `private_file` or `make_private`
 EXCEPTIONS = {
     "_files.py": "it is where they are",
@@ -162,7 +177,8 @@ def test_package__every_writer_makes_its_files_private():
         for node in ast.walk(ast.parse(path.read_text())):
             if not isinstance(node, ast.Call):
                 continue
-            text, called = ast.unparse(node), ast.unparse(node.func)
+            text = ast.unparse(node)
+            called = ast.unparse(node.func)
             opens = called.rpartition(".")[2] == "open" and any(f"'{how}" in text for how in ("w", "a", "x"))
             if (opens or {called, called.rpartition(".")[2]} & CALLS) and "private_file(" not in text:
                 found.append(f"{name}:{node.lineno}: {text}")

@@ -109,7 +109,8 @@ def _colours(one: xr.Dataset, drawn: xr.Dataset | None) -> Colours:
     """Sampled surfels of one take of a cohort, with the regions of its capture or those defined by landmarks."""
     good = np.isfinite(one["diffuse_reflectance"].values).all(axis=-1) & (one["surfel_area"].values > 0)
     if not good.any():
-        where, cure = str(one["take"].values), "skip the take or fit it again"
+        where = str(one["take"].values)
+        cure = "skip the take or fit it again"
         raise InputError(Fault(where, "a take of a population must have fitted surfels", "none", cure))
     own = _masks(one, good)
     name = one["take"].values.item()
@@ -118,10 +119,8 @@ def _colours(one: xr.Dataset, drawn: xr.Dataset | None) -> Colours:
         other = drawn.sel(take=name)
         same = np.array_equal(other["surfel_index"].values[: len(good)][good], one["surfel_index"].values[good])
         if not same:
-            rule, cure = (
-                "regions by landmarks must belong to the sampled surfels",
-                "open both cohorts with the same seed",
-            )
+            rule = "regions by landmarks must belong to the sampled surfels"
+            cure = "open both cohorts with the same seed"
             raise InputError(Fault(str(name), rule, "a different sample", cure))
         more = _masks(other, good)
     by_landmarks = frozenset(region for region in more if region not in own)
@@ -139,7 +138,8 @@ def _masks(take: xr.Dataset, good: Mask) -> dict[str, Mask]:
 
 def _colour_axes(samples: Sequence[Colours]) -> tuple[Array, Array]:
     """Common mean (3,) and axes (3, 3) in rows; every take has the same weight."""
-    means, spreads = [], []
+    means = []
+    spreads = []
     for one in samples:
         means.append(np.average(one.colour, axis=0, weights=one.area))
         from_mean = one.colour - means[-1]

@@ -26,9 +26,13 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.floating[Any]]
 BASIS_SIZE_VARIABLES = (
-    "surfel_position", "shading_normal", "diffuse_reflectance", "reflectance_sample", "light_position",
+    "surfel_position",
+    "shading_normal",
+    "diffuse_reflectance",
+    "reflectance_sample",
+    "light_position",
     "camera_position",
-)  # fmt: skip
+)
 NEEDED = (*BASIS_SIZE_VARIABLES, "fit_eta")
 DEFAULT_ETA = 1.3  # refractive index of models without parameters of the fit
 BLOCK = 128  # surfels at a time: rows of 2,400 samples and 59 bases take 72 MB
@@ -186,7 +190,8 @@ def tabulate_basis_size(curve: xr.Dataset) -> tuple[list[str], list[list[Any]]]:
     """
     error, low, high = (100 * curve[f"relative_error{end}"].values for end in ("", "_low", "_high"))
     ratio = error[:-1] / error[1:]
-    digits, ratio_digits = _digits_to_differ(error), _digits_to_differ(ratio, least=4)
+    digits = _digits_to_differ(error)
+    ratio_digits = _digits_to_differ(ratio, least=4)
     steps = [*(f"{one:.{ratio_digits}f}" for one in ratio), "-"]
     rows = [
         [int(k), *(f"{column[i]:.{digits}f}" for column in (error, low, high)), steps[i]]
@@ -206,7 +211,9 @@ def describe_basis_size(curve: xr.Dataset) -> str:
     """Number of bases that are needed by `choose_size`, and the reason, in one or two sentences."""
     ks = curve["k"].values
     tolerance = f"{100 * float(curve['plateau_tolerance']):.3g} %"
-    fewest, most, largest = int(curve["smallest_size"]), int(curve["sufficient_size"]), int(ks[-1])
+    fewest = int(curve["smallest_size"])
+    most = int(curve["sufficient_size"])
+    largest = int(ks[-1])
     last = float(curve["relative_error"][-1])
     if not most and last > 1 + float(curve["plateau_tolerance"]):
         return (
@@ -287,7 +294,8 @@ def plot_basis_size(curve: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     k = curve["k"].values
     ax.fill_between(k, curve["relative_error_low"], curve["relative_error_high"], alpha=0.25, label="95 % interval")
     ax.plot(k, curve["relative_error"], "o-", label="error")
-    fewest, most = int(curve["smallest_size"]), int(curve["sufficient_size"])
+    fewest = int(curve["smallest_size"])
+    most = int(curve["sufficient_size"])
     if most:
         chosen = str(most) if fewest == most else f"{fewest} to {most}"
         ax.axvspan(fewest - 0.05, most + 0.05, color="0.4", alpha=0.4, lw=0, label=f"chosen size: {chosen}")

@@ -17,11 +17,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.projections.polar import PolarAxes
 
-MARKERS, LINES = "osD^vP", ("-", "--")
-FRONTAL, GRAZING = (
-    np.radians(15.0),
-    np.radians(100.0),
-)  # angles of the lights from the viewing direction, upwards and to the right
+MARKERS = "osD^vP"
+LINES = ("-", "--")
+# angles of the lights from the viewing direction, upwards and to the right
+FRONTAL = np.radians(15.0)
+GRAZING = np.radians(100.0)
 SPHERE = 256  # diameter of a sphere in pixels
 SPHERES_PER_ROW = 6
 WHITE_PERCENTILE = 99.5  # percentile of all pixels on spheres that is drawn white
@@ -44,9 +44,11 @@ def plot_brdf_space(space: xr.Dataset, *, ax: Axes | None = None) -> Axes:
 
     if ax is None:
         _, ax = pyplot.subplots(figsize=(5, 4.4))
-    named, place = np.array(space.attrs["groups_of_takes"]), space["take_place"].values
+    named = np.array(space.attrs["groups_of_takes"])
+    place = space["take_place"].values
     for i, (group, count) in enumerate(zip(space["group"].values, space["group_subject_count"].values, strict=True)):
-        own, takes = place[named == str(group)], int((named == str(group)).sum())
+        own = place[named == str(group)]
+        takes = int((named == str(group)).sum())
         subjects = f"n = {count}" if takes == count else f"n = {count}, {takes} takes"
         ax.plot(*own.T, MARKERS[i % 6], color=_colour(i), markersize=4, alpha=0.75, label=f"{group} ({subjects})")
     first, second = (f"{one:.1%}" for one in space["explained_fraction"].values)
@@ -80,9 +82,11 @@ def plot_group_spheres(space: xr.Dataset, *, ax: Axes | None = None) -> Axes:
         _, ax = pyplot.subplots(figsize=(1.6 * columns + 0.4, 1.9 * rows + 0.4))
     radiance, inside = sphere_radiance(_tables(space))
     white = float(np.percentile(radiance[inside], WHITE_PERCENTILE)) or 1.0
-    step_x, step_y = 1.1, 1.35
+    step_x = 1.1
+    step_y = 1.35
     for i, name in enumerate(names):
-        x, y = step_x * (i % columns), -step_y * (i // columns)
+        x = step_x * (i % columns)
+        y = -step_y * (i // columns)
         picture = np.ones((*inside.shape, 3))
         picture[inside] = np.clip(radiance[inside][:, i, None] / white, 0, 1) ** (1 / GAMMA)
         ax.imshow(picture, extent=(x - 0.5, x + 0.5, y - 0.5, y + 0.5), interpolation="antialiased")
@@ -179,10 +183,13 @@ def lobe(tables: NDArray[Any], incidence: float, angle: Array) -> Array:
 def _shaded(tables: NDArray[Any], normal: Array, light: Array) -> Array:
     """Values f cos(theta_i) (n, groups) for normals seen from the direction z; the BRDF is isotropic."""
     view = np.array([0.0, 0.0, 1.0])
-    cos_i, cos_o = normal @ light, normal @ view
+    cos_i = normal @ light
+    cos_o = normal @ view
     lit = cos_i > 0
     out = np.zeros((len(normal), tables.shape[-1]))
-    n, wi_z, wo_z = normal[lit], cos_i[lit], cos_o[lit]
+    n = normal[lit]
+    wi_z = cos_i[lit]
+    wo_z = cos_o[lit]
     first = view - wo_z[:, None] * n  # local frame of the normal with the viewer in its x, z plane
     length = np.linalg.norm(first, axis=1, keepdims=True)
     first = np.where(length > 1e-9, first / np.maximum(length, 1e-9), [1.0, 0.0, 0.0])

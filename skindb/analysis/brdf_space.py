@@ -179,7 +179,8 @@ def _coefficients(takes: xr.Dataset, basis: xr.Dataset) -> Array:
     stored = basis["take_coefficient"].values.astype(np.float64)
     bad = [name for name in names if name not in known or not np.isfinite(stored[known[name]]).all()]
     if bad:
-        rule, cure = "a take must have fitted surfels", "fit it again, or exclude it"
+        rule = "a take must have fitted surfels"
+        cure = "fit it again, or exclude it"
         raise InputError(Fault(f"take {name}", rule, "none in the basis", cure) for name in bad)
     return stored[[known[name] for name in names]]
 
@@ -215,20 +216,26 @@ def _by_subject(takes: xr.Dataset, named: Sequence[str], coefficient: Array, pla
 
 def _pairs(subjects: _Subjects, most: int, rng: np.random.Generator) -> tuple[dict[str, Array], str, list[str]]:
     """Distances [length of a BRDF] and p values of every pair, the method of adjustment, and flags."""
-    there, groups, rows = subjects.there, subjects.groups, []
-    within, flags = [], list[str]()
+    there = subjects.there
+    groups = subjects.groups
+    rows = []
+    within = []
+    flags = list[str]()
     for a, b in combinations(range(len(groups)), 2):
         both = there[:, a] & there[:, b]
         within.append(bool(both.any()))
         values = subjects.place[:, [a, b]]
         if within[-1]:
             values = values[both]
-            step, count = (values[:, 0] - values[:, 1]).mean(axis=0), (len(values), len(values))
+            step = (values[:, 0] - values[:, 1]).mean(axis=0)
+            count = (len(values), len(values))
         else:
             step = known_mean(values[:, 0]) - known_mean(values[:, 1])
             count = (int(there[:, a].sum()), int(there[:, b].sum()))
         name = f"{groups[a]} to {groups[b]}"
-        statistic, p, drawn = np.nan, np.nan, 0
+        statistic = np.nan
+        p = np.nan
+        drawn = 0
         if min(count) < 2:
             flags.append(
                 f"{name}: no p value with fewer than two subjects {'in both groups' if within[-1] else 'per group'}"
@@ -288,7 +295,8 @@ def tabulate_brdf_space(space: xr.Dataset) -> tuple[list[str], list[list[Any]]]:
 def describe_brdf_space(space: xr.Dataset) -> list[str]:
     """Results of a study of the space of BRDFs and its flags, one line each."""
     p = space["group_distance_p_adjusted"].values
-    compared, differ = int(np.isfinite(p).sum()), int((p < SIGNIFICANT).sum())
+    compared = int(np.isfinite(p).sum())
+    differ = int((p < SIGNIFICANT).sum())
     how = space.attrs["adjusted_by"]
     how = how if how == ONE_PAIR else f"adjusted for all pairs: {how}"
     fractions = ", ".join(f"{one:.0%}" for one in space["explained_fraction"].values)

@@ -123,11 +123,13 @@ def chromophore_axes(
     count = max(SAMPLES // max(cohort.sizes["take"], 1), 64)
     found = [one for one in each_take(_sampled, cohort, MAPPED, inside, count) if one is not None]
     if not found:
-        rule, cure = "some texels of skin must be measured", "fit or register more takes"
+        rule = "some texels of skin must be measured"
+        cure = "fit or register more takes"
         raise InputError(Fault("chromophores", rule, "none", cure))
     density = np.concatenate([one.density for one in found])
     if density.var(axis=0).sum() <= CONSTANT:
-        rule, cure = "albedo must vary over the skin of a take", "use maps of measured faces"
+        rule = "albedo must vary over the skin of a take"
+        cure = "use maps of measured faces"
         raise InputError(Fault("chromophores", rule, "constant maps", cure))
     plane = _principal_plane(density)
     mixing, spread = _components(found, plane, rng)
@@ -200,7 +202,8 @@ def chromophore_statistics(
     """
     drawn = chromophore_regions(landmarks or {}, cohort.sizes["v"])
     masks = np.stack(list(drawn.values()))
-    vectors, offset = axes["chromophore_axis"].values, axes["chromophore_offset"].values
+    vectors = axes["chromophore_axis"].values
+    offset = axes["chromophore_offset"].values
     rows = each_take(_statistics, cohort, MAPPED, masks, vectors, offset)
     mean, deviation, residual, covered = (np.stack(column) for column in zip(*rows, strict=True))
     return dataset(
@@ -238,7 +241,8 @@ def chromophore_table(cohort: xr.Dataset, *, statistics: xr.Dataset, group_by: s
         (group, region, chromophore), see the variables of the group "chromophore_table".
     """
     takes = takes_to_compare(cohort, group_by)
-    groups, subjects = groups_by(takes, group_by), [str(one) for one in takes["subject"].values.tolist()]
+    groups = groups_by(takes, group_by)
+    subjects = [str(one) for one in takes["subject"].values.tolist()]
     names = sorted(set(groups))
     values = statistics["take_chromophore"].sel(take=[str(take) for take in takes["take"].values]).values
     parts = []
@@ -291,7 +295,8 @@ def _sampled(maps: xr.Dataset, inside: Mask, count: int) -> _Sampled | None:
     if not len(rows):
         return None
     chosen = np.linspace(0, len(rows) - 1, count).round().astype(np.int64)
-    rows, columns = rows[chosen], columns[chosen]
+    rows = rows[chosen]
+    columns = columns[chosen]
     height, width = measured.shape
     tile = rows * TILES // height * TILES + columns * TILES // width
     values = density[rows, columns]
@@ -442,9 +447,17 @@ def plot_chromophores(statistics: xr.Dataset, *, table: xr.Dataset | None = None
             )
             count = int(one["group_chromophore_count"].max())
             ax.errorbar(
-                mean, y, xerr=bars, fmt="osD^v"[g % 5], color=colour, mfc=colour if c else "white", markersize=5,
-                capsize=2, linewidth=1, label=f"{name}, {group} (n = {count})",
-            )  # fmt: skip
+                mean,
+                y,
+                xerr=bars,
+                fmt="osD^v"[g % 5],
+                color=colour,
+                mfc=colour if c else "white",
+                markersize=5,
+                capsize=2,
+                linewidth=1,
+                label=f"{name}, {group} (n = {count})",
+            )
     ax.set_yticks(range(len(shown)), shown)
     ax.invert_yaxis()
     ax.set_xlabel("amount relative to the mean of all takes, with 95 % CI [-ln R_d at green]")

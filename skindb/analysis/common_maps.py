@@ -38,8 +38,10 @@ def common_maps(model: xr.DataTree, registered: xr.Dataset, *, size: int = SIZE)
         `texel_status` (whether a value is trusted, and why not) and `texel_coverage`. Inside the face, values that
         were not measured are interpolated from the surrounding texels; outside they are NaN.
     """
-    fitted, triangles = model["fitted"].to_dataset().load(), model["mesh"].to_dataset()["triangle"].values
-    uv, codes = registered["common_uv"].values, surfel_texels(fitted)
+    fitted = model["fitted"].to_dataset().load()
+    triangles = model["mesh"].to_dataset()["triangle"].values
+    uv = registered["common_uv"].values
+    codes = surfel_texels(fitted)
     raster = rasterise_atlas(uv, triangles, size)
     status = texel_codes(codes, triangles, *raster)
     outside = status == TexelStatus.OUTSIDE

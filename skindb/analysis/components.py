@@ -70,11 +70,13 @@ def principal_components(values: xr.DataArray, *, most: int = 10, least_known: f
         note(takes[i], f"only {fraction[i]:.0%} of its entries are known") for i in range(len(takes)) if i not in kept
     ]
     if len(kept) < 2:
-        rule, there = "at least two takes must have enough values", f"{len(kept)} of {len(takes)}"
+        rule = "at least two takes must have enough values"
+        there = f"{len(kept)} of {len(takes)}"
         raise InputError(Fault("principal components", rule, there, "fit or register more takes"))
     used: Mask = np.logical_and.reduce([known[i] for i in kept])
     if not used.any():
-        there, cure = f"none of {used.size}", "set a larger least_known to exclude takes that cover other parts"
+        there = f"none of {used.size}"
+        cure = "set a larger least_known to exclude takes that cover other parts"
         raise InputError(Fault("principal components", "some entries must be known in every take", there, cure))
     once = shared_once(used)
     most = min(most, max(len(kept) - 1, 1))  # the mean uses up one dimension: one more axis would be rounding error
@@ -157,7 +159,8 @@ def face_components(cohort: xr.Dataset, *, most: int = 5, mixed_fits: bool = Fal
 def tabulate_components(table: xr.Dataset) -> tuple[list[str], list[list[Any]]]:
     """Header and one row per take with its scores and its residual."""
     names = [f"score_{i + 1}" for i in range(table.sizes["component"])]
-    scores, left = table["principal_score"].values, table["principal_residual"].values
+    scores = table["principal_score"].values
+    left = table["principal_residual"].values
     takes = table["take"].values.tolist()
     rows = [[take, *own, rest] for take, own, rest in zip(takes, scores.tolist(), left.tolist(), strict=True)]
     return ["take", *names, "principal_residual"], rows
@@ -176,7 +179,8 @@ def plot_components(table: xr.Dataset, *, most: int = 3) -> Figure:
     from matplotlib import pyplot
 
     count = min(most, table.sizes["component"])
-    mean, deviation = table["principal_mean"].values, table["principal_score"].values.std(axis=0, ddof=1)
+    mean = table["principal_mean"].values
+    deviation = table["principal_score"].values.std(axis=0, ddof=1)
     gain = 0.9 / max(float(np.nanquantile(mean, 0.995)), 1e-6)
     figure: Figure
     figure, axes = pyplot.subplots(count, 3, figsize=(6, 2.2 * count), squeeze=False)

@@ -82,7 +82,8 @@ def component_correlations(
     ]
     pairs = [(i, j) for i, j in pairs if _varies(values[:, [i, j]])]
     if not pairs:
-        rule, cure = f"at least {MIN_SUBJECTS} subjects must have two components that vary", "fit more subjects"
+        rule = f"at least {MIN_SUBJECTS} subjects must have two components that vary"
+        cure = "fit more subjects"
         raise InputError(Fault("correlations", rule, f"{len(values)} subjects", cure))
     rows = [_pair(values[:, [i, j]], permutations, rng) for i, j in pairs]
     found, low, high, p, count = (np.array(column) for column in zip(*rows, strict=True))
@@ -139,7 +140,8 @@ def _pair(two: Array, permutations: int, rng: np.random.Generator) -> tuple[floa
         made = stats.bootstrap(
             (x, y), _pearson, paired=True, vectorized=True, n_resamples=RESAMPLES, method="BCa", rng=rng
         ).confidence_interval
-        low, high = float(made.low), float(made.high)
+        low = float(made.low)
+        high = float(made.high)
     return float(_pearson(x, y)), low, high, float(p), len(x)
 
 
@@ -165,16 +167,25 @@ def plot_correlations(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     if ax is None:
         _, ax = pyplot.subplots(figsize=(6.5, 1.0 + 0.24 * len(names)))
     ax.axvline(0, color="0.6", linewidth=1)
-    found, place = table["component_correlation"].values, np.arange(len(names))[::-1]
-    bars = np.stack([found - table["component_correlation_low"].values,
-                     table["component_correlation_high"].values - found])  # fmt: skip
+    found = table["component_correlation"].values
+    place = np.arange(len(names))[::-1]
+    bars = np.stack(
+        [found - table["component_correlation_low"].values, table["component_correlation_high"].values - found]
+    )
     bars = np.maximum(np.nan_to_num(bars), 0.0)
     significant = table["correlation_p_false_discovery"].values < 0.05
     for kept, fill in ((significant, colours.CYCLE[0]), (~significant, "white")):
         ax.errorbar(
-            found[kept], place[kept], xerr=bars[:, kept], fmt="o", color=colours.CYCLE[0], mfc=fill, markersize=4,
-            capsize=2, linewidth=1,
-        )  # fmt: skip
+            found[kept],
+            place[kept],
+            xerr=bars[:, kept],
+            fmt="o",
+            color=colours.CYCLE[0],
+            mfc=fill,
+            markersize=4,
+            capsize=2,
+            linewidth=1,
+        )
     ax.set_yticks(place, names, fontsize=7)
     ax.set_xlim(-1, 1)
     count = int(table["correlation_count"].max())

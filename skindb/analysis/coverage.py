@@ -21,7 +21,10 @@ from skindb.schema.cohort import require_takes
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-GENDER, ANCESTRY, AGE_BAND, SITE = "gender", "ancestry", "age band", "site"
+GENDER = "gender"
+ANCESTRY = "ancestry"
+AGE_BAND = "age band"
+SITE = "site"
 CROSSED = (GENDER, ANCESTRY, AGE_BAND)  # factors of which pairs and the triple are counted
 DECADE = 10  # years in an age band
 AND = " x "

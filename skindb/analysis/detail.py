@@ -67,7 +67,8 @@ def transfer_detail(
     for one in (model, source):
         honour_consent(one.attrs, "statistics")
     if not np.array_equal(registered["landmark"].values, source_registered["landmark"].values):
-        rule, cure = "both takes must be registered together", "run skindb register"
+        rule = "both takes must be registered together"
+        cure = "run skindb register"
         raise InputError(Fault("transfer of detail", rule, "different sets of landmarks", cure))
     per_texel = float(registered["mm_per_uv"]) / size
     levels = math.floor(math.log2(coarsest / per_texel)) - 1 if coarsest > 0 else 0
@@ -95,8 +96,10 @@ def transfer_detail(
 
 def _detail_change(image: Array, other: Array, fraction: Array, levels: int) -> Array:
     """Change (v, u) of an image that replaces its finest levels by those of another image where `fraction` is 1."""
-    mine, theirs = build(image, levels), build(other, levels)
-    parts, others = mine.parts(), theirs.parts()
+    mine = build(image, levels)
+    theirs = build(other, levels)
+    parts = mine.parts()
+    others = theirs.parts()
     weights = level_fractions(fraction, [part.shape for part in parts])
     steps: list[Image] = [weight * (b - a) for a, b, weight in zip(parts, others, weights, strict=True)]
     steps[-1] = np.zeros_like(parts[-1])  # the low-pass residual of the face is kept
@@ -107,7 +110,8 @@ def _region(region: str | Mask, registered: xr.Dataset, other: xr.Dataset, size:
     if not isinstance(region, str):
         mask = np.asarray(region, np.bool_)
         if mask.shape != (size, size):
-            rule, cure = f"a mask must have ({size}, {size}) texels", "pass a mask of that shape, or another size"
+            rule = f"a mask must have ({size}, {size}) texels"
+            cure = "pass a mask of that shape, or another size"
             raise InputError(Fault("region", rule, str(mask.shape), cure))
         return mask
     if region == FACE:

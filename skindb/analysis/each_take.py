@@ -38,7 +38,8 @@ def each_take(
         [name for name in asked.coords if name not in names]
     )  # otherwise every task would hold them
     takes = [asked.isel(take=i) for i in range(cohort.sizes["take"])]
-    call, once = delayed(_InOrder(function), pure=False, traverse=False), [shared_once(one) for one in shared]
+    call = delayed(_InOrder(function), pure=False, traverse=False)
+    once = [shared_once(one) for one in shared]
     return list(compute(*(call(one, *once) for one in takes)))  # type: ignore[no-untyped-call]
 
 

@@ -24,20 +24,33 @@ from skindb.schema.regions import FACE
 
 Array = NDArray[np.floating[Any]]
 Report = dict[str, Any]
-DARKEST, BRIGHTEST = 1e-3, 0.999  # limits of an edited albedo
+# limits of an edited albedo
+DARKEST = 1e-3
+BRIGHTEST = 0.999
 SIGMA_TR_RANGE = (1e-2, 1e2)  # mm^-1; limits of an edited value, far beyond the 0.4 to 2 of skin
 MAX_AMOUNT = 100.0  # of a trait vector; the exponential of a larger shift of log sigma_tr may overflow
 # variables that an edit changes or that stay valid; errors, residuals and weights belong to the unedited model
 KEPT = (
-    "surfel_position", "surfel_normal", "surfel_area", "surfel_uv", "region_mask", "shading_normal", "fit_status",
-    "diffuse_reflectance", "dipole_s", "basis_weight", "sigma_tr", "refractive_index",
-)  # fmt: skip
+    "surfel_position",
+    "surfel_normal",
+    "surfel_area",
+    "surfel_uv",
+    "region_mask",
+    "shading_normal",
+    "fit_status",
+    "diffuse_reflectance",
+    "dipole_s",
+    "basis_weight",
+    "sigma_tr",
+    "refractive_index",
+)
 KEPT_ATTRS = ("subject", "condition", "session", "traits", "consent_scope", "take")
 PROBED = "probe"  # measurements of the unedited skin
 KEPT_SITES = ("site_sigma_tr", "site_position", "site_status")  # what rendering and export need of a site
 MIN_REPORTED = 1e-3  # fraction of a change above which an omission is reported
 TEXTURE_SHIFT = "trait_texture_shift"  # only where takes are registered
-ONE_SUBJECT, NO_SUBJECT = "unknown: only one subject", "unknown: no subject was measured"
+ONE_SUBJECT = "unknown: only one subject"
+NO_SUBJECT = "unknown: no subject was measured"
 
 
 def apply_traits(
@@ -110,7 +123,8 @@ def apply_traits(
         where="traits (run skindb analyze DB traits again)",
     )
     amount = _trait_amounts(amounts, traits)
-    fitted, tree = model["fitted"].to_dataset().load(), model.copy()
+    fitted = model["fitted"].to_dataset().load()
+    tree = model.copy()
     reports: dict[str, Report] = {}
     moves = []
     if "brdf" in parts:
@@ -123,7 +137,8 @@ def apply_traits(
         shifts = traits[TEXTURE_SHIFT].values[amount != 0] if TEXTURE_SHIFT in traits else None
         if texture is not None and maps is not None and registered is not None and shifts is not None:
             moved = np.tensordot(amount[amount != 0], shifts.astype(np.float64), 1)
-            uv, rng = registered["common_uv"].values, np.random.default_rng(0) if rng is None else rng
+            uv = registered["common_uv"].values
+            rng = np.random.default_rng(0) if rng is None else rng
             fitted, reports["albedo"], move = _moved_texture(fitted, moved, texture, maps, uv, albedo, rng)
         else:
             moved = np.tensordot(amount, traits["trait_quantile_shift"].values, 1)
@@ -156,7 +171,8 @@ def _notes(traits: xr.Dataset, used: list[str]) -> list[str]:
 def _trait_amounts(amounts: Mapping[str, float], traits: xr.Dataset) -> Array:
     """Amounts (trait,); raises `InputError` for unknown traits and for amounts that are not finite or too large."""
     known = [str(t) for t in traits["trait"].values]
-    found, faults = np.zeros(len(known)), list[Fault]()
+    found = np.zeros(len(known))
+    faults = list[Fault]()
     for name, amount in amounts.items():
         try:
             found[known.index(trait_name(name, known))] += amount
@@ -210,7 +226,8 @@ def with_basis(model: xr.DataTree, *, mixture: Array, names: Sequence[str], tabl
     tables
         (nh, nd, np, m) tables of the dictionary the model was fitted with [sr^-1].
     """
-    fitted, tree = model["fitted"].to_dataset().load(), model.copy()
+    fitted = model["fitted"].to_dataset().load()
+    tree = model.copy()
     weights = fitted["dictionary_weight"].values.astype(np.float64)
     good = np.isfinite(weights).all(axis=1)
     found = np.full((len(weights), len(mixture)), np.nan)
@@ -227,7 +244,8 @@ def with_basis(model: xr.DataTree, *, mixture: Array, names: Sequence[str], tabl
 def _common_basis(model: xr.DataTree, basis: xr.Dataset, tables: Array) -> xr.Dataset:
     H = basis["population_mixture"].values
     brdf = stored_brdf(tables @ H.T.astype(np.float32))
-    disc, source = model["basis/disc_angular_radius"].values, model["basis"].attrs.get("dictionary")
+    disc = model["basis/disc_angular_radius"].values
+    source = model["basis"].attrs.get("dictionary")
     return dataset(
         {"basis_mixture": H, "basis_brdf": brdf, "disc_angular_radius": disc},
         coords={"dictionary": basis["dictionary"].values, **brdf_coords(TableGrid(*tables.shape[:3]))},
@@ -276,7 +294,8 @@ def _with_albedo(fitted: xr.Dataset, wanted: Array, albedo: xr.Dataset) -> tuple
     area = fitted["surfel_area"].values[good].astype(np.float64)
     own, now = (np.average(x[good], axis=0, weights=area) for x in (colour, out))
     whole = [str(r) for r in albedo["region"].values].index(FACE)
-    takes, axes = albedo["albedo_mean"].values[:, whole], albedo["colour_axis"].values
+    takes = albedo["albedo_mean"].values[:, whole]
+    axes = albedo["colour_axis"].values
     # on the decorrelated axes, the unit is the standard deviation of skin in that direction
     distance, move = _distances(now, own, takes, [str(t) for t in albedo["take"].values], axes.T @ axes)
     cut = (np.clip(wanted, DARKEST, BRIGHTEST) != wanted)[good] & (wanted != colour)[good]
@@ -369,7 +388,8 @@ def _distances(now: Array, own: Array, takes: Array, names: list[str], metric: A
 def describe_edit(report: Mapping[str, Report]) -> list[str]:
     """Limitations of an edit and changes that were omitted, one line each; `report` is its attribute `edit_report`."""
     lines = []
-    surface, albedo = report.get("brdf", {}), report.get("albedo", {})
+    surface = report.get("brdf", {})
+    albedo = report.get("albedo", {})
     if surface.get("clipped", 0.0) > MIN_REPORTED:
         rule = "would have made weights negative and was omitted"
         lines.append(f"brdf: {surface['clipped']:.1%} of the requested change {rule}")
@@ -379,7 +399,8 @@ def describe_edit(report: Mapping[str, Report]) -> list[str]:
     if albedo.get("how") == "colours":
         lines.append("albedo: only colours were edited; textures need a registration of the take and of the study")
     if albedo.get("how") == "texture" and not isinstance(albedo["distance"], str):
-        before, after = albedo["distance_before"], albedo["distance"]
+        before = albedo["distance_before"]
+        after = albedo["distance"]
         lines.append(
             f"albedo: {after:.2f} standard deviations from the mean of the takes, {before:.2f} before the edit"
         )

@@ -93,14 +93,16 @@ def effect_maps(
         require_same_fit(cohort)
     whole = cohort.sizes["v"]
     if size < 1 or whole % size:
-        rule, cure = f"must divide the {whole} texels of the maps", f"choose {whole}, {whole // 2} or {whole // 4}"
+        rule = f"must divide the {whole} texels of the maps"
+        cure = f"choose {whole}, {whole // 2} or {whole // 4}"
         raise InputError(Fault("size", rule, str(size), cure))
     columns: dict[str, list[Array]] = {}
     names: list[str] = []
     quantities: list[str] = []
     counts: list[int] = []
     faults: list[Fault] = []
-    flags, others = list[str](), other_attributes(cohort, group_by)
+    flags = list[str]()
+    others = other_attributes(cohort, group_by)
     for variable, called in MAPPED.items():
         if variable not in cohort:
             continue
@@ -123,7 +125,8 @@ def effect_maps(
         if names and [name for name, _, _ in found] != names:  # a contrast is missing for this variable only
             faults.append(Fault(called, "every comparison must have texels", "none for some", "exclude takes"))
             continue
-        names, counts = [name for name, _, _ in found], [count for _, _, count in found]
+        names = [name for name, _, _ in found]
+        counts = [count for _, _, count in found]
         quantities += own
         for name in found[0][1]:
             stacked = np.stack([values[name] for _, values, _ in found])  # (contrast, texel * channel)
@@ -155,9 +158,13 @@ def _texel_quantities(takes: xr.Dataset, variable: str, size: int) -> Quantities
     subject = tuple(str(one) for one in texts(takes["subject"]))
     nothing = np.full(values.shape, np.nan, np.float32)  # errors of texels are not used
     return Quantities(
-        tuple(map(str, range(count))), values, nothing, np.full(count, variable.endswith(LOGARITHMIC)),
-        np.zeros(count), subject,
-    )  # fmt: skip
+        tuple(map(str, range(count))),
+        values,
+        nothing,
+        np.full(count, variable.endswith(LOGARITHMIC)),
+        np.zeros(count),
+        subject,
+    )
 
 
 def _block_means(take: xr.Dataset, variable: str, size: int) -> Array:
@@ -210,7 +217,8 @@ def tabulate_effect_maps(maps: xr.Dataset) -> tuple[list[str], list[list[Any]]]:
     for contrast in maps["contrast"].values.tolist():
         for quantity in maps["quantity"].values.tolist():
             one = maps.sel(contrast=contrast, quantity=quantity)
-            effect, known = one["map_effect"].values, np.isfinite(one["map_effect_p"].values)
+            effect = one["map_effect"].values
+            known = np.isfinite(one["map_effect_p"].values)
             if not known.any():
                 rows.append([contrast, quantity, 0, 0, *[float("nan")] * 3])
                 continue

@@ -134,7 +134,11 @@ def group_effects(
         require_same_fit(cohort)
     others = other_attributes(cohort, group_by)
     columns: dict[str, list[Array]] = {}
-    names, counts, smallest, flags, faults = [], [], [], [], []
+    names = []
+    counts = []
+    smallest = []
+    flags = []
+    faults = []
     for one in contrasts(cohort, group_by, adjust, quantities_of):
         try:
             found, count = _contrast_statistics(one, permutations, rng)
@@ -244,7 +248,8 @@ def _paired(cohort: xr.Dataset, group_by: str, measure: Callable[[xr.Dataset], Q
         after, before = (_select_subjects(one.of_subjects(), both) for one in (changed, plain))
         errors = np.hypot(after.errors, before.errors)
         difference = replace(after, values=after.values - before.values, errors=errors)
-        ones, nothing = np.ones(len(both)), np.empty((len(both), 0))
+        ones = np.ones(len(both))
+        nothing = np.empty((len(both), 0))
         found.append(Contrast(f"{name} less {NORMAL}", difference, ones, nothing, before=before.values))
     if not found:
         rule = "some subjects must be measured in both conditions"
@@ -287,9 +292,10 @@ def _contrast_statistics(one: Contrast, most: int, rng: np.random.Generator) -> 
         "effect_p": p,
         "effect_p_adjusted": adjusted,
         "effect_p_false_discovery": discovered,
-        "effect_detectable": detectable_difference(fit.error, fit.free) if _least_p(one, count) < SIGNIFICANT
+        "effect_detectable": detectable_difference(fit.error, fit.free)
+        if _least_p(one, count) < SIGNIFICANT
         else np.full_like(fit.error, np.nan),
-    }, count  # fmt: skip
+    }, count
 
 
 def _least_p(one: Contrast, count: int) -> float:
@@ -336,7 +342,8 @@ def _association(one: Contrast, cohort: xr.Dataset, other: str) -> float:
         return float("nan")
     columns = columns_of(stated)
     known = np.isfinite(columns).all(axis=1)
-    y, x = one.regressor[known], np.column_stack([np.ones(known.sum()), columns[known]])
+    y = one.regressor[known]
+    x = np.column_stack([np.ones(known.sum()), columns[known]])
     if not known.any() or np.ptp(y) == 0:
         return float("nan")
     left = y - x @ np.linalg.lstsq(x, y, rcond=None)[0]
@@ -402,7 +409,8 @@ def contrast_flags(
 
 def _surface_flag(one: Contrast, found: dict[str, Array]) -> list[str]:
     """Warning if surface reflectance differs, because its diffuse part is counted as albedo."""
-    names, differ = np.array(one.quantities.names), found["effect_p_adjusted"] < SIGNIFICANT
+    names = np.array(one.quantities.names)
+    differ = found["effect_p_adjusted"] < SIGNIFICANT
     small = differ & (np.abs(found["effect"]) < one.quantities.common)
     if not (differ & np.char.startswith(names, SURFACE)).any() or not small.any():
         return []
@@ -457,18 +465,27 @@ def plot_group_effects(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     contrasts = [str(name) for name in table["contrast"].values]
     for i, contrast in enumerate(contrasts):
         one = table.sel(contrast=contrast)
-        effect, scale = one["effect"].values, one["effect"].values / one["effect_standardised"].values
+        effect = one["effect"].values
+        scale = one["effect"].values / one["effect_standardised"].values
         bars = np.abs(np.stack([effect - one["effect_low"].values, one["effect_high"].values - effect]) / scale)
         found = one["effect_p_adjusted"].values < SIGNIFICANT
         y = places + 0.6 * ((i + 0.5) / len(contrasts) - 0.5)
-        colour, count = colours.CYCLE[i % len(colours.CYCLE)], int(one["effect_count"].sum("side").max())
+        colour = colours.CYCLE[i % len(colours.CYCLE)]
+        count = int(one["effect_count"].sum("side").max())
         label = f"{contrast} (n = {count})"
         ax.plot([], [], "osD^v"[i % 5], color=colour, markersize=4, label=label)
         for kept, fill in ((found, colour), (~found, "white")):
             ax.errorbar(
-                (effect / scale)[kept], y[kept], xerr=bars[:, kept], fmt="osD^v"[i % 5], color=colour, mfc=fill,
-                markersize=4, capsize=2, linewidth=1,
-            )  # fmt: skip
+                (effect / scale)[kept],
+                y[kept],
+                xerr=bars[:, kept],
+                fmt="osD^v"[i % 5],
+                color=colour,
+                mfc=fill,
+                markersize=4,
+                capsize=2,
+                linewidth=1,
+            )
     ax.set_yticks(places, names, fontsize=7)
     ax.set_ylim(-0.6, len(names) - 0.4)
     held = f", {', '.join(table.attrs['adjust'])} held fixed" if table.attrs["adjust"] else ""

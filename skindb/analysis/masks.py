@@ -21,45 +21,80 @@ Corner = tuple[str, float, float]
 # corners of the eyes, and an offset down, as a fraction of the height from nasion to chin.
 _MIDDLE: dict[str, tuple[Corner, ...]] = {
     "lips": (
-        ("lip_upper", 0, -0.03), ("lip_upper", -0.17, 0), ("mouth_corner_right", -0.02, -0.01),
-        ("mouth_corner_right", 0, 0.03), ("lip_lower", -0.2, -0.02), ("lip_lower", 0, 0),
+        ("lip_upper", 0, -0.03),
+        ("lip_upper", -0.17, 0),
+        ("mouth_corner_right", -0.02, -0.01),
+        ("mouth_corner_right", 0, 0.03),
+        ("lip_lower", -0.2, -0.02),
+        ("lip_lower", 0, 0),
     ),
     "nose": (
-        ("nasion", 0, -0.05), ("nasion", -0.11, -0.02), ("nose_tip", -0.23, 0), ("ala_right", -0.06, -0.09),
-        ("ala_right", -0.04, 0.02), ("subnasale", -0.13, 0.03), ("subnasale", 0, 0.02),
+        ("nasion", 0, -0.05),
+        ("nasion", -0.11, -0.02),
+        ("nose_tip", -0.23, 0),
+        ("ala_right", -0.06, -0.09),
+        ("ala_right", -0.04, 0.02),
+        ("subnasale", -0.13, 0.03),
+        ("subnasale", 0, 0.02),
     ),
     "chin": (
-        ("lip_lower", 0, 0), ("mouth_corner_right", -0.1, 0.03), ("mouth_corner_right", -0.07, 0.25),
-        ("chin", -0.40, 0.13), ("chin", 0, 0.16),
+        ("lip_lower", 0, 0),
+        ("mouth_corner_right", -0.1, 0.03),
+        ("mouth_corner_right", -0.07, 0.25),
+        ("chin", -0.40, 0.13),
+        ("chin", 0, 0.16),
     ),
     "forehead": (
-        ("forehead_centre", 0, -0.19), ("forehead_right", 0, -0.22), ("forehead_right", -0.24, -0.1),
-        ("brow_right", -0.39, 0.04), ("brow_right", 0, -0.07), ("nasion", 0, -0.25),
+        ("forehead_centre", 0, -0.19),
+        ("forehead_right", 0, -0.22),
+        ("forehead_right", -0.24, -0.1),
+        ("brow_right", -0.39, 0.04),
+        ("brow_right", 0, -0.07),
+        ("nasion", 0, -0.25),
     ),
     "neck": (
-        ("chin", 0, 0.17), ("chin", -0.4, 0.16), ("jaw_right", -0.16, 0.26), ("jaw_right", -0.8, 0.26),
-        ("jaw_right", -0.8, 1.2), ("chin", 0, 1.2),
+        ("chin", 0, 0.17),
+        ("chin", -0.4, 0.16),
+        ("jaw_right", -0.16, 0.26),
+        ("jaw_right", -0.8, 0.26),
+        ("jaw_right", -0.8, 1.2),
+        ("chin", 0, 1.2),
     ),
     "beard": (
-        ("subnasale", 0, 0.02), ("subnasale", -0.2, 0.04), ("mouth_corner_right", -0.1, -0.07),
-        ("jaw_right", -0.05, -0.4), ("jaw_right", -0.2, -0.57), ("jaw_right", -0.46, -0.3), ("jaw_right", -0.24, 0.14),
-        ("chin", -0.4, 0.38), ("chin", 0, 0.4),
+        ("subnasale", 0, 0.02),
+        ("subnasale", -0.2, 0.04),
+        ("mouth_corner_right", -0.1, -0.07),
+        ("jaw_right", -0.05, -0.4),
+        ("jaw_right", -0.2, -0.57),
+        ("jaw_right", -0.46, -0.3),
+        ("jaw_right", -0.24, 0.14),
+        ("chin", -0.4, 0.38),
+        ("chin", 0, 0.4),
     ),
-}  # fmt: skip
+}
 # closed outlines on the subject's right side; the left side is mirrored
 _SIDE: dict[str, tuple[Corner, ...]] = {
     "eyelid": (
-        ("eye_inner_right", 0.07, 0.03), ("eye_inner_right", 0.09, -0.11), ("eye_inner_right", -0.12, -0.14),
-        ("eye_outer_right", -0.06, -0.11), ("eye_outer_right", -0.14, -0.01), ("eye_outer_right", -0.07, 0.11),
-        ("eye_inner_right", -0.17, 0.17), ("eye_inner_right", -0.04, 0.13),
+        ("eye_inner_right", 0.07, 0.03),
+        ("eye_inner_right", 0.09, -0.11),
+        ("eye_inner_right", -0.12, -0.14),
+        ("eye_outer_right", -0.06, -0.11),
+        ("eye_outer_right", -0.14, -0.01),
+        ("eye_outer_right", -0.07, 0.11),
+        ("eye_inner_right", -0.17, 0.17),
+        ("eye_inner_right", -0.04, 0.13),
     ),
     "cheek": (
         ("nose_tip", -0.28, -0.05),
-        ("eye_outer_right", 0.05, 0.13), ("eye_outer_right", -0.14, 0.05), ("eye_outer_right", -0.26, 0.03),
-        ("eye_outer_right", -0.39, 0.23), ("ala_right", -0.38, 0.03), ("ala_right", -0.1, 0.08),
+        ("eye_outer_right", 0.05, 0.13),
+        ("eye_outer_right", -0.14, 0.05),
+        ("eye_outer_right", -0.26, 0.03),
+        ("eye_outer_right", -0.39, 0.23),
+        ("ala_right", -0.38, 0.03),
+        ("ala_right", -0.1, 0.08),
         ("ala_right", -0.07, -0.09),
     ),
-}  # fmt: skip
+}
 FINE = (
     "lips",
     "eyelid",
@@ -160,7 +195,8 @@ def _corners(outline: tuple[Corner, ...], landmarks: Mapping[str, Array], *, mir
 def inside_outline(points: Array, outline: Array) -> Mask:
     """Whether points (n, 2) lie inside a closed outline (m, 2), by the even-odd rule."""
     inside = np.zeros(len(points), np.bool_)
-    x, y = points[:, 0], points[:, 1]
+    x = points[:, 0]
+    y = points[:, 1]
     for (ax, ay), (bx, by) in zip(outline, np.roll(outline, -1, axis=0), strict=True):
         if ay != by:
             inside ^= ((ay > y) != (by > y)) & (x < ax + (y - ay) / (by - ay) * (bx - ax))

@@ -77,7 +77,8 @@ def mean_face(cohort: xr.Dataset, *, least: int = LEAST_SUBJECTS, mixed_fits: bo
         count = moments.count.min(axis=-1) if moments.count.ndim == 3 else moments.count
         found[f"{short}_count"] = count.astype(np.int32)
     if not any(np.isfinite(found[AVERAGED[name][0]]).any() for name in names):
-        rule, cure = f"at least one texel must be measured in {least} subjects", "fit or register more subjects"
+        rule = f"at least one texel must be measured in {least} subjects"
+        cure = "fit or register more subjects"
         raise InputError(Fault("mean face", rule, f"none among {len(set(subjects))} subjects", cure))
     return dataset(
         found,

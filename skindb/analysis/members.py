@@ -16,9 +16,13 @@ from skindb._types import Array, Mask
 from skindb.errors import Fault, InputError
 from skindb.schema.notes import Note, note
 
-CONDITION, NORMAL = "condition", "normal"
-AGE, OLDER = "age", "age:older"
-ALL_TAKES, UNKNOWN, OTHER = "all", "unknown", "other conditions"
+CONDITION = "condition"
+NORMAL = "normal"
+AGE = "age"
+OLDER = "age:older"
+ALL_TAKES = "all"
+UNKNOWN = "unknown"
+OTHER = "other conditions"
 NO_ATTRIBUTES = ("take", "subject", "session", "model_generation")  # coordinates along "take" that describe no subject
 FIT = "fit_"  # prefix of coordinates that are parameters of the fit
 
@@ -60,7 +64,8 @@ def trait_name(name: str, known: Iterable[str]) -> str:
 
 def sides(cohort: xr.Dataset, trait: str) -> tuple[Mask, Mask]:
     """Masks (take,) of the comparable takes with and without a trait."""
-    carries, usable = has_trait(cohort, trait), comparable_takes(cohort, trait)
+    carries = has_trait(cohort, trait)
+    usable = comparable_takes(cohort, trait)
     return carries & usable, ~carries & usable
 
 
@@ -98,7 +103,8 @@ def comparable_takes(cohort: xr.Dataset, trait: str) -> Mask:
     subjects it would be confounded with everything else that differs.
     """
     carries = has_trait(cohort, trait)
-    subjects, plain = np.array([str(one) for one in texts(cohort["subject"])]), is_normal(cohort)
+    subjects = np.array([str(one) for one in texts(cohort["subject"])])
+    plain = is_normal(cohort)
     if not trait.startswith(f"{CONDITION}:"):
         # takes in other conditions are used only if no take with the trait is in the condition normal
         return np.asarray(has_attribute(cohort, trait) & (plain if (carries & plain).any() else plain | carries))
@@ -110,7 +116,8 @@ def comparable_takes(cohort: xr.Dataset, trait: str) -> Mask:
 
 def subjects_without_normal(cohort: xr.Dataset) -> list[Note]:
     """One note for each subject without a take in the condition normal; such subjects are not compared with others."""
-    subjects, plain = np.array([str(one) for one in texts(cohort["subject"])]), is_normal(cohort)
+    subjects = np.array([str(one) for one in texts(cohort["subject"])])
+    plain = is_normal(cohort)
     others = [str(one) for one in dict.fromkeys(subjects) if not plain[subjects == one].any()]
     return [note(subject, "no take in the condition normal") for subject in others]
 
@@ -128,10 +135,8 @@ def takes_to_compare(cohort: xr.Dataset, group_by: str | None) -> xr.Dataset:
         compared = trait_of(cohort, group_by).startswith(f"{CONDITION}:")
     kept = cohort if compared else cohort.isel(take=np.flatnonzero(is_normal(cohort)))
     if not kept.sizes["take"]:
-        rule, found = (
-            "groups must have a take in the condition normal",
-            f"only {', '.join(map(str, cohort['take'].values))}",
-        )
+        rule = "groups must have a take in the condition normal"
+        found = f"only {', '.join(map(str, cohort['take'].values))}"
         cure = "group by condition, or add takes in the condition normal"
         raise InputError(Fault("population", rule, found, cure))
     return kept

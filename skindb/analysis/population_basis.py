@@ -66,7 +66,8 @@ def population_basis(
     part = max(1, MAX_START_SURFELS // len(takes))
     first = each_take(_fitted_weights, cohort.isel(surfel=slice(2 * part)), ["dictionary_weight"])
     if lost := [take for take, known in zip(takes, first, strict=True) if not len(known)]:
-        rule, cure = "a take must have fitted surfels", "fit it again, or exclude it"
+        rule = "a take must have fitted surfels"
+        cure = "fit it again, or exclude it"
         raise InputError(Fault(f"take {take}", rule, "none", cure) for take in lost)
     X = np.concatenate([rng.permutation(one)[:part] for one in first])
     [metric] = each_item(brdf_metric, [tables])
@@ -95,7 +96,8 @@ def population_basis(
 
 def _mean(take: xr.Dataset) -> Array:
     """Area-weighted mean (m,) of the weights (n, m) of one take."""
-    weights, area = take["dictionary_weight"].values, take["surfel_area"].values
+    weights = take["dictionary_weight"].values
+    area = take["surfel_area"].values
     good = np.isfinite(weights).all(axis=1)
     return np.asarray(np.average(weights[good].astype(np.float64), axis=0, weights=area[good].astype(np.float64)))
 
@@ -113,7 +115,8 @@ def _fitted_weights(take: xr.Dataset) -> Array:
 
 def project(weights: Array, H: Array, metric: Array) -> Array:
     """Non-negative coefficients (n, k) of the BRDFs nearest to `weights` (n, m) in the space of H (k, m)."""
-    gram, rhs = H @ metric @ H.T, weights @ metric @ H.T
+    gram = H @ metric @ H.T
+    rhs = weights @ metric @ H.T
     x, _, _, _ = solve_nnls(np.broadcast_to(gram, (len(rhs), *gram.shape)), rhs)
     return x
 

@@ -107,7 +107,8 @@ def require_adjustable(cohort: xr.Dataset, adjust: Sequence[str], own: str = "")
     able = set(attributes(cohort)) - {CONDITION, own}
     if unknown := [name for name in adjust if name not in able]:
         rule = "must be an attribute other than the compared one"
-        found, cure = "an unknown name", f"choose from: {', '.join(sorted(able)) or 'none'}"
+        found = "an unknown name"
+        cure = f"choose from: {', '.join(sorted(able)) or 'none'}"
         raise InputError(Fault(f"adjust {name}", rule, found, cure) for name in unknown)
 
 

@@ -27,7 +27,9 @@ Registered = Mapping[str, xr.Dataset]
 MEAN = "mean"
 # a landmark is doubtful if its prediction error [mm], its ratio to the error in other takes, and its ratio to the
 # largest error of its own take are above these
-DOUBTFUL_ERROR, DOUBTFUL_RATIO, DOUBTFUL_FRACTION = 5.0, 3.0, 0.7
+DOUBTFUL_ERROR = 5.0
+DOUBTFUL_RATIO = 3.0
+DOUBTFUL_FRACTION = 0.7
 IMPOSSIBLE_ERROR = 20.0  # mm, more than faces can differ
 TEMPLATE_FRACTION = 0.75  # minimum number of landmarks of the template, as a fraction of the largest number in a take
 HEIGHT = 1e-2  # of the plane from which rays start, in units of uv
@@ -112,7 +114,8 @@ def outline(model: xr.DataTree, names: Sequence[str]) -> Outline:
 
 def with_names(one: Outline, own: Sequence[str], names: Sequence[str]) -> Outline:
     """An outline with the landmarks `own`, extended to and sorted by the names of the landmarks of all takes."""
-    landmark, uv = np.full((len(names), 3), np.nan), np.full((len(names), 2), np.nan)
+    landmark = np.full((len(names), 3), np.nan)
+    uv = np.full((len(names), 2), np.nan)
     at = [list(names).index(name) for name in own]
     landmark[at], uv[at] = one.landmark, one.landmark_uv
     return Outline(landmark, uv, one.area, one.alignable)
@@ -138,7 +141,8 @@ def common_frame(
     """
     if reference is not None and reference not in outlines:
         there = ", ".join(outlines) or "none"
-        rule, found = "must be a take with landmarks", "another name"
+        rule = "must be a take with landmarks"
+        found = "another name"
         raise InputError(Fault(f"reference {reference}", rule, found, f"choose from takes with landmarks: {there}"))
     if not outlines:
         return None
@@ -150,7 +154,10 @@ def common_frame(
 
 def register_one(take: str, model: xr.DataTree, template: xr.DataTree, frame: Frame) -> xr.Dataset:
     """Common texture coordinates of one take; see `register`."""
-    names, at, target, smoothing = list(frame.names), frame.at, frame.target, frame.smoothing
+    names = list(frame.names)
+    at = frame.at
+    target = frame.target
+    smoothing = frame.smoothing
     sheet = _sheet(model, names)
     warp = fit_warp(at[frame.template], target, smoothing=smoothing)
     if take != frame.template:
@@ -184,7 +191,8 @@ def with_landmarks(models: Takes) -> dict[str, xr.DataTree]:
 
 def _sheet(model: xr.DataTree, names: list[str]) -> Sheet:
     """Surface of a take and its landmarks (k, 3); NaN for landmarks that the take lacks."""
-    mesh, landmark = model["mesh"].to_dataset(), np.full((len(names), 3), np.nan)
+    mesh = model["mesh"].to_dataset()
+    landmark = np.full((len(names), 3), np.nan)
     landmark[[names.index(str(name)) for name in mesh["landmark"].values]] = _landmarks_mm(model)
     return Sheet.of(*_surface(model), landmark)
 
@@ -271,7 +279,8 @@ def correspondence_error(models: Takes, registered: Registered, points: Mapping[
         (pair, p) distances [mm] for every ordered pair of takes, between point i of the first take and the point of
         its surface that corresponds to point i of the second; NaN where there is no corresponding point.
     """
-    true, common = {}, {}
+    true = {}
+    common = {}
     for take, wanted in points.items():
         position, _, faces = _surface(models[take])
         face, corner, _ = closest_on_mesh(position, faces, wanted)
@@ -365,7 +374,8 @@ def describe_registration(registered: Registered, takes: Iterable[str]) -> list[
 
 def _surface(model: xr.DataTree) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
     """Positions (n, 3) in mm, texture coordinates (n, 2) and triangles (f, 3) of a take."""
-    fitted, faces = model["fitted"].to_dataset(), model["mesh"].to_dataset()["triangle"].values
+    fitted = model["fitted"].to_dataset()
+    faces = model["mesh"].to_dataset()["triangle"].values
     position, uv = (fitted[name].values.astype(np.float64) for name in ("surfel_position", "surfel_uv"))
     return position, uv, faces.astype(np.int64)
 

@@ -23,18 +23,43 @@ SAMPLED = 5000  # surfels per take; the paper drew 2,000 of each subject, and 5,
 STREAM = 7  # random stream of the sample
 # variables of the group "fitted" that a sample keeps
 KEPT = (
-    "surfel_position", "surfel_uv", "surfel_area", "region_mask", "shading_normal", "normal_error",
-    "diffuse_reflectance", "diffuse_reflectance_error", "diffuse_reflectance_total_error", "dictionary_weight",
-    "basis_weight", "basis_weight_error", "surface_reflectance", "surface_reflectance_error", "sigma_tr",
-    "fit_residual", "fit_residual_perceptual", "held_out_error", "held_out_camera_error", "outlier_fraction",
-)  # fmt: skip
+    "surfel_position",
+    "surfel_uv",
+    "surfel_area",
+    "region_mask",
+    "shading_normal",
+    "normal_error",
+    "diffuse_reflectance",
+    "diffuse_reflectance_error",
+    "diffuse_reflectance_total_error",
+    "dictionary_weight",
+    "basis_weight",
+    "basis_weight_error",
+    "surface_reflectance",
+    "surface_reflectance_error",
+    "sigma_tr",
+    "fit_residual",
+    "fit_residual_perceptual",
+    "held_out_error",
+    "held_out_camera_error",
+    "outlier_fraction",
+)
 SITES = (
-    "site_sigma_tr", "site_sigma_tr_error", "site_sigma_tr_model_error", "site_sigma_tr_total_error", "site_status",
-)  # fmt: skip
+    "site_sigma_tr",
+    "site_sigma_tr_error",
+    "site_sigma_tr_model_error",
+    "site_sigma_tr_total_error",
+    "site_status",
+)
 MEASURES = (
-    "dictionary_residual", "fit_residual", "fit_residual_perceptual", "held_out_error", "held_out_error_perceptual",
-    "held_out_camera_error", "held_out_camera_error_perceptual",
-)  # fmt: skip
+    "dictionary_residual",
+    "fit_residual",
+    "fit_residual_perceptual",
+    "held_out_error",
+    "held_out_error_perceptual",
+    "held_out_camera_error",
+    "held_out_camera_error_perceptual",
+)
 
 
 def sample_surfels(model: xr.DataTree, *, surfels: int = SAMPLED, seed: int = 0) -> xr.Dataset:
@@ -124,16 +149,18 @@ def region_tables(fitted: xr.Dataset, masks: Mapping[str, Mask]) -> xr.Dataset:
         # model errors of neighbouring surfels are correlated: averaging does not reduce them
         model_error = np.sqrt(np.maximum(total[inside] ** 2 - noise[inside] ** 2, 0))
         common = _weighted_mean(model_error, model_error, weight)[0]
-        rows.append({
-            "region_surfels": int(inside.sum()),
-            "region_area": float(weight.sum()),
-            "region_diffuse_reflectance": mean,
-            "region_diffuse_reflectance_error": error,
-            "region_diffuse_reflectance_total_error": np.hypot(error, common),
-            "region_diffuse_covariance": _covariance(colour[inside], weight),
-            "region_surface_reflectance": _weighted_mean(shine[inside], shine[inside], weight)[0],
-            "region_surface_reflectance_error": _weighted_mean(shine[inside], shine_error[inside], weight)[1],
-        })  # fmt: skip
+        rows.append(
+            {
+                "region_surfels": int(inside.sum()),
+                "region_area": float(weight.sum()),
+                "region_diffuse_reflectance": mean,
+                "region_diffuse_reflectance_error": error,
+                "region_diffuse_reflectance_total_error": np.hypot(error, common),
+                "region_diffuse_covariance": _covariance(colour[inside], weight),
+                "region_surface_reflectance": _weighted_mean(shine[inside], shine[inside], weight)[0],
+                "region_surface_reflectance_error": _weighted_mean(shine[inside], shine_error[inside], weight)[1],
+            }
+        )
     variables = {name: np.stack([np.asarray(row[name]) for row in rows]) for name in rows[0]}
     if "even_reflection_limit" in fitted:
         variables["even_reflection_limit"] = fitted["even_reflection_limit"].values
@@ -245,7 +272,8 @@ def cohort_of(
     """
     allowed = {take: model for take, model in models.items() if "statistics" in consent_scope(model.attrs)}
     if not allowed:
-        found, cure = f"none of {len(models)} takes", "see consent.scope in capture.json"
+        found = f"none of {len(models)} takes"
+        cure = "see consent.scope in capture.json"
         raise InputError(Fault("population", "the consent of a take must cover statistics", found, cure))
     skipped = [note(take, "its consent does not cover statistics") for take in models if take not in allowed]
     parts = []

@@ -30,14 +30,26 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 EFFECT_COLUMNS = (
-    "effect", "effect_low", "effect_high", "effect_percent", "effect_percent_low", "effect_percent_high", "effect_p",
-    "effect_p_adjusted", "effect_p_false_discovery", "effect_detectable",
-)  # fmt: skip
+    "effect",
+    "effect_low",
+    "effect_high",
+    "effect_percent",
+    "effect_percent_low",
+    "effect_percent_high",
+    "effect_p",
+    "effect_p_adjusted",
+    "effect_p_false_discovery",
+    "effect_detectable",
+)
 
 CORRELATION_COLUMNS = (
-    "correlation_count", "component_correlation", "component_correlation_low", "component_correlation_high",
-    "correlation_p", "correlation_p_false_discovery",
-)  # fmt: skip
+    "correlation_count",
+    "component_correlation",
+    "component_correlation_low",
+    "component_correlation_high",
+    "correlation_p",
+    "correlation_p_false_discovery",
+)
 
 
 def tabulate_study(study: xr.DataTree) -> tuple[list[str], list[list[Any]]]:
@@ -67,30 +79,38 @@ def tabulate_study(study: xr.DataTree) -> tuple[list[str], list[list[Any]]]:
         dims = ["group", "site", "channel"]
     elif "correlations" in study.children:
         table = study["correlations"].to_dataset()
-        names, dims = list(CORRELATION_COLUMNS), ["pair"]
+        names = list(CORRELATION_COLUMNS)
+        dims = ["pair"]
     elif "effects" in study.children:
         table = study["effects"].to_dataset()
         table = table.assign(
             {f"subjects_{s}": table["effect_count"].sel(side=s, drop=True) for s in table["side"].values.tolist()}
         )
-        names, dims = ["subjects_with", "subjects_without", *EFFECT_COLUMNS], ["contrast", "quantity"]
+        names = ["subjects_with", "subjects_without", *EFFECT_COLUMNS]
+        dims = ["contrast", "quantity"]
     elif "traits" in study.children:
         table = study["traits"].to_dataset()
         table = table.assign({**_side_counts(table), **_vector_lengths(table)})
-        names, dims = ["takes_with", "takes_without", *_vector_lengths(table)], ["trait"]
+        names = ["takes_with", "takes_without", *_vector_lengths(table)]
+        dims = ["trait"]
     elif "chromophore_table" in study.children:
         table = study["chromophore_table"].to_dataset()
         columns = ("count", "mean", "mean_low", "mean_high", "standard_deviation")
-        names, dims = [f"group_chromophore_{column}" for column in columns], ["group", "region", "chromophore"]
+        names = [f"group_chromophore_{column}" for column in columns]
+        dims = ["group", "region", "chromophore"]
     elif "coverage" in study.children:
-        table, names, dims = study["coverage"].to_dataset(), ["coverage_count"], ["cell"]
+        table = study["coverage"].to_dataset()
+        names = ["coverage_count"]
+        dims = ["cell"]
     elif study["albedo_table"].attrs["group_by"]:
         table = study["albedo_table"].to_dataset()
         columns = ("count", "mean", "mean_low", "mean_high", "standard_deviation")
-        names, dims = [f"group_albedo_{column}" for column in columns], ["group", "region", "channel"]
+        names = [f"group_albedo_{column}" for column in columns]
+        dims = ["group", "region", "channel"]
     else:
         table = study["albedo"].to_dataset()
-        names, dims = ["albedo_mean"], ["take", "region", "channel"]
+        names = ["albedo_mean"]
+        dims = ["take", "region", "channel"]
     stacked = table[names].stack(row=dims, create_index=False).load()
     keys = [list(key) for key in itertools.product(*(table[d].values.tolist() for d in dims))]
     return [*dims, *names], [[*k, *(stacked[n].values[i].item() for n in names)] for i, k in enumerate(keys)]

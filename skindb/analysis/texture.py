@@ -110,7 +110,8 @@ def texture_statistics(cohort: xr.Dataset, *, landmarks: Mapping[str, Array], mi
     mean, axes = _axes(each_take(_moments, cohort, MAPPED))
     found = each_take(_distributions, cohort, MAPPED, drawn, mean, axes)
     if not np.isfinite(np.stack([one[0] for one in found])).any():
-        rule, cure = "at least one take must have measured half of a region", "fit or register more takes"
+        rule = "at least one take must have measured half of a region"
+        cure = "fit or register more takes"
         raise InputError(Fault("texture", rule, f"none of {len(found)} takes", cure))
     quantiles, low, high, covered = (np.stack(column) for column in zip(*found, strict=True))
     edges = _edges(np.nanmin(low, axis=(0, 1)), np.nanmax(high, axis=(0, 1)))
@@ -208,7 +209,8 @@ def _part_weights(drawn: Array, measured: Mask, covered: Array, parts: list[Arra
 
 def _edges(low: Array, high: Array) -> Array:
     """Edges (axis, part, BINS + 1) of equal bins that contain every texel of every take."""
-    low, high = np.nan_to_num(low), np.nan_to_num(high)
+    low = np.nan_to_num(low)
+    high = np.nan_to_num(high)
     margin = 1e-6 * (high - low) + 1e-9
     return np.moveaxis(np.linspace(low - margin, high + margin, BINS + 1), 0, -1)
 

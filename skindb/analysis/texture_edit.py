@@ -64,7 +64,8 @@ def edit_texture(
         Random generator of the noise.
     """
     names = [str(name) for name in texture["region"].values]
-    mean, axes = texture["texture_colour_mean"].values, texture["texture_colour_axis"].values
+    mean = texture["texture_colour_mean"].values
+    axes = texture["texture_colour_axis"].values
     drawn = texture["texture_region"].values.astype(np.float32)
     log, measured = log_albedo(maps)
     halves = not whole and {BEARD, REST} <= set(names)
@@ -74,7 +75,8 @@ def edit_texture(
         beard = gaussian_filter(drawn[at[0]], BLEND * len(drawn[0]))
         regions = [beard, 1 - beard]
     else:
-        at, regions = [names.index(FACE)], [np.ones(measured.shape, np.float32)]
+        at = [names.index(FACE)]
+        regions = [np.ones(measured.shape, np.float32)]
     counted = [drawn[i] * measured for i in at]
     images = decorrelated(log, mean, axes)
 
@@ -123,7 +125,8 @@ def _distances(texture: xr.Dataset, at: list[int], quantiles: list[Array]) -> tu
     found = principal_axes(rows[:, usable], len(rows) - 1)
     fraction = np.cumsum(found.variance) / max(found.total, 1e-300)
     count = int(np.searchsorted(fraction, KEPT_VARIANCE)) + 1
-    axes, spread = found.axes[:count], np.sqrt(found.variance[:count])
+    axes = found.axes[:count]
+    spread = np.sqrt(found.variance[:count])
 
     def distance(one: Array) -> float:
         score = axes @ (one[usable] - found.mean) / spread

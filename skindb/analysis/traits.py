@@ -102,7 +102,8 @@ def trait_vectors(
     """
     if not mixed_fits:
         require_same_fit(cohort)
-    known, numbers = trait_names(cohort), numeric_attributes(cohort)
+    known = trait_names(cohort)
+    numbers = numeric_attributes(cohort)
     named = sorted({*_requestable_traits(cohort, known), *numbers})
     names = [*known, *numbers] if traits is None else [trait_name(name, named) for name in traits]
     split = [_sides(cohort, name, numbers) for name in names]
@@ -110,10 +111,12 @@ def trait_vectors(
     bad = [(n, w, o) for n, (w, o) in both if not w.any() or (n not in numbers and not o.any())]
     if bad:
         there = ", ".join(known) or "none"
-        rule, cure = "there must be takes with and without it", f"choose from: {there}"
+        rule = "there must be takes with and without it"
+        cure = f"choose from: {there}"
         raise InputError(Fault(f"trait {n}", rule, f"{w.sum()} with, {o.sum()} without", cure) for n, w, o in bad)
     require_adjustable(cohort, adjust)
-    units, flags = dict[str, Units](), list[str]()
+    units = dict[str, Units]()
+    flags = list[str]()
     for name, side in both:
         try:
             units[name] = _units(cohort, name, side, adjust, numbers)
@@ -142,7 +145,8 @@ def trait_vectors(
             resamples = drawn.astype(np.float64) if name not in WITHOUT_ERRORS else np.empty((0, len(own.design)))
             shift, resampled = _coefficients(own.values(values), own.design, resamples)
             if values is log_tr:  # averaged over sites last: differences between sites must not appear as a trait
-                shift, resampled = known_mean(shift), known_mean(np.moveaxis(resampled, 1, 0))
+                shift = known_mean(shift)
+                resampled = known_mean(np.moveaxis(resampled, 1, 0))
             shifts[name].append(shift)
             if name not in WITHOUT_ERRORS:
                 errors[name].append(_deviation(resampled))
@@ -204,7 +208,8 @@ def _units(
     design = design[complete]
     if np.linalg.matrix_rank(design) < np.linalg.matrix_rank(design[:, 1:]) + 1:
         rule = "must vary independently of the attributes that are adjusted for"
-        found, cure = ", ".join(adjust) or "one value", "adjust for fewer attributes, or exclude the trait"
+        found = ", ".join(adjust) or "one value"
+        cure = "adjust for fewer attributes, or exclude the trait"
         raise InputError(Fault(f"trait {trait}", rule, found, cure))
     return Units(tuple(own for (_, _, own), kept in zip(whose, complete, strict=True) if kept), (), design)
 
@@ -215,7 +220,8 @@ def _coefficients(values: Array, design: Array, drawn: Array) -> tuple[Array, Ar
     NaN where the subjects with a value, or a resample of them, do not determine the coefficient.
     """
     flat = values.reshape(len(values), -1)
-    out, resampled = np.full(flat.shape[1], np.nan), np.full((len(drawn), flat.shape[1]), np.nan)
+    out = np.full(flat.shape[1], np.nan)
+    resampled = np.full((len(drawn), flat.shape[1]), np.nan)
     for rows, columns in missing_patterns(flat):
         own = design[rows]
         others = np.linalg.matrix_rank(own[:, 1:]) if own.shape[1] > 1 else 0

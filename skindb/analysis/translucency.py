@@ -61,9 +61,11 @@ def translucency_table(cohort: xr.Dataset, *, group_by: str | None = None, mixed
     names = sorted(set(groups))
     members = [np.flatnonzero([group == name for group in groups]) for name in names]
     if "site_sigma_tr" not in takes:  # the probe was not used
-        sites, measured = list[str](), dict[str, Array]()
+        sites = list[str]()
+        measured = dict[str, Array]()
     else:
-        sites, measured = [str(site) for site in takes["site"].values], _trusted(takes)
+        sites = [str(site) for site in takes["site"].values]
+        measured = _trusted(takes)
     empty = np.full((takes.sizes["take"], len(sites), 3), np.nan)
 
     def moments(name: str) -> Moments:

@@ -8,7 +8,9 @@ from dataclasses import dataclass, field
 from typing import TypeVar
 
 T = TypeVar("T")
-ROUNDS, LONG = 3, 2.0  # number of rounds, of which the best counts; no further round after this time [s]
+# number of rounds, of which the best counts; no further round after this time [s]
+ROUNDS = 3
+LONG = 2.0
 
 
 @dataclass(frozen=True)

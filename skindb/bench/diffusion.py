@@ -101,7 +101,8 @@ def _exact(value: float) -> float:
 
 def transport_curves(quick: bool) -> list[Curve]:
     """R(r) of a medium by model, and by moments of several degrees, from which the table is made."""
-    walk, points = _walk(quick), []
+    walk = _walk(quick)
+    points = []
     r = np.linspace(0.5, 20, 1000)
     for albedo in (0.7, 0.9) if quick else (0.3, 0.7, 0.9, 0.99):
         ratio = (1 - albedo) / albedo
@@ -142,7 +143,8 @@ def ring_mean(found: Array, middle: Array, width: float = WIDTH) -> Array:
 def rings(walk: Walk, ratio: float, middle: Array, width: float = WIDTH) -> tuple[Array, Array]:
     """R in a ring around each distance, and its relative standard error; sigma_s' = 1, sigma_a = `ratio`."""
     found = [radial_profile(walk, ratio, 1.0, np.array([r / width, r * width])) for r in middle]
-    value, error = np.concatenate([v for v, _ in found]), np.concatenate([e for _, e in found])
+    value = np.concatenate([v for v, _ in found])
+    error = np.concatenate([e for _, e in found])
     with np.errstate(invalid="ignore", divide="ignore"):
         return value, np.asarray(np.where(value > 0, error / value, np.inf))
 
@@ -162,7 +164,8 @@ def _profile(name: str, albedo: float, took: float, mean: Array, value: Array, n
 
 def probe_curves(quick: bool) -> list[Curve]:
     """sigma_tr from the fibres of the probe, by profile model, number of fibres, and known or fitted gain."""
-    walk, points = _walk(quick), []
+    walk = _walk(quick)
+    points = []
     skin = SKIN[1:4:2] if quick else SKIN
     edges = np.append(FIBRES - 0.25, FIBRES[-1] + 0.25)
     photons = [radial_profile(walk, a, s, edges) for a, s in skin]
@@ -190,10 +193,8 @@ def probe_curves(quick: bool) -> list[Curve]:
 def _fitter(model: str, free: bool, fibres: int, photons: Sequence[tuple[Array, Array]]) -> Callable[[], list[Any]]:
     def fit() -> list[Any]:
         return [
-            fit_profile(
-                FIBRES[:fibres], v[:fibres], e[:fibres], radius=0.0, eta=ETA, model=model, free_gain=free
-            )
+            fit_profile(FIBRES[:fibres], v[:fibres], e[:fibres], radius=0.0, eta=ETA, model=model, free_gain=free)
             for v, e in photons
-        ]  # fmt: skip
+        ]
 
     return fit

@@ -37,11 +37,15 @@ def nmf_curves(quick: bool) -> list[Curve]:
     reference = f"{len(X)} planted mixtures of {K} with 20 % scatter, so that the error cannot be zero"
     return [
         Curve(
-            "nmf", f"|X - W H| / |X| between {name}", reference, "a factorisation", "scikit-learn cd, 200 iterations",
+            "nmf",
+            f"|X - W H| / |X| between {name}",
+            reference,
+            "a factorisation",
+            "scikit-learn cd, 200 iterations",
             tuple(Point(method, at, took, relative_error(X, rows, metric)) for method, at, took, rows in found),
         )
         for name, metric in metrics.items()
-    ]  # fmt: skip
+    ]
 
 
 def _rng() -> np.random.Generator:

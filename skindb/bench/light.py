@@ -21,7 +21,10 @@ from skindb.optics.dipole import dipole_profile
 from skindb.optics.dipole_tree import subsurface_exitance
 from skindb.virtual.sensor import Sensor
 
-ETA, RADIUS, RECEIVERS = 1.3, 30.0, 150  # refractive index, radius of a ball [mm], points of comparison
+# refractive index, radius of a ball [mm], points of comparison
+ETA = 1.3
+RADIUS = 30.0
+RECEIVERS = 150
 SIGMA_TR = np.array([0.55, 0.98, 1.55])  # mm-1
 SKIN = (0.5, 0.3, 0.2)  # R_d
 PROFILE_REACH_MM = 25.0  # mm: beyond it the profile is below 1e-6 of its integral
@@ -34,7 +37,8 @@ def subsurface_curves(quick: bool) -> list[Curve]:
     fine = 0.4 if quick else 0.15
     fine_points, fine_areas = _ball(fine)
     fine_light = _irradiance(fine_points)
-    tree, spaced = [], []
+    tree = []
+    spaced = []
     _exitance(*_ball(20.0), 0.1)  # compiles
     for spacing in spacings:
         points, areas = _ball(spacing)
@@ -47,10 +51,12 @@ def subsurface_curves(quick: bool) -> list[Curve]:
         spaced.append(Point("every pair by NumPy", f"{spacing} mm", brute, _rms(want, best)))
         for tolerance in (0.05, 0.2) if quick else (0.02, 0.05, 0.1, 0.2, 0.4):
             took, got = cpu_time(lambda p=points, a=areas, t=tolerance: _exitance(p, a, t))  # type: ignore[misc]
-            name, at = f"skindb octree, {spacing} mm", f"tolerance {tolerance}"
+            name = f"skindb octree, {spacing} mm"
+            at = f"tolerance {tolerance}"
             tree.append(Point(name, at, took, _rms(got[:, chosen], want)))
             spaced.append(Point(name, at, took, _rms(got[:, chosen], best)))
-    base, of = f"every pair by NumPy, {spacings[0]} mm", f"{LIGHTS} lights on a ball of {RADIUS:g} mm"
+    base = f"every pair by NumPy, {spacings[0]} mm"
+    of = f"{LIGHTS} lights on a ball of {RADIUS:g} mm"
     error = "RMS error of the exitance over its RMS"
     brute_of = f"every pair of the same points ({RECEIVERS} receivers)"
     fine_of = f"every pair of points {fine} mm apart, so that the error of the spacing is included"
@@ -63,7 +69,8 @@ def subsurface_curves(quick: bool) -> list[Curve]:
 def _ball(spacing: float) -> tuple[Array, Array]:
     """Points (n, 3) of a spiral on the ball, and their areas."""
     n = round(4 * np.pi * RADIUS**2 / spacing**2)
-    z, phi = 1 - (2 * np.arange(n) + 1) / n, np.pi * (1 + 5**0.5) * (np.arange(n) + 0.5)
+    z = 1 - (2 * np.arange(n) + 1) / n
+    phi = np.pi * (1 + 5**0.5) * (np.arange(n) + 0.5)
     r = np.sqrt(1 - z * z)
     return RADIUS * np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=1), np.full(n, spacing**2)
 
@@ -99,14 +106,16 @@ def _rms(got: Array, want: Array) -> float:
 
 def disc_curves(quick: bool) -> list[Curve]:
     """Averages of tables over the disc of the light, by number of quadrature points."""
-    whole, angle = embedded_dictionary(), float(np.radians(0.8))
+    whole = embedded_dictionary()
+    angle = float(np.radians(0.8))
     table = np.ascontiguousarray(whole.table[..., 18:50:8])
     few = Dictionary(whole.names[18:50:8], table, whole.grid, whole.source)
     nodes = _nodes(whole.table.shape[:3], 150 if quick else 600)
     want = _dense_disc(few, nodes, angle, 100 if quick else 400)
     convolve_disc(few, angle, far=(1, 1), near=(1, 1))  # compiles
     points = []
-    one, four = ((1, 4), (1, 4)), ((4, 12), (4, 12))
+    one = ((1, 4), (1, 4))
+    four = ((4, 12), (4, 12))
     more = () if quick else (((2, 6), (2, 6)), ((3, 8), (3, 8)), four, ((6, 18), (6, 18)))
     rules = (one, *more, (FAR_RULE, NEAR_RULE))
     for far, near in rules:
@@ -126,7 +135,8 @@ def disc_curves(quick: bool) -> list[Curve]:
 
 def _nodes(shape: tuple[int, ...], count: int) -> tuple[NDArray[np.int64], ...]:
     """Indices of random nodes in the lobes, both directions 12 degrees above the horizon."""
-    grid, rng = embedded_dictionary().grid, np.random.default_rng(5)
+    grid = embedded_dictionary().grid
+    rng = np.random.default_rng(5)
     i, j, k = (rng.integers(0, n, 20 * count) for n in (shape[0] // 2, shape[1] * 2 // 3, shape[2]))
     wi, wo = directions(grid.theta_h[i], grid.theta_d[j], grid.phi_d[k])
     up = np.flatnonzero(np.minimum(wi[:, 2], wo[:, 2]) > 0.2)[:count]
@@ -137,7 +147,8 @@ def _dense_disc(dictionary: Dictionary, nodes: tuple[NDArray[np.int64], ...], an
     """Means (nodes, materials) over `count` spiral points on the disc around either direction."""
     grid, (i, j, k), q = dictionary.grid, nodes, np.arange(count)
     wi, wo = directions(grid.theta_h[i], grid.theta_d[j], grid.phi_d[k])
-    radius, turn = np.sqrt((q + 0.5) / count) * np.tan(angle), q * np.pi * (3 - np.sqrt(5))
+    radius = np.sqrt((q + 0.5) / count) * np.tan(angle)
+    turn = q * np.pi * (3 - np.sqrt(5))
     total = np.zeros((len(i), len(dictionary.names)))
     for a, b in ((wi, wo), (wo, wi)):
         first = np.cross(a, [0.3, 0.9, 0.1])
@@ -153,7 +164,8 @@ def _dense_disc(dictionary: Dictionary, nodes: tuple[NDArray[np.int64], ...], an
 def exposures_curves(quick: bool) -> list[Curve]:
     """Radiance over four decades from one to five exposures in steps of a factor of four."""
     side = 100 if quick else 300
-    rng, sensor = np.random.default_rng(6), Sensor()
+    rng = np.random.default_rng(6)
+    sensor = Sensor()
     record = SensorRecord(
         FrameKind(side, side, 16), sensor.black, sensor.white, sensor.read_noise, sensor.electrons_per_dn, sensor.step
     )
@@ -176,10 +188,8 @@ def exposures_curves(quick: bool) -> list[Curve]:
     one, _, flag = merge_exposures([frame], (longest,), record)
     why = f"{(flag != OK).mean():.0%} of the pixels are white or black: one exposure does not cover four decades"
     points.append(_merged("one medium exposure", 1, np.nan, one, truth, flag == OK, why))
-    label, base = (
-        "median relative error of radiance from 1e-3 to 10 (white after 1 s at 1)",
-        "skindb merge_exposures, 1 exposure",
-    )
+    label = "median relative error of radiance from 1e-3 to 10 (white after 1 s at 1)"
+    base = "skindb merge_exposures, 1 exposure"
     return [Curve("exposures", label, "radiance given to a virtual sensor", "a pixel", base, tuple(points))]
 
 

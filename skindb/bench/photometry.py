@@ -17,9 +17,12 @@ from skindb.optics.rows import basis_rows
 from skindb.schema import dataset, label
 
 Array = NDArray[np.float64]
-ETA, SCAN_ERROR = 1.3, 3.0  # degree
+# degree
+ETA = 1.3
+SCAN_ERROR = 3.0
 DOMES = ((12, 2), (16, 4), (32, 6), (64, 8), (150, 16))  # lights, cameras
-NOISE, GLOSS = 0.03, 0.1
+NOISE = 0.03
+GLOSS = 0.1
 
 
 @dataclass(frozen=True)
@@ -43,7 +46,8 @@ def _unit(v: Array) -> Array:
 
 def _spiral(n: int, top: float) -> Array:
     z = 1 - (np.arange(n) + 0.5) / n * (1 - top)
-    phi, r = np.pi * (3 - np.sqrt(5)) * np.arange(n), np.sqrt(1 - z * z)
+    phi = np.pi * (3 - np.sqrt(5)) * np.arange(n)
+    r = np.sqrt(1 - z * z)
     return np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=1)
 
 
@@ -64,9 +68,13 @@ def model_samples(
     `gloss`. Noise is relative, with `floor` [sr^-1] added in quadrature.
     """
     normal = _unit(_spiral(surfels, 0.6) + 0.05 * rng.normal(size=(surfels, 3)))
-    position, light, camera = 80 * _spiral(surfels, 0.6), 880 * _spiral(lights, 0.1), 830 * _spiral(cameras, 0.5)
-    wi, wo = _unit(light - position[:, None]), _unit(camera - position[:, None])
-    lit, seen = np.einsum("nk,ntk->nt", normal, wi), np.einsum("nk,ntk->nt", normal, wo)
+    position = 80 * _spiral(surfels, 0.6)
+    light = 880 * _spiral(lights, 0.1)
+    camera = 830 * _spiral(cameras, 0.5)
+    wi = _unit(light - position[:, None])
+    wo = _unit(camera - position[:, None])
+    lit = np.einsum("nk,ntk->nt", normal, wi)
+    seen = np.einsum("nk,ntk->nt", normal, wo)
     diffuse = np.array([0.5, 0.33, 0.24]) * rng.uniform(0.7, 1.2, (surfels, 1)) * rng.uniform(0.95, 1.05, (surfels, 3))
     table, grid = surface_lobes()
     rows, offsets, index = basis_rows(table, grid, normal, wi, wo, (lit > 0)[:, :, None] & (seen > 0)[:, None])
@@ -97,7 +105,8 @@ def model_samples(
 
 def _domes(quick: bool) -> list[tuple[str, ModelSamples]]:
     """Samples of every dome, named by their mean number per surfel."""
-    rng, made = np.random.default_rng(11), []
+    rng = np.random.default_rng(11)
+    made = []
     for lights, cameras in DOMES[1::2] if quick else DOMES:
         skin = model_samples(
             rng, surfels=60 if quick else 300, lights=lights, cameras=cameras, noise=NOISE, gloss=GLOSS
@@ -109,7 +118,8 @@ def _domes(quick: bool) -> list[tuple[str, ModelSamples]]:
 
 def normals_curves(quick: bool) -> list[Curve]:
     """Every method by size of the dome; all methods share one kernel, so the time only depends on the dome."""
-    points, domes = [], _domes(quick)
+    points = []
+    domes = _domes(quick)
     for samples, skin in domes:
         for method in normals.METHODS:
             ask: dict[str, Any] = {"eta": ETA, "scan_error": SCAN_ERROR, "method": method}
@@ -128,7 +138,8 @@ def normals_curves(quick: bool) -> list[Curve]:
 
 def albedo_curves(quick: bool) -> list[Curve]:
     """Every method by size of the dome, and the paper's rule by the number of smallest ratios that it discards."""
-    points, domes = [], _domes(quick)
+    points = []
+    domes = _domes(quick)
     for samples, skin in domes:
         points += [_albedo(skin, method, samples, method=method) for method in albedo.METHODS]
     samples, skin = domes[-1]

@@ -41,7 +41,8 @@ def plot_curve(curve: Curve, *, ax: Axes) -> Axes:
             ax.axhline(max(p.error, EXACT), color=colour, ls=":", lw=1, label=_legend(method, p))
         timed = [p for p in own if np.isfinite(p.seconds)]
         if timed:
-            x, y = [p.seconds for p in timed], [max(p.error, EXACT) for p in timed]
+            x = [p.seconds for p in timed]
+            y = [max(p.error, EXACT) for p in timed]
             marker = "x" if all(p.failure for p in timed) else "os^Dv"[i // 10 % 5]
             ax.plot(x, y, marker=marker, lw=0.4, color=colour, label=_legend(method, timed[0]))
         for p in timed:

@@ -19,7 +19,8 @@ TAKES = 87
 
 def pyramid_curves(quick: bool) -> list[Curve]:
     """Round trip of images of several sizes in both precisions, relative to a Fourier transform and its inverse."""
-    points, base = [], ""
+    points = []
+    base = ""
     for size in (256, 512) if quick else (512, 1024, 2048):
         image = np.random.default_rng(size).standard_normal((size, size))
         took, back = cpu_time(lambda x=image: np.fft.irfft2(np.fft.rfft2(x), x.shape), size**2)  # type: ignore[misc]
@@ -42,7 +43,8 @@ def textures_curves(quick: bool) -> list[Curve]:
     shift = (goal - _quantiles(image, levels))[None]
 
     def made(iterations: int) -> Array:
-        every, own = [np.ones(image.shape)], np.random.default_rng(1)
+        every = [np.ones(image.shape)]
+        own = np.random.default_rng(1)
         return synthesise(image, every, shift, iterations=iterations, levels=levels, rng=own).image
 
     points = []
@@ -92,10 +94,14 @@ def permutations_curves(quick: bool) -> list[Curve]:
 
     took, found = cpu_time(
         lambda: stats.permutation_test(
-            (values[group == 1], values[group == 0]), welch, n_resamples=most, vectorized=True, axis=0,
+            (values[group == 1], values[group == 0]),
+            welch,
+            n_resamples=most,
+            vectorized=True,
+            axis=0,
             rng=np.random.default_rng(1),
         )
-    )  # fmt: skip
+    )
     name = "SciPy permutation_test of Welch's statistic, which differs from HC3's"
     points.append(Point(name, f"{most} permutations", took, _largest(found.pvalue - exact)))
     count = "20,000" if quick else "200,000"

@@ -71,8 +71,10 @@ def run_bench(
     if "inverse" in kernels:
         require_mpmath()  # fails before the work begins
     make_private(out)
-    tell, begin = progress or (lambda *_: None), time.perf_counter()
-    points, seconds = [], {}
+    tell = progress or (lambda *_: None)
+    begin = time.perf_counter()
+    points = []
+    seconds = {}
     with threadpool_limits(1):  # waiting threads of BLAS would count as CPU time
         for i, kernel in enumerate(kernels):
             tell(f"curves: {kernel}", i, len(kernels))

@@ -22,7 +22,8 @@ from skindb.optics.fresnel import fresnel_transmittance
 from skindb.optics.rows import basis_rows, reduce_dictionary
 
 Array = NDArray[Any]
-ETA, DISC = 1.3, float(np.radians(0.8))
+ETA = 1.3
+DISC = float(np.radians(0.8))
 MIN_COSINE_SAMPLES = 0.1  # to light and camera, as in `skindb.optics.truncation`
 LINEAR = "RMS error of the surface's reflectance at the samples over its RMS"
 ROOTS = "the same error in cube-root space"
@@ -51,31 +52,38 @@ class Strip:
 def _spiral(count: int, radius: float, share: float) -> Array:
     """Points (count, 3) spread evenly over the front `share` of a sphere."""
     z = 1 - (np.arange(count) + 0.5) / count * share
-    phi, s = np.pi * (1 + 5**0.5) * np.arange(count), np.sqrt(1 - z * z)
+    phi = np.pi * (1 + 5**0.5) * np.arange(count)
+    s = np.sqrt(1 - z * z)
     return np.asarray(radius * np.stack([s * np.cos(phi), s * np.sin(phi), z], axis=-1))
 
 
 def strip(surfels: int, dictionary: Dictionary, *, noise: float = 0.05, seed: int = 0) -> Strip:
     """Samples of surfels with four random materials and a diffuse colour each; some samples are hidden."""
     rng = np.random.default_rng(seed)
-    light, camera = _spiral(150, 1000, 1.0), _spiral(16, 1200, 0.8)
+    light = _spiral(150, 1000, 1.0)
+    camera = _spiral(16, 1200, 0.8)
     side = int(np.sqrt(surfels))
-    a, b = 0.9 * (np.arange(surfels) // side) / side - 0.45, 0.9 * (np.arange(surfels) % side) / side - 0.45
+    a = 0.9 * (np.arange(surfels) // side) / side - 0.45
+    b = 0.9 * (np.arange(surfels) % side) / side - 0.45
     normal = np.stack([np.sin(b), np.sin(a) * np.cos(b), np.cos(a) * np.cos(b)], -1)
     normal += 0.01 * rng.normal(size=normal.shape)
     normal = (normal / np.linalg.norm(normal, axis=1, keepdims=True)).astype(np.float32).astype(float)
     position = (90 * normal).astype(np.float32).astype(float)
     wi, wo = ((t[None] - position[:, None]) for t in (light, camera))
-    wi, wo = wi / np.linalg.norm(wi, axis=-1, keepdims=True), wo / np.linalg.norm(wo, axis=-1, keepdims=True)
-    ci, co = np.einsum("nk,ntk->nt", normal, wi), np.einsum("nk,ntk->nt", normal, wo)
+    wi = wi / np.linalg.norm(wi, axis=-1, keepdims=True)
+    wo = wo / np.linalg.norm(wo, axis=-1, keepdims=True)
+    ci = np.einsum("nk,ntk->nt", normal, wi)
+    co = np.einsum("nk,ntk->nt", normal, wo)
     seen = (rng.random((surfels, 150, 1)) < 0.85) & (rng.random((surfels, 1, 16)) < 0.8)
     seen &= (ci > MIN_COSINE_SAMPLES)[:, :, None] & (co > MIN_COSINE_SAMPLES)[:, None]
     rows, offsets, index = basis_rows(dictionary.table, dictionary.grid, normal, wi, wo, seen)
     owner, (i, o) = np.repeat(np.arange(surfels), np.diff(offsets)), index.T
-    diffuse, weight = rng.uniform(0.2, 0.6, (surfels, 3)), np.zeros((surfels, rows.shape[1]))
+    diffuse = rng.uniform(0.2, 0.6, (surfels, 3))
+    weight = np.zeros((surfels, rows.shape[1]))
     for w in weight:
         w[rng.choice(len(w), 4, replace=False)] = rng.uniform(0, 0.4, 4)
-    c, d = ci[owner, i], co[owner, o]
+    c = ci[owner, i]
+    d = co[owner, o]
     scattered = (c * fresnel_transmittance(c, ETA) * fresnel_transmittance(d, ETA) / np.pi)[:, None] * diffuse[owner]
     true = np.einsum("tm,tm->t", rows, weight[owner])
     value = true[:, None] + scattered
@@ -119,16 +127,21 @@ def scipy_loop(made: Strip, count: int, *, channels: int, table: Array | None = 
         else:
             angles = half_difference(*(d[part] for d in made.directions))
             M = lookup(table, *angles) * made.cosine[part, None]
-        M, target = M if H is None else M @ H.T, made.target[part]
+        M = M if H is None else M @ H.T
+        target = made.target[part]
         found.append(nnls(np.repeat(M, 3, 0), target.ravel())[0] if channels == 3 else nnls(M, target.mean(1))[0])
     return np.array(found)
 
 
 def _errors(made: Strip, count: int, predict: Callable[[slice, int], Array]) -> tuple[float, float, float]:
     """Medians over surfels of the true errors, linear and in cube-root space, and of |M x - R| / |R|."""
-    linear, roots, residual = [], [], []
+    linear = []
+    roots = []
+    residual = []
     for s, part in enumerate(_parts(made, count)):
-        y, true, given = predict(part, s), made.true[part], made.target[part]
+        y = predict(part, s)
+        true = made.true[part]
+        given = made.target[part]
         linear.append(np.linalg.norm(y - true) / np.linalg.norm(true))
         roots.append(np.linalg.norm(np.cbrt(y) - np.cbrt(true)) / np.linalg.norm(np.cbrt(true)))
         residual.append(np.linalg.norm(y[:, None] - given) / np.linalg.norm(given))
@@ -172,14 +185,18 @@ def surface_curves(quick: bool) -> list[Curve]:
                 measured.append(("paper's weights used as linear weights", "rank 59", took, errors, why, more))
     return [
         Curve(
-            "surface", label, TRUTH, "a surfel", SCIPY,
+            "surface",
+            label,
+            TRUTH,
+            "a surfel",
+            SCIPY,
             tuple(
                 Point(name, at, took, errors[i], why, more | {"residual": errors[2]})
                 for name, at, took, errors, why, more in measured
             ),
         )
         for i, label in enumerate((LINEAR, ROOTS))
-    ]  # fmt: skip
+    ]
 
 
 def _cubes(made: Strip, roots: Array, weight: Array) -> Callable[[slice, int], Array]:
@@ -207,11 +224,15 @@ def refit_curves(quick: bool) -> list[Curve]:
     errors = [_errors(made, few, _mixed(made, weight @ H)) for _, _, weight in measured]
     return [
         Curve(
-            "refit", label, TRUTH + ", which four mixtures cannot represent", "a surfel", f"{SCIPY}, 4 bases",
+            "refit",
+            label,
+            TRUTH + ", which four mixtures cannot represent",
+            "a surfel",
+            f"{SCIPY}, 4 bases",
             tuple(
                 Point(name, "4 bases", took, error[i], "", {"residual": error[2]})
                 for (name, took, _), error in zip(measured, errors, strict=True)
             ),
         )
         for i, label in enumerate((LINEAR, ROOTS))
-    ]  # fmt: skip
+    ]

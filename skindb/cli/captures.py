@@ -187,7 +187,8 @@ def ingest(
     withdrawn is refused, unless --new-consent states a new consent.
     """
     if new_consent is not None and len(captures) > 1:
-        rule, cure = "a new consent is stated for one capture", "ingest one capture with it, and then the others"
+        rule = "a new consent is stated for one capture"
+        cure = "ingest one capture with it, and then the others"
         raise InputError(Fault("--new-consent", rule, f"{len(captures)} captures", cure))
     low, high = (crop_box[:3], crop_box[3:]) if crop_box else (None, None)
     crop = skindb.ingest.Crop(low, high, crop_reach) if crop_box or crop_reach else None
@@ -197,7 +198,8 @@ def ingest(
     database = skindb.open(db)
     call = partial(skindb.workflow.ingest_take, database, **options)
     work: dict[str, Any] = {"workers": workers, "scheduler": scheduler, "shared": database.folder}
-    finish, folders = partial(_ingested, database, explain=explain), [shared_path(one, scheduler) for one in captures]
+    finish = partial(_ingested, database, explain=explain)
+    folders = [shared_path(one, scheduler) for one in captures]
     with _logged(database, folders):
         done, faults = each_take(call, folders, **work, progress=progress, finish=finish)
     if faults and len(captures) > 1:

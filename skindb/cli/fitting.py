@@ -88,7 +88,9 @@ def fit(
     A model is current if it was made from the newest capture of its take. A take that fails does not stop the others.
     The same command resumes an interrupted run.
     """
-    database, progress, workflow = existing(db), bar(), skindb.workflow
+    database = existing(db)
+    progress = bar()
+    workflow = skindb.workflow
     given = {name: value for name, value in options.items() if value is not None}
     dictionary = shared_path(dictionary, scheduler)
     workflow.dictionary_at(dictionary)  # its faults are reported once, before the fits start
@@ -170,7 +172,8 @@ def _site_line(site: str, one: dict[str, Any]) -> str:
 
 def _suspect_line(one: dict[str, Any]) -> str:
     what, why = ("light", "did the face move?") if "light" in one else ("camera", "was it moved?")
-    fraction, misfit = one["outlier_fraction"], one["misfit"]
+    fraction = one["outlier_fraction"]
+    misfit = one["misfit"]
     return (
         f"  {what} {one[what]}: {fraction:.0%} of its samples are outliers, residuals {misfit:.1f} times noise ({why})"
     )

@@ -194,13 +194,15 @@ def export(
     The bundle of a take holds maps (EXR), basis BRDFs (MERL binary and npz), glTF, USD with OpenPBR, a program for
     Mitsuba 3, manifest.json and a README.txt that describes each file and its measured error.
     """
-    database, progress = existing(db), bar()
+    database = existing(db)
+    progress = bar()
     wanted = _wanted(db, takes, edited=edited)
     if options["gltf"] and out.suffix:
         writable(out, ".glb")
         _require_one(out, wanted)
     elif out.suffix in (".glb", ".gltf"):
-        rule, cure = "without --gltf it must be a folder, which gets a bundle for each take", "add --gltf, or rename it"
+        rule = "without --gltf it must be a folder, which gets a bundle for each take"
+        cure = "add --gltf, or rename it"
         raise InputError(Fault(str(out), rule, f"a name that ends in {out.suffix}", cure))
     options |= {"merl": not no_merl, "edited": edited, "progress": progress}
     call = partial(skindb.workflow.export_take, database, shared_path(out, scheduler), **options)

@@ -140,7 +140,8 @@ def analyze(
         raise InputError(
             Fault(f"analyze {what}", "needs an attribute to compare by", "none", "name it with --group-by")
         )
-    database, progress = existing(db), bar()
+    database = existing(db)
+    progress = bar()
     progress(f"analyze {what}", 0, 1)
     given = {option: options[option] for option in OPTIONS[what] if options[option] is not None}
     if "dictionary" in given:
@@ -195,7 +196,9 @@ def register(db: str, takes: tuple[str, ...], reference: str | None, workers: in
 
     The report says how well the landmarks agree.
     """
-    database, workflow, progress = existing(db), skindb.workflow, bar()
+    database = existing(db)
+    workflow = skindb.workflow
+    progress = bar()
     with client_of(scheduler, progress) as client:
         records = workflow.register_takes(
             database, takes=takes or None, reference=reference, workers=workers, client=client, progress=progress

@@ -25,10 +25,17 @@ class Progress:
 
     def __init__(self, style: str, *, plain: bool = False) -> None:
         moving = sys.stderr.isatty()
-        self.style, self.bars, self.plain = style, style == "bar" and moving, style == "bar" and plain and not moving
-        self.stage, self.first, self.last, self.said = "", 0, 0.0, (-1, 0)
+        self.style = style
+        self.bars = style == "bar" and moving
+        self.plain = style == "bar" and plain and not moving
+        self.stage = ""
+        self.first = 0
+        self.last = 0.0
+        self.said = (-1, 0)
         self.begin = self.since = time.monotonic()
-        self.take, self.takes_done, self.takes_total = "", 0, 0
+        self.take = ""
+        self.takes_done = 0
+        self.takes_total = 0
 
     def __reduce__(self) -> tuple[Callable[[], Callable[[str, int, int], None]], tuple[()]]:
         return _silent_progress, ()
@@ -38,12 +45,16 @@ class Progress:
         now = time.monotonic()
         new = stage != self.stage
         if new:
-            self.stage, self.since, self.first, self.said = stage, now, done, (-1, 0)
+            self.stage = stage
+            self.since = now
+            self.first = done
+            self.said = (-1, 0)
             if self.plain:
                 echo(stage, err=True)
         soon = now - self.last < MIN_INTERVAL_S.get(self.style, 0.0) and done < total
         if self.style == "json" and (new or not soon) and (done, total) != self.said:
-            self.last, self.said = now, (done, total)
+            self.last = now
+            self.said = (done, total)
             self._line(stage, done, total)
         elif self.bars and not soon:
             self.last = now
@@ -51,18 +62,23 @@ class Progress:
 
     def begin_takes(self, count: int, *, first: str = "") -> None:
         """Start to count finished takes; `first` is the take that is processed now, if it is known."""
-        self.begin, self.takes_done, self.takes_total, self.take = time.monotonic(), 0, count, first
+        self.begin = time.monotonic()
+        self.takes_done = 0
+        self.takes_total = count
+        self.take = first
 
     def end_take(self, take: str, *, failed: bool, following: str = "") -> None:
         """Report that a take is finished; `following` is the take that is processed next, if it is known."""
-        self.take, self.takes_done = take, self.takes_done + 1
+        self.take = take
+        self.takes_done = self.takes_done + 1
         if self.style == "json":
             self._line("failed" if failed else "finished", 1, 1)
         elif self.bars and self.takes_total > 1:
             rate, left = _pace(self.takes_done, self.takes_total, time.monotonic() - self.begin)
             pace = f"{rate:.3g} takes per minute, {left:.0f} s left"
             echo(f"take {self.takes_done} of {self.takes_total}: {pace}", err=True)
-        self.take, self.stage = following, ""
+        self.take = following
+        self.stage = ""
 
     def dashboard(self, link: str) -> None:
         """Report the address of the dashboard of a Dask cluster."""

@@ -145,7 +145,8 @@ def _placed(fault: Fault, item: str) -> Fault:
 
 def fault_lines(faults: Iterable[Fault], *, every: bool, most: int = 10) -> list[str]:
     """One line for each fault; if more than `most` break the same rule, the others are only counted unless `every`."""
-    lines, count = [], Counter[str]()
+    lines = []
+    count = Counter[str]()
     for fault in faults:
         count[fault.rule] += 1
         if every or count[fault.rule] <= most:

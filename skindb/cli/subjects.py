@@ -39,7 +39,8 @@ def consent(db: str, subject: str, scope: str | None) -> None:
     if scope is not None:
         names = [name for part in scope.split(",") if (name := part.strip())]
         if not names or ("none" in names and len(names) > 1):
-            rule, found = "must name scopes, or be the single word none", repr(scope)
+            rule = "must name scopes, or be the single word none"
+            found = repr(scope)
             raise InputError(Fault("--scope", rule, found, "for example fit,statistics"))
         names = [] if names == ["none"] else names
         skindb.workflow.record_consent(database, subject, names)
@@ -96,7 +97,9 @@ def refresh(db: str, dictionary: Path | None, wait: float, workers: int, schedul
     or withdrawn, or when a subject no longer consents to statistics. Each result is computed again with its own
     parameters.
     """
-    database, workflow, progress = existing(db), skindb.workflow, bar()
+    database = existing(db)
+    workflow = skindb.workflow
+    progress = bar()
     if dry_run:
         found = workflow.stale_results(database)
     else:
@@ -119,7 +122,8 @@ def stale_as_json(one: Refreshed) -> dict[str, Any]:
 
 
 def _line(one: Refreshed) -> str:
-    what, reasons = one.name, "; ".join(one.reasons[:3])
+    what = one.name
+    reasons = "; ".join(one.reasons[:3])
     reasons += f" and {len(one.reasons) - 3} more" if len(one.reasons) > 3 else ""
     if one.record is not None:
         return f"{what} -> {one.record.generation} ({reasons})"
@@ -163,7 +167,8 @@ def withdraw(
     A keyed mark of the pseudonym remains, so that neither interrupted runs nor the capture folder bring the subject
     back. Pictures and exports that were written earlier, and backups that are not given, are not reached.
     """
-    database, workflow = existing(db), skindb.workflow
+    database = existing(db)
+    workflow = skindb.workflow
     plan = workflow.plan_withdrawal(database, subject, backups=backups)
     if report is not None and not report.parent.is_dir():
         raise InputError(Fault(str(report), "its folder must exist", "none", f"make {report.parent}"))

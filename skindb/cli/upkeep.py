@@ -94,12 +94,14 @@ def _sample_lines(database: Database, take: str) -> list[str]:
     try:
         return [*skindb.ingest.sample_lines(samples), *aligned(skindb.ingest.sample_table(samples))]
     except (KeyError, TypeError, ValueError, AttributeError):  # a record that another program wrote
-        rule, cure = "its record must hold the number of samples of surfels", "restore it from a backup"
+        rule = "its record must hold the number of samples of surfels"
+        cure = "restore it from a backup"
         raise InputError(Fault(f"capture of {take}", rule, "a different summary", cure)) from None
 
 
 def _prediction_lines(database: Database, take: str) -> list[str]:
-    record, fit = database.record("model", take), skindb.fit
+    record = database.record("model", take)
+    fit = skindb.fit
     table = database.tables(record) if record.tables else None
     if table is None:  # a model of an earlier version of skindb
         table = fit.prediction_table(database.read("model", take)["fitted"].to_dataset())
@@ -142,7 +144,9 @@ def verify(db: str) -> None:
     Results that are out of date and garbage, to which no record refers, are listed too; they are not damage.
     """
     database = existing(db)
-    faults, garbage, stale = database.verify(), database.garbage(), skindb.workflow.stale_results(database)
+    faults = database.verify()
+    garbage = database.garbage()
+    stale = skindb.workflow.stale_results(database)
     lines = [f"out of date: {one.name}: {one.reasons[0]}" for one in stale]
     lines += [f"garbage, see skindb clean: {_garbage_line(one)}" for one in garbage]
     found = {"stale": [stale_as_json(one) for one in stale], "garbage": [asdict(one) for one in garbage]}
@@ -198,7 +202,8 @@ def clean(db: str, generations: int | None, yes: bool) -> None:
         found = skindb.workflow.clean(database, generations=generations)
     else:
         found = database.garbage(generations=generations)
-    going, kept = [one for one in found if not one.kept], [one for one in found if one.kept]
+    going = [one for one in found if not one.kept]
+    kept = [one for one in found if one.kept]
     total = sum(one.bytes for one in going)
     lines = [_garbage_line(one) for one in [*going, *kept]]
     lines.append(

@@ -68,7 +68,8 @@ def view(
         emit(skipped, [f"{take}: {line}" for take, lines in skipped.items() for line in lines])
         return
     if out is not None and out.suffix == ".html" and len(wanted) > 1:
-        found, cure = f"{len(wanted)} takes", "name a folder, or one take"
+        found = f"{len(wanted)} takes"
+        cure = "name a folder, or one take"
         raise InputError(Fault(str(out), "a file must hold one take", found, cure))
     options: dict[str, Any] = {"traits": amounts, "study": study, "dictionary": dictionary, "progress": bar()}
     options["environment"] = environment

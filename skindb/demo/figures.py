@@ -77,7 +77,8 @@ def reflectance_plot(recovered: Mapping[str, Recovery]) -> str:
     """Plot of recovered against true diffuse reflectance, for every fortieth fitted surfel of all takes."""
     ax = _axes()
     for channel, (name, colour) in enumerate(zip("RGB", colours.CHANNELS, strict=True)):
-        true, found = [], []
+        true = []
+        found = []
         for one in recovered.values():
             pick = np.flatnonzero(one.fitted)[::40]
             true.append(one.true_diffuse[pick, channel])

@@ -131,27 +131,31 @@ def crop_alike(pictures: Sequence[Picture], masks: Sequence[Mask], margin: int =
 
 def _box(mask: Mask) -> tuple[int, int, int, int] | None:
     """First row, end row, first column and end column of a face; the ends are exclusive."""
-    rows, cols = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    rows = np.flatnonzero(mask.any(axis=1))
+    cols = np.flatnonzero(mask.any(axis=0))
     return (int(rows[0]), int(rows[-1]) + 1, int(cols[0]), int(cols[-1]) + 1) if rows.size else None
 
 
 def _window(image: Picture, box: tuple[int, int, int, int] | None, rows: int, cols: int) -> Picture:
     top, bottom, left, right = box or (0, image.shape[0], 0, image.shape[1])
     padded = np.pad(image, ((rows, rows), (cols, cols), (0, 0)))
-    first_row, first_col = (top + bottom - rows) // 2 + rows, (left + right - cols) // 2 + cols
+    first_row = (top + bottom - rows) // 2 + rows
+    first_col = (left + right - cols) // 2 + cols
     return np.ascontiguousarray(padded[first_row : first_row + rows, first_col : first_col + cols])
 
 
 def half_size(image: Picture) -> Picture:
     """A picture of half the size; an odd last row or column is discarded."""
-    rows, cols = image.shape[0] // 2, image.shape[1] // 2
+    rows = image.shape[0] // 2
+    cols = image.shape[1] // 2
     mean = image[: 2 * rows, : 2 * cols].reshape(rows, 2, cols, 2, 3).mean(axis=(1, 3))
     return np.asarray(np.round(mean), np.uint8)
 
 
 def predictions(shown: Sequence[Comparison], exposure: float) -> list[Picture]:
     """Photograph, prediction and difference of each comparison side by side, all at one exposure and one scale."""
-    drawn, masks = list[Picture](), list[Mask]()
+    drawn = list[Picture]()
+    masks = list[Mask]()
     for one in shown:
         width = one.mask.shape[1]
         strip = side_by_side(one, exposure=exposure)

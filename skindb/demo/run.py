@@ -25,9 +25,13 @@ from skindb.virtual.person import default_people
 from skindb.virtual.takes import simulate_takes
 from skindb.virtual.truth import recovered_against_true
 
-HELD_OUT, SPACING = 0.1, 1.5  # fraction of lights; mm
+# fraction of lights; mm
+HELD_OUT = 0.1
+SPACING = 1.5
 MAX_WORKERS = 4  # each take of the demo needs 1.5 GB
-EDIT_CONDITION, EDIT_AMOUNTS = "lotion", (0.0, 0.25, 1.0)  # 0 and 1 correspond to measured takes of one subject
+# 0 and 1 correspond to measured takes of one subject
+EDIT_CONDITION = "lotion"
+EDIT_AMOUNTS = (0.0, 0.25, 1.0)
 
 
 def run_demo(
@@ -70,7 +74,8 @@ def run_demo(
     """
     _remove_earlier_demo(out)
     tell = progress or silent
-    results, db = Results(), Database(out / "db")
+    results = Results()
+    db = Database(out / "db")
     make = partial(_make_take, out=out, cameras=cameras, lights=lights, seed=seed)
     results.add(make(0, progress=tell))  # first and alone, as it compiles the kernels that the others use
     if takes > 1:
@@ -127,7 +132,8 @@ def _remove_earlier_demo(out: Path) -> None:
 
 def _make_take(i: int, *, out: Path, cameras: int, lights: int, seed: int, progress: Progress | None = None) -> Results:
     """Simulate, ingest and fit a virtual take, and compare the model with its photographs and its true values."""
-    results, db = Results(), Database(out / "db")
+    results = Results()
+    db = Database(out / "db")
     with results.stage("simulate"):
         (folder,) = simulate_takes(
             out / "captures", takes=[i], cameras=cameras, lights=lights, seed=seed, progress=progress
@@ -152,6 +158,7 @@ def _edit(results: Results, db: Database) -> None:
     pairs = [take for take in results.models if f"{take}.{EDIT_CONDITION}" in results.models]
     if "traits" not in results.studies or not pairs:
         return
-    results.edited_take, results.target_take = pairs[0], f"{pairs[0]}.{EDIT_CONDITION}"
+    results.edited_take = pairs[0]
+    results.target_take = f"{pairs[0]}.{EDIT_CONDITION}"
     for amount in EDIT_AMOUNTS:
         results.edits[amount] = workflow.edit(db, results.edited_take, {EDIT_CONDITION: amount})

@@ -30,7 +30,8 @@ def subjects_section(results: Results, portraits: Portraits) -> list[str]:
         "and the relative error of samples under lights that the fit did not use."
     )
     drawn = portraits.cut(portraits.images)
-    maps, strips = map_pictures(results.models), _strips(results)
+    maps = map_pictures(results.models)
+    strips = _strips(results)
     bodies = []
     for values in tables.subject_table(results).rows:
         record = dict(zip(tables.SUBJECT_HEADER, values, strict=True))

@@ -14,10 +14,21 @@ from skindb.schema import FitStatus
 
 ERROR_COLUMNS = ("relative_rmse", "psnr", "ssim", "delta_e_median")
 SUBJECT_HEADER = (
-    "take", "age", "gender", "ancestry", "condition", "surfels", "fitted_surfels", "fitted_percent",
-    "normal_median_deg", "normal_95_deg", "diffuse_red_percent", "diffuse_green_percent", "diffuse_blue_percent",
+    "take",
+    "age",
+    "gender",
+    "ancestry",
+    "condition",
+    "surfels",
+    "fitted_surfels",
+    "fitted_percent",
+    "normal_median_deg",
+    "normal_95_deg",
+    "diffuse_red_percent",
+    "diffuse_green_percent",
+    "diffuse_blue_percent",
     "held_out_percent",
-)  # fmt: skip
+)
 
 
 def status_counts(model: xr.DataTree) -> dict[FitStatus, int]:
@@ -30,7 +41,8 @@ def subject_table(results: Results) -> Table:
     """One row per take: attributes, number of fitted surfels, and median errors against the truth."""
     rows = []
     for take, model in results.models.items():
-        counts, traits = status_counts(model), dict(model.attrs.get("traits", {}))
+        counts = status_counts(model)
+        traits = dict(model.attrs.get("traits", {}))
         total = sum(counts.values())
         about = [traits.get(name, "") for name in ("age", "gender", "ancestry")]
         fitted = [total, counts[FitStatus.FITTED], 100 * counts[FitStatus.FITTED] / total]

@@ -35,14 +35,38 @@ from skindb.schema.consent import require_consent
 from skindb.schema.plain import plain
 
 PROVENANCE = (
-    "schema_version", "software_version", "command", "parameters", "seeds", "inputs", "subject", "condition", "session",
-    "mode", "rank", "k", "eta", "held_out_lights", "held_out_cameras", "generation", "edit", "edit_distance",
-)  # fmt: skip
+    "schema_version",
+    "software_version",
+    "command",
+    "parameters",
+    "seeds",
+    "inputs",
+    "subject",
+    "condition",
+    "session",
+    "mode",
+    "rank",
+    "k",
+    "eta",
+    "held_out_lights",
+    "held_out_cameras",
+    "generation",
+    "edit",
+    "edit_distance",
+)
 ERRORS = (
-    "fit_residual", "fit_residual_perceptual", "dictionary_residual", "held_out_error", "held_out_camera_error",
-    "kkt_residual", "normal_disagreement", "diffuse_reflectance_error", "diffuse_reflectance_total_error",
-    "normal_total_error", "surface_reflectance_error",
-)  # fmt: skip
+    "fit_residual",
+    "fit_residual_perceptual",
+    "dictionary_residual",
+    "held_out_error",
+    "held_out_camera_error",
+    "kkt_residual",
+    "normal_disagreement",
+    "diffuse_reflectance_error",
+    "diffuse_reflectance_total_error",
+    "normal_total_error",
+    "surface_reflectance_error",
+)
 # standard_error is from the errors of the fibres; total_error includes the error of the model of the profile
 SITE_FIGURES = {
     "sigma_tr": "site_sigma_tr",
@@ -100,7 +124,8 @@ def export_bundle(
     try:
         make_private(staged)
     except OSError as error:
-        rule, found = "must be a folder that can be created", error.strerror or str(error)
+        rule = "must be a folder that can be created"
+        found = error.strerror or str(error)
         raise InputError(Fault(str(target), rule, found, "choose another folder")) from None
     try:
         described = _write_parts(model, staged, size, merl, tell)
@@ -119,7 +144,8 @@ def export_bundle(
 def merl_table(table: NDArray[np.float32]) -> NDArray[np.float64]:
     """One component (nh, nd, np) resampled to the bin centres of MERL, (90, 90, 180, 3), with equal channels."""
     h = (np.arange(90) + 0.5) ** 2 / 90**2 * np.pi / 2
-    d, p = (np.arange(90) + 0.5) / 90 * np.pi / 2, (np.arange(180) + 0.5) / 180 * np.pi
+    d = (np.arange(90) + 0.5) / 90 * np.pi / 2
+    p = (np.arange(180) + 0.5) / 180 * np.pi
     values = lookup(table[..., None], *np.meshgrid(h, d, p, indexing="ij"))
     return np.repeat(np.asarray(values, np.float64), 3, axis=-1)
 

@@ -17,8 +17,10 @@ from skindb.export.edited import describe_edit
 from skindb.export.textures import Skin, skin_of
 from skindb.schema.consent import require_consent
 
-FLOAT, UNSIGNED_INT = 5126, 5125
-VERTEX_BUFFER, INDEX_BUFFER = 34962, 34963
+FLOAT = 5126
+UNSIGNED_INT = 5125
+VERTEX_BUFFER = 34962
+INDEX_BUFFER = 34963
 MM = 1e-3  # glTF's unit is the metre
 
 
@@ -60,7 +62,8 @@ def export_gltf(
 
 def _document(textures: dict[str, bytes], extras: dict[str, Any], skin: Skin) -> tuple[dict[str, Any], bytes]:
     """The JSON document of the scene, and the binary data to which it refers."""
-    shape, material = skin.shape, _material(extras, skin)
+    shape = skin.shape
+    material = _material(extras, skin)
     take = str(extras["take"])  # in all names, because programs merge what has the same name in several files
     position = shape.position * np.float32(MM)
     blocks = {
@@ -71,7 +74,8 @@ def _document(textures: dict[str, bytes], extras: dict[str, Any], skin: Skin) ->
         "indices": (shape.triangles.astype(np.uint32).reshape(-1), INDEX_BUFFER, UNSIGNED_INT, "SCALAR"),
     }
     views: list[dict[str, int]] = []
-    body, accessors = b"", []
+    body = b""
+    accessors = []
     for array, target, component, kind in blocks.values():
         accessors.append({"bufferView": len(views), "componentType": component, "count": len(array), "type": kind})
         body = _append(body, views, array.tobytes(), target=target)

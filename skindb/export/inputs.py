@@ -11,17 +11,26 @@ from skindb.errors import Fault, InputError
 from skindb.schema import check
 
 REQUIRED = (
-    "surfel_position", "surfel_normal", "surfel_uv", "shading_normal", "diffuse_reflectance", "basis_weight",
-    "fit_status", "refractive_index",
-)  # fmt: skip
+    "surfel_position",
+    "surfel_normal",
+    "surfel_uv",
+    "shading_normal",
+    "diffuse_reflectance",
+    "basis_weight",
+    "fit_status",
+    "refractive_index",
+)
 TEXELS_PER_SPACING = 1.5  # texels per spacing of surfels; more would only show interpolation, less would lose detail
-MIN_SIZE, MAX_SIZE = 64, 8192  # of the default
+# of the default
+MIN_SIZE = 64
+MAX_SIZE = 8192
 BYTES_PER_TEXEL = 220  # of memory while maps of 30 channels are computed (measured: 190)
 
 
 def texture_size(model: xr.DataTree) -> int:
     """Texels along each side of maps without loss: 1.5 per spacing of the surfels, rounded up to a power of two."""
-    uv, triangles = model["fitted"].to_dataset()["surfel_uv"].values, model["mesh"].to_dataset()["triangle"].values
+    uv = model["fitted"].to_dataset()["surfel_uv"].values
+    triangles = model["mesh"].to_dataset()["triangle"].values
     corners = uv.astype(np.float64)[triangles]
     edge = np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1))
     wanted = TEXELS_PER_SPACING / max(float(edge), 1e-6)
@@ -39,9 +48,11 @@ def chosen_size(model: xr.DataTree, size: int | None) -> int:
     side = texture_size(model) if size is None else size
     if side < 1:
         raise InputError(Fault("size", "must be positive", str(side), "omit it"))
-    needed, free = BYTES_PER_TEXEL * side**2, _free_memory()
+    needed = BYTES_PER_TEXEL * side**2
+    free = _free_memory()
     if needed > free:
-        rule, cure = f"maps of {side} x {side} texels need {needed / 1e9:.1f} GB of memory", "choose a smaller size"
+        rule = f"maps of {side} x {side} texels need {needed / 1e9:.1f} GB of memory"
+        cure = "choose a smaller size"
         raise InputError(Fault("size", rule, f"{free / 1e9:.1f} GB", f"{cure}, for example {texture_size(model)}"))
     return side
 
@@ -68,7 +79,8 @@ def required(model: xr.DataTree) -> xr.Dataset:
     check(fitted, REQUIRED, where="fitted")
     corner = fitted["surfel_uv"].values[model["mesh"].to_dataset()["triangle"].values].astype(np.float64)
     if not np.isfinite(corner).all() or not np.ptp(corner, axis=1).any():
-        rule, cure = "texture coordinates must be finite and cover an area", "ingest and fit the capture again"
+        rule = "texture coordinates must be finite and cover an area"
+        cure = "ingest and fit the capture again"
         found = "values that are not finite" if not np.isfinite(corner).all() else "no triangle with an area"
         raise InputError(Fault("fitted[surfel_uv]", rule, found, cure))
     return fitted

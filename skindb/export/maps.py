@@ -56,7 +56,8 @@ def atlas_images(
     model: xr.DataTree, columns: dict[str, NDArray[np.float32]], trust: NDArray[np.float32], *, size: int
 ) -> tuple[Image, dict[str, int]]:
     """Texels (size, size, c) of concatenated values (n, c) at the surfels, and the number of channels of each name."""
-    uv, triangles = model["fitted"].to_dataset()["surfel_uv"].values, model["mesh"].to_dataset()["triangle"].values
+    uv = model["fitted"].to_dataset()["surfel_uv"].values
+    triangles = model["mesh"].to_dataset()["triangle"].values
     atlas = Atlas(uv, triangles, rasterise_atlas(uv, triangles, size))
     image, _ = _spread(np.concatenate(list(columns.values()), axis=1), trust, atlas)
     return image, {name: values.shape[1] for name, values in columns.items()}
@@ -92,7 +93,8 @@ def texture_maps(model: xr.DataTree, *, size: int | None = None) -> dict[str, Te
     """
     fitted = required(model)
     trust = surfel_confidence(fitted)
-    uv, triangles = fitted["surfel_uv"].values, model["mesh"].to_dataset()["triangle"].values
+    uv = fitted["surfel_uv"].values
+    triangles = model["mesh"].to_dataset()["triangle"].values
     atlas = Atlas(uv, triangles, rasterise_atlas(uv, triangles, chosen_size(model, size)))
     columns, layout = _columns(fitted, triangles)
     image, confidence = _spread(columns, trust, atlas)
@@ -112,10 +114,12 @@ def _spread(columns: NDArray[Any], trust: NDArray[np.float32], atlas: Atlas) -> 
 def _columns(fitted: xr.Dataset, triangles: NDArray[Any]) -> tuple[NDArray[Any], dict[str, slice]]:
     """Concatenated values (n, c) that every trusted surfel has, and the columns of each variable."""
     parts = {name: fitted[name].values for name in ("diffuse_reflectance", "shading_normal", "basis_weight")}
-    mesh, uv = fitted["surfel_normal"].values.astype(np.float64), fitted["surfel_uv"].values
+    mesh = fitted["surfel_normal"].values.astype(np.float64)
+    uv = fitted["surfel_uv"].values
     frames = tangent_frames(fitted["surfel_position"].values, mesh, uv, triangles)
     parts["tangent"] = to_tangent_space(parts["shading_normal"], mesh, frames).astype(np.float32)
-    layout, start = {}, 0
+    layout = {}
+    start = 0
     for name, part in parts.items():
         layout[name] = slice(start, start + part.shape[1])
         start += part.shape[1]
@@ -126,7 +130,8 @@ def _translucency(fitted: xr.Dataset, trust: NDArray[np.float32], atlas: Atlas) 
     """Maps of the channels that are known at any trusted surfel, each filled separately; empty if there are none."""
     if "sigma_tr" not in fitted:
         return {}
-    sigma_tr, diffuse = fitted["sigma_tr"].values, fitted["diffuse_reflectance"].values
+    sigma_tr = fitted["sigma_tr"].values
+    diffuse = fitted["diffuse_reflectance"].values
     sigma_tr = np.where(sigma_tr > 0, sigma_tr, np.nan)
     path = mean_free_path(diffuse, sigma_tr, eta=float(fitted["refractive_index"])).astype(np.float32)
     values: dict[str, NDArray[Any]] = {"translucency": 1 / sigma_tr, "mean_free_path": path}

@@ -12,7 +12,8 @@ from skindb.optics.diffuse import dipole_s
 Float = NDArray[np.floating[Any]]
 # mean free path of the walk over that of the dipole, s / sigma_tr, is this constant plus this factor times R_d. Fitted
 # to the edge of a shadow for R_d from 0.02 to 0.9 and an index of 1.3, within 3 %; within 20 % for an index of 1.45
-CONSTANT, FACTOR = 1.7, 0.4
+CONSTANT = 1.7
+FACTOR = 0.4
 
 
 def mean_free_path(diffuse: Float, sigma_tr: Float, *, eta: float) -> Float:

@@ -11,7 +11,8 @@ import xarray as xr
 from skindb._files import make_private, private_file
 from skindb.export.textures import shading_normals
 
-MESH, PROGRAM = "face.ply", "skin.py"
+MESH = "face.ply"
+PROGRAM = "skin.py"
 
 
 def export_mitsuba(model: xr.DataTree, folder: Path) -> None:
@@ -27,7 +28,8 @@ def export_mitsuba(model: xr.DataTree, folder: Path) -> None:
     make_private(folder)
     program = resources.files("skindb.export") / "mitsuba" / f"{PROGRAM}.txt"
     private_file(folder / PROGRAM).write_text(program.read_text(encoding="utf-8"), encoding="utf-8")
-    fitted, triangles = model["fitted"].to_dataset(), model["mesh"].to_dataset()["triangle"].values
+    fitted = model["fitted"].to_dataset()
+    triangles = model["mesh"].to_dataset()["triangle"].values
     columns = [fitted["surfel_position"].values, shading_normals(fitted), fitted["surfel_uv"].values]
     vertices = np.concatenate(columns, axis=1).astype("<f4")
     names = ("x", "y", "z", "nx", "ny", "nz", "u", "v")

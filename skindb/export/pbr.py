@@ -77,17 +77,21 @@ def fit_material(tables: NDArray[np.float32], diffuse: Float, weights: Float, *,
 
 def _fit_lobe(pairs: _Pairs, parts: Float, amounts: Float, base: Float) -> tuple[Float, Float, Float]:
     """a, b and roughness (n,) for base colours (n, 3), where the model is `amounts` (3, n, m) of `parts` (pairs, m)."""
-    use, rise = pairs.weight * pairs.cos_i**2, (1 - pairs.cos_d) ** 5
+    use = pairs.weight * pairs.cos_i**2
+    rise = (1 - pairs.cos_d) ** 5
     matt = np.stack([np.ones_like(rise), rise], axis=1) / np.pi
     of_matt = parts.T @ (use[:, None] * matt)
-    found, best = np.zeros((len(base), 3)), np.full(len(base), -np.inf)
+    found = np.zeros((len(base), 3))
+    best = np.full(len(base), -np.inf)
     for roughness in ROUGHNESS:
         lobe = _ggx(np.full((1, 1), roughness**4), pairs.cos_i, pairs.cos_o, pairs.cos_h)[0]
         gloss = lobe[:, None] * matt * np.pi
         squares = [one.T @ (use[:, None] * other) for one, other in ((gloss, gloss), (gloss, matt), (matt, matt))]
         of_gloss = parts.T @ (use[:, None] * gloss)
-        flat_gloss, flat_matt = (matt[:, 0] * use) @ gloss, (matt[:, 0] * use) @ matt
-        gram, rhs = np.zeros((len(base), 2, 2)), np.zeros((len(base), 2))
+        flat_gloss = (matt[:, 0] * use) @ gloss
+        flat_matt = (matt[:, 0] * use) @ matt
+        gram = np.zeros((len(base), 2, 2))
+        rhs = np.zeros((len(base), 2))
         for c in range(3):  # the three channels share the lobe
             own = base[:, c, None]
             cross = squares[1] + squares[1].T
@@ -105,7 +109,9 @@ def _best_pair(gram: Float, rhs: Float) -> tuple[Float, Float]:
 
     The constraints are that the sum of x is at most 1, and f0 at most MAX_F0.
     """
-    a, b, d = gram[:, 0, 0], gram[:, 0, 1], gram[:, 1, 1]
+    a = gram[:, 0, 0]
+    b = gram[:, 0, 1]
+    d = gram[:, 1, 1]
     p, q = rhs.T
     zero = np.zeros_like(p)
     determinant = np.maximum(a * d - b * b, 1e-30)
@@ -119,7 +125,8 @@ def _best_pair(gram: Float, rhs: Float) -> tuple[Float, Float]:
         (zero, np.clip(q / np.maximum(d, 1e-30), 0, 1)),
         (edge, 1 - edge),
     ]
-    best, gain = np.zeros_like(rhs), zero.copy()
+    best = np.zeros_like(rhs)
+    gain = zero.copy()
     for x, y in candidates:
         fall = 2 * (x * p + y * q) - (a * x * x + 2 * b * x * y + d * y * y)
         better = (x >= 0) & (y >= ratio * x * (1 - 1e-9)) & (x + y <= 1 + 1e-9) & (fall > gain)
@@ -130,9 +137,12 @@ def _best_pair(gram: Float, rhs: Float) -> tuple[Float, Float]:
 
 def _fit_base(pairs: _Pairs, parts: Float, amounts: Float, low: Float, high: Float, roughness: Float) -> Float:
     """Base colours (n, 3), from 0 to 1, for given lobes (n,)."""
-    use, rise = pairs.weight * pairs.cos_i**2, (1 - pairs.cos_d) ** 5
+    use = pairs.weight * pairs.cos_i**2
+    rise = (1 - pairs.cos_d) ** 5
     moment = [float((use * rise**i).sum()) / np.pi**2 for i in range(3)]
-    constant, slope = 1 - low, -high  # 1 - F = constant + slope rise
+    # 1 - F = constant + slope rise
+    constant = 1 - low
+    slope = -high
     square = constant**2 * moment[0] + 2 * constant * slope * moment[1] + slope**2 * moment[2]
     of_flat, of_rise = (parts.T @ (use * one) / np.pi for one in (np.ones_like(rise), rise))
     gloss = np.zeros((len(low), 3))
@@ -171,7 +181,8 @@ def approximation_error(
     through = fresnel_transmittance(pairs.cos_i, eta) * fresnel_transmittance(pairs.cos_o, eta) / np.pi
     ours = diffuse[:, None, :] * through[:, None] + (weights @ lookup(tables, *pairs.angles).T)[..., None]
     theirs = gltf_brdf(values, pairs.cos_i, pairs.cos_o, pairs.cos_h, pairs.cos_d)
-    ours, theirs = ours * pairs.cos_i[:, None], theirs * pairs.cos_i[:, None]
+    ours = ours * pairs.cos_i[:, None]
+    theirs = theirs * pairs.cos_i[:, None]
     return {
         "relative_rms": _relative(ours, theirs, pairs.weight),
         "relative_rms_perceptual": _relative(np.cbrt(ours), np.cbrt(theirs), pairs.weight),
@@ -205,12 +216,14 @@ def _relative(ours: Float, theirs: Float, weight: Float) -> float:
 
 def _pairs() -> _Pairs:
     theta_h = (np.arange(45) + 0.5) ** 2 / 45**2 * np.pi / 2
-    theta_d, phi_d = np.radians(np.arange(4, 88, 7.0)), np.radians(np.arange(15, 180, 30.0))
+    theta_d = np.radians(np.arange(4, 88, 7.0))
+    phi_d = np.radians(np.arange(15, 180, 30.0))
     angles = tuple(x.ravel() for x in np.meshgrid(theta_h, theta_d, phi_d, indexing="ij"))
     wi, wo = directions(*angles)
     above = (wi[:, 2] > 0.05) & (wo[:, 2] > 0.05)
     h, d, p = (x[above] for x in angles)
-    cos_i, cos_o = wi[above, 2], wo[above, 2]
+    cos_i = wi[above, 2]
+    cos_o = wo[above, 2]
     # d omega_i d omega_o = 4 cos(theta_d) d omega_h d omega_d, d theta_h = 2 sqrt(theta_h) d sqrt(theta_h)
     weight = np.cos(d) * np.sin(d) * np.sin(h) * np.sqrt(h) * cos_o
     return _Pairs((h, d, p), cos_i, cos_o, np.cos(h), np.cos(d), weight)

@@ -97,7 +97,8 @@ def _errors(manifest: Mapping[str, Any]) -> list[str]:
         "(median)",
     )
     usd = manifest["files"]["usd/face.usda"]
-    error, preview = usd["approximation_error"], usd["approximation_error_of_preview"]
+    error = usd["approximation_error"]
+    preview = usd["approximation_error_of_preview"]
     lines += _item(
         "mitsuba/skin.py",
         "pictures differ from those of skindb without subsurface transport by about 1%, because of the size of texels",

@@ -25,8 +25,10 @@ def tangent_frames(
     triangles
         (f, 3) indices of vertices.
     """
-    corner, place = position[triangles].astype(np.float64), uv[triangles].astype(np.float64)
-    edge, step = corner[:, 1:] - corner[:, :1], place[:, 1:] - place[:, :1]
+    corner = position[triangles].astype(np.float64)
+    place = uv[triangles].astype(np.float64)
+    edge = corner[:, 1:] - corner[:, :1]
+    step = place[:, 1:] - place[:, :1]
     area = step[:, 0, 0] * step[:, 1, 1] - step[:, 1, 0] * step[:, 0, 1]
     regular = np.abs(area) > 1e-20
     scale = np.where(regular, 1 / np.where(regular, area, 1.0), 0.0)[:, None]

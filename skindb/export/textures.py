@@ -66,8 +66,10 @@ def skin_of(model: xr.DataTree, *, size: int | None = None) -> Skin:
         If no surfel was fitted.
     """
     fitted = required(model)
-    eta, mesh = float(fitted["refractive_index"]), model["mesh"].to_dataset()
-    trust, tables = surfel_confidence(fitted), kernel_tables(model["basis"].to_dataset())
+    eta = float(fitted["refractive_index"])
+    mesh = model["mesh"].to_dataset()
+    trust = surfel_confidence(fitted)
+    tables = kernel_tables(model["basis"].to_dataset())
     known = np.flatnonzero(trust > 0)
     diffuse, weights = (fitted[name].values[known] for name in ("diffuse_reflectance", "basis_weight"))
     skin = fit_material(tables, diffuse, weights, eta=eta)
@@ -115,7 +117,8 @@ class Shape:
 
 
 def _shape(fitted: xr.Dataset, triangles: NDArray[Any]) -> Shape:
-    place, uv = fitted["surfel_position"].values, fitted["surfel_uv"].values.astype(np.float32)
+    place = fitted["surfel_position"].values
+    uv = fitted["surfel_uv"].values.astype(np.float32)
     normal, shading = (_unit(fitted, name) for name in ("surfel_normal", "shading_normal"))
     tangent = tangent_frames(place, normal, uv, triangles)
     return Shape(place.astype(np.float32), normal, shading, tangent, uv, triangles)
@@ -167,7 +170,8 @@ def _textures(values: dict[str, NDArray[np.float32]]) -> dict[str, NDArray[np.ui
         "normal": _eight_bits(0.5 * bent + 0.5),
     }
     if "passed" in values:
-        colour, strength = _eight_bits(encode_srgb(values["passed"])), _eight_bits(values["strength"])
+        colour = _eight_bits(encode_srgb(values["passed"]))
+        strength = _eight_bits(values["strength"])
         pictures["diffuseTransmission"] = np.concatenate([colour, strength], axis=-1)
     return pictures
 
@@ -183,7 +187,8 @@ def _normal_error(picture: NDArray[np.uint8], shape: Shape, known: NDArray[np.in
     bent = np.stack(
         [ndimage.map_coordinates(picture[..., c] / 127.5 - 1, at, order=1, mode="nearest") for c in range(3)], 1
     )
-    normal, tangent = shape.normal[known], shape.tangent[known]
+    normal = shape.normal[known]
+    tangent = shape.tangent[known]
     bitangent = np.cross(normal, tangent[:, :3]) * tangent[:, 3:]
     found = bent[:, :1] * tangent[:, :3] + bent[:, 1:2] * bitangent + bent[:, 2:] * normal
     found /= np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-9)

@@ -123,8 +123,10 @@ def _materialx(inputs: Mapping[str, tuple[str, str | float]]) -> str:
 
 
 def _usda(model: xr.DataTree, inputs: Mapping[str, tuple[str, str | float]], ior: float) -> str:
-    fitted, mesh = model["fitted"].to_dataset(), model["mesh"].to_dataset()
-    place, triangles = fitted["surfel_position"].values.astype(np.float32), mesh["triangle"].values
+    fitted = model["fitted"].to_dataset()
+    mesh = model["mesh"].to_dataset()
+    place = fitted["surfel_position"].values.astype(np.float32)
+    triangles = mesh["triangle"].values
     uv = fitted["surfel_uv"].values.astype(np.float64) * [1, -1] + [0, 1]  # v increases upwards in USD
     extent = _vectors(np.stack([place.min(axis=0), place.max(axis=0)]))
     shaders = [*_openpbr(inputs), *_preview(ior)]
@@ -214,9 +216,12 @@ def _preview(ior: float) -> list[str]:
         ("PreviewRoughness", "roughness.png", "raw", "float outputs:r"),
         ("PreviewNormal", "normal.png", "raw", "float3 outputs:rgb"),
     ):
-        lines = [f"asset inputs:file = @{file}@", f'token inputs:sourceColorSpace = "{space}"',
-                 *(f'token inputs:wrap{axis} = "clamp"' for axis in "ST"),
-                 f"float2 inputs:st.connect = <{path}/PreviewCoordinates.outputs:result>"]  # fmt: skip
+        lines = [
+            f"asset inputs:file = @{file}@",
+            f'token inputs:sourceColorSpace = "{space}"',
+            *(f'token inputs:wrap{axis} = "clamp"' for axis in "ST"),
+            f"float2 inputs:st.connect = <{path}/PreviewCoordinates.outputs:result>",
+        ]
         if name == "PreviewNormal":
             lines += ["float4 inputs:scale = (2, 2, 2, 1)", "float4 inputs:bias = (-1, -1, -1, 0)"]
         found.append(_shader(name, "UsdUVTexture", [*lines, output]))

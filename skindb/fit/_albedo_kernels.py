@@ -34,12 +34,18 @@ MEAN_TO_SIGMA = 1.2533  # standard deviation over mean absolute deviation of nor
 MIN_BEND = 0.3  # mean slope of the influence function over mean weight, 0.86 for normal noise; reliable above this
 NOISE_FLOOR_ALBEDO = 0.01  # sr^-1; the errors of darker samples are not proportional to their value
 MIN_RELATIVE_SCALE = 0.005  # differences by rounding must not produce outliers
-SLOPE_STEPS, LOBE_STEPS = 5, 4  # number of reweighting steps
+# number of reweighting steps
+SLOPE_STEPS = 5
+LOBE_STEPS = 4
 ROWS_PER_SUM = 64  # rows summed in single precision before they are added in double
-LOBES, SHAPE, COLUMNS = 6, 6, 8  # columns of the rows: lobes, then the diffuse shape, then padding
+# columns of the rows: lobes, then the diffuse shape, then padding
+LOBES = 6
+SHAPE = 6
+COLUMNS = 8
 MAX_SAMPLE = 1e6  # sr^-1
 MIN_SINE = 1e-3  # of the angle of the half vector; the lobes are flat below it
-ZERO, ONE = np.float32(0), np.float32(1)
+ZERO = np.float32(0)
+ONE = np.float32(1)
 
 
 class Separation(NamedTuple):
@@ -68,10 +74,23 @@ def separation_memory(most: int) -> Any:
     """Buffers for up to `most` samples of a surfel."""
     v = np.empty((10, most), np.float32)
     return Separation(
-        v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7], v[8], v[9], np.zeros(2 * COLUMNS, np.float32),
-        np.empty((COLUMNS, COLUMNS)), np.empty(COLUMNS), np.zeros(COLUMNS), active_set_memory(COLUMNS),
+        v[0],
+        v[1],
+        v[2],
+        v[3],
+        v[4],
+        v[5],
+        v[6],
+        v[7],
+        v[8],
+        v[9],
+        np.zeros(2 * COLUMNS, np.float32),
+        np.empty((COLUMNS, COLUMNS)),
+        np.empty(COLUMNS),
+        np.zeros(COLUMNS),
+        active_set_memory(COLUMNS),
         np.empty((LANES + 1, LANES), np.float32),
-    )  # fmt: skip
+    )
 
 
 @fast_kernel
@@ -82,16 +101,21 @@ def robust_slope(x: Any, y: Any, weight: Any, residual: Any, n: int) -> tuple[fl
     """
     for i in range(n):
         weight[i] = ONE
-    found, norm, inverse = 0.0, 1.0, ZERO
+    found = 0.0
+    norm = 1.0
+    inverse = ZERO
     for step in range(SLOPE_STEPS):
-        xx, xy = ZERO, ZERO
+        xx = ZERO
+        xy = ZERO
         for i in range(n):
             wx = weight[i] * x[i]
             xx += wx * x[i]
             xy += wx * y[i]
         norm = max(np.float64(xx), 1e-12)
         found = np.float64(xy) / norm
-        slope, absolute, total = np.float32(found), ZERO, ZERO
+        slope = np.float32(found)
+        absolute = ZERO
+        total = ZERO
         for i in range(n):
             residual[i] = y[i] - slope * x[i]
             absolute += weight[i] * abs(residual[i])
@@ -102,7 +126,8 @@ def robust_slope(x: Any, y: Any, weight: Any, residual: Any, n: int) -> tuple[fl
             for i in range(n):
                 u = ONE - residual[i] * residual[i] * inverse
                 weight[i] = u * u if u > ZERO else ZERO
-    meat, bend = ZERO, ZERO
+    meat = ZERO
+    bend = ZERO
     for i in range(n):
         u = residual[i] * residual[i] * inverse
         # with x squared, as noise that grows with x is downweighted most where x has the largest weight
@@ -134,7 +159,9 @@ def _weigh(n: int, noise: Any, s: Any) -> tuple[float, float]:
 
     Residuals are relative to the prediction, or to the noise where that exceeds MODEL_ERROR of the prediction.
     """
-    floor, absolute, total = np.float32(NOISE_FLOOR_ALBEDO), ZERO, ZERO
+    floor = np.float32(NOISE_FLOOR_ALBEDO)
+    absolute = ZERO
+    total = ZERO
     factor = np.float32(1.0 / (3.0 * MODEL_ERROR**2))  # the mean of three channels has a third of the variance
     for i in range(n):
         level = s.predicted[i] if s.predicted[i] > floor else floor
@@ -143,7 +170,9 @@ def _weigh(n: int, noise: Any, s: Any) -> tuple[float, float]:
         absolute += s.keep[i] * abs(s.residual[i])
         total += s.keep[i]
     scale = MEAN_TO_SIGMA * np.float64(absolute) / max(np.float64(total), 1e-12) + MIN_RELATIVE_SCALE
-    inverse, kept, slope = np.float32(1.0 / (TUKEY * scale) ** 2), ZERO, ZERO
+    inverse = np.float32(1.0 / (TUKEY * scale) ** 2)
+    kept = ZERO
+    slope = ZERO
     for i in range(n):
         u = s.residual[i] * s.residual[i] * inverse
         inside = u < ONE
@@ -190,13 +219,16 @@ def fit_shape(rows: Any, n: int, noise: Any, s: Any) -> tuple[float, float]:
         s.keep[i], s.weight[i] = ONE, ONE / (level * level)
         s.aim[i] = s.weight[i] * s.mean[i]
     s.x[:] = 0.0
-    kept, slope = 1.0, 1.0
+    kept = 1.0
+    slope = 1.0
     for _ in range(LOBE_STEPS):
         _normal_equations(rows, n, s)
         solve_scaled(s.gram, s.right, s.x, 1e-10, 6 * COLUMNS, s.active_set)
         _predict(rows, n, s.x, 0, s, s.predicted)
         kept, slope = _weigh(n, noise, s)
-    active, k, place = np.empty(COLUMNS, np.int64), 0, -1
+    active = np.empty(COLUMNS, np.int64)
+    k = 0
+    place = -1
     for j in range(COLUMNS):
         if s.x[j] > 0.0:  # columns without weight do not contribute to the uncertainty
             place = k if j == SHAPE else place
@@ -224,7 +256,8 @@ def fit_shape(rows: Any, n: int, noise: Any, s: Any) -> tuple[float, float]:
 @kernel
 def _first_row(active: Any, k: int, s: Any) -> bool:
     """Write the row of the diffuse shape of the inverse Gram matrix of the active columns to `s.right`."""
-    length, z = np.ones(COLUMNS), np.empty(COLUMNS)
+    length = np.ones(COLUMNS)
+    z = np.empty(COLUMNS)
     for p in range(k):
         j = active[p]
         length[j] = 1.0 / math.sqrt(s.gram[j, j]) if s.gram[j, j] > 0.0 else 0.0
@@ -249,13 +282,15 @@ def _tangents(n: Any, first: Any, second: Any) -> None:
     for k in range(3):
         small = k if abs(n[k]) < abs(n[small]) else small
     for k in range(3):
-        p, q = (k + 1) % 3, (k + 2) % 3
+        p = (k + 1) % 3
+        q = (k + 2) % 3
         first[k] = n[p] * (1.0 if q == small else 0.0) - n[q] * (1.0 if p == small else 0.0)
     size = math.sqrt(first[0] * first[0] + first[1] * first[1] + first[2] * first[2])
     for k in range(3):
         first[k] /= size
     for k in range(3):
-        p, q = (k + 1) % 3, (k + 2) % 3
+        p = (k + 1) % 3
+        q = (k + 2) % 3
         second[k] = n[p] * first[q] - n[q] * first[p]
 
 
@@ -284,7 +319,8 @@ def _slide(axes: Any, eta: float, b: Any, light: Any, camera: Any) -> None:
 @inline_kernel
 def _relative_slope(c: float, eta: float) -> float:
     """Derivative of the logarithm of F_t with respect to the cosine."""
-    high, low = min(c + 1e-4, 1.0), c - 1e-4
+    high = min(c + 1e-4, 1.0)
+    low = c - 1e-4
     return float((transmittance(high, eta) / transmittance(low, eta) - 1.0) / (high - low))
 
 
@@ -296,18 +332,24 @@ def _turn_effect(light: Any, camera: Any, n: int, b: Any, s: Any, mixed: Any, be
     are the mixture of lobes and its derivative with respect to theta_h; phi_d hardly affects lobes of isotropic
     materials.
     """
-    weight, square = s.x[SHAPE], 0.0
+    weight = s.x[SHAPE]
+    square = 0.0
     out[:] = 0.0
     for r in range(n):
-        i, o = b.index[r, 0], b.index[r, 1]
+        i = b.index[r, 0]
+        o = b.index[r, 1]
         wi_wo = (
-            b.to_light[i, 0] * b.to_camera[o, 0] + b.to_light[i, 1] * b.to_camera[o, 1]
+            b.to_light[i, 0] * b.to_camera[o, 0]
+            + b.to_light[i, 1] * b.to_camera[o, 1]
             + b.to_light[i, 2] * b.to_camera[o, 2]
-        )  # fmt: skip
+        )
         # cosine and sine of theta_h times the length of wi + wo
-        along, whole = b.lit[i] + b.seen[o], 2.0 + 2.0 * wi_wo
+        along = b.lit[i] + b.seen[o]
+        whole = 2.0 + 2.0 * wi_wo
         across = math.sqrt(max(whole - along * along, MIN_SINE * MIN_SINE * whole))
-        tilt, shape, pull = bent[r] / across, s.shape[r], s.pull[r]
+        tilt = bent[r] / across
+        shape = s.shape[r]
+        pull = s.pull[r]
         square += shape * shape
         for q in range(2):
             body = shape * (light[i, 3 * q + 1] + camera[o, 2 * q + 1])
@@ -329,7 +371,8 @@ def _add_by_device(index: Any, moved: Any, n: int, by_light: Any, by_camera: Any
 @kernel
 def _variance_of_sums(sums: Any) -> float:
     """Variance of a result from the summed changes per device; devices without samples have 0."""
-    count, square = 0, 0.0
+    count = 0
+    square = 0.0
     for i in range(sums.shape[0]):
         if sums[i] != 0.0:
             count += 1
@@ -339,9 +382,18 @@ def _variance_of_sums(sums: Any) -> float:
 
 @kernel
 def separate(
-    n: Any, turn: Any, eta: float, table: Any, noise: Any, surfel: int, b: Any, s: Any, estimate: Any, error: Any,
+    n: Any,
+    turn: Any,
+    eta: float,
+    table: Any,
+    noise: Any,
+    surfel: int,
+    b: Any,
+    s: Any,
+    estimate: Any,
+    error: Any,
     total: Any,
-) -> None:  # fmt: skip
+) -> None:
     """R_d (3,), its standard error for independent samples, and that for errors by device; NaN for too few samples.
 
     `turn` (2,) is the error of the normal [rad] for either standard error. An error of a light or camera affects all of
@@ -358,8 +410,11 @@ def separate(
         s.shape[r] = b.enters[b.index[r, 0]] * b.leaves[b.index[r, 1]]
         s.mean[r] = (b.given[0, r] + b.given[1, r] + b.given[2, r]) / np.float32(3)
         b.rows[r, SHAPE] = s.shape[r]
-    tint, variance, shared = np.empty(3), np.empty(3), np.empty(3)
-    by_light, by_camera = np.zeros((3, b.lit.shape[0])), np.zeros((3, b.seen.shape[0]))
+    tint = np.empty(3)
+    variance = np.empty(3)
+    shared = np.empty(3)
+    by_light = np.zeros((3, b.lit.shape[0]))
+    by_camera = np.zeros((3, b.seen.shape[0]))
     for c in range(3):
         for r in range(count):
             s.tint[r] = b.given[c, r] - s.mean[r]
@@ -374,9 +429,11 @@ def separate(
         by_device = _variance_of_sums(by_light[c]) + _variance_of_sums(by_camera[c]) - variance[c]
         shared[c] = max(by_device, variance[c])
     if turn[1] > 0.0:
-        axes, moved = np.empty((2, 3)), np.empty((2, 2))
+        axes = np.empty((2, 3))
+        moved = np.empty((2, 2))
         _tangents(n, axes[0], axes[1])
-        light, camera = np.empty((b.lit.shape[0], 6)), np.empty((b.seen.shape[0], 4))
+        light = np.empty((b.lit.shape[0], 6))
+        camera = np.empty((b.seen.shape[0], 4))
         lobes = s.x.copy()
         lobes[SHAPE] = 0.0
         _predict(b.rows, count, lobes, 0, s, s.predicted)
@@ -394,9 +451,19 @@ def separate(
 
 @kernel
 def separate_block(
-    sample: Any, position: Any, light: Any, camera: Any, normal: Any, turn: Any, table: Any, noise: Any, eta: float,
-    estimate: Any, error: Any, total: Any,
-) -> None:  # fmt: skip
+    sample: Any,
+    position: Any,
+    light: Any,
+    camera: Any,
+    normal: Any,
+    turn: Any,
+    table: Any,
+    noise: Any,
+    eta: float,
+    estimate: Any,
+    error: Any,
+    total: Any,
+) -> None:
     """`separate` of every surfel of a block."""
     b = lumitexel_memory(light.shape[0], camera.shape[0], 2 * COLUMNS)
     s = separation_memory(light.shape[0] * camera.shape[0])

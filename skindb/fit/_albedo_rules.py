@@ -16,8 +16,11 @@ from skindb.optics.brdf_table import DEFAULT_GRID, TableGrid, tabulate
 from skindb.optics.dictionary import evaluate_abc
 from skindb.optics.fresnel import fresnel_transmittance
 
-LOW, LOWER = 0.10, 0.02  # quantiles of the method "quantile", and their normal deviates
-Z_LOW, Z_LOWER = -1.2816, -2.0537
+# quantiles of the method "quantile", and their normal deviates
+LOW = 0.10
+LOWER = 0.02
+Z_LOW = -1.2816
+Z_LOWER = -2.0537
 # The six most different embedded materials, from narrow to nearly diffuse. The width of the broadest one trades two
 # errors: broad lobes take light from R_d, and without them R_d includes the even reflection of the surface. These
 # balance the two on captures with and without such reflection (notes of `estimate_diffuse_reflectance`).
@@ -47,14 +50,17 @@ def ratios(
     sample: Array, position: Array, light: Array, camera: Array, normal: Array, eta: float
 ) -> tuple[Array, Array]:
     """Ratios pi f_r / (F_t F_t) of all samples (n, l c, 3), NaN at grazing angles, and weights that decrease there."""
-    normal, samples = normal.astype(np.float64), sample.astype(np.float32)
+    normal = normal.astype(np.float64)
+    samples = sample.astype(np.float32)
     lit, seen = (cosines(normal, directions(position, targets)) for targets in (light, camera))
     lit, seen = (np.where(c > MIN_COSINE_ALBEDO, c, np.nan) for c in (lit, seen))
     # F_t is evaluated at the limit instead of NaN; the cosine carries the NaN
     per_light = np.pi / (lit * fresnel_transmittance(np.fmax(lit, MIN_COSINE_ALBEDO), eta))
     per_camera = seen / (seen * fresnel_transmittance(np.fmax(seen, MIN_COSINE_ALBEDO), eta))
     ratio = samples * (per_light[:, :, None] * per_camera[:, None]).astype(np.float32)[..., None]
-    n, pairs = len(sample), lit.shape[1] * seen.shape[1]  # -1 would be ambiguous without surfels
+    # -1 would be ambiguous without surfels
+    n = len(sample)
+    pairs = lit.shape[1] * seen.shape[1]
     weight = (lit[:, :, None] * seen[:, None]).reshape(n, pairs)
     return ratio.reshape(n, pairs, 3), weight
 
@@ -78,7 +84,8 @@ def stable_minimum(ratio: Array, weight: Array, discard: int) -> tuple[Array, Ar
 def low_quantile(ratio: Array) -> tuple[Array, Array]:
     """Tenth percentile, raised by half of its bias under normal noise, whose spread is estimated below it."""
     count = np.isfinite(ratio).sum(1)
-    low, lower = quantile_finite(ratio, LOW, 1), quantile_finite(ratio, LOWER, 1)
+    low = quantile_finite(ratio, LOW, 1)
+    lower = quantile_finite(ratio, LOWER, 1)
     noise = (low - lower) / (Z_LOW - Z_LOWER)
     enough = count >= MIN_SAMPLES_ALBEDO
     # the variance of a quantile: p (1 - p) / (n density^2), density of the normal at it

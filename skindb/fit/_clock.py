@@ -30,7 +30,8 @@ class Clock:
         if self.progress is None:
             yield
         else:
-            tell, ticker = self.progress, _Ticker(name, self.progress)
+            tell = self.progress
+            ticker = _Ticker(name, self.progress)
             tell(name, 0, 1)
             with ticker, reported_compilation(lambda: tell(f"{name} ({COMPILING})", ticker.done, ticker.total)):
                 yield
@@ -43,10 +44,14 @@ class _Ticker(Callback):
 
     def __init__(self, name: str, progress: Progress) -> None:
         super().__init__(start=self._begin, posttask=self._finish)  # type: ignore[no-untyped-call]
-        self.name, self.tell, self.total, self.done = name, progress, 1, 0
+        self.name = name
+        self.tell = progress
+        self.total = 1
+        self.done = 0
 
     def _begin(self, graph: Mapping[Any, Any]) -> None:
-        self.total, self.done = max(len(graph), 1), 0
+        self.total = max(len(graph), 1)
+        self.done = 0
 
     def _finish(self, *_: Any) -> None:
         self.done = min(self.done + 1, self.total)

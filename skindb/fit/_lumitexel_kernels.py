@@ -61,17 +61,29 @@ def lumitexel_memory(lights: int, cameras: int, width: int) -> Any:
     most = lights * cameras
     channels = np.zeros((9, most), np.float32)
     return Lumitexel(
-        np.empty(most * 3, np.float32), np.empty((lights, 3)), np.empty((cameras, 3)), np.empty(lights),
-        np.empty(cameras), np.empty(lights), np.empty(cameras), np.zeros((lights, cameras), np.bool_),
-        np.empty((most, 2), np.int32), row_memory(cameras), np.zeros((most, width), np.float32), channels[:3],
-        channels[3:6], channels[6:], np.zeros((2, most), np.float32),
-    )  # fmt: skip
+        np.empty(most * 3, np.float32),
+        np.empty((lights, 3)),
+        np.empty((cameras, 3)),
+        np.empty(lights),
+        np.empty(cameras),
+        np.empty(lights),
+        np.empty(cameras),
+        np.zeros((lights, cameras), np.bool_),
+        np.empty((most, 2), np.int32),
+        row_memory(cameras),
+        np.zeros((most, width), np.float32),
+        channels[:3],
+        channels[3:6],
+        channels[6:],
+        np.zeros((2, most), np.float32),
+    )
 
 
 @fast_kernel
 def sample_status(values: Any) -> int:
     """Status of the samples of a surfel: UNSEEN, NOT_FINITE, or FITTED if there are finite samples."""
-    known, infinite = np.int32(0), np.int32(0)
+    known = np.int32(0)
+    infinite = np.int32(0)
     for i in range(values.shape[0]):
         known += np.int32(abs(values[i]) < np.inf)
         infinite += np.int32(abs(values[i]) == np.inf)
@@ -88,7 +100,9 @@ def write_directions(position: Any, light: Any, camera: Any, b: Any) -> None:
 @kernel
 def _towards(target: Any, p: Any, out: Any) -> None:
     for i in range(target.shape[0]):
-        x, y, z = target[i, 0] - p[0], target[i, 1] - p[1], target[i, 2] - p[2]
+        x = target[i, 0] - p[0]
+        y = target[i, 1] - p[1]
+        z = target[i, 2] - p[2]
         scale = 1.0 / np.sqrt(x * x + y * y + z * z)
         out[i, 0], out[i, 1], out[i, 2] = x * scale, y * scale, z * scale
 
@@ -114,7 +128,8 @@ def _transmission(n: Any, towards: Any, eta: float, min_cosine: float, cosine: A
 @kernel
 def choose(b: Any) -> int:
     """Mark the samples that are finite in all channels and not grazing; returns their number."""
-    cameras, count = b.seen.shape[0], 0
+    cameras = b.seen.shape[0]
+    count = 0
     for i in range(b.lit.shape[0]):
         above = b.lit[i] > 0.0
         for o in range(cameras):
@@ -151,7 +166,8 @@ def write_noise(surfel: int, count: int, noise: Any, b: Any) -> bool:
         return bool(noise.shot > 0.0)
     last = noise.limit.shape[1] - 1
     for r in range(count):
-        i, o = b.index[r, 0], b.index[r, 1]
+        i = b.index[r, 0]
+        o = b.index[r, 1]
         scale = noise.per_radiance[surfel, i]
         brightest = max(b.given[0, r], b.given[1, r], b.given[2, r])
         e = 0

@@ -13,7 +13,9 @@ from skindb.optics._photometric_kernels import buffers, estimate_one
 COMBINED, CHROMATIC, PHOTOMETRIC, PEAK = range(4)
 # Terms of the total error that cover 91 to 96 % of the normals of six independent captures with known truth: shadows,
 # folds and residual highlights affect neighbouring lights alike, which increases the angle between the two estimates
-NOISE_FACTOR_NORMAL, MODEL_ERROR_DEGREES = 3.0, 1.0  # the second in degrees
+# the second in degrees
+NOISE_FACTOR_NORMAL = 3.0
+MODEL_ERROR_DEGREES = 1.0
 
 
 @kernel
@@ -28,9 +30,11 @@ def _angle(a: Any, b: Any) -> float:
 @kernel
 def _mean(first: float, normal: Any, out: Any) -> None:
     """Unit mean of two normals, the first weighted by `first`; a normal that is NaN is ignored."""
-    second, size = 1.0 - first, 0.0
+    second = 1.0 - first
+    size = 0.0
     for k in range(3):
-        a, b = normal[0, k], normal[1, k]
+        a = normal[0, k]
+        b = normal[1, k]
         out[k] = (first * a if a == a else 0.0) + (second * b if b == b else 0.0)
         size += out[k] * out[k]
     for k in range(3):
@@ -40,14 +44,19 @@ def _mean(first: float, normal: Any, out: Any) -> None:
 @kernel
 def _variance(first: float, covariance: Any, cross: Any, pull: Any, scan_error: float) -> float:
     """Squared RMS angle [rad^2] of a mean: noise, which is partly common to both, and error of the scan per axis."""
-    second, noise, scan = 1.0 - first, 0.0, 0.0
+    second = 1.0 - first
+    noise = 0.0
+    scan = 0.0
     for k in range(3):
-        a, b, c = covariance[0, k, k], covariance[1, k, k], cross[k, k]
+        a = covariance[0, k, k]
+        b = covariance[1, k, k]
+        c = cross[k, k]
         noise += first * first * a if a == a else 0.0
         noise += second * second * b if b == b else 0.0
         noise += 2.0 * first * second * c if c == c else 0.0
         for j in range(3):
-            p, q = pull[0, j, k], pull[1, j, k]
+            p = pull[0, j, k]
+            q = pull[1, j, k]
             turned = (first * p if p == p else 0.0) + (second * q if q == q else 0.0)
             scan += turned * turned
     return noise + scan * scan_error * scan_error / 2.0
@@ -55,24 +64,52 @@ def _variance(first: float, covariance: Any, cross: Any, pull: Any, scan_error: 
 
 @kernel
 def normals_block(
-    sample: Any, position: Any, light: Any, camera: Any, scan: Any, method: int, eta: float, scan_error: float,
-    chosen: Any, disagreement: Any, error: Any, total: Any,
-) -> None:  # fmt: skip
+    sample: Any,
+    position: Any,
+    light: Any,
+    camera: Any,
+    scan: Any,
+    method: int,
+    eta: float,
+    scan_error: float,
+    chosen: Any,
+    disagreement: Any,
+    error: Any,
+    total: Any,
+) -> None:
     """Normals (n, 3) by the method, angle (n,) of peak and combined, standard and total error (n,) [degree].
 
     `scan_error` is an angle [rad].
     """
     b = buffers(light.shape[0], camera.shape[0])
-    first, peak, normal, spread = np.empty(3), np.empty(3), np.empty((2, 3)), np.empty(2)
-    covariance, pull, cross, combined = np.empty((2, 3, 3)), np.empty((2, 3, 3)), np.empty((3, 3)), np.empty(3)
+    first = np.empty(3)
+    peak = np.empty(3)
+    normal = np.empty((2, 3))
+    spread = np.empty(2)
+    covariance = np.empty((2, 3, 3))
+    pull = np.empty((2, 3, 3))
+    cross = np.empty((3, 3))
+    combined = np.empty(3)
     for s in range(position.shape[0]):
         size = math.sqrt(scan[s, 0] ** 2 + scan[s, 1] ** 2 + scan[s, 2] ** 2)
         for k in range(3):
             first[k] = scan[s, k] / size if size > 0.0 else math.nan
         estimate_one(
-            sample[s], position[s], light, camera, first, eta, scan_error, b, peak, normal, spread, covariance, cross,
+            sample[s],
+            position[s],
+            light,
+            camera,
+            first,
+            eta,
+            scan_error,
+            b,
+            peak,
+            normal,
+            spread,
+            covariance,
+            cross,
             pull,
-        )  # fmt: skip
+        )
         # inverse variance: each residual relative to the signal; for skin without colour the first has all the weight
         white = 1.0 / spread[0] ** 2 if spread[0] == spread[0] else 0.0
         tinted = 1.0 / spread[1] ** 2 if spread[1] == spread[1] else 0.0
@@ -84,10 +121,12 @@ def normals_block(
         share = 1.0 if method == PHOTOMETRIC else 0.0 if method == CHROMATIC else share
         for k in range(3):
             chosen[s, k] = (
-                peak[k] if method == PEAK
-                else combined[k] if method == COMBINED
+                peak[k]
+                if method == PEAK
+                else combined[k]
+                if method == COMBINED
                 else normal[0 if method == PHOTOMETRIC else 1, k]
-            )  # fmt: skip
+            )
         disagreement[s] = _angle(peak, combined)
         error[s], total[s] = math.nan, math.nan
         if method != PEAK and np.isfinite(chosen[s]).all():

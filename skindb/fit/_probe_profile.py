@@ -18,17 +18,26 @@ from skindb.schema import ProbeStatus
 MIN_FIBRE_SIGNAL = 3.0  # standard errors above zero for a fibre to be used
 MIN_FIBRES = 3
 # bounds of sigma_tr, sigma_s' [mm^-1] and the logarithm of the gain in units of the profile
-LOWER, UPPER = np.log([0.01, 0.05, 1e-12]), np.log([30.0, 100.0, 1e12])
+LOWER = np.log([0.01, 0.05, 1e-12])
+UPPER = np.log([30.0, 100.0, 1e12])
 RIVAL = 30.0  # deviance within which other minima are not excluded; 9 for noise alone, more for smooth errors
 MIN_SEPARATION = 0.05  # of log sigma_tr between minima that count as different
-TYPICAL, TYPICAL_SPREAD = 1.5, 0.7  # sigma_s' of skin, mm^-1, and the standard deviation of its logarithm
-SCAN, STEPS, START = 50, 12, 1.0  # values of sigma_s', steps from this sigma_tr [mm^-1] at each
-SMALL, MOST = 1e-4, 4  # step of finite differences; number of minima that are refined
+# sigma_s' of skin, mm^-1, and the standard deviation of its logarithm
+TYPICAL = 1.5
+TYPICAL_SPREAD = 0.7
+# values of sigma_s', steps from this sigma_tr [mm^-1] at each
+SCAN = 50
+STEPS = 12
+START = 1.0
+# step of finite differences; number of minima that are refined
+SMALL = 1e-4
+MOST = 4
 EVALUATIONS = 200
 # RMS relative residual that the errors do not explain, and probability of a chi-squared as large, beyond both of which
 # no single medium fits. The status states 10 %; the probability prevents false alarms by noise where few fibres are
 # clear. Tested with simulated profiles of one and of several media in tests/fit/test_probe_status.py.
-POOR_MISFIT, RARE_CHI_SQUARED = 0.1, 1e-6
+POOR_MISFIT = 0.1
+RARE_CHI_SQUARED = 1e-6
 CLEAR = 0.05  # relative error of a clear fibre: a misfit of 10 % is visible only if the noise is at most half of it
 PER_FIBRE = ("distance", "face", "log_profile", "error")
 
@@ -218,7 +227,8 @@ def _descend(problem: Problem, start: Array) -> Any:
 
 def _coefficients(p: Array) -> tuple[Array, Array]:
     """sigma_a and sigma_s' (...) of (..., 2 or 3) log sigma_tr and log sigma_s' (eq. 9 without cancellation)."""
-    tr, s = np.exp(p[..., 0]), np.exp(p[..., 1])
+    tr = np.exp(p[..., 0])
+    s = np.exp(p[..., 1])
     third = 4 * tr * tr / 3
     return third / (2 * (s + np.sqrt(s * s + third))), s
 
@@ -229,7 +239,8 @@ def _report(found: Any, problem: Problem, *, rival: float, near: float) -> Probe
     Distances in log sigma_tr: `rival` to minima of similar quality; `near` to the fit without the nearest fibre.
     """
     p = found.x
-    size, used = len(p), len(problem.log_profile)
+    size = len(p)
+    used = len(problem.log_profile)
     # a ridge keeps undetermined directions finite; their error exceeds any bound
     normal = np.linalg.inv(found.jac.T @ found.jac + 1e-12 * np.eye(size))
     effect = normal @ found.jac.T  # of each weighted residual on each parameter

@@ -16,7 +16,8 @@ class Segments:
         sizes = np.diff(offsets)
         self._total = len(sizes)
         self._filled = np.flatnonzero(sizes)
-        self._begin, self._sizes = offsets[:-1][self._filled], sizes[self._filled]
+        self._begin = offsets[:-1][self._filled]
+        self._sizes = sizes[self._filled]
         self.count = len(self._filled)
         self.owner = np.repeat(self._filled, self._sizes)  # (total,) surfel of each sample
 

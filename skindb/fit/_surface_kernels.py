@@ -137,7 +137,8 @@ def _cube_roots(count: int, b: Any) -> None:
 
 @kernel
 def _clamped(d: Any) -> bool:
-    low, high = min(d[0], d[1], d[2]), max(d[0], d[1], d[2])
+    low = min(d[0], d[1], d[2])
+    high = max(d[0], d[1], d[2])
     return bool(low <= np.float32(SMALLEST_R_D) or high >= np.float32(LARGEST_R_D))
 
 
@@ -151,7 +152,8 @@ def weigh(surfel: int, count: int, noise: Any, options: Any, b: Any, weight: Any
         for r in range(count):
             weight[r] = 1.0
         return
-    mean, least = 0.0, options.floor * options.floor
+    mean = 0.0
+    least = options.floor * options.floor
     for r in range(count):
         mean += (b.scattered[0, r] + b.scattered[1, r] + b.scattered[2, r]) / (3.0 * count)
     mean = max(mean, options.floor)
@@ -172,13 +174,12 @@ def fit_block(block: Any, table: Any, lift: Any, options: Any, out: Any) -> None
     """Fit, or only evaluate, every surfel of a block by the dictionary."""
     b = lumitexel_memory(block.light.shape[0], block.camera.shape[0], table.shape[3])
     most = b.index.shape[0]
-    work, weight, y = (
-        fit_memory(most, table.shape[3], lift.shape[1]),
-        np.ones(most, np.float32),
-        np.empty(most, np.float32),
-    )
+    work = fit_memory(most, table.shape[3], lift.shape[1])
+    weight = np.ones(most, np.float32)
+    y = np.empty(most, np.float32)
     for s in range(block.position.shape[0]):
-        n, d = block.normal[s], block.diffuse[s]
+        n = block.normal[s]
+        d = block.diffuse[s]
         unpack(block.sample[s], b.values)
         out.status[s] = prepare(block.position[s], n, d, block, options, b)
         if out.status[s] != FITTED:
@@ -249,9 +250,12 @@ def _add_turned(
     small = 0
     for k in range(3):
         small = k if abs(n[k]) < abs(n[small]) else small
-    away, moved = np.zeros(3), np.empty(x.shape[0])
+    away = np.zeros(3)
+    moved = np.empty(x.shape[0])
     away[small] = 1.0
-    first, second, turned = np.empty(3), np.empty(3), np.empty(3)
+    first = np.empty(3)
+    second = np.empty(3)
+    turned = np.empty(3)
     _across(n, away, first)
     _across(n, first, second)
     for q in range(4):
@@ -284,13 +288,15 @@ def _add_turned(
 @fast_kernel
 def _root_residuals(count: int, begin: int, floor: Any, y: Any, b: Any, work: Any) -> float:
     """Write residuals in cube-root space, averaged over channels, to `work.trial`; returns the mean sample."""
-    third, mean = np.float32(1.0 / 3.0), np.float32(0)
+    third = np.float32(1.0 / 3.0)
+    mean = np.float32(0)
     for r in range(count):
         work.total[r] = (b.given[0, begin + r] + b.given[1, begin + r] + b.given[2, begin + r]) * third
         body = b.scattered[0, begin + r] + b.scattered[1, begin + r] + b.scattered[2, begin + r]
         work.mixed[r] = body * third + y[begin + r]
         mean += work.total[r]
-    square, inverse = work.square[:count], work.inverse[:count]
+    square = work.square[:count]
+    inverse = work.inverse[:count]
     to_roots(work.total[:count], floor, square, inverse, work.square_bits, work.inverse_bits)
     for r in range(count):
         work.trial[r] = work.total[r] * inverse[r]
@@ -304,7 +310,8 @@ def _root_residuals(count: int, begin: int, floor: Any, y: Any, b: Any, work: An
 def _outliers(count: int, options: Any, y: Any, b: Any, work: Any, counts: Any) -> float:
     """Fraction of outlying samples, NaN for too few samples; adds to the histograms (lights, cameras, bins)."""
     mean = _root_residuals(count, 0, np.float32(options.floor), y, b, work)
-    steep, last = 0, counts.shape[2] - 1
+    steep = 0
+    last = counts.shape[2] - 1
     for r in range(count):
         above = b.lit[b.index[r, 0]] >= MIN_COSINE_OUTLIER and b.seen[b.index[r, 1]] >= MIN_COSINE_OUTLIER
         work.square[r] = abs(work.trial[r]) if above else np.float32(np.inf)
@@ -314,7 +321,8 @@ def _outliers(count: int, options: Any, y: Any, b: Any, work: Any, counts: Any) 
     level = max(mean, options.floor)
     finest = MIN_ROOT_SCALE * level / np.cbrt(level * level + options.floor * options.floor)
     scale = max(1.4826 * median_of(work.square, work.square_bits, count, steep), finest)
-    beyond, per_scale = 0, BINS_PER_SCALE / scale
+    beyond = 0
+    per_scale = BINS_PER_SCALE / scale
     for r in range(count):
         if work.square[r] < np.inf:
             place = min(int(work.square[r] * per_scale), last)
@@ -352,16 +360,24 @@ def refit_block(block: Any, table: Any, lift: Any, options: Any, out: Any, more:
 
     `table` is scaled to order one and the lift (m, m) is the identity. Every block of samples is read only once.
     """
-    lights, cameras, m = block.light.shape[0], block.camera.shape[0], out.weight.shape[1]
+    lights = block.light.shape[0]
+    cameras = block.camera.shape[0]
+    m = out.weight.shape[1]
     b = lumitexel_memory(lights, cameras, table.shape[3])
     most = b.index.shape[0]
-    work, weight, y = fit_memory(most, table.shape[3], m), np.ones(most, np.float32), np.empty(most, np.float32)
-    drift, finite, present = np.empty(3), np.empty((lights, cameras), np.bool_), np.zeros(4, np.bool_)
+    work = fit_memory(most, table.shape[3], m)
+    weight = np.ones(most, np.float32)
+    y = np.empty(most, np.float32)
+    drift = np.empty(3)
+    finite = np.empty((lights, cameras), np.bool_)
+    present = np.zeros(4, np.bool_)
     for i in range(lights):
         for o in range(cameras):
             present[more.held[i, o]] = True
     for s in range(block.position.shape[0]):
-        n, d, x = block.normal[s], block.diffuse[s], out.weight[s]
+        n = block.normal[s]
+        d = block.diffuse[s]
+        x = out.weight[s]
         unpack(block.sample[s], b.values)
         if prepare(block.position[s], n, d, block, options, b) != FITTED:
             x[:] = np.nan
@@ -403,9 +419,17 @@ def refit_block(block: Any, table: Any, lift: Any, options: Any, out: Any, more:
                 drift[c] = shared / max(d[c], SMALLEST_R_D)
             _restore_total(count, b, work)
             weight_covariance(
-                b.rows, y[:count], weight, options.mode == PERCEPTUAL, options.floor, b.scattered[:, :count], drift, x,
-                more.covariance[s], work,
-            )  # fmt: skip
+                b.rows,
+                y[:count],
+                weight,
+                options.mode == PERCEPTUAL,
+                options.floor,
+                b.scattered[:, :count],
+                drift,
+                x,
+                more.covariance[s],
+                work,
+            )
         for c in range(3):
             for r in range(count):
                 b.scattered[c, r] += y[r]

@@ -127,7 +127,8 @@ def reflectance_interval(fitted: xr.Dataset) -> tuple[xr.DataArray, xr.DataArray
     --------
     >>> low, high = reflectance_interval(model["fitted"].to_dataset())  # doctest: +SKIP
     """
-    value, limit = fitted["diffuse_reflectance"], fitted["even_reflection_limit"]
+    value = fitted["diffuse_reflectance"]
+    limit = fitted["even_reflection_limit"]
     both = (NORMAL_95 * fitted["diffuse_reflectance_total_error"]) ** 2
     return value - both**0.5, value + (both - limit**2).clip(min=0) ** 0.5
 

@@ -51,10 +51,8 @@ def reduce_basis(
     """
     check(fitted, ("dictionary_weight", "fit_status", "surfel_area"), where="fitted")
     good = _fitted_surfels(fitted)
-    weight, area = (
-        fitted["dictionary_weight"].values,
-        np.maximum(fitted["surfel_area"].values.astype(np.float64), 0) + 1e-12,
-    )
+    weight = fitted["dictionary_weight"].values
+    area = np.maximum(fitted["surfel_area"].values.astype(np.float64), 0) + 1e-12
     most = min(len(good), weight.shape[1])
     if not 1 <= k <= most:
         raise InputError(Fault("k", f"a reduced basis has 1 to {most} components here", str(k), "choose another k"))

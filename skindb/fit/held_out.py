@@ -71,7 +71,8 @@ def _drawn(capture: xr.DataTree, dim: str, useful: Mask, fraction: float, seed: 
     """Indices of the useful lights or cameras that are held out: at least one if any, never all."""
     count = int(useful.sum())
     if fraction and count < 2:
-        rule, cure = f"to hold out a {dim}, two or more must reach the subject", "hold nothing out"
+        rule = f"to hold out a {dim}, two or more must reach the subject"
+        cure = "hold nothing out"
         raise InputError(Fault(f"hold_out_{dim}s", rule, str(count), cure))
     order = np.random.default_rng(seed).permutation(np.flatnonzero(useful))
     if "photographs" in capture.children:

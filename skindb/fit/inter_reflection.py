@@ -56,7 +56,8 @@ def bounced_light(
         rule = "samples, visibility and R_d must be of the same surfels"
         raise InputError(Fault("inter-reflection", rule, found, "ingest the capture again"))
     known = np.where(np.isfinite(diffuse), diffuse, np.nanmedian(diffuse, axis=0)).astype(np.float32)
-    scene, rays = RayScene(position, triangles), _cosine_rays()
+    scene = RayScene(position, triangles)
+    rays = _cosine_rays()
     square = np.square(position[:, None] - light).sum(axis=2)
     lit = cosines(normal, directions(position, light))
     enters = np.maximum(lit, 0) * fresnel_transmittance(np.clip(lit, 1e-3, 1), eta) * np.nan_to_num(visible)
@@ -82,7 +83,8 @@ def without_bounce(
     leaves = (fresnel_transmittance(np.clip(seen, 1e-3, 1), eta) / np.pi).astype(np.float32)
     back = bounced * np.nan_to_num(diffuse)[:, None].astype(np.float32)
     sample = lumitexels["reflectance_sample"]
-    arrives, towards = xr.Variable(("surfel", "light", "channel"), back), xr.Variable(("surfel", "camera"), leaves)
+    arrives = xr.Variable(("surfel", "light", "channel"), back)
+    towards = xr.Variable(("surfel", "camera"), leaves)
     if sample.chunks is not None:  # otherwise the contribution to all samples would be computed at once
         arrives, towards = (one.chunk({"surfel": sample.chunksizes["surfel"]}) for one in (arrives, towards))
     direct = (sample.astype(np.float32) - arrives * towards).clip(min=0).astype(sample.dtype).transpose(*sample.dims)
@@ -111,5 +113,6 @@ def _meetings(
 def _cosine_rays() -> Array:
     """Cosine-distributed directions (RAYS, 3) above z = 0, evenly spread (Vogel's spiral)."""
     i = np.arange(RAYS) + 0.5
-    radius, angle = np.sqrt(i / RAYS), np.pi * (3 - np.sqrt(5)) * i
+    radius = np.sqrt(i / RAYS)
+    angle = np.pi * (3 - np.sqrt(5)) * i
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - radius**2)], axis=1)

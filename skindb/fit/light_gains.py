@@ -16,8 +16,12 @@ Array = NDArray[np.float64]
 VIEWS = 6_000  # surfels in a camera that are used: twice as many changed gains by 0.1 to 0.4 %, at most 2.2 %
 MIN_COSINE_GAIN = 0.25  # to light and camera; below it F_t changes too fast
 MIN_HALF_ANGLE = 25.0  # degrees between half vector and normal; highlights are narrower
-SMOOTH, SPARE = 3, 3  # number of smooth functions that model the shading; required lights in excess of it
-LOWEST, HIGHEST = 0.5, 1.5  # range of sample over smooth model; outside it are shadows, hair and motion, not gains
+# number of smooth functions that model the shading; required lights in excess of it
+SMOOTH = 3
+SPARE = 3
+# range of sample over smooth model; outside it are shadows, hair and motion, not gains
+LOWEST = 0.5
+HIGHEST = 1.5
 SMALLEST_SHADING = 0.2  # relative to the median; ratios to smaller values are unreliable
 # weight of the prior that gains are 1, relative to the information of the views on the median light. Chosen on three
 # captures of measured materials; on these and on two with other surfaces, with errors of the lights of 0 to 15 %,
@@ -55,14 +59,17 @@ def estimate_light_gains(lumitexels: xr.Dataset, *, rng: np.random.Generator, et
     """
     names = ("reflectance_sample", "surfel_position", "surfel_normal", "light_position", "camera_position")
     check(lumitexels, names, where="lumitexels")
-    surfels, cameras = lumitexels.sizes["surfel"], lumitexels.sizes["camera"]
+    surfels = lumitexels.sizes["surfel"]
+    cameras = lumitexels.sizes["camera"]
     chosen = np.sort(rng.choice(surfels, min(-(-VIEWS // cameras), surfels), replace=False))
     few = lumitexels[list(names)].isel(surfel=chosen).compute()
     samples = few["reflectance_sample"].values.astype(np.float64).mean(axis=3)
     matrix = np.zeros((samples.shape[1],) * 2)
     position, normal, light, camera = (few[name].values.astype(np.float64) for name in names[1:])
-    to_light, to_camera = directions(position, light), directions(position, camera)
-    lit, seen = cosines(normal, to_light), cosines(normal, to_camera)
+    to_light = directions(position, light)
+    to_camera = directions(position, camera)
+    lit = cosines(normal, to_light)
+    seen = cosines(normal, to_camera)
     for i in range(len(chosen)):
         axes = _frame(normal[i])
         shading = _shading(to_light[i] @ axes.T, eta)
@@ -78,7 +85,8 @@ def estimate_light_gains(lumitexels: xr.Dataset, *, rng: np.random.Generator, et
 
 def divided_by_gains(lumitexels: xr.Dataset, light_gain: xr.DataArray) -> xr.Dataset:
     """The samples divided by the gains of their lights."""
-    sample, gain = lumitexels["reflectance_sample"], light_gain.variable.astype(np.float32)
+    sample = lumitexels["reflectance_sample"]
+    gain = light_gain.variable.astype(np.float32)
     right = (sample.astype(np.float32) / gain).astype(sample.dtype)
     return lumitexels.assign(reflectance_sample=right.transpose(*sample.dims).assign_attrs(sample.attrs))
 
@@ -95,7 +103,8 @@ def _add_view(sample: Array, shading: Array, at: NDArray[np.intp], matrix: Array
     """Add to `matrix` (light, light) the squared residuals of a smooth function for the samples of lights `at`."""
     if len(at) < SMOOTH + SPARE:
         return
-    columns, seen = shading[at], sample[at]
+    columns = shading[at]
+    seen = sample[at]
     fitted = columns @ np.linalg.lstsq(columns, seen, rcond=None)[0]
     if fitted.min() <= SMALLEST_SHADING * max(np.median(fitted), 0.0):
         return

@@ -105,7 +105,8 @@ def first_pass(
     """
     honour_consent(capture.attrs, "fit")
     parameters = parameters or FitParameters()
-    clock, whole = Clock(progress), lumitexels(capture)
+    clock = Clock(progress)
+    whole = lumitexels(capture)
     groups: dict[str, xr.Dataset] = {}
     if parameters.light_gains:
         chosen = np.random.default_rng([parameters.seed, 2])
@@ -117,7 +118,9 @@ def first_pass(
         plan = plan_fit(capture, parameters, dictionary=dictionary)
     _require_components(parameters.k, len(tables.names))
     held_out = hold_out(capture, plan, parameters)
-    work, eta, rank = fitted_part(whole, held_out), parameters.eta, min(parameters.rank, len(tables.names))
+    work = fitted_part(whole, held_out)
+    eta = parameters.eta
+    rank = min(parameters.rank, len(tables.names))
     diffuse = partial(estimate_diffuse_reflectance, eta=eta, even_reflection=parameters.even_reflection)
 
     def fit(samples: xr.Dataset) -> xr.Dataset:  # one graph: every block of samples is read once
@@ -166,12 +169,15 @@ def second_pass(
         If `first` was made with another dictionary or another number of surfels, or holds no fitted surfel.
     """
     honour_consent(capture.attrs, "fit")
-    parameters, clock, whole = FitParameters.of(first.attrs), Clock(progress), lumitexels(capture)
+    parameters = FitParameters.of(first.attrs)
+    clock = Clock(progress)
+    whole = lumitexels(capture)
     if "light_gains" in first.children:
         whole = divided_by_gains(whole, first["light_gains"].to_dataset()["light_gain"])
     tables = disc_dictionary(dictionary, disc_angle(whole))
     _require_match(first, tables.source, _digest(dictionary), whole)
-    fitted, held_out = first["fitted"].to_dataset(), first["held_out"].to_dataset()
+    fitted = first["fitted"].to_dataset()
+    held_out = first["held_out"].to_dataset()
     if parameters.inter_reflection:
         with clock.stage("inter-reflection"):
             whole = _direct_light(capture, whole, fitted, parameters.eta)
@@ -225,7 +231,8 @@ def _digest(dictionary: Dictionary | None) -> str:
 
 def _require_match(first: xr.DataTree, source: str, digest: str, whole: xr.Dataset) -> None:
     if first.attrs["dictionary_digest"] != digest:
-        rule, cure = "both passes need the same dictionary", "give that of the first pass, or repeat it"
+        rule = "both passes need the same dictionary"
+        cure = "give that of the first pass, or repeat it"
         raise InputError(Fault("dictionary", rule, source, cure))
     surfels = first["fitted"].sizes["surfel"]
     if surfels != whole.sizes["surfel"]:
@@ -253,8 +260,10 @@ def _groups(capture: xr.DataTree, fitted: xr.Dataset, basis: xr.Dataset) -> dict
 
 def _direct_light(capture: xr.DataTree, samples: xr.Dataset, fitted: xr.Dataset, eta: float) -> xr.Dataset:
     """The samples minus inter-reflections between parts of the face."""
-    diffuse, surfels = fitted["diffuse_reflectance"].values, capture["surfels"].to_dataset()
-    visible, triangles = surfels["light_visible_fraction"].values, capture["mesh"].to_dataset()["triangle"].values
+    diffuse = fitted["diffuse_reflectance"].values
+    surfels = capture["surfels"].to_dataset()
+    visible = surfels["light_visible_fraction"].values
+    triangles = capture["mesh"].to_dataset()["triangle"].values
     return without_bounce(samples, bounced_light(samples, diffuse, visible, triangles, eta=eta), diffuse, eta=eta)
 
 

@@ -55,14 +55,22 @@ def find_outliers(lumitexels: xr.Dataset, *, basis: xr.Dataset, eta: float = 1.3
     names = (*NEEDED, "basis_weight")
     check(lumitexels, names, where="lumitexels")
     cuts = np.cumsum([0, *lumitexels.chunksizes.get("surfel", (lumitexels.sizes["surfel"],))])
-    tables, floor, used = reduced_tables(basis), noise_floor(lumitexels), lumitexels[list(names)]
+    tables = reduced_tables(basis)
+    floor = noise_floor(lumitexels)
+    used = lumitexels[list(names)]
 
     def counted(block: xr.Dataset) -> tuple[NDArray[Any], NDArray[Any]]:
         *samples, weight = (block[name].values for name in names)
         found = refit_weights(
-            *samples, weight=weight, tables=tables, eta=eta, mode="perceptual", noise_floor=floor,
-            min_samples=MIN_SAMPLES, outliers=True,
-        )  # fmt: skip
+            *samples,
+            weight=weight,
+            tables=tables,
+            eta=eta,
+            mode="perceptual",
+            noise_floor=floor,
+            min_samples=MIN_SAMPLES,
+            outliers=True,
+        )
         return found.outlier, found.counts
 
     blocks = [used.isel(surfel=slice(a, b)) for a, b in pairwise(cuts)]
@@ -114,7 +122,8 @@ def suspects(outliers: xr.Dataset, lumitexels: xr.Dataset) -> list[dict[str, Any
     }
     found: list[dict[str, Any]] = []
     for dim, named in moved.items():
-        misfit, share = outliers[f"{dim}_misfit"].values, outliers[f"{dim}_outlier_fraction"].values
+        misfit = outliers[f"{dim}_misfit"].values
+        share = outliers[f"{dim}_outlier_fraction"].values
         names = outliers[dim].values if dim in outliers.coords else np.arange(misfit.size)
         found += [
             {dim: str(names[i]), "outlier_fraction": float(share[i]), "misfit": float(misfit[i])}
@@ -125,7 +134,8 @@ def suspects(outliers: xr.Dataset, lumitexels: xr.Dataset) -> list[dict[str, Any
 
 def _moved_cameras(outliers: xr.Dataset) -> NDArray[np.bool_]:
     """Cameras with a misfit under nearly all lights; by the misfit of all samples if few photographs are usable."""
-    misfit, frames = outliers["camera_misfit"].values, outliers["frame_misfit"].values
+    misfit = outliers["camera_misfit"].values
+    frames = outliers["frame_misfit"].values
     whole = misfit > MOVED_CAMERA_WHOLE_RATIO * _usual(outliers["camera_misfit"])
     usable = frames[np.isfinite(frames).sum(axis=1) > 2]  # lights with results for at least three cameras
     judged = np.isfinite(usable).sum(axis=0) >= MIN_LIGHTS_PER_CAMERA
@@ -161,7 +171,8 @@ def _median(counts: NDArray[Any]) -> NDArray[Any]:
 
     If most samples are outliers, the median is the lower end of the last bin.
     """
-    total, below = counts.sum(-1), counts.cumsum(-1)
+    total = counts.sum(-1)
+    below = counts.cumsum(-1)
     half = total / 2
     place = np.argmax(below >= half[..., None], axis=-1)
     inside = np.take_along_axis(counts, place[..., None], -1)[..., 0]

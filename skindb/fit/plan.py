@@ -70,15 +70,14 @@ def plan_fit(
         measured = "only the probe was measured" if "probe" in capture.children else "neither dome nor probe"
         cure = "photograph the subject in the dome, or exclude this take"
         raise InputError(Fault(where, "a fit needs photographs of a dome", measured, cure))
-    surfels, probe = capture["samples"].to_dataset()["sample_count"].values > 0, "probe" in capture.children
+    surfels = capture["samples"].to_dataset()["sample_count"].values > 0
+    probe = "probe" in capture.children
     # a light that is hidden from every sampled surfel has no samples; dark lights cannot be ingested
     fraction = capture["surfels"].to_dataset()["light_visible_fraction"].values
     reached = np.asarray((fraction[surfels] > 0).any(axis=0))
     if not surfels.any() or not reached.any():
-        rule, cure = (
-            "a fit needs surfels that a camera sees lit",
-            "check calibration, mesh and frames, then ingest again",
-        )
+        rule = "a fit needs surfels that a camera sees lit"
+        cure = "check calibration, mesh and frames, then ingest again"
         raise InputError(Fault(f"{where}: samples", rule, "no usable sample", cure))
     found = [
         Omission("surfels", int((~surfels).sum()), surfels.size, "no usable sample: no camera sees them lit"),

@@ -36,11 +36,15 @@ def prediction_table(fitted: xr.Dataset) -> xr.Dataset:
         "perceptual": cube-root space). Region "face" and status "any" include all surfels.
     """
     check(fitted, ("fit_status", "surfel_area"), where="fitted")
-    status, area = fitted["fit_status"].values, fitted["surfel_area"].values.astype(np.float64)
+    status = fitted["fit_status"].values
+    area = fitted["surfel_area"].values.astype(np.float64)
     errors = [[_values(fitted, name) for name in names] for names in SAMPLES.values()]
-    outliers, regions = _values(fitted, "outlier_fraction"), _regions(fitted)
+    outliers = _values(fitted, "outlier_fraction")
+    regions = _regions(fitted)
     shape = len(regions), len(FitStatus) + 1
-    count, share, strange = np.zeros(shape, np.int64), np.full(shape, np.nan), np.full(shape, np.nan)
+    count = np.zeros(shape, np.int64)
+    share = np.full(shape, np.nan)
+    strange = np.full(shape, np.nan)
     error = np.full((*shape, len(SAMPLES), len(SPACES), len(QUANTILES)), np.nan)
     for r, inside in enumerate(regions.values()):
         for s, member in enumerate((None, *FitStatus)):

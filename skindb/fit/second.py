@@ -52,7 +52,8 @@ def refit_and_evaluate(
     names = (*NEEDED, *noise_inputs(lumitexels), *ERROR_INPUTS)
     check(lumitexels, names, where="lumitexels")
     held = 1 * held_out["light_held_out"].values[:, None] + 2 * held_out["camera_held_out"].values[None, :]
-    tables, used = reduced_tables(basis), lumitexels[list(names)]
+    tables = reduced_tables(basis)
+    used = lumitexels[list(names)]
     strength = surface_strength(tables)
     judged_at = [(i, of) for i, of in enumerate(("light", "camera")) if held_out[f"{of}_held_out"].any()]
     options: dict[str, Any] = {"eta": eta, "mode": mode, "noise_floor": noise_floor(lumitexels)}

@@ -122,13 +122,15 @@ def refit(lumitexels: xr.Dataset, *, basis: xr.Dataset, mode: Mode = "perceptual
         so sharp that only a few samples see them, and for weights that noise moves to their bound.
     """
     check(lumitexels, NEEDED, where="lumitexels")
-    known, noise = tuple(name for name in ERROR_INPUTS if name in lumitexels), noise_inputs(lumitexels)
+    known = tuple(name for name in ERROR_INPUTS if name in lumitexels)
+    noise = noise_inputs(lumitexels)
     tables = reduced_tables(basis)
     strength = surface_strength(tables)
 
     def kernel(*arrays: Array, **params: Any) -> tuple[Array, ...]:
         given = len(arrays) - len(known)
-        samples, errors = arrays[:given], dict(zip(known, arrays[given:], strict=True))
+        samples = arrays[:given]
+        errors = dict(zip(known, arrays[given:], strict=True))
         diffuse = errors.get("diffuse_reflectance_error", np.zeros((len(samples[0]), 3)))
         found = refit_weights(*samples, diffuse_error=diffuse, normal_error=errors.get("normal_error"), **params)
         variables = refitted_variables(found, strength)

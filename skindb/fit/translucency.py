@@ -74,7 +74,8 @@ def fit_probe(probe: xr.Dataset, *, eta: float = 1.3, profile: str = "transport"
     if profile not in PROFILE_NAMES:
         raise ValueError(f"profile must be one of {PROFILE_NAMES}, not {profile!r}")
     check(probe, PROBE, where="probe")
-    free, radius = not bool(probe["gain_known"]), float(probe["fibre_radius"])
+    free = not bool(probe["gain_known"])
+    radius = float(probe["fibre_radius"])
     fits = _fit_each(probe, eta=eta, radius=radius, model=profile, free_gain=free)
     shape = probe.sizes["site"], probe.sizes["channel"]
     columns = {
@@ -181,7 +182,8 @@ def translucency_map(surfels: xr.Dataset, sites: xr.Dataset) -> xr.Dataset:
     place = sites["site_position"].values.astype(np.float64)
     mirrored = np.abs(place[:, 0]) > MIDLINE
     place = np.concatenate([place, place[mirrored] * [-1, 1, 1]])
-    path, good = np.concatenate([path, path[mirrored]]), np.concatenate([good, good[mirrored]])
+    path = np.concatenate([path, path[mirrored]])
+    good = np.concatenate([good, good[mirrored]])
     known = np.isfinite(place).all(1)
     position = surfels["surfel_position"].values.astype(np.float64)
     weight = np.empty((len(position), len(place)))

@@ -55,13 +55,18 @@ def matches_tangent_plane(
     span = math.ceil(reach)
     for k in range(len(chosen)):
         i = chosen[k]
-        x, y, z = points[i, 0] - centre[0], points[i, 1] - centre[1], points[i, 2] - centre[2]
+        x = points[i, 0] - centre[0]
+        y = points[i, 1] - centre[1]
+        z = points[i, 2] - centre[2]
         nx, ny, nz = normals[i]
-        own, level = math.sqrt(x * x + y * y + z * z), x * nx + y * ny + z * nz
-        column0, row0 = math.floor(pixels[i, 0] - 0.5), math.floor(pixels[i, 1] - 0.5)
+        own = math.sqrt(x * x + y * y + z * z)
+        level = x * nx + y * ny + z * nz
+        column0 = math.floor(pixels[i, 0] - 0.5)
+        row0 = math.floor(pixels[i, 1] - 0.5)
         for row in range(max(row0 - span + 1, 0), min(row0 + span + 1, height)):
             for column in range(max(column0 - span + 1, 0), min(column0 + span + 1, width)):
-                dx, dy = column + 0.5 - pixels[i, 0], row + 0.5 - pixels[i, 1]
+                dx = column + 0.5 - pixels[i, 0]
+                dy = row + 0.5 - pixels[i, 1]
                 if dx * dx + dy * dy > reach * reach:
                     continue
                 facing = rays[row, column, 0] * nx + rays[row, column, 1] * ny + rays[row, column, 2] * nz

@@ -45,13 +45,19 @@ def aim(
         (m, 3) mm, unit directions and (m,) mm, output; reach is at least 0, and not finite if a point is not.
     """
     for k in range(len(at)):
-        i, up, to = at[k] if len(origin) > 1 else 0, at[k] if len(lift) > 1 else 0, k if len(target) > 1 else 0
+        i = at[k] if len(origin) > 1 else 0
+        up = at[k] if len(lift) > 1 else 0
+        to = k if len(target) > 1 else 0
         x = origin[i, 0] - centre[0] + offset * lift[up, 0]
         y = origin[i, 1] - centre[1] + offset * lift[up, 1]
         z = origin[i, 2] - centre[2] + offset * lift[up, 2]
-        dx, dy, dz = target[to, 0] - centre[0] - x, target[to, 1] - centre[1] - y, target[to, 2] - centre[2] - z
+        dx = target[to, 0] - centre[0] - x
+        dy = target[to, 1] - centre[1] - y
+        dz = target[to, 2] - centre[2] - z
         length = math.sqrt(dx * dx + dy * dy + dz * dz)
-        dx, dy, dz = dx / length, dy / length, dz / length
+        dx = dx / length
+        dy = dy / length
+        dz = dz / length
         start[k, 0], start[k, 1], start[k, 2] = x + ahead * dx, y + ahead * dy, z + ahead * dz
         way[k, 0], way[k, 1], way[k, 2] = dx, dy, dz
         # Embree marks a hit by a negative length, so that the input must not be negative

@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from skindb._compiled import fast_kernel, inline_fast_kernel
 
 Single = NDArray[np.float32]
-ZERO, HALF, ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
+ZERO = np.float32(0.0)
+HALF = np.float32(0.5)
+ONE = np.float32(1.0)
 MIN_DEPTH_MM = np.float32(1.0)  # mm in front of the eye
 LEVEL = np.float32(-0.01)  # tangent planes closer to the line of sight are not extrapolated
 MAX_DISC_SLOPE = np.float32(50.0)  # depth of a disc per width at most
@@ -20,7 +22,9 @@ MAX_DISC_SLOPE = np.float32(50.0)  # depth of a disc per width at most
 @inline_fast_kernel
 def _project(p: Any, n: Any, frame: Any, eye: Any) -> Any:
     """Point and normal in the frame of the eye, and the height of the eye over the disc: negative from behind."""
-    dx, dy, dz = p[0] - eye[0], p[1] - eye[1], p[2] - eye[2]
+    dx = p[0] - eye[0]
+    dy = p[1] - eye[1]
+    dz = p[2] - eye[2]
     height = -(n[0] * dx + n[1] * dy + n[2] * dz)
     x = frame[0, 0] * dx + frame[0, 1] * dy + frame[0, 2] * dz
     y = frame[1, 0] * dx + frame[1, 1] * dy + frame[1, 2] * dz
@@ -38,12 +42,22 @@ def _ellipse(x: Any, y: Any, z: Any, a: Any, b: Any, c: Any, radius: Any, focal:
     q = -ONE / (side + c)
     w = a * b * q
     scale = focal / z * radius
-    ux, uy, uz = ONE + side * a * a * q, side * w, -side * a  # tangents by Duff et al. 2017
-    vx, vy, vz = w, side + b * b * q, -b
-    sx, sy = x / z, y / z
-    j00, j10 = scale * (ux - sx * uz), scale * (uy - sy * uz)
-    j01, j11 = scale * (vx - sx * vz), scale * (vy - sy * vz)
-    xx, xy, yy = j00 * j00 + j01 * j01 + ONE, j00 * j10 + j01 * j11, j10 * j10 + j11 * j11 + ONE
+    # tangents by Duff et al. 2017
+    ux = ONE + side * a * a * q
+    uy = side * w
+    uz = -side * a
+    vx = w
+    vy = side + b * b * q
+    vz = -b
+    sx = x / z
+    sy = y / z
+    j00 = scale * (ux - sx * uz)
+    j10 = scale * (uy - sy * uz)
+    j01 = scale * (vx - sx * vz)
+    j11 = scale * (vy - sy * vz)
+    xx = j00 * j00 + j01 * j01 + ONE
+    xy = j00 * j10 + j01 * j11
+    yy = j10 * j10 + j11 * j11 + ONE
     determinant = xx * yy - xy * xy
     return yy / determinant, -xy / determinant, xx / determinant, math.sqrt(xx), math.sqrt(yy)
 
@@ -92,8 +106,12 @@ def splat(
         if not z > MIN_DEPTH_MM or over == 0 or (counting and over < 0):
             continue
         if over < 0:  # an open mesh also hides from behind
-            a, b, c, over = -a, -b, -c, -over
-        px, py = focal * x / z - corner[0], focal * y / z - corner[1]
+            a = -a
+            b = -b
+            c = -c
+            over = -over
+        px = focal * x / z - corner[0]
+        py = focal * y / z - corner[1]
         # the linear approximation fails for discs larger than half of a map
         beside = ZERO if counting else HALF
         if abs(px - HALF * width) > (HALF + beside) * width or abs(py - HALF * height) > (HALF + beside) * height:
@@ -108,8 +126,10 @@ def splat(
         creep = slope * z / focal * min(lean * z / over, MAX_DISC_SLOPE)
         # the depth is valid only within the rim of the disc
         reach = radius[i] * lean + creep
-        behind, plane = bias + creep, a * x + b * y + c * z
-        rasterised, blended = 0, 0
+        behind = bias + creep
+        plane = a * x + b * y + c * z
+        rasterised = 0
+        blended = 0
         for row in range(y0, y1 + 1):
             fy = row + HALF - py
             for column in range(x0, x1 + 1):

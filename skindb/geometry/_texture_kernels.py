@@ -19,16 +19,23 @@ def rasterise(uv: Array, faces: Array, face: Array, weight: Array) -> None:
     """Write the first triangle over each texel centre and the weights of its corners; `face` starts as -1."""
     size = face.shape[0]
     for f in range(len(faces)):
-        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
+        a = faces[f, 0]
+        b = faces[f, 1]
+        c = faces[f, 2]
         # texel centres become integers
-        ax, ay = np.float64(uv[a, 0]) * size - 0.5, np.float64(uv[a, 1]) * size - 0.5
-        bx, by = np.float64(uv[b, 0]) * size - 0.5, np.float64(uv[b, 1]) * size - 0.5
-        cx, cy = np.float64(uv[c, 0]) * size - 0.5, np.float64(uv[c, 1]) * size - 0.5
+        ax = np.float64(uv[a, 0]) * size - 0.5
+        ay = np.float64(uv[a, 1]) * size - 0.5
+        bx = np.float64(uv[b, 0]) * size - 0.5
+        by = np.float64(uv[b, 1]) * size - 0.5
+        cx = np.float64(uv[c, 0]) * size - 0.5
+        cy = np.float64(uv[c, 1]) * size - 0.5
         double_area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
         if not (abs(double_area) > 0):
             continue
-        left, right = max(np.ceil(min(ax, bx, cx) - EDGE), 0), min(np.floor(max(ax, bx, cx) + EDGE), size - 1)
-        top, bottom = max(np.ceil(min(ay, by, cy) - EDGE), 0), min(np.floor(max(ay, by, cy) + EDGE), size - 1)
+        left = max(np.ceil(min(ax, bx, cx) - EDGE), 0)
+        right = min(np.floor(max(ax, bx, cx) + EDGE), size - 1)
+        top = max(np.ceil(min(ay, by, cy) - EDGE), 0)
+        bottom = min(np.floor(max(ay, by, cy) + EDGE), size - 1)
         for i in range(int(top), int(bottom) + 1):
             for j in range(int(left), int(right) + 1):
                 if face[i, j] >= 0:
@@ -37,7 +44,9 @@ def rasterise(uv: Array, faces: Array, face: Array, weight: Array) -> None:
                 v = ((bx - ax) * (i - ay) - (by - ay) * (j - ax)) / double_area
                 if min(u, v, 1 - u - v) < -EDGE:
                     continue
-                first, second, third = max(1 - u - v, 0), max(u, 0), max(v, 0)
+                first = max(1 - u - v, 0)
+                second = max(u, 0)
+                third = max(v, 0)
                 total = first + second + third
                 face[i, j] = f
                 weight[i, j, 0], weight[i, j, 1], weight[i, j, 2] = first / total, second / total, third / total
@@ -93,15 +102,22 @@ def average(
                 for channel in range(values.shape[1]):
                     image[i, j, channel] = 0
     for f in range(len(faces)):
-        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-        ax, ay = np.float64(uv[a, 0]) * size, np.float64(uv[a, 1]) * size
-        bx, by = np.float64(uv[b, 0]) * size, np.float64(uv[b, 1]) * size
-        cx, cy = np.float64(uv[c, 0]) * size, np.float64(uv[c, 1]) * size
+        a = faces[f, 0]
+        b = faces[f, 1]
+        c = faces[f, 2]
+        ax = np.float64(uv[a, 0]) * size
+        ay = np.float64(uv[a, 1]) * size
+        bx = np.float64(uv[b, 0]) * size
+        by = np.float64(uv[b, 1]) * size
+        cx = np.float64(uv[c, 0]) * size
+        cy = np.float64(uv[c, 1]) * size
         double_area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
         if not (abs(double_area) > 0):
             continue
-        left, right = max(np.floor(min(ax, bx, cx)), 0), min(np.floor(max(ax, bx, cx)), size - 1)
-        top, bottom = max(np.floor(min(ay, by, cy)), 0), min(np.floor(max(ay, by, cy)), size - 1)
+        left = max(np.floor(min(ax, bx, cx)), 0)
+        right = min(np.floor(max(ax, bx, cx)), size - 1)
+        top = max(np.floor(min(ay, by, cy)), 0)
+        bottom = min(np.floor(max(ay, by, cy)), size - 1)
         for i in range(int(top), int(bottom) + 1):
             for j in range(int(left), int(right) + 1):
                 if not chosen[i, j]:
@@ -117,8 +133,10 @@ def average(
                 part[0], part[1], part[2] = 0.0, 0.0, 0.0
                 # a fan of triangles: area of each times the weights of the corners at its centroid
                 for k in range(1, n - 1):
-                    px, py = polygon[k, 0] - polygon[0, 0], polygon[k, 1] - polygon[0, 1]
-                    qx, qy = polygon[k + 1, 0] - polygon[0, 0], polygon[k + 1, 1] - polygon[0, 1]
+                    px = polygon[k, 0] - polygon[0, 0]
+                    py = polygon[k, 1] - polygon[0, 1]
+                    qx = polygon[k + 1, 0] - polygon[0, 0]
+                    qy = polygon[k + 1, 1] - polygon[0, 1]
                     area = abs(px * qy - py * qx) / 2
                     x = polygon[0, 0] + (px + qx) / 3 - ax
                     y = polygon[0, 1] + (py + qy) / 3 - ay
@@ -149,7 +167,8 @@ def _clip(polygon: Array, out: Array, n: int, axis: int, line: float, side: floa
     m = 0
     for k in range(n):
         after = k + 1 if k + 1 < n else 0
-        here, there = side * (polygon[k, axis] - line), side * (polygon[after, axis] - line)
+        here = side * (polygon[k, axis] - line)
+        there = side * (polygon[after, axis] - line)
         if here >= 0:
             out[m, 0], out[m, 1] = polygon[k, 0], polygon[k, 1]
             m += 1
@@ -168,7 +187,8 @@ def pull(values: Array, weight: Array, coarse: Array, total: Array) -> None:
     height, width = weight.shape
     for i in range(total.shape[0]):
         for j in range(total.shape[1]):
-            rows, columns = min(2 * i + 2, height), min(2 * j + 2, width)
+            rows = min(2 * i + 2, height)
+            columns = min(2 * j + 2, width)
             known = 0.0
             for y in range(2 * i, rows):
                 for x in range(2 * j, columns):
@@ -185,7 +205,8 @@ def pull(values: Array, weight: Array, coarse: Array, total: Array) -> None:
 @kernel
 def push(values: Array, weight: Array, coarse: Array, total: Array) -> None:
     """Blend texels with a weight below 1 with the interpolated coarser level, in place."""
-    rows, columns = np.empty(2, np.int64), np.empty(2, np.int64)
+    rows = np.empty(2, np.int64)
+    columns = np.empty(2, np.int64)
     for i in range(weight.shape[0]):
         rows[0] = i // 2
         rows[1] = min(max(rows[0] + 2 * (i % 2) - 1, 0), total.shape[0] - 1)

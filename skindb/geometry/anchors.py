@@ -19,13 +19,24 @@ Float = NDArray[np.floating[Any]]
 Index = NDArray[np.int64]
 ALIGNED = 3  # number of shared landmarks that an alignment requires
 MIN_LANDMARK_WIDTH_RATIO = 0.05  # width of the landmarks over their length, below which the rotation is undetermined
-INNER, RIM = 200, 48  # points inside the surface (17 mm apart on a head) and along its outline
+# points inside the surface (17 mm apart on a head) and along its outline
+INNER = 200
+RIM = 48
 SAMPLED_VERTICES = 20_000  # vertices from which these points are chosen
-ALIGNMENT_ROUNDS, RIM_FROM = 8, 4  # rounds of alignment; round from which matching outlines are used
-AMPLITUDE, LENGTH = 10.0, 60.0  # mm: amplitude and correlation length of differences of faces after a similarity
+# rounds of alignment; round from which matching outlines are used
+ALIGNMENT_ROUNDS = 8
+RIM_FROM = 4
+# mm: amplitude and correlation length of differences of faces after a similarity
+AMPLITUDE = 10.0
+LENGTH = 60.0
 # mm, standard deviations: of a click; across the surface; along the surface; of the outline
-CLICK, ACROSS, ALONG, OUTLINE = 1.0, 0.5, 6.0, 4.0
-MAX_ALIGNING_DISTANCE_MM, MAX_FOUND_DISTANCE_MM = 20.0, 8.0  # mm from the surface: during alignment, and at the end
+CLICK = 1.0
+ACROSS = 0.5
+ALONG = 6.0
+OUTLINE = 4.0
+# mm from the surface: during alignment, and at the end
+MAX_ALIGNING_DISTANCE_MM = 20.0
+MAX_FOUND_DISTANCE_MM = 8.0
 # mm from the nearest landmark: within it, clicks are more accurate than shape (lips and nose by 0.3 mm)
 MIN_LANDMARK_DISTANCE_MM = 20.0
 MIN_COSINE_NORMALS = 0.5  # between the normals of points that may correspond
@@ -72,7 +83,8 @@ def anchor_vertices(sheet: Sheet) -> Index:
     """`INNER` vertices far from each other and the landmarks, then `RIM` along the outline."""
     among = np.flatnonzero(~sheet.rim)[:: max(1, len(sheet.position) // SAMPLED_VERTICES)]
     points = sheet.position[among]
-    away, inner = cKDTree(sheet.landmark[sheet.known()]).query(points)[0], list[int]()
+    away = cKDTree(sheet.landmark[sheet.known()]).query(points)[0]
+    inner = list[int]()
     for _ in range(min(INNER, len(among))):
         inner.append(int(away.argmax()))
         away = np.minimum(away, np.linalg.norm(points - points[inner[-1]], axis=1))
@@ -105,17 +117,21 @@ def corresponding_uv(template: Sheet, chosen: Index, take: Sheet) -> NDArray[np.
 
 def _aligned(template: Sheet, chosen: Index, take: Sheet, known: Mask) -> tuple[NDArray[np.float64], Mask, bool]:
     """Positions (n, 3) of chosen points on the take, mask of outline points, and whether the outlines match."""
-    clicks, on_rim = template.landmark[known], template.rim[chosen]
+    clicks = template.landmark[known]
+    on_rim = template.rim[chosen]
     matrix, shift = similarity(clicks, take.landmark[known])
     turn = matrix / np.cbrt(np.linalg.det(matrix))
-    start, normal = template.position[chosen] @ matrix + shift, template.normal[chosen] @ turn
+    start = template.position[chosen] @ matrix + shift
+    normal = template.normal[chosen] @ turn
     tree = cKDTree(take.position)
     outline = take.outline[cKDTree(take.uv[take.outline]).query(template.uv[chosen[on_rim]])[1]]
-    n, every = len(clicks), np.concatenate([clicks @ matrix + shift, start])
+    n = len(clicks)
+    every = np.concatenate([clicks @ matrix + shift, start])
     kernel = AMPLITUDE**2 * _matern(np.linalg.norm(every[:, None] - every, axis=2) / LENGTH)
     pull = np.concatenate([take.landmark[known] - every[:n], np.zeros_like(start)])
     spread = np.tile(CLICK**2 * np.eye(3), (len(every), 1, 1))
-    used, same = np.arange(len(every)) < n, False
+    used = np.arange(len(every)) < n
+    same = False
     for i in range(ALIGNMENT_ROUNDS + 1):
         now = start + kernel[n:, used] @ _weights(kernel[np.ix_(used, used)], pull[used], spread[used])
         distance, near = tree.query(now)

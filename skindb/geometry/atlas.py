@@ -60,7 +60,8 @@ def disc_atlas(
     InputError
         If the surface is closed, has a handle, is in pieces, or has triangles too small for any map.
     """
-    points, corner = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
+    points = np.asarray(vertices, np.float64)
+    corner = np.asarray(faces, np.int64)
     loops = outline_first(points, boundary_loops(corner))
     _check(len(points), corner, loops)
     surface = Surface(*_cap_holes(points, corner, loops[1:]), len(corner), loops[0], _circle(points[loops[0]]))
@@ -95,16 +96,19 @@ class Surface:
 def signed_areas(uv: Float, faces: Faces) -> NDArray[np.float64]:
     """Areas (f,) of triangles in the map; positive if they face outwards (u to the right, v down)."""
     a, b, c = (np.asarray(uv, np.float64)[faces[:, i]] for i in range(3))
-    first, second = b - a, c - a
+    first = b - a
+    second = c - a
     return np.asarray(first[:, 1] * second[:, 0] - first[:, 0] * second[:, 1]) / 2
 
 
 def _check(n: int, faces: Index, loops: list[Index]) -> None:
-    where, cure = "mesh", "cut the scan so that one open surface remains"
+    where = "mesh"
+    cure = "cut the scan so that one open surface remains"
     if not loops:
         raise InputError(Fault(where, "a surface must have a boundary to be flattened", "a closed surface", cure))
     if len(np.unique(faces)) != n or face_components(faces).max() > 0:
-        rule, found = "a surface must be connected to be flattened", "several components or unused vertices"
+        rule = "a surface must be connected to be flattened"
+        found = "several components or unused vertices"
         raise InputError(Fault(where, rule, found, "clean it"))
     handles = (2 - len(loops) - (n - len(edge_table(faces).edges) + len(faces))) // 2
     if handles:
@@ -140,11 +144,13 @@ def _intrinsic_weights(points: NDArray[np.float64], faces: Index) -> sp.csr_matr
     tiny = 1e-9 * area.max()
     cot = [-np.einsum("ni,ni->n", sides[k - 2], sides[k - 1]) / np.maximum(2 * area, tiny) for k in range(3)]
     for k in range(3):
-        i, j = faces[:, (k + 1) % 3], faces[:, (k + 2) % 3]
+        i = faces[:, (k + 1) % 3]
+        j = faces[:, (k + 2) % 3]
         square = np.maximum(np.einsum("ni,ni->n", sides[k], sides[k]), tiny)
         forth = MIX * cot[k] + (1 - MIX) * around[i] * cot[(k + 2) % 3] / square
         back = MIX * cot[k] + (1 - MIX) * around[j] * cot[(k + 1) % 3] / square
-        rows, columns = np.concatenate([i, j]), np.concatenate([j, i])
+        rows = np.concatenate([i, j])
+        columns = np.concatenate([j, i])
         weights = weights + sp.csr_matrix((np.concatenate([forth, back]), (rows, columns)), shape=(n, n))
     return weights
 
@@ -156,12 +162,14 @@ def _mean_value_weights(points: NDArray[np.float64], faces: Index) -> sp.csr_mat
     tiny = 1e-9 * float(np.ptp(points, axis=0).max())
     for k in range(3):
         i, j, l = faces[:, k], faces[:, (k + 1) % 3], faces[:, (k + 2) % 3]  # noqa: E741
-        first, second = points[j] - points[i], points[l] - points[i]
+        first = points[j] - points[i]
+        second = points[l] - points[i]
         a, b = (np.maximum(np.linalg.norm(x, axis=1), tiny) for x in (first, second))
         cosine = np.einsum("ni,ni->n", first, second) / (a * b)
         # at least 1e-6 and at most 1e6, so that coinciding or opposite sides have positive, finite weights
         half = np.sqrt(np.clip(1 - cosine, 1e-12, 2) / np.clip(1 + cosine, 1e-12, 2))
-        rows, columns = np.concatenate([i, i]), np.concatenate([j, l])
+        rows = np.concatenate([i, i])
+        columns = np.concatenate([j, l])
         weights = weights + sp.csr_matrix((np.concatenate([half / a, half / b]), (rows, columns)), shape=(n, n))
     return weights
 
@@ -189,7 +197,10 @@ def _equalised(surface: Surface, weights: sp.csr_matrix) -> list[tuple[NDArray[n
 
     In each round the weights of neighbours in stretched areas are reduced (Yoshizawa et al. 2004).
     """
-    points, faces, real = surface.points, surface.faces, slice(0, surface.real)  # excludes the caps of holes
+    # excludes the caps of holes
+    points = surface.points
+    faces = surface.faces
+    real = slice(0, surface.real)
     area = np.linalg.norm(face_crosses(points, faces), axis=1) / 2
     share = np.bincount(faces.ravel(), np.repeat(area, 3), minlength=len(points))
     found: list[tuple[float, float, NDArray[np.float64]]] = []
@@ -217,6 +228,7 @@ def _upright(uv: NDArray[np.float64], points: NDArray[np.float64], faces: Index)
     height = points[:, 1] - area @ points[:, 1] / area.sum()
     up = (area * height) @ (uv - area @ uv / area.sum())
     angle = np.arctan2(up[0], -up[1])  # of `up` from the top of the page, clockwise
-    cosine, sine = np.cos(angle), np.sin(angle)
+    cosine = np.cos(angle)
+    sine = np.sin(angle)
     turned = uv @ np.array([[cosine, -sine], [sine, cosine]])
     return np.asarray(turned + 0.5)

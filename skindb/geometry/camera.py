@@ -57,7 +57,8 @@ def undistort(pixels: ArrayLike, K: ArrayLike, distortion: ArrayLike) -> NDArray
 
     NaN where no point in front of the camera appears at that pixel.
     """
-    matrix, coefficients = np.asarray(K, np.float64), np.asarray(distortion, np.float64)
+    matrix = np.asarray(K, np.float64)
+    coefficients = np.asarray(distortion, np.float64)
     offset = np.asarray(pixels, np.float64) - matrix[:2, 2]
     bent = np.asarray(offset @ np.linalg.inv(matrix[:2, :2]).T).reshape(-1, 2)
     if not coefficients.any():
@@ -81,7 +82,8 @@ def pixel_rays(pixels: ArrayLike, K: ArrayLike, R: ArrayLike, distortion: ArrayL
 def _distort(plane: Float, coefficients: Float) -> Float:
     """Distorted coordinates (..., 2) (OpenCV, camera calibration, 5 coefficients)."""
     k1, k2, p1, p2, k3 = coefficients
-    x, y = plane[..., 0], plane[..., 1]
+    x = plane[..., 0]
+    y = plane[..., 1]
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
     return np.stack(

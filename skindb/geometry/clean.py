@@ -119,7 +119,8 @@ def clean_mesh(
     InputError
         If nothing is left.
     """
-    points, current = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
+    points = np.asarray(vertices, np.float64)
+    current = np.asarray(faces, np.int64)
     found = _Found()
     if keep is not None:
         found.count["cropped_faces"] = int((~keep).sum())
@@ -182,7 +183,8 @@ def _drop_overfull(points: NDArray[np.float64], faces: Index, found: _Found) -> 
         label = face_components(faces)
         free = (table.count[table.of_face] == 1).sum(axis=1)
         area = np.linalg.norm(face_crosses(points, faces), axis=1)
-        edge, size = table.of_face[face, side], np.bincount(label)[label]
+        edge = table.of_face[face, side]
+        size = np.bincount(label)[label]
         order = np.lexsort((area[face], -free[face], size[face], edge))
         _, first = np.unique(edge[order], return_index=True)
         extra = np.unique(face[order[first]])
@@ -235,7 +237,8 @@ def _fill_small_holes(points: NDArray[np.float64], faces: Index, hole_edges: int
     split, source = _split_bow_ties(faces, len(points))
     parts = [part for loop in boundary_loops(split) for part in simple_loops(source[loop])]
     taken = {(int(a), int(b)) for a, b in edge_table(faces).edges}
-    patches, holes = [faces], []
+    patches = [faces]
+    holes = []
     for loop in outline_first(points, parts)[1:]:
         patch = fill_hole(points, loop, taken) if len(loop) <= hole_edges else None
         if patch is not None:

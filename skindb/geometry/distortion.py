@@ -21,8 +21,10 @@ def flipped(uv: Float, faces: Faces) -> NDArray[np.bool_]:
     for start in range(0, len(faces), TRIANGLES_PER_BLOCK):
         part = faces[start : start + TRIANGLES_PER_BLOCK]
         a, b, c = (np.asarray(uv)[part[:, i]].astype(np.float64) for i in range(3))
-        first, second = b - a, c - a
-        plus, minus = first[:, 1] * second[:, 0], first[:, 0] * second[:, 1]
+        first = b - a
+        second = c - a
+        plus = first[:, 1] * second[:, 0]
+        minus = first[:, 0] * second[:, 1]
         wrong[start : start + TRIANGLES_PER_BLOCK] = plus <= minus
         for i in np.flatnonzero(np.abs(plus - minus) <= CERTAIN * (np.abs(plus) + np.abs(minus))):
             wrong[start + i] = _turned(a[i], b[i], c[i])
@@ -57,7 +59,8 @@ def stretches(vertices: Float, faces: Faces, uv: Float) -> tuple[Array, Array, A
 def _stretches(vertices: Float, faces: Faces, uv: Float) -> tuple[Array, Array, Array]:
     p, q, r = (np.asarray(vertices)[faces[:, k]].astype(np.float64) for k in range(3))
     s, t = (np.asarray(uv)[:, axis].astype(np.float64)[faces].T for axis in (0, 1))
-    first, second = q - p, r - p
+    first = q - p
+    second = r - p
     area = np.linalg.norm(np.cross(first, second), axis=1) / 2
     double = (s[1] - s[0]) * (t[2] - t[0]) - (t[1] - t[0]) * (s[2] - s[0])
     flat = double == 0
@@ -87,7 +90,9 @@ def symmetric_dirichlet(largest: Array, smallest: Array, area: Array) -> float:
     used = (area > 0) & (smallest > 0)
     if not used.any():
         return float("inf")
-    high, low, weight = largest[used] ** 2, smallest[used] ** 2, area[used] / area[used].sum()
+    high = largest[used] ** 2
+    low = smallest[used] ** 2
+    weight = area[used] / area[used].sum()
     scale = area[used].sum() / (area[used] / (largest[used] * smallest[used])).sum()  # mm2 of a unit of the map
     return float(weight @ (high / scale + low / scale + scale / high + scale / low) / 4)
 

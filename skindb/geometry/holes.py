@@ -42,8 +42,10 @@ def fill_hole(vertices: Float, loop: Index, taken: set[tuple[int, int]]) -> Inde
         (n - 2, 3) wound like the mesh; None where every triangulation has a sliver or repeats an edge.
     """
     ring = loop[::-1]  # the mesh follows the loop, so that the patch follows its reverse
-    n, p = len(ring), np.asarray(vertices, np.float64)[ring]
-    cost, split = np.full((n, n), np.inf), np.zeros((n, n), np.int64)
+    n = len(ring)
+    p = np.asarray(vertices, np.float64)[ring]
+    cost = np.full((n, n), np.inf)
+    split = np.zeros((n, n), np.int64)
     cost[np.arange(n - 1), np.arange(1, n)] = 0.0
     for span in range(2, n):
         for i in range(n - span):
@@ -62,7 +64,8 @@ def fill_hole(vertices: Float, loop: Index, taken: set[tuple[int, int]]) -> Inde
             cost[i, k] = total.min()
     if not np.isfinite(cost[0, n - 1]):
         return None
-    triangles, todo = [], [(0, n - 1)]
+    triangles = []
+    todo = [(0, n - 1)]
     while todo:
         i, k = todo.pop()
         if k - i > 1:

@@ -14,7 +14,8 @@ from skindb.geometry.nearest import closest_on_mesh
 Float = NDArray[np.floating[Any]]
 Points = dict[str, NDArray[np.float64]]
 NOSE = "nose_tip"
-RIGHT, LEFT = "_right", "_left"
+RIGHT = "_right"
+LEFT = "_left"
 MIDDLE_FRACTION = 0.15  # of the width of the scan to each side of its middle, where the nose tip is searched
 MIN_WIDTH = 0.15  # of points over their length, below which they lie on a line and do not determine a rotation
 # positions in mm on a mean face that looks along +z, y up: the virtual head of average proportions, rounded. The
@@ -101,12 +102,15 @@ def _spread(known: Mapping[str, Float]) -> bool:
 
 def _fitted(known: Points) -> Points:
     """The mean face, moved onto the points that are set; only shifted where they determine no rotation."""
-    names, mean = [*known], np.array([*MEAN_FACE.values()])
-    source, target = np.array([MEAN_FACE[name] for name in names]), np.array([known[name] for name in names])
+    names = [*known]
+    mean = np.array([*MEAN_FACE.values()])
+    source = np.array([MEAN_FACE[name] for name in names])
+    target = np.array([known[name] for name in names])
     if _spread(known):
         matrix, shift = similarity(source, target)
     else:
-        matrix, shift = np.eye(3), (target - source).mean(axis=0)
+        matrix = np.eye(3)
+        shift = (target - source).mean(axis=0)
     return dict(zip(MEAN_FACE, mean @ matrix + shift, strict=True))
 
 

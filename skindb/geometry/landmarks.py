@@ -25,12 +25,15 @@ def similarity(source: Float, target: Float) -> tuple[NDArray[np.float64], NDArr
     matrix, shift : ndarray
         `source @ matrix + shift` approximates target.
     """
-    x, y = np.asarray(source, np.float64), np.asarray(target, np.float64)
-    a, b = x - x.mean(axis=0), y - y.mean(axis=0)
+    x = np.asarray(source, np.float64)
+    y = np.asarray(target, np.float64)
+    a = x - x.mean(axis=0)
+    b = y - y.mean(axis=0)
     left, value, right = np.linalg.svd(a.T @ b)
     sign = np.ones(len(value))
     sign[-1] = np.sign(np.linalg.det(left @ right))
-    length, along = float((a**2).sum()), float(value @ sign)
+    length = float((a**2).sum())
+    along = float(value @ sign)
     matrix = along / length * (left * sign) @ right if along > 0 and length > 0 else np.eye(len(value))
     return matrix, y.mean(axis=0) - x.mean(axis=0) @ matrix
 
@@ -75,5 +78,6 @@ def _onto(shape: Float, target: Float) -> NDArray[np.float64]:
 
 def _known_mean(shapes: Float) -> NDArray[np.float64]:
     known = np.isfinite(shapes).all(axis=2, keepdims=True)
-    total, count = np.where(known, shapes, 0.0).sum(axis=0), known.sum(axis=0)
+    total = np.where(known, shapes, 0.0).sum(axis=0)
+    count = known.sum(axis=0)
     return np.asarray(np.where(count > 0, total / np.maximum(count, 1), np.nan))

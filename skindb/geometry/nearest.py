@@ -35,12 +35,14 @@ def closest_on_mesh(
     distance : ndarray
         (n,) mm.
     """
-    p, triangles = np.asarray(points, np.float64).reshape(-1, 3), np.asarray(vertices, np.float64)[faces]
+    p = np.asarray(points, np.float64).reshape(-1, 3)
+    triangles = np.asarray(vertices, np.float64)[faces]
     used = np.zeros(len(vertices), np.bool_)
     used[faces] = True
     near = cKDTree(np.asarray(vertices, np.float64)[used]).query(p)[0]
     classes = _by_reach(triangles)
-    face, corner = np.empty(len(p), np.int64), np.empty((len(p), 3))
+    face = np.empty(len(p), np.int64)
+    corner = np.empty((len(p), 3))
     for start in range(0, len(p), POINTS_PER_BLOCK):
         own = slice(start, start + POINTS_PER_BLOCK)
         row, at = _candidates(classes, p[own], near[own])
@@ -73,7 +75,8 @@ def _by_reach(triangles: Float) -> list[_Class]:
 
 def _candidates(classes: list[_Class], points: Float, near: Float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Pairs (m,) of a point and a triangle that may be nearest to it, given the distance `near` of some vertex."""
-    rows, faces = [], []
+    rows = []
+    faces = []
     for one in classes:
         # no point of a triangle is nearer than its centre minus its radius
         found = one.middles.query_ball_point(points, (near + one.reach) * (1 + 1e-12))
@@ -85,10 +88,13 @@ def _candidates(classes: list[_Class], points: Float, near: Float) -> tuple[NDAr
 def _closest(point: Float, triangles: Float) -> Float:
     """Barycentric (n, 3) of the point of each triangle (n, 3, 3) nearest to a point (n, 3): inside, or on an edge."""
     a = triangles[:, 0]
-    first, second, away = triangles[:, 1] - a, triangles[:, 2] - a, point - a
+    first = triangles[:, 1] - a
+    second = triangles[:, 2] - a
+    away = point - a
     # by orthogonalisation: Gram determinants are squared quantities, which lose precision for needles
     base = _square(first)
-    along, ahead = _dot(first, second) / base, _dot(first, away) / base
+    along = _dot(first, second) / base
+    ahead = _dot(first, away) / base
     height = second - along[:, None] * first
     v = _dot(height, away - ahead[:, None] * first) / _square(height)
     u = ahead - v * along
@@ -97,7 +103,8 @@ def _closest(point: Float, triangles: Float) -> Float:
     off = u[:, None] * first + v[:, None] * second - away
     squared = [np.where(inside, _dot(off, off), np.inf)]
     for i, j in ((0, 1), (1, 2), (2, 0)):
-        start, edge = triangles[:, i], triangles[:, j] - triangles[:, i]
+        start = triangles[:, i]
+        edge = triangles[:, j] - triangles[:, i]
         t = np.clip(_dot(point - start, edge) / _square(edge), 0.0, 1.0)
         weight = np.zeros((len(t), 3))
         weight[:, i], weight[:, j] = 1 - t, t

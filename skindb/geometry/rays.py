@@ -36,7 +36,8 @@ class RayScene:
         if not len(used) or not np.isfinite(used).all():
             raise ValueError("rays need at least one triangle, and finite vertices")
         self._centre = (used.min(axis=0) + used.max(axis=0)) / 2
-        self._corners, self._faces = corners - self._centre, index
+        self._corners = corners - self._centre
+        self._faces = index
         self._scene = EmbreeScene()
         # triangles by value: vertices of no triangle may be invalid
         TriangleMesh(self._scene, self._corners.astype(np.float32)[index])
@@ -75,9 +76,12 @@ class RayScene:
         which = np.arange(np.broadcast_shapes(begin.shape, end.shape)[0]) if at is None else np.asarray(at, np.int64)
         hidden = np.empty(len(which), bool)
         size = min(RAYS_PER_BLOCK, len(which))
-        start, way, reach = np.empty((size, 3), np.float32), np.empty((size, 3), np.float32), np.empty(size, np.float32)
+        start = np.empty((size, 3), np.float32)
+        way = np.empty((size, 3), np.float32)
+        reach = np.empty(size, np.float32)
         for i in range(0, len(which), RAYS_PER_BLOCK):
-            part, aims = which[i : i + RAYS_PER_BLOCK], end[i : i + RAYS_PER_BLOCK] if len(end) > 1 else end
+            part = which[i : i + RAYS_PER_BLOCK]
+            aims = end[i : i + RAYS_PER_BLOCK] if len(end) > 1 else end
             rays = (start[: len(part)], way[: len(part)], reach[: len(part)])
             aim(begin, part, aims, lift, self._centre, offset_mm, ahead, offset_mm, *rays)
             found = ~np.isfinite(rays[2])  # Embree overwrites its input
@@ -105,7 +109,8 @@ class RayScene:
         """
         begin, towards = np.broadcast_arrays(np.asarray(origin, np.float64), np.asarray(direction, np.float64))
         face = np.full(len(begin), -1, np.int32)
-        barycentric, distance = np.zeros((len(begin), 3)), np.full(len(begin), np.inf)
+        barycentric = np.zeros((len(begin), 3))
+        distance = np.full(len(begin), np.inf)
         for i in range(0, len(begin), RAYS_PER_BLOCK):
             part = slice(i, i + RAYS_PER_BLOCK)
             start = begin[part] - self._centre
@@ -154,9 +159,14 @@ def _length(vectors: Float) -> Float:
 
 def _refine(triangles: Float, origin: Float, direction: Float) -> tuple[Float, Float]:
     """Barycentric (n, 3) and distance (n,) in float64 of rays that meet their triangles (Moller and Trumbore 1997)."""
-    a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
-    first, second, from_a = b - a, c - a, origin - a
-    p, q = np.cross(direction, second), np.cross(from_a, first)
+    a = triangles[:, 0]
+    b = triangles[:, 1]
+    c = triangles[:, 2]
+    first = b - a
+    second = c - a
+    from_a = origin - a
+    p = np.cross(direction, second)
+    q = np.cross(from_a, first)
     determinant = np.einsum("ni,ni->n", first, p)
     # edge-on in float64 although Embree reports a hit: corner a replaces the hit
     safe = np.where(np.abs(determinant) > 0, determinant, np.inf)

@@ -139,7 +139,8 @@ def _require_counts(stream: BinaryIO) -> None:
         word, *rest = line.split()[:3] or [b""]
         if word != b"element":
             continue
-        name, count = rest[0], int(rest[1])
+        name = rest[0]
+        count = int(rest[1])
         most = {b"vertex": MAX_SCAN_VERTICES, b"face": MAX_SCAN_FACES}.get(name, size)
         total += count
         if not 0 <= count <= min(most, size):
@@ -157,7 +158,9 @@ def _require_counts(stream: BinaryIO) -> None:
 
 def _read_obj(stream: BinaryIO) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Positions and faces only: general readers split or reorder vertices where texture coordinates differ."""
-    vertices, corners, sizes = array("d"), array("q"), array("q")
+    vertices = array("d")
+    corners = array("q")
+    sizes = array("q")
     for word, rest in _obj_lines(stream):
         if word == b"v":
             point = [float(x) for x in rest.split()[:3]]
@@ -171,7 +174,8 @@ def _read_obj(stream: BinaryIO) -> tuple[NDArray[np.float64], NDArray[np.int64]]
             sizes.append(len(index))
         if len(vertices) > 3 * MAX_SCAN_VERTICES or len(corners) > 3 * MAX_SCAN_FACES:
             raise DamageError(f"more than {MAX_SCAN_VERTICES:,} vertices or {MAX_SCAN_FACES:,} triangles")
-    points, numbers = np.array(vertices, np.float64).reshape(-1, 3), np.array(corners, np.int64)
+    points = np.array(vertices, np.float64).reshape(-1, 3)
+    numbers = np.array(corners, np.int64)
     if all(size == 3 for size in sizes):
         return points, numbers.reshape(-1, 3)
     return points, _triangulated(np.split(numbers, np.cumsum(sizes)[:-1]), points)

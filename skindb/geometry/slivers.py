@@ -29,7 +29,8 @@ def repair_slivers(vertices: Float, faces: Index) -> tuple[Index, Index, Index]:
     for _ in range(MAX_FLIP_ROUNDS):
         bad = sliver_mask(vertices, current)
         near = np.flatnonzero(np.isin(current, current[bad]).any(axis=1))  # the neighbourhood that a repair needs
-        patch, before = _patch(current[near]), len(repaired)
+        patch = _patch(current[near])
+        before = len(repaired)
         for i in np.flatnonzero(bad[near]).tolist():
             corners = patch.faces[i].copy()
             if _repair(vertices, patch, i):
@@ -75,7 +76,8 @@ def _repair(vertices: Float, patch: _Patch, i: int) -> bool:
     if corner[0] < 0 or not sliver_mask(vertices, corner[None])[0]:
         return False  # removed by an earlier repair
     side = np.linalg.norm(vertices[np.roll(corner, -1)] - vertices[corner], axis=1)
-    short, long = int(side.argmin()), int(side.argmax())
+    short = int(side.argmin())
+    long = int(side.argmax())
     ends = int(corner[short]), int(corner[(short + 1) % 3])
     if side[short] <= MAX_NEEDLE_RATIO * side[long] and _collapse(patch, min(ends), max(ends)):
         return True
@@ -84,7 +86,8 @@ def _repair(vertices: Float, patch: _Patch, i: int) -> bool:
 
 def _collapse(patch: _Patch, keep: int, gone: int) -> bool:
     """Move a vertex onto another unless that would pinch the surface (link condition)."""
-    at_keep, at_gone = patch.around(keep), patch.around(gone)
+    at_keep = patch.around(keep)
+    at_gone = patch.around(gone)
     between = patch.star[keep] & patch.star[gone]
     common = (set(at_keep.ravel().tolist()) & set(at_gone.ravel().tolist())) - {keep, gone}
     open_ends = _is_open(at_keep, keep) and _is_open(at_gone, gone)

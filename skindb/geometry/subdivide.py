@@ -60,7 +60,8 @@ def subdivide(
     matrix : csr_matrix
         (v', v): apply it to any value of the old vertices (texture coordinates, masks) for that of the new.
     """
-    matrix, current = sp.identity(len(vertices), format="csr"), np.asarray(faces, np.int64)
+    matrix = sp.identity(len(vertices), format="csr")
+    current = np.asarray(faces, np.int64)
     for _ in range(levels):
         level, current = loop_matrix(current, matrix.shape[0])
         matrix = level @ matrix
@@ -86,7 +87,8 @@ def carry_points(
     face, barycentric
         (k,) triangles of the new mesh and (k, 3) weights of their corners.
     """
-    at, weight = np.array(face, np.int64), np.array(barycentric, np.float64).reshape(-1, 3)
+    at = np.array(face, np.int64)
+    weight = np.array(barycentric, np.float64).reshape(-1, 3)
     for level in range(levels):
         corner = weight.argmax(axis=1)
         middle = weight.max(axis=1) < 1 / 2
@@ -102,7 +104,8 @@ def _odd_rows(table: EdgeTable, opposite: Faces, n: int) -> sp.csr_matrix:
     """New vertices: 3/8 of both ends and 1/8 of both vertices across; the middle of a boundary edge."""
     on_boundary = table.count == 1
     ends = np.where(on_boundary, 1 / 2, 3 / 8)
-    row, side = np.arange(len(ends)), table.of_face.ravel()
+    row = np.arange(len(ends))
+    side = table.of_face.ravel()
     inner = ~on_boundary[side]
     rows = np.concatenate([row, row, side[inner]])
     columns = np.concatenate([table.edges[:, 0], table.edges[:, 1], opposite.ravel()[inner]])
@@ -112,7 +115,8 @@ def _odd_rows(table: EdgeTable, opposite: Faces, n: int) -> sp.csr_matrix:
 
 def _even_rows(table: EdgeTable, n: int) -> sp.csr_matrix:
     """Old vertices: beta of each neighbour inside; 3/4, 1/8, 1/8 along a boundary; corners and isolated ones stay."""
-    neighbours, rim = _adjacency(table.edges, n), _adjacency(table.edges[table.count == 1], n)
+    neighbours = _adjacency(table.edges, n)
+    rim = _adjacency(table.edges[table.count == 1], n)
     valence, rim_valence = (np.diff(a.indptr) for a in (neighbours, rim))
     safe = np.maximum(valence, 1)
     beta = (5 / 8 - (3 / 8 + np.cos(2 * np.pi / safe) / 4) ** 2) / safe

@@ -66,7 +66,8 @@ def atlas_values(
         (size, size): mean trust in each texel, 0 outside.
     """
     face, weight = raster
-    corner, at = _indices(faces), _doubles(uv)
+    corner = _indices(faces)
+    at = _doubles(uv)
     mixed, trusted = (np.ascontiguousarray(x, np.float32) for x in (values, trust))
     image = np.zeros((*face.shape, values.shape[1]), np.float32)
     confidence = np.zeros(face.shape, np.float32)
@@ -90,7 +91,8 @@ def _indices(faces: Faces) -> NDArray[np.int32]:
 
 def _areas(uv: Float, faces: Faces) -> Image:
     a, b, c = (np.asarray(uv, np.float32)[faces[:, k]] for k in range(3))
-    first, second = b - a, c - a
+    first = b - a
+    second = c - a
     area: Image = np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]) / 2
     return area
 
@@ -152,8 +154,10 @@ def bilinear(image: Float, pixels: Float) -> NDArray[np.float64]:
     column, x = _cell(np.where(inside, place[..., 0], 0.5), width)
     row, y = _cell(np.where(inside, place[..., 1], 0.5), height)
     # a neighbour of weight 0 must not spread its NaN: it is replaced by the pixel itself
-    right, below = column + (x > 0), row + (y > 0)
-    x, y = x[..., None], y[..., None]
+    right = column + (x > 0)
+    below = row + (y > 0)
+    x = x[..., None]
+    y = y[..., None]
     top = values[row, column] * (1 - x) + values[row, right] * x
     bottom = values[below, column] * (1 - x) + values[below, right] * x
     return np.asarray(np.where(inside[..., None], top * (1 - y) + bottom * y, np.nan))

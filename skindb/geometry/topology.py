@@ -57,7 +57,9 @@ def boundary_loops(faces: Faces) -> list[Index]:
 
 def simple_loops(loop: Index) -> list[Index]:
     """Split a closed path (n,) at repeated vertices into parts that pass no vertex twice."""
-    parts, path, place = list[Index](), list[int](), dict[int, int]()
+    parts = list[Index]()
+    path = list[int]()
+    place = dict[int, int]()
     for vertex in loop.tolist():
         if vertex in place:
             start = place[vertex]

@@ -18,8 +18,13 @@ WEAK_SMOOTHING_FACTOR = 3.0  # smoothing at a weak point relative to other point
 LOOSER = (1.0, 4.0, 16.0, 64.0)  # weak points give way before others do
 MIN_WIDTH_RATIO = 1e-2  # width of the points over their length, below which they are treated as a line
 MIN_AREA_RATIO = 0.05  # smallest area of the map relative to that of the similarity
-SMOOTHEST, FIRST, STEP = 1e4, 1e-3, 4.0  # smoothing of folding maps: 1e-3 moves a point by a hundredth of its misfit
-GRID, MARGIN = 64, 4.0  # points per side of the grid that is checked for folds, and its half length in spreads
+# smoothing of folding maps: 1e-3 moves a point by a hundredth of its misfit
+SMOOTHEST = 1e4
+FIRST = 1e-3
+STEP = 4.0
+# points per side of the grid that is checked for folds, and its half length in spreads
+GRID = 64
+MARGIN = 4.0
 NEIGHBOURS = 20  # of a centre, to which lines are checked for folds
 PRODUCTS_PER_BLOCK = 1 << 18  # points times centres: 2 MB of doubles, which stay in the cache
 
@@ -65,7 +70,8 @@ def fit_warp(
     if len(a) < 2:
         shift = b[0] - a[0] if len(a) else np.zeros(2)
         return _plain("shift" if len(a) else "identity", used, np.zeros(2), 1.0, np.eye(2), shift)
-    origin, scale = a.mean(axis=0), _spread(a)
+    origin = a.mean(axis=0)
+    scale = _spread(a)
     a = (a - origin) / scale
     matrix, shift = similarity(a, b)
     fallback = _plain("similarity", used, origin, scale, matrix, shift)
@@ -73,7 +79,8 @@ def fit_warp(
         return fallback
     least = MIN_AREA_RATIO * np.linalg.det(matrix)
     more, there = (np.zeros((0, 2)),) * 2 if weak is None else _finite(*weak)
-    centre, goal = np.concatenate([a, (more - origin) / scale]), np.concatenate([b, there])
+    centre = np.concatenate([a, (more - origin) / scale])
+    goal = np.concatenate([b, there])
     start = max(0.0, SMOOTHING if smoothing is None else smoothing)
     grown = [v for v in FIRST * STEP ** np.arange(20) if start < v < SMOOTHEST]
     tried = [(start, by) for by in (LOOSER if len(more) else LOOSER[:1])]
@@ -142,7 +149,8 @@ class _System:
     @classmethod
     def of(cls, centre: Float, loose: Float) -> _System:
         root = np.sqrt(loose)[:, None]
-        kernel, linear = _bending(centre, centre) / (root * root.T), _linear(centre) / root
+        kernel = _bending(centre, centre) / (root * root.T)
+        linear = _linear(centre) / root
         complement = np.linalg.qr(linear, mode="complete")[0][:, 3:]
         value, vector = np.linalg.eigh(complement.T @ kernel @ complement)
         return cls(centre, loose, kernel, linear, complement, value, vector)
@@ -209,7 +217,8 @@ def _bending(points: Float, centre: Float) -> Float:
 
 def _slope(points: Float, centre: Float, weight: Float) -> Float:
     """Gradient (n, 2, 2) of the weighted sum of r^2 log r: (2 log r + 1) times the vector from each centre."""
-    x, y = points[:, :1] - centre[:, 0], points[:, 1:] - centre[:, 1]
+    x = points[:, :1] - centre[:, 0]
+    y = points[:, 1:] - centre[:, 1]
     factor = np.log(np.maximum(x * x + y * y, np.finfo(np.float64).tiny)) + 1
     return np.stack([(factor * x) @ weight, (factor * y) @ weight], axis=1)
 
@@ -224,6 +233,7 @@ def _watched(centre: Float) -> Float:
     side = np.linspace(-MARGIN, MARGIN, GRID)
     even = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
     near = cKDTree(centre).query(centre, min(NEIGHBOURS, len(centre)))[1].reshape(len(centre), -1)
-    i, j = np.repeat(np.arange(len(centre)), near.shape[1]), near.ravel()
+    i = np.repeat(np.arange(len(centre)), near.shape[1])
+    j = near.ravel()
     between = [t * centre[i] + (1 - t) * centre[j] for t in (0.1, 0.5)]
     return np.concatenate([even, centre, *between])

@@ -88,7 +88,8 @@ class FolderCameras:
         self._quiet = quiet
         self._clock = clock
         if missing := [name for name in ids if not (self.root / name).is_dir()]:
-            rule, cure = "must have a subfolder for each camera", "set the folders in the tethering tool"
+            rule = "must have a subfolder for each camera"
+            cure = "set the folders in the tethering tool"
             raise InputError(Fault(str(self.root), rule, f"no subfolder {', '.join(missing[:5])}", cure))
         self._before: dict[Path, int] = {}  # file -> modification time [ns]
 

@@ -141,7 +141,8 @@ def run_capture(
     """
     _require_devices(setup, devices, plan)
     session = open_unfinished(out, identity(setup, subject, plan.base))
-    schedule, kept = planned_schedule(setup, plan), _keep_interrupted(session, setup, devices)
+    schedule = planned_schedule(setup, plan)
+    kept = _keep_interrupted(session, setup, devices)
     left = remaining_schedule(schedule, session.sequence) if session.sequence else schedule
     run = None
     notes = kept
@@ -218,7 +219,8 @@ def _keep_interrupted(session: Unfinished, setup: Setup, devices: Devices) -> li
     interrupted = session.interrupted_run()
     if interrupted is None:
         return []
-    run, before = recover_run(devices.dome, devices.cameras, *interrupted), len(session.sequence)
+    run = recover_run(devices.dome, devices.cameras, *interrupted)
+    before = len(session.sequence)
     if run is None:
         session.running = None
         session.save()
@@ -247,10 +249,12 @@ def _check_lamp(
 def _require_devices(setup: Setup, devices: Devices, plan: CapturePlan) -> None:
     faults = []
     if unknown := sorted(set(setup.lights) - set(devices.dome.lights)):
-        rule, cure = "the controller must have every light of dome.json", "correct the ids, or the wiring"
+        rule = "the controller must have every light of dome.json"
+        cure = "correct the ids, or the wiring"
         faults.append(Fault(devices.dome.link.name, rule, f"no light {', '.join(unknown[:5])}", cure))
     if unknown := sorted(set(setup.cameras) - set(devices.cameras.ids)):
-        rule, cure = "every camera of dome.json must be connected", "set up their folders"
+        rule = "every camera of dome.json must be connected"
+        cure = "set up their folders"
         faults.append(Fault("cameras", rule, f"no camera {', '.join(unknown[:5])}", cure))
     if plan.sites and (devices.probe is None or devices.probe_camera is None or setup.probe is None):
         rule = "a probe, its camera and contact/probe.json must be present to measure sites"

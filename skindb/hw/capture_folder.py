@@ -81,8 +81,10 @@ def read_setup(folder: Path) -> Setup:
     dome = read_json(folder / "dome/dome.json", faults)
     there = (folder / "contact/probe.json").is_file()
     probe = read_json(folder / "contact/probe.json", faults) if there else None
-    for name, record, keys in (("dome/dome.json", dome, ("cameras", "lights", "exposures")),
-                               ("contact/probe.json", probe, ("exposures", "fibres"))):  # fmt: skip
+    for name, record, keys in (
+        ("dome/dome.json", dome, ("cameras", "lights", "exposures")),
+        ("contact/probe.json", probe, ("exposures", "fibres")),
+    ):
         for key in keys if record is not None else ():
             items = record.get(key) if isinstance(record, dict) else None
             if not isinstance(items, list) or not items or not all(isinstance(i, dict) and "id" in i for i in items):
@@ -127,7 +129,8 @@ def remaining_schedule(schedule: Schedule, entries: Sequence[Mapping[str, Any]])
 
 def keep_frames(session: Unfinished, run: DomeRun, setup: Setup) -> None:
     """Copy the frames of complete steps, and record them in `unfinished.json`."""
-    cameras, entries = setup.cameras, session.sequence
+    cameras = setup.cameras
+    entries = session.sequence
     missing = run.missing(cameras)
     offset = max((float(entry["t_off"]) for entry in entries), default=0.0)
     suffix = next((path.suffix for path in run.frames.values()), ".png")

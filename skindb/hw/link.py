@@ -273,7 +273,8 @@ def open_port(url: str) -> Port:
         port: Port = serial.serial_for_url(url, baudrate=BAUD_RATE, timeout=READ_SECONDS, write_timeout=REPLY_SECONDS)
     except (OSError, ValueError, LookupError, AttributeError, TypeError, serial.SerialException) as error:
         # pyserial parses its URLs without checks and does not catch the errors of parsing
-        rule, cure = "a device must be at this address", "give an address like /dev/ttyACM0 or socket://127.0.0.1:7000"
+        rule = "a device must be at this address"
+        cure = "give an address like /dev/ttyACM0 or socket://127.0.0.1:7000"
         raise DeviceError(Fault(f"address {url}", rule, _system_reason(error), cure)) from None
     return port
 
@@ -350,7 +351,8 @@ class ReplayPort:
             self._left.pop(0)
         recorded = self._left.pop(0)[2] if self._left else b"nothing more"
         if recorded != data:
-            rule, found = f"the next request of a replay must be {recorded!r}", f"{data!r}"
+            rule = f"the next request of a replay must be {recorded!r}"
+            found = f"{data!r}"
             raise DeviceError(Fault(str(self.path), rule, found, "replay it with the same commands"))
 
     def close(self) -> None:

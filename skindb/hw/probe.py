@@ -31,7 +31,9 @@ TIME_PRECISION_SECONDS = 1e-3  # of the times of the gauge
 MAX_AHEAD_SECONDS = 0.2  # by which the clock of the gauge may be fast, in the two minutes of a site
 POLL_SECONDS = 0.1  # interval of status requests
 RELEASE_SECONDS = 0.25  # without a reading, after which the pump counts as off
-PAPER_BRACKETS, PAPER_RATIO = 23, 2 ** (2 / 3)  # exposures, and their ratio (Weyrich et al. 2005, section 8)
+# exposures, and their ratio (Weyrich et al. 2005, section 8)
+PAPER_BRACKETS = 23
+PAPER_RATIO = 2 ** (2 / 3)
 PAPER_SECONDS = 88.0  # for all exposures of a site
 
 Log = NDArray[np.float64]

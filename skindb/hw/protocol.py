@@ -14,8 +14,11 @@ from urllib.parse import quote, unquote
 PROTOCOL = 1  # version that HELLO reports
 MAX_LINE_BYTES = 8192  # HELLO of a dome lists its lights: 150 ids of four characters need 750 bytes
 MAX_NUMBER = 99_999
-REQUEST, REPLY, EVENT = "Q", "R", "E"
-OK, ERROR = "OK", "ERR"
+REQUEST = "Q"
+REPLY = "R"
+EVENT = "E"
+OK = "OK"
+ERROR = "ERR"
 LINE = re.compile(rb"([QRE])(\d{1,5}) ([A-Z]{1,16})((?: [a-z_]{1,16}=[!-)+-~]{0,8000})*)\*([0-9A-F]{4})")
 
 
@@ -83,11 +86,13 @@ class Lines:
         """Add bytes and return the messages that are now complete."""
         *lines, self._rest = (self._rest + data).split(b"\n")
         if len(self._rest) > MAX_LINE_BYTES:  # noise without newlines must not fill the memory
-            lines, self._rest = [*lines, self._rest], b""
+            lines = [*lines, self._rest]
+            self._rest = b""
         messages = []
         for line in filter(None, (line.rstrip(b"\r") for line in lines)):
             try:
                 messages.append(decode(line))
             except ProtocolError:
-                self.damaged, self.sample = self.damaged + 1, line[:80]
+                self.damaged = self.damaged + 1
+                self.sample = line[:80]
         return messages

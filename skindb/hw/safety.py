@@ -76,7 +76,8 @@ def assess(schedule: Schedule, *, window_us: int = WINDOW_US) -> Assessment:
     starts = sorted(one.on_us for one in schedule.steps if one.light != DARK)
     if step < MIN_LUMINANCE_STEP:
         starts = []
-    most, first = 0, 0
+    most = 0
+    first = 0
     for last, start in enumerate(starts):
         while starts[first] <= start - window_us:
             first += 1
@@ -98,7 +99,8 @@ def slowed_schedule(schedule: Schedule, flashes: int = MAX_FLASHES) -> Schedule:
     """The schedule with longer intervals, so that at most `flashes` lights are switched on in any second."""
     period = WINDOW_US // max(flashes, 1) + 1
     after = [step.on_us for step in schedule.steps[1:]] + [0]
-    steps, start = list[Step](), 0
+    steps = list[Step]()
+    start = 0
     for step, following in zip(schedule.steps, after, strict=False):
         steps.append(replace(step, on_us=start, off_us=start + step.off_us - step.on_us))
         start += max(period if step.light != DARK else 0, following - step.on_us)
@@ -107,7 +109,8 @@ def slowed_schedule(schedule: Schedule, flashes: int = MAX_FLASHES) -> Schedule:
 
 def partial_schedule(schedule: Schedule, steps: Iterable[int]) -> Schedule:
     """Schedule of some of the steps, with at most as many flashes in any second as the whole schedule."""
-    part, allowed = schedule.subset(steps), assess(schedule).flashes_per_second
+    part = schedule.subset(steps)
+    allowed = assess(schedule).flashes_per_second
     return part if assess(part).flashes_per_second <= allowed else slowed_schedule(part, allowed)
 
 
@@ -118,7 +121,8 @@ def with_base_light(schedule: Schedule) -> Schedule:
 
 def alternatives(schedule: Schedule) -> list[str]:
     """Descriptions of alternative schedules that need no override, one line each, with their cost."""
-    late, lit = slowed_schedule(schedule), with_base_light(schedule)
+    late = slowed_schedule(schedule)
+    lit = with_base_light(schedule)
     noise = (1 + lit.base) ** 0.5
     return [
         f"slower (--slower): {assess(late)}, {late.seconds - schedule.seconds:.1f} s longer",

@@ -43,7 +43,8 @@ class Schedule:
 
     def subset(self, steps: Iterable[int]) -> Schedule:
         """Schedule of some of the steps, starting at zero, each followed by the same interval as in this one."""
-        start, made = 0, list[Step]()
+        start = 0
+        made = list[Step]()
         for index in sorted(set(steps)):
             step = self.steps[index]
             length = step.off_us - step.on_us
@@ -94,14 +95,16 @@ def plan_schedule(
     if not pairs:
         raise InputError(Fault("sequence", "must have lights and exposures", "none", "name at least one of each"))
     if bad := [name for name, time in exposures.items() if not 1e-6 <= time <= 60]:
-        rule, found = "an exposure must last 1e-6 to 60 s", f"{exposures[bad[0]]} s for {bad[0]}"
+        rule = "an exposure must last 1e-6 to 60 s"
+        found = f"{exposures[bad[0]]} s for {bad[0]}"
         raise InputError(Fault("sequence", rule, found, ""))
     least = sum(max(exposures[name] + GAP_SECONDS, period) for _, name in pairs)
     if seconds is not None and seconds < least - 1e-9:
         cure = "allow more time, or shorten the exposures"
         raise InputError(Fault("sequence", f"must last at least {least:.3f} s", f"{seconds:g} s", cure))
     stretch = 0.0 if seconds is None else (seconds - least) / len(pairs)
-    steps, start = list[Step](), 0.0
+    steps = list[Step]()
+    start = 0.0
     for light, name in pairs:
         on = round(start * 1e6)
         steps.append(Step(light, name, on, on + round(exposures[name] * 1e6)))

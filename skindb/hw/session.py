@@ -27,7 +27,9 @@ FRAME_SECONDS = 10.0  # timeout for the last frames to be written
 LOST_FRAME_SECONDS = 1.0  # the same timeout if the expected number of frames is unknown
 DARK_FRAMES = 4  # per exposure before the lights, of which the mean is kept: they take 1.5 s for two exposures
 PAUSE_US = 250_000  # around dark frames: with uneven intervals a missing frame can be identified
-MIN_LEVEL, MAX_LEVEL = 0.9, 1.1  # current of a light, relative to its nominal current
+# current of a light, relative to its nominal current
+MIN_LEVEL = 0.9
+MAX_LEVEL = 1.1
 MAX_REST = 0.02  # current when all lights should be off, relative to one light
 MAX_TIME_ERROR_US = 1_000  # of the measured time for which a light is on
 
@@ -61,7 +63,8 @@ class DomeRun:
 def with_dark_frames(schedule: Schedule, *, count: int = DARK_FRAMES) -> Schedule:
     """The schedule with `count` dark frames of every exposure before it, and one after it to detect stuck lights."""
     lengths = {step.exposure: step.off_us - step.on_us for step in schedule.steps}
-    steps, start = list[Step](), 0
+    steps = list[Step]()
+    start = 0
     for name, length in lengths.items():
         for _ in range(count):
             steps.append(Step(DARK, name, start, start + length))

@@ -89,7 +89,8 @@ def open_unfinished(folder: Path, identity: Mapping[str, Any]) -> Unfinished:
         begun = Unfinished(folder, dict(identity))
         begun.save()  # also verifies that the folder is writable before any light is switched on
         return begun
-    path, faults = folder / UNFINISHED, list[Fault]()
+    path = folder / UNFINISHED
+    faults = list[Fault]()
     note = read_json(path, faults) if path.is_file() else None
     if faults:
         raise InputError(faults)
@@ -107,8 +108,10 @@ def open_unfinished(folder: Path, identity: Mapping[str, Any]) -> Unfinished:
 
 def _read(folder: Path, path: Path, note: Any) -> Unfinished:
     record: dict[str, Any] = note if isinstance(note, dict) else {}
-    identity, override = record.get("identity"), record.get("override")
-    sequence, sites = _entries(record.get("sequence"), STEP_KEYS), _entries(record.get("sites"), SITE_KEYS)
+    identity = record.get("identity")
+    override = record.get("override")
+    sequence = _entries(record.get("sequence"), STEP_KEYS)
+    sites = _entries(record.get("sites"), SITE_KEYS)
     flashes, lamp, running = (record.get(name) for name in ("flashes_per_second", "lamp", "running"))
     sound = all(isinstance(one, dict | None) for one in (override, lamp)) and isinstance(flashes, int)
     sound = sound and (running is None or _is_run(running))
@@ -122,7 +125,8 @@ def _is_run(value: Any) -> bool:
     """Whether a value is a record of `Unfinished.begin_run`."""
     if not isinstance(value, dict) or not isinstance(value.get("base"), int):
         return False
-    steps, kinds = value.get("steps"), (str, str, int, int)
+    steps = value.get("steps")
+    kinds = (str, str, int, int)
     if not isinstance(steps, list) or not isinstance(value.get("started"), int | float):
         return False
     return all(

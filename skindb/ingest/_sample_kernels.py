@@ -13,7 +13,8 @@ from skindb._compiled import inline_kernel, kernel
 from skindb.ingest.pixel_flags import DARK, DARK_SIGMA, OK, SATURATED
 
 # outcomes of a sample besides those of a pixel: usable, but no pixel has two exposures; no sample was requested
-SINGLE, NONE = 3, 4
+SINGLE = 3
+NONE = 4
 NAN_BITS = np.uint16(0x7E00)  # the half float NaN
 MAX_HALF_FLOAT = 65504.0  # larger numbers are infinite in half precision
 MIN_DARK_FRACTION = (
@@ -21,7 +22,9 @@ MIN_DARK_FRACTION = (
 )
 FOOTPRINT_REACH = 8.0  # where the weight (1 - q / FOOTPRINT_REACH)^2 ends; its second moments are those of exp(-q / 2)
 MIN_VARIANCE = np.float32(1e-30)  # of relative exposure; the weight 1 / variance stays finite
-ZERO, ONE, ENDLESS = np.float32(0.0), np.float32(1.0), np.float32(np.inf)
+ZERO = np.float32(0.0)
+ONE = np.float32(1.0)
+ENDLESS = np.float32(np.inf)
 NO_USABLE_EXPOSURE = np.float32(
     100.0
 )  # marks a channel that was saturated in every exposure; larger than any number of exposures
@@ -82,21 +85,27 @@ def develop(
         (h, w) uint8 zeros, output: see `skindb.ingest.radiance.usable_exposures`; or (0, 0).
     """
     count, (height, width) = len(frames), flag.shape
-    signal, noise = np.empty((count, 3 * width), np.float32), np.empty((count, 3 * width), np.float32)
-    total, time = np.empty(3 * width, np.float32), np.empty(3 * width, np.float32)
-    above, weights = np.empty(3 * width, np.float32), np.empty(3 * width, np.float32)
+    signal = np.empty((count, 3 * width), np.float32)
+    noise = np.empty((count, 3 * width), np.float32)
+    total = np.empty(3 * width, np.float32)
+    time = np.empty(3 * width, np.float32)
+    above = np.empty(3 * width, np.float32)
+    weights = np.empty(3 * width, np.float32)
     black = np.full(3 * width, np.float32(zero), np.float32)
     slope = ONE / np.float32(span)
     for y in range(height):
-        first, last = spans[y, 0], max(spans[y, 0], spans[y, 1])
+        first = spans[y, 0]
+        last = max(spans[y, 0], spans[y, 1])
         flag[y, :first], flag[y, last:] = SATURATED, SATURATED
-        begin, size = 3 * first, 3 * (last - first)
+        begin = 3 * first
+        size = 3 * (last - first)
         if size == 0:
             continue
         total[:size], time[:size], above[:size] = ZERO, ZERO, ZERO
         for e in range(count):
             value = frames[e][y].reshape(3 * width)[begin : begin + size]
-            own, spread = signal[e, :size], noise[e, :size]
+            own = signal[e, :size]
+            spread = noise[e, :size]
             if curve.shape[0]:
                 shade = dark[e, y].reshape(3 * width)[begin : begin + size] if dark.shape[0] else dark[:0, 0, 0, 0]
                 _tabulated_response(value, shade, curve, offset, own, spread)
@@ -133,7 +142,8 @@ def _tabulated_response(value: Any, dark: Any, curve: Any, offset: int, signal: 
 def _count(value: Any, white: float, signal: Any, noise: Any, usable: Any) -> None:
     """Count the exposure at pixels where a channel is above the noise and none is at the white level."""
     for x in range(usable.shape[0]):
-        lit, white_channels = 0, 0
+        lit = 0
+        white_channels = 0
         for k in range(3 * x, 3 * x + 3):
             lit += 1 if signal[k] > DARK_SIGMA * np.sqrt(noise[k]) else 0
             white_channels += 0 if np.float32(value[k]) < white else 1
@@ -163,7 +173,9 @@ def _average(signal: Any, noise: Any, seconds: Any, photons: Any, weights: Any) 
     weights[:] = ZERO
     mean = np.zeros_like(weights)
     for e in range(signal.shape[0]):
-        second, own, spread = seconds[e], signal[e], noise[e]
+        second = seconds[e]
+        own = signal[e]
+        spread = noise[e]
         for k in range(weights.shape[0]):
             variance = photons[k] * second + spread[k]
             weight = second / (variance if variance > MIN_VARIANCE else MIN_VARIANCE)
@@ -189,7 +201,9 @@ def _finish(y: int, first: int, value: Any, time: Any, above: Any, gain: Any, ma
                 row[k] = value[k] * factor
     if matrix.shape[0]:
         for k in range(0, value.shape[0], 3):
-            r, g, b = row[k], row[k + 1], row[k + 2]
+            r = row[k]
+            g = row[k + 1]
+            b = row[k + 2]
             row[k] = matrix[0, 0] * r + matrix[0, 1] * g + matrix[0, 2] * b
             row[k + 1] = matrix[1, 0] * r + matrix[1, 1] * g + matrix[1, 2] * b
             row[k + 2] = matrix[2, 0] * r + matrix[2, 1] * g + matrix[2, 2] * b
@@ -221,7 +235,8 @@ def _bilinear_bounds(column: float, row: float, height: int, width: int) -> Any:
     """First and last column and row of the four pixels around a position; an empty range outside the picture."""
     if not (column >= 0 and column <= width and row >= 0 and row <= height):
         return 0, -1, 0, -1
-    left, top = int(max(column - 0.5, 0.0)), int(max(row - 0.5, 0.0))
+    left = int(max(column - 0.5, 0.0))
+    top = int(max(row - 0.5, 0.0))
     return min(left, width - 1), min(left + 1, width - 1), min(top, height - 1), min(top + 1, height - 1)
 
 
@@ -231,18 +246,16 @@ def _footprint_bounds(column: float, row: float, spread: Any, height: int, width
 
     The mean over a part of a footprint would belong to another position.
     """
-    xx, xy, yy = float(spread[0]), float(spread[1]), float(spread[2])
+    xx = float(spread[0])
+    xy = float(spread[1])
+    yy = float(spread[2])
     inside = column >= 0 and column <= width and row >= 0 and row <= height
     if not (xx * yy - xy * xy > 0 and inside):
         return 0, -1, 0, -1
-    left, right = (
-        int(np.ceil(column - 0.5 - np.sqrt(FOOTPRINT_REACH * xx))),
-        int(np.floor(column - 0.5 + np.sqrt(FOOTPRINT_REACH * xx))),
-    )
-    top, bottom = (
-        int(np.ceil(row - 0.5 - np.sqrt(FOOTPRINT_REACH * yy))),
-        int(np.floor(row - 0.5 + np.sqrt(FOOTPRINT_REACH * yy))),
-    )
+    left = int(np.ceil(column - 0.5 - np.sqrt(FOOTPRINT_REACH * xx)))
+    right = int(np.floor(column - 0.5 + np.sqrt(FOOTPRINT_REACH * xx)))
+    top = int(np.ceil(row - 0.5 - np.sqrt(FOOTPRINT_REACH * yy)))
+    bottom = int(np.floor(row - 0.5 + np.sqrt(FOOTPRINT_REACH * yy)))
     if left < 0 or top < 0 or right >= width or bottom >= height:
         return 0, -1, 0, -1
     return left, right, top, bottom
@@ -297,7 +310,9 @@ def gather(
     for i in range(wanted.shape[0]):
         if not wanted[i] or (light_fraction.shape[0] and light_fraction[i] <= 0):
             continue
-        x, y, z = position[i, 0] - light[0], position[i, 1] - light[1], position[i, 2] - light[2]
+        x = position[i, 0] - light[0]
+        y = position[i, 1] - light[1]
+        z = position[i, 2] - light[2]
         if not x * normal[i, 0] + y * normal[i, 1] + z * normal[i, 2] < 0:  # also rejects NaN
             continue
         scale = x * x + y * y + z * z
@@ -314,7 +329,9 @@ def gather(
             state = _bilinear(radiance, flag, usable, pixels[i, 0], pixels[i, 1], found)
         outcome[i] = SINGLE if state == OK and found[4] < 2.0 else state
         if state == OK:
-            r, g, b = found[0] * scale * factor[0], found[1] * scale * factor[1], found[2] * scale * factor[2]
+            r = found[0] * scale * factor[0]
+            g = found[1] * scale * factor[1]
+            b = found[2] * scale * factor[2]
             out[0, i], out[1, i], out[2, i] = _half_or_nan(r), _half_or_nan(g), _half_or_nan(b)
 
 
@@ -325,14 +342,17 @@ def pixel_counts(wanted: Any, pixels: Any, spread: Any, height: int, width: int,
     for i in range(wanted.shape[0]):
         if not wanted[i]:
             continue
-        column, row = pixels[i, 0], pixels[i, 1]
+        column = pixels[i, 0]
+        row = pixels[i, 1]
         if spread.shape[0] and not np.isnan(spread[i, 0]):
             total, square = _footprint_weights(column, row, spread[i], height, width)
             if total > 0:
                 out[i] = total * total / square
         elif column >= 0 and column <= width and row >= 0 and row <= height:
-            x, y = min(max(column - 0.5, 0.0), width - 1.0), min(max(row - 0.5, 0.0), height - 1.0)
-            x, y = x - int(x), y - int(y)
+            x = min(max(column - 0.5, 0.0), width - 1.0)
+            y = min(max(row - 0.5, 0.0), height - 1.0)
+            x = x - int(x)
+            y = y - int(y)
             out[i] = 1.0 / ((x * x + (1.0 - x) * (1.0 - x)) * (y * y + (1.0 - y) * (1.0 - y)))
 
 
@@ -340,8 +360,12 @@ def pixel_counts(wanted: Any, pixels: Any, spread: Any, height: int, width: int,
 def _footprint_weights(column: float, row: float, spread: Any, height: int, width: int) -> tuple[float, float]:
     """Sum of the weights of `_footprint`, and sum of their squares."""
     left, right, top, bottom = _footprint_bounds(column, row, spread, height, width)
-    xx, xy, yy = float(spread[0]), float(spread[1]), float(spread[2])
-    scale, total, square = 1.0 / (FOOTPRINT_REACH * (xx * yy - xy * xy)), 0.0, 0.0
+    xx = float(spread[0])
+    xy = float(spread[1])
+    yy = float(spread[2])
+    scale = 1.0 / (FOOTPRINT_REACH * (xx * yy - xy * xy))
+    total = 0.0
+    square = 0.0
     for v in range(top, bottom + 1):
         dy = v + 0.5 - row
         for u in range(left, right + 1):
@@ -371,8 +395,10 @@ def _bilinear(radiance: Any, flag: Any, usable: Any, column: float, row: float, 
     height, width = flag.shape
     if not (column >= 0 and column <= width and row >= 0 and row <= height):
         return NONE
-    x, y = min(max(column - 0.5, 0.0), width - 1.0), min(max(row - 0.5, 0.0), height - 1.0)
-    left, top = int(x), int(y)
+    x = min(max(column - 0.5, 0.0), width - 1.0)
+    y = min(max(row - 0.5, 0.0), height - 1.0)
+    left = int(x)
+    top = int(y)
     found[:] = 0.0
     for down in range(2):
         for right in range(2):
@@ -387,7 +413,9 @@ def _bilinear(radiance: Any, flag: Any, usable: Any, column: float, row: float, 
 def _footprint(radiance: Any, flag: Any, usable: Any, column: float, row: float, spread: Any, found: Any) -> int:
     """Weighted mean over an ellipse of pixels (Heckbert 1989, the elliptical weighted average)."""
     left, right, top, bottom = _footprint_bounds(column, row, spread, *flag.shape)
-    xx, xy, yy = float(spread[0]), float(spread[1]), float(spread[2])
+    xx = float(spread[0])
+    xy = float(spread[1])
+    yy = float(spread[2])
     found[:] = 0.0
     total = 0.0
     scale = 1.0 / (FOOTPRINT_REACH * (xx * yy - xy * xy))

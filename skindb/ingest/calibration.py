@@ -42,7 +42,8 @@ ALBEDO_ROUNDS = 2  # albedo and offsets improve each other; a third round change
 MIN_AGREEMENT = 0.7  # correlation of the square roots of photograph and prediction
 MAX_OFFSET_MM = 10.0  # mm on the face, a tenth of a head's radius
 # gain in correlation, and correlation, from which another explanation is named
-BETTER_AGREEMENT, GOOD_AGREEMENT = 0.1, 0.8
+BETTER_AGREEMENT = 0.1
+GOOD_AGREEMENT = 0.8
 
 
 @dataclass(frozen=True)
@@ -129,9 +130,16 @@ class CalibrationCheck:
         pose = self._scan_pose(good)
         brightness = self._brightness([view for view in views if view.camera in good], pictures, offsets, albedo)
         return Calibration(
-            agreement, offset, scale, own, alike, np.nanmax(table, axis=1, initial=-1.0), *pose,
-            brightness, {c: said for c, said in explanations.items() if said},
-        )  # fmt: skip
+            agreement,
+            offset,
+            scale,
+            own,
+            alike,
+            np.nanmax(table, axis=1, initial=-1.0),
+            *pose,
+            brightness,
+            {c: said for c, said in explanations.items() if said},
+        )
 
     def good_offsets(self, pictures: Mapping[Pair, NDArray[np.float32]]) -> dict[int, Offset]:
         """Offset of each camera whose photographs show the face near the scan."""
@@ -199,7 +207,8 @@ class CalibrationCheck:
 
     def _usable(self, views: Iterable[ReducedView]) -> list[ReducedView]:
         """Views with enough surfels of varying irradiance that are not black, as they are when a lamp fails."""
-        kept, bright = list[ReducedView](), list[float]()
+        kept = list[ReducedView]()
+        bright = list[float]()
         for view in views:
             light = self.irradiance[view.light, view.clear]
             if view.clear.sum() < MIN_SURFELS or np.std(np.sqrt(light)) < MIN_VARIATION * np.mean(np.sqrt(light)):
@@ -212,7 +221,8 @@ class CalibrationCheck:
 
     def _offsets(self, views: Sequence[ReducedView]) -> tuple[dict[int, Offset], Array]:
         """Offset of every camera, and albedo of the surfels."""
-        albedo, offsets = np.ones(len(self._position)), dict[int, Offset]()
+        albedo = np.ones(len(self._position))
+        offsets = dict[int, Offset]()
         if not views:
             return offsets, albedo
         cameras = sorted({view.camera for view in views})
@@ -244,20 +254,24 @@ class CalibrationCheck:
     def _explanation(self, camera: int, views: Sequence[ReducedView], found: Offset, albedo: Array) -> str:
         """Exchange of pictures or parameters that explains the photographs of a camera; empty if none does."""
         mine = [view for view in views if view.camera == camera]
-        best, said = max(found.agreement + BETTER_AGREEMENT, GOOD_AGREEMENT), ""
+        best = max(found.agreement + BETTER_AGREEMENT, GOOD_AGREEMENT)
+        said = ""
         for text, pixels, clear in self._alternatives(camera):
             others = [replace(view, pixels=pixels, clear=clear) for view in mine]
             if clear.sum() < MIN_SURFELS:
                 continue
             offset = camera_offset(others, self.irradiance, albedo)
             if offset.agreement > best and offset.length * self._mm(camera) < MAX_OFFSET_MM:
-                best, said = offset.agreement, text
+                best = offset.agreement
+                said = text
         return said
 
     def _alternatives(self, c: int) -> Iterator[tuple[str, Array, NDArray[np.bool_]]]:
         """Possible exchanges, each with the pixels (n, 2) and the visibility (n,) of the surfels that it implies."""
-        camera, factor = self.dome.cameras[c], self.factor(c)
-        pixels, clear = self.pixels[self.compared, c].astype(np.float64) / factor, self._clear[:, c]
+        camera = self.dome.cameras[c]
+        factor = self.factor(c)
+        pixels = self.pixels[self.compared, c].astype(np.float64) / factor
+        clear = self._clear[:, c]
         size = np.array([camera.width, camera.height]) / factor
         yield "they look upside down", size - pixels, clear
         yield "they look mirrored", np.stack([size[0] - pixels[:, 0], pixels[:, 1]], axis=1), clear
@@ -292,7 +306,8 @@ class CalibrationCheck:
 
     def _pose_rows(self, c: int, offset: Offset) -> tuple[Array, Array]:
         """Derivatives (2 m, 6) of m pixels by translation [mm] and rotation [rad], and displacements (2 m,)."""
-        camera, middle = self.dome.cameras[c], self.surfels.position.mean(axis=0)
+        camera = self.dome.cameras[c]
+        middle = self.surfels.position.mean(axis=0)
         at = np.flatnonzero(self._clear[:, c])
         at = at[:: max(len(at) // 200, 1)]
         points = self._position[at]

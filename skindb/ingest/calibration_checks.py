@@ -13,21 +13,27 @@ from skindb.ingest.devices import DomeRecord
 
 # Heads in domes with common errors (lights 1 mm, cameras 0.03 degrees, hair, motion) have offsets of up to 1.4 mm,
 # scales of 1.5 %, agreements of 0.93 and more, a scan within 0.8 mm and 0.2 degrees: see docs/validation.md
-DOUBTFUL_OFFSET_MM, DOUBTFUL_AGREEMENT = 2.5, 0.8
-MAX_SCALE, DOUBTFUL_SCALE, REPORTED_SCALE = 0.15, 0.04, 0.02  # relative: a wrong distance, focal length or unit
-DOUBTFUL_SCAN_MM, DOUBTFUL_SCAN_DEGREES = 2.0, 1.5
-MAX_BETTER_LIGHT, DOUBTFUL_BETTER_LIGHT = (
-    0.05,
-    0.0,
-)  # agreement with the shading of another light minus that with its own
-MIN_LIGHT_AGREEMENT, DOUBTFUL_LIGHT_AGREEMENT = 0.5, 0.7
+DOUBTFUL_OFFSET_MM = 2.5
+DOUBTFUL_AGREEMENT = 0.8
+# relative: a wrong distance, focal length or unit
+MAX_SCALE = 0.15
+DOUBTFUL_SCALE = 0.04
+REPORTED_SCALE = 0.02
+DOUBTFUL_SCAN_MM = 2.0
+DOUBTFUL_SCAN_DEGREES = 1.5
+# agreement with the shading of another light minus that with its own
+MAX_BETTER_LIGHT = 0.05
+DOUBTFUL_BETTER_LIGHT = 0.0
+MIN_LIGHT_AGREEMENT = 0.5
+DOUBTFUL_LIGHT_AGREEMENT = 0.7
 DOUBTFUL_DISTANCE_RATIO = 5.0  # distances differ by tens of percent in a dome, by factors of two or three in a studio
-MIN_RED_TO_BLUE, DOUBTFUL_RED_TO_BLUE = (
-    0.8,
-    1.05,
-)  # skin of every tone reflects more red than blue; with exchanged channels the ratio is at most 0.7
+# skin of every tone reflects more red than blue; with exchanged channels the ratio is at most 0.7
+MIN_RED_TO_BLUE = 0.8
+DOUBTFUL_RED_TO_BLUE = 1.05
 # brightness of a camera's or a light's photographs over that of the others: at most 1.08 and 1.17 in simulated domes
-MAX_BRIGHTNESS, DOUBTFUL_CAMERA_BRIGHTNESS, DOUBTFUL_LIGHT_BRIGHTNESS = 2.0, 1.25, 1.4
+MAX_BRIGHTNESS = 2.0
+DOUBTFUL_CAMERA_BRIGHTNESS = 1.25
+DOUBTFUL_LIGHT_BRIGHTNESS = 1.4
 RED_REFLECTANCES = (0.1, 0.9)  # of a face; skin of all tones has 0.2 to 0.75
 CHANNELS = ("red", "green", "blue")
 
@@ -46,7 +52,8 @@ def calibration_faults(dome: DomeRecord, found: Calibration) -> list[Fault]:
 def _channel_faults(dome: DomeRecord, found: Calibration) -> list[Fault]:
     """Faults of channels in another order than R, G, B: one if that of all cameras is wrong, else one for each."""
     ratio = _red_to_blue(found)
-    rule, cure = "skin must reflect more red than blue", "write the channels in the order R, G, B"
+    rule = "skin must reflect more red than blue"
+    cure = "write the channels in the order R, G, B"
     if not np.isfinite(ratio).any():
         return []
     if (middle := np.nanmedian(ratio)) < MIN_RED_TO_BLUE:
@@ -149,7 +156,9 @@ def _light_notes(dome: DomeRecord, found: Calibration) -> Iterator[str]:
 
 def _camera_faults(dome: DomeRecord, found: Calibration) -> Iterator[Fault]:
     for c, camera in enumerate(dome.cameras):
-        offset, agreement, scale = found.camera_offset[c], found.camera_agreement[c], found.camera_scale[c]
+        offset = found.camera_offset[c]
+        agreement = found.camera_agreement[c]
+        scale = found.camera_scale[c]
         if offset > MAX_OFFSET_MM or agreement < MIN_AGREEMENT or abs(scale) > MAX_SCALE:
             rule = f"its photographs must show the face within {MAX_OFFSET_MM:g} mm of the scan"
             said = f"the face {_beside(offset, scale)}, correlation {agreement:.2f}"
@@ -168,7 +177,8 @@ def _light_faults(dome: DomeRecord, found: Calibration) -> Iterator[Fault]:
 
 
 def _shading(dome: DomeRecord, found: Calibration, j: int) -> str:
-    own, other = found.light_agreement[j], found.light_similar_agreement[j]
+    own = found.light_agreement[j]
+    other = found.light_similar_agreement[j]
     said = f"correlation {own:.2f}"
     return said + (f", {other:.2f} with light {dome.lights[int(found.light_similar[j])].id}" if other > own else "")
 

@@ -33,7 +33,8 @@ THREADS = 2
 GREEN = 1
 # rms of the known points: at this distance on the face ingest would warn of every photograph; but not less than the
 # error with which points are found in a coarse picture, nor more than ten times that of a poor calibration
-MAX_REPROJECTION_MM, MAX_REPROJECTIONS_PX = 2.5, (2.0, 10.0)
+MAX_REPROJECTION_MM = 2.5
+MAX_REPROJECTIONS_PX = (2.0, 10.0)
 UNKNOWN: Values = {
     "calibrated_response": np.full((TABLE_ROWS, 3), np.nan),
     "calibrated_read_noise": np.nan,
@@ -84,7 +85,8 @@ def calibrate_cameras(dome: DomeRecord, frames: CalibrationFrames) -> xr.Dataset
     faults = list[Fault]()
 
     def one(camera: CameraRecord) -> Values:
-        values, known = dict(UNKNOWN), camera
+        values = dict(UNKNOWN)
+        known = camera
         for name, step in STEPS.items():
             kind: CameraFrames | None = getattr(frames, name)
             if kind is None or (kind.places is not None and camera.id not in kind.places):
@@ -127,7 +129,8 @@ def calibrated_cameras(dome: DomeRecord, calibration: xr.Dataset, *, where: str)
         found = f"none of {', '.join(missing[:5])}"
         raise InputError(Fault(where, "a calibration must have every camera of the capture", found, "calibrate again"))
     if dome.cameras and dome.cameras[0].sensor.kind.bits == 0:
-        rule, cure = "a sensor calibration applies to sensor values only", "calibrate a set-up without its cameras"
+        rule = "a sensor calibration applies to sensor values only"
+        cure = "calibrate a set-up without its cameras"
         raise InputError(Fault(where, rule, "a capture in OpenEXR", cure))
     return replace(dome, cameras=tuple(_calibrated(camera, known.sel(camera=camera.id)) for camera in dome.cameras))
 
@@ -140,7 +143,8 @@ def _calibrated(camera: CameraRecord, known: xr.Dataset) -> CameraRecord:
         sensor = replace(sensor, response=np.column_stack([values, response]), response_file=None)
     if np.isfinite(gain := float(known["calibrated_electrons_per_value"])):
         sensor = replace(sensor, electrons_per_dn=gain, read_noise=float(known["calibrated_read_noise"]))
-    vignette, colours = known["calibrated_vignette"].values, known["calibrated_colour_matrix"].values
+    vignette = known["calibrated_vignette"].values
+    colours = known["calibrated_colour_matrix"].values
     return replace(
         camera,
         sensor=sensor,
@@ -168,7 +172,8 @@ def _response(frames: CalibrationFrames, kind: CameraFrames, camera: CameraRecor
 
 def _flat(frames: CalibrationFrames, kind: CameraFrames, camera: CameraRecord) -> tuple[CameraRecord, Values]:
     """Noise from pairs of equal frames of the green channel, and the vignette from their mean."""
-    sensor, span = camera.sensor, camera.sensor.white - camera.sensor.black
+    sensor = camera.sensor
+    span = camera.sensor.white - camera.sensor.black
     sets = frames.read(kind.frames, camera, [*frames.exposures], kind.repeats)
     # in linear values above black; saturated values stay at the white level, so that the fit excludes them
     pairs = [[relative_exposure(frame, None, sensor)[0][..., GREEN] * span for frame in own[:2]] for own in sets]

@@ -22,7 +22,9 @@ from skindb.ingest.light_positions import BallFrames, read_ball
 FILE = "dome/calibration.json"
 PATCHES = 24  # of a ColorChecker
 MAX_REPEATS = 64
-CAMERA, EXPOSURE, REPEAT = "camera", "exposure", "repeat"
+CAMERA = "camera"
+EXPOSURE = "exposure"
+REPEAT = "repeat"
 BRACKETED = ("response", "flat", "chart", "edge")  # kinds that need the key exposures
 
 
@@ -88,14 +90,16 @@ def read_calibration_frames(dome: DomeRecord) -> CalibrationFrames | None:
     InputError
         With every fault of the file.
     """
-    file, faults = dome.folder / FILE, list[Fault]()
+    file = dome.folder / FILE
+    faults = list[Fault]()
     if not file.exists():
         return None
     data = read_json(file, faults)
     if data is None:
         raise InputError(faults)
     if dome.cameras[0].sensor.kind.bits == 0:
-        rule, cure = "cameras that write OpenEXR frames are already calibrated", "remove this file"
+        rule = "cameras that write OpenEXR frames are already calibrated"
+        cure = "remove this file"
         raise InputError(Fault(str(file), rule, "linear radiance", cure))
     fields = Fields(data, str(file), faults)
     least, most = EXPOSURE_SECONDS
@@ -184,7 +188,8 @@ def _known_points(dome: DomeRecord, fields: Fields) -> dict[str, KnownPoints]:
     seen = Fields(item.get("pixels"), item.place("pixels"), item.faults)
     if not known.at_most(MAX_KNOWN_POINTS, "points"):
         return {}
-    position, found = {name: known.array(name, (3,)) for name in known.data}, dict[str, KnownPoints]()
+    position = {name: known.array(name, (3,)) for name in known.data}
+    found = dict[str, KnownPoints]()
     for camera in seen.data:
         if camera not in {one.id for one in dome.cameras}:
             seen.fault(camera, "must be a camera of the dome", shown(camera))

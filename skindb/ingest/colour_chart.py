@@ -58,7 +58,8 @@ def fit_colour_matrix(patches: ArrayLike, reference: ArrayLike | None = None) ->
     values = np.asarray(patches, np.float64)
     target = chart_reference() if reference is None else np.asarray(reference, np.float64)
     if values.shape != target.shape or values.shape[1:] != (3,):
-        rule, cure = "its values must have the shape (patch, 3) of the reference", "give the patches row by row"
+        rule = "its values must have the shape (patch, 3) of the reference"
+        cure = "give the patches row by row"
         raise InputError(Fault("colour chart", rule, f"{values.shape} and {target.shape}", cure))
     good: NDArray[np.bool_] = np.asarray(np.isfinite(values).all(axis=1))
     white = int(target.sum(axis=1).argmax())
@@ -73,7 +74,8 @@ def fit_colour_matrix(patches: ArrayLike, reference: ArrayLike | None = None) ->
     variance = (apart**2).sum(axis=0) / max(len(camera) - 3, 1)
     error = np.sqrt(variance[:, None] * np.diag(np.linalg.inv(camera.T @ camera)))
     level = float(camera[good[:white].sum()] @ solution[:, 1]) / target[white, 1]
-    before, after = np.full(len(values), np.nan), np.full(len(values), np.nan)
+    before = np.full(len(values), np.nan)
+    after = np.full(len(values), np.nan)
     before[good] = _difference(camera, target[good])
     after[good] = _difference(camera @ solution, target[good])
     return ColourFit(solution.T / level, error / level, before, after)

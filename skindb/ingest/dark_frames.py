@@ -48,7 +48,8 @@ def average_dark(frames: ArrayLike) -> DarkFrame:
             Fault("dark frames", rule, f"an array of {stack.shape}", "repeat the frame with the lens covered")
         )
     values = stack.astype(np.float64)
-    mean, spread = values.mean(axis=0), values.std(axis=0, ddof=1)
+    mean = values.mean(axis=0)
+    spread = values.std(axis=0, ddof=1)
     noisy = float(np.median(spread)) > 0
     defect = _outliers(mean) | _outliers(spread) | ((spread == 0) & noisy & (len(stack) > 3))
     return DarkFrame(mean, spread / np.sqrt(len(stack)), defect)

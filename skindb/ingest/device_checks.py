@@ -20,7 +20,9 @@ MAX_DEVICE_DISTANCE_MM = 100_000.0  # mm from the origin: 100 m; domes have a ra
 TARGET_HALF_SIZES_MM = (1.0, 2_000.0)  # mm: from a patch of a colour chart to a wall
 MIN_VIGNETTE_GAIN = 0.05  # at a corner: a lens that darkens by 4 stops has 0.06
 MAX_VIGNETTE_GAIN = 4.0  # relative to the principal point; lenses darken towards the corners
-RADIAL_FACTORS, MAX_TANGENTIAL = (0.1, 10.0), 0.5  # distortion at the farthest corner; fisheyes have 0.5 and 0.01
+# distortion at the farthest corner; fisheyes have 0.5 and 0.01
+RADIAL_FACTORS = (0.1, 10.0)
+MAX_TANGENTIAL = 0.5
 MIN_FULL_ELECTRONS = 100.0  # electrons at the white level; cameras of phones have thousands
 MAX_READ_NOISE_FRACTION = 0.1  # of the white level; cameras have at most 0.01
 FIBRE_DISTANCES_MM = (0.1, 300.0)  # mm, of the farthest fibre: light does not scatter within a tenth of a millimetre
@@ -53,7 +55,8 @@ def fibre_faults(where: str, distance: Array, centre: Array, radius: Array, face
         rule = f"distances must be in mm, and the farthest fibre must be {least:g} to {most:g} mm from the source"
         faults.append(Fault(f"{where}[fibres]", rule, f"{distance.max():g} mm", "give the distances in mm"))
     elif len(distance) > 1 and np.ptp(distance) == 0:
-        rule, cure = "a profile needs fibres at different distances", "give each fibre its own distance"
+        rule = "a profile needs fibres at different distances"
+        cure = "give each fibre its own distance"
         faults.append(Fault(f"{where}[fibres]", rule, f"all {len(distance)} at {distance[0]:g} mm", cure))
     if face > 0 and (distance < 2 * face).any():
         i = int(distance.argmin())
@@ -73,7 +76,8 @@ def _overlap_faults(where: str, centre: Array, radius: Array) -> list[Fault]:
     if not count:
         return []
     i, j = np.unravel_index(closeness.argmin(), closeness.shape)
-    rule, cure = "fibres must not overlap in the picture", "correct centre and radius, in pixels"
+    rule = "fibres must not overlap in the picture"
+    cure = "correct centre and radius, in pixels"
     found = f"{count} pairs, such as {i} and {j}: {gap[i, j]:.3g} px apart, radii {radius[i]:g} and {radius[j]:g} px"
     return [Fault(f"{where}[fibres]", rule, found, cure)]
 
@@ -111,7 +115,8 @@ def distortion_fault(where: str, lens: Array, K: Array, size: Array) -> Fault | 
     corners = (np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * size - K[:2, 2]) / [K[0, 0], K[1, 1]]
     k1, k2, p1, p2, k3 = lens
     r2 = float((corners**2).sum(axis=1).max())
-    radial, tangential = 1 + r2 * (k1 + r2 * (k2 + r2 * k3)), 3 * np.hypot(p1, p2) * np.sqrt(r2)
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    tangential = 3 * np.hypot(p1, p2) * np.sqrt(r2)
     if RADIAL_FACTORS[0] <= radial <= RADIAL_FACTORS[1] and tangential <= MAX_TANGENTIAL:
         return None
     rule = (

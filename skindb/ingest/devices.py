@@ -45,7 +45,11 @@ Array = NDArray[np.float64]
 ROTATION_TOLERANCE = 1e-4  # of R R^T - 1: five digits in the file
 VIGNETTE_STEPS = 1000  # radii from the centre to a corner at which the gain of a lens is checked
 GAIN_ERROR = 0.005  # relative error of a fibre's gain, where the file does not state it
-EXPOSURE, LIGHT, CAMERA, SITE, PLACEMENT = "exposure", "light", "camera", "site", "placement"
+EXPOSURE = "exposure"
+LIGHT = "light"
+CAMERA = "camera"
+SITE = "site"
+PLACEMENT = "placement"
 
 
 @dataclass(frozen=True)
@@ -251,7 +255,8 @@ def _require_merged(fields: Fields, exposures: Mapping[str, float]) -> None:
 
 def _camera(folder: Path, item: Fields, *, linear: bool) -> CameraRecord:
     noted = len(item.faults)
-    K, R = item.array("K", (3, 3), fallback=np.eye(3)), item.array("R", (3, 3), fallback=np.eye(3))
+    K = item.array("K", (3, 3), fallback=np.eye(3))
+    R = item.array("R", (3, 3), fallback=np.eye(3))
     error = float(np.abs(R @ R.T - np.eye(3)).max())
     if error > ROTATION_TOLERANCE or np.linalg.det(R) < 0:
         found = f"R R^T differs from 1 by {error:.2g}, determinant {np.linalg.det(R):.3g}"
@@ -286,17 +291,20 @@ def _camera(folder: Path, item: Fields, *, linear: bool) -> CameraRecord:
 
 def _size(item: Fields) -> tuple[int, int]:
     """Width and height of the pictures, within the limit that the memory is planned for."""
-    width, height = item.integer("width", least=1), item.integer("height", least=1)
+    width = item.integer("width", least=1)
+    height = item.integer("height", least=1)
     if width * height <= MAX_FRAME_PIXELS:
         return width, height
-    rule, cure = f"a picture must have at most {MAX_FRAME_PIXELS:,} pixels", "correct width and height"
+    rule = f"a picture must have at most {MAX_FRAME_PIXELS:,} pixels"
+    cure = "correct width and height"
     item.fault("width", rule, f"{width} x {height}", cure)
     return 1, 1
 
 
 def _require_light(item: Fields, vignette: Array, centre: Array, size: Array) -> None:
     """Require a vignette within limits: a polynomial fitted to the centre alone may be negative at the corners."""
-    near, far = np.clip(centre, 0, size) - centre, np.maximum(np.abs(centre), np.abs(size - centre))
+    near = np.clip(centre, 0, size) - centre
+    far = np.maximum(np.abs(centre), np.abs(size - centre))
     r2 = np.linspace(near @ near, far @ far, VIGNETTE_STEPS) / (size @ size / 4)
     gain = 1 + r2 * (vignette[0] + r2 * (vignette[1] + r2 * vignette[2]))
     if not ((gain > MIN_VIGNETTE_GAIN) & (gain <= MAX_VIGNETTE_GAIN)).all():
@@ -333,7 +341,8 @@ def _white(fields: Fields, cameras: set[str], several: set[str]) -> WhiteRecord 
     if given is None:
         return None
     white = Fields(given, f"{fields.where}[white]", fields.faults)
-    normal, reflectance = white.array("normal", (3,)), white.number("reflectance", above=0.0)
+    normal = white.array("normal", (3,))
+    reflectance = white.number("reflectance", above=0.0)
     length = float(np.linalg.norm(normal))
     if length == 0:
         white.fault("normal", "must have a direction", shown(normal))
@@ -360,7 +369,8 @@ def _white(fields: Fields, cameras: set[str], several: set[str]) -> WhiteRecord 
 def _check_frames(dome: DomeRecord, fields: Fields) -> None:
     """Check the headers of all frames that the folder must hold."""
     if dome.frame_count > MAX_FRAMES:
-        found, cure = f"{dome.frame_count:,}: cameras x lights x exposures", "remove those that were not used"
+        found = f"{dome.frame_count:,}: cameras x lights x exposures"
+        cure = "remove those that were not used"
         fields.fault("frames", f"a capture must have at most {MAX_FRAMES:,} frames", found, cure)
         return
     known = dict[Path, bool]()
@@ -376,7 +386,8 @@ def _check_frames(dome: DomeRecord, fields: Fields) -> None:
 
 def _require_own_files(fields: Fields, views: Iterable[tuple[str, str, dict[str, str]]]) -> None:
     """Require a separate file for every view: ids such as a_b and a with c and b_c can form the same path."""
-    first, shared = dict[Path, dict[str, str]](), list[tuple[str, str]]()
+    first = dict[Path, dict[str, str]]()
+    shared = list[tuple[str, str]]()
     for key, name, names in views:
         if (other := first.setdefault(Path(name), names)) != names:
             one, two = (

@@ -17,7 +17,8 @@ from skindb.ingest.scan_checks import HEAD_DIAGONAL, UNITS, likely_unit, rescali
 Array = NDArray[np.float64]
 MIN_WINDING_NUMBER = 0.5  # of a point inside; outside the convex hull of a surface it is at most 0.5
 # of the longest side of a picture. Heads in a dome span 0.7 to 1; ten times too far away they span at most 0.1
-LEAST_SPAN, USUAL_SPAN = 0.1, 0.8
+LEAST_SPAN = 0.1
+USUAL_SPAN = 0.8
 PATCH_SPAN = 0.005  # for a small scan: a patch of 20 mm in a picture of a person of 1.7 m spans 0.01
 FACE_DIAGONAL = 200.0  # mm, of a child's face; a scan of this size is not a patch of skin
 LARGEST_HEAD = 700.0  # mm, with neck and shoulders
@@ -63,7 +64,8 @@ def unit_fault(where: str, dome: DomeRecord, mesh: str, surface: CleanMesh, *, s
     sized
         Whether landmarks or regions have shown that the face is in mm.
     """
-    low, high = surface.vertices.min(axis=0), surface.vertices.max(axis=0)
+    low = surface.vertices.min(axis=0)
+    high = surface.vertices.max(axis=0)
     diagonal = float(np.linalg.norm(high - low))
     places = np.array([*device_positions(dome).values(), *(light.position for light in dome.lights)])
     if ((places > low) & (places < high)).all():
@@ -113,7 +115,8 @@ def picture_span(camera: CameraRecord, vertices: Array, *, factor: float = 1.0) 
         return np.inf  # the camera is inside the scan
     pixels = local @ camera.K.T
     places = pixels[:, :2] / pixels[:, 2:] / [camera.width, camera.height]
-    low, high = places.min(axis=0), places.max(axis=0)
+    low = places.min(axis=0)
+    high = places.max(axis=0)
     return float((high - low).max()) if (low < 1.5).all() and (high > -0.5).all() else None
 
 

@@ -63,7 +63,8 @@ def find_fibres(picture: ArrayLike, *, count: int) -> Spots:
     """
     grey = np.asarray(picture, np.float64)
     if grey.ndim != 2 or not np.isfinite(grey).all():
-        rule, cure = "it must be finite and have the shape (height, width)", "give one channel of the merged brackets"
+        rule = "it must be finite and have the shape (height, width)"
+        cure = "give one channel of the merged brackets"
         raise InputError(Fault("picture of the fibres", rule, str(grey.shape), cure))
     dark = float(np.median(grey))
     noise = 1.4826 * float(np.median(np.abs(grey - dark)))
@@ -84,7 +85,8 @@ def find_fibres(picture: ArrayLike, *, count: int) -> Spots:
 def _measure(grey: Array, spot: NDArray[np.bool_], box: tuple[slice, slice], dark: float) -> tuple[float, float, float]:
     """Column, row and radius of one spot, measured in its bounding box with a margin."""
     top, left = (max(side.start - MARGIN, 0) for side in box)
-    bottom, right = box[0].stop + MARGIN, box[1].stop + MARGIN
+    bottom = box[0].stop + MARGIN
+    right = box[1].stop + MARGIN
     light = np.where(ndimage.binary_dilation(spot[top:bottom, left:right], iterations=MARGIN), 1.0, 0.0)
     light *= grey[top:bottom, left:right] - dark
     middle = float(np.percentile(light[spot[top:bottom, left:right]], 75))
@@ -103,14 +105,16 @@ def match_fibres(found: Spots, given: Spots) -> SpotOffsets:
         The numbers differ, or a fibre is farther from its given position than its radius.
     """
     if len(found.radius) != len(given.radius):
-        rule, cure = "as many fibres must be found as are given", "compare probe.json with the picture"
+        rule = "as many fibres must be found as are given"
+        cure = "compare probe.json with the picture"
         raise InputError(Fault("fibres", rule, f"{len(found.radius)} and {len(given.radius)}", cure))
     square = ((given.centre[:, None] - found.centre) ** 2).sum(axis=-1)
     _, order = optimize.linear_sum_assignment(square)
     offset = found.centre[order] - given.centre
     far = np.flatnonzero(np.linalg.norm(offset, axis=1) > given.radius)
     if len(far):
-        rule, cure = "every fibre must be found within its radius of the given centre", "correct the centres"
+        rule = "every fibre must be found within its radius of the given centre"
+        cure = "correct the centres"
         worst = float(np.linalg.norm(offset, axis=1).max())
         raise InputError(Fault("fibres", rule, f"{len(far)} farther away, up to {worst:.1f} px", cure))
     return SpotOffsets(offset, found.radius[order] / given.radius, np.asarray(order, np.int64))

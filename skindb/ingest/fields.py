@@ -38,7 +38,9 @@ class Fields:
     """The keys of one JSON object; a faulty value is recorded in `faults` and replaced by a valid default."""
 
     def __init__(self, data: Any, where: str, faults: list[Fault]) -> None:
-        self.where, self.faults, self.used = where, faults, set[str]()
+        self.where = where
+        self.faults = faults
+        self.used = set[str]()
         self.whole = isinstance(data, dict)  # otherwise missing keys are not reported in addition
         if not self.whole:
             faults.append(Fault(where, "must be a JSON object {...}", shown(data), CURE))
@@ -66,7 +68,8 @@ class Fields:
 
     def unknown(self, *, besides: Collection[str] = ()) -> tuple[str, ...]:
         """Keys that were not read, except `besides`, each with the most similar key that was read."""
-        found, keys = [], sorted(self.rest().keys() - set(besides))
+        found = []
+        keys = sorted(self.rest().keys() - set(besides))
         for key in keys[:MAX_NAMED_UNKNOWN_KEYS]:
             near = difflib.get_close_matches(key[:MAX_NAME_CHARACTERS].lower(), self.used - self.data.keys(), n=1)
             name = short(key)
@@ -250,7 +253,8 @@ def inside(
     try:
         within = _within(path, folder, {} if known is None else known)
     except (OSError, ValueError, RuntimeError) as error:
-        rule, cure = "must be a path that this system can follow", "rename the file, and correct the path"
+        rule = "must be a path that this system can follow"
+        cure = "rename the file, and correct the path"
         faults.append(Fault(where, rule, f"{short(name)}: {_reason(error)}", cure))
         return None
     given = Path(name)

@@ -39,11 +39,13 @@ from skindb.ingest.scan_checks import (
 )
 from skindb.schema.cohort import imitates_column
 
-FORMAT, VERSIONS = "skindb-capture", (1, 2)
+FORMAT = "skindb-capture"
+VERSIONS = (1, 2)
 OVERRIDE = ("screened", "consented", "eyes_closed")  # what the operator confirms
 SCOPES = ("fit", "statistics", "export", "publish")
 WHOLE_SURFACE = "all"  # name of the entire surface in reports by region
-SESSION_RULE, SESSION_CURE = "must be an ISO 8601 time with its zone", "write it like 2005-01-10T09:00:00+01:00"
+SESSION_RULE = "must be an ISO 8601 time with its zone"
+SESSION_CURE = "write it like 2005-01-10T09:00:00+01:00"
 SIMULATED = ("virtual", "seed", "rehearsal")  # attributes of virtual captures
 
 
@@ -101,7 +103,8 @@ def read_capture(path: str | Path, *, crop: Crop | None = None) -> Capture:
     InputError
         With every fault of the folder: file, key, rule and the value found.
     """
-    folder, faults = Path(path), list[Fault]()
+    folder = Path(path)
+    faults = list[Fault]()
     file = folder / "capture.json"
     data = read_json(file, faults) if inside(folder, file.name, str(file), faults) else None
     if data is None:
@@ -129,7 +132,8 @@ def _require_version(fields: Fields) -> None:
     for key, known in (("format", (FORMAT,)), ("version", VERSIONS)):
         value = fields.get(key)
         if value is not None and (value not in known or isinstance(value, bool)):
-            cure, rule = "update skindb, or write this version", " or ".join(map(json.dumps, known))
+            cure = "update skindb, or write this version"
+            rule = " or ".join(map(json.dumps, known))
             fields.fault(key, f"must be {rule}, which this skindb reads", shown(value), cure)
             raise InputError(fields.faults)
 
@@ -138,7 +142,10 @@ class _Reader:
     """The files that `capture.json` names, one after the other."""
 
     def __init__(self, folder: Path, fields: Fields, faults: list[Fault], crop: Crop | None) -> None:
-        self.folder, self.fields, self.faults, self.crop = folder, fields, faults, crop
+        self.folder = folder
+        self.fields = fields
+        self.faults = faults
+        self.crop = crop
         self.version = 1 if fields.data.get("version") == 1 else 2
         self.files = [folder / "capture.json"]
         self.skipped: list[str] = []
@@ -148,7 +155,8 @@ class _Reader:
         self.probe: ProbeRecord | None = None
 
     def capture(self) -> Capture | None:
-        fields, person = self.fields, self.person()
+        fields = self.fields
+        person = self.person()
         mesh_file = self._path("mesh", required=True)
         scan, surface = self._mesh(mesh_file)
         landmarks = self._landmarks(scan, surface)
@@ -246,7 +254,8 @@ class _Reader:
         if not self._named_in_version_2("override"):
             return {}
         given = Fields(self.fields.get("override"), f"{self.fields.where}[override]", self.faults)
-        operator, time = given.text("operator", rule=IDENTIFIER), given.text("time", default="")
+        operator = given.text("operator", rule=IDENTIFIER)
+        time = given.text("time", default="")
         for key in OVERRIDE:
             if given.get(key) is not True and given.data.get(key) is not None:
                 cure = "a subject who was not screened must not be photographed above 3 flashes per second"
@@ -285,7 +294,8 @@ class _Reader:
         if path is None:
             return None
         self.files.append(path)
-        noted, data = len(self.faults), read_json(path, self.faults)
+        noted = len(self.faults)
+        data = read_json(path, self.faults)
         if len(self.faults) > noted:
             return None
         try:
@@ -313,7 +323,8 @@ class _Reader:
             low, high = (
                 " ".join(f"{x:.0f}" for x in corner) for corner in (np.min(scan.vertices, 0), np.max(scan.vertices, 0))
             )
-            rule, found = "the crop must leave a part of the scan", f"{keep.sum()} of {len(keep)} triangles"
+            rule = "the crop must leave a part of the scan"
+            found = f"{keep.sum()} of {len(keep)} triangles"
             self.faults.append(Fault(f"{path} (mesh)", rule, found, f"the scan reaches from {low} to {high} mm"))
             return surface
 

@@ -20,7 +20,8 @@ Array = NDArray[np.float32]
 Values = NDArray[np.float64]
 MAX_COMPARED_PIXELS = 40_000  # of a frame, evenly spread: takes 1 % of the time to decode 10 megapixels
 # standard deviations of read noise above black, and relative exposure: the effect of dark frames is small above both
-MIN_SIGNAL_DEVIATIONS, MIN_SIGNAL = 20.0, 0.005
+MIN_SIGNAL_DEVIATIONS = 20.0
+MIN_SIGNAL = 0.005
 MAX_SIGNAL = 0.7  # relative exposure that is clearly below the white level
 MIN_RATIO_VALUES = 50  # values that are needed for a ratio
 # largest ratio between the radiance of two exposures
@@ -29,11 +30,16 @@ MAX_RADIANCE_RATIO = 1.4
 # by 0.3 mm between them, 0.14 and more if one was mirrored, 0.7 if it was taken under another light
 MAX_APART_FRACTION = 0.1
 # of the white level: larger than the dark current of warm cameras in seconds; beyond it, black_level is wrong
-MAX_DARK_OFFSET, NOTED_DARK_OFFSET = 0.05, 0.01
+MAX_DARK_OFFSET = 0.05
+NOTED_DARK_OFFSET = 0.01
 # standard deviations of read noise and relative exposure below black, and fraction of pixels; noise reaches one in 1e9
-MAX_BELOW_DEVIATIONS, MAX_BELOW, MAX_BELOW_FRACTION = 6.0, 0.005, 0.05
+MAX_BELOW_DEVIATIONS = 6.0
+MAX_BELOW = 0.005
+MAX_BELOW_FRACTION = 0.05
 # values at the highest one, of those in the upper tenth below it, in a picture that is cut off there; noise has one
-MIN_CLIPPED_FRACTION, MIN_CLIPPED_VALUES, MIN_CLIPPED_VIEWS = 0.3, 50, 2
+MIN_CLIPPED_FRACTION = 0.3
+MIN_CLIPPED_VALUES = 50
+MIN_CLIPPED_VIEWS = 2
 MAX_ABOVE_WHITE = 1.25  # highest value over white_level, both above black; cameras are linear up to at least 0.8
 MIN_USED_RANGE = 0.02  # of the range of values, by the brightest photograph of a camera
 MIN_POSITIVE_FRACTION = 0.01  # of the pixels of linear radiance; of noise around zero, half are positive
@@ -54,7 +60,8 @@ def view_faults(
         Whether the frames show the white target.
     """
     where = f"{dome.file}[white][frames]" if white else f"{dome.file}[frames]"
-    sensor, names = merger.camera.sensor, [*dome.exposures]
+    sensor = merger.camera.sensor
+    names = [*dome.exposures]
     step = _step(frames[0])
     some = [frame[::step, ::step] for frame in frames]
     said = f"camera {merger.camera.id}, light {light}: "
@@ -110,7 +117,8 @@ def _radiance_ratio(
     good = by_short | by_long
     if good.sum() < MIN_RATIO_VALUES:
         return float("nan"), float("nan")
-    one, other = np.maximum(low[good], 0), np.maximum(high[good] * np.float32(a / b), 0)
+    one = np.maximum(low[good], 0)
+    other = np.maximum(high[good] * np.float32(a / b), 0)
     larger = np.maximum(one, other)
     noise = MAX_BELOW_DEVIATIONS * np.sqrt(read**2 + larger / sensor.full_electrons) + MIN_SIGNAL
     apart = np.abs(one - other) > (MAX_RADIANCE_RATIO - 1) * larger + noise
@@ -120,7 +128,8 @@ def _radiance_ratio(
 def _saturated_fault(where: str, frames: Sequence[Frame], sensor: SensorRecord) -> Fault | None:
     """Fault of a picture that is at the white level everywhere, in every exposure."""
     if all((frame >= sensor.white).all() for frame in frames):
-        rule, cure = "a photograph must not be saturated everywhere", "take it with a shorter exposure"
+        rule = "a photograph must not be saturated everywhere"
+        cure = "take it with a shorter exposure"
         return Fault(where, rule, "no value below white_level", cure)
     return None
 
@@ -147,7 +156,8 @@ def _linear_fault(where: str, frame: Frame) -> Fault | None:
     finite = np.isfinite(frame)
     low = float(np.min(frame, where=finite, initial=np.inf))
     high = float(np.max(frame, where=finite, initial=-np.inf))
-    rule, cure = "an OpenEXR frame must hold the radiance of a photograph", "merge the exposures of this view again"
+    rule = "an OpenEXR frame must hold the radiance of a photograph"
+    cure = "merge the exposures of this view again"
     if not low <= high:
         return Fault(where, rule, "no finite value", cure)
     if max(-low, high) > MAX_MAGNITUDE:
@@ -205,11 +215,13 @@ def level_notes(dome: DomeRecord, highest: Values, clipped: NDArray[np.bool_]) -
 
 def dark_faults(dome: DomeRecord, merger: FrameMerger) -> list[Fault]:
     """Faults of dark frames that are bright, all zero, or far from the black level of their camera."""
-    faults, key = [], f"{dome.file}[dark]"
+    faults = []
+    key = f"{dome.file}[dark]"
     for i, (name, offset) in enumerate(_dark_offsets(dome, merger).items()):
         said = f"exposure {name} of camera {merger.camera.id}"
         if merger.dark is not None and not merger.dark[i].any() and merger.camera.sensor.black > 0:
-            rule, cure = "dark frames must hold the values of black", "take them again, with the lens covered"
+            rule = "dark frames must hold the values of black"
+            cure = "take them again, with the lens covered"
             faults.append(Fault(key, rule, f"0 everywhere, {said}, black_level {merger.camera.sensor.black:g}", cure))
         elif abs(offset) > MAX_DARK_OFFSET:
             rule = f"dark frames and black_level must differ by at most {MAX_DARK_OFFSET:.0%} of the range"

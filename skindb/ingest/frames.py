@@ -29,7 +29,8 @@ from skindb.render.image import write_exr
 Frame = NDArray[Any]  # (h, w, 3) uint8, uint16 or float32
 Header = tuple[int, int, int, np.dtype[Any]]  # width, height, channels, type
 Digests = dict[Path, str]  # sha256 of the bytes that were decoded
-PNG_HEAD, PNG_TAIL = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
+PNG_HEAD = b"\x89PNG\r\n\x1a\n"
+PNG_TAIL = b"IEND\xaeB`\x82"
 PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}  # colour type of IHDR
 EXR_LINES = {0: 1, 1: 1, 2: 1, 3: 16, 4: 32, 5: 16, 6: 32, 7: 32, 8: 32, 9: 256}  # lines per chunk, by compression
 MAX_CHANNELS = 16  # of a file; a count far above R, G, B, alpha and depth indicates damage
@@ -121,7 +122,8 @@ def _header(path: Path) -> Header:
             Fault(where, "a frame must have the channels R, G, B", f"{channels} channels", "write RGB frames")
         )
     if min(width, height) < 1 or width * height > MAX_FRAME_PIXELS:
-        rule, found = f"a frame must have 1 to {MAX_FRAME_PIXELS:,} pixels", f"{width} x {height} in its header"
+        rule = f"a frame must have 1 to {MAX_FRAME_PIXELS:,} pixels"
+        found = f"{width} x {height} in its header"
         raise InputError(Fault(where, rule, found, CURE))
     return width, height, channels, dtype
 
@@ -168,7 +170,8 @@ def read_frame(path: Path, kind: FrameKind | None = None, digests: Digests | Non
 
 def read_frames(paths: Iterable[Path], kind: FrameKind | None = None, digests: Digests | None = None) -> list[Frame]:
     """Several frames; `InputError` with the faults of all of them."""
-    frames, faults = list[Frame](), list[Fault]()
+    frames = list[Frame]()
+    faults = list[Fault]()
     for path in paths:
         try:
             frames.append(read_frame(path, kind, digests))
@@ -259,7 +262,8 @@ def _require_chunks(stream: BinaryIO, height: int) -> None:
         stream.seek(min(at, size))
         return stream.read(min(max(count, 0), size))  # a damaged file may contain any number
 
-    at, lines = 8, 0
+    at = 8
+    lines = 0
     while (attribute := content(at, 600))[:1] != b"\0":
         name, _, rest = attribute.partition(b"\0")
         kind = rest.partition(b"\0")[0]

@@ -78,7 +78,8 @@ def atlas_group(surfels: SurfelSet) -> xr.Dataset:
 
 def dome_group(dome: DomeRecord, intensity: Array) -> xr.Dataset:
     """Group "dome"."""
-    cameras, lights = dome.cameras, dome.lights
+    cameras = dome.cameras
+    lights = dome.lights
     variables = {
         "light_position": [light.position for light in lights],
         "light_axis": [light.axis for light in lights],
@@ -169,7 +170,8 @@ def probe_group(probe: ProbeRecord, profiles: Profiles, position: Array, isotrop
 
 def sequence_group(sequence: SequenceRecord, dome: DomeRecord) -> xr.Dataset:
     """Group "sequence": the steps of the dome in the order in which they were executed."""
-    lights, exposures = [light.id for light in dome.lights], list(dome.exposures)
+    lights = [light.id for light in dome.lights]
+    exposures = list(dome.exposures)
     variables = {
         "step_light": [lights.index(name) for name in sequence.light],
         "step_exposure": [exposures.index(name) for name in sequence.exposure],

@@ -96,7 +96,8 @@ def target_pixels(camera: CameraRecord, white: WhiteRecord) -> Target:
     blocks = [(first, min(first + step, camera.height)) for first in range(0, camera.height, step)]
     parts = [_target_rows(camera, white, *block) for block in blocks]
     inside = np.concatenate([part[0] for part in parts])
-    first, last = inside.argmax(axis=1), camera.width - inside[:, ::-1].argmax(axis=1)
+    first = inside.argmax(axis=1)
+    last = camera.width - inside[:, ::-1].argmax(axis=1)
     spans = np.stack([first, np.where(inside.any(axis=1), last, first)], axis=1)
     return Target(camera.id, np.flatnonzero(inside), spans, np.concatenate([part[1] for part in parts]))
 

@@ -62,8 +62,10 @@ def compare_azimuths(value: ArrayLike, error: ArrayLike, distance: ArrayLike, az
     InputError
         Wrong shapes, too few azimuths, or too few distances at which all profiles are clear of noise.
     """
-    profile, sigma = np.asarray(value, np.float64), np.asarray(error, np.float64)
-    r, phi = np.asarray(distance, np.float64), np.asarray(azimuth, np.float64)
+    profile = np.asarray(value, np.float64)
+    sigma = np.asarray(error, np.float64)
+    r = np.asarray(distance, np.float64)
+    phi = np.asarray(azimuth, np.float64)
     shape = (len(phi), len(r), 3)
     if profile.shape != shape or sigma.shape != shape or len(phi) < MIN_AZIMUTHS:
         rule = f"value and error must have the shape (azimuth, fibre, 3), with {MIN_AZIMUTHS} azimuths or more"
@@ -81,11 +83,20 @@ def compare_azimuths(value: ArrayLike, error: ArrayLike, distance: ArrayLike, az
     chi_square = ((slope - level) ** 2 / variance).sum(axis=0)
     parts = [_harmonics(slope[:, c] - level[c], variance[:, c], phi) for c in range(3)]
     first, amplitude, direction, amplitude_error = (np.array(part) for part in zip(*parts, strict=True))
-    ratio, steep = _ratio(decay, amplitude), np.maximum(np.abs(decay) - amplitude, 1e-12)
+    ratio = _ratio(decay, amplitude)
+    steep = np.maximum(np.abs(decay) - amplitude, 1e-12)
     return Isotropy(
-        slope - level, np.sqrt(variance), decay, stats.chi2.sf(chi_square, len(phi) - 1), amplitude, direction,
-        ratio, 2 * np.abs(decay) / steep**2 * amplitude_error, first, clear,
-    )  # fmt: skip
+        slope - level,
+        np.sqrt(variance),
+        decay,
+        stats.chi2.sf(chi_square, len(phi) - 1),
+        amplitude,
+        direction,
+        ratio,
+        2 * np.abs(decay) / steep**2 * amplitude_error,
+        first,
+        clear,
+    )
 
 
 def _slopes(log: Array, sigma: Array, r: Array) -> tuple[Array, Array]:

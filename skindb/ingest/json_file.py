@@ -22,7 +22,8 @@ CURE = "correct it, see docs/capture_format.md"
 
 def read_json(path: Path, faults: list[Fault]) -> Any:
     """Content of a JSON file; None and a fault if it is absent, invalid, null, or beyond a limit."""
-    where, noted = str(path), len(faults)
+    where = str(path)
+    noted = len(faults)
     try:
         text = read_regular(path, MAX_JSON_BYTES).decode("utf-8")
         if (depth := json_depth(text)) > MAX_JSON_DEPTH:
@@ -42,7 +43,8 @@ def read_json(path: Path, faults: list[Fault]) -> Any:
     if content is None:
         faults.append(Fault(where, "must be a JSON object {...}", "null", CURE))
     if re.search(r"\\u[dD][89a-fA-F]", text):
-        rule, cure = "must be text that UTF-8 can represent", "write the complete character"
+        rule = "must be text that UTF-8 can represent"
+        cure = "write the complete character"
         faults += [Fault(f"{where}{place}", rule, "half a surrogate pair", cure) for place in _broken_texts(content)]
     return content if len(faults) == noted else None
 
@@ -59,7 +61,8 @@ def _unique_pairs(pairs: list[tuple[str, Any]], where: str, faults: list[Fault])
         faults.append(Fault(where, rule, f"{len(pairs)}", "remove those that are not needed"))
     elif len(data) < len(pairs):
         for key in sorted(key for key, times in Counter(key for key, _ in pairs).items() if times > 1):
-            rule, cure = "an object must have each key once", "remove all but one"
+            rule = "an object must have each key once"
+            cure = "remove all but one"
             faults.append(Fault(f"{where}[{short(key)}]", rule, "the key more than once", cure))
     return data
 

@@ -25,7 +25,10 @@ from skindb.ingest.scan_checks import (
 )
 
 Array = NDArray[np.float64]
-SCAN, LANDMARKS, CAMERAS, LIGHTS = "scan", "landmarks", "cameras", "lights"
+SCAN = "scan"
+LANDMARKS = "landmarks"
+CAMERAS = "cameras"
+LIGHTS = "lights"
 SIZES = {
     SCAN: "diagonal of the scan",
     LANDMARKS: "face from eyes to mouth",
@@ -85,7 +88,8 @@ def likely_units(lengths: Lengths) -> dict[str, str]:
     parts = [*lengths.sizes]
     near = {ratio: _landmarks_near(lengths, ratio) for ratio in _ratios()} if LANDMARKS in parts else {}
     views = {ratio: _device_cost(lengths, ratio) for ratio in _ratios()}
-    best, least = dict[str, str](), inf
+    best = dict[str, str]()
+    least = inf
     for names in product(MM, repeat=len(parts)):
         units = dict(zip(parts, names, strict=True))
         other = {part: unit for part, unit in units.items() if MM[unit] != 1}
@@ -93,7 +97,8 @@ def likely_units(lengths: Lengths) -> dict[str, str]:
         if cost < least:
             cost += _cost(lengths, {part: MM[unit] for part, unit in units.items()}, near, views)
         if cost < least:
-            best, least = other, cost
+            best = other
+            least = cost
     return best
 
 

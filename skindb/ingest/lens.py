@@ -60,7 +60,9 @@ def fit_edge(picture: ArrayLike) -> EdgeFit:
     row, column = np.mgrid[: grey.shape[0], : grey.shape[1]] + 0.5
     middle = grey.shape[0] / 2
     near = np.abs(column - start - slant * (row - middle)) < EDGE_REACH_PX
-    row, column, value = row[near] - middle, column[near], grey[near]
+    row = row[near] - middle
+    column = column[near]
+    value = grey[near]
     low, high = np.percentile(value, [5, 95])
     sign = 1.0 if np.corrcoef(column, value)[0, 1] > 0 else -1.0
 
@@ -69,9 +71,11 @@ def fit_edge(picture: ArrayLike) -> EdgeFit:
         return np.asarray(p[3] + p[4] * special.ndtr(sign * way / p[2]) - value)
 
     fit = optimize.least_squares(
-        residual, [start, slant, 1.0, low, high - low], x_scale=[1, 0.1, 1, high - low, high - low],
+        residual,
+        [start, slant, 1.0, low, high - low],
+        x_scale=[1, 0.1, 1, high - low, high - low],
         bounds=([-np.inf, -1, 0.05, -np.inf, 0], [np.inf, 1, EDGE_REACH_PX, np.inf, np.inf]),
-    )  # fmt: skip
+    )
     variance = 2 * fit.cost / max(len(value) - 5, 1)
     error = float(np.sqrt(variance * np.linalg.pinv(fit.jac.T @ fit.jac)[2, 2]))
     if not fit.x[4] > MIN_CONTRAST_TO_NOISE * np.sqrt(variance):

@@ -38,7 +38,8 @@ def read_setup_dome(folder: Path, *, white: bool = True, dark: bool = True) -> D
     InputError
         With every fault of `dome/dome.json` and of the frames, or without a white target.
     """
-    faults, file = list[Fault](), folder / "dome/dome.json"
+    faults = list[Fault]()
+    file = folder / "dome/dome.json"
     data = read_json(file, faults)
     if data is None:
         raise InputError(faults)
@@ -46,7 +47,8 @@ def read_setup_dome(folder: Path, *, white: bool = True, dark: bool = True) -> D
         data = {key: value for key, value in data.items() if key not in ("dark", "sequence")}
     dome = read_dome(folder, Fields(data, str(file), faults), face=False, calibrated=True)
     if white and dome.white is None and not faults:
-        rule, cure = "a calibration needs the frames of a white target", "photograph it, see docs/capture_format.md"
+        rule = "a calibration needs the frames of a white target"
+        cure = "photograph it, see docs/capture_format.md"
         faults.append(Fault(f"{file}[white]", rule, "none", cure))
     if faults:
         raise InputError(faults)
@@ -152,7 +154,9 @@ def _pixels(dome: DomeRecord, light: LightRecord, views: list[_View]) -> tuple[T
     white = dome.white
     if white is None:
         raise InputError(Fault("white target", "a calibration needs one", "none", "photograph it"))
-    radiance, points, beside = list[NDArray[np.float64]](), list[NDArray[np.float64]](), [0.0]
+    radiance = list[NDArray[np.float64]]()
+    points = list[NDArray[np.float64]]()
+    beside = [0.0]
     for view in views:
         frames = read_view(dome, light.id, view.merger.camera, white=True)
         if faults := view_faults(dome, light.id, view.merger, frames, white=True):
@@ -189,7 +193,8 @@ def calibrated_dome(dome: DomeRecord, calibration: xr.Dataset, *, where: str) ->
     if missing := [light.id for light in dome.lights if light.id not in names]:
         found = f"none of {', '.join(missing[:5])}"
         raise InputError(Fault(where, "a calibration must have every light of the capture", found, "calibrate again"))
-    intensity, falloff = known["calibrated_intensity"], known["calibrated_falloff"]
+    intensity = known["calibrated_intensity"]
+    falloff = known["calibrated_falloff"]
     lights = (
         replace(light, intensity=intensity.sel(light=light.id).values, falloff=float(falloff.sel(light=light.id)))
         for light in dome.lights

@@ -30,7 +30,9 @@ from skindb.ingest.mirror_ball import (
 from skindb.schema import dataset
 
 Array = NDArray[np.float64]
-PLACE, LIGHT, CAMERA = "place", "light", "camera"
+PLACE = "place"
+LIGHT = "light"
+CAMERA = "camera"
 THREADS = 2
 
 
@@ -123,7 +125,8 @@ def calibrate_positions(dome: DomeRecord, ball: BallFrames) -> xr.Dataset:
         try:
             rays = list(_rays(dome, ball, centres, light))
             if len(rays) < 2:
-                rule, cure = "its highlight must appear in two frames", "expose them longer, or add a place of the ball"
+                rule = "its highlight must appear in two frames"
+                cure = "expose them longer, or add a place of the ball"
                 raise InputError(Fault("mirror ball", rule, f"{len(rays)}", cure))
             return light_position(*zip(*rays, strict=True)), len(rays)
         except InputError as error:

@@ -233,10 +233,12 @@ def checked_pictures(
     InputError
         With every frame that cannot be decoded or that cannot be a photograph.
     """
-    faults, dome = list[Fault](), check.dome
+    faults = list[Fault]()
+    dome = check.dome
 
     def one(pair: tuple[int, int]) -> NDArray[np.float32] | None:
-        light, camera = dome.lights[pair[0]].id, dome.cameras[pair[1]]
+        light = dome.lights[pair[0]].id
+        camera = dome.cameras[pair[1]]
         try:
             frames = read_view(dome, light, camera, digests={})
         except InputError as error:
@@ -286,7 +288,8 @@ def footprints(surfels: SurfelSet, camera: CameraRecord) -> NDArray[np.float32]:
 
 
 def _camera_sampling(views: Views, camera: CameraRecord, c: int) -> CameraSampling:
-    wanted, spread = views.clear[:, c] & _frontal(camera, views.surfels), np.zeros((0, 3), np.float32)
+    wanted = views.clear[:, c] & _frontal(camera, views.surfels)
+    spread = np.zeros((0, 3), np.float32)
     if views.footprint:
         spread = footprints(views.surfels, camera)
         wide = spread[:, [0, 2]].max(axis=1) > MAX_CLEAR_FOOTPRINT_PX**2
@@ -322,14 +325,26 @@ def _sampled(
 ) -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
     """Bits of the samples (3, n) of a view, and outcome (n,) for each surfel."""
     n = len(wanted)
-    out, outcome = np.empty((3, n), np.uint16), np.empty(n, np.uint8)
+    out = np.empty((3, n), np.uint16)
+    outcome = np.empty(n, np.uint8)
     light_fraction = (
         np.zeros(0, np.float32) if views.light_fraction is None else views.light_fraction[:, j].astype(np.float32)
     )
     gather(
-        *picture, wanted, light_fraction, shot.pixels, shot.spread, views.surfels.position,
-        views.surfels.normal, light.position, light.axis, float(light.falloff), intensity, out, outcome,
-    )  # fmt: skip
+        *picture,
+        wanted,
+        light_fraction,
+        shot.pixels,
+        shot.spread,
+        views.surfels.position,
+        views.surfels.normal,
+        light.position,
+        light.axis,
+        float(light.falloff),
+        intensity,
+        out,
+        outcome,
+    )
     return out, outcome
 
 

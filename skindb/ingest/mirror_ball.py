@@ -84,7 +84,8 @@ def ball_outline(mask: ArrayLike) -> Outline:
         far = float(np.hypot(column + 0.5 - centre[0], row + 0.5 - centre[1]).max())
         if far < 1.1 * radius + 1:
             return Outline(centre, radius)
-    rule, cure = "the mask of the mirror ball must be one disc", "draw it again, without the stand of the ball"
+    rule = "the mask of the mirror ball must be one disc"
+    cure = "draw it again, without the stand of the ball"
     raise InputError(Fault("mirror ball", rule, f"{area} pixels that do not fill a disc" if area else "nothing", cure))
 
 
@@ -110,7 +111,8 @@ def highlight_centre(picture: ArrayLike, outline: Outline) -> Array:
     known = bool(ball.any()) and bool(np.isfinite(grey[ball]).all())
     low, high = (float(np.median(grey[ball])), float(grey[ball].max())) if known else (0.0, 0.0)
     if not high > low:
-        rule, cure = "the mirror ball must show a highlight", "check its position in the picture, or expose it longer"
+        rule = "the mirror ball must show a highlight"
+        cure = "check its position in the picture, or expose it longer"
         raise InputError(Fault("mirror ball", rule, "a uniform picture" if known else "no finite values", cure))
     level = low + HIGHLIGHT_FRACTION * (high - low)
     labels, _ = ndimage.label(ball & (grey >= level))
@@ -118,10 +120,13 @@ def highlight_centre(picture: ArrayLike, outline: Outline) -> Array:
     spot = labels == 1 + int(sizes.argmax())
     if sizes.max() > MAX_HIGHLIGHT_FRACTION * ball.sum():
         rule = f"the highlight must cover at most {MAX_HIGHLIGHT_FRACTION:.0%} of the ball"
-        found, cure = f"{sizes.max() / ball.sum():.0%}", "expose the frame shorter, and darken the room"
+        found = f"{sizes.max() / ball.sum():.0%}"
+        cure = "expose the frame shorter, and darken the room"
         raise InputError(Fault("mirror ball", rule, found, cure))
     near = ball & ndimage.binary_dilation(spot, iterations=HIGHLIGHT_MARGIN)
-    row, column, weight = row[near], column[near], np.maximum(grey[near] - low, 0)
+    row = row[near]
+    column = column[near]
+    weight = np.maximum(grey[near] - low, 0)
     return np.array([np.average(column, weights=weight), np.average(row, weights=weight)])
 
 
@@ -133,7 +138,8 @@ def distant_light(outline: Outline, highlight: ArrayLike) -> Array:
     offset = (np.asarray(highlight, np.float64) - outline.centre) / outline.radius * [1, -1]
     square = float(offset @ offset)
     if not square < 1:
-        rule, cure = "the highlight must lie on the ball", "check the centre and radius of the ball"
+        rule = "the highlight must lie on the ball"
+        cure = "check the centre and radius of the ball"
         raise InputError(Fault("mirror ball", rule, f"{np.sqrt(square):.2f} radii from its centre", cure))
     normal = np.array([*offset, np.sqrt(1 - square)])
     return np.asarray(2 * normal[2] * normal - [0, 0, 1])
@@ -164,10 +170,8 @@ def reflected_ray(camera: Pinhole, ball: ArrayLike, radius: float, highlight: Ar
     along = float(way @ view)
     under = radius**2 - float(way @ way) + along**2
     if not (under > 0 and along > 0):
-        found, cure = (
-            f"{np.sqrt(max(float(way @ way) - along**2, 0.0)):.1f} mm from its centre",
-            "check the position of the ball",
-        )
+        found = f"{np.sqrt(max(float(way @ way) - along**2, 0.0)):.1f} mm from its centre"
+        cure = "check the position of the ball"
         raise InputError(Fault("mirror ball", f"the line of sight must meet the ball of {radius:g} mm", found, cure))
     point = origin + (along - np.sqrt(under)) * view
     normal = (point - np.asarray(ball, np.float64)) / radius
@@ -197,7 +201,9 @@ def ball_centre(cameras: Sequence[Pinhole], outlines: ArrayLike, radius: float) 
     circles = np.asarray(outlines, np.float64)
     turn = np.linspace(0, 2 * np.pi, OUTLINE_POINTS, endpoint=False)
     around = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
-    origins, axes, distances = list[Array](), list[Array](), list[float]()
+    origins = list[Array]()
+    axes = list[Array]()
+    distances = list[float]()
     for camera, circle in zip(cameras, circles, strict=True):
         sight = pixel_rays(circle[:2] + circle[2] * around, camera.K, camera.R, camera.distortion)
         # all lines make the same angle with the axis: sight . axis = cos(angle)
@@ -206,7 +212,9 @@ def ball_centre(cameras: Sequence[Pinhole], outlines: ArrayLike, radius: float) 
         origins.append(np.asarray(camera_centre(camera.R, camera.t), np.float64))
         axes.append(np.asarray(axis / length, np.float64))
         distances.append(radius / np.sqrt(1 - min(1 / length**2, 1 - 1e-12)))
-    start, way, distance = np.array(origins), np.array(axes), np.array(distances)
+    start = np.array(origins)
+    way = np.array(axes)
+    distance = np.array(distances)
     if len(start) == 1:
         return BallCentre(start[0] + distance[0] * way[0], np.nan)
     centre = light_position(start, way).position
@@ -237,7 +245,8 @@ def light_position(origins: ArrayLike, directions: ArrayLike) -> LightPosition:
     InputError
         Fewer than two rays, values that are not finite, or rays that are nearly parallel.
     """
-    start, way = np.asarray(origins, np.float64), np.asarray(directions, np.float64)
+    start = np.asarray(origins, np.float64)
+    way = np.asarray(directions, np.float64)
     if start.ndim != 2 or start.shape != way.shape or len(start) < 2 or not np.isfinite([start, way]).all():
         rule = "its position needs two or more rays of finite numbers"
         cure = "photograph the ball at another position"
@@ -247,7 +256,8 @@ def light_position(origins: ArrayLike, directions: ArrayLike) -> LightPosition:
     for _ in range(ROUNDS):
         normal = np.einsum("r,rij->ij", weight, across)
         if np.linalg.eigvalsh(normal)[0] < MIN_BASELINE**2 * weight.sum() / 4:
-            rule, cure = "its rays must not be parallel", "move the ball farther between the photographs"
+            rule = "its rays must not be parallel"
+            cure = "move the ball farther between the photographs"
             raise InputError(Fault("light", rule, f"{len(start)} rays within about a degree", cure))
         position = np.linalg.solve(normal, np.einsum("r,rij,rj->i", weight, across, start))
         weight = 1 / ((position - start) ** 2).sum(axis=1)
@@ -273,7 +283,8 @@ def reprojection_error(points: ArrayLike, pixels: ArrayLike, camera: Pinhole) ->
     length = np.linalg.norm(residual, axis=-1)
     seen = np.isfinite(length)
     if not seen.any():
-        rule, cure = "at least one known point must be seen", "check the pose of the camera"
+        rule = "at least one known point must be seen"
+        cure = "check the pose of the camera"
         raise InputError(Fault("reprojection", rule, f"none of {len(length)}", cure))
     return Reprojection(
         residual, float(np.sqrt(np.mean(length[seen] ** 2))), float(length[seen].max()), int(seen.sum())

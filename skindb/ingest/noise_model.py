@@ -65,12 +65,14 @@ def fit_noise(pairs: ArrayLike, *, black: float, white: float, step: float = 1.0
     count = frames[0, 0].size
     mean = np.where(cut, np.nan, frames.mean(axis=(1, 2, 3)) - black)
     variance = np.where(cut, np.nan, np.var(frames[:, 0] - frames[:, 1], axis=(1, 2), ddof=1) / 2)
-    x, y = mean[~cut], variance[~cut]
+    x = mean[~cut]
+    y = variance[~cut]
     if len(x) < MIN_PAIRS or x.max() < MIN_RATIO * max(x.min(), 0.0) or not (y > 0).all():
         rule = f"at least {MIN_PAIRS} pairs must be unsaturated, noisy, and differ {MIN_RATIO:g} times in brightness"
         found = f"{len(x)} unsaturated pairs, {int((y > 0).sum())} of them noisy"
         raise InputError(Fault("pairs of flat frames", rule, found, "photograph them with several exposure times"))
-    design, expected = np.stack([np.ones_like(x), x], axis=1), y
+    design = np.stack([np.ones_like(x), x], axis=1)
+    expected = y
     for _ in range(ROUNDS):
         sigma = expected * np.sqrt(2 / (count - 1))
         covariance = np.linalg.inv(design.T @ (design / sigma[:, None] ** 2))
@@ -78,7 +80,8 @@ def fit_noise(pairs: ArrayLike, *, black: float, white: float, step: float = 1.0
         expected = np.maximum(design @ solution, 1e-3 * y)
     floor, slope = solution
     if slope <= 0:
-        rule, cure = "the noise must grow with brightness", "check that the frames are linear and not denoised"
+        rule = "the noise must grow with brightness"
+        cure = "check that the frames are linear and not denoised"
         raise InputError(Fault("pairs of flat frames", rule, f"a slope of {slope:.3g}", cure))
     chi_square = float((((y - design @ solution) / sigma) ** 2).sum() / max(len(x) - 2, 1))
     return _electrons(solution, covariance, floor - step**2 / 12, chi_square, (mean, variance))

@@ -18,8 +18,12 @@ from scipy.ndimage import gaussian_filter
 Array = NDArray[np.float64]
 PIXEL_MM = 2.0  # mm; about the width of an eyelid, well below the offsets to be found
 SMOOTHING_PX = 0.7  # px of the downsampled picture; makes its derivatives smooth
-MAX_STEPS, SMALL_STEP = 12, 1e-3  # number of Gauss-Newton steps, and step length in px at which they stop
-SEARCH_RADII, SEARCH_STEPS = 0.75, 7  # range of the search for large offsets in radii of the face, and steps per side
+# number of Gauss-Newton steps, and step length in px at which they stop
+MAX_STEPS = 12
+SMALL_STEP = 1e-3
+# range of the search for large offsets in radii of the face, and steps per side
+SEARCH_RADII = 0.75
+SEARCH_STEPS = 7
 ROBUST_SCALE = 2.0  # robust standard deviations at which the weight of a residual is one half
 ALBEDO_QUANTILE = 0.4  # of the ratios measured / predicted of a surfel; highlights raise the larger ones
 ALBEDO_RANGE = (0.2, 3.0)  # relative to the median albedo, from brows and nostrils to the forehead
@@ -91,7 +95,8 @@ def interpolated(images: Array, pixels: Array) -> Array:
 
 def correlation(a: Array, b: Array) -> float:
     """Pearson's correlation; 0 if one of the two is constant."""
-    a, b = a - a.mean(), b - b.mean()
+    a = a - a.mean()
+    b = b - b.mean()
     product = float(np.sqrt((a @ a) * (b @ b)))
     return float(a @ b) / product if product > 0 else 0.0
 
@@ -172,7 +177,8 @@ def nan_quantile(values: Array, level: float) -> Array:
     low, high = (
         np.take_along_axis(ordered, at[None], 0)[0] for at in (below, np.ceil(np.maximum(place, 0)).astype(int))
     )
-    part, step = place - below, high - low
+    part = place - below
+    step = high - low
     return np.asarray(np.where(part < 0.5, low + step * part, high - step * (1 - part)))
 
 
@@ -187,7 +193,8 @@ def _gauss_newton(images: Array, predicted: Sequence[Array], pixels: Array, move
     for _ in range(MAX_STEPS):
         places = pixels + moves @ move
         right, left, below, above = (interpolated(images, places + step) for step in STEPS)
-        rows, rest = [], []
+        rows = []
+        rest = []
         for seen, across, down, shade in zip(
             interpolated(images, places), right - left, below - above, predicted, strict=True
         ):
@@ -195,7 +202,8 @@ def _gauss_newton(images: Array, predicted: Sequence[Array], pixels: Array, move
             row = across[:, None] * moves[:, 0] + down[:, None] * moves[:, 1]
             rows.append(row - np.outer(shade, shade @ row) / square)  # the gain is eliminated
             rest.append(float(seen @ shade) / square * shade - seen)
-        matrix, residual = np.concatenate(rows), np.concatenate(rest)
+        matrix = np.concatenate(rows)
+        residual = np.concatenate(rest)
         scale = ROBUST_SCALE * 1.4826 * float(np.median(np.abs(residual))) + FLOOR
         weight = 1 / (1 + (residual / scale) ** 2)
         normal = (matrix * weight[:, None]).T @ matrix

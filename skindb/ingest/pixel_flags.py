@@ -4,5 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-OK, SATURATED, DARK = 0, 1, 2
+OK = 0
+SATURATED = 1
+DARK = 2
 DARK_SIGMA = np.float32(2.0)  # standard deviations of read noise above black; a pixel at or below it is dark

@@ -48,7 +48,8 @@ def fibre_profiles(probe: ProbeRecord, digests: Digests | None = None) -> Profil
     InputError
         With every frame that cannot be decoded, and fibres that lie outside the picture.
     """
-    found, faults = list[list[tuple[Array, Array]]](), list[Fault]()
+    found = list[list[tuple[Array, Array]]]()
+    faults = list[Fault]()
     for site in probe.sites:
         try:
             found.append([placement_signal(probe, site, placement, digests) for placement in probe.placements[site]])
@@ -64,7 +65,8 @@ def fibre_profiles(probe: ProbeRecord, digests: Digests | None = None) -> Profil
     value, error, spread = (np.array(column) for column in zip(*together, strict=True))
     value, error = value * factor, np.hypot(error, probe.gain_error * value) * factor
     if (np.fmax(np.abs(value), error) > MAX_MAGNITUDE).any():
-        rule, cure = f"scale * signal / gain must be at most {MAX_MAGNITUDE:g}", "correct scale, gain and seconds"
+        rule = f"scale * signal / gain must be at most {MAX_MAGNITUDE:g}"
+        cure = "correct scale, gain and seconds"
         raise InputError(Fault(f"{probe.file}[gain]", rule, f"{np.nanmax(np.abs(value)):.3g}", cure))
     known = probe.scale is not None
     fault = energy_fault(str(probe.file), probe.sites, probe.distance, value, error) if known else None
@@ -109,7 +111,8 @@ def combine_placements(value: Array, error: Array) -> tuple[Array, Array, Array]
     repeatability : ndarray
         (3,) relative standard deviation between placements; NaN of a single one.
     """
-    count, mean = len(value), value.mean(axis=0)
+    count = len(value)
+    mean = value.mean(axis=0)
     noise = np.sqrt((error**2).sum(axis=0)) / count
     if count == 1:
         return mean, noise, np.full(3, np.nan)
@@ -124,7 +127,9 @@ def placement_signal(
     probe: ProbeRecord, site: str, placement: str = "", digests: Digests | None = None
 ) -> tuple[Array, Array]:
     """Signal per second (fibre, 3) and its standard error; NaN where pixels are saturated in every bracket."""
-    fibres, strips, faults = list[Index](), list[Frame](), dict[Fault, None]()
+    fibres = list[Index]()
+    strips = list[Frame]()
+    faults = dict[Fault, None]()
     for exposure in probe.exposures:
         try:
             frame = read_frame(probe.frame(site, exposure, placement), None, digests)
@@ -141,11 +146,13 @@ def placement_signal(
         at = f"site {site}, placement {placement}" if placement else f"site {site}"
         raise InputError(replace(fault, found=f"{at}: bracket {fault.found}"))
     radiance, error, _ = merge_exposures(strips, tuple(probe.exposures.values()), probe.sensor)
-    value, spread = np.full((len(fibres), 3), np.nan), np.full((len(fibres), 3), np.nan)
+    value = np.full((len(fibres), 3), np.nan)
+    spread = np.full((len(fibres), 3), np.nan)
     union = np.unique(np.concatenate(fibres))
     for i, pixels in enumerate(fibres):
         own = np.searchsorted(union, pixels)
-        signal, noise = radiance[0, own].astype(np.float64), error[0, own].astype(np.float64)
+        signal = radiance[0, own].astype(np.float64)
+        noise = error[0, own].astype(np.float64)
         for c in range(3):
             usable = np.isfinite(signal[:, c])
             if 1 - usable.mean() <= MAX_LOST_FRACTION:
@@ -162,7 +169,8 @@ def fibre_pixels(probe: ProbeRecord, shape: tuple[int, ...]) -> list[Index]:
     InputError
         With every fibre without a pixel, or if the fibres cover more pixels than the memory is planned for.
     """
-    fibres, total = list[Index](), 0
+    fibres = list[Index]()
+    total = 0
     for centre, radius in zip(probe.centre, probe.radius, strict=True):
         (left, right), (top, bottom) = (
             (min(max(math.floor(c - radius), 0), side), min(math.ceil(c + radius), side))
@@ -173,7 +181,8 @@ def fibre_pixels(probe: ProbeRecord, shape: tuple[int, ...]) -> list[Index]:
             rule = f"the fibres must cover at most {MAX_FIBRE_PIXELS:,} pixels"
             cure = "give centre and radius in pixels of the picture"
             raise InputError(Fault(f"{probe.file}[fibres]", rule, f"{total:,} or more", cure))
-        y, x = np.arange(top, bottom)[:, None] + 0.5, np.arange(left, right) + 0.5
+        y = np.arange(top, bottom)[:, None] + 0.5
+        x = np.arange(left, right) + 0.5
         row, column = np.nonzero((x - centre[0]) ** 2 + (y - centre[1]) ** 2 <= radius * radius)
         fibres.append((row + top) * shape[1] + column + left)
     faults = [

@@ -19,7 +19,8 @@ from skindb.ingest.probe import placement_signal
 from skindb.ingest.radiance import merge_exposures
 from skindb.schema import dataset
 
-FILE, PROBE_FILE = "contact/calibration.json", "contact/probe.json"
+FILE = "contact/calibration.json"
+PROBE_FILE = "contact/probe.json"
 REPEAT = "repeat"
 MAX_REPEATS = 64
 ROWS = 256  # of the frames that are merged at a time
@@ -35,10 +36,12 @@ def read_flat_frames(folder: Path) -> ProbeRecord | None:
     InputError
         With every fault of the two files and of the headers of the frames.
     """
-    file, faults = folder / FILE, list[Fault]()
+    file = folder / FILE
+    faults = list[Fault]()
     if not file.exists():
         return None
-    data, probe = read_json(file, faults), read_json(folder / PROBE_FILE, faults)
+    data = read_json(file, faults)
+    probe = read_json(folder / PROBE_FILE, faults)
     if data is None or not isinstance(probe, dict):
         raise InputError(faults or [Fault(str(folder / PROBE_FILE), "must be a JSON object {...}", "another value")])
     fields = Fields(data, str(file), faults)

@@ -76,7 +76,8 @@ def _decay_notes(probe: ProbeRecord, profiles: Profiles) -> Iterator[str]:
     """Warnings about profiles that no skin has: wrong unit of distances, order of channels, or gain of a fibre."""
     order = np.argsort(probe.distance, kind="stable")
     distance = probe.distance[order]
-    value, error = profiles.value[:, order], profiles.error[:, order]
+    value = profiles.value[:, order]
+    error = profiles.error[:, order]
     clear = np.isfinite(value) & (value > MIN_SIGNAL_TO_NOISE * error)
     log = np.full(value.shape, np.nan)
     np.log(value * distance[:, None] ** 2, out=log, where=clear)

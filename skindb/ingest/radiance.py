@@ -47,7 +47,8 @@ class FrameMerger:
                 usable[:] = 2
             return radiance, flag
         height, width, _ = frames[0].shape
-        radiance, flag = np.empty((height, width, 3), np.float32), np.empty((height, width), np.uint8)
+        radiance = np.empty((height, width, 3), np.float32)
+        flag = np.empty((height, width), np.uint8)
         if spans is None:
             spans = np.tile(np.array([0, width]), (height, 1))
         count = np.empty((0, 0), np.uint8) if usable is None else usable
@@ -57,19 +58,31 @@ class FrameMerger:
     @cached_property
     def _kernel_arguments(self) -> tuple[Any, ...]:
         """The other arguments of `develop`."""
-        sensor, matrix, dtype = self.camera.sensor, self.camera.colour_matrix, self.camera.sensor.kind.dtype
+        sensor = self.camera.sensor
+        matrix = self.camera.colour_matrix
+        dtype = self.camera.sensor.kind.dtype
         dark = np.zeros((0, 1, 1, 3), dtype) if self.dark is None else np.ascontiguousarray(self.dark)
         curve, offset = _curve(sensor, dark=self.dark is not None)
-        zero, span = np.float32(sensor.black), sensor.white - sensor.black
+        zero = np.float32(sensor.black)
+        span = sensor.white - sensor.black
         variance = float(read_sigma(np.asarray([1 / np.float32(span)], np.float32), sensor)[0]) ** 2
         longest = max(self.seconds)
         gain = 1 / (np.ones((1, 1)) if self.vignette is None else self.vignette[..., 0].astype(np.float64)) / longest
         colours = matrix if (matrix != np.eye(3)).any() else np.zeros((0, 3))
         seconds = np.asarray(self.seconds, np.float32) / np.float32(longest)
         return (
-            dark, curve, offset, float(zero), float(span), variance, float(sensor.white), seconds,
-            1 / sensor.full_electrons, gain.astype(np.float32), np.ascontiguousarray(colours, np.float32),
-        )  # fmt: skip
+            dark,
+            curve,
+            offset,
+            float(zero),
+            float(span),
+            variance,
+            float(sensor.white),
+            seconds,
+            1 / sensor.full_electrons,
+            gain.astype(np.float32),
+            np.ascontiguousarray(colours, np.float32),
+        )
 
 
 def _curve(sensor: SensorRecord, *, dark: bool) -> tuple[Image, int]:
@@ -172,8 +185,10 @@ def merge_exposures(
     if sensor.kind.bits == 0:
         return _linear(frames)
     shape = frames[0].shape
-    total, time = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-    signals, flag_dark = [], np.ones(shape[:2], bool)
+    total = np.zeros(shape, np.float32)
+    time = np.zeros(shape, np.float32)
+    signals = []
+    flag_dark = np.ones(shape[:2], bool)
     longest = max(seconds)  # times are relative to it: their squares stay within single precision
     for i, frame in enumerate(frames):
         black = dark[i] if dark is not None else None
@@ -230,7 +245,8 @@ def relative_exposure(frame: Frame, dark: Frame | np.float32 | None, sensor: Sen
         return level / span, np.broadcast_to(1 / span, frame.shape)
     table = sensor.response
     value = level + np.float32(sensor.black)
-    signal, slope = np.empty(frame.shape, np.float32), np.empty(frame.shape, np.float32)
+    signal = np.empty(frame.shape, np.float32)
+    slope = np.empty(frame.shape, np.float32)
     for c in range(3):
         rise = np.diff(table[:, c + 1]) / np.diff(table[:, 0])
         cell = np.clip(np.searchsorted(table[:, 0], value[..., c], side="right") - 1, 0, len(rise) - 1)
@@ -248,7 +264,8 @@ def read_sigma(slope: Image, sensor: SensorRecord) -> Image:
 
 
 def _weighted(signals: list[Any], expected: Image, sensor: SensorRecord) -> tuple[Image, Image]:
-    weighted, weights = np.zeros_like(expected), np.zeros_like(expected)
+    weighted = np.zeros_like(expected)
+    weights = np.zeros_like(expected)
     for signal, slope, usable, seconds in signals:
         photons = expected * seconds / np.float32(sensor.full_electrons)
         variance = photons + read_sigma(slope, sensor) ** 2

@@ -55,7 +55,8 @@ def applied_rotations(before: DomeRecord, after: DomeRecord) -> Array:
 def _turn(check: CalibrationCheck, c: int, offset: Offset) -> Array:
     """Rotation vector (3,) [rad] in the frame of camera c that compensates for its offset."""
     at = np.flatnonzero(check.clear[check.compared, c])
-    points, camera = check.surfels.position[check.compared][at], check.dome.cameras[c]
+    points = check.surfels.position[check.compared][at]
+    camera = check.dome.cameras[c]
 
     def pixels(turn: Array) -> Array:
         turned = _turned(camera, turn)

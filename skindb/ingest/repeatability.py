@@ -60,7 +60,8 @@ def placement_variance(value: ArrayLike, error: ArrayLike) -> Repeatability:
     InputError
         Wrong shapes, fewer than three placements, or fewer than two fibres with a clear signal.
     """
-    profile, sigma = np.asarray(value, np.float64), np.asarray(error, np.float64)
+    profile = np.asarray(value, np.float64)
+    sigma = np.asarray(error, np.float64)
     if profile.ndim != 3 or profile.shape != sigma.shape or profile.shape[-1] != 3 or len(profile) < MIN_PLACEMENTS:
         rule = (
             f"profiles and errors must have the shape (placement, fibre, 3), with {MIN_PLACEMENTS} or more placements"
@@ -69,16 +70,19 @@ def placement_variance(value: ArrayLike, error: ArrayLike) -> Repeatability:
     with np.errstate(invalid="ignore"):
         clear = np.asarray((sigma >= 0) & (profile > MIN_SIGNAL_TO_NOISE * sigma) & (profile > 0)).all(axis=(0, 2))
     if clear.sum() < 2:
-        rule, cure = "at least two fibres must have a clear signal in all placements", "add longer exposures"
+        rule = "at least two fibres must have a clear signal in all placements"
+        cure = "add longer exposures"
         raise InputError(Fault("repeated placements", rule, f"{int(clear.sum())}", cure))
-    log, noise = np.log(profile[:, clear]), (sigma[:, clear] / profile[:, clear]) ** 2
+    log = np.log(profile[:, clear])
+    noise = (sigma[:, clear] / profile[:, clear]) ** 2
     placements, fibres, _ = log.shape
     centred = log - log.mean(axis=0)
     levels = centred.mean(axis=1)
     rest = (centred - levels[:, None]).reshape(-1, 3)
     rest_variance = (rest**2).sum(axis=0) / ((placements - 1) * (fibres - 1))
     level_variance = (levels**2).sum(axis=0) / (placements - 1) - rest_variance / fibres
-    mean, spread = np.full(profile.shape[1:], np.nan), np.full(profile.shape[1:], np.nan)
+    mean = np.full(profile.shape[1:], np.nan)
+    spread = np.full(profile.shape[1:], np.nan)
     mean[clear] = np.exp(log.mean(axis=0))
     spread[clear] = mean[clear] * centred.std(axis=0, ddof=1) / np.sqrt(placements)
     shape_variance = rest_variance - noise.mean(axis=(0, 1))
@@ -102,7 +106,8 @@ def level_trend(levels: ArrayLike, covariate: ArrayLike) -> Trend:
     InputError
         Wrong shapes, values that are not finite, fewer than three placements, or a covariate that does not vary.
     """
-    y, x = np.asarray(levels, np.float64), np.asarray(covariate, np.float64)
+    y = np.asarray(levels, np.float64)
+    x = np.asarray(covariate, np.float64)
     good = x.ndim == 1 and y.shape == (len(x), 3) and len(x) >= MIN_PLACEMENTS and np.isfinite(y).all()
     if not good or not np.isfinite(x).all() or np.ptp(x) == 0:
         rule = f"levels (placement, 3) and a covariate that varies over {MIN_PLACEMENTS} placements or more are needed"

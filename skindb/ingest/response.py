@@ -146,7 +146,8 @@ def _response(
     black, white = levels
     table = np.column_stack([black + value * (white - black), *(curve / curve[-1] for curve in curves)])
     covered = np.array([[s.value[s.usable].min(), s.value[s.usable].max()] for s in picked])
-    residual, counts = np.array([p[1] for p in parts]), np.array([p[2] for p in parts], np.int64)
+    residual = np.array([p[1] for p in parts])
+    counts = np.array([p[2] for p in parts], np.int64)
     return Response(table, residual, covered, counts, np.array(rising))
 
 
@@ -167,7 +168,8 @@ def _mean_exposure_value(pixels: Array, log_ratio: Array, knots: int) -> Array:
     grid = np.linspace(0.0, 1.0, MEAN_ROWS)
     curve = np.maximum.accumulate(_curve(grid, log_ratio, knots)) + MIN_RISE * np.arange(MEAN_ROWS)
     exposure = np.interp(pixels, grid, curve)
-    mean, noise = exposure.mean(axis=-1), exposure.std(axis=-1)
+    mean = exposure.mean(axis=-1)
+    noise = exposure.std(axis=-1)
     usable = mean > MIN_SIGNAL_TO_NOISE * noise
     return np.asarray(np.where(usable, np.interp(mean, curve, grid), pixels.mean(axis=-1)))
 
@@ -202,7 +204,8 @@ def _solve(
     total = weight.sum(axis=1, keepdims=True)
     design -= (weight[..., None] * design).sum(axis=1, keepdims=True) / total[..., None]
     target = target - (weight * target).sum(axis=1, keepdims=True) / total
-    rows, known = design[kept].reshape(-1, options.knots), target[kept].ravel()
+    rows = design[kept].reshape(-1, options.knots)
+    known = target[kept].ravel()
     heavy = weight[kept].ravel()[:, None]
     bend = np.diff(np.eye(options.knots), 2, axis=0)
     penalty = options.smoothness * (options.knots - 1) ** 3 * bend.T @ bend

@@ -63,16 +63,22 @@ def response_samples(
     InputError
         Wrong shapes, non-finite values, levels that do not rise, or times that are all equal or not positive.
     """
-    frames, times = np.asarray(stack), np.asarray(seconds, np.float64)
+    frames = np.asarray(stack)
+    times = np.asarray(seconds, np.float64)
     _require_stack(frames, times, levels, block)
     values = (frames[..., channel].astype(np.float64) - levels[0]) / (levels[1] - levels[0])
     height, width = (side // block * block for side in values.shape[1:])
     tiles = values[:, :height, :width].reshape(len(times), height // block, block, width // block, block)
     tiles = tiles.transpose(1, 3, 0, 2, 4).reshape(-1, len(times), block * block)
-    mean, top, spread = tiles.mean(axis=-1), tiles.max(axis=-1), tiles.std(axis=-1)
+    mean = tiles.mean(axis=-1)
+    top = tiles.max(axis=-1)
+    spread = tiles.std(axis=-1)
     usable = (mean >= MIN_VALUE) & (mean <= MAX_VALUE) & (top < 1)
     enough = usable.sum(axis=1) >= 2
-    tiles, mean, usable, spread = tiles[enough], mean[enough], usable[enough], spread[enough]
+    tiles = tiles[enough]
+    mean = mean[enough]
+    usable = usable[enough]
+    spread = spread[enough]
     rough = np.where(usable, spread / np.maximum(mean, MIN_VALUE), 0).max(axis=1, initial=0)
     bright = np.clip(mean, 0, 1).mean(axis=1)
     low, high = (bright.min(), bright.max()) if len(bright) else (0.0, 1.0)
@@ -86,7 +92,8 @@ def response_samples(
 
 def _require_stack(frames: NDArray[np.generic], times: Array, levels: tuple[float, float], block: int) -> None:
     """Report every fault of the arguments at once."""
-    where, faults = "the exposure stack", list[Fault]()
+    where = "the exposure stack"
+    faults = list[Fault]()
     if frames.ndim != 4 or frames.shape[-1] != 3 or times.shape != frames.shape[:1]:
         rule = "it must have the shape (exposure, height, width, 3) and one time for each exposure"
         faults.append(

@@ -58,7 +58,9 @@ from skindb.ingest.visibility import Method, camera_visibility, coarse_maps, lig
 
 T = TypeVar("T")
 OnContradiction = Literal["refuse", "note"]
-MIN_THREADS, MAX_THREADS = 2, 8  # with two, one reads while the other computes
+# with two, one reads while the other computes
+MIN_THREADS = 2
+MAX_THREADS = 8
 MAX_BYTES = 4 << 30  # of memory for all threads together, unless two threads need more
 
 
@@ -130,13 +132,16 @@ def ingest_capture(
     >>> with ingest_capture(read_capture("captures/S01"), scratch="scratch") as tree:  # doctest: +SKIP
     ...     model = skindb.fit.fit_model(tree)
     """
-    report, asked = progress or silent, parameters or IngestParameters()
+    report = progress or silent
+    asked = parameters or IngestParameters()
     require_fit_consent(capture)
     report("check", 1, 1)
     surfels = build_surfels(capture, spacing_mm=asked.spacing_mm)
     report("surfels", 1, 1)
     groups = {"mesh": mesh_group(capture, surfels), "atlas": atlas_group(surfels)}
-    faults, digests, touched = list[Fault](), Digests(), list[str]()
+    faults = list[Fault]()
+    digests = Digests()
+    touched = list[str]()
     with ExitStack() as stack:
         if (probe := capture.probe) is not None:
             profiles = _attempt(faults, lambda: fibre_profiles(probe, digests))
@@ -220,7 +225,8 @@ def _dome_groups(
     plan: Plan, faults: list[Fault], digests: Digests, spool: Spool, pool: Executor, report: Progress
 ) -> tuple[dict[str, xr.Dataset], dict[str, Any]]:
     """Groups surfels, samples, dome and photographs, and their summary; both empty if faults were found."""
-    dome, surfels = plan.dome, plan.surfels
+    dome = plan.dome
+    surfels = plan.surfels
     mergers = frame_mergers(dome, faults, digests)
     faults += [fault for merger in mergers.values() for fault in dark_faults(dome, merger)]
     if not faults:
@@ -263,7 +269,8 @@ def _dome_groups(
     if judged and not faults:
         faults += sample_faults(dome, found.views.median, found.views.bright)
     if not found.sample_count.any():
-        rule, cure = "a surfel must be lit by a light and seen by a camera", "check the crop, poses and positions"
+        rule = "a surfel must be lit by a light and seen by a camera"
+        cure = "check the crop, poses and positions"
         faults.append(Fault("samples", rule, "none is", cure))
     if faults:
         return {}, {}

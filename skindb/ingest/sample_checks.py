@@ -11,13 +11,16 @@ from skindb.ingest.devices import DomeRecord
 Array = NDArray[np.float64]
 MIN_MEDIAN_SAMPLES = 50  # of a view, for a reliable median
 # of a light to the median one, in a channel: lights of a dome differ by tens of percent, of two types by ten times
-MAX_INTENSITY_RATIO, NOTED_INTENSITY_RATIO = 1_000.0, 20.0
+MAX_INTENSITY_RATIO = 1_000.0
+NOTED_INTENSITY_RATIO = 20.0
 # sr^-1, of the median sample: black velvet has 0.002, a perfect diffuser 0.3
 MEDIAN_SAMPLES = (3e-4, 3.0)
 # of the median sample of a light to that of all lights: 0.55 to 1.3 in virtual domes, less for grazing lights
-MAX_SAMPLE_RATIO, NOTED_SAMPLE_RATIO = 50.0, 8.0
+MAX_SAMPLE_RATIO = 50.0
+NOTED_SAMPLE_RATIO = 8.0
 # sr^-1, of a sample: sharp highlights of wet skin have about 50; and fraction of the samples of a view that exceed it
-MAX_SAMPLE, MAX_BRIGHT_FRACTION = 1_000.0, 0.05
+MAX_SAMPLE = 1_000.0
+MAX_BRIGHT_FRACTION = 0.05
 SAMPLE_CURE = "give each light its intensity in the unit of the frames, times mm^2, or a white target; check the frames"
 
 
@@ -94,7 +97,8 @@ def unlit_fault(where: str, radiance: NDArray[np.float32], count: int) -> Fault 
     """Fault of a view whose usable pixels (n, 3), at `count` surfels, are all zero or negative."""
     if count < MIN_MEDIAN_SAMPLES or (radiance > 0).any():
         return None
-    rule, cure = "a frame must be bright where its light reaches the face", "copy the frame from the camera again"
+    rule = "a frame must be bright where its light reaches the face"
+    cure = "copy the frame from the camera again"
     return Fault(where, rule, f"none at {count} surfels", cure)
 
 

@@ -72,7 +72,8 @@ def radiance_noise(camera: CameraRecord, seconds: Sequence[float] | Array, gain:
     gain
         Gain of the lens (vignette) at the face.
     """
-    sensor, time = camera.sensor, np.asarray(seconds, np.float64)
+    sensor = camera.sensor
+    time = np.asarray(seconds, np.float64)
     per_value = np.asarray([1 / (sensor.white - sensor.black)], np.float32)
     read = float(read_sigma(per_value, sensor)[0]) ** 2
     # an exposure is the longest usable one where all longer ones are saturated

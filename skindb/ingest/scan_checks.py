@@ -23,7 +23,9 @@ UNITS = {
     "micrometres": 0.001,
 }  # mm of each
 SCAN_DIAGONAL = (20.0, 3000.0)  # mm: from a patch of skin to an entire person; a head has 350 to 400
-HEAD_DIAGONAL, FACE_HEIGHT = 380.0, 90.0  # mm
+# mm
+HEAD_DIAGONAL = 380.0
+FACE_HEIGHT = 90.0
 FACE_HEIGHTS = (20.0, 400.0)  # mm between the centres of upper and lower landmarks: from a child's nose to a statue
 LANDMARK_REACH = 10.0  # mm; a landmark farther from the scan does not belong to this face
 SITE_LANDMARK = {"forehead": "forehead_centre"}  # landmark at a probe site that has another name
@@ -105,7 +107,8 @@ def discarded_piece_faults(where: str, points: Mapping[str, Array], surface: Cle
 
 def coincidence_faults(where: str, points: Mapping[str, Array]) -> list[Fault]:
     """Faults of landmarks at the same point."""
-    names, place = [*points], np.array([*points.values()]).reshape(-1, 3)
+    names = [*points]
+    place = np.array([*points.values()]).reshape(-1, 3)
     rule = f"landmarks must be at least {MIN_LANDMARK_DISTANCE_MM:g} mm apart"
     return [
         Fault(f"{where}[{names[j]}]", rule, f"{names[i]} at the same point", "mark one of them again, or remove it")

@@ -57,12 +57,17 @@ class Spool:
 
     def __init__(self, folder: Path, shape: tuple[int, int, int], frames: Mapping[str, Any], *, key: str) -> None:
         lights, cameras, surfels = shape
-        self.folder, self.shape, self._frames, self._key = folder, shape, dict(frames), key.encode()
+        self.folder = folder
+        self.shape = shape
+        self._frames = dict(frames)
+        self._key = key.encode()
         self.done = np.zeros((lights, cameras), bool)
         self.views = np.zeros((lights, cameras), np.int64)  # number of samples of each view
         self.counts = np.zeros((STATES, surfels), np.int32)
         self.digests: dict[str, str] = {}
-        self._guard, self._turn, self._written = threading.Lock(), threading.Lock(), time.monotonic()
+        self._guard = threading.Lock()
+        self._turn = threading.Lock()
+        self._written = time.monotonic()
         self._file = self._lock = -1
 
     def __enter__(self) -> Self:
@@ -152,7 +157,8 @@ class Spool:
         at = (light * self.shape[1] + camera) * len(content)
         while content:  # a large write may be partial
             count = os.pwrite(self._file, content, at)
-            content, at = content[count:], at + count
+            content = content[count:]
+            at = at + count
 
     def _read(self, begin: int, end: int) -> NDArray[np.float16]:
         """Samples (surfel, light, camera, 3) in column-major order, as the store keeps them."""
@@ -183,7 +189,8 @@ class Spool:
         path = self.folder / name
         if path.is_symlink() or not path.is_file():
             return None
-        seal, content = path.read_bytes()[:SEAL_BYTES], path.read_bytes()[SEAL_BYTES:]
+        seal = path.read_bytes()[:SEAL_BYTES]
+        content = path.read_bytes()[SEAL_BYTES:]
         return io.BytesIO(content) if hmac.compare_digest(seal, self._seal(name, content)) else None
 
     def _seal(self, name: str, content: bytes) -> bytes:

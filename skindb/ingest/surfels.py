@@ -101,7 +101,9 @@ def transferred_landmarks(capture: Capture, surfels: SurfelSet) -> tuple[Array, 
     The distance is that of the given landmark from the cleaned scan. The position is NaN if the landmark was cropped
     away, so that the complete scan is nearer to it than the surface.
     """
-    given, base, scan = np.array([*capture.landmarks.values()]).reshape(-1, 3), capture.surface, capture.scan
+    given = np.array([*capture.landmarks.values()]).reshape(-1, 3)
+    base = capture.surface
+    scan = capture.scan
     face, weight, distance = closest_on_mesh(base.vertices, base.faces, given)
     there = distance <= LANDMARK_REACH
     if capture.crop is not None:
@@ -140,7 +142,8 @@ def _site_position(surfels: SurfelSet, site: str, landmarks: Mapping[str, Array]
             break
     if not member.any():
         return np.full(3, np.nan)
-    points, area = surfels.position[member], surfels.area[member]
+    points = surfels.position[member]
+    area = surfels.area[member]
     middle = area @ points / area.sum()
     return np.asarray(points[np.linalg.norm(points - middle, axis=1).argmin()])
 

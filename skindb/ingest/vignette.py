@@ -48,13 +48,16 @@ def fit_vignette(flat: ArrayLike, centre: ArrayLike) -> Vignette:
     InputError
         Too few pixels are finite and positive, or they do not reach far enough from the principal point.
     """
-    picture, middle = np.asarray(flat, np.float64), np.asarray(centre, np.float64)
+    picture = np.asarray(flat, np.float64)
+    middle = np.asarray(centre, np.float64)
     if picture.ndim != 2:
-        rule, cure = "it must have the shape (height, width)", "fit one channel, or the mean of the channels"
+        rule = "it must have the shape (height, width)"
+        cure = "fit one channel, or the mean of the channels"
         raise InputError(Fault("flat frame", rule, str(picture.shape), cure))
     row, column = np.nonzero(np.isfinite(picture) & (picture > 0))
     half = np.hypot(*picture.shape) / 2
-    x, y = (column + 0.5 - middle[0]) / half, (row + 0.5 - middle[1]) / half
+    x = (column + 0.5 - middle[0]) / half
+    y = (row + 0.5 - middle[1]) / half
     r2 = x**2 + y**2
     if len(r2) < MIN_PIXELS or r2.max() < MIN_REACH**2:
         rule = f"at least {MIN_PIXELS} pixels must be usable, some of them {MIN_REACH} half diagonals from the centre"
@@ -70,7 +73,8 @@ def fit_vignette(flat: ArrayLike, centre: ArrayLike) -> Vignette:
         kept = np.abs(apart) <= MAX_DEVIATIONS * max(spread, 1e-12 * abs(solution[0]))
     misfit = float(np.sqrt(np.mean(apart[kept] ** 2)))
     inverse = misfit**2 * np.linalg.inv(design[kept].T @ design[kept])
-    level, found = solution[0], solution[3:] / solution[0]
+    level = solution[0]
+    found = solution[3:] / solution[0]
     # covariance of the ratio of the coefficients to the level at the centre
     slope = np.hstack([-found[:, None] / level, np.zeros((3, 2)), np.eye(3) / level])
     return Vignette(found, slope @ inverse @ slope.T, misfit / abs(level), float(kept.mean()))

@@ -84,7 +84,8 @@ def _add_penumbrae(fraction: Half, start: Bools, faces: Places, facing: Bools, r
 def _visibility_test(surfels: SurfelSet, scene: RayScene, method: Method) -> Callable[[Array], VisibilityTest]:
     """Function from an eye (3,) in mm to the visibility of surfels from it, by the method."""
     if method == "rays":
-        position, normal = surfels.position, surfels.normal
+        position = surfels.position
+        normal = surfels.normal
         return lambda eye: lambda at: ~scene.occluded(position, eye[None], normal=normal, at=at)
     if method == "splats":
         splats = SplatScene(surfels.position, surfels.normal, surfels.radius)
@@ -139,7 +140,8 @@ def camera_visibility(
     look = _visibility_test(surfels, scene, method)
     count = len(surfels.position)
     # the columns of cameras are used one by one
-    visible, clear = np.zeros((len(cameras), count), np.float16).T, np.zeros((len(cameras), count), bool).T
+    visible = np.zeros((len(cameras), count), np.float16).T
+    clear = np.zeros((len(cameras), count), bool).T
     pixels = np.empty((len(cameras), count, 2), np.float32).transpose(1, 0, 2)
 
     def one(c: int) -> None:
@@ -156,8 +158,10 @@ def camera_visibility(
 
 def _in_picture(surfels: SurfelSet, camera: CameraRecord) -> tuple[Array, Bools]:
     """Projections (n, 2) of the surfels, and which of them face the camera and fall inside its picture (n,)."""
-    centre, last = camera_centre(camera.R, camera.t), np.array([camera.width, camera.height]) - 0.5
-    pixels, inside = np.empty((len(surfels.position), 2)), np.empty(len(surfels.position), bool)
+    centre = camera_centre(camera.R, camera.t)
+    last = np.array([camera.width, camera.height]) - 0.5
+    pixels = np.empty((len(surfels.position), 2))
+    inside = np.empty(len(surfels.position), bool)
     for i in range(0, len(pixels), SURFELS_PER_BLOCK):
         part = slice(i, i + SURFELS_PER_BLOCK)
         position = surfels.position[part]

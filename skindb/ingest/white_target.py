@@ -59,7 +59,8 @@ def position_sensitivity(target: TargetPixels, *, falloff: float) -> float:
     def mean(position: Array) -> float:
         way = target.points - position
         distance = np.linalg.norm(way, axis=1)
-        lit, angle = -(way @ target.normal) / distance, (way @ target.axis) / distance
+        lit = -(way @ target.normal) / distance
+        angle = (way @ target.axis) / distance
         known = (lit > MIN_COSINE) & (angle > MIN_COSINE)
         return float(np.mean(np.log(distance**2 / (lit * angle**falloff)), where=known))
 
@@ -88,11 +89,13 @@ def fit_light(target: TargetPixels, *, falloff: float | None = None) -> LightFit
     """
     radiance = np.asarray(target.radiance, np.float64)
     if radiance.ndim != 2 or radiance.shape != np.shape(target.points) or radiance.shape[1] != 3:
-        rule, cure = "radiance and points must have the shape (pixel, 3)", "give one row for each pixel of the target"
+        rule = "radiance and points must have the shape (pixel, 3)"
+        cure = "give one row for each pixel of the target"
         raise InputError(Fault("white target", rule, f"{radiance.shape} and {np.shape(target.points)}", cure))
     way = target.points - target.position
     distance = np.linalg.norm(way, axis=1)
-    lit, angle = -(way @ target.normal) / distance, (way @ target.axis) / distance
+    lit = -(way @ target.normal) / distance
+    angle = (way @ target.axis) / distance
     with np.errstate(invalid="ignore", divide="ignore"):
         value = np.log(np.pi * radiance * (distance**2 / (target.reflectance * lit))[:, None])
         slope = np.log(angle)
@@ -105,7 +108,8 @@ def fit_light(target: TargetPixels, *, falloff: float | None = None) -> LightFit
 
 def _fit(value: Array, slope: Array, falloff: float | None) -> LightFit:
     """Robust fit of logarithms (n, 3) over ln cosine (n,)."""
-    kept, exponent = np.ones(len(value), bool), falloff or 0.0
+    kept = np.ones(len(value), bool)
+    exponent = falloff or 0.0
     level = np.median(value - exponent * slope[:, None], axis=0)
     for _ in range(ROUNDS):
         apart = (value - level - exponent * slope[:, None]).mean(axis=1)
@@ -120,7 +124,8 @@ def _fit(value: Array, slope: Array, falloff: float | None) -> LightFit:
         kept = chosen
     used = float(kept.mean())
     if used < MIN_USED:
-        rule, cure = "less than half of the white target may lie in shadow", "move the target, or remove the obstacle"
+        rule = "less than half of the white target may lie in shadow"
+        cure = "move the target, or remove the obstacle"
         raise InputError(Fault("white target", rule, f"{used:.0%} agree", cure))
     residual = value[kept] - level - exponent * slope[kept, None]
     count = int(kept.sum())

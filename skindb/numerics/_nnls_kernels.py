@@ -79,10 +79,12 @@ def _exchange(G: Any, entering: int, active: Any, k: int, L: Any, x: Any, z: Any
     only by the gradient of the entering column. Returns the position of the removed column, or -1.
     """
     solve(L, G[entering], active, k, z)
-    leaving, step = -1, math.inf
+    leaving = -1
+    step = math.inf
     for a in range(k):
         if z[a] > 0.0 and x[active[a]] < step * z[a]:
-            leaving, step = a, x[active[a]] / z[a]
+            leaving = a
+            step = x[active[a]] / z[a]
     if leaving < 0 or step <= 0.0:
         return -1
     for a in range(k):
@@ -115,21 +117,31 @@ def active_set(G: Any, b: Any, x: Any, tolerance: float, limit: int, memory: Any
     if scale == 0.0:
         x[:] = 0.0
         return 0.0, 0, True, 1.0
-    L, z, w = memory.factor, memory.solution, memory.gradient
-    active, passive, barred = np.empty(m, np.int64), np.zeros(m, np.bool_), np.zeros(m, np.bool_)
-    k, valid, count = 0, 0, 0  # active columns, those the factor holds, iterations
+    L = memory.factor
+    z = memory.solution
+    w = memory.gradient
+    active = np.empty(m, np.int64)
+    passive = np.zeros(m, np.bool_)
+    barred = np.zeros(m, np.bool_)
+    # active columns, those the factor holds, iterations
+    k = 0
+    valid = 0
+    count = 0
     for j in range(m):
         if x[j] > 0.0:
             active[k], passive[j] = j, True
             k += 1
-    entering, warm = -1, k > 0
+    entering = -1
+    warm = k > 0
     while count < limit:
         if not warm:
             _gradient(G, b, x, w)
-            entering, best = -1, tolerance * scale
+            entering = -1
+            best = tolerance * scale
             for j in range(m):
                 if not passive[j] and not barred[j] and G[j, j] > 0.0 and w[j] > best:
-                    entering, best = j, w[j]
+                    entering = j
+                    best = w[j]
             if entering < 0:
                 break
             active[k], passive[entering] = entering, True
@@ -145,7 +157,8 @@ def active_set(G: Any, b: Any, x: Any, tolerance: float, limit: int, memory: Any
                     out = _exchange(G, entering, active, k - 1, L, x, z)
                     if out >= 0:  # of two similar columns, the better one is kept
                         passive[active[out]] = False
-                        k, valid = _drop(active, out, k), min(valid, out)
+                        k = _drop(active, out, k)
+                        valid = min(valid, out)
                         if count < limit:
                             continue
                         break
@@ -156,7 +169,8 @@ def active_set(G: Any, b: Any, x: Any, tolerance: float, limit: int, memory: Any
                 continue
             valid = k
             solve(L, b, active, k, z)
-            step, leaving = 1.0, False
+            step = 1.0
+            leaving = False
             for a in range(k):
                 if z[a] <= 0.0:
                     leaving = True
@@ -175,7 +189,8 @@ def active_set(G: Any, b: Any, x: Any, tolerance: float, limit: int, memory: Any
                     x[j], passive[j] = 0.0, False
                     if j == entering and step == 0.0:
                         barred[j] = True  # it entered because of rounding and would leave at once
-                    k, valid = _drop(active, a, k), min(valid, a)
+                    k = _drop(active, a, k)
+                    valid = min(valid, a)
             if count >= limit:
                 break
         entering = -1
@@ -184,9 +199,11 @@ def active_set(G: Any, b: Any, x: Any, tolerance: float, limit: int, memory: Any
     for j in range(m):
         if G[j, j] > 0.0:
             worst = max(worst, abs(w[j]) if x[j] > 0.0 else w[j])
-    low, high = math.inf, 0.0
+    low = math.inf
+    high = 0.0
     for a in range(min(valid, k)):
-        low, high = min(low, L[a, a]), max(high, L[a, a])
+        low = min(low, L[a, a])
+        high = max(high, L[a, a])
     condition = (high / low) ** 2 if high > 0.0 else 1.0
     return worst / scale, count, worst <= 10.0 * max(tolerance, 1e-12) * scale and count < limit, condition
 

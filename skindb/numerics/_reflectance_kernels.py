@@ -64,10 +64,26 @@ def fit_memory(most: int, width: int, m: int) -> Any:
     """Memory for up to `most` rows."""
     v = np.empty((9, most), np.float32)
     return FitMemory(
-        v[0], v[1], v[2], v[3], v[4], v[5], v[6], v[7], v[8], v[7].view(np.int32), v[8].view(np.int32),
-        np.empty((width, width)), np.empty(width), np.empty((m, m)), np.empty(m), active_set_memory(m), np.empty(m),
-        np.empty((LANES + 1, LANES), np.float32), np.zeros(width, np.float32),
-    )  # fmt: skip
+        v[0],
+        v[1],
+        v[2],
+        v[3],
+        v[4],
+        v[5],
+        v[6],
+        v[7],
+        v[8],
+        v[7].view(np.int32),
+        v[8].view(np.int32),
+        np.empty((width, width)),
+        np.empty(width),
+        np.empty((m, m)),
+        np.empty(m),
+        active_set_memory(m),
+        np.empty(m),
+        np.empty((LANES + 1, LANES), np.float32),
+        np.zeros(width, np.float32),
+    )
 
 
 @kernel
@@ -141,7 +157,8 @@ def coefficients(lift: Any, x: Any) -> Any:
 @kernel
 def _weighted(rows: Any, n: int, lift: Any, tolerance: float, x: Any, work: Any) -> Any:
     """Minimise the linear problem of `work.slope` and `work.aim` over x >= 0 with the warm start x."""
-    r, right = lift.shape[0], work.right
+    r = lift.shape[0]
+    right = work.right
     gram(rows, n, work.slope, work.aim, work.reduced_gram, work.reduced_right, work.block)
     if r == right.shape[0]:
         for i in range(r):  # loops here and below, because copies of arrays take seconds to compile
@@ -174,7 +191,9 @@ def fit_weighted(
     space, this fit is not biased by noise (the cube root is concave). Returns the KKT residual, the iterations, whether
     it converged, and the condition.
     """
-    n, channels, least = target.shape[1], np.float32(target.shape[0]), np.float32(floor)
+    n = target.shape[1]
+    channels = np.float32(target.shape[0])
+    least = np.float32(floor)
     for i in range(n):
         work.total[i], work.slope[i] = ZERO, ONE
     for c in range(target.shape[0]):
@@ -215,11 +234,20 @@ def _fit_roots(
     rows: Any, target: Any, weight: Any, lift: Any, floor: float, tolerance: float, x: Any, work: Any
 ) -> int:
     """Minimise the distance in cube-root space by Gauss-Newton with a line search; returns the iterations."""
-    n, channels, least = target.shape[1], np.float32(target.shape[0]), np.float32(floor)
-    y, trial, mixed, roots, s, q = (
-        work.predicted[:n], work.trial[:n], work.mixed[:n], work.roots[:n], work.square[:n], work.inverse[:n],
-    )  # fmt: skip
-    bits_in, bits_out, a, t, total = work.square_bits, work.inverse_bits, work.slope[:n], work.aim[:n], work.total[:n]
+    n = target.shape[1]
+    channels = np.float32(target.shape[0])
+    least = np.float32(floor)
+    y = work.predicted[:n]
+    trial = work.trial[:n]
+    mixed = work.mixed[:n]
+    roots = work.roots[:n]
+    s = work.square[:n]
+    q = work.inverse[:n]
+    bits_in = work.square_bits
+    bits_out = work.inverse_bits
+    a = work.slope[:n]
+    t = work.aim[:n]
+    total = work.total[:n]
     started = False
     for j in range(x.shape[0]):
         started = started or x[j] > 0.0
@@ -265,7 +293,8 @@ def _fit_roots(
             y[i] = mixed[i]
         for j in range(x.shape[0]):
             x[j] += step * (work.new[j] - x[j])
-        gain, best = best - value, value
+        gain = best - value
+        best = value
         if gain < MIN_GAIN * (best + level):
             break
     return int(count)
@@ -277,9 +306,13 @@ def _squares(found: Any, want: Any, q: Any, roots: Any) -> tuple[float, float, f
 
     In cube-root space the prediction is `found` q and the target is `roots`.
     """
-    wrong, whole, wrong_root, whole_root = 0.0, 0.0, 0.0, 0.0
+    wrong = 0.0
+    whole = 0.0
+    wrong_root = 0.0
+    whole_root = 0.0
     for i in range(want.shape[0]):
-        d, e = found[i] - want[i], found[i] * q[i] - roots[i]
+        d = found[i] - want[i]
+        e = found[i] * q[i] - roots[i]
         wrong += d * d
         whole += want[i] * want[i]
         wrong_root += e * e
@@ -290,9 +323,13 @@ def _squares(found: Any, want: Any, q: Any, roots: Any) -> tuple[float, float, f
 @kernel
 def relative_errors(found: Any, want: Any, floor: float, work: Any) -> tuple[float, float]:
     """RMS error over RMS of `want`, both (channels, n), linear and in cube-root space; NaN if `want` is zero."""
-    n, least = want.shape[1], np.float32(floor)
-    s, q, given = work.square[:n], work.inverse[:n], work.mixed[:n]
-    bits_in, bits_out = work.square_bits, work.inverse_bits
+    n = want.shape[1]
+    least = np.float32(floor)
+    s = work.square[:n]
+    q = work.inverse[:n]
+    given = work.mixed[:n]
+    bits_in = work.square_bits
+    bits_out = work.inverse_bits
     sums = np.zeros(4)
     for c in range(want.shape[0]):
         to_roots(want[c], least, s, q, bits_in, bits_out)
@@ -329,7 +366,8 @@ def _to_order_one(
         lengths[p] = _power(lengths[p])
         for i in range(part.shape[0]):
             rows[i, p] = part[i, p] / lengths[p]
-    scale, heaviest = _power(np.abs(want).max()), _power(w.max())
+    scale = _power(np.abs(want).max())
+    heaviest = _power(w.max())
     for i in range(part.shape[0]):
         weight[i] = w[i] / heaviest
         for c in range(want.shape[1]):
@@ -339,28 +377,47 @@ def _to_order_one(
 
 @kernel
 def fit_many(
-    rows: Any, offsets: Any, target: Any, weight: Any, lift: Any, perceptual: bool, floor: float,
-    tolerance: float, least: int, x: Any, kkt: Any, iterations: Any, residual: Any, residual_root: Any, status: Any,
-) -> None:  # fmt: skip
+    rows: Any,
+    offsets: Any,
+    target: Any,
+    weight: Any,
+    lift: Any,
+    perceptual: bool,
+    floor: float,
+    tolerance: float,
+    least: int,
+    x: Any,
+    kkt: Any,
+    iterations: Any,
+    residual: Any,
+    residual_root: Any,
+    status: Any,
+) -> None:
     """Fit all surfels of a block; statuses are those of FitStatus."""
-    most, square = 1, lift.shape[0] == lift.shape[1]
+    most = 1
+    square = lift.shape[0] == lift.shape[1]
     for s in range(offsets.shape[0] - 1):
         most = max(most, offsets[s + 1] - offsets[s])
-    width, channels = (lift.shape[0] + LANES - 1) // LANES * LANES, target.shape[1]
-    work, y, single = fit_memory(most, width, lift.shape[1]), np.empty(most, np.float32), np.zeros(width, np.float32)
-    scaled, aim, heavy = (
-        np.zeros((most, width), np.float32),
-        np.empty((channels, most), np.float32),
-        np.empty(most, np.float32),
-    )
-    lengths, found = np.empty(lift.shape[0]), np.empty((channels, most), np.float32)
+    width = (lift.shape[0] + LANES - 1) // LANES * LANES
+    channels = target.shape[1]
+    work = fit_memory(most, width, lift.shape[1])
+    y = np.empty(most, np.float32)
+    single = np.zeros(width, np.float32)
+    scaled = np.zeros((most, width), np.float32)
+    aim = np.empty((channels, most), np.float32)
+    heavy = np.empty(most, np.float32)
+    lengths = np.empty(lift.shape[0])
+    found = np.empty((channels, most), np.float32)
     for s in range(offsets.shape[0] - 1):
-        lo, hi = offsets[s], offsets[s + 1]
+        lo = offsets[s]
+        hi = offsets[s + 1]
         n = hi - lo
         if n < least:
             status[s] = 2
             continue
-        part, want, w = rows[lo:hi], target[lo:hi], weight[lo:hi]
+        part = rows[lo:hi]
+        want = target[lo:hi]
+        w = weight[lo:hi]
         if not (np.isfinite(part).all() and np.isfinite(want).all() and np.isfinite(w).all() and w.min() >= 0.0):
             status[s] = 6
             continue

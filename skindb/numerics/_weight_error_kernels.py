@@ -15,8 +15,13 @@ from skindb.numerics._reflectance_kernels import ONE, ZERO, gram, slopes
 @fast_kernel
 def _scores(y: Any, weight: Any, perceptual: bool, floor: float, scattered: Any, drift: Any, work: Any) -> None:
     """Write to `work`, per row at the solution, the slopes, the right side due to drift, and the squared scores."""
-    n, channels, least = y.shape[0], np.float32(scattered.shape[0]), np.float32(floor)
-    total, a, t, square = work.total, work.slope, work.aim, work.trial
+    n = y.shape[0]
+    channels = np.float32(scattered.shape[0])
+    least = np.float32(floor)
+    total = work.total
+    a = work.slope
+    t = work.aim
+    square = work.trial
     for i in range(n):
         t[i], a[i] = ZERO, ONE
     if perceptual:
@@ -24,7 +29,8 @@ def _scores(y: Any, weight: Any, perceptual: bool, floor: float, scattered: Any,
     for i in range(n):
         a[i] *= weight[i]
     for c in range(scattered.shape[0]):
-        f, light = np.float32(drift[c]), scattered[c]
+        f = np.float32(drift[c])
+        light = scattered[c]
         for i in range(n):
             t[i] += f * light[i]
     for i in range(n):
@@ -55,10 +61,16 @@ def weight_covariance(
     noise of any size that the channels may share; and the shift of the weights that is caused by a fraction `drift` of
     the light `scattered` (channels, n).
     """
-    m, n = x.shape[0], y.shape[0]
-    G, b, H, L, block = work.reduced_gram, work.reduced_right, work.gram, work.active_set.factor, work.block
+    m = x.shape[0]
+    n = y.shape[0]
+    G = work.reduced_gram
+    b = work.reduced_right
+    H = work.gram
+    L = work.active_set.factor
+    block = work.block
     out[:] = np.nan
-    active, k = np.empty(m, np.int64), 0
+    active = np.empty(m, np.int64)
+    k = 0
     for j in range(m):
         if x[j] > 0.0:
             active[k] = j
@@ -67,7 +79,10 @@ def weight_covariance(
         return
     _scores(y, weight, perceptual, floor, scattered, drift, work)
     gram(rows, n, work.slope, work.aim, G, b, block)
-    length, push, inverse, z = np.ones(m), np.zeros(m), np.zeros((m, m)), np.empty(m)
+    length = np.ones(m)
+    push = np.zeros(m)
+    inverse = np.zeros((m, m))
+    z = np.empty(m)
     for j in range(m):
         length[j] = 1.0 / math.sqrt(G[j, j]) if G[j, j] > 0.0 else 0.0
     for i in range(m):

@@ -76,7 +76,8 @@ def nmf(
 
 def _from_start(X: Array, k: int, A: Array | None, seed: int | None) -> tuple[float, Array]:
     """Relative error and H (k, m) from one start."""
-    X, A = c_contiguous(X), None if A is None else c_contiguous(A)
+    X = c_contiguous(X)
+    A = None if A is None else c_contiguous(A)
     W, H = _in_coefficients(X, k, seed)
     if A is None:
         return relative_error(X, H, np.eye(X.shape[1])), H
@@ -99,12 +100,15 @@ def _in_coefficients(X: Array, k: int, seed: int | None) -> tuple[Array, Array]:
 def _in_metric(X: Array, W: Array, H: Array, A: Array) -> Array:
     """H after block descent on tr((X - W H) A (X - W H)'), exact in each column of W and then each row of H."""
     XA = X @ A
-    level, last = float((X * XA).sum()), np.inf
+    level = float((X * XA).sum())
+    last = np.inf
     for _ in range(MAX_SWEEPS):
-        gram, rhs = H @ A @ H.T, XA @ H.T
+        gram = H @ A @ H.T
+        rhs = XA @ H.T
         for j in np.flatnonzero(np.diag(gram) > 0):
             W[:, j] = np.maximum(W[:, j] + (rhs[:, j] - W @ gram[:, j]) / gram[j, j], 0.0)
-        inner, cross = W.T @ W, W.T @ X
+        inner = W.T @ W
+        cross = W.T @ X
         H = _next_rows(H, inner, cross, A)
         square = level - 2 * float((cross @ A * H).sum()) + float((inner @ H @ A * H).sum())
         if last - square < TOLERANCE * level:
@@ -183,14 +187,16 @@ def refine(
     found = groups(H)
     errors = [_mean(found).error(H, A)]
     while len(errors) <= MAX_PASSES:
-        mean, rows = _mean(found), H
+        mean = _mean(found)
+        rows = H
         for _ in range(SWEEPS_PER_PASS):
             rows = _next_rows(rows, mean.inner, mean.cross, A)
         sums = groups(rows)
         error = _mean(sums).error(rows, A)
         if not error < errors[-1]:  # rounding
             break
-        H, found = rows, sums
+        H = rows
+        found = sums
         errors.append(error)
         if errors[-2] - error < MIN_FALL_PER_PASS * error:
             break

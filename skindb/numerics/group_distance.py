@@ -45,11 +45,13 @@ def between_groups_p(values: Array, group: Labels, *, most: int, rng: np.random.
     sizes = np.bincount(group)
     total = factorial(len(group)) // prod(factorial(int(n)) for n in sizes)
     if total - 1 <= most:
-        draws, count = _arrangements(sizes.tolist()), total - 1
+        draws = _arrangements(sizes.tolist())
+        count = total - 1
         observed = next(draws)  # the first arrangement has the groups in order, like the sorted values
     else:
         observed = np.repeat(np.arange(len(sizes)), sizes)
-        draws, count = (rng.permutation(observed) for _ in range(most)), most
+        draws = (rng.permutation(observed) for _ in range(most))
+        count = most
     # sorted by group, so that the order of the subjects does not change the bits of the result
     y = values[np.argsort(group, kind="stable")]
     y = _without_rounding(y - y.mean(axis=0), values)
@@ -84,7 +86,8 @@ def within_subjects_p(values: Array, *, most: int, rng: np.random.Generator) -> 
         chosen = islice((np.array(one) for one in product(*map(range, lengths))), 1, None)
         count = total - 1
     else:
-        chosen, count = (rng.integers(lengths) for _ in range(most)), most
+        chosen = (rng.integers(lengths) for _ in range(most))
+        count = most
     statistic = _within(values[None])[0]
     rows = np.arange(len(values))[:, None]
     reached = np.zeros(len(statistic))
@@ -115,7 +118,8 @@ def classical_scaling(distance: Array, axes: int = 2) -> tuple[Array, Array, flo
     centre = np.eye(n) - 1 / n
     gram = -0.5 * centre @ distance**2 @ centre
     variance, vectors = np.linalg.eigh((gram + gram.T) / 2)
-    variance, vectors = np.maximum(variance[::-1], 0.0), vectors[:, ::-1]
+    variance = np.maximum(variance[::-1], 0.0)
+    vectors = vectors[:, ::-1]
     total = variance.sum() or 1.0
     kept = variance[:axes]
     place = vectors[:, :axes] * np.sqrt(np.where(kept > ROUNDING * total, kept, 0.0))
@@ -130,7 +134,8 @@ def classical_scaling(distance: Array, axes: int = 2) -> tuple[Array, Array, flo
 def _between(values: Array, group: Labels, sizes: Labels) -> Array:
     """Statistics (b, pairs) of centred values (n, k) for labels (b, n)."""
     square = (values**2).sum(axis=1)
-    means, errors = [], []
+    means = []
+    errors = []
     for g, size in enumerate(sizes.tolist()):
         member = (group == g).astype(np.float64)
         mean = member @ values / size
@@ -147,7 +152,8 @@ def _within(values: Array) -> Array:
     for a, b in combinations(range(values.shape[2]), 2):
         difference = values[:, :, a] - values[:, :, b]
         difference = difference[:, np.isfinite(difference[0]).all(axis=1)]  # the same subjects in all permutations
-        n, mean = difference.shape[1], difference.mean(axis=1)
+        n = difference.shape[1]
+        mean = difference.mean(axis=1)
         scatter = ((difference - mean[:, None]) ** 2).sum(axis=(1, 2)) / (n - 1)
         largest = (difference**2).sum(axis=2).max(axis=1)
         found.append(_ratio(mean, np.where(scatter > ROUNDING * largest, scatter, 0.0) / n))

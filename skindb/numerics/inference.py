@@ -78,7 +78,8 @@ def effects(values: Array, regressor: Array, covariates: Array | None = None, *,
     """
     found = np.full((5, values.shape[1]), np.nan)
     for part in _parts(values, regressor, covariates):
-        own, y = part.own, _residual(part.values, part.basis)
+        own = part.own
+        y = _residual(part.values, part.basis)
         square = float(own @ own)
         slope = own @ y / square
         residual = y - own[:, None] * slope
@@ -149,7 +150,8 @@ def permutation_p(
         orders = (np.array(order) for order in islice(permutations(range(n)), 1, None))
         count = factorial(n) - 1
     else:
-        orders, count = (rng.permutation(n) for _ in range(most)), most
+        orders = (rng.permutation(n) for _ in range(most))
+        count = most
 
     def drawn(part: _Part, order: Array) -> tuple[NDArray[np.intp], Array]:
         """Permuted residuals; subjects who lack a quantity are excluded, and all orders remain equally likely."""
@@ -174,7 +176,8 @@ def sign_flip_p(differences: Array, *, most: int = 10_000, rng: np.random.Genera
         signs = (np.array(one) for one in islice(product((1.0, -1.0), repeat=n), 1, None))
         count = 2**n - 1
     else:
-        signs, count = (rng.choice((1.0, -1.0), n) for _ in range(most)), most
+        signs = (rng.choice((1.0, -1.0), n) for _ in range(most))
+        count = most
 
     def drawn(part: _Part, sign: Array) -> tuple[NDArray[np.intp], Array]:
         own = sign[:, part.rows]
@@ -209,7 +212,8 @@ def variance_components(values: Array, subject: NDArray[Any]) -> tuple[float, fl
         (n,) subject of each value; at least two subjects, one of them with two values.
     """
     _, which, count = np.unique(subject, return_inverse=True, return_counts=True)
-    n, people = len(values), len(count)
+    n = len(values)
+    people = len(count)
     if people < 2 or n == people:
         raise ValueError("variance components must come from two subjects or more, one of them with two values")
     if np.ptp(values) <= ROUNDING * np.abs(values).max():
@@ -285,7 +289,8 @@ def _redrawn(part: _Part, places: NDArray[np.intp], signs: Array) -> Array:
     moved = factors[back] * np.take_along_axis(signs, back, axis=1)[..., None]
     b, n, c = moved.shape
     sums = (np.moveaxis(moved, 2, 1).reshape(b * c, n) @ part.values).reshape(b, c, -1)
-    along, weighted = sums[:, : c // 2], sums[:, c // 2 :]
+    along = sums[:, : c // 2]
+    weighted = sums[:, c // 2 :]
     along[:, -1] /= square
     whole = weight[back] @ part.values**2
     cross = np.einsum("bcq,bcq->bq", along, weighted)
@@ -315,7 +320,8 @@ def _require_several(own: Array, basis: Array) -> None:
 
 def _parts(values: Array, regressor: Array, covariates: Array | None) -> list[_Part]:
     """Quantities grouped by the subjects who have them, if their effect can be estimated."""
-    parts, why = [], ValueError("no subject has any of the quantities")
+    parts = []
+    why = ValueError("no subject has any of the quantities")
     x = np.asarray(regressor, np.float64)
     for rows, columns in missing_patterns(values):
         try:
@@ -357,7 +363,8 @@ def _compared(
     for part in parts:
         observed[part.columns] = np.abs(_statistics(_residual(part.values, part.basis)[None], part.own, part.basis)[0])
     reached = observed * (1 - 1e-9)  # tolerance for the same value summed in another order
-    alone, largest = np.zeros(shape[1]), np.zeros(shape[1])
+    alone = np.zeros(shape[1])
+    largest = np.zeros(shape[1])
     entries = shape[1] * (shape[0] if shape[1] < MANY else SUMS)
     while batch := list(islice(draws, max(1, BATCH // max(entries, 1)))):
         most = np.zeros(len(batch))

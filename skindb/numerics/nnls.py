@@ -46,9 +46,12 @@ def solve_nnls(
         (n, m) and (n,) each; x is NaN and converged False where the input is not finite.
     """
     # C order: a broadcast array would be copied in the order of its strides, for which the kernel is compiled again
-    G, b = np.array(gram, np.float64, order="C"), np.array(rhs, np.float64, order="C")
+    G = np.array(gram, np.float64, order="C")
+    b = np.array(rhs, np.float64, order="C")
     x = np.zeros_like(b) if warm is None else np.maximum(np.array(warm, np.float64, order="C"), 0.0)
-    kkt, count, met = np.full(len(b), np.nan), np.zeros(len(b), np.int32), np.zeros(len(b), np.bool_)
+    kkt = np.full(len(b), np.nan)
+    count = np.zeros(len(b), np.int32)
+    met = np.zeros(len(b), np.bool_)
     finite = np.isfinite(G).all(axis=(1, 2)) & np.isfinite(b + x).all(axis=1)
     _nnls_kernels.solve_many(G, b, x, finite, tolerance, kkt, count, met)
     x[~finite] = np.nan
@@ -96,14 +99,28 @@ def fit_reflectance(
         raise ValueError(f"mode must be 'linear' or 'perceptual', not {mode!r}")
     if not noise_floor > 0:
         raise ValueError(f"noise_floor must be positive, not {noise_floor}")
-    n, m = len(offsets) - 1, lift.shape[1]
-    x, iterations, status = np.zeros((n, m)), np.zeros(n, np.int32), np.zeros(n, np.uint8)
+    n = len(offsets) - 1
+    m = lift.shape[1]
+    x = np.zeros((n, m))
+    iterations = np.zeros(n, np.int32)
+    status = np.zeros(n, np.uint8)
     kkt, residual, residual_root = (np.full(n, np.nan) for _ in range(3))
     _reflectance_kernels.fit_many(
-        np.ascontiguousarray(rows), np.asarray(offsets, np.int64), np.ascontiguousarray(target, np.float64),
+        np.ascontiguousarray(rows),
+        np.asarray(offsets, np.int64),
+        np.ascontiguousarray(target, np.float64),
         np.ones(len(rows)) if weight is None else np.ascontiguousarray(weight, np.float64),
-        np.ascontiguousarray(lift, np.float64), mode == "perceptual", float(noise_floor), tolerance,
-        max(min_samples, 1), x, kkt, iterations, residual, residual_root, status,
-    )  # fmt: skip
+        np.ascontiguousarray(lift, np.float64),
+        mode == "perceptual",
+        float(noise_floor),
+        tolerance,
+        max(min_samples, 1),
+        x,
+        kkt,
+        iterations,
+        residual,
+        residual_root,
+        status,
+    )
     x[(status == 2) | (status == 6)] = np.nan
     return ReflectanceFit(x, kkt, iterations, residual, residual_root, status)

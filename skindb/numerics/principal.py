@@ -39,17 +39,20 @@ def principal_axes(vectors: NDArray[np.floating], most: int) -> Components:
     """
     n, d = vectors.shape
     blocks = [slice(start, start + BLOCK) for start in range(0, d, BLOCK)]
-    mean, inner = np.empty(d), np.zeros((n, n))
+    mean = np.empty(d)
+    inner = np.zeros((n, n))
     for block in blocks:
         x = vectors[:, block].astype(np.float64)
         mean[block] = x.mean(axis=0)
         x -= mean[block]
         inner += x @ x.T
     values, places = np.linalg.eigh(inner)
-    values, places = values[::-1][: min(most, n - 1)], places[:, ::-1][:, : min(most, n - 1)]
+    values = values[::-1][: min(most, n - 1)]
+    places = places[:, ::-1][:, : min(most, n - 1)]
     there = int((values > max(float(values[0]), 0.0) * 1e-12).sum())
     length = np.sqrt(values[:there])
-    axes, residual = np.empty((there, d)), np.zeros(n)
+    axes = np.empty((there, d))
+    residual = np.zeros(n)
     for block in blocks:
         x = vectors[:, block] - mean[block]
         axes[:, block] = (places[:, :there] / length).T @ x
@@ -57,5 +60,6 @@ def principal_axes(vectors: NDArray[np.floating], most: int) -> Components:
     largest = np.abs(axes).argmax(axis=1)
     sign = np.where(axes[np.arange(there), largest] < 0, -1.0, 1.0)
     score = places[:, :there] * (length * sign)
-    variance, total = values[:there] / (n - 1), float(np.trace(inner)) / (n - 1)
+    variance = values[:there] / (n - 1)
+    total = float(np.trace(inner)) / (n - 1)
     return Components(mean, axes * sign[:, None], score, variance, total, np.sqrt(residual / d))

@@ -33,7 +33,8 @@ class Pyramid:
 
     def with_parts(self, parts: list[Image]) -> Pyramid:
         """A pyramid of this layout with other images, in the order of `parts`."""
-        bands, at = [], 1
+        bands = []
+        at = 1
         for level in self.bands:
             bands.append(np.stack(parts[at : at + len(level)]))
             at += len(level)
@@ -73,9 +74,11 @@ def build(image: Image, levels: int = 7, orientations: int = 4) -> Pyramid:
             f"an image {image.shape} must have 0 to {most} levels of 1 or more bands, not {levels} of {orientations}"
         )
     spectrum = _transform(image)
-    whole, kind = image.shape, image.dtype.type
+    whole = image.shape
+    kind = image.dtype.type
     low, high = _low(whole, whole, 0, kind)
-    residual, bands = _image(spectrum * high, whole), []
+    residual = _image(spectrum * high, whole)
+    bands = []
     spectrum *= low
     for level, (size, smaller) in enumerate(_sizes(whole, levels)):
         low, high = _low(size, whole, level + 1, kind)
@@ -88,7 +91,8 @@ def build(image: Image, levels: int = 7, orientations: int = 4) -> Pyramid:
 
 def reconstruct(pyramid: Pyramid) -> Image:
     """Rebuild the image of a pyramid as the sum of its parts, filtered with the masks of the decomposition."""
-    whole, kind = pyramid.high.shape, pyramid.high.dtype.type
+    whole = pyramid.high.shape
+    kind = pyramid.high.dtype.type
     spectrum = _transform(pyramid.low)
     for level in reversed(range(len(pyramid.bands))):
         own = pyramid.bands[level]
@@ -129,7 +133,8 @@ def _low(size: tuple[int, ...], whole: tuple[int, ...], level: int, kind: Any) -
     square = rows * rows + columns * columns
     square *= 4.0 ** (level + 1)
     between = np.flatnonzero((square > 0.25) & (square < 1))
-    low, high = (square <= 0.25).astype(kind), (square >= 1).astype(kind)
+    low = (square <= 0.25).astype(kind)
+    high = (square >= 1).astype(kind)
     octave = pi / 4 * np.log2(square.ravel()[between]) + pi / 2
     low.ravel()[between], high.ravel()[between] = np.cos(octave), np.sin(octave)
     return low, high
@@ -158,14 +163,16 @@ def _phase(orientations: int, kind: Any) -> Any:
 
 def _cropped(spectrum: Spectrum, size: tuple[int, ...]) -> Spectrum:
     """Crop a spectrum to the frequencies of a smaller image; the mask has set the others to 0."""
-    rows, columns = (size[0] + 1) // 2, size[1] // 2 + 1
+    rows = (size[0] + 1) // 2
+    columns = size[1] // 2 + 1
     return np.concatenate([spectrum[:rows, :columns], spectrum[len(spectrum) - size[0] // 2 :, :columns]])
 
 
 def _widened(spectrum: Spectrum, size: tuple[int, ...]) -> Spectrum:
     """Pad a spectrum with zeros to that of a larger image."""
     out = np.zeros((size[0], size[1] // 2 + 1), spectrum.dtype)
-    rows, columns = (len(spectrum) + 1) // 2, spectrum.shape[1]
+    rows = (len(spectrum) + 1) // 2
+    columns = spectrum.shape[1]
     out[:rows, :columns] = spectrum[:rows]
     out[len(out) - len(spectrum) // 2 :, :columns] = spectrum[rows:]
     return out

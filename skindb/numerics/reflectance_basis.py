@@ -37,8 +37,10 @@ class Systems:
     @classmethod
     def of(cls, rows: Array, offsets: NDArray[np.int64], target: Array) -> Systems:
         """Normal equations of rows (total, m) and samples (total, channels); `offsets` (n + 1,) start each surfel."""
-        n, m = len(offsets) - 1, rows.shape[1]
-        gram, rhs = np.zeros((n, m, m)), np.zeros((n, m))
+        n = len(offsets) - 1
+        m = rows.shape[1]
+        gram = np.zeros((n, m, m))
+        rhs = np.zeros((n, m))
         for s, (start, stop) in enumerate(pairwise(offsets)):
             own = rows[start:stop].astype(np.float64)
             gram[s] = target.shape[1] * (own.T @ own)

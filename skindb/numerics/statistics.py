@@ -60,7 +60,8 @@ class Moments:
     def deviation_interval(self, *, level: float = 0.95) -> tuple[Array, Array]:
         """Chi-square interval of the standard deviation of normal values; NaN for fewer than two values."""
         free = np.maximum(self.count - 1.0, 1.0)
-        low, high = stats.chi2.ppf((1 + level) / 2, free), stats.chi2.ppf((1 - level) / 2, free)
+        low = stats.chi2.ppf((1 + level) / 2, free)
+        high = stats.chi2.ppf((1 - level) / 2, free)
         second = np.where(self.count > 1, self.second, np.nan)
         return np.sqrt(second / low), np.sqrt(second / high)
 

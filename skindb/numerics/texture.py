@@ -17,7 +17,8 @@ from scipy.optimize import isotonic_regression
 
 from skindb.numerics.pyramid import Image, build, reconstruct
 
-LEVELS, ORIENTATIONS = 7, 4
+LEVELS = 7
+ORIENTATIONS = 4
 QUANTILES = 256  # entries of a quantile function
 MAX_SORTED = 1 << 17  # values; a quantile of this many is accurate to 0.14 % of all ranks, a third of a level
 NOISE = 0.05  # standard deviation of the noise added before matching, relative to that of the requested change
@@ -165,7 +166,8 @@ def synthesise(
         moved = np.zeros_like(part)
         for region, own in enumerate(blend):
             if np.isfinite(targets[region, at]).all():
-                step, inside = targets[region, at] - now[region], own[at] > 0
+                step = targets[region, at] - now[region]
+                inside = own[at] > 0
                 moved[inside] += own[at][inside] * np.interp(part[inside], _strictly_increasing(now[region]), step)
         return part + moved / total[at]
 

@@ -27,7 +27,9 @@ from skindb.optics.fresnel import fresnel_reflectance
 
 Array = NDArray[np.float64]
 PER_PANEL = 8  # Gauss points between two branch points, for an error of 2e-4 of R
-PANELS_FIRST, PANELS_LAST = 8, 2  # number of geometric panels after the first branch point and after the last
+# number of geometric panels after the first branch point and after the last
+PANELS_FIRST = 8
+PANELS_LAST = 2
 
 
 @dataclass(frozen=True)
@@ -47,14 +49,16 @@ class Moments:
 def moments(degree: int, *, eta: float, anisotropy: float) -> Moments:
     """Matrices for odd `degree`, index of refraction `eta` and Henyey-Greenstein scattering."""
     degrees, m = np.array([(i, j) for i in range(degree + 1) for j in range(i + 1)]).T
-    same, even = m[:, None] == m, (degrees + m) % 2 == 0
+    same = m[:, None] == m
+    even = (degrees + m) % 2 == 0
     x, w = np.polynomial.legendre.leggauss(degree + 2)
     y = _harmonics(degrees, m, x)
     near = np.where((m[:, None] == 0) | (m == 0), np.sqrt(0.5), 0.5) * (np.abs(m[:, None] - m) == 1)
     inside, weight = _half_range(eta)
     back = np.asarray(fresnel_reflectance(inside, 1 / eta), np.float64)
     h = _harmonics(degrees, m, inside)
-    kept, passed = (h.T * (weight * (1 + back))) @ h * same, (h.T * (weight * (1 - back))) @ h * same
+    kept = (h.T * (weight * (1 + back))) @ h * same
+    passed = (h.T * (weight * (1 - back))) @ h * same
     flux = np.sqrt(2 * np.pi) * h.T @ (weight * inside * (1 - back))
     return Moments(
         order=degrees.astype(np.float64),
@@ -77,7 +81,8 @@ def _harmonics(n: NDArray[np.int64], m: NDArray[np.int64], x: Array) -> Array:
 def _half_range(eta: float) -> tuple[Array, Array]:
     """Gauss points on (0, 1), split at the critical cosine, above which the transmittance rises like a square root."""
     t, w = np.polynomial.legendre.leggauss(64)
-    t, w = (t + 1) / 2, w / 2
+    t = (t + 1) / 2
+    w = w / 2
     critical = np.sqrt(max(1 - 1 / eta**2, 0.0))
     rest = 1 - critical
     return np.concatenate([critical * t, critical + rest * t * t]), np.concatenate([critical * w, 2 * rest * t * w])
@@ -85,7 +90,9 @@ def _half_range(eta: float) -> tuple[Array, Array]:
 
 def leaving_transform(kappa: Array, sigma_a: float, basis: Moments) -> tuple[NDArray[np.complex128], Array]:
     """F(i kappa + 0) (k,) per photon that enters, and the squares (k, odd) of the decay constants in depth."""
-    n, even, g = basis.order, basis.even, basis.anisotropy
+    n = basis.order
+    even = basis.even
+    g = basis.anisotropy
     forward = g ** (n.max() + 1)  # the forward peak beyond these moments counts as unscattered (delta-M)
     scattering = 1 / (1 - g)
     extinction = scattering * (1 - forward) + sigma_a
@@ -112,7 +119,8 @@ def half_space_profile(r: Array, sigma_a: float, basis: Moments) -> tuple[Array,
     edge = np.concatenate([branch[:1], first, branch[1:], branch[-1] * 2.0 ** np.arange(1, PANELS_LAST + 1)])
     edge = edge[np.concatenate([[True], np.diff(edge) > 1e-6 * edge[1:]])]
     t, w = np.polynomial.legendre.leggauss(PER_PANEL)
-    t, w = (t + 1) / 2, w / 2
+    t = (t + 1) / 2
+    w = w / 2
     width = np.diff(edge)[:, None]
     # the substitution by sin^2 removes the square roots at both ends of a panel
     kappa = (edge[:-1, None] + width * np.sin(np.pi * t / 2) ** 2).ravel()

@@ -21,11 +21,15 @@ SHADE_QUANTILE = 0.25  # over cameras; below the highlights, above the darkest o
 # number of lights that count as independent; with all 150, the prior of the scan would be ineffective. It lowers the
 # 95 % quantile of errors from 7.4 to 4.3 degrees
 INDEPENDENT_LIGHTS = 8
-TUKEY, MAX_ITERATIONS = 4.685, 12  # 95 % efficiency for normal noise; converges in 6 to 10 iterations
+# 95 % efficiency for normal noise; converges in 6 to 10 iterations
+TUKEY = 4.685
+MAX_ITERATIONS = 12
 # squared change of the normal that ends the iteration: 0.002 degrees, a hundredth of the smallest error
 MIN_SQUARED_CHANGE = 1e-9
 BRIGHTEST = 5  # lights that determine a camera's direction of maximum reflectance; the last one is the base level
-ZERO, ONE, HALF = np.float32(0), np.float32(1), np.float32(0.5)
+ZERO = np.float32(0)
+ONE = np.float32(1)
+HALF = np.float32(0.5)
 
 
 class Buffers(NamedTuple):
@@ -60,14 +64,33 @@ class Buffers(NamedTuple):
 def buffers(lights: int, cameras: int) -> Any:
     """Memory for `estimate_one`."""
     single = np.zeros((10 + 3 * cameras, lights), np.float32)
-    dark, size = single[10 + 2 * cameras :], single[9]
+    dark = single[10 + 2 * cameras :]
+    size = single[9]
     return Buffers(
-        np.empty(lights * cameras * 3, np.float32), single[0:3], np.zeros((3, cameras)), np.zeros(cameras, np.float32),
-        np.zeros(cameras, np.int64), single[10 : 10 + cameras], single[10 + cameras : 10 + 2 * cameras], dark,
-        np.zeros(lights, np.int64), single[3:5], single[5], single[6], single[7], single[8], size,
-        size.view(np.int32), dark.view(np.int32), np.zeros((2, lights)), np.empty((cameras, 3)), np.empty(cameras),
-        np.empty(cameras), np.empty(cameras), np.empty(cameras),
-    )  # fmt: skip
+        np.empty(lights * cameras * 3, np.float32),
+        single[0:3],
+        np.zeros((3, cameras)),
+        np.zeros(cameras, np.float32),
+        np.zeros(cameras, np.int64),
+        single[10 : 10 + cameras],
+        single[10 + cameras : 10 + 2 * cameras],
+        dark,
+        np.zeros(lights, np.int64),
+        single[3:5],
+        single[5],
+        single[6],
+        single[7],
+        single[8],
+        size,
+        size.view(np.int32),
+        dark.view(np.int32),
+        np.zeros((2, lights)),
+        np.empty((cameras, 3)),
+        np.empty(cameras),
+        np.empty(cameras),
+        np.empty(cameras),
+        np.empty(cameras),
+    )
 
 
 @inline_kernel
@@ -80,8 +103,10 @@ def _finite(value: float) -> bool:
 def _transmittance(cosine: Any, square: Any) -> Any:
     """F_t of a cosine; `square` is eta^2 - 1, which must not be negative."""
     g = math.sqrt(square + cosine * cosine)
-    less, more = g - cosine, g + cosine
-    p, q = cosine * less + ONE, cosine * more - ONE
+    less = g - cosine
+    more = g + cosine
+    p = cosine * less + ONE
+    q = cosine * more - ONE
     # a single division, as divisions dominate the time
     return ONE - HALF * less * less * (p * p + q * q) / (more * more * p * p)
 
@@ -99,12 +124,16 @@ def _unit(v: Any) -> bool:
 def _point(position: Any, light: Any, camera: Any, scan: Any, square: Any, b: Any) -> int:
     """Set directions from a surfel, and F_t towards cameras above MIN_COSINE_CAMERA; returns their number."""
     for i in range(light.shape[0]):
-        x, y, z = light[i, 0] - position[0], light[i, 1] - position[1], light[i, 2] - position[2]
+        x = light[i, 0] - position[0]
+        y = light[i, 1] - position[1]
+        z = light[i, 2] - position[2]
         scale = 1.0 / math.sqrt(x * x + y * y + z * z)
         b.light[0, i], b.light[1, i], b.light[2, i] = x * scale, y * scale, z * scale
     count = 0
     for o in range(camera.shape[0]):
-        x, y, z = camera[o, 0] - position[0], camera[o, 1] - position[1], camera[o, 2] - position[2]
+        x = camera[o, 0] - position[0]
+        y = camera[o, 1] - position[1]
+        z = camera[o, 2] - position[2]
         scale = 1.0 / math.sqrt(x * x + y * y + z * z)
         b.camera[0, o], b.camera[1, o], b.camera[2, o] = x * scale, y * scale, z * scale
         cosine = np.float32((scan[0] * x + scan[1] * y + scan[2] * z) * scale)
@@ -120,17 +149,27 @@ def _point(position: Any, light: Any, camera: Any, scan: Any, square: Any, b: An
 def _shades(used: int, cameras: int, b: Any) -> None:
     """For each light, low quantile over cameras of the mean channel, and median of the part along the skin's colour."""
     lights = b.known.shape[0]
-    red, green, blue, count = 0.0, 0.0, 0.0, 0.0
+    red = 0.0
+    green = 0.0
+    blue = 0.0
+    count = 0.0
     for i in range(lights):
         b.count[i] = 0
         for q in range(used):
             at = 3 * (i * cameras + b.used[q])
-            r, g, v = b.values[at], b.values[at + 1], b.values[at + 2]
+            r = b.values[at]
+            g = b.values[at + 1]
+            v = b.values[at + 2]
             if _finite(r + g + v):
-                red, green, blue, count = red + r, green + g, blue + v, count + 1.0
+                red = red + r
+                green = green + g
+                blue = blue + v
+                count = count + 1.0
                 b.count[i] += 1
     grey = (red + green + blue) / 3.0
-    red, green, blue = red - grey, green - grey, blue - grey
+    red = red - grey
+    green = green - grey
+    blue = blue - grey
     size = math.sqrt(red * red + green * green + blue * blue)
     scale = 1.0 / size if size > 0.0 else 0.0
     along = np.float32(red * scale), np.float32(green * scale), np.float32(blue * scale)
@@ -140,7 +179,9 @@ def _shades(used: int, cameras: int, b: Any) -> None:
         third = inverse / np.float32(3)
         for i in range(lights):
             at = 3 * (i * cameras + o)
-            r, g, v = b.values[at], b.values[at + 1], b.values[at + 2]
+            r = b.values[at]
+            g = b.values[at + 1]
+            v = b.values[at + 2]
             known = _finite(r + g + v)
             b.white[q, i] = (r + g + v) * third if known else np.float32(np.inf)
             b.tinted[q, i] = (r * along[0] + g * along[1] + v * along[2]) * inverse if known else np.float32(np.inf)
@@ -159,17 +200,31 @@ def _shades(used: int, cameras: int, b: Any) -> None:
 @fast_kernel
 def _normal_equations(n: Any, shade: Any, square: Any, b: Any, data: Any, right: Any) -> int:
     """F_t of the lights at the normal n and weighted sums of their directions; returns the number of lights used."""
-    nx, ny, nz = np.float32(n[0]), np.float32(n[1]), np.float32(n[2])
-    x, y, z, weight = b.light[0], b.light[1], b.light[2], b.weight
-    xx, xy, xz, yy, yz, zz = ZERO, ZERO, ZERO, ZERO, ZERO, ZERO
-    rx, ry, rz, count = ZERO, ZERO, ZERO, ZERO
+    nx = np.float32(n[0])
+    ny = np.float32(n[1])
+    nz = np.float32(n[2])
+    x = b.light[0]
+    y = b.light[1]
+    z = b.light[2]
+    weight = b.weight
+    xx = ZERO
+    xy = ZERO
+    xz = ZERO
+    yy = ZERO
+    yz = ZERO
+    zz = ZERO
+    rx = ZERO
+    ry = ZERO
+    rz = ZERO
+    count = ZERO
     for i in range(x.shape[0]):
         cosine = nx * x[i] + ny * y[i] + nz * z[i]
         above = b.known[i] if cosine > MIN_COSINE_LIGHT else ZERO
         passed = above * _transmittance(min(max(cosine, MIN_COSINE_LIGHT), ONE), square)
         b.passed[i] = passed
         a = weight[i] * passed
-        s, a = a * shade[i], a * passed
+        s = a * shade[i]
+        a = a * passed
         xx += a * x[i] * x[i]
         xy += a * x[i] * y[i]
         xz += a * x[i] * z[i]
@@ -189,8 +244,12 @@ def _normal_equations(n: Any, shade: Any, square: Any, b: Any, data: Any, right:
 
 @fast_kernel
 def _residuals(g: Any, shade: Any, b: Any) -> None:
-    gx, gy, gz = np.float32(g[0]), np.float32(g[1]), np.float32(g[2])
-    x, y, z = b.light[0], b.light[1], b.light[2]
+    gx = np.float32(g[0])
+    gy = np.float32(g[1])
+    gz = np.float32(g[2])
+    x = b.light[0]
+    y = b.light[1]
+    z = b.light[2]
     for i in range(x.shape[0]):
         passed = b.passed[i]
         residual = shade[i] - passed * (gx * x[i] + gy * y[i] + gz * z[i])
@@ -210,9 +269,11 @@ def _tukey(spread: float, b: Any) -> None:
 def _inverse(a: Any, out: Any) -> None:
     """Inverse of a 3 x 3 matrix by cofactors; with a ridge of 1e-6 of its trace, 9 digits are accurate."""
     for j in range(3):
-        p, q = (j + 1) % 3, (j + 2) % 3
+        p = (j + 1) % 3
+        q = (j + 2) % 3
         for k in range(3):
-            u, v = (k + 1) % 3, (k + 2) % 3
+            u = (k + 1) % 3
+            v = (k + 2) % 3
             out[k, j] = a[p, u] * a[q, v] - a[p, v] * a[q, u]
     f = 1.0 / (a[0, 0] * out[0, 0] + a[0, 1] * out[1, 0] + a[0, 2] * out[2, 0])
     for j in range(3):
@@ -234,19 +295,33 @@ def _sandwich(left: Any, meat: Any, right: Any, out: Any) -> None:
 
 @fast_kernel
 def _photometric(
-    shade: Any, scan: Any, square: Any, prior: float, b: Any, normal: Any, covariance: Any, pull: Any, score: Any,
+    shade: Any,
+    scan: Any,
+    square: Any,
+    prior: float,
+    b: Any,
+    normal: Any,
+    covariance: Any,
+    pull: Any,
+    score: Any,
     half: Any,
-) -> float:  # fmt: skip
+) -> float:
     """Robust photometric stereo: shade = F_t(n.l) g.l for one g; writes g/|g| and its covariance, returns residual/|g|.
 
     Tukey weights exclude shadows and remaining highlights. The scan's normal is a prior on the direction of g, which
     matters where few lights or mixed pixels do not determine the direction.
     """
-    data, matrix, inverse, right, g = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3)
+    data = np.empty((3, 3))
+    matrix = np.empty((3, 3))
+    inverse = np.empty((3, 3))
+    right = np.empty(3)
+    g = np.empty(3)
     b.weight[:] = ONE
     for k in range(3):
         normal[k] = scan[k]
-    spread, size, share = 0.0, 1.0, 0.0
+    spread = 0.0
+    size = 1.0
+    share = 0.0
     for step in range(MAX_ITERATIONS):
         count = _normal_equations(normal, shade, square, b, data, right)
         if step > 0:
@@ -280,15 +355,30 @@ def _photometric(
 
 @fast_kernel
 def _covariance(
-    square: Any, spread: float, share: float, size: float, normal: Any, data: Any, matrix: Any, out: Any, pull: Any,
-    score: Any, half: Any, b: Any,
-) -> None:  # fmt: skip
+    square: Any,
+    spread: float,
+    share: float,
+    size: float,
+    normal: Any,
+    data: Any,
+    matrix: Any,
+    out: Any,
+    pull: Any,
+    score: Any,
+    half: Any,
+    b: Any,
+) -> None:
     """Covariance of the normal from the residuals (Huber's sandwich), and its derivative by the scan's normal.
 
     It also writes the scores of the lights, and the matrix `half` from a sum of score times direction to a rotation.
     """
-    slope, total, count = 0.0, 0.0, 0
-    meat, bent, inverse, way = np.zeros((3, 3)), np.zeros((3, 3)), np.empty((3, 3)), np.empty(3)
+    slope = 0.0
+    total = 0.0
+    count = 0
+    meat = np.zeros((3, 3))
+    bent = np.zeros((3, 3))
+    inverse = np.empty((3, 3))
+    way = np.empty(3)
     for i in range(score.shape[0]):
         score[i] = 0.0
         passed = np.float64(b.passed[i])
@@ -348,13 +438,16 @@ def _brightest(dark: Any, best: Any, place: Any) -> None:
 @fast_kernel
 def _peak(used: int, b: Any) -> None:
     """Half vectors of the brightest lights of each camera and their weights; see `PhotometricNormals.peak`."""
-    best, place, maximum = np.empty(BRIGHTEST), np.empty(BRIGHTEST, np.int64), np.empty(3)
+    best = np.empty(BRIGHTEST)
+    place = np.empty(BRIGHTEST, np.int64)
+    maximum = np.empty(3)
     for q in range(used):
         b.half[q], b.contrast[q] = 0.0, 0.0
         _brightest(b.dark[q], best, place)
         if best[BRIGHTEST - 1] < 0.0:
             continue
-        lights, count = b.dark.shape[1], 0
+        lights = b.dark.shape[1]
+        count = 0
         for i in range(lights):
             count += int(b.dark[q, i] < np.inf)
         maximum[:] = 0.0
@@ -375,7 +468,8 @@ def _peak(used: int, b: Any) -> None:
 def _middle(values: Any, count: int) -> float:
     """Median of the first `count` values, which are sorted in place; 0 if there are none."""
     for i in range(1, count):  # insertion sort, as there are few values
-        value, j = values[i], i
+        value = values[i]
+        j = i
         while j > 0 and values[j - 1] > value:
             values[j] = values[j - 1]
             j -= 1
@@ -409,9 +503,21 @@ def _robust_mean(used: int, mean: Any, b: Any) -> None:
 
 @fast_kernel
 def estimate_one(
-    sample: Any, position: Any, light: Any, camera: Any, scan: Any, eta: float, prior: float, b: Any,
-    peak: Any, normal: Any, spread: Any, covariance: Any, cross: Any, pull: Any,
-) -> None:  # fmt: skip
+    sample: Any,
+    position: Any,
+    light: Any,
+    camera: Any,
+    scan: Any,
+    eta: float,
+    prior: float,
+    b: Any,
+    peak: Any,
+    normal: Any,
+    spread: Any,
+    covariance: Any,
+    cross: Any,
+    pull: Any,
+) -> None:
     """Peak normal (3,) of a surfel; normals (2, 3), spreads (2,), covariances and pulls (2, 3, 3) of both signals.
 
     `cross` (3, 3) is the covariance of the first normal with the second.
@@ -421,7 +527,8 @@ def estimate_one(
     scale_to_one(b.values)  # normals do not depend on brightness, and squares must neither underflow nor overflow
     used = _point(position, light, camera, scan, square, b)
     _shades(used, camera.shape[0], b)
-    turn, meat = np.empty((2, 3, 3)), np.zeros((3, 3))
+    turn = np.empty((2, 3, 3))
+    meat = np.zeros((3, 3))
     for q in range(2):
         spread[q] = _photometric(
             b.shade[q], scan, square, prior, b, normal[q], covariance[q], pull[q], b.score[q], turn[q]
@@ -439,13 +546,36 @@ def estimate_one(
 
 @kernel
 def estimate(
-    sample: Any, position: Any, light: Any, camera: Any, scan: Any, eta: float, prior: float,
-    peak: Any, normal: Any, spread: Any, covariance: Any, cross: Any, pull: Any,
-) -> None:  # fmt: skip
+    sample: Any,
+    position: Any,
+    light: Any,
+    camera: Any,
+    scan: Any,
+    eta: float,
+    prior: float,
+    peak: Any,
+    normal: Any,
+    spread: Any,
+    covariance: Any,
+    cross: Any,
+    pull: Any,
+) -> None:
     """Apply `estimate_one` to every surfel."""
     b = buffers(light.shape[0], camera.shape[0])
     for s in range(position.shape[0]):
         estimate_one(
-            sample[s], position[s], light, camera, scan[s], eta, prior, b, peak[s], normal[s], spread[s],
-            covariance[s], cross[s], pull[s],
-        )  # fmt: skip
+            sample[s],
+            position[s],
+            light,
+            camera,
+            scan[s],
+            eta,
+            prior,
+            b,
+            peak[s],
+            normal[s],
+            spread[s],
+            covariance[s],
+            cross[s],
+            pull[s],
+        )

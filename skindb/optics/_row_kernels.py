@@ -43,7 +43,8 @@ ZERO, ONE, MIN_SQUARE, HALF_PI, PI = (np.float32(c) for c in (0.0, 1.0, 1e-30, m
 NONE, STEP, TWO = (np.int32(c) for c in (0, 1, 2))
 X, Y, Z, ACROSS_X, ACROSS_Y, ACROSS_Z, COSINE = range(7)  # rows of `RowMemory.faces`
 THETA_H, THETA_D, PHI_D = range(3)  # rows of `RowMemory.place`
-ROOT_HALF, SMALLEST_SINE = np.float32(math.sqrt(0.5)), np.float32(1e-6)
+ROOT_HALF = np.float32(math.sqrt(0.5))
+SMALLEST_SINE = np.float32(1e-6)
 
 
 @inline_fast_kernel
@@ -62,16 +63,27 @@ def _arctangent(y: float, x: float) -> float:
 @inline_fast_kernel
 def _angles(n: Any, wi: Any, wo: Any) -> tuple[float, float, float]:
     """theta_h, theta_d, phi_d of unit 3-tuples; sines from cross products are accurate for narrow lobes."""
-    hx, hy, hz = wi[0] + wo[0], wi[1] + wo[1], wi[2] + wo[2]
+    hx = wi[0] + wo[0]
+    hy = wi[1] + wo[1]
+    hz = wi[2] + wo[2]
     scale = 1.0 / max(math.sqrt(hx * hx + hy * hy + hz * hz), 1e-12)
-    hx, hy, hz = hx * scale, hy * scale, hz * scale
-    bx, by, bz = n[1] * hz - n[2] * hy, n[2] * hx - n[0] * hz, n[0] * hy - n[1] * hx
-    cx, cy, cz = hy * wi[2] - hz * wi[1], hz * wi[0] - hx * wi[2], hx * wi[1] - hy * wi[0]
-    tx, ty, tz = by * hz - bz * hy, bz * hx - bx * hz, bx * hy - by * hx
+    hx = hx * scale
+    hy = hy * scale
+    hz = hz * scale
+    bx = n[1] * hz - n[2] * hy
+    by = n[2] * hx - n[0] * hz
+    bz = n[0] * hy - n[1] * hx
+    cx = hy * wi[2] - hz * wi[1]
+    cy = hz * wi[0] - hx * wi[2]
+    cz = hx * wi[1] - hy * wi[0]
+    tx = by * hz - bz * hy
+    ty = bz * hx - bx * hz
+    tz = bx * hy - by * hx
     sin_h = math.sqrt(bx * bx + by * by + bz * bz)
     theta_h = _arctangent(sin_h, max(n[0] * hx + n[1] * hy + n[2] * hz, 0.0))
     theta_d = _arctangent(math.sqrt(cx * cx + cy * cy + cz * cz), max(hx * wi[0] + hy * wi[1] + hz * wi[2], 0.0))
-    across, along = bx * wi[0] + by * wi[1] + bz * wi[2], tx * wi[0] + ty * wi[1] + tz * wi[2]
+    across = bx * wi[0] + by * wi[1] + bz * wi[2]
+    along = tx * wi[0] + ty * wi[1] + tz * wi[2]
     # phi_d has period pi, so a pair with phi_d < 0 is the pair with both signs reversed
     phi = _arctangent(abs(across), along if across >= 0.0 else -along)
     return theta_h, theta_d, phi if sin_h > 1e-7 else 0.0
@@ -80,7 +92,9 @@ def _angles(n: Any, wi: Any, wo: Any) -> tuple[float, float, float]:
 @fast_kernel
 def _coordinates(n: Any, wi: Any, wo: Any, count: int, shape: Any, out: Any) -> None:
     """Coordinates [cells] in a table of `shape`, out (3, count), of wi with the columns of wo (3, count)."""
-    per_h, per_d, per_phi = 2.0 / math.pi, (shape[1] - 1) * 2.0 / math.pi, shape[2] / math.pi
+    per_h = 2.0 / math.pi
+    per_d = (shape[1] - 1) * 2.0 / math.pi
+    per_phi = shape[2] / math.pi
     for q in range(count):
         theta_h, theta_d, phi = _angles(n, wi, (wo[0, q], wo[1, q], wo[2, q]))
         out[0, q] = math.sqrt(theta_h * per_h) * (shape[0] - 1)
@@ -92,14 +106,22 @@ def _coordinates(n: Any, wi: Any, wo: Any, count: int, shape: Any, out: Any) -> 
 def _interpolate(table: Any, x: float, y: float, z: float, factor: float, out: Any) -> None:
     """out[:] = factor * trilinear table value at x, y, z in cells; NaN reads cell 0 and gives NaN."""
     nh, nd, n_phi, size = table.shape
-    i, j, k = max(min(int(x), nh - 2), 0), max(min(int(y), nd - 2), 0), max(int(z), 0)
-    fx, fy, fz = x - i, y - j, z - k
+    i = max(min(int(x), nh - 2), 0)
+    j = max(min(int(y), nd - 2), 0)
+    k = max(int(z), 0)
+    fx = x - i
+    fy = y - j
+    fz = z - k
     k = k if k < n_phi else 0
     k1 = k + 1 if k + 1 < n_phi else 0
-    w00, w01 = nb.float32(factor * (1 - fx) * (1 - fy) * (1 - fz)), nb.float32(factor * (1 - fx) * (1 - fy) * fz)
-    w10, w11 = nb.float32(factor * (1 - fx) * fy * (1 - fz)), nb.float32(factor * (1 - fx) * fy * fz)
-    v00, v01 = nb.float32(factor * fx * (1 - fy) * (1 - fz)), nb.float32(factor * fx * (1 - fy) * fz)
-    v10, v11 = nb.float32(factor * fx * fy * (1 - fz)), nb.float32(factor * fx * fy * fz)
+    w00 = nb.float32(factor * (1 - fx) * (1 - fy) * (1 - fz))
+    w01 = nb.float32(factor * (1 - fx) * (1 - fy) * fz)
+    w10 = nb.float32(factor * (1 - fx) * fy * (1 - fz))
+    w11 = nb.float32(factor * (1 - fx) * fy * fz)
+    v00 = nb.float32(factor * fx * (1 - fy) * (1 - fz))
+    v01 = nb.float32(factor * fx * (1 - fy) * fz)
+    v10 = nb.float32(factor * fx * fy * (1 - fz))
+    v11 = nb.float32(factor * fx * fy * fz)
     for m in range(size):
         out[m] = (
             w00 * table[i, j, k, m]
@@ -133,7 +155,9 @@ def _face_cameras(n: Any, to_camera: Any, faces: Any, cameras: Any) -> int:
     """
     count = 0
     for o in range(to_camera.shape[0]):
-        x, y, z = to_camera[o, 0], to_camera[o, 1], to_camera[o, 2]
+        x = to_camera[o, 0]
+        y = to_camera[o, 1]
+        z = to_camera[o, 2]
         cosine = n[0] * x + n[1] * y + n[2] * z
         if cosine > 0.0 and cosine < 2.0:  # false for NaN and inf
             faces[X, count], faces[Y, count], faces[Z, count] = x, y, z
@@ -158,10 +182,15 @@ def _cells(wi: Any, across: Any, cosine: Any, faces: Any, count: int, size: Any,
     `size` is the number of cells per unit of sqrt(theta_h), theta_d and phi_d.
     """
     for q in range(count):
-        x, y, z = faces[X, q], faces[Y, q], faces[Z, q]
-        bx, by, bz = faces[ACROSS_X, q] + across[0], faces[ACROSS_Y, q] + across[1], faces[ACROSS_Z, q] + across[2]
+        x = faces[X, q]
+        y = faces[Y, q]
+        z = faces[Z, q]
+        bx = faces[ACROSS_X, q] + across[0]
+        by = faces[ACROSS_Y, q] + across[1]
+        bz = faces[ACROSS_Z, q] + across[2]
         both = wi[0] * x + wi[1] * y + wi[2] * z
-        near, far = math.sqrt(max(ONE + both, MIN_SQUARE)), math.sqrt(max(ONE - both, ZERO))
+        near = math.sqrt(max(ONE + both, MIN_SQUARE))
+        far = math.sqrt(max(ONE - both, ZERO))
         sin_h = math.sqrt(bx * bx + by * by + bz * bz)
         theta_h = _arctangent_single(sin_h, cosine + faces[COSINE, q])
         theta_d = _arctangent_single(far, near)
@@ -179,21 +208,36 @@ def _cells(wi: Any, across: Any, cosine: Any, faces: Any, count: int, size: Any,
 @inline_fast_kernel
 def _row(flat: Any, shape: Any, place: Any, q: int, cosine: Any, rows: Any, row: int) -> None:
     """One row: cosine times the trilinear sum of the eight corners of the cell around place[:, q]."""
-    x, y, z = place[THETA_H, q], place[THETA_D, q], place[PHI_D, q]
-    i, j, k = min(np.int32(x), shape[0] - TWO), min(np.int32(y), shape[1] - TWO), np.int32(z)
-    fx, fy, fz = x - np.float32(i), y - np.float32(j), z - np.float32(k)
+    x = place[THETA_H, q]
+    y = place[THETA_D, q]
+    z = place[PHI_D, q]
+    i = min(np.int32(x), shape[0] - TWO)
+    j = min(np.int32(y), shape[1] - TWO)
+    k = np.int32(z)
+    fx = x - np.float32(i)
+    fy = y - np.float32(j)
+    fz = z - np.float32(k)
     corner = np.int64((i * shape[1] + j) * shape[2])
     a = corner + (k if k < shape[2] else NONE)
     b = corner + (k + STEP if k + STEP < shape[2] else NONE)
-    along, across = np.int64(shape[2]), np.int64(shape[1] * shape[2])  # to the next theta_d, theta_h
-    gx, fx, gy, gz = (ONE - fx) * cosine, fx * cosine, ONE - fy, ONE - fz
-    low, high, low_far, high_far = gx * gy, gx * fy, fx * gy, fx * fy
+    # to the next theta_d, theta_h
+    along = np.int64(shape[2])
+    across = np.int64(shape[1] * shape[2])
+    gx = (ONE - fx) * cosine
+    fx = fx * cosine
+    gy = ONE - fy
+    gz = ONE - fz
+    low = gx * gy
+    high = gx * fy
+    low_far = fx * gy
+    high_far = fx * fy
     blend(
         flat,
         (a, b, a + along, b + along, a + across, b + across, a + across + along, b + across + along),
         (low * gz, low * fz, high * gz, high * fz, low_far * gz, low_far * fz, high_far * gz, high_far * fz),
-        rows, row,
-    )  # fmt: skip
+        rows,
+        row,
+    )
 
 
 class RowMemory(NamedTuple):
@@ -223,7 +267,10 @@ def form_rows(
     Neighbouring surfels use the same cells, so surfels in spatial order keep this part of the table in the cache. The
     width of `table` and `rows` must be a multiple of LANES.
     """
-    faces, place, cameras, chosen = memory.faces, memory.place, memory.above, memory.chosen
+    faces = memory.faces
+    place = memory.place
+    cameras = memory.above
+    chosen = memory.chosen
     seen = _face_cameras(n, to_camera, faces, cameras)
     if seen == 0:
         return 0
@@ -233,11 +280,14 @@ def form_rows(
         np.float32(2.0 / math.pi * (nd - 1)),
         np.float32(n_phi / math.pi),
     )
-    shape, flat = (np.int32(nh), np.int32(nd), np.int32(n_phi)), table.reshape(-1, m)
+    shape = (np.int32(nh), np.int32(nd), np.int32(n_phi))
+    flat = table.reshape(-1, m)
     padded = (seen + LANES - 1) // LANES * LANES
     count = 0
     for i in range(to_light.shape[0]):
-        x, y, z = to_light[i, 0], to_light[i, 1], to_light[i, 2]
+        x = to_light[i, 0]
+        y = to_light[i, 1]
+        z = to_light[i, 2]
         cosine = n[0] * x + n[1] * y + n[2] * z
         if not (cosine > 0.0 and cosine < 2.0):  # also NaN and inf
             continue
@@ -268,20 +318,25 @@ def turn_rows(
 
     Samples below the horizon of this normal have rows of zeros.
     """
-    faces, place = memory.faces, memory.place
+    faces = memory.faces
+    place = memory.place
     nh, nd, n_phi, m = table.shape
     size = (
         np.float32(math.sqrt(2.0 / math.pi) * (nh - 1)),
         np.float32(2.0 / math.pi * (nd - 1)),
         np.float32(n_phi / math.pi),
     )
-    shape, flat = (np.int32(nh), np.int32(nd), np.int32(n_phi)), table.reshape(-1, m)
+    shape = (np.int32(nh), np.int32(nd), np.int32(n_phi))
+    flat = table.reshape(-1, m)
     begin = 0
     while begin < count:
-        i, end = index[begin, 0], begin
+        i = index[begin, 0]
+        end = begin
         while end < count and index[end, 0] == i:
             end += 1
-        x, y, z = to_light[i, 0], to_light[i, 1], to_light[i, 2]
+        x = to_light[i, 0]
+        y = to_light[i, 1]
+        z = to_light[i, 2]
         cosine = max(n[0] * x + n[1] * y + n[2] * z, 0.0)
         _face_samples(n, to_camera, index, begin, end, faces)
         across = (
@@ -302,7 +357,9 @@ def _face_samples(n: Any, to_camera: Any, index: Any, begin: int, end: int, face
     """Write the input of `_cells` for the cameras of samples begin to end; the cosine is 0 below the horizon."""
     for q in range(end - begin):
         o = index[begin + q, 1]
-        x, y, z = to_camera[o, 0], to_camera[o, 1], to_camera[o, 2]
+        x = to_camera[o, 0]
+        y = to_camera[o, 1]
+        z = to_camera[o, 2]
         faces[X, q], faces[Y, q], faces[Z, q] = x, y, z
         faces[ACROSS_X, q] = n[1] * z - n[2] * y
         faces[ACROSS_Y, q] = n[2] * x - n[0] * z
@@ -320,7 +377,8 @@ def fill_rows(
     """Write the rows of every surfel, starting at its offset."""
     memory = row_memory(to_camera.shape[1])
     for s in range(normal.shape[0]):
-        lo, hi = offsets[s], offsets[s + 1]
+        lo = offsets[s]
+        hi = offsets[s + 1]
         form_rows(table, normal[s], to_light[s], to_camera[s], usable[s], memory, rows[lo:hi], index[lo:hi])
 
 
@@ -328,14 +386,19 @@ def fill_rows(
 def average_disc(table: Any, wi: Any, wo: Any, points: Any, weights: Any, out: Any) -> None:
     """Add to `out` (n, m) the weighted mean of the table over directions around wi."""
     count = points.shape[0]
-    disc, place, value = np.empty((3, count)), np.empty((3, count)), np.empty(out.shape[1], out.dtype)
+    disc = np.empty((3, count))
+    place = np.empty((3, count))
+    value = np.empty(out.shape[1], out.dtype)
     for s in range(wi.shape[0]):
-        x, y, z = wi[s, 0], wi[s, 1], wi[s, 2]
+        x = wi[s, 0]
+        y = wi[s, 1]
+        z = wi[s, 2]
         sign = 1.0 if z >= 0.0 else -1.0
         a = -1.0 / (sign + z)
         b = x * y * a
         for q in range(count):
-            u, v = points[q, 0], points[q, 1]
+            u = points[q, 0]
+            v = points[q, 1]
             px = x + u * (1.0 + sign * x * x * a) + v * b
             py = y + u * sign * b + v * (sign + y * y * a)
             pz = z - u * sign * x - v * y

@@ -26,8 +26,12 @@ def _surface(table: Any, weight: Any, n: Any, wi: Any, wo: Any) -> float:
     x = math.sqrt(min(theta_h / half, 1.0)) * (nh - 1)
     y = min(theta_d / half, 1.0) * (nd - 1)
     z = phi / math.pi * n_phi
-    i, j, k = min(int(x), nh - 2), min(int(y), nd - 2), int(z)
-    fx, fy, fz = x - i, y - j, z - k
+    i = min(int(x), nh - 2)
+    j = min(int(y), nd - 2)
+    k = int(z)
+    fx = x - i
+    fy = y - j
+    fz = z - k
     k = k % n_phi
     k1 = k + 1 if k + 1 < n_phi else 0
     total = 0.0
@@ -62,20 +66,28 @@ def shade(
     """Fill `out` (n, 3) with the radiance per unit of the light's radiant intensity."""
     n, points = lit.shape
     for i in range(n):
-        nx, ny, nz = float(normal[i, 0]), float(normal[i, 1]), float(normal[i, 2])
-        vx, vy, vz = float(view[i, 0]), float(view[i, 1]), float(view[i, 2])
+        nx = float(normal[i, 0])
+        ny = float(normal[i, 1])
+        nz = float(normal[i, 2])
+        vx = float(view[i, 0])
+        vy = float(view[i, 1])
+        vz = float(view[i, 2])
         cos_o = nx * vx + ny * vy + nz * vz
-        matte, gloss = 0.0, 0.0
+        matte = 0.0
+        gloss = 0.0
         if cos_o > 0.0:
             out_transmittance = transmittance(min(cos_o, 1.0), eta)
             for p in range(points):
                 if lit[i, p] <= 0.0:
                     continue
-                dx, dy = lamp[i, p, 0] - position[i, 0], lamp[i, p, 1] - position[i, 1]
+                dx = lamp[i, p, 0] - position[i, 0]
+                dy = lamp[i, p, 1] - position[i, 1]
                 dz = lamp[i, p, 2] - position[i, 2]
                 square = dx * dx + dy * dy + dz * dz
                 inverse = 1.0 / math.sqrt(square)
-                dx, dy, dz = dx * inverse, dy * inverse, dz * inverse
+                dx = dx * inverse
+                dy = dy * inverse
+                dz = dz * inverse
                 cos_i = dx * nx + dy * ny + dz * nz
                 if cos_i <= 0.0:
                     continue

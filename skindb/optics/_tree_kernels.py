@@ -24,9 +24,14 @@ def build(code: Any, points: Any, area: Any, leaf: int) -> Any:
     Returns first, last, child, children, box, centre (area-weighted) and node area; children come after their parents.
     """
     most = 2 * len(code) + 16
-    first, last = np.zeros(most, np.int64), np.zeros(most, np.int64)
-    child, children, level = np.full(most, -1, np.int64), np.zeros(most, np.int64), np.zeros(most, np.int64)
-    centre, box, node_area = np.zeros((most, 3)), np.zeros((most, 6)), np.zeros(most)
+    first = np.zeros(most, np.int64)
+    last = np.zeros(most, np.int64)
+    child = np.full(most, -1, np.int64)
+    children = np.zeros(most, np.int64)
+    level = np.zeros(most, np.int64)
+    centre = np.zeros((most, 3))
+    box = np.zeros((most, 6))
+    node_area = np.zeros(most)
     count, last[0], i = 1, len(code), 0
     while i < count:
         box[i, :3], box[i, 3:] = np.inf, -np.inf
@@ -41,17 +46,21 @@ def build(code: Any, points: Any, area: Any, leaf: int) -> Any:
         for a in range(3):
             centre[i, a] /= total
         if last[i] - first[i] > leaf and level[i] < MAX_DEPTH:
-            shift, start = 3 * (MAX_DEPTH - 1 - level[i]), first[i]
+            shift = 3 * (MAX_DEPTH - 1 - level[i])
+            start = first[i]
             child[i] = count
             while start < last[i]:
-                digit, stop = (code[start] >> shift) & 7, start
+                digit = (code[start] >> shift) & 7
+                stop = start
                 while stop < last[i] and ((code[stop] >> shift) & 7) == digit:
                     stop += 1
                 first[count], last[count], level[count] = start, stop, level[i] + 1
-                count, start = count + 1, stop
+                count = count + 1
+                start = stop
             children[i] = count - child[i]
         i += 1
-    stretch, family = (first[:count], last[:count]), (child[:count], children[:count])
+    stretch = (first[:count], last[:count])
+    family = (child[:count], children[:count])
     return *stretch, *family, box[:count], centre[:count], node_area[:count]
 
 
@@ -60,9 +69,11 @@ def sum_nodes(power: Any, points: int, first: Any, last: Any, child: Any, childr
     """Fill the rows of the nodes of power (groups, rows, LIGHTS_IN_REGISTERS) from the rows of the points."""
     for g in range(power.shape[0]):
         for v in range(len(first) - 1, -1, -1):  # children before their parents
-            low, high = first[v], last[v]
+            low = first[v]
+            high = last[v]
             if child[v] >= 0:
-                low, high = points + child[v], points + child[v] + children[v]
+                low = points + child[v]
+                high = points + child[v] + children[v]
             for c in range(LIGHTS_IN_REGISTERS):
                 total = 0.0
                 for j in range(low, high):
@@ -115,10 +126,15 @@ def _add(
     """
     for e in range(count):
         j = rows[e]
-        dx, dy, dz = at[0] - place[j, 0], at[1] - place[j, 1], at[2] - place[j, 2]
+        dx = at[0] - place[j, 0]
+        dy = at[1] - place[j, 1]
+        dz = at[2] - place[j, 2]
         square[e] = dx * dx + dy * dy + dz * dz
     for c in range(3):
-        depth, above, decay, scale = p[c, 0], p[c, 1], p[c, 2], p[c, 3] * 0.07957747154594767
+        depth = p[c, 0]
+        above = p[c, 1]
+        decay = p[c, 2]
+        scale = p[c, 3] * 0.07957747154594767
         for e in range(count):
             profile[c, e] = scale * (_source(square[e], depth, decay) + _source(square[e], above, decay))
         total = 0.0
@@ -129,7 +145,8 @@ def _add(
         for c in range(3):
             a0 = a1 = a2 = a3 = a4 = a5 = a6 = a7 = 0.0  # LIGHTS_IN_REGISTERS variables, unrolled to stay in registers
             for e in range(count):
-                r, sent = profile[c, e], power[g, rows[e]]
+                r = profile[c, e]
+                sent = power[g, rows[e]]
                 a0 += r * sent[0]
                 a1 += r * sent[1]
                 a2 += r * sent[2]
@@ -151,9 +168,23 @@ def _add(
 
 @fast_kernel
 def gather(
-    start: int, stop: int, receivers: Any, parameters: Any, place: Any, area: Any, power: Any, first: Any, last: Any,
-    child: Any, children: Any, box: Any, tolerance: float, reach: float, even: Any, out: Any,
-) -> None:  # fmt: skip
+    start: int,
+    stop: int,
+    receivers: Any,
+    parameters: Any,
+    place: Any,
+    area: Any,
+    power: Any,
+    first: Any,
+    last: Any,
+    child: Any,
+    children: Any,
+    box: Any,
+    tolerance: float,
+    reach: float,
+    even: Any,
+    out: Any,
+) -> None:
     """Dipole sums at the points receivers[start:stop], with receivers (m,).
 
     parameters (n, 3, 4) are z_r, z_v, sigma_tr, alpha' of each point and channel; place (rows, 3), area (rows,) and
@@ -161,11 +192,15 @@ def gather(
     out (m, groups, 3, LIGHTS_IN_REGISTERS).
     """
     points = len(parameters)
-    stack, rows = np.empty(8 * (MAX_DEPTH + 2), np.int64), np.empty(ROWS_PER_SUM, np.int64)
-    square, profile = np.empty(ROWS_PER_SUM), np.empty((3, ROWS_PER_SUM))
+    stack = np.empty(8 * (MAX_DEPTH + 2), np.int64)
+    rows = np.empty(ROWS_PER_SUM, np.int64)
+    square = np.empty(ROWS_PER_SUM)
+    profile = np.empty((3, ROWS_PER_SUM))
     for k in range(start, stop):
         i = receivers[k]
-        x, y, z = place[i, 0], place[i, 1], place[i, 2]
+        x = place[i, 0]
+        y = place[i, 1]
+        z = place[i, 2]
         top, stack[0], count = 1, 0, 0
         while top > 0:
             top -= 1
@@ -176,10 +211,14 @@ def gather(
             gap = gx * gx + gy * gy + gz * gz
             if gap > reach * reach:
                 continue
-            low, high = points + v, points + v + 1
-            dx, dy, dz = x - place[low, 0], y - place[low, 1], z - place[low, 2]
+            low = points + v
+            high = points + v + 1
+            dx = x - place[low, 0]
+            dy = y - place[low, 1]
+            dz = z - place[low, 2]
             if gap == 0.0 or area[low] >= tolerance * (dx * dx + dy * dy + dz * dz):
-                low, high = first[v], last[v]
+                low = first[v]
+                high = last[v]
                 if child[v] >= 0:
                     low = high
                     for q in range(children[v]):

@@ -31,15 +31,23 @@ def walk(rng: Any, packets: int, g: float, eta: float, longest: float, events: n
     """
     count = 0
     for _ in range(packets):
-        x, y, z = 0.0, 0.0, 0.0
-        dx, dy, dz = 0.0, 0.0, 1.0
-        path, weight = 0.0, 1.0
+        x = 0.0
+        y = 0.0
+        z = 0.0
+        dx = 0.0
+        dy = 0.0
+        dz = 1.0
+        path = 0.0
+        weight = 1.0
         while path < longest:
             step = -np.log(1.0 - rng.random()) * (1.0 - g)
             while dz < 0.0 and z + dz * step < 0.0:  # the boundary comes first
                 reach = -z / dz
-                x, y, z = x + dx * reach, y + dy * reach, 0.0
-                path, step = path + reach, step - reach
+                x = x + dx * reach
+                y = y + dy * reach
+                z = 0.0
+                path = path + reach
+                step = step - reach
                 out = _escape(-dz, eta)
                 if out > 0.0:
                     if count == events.shape[0]:
@@ -50,7 +58,10 @@ def walk(rng: Any, packets: int, g: float, eta: float, longest: float, events: n
                     count += 1
                     weight *= 1.0 - out
                 dz = -dz
-            x, y, z, path = x + dx * step, y + dy * step, z + dz * step, path + step
+            x = x + dx * step
+            y = y + dy * step
+            z = z + dz * step
+            path = path + step
             if weight < 0.05:  # Russian roulette preserves the mean
                 if rng.random() > 0.25:
                     break
@@ -62,15 +73,20 @@ def walk(rng: Any, packets: int, g: float, eta: float, longest: float, events: n
                 ct = (1.0 + g * g - q * q) / (2.0 * g)
             st = np.sqrt(max(0.0, 1.0 - ct * ct))
             # a uniform direction in the plane by rejection, which is faster than sine and cosine
-            a, b = 2.0 * rng.random() - 1.0, 2.0 * rng.random() - 1.0
+            a = 2.0 * rng.random() - 1.0
+            b = 2.0 * rng.random() - 1.0
             r2 = a * a + b * b
             while r2 > 1.0 or r2 < 1e-12:
-                a, b = 2.0 * rng.random() - 1.0, 2.0 * rng.random() - 1.0
+                a = 2.0 * rng.random() - 1.0
+                b = 2.0 * rng.random() - 1.0
                 r2 = a * a + b * b
             f = st / np.sqrt(r2)
-            c, s = a * f, b * f
+            c = a * f
+            s = b * f
             if abs(dz) > 0.99999:
-                dx, dy, dz = c, s, ct * np.sign(dz)
+                dx = c
+                dy = s
+                dz = ct * np.sign(dz)
             else:
                 h = np.sqrt(1.0 - dz * dz)
                 dx, dy, dz = (
@@ -79,5 +95,7 @@ def walk(rng: Any, packets: int, g: float, eta: float, longest: float, events: n
                     -c * h + dz * ct,
                 )
             n = 1.0 / np.sqrt(dx * dx + dy * dy + dz * dz)
-            dx, dy, dz = dx * n, dy * n, dz * n
+            dx = dx * n
+            dy = dy * n
+            dz = dz * n
     return count

@@ -24,14 +24,16 @@ def half_difference(wi: ArrayLike, wo: ArrayLike, normal: ArrayLike | None = Non
         theta_h, theta_d in [0, pi/2] and phi_d in [0, pi), as isotropic reciprocal BRDFs have period pi. phi_d is 0
         where the half vector is the normal.
     """
-    wi, wo = np.asarray(wi, np.float64), np.asarray(wo, np.float64)
+    wi = np.asarray(wi, np.float64)
+    wo = np.asarray(wo, np.float64)
     n = np.broadcast_to(np.array([0.0, 0.0, 1.0]) if normal is None else np.asarray(normal, np.float64), wi.shape)
     h = wi + wo
     h = h / np.maximum(np.linalg.norm(h, axis=-1, keepdims=True), 1e-12)
     # sines from cross products, because an arc cosine is too inaccurate for narrow lobes
     b = np.cross(n, h)
     t = np.cross(b, h)
-    sin_h, sin_d = np.linalg.norm(b, axis=-1), np.linalg.norm(np.cross(h, wi), axis=-1)
+    sin_h = np.linalg.norm(b, axis=-1)
+    sin_d = np.linalg.norm(np.cross(h, wi), axis=-1)
     theta_h = np.arctan2(sin_h, np.maximum((n * h).sum(-1), 0.0))
     theta_d = np.arctan2(sin_d, np.maximum((h * wi).sum(-1), 0.0))
     phi = np.where(sin_h > 1e-7, np.arctan2((b * wi).sum(-1), (t * wi).sum(-1)), 0.0)
@@ -42,8 +44,11 @@ def half_difference(wi: ArrayLike, wo: ArrayLike, normal: ArrayLike | None = Non
 def directions(theta_h: ArrayLike, theta_d: ArrayLike, phi_d: ArrayLike) -> tuple[Array, Array]:
     """Unit directions (wi, wo), each (..., 3), in the local frame (normal +z, half vector in the xz plane)."""
     th, td, pd = np.broadcast_arrays(*(np.asarray(x, np.float64) for x in (theta_h, theta_d, phi_d)))
-    dx, dy, dz = np.sin(td) * np.cos(pd), np.sin(td) * np.sin(pd), np.cos(td)
-    c, s = np.cos(th), np.sin(th)
+    dx = np.sin(td) * np.cos(pd)
+    dy = np.sin(td) * np.sin(pd)
+    dz = np.cos(td)
+    c = np.cos(th)
+    s = np.sin(th)
     wi = np.stack([c * dx + s * dz, dy, -s * dx + c * dz], axis=-1)
     wo = np.stack([-c * dx + s * dz, -dy, s * dx + c * dz], axis=-1)
     return wi, wo

@@ -65,8 +65,12 @@ def lookup(table: NDArray[Any], theta_h: ArrayLike, theta_d: ArrayLike, phi_d: A
     y = np.clip(np.asarray(theta_d, np.float64) / half, 0, 1) * (nd - 1)
     z = np.mod(np.asarray(phi_d, np.float64) / np.pi, 1.0) * n_phi
     x, y, z = np.broadcast_arrays(x, y, z)
-    i, j, k = np.minimum(x.astype(int), nh - 2), np.minimum(y.astype(int), nd - 2), z.astype(int)
-    fx, fy, fz = (x - i)[..., None], (y - j)[..., None], (z - k)[..., None]
+    i = np.minimum(x.astype(int), nh - 2)
+    j = np.minimum(y.astype(int), nd - 2)
+    k = z.astype(int)
+    fx = (x - i)[..., None]
+    fy = (y - j)[..., None]
+    fz = (z - k)[..., None]
     k, k1 = k % n_phi, (k + 1) % n_phi
     total: Array = np.zeros((*x.shape, table.shape[3]))
     for di, wx in ((0, 1 - fx), (1, fx)):
@@ -103,8 +107,10 @@ def directional_albedo(table: NDArray[Any], cos_o: ArrayLike, *, n: int = 96) ->
     The integral is over half vectors, on a grid that is quadratic in theta_h to resolve narrow lobes.
     """
     t, w = np.polynomial.legendre.leggauss(n)
-    t, w = (t + 1) / 2, w / 2
-    theta, phi = t**2 * np.pi / 2, (np.arange(2 * n) + 0.5) * np.pi / n
+    t = (t + 1) / 2
+    w = w / 2
+    theta = t**2 * np.pi / 2
+    phi = (np.arange(2 * n) + 0.5) * np.pi / n
     a, b = np.meshgrid(theta, phi, indexing="ij")
     h = np.stack([np.sin(a) * np.cos(b), np.sin(a) * np.sin(b), np.cos(a)], axis=-1)
     rows = []

@@ -25,16 +25,25 @@ from skindb.optics.fresnel import fresnel_reflectance
 from skindb.optics.rows import reduce_dictionary
 
 Rule = tuple[int, int]  # rings and points per ring of a quadrature over a disc
-FAR_RULE, NEAR_RULE = (4, 12), (12, 36)  # away from the mirror direction and near it; see `convolve_disc`
+# away from the mirror direction and near it; see `convolve_disc`
+FAR_RULE = (4, 12)
+NEAR_RULE = (12, 36)
 EMBEDDED = "analytic fits to measured BRDFs (ABC parameters of Loew et al. 2012)"
 # modules that determine the tables; a change of their source invalidates the cache
 SOURCES = tuple(
     f"skindb.{name}"
     for name in (
-        "optics.dictionary", "optics.rows", "optics.brdf_table", "optics.angles", "optics.fresnel",
-        "optics.abc_low2012", "optics._row_kernels", "optics.truncation", "_vectors",
+        "optics.dictionary",
+        "optics.rows",
+        "optics.brdf_table",
+        "optics.angles",
+        "optics.fresnel",
+        "optics.abc_low2012",
+        "optics._row_kernels",
+        "optics.truncation",
+        "_vectors",
     )
-)  # fmt: skip
+)
 MIN_COSINE_TABLE = 0.03  # cosines are clamped to this, so that cells below the horizon continue the last value above it
 
 
@@ -90,14 +99,20 @@ def evaluate_abc(parameters: Array, wi: Array, wo: Array) -> Array:
     f = kd/pi + A F(theta_d) (1 + B (1 - cos theta_h))^-C G / (pi cos_i cos_o), with G for V grooves. Directions are in
     the local frame.
     """
-    cos_i, cos_o = np.maximum(wi[..., 2], MIN_COSINE_TABLE), np.maximum(wo[..., 2], MIN_COSINE_TABLE)
+    cos_i = np.maximum(wi[..., 2], MIN_COSINE_TABLE)
+    cos_o = np.maximum(wo[..., 2], MIN_COSINE_TABLE)
     theta_h, theta_d, _ = half_difference(wi, wo)
-    cos_h, cos_d = np.maximum(np.cos(theta_h), 1e-6), np.maximum(np.cos(theta_d), MIN_COSINE_TABLE)
+    cos_h = np.maximum(np.cos(theta_h), 1e-6)
+    cos_d = np.maximum(np.cos(theta_d), MIN_COSINE_TABLE)
     masking = np.minimum(1.0, 2 * cos_h * np.minimum(cos_i, cos_o) / cos_d) / (np.pi * cos_i * cos_o)
     out = np.empty((*cos_i.shape, len(parameters)))
     lean = 2.0 * np.sin(theta_h / 2) ** 2  # 1 - cos theta_h without cancellation
     for m, row in enumerate(parameters):
-        kd, scale, b, c, index = row[:3].mean(), row[3:6].mean(), row[6], row[7], row[8]
+        kd = row[:3].mean()
+        scale = row[3:6].mean()
+        b = row[6]
+        c = row[7]
+        index = row[8]
         lobe = np.exp(-c * np.log1p(b * lean))
         out[..., m] = kd / np.pi + scale * fresnel_reflectance(cos_d, float(index)) * lobe * masking
     return out

@@ -12,7 +12,9 @@ from skindb._types import Array
 from skindb.optics.fresnel import boundary_factor
 
 S_MAX = float(np.sqrt(3.0))
-MIN_R_D, MAX_R_D = 1e-6, 1.0 - 1e-9  # range of R_d that is inverted; values outside are clamped
+# range of R_d that is inverted; values outside are clamped
+MIN_R_D = 1e-6
+MAX_R_D = 1.0 - 1e-9
 S_FLOOR = 1e-4  # lower limit of s for scattering coefficients, as sigma_t' = sigma_tr / s diverges
 
 
@@ -41,11 +43,13 @@ def dipole_s(diffuse: ArrayLike, *, eta: float) -> tuple[Array, NDArray[np.bool_
     value = np.asarray(diffuse, np.float64)
     clamped = (value < MIN_R_D) | (value > MAX_R_D)
     absorbed = 1.0 - np.clip(value, MIN_R_D, MAX_R_D)
-    low, high = np.zeros(value.shape), np.full(value.shape, S_MAX)
+    low = np.zeros(value.shape)
+    high = np.full(value.shape, S_MAX)
     for _ in range(8):  # bisection until Newton's method converges
         mid = (low + high) / 2.0
         below = _absorbed(mid, eta) < absorbed
-        low, high = np.where(below, mid, low), np.where(below, high, mid)
+        low = np.where(below, mid, low)
+        high = np.where(below, high, mid)
     s = (low + high) / 2.0
     for _ in range(5):
         s = np.clip(s - (_absorbed(s, eta) - absorbed) / _slope(s, eta), low, high)
@@ -70,7 +74,8 @@ def _steepness(eta: float) -> float:
 
 def _absorbed(s: Array, eta: float) -> Array:
     """1 - R_d(s) as a sum of non-negative terms, which avoids cancellation for R_d near 1."""
-    near, far = np.exp(-s), np.exp(-(1.0 + _steepness(eta)) * s)
+    near = np.exp(-s)
+    far = np.exp(-(1.0 + _steepness(eta)) * s)
     lost = -(np.expm1(-s) + np.expm1(-(1.0 + _steepness(eta)) * s)) / 2.0
     return np.asarray(lost + s * s / 6.0 * (near + far))
 
@@ -78,5 +83,6 @@ def _absorbed(s: Array, eta: float) -> Array:
 def _slope(s: Array, eta: float) -> Array:
     """Derivative of 1 - R_d(s)."""
     b = 1.0 + _steepness(eta)
-    near, far = np.exp(-s), np.exp(-b * s)
+    near = np.exp(-s)
+    far = np.exp(-b * s)
     return np.asarray((1.0 - s * s / 3.0) / 2.0 * (near + b * far) + s / 3.0 * (near + far))

@@ -11,7 +11,8 @@ from skindb.optics.fresnel import boundary_factor
 
 def sigma_tr(sigma_a: ArrayLike, sigma_s_prime: ArrayLike) -> Array:
     """sigma_tr = sqrt(3 sigma_a (sigma_a + sigma_s')) in mm^-1 (eq. 9)."""
-    a, s = np.asarray(sigma_a, np.float64), np.asarray(sigma_s_prime, np.float64)
+    a = np.asarray(sigma_a, np.float64)
+    s = np.asarray(sigma_s_prime, np.float64)
     return np.asarray(np.sqrt(3.0 * a * (a + s)))
 
 

@@ -64,22 +64,23 @@ def subsurface_exitance(
         return result
     code = _morton(points)
     order = np.argsort(code, kind="stable")
-    code, points, areas = code[order], points[order], areas[order]
+    code = code[order]
+    points = points[order]
+    areas = areas[order]
     s = np.maximum(np.asarray(s, np.float64)[order], S_FLOOR)
     decay = np.asarray(sigma_tr, np.float64)[order]
     depth = s / decay
     above = depth * (1.0 + 4.0 / 3.0 * boundary_factor(eta))
     parameters = np.stack([depth, above, decay, reduced_albedo(s)], axis=-1)
     *tree, box, centre, node_area = _tree_kernels.build(code, points, areas, MAX_LEAF_POINTS)
-    place, area = np.concatenate([points, centre]), np.concatenate([areas, node_area])
+    place = np.concatenate([points, centre])
+    area = np.concatenate([areas, node_area])
     reach = REACH_MEAN_PATHS / float(decay.min())
     wanted = np.arange(len(points)) if receivers is None else np.flatnonzero(receivers[order])
     for low in range(0, len(result), LIGHTS_PER_WALK):
         power = _powers(irradiance[order, low : low + LIGHTS_PER_WALK] * areas[:, None], tree, _tree_kernels)
-        even, sums = (
-            np.zeros((len(wanted), 3)),
-            np.zeros((len(wanted), len(power), 3, _tree_kernels.LIGHTS_IN_REGISTERS)),
-        )
+        even = np.zeros((len(wanted), 3))
+        sums = np.zeros((len(wanted), len(power), 3, _tree_kernels.LIGHTS_IN_REGISTERS))
 
         def walk(start: int, power: Array = power, even: Array = even, sums: Array = sums) -> None:
             stop = min(start + RECEIVERS_PER_BLOCK, len(wanted))

@@ -15,7 +15,9 @@ from skindb.optics.merl_published import SHA256
 from skindb.optics.resample import to_default_grid
 from skindb.optics.table_file import read_tables
 
-GENUINE, DIFFERS, UNKNOWN = "genuine", "differs from the published file of that name", "not in the published set"
+GENUINE = "genuine"
+DIFFERS = "differs from the published file of that name"
+UNKNOWN = "not in the published set"
 
 
 def read_dictionary(path: str | Path) -> Dictionary:
@@ -39,7 +41,8 @@ def read_merl_folder(path: str | Path) -> Dictionary:
     """
     files = sorted(Path(path).glob("*.binary"))
     if not files:
-        rule, cure = "the folder must contain MERL .binary files", "choose their folder, or an .npz file of tables"
+        rule = "the folder must contain MERL .binary files"
+        cure = "choose their folder, or an .npz file of tables"
         raise InputError(Fault(str(path), rule, "none", cure))
     h, d, p = ((np.arange(n) + 0.5) / n for n in SHAPE)  # centres of bins; theta_h is quadratic
     nodes = (h**2 * np.pi / 2, d * np.pi / 2, p * np.pi)

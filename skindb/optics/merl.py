@@ -46,7 +46,8 @@ def read_merl(path: str | Path) -> tuple[Array, int]:
     table = np.moveaxis(values, 0, -1) * SCALE
     hole = np.asarray((table < 0).any(axis=-1))
     if hole.all():
-        rule, found = "some cells must be measured", "only negative values"
+        rule = "some cells must be measured"
+        found = "only negative values"
         raise InputError(Fault(str(path), rule, found, "download it again"))
     return np.where(hole[..., None], np.nan, table), int(hole.sum())
 

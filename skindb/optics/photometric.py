@@ -54,8 +54,11 @@ def photometric_normals(
         Standard deviation of the scan's normals [rad].
     """
     n = len(position)
-    peak, normal, spread = np.full((n, 3), np.nan), np.full((n, 2, 3), np.nan), np.full((n, 2), np.nan)
-    covariance, pull = np.full((n, 2, 3, 3), np.nan), np.full((n, 2, 3, 3), np.nan)
+    peak = np.full((n, 3), np.nan)
+    normal = np.full((n, 2, 3), np.nan)
+    spread = np.full((n, 2), np.nan)
+    covariance = np.full((n, 2, 3, 3), np.nan)
+    pull = np.full((n, 2, 3, 3), np.nan)
     cross = np.full((n, 3, 3), np.nan)
     points = (np.ascontiguousarray(a, np.float64) for a in (position, light, camera, scan))
     _photometric_kernels.estimate(

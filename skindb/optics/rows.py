@@ -97,11 +97,13 @@ def basis_rows(
     if table.shape[:3] != (grid.n_theta_h, grid.n_theta_d, grid.n_phi_d):
         raise ValueError(f"the table must have the shape of the grid {grid}, found {table.shape}")
     normal, to_light, to_camera = (np.ascontiguousarray(a, np.float64) for a in (normal, to_light, to_camera))
-    lit, seen = _above_horizon(normal, to_light), _above_horizon(normal, to_camera)
+    lit = _above_horizon(normal, to_light)
+    seen = _above_horizon(normal, to_camera)
     use = np.ascontiguousarray(usable & lit[:, :, None] & seen[:, None, :])
     offsets = np.concatenate([[0], np.cumsum(use.sum((1, 2)))]).astype(np.int64)
     whole = pad_to_lanes(table)
-    rows, index = np.empty((offsets[-1], whole.shape[3]), np.float32), np.empty((offsets[-1], 2), np.int32)
+    rows = np.empty((offsets[-1], whole.shape[3]), np.float32)
+    index = np.empty((offsets[-1], 2), np.int32)
     _row_kernels.fill_rows(whole, normal, to_light, to_camera, use, offsets, rows, index)
     return rows[:, : table.shape[3]], offsets, index
 

@@ -18,7 +18,8 @@ from skindb.optics.brdf_table import DEFAULT_GRID, directional_albedo
 from skindb.optics.dictionary import Dictionary
 from skindb.optics.resample import hole_fraction, to_default_grid
 
-TABLE, NODES = "basis_brdf", ("theta_h", "theta_d", "phi_d")
+TABLE = "basis_brdf"
+NODES = ("theta_h", "theta_d", "phi_d")
 UNITS = ("sr-1", "sr^-1", "1/sr")
 MAX_HOLE_FRACTION = 0.5  # of the nodes above the horizon, above which a table is mostly extrapolated
 
@@ -45,13 +46,15 @@ def read_tables(path: str | Path) -> Dictionary:
     faults = faults or _value_faults(path, arrays)
     if faults:
         raise InputError(faults)
-    brdf, nodes = arrays[TABLE], (arrays["theta_h"], arrays["theta_d"], arrays["phi_d"])
+    brdf = arrays[TABLE]
+    nodes = (arrays["theta_h"], arrays["theta_d"], arrays["phi_d"])
     found = hashlib.sha256(path.read_bytes()).hexdigest()
     made = [to_default_grid(_channel_mean(one), nodes, "a file of tables", found) for one in brdf]
     table = np.stack([table for table, _ in made], axis=-1)
     albedo = directional_albedo(table, 1.0)[0]
     if albedo.max() > 2:  # more than an error of measurement explains
-        rule, cure = "a surface must not reflect more light than it receives", "provide values in sr^-1"
+        rule = "a surface must not reflect more light than it receives"
+        cure = "provide values in sr^-1"
         raise InputError(Fault(f"{path}[{TABLE}]", rule, f"an albedo of {albedo.max():.3g} at normal incidence", cure))
     names = tuple(map(str, arrays["names"])) if "names" in arrays else tuple(f"material{i}" for i in range(len(brdf)))
     disc = float(arrays.get("disc_angular_radius", 0.0))
@@ -86,7 +89,8 @@ def _load(path: Path) -> dict[str, NDArray[Any]]:
         raise InputError(Fault(str(path), "must be an .npz file of plain arrays", "another file", cure)) from None
     missing = [name for name in (TABLE, *NODES) if name not in arrays]
     if missing:
-        rule, found = f"must contain {TABLE} and its nodes {', '.join(NODES)}", f"no {', '.join(missing)}"
+        rule = f"must contain {TABLE} and its nodes {', '.join(NODES)}"
+        found = f"no {', '.join(missing)}"
         raise InputError(Fault(str(path), rule, found, "add them, in sr^-1 and rad"))
     wrong = [name for name in (TABLE, *NODES) if arrays[name].dtype.kind not in "fiu"]
     if wrong:
@@ -106,7 +110,8 @@ def _channel_mean(one: NDArray[Any]) -> Array:
 def _node_faults(path: Path, arrays: Mapping[str, NDArray[Any]]) -> list[Fault]:
     faults = []
     for name, least in zip(NODES, (2, 2, 1), strict=True):
-        nodes, where = arrays[name], f"{path}[{name}]"
+        nodes = arrays[name]
+        where = f"{path}[{name}]"
         if nodes.ndim != 1 or len(nodes) < least:
             rule = f"must be a one-dimensional array of at least {least} nodes"
             faults.append(Fault(where, rule, f"the shape {nodes.shape}", "add the nodes"))
@@ -119,7 +124,8 @@ def _node_faults(path: Path, arrays: Mapping[str, NDArray[Any]]) -> list[Fault]:
 
 
 def _shape_faults(path: Path, arrays: Mapping[str, NDArray[Any]]) -> list[Fault]:
-    brdf, lengths = arrays[TABLE], tuple(arrays[name].size for name in NODES)
+    brdf = arrays[TABLE]
+    lengths = tuple(arrays[name].size for name in NODES)
     if brdf.ndim not in (4, 5) or brdf.shape[1:4] != lengths or brdf.shape[4:] not in ((), (3,)) or not len(brdf):
         rule = f"must have the shape (materials, {', '.join(map(str, lengths))}), or with RGB (..., 3)"
         cure = "transpose it, or correct the nodes"
@@ -133,7 +139,8 @@ def _shape_faults(path: Path, arrays: Mapping[str, NDArray[Any]]) -> list[Fault]
 
 def _range_faults(name: str, nodes: Array, where: str) -> list[Fault]:
     """Faults of nodes that are not in rad or do not span their axis; the outermost value is used beyond them."""
-    low, high = float(nodes[0]), float(nodes[-1])
+    low = float(nodes[0])
+    high = float(nodes[-1])
     if high > 2 * np.pi:
         return [Fault(where, "angles must be in rad", f"{high:g}", "convert them with numpy.radians")]
     if name == "phi_d":
@@ -157,16 +164,19 @@ def _unit_faults(path: Path, arrays: Mapping[str, NDArray[Any]]) -> list[Fault]:
         faults.append(Fault(f"{path}[units]", "the unit of a BRDF must be sr-1", found, "convert the table"))
     disc = arrays.get("disc_angular_radius", np.zeros(()))
     if disc.shape != () or disc.dtype.kind not in "fiu" or not 0 <= disc < 0.5:
-        rule, cure = "must be one angle from 0 to 0.5 rad", "omit it for tables of point lights"
+        rule = "must be one angle from 0 to 0.5 rad"
+        cure = "omit it for tables of point lights"
         faults.append(Fault(f"{path}[disc_angular_radius]", rule, str(disc), cure))
     return faults
 
 
 def _value_faults(path: Path, arrays: Mapping[str, NDArray[Any]]) -> list[Fault]:
-    brdf, where = arrays[TABLE], f"{path}[{TABLE}]"
+    brdf = arrays[TABLE]
+    where = f"{path}[{TABLE}]"
     faults = []
     if np.isinf(brdf).any():
-        found, cure = f"{np.isinf(brdf).sum()} infinite ones", "replace them by NaN"
+        found = f"{np.isinf(brdf).sum()} infinite ones"
+        cure = "replace them by NaN"
         faults.append(Fault(where, "values must be finite or NaN", found, cure))
     if (brdf < 0).any():
         cure = "use NaN where nothing was measured, and 0 where no light is reflected"

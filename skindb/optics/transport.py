@@ -24,10 +24,22 @@ from skindb.optics.random_walk import radial_profile, random_walk
 Array = NDArray[np.float64]
 ANISOTROPY = 0.8  # of skin; for a given sigma_s' the profile hardly depends on it
 DEGREE = 11
-RATIO_MIN, RATIO_MAX, RATIOS = 1e-5, 10.0, 15  # sigma_a / sigma_s', for reduced albedos of 0.99999 to 0.09
-NEAREST, SEAM, FARTHEST, RADII = 0.03, 0.9, 300.0, 72  # r sigma_s'
-PACKETS, SEED, LONGEST = 250_000, 1955, 60.0  # of the walk near the source, whose error is 1 %
-RINGS, POWERS = 16, 4  # rings about the source, and powers of the polynomial through them
+# sigma_a / sigma_s', for reduced albedos of 0.99999 to 0.09
+RATIO_MIN = 1e-5
+RATIO_MAX = 10.0
+RATIOS = 15
+# r sigma_s'
+NEAREST = 0.03
+SEAM = 0.9
+FARTHEST = 300.0
+RADII = 72
+# of the walk near the source, whose error is 1 %
+PACKETS = 250_000
+SEED = 1955
+LONGEST = 60.0
+# rings about the source, and powers of the polynomial through them
+RINGS = 16
+POWERS = 4
 # modules that determine the table; a change of their source invalidates the cache
 SOURCES = tuple(
     f"skindb.optics.{name}" for name in ("transport", "_moments", "random_walk", "_walk_kernels", "fresnel")
@@ -57,7 +69,8 @@ def transport_profile(r: ArrayLike, sigma_a: ArrayLike, sigma_s_prime: ArrayLike
     inside = np.clip(radius, NEAREST, FARTHEST)
     log_ratio, log_radius = np.broadcast_arrays(held, np.log(inside))
     decay = known.decay(held)
-    kappa, least = decay * np.sqrt(3 * ratio * (1 + ratio)), decay * np.sqrt(3 * RATIO_MIN * (1 + RATIO_MIN))
+    kappa = decay * np.sqrt(3 * ratio * (1 + ratio))
+    least = decay * np.sqrt(3 * RATIO_MIN * (1 + RATIO_MIN))
     level = known.level(log_ratio, log_radius) - kappa * radius
     level = level + np.log1p(kappa * radius) - np.log1p(np.maximum(kappa, least) * radius)
     with np.errstate(divide="ignore"):
@@ -67,7 +80,8 @@ def transport_profile(r: ArrayLike, sigma_a: ArrayLike, sigma_s_prime: ArrayLike
 
 @lru_cache(maxsize=4)
 def _table(eta: float) -> Table:
-    ratio, radius = np.geomspace(RATIO_MIN, RATIO_MAX, RATIOS), np.geomspace(NEAREST, FARTHEST, RADII)
+    ratio = np.geomspace(RATIO_MIN, RATIO_MAX, RATIOS)
+    radius = np.geomspace(NEAREST, FARTHEST, RADII)
     found = cached_arrays("transport", (eta,), sources=SOURCES, make=lambda: _tabulate(ratio, radius, eta))
     surface = RectBivariateSpline(np.log(ratio), np.log(radius), found["level"], kx=5, s=0)
     decay = make_interp_spline(np.log(ratio), found["kappa"] / np.sqrt(3 * ratio * (1 + ratio)), k=5)

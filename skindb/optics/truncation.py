@@ -47,7 +47,8 @@ def truncation_bound(table: Table, reduced: Table, lift: Array, *, elevation: fl
     if not error.any():
         return Truncation(0.0, 0.0)
     used = nodes_above(TableGrid(*table.shape[:3]), elevation)
-    value, off = table[used], np.abs(error[used])
+    value = table[used]
+    off = np.abs(error[used])
     ratio = np.divide(off, value, out=np.where(off > 0, np.inf, 0.0).astype(off.dtype), where=value > 0)
     length = np.sqrt(np.diag(brdf_metric(error, weighted_like=table)))
     return Truncation(_largest_ratio(brdf_metric(table), length), float(ratio.max(initial=0.0)))
@@ -62,7 +63,8 @@ def nodes_above(grid: TableGrid, elevation: float) -> NDArray[np.bool_]:
     slope = np.abs(np.cos(np.append(grid.phi_d, np.pi)))
     lean = np.minimum(slope[:-1], slope[1:])
     lean[(grid.phi_d < np.pi / 2) & (grid.phi_d + np.pi / grid.n_phi_d > np.pi / 2)] = 0.0
-    h, d = grid.theta_h[:-1, None, None], grid.theta_d[None, :-1, None]
+    h = grid.theta_h[:-1, None, None]
+    d = grid.theta_d[None, :-1, None]
     cells = np.cos(h) * np.cos(d) - np.sin(h) * np.sin(d) * lean > elevation
     nodes = np.zeros((grid.n_theta_h, grid.n_theta_d, grid.n_phi_d), np.bool_)
     for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):

@@ -69,7 +69,8 @@ def delta_e(first: ArrayLike, second: ArrayLike) -> Float:
 
 
 def _prepared(rendered: ArrayLike, photographed: ArrayLike, mask: Mask | None) -> tuple[Float, Float, Mask]:
-    ours, theirs = np.asarray(rendered, np.float64), np.asarray(photographed, np.float64)
+    ours = np.asarray(rendered, np.float64)
+    theirs = np.asarray(photographed, np.float64)
     if ours.shape != theirs.shape or ours.ndim != 3 or ours.shape[2] != 3:
         raise ValueError(f"both images must have the shape (h, w, 3), found {ours.shape} and {theirs.shape}")
     known = np.isfinite(ours).all(axis=-1) & np.isfinite(theirs).all(axis=-1)

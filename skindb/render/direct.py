@@ -125,7 +125,8 @@ def trace_view(
     at = np.arange(camera.height * camera.width) if pixels is None else np.flatnonzero(pixels)
     y, x = np.divmod(at[:, None], camera.width)
     # rays of a pixel are adjacent, which keeps the ray tracer and memory access coherent
-    sy, sx = np.repeat(offset, samples), np.tile(offset, samples)
+    sy = np.repeat(offset, samples)
+    sx = np.tile(offset, samples)
     place = np.stack([x + sx, y + sy], axis=-1)
     if rng is not None:
         drawn = rng.random((camera.height * camera.width, samples**2, 2))
@@ -133,7 +134,8 @@ def trace_view(
     direction = pixel_rays(place.reshape(-1, 2), camera.K, camera.R, camera.distortion)
     face, barycentric, _ = rays.first_hit(np.broadcast_to(camera.centre, direction.shape), direction)
     hit = np.flatnonzero(face >= 0)
-    corners, weight = np.asarray(surface.faces)[face[hit]].astype(np.int64), barycentric[hit]
+    corners = np.asarray(surface.faces)[face[hit]].astype(np.int64)
+    weight = barycentric[hit]
     normal = np.einsum("nk,nkc->nc", weight, surface.normals[corners])
     position = np.einsum("nk,nkc->nc", weight, surface.vertices[corners])
     with np.errstate(invalid="ignore"):
@@ -175,11 +177,24 @@ def shade_view(
         lamp = _lamp_points(lights, i, disc_samples * view.samples**2)[chosen]
         lit = _lit(scene, view, lamp)
         if surface.disc_included:
-            lamp, lit = np.broadcast_to(lights.position[i], (len(lit), 1, 3)), lit.mean(axis=1, keepdims=True)
-        values = shade_points(
-            view.position, view.normal, view.towards, diffuse, weights, tables,
-            lamp=lamp, lit=lit, axis=lights.axis[i], falloff=float(lights.falloff[i]), eta=surface.eta,
-        ) * lights.intensity[i]  # fmt: skip
+            lamp = np.broadcast_to(lights.position[i], (len(lit), 1, 3))
+            lit = lit.mean(axis=1, keepdims=True)
+        values = (
+            shade_points(
+                view.position,
+                view.normal,
+                view.towards,
+                diffuse,
+                weights,
+                tables,
+                lamp=lamp,
+                lit=lit,
+                axis=lights.axis[i],
+                falloff=float(lights.falloff[i]),
+                eta=surface.eta,
+            )
+            * lights.intensity[i]
+        )
         if escape is not None and glow is not None:
             values = values + escape * view.interpolate(glow[i])
         images[i] = view.image(values)

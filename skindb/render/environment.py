@@ -39,7 +39,8 @@ class Environment:
         """
         pixels, names = read_exr(path)
         if names[:3] != ("R", "G", "B"):
-            rule, cure = "an environment must have the channels R, G and B", "write it as an RGB image"
+            rule = "an environment must have the channels R, G and B"
+            cure = "write it as an RGB image"
             raise InputError(Fault(str(path), rule, ", ".join(names), cure))
         values = pixels[..., :3].astype(np.float64)
         known = np.isfinite(values)
@@ -48,7 +49,8 @@ class Environment:
             rule = "a latitude-longitude image of all directions must be twice as wide as it is high"
             raise InputError(Fault(str(path), rule, f"{width} x {height} pixels", "convert the image"))
         if not known.all() or values.min() < 0 or values.max() == 0:
-            rule, cure = "radiance must be finite, not negative, and not zero everywhere", "correct the image"
+            rule = "radiance must be finite, not negative, and not zero everywhere"
+            cure = "correct the image"
             found = f"{int((~known).sum())} values that are not finite, {int((values < 0).sum())} negative ones"
             found = "zero everywhere" if known.all() and not values.any() else found
             raise InputError(Fault(str(path), rule, found, cure))
@@ -69,8 +71,10 @@ class Environment:
         texel = np.minimum(place, len(self._rising) - 1)
         height, width, _ = self.radiance.shape
         row, column = np.divmod(texel, width)
-        across, down = draw[:, 1], draw[:, 2]
-        top, bottom = np.cos(np.pi * row / height), np.cos(np.pi * (row + 1) / height)
+        across = draw[:, 1]
+        down = draw[:, 2]
+        top = np.cos(np.pi * row / height)
+        bottom = np.cos(np.pi * (row + 1) / height)
         cosine = top + down * (bottom - top)
         turn = 2 * np.pi * ((column + across) / width - 0.5)
         sine = np.sqrt(np.maximum(1 - cosine**2, 0.0))

@@ -60,22 +60,32 @@ def evaluate(model: xr.DataTree, surfel: int, wi: ArrayLike, wo: ArrayLike) -> N
     --------
     >>> f_r = evaluate(model, 1200, wi=[0.0, 0.0, 1.0], wo=[0.0, 0.6, 0.8])  # doctest: +SKIP
     """
-    fitted, basis = model["fitted"].to_dataset(), model["basis"].to_dataset()
+    fitted = model["fitted"].to_dataset()
+    basis = model["basis"].to_dataset()
     check(fitted, (*NEEDED, "refractive_index"), where="fitted")
     check(basis, ("basis_brdf",), where="basis")
     values = _values_of(fitted, surfel)
     to_light, to_camera = np.broadcast_arrays(_unit("wi", wi), _unit("wo", wo))
     shape = to_light.shape
-    to_light, to_camera = to_light.reshape(-1, 3), to_camera.reshape(-1, 3)
+    to_light = to_light.reshape(-1, 3)
+    to_camera = to_camera.reshape(-1, 3)
     normal, diffuse, weight = (
         np.broadcast_to(values[name], (len(to_light), values[name].shape[1]))
         for name in ("shading_normal", "diffuse_reflectance", "basis_weight")
     )
     radiance = shade_points(
-        np.zeros_like(to_light), normal, to_camera, diffuse, weight, kernel_tables(basis),
-        lamp=to_light[:, None], lit=np.ones((len(to_light), 1), np.float32), axis=np.zeros(3), falloff=0.0,
+        np.zeros_like(to_light),
+        normal,
+        to_camera,
+        diffuse,
+        weight,
+        kernel_tables(basis),
+        lamp=to_light[:, None],
+        lit=np.ones((len(to_light), 1), np.float32),
+        axis=np.zeros(3),
+        falloff=0.0,
         eta=float(fitted["refractive_index"]),
-    )  # fmt: skip
+    )
     # for a lamp at a distance of 1 mm, radiance per radiant intensity is f_r cos(theta_i) per mm2
     cosine = np.einsum("nc,nc->n", normal, to_light)[:, None]
     above = (cosine > 0) & (np.einsum("nc,nc->n", normal, to_camera)[:, None] > 0)

@@ -59,7 +59,8 @@ def field_figure(
     at = dict(at or {})
     colour = _colour_dim(found, at)
     chosen = _chosen(found, dict(at), keep=colour)
-    position, triangle = group["surfel_position"].values, take["mesh"].to_dataset()["triangle"].values
+    position = group["surfel_position"].values
+    triangle = take["mesh"].to_dataset()["triangle"].values
     views = [trace_front(position, triangle, turn) for turn in turns]
     who = f"{take.attrs.get('subject') or ''} {take.attrs.get('condition', '')}".strip()
     title = ", ".join([*([who] if take.attrs.get("subject") else []), variable, *(f"{k} {v}" for k, v in at.items())])
@@ -113,10 +114,8 @@ def _colour_images(chosen: xr.DataArray, views: Sequence[View]) -> tuple[list[ND
     values = chosen.transpose("surfel", ...).values.astype(np.float64)
     pictures = [np.stack([_field(view, value, nearest=False) for value in values.T], axis=-1) for view in views]
     if "xyz" in chosen.dims:
-        images, scale = (
-            [np.clip((picture + 1) / 2, 0, 1) for picture in pictures],
-            "red, green, blue = (x + 1, y + 1, z + 1) / 2",
-        )
+        images = [np.clip((picture + 1) / 2, 0, 1) for picture in pictures]
+        scale = "red, green, blue = (x + 1, y + 1, z + 1) / 2"
     else:
         exposure = 1 / _white(np.concatenate([picture.reshape(-1, 3) for picture in pictures]))
         images = [encode_srgb(exposure * picture) for picture in pictures]
@@ -198,8 +197,11 @@ def trace_front(position: Float, triangle: NDArray[np.integer[Any]], turn: float
     shade : ndarray
         (rows, columns) cosine between the triangle's normal and the direction to the viewer; NaN where there is no hit.
     """
-    c, s = np.cos(np.radians(turn)), np.sin(np.radians(turn))
-    right, back = np.array([c, 0, -s]), np.array([s, 0, c])  # rightwards in the picture; towards the viewer
+    c = np.cos(np.radians(turn))
+    s = np.sin(np.radians(turn))
+    # rightwards in the picture; towards the viewer
+    right = np.array([c, 0, -s])
+    back = np.array([s, 0, c])
     used = position[np.unique(triangle)].astype(np.float64)
     place = np.column_stack([used @ right, used[:, 1], used @ back])
     (left, bottom, _), (end, top, front) = place.min(axis=0), place.max(axis=0)
@@ -222,7 +224,8 @@ def _field(view: View, values: Float, *, nearest: bool) -> NDArray[np.float64]:
     """Values (n,) interpolated in a view; NaN beside the face, and where a corner with a weight has no value."""
     corner, weight, shade = view
     if nearest:
-        corner, weight = np.take_along_axis(corner, weight.argmax(axis=-1)[..., None], -1), np.ones((1, 1, 1))
+        corner = np.take_along_axis(corner, weight.argmax(axis=-1)[..., None], -1)
+        weight = np.ones((1, 1, 1))
     with np.errstate(invalid="ignore"):
         picture = np.where(weight > 0, weight * values[corner], 0).sum(axis=-1)
     return np.where(np.isnan(shade), np.nan, picture)
@@ -270,7 +273,8 @@ def _shades(chosen: xr.DataArray) -> tuple[NDArray[np.float64], list[str]]:
     """Numbers (n,) to colour, and for categories their names."""
     values = chosen.values
     if "flag_values" in chosen.attrs:
-        codes, names = np.atleast_1d(chosen.attrs["flag_values"]), str(chosen.attrs["flag_meanings"]).split()
+        codes = np.atleast_1d(chosen.attrs["flag_values"])
+        names = str(chosen.attrs["flag_meanings"]).split()
         met = [i for i, code in enumerate(codes) if (values == code).any()]
         shade = np.full(len(values), np.nan)
         for place, i in enumerate(met):

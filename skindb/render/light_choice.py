@@ -46,7 +46,8 @@ class LightChoice:
 
     def draw(self, view: View, rng: np.random.Generator) -> list[tuple[NDArray[np.int64], Float]]:
         """Indices (n,) and inverse probabilities (n,) of the lights of each hit; LIGHTS_PER_RAY such pairs."""
-        n, count = len(view.pixel), self.probability.shape[1]
+        n = len(view.pixel)
+        count = self.probability.shape[1]
         if count <= LIGHTS_PER_RAY:
             return [(np.full(n, i), np.ones(n)) for i in range(count)]
         x, y, z = np.clip((view.normal.T + 1) * (CELLS / 2), 0, CELLS - 1).astype(np.int64)

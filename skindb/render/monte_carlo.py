@@ -23,7 +23,8 @@ from skindb.render.subsurface import exitance_from_irradiance
 Float = NDArray[np.floating[Any]]
 Image = NDArray[np.float32]
 # rays per pixel and axis in one batch; random numbers are stratified over the rays of a pixel. Environments need more
-RAYS_PER_AXIS, RAYS_PER_AXIS_ENVIRONMENT = 2, 4
+RAYS_PER_AXIS = 2
+RAYS_PER_AXIS_ENVIRONMENT = 4
 MIN_BATCHES = 8  # for an estimate of the variance that can be compared with the target error
 MAX_SAMPLES = 4096  # rays per pixel at which rendering ends even if the target error is not reached
 VERTEX_SAMPLES = 32  # directions of an environment at each vertex in one batch, for subsurface light
@@ -128,12 +129,14 @@ def render_monte_carlo(
         Radiance in the unit of the lights' intensity per mm2, or in that of the environment.
     """
     rays = RayScene(surface.vertices, surface.faces) if scene is None else scene
-    lights, middle = lighting.lights, surface.vertices[surface.known].mean(axis=0)
+    lights = lighting.lights
+    middle = surface.vertices[surface.known].mean(axis=0)
     choice = LightChoice.of_lights(lights, middle) if lights is not None and len(lights) else None
     painter = _Painter(surface, rays, lighting, quality, LobeSampler.of_tables(surface.tables), choice)
     many = lighting.environment is not None and quality.samples >= 2 * RAYS_PER_AXIS_ENVIRONMENT**2
     axis = RAYS_PER_AXIS_ENVIRONMENT if many else RAYS_PER_AXIS
-    per_batch, sums = axis**2, _Sums()
+    per_batch = axis**2
+    sums = _Sums()
     # at least two batches, for the variance
     most = MAX_SAMPLES if quality.error is not None else max(quality.samples, 2 * per_batch)
     while sums.count * per_batch < most:
@@ -167,7 +170,8 @@ class _Painter:
 
     def batch(self, view: View, rng: np.random.Generator) -> Image:
         """One independent estimate of the picture (h, w, 3)."""
-        surface, terms = self.surface, self.quality.terms
+        surface = self.surface
+        terms = self.quality.terms
         subsurface = self.quality.subsurface and "diffuse" in terms
         values = np.zeros((len(view.pixel), 3))
         hits = _Hits(
@@ -192,7 +196,9 @@ class _Painter:
 
     def _by_lights(self, hits: _Hits, choice: LightChoice, rng: np.random.Generator) -> Float:
         """Radiance (n, 3) from a few lights per hit, which are drawn in proportion to the power that arrives there."""
-        view, surface, lights = hits.view, self.surface, choice.lights
+        view = hits.view
+        surface = self.surface
+        lights = choice.lights
         values = np.zeros((len(view.pixel), 3))
         for chosen, weight in choice.draw(view, rng):
             points = points_on_discs(lights, chosen, rng)
@@ -234,7 +240,8 @@ class _Painter:
         """Irradiance (v, 3) under the boundary, F_t(w_i) E, at the vertices; an independent estimate in each batch."""
         surface = self.surface
         known = np.flatnonzero(surface.known)
-        points, normals = surface.vertices[known], surface.normals[known]
+        points = surface.vertices[known]
+        normals = surface.normals[known]
         received = np.zeros((len(known), 3))
         if self.lighting.lights is not None and len(self.lighting.lights):
             received += self._received_from_lights(points, normals, self.lighting.lights, rng)
@@ -267,7 +274,8 @@ class _Painter:
             if i % 2:
                 towards = environment.sample(rng.random((len(points), 3)))
             else:
-                height, turn = np.sqrt(rng.random(len(points))), 2 * np.pi * rng.random(len(points))
+                height = np.sqrt(rng.random(len(points)))
+                turn = 2 * np.pi * rng.random(len(points))
                 sine = np.sqrt(1 - height**2)
                 towards = (sine * np.cos(turn))[:, None] * first + (sine * np.sin(turn))[:, None] * second
                 towards += height[:, None] * normals
@@ -303,8 +311,16 @@ class _Hits:
         view = self.view
         lit = np.asarray(weight, np.float64)
         shaded = shade_points(
-            view.position[rows], view.normal[rows], view.towards[rows], self.diffuse[rows], self.weights[rows],
-            self.tables, lamp=lamp[:, None], lit=np.ones((len(rows), 1), np.float32), axis=np.asarray(axis, np.float64),
-            falloff=float(falloff), eta=eta,
-        )  # fmt: skip
+            view.position[rows],
+            view.normal[rows],
+            view.towards[rows],
+            self.diffuse[rows],
+            self.weights[rows],
+            self.tables,
+            lamp=lamp[:, None],
+            lit=np.ones((len(rows), 1), np.float32),
+            axis=np.asarray(axis, np.float64),
+            falloff=float(falloff),
+            eta=eta,
+        )
         return np.asarray(shaded * lit[:, None])

@@ -61,18 +61,22 @@ def compare_photographs(
     if "photographs" not in capture.children:
         cure = "ingest the capture again with --photographs 4"
         raise InputError(Fault("capture", "must contain kept photographs", "none", cure))
-    kept, dome = capture["photographs"].to_dataset(), capture["dome"].to_dataset()
+    kept = capture["photographs"].to_dataset()
+    dome = capture["dome"].to_dataset()
     check(kept, ("photograph_radiance", "photograph_light", "photograph_camera"), where="photographs")
     surface = from_model(model)
     if subsurface:
         require_translucency(surface)
     scene = RayScene(surface.vertices, surface.faces)
-    cameras, lights = cameras_from_dome(dome), lights_from_dome(dome)
+    cameras = cameras_from_dome(dome)
+    lights = lights_from_dome(dome)
     dark, away = (_held_out(model, what) for what in ("light", "camera"))
-    regions, doubtful = _regions(capture), 1 - surfel_confidence(model["fitted"].to_dataset()).astype(np.float64)
+    regions = _regions(capture)
+    doubtful = 1 - surfel_confidence(model["fitted"].to_dataset()).astype(np.float64)
     results = []
     for i in range(kept.sizes["photograph"]):
-        at_light, at_camera = int(kept["photograph_light"][i]), int(kept["photograph_camera"][i])
+        at_light = int(kept["photograph_light"][i])
+        at_camera = int(kept["photograph_camera"][i])
         camera = cameras[at_camera]
         view = trace_view(surface, camera, samples=samples, scene=scene)
         lamp = lights.select(at_light)
@@ -83,7 +87,8 @@ def compare_photographs(
         mask = (view.coverage >= MIN_COVERAGE) & np.isfinite(photo).all(axis=-1)
         if not mask.any():
             continue  # this camera sees no fitted surfel
-        light, name = str(dome["light"].values[at_light]), str(dome["camera"].values[at_camera])
+        light = str(dome["light"].values[at_light])
+        name = str(dome["camera"].values[at_camera])
         error = compare_images(rendered, photo, mask=mask)
         parts = _by_region(view, regions, rendered, photo, mask, error["exposure"])
         shown = view.image(view.interpolate(doubtful[:, None]))[..., 0]

@@ -105,7 +105,9 @@ def trace_shot(surface: Surface, lamps: Lights, camera: Camera, *, samples: int,
 
 def picture(shot: Shot) -> NDArray[np.float32]:
     """Linear picture (h, w, 3), the sum over the lights."""
-    surface, lamps, plan = shot.surface, shot.lamps, shot.plan
+    surface = shot.surface
+    lamps = shot.lamps
+    plan = shot.plan
     terms = ("surface",) if plan.subsurface else TERMS
     direct = shade_view(shot.view, surface, lamps, shot.scene, terms=terms).sum(axis=0)
     if plan.subsurface:

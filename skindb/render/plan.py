@@ -105,7 +105,8 @@ def plan_scene(
 
 def _with_terms(surface: Surface, terms: tuple[str, ...]) -> Surface:
     """The surface with some terms of its BRDF."""
-    diffuse, weights = surface.diffuse * ("diffuse" in terms), surface.weights * ("surface" in terms)
+    diffuse = surface.diffuse * ("diffuse" in terms)
+    weights = surface.weights * ("surface" in terms)
     return replace(surface, diffuse=diffuse, weights=weights)
 
 
@@ -127,8 +128,10 @@ def without_unused_bases(surface: Surface) -> tuple[Surface, Omissions]:
 
 def covered_pixels(surface: Surface, camera: Camera) -> tuple[Mask, Omissions]:
     """Pixels (h, w) that triangles may cover: those that the box around a projected triangle meets."""
-    faces, view = np.asarray(surface.faces), (camera.K, camera.R, camera.t, camera.distortion)
-    corner, middle = project(surface.vertices, *view)[0][faces], project(surface.vertices[faces].mean(axis=1), *view)[0]
+    faces = np.asarray(surface.faces)
+    view = (camera.K, camera.R, camera.t, camera.distortion)
+    corner = project(surface.vertices, *view)[0][faces]
+    middle = project(surface.vertices[faces].mean(axis=1), *view)[0]
     if not (np.isfinite(corner).all() and np.isfinite(middle).all()):
         return np.ones((camera.height, camera.width), bool), ()  # triangles behind the camera
     # distortion curves edges by about as much as it moves the middle of a triangle
@@ -181,7 +184,9 @@ def notable_lights(
     )
     level = float(np.sqrt(np.mean((light * shown[..., None]).sum(axis=0) ** 2)))
     dropped: list[int] = []
-    total, entered, bound = np.zeros(light.shape[1:]), np.zeros((len(surface.vertices), 3)), 0.0
+    total = np.zeros(light.shape[1:])
+    entered = np.zeros((len(surface.vertices), 3))
+    bound = 0.0
     for i in np.argsort((light**2).sum(axis=(1, 2))) if level > 0 else []:
         total = total + light[i]
         cost = SAFETY * float(np.sqrt(np.mean(total**2))) / level
@@ -190,7 +195,8 @@ def notable_lights(
             cost += float(np.nanmax(entered)) / np.pi / level
         if cost > ERROR_PART * error:
             break
-        dropped, bound = [*dropped, int(i)], cost
+        dropped = [*dropped, int(i)]
+        bound = cost
     if not dropped:
         return lights, ()
     kept = np.ones(len(lights), bool)
@@ -203,16 +209,26 @@ def notable_lights(
 
 def _unshadowed(lights: Lights, surface: Surface, view: View, rows: NDArray[np.int64]) -> Float:
     """Radiance (l, m, 3) of chosen hits under each light, from its centre and without shadows."""
-    diffuse, weights = view.interpolate(surface.diffuse)[rows], view.interpolate(surface.weights)[rows]
+    diffuse = view.interpolate(surface.diffuse)[rows]
+    weights = view.interpolate(surface.weights)[rows]
     lit = np.ones((len(rows), 1), np.float32)
     found = [
         shade_points(
-            view.position[rows], view.normal[rows], view.towards[rows], diffuse, weights, surface.tables, lit=lit,
-            lamp=np.broadcast_to(lights.position[i], (len(rows), 1, 3)), axis=lights.axis[i],
-            falloff=float(lights.falloff[i]), eta=surface.eta,
-        ) * lights.intensity[i]
+            view.position[rows],
+            view.normal[rows],
+            view.towards[rows],
+            diffuse,
+            weights,
+            surface.tables,
+            lit=lit,
+            lamp=np.broadcast_to(lights.position[i], (len(rows), 1, 3)),
+            axis=lights.axis[i],
+            falloff=float(lights.falloff[i]),
+            eta=surface.eta,
+        )
+        * lights.intensity[i]
         for i in range(len(lights))
-    ]  # fmt: skip
+    ]
     return np.stack(found)
 
 

@@ -40,7 +40,8 @@ def subdivide_surface(surface: Surface, spacing: float, shown: NDArray[np.bool_]
     names = [name for name in ("normals", "diffuse", "weights", "s", "sigma_tr") if getattr(surface, name) is not None]
     values = {name: np.asarray(getattr(surface, name), np.float64) for name in names}
     values["shown"] = shown.astype(np.float64)[:, None]
-    vertices, faces = np.asarray(surface.vertices, np.float64), np.asarray(surface.faces, np.int64)
+    vertices = np.asarray(surface.vertices, np.float64)
+    faces = np.asarray(surface.faces, np.int64)
     for _ in range(MAX_LEVELS):
         corners = vertices[faces]
         longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1).max(axis=1)

@@ -219,7 +219,8 @@ def render_picture(
         raise InputError(Fault(str(out), rule, out.suffix or "no suffix", "change the name"))
     keys = ("lights", "environment", "camera")
     where = {"lights": (), "environment": None, "camera": None} | {k: options[k] for k in keys if k in options}
-    subsurface, scale = bool(options.get("subsurface", False)), float(options.get("scale", 1.0))
+    subsurface = bool(options.get("subsurface", False))
+    scale = float(options.get("scale", 1.0))
     if explain:
         how = {key: options[key] for key in ("spacing", "error", "terms") if key in options}
         inputs = render_inputs(model, **where, subsurface=subsurface, scale=scale, **how)
@@ -247,7 +248,8 @@ def fixed_exposure(lighting: Lighting, camera: Camera) -> float:
     mean over all orientations, which counts if the light comes from behind.
     """
     normal = camera.centre / np.linalg.norm(camera.centre)
-    facing, mean = 0.0, 0.0
+    facing = 0.0
+    mean = 0.0
     if lighting.lights is not None:
         lights = lighting.lights
         square = np.square(lights.position).sum(axis=1)
@@ -257,7 +259,8 @@ def fixed_exposure(lighting: Lighting, camera: Camera) -> float:
         mean += float(power.sum()) / 4
     if lighting.environment is not None:
         k = np.arange(DIRECTIONS) + 0.5
-        height, turn = 1 - 2 * k / DIRECTIONS, k * np.pi * (3 - 5**0.5)
+        height = 1 - 2 * k / DIRECTIONS
+        turn = k * np.pi * (3 - 5**0.5)
         sine = np.sqrt(1 - height**2)
         way = np.stack([sine * np.cos(turn), height, sine * np.sin(turn)], axis=1)
         level = lighting.environment.along(way).mean(axis=1)

@@ -67,7 +67,8 @@ class Camera:
         InputError
             For a picture that would not fit into memory.
         """
-        width, height = round(self.width * factor), round(self.height * factor)
+        width = round(self.width * factor)
+        height = round(self.height * factor)
         if not 1 <= width * height <= MAX_PICTURE_PIXELS:
             rule = f"a picture must have 1 to {MAX_PICTURE_PIXELS:,} pixels"
             raise InputError(Fault("scale", rule, f"{width} x {height}", "choose a smaller scale"))
@@ -126,13 +127,15 @@ def from_model(model: xr.DataTree, *, fill: bool = False) -> Surface:
     Surface
         The surface; it has `sigma_tr` only if the model has translucency.
     """
-    fitted, basis = model["fitted"].to_dataset(), model["basis"].to_dataset()
+    fitted = model["fitted"].to_dataset()
+    basis = model["basis"].to_dataset()
     check(fitted, (*NEEDED, "refractive_index"), where="fitted")
     check(basis, ("basis_brdf", "disc_angular_radius"), where="basis")
     values = {name: np.asarray(fitted[name].values) for name in NEEDED}
     if "sigma_tr" in fitted:
         values["sigma_tr"] = np.asarray(fitted["sigma_tr"].values)
-    position, known = values.pop("surfel_position"), usable_surfels(values)
+    position = values.pop("surfel_position")
+    known = usable_surfels(values)
     if not known.any():
         rule = "at least one surfel must be fitted for a picture"
         raise InputError(Fault("fitted[fit_status]", rule, "none", "see the report of the fit"))

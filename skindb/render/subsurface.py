@@ -38,7 +38,8 @@ def transmitted_irradiance(surface: Surface, lights: Lights, scene: RayScene) ->
     light, is in its shadow, or has no known normal.
     """
     known = np.flatnonzero(surface.known)
-    points, normals = surface.vertices[known], surface.normals[known]
+    points = surface.vertices[known]
+    normals = surface.normals[known]
     out = np.zeros((len(surface.vertices), len(lights)), np.float32)
     for i in range(len(lights)):
         towards = lights.position[i] - points
@@ -112,8 +113,13 @@ def _exitances_from_irradiance(
     known = surface.known & np.isfinite(surface.s).all(axis=1) & np.isfinite(surface.sigma_tr).all(axis=1)
     out = np.zeros((irradiance.shape[1], len(surface.vertices), 3), np.float32)
     out[:, known] = subsurface_exitance(
-        surface.vertices[known], vertex_areas(surface.vertices, surface.faces)[known], irradiance[known],
-        surface.s[known], surface.sigma_tr[known], eta=surface.eta, tolerance=tolerance,
+        surface.vertices[known],
+        vertex_areas(surface.vertices, surface.faces)[known],
+        irradiance[known],
+        surface.s[known],
+        surface.sigma_tr[known],
+        eta=surface.eta,
+        tolerance=tolerance,
         receivers=None if wanted is None else wanted[known],
-    )  # fmt: skip
+    )
     return out

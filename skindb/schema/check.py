@@ -29,7 +29,8 @@ def check(ds: xr.Dataset, names: Iterable[str], *, where: str = "dataset") -> No
 
 
 def _faults(ds: xr.Dataset, name: str, where: str) -> list[Fault]:
-    spec, place = VARIABLES[name], f"{where}[{name}]"
+    spec = VARIABLES[name]
+    place = f"{where}[{name}]"
     if name not in ds.variables:
         return [
             Fault(
@@ -39,7 +40,8 @@ def _faults(ds: xr.Dataset, name: str, where: str) -> list[Fault]:
                 f"it is {spec.doc}",
             )
         ]
-    var, faults = ds[name], []
+    var = ds[name]
+    faults = []
     if var.dims != spec.dims:
         faults.append(Fault(place, f"dims must be {spec.dims}", str(var.dims), "transpose or rename them"))
     if not np.can_cast(var.dtype, spec.dtype, "same_kind"):

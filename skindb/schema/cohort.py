@@ -29,8 +29,16 @@ ABSENT: dict[str, int] = {
     "region_mask": -1,
 }
 COMPARED = (
-    "k", "mode", "rank", "eta", "profile", "hold_out_lights", "hold_out_cameras", "dictionary", "dictionary_digest",
-)  # fmt: skip
+    "k",
+    "mode",
+    "rank",
+    "eta",
+    "profile",
+    "hold_out_lights",
+    "hold_out_cameras",
+    "dictionary",
+    "dictionary_digest",
+)
 PARAMETERS = (*COMPARED, "even_reflection")  # the last changes errors alone
 # columns of the catalogue and coordinates of cohorts that are no attributes
 COLUMN = re.compile(

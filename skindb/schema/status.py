@@ -11,7 +11,9 @@ MAX_CONDITION_TRUSTED = 1e3
 MIN_SAMPLES_TRUSTED = 16
 
 
-SMALLEST_R_D, LARGEST_R_D = 1e-4, 0.9999  # estimates outside are clamped to these, and flagged
+# estimates outside are clamped to these, and flagged
+SMALLEST_R_D = 1e-4
+LARGEST_R_D = 0.9999
 
 
 class Explained(IntEnum):

@@ -40,7 +40,8 @@ from skindb.store.requests import REQUEST_NAME, REQUESTS, Request, request_conte
 from skindb.store.verified import Manifest, manifest_from_json
 
 FORMAT = 1
-FILES, STATES = "files", "states"
+FILES = "files"
+STATES = "states"
 CONTENT = re.compile(r"[0-9a-f]{2}/([0-9a-f]{64})")
 STATE = re.compile(r"([0-9]{6})\.json")
 RECORD_KEY = re.compile(rf"log/({KIND})/({TAKE})/[0-9]{{8}}\.json")
@@ -109,7 +110,8 @@ class Archive:
     def require_of(self, place: Place) -> None:
         """Raise an `InputError` unless it is a backup of this database."""
         if require_secret(place) != require_secret(self.place):
-            rule, cure = "all states of a backup must be of the same database", "give another folder"
+            rule = "all states of a backup must be of the same database"
+            cure = "give another folder"
             raise InputError(Fault(self.place.name, rule, "a backup of another database", cure))
 
     def adopt(self, place: Place) -> Markers:
@@ -128,7 +130,8 @@ class Archive:
 
     def state(self, number: int) -> State:
         """A state; `InputError` if it does not exist or is damaged."""
-        key, cure = f"{STATES}/{number:06d}.json", CURE_STATE
+        key = f"{STATES}/{number:06d}.json"
+        cure = CURE_STATE
         if number not in self.numbers():
             found = f"states {', '.join(map(str, self.numbers())) or 'none'}"
             raise InputError(Fault(self.place.name, f"state {number} must exist", found, "see skindb restore --list"))
@@ -285,7 +288,8 @@ def require_apart(backup: Place, database: Place) -> None:
     inner = backup.url(FILES).removesuffix(FILES)
     outer = database.url(FILES).removesuffix(FILES)
     if inner.startswith(outer) or outer.startswith(inner):
-        rule, cure = "a backup must not be inside its database, nor the database inside it", "give another folder"
+        rule = "a backup must not be inside its database, nor the database inside it"
+        cure = "give another folder"
         raise InputError(Fault(backup.name, rule, f"the database {database.name}", cure))
 
 

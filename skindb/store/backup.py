@@ -44,7 +44,8 @@ from skindb.store.requests import REQUESTS, read_requests
 from skindb.store.verified import AS_COMMITTED, CHANGED, CURE, read_manifest
 
 T = TypeVar("T")
-MAX_LISTS, MAX_ATTEMPTS = 100, 20
+MAX_LISTS = 100
+MAX_ATTEMPTS = 20
 LISTED = (REQUESTS, WITHDRAWN, "log", "tombstones", "audit")  # requests first, because they can appear and vanish again
 NEVER_CHANGE = ("audit/", "tombstones/")  # files whose names always have the same content
 Listing = dict[str, Hashable]  # key of a file -> identity
@@ -148,7 +149,8 @@ def _begin(place: Place, archive: Archive) -> None:
     if not dest.file_type(f"{WITHDRAWN}/{BACKUP}"):
         others = [name for name in dest.names() or [] if name not in ("staging", SECRET, WITHDRAWN)]
         if others:
-            rule, cure = "a backup needs an empty folder, or one with a backup", "give another folder"
+            rule = "a backup needs an empty folder, or one with a backup"
+            cure = "give another folder"
             raise InputError(Fault(dest.name, rule, f"other files, such as {others[0]}", cure))
         dest.create(SECRET, place.read_small(SECRET))
         dest.create(f"{WITHDRAWN}/{BACKUP}", b"{}")

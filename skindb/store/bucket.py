@@ -86,7 +86,8 @@ class Bucket:
         make_private(own)
         status = own.lstat()
         if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & 0o077:
-            rule, cure = "must be a folder of this user with permissions 0700", "remove it, or set SKINDB_CACHE"
+            rule = "must be a folder of this user with permissions 0700"
+            cure = "remove it, or set SKINDB_CACHE"
             found = f"a different owner, or permissions {status.st_mode & 0o777:04o}"
             raise InputError(Fault(str(own), rule, found, cure))
         return own
@@ -241,7 +242,8 @@ class Bucket:
         If an answer was lost, the object was created if it has exactly this content. No other writer may therefore
         write the same content under this key, as is the case for a record.
         """
-        path, lost = self._path(key), None
+        path = self._path(key)
+        lost = None
         for pause_s in PAUSES_S:
             try:
                 if self._put_new(path, data):
@@ -333,7 +335,8 @@ class Bucket:
         with suppress(UnavailableError):  # checked with the next object
             if not self._is_conditional and self._put_new(path, data):
                 rule = "the server must support conditional put (If-None-Match)"
-                found, cure = "a server that overwrites objects", "use another server, or a newer version of it"
+                found = "a server that overwrites objects"
+                cure = "use another server, or a newer version of it"
                 raise InputError(Fault(self.name, rule, found, cure))
             self._is_conditional = True
 
@@ -395,7 +398,9 @@ class BucketStore(Store):
 
     def __init__(self, bucket: Bucket, key: str) -> None:
         super().__init__(read_only=False)
-        self.bucket, self.key, self.is_copy = bucket, key, False
+        self.bucket = bucket
+        self.key = key
+        self.is_copy = False
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, BucketStore) and (self.bucket.name, self.key) == (other.bucket.name, other.key)

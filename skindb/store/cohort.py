@@ -25,9 +25,11 @@ if TYPE_CHECKING:
 
 Layout = Literal["tables", "surfels", "maps"]
 GROUP: dict[str, str] = {"tables": "tables", "surfels": "sample", "maps": "maps"}
-SAMPLES, DOME = "reflectance_sample", ("light_position", "camera_position")
+SAMPLES = "reflectance_sample"
+DOME = ("light_position", "camera_position")
 # cached by a process; the tables of a take have some 20 kB, and open groups hold no values
-MAX_OPEN_TABLES, MAX_OPEN_GROUPS = 2048, 512
+MAX_OPEN_TABLES = 2048
+MAX_OPEN_GROUPS = 512
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,8 @@ class Address:
         """The record at this address; `InputError` if its seal differs."""
         record = self.db.record(self.kind, self.take, self.generation)
         if record.seal != self.seal:
-            where, rule = f"{self.kind} of {self.take}", "a version must not change while a cohort refers to it"
+            where = f"{self.kind} of {self.take}"
+            rule = "a version must not change while a cohort refers to it"
             raise InputError(Fault(where, rule, "a different version of that generation", "open the cohort again"))
         return record
 
@@ -171,7 +174,8 @@ def lacking(
     db: Database, kind: str, requests: Iterable[CohortRequest], takes: Iterable[str], *, release: str | None = None
 ) -> list[str]:
     """Takes whose versions of a kind, and the summaries of these versions, lack data that the cohorts need."""
-    known, every = Known(db, release), list(requests)
+    known = Known(db, release)
+    every = list(requests)
     return [
         take for take in takes if any(_stored_record(known, known.record(kind, take), one) is None for one in every)
     ]
@@ -182,12 +186,14 @@ def _members(known: Known, kind: str, takes: Sequence[str] | None) -> tuple[list
     there = sorted(known.takes(kind))
     names = there if takes is None else list(dict.fromkeys(takes))
     if unknown := [take for take in names if take not in there]:
-        rule, cure = f"every take of a cohort must have a {kind}", f"takes with one: {', '.join(there) or 'none'}"
+        rule = f"every take of a cohort must have a {kind}"
+        cure = f"takes with one: {', '.join(there) or 'none'}"
         raise InputError(Fault(take, rule, "none", cure) for take in unknown)
     if not names:
         cure = "run skindb register first" if kind == "registration" else "run skindb fit first"
         raise InputError(Fault(known.db.url, "a study needs fitted takes", f"no {kind}", cure))
-    allowed, skipped = [], []
+    allowed = []
+    skipped = []
     lacks_registration = False
     for take in names:
         if "statistics" not in known.scope(take):
@@ -202,10 +208,12 @@ def _members(known: Known, kind: str, takes: Sequence[str] | None) -> tuple[list
         reason = "it was not registered together with the others; run skindb register"
         skipped += [note(take, reason) for take in others]
     if not allowed:
-        found, cure = "; ".join(note_lines(skipped[:3])), "see skindb consent"
+        found = "; ".join(note_lines(skipped[:3]))
+        cure = "see skindb consent"
         rule = "statistics need takes that consent to them"
         if lacks_registration:
-            rule, cure = "at least one take must have an up-to-date registration", ""
+            rule = "at least one take must have an up-to-date registration"
+            cure = ""
         raise InputError(Fault("population", rule, found, cure))
     return allowed, skipped
 
@@ -258,7 +266,8 @@ def _has_data_for(record: Record, request: CohortRequest) -> bool:
     if contents is None:  # the take of a summary without a sample has no fitted surfels
         return request.layout == "surfels" and record.kind == SUMMARY and "tables" in record.contents
     if request.layout == "surfels":
-        kept, of = contents["sizes"]["surfel"], record.provenance.get("summary_parameters", {})
+        kept = contents["sizes"]["surfel"]
+        of = record.provenance.get("summary_parameters", {})
         whole = kept < int(of.get("surfels", 0))  # fewer than requested: the sample contains all fitted surfels
         return int(of.get("seed", 0)) == request.seed and (kept >= request.surfels or whole)
     return request.layout == "tables" or contents["sizes"]["u"] == request.size
@@ -266,9 +275,12 @@ def _has_data_for(record: Record, request: CohortRequest) -> bool:
 
 def _part(known: Known, record: Record, stored: Record, request: CohortRequest, wanted: Sequence[str] | None) -> Part:
     db = known.db
-    layout, address = request.layout, Address.of(db, stored)
+    layout = request.layout
+    address = Address.of(db, stored)
     contents = stored.contents.get(GROUP[layout], {"variables": [], "sizes": {}, "labels": {}})
-    variables, sizes, labels = list(contents["variables"]), dict(contents["sizes"]), dict(contents["labels"])
+    variables = list(contents["variables"])
+    sizes = dict(contents["sizes"])
+    labels = dict(contents["labels"])
     coords = _coords(known, record.take)
     if layout == "tables":
         return Part(record.take, coords, variables, sizes, labels, StoredTables(address))
@@ -303,7 +315,8 @@ def _dome(db: Database, capture: Record) -> tuple[dict[str, int], dict[str, list
     """Sizes and labels of the lights, cameras and channels of a capture."""
     contents = capture.contents
     if "dome" in contents and "samples" in contents:
-        sizes, labels = dict(contents["dome"]["sizes"]), dict(contents["dome"]["labels"])
+        sizes = dict(contents["dome"]["sizes"])
+        labels = dict(contents["dome"]["labels"])
     else:  # the record of a capture of schema version 1 does not contain them
         dome = _group(Address.of(db, capture), "dome")
         sizes = {str(dim): size for dim, size in dome.sizes.items()}

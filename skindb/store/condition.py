@@ -36,7 +36,10 @@ COMPARISONS: dict[type[ast.cmpop], Callable[[Any, Any], Any]] = {
     ast.GtE: operator.ge,
 }
 ORDER = {ast.Lt, ast.LtE, ast.Gt, ast.GtE}
-TEXT, NUMBER, TRUTH, DATE = "text", "a number", "true or false", "a date"
+TEXT = "text"
+NUMBER = "a number"
+TRUTH = "true or false"
+DATE = "a date"
 REFUSED = {  # the most likely expressions that are not part of the language
     ast.Attribute: "a dot after a name",
     ast.BinOp: "arithmetic",

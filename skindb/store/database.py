@@ -172,7 +172,8 @@ class Database:
         if not markers.admits(record):
             if markers.hides(kind, take):
                 raise self._missing_error(kind, take)
-            what, rule = f"{kind} {record.generation} of {take}", "a version must not refer to a withdrawn subject"
+            what = f"{kind} {record.generation} of {take}"
+            rule = "a version must not refer to a withdrawn subject"
             raise WithdrawnError(Fault(what, rule, "a withdrawal that is not complete", "run skindb refresh"))
         return record
 
@@ -192,7 +193,8 @@ class Database:
         InputError
             If a record is damaged, or is missing without a tombstone.
         """
-        current, log = self.record(kind, take), Log(self._place, kind, take)
+        current = self.record(kind, take)
+        log = Log(self._place, kind, take)
         before = [one for one in log.generations() if one < current.generation]
         if len(before) < current.generation - 1 and (faults := log.faults()[1]):
             raise InputError(faults)
@@ -278,7 +280,8 @@ class Database:
         """
         asked = list(dict.fromkeys(scope))
         if unknown := [name for name in asked if name not in SCOPES]:
-            rule, cure = f"a scope must be one of {', '.join(SCOPES)}", "choose from these"
+            rule = f"a scope must be one of {', '.join(SCOPES)}"
+            cure = "choose from these"
             raise InputError(Fault("scope", rule, ", ".join(map(repr, unknown)), cure))
         self._require_subject(subject)
         with self.stage(CONSENT, subject) as stage:
@@ -423,7 +426,8 @@ class Database:
             if made_from["kind"] == kind and take in (None, made_from["take"]):
                 record = self.record(kind, made_from["take"], made_from["generation"])
                 if made_from.get("seal", record.seal) != record.seal:
-                    rule, found = f"the {kind} it was made from must exist", "a different version of that generation"
+                    rule = f"the {kind} it was made from must exist"
+                    found = "a different version of that generation"
                     raise InputError(Fault(where, rule, found, "compute the version again"))
                 return self.read(kind, made_from["take"], generation=made_from["generation"])
         raise InputError(Fault(where, f"its provenance must name a {kind}", "none", "compute the version again"))
@@ -501,7 +505,8 @@ class Database:
             If `path` is not the path of a version of this take, or if the log cannot be read.
         """
         if not path.startswith(f"data/{kind}/{take}/"):
-            where, rule = f"{self.url}: {path[:200]!r}", f"must be the path of a {kind} of {take}"
+            where = f"{self.url}: {path[:200]!r}"
+            rule = f"must be the path of a {kind} of {take}"
             raise InputError(Fault(where, rule, "a different path", "remove the folder tmp of the database"))
         log = Log(self._place, kind, take)
         if path not in {log.read(generation).path for generation in log.generations()}:
@@ -532,7 +537,8 @@ class Database:
         """
         found: dict[str, dict[str, Any]] = {name: {} for name in ("takes", *INFO_SECTIONS.values())}
         records = RecordCache(self, self._place)
-        known, stale = Known(self, release, records), Staleness(self, records)
+        known = Known(self, release, records)
+        stale = Staleness(self, records)
         whole = Known(self, release)
         chosen = None if takes is None else {*takes}
         if where is not None:
@@ -628,9 +634,11 @@ class Database:
             raise self._missing_error(kind, take)
 
     def _missing_error(self, kind: str, take: str) -> InputError:
-        takes, kinds = self.takes(kind), self.kinds()
+        takes = self.takes(kind)
+        kinds = self.kinds()
         there = f"takes: {', '.join(takes)}" if takes else f"no {kind}; kinds: {', '.join(kinds) or 'none'}"
-        where, rule = f"{self.url}: {kind} of {take}", "the database must hold it"
+        where = f"{self.url}: {kind} of {take}"
+        rule = "the database must hold it"
         return InputError(Fault(where, rule, there, "see skindb info"))
 
     def _summary(self, known: Known, stale: Staleness, kind: str, take: str) -> dict[str, Any]:
@@ -639,7 +647,8 @@ class Database:
             reasons = stale.reasons(record) if kind in DERIVED else ()
         except InputError as error:
             return {"fault": str(error)}
-        path, created = self._place.url(record.path), record.created
+        path = self._place.url(record.path)
+        created = record.created
         summary = {"generation": record.generation, "path": path, "created": created, "bytes": record.bytes}
         if kind == CONSENT:
             return summary | {"scope": list(consent_scope(record.provenance))}

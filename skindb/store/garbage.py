@@ -159,7 +159,8 @@ def _unrecorded(place: Place, kind: str, take: str, now: Clock, *, tombstone_nam
 def _first_pass(place: Place, log: Log, records: list[Record], now: Clock) -> Garbage:
     """The first pass of a fit that was committed, or of a killed fit that can be resumed."""
     data = f"data/{log.kind}/{log.take}"
-    what, kept = "the first pass of a killed fit", _in_use_reason(place, log.kind, log.take)
+    what = "the first pass of a killed fit"
+    kept = _in_use_reason(place, log.kind, log.take)
     if records and _has_model(place, records[-1]):
         what = "the first pass of a fit that was committed"
     elif records:

@@ -25,7 +25,8 @@ class Snapshot:
     """
 
     def __init__(self, db: Database) -> None:
-        self.db, self._markers = db, db.markers()
+        self.db = db
+        self._markers = db.markers()
 
     def takes(self, kind: str) -> list[str]:
         """See `Database.takes`."""

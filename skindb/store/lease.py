@@ -93,23 +93,34 @@ class Lease:
     """
 
     def __init__(
-        self, place: Place, take: str, kinds: tuple[str, ...], *,
-        wait: float = 0.0, seconds: float = LEASE_SECONDS, command: str = "python", clock: Clock = SYSTEM_CLOCK,
-    ) -> None:  # fmt: skip
+        self,
+        place: Place,
+        take: str,
+        kinds: tuple[str, ...],
+        *,
+        wait: float = 0.0,
+        seconds: float = LEASE_SECONDS,
+        command: str = "python",
+        clock: Clock = SYSTEM_CLOCK,
+    ) -> None:
         require_text(take, TAKE, "take")
         if not 0 < seconds <= MAX_LEASE_SECONDS:
             rule = f"the seconds of a lease must be above 0 and at most {MAX_LEASE_SECONDS:.0f}"
             raise ValueError(f"{rule}; found {seconds}")
-        self.place, self.wait, self.seconds = place, wait, seconds
+        self.place = place
+        self.wait = wait
+        self.seconds = seconds
         self.keys = [f"leases/{require_text(kind, KIND, 'kind')}/{take}" for kind in sorted(set(kinds))]
-        self.token, self.command = uuid.uuid4().hex, command
+        self.token = uuid.uuid4().hex
+        self.command = command
         self._clock = clock
         self._held: dict[str, int] = {}  # key -> number of its file
         # key -> last file of another holder, and when it was first seen
         self._seen: dict[str, tuple[tuple[int, float], float]] = {}
         self._content = b""
         self._lost: Fault | None = None
-        self._ended, self._turn = threading.Event(), threading.Lock()
+        self._ended = threading.Event()
+        self._turn = threading.Lock()
         of_subject = {*kinds} - {*KINDS_WITHOUT_SUBJECT}
         self._subjects = [subject_of(take)] if of_subject else []
         self._guard = AdmissionGuard(place, {})
@@ -213,7 +224,8 @@ class Lease:
         if _has_ended(self.place, claim):
             return True
         try:
-            mark, now = (claim.number, self.place.modified(_file_key(claim.key, claim.number))), _uptime()
+            mark = (claim.number, self.place.modified(_file_key(claim.key, claim.number)))
+            now = _uptime()
         except FileNotFoundError:  # removed meanwhile: the next attempt decides
             return False
         if self._seen.get(claim.key, (None, 0.0))[0] != mark:

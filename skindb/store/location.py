@@ -15,7 +15,8 @@ def place_at(url: str) -> Place:
     if url.startswith("s3://"):
         return Bucket(url)
     if "://" in url:
-        scheme, cure = url.partition("://")[0], "give a folder, or s3://BUCKET/PREFIX"
+        scheme = url.partition("://")[0]
+        cure = "give a folder, or s3://BUCKET/PREFIX"
         rule = "a database must be a local folder or an S3 bucket"
         raise InputError(Fault(f"{scheme}://...", rule, "a different URL", cure))
     if Path(url).exists() and not Path(url).is_dir():

@@ -43,8 +43,11 @@ class Log:
     """Log of the versions of one kind of a take, below `log/`."""
 
     def __init__(self, place: Place, kind: str, take: str) -> None:
-        self.place, self.kind, self.take = place, require_text(kind, KIND, "kind"), require_text(take, TAKE, "take")
-        self.key, self.head_key = f"log/{kind}/{take}", f"heads/{kind}/{take}.json"
+        self.place = place
+        self.kind = require_text(kind, KIND, "kind")
+        self.take = require_text(take, TAKE, "take")
+        self.key = f"log/{kind}/{take}"
+        self.head_key = f"heads/{kind}/{take}.json"
         self.what = f"{kind} of {take}"
 
     def generations(self) -> list[int]:
@@ -153,18 +156,22 @@ class Log:
         records: list[Record] = []
         faults: list[Fault] = []
         head = self.head()
-        known, last, seal = self.generations(), 0, ""
+        known = self.generations()
+        last = 0
+        seal = ""
         for generation in known:
             try:
                 record = self._read(generation)
             except InputError as error:
                 faults += error.faults
-                last, seal = generation, "?"
+                last = generation
+                seal = "?"
                 continue
             faults += self._link_faults(record, last, seal)
             faults += [fault] if (fault := self._mismatch_fault(head, record)) else []
             records.append(record)
-            last, seal = generation, record.seal
+            last = generation
+            seal = record.seal
         return records, faults + ([lost] if (lost := self._lost_fault(head, known)) else [])
 
     def readable(self) -> list[Record]:
@@ -197,13 +204,15 @@ class Log:
         return self._tombstone(seal) is not None
 
     def _read(self, generation: int) -> Record:
-        key, cure = self.record_key(generation), RESTORE
+        key = self.record_key(generation)
+        cure = RESTORE
         try:
             return record_from_json(self.place.read_small(key), key)
         except UnavailableError:
             raise
         except LaterError as error:
-            found, cure = f"{error}, written by a later version of skindb", UPDATE
+            found = f"{error}, written by a later version of skindb"
+            cure = UPDATE
         except InputError as error:  # a symbolic link
             found = error.faults[0].found
         except (ValueError, RecursionError) as error:
@@ -214,12 +223,14 @@ class Log:
 
     def _link_faults(self, record: Record, last: int, seal: str) -> list[Fault]:
         """Faults of the link to the previous record, which must exist unless it was removed deliberately."""
-        before, missing = record.previous, record.generation - last - 1
+        before = record.previous
+        missing = record.generation - last - 1
         tombstone = self._tombstone(before)
         if not missing and tombstone is not None:
             return []
         while missing and tombstone is not None:
-            before, missing = tombstone["previous"], missing - 1
+            before = tombstone["previous"]
+            missing = missing - 1
             tombstone = self._tombstone(before)
         if missing:
             lost = f"generation {last + 1}" if missing == 1 else f"generations {last + 1} to {last + missing}"

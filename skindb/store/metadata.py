@@ -9,9 +9,20 @@ from typing import Any
 from skindb.store.record import json_object
 
 DTYPES = {  # bytes per element; that of a string is a reference
-    "bool": 1, "int8": 1, "int16": 2, "int32": 4, "int64": 8, "uint8": 1, "uint16": 2, "uint32": 4, "uint64": 8,
-    "float16": 2, "float32": 4, "float64": 8, "string": 16,
-}  # fmt: skip
+    "bool": 1,
+    "int8": 1,
+    "int16": 2,
+    "int32": 4,
+    "int64": 8,
+    "uint8": 1,
+    "uint16": 2,
+    "uint32": 4,
+    "uint64": 8,
+    "float16": 2,
+    "float32": 4,
+    "float64": 8,
+    "string": 16,
+}
 MAX_CHUNK_BYTES = 1 << 32  # in memory; samples of 4,096 surfels with 300 lights and 32 cameras have 0.24 GB
 MAX_DIMS = 8
 MAX_CODECS = 8  # of an array, and of the chunks inside a shard; skindb writes three
@@ -41,7 +52,8 @@ def _array_faults(meta: dict[str, Any], chunks: int) -> str:
     dtype = meta["data_type"]
     if not isinstance(dtype, str) or dtype not in DTYPES:
         return f"elements of the type {str(dtype)[:80]}"
-    shape, chunk = _lengths(meta["shape"]), _lengths(meta["chunk_grid"]["configuration"]["chunk_shape"])
+    shape = _lengths(meta["shape"])
+    chunk = _lengths(meta["chunk_grid"]["configuration"]["chunk_shape"])
     if len(shape) != len(chunk) or len(shape) > MAX_DIMS or 0 in chunk:
         return f"a shape {list(shape)} with chunks {list(chunk)}"
     if (size := math.prod(chunk) * DTYPES[dtype]) > MAX_CHUNK_BYTES:

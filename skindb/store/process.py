@@ -20,7 +20,9 @@ def this_process() -> dict[str, Any]:
 
 def has_ended(holder: Mapping[str, Any]) -> bool:
     """Whether a process described by `this_process` has certainly ended; False for a process of another machine."""
-    here, number, started = _machine(), holder.get("process"), holder.get("started")
+    here = _machine()
+    number = holder.get("process")
+    started = holder.get("started")
     if not all(here[name] and here[name] == holder.get(name) for name in MACHINE_KEYS):
         return False
     if not isinstance(number, int) or not 0 < number < 1 << 31 or not started:

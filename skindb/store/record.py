@@ -17,9 +17,21 @@ from skindb.store.paths import GROUP, KIND, TAKE, VERSION, subject_of
 
 FORMAT = 3
 FIELDS = {
-    "format", "kind", "take", "generation", "path", "created", "bytes", "provenance", "names", "admissions", "manifest",
-    "tables", "contents", "previous",
-}  # fmt: skip
+    "format",
+    "kind",
+    "take",
+    "generation",
+    "path",
+    "created",
+    "bytes",
+    "provenance",
+    "names",
+    "admissions",
+    "manifest",
+    "tables",
+    "contents",
+    "previous",
+}
 DIGEST = re.compile("[0-9a-f]{64}")
 AS_RECORDED = "the record must agree with the attributes of its version"
 MAX_COUNT = 1 << 53  # number of bytes, or of elements along a dim
@@ -195,7 +207,9 @@ def _is_group(one: object) -> bool:
     """Whether the description of a group has sizes for the dims of all variables, and labels of matching lengths."""
     if not isinstance(one, dict) or one.keys() != {"sizes", "variables", "labels"}:
         return False
-    sizes, variables, labels = one["sizes"], one["variables"], one["labels"]
+    sizes = one["sizes"]
+    variables = one["variables"]
+    labels = one["labels"]
     if not (_is_object(sizes) and _are_texts(variables) and _is_object(labels)):
         return False
     return (

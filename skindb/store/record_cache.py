@@ -30,9 +30,17 @@ FORMAT = 3
 READER_THREADS = 32  # threads that read records; a bucket takes some 20 ms per record, whatever its size
 # parts of a provenance that the catalogue shows or uses
 CACHED_PARTS = (
-    "schema_version", "subject", "condition", "session", "traits", "parameters", "dictionary", "dictionary_digest",
-    "status", "consent_scope",
-)  # fmt: skip
+    "schema_version",
+    "subject",
+    "condition",
+    "session",
+    "traits",
+    "parameters",
+    "dictionary",
+    "dictionary_digest",
+    "status",
+    "consent_scope",
+)
 KINDS_WITH_INPUTS = ("model",)  # not registrations, which name every take: those of 1,000 takes have a million inputs
 CACHED_KINDS = ("capture", *KINDS_WITH_INPUTS, CONSENT)  # kinds whose cached records contain all that `Staleness` needs
 # cached fields of a record
@@ -59,11 +67,16 @@ class RecordCache:
     """
 
     def __init__(self, db: Database, place: Place) -> None:
-        self.db, self.place = db, place
+        self.db = db
+        self.place = place
         with ThreadPoolExecutor(4) as pool:
-            listed, heads = pool.submit(_list_records, place), pool.submit(_list_heads, place)
-            stored, markers = pool.submit(_load_entries, place), pool.submit(read_markers, place)
-        self._files, self._heads, self._markers = listed.result(), heads.result(), markers.result()
+            listed = pool.submit(_list_records, place)
+            heads = pool.submit(_list_heads, place)
+            stored = pool.submit(_load_entries, place)
+            markers = pool.submit(read_markers, place)
+        self._files = listed.result()
+        self._heads = heads.result()
+        self._markers = markers.result()
         entries = stored.result() or {}
         self._entries = _unchanged_entries(entries, self._files)
         self._changed = len(self._entries) != len(entries)
@@ -152,7 +165,8 @@ class RecordCache:
 
     def _read(self, kind: str, take: str, generation: int | None) -> Record:
         """A record from the log, with the checks of `Log.read`."""
-        log, known = Log(self.place, kind, take), self._generations.get((kind, take), [])
+        log = Log(self.place, kind, take)
+        known = self._generations.get((kind, take), [])
         head = self._heads.get((kind, take), ())
         try:
             if generation is None and known:

@@ -30,7 +30,8 @@ def create_release(db: Database, name: str, takes: Sequence[str] | None) -> Reco
     known = db.takes("model")
     names = known if takes is None else list(dict.fromkeys(takes))
     if unknown := [take for take in names if take not in known]:
-        rule, cure = "a release must consist of takes with a model", f"takes with a model: {', '.join(known) or 'none'}"
+        rule = "a release must consist of takes with a model"
+        cure = f"takes with a model: {', '.join(known) or 'none'}"
         raise InputError(Fault(take, rule, "no model", cure) for take in unknown)
     if not names:
         raise InputError(Fault(name, "a release needs fitted takes", "no model", "run skindb fit first"))
@@ -57,11 +58,13 @@ def pinned_record(db: Database | Snapshot | RecordCache, pins: Pins, kind: str, 
     """The record of the version that a release names for a take."""
     if (kind, take) not in pins:
         there = sorted(name for of, name in pins if of == kind)
-        rule, found = f"the release must name a {kind} of this take", f"takes: {', '.join(there) or 'none'}"
+        rule = f"the release must name a {kind} of this take"
+        found = f"takes: {', '.join(there) or 'none'}"
         raise InputError(Fault(take, rule, found, "choose one of these"))
     pin = pins[kind, take]
     record = db.record(kind, take, pin["generation"])
     if record.seal != pin["seal"]:
-        rule, found = f"generation {pin['generation']} of its {kind} must be that of the release", "a different version"
+        rule = f"generation {pin['generation']} of its {kind} must be that of the release"
+        found = "a different version"
         raise InputError(Fault(take, rule, found, "restore it from a backup"))
     return record

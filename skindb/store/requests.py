@@ -22,7 +22,9 @@ from skindb.store.record import json_object, seal_of
 REQUESTS = "requests"
 REQUEST_NAME = r"[0-9a-f]{64}\.json"
 # parameters that name takes: those that a result is limited to, one of a registration, and the versions of a release
-TAKES, REFERENCE, PINS = "takes", "reference", "pins"
+TAKES = "takes"
+REFERENCE = "reference"
+PINS = "pins"
 
 
 @dataclass(frozen=True)

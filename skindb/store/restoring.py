@@ -196,7 +196,8 @@ def _require_empty(place: Place) -> None:
     names = place.names() or []
     others = [name for name in names if name not in (STAGING, WITHDRAWN)]
     if others or place.sizes(WITHDRAWN):
-        rule, cure = "a restore needs an empty or missing folder", "give another folder; nothing was changed"
+        rule = "a restore needs an empty or missing folder"
+        cure = "give another folder; nothing was changed"
         found = "a database or a backup" if {"log", WITHDRAWN} & {*names} else f"other files, such as {others[0]}"
         raise InputError(Fault(place.name, rule, found, cure))
 

@@ -24,7 +24,9 @@ CONNECT_TIMEOUT = timedelta(seconds=5)
 REQUEST_TIMEOUT = timedelta(seconds=120)  # the largest object is a shard of 16 MB, which takes this long at 1 Mbit/s
 RETRY_TIMEOUT = timedelta(seconds=290)  # two requests that time out and a third one; a signature expires after 300 s
 MAX_RETRIES = 10  # half a minute with the pauses below, for servers that restart or limit the rate of requests
-FIRST_PAUSE, LONGEST_PAUSE, PAUSE_GROWTH = timedelta(seconds=0.1), timedelta(seconds=10), 2
+FIRST_PAUSE = timedelta(seconds=0.1)
+LONGEST_PAUSE = timedelta(seconds=10)
+PAUSE_GROWTH = 2
 ENDPOINTS = ("AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL", "AWS_ENDPOINT")
 KEYS = {"access_key_id": "aws_access_key_id", "secret_access_key": "aws_secret_access_key"}
 # environment variables for credentials; other sources are a profile and the metadata service of AWS machines
@@ -78,7 +80,8 @@ def connect(bucket: str, prefix: str) -> S3Store:
         from obstore.exceptions import BaseError
         from obstore.store import S3Store
     except ImportError:
-        rule, cure = "a database in a bucket needs obstore", "pip install 'skindb[s3]'"
+        rule = "a database in a bucket needs obstore"
+        cure = "pip install 'skindb[s3]'"
         raise InputError(Fault(f"s3://{bucket}", rule, "it is not installed", cure)) from None
     settings: dict[str, Any] = {"endpoint": endpoint()} if endpoint() else {}
     if not {"AWS_REGION", "AWS_DEFAULT_REGION"} & os.environ.keys() and "region" in _profile():
@@ -98,7 +101,8 @@ def connect(bucket: str, prefix: str) -> S3Store:
             **settings,
         )
     except (BaseError, ValueError, TypeError):  # the text of the error may contain secret values of variables
-        rule, cure = "the AWS_ variables must have valid values", "correct them"
+        rule = "the AWS_ variables must have valid values"
+        cure = "correct them"
         raise InputError(Fault(f"s3://{bucket}", rule, "an invalid value", cure)) from None
 
 
@@ -116,7 +120,8 @@ def endpoint() -> str:
     parts = urlsplit(found)
     host = parts.hostname or ""
     if not re.fullmatch(r"https?://[^@/?#]+/?", found) or not host:
-        rule, cure = "must be http(s)://HOST:PORT without credentials", "correct it"
+        rule = "must be http(s)://HOST:PORT without credentials"
+        cure = "correct it"
         raise InputError(Fault("AWS_ENDPOINT_URL", rule, "a different URL", cure))
     loopback = host in ("localhost", "::1") or host.startswith("127.")
     if parts.scheme == "http" and not loopback and os.environ.get("AWS_ALLOW_HTTP", "").lower() not in ("1", "true"):
@@ -194,7 +199,8 @@ def _fault(where: str, rule: str, found: str, cure: str) -> UnavailableError:
 
 def _profile() -> dict[str, str]:
     """Settings of the profile AWS_PROFILE, by default "default", from the files of the AWS command line."""
-    name, home = os.environ.get("AWS_PROFILE", ""), Path.home() / ".aws"
+    name = os.environ.get("AWS_PROFILE", "")
+    home = Path.home() / ".aws"
     section = f"profile {name}" if name and name != "default" else "default"
     files = {
         Path(os.environ.get("AWS_CONFIG_FILE") or home / "config"): section,
@@ -206,11 +212,13 @@ def _profile() -> dict[str, str]:
         try:
             parser.read(path, encoding="utf-8")
         except (configparser.Error, UnicodeDecodeError):  # the text of the error repeats lines of the file
-            rule, cure = "must be a configuration file of the AWS command line", "correct it"
+            rule = "must be a configuration file of the AWS command line"
+            cure = "correct it"
             raise InputError(Fault(str(path), rule, "lines that cannot be parsed", cure)) from None
         found |= dict(parser[title]) if title in parser else {}
     if name and not found:
-        rule, cure = "must name a profile of the AWS configuration", "correct it, or unset it"
+        rule = "must name a profile of the AWS configuration"
+        cure = "correct it, or unset it"
         raise InputError(Fault("AWS_PROFILE", rule, repr(name), cure))
     return found
 

@@ -64,7 +64,9 @@ class Stage:
     def __init__(
         self, place: Place, kind: str, take: str, lease: Lease | None = None, names: Iterable[str] = ()
     ) -> None:
-        self.place, self.log, self.lease = place, Log(place, kind, take), lease
+        self.place = place
+        self.log = Log(place, kind, take)
+        self.lease = lease
         names = list(names)
         require_own_subject(kind, take, names)
         self.names = sorted({require_text(name, TAKE, "take") for name in names} - own_takes(kind, take))
@@ -173,7 +175,8 @@ class Stage:
         sizes = {name: size for name, size in self.place.sizes(self.path).items() if size >= 0}
         if gone := [name for name in sorted(self.groups) if f"{name}/zarr.json" not in sizes]:
             rule = "all groups of a version must exist when it is committed"
-            found, cure = f"that another process removed {', '.join(gone)}", "run the command again"
+            found = f"that another process removed {', '.join(gone)}"
+            cure = "run the command again"
             raise InputError(Fault(self.log.what, rule, found, cure))
         files = {name: (self.place.digest(f"{self.path}/{name}"), size) for name, size in sorted(sizes.items())}
         record = Record(
@@ -207,7 +210,8 @@ class Stage:
 
     def _require_named(self, takes: Iterable[str]) -> None:
         """Raise an `InputError` for takes that were not named when the version was begun."""
-        kind, take = self.log.kind, self.log.take
+        kind = self.log.kind
+        take = self.log.take
         unnamed = sorted({*takes} - {*self.names} - own_takes(kind, take))
         if kind not in KINDS_OF_ONE_SUBJECT and unnamed:
             rule = "a version must name the takes that it refers to before it is written"
@@ -229,7 +233,8 @@ class Stage:
     def _discard(self) -> None:
         """Remove what was written; of a withdrawn subject also the folder, whose name is the pseudonym."""
         remove_version(self.place, self.path)
-        kind, take = self.log.kind, self.log.take
+        kind = self.log.kind
+        take = self.log.take
         subjects = subjects_of(kind, take, ())
         markers = read_markers(self.place)
         if any(markers.is_withdrawn(subject) for subject in subjects):
@@ -298,7 +303,8 @@ def _faults(name: str, ds: xr.Dataset) -> list[Fault]:
     require_text(name, GROUP, "group")
     names = [str(v) for v in ds.data_vars]
     unknown = [v for v in names if v not in VARIABLES]
-    rule, cure = "a stored variable must be declared in the schema", "declare or drop it"
+    rule = "a stored variable must be declared in the schema"
+    cure = "declare or drop it"
     faults = [Fault(f"{name}[{v}]", rule, "an unknown name", cure) for v in unknown]
     try:
         check(ds, [v for v in names if v not in unknown], where=name)
@@ -347,7 +353,8 @@ def _encoding(array: xr.DataArray) -> dict[str, Any]:
         return plain
     rest = array.shape[1:]
     # reading a chunk takes at least a millisecond, whatever its size
-    row, chunk = array.dtype.itemsize * int(np.prod(rest)), MIN_CHUNK_SURFELS
+    row = array.dtype.itemsize * int(np.prod(rest))
+    chunk = MIN_CHUNK_SURFELS
     while chunk < SHARD and chunk * row < MIN_CHUNK_BYTES:
         chunk *= 2
     # a shard is allocated in full, so that of a small take is no larger than the array

@@ -66,7 +66,9 @@ class Staleness:
     """
 
     def __init__(self, db: Database, cache: RecordCache | None = None) -> None:
-        self.db, self._cache, self._snapshot = db, cache, Snapshot(db)
+        self.db = db
+        self._cache = cache
+        self._snapshot = Snapshot(db)
         self._known: dict[tuple[str, str, int], tuple[Reason, ...]] = {}
         self._newest: dict[tuple[str, str], int] = {}
         self._covered: dict[str, bool] = {}
@@ -84,7 +86,9 @@ class Staleness:
         return self._known[key]
 
     def _input_reasons(self, record: Record, one: Mapping[str, Any]) -> Iterator[Reason]:
-        kind, take, generation = str(one["kind"]), str(one["take"]), int(one["generation"])
+        kind = str(one["kind"])
+        take = str(one["take"])
+        generation = int(one["generation"])
         try:
             made_from = self._records(kind).record(kind, take, generation)
         except UnavailableError:
@@ -140,7 +144,8 @@ def require_fresh(db: Database, kind: str, take: str, generation: int | None = N
         If an input was withdrawn or cannot be read, or if the consent of its subject no longer covers statistics.
     """
     record = db.record(kind, take, generation)
-    what, reasons = f"{kind} {record.generation} of {take}", Staleness(db).reasons(record)
+    what = f"{kind} {record.generation} of {take}"
+    reasons = Staleness(db).reasons(record)
     if refused := [reason for reason in reasons if reason.why != "superseded"]:
         rule = "its inputs must exist and be covered by consent"
         cure = CURE_DAMAGE if any(reason.why == "unreadable" for reason in refused) else CURE
@@ -156,7 +161,8 @@ def stale_versions(db: Database) -> list[tuple[Record, tuple[Reason, ...]]]:
     Damaged versions and results that were made from them are omitted, because results that are computed again would
     lack the damaged data.
     """
-    staleness, found = Staleness(db), []
+    staleness = Staleness(db)
+    found = []
     for kind in DERIVED:
         for take in db.takes(kind):
             try:

@@ -163,7 +163,8 @@ class VerifiedStore(Store):
     def _require_plausible(self, key: str, content: bytes) -> None:
         """Raise an `InputError` for metadata that do not match the chunk files."""
         if found := metadata_faults(content, self._chunks[key.rpartition("/")[0]]):
-            where, rule = self.place.where(f"{self.record.path}/{key}"), "the metadata of an array must match its files"
+            where = self.place.where(f"{self.record.path}/{key}")
+            rule = "the metadata of an array must match its files"
             raise InputError(Fault(where, rule, found, "compute the version again"))
 
     def _require_files(self) -> None:

@@ -50,7 +50,8 @@ def database_faults(place: Place) -> list[Fault]:
         try:
             readable, broken = log.faults()
         except InputError as error:  # a link in place of the folder of a take
-            readable, broken = [], list(error.faults)
+            readable = []
+            broken = list(error.faults)
         partly_removed = partly_removed_records(log, readable, tombstone_names)
         records += readable
         faults += broken
@@ -76,7 +77,8 @@ def _withdrawn_faults(place: Place) -> list[Fault]:
     left += [f"{record.kind} {record.generation} of {record.take}" for record in holdings.versions]
     left += [place.where(key) for key in (*holdings.unrecorded, *holdings.caches)]
     left += [*map(str, holdings.requests), *map(str, holdings.scratch)]
-    rule, cure = "nothing of a withdrawn subject must remain", "run skindb clean --yes"
+    rule = "nothing of a withdrawn subject must remain"
+    cure = "run skindb clean --yes"
     return [Fault(where, rule, "data that the withdrawal did not remove, or that came later", cure) for where in left]
 
 
@@ -114,7 +116,8 @@ def _input_faults(place: Place, records: list[Record], damaged: set[str]) -> lis
     faults = []
     for record in records:
         for one in record.made_from:
-            log, generation = Log(place, one["kind"], one["take"]), one["generation"]
+            log = Log(place, one["kind"], one["take"])
+            generation = one["generation"]
             if log.what in damaged or not one.get("seal") or log.is_removed(one["seal"]):
                 continue
             if seals.get((log.kind, log.take, generation)) != one["seal"]:

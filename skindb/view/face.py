@@ -93,7 +93,8 @@ def face_record(
     honour_consent(model.attrs, "export")
     surface = _surface(model, edited=bool(traits))[0]
     if (count := surface.tables.shape[-1]) > MAX_BASES:
-        rule, cure = f"the viewer needs at most {MAX_BASES} bases", f"fit again with --k {MAX_BASES} or less"
+        rule = f"the viewer needs at most {MAX_BASES} bases"
+        cure = f"fit again with --k {MAX_BASES} or less"
         raise InputError(Fault(take, rule, str(count), cure))
     values = _values(surface)
     uv = model["fitted"].to_dataset()["surfel_uv"].values.astype(np.float32)
@@ -192,8 +193,10 @@ def _values(surface: Surface) -> dict[str, Float]:
 def _trait(trait: Trait, plain: Mapping[str, Float]) -> dict[str, Any]:
     """Change of the arrays by a trait: differences of weights, log ratios of albedo and diffusion length."""
     whole, half = (_values(from_model(tree, fill=True)) for tree in (trait.whole, trait.half))
-    ratio = {name: np.log(np.maximum(whole[name], MIN_ALBEDO) / np.maximum(plain[name], MIN_ALBEDO))
-             for name in ("albedo", "diffusion")}  # fmt: skip
+    ratio = {
+        name: np.log(np.maximum(whole[name], MIN_ALBEDO) / np.maximum(plain[name], MIN_ALBEDO))
+        for name in ("albedo", "diffusion")
+    }
     between = plain["albedo"] * np.exp(0.5 * ratio["albedo"])
     error = float(np.median(np.abs(between / half["albedo"] - 1)))
     moves = ratio | {name: whole[name] - plain[name] for name in ("weightA", "weightB")}

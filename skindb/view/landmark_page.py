@@ -97,7 +97,8 @@ def _save(task: LandmarkTask, asked: dict[str, Any]) -> dict[str, Any]:
 
 def _mesh(task: LandmarkTask) -> bytes:
     """Bytes of positions and normals (float32), triangles (uint32) and colours (uint8), in this order."""
-    vertices, faces = task.scan.vertices, task.scan.faces
+    vertices = task.scan.vertices
+    faces = task.scan.faces
     normal = np.nan_to_num(vertex_normals(vertices, faces))
     parts = [vertices.astype("<f4"), normal.astype("<f4"), faces.astype("<u4")]
     return b"".join(part.tobytes() for part in parts) + (b"" if task.colours is None else task.colours.tobytes())

@@ -79,7 +79,8 @@ def reread_task(task: LandmarkTask) -> LandmarkTask:
     InputError
         If one of the files cannot be read.
     """
-    found, box = _existing(task.out), _existing(crop_path(task.out))
+    found = _existing(task.out)
+    box = _existing(crop_path(task.out))
     crop = None if not box else parsed_crop(box, str(crop_path(task.out)))
     return replace(task, points=parsed_points(found, str(task.out)), crop=crop)
 
@@ -104,7 +105,8 @@ def parsed_points(value: Any, where: str) -> dict[str, NDArray[np.float64]]:
     """
     if not isinstance(value, dict):
         raise InputError(Fault(where, "must be a JSON object {name: [x, y, z]}", type(value).__name__, "correct it"))
-    rule, cure = "a landmark must be [x, y, z] in mm", "correct it, or remove it"
+    rule = "a landmark must be [x, y, z] in mm"
+    cure = "correct it, or remove it"
     wrong = [Fault(f"{where}[{name}]", rule, str(p), cure) for name, p in value.items() if not is_point(p)]
     if wrong:
         raise InputError(wrong)
@@ -138,7 +140,8 @@ def _outside(where: str, points: Points, crop: Crop | None) -> list[Fault]:
     if crop is None or crop.low is None or crop.high is None:
         return []
     out = [name for name, p in points.items() if (p < crop.low).any() or (p > crop.high).any()]
-    rule, cure = "a landmark must be inside the crop box", "enlarge the box, or move the point"
+    rule = "a landmark must be inside the crop box"
+    cure = "enlarge the box, or move the point"
     return [Fault(f"{where}[{name}]", rule, "a point outside", cure) for name in out]
 
 

@@ -44,7 +44,8 @@ def write_page(out: Path, record: Mapping[str, Any], still: str, *, surroundings
     faces = f'<script type="application/json" id="face-{html.escape(take)}">{embedded_json(record)}</script>'
     text = _page(f"skindb: {take}", [{"take": take, "title": take, "still": still}], faces, surroundings)
     if (size := len(text.encode())) > MAX_PAGE_BYTES:
-        rule, cure = f"a page must have at most {MAX_PAGE_BYTES // 1_000_000} MB", "fit with a larger --spacing"
+        rule = f"a page must have at most {MAX_PAGE_BYTES // 1_000_000} MB"
+        cure = "fit with a larger --spacing"
         raise InputError(Fault(str(out), rule, f"{size / 1e6:.0f} MB", cure))
     private_file(out).write_text(text, encoding="utf-8")
     return size

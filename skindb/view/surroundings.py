@@ -61,7 +61,8 @@ def distant_lights(environment: Environment, count: int = COUNT) -> DistantLight
         if totals[most] <= 0:
             break
         regions += _halves(bright, regions.pop(most))
-    mean, azimuth = (polar[:-1] + polar[1:]) / 2, 2 * np.pi * ((np.arange(width) + 0.5) / width - 0.5)
+    mean = (polar[:-1] + polar[1:]) / 2
+    azimuth = 2 * np.pi * ((np.arange(width) + 0.5) / width - 0.5)
     towards = np.stack(
         [
             np.sin(mean)[:, None] * np.sin(azimuth),
@@ -81,8 +82,10 @@ def distant_lights(environment: Environment, count: int = COUNT) -> DistantLight
 def _halves(bright: Float, region: tuple[int, int, int, int]) -> list[tuple[int, int, int, int]]:
     """A region (rows a to b, columns c to d), divided into two parts of equal brightness."""
     a, b, c, d = region
-    part, across = bright[a:b, c:d], np.pi * ((a + b) / 2) / bright.shape[0]
-    high, wide = (b - a) / bright.shape[0], 2 * (d - c) / bright.shape[1] * np.sin(across)
+    part = bright[a:b, c:d]
+    across = np.pi * ((a + b) / 2) / bright.shape[0]
+    high = (b - a) / bright.shape[0]
+    wide = 2 * (d - c) / bright.shape[1] * np.sin(across)
     if b - a > 1 and (high >= wide or d - c == 1):
         rising = np.cumsum(part.sum(axis=1))
         cut = a + 1 + min(int(np.searchsorted(rising, rising[-1] / 2)), b - a - 2)

@@ -32,7 +32,9 @@ from skindb.virtual.sensor import Sensor
 from skindb.virtual.skin import MATERIALS, Skin, skin_of
 
 Array = NDArray[np.float64]
-TRUE_SPACING, SCAN_SPACING = 1.5, 3.6  # mm
+# mm
+TRUE_SPACING = 1.5
+SCAN_SPACING = 3.6
 SCAN_NOISE = 0.08  # mm each, smooth and white
 DEVICE_SEED = 2005
 SCAN_REGIONS = ("forehead", "nose", "cheek", "lips", "chin", "neck", "beard")
@@ -104,7 +106,10 @@ class _Steps:
     """Counts steps for the progress callback."""
 
     def __init__(self, stage: str, total: int, progress: Progress | None) -> None:
-        self.stage, self.total, self.progress, self.done = stage, total, progress, 0
+        self.stage = stage
+        self.total = total
+        self.progress = progress
+        self.done = 0
 
     def __call__(self) -> None:
         self.done += 1

@@ -159,25 +159,42 @@ class EmulatedDome(Emulated):
         clock: Clock = SYSTEM_CLOCK,
     ) -> None:
         super().__init__(faults, clock=clock)
-        self.lights, self._trigger = lights, trigger
-        self.state, self.reason, self.steps = "idle", "", list[_Step]()
+        self.lights = lights
+        self._trigger = trigger
+        self.state = "idle"
+        self.reason = ""
+        self.steps = list[_Step]()
         self.on: str | None = None  # light that is on
-        self.base, self._start, self._runs, self._done, self._stuck = 0, 0.0, 0, 0, ""
+        self.base = 0
+        self._start = 0.0
+        self._runs = 0
+        self._done = 0
+        self._stuck = ""
         self.interlock_closed = True
 
     def handle(self, verb: str, values: dict[str, str]) -> dict[str, object]:
         """The verbs of a light controller."""
         if verb == "HELLO":
             return {
-                "kind": self.kind, "name": "emulated", "firmware": "1", "protocol": PROTOCOL,
+                "kind": self.kind,
+                "name": "emulated",
+                "firmware": "1",
+                "protocol": PROTOCOL,
                 "lights": ",".join(self.lights),
-            }  # fmt: skip
+            }
         if verb in ("CLEAR", "STEP", "ARM") and self.state == "running":
             raise RefusedError("a sequence is running")
         known = {
-            "CLEAR": self._clear, "STEP": self._add, "PLAN": self._plan, "ARM": self._arm, "START": self._begin,
-            "STATUS": self._status, "BEAT": lambda _: {}, "STOP": lambda _: self._halt("stop"), "REPORT": self._report,
-        }  # fmt: skip
+            "CLEAR": self._clear,
+            "STEP": self._add,
+            "PLAN": self._plan,
+            "ARM": self._arm,
+            "START": self._begin,
+            "STATUS": self._status,
+            "BEAT": lambda _: {},
+            "STOP": lambda _: self._halt("stop"),
+            "REPORT": self._report,
+        }
         if verb not in known:
             raise RefusedError(f"unknown verb {verb}")
         return known[verb](values)
@@ -208,7 +225,8 @@ class EmulatedDome(Emulated):
         return b""
 
     def _light(self, step: _Step) -> None:
-        step.lit, self.on = True, step.light
+        step.lit = True
+        self.on = step.light
         lost = self._runs == 1 and self._done in self.faults.lost_triggers
         level = 0.5 if step.light == self.faults.dim_light else 1.0
         wrong = {self._stuck: 1.0} if self._stuck else {}
@@ -224,10 +242,15 @@ class EmulatedDome(Emulated):
     def _dark(self, step: _Step) -> None:
         if step.light in (self.faults.stuck_light, self.faults.silently_stuck_light):
             self._stuck = step.light
-        self.on, self._done = self._stuck or None, self._done + 1
+        self.on = self._stuck or None
+        self._done = self._done + 1
 
     def _clear(self, values: dict[str, str]) -> dict[str, object]:
-        self.steps, self.state, self.reason, self._done, self.base = [], "idle", "", 0, int(values.get("base", "0"))
+        self.steps = []
+        self.state = "idle"
+        self.reason = ""
+        self._done = 0
+        self.base = int(values.get("base", "0"))
         return {}
 
     def _add(self, values: dict[str, str]) -> dict[str, object]:
@@ -276,7 +299,8 @@ class EmulatedDome(Emulated):
     def _halt(self, reason: str) -> dict[str, object]:
         self.on = None
         if self.state in ("running", "armed"):
-            self.state, self.reason = "stopped", reason
+            self.state = "stopped"
+            self.reason = reason
         return {}
 
     def _report(self, values: dict[str, str]) -> dict[str, object]:
@@ -323,10 +347,13 @@ class EmulatedProbe(Emulated):
         if verb == "HELLO":
             return {"kind": self.kind, "name": "emulated", "firmware": "1", "protocol": PROTOCOL}
         if verb == "PUMP":
-            self.target, self._since, self._next = float(values["kpa"]), now, now
+            self.target = float(values["kpa"])
+            self._since = now
+            self._next = now
             self._lit = np.inf
         elif verb == "LED":
-            self.led, self._lit = values["on"] == "1", now
+            self.led = values["on"] == "1"
+            self._lit = now
         elif verb == "EXPOSE":
             self._expose(values["exposure"], int(values["us"]) / 1e6)
         elif verb == "STATUS":
@@ -374,7 +401,9 @@ class EmulatedProbe(Emulated):
             self._triggers = 1
 
     def _release(self) -> None:
-        self.led, self.target, self._until = False, 0.0, 0.0
+        self.led = False
+        self.target = 0.0
+        self._until = 0.0
 
 
 class DirectPort:

@@ -12,7 +12,9 @@ from skindb.errors import Fault, InputError
 
 Array = NDArray[np.float64]
 CENTRE = np.array([0.0, -8.0, 45.0])  # of the dome in the subject frame, mm
-LIGHT_RADIUS, CAMERA_RADIUS = 880.0, 830.0  # mm
+# mm
+LIGHT_RADIUS = 880.0
+CAMERA_RADIUS = 830.0
 DISC_RADIUS = 12.5  # mm
 INTENSITY = 6.0e7  # radiance mm2
 HEAD = np.array([96.0, 138.0, 92.0])  # half axes of the ellipsoid that every camera frames, mm
@@ -162,5 +164,6 @@ def _look_at(eye: Array, target: Array, roll: float) -> Array:
     right = np.cross(forward, [0.0, 1.0, 0.0])
     right /= np.linalg.norm(right)
     down = np.cross(forward, right)
-    c, s = np.cos(roll), np.sin(roll)
+    c = np.cos(roll)
+    s = np.sin(roll)
     return np.stack([c * right + s * down, c * down - s * right, forward])

@@ -49,7 +49,9 @@ class FaceShape:
 def field(points: Array, shape: FaceShape) -> Array:
     """Approximate signed distance (n,) mm of `points` (n, 3) to the skin, negative inside; smooth near the skin."""
     # one row per axis, as NumPy is slow for sums over a short last axis
-    x, y, z = points[:, 0] / shape.width, points[:, 1] / shape.height, points[:, 2]
+    x = points[:, 0] / shape.width
+    y = points[:, 1] / shape.height
+    z = points[:, 2]
     x = x - shape.asymmetry * np.cos(y / 35.0 + 1.0)
     q = np.stack([np.sqrt(x * x + 1.0), y, z])  # mirrored, and smooth at the midline
     distance = _skull(q, shape)
@@ -69,7 +71,9 @@ def normals(points: Array, shape: FaceShape) -> Array:
 def _ellipsoid(p: Array, centre: tuple[float, ...] | Array, radii: tuple[float, ...]) -> Array:
     x, y, z = ((p[i] - centre[i]) / radii[i] for i in range(3))
     length = np.sqrt(x * x + y * y + z * z + 1e-9)
-    x, y, z = x / radii[0], y / radii[1], z / radii[2]
+    x = x / radii[0]
+    y = y / radii[1]
+    z = z / radii[2]
     return np.asarray(length * (length - 1) / np.sqrt(x * x + y * y + z * z + 1e-12))
 
 
@@ -79,7 +83,9 @@ def _cone(p: Array, a: tuple[float, ...] | Array, b: tuple[float, ...] | Array, 
     x, y, z = (p[i] - a[i] for i in range(3))
     along = np.clip((x * axis[0] + y * axis[1] + z * axis[2]) / (axis @ axis), 0, 1)
     along = along * along * (3 - 2 * along)  # soft at both ends
-    x, y, z = x - along * axis[0], y - along * axis[1], z - along * axis[2]
+    x = x - along * axis[0]
+    y = y - along * axis[1]
+    z = z - along * axis[2]
     return np.asarray(np.sqrt(x * x + y * y + z * z) - ra - along * (rb - ra))
 
 
@@ -158,7 +164,9 @@ def _nose(p: Array, d: Array, s: FaceShape) -> Array:
 
 
 def _mouth(p: Array, d: Array, s: FaceShape) -> Array:
-    y, w, full = s.mouth_height, s.mouth_width, s.lip_fullness
+    y = s.mouth_height
+    w = s.mouth_width
+    full = s.lip_fullness
     bow = -0.0045 * p[0] ** 2 + 1.2 * np.exp(-0.5 * ((p[0] - 6) / 4) ** 2)
     q = np.stack([p[0], p[1] - bow, p[2] + 0.014 * p[0] ** 2])
     upper = _ellipsoid(q, (0, y + 3.2, 102.0), (w, 5.6 + 3.4 * full, 9.2 + 3.4 * full))

@@ -21,7 +21,10 @@ def landmark_directions(shape: FaceShape, centre: Array) -> dict[str, Array]:
 
 
 def _landmarks(s: FaceShape) -> dict[str, tuple[float, float]]:
-    tip, y, e, w = s.nose_tip, s.mouth_height, s.eye_distance, s.mouth_width
+    tip = s.nose_tip
+    y = s.mouth_height
+    e = s.eye_distance
+    w = s.mouth_width
     middle = {
         "forehead_centre": 96.0,
         "nasion": 42.0,
@@ -53,11 +56,13 @@ def _front(flat: Array, shape: FaceShape) -> Array:
     depth = np.linspace(150, 20, 131)
     line = np.concatenate([np.repeat(flat, len(depth), axis=0), np.tile(depth, len(flat))[:, None]], axis=1)
     inside = np.argmax((field(line, shape) < 0).reshape(len(flat), -1), axis=1)
-    low, high = depth[inside], depth[inside - 1]
+    low = depth[inside]
+    high = depth[inside - 1]
     for _ in range(30):
         middle = (low + high) / 2
         below = field(np.column_stack([flat, middle]), shape) < 0
-        low, high = np.where(below, middle, low), np.where(below, high, middle)
+        low = np.where(below, middle, low)
+        high = np.where(below, high, middle)
     return np.column_stack([flat, low])
 
 
@@ -70,8 +75,11 @@ def _soft(value: Array, width: float) -> Array:
 def region_membership(points: Array, shape: FaceShape) -> dict[str, Array]:
     """Membership in [0, 1] of points (n, 3) in each region of `REGIONS`."""
     s = shape
-    x, y, z = np.abs(points[:, 0]) / s.width, points[:, 1] / s.height, points[:, 2]
-    tip, mouth = s.nose_tip, s.mouth_height
+    x = np.abs(points[:, 0]) / s.width
+    y = points[:, 1] / s.height
+    z = points[:, 2]
+    tip = s.nose_tip
+    mouth = s.mouth_height
     front = _soft(z - 20, 12)
     down = np.clip((44 - y) / (44 - tip[1] + 14), 0, 1)
     nose_half = 7.0 + (s.nose_width - 0.5) * down**1.6
@@ -96,7 +104,8 @@ def _lips(x: Array, y: Array, z: Array, s: FaceShape) -> Array:
     line = s.mouth_height + mouth_line(x)
     taper = np.sqrt(np.clip(1 - (x / (s.mouth_width - 0.5)) ** 2, 0, 1))
     bow = 1.0 + 0.22 * np.exp(-0.5 * ((x - 6) / 4) ** 2) - 0.1 * np.exp(-0.5 * (x / 3) ** 2)
-    upper, lower = (5.2 + 3.2 * s.lip_fullness) * taper * bow, (6.6 + 3.6 * s.lip_fullness) * taper
+    upper = (5.2 + 3.2 * s.lip_fullness) * taper * bow
+    lower = (6.6 + 3.6 * s.lip_fullness) * taper
     return (
         _soft(upper - (y - line), 0.9) * _soft(lower + (y - line), 0.9) * _soft(taper - 0.08, 0.08) * _soft(z - 70, 8)
     )
@@ -114,6 +123,7 @@ def _moustache(x: Array, y: Array, mouth: float) -> Array:
 
 def _lashes(points: Array, shape: FaceShape) -> Array:
     """How dark the closed lids' lashes make each point, 0 to 1."""
-    x, y = np.abs(points[:, 0]) / shape.width, points[:, 1] / shape.height
+    x = np.abs(points[:, 0]) / shape.width
+    y = points[:, 1] / shape.height
     across = np.exp(-0.5 * ((y - lid_height(x, shape) + 0.6) / 1.3) ** 2)
     return np.asarray(across * _soft(14.5 - np.abs(x - shape.eye_distance), 2) * _soft(points[:, 2] - 60, 8))

@@ -23,7 +23,8 @@ FRAMES = "dome/frames/{exposure}/{light}_{camera}.png"
 DARK = "dome/dark/{exposure}_{camera}.png"
 WHITE = "dome/white/{exposure}/{light}_{camera}.png"
 DARK_AVERAGE = 16
-TARGET_REFLECTANCE, TARGET_HALF_SIZE = 0.99, 60.0
+TARGET_REFLECTANCE = 0.99
+TARGET_HALF_SIZE = 60.0
 TARGET_NORMAL = np.array([0.0, 0.0, 1.0])
 
 
@@ -55,7 +56,9 @@ def photograph(
     step
         Called after each camera.
     """
-    scene, lights, white = RayScene(surface.vertices, surface.faces), render_lights(dome), frontal_camera(dome)
+    scene = RayScene(surface.vertices, surface.faces)
+    lights = render_lights(dome)
+    white = frontal_camera(dome)
     for exposure in EXPOSURES:
         for template in (FRAMES, DARK, WHITE):
             make_private((folder / template.format(exposure=exposure, light="l", camera="c")).parent)
@@ -65,9 +68,15 @@ def photograph(
     def shoot(camera: DomeCamera, own: np.random.Generator, stream: np.random.Generator) -> None:
         pattern = sensor.pattern((camera.height, camera.width, 3), rng=own)
         images = render_view(
-            surface, _render_camera(camera), lights, samples=1, disc_samples=1, subsurface=subsurface, scene=scene,
+            surface,
+            _render_camera(camera),
+            lights,
+            samples=1,
+            disc_samples=1,
+            subsurface=subsurface,
+            scene=scene,
             glow=glow,
-        )  # fmt: skip
+        )
         writer = _FrameWriter(folder, camera, sensor, pattern, stream)
         for light, image in zip(dome.lights, images, strict=True):
             writer.write(FRAMES, light.name, image)
@@ -89,7 +98,11 @@ class _FrameWriter:
     def __init__(
         self, folder: Path, camera: DomeCamera, sensor: Sensor, pattern: Image, rng: np.random.Generator
     ) -> None:
-        self.folder, self.camera, self.sensor, self.pattern, self.rng = folder, camera, sensor, pattern, rng
+        self.folder = folder
+        self.camera = camera
+        self.sensor = sensor
+        self.pattern = pattern
+        self.rng = rng
         self.gain = _vignette(camera)
 
     def write(self, template: str, light: str, radiance: Image, *, averaged: int = 1) -> None:

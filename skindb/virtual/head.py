@@ -54,7 +54,8 @@ def parametric_head(shape: FaceShape, *, spacing_mm: float = 1.6, jitter: float 
     Head
         Vertices lie on the true surface; one boundary loop, the topology of a disc.
     """
-    rows, columns = max(round(270 / spacing_mm), 8), max(round(285 / spacing_mm), 8)
+    rows = max(round(270 / spacing_mm), 8)
+    columns = max(round(285 / spacing_mm), 8)
     near = _project(_resample(_relaxed_grid(shape), rows, columns, jitter, seed), shape, rounds=2)
     vertices = _project(near, shape, rounds=3)
     marks = landmark_directions(shape, CENTRE)
@@ -86,7 +87,8 @@ def _resample(grid: Array, rows: int, columns: int, jitter: float, seed: int) ->
     if jitter:
         move = np.random.default_rng(seed).uniform(-jitter, jitter, (2, rows, columns))
         move[:, [0, -1]] = move[:, :, [0, -1]] = 0
-        v, u = v + move[0] / rows, u + move[1] / columns
+        v = v + move[0] / rows
+        u = u + move[1] / columns
     axes = np.linspace(0, 1, COARSE[0]), np.linspace(0, 1, COARSE[1])
     spline = (RectBivariateSpline(*axes, grid[..., k]) for k in range(3))
     return np.stack([f.ev(v.ravel(), u.ravel()) for f in spline], axis=1)
@@ -148,7 +150,10 @@ def _settle(points: Array, shape: FaceShape) -> Array:
 def _grid_faces(rows: int, columns: int) -> NDArray[np.int64]:
     """Two triangles per cell, diagonals alternating."""
     index = np.arange(rows * columns).reshape(rows, columns)
-    a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
+    a = index[:-1, :-1]
+    b = index[:-1, 1:]
+    c = index[1:, 1:]
+    d = index[1:, :-1]
     even = ((np.arange(rows - 1)[:, None] + np.arange(columns - 1)) % 2 == 0)[..., None]
     first = np.where(even, np.stack([a, d, c], -1), np.stack([a, d, b], -1))
     second = np.where(even, np.stack([a, c, b], -1), np.stack([d, c, b], -1))

@@ -83,7 +83,8 @@ def _checked(path: Path, model: HeadModel) -> HeadModel:
 
 
 def _plain(a: Mapping[str, NDArray[Any]]) -> HeadModel:
-    names, vertex = a.get("landmark_names", np.array([])), a.get("landmark_vertex", np.array([]))
+    names = a.get("landmark_names", np.array([]))
+    vertex = a.get("landmark_vertex", np.array([]))
     landmarks = {str(n): int(v) for n, v in zip(names, vertex, strict=True)}
     return HeadModel(a["vertices"].astype(float), a["faces"].astype(np.int64), landmarks, _regions(a))
 

@@ -98,14 +98,23 @@ def cohort_people(subjects: int = 87, *, conditions: Sequence[str] = (), seed: i
         ancestries, gender, _, youngest, oldest, worn, i = kinds[order[number % len(kinds)]]
         rng = np.random.default_rng([seed, number])
         male = gender == "male"
-        age, ancestry = int(rng.integers(youngest, oldest + 1)), ancestries[i % len(ancestries)]
+        age = int(rng.integers(youngest, oldest + 1))
+        ancestry = ancestries[i % len(ancestries)]
         shadow = rng.uniform(0.0, 0.8) * min(max(age - 14, 0) / 6, 1.0) if male else 0.0  # boys have none
         freckles = rng.uniform(0.0, 0.6) if ancestry == "european" else 0.0
         person = Person(
-            f"P{number + 1:03d}", age, gender, ancestry, int(rng.integers(2**31)), worn[i % len(worn)],
-            beard_density=round(float(shadow), 2), freckles=round(float(freckles), 2),
-            melanin=float(rng.normal(0, 1)), blood=float(rng.normal(0, 1)), fullness=float(rng.uniform(0.3, 0.7)),
-        )  # fmt: skip
+            f"P{number + 1:03d}",
+            age,
+            gender,
+            ancestry,
+            int(rng.integers(2**31)),
+            worn[i % len(worn)],
+            beard_density=round(float(shadow), 2),
+            freckles=round(float(freckles), 2),
+            melanin=float(rng.normal(0, 1)),
+            blood=float(rng.normal(0, 1)),
+            fullness=float(rng.uniform(0.3, 0.7)),
+        )
         people += [person, *(replace(person, condition=one) for one in conditions if one != person.condition)]
     return people
 
@@ -118,7 +127,8 @@ def face_shape(person: Person) -> FaceShape:
     """
     z = person.stream(1).standard_normal(18)
     male = 1.0 if person.gender == "male" else 0.0
-    african, asian = float(person.ancestry == "african"), float(person.ancestry == "east_asian")
+    african = float(person.ancestry == "african")
+    asian = float(person.ancestry == "east_asian")
     south = float(person.ancestry == "south_asian")
     age = np.clip((person.age - 30) / 45, 0, 1)
     child = np.clip((18 - person.age) / 10, 0, 1)

@@ -19,13 +19,24 @@ from skindb.virtual.sensor import Sensor, write_png
 from skindb.virtual.skin import Site
 
 Array = NDArray[np.float64]
-FIBRES, FIRST, PITCH, FIBRE_RADIUS = 28, 1.0, 0.5, 0.25  # mm
-BRACKETS, LONGEST = 23, 24.0  # seconds; 2/3 stop apart
+# mm
+FIBRES = 28
+FIRST = 1.0
+PITCH = 0.5
+FIBRE_RADIUS = 0.25
+# seconds; 2/3 stop apart
+BRACKETS = 23
+LONGEST = 24.0
 SIGNAL = 1300.0  # full scales per second and mm^-2 at gain 1
-COLUMNS, CELL, SPOT, INSIDE = 7, 16, 5.0, 4.0  # fibres a row of the image, pixels
+# fibres a row of the image, pixels
+COLUMNS = 7
+CELL = 16
+SPOT = 5.0
+INSIDE = 4.0
 GAIN_ERROR = 0.004
 BIN = 0.025  # mm, width of the rings of the profile: reproduces the variance of faces of 0.25 mm within 2 %
-PACKETS, WALK_SEED = 160_000, 20050701
+PACKETS = 160_000
+WALK_SEED = 20050701
 SOURCES = ("skindb.optics._walk_kernels", "skindb.optics.random_walk", "skindb.virtual.probe")
 SMOOTH = 0.15  # expected change of slope of log(r^2 R) from fibre to fibre, per mm of spacing over r
 PROBE_SENSOR = Sensor(black=512, white=65535, step=1, full_well=90000.0, read_noise=8.0, pattern_noise=4.0)
@@ -58,18 +69,21 @@ def fibre_profiles(walk: Walk, sites: Sequence[Site]) -> ProbeTruth:
     edges: Array = BIN * np.arange(round((distance[-1] + 1.0) / BIN) + 1, dtype=np.float64)
     middle = (edges[:-1] + edges[1:]) / 2
     face = _disc_shares(middle, distance) @ _disc_shares(middle, middle)
-    profile, error = np.empty((len(sites), FIBRES, 3)), np.empty((len(sites), FIBRES, 3))
+    profile = np.empty((len(sites), FIBRES, 3))
+    error = np.empty((len(sites), FIBRES, 3))
     for i, site in enumerate(sites):
         for c in range(3):
             mean, deviation = radial_profile(walk, site.sigma_a[c], site.sigma_s_prime[c], edges)
-            value, sigma = face @ mean, np.sqrt(face**2 @ deviation**2)
+            value = face @ mean
+            sigma = np.sqrt(face**2 @ deviation**2)
             profile[i, :, c], error[i, :, c] = _smooth(distance, value, sigma), sigma
     return ProbeTruth(distance, profile, error)
 
 
 def _disc_shares(middle: Array, distance: Array) -> Array:
     """Fraction (n, ring) of each ring around a point that lies inside a face at each of n distances."""
-    r, d = middle[None, :], distance[:, None]
+    r = middle[None, :]
+    d = distance[:, None]
     arc = 2 * r * np.arccos(np.clip((r * r + d * d - FIBRE_RADIUS**2) / (2 * r * d), -1, 1))
     return np.asarray(arc / arc.sum(axis=1, keepdims=True))
 
@@ -129,7 +143,8 @@ def _layout(rng: np.random.Generator) -> tuple[Array, Array]:
     """Centres (fibre, 2) px, and spots (fibre, y, x): 1 within INSIDE of the centre, a soft edge, 0 before the next."""
     index = np.arange(FIBRES)
     centre = np.stack([index % COLUMNS, index // COLUMNS], axis=1) * CELL + CELL / 2 + rng.normal(0, 0.3, (FIBRES, 2))
-    height, width = CELL * (FIBRES // COLUMNS), CELL * COLUMNS
+    height = CELL * (FIBRES // COLUMNS)
+    width = CELL * COLUMNS
     y, x = np.mgrid[:height, :width] + 0.5
     distance = np.hypot(x - centre[:, 0, None, None], y - centre[:, 1, None, None])
     # a compact edge, as a bright fibre must not leak into a neighbour that is five decades darker

@@ -25,7 +25,8 @@ from skindb.virtual.sensor import Sensor
 
 def session_time(person: Person) -> datetime:
     """A fixed time that depends only on the person and the condition."""
-    days, minutes = person.seed % 365, 40 * CONDITIONS.index(person.condition)
+    days = person.seed % 365
+    minutes = 40 * CONDITIONS.index(person.condition)
     return datetime(2005, 1, 10, 9, 0, tzinfo=UTC) + timedelta(days=days, minutes=minutes)
 
 

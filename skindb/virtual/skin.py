@@ -106,13 +106,15 @@ def skin_of(head: Head, person: Person, *, material_albedo: Array, eta: float) -
 
 def _diffuse_reflectance(head: Head, person: Person, effect: ConditionEffect) -> Array:
     """Group and site mean, moved along the melanin and haemoglobin axes; then hair."""
-    group, m = (person.ancestry, person.gender), head.membership
+    group = (person.ancestry, person.gender)
+    m = head.membership
     weight = np.stack([m[site] for site in SITES], axis=1) + 1e-6
     weight[:, SITES.index("cheek")] += np.clip(1 - weight.sum(axis=1), 0, 1)  # everywhere else
     weight[:, SITES.index("cheek")] += m["lips"]
     log = (weight / weight.sum(axis=1, keepdims=True)) @ np.log(np.array(MEAN[group]))
     melanin, blood = _pigment(head, person)
-    melanin, blood = (1 - effect.even) * melanin, (1 - effect.even) * blood
+    melanin = (1 - effect.even) * melanin
+    blood = (1 - effect.even) * blood
     old = np.clip((person.age - 30) / 50, 0, 1)
     melanin += SPREAD[group] * person.melanin + 0.08 * old + effect.melanin
     blood += BLOOD_SPREAD * person.blood + effect.blood
@@ -125,7 +127,8 @@ def _diffuse_reflectance(head: Head, person: Person, effect: ConditionEffect) ->
 
 def _pigment(head: Head, person: Person) -> tuple[Array, Array]:
     """Melanin and blood of each vertex about the mean, log green: mottling, freckles, age spots, flushed cheeks."""
-    rng, p = person.stream(2), head.vertices
+    rng = person.stream(2)
+    p = head.vertices
     melanin = sum(
         (a * smooth_noise(p, w, rng=rng) for w, a in ((60, 0.03), (20, 0.03), (8, 0.03), (4, 0.025))), 0 * p[:, 0]
     )
@@ -146,7 +149,8 @@ def _pigment(head: Head, person: Person) -> tuple[Array, Array]:
 
 def _hair(head: Head, person: Person) -> Array:
     """Fraction of light (n, 3) that brows, lashes and beard stubble absorb."""
-    rng, m = person.stream(3), head.membership
+    rng = person.stream(3)
+    m = head.membership
     strands = np.clip(1 + 0.35 * smooth_noise(head.vertices, 3.0, rng=rng), 0.2, 1.6)
     brow = np.clip((0.62 if person.gender == "male" else 0.5) * m["brow"] * strands, 0, 0.85)
     lash = 0.6 * m.get("lash", 0 * brow)
@@ -157,7 +161,8 @@ def _hair(head: Head, person: Person) -> Array:
 
 def _weights(head: Head, person: Person, effect: ConditionEffect, material_albedo: Array) -> Array:
     """Smooth non-negative weights with the wanted specular albedo at normal incidence."""
-    rng, p = person.stream(4), head.vertices
+    rng = person.stream(4)
+    p = head.vertices
     names = [name for name in GLOSS if name in head.membership]
     member = np.stack([head.membership[name] for name in names], axis=1)
     rest = np.clip(1 - member.sum(axis=1), 0, 1)
@@ -174,7 +179,8 @@ def _weights(head: Head, person: Person, effect: ConditionEffect, material_albed
 
 def _sites(head: Head, person: Person, diffuse: Array, effect: ConditionEffect, eta: float) -> tuple[Site, ...]:
     """The probe's sites: sigma_tr about table 2, and the coefficients it and the local R_d imply (paper, section 9)."""
-    rng, own = person.stream(5), person.stream(6).lognormal(0, 0.12)
+    rng = person.stream(5)
+    own = person.stream(6).lognormal(0, 0.12)
     sites = []
     for name, mean in SIGMA_TR.items():
         local = rng.lognormal(0, 0.06) * rng.lognormal(0, 0.03, 3)

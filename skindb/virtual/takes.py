@@ -53,7 +53,8 @@ def simulate_takes(
     dome = build_dome(lights, cameras, width=width, height=height, rng=np.random.default_rng(DEVICE_SEED))
     everybody = default_people() if people is None else people
     for i in range(len(everybody))[:takes] if isinstance(takes, int) else takes:
-        person, rng = replace(everybody[i], head_file=head), np.random.default_rng([seed, i])
+        person = replace(everybody[i], head_file=head)
+        rng = np.random.default_rng([seed, i])
         folders.append(out / person.take)
         simulate_take(folders[-1], person, dome, subsurface=subsurface, rng=rng, progress=progress)
     return folders

@@ -28,7 +28,8 @@ class Recovery:
 
     def summary(self) -> dict[str, object]:
         """Medians and 95 % quantiles over fitted surfels."""
-        angle, error = self.normal_angle[self.fitted], np.abs(self.diffuse_error[self.fitted])
+        angle = self.normal_angle[self.fitted]
+        error = np.abs(self.diffuse_error[self.fitted])
         sites = {site: np.round(100 * value, 1).tolist() for site, value in self.sigma_tr_error.items()}
         return {
             "normal_median_deg": round(float(np.nanmedian(angle)), 2),

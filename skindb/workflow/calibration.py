@@ -71,7 +71,8 @@ def calibrate(
         With every fault of the folder.
     """
     key = require_text(name, NAME, "name of a calibration")
-    dome, groups = read_setup_dome(Path(setup)), dict[str, xr.Dataset]()
+    dome = read_setup_dome(Path(setup))
+    groups = dict[str, xr.Dataset]()
     if frames := read_calibration_frames(dome):
         if frames.ball is not None:
             groups["position_calibration"] = calibrate_positions(dome, frames.ball)
@@ -94,12 +95,15 @@ def calibrated_capture(db: Database, capture: Capture) -> Capture:
         return capture
     if not db.has(CALIBRATION, capture.calibration):
         there = ", ".join(db.takes(CALIBRATION)) or "none"
-        rule, cure = "the database must hold the calibration that it names", "run skindb calibrate first"
+        rule = "the database must hold the calibration that it names"
+        cure = "run skindb calibrate first"
         where = f"{capture.folder / 'capture.json'}[calibration]"
         raise InputError(Fault(where, rule, f"{capture.calibration}; calibrations: {there}", cure))
     record = db.record(CALIBRATION, capture.calibration)
     stored = db.read(CALIBRATION, capture.calibration, generation=record.generation)
-    dome, probe, where = capture.dome, capture.probe, f"calibration {capture.calibration}"
+    dome = capture.dome
+    probe = capture.probe
+    where = f"calibration {capture.calibration}"
     for group, apply in APPLIED.items():
         if dome is not None and group in stored.children:
             dome = apply(dome, stored[group].to_dataset(), where=where)
@@ -115,7 +119,8 @@ def describe_calibration(db: Database, record: Record) -> dict[str, Any]:
     relative = (now["calibrated_intensity_error"] / now["calibrated_intensity"]).max("channel")
     about: dict[str, Any] = {"lights": now.sizes["light"], "largest_relative_error": float(relative.max())}
     if "glare_fraction" in now:  # calibrations of earlier versions have none
-        position, glare = now["calibrated_intensity_position_error"], now["glare_fraction"]
+        position = now["calibrated_intensity_position_error"]
+        glare = now["glare_fraction"]
         about |= {"position_error": float(position.median()), "glare": float(glare.median())}
         about["total_relative_error"] = float(np.sqrt(relative**2 + position**2 + glare**2).max())
     if record.generation > 1:

@@ -46,12 +46,14 @@ class Expected:
     def require(self, worker: str) -> None:
         """Raise an `InputError` if this process, which is the named worker, has something else."""
         if (self.version, self.code) != (__version__, method_digest()):
-            rule, found = f"must run the same skindb as this process ({self.version})", f"version {__version__}"
+            rule = f"must run the same skindb as this process ({self.version})"
+            found = f"version {__version__}"
             found += "" if __version__ != self.version else " with other source code"
             raise InputError(Fault(f"worker {worker}", rule, found, "install the same version, restart the worker"))
         if self.token and not Path(self.token).is_file():
             folder = str(Path(self.token).parent.parent)
-            rule, cure = f"must see the database {folder}", "use a folder that all machines share"
+            rule = f"must see the database {folder}"
+            cure = "use a folder that all machines share"
             raise InputError(Fault(f"worker {worker}", rule, "no such folder, or another one", cure))
 
 
@@ -72,7 +74,8 @@ def connected(address: str) -> Iterator[Client]:
     try:
         from distributed import Client
     except ImportError as error:
-        rule, cure = "needs the package distributed", "run: pip install 'skindb[cluster]'"
+        rule = "needs the package distributed"
+        cure = "run: pip install 'skindb[cluster]'"
         raise InputError(Fault("--scheduler", rule, str(error), cure)) from None
     try:
         where = json.loads(Path(address).read_text())["address"] if address.endswith(".json") else address
@@ -80,7 +83,8 @@ def connected(address: str) -> Iterator[Client]:
             apart.submit(asyncio.run, _greet(where)).result()
         client = Client(where, timeout=CONNECT_SECONDS, set_as_default=False)
     except Exception as error:  # noqa: BLE001  of any kind: the file and the server are not ours
-        rule, cure = "a Dask scheduler must answer there", "check the address, and that `dask scheduler` runs"
+        rule = "a Dask scheduler must answer there"
+        cure = "check the address, and that `dask scheduler` runs"
         raise InputError(Fault(address, rule, f"{type(error).__name__}: {str(error) or 'no answer'}", cure)) from None
     with client:
         yield client
@@ -128,10 +132,12 @@ def _require_workers(client: Client, expected: Expected) -> None:
     except InputError:
         raise
     except Exception as error:  # noqa: BLE001  workers without skindb, or that were lost
-        rule, cure = "every worker must have skindb and answer", "install it in the environment of the workers"
+        rule = "every worker must have skindb and answer"
+        cure = "install it in the environment of the workers"
         raise InputError(Fault("cluster", rule, f"{type(error).__name__}: {error}", cure)) from None
     if not checked:
-        rule, cure = "a study needs workers", "start one: dask worker ADDRESS"
+        rule = "a study needs workers"
+        cure = "start one: dask worker ADDRESS"
         raise InputError(Fault("cluster", rule, "the scheduler has none", cure))
 
 
@@ -245,10 +251,12 @@ def _answer(future: Future, client: Client) -> bytes | Exception:
         raise
     except CancelledError:
         where = str(client.scheduler.address if client.scheduler else "the scheduler")
-        rule, cure = "the scheduler must answer until the work is done", "start it, and run the command again"
+        rule = "the scheduler must answer until the work is done"
+        cure = "start it, and run the command again"
         raise InputError(Fault(where, rule, "the connection was lost", cure)) from None
     except ImportError as error:
-        rule, cure = "every worker must have skindb", "install it in the environment of the workers"
+        rule = "every worker must have skindb"
+        cure = "install it in the environment of the workers"
         raise InputError(Fault("cluster", rule, str(error), cure)) from None
     except Exception as error:  # noqa: BLE001  the call could not be sent, or its worker was lost
         return error

@@ -132,11 +132,15 @@ def edit_grid(
     dict
         Label -> edited model at the last strength, which is described in `edit_report` and `trait_notes`.
     """
-    source, tell = editable_model(db, take, study, dictionary), progress or silent
+    source = editable_model(db, take, study, dictionary)
+    tell = progress or silent
     require_consent({**source.model.attrs, "take": take}, "export")
     options.setdefault("scale", _grid_scale(source.model))
     plain = radiance_of(source.model, **options).radiance
-    pictures, last, done, steps = {}, {}, 0, len(rows) * len(strengths)
+    pictures = {}
+    last = {}
+    done = 0
+    steps = len(rows) * len(strengths)
     tell("edits", 0, steps)
     for label, amounts in rows.items():
         pictures[label] = [plain]
@@ -233,7 +237,8 @@ def _sides(edited: xr.DataTree) -> str:
 def editable_model(db: Database, take: str, study: str | None, dictionary: Path | None) -> Editable:
     """A model of a database with what moves it along the traits of a study."""
     study = _trait_study(db, study)
-    model, vectors = db.read("model", take), db.read(STUDY, study)
+    model = db.read("model", take)
+    vectors = db.read(STUDY, study)
     require_consent({**model.attrs, "take": take}, "statistics")
     require_fresh(db, STUDY, study)
     names = [str(name) for name in model["fitted"].to_dataset()["dictionary"].values]

@@ -25,9 +25,20 @@ from skindb.workflow.summaries import sample_groups, summary_digest, tables_of
 
 # modules and subpackages that decide the numbers of a fit
 METHOD = (
-    "fit", "numerics", "optics", "elementwise", "schema/status", "schema/brdf", "_compiled", "_vectors",
-    "_blas", "_half_kernels", "_select_kernels", "geometry/rays", "geometry/_ray_kernels",
-)  # fmt: skip
+    "fit",
+    "numerics",
+    "optics",
+    "elementwise",
+    "schema/status",
+    "schema/brdf",
+    "_compiled",
+    "_vectors",
+    "_blas",
+    "_half_kernels",
+    "_select_kernels",
+    "geometry/rays",
+    "geometry/_ray_kernels",
+)
 
 
 @logged("fit")
@@ -72,7 +83,8 @@ def fit_take(
         be fitted. Nothing is committed then.
     """
     db.record("capture", take, generation)  # before anything is written for a take that there is not
-    asked, method = parameters or FitParameters(), method_digest(METHOD)
+    asked = parameters or FitParameters()
+    method = method_digest(METHOD)
     with db.lease(take, "model", wait=wait, command="skindb fit") as lease, one_blas_thread():
         capture = db.read("capture", take, generation=generation)
         require_consent({"consent_scope": db.consent(take), "take": take}, "fit")  # the newest record decides
@@ -207,7 +219,8 @@ def parameters_of(
         return FitParameters(**given)
     own = db.record("model", take).provenance
     if dictionary is None and own.get("dictionary", EMBEDDED) != EMBEDDED:
-        rule, cure = "a refit uses the dictionary of the model", "name it with --dictionary, or fit without --refit"
+        rule = "a refit uses the dictionary of the model"
+        cure = "name it with --dictionary, or fit without --refit"
         raise InputError(Fault(take, rule, f"no dictionary for a model made with {own['dictionary']!r}", cure))
     return replace(_requested(own), **given)
 
@@ -216,7 +229,8 @@ def current_model(db: Database, take: str) -> Record | None:
     """The newest model of a take if it was made from the newest capture."""
     if not db.has("model", take):
         return None
-    record, newest = db.record("model", take), db.record("capture", take).generation
+    record = db.record("model", take)
+    newest = db.record("capture", take).generation
     made_from = record.provenance.get("inputs", [])
     return record if any(one["kind"] == "capture" and one["generation"] == newest for one in made_from) else None
 

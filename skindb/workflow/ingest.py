@@ -66,9 +66,11 @@ def ingest_take(
         ingests or fits the take, or if the subject was withdrawn and no new consent is given.
     """
     if db.folder is not None and Path(folder).resolve() in (db.folder.resolve(), *db.folder.resolve().parents):
-        rule, cure = "a database lies outside the captures it holds", "choose another folder for the database"
+        rule = "a database lies outside the captures it holds"
+        cure = "choose another folder for the database"
         raise InputError(Fault(db.url, rule, f"the capture {folder} around it", cure))
-    capture, asked = calibrated_capture(db, read_capture(folder, crop=crop)), IngestParameters(**parameters)
+    capture = calibrated_capture(db, read_capture(folder, crop=crop))
+    asked = IngestParameters(**parameters)
     scratch = db.scratch() / scratch_name(capture, asked)
     with logged_action(db, "ingest", [capture.take], arguments={"new_consent": new_consent is not None}):
         if new_consent is not None:

@@ -123,5 +123,6 @@ def _model(db: Database, take: str, generation: int | None, *, edited: bool = Fa
 
 def _require_outside(db: Database, out: Path) -> None:
     if db.folder is not None and db.folder.resolve() in (out.resolve(), *out.resolve().parents):
-        rule, cure = "pictures and exports are written outside of the database", "choose another folder"
+        rule = "pictures and exports are written outside of the database"
+        cure = "choose another folder"
         raise InputError(Fault(str(out), rule, f"a place inside {db.url}", cure))

@@ -73,7 +73,8 @@ def register_takes(
         require_consent({"consent_scope": db.consent(take), "take": take}, "statistics")
     names = takes_with_landmarks(db, takes)
     if not names:
-        found, cure = "no take has any", "name the 20 points in the capture's landmarks.json"
+        found = "no take has any"
+        cure = "name the 20 points in the capture's landmarks.json"
         raise InputError(Fault(db.url, "a registration needs landmarks", found, cure))
     if done := _registered_alike(db, names, reference or ""):
         return done
@@ -105,7 +106,8 @@ def takes_with_landmarks(db: Database, takes: Sequence[str] | None = None) -> li
     known = db.takes("model")
     names = known if not takes else list(dict.fromkeys(takes))
     if not names:
-        rule, cure = "a study needs fitted takes", "run skindb fit first"
+        rule = "a study needs fitted takes"
+        cure = "run skindb fit first"
         raise InputError(Fault(db.url, rule, "no model", cure))
     return [take for take in names if "statistics" in db.consent(take) and _has_landmarks(db, db.record("model", take))]
 

@@ -62,7 +62,8 @@ def plan_session(
         setup = read_setup(laboratory.subject if laboratory else options["setup"])
     plan = _plan(setup, options, virtual=laboratory is not None)
     schedule = planned_schedule(setup, plan)
-    found, brackets = assess(schedule), setup.brackets
+    found = assess(schedule)
+    brackets = setup.brackets
     lines = [f"{len(setup.lights)} lights, {len(setup.exposures)} exposures, {len(setup.cameras)} cameras: {found}"]
     if brackets:
         each = f"{len(brackets)} exposures of together {sum(brackets.values()):.0f} s"
@@ -104,8 +105,10 @@ def capture_session(
         setup = read_setup(laboratory.subject if laboratory else options["setup"])
         # what ingest cannot read is refused before the subject is there; the session takes its own dark frames
         read_setup_dome(setup.folder, white=False, dark=False)
-        plan, override = _plan(setup, options, virtual=laboratory is not None), _override(options)
-        subject, files = _subject(options, laboratory), _files(options, laboratory)
+        plan = _plan(setup, options, virtual=laboratory is not None)
+        override = _override(options)
+        subject = _subject(options, laboratory)
+        files = _files(options, laboratory)
         read_scan(files["mesh"])
         devices = stack.enter_context(_devices(setup, plan, options, laboratory))
         put = laboratory.place if laboratory else None
@@ -154,7 +157,8 @@ def _require_options(options: Mapping[str, Any], needed: tuple[str, ...]) -> Non
 
 def _subject_faults(options: Mapping[str, Any]) -> list[Fault]:
     """Faults of the options that describe the subject, by the rules of ingest."""
-    faults, traits = list[Fault](), dict[str, Any]()
+    faults = list[Fault]()
+    traits = dict[str, Any]()
     for text in options["traits"]:
         name, equals, _ = text.partition("=")
         if not name or not equals:
@@ -175,12 +179,14 @@ def _subject_faults(options: Mapping[str, Any]) -> list[Fault]:
 
 
 def _operator_faults(options: Mapping[str, Any]) -> list[Fault]:
-    operator, confirmed = options["operator"], options["confirm_screening"]
+    operator = options["operator"]
+    confirmed = options["confirm_screening"]
     if operator is not None and not re.fullmatch(IDENTIFIER.pattern, operator):
         return [Fault("--operator", IDENTIFIER.said, repr(operator), "correct it")]
     if operator is None and (confirmed or (options["base"] and not options["virtual"])):
         what = "--confirm-screening" if confirmed else "--base-light"
-        rule, cure = "an operator must be responsible for it", "add --operator ID"
+        rule = "an operator must be responsible for it"
+        cure = "add --operator ID"
         return [Fault(what, rule, "no --operator", cure)]
     return []
 
@@ -271,7 +277,8 @@ def one_session(out: Path) -> Iterator[None]:
             if not os.path.samestat(os.fstat(lock.fileno()), path.stat()):
                 raise FileNotFoundError  # the other session ended between opening and locking
         except (BlockingIOError, FileNotFoundError):
-            rule, cure = "only one session at a time may write into a folder", "wait until the other session has ended"
+            rule = "only one session at a time may write into a folder"
+            cure = "wait until the other session has ended"
             raise InputError(Fault(str(out), rule, "another session", cure)) from None
         try:
             yield
@@ -321,7 +328,8 @@ def _laboratory(out: Path, options: Mapping[str, Any], progress: Progress | None
         rule = "with --virtual it must be a capture with PNG frames, which the emulated cameras deliver"
         found = f"no dome in {subject}" if dome is None else f"{dome.frames} in {subject}"
         raise InputError(Fault("--setup", rule, found, "name another capture; skindb simulate writes some"))
-    faults, watched = _faults(options["faults"], read_setup(subject)), beside / "frames"
+    faults = _faults(options["faults"], read_setup(subject))
+    watched = beside / "frames"
     try:
         clock = SimulatedClock(time.time())
         yield Laboratory(subject, watched, faults, clock=clock, lamp=options["base"])
@@ -375,7 +383,8 @@ def _fault_value(what: str, kind: str, value: str, setup: Setup) -> Any:
         return value
     if kind == "int":
         return _count(value)
-    number, most = float(value), 1.0 if what in PROBABILITIES else MAX_FAULT
+    number = float(value)
+    most = 1.0 if what in PROBABILITIES else MAX_FAULT
     if not 0.0 <= number <= most:
         raise ValueError(value)
     return number

@@ -83,7 +83,8 @@ def begin_cohort(out: Path, subjects: int, conditions: Sequence[str], options: d
             differ = [
                 f"{name} {found.get(name)}" for name in sorted({*found, *asked}) if found.get(name) != asked.get(name)
             ]
-            rule, cure = "a cohort is continued with the same options", "give them, or choose another folder"
+            rule = "a cohort is continued with the same options"
+            cure = "give them, or choose another folder"
             raise InputError(Fault(str(note), rule, ", ".join(differ), cure))
     elif out.is_dir() and any(out.iterdir()):
         rule = "a new cohort needs an absent or empty folder"

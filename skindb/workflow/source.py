@@ -12,7 +12,8 @@ from skindb._version import __file__ as version_file
 @cache
 def method_digest(modules: tuple[str, ...] = ("",)) -> str:
     """Digest of the source of modules and subpackages of skindb, default all of it."""
-    root, digest = Path(version_file).parent, hashlib.sha256()
+    root = Path(version_file).parent
+    digest = hashlib.sha256()
     for name in modules:
         files = sorted((root / name).rglob("*.py")) if (root / name).is_dir() else [root / f"{name}.py"]
         for file in files:

@@ -141,7 +141,8 @@ def basis_size(
     cohort = study_cohort(db, "surfels", takes, release, surfels=BASIS_SURFELS, variables=variables)
 
     def compute() -> Groups:
-        tables, rng = brdf_tables(db, cohort, dictionary, release), np.random.default_rng(seed)
+        tables = brdf_tables(db, cohort, dictionary, release)
+        rng = np.random.default_rng(seed)
         return {"basis_size": basis_size_curve(cohort, tables=tables, mixed_fits=bool(takes), rng=rng)}
 
     return made(db, StudyRequest("brdf", name, release, tuple(takes), {"seed": seed}, dictionary), compute, cohort)
@@ -183,7 +184,8 @@ def traits(
     frame = frame_of(db, cohort, release)
 
     def compute() -> Groups:
-        rng, brdfs = np.random.default_rng(seed), brdf_tables(db, cohort, dictionary, release)
+        rng = np.random.default_rng(seed)
+        brdfs = brdf_tables(db, cohort, dictionary, release)
         basis = population_basis(cohort, tables=brdfs, k=k, in_metric=in_metric, mixed_fits=mixed, rng=rng)
         found = _albedo(db, cohort, frame, release, mixed=mixed)
         options: dict[str, Any] = {"adjust": adjust, "mixed_fits": mixed, "rng": rng} | found
@@ -346,7 +348,8 @@ def chromophores(
     cohort, frame = registered_maps(db, takes, release)
 
     def compute() -> Groups:
-        mixed, landmarks = bool(takes), common_landmarks(frame.datasets)
+        mixed = bool(takes)
+        landmarks = common_landmarks(frame.datasets)
         axes = chromophore_axes(cohort, landmarks=landmarks, mixed_fits=mixed, rng=np.random.default_rng(seed))
         statistics = chromophore_statistics(cohort, axes=axes, landmarks=landmarks)
         table = chromophore_table(cohort, statistics=statistics, group_by=group_by)
@@ -419,7 +422,8 @@ def surface(
     cohort = study_cohort(db, "surfels", takes, release, surfels=SAMPLED)
 
     def compute() -> Groups:
-        brdfs, rng = brdf_tables(db, cohort, dictionary, release), np.random.default_rng(seed)
+        brdfs = brdf_tables(db, cohort, dictionary, release)
+        rng = np.random.default_rng(seed)
         basis = population_basis(cohort, tables=brdfs, k=k, mixed_fits=mixed, rng=rng)
         if (found := basis.sizes["component"]) < k:
             rule = "must not be above the number of BRDFs of the dictionary or of surfels"
@@ -455,7 +459,8 @@ def _albedo(
     registered.
     """
     regions: tuple[str, ...] = (FACE, "beard")
-    drawn, texture = None, dict[str, xr.Dataset]()
+    drawn = None
+    texture = dict[str, xr.Dataset]()
     if names := list(frame.records):
         regions = (FACE, "beard", "no_beard")
         summarise(db, names, release=release)

@@ -51,8 +51,10 @@ def dictionary_tables(names: Sequence[str], disc: float, dictionary: Path | None
     """
     own = embedded_dictionary() if dictionary is None else read_dictionary(dictionary)
     if list(own.names) != list(names):
-        where, rule = "dictionary", "must be the one the takes were fitted with"
-        found, cure = f"{len(names)} BRDFs, {names[0]} first", "name its folder with --dictionary"
+        where = "dictionary"
+        rule = "must be the one the takes were fitted with"
+        found = f"{len(names)} BRDFs, {names[0]} first"
+        cure = "name its folder with --dictionary"
         raise InputError(Fault(where, rule, found, cure))
     return convolve_disc(own, disc).table
 
@@ -98,7 +100,8 @@ def registered_maps(db: Database, takes: Sequence[str], release: str | None) -> 
         require_same_fit(models)
     frame = frame_of(db, models, release)
     if not frame.records:
-        rule, cure = "maps need registered takes", "add landmarks to the captures, then ingest and fit them"
+        rule = "maps need registered takes"
+        cure = "add landmarks to the captures, then ingest and fit them"
         raise InputError(Fault(db.url, rule, f"none of {models.sizes['take']} takes has landmarks", cure))
     names = list(frame.records)
     summarise(db, names, release=release)
@@ -111,7 +114,8 @@ def require_covered(db: Database, release: str | None) -> None:
     """Refuse a release whose registrations contain data of a subject who no longer consents to statistics."""
     if release is None:
         return
-    known, staleness = Known(db, release), Staleness(db)
+    known = Known(db, release)
+    staleness = Staleness(db)
     records = [known.record("registration", take) for take in known.takes("registration")]
     reasons = [reason for record in records for reason in staleness.reasons(record) if reason.why != "superseded"]
     if found := list(dict.fromkeys(map(str, reasons))):

@@ -21,14 +21,27 @@ MAP_PERMUTATIONS = 1000  # each of 100,000 texels and more
 OF_NORMAL_TAKES = ("groups", "maps", "surface", "correlations", "translucency")  # unless conditions are compared
 STUDY_NAME = r"[A-Za-z0-9_-]{1,64}"
 METHOD = (
-    "analysis", "numerics", "optics", "geometry", "render/texels", "schema", "store/cohort", "workflow/studies",
+    "analysis",
+    "numerics",
+    "optics",
+    "geometry",
+    "render/texels",
+    "schema",
+    "store/cohort",
+    "workflow/studies",
     "workflow/study_inputs",
-)  # fmt: skip
+)
 Groups = dict[str, xr.Dataset]
 DEFAULTS = {
-    "group_by": "", "k": 6, "in_metric": False, "seed": 0, "takes": [], "release": "", "adjust": [],
+    "group_by": "",
+    "k": 6,
+    "in_metric": False,
+    "seed": 0,
+    "takes": [],
+    "release": "",
+    "adjust": [],
     "permutations": 10_000,
-}  # fmt: skip
+}
 OWN_DEFAULTS: dict[str, dict[str, Any]] = {"maps": {"permutations": MAP_PERMUTATIONS}, "components": {"k": 5}}
 
 

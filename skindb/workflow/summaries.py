@@ -21,9 +21,16 @@ from skindb.workflow.takes import map_takes, results_of
 
 # modules that decide the numbers of a summary
 METHOD = (
-    "analysis/summary", "analysis/common_maps", "analysis/masks", "fit/prediction", "render/texels",
-    "schema/status", "schema/regions", "geometry/texture", "geometry/_texture_kernels",
-)  # fmt: skip
+    "analysis/summary",
+    "analysis/common_maps",
+    "analysis/masks",
+    "fit/prediction",
+    "render/texels",
+    "schema/status",
+    "schema/regions",
+    "geometry/texture",
+    "geometry/_texture_kernels",
+)
 
 
 @logged("summarise")
@@ -69,11 +76,10 @@ def summarise(
     """
     names = db.takes("model", release=release) if takes is None else list(takes)
     code = summary_digest()
-    tables, sample = (
-        CohortRequest("tables", digest=code),
-        CohortRequest("surfels", surfels=surfels, seed=seed, digest=code),
-    )
-    known, maps = Known(db, release), CohortRequest("maps", size=size, digest=code)
+    tables = CohortRequest("tables", digest=code)
+    sample = CohortRequest("surfels", surfels=surfels, seed=seed, digest=code)
+    known = Known(db, release)
+    maps = CohortRequest("maps", size=size, digest=code)
     models = [known.record("model", take) for take in lacking(db, "model", [tables, sample], names, release=release)]
     registered = [take for take in names if known.has("registration", take)]
     lack = lacking(db, "registration", [maps, sample], registered, release=release)
@@ -126,7 +132,8 @@ def _model(db: Database, sample: CohortRequest, record: Record) -> Record:
 
 def _registration(db: Database, sample: CohortRequest, size: int, record: Record) -> Record:
     version = db.read("registration", record.take, generation=record.generation)
-    model, registered = db.source(version, "model", record.take), version["registration"].to_dataset()
+    model = db.source(version, "model", record.take)
+    registered = version["registration"].to_dataset()
     options = {"surfels": sample.surfels, "seed": sample.seed, "size": size}
     groups, tables = registered_parts(model, registered, **options)
     return _commit(db, record, groups, tables, sample, size)

@@ -164,7 +164,8 @@ def _in_worker(function: Callable[[Take], Result], threads: int, take: Take) -> 
 def _in_processes(
     function: Callable[[Take], Result], takes: list[Take], workers: int
 ) -> Iterator[Outcome[Take, Result]]:
-    waiting, running = deque(takes), dict[Future[bytes], Take]()
+    waiting = deque(takes)
+    running = dict[Future[bytes], Take]()
     suspects = deque[Take]()  # being processed when a process died: each is tried again alone
     threads = max(1, thread_count() // workers)
     executor = _executor(workers)

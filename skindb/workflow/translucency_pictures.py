@@ -61,10 +61,12 @@ def translucency_grid(
     """
     lengths = _diffusion_lengths(db, site)
     if len(lengths) < 2:
-        rule, cure = f"two takes must have translucency at {site}", "name another site, or fit more takes"
+        rule = f"two takes must have translucency at {site}"
+        cure = "name another site, or fit more takes"
         raise InputError(Fault(db.url, rule, f"{len(lengths)}", cure))
     chosen = [min(lengths, key=lengths.__getitem__), max(lengths, key=lengths.__getitem__)]
-    tell, rows = progress or silent, {}
+    tell = progress or silent
+    rows = {}
     for i, take in enumerate(chosen):
         tell("render", 3 * i, 6)
         model = db.read("model", take)

@@ -96,7 +96,8 @@ def refresh(
         "edit": partial(_edit_again, db, dictionary),
     }
     db.complete_erasures()
-    done, tell = list[Refreshed](), progress or silent
+    done = list[Refreshed]()
+    tell = progress or silent
     for number, kind in enumerate(KINDS):
         tell("refresh", number, len(KINDS))
         with computing_on(client if kind == STUDY else None, db.folder):
@@ -151,8 +152,10 @@ def repeat_study(db: Database, key: str, parameters: Mapping[str, Any], *, dicti
         If this version of skindb does not know the study or one of its parameters, or as the study.
     """
     options = dict(parameters)
-    what, name = str(options.pop("what", "")), key.partition(".")[2]
-    rule, cure = "a study must be one that this version of skindb can compute", "run skindb analyze"
+    what = str(options.pop("what", ""))
+    name = key.partition(".")[2]
+    rule = "a study must be one that this version of skindb can compute"
+    cure = "run skindb analyze"
     if what not in STUDIES:
         raise InputError(Fault(key, rule, f"the study {what!r}", cure))
     accepted = inspect.signature(STUDIES[what]).parameters.keys() - {"db", "name", "dictionary"}

@@ -17,13 +17,27 @@ from skindb.schema import dataset
 SIZE = 128
 # of a plain face in the common (u, v)
 LANDMARKS = {
-    "forehead_centre": (0.5, 0.25), "nasion": (0.5, 0.35), "nose_tip": (0.5, 0.5), "subnasale": (0.5, 0.55),
-    "lip_upper": (0.5, 0.58), "chin": (0.5, 0.75), "forehead_right": (0.38, 0.25), "forehead_left": (0.62, 0.25),
-    "brow_right": (0.4, 0.32), "brow_left": (0.6, 0.32), "ala_right": (0.46, 0.53), "ala_left": (0.54, 0.53),
-    "eye_outer_right": (0.36, 0.37), "eye_outer_left": (0.64, 0.37), "eye_inner_right": (0.45, 0.37),
-    "eye_inner_left": (0.55, 0.37), "mouth_corner_right": (0.43, 0.62), "mouth_corner_left": (0.57, 0.62),
-    "jaw_right": (0.34, 0.66), "jaw_left": (0.66, 0.66),
-}  # fmt: skip
+    "forehead_centre": (0.5, 0.25),
+    "nasion": (0.5, 0.35),
+    "nose_tip": (0.5, 0.5),
+    "subnasale": (0.5, 0.55),
+    "lip_upper": (0.5, 0.58),
+    "chin": (0.5, 0.75),
+    "forehead_right": (0.38, 0.25),
+    "forehead_left": (0.62, 0.25),
+    "brow_right": (0.4, 0.32),
+    "brow_left": (0.6, 0.32),
+    "ala_right": (0.46, 0.53),
+    "ala_left": (0.54, 0.53),
+    "eye_outer_right": (0.36, 0.37),
+    "eye_outer_left": (0.64, 0.37),
+    "eye_inner_right": (0.45, 0.37),
+    "eye_inner_left": (0.55, 0.37),
+    "mouth_corner_right": (0.43, 0.62),
+    "mouth_corner_left": (0.57, 0.62),
+    "jaw_right": (0.34, 0.66),
+    "jaw_left": (0.66, 0.66),
+}
 PIGMENT = np.array([0.3, 0.6, 0.8])  # decrease of log R_d by one step of melanin
 POINTS = {name: np.array(at) for name, at in LANDMARKS.items()}
 BEARD = texel_regions(POINTS, SIZE)["beard"]
@@ -129,8 +143,9 @@ def test_texture_statistics__nothing_measured_is_refused():
 def test_texture_statistics__without_landmarks_the_face_is_one_region():
     texture = texture_statistics(maps_of({"A": face(0), "B": face(1)}), landmarks={})
     assert texture["region"].values.tolist() == ["face"]
-    edit = edit_texture(maps_of({"A": face(0)}).isel(take=0), shift_of(texture, ["B"], ["A"]), texture,
-                        rng=np.random.default_rng(0))  # fmt: skip
+    edit = edit_texture(
+        maps_of({"A": face(0)}).isel(take=0), shift_of(texture, ["B"], ["A"]), texture, rng=np.random.default_rng(0)
+    )
     assert np.isfinite(edit.change).all()
     assert edit.distance is None
 

@@ -120,7 +120,8 @@ def test_brdf_space__conditions_are_compared_within_subjects():
 
 
 def test_brdf_space__three_conditions_and_pairs_of_two_kinds():
-    subjects, conditions = _names(8) * 3, ["normal"] * 8 + ["lotion"] * 8 + ["powder"] * 8
+    subjects = _names(8) * 3
+    conditions = ["normal"] * 8 + ["lotion"] * 8 + ["powder"] * 8
     shift = 0.3 * (np.array(conditions) == "powder")
     space = _space(_planted(subjects, noise=0.001, shift=shift, conditions=conditions), "condition")
     assert space["group"].values.tolist() == ["normal", "lotion", "powder"]
@@ -185,7 +186,8 @@ def test_sphere_radiance__of_a_constant_brdf_is_the_cosine():
     pixel = 5000
     frame = np.linalg.qr(np.column_stack([n[pixel], [0.3, 0.8, 0.1], [1, 0, 0]]))[0] * [1, 1, 1]
     frame = frame * np.sign(frame[:, 0] @ n[pixel])
-    wo, want = frame[:, [1, 2, 0]].T @ [0, 0, 1], 0.0
+    wo = frame[:, [1, 2, 0]].T @ [0, 0, 1]
+    want = 0.0
     for light in lights:
         wi = frame[:, [1, 2, 0]].T @ light
         want = want + (lookup(TABLES, *half_difference(wi, wo)) * wi[2] if wi[2] > 0 else 0.0)

@@ -29,13 +29,27 @@ BASE = -np.log([0.45, 0.27, 0.2])
 TABLES = Path(__file__).resolve().parents[3] / "shared/data/optics"
 # of a plain face in the common (u, v)
 LANDMARKS = {
-    "forehead_centre": (0.5, 0.25), "nasion": (0.5, 0.35), "nose_tip": (0.5, 0.5), "subnasale": (0.5, 0.55),
-    "lip_upper": (0.5, 0.58), "chin": (0.5, 0.75), "forehead_right": (0.38, 0.25), "forehead_left": (0.62, 0.25),
-    "brow_right": (0.4, 0.32), "brow_left": (0.6, 0.32), "ala_right": (0.46, 0.53), "ala_left": (0.54, 0.53),
-    "eye_outer_right": (0.36, 0.37), "eye_outer_left": (0.64, 0.37), "eye_inner_right": (0.45, 0.37),
-    "eye_inner_left": (0.55, 0.37), "mouth_corner_right": (0.43, 0.62), "mouth_corner_left": (0.57, 0.62),
-    "jaw_right": (0.34, 0.66), "jaw_left": (0.66, 0.66),
-}  # fmt: skip
+    "forehead_centre": (0.5, 0.25),
+    "nasion": (0.5, 0.35),
+    "nose_tip": (0.5, 0.5),
+    "subnasale": (0.5, 0.55),
+    "lip_upper": (0.5, 0.58),
+    "chin": (0.5, 0.75),
+    "forehead_right": (0.38, 0.25),
+    "forehead_left": (0.62, 0.25),
+    "brow_right": (0.4, 0.32),
+    "brow_left": (0.6, 0.32),
+    "ala_right": (0.46, 0.53),
+    "ala_left": (0.54, 0.53),
+    "eye_outer_right": (0.36, 0.37),
+    "eye_outer_left": (0.64, 0.37),
+    "eye_inner_right": (0.45, 0.37),
+    "eye_inner_left": (0.55, 0.37),
+    "mouth_corner_right": (0.43, 0.62),
+    "mouth_corner_left": (0.57, 0.62),
+    "jaw_right": (0.34, 0.66),
+    "jaw_left": (0.66, 0.66),
+}
 POINTS = {name: np.array(at) for name, at in LANDMARKS.items()}
 
 
@@ -169,10 +183,12 @@ def test_chromophore_axes__falls_back_where_pigments_cannot_be_separated(melanin
 def test_chromophore_axes__projected_fallback_lies_in_the_plane():
     axes = found_axes(maps_of(pigments(melanin=normally(0.2), blood=normally(0.1)), noise=0.002))
     assert axes.attrs["axes_origin"].endswith("in the plane of the two largest principal components")
-    normal, found = np.cross(*PLANTED), axes["chromophore_axis"].values
+    normal = np.cross(*PLANTED)
+    found = axes["chromophore_axis"].values
     assert np.abs(found @ normal).max() < 0.02 * np.linalg.norm(normal)
     np.testing.assert_allclose(found[:, :2], TABLE_AXES[:, :2])
-    own, other = degrees(found, PLANTED), degrees(found, PLANTED[::-1])
+    own = degrees(found, PLANTED)
+    other = degrees(found, PLANTED[::-1])
     assert own.sum() < other.sum()  # the pigments are not exchanged
 
 
@@ -258,7 +274,8 @@ def test_table_axes__recomputed_from_the_published_tables():
     def read(name):
         return np.loadtxt(TABLES / name, delimiter=",", skiprows=1)
 
-    blood, melanin = read("hemoglobin_prahl.csv"), read("eumelanin_sarna.csv")
+    blood = read("hemoglobin_prahl.csv")
+    melanin = read("eumelanin_sarna.csv")
     grid = np.arange(400.0, 701.0)
     spectra = [
         np.interp(grid, melanin[:, 0], melanin[:, 1]),

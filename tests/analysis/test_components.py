@@ -14,7 +14,8 @@ from skindb.errors import InputError
 def _planted(takes=12, seed=3):
     """Maps that differ along two patterns, with some noise."""
     rng = np.random.default_rng(seed)
-    patterns, amounts = rng.normal(size=(2, 5, 4, 3)), rng.normal(size=(takes, 2)) * [3.0, 1.0]
+    patterns = rng.normal(size=(2, 5, 4, 3))
+    amounts = rng.normal(size=(takes, 2)) * [3.0, 1.0]
     values = 10 + np.einsum("tp,pvuc->tvuc", amounts, patterns) + 1e-3 * rng.normal(size=(takes, 5, 4, 3))
     names = [f"T{i}" for i in range(takes)]
     coords = {"take": names, "channel": ["R", "G", "B"]}

@@ -56,9 +56,7 @@ def test_component_correlations__intervals_are_those_of_scipy():
 
 @pytest.mark.slow
 def test_component_correlations__p_is_even_without_any():
-    p = [
-        float(found(linked(20, 0.0, seed=s), permutations=99)["correlation_p"].sel(pair=PAIR)) for s in range(60)
-    ]  # fmt: skip
+    p = [float(found(linked(20, 0.0, seed=s), permutations=99)["correlation_p"].sel(pair=PAIR)) for s in range(60)]
     assert stats.kstest(p, "uniform").pvalue > 0.001
 
 

@@ -31,7 +31,8 @@ def cohort_of(subjects, conditions=None, status=None, **attributes):
     return xr.Dataset(variables, coords)
 
 
-GOOD, NOTHING = int(ProbeStatus.FITTED), int(ProbeStatus.NOT_MEASURED)
+GOOD = int(ProbeStatus.FITTED)
+NOTHING = int(ProbeStatus.NOT_MEASURED)
 
 
 @pytest.fixture
@@ -43,9 +44,13 @@ def population():
     ancestry = ["european" if i % 2 else "african" for i in range(35)] + [None]
     status = [[GOOD, NOTHING]] * 35 + [[NOTHING, NOTHING]]
     return cohort_of(
-        [*subjects, "S0"], ["normal"] * 36 + ["lotion"], [*status, [GOOD, GOOD]],
-        gender=[*gender, "female"], age=[*age, None], ancestry=[*ancestry, "african"],
-    )  # fmt: skip
+        [*subjects, "S0"],
+        ["normal"] * 36 + ["lotion"],
+        [*status, [GOOD, GOOD]],
+        gender=[*gender, "female"],
+        age=[*age, None],
+        ancestry=[*ancestry, "african"],
+    )
 
 
 def counts_of(report):

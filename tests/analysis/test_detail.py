@@ -13,7 +13,9 @@ from skindb.analysis import register, transfer_detail
 from skindb.errors import InputError
 from skindb.schema import dataset
 
-SIZE, COARSEST = 64, 80.0  # texels of 2.5 mm; spots are two surfels wide, 40 mm apart
+# texels of 2.5 mm; spots are two surfels wide, 40 mm apart
+SIZE = 64
+COARSEST = 80.0
 SPOT = 0.5  # of log R_d
 
 

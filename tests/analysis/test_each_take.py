@@ -26,7 +26,8 @@ def _product(take, matrix):
 @pytest.mark.parametrize("change", [_misaligned, np.asfortranarray, lambda a: np.repeat(a, 2, axis=0)[::2]])
 def test_each_take__gives_the_same_bits_for_any_layout_in_memory(change):
     rng = np.random.default_rng(3)
-    value, matrix = rng.random((2, 700, 59)), rng.random((3, 59))
+    value = rng.random((2, 700, 59))
+    matrix = rng.random((3, 59))
     cohort = xr.Dataset({"value": (("take", "surfel", "dictionary"), value)})
     changed = xr.Dataset({"value": (("take", "surfel", "dictionary"), change(value))})
     expected = each_take(_product, cohort, ["value"], matrix)

@@ -77,11 +77,13 @@ def test_effect_maps__family_wise_errors():
     """Of 60 cohorts without any difference, about 5 % have a texel that differs (binomial, 99.9 %)."""
     found = [
         maps_of(
-            cohort(16, step=0.0, seed=seed).drop_vars("texel_sigma_tr"), permutations=100, size=8,
+            cohort(16, step=0.0, seed=seed).drop_vars("texel_sigma_tr"),
+            permutations=100,
+            size=8,
             rng=np.random.default_rng(seed),
         )["map_effect_p_adjusted"].min()
         for seed in range(60)
-    ]  # fmt: skip
+    ]
     assert sum(one < 0.05 for one in found) <= 10
 
 

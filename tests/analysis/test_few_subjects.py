@@ -27,7 +27,8 @@ def test_effects__a_group_of_one_has_no_error(others):
 def test_effects__a_subject_alone_in_a_category_is_harmless():
     """The only subject of a category that is held fixed contains no information about the effect, and is harmless."""
     rng = np.random.default_rng(1)
-    values, group = rng.standard_normal((12, 5)), np.array([0.0, 1.0] * 6)
+    values = rng.standard_normal((12, 5))
+    group = np.array([0.0, 1.0] * 6)
     alone = np.eye(12)[:1].T
     without = effects(values[1:], group[1:])
     found = effects(values, group, alone)
@@ -37,7 +38,8 @@ def test_effects__a_subject_alone_in_a_category_is_harmless():
 
 def test_effects__quantities_that_only_one_of_a_group_has_are_unknown():
     rng = np.random.default_rng(2)
-    values, group = rng.standard_normal((10, 2)), np.array([1.0] * 3 + [0.0] * 7)
+    values = rng.standard_normal((10, 2))
+    group = np.array([1.0] * 3 + [0.0] * 7)
     values[:2, 1] = np.nan
     found = effects(values, group)
     assert np.isfinite(found.error[0])

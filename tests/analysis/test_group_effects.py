@@ -10,7 +10,8 @@ from scipy import stats
 from skindb.analysis import describe_group_effects, group_effects, plot_group_effects
 from skindb.errors import InputError
 
-FACE_R, CHEEK_G = "R_d face R", "sigma_tr cheek G"
+FACE_R = "R_d face R"
+CHEEK_G = "sigma_tr cheek G"
 
 
 def _people(n):
@@ -42,7 +43,8 @@ def test_group_effects__are_student_s_test_where_nothing_is_adjusted():
     cohort = planted_tables(_people(30), log_tr=0.08 * (gender == "male"), gender=gender)
     one = _compare(cohort, "gender", permutations=20_000).sel(contrast="male less female", quantity=CHEEK_G)
     logs = np.log(cohort["site_sigma_tr"].values[:, 0, 1])
-    men, women = logs[gender == "male"], logs[gender == "female"]
+    men = logs[gender == "male"]
+    women = logs[gender == "female"]
     np.testing.assert_allclose(one["effect"], men.mean() - women.mean(), rtol=1e-12)
     np.testing.assert_allclose(one["effect_percent"], 100 * np.expm1(men.mean() - women.mean()), rtol=1e-12)
     assert abs(float(one["effect_p"]) - stats.ttest_ind(men, women).pvalue) < 0.02  # 20,000 draws, nearly normal values
@@ -50,7 +52,8 @@ def test_group_effects__are_student_s_test_where_nothing_is_adjusted():
 
 def test_group_effects__a_confounder_misleads_the_plain_comparison_and_not_the_adjusted_one():
     """Ancestry is correlated with age, and albedo depends on age only; means over 100 cohorts."""
-    plain, held = [], []
+    plain = []
+    held = []
     for seed in range(100):
         rng = np.random.default_rng([5, seed])
         age = rng.uniform(20, 60, 40)
@@ -161,7 +164,8 @@ def test_group_effects__what_cannot_be_compared_is_one_line(group_by, adjust, me
     gender = np.where(np.arange(4) % 2, "male", "female")
     cohort = planted_tables(_people(4), gender=gender, age=np.arange(4.0), same=["yes"] * 4)
     if group_by == "lone":
-        cohort, group_by = cohort.isel(take=slice(2)), "gender"
+        cohort = cohort.isel(take=slice(2))
+        group_by = "gender"
     with pytest.raises(InputError, match=message):
         _compare(cohort, group_by, adjust=adjust)
 

@@ -19,7 +19,8 @@ SIZE = 8
 @pytest.fixture
 def cohort():
     rng = np.random.default_rng(2)
-    n, dims = len(SUBJECTS), ("take", "v", "u")
+    n = len(SUBJECTS)
+    dims = ("take", "v", "u")
     albedo = rng.uniform(0.1, 0.5, (n, SIZE, SIZE, 3)).astype(np.float32)
     albedo[3, 0, 0, 1] = np.nan  # C lacks one channel there
     coverage = np.ones((n, SIZE, SIZE), np.float32)
@@ -57,7 +58,8 @@ def by_numpy(values, coverage):
 )
 @pytest.mark.parametrize("chunks", [None, {"take": 1}, {"take": 2, "v": 3}])
 def test_mean_face__as_numpy(cohort, name, is_log, chunks):
-    values, coverage = cohort[f"texel_{name}"].values, cohort["texel_coverage"].values
+    values = cohort[f"texel_{name}"].values
+    coverage = cohort["texel_coverage"].values
     people = by_numpy(np.log(values) if is_log else values, coverage)
     count = np.isfinite(people).sum(axis=0)
     centre = np.where(count, np.nan_to_num(people).sum(axis=0) / np.maximum(count, 1), np.nan)

@@ -16,7 +16,9 @@ from skindb.schema import dataset
 SPECTRA = Path(__file__).resolve().parents[2] / ".." / "shared" / "data" / "optics" / "issa2025_skin.csv"
 SITES = ["forehead", "cheek"]
 COLOUR = ["lin_sRGB_r", "lin_sRGB_g", "lin_sRGB_b"]
-COHORTS, EACH = 60, 25  # subjects of each gender
+# subjects of each gender
+COHORTS = 60
+EACH = 25
 
 pytestmark = pytest.mark.skipif(not SPECTRA.is_file(), reason="the data beside the project are absent")
 
@@ -39,7 +41,8 @@ def colours_of(rows: pd.DataFrame) -> np.ndarray:
 
 def drawn(seed: int) -> xr.Dataset:
     """A cohort of tables of randomly chosen people."""
-    rng, everybody = np.random.default_rng(seed), people()
+    rng = np.random.default_rng(seed)
+    everybody = people()
     gender = everybody.index.get_level_values("gender")
     rows = np.concatenate([rng.choice(np.flatnonzero(gender == name), EACH, replace=False) for name in ("F", "M")])
     values = colours_of(everybody.iloc[rows])
@@ -81,10 +84,12 @@ def test_group_effects__intervals_hold_the_difference_of_all_measured_people():
 
 
 def test_albedo_table__intervals_hold_the_means_of_all_measured_people():
-    want, inside = truth(), []
+    want = truth()
+    inside = []
     for seed in range(COHORTS):
         cohort = drawn(seed)
-        takes, sites = cohort.sizes["take"], len(SITES)
+        takes = cohort.sizes["take"]
+        sites = len(SITES)
         means = cohort["region_diffuse_reflectance"].values
         albedo = dataset(
             {"albedo_mean": means, "albedo_histogram": np.full((takes, sites, 3, 256), np.nan)},

@@ -108,7 +108,8 @@ def _capture(model: xr.DataTree, noise: float) -> xr.DataTree:
     rng = np.random.default_rng(9)
     lights, cameras = (_unit(rng.normal(size=(n, 3)) * [1, 1, 0.3] + [0, 0, 1]) * 900 for n in (20, 3))
     node = model["fitted"].to_dataset()
-    position, normal = node["surfel_position"].values.astype(float), node["shading_normal"].values.astype(float)
+    position = node["surfel_position"].values.astype(float)
+    normal = node["shading_normal"].values.astype(float)
     to_light, to_camera = (_unit(p[None] - position[:, None]) for p in (lights, cameras))
     rows, offsets, index = basis_rows(TABLES, GRID, normal, to_light, to_camera, np.ones((N, 20, 3), bool))
     surfel = np.repeat(np.arange(N), np.diff(offsets))
@@ -119,10 +120,12 @@ def _capture(model: xr.DataTree, noise: float) -> xr.DataTree:
     ].values[surfel]
     sample = np.full((N, 20, 3, 3), np.nan)
     sample[surfel, index[:, 0], index[:, 1]] = value * (1 + noise * rng.normal(size=value.shape))
-    return xr.DataTree.from_dict({
-        "samples": dataset({"reflectance_sample": sample}),
-        "dome": dataset({"light_position": lights, "camera_position": cameras}),
-    })  # fmt: skip
+    return xr.DataTree.from_dict(
+        {
+            "samples": dataset({"reflectance_sample": sample}),
+            "dome": dataset({"light_position": lights, "camera_position": cameras}),
+        }
+    )
 
 
 @pytest.mark.slow
@@ -271,7 +274,8 @@ class _Made:
     """A take whose surfels are computed when they are read, and not kept."""
 
     def __init__(self, seed: int, count: int) -> None:
-        self.seed, self.count = seed, count
+        self.seed = seed
+        self.count = count
 
     def read(self, name: str) -> xr.DataArray:
         rng = np.random.default_rng([self.seed, len(name)])

@@ -97,7 +97,8 @@ def test_register__the_mean_of_all_is_between_them():
 
 
 def test_register__skips_a_missing_landmark():
-    models, points = sheet_pair(), on_sheet(nodes())
+    models = sheet_pair()
+    points = on_sheet(nodes())
     models["B"] = sheet_take(planted_uv(1), points[1:], names=NAMES[1:])
     points[4] = np.nan
     models["C"] = sheet_take(planted_uv(2), points)
@@ -121,7 +122,8 @@ def test_register__skips_takes_without_landmarks():
 
 
 def test_register__a_wrong_click_stands_out():
-    models, points = sheet_pair(), on_sheet(nodes())
+    models = sheet_pair()
+    points = on_sheet(nodes())
     points[4] += [0, 16, 0]  # 0.1 of the side
     models |= {f"C{i}": sheet_take(planted_uv(i, 0.005), on_sheet(nodes())) for i in range(3)}
     models["wrong"] = sheet_take(planted_uv(3, 0.005), points)
@@ -132,7 +134,8 @@ def test_register__a_wrong_click_stands_out():
 
 @pytest.mark.parametrize("wrong", ["click", "swap", None])
 def test_doubtful_landmarks__names_the_wrong_ones(wrong):
-    models, points = sheet_pair(), on_sheet(nodes())
+    models = sheet_pair()
+    points = on_sheet(nodes())
     models |= {f"C{i}": sheet_take(planted_uv(i, 0.005), on_sheet(nodes())) for i in range(3)}
     points = {"click": points + 16 * np.eye(9)[4][:, None] * [0, 1, 0], "swap": points[[1, 0, *range(2, 9)]]}.get(
         wrong, points
@@ -185,8 +188,11 @@ def test_register__takes_with_other_names():
     models["other"] = sheet_take(planted_uv(3), points, names=[f"mark{i}" for i in range(9)])
     found = register(models)
     assert {take: int(one["landmark_used"].sum()) for take, one in found.items()} == {
-        "A": 9, "B": 9, "few": 4, "other": 9,
-    }  # fmt: skip
+        "A": 9,
+        "B": 9,
+        "few": 4,
+        "other": 9,
+    }
     assert found["A"].attrs["template"] in "AB"
     assert found["few"].attrs["warp_anchors"] > 100
     assert found["other"].attrs["warp_anchors"] == 0
@@ -202,7 +208,8 @@ def test_register__one_take_alone_stays_as_it_is():
 @pytest.mark.parametrize("swapped", [False, True])
 def test_register__turns_no_triangle_over(swapped):
     """The clicks are so wrong that every map through them folds."""
-    models, points = sheet_pair(), on_sheet(nodes())
+    models = sheet_pair()
+    points = on_sheet(nodes())
     points = points[[1, 0, *range(2, 9)]] if swapped else points + np.random.default_rng(3).normal(size=(9, 3)) * 12
     models["A"] = sheet_take(sheet()[0], points)
     for reference in ("B", None):
@@ -220,9 +227,16 @@ def test_corresponding_points__outside_is_nan():
 
 TEXELS = np.stack(np.meshgrid(*2 * [(np.arange(200) + 0.5) / 200]), axis=-1).reshape(-1, 2)
 PLACE = {
-    "forehead": (0.4, 0.15), "nose": (0.47, 0.45), "cheek": (0.3, 0.47), "lips": (0.45, 0.59), "chin": (0.5, 0.68),
-    "eyelid": (0.36, 0.32), "neck": (0.5, 0.9), "beard": (0.3, 0.65), "no_beard": (0.7, 0.47),
-}  # fmt: skip
+    "forehead": (0.4, 0.15),
+    "nose": (0.47, 0.45),
+    "cheek": (0.3, 0.47),
+    "lips": (0.45, 0.59),
+    "chin": (0.5, 0.68),
+    "eyelid": (0.36, 0.32),
+    "neck": (0.5, 0.9),
+    "beard": (0.3, 0.65),
+    "no_beard": (0.7, 0.47),
+}
 
 
 def test_region_masks__lie_where_they_should():
@@ -255,7 +269,8 @@ def test_region_masks__skips_regions_that_cannot_be_drawn():
 def test_inside_outline__is_odd_winding():
     rng = np.random.default_rng(0)
     for _ in range(20):
-        outline, points = rng.normal(size=(9, 2)), rng.normal(size=(500, 2))
+        outline = rng.normal(size=(9, 2))
+        points = rng.normal(size=(500, 2))
         inside = inside_outline(points, outline)
         angles = np.arctan2(*(outline[None] - points[:, None])[..., ::-1].T).T
         turns = np.diff(np.concatenate([angles, angles[:, :1]], axis=1), axis=1)
@@ -279,7 +294,8 @@ def test_take_masks__the_capture_wins():
 
 
 def test_mask_agreement__counts_area():
-    a, b = np.array([1, 1, 0, 0], bool), np.array([0, 1, 1, 0], bool)
+    a = np.array([1, 1, 0, 0], bool)
+    b = np.array([0, 1, 1, 0], bool)
     assert mask_agreement(a, b, np.array([1.0, 3.0, 2.0, 50.0])) == 0.5
 
 

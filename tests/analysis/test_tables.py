@@ -216,7 +216,8 @@ def test_albedo_table__even_reflection_moves_levels_down():
     for model in models.values():
         model.attrs["parameters"] = {"even_reflection": 0.05}
     table = albedo_table(tables(models), albedo=albedo).sel(region="face", group="all")
-    down, limit = table["group_albedo_mean"] - table["group_albedo_mean_low"], table["group_even_reflection_limit"]
+    down = table["group_albedo_mean"] - table["group_albedo_mean_low"]
+    limit = table["group_even_reflection_limit"]
     assert limit == 0.05
     np.testing.assert_allclose(table["group_albedo_level_low"], table["group_albedo_mean"] - np.hypot(down, 0.05))
     np.testing.assert_array_equal(
@@ -247,7 +248,8 @@ def test_albedo_histograms__absent_regions_are_unknown():
 def test_albedo_histograms__shares_and_decorrelation():
     histograms = albedo_histograms(surfels(population()))
     np.testing.assert_allclose(histograms["albedo_histogram"].sum("bin"), 1.0)
-    flat, weights = [], []
+    flat = []
+    weights = []
     for take, model in population().items():
         node = model["fitted"].to_dataset()
         good = node["fit_status"].values == 0

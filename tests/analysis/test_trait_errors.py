@@ -19,8 +19,10 @@ def _vectors(cohort, *, coefficient=None, **options):
     takes = cohort["take"].values
     n = len(takes)
     values = np.zeros(n) if coefficient is None else np.asarray(coefficient)
-    basis = dataset({"population_mixture": np.eye(2), "take_coefficient": np.stack([values, -values], axis=1)},
-                    coords={"take": takes, "dictionary": ["a", "b"]})  # fmt: skip
+    basis = dataset(
+        {"population_mixture": np.eye(2), "take_coefficient": np.stack([values, -values], axis=1)},
+        coords={"take": takes, "dictionary": ["a", "b"]},
+    )
     edges = np.tile(np.linspace(-3, 3, 257), (3, 1))
     shares = np.zeros((n, 1, 3, 256))
     shares[..., 120:136] = 1 / 16
@@ -58,7 +60,8 @@ def test_trait_vectors__errors_are_those_of_means():
     gender = np.where(np.arange(80) % 4, "male", "female")
     values = np.random.default_rng(3).normal(size=80)
     found = _vectors(planted_tables(_people(80), gender=gender), coefficient=values).sel(trait="gender:male")
-    men, women = values[gender == "male"], values[gender == "female"]
+    men = values[gender == "male"]
+    women = values[gender == "female"]
     expected = np.sqrt(men.var(ddof=1) / len(men) + women.var(ddof=1) / len(women))
     np.testing.assert_allclose(found["trait_brdf_shift_error"], expected, rtol=0.2)
     assert found["trait_brdf_shift"].values[0] == pytest.approx(men.mean() - women.mean())
@@ -77,7 +80,8 @@ def test_trait_vectors__errors_cover_what_was_planted():
 
 
 def test_trait_vectors__conditions_are_differences_within_subjects():
-    who, conditions = np.repeat(_people(12), 2), ["normal", "lotion"] * 12
+    who = np.repeat(_people(12), 2)
+    conditions = ["normal", "lotion"] * 12
     own = np.repeat(np.random.default_rng(4).normal(size=12), 2)
     change = np.tile([0.0, 1.0], 12)
     found = _vectors(planted_tables(who.tolist(), conditions=conditions), coefficient=own + change)
@@ -110,19 +114,21 @@ def test_trait_vectors__what_is_held_fixed_has_no_vector():
 
 def test_describe_traits__takes_that_a_vector_needs():
     """A true vector of length 2 with an error of length 1 at 10 takes needs 22.5 for three times its error."""
-    levels, quarter = 256, 0.5 / np.sqrt(3 * 256)
+    levels = 256
+    quarter = 0.5 / np.sqrt(3 * 256)
     shift = np.full((3, 1, 3, levels), np.sqrt(5.0) * 2 * quarter)  # 2 squared and 1 squared
     error = np.full((3, 1, 3, levels), 2 * quarter)
     shift[1] = error[1]
     error[2] = 0.1 * shift[2]
     traits = dataset(
         {
-            "trait_quantile_shift": shift, "trait_quantile_shift_error": error,
+            "trait_quantile_shift": shift,
+            "trait_quantile_shift_error": error,
             "trait_count": np.array([[4, 6], [4, 6], [4, 6]]),
         },
         coords={"trait": ["a", "b", "c"], "region": ["face"], "side": ["with", "without"]},
         attrs={"flags": ["a: few"]},
-    )  # fmt: skip
+    )
     few, needs, noise = describe_traits(traits)
     assert few == "a: few"
     assert needs == "a: about 23 takes would be needed for a colour vector 3 times as long as its error"

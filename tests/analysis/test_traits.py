@@ -63,9 +63,11 @@ def test_trait_vectors__sites_do_not_pass_for_traits():
 def test_trait_vectors__a_value_of_one_side_alone_is_no_difference():
     """Lotion has no effect, one of two subjects was not measured with it, and subjects differ."""
     models = {
-        "A": model_of(1, subject="A"), "A.lotion": model_of(1, subject="A", condition="lotion"),
-        "B": model_of(2, tr=3.0, subject="B"), "B.lotion": model_of(2, tr=3.0, subject="B", condition="lotion"),
-    }  # fmt: skip
+        "A": model_of(1, subject="A"),
+        "A.lotion": model_of(1, subject="A", condition="lotion"),
+        "B": model_of(2, tr=3.0, subject="B"),
+        "B.lotion": model_of(2, tr=3.0, subject="B", condition="lotion"),
+    }
     models["A.lotion"]["translucency/site_status"][:] = 1
     shift = analysed(models)[2].sel(trait="condition:lotion")["trait_log_sigma_tr_shift"]
     np.testing.assert_allclose(shift, 0, atol=1e-6)
@@ -133,7 +135,8 @@ def test_apply_traits__reports_what_was_asked_and_done():
     report = json.loads(json.dumps(tree.attrs["edit_report"]))  # it is stored as JSON
     shift = 0.5 * traits["trait_brdf_shift"].sel(trait="condition:lotion").values
     np.testing.assert_allclose(report["brdf"]["requested"], shift)
-    area, good = models["B"]["fitted/surfel_area"].values[1:], slice(1, None)
+    area = models["B"]["fitted/surfel_area"].values[1:]
+    good = slice(1, None)
     still = apply_traits(models["B"], amounts={}, **call)
     change = tree["fitted/basis_weight"].values[good] - still["fitted/basis_weight"].values[good]
     np.testing.assert_allclose(report["brdf"]["applied"], np.average(change, axis=0, weights=area), atol=1e-6)
@@ -145,7 +148,8 @@ def test_apply_traits__reports_what_was_asked_and_done():
         np.testing.assert_allclose(part["requested"], part["applied"], atol=1e-4)
     # standard deviations over takes, in the metric of the basis
     gram = basis["population_mixture"].values @ brdf_metric(TABLES) @ basis["population_mixture"].values.T
-    root, takes = np.linalg.cholesky(gram), basis["take_coefficient"].values
+    root = np.linalg.cholesky(gram)
+    takes = basis["take_coefficient"].values
     spread = np.sqrt((takes @ root).var(axis=0, ddof=1).sum())
     want = np.linalg.norm((mine - takes.mean(axis=0)) @ root) / spread
     assert still.attrs["edit_report"]["brdf"]["distance"] == pytest.approx(want, rel=1e-4)
@@ -169,8 +173,16 @@ def test_apply_traits__drops_what_an_edit_makes_untrue():
     assert set(edited.children) == {"fitted", "basis", "translucency"}
     assert set(edited["translucency"].data_vars) == {"site_sigma_tr", "site_status"}
     assert set(edited.attrs) == {
-        "subject", "condition", "traits", "consent_scope", "take", "edit", "edit_distance", "edit_report", "trait_notes"
-    }  # fmt: skip
+        "subject",
+        "condition",
+        "traits",
+        "consent_scope",
+        "take",
+        "edit",
+        "edit_distance",
+        "edit_report",
+        "trait_notes",
+    }
     assert set(model.children) == {"fitted", "basis", "translucency", "probe"}
     assert set(apply_traits(model, **call, parts=("albedo",)).children) == set(model.children)
 
@@ -240,9 +252,11 @@ def test_valid_quantiles__are_the_nearest_monotone_ones():
         assert (np.diff(found) >= 0).all()
         assert found.mean() == pytest.approx(wanted.mean())
         best = minimize(
-            lambda q, wanted=wanted: ((q - wanted) ** 2).sum(), np.sort(wanted), method="SLSQP",
+            lambda q, wanted=wanted: ((q - wanted) ** 2).sum(),
+            np.sort(wanted),
+            method="SLSQP",
             constraints={"type": "ineq", "fun": np.diff},
-        )  # fmt: skip
+        )
         assert ((found - wanted) ** 2).sum() <= best.fun + 1e-6  # the solver's own tolerance
 
 
@@ -251,7 +265,8 @@ def test_quantiles__are_those_of_the_values():
     x = np.sort(rng.gamma(3.0, 1.0, (2, 50_000)), axis=1)
     edges = np.linspace(-1, 20, 257) * np.ones((2, 1))
     shares = np.stack([np.histogram(v, edges[0])[0] / x.shape[1] for v in x])
-    found, want = quantiles(shares, edges), np.quantile(x, levels(), axis=1).T
+    found = quantiles(shares, edges)
+    want = np.quantile(x, levels(), axis=1).T
     middle = slice(5, -5)
     np.testing.assert_allclose(found[:, middle], want[:, middle], atol=21 / 256)  # a bin
     assert np.isnan(quantiles(np.full((2, 256), np.nan), edges)).all()
@@ -259,7 +274,8 @@ def test_quantiles__are_those_of_the_values():
 
 def test_carry__moves_the_mean_and_keeps_the_order():
     rng = np.random.default_rng(0)
-    edges, x = np.linspace(-6, 6, 257), rng.normal(size=5000)
+    edges = np.linspace(-6, 6, 257)
+    x = rng.normal(size=5000)
     shares = np.histogram(x, edges)[0] / 5000
     shift = 0.5 + 0.3 * levels()
     got = shift_quantiles(x, shares, shift, edges)
@@ -277,7 +293,8 @@ def test_apply_traits__moves_the_probe_sites_like_the_map():
     ).reshape(traits["trait_log_sigma_tr_shift"].shape)
     model = models["B"]
     place = dataset({"site_position": [[30.0, 0, 60], [0, -40, 50]]}, coords={"site": ["cheek", "neck"]})
-    fitted, sites = model["fitted"].to_dataset(), model["translucency"].to_dataset().merge(place)
+    fitted = model["fitted"].to_dataset()
+    sites = model["translucency"].to_dataset().merge(place)
     model["translucency"] = xr.DataTree(sites)
     model["fitted"] = fitted.merge(translucency_map(fitted, sites), overwrite_vars="sigma_tr")
     edited = apply_traits(

@@ -33,7 +33,8 @@ def _normals():
 def test_fit__recovers_planted_normals_and_unseen_lights():
     import peers
 
-    light, normal = _lights(), _normals()
+    light = _lights()
+    normal = _normals()
     training = np.arange(len(light)) % 5 > 0
     for peer in peers.PEERS:
         parameters = np.tile(peer.start, (len(normal), 1))

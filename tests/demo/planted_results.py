@@ -21,7 +21,10 @@ PLANTED = {
 }
 SURFELS = SIDE**2
 SCALE = 0.25
-NORMAL_ERROR, DIFFUSE_ERROR, HELD_OUT_ERROR = 2.0, 0.05, 0.034  # deg, relative, relative
+# deg, relative, relative
+NORMAL_ERROR = 2.0
+DIFFUSE_ERROR = 0.05
+HELD_OUT_ERROR = 0.034
 
 
 def planted_results(takes: tuple[str, ...] = TAKES) -> Results:
@@ -33,7 +36,8 @@ def planted_results(takes: tuple[str, ...] = TAKES) -> Results:
         results.compared[take] = [comparison("l0", held_out=False), comparison("l1", held_out=True)]
     results.studies = _studies(takes)
     results.seconds = {"simulate": 60.0, "fit": 100.0, "report": 1.0}
-    results.edited_take, results.target_take = takes[0], takes[1]
+    results.edited_take = takes[0]
+    results.target_take = takes[1]
     for amount, distance in ((0.0, 0.0), (1.0, 0.4)):
         edited = small_face((0.6 + 0.2 * amount, 0.4, 0.3))
         _shrink(edited)
@@ -57,7 +61,8 @@ def _model(take: str) -> xr.DataTree:
 def _shrink(model: xr.DataTree) -> None:
     """Reduce the size of the pictures of the camera, so that rendering is fast."""
     dome = model["dome"].to_dataset()
-    matrix, size = dome["camera_matrix"], dome["camera_size"]
+    matrix = dome["camera_matrix"]
+    size = dome["camera_size"]
     smaller = {
         "camera_matrix": matrix * np.array([[SCALE], [SCALE], [1.0]]),
         "camera_size": (size * SCALE).astype(size.dtype),
@@ -70,7 +75,8 @@ def _recovery(model: xr.DataTree) -> Recovery:
     fitted = model["fitted"].to_dataset()
     found = fitted["fit_status"].values == FitStatus.FITTED
     site = {"cheek": np.array([0.1, 0.0, -0.2])}
-    diffuse, error = fitted["diffuse_reflectance"].values, np.full((SURFELS, 3), DIFFUSE_ERROR)
+    diffuse = fitted["diffuse_reflectance"].values
+    error = np.full((SURFELS, 3), DIFFUSE_ERROR)
     return Recovery(np.full(SURFELS, NORMAL_ERROR), error, diffuse, found, site)
 
 
@@ -84,15 +90,26 @@ def comparison(light: str, *, held_out: bool, exposure: float = 1.0) -> Comparis
 
 
 def _studies(takes: tuple[str, ...]) -> dict[str, xr.DataTree]:
-    channel, region = list("RGB"), ["face"]
-    by_site, sizes = ("group", "site", "channel"), np.arange(1, 7)
-    translucency = {name: (by_site, np.full((1, 2, 3), value)) for name, value in (
-        ("sigma_tr_count", 6), ("sigma_tr_mean", 1.0), ("sigma_tr_mean_low", 0.8), ("sigma_tr_mean_high", 1.2)
-    )}  # fmt: skip
+    channel = list("RGB")
+    region = ["face"]
+    by_site = ("group", "site", "channel")
+    sizes = np.arange(1, 7)
+    translucency = {
+        name: (by_site, np.full((1, 2, 3), value))
+        for name, value in (
+            ("sigma_tr_count", 6),
+            ("sigma_tr_mean", 1.0),
+            ("sigma_tr_mean_low", 0.8),
+            ("sigma_tr_mean_high", 1.2),
+        )
+    }
     curve = {
         **{f"relative_error{end}": ("k", 1 + 0.3 / sizes) for end in ("", "_low", "_high")},
-        "smallest_size": 3, "sufficient_size": 4, "plateau_tolerance": 0.01, "dictionary_error": 0.02,
-    }  # fmt: skip
+        "smallest_size": 3,
+        "sufficient_size": 4,
+        "plateau_tolerance": 0.01,
+        "dictionary_error": 0.02,
+    }
     albedo = {
         "histogram_edge": (("axis", "edge"), np.tile(np.linspace(-2, 2, 257), (3, 1))),
         "albedo_mean": (("take", "region", "channel"), np.full((len(takes), 1, 3), 0.4)),
@@ -107,13 +124,15 @@ def _studies(takes: tuple[str, ...]) -> dict[str, xr.DataTree]:
     where = {"channel": channel, "region": region}
     grouped = xr.Dataset(attrs={"group_by": ""})
     planted = {
-        "translucency": {"translucency_table": xr.Dataset(
-            translucency, {"channel": channel, "site": ["cheek", "forehead"], "group": ["all"]}
-        )},
+        "translucency": {
+            "translucency_table": xr.Dataset(
+                translucency, {"channel": channel, "site": ["cheek", "forehead"], "group": ["all"]}
+            )
+        },
         "brdf": {"basis_size": xr.Dataset(curve, {"k": sizes}, {"size_status": "3 to 4", "surfels": 400})},
         "albedo": {"albedo": xr.Dataset(albedo, where | {"take": list(takes)}), "albedo_table": grouped},
-        "traits": {"traits": xr.Dataset(
-            traits, where | {"trait": ["ancestry:south_asian"], "side": ["with", "without"]}
-        )},
-    }  # fmt: skip
+        "traits": {
+            "traits": xr.Dataset(traits, where | {"trait": ["ancestry:south_asian"], "side": ["with", "without"]})
+        },
+    }
     return {name: xr.DataTree.from_dict(groups) for name, groups in planted.items()}

@@ -51,6 +51,7 @@ def test_predictions__one_exposure_whatever_each_photograph_has():
     shown = [comparison("l0", held_out=True, exposure=exposure) for exposure in (0.3, 1.0)]
     first, second = predictions(shown, 0.5)
     np.testing.assert_array_equal(first, second)
-    photograph, difference = first[20, 15], first[20, -15]
+    photograph = first[20, 15]
+    difference = first[20, -15]
     assert photograph[0] == round(255 * (1.055 * 0.25 ** (1 / 2.4) - 0.055))  # IEC 61966-2-1 of 0.5 times 0.5
     np.testing.assert_array_equal(difference, 127)  # grey: the prediction is equal

@@ -86,7 +86,8 @@ def test_write_report__states_the_distance_of_the_edit(report, results):
 
 def test_write_report__without_edits_and_traits(report):
     plain = planted_results((TAKES[0], TAKES[3]))
-    plain.edits, plain.edited_take = {}, ""
+    plain.edits = {}
+    plain.edited_take = ""
     del plain.studies["traits"]
     text = write_report(report.with_name("plain.html"), plain, progress=lambda *_: None).read_text()
     assert "An edit and its distance" not in text
@@ -102,7 +103,8 @@ def test_status_sums__count_every_surfel_once(results):
 @pytest.mark.parametrize("theme", ["light", "dark"])
 def test_write_report__fits_a_narrow_page(report, browser, theme):
     context = browser.new_context(viewport={"width": 400, "height": 800}, color_scheme=theme)
-    page, asked = context.new_page(), []
+    page = context.new_page()
+    asked = []
     page.on("request", lambda request: asked.append(request.url))
     page.goto(report.as_uri())
     assert page.evaluate("document.documentElement.scrollHeight") < MAX_HEIGHT

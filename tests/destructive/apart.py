@@ -20,7 +20,9 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-TIME_LIMIT_S, ADDRESS_LIMIT_BYTES, RESIDENT_LIMIT_KB = 20.0, 3 << 30, 1_500_000
+TIME_LIMIT_S = 20.0
+ADDRESS_LIMIT_BYTES = 3 << 30
+RESIDENT_LIMIT_KB = 1_500_000
 PATIENCE = 10  # times its limit of CPU time that a case may take on busy cores
 FAILURES = ("message of a library", "traceback", "hang", "memory")
 Outcome = tuple[str, str]  # outcome of a case, and a detail
@@ -68,7 +70,9 @@ class Limits:
 def run(cases: Iterable[int], prepare: Prepare, folder: Path, limits: Limits) -> list[Case]:
     """Make, attempt and judge every case."""
     since = time.monotonic()
-    waiting, running, done = list(cases), {}, []
+    waiting = list(cases)
+    running = {}
+    done = []
     while waiting or running:
         if time.monotonic() - since > 60 * limits.minutes:
             waiting = []

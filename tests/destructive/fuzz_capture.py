@@ -107,7 +107,8 @@ def numbers(place: Path) -> tuple[dict[str, np.ndarray], list[str]]:
     db = skindb.open(place)
     (take,) = db.takes("capture")
     record = db.record("capture", take)
-    tree, made = db.read("capture", record.take), record.provenance
+    tree = db.read("capture", record.take)
+    made = record.provenance
     said = [*made["summary"].get("notes", []), *made["skipped"], *made["unknown_keys"]]
     said += sample_lines(made["summary"]["samples"])[1:] if "samples" in made["summary"] else []
     said += [f"{kind}: {count}" for kind, count in made["cleaning"].items()]
@@ -133,7 +134,8 @@ def ingest(capture: Path, work: Path) -> tuple[int, str, str]:
             code = end.code
         sys.stdout.flush()
         sys.stderr.flush()
-        sys.stdout, sys.stderr = sys.__stdout__, sys.__stderr__
+        sys.stdout = sys.__stdout__
+        sys.stderr = sys.__stderr__
     return int(str(code or 0)), (work / "out").read_text(errors="replace"), (work / "err").read_text(errors="replace")
 
 
@@ -160,7 +162,8 @@ def difference(found: dict[str, np.ndarray], true: dict[str, np.ndarray]) -> tup
             said.append(f"{name} of shape {value.shape}, not {true[name].shape if name in true else 'there'}")
             worst = np.inf
         elif not np.array_equal(value, true[name], equal_nan=value.dtype.kind == "f"):
-            a, b = value.astype(np.float64), true[name].astype(np.float64)
+            a = value.astype(np.float64)
+            b = true[name].astype(np.float64)
             known = np.isfinite(a) & np.isfinite(b)
             size = max(float(np.nanmedian(np.abs(b))), 1e-30)
             off = float(np.abs(a - b)[known].max() / size) if known.any() else 0.0

@@ -80,7 +80,9 @@ def read_all(root: Path, versions: list[list[Any]], damage: str = "") -> tuple[N
     opened.
     """
     near = {kind for kind, _, _ in versions if f"/{kind}" in damage} or {kind for kind, _, _ in versions}
-    db, found, faults = skindb.open(str(root)), {}, []
+    db = skindb.open(str(root))
+    found = {}
+    faults = []
 
     def add(name: str, call: Callable[[], Any]) -> None:
         try:
@@ -160,7 +162,9 @@ def differences(found: Any, true: Any, name: str = "") -> list[str]:
 
 def call(*args: str) -> tuple[int, str, str]:
     """Exit, output and messages of a command."""
-    out, err, code = io.StringIO(), io.StringIO(), 0
+    out = io.StringIO()
+    err = io.StringIO()
+    code = 0
     with mock.patch.object(sys, "argv", ["skindb", *args]), redirect_stdout(out), redirect_stderr(err):
         try:
             main()
@@ -232,7 +236,8 @@ def _same_json(one: Path, other: Path) -> bool:
 
 def run(cases: range, seed: int, folder: Path, limits: apart.Limits) -> list[apart.Case]:
     """Damage, read and judge every case."""
-    whole, kept = folder / "whole/db", folder / "true.json"
+    whole = folder / "whole/db"
+    kept = folder / "true.json"
     whole.parent.mkdir()
     apart.in_a_process(lambda: database(whole))
     logs = sorted(whole.glob("log/*/*/*.json"))

@@ -164,7 +164,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--every", type=int, default=1, help="Every n-th call is one at which a process is killed.")
     parser.add_argument("--jobs", type=int, default=2, help="Number of processes at a time.")
-    asked, bad = parser.parse_args(), []
+    asked = parser.parse_args()
+    bad = []
     for variant in STEPS:
         with tempfile.TemporaryDirectory() as folder:
             cases = kill(variant, Path(folder), asked)

@@ -42,7 +42,8 @@ from skindb.store import Database
 from skindb.workflow.provenance import groups_of
 
 TAKES = 4
-START_S, COMMAND_S = 120.0, 600.0
+START_S = 120.0
+COMMAND_S = 600.0
 LATEST = 0.8  # moment of a kill, as a fraction of the time of an undisturbed run: later ones often come too late
 ORPHANS_S = 60.0  # time in which the processes of a killed command must end
 COMMAND = [sys.executable, "-c", "from skindb.cli import main; main()", "fit"]
@@ -116,7 +117,8 @@ class Cluster:
 @contextmanager
 def started_cluster(folder: Path) -> Iterator[Cluster]:
     """A cluster of the commands that docs/howto/cluster.md names."""
-    file, log = folder / "scheduler.json", (folder / "cluster.txt").open("wb")
+    file = folder / "scheduler.json"
+    log = (folder / "cluster.txt").open("wb")
     dask = [sys.executable, "-m", "dask"]
     scheduler = [*dask, "scheduler", "--no-dashboard", "--port", "0", "--host", "127.0.0.1"]
     worker = [*dask, "worker", "--scheduler-file", str(file), "--nworkers", "2", "--nthreads", "1", "--no-dashboard"]
@@ -253,7 +255,8 @@ def undisturbed(root: Path, options: list[str]) -> tuple[float, dict]:
 
 def measured(folder: Path, cluster: Cluster, variants: set[str]) -> tuple[dict[str, float], dict]:
     """Seconds of a run on each engine of these variants, and the files that every run must end with."""
-    seconds, expected = {}, {}
+    seconds = {}
+    expected = {}
     given = {"cluster": ["--scheduler", cluster.address], "processes": ["--workers", "2"]}
     for name in sorted({engine_of(variant) for variant in variants}):
         options = given[name]
@@ -273,7 +276,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="Random seed of the moments and of the workers.")
     asked = parser.parse_args()
     os.environ["PYTHONPATH"] = os.pathsep.join([str(HERE.parents[1]), os.environ.get("PYTHONPATH", "")])
-    rows, failures = Counter[tuple[str, str]](), []
+    rows = Counter[tuple[str, str]]()
+    failures = []
     with tempfile.TemporaryDirectory() as name, started_cluster(Path(name)) as cluster:
         folder = Path(name)
         prepare(folder / "source")
@@ -281,7 +285,8 @@ def main() -> None:
         seconds, expected = measured(folder, cluster, {VARIANTS[number % len(VARIANTS)] for number in numbers})
         print(f"undisturbed: {seconds}", file=sys.stderr, flush=True)
         for number in numbers:
-            draw, variant = random.Random(f"{asked.seed} {number}"), VARIANTS[number % len(VARIANTS)]
+            draw = random.Random(f"{asked.seed} {number}")
+            variant = VARIANTS[number % len(VARIANTS)]
             after = draw.uniform(0, LATEST * seconds[engine_of(variant)])
             root = Path(shutil.copytree(folder / "source", folder / f"case-{number}" / "db"))
             outcome, detail, repeated = attempt(root, variant, after, draw, cluster, expected)

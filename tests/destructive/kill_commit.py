@@ -34,7 +34,8 @@ from skindb.store import Database
 
 EVENTS = ("open", "os.mkdir", "os.link", "os.rename", "os.remove", "os.rmdir", "os.scandir", "os.listdir", "os.fsync")
 PLACES = ("/data/model", "/log/model", "/heads/model")
-TAKE, BROKEN = "S01", "broken promise"
+TAKE = "S01"
+BROKEN = "broken promise"
 
 
 def count_calls(die_at: int) -> list[int]:
@@ -101,7 +102,8 @@ def values(db: Database, name: str, generation: int) -> list[float]:
 
 def kill(variant: str, folder: Path, asked: argparse.Namespace) -> list[apart.Case]:
     """Kill the writer of one variant at many of its calls."""
-    whole, kept = folder / "db", folder / "kept.json"
+    whole = folder / "db"
+    kept = folder / "kept.json"
     writer, name = WRITERS[variant]
 
     def prepare_whole() -> None:
@@ -136,14 +138,17 @@ def main() -> None:
     parser.add_argument("--every", type=int, default=1, help="The small model is killed at every n-th call.")
     parser.add_argument("--fits", type=int, default=20, help="Number of fits that are killed.")
     parser.add_argument("--jobs", type=int, default=2, help="Number of processes at a time.")
-    asked, bad = parser.parse_args(), []
+    asked = parser.parse_args()
+    bad = []
     for variant in WRITERS if asked.fits else ["small model"]:
         with tempfile.TemporaryDirectory() as folder:
             cases = kill(variant, Path(folder), asked)
         count = [sum(case.outcome == one for case in cases) for one in ("before", "after")]
         bad += [case for case in cases if case.outcome not in ("before", "after")]
-        print(f"{variant}: {len(cases)} kills, the last at {cases[-1].damage}: {count[0]} left the version before as "
-              f"the current one, {count[1]} the new one")  # fmt: skip
+        print(
+            f"{variant}: {len(cases)} kills, the last at {cases[-1].damage}: {count[0]} left the version before as "
+            f"the current one, {count[1]} the new one"
+        )
     for case in bad:
         print(f"{case.variant}, {case.damage}: {case.outcome}: {case.detail}")
     sys.exit(bool(bad))

@@ -52,7 +52,8 @@ FIT = ("begin", "first pass", "keep first pass", "second pass", "write", "commit
 INGEST = ("begin", "samples", "write", "commit", "end")
 STAGES = {"fit": FIT, "refit": FIT, "ingest": INGEST}
 KINDS = {"fit": "model", "refit": "model", "ingest": "capture"}
-FIT_TAKE, INGEST_TAKE = "S01", "T001"
+FIT_TAKE = "S01"
+INGEST_TAKE = "T001"
 GOOD = ("not yet committed", "committed", "ended before the kill")
 BAD = ("half-written and visible", "acknowledged and lost", "not continued", "other numbers", "not listed as garbage")
 Tell = Callable[[str], None]
@@ -88,7 +89,8 @@ def _telling(call, stage: str, tell: Tell):
 
 def _tell_stages(kind: str, tell: Tell) -> None:
     """Report when a version of a kind is written and committed, and what follows."""
-    write, commit = Stage.write, Stage.commit
+    write = Stage.write
+    commit = Stage.commit
 
     def writing(stage, *args, **options):
         if stage.log.kind == kind:
@@ -103,7 +105,8 @@ def _tell_stages(kind: str, tell: Tell) -> None:
         tell("end")
         return record
 
-    Stage.write, Stage.commit = writing, committing
+    Stage.write = writing
+    Stage.commit = committing
 
 
 def in_folder(work: Path) -> str:
@@ -151,7 +154,8 @@ def measure(work: Path, url: str, variant: str, known_at: Path) -> None:
         if not compiled:  # otherwise again, since the runs that are killed do not compile
             break
     seconds = {stage: end - begin for (stage, begin), (_, end) in pairwise(marks)}
-    kind, take = KINDS[variant], FIT_TAKE if KINDS[variant] == "model" else INGEST_TAKE
+    kind = KINDS[variant]
+    take = FIT_TAKE if KINDS[variant] == "model" else INGEST_TAKE
     known = {"seconds": seconds, "files": files_of(db, kind, take, db.record(kind, take).generation)}
     known["before"] = [files_of(db, kind, take, 1)] if variant == "refit" else []
     known_at.write_text(json.dumps(known))
@@ -167,7 +171,8 @@ def files_of(db: Database, kind: str, take: str, generation: int) -> dict[str, l
 
 def attempt(work: Path, url: str, variant: str, stage: str, part: float, known: dict, *, clean: bool) -> apart.Outcome:
     """Kill a run within a stage, check every promise, and run it again."""
-    kind, take = KINDS[variant], FIT_TAKE if KINDS[variant] == "model" else INGEST_TAKE
+    kind = KINDS[variant]
+    take = FIT_TAKE if KINDS[variant] == "model" else INGEST_TAKE
     marks = killed_within(work, url, variant, stage, part * known["seconds"].get(stage, 0.0))
     db = skindb.open(url)  # not before: threads of a client of a bucket must not be forked
     first = db.has("first", take)
@@ -194,7 +199,8 @@ def attempt(work: Path, url: str, variant: str, stage: str, part: float, known: 
             or db.has("first", take) != (first and not committed)
         ):
             return BAD[4], f"{said}: clean left {db.garbage()}, or removed what it must not"
-    first, stages = db.has("first", take), []
+    first = db.has("first", take)
+    stages = []
     following = WORK[variant](db, stages.append, work)
     if first and "first pass" in stages:
         return BAD[2], f"{said}: the first pass was repeated"
@@ -217,8 +223,12 @@ def unlisted(db: Database) -> set[str]:
     below = db._place.children
     keys = {f"data/{kind}/{take}" for kind in below("data") for take in below(f"data/{kind}")}
     there = {f"{key}/{name}" for key in keys for name in below(key) if name.endswith(".zarr")}
-    named = {db.record(kind, take, n).path for kind in (*db.kinds(), "first") for take in db.takes(kind)
-             for n in generations(db, kind, take)}  # fmt: skip
+    named = {
+        db.record(kind, take, n).path
+        for kind in (*db.kinds(), "first")
+        for take in db.takes(kind)
+        for n in generations(db, kind, take)
+    }
     listed = {one.key for one in db.garbage()}
     return {path for path in there - named - listed if "/first/" not in path}
 
@@ -323,7 +333,8 @@ def main() -> None:
     parser.add_argument("--bucket", action="store_true", help="In a bucket of a server on this machine.")
     asked = parser.parse_args()
     with ExitStack() as stack:
-        folder, new_url = Path(stack.enter_context(tempfile.TemporaryDirectory())), in_folder
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        new_url = in_folder
         if asked.bucket:
             address = stack.enter_context(s3_server("localbucket"))
             new_url = partial(in_new_bucket, address)

@@ -51,7 +51,9 @@ SUBJECT = "Xqz7"
 LEASE_S = 1.0  # so that the lease of a suspended writer expires soon
 END_S = 300.0  # after which a process hangs
 NOT_BEGUN = ("killed, completed by clean", "killed, completed by refresh")
-REFUSED, FAILED = 3, 4  # exit codes of writers
+# exit codes of writers
+REFUSED = 3
+FAILED = 4
 WRITERS: dict[str, Callable[[Database], object]] = {
     "study": lambda db: workflow.translucency(db, name="mine"),
     "traits": lambda db: workflow.traits(db, k=3, name="mine"),
@@ -109,7 +111,8 @@ class Process:
     """A function in a process of its own, forked from this one, which has imported everything and used nothing."""
 
     def __init__(self, work: Callable[[], object], log: Path) -> None:
-        self.log, self.code = log, None
+        self.log = log
+        self.code = None
         self.number = os.fork()
         if not self.number:
             os._exit(_run(work, log))
@@ -173,7 +176,10 @@ class Trial:
     """
 
     def __init__(self, url: str, folder: Path, seconds: dict[str, float], draw: random.Random) -> None:
-        self.url, self.folder, self.seconds, self.draw = url, folder, seconds, draw
+        self.url = url
+        self.folder = folder
+        self.seconds = seconds
+        self.draw = draw
         self.processes: dict[str, Process] = {}
 
     def run(self) -> str:
@@ -283,7 +289,9 @@ def _without_reference(root: Path) -> dict[str, bytes]:
 @contextmanager
 def _environment(folder: Path, capture: Path) -> Iterator[list[Path]]:
     """An own cache, data folder and folder for temporary files; yields all."""
-    temporary, cache, share = folder / "tmp", folder / "cache", folder / "share"
+    temporary = folder / "tmp"
+    cache = folder / "cache"
+    share = folder / "share"
     temporary.mkdir()
     own_cache(cache)
     os.environ |= {"SKINDB_CACHE": str(cache), "TMPDIR": str(temporary), "CAPTURE": str(capture)}
@@ -300,7 +308,9 @@ def main() -> None:
     args = parser.parse_args()
     study_inputs.dictionary_tables = lambda *_: TABLES  # 8 of the 59
     Database.lease = partial_lease(Database.lease)
-    draw, counts, failures = random.Random(args.seed), Counter[str](), 0
+    draw = random.Random(args.seed)
+    counts = Counter[str]()
+    failures = 0
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="kill-withdraw-")))
         address = stack.enter_context(s3_server("localbucket")) if args.bucket else ""

@@ -21,11 +21,45 @@ JSON_TEXTS = {  # values that json.dumps does not write, or not without recursio
     "digits": "9" * 5_000,
 }
 VALUES = (
-    float("nan"), float("inf"), -float("inf"), 1e300, -1e300, 1e30, 1e-300, 1e9, -1e9, 0, -1, 0.5, 10**400, 2**63, None,
-    True, False, "1.0", "\uff11", "\u202e\u0301", "é" * 70, "", "x", "\ud800", "\x1b[31m", "a\0b",
-    "a" * 100_000, "../x", "/etc/passwd", "{light}", [], {}, [[]], [None],
-    {"a": {"b": [1]}}, [1] * 30_000, {str(i): i for i in range(20_000)}, *JSON_TEXTS,
-)  # fmt: skip
+    float("nan"),
+    float("inf"),
+    -float("inf"),
+    1e300,
+    -1e300,
+    1e30,
+    1e-300,
+    1e9,
+    -1e9,
+    0,
+    -1,
+    0.5,
+    10**400,
+    2**63,
+    None,
+    True,
+    False,
+    "1.0",
+    "\uff11",
+    "\u202e\u0301",
+    "é" * 70,
+    "",
+    "x",
+    "\ud800",
+    "\x1b[31m",
+    "a\0b",
+    "a" * 100_000,
+    "../x",
+    "/etc/passwd",
+    "{light}",
+    [],
+    {},
+    [[]],
+    [None],
+    {"a": {"b": [1]}},
+    [1] * 30_000,
+    {str(i): i for i in range(20_000)},
+    *JSON_TEXTS,
+)
 SUBSTITUTES = ("nothing", "pipe", "folder", "zeros", "loop", "outside", "socket", "sparse", "secret")
 TOKENS = ("nan", "inf", "-1", "0", "1e308", "9" * 25, "x", "1_0", "\x00", "", "-", "1e5", "4294967296", "a" * 5_000)
 
@@ -124,7 +158,8 @@ def swap(path: Path, rng: np.random.Generator) -> str:
     if not others:
         return "nothing (no other file)"
     other = others[rng.integers(len(others))]
-    mine, theirs = path.read_bytes(), other.read_bytes()
+    mine = path.read_bytes()
+    theirs = other.read_bytes()
     path.write_bytes(theirs)
     other.write_bytes(mine)
     return f"exchanged with {other.relative_to(root)}"
@@ -136,11 +171,16 @@ def picture(path: Path, rng: np.random.Generator) -> str:
     frame = read_frame(path)
     what = str(rng.choice(["half", "grey", "alpha", "8 bit", "turned", "mirrored", "brighter", "black", "white"]))
     changed = {
-        "half": frame[::2, ::2], "grey": frame[..., 0], "alpha": np.concatenate([frame, frame[..., :1]], axis=-1),
-        "8 bit": (frame // 256).astype(np.uint8), "turned": frame.swapaxes(0, 1), "mirrored": frame[:, ::-1],
-        "brighter": np.minimum(frame.astype(np.float64) * 1.5, 65535).astype(frame.dtype), "black": frame * 0,
+        "half": frame[::2, ::2],
+        "grey": frame[..., 0],
+        "alpha": np.concatenate([frame, frame[..., :1]], axis=-1),
+        "8 bit": (frame // 256).astype(np.uint8),
+        "turned": frame.swapaxes(0, 1),
+        "mirrored": frame[:, ::-1],
+        "brighter": np.minimum(frame.astype(np.float64) * 1.5, 65535).astype(frame.dtype),
+        "black": frame * 0,
         "white": frame * 0 + 65535,
-    }[what]  # fmt: skip
+    }[what]
     if path.suffix == ".png":
         path.write_bytes(imagecodecs.png_encode(np.ascontiguousarray(changed)))
     elif changed.ndim == 3 and changed.shape[2] == 3:

@@ -13,9 +13,21 @@ from skindb.store.record import seal_of
 
 TIME_HEX = "20260101T000000-01234567"
 FOREIGN = (
-    "x", "note.txt", ".DS_Store", "00000009.json", "0000009.json", "\u0661" * 8 + ".json", "zarr.json", "a b", "A9",
-    "modell", f"{TIME_HEX}.zarr", f"{TIME_HEX}.manifest.json", "\udcff", "x" * 200,
-)  # fmt: skip
+    "x",
+    "note.txt",
+    ".DS_Store",
+    "00000009.json",
+    "0000009.json",
+    "\u0661" * 8 + ".json",
+    "zarr.json",
+    "a b",
+    "A9",
+    "modell",
+    f"{TIME_HEX}.zarr",
+    f"{TIME_HEX}.manifest.json",
+    "\udcff",
+    "x" * 200,
+)
 
 
 def damage(root: Path, rng: np.random.Generator) -> tuple[str, str]:
@@ -58,7 +70,8 @@ def _file(root: Path, rng: np.random.Generator) -> tuple[str, Path, str]:
         return kind, path, choices[at](path, rng)
     near = [other for other in files[kind] if other != path] or [path]
     other = near[rng.integers(len(near))]
-    mine, theirs = path.read_bytes(), other.read_bytes()
+    mine = path.read_bytes()
+    theirs = other.read_bytes()
     path.write_bytes(theirs)
     if at == len(choices):
         other.write_bytes(mine)

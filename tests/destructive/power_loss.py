@@ -84,7 +84,8 @@ class Disk:
             if self.on and (writing or event in CHANGES) and any(str(self.base) in str(arg) for arg in args[:2]):
                 self.note(f"{event} {Path(str(args[0])).name}")
 
-        os.fsync, self.on = fsync, True
+        os.fsync = fsync
+        self.on = True
         sys.addaudithook(change)
 
     def note(self, event: str) -> None:
@@ -114,7 +115,9 @@ def _scan(
     base: Path, flushed: dict[Inode, bytes]
 ) -> tuple[dict[Inode, str], dict[Inode, dict[str, Inode]], dict[Inode, bytes]]:
     """Path and entries of every folder, and contents of files that were never flushed."""
-    folders, entries, contents = {}, {}, {}
+    folders = {}
+    entries = {}
+    contents = {}
     for folder, _, names in os.walk(base):
         with suppress(FileNotFoundError), os.scandir(folder) as found:
             inode = Path(folder).stat().st_ino
@@ -133,7 +136,8 @@ def put_together(state: State, base: Inode, folders: set[Inode], out: Path, rng:
     while waiting:
         inode, folder = waiting.pop()
         folder.mkdir(exist_ok=True)
-        sure, now = state.entries.get(inode, {}), state.entries_now.get(inode, {})
+        sure = state.entries.get(inode, {})
+        now = state.entries_now.get(inode, {})
         for name in sorted(sure.keys() | now.keys()):
             one = sure.get(name)
             if rng is not None and sure.get(name) != now.get(name) and rng.random() < 0.5:

@@ -33,7 +33,8 @@ lease_module.POLL_SECONDS = 0.02  # otherwise a race consists mostly of waiting
 
 def write(root: Path, takes: list[str], note: int, seed: int) -> None:
     """Commit until killed, and record every commit as soon as it is acknowledged."""
-    db, rng = Database(root), np.random.default_rng(seed)
+    db = Database(root)
+    rng = np.random.default_rng(seed)
     while True:
         take = takes[rng.integers(len(takes))]
         with db.lease(take, "capture", wait=600) as lease, db.stage("capture", take, lease) as stage:
@@ -57,9 +58,13 @@ def race(root: Path, takes: list[str], asked: argparse.Namespace) -> list[str]:
     """Let the writers race, and return the faults."""
     pipe, note = os.pipe()
     os.set_blocking(pipe, False)
-    rng, seeds = np.random.default_rng([asked.seed, len(takes)]), iter(range(10**6))
+    rng = np.random.default_rng([asked.seed, len(takes)])
+    seeds = iter(range(10**6))
     running = [start(root, takes, note, next(seeds)) for _ in range(WRITERS)]
-    text, kills, faults, since = "", 0, [], time.monotonic()
+    text = ""
+    kills = 0
+    faults = []
+    since = time.monotonic()
     while text.count("\n") < asked.commits:
         time.sleep(0.02)
         while True:
@@ -110,7 +115,8 @@ def main() -> None:
     parser.add_argument("--commits", type=int, default=60, help="Number of commits of each race.")
     parser.add_argument("--kills", type=int, default=8, help="Number of writers that are killed in each race.")
     parser.add_argument("--seed", type=int, default=0, help="Random seed of who is killed.")
-    asked, failed = parser.parse_args(), False
+    asked = parser.parse_args()
+    failed = False
     for count in (1, WRITERS):
         with tempfile.TemporaryDirectory() as folder:
             process = os.fork()  # its threads must not be forked again

@@ -36,7 +36,8 @@ from skindb.store import Database, LeaseLost
 
 SECONDS = 1.0  # of a lease
 STAGES = kill_fit.FIT[1:6]
-GOOD, BAD = ("refused in one line",), ("committed over the new holder", "no line, or another", "second fit refused")
+GOOD = ("refused in one line",)
+BAD = ("committed over the new holder", "no line, or another", "second fit refused")
 
 
 def stopped_in(root: Path, stage: str) -> tuple[int, int]:
@@ -85,7 +86,8 @@ def attempt(root: Path, stage: str, *, early: bool) -> apart.Outcome:
     if kind != "lost" or "\n" in text or "another run took over" not in text:
         return BAD[1], f"stopped in {stage}: {kind}: {text}"
     db.clean()
-    faults, left = db.verify(), kill_fit.unlisted(db)
+    faults = db.verify()
+    left = kill_fit.unlisted(db)
     return (BAD[1], str(faults or left)) if faults or left else (GOOD[0], stage)
 
 

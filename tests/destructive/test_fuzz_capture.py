@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-CASES, SEED = 30, 2005
+CASES = 30
+SEED = 2005
 
 
 @pytest.mark.destructive

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-CASES, SEED = 10, 2006
+CASES = 10
+SEED = 2006
 
 
 @pytest.mark.destructive

@@ -30,7 +30,8 @@ def ggx(theta_h: np.ndarray, theta_d: np.ndarray, phi_d: np.ndarray, roughness: 
 
 
 def table(roughness: float, strength: float, diffuse: float, shape: tuple[int, int, int] = (90, 46, 36)) -> np.ndarray:
-    h, d = np.linspace(0, 1, shape[0]) ** 2 * np.pi / 2, np.linspace(0, np.pi / 2, shape[1])
+    h = np.linspace(0, 1, shape[0]) ** 2 * np.pi / 2
+    d = np.linspace(0, np.pi / 2, shape[1])
     p = np.arange(shape[2]) / shape[2] * np.pi
     return strength * ggx(*np.meshgrid(h, d, p, indexing="ij"), roughness) + diffuse / np.pi
 
@@ -46,7 +47,8 @@ def patch(tables: np.ndarray) -> xr.DataTree:
     u, v = (x.ravel() for x in np.meshgrid(*2 * [np.linspace(0.05, 0.95, SIDE)]))
     i = (np.arange(SIDE - 1)[:, None] * SIDE + np.arange(SIDE - 1)).ravel()
     faces = np.concatenate([np.stack([i, i + SIDE, i + 1], 1), np.stack([i + 1, i + SIDE, i + SIDE + 1], 1)])
-    x, y = (u - 0.5) * 120, (0.5 - v) * 120
+    x = (u - 0.5) * 120
+    y = (0.5 - v) * 120
     normal = np.stack([x / 150, y / 150, np.ones_like(x)], axis=1)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     status = np.where((u > 0.8) & (v > 0.8), int(FitStatus.UNSEEN), int(FitStatus.FITTED))

@@ -38,7 +38,8 @@ def test_export_page__reflectance_is_that_of_skindb(model, tmp_path, monkeypatch
     draws = np.random.default_rng(3)
     compared = 0
     for light, camera in draws.standard_normal((60, 2, 3)):
-        light, camera = light / np.linalg.norm(light), camera / np.linalg.norm(camera)
+        light = light / np.linalg.norm(light)
+        camera = camera / np.linalg.norm(camera)
         if min(light @ values["normal"], camera @ values["normal"]) > 0.2:
             expected = skindb.render.evaluate(model, surfel, light, camera)
             np.testing.assert_allclose(names["reflectance"](0, 0, light, camera), expected, rtol=TOLERANCE)

@@ -113,7 +113,9 @@ def test_export_gltf__normals_come_back_from_tangent_space(model: xr.DataTree, t
         view = document["bufferViews"][accessor["bufferView"]]
         return np.frombuffer(body, np.float32, accessor["count"] * width, view["byteOffset"]).reshape(-1, width)
 
-    normal, tangent, uv = read("NORMAL", 3), read("TANGENT", 4), read("TEXCOORD_0", 2)
+    normal = read("NORMAL", 3)
+    tangent = read("TANGENT", 4)
+    uv = read("TEXCOORD_0", 2)
     image = picture(document, body, 4)
     at = np.clip((uv * 256).astype(int), 0, 255)
     local = image[at[:, 1], at[:, 0]] / 127.5 - 1

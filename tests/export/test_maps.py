@@ -51,9 +51,12 @@ def test_texture_maps__values_without_a_fit_never_enter(model: xr.DataTree) -> N
 
 
 def test_texture_maps__status_says_where_each_texel_comes_from(model: xr.DataTree) -> None:
-    fitted, triangles = model["fitted"].to_dataset(), model["mesh/triangle"].values
+    fitted = model["fitted"].to_dataset()
+    triangles = model["mesh/triangle"].values
     u, v = fitted["surfel_uv"].values.T
-    left, top, middle = (u < 0.3) & (v > 0.5), (u < 0.3) & (v < 0.3), np.hypot(u - 0.5, v - 0.5) < 0.15
+    left = (u < 0.3) & (v > 0.5)
+    top = (u < 0.3) & (v < 0.3)
+    middle = np.hypot(u - 0.5, v - 0.5) < 0.15
     lower = (v > 0.7) & (u > 0.4) & (u < 0.6)
     status = np.where(lower, int(FitStatus.DIFFUSE_CLAMPED), fitted["fit_status"].values)
     model["fitted"] = fitted.assign(
@@ -91,7 +94,8 @@ def test_texture_maps__status_says_where_each_texel_comes_from(model: xr.DataTre
 
 def noisy(model: xr.DataTree, doubtful: np.ndarray) -> dict[str, np.ndarray]:
     """Maps of a patch of white noise, some surfels of which have few samples."""
-    fitted, rng = model["fitted"].to_dataset(), np.random.default_rng(0)
+    fitted = model["fitted"].to_dataset()
+    rng = np.random.default_rng(0)
     fitted["fit_status"].values[:] = int(FitStatus.FITTED)
     tilted = fitted["surfel_normal"].values + rng.normal(scale=0.1, size=(len(doubtful), 3))
     albedo = rng.uniform(0.1, 0.9, (len(doubtful), 3))
@@ -109,7 +113,8 @@ def noisy(model: xr.DataTree, doubtful: np.ndarray) -> dict[str, np.ndarray]:
 
 def test_texture_maps__evenly_doubtful_surfels_are_marked_and_not_blurred(model: xr.DataTree) -> None:
     n = model["fitted"].sizes["surfel"]
-    sure, doubtful = noisy(model, np.zeros(n, bool)), noisy(model, np.ones(n, bool))
+    sure = noisy(model, np.zeros(n, bool))
+    doubtful = noisy(model, np.ones(n, bool))
     inside = sure["confidence"][..., 0] > 0
     np.testing.assert_allclose(doubtful["confidence"], sure["confidence"] / 2, rtol=1e-6)
     assert sure["albedo"][inside].std() > 0.1
@@ -120,7 +125,8 @@ def test_texture_maps__evenly_doubtful_surfels_are_marked_and_not_blurred(model:
 def test_texture_maps__a_doubtful_part_is_blurred_at_its_rim_at_most(model: xr.DataTree) -> None:
     u, _ = grid()
     surfel_u = model["fitted/surfel_uv"].values[:, 0]
-    sure, part = noisy(model, np.zeros(len(surfel_u), bool)), noisy(model, surfel_u < 0.5)
+    sure = noisy(model, np.zeros(len(surfel_u), bool))
+    part = noisy(model, surfel_u < 0.5)
     rim = np.abs(u - 0.5) < 0.9 / 23 + 2 / SIZE  # a surfel and two texels
     away = ~rim & (sure["confidence"][..., 0] > 0)
     np.testing.assert_allclose(part["albedo"][away], sure["albedo"][away], atol=2e-6)
@@ -144,8 +150,14 @@ def test_texture_maps__a_lone_doubtful_surfel_is_drawn_towards_those_around(mode
 def test_texture_maps__without_translucency_there_is_no_such_map(model: xr.DataTree) -> None:
     model["fitted"] = model["fitted"].to_dataset().drop_vars("sigma_tr")
     assert set(texture_maps(model, size=SIZE)) == {
-        "albedo", "normal", "normal_tangent", "weight_0", "weight_1", "confidence", "status",
-    }  # fmt: skip
+        "albedo",
+        "normal",
+        "normal_tangent",
+        "weight_0",
+        "weight_1",
+        "confidence",
+        "status",
+    }
 
 
 def test_texture_maps__unknown_translucency_is_left_out_channel_by_channel(model: xr.DataTree) -> None:

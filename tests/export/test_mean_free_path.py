@@ -10,7 +10,8 @@ from skindb.export.mean_free_path import mean_free_path
 from skindb.optics.diffuse import dipole_s, scattering_coefficients
 from skindb.optics.dipole import dipole_profile
 
-ETA, PHOTONS = 1.3, 100_000
+ETA = 1.3
+PHOTONS = 100_000
 Float = NDArray[np.float64]
 
 
@@ -23,25 +24,36 @@ def single_albedo(multiple: float) -> float:
 def walk(albedo: float, rng: np.random.Generator) -> tuple[Float, Float]:
     """Distances along x, in mean free paths, between entry and exit of photons, and their weights."""
     rise = -np.sqrt(rng.random(PHOTONS))  # they enter in proportion to the cosine
-    x, z, weight, turn = np.zeros(PHOTONS), np.zeros(PHOTONS), np.ones(PHOTONS), 2 * np.pi * rng.random(PHOTONS)
-    found, left = [], []
+    x = np.zeros(PHOTONS)
+    z = np.zeros(PHOTONS)
+    weight = np.ones(PHOTONS)
+    turn = 2 * np.pi * rng.random(PHOTONS)
+    found = []
+    left = []
     while len(x):
-        step, along = rng.exponential(size=len(x)), np.sqrt(1 - rise**2) * np.cos(turn)
+        step = rng.exponential(size=len(x))
+        along = np.sqrt(1 - rise**2) * np.cos(turn)
         out = z + step * rise > 0
         found.append((x - z / rise * along)[out])
         left.append(weight[out])
-        x, z, weight = (x + step * along)[~out], (z + step * rise)[~out], weight[~out] * albedo
+        x = (x + step * along)[~out]
+        z = (z + step * rise)[~out]
+        weight = weight[~out] * albedo
         weak = weight < 0.01
         alive = ~weak | (rng.random(len(x)) < 0.1)
-        x, z, weight = x[alive], z[alive], np.where(weak, 10 * weight, weight)[alive]
-        rise, turn = 2 * rng.random(len(x)) - 1, 2 * np.pi * rng.random(len(x))
+        x = x[alive]
+        z = z[alive]
+        weight = np.where(weak, 10 * weight, weight)[alive]
+        rise = 2 * rng.random(len(x)) - 1
+        turn = 2 * np.pi * rng.random(len(x))
     return np.concatenate(found), np.concatenate(left)
 
 
 def dipole_edge(diffuse: float, sigma_tr: float, across: Float) -> Float:
     """Light that leaves the skin at these distances [mm] from the edge of a shadow; 1 is that of even light."""
     absorption, scattering = scattering_coefficients(dipole_s(np.array(diffuse), eta=ETA)[0], np.array(sigma_tr))
-    line, along = np.linspace(0, 30, 1201), np.concatenate([[0], np.geomspace(1e-4, 100, 1500)])
+    line = np.linspace(0, 30, 1201)
+    along = np.concatenate([[0], np.geomspace(1e-4, 100, 1500)])
     distance = np.hypot(line[:, None], along)
     spread = np.trapezoid(dipole_profile(distance, float(absorption), float(scattering), eta=ETA), along, axis=1)
     light = np.concatenate([[0], np.cumsum((spread[1:] + spread[:-1]) / 2)])
@@ -50,7 +62,8 @@ def dipole_edge(diffuse: float, sigma_tr: float, across: Float) -> Float:
 
 @pytest.mark.parametrize("diffuse", [0.2, 0.5, 0.8])
 def test_mean_free_path__a_walk_spreads_light_as_the_dipole_does(diffuse: float) -> None:
-    sigma_tr, across = 0.7, np.linspace(-8, 8, 81)
+    sigma_tr = 0.7
+    across = np.linspace(-8, 8, 81)
     place, weight = walk(single_albedo(diffuse), np.random.default_rng(1))
     assert weight.sum() / PHOTONS == pytest.approx(diffuse, rel=0.02)  # the formula of the albedo, and noise
     order = np.argsort(place)

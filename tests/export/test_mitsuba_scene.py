@@ -29,13 +29,16 @@ from skindb.render.scene import Camera, Lights, Surface, from_model
 pytestmark = pytest.mark.slow
 
 LIGHT = np.array([[150.0, 100, 500]])
-WIDTH, HEIGHT, DISTANCE = 480, 600, 800.0
+WIDTH = 480
+HEIGHT = 600
+DISTANCE = 800.0
 
 
 def rendered(surface: Surface) -> np.ndarray:
     """As `skin.scene` of the bundle: a camera 800 mm in front, 20 degrees wide, and a point light."""
     focal = WIDTH / 2 / np.tan(np.radians(10))
-    K, R = np.array([[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1]]), np.diag([1.0, -1, -1])
+    K = np.array([[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1]])
+    R = np.diag([1.0, -1, -1])
     camera = Camera(K, R, np.array([0, 0, DISTANCE]), np.zeros(5), WIDTH, HEIGHT)
     lamp = Lights(LIGHT, np.full((1, 3), 1e6), np.zeros(1), -LIGHT / np.linalg.norm(LIGHT), np.zeros(1))
     return render_view(surface, camera, lamp, samples=2, disc_samples=1).sum(axis=0)

@@ -50,7 +50,8 @@ def test_fit_material__no_other_material_is_better(tables: np.ndarray, weights: 
 def test_best_pair__against_a_search() -> None:
     rng = np.random.default_rng(1)
     root = rng.standard_normal((200, 2, 4))
-    gram, rhs = root @ root.transpose(0, 2, 1), rng.standard_normal((200, 2)) * 2
+    gram = root @ root.transpose(0, 2, 1)
+    rhs = rng.standard_normal((200, 2)) * 2
     x, gain = _best_pair(gram, rhs)
     assert (x >= 0).all()
     assert (x.sum(axis=1) <= 1 + 1e-9).all()
@@ -64,7 +65,8 @@ def test_best_pair__against_a_search() -> None:
 
 def test_fit_material__stays_in_the_range_of_gltf(tables: np.ndarray) -> None:
     rng = np.random.default_rng(2)
-    diffuse, weights = rng.uniform(0, 1, (300, 3)), rng.exponential(2.0, (300, 2)) * rng.integers(0, 2, (300, 2))
+    diffuse = rng.uniform(0, 1, (300, 3))
+    weights = rng.exponential(2.0, (300, 2)) * rng.integers(0, 2, (300, 2))
     found = fit_material(tables, diffuse, weights, eta=1.3)
     most = {"base_color": 1.0, "specular": 1.0, "f0": MAX_F0, "roughness": 1.0}
     for name, limit in most.items():
@@ -75,7 +77,8 @@ def test_fit_material__stays_in_the_range_of_gltf(tables: np.ndarray) -> None:
 
 
 def test_approximation_error__large_for_a_wrong_material(tables: np.ndarray) -> None:
-    diffuse, weights = np.full((3, 3), 0.3), np.array([[0.2], [0.5], [0.9]])
+    diffuse = np.full((3, 3), 0.3)
+    weights = np.array([[0.2], [0.5], [0.9]])
     good = fit_material(tables[..., :1], diffuse, weights, eta=1.0)
     bad = replace(good, specular=good.specular / 2)
     assert error(tables[..., :1], weights, bad, diffuse, 1.0) > 3 * error(tables[..., :1], weights, good, diffuse, 1.0)

@@ -18,9 +18,11 @@ def patch(seed: int, *, mirrored: bool = False):
         [-16 * np.cos(2 * x) * np.cos(y) / 40, 8 * np.sin(2 * x) * np.sin(y) / 40, np.ones_like(x)], axis=1
     )
     normal = slope / np.linalg.norm(slope, axis=1, keepdims=True)
-    turn, stretch = rng.uniform(0, 2 * np.pi), rng.uniform(0.5, 2)
+    turn = rng.uniform(0, 2 * np.pi)
+    stretch = rng.uniform(0.5, 2)
     flat = np.stack([x * (-1 if mirrored else 1), stretch * y], axis=1)
-    c, s = np.cos(turn), np.sin(turn)
+    c = np.cos(turn)
+    s = np.sin(turn)
     uv = 0.5 + 0.2 * flat @ np.array([[c, s], [-s, c]])
     i = (np.arange(side - 1)[:, None] * side + np.arange(side - 1)).ravel()
     faces = np.concatenate([np.stack([i, i + 1, i + side], 1), np.stack([i + 1, i + side + 1, i + side], 1)])
@@ -32,17 +34,20 @@ def test_tangent_frames__follow_the_texture(mirrored):
     for seed in range(8):
         position, normal, uv, faces = patch(seed, mirrored=mirrored)
         frames = tangent_frames(position, normal, uv, faces)
-        tangent, sign = frames[:, :3], frames[:, 3]
+        tangent = frames[:, :3]
+        sign = frames[:, 3]
         np.testing.assert_allclose(np.linalg.norm(tangent, axis=1), 1)
         np.testing.assert_allclose((tangent * normal).sum(axis=1), 0, atol=1e-12)
         # v grows downwards: with y up in space and down in the texture, an unmirrored texture has the sign -1
         assert set(sign) == {1.0 if mirrored else -1.0}
         # the derivative of the position with u, by finite differences over the triangles' corners
-        corner, place = position[faces], uv[faces]
+        corner = position[faces]
+        place = uv[faces]
         step = np.linalg.solve((place[:, 1:] - place[:, :1]), corner[:, 1:] - corner[:, :1])  # (f, 2, 3)
         along = step[:, 0] / np.linalg.norm(step[:, 0], axis=1, keepdims=True)
         up = -step[:, 1] / np.linalg.norm(step[:, 1], axis=1, keepdims=True)
-        mean, bitangent = tangent[faces].mean(axis=1), (np.cross(normal, tangent) * sign[:, None])[faces].mean(axis=1)
+        mean = tangent[faces].mean(axis=1)
+        bitangent = (np.cross(normal, tangent) * sign[:, None])[faces].mean(axis=1)
         assert (mean * along).sum(axis=1).min() > 0.97  # triangles of 4 mm on a surface that bends
         assert (bitangent * up).sum(axis=1).min() > 0.75  # a texture that is stretched at an angle is sheared
 

@@ -47,7 +47,8 @@ def plate(
 
 @pytest.mark.parametrize("distance", [0.0, 0.3, 2.0, 15.0])
 def test_dipole_power_beyond__is_the_integral_of_the_profile(distance):
-    absorption, scattering = np.array([0.02, 0.1]), np.array([1.5, 0.8])
+    absorption = np.array([0.02, 0.1])
+    scattering = np.array([1.5, 0.8])
     found = dipole_power_beyond(distance, absorption, scattering, eta=ETA)
     for i in range(2):
 
@@ -87,7 +88,8 @@ def test_transmitted_fraction__is_that_of_the_octree(depth):
     """A plate of 40 mm lit evenly from behind: the exitance in front over R_d, in the middle."""
     points, _, faces = plate(depth, 81, 0.5)
     areas = vertex_areas(points, faces)
-    sigma_tr, diffuse = np.array([[0.5, 0.8, 1.25]]), np.array([[0.6, 0.4, 0.3]])
+    sigma_tr = np.array([[0.5, 0.8, 1.25]])
+    diffuse = np.array([[0.6, 0.4, 0.3]])
     s, _ = dipole_s(diffuse, eta=ETA)
     lit = np.zeros((len(points), 1))
     lit[len(points) // 2 :] = 1.0
@@ -104,7 +106,8 @@ def test_transmitted_fraction__is_that_of_the_octree(depth):
 
 
 def test_transmitted_fraction__of_thick_or_unknown_skin_is_zero():
-    diffuse, sigma_tr = np.full((3, 3), 0.4), np.array([[0.5] * 3, [np.nan] * 3, [0.5] * 3])
+    diffuse = np.full((3, 3), 0.4)
+    sigma_tr = np.array([[0.5] * 3, [np.nan] * 3, [0.5] * 3])
     found = transmitted_fraction(np.array([np.inf, 1.0, 1.0]), diffuse, sigma_tr, eta=ETA)
     assert (found[:2] == 0).all()
     assert (found[2] > 0.1).all()
@@ -134,8 +137,11 @@ def test_export_gltf__thin_parts_have_diffuse_transmission(model: xr.DataTree, t
     base = decode_srgb(picture(document, body, 0) / 255.0)[..., :3]
     strength = material["diffuseTransmissionFactor"] * image[..., 3:] / 255.0
     found = strength * decode_srgb(image[..., :3] / 255.0)
-    row, column = 32, 16  # on the front side, between surfels: u = 0.258, v = 0.508
-    u, v = (column + 0.5) / 64, (row + 0.5) / 64
+    # on the front side, between surfels: u = 0.258, v = 0.508
+    row = 32
+    column = 16
+    u = (column + 0.5) / 64
+    v = (row + 0.5) / 64
     diffuse = 0.2 + 0.5 * np.array([[u, v, u * v]])
     expected = transmitted_fraction(np.array([2.0]), diffuse, np.array([[0.5, 0.8, 1.25]]), eta=ETA)[0]
     # eight bits of an sRGB colour, and values interpolated between surfels

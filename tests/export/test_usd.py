@@ -75,7 +75,8 @@ def test_export_usd__its_preview_reflects_as_much_as_the_face(model: xr.DataTree
     assert preview.GetIdAttr().Get() == "UsdPreviewSurface"
     ior = preview.GetInput("ior").Get()
     fitted = model["fitted"].to_dataset().isel(surfel=model["fitted/fit_status"].values == 0)
-    tables, diffuse = kernel_tables(model["basis"].to_dataset()), fitted["diffuse_reflectance"].values
+    tables = kernel_tables(model["basis"].to_dataset())
+    diffuse = fitted["diffuse_reflectance"].values
     skin = fit_material(tables, diffuse, fitted["basis_weight"].values, eta=1.3)
     assert ((ior - 1) / (ior + 1)) ** 2 == pytest.approx((skin.specular * skin.f0).mean(), rel=1e-3)
     colour = preview.GetInput("diffuseColor").GetConnectedSource()[0]
@@ -84,7 +85,8 @@ def test_export_usd__its_preview_reflects_as_much_as_the_face(model: xr.DataTree
 
 def test_export_usd__its_material_is_valid_materialx(bundle: Path) -> None:
     mx = pytest.importorskip("MaterialX", reason="materialx is not installed")
-    library, document = mx.createDocument(), mx.createDocument()
+    library = mx.createDocument()
+    document = mx.createDocument()
     mx.loadLibraries(mx.getDefaultDataLibraryFolders(), mx.getDefaultDataSearchPath(), library)
     mx.readFromXmlFile(document, str(bundle / "usd/face.mtlx"))
     document.setDataLibrary(library)

@@ -41,7 +41,8 @@ def _naive_slope(x, y):
 
 def _naive_shape(columns, y, noise=(0.0, 0.0)):
     """Weights of the columns, the diffuse shape first."""
-    level, keep = np.maximum(y, FLOOR), np.ones_like(y)
+    level = np.maximum(y, FLOOR)
+    keep = np.ones_like(y)
     for _ in range(4):
         root = np.sqrt(keep) / level
         x = nnls(columns * root[:, None], y * root)[0]
@@ -60,7 +61,8 @@ def _slope(x, y):
 
 def _shape(shape, lobes, y, noise=(0.0, 0.0)):
     n = len(y)
-    memory, rows = separation_memory(n), np.zeros((n, 2 * COLUMNS), np.float32)
+    memory = separation_memory(n)
+    rows = np.zeros((n, 2 * COLUMNS), np.float32)
     rows[:, : lobes.shape[1]], rows[:, SHAPE] = lobes, shape
     memory.mean[:n] = y
     lines = np.broadcast_to(np.array(noise)[:, None], (2, n)).astype(np.float32)
@@ -68,7 +70,8 @@ def _shape(shape, lobes, y, noise=(0.0, 0.0)):
 
 
 def _samples(rng, count, noise=0.03):
-    shape, lobes = rng.uniform(0.05, 0.3, count), rng.uniform(0, 1, (count, LOBES)) ** 4
+    shape = rng.uniform(0.05, 0.3, count)
+    lobes = rng.uniform(0, 1, (count, LOBES)) ** 4
     y = 0.4 * shape + lobes @ np.linspace(0.05, 0.1, LOBES)
     y *= 1 + noise * rng.normal(size=count)
     y[::17] *= 0.4  # shadows
@@ -93,7 +96,8 @@ def test_fit_shape__is_the_plain_loop_with_scipy(count):
 @pytest.mark.parametrize("count", [60, 600])
 def test_errors__are_the_scatter_of_repeated_draws(count):
     rng = np.random.default_rng(3)
-    shape, lobes = rng.uniform(0.05, 0.3, count), rng.uniform(0, 1, (count, 3)) ** 4
+    shape = rng.uniform(0.05, 0.3, count)
+    lobes = rng.uniform(0, 1, (count, 3)) ** 4
     clean = 0.4 * shape + lobes @ np.array([0.05, 0.07, 0.1])
     # noise of unequal variance, as photographs have
     slopes = np.array([_slope(shape, 0.4 * shape * (1 + 0.03 * rng.normal(size=count))) for _ in range(1500)])
@@ -117,7 +121,8 @@ def _pairs(sample, normal, wi, wo):
 
 def _plain(sample, normal, wi, wo, pairs):
     """R_d (3,) of one surfel by table lookups and SciPy in double precision."""
-    ci, co = wi @ normal, wo @ normal
+    ci = wi @ normal
+    co = wo @ normal
     i, o = pairs
     shape = ci[i] * fresnel_transmittance(ci[i], 1.3) * fresnel_transmittance(co[o], 1.3) / np.pi
     table, _ = surface_lobes()
@@ -160,7 +165,9 @@ def test_separate__error_of_the_normal_is_what_turning_it_does(separated):
     for i, n in enumerate(ds["shading_normal"].values.astype(float)):
         first = np.cross(n, np.eye(3)[np.abs(n).argmin()])
         first /= np.linalg.norm(first)
-        sample, step, square = ds["reflectance_sample"].values[i], np.radians(0.05), 0.0
+        sample = ds["reflectance_sample"].values[i]
+        step = np.radians(0.05)
+        square = 0.0
         pairs = _pairs(sample, n, wi[i], wo[i])
         for axis in (first, np.cross(n, first)):
             ends = [(n + s * step * axis) / np.hypot(1, step) for s in (-1, 1)]

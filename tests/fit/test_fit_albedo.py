@@ -67,11 +67,13 @@ def test_estimate_diffuse_reflectance__total_error_counts_what_lights_and_camera
 
 
 def test_reflectance_interval__even_reflection_acts_downwards():
-    fitted = dataset({
-        "diffuse_reflectance": np.array([[0.4, 0.2, 0.1]], np.float32),
-        "diffuse_reflectance_total_error": np.hypot(np.array([[0.01, 0.0, 0.02]], np.float32), 0.055 / 1.96),
-        "even_reflection_limit": 0.055,
-    })  # fmt: skip
+    fitted = dataset(
+        {
+            "diffuse_reflectance": np.array([[0.4, 0.2, 0.1]], np.float32),
+            "diffuse_reflectance_total_error": np.hypot(np.array([[0.01, 0.0, 0.02]], np.float32), 0.055 / 1.96),
+            "even_reflection_limit": 0.055,
+        }
+    )
     low, high = reflectance_interval(fitted)
     np.testing.assert_allclose(high, [[0.4196, 0.2, 0.1392]], atol=1e-5)
     np.testing.assert_allclose(low, [[0.4 - np.hypot(0.0196, 0.055), 0.145, 0.1 - np.hypot(0.0392, 0.055)]], atol=1e-5)
@@ -103,7 +105,8 @@ def _of_the_model(new_skin, surfels, lights, cameras, noise, rng, gloss=0.3):
     position = ds["surfel_position"].values.astype(float)
     wi, wo = (ds[f"{name}_position"].values - position[:, None] for name in ("light", "camera"))
     wi, wo = (v / np.linalg.norm(v, axis=-1, keepdims=True) for v in (wi, wo))
-    ci, co = np.einsum("nk,ntk->nt", skin.normal, wi), np.einsum("nk,ntk->nt", skin.normal, wo)
+    ci = np.einsum("nk,ntk->nt", skin.normal, wi)
+    co = np.einsum("nk,ntk->nt", skin.normal, wo)
     table, grid = surface_lobes()
     rows, offsets, index = basis_rows(table, grid, skin.normal, wi, wo, (ci > 0)[:, :, None] & (co > 0)[:, None])
     s, (i, o) = np.repeat(np.arange(surfels), np.diff(offsets)), index.T

@@ -67,11 +67,15 @@ def test_segments__without_any_sample():
 @pytest.mark.parametrize("mode", ["linear", "perceptual"])
 def test_weigh__noise_over_the_error_of_models_in_plain_numpy(mode):
     rng = np.random.default_rng(7)
-    count, floor, noise, shot = 40, 2e-3, 1e-3, 4e-4
+    count = 40
+    floor = 2e-3
+    noise = 1e-3
+    shot = 4e-4
     memory = lumitexel_memory(10, 6, 4)
     memory.scattered[:, :count] = rng.uniform(0, 0.3, (3, count))
     weight = np.zeros(60, np.float32)
-    options, typical = Options(1.3, MODES.index(mode), floor, 1, True), TypicalNoise(noise, shot)
+    options = Options(1.3, MODES.index(mode), floor, 1, True)
+    typical = TypicalNoise(noise, shot)
     weigh(0, count, noise_of((), typical), options, memory, weight)
 
     level = memory.scattered[:, :count].mean(axis=0, dtype=np.float64)

@@ -140,7 +140,8 @@ def test_fit_model__is_its_two_passes(fitted, planted, small_dictionary):
 def test_fit_model__passes_are_their_separate_methods(fitted, planted, small_dictionary):
     """Each method, called with the results of those before it, gives the same as the fused passes."""
     model, _ = fitted
-    held_out, found = model["held_out"].to_dataset(), model["fitted"].to_dataset()
+    held_out = model["held_out"].to_dataset()
+    found = model["fitted"].to_dataset()
     whole = lumitexels_of(planted)
     work = fitted_part(whole, held_out)
     alone = estimate_normals(work)
@@ -279,7 +280,8 @@ def test_fit_model__basis_brdf_is_interpolated_over_the_closed_period(fitted):
     assert np.isfinite(found.values).all()
     np.testing.assert_allclose(found.isel(phi_d=0), found.isel(phi_d=-1), rtol=2e-6)  # single precision
     # between two nodes the values are theirs in proportion, in the last cell of the period as in any other
-    nodes, k = brdf["phi_d"].values, brdf.sizes["phi_d"] - 2
+    nodes = brdf["phi_d"].values
+    k = brdf.sizes["phi_d"] - 2
     middle = brdf.interp(phi_d=(nodes[k] + nodes[k + 1]) / 2)
     np.testing.assert_allclose(middle, (brdf.isel(phi_d=k) + brdf.isel(phi_d=0)) / 2, rtol=1e-6, atol=1e-7)
 
@@ -306,7 +308,8 @@ def test_fit_model__light_gains_lower_the_held_out_error(planted, small_dictiona
 
 def test_fit_model__inter_reflection_of_a_convex_face_is_nothing(fitted, planted, small_dictionary):
     asked = replace(HELD_OUT, inter_reflection=True)
-    found, plain = fit_model(planted, asked, dictionary=small_dictionary), fitted[0]
+    found = fit_model(planted, asked, dictionary=small_dictionary)
+    plain = fitted[0]
     assert {"inter-reflection", "first pass again"} <= set(found.attrs["seconds"])
     for name in ("shading_normal", "diffuse_reflectance", "basis_weight"):
         np.testing.assert_allclose(found[f"fitted/{name}"], plain[f"fitted/{name}"], rtol=1e-5)

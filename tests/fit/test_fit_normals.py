@@ -84,7 +84,8 @@ def test_estimate_normals__few_lights_lean_on_the_scan(skin):
 def test_estimate_normals__error_covers_noise_and_scan(new_skin, method):
     skin = new_skin(surfels=300, gloss=0.0, noise=0.03)
     found = estimate_normals(skin.lumitexels, method=method)
-    angle, error = _angles(found["shading_normal"].values, skin.normal), found["normal_error"].values
+    angle = _angles(found["shading_normal"].values, skin.normal)
+    error = found["normal_error"].values
     # two equal axes: 95 % below 1.73 of the RMS angle (chi-square of two degrees of freedom; unequal axes have up to
     # 3 % less); 300 surfels know the share to 1.3 %, three of which are allowed
     assert 0.95 - 0.03 - 0.038 < (angle < 1.73 * error).mean() < 0.95 + 0.038
@@ -106,7 +107,8 @@ def test_estimate_normals__error_has_the_size_of_the_noise(new_skin, method):
     """
     skin = new_skin(surfels=600, gloss=0.0, noise=0.05)
     found = estimate_normals(skin.lumitexels, method=method, scan_error=1e3)
-    angle, error = _angles(found["shading_normal"].values, skin.normal), found["normal_error"].values
+    angle = _angles(found["shading_normal"].values, skin.normal)
+    error = found["normal_error"].values
     assert abs(np.sqrt((angle**2).mean() / (error**2).mean()) - 1) < 0.06
     assert abs((angle < 1.73 * error).mean() - 0.95) < 0.027  # three times what 600 surfels know the share to
 

@@ -19,7 +19,9 @@ from skindb.schema import dataset, label
 from skindb.schema.brdf import kernel_tables, stored_brdf
 
 NOISE = 0.01  # relative, of every sample
-SURFELS, LIGHTS, CAMERAS = 300, 30, 8
+SURFELS = 300
+LIGHTS = 30
+CAMERAS = 8
 HAIR = 0.03  # of the pairs of a patch
 
 
@@ -59,7 +61,8 @@ def test_find_outliers__noise_is_not_an_outlier(taken):
 
 def test_find_outliers__hair_is_found_where_it_is(taken):
     lumitexels, basis = taken
-    patch, rng = np.arange(100, 160), np.random.default_rng(2)
+    patch = np.arange(100, 160)
+    rng = np.random.default_rng(2)
     hit = np.zeros((SURFELS, LIGHTS, CAMERAS), bool)
     hit[patch] = rng.uniform(size=(len(patch), LIGHTS, CAMERAS)) < HAIR
 
@@ -159,7 +162,8 @@ def test_find_outliers__is_its_definition(taken):
     heavy = np.where(np.random.default_rng(2).uniform(size=tails.shape) < 0.2, tails**3, 1)  # a fifth, not all outliers
     few = _changed(lumitexels.isel(surfel=slice(0, 12)), lambda sample: np.multiply(sample, heavy, out=sample))
     given = few["reflectance_sample"].values.astype(float).mean(-1)
-    predicted, floor = _predicted(few, basis), noise_floor(few)
+    predicted = _predicted(few, basis)
+    floor = noise_floor(few)
     root = lambda y: y / np.cbrt(y**2 + floor**2)  # noqa: E731
     cosine = _cosines(few)
     usable = (cosine[0] > 0.2)[:, :, None] & (cosine[1] > 0.2)[:, None]
@@ -204,7 +208,8 @@ def test_find_outliers__a_perfect_fit_has_none(new_skin, small_dictionary, plant
 
 
 def _cosines(ds):
-    normal, position = ds["shading_normal"].values.astype(float), ds["surfel_position"].values.astype(float)
+    normal = ds["shading_normal"].values.astype(float)
+    position = ds["surfel_position"].values.astype(float)
     found = []
     for name in ("light_position", "camera_position"):
         away = ds[name].values.astype(float)[None] - position[:, None]
@@ -214,7 +219,8 @@ def _cosines(ds):
 
 def _predicted(ds, basis):
     """(surfel, light, camera) mean over channels."""
-    position, table = ds["surfel_position"].values.astype(float), kernel_tables(basis)
+    position = ds["surfel_position"].values.astype(float)
+    table = kernel_tables(basis)
     out = []
     for s, (ci, co) in enumerate(zip(*_cosines(ds), strict=True)):
         wi, wo = (ds[name].values.astype(float) - position[s] for name in ("light_position", "camera_position"))

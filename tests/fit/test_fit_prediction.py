@@ -10,7 +10,9 @@ from skindb.fit import prediction_table
 from skindb.fit.prediction import describe_prediction, tabulate_prediction
 from skindb.schema import FitStatus, dataset
 
-FITTED, CLAMPED, UNSEEN = FitStatus.FITTED, FitStatus.DIFFUSE_CLAMPED, FitStatus.UNSEEN
+FITTED = FitStatus.FITTED
+CLAMPED = FitStatus.DIFFUSE_CLAMPED
+UNSEEN = FitStatus.UNSEEN
 
 
 def _fitted(**more):
@@ -57,7 +59,8 @@ def test_prediction_table__counts_and_weighs_by_area():
 
 def test_prediction_table__agrees_with_numpy_for_equal_areas():
     rng = np.random.default_rng(1)
-    values, status = rng.lognormal(size=501), rng.choice([FITTED, CLAMPED], 501)
+    values = rng.lognormal(size=501)
+    status = rng.choice([FITTED, CLAMPED], 501)
     mask = rng.uniform(size=(501, 2)) < 0.4
     table = prediction_table(
         dataset(

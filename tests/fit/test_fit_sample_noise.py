@@ -22,7 +22,8 @@ from skindb.fit.sample_noise import NO_NOISE, NOISE_INPUTS, noise_inputs, noise_
 from skindb.optics.rows import pad_to_lanes
 from skindb.schema import label
 
-ETA, TIMES = 1.3, np.array([0.04, 0.005])
+ETA = 1.3
+TIMES = np.array([0.04, 0.005])
 
 
 @pytest.fixture(scope="module")
@@ -65,8 +66,11 @@ def test_write_noise__variance_of_each_sample_by_hand(skin, whole):
     known = with_noise(skin.lumitexels, whole=whole)
     arrays = tuple(known[name].values for name in NOISE_INPUTS)
     sample = known["reflectance_sample"].values
-    noise, table = noise_of(arrays, NO_NOISE), np.zeros((3, 3, 3, 4), np.float32)
-    b, rows, steps = lumitexel_memory(20, 4, 8), 0, set()
+    noise = noise_of(arrays, NO_NOISE)
+    table = np.zeros((3, 3, 3, 4), np.float32)
+    b = lumitexel_memory(20, 4, 8)
+    rows = 0
+    steps = set()
     for s in range(len(sample)):
         b.values[:] = sample[s].astype(np.float32).ravel()
         position, light, camera = (
@@ -109,11 +113,13 @@ def test_sample_variance__of_captures_that_do_not_say_it(skin):
 @pytest.mark.parametrize("mode", ["linear", "perceptual"])
 def test_weigh__no_weight_exceeds_what_noise_permits(skin, mode):
     """Doubling the noise variance of a sample never increases its weight, and almost halves it if noise dominates."""
-    known, weights = with_noise(skin.lumitexels, electrons=100.0), []
+    known = with_noise(skin.lumitexels, electrons=100.0)
+    weights = []
     for pixels in (1.0, 0.5):
         arrays = tuple(known[name].values for name in NOISE_INPUTS)
         noise = noise_of((arrays[0], np.full_like(arrays[1], pixels), *arrays[2:]), NO_NOISE)
-        b, weight = lumitexel_memory(20, 4, 8), np.zeros(80, np.float32)
+        b = lumitexel_memory(20, 4, 8)
+        weight = np.zeros(80, np.float32)
         b.index[:] = [(i, o) for i in range(20) for o in range(4)]
         b.given[:], b.scattered[:] = 0.05, np.linspace(0.001, 0.2, 80)
         weigh(0, 80, noise, Options(ETA, MODES.index(mode), 2e-3, 1, True), b, weight)
@@ -130,7 +136,8 @@ def test_weigh__no_weight_exceeds_what_noise_permits(skin, mode):
 
 def test_estimate_diffuse_reflectance__read_noise_moves_it_less_if_it_is_known():
     """Noise is as large as most samples; weights by the level of the samples only would favour the darkest ones."""
-    skin, rng = make_skin(surfels=150, lights=40, cameras=6, noise=0.0, seed=3), np.random.default_rng(5)
+    skin = make_skin(surfels=150, lights=40, cameras=6, noise=0.0, seed=3)
+    rng = np.random.default_rng(5)
     true = skin.lumitexels.assign(shading_normal=label("shading_normal", skin.normal))
     known = with_noise(true, electrons=60.0, pixels=1.0, whole=100.0)
     sample = known["reflectance_sample"].values.astype(np.float64)

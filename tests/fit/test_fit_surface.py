@@ -41,7 +41,8 @@ def test_fit_surface__reproduces_planted_reflectance(planted, small_dictionary, 
     assert (found["dictionary_weight"] >= 0).all()
     # compared as BRDFs: weights are not unique
     cells = small_dictionary.table[5:60, 5:60, ::6].reshape(-1, weight.shape[1]).astype(float)
-    true, fitted = weight @ cells.T, found["dictionary_weight"].values @ cells.T
+    true = weight @ cells.T
+    fitted = found["dictionary_weight"].values @ cells.T
     assert np.median(np.abs(fitted - true)) < 0.02 * np.median(true)
 
 
@@ -63,7 +64,8 @@ def test_fit_surface__reduced_rank_agrees_within_the_bound(skin, small_dictionar
         ways = [lumitexels[name].values - place[s] for name in ("light_position", "camera_position")]
         wi, wo = (way / np.linalg.norm(way, axis=1)[:, None] for way in ways)
         i, o = np.nonzero((wi @ n > MIN_COSINE_SURFACE)[:, None] & (wo @ n > MIN_COSINE_SURFACE))
-        cosine, angles = wi[i] @ n, half_difference(wi[i], wo[o], np.broadcast_to(n, (len(i), 3)))
+        cosine = wi[i] @ n
+        angles = half_difference(wi[i], wo[o], np.broadcast_to(n, (len(i), 3)))
         body = cosine * fresnel_transmittance(cosine, 1.3) * fresnel_transmittance(wo[o] @ n, 1.3) / np.pi
         given = lumitexels["reflectance_sample"].values[s, i, o].astype(float)
         given -= body[:, None] * lumitexels["diffuse_reflectance"].values[s].astype(float)
@@ -85,8 +87,10 @@ def test_fit_surface__reduced_rank_agrees_within_the_bound(skin, small_dictionar
 
 def test_fit_surface__statuses(planted, small_dictionary):
     lumitexels = planted[0].copy(deep=True)
-    sample, position = lumitexels["reflectance_sample"].values, lumitexels["surfel_position"].values
-    diffuse, normal = lumitexels["diffuse_reflectance"].values, lumitexels["shading_normal"].values
+    sample = lumitexels["reflectance_sample"].values
+    position = lumitexels["surfel_position"].values
+    diffuse = lumitexels["diffuse_reflectance"].values
+    normal = lumitexels["shading_normal"].values
     sample[0] = np.nan
     sample[1].reshape(-1, 3)[40:] = np.nan
     sample[1].reshape(-1, 3)[:35] = np.nan
@@ -199,7 +203,9 @@ def test_refit__error_of_diffuse_light_reaches_the_weights(two_lobes):
 def test_refit__error_of_the_normal_reaches_the_weights(two_lobes, mode):
     """For normals that are wrong by their error, errors of the weights cover the truth only if they include it."""
     lumitexels, basis, weight, _ = two_lobes
-    rng, turn = np.random.default_rng(17), 0.7  # degrees; the narrow lobe has a half width of some three
+    # degrees; the narrow lobe has a half width of some three
+    rng = np.random.default_rng(17)
+    turn = 0.7
     normal = lumitexels["shading_normal"].values.astype(float)
     off = rng.normal(size=normal.shape) * np.radians(turn) / np.sqrt(2)
     off -= (off * normal).sum(1, keepdims=True) * normal
@@ -279,12 +285,15 @@ def test_reduce_basis__refuses_what_it_cannot_do(small_dictionary):
 
 
 def test_brdf_metric__is_the_sum_over_cells(small_dictionary):
-    grid, table = small_dictionary.grid, small_dictionary.table.astype(float)
+    grid = small_dictionary.grid
+    table = small_dictionary.table.astype(float)
     total = 0.0
     for i, th in enumerate(grid.theta_h):
         for j, td in enumerate(grid.theta_d):
             for p, pd in enumerate(grid.phi_d):
-                both, side = np.cos(th) * np.cos(td), np.sin(th) * np.sin(td) * np.cos(pd)  # elevations of the two
+                # elevations of the two
+                both = np.cos(th) * np.cos(td)
+                side = np.sin(th) * np.sin(td) * np.cos(pd)
                 seen = max(both - side, 0) * max(both + side, 0)
                 step = np.sin(th) * np.sqrt(th) * np.sin(td) * np.cos(td) * seen
                 cell = table[i, j, p]
@@ -300,15 +309,18 @@ def test_fit_surface__paper_rule_against_scipy(planted, small_dictionary):
     sample, position, light, camera, normal, diffuse = (lumitexels[name].values.astype(float) for name in NEEDED)
     for s in range(4):
         wi, wo = ((d - position[s]) / np.linalg.norm(d - position[s], axis=-1, keepdims=True) for d in (light, camera))
-        ci, co = wi @ normal[s], wo @ normal[s]
+        ci = wi @ normal[s]
+        co = wo @ normal[s]
         i, o = np.nonzero(np.isfinite(sample[s]).all(-1) & (ci > 0.1)[:, None] & (co > 0.1))
         table = lookup(np.cbrt(small_dictionary.table), *half_difference(wi[i], wo[o], normal[s]))
         M = table * np.cbrt(ci[i])[:, None]
         f = ci[i] * fresnel_transmittance(ci[i], 1.3) * fresnel_transmittance(co[o], 1.3) / np.pi
-        given, scattered = sample[s, i, o], f[:, None] * diffuse[s]
+        given = sample[s, i, o]
+        scattered = f[:, None] * diffuse[s]
         x, _ = nnls(np.repeat(M, 3, axis=0), np.cbrt(given - scattered).ravel())
         # places in the table are single precision, and weights of like columns trade: the fits are compared
-        root, ours = np.cbrt(given - scattered), found["dictionary_weight"].values[s]
+        root = np.cbrt(given - scattered)
+        ours = found["dictionary_weight"].values[s]
         here, there = (np.linalg.norm(root - (M @ w)[:, None]) for w in (x, ours))
         assert there < here * (1 + 1e-3)
         error = np.linalg.norm((M @ x)[:, None] ** 3 + scattered - given) / np.linalg.norm(given)

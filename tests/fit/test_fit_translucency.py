@@ -74,8 +74,10 @@ def test_fit_probe__faces_of_source_and_fibres_are_averaged():
 def test_faces__mean_and_variance_of_the_distance(radius, distance):
     """Of a million pairs of random points, touching fibres too; the variance of both coordinates adds up."""
     rng = np.random.default_rng(0)
-    r, turn = radius * np.sqrt(rng.uniform(size=(2, 10**6))), 2 * np.pi * rng.uniform(size=(2, 10**6))
-    x, y = np.diff(r * np.cos(turn), axis=0)[0], np.diff(r * np.sin(turn), axis=0)[0]
+    r = radius * np.sqrt(rng.uniform(size=(2, 10**6)))
+    turn = 2 * np.pi * rng.uniform(size=(2, 10**6))
+    x = np.diff(r * np.cos(turn), axis=0)[0]
+    y = np.diff(r * np.sin(turn), axis=0)[0]
     away = np.hypot(distance + x, y)
     found, share = _faces(np.array([distance]), radius)
     mean = float((found * share).sum())
@@ -92,9 +94,12 @@ def test_fit_probe__intervals_cover_the_truth(free):
 
     With a free gain some have a second minimum 20 to 40 % away: none of these passes for fitted.
     """
-    rng, inside, silent = np.random.default_rng(11), [], []
+    rng = np.random.default_rng(11)
+    inside = []
+    silent = []
     for i in range(120):
-        s, true = 1.5 * np.exp(0.5 * rng.normal()), np.exp(rng.uniform(np.log(0.3), np.log(2.4)))
+        s = 1.5 * np.exp(0.5 * rng.normal())
+        true = np.exp(rng.uniform(np.log(0.3), np.log(2.4)))
         sigma_a = (np.sqrt(s * s + 4 * true**2 / 3) - s) / 2
         value = transport_profile(DISTANCE, sigma_a, s, eta=1.3)
         error = np.hypot((0.004, 0.01)[i % 2] * value, 3e-7)
@@ -112,8 +117,10 @@ def test_fit_probe__intervals_cover_the_truth(free):
 
 def _noisy(sigma_a, sigma_s, floor, seed):
     """15 fits with a free gain to one medium, and the relative error of each sigma_tr."""
-    rng, value = np.random.default_rng(seed), transport_profile(DISTANCE, sigma_a, sigma_s, eta=1.3)
-    error, true = np.hypot(0.004 * value, floor), sigma_tr(sigma_a, sigma_s)
+    rng = np.random.default_rng(seed)
+    value = transport_profile(DISTANCE, sigma_a, sigma_s, eta=1.3)
+    error = np.hypot(0.004 * value, floor)
+    true = sigma_tr(sigma_a, sigma_s)
     for z in rng.normal(size=(15, 28)):
         fit = fit_profile(DISTANCE, value + error * z, error, radius=0.0, eta=1.3, model="transport", free_gain=True)
         yield fit, abs(fit.sigma_tr / true - 1)
@@ -139,7 +146,8 @@ def test_fit_probe__photons_within_4_percent():
 
     walk = random_walk(40_000, eta=1.3, rng=np.random.default_rng(3))
     edges = np.concatenate([DISTANCE[:16] - 0.25, [DISTANCE[15] + 0.25]])
-    profile, error = np.empty((1, 16, 3)), np.empty((1, 16, 3))
+    profile = np.empty((1, 16, 3))
+    error = np.empty((1, 16, 3))
     for c in range(3):
         profile[0, :, c], error[0, :, c] = radial_profile(walk, SIGMA_A[0, c], SIGMA_S[0, c], edges)
     found = fit_probe(_probe(profile, error))
@@ -159,7 +167,8 @@ def test_fit_probe__dark_skin_by_photons(sigma_a, sigma_s):
     found, paper = (fit_probe(_probe(profile, error), profile=p).isel(site=0, channel=0) for p in PROFILES)
     true = float(sigma_tr(sigma_a, sigma_s))
     off = [abs(float(f["site_sigma_tr"]) - true) for f in (found, paper)]
-    noise, own = found["site_sigma_tr_error"], found["site_sigma_tr_model_error"]
+    noise = found["site_sigma_tr_error"]
+    own = found["site_sigma_tr_model_error"]
     assert off[0] < 3 * float(noise) + 2 * float(own)  # rings of 0.5 mm stand for points
     assert off[0] < 0.04 * true < 0.12 * true < off[1]
     assert off[1] < 1.5 * float(paper["site_sigma_tr_model_error"])
@@ -256,7 +265,8 @@ def test_fit_probe__jensen_2001_by_photons(material, walks):
 @pytest.mark.parametrize(("sigma_s", "sigma_a", "scatters"), [(1.01, 0.48, False), (0.70, 0.0014, True)])
 def test_fit_probe__the_combination_called_best_is(sigma_s, sigma_a, scatters):
     """Of 25 noisy profiles no other product of powers varies less: about sigma_tr of skin, about sigma_s' of milk."""
-    rng, value = np.random.default_rng(4), transport_profile(DISTANCE, sigma_a, sigma_s, eta=1.3)
+    rng = np.random.default_rng(4)
+    value = transport_profile(DISTANCE, sigma_a, sigma_s, eta=1.3)
     error = np.hypot(0.01 * value, 1e-8)
     fits = [
         fit_profile(DISTANCE, value + error * z, error, radius=0.0, eta=1.3, model="transport", free_gain=False)

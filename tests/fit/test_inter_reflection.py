@@ -12,25 +12,30 @@ from skindb.fit.inter_reflection import bounced_light, without_bounce
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.schema import dataset
 
-ETA, DIFFUSE = 1.3, np.array([0.5, 0.3, 0.1])
+ETA = 1.3
+DIFFUSE = np.array([0.5, 0.3, 0.1])
 
 
 def _points(position, normal, light, sample=None):
-    n, lights = len(position), len(light)
+    n = len(position)
+    lights = len(light)
     values = np.full((n, lights, 1, 3), 0.1, np.float16) if sample is None else sample
-    return dataset({
-        "reflectance_sample": values,
-        "surfel_position": position,
-        "surfel_normal": normal,
-        "light_position": light,
-        "camera_position": np.zeros((values.shape[2], 3)),
-    })  # fmt: skip
+    return dataset(
+        {
+            "reflectance_sample": values,
+            "surfel_position": position,
+            "surfel_normal": normal,
+            "light_position": light,
+            "camera_position": np.zeros((values.shape[2], 3)),
+        }
+    )
 
 
 def _sphere(count=1500, radius=80.0):
     """Positions, inward normals and triangles of a sphere."""
     i = np.arange(count) + 0.5
-    z, angle = 1 - 2 * i / count, np.pi * (3 - np.sqrt(5)) * i
+    z = 1 - 2 * i / count
+    angle = np.pi * (3 - np.sqrt(5)) * i
     unit = np.stack([np.sqrt(1 - z**2) * np.cos(angle), np.sqrt(1 - z**2) * np.sin(angle), z], axis=1)
     return radius * unit, -unit, ConvexHull(unit).simplices
 
@@ -49,7 +54,8 @@ def test_bounced_light__in_a_sphere_is_the_closed_form():
 
 def test_bounced_light__of_walls_in_shadow_and_of_unknown_reflectance():
     position, normal, triangles = _sphere(400)
-    ds, diffuse = _points(position, normal, np.zeros((2, 3))), np.tile(DIFFUSE, (len(position), 1))
+    ds = _points(position, normal, np.zeros((2, 3)))
+    diffuse = np.tile(DIFFUSE, (len(position), 1))
     visible = np.ones((len(position), 2))
     visible[:, 1] = 0
     found = bounced_light(ds, diffuse, visible, triangles)
@@ -75,7 +81,8 @@ def test_bounced_light__of_other_surfels_is_refused():
 @pytest.mark.parametrize("chunks", [None, {"surfel": 30}])
 def test_without_bounce__takes_away_what_was_added(chunks):
     position, normal, triangles = _sphere(100)
-    diffuse, rng = np.tile(DIFFUSE, (100, 1)), np.random.default_rng(2)
+    diffuse = np.tile(DIFFUSE, (100, 1))
+    rng = np.random.default_rng(2)
     direct = rng.uniform(0.05, 0.2, (100, 1, 2, 3))
     direct[3] = np.nan
     bounced = bounced_light(_points(position, normal, np.zeros((1, 3))), diffuse, np.ones((100, 1)), triangles)

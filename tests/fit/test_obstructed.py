@@ -10,15 +10,20 @@ from skindb.schema import FitStatus, dataset
 
 def _face(residual, brightness, status=None):
     """Twenty surfels of a face, and others after them."""
-    residual, brightness = np.asarray(residual, np.float32), np.asarray(brightness, np.float32)
+    residual = np.asarray(residual, np.float32)
+    brightness = np.asarray(brightness, np.float32)
     n = 20 + len(residual)
     fitted = np.full(n, FitStatus.FITTED, np.uint8)
     fitted[20:] = FitStatus.FITTED if status is None else status
-    return dataset({
-        "fit_status": fitted,
-        "dictionary_residual": np.concatenate([np.full(20, 0.03, np.float32), residual]),
-        "diffuse_reflectance": np.concatenate([np.full(20, 0.4, np.float32), brightness])[:, None].repeat(3, axis=1),
-    })  # fmt: skip
+    return dataset(
+        {
+            "fit_status": fitted,
+            "dictionary_residual": np.concatenate([np.full(20, 0.03, np.float32), residual]),
+            "diffuse_reflectance": np.concatenate([np.full(20, 0.4, np.float32), brightness])[:, None].repeat(
+                3, axis=1
+            ),
+        }
+    )
 
 
 def test_find_obstructed__dark_and_unlike_any_surface():

@@ -26,7 +26,8 @@ Distortion = Callable[[np.ndarray, np.random.Generator], np.ndarray]
 
 def _medium(rng: np.random.Generator) -> tuple[float, float, float]:
     """sigma_a, sigma_s' and sigma_tr [mm^-1] within and around the range of skin."""
-    scattering, transport = 1.5 * np.exp(0.5 * rng.normal()), np.exp(rng.uniform(np.log(0.3), np.log(2.4)))
+    scattering = 1.5 * np.exp(0.5 * rng.normal())
+    transport = np.exp(rng.uniform(np.log(0.3), np.log(2.4)))
     return (np.sqrt(scattering**2 + 4 * transport**2 / 3) - scattering) / 2, scattering, transport
 
 
@@ -45,7 +46,8 @@ def _fits(
     distort: Distortion, relative: float, floor: float, *, seed: int, **options: Any
 ) -> list[tuple[ProbeFit, float]]:
     """Fits to noisy distorted profiles of random media, and the relative error of each sigma_tr."""
-    rng, found = np.random.default_rng(seed), []
+    rng = np.random.default_rng(seed)
+    found = []
     for _ in range(PROFILES):
         sigma_a, scattering, true = _medium(rng)
         value = distort(transport_profile(DISTANCE, sigma_a, scattering, eta=1.3), rng)

@@ -27,8 +27,10 @@ SPACING = 5.0  # mm, of the surfaces
 
 def _disc(seed: int) -> np.ndarray:
     """Points (n, 2) of the unit disc, the outline even, the others differently for each seed."""
-    rng, n = np.random.default_rng(seed), 2500
-    r, angle = np.sqrt((np.arange(n) + 0.5) / n) * 0.97, np.pi * (3 - np.sqrt(5)) * np.arange(n) + 6 * rng.random()
+    rng = np.random.default_rng(seed)
+    n = 2500
+    r = np.sqrt((np.arange(n) + 0.5) / n) * 0.97
+    angle = np.pi * (3 - np.sqrt(5)) * np.arange(n) + 6 * rng.random()
     ring = np.linspace(0, 2 * np.pi, 180, endpoint=False)
     rim = np.column_stack([np.cos(ring), np.sin(ring)])
     return np.concatenate([np.column_stack([r * np.cos(angle), r * np.sin(angle)]), rim])
@@ -59,7 +61,8 @@ def _sheet(seed: int, change=lambda points: points, kept=lambda plane: plane[:, 
     faces = np.where((signed_areas(uv, faces) < 0)[:, None], faces[:, ::-1], faces)
     faces = faces[kept(plane)[faces].all(axis=1)]
     used, faces = np.unique(faces, return_inverse=True)
-    plane, faces = plane[used], faces.reshape(-1, 3)
+    plane = plane[used]
+    faces = faces.reshape(-1, 3)
     landmark = change(_lifted(MARKS))
     return Sheet.of(change(_lifted(plane)), uv[used], faces, landmark), plane
 
@@ -114,7 +117,8 @@ def test_corresponding_uv__of_removed_parts_is_nan():
 @pytest.mark.parametrize("unknown", [slice(2, None), slice(0, None)])
 def test_corresponding_uv__without_a_pose_is_nan(unknown):
     template, _ = _sheet(1)
-    chosen, landmark = anchor_vertices(template)[::50], template.landmark.copy()
+    chosen = anchor_vertices(template)[::50]
+    landmark = template.landmark.copy()
     landmark[unknown] = np.nan
     assert np.isnan(corresponding_uv(template, chosen, replace(template, landmark=landmark))).all()
     line = np.where(np.isfinite(landmark), landmark, np.linspace(0, 1, 6)[:, None] * [50.0, 20, 0])
@@ -145,7 +149,8 @@ def test_sheet__area_and_whether_it_can_be_aligned():
 
 def test_weights__of_equal_errors_are_those_of_each_axis():
     rng = np.random.default_rng(4)
-    points, pull = rng.normal(size=(7, 3)), rng.normal(size=(7, 3))
+    points = rng.normal(size=(7, 3))
+    pull = rng.normal(size=(7, 3))
     kernel = np.exp(-np.linalg.norm(points[:, None] - points, axis=2))
     found = _weights(kernel, pull, np.tile(0.3 * np.eye(3), (7, 1, 1)))
     np.testing.assert_allclose(found, np.linalg.solve(kernel + 0.3 * np.eye(7), pull), atol=1e-12)

@@ -26,7 +26,8 @@ UNEVEN = 0.5  # of what is nearly closed: 1.9 before; evener ones are stretched 
 
 def front(level: int = 3, below: float = -10.0, noise: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     mesh = trimesh.creation.icosphere(level, radius=80.0)
-    v, f = np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int64)
+    v = np.asarray(mesh.vertices)
+    f = np.asarray(mesh.faces, np.int64)
     f = f[v[f].mean(axis=1)[:, 2] > below]
     used, inverse = np.unique(f, return_inverse=True)
     return v[used] + noise * np.random.default_rng(0).normal(size=(len(used), 3)), inverse.reshape(-1, 3)
@@ -34,7 +35,8 @@ def front(level: int = 3, below: float = -10.0, noise: float = 0.0) -> tuple[np.
 
 def twisted(uv: np.ndarray, faces: np.ndarray) -> int:
     """Triangles not seen from outside, one by one with v turned up."""
-    x, y = uv[:, 0], 1 - uv[:, 1]
+    x = uv[:, 0]
+    y = 1 - uv[:, 1]
     return sum((x[b] - x[a]) * (y[c] - y[a]) - (y[b] - y[a]) * (x[c] - x[a]) <= 0 for a, b, c in faces)
 
 

@@ -23,7 +23,8 @@ ONE_POINT = 1e-9  # px: two orders of the same sums
 def project_one(point: np.ndarray, distortion: np.ndarray) -> tuple[float, float, float]:
     """cv2.projectPoints for one point, scalar by scalar."""
     x, y, z = (sum(R[i, j] * point[j] for j in range(3)) + T[i] for i in range(3))
-    a, b = x / z, y / z
+    a = x / z
+    b = y / z
     k1, k2, p1, p2, k3 = distortion
     r2 = a**2 + b**2
     radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3

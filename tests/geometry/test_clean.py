@@ -18,7 +18,8 @@ from skindb.geometry.clean import CleanMesh, clean_mesh
 def cap(level: int = 3) -> tuple[np.ndarray, np.ndarray]:
     """The front of a head-sized sphere: one outline, outwards."""
     mesh = trimesh.creation.icosphere(level, radius=80.0)
-    v, f = np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int64)
+    v = np.asarray(mesh.vertices)
+    f = np.asarray(mesh.faces, np.int64)
     f = f[v[f].mean(axis=1)[:, 2] > -10]
     used, inverse = np.unique(f, return_inverse=True)
     return v[used], inverse.reshape(-1, 3)
@@ -43,9 +44,11 @@ def assert_sound(mesh: CleanMesh) -> None:
             onward.setdefault(i, {})[j] = k
     for fan in onward.values():  # one chain or ring of faces around each vertex
         start = (set(fan) - set(fan.values()) or {next(iter(fan))}).pop()
-        seen, at = 0, start
+        seen = 0
+        at = start
         while at in fan and seen < len(fan):
-            at, seen = fan[at], seen + 1
+            at = fan[at]
+            seen = seen + 1
         assert seen == len(fan)
     assert set(onward) == set(range(len(mesh.vertices)))
 
@@ -143,7 +146,9 @@ def test_clean_mesh__unconnected_triangles_are_welded():
 
 def test_clean_mesh__bow_tie_is_split():
     v, f = cap(2)
-    tip, a, b = len(v), len(v) + 1, len(v) + 2
+    tip = len(v)
+    a = len(v) + 1
+    b = len(v) + 2
     rim = int(f[0, 0])
     v = np.concatenate([v, v[[rim]] + [[0, 3, 9], [3, 0, 9], [5, 5, 12]]])
     # two sheets that touch in one vertex, and are joined by nothing else, are two pieces
@@ -212,11 +217,13 @@ def test_clean_mesh__large_flap_goes_before_the_small_faces_it_stands_on():
 
 
 def test_clean_mesh__outline_of_few_vertices_is_no_hole():
-    inner, outer = np.arange(12) * np.pi / 6, np.arange(6) * np.pi / 3
+    inner = np.arange(12) * np.pi / 6
+    outer = np.arange(6) * np.pi / 3
     ring = [np.stack([r * np.cos(x), r * np.sin(x), 0 * x], axis=1) for r, x in ((10, inner), (80, outer))]
     o = 12 + np.arange(6)
     i = np.arange(0, 12, 2)
-    after, beyond = 12 + np.arange(1, 7) % 6, (i + 2) % 12
+    after = 12 + np.arange(1, 7) % 6
+    beyond = (i + 2) % 12
     f = np.concatenate([np.stack(x, 1) for x in ((i, o, i + 1), (i + 1, o, after), (i + 1, after, beyond))])
     mesh = clean_mesh(np.concatenate(ring), f)
     assert_sound(mesh)

@@ -120,7 +120,8 @@ def sites(v: np.ndarray, f: np.ndarray, count: int, seed: int) -> list[int]:
     """Faces so far apart that no vertex of one is joined to a vertex of another."""
     rng = np.random.default_rng(seed)
     inner = v[f].min(axis=1)[:, 2] > 0
-    taken, found = np.zeros(len(v), bool), []
+    taken = np.zeros(len(v), bool)
+    found = []
     for i in rng.permutation(np.flatnonzero(inner)):
         ring = f[np.isin(f, f[i]).any(axis=1)]
         if not taken[ring].any():
@@ -175,7 +176,8 @@ def test_clean_mesh__says_where(kind):
 
 def test_clean_mesh__twenty_of_each_kind_together():
     v, f = cap(5)
-    spoilt, total = Spoilt(v, f.copy()), {"open_loops": 1}
+    spoilt = Spoilt(v, f.copy())
+    total = {"open_loops": 1}
     where = iter(sites(v, f, N * len(PLANTED), seed=1))
     for plant, expected in PLANTED.values():
         for _ in range(N):
@@ -231,7 +233,8 @@ def test_simple_loops__pass_no_vertex_twice(loop, parts):
 def test_simple_loops__long_paths_agree_with_a_search_of_the_path():
     rng = np.random.default_rng(0)
     loop = rng.integers(0, 300, 2000)
-    parts, path = [], []
+    parts = []
+    path = []
     for vertex in loop.tolist():
         if vertex in path:
             parts.append(path[path.index(vertex) :])

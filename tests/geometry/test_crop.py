@@ -10,7 +10,8 @@ from skindb.errors import InputError
 from skindb.geometry.crop import Crop, crop_faces
 
 BALL = trimesh.creation.icosphere(2, radius=80.0)
-V, F = np.asarray(BALL.vertices), np.asarray(BALL.faces)
+V = np.asarray(BALL.vertices)
+F = np.asarray(BALL.faces)
 MARKS = np.array([[0.0, 0, 80], [60, 0, 50]])
 
 

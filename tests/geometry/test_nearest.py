@@ -59,7 +59,8 @@ def test_winding_number__closed():
 
 
 def test_closest_on_mesh__a_large_triangle_whose_middle_is_far():
-    big, small = [[0, 0, 0], [100, 0, 0], [0, 100, 0]], [[97, 1, 3], [98, 1, 3], [97, 2, 3]]
+    big = [[0, 0, 0], [100, 0, 0], [0, 100, 0]]
+    small = [[97, 1, 3], [98, 1, 3], [97, 2, 3]]
     face, _, distance = closest_on_mesh(
         np.array(big + small, float), np.array([[3, 4, 5], [0, 1, 2]]), np.array([[97, 1, 1.0]])
     )
@@ -77,7 +78,8 @@ def test_closest_on_mesh__needles_down_to_no_height(reach):
         foot = rng.dirichlet([0.3, 0.3, 0.3]) @ v
         point = foot + rng.normal(scale=reach) * up
         _, weight, distance = closest_on_mesh(v, np.array([[0, 1, 2]]), point[None])
-        edge, away = np.roll(v, -1, axis=0) - v, point - v
+        edge = np.roll(v, -1, axis=0) - v
+        away = point - v
         t = np.clip((away * edge).sum(axis=1) / (edge**2).sum(axis=1), 0, 1)
         others = [np.linalg.norm(point - foot), *np.linalg.norm(t[:, None] * edge - away, axis=1)]
         assert distance[0] <= min(others) + 1e-14  # ten roundings of 5 mm
@@ -96,7 +98,8 @@ def test_closest_on_mesh__triangles_of_all_sizes():
 
 
 def test_closest_on_mesh__one_long_triangle_costs_the_others_nothing():
-    side, step = np.meshgrid(*2 * [np.arange(100.0)]), np.arange(100 * 100).reshape(100, 100)
+    side = np.meshgrid(*2 * [np.arange(100.0)])
+    step = np.arange(100 * 100).reshape(100, 100)
     a, b, c, d = (step[i : i + 99, j : j + 99].ravel() for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)))
     plain = np.concatenate([np.stack([a, b, d], 1), np.stack([a, d, c], 1)])
     v = np.stack([*(x.ravel() / 2 for x in side), np.zeros(100 * 100)], axis=1)

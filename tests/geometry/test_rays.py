@@ -42,7 +42,8 @@ def tangents(normal: np.ndarray, elevation: np.ndarray, rng: np.random.Generator
 
 def on_facets(v: np.ndarray, f: np.ndarray, n: int, rng: np.random.Generator):
     """Points on triangles and their interpolated unit normals."""
-    face, weight = rng.integers(0, len(f), n), rng.dirichlet([1, 1, 1], n)
+    face = rng.integers(0, len(f), n)
+    weight = rng.dirichlet([1, 1, 1], n)
     normal = np.einsum("nk,nkc->nc", weight, vertex_normals(v, f)[f[face]])
     return np.einsum("nk,nkc->nc", weight, v[f[face]]), normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
@@ -89,7 +90,8 @@ def test_first_hit__no_rays():
 def test_distances__are_those_of_the_first_hit(monkeypatch):
     v, f = sphere(2)
     rng = np.random.default_rng(0)
-    origin, direction = np.array([40.0, 20, 700]), rng.normal(size=(500, 3)) * 60 + v.mean(0)
+    origin = np.array([40.0, 20, 700])
+    direction = rng.normal(size=(500, 3)) * 60 + v.mean(0)
     direction = (direction - origin) / np.linalg.norm(direction - origin, axis=1)[:, None]
     direction[::50] = np.nan
     monkeypatch.setattr("skindb.geometry.rays.RAYS_PER_BLOCK", 70)
@@ -103,9 +105,11 @@ def test_distances__are_those_of_the_first_hit(monkeypatch):
 def test_ray_scene__blocks_give_what_single_rays_give(monkeypatch):
     v, f = sphere(2)
     rng = np.random.default_rng(0)
-    origin, direction = rng.normal(size=(101, 3)) * 200, rng.normal(size=(101, 3))
+    origin = rng.normal(size=(101, 3)) * 200
+    direction = rng.normal(size=(101, 3))
     scene = RayScene(v, f)
-    whole, hidden = scene.first_hit(origin, direction), scene.occluded(origin, -origin)
+    whole = scene.first_hit(origin, direction)
+    hidden = scene.occluded(origin, -origin)
     monkeypatch.setattr("skindb.geometry.rays.RAYS_PER_BLOCK", 7)
     for a, b in zip(whole, scene.first_hit(origin, direction), strict=True):
         np.testing.assert_array_equal(a, b)
@@ -153,12 +157,16 @@ def test_occluded__plate_between():
 @pytest.mark.parametrize("one", [False, True])
 def test_aim__as_by_numpy(lifted, one):
     rng = np.random.default_rng(6)
-    origin, normal, centre = rng.normal(size=(50, 3)) * 80, rng.normal(size=(50, 3)), np.array([3.0, -2, 1])
+    origin = rng.normal(size=(50, 3)) * 80
+    normal = rng.normal(size=(50, 3))
+    centre = np.array([3.0, -2, 1])
     at = rng.permutation(50)[:30]
     target = rng.normal(size=(1 if one else 30, 3)) * 500
     target[-1], origin[at[2]] = origin[at[-1]], np.nan  # too near for the offset, and without a position
     lift, ahead = (normal, 0.0) if lifted else (np.zeros((1, 3)), 0.7)
-    start, way, reach = np.empty((30, 3), np.float32), np.empty((30, 3), np.float32), np.empty(30, np.float32)
+    start = np.empty((30, 3), np.float32)
+    way = np.empty((30, 3), np.float32)
+    reach = np.empty(30, np.float32)
     aim(origin, at, target, lift, centre, 0.3, ahead, 0.3, start, way, reach)
     begin = origin[at] - centre + 0.3 * (normal[at] if lifted else 0)
     path = target - centre - begin
@@ -173,7 +181,8 @@ def test_aim__as_by_numpy(lifted, one):
 
 def test_occluded__chosen_origins_are_those_origins(monkeypatch):
     v, f = sphere(3)
-    normal, eye = vertex_normals(v, f), np.array([[10.0, -30, 900]])
+    normal = vertex_normals(v, f)
+    eye = np.array([[10.0, -30, 900]])
     rng = np.random.default_rng(7)
     at = rng.integers(0, len(v), 200)
     target = eye + rng.normal(size=(200, 3)) * 500
@@ -187,7 +196,8 @@ def test_occluded__chosen_origins_are_those_origins(monkeypatch):
 
 def test_ray_scene__far_from_the_origin_loses_nothing():
     v, f = sphere(3, centre=(5000, 0, 0))
-    origin, way = np.array([5003.3, 7.1, 900]), np.array([0, 0, -1.0])
+    origin = np.array([5003.3, 7.1, 900])
+    way = np.array([0, 0, -1.0])
     face, _, distance = RayScene(v, f).first_hit(origin[None], way[None])
     expected, near = brute_force(v, f, origin, way)
     assert face[0] == near

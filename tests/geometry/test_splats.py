@@ -16,7 +16,8 @@ EDGE = 0.7  # mm; two pixels of the maps below, and the bias seen at the angles 
 def plate(x, y, corner, u, v):
     """Discs of a rectangle of x by y points 1 mm apart: positions, normals, radii, and their places in the plane."""
     place = np.stack(np.meshgrid(np.arange(x), np.arange(y), indexing="ij"), -1).reshape(-1, 2).astype(float)
-    u, v = np.asarray(u, float), np.asarray(v, float)
+    u = np.asarray(u, float)
+    v = np.asarray(v, float)
     position = np.asarray(corner, float) + place[:, :1] * u + place[:, 1:] * v
     return position, np.tile(np.cross(u, v), (len(place), 1)), np.full(len(place), 0.7 * np.sqrt(2)), place
 
@@ -29,7 +30,8 @@ def behind_triangles(points, eye, triangles):
     """Whether any of the triangles (k, 3, 3) lies between each point and the eye: solved one by one in float64."""
     out = np.zeros(len(points), bool)
     for a, b, c in triangles:
-        first, second = np.broadcast_to(b - a, points.shape), np.broadcast_to(c - a, points.shape)
+        first = np.broadcast_to(b - a, points.shape)
+        second = np.broadcast_to(c - a, points.shape)
         matrix = np.stack([first, second, points - eye], axis=2)
         sound = np.abs(np.linalg.det(matrix)) > 1e-12
         u, w, along = np.linalg.solve(matrix[sound], (points - a)[sound, :, None])[..., 0].T
@@ -40,10 +42,8 @@ def behind_triangles(points, eye, triangles):
 @pytest.mark.parametrize("angle", [0, 30, 60])
 def test_visible_fraction__shadow_of_a_plate_on_a_plate(angle):
     """A small plate 10 mm above a large one: its shadow is its picture by central projection."""
-    ground, roof = (
-        plate(81, 81, [-40, -40, 0], [1, 0, 0], [0, 1, 0]),
-        plate(21, 21, [-10, -10, 10], [1, 0, 0], [0, 1, 0]),
-    )
+    ground = plate(81, 81, [-40, -40, 0], [1, 0, 0], [0, 1, 0])
+    roof = plate(21, 21, [-10, -10, 10], [1, 0, 0], [0, 1, 0])
     eye = 300 * np.array([np.sin(np.radians(angle)), 0, np.cos(np.radians(angle))])
     share = scene_of(ground, roof).visible_fraction(eye)
     assert (share[len(ground[0]) :] == 1).all()
@@ -74,12 +74,14 @@ def test_visible_fraction__crossing_plates():
 
 def test_visible_fraction__agrees_with_brute_force_on_a_mesh():
     """A ball in a bowl: points against each of some 3,000 triangles; the rim of a shadow is half a disc uncertain."""
-    ball, bowl = trimesh.creation.icosphere(2, radius=15), trimesh.creation.icosphere(4, radius=40)
+    ball = trimesh.creation.icosphere(2, radius=15)
+    bowl = trimesh.creation.icosphere(4, radius=40)
     bowl.invert()  # its inside is visible
     faces = bowl.faces[bowl.triangles_center[:, 2] < -10]
     vertices = np.concatenate([ball.vertices, bowl.vertices])
     faces = np.concatenate([ball.faces, faces + len(ball.vertices)])
-    normal, radius = vertex_normals(vertices, faces), splat_radius(vertices, faces)
+    normal = vertex_normals(vertices, faces)
+    radius = splat_radius(vertices, faces)
     eye = np.array([60.0, -40, 300])
     seen = SplatScene(vertices, normal, radius).visible_fraction(eye) > THRESHOLD
     facing = ((eye - vertices) * normal).sum(axis=1) / np.linalg.norm(eye - vertices, axis=1)
@@ -95,7 +97,8 @@ def test_visible_fraction__agrees_with_brute_force_on_a_mesh():
 
 
 def test_visible_fraction__back_of_an_open_surface_hides_too():
-    roof, ground = plate(21, 21, [-10, -10, 20], [0, 1, 0], [1, 0, 0]), plate(9, 9, [-4, -4, 0], [1, 0, 0], [0, 1, 0])
+    roof = plate(21, 21, [-10, -10, 20], [0, 1, 0], [1, 0, 0])
+    ground = plate(9, 9, [-4, -4, 0], [1, 0, 0], [0, 1, 0])
     share = scene_of(roof, ground).visible_fraction(np.array([0, 0, 500.0]))
     assert (share == 0).all()
 
@@ -111,8 +114,10 @@ def test_visible_fraction__all_round_an_eye_in_the_middle():
 
 
 def test_visible_fraction__asked_for_some_is_the_answer_for_all():
-    ground, roof = plate(31, 31, [-15, -15, 0], [1, 0, 0], [0, 1, 0]), plate(9, 9, [-4, -4, 5], [1, 0, 0], [0, 1, 0])
-    scene, eye = scene_of(ground, roof), np.array([20.0, 5, 200])
+    ground = plate(31, 31, [-15, -15, 0], [1, 0, 0], [0, 1, 0])
+    roof = plate(9, 9, [-4, -4, 5], [1, 0, 0], [0, 1, 0])
+    scene = scene_of(ground, roof)
+    eye = np.array([20.0, 5, 200])
     at = np.array([700, 3, 3, 1000, 480])
     np.testing.assert_array_equal(scene.visible_fraction(eye, at), scene.visible_fraction(eye)[at])
     np.testing.assert_array_equal(
@@ -122,8 +127,10 @@ def test_visible_fraction__asked_for_some_is_the_answer_for_all():
 
 
 def test_visible_fraction__does_not_depend_on_the_place_of_the_subject():
-    ground, roof = plate(31, 31, [-15, -15, 0], [1, 0, 0], [0, 1, 0]), plate(9, 9, [-4, -4, 5], [1, 0, 0], [0, 1, 0])
-    eye, far = np.array([20.0, 5, 200]), np.array([4096.0, -8192, 2048])
+    ground = plate(31, 31, [-15, -15, 0], [1, 0, 0], [0, 1, 0])
+    roof = plate(9, 9, [-4, -4, 5], [1, 0, 0], [0, 1, 0])
+    eye = np.array([20.0, 5, 200])
+    far = np.array([4096.0, -8192, 2048])
     moved = [(p[0] + far, *p[1:]) for p in (ground, roof)]
     np.testing.assert_array_equal(
         scene_of(ground, roof).visible_fraction(eye), scene_of(*moved).visible_fraction(eye + far)
@@ -169,7 +176,8 @@ def test_visible_fraction__maps_stay_below_the_largest(monkeypatch):
 
 @pytest.mark.parametrize("height", [300.0, 0.5], ids=["one map", "six maps"])
 def test_coarsening__is_how_much_wider_pixels_are_than_wanted(monkeypatch, height):
-    ground, eye = plate(41, 41, [-20, -20, 0], [1, 0, 0], [0, 1, 0])[:3], np.array([0, 0, height])
+    ground = plate(41, 41, [-20, -20, 0], [1, 0, 0], [0, 1, 0])[:3]
+    eye = np.array([0, 0, height])
     scene = SplatScene(*ground, pixel_mm=0.05)
     enough = scene.draw(eye)[0].focal
     assert scene.coarsening(eye) == 1

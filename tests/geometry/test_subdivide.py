@@ -83,17 +83,21 @@ def bumpy(mesh: trimesh.Trimesh, faces: slice = slice(None)) -> tuple[np.ndarray
         bumpy(trimesh.creation.icosphere(2, radius=80.0)),  # valences 5 and 6
         bumpy(trimesh.creation.icosphere(0, radius=80.0).subdivide_loop(1), slice(0, -9)),  # open
         bumpy(trimesh.creation.box([80, 80, 80])),  # 4 and 5
-        bumpy(trimesh.Trimesh([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1.0]], [[0, 1, 2], [0, 3, 1], [0, 2, 3],
-                                                                                     [1, 3, 2]])),  # 3
+        bumpy(
+            trimesh.Trimesh(
+                [[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1.0]], [[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]]
+            )
+        ),  # 3
     ],
     ids=["sphere", "open", "box", "tetrahedron"],
-)  # fmt: skip
+)
 def test_loop_matrix__agrees_with_libigl_in_the_interior(mesh):
     """libigl has Warren's even weights: those of Loop at valences 3 and 6, 3/8 for the ring at every other."""
     igl = pytest.importorskip("igl")
     v, f = mesh
     theirs, their_faces = igl.loop_matrix(f, len(v))
-    theirs, ours = theirs.toarray(), loop_matrix(f, len(v))[0].toarray()
+    theirs = theirs.toarray()
+    ours = loop_matrix(f, len(v))[0].toarray()
     assert theirs.shape == ours.shape
     edges, count = np.unique(np.sort(f[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0, return_counts=True)
     rim = np.unique(edges[count == 1])
@@ -118,7 +122,8 @@ def test_carry_points__stay_at_their_parameter():
     weight = rng.dirichlet([1, 1, 1], 200)
     weight[:4] = [[1, 0, 0], [0, 0.5, 0.5], [0.5, 0.25, 0.25], [1 / 3, 1 / 3, 1 / 3]]
     there = np.einsum("kc,kci->ki", weight, v[f[face]])
-    flat, faces = v, f
+    flat = v
+    faces = f
     for levels in range(4):
         at, share = carry_points(face, weight, len(f), levels)
         np.testing.assert_allclose(np.einsum("kc,kci->ki", share, flat[faces[at]]), there, atol=1e-10)
@@ -129,7 +134,8 @@ def test_carry_points__stay_at_their_parameter():
         corner = children[3 * len(faces) :] - len(flat)  # the middle child's corners: one on each side of its parent
         for side in range(3):
             middle[corner[:, side]] = (flat[faces[:, side]] + flat[faces[:, (side + 1) % 3]]) / 2
-        flat, faces = np.concatenate([flat, middle]), children
+        flat = np.concatenate([flat, middle])
+        faces = children
 
 
 def test_loop_matrix__children_tile_the_parent_and_keep_its_winding():
@@ -163,7 +169,8 @@ def test_loop_matrix__boundary_depends_on_the_boundary_alone():
     edge, count = np.unique(sides, axis=0, return_counts=True)
     old = np.sort(f[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     old_edge, old_count = np.unique(old, axis=0, return_counts=True)
-    rim, inner = np.unique(edge[count == 1]), np.setdiff1d(np.arange(len(v)), old_edge[old_count == 1])
+    rim = np.unique(edge[count == 1])
+    inner = np.setdiff1d(np.arange(len(v)), old_edge[old_count == 1])
     assert matrix[rim][:, inner].nnz == 0
 
 

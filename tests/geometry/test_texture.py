@@ -102,9 +102,12 @@ def test_atlas_values__small_triangles_count_by_their_area_in_the_texel():
     """Compared with 200 x 200 points per texel, each located in its triangle; the values are not linear."""
     rng = np.random.default_rng(0)
     uv = np.concatenate([rng.random((60, 2)), [[0, 0], [0, 1], [1, 0], [1, 1]]])
-    located, trust, values = Delaunay(uv), rng.random(64), rng.random((64, 1))
+    located = Delaunay(uv)
+    trust = rng.random(64)
+    values = rng.random((64, 1))
     f = located.simplices[np.argsort(located.find_simplex([0.25, 0.25]) == np.arange(len(located.simplices)))]
-    size, fine = 2, 400
+    size = 2
+    fine = 400
     image, confidence = atlas_values(values, trust, uv, f, rasterise_atlas(uv, f, size))
     face, weight = rasterise_atlas(uv, f, fine)
     share = weight * trust[f[face]]
@@ -121,7 +124,8 @@ def test_atlas_values__what_lies_outside_the_texel_does_not_enter():
     n = 65
     uv = np.stack(np.meshgrid(*2 * [np.linspace(0, 1, n)]), axis=-1).reshape(-1, 2)
     f = Delaunay(uv).simplices
-    values, trust = np.full((len(uv), 1), 3.0), np.ones(len(uv))
+    values = np.full((len(uv), 1), 3.0)
+    trust = np.ones(len(uv))
     values[0], values[-1], trust[-1] = 1e6, 1e6, 0
     image, confidence = atlas_values(values, trust, uv, f, rasterise_atlas(uv, f, 16))
     beside = np.ones((16, 16), bool)
@@ -173,7 +177,8 @@ def pushed_and_pulled(image: np.ndarray, known: np.ndarray) -> np.ndarray:
     h, w = known.shape
     if h == w == 1:
         return image
-    coarse, total = np.zeros(((h + 1) // 2, (w + 1) // 2, image.shape[2])), np.zeros(((h + 1) // 2, (w + 1) // 2))
+    coarse = np.zeros(((h + 1) // 2, (w + 1) // 2, image.shape[2]))
+    total = np.zeros(((h + 1) // 2, (w + 1) // 2))
     for y, x in np.ndindex(h, w):
         coarse[y // 2, x // 2] += known[y, x] * image[y, x]
         total[y // 2, x // 2] += known[y, x]
@@ -188,7 +193,8 @@ def pushed_and_pulled(image: np.ndarray, known: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("shape", [(16, 16), (21, 13), (1, 6), (9, 1)])
 def test_push_pull__agrees_with_loops_over_texels(shape):
     rng = np.random.default_rng(0)
-    image, known = rng.normal(size=(*shape, 3)), rng.random(shape) * (rng.random(shape) < 0.2)
+    image = rng.normal(size=(*shape, 3))
+    known = rng.random(shape) * (rng.random(shape) < 0.2)
     known[0, 0] = 0.3
     np.testing.assert_allclose(push_pull(image, known)[0], pushed_and_pulled(image, known), atol=FLOAT32)
 

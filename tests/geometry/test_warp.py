@@ -25,11 +25,30 @@ from skindb.geometry.warp import (
     left_out_error,
 )
 
-FACE = np.array([
-    [0.50, 0.12], [0.35, 0.15], [0.66, 0.16], [0.39, 0.25], [0.62, 0.25], [0.50, 0.33], [0.50, 0.43], [0.50, 0.53],
-    [0.41, 0.52], [0.59, 0.52], [0.32, 0.37], [0.41, 0.36], [0.59, 0.35], [0.69, 0.37], [0.37, 0.60], [0.63, 0.60],
-    [0.50, 0.555], [0.50, 0.71], [0.23, 0.68], [0.77, 0.67],
-])  # fmt: skip
+FACE = np.array(
+    [
+        [0.50, 0.12],
+        [0.35, 0.15],
+        [0.66, 0.16],
+        [0.39, 0.25],
+        [0.62, 0.25],
+        [0.50, 0.33],
+        [0.50, 0.43],
+        [0.50, 0.53],
+        [0.41, 0.52],
+        [0.59, 0.52],
+        [0.32, 0.37],
+        [0.41, 0.36],
+        [0.59, 0.35],
+        [0.69, 0.37],
+        [0.37, 0.60],
+        [0.63, 0.60],
+        [0.50, 0.555],
+        [0.50, 0.71],
+        [0.23, 0.68],
+        [0.77, 0.67],
+    ]
+)
 ROUNDED = 1e-10  # two ways to the same solution of a system of condition below 1e4, numbers of the order of 1
 EVERYWHERE = np.stack(np.meshgrid(*2 * [np.linspace(-0.3, 1.3, 211)]), axis=-1).reshape(-1, 2)
 
@@ -67,7 +86,8 @@ def test_fit_warp__condition_is_that_of_the_bending_energy():
 
 
 def test_fit_warp__affine_maps_come_back_exactly():
-    matrix, shift = np.array([[1.1, 0.2], [-0.1, 0.8]]), np.array([0.03, -0.2])
+    matrix = np.array([[1.1, 0.2], [-0.1, 0.8]])
+    shift = np.array([0.03, -0.2])
     warp = fit_warp(FACE, FACE @ matrix + shift)
     np.testing.assert_allclose(apply_warp(warp, EVERYWHERE), EVERYWHERE @ matrix + shift, atol=ROUNDED)
     np.testing.assert_allclose(area_factor(warp, EVERYWHERE), np.linalg.det(matrix), atol=ROUNDED)
@@ -82,9 +102,11 @@ def test_area_factor__is_the_determinant():
 
 
 def test_fit_warp__skips_a_missing_point():
-    source, target = FACE.copy(), _moved(4)
+    source = FACE.copy()
+    target = _moved(4)
     source[3], target[7, 1] = np.nan, np.inf
-    warp, known = fit_warp(source, target), np.delete(np.arange(20), [3, 7])
+    warp = fit_warp(source, target)
+    known = np.delete(np.arange(20), [3, 7])
     assert warp.used.tolist() == [i in known for i in range(20)]
     without = fit_warp(source[known], target[known])
     np.testing.assert_allclose(apply_warp(warp, EVERYWHERE), apply_warp(without, EVERYWHERE), atol=ROUNDED)
@@ -102,7 +124,8 @@ def test_fit_warp__far_points_that_belong_together_are_one():
 
 @pytest.mark.parametrize("which", ["source", "target", "both"])
 def test_fit_warp__points_that_nearly_coincide_are_one(which):
-    source, target = np.vstack([FACE, FACE[5]]), np.vstack([_moved(5), _moved(5)[5]])
+    source = np.vstack([FACE, FACE[5]])
+    target = np.vstack([_moved(5), _moved(5)[5]])
     tiny = 0.3 * SAME_POINT_FRACTION * np.sqrt(FACE.var(axis=0).sum()) * np.array([0.6, -0.8])
     if which != "target":
         source[20] += tiny
@@ -118,7 +141,8 @@ def test_fit_warp__points_that_nearly_coincide_are_one(which):
 def test_fit_warp__is_regularised_where_points_are_near():
     """Two points at a distance of 1.5 % of the spread, moved by a typical error of a click."""
     away = 1.5 * SAME_POINT_FRACTION * np.sqrt(FACE.var(axis=0).sum())
-    source, target = np.vstack([FACE, FACE[6] + [away, 0]]), np.vstack([_moved(6), _moved(6)[6] + [0.9 * away, 0]])
+    source = np.vstack([FACE, FACE[6] + [away, 0]])
+    target = np.vstack([_moved(6), _moved(6)[6] + [0.9 * away, 0]])
     warp = fit_warp(source, target)
     assert (warp.used.all(), warp.smoothing) == (True, SMOOTHING)
     # the largest eigenvalue of 21 points is about 6, the least is not below 0
@@ -132,12 +156,14 @@ WEAKER = np.random.default_rng(20).uniform(-0.2, 1.2, (40, 2))
 
 
 def test_fit_warp__weak_points_are_smoothed_more():
-    target, there = _moved(13), _moved(14, points=WEAKER)
+    target = _moved(13)
+    there = _moved(14, points=WEAKER)
     there[5] = np.nan
     warp = fit_warp(FACE, target, smoothing=0.02, weak=(WEAKER, there))
     known = np.delete(np.arange(40), 5)
     smoothing = 0.02 * warp.scale**2 * np.repeat([1.0, WEAK_SMOOTHING_FACTOR], [20, 39])
-    every, goal = np.vstack([FACE, WEAKER[known]]), np.vstack([target, there[known]])
+    every = np.vstack([FACE, WEAKER[known]])
+    goal = np.vstack([target, there[known]])
     other = RBFInterpolator(every, goal, kernel="thin_plate_spline", smoothing=smoothing)
     np.testing.assert_allclose(apply_warp(warp, EVERYWHERE), other(EVERYWHERE), atol=ROUNDED)
     assert warp.used.shape == (20,)
@@ -147,7 +173,8 @@ def test_fit_warp__weak_points_are_smoothed_more():
 
 def _projected(points, warp, loose):
     """The divided kernel on the complement of the divided affine maps, with three zeros."""
-    x, root = (points - warp.origin) / warp.scale, np.sqrt(loose)
+    x = (points - warp.origin) / warp.scale
+    root = np.sqrt(loose)
     r = np.linalg.norm(x[:, None] - x, axis=2)
     kernel = r**2 * np.log(np.where(r > 0, r, 1)) / np.outer(root, root)
     linear = np.column_stack([np.ones(len(x)), x]) / root[:, None]
@@ -169,7 +196,8 @@ def test_fit_warp__weak_points_give_way_first():
 @pytest.mark.parametrize("points", [0, 1, 2])
 def test_fit_warp__weak_points_alone_do_not_count(points):
     target = _moved(16)[:points]
-    warp, without = fit_warp(FACE[:points], target, weak=(WEAKER, WEAKER + 1)), fit_warp(FACE[:points], target)
+    warp = fit_warp(FACE[:points], target, weak=(WEAKER, WEAKER + 1))
+    without = fit_warp(FACE[:points], target)
     assert warp.kind == without.kind
     np.testing.assert_array_equal(apply_warp(warp, EVERYWHERE), apply_warp(without, EVERYWHERE))
 
@@ -236,7 +264,8 @@ def test_fit_warp__of_any_face_does_not_fold(seed, count, wrong, scale):
     """Clicks are wrong by up to a third of the face: the warp becomes smoother, and never folds."""
     rng = np.random.default_rng(seed)
     keep = rng.permutation(20)[:count]
-    source, target = scale * _moved(seed, 0.02)[keep], _moved(seed + 1, wrong)[keep]
+    source = scale * _moved(seed, 0.02)[keep]
+    target = _moved(seed + 1, wrong)[keep]
     warp = fit_warp(source, target)
     factor = area_factor(warp, scale * EVERYWHERE)
     unit = np.linalg.det(similarity(source[warp.used], target[warp.used])[0]) if warp.used.sum() > 1 else 1.0
@@ -258,7 +287,8 @@ def test_similarity__is_the_least_squares_one():
 
 def test_similarity__in_space_brings_back_a_planted_one():
     rng = np.random.default_rng(18)
-    turn, points = Rotation.from_rotvec([0.3, -1.0, 2.0]).as_matrix(), rng.normal(size=(5, 3))
+    turn = Rotation.from_rotvec([0.3, -1.0, 2.0]).as_matrix()
+    points = rng.normal(size=(5, 3))
     matrix, shift = similarity(points, 1.3 * points @ turn + [1, 2, 3])
     np.testing.assert_allclose(matrix, 1.3 * turn, atol=1e-12)
     np.testing.assert_allclose(shift, [1, 2, 3], atol=1e-12)
@@ -281,7 +311,8 @@ def test_mean_shape__of_turned_copies_is_their_shape():
     rng = np.random.default_rng(9)
     copies = []
     for _ in range(5):
-        angle, scale = rng.uniform(-0.3, 0.3), rng.uniform(0.8, 1.2)
+        angle = rng.uniform(-0.3, 0.3)
+        scale = rng.uniform(0.8, 1.2)
         turn = scale * np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
         copies.append(FACE @ turn + rng.normal(size=2))
     full = np.stack(copies)

@@ -89,8 +89,20 @@ IGNORED = {
     "dome": ("CLEAR", "STEP", "ARM", "START", "STATUS", "REPORT", "STOP"),
     "probe": ("PUMP", "LED", "EXPOSE", "BEAT", "STATUS", "STOP"),
 }
-KINDS = ("silent", "deaf", "slow", "late", "duplicate", "reorder", "babble", "truncate", "repeat", "wrong number",
-         "frozen", "vanish")  # fmt: skip
+KINDS = (
+    "silent",
+    "deaf",
+    "slow",
+    "late",
+    "duplicate",
+    "reorder",
+    "babble",
+    "truncate",
+    "repeat",
+    "wrong number",
+    "frozen",
+    "vanish",
+)
 KINDS = (*KINDS, *3 * ("silent", "late", "frozen"), *5 * ("ignore", "stale"), *12 * ("value",))
 
 
@@ -131,9 +143,14 @@ class AttackedPort(DirectPort):
 
     def __init__(self, device, clock, attacks, rng):
         super().__init__(device, clock)
-        self.attacks, self.rng, self.count = attacks, rng, 0
-        self.requests, self.replies = Lines(), Lines()
-        self.late, self.held, self.before = [], [], {}
+        self.attacks = attacks
+        self.rng = rng
+        self.count = 0
+        self.requests = Lines()
+        self.replies = Lines()
+        self.late = []
+        self.held = []
+        self.before = {}
 
     def active(self, kind, message=None):
         """The attacks of a kind that happen now, or to a message that the device sends."""
@@ -226,7 +243,9 @@ class Session:
     """A folder of a capture, and sessions of it with devices that misbehave or not."""
 
     def __init__(self, setup, folder):
-        self.setup, self.folder, self.out = setup, folder, folder / "C"
+        self.setup = setup
+        self.folder = folder
+        self.out = folder / "C"
 
     def run(self, attacks=(), seed=0):
         """Run once; returns the text of the refusal, with the laboratory and its clock as they are then."""
@@ -239,16 +258,20 @@ class Session:
             ports[name] = AttackedPort(getattr(laboratory, name), clock, own, rng)
         refusal = ""
         try:
-            dome, probe = (
-                Dome(Link(ports["dome"], "dome", clock=clock)),
-                Probe(Link(ports["probe"], "probe", clock=clock)),
-            )
+            dome = Dome(Link(ports["dome"], "dome", clock=clock))
+            probe = Probe(Link(ports["probe"], "probe", clock=clock))
             cameras = FolderCameras(laboratory.watched, CAMERAS, clock=clock)
             devices = Devices(dome, cameras, probe, FolderCameras(laboratory.watched, ["probe"], clock=clock))
             run_capture(
-                self.out, read_setup(self.setup), PERSON, devices, PLAN, files={"mesh": self.setup / "scan.ply"},
-                override=OVERRIDE, place=lambda site, _: laboratory.place(site),
-            )  # fmt: skip
+                self.out,
+                read_setup(self.setup),
+                PERSON,
+                devices,
+                PLAN,
+                files={"mesh": self.setup / "scan.ply"},
+                override=OVERRIDE,
+                place=lambda site, _: laboratory.place(site),
+            )
         except InputError as error:
             refusal = str(error) or "nothing"
         return refusal, laboratory, clock
@@ -269,7 +292,8 @@ class Session:
 
 def violations(setup, folder, seed):
     """Run a case; returns the outcome, and what must not be."""
-    session, attacks = Session(setup, folder), attacks_of(seed)
+    session = Session(setup, folder)
+    attacks = attacks_of(seed)
     refusal, laboratory, clock = session.run(attacks, seed)
     wrong = []
     if laboratory.dome.on is not None or laboratory.dome.state == "running":
@@ -353,7 +377,8 @@ def main():
     parser.add_argument("--seed", type=int, default=0, help="seed of the first case; each has the next one")
     parser.add_argument("--list", action="store_true", help="print attacks and message of every case")
     options = parser.parse_args()
-    outcomes, failed = Counter(), 0
+    outcomes = Counter()
+    failed = 0
     with tempfile.TemporaryDirectory() as folder:
         setup = attacked_setup(Path(folder) / "lab")
         for seed in range(options.seed, options.seed + options.cases):

@@ -109,7 +109,8 @@ def test_lamp_brightness__is_unknown_without_a_frame(tmp_path, lost):
 
 def test_levels__light_beside_a_lamp_from_another_side(tmp_path):
     """Differences are taken pixel by pixel, as the brightest pixels are those of the lamp."""
-    beside, lit = np.full((10, 10, 3), BLACK, np.uint16), np.full((10, 10, 3), BLACK, np.uint16)
+    beside = np.full((10, 10, 3), BLACK, np.uint16)
+    lit = np.full((10, 10, 3), BLACK, np.uint16)
     beside[:, :5] += 20_000
     lit[:, 5:] += 8_000
     paths = {("c0", 0): tmp_path / "dark.png", ("c0", 1): tmp_path / "lit.png"}
@@ -133,7 +134,8 @@ def _session(setup, tmp_path, fraction, **options):
     """
     faults = LaboratoryFaults(lamp=fraction)
     with Bench(setup, tmp_path / "watched", faults, lamp=15.0) as bench:
-        light, flashes = bench.laboratory.dome._light, []
+        light = bench.laboratory.dome._light
+        flashes = []
 
         def record(step):
             if step.light != DARK:
@@ -141,7 +143,8 @@ def _session(setup, tmp_path, fraction, **options):
             light(step)
 
         bench.laboratory.dome._light = record
-        devices, plan = Devices(bench.dome, bench.cameras), CapturePlan(base=10, operator="OP-1")
+        devices = Devices(bench.dome, bench.cameras)
+        plan = CapturePlan(base=10, operator="OP-1")
         files = {"mesh": setup / "scan.ply"}
         try:
             run_capture(tmp_path / "C", read_setup(setup), PERSON, devices, plan, files=files, **options)
@@ -199,12 +202,14 @@ def test_run_capture__a_dark_frame_that_cannot_be_read_is_not_used(setup, tmp_pa
             trigger(*arguments)
             path = bench.watched / "c0/IMG_00001.png"
             if path.exists():
-                content, time = path.read_bytes(), path.stat().st_mtime
+                content = path.read_bytes()
+                time = path.stat().st_mtime
                 path.write_bytes(content[:40] + content[-12:])
                 os.utime(path, (time, time))
 
         bench.laboratory.dome._trigger = damage_the_second
-        devices, files = Devices(bench.dome, bench.cameras), {"mesh": setup / "scan.ply"}
+        devices = Devices(bench.dome, bench.cameras)
+        files = {"mesh": setup / "scan.ply"}
         options = {"files": files, "override": OVERRIDE}
         run_capture(tmp_path / "C", read_setup(setup), PERSON, devices, CapturePlan(), **options)
     mean = imagecodecs.png_decode((tmp_path / "C/dome/dark/long_c0.png").read_bytes())
@@ -218,12 +223,14 @@ def test_run_capture__more_flashes_than_planned_are_recorded(setup, tmp_path):
         report = device._report
 
         def catch_up(values):
-            reply, lit = report(values), [step for step in device.steps if step.light != DARK]
+            reply = report(values)
+            lit = [step for step in device.steps if step.light != DARK]
             late = 0 if reply["on"] < lit[0].on_us else max(lit[5].on_us - int(reply["on"]), 0)
             return reply | {"on": reply["on"] + late, "off": reply["off"] + late}
 
         device._report = catch_up
-        devices, files = Devices(bench.dome, bench.cameras), {"mesh": setup / "scan.ply"}
+        devices = Devices(bench.dome, bench.cameras)
+        files = {"mesh": setup / "scan.ply"}
         found = run_capture(tmp_path / "C", read_setup(setup), PERSON, devices, CapturePlan(slow=True), files=files)
     assert found["flashes_per_second"] > MAX_FLASHES
     assert (

@@ -144,7 +144,8 @@ def test_capture_dome__reports_of_steps_that_never_ran_are_not_asked_for(subject
     with Bench(subject, tmp_path) as bench:
         device = bench.laboratory.dome
         device.faults = DeviceFaults(open_interlock_at=20)
-        report, asked = device._report, []
+        report = device._report
+        asked = []
 
         def any_step(values):
             asked.append(int(values["index"]))
@@ -245,7 +246,8 @@ def test_run__a_stop_that_is_not_confirmed_is_left_to_the_watchdog(stays):
 def test_run__a_start_whose_reply_is_lost_is_stopped(monkeypatch):
     """The controller runs although the host does not know it."""
     device = OddDome()
-    begin, answer = device._begin, device._answer
+    begin = device._begin
+    answer = device._answer
 
     def silent(message):
         reply = answer(message)

@@ -34,11 +34,14 @@ class Line:
     """A port with the given bytes, which then arrive again and again, every 5 ms."""
 
     def __init__(self, clock, data=b"", chatter=b""):
-        self.clock, self.data, self.chatter = clock, data, chatter
+        self.clock = clock
+        self.data = data
+        self.chatter = chatter
 
     def read(self, size):
         self.clock.sleep(READ_SECONDS)
-        data, self.data = self.data + self.chatter, b""
+        data = self.data + self.chatter
+        self.data = b""
         return data
 
     def write(self, data):

@@ -117,7 +117,8 @@ def test_measure__a_gap_between_readings_is_refused_although_the_last_one_is_rec
 def test_measure__readings_that_arrive_late_are_refused(age):
     """One arrives every 0.1 s, but each is old."""
     device = OddProbe()
-    act, waiting = device.act, []
+    act = device.act
+    waiting = []
 
     def late():
         waiting.append((device.clock.monotonic() + age, act()))

@@ -81,7 +81,10 @@ def test_encode__refuses_what_breaks_the_format(message):
 @settings(deadline=None)
 @given(st.lists(MESSAGES, max_size=6), st.lists(st.integers(1, 40), min_size=1, max_size=30))
 def test_feed__any_cuts_of_the_stream_give_the_same_messages(messages, cuts):
-    stream, lines, found, at = b"".join(message.encode() for message in messages), Lines(), [], 0
+    stream = b"".join(message.encode() for message in messages)
+    lines = Lines()
+    found = []
+    at = 0
     while at < len(stream):
         step = cuts[at % len(cuts)]
         found += lines.feed(stream[at : at + step])
@@ -91,7 +94,8 @@ def test_feed__any_cuts_of_the_stream_give_the_same_messages(messages, cuts):
 
 
 def test_feed__counts_noise_and_goes_on():
-    lines, good = Lines(), Message("E", 7, "PRESSURE", {"kpa": "-5.0"}).encode()
+    lines = Lines()
+    good = Message("E", 7, "PRESSURE", {"kpa": "-5.0"}).encode()
     assert len(lines.feed(b"\xff\x00noise\n\n" + good + good.replace(b"-5", b"-6") + good)) == 2
     assert lines.damaged == 2
     assert lines.feed(b"x" * (10 * MAX_LINE_BYTES)) == []
@@ -112,7 +116,8 @@ def _check_feed__attacks_never_raise_nor_pass_a_changed_message(seed):
     ]
     wire = []
     for message in sent:
-        line, attack = bytearray(message.encode()), rng.integers(6)
+        line = bytearray(message.encode())
+        attack = rng.integers(6)
         if attack == 0:  # the CRC finds any three flipped bits of lines that are so short
             for bit in rng.choice(8 * (len(line) - 1), rng.integers(1, 4), replace=False):
                 line[bit // 8] ^= 1 << (bit % 8)
@@ -123,12 +128,17 @@ def _check_feed__attacks_never_raise_nor_pass_a_changed_message(seed):
         elif attack == 3:
             del line[-1]  # merged with the next one
         wire.append(bytes(line))
-    stream, lines, found = b"".join(wire), Lines(), []
+    stream = b"".join(wire)
+    lines = Lines()
+    found = []
     for at in range(0, len(stream), 17):
         found += lines.feed(stream[at : at + 17])
     assert all(message in sent for message in found)
-    untouched = [m for m, line, before in zip(sent, wire, [b"\n", *wire], strict=False)
-                 if line == m.encode() and before.endswith(b"\n")]  # fmt: skip
+    untouched = [
+        m
+        for m, line, before in zip(sent, wire, [b"\n", *wire], strict=False)
+        if line == m.encode() and before.endswith(b"\n")
+    ]
     assert all(message in found for message in untouched)
 
 

@@ -206,7 +206,8 @@ def test_capture_dome__a_repetition_that_is_refused_loses_nothing(subject, tmp_p
         slowed_schedule(plan_schedule(LIGHTS, EXPOSURES)) if slow else plan_schedule(LIGHTS, EXPOSURES)
     )
     with Bench(subject, tmp_path, LaboratoryFaults(dropped_frames=(("c0", 9),))) as bench:
-        arm, armed = bench.dome.arm, []
+        arm = bench.dome.arm
+        armed = []
 
         def refuse_the_second(part, override):
             assert assess(part).flashes_per_second <= assess(schedule).flashes_per_second

@@ -108,7 +108,8 @@ def test_upload__ends_within_its_deadline(monkeypatch):
     """Every request is answered at the third attempt only."""
     device = emulated_dome()
     dome = Dome(linked(device))
-    receive, heard = device.receive, []
+    receive = device.receive
+    heard = []
 
     def every_third(data):
         heard.append(data)

@@ -9,9 +9,14 @@ import imagecodecs
 import numpy as np
 import trimesh
 
-RADIUS, ALBEDO = 80.0, np.array([0.6, 0.4, 0.3])
-WIDTH, HEIGHT, FOCAL = 72, 64, 160.0
-BLACK, WHITE, ELECTRONS_PER_DN = 256, 65535, 0.5
+RADIUS = 80.0
+ALBEDO = np.array([0.6, 0.4, 0.3])
+WIDTH = 72
+HEIGHT = 64
+FOCAL = 160.0
+BLACK = 256
+WHITE = 65535
+ELECTRONS_PER_DN = 0.5
 SECONDS = {"long": 1.0, "short": 0.1}
 INTENSITY = np.array([1.0e6, 0.9e6, 0.8e6])
 LIGHTS = {"l0": (0, 0, 500), "l1": (200, 50, 450), "l2": (-250, 100, 350), "l3": (50, -300, 300)}
@@ -20,7 +25,8 @@ TARGET = {"reflectance": 0.99, "point": [0, 0, 60], "normal": [0, 0, 1], "half_s
 FIBRES = 4
 PROBE_SECONDS = {"b0": 4.0, "b1": 1.0, "b2": 0.25}
 PROBE_R = 0.02 * np.exp(-np.arange(1, FIBRES + 1)[:, None] * np.array([0.5, 0.8, 1.2]))  # mm^-2
-PROBE_SCALE, PROBE_GAIN = 0.05, [1.1, 0.9, 1.05, 0.8]
+PROBE_SCALE = 0.05
+PROBE_GAIN = [1.1, 0.9, 1.05, 0.8]
 
 
 def look_at(eye):
@@ -41,7 +47,8 @@ def rays(eye, centre=(WIDTH / 2, HEIGHT / 2), lens=(0, 0, 0, 0, 0)):
 
 def straightened(u, v, k1, k2, p1, p2, k3):
     """Where a lens would show (u, v) without its distortion: Brown's formula, repeated until it stands still."""
-    x, y = u, v
+    x = u
+    y = v
     for _ in range(60):
         r2 = x * x + y * y
         radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
@@ -54,7 +61,9 @@ def straightened(u, v, k1, k2, p1, p2, k3):
 
 def face_radiance(eye, light, **camera):
     """The sphere, by the quadratic formula."""
-    d, eye, light = rays(eye, **camera), np.asarray(eye, float), np.asarray(light, float)
+    d = rays(eye, **camera)
+    eye = np.asarray(eye, float)
+    light = np.asarray(light, float)
     b = d @ eye
     inside = b * b - eye @ eye + RADIUS**2
     point = eye + (-b - np.sqrt(np.maximum(inside, 0)))[..., None] * d
@@ -65,7 +74,9 @@ def face_radiance(eye, light, **camera):
 
 
 def target_radiance(eye, light, **camera):
-    d, eye, light = rays(eye, **camera), np.asarray(eye, float), np.asarray(light, float)
+    d = rays(eye, **camera)
+    eye = np.asarray(eye, float)
+    light = np.asarray(light, float)
     point = eye + ((60 - eye[2]) / d[..., 2])[..., None] * d
     way = light - point
     square = (way**2).sum(-1)
@@ -124,7 +135,8 @@ def write_capture(folder: Path) -> None:
     }
     write_json(folder / "dome/dome.json", dome)
     write_probe(folder, sensor, rng)
-    x, y = vertices[:, 0], vertices[:, 1]
+    x = vertices[:, 0]
+    y = vertices[:, 1]
     regions = {"forehead": y > 50, "cheek": np.hypot(np.abs(x) - 40, y) < 15, "nose": np.hypot(x, y) < 12}
     write_json(folder / "regions.json", {k: [np.flatnonzero(v).tolist()] for k, v in regions.items()})
     points = {"nose_tip": [0, 0, RADIUS], "forehead_centre": [0, 0.7 * RADIUS, RADIUS * np.sqrt(0.51)]}

@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-C, D, P = "capture.json", "dome/dome.json", "contact/probe.json"
+C = "capture.json"
+D = "dome/dome.json"
+P = "contact/probe.json"
 
 
 def edit(path: Path, change) -> None:

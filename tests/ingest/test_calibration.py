@@ -37,7 +37,8 @@ from skindb.ingest.surfels import build_surfels
 from skindb.ingest.visibility import camera_visibility, light_visibility
 from skindb.virtual.takes import simulate_takes
 
-CAMERAS, LIGHTS = 4, 14
+CAMERAS = 4
+LIGHTS = 14
 
 
 @dataclass(frozen=True)
@@ -125,7 +126,8 @@ def _centre(shoot):
 
 
 def _poses(shoot):
-    a, b = shoot.dome.cameras[0], shoot.dome.cameras[1]
+    a = shoot.dome.cameras[0]
+    b = shoot.dome.cameras[1]
     return _camera(_camera(shoot, 0, R=b.R, t=b.t, K=b.K), 1, R=a.R, t=a.t, K=a.K)
 
 
@@ -233,10 +235,8 @@ def test_ingest_capture__refuses_or_notes_exchanged_frames(shoot, tmp_path):
         second.rename(first)
         (tmp_path / "kept").rename(second)
     capture = read_capture(folder)
-    message, coarse = (
-        r"light l002: the shading of the face must match its position; .*with light l009",
-        {"spacing_mm": 4.0},
-    )
+    message = r"light l002: the shading of the face must match its position; .*with light l009"
+    coarse = {"spacing_mm": 4.0}
     with (
         pytest.raises(InputError, match=message),
         ingest_capture(capture, IngestParameters(**coarse), scratch=tmp_path / "scratch"),
@@ -323,7 +323,8 @@ def test_camera_offset__finds_a_planted_move_of_a_smooth_picture():
 
 def test_calibration__of_nothing_that_is_seen_is_unknown(shoot):
     few = replace(shoot.surfels, **{n: getattr(shoot.surfels, n)[:20] for n in ("position", "normal", "area")})
-    share, clear = np.ones((20, LIGHTS), np.float16), np.ones((20, CAMERAS), bool)
+    share = np.ones((20, LIGHTS), np.float16)
+    clear = np.ones((20, CAMERAS), bool)
     pixels = np.full((20, CAMERAS, 2), 60, np.float32)
     check = CalibrationCheck(shoot.dome, few, share, clear, pixels, shoot.intensity)
     found = check.evaluate({pair: check.reduce(pair[1], shoot.pictures[pair]) for pair in check.pairs})
@@ -368,7 +369,8 @@ def test_bilinear__between_pixel_centres():
 @pytest.mark.parametrize("shape", [(9, 7), (1, 5), (4, 1), (1, 1)])
 def test_interpolated__every_picture_as_by_scipy(shape):
     rng = np.random.default_rng(3)
-    images, pixels = rng.random((3, *shape)), rng.uniform(-1, 10, (400, 2))
+    images = rng.random((3, *shape))
+    pixels = rng.uniform(-1, 10, (400, 2))
     expected = [map_coordinates(one, pixels.T[::-1] - 0.5, order=1, mode="nearest") for one in images]
     inside = ((pixels >= 0) & (pixels <= shape[::-1])).all(axis=1)
     assert 0 < inside.sum() < 400

@@ -68,7 +68,8 @@ def test_read_capture__version_2_says_more(second, tmp_path):
         assert tree.attrs["override"] == OVERRIDE
         for group in ("probe", "sequence"):
             check(tree[group].to_dataset(), [v.name for v in GROUPS[group] if "isotropy" not in v.name], where=group)
-        sequence, probe = tree["sequence"].to_dataset(), tree["probe"].to_dataset()
+        sequence = tree["sequence"].to_dataset()
+        probe = tree["probe"].to_dataset()
         np.testing.assert_allclose(sequence["step_on"], 0.1 * np.arange(len(LIGHTS) * len(SECONDS)))
         np.testing.assert_allclose(sequence["step_off"] - sequence["step_on"], 0.05)
         assert sequence["step_light"].values.tolist() == [*range(len(LIGHTS))] * len(SECONDS)
@@ -141,8 +142,10 @@ def test_read_capture__mistakes_of_version_2(second, file, change, said):
 
 
 def test_read_sequence__iso_times_are_seconds(second):
-    steps = [step | {"t_on": f"2026-01-01T10:00:0{i}+01:00", "t_off": f"2026-01-01T10:00:0{i}.5+01:00"}
-             for i, step in enumerate(_steps())]  # fmt: skip
+    steps = [
+        step | {"t_on": f"2026-01-01T10:00:0{i}+01:00", "t_off": f"2026-01-01T10:00:0{i}.5+01:00"}
+        for i, step in enumerate(_steps())
+    ]
     _edit(second, "dome/dome.json", sequence=steps)
     np.testing.assert_allclose(read_capture(second).dome.sequence.on, np.arange(len(steps)))
 
@@ -154,7 +157,9 @@ def test_combine_placements__error_is_that_of_the_mean(spread, count):
     rng = np.random.default_rng(count)
     truth = PROBE_R[:, :3]
     noise = 0.01 * truth + 1e-5
-    squares, stated, repeatability = [], [], []
+    squares = []
+    stated = []
+    repeatability = []
     for _ in range(2_000):
         coupling = 1 + spread * rng.standard_normal((count, 1, 3))
         value = truth * coupling + noise * rng.standard_normal((count, *truth.shape))

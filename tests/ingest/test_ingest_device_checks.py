@@ -77,7 +77,7 @@ HOSTILE = {
         edited(D, lambda dome: dome["white"].update(frames=dome["frames"])),
         r"\[white\]: every view must have its own file; found 8 shared, l0_c0\.png of template frames and of",
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", HOSTILE)

@@ -158,7 +158,8 @@ def test_unit_fault__a_person_in_a_large_dome_passes(dome):
 def test_unit_fault__a_nose_whose_landmarks_tell_its_size_passes(dome):
     """Round, in the middle of its frame and small in the pictures as it is: a head in centimetres else."""
     vertices, faces = half_sphere()
-    nose, afar = clean_mesh(vertices / 10, faces), further(dome, 2)
+    nose = clean_mesh(vertices / 10, faces)
+    afar = further(dome, 2)
     assert judged(afar, nose) is not None
     assert judged(afar, nose, sized=True) is None
     ahead = np.array([0.0, 0, 70])  # where a nose lies in the frame of its head
@@ -176,7 +177,8 @@ def test_unit_fault__a_scan_round_a_camera_is_large_not_unseen(dome):
 @pytest.mark.parametrize("how", ["turned away", "aside", "other side"])
 def test_unit_fault__no_camera_shows_the_scan(dome, how):
     vertices, faces = half_sphere()
-    turn, aside = np.diag([-1.0, 1, -1]), np.array([500.0 if how == "aside" else -500.0, 0, 0])
+    turn = np.diag([-1.0, 1, -1])
+    aside = np.array([500.0 if how == "aside" else -500.0, 0, 0])
     cameras = tuple(
         replace(c, R=turn @ c.R, t=turn @ c.t) if how == "turned away" else replace(c, t=c.t + aside)
         for c in dome.cameras

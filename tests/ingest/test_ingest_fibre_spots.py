@@ -13,7 +13,8 @@ from skindb.ingest.fibre_spots import Spots, fibre_gain, find_fibres, match_fibr
 def fibre_picture(rng, noise=0.005):
     """28 discs, drawn at 8 times the resolution, of differing brightness on stray light."""
     centre = np.array([[30 + 22.3 * (i % 7), 28 + 25.7 * (i // 7)] for i in range(28)]) + rng.uniform(-2, 2, (28, 2))
-    radius, fine = rng.uniform(6.0, 7.0, 28), 8
+    radius = rng.uniform(6.0, 7.0, 28)
+    fine = 8
     row, column = (np.mgrid[: 140 * fine, : 200 * fine] + 0.5) / fine
     picture = np.zeros(row.shape)
     for (x, y), r in zip(centre, radius, strict=True):

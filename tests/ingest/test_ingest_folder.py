@@ -35,8 +35,10 @@ def mesh(vertices, faces):
 
 
 def text_mesh(folder):
-    (folder / "scan.ply").write_text("ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\n"
-        "property float z\nelement face 0\nproperty list uchar int vertex_indices\nend_header\n")  # fmt: skip
+    (folder / "scan.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nproperty float y\n"
+        "property float z\nelement face 0\nproperty list uchar int vertex_indices\nend_header\n"
+    )
 
 
 def soup(folder):
@@ -82,7 +84,8 @@ def response(low, high, first, last):
     """A table for the first camera, between these values and exposures."""
 
     def write(folder):
-        dn, exposure = np.linspace(low, high, 9), np.linspace(first, last, 9)
+        dn = np.linspace(low, high, 9)
+        exposure = np.linspace(first, last, 9)
         table = np.column_stack([dn, exposure, exposure, exposure])
         np.savetxt(folder / "dome/r.csv", table, delimiter=",", header="dn,r,g,b", comments="")
         put(D, "cameras", 0, "response", value="dome/r.csv")(folder)
@@ -213,7 +216,7 @@ FAULTS = {
     "ids that run together": (lights_run_together, r"dome\.json\[frames\]: every view .*; found 2 shared, a_b_c"),
     "sites that run together": (sites_run_together, r"\[frames\]: .*; found 1 shared, a_b_c\.png of site a, expo"),
     "duplicate site": (put(P, "sites", value=["cheek", "cheek"]), r"\[sites\]: ids must differ"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", FAULTS)
@@ -248,9 +251,15 @@ def test_read_capture__one_fault_is_one_line(capture_folder):
 
 
 VALUES = (
-    "reflectance in per cent", "target without direction", "white beyond 16 bits", "16 bit white of 12 bits",
-    "vignette through zero", "K singular", "response to 255", "response of a part",
-)  # fmt: skip
+    "reflectance in per cent",
+    "target without direction",
+    "white beyond 16 bits",
+    "16 bit white of 12 bits",
+    "vignette through zero",
+    "K singular",
+    "response to 255",
+    "response of a part",
+)
 
 
 @pytest.mark.parametrize("name", VALUES)
@@ -272,7 +281,7 @@ LEGAL = {
     "empty region of no site": put("regions.json", "nose", value=[]),
     "empty region of a site with a landmark": put("regions.json", "forehead", value=[]),
     "target that looks aside": put(D, "white", "normal", value=[0, 3, 4]),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", LEGAL)
@@ -425,7 +434,7 @@ HOSTILE = {
     "text for a number": (put(D, "lights", 0, "position", value=["1.0", 1, 500]), r"\[position\]: must be 3 numbers"),
     "empty region of a site": (put("regions.json", "cheek", value=[[]]), r"regions\.json\[cheek\]: a region that"),
     "version as text": (put(C, "version", value="1"), r'\[version\]: must be 1 or 2, .*; found the text "1";'),
-}  # fmt: skip
+}
 
 
 def test_read_capture__a_region_without_vertices_is_told(capture_folder):

@@ -35,7 +35,8 @@ from skindb.ingest.radiance import FrameMerger, read_view
 from skindb.store import Database
 from skindb.workflow import ingest_take
 
-FRAME, SHORT = "dome/frames/long/l1_c1.png", "dome/frames/short/l1_c1.png"
+FRAME = "dome/frames/long/l1_c1.png"
+SHORT = "dome/frames/short/l1_c1.png"
 
 
 def exchange(one, two):
@@ -217,7 +218,7 @@ HOSTILE = {
     ),
     "white frames of a site": (brackets("neck", WHITE), r"\[frames\]: at least 3 .* site neck: 0 of 4, 4 saturated;"),
     "seconds of a bracket": (put(P, "exposures", 1, "seconds", value=1.5), r"probe\.json\[exposures\]: .* bracket b2 "),
-}  # fmt: skip
+}
 
 
 def ingested(folder, root):

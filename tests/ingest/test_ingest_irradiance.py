@@ -17,7 +17,8 @@ from skindb.ingest.folder import read_capture
 from skindb.ingest.irradiance import PIXELS_PER_BLOCK, TARGET_INTERIOR_FRACTION, light_intensities, target_pixels
 from skindb.ingest.radiance import frame_mergers
 
-Z, FOCAL = 900.0, 2000.0
+Z = 900.0
+FOCAL = 2000.0
 FLAT = WhiteRecord("", 0.9, np.array([12.0, -7.0, Z]), np.array([0, 0, -1.0]), 50.0, ("c0",))
 
 

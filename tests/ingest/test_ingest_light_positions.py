@@ -104,7 +104,8 @@ def test_ball_centre__from_one_and_from_two_cameras(outlines):
     for place, centre in PLACES.items():
         seen = [Pinhole(np.array(c["K"]), np.array(c["R"]), np.array(c["t"]), np.zeros(5)) for c in CAMERAS.values()]
         circles = list(outlines[place].values())
-        one, two = ball_centre(seen[:1], circles[:1], RADIUS), ball_centre(seen, circles, RADIUS)
+        one = ball_centre(seen[:1], circles[:1], RADIUS)
+        two = ball_centre(seen, circles, RADIUS)
         # the outline is known to a tenth of 37 px: 0.3 % of 900 mm along the view, 0.1 mm across it
         np.testing.assert_allclose(one.centre, centre, atol=3)
         np.testing.assert_allclose(two.centre, centre, atol=0.3)

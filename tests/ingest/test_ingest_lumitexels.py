@@ -57,13 +57,18 @@ def test_fully_lit__keeps_a_pixel_of_the_widest_camera_away_from_a_shadow(captur
     A pixel is the mean over itself, a sample lies between two of them: at the nearest kept surfel it may be an eighth
     of half a pixel too dark at the worst place of the grid of pixels, which is 6 %, and 2 % on average (by hand).
     """
-    count, step = 81, 0.25
+    count = 81
+    step = 0.25
     x, y = (axis.ravel() * step for axis in np.mgrid[:count, :count] - count // 2)
     at = np.arange(count * count).reshape(count, count)
     (a, b), (c, d) = ((row[:, :-1].ravel(), row[:, 1:].ravel()) for row in (at[:-1], at[1:]))
-    place, faces = np.stack([x, y, 0 * x], axis=1), np.concatenate([np.stack([a, b, d], 1), np.stack([a, d, c], 1)])
-    up, one = np.tile([0.0, 0, 1], (len(place), 1)), np.ones(len(place))
-    area, uv, none = vertex_areas(place, faces), place[:, :2].astype(np.float32), np.zeros((len(place), 0), bool)
+    place = np.stack([x, y, 0 * x], axis=1)
+    faces = np.concatenate([np.stack([a, b, d], 1), np.stack([a, d, c], 1)])
+    up = np.tile([0.0, 0, 1], (len(place), 1))
+    one = np.ones(len(place))
+    area = vertex_areas(place, faces)
+    uv = place[:, :2].astype(np.float32)
+    none = np.zeros((len(place), 0), bool)
     plane = SurfelSet(place, up, area, one, uv, faces, (), none, "intrinsic")
     one = capture.dome.cameras[0]
     fine, coarse = (
@@ -116,10 +121,8 @@ def test_noise_floor__of_linear_files(surfels, capture):
 
 def sampled(dome, surfels, folder, *, share=None, lit=None, footprint=False):
     """Every view of a dome, by rays that say what is clear; samples in memory."""
-    mergers, shape = (
-        {camera.id: frame_merger(dome, camera) for camera in dome.cameras},
-        (len(dome.lights), len(dome.cameras)),
-    )
+    mergers = {camera.id: frame_merger(dome, camera) for camera in dome.cameras}
+    shape = (len(dome.lights), len(dome.cameras))
     n = len(surfels.position)
     lit = np.ones((n, shape[0]), bool) if lit is None else lit
     with ThreadPoolExecutor(2) as pool, Spool(folder, (*shape, n), {}, key="run") as spool:
@@ -194,7 +197,8 @@ def test_sample_lumitexels__counts_what_is_lost(capture_folder, tmp_path):
         save(capture_folder / f"dome/frames/{exposure}/l1_c0.png", white)
         save(capture_folder / f"dome/frames/{exposure}/l0_c1.png", np.full((64, 72, 3), BLACK, np.uint16))
     capture = read_capture(capture_folder)
-    dome, surfels = capture.dome, build_surfels(capture, spacing_mm=8.0)
+    dome = capture.dome
+    surfels = build_surfels(capture, spacing_mm=8.0)
     clear, found = sampled(dome, surfels, tmp_path / "spool")
     store = found.sample
     assert np.isnan(store[:, 1, 0]).all()

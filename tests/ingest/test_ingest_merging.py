@@ -9,7 +9,10 @@ from skindb.ingest.frames import FrameKind
 from skindb.ingest.radiance import merge_exposures, usable_exposures
 from skindb.ingest.sensor import SensorRecord
 
-BLACK, WHITE, READ, STEP = 1024.0, 65520.0, 6.0, 16.0
+BLACK = 1024.0
+WHITE = 65520.0
+READ = 6.0
+STEP = 16.0
 FULL = 20000.0  # electrons at the white level
 BRACKETS = (0.04, 0.02, 0.01, 0.005)
 KIND = FrameKind(100, 200, 16)
@@ -25,7 +28,8 @@ def bend(exposure):
 def sensor_of(*, curved):
     table = None
     if curved:
-        value, exposure = np.linspace(BLACK, WHITE, 2000), np.linspace(0, 1, 100_001)
+        value = np.linspace(BLACK, WHITE, 2000)
+        exposure = np.linspace(0, 1, 100_001)
         column = np.interp((value - BLACK) / (WHITE - BLACK), bend(exposure), exposure)
         table = np.column_stack([value, column, column, column])
     return SensorRecord(KIND, BLACK, WHITE, READ, FULL / (WHITE - BLACK), STEP, response=table)

@@ -41,7 +41,8 @@ def highlight_of(camera, ball, light=LIGHT):
     centre = camera_centre(camera.R, camera.t)
 
     def length(angles):
-        z, phi = np.cos(angles[0]), angles[1]
+        z = np.cos(angles[0])
+        phi = angles[1]
         normal = np.array([np.sin(angles[0]) * np.cos(phi), np.sin(angles[0]) * np.sin(phi), z])
         point = ball + RADIUS * normal
         return np.linalg.norm(point - centre) + np.linalg.norm(point - light), point

@@ -33,7 +33,8 @@ def test_ingest__differences_of_repeated_photographs_are_as_large_as_the_stated_
             for light, place in LIGHTS.items():
                 frame = expose(face_radiance(eye, place), seconds, rng)
                 save(second / f"dome/frames/{exposure}/{light}_{camera}.png", frame)
-    one, two = _samples(tmp_path, "db1", first), _samples(tmp_path, "db2", second)
+    one = _samples(tmp_path, "db1", first)
+    two = _samples(tmp_path, "db2", second)
     a, b = (samples["reflectance_sample"].values.astype(np.float64) for samples in (one, two))
     level = (a + b) / 2
     stated = np.sqrt(4 / 9 * float(one["noise_floor"]) ** 2 + float(one["shot_noise"]) * np.maximum(level, 0))

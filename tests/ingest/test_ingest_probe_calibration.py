@@ -22,8 +22,13 @@ from skindb.ingest.probe_calibration import calibrate_probe, calibrated_probe, r
 sys.path.append(str(Path(__file__).parent))
 from sphere import FIBRES, PROBE_GAIN, PROBE_R, PROBE_SECONDS, write_capture
 
-SPOT, REPEATS, MOVED = 4.5, 6, np.array([1.3, -0.8])  # px
-BLACK, WHITE, ELECTRONS = 256.0, 65535.0, 30000.0
+# px
+SPOT = 4.5
+REPEATS = 6
+MOVED = np.array([1.3, -0.8])
+BLACK = 256.0
+WHITE = 65535.0
+ELECTRONS = 30000.0
 # (fibre, 3), of which probe.json knows nothing
 GAINS = np.array([1.2, 0.9, 1.0, 0.9])[:, None] * [1.0, 1.02, 0.98] + np.array([0.0, 0.0, 0.05, -0.05])[:, None]
 

@@ -12,8 +12,10 @@ from skindb.ingest.folder import read_capture
 from skindb.ingest.probe import Profiles
 from skindb.ingest.probe_notes import isotropy_p_values, probe_notes
 
-ROWS, FIBRES = 16, 8
-DISTANCE, AZIMUTH = np.tile(np.linspace(1, 8, FIBRES), ROWS), np.repeat(np.arange(ROWS) * 22.5, FIBRES)
+ROWS = 16
+FIBRES = 8
+DISTANCE = np.tile(np.linspace(1, 8, FIBRES), ROWS)
+AZIMUTH = np.repeat(np.arange(ROWS) * 22.5, FIBRES)
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +65,8 @@ def test_isotropy_p_values__only_of_several_complete_rows(probe):
 def test_probe_notes__pressure_and_repeatability(probe):
     profiles = _profiles(probe, np.random.default_rng(5))
     assert probe_notes(probe, profiles, None) == []
-    steady, sinking = np.array([[0.0, -5.0], [1.0, -5.2]]), np.array([[0.0, -5.0], [1.0, -2.5]])
+    steady = np.array([[0.0, -5.0], [1.0, -5.2]])
+    sinking = np.array([[0.0, -5.0], [1.0, -2.5]])
     touched = replace(probe, pressure={("cheek", ""): steady, ("neck", "b"): sinking})
     spread = np.array([[0.01, 0.02, 0.01], [0.01, 0.08, 0.01], [np.nan] * 3])
     notes = probe_notes(touched, replace(profiles, repeatability=spread), None)

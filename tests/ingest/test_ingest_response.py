@@ -14,14 +14,18 @@ from skindb.ingest.response import TOE, ResponseOptions, _mean_exposure_value, r
 from skindb.ingest.response_samples import response_samples
 from skindb.ingest.sensor import SensorRecord, read_sensor
 
-BLACK, WHITE, FULL, READ = 1024.0, 65520.0, 20000.0, 6.0
+BLACK = 1024.0
+WHITE = 65520.0
+FULL = 20000.0
+READ = 6.0
 EIGHT = tuple(0.08 / 2.0**i for i in range(8))
 PUBLISHED = Path("/work/shared/data/exposures")
 
 
 def encoded(exposure, gamma):
     """A gamma curve with a linear toe: (0, 0) to (1, 1)."""
-    toe, power = 0.004, 1 / gamma
+    toe = 0.004
+    power = 1 / gamma
     slope = power * toe ** (power - 1)
     lift = toe**power - slope * toe
     return np.where(exposure < toe, slope * exposure, np.maximum(exposure, toe) ** power - lift) / (1 - lift)

@@ -88,7 +88,8 @@ def test_ingest_capture__probe(take):
 
 
 def test_ingest_capture__surfels_lie_in_order_with_areas_regions_and_faces(take):
-    surfels, mesh = take["surfels"].to_dataset(), take["mesh"]["triangle"].values
+    surfels = take["surfels"].to_dataset()
+    mesh = take["mesh"]["triangle"].values
     place = surfels["surfel_position"].values
     np.testing.assert_allclose(np.linalg.norm(place, axis=1), RADIUS, rtol=0.01)
     assert float(surfels["surfel_area"].sum()) == pytest.approx(2 * np.pi * RADIUS**2, rel=0.05)
@@ -103,7 +104,8 @@ def test_ingest_capture__surfels_lie_in_order_with_areas_regions_and_faces(take)
 
 
 def test_ingest_capture__the_atlas_as_stored_has_no_flips_and_its_distortion_is_told(take):
-    atlas, triangle = take["atlas"].to_dataset(), take["mesh"]["triangle"].values
+    atlas = take["atlas"].to_dataset()
+    triangle = take["mesh"]["triangle"].values
     assert atlas.attrs["weights"] == "intrinsic"  # few obtuse triangles
     uv = take["surfels"]["surfel_uv"].values
     assert uv.dtype == np.float32
@@ -124,7 +126,8 @@ def test_ingest_capture__photographs_are_radiance_as_taken(take):
     photos = take["photographs"].to_dataset()
     assert photos.sizes["photograph"] == 2
     assert set(photos["photograph_camera"].values) == {0}
-    image, light = photos["photograph_radiance"][0].values, list(LIGHTS)[int(photos["photograph_light"][0])]
+    image = photos["photograph_radiance"][0].values
+    light = list(LIGHTS)[int(photos["photograph_light"][0])]
     truth = face_radiance(CAMERAS["c0"], LIGHTS[light])
     lit = truth.min(-1) > 0.2
     assert abs(np.median(image[lit] / truth[lit]) - 1) < 0.002  # exposures of a camera by hand

@@ -61,7 +61,7 @@ HOSTILE = {
         linear("l1", 0),
         r"\[frames\], camera c0, light l1: a frame must be bright where .*; found none at \d+ surfels; copy the frame",
     ),
-}  # fmt: skip
+}
 
 
 def ingested(folder, root, **options):

@@ -25,7 +25,10 @@ from skindb.ingest.spool import Spool
 from skindb.ingest.surfels import build_surfels
 from skindb.ingest.visibility import camera_visibility
 
-FULL, READ, REPEATS = 2000.0, 5.0, 4  # electrons; few, so that steps of the files do not matter
+# electrons; few, so that steps of the files do not matter
+FULL = 2000.0
+READ = 5.0
+REPEATS = 4
 VIGNETTE = np.array([-0.1, 0.0, 0.0])
 
 
@@ -46,7 +49,8 @@ def take_frames(folder, dome, rng):
 
 def lumitexels_of(dome, surfels, folder, *, footprint):
     """What a fit reads of the frames that lie there."""
-    n, intensity = len(surfels.position), np.tile(INTENSITY, (len(dome.lights), 1))
+    n = len(surfels.position)
+    intensity = np.tile(INTENSITY, (len(dome.lights), 1))
     mergers = {camera.id: frame_merger(dome, camera) for camera in dome.cameras}
     shape = (len(dome.lights), len(dome.cameras), n)
     with ThreadPoolExecutor(2) as pool, Spool(folder, shape, {}, key="run") as spool:
@@ -75,7 +79,8 @@ def test_sample_variance__z_scores_of_repeated_frames_have_unit_variance(capture
         for light in capture.dome.lights
     )
     dome = replace(capture.dome, cameras=cameras, lights=lights)
-    surfels, rng = build_surfels(capture, spacing_mm=4.0), np.random.default_rng(11)
+    surfels = build_surfels(capture, spacing_mm=4.0)
+    rng = np.random.default_rng(11)
     if footprint:
         surfels = replace(surfels, radius=np.full(len(surfels.position), 6.0))
     take_frames(capture_folder, dome, None)
@@ -89,7 +94,8 @@ def test_sample_variance__z_scores_of_repeated_frames_have_unit_variance(capture
         scores.append((noisy["reflectance_sample"].values - expected) / np.sqrt(variance))
     z = np.stack(scores)
     pixels = noisy["effective_pixels"].values.astype(np.float64)
-    position, place = surfels.position, np.array([light.position for light in dome.lights])
+    position = surfels.position
+    place = np.array([light.position for light in dome.lights])
     square = ((position[:, None] - place) ** 2).sum(axis=2)[:, :, None, None]
     white = expected * INTENSITY / square > 1.15  # in the long exposure, which lasts a second
     dark = (expected * INTENSITY / square < 0.85) & (expected * INTENSITY / square > 0.05)
@@ -124,7 +130,8 @@ def test_radiance_noise__is_the_variance_of_merged_exposures(seconds):
 def test_radiance_noise__lens_and_colours():
     """Behind a lens that lets half through, twice the photons' variance; a matrix adds variances by its squares."""
     sensor = SensorRecord(FrameKind(4, 4, 16), 0.0, 65535.0, 6.0, 0.5)
-    eye, matrix = np.eye(3), np.array([[1.4, -0.3, -0.1], [-0.2, 1.3, -0.1], [0.0, -0.4, 1.4]])
+    eye = np.eye(3)
+    matrix = np.array([[1.4, -0.3, -0.1], [-0.2, 1.3, -0.1], [0.0, -0.4, 1.4]])
     camera = CameraRecord("c", 4, 4, eye, eye, np.zeros(3), np.zeros(5), sensor, eye, np.zeros(3))
     limit, read, shot = radiance_noise(camera, [1.0], 1.0)
     behind = radiance_noise(camera, [1.0], 0.5)
@@ -139,7 +146,9 @@ def test_sample_noise__is_unknown_without_electrons(capture_folder, tmp_path):
     first, *others = capture.dome.cameras
     silent = replace(first, sensor=replace(first.sensor, electrons_per_dn=UNKNOWN_ELECTRONS))
     found = lumitexels_of(
-        replace(capture.dome, cameras=(silent, *others)), build_surfels(capture, spacing_mm=8.0), tmp_path / "a",
+        replace(capture.dome, cameras=(silent, *others)),
+        build_surfels(capture, spacing_mm=8.0),
+        tmp_path / "a",
         footprint=False,
-    )  # fmt: skip
+    )
     assert noise_inputs(found) == ()

@@ -150,7 +150,9 @@ def test_spool__begins_again_after_a_version_that_counted_less(tmp_path):
 def test_spool__an_older_note_never_replaces_a_newer_one(tmp_path, monkeypatch):
     """Two threads note their views; the note of the first is held up until the other's is written, or in vain."""
     monkeypatch.setattr("skindb.ingest.spool.JOURNAL_INTERVAL_SECONDS", 0.0)
-    plain, begun, over = Spool._replace, threading.Event(), threading.Event()
+    plain = Spool._replace
+    begun = threading.Event()
+    over = threading.Event()
 
     def slow(self, name, content):
         if not begun.is_set():
@@ -159,7 +161,8 @@ def test_spool__an_older_note_never_replaces_a_newer_one(tmp_path, monkeypatch):
         plain(self, name, content)
         over.set()
 
-    bits, none = np.zeros((3, 5), np.uint16), np.full(5, 3, np.uint8)
+    bits = np.zeros((3, 5), np.uint16)
+    none = np.full(5, 3, np.uint8)
     with Spool(tmp_path / "a", (2, 2, 5), FRAMES, key="run") as target:
         monkeypatch.setattr(Spool, "_replace", slow)
         first = threading.Thread(target=target.put, args=(0, 0, bits, none, {}))
@@ -278,7 +281,10 @@ def test_spool__lets_go_of_everything_when_it_cannot_begin(tmp_path, monkeypatch
     def full(*_):
         raise OSError(errno.ENOSPC, "no space")
 
-    opened, closed, begin, end = [], [], os.open, os.close
+    opened = []
+    closed = []
+    begin = os.open
+    end = os.close
     with monkeypatch.context() as patch:
         patch.setattr("skindb.ingest.spool.os.open", lambda *a: opened.append(begin(*a)) or opened[-1])
         patch.setattr("skindb.ingest.spool.os.close", lambda one: closed.append(one) or end(one))
@@ -301,7 +307,8 @@ def test_spool__a_file_system_without_locks_is_not_another_process(tmp_path, mon
 
 
 def test_spool__the_lock_of_a_folder_that_was_removed_meanwhile_is_not_one(tmp_path, monkeypatch):
-    plain, times = fcntl.flock, []
+    plain = fcntl.flock
+    times = []
 
     def late(descriptor, how):
         times.append(descriptor)
@@ -324,7 +331,8 @@ def whole(pristine, tmp_path_factory):
 @pytest.mark.parametrize("point", [("visibility", 1), ("sample", 3), ("sample", 8), ("write", 1)])
 def test_ingest_capture__killed_goes_on_where_it_was(pristine, tmp_path, monkeypatch, whole, point):
     """Nothing is visible after the kill; the second run reads only the frames that lack and gives the same bits."""
-    db, read = Database(tmp_path / "db"), []
+    db = Database(tmp_path / "db")
+    read = []
 
     def killer(stage, step, _):
         if (stage, step) == point:
@@ -372,7 +380,8 @@ def test_ingest_capture__survives_a_kill_without_goodbye(pristine, tmp_path, mon
     """No `finally` is run: the lock falls with the process, the journal says what is done, written data are removed."""
     folder = tmp_path / "db"
     assert subprocess.run([sys.executable, "-c", DIE, folder, pristine, point], check=False).returncode == 9
-    db, read = Database(folder), []
+    db = Database(folder)
+    read = []
     assert db.takes() == []
     plain = lumitexels.read_view
     monkeypatch.setattr(lumitexels, "read_view", lambda *a, **k: read.append(a) or plain(*a, **k))
@@ -391,7 +400,8 @@ def test_ingest_capture__survives_a_kill_without_goodbye(pristine, tmp_path, mon
 )
 def test_ingest_take__a_planted_note_removes_nothing(pristine, tmp_path, planted):
     """What a killed ingest left may have been changed: nothing but data of this take that no record names may go."""
-    db, victims = Database(tmp_path / "db"), [tmp_path / "victim/file", tmp_path / "db/data/capture/OTHER/x.zarr/file"]
+    db = Database(tmp_path / "db")
+    victims = [tmp_path / "victim/file", tmp_path / "db/data/capture/OTHER/x.zarr/file"]
 
     def killer(stage, step, _):
         if (stage, step) == ("sample", 8):

@@ -107,8 +107,11 @@ def head_and_places(count):
     head = parametric_head(FaceShape(), spacing_mm=3.0)
     vertices, faces, _ = subdivide(head.vertices, head.faces, 1)
     order = morton_order(vertices)
-    position, faces = vertices[order], np.argsort(order)[faces]
-    one, normal, radius = np.ones(len(order)), vertex_normals(position, faces), splat_radius(position, faces)
+    position = vertices[order]
+    faces = np.argsort(order)[faces]
+    one = np.ones(len(order))
+    normal = vertex_normals(position, faces)
+    radius = splat_radius(position, faces)
     surfels = SurfelSet(
         position, normal, one, radius, position[:, :2], faces, (), np.zeros((len(order), 0), bool), "intrinsic"
     )
@@ -154,7 +157,9 @@ def test_light_visibility__the_two_methods_agree_away_from_edges(capture):
     with ThreadPoolExecutor(2) as pool:
         rays = light_visibility(surfels, lights, scene, pool)
         splats = light_visibility(surfels, lights, scene, pool, method="splats")
-    shadow, lit, dark = rays == 0, rays > 0, rays == 0
+    shadow = rays == 0
+    lit = rays > 0
+    dark = rays == 0
     for _ in range(4):
         lit, dark = (
             np.stack([grown(surfels.faces, np.ascontiguousarray(one)) for one in mask.T], axis=1)
@@ -211,7 +216,8 @@ def test_camera_visibility__keeps_off_a_step_in_depth(capture):
     with ThreadPoolExecutor(1) as pool:
         visible, clear, _ = camera_visibility(surfels, [camera], scene, pool)
     row = np.flatnonzero(surfels.position[:, 1] == 0)
-    visible, clear = visible[row, 0] == 1, clear[row, 0]
+    visible = visible[row, 0] == 1
+    clear = clear[row, 0]
     x = np.arange(-20, 21)
     # the line over the edge (5.5, 5) meets the plate at 5.5 + 5 * 65.5 / 75 = 9.87; a pixel is 0.6 mm wide
     np.testing.assert_array_equal(visible, (x < 5.5) | (x > 9.87))
@@ -225,14 +231,18 @@ def clear_twin(camera, scene, points, normals, pixels):
     rays = pixel_rays(np.stack([column, row], axis=-1) + 0.5, camera.K, camera.R, camera.distortion)
     eye = camera_centre(camera.R, camera.t)
     distance = scene.first_hit(np.broadcast_to(eye, (row.size, 3)), rays.reshape(-1, 3))[2].reshape(row.shape)
-    own, level = np.linalg.norm(points - eye, axis=1), ((points - eye) * normals).sum(axis=1)
-    first, clear = np.floor(pixels - 0.5).astype(int), np.ones(len(points), bool)
+    own = np.linalg.norm(points - eye, axis=1)
+    level = ((points - eye) * normals).sum(axis=1)
+    first = np.floor(pixels - 0.5).astype(int)
+    clear = np.ones(len(points), bool)
     for dx, dy in product(range(-1, 3), range(-1, 3)):
-        x, y = first[:, 0] + dx, first[:, 1] + dy
+        x = first[:, 0] + dx
+        y = first[:, 1] + dy
         near = np.hypot(x + 0.5 - pixels[:, 0], y + 0.5 - pixels[:, 1]) <= 1.5
         at = np.flatnonzero(near & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height))
         foretold = level[at] / (rays[y[at], x[at]] * normals[at]).sum(axis=1)
-        found, width = distance[y[at], x[at]], own[at] / np.sqrt(camera.K[0, 0] * camera.K[1, 1])
+        found = distance[y[at], x[at]]
+        width = own[at] / np.sqrt(camera.K[0, 0] * camera.K[1, 1])
         smooth = np.abs(found - foretold) <= 2 + np.abs(foretold - own[at])
         clear[at] &= smooth & (np.abs(found - own[at]) <= 2 + 15 * width)
     return clear
@@ -272,7 +282,8 @@ def test_visibility__from_inside_the_head_nothing_is_seen(surfels, capture, meth
 
 @pytest.mark.parametrize("method", ["rays", "splats"])
 def test_visibility__one_triangle(capture, method):
-    position, one = np.array([[-30.0, -30, 0], [30, -30, 0], [0, 40, 0]]), np.ones(3)
+    position = np.array([[-30.0, -30, 0], [30, -30, 0], [0, 40, 0]])
+    one = np.ones(3)
     normal = np.array([[0, 0, 1.0], [0, 0, 1], [np.nan, 0, 1]])
     faces = np.array([[0, 1, 2]])
     surfels = SurfelSet(position, normal, one, 0 * one, position[:, :2], faces, (), np.zeros((3, 0), bool), "intrinsic")

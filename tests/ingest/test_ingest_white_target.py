@@ -20,7 +20,8 @@ def target(rng, *, falloff=2.0, noise=0.01, half=75.0, tilt=0.25):
     axis = np.cos(tilt) * axis + np.sin(tilt) * np.cross(axis, [0, 1, 0]) / np.linalg.norm(np.cross(axis, [0, 1, 0]))
     way = points - POSITION
     distance = np.linalg.norm(way, axis=1)
-    cosine, angle = -way[:, 2] / distance, way @ axis / distance
+    cosine = -way[:, 2] / distance
+    angle = way @ axis / distance
     radiance = INTENSITY * (0.9 / np.pi * cosine * angle**falloff / distance**2)[:, None]
     radiance = radiance * (1 + noise * rng.standard_normal(radiance.shape))
     return TargetPixels(radiance, points, POSITION, axis, np.array([0.0, 0.0, 1.0]), 0.9)
@@ -67,7 +68,8 @@ def test_fit_light__refuses_a_target_that_tells_nothing():
 def test_position_sensitivity__is_the_gradient_of_the_inverse_square_and_the_cosine():
     small = target(np.random.default_rng(4), half=0.5, tilt=0.0)
     distance = np.linalg.norm(POSITION)
-    towards, cosine = POSITION / distance, POSITION[2] / distance
+    towards = POSITION / distance
+    cosine = POSITION[2] / distance
     # of 3 ln d - ln((light - point) . normal); the cosine to an axis that meets the point has no gradient
     expected = np.linalg.norm(3 * towards - np.array([0, 0, 1]) / cosine) / distance
     for falloff in (0.0, 2.0):

@@ -8,21 +8,34 @@ from skindb.geometry.texture import bilinear
 from skindb.ingest._sample_kernels import NONE, SINGLE, gather, pixel_counts, pixel_spans, tally
 from skindb.ingest.pixel_flags import DARK, OK, SATURATED
 
-LIGHT, AXIS, INTENSITY = np.array([10.0, -20.0, 300.0]), np.array([0.0, 0.1, -1.0]) / np.hypot(1, 0.1), (2e5, 1e5, 3e4)
+LIGHT = np.array([10.0, -20.0, 300.0])
+AXIS = np.array([0.0, 0.1, -1.0]) / np.hypot(1, 0.1)
+INTENSITY = (2e5, 1e5, 3e4)
 
 
 def sampled(radiance, flag, pixels, spread=None, *, share=None, falloff=0.0, wanted=None, far=None, usable=None):
     """Samples of points near the origin, as floats, and the outcome of them."""
     n = len(pixels)
     position = np.zeros((n, 3)) if far is None else far
-    out, outcome = np.zeros((3, n), np.uint16), np.zeros(n, np.uint8)
+    out = np.zeros((3, n), np.uint16)
+    outcome = np.zeros(n, np.uint8)
     gather(
-        np.asarray(radiance, np.float32), flag, np.full_like(flag, 2) if usable is None else usable,
+        np.asarray(radiance, np.float32),
+        flag,
+        np.full_like(flag, 2) if usable is None else usable,
         np.ones(n, bool) if wanted is None else wanted,
-        np.zeros(0, np.float32) if share is None else share, np.asarray(pixels, np.float32),
+        np.zeros(0, np.float32) if share is None else share,
+        np.asarray(pixels, np.float32),
         np.zeros((0, 3), np.float32) if spread is None else np.asarray(spread, np.float32),
-        position, np.tile([0.0, 0, 1], (n, 1)), LIGHT, AXIS, falloff, np.array(INTENSITY), out, outcome,
-    )  # fmt: skip
+        position,
+        np.tile([0.0, 0, 1], (n, 1)),
+        LIGHT,
+        AXIS,
+        falloff,
+        np.array(INTENSITY),
+        out,
+        outcome,
+    )
     return out.view(np.float16).T, outcome
 
 
@@ -32,7 +45,8 @@ def factor(position=(0.0, 0.0, 0.0)):
 
 def ellipse(radius, ratio, angle):
     """Variances xx, xy, yy of an ellipse with standard deviations radius and radius * ratio."""
-    c, s = np.cos(angle), np.sin(angle)
+    c = np.cos(angle)
+    s = np.sin(angle)
     turn = np.array([[c, -s], [s, c]])
     v = turn @ np.diag([radius**2, (radius * ratio) ** 2]) @ turn.T
     return v[0, 0], v[0, 1], v[1, 1]
@@ -49,7 +63,8 @@ def twin(image, pixel, spread):
 
 def test_gather__bilinear_as_the_texture_lookup():
     rng = np.random.default_rng(1)
-    image, flag = rng.random((12, 17, 3)), np.zeros((12, 17), np.uint8)
+    image = rng.random((12, 17, 3))
+    flag = np.zeros((12, 17), np.uint8)
     flag[4:7, 5:8], flag[9:12, 11:15] = SATURATED, DARK
     pixels = rng.uniform(-1, 18, (4000, 2)).astype(np.float32)
     pixels[:40] = np.round(pixels[:40]) + 0.5  # neighbours of weight 0
@@ -71,7 +86,8 @@ def test_gather__bilinear_as_the_texture_lookup():
 @pytest.mark.parametrize("radius", [0.45, 0.7, 2.0, 5.0])
 def test_gather__footprint_as_the_twin(radius):
     rng = np.random.default_rng(2)
-    image, flag = rng.random((64, 70, 3)), np.zeros((64, 70), np.uint8)
+    image = rng.random((64, 70, 3))
+    flag = np.zeros((64, 70), np.uint8)
     pixels = rng.uniform(26, 38, (50, 2)).astype(np.float32)
     spread = np.array([ellipse(radius, rng.uniform(0.6, 1), a) for a in rng.uniform(0, 3, 50)], np.float32)
     got, outcome = sampled(image, flag, pixels, spread)
@@ -99,7 +115,8 @@ def test_gather__footprint_of_a_sinusoid(radius):
 
 def test_gather__a_constant_stays():
     rng = np.random.default_rng(3)
-    image, flag = np.full((90, 90, 3), 0.37, np.float32), np.zeros((90, 90), np.uint8)
+    image = np.full((90, 90, 3), 0.37, np.float32)
+    flag = np.zeros((90, 90), np.uint8)
     pixels = rng.uniform(40, 50, (200, 2))
     spread = np.array([ellipse(r, rng.uniform(0.1, 1), r) for r in rng.uniform(0.5, 8, 200)])
     spread[:, [0, 2]] += 0.2
@@ -111,8 +128,10 @@ def test_gather__a_constant_stays():
 
 
 def test_gather__flags_in_the_footprint():
-    image, flag = np.ones((30, 30, 3)), np.zeros((30, 30), np.uint8)
-    pixels, spread = [[15.5, 15.5]] * 2, [[0.2, 0, 0.2], [4.0, 0, 4.0]]
+    image = np.ones((30, 30, 3))
+    flag = np.zeros((30, 30), np.uint8)
+    pixels = [[15.5, 15.5]] * 2
+    spread = [[0.2, 0, 0.2], [4.0, 0, 4.0]]
     flag[15, 20] = SATURATED  # five pixels off: inside 2 sqrt 8 only
     got, outcome = sampled(image, flag, pixels, spread)
     assert outcome.tolist() == [OK, SATURATED]
@@ -124,7 +143,9 @@ def test_gather__flags_in_the_footprint():
 
 
 def test_gather__light_share_falloff_and_what_is_not_wanted():
-    image, flag, n = np.ones((8, 8, 3)), np.zeros((8, 8), np.uint8), 5
+    image = np.ones((8, 8, 3))
+    flag = np.zeros((8, 8), np.uint8)
+    n = 5
     far = np.array([[0, 0, 0], [40, 5, 3], [0, 0, 400], [1, 1, 1], [2, 2, 2.0]])  # the third is behind the light
     share = np.array([0.5, 1, 1, 0, 1], np.float32)
     wanted = np.array([True, True, True, True, False])
@@ -148,7 +169,8 @@ def test_gather__half_floats_end():
 def test_touched__are_the_spans_of_the_pixels_that_gather_takes(wide):
     """Twin: every pixel of the picture is spoiled in turn, and the samples that notice are counted."""
     rng = np.random.default_rng(4)
-    image, flag = rng.random((14, 19, 3)), np.zeros((14, 19), np.uint8)
+    image = rng.random((14, 19, 3))
+    flag = np.zeros((14, 19), np.uint8)
     pixels = rng.uniform([-2, -2], [21, 16], (60, 2)).astype(np.float32)
     pixels[0], pixels[1] = np.nan, (19, 14)
     spread = np.array([ellipse(r, 0.6, a) for r, a in rng.uniform((0.3, 0), (1.2, 3), (60, 2))]) if wide else None
@@ -174,7 +196,8 @@ def test_touched__are_the_spans_of_the_pixels_that_gather_takes(wide):
 def test_pixel_counts__inverse_of_the_squared_weights_of_every_pixel():
     """The weights are what `gather` answers to a picture with a single lit pixel."""
     rng = np.random.default_rng(12)
-    height, width = 9, 11
+    height = 9
+    width = 11
     pixels = np.concatenate([rng.uniform(0, (width, height), (30, 2)), [[0.2, 0.1], [5.5, 4.5], [-1, 3]]])
     pixels = pixels.astype(np.float32)
     spread = np.array([ellipse(r, 0.8, r) for r in rng.uniform(0.4, 0.9, len(pixels))], np.float32)
@@ -195,7 +218,9 @@ def test_pixel_counts__inverse_of_the_squared_weights_of_every_pixel():
 
 def test_gather__samples_of_a_single_exposure():
     """Single where no pixel that takes part has two exposures; one of weight 0 takes no part."""
-    image, flag, usable = np.ones((6, 8, 3)), np.zeros((6, 8), np.uint8), np.ones((6, 8), np.uint8)
+    image = np.ones((6, 8, 3))
+    flag = np.zeros((6, 8), np.uint8)
+    usable = np.ones((6, 8), np.uint8)
     usable[:, 4:] = 2
     pixels = [[2.0, 3.0], [4.0, 3.0], [3.5, 3.0], [5.0, 3.0]]
     got, outcome = sampled(image, flag, pixels, usable=usable)

@@ -64,9 +64,13 @@ def test_within_subjects_p__is_scipy_s_test_of_paired_samples():
         return (d.mean(axis=0) ** 2).sum() / (d.var(axis=0, ddof=1).sum() / len(d))
 
     want = stats.permutation_test(
-        (np.zeros(8), np.ones(8)), of_rows, permutation_type="samples", vectorized=False, alternative="greater",
+        (np.zeros(8), np.ones(8)),
+        of_rows,
+        permutation_type="samples",
+        vectorized=False,
+        alternative="greater",
         n_resamples=np.inf,
-    )  # fmt: skip
+    )
     np.testing.assert_allclose(statistic, want.statistic, rtol=1e-10)
     assert count == 255
     np.testing.assert_allclose(p, want.pvalue, rtol=1e-10)
@@ -88,7 +92,8 @@ def _cohorts(sizes, spreads):
 
 
 def test_within_subjects_p__is_uniform_where_conditions_do_not_differ():
-    p, three = [], []
+    p = []
+    three = []
     for seed in range(COHORTS):
         rng = np.random.default_rng([42, seed])
         y = 3 * rng.normal(size=(12, 1, 6)) + SHAPE * rng.normal(size=(12, 3, 6))

@@ -53,7 +53,8 @@ def test_permutation_p__of_all_orders_is_that_of_scipy():
     values, group, _, rng = _cohort(2, n=7, quantities=1, slope=2.0)
     p, adjusted, count = permutation_p(values, group, rng=rng)
     assert count == 5039
-    x, y = values[group == 0, 0], values[group == 1, 0]
+    x = values[group == 0, 0]
+    y = values[group == 1, 0]
 
     def statistic(a, b, axis):
         squares = [
@@ -89,7 +90,8 @@ def test_benjamini_hochberg__is_that_of_scipy():
 
 
 def test_detectable_difference__is_found_as_often_as_stated():
-    n, trials = 30, 2000
+    n = 30
+    trials = 2000
     rng = np.random.default_rng(11)
     group = np.arange(n) % 2.0
     error = np.sqrt(4 / n)  # of a difference of means at unit variance
@@ -118,7 +120,10 @@ def test_variance_components__are_those_of_statsmodels(statsmodels, repeats, bet
 @pytest.mark.slow
 def test_permutation_p__is_even_without_an_effect_and_not_misled_by_a_covariate():
     """200 cohorts in which age differs between the groups, and only age has an effect."""
-    plain, adjusted, smallest, covered = [], [], [], 0
+    plain = []
+    adjusted = []
+    smallest = []
+    covered = 0
     for seed in range(200):
         values, group, age, rng = _cohort(seed, confounded=0.8)
         plain.append(permutation_p(values, group, most=199, rng=rng)[0][0])
@@ -163,7 +168,8 @@ def test_effects__of_a_constant_are_nothing():
 
 
 def _with_gaps(rng, n=24, q=5):
-    values, x = rng.normal(size=(n, q)), np.arange(n) % 2.0
+    values = rng.normal(size=(n, q))
+    x = np.arange(n) % 2.0
     values[:4, 1], values[3:9, 2], values[2:, 3] = np.nan, np.nan, np.nan
     return values, x, rng.normal(size=(n, 2))
 
@@ -236,8 +242,10 @@ def test_paired_effects__are_those_of_scipy():
 def test_permutation_p__products_of_matrices_give_the_same(monkeypatch, kind, covariates):
     """With gaps, constants, effects of a million standard deviations, and no scatter at all."""
     rng = np.random.default_rng(0)
-    n, q = 24, 60
-    values, group = rng.standard_normal((n, q)), (np.arange(n) % 3 == 0).astype(float)
+    n = 24
+    q = 60
+    values = rng.standard_normal((n, q))
+    group = (np.arange(n) % 3 == 0).astype(float)
     values[3, :20] = np.nan
     values[:, 20], values[:, 21], values[:, 22] = 1.0, group * 1e6 + rng.standard_normal(n), group
     held = rng.standard_normal((n, covariates)) if covariates else None
@@ -246,8 +254,9 @@ def test_permutation_p__products_of_matrices_give_the_same(monkeypatch, kind, co
         monkeypatch.setattr(inference, "MANY", many)
         own = np.random.default_rng(1)
         found.append(
-            permutation_p(values, group, held, most=200, rng=own) if kind == "permutation"
+            permutation_p(values, group, held, most=200, rng=own)
+            if kind == "permutation"
             else sign_flip_p(values, most=200, rng=own)
-        )  # fmt: skip
+        )
     for one, other in zip(*found, strict=True):
         np.testing.assert_array_equal(one, other)

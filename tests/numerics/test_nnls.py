@@ -52,7 +52,8 @@ def test_solve_nnls__the_certificate_holds_for_nearly_collinear_columns(apart):
         M = np.concatenate([a, a + apart * rng.normal(size=a.shape)], axis=1)[:, rng.permutation(16)]
         r = M @ np.where(rng.random(16) < 0.3, rng.uniform(size=16), 0) + 0.05 * rng.normal(size=60)
         x, kkt, _, met = solve_nnls((M.T @ M)[None], (M.T @ r)[None])
-        w, length = M.T @ (r - M @ x[0]), np.linalg.norm(M, axis=0)
+        w = M.T @ (r - M @ x[0])
+        length = np.linalg.norm(M, axis=0)
         true = (np.where(x[0] > 0, abs(w), np.maximum(w, 0)) / length).max() / abs(M.T @ r / length).max()
         assert met[0]
         assert kkt[0] < 1e-9
@@ -82,7 +83,9 @@ def _check_minimum(seed):
 
     starts = np.random.default_rng(seed).uniform(0, 1, (4, m))
     best = min(minimize(objective, s, method="L-BFGS-B", bounds=[(0, None)] * m).fun for s in starts)
-    x, filled, given = np.zeros(m), np.pad(rows, ((0, 0), (0, 7))), _as_fits_give(target.T)
+    x = np.zeros(m)
+    filled = np.pad(rows, ((0, 0), (0, 7)))
+    given = _as_fits_give(target.T)
     work = _reflectance_kernels.fit_memory(n, 16, m)
     _reflectance_kernels._fit_roots(filled, given, np.ones(n, np.float32), np.eye(m), floor, 1e-10, x, work)
     assert objective(x) <= best * (1 + 1e-4)  # Gauss-Newton stops at a gain of 1e-6
@@ -101,8 +104,11 @@ def test_fit_reflectance__noise_does_not_bias_the_perceptual_fit():
     """Noise as large as the samples: their mean root is lower than the root of their mean, by 10 % and more here."""
     rng = np.random.default_rng(31)
     rows = rng.uniform(0.1, 1.0, (300, 2)).astype(np.float32)
-    clean, draws, floor = rows.astype(np.float64) @ [0.3, 0.2], 100, 1e-2
-    found, noise = np.empty(draws), 0.5 * clean.mean()
+    clean = rows.astype(np.float64) @ [0.3, 0.2]
+    draws = 100
+    floor = 1e-2
+    found = np.empty(draws)
+    noise = 0.5 * clean.mean()
     for k in range(draws):
         target = clean[:, None] + noise * rng.normal(size=(300, 3))
         found[k] = _fit(rows, target, mode="perceptual", floor=floor).weight[0] @ rows.mean(axis=0)
@@ -149,7 +155,8 @@ def test_fit_reflectance__any_scale(mode, of_rows, of_target):
 def test_fit_reflectance__columns_of_different_scales():
     rows, target = _problem(4)
     lengths = 2.0 ** np.array([0, 80, -80, 3, -3, 40, -40, 1, 0])
-    plain, scaled = _fit(rows, target), _fit((rows * lengths).astype(np.float32), target)
+    plain = _fit(rows, target)
+    scaled = _fit((rows * lengths).astype(np.float32), target)
     np.testing.assert_allclose(scaled.weight[0] * lengths, plain.weight[0], rtol=1e-9)
 
 
@@ -171,15 +178,21 @@ def test_fit_reflectance__wrong_arguments():
 @pytest.mark.parametrize("perceptual", [False, True])
 def test_weight_covariance__is_the_sandwich_in_plain_numpy(perceptual):
     rng = np.random.default_rng(12)
-    n, floor, drift = 300, 0.02, np.array([0.1, 0.2, 0.05])
+    n = 300
+    floor = 0.02
+    drift = np.array([0.1, 0.2, 0.05])
     rows = (rng.uniform(0, 1, (n, 4)) ** [1, 2, 3, 4]).astype(np.float32)
     target = (rows @ np.array([0.3, 0.2, 0.0, 0.4]) - 0.3 * rows[:, 2])[:, None] * (1 + 0.1 * rng.normal(size=(n, 3)))
     scattered = rng.uniform(0, 0.1, (3, n))
-    work, x, covariance = _reflectance_kernels.fit_memory(n + 7, 8, 4), np.zeros(4), np.empty((4, 4))
-    filled, given = np.pad(rows, ((0, 7), (0, 4))), _as_fits_give(target.T)
+    work = _reflectance_kernels.fit_memory(n + 7, 8, 4)
+    x = np.zeros(4)
+    covariance = np.empty((4, 4))
+    filled = np.pad(rows, ((0, 7), (0, 4)))
+    given = _as_fits_give(target.T)
     weight = rng.uniform(0.2, 1, n).astype(np.float32)
     _reflectance_kernels.fit_one(filled, given, weight, np.eye(4), perceptual, floor, 1e-10, x, work)
-    y, scattered = rows.astype(np.float64) @ x, _as_fits_give(scattered)
+    y = rows.astype(np.float64) @ x
+    scattered = _as_fits_give(scattered)
     _weight_error_kernels.weight_covariance(
         filled, y.astype(np.float32), weight, perceptual, floor, scattered, drift, x, covariance, work
     )
@@ -189,7 +202,8 @@ def test_weight_covariance__is_the_sandwich_in_plain_numpy(perceptual):
     def root(v):
         return v / np.cbrt(v**2 + floor**2) if perceptual else v
 
-    M, h = rows[:, free].astype(np.float64), 1e-6
+    M = rows[:, free].astype(np.float64)
+    h = 1e-6
     slope = (root(y + h) - root(y - h)) / (2 * h)
     square = weight * slope**2
     inverse = np.linalg.inv(3 * (M * square[:, None]).T @ M)
@@ -205,8 +219,10 @@ def test_weight_covariance__is_the_sandwich_in_plain_numpy(perceptual):
 def test_weight_covariance__collinear_columns_have_none():
     rng = np.random.default_rng(13)
     rows = np.repeat(rng.uniform(0, 1, (50, 1)), 2, axis=1).astype(np.float32)
-    work, covariance = _reflectance_kernels.fit_memory(50, 8, 2), np.empty((2, 2))
-    filled, ones = np.pad(rows, ((0, 0), (0, 6))), np.ones(50, np.float32)
+    work = _reflectance_kernels.fit_memory(50, 8, 2)
+    covariance = np.empty((2, 2))
+    filled = np.pad(rows, ((0, 0), (0, 6)))
+    ones = np.ones(50, np.float32)
     given = _as_fits_give(np.repeat(rows[:, :1].T, 3, axis=0))
     _reflectance_kernels.fit_one(filled, given, ones, np.eye(2), False, 1.0, 1e-10, np.zeros(2), work)
     nothing = _as_fits_give(np.zeros((3, 50))), np.zeros(3)
@@ -218,7 +234,8 @@ def test_weight_covariance__collinear_columns_have_none():
 
 def test_solve_nnls__a_shared_system_compiles_nothing_more():
     """Each layout of an array needs its own kernel, 5 s of compiling; a common system is passed as a broadcast view."""
-    gram, rhs = np.array([[2.0, 0.5], [0.5, 1.0]]), np.array([[1.0, -1.0], [0.2, 0.7]])
+    gram = np.array([[2.0, 0.5], [0.5, 1.0]])
+    rhs = np.array([[1.0, -1.0], [0.2, 0.7]])
     x, *_ = solve_nnls(np.broadcast_to(gram, (2, 2, 2)), rhs)
     np.testing.assert_allclose(x, [[0.5, 0.0], [0.0, 0.7]], atol=1e-12)
     compiled = _nnls_kernels.solve_many.signatures

@@ -36,7 +36,8 @@ def test_build__a_wave_is_in_the_band_of_its_scale_and_direction():
     for number in range(4):
         for level in range(3):
             rows, columns = np.mgrid[:256, :256]
-            frequency, angle = 0.25 / 2**level, np.pi * number / 4
+            frequency = 0.25 / 2**level
+            angle = np.pi * number / 4
             wave = np.cos(2 * np.pi * frequency * (columns * np.cos(angle) + rows * np.sin(angle)))
             energy = np.array([[(band**2).mean() for band in own] for own in build(wave, 5).bands])
             assert np.unravel_index(energy.argmax(), energy.shape) == (level, number)

@@ -52,7 +52,8 @@ def test_quantile_function__is_numpys(n):
 
 
 def test_part_histogram__is_numpys():
-    part, share = noise((50, 40)), (np.random.default_rng(1).random((50, 40)) > 0.3).astype(float)
+    part = noise((50, 40))
+    share = (np.random.default_rng(1).random((50, 40)) > 0.3).astype(float)
     edges = np.linspace(-6, 6, 257)
     want = np.histogram(part[share > 0.5], edges)[0] / (share > 0.5).sum()
     np.testing.assert_allclose(part_histogram(part, share, edges), want, atol=1e-15)
@@ -74,7 +75,8 @@ def test_level_shares__keep_the_area_of_a_region(shape):
 
 def test_part_quantiles__of_a_region_alone():
     """Values that are outside of the region and far from it change nothing within."""
-    image, mask = noise((128, 128)), np.zeros((128, 128))
+    image = noise((128, 128))
+    mask = np.zeros((128, 128))
     mask[:, :48] = 1
     other = image.copy()
     other[:, 90:100] += 5
@@ -104,7 +106,8 @@ def test_synthesise__no_shift_returns_the_image():
 
 def test_synthesise__gray_values_alone_are_those_of_scikit_image():
     """Without a pyramid, one iteration is the matching of histograms."""
-    image, wanted = noise((200, 200)), np.exp(0.5 * noise((200, 200), seed=3))
+    image = noise((200, 200))
+    wanted = np.exp(0.5 * noise((200, 200), seed=3))
     shift = np.zeros((1, 3, QUANTILES))
     shift[0] = quantiles_of(wanted, levels=0, orientations=1) - quantiles_of(image, levels=0, orientations=1)
     found = synthesise(image, [np.ones(image.shape)], shift, iterations=1, levels=0, orientations=1, rng=Still())
@@ -135,7 +138,8 @@ def test_synthesise__a_texture_takes_the_distributions_of_another():
 
 
 def test_synthesise__regions_move_apart():
-    image, left = noise((96, 96)), np.zeros((96, 96))
+    image = noise((96, 96))
+    left = np.zeros((96, 96))
     left[:, :48] = 1
     shift = np.zeros((2, 15, QUANTILES))
     shift[0, 0] = shift[0, -1] = 3.0
@@ -162,7 +166,8 @@ def test_synthesise__extremes_stay_finite(case):
 
 
 def test_synthesise__seeded():
-    image, shift = np.zeros((32, 32)), noise((1, 15, QUANTILES))
+    image = np.zeros((32, 32))
+    shift = noise((1, 15, QUANTILES))
     options = {"regions": [np.ones((32, 32))], "shifts": np.sort(shift), **SMALL}
     one, same, other = (synthesise(image, rng=np.random.default_rng(s), **options).image for s in (0, 0, 1))
     np.testing.assert_array_equal(one, same)

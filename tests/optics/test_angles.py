@@ -19,7 +19,8 @@ def _upper(rng, shape):
 
 def test_half_difference__by_definition():
     rng = np.random.default_rng(0)
-    wi, wo = _upper(rng, (500,)), _upper(rng, (500,))
+    wi = _upper(rng, (500,))
+    wo = _upper(rng, (500,))
     th, td, pd = half_difference(wi, wo)
     h = _unit(wi + wo)
     np.testing.assert_allclose(np.cos(th), h[:, 2], atol=1e-12)
@@ -35,7 +36,8 @@ def test_half_difference__by_definition():
 
 def test_half_difference__reciprocal_and_turned_with_the_normal():
     rng = np.random.default_rng(1)
-    wi, wo = _upper(rng, (200,)), _upper(rng, (200,))
+    wi = _upper(rng, (200,))
+    wo = _upper(rng, (200,))
     turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     turn *= np.sign(np.linalg.det(turn))
     here = half_difference(wi, wo)
@@ -63,7 +65,9 @@ def test_half_difference__one_direction_and_the_normal():
 
 def test_directions__invert_the_angles():
     rng = np.random.default_rng(2)
-    th, td, pd = rng.uniform(0.01, 0.7, 100), rng.uniform(0.01, 0.7, 100), rng.uniform(0.01, 3.1, 100)
+    th = rng.uniform(0.01, 0.7, 100)
+    td = rng.uniform(0.01, 0.7, 100)
+    pd = rng.uniform(0.01, 3.1, 100)
     wi, wo = directions(th, td, pd)
     np.testing.assert_allclose(np.linalg.norm([wi, wo], axis=-1), 1, rtol=1e-14)
     for got, want in zip(half_difference(wi, wo), (th, td, pd), strict=True):

@@ -37,7 +37,10 @@ def test_sample__has_the_stated_density(weights, tilt):
 
     # cells of equal solid angle over the upper hemisphere; the density is integrated on a grid that is fine in theta,
     # so that narrow lobes about the normal are resolved
-    n_z, n_phi, steps, fine = 24, 32, 100, 12
+    n_z = 24
+    n_phi = 32
+    steps = 100
+    fine = 12
     edge = np.arccos(np.linspace(0, 1, n_z + 1))[:, None]
     theta = edge[:-1] + (edge[1:] - edge[:-1]) * (np.arange(steps) + 0.5) / steps
     width = np.sin(theta) * (edge[:-1] - edge[1:]) / steps
@@ -63,7 +66,9 @@ def test_sample__has_the_stated_density(weights, tilt):
 def test_sample__weights_integrate_the_brdf():
     """The estimator f cos / pdf has the mean of a plain quadrature over the hemisphere, and finite variance."""
     tables = _tables()
-    sampler, rng, count = LobeSampler.of_tables(tables), np.random.default_rng(5), 100_000
+    sampler = LobeSampler.of_tables(tables)
+    rng = np.random.default_rng(5)
+    count = 100_000
     normal = np.broadcast_to([0.0, 0.0, 1.0], (count, 3))
     view = np.broadcast_to([0.6, 0.0, 0.8], (count, 3))
 

@@ -47,11 +47,14 @@ def test_parameters__as_printed():
 def _by_the_book(row, wi, wo):
     """Loew et al. 2012, for one pair of directions with 40 digits, channel by channel."""
     mpmath.mp.dps = 40
-    wi, wo = mpmath.matrix(list(map(float, wi))), mpmath.matrix(list(map(float, wo)))
+    wi = mpmath.matrix(list(map(float, wi)))
+    wo = mpmath.matrix(list(map(float, wo)))
     h = (wi + wo) / mpmath.norm(wi + wo)
-    cos_d, eta = (wi.T * h)[0], mpmath.mpf(row[8])
+    cos_d = (wi.T * h)[0]
+    eta = mpmath.mpf(row[8])
     cos_t = mpmath.sqrt(1 - (1 - cos_d**2) / eta**2)
-    parallel, across = (eta * cos_d - cos_t) / (eta * cos_d + cos_t), (cos_d - eta * cos_t) / (cos_d + eta * cos_t)
+    parallel = (eta * cos_d - cos_t) / (eta * cos_d + cos_t)
+    across = (cos_d - eta * cos_t) / (cos_d + eta * cos_t)
     masking = min(1, 2 * h[2] * wi[2] / cos_d, 2 * h[2] * wo[2] / cos_d)
     lobe = (1 + row[6] * (1 - h[2])) ** -row[7] * (parallel**2 + across**2) / 2 * masking
     channels = [row[c] / mpmath.pi + row[3 + c] * lobe / (mpmath.pi * wi[2] * wo[2]) for c in range(3)]
@@ -110,7 +113,9 @@ def test_embedded_dictionary__shared_and_not_writeable():
 
 def test_convolve_disc__matches_averaging_of_the_exact_model(convolved):
     """Away from the horizon: the average over a dense disc around either direction, as in the docstring."""
-    rng, some = np.random.default_rng(3), np.r_[0:59:5, 18, 46, 48]  # with the sharpest lobes, as narrow as the disc
+    # with the sharpest lobes, as narrow as the disc
+    rng = np.random.default_rng(3)
+    some = np.r_[0:59:5, 18, 46, 48]
     wi, wo = directions(rng.random(200) ** 2 * 0.8, rng.random(200) * 0.8, rng.random(200) * np.pi)
     k = np.arange(300)
     disc = np.sqrt((k + 0.5) / 300)[:, None] * np.stack([np.cos(k * 2.399963), np.sin(k * 2.399963)], 1) * np.tan(DISC)
@@ -128,7 +133,8 @@ def test_convolve_disc__matches_averaging_of_the_exact_model(convolved):
 
 def test_convolve_disc__takes_the_mean_of_both_directions():
     """A disc of 0.2 rad before a BRDF that rises to the horizon: the averages around either differ by up to 20 %."""
-    grid, radius = TableGrid(40, 40, 8), 0.2
+    grid = TableGrid(40, 40, 8)
+    radius = 0.2
     table = tabulate(lambda wi, wo: 1 / np.maximum(wi[..., 2:] * wo[..., 2:], 0.01), grid)
     got = convolve_disc(Dictionary(("rising",), table, grid, "test"), radius).table[..., 0]
     nodes = np.s_[10:20, 20:26, 0]  # both directions stay above 0.3 rad, at unlike elevations

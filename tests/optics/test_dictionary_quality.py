@@ -78,7 +78,8 @@ def _reflected(cosine, row, wo):
 @pytest.mark.parametrize("name", ["blue-rubber", "pearl-paint", "teflon"])
 def test_dictionary_quality__albedo_by_scipy(embedded, name):
     """Compared with the albedo of the formula, not of the table; 1 % is the trilinear error."""
-    row, slope = np.array([PARAMETERS[name]]), np.radians(85)
+    row = np.array([PARAMETERS[name]])
+    slope = np.radians(85)
     normal, grazing = (
         quad(_reflected, 0, 1, args=(row, wo), epsrel=1e-4, limit=200)[0]
         for wo in ([0.0, 0.0, 1.0], [np.sin(slope), 0.0, np.cos(slope)])
@@ -93,18 +94,21 @@ def test_dictionary_quality__disc_errors_by_brute_force(embedded):
     table = embedded_dictionary().table[..., index : index + 1].astype(np.float64)
     wi, wo = sample_pairs(PAIRS)
     k = np.arange(1500)
-    radius, turn = np.sqrt((k + 0.5) / 1500) * np.tan(DISC), k * 2.399963
+    radius = np.sqrt((k + 0.5) / 1500) * np.tan(DISC)
+    turn = k * 2.399963
     sides = []
     for a, b in ((wi, wo), (wo, wi)):
         first = np.cross(a, [0.3, 0.9, 0.1])
         first /= np.linalg.norm(first, axis=1, keepdims=True)
-        second, mean = np.cross(a, first), np.zeros(len(a))
+        second = np.cross(a, first)
+        mean = np.zeros(len(a))
         for u, v in np.stack([radius * np.cos(turn), radius * np.sin(turn)], 1):
             moved = a + u * first + v * second
             moved /= np.linalg.norm(moved, axis=1, keepdims=True)
             mean += lookup(table, *half_difference(moved, b))[:, 0] / len(k)
         sides.append(mean)
-    exact, weight = (sides[0] + sides[1]) / 2, wi[:, 2] * wo[:, 2]
+    exact = (sides[0] + sides[1]) / 2
+    weight = wi[:, 2] * wo[:, 2]
 
     def rms(off):
         return np.sqrt((weight * off**2).sum() / (weight * exact**2).sum())

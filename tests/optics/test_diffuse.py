@@ -36,7 +36,8 @@ def test_dipole_s__twelve_digits_against_mpmath(eta):
 
 
 def test_scattering_coefficients__give_back_sigma_tr_and_albedo():
-    s, tr = np.array([0.2, 0.7, 1.2]), np.array([0.5, 1.0, 1.5])
+    s = np.array([0.2, 0.7, 1.2])
+    tr = np.array([0.5, 1.0, 1.5])
     a, scattered = scattering_coefficients(s, tr)
     np.testing.assert_allclose(sigma_tr(a, scattered), tr, rtol=1e-14)
     np.testing.assert_allclose(scattered / (a + scattered), reduced_albedo(s), rtol=1e-14)

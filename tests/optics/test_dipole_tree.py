@@ -18,7 +18,8 @@ FLOAT32 = 2e-6  # power and results are float32; the sums are float64
 
 def _sphere(n: int, radius: float = 30.0):
     k = np.arange(n) + 0.5
-    z, phi = 1 - 2 * k / n, np.pi * (1 + 5**0.5) * k
+    z = 1 - 2 * k / n
+    phi = np.pi * (1 + 5**0.5) * k
     r = np.sqrt(1 - z * z)
     points = radius * np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=1)
     return points, np.full(n, 4 * np.pi * radius**2 / n)
@@ -81,7 +82,8 @@ def test_subsurface_exitance__two_threads_at_once_give_the_same_bits():
 def test_subsurface_exitance__other_receivers_do_not_matter():
     points, area = _sphere(5000)
     _, s, tr = _skin(5000)
-    light, wanted = _striped(points, LIGHTS_PER_WALK + 2), np.random.default_rng(2).random(5000) < 0.6
+    light = _striped(points, LIGHTS_PER_WALK + 2)
+    wanted = np.random.default_rng(2).random(5000) < 0.6
     whole = subsurface_exitance(points, area, light, s, tr, eta=ETA)
     part = subsurface_exitance(points, area, light, s, tr, eta=ETA, receivers=wanted)
     np.testing.assert_array_equal(part, np.where(wanted[:, None], whole, 0))

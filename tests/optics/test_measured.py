@@ -140,7 +140,8 @@ def test_resample__linear_in_the_tables_coordinates():
     at = np.meshgrid(
         np.sqrt(np.clip(grid.theta_h, h[0], h[-1])), np.clip(grid.theta_d, d[0], d[-1]), grid.phi_d, indexing="ij"
     )
-    want, found = scipy(np.stack(at, axis=-1)), resample(values, (h, d, p))
+    want = scipy(np.stack(at, axis=-1))
+    found = resample(values, (h, d, p))
     np.testing.assert_allclose(found[1:], want[1:], atol=1e-6)  # single precision
     np.testing.assert_allclose(found[0], np.repeat(want[0].mean(axis=1, keepdims=True), 16, axis=1), atol=1e-6)
 

@@ -7,7 +7,8 @@ import numpy as np
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.optics.photometric import photometric_normals
 
-ETA, PRIOR = 1.3, np.deg2rad(3.0)
+ETA = 1.3
+PRIOR = np.deg2rad(3.0)
 
 
 def _unit(v):
@@ -21,8 +22,10 @@ def _scene(seed, surfels=12, lights=40, cameras=7):
     position = 50 * normal
     light = 900 * _unit(rng.normal(size=(lights, 3)) * [1, 1, 0.5] + [0, 0, 0.6])
     camera = 800 * _unit(rng.normal(size=(cameras, 3)) * 0.7 + [0, 0, 1])
-    wi, wo = _unit(light - position[:, None]), _unit(camera - position[:, None])
-    ci, co = np.einsum("nk,nlk->nl", normal, wi), np.einsum("nk,nck->nc", normal, wo)
+    wi = _unit(light - position[:, None])
+    wo = _unit(camera - position[:, None])
+    ci = np.einsum("nk,nlk->nl", normal, wi)
+    co = np.einsum("nk,nck->nc", normal, wo)
     half = np.einsum("nk,nlck->nlc", normal, _unit(wi[:, :, None] + wo[:, None])).clip(0, 1)
     sample = (ci.clip(0)[:, :, None, None]) * (np.array([0.15, 0.1, 0.07]) + 0.2 * half[..., None] ** 30)
     sample *= (1 + 0.02 * rng.normal(size=sample.shape)) * np.where(rng.uniform(size=ci.shape) < 0.1, 0.3, 1)[
@@ -39,7 +42,10 @@ def _directions(s, position, light, camera):
 
 def _naive_photometric(shade, to_light, scan):
     usable = np.isfinite(shade)
-    normal, weight, spread, size = scan, usable * 1.0, 0.0, 1.0
+    normal = scan
+    weight = usable * 1.0
+    spread = 0.0
+    size = 1.0
     for step in range(12):
         cosine = to_light @ normal
         lit = usable & (cosine > 0.1)
@@ -51,7 +57,8 @@ def _naive_photometric(shade, to_light, scan):
         matrix += (1e-6 * np.trace(matrix) + 1e-12) * np.eye(3)
         g = np.linalg.solve(matrix, row.T @ (weight[lit] * shade[lit]))
         size = np.linalg.norm(g)
-        normal, residual = g / size, shade[lit] - row @ g
+        normal = g / size
+        residual = shade[lit] - row @ g
         spread = 1.4826 * np.median(abs(residual)) + 0.01 * size
         weight = np.ones(len(shade))
         weight[lit] = np.clip(1 - (residual / (4.685 * spread)) ** 2, 0, 1) ** 2
@@ -70,7 +77,8 @@ def test_photometric_normals__are_those_of_the_plain_rule():
             through = fresnel_transmittance(to_camera[seen] @ scan[s], ETA)
             colour = np.nanmean(part, axis=(0, 1))
             tint = _unit(colour - colour.mean())
-            white, tinted = np.full(len(part), np.nan), np.full(len(part), np.nan)
+            white = np.full(len(part), np.nan)
+            tinted = np.full(len(part), np.nan)
             for i in range(len(part)):
                 known = np.isfinite(part[i]).all(-1)
                 if known.any():
@@ -85,7 +93,8 @@ def test_photometric_normals__are_those_of_the_plain_rule():
 
 
 def _naive_peak(part, to_light, to_camera):
-    half, contrast = [], []
+    half = []
+    contrast = []
     for o in range(len(to_camera)):
         dark = part[:, o].min(-1)
         lights = np.flatnonzero(np.isfinite(dark))
@@ -95,7 +104,8 @@ def _naive_peak(part, to_light, to_camera):
         maximum = _unit(((dark[top] - dark[top[4]])[:, None] * to_light[top]).sum(0))
         half.append(_unit(maximum + to_camera[o]))
         contrast.append(max(dark[top[0]] / np.median(dark[lights]) - 1, 0))
-    half, contrast = np.array(half), np.array(contrast)
+    half = np.array(half)
+    contrast = np.array(contrast)
     mean = _unit(contrast @ half)
     for _ in range(8):
         angle = np.degrees(np.arccos(np.clip(half @ mean, -1, 1)))

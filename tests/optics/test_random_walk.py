@@ -39,7 +39,8 @@ def test_random_walk__henyey_greenstein_and_matched_index():
 
 def _internal_reflectance(eta):
     cosine, weight = np.polynomial.legendre.leggauss(400)
-    cosine, weight = (cosine + 1) / 2, weight / 2
+    cosine = (cosine + 1) / 2
+    weight = weight / 2
     sine2 = (1 - cosine**2) * eta**2
     outside = np.sqrt(np.maximum(1 - sine2, 0))
     a = (eta * cosine - outside) / (eta * cosine + outside)
@@ -81,8 +82,10 @@ def test_radial_profile__scales_with_the_medium(isotropic):
 
 
 def _dipole(r, sigma_a, sigma_s):
-    sigma_t, z_r = sigma_a + sigma_s, 1 / (sigma_a + sigma_s)
-    tr, z_v = np.sqrt(3 * sigma_a * sigma_t), z_r * (1 + 4 * A / 3)
+    sigma_t = sigma_a + sigma_s
+    z_r = 1 / (sigma_a + sigma_s)
+    tr = np.sqrt(3 * sigma_a * sigma_t)
+    z_v = z_r * (1 + 4 * A / 3)
     each = [z * (1 + tr * d) * np.exp(-tr * d) / d**3 for z, d in ((z_r, np.hypot(r, z_r)), (z_v, np.hypot(r, z_v)))]
     return sigma_s / sigma_t / (4 * np.pi) * sum(each)
 

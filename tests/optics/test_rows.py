@@ -35,7 +35,8 @@ def test_basis_rows__reproduce_lookup_times_cosine():
     table = np.random.default_rng(8).uniform(0.1, 1, (30, 20, 9, 7)).astype(np.float32)
     rows, offsets, index = basis_rows(table, grid, n, light, camera, usable)
     s = np.repeat(np.arange(20), np.diff(offsets))
-    wi, wo = light[s, index[:, 0]], camera[s, index[:, 1]]
+    wi = light[s, index[:, 0]]
+    wo = camera[s, index[:, 1]]
     want = lookup(table, *half_difference(wi, wo, n[s])) * (n[s] * wi).sum(1)[:, None]
     np.testing.assert_allclose(rows, want, rtol=SINGLE)
     assert rows.dtype == np.float32
@@ -48,9 +49,11 @@ def test_basis_rows__exactly_the_usable_samples_above_the_horizon_in_order():
     _, offsets, index = basis_rows(embedded_dictionary().table[..., :1], DEFAULT_GRID, n, light, camera, usable)
     want = [
         (s, i, o)
-        for s in range(20) for i in range(9) for o in range(5)
+        for s in range(20)
+        for i in range(9)
+        for o in range(5)
         if usable[s, i, o] and n[s] @ light[s, i] > 0 and np.isfinite(camera[s, o]).all() and n[s] @ camera[s, o] > 0
-    ]  # fmt: skip
+    ]
     s = np.repeat(np.arange(20), np.diff(offsets))
     assert np.column_stack([s, index]).tolist() == [list(w) for w in want]
 
@@ -58,7 +61,8 @@ def test_basis_rows__exactly_the_usable_samples_above_the_horizon_in_order():
 def test_basis_rows__reciprocal():
     """If light and camera are exchanged, the BRDF is the same and the cosine differs."""
     n, light, camera, _ = _scene(50, 1, 1)
-    table, every = embedded_dictionary().table, np.ones((50, 1, 1), bool)
+    table = embedded_dictionary().table
+    every = np.ones((50, 1, 1), bool)
     there, offsets, _ = basis_rows(table, DEFAULT_GRID, n, light, camera, every)
     back, _, _ = basis_rows(table, DEFAULT_GRID, n, camera, light, every)
     s = np.repeat(np.arange(50), np.diff(offsets))
@@ -97,16 +101,20 @@ def test_fill_rows__releases_the_interpreter_lock():
 
 def test_fill_rows__a_broken_direction_reads_no_wild_address():
     """The public function excludes such samples, and the kernel itself forms no row for them."""
-    table, rows = np.ones((4, 5, 6, 2), np.float32), np.zeros((4, 2), np.float32)
-    normal, light = np.array([[0.0, 0, 1]]), np.array([[[np.nan, 0, 1], [np.inf, 0, 1]]])
-    every, index = np.ones((1, 2, 2), bool), np.zeros((4, 2), np.int32)
+    table = np.ones((4, 5, 6, 2), np.float32)
+    rows = np.zeros((4, 2), np.float32)
+    normal = np.array([[0.0, 0, 1]])
+    light = np.array([[[np.nan, 0, 1], [np.inf, 0, 1]]])
+    every = np.ones((1, 2, 2), bool)
+    index = np.zeros((4, 2), np.int32)
     _row_kernels.fill_rows(table, normal, light, light, every, np.array([0, 4]), rows, index)
     assert (rows == 0).all()
 
 
 def test_arctangent__as_numpy():
     rng = np.random.default_rng(5)
-    y, x = rng.uniform(0, 1, 2000) ** 4, rng.uniform(-1, 1, 2000) ** 3
+    y = rng.uniform(0, 1, 2000) ** 4
+    x = rng.uniform(-1, 1, 2000) ** 3
     y[:4], x[:4] = [0, 0, 0, 1], [0, 1, -1, 0]
     got = [_row_kernels._arctangent(a, b) for a, b in zip(y, x, strict=True)]
     np.testing.assert_allclose(got, np.arctan2(y, x), atol=ARCTAN)
@@ -148,12 +156,15 @@ def test_turn_rows__are_the_rows_of_the_other_normal():
     n, light, camera, usable = _scene()
     turned = _unit(n + 0.3 * np.random.default_rng(5).normal(size=n.shape))
     table = np.random.default_rng(8).uniform(0.1, 1, (30, 20, 9, 8)).astype(np.float32)
-    memory, below = _row_kernels.row_memory(5), 0
+    memory = _row_kernels.row_memory(5)
+    below = 0
     for s in range(len(n)):
-        rows, index = np.empty((45, 8), np.float32), np.empty((45, 2), np.int32)
+        rows = np.empty((45, 8), np.float32)
+        index = np.empty((45, 2), np.int32)
         count = _row_kernels.form_rows(table, n[s], light[s], camera[s], usable[s], memory, rows, index)
         _row_kernels.turn_rows(table, turned[s], light[s], camera[s], index, count, memory, rows)
-        wi, wo = light[s, index[:count, 0]], camera[s, index[:count, 1]]
+        wi = light[s, index[:count, 0]]
+        wo = camera[s, index[:count, 1]]
         up = (wi @ turned[s] > 0) & (wo @ turned[s] > 0)
         want = lookup(table, *half_difference(wi, wo, np.broadcast_to(turned[s], wi.shape))) * (wi @ turned[s])[:, None]
         np.testing.assert_allclose(rows[:count], np.where(up[:, None], want, 0), rtol=SINGLE)

@@ -50,7 +50,8 @@ def test_truncation_bound__holds_for_mixtures(tables, rank):
     # a single table is a mixture: the bound is not far from the actual error
     assert (off / whole).max() > 0.8 * bound.rms
     angles = half_difference(*_pairs(rng, 4000, 0.1))
-    exact, near = lookup(tables, *angles) @ x.T, lookup(reduced, *angles) @ lift @ x.T
+    exact = lookup(tables, *angles) @ x.T
+    near = lookup(reduced, *angles) @ lift @ x.T
     share = np.abs(near - exact) / exact
     assert (share <= bound.worst + SINGLE).all()
     wi, wo = directions(*np.meshgrid(GRID.theta_h, GRID.theta_d, GRID.phi_d, indexing="ij"))

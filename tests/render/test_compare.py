@@ -47,7 +47,8 @@ def test_delta_e__published_pair() -> None:
 
 
 def test_compare_images__mask_and_unknown_pixels_do_not_count(photograph: np.ndarray) -> None:
-    broken, mask = photograph.copy(), np.ones(photograph.shape[:2], bool)
+    broken = photograph.copy()
+    mask = np.ones(photograph.shape[:2], bool)
     broken[:10] = 1e4
     mask[:10] = False
     broken[20, 20] = np.nan

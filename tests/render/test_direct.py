@@ -21,9 +21,14 @@ LAMBERT = 1.0  # index at which Fresnel lets everything pass
 def surface(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, eta: float = LAMBERT) -> Surface:
     n = len(vertices)
     return Surface(
-        np.asarray(vertices, float), faces, normals, np.full((n, 3), [0.6, 0.4, 0.3]), np.full((n, 1), 0.0),
-        np.ones((4, 3, 2, 1), np.float32), eta=eta,
-    )  # fmt: skip
+        np.asarray(vertices, float),
+        faces,
+        normals,
+        np.full((n, 3), [0.6, 0.4, 0.3]),
+        np.full((n, 1), 0.0),
+        np.ones((4, 3, 2, 1), np.float32),
+        eta=eta,
+    )
 
 
 def plane(half: float = 100.0, cells: int = 1) -> Surface:
@@ -57,7 +62,8 @@ def plane_points(view: Camera) -> np.ndarray:
 
 
 def test_render_view__lambertian_plane() -> None:
-    view, lamps = camera(), lights((200, 100, 400), (-50, 300, 250), falloff=2.0)
+    view = camera()
+    lamps = lights((200, 100, 400), (-50, 300, 250), falloff=2.0)
     images = render_view(plane(), view, lamps)
     for image, position, axis in zip(images, lamps.position, lamps.axis, strict=True):
         towards = position - plane_points(view)
@@ -79,7 +85,8 @@ def test_render_view__dielectric_plane_at_normal_incidence() -> None:
 def test_render_view__sphere() -> None:
     mesh = trimesh.creation.icosphere(subdivisions=5, radius=60.0)
     normals = mesh.vertices / 60.0
-    view, lamps = camera(32, 32), lights((200, 150, 400))
+    view = camera(32, 32)
+    lamps = lights((200, 150, 400))
     seen = trace_view(surface(mesh.vertices, mesh.faces, normals), view)
     image = render_view(surface(mesh.vertices, mesh.faces, normals), view, lamps)[0]
     # ray-sphere intersection
@@ -107,7 +114,8 @@ def test_render_view__shadow_of_a_sphere_on_a_plane() -> None:
     both = surface(
         vertices, np.concatenate([flat.faces, ball.faces + 4]), np.concatenate([flat.normals, ball.vertices / 15])
     )
-    view, lamps = camera(60, 60), lights((250, 0, 300))
+    view = camera(60, 60)
+    lamps = lights((250, 0, 300))
     lit = render_view(both, view, lamps)[0, ..., 0] > 0
     points = plane_points(view)
     towards = lamps.position[0] - points
@@ -116,7 +124,8 @@ def test_render_view__shadow_of_a_sphere_on_a_plane() -> None:
     camera_ray = points - view.centre
     camera_ray /= np.linalg.norm(camera_ray, axis=-1, keepdims=True)
     on_plane = np.linalg.norm(np.cross([0, 0, 60] - view.centre, camera_ray), axis=-1) > 15.5
-    shadow, bright = on_plane & (nearest < 14.8), on_plane & (nearest > 15.2)
+    shadow = on_plane & (nearest < 14.8)
+    bright = on_plane & (nearest > 15.2)
     assert shadow.sum() > 50
     assert not lit[shadow].any()
     assert lit[bright].all()
@@ -124,7 +133,9 @@ def test_render_view__shadow_of_a_sphere_on_a_plane() -> None:
 
 def test_render_view__disc_light_converges_to_its_irradiance() -> None:
     # isotropic points over a disc of radius R at height h: E = 2 I / R^2 (1 - h / sqrt(h^2 + R^2))
-    view, h, R = camera(width=25, height=25), 100.0, 60.0
+    view = camera(width=25, height=25)
+    h = 100.0
+    R = 60.0
     irradiance = 2 / R**2 * (1 - h / np.hypot(h, R)) * np.array([0.6e5, 0.8e5, 0.9e5])
     # midpoint rule in r^2: error falls with the square of the number of points; 16 give 3e-4 on the axis
     image = render_view(plane(), view, lights((0.0, 0.0, h), radius=R), disc_samples=16)[0]
@@ -135,7 +146,9 @@ def test_render_view__disc_light_converges_to_its_irradiance() -> None:
 
 
 def test_render_view__tables_that_include_the_disc_are_read_at_its_centre() -> None:
-    view, small, wide = camera(), lights((0.0, 0.0, 100.0)), lights((0.0, 0.0, 100.0), radius=60.0)
+    view = camera()
+    small = lights((0.0, 0.0, 100.0))
+    wide = lights((0.0, 0.0, 100.0), radius=60.0)
     expected = render_view(plane(), view, small)
     found = render_view(replace(plane(), disc_included=True), view, wide)
     np.testing.assert_allclose(found, expected, rtol=FLOAT32)
@@ -143,7 +156,8 @@ def test_render_view__tables_that_include_the_disc_are_read_at_its_centre() -> N
 
 def test_render_view__terms_add_up() -> None:
     glossy = replace(plane(), weights=np.full((4, 1), 0.7), eta=1.3)
-    view, lamps = camera(), lights((200, 100, 400))
+    view = camera()
+    lamps = lights((200, 100, 400))
     parts = [render_view(glossy, view, lamps, terms=(term,)) for term in ("diffuse", "surface")]
     np.testing.assert_allclose(render_view(glossy, view, lamps), parts[0] + parts[1], rtol=FLOAT32)
     # a table of ones is Lambertian with albedo pi
@@ -190,7 +204,8 @@ def test_render_view__uniform_light_under_a_plane_gives_the_local_answer() -> No
     flat = replace(plane(60.0, cells=60), eta=1.3)
     s, _ = dipole_s(flat.diffuse, eta=1.3)
     skin = replace(flat, s=s, sigma_tr=np.full(s.shape, [0.5, 0.8, 1.1]))
-    view, lamps = camera(12, 9), lights((1e6, 0, 2e6))
+    view = camera(12, 9)
+    lamps = lights((1e6, 0, 2e6))
     local = render_view(skin, view, lamps)
     spread = render_view(skin, view, lamps, subsurface=True)
     np.testing.assert_allclose(spread, local, rtol=1e-4)
@@ -207,11 +222,13 @@ def test_render_view__subsurface_light_crosses_a_shadow_line() -> None:
     scene = surface(
         np.concatenate([flat.vertices, wall]),
         np.concatenate([flat.faces, [[n, n + 1, n + 2], [n, n + 2, n + 3]]]),
-        np.concatenate([flat.normals, np.tile([-1.0, 0, 0], (4, 1))]), eta=1.3,
-    )  # fmt: skip
+        np.concatenate([flat.normals, np.tile([-1.0, 0, 0], (4, 1))]),
+        eta=1.3,
+    )
     s, _ = dipole_s(scene.diffuse, eta=1.3)
     skin = replace(scene, s=s, sigma_tr=np.full(s.shape, [0.3, 0.9, 1.5]))
-    view, lamps = camera(48, 4), lights((400.0, 0, 400.0))
+    view = camera(48, 4)
+    lamps = lights((400.0, 0, 400.0))
     near = Camera(view.K * [[8], [8], [1]], view.R, view.t, view.distortion, 384, 32)
     image = render_view(skin, near, lamps, subsurface=True)[0, 16]
     local = render_view(skin, near, lamps)[0, 16]

@@ -14,7 +14,8 @@ from skindb.render import evaluate
 from skindb.schema import FitStatus, dataset
 from skindb.schema.brdf import brdf_coords, stored_brdf
 
-ETA, GRID = 1.35, TableGrid(12, 10, 6)
+ETA = 1.35
+GRID = TableGrid(12, 10, 6)
 SINGLE = 2e-5  # values, weights and tables are in single precision, and cells are interpolated twice
 
 
@@ -53,12 +54,14 @@ def _pairs(model, surfel, count=400, seed=1):
 def _transmittance(cosine):
     """Fresnel by Snell's law and the two polarisations."""
     t = np.sqrt(1 - (1 - cosine**2) / ETA**2)
-    s, p = (cosine - ETA * t) / (cosine + ETA * t), (t - ETA * cosine) / (t + ETA * cosine)
+    s = (cosine - ETA * t) / (cosine + ETA * t)
+    p = (t - ETA * cosine) / (t + ETA * cosine)
     return 1 - (s**2 + p**2) / 2
 
 
 def _oracle(model, surfel, wi, wo):
-    fitted, basis = model["fitted"], model["basis"]
+    fitted = model["fitted"]
+    basis = model["basis"]
     normal = _unit(fitted["shading_normal"].values[surfel].astype(float))
     nodes = tuple(basis[name].values for name in ("theta_h", "theta_d", "phi_d"))
     angles = half_difference(wi, wo, np.broadcast_to(normal, wi.shape))

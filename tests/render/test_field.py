@@ -16,7 +16,10 @@ def plate():
     x, y = np.meshgrid(np.linspace(-40, 40, SIDE), np.linspace(-20, 20, SIDE))
     position = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
     i = np.arange(SIDE * SIDE).reshape(SIDE, SIDE)
-    a, b, c, d = i[:-1, :-1].ravel(), i[:-1, 1:].ravel(), i[1:, :-1].ravel(), i[1:, 1:].ravel()
+    a = i[:-1, :-1].ravel()
+    b = i[:-1, 1:].ravel()
+    c = i[1:, :-1].ravel()
+    d = i[1:, 1:].ravel()
     return position, np.concatenate([np.stack([a, b, d], -1), np.stack([a, d, c], -1)])
 
 

@@ -35,7 +35,8 @@ def test_light_choice__draws_by_its_probabilities() -> None:
 
 
 def test_light_choice__light_from_below_the_horizon_is_rare() -> None:
-    view, lights = trace_view(ball(), camera(), samples=4), around()
+    view = trace_view(ball(), camera(), samples=4)
+    lights = around()
     rng = np.random.default_rng(1)
     above = [
         np.einsum("nc,nc->n", lights.position[at] - view.position, view.normal) > 0

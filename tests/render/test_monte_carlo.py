@@ -39,9 +39,14 @@ def ball(eta: float = 1.0, diffuse: float = 0.6, weight: float = 0.0) -> Surface
         return 2 * np.clip(h[..., 2:], 0, 1) ** 40
 
     return Surface(
-        mesh.vertices, mesh.faces, mesh.vertices / 60.0, np.full((n, 3), diffuse), np.full((n, 1), weight),
-        tabulate(lobe, TableGrid(40, 30, 8)), eta=eta,
-    )  # fmt: skip
+        mesh.vertices,
+        mesh.faces,
+        mesh.vertices / 60.0,
+        np.full((n, 3), diffuse),
+        np.full((n, 1), weight),
+        tabulate(lobe, TableGrid(40, 30, 8)),
+        eta=eta,
+    )
 
 
 def lights(count: int, radius: float = 30.0) -> Lights:
@@ -125,7 +130,8 @@ def test_lights__as_the_renderer_of_the_fit(count, disc_included) -> None:
 
 def test_environment__as_many_small_lights() -> None:
     """An environment against one distant point light for each of its texels."""
-    surface, sky = ball(eta=1.3, weight=0.5), SKY.environment
+    surface = ball(eta=1.3, weight=0.5)
+    sky = SKY.environment
     height, width, _ = sky.radiance.shape
     fine = 4  # points in a texel along each side
     theta = (np.arange(height * fine) + 0.5) / (height * fine) * np.pi
@@ -180,7 +186,8 @@ def test_render__the_same_seed_gives_the_same_picture() -> None:
 
 
 def test_environment__draws_by_its_density() -> None:
-    sky, count = SKY.environment, 200_000
+    sky = SKY.environment
+    count = 200_000
     drawn = sky.sample(np.random.default_rng(2).random((count, 3)))
     np.testing.assert_allclose(np.linalg.norm(drawn, axis=1), 1, atol=1e-12)
     found = np.bincount(sky._texel(drawn), minlength=8 * 16)

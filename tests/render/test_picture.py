@@ -32,19 +32,29 @@ def model() -> xr.DataTree:
     colour = rng.uniform(0.2, 0.6, (x.size, 3))
     s, _ = dipole_s(colour, eta=1.3)
     values = {
-        "surfel_position": np.stack([x, y, 0 * x], axis=1), "shading_normal": np.tile([0.0, 0, 1], (x.size, 1)),
-        "diffuse_reflectance": colour, "dipole_s": s, "basis_weight": rng.uniform(0, 0.2, (x.size, 2)),
-        "sigma_tr": np.tile([0.5, 0.8, 1.2], (x.size, 1)), "fit_status": np.zeros(x.size), "refractive_index": 1.3,
-    }  # fmt: skip
+        "surfel_position": np.stack([x, y, 0 * x], axis=1),
+        "shading_normal": np.tile([0.0, 0, 1], (x.size, 1)),
+        "diffuse_reflectance": colour,
+        "dipole_s": s,
+        "basis_weight": rng.uniform(0, 0.2, (x.size, 2)),
+        "sigma_tr": np.tile([0.5, 0.8, 1.2], (x.size, 1)),
+        "fit_status": np.zeros(x.size),
+        "refractive_index": 1.3,
+    }
     place = np.array([[0.0, 100, 300], [200, 0, 250], [-150, -80, 200]])
     dome = {
         "camera_matrix": np.array([[[200.0, 0, 16], [0, 200, 12], [0, 0, 1]]]),
-        "camera_rotation": np.diag([1.0, -1, -1])[None], "camera_translation": np.array([[0.0, 0, 250]]),
-        "camera_distortion": np.zeros((1, 5)), "camera_size": np.array([[32, 24]]),
-        "camera_position": np.array([[0.0, 0, 250]]), "light_position": place,
-        "light_intensity": rng.uniform(1e4, 3e4, (3, 3)), "light_disc_radius": np.full(3, 5.0),
-        "light_axis": -place / np.linalg.norm(place, axis=1, keepdims=True), "light_falloff": np.array([0.0, 1, 2]),
-    }  # fmt: skip
+        "camera_rotation": np.diag([1.0, -1, -1])[None],
+        "camera_translation": np.array([[0.0, 0, 250]]),
+        "camera_distortion": np.zeros((1, 5)),
+        "camera_size": np.array([[32, 24]]),
+        "camera_position": np.array([[0.0, 0, 250]]),
+        "light_position": place,
+        "light_intensity": rng.uniform(1e4, 3e4, (3, 3)),
+        "light_disc_radius": np.full(3, 5.0),
+        "light_axis": -place / np.linalg.norm(place, axis=1, keepdims=True),
+        "light_falloff": np.array([0.0, 1, 2]),
+    }
     groups = {
         "/fitted": dataset(values),
         "/mesh": dataset({"triangle": faces}),
@@ -60,8 +70,10 @@ def test_render_picture__subsurface_names_the_channel_without_sigma_tr(model: xr
     with pytest.raises(InputError, match=message):
         render_picture(model, tmp_path / "a.exr", subsurface=True)
     photographs = {
-        "photograph_radiance": np.ones((1, 24, 32, 3)), "photograph_light": [0], "photograph_camera": [0],
-    }  # fmt: skip
+        "photograph_radiance": np.ones((1, 24, 32, 3)),
+        "photograph_light": [0],
+        "photograph_camera": [0],
+    }
     capture = xr.DataTree.from_dict({"photographs": dataset(photographs), "dome": model["dome"].to_dataset()})
     with pytest.raises(InputError, match=message):
         compare_photographs(model, capture, subsurface=True)
@@ -73,8 +85,10 @@ def test_render_picture__subsurface_names_the_channel_without_sigma_tr(model: xr
 
 @pytest.mark.parametrize("subsurface", [False, True])
 def test_picture__is_the_sum_over_the_lights(model: xr.DataTree, subsurface: bool) -> None:
-    surface, dome = from_model(model), model["dome"].to_dataset()
-    camera, lights = cameras_from_dome(dome)[0].scaled(2.0), lights_from_dome(dome).select([0, 2])
+    surface = from_model(model)
+    dome = model["dome"].to_dataset()
+    camera = cameras_from_dome(dome)[0].scaled(2.0)
+    lights = lights_from_dome(dome).select([0, 2])
     together = picture(trace_shot(surface, lights, camera, samples=2, subsurface=subsurface))
     each = render_view(surface, camera, lights, samples=2, subsurface=subsurface)
     assert each.max(axis=(1, 2, 3)).min() > 0
@@ -112,7 +126,8 @@ def test_picture__all_lights_are_carried_as_three_columns(model: xr.DataTree, mo
     carry = subsurface_module.subsurface_exitance
     monkeypatch.setattr(subsurface_module, "subsurface_exitance", counted)
     model["dome"] = model["dome"].to_dataset().isel(light=[0, 1, 2, 0, 1])
-    surface, dome = from_model(model), model["dome"].to_dataset()
+    surface = from_model(model)
+    dome = model["dome"].to_dataset()
     picture(trace_shot(surface, lights_from_dome(dome), cameras_from_dome(dome)[0], samples=1, subsurface=True))
     assert columns == [3]
 
@@ -134,7 +149,8 @@ def test_compare_photographs__reads_the_half_floats_of_older_stores(model: xr.Da
 def test_render__is_a_labelled_picture(model: xr.DataTree) -> None:
     seen = render(model, lights=["l0", "l2"], samples=256, scale=2.0)
     dome = model["dome"].to_dataset()
-    lamps, view = lights_from_dome(dome).select([0, 2]), cameras_from_dome(dome)[0].scaled(2.0)
+    lamps = lights_from_dome(dome).select([0, 2])
+    view = cameras_from_dome(dome)[0].scaled(2.0)
     expected = render_view(from_model(model), view, lamps, samples=4).sum(axis=0)
     assert seen["radiance"].dims == ("image_row", "image_col", "channel")
     assert seen.attrs["lights"] == ["l0", "l2"]
@@ -177,7 +193,8 @@ def test_render_picture__exposure_is_that_of_a_white_surface(model: xr.DataTree,
     assert level["fixed", "plain"][1] == level["fixed", "dark"][1]
     assert level["fixed", "dark"][0] == pytest.approx(level["fixed", "plain"][0] / 2, rel=0.02)  # eight bits
     assert level["auto", "dark"][0] == pytest.approx(level["auto", "plain"][0], rel=0.05)
-    place, power = np.array([0.0, 100, 300]), model["dome/light_intensity"].values[0].mean()
+    place = np.array([0.0, 100, 300])
+    power = model["dome/light_intensity"].values[0].mean()
     expected = np.pi * np.linalg.norm(place) ** 3 / (place[2] * power)
     assert level["fixed", "plain"][1] == pytest.approx(expected, rel=1e-6)
 

@@ -23,7 +23,8 @@ def skin() -> Surface:
 
 
 def front(distortion: tuple[float, ...] = (0, 0, 0, 0, 0), distance: float = 400.0, focal: float = 200.0) -> Camera:
-    K, R = np.array([[focal, 0, 40], [0, focal, 40], [0, 0, 1]]), np.diag([1.0, -1, -1])
+    K = np.array([[focal, 0, 40], [0, focal, 40], [0, 0, 1]])
+    R = np.diag([1.0, -1, -1])
     return Camera(K, R, -R @ np.array([0, 0, distance]), np.array(distortion), 80, 80)
 
 
@@ -63,7 +64,8 @@ POWERS = {
 @pytest.mark.parametrize("name", list(POWERS))
 @pytest.mark.parametrize("subsurface", [False, True])
 def test_notable_lights__pictures_agree_within_the_bound(name: str, subsurface: bool) -> None:
-    surface, lights = skin(), around(POWERS[name])
+    surface = skin()
+    lights = around(POWERS[name])
     true = whole(surface, lights, subsurface=subsurface)
     for error in (0.5, 0.05, 0.005):
         kept, omission = planned(surface, lights, error, subsurface=subsurface)
@@ -90,7 +92,8 @@ def test_notable_lights__equal_lights_are_all_kept(error: float, subsurface: boo
 
 
 def test_plan_scene__bounds_are_relative_to_the_terms_of_the_picture() -> None:
-    surface, lights = skin(), around(POWERS["eight decades"])
+    surface = skin()
+    lights = around(POWERS["eight decades"])
     parts = {
         ("diffuse",): replace(surface, weights=0 * surface.weights),
         ("surface",): replace(surface, diffuse=0 * surface.diffuse),
@@ -156,7 +159,9 @@ def test_plan_scene__the_picture_is_the_same_to_the_bit(subsurface: bool) -> Non
     surface = ball(eta=1.3, weight=0.5)
     n = len(surface.vertices)
     surface = replace(surface, s=np.full((n, 3), dipole_s(0.6, eta=1.3)[0]), sigma_tr=np.full((n, 3), 1.0))
-    scene, lighting, size = RayScene(surface.vertices, surface.faces), Lighting(around(np.full(9, 1e5))), camera()
+    scene = RayScene(surface.vertices, surface.faces)
+    lighting = Lighting(around(np.full(9, 1e5)))
+    size = camera()
     plan = plan_scene(surface, size, lighting, scene, subsurface=subsurface)
     assert any(one.what == "pixels" for one in plan.omissions)
     quality = Quality(samples=16, subsurface=subsurface)

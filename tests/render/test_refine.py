@@ -28,14 +28,16 @@ def skin(cells: int) -> Surface:
     faces = np.concatenate([np.stack([i, i + 1, i + cells + 2], 1), np.stack([i, i + cells + 2, i + cells + 1], 1)])
     n = len(vertices)
     wall = np.array([[0.13, -60, 0.0], [0.13, 60, 0], [0.13, 60, 60], [0.13, -60, 60]])
-    colour = np.concatenate([np.stack([0.5 + 0.005 * x.ravel(), 0.4 + 0 * x.ravel(), 0.3 + 0 * x.ravel()], 1),
-                             np.full((4, 3), 0.4)])  # fmt: skip
+    colour = np.concatenate(
+        [np.stack([0.5 + 0.005 * x.ravel(), 0.4 + 0 * x.ravel(), 0.3 + 0 * x.ravel()], 1), np.full((4, 3), 0.4)]
+    )
     normals = np.concatenate([np.tile([0.0, 0, 1], (n, 1)), np.tile([-1.0, 0, 0], (4, 1))])
     all_vertices = np.concatenate([vertices, wall])
     all_faces = np.concatenate([faces, [[n, n + 1, n + 2], [n, n + 2, n + 3]]])
     tables = np.zeros((4, 4, 4, 1), np.float32)
     s, _ = dipole_s(colour, eta=1.3)
-    weights, sigma = np.zeros((n + 4, 1)), np.full((n + 4, 3), 0.7)
+    weights = np.zeros((n + 4, 1))
+    sigma = np.full((n + 4, 3), 0.7)
     return Surface(all_vertices, all_faces, normals, colour, weights, tables, s, sigma, 1.3)
 
 
@@ -61,7 +63,8 @@ def test_refined__light_under_the_skin_is_that_of_a_fine_mesh() -> None:
 
     Both meshes know where the shadow ends to half an edge, together 0.35 mm, over which light falls by 25 %.
     """
-    true, coarse = profile(skin(128)), skin(8)
+    true = profile(skin(128))
+    coarse = skin(8)
     finer = subdivide_surface(coarse, 0.5, shown(coarse))
     assert np.abs(profile(finer) / true - 1).mean() < 0.15
     assert np.abs(profile(coarse) / true - 1).mean() > 0.5
@@ -71,7 +74,8 @@ def test_refined__pictures_without_light_under_the_skin_stay_the_same() -> None:
     coarse = skin(8)
     finer = subdivide_surface(coarse, 1.0, shown(coarse))
     assert len(finer.vertices) > 20 * len(coarse.vertices)
-    K, R = np.array([[300.0, 0, 24], [0, 300, 18], [0, 0, 1]]), np.diag([1.0, -1, -1])
+    K = np.array([[300.0, 0, 24], [0, 300, 18], [0, 0, 1]])
+    R = np.diag([1.0, -1, -1])
     view = Camera(K, R, np.array([0.0, 0, 300]), np.zeros(5), 48, 36)
     one, other = (render_view(each, view, LAMP) for each in (coarse, finer))
     np.testing.assert_allclose(other, one, rtol=1e-5, atol=1e-6 * one.max())  # rays are traced in single precision

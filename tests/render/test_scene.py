@@ -11,7 +11,8 @@ from skindb.schema.brdf import stored_brdf
 
 
 def model(status: list[int], *, translucent: bool = True) -> xr.DataTree:
-    n, rng = 5, np.random.default_rng(0)
+    n = 5
+    rng = np.random.default_rng(0)
     position = np.array([[0, 0, 0], [10, 0, 0], [10, 10, 0], [0, 10, 0], [0, 20, 0]], float)
     values = {
         "surfel_position": position,
@@ -90,7 +91,8 @@ def test_cameras_and_lights_from_dome__round_trip() -> None:
             "light_falloff": np.arange(3.0),
         }
     )
-    cameras, lamps = cameras_from_dome(dome), lights_from_dome(dome)
+    cameras = cameras_from_dome(dome)
+    lamps = lights_from_dome(dome)
     assert (cameras[1].width, cameras[1].height) == (31, 21)
     np.testing.assert_allclose(R[1] @ cameras[1].centre + cameras[1].t, 0, atol=1e-12)
     assert len(lamps) == 3

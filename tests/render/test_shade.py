@@ -27,9 +27,11 @@ def table_value(table: np.ndarray, n: np.ndarray, wi: np.ndarray, wo: np.ndarray
     """Rotates into the half-vector frame by explicit matrices, as Rusinkiewicz 1998 writes it."""
     h = unit(wi + wo)
     theta_h = np.arccos(np.clip(n @ h, -1, 1))
-    z, x = n, unit(h - (n @ h) * n)
+    z = n
+    x = unit(h - (n @ h) * n)
     local = np.array([x, np.cross(z, x), z]) @ wi
-    c, s = np.cos(-theta_h), np.sin(-theta_h)
+    c = np.cos(-theta_h)
+    s = np.sin(-theta_h)
     difference = np.array([c * local[0] + s * local[2], local[1], -s * local[0] + c * local[2]])
     theta_d = np.arccos(np.clip(difference[2], -1, 1))
     phi_d = np.mod(np.arctan2(difference[1], difference[0]), np.pi)
@@ -43,7 +45,9 @@ def table_value(table: np.ndarray, n: np.ndarray, wi: np.ndarray, wo: np.ndarray
 @pytest.fixture
 def points() -> dict[str, np.ndarray]:
     rng = np.random.default_rng(1)
-    n, k, lamps = 60, 3, 2
+    n = 60
+    k = 3
+    lamps = 2
     normal = unit(rng.normal(size=(n, 3)))
     return {
         "position": rng.normal(size=(n, 3)) * 50,
@@ -58,7 +62,8 @@ def points() -> dict[str, np.ndarray]:
 
 
 def test_shade_points__equals_slow_twin(points: dict[str, np.ndarray]) -> None:
-    axis, falloff = unit(np.array([0.3, -0.2, -1.0])), 1.5
+    axis = unit(np.array([0.3, -0.2, -1.0]))
+    falloff = 1.5
     values = shade_points(**points, axis=axis, falloff=falloff, eta=ETA)
     for i, (x, n, wo) in enumerate(zip(points["position"], points["normal"], points["view"], strict=True)):
         expected = np.zeros(3)
@@ -79,9 +84,18 @@ def test_shade_points__mirror_at_normal_incidence_reads_the_first_node() -> None
     table[0, 0] = 2.0
     up = np.array([[0.0, 0.0, 1.0]])
     values = shade_points(
-        np.zeros((1, 3)), up, up, np.zeros((1, 3)), np.ones((1, 1)), table,
-        lamp=up[:, None] * 10, lit=np.ones((1, 1), np.float32), axis=-up[0], falloff=0, eta=ETA,
-    )  # fmt: skip
+        np.zeros((1, 3)),
+        up,
+        up,
+        np.zeros((1, 3)),
+        np.ones((1, 1)),
+        table,
+        lamp=up[:, None] * 10,
+        lit=np.ones((1, 1), np.float32),
+        axis=-up[0],
+        falloff=0,
+        eta=ETA,
+    )
     np.testing.assert_allclose(values, 2.0 / 100, rtol=FLOAT32)
 
 

@@ -111,7 +111,9 @@ def test_append_entry__a_lost_answer_of_a_bucket_is_no_second_entry(bucket, monk
     append_entry(Bucket(bucket), "render", actor="anna")
     with faulty_proxy(os.environ["AWS_ENDPOINT_URL"]) as proxy:
         monkeypatch.setenv("AWS_ENDPOINT_URL", proxy.address)
-        proxy.part, proxy.fraction, proxy.faults = "000000002.json", 0.5, ("lost answer",)
+        proxy.part = "000000002.json"
+        proxy.fraction = 0.5
+        proxy.faults = ("lost answer",)
         append_entry(Bucket(bucket), "render", actor="anna")
         proxy.fraction = 0.0
         entries, faults = read_audit(Bucket(bucket))

@@ -139,7 +139,12 @@ def test_restore__brings_back_nobody_who_was_withdrawn_later(db, dest, tmp_path)
     assert traces(copy.root, SUBJECT) == []
     assert traces(tmp_path / "copy.markers", SUBJECT) == []
     assert SUBJECT.encode() not in db._place.marker_file().read_bytes()
-    assert (copy.takes("model"), copy.subjects(), copy.takes("population"), copy.takes("calibration")) == (["B"], ["B"], [], [])  # fmt: skip  # noqa: E501
+    assert (copy.takes("model"), copy.subjects(), copy.takes("population"), copy.takes("calibration")) == (
+        ["B"],
+        ["B"],
+        [],
+        [],
+    )
     assert copy.verify() == []
     assert sorted(str(request) for request in copy.requests()) == ["population of traits", "release of r1"]
     assert copy.requests() != []
@@ -177,7 +182,11 @@ def test_backup__erases_subjects_who_were_withdrawn_from_earlier_states(db, dest
 
 def test_erase_from_backup__leaves_the_bytes_of_others(db, dest, tmp_path):
     others = {key: content for key, content in _state(db.root).items() if SUBJECT.encode() not in content}
-    others = {key: content for key, content in others.items() if SUBJECT not in key and key.startswith(("data/capture", "data/model", "log/capture", "log/model"))}  # fmt: skip  # noqa: E501
+    others = {
+        key: content
+        for key, content in others.items()
+        if SUBJECT not in key and key.startswith(("data/capture", "data/model", "log/capture", "log/model"))
+    }
     db.backup(str(dest))
     _commit(db.url, "model", "B", 5.0)
     db.backup(str(dest))
@@ -403,7 +412,9 @@ class Steps:
     """Calls an action before one of the steps of a run, which are the calls of some methods."""
 
     def __init__(self, number: int, action) -> None:
-        self.left, self.action, self.is_done = number, action, False
+        self.left = number
+        self.action = action
+        self.is_done = False
 
     def watch(self, patch, owner, names) -> None:
         for name in names:
@@ -506,7 +517,8 @@ def test_backup__while_others_commit_and_remove_is_one_moment(made, tmp_path):
         with pytest.MonkeyPatch.context() as patch:
             steps.watch(patch, Folder, STEPS)
             for _ in range(2):
-                steps.left, steps.is_done = draw.randint(0, 60), False
+                steps.left = draw.randint(0, 60)
+                steps.is_done = False
                 report = db.backup(str(work / "backup"))
                 assert report.faults == (), seed
         for number in _archive(work / "backup").numbers():
@@ -621,7 +633,8 @@ def test_restore__that_was_interrupted_before_a_withdrawal_keeps_nothing_of_the_
 
 def test_backup__from_a_folder_to_a_bucket_and_back(db, new_database, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "share"))
-    archive, copy = new_database("localbucket"), new_database("localbucket")
+    archive = new_database("localbucket")
+    copy = new_database("localbucket")
     first = db.backup(archive, verify=True)
     assert first.faults == ()
     assert db.backup(archive).copied == 0

@@ -303,7 +303,8 @@ def test_commit__reads_nothing_back(bucket, s3_address, monkeypatch):
 def test_commit__refuses_if_what_was_put_is_not_there(bucket, what):
     with Database(bucket).stage("capture", "A1") as stage:
         stage.write(groups())
-        key, other = f"{stage.path}/surfels/surfel_area/c/0", Bucket(bucket)
+        key = f"{stage.path}/surfels/surfel_area/c/0"
+        other = Bucket(bucket)
         other.remove(key)
         if what == "replaced":
             other.replace(key, b"of another writer")
@@ -395,7 +396,8 @@ def test_stage__keeps_what_may_be_committed_where_the_server_is_gone(new_databas
     monkeypatch.setattr(s3, "MAX_RETRIES", 1)
     with faulty_proxy(s3_address("localbucket"), faults=("503",)) as proxy:
         monkeypatch.setenv("AWS_ENDPOINT_URL", proxy.address)
-        stage, proxy.part = Database(url).stage("capture", "A1"), "/log/"
+        stage = Database(url).stage("capture", "A1")
+        proxy.part = "/log/"
 
         def refused():
             with stage:

@@ -89,7 +89,8 @@ def test_takes__where_with_an_unknown_column_lists_those_of_the_catalogue(db):
 
 def _count_reads(monkeypatch):
     """Kind, take and generation of every record that is read from now on."""
-    reads, read = [], Log._read
+    reads = []
+    read = Log._read
 
     def counted(self, generation):
         reads.append((self.kind, self.take, generation))
@@ -184,7 +185,8 @@ def test_table__of_a_restored_database_is_that_of_its_records(db, tmp_path):
 
 @pytest.mark.parametrize("damage", ["cut", "value", "head", "empty", "list"])
 def test_table__a_damaged_cache_changes_nothing(db, damage):
-    whole, path = db.table(), db.root / "catalogue.json"
+    whole = db.table()
+    path = db.root / "catalogue.json"
     body = json.loads(path.read_text())
     if damage == "value":
         body["records"][0]["record"]["provenance"]["traits"] = {"age": 99}
@@ -203,7 +205,8 @@ def test_info__lists_the_same_stale_versions_with_and_without_the_cache(db):
     db.table()
     commit(db.root, take="B2", **SCOPE, subject="B2")
     commit(db.root, take="A1.lotion", kind="model", **SCOPE, inputs=[db.record("capture", "A1.lotion").as_input()])
-    cached, again = db.info(), db.info()
+    cached = db.info()
+    again = db.info()
     (db.root / "catalogue.json").unlink()
     assert cached == again == db.info()
     assert cached["takes"]["B2"]["model"]["stale"] == ["capture 1 of B2 was superseded"]

@@ -27,7 +27,8 @@ def test_cohort__tables_are_those_of_every_take(db):
     assert cohort.sizes["take"] == len(PEOPLE) - 1
     assert all(array.chunks is not None for array in cohort.data_vars.values())
     for take in cohort["take"].values:
-        own, shown = db.tables(db.record("model", take)), cohort.sel(take=take)
+        own = db.tables(db.record("model", take))
+        shown = cohort.sel(take=take)
         for name in own.data_vars:
             found = shown[name].sel({dim: own[dim].values for dim in own[name].dims if dim in own.coords})
             np.testing.assert_array_equal(found.values, own[name].values, err_msg=name)
@@ -67,10 +68,12 @@ def test_cohort__surfels_and_their_samples(db):
     cohort = db.cohort("surfels", surfels=50)
     assert cohort["reflectance_sample"].dims == ("take", "surfel", "light", "camera", "channel")
     for take in ("S01", "S02"):
-        one, model = cohort.sel(take=take), db.read("model", take)
+        one = cohort.sel(take=take)
+        model = db.read("model", take)
         index = one["surfel_index"].values
         assert len(set(index.tolist())) == 50
-        fitted, capture = model["fitted"].to_dataset(), db.source(model)
+        fitted = model["fitted"].to_dataset()
+        capture = db.source(model)
         for name in ("diffuse_reflectance", "dictionary_weight", "shading_normal"):
             np.testing.assert_array_equal(one[name], fitted[name].isel(surfel=index))
         samples = capture["samples"].to_dataset()["reflectance_sample"].isel(surfel=index)

@@ -64,7 +64,8 @@ def condition(rng, depth=0):
     if kind == "truth":
         return "outdated", lambda c: pd.array([None if v is None or v != v else v for v in c["outdated"]], "boolean")
     if kind == "missing":
-        name, negated = rng.choice(["age", "condition", "model_created"]), rng.random() < 0.5
+        name = rng.choice(["age", "condition", "model_created"])
+        negated = rng.random() < 0.5
         text = f"{name} is {'not ' if negated else ''}missing"
         return text, lambda c: pd.array(pd.isna(pd.Series(c[name], dtype=object)) != negated, "boolean")
     if kind == "in":

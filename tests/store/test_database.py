@@ -265,7 +265,8 @@ def test_commit__stale_writer_is_refused(tmp_path):
 
 def test_read__no_half_version_while_others_commit(tmp_path):
     commit(tmp_path, 0.0)
-    db, seen = Database(tmp_path), []
+    db = Database(tmp_path)
+    seen = []
 
     def look():
         tree = db.read("capture", "A1")

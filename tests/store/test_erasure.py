@@ -149,7 +149,8 @@ def test_record__refers_to_takes_through_any_number_of_inputs(db):
 
 
 def test_erase__unfinished_versions_of_others_are_removed_only_if_they_may_hold_its_data(db):
-    a, b = _fitted(db, "A"), _fitted(db, "B")
+    a = _fitted(db, "A")
+    b = _fitted(db, "B")
     stages = [db.stage("population", name, names=names) for name, names in (("one", ["A", "B"]), ("two", ["B"]))]
     stages.append(db.stage("population", "unknown", names=["B"]))
     for stage in stages:
@@ -294,7 +295,8 @@ class _FullDisk:
     """Refuses to write until the data of the subject were removed."""
 
     def __init__(self, monkeypatch, root, *, keeps="A"):
-        self.refused, self.data = 0, root / "data/model" / keeps
+        self.refused = 0
+        self.data = root / "data/model" / keeps
         write = Folder._temporary
 
         def refuse(place, data, *, for_file):

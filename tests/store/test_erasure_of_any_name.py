@@ -66,7 +66,8 @@ class Planter:
     """
 
     def __init__(self, db: Database, draw: random.Random) -> None:
-        self.db, self.draw = db, draw
+        self.db = db
+        self.draw = draw
         self.versions: list[Planted] = []
         subjects = draw.sample(WORDS, draw.randint(2, 4))
         condition = draw.choice(WORDS)
@@ -162,7 +163,8 @@ class _QuickGroup:
     """A root group without arrays, whose attributes are written directly: zarr takes ten times as long."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder, self.attrs = folder, self
+        self.folder = folder
+        self.attrs = self
 
     def update(self, attrs: dict[str, Any]) -> None:
         self.folder.mkdir(parents=True)

@@ -106,7 +106,8 @@ def test_clean__keeps_what_may_be_written_at_this_moment(db, monkeypatch):
 
 
 def test_clean__touches_nothing_of_a_take_that_is_worked_on(db, monkeypatch):
-    path, other = _left(db), _left(db, take="B1")
+    path = _left(db)
+    other = _left(db, take="B1")
     with db.lease("A1", "capture", command="skindb ingest"):
         assert _kept(db)[path].startswith("in use by skindb ingest on")
         assert [one.key for one in db.clean()] == [other]
@@ -296,7 +297,8 @@ def test_commit__of_a_stage_whose_data_were_removed_is_refused(db):
 def test_clean__killed_between_its_steps_is_continued(db):
     """There is a tombstone of a record that still exists, and a version whose record is already removed."""
     _age(db.root / "data", OLD)
-    data, record = shutil.copytree(db.root / "data", db.root.parent / "data"), db.record("capture", "A1", 1)
+    data = shutil.copytree(db.root / "data", db.root.parent / "data")
+    record = db.record("capture", "A1", 1)
     log = (db.root / "log/capture/A1/00000001.json").read_bytes()
     db.clean(generations=1)
     (db.root / "log/capture/A1/00000001.json").write_bytes(log)

@@ -26,9 +26,10 @@ pytestmark = pytest.mark.slow
 
 APART = ["unshare", "--mount", "--map-root-user"]
 TRIED = "mount -t tmpfs -o size=64k tmpfs /mnt"
-HAS_MOUNTS = shutil.which("unshare") is not None and not subprocess.run(
-    [*APART, "sh", "-c", TRIED], check=False, capture_output=True
-).returncode  # fmt: skip
+HAS_MOUNTS = (
+    shutil.which("unshare") is not None
+    and not subprocess.run([*APART, "sh", "-c", TRIED], check=False, capture_output=True).returncode
+)
 needs_mounts = pytest.mark.skipif(not HAS_MOUNTS, reason="needs user namespaces of Linux with mounts of their own")
 YEAR = 365 * 86400.0
 
@@ -65,9 +66,15 @@ def _writing(place, captures, name):
 def _reading(place):
     db = str(place / "db")
     return [
-        ("info", db), ("info", db, "-v", "--json"), ("info", db, "--where", "age > 0"), ("verify", db), ("clean", db),
-        ("consent", db, "V001"), ("release", db), ("refresh", db, "--dry-run"),
-    ]  # fmt: skip
+        ("info", db),
+        ("info", db, "-v", "--json"),
+        ("info", db, "--where", "age > 0"),
+        ("verify", db),
+        ("clean", db),
+        ("consent", db, "V001"),
+        ("release", db),
+        ("refresh", db, "--dry-run"),
+    ]
 
 
 def _apart(place, mount, steps):
@@ -90,7 +97,8 @@ def _one_line(code, stderr, found, cure, place):
 
 @needs_mounts
 def test_full_disk__is_one_line_of_every_command_and_harms_nothing(made, tmp_path):
-    place, tries = tmp_path / "full", []
+    place = tmp_path / "full"
+    tries = []
     place.mkdir()
     mount = f"mount -t tmpfs -o size=24m tmpfs {place} && cp -a {made / 'db'} {place}"
     steps = []
@@ -151,7 +159,8 @@ def test_read_only_folder__reads_everything_and_refuses_to_write_in_one_line(mad
 @pytest.fixture
 def clock(monkeypatch):
     """A function that sets the clock of this machine by so many seconds, as skindb reads it; files keep theirs."""
-    real, now = datetime_module.datetime, time.time
+    real = datetime_module.datetime
+    now = time.time
 
     def set_by(seconds):
         class Shifted(real):
@@ -260,7 +269,8 @@ def test_full_disk__a_backup_and_a_restore_end_in_one_line_and_continue(made, tm
     mount = f"mount -t tmpfs -o size=24m tmpfs {place}"
     db, backup, copy = (str(one) for one in (made / "db", place / "backup", place / "copy"))
     commands = [("backup", db, backup), ("restore", backup, copy, "--markers", f"{db}.markers")]
-    steps, checked = [], []
+    steps = []
+    checked = []
     for command in commands:
         for left in (0, 48_000, 400_000):
             steps += [["leave", left], ["run", command], ["run", ("info", copy)], ["free"]]

@@ -142,7 +142,8 @@ class Turns(threading.Event):
     def __init__(self):
         super().__init__()
         self.waits = []
-        self.begun, self.passed = threading.Semaphore(0), threading.Semaphore(0)
+        self.begun = threading.Semaphore(0)
+        self.passed = threading.Semaphore(0)
 
     def wait(self, timeout=None):
         self.waits.append(timeout)

@@ -44,7 +44,8 @@ def place(tmp_path, monkeypatch):
 
 
 def test_subject_hash__depends_on_the_secret_and_the_whole_pseudonym(tmp_path):
-    one, other = Folder(tmp_path / "one"), Folder(tmp_path / "other")
+    one = Folder(tmp_path / "one")
+    other = Folder(tmp_path / "other")
     hashes = [subject_hash(place, name) for place in (one, other) for name in ("S01", "S0", "1")]
     assert len(set(hashes)) == 6
     assert subject_hash(one, "S01") == hashes[0]

@@ -20,7 +20,8 @@ OUTSIDE = ["..", "../victim", "data/../../victim", "/etc/passwd", "", "a//b", "a
 @pytest.fixture
 def place(tmp_path):
     """A folder with a victim beside it, and links to that inside."""
-    root, victim = tmp_path / "db", tmp_path / "victim"
+    root = tmp_path / "db"
+    victim = tmp_path / "victim"
     (root / "data").mkdir(parents=True)
     victim.mkdir()
     (victim / "file").write_text("keep me")
@@ -35,7 +36,8 @@ def test_identities__what_is_removed_during_the_listing_is_left_out(tmp_path, re
     for key in ("log/A/1", "log/A/2", "log/B/1"):
         place.create(key, b"x")
     listed = set(place.identities("log"))
-    gone, scan = tmp_path / removed, os.scandir
+    gone = tmp_path / removed
+    scan = os.scandir
 
     def scandir(folder):
         entries = list(scan(folder))

@@ -42,7 +42,9 @@ class Steps:
     """Counts the steps of a writer, and calls a function in one of them."""
 
     def __init__(self, number: int, action) -> None:
-        self.left, self.action, self.is_done = number, action, False
+        self.left = number
+        self.action = action
+        self.is_done = False
 
     def watch(self, patch: pytest.MonkeyPatch, targets) -> None:
         for owner, name in targets:

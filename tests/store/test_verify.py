@@ -215,9 +215,20 @@ def test_cohort__a_record_that_describes_other_tables_is_refused(db):
 
 @pytest.mark.parametrize(
     "place",
-    ["log/X", "log/capture/a b", "log/capture/A1/x.json", "log/capture/A1/1.json", "log/capture/A1/٠٠٠٠٠٠٠٣.json",
-     "data/X", "data/capture/A1/x", "data/capture/A1/x.zarr", "data/Capture", "heads/capture/A1", "tombstones/x.json"],
-)  # fmt: skip
+    [
+        "log/X",
+        "log/capture/a b",
+        "log/capture/A1/x.json",
+        "log/capture/A1/1.json",
+        "log/capture/A1/٠٠٠٠٠٠٠٣.json",
+        "data/X",
+        "data/capture/A1/x",
+        "data/capture/A1/x.zarr",
+        "data/Capture",
+        "heads/capture/A1",
+        "tombstones/x.json",
+    ],
+)
 @pytest.mark.parametrize("kind", ["file", "folder"])
 def test_verify__foreign_files_are_named(db, place, kind):
     path = db.root / place

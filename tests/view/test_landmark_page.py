@@ -252,7 +252,8 @@ def test_page__fits_a_width_of_400_px(browser, address):
 def test_landmark_server__saves_nothing_for_others(server, tmp_path):
     """A page that knows the address, but not the token, can neither read the scan nor write landmarks."""
     body = json.dumps({"points": {"chin": [0, 0, 0]}}).encode()
-    stranger, session = Session(server.address), Session.opened(server.address)
+    stranger = Session(server.address)
+    session = Session.opened(server.address)
     for name in ("save", "suggest"):
         assert stranger.status("POST", name, body) == 403
         assert session.status("POST", name, body, Origin="http://example.org") == 403

@@ -12,10 +12,13 @@ def irradiance(environment, normal):
     """Integral over the texels, each divided into 4 x 4: (n, 3)."""
     fine = np.repeat(np.repeat(environment.radiance, 4, axis=0), 4, axis=1)
     h, w, _ = fine.shape
-    theta, phi = np.pi * (np.arange(h) + 0.5) / h, 2 * np.pi * ((np.arange(w) + 0.5) / w - 0.5)
+    theta = np.pi * (np.arange(h) + 0.5) / h
+    phi = 2 * np.pi * ((np.arange(w) + 0.5) / w - 0.5)
     solid = np.sin(theta) * (np.pi / h) * (2 * np.pi / w)
-    towards = np.stack([np.sin(theta)[:, None] * np.sin(phi), np.cos(theta)[:, None] + 0 * phi,
-                        np.sin(theta)[:, None] * np.cos(phi)], axis=-1)  # fmt: skip
+    towards = np.stack(
+        [np.sin(theta)[:, None] * np.sin(phi), np.cos(theta)[:, None] + 0 * phi, np.sin(theta)[:, None] * np.cos(phi)],
+        axis=-1,
+    )
     cosine = np.maximum(np.einsum("hwk,nk->nhw", towards, normal), 0)
     return np.einsum("nhw,hwc->nc", cosine * solid[None, :, None], fine)
 

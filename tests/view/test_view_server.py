@@ -54,7 +54,8 @@ def test_server__the_token_opens_one_session(server):
 
 
 def test_server__a_token_is_accepted_once_by_concurrent_requests(server):
-    address, start = urlsplit(server.address), threading.Barrier(8)
+    address = urlsplit(server.address)
+    start = threading.Barrier(8)
 
     def open_page(_):
         start.wait(10)

@@ -50,7 +50,8 @@ def model():
 
 @pytest.fixture(scope="module")
 def page_file(model, tmp_path_factory):
-    half, whole = small_face((0.75, 0.4, 0.25)), small_face((0.9, 0.4, 0.2))
+    half = small_face((0.75, 0.4, 0.25))
+    whole = small_face((0.9, 0.4, 0.2))
     record = face_record(model, take="S1", attributes={"age": 30}, traits=(Trait("tan", whole, half),))
     path = tmp_path_factory.mktemp("view") / "face.html"
     write_page(path, record, still_picture(model))
@@ -97,7 +98,8 @@ def lamp(position, intensity=(5e5, 4.75e5, 4.5e5)):
 
 
 def rendered(model, lights, **options):
-    surface, camera = from_model(model), cameras_from_dome(model["dome"].to_dataset())[0]
+    surface = from_model(model)
+    camera = cameras_from_dome(model["dome"].to_dataset())[0]
     return render_view(surface, camera, lights, samples=2, disc_samples=1, **options).sum(axis=0)
 
 
@@ -188,7 +190,8 @@ def test_page__controls_do_what_they_say(browser, page_file):
     before = pixels(page)
     page.get_by_label("azimuth").first.fill("-60")
     moved = pixels(page)
-    left, right = (slice(None), slice(0, moved.shape[1] // 2)), (slice(None), slice(moved.shape[1] // 2, None))
+    left = (slice(None), slice(0, moved.shape[1] // 2))
+    right = (slice(None), slice(moved.shape[1] // 2, None))
     # the subject's left is at the right of the picture; the light went to the other side
     assert before[right].mean() > before[left].mean()
     assert moved[left].mean() > moved[right].mean()
@@ -252,7 +255,8 @@ def test_page__the_line_of_the_divider_separates_the_sides(browser, page_file):
 
 @pytest.mark.slow
 def test_page__a_slider_ends_at_the_amount_of_its_trait(browser, model, tmp_path):
-    half, whole = small_face((0.75, 0.4, 0.25)), small_face((0.9, 0.4, 0.2))
+    half = small_face((0.75, 0.4, 0.25))
+    whole = small_face((0.9, 0.4, 0.2))
     pages = {}
     for amount in (1.0, 20.0, -0.5):
         record = face_record(model, take="S1", attributes={}, traits=(Trait("tan", whole, half, amount),))
@@ -428,11 +432,13 @@ def test_camera__of_the_page_is_that_of_the_renderer(model):
 def test_face_record__skips_bases_without_weight(model):
     """The page needs a texture for every four bases; sliders of traits may need all of them."""
     five = model.copy(deep=True)
-    fitted, basis = five["fitted"].to_dataset(), five["basis"].to_dataset()
+    fitted = five["fitted"].to_dataset()
+    basis = five["basis"].to_dataset()
     weight = np.concatenate([fitted["basis_weight"].values, 0 * fitted["basis_weight"].values], axis=1)
     tables = np.concatenate([kernel_tables(basis)] * 2, axis=-1)
-    five["fitted"] = dataset({**{n: v.values for n, v in fitted.data_vars.items() if n != "basis_weight"},
-                              "basis_weight": weight})  # fmt: skip
+    five["fitted"] = dataset(
+        {**{n: v.values for n, v in fitted.data_vars.items() if n != "basis_weight"}, "basis_weight": weight}
+    )
     five["basis"] = dataset({"basis_brdf": stored_brdf(tables), "disc_angular_radius": 0.0})
     assert "tableB" not in face_record(five, take="S1", attributes={})["arrays"]
     moved = (Trait("tan", five, five),)

@@ -38,7 +38,8 @@ def test_build_dome__up_in_the_world_is_up_in_the_image():
 
 
 def test_build_dome__the_same_seed_is_the_same_device():
-    first, second = _dome(lights=7, cameras=3), _dome(lights=7, cameras=3)
+    first = _dome(lights=7, cameras=3)
+    second = _dome(lights=7, cameras=3)
     for a, b in zip(first.lights, second.lights, strict=True):
         np.testing.assert_array_equal(a.position, b.position)
     for c, d in zip(first.cameras, second.cameras, strict=True):
@@ -102,7 +103,8 @@ def test_sensor__saturates_at_white_and_steps_by_the_converter():
 
 def test_sensor__averaging_lowers_the_noise():
     sensor = Sensor()
-    single, many = _frames(0.0, 10, sensor).std(), _frames(0.0, 10, sensor, averaged=16).std()
+    single = _frames(0.0, 10, sensor).std()
+    many = _frames(0.0, 10, sensor, averaged=16).std()
     assert many == pytest.approx(sensor.read_noise / 4 / sensor.electrons_per_dn, rel=0.05)
     assert many < single / 3
 

@@ -7,10 +7,27 @@ from skindb.virtual.head import parametric_head
 from skindb.virtual.person import Person, default_people, face_shape
 
 LANDMARKS = {
-    "forehead_centre", "forehead_right", "forehead_left", "brow_right", "brow_left", "nasion", "nose_tip", "subnasale",
-    "ala_right", "ala_left", "eye_outer_right", "eye_inner_right", "eye_inner_left", "eye_outer_left",
-    "mouth_corner_right", "mouth_corner_left", "lip_upper", "chin", "jaw_right", "jaw_left",
-}  # fmt: skip
+    "forehead_centre",
+    "forehead_right",
+    "forehead_left",
+    "brow_right",
+    "brow_left",
+    "nasion",
+    "nose_tip",
+    "subnasale",
+    "ala_right",
+    "ala_left",
+    "eye_outer_right",
+    "eye_inner_right",
+    "eye_inner_left",
+    "eye_outer_left",
+    "mouth_corner_right",
+    "mouth_corner_left",
+    "lip_upper",
+    "chin",
+    "jaw_right",
+    "jaw_left",
+}
 ON_SKIN = 1e-3  # mm: error of the Newton projection
 
 
@@ -34,7 +51,9 @@ def test_parametric_head__is_a_disc_with_one_boundary_loop(head):
         following.setdefault(a, []).append(b)
         following.setdefault(b, []).append(a)
     assert all(len(v) == 2 for v in following.values())
-    seen, at, before = set(), boundary[0, 0], -1
+    seen = set()
+    at = boundary[0, 0]
+    before = -1
     while at not in seen:
         seen.add(at)
         at, before = next(v for v in following[at] if v != before), at
@@ -68,7 +87,8 @@ def test_normals__agree_with_a_finer_sampling_of_the_surface(head):
 
 
 def test_normals__are_the_gradient(head):
-    shape, eps = FaceShape(), 1e-3
+    shape = FaceShape()
+    eps = 1e-3
     outside = field(head.vertices + eps * head.normals, shape)
     inside = field(head.vertices - eps * head.normals, shape)
     assert (outside > inside).all()
@@ -116,7 +136,8 @@ def test_parametric_head__two_samplings_are_the_same_surface(head):
 
 
 def test_face_shape__differs_between_people_and_not_between_conditions():
-    first, second = Person("A", 30, "female", "european", 1), Person("B", 30, "female", "european", 2)
+    first = Person("A", 30, "female", "european", 1)
+    second = Person("B", 30, "female", "european", 2)
     assert face_shape(first) == face_shape(Person("A", 30, "female", "european", 1, condition="lotion"))
     assert face_shape(first) != face_shape(second)
 
@@ -137,9 +158,17 @@ def test_default_people__are_eight_takes_of_six_subjects():
 def test_parametric_head__no_vertex_leaves_the_skin_in_a_crease():
     """Seen in a cohort of 87: one vertex of this head was 0.8 m away."""
     person = Person(
-        "P075", 68.0, "male", "south_asian", 1075, freckles=0.5, melanin=0.5435021410946412, blood=0.38540485500243327,
-        beard_density=0.14826078548974328, fullness=0.6932476719384093,
-    )  # fmt: skip
+        "P075",
+        68.0,
+        "male",
+        "south_asian",
+        1075,
+        freckles=0.5,
+        melanin=0.5435021410946412,
+        blood=0.38540485500243327,
+        beard_density=0.14826078548974328,
+        fullness=0.6932476719384093,
+    )
     shape = face_shape(person)
     seed = int(np.random.default_rng([person.seed, True]).integers(2**31))
     head = parametric_head(shape, spacing_mm=3.6, jitter=0.25, seed=seed)

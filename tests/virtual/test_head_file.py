@@ -25,9 +25,14 @@ def test_load_head__reads_a_plain_npz(tmp_path):
     vertices, faces = _grid()
     region = (vertices[:, 1] > 0).astype(int)
     np.savez(
-        tmp_path / "head.npz", vertices=vertices, faces=faces, landmark_names=["nose_tip"], landmark_vertex=[14],
-        region=region, region_names=["cheek", "forehead"],
-    )  # fmt: skip
+        tmp_path / "head.npz",
+        vertices=vertices,
+        faces=faces,
+        landmark_names=["nose_tip"],
+        landmark_vertex=[14],
+        region=region,
+        region_names=["cheek", "forehead"],
+    )
     model = load_head(tmp_path / "head.npz")
     assert model.landmarks == {"nose_tip": 14}
     np.testing.assert_array_equal(model.regions["forehead"], np.flatnonzero(region == 1))

@@ -24,7 +24,8 @@ DOME = build_dome(4, 3, width=64, height=80, rng=np.random.default_rng(1))
 
 
 def _simulate(out, **options):
-    person, seed = options.pop("person", PERSON), options.pop("seed", 7)
+    person = options.pop("person", PERSON)
+    seed = options.pop("seed", 7)
     simulate_take(out, person, DOME, rng=np.random.default_rng(seed), spacing_mm=4.0, **options)
     return out
 
@@ -83,7 +84,8 @@ def test_simulate_take__white_frames_give_the_true_intensities(capture):
     dome = json.loads((capture / "dome" / "dome.json").read_text())
     with np.load(str(capture) + ".truth.npz") as truth:
         true = truth["light_intensity"]
-    white, camera = dome["white"], frontal_camera(DOME)
+    white = dome["white"]
+    camera = frontal_camera(DOME)
     centre = camera.rotation @ np.array(white["point"]) + camera.translation
     x, y = np.floor((camera.matrix @ centre)[:2] / centre[2]).astype(int)
     for light, expected in zip(dome["lights"], true, strict=True):
@@ -110,10 +112,12 @@ def test_simulate_take__exposures_and_vignetting_follow_the_format(tmp_path, cap
     bare = replace(DOME, cameras=tuple(replace(c, vignette=np.zeros(3)) for c in DOME.cameras))
     plain = tmp_path / "plain"
     simulate_take(plain, PERSON, bare, rng=np.random.default_rng(7), spacing_mm=4.0, sensor=Sensor(noisy=False, step=1))
-    camera, sensor = DOME.cameras[0], Sensor()
+    camera = DOME.cameras[0]
+    sensor = Sensor()
     name = "dome/frames/{exposure}/l000_c00.png"
-    long, short = ((_read(folder, name, exposure=e).astype(float) - sensor.black) for folder, e in
-                   ((plain, "e0"), (plain, "e1")))  # fmt: skip
+    long, short = (
+        (_read(folder, name, exposure=e).astype(float) - sensor.black) for folder, e in ((plain, "e0"), (plain, "e1"))
+    )
     used = (short > 500) & (long < 0.95 * (sensor.white - sensor.black))
     assert used.sum() > 500
     np.testing.assert_allclose(long[used] / short[used], 8, rtol=2e-3)  # 40 ms against 5 ms; rounding of 500

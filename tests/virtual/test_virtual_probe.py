@@ -18,9 +18,13 @@ from skindb.virtual.probe import (
 from skindb.virtual.skin import Site
 
 ETA = 1.3
-SITE = Site("cheek", np.zeros(3), np.array([0.45, 0.27, 0.2]), np.array([0.56, 0.97, 1.5]), *np.array(
-    [[0.086, 0.28, 0.58], [1.13, 0.85, 0.72]]
-))  # fmt: skip
+SITE = Site(
+    "cheek",
+    np.zeros(3),
+    np.array([0.45, 0.27, 0.2]),
+    np.array([0.56, 0.97, 1.5]),
+    *np.array([[0.086, 0.28, 0.58], [1.13, 0.85, 0.72]]),
+)
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +78,8 @@ def test_write_probe__the_images_decode_to_the_profile(tmp_path):
     ]
     assert frames[0].dtype == np.uint16
     y, x = np.mgrid[: frames[0].shape[0], : frames[0].shape[1]] + 0.5
-    black, white = meta["black_level"], meta["white_level"]
+    black = meta["black_level"]
+    white = meta["white_level"]
     decoded = np.full((FIBRES, 3), np.nan)
     for i, fibre in enumerate(meta["fibres"]):
         inside = np.hypot(x - fibre["centre"][0], y - fibre["centre"][1]) <= fibre["radius"]

@@ -25,10 +25,13 @@ sys.path.append(str(Path(__file__).parents[1] / "ingest"))
 from sphere import BLACK, HEIGHT, WHITE, WIDTH, write_capture
 
 SECONDS = {f"e{i}": 0.4 / 2.0**i for i in range(7)}
-FULL, READ, DARK_SEED = 20000.0, 6.0, 3
+FULL = 20000.0
+READ = 6.0
+DARK_SEED = 3
 VIGNETTE = np.array([-0.2, 0.03, 0.0])
 TO_SRGB = np.array([[1.6, -0.45, -0.15], [-0.25, 1.4, -0.15], [0.0, -0.5, 1.5]])
-BLUR, GLARE = 0.9, 0.0
+BLUR = 0.9
+GLARE = 0.0
 CENTRE = np.array([WIDTH / 2, HEIGHT / 2])
 COLUMN, ROW = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
 R2 = ((COLUMN - CENTRE[0]) ** 2 + (ROW - CENTRE[1]) ** 2) / (np.hypot(WIDTH, HEIGHT) / 2) ** 2
@@ -38,7 +41,8 @@ PATCHES = [[6 + 12 * (i % 6), 8 + 16 * (i // 6)] for i in range(24)]
 
 def encoded(exposure, gamma):
     """A gamma with a linear toe below 0.004; 1 is linear."""
-    toe, power = 0.004, 1 / gamma
+    toe = 0.004
+    power = 1 / gamma
     slope = power * toe ** (power - 1)
     lift = toe**power - slope * toe
     return np.where(exposure < toe, slope * exposure, np.maximum(exposure, toe) ** power - lift) / (1 - lift)
@@ -146,9 +150,11 @@ def test_calibrate_cameras__finds_what_was_put_in(pristine, tmp_path, gamma):
     gain = found["calibrated_electrons_per_value"] - FULL / (WHITE - BLACK)
     assert np.abs(gain / found["calibrated_electrons_per_value_error"]).max() < most
     assert np.abs(found["calibrated_read_noise"] - READ).max() < (1 if gamma == 1 else 3)
-    shade = 1 + R2[..., None] * (found["calibrated_vignette"].values[:, 0] + R2[..., None] * (
-        found["calibrated_vignette"].values[:, 1] + R2[..., None] * found["calibrated_vignette"].values[:, 2]
-    ))  # fmt: skip
+    shade = 1 + R2[..., None] * (
+        found["calibrated_vignette"].values[:, 0]
+        + R2[..., None]
+        * (found["calibrated_vignette"].values[:, 1] + R2[..., None] * found["calibrated_vignette"].values[:, 2])
+    )
     assert np.abs(shade / LENS[..., None] - 1).max() < (0.01 if gamma == 1 else 0.02)  # noise of 5 electrons per mille
     # noise of 0.2 % in a patch, times rows of the inverse as large as 2
     np.testing.assert_allclose(found["calibrated_colour_matrix"], np.stack([TO_SRGB] * 2), atol=0.02)

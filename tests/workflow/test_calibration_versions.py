@@ -120,7 +120,8 @@ def test_ingest__takes_the_lights_of_the_named_calibration(setup, capture, prist
 @pytest.mark.slow
 def test_ingest__takes_the_positions_of_the_named_calibration(setup, capture, tmp_path):
     dome = json.loads((setup / "dome/dome.json").read_text())
-    places, radius = {"a": [-60.0, 0.0, 0.0], "b": [60.0, 20.0, 0.0]}, 25.0
+    places = {"a": [-60.0, 0.0, 0.0], "b": [60.0, 20.0, 0.0]}
+    radius = 25.0
     (setup / "ball").mkdir()
     for place, light, camera in product(places, LIGHTS, dome["cameras"]):
         value = np.rint(50000 * ball_picture(camera, places[place], radius, LIGHTS[light])).astype(np.uint16)

@@ -101,7 +101,8 @@ def test_fit_take__continues_after_the_first_pass_of_a_killed_run(db, monkeypatc
 @pytest.mark.slow
 @pytest.mark.parametrize("change", ["parameters", "capture", "dictionary", "method", "schema"])
 def test_fit_take__uses_no_first_pass_that_would_be_another(killed, change, monkeypatch):
-    parameters, options = PARAMETERS, {}
+    parameters = PARAMETERS
+    options = {}
     if change == "parameters":
         parameters = replace(PARAMETERS, eta=1.31)
     elif change == "capture":

@@ -147,7 +147,8 @@ class _Disc:
     """Refuses to create files until it is repaired."""
 
     def __init__(self, monkeypatch, error):
-        self.error, self.create = OSError(error, "refused by the disk", "staging"), Folder.create
+        self.error = OSError(error, "refused by the disk", "staging")
+        self.create = Folder.create
         monkeypatch.setattr(Folder, "create", lambda *args, **options: self(*args, **options))
 
     def __call__(self, *args, **options):

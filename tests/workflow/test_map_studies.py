@@ -21,7 +21,8 @@ STEP = 0.1  # of R_d between the two groups
 @pytest.fixture(scope="module")
 def database(tmp_path_factory):
     """Eight subjects; men are darker by a constant everywhere."""
-    db, rng = Database(tmp_path_factory.mktemp("maps") / "db"), np.random.default_rng(0)
+    db = Database(tmp_path_factory.mktemp("maps") / "db")
+    rng = np.random.default_rng(0)
     for i in range(8):
         model = face_take(seed=i + 1)
         fitted = model["fitted"].to_dataset()

@@ -55,8 +55,12 @@ def test_population__of_a_bucket(db):
     assert db.has("model", "A")
     done = workflow.withdraw(db, "A")
     assert done.removed == {
-        "edit": 1, "model": 2, "population": 3, "release": 1, "summary": 2,
-    }  # fmt: skip
+        "edit": 1,
+        "model": 2,
+        "population": 3,
+        "release": 1,
+        "summary": 2,
+    }
     keys = [meta["path"] for page in obstore.list(db._place._store) for meta in page]
     assert len(keys) > 20
     for key in keys:

@@ -206,7 +206,8 @@ def test_map_takes__libraries_use_one_thread_on_every_engine(monkeypatch, worker
 
 
 def test_results_of__all_results_then_all_faults():
-    results, seen = results_of(map_takes(_mixed, range(6))), []
+    results = results_of(map_takes(_mixed, range(6)))
+    seen = []
     with pytest.raises(InputError) as error:
         seen.extend(results)
     assert seen == [1, 3, 5]

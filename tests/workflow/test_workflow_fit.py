@@ -67,11 +67,13 @@ def test_fit_take__refuses_without_consent_and_commits_nothing(tmp_path, skin):
 def test_fit_take__keeps_what_cohorts_need(tmp_path, skin, small_dictionary):
     db = _commit(tmp_path / "db", capture_of(skin))
     record = fit_take(db, "S1", SMALL, dictionary=small_dictionary)
-    tables, model = db.tables(record), db.read("model", "S1")
+    tables = db.tables(record)
+    model = db.read("model", "S1")
     fitted = model["fitted"].to_dataset()
     good = fitted["fit_status"].values == 0
     assert int(tables["prediction_surfels"].sel(region="face", status="fitted")) == good.sum()
-    area, colour = fitted["surfel_area"].values[good], fitted["diffuse_reflectance"].values[good]
+    area = fitted["surfel_area"].values[good]
+    colour = fitted["diffuse_reflectance"].values[good]
     trusted = int(tables["region_surfels"].sel(region="face"))
     if trusted == good.sum():
         want = np.average(colour, axis=0, weights=area)

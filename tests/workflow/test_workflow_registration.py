@@ -166,7 +166,8 @@ def test_current_registrations__a_database_made_anew_has_none_of_the_old(tmp_pat
     """Versions are identified by seals: the first model of the new database is the second one of the old."""
     monkeypatch.setattr("skindb.store.stage.require_inputs", lambda *_: [])  # no commit would accept this
     models = {"A": face_take()}
-    db, other = _stored(tmp_path, models), _stored(tmp_path / "other", models)
+    db = _stored(tmp_path, models)
+    other = _stored(tmp_path / "other", models)
     workflow.register_takes(other)
     _replace(db, "registration", "A", other.read("registration", "A"))
     assert current_registrations(db, ["A"]) == {}

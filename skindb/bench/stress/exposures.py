@@ -101,19 +101,27 @@ EXPOSURES = (
     Case("exposures", "all saturated", "The result is NaN and flagged.", _white),
     Case("exposures", "one of two saturated", "The other exposure is used.", _one_white),
     *each(
-        "exposures", "all black, value {}", "The result is flagged dark, and zero within its error.",
-        _no_exposure_black, 256, 250,
+        "exposures",
+        "all black, value {}",
+        "The result is flagged dark, and zero within its error.",
+        _no_exposure_black,
+        256,
+        250,
     ),
     Case("exposures", "no noise", "The result is the value over the time.", _dead_noise),
     Case(
-        "exposures", "shot noise unknown", "The result is the value over the time, with the error of quantisation.",
+        "exposures",
+        "shot noise unknown",
+        "The result is the value over the time, with the error of quantisation.",
         _shot_noise_unknown,
     ),
     *each("exposures", "times multiplied by {:g}", "Radiance and error are divided by it.", _scaled_times, *SCALES),
     *each("exposures", "{} x {} pixels", "Shapes and values are right.", _odd_sizes, (0, 4), (1, 1), (3, 7)),
     Case(
-        "exposures", "the same exposure twice", "The radiance is the same, and the error smaller by sqrt 2.",
+        "exposures",
+        "the same exposure twice",
+        "The radiance is the same, and the error smaller by sqrt 2.",
         _duplicates,
     ),
     *each("exposures", "a linear pixel is {}", "Only that pixel is NaN and flagged.", _linear, np.nan, np.inf),
-)  # fmt: skip
+)

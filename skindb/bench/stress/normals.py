@@ -44,7 +44,8 @@ def _matte_normals(method: str, eta: float) -> None:
 
 def _no_normals(method: str, value: float) -> None:
     skin = surfels()
-    found, whole = _normals(spoiled(skin, filled(value)), method), _normals(skin, method)
+    found = _normals(spoiled(skin, filled(value)), method)
+    whole = _normals(skin, method)
     expect(np.isnan(found[0]).all(), found[0])
     close(found[1:], whole[1:], atol=1e-7)
 
@@ -117,7 +118,8 @@ def _few_albedo(method: str, lights: int, cameras: int) -> None:
 
 def _no_albedo(method: str) -> None:
     skin = surfels()
-    found, whole = _albedo(spoiled(skin, filled(np.nan)), method)[0], _albedo(skin, method)[0]
+    found = _albedo(spoiled(skin, filled(np.nan)), method)[0]
+    whole = _albedo(skin, method)[0]
     expect(np.isnan(found[0]).all(), found[0])
     close(found[1:], whole[1:], rtol=1e-7)
 
@@ -155,31 +157,72 @@ def _no_surfels_albedo(method: str) -> None:
 
 
 NORMAL = (
-    *each("normals", "{}: 2400 samples of matte skin, eta {}", "Normals are accurate to half a degree.", _matte_normals,
-          *combinations(NORMALS[:3], 1.0, 1.3)),
-    *each("normals", "{}: all {}", "The normal is NaN; neighbours are unchanged.", _no_normals,
-          *combinations(NORMALS, np.nan, 0.0)),
-    *each("normals", "{}: {} light(s), {} camera", "The normal is NaN, or a unit vector near the scan.", _few_normals,
-          *combinations(NORMALS, (1, 1), (3, 1))),
-    *each("normals", "{}: samples times {:g}", "Normals are unchanged.", _scaled_normals,
-          *combinations(NORMALS, *SCALES)),
-    *each("normals", "{}: a sample is {}", "One sample changes the normal by less than half a degree.",
-          _one_sample_lost, *combinations(NORMALS[:3], np.nan, np.inf)),
+    *each(
+        "normals",
+        "{}: 2400 samples of matte skin, eta {}",
+        "Normals are accurate to half a degree.",
+        _matte_normals,
+        *combinations(NORMALS[:3], 1.0, 1.3),
+    ),
+    *each(
+        "normals",
+        "{}: all {}",
+        "The normal is NaN; neighbours are unchanged.",
+        _no_normals,
+        *combinations(NORMALS, np.nan, 0.0),
+    ),
+    *each(
+        "normals",
+        "{}: {} light(s), {} camera",
+        "The normal is NaN, or a unit vector near the scan.",
+        _few_normals,
+        *combinations(NORMALS, (1, 1), (3, 1)),
+    ),
+    *each(
+        "normals", "{}: samples times {:g}", "Normals are unchanged.", _scaled_normals, *combinations(NORMALS, *SCALES)
+    ),
+    *each(
+        "normals",
+        "{}: a sample is {}",
+        "One sample changes the normal by less than half a degree.",
+        _one_sample_lost,
+        *combinations(NORMALS[:3], np.nan, np.inf),
+    ),
     Case("normals", "constant", "Normals are unit vectors or NaN.", _even_light),
     *each("normals", "{}: no normal of the scan", "The normal is NaN.", _no_scan, *NORMALS[:3]),
     Case("normals", "no surfels", "Arrays are empty and have the right shapes.", _no_surfels_normals),
-)  # fmt: skip
+)
 ALBEDO = (
-    *each("albedo", "{}: 2400 samples of matte skin, eta {}", "R_d is accurate to rounding.",
-          _matte_albedo, *combinations(METHODS, 1.0, 1.3)),
-    *each("albedo", "{}: {} light(s), {} camera", "R_d and its error are NaN.",
-          _few_albedo, *combinations(METHODS, (1, 1), (3, 1))),
+    *each(
+        "albedo",
+        "{}: 2400 samples of matte skin, eta {}",
+        "R_d is accurate to rounding.",
+        _matte_albedo,
+        *combinations(METHODS, 1.0, 1.3),
+    ),
+    *each(
+        "albedo",
+        "{}: {} light(s), {} camera",
+        "R_d and its error are NaN.",
+        _few_albedo,
+        *combinations(METHODS, (1, 1), (3, 1)),
+    ),
     *each("albedo", "{}: all saturated", "R_d is NaN; neighbours are unchanged.", _no_albedo, *METHODS),
-    *each("albedo", "{}: a sample is {}", "One sample of 240 changes R_d by less than 1e-3.", _one_albedo_lost,
-          *combinations(METHODS, np.nan, np.inf)),
-    *each("albedo", "{}: samples times {:g}", "R_d is clamped to the range of eq. 5.", _clamped_albedo,
-          *combinations(METHODS, 0.0, 1e-30, 1e3, 1e30)),
+    *each(
+        "albedo",
+        "{}: a sample is {}",
+        "One sample of 240 changes R_d by less than 1e-3.",
+        _one_albedo_lost,
+        *combinations(METHODS, np.nan, np.inf),
+    ),
+    *each(
+        "albedo",
+        "{}: samples times {:g}",
+        "R_d is clamped to the range of eq. 5.",
+        _clamped_albedo,
+        *combinations(METHODS, 0.0, 1e-30, 1e3, 1e30),
+    ),
     *each("albedo", "{}: grazing lights", "Their samples are ignored.", _grazing_albedo, *METHODS),
     *each("albedo", "{}: any precision", "Results agree to rounding.", _precision_albedo, *METHODS),
     *each("albedo", "{}: no surfels", "Arrays are empty and have the right shapes.", _no_surfels_albedo, *METHODS),
-)  # fmt: skip
+)

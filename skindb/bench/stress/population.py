@@ -31,14 +31,16 @@ def _texture(scale: float) -> None:
     wanted = gaussian_filter(image.T, 2)
     every = [[np.ones(part.shape) for part in image_parts(x, 3)] for x in (image, wanted)]
     before, after = (part_quantiles(image_parts(x, 3), one) for x, one in zip((image, wanted), every, strict=True))
-    image, shift = scale * image, scale * (after - before)[None]
+    image = scale * image
+    shift = scale * (after - before)[None]
     found = synthesise(image, [np.ones((64, 64))], shift, levels=3, iterations=2, rng=np.random.default_rng(0))
     expect(np.isfinite(found.image).all() and found.trace[-1] < found.trace[0], found.trace)
 
 
 def _flat_texture() -> None:
     shift = np.sort(_noise(1, 15, QUANTILES))
-    blank, rng = np.zeros((64, 64)), np.random.default_rng(0)
+    blank = np.zeros((64, 64))
+    rng = np.random.default_rng(0)
     found = synthesise(blank, [np.ones((64, 64))], shift, levels=3, iterations=3, rng=rng)
     expect(np.isfinite(found.image).all() and found.image.std() > 0.1, found.image.std())
 
@@ -68,14 +70,17 @@ def _vectors(scale: float) -> None:
 
 
 def _scaled(scale: float) -> None:
-    values, group = _noise(20, 4), (np.arange(20) % 2).astype(float)
-    one, other = effects(values, group), effects(scale * values, group)
+    values = _noise(20, 4)
+    group = (np.arange(20) % 2).astype(float)
+    one = effects(values, group)
+    other = effects(scale * values, group)
     close(other.slope, scale * one.slope, rtol=1e-9)
     close(other.statistic, one.statistic, rtol=1e-9)
 
 
 def _equal_values() -> None:
-    values, group = np.ones((10, 2)), (np.arange(10) % 2).astype(float)
+    values = np.ones((10, 2))
+    group = (np.arange(10) % 2).astype(float)
     found = effects(values, group)
     close(found.slope, [0.0, 0.0], atol=1e-15)
     p, adjusted, _ = permutation_p(values, group, most=200, rng=np.random.default_rng(0))
@@ -93,7 +98,9 @@ POPULATION: tuple[Case, ...] = (
     Case("pyramid", "constant image", "No band has any detail.", lambda: _constant(1e6)),
     *(
         Case(
-            "pyramid", f"{height} x {width}, values of {scale:g}", "A round trip returns the image.",
+            "pyramid",
+            f"{height} x {width}, values of {scale:g}",
+            "A round trip returns the image.",
             lambda h=height, w=width, s=scale: _round_trip(h, w, s),  # type: ignore[misc]
         )
         for height, width, scale in [(64, 64, s) for s in SCALES] + [(63, 50, 1.0), (1, 17, 1.0), (2, 300, 1.0)]
@@ -107,4 +114,4 @@ POPULATION: tuple[Case, ...] = (
     *each("permutations", "values of {:g}", "Effects scale, statistics do not.", _scaled, *SCALES),
     Case("permutations", "equal subjects", "The effect is 0 and p is 1.", _equal_values),
     Case("permutations", "groups a million apart", "p is small, and not below 1 / (n + 1).", _far_apart),
-)  # fmt: skip
+)

@@ -110,7 +110,8 @@ def _gain(model: str, gain: float) -> None:
 
 def _near_and_far(model: str, factor: float) -> None:
     """If all lengths are multiplied by `factor`, the fitted coefficients are divided by it."""
-    a, s = MEDIUM[0] / factor, MEDIUM[1] / factor
+    a = MEDIUM[0] / factor
+    s = MEDIUM[1] / factor
     fit = _probe(model, _profile(model, a, s, FIBRES * factor), distance=FIBRES * factor)
     _is_truth(fit, a, s, rtol=5e-3)
 
@@ -127,26 +128,68 @@ def _zero_error(model: str) -> None:
 
 PROBE = (
     *each("probe", "{}: {} fibres", RECOVERED, _enough_fibres, *combinations(PROBES, 5, 28)),
-    *each("probe", "{}: 3 fibres", "Coefficients are recovered, or a status is set: three values may be ambiguous.",
-          _three_fibres, *PROBES),
-    *each("probe", "{}: only {} fibres", "The fit is refused with a status.", _too_few_fibres,
-          *combinations(PROBES, 0, 1, 2)),
+    *each(
+        "probe",
+        "{}: 3 fibres",
+        "Coefficients are recovered, or a status is set: three values may be ambiguous.",
+        _three_fibres,
+        *PROBES,
+    ),
+    *each(
+        "probe",
+        "{}: only {} fibres",
+        "The fit is refused with a status.",
+        _too_few_fibres,
+        *combinations(PROBES, 0, 1, 2),
+    ),
     *each("probe", "{}: 2400 readings", RECOVERED, _many_readings, *PROBES),
-    *each("probe", "{}: two fibres {}", "They are excluded, and coefficients are recovered from the others.",
-          _bad_fibre, *combinations(PROBES, np.nan, np.inf, 0.0, -1.0)),
-    *each("probe", "{}: two errors {}", "They are excluded, and coefficients are recovered from the others.",
-          _bad_error, *combinations(PROBES, np.nan, np.inf)),
-    *each("probe", "{}: all {}", "The fit is refused with a status.", _dead_probe,
-          *combinations(PROBES, 0.0, np.nan, np.inf, -1.0)),
-    *each("probe", "{}: sigma_a {:g}, sigma_s' {:g}", "sigma_tr is within 2 % or three errors, or flagged.", _medium,
-          *combinations(
-              PROBES, (0.0, 2.0), (1e-8, 2.0), (1e-6, 2.0), (0.1, 1e-4), (0.1, 1e-3), (20.0, 1.0), (1e-3, 50.0)
-          )),
+    *each(
+        "probe",
+        "{}: two fibres {}",
+        "They are excluded, and coefficients are recovered from the others.",
+        _bad_fibre,
+        *combinations(PROBES, np.nan, np.inf, 0.0, -1.0),
+    ),
+    *each(
+        "probe",
+        "{}: two errors {}",
+        "They are excluded, and coefficients are recovered from the others.",
+        _bad_error,
+        *combinations(PROBES, np.nan, np.inf),
+    ),
+    *each(
+        "probe",
+        "{}: all {}",
+        "The fit is refused with a status.",
+        _dead_probe,
+        *combinations(PROBES, 0.0, np.nan, np.inf, -1.0),
+    ),
+    *each(
+        "probe",
+        "{}: sigma_a {:g}, sigma_s' {:g}",
+        "sigma_tr is within 2 % or three errors, or flagged.",
+        _medium,
+        *combinations(
+            PROBES, (0.0, 2.0), (1e-8, 2.0), (1e-6, 2.0), (0.1, 1e-4), (0.1, 1e-3), (20.0, 1.0), (1e-3, 50.0)
+        ),
+    ),
     *each("probe", "{}: constant", "The fit is flagged, or has a large residual.", _flat_profile, *PROBES),
-    *each("probe", "{}: gain {:g}", "The gain is recovered, or the status says that it is out of range.", _gain,
-          *combinations(PROBES, 1e-6, 1e6), ("dipole", 1e-30), ("dipole", 1e30)),
-    *each("probe", "{}: distances times {:g}", "Coefficients are divided by it.", _near_and_far,
-          *combinations(PROBES, 0.2, 3.0)),
+    *each(
+        "probe",
+        "{}: gain {:g}",
+        "The gain is recovered, or the status says that it is out of range.",
+        _gain,
+        *combinations(PROBES, 1e-6, 1e6),
+        ("dipole", 1e-30),
+        ("dipole", 1e30),
+    ),
+    *each(
+        "probe",
+        "{}: distances times {:g}",
+        "Coefficients are divided by it.",
+        _near_and_far,
+        *combinations(PROBES, 0.2, 3.0),
+    ),
     *each("probe", "{}: eta 1", RECOVERED, _matched_index, "dipole"),
     *each("probe", "{}: errors of zero", RECOVERED, _zero_error, *PROBES),
-)  # fmt: skip
+)

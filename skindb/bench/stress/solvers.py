@@ -38,7 +38,8 @@ def _as_scipy(rows: Array, target: Array) -> None:
     fit = _fit(rows, target)
     M = np.repeat(rows.astype(np.float64), 3, axis=0)
     expect(fit.status[0] == 0 and fit.kkt[0] < KKT, (fit.status, fit.kkt))
-    ours, theirs = np.linalg.norm(M @ fit.weight[0] - target.ravel()), nnls(M, target.ravel())[1]
+    ours = np.linalg.norm(M @ fit.weight[0] - target.ravel())
+    theirs = nnls(M, target.ravel())[1]
     expect(ours <= theirs * (1 + ROUNDING) + 1e-14 * np.linalg.norm(target), (ours, theirs))
 
 
@@ -56,7 +57,8 @@ def _columns(change: str) -> None:
     rows, target = _rows(60)
     extra = {"zero": 0 * rows[:, :1], "duplicate": rows[:, :1], "collinear": rows[:, :1] + rows[:, 1:2]}[change]
     _as_scipy(np.concatenate([rows, extra, extra], axis=1), target)
-    more, less = _fit(np.concatenate([extra, rows], axis=1), target), _fit(rows, target)
+    more = _fit(np.concatenate([extra, rows], axis=1), target)
+    less = _fit(rows, target)
     # a redundant column does not change the residual (a collinear one may, as it is a new mixture)
     if change != "collinear":
         close(more.residual, less.residual, rtol=1e-6)
@@ -79,16 +81,19 @@ def _scaled_samples(mode: str, scale: float) -> None:
 def _scaled_columns(scale: float) -> None:
     rows, target = _rows(60)
     factor = np.geomspace(1, scale, rows.shape[1])
-    M, r = np.repeat(rows.astype(np.float64), 3, axis=0) * factor, target.ravel()
+    M = np.repeat(rows.astype(np.float64), 3, axis=0) * factor
+    r = target.ravel()
     x, kkt, _, met = solve_nnls((M.T @ M)[None], (M.T @ r)[None])
     expect(met[0] and kkt[0] < KKT, kkt)
-    ours, theirs = np.linalg.norm(M @ x[0] - r), nnls(M / factor, r)[1]
+    ours = np.linalg.norm(M @ x[0] - r)
+    theirs = nnls(M / factor, r)[1]
     expect(ours <= theirs * (1 + ROUNDING), (ours, theirs))
 
 
 def _not_finite(mode: str, bad: float) -> None:
     rows, target = _rows(40)
-    both, offsets = np.concatenate([rows, rows]), np.array([0, 40, 80])
+    both = np.concatenate([rows, rows])
+    offsets = np.array([0, 40, 80])
     spoiled = np.concatenate([target, target])
     spoiled[3, 1] = bad
     fit = fit_reflectance(both, offsets, spoiled, None, np.eye(6), mode=mode, noise_floor=1e-3)  # type: ignore[arg-type]
@@ -152,7 +157,8 @@ def _scaled_weights(scale: float) -> None:
 
 
 def _scaled_in_metric(scale: float) -> None:
-    X, A = _planted(), np.eye(12) + 0.5
+    X = _planted()
+    A = np.eye(12) + 0.5
     close(_factors(X * scale, 3, A).H, _factors(X, 3, A).H, atol=1e-3)
     close(_factors(X, 3, A * scale).H, _factors(X, 3, A).H, atol=1e-3)
 
@@ -213,25 +219,37 @@ def _samples(n: int) -> None:
     _as_scipy(*_rows(n))
 
 
-MODES, SPACES = ("linear", "perceptual"), ("weights", "metric")
+MODES = ("linear", "perceptual")
+SPACES = ("weights", "metric")
 BOTH = [(mode, s) for mode in MODES for s in SCALES]
 SOLVERS = (
     Case("surface", "solver: 0 samples", "Nothing is fitted, and the status says so.", _no_rows),
     Case("surface", "solver: fewer than required", "Too few samples give a status, not a fit.", _few_are_refused),
     *each("surface", "solver: {} samples", "Certified, and no worse than SciPy.", _samples, 1, 3, 2400),
     *each(
-        "surface", "solver: {} bases", "No worse than SciPy; redundant bases change nothing.", _columns,
-        "zero", "duplicate", "collinear",
+        "surface",
+        "solver: {} bases",
+        "No worse than SciPy; redundant bases change nothing.",
+        _columns,
+        "zero",
+        "duplicate",
+        "collinear",
     ),
     *each("surface", "solver: {}, bases times {:g}", "Weights are divided by it.", _scaled_rows, *BOTH),
     *each("surface", "solver: {}, samples times {:g}", "Weights are multiplied by it.", _scaled_samples, *BOTH),
     *each("surface", "solver: bases from 1 to {:g}", "No worse than SciPy on equal scales.", _scaled_columns, *SCALES),
     *each(
-        "surface", "solver: {}, a sample is {}", "Its surfel is NaN with a status; its neighbour is unchanged.",
-        _not_finite, *((mode, bad) for mode in MODES for bad in (np.nan, np.inf, -np.inf)),
+        "surface",
+        "solver: {}, a sample is {}",
+        "Its surfel is NaN with a status; its neighbour is unchanged.",
+        _not_finite,
+        *((mode, bad) for mode in MODES for bad in (np.nan, np.inf, -np.inf)),
     ),
     *each(
-        "surface", "solver: {}, all samples {:g}", "Black and negative samples give weights of exactly zero.", _black,
+        "surface",
+        "solver: {}, all samples {:g}",
+        "Black and negative samples give weights of exactly zero.",
+        _black,
         *((mode, level) for mode in MODES for level in (0.0, -1.0)),
     ),
     Case("surface", "solver: single precision", "Weights are the same to rounding.", _single_precision),
@@ -248,4 +266,4 @@ SOLVERS = (
     Case("nmf", "a BRDF of zero", "A singular metric still gives a basis.", _zero_basis_in_metric),
     *each("nmf", "a weight is {}", "Refused with the rule.", _bad_weights, np.nan, np.inf, -1.0),
     Case("nmf", "duplicates", "Components are the same, divided equally between duplicates.", _duplicates),
-)  # fmt: skip
+)

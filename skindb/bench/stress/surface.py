@@ -50,13 +50,15 @@ def _few(lights: int, cameras: int) -> None:
 
 def _unseen_surfel(mode: str) -> None:
     skin = surfels()
-    found, whole = weights(spoiled(skin, filled(np.nan)), mode), weights(skin, mode)
+    found = weights(spoiled(skin, filled(np.nan)), mode)
+    whole = weights(skin, mode)
     expect(found.status.tolist() == [FitStatus.UNSEEN, 0, 0] and np.isnan(found.weight[0]).all(), found.status)
     np.testing.assert_array_equal(found.weight[1:], whole.weight[1:])
 
 
 def _infinite(bad: float) -> None:
-    found, whole = weights(first(surfels(), bad)), weights(surfels())
+    found = weights(first(surfels(), bad))
+    whole = weights(surfels())
     expect(found.status.tolist() == [FitStatus.NOT_FINITE, 0, 0] and np.isnan(found.weight[0]).all(), found.status)
     np.testing.assert_array_equal(found.weight[1:], whole.weight[1:])
 
@@ -72,7 +74,8 @@ def _geometry_nan(field: str, status: FitStatus) -> None:
     skin = surfels()
     spoiled = getattr(skin, field).copy()
     spoiled[0] = np.nan
-    found, whole = weights(replace(skin, **{field: spoiled})), weights(skin)
+    found = weights(replace(skin, **{field: spoiled}))
+    whole = weights(skin)
     expect(found.status.tolist() == [status, 0, 0] and np.isnan(found.weight[0]).all(), found.status)
     np.testing.assert_array_equal(found.weight[1:], whole.weight[1:])
 
@@ -190,25 +193,61 @@ def _refit_nothing() -> None:
 
 SURFACE = (
     *each("surface", "2400 samples, {}", "The planted weights are recovered.", _recovers, *MODES),
-    *each("surface", "{} light(s), {} camera", "Too few samples are refused; with a lower limit, no worse than SciPy.",
-          _few, (1, 1), (3, 1)),
-    *each("surface", "all saturated, {}", "Weights are NaN with a status; neighbours are identical.",
-          _unseen_surfel, *MODES),
-    *each("surface", "a sample is {}", "Weights are NaN with a status; neighbours are identical.",
-          _infinite, np.inf, -np.inf),
+    *each(
+        "surface",
+        "{} light(s), {} camera",
+        "Too few samples are refused; with a lower limit, no worse than SciPy.",
+        _few,
+        (1, 1),
+        (3, 1),
+    ),
+    *each(
+        "surface",
+        "all saturated, {}",
+        "Weights are NaN with a status; neighbours are identical.",
+        _unseen_surfel,
+        *MODES,
+    ),
+    *each(
+        "surface",
+        "a sample is {}",
+        "Weights are NaN with a status; neighbours are identical.",
+        _infinite,
+        np.inf,
+        -np.inf,
+    ),
     Case("surface", "a sample is NaN", "The sample is excluded, and nothing else changes.", _one_nan),
-    *each("surface", "{} is NaN: {!r}", "The status gives the reason; neighbours are identical.", _geometry_nan,
-          ("position", FitStatus.NOT_FINITE), ("normal", FitStatus.TOO_FEW_SAMPLES),
-          ("diffuse", FitStatus.NO_DIFFUSE_ESTIMATE)),
+    *each(
+        "surface",
+        "{} is NaN: {!r}",
+        "The status gives the reason; neighbours are identical.",
+        _geometry_nan,
+        ("position", FitStatus.NOT_FINITE),
+        ("normal", FitStatus.TOO_FEW_SAMPLES),
+        ("diffuse", FitStatus.NO_DIFFUSE_ESTIMATE),
+    ),
     *each("surface", "all black, {}", "Weights are exactly zero.", _black_surfel, *MODES),
     *each("surface", "matte skin, eta {}", "Weights of the surface are zero.", _matte, 1.0, 1.3, 1.5),
-    *each("surface", "R_d {:g}", "Weights are flagged as clamped, finite and not negative.", _albedo_bound,
-          SMALLEST_R_D, LARGEST_R_D),
+    *each(
+        "surface",
+        "R_d {:g}",
+        "Weights are flagged as clamped, finite and not negative.",
+        _albedo_bound,
+        SMALLEST_R_D,
+        LARGEST_R_D,
+    ),
     Case("surface", "grazing lights", "Their samples are ignored.", _grazing_lights),
     Case("surface", "lights behind", "Their samples are ignored.", _behind),
     *each("surface", "{} samples", "Reflectance is the same as from half floats.", _precision, "float32", "float64"),
-    *each("surface", "{} tables", "The fit is certified and exact, and zero tables have zero weight.",
-          _extra_tables, "zero", "duplicate", "collinear"),
+    *each(
+        "surface",
+        "{} tables",
+        "The fit is certified and exact, and zero tables have zero weight.",
+        _extra_tables,
+        "zero",
+        "duplicate",
+        "collinear",
+    ),
     Case("surface", "rank above the bases", "The weights are those of the exact tables.", _rank_above),
     Case("surface", "rank above that of the tables", "The fit is finite and correct.", _rank_of_one_material),
     Case("surface", "no surfels", "Arrays are empty and have the right shapes.", _no_surfels),
@@ -216,4 +255,4 @@ SURFACE = (
     *each("refit", "k above the rank, {}", "Duplicates divide the weight, a black component has none.", _twins, *MODES),
     *each("refit", "component times {:g}", "Weights are divided by it.", _scaled_basis, *SCALES),
     Case("refit", "all saturated", "Weights are NaN with a status.", _refit_nothing),
-)  # fmt: skip
+)

@@ -27,7 +27,8 @@ DIFFUSE = np.array([0.5, 0.33, 0.24])
 def spiral(n: int, top: float) -> Array:
     """(n, 3) directions, evenly spread around +z down to the cosine `top`."""
     z = 1 - (np.arange(n) + 0.5) / n * (1 - top)
-    phi, r = np.pi * (3 - np.sqrt(5)) * np.arange(n), np.sqrt(1 - z * z)
+    phi = np.pi * (3 - np.sqrt(5)) * np.arange(n)
+    r = np.sqrt(1 - z * z)
     return np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=1)
 
 
@@ -69,10 +70,13 @@ def surfels(lights: int = 40, cameras: int = 6, *, eta: float = ETA, weight: Arr
     """Three surfels with different positions and normals; `weight` (6,) of the six materials."""
     position = np.array([[0.0, 0, 0], [40, 10, -5], [-30, 20, -8]])
     normal = unit(np.array([[0.0, 0, 1], [0.3, 0.1, 1], [-0.2, 0.2, 1]]))
-    light, camera = 900 * spiral(lights, 0.6), 800 * spiral(cameras, 0.7)
+    light = 900 * spiral(lights, 0.6)
+    camera = 800 * spiral(cameras, 0.7)
     diffuse = np.tile(DIFFUSE, (3, 1))
-    wi, wo = unit(light - position[:, None]), unit(camera - position[:, None])
-    ci, co = np.einsum("nk,ntk->nt", normal, wi), np.einsum("nk,ntk->nt", normal, wo)
+    wi = unit(light - position[:, None])
+    wo = unit(camera - position[:, None])
+    ci = np.einsum("nk,ntk->nt", normal, wi)
+    co = np.einsum("nk,ntk->nt", normal, wo)
     a, b, n = np.broadcast_arrays(wi[:, :, None], wo[:, None], normal[:, None, None])
     surface = lookup(six(), *half_difference(a, b, n)) @ weight
     through = fresnel_transmittance(ci, eta)[:, :, None] * fresnel_transmittance(co, eta)[:, None]
@@ -110,9 +114,11 @@ def first(skin: Surfels, value: float) -> Surfels:
 
 def rows(skin: Surfels, s: int) -> tuple[Array, Array]:
     """Rows and targets of one surfel, computed with NumPy."""
-    wi, wo = unit(skin.light - skin.position[s]), unit(skin.camera - skin.position[s])
+    wi = unit(skin.light - skin.position[s])
+    wo = unit(skin.camera - skin.position[s])
     a, b = np.broadcast_arrays(wi[:, None], wo[None])
-    ci, co = wi @ skin.normal[s], wo @ skin.normal[s]
+    ci = wi @ skin.normal[s]
+    co = wo @ skin.normal[s]
     M = lookup(six(), *half_difference(a, b, skin.normal[s])) * ci[:, None, None]
     shape = (ci * fresnel_transmittance(ci, ETA))[:, None] * fresnel_transmittance(co, ETA) / np.pi
     target = skin.sample[s].astype(np.float64) - shape[..., None] * skin.diffuse[s]

@@ -67,7 +67,8 @@ def _grazing_rows(height: float) -> None:
 
 
 def _special_rows() -> None:
-    up, down = [0.0, 0.0, 1.0], [0.0, 0.0, -1.0]
+    up = [0.0, 0.0, 1.0]
+    down = [0.0, 0.0, -1.0]
     close(_row_of(up, up), [[1.0, 1.0]], rtol=1e-6)  # light, camera and normal coincide, so phi_d is undefined
     expect(len(_row_of(down, up)) == len(_row_of(up, down)) == 0, "a row from below")
     expect(len(_row_of([np.nan, 0, 1], up)) == len(_row_of(up, [np.inf, 0, 1])) == 0, "a row of no finite direction")
@@ -75,14 +76,40 @@ def _special_rows() -> None:
 
 
 TABLES = (
-    *each("disc", "a table of {1:g}, disc of {0} rad", "A constant is unchanged.", _even_table,
-          (0.014, 0.0), (0.014, 0.25), (0.3, 0.25), (0.014, 1e-30), (0.014, 1e30)),
+    *each(
+        "disc",
+        "a table of {1:g}, disc of {0} rad",
+        "A constant is unchanged.",
+        _even_table,
+        (0.014, 0.0),
+        (0.014, 0.25),
+        (0.3, 0.25),
+        (0.014, 1e-30),
+        (0.014, 1e30),
+    ),
     Case("disc", "no disc", "The tables are unchanged, also in the limit.", _no_disc),
     *each("disc", "tables times {:g}", "Averages are multiplied by it.", _scaled_table, *SCALES),
-    *each("disc", "a disc of {} rad", "Averages lie between the extremes; sharp lobes are lowered.",
-          _between_extremes, 0.05, 0.5),
-    *each("surface", "rows: light {:g} above the horizon", "A row is the table's value times the cosine.",
-          _grazing_rows, 1e-8, 1e-4, 0.02),
-    Case("surface", "rows: overhead, mirror, below, not finite", "Rows are one, the cosine, none and none.",
-         _special_rows),
-)  # fmt: skip
+    *each(
+        "disc",
+        "a disc of {} rad",
+        "Averages lie between the extremes; sharp lobes are lowered.",
+        _between_extremes,
+        0.05,
+        0.5,
+    ),
+    *each(
+        "surface",
+        "rows: light {:g} above the horizon",
+        "A row is the table's value times the cosine.",
+        _grazing_rows,
+        1e-8,
+        1e-4,
+        0.02,
+    ),
+    Case(
+        "surface",
+        "rows: overhead, mirror, below, not finite",
+        "Rows are one, the cosine, none and none.",
+        _special_rows,
+    ),
+)
