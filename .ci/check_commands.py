@@ -1,9 +1,11 @@
-"""Run the quick commands and the Python blocks of the documentation pages on a copy of the database of `make demo`.
+"""Run the quick commands and the Python blocks of the documentation pages on a copy of
+the database of `make demo`.
 
     python .ci/check_commands.py
 
-`check_docs.py` parses all commands of the pages; this program runs those that finish within seconds on a fitted
-database, which is called `faces` as in the pages. `check_readme.py` runs the commands of the README.
+`check_docs.py` parses all commands of the pages; this program runs those that finish
+within seconds on a fitted database, which is called `faces` as in the pages.
+`check_readme.py` runs the commands of the README.
 """
 
 from __future__ import annotations
@@ -18,11 +20,15 @@ from shutil import copytree
 
 from check_docs import ROOT, commands, pages
 
-READ_ONLY = {"info", "verify", "show", "compare", "analyze", "release", "dictionary"}  # or add a study or a release
+# or add a study or a release
+READ_ONLY = {"info", "verify", "show", "compare", "analyze", "release", "dictionary"}
 LAST = {"clean", "consent"}  # change what later commands find
-SLOW = {"brdf", "albedo", "traits", "maps", "surface", "chromophores", "components"}  # studies of more than seconds
-TAKES = {"S01": "V001", "S02": "V002", "P010": "V003"}  # takes of the pages, and those of the demo
-TOO_FEW = "the subjects must determine the effect"  # the demo has six subjects; some comparisons need more
+# studies of more than seconds
+SLOW = {"brdf", "albedo", "traits", "maps", "surface", "chromophores", "components"}
+# takes of the pages, and those of the demo
+TAKES = {"S01": "V001", "S02": "V002", "P010": "V003"}
+# the demo has six subjects; some comparisons need more
+TOO_FEW = "the subjects must determine the effect"
 
 
 def is_run(words: list[str]) -> bool:
@@ -31,7 +37,11 @@ def is_run(words: list[str]) -> bool:
         return False
     if words[1:] == ["dictionary"]:
         return True
-    quick = words[1] in READ_ONLY | LAST or "--dry-run" in words or (words[1:2] == ["fit"] and "--explain" in words)
+    quick = (
+        words[1] in READ_ONLY | LAST
+        or "--dry-run" in words
+        or (words[1:2] == ["fit"] and "--explain" in words)
+    )
     return quick and words[2:3] in (["faces"], ["demo/db"])
 
 
@@ -53,15 +63,23 @@ def calls() -> list[list[str]]:
 
 def main() -> int:
     """Run the commands, and stop at the first one that fails."""
-    env = os.environ | {"PATH": f"{ROOT / '.venv/bin'}{os.pathsep}{os.environ['PATH']}", "MPLBACKEND": "agg"}
+    env = os.environ | {
+        "PATH": f"{ROOT / '.venv/bin'}{os.pathsep}{os.environ['PATH']}",
+        "MPLBACKEND": "agg",
+    }
     with tempfile.TemporaryDirectory() as folder:
         copytree(ROOT / "demo/db", Path(folder) / "demo/db")
         (Path(folder) / "faces").symlink_to("demo/db")
         found = calls()
         for call in found:
-            done = subprocess.run(call, cwd=folder, env=env, capture_output=True, text=True, check=False)
+            done = subprocess.run(
+                call, cwd=folder, env=env, capture_output=True, text=True, check=False
+            )
             if done.returncode and TOO_FEW not in done.stderr:
-                sys.stderr.write(f"{' '.join(call)}\n{done.stdout}{done.stderr}this command of the pages failed\n")
+                sys.stderr.write(
+                    f"{' '.join(call)}\n{done.stdout}{done.stderr}this command of "
+                    "the pages failed\n"
+                )
                 return 1
     sys.stdout.write(f"{len(found)} commands and Python blocks of the pages run\n")
     return 0 if found else 1

@@ -1,18 +1,20 @@
-"""Check the documentation: wording, commands, links, and that all results have a command that reproduces them.
+"""Check the documentation: wording, commands, links, and that all results have a
+command that reproduces them.
 
     python .ci/check_docs.py
 
 Links between pages of the site are checked by Sphinx (`make docs`). This program checks
 
-* that pages, changelog, notebooks, help texts, and the comments, docstrings and messages of the code and of the tests
-  use common technical terms (`TERMS`);
-* that every `skindb` command in a block marked bash, console or sh exists and accepts its options and arguments, and
-  that scripts, tests and make targets in such blocks exist;
+* that pages, changelog, notebooks, help texts, and the comments, docstrings and
+  messages of the code and of the tests use common technical terms (`TERMS`);
+* that every `skindb` command in a block marked bash, console or sh exists and accepts
+  its options and arguments, and that scripts, tests and make targets in such blocks
+  exist;
 * that every section with figures in the pages of results shows a command;
 * that links in README, CHANGELOG and CONTRIBUTING refer to existing files.
 
-It prints one line for each fault, and its exit code is 1 if there are any. No command is run; `check_commands.py` runs
-the quick ones.
+It prints one line for each fault, and its exit code is 1 if there are any. No command
+is run; `check_commands.py` runs the quick ones.
 """
 
 from __future__ import annotations
@@ -32,7 +34,12 @@ from skindb.cli import cli
 from skindb.errors import InputError
 
 ROOT = Path(__file__).resolve().parents[1]
-GENERATED = ("docs/_build", "docs/api/generated", "docs/notebooks", "docs/reference/commands.md")
+GENERATED = (
+    "docs/_build",
+    "docs/api/generated",
+    "docs/notebooks",
+    "docs/reference/commands.md",
+)
 RESULTS = ("docs/validation.md", "docs/performance.md", "docs/reliability.md")
 
 ONCE = r"[(;,] ?once[);:,]"  # of a figure on a page; in the code it is a common word
@@ -60,7 +67,11 @@ TERMS = {
     r"\bthe way of the data\b": "data flow",
     r"\bsmall hours\b|\bhand in hand\b": "a plain description",
 }
-TEXTS = {tokenize.COMMENT, tokenize.STRING, getattr(tokenize, "FSTRING_MIDDLE", tokenize.STRING)}
+TEXTS = {
+    tokenize.COMMENT,
+    tokenize.STRING,
+    getattr(tokenize, "FSTRING_MIDDLE", tokenize.STRING),
+}
 CODE = re.compile(r"^(```|~~~).*?^\1|^(?: {4}|\t).*?$|`[^`]*`|\]\([^)]*\)", re.S | re.M)
 BLOCK = re.compile(r"^```(?:bash|console|sh)\n(.*?)^```", re.S | re.M)
 
@@ -71,13 +82,24 @@ def pages() -> list[Path]:
         *sorted((ROOT / "docs").rglob("*.md")),
         *(ROOT / f"{n}.md" for n in ("README", "CHANGELOG", "CONTRIBUTING")),
     ]
-    return [page for page in found if not page.relative_to(ROOT).as_posix().startswith(GENERATED)]
+    return [
+        page
+        for page in found
+        if not page.relative_to(ROOT).as_posix().startswith(GENERATED)
+    ]
 
 
 def sources() -> list[Path]:
-    """Python files whose comments and strings are read; this program and its tests contain the terms."""
+    """Python files whose comments and strings are read; this program and its tests
+    contain the terms.
+    """
     folders = ("skindb", "tests", "benchmarks")
-    return sorted(p for f in folders for p in (ROOT / f).rglob("*.py") if p.name != "test_check_docs.py")
+    return sorted(
+        p
+        for f in folders
+        for p in (ROOT / f).rglob("*.py")
+        if p.name != "test_check_docs.py"
+    )
 
 
 def blank(match: re.Match[str]) -> str:
@@ -99,9 +121,12 @@ def source_faults(where: str, source: str) -> Iterator[str]:
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         if token.type not in TEXTS:
             continue
-        text = re.sub(r"`[^`]*`|\{[^}]*\}", "", token.string)  # code, and values in messages
+        # code, and values in messages
+        text = re.sub(r"`[^`]*`|\{[^}]*\}", "", token.string)
         for pattern, term in TERMS.items():
-            if pattern != ONCE and (match := re.search(pattern.replace(" ", r"\s+"), text, re.I)):
+            if pattern != ONCE and (
+                match := re.search(pattern.replace(" ", r"\s+"), text, re.I)
+            ):
                 line = token.start[0] + text.count("\n", 0, match.start())
                 yield f"{where}:{line}: {' '.join(match.group().split())!r}; write: {term}"
 
@@ -139,17 +164,27 @@ def command_fault(words: list[str]) -> str:
     """Description of the fault of a command; empty if there is none."""
     if words[0] == "skindb":
         return skindb_fault(words[1:])
-    if words[0] == "make" and len(words) > 1 and f"\n{words[1]}:" not in (ROOT / "Makefile").read_text("utf-8"):
+    if (
+        words[0] == "make"
+        and len(words) > 1
+        and f"\n{words[1]}:" not in (ROOT / "Makefile").read_text("utf-8")
+    ):
         return f"the Makefile has no target {words[1]}"
     own = ("benchmarks/", "tests/", "docs/", ".ci/")
-    missing = [word for word in words[1:] if word.startswith(own) and not (ROOT / word).exists()]
+    missing = [
+        word
+        for word in words[1:]
+        if word.startswith(own) and not (ROOT / word).exists()
+    ]
     if words[0] in {"python", "pytest"} and missing:
         return f"{missing[0]} does not exist"
     return ""
 
 
 def skindb_fault(words: list[str]) -> str:
-    """Error message of click for a call of skindb, which is parsed but not run; empty if there is none."""
+    """Error message of click for a call of skindb, which is parsed but not run; empty
+    if there is none.
+    """
     if not words or words[0] in {"--help", "--version"}:
         return ""
     command = cli.commands.get(words[0])
@@ -160,7 +195,11 @@ def skindb_fault(words: list[str]) -> str:
     try:
         command.make_context(words[0], words[1:])
     except (click.ClickException, InputError) as error:
-        said = error.format_message() if isinstance(error, click.ClickException) else str(error)
+        said = (
+            error.format_message()
+            if isinstance(error, click.ClickException)
+            else str(error)
+        )
         return "" if "does not exist" in said else said
     return ""
 
@@ -177,7 +216,11 @@ def figure_faults(where: str, text: str) -> Iterator[str]:
     for section in re.split(r"^(?=## )", text, flags=re.M)[1:]:
         title = section.splitlines()[0]
         figures = re.search(r"\d", CODE.sub(blank, section.partition("\n")[2]))
-        called = any(words[0] in {"skindb", "python", "pytest"} for _, words in commands(section) if words)
+        called = any(
+            words[0] in {"skindb", "python", "pytest"}
+            for _, words in commands(section)
+            if words
+        )
         if figures and not called:
             yield f"{where}: the section {title!r} has figures, but no command that reproduces them"
 
@@ -187,7 +230,9 @@ def main() -> int:
     texts = [*help_texts(), *notebook_texts()]
     faults = [fault for where, text in texts for fault in term_faults(where, text)]
     for path in sources():
-        faults += source_faults(path.relative_to(ROOT).as_posix(), path.read_text(encoding="utf-8"))
+        faults += source_faults(
+            path.relative_to(ROOT).as_posix(), path.read_text(encoding="utf-8")
+        )
     calls = 0
     for page in pages():
         where = page.relative_to(ROOT).as_posix()
@@ -200,7 +245,9 @@ def main() -> int:
         faults += figure_faults(where, text) if where in RESULTS else []
         faults += link_faults(page, text) if page.parent == ROOT else []
     sys.stdout.write("".join(f"{fault}\n" for fault in faults))
-    sys.stdout.write(f"{calls} commands and {len(pages())} pages checked, {len(faults)} faults\n")
+    sys.stdout.write(
+        f"{calls} commands and {len(pages())} pages checked, {len(faults)} faults\n"
+    )
     return 1 if faults else 0
 
 

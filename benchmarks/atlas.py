@@ -2,8 +2,9 @@
 
     python benchmarks/atlas.py CAPTURE [--levels 3] [--size 2048] [--channels 10]
 
-Rounds are shown for both kinds of weights until one folds; `chosen` is the result of `disc_atlas` on the mesh after
-`--levels` subdivisions. Maps have random values at 95 % of the vertices; memory is the peak of the process.
+Rounds are shown for both kinds of weights until one folds; `chosen` is the result of
+`disc_atlas` on the mesh after `--levels` subdivisions. Maps have random values at 95 %
+of the vertices; memory is the peak of the process.
 """
 
 from __future__ import annotations
@@ -37,7 +38,10 @@ def main() -> None:
     vertices, faces, matrix = subdivide(mesh.vertices, mesh.faces, args.levels)
     start = time.process_time()
     uv, report = atlas.disc_atlas(mesh.vertices, mesh.faces, finer=(matrix, faces))
-    print(f"chosen: {'intrinsic' if report['intrinsic'] else 'mean-value'}, {time.process_time() - start:.1f} CPU s")
+    print(
+        f"chosen: {'intrinsic' if report['intrinsic'] else 'mean-value'}, "
+        f"{time.process_time() - start:.1f} CPU s"
+    )
     print_distortion("chosen", vertices, faces, uv)
     order = morton_order(vertices)
     rank = np.empty_like(order)
@@ -54,12 +58,20 @@ def rounds(vertices: np.ndarray, faces: np.ndarray) -> None:
     for kind in ("intrinsic", "mean_value"):
         weights = getattr(atlas, f"_{kind}_weights")(surface.points, surface.faces)
         for place, (uv, _) in enumerate(atlas._equalised(surface, weights)):
-            print_distortion(f"{kind}, round {place}", vertices, faces, uv[: len(vertices)])
+            print_distortion(
+                f"{kind}, round {place}", vertices, faces, uv[: len(vertices)]
+            )
 
 
-def print_distortion(name: str, vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray) -> None:
+def print_distortion(
+    name: str, vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray
+) -> None:
     found = distortion(vertices, faces, uv, np.zeros((len(vertices), 0), bool))
-    print(f"{name:22}", {key: round(float(value[0]), 3) for key, value in found.items()}, f"{len(faces)} triangles")
+    print(
+        f"{name:22}",
+        {key: round(float(value[0]), 3) for key, value in found.items()},
+        f"{len(faces)} triangles",
+    )
 
 
 def maps(uv: np.ndarray, faces: np.ndarray, size: int, channels: int) -> None:
@@ -76,8 +88,17 @@ def maps(uv: np.ndarray, faces: np.ndarray, size: int, channels: int) -> None:
         push_pull(image, confidence)
         start.append(time.process_time())
     names = ("rasterise", "interpolate and average", "push-pull")
-    print({name: round(b - a, 2) for name, a, b in zip(names, start[:-1], start[1:], strict=True)}, "CPU s")
-    print(f"peak {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f} GiB, for the whole process")
+    print(
+        {
+            name: round(b - a, 2)
+            for name, a, b in zip(names, start[:-1], start[1:], strict=True)
+        },
+        "CPU s",
+    )
+    print(
+        f"peak {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f} "
+        "GiB, for the whole process"
+    )
 
 
 if __name__ == "__main__":

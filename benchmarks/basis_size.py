@@ -1,10 +1,12 @@
-"""How often the basis-size rule recovers the number k of planted mixtures of the measured BRDFs, with noise.
+"""How often the basis-size rule recovers the number k of planted mixtures of the
+measured BRDFs, with noise.
 
     python benchmarks/basis_size.py [--seeds N] [--first S] [--lights L] [--cameras C] [--surfels S]
 
-A planted component can only be found if removing it increases the error. The least important component is therefore
-redrawn until removing any of them increases the error by 20 %, at most a hundred times; problems that stay below 5 %
-are counted separately. The number in brackets is the error with the planted basis over that with all BRDFs. The
+A planted component can only be found if removing it increases the error. The least
+important component is therefore redrawn until removing any of them increases the error
+by 20 %, at most a hundred times; problems that stay below 5 % are counted separately.
+The number in brackets is the error with the planted basis over that with all BRDFs. The
 threshold of the rule was chosen on seeds 0 to 2.
 """
 
@@ -27,29 +29,42 @@ LARGEST = 12
 NEEDED = 1.2
 MATTERS = 1.05
 TRIES = 100
-MATTE = np.array([0.5, 0.3, 0.2]) / np.pi  # diffuse term; its noise remains in the samples after it is subtracted
+# diffuse term; its noise remains in the samples after it is subtracted
+MATTE = np.array([0.5, 0.3, 0.2]) / np.pi
 
 
 def planted(size, noise, seed, *, surfels=300, lights=40, cameras=4):
-    """Normal equations of a planted problem, the factor by which its least component lowers the error, and H."""
+    """Normal equations of a planted problem, the factor by which its least component
+    lowers the error, and H.
+    """
     rng = np.random.default_rng([size, seed, round(1000 * noise)])
     tables = embedded_dictionary().table
     normal = _unit(rng.normal(size=(surfels, 3)) * [0.6, 0.6, 0.3] + [0, 0, 1])
     away = [
-        _unit(_unit(rng.normal(size=(n, 3)) * [1, 1, 0.5] + [0, 0, 0.7]) * 900 - 80 * normal[:, None])
+        _unit(
+            _unit(rng.normal(size=(n, 3)) * [1, 1, 0.5] + [0, 0, 0.7]) * 900
+            - 80 * normal[:, None]
+        )
         for n in (lights, cameras)
     ]
     everything = np.ones((surfels, lights, cameras), np.bool_)
-    rows, offsets, index = basis_rows(tables, TableGrid(*tables.shape[:3]), normal, *away, everything)
+    rows, offsets, index = basis_rows(
+        tables, TableGrid(*tables.shape[:3]), normal, *away, everything
+    )
     surfel = np.repeat(np.arange(surfels), np.diff(offsets))
-    matte = np.einsum("nc,nc->n", normal[surfel], away[0][surfel, index[:, 0]])[:, None] * MATTE
+    matte = (
+        np.einsum("nc,nc->n", normal[surfel], away[0][surfel, index[:, 0]])[:, None]
+        * MATTE
+    )
     level = np.sqrt((rows.astype(np.float64) ** 2).mean(axis=0))
     few = offsets[60]
     best = (0.0, np.empty(0), np.empty(0))
     H = np.stack([_mixture(rng, level) for _ in range(size)])
     for _ in range(TRIES):
         x = rng.gamma(0.7, 0.02, (surfels, size)) @ H
-        value = np.einsum("nm,nm->n", rows, x[surfel].astype(np.float32))[:, None] + matte
+        value = (
+            np.einsum("nm,nm->n", rows, x[surfel].astype(np.float32))[:, None] + matte
+        )
         target = value * (1 + noise * rng.normal(size=value.shape)) - matte
         part = Systems.of(rows[:few], offsets[:61], target[:few])
         without = [residuals(part, np.delete(H, i, 0))[1].sum() for i in range(size)]
@@ -63,17 +78,23 @@ def planted(size, noise, seed, *, surfels=300, lights=40, cameras=4):
 
 
 def _mixture(rng, level):
-    """Two materials in a random ratio, scaled so that the rows of all mixtures have the same root mean square."""
+    """Two materials in a random ratio, scaled so that the rows of all mixtures have the
+    same root mean square.
+    """
     row = np.zeros(len(level))
     row[rng.choice(len(row), 2, replace=False)] = rng.dirichlet([1, 1])
     return row / (row @ level)
 
 
 def found_sizes(systems, *, largest=LARGEST, tolerance=0.01):
-    """Range of sizes at which the rule locates the start of the plateau (0 at the end if none), and the curve."""
+    """Range of sizes at which the rule locates the start of the plateau (0 at the end
+    if none), and the curve.
+    """
     errors = surfel_errors(systems, factor_reflectance(systems, largest))
     ks = range(1, largest + 1)
-    error, _, _, sizes = choose_size(errors, ks, tolerance=tolerance, rng=np.random.default_rng(0))
+    error, _, _, sizes = choose_size(
+        errors, ks, tolerance=tolerance, rng=np.random.default_rng(0)
+    )
     return sizes, error
 
 
@@ -84,7 +105,13 @@ def _unit(v):
 def main() -> None:
     """Print one line per problem, and the counts."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    for name, default in (("seeds", 4), ("first", 10), ("lights", 40), ("cameras", 4), ("surfels", 300)):
+    for name, default in (
+        ("seeds", 4),
+        ("first", 10),
+        ("lights", 40),
+        ("cameras", 4),
+        ("surfels", 300),
+    ):
         parser.add_argument(f"--{name}", type=int, default=default)
     args = parser.parse_args()
     shape = {"surfels": args.surfels, "lights": args.lights, "cameras": args.cameras}
@@ -97,14 +124,23 @@ def main() -> None:
         truth = np.sqrt(squares[0] / free[0] / (squares[1] / free[1]))
         counts[needed > MATTERS][judged(size, fewest, most)] += 1
         print(
-            f"planted {size} ({truth:.4f}), noise {noise:.0%}, least important component {needed - 1:6.1%}: "
+            f"planted {size} ({truth:.4f}), noise {noise:.0%}, least important "
+            f"component {needed - 1:6.1%}: "
             f"{size_status(fewest, most).split(':')[0]}; curve",
             *(f"{e:.4f}" for e in error),
             flush=True,
         )
     for seen, found in counts.items():
-        kind = "every component lowers the error by 5 % or more" if seen else "some component lowers it by less"
-        print(f"{kind}: {', '.join(f'{n} {what}' for what, n in sorted(found.items()))}, of {found.total()}")
+        kind = (
+            "every component lowers the error by 5 % or more"
+            if seen
+            else "some component lowers it by less"
+        )
+        print(
+            f"{kind}: "
+            f"{', '.join(f'{n} {what}' for what, n in sorted(found.items()))}, of "
+            f"{found.total()}"
+        )
 
 
 def judged(size, fewest, most):

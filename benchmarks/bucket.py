@@ -1,9 +1,11 @@
-"""Times of a database in a bucket compared with a folder: commit, read, a small sample and verify of one capture.
+"""Times of a database in a bucket compared with a folder: commit, read, a small sample
+and verify of one capture.
 
     python benchmarks/bucket.py [--surfels 20480] [--repeat 3] [--delay-ms 20]
 
-The bucket is in an S3 server on this machine, in its own process, behind a proxy that delays every request by
-`--delay-ms` like a network. Folder and bucket alternate within one run; medians and requests are printed.
+The bucket is in an S3 server on this machine, in its own process, behind a proxy that
+delays every request by `--delay-ms` like a network. Folder and bucket alternate within
+one run; medians and requests are printed.
 """
 
 from __future__ import annotations
@@ -72,23 +74,32 @@ def main() -> None:
     values = samples(args.surfels)
     found: dict[tuple[str, str], list[float]] = {}
     requests: dict[str, int] = {}
-    with s3_server("localbucket") as address, faulty_proxy(address, delay_s=args.delay_ms / 1000) as proxy:
+    with (
+        s3_server("localbucket") as address,
+        faulty_proxy(address, delay_s=args.delay_ms / 1000) as proxy,
+    ):
         os.environ.update(settings(proxy.address))
         for _ in range(args.repeat):
             with tempfile.TemporaryDirectory() as folder:
-                for name, url in (("folder", folder), ("bucket", f"s3://{new_bucket(address)}/db")):
+                for name, url in (
+                    ("folder", folder),
+                    ("bucket", f"s3://{new_bucket(address)}/db"),
+                ):
                     proxy.requests.clear()
                     for step, seconds in steps(url, values):
                         found.setdefault((step, name), []).append(seconds)
                         if name == "bucket":
                             requests[step] = len(proxy.requests)
                             proxy.requests.clear()
-    print(f"{values.nbytes / 1e6:.0f} MB of samples, {args.delay_ms:g} ms delay per request")
+    print(
+        f"{values.nbytes / 1e6:.0f} MB of samples, {args.delay_ms:g} ms delay per request"
+    )
     for step, count in requests.items():
         folder = median(found[step, "folder"])
         bucket = median(found[step, "bucket"])
         print(
-            f"{step:32} folder {folder:6.2f} s  bucket {bucket:6.2f} s  ratio {bucket / folder:5.1f}  {count} requests"
+            f"{step:32} folder {folder:6.2f} s  bucket {bucket:6.2f} s  ratio "
+            f"{bucket / folder:5.1f}  {count} requests"
         )
 
 

@@ -1,11 +1,15 @@
-"""Times of queries over the catalogue of many takes, in a folder and in buckets with different delays.
+"""Times of queries over the catalogue of many takes, in a folder and in buckets with
+different delays.
 
-    python benchmarks/catalogue.py [--takes 1000] [--delay-ms 0 20] [--repeat 3] [--out catalogue.json]
+    python benchmarks/catalogue.py [--takes 1000] [--delay-ms 0 20] [--repeat 3] [--out
+    catalogue.json]
 
-Captures and models have realistic records (about 10 kB of provenance) and no data. The bucket is a copy of the folder
-in an S3 server on this machine, in its own process; the delay is added to every request. Every query runs in a new
-process, whose start and imports are not timed: without the cache `catalogue.json` (cold), with it (later), and after
-one take was fitted again (refitted). "CPU" is the CPU time of the process. Medians are printed.
+Captures and models have realistic records (about 10 kB of provenance) and no data. The
+bucket is a copy of the folder in an S3 server on this machine, in its own process; the
+delay is added to every request. Every query runs in a new process, whose start and
+imports are not timed: without the cache `catalogue.json` (cold), with it (later), and
+after one take was fitted again (refitted). "CPU" is the CPU time of the process.
+Medians are printed.
 """
 
 from __future__ import annotations
@@ -48,7 +52,11 @@ def about(number: int) -> dict[str, Any]:
     subject = f"S{number // 2:04d}"
     condition = ("normal", "lotion")[number % 2]
     take = subject if condition == "normal" else f"{subject}.{condition}"
-    traits = {"age": 20 + number % 60, "gender": ("female", "male")[number % 3 % 2], "hair": "dark"}
+    traits = {
+        "age": 20 + number % 60,
+        "gender": ("female", "male")[number % 3 % 2],
+        "hair": "dark",
+    }
     scope = ["fit", "statistics"]
     padding = {"digests": {f"file{i}": "0" * 64 for i in range(100)}}
     return {
@@ -64,9 +72,14 @@ def about(number: int) -> dict[str, Any]:
 def refit(db: Database, number: int) -> None:
     """Commit a model of a take."""
     one = about(number)
-    fit = {"parameters": {"k": 4 + number % 5, "rank": 16}, "status": {"fitted": 0.93, "obstructed": 0.07}}
+    fit = {
+        "parameters": {"k": 4 + number % 5, "rank": 16},
+        "status": {"fitted": 0.93, "obstructed": 0.07},
+    }
     with db.stage("model", one["take"]) as stage:
-        stage.commit(one | fit | {"inputs": [db.record("capture", one["take"]).as_input()]})
+        stage.commit(
+            one | fit | {"inputs": [db.record("capture", one["take"]).as_input()]}
+        )
 
 
 def fill(db: Database, takes: int) -> None:
@@ -81,9 +94,18 @@ def fill(db: Database, takes: int) -> None:
 def copied(folder: Path, url: str) -> None:
     """Put every file of a database into a bucket."""
     place = Bucket(url)
-    names = [path for path in folder.rglob("*") if path.is_file() and path.name != CATALOGUE]
+    names = [
+        path for path in folder.rglob("*") if path.is_file() and path.name != CATALOGUE
+    ]
     with ThreadPoolExecutor(8) as pool:
-        list(pool.map(lambda path: place.replace(path.relative_to(folder).as_posix(), path.read_bytes()), names))
+        list(
+            pool.map(
+                lambda path: place.replace(
+                    path.relative_to(folder).as_posix(), path.read_bytes()
+                ),
+                names,
+            )
+        )
 
 
 def query(url: str, name: str) -> None:
@@ -92,16 +114,24 @@ def query(url: str, name: str) -> None:
     wall = time.perf_counter()
     cpu = time.process_time()
     QUERIES[name](db)
-    print(json.dumps({"wall": time.perf_counter() - wall, "cpu": time.process_time() - cpu}))
+    print(
+        json.dumps(
+            {"wall": time.perf_counter() - wall, "cpu": time.process_time() - cpu}
+        )
+    )
 
 
 def in_new_process(url: str, name: str) -> dict[str, float]:
     """Times of a query that runs in a new process."""
     run = [sys.executable, __file__, "--query", url, name]
-    return dict(json.loads(subprocess.run(run, check=True, stdout=subprocess.PIPE).stdout))
+    return dict(
+        json.loads(subprocess.run(run, check=True, stdout=subprocess.PIPE).stdout)
+    )
 
 
-def measure(url: str, repeat: int, requests: list[Any]) -> Iterator[tuple[str, dict[str, float]]]:
+def measure(
+    url: str, repeat: int, requests: list[Any]
+) -> Iterator[tuple[str, dict[str, float]]]:
     """Median times and requests of every query."""
     for name in QUERIES:
         for state in ("cold", "later", "refitted") if name != "takes" else ("later",):
@@ -114,12 +144,17 @@ def measure(url: str, repeat: int, requests: list[Any]) -> Iterator[tuple[str, d
                     refit(skindb.open(url), number)
                 requests.clear()
                 times.append(in_new_process(url, name) | {"requests": len(requests)})
-            yield f"{name}, {state}", {key: median(one[key] for one in times) for key in times[0]}
+            yield (
+                f"{name}, {state}",
+                {key: median(one[key] for one in times) for key in times[0]},
+            )
 
 
 @contextmanager
 def bucket_of(folder: Path, delay_s: float) -> Iterator[tuple[str, list[Any]]]:
-    """A copy of a database in a bucket, and the requests; without a delay there is no proxy and none are recorded."""
+    """A copy of a database in a bucket, and the requests; without a delay there is no
+    proxy and none are recorded.
+    """
     with s3_server("localbucket") as address:
         os.environ.update(settings(address))
         url = f"s3://{new_bucket(address)}/db"
@@ -137,7 +172,9 @@ def main() -> None:
     if sys.argv[1:2] == ["--query"]:
         query(*sys.argv[2:])
         return
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--takes", type=int, default=1000)
     parser.add_argument("--repeat", type=int, default=3)
     parser.add_argument("--delay-ms", type=float, nargs="*", default=[0.0, 20.0])
@@ -150,11 +187,15 @@ def main() -> None:
         found["folder"] = dict(measure(str(folder), args.repeat, []))
         for delay in args.delay_ms:
             with bucket_of(folder, delay / 1000) as (url, requests):
-                found[f"bucket, {delay:g} ms"] = dict(measure(url, args.repeat, requests))
+                found[f"bucket, {delay:g} ms"] = dict(
+                    measure(url, args.repeat, requests)
+                )
     for place, queries in found.items():
         for name, one in queries.items():
             requests = f", {one['requests']:.0f} requests" if one["requests"] else ""
-            print(f"{place:14} {name:24} {one['wall']:6.2f} s, CPU {one['cpu']:5.2f} s{requests}")
+            print(
+                f"{place:14} {name:24} {one['wall']:6.2f} s, CPU {one['cpu']:5.2f} s{requests}"
+            )
     if args.out:
         args.out.write_text(json.dumps({"takes": args.takes, "found": found}, indent=1))
 

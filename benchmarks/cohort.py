@@ -4,10 +4,12 @@
     skindb ingest db captures/*/ --workers 2 && skindb fit db --workers 2
     python benchmarks/cohort.py captures db [--group-by gender] [--adjust age]
 
-For every quantity that `analyze groups` compares and whose truth is known (R_d of regions, sigma_tr of sites), the
-table has the mean over subjects and its truth, the difference between groups and its truth (the same regression of the
-true values), and whether the stated 95 % interval of the difference contains that truth. It should nearly always do so,
-because the interval also covers the variation between subjects, which the true values share.
+For every quantity that `analyze groups` compares and whose truth is known (R_d of
+regions, sigma_tr of sites), the table has the mean over subjects and its truth, the
+difference between groups and its truth (the same regression of the true values), and
+whether the stated 95 % interval of the difference contains that truth. It should nearly
+always do so, because the interval also covers the variation between subjects, which the
+true values share.
 """
 
 from __future__ import annotations
@@ -50,24 +52,41 @@ def truth_of(path: Path, cohort: xr.Dataset) -> xr.Dataset:
 
 def main() -> None:
     """Compare and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("captures", type=Path)
     parser.add_argument("db")
     parser.add_argument("--group-by", default="gender")
     parser.add_argument("--adjust", nargs="*", default=[])
     args = parser.parse_args()
     cohort = skindb.open(args.db).cohort("tables").load()
-    true = [truth_of(args.captures / f"{take}.truth.npz", cohort) for take in cohort["take"].values.tolist()]
+    true = [
+        truth_of(args.captures / f"{take}.truth.npz", cohort)
+        for take in cohort["take"].values.tolist()
+    ]
     planted = xr.concat(true, "take").assign_coords(cohort.coords)
-    measured = [name for name in ("region_diffuse_reflectance", "site_sigma_tr") if name in cohort]
+    measured = [
+        name
+        for name in ("region_diffuse_reflectance", "site_sigma_tr")
+        if name in cohort
+    ]
     # restrict the truth to where estimates exist
     kept = {name: planted[name].where(np.isfinite(cohort[name])) for name in measured}
-    planted = cohort.drop_vars([name for name in cohort if str(name).endswith("_error")]).assign(kept)
+    planted = cohort.drop_vars(
+        [name for name in cohort if str(name).endswith("_error")]
+    ).assign(kept)
     options = {"group_by": args.group_by, "adjust": args.adjust, "permutations": 1000}
-    found, want = (group_effects(one, rng=np.random.default_rng(0), **options) for one in (cohort, planted))
+    found, want = (
+        group_effects(one, rng=np.random.default_rng(0), **options)
+        for one in (cohort, planted)
+    )
     for contrast in found["contrast"].values.tolist():
         inside = []
-        print(f"| {contrast} | true mean | mean | true difference | difference | 95 % interval | contains the truth |")
+        print(
+            f"| {contrast} | true mean | mean | true difference | difference | 95 "
+            "% interval | contains the truth |"
+        )
         for quantity in found["quantity"].values.tolist():
             if quantity.startswith("surface"):
                 continue
@@ -79,16 +98,28 @@ def main() -> None:
             inside.append(low <= truth <= high)
             means = [_mean(one, quantity) for one in (planted, cohort)]
             numbers = f"{means[0]:.3f} | {means[1]:.3f} | {truth:.4f} | {float(est['effect']):.4f}"
-            print(f"| {quantity} | {numbers} | {low:.4f} to {high:.4f} | {'yes' if inside[-1] else 'no'} |")
+            print(
+                f"| {quantity} | {numbers} | {low:.4f} to {high:.4f} | "
+                f"{'yes' if inside[-1] else 'no'} |"
+            )
         print(f"{sum(inside)} of {len(inside)} intervals contain the truth")
 
 
 def _mean(cohort: xr.Dataset, quantity: str) -> float:
     """Mean over takes of the quantity with this name."""
     prefix, place, channel = quantity.rsplit(" ", 2)
-    variable, dim = {"R_d": ("region_diffuse_reflectance", "region"), "sigma_tr": ("site_sigma_tr", "site")}[prefix]
-    labels = cohort["channel"].values.tolist() if "channel" in cohort.coords else list(CHANNELS)
-    return float(cohort[variable].sel({dim: place}).isel(channel=labels.index(channel)).mean())
+    variable, dim = {
+        "R_d": ("region_diffuse_reflectance", "region"),
+        "sigma_tr": ("site_sigma_tr", "site"),
+    }[prefix]
+    labels = (
+        cohort["channel"].values.tolist()
+        if "channel" in cohort.coords
+        else list(CHANNELS)
+    )
+    return float(
+        cohort[variable].sel({dim: place}).isel(channel=labels.index(channel)).mean()
+    )
 
 
 if __name__ == "__main__":

@@ -1,17 +1,21 @@
 """Pictures of an exported bundle in Blender and Mitsuba 3, compared with those of skindb.
 
-python benchmarks/exports.py DB [--take NAME] [--blender PYTHON] [--mitsuba PYTHON] [--out FOLDER] [--picture FILE]
+python benchmarks/exports.py DB [--take NAME] [--blender PYTHON] [--mitsuba PYTHON]
+[--out FOLDER] [--picture FILE]
 
-DB contains a fitted model with translucency. PYTHON is an interpreter with the package of that renderer:
+DB contains a fitted model with translucency. PYTHON is an interpreter with the package
+of that renderer:
 
-    python3.11 -m venv blender && blender/bin/pip install bpy==5.0.1        # bpy 5.0 needs Python 3.11
+    python3.11 -m venv blender && blender/bin/pip install bpy==5.0.1  # needs 3.11
     python3 -m venv mitsuba && mitsuba/bin/pip install mitsuba==3.9.1 numpy
 
-Every program gets the same pinhole camera in front of the face and the same point light, and follows direct light only.
-Files are used as README.txt of the bundle says. For each light and way of use, the median ratio and the root mean
-square difference from skindb are printed (also in cube-root space), over pixels of measured and lit skin; the pictures
-and the figures of each region are in FOLDER. The same is printed for controls: a matt surface, positions and normals.
-For light under the skin, the edge of a shadow on a plate is compared with the dipole.
+Every program gets the same pinhole camera in front of the face and the same point
+light, and follows direct light only. Files are used as README.txt of the bundle says.
+For each light and way of use, the median ratio and the root mean square difference from
+skindb are printed (also in cube-root space), over pixels of measured and lit skin; the
+pictures and the figures of each region are in FOLDER. The same is printed for controls:
+a matt surface, positions and normals. For light under the skin, the edge of a shadow on
+a plate is compared with the dipole.
 """
 
 from __future__ import annotations
@@ -46,13 +50,27 @@ ANGLES = (15, 45, 75)  # degrees between camera and light, as seen from the face
 WAYS = {  # file, what is connected, and the picture of skindb that it is compared with
     "matt surface (control)": ("model.glb", ["matt"], "matt"),
     "model.glb": ("model.glb", [], "whole"),
-    "model.glb, albedo.exr, normal_tangent.exr": ("model.glb", ["albedo", "normal"], "whole"),
-    "the same, translucency.exr": ("model.glb", ["albedo", "normal", "translucency"], "subsurface"),
-    "the same, mean_free_path.exr": ("model.glb", ["albedo", "normal", "mean_free_path"], "subsurface"),
+    "model.glb, albedo.exr, normal_tangent.exr": (
+        "model.glb",
+        ["albedo", "normal"],
+        "whole",
+    ),
+    "the same, translucency.exr": (
+        "model.glb",
+        ["albedo", "normal", "translucency"],
+        "subsurface",
+    ),
+    "the same, mean_free_path.exr": (
+        "model.glb",
+        ["albedo", "normal", "mean_free_path"],
+        "subsurface",
+    ),
     "face.usda": ("usd/face.usda", [], "whole"),
 }
-SHOWN = ("model.glb", "the same, translucency.exr")  # in the picture for the documentation
-# light under the skin on plates: albedos, half of the width [mm], and radii [mm] for diffusion lengths of about 1 mm
+# in the picture for the documentation
+SHOWN = ("model.glb", "the same, translucency.exr")
+# light under the skin on plates: albedos, half of the width [mm], and radii [mm] for
+# diffusion lengths of about 1 mm
 PLATES = ((0.5, 0.3, 0.2), (0.7, 0.4, 0.1))
 HALF = 10.0
 PIXELS = 80
@@ -75,7 +93,9 @@ class Stage:
 
 
 def set_stage(model) -> Stage:
-    """A camera without distortion in front of the face, at twice the resolution of that of the dome."""
+    """A camera without distortion in front of the face, at twice the resolution of that
+    of the dome.
+    """
     camera = chosen_camera(model["dome"].to_dataset().load(), None)[0].scaled(2)
     K = camera.K.copy()
     K[0, 0] = K[1, 1] = (K[0, 0] + K[1, 1]) / 2
@@ -84,26 +104,40 @@ def set_stage(model) -> Stage:
     fitted = model["fitted"].to_dataset()
     scene = RayScene(surface.vertices, surface.faces)
     view = trace_view(surface, camera, samples=4, scene=scene)
-    trust = view.image(view.interpolate(surfel_confidence(fitted)[:, None].astype(float)))[..., 0]
+    trust = view.image(
+        view.interpolate(surfel_confidence(fitted)[:, None].astype(float))
+    )[..., 0]
     mask = fitted["region_mask"].transpose("surfel", "region")
     shown = view.image(view.interpolate(mask.values.astype(float)))
     good = binary_erosion(view.coverage > 0.999, iterations=2) & (trust > 0.99)
     names = map(str, mask["region"].values)
-    return Stage(surface, scene, view, good, {name: shown[..., i] > 0.5 for i, name in enumerate(names)})
+    return Stage(
+        surface,
+        scene,
+        view,
+        good,
+        {name: shown[..., i] > 0.5 for i, name in enumerate(names)},
+    )
 
 
 def pictures(stage: Stage, light: Lights) -> dict[str, np.ndarray]:
     """Pictures of skindb under a point light."""
-    matt = replace(stage.surface, eta=1.0, diffuse=np.full_like(stage.surface.diffuse, 0.5))
+    matt = replace(
+        stage.surface, eta=1.0, diffuse=np.full_like(stage.surface.diffuse, 0.5)
+    )
 
     def shade(surface: Surface, **options):
-        return shade_view(stage.view, surface, light, stage.scene, disc_samples=1, **options)[0]
+        return shade_view(
+            stage.view, surface, light, stage.scene, disc_samples=1, **options
+        )[0]
 
     whole = shade(stage.surface)
     return {
         "whole": whole,
         "matt": shade(matt, terms=("diffuse",)),
-        "subsurface": shade(stage.surface, subsurface=True) if stage.surface.sigma_tr is not None else whole,
+        "subsurface": shade(stage.surface, subsurface=True)
+        if stage.surface.sigma_tr is not None
+        else whole,
     }
 
 
@@ -113,18 +147,31 @@ def point_lights(model, view: View) -> dict[int, Lights]:
     way = lights.position / np.linalg.norm(lights.position, axis=1, keepdims=True)
     ahead = view.camera.centre
     angle = np.degrees(np.arccos(way @ ahead / np.linalg.norm(ahead)))
-    points = replace(lights, disc_radius=0 * lights.disc_radius, falloff=0 * lights.falloff)
-    return {round(angle[i]): points.select(i) for i in (int(np.argmin(np.abs(angle - a))) for a in ANGLES)}
+    points = replace(
+        lights, disc_radius=0 * lights.disc_radius, falloff=0 * lights.falloff
+    )
+    return {
+        round(angle[i]): points.select(i)
+        for i in (int(np.argmin(np.abs(angle - a))) for a in ANGLES)
+    }
 
 
 def read(path: Path, name: str, channels: str = "RGB") -> np.ndarray:
     """A pass of a picture of Blender, or the picture of Mitsuba if the name is empty."""
     with OpenEXR.File(str(path), separate_channels=True) as file:
-        planes = {key: value.pixels for part in file.parts for key, value in part.channels.items()}
-        return np.stack([np.array(planes[f"{name}{c}"], np.float32) for c in channels], axis=-1)
+        planes = {
+            key: value.pixels
+            for part in file.parts
+            for key, value in part.channels.items()
+        }
+        return np.stack(
+            [np.array(planes[f"{name}{c}"], np.float32) for c in channels], axis=-1
+        )
 
 
-def difference(found: np.ndarray, true: np.ndarray, mask: np.ndarray) -> dict[str, float]:
+def difference(
+    found: np.ndarray, true: np.ndarray, mask: np.ndarray
+) -> dict[str, float]:
     """Median ratio, and RMS difference over RMS, also in cube-root space."""
 
     def rms(a: np.ndarray, b: np.ndarray) -> float:
@@ -133,7 +180,11 @@ def difference(found: np.ndarray, true: np.ndarray, mask: np.ndarray) -> dict[st
     a = found[mask]
     b = true[mask]
     ratio = [round(float(x), 4) for x in np.median(a / np.maximum(b, 1e-12), axis=0)]
-    return {"median_ratio": ratio, "rms": rms(a, b), "rms_perceptual": rms(np.cbrt(a), np.cbrt(b))}
+    return {
+        "median_ratio": ratio,
+        "rms": rms(a, b),
+        "rms_perceptual": rms(np.cbrt(a), np.cbrt(b)),
+    }
 
 
 def compare(stage: Stage, job, true: np.ndarray, found: np.ndarray, out: Path):
@@ -146,9 +197,13 @@ def compare(stage: Stage, job, true: np.ndarray, found: np.ndarray, out: Path):
         if (lit & inside).sum() > 50
     }
     gain = 0.9 / np.quantile(true[lit].max(axis=-1), 0.99)
-    write_png(out, np.concatenate([tone_map(one, exposure=gain) for one in (found, true)], axis=1))
+    write_png(
+        out,
+        np.concatenate([tone_map(one, exposure=gain) for one in (found, true)], axis=1),
+    )
     print(
-        f"{job['name']}: ratio {figures['median_ratio']}, RMS {figures['rms']:.1%}, in cube-root space "
+        f"{job['name']}: ratio {figures['median_ratio']}, RMS "
+        f"{figures['rms']:.1%}, in cube-root space "
         f"{figures['rms_perceptual']:.1%}"
     )
     return figures
@@ -161,24 +216,35 @@ def controls(stage: Stage, path: Path) -> None:
         x, y, z = np.moveaxis(read(path, f"ViewLayer.{name}.", "XYZ"), -1, 0)
         return np.stack([x, z, -y], axis=-1)
 
-    apart = np.linalg.norm(1000 * upright("Position") - stage.view.image(stage.view.position), axis=-1)[stage.good]
+    apart = np.linalg.norm(
+        1000 * upright("Position") - stage.view.image(stage.view.position), axis=-1
+    )[stage.good]
     a = upright("Normal")[stage.good]
     b = stage.view.image(stage.view.normal)[stage.good]
     cosine = (a * b).sum(axis=1) / np.linalg.norm(a, axis=1) / np.linalg.norm(b, axis=1)
     angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
     print(
-        f"  positions differ by {np.median(apart):.4f} mm (median), normals by {np.median(angle):.2f} degrees (median; "
+        f"  positions differ by {np.median(apart):.4f} mm (median), normals by "
+        f"{np.median(angle):.2f} degrees (median; "
         f"95 % {np.quantile(angle, 0.95):.2f})"
     )
 
 
 def edge(albedo: float, length: float, across: np.ndarray) -> np.ndarray:
-    """Light that leaves a plate at these distances [mm] from the edge of a shadow, by the dipole; 1 is full light."""
-    absorption, scattering = scattering_coefficients(dipole_s(np.array(albedo), eta=1.3)[0], np.array(1 / length))
+    """Light that leaves a plate at these distances [mm] from the edge of a shadow, by
+    the dipole; 1 is full light.
+    """
+    absorption, scattering = scattering_coefficients(
+        dipole_s(np.array(albedo), eta=1.3)[0], np.array(1 / length)
+    )
     line = np.linspace(0, 15, 601)
     along = np.concatenate([[0], np.geomspace(1e-4, 60, 2000)])
     far = np.hypot(line[:, None], along)
-    spread = 2 * np.trapezoid(dipole_profile(far, float(absorption), float(scattering), eta=1.3), along, axis=1)
+    spread = 2 * np.trapezoid(
+        dipole_profile(far, float(absorption), float(scattering), eta=1.3),
+        along,
+        axis=1,
+    )
     half = np.concatenate([[0], np.cumsum((spread[1:] + spread[:-1]) / 2)])
     half = half / half[-1] / 2
     return 0.5 + np.sign(across) * np.interp(np.abs(across), line, half)
@@ -210,18 +276,26 @@ def report_spread(folder: Path) -> None:
     for method, radii in SPREADS.items():
         for i, albedos in enumerate(PLATES):
             even, half = (
-                read(folder / f"{method}_{i}_{blocked}.exr", "ViewLayer.Combined.") for blocked in (False, True)
+                read(folder / f"{method}_{i}_{blocked}.exr", "ViewLayer.Combined.")
+                for blocked in (False, True)
             )
             for c, albedo in enumerate(albedos):
                 level = float(even[..., c].mean())
                 seen = half[..., c].mean(axis=0) / level
-                cost = lambda x, a=albedo, s=seen: np.mean((edge(a, np.exp(x), across) - s) ** 2)  # noqa: E731
+
+                def cost(x, a=albedo, s=seen):
+                    return np.mean((edge(a, np.exp(x), across) - s) ** 2)
+
                 best = minimize_scalar(cost, bounds=(-3, 2), method="bounded")
                 length = float(np.exp(best.x))
-                path = float(mean_free_path(np.array(albedo), np.array(1 / length), eta=1.3))
+                path = float(
+                    mean_free_path(np.array(albedo), np.array(1 / length), eta=1.3)
+                )
                 print(
-                    f"{method}, albedo {albedo}: returns {level / albedo:.3f} of it; radius {radii[i][c] / length:.2f} "
-                    f"diffusion lengths, {radii[i][c] / path / np.pi:.2f} pi mean free paths; edge differs by "
+                    f"{method}, albedo {albedo}: returns {level / albedo:.3f} of "
+                    f"it; radius {radii[i][c] / length:.2f} "
+                    f"diffusion lengths, {radii[i][c] / path / np.pi:.2f} pi mean "
+                    "free paths; edge differs by "
                     f"{np.sqrt(best.fun):.4f}"
                 )
 
@@ -231,14 +305,21 @@ def draw(paths: list[Path], picture: Path) -> None:
     halves = [half for path in paths for half in np.split(read_png(path), 2, axis=1)]
     lit = np.any([half.max(axis=2) > 8 for half in halves], axis=0)
     rows, columns = (np.flatnonzero(lit.any(axis=axis)) for axis in (1, 0))
-    write_png(picture, np.concatenate([half[np.ix_(rows, columns)] for half in halves], axis=1))
+    write_png(
+        picture,
+        np.concatenate([half[np.ix_(rows, columns)] for half in halves], axis=1),
+    )
 
 
 def run(python: str, program: str, jobs: list[dict], folder: Path) -> None:
     """Render jobs in another program."""
     described = folder / "jobs.json"
     described.write_text(json.dumps(jobs), encoding="utf-8")
-    subprocess.run([python, str(HERE / program), str(described)], check=True, stdout=subprocess.DEVNULL)
+    subprocess.run(
+        [python, str(HERE / program), str(described)],
+        check=True,
+        stdout=subprocess.DEVNULL,
+    )
 
 
 def described(camera: Camera, light: Lights) -> dict:
@@ -246,21 +327,39 @@ def described(camera: Camera, light: Lights) -> dict:
     K = camera.K.tolist()
     R = camera.R.tolist()
     centre = camera.centre.tolist()
-    about = {"K": K, "R": R, "centre": centre, "width": camera.width, "height": camera.height}
-    lamp = {"position": light.position[0].tolist(), "intensity": light.intensity[0].tolist()}
-    return {"camera": about, "light": lamp, "size": [camera.width, camera.height], "samples": SAMPLES}
+    about = {
+        "K": K,
+        "R": R,
+        "centre": centre,
+        "width": camera.width,
+        "height": camera.height,
+    }
+    lamp = {
+        "position": light.position[0].tolist(),
+        "intensity": light.intensity[0].tolist(),
+    }
+    return {
+        "camera": about,
+        "light": lamp,
+        "size": [camera.width, camera.height],
+        "samples": SAMPLES,
+    }
 
 
 def main() -> None:
     """Print the differences, and write pictures and figures."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("db")
     parser.add_argument("--take")
     parser.add_argument("--blender", help="Python with bpy")
     parser.add_argument("--mitsuba", help="Python with mitsuba and numpy")
     parser.add_argument("--out", type=Path)
     parser.add_argument(
-        "--picture", type=Path, help="picture of the second light, without and with light under the skin"
+        "--picture",
+        type=Path,
+        help="picture of the second light, without and with light under the skin",
     )
     options = parser.parse_args()
     out = (options.out or Path(tempfile.mkdtemp())).absolute()
@@ -275,18 +374,33 @@ def main() -> None:
         common = described(stage.view.camera, light) | {"maps": str(bundle / "maps")}
         jobs = [
             common
-            | {"name": name, "file": str(bundle / file), "use": use, "true": key, "out": f"{out}/{angle}_{i}.exr"}
+            | {
+                "name": name,
+                "file": str(bundle / file),
+                "use": use,
+                "true": key,
+                "out": f"{out}/{angle}_{i}.exr",
+            }
             for i, (name, (file, use, key)) in enumerate(WAYS.items())
         ]
-        exact = common | {"name": "mitsuba/skin.py", "true": "whole", "out": f"{out}/{angle}_mitsuba.exr"}
+        exact = common | {
+            "name": "mitsuba/skin.py",
+            "true": "whole",
+            "out": f"{out}/{angle}_mitsuba.exr",
+        }
         if options.blender:
             run(options.blender, "exports_blender.py", jobs, out)
         if options.mitsuba:
             run(options.mitsuba, "exports_mitsuba.py", [exact], out)
-        for job in [*(jobs if options.blender else []), *([exact] if options.mitsuba else [])]:
+        for job in [
+            *(jobs if options.blender else []),
+            *([exact] if options.mitsuba else []),
+        ]:
             path = Path(job["out"])
             found = read(path, "" if job is exact else "ViewLayer.Combined.")
-            figures[f"{angle}: {job['name']}"] = compare(stage, job, true[job["true"]], found, path.with_suffix(".png"))
+            figures[f"{angle}: {job['name']}"] = compare(
+                stage, job, true[job["true"]], found, path.with_suffix(".png")
+            )
         if options.blender:
             controls(stage, Path(jobs[0]["out"]))
     if options.blender:
@@ -294,8 +408,13 @@ def main() -> None:
         report_spread(out)
         if options.picture:
             angle = list(point_lights(model, stage.view))[1]
-            draw([out / f"{angle}_{list(WAYS).index(name)}.png" for name in SHOWN], options.picture)
-    (out / "figures.json").write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+            draw(
+                [out / f"{angle}_{list(WAYS).index(name)}.png" for name in SHOWN],
+                options.picture,
+            )
+    (out / "figures.json").write_text(
+        json.dumps(figures, indent=1) + "\n", encoding="utf-8"
+    )
     print(f"pictures, and the figures of each region: {out}")
 
 

@@ -1,4 +1,5 @@
-"""Render exported files in Blender, for benchmarks/exports.py, which calls this program with the Python of bpy.
+"""Render exported files in Blender, for benchmarks/exports.py, which calls this program
+with the Python of bpy.
 
 python benchmarks/exports_blender.py JOBS.json
 """
@@ -14,7 +15,8 @@ import bpy
 from mathutils import Matrix, Vector
 
 MM = 1e-3  # the unit of Blender is the metre
-UPRIGHT = Matrix(((1, 0, 0), (0, 0, -1), (0, 1, 0)))  # +y up to +z up, as importers of glTF and USD do
+# +y up to +z up, as importers of glTF and USD do
+UPRIGHT = Matrix(((1, 0, 0), (0, 0, -1), (0, 1, 0)))
 SKIN_METHODS = {  # method, and factor from the map in mm to the radius in mm
     "translucency": ("RANDOM_WALK_SKIN", 2),
     "mean_free_path": ("RANDOM_WALK", 4 * math.pi),
@@ -45,12 +47,24 @@ def connect(mesh, maps: Path, use: list[str]) -> None:
     link = tree.links.new
     (skin,) = [node for node in tree.nodes if node.type == "BSDF_PRINCIPLED"]
     if "albedo" in use:
-        link(image(tree.nodes, maps / "albedo.exr", "Linear Rec.709").outputs["Color"], skin.inputs["Base Color"])
+        link(
+            image(tree.nodes, maps / "albedo.exr", "Linear Rec.709").outputs["Color"],
+            skin.inputs["Base Color"],
+        )
     if "normal" in use:
         scaled = tree.nodes.new("ShaderNodeVectorMath")
         scaled.operation = "MULTIPLY_ADD"
-        scaled.inputs[1].default_value = scaled.inputs[2].default_value = (0.5, 0.5, 0.5)
-        link(image(tree.nodes, maps / "normal_tangent.exr", "Non-Color").outputs["Color"], scaled.inputs[0])
+        scaled.inputs[1].default_value = scaled.inputs[2].default_value = (
+            0.5,
+            0.5,
+            0.5,
+        )
+        link(
+            image(tree.nodes, maps / "normal_tangent.exr", "Non-Color").outputs[
+                "Color"
+            ],
+            scaled.inputs[0],
+        )
         bent = tree.nodes.new("ShaderNodeNormalMap")
         link(scaled.outputs["Vector"], bent.inputs["Color"])
         link(bent.outputs["Normal"], skin.inputs["Normal"])
@@ -58,7 +72,10 @@ def connect(mesh, maps: Path, use: list[str]) -> None:
         skin.subsurface_method, factor = SKIN_METHODS[name]
         skin.inputs["Subsurface Weight"].default_value = 1
         skin.inputs["Subsurface Scale"].default_value = factor * MM
-        link(image(tree.nodes, maps / f"{name}.exr", "Non-Color").outputs["Color"], skin.inputs["Subsurface Radius"])
+        link(
+            image(tree.nodes, maps / f"{name}.exr", "Non-Color").outputs["Color"],
+            skin.inputs["Subsurface Radius"],
+        )
     if "matt" in use:
         matt = tree.nodes.new("ShaderNodeBsdfDiffuse")
         matt.inputs["Color"].default_value = (0.5, 0.5, 0.5, 1)
@@ -75,7 +92,10 @@ def add(name: str, data):
 
 def add_camera(about) -> None:
     """A pinhole camera from its matrices in the frame of the subject."""
-    data, (K, width, height) = bpy.data.cameras.new("camera"), (about["K"], about["width"], about["height"])
+    data, (K, width, height) = (
+        bpy.data.cameras.new("camera"),
+        (about["K"], about["width"], about["height"]),
+    )
     data.sensor_fit = "HORIZONTAL"
     data.sensor_width = 36
     data.clip_start = 0.01
@@ -101,13 +121,19 @@ def add_light(about) -> None:
 
 
 def half_lit(albedo, method: str, radius, blocked: bool) -> None:
-    """A plate from above, 20 mm across the picture, half of it in the shadow of a card if `blocked`."""
+    """A plate from above, 20 mm across the picture, half of it in the shadow of a card
+    if `blocked`.
+    """
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    bpy.ops.mesh.primitive_cube_add(size=1, location=(0, 0, -0.025), scale=(0.2, 0.2, 0.05))
+    bpy.ops.mesh.primitive_cube_add(
+        size=1, location=(0, 0, -0.025), scale=(0.2, 0.2, 0.05)
+    )
     material = bpy.data.materials.new("plate")
     bpy.context.object.data.materials.append(material)
     material.use_nodes = True
-    (skin,) = [node for node in material.node_tree.nodes if node.type == "BSDF_PRINCIPLED"]
+    (skin,) = [
+        node for node in material.node_tree.nodes if node.type == "BSDF_PRINCIPLED"
+    ]
     skin.inputs["Base Color"].default_value = (*albedo, 1)
     skin.inputs["Specular IOR Level"].default_value = 0
     skin.inputs["Subsurface Weight"].default_value = 1
@@ -130,7 +156,9 @@ def half_lit(albedo, method: str, radius, blocked: bool) -> None:
 
 
 def write(path: str, width: int, height: int, samples: int) -> None:
-    """Render by direct light, because skindb does not follow light between parts of the face either."""
+    """Render by direct light, because skindb does not follow light between parts of the
+    face either.
+    """
     scene = bpy.context.scene
     scene.render.engine, cycles = "CYCLES", scene.cycles
     cycles.device = "CPU"
@@ -139,12 +167,22 @@ def write(path: str, width: int, height: int, samples: int) -> None:
     cycles.use_adaptive_sampling = cycles.use_denoising = False
     cycles.pixel_filter_type = "BOX"
     scene.render.film_transparent = True
-    scene.render.resolution_x, scene.render.resolution_y, scene.render.resolution_percentage = width, height, 100
+    (
+        scene.render.resolution_x,
+        scene.render.resolution_y,
+        scene.render.resolution_percentage,
+    ) = width, height, 100
     layer = scene.view_layers[0]
-    layer.use_pass_normal = layer.use_pass_position = layer.use_pass_diffuse_color = True
+    layer.use_pass_normal = layer.use_pass_position = layer.use_pass_diffuse_color = (
+        True
+    )
     settings = scene.render.image_settings
     settings.media_type = "MULTI_LAYER_IMAGE"  # of Blender 5
-    settings.file_format, settings.color_depth, scene.render.filepath = "OPEN_EXR_MULTILAYER", "32", path
+    settings.file_format, settings.color_depth, scene.render.filepath = (
+        "OPEN_EXR_MULTILAYER",
+        "32",
+        path,
+    )
     bpy.ops.render.render(write_still=True)
 
 

@@ -1,4 +1,5 @@
-"""Render an exported face in Mitsuba 3, for benchmarks/exports.py, which calls this program with the Python of Mitsuba.
+"""Render an exported face in Mitsuba 3, for benchmarks/exports.py, which calls this
+program with the Python of Mitsuba.
 
 python benchmarks/exports_mitsuba.py JOBS.json
 """
@@ -26,7 +27,10 @@ def main() -> None:
         K = np.array(camera["K"])
         R = np.array(camera["R"])
         to_world = np.eye(4)
-        to_world[:3, :3], to_world[:3, 3] = R.T @ np.diag([-1.0, -1.0, 1.0]), camera["centre"]
+        to_world[:3, :3], to_world[:3, 3] = (
+            R.T @ np.diag([-1.0, -1.0, 1.0]),
+            camera["centre"],
+        )
         sensor = {
             "type": "perspective",
             "fov": float(np.degrees(2 * np.arctan(width / 2 / K[0, 0]))),
@@ -36,7 +40,12 @@ def main() -> None:
             "to_world": mitsuba.ScalarTransform4f(to_world),
             "near_clip": 1.0,
             "far_clip": 1e5,
-            "film": {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"}},
+            "film": {
+                "type": "hdrfilm",
+                "width": width,
+                "height": height,
+                "rfilter": {"type": "box"},
+            },
         }
         lamp = {
             "type": "point",
@@ -50,7 +59,9 @@ def main() -> None:
             "sensor": sensor,
             "lamp": lamp,
         }
-        mitsuba.util.write_bitmap(job["out"], mitsuba.render(mitsuba.load_dict(scene), spp=job["samples"]))
+        mitsuba.util.write_bitmap(
+            job["out"], mitsuba.render(mitsuba.load_dict(scene), spp=job["samples"])
+        )
 
 
 if __name__ == "__main__":

@@ -1,9 +1,11 @@
-"""Time and size of storing the first pass of a fit, compared with the time that a resumed fit saves.
+"""Time and size of storing the first pass of a fit, compared with the time that a
+resumed fit saves.
 
     python benchmarks/first_pass.py [--surfels 16384] [--repeat 3]
 
-Planted skin under 60 lights and 8 cameras is fitted with the embedded dictionary by `fit_take`. The first fit compiles
-and is not counted; medians of the others are printed.
+Planted skin under 60 lights and 8 cameras is fitted with the embedded dictionary by
+`fit_take`. The first fit compiles and is not counted; medians of the others are
+printed.
 """
 
 from __future__ import annotations
@@ -54,8 +56,13 @@ def main() -> None:
             record = fit_module.fit_take(db, TAKE)
             seconds["fit"].append(time.perf_counter() - begin)
             seconds["first pass"].append(record.provenance["seconds"]["first pass"])
-    whole, kept, first = (median(seconds[name][1:]) for name in ("fit", "keep", "first pass"))
-    print(f"{asked.surfels} surfels: fit {whole:.1f} s, of which first pass {first:.1f} s and storing it {kept:.2f} s")
+    whole, kept, first = (
+        median(seconds[name][1:]) for name in ("fit", "keep", "first pass")
+    )
+    print(
+        f"{asked.surfels} surfels: fit {whole:.1f} s, of which first pass "
+        f"{first:.1f} s and storing it {kept:.2f} s"
+    )
     print(f"storing it: {kept / whole:.1%} of the fit, {size[-1] / 1e6:.1f} MB")
 
 

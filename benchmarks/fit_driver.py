@@ -6,8 +6,9 @@
     PYTHONPATH=REVISION python benchmarks/fit_driver.py parts DB TAKE
     PYTHONPATH=REVISION python benchmarks/fit_driver.py read DB TAKE
 
-`benchmarks/fit.py` and `benchmarks/workers.py` call it. The last printed line is the result as JSON. It works with
-revisions from before and after the fit in two passes (df1cf9e).
+`benchmarks/fit.py` and `benchmarks/workers.py` call it. The last printed line is the
+result as JSON. It works with revisions from before and after the fit in two passes
+(df1cf9e).
 """
 
 from __future__ import annotations
@@ -43,7 +44,12 @@ HOLD_OUT = 0.1  # fraction of the lights
 SURFELS = 2048  # for the measurement of parts of the fit
 ROUNDS = 3
 COMPONENTS = 4
-KNOWN = ("shading_normal", "normal_error", "diffuse_reflectance", "diffuse_reflectance_error")
+KNOWN = (
+    "shading_normal",
+    "normal_error",
+    "diffuse_reflectance",
+    "diffuse_reflectance_error",
+)
 
 
 def peak() -> float:
@@ -61,7 +67,9 @@ def ingest(db: Any, capture: str) -> dict[str, Any]:
 
 
 def fit(db: Any, take: str) -> dict[str, Any]:
-    """Fit and commit a take; returns CPU time, wall time and memory of each stage, and peak resident memory."""
+    """Fit and commit a take; returns CPU time, wall time and memory of each stage, and
+    peak resident memory.
+    """
     with Stages() as stages:
         if TWO_PASSES:
             fit_take(db, take, FitParameters(hold_out_lights=HOLD_OUT), progress=stages)
@@ -79,15 +87,27 @@ def fit_one_thread(db: Any, take: str) -> dict[str, Any]:
 
 def read(db: Any, take: str) -> dict[str, Any]:
     """CPU time and wall time of reading every block of samples once."""
-    blocks = db.read("capture", take)["samples"]["reflectance_sample"].data.to_delayed().ravel()
+    blocks = (
+        db.read("capture", take)["samples"]["reflectance_sample"]
+        .data.to_delayed()
+        .ravel()
+    )
     start = time.perf_counter(), time.process_time()
     dask.compute(*(delayed(np.size)(block) for block in blocks))  # type: ignore[no-untyped-call]
-    return {"wall": time.perf_counter() - start[0], "cpu": time.process_time() - start[1]}
+    return {
+        "wall": time.perf_counter() - start[0],
+        "cpu": time.process_time() - start[1],
+    }
 
 
 def parts(db: Any, take: str) -> dict[str, float]:
     """CPU time per surfel [us] of the parts of a fit, on one thread and on samples in memory."""
-    from skindb.fit import estimate_diffuse_reflectance, estimate_normals, fit_surface, reduce_basis
+    from skindb.fit import (
+        estimate_diffuse_reflectance,
+        estimate_normals,
+        fit_surface,
+        reduce_basis,
+    )
     from skindb.fit.lumitexels import lumitexels
 
     dask.config.set(scheduler="synchronous")
@@ -115,7 +135,9 @@ def parts(db: Any, take: str) -> dict[str, float]:
     known = work.merge(fitted[list(KNOWN)])
     surface = timed("dictionary fit", lambda: fit_surface(known, dictionary=tables))
     weighted = surface.merge(work[["surfel_area"]])
-    basis = reduce_basis(weighted, dictionary=tables, k=COMPONENTS, rng=np.random.default_rng(0))
+    basis = reduce_basis(
+        weighted, dictionary=tables, k=COMPONENTS, rng=np.random.default_rng(0)
+    )
     held = np.arange(work.sizes["light"]) % round(1 / HOLD_OUT) == 0
     timed("second pass", _second_pass(known, held, basis))
     timed("linear refit of 4 components", _linear_refit(known, basis))
@@ -134,15 +156,22 @@ def _tables(whole: xr.Dataset) -> Any:
     return _convolved(None, _disc_angle(whole))
 
 
-def _second_pass(known: xr.Dataset, held: np.ndarray, basis: xr.Dataset) -> Callable[[], Any]:
+def _second_pass(
+    known: xr.Dataset, held: np.ndarray, basis: xr.Dataset
+) -> Callable[[], Any]:
     """Refit with its errors, held-out errors, and outliers."""
     if TWO_PASSES:
         from skindb.fit.second import refit_and_evaluate
         from skindb.schema import dataset
 
-        flags = {"light_held_out": held, "camera_held_out": np.zeros(known.sizes["camera"], np.bool_)}
+        flags = {
+            "light_held_out": held,
+            "camera_held_out": np.zeros(known.sizes["camera"], np.bool_),
+        }
         held_out = dataset(flags)
-        return lambda: refit_and_evaluate(known, held_out=held_out, basis=basis, mode="perceptual", eta=1.3)
+        return lambda: refit_and_evaluate(
+            known, held_out=held_out, basis=basis, mode="perceptual", eta=1.3
+        )
     from skindb.fit import find_outliers, held_out_error, refit
 
     work = known.isel(light=~held)
@@ -165,12 +194,23 @@ def _linear_refit(known: xr.Dataset, basis: xr.Dataset) -> Callable[[], Any]:
     else:
         from skindb.fit._surface_kernels import surface_weights as weights
     arrays = [known[name].values for name in NEEDED]
-    options = {"eta": 1.3, "mode": "linear", "noise_floor": noise_floor(known), "min_samples": MIN_SAMPLES}
+    options = {
+        "eta": 1.3,
+        "mode": "linear",
+        "noise_floor": noise_floor(known),
+        "min_samples": MIN_SAMPLES,
+    }
     tables = reduced_tables(basis)
     return lambda: weights(*arrays, tables=tables, **options)
 
 
-ACTIONS = {"ingest": ingest, "fit": fit, "fit-one-thread": fit_one_thread, "read": read, "parts": parts}
+ACTIONS = {
+    "ingest": ingest,
+    "fit": fit,
+    "fit-one-thread": fit_one_thread,
+    "read": read,
+    "parts": parts,
+}
 
 if __name__ == "__main__":
     if len(sys.argv) != 4 or sys.argv[1] not in ACTIONS:

@@ -1,12 +1,15 @@
 """P values, intervals and power of group comparisons over many planted cohorts.
 
-    python benchmarks/group_effects.py [--cohorts 200] [--subjects 87] [--permutations 1000] [--seed 0]
+    python benchmarks/group_effects.py [--cohorts 200] [--subjects 87] [--permutations
+    1000] [--seed 0]
 
-Each cohort has the tables of `--subjects` subjects. The smaller of two groups is a fifth of the subjects, with the same
-spread as the other or twice the spread. Without a difference, p values must be uniform (Kolmogorov and Smirnov), and
-5 % of the cohorts may have a quantity with an adjusted p below 0.05. With a difference, its interval must cover it in
-93 to 97 % of the cohorts. A difference of the size `effect_detectable` must be found in 80 %. An attribute that is only
-correlated with age must have no effect after adjustment for age.
+Each cohort has the tables of `--subjects` subjects. The smaller of two groups is a
+fifth of the subjects, with the same spread as the other or twice the spread. Without a
+difference, p values must be uniform (Kolmogorov and Smirnov), and 5 % of the cohorts
+may have a quantity with an adjusted p below 0.05. With a difference, its interval must
+cover it in 93 to 97 % of the cohorts. A difference of the size `effect_detectable` must
+be found in 80 %. An attribute that is only correlated with age must have no effect
+after adjustment for age.
 """
 
 from __future__ import annotations
@@ -29,13 +32,25 @@ R_D = "R_d face G"
 SIGMA_TR = "sigma_tr cheek G"
 
 
-def cohort_of_two(n: int, seed: int, difference: float = 0.0, log_tr: float = 0.0, spread: float = 2.0) -> xr.Dataset:
-    """Two groups, of which the smaller one, a fifth of the subjects, has `spread` times the spread of the other."""
+def cohort_of_two(
+    n: int, seed: int, difference: float = 0.0, log_tr: float = 0.0, spread: float = 2.0
+) -> xr.Dataset:
+    """Two groups, of which the smaller one, a fifth of the subjects, has `spread` times
+    the spread of the other.
+    """
     rng = np.random.default_rng([1, seed])
     few = np.arange(n) % 5 == 0
-    albedo = difference * few + np.where(few, np.sqrt(spread**2 - 1), 0.0) * 0.03 * rng.normal(size=n)
+    albedo = difference * few + np.where(
+        few, np.sqrt(spread**2 - 1), 0.0
+    ) * 0.03 * rng.normal(size=n)
     gender = np.where(few, "women", "men")
-    return planted_tables([f"S{i}" for i in range(n)], albedo=albedo, log_tr=log_tr * few, seed=seed, gender=gender)
+    return planted_tables(
+        [f"S{i}" for i in range(n)],
+        albedo=albedo,
+        log_tr=log_tr * few,
+        seed=seed,
+        gender=gender,
+    )
 
 
 def confounded(n: int, seed: int) -> xr.Dataset:
@@ -44,7 +59,13 @@ def confounded(n: int, seed: int) -> xr.Dataset:
     age = rng.uniform(20, 60, n)
     ancestry = np.where(rng.random(n) < 1 / (1 + np.exp(-(age - 40) / 5)), "a", "b")
     albedo = -0.002 * (age - 40)
-    return planted_tables([f"S{i}" for i in range(n)], albedo=albedo, seed=seed, age=age, ancestry=ancestry)
+    return planted_tables(
+        [f"S{i}" for i in range(n)],
+        albedo=albedo,
+        seed=seed,
+        age=age,
+        ancestry=ancestry,
+    )
 
 
 def paired(n: int, seed: int) -> xr.Dataset:
@@ -53,12 +74,20 @@ def paired(n: int, seed: int) -> xr.Dataset:
     who = np.repeat(np.arange(n), 2)
     conditions = np.tile(["normal", "lotion"], n)
     change = np.repeat(rng.normal(0.001, 0.003, n), 2) * (conditions == "lotion")
-    return planted_tables([f"S{i}" for i in who], conditions=list(conditions), albedo=change, seed=seed, spread=0.1)
+    return planted_tables(
+        [f"S{i}" for i in who],
+        conditions=list(conditions),
+        albedo=change,
+        seed=seed,
+        spread=0.1,
+    )
 
 
 def main() -> None:
     """Compare all cohorts and print a table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--cohorts", type=int, default=200)
     parser.add_argument("--subjects", type=int, default=87)
     parser.add_argument("--permutations", type=int, default=1000)
@@ -66,42 +95,76 @@ def main() -> None:
     args = parser.parse_args()
     n = args.subjects
 
-    def over(cohort: Callable[[int], xr.Dataset], group_by: str, **options: tuple[str, ...]) -> xr.Dataset:
+    def over(
+        cohort: Callable[[int], xr.Dataset], group_by: str, **options: tuple[str, ...]
+    ) -> xr.Dataset:
         """First contrast of every cohort."""
         every = []
         for i in range(args.cohorts):
             seed = args.seed * 100_000 + i
             rng = np.random.default_rng([4, seed])
-            table = group_effects(cohort(seed), group_by=group_by, permutations=args.permutations, rng=rng, **options)
+            table = group_effects(
+                cohort(seed),
+                group_by=group_by,
+                permutations=args.permutations,
+                rng=rng,
+                **options,
+            )
             every.append(table.isel(contrast=0, drop=True))
         return xr.concat(every, "cohort", combine_attrs="override")
 
     def covered(found: xr.Dataset, quantity: str, truth: float) -> str:
         one = found.sel(quantity=quantity)
-        return f"{100 * float(((one['effect_low'] < truth) & (one['effect_high'] > truth)).mean()):.1f} %"
+        inside = (one["effect_low"] < truth) & (one["effect_high"] > truth)
+        return f"{100 * float(inside.mean()):.1f} %"
 
     for name, spread in (("equal spreads", 1.0), ("twice the spread", 2.0)):
-        null = over(lambda seed, spread=spread: cohort_of_two(n, seed, spread=spread), "gender")
+        null = over(
+            lambda seed, spread=spread: cohort_of_two(n, seed, spread=spread), "gender"
+        )
         for quantity in (R_D, SIGMA_TR):
-            even = stats.kstest(null["effect_p"].sel(quantity=quantity).values, "uniform").pvalue
-            print(f"| no difference, {name} | {quantity} | uniformity of p: {even:.2f} |")
+            even = stats.kstest(
+                null["effect_p"].sel(quantity=quantity).values, "uniform"
+            ).pvalue
+            print(
+                f"| no difference, {name} | {quantity} | uniformity of p: {even:.2f} |"
+            )
         false = float((null["effect_p_adjusted"] < 0.05).any("quantity").mean())
-        print(f"| no difference, {name} | any quantity | adjusted p < 0.05: {100 * false:.1f} % |")
-        real = over(lambda seed, spread=spread: cohort_of_two(n, seed, -0.03, 0.05, spread), "gender")
+        print(
+            f"| no difference, {name} | any quantity | adjusted p < 0.05: {100 * false:.1f} % |"
+        )
+        real = over(
+            lambda seed, spread=spread: cohort_of_two(n, seed, -0.03, 0.05, spread),
+            "gender",
+        )
         print(f"| planted, {name} | {R_D} | covered: {covered(real, R_D, -0.03)} |")
-        print(f"| planted, {name} | {SIGMA_TR} | covered: {covered(real, SIGMA_TR, 0.05)} |")
+        print(
+            f"| planted, {name} | {SIGMA_TR} | covered: {covered(real, SIGMA_TR, 0.05)} |"
+        )
         least = float(null["effect_detectable"].sel(quantity=R_D).median())
-        found = over(lambda seed, least=least, spread=spread: cohort_of_two(n, seed, least, 0.0, spread), "gender")
+        found = over(
+            lambda seed, least=least, spread=spread: cohort_of_two(
+                n, seed, least, 0.0, spread
+            ),
+            "gender",
+        )
         power = float((found["effect_p"].sel(quantity=R_D) < 0.05).mean())
-        print(f"| detectable difference ({least:.3f}), {name} | {R_D} | found: {100 * power:.0f} % |")
+        print(
+            f"| detectable difference ({least:.3f}), {name} | {R_D} | found: {100 * power:.0f} % |"
+        )
     for name, adjust in (("not adjusted", ()), ("adjusted for age", ("age",))):
-        found = over(lambda seed: confounded(n, seed), "ancestry", adjust=adjust)["effect"].sel(quantity=R_D)
+        found = over(lambda seed: confounded(n, seed), "ancestry", adjust=adjust)[
+            "effect"
+        ].sel(quantity=R_D)
         error = float(found.std()) / np.sqrt(args.cohorts)
         print(
-            f"| confounded by age, {name} | {R_D} | mean effect {float(found.mean()):.4f}, standard error {error:.4f} |"
+            f"| confounded by age, {name} | {R_D} | mean effect "
+            f"{float(found.mean()):.4f}, standard error {error:.4f} |"
         )
     both = over(lambda seed: paired(n, seed), "condition")
-    print(f"| conditions within subjects | {R_D} | covered: {covered(both, R_D, 0.001)} |")
+    print(
+        f"| conditions within subjects | {R_D} | covered: {covered(both, R_D, 0.001)} |"
+    )
 
 
 if __name__ == "__main__":

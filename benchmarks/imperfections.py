@@ -1,12 +1,15 @@
-"""Captures of imperfect domes: accuracy of the recovered parameters, and coverage of their stated errors.
+"""Captures of imperfect domes: accuracy of the recovered parameters, and coverage of
+their stated errors.
 
     python benchmarks/imperfections.py DB CAPTURE [CAPTURE...]
 
-Each capture folder has its truth beside it as <folder>.truth.npz (keys of skindb.virtual.truth). The captures are
-ingested into DB, which must be new, and fitted with a tenth of the lights held out; with --corrected, ingest uses
---refine and fit uses --inter-reflection. The Markdown table has one row per capture: errors of normals and R_d,
-fraction of R_d within its 95 % interval, the median half-width of the interval, errors at held-out lights, and notes of
-ingest. The lines after the table pool the captures.
+Each capture folder has its truth beside it as <folder>.truth.npz (keys of
+skindb.virtual.truth). The captures are ingested into DB, which must be new, and fitted
+with a tenth of the lights held out; with --corrected, ingest uses --refine and fit uses
+--inter-reflection. The Markdown table has one row per capture: errors of normals and
+R_d, fraction of R_d within its 95 % interval, the median half-width of the interval,
+errors at held-out lights, and notes of ingest. The lines after the table pool the
+captures.
 """
 
 from __future__ import annotations
@@ -42,7 +45,9 @@ COLUMNS = (
 def measure(db: Database, folder: Path, *, corrected: bool) -> dict[str, Any]:
     """Ingest, fit and compare one capture."""
     done = ingest_take(db, folder, calibration="note", refine=corrected)
-    report = fit_take(db, done.take, FitParameters(hold_out_lights=0.1, inter_reflection=corrected)).provenance
+    report = fit_take(
+        db, done.take, FitParameters(hold_out_lights=0.1, inter_reflection=corrected)
+    ).provenance
     model = db.read("model", done.take)
     with np.load(folder.with_name(folder.name + ".truth.npz")) as truth:
         recovered = recovered_against_true(model, dict(truth))
@@ -51,13 +56,17 @@ def measure(db: Database, folder: Path, *, corrected: bool) -> dict[str, Any]:
     error = model["fitted/diffuse_reflectance_total_error"].values[fitted].astype(float)
     off = found - recovered.true_diffuse[fitted]
     known = np.isfinite(off).all(axis=1)
-    low, high = (end.values[fitted] for end in reflectance_interval(model["fitted"].to_dataset()))
+    low, high = (
+        end.values[fitted] for end in reflectance_interval(model["fitted"].to_dataset())
+    )
     true = recovered.true_diffuse[fitted]
     return {
         "capture": folder.name,
         **recovered.summary(),
         "coverage": (np.abs(off[known]) < 1.96 * error[known]).mean(axis=0).tolist(),
-        "one_sided_coverage": ((true > low) & (true < high))[known].mean(axis=0).tolist(),
+        "one_sided_coverage": ((true > low) & (true < high))[known]
+        .mean(axis=0)
+        .tolist(),
         "half_width": np.median(1.96 * error[known] / found[known], axis=0).tolist(),
         "offset": np.median(off[known], axis=0).tolist(),
         "held_out": report.get("held_out_error"),
@@ -70,8 +79,12 @@ def measure(db: Database, folder: Path, *, corrected: bool) -> dict[str, Any]:
 def row(r: dict[str, Any]) -> str:
     """One row of the table."""
     if "refused" in r:
-        return f"| {r['capture']} | refused: {r['refused']} |" + " |" * (len(COLUMNS) - 1)
-    share, lower = (100 * np.mean(r[name]) for name in ("coverage", "one_sided_coverage"))
+        return f"| {r['capture']} | refused: {r['refused']} |" + " |" * (
+            len(COLUMNS) - 1
+        )
+    share, lower = (
+        100 * np.mean(r[name]) for name in ("coverage", "one_sided_coverage")
+    )
     light = r["held_out"]
     cells = (
         f"{r['normal_median_deg']:.1f}, {r['normal_95_deg']:.1f}",
@@ -97,7 +110,9 @@ def main() -> None:
     parser.add_argument("db")
     parser.add_argument("captures", nargs="+", type=Path)
     parser.add_argument(
-        "--corrected", action="store_true", help="Ingest with --refine, and fit with --inter-reflection."
+        "--corrected",
+        action="store_true",
+        help="Ingest with --refine, and fit with --inter-reflection.",
     )
     parser.add_argument("--json", type=Path, help="File for all results.")
     args = parser.parse_args()
@@ -108,16 +123,25 @@ def main() -> None:
         try:
             results.append(measure(db, folder, corrected=args.corrected))
         except InputError as error:
-            results.append({"capture": folder.name, "refused": str(error).splitlines()[0]})
+            results.append(
+                {"capture": folder.name, "refused": str(error).splitlines()[0]}
+            )
         print(row(results[-1]), flush=True)
     share = np.array([r["coverage"] for r in results if "coverage" in r])
     if len(share):
         each = share.mean(axis=1)
         width = np.median([r["half_width"] for r in results if "coverage" in r], axis=0)
-        print(f"\nIn the 95 % interval of R_d: {100 * share.mean():.1f} % of all; lowest {100 * each.min():.0f} %")
-        print(f"Median half-width of the interval, R G B: {numbers(100 * width, '.0f')} %")
+        print(
+            f"\nIn the 95 % interval of R_d: {100 * share.mean():.1f} % of all; "
+            f"lowest {100 * each.min():.0f} %"
+        )
+        print(
+            f"Median half-width of the interval, R G B: {numbers(100 * width, '.0f')} %"
+        )
     if args.json:
-        args.json.write_text(json.dumps(results, indent=1, default=str), encoding="utf-8")
+        args.json.write_text(
+            json.dumps(results, indent=1, default=str), encoding="utf-8"
+        )
 
 
 if __name__ == "__main__":

@@ -1,10 +1,12 @@
-"""Ingest compared with decoding alone: CPU time, wall time and peak anonymous memory of every stage.
+"""Ingest compared with decoding alone: CPU time, wall time and peak anonymous memory of
+every stage.
 
     python benchmarks/ingest.py CAPTURE [--spacing MM] [--every N] [--json FILE]
 
-The CPU times are compared. Every N-th frame of each kind (face, white target, dark) is decoded with the same number of
-threads before and after the ingest, and the mean of both is used, because a shared processor varies in speed. The first
-run after a change of the code also compiles, so run it twice.
+The CPU times are compared. Every N-th frame of each kind (face, white target, dark) is
+decoded with the same number of threads before and after the ingest, and the mean of
+both is used, because a shared processor varies in speed. The first run after a change
+of the code also compiles, so run it twice.
 """
 
 from __future__ import annotations
@@ -29,7 +31,9 @@ from skindb.workflow import ingest_take
 
 
 def decoding(folder: Path, every: int) -> dict[str, dict[str, float]]:
-    """CPU and wall time of decoding the frames of each kind ("frames" of the face, "white", "dark"), and number."""
+    """CPU and wall time of decoding the frames of each kind ("frames" of the face,
+    "white", "dark"), and number.
+    """
     dome = read_capture(folder).dome
     if dome is None:
         raise SystemExit(f"{folder}: no dome")
@@ -44,14 +48,19 @@ def decoding(folder: Path, every: int) -> dict[str, dict[str, float]]:
             for _ in pool.map(lambda frame: len(read_frame(*frame)), some):
                 pass
         scale = len(frames) / len(some)
-        spent = {"wall": scale * (time.monotonic() - start[0]), "cpu": scale * (time.process_time() - start[1])}
+        spent = {
+            "wall": scale * (time.monotonic() - start[0]),
+            "cpu": scale * (time.process_time() - start[1]),
+        }
         found[kind] = spent | {"frames": len(frames)}
     return found
 
 
 def main() -> None:
     """Print a table, and write the results."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("capture", type=Path)
     parser.add_argument("--spacing", type=float, default=1.5)
     parser.add_argument("--every", type=int, default=10)
@@ -59,7 +68,10 @@ def main() -> None:
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     before = decoding(options.capture, options.every)
-    with tempfile.TemporaryDirectory(dir=options.capture.parent) as folder, Stages() as stages:
+    with (
+        tempfile.TemporaryDirectory(dir=options.capture.parent) as folder,
+        Stages() as stages,
+    ):
         record = ingest_take(
             skindb.open(folder),
             options.capture,
@@ -69,14 +81,25 @@ def main() -> None:
         )
         stages.end("commit")
     after = decoding(options.capture, options.every)
-    alone = {kind: {key: (before[kind][key] + after[kind][key]) / 2 for key in before[kind]} for kind in before}
-    decoded = {key: sum(kind[key] for kind in alone.values()) for key in ("wall", "cpu")}
+    alone = {
+        kind: {key: (before[kind][key] + after[kind][key]) / 2 for key in before[kind]}
+        for kind in before
+    }
+    decoded = {
+        key: sum(kind[key] for kind in alone.values()) for key in ("wall", "cpu")
+    }
     table = stages.table()
     ratio = table["all"]["cpu"] / decoded["cpu"]
-    result: dict[str, Any] = {"capture": options.capture.name, "spacing_mm": options.spacing, "decoding": alone}
+    result: dict[str, Any] = {
+        "capture": options.capture.name,
+        "spacing_mm": options.spacing,
+        "decoding": alone,
+    }
     result |= {"stages": table, "ratio_cpu": ratio, "bytes": record.bytes}
     result |= {"samples": record.provenance["summary"]["samples"]}
-    rows = {f"decode {kind} ({spent['frames']:.0f})": spent for kind, spent in alone.items()}
+    rows = {
+        f"decode {kind} ({spent['frames']:.0f})": spent for kind, spent in alone.items()
+    }
     print("\n".join(stage_lines({**rows, "decode all": decoded, **table})))
     print(f"ratio {ratio:.2f}, {record.bytes / 1e6:.0f} MB")
     print("\n".join(sample_lines(result["samples"])))

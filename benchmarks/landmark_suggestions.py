@@ -2,8 +2,8 @@
 
     python benchmarks/landmark_suggestions.py FOLDER...
 
-Each FOLDER has scan.ply and landmarks.json, as a capture has. One Markdown row for each case: the points that are set,
-the scan as it is, and turned.
+Each FOLDER has scan.ply and landmarks.json, as a capture has. One Markdown row for each
+case: the points that are set, the scan as it is, and turned.
 """
 
 from __future__ import annotations
@@ -18,7 +18,15 @@ from scipy.spatial.transform import Rotation
 
 from skindb.geometry.landmark_suggestions import MEAN_FACE, mate, suggest_landmarks
 
-SEVEN = ("nose_tip", "nasion", "chin", "eye_outer_left", "eye_outer_right", "forehead_centre", "mouth_corner_left")
+SEVEN = (
+    "nose_tip",
+    "nasion",
+    "chin",
+    "eye_outer_left",
+    "eye_outer_right",
+    "forehead_centre",
+    "mouth_corner_left",
+)
 RIGHT = tuple(name for name in MEAN_FACE if not name.endswith("_left"))
 CASES = {  # points that are set, and the turn about the vertical in degrees
     "none": ((), 0.0),
@@ -34,21 +42,30 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folders", type=Path, nargs="+")
     scans = [read(folder) for folder in parser.parse_args().folders]
-    print(f"{len(scans)} scans\n\n| points that are set | median [mm] | 95 % | largest | farthest point |")
+    print(
+        f"{len(scans)} scans\n\n| points that are set | median [mm] | 95 % | "
+        "largest | farthest point |"
+    )
     print("|---" * 5 + "|")
     for label, (given, turn) in CASES.items():
         found = [errors(scan, given, turn) for scan in scans]
         names = sorted(found[0])
         table = np.array([[one[name] for name in names] for one in found])
         worst = names[int(np.median(table, axis=0).argmax())]
-        quantiles = " | ".join(f"{value:.1f}" for value in np.quantile(table, (0.5, 0.95, 1.0)))
+        quantiles = " | ".join(
+            f"{value:.1f}" for value in np.quantile(table, (0.5, 0.95, 1.0))
+        )
         print(f"| {label} | {quantiles} | {worst} |", flush=True)
 
 
 def read(folder: Path) -> Scan:
     mesh = trimesh.load(folder / "scan.ply", process=False)
     points = json.loads((folder / "landmarks.json").read_text())
-    return np.asarray(mesh.vertices), np.asarray(mesh.faces), {name: np.array(points[name]) for name in MEAN_FACE}
+    return (
+        np.asarray(mesh.vertices),
+        np.asarray(mesh.faces),
+        {name: np.array(points[name]) for name in MEAN_FACE},
+    )
 
 
 def errors(scan: Scan, given: tuple[str, ...], turn: float) -> dict[str, float]:
@@ -56,7 +73,9 @@ def errors(scan: Scan, given: tuple[str, ...], turn: float) -> dict[str, float]:
     vertices, faces, points = scan
     matrix = Rotation.from_euler("y", turn, degrees=True).as_matrix()
     turned = {name: matrix @ place for name, place in points.items()}
-    found = suggest_landmarks(vertices @ matrix.T, faces, {name: turned[name] for name in given})
+    found = suggest_landmarks(
+        vertices @ matrix.T, faces, {name: turned[name] for name in given}
+    )
     mirrored = {name for name in found if mate(name) in given and mate(name) != name}
     kept = mirrored if set(RIGHT) <= set(given) else set(found)
     return {name: float(np.linalg.norm(found[name] - turned[name])) for name in kept}

@@ -1,10 +1,12 @@
-"""Estimation of planted gains of the lights in captures with known truth: residual gains, and effect on the errors.
+"""Estimation of planted gains of the lights in captures with known truth: residual
+gains, and effect on the errors.
 
     python benchmarks/light_gains.py DB CAPTURE [CAPTURE...]
 
-Each capture folder has its truth beside it as <folder>.truth.npz (keys of skindb.virtual.truth). The captures are
-ingested into DB; their samples are multiplied by random gains and fitted without and with `light_gains`, a tenth of the
-lights held out. The Markdown table has one row for each capture and size of the gains.
+Each capture folder has its truth beside it as <folder>.truth.npz (keys of
+skindb.virtual.truth). The captures are ingested into DB; their samples are multiplied
+by random gains and fitted without and with `light_gains`, a tenth of the lights held
+out. The Markdown table has one row for each capture and size of the gains.
 """
 
 from __future__ import annotations
@@ -22,7 +24,12 @@ from skindb.fit import FitParameters, fit_model
 from skindb.virtual.truth import recovered_against_true
 from skindb.workflow import ingest_take
 
-COLUMNS = ("gains", "residual [%]", "normals, without, with [deg]", "held-out lights, without, with [%]")
+COLUMNS = (
+    "gains",
+    "residual [%]",
+    "normals, without, with [deg]",
+    "held-out lights, without, with [%]",
+)
 SPREADS = (0.0, 0.05, 0.15)
 
 
@@ -31,8 +38,12 @@ def planted(capture: xr.DataTree, gain: np.ndarray[Any, Any]) -> xr.DataTree:
     samples = capture["samples"].to_dataset()
     out = capture.copy()
     sample = samples["reflectance_sample"]
-    brighter = (sample.astype(np.float32) * xr.Variable("light", gain.astype(np.float32))).astype(sample.dtype)
-    out["samples"] = samples.assign(reflectance_sample=brighter.transpose(*sample.dims).assign_attrs(sample.attrs))
+    brighter = (
+        sample.astype(np.float32) * xr.Variable("light", gain.astype(np.float32))
+    ).astype(sample.dtype)
+    out["samples"] = samples.assign(
+        reflectance_sample=brighter.transpose(*sample.dims).assign_attrs(sample.attrs)
+    )
     return out
 
 
@@ -47,17 +58,32 @@ def main() -> None:
     for folder in args.captures:
         capture = db.read("capture", ingest_take(db, folder, calibration="note").take)
         truth = dict(np.load(folder.with_name(folder.name + ".truth.npz")))
-        normal = np.random.default_rng(5).standard_normal(capture["samples"].sizes["light"]).clip(-2.5, 2.5)
+        normal = (
+            np.random.default_rng(5)
+            .standard_normal(capture["samples"].sizes["light"])
+            .clip(-2.5, 2.5)
+        )
         for spread in SPREADS:
             gain = 1 + spread * normal
             models = [
-                fit_model(planted(capture, gain), FitParameters(hold_out_lights=0.1, light_gains=on))
+                fit_model(
+                    planted(capture, gain),
+                    FitParameters(hold_out_lights=0.1, light_gains=on),
+                )
                 for on in (False, True)
             ]
-            angles = [recovered_against_true(model, truth).summary()["normal_median_deg"] for model in models]
+            angles = [
+                recovered_against_true(model, truth).summary()["normal_median_deg"]
+                for model in models
+            ]
             errors = [100 * model.attrs["held_out_error"]["median"] for model in models]
             left = 100 * np.log(models[1]["light_gains/light_gain"].values / gain).std()
-            cells = (f"{spread:.0%}", f"{left:.1f}", "{:.1f}, {:.1f}".format(*angles), "{:.1f}, {:.1f}".format(*errors))
+            cells = (
+                f"{spread:.0%}",
+                f"{left:.1f}",
+                "{:.1f}, {:.1f}".format(*angles),
+                "{:.1f}, {:.1f}".format(*errors),
+            )
             print(f"| {folder.name} | {' | '.join(cells)} |", flush=True)
 
 

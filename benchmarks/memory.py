@@ -2,8 +2,8 @@
 
     python benchmarks/memory.py DB TAKE [--surfels 600000]
 
-Samples are read block by block from DB, as for a real take of that size. The model is committed to a temporary
-database.
+Samples are read block by block from DB, as for a real take of that size. The model is
+committed to a temporary database.
 """
 
 from __future__ import annotations
@@ -60,7 +60,9 @@ def main() -> None:
     print("peaks of stages are anonymous memory, without memory-mapped files")
     lights, cameras = (capture["samples"].sizes[dim] for dim in ("light", "camera"))
     fitted = model.attrs["status"].get("fitted", 0.0)
-    print(f"{args.surfels:,} surfels, {fitted:.1%} fitted, {lights} lights, {cameras} cameras")
+    print(
+        f"{args.surfels:,} surfels, {fitted:.1%} fitted, {lights} lights, {cameras} cameras"
+    )
     print(f"peak resident memory: {peak():.2f} GiB ({before:.2f} before the fit)")
 
 

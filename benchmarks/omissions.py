@@ -2,9 +2,10 @@
 
 python benchmarks/omissions.py DB [--take NAME]
 
-DB contains a fitted model with translucency. CPU times are of pictures with and without their plan; both have the same
-random numbers. The other lines are about what is not skipped: bases of small weight, parts of an environment below the
-horizon, surfels that no view shows, and nodes of the BRDF tables of the viewer's page.
+DB contains a fitted model with translucency. CPU times are of pictures with and without
+their plan; both have the same random numbers. The other lines are about what is not
+skipped: bases of small weight, parts of an environment below the horizon, surfels that
+no view shows, and nodes of the BRDF tables of the viewer's page.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ from skindb.render.picture import chosen_camera
 from skindb.render.plan import plan_scene
 from skindb.render.scene import Camera, from_model, lights_from_dome
 
-DOMINANT = 1e5  # factor on one light, so that all others together are below the wanted error
+# factor on one light, so that all others together are below the wanted error
+DOMINANT = 1e5
 DIRECTIONS = 300  # of views around the face
 
 
@@ -43,7 +45,13 @@ def made(surface, camera, lighting, scene, quality, *, planned):
         pixels = plan.pixels
         omissions = plan.omissions
     picture = render_monte_carlo(
-        surface, camera, lighting, quality, rng=np.random.default_rng(1), scene=scene, pixels=pixels
+        surface,
+        camera,
+        lighting,
+        quality,
+        rng=np.random.default_rng(1),
+        scene=scene,
+        pixels=pixels,
     )
     return time.process_time() - started, picture, omissions
 
@@ -62,15 +70,28 @@ def pictures(surface, camera, lights, scene) -> None:
         "one light dominates, error 2 %": (Lighting(dominated), Quality(error=0.02)),
         "sky": (room, Quality(64)),
         "dome, subsurface": (whole, Quality(32, subsurface=True)),
-        "one light dominates, subsurface, error 2 %": (Lighting(dominated), Quality(error=0.02, subsurface=True)),
+        "one light dominates, subsurface, error 2 %": (
+            Lighting(dominated),
+            Quality(error=0.02, subsurface=True),
+        ),
     }
     for name, (lighting, quality) in cases.items():
-        runs = [[made(surface, camera, lighting, scene, quality, planned=p) for p in (False, True)] for _ in range(3)]
+        runs = [
+            [
+                made(surface, camera, lighting, scene, quality, planned=p)
+                for p in (False, True)
+            ]
+            for _ in range(3)
+        ]
         first, second = (min(run[i][0] for run in runs) for i in (0, 1))
         (_, without, _), (_, found, omissions) = runs[0]
-        gap = np.sqrt(np.mean((found.radiance - without.radiance) ** 2) / np.mean(without.radiance**2))
+        gap = np.sqrt(
+            np.mean((found.radiance - without.radiance) ** 2)
+            / np.mean(without.radiance**2)
+        )
         print(
-            f"{name}: {first:.1f} s, with its plan {second:.1f} s; pictures differ by {gap:.2%}, noise "
+            f"{name}: {first:.1f} s, with its plan {second:.1f} s; pictures differ "
+            f"by {gap:.2%}, noise "
             f"{found.relative_error:.2%}"
         )
         print("".join(f"    {one}\n" for one in omissions), end="")
@@ -78,10 +99,20 @@ def pictures(surface, camera, lights, scene) -> None:
 
 def bases(surface, camera, lights, scene) -> None:
     """Time with all bases, and with the first one alone."""
-    one = replace(surface, weights=surface.weights[:, :1], tables=np.ascontiguousarray(surface.tables[..., :1]))
-    for name, lighting in (("one light", Lighting(lights.select([0]))), ("sky", Lighting(None, sky()))):
+    one = replace(
+        surface,
+        weights=surface.weights[:, :1],
+        tables=np.ascontiguousarray(surface.tables[..., :1]),
+    )
+    for name, lighting in (
+        ("one light", Lighting(lights.select([0]))),
+        ("sky", Lighting(None, sky())),
+    ):
         times = [
-            [made(face, camera, lighting, scene, Quality(64), planned=True)[0] for face in (surface, one)]
+            [
+                made(face, camera, lighting, scene, Quality(64), planned=True)[0]
+                for face in (surface, one)
+            ]
             for _ in range(3)
         ]
         many, few = np.min(times, axis=0)
@@ -101,12 +132,18 @@ def behind(surface, scene) -> None:
     lowest = trace_view(surface, camera, scene=scene).normal[:, 2].min()
     found = [
         render_monte_carlo(
-            surface, camera, Lighting(None, Environment(one)), Quality(64), rng=np.random.default_rng(1), scene=scene
+            surface,
+            camera,
+            Lighting(None, Environment(one)),
+            Quality(64),
+            rng=np.random.default_rng(1),
+            scene=scene,
         ).relative_error
         for one in (room, dark)
     ]
     print(
-        f"close-up, sun behind (normals face it by at most {-lowest:.2f}): noise {found[0]:.2%}, without it "
+        f"close-up, sun behind (normals face it by at most {-lowest:.2f}): noise "
+        f"{found[0]:.2%}, without it "
         f"{found[1]:.2%}"
     )
 
@@ -116,18 +153,32 @@ def hidden(surface, scene) -> None:
     k = np.arange(DIRECTIONS) + 0.5
     z = 1 - 2 * k / DIRECTIONS
     turn = k * np.pi * (3 - 5**0.5)
-    way = np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], axis=1)
+    way = np.stack(
+        [np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z],
+        axis=1,
+    )
     seen = np.zeros(len(surface.vertices), bool)
     for one in way:
         front = np.flatnonzero(surface.normals @ one > 0)
         target = surface.vertices[front] + 2000 * one
-        seen[front[~scene.occluded(surface.vertices[front], target, normal=surface.normals[front])]] = True
+        seen[
+            front[
+                ~scene.occluded(
+                    surface.vertices[front], target, normal=surface.normals[front]
+                )
+            ]
+        ] = True
     below = (way @ surface.normals.T).max(axis=1) <= 0
-    print(f"{(~seen).sum()} of {len(seen)} surfels are hidden in {DIRECTIONS} views; {below.sum()} of them show none")
+    print(
+        f"{(~seen).sum()} of {len(seen)} surfels are hidden in {DIRECTIONS} views; "
+        f"{below.sum()} of them show none"
+    )
 
 
 def nodes(tables) -> None:
-    """Relative RMS error of tables with half as many nodes along each axis, weighted as a picture sees them."""
+    """Relative RMS error of tables with half as many nodes along each axis, weighted as
+    a picture sees them.
+    """
     tables = tables.astype(np.float64)
     shape = tables.shape[:3]
     h = np.linspace(0, 1, shape[0]) ** 2 * np.pi / 2
@@ -135,7 +186,12 @@ def nodes(tables) -> None:
     p = np.arange(shape[2])
     angles = [x.ravel() for x in np.meshgrid(h, d, p * np.pi / shape[2], indexing="ij")]
     wi, wo = directions(*angles)
-    weight = np.clip(wi[:, 2], 0, 1) ** 2 * np.clip(wo[:, 2], 0, 1) * np.sin(angles[0]) * np.sqrt(angles[0])
+    weight = (
+        np.clip(wi[:, 2], 0, 1) ** 2
+        * np.clip(wo[:, 2], 0, 1)
+        * np.sin(angles[0])
+        * np.sqrt(angles[0])
+    )
     weight = (weight * np.sin(angles[1]) * np.cos(angles[1])).reshape(*shape, 1)
     for axis, name in enumerate(("theta_h", "theta_d", "phi_d")):
         whole = np.moveaxis(tables, axis, 0)
@@ -145,8 +201,13 @@ def nodes(tables) -> None:
         half = resampled(whole, np.linspace(0, count - 1, (count + 1) // 2))
         back = resampled(half, np.linspace(0, len(half) - 1, count))[: shape[axis]]
         error = np.moveaxis(back, 0, axis) - tables
-        rms = np.sqrt((weight * error**2).sum(axis=(0, 1, 2)) / (weight * tables**2).sum(axis=(0, 1, 2)))
-        print(f"half of the nodes of {name}: bases differ by {rms.min():.1%} to {rms.max():.1%}")
+        rms = np.sqrt(
+            (weight * error**2).sum(axis=(0, 1, 2))
+            / (weight * tables**2).sum(axis=(0, 1, 2))
+        )
+        print(
+            f"half of the nodes of {name}: bases differ by {rms.min():.1%} to {rms.max():.1%}"
+        )
 
 
 def resampled(values, place):
@@ -158,16 +219,25 @@ def resampled(values, place):
 
 def main() -> None:
     """Print the results."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("db")
     parser.add_argument("--take")
     options = parser.parse_args()
     db = skindb.open(options.db)
     model = db.read("model", options.take or db.takes("model")[0])
     dome = model["dome"].to_dataset().load()
-    surface, (camera, _), lights = from_model(model, fill=True), chosen_camera(dome, None), lights_from_dome(dome)
+    surface, (camera, _), lights = (
+        from_model(model, fill=True),
+        chosen_camera(dome, None),
+        lights_from_dome(dome),
+    )
     scene = RayScene(surface.vertices, surface.faces)
-    print(f"{camera.width} x {camera.height} pixels, {len(surface.vertices)} surfels, {len(lights)} lights")
+    print(
+        f"{camera.width} x {camera.height} pixels, {len(surface.vertices)} "
+        f"surfels, {len(lights)} lights"
+    )
     pictures(surface, camera, lights, scene)
     bases(surface, camera, lights, scene)
     behind(surface, scene)

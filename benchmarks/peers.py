@@ -1,7 +1,8 @@
-"""Simple reflectance models with which skindb is compared: fits of pixels under distant lights and one camera at +z.
+"""Simple reflectance models with which skindb is compared: fits of pixels under distant
+lights and one camera at +z.
 
-Each pixel has a normal and a few parameters, refined together by robust damped least squares (Levenberg and Marquardt)
-for all pixels at once.
+Each pixel has a normal and a few parameters, refined together by robust damped least
+squares (Levenberg and Marquardt) for all pixels at once.
 """
 
 from __future__ import annotations
@@ -15,15 +16,19 @@ from scipy.optimize import nnls
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-Shading = Callable[[Array, Array, Array], Array]  # parameters (n, p), normals (n, 3), lights (l, 3) -> (n, l)
+# parameters (n, p), normals (n, 3), lights (l, 3) -> (n, l)
+Shading = Callable[[Array, Array, Array], Array]
 
 ROUNDS = 40
 MIXTURE_ROUNDS = 5
 DIFFERENCE = 1e-4  # of a parameter, for derivatives
 TUKEY = 4.685  # 95 % efficiency for normal noise
-MIN_LEVEL = 0.05  # of the pixel's brightest prediction; errors of darker samples are not proportional to their value
+# of the pixel's brightest prediction; errors of darker samples are not proportional to
+# their value
+MIN_LEVEL = 0.05
 MIN_SCALE = 0.005  # of the level
-PRIOR = 0.005  # weight of the starting values, for pixels with fewer samples than parameters
+# weight of the starting values, for pixels with fewer samples than parameters
+PRIOR = 0.005
 MIN_COSINE = 0.02
 VIEW = np.array([0.0, 0.0, 1.0])
 WIDTHS = np.geomspace(0.08, 1.0, 8)  # roughness of the lobes of mixtures
@@ -35,7 +40,8 @@ class Peer:
 
     name: str
     shading: Shading
-    start: tuple[float, ...]  # the first is the logarithm of the albedo over that of Lambert's law
+    # the first is the logarithm of the albedo over that of Lambert's law
+    start: tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -53,7 +59,9 @@ def lambert(parameters: Array, normal: Array, light: Array) -> Array:
 
 
 def ggx_lobe(roughness: Array, normal: Array, light: Array) -> Array:
-    """Microfacet lobe times the cosine: GGX distribution, separable Smith shadowing, no Fresnel factor."""
+    """Microfacet lobe times the cosine: GGX distribution, separable Smith shadowing, no
+    Fresnel factor.
+    """
     half = light + VIEW
     half = half / np.linalg.norm(half, axis=1, keepdims=True)
     lit = np.maximum(normal @ light.T, MIN_COSINE)
@@ -67,7 +75,9 @@ def ggx_lobe(roughness: Array, normal: Array, light: Array) -> Array:
 
 
 def _smith(cosine: Array, square: Array) -> Array:
-    return np.asarray(2.0 * cosine / (cosine + np.sqrt(square + (1.0 - square) * cosine**2)))
+    return np.asarray(
+        2.0 * cosine / (cosine + np.sqrt(square + (1.0 - square) * cosine**2))
+    )
 
 
 def ggx(parameters: Array, normal: Array, light: Array) -> Array:
@@ -77,20 +87,31 @@ def ggx(parameters: Array, normal: Array, light: Array) -> Array:
 
 
 def oren_nayar_ggx(parameters: Array, normal: Array, light: Array) -> Array:
-    """Oren and Nayar's (1994) matt surface and one GGX lobe: albedo, strength, roughness, roughness of the former."""
+    """Oren and Nayar's (1994) matt surface and one GGX lobe: albedo, strength,
+    roughness, roughness of the former.
+    """
     lit = np.clip(normal @ light.T, 0.0, 1.0)
     seen = np.clip(normal @ VIEW, MIN_COSINE, 1.0)[:, None]
     variance = _fraction(parameters[:, 3:4]) ** 2
     sines = np.sqrt(1.0 - lit**2) * np.sqrt(1.0 - seen**2)
-    azimuth = np.maximum(light @ VIEW - lit * seen, 0.0)  # cosine of the difference of azimuth, times both sines
+    # cosine of the difference of azimuth, times both sines
+    azimuth = np.maximum(light @ VIEW - lit * seen, 0.0)
     steep = np.where(sines > 0, azimuth / np.maximum(lit, seen), 0.0)
-    rough = 1.0 - 0.5 * variance / (variance + 0.33) + 0.45 * variance / (variance + 0.09) * steep
+    rough = (
+        1.0
+        - 0.5 * variance / (variance + 0.33)
+        + 0.45 * variance / (variance + 0.09) * steep
+    )
     lobe = ggx_lobe(_fraction(parameters[:, 2:3]), normal, light)
-    return lambert(parameters, normal, light) * rough + np.exp(parameters[:, 1:2]) * lobe
+    return (
+        lambert(parameters, normal, light) * rough + np.exp(parameters[:, 1:2]) * lobe
+    )
 
 
 def lafortune(parameters: Array, normal: Array, light: Array) -> Array:
-    """Lambert's law and one isotropic Lafortune lobe (1997): albedo, both coefficients, exponent."""
+    """Lambert's law and one isotropic Lafortune lobe (1997): albedo, both coefficients,
+    exponent.
+    """
     lit = normal @ light.T
     seen = (normal @ VIEW)[:, None]
     level = lit * seen
@@ -110,22 +131,32 @@ PEERS = (LAMBERT, GGX, OREN_NAYAR_GGX, LAFORTUNE)
 
 
 def fit(peer: Peer, observed: Array, usable: Mask, light: Array, training: Mask) -> Fit:
-    """Fit `peer` to observations (n, l) at the training lights; the prediction is for all lights."""
-    normal, albedo = _least_squares(observed[:, training], usable[:, training], light[training])
+    """Fit `peer` to observations (n, l) at the training lights; the prediction is for
+    all lights.
+    """
+    normal, albedo = _least_squares(
+        observed[:, training], usable[:, training], light[training]
+    )
     first, second = _tangents(normal)
     start = np.tile(np.array([*peer.start, 0.0, 0.0]), (len(observed), 1))
     start[:, 0] += np.log(albedo)
 
     def shade(parameters: Array, lights: Array) -> Array:
-        return peer.shading(parameters[:, :-2], _turned(parameters, normal, first, second), lights)
+        return peer.shading(
+            parameters[:, :-2], _turned(parameters, normal, first, second), lights
+        )
 
     seen = usable[:, training]
-    found = _refine(lambda p: shade(p, light[training]), start, observed[:, training], seen)
+    found = _refine(
+        lambda p: shade(p, light[training]), start, observed[:, training], seen
+    )
     return Fit(_turned(found, normal, first, second), shade(found, light))
 
 
 def mixture(observed: Array, usable: Mask, light: Array, training: Mask) -> Fit:
-    """Non-negative mixture of Lambert's law and GGX lobes of fixed widths, with the normals of `GGX`."""
+    """Non-negative mixture of Lambert's law and GGX lobes of fixed widths, with the
+    normals of `GGX`.
+    """
     normal = fit(GGX, observed, usable, light, training).normal
     count = len(observed)
     columns = [lambert(np.zeros((count, 1)), normal, light)]
@@ -142,7 +173,9 @@ def mixture(observed: Array, usable: Mask, light: Array, training: Mask) -> Fit:
 
 
 def _least_squares(observed: Array, usable: Mask, light: Array) -> tuple[Array, Array]:
-    """Normals (n, 3) and albedos (n,) by robust photometric stereo (Woodham 1980), the start of every fit."""
+    """Normals (n, 3) and albedos (n,) by robust photometric stereo (Woodham 1980), the
+    start of every fit.
+    """
     weight = usable.astype(np.float64)
     scaled = np.zeros((len(observed), 3))
     for _ in range(10):
@@ -160,7 +193,9 @@ def _least_squares(observed: Array, usable: Mask, light: Array) -> tuple[Array, 
 
 def _robust_weights(observed: Array, predicted: Array, usable: Mask) -> Array:
     """Tukey weights of the errors relative to the prediction, over the squared level."""
-    level = np.maximum(predicted, MIN_LEVEL * predicted.max(axis=1, keepdims=True) + 1e-9)
+    level = np.maximum(
+        predicted, MIN_LEVEL * predicted.max(axis=1, keepdims=True) + 1e-9
+    )
     error = (observed - predicted) / level
     size = np.where(usable, np.abs(error), np.nan)
     scale = 1.4826 * _median_rows(size)[:, None] + MIN_SCALE
@@ -177,7 +212,9 @@ def _median_rows(values: Array) -> Array:
     return np.where(count > 0, median, 0.0)
 
 
-def _refine(shade: Callable[[Array], Array], start: Array, observed: Array, usable: Mask) -> Array:
+def _refine(
+    shade: Callable[[Array], Array], start: Array, observed: Array, usable: Mask
+) -> Array:
     """Damped Gauss-Newton steps for every row of parameters (n, p) by itself."""
     found = start.copy()
     predicted = shade(found)
@@ -191,15 +228,23 @@ def _refine(shade: Callable[[Array], Array], start: Array, observed: Array, usab
         right = np.einsum("nl,nlp,nl->np", weight, slope, observed - predicted)
         right -= prior[:, None] * (found - start)
         diagonal = np.einsum("npp->np", gram)
-        diagonal += prior[:, None] + damping[:, None] * (diagonal + 1e-9 * strength[:, None])
+        diagonal += prior[:, None] + damping[:, None] * (
+            diagonal + 1e-9 * strength[:, None]
+        )
         step = np.clip(np.linalg.solve(gram, right[:, :, None])[:, :, 0], -0.5, 0.5)
         trial = shade(found + step)
-        before = (weight * (observed - predicted) ** 2).sum(axis=1) + prior * ((found - start) ** 2).sum(axis=1)
-        after = (weight * (observed - trial) ** 2).sum(axis=1) + prior * ((found + step - start) ** 2).sum(axis=1)
+        before = (weight * (observed - predicted) ** 2).sum(axis=1) + prior * (
+            (found - start) ** 2
+        ).sum(axis=1)
+        after = (weight * (observed - trial) ** 2).sum(axis=1) + prior * (
+            (found + step - start) ** 2
+        ).sum(axis=1)
         better = after < before
         found[better] += step[better]
         predicted[better] = trial[better]
-        damping = np.where(better, np.maximum(damping / 3, 1e-6), np.minimum(damping * 4, 1e4))
+        damping = np.where(
+            better, np.maximum(damping / 3, 1e-6), np.minimum(damping * 4, 1e4)
+        )
     return found
 
 

@@ -1,4 +1,5 @@
-"""Coverage of the 95 % intervals of sigma_tr, for noisy profiles of random media with known and free gain.
+"""Coverage of the 95 % intervals of sigma_tr, for noisy profiles of random media with
+known and free gain.
 
 python benchmarks/probe_intervals.py [--profiles N]
 """
@@ -20,7 +21,9 @@ FLOOR = (3e-9, 3e-7)
 
 
 def draws(count, *, relative, floor, free, seed=1):
-    """Fits and true sigma_tr of `count` media: sigma_s' 1.5 mm^-1 within a factor of e^0.5, sigma_tr 0.3 to 2.4."""
+    """Fits and true sigma_tr of `count` media: sigma_s' 1.5 mm^-1 within a factor of
+    e^0.5, sigma_tr 0.3 to 2.4.
+    """
     rng = np.random.default_rng([seed, round(1e4 * relative), round(1e10 * floor)])
     for _ in range(count):
         s = 1.5 * np.exp(0.5 * rng.normal())
@@ -29,29 +32,48 @@ def draws(count, *, relative, floor, free, seed=1):
         value = transport_profile(DISTANCE, a, s, eta=1.3)
         error = np.hypot(relative * value, floor)
         taken = value + error * rng.normal(size=len(DISTANCE))
-        fit = fit_profile(DISTANCE, taken, error, radius=0.0, eta=1.3, model="transport", free_gain=free)
+        fit = fit_profile(
+            DISTANCE,
+            taken,
+            error,
+            radius=0.0,
+            eta=1.3,
+            model="transport",
+            free_gain=free,
+        )
         if fit.status != ProbeStatus.TOO_FEW_FIBRES:
             yield fit, true
 
 
 def main() -> None:
-    """Print coverage, errors of profiles with the status fitted, and the fraction that is flagged."""
+    """Print coverage, errors of profiles with the status fitted, and the fraction that
+    is flagged.
+    """
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--profiles", type=int, default=200)
     count = parser.parse_args().profiles
-    print("| gain | noise | floor [mm^-2] | in the interval | median error | largest error, status fitted | flagged |")
+    print(
+        "| gain | noise | floor [mm^-2] | in the interval | median error | largest "
+        "error, status fitted | flagged |"
+    )
     print("|---" * 7 + "|")
     for free in (False, True):
         for relative in RELATIVE:
             for floor in FLOOR:
                 found = list(draws(count, relative=relative, floor=floor, free=free))
                 off = np.array([fit.sigma_tr / true - 1 for fit, true in found])
-                inside = [abs(fit.sigma_tr - true) < 1.96 * fit.sigma_tr_error for fit, true in found]
-                fitted = np.array([fit.status == ProbeStatus.FITTED for fit, _ in found])
+                inside = [
+                    abs(fit.sigma_tr - true) < 1.96 * fit.sigma_tr_error
+                    for fit, true in found
+                ]
+                fitted = np.array(
+                    [fit.status == ProbeStatus.FITTED for fit, _ in found]
+                )
                 gain = "free" if free else "known"
                 print(
                     f"| {gain} | {100 * relative:g} % | {floor:g} | {100 * np.mean(inside):.1f} %"
-                    f" | {100 * np.median(np.abs(off)):.2f} % | {100 * np.abs(off[fitted]).max():.1f} %"
+                    f" | {100 * np.median(np.abs(off)):.2f} % | "
+                    f"{100 * np.abs(off[fitted]).max():.1f} %"
                     f" | {100 * np.mean(~fitted):.0f} % |",
                     flush=True,
                 )

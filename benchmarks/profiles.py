@@ -18,25 +18,35 @@ from skindb.fit._probe_profile import MODELS
 from skindb.optics.random_walk import random_walk
 
 ALBEDO = (0.1, 0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.99, 0.999)  # reduced
-DISTANCE = (0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.4, 2.0, 3.0, 5.0, 7.0, 10.0, 14.0, 20.0)  # transport mean free paths
+# transport mean free paths
+DISTANCE = (0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 1.4, 2.0, 3.0, 5.0, 7.0, 10.0, 14.0, 20.0)
 PRINTED = (0.1, 0.3, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
 WIDTH = 1.1  # rings extend from r / WIDTH to r WIDTH
 LOST = 0.15  # relative noise of the walk above which the error is not meaningful
 REPEAT = 50
-# largest albedo, packets, and path in units of 1 / sigma_s': from a dark medium few photons return, after short paths
+# largest albedo, packets, and path in units of 1 / sigma_s': from a dark medium few
+# photons return, after short paths
 WALKS = ((0.5, 3_000_000, 40.0), (0.95, 400_000, 600.0), (1.0, 200_000, 3000.0))
 
 
-def work_precision(*, eta: float = 1.3, seed: int = 0, share: float = 1.0) -> list[dict[str, float | str]]:
+def work_precision(
+    *, eta: float = 1.3, seed: int = 0, share: float = 1.0
+) -> list[dict[str, float | str]]:
     """One row per model, albedo and distance, with a fraction `share` of the photons.
 
-    `error` is that of the mean of a ring relative to the walk; `noise` is the relative standard error of the walk,
-    infinite where no photon arrived; `seconds` is the time per 1000 distances, without that of making tables.
+    `error` is that of the mean of a ring relative to the walk; `noise` is the relative
+    standard error of the walk, infinite where no photon arrived; `seconds` is the time
+    per 1000 distances, without that of making tables.
     """
     rows: list[dict[str, float | str]] = []
     darker = 0.0
     for limit, packets, longest in WALKS:
-        walk = random_walk(int(packets * share), eta=eta, longest=longest, rng=np.random.default_rng(seed))
+        walk = random_walk(
+            int(packets * share),
+            eta=eta,
+            longest=longest,
+            rng=np.random.default_rng(seed),
+        )
         for albedo in (a for a in ALBEDO if darker < a <= limit):
             rows += _compare(walk, albedo, eta)
         darker = limit
@@ -50,11 +60,22 @@ def _compare(walk, albedo, eta):
     rows = []
     value, noise = rings(walk, ratio, middle, WIDTH)
     for name, model in MODELS.items():
-        mean = ring_mean(model.profile(across(middle, WIDTH), ratio, 1.0, eta=eta), middle, WIDTH)
+        mean = ring_mean(
+            model.profile(across(middle, WIDTH), ratio, 1.0, eta=eta), middle, WIDTH
+        )
         seconds = _seconds(model.profile, 1 - albedo, albedo, eta)
         for d, v, e, m in zip(DISTANCE, value, noise, mean, strict=True):
             off = m / v - 1 if v > 0 else np.nan
-            rows.append({"model": name, "albedo": albedo, "distance": d, "error": off, "noise": e, "seconds": seconds})
+            rows.append(
+                {
+                    "model": name,
+                    "albedo": albedo,
+                    "distance": d,
+                    "error": off,
+                    "noise": e,
+                    "seconds": seconds,
+                }
+            )
     return rows
 
 
@@ -68,18 +89,41 @@ def _seconds(profile, sigma_a, sigma_s, eta) -> float:
 
 
 def plot(rows, path: Path) -> None:
-    """Plot the error over distance, one panel per model, one curve per albedo, with the noise of the walk."""
+    """Plot the error over distance, one panel per model, one curve per albedo, with the
+    noise of the walk.
+    """
     import matplotlib as mpl
 
     mpl.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, axes = plt.subplots(1, len(MODELS), figsize=(11, 4.2), constrained_layout=True)
+    figure, axes = plt.subplots(
+        1, len(MODELS), figsize=(11, 4.2), constrained_layout=True
+    )
     for ax, name in zip(axes, MODELS, strict=True):
-        for albedo, colour in zip(ALBEDO, plt.get_cmap("viridis")(np.linspace(0, 0.95, len(ALBEDO))), strict=True):
-            part = [r for r in rows if (r["model"], r["albedo"]) == (name, albedo) and r["noise"] < LOST]
-            x, y, e = (np.array([r[key] for r in part]) for key in ("distance", "error", "noise"))
-            ax.errorbar(x, 100 * y, 100 * e, color=colour, lw=1.2, capsize=2, label=f"{albedo:g}")
+        for albedo, colour in zip(
+            ALBEDO,
+            plt.get_cmap("viridis")(np.linspace(0, 0.95, len(ALBEDO))),
+            strict=True,
+        ):
+            part = [
+                r
+                for r in rows
+                if (r["model"], r["albedo"]) == (name, albedo) and r["noise"] < LOST
+            ]
+            x, y, e = (
+                np.array([r[key] for r in part])
+                for key in ("distance", "error", "noise")
+            )
+            ax.errorbar(
+                x,
+                100 * y,
+                100 * e,
+                color=colour,
+                lw=1.2,
+                capsize=2,
+                label=f"{albedo:g}",
+            )
         ax.axhline(0, color="k", lw=0.6)
         ax.set(
             xscale="log",
@@ -99,17 +143,26 @@ def main() -> None:
     parser.add_argument("--png", type=Path, help="File for the plot of the curves.")
     args = parser.parse_args()
     rows = work_precision()
-    print("| albedo | model | " + " | ".join(f"r = {d:g}" for d in PRINTED) + " | ms per 1000 |")
+    print(
+        "| albedo | model | "
+        + " | ".join(f"r = {d:g}" for d in PRINTED)
+        + " | ms per 1000 |"
+    )
     print("|---" * (len(PRINTED) + 3) + "|")
     for i in range(0, len(rows), len(DISTANCE)):
         part = rows[i : i + len(DISTANCE)]
         cells = [
-            f"{100 * r['error']:+.1f} ({100 * r['noise']:.1f})" if r["noise"] < LOST else "lost in noise"
+            f"{100 * r['error']:+.1f} ({100 * r['noise']:.1f})"
+            if r["noise"] < LOST
+            else "lost in noise"
             for r in part
             if r["distance"] in PRINTED
         ]
         first = part[0]
-        print(f"| {first['albedo']} | {first['model']} | {' | '.join(cells)} | {1e3 * first['seconds']:.2f} |")
+        print(
+            f"| {first['albedo']} | {first['model']} | {' | '.join(cells)} | "
+            f"{1e3 * first['seconds']:.2f} |"
+        )
     if args.png:
         plot(rows, args.png)
 

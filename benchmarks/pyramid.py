@@ -35,18 +35,35 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=1)
     asked = parser.parse_args()
     image = np.random.default_rng(0).normal(size=(asked.size, asked.size))
-    print(f"{'':<22} {'build [s]':>10} {'reconstruct [s]':>16} {'largest error / range':>22}")
+    print(
+        f"{'':<22} {'build [s]':>10} {'reconstruct [s]':>16} {'largest error / range':>22}"
+    )
     whole = {}
-    for name, x in (("skindb, float64", image), ("skindb, float32", image.astype(np.float32))):
+    for name, x in (
+        ("skindb, float64", image),
+        ("skindb, float32", image.astype(np.float32)),
+    ):
         with set_workers(asked.threads):
             built, pyramid = best(lambda x=x: build(x), asked.rounds)
             back, again = best(lambda p=pyramid: reconstruct(p), asked.rounds)
         whole[name] = built + back
-        print(f"{name:<22} {built:>10.2f} {back:>16.2f} {np.abs(again - x).max() / np.ptp(x):>22.1e}")
-    built, other = best(lambda: SteerablePyramidFreq(image, height=7, order=3), asked.rounds)
+        print(
+            f"{name:<22} {built:>10.2f} {back:>16.2f} {np.abs(again - x).max() / np.ptp(x):>22.1e}"
+        )
+    built, other = best(
+        lambda: SteerablePyramidFreq(image, height=7, order=3), asked.rounds
+    )
     back, again = best(other.recon_pyr, asked.rounds)
-    print(f"{'pyrtools':<22} {built:>10.2f} {back:>16.2f} {np.abs(again - image).max() / np.ptp(image):>22.1e}")
-    print(", ".join(f"{name}: {seconds / (built + back):.2f} of its time" for name, seconds in whole.items()))
+    print(
+        f"{'pyrtools':<22} {built:>10.2f} {back:>16.2f} "
+        f"{np.abs(again - image).max() / np.ptp(image):>22.1e}"
+    )
+    print(
+        ", ".join(
+            f"{name}: {seconds / (built + back):.2f} of its time"
+            for name, seconds in whole.items()
+        )
+    )
 
 
 if __name__ == "__main__":

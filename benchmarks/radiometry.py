@@ -2,8 +2,8 @@
 
 python benchmarks/radiometry.py CAPTURE... [--exposures FOLDER] [--photometric FOLDER]
 
-The truth of each CAPTURE is in CAPTURE.truth.npz. FOLDER contains the published exposure stacks or the photographs of
-the chrome ball.
+The truth of each CAPTURE is in CAPTURE.truth.npz. FOLDER contains the published
+exposure stacks or the photographs of the chrome ball.
 """
 
 from __future__ import annotations
@@ -25,22 +25,31 @@ from skindb.ingest.radiance import frame_mergers, merge_exposures, read_view
 from skindb.ingest.response import ResponseOptions, recover_response
 from skindb.ingest.white_target import TargetPixels, fit_light
 
-OCTAVES = range(-9, 1)  # of radiance, where 0 is the white level of the longest exposure
+# of radiance, where 0 is the white level of the longest exposure
+OCTAVES = range(-9, 1)
 MIN_VALUES = 200  # number of values in an octave below which its mean is not compared
 
 
 def radiance_biases(capture, folder):
-    """Bias (octave,) of merged radiance relative to the truth, with the given and with the recovered response.
+    """Bias (octave,) of merged radiance relative to the truth, with the given and with
+    the recovered response.
 
-    With a recovered response the unit of radiance is free in each channel; it is set by the median of bright octaves.
+    With a recovered response the unit of radiance is free in each channel; it is set by
+    the median of bright octaves.
     """
     dome = capture.dome
     faults = []
     mergers = frame_mergers(dome, faults)
     sensor = dome.cameras[0].sensor
     seconds = tuple(dome.exposures.values())
-    views = [np.stack(read_view(dome, light.id, c)) for c in dome.cameras for light in dome.lights]
-    response = recover_response(np.concatenate(views, axis=1), seconds, black=sensor.black, white=sensor.white)
+    views = [
+        np.stack(read_view(dome, light.id, c))
+        for c in dome.cameras
+        for light in dome.lights
+    ]
+    response = recover_response(
+        np.concatenate(views, axis=1), seconds, black=sensor.black, white=sensor.white
+    )
     biases = []
     for own in (sensor, replace(sensor, response=response.table)):
         merged = []
@@ -49,12 +58,16 @@ def radiance_biases(capture, folder):
             light, name = path.stem.split("_")
             camera = next(c for c in dome.cameras if c.id == name)
             frames = read_view(dome, light, camera)
-            found, _, flag = merge_exposures(frames, seconds, own, dark=mergers[name].dark)
+            found, _, flag = merge_exposures(
+                frames, seconds, own, dark=mergers[name].dark
+            )
             expected = read_frame(path, None)
             usable = (flag == 0) & (expected > 0).all(axis=-1)
             merged.append(found[usable].astype(float))
             truth.append(expected[usable].astype(float))
-        biases.append(_octave_biases(np.concatenate(merged), np.concatenate(truth), seconds[0]))
+        biases.append(
+            _octave_biases(np.concatenate(merged), np.concatenate(truth), seconds[0])
+        )
     return biases
 
 
@@ -64,69 +77,124 @@ def _octave_biases(merged, truth, longest):
     octave = np.round(np.log2(truth * longest))
     groups = [octave == o for o in OCTAVES]
     merged = merged / scale
-    return [merged[g].sum() / truth[g].sum() - 1 if g.sum() >= MIN_VALUES else np.nan for g in groups]
+    return [
+        merged[g].sum() / truth[g].sum() - 1 if g.sum() >= MIN_VALUES else np.nan
+        for g in groups
+    ]
 
 
 def light_errors(capture, truth):
-    """Relative errors of the intensities from `light_intensities` and from `fit_light`, and the fitted fall-off."""
+    """Relative errors of the intensities from `light_intensities` and from `fit_light`,
+    and the fitted fall-off.
+    """
     dome = capture.dome
     faults = []
     mergers = frame_mergers(dome, faults)
     with ThreadPoolExecutor(2) as pool:
         used = light_intensities(dome, mergers, pool) / truth["light_intensity"] - 1
-    targets = [target_pixels(c, dome.white) for c in dome.cameras if c.id in dome.white.cameras]
+    targets = [
+        target_pixels(c, dome.white) for c in dome.cameras if c.id in dome.white.cameras
+    ]
     fits = []
     for light, axis in zip(dome.lights, truth["light_axis"], strict=True):
-        radiance = [_target_radiance(dome, light, mergers[t.camera], t) for t in targets]
+        radiance = [
+            _target_radiance(dome, light, mergers[t.camera], t) for t in targets
+        ]
         points = np.concatenate([t.points for t in targets])
         white = dome.white
-        pixels = TargetPixels(np.concatenate(radiance), points, light.position, axis, white.normal, white.reflectance)
+        pixels = TargetPixels(
+            np.concatenate(radiance),
+            points,
+            light.position,
+            axis,
+            white.normal,
+            white.reflectance,
+        )
         fits.append(fit_light(pixels))
     own = np.array([f.intensity for f in fits]) / truth["light_intensity"] - 1
     return used, own, np.median([[f.falloff, f.falloff_error] for f in fits], axis=0)
 
 
 def _target_radiance(dome, light, merger, target):
-    radiance, flag = merger.merge(read_view(dome, light.id, merger.camera, white=True), target.spans)
+    radiance, flag = merger.merge(
+        read_view(dome, light.id, merger.camera, white=True), target.spans
+    )
     values = radiance.reshape(-1, 3)[target.at].astype(float)
     values[flag.ravel()[target.at] != 0] = np.nan
     return values
 
 
 def stated_errors(capture, truth):
-    """Mean and largest relative error of `calibrate_lights` with the stated fall-off, glare, and rms z-score."""
+    """Mean and largest relative error of `calibrate_lights` with the stated fall-off,
+    glare, and rms z-score.
+    """
     found = calibrate_lights(
-        replace(capture.dome, lights=[replace(light, intensity=None) for light in capture.dome.lights])
+        replace(
+            capture.dome,
+            lights=[replace(light, intensity=None) for light in capture.dome.lights],
+        )
     )
     error = found["calibrated_intensity"].values / truth["light_intensity"] - 1
     noise = (found["calibrated_intensity_error"] / found["calibrated_intensity"]).values
     position, glare = (
-        found[name].values[:, None] for name in ("calibrated_intensity_position_error", "glare_fraction")
+        found[name].values[:, None]
+        for name in ("calibrated_intensity_position_error", "glare_fraction")
     )
     z = error / np.sqrt(noise**2 + position**2 + glare**2)
-    return 100 * error.mean(), 100 * np.abs(error).max(), 100 * np.median(glare), np.sqrt((z**2).mean())
+    return (
+        100 * error.mean(),
+        100 * np.abs(error).max(),
+        100 * np.median(glare),
+        np.sqrt((z**2).mean()),
+    )
 
 
 def published_response(folder):
-    """Recovered response, published curves, and differences of their logarithms for the stack frobisher."""
-    names = [folder / "frobisher" / f"IMG_{number}.jpg" for number in (2600, 2601, 2602)]
-    reference = np.load(folder / "frobisher" / "reference" / "test_camera_response_function_Debevec1997_crfs.npy")
+    """Recovered response, published curves, and differences of their logarithms for the
+    stack frobisher.
+    """
+    names = [
+        folder / "frobisher" / f"IMG_{number}.jpg" for number in (2600, 2601, 2602)
+    ]
+    reference = np.load(
+        folder
+        / "frobisher"
+        / "reference"
+        / "test_camera_response_function_Debevec1997_crfs.npy"
+    )
     stack = np.stack([imagecodecs.imread(str(name)) for name in names])
     options = ResponseOptions(smoothness=1e-7)
-    response = recover_response(stack, (0.125, 1.0, 8.0), black=0, white=255, options=options)
+    response = recover_response(
+        stack, (0.125, 1.0, 8.0), black=0, white=255, options=options
+    )
     values = np.arange(20, 251)
-    found = np.stack([np.interp(values, response.table[:, 0], response.table[:, c]) for c in (1, 2, 3)], axis=-1)
+    found = np.stack(
+        [
+            np.interp(values, response.table[:, 0], response.table[:, c])
+            for c in (1, 2, 3)
+        ],
+        axis=-1,
+    )
     return response, reference, np.log(found / reference[values]).std(axis=0)
 
 
 def chrome_directions(folder):
     """Angles (photograph,) in degrees between detected highlights and published directions."""
-    outline = ball_outline(imagecodecs.imread(str(folder / "uw" / "chrome" / "chrome.mask.png"))[..., 0] > 128)
+    outline = ball_outline(
+        imagecodecs.imread(str(folder / "uw" / "chrome" / "chrome.mask.png"))[..., 0]
+        > 128
+    )
     published = np.loadtxt(folder / "uw" / "light_directions_chrome.csv", delimiter=",")
     angles = []
     for number, expected in enumerate(published):
-        picture = imagecodecs.imread(str(folder / "uw" / "chrome" / f"chrome.{number}.png"))[..., :3]
-        cosine = distant_light(outline, highlight_centre(picture, outline)) @ expected / np.linalg.norm(expected)
+        picture = imagecodecs.imread(
+            str(folder / "uw" / "chrome" / f"chrome.{number}.png")
+        )[..., :3]
+        cosine = (
+            distant_light(outline, highlight_centre(picture, outline))
+            @ expected
+            / np.linalg.norm(expected)
+        )
         angles.append(np.degrees(np.arccos(min(cosine, 1.0))))
     return np.array(angles)
 
@@ -138,7 +206,10 @@ def main() -> None:
     parser.add_argument("--exposures", type=Path)
     parser.add_argument("--photometric", type=Path)
     arguments = parser.parse_args()
-    print("| capture | largest error of `light_intensities` | of `fit_light` | fitted fall-off ", end="")
+    print(
+        "| capture | largest error of `light_intensities` | of `fit_light` | fitted fall-off ",
+        end="",
+    )
     print("| `calibrate_lights`: mean error, largest error, glare, rms z |")
     print("|---" * 5 + "|")
     curved = {}
@@ -147,19 +218,37 @@ def main() -> None:
         truth = np.load(folder.with_name(folder.name + ".truth.npz"))
         used, own, falloff = light_errors(capture, truth)
         if capture.dome.cameras[0].sensor.response is not None:
-            curved[folder.name] = radiance_biases(capture, folder.with_name(folder.name + ".truth"))
+            curved[folder.name] = radiance_biases(
+                capture, folder.with_name(folder.name + ".truth")
+            )
         largest = [f"{100 * np.abs(e).max():.2f} %" for e in (used, own)]
-        stated = "{:.2f} %, {:.2f} %, {:.2f} %, {:.2f}".format(*stated_errors(capture, truth))
-        print(f"| {folder.name} | {' | '.join(largest)} | {falloff[0]:.2f} ± {falloff[1]:.2f} | {stated} |", flush=True)
+        stated = "{:.2f} %, {:.2f} %, {:.2f} %, {:.2f}".format(
+            *stated_errors(capture, truth)
+        )
+        print(
+            (
+                f"| {folder.name} | {' | '.join(largest)} | {falloff[0]:.2f} ± "
+                f"{falloff[1]:.2f} | {stated} |"
+            ),
+            flush=True,
+        )
     for name, biases in curved.items():
         for response, bias in zip(("given", "recovered"), biases, strict=True):
-            shown = ", ".join(f"2^{o} {100 * b:+.2f} %" for o, b in zip(OCTAVES, bias, strict=True))
+            shown = ", ".join(
+                f"2^{o} {100 * b:+.2f} %" for o, b in zip(OCTAVES, bias, strict=True)
+            )
             print(f"{name}, bias of radiance with the {response} response: {shown}")
     if arguments.exposures:
-        print("frobisher, RMS difference of ln exposure, R G B:", published_response(arguments.exposures)[2].round(4))
+        print(
+            "frobisher, RMS difference of ln exposure, R G B:",
+            published_response(arguments.exposures)[2].round(4),
+        )
     if arguments.photometric:
         angles = chrome_directions(arguments.photometric)
-        print(f"chrome ball: median {np.median(angles):.2f} degrees, largest {angles.max():.2f} degrees")
+        print(
+            f"chrome ball: median {np.median(angles):.2f} degrees, largest "
+            f"{angles.max():.2f} degrees"
+        )
 
 
 if __name__ == "__main__":

@@ -1,9 +1,11 @@
-"""Time of verified reads: digests of the record compared with zarr's crc32c codec and with no check.
+"""Time of verified reads: digests of the record compared with zarr's crc32c codec and
+with no check.
 
     python benchmarks/reads.py [--surfels 20480] [--repeat 5]
 
-Samples in the layout of the store (150 lights x 16 cameras) are read completely by shards, and in part by chunks of 256
-surfels, from the page cache. The three methods alternate within one run; ratios of medians are printed.
+Samples in the layout of the store (150 lights x 16 cameras) are read completely by
+shards, and in part by chunks of 256 surfels, from the page cache. The three methods
+alternate within one run; ratios of medians are printed.
 """
 
 from __future__ import annotations
@@ -35,14 +37,19 @@ def samples(surfels: int) -> np.ndarray:
     rng = np.random.default_rng(0)
     wave = 1 + 0.3 * np.sin(np.arange(surfels) / 50)
     level = rng.uniform(0.05, 0.3, (1, LIGHTS, CAMERAS, 3)) * wave[:, None, None, None]
-    out = (level * (1 + 0.01 * rng.standard_normal((surfels, LIGHTS, CAMERAS, 1), np.float32))).astype(np.float16)
+    out = (
+        level
+        * (1 + 0.01 * rng.standard_normal((surfels, LIGHTS, CAMERAS, 1), np.float32))
+    ).astype(np.float16)
     out[:, rng.random((LIGHTS, CAMERAS)) < 0.33] = np.nan
     return np.asfortranarray(out)
 
 
 def write_checksums(root: Path, values: np.ndarray) -> Path:
     """Write the samples in the layout of the store, with a checksum in every chunk."""
-    layout = stage_module._encoding(dataset({"reflectance_sample": values})["reflectance_sample"])
+    layout = stage_module._encoding(
+        dataset({"reflectance_sample": values})["reflectance_sample"]
+    )
     array = zarr.create_array(
         LocalStore(root),
         name=NAME,
@@ -54,7 +61,9 @@ def write_checksums(root: Path, values: np.ndarray) -> Path:
         compressors=[*layout["compressors"], Crc32cCodec()],
     )
     for start in range(0, len(values), stage_module.SHARD):
-        array[start : start + stage_module.SHARD] = values[start : start + stage_module.SHARD]
+        array[start : start + stage_module.SHARD] = values[
+            start : start + stage_module.SHARD
+        ]
     return root
 
 
@@ -96,14 +105,21 @@ def main() -> None:
                 for what, read in (("whole", whole), ("part", part)):
                     begin = time.perf_counter()
                     read(zarr.open_array(store(), path=NAME, mode="r"))
-                    seconds.setdefault((name, what), []).append(time.perf_counter() - begin)
+                    seconds.setdefault((name, what), []).append(
+                        time.perf_counter() - begin
+                    )
         stored = record.bytes / args.surfels
-        print(f"{args.surfels} surfels, {values.nbytes / 1e6:.0f} MB, {stored:.0f} bytes stored per surfel")
+        print(
+            f"{args.surfels} surfels, {values.nbytes / 1e6:.0f} MB, {stored:.0f} "
+            "bytes stored per surfel"
+        )
         for name in stores:
             row = [median(seconds[name, what]) for what in ("whole", "part")]
             base = [median(seconds["no check", what]) for what in ("whole", "part")]
             columns = zip(("whole", "part"), row, base, strict=True)
-            ratios = " ".join(f"{what} {a:.3f} s ({a / b:.2f} x)" for what, a, b in columns)
+            ratios = " ".join(
+                f"{what} {a:.3f} s ({a / b:.2f} x)" for what, a, b in columns
+            )
             print(f"{name:<24} {ratios}")
 
 

@@ -1,10 +1,12 @@
-"""Errors on photographs of real faces and objects and on measured BRDFs, of skindb and of simple models.
+"""Errors on photographs of real faces and objects and on measured BRDFs, of skindb and
+of simple models.
 
     python benchmarks/real.py DATA [--parts faces cat lights sphere brdfs] [--json results.json]
 
-DATA contains photometric/yale, photometric/diligent, photometric/uw and brdf/merl_slices_phid90.npz. A part whose files
-are absent is skipped with the reason. Every fifth light is held out. The error of a pixel is the RMS error of its
-held-out samples over their RMS, and the table has the median over pixels.
+DATA contains photometric/yale, photometric/diligent, photometric/uw and
+brdf/merl_slices_phid90.npz. A part whose files are absent is skipped with the reason.
+Every fifth light is held out. The error of a pixel is the RMS error of its held-out
+samples over their RMS, and the table has the median over pixels.
 """
 
 from __future__ import annotations
@@ -21,7 +23,14 @@ import xarray as xr
 from numpy.typing import NDArray
 from peers import GGX, PEERS, Fit, fit, mixture
 from real_brdfs import brdf_rows
-from real_photographs import Photographs, cat, common_gains, faces, gray_sphere, spread_lights
+from real_photographs import (
+    Photographs,
+    cat,
+    common_gains,
+    faces,
+    gray_sphere,
+    spread_lights,
+)
 
 from skindb.fit import (
     embedded_dictionary,
@@ -42,12 +51,15 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 FAR_MM = 1e6  # distance of lights and camera; pixels have a spacing of 1 mm
-NO_SCAN_DEGREES = 60.0  # error of the scan's normals for which their prior has no effect
+# error of the scan's normals for which their prior has no effect
+NO_SCAN_DEGREES = 60.0
 # refractive indices; matt plaster has no smooth boundary
 SKIN = 1.3
 PLASTER = 1.0
-ISOTROPIC_95 = float(np.sqrt(-np.log(0.05)))  # 95 % of the angles of two equal axes, over their RMS
-MIN_PREDICTED = 0.01  # of a white facing surface times pi; smaller predictions tell nothing about gains
+# 95 % of the angles of two equal axes, over their RMS
+ISOTROPIC_95 = float(np.sqrt(-np.log(0.05)))
+# of a white facing surface times pi; smaller predictions tell nothing about gains
+MIN_PREDICTED = 0.01
 GAIN_ROUNDS = 3
 LIGHT_COUNTS = (4, 6, 8, 12, 24)
 PARTS = ("faces", "cat", "lights", "sphere", "brdfs")
@@ -60,7 +72,9 @@ Method = Callable[[Photographs, Mask], "Fitted"]
 
 @dataclass(frozen=True)
 class Fitted:
-    """Normals (n, 3), predictions (n, light) for all lights, and stated errors (n,) of the normals [degree]."""
+    """Normals (n, 3), predictions (n, light) for all lights, and stated errors (n,) of
+    the normals [degree].
+    """
 
     normal: Array
     predicted: Array
@@ -75,7 +89,9 @@ def samples_of(photographs: Photographs, chosen: NDArray[np.intp]) -> xr.Dataset
     count = len(sample)
     return dataset(
         {
-            "reflectance_sample": np.broadcast_to(sample, (*sample.shape[:2], 3))[:, :, None],
+            "reflectance_sample": np.broadcast_to(sample, (*sample.shape[:2], 3))[
+                :, :, None
+            ],
             "noise_floor": np.array(0.0),
             "surfel_position": np.zeros((count, 3)),
             "surfel_normal": np.tile([0.0, 0.0, 1.0], (count, 1)),
@@ -92,20 +108,31 @@ def skindb_fit(photographs: Photographs, training: Mask, *, eta: float) -> Fitte
     """Normals, R_d, dictionary and reduced basis of skindb, and the predictions of the model."""
     samples = samples_of(photographs, np.flatnonzero(training))
     dictionary = embedded_dictionary()
-    samples = samples.merge(estimate_normals(samples, eta=eta, scan_error=NO_SCAN_DEGREES))
+    samples = samples.merge(
+        estimate_normals(samples, eta=eta, scan_error=NO_SCAN_DEGREES)
+    )
     samples = samples.merge(estimate_diffuse_reflectance(samples, eta=eta))
     surface = fit_surface(samples, dictionary=dictionary, eta=eta)
-    basis = reduce_basis(surface.merge(samples), dictionary=dictionary, rng=np.random.default_rng(1))
+    basis = reduce_basis(
+        surface.merge(samples), dictionary=dictionary, rng=np.random.default_rng(1)
+    )
     weight = refit(samples, basis=basis, eta=eta)["basis_weight"].values
     normal = samples["shading_normal"].values.astype(np.float64)
     diffuse = samples["diffuse_reflectance"].values.mean(axis=1)
-    predicted = _predicted(normal, diffuse, weight, kernel_tables(basis), photographs.light, eta)
+    predicted = _predicted(
+        normal, diffuse, weight, kernel_tables(basis), photographs.light, eta
+    )
     errors = (samples[name].values for name in ("normal_error", "normal_total_error"))
     return Fitted(normal, predicted, *errors)
 
 
 def _predicted(
-    normal: Array, diffuse: Array, weight: Array, table: NDArray[np.float32], light: Array, eta: float
+    normal: Array,
+    diffuse: Array,
+    weight: Array,
+    table: NDArray[np.float32],
+    light: Array,
+    eta: float,
 ) -> Array:
     """Samples (n, light) of the model; NaN for pixels without a normal."""
     unknown = ~np.isfinite(normal).all(axis=1)
@@ -116,14 +143,20 @@ def _predicted(
     columns = []
     for direction in light:
         lit = np.clip(normal @ direction, 0, 1)
-        angles = half_difference(np.broadcast_to(direction, normal.shape), np.broadcast_to(view, normal.shape), normal)
+        angles = half_difference(
+            np.broadcast_to(direction, normal.shape),
+            np.broadcast_to(view, normal.shape),
+            normal,
+        )
         surface = (lookup(table, *angles) * weight).sum(axis=1)
         matt = through * fresnel_transmittance(np.maximum(lit, 1e-3), eta)
         columns.append(lit * (matt + surface))
     return np.where(unknown[:, None], np.nan, np.stack(columns, axis=1))
 
 
-def peer_fit(photographs: Photographs, training: Mask, *, estimate: Callable[..., Fit]) -> Fitted:
+def peer_fit(
+    photographs: Photographs, training: Mask, *, estimate: Callable[..., Fit]
+) -> Fitted:
     """A simple model, fitted to the mean of the channels."""
     result = estimate(photographs.grey, photographs.usable, photographs.light, training)
     return Fitted(result.normal, result.predicted)
@@ -131,12 +164,16 @@ def peer_fit(photographs: Photographs, training: Mask, *, estimate: Callable[...
 
 def methods(eta: float) -> dict[str, Method]:
     """Every compared method by its name."""
-    peers: dict[str, Method] = {peer.name: partial(peer_fit, estimate=partial(fit, peer)) for peer in PEERS}
+    peers: dict[str, Method] = {
+        peer.name: partial(peer_fit, estimate=partial(fit, peer)) for peer in PEERS
+    }
     peers["mixture of GGX lobes"] = partial(peer_fit, estimate=mixture)
     return {"skindb": partial(skindb_fit, eta=eta)} | peers
 
 
-def prediction_error(photographs: Photographs, predicted: Array, chosen: Mask, *, scaled: bool = False) -> float:
+def prediction_error(
+    photographs: Photographs, predicted: Array, chosen: Mask, *, scaled: bool = False
+) -> float:
     """Median over pixels of the relative RMS error [%]; `scaled` by one factor for each light."""
     observed = photographs.grey
     if scaled:
@@ -152,16 +189,27 @@ def prediction_error(photographs: Photographs, predicted: Array, chosen: Mask, *
 def light_factors(photographs: Photographs, predicted: Array) -> Array:
     """Median ratio (light,) of the samples to the predictions."""
     usable = photographs.usable & (predicted > MIN_PREDICTED)
-    ratio = np.where(usable, photographs.grey / np.where(usable, predicted, 1.0), np.nan)
-    return np.array([np.nanmedian(column) if np.isfinite(column).any() else 1.0 for column in ratio.T])
+    ratio = np.where(
+        usable, photographs.grey / np.where(usable, predicted, 1.0), np.nan
+    )
+    return np.array(
+        [
+            np.nanmedian(column) if np.isfinite(column).any() else 1.0
+            for column in ratio.T
+        ]
+    )
 
 
 def own_gains(photographs: Photographs, training: Mask, method: Method | None) -> Array:
-    """Gains (light,) from the training lights alone: those of skindb, or of a simple model by alternation."""
+    """Gains (light,) from the training lights alone: those of skindb, or of a simple
+    model by alternation.
+    """
     gain = np.ones(len(training))
     if method is None:
         samples = samples_of(photographs, np.flatnonzero(training))
-        gain[training] = estimate_light_gains(samples, rng=np.random.default_rng(2))["light_gain"].values
+        gain[training] = estimate_light_gains(samples, rng=np.random.default_rng(2))[
+            "light_gain"
+        ].values
         return gain
     for _ in range(GAIN_ROUNDS):
         predicted = method(photographs.divided_by(gain), training).predicted
@@ -172,16 +220,23 @@ def own_gains(photographs: Photographs, training: Mask, method: Method | None) -
 
 def face_rows(people: list[Photographs]) -> list[list[str]]:
     """Errors at held-out lights of the faces [%], mean over the people."""
-    rig = [own_gains(person, np.ones(len(person.light), np.bool_), methods(SKIN)[GGX.name]) for person in people]
+    rig = [
+        own_gains(person, np.ones(len(person.light), np.bool_), methods(SKIN)[GGX.name])
+        for person in people
+    ]
     title = f"{len(people)} faces: error at held-out lights [%]"
     rows = [[title, "raw", "scaled", "own gains, scaled", "gains of others"]]
     for name, method in methods(SKIN).items():
         cells = []
         for k, person in enumerate(people):
             training = ~person.held_out
-            own = person.divided_by(own_gains(person, training, None if name == "skindb" else method))
+            own = person.divided_by(
+                own_gains(person, training, None if name == "skindb" else method)
+            )
             shared = person.divided_by(common_gains(people, rig, k))
-            raw, balanced, common = (method(part, training).predicted for part in (person, own, shared))
+            raw, balanced, common = (
+                method(part, training).predicted for part in (person, own, shared)
+            )
             cells.append(
                 [
                     prediction_error(person, raw, person.held_out),
@@ -195,21 +250,40 @@ def face_rows(people: list[Photographs]) -> list[list[str]]:
 
 
 def cat_rows(photographs: Photographs) -> list[list[str]]:
-    """Angles to the measured normals of the cat, coverage of the stated errors, and errors at held-out lights."""
-    rows = [["cat, 76 of 96 lights", ANGLE, COVERAGE, "held-out lights, raw, scaled [%]"]]
+    """Angles to the measured normals of the cat, coverage of the stated errors, and
+    errors at held-out lights.
+    """
+    rows = [
+        ["cat, 76 of 96 lights", ANGLE, COVERAGE, "held-out lights, raw, scaled [%]"]
+    ]
     for name, method in methods(SKIN).items():
         fitted = method(photographs, ~photographs.held_out)
         angle = angles(fitted.normal, photographs.normal)
         errors = [
-            prediction_error(photographs, fitted.predicted, photographs.held_out, scaled=s) for s in (False, True)
+            prediction_error(
+                photographs, fitted.predicted, photographs.held_out, scaled=s
+            )
+            for s in (False, True)
         ]
-        rows.append([name, _two(np.nanmean(angle), np.nanmedian(angle)), coverage(fitted, angle), _two(*errors)])
+        rows.append(
+            [
+                name,
+                _two(np.nanmean(angle), np.nanmedian(angle)),
+                coverage(fitted, angle),
+                _two(*errors),
+            ]
+        )
     return rows
 
 
 def light_rows(photographs: Photographs) -> list[list[str]]:
     """Errors of the cat by the number of training lights."""
-    rows = [["cat: normals, mean [deg] / held-out lights [%]", *(f"{n} lights" for n in LIGHT_COUNTS)]]
+    rows = [
+        [
+            "cat: normals, mean [deg] / held-out lights [%]",
+            *(f"{n} lights" for n in LIGHT_COUNTS),
+        ]
+    ]
     training = np.flatnonzero(~photographs.held_out)
     for name, method in methods(SKIN).items():
         cells = []
@@ -227,7 +301,10 @@ def _few_lights(photographs: Photographs, method: Method, chosen: Mask) -> str:
     except ValueError:  # of skindb: no surfel could be fitted
         return "no model"
     angle = np.nanmean(angles(fitted.normal, photographs.normal))
-    return f"{angle:.1f} / {prediction_error(photographs, fitted.predicted, photographs.held_out):.1f}"
+    return (
+        f"{angle:.1f} / "
+        f"{prediction_error(photographs, fitted.predicted, photographs.held_out):.1f}"
+    )
 
 
 def sphere_rows(photographs: Photographs) -> list[list[str]]:
@@ -237,7 +314,13 @@ def sphere_rows(photographs: Photographs) -> list[list[str]]:
     for name, method in methods(PLASTER).items():
         fitted = method(photographs, everything)
         angle = angles(fitted.normal, photographs.normal)
-        rows.append([name, _two(np.nanmean(angle), np.nanmedian(angle)), coverage(fitted, angle)])
+        rows.append(
+            [
+                name,
+                _two(np.nanmean(angle), np.nanmedian(angle)),
+                coverage(fitted, angle),
+            ]
+        )
     return rows
 
 
@@ -245,7 +328,9 @@ def angles(estimated: Array, true: Array | None) -> Array:
     """Angles (n,) [degree]."""
     if true is None:
         raise ValueError("the object has no measured normals")
-    return np.asarray(np.degrees(np.arccos(np.clip((estimated * true).sum(axis=1), -1, 1))))
+    return np.asarray(
+        np.degrees(np.arccos(np.clip((estimated * true).sum(axis=1), -1, 1)))
+    )
 
 
 def coverage(fitted: Fitted, angle: Array) -> str:
@@ -253,7 +338,13 @@ def coverage(fitted: Fitted, angle: Array) -> str:
     if fitted.normal_error is None or fitted.normal_total_error is None:
         return "-"
     errors = (fitted.normal_error, fitted.normal_total_error)
-    return _two(*(100 * np.mean(angle[np.isfinite(e)] < ISOTROPIC_95 * e[np.isfinite(e)]) for e in errors), places=0)
+    return _two(
+        *(
+            100 * np.mean(angle[np.isfinite(e)] < ISOTROPIC_95 * e[np.isfinite(e)])
+            for e in errors
+        ),
+        places=0,
+    )
 
 
 def _two(first: float, second: float, places: int = 1) -> str:
@@ -285,9 +376,19 @@ def measure(data: Path, part: str) -> list[list[str]] | str:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", type=Path, help="Folder of the photographs and measured BRDFs.")
-    parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS), help="What is measured.")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "data", type=Path, help="Folder of the photographs and measured BRDFs."
+    )
+    parser.add_argument(
+        "--parts",
+        nargs="+",
+        choices=PARTS,
+        default=list(PARTS),
+        help="What is measured.",
+    )
     parser.add_argument("--json", type=Path, help="File for the results.")
     args = parser.parse_args()
     results = {}

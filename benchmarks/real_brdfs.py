@@ -28,7 +28,11 @@ def brdf_rows(path: Path) -> list[list[str]]:
     """Errors of fits to slices at phi_d = 90 degrees, median over the materials."""
     with np.load(path) as archive:
         names = archive["names"].tolist()
-        theta_d, theta_h = np.meshgrid(archive["theta_d_rad"][::EVERY], archive["theta_h_rad"][::EVERY], indexing="ij")
+        theta_d, theta_h = np.meshgrid(
+            archive["theta_d_rad"][::EVERY],
+            archive["theta_h_rad"][::EVERY],
+            indexing="ij",
+        )
         values = archive["f"][:, ::EVERY, ::EVERY].mean(axis=3).astype(np.float64)
     wi, wo = directions(theta_h, theta_d, np.pi / 2)
     above = np.minimum(wi[..., 2], wo[..., 2]) > MIN_COSINE
@@ -39,13 +43,18 @@ def brdf_rows(path: Path) -> list[list[str]]:
         f"mixture of {GGX_WIDTHS.size * len(INDICES)} GGX lobes + Lambert": _ggx_mixture(
             theta_h[above], theta_d[above], wi[above], wo[above]
         ),
-        "Cook-Torrance + Lambert": _cook_torrance(theta_h[above], theta_d[above], wi[above], wo[above]),
+        "Cook-Torrance + Lambert": _cook_torrance(
+            theta_h[above], theta_d[above], wi[above], wo[above]
+        ),
         "Lafortune + Lambert": _lafortune(wi[above], wo[above]),
     }
     title = "59 measured BRDFs: error [%], median over materials"
     rows = [[title, "median over directions", "RMS in cube-root space"]]
     for name, estimate in fits.items():
-        errors = [_errors(estimate(material, value), value) for material, value in measured.items()]
+        errors = [
+            _errors(estimate(material, value), value)
+            for material, value in measured.items()
+        ]
         rows.append([name, *(f"{100 * e:.1f}" for e in np.median(errors, axis=0))])
     return rows
 
@@ -57,7 +66,9 @@ def _errors(fitted: Array, value: Array) -> tuple[float, float]:
 
 
 def _perceptual_nnls(columns: Array, value: Array) -> Array:
-    """Prediction of the non-negative mixture that is closest in cube-root space, by reweighted least squares."""
+    """Prediction of the non-negative mixture that is closest in cube-root space, by
+    reweighted least squares.
+    """
     level = np.maximum(value, FLOOR)
     for _ in range(ROUNDS):
         slope = level ** (-2 / 3)
@@ -80,7 +91,9 @@ def _others(wi: Array, wo: Array):
 def _ggx(roughness: float, theta_h: Array, wi: Array, wo: Array) -> Array:
     square = roughness**4
     distribution = square / (np.pi * (np.cos(theta_h) ** 2 * (square - 1) + 1) ** 2)
-    factors = [2 / (c + np.sqrt(square + (1 - square) * c * c)) for c in (wi[:, 2], wo[:, 2])]
+    factors = [
+        2 / (c + np.sqrt(square + (1 - square) * c * c)) for c in (wi[:, 2], wo[:, 2])
+    ]
     return np.asarray(distribution * factors[0] * factors[1] / 4)
 
 
@@ -98,16 +111,26 @@ def _ggx_mixture(theta_h: Array, theta_d: Array, wi: Array, wo: Array):
 def _best(shade, starts: list[list[float]], value: Array) -> Array:
     """Prediction of the best of several fits in cube-root space."""
     roots = np.cbrt(value)
-    results = [least_squares(lambda p: np.cbrt(shade(p)) - roots, start, x_scale="jac") for start in starts]
+    results = [
+        least_squares(lambda p: np.cbrt(shade(p)) - roots, start, x_scale="jac")
+        for start in starts
+    ]
     return np.asarray(shade(min(results, key=lambda result: result.cost).x))
 
 
 def _one_ggx(theta_h: Array, theta_d: Array, wi: Array, wo: Array):
     def shade(p: Array) -> Array:
         fresnel = fresnel_reflectance(np.cos(theta_d), 1.0 + np.exp(p[3]))
-        return np.exp(p[0]) + np.exp(p[1]) * fresnel * _ggx(np.exp(p[2]), theta_h, wi, wo) + 1e-9
+        return (
+            np.exp(p[0])
+            + np.exp(p[1]) * fresnel * _ggx(np.exp(p[2]), theta_h, wi, wo)
+            + 1e-9
+        )
 
-    starts = [[np.log(0.02), 0.0, np.log(width), -0.7] for width in (WIDTHS[0], WIDTHS[3], WIDTHS[6])]
+    starts = [
+        [np.log(0.02), 0.0, np.log(width), -0.7]
+        for width in (WIDTHS[0], WIDTHS[3], WIDTHS[6])
+    ]
     return lambda _, value: _best(shade, starts, value)
 
 
@@ -120,7 +143,9 @@ def _cook_torrance(theta_h: Array, theta_d: Array, wi: Array, wo: Array):
     def shade(p: Array) -> Array:
         square = np.exp(2 * p[2])
         tangent = np.tan(theta_h) ** 2
-        distribution = np.exp(-np.minimum(tangent / square, 50)) / (np.pi * square * across**4)
+        distribution = np.exp(-np.minimum(tangent / square, 50)) / (
+            np.pi * square * across**4
+        )
         fresnel = fresnel_reflectance(np.cos(theta_d), 1.0 + np.exp(p[3]))
         lobe = distribution * shadowed * fresnel / (4 * wi[:, 2] * wo[:, 2])
         return np.exp(p[0]) + np.exp(p[1]) * lobe + 1e-9
@@ -136,7 +161,9 @@ def _lafortune(wi: Array, wo: Array):
     def shade(p: Array) -> Array:
         p = np.clip(p, -20, 6)
         base = np.maximum(np.exp(p[2]) * level - np.exp(p[1]) * flat, 1e-6)
-        return np.exp(p[0]) + np.exp(np.clip(np.exp(p[3]) * np.log(base), -50, 50)) + 1e-9
+        return (
+            np.exp(p[0]) + np.exp(np.clip(np.exp(p[3]) * np.log(base), -50, 50)) + 1e-9
+        )
 
     starts = [[np.log(0.02), -0.7, -0.7, np.log(exponent)] for exponent in (3, 20, 100)]
     return lambda _, value: _best(shade, starts, value)

@@ -13,21 +13,26 @@ from skimage.io import imread
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-DARKEST = 8  # of 255; darker pixels are in shadow or show little more than ambient light
+# of 255; darker pixels are in shadow or show little more than ambient light
+DARKEST = 8
 BRIGHTEST = 250  # of 255; brighter pixels may be clipped
 FACE_STEP = 4  # every fourth pixel in either direction
 CAT_STEP = 2
 SPHERE_STEP = 3
-MIN_FRONTAL = 0.2  # z of the direction to a light of the faces; others shine from behind
+# z of the direction to a light of the faces; others shine from behind
+MIN_FRONTAL = 0.2
 HELD_OUT_EVERY = 5  # lights
 
 
 @dataclass(frozen=True)
 class Photographs:
-    """Pixels of one object under several distant lights, seen by one distant camera in the direction +z."""
+    """Pixels of one object under several distant lights, seen by one distant camera in
+    the direction +z.
+    """
 
     name: str
-    sample: Array  # (pixel, light, channel) value of a white matt facing surface: 1 / pi
+    # (pixel, light, channel) value of a white matt facing surface: 1 / pi
+    sample: Array
     usable: Mask  # (pixel, light)
     light: Array  # (light, 3) unit directions
     light_name: tuple[str, ...]
@@ -56,7 +61,9 @@ class Photographs:
 
 
 def faces(folder: Path) -> list[Photographs]:
-    """The faces of Extended Yale B: FOLDER/yaleB<NN>.npz with 8-bit linear pictures and angles of the strobes."""
+    """The faces of Extended Yale B: FOLDER/yaleB<NN>.npz with 8-bit linear pictures and
+    angles of the strobes.
+    """
     return [_face(path) for path in sorted(folder.glob("yaleB*.npz"))]
 
 
@@ -65,7 +72,9 @@ def _face(path: Path) -> Photographs:
         image = archive["image"][:, ::FACE_STEP, ::FACE_STEP]
         azimuth = np.radians(archive["azimuth_degree"])
         elevation = np.radians(archive["elevation_degree"])
-        degrees = zip(archive["azimuth_degree"], archive["elevation_degree"], strict=True)
+        degrees = zip(
+            archive["azimuth_degree"], archive["elevation_degree"], strict=True
+        )
     names = [f"{a:+.0f}{e:+.0f}" for a, e in degrees]
     across = -np.sin(azimuth) * np.cos(elevation)
     towards = np.cos(azimuth) * np.cos(elevation)
@@ -83,7 +92,9 @@ def _face(path: Path) -> Photographs:
 
 
 def cat(folder: Path) -> Photographs:
-    """The cat of DiLiGenT: FOLDER/cat.npz with linear 16-bit pictures, intensities and measured normals."""
+    """The cat of DiLiGenT: FOLDER/cat.npz with linear 16-bit pictures, intensities and
+    measured normals.
+    """
     with np.load(folder / "cat.npz") as archive:
         mask = archive["mask"].copy()
         mask[1::CAT_STEP] = False
@@ -109,10 +120,15 @@ def cat(folder: Path) -> Photographs:
 
 
 def gray_sphere(folder: Path) -> Photographs:
-    """The gray sphere of the UW set; its normals follow from its outline, and its pictures are taken as linear."""
+    """The gray sphere of the UW set; its normals follow from its outline, and its
+    pictures are taken as linear.
+    """
     light = _unit(np.loadtxt(folder / "light_directions_chrome.csv", delimiter=","))
     mask = imread(folder / "gray" / "gray.mask.png")[..., :3].max(axis=2) > 127
-    pictures = [imread(folder / "gray" / f"gray.{k}.png")[..., :3][mask] for k in range(len(light))]
+    pictures = [
+        imread(folder / "gray" / f"gray.{k}.png")[..., :3][mask]
+        for k in range(len(light))
+    ]
     value = np.stack(pictures, axis=1)
     row, column = np.nonzero(mask)
     radius = np.sqrt(mask.sum() / np.pi)
@@ -141,8 +157,12 @@ def spread_lights(light: Array, count: int) -> NDArray[np.intp]:
     return np.sort(np.array(chosen))
 
 
-def common_gains(people: Sequence[Photographs], gains: Sequence[Array], without: int) -> Array:
-    """Gain (light,) of each light of person `without` as the median over the other people; 1 where nobody has it."""
+def common_gains(
+    people: Sequence[Photographs], gains: Sequence[Array], without: int
+) -> Array:
+    """Gain (light,) of each light of person `without` as the median over the other
+    people; 1 where nobody has it.
+    """
     result = np.ones(len(people[without].light))
     for i, name in enumerate(people[without].light_name):
         others = [

@@ -1,12 +1,15 @@
-"""Errors of a common (u, v): correspondences of virtual heads with known corresponding points, and regions.
+"""Errors of a common (u, v): correspondences of virtual heads with known corresponding
+points, and regions.
 
     python benchmarks/registration.py CAPTURE ... [--shared N] [--every N] [--brief]
 
-Only the scan, landmarks and regions of the folder CAPTURE are read, not its frames. CAPTURE.truth.npz beside it has
-`vertices` (v, 3) in mm, `region` (v,) and `region_names`; its first N vertices are the same points of every head.
-Prints Markdown tables: errors in mm by region without and with the warp, for the unchanged scans and for scans that
-end at different places; errors in mm by number of landmarks, errors of clicks and smoothing; agreement of regions from
-landmarks with those of the captures. Use other heads than those on which thresholds were chosen.
+Only the scan, landmarks and regions of the folder CAPTURE are read, not its frames.
+CAPTURE.truth.npz beside it has `vertices` (v, 3) in mm, `region` (v,) and
+`region_names`; its first N vertices are the same points of every head. Prints Markdown
+tables: errors in mm by region without and with the warp, for the unchanged scans and
+for scans that end at different places; errors in mm by number of landmarks, errors of
+clicks and smoothing; agreement of regions from landmarks with those of the captures.
+Use other heads than those on which thresholds were chosen.
 """
 
 from __future__ import annotations
@@ -39,47 +42,66 @@ CLICKS = (0.5, 1.0, 2.0, 3.0)  # mm rms, each axis
 CUTS = (None, 25.0, 40.0, None, 10.0)  # mm below the chin, for one take after another
 BACK = 25.0  # mm that are cut off at the back of the head
 PRESENT = 3.0  # mm from the scan; farther points are not on it
-BESIDE = {"neck": ("neck", "neck_beard")}  # region from landmarks -> names of the same region in other data
+# region from landmarks -> names of the same region in other data
+BESIDE = {"neck": ("neck", "neck_beard")}
 
 
 def scanned(folder: Path, spacing_mm: float) -> xr.DataTree:
     """Groups of a take that a registration reads, made from the scan as by ingest."""
     capture = read_capture(folder)
     surfels = build_surfels(capture, spacing_mm=spacing_mm)
-    return xr.DataTree.from_dict({"fitted": surfel_group(surfels), "mesh": mesh_group(capture, surfels)})
+    return xr.DataTree.from_dict(
+        {"fitted": surfel_group(surfels), "mesh": mesh_group(capture, surfels)}
+    )
 
 
-def with_landmarks(models: Models, chosen: NDArray[np.int64], *, click: float = 0.0, seed: int = 0) -> Models:
+def with_landmarks(
+    models: Models, chosen: NDArray[np.int64], *, click: float = 0.0, seed: int = 0
+) -> Models:
     """The takes with some of their landmarks, each displaced by a random error of `click` mm."""
     rng = np.random.default_rng(seed)
     out = {}
     for take, model in models.items():
         mesh = model["mesh"].to_dataset().isel(landmark=chosen)
-        moved = mesh["landmark_position"] + click * rng.normal(size=mesh["landmark_position"].shape)
-        mesh = mesh.assign(landmark_position=mesh["landmark_position"].copy(data=moved.values))
-        out[take] = xr.DataTree.from_dict({"fitted": model["fitted"].to_dataset(), "mesh": mesh})
+        moved = mesh["landmark_position"] + click * rng.normal(
+            size=mesh["landmark_position"].shape
+        )
+        mesh = mesh.assign(
+            landmark_position=mesh["landmark_position"].copy(data=moved.values)
+        )
+        out[take] = xr.DataTree.from_dict(
+            {"fitted": model["fitted"].to_dataset(), "mesh": mesh}
+        )
     return out
 
 
 def cut_differently(models: Models) -> Models:
-    """The takes with scans that are cut below the chin and at the back, and with new texture coordinates."""
+    """The takes with scans that are cut below the chin and at the back, and with new
+    texture coordinates.
+    """
     out = {}
     for i, (take, model) in enumerate(models.items()):
         below = CUTS[i % len(CUTS)]
         if below is None:
             out[take] = model
             continue
-        position = model["fitted"].to_dataset()["surfel_position"].values.astype(np.float64)
+        position = (
+            model["fitted"].to_dataset()["surfel_position"].values.astype(np.float64)
+        )
         mesh = model["mesh"].to_dataset()
         corners = position[mesh["triangle"].values]
         low = float(mesh["landmark_position"].sel(landmark="chin")[1]) - below
-        kept = (corners[..., 1].min(axis=1) > low) & (corners[..., 2].min(axis=1) > position[:, 2].min() + BACK)
+        kept = (corners[..., 1].min(axis=1) > low) & (
+            corners[..., 2].min(axis=1) > position[:, 2].min() + BACK
+        )
         piece = clean_mesh(position, mesh["triangle"].values[kept].astype(np.int64))
         uv, _ = disc_atlas(piece.vertices, piece.faces)
         out[take] = xr.DataTree.from_dict(
             {
                 "fitted": dataset({"surfel_position": piece.vertices, "surfel_uv": uv}),
-                "mesh": mesh[["landmark_position"]].merge(dataset({"triangle": piece.faces})),
+                "mesh": mesh[["landmark_position"]].merge(
+                    dataset({"triangle": piece.faces})
+                ),
             }
         )
     return out
@@ -96,9 +118,14 @@ def spread_order(points: Array) -> NDArray[np.int64]:
 
 def on_both(models: Models, points: Mapping[str, Array]) -> NDArray[np.bool_]:
     """Mask (pair, p) of `correspondence_error` for points that are on both scans."""
-    tree = {take: cKDTree(model["fitted"].to_dataset()["surfel_position"].values) for take, model in models.items()}
+    tree = {
+        take: cKDTree(model["fitted"].to_dataset()["surfel_position"].values)
+        for take, model in models.items()
+    }
     there = {take: tree[take].query(p)[0] < PRESENT for take, p in points.items()}
-    return np.concatenate([[there[a] & there[b] for a in points if a != b] for b in points])
+    return np.concatenate(
+        [[there[a] & there[b] for a in points if a != b] for b in points]
+    )
 
 
 def cell(error: Array) -> str:
@@ -106,7 +133,9 @@ def cell(error: Array) -> str:
     return f"{np.nanmedian(error):.2f}, {np.nanmean(error):.2f}, {np.nanquantile(error, 0.95):.1f}"
 
 
-def by_region(errors: Mapping[str, Array], region: NDArray[Any], face: NDArray[np.bool_]) -> None:
+def by_region(
+    errors: Mapping[str, Array], region: NDArray[Any], face: NDArray[np.bool_]
+) -> None:
     """Print errors by region (rows) and by method for a common (u, v) (columns)."""
     print(f"| median, mean, 95 % [mm] | points | {' | '.join(errors)} |")
     print("|---|" + "---|" * (1 + len(errors)))
@@ -114,13 +143,31 @@ def by_region(errors: Mapping[str, Array], region: NDArray[Any], face: NDArray[n
         name: region == name for name in sorted({*region.tolist()})
     }
     for name, inside in rows.items():
-        print(f"| {name} | {inside.sum()} | {' | '.join(cell(e[:, inside]) for e in errors.values())} |", flush=True)
+        print(
+            (
+                f"| {name} | {inside.sum()} | "
+                f"{' | '.join(cell(e[:, inside]) for e in errors.values())} |"
+            ),
+            flush=True,
+        )
 
 
-def against(models: Models, points: Mapping[str, Array], face: NDArray[np.bool_], cases: list[dict[str, Any]]) -> None:
+def against(
+    models: Models,
+    points: Mapping[str, Array],
+    face: NDArray[np.bool_],
+    cases: list[dict[str, Any]],
+) -> None:
     """Print one row per case, with errors over the face and over all points."""
-    order = spread_order(next(iter(models.values()))["mesh"].to_dataset()["landmark_position"].values.astype(float))
-    print("\n| landmarks | click [mm] | smoothing | warp | condition | face [mm] | all [mm] | anchors | flipped |")
+    order = spread_order(
+        next(iter(models.values()))["mesh"]
+        .to_dataset()["landmark_position"]
+        .values.astype(float)
+    )
+    print(
+        "\n| landmarks | click [mm] | smoothing | warp | condition | face [mm] | "
+        "all [mm] | anchors | flipped |"
+    )
     print("|---|" + 8 * "---|")
     for case in cases:
         count = case.get("count", len(order))
@@ -132,10 +179,21 @@ def against(models: Models, points: Mapping[str, Array], face: NDArray[np.bool_]
         kinds = ", ".join(sorted({one.attrs["warp_kind"] for one in found.values()}))
         used = [one.attrs["warp_smoothing"] for one in found.values()]
         condition = max(one.attrs["warp_condition"] for one in found.values())
-        said = f"{max(used):.3g}" if max(used) == min(used) else f"{min(used):.3g} to {max(used):.3g}"
+        said = (
+            f"{max(used):.3g}"
+            if max(used) == min(used)
+            else f"{min(used):.3g} to {max(used):.3g}"
+        )
         row = f"| {count} | {click:g} | {said} | {kinds} | {condition:.0f} |"
-        anchors, flips = (sum(one.attrs[f"warp_{name}"] for one in found.values()) for name in ("anchors", "flips"))
-        print(row, f"{cell(error[:, face])} | {cell(error)} | {anchors} | {flips} |", flush=True)
+        anchors, flips = (
+            sum(one.attrs[f"warp_{name}"] for one in found.values())
+            for name in ("anchors", "flips")
+        )
+        print(
+            row,
+            f"{cell(error[:, face])} | {cell(error)} | {anchors} | {flips} |",
+            flush=True,
+        )
 
 
 def regions(models: Models, registered: Mapping[str, xr.Dataset]) -> None:
@@ -148,49 +206,83 @@ def regions(models: Models, registered: Mapping[str, xr.Dataset]) -> None:
         one = registered[take]
         own = own_masks(fitted)
         area = fitted["surfel_area"].values
-        named = {str(n): one["common_landmark"].sel(landmark=n).values for n in one["landmark"].values}
+        named = {
+            str(n): one["common_landmark"].sel(landmark=n).values
+            for n in one["landmark"].values
+        }
         for name, mask in region_masks(one["common_uv"].values, named).items():
             parts = [own[part] for part in BESIDE.get(name, (name,)) if part in own]
             if parts:
-                rows.setdefault(name, []).append(mask_agreement(mask, np.any(parts, axis=0), area))
+                rows.setdefault(name, []).append(
+                    mask_agreement(mask, np.any(parts, axis=0), area)
+                )
     for name, values in rows.items():
         print(f"| {name} | {np.mean(values):.2f} | {min(values):.2f} |")
 
 
 def main() -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("capture", nargs="+", type=Path)
-    parser.add_argument("--spacing", type=float, default=4.0, help="Spacing of surfels [mm].")
-    parser.add_argument("--shared", type=int, default=9409, help="Number of leading vertices that all heads share.")
+    parser.add_argument(
+        "--spacing", type=float, default=4.0, help="Spacing of surfels [mm]."
+    )
+    parser.add_argument(
+        "--shared",
+        type=int,
+        default=9409,
+        help="Number of leading vertices that all heads share.",
+    )
     parser.add_argument("--every", type=int, default=3, help="Use every N-th of them.")
     parser.add_argument(
-        "--outside", default="ear,scalp,neck,neck_beard,other", help="Regions that are not part of the face."
+        "--outside",
+        default="ear,scalp,neck,neck_beard,other",
+        help="Regions that are not part of the face.",
     )
-    parser.add_argument("--brief", action="store_true", help="Skip the table by landmarks and smoothing.")
+    parser.add_argument(
+        "--brief",
+        action="store_true",
+        help="Skip the table by landmarks and smoothing.",
+    )
     args = parser.parse_args()
     models = {folder.name: scanned(folder, args.spacing) for folder in args.capture}
     points = {}
     region = np.zeros(0, str)
     for folder in args.capture:
         with np.load(f"{folder}.truth.npz") as truth:
-            points[folder.name] = truth["vertices"][: args.shared : args.every].astype(np.float64)
+            points[folder.name] = truth["vertices"][: args.shared : args.every].astype(
+                np.float64
+            )
             region = truth["region_names"][truth["region"][: args.shared : args.every]]
     face = ~np.isin(region, args.outside.split(","))
     first = sorted(models)[0]
     cut = cut_differently(models)
-    for title, takes in {"Unchanged scans": models, "Scans that end at different places": cut}.items():
+    for title, takes in {
+        "Unchanged scans": models,
+        "Scans that end at different places": cut,
+    }.items():
         ways = {"own (u, v)": unregistered(takes), "mean of all": register(takes)}
         ways |= {f"{first} as reference": register(takes, reference=first)}
         both = on_both(takes, points)
-        errors = {n: np.where(both, correspondence_error(takes, one, points), np.nan) for n, one in ways.items()}
+        errors = {
+            n: np.where(both, correspondence_error(takes, one, points), np.nan)
+            for n, one in ways.items()
+        }
         print(f"\n{title}:\n")
         by_region(errors, region, face)
-        lost = ", ".join(f"{name} {np.isnan(e[both]).mean():.1%}" for name, e in errors.items())
+        lost = ", ".join(
+            f"{name} {np.isnan(e[both]).mean():.1%}" for name, e in errors.items()
+        )
         print(f"\nPoints without a correspondence on the other head: {lost}.")
     cases: list[dict[str, Any]] = [{"count": count} for count in COUNTS]
     cases += [{"click": value} for value in CLICKS]
-    cases += [{"smoothing": value, "click": click} for click in (0.0, 2.0) for value in SMOOTHINGS]
+    cases += [
+        {"smoothing": value, "click": click}
+        for click in (0.0, 2.0)
+        for value in SMOOTHINGS
+    ]
     if not args.brief:
         against(models, points, face, cases)
     regions(models, register(models))

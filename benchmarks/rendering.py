@@ -1,9 +1,11 @@
-"""Error of Monte Carlo pictures by time, by samples, by the opening of the octree, and compared with Mitsuba 3.
+"""Error of Monte Carlo pictures by time, by samples, by the opening of the octree, and
+compared with Mitsuba 3.
 
 python benchmarks/rendering.py DB [--take NAME] [--picture FILE]
 
-DB contains a fitted model. If Mitsuba is installed (pip install mitsuba), the diffuse term without Fresnel factors is
-compared for an environment and for a point light, which both programs support.
+DB contains a fitted model. If Mitsuba is installed (pip install mitsuba), the diffuse
+term without Fresnel factors is compared for an environment and for a point light, which
+both programs support.
 """
 
 from __future__ import annotations
@@ -35,15 +37,25 @@ def sky() -> Environment:
     row, column = np.mgrid[:64, :128]
     theta = np.pi * (row + 0.5) / 64
     phi = 2 * np.pi * ((column + 0.5) / 128 - 0.5)
-    way = np.stack([np.sin(theta) * np.sin(phi), np.cos(theta), np.sin(theta) * np.cos(phi)], axis=-1)
+    way = np.stack(
+        [np.sin(theta) * np.sin(phi), np.cos(theta), np.sin(theta) * np.cos(phi)],
+        axis=-1,
+    )
     dome = 0.3 + 0.7 * np.clip(way[..., 1:2], 0, 1) * np.array([0.6, 0.8, 1.2])
-    return Environment(dome + 400 * (way @ np.array([0.6, 0.6, 0.53]) > 0.9985)[..., None] * np.array([1.2, 1.0, 0.8]))
+    return Environment(
+        dome
+        + 400
+        * (way @ np.array([0.6, 0.6, 0.53]) > 0.9985)[..., None]
+        * np.array([1.2, 1.0, 0.8])
+    )
 
 
 def difference(found, reference):
     """RMS difference over RMS of the reference, where both pictures show skin."""
     seen = (found.coverage > 0.999) & (reference.coverage > 0.999)
-    square = np.mean((found.radiance - reference.radiance)[seen] ** 2) / np.mean(reference.radiance[seen] ** 2)
+    square = np.mean((found.radiance - reference.radiance)[seen] ** 2) / np.mean(
+        reference.radiance[seen] ** 2
+    )
     return float(np.sqrt(square))
 
 
@@ -57,7 +69,13 @@ def by_samples(surface, camera, lighting, **options):
         quality = Quality(samples=samples, **options)
         rng = np.random.default_rng(seed)
         return render_monte_carlo(
-            plan.surface, camera, plan.lighting, quality, rng=rng, scene=scene, pixels=plan.pixels
+            plan.surface,
+            camera,
+            plan.lighting,
+            quality,
+            rng=rng,
+            scene=scene,
+            pixels=plan.pixels,
         )
 
     reference = made(REFERENCE, 99)
@@ -68,43 +86,66 @@ def by_samples(surface, camera, lighting, **options):
 
 def by_opening(surface, lighting):
     """Rows of opening, time [s] of a tree walk, and RMS difference from the sum over all pairs."""
-    from skindb.render.subsurface import exitance_from_irradiance, transmitted_irradiance
+    from skindb.render.subsurface import (
+        exitance_from_irradiance,
+        transmitted_irradiance,
+    )
 
     scene = RayScene(surface.vertices, surface.faces)
-    received = transmitted_irradiance(surface, lighting.lights, scene) @ lighting.lights.intensity
+    received = (
+        transmitted_irradiance(surface, lighting.lights, scene)
+        @ lighting.lights.intensity
+    )
     wanted = np.zeros(len(surface.vertices), bool)
-    wanted[:: max(len(wanted) // 2000, 1)] = True  # all pairs of all surfels would take hours
+    # all pairs of all surfels would take hours
+    wanted[:: max(len(wanted) // 2000, 1)] = True
     started = time.perf_counter()
     exact = exitance_from_irradiance(surface, received, wanted, tolerance=0.0)[wanted]
     yield 0.0, time.perf_counter() - started, 0.0
     for opening in OPENINGS:
         started = time.perf_counter()
-        found = exitance_from_irradiance(surface, received, wanted, tolerance=opening)[wanted]
+        found = exitance_from_irradiance(surface, received, wanted, tolerance=opening)[
+            wanted
+        ]
         error = np.sqrt(np.mean((found - exact) ** 2) / np.mean(exact**2))
         yield opening, time.perf_counter() - started, float(error)
 
 
 def against_mitsuba(surface, camera, lighting):
-    """Times [s] of both programs, difference of their means over skin, RMS difference, and noise of skindb."""
+    """Times [s] of both programs, difference of their means over skin, RMS difference,
+    and noise of skindb.
+    """
     import mitsuba
     import trimesh
 
     mitsuba.set_variant("scalar_rgb")
     from mitsuba import ScalarTransform4f as T
 
-    matte = replace(surface, eta=1.0, diffuse=np.full_like(surface.diffuse, 0.5), weights=0 * surface.weights)
+    matte = replace(
+        surface,
+        eta=1.0,
+        diffuse=np.full_like(surface.diffuse, 0.5),
+        weights=0 * surface.weights,
+    )
     straight = replace(camera, distortion=np.zeros(5))
     ours = render_monte_carlo(
-        matte, straight, lighting, Quality(samples=256, terms=("diffuse",)), rng=np.random.default_rng(1)
+        matte,
+        straight,
+        lighting,
+        Quality(samples=256, terms=("diffuse",)),
+        rng=np.random.default_rng(1),
     )
     with tempfile.TemporaryDirectory() as folder:
-        mesh = trimesh.Trimesh(matte.vertices, matte.faces, vertex_normals=matte.normals, process=False)
+        mesh = trimesh.Trimesh(
+            matte.vertices, matte.faces, vertex_normals=matte.normals, process=False
+        )
         mesh.export(f"{folder}/mesh.ply", vertex_normal=True)
         K = camera.K
         width = camera.width
         height = camera.height
         to_world = np.eye(4)
-        to_world[:3, :3] = camera.R.T @ np.diag([-1.0, -1.0, 1.0])  # Mitsuba: +x left, +y up, +z forward
+        # Mitsuba: +x left, +y up, +z forward
+        to_world[:3, :3] = camera.R.T @ np.diag([-1.0, -1.0, 1.0])
         to_world[:3, 3] = camera.centre
         sensor = {
             "type": "perspective",
@@ -115,7 +156,12 @@ def against_mitsuba(surface, camera, lighting):
             "near_clip": 1.0,
             "far_clip": 1e5,
             "to_world": T(to_world),
-            "film": {"type": "hdrfilm", "width": width, "height": height, "rfilter": {"type": "box"}},
+            "film": {
+                "type": "hdrfilm",
+                "width": width,
+                "height": height,
+                "rfilter": {"type": "box"},
+            },
             "sampler": {"type": "independent", "sample_count": 256},
         }
         scene = {
@@ -125,12 +171,17 @@ def against_mitsuba(surface, camera, lighting):
             "face": {
                 "type": "ply",
                 "filename": f"{folder}/mesh.ply",
-                "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}},
+                "bsdf": {
+                    "type": "diffuse",
+                    "reflectance": {"type": "rgb", "value": 0.5},
+                },
             },
         }
         if lighting.environment is not None:
             # Mitsuba's columns have the opposite order
-            write_exr(f"{folder}/sky.exr", np.float32(lighting.environment.radiance[:, ::-1]))
+            write_exr(
+                f"{folder}/sky.exr", np.float32(lighting.environment.radiance[:, ::-1])
+            )
             scene["light"] = {"type": "envmap", "filename": f"{folder}/sky.exr"}
         else:
             lights = lighting.lights
@@ -144,8 +195,16 @@ def against_mitsuba(surface, camera, lighting):
         seconds = time.perf_counter() - started
     seen = ours.coverage > 0.999
     apart = theirs[seen].mean(axis=0) / ours.radiance[seen].mean(axis=0) - 1
-    rms = np.sqrt(np.mean((theirs - ours.radiance)[seen] ** 2) / np.mean(theirs[seen] ** 2))
-    return ours.seconds, seconds, float(np.abs(apart).max()), float(rms), ours.relative_error
+    rms = np.sqrt(
+        np.mean((theirs - ours.radiance)[seen] ** 2) / np.mean(theirs[seen] ** 2)
+    )
+    return (
+        ours.seconds,
+        seconds,
+        float(np.abs(apart).max()),
+        float(rms),
+        ours.relative_error,
+    )
 
 
 def main() -> None:
@@ -158,7 +217,11 @@ def main() -> None:
     db = skindb.open(options.db)
     model = db.read("model", options.take or db.takes("model")[0])
     dome = model["dome"].to_dataset().load()
-    surface, (camera, _), lights = from_model(model, fill=True), chosen_camera(dome, None), lights_from_dome(dome)
+    surface, (camera, _), lights = (
+        from_model(model, fill=True),
+        chosen_camera(dome, None),
+        lights_from_dome(dome),
+    )
     cases = {
         "one light": (Lighting(lights.select([0])), {}),
         f"{len(lights)} lights": (Lighting(lights), {}),
@@ -170,7 +233,10 @@ def main() -> None:
     for name, (lighting, more) in cases.items():
         curves[name] = list(by_samples(surface, camera, lighting, **more))
         for samples, seconds, error, stated in curves[name]:
-            print(f"{name}: {samples} rays per pixel {seconds:.1f} s, error {error:.2%}, stated {stated:.2%}")
+            print(
+                f"{name}: {samples} rays per pixel {seconds:.1f} s, error "
+                f"{error:.2%}, stated {stated:.2%}"
+            )
     for opening, seconds, error in by_opening(surface, cases["one light"][0]):
         print(f"opening {opening}: {seconds:.2f} s, error {error:.3%}")
     try:
@@ -178,18 +244,30 @@ def main() -> None:
             *(
                 np.asarray(x)[:1] * (1 if i != 2 else 0)
                 for i, x in enumerate(
-                    (lights.position, lights.intensity, lights.disc_radius, lights.axis, 0 * lights.falloff)
+                    (
+                        lights.position,
+                        lights.intensity,
+                        lights.disc_radius,
+                        lights.axis,
+                        0 * lights.falloff,
+                    )
                 )
             )
         )
-        for name, lighting in (("point light", Lighting(point)), ("sky", Lighting(None, sky()))):
+        for name, lighting in (
+            ("point light", Lighting(point)),
+            ("sky", Lighting(None, sky())),
+        ):
             mine, theirs, mean, rms, noise = against_mitsuba(surface, camera, lighting)
             print(
-                f"Mitsuba, {name}: means differ by {mean:.3%}, pixels by {rms:.2%} (noise of skindb {noise:.2%}); "
+                f"Mitsuba, {name}: means differ by {mean:.3%}, pixels by {rms:.2%} "
+                f"(noise of skindb {noise:.2%}); "
                 f"skindb {mine:.1f} s, Mitsuba {theirs:.1f} s"
             )
     except ImportError:
-        print("the comparison with Mitsuba is skipped, because Mitsuba is not installed")
+        print(
+            "the comparison with Mitsuba is skipped, because Mitsuba is not installed"
+        )
     if options.picture:
         draw(curves, options.picture)
 
@@ -200,7 +278,9 @@ def draw(curves, path: Path) -> None:
 
     figure, axis = pyplot.subplots(figsize=(5, 3.5), layout="constrained")
     for name, rows in curves.items():
-        axis.loglog([row[1] for row in rows], [100 * row[2] for row in rows], "o-", label=name)
+        axis.loglog(
+            [row[1] for row in rows], [100 * row[2] for row in rows], "o-", label=name
+        )
     axis.set(xlabel="wall time [s]", ylabel="relative RMS error [%]")
     axis.legend(fontsize=8)
     figure.savefig(path, dpi=110)

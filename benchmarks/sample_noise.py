@@ -2,8 +2,9 @@
 
     python benchmarks/sample_noise.py CAPTURE --electrons 20000 500
 
-CAPTURE has 16-bit PNG frames without noise and known intensities of the lights. Its frames of the face are exposed
-again by sensors with a full well of so many electrons, and both captures are ingested.
+CAPTURE has 16-bit PNG frames without noise and known intensities of the lights. Its
+frames of the face are exposed again by sensors with a full well of so many electrons,
+and both captures are ingested.
 """
 
 from __future__ import annotations
@@ -36,18 +37,29 @@ def main() -> None:
     parser.add_argument("--electrons", type=float, nargs="+", default=[20_000, 500])
     parser.add_argument("--seed", type=int, default=1)
     args = parser.parse_args()
-    print("| full well | samples | number | standard deviation of z |\n|---|---|---|---|")
+    print(
+        "| full well | samples | number | standard deviation of z |\n|---|---|---|---|"
+    )
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         clean = ingested(folder / "clean", args.capture)
         for electrons in args.electrons:
             noisy = folder / f"capture-{electrons:.0f}"
-            expose_again(args.capture, noisy, electrons, np.random.default_rng(args.seed))
-            for label, z in groups(clean, ingested(folder / f"db-{electrons:.0f}", noisy)):
-                print(f"| {electrons:,.0f} | {label} | {len(z):,} | {z.std():.3f} |", flush=True)
+            expose_again(
+                args.capture, noisy, electrons, np.random.default_rng(args.seed)
+            )
+            for label, z in groups(
+                clean, ingested(folder / f"db-{electrons:.0f}", noisy)
+            ):
+                print(
+                    f"| {electrons:,.0f} | {label} | {len(z):,} | {z.std():.3f} |",
+                    flush=True,
+                )
 
 
-def expose_again(source: Path, target: Path, electrons: float, rng: np.random.Generator) -> None:
+def expose_again(
+    source: Path, target: Path, electrons: float, rng: np.random.Generator
+) -> None:
     """Copy a capture, and add photon and read noise to its frames of the face."""
     shutil.copytree(source, target)
     file = target / "dome/dome.json"
@@ -60,9 +72,16 @@ def expose_again(source: Path, target: Path, electrons: float, rng: np.random.Ge
         for path in sorted((target / "dome/frames").glob(f"*/*_{camera['id']}.png")):
             values = imagecodecs.png_decode(path.read_bytes())
             expected = per_value * np.maximum(values - float(black), 0)
-            found = rng.poisson(expected) + READ_NOISE * rng.standard_normal(expected.shape)
-            # where the frame is saturated, how much light there was is unknown: it remains saturated
-            values = np.where(values >= white, white, np.clip(np.rint(black + found / per_value), 0, white))
+            found = rng.poisson(expected) + READ_NOISE * rng.standard_normal(
+                expected.shape
+            )
+            # where the frame is saturated, how much light there was is unknown: it
+            # remains saturated
+            values = np.where(
+                values >= white,
+                white,
+                np.clip(np.rint(black + found / per_value), 0, white),
+            )
             path.write_bytes(imagecodecs.png_encode(values.astype(np.uint16)))
     file.write_text(json.dumps(dome))
 
@@ -78,13 +97,18 @@ def groups(clean: xr.Dataset, noisy: xr.Dataset) -> Iterator[tuple[str, np.ndarr
     true = clean["reflectance_sample"].values.astype(np.float64)
     variance = sample_variance(noisy, np.nan_to_num(true)).values
     z = (noisy["reflectance_sample"].values - true) / np.sqrt(variance)
-    pixels = np.broadcast_to(noisy["effective_pixels"].values[:, None, :, None], z.shape)
+    pixels = np.broadcast_to(
+        noisy["effective_pixels"].values[:, None, :, None], z.shape
+    )
     known = np.isfinite(z)
     z = z[known]
     true = true[known]
     pixels = pixels[known]
     yield "all", z
-    for kind, values, bounds, unit in (("effective pixels", pixels, PIXELS, ""), ("value", true, VALUES, " / sr")):
+    for kind, values, bounds, unit in (
+        ("effective pixels", pixels, PIXELS, ""),
+        ("value", true, VALUES, " / sr"),
+    ):
         for low, high in bounds:
             part = z[(values >= low) & (values < high)]
             if len(part) >= MIN_SAMPLES:

@@ -2,10 +2,11 @@
 
     python benchmarks/scheduler.py [--takes 1000] [--workers 2] [--out scheduler.json]
 
-`dask scheduler` and `dask worker` are started as processes on 127.0.0.1. The task of each take contains the call of
-`skindb fit` (`fit_with` with its database and parameters), but reads the record of one of 1,000 small captures instead
-of fitting it, so that only the scheduler is measured. The exit code is 1 if a limit is exceeded: two tasks per take,
-300 MB of memory of the scheduler, 4 kB of messages to it per take.
+`dask scheduler` and `dask worker` are started as processes on 127.0.0.1. The task of
+each take contains the call of `skindb fit` (`fit_with` with its database and
+parameters), but reads the record of one of 1,000 small captures instead of fitting it,
+so that only the scheduler is measured. The exit code is 1 if a limit is exceeded: two
+tasks per take, 300 MB of memory of the scheduler, 4 kB of messages to it per take.
 """
 
 from __future__ import annotations
@@ -46,7 +47,12 @@ class CountTasks(SchedulerPlugin):
     def __init__(self) -> None:
         self.keys: set[Any] = set()
 
-    def transition(self, key: Any, start: str, finish: str, *args: Any, **kwargs: Any) -> None:  # noqa: ARG002
+    def transition(
+        self,
+        key: Any,
+        *_: Any,
+        **__: Any,
+    ) -> None:
         """Record a task."""
         self.keys.add(key)
 
@@ -64,10 +70,19 @@ def fill(db: skindb.Database, takes: int) -> None:
             stage.commit(one)
 
 
-def fit_call(db: skindb.Database, dictionary: Path | None = None) -> Callable[[str], Any]:
+def fit_call(
+    db: skindb.Database, dictionary: Path | None = None
+) -> Callable[[str], Any]:
     """The call that `skindb fit` sends."""
     return partial(
-        workflow.fit_with, db, given=GIVEN, refit=False, dictionary=dictionary, explain=False, wait=0.0, progress=None
+        workflow.fit_with,
+        db,
+        given=GIVEN,
+        refit=False,
+        dictionary=dictionary,
+        explain=False,
+        wait=0.0,
+        progress=None,
     )
 
 
@@ -79,15 +94,28 @@ def look_up(call: Any, take: str) -> int:
 def memory_mb(process: int, name: str = "VmRSS") -> float:
     """Resident memory of a process [MB], or its peak with VmHWM."""
     lines = Path(f"/proc/{process}/status").read_text(encoding="ascii").splitlines()
-    return next(int(line.split()[1]) * 1024 / 1e6 for line in lines if line.startswith(f"{name}:"))
+    return next(
+        int(line.split()[1]) * 1024 / 1e6
+        for line in lines
+        if line.startswith(f"{name}:")
+    )
 
 
 @contextmanager
 def process(*arguments: str) -> Iterator[int]:
     """Context with the id of a process that is terminated at its end."""
-    here = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
-    options: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    with subprocess.Popen([sys.executable, "-m", *arguments], env=os.environ | {"PYTHONPATH": here}, **options) as one:
+    here = os.pathsep.join(
+        [str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]
+    )
+    options: dict[str, Any] = {
+        "stdout": subprocess.DEVNULL,
+        "stderr": subprocess.DEVNULL,
+    }
+    with subprocess.Popen(
+        [sys.executable, "-m", *arguments],
+        env=os.environ | {"PYTHONPATH": here},
+        **options,
+    ) as one:
         try:
             yield one.pid
         finally:
@@ -100,11 +128,27 @@ def cluster(folder: Path, workers: int) -> Iterator[tuple[str, int]]:
     file = folder / "scheduler.json"
     local = ["--host", "127.0.0.1", "--no-dashboard"]
     with ExitStack() as stack:
-        scheduler = ["distributed.cli.dask_scheduler", *local, "--port", "0", "--scheduler-file", str(file)]
+        scheduler = [
+            "distributed.cli.dask_scheduler",
+            *local,
+            "--port",
+            "0",
+            "--scheduler-file",
+            str(file),
+        ]
         number = stack.enter_context(process(*scheduler))
         wait_until(file.exists)
         where = str(json.loads(file.read_text())["address"])
-        worker = [where, *local, "--nworkers", str(workers), "--nthreads", "1", "--local-directory", str(folder)]
+        worker = [
+            where,
+            *local,
+            "--nworkers",
+            str(workers),
+            "--nthreads",
+            "1",
+            "--local-directory",
+            str(folder),
+        ]
         stack.enter_context(process("distributed.cli.dask_worker", *worker))
         yield where, number
 
@@ -142,13 +186,17 @@ def run(client: Client, scheduler: int, db: skindb.Database) -> dict[str, float]
         "scheduler after [MB]": memory_mb(scheduler),
         "takes per second": len(takes) / seconds,
         "bytes of the call": len(cloudpickle.dumps(fit_call(db))),
-        "bytes of the call with --dictionary": len(cloudpickle.dumps(fit_call(db, Path("/shared/measured/brdfs")))),
+        "bytes of the call with --dictionary": len(
+            cloudpickle.dumps(fit_call(db, Path("/shared/measured/brdfs")))
+        ),
     }
 
 
 def main() -> int:
     """Measure, print and compare with the limits."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--takes", type=int, default=1000)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--out", type=Path)
@@ -156,7 +204,10 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as temporary:
         db = skindb.open(f"{temporary}/db")
         fill(db, args.takes)
-        with cluster(Path(temporary), args.workers) as (address, scheduler), workflow.connected(address) as client:
+        with (
+            cluster(Path(temporary), args.workers) as (address, scheduler),
+            workflow.connected(address) as client,
+        ):
             client.wait_for_workers(args.workers, timeout=START_SECONDS)
             found = run(client, scheduler, db)
     for name, value in found.items():

@@ -1,10 +1,13 @@
-"""Soak test of many takes through every step with several workers: times, memory over time, failures.
+"""Soak test of many takes through every step with several workers: times, memory over
+time, failures.
 
-    python benchmarks/soak.py OUT [--subjects 87] [--workers 2] [--scheduler ADDRESS] [--json soak.json]
+    python benchmarks/soak.py OUT [--subjects 87] [--workers 2] [--scheduler ADDRESS]
+    [--json soak.json]
 
-Every subject is simulated twice (normal and with lotion), with small frames and few lights. The aim is to find growing
-memory, files that stay open and takes that fail, not to measure accuracy. Ingest, fit, registration and all studies
-follow. OUT receives the captures (removed after ingest) and the database; 174 takes need 3 GB.
+Every subject is simulated twice (normal and with lotion), with small frames and few
+lights. The aim is to find growing memory, files that stay open and takes that fail, not
+to measure accuracy. Ingest, fit, registration and all studies follow. OUT receives the
+captures (removed after ingest) and the database; 174 takes need 3 GB.
 """
 
 from __future__ import annotations
@@ -64,15 +67,26 @@ def memory_mib(process: int | str = "self") -> dict[str, float]:
         return {}
     names = {"VmRSS": "resident", "RssAnon": "anonymous"}
     parts = (line.split() for line in lines)
-    return {names[p[0][:-1]]: int(p[1]) / 1024 for p in parts if p and p[0][:-1] in names}
+    return {
+        names[p[0][:-1]]: int(p[1]) / 1024 for p in parts if p and p[0][:-1] in names
+    }
 
 
 def simulated(out: Path, size: dict[str, int], person: Person) -> Path:
     """Simulate a capture folder with small frames."""
     rng = np.random.default_rng(DEVICE_SEED)
-    dome = build_dome(size["lights"], size["cameras"], width=size["width"], height=size["height"], rng=rng)
+    dome = build_dome(
+        size["lights"],
+        size["cameras"],
+        width=size["width"],
+        height=size["height"],
+        rng=rng,
+    )
     simulate_take(
-        out / person.take, person, dome, rng=np.random.default_rng([person.seed, person.take == person.subject])
+        out / person.take,
+        person,
+        dome,
+        rng=np.random.default_rng([person.seed, person.take == person.subject]),
     )
     return out / person.take
 
@@ -89,7 +103,11 @@ def ingested(db: Any, folder: Path) -> Any:
 def fitted(db: Any, take: str) -> dict[str, Any]:
     """Fit a take; returns the bytes read (twice the capture) and written."""
     record = workflow.fit_with(db, take, given=GIVEN)
-    return {"take": take, "read": 2 * db.record("capture", take).bytes, "written": record.bytes}
+    return {
+        "take": take,
+        "read": 2 * db.record("capture", take).bytes,
+        "written": record.bytes,
+    }
 
 
 def timed(call: Callable[[Any], Any], item: Any) -> dict[str, Any]:
@@ -99,7 +117,14 @@ def timed(call: Callable[[Any], Any], item: Any) -> dict[str, Any]:
     value = call(item)
     seconds = {"wall": time.perf_counter() - begin, "cpu": time.process_time() - cpu}
     files = len(os.listdir("/proc/self/fd"))  # noqa: PTH208
-    return {"value": value, "process": os.getpid(), "files": files, "end": time.time(), **seconds, **memory_mib()}
+    return {
+        "value": value,
+        "process": os.getpid(),
+        "files": files,
+        "end": time.time(),
+        **seconds,
+        **memory_mib(),
+    }
 
 
 class Watch:
@@ -122,8 +147,12 @@ class Watch:
     def _run(self) -> None:
         begin = time.monotonic()
         while not self._stop.wait(SAMPLED_SECONDS):
-            of = {"driver": memory_mib()} | {str(child): memory_mib(child) for child in children(os.getpid())}
-            self.samples.append({"seconds": time.monotonic() - begin, "stage": self.stage, "memory": of})
+            of = {"driver": memory_mib()} | {
+                str(child): memory_mib(child) for child in children(os.getpid())
+            }
+            self.samples.append(
+                {"seconds": time.monotonic() - begin, "stage": self.stage, "memory": of}
+            )
 
 
 def children(parent: int) -> Iterator[int]:
@@ -139,11 +168,17 @@ def children(parent: int) -> Iterator[int]:
 
 
 def worked(
-    stage: str, call: Callable[[Any], Any], items: list[Any], watch: Watch, where: dict[str, Any]
+    stage: str,
+    call: Callable[[Any], Any],
+    items: list[Any],
+    watch: Watch,
+    where: dict[str, Any],
 ) -> dict[str, Any]:
     """Run a step over all takes; returns its wall time, tasks and failures."""
     watch.stage, begin, tasks, failures = stage, time.perf_counter(), [], []
-    for number, outcome in enumerate(workflow.map_takes(partial(timed, call), items, **where), 1):
+    for number, outcome in enumerate(
+        workflow.map_takes(partial(timed, call), items, **where), 1
+    ):
         if outcome.error is None:
             tasks.append(outcome.result())
         else:
@@ -151,7 +186,9 @@ def worked(
             print(failures[-1], outcome.traceback, file=sys.stderr, flush=True)
         if number % 20 == 0 or number == len(items):
             print(
-                f"{stage}: {number} of {len(items)}, {time.perf_counter() - begin:.0f} s", file=sys.stderr, flush=True
+                f"{stage}: {number} of {len(items)}, {time.perf_counter() - begin:.0f} s",
+                file=sys.stderr,
+                flush=True,
             )
     return {"wall": time.perf_counter() - begin, "tasks": tasks, "failures": failures}
 
@@ -166,18 +203,28 @@ def alone(name: str, watch: Watch, studies: dict[str, Any]) -> Iterator[None]:
     except Exception as error:  # noqa: BLE001  reported at the end
         failure = f"{type(error).__name__}: {error}"
         print(f"{name}: {failure}", file=sys.stderr, flush=True)
-    studies[name] = {"wall": time.perf_counter() - begin, "cpu": time.process_time() - cpu, "failure": failure}
+    studies[name] = {
+        "wall": time.perf_counter() - begin,
+        "cpu": time.process_time() - cpu,
+        "failure": failure,
+    }
     studies[name] |= memory_mib()
     print(f"{name}: {studies[name]['wall']:.0f} s", file=sys.stderr, flush=True)
 
 
 def growth(tasks: list[dict[str, Any]]) -> dict[str, float]:
-    """Anonymous memory of workers [MiB] at the end of their takes: medians of the second and of the last quarter."""
+    """Anonymous memory of workers [MiB] at the end of their takes: medians of the
+    second and of the last quarter.
+    """
     memory = [task["anonymous"] for task in sorted(tasks, key=lambda one: one["end"])]
     quarter = max(1, len(memory) // 4)
     early = memory[quarter : 2 * quarter] or memory
     late = memory[-quarter:]
-    return {"early": float(np.median(early)), "late": float(np.median(late)), "largest": max(memory)}
+    return {
+        "early": float(np.median(early)),
+        "late": float(np.median(late)),
+        "largest": max(memory),
+    }
 
 
 def summary(name: str, stage: dict[str, Any]) -> str:
@@ -187,8 +234,10 @@ def summary(name: str, stage: dict[str, Any]) -> str:
     memory = growth(tasks)
     files = max(task["files"] for task in tasks)
     return (
-        f"{name:<10} {len(tasks):>5} {len(stage['failures']):>4} {stage['wall']:>7.0f} {np.median(wall):>7.2f} "
-        f"{np.quantile(wall, 0.95):>7.2f} {np.median(cpu):>7.2f} {memory['early']:>7.0f} {memory['late']:>7.0f} "
+        f"{name:<10} {len(tasks):>5} {len(stage['failures']):>4} "
+        f"{stage['wall']:>7.0f} {np.median(wall):>7.2f} "
+        f"{np.quantile(wall, 0.95):>7.2f} {np.median(cpu):>7.2f} "
+        f"{memory['early']:>7.0f} {memory['late']:>7.0f} "
         f"{memory['largest']:>7.0f} {files:>6} {len({task['process'] for task in tasks}):>9}"
     )
 
@@ -210,18 +259,31 @@ def main() -> None:
         parser.add_argument(f"--{name}", type=int, default=value)
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
-    size = {name: getattr(args, name) for name in ("lights", "cameras", "width", "height")}
+    size = {
+        name: getattr(args, name) for name in ("lights", "cameras", "width", "height")
+    }
     db = skindb.open(str(args.out.absolute() / "db"))
     persons = people(args.subjects)
     studies = {}
     stages = {}
     captures = args.out.absolute() / "captures"
-    with Watch() as watch, workflow.connected(args.scheduler) if args.scheduler else nullcontext() as client:
+    with (
+        Watch() as watch,
+        workflow.connected(args.scheduler)
+        if args.scheduler
+        else nullcontext() as client,
+    ):
         where = {"client": client} if client else {"workers": args.workers}
-        stages["simulate"] = worked("simulate", partial(simulated, captures, size), persons, watch, where)
+        stages["simulate"] = worked(
+            "simulate", partial(simulated, captures, size), persons, watch, where
+        )
         folders = [task["value"] for task in stages["simulate"]["tasks"]]
-        stages["ingest"] = worked("ingest", partial(ingested, db), folders, watch, where)
-        stages["fit"] = worked("fit", partial(fitted, db), db.takes("capture"), watch, where)
+        stages["ingest"] = worked(
+            "ingest", partial(ingested, db), folders, watch, where
+        )
+        stages["fit"] = worked(
+            "fit", partial(fitted, db), db.takes("capture"), watch, where
+        )
         with alone("register", watch, studies):
             workflow.register_takes(db, **where)
         with alone("brdf", watch, studies):
@@ -238,12 +300,17 @@ def main() -> None:
         with alone("verify", watch, studies):
             if faults := db.verify():
                 raise skindb.InputError(faults)
-    print(f"{'step':<10} takes fail  wall s  median   p95 s   cpu s   early    late largest  files processes")
+    print(
+        f"{'step':<10} takes fail  wall s  median   p95 s   cpu s   early    late "
+        "largest  files processes"
+    )
     for name, stage in stages.items():
         print(summary(name, stage))
     for name, one in studies.items():
         outcome = one["failure"] or f"driver {one['anonymous']:.0f} MiB"
-        print(f"{name:<26} wall {one['wall']:7.1f} s, CPU {one['cpu']:7.1f} s, {outcome}")
+        print(
+            f"{name:<26} wall {one['wall']:7.1f} s, CPU {one['cpu']:7.1f} s, {outcome}"
+        )
     driver = [sample["memory"]["driver"]["anonymous"] for sample in watch.samples]
     print(f"driver, peak anonymous memory: {max(driver):.0f} MiB")
     for kind in ("capture", "model", "registration"):
@@ -252,8 +319,17 @@ def main() -> None:
     if args.json:
         for stage in stages.values():
             for task in stage["tasks"]:
-                task["value"] = task["value"] if isinstance(task["value"], dict) else str(task["value"])
-        whole = {"arguments": vars(args), "stages": stages, "studies": studies, "memory": watch.samples}
+                task["value"] = (
+                    task["value"]
+                    if isinstance(task["value"], dict)
+                    else str(task["value"])
+                )
+        whole = {
+            "arguments": vars(args),
+            "stages": stages,
+            "studies": studies,
+            "memory": watch.samples,
+        }
         args.json.write_text(json.dumps(whole, default=str))
 
 

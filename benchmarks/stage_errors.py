@@ -1,9 +1,11 @@
-"""Error of every stage of a fitted take relative to the truth of an independent capture, one Markdown row per stage.
+"""Error of every stage of a fitted take relative to the truth of an independent
+capture, one Markdown row per stage.
 
     python benchmarks/stage_errors.py DB CAPTURE
 
-CAPTURE.truth.npz contains the truth, and CAPTURE.truth/<light>_<camera>.exr the noise-free radiance of some frames. The
-take must have been ingested into DB and fitted, for example by benchmarks/validate.py.
+CAPTURE.truth.npz contains the truth, and CAPTURE.truth/<light>_<camera>.exr the
+noise-free radiance of some frames. The take must have been ingested into DB and fitted,
+for example by benchmarks/validate.py.
 """
 
 from __future__ import annotations
@@ -28,7 +30,9 @@ from skindb.ingest.radiance import frame_mergers, read_view
 from skindb.render.image import read_exr
 from skindb.virtual.truth import recovered_against_true
 
-LIT = 0.02  # fraction of the 99.9 % quantile of a frame's radiance, below which relative errors are not computed
+# fraction of the 99.9 % quantile of a frame's radiance, below which relative errors are
+# not computed
+LIT = 0.02
 # mm and cosine, within which a vertex and a surfel are the same place
 NEAR = 0.5
 TURNED = 0.9
@@ -51,22 +55,40 @@ def main() -> None:
     capture = db.read("capture", record.take)
     model = db.read("model", record.take)
     print("| stage | error | of what |\n|---|---|---|")
-    for row in rows(record.dome, capture, model, truth, folder.with_name(folder.name + ".truth")):
+    for row in rows(
+        record.dome, capture, model, truth, folder.with_name(folder.name + ".truth")
+    ):
         print("| " + " | ".join(row) + " |", flush=True)
 
 
 def rows(
-    dome: DomeRecord, capture: xr.DataTree, model: xr.DataTree, truth: dict[str, NDArray], frames: Path
+    dome: DomeRecord,
+    capture: xr.DataTree,
+    model: xr.DataTree,
+    truth: dict[str, NDArray],
+    frames: Path,
 ) -> Iterator[Row]:
     surfels = capture["surfels"].to_dataset()
     position = surfels["surfel_position"].values.astype(float)
-    some = np.random.default_rng(0).choice(len(position), min(SOME, len(position)), replace=False)
-    _, _, distance = closest_on_mesh(truth["vertices"].astype(float), truth["faces"].astype(int), position[some])
-    yield "scan, subdivision", f"{quantiles(distance)} mm", f"distance of {len(some):,} surfels from the true surface"
+    some = np.random.default_rng(0).choice(
+        len(position), min(SOME, len(position)), replace=False
+    )
+    _, _, distance = closest_on_mesh(
+        truth["vertices"].astype(float), truth["faces"].astype(int), position[some]
+    )
+    yield (
+        "scan, subdivision",
+        f"{quantiles(distance)} mm",
+        f"distance of {len(some):,} surfels from the true surface",
+    )
     found = capture["dome/light_intensity"].values
     true = truth["light_intensity"]
     off = found / true - 1
-    yield "white target", f"{100 * np.sqrt(np.mean(off**2)):.3f} % rms", f"intensity of {len(off)} lights"
+    yield (
+        "white target",
+        f"{100 * np.sqrt(np.mean(off**2)):.3f} % rms",
+        f"intensity of {len(off)} lights",
+    )
     merged = []
     sampled = []
     mergers = frame_mergers(dome, faults := [])
@@ -76,13 +98,25 @@ def rows(
     for path in sorted(frames.glob("*.exr")):
         light, camera = path.stem.split("_")
         image, _ = read_exr(path)
-        radiance, flag = mergers[camera].merge(read_view(dome, light, dome.cameras[cameras[camera]]))
+        radiance, flag = mergers[camera].merge(
+            read_view(dome, light, dome.cameras[cameras[camera]])
+        )
         lit = (flag == 0) & (image.min(axis=-1) > LIT * np.quantile(image, 0.999))
         merged.append((radiance[lit] / image[lit] - 1).ravel())
-        sampled.append(of_samples(dome, capture, true, image, lights[light], cameras[camera]))
+        sampled.append(
+            of_samples(dome, capture, true, image, lights[light], cameras[camera])
+        )
     if merged:
-        yield "merged exposures", relative(np.concatenate(merged)), f"lit pixels of {len(merged)} frames, noise-free"
-        yield "samples", relative(np.concatenate(sampled)), "the same frames at the same pixels, noise-free"
+        yield (
+            "merged exposures",
+            relative(np.concatenate(merged)),
+            f"lit pixels of {len(merged)} frames, noise-free",
+        )
+        yield (
+            "samples",
+            relative(np.concatenate(sampled)),
+            "the same frames at the same pixels, noise-free",
+        )
     yield from of_visibility(surfels, truth, dome)
     summary = recovered_against_true(model, truth).summary()
     median = summary["normal_median_deg"]
@@ -90,22 +124,40 @@ def rows(
     yield "normals", f"{median} deg median, {worst} at 95 %", "fitted surfels"
     diffuse = summary["diffuse_median_percent"]
     bias = summary["diffuse_bias_percent"]
-    yield "diffuse albedo", f"{diffuse} % median, bias {bias} %", "fitted surfels, R G B"
+    yield (
+        "diffuse albedo",
+        f"{diffuse} % median, bias {bias} %",
+        "fitted surfels, R G B",
+    )
     if "held_out_error" in model["fitted"]:
         held = model["fitted/held_out_error"].values
-        yield "surface BRDF", f"{quantiles(100 * held[np.isfinite(held)])} %", "samples of held-out lights"
+        yield (
+            "surface BRDF",
+            f"{quantiles(100 * held[np.isfinite(held)])} %",
+            "samples of held-out lights",
+        )
     if summary["sigma_tr_percent"]:
         sites = "; ".join(
-            f"{site} {' '.join(f'{v:+.1f}' for v in by)}" for site, by in summary["sigma_tr_percent"].items()
+            f"{site} {' '.join(f'{v:+.1f}' for v in by)}"
+            for site, by in summary["sigma_tr_percent"].items()
         )
         yield "translucency", f"{sites} %", "sigma_tr, R G B"
 
 
 def of_samples(
-    dome: DomeRecord, capture: xr.DataTree, intensity: NDArray, image: NDArray, light: int, camera: int
+    dome: DomeRecord,
+    capture: xr.DataTree,
+    intensity: NDArray,
+    image: NDArray,
+    light: int,
+    camera: int,
 ) -> NDArray:
     """Stored samples of a view over those of its noise-free frame, minus 1."""
-    stored = capture["samples/reflectance_sample"].isel(light=light, camera=camera).values.astype(float)
+    stored = (
+        capture["samples/reflectance_sample"]
+        .isel(light=light, camera=camera)
+        .values.astype(float)
+    )
     at = np.flatnonzero(np.isfinite(stored).all(axis=1))
     position = capture["surfels/surfel_position"].values[at].astype(float)
     seen = dome.cameras[camera]
@@ -117,12 +169,21 @@ def of_samples(
     return (stored[at][lit] / true[lit] - 1).ravel()
 
 
-def of_visibility(surfels: xr.Dataset, truth: dict[str, NDArray], dome: DomeRecord) -> Iterator[Row]:
-    """Errors of the visibility of light centres and cameras, at the surfels nearest to true vertices."""
+def of_visibility(
+    surfels: xr.Dataset, truth: dict[str, NDArray], dome: DomeRecord
+) -> Iterator[Row]:
+    """Errors of the visibility of light centres and cameras, at the surfels nearest to
+    true vertices.
+    """
     vertices = truth["vertices"].astype(float)
     normals = truth["normals"].astype(float)
-    distance, nearest = cKDTree(surfels["surfel_position"].values).query(vertices, workers=1)
-    same = (distance < NEAR) & (np.einsum("ni,ni->n", surfels["surfel_normal"].values[nearest], normals) > TURNED)
+    distance, nearest = cKDTree(surfels["surfel_position"].values).query(
+        vertices, workers=1
+    )
+    same = (distance < NEAR) & (
+        np.einsum("ni,ni->n", surfels["surfel_normal"].values[nearest], normals)
+        > TURNED
+    )
     for kind, devices in (("light", dome.lights), ("camera", dome.cameras)):
         share = surfels[f"{kind}_visible_fraction"].values
         seen = np.unpackbits(truth[f"visible_{kind}"], axis=1).astype(bool)
@@ -130,7 +191,9 @@ def of_visibility(surfels: xr.Dataset, truth: dict[str, NDArray], dome: DomeReco
         for j, device in enumerate(devices):
             eye = device.position if kind == "light" else -device.R.T @ device.t
             way = eye - vertices
-            steep = np.einsum("ni,ni->n", way, normals) > STEEP * np.linalg.norm(way, axis=1)
+            steep = np.einsum("ni,ni->n", way, normals) > STEEP * np.linalg.norm(
+                way, axis=1
+            )
             at = np.flatnonzero(same & steep)
             right += int(((share[nearest[at], j] > 0.5) == seen[at, j]).sum())
             pairs += len(at)

@@ -19,7 +19,9 @@ class Spent:
 
 
 class Stages:
-    """Assigns all time to the stage that is reported next: `with Stages() as stages: call(progress=stages)`."""
+    """Assigns all time to the stage that is reported next: `with Stages() as stages:
+    call(progress=stages)`.
+    """
 
     def __init__(self) -> None:
         self.spent: dict[str, Spent] = {}
@@ -54,8 +56,14 @@ class Stages:
     def table(self) -> dict[str, dict[str, float]]:
         """Resources of every stage, and of "all"."""
         parts = self.spent.values()
-        whole = Spent(sum(p.wall for p in parts), sum(p.cpu for p in parts), max(p.anonymous for p in parts))
-        return {name: asdict(spent) for name, spent in {**self.spent, "all": whole}.items()}
+        whole = Spent(
+            sum(p.wall for p in parts),
+            sum(p.cpu for p in parts),
+            max(p.anonymous for p in parts),
+        )
+        return {
+            name: asdict(spent) for name, spent in {**self.spent, "all": whole}.items()
+        }
 
     def _watch(self) -> None:
         while not self._stop.wait(0.05):
@@ -74,5 +82,7 @@ def stage_lines(table: Mapping[str, Mapping[str, float]]) -> list[str]:
     lines = []
     for name, one in table.items():
         peak = f"   peak {one['anonymous']:6.0f} MiB" if "anonymous" in one else ""
-        lines.append(f"{name:<24} cpu {one['cpu']:7.1f} s   wall {one['wall']:7.1f} s{peak}")
+        lines.append(
+            f"{name:<24} cpu {one['cpu']:7.1f} s   wall {one['wall']:7.1f} s{peak}"
+        )
     return lines

@@ -1,11 +1,14 @@
 """Time and peak memory of population studies of growing cohorts, each in its own process.
 
-    python benchmarks/study_cost.py DB --work FOLDER [--takes 22 44 87] [--studies albedo traits ...] [--subdivide N]
+    python benchmarks/study_cost.py DB --work FOLDER [--takes 22 44 87] [--studies
+    albedo traits ...] [--subdivide N]
 
-DB contains fitted takes with landmarks. In FOLDER a database with as many virtual subjects as the largest cohort is
-created from copies of the models of DB under new names, with random attributes and albedo scaled at random by 10 %. It
-is kept and reused by the next run. Registration is one of the measured steps; because it stores maps and samples, it is
-the only one that reads all surfels. --subdivide splits every triangle into four, N times.
+DB contains fitted takes with landmarks. In FOLDER a database with as many virtual
+subjects as the largest cohort is created from copies of the models of DB under new
+names, with random attributes and albedo scaled at random by 10 %. It is kept and reused
+by the next run. Registration is one of the measured steps; because it stores maps and
+samples, it is the only one that reads all surfels. --subdivide splits every triangle
+into four, N times.
 """
 
 from __future__ import annotations
@@ -26,7 +29,8 @@ from skindb.store import Database
 from skindb.workflow import STUDIES, register_takes
 from skindb.workflow.provenance import groups_of
 
-STEPS = ("register", *(name for name in STUDIES if name != "brdf"))  # brdf needs captures, of which there are none
+# brdf needs captures, of which there are none
+STEPS = ("register", *(name for name in STUDIES if name != "brdf"))
 GROUPED = ("groups", "maps", "surface")
 
 
@@ -41,16 +45,31 @@ def subdivided(groups: dict[str, xr.Dataset]) -> dict[str, xr.Dataset]:
     for name in ("surfel_position", "surfel_uv", "diffuse_reflectance"):
         new[name] = (new[name] + fitted[name].isel(surfel=edges[:, 1])) / 2
     whole = xr.concat(
-        [fitted, new], "surfel", data_vars="minimal", coords="minimal", compat="override", join="override"
+        [fitted, new],
+        "surfel",
+        data_vars="minimal",
+        coords="minimal",
+        compat="override",
+        join="override",
     )
     whole["surfel_area"] = whole["surfel_area"] / 4
-    corners = [triangle[:, 0], middle[:, 0], middle[:, 2]], [middle[:, 0], triangle[:, 1], middle[:, 1]]
-    more = [middle[:, 2], middle[:, 1], triangle[:, 2]], [middle[:, 0], middle[:, 1], middle[:, 2]]
-    finer = np.concatenate([np.stack(one, axis=1) for one in (*corners, *more)]).astype(np.int32)
+    corners = (
+        [triangle[:, 0], middle[:, 0], middle[:, 2]],
+        [middle[:, 0], triangle[:, 1], middle[:, 1]],
+    )
+    more = (
+        [middle[:, 2], middle[:, 1], triangle[:, 2]],
+        [middle[:, 0], middle[:, 1], middle[:, 2]],
+    )
+    finer = np.concatenate([np.stack(one, axis=1) for one in (*corners, *more)]).astype(
+        np.int32
+    )
     rest = groups["mesh"].drop_dims("face")
     return groups | {
         "fitted": whole.transpose("surfel", ...),
-        "mesh": rest.assign(triangle=(("face", "corner"), finer, groups["mesh"]["triangle"].attrs)),
+        "mesh": rest.assign(
+            triangle=(("face", "corner"), finer, groups["mesh"]["triangle"].attrs)
+        ),
     }
 
 
@@ -64,11 +83,23 @@ def grow(source: Database, target: Database, takes: int, subdivide: int) -> None
         groups.pop("sample", None)
         for _ in range(subdivide):
             groups = subdivided(groups)
-        scaled = groups["fitted"]["diffuse_reflectance"] * np.exp(0.1 * rng.standard_normal())
-        groups["fitted"] = groups["fitted"].assign(diffuse_reflectance=scaled.clip(0, 0.95).astype(np.float32))
-        traits = {"age": int(rng.integers(18, 80)), "gender": str(rng.choice(["female", "male"]))}
+        scaled = groups["fitted"]["diffuse_reflectance"] * np.exp(
+            0.1 * rng.standard_normal()
+        )
+        groups["fitted"] = groups["fitted"].assign(
+            diffuse_reflectance=scaled.clip(0, 0.95).astype(np.float32)
+        )
+        traits = {
+            "age": int(rng.integers(18, 80)),
+            "gender": str(rng.choice(["female", "male"])),
+        }
         take = f"C{number:03d}"
-        about = {"subject": take, "condition": "normal", "traits": traits, "consent_scope": ["fit", "statistics"]}
+        about = {
+            "subject": take,
+            "condition": "normal",
+            "traits": traits,
+            "consent_scope": ["fit", "statistics"],
+        }
         with target.stage("model", take) as stage:
             stage.write(groups)
             stage.commit({**model.attrs, **about, "take": take, "inputs": []})
@@ -90,7 +121,9 @@ def measure(url: str, step: str, takes: int) -> None:
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("db")
     parser.add_argument("--work", type=Path, required=True)
     parser.add_argument("--takes", type=int, nargs="+", default=[22, 44, 87])
@@ -101,13 +134,27 @@ def main() -> None:
     if args.child:
         measure(args.db, args.child[0], int(args.child[1]))
         return
-    grow(skindb.open(args.db), skindb.open(str(args.work)), max(args.takes), args.subdivide)
+    grow(
+        skindb.open(args.db),
+        skindb.open(str(args.work)),
+        max(args.takes),
+        args.subdivide,
+    )
     print("| step | " + " | ".join(f"{n} takes" for n in args.takes) + " |")
     print("|---|" + "---|" * len(args.takes))
     for step in args.studies:
         cells = []
         for takes in args.takes:
-            command = [sys.executable, __file__, str(args.work), "--work", str(args.work), "--child", step, str(takes)]
+            command = [
+                sys.executable,
+                __file__,
+                str(args.work),
+                "--work",
+                str(args.work),
+                "--child",
+                step,
+                str(takes),
+            ]
             done = subprocess.run(command, capture_output=True, text=True, check=False)
             if done.returncode:
                 cells.append(done.stderr.strip().splitlines()[-1][:80])

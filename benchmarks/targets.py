@@ -1,11 +1,13 @@
-"""Measured BRDFs outside the dictionary, fitted with its 59 materials and with reduced bases (docs/validation.md).
+"""Measured BRDFs outside the dictionary, fitted with its 59 materials and with reduced
+bases (docs/validation.md).
 
     python benchmarks/targets.py PATH... [--only WORD...] [--surfels N] [--noise FRACTION]
 
-PATH is a file of Lafortune lobes (.csv with term, Cxy_*, Cz_*, n_* of r, g, b and a row diffuse_albedo, as fitted to
-skin by Marschner et al. 1999) or of networks (.npz with 675 weights per material, Sztrajman et al. 2021); --only
-selects networks whose name contains a word. Surfels with random normals are seen under 150 lights by 16 cameras; the
-diffuse and the surface part are estimated with the public functions.
+PATH is a file of Lafortune lobes (.csv with term, Cxy_*, Cz_*, n_* of r, g, b and a row
+diffuse_albedo, as fitted to skin by Marschner et al. 1999) or of networks (.npz with
+675 weights per material, Sztrajman et al. 2021); --only selects networks whose name
+contains a word. Surfels with random normals are seen under 150 lights by 16 cameras;
+the diffuse and the surface part are estimated with the public functions.
 """
 
 from __future__ import annotations
@@ -26,37 +28,58 @@ from skindb.schema import dataset
 MODES = ("linear", "perceptual", "paper")
 SIZES = range(1, 9)
 LAYERS = ((6, 21), (21, 21), (21, 3))
-Target = Callable[[np.ndarray, np.ndarray], np.ndarray]  # BRDF (..., 3) sr^-1 of local directions
+# BRDF (..., 3) sr^-1 of local directions
+Target = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 def lafortune(path: Path) -> Target:
     """kd/pi + sum of (Cxy (x x' + y y') + Cz z z')^n (Lafortune et al. 1997)."""
     with path.open() as file:
         rows = {row["term"]: row for row in csv.DictReader(file)}
-    values = {term: [[row[f"{key}_{c}"] for c in "rgb"] for key in ("Cxy", "Cz", "n")] for term, row in rows.items()}
+    values = {
+        term: [[row[f"{key}_{c}"] for c in "rgb"] for key in ("Cxy", "Cz", "n")]
+        for term, row in rows.items()
+    }
     albedo = np.array(values.pop("diffuse_albedo")[0], float)
     lobes = np.array(list(values.values()), float)
 
     def evaluate(wi, wo):
         flat = (wi[..., :2] * wo[..., :2]).sum(-1, keepdims=True)
         high = wi[..., 2:] * wo[..., 2:]
-        return albedo / np.pi + sum(np.maximum(xy * flat + z * high, 0) ** n for xy, z, n in lobes)
+        return albedo / np.pi + sum(
+            np.maximum(xy * flat + z * high, 0) ** n for xy, z, n in lobes
+        )
 
     return evaluate
 
 
 def network(weights: np.ndarray) -> Target:
-    """Network 6-21-21-3 on half and difference vector, with ReLU and at the end max(exp(x) - 1, 0)."""
+    """Network 6-21-21-3 on half and difference vector, with ReLU and at the end
+    max(exp(x) - 1, 0).
+    """
     parts = []
     at = 0
     for a, b in LAYERS:
-        parts.append((weights[at : at + a * b].reshape(a, b), weights[at + a * b : at + a * b + b]))
+        parts.append(
+            (
+                weights[at : at + a * b].reshape(a, b),
+                weights[at + a * b : at + a * b + b],
+            )
+        )
         at += a * b + b
 
     def evaluate(wi, wo):
         h, d, phi = half_difference(wi, wo)
         x = np.stack(
-            [np.sin(h), 0 * h, np.cos(h), np.sin(d) * np.cos(phi), np.sin(d) * np.sin(phi), np.cos(d)], axis=-1
+            [
+                np.sin(h),
+                0 * h,
+                np.cos(h),
+                np.sin(d) * np.cos(phi),
+                np.sin(d) * np.sin(phi),
+                np.cos(d),
+            ],
+            axis=-1,
         )
         for matrix, bias in parts[:-1]:
             x = np.maximum(x @ matrix + bias, 0)
@@ -73,12 +96,18 @@ def read_targets(paths: list[Path], words: list[str]) -> dict[str, Target]:
             found[path.stem] = lafortune(path)
             continue
         with np.load(path) as nets:
-            found |= {n: network(nets[n]) for n in nets.files if not words or any(word in n for word in words)}
+            found |= {
+                n: network(nets[n])
+                for n in nets.files
+                if not words or any(word in n for word in words)
+            }
     return found
 
 
 def sampled(target: Target, *, surfels: int, noise: float, seed: int = 0) -> xr.Dataset:
-    """Samples f cos(theta_i) of a ball in a dome, with true normals; every target has the same geometry."""
+    """Samples f cos(theta_i) of a ball in a dome, with true normals; every target has
+    the same geometry.
+    """
     rng = np.random.default_rng(seed)
     light = _spiral(150, 1000.0, 1.0)
     camera = _spiral(16, 1200.0, 0.8)
@@ -89,7 +118,10 @@ def sampled(target: Target, *, surfels: int, noise: float, seed: int = 0) -> xr.
         frame = np.linalg.qr(np.c_[n, np.eye(3)[:, :2]])[0]
         frame[:, 0] = n
         wi, wo = (t - 90 * n for t in (light, camera))
-        wi, wo = ((w / np.linalg.norm(w, axis=1, keepdims=True)) @ frame[:, [1, 2, 0]] for w in (wi, wo))
+        wi, wo = (
+            (w / np.linalg.norm(w, axis=1, keepdims=True)) @ frame[:, [1, 2, 0]]
+            for w in (wi, wo)
+        )
         a, b = np.nonzero((wi[:, None, 2] > 0.1) & (wo[None, :, 2] > 0.1))
         value = target(wi[a], wo[b]) * wi[a, 2:]
         out[a, b] = value * (1 + noise * rng.normal(size=value.shape))
@@ -113,7 +145,10 @@ def _spiral(count, radius, share):
 
 
 def _cell(fitted, linear, perceptual):
-    return f"{100 * float(fitted[linear].median()):.1f} / {100 * float(fitted[perceptual].median()):.1f}"
+    return (
+        f"{100 * float(fitted[linear].median()):.1f} / "
+        f"{100 * float(fitted[perceptual].median()):.1f}"
+    )
 
 
 def _table(heads, rows):
@@ -138,23 +173,44 @@ def main() -> None:
     rows = []
     weights = {}
     for name, ds in samples.items():
-        fits = {mode: fit_surface(ds, dictionary=dictionary, mode=mode) for mode in MODES}
+        fits = {
+            mode: fit_surface(ds, dictionary=dictionary, mode=mode) for mode in MODES
+        }
         weights[name] = fits["perceptual"]
         rd = ds["diffuse_reflectance"].median("surfel").values
-        cells = [_cell(fit, "dictionary_residual", "dictionary_residual_perceptual") for fit in fits.values()]
+        cells = [
+            _cell(fit, "dictionary_residual", "dictionary_residual_perceptual")
+            for fit in fits.values()
+        ]
         rows.append([name, " ".join(f"{v:.2f}" for v in rd), *cells])
-    print("RMS residual over RMS of the samples with diffuse light, linear / in cube-root space [%]; median surfel\n")
+    print(
+        "RMS residual over RMS of the samples with diffuse light, linear / in "
+        "cube-root space [%]; median surfel\n"
+    )
     _table(["target", "estimated R_d", *MODES], rows)
     fitted = xr.concat(
-        [weights[name].merge(ds[["surfel_area"]]) for name, ds in samples.items()], "surfel", combine_attrs="override"
+        [weights[name].merge(ds[["surfel_area"]]) for name, ds in samples.items()],
+        "surfel",
+        combine_attrs="override",
     )
     columns = {name: [] for name in samples}
     for k in SIZES:
-        basis = reduce_basis(fitted, dictionary=dictionary, rng=np.random.default_rng(0), k=k, in_metric=True)
+        basis = reduce_basis(
+            fitted,
+            dictionary=dictionary,
+            rng=np.random.default_rng(0),
+            k=k,
+            in_metric=True,
+        )
         for name, ds in samples.items():
-            columns[name].append(_cell(refit(ds, basis=basis), "fit_residual", "fit_residual_perceptual"))
+            columns[name].append(
+                _cell(refit(ds, basis=basis), "fit_residual", "fit_residual_perceptual")
+            )
     print("\nThe same with k components common to all targets, mode perceptual\n")
-    _table(["target", *(f"k = {k}" for k in SIZES)], [[name, *cells] for name, cells in columns.items()])
+    _table(
+        ["target", *(f"k = {k}" for k in SIZES)],
+        [[name, *cells] for name, cells in columns.items()],
+    )
 
 
 if __name__ == "__main__":

@@ -1,9 +1,11 @@
-"""Errors of fits of captures made by an independent renderer, relative to their truth (docs/validation.md).
+"""Errors of fits of captures made by an independent renderer, relative to their truth
+(docs/validation.md).
 
     python benchmarks/validate.py DB CAPTURE [CAPTURE...]
 
-The truth of each capture folder is in <folder>.truth.npz (keys of skindb.virtual.truth). The captures are ingested into
-DB and fitted. Two Markdown tables are printed: errors, and surfels by status with times and memory.
+The truth of each capture folder is in <folder>.truth.npz (keys of
+skindb.virtual.truth). The captures are ingested into DB and fitted. Two Markdown tables
+are printed: errors, and surfels by status with times and memory.
 """
 
 from __future__ import annotations
@@ -33,10 +35,19 @@ COLUMNS = (
     "held-out cameras [%]",
     "sigma_tr per site, R G B [%]",
 )
-STAGES = ("dictionary", "first pass", "reduced basis", "second pass", "translucency", "commit")
+STAGES = (
+    "dictionary",
+    "first pass",
+    "reduced basis",
+    "second pass",
+    "translucency",
+    "commit",
+)
 
 
-def measure(db: Database, folder: Path, *, spacing: float, parameters: FitParameters) -> dict[str, Any]:
+def measure(
+    db: Database, folder: Path, *, spacing: float, parameters: FitParameters
+) -> dict[str, Any]:
     """Ingest, fit and compare one capture."""
     with Stages() as ingest:
         take = ingest_take(db, folder, spacing_mm=spacing, progress=ingest).take
@@ -45,7 +56,9 @@ def measure(db: Database, folder: Path, *, spacing: float, parameters: FitParame
         report = fit_take(db, take, parameters, progress=fit).provenance
         fit.end("commit")
     with np.load(folder.with_name(folder.name + ".truth.npz")) as truth:
-        recovered = recovered_against_true(db.read("model", take), dict(truth)).summary()
+        recovered = recovered_against_true(
+            db.read("model", take), dict(truth)
+        ).summary()
     stages = {"ingest": ingest.table(), "fit": fit.table()}
     return {"capture": folder.name, **report, **recovered, "stages": stages}
 
@@ -58,9 +71,12 @@ def header(*columns: str) -> str:
 def error_row(r: dict[str, Any]) -> str:
     """Row of the table of errors."""
     sites = "; ".join(
-        f"{name} {_triple(np.round(values) + 0.0, '+.0f')}" for name, values in r["sigma_tr_percent"].items()
+        f"{name} {_triple(np.round(values) + 0.0, '+.0f')}"
+        for name, values in r["sigma_tr_percent"].items()
     )
-    light, camera = (r.get(name) for name in ("held_out_error", "held_out_camera_error"))
+    light, camera = (
+        r.get(name) for name in ("held_out_error", "held_out_camera_error")
+    )
     cells = (
         f"{r['normal_median_deg']:.1f}, {r['normal_95_deg']:.1f}",
         _triple(r["diffuse_median_percent"], ".1f"),
@@ -74,10 +90,16 @@ def error_row(r: dict[str, Any]) -> str:
 
 def time_row(r: dict[str, Any]) -> str:
     """Row of the table of surfels by status, CPU times and memory."""
-    status = ", ".join(f"{name.replace('_', ' ')} {100 * share:.1f}" for name, share in r["status"].items())
+    status = ", ".join(
+        f"{name.replace('_', ' ')} {100 * share:.1f}"
+        for name, share in r["status"].items()
+    )
     ingest = r["stages"]["ingest"]
     fit = r["stages"]["fit"]
-    seconds = [ingest["all"]["cpu"], *(fit[name]["cpu"] if name in fit else 0.0 for name in STAGES)]
+    seconds = [
+        ingest["all"]["cpu"],
+        *(fit[name]["cpu"] if name in fit else 0.0 for name in STAGES),
+    ]
     peak = max(ingest["all"]["anonymous"], fit["all"]["anonymous"]) / 1024
     cells = (f"{r['surfels']:,}", status, *(f"{s:.1f}" for s in seconds), f"{peak:.1f}")
     return f"| {r['capture']} | {' | '.join(cells)} |"
@@ -95,12 +117,18 @@ def main() -> None:
     parser.add_argument("--spacing", type=float, default=1.5)
     parser.add_argument("--hold-out-lights", type=float, default=0.1)
     parser.add_argument("--hold-out-cameras", type=float, default=0.0)
-    parser.add_argument("--stages", action="store_true", help="Print time and memory of every stage to standard error.")
+    parser.add_argument(
+        "--stages",
+        action="store_true",
+        help="Print time and memory of every stage to standard error.",
+    )
     parser.add_argument("--json", type=Path, help="File for all results.")
     args = parser.parse_args()
     db = skindb.open(args.db)
     results = []
-    parameters = FitParameters(hold_out_lights=args.hold_out_lights, hold_out_cameras=args.hold_out_cameras)
+    parameters = FitParameters(
+        hold_out_lights=args.hold_out_lights, hold_out_cameras=args.hold_out_cameras
+    )
     print(header(*COLUMNS))
     for folder in args.captures:
         results.append(measure(db, folder, spacing=args.spacing, parameters=parameters))
@@ -108,11 +136,20 @@ def main() -> None:
         for name, table in results[-1]["stages"].items() if args.stages else ():
             print("\n".join([name, *stage_lines(table)]), file=sys.stderr)
     print(
-        "\n" + header("surfels", "percent per status", "ingest, CPU time [s]", *STAGES, "peak anonymous memory [GiB]")
+        "\n"
+        + header(
+            "surfels",
+            "percent per status",
+            "ingest, CPU time [s]",
+            *STAGES,
+            "peak anonymous memory [GiB]",
+        )
     )
     print("\n".join(time_row(result) for result in results))
     if args.json:
-        args.json.write_text(json.dumps(results, indent=1, default=str), encoding="utf-8")
+        args.json.write_text(
+            json.dumps(results, indent=1, default=str), encoding="utf-8"
+        )
 
 
 if __name__ == "__main__":

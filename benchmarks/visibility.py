@@ -1,10 +1,13 @@
-"""Visibility by rays and by splats: time for all lights and cameras, agreement, and error relative to the truth.
+"""Visibility by rays and by splats: time for all lights and cameras, agreement, and
+error relative to the truth.
 
-    python benchmarks/visibility.py CAPTURE [--truth TRUTH.npz] [--spacing 0.4] [--every 10] [--picture FILE.png]
+    python benchmarks/visibility.py CAPTURE [--truth TRUTH.npz] [--spacing 0.4] [--every
+    10] [--picture FILE.png]
 
-CAPTURE is a capture folder; TRUTH has `vertices`, `normals`, `region`, `region_names` and `visible_light` (bits for the
-centres of the lights) of the surface from which it was made. Cameras are enlarged to 1300 x 1030 pixels. Every result
-is one line of JSON, with wall time and CPU time, since other programs may be running.
+CAPTURE is a capture folder; TRUTH has `vertices`, `normals`, `region`, `region_names`
+and `visible_light` (bits for the centres of the lights) of the surface from which it
+was made. Cameras are enlarged to 1300 x 1030 pixels. Every result is one line of JSON,
+with wall time and CPU time, since other programs may be running.
 """
 
 from __future__ import annotations
@@ -48,7 +51,9 @@ def main() -> None:
     parser.add_argument("capture", type=Path)
     parser.add_argument("--truth", type=Path)
     parser.add_argument("--spacing", type=float, default=0.4)
-    parser.add_argument("--every", type=int, default=10, help="Compare every N-th light.")
+    parser.add_argument(
+        "--every", type=int, default=10, help="Compare every N-th light."
+    )
     parser.add_argument("--picture", type=Path)
     args = parser.parse_args()
     capture = read_capture(args.capture)
@@ -67,7 +72,15 @@ def main() -> None:
 
 
 def say(**figures: Any) -> None:
-    print(json.dumps({k: float(f"{v:.6g}") if isinstance(v, float) else v for k, v in figures.items()}), flush=True)
+    print(
+        json.dumps(
+            {
+                k: float(f"{v:.6g}") if isinstance(v, float) else v
+                for k, v in figures.items()
+            }
+        ),
+        flush=True,
+    )
 
 
 @contextmanager
@@ -76,7 +89,13 @@ def clock(what: str, **figures: Any) -> Iterator[None]:
     cpu = time.process_time()
     yield
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-    say(what=what, wall=time.perf_counter() - wall, cpu=time.process_time() - cpu, peak_gib=peak, **figures)
+    say(
+        what=what,
+        wall=time.perf_counter() - wall,
+        cpu=time.process_time() - cpu,
+        peak_gib=peak,
+        **figures,
+    )
 
 
 def enlarged(camera: CameraRecord) -> CameraRecord:
@@ -84,7 +103,12 @@ def enlarged(camera: CameraRecord) -> CameraRecord:
     return replace(camera, width=WIDTH, height=HEIGHT, K=scale @ camera.K)
 
 
-def timings(surfels: SurfelSet, scene: RayScene, lights: tuple[LightRecord, ...], cameras: list[CameraRecord]) -> None:
+def timings(
+    surfels: SurfelSet,
+    scene: RayScene,
+    lights: tuple[LightRecord, ...],
+    cameras: list[CameraRecord],
+) -> None:
     """Time all lights and cameras on two threads, after a small run that compiles the kernels."""
     points = [replace(light, disc_radius=0.0) for light in lights]
     small = replace(cameras[0], width=8, height=8)
@@ -95,7 +119,9 @@ def timings(surfels: SurfelSet, scene: RayScene, lights: tuple[LightRecord, ...]
             camera_visibility(surfels, [small], scene, pool, method=method)
             with clock(f"{method}: centres of the lights", **size):
                 light_visibility(surfels, points, scene, pool, method=method)
-            with clock(f"{method}: cameras, depth maps, clear views", cameras=len(cameras)):
+            with clock(
+                f"{method}: cameras, depth maps, clear views", cameras=len(cameras)
+            ):
                 camera_visibility(surfels, cameras, scene, pool, method=method)
         with clock("rays: discs of the lights", **size):
             light_visibility(surfels, lights, scene, pool)
@@ -106,8 +132,12 @@ def facing(surfels: SurfelSet, place: Any) -> Any:
     return np.einsum("ni,ni->n", way, surfels.normal) / np.linalg.norm(way, axis=1)
 
 
-def compare(surfels: SurfelSet, scene: RayScene, lights: tuple[LightRecord, ...]) -> None:
-    """Compare splats with rays for several map sizes, and the five points of a disc with DENSE points."""
+def compare(
+    surfels: SurfelSet, scene: RayScene, lights: tuple[LightRecord, ...]
+) -> None:
+    """Compare splats with rays for several map sizes, and the five points of a disc
+    with DENSE points.
+    """
     differing = 0
     faced = 0
     errors = []
@@ -122,7 +152,8 @@ def compare(surfels: SurfelSet, scene: RayScene, lights: tuple[LightRecord, ...]
         at = np.flatnonzero(cosine > 0)
         rays = np.zeros(len(cosine), bool)
         by_point = [
-            ~scene.occluded(surfels.position[at], p[None], normal=surfels.normal[at]) for p in disc_points(light)
+            ~scene.occluded(surfels.position[at], p[None], normal=surfels.normal[at])
+            for p in disc_points(light)
         ]
         rays[at] = by_point[0]
         expected = np.mean(by_point, axis=0).astype(np.float16)
@@ -130,7 +161,9 @@ def compare(surfels: SurfelSet, scene: RayScene, lights: tuple[LightRecord, ...]
         faced = faced + len(at)
         inside = at[(expected > 0) & (expected < 1)]
         soft += len(inside)
-        errors.append(share[inside].astype(float) - dense_share(scene, surfels, inside, light))
+        errors.append(
+            share[inside].astype(float) - dense_share(scene, surfels, inside, light)
+        )
         edge = mixed(surfels.faces, rays)
         for _ in range(RINGS):
             edge = grown(surfels.faces, edge)
@@ -138,11 +171,24 @@ def compare(surfels: SurfelSet, scene: RayScene, lights: tuple[LightRecord, ...]
         steep.append(cosine > STEEP)
         sure.append(steep[-1] & ~edge)
     error = np.concatenate(errors)
-    say(what="pairs that differ from five points everywhere", share=differing / faced, count=differing, of=faced)
-    say(what="five points in penumbrae", error=float(np.abs(error).mean()), bias=float(error.mean()), soft=soft / faced)
+    say(
+        what="pairs that differ from five points everywhere",
+        share=differing / faced,
+        count=differing,
+        of=faced,
+    )
+    say(
+        what="five points in penumbrae",
+        error=float(np.abs(error).mean()),
+        bias=float(error.mean()),
+        soft=soft / faced,
+    )
     for factor in (0.3, PIXEL, 0.5, 0.7):
         splats = SplatScene(
-            surfels.position, surfels.normal, surfels.radius, pixel_mm=factor * float(np.median(surfels.radius))
+            surfels.position,
+            surfels.normal,
+            surfels.radius,
+            pixel_mm=factor * float(np.median(surfels.radius)),
         )
         begin = time.process_time()
         share = [splats.visible_fraction(light.position) for light in lights]
@@ -151,28 +197,60 @@ def compare(surfels: SurfelSet, scene: RayScene, lights: tuple[LightRecord, ...]
             same = [(s >= threshold) == r for s, r in zip(share, seen, strict=True)]
             away = [a[w].mean() for a, w in zip(same, sure, strict=True)]
             every = np.mean([a[w].mean() for a, w in zip(same, steep, strict=True)])
-            figures = {"mean": float(np.mean(away)), "worst": float(min(away)), "with_edges": float(every)}
-            say(what="splats as rays", pixel_of_radius=factor, threshold=threshold, cpu_a_view=cpu, **figures)
+            figures = {
+                "mean": float(np.mean(away)),
+                "worst": float(min(away)),
+                "with_edges": float(every),
+            }
+            say(
+                what="splats as rays",
+                pixel_of_radius=factor,
+                threshold=threshold,
+                cpu_a_view=cpu,
+                **figures,
+            )
 
 
-def dense_share(scene: RayScene, surfels: SurfelSet, at: Any, light: LightRecord) -> Any:
+def dense_share(
+    scene: RayScene, surfels: SurfelSet, at: Any, light: LightRecord
+) -> Any:
     """Visible fraction of the disc from DENSE points on a spiral."""
     k = np.arange(DENSE) + 0.5
     centre, *ring = disc_points(light)
     u, v = (np.asarray(p - centre) / np.sqrt(0.6) for p in ring[:2])
     radius = np.sqrt(k / DENSE)
     angle = k * np.pi * (3 - np.sqrt(5))
-    points = centre + (radius * np.cos(angle))[:, None] * u + (radius * np.sin(angle))[:, None] * v
-    return np.mean([~scene.occluded(surfels.position[at], p[None], normal=surfels.normal[at]) for p in points], axis=0)
+    points = (
+        centre
+        + (radius * np.cos(angle))[:, None] * u
+        + (radius * np.sin(angle))[:, None] * v
+    )
+    return np.mean(
+        [
+            ~scene.occluded(surfels.position[at], p[None], normal=surfels.normal[at])
+            for p in points
+        ],
+        axis=0,
+    )
 
 
-def against_truth(surfels: SurfelSet, scene: RayScene, lights: tuple[LightRecord, ...], every: int, path: Path) -> None:
-    """Compare both methods with the truth by region, at the surfels nearest to true vertices that face the light."""
+def against_truth(
+    surfels: SurfelSet,
+    scene: RayScene,
+    lights: tuple[LightRecord, ...],
+    every: int,
+    path: Path,
+) -> None:
+    """Compare both methods with the truth by region, at the surfels nearest to true
+    vertices that face the light.
+    """
     truth = np.load(path)
     vertices = truth["vertices"].astype(float)
     normals = truth["normals"].astype(float)
     distance, nearest = cKDTree(surfels.position).query(vertices, workers=1)
-    good = (distance < NEAREST) & (np.einsum("ni,ni->n", surfels.normal[nearest], normals) > TURNED)
+    good = (distance < NEAREST) & (
+        np.einsum("ni,ni->n", surfels.normal[nearest], normals) > TURNED
+    )
     taken = np.unique(nearest[good])
     place = np.searchsorted(taken, nearest)
     names = [str(n) for n in truth["region_names"]]
@@ -184,24 +262,35 @@ def against_truth(surfels: SurfelSet, scene: RayScene, lights: tuple[LightRecord
     groups["under the chin"] = np.any(below, axis=0) & down
     groups = {"all": np.ones(len(region), bool)} | groups
     splats = SplatScene(surfels.position, surfels.normal, surfels.radius)
-    wrong = {name: np.zeros(4) for name in groups}  # errors of rays, errors of splats, differences between both, pairs
+    # errors of rays, errors of splats, differences between both, pairs
+    wrong = {name: np.zeros(4) for name in groups}
     false = np.zeros((2, 2))  # method, false visible and false hidden
     bits = truth["visible_light"]
     for j in range(0, len(lights), every):
         seen = ((bits[:, j // 8] >> (7 - j % 8)) & 1).astype(bool)
         eye = lights[j].position
         way = eye - vertices
-        at = good & (np.einsum("ni,ni->n", way, normals) > STEEP * np.linalg.norm(way, axis=1))
+        at = good & (
+            np.einsum("ni,ni->n", way, normals) > STEEP * np.linalg.norm(way, axis=1)
+        )
         front = facing(surfels, eye)[taken] > 0
-        rays = front & ~scene.occluded(surfels.position[taken], eye[None], normal=surfels.normal[taken])
+        rays = front & ~scene.occluded(
+            surfels.position[taken], eye[None], normal=surfels.normal[taken]
+        )
         drawn = front & (splats.visible_fraction(eye, taken) >= THRESHOLD)
         of = place[at]
         both = np.stack([rays[of], drawn[of]])
         off = both != seen[at]
-        false += np.stack([(both & ~seen[at]).sum(axis=1), (~both & seen[at]).sum(axis=1)], axis=1)
+        false += np.stack(
+            [(both & ~seen[at]).sum(axis=1), (~both & seen[at]).sum(axis=1)], axis=1
+        )
         for name, member in groups.items():
             here = member[at]
-            wrong[name] += [*off[:, here].sum(axis=1), (off[0] != off[1])[here].sum(), here.sum()]
+            wrong[name] += [
+                *off[:, here].sum(axis=1),
+                (off[0] != off[1])[here].sum(),
+                here.sum(),
+            ]
     total = wrong["all"][3]
     for i, method in enumerate(("rays", "splats")):
         say(
@@ -212,10 +301,19 @@ def against_truth(surfels: SurfelSet, scene: RayScene, lights: tuple[LightRecord
         )
     for name, (r, s, d, n) in wrong.items():
         if n:
-            say(what="truth", region=name, pairs=int(n), rays=1 - r / n, splats=1 - s / n, each_other=1 - d / n)
+            say(
+                what="truth",
+                region=name,
+                pairs=int(n),
+                rays=1 - r / n,
+                splats=1 - s / n,
+                each_other=1 - d / n,
+            )
 
 
-def draw(surfels: SurfelSet, scene: RayScene, lights: tuple[LightRecord, ...], path: Path) -> None:
+def draw(
+    surfels: SurfelSet, scene: RayScene, lights: tuple[LightRecord, ...], path: Path
+) -> None:
     """Draw the head under one light from the side: by rays, by splats, and the difference."""
     import matplotlib as mpl
 
@@ -224,25 +322,51 @@ def draw(surfels: SurfelSet, scene: RayScene, lights: tuple[LightRecord, ...], p
 
     middle = surfels.position.mean(axis=0)
     towards = np.array([light.position for light in lights]) - middle
-    wanted = np.array([0.75, 0.45, 0.5])  # from above and the side, so that nose, brow and ear cast shadows
+    # from above and the side, so that nose, brow and ear cast shadows
+    wanted = np.array([0.75, 0.45, 0.5])
     light = lights[int((towards @ wanted / np.linalg.norm(towards, axis=1)).argmax())]
     with ThreadPoolExecutor(1) as pool:
-        shares = [light_visibility(surfels, [light], scene, pool, method=m)[:, 0] for m in ("rays", "splats")]
+        shares = [
+            light_visibility(surfels, [light], scene, pool, method=m)[:, 0]
+            for m in ("rays", "splats")
+        ]
     low = surfels.position.min(axis=0)
     high = surfels.position.max(axis=0)
-    eye = np.array([(low[0] + high[0]) / 2 + 250, (low[1] + high[1]) / 2, high[2] + 700])
-    x, y = np.meshgrid(np.linspace(low[0] - 20, high[0] + 40, 640), np.linspace(high[1] + 5, low[1] - 5, 720))
+    eye = np.array(
+        [(low[0] + high[0]) / 2 + 250, (low[1] + high[1]) / 2, high[2] + 700]
+    )
+    x, y = np.meshgrid(
+        np.linspace(low[0] - 20, high[0] + 40, 640),
+        np.linspace(high[1] + 5, low[1] - 5, 720),
+    )
     target = np.stack([x, y, np.full(x.shape, middle[2])], axis=-1).reshape(-1, 3)
     face, weight, _ = scene.first_hit(np.broadcast_to(eye, target.shape), target - eye)
     corner = surfels.faces[face]
     shade = 0.25 + 0.75 * np.maximum(facing(surfels, light.position), 0)
-    lit = [(np.einsum("nk,nk->n", weight, (0.15 + 0.85 * s.astype(float) * shade)[corner])) for s in shares]
-    off = np.einsum("nk,nk->n", weight, (shares[1].astype(float) - shares[0].astype(float))[corner])
+    lit = [
+        (np.einsum("nk,nk->n", weight, (0.15 + 0.85 * s.astype(float) * shade)[corner]))
+        for s in shares
+    ]
+    off = np.einsum(
+        "nk,nk->n", weight, (shares[1].astype(float) - shares[0].astype(float))[corner]
+    )
     base = 0.75 + 0.2 * np.einsum("nk,nk->n", weight, shade[corner])
-    apart = np.clip(np.stack([base - np.maximum(-off, 0), base - np.abs(off), base - np.maximum(off, 0)], -1), 0, 1)
+    apart = np.clip(
+        np.stack(
+            [base - np.maximum(-off, 0), base - np.abs(off), base - np.maximum(off, 0)],
+            -1,
+        ),
+        0,
+        1,
+    )
     count = int((np.abs(shares[0].astype(float) - shares[1]) > 0).sum())
-    panels = [(np.repeat(i[:, None], 3, axis=1), t) for i, t in zip(lit, ("rays", "splats"), strict=True)]
-    panels.append((apart, f"difference ({100 * count / len(shares[0]):.2f} % of the surfels)"))
+    panels = [
+        (np.repeat(i[:, None], 3, axis=1), t)
+        for i, t in zip(lit, ("rays", "splats"), strict=True)
+    ]
+    panels.append(
+        (apart, f"difference ({100 * count / len(shares[0]):.2f} % of the surfels)")
+    )
     figure, axes = plt.subplots(1, 3, figsize=(11, 5.1))
     for axis, (image, title) in zip(axes, panels, strict=True):
         image[face < 0] = 1

@@ -1,10 +1,12 @@
-"""Time of two one-thread workers that fit two takes in parallel, compared with one worker that fits them in sequence.
+"""Time of two one-thread workers that fit two takes in parallel, compared with one
+worker that fits them in sequence.
 
     python benchmarks/workers.py DB TAKE [TAKE] [--repeats 3]
 
-Every worker is a process with one thread on its own copy of DB; its start is timed, compilation is not. Both methods
-alternate. The ratio of the wall times is only meaningful on two idle cores, so the CPU time is printed as well: if it
-increases with two workers, they compete for memory or caches.
+Every worker is a process with one thread on its own copy of DB; its start is timed,
+compilation is not. Both methods alternate. The ratio of the wall times is only
+meaningful on two idle cores, so the CPU time is printed as well: if it increases with
+two workers, they compete for memory or caches.
 """
 
 from __future__ import annotations
@@ -29,7 +31,9 @@ def start(folder: Path, take: str) -> subprocess.Popen[str]:
     """Start a worker that fits a take."""
     surroundings = os.environ | ONE_THREAD | {"PYTHONPATH": str(ROOT)}
     command = [sys.executable, str(DRIVER), "fit-one-thread", str(folder), take]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=surroundings)
+    return subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, env=surroundings
+    )
 
 
 def finish(worker: subprocess.Popen[str]) -> float:
@@ -40,7 +44,9 @@ def finish(worker: subprocess.Popen[str]) -> float:
     return float(json.loads(printed.splitlines()[-1])["stages"]["all"]["cpu"])
 
 
-def timed(folders: Sequence[Path], takes: Sequence[str], *, together: bool) -> tuple[float, float]:
+def timed(
+    folders: Sequence[Path], takes: Sequence[str], *, together: bool
+) -> tuple[float, float]:
     """Wall time and CPU time [s] of the fits of all takes."""
     begin = time.perf_counter()
     if together:
@@ -55,7 +61,9 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("db", type=Path)
-    parser.add_argument("takes", nargs="+", help="One take, which is fitted twice, or two takes.")
+    parser.add_argument(
+        "takes", nargs="+", help="One take, which is fitted twice, or two takes."
+    )
     parser.add_argument("--repeats", type=int, default=3)
     args = parser.parse_args()
     takes = (args.takes * WORKERS)[:WORKERS]
@@ -65,14 +73,21 @@ def main() -> None:
             shutil.copytree(args.db, folder)
         timed(folders[:1], takes[:1], together=False)  # compiles
         runs = [
-            (timed(folders, takes, together=False), timed(folders, takes, together=True)) for _ in range(args.repeats)
+            (
+                timed(folders, takes, together=False),
+                timed(folders, takes, together=True),
+            )
+            for _ in range(args.repeats)
         ]
     best = [[min(run[way][what] for run in runs) for way in (0, 1)] for what in (0, 1)]
     for way, name in enumerate(("in sequence", "in parallel")):
         walls = ", ".join(f"{run[way][0]:.1f}" for run in runs)
-        print(f"{name:<20} wall {best[0][way]:.1f} s ({walls})   CPU {best[1][way]:.1f} s")
+        print(
+            f"{name:<20} wall {best[0][way]:.1f} s ({walls})   CPU {best[1][way]:.1f} s"
+        )
     print(
-        f"parallel: {best[0][0] / best[0][1]:.2f} times as fast, CPU time {best[1][1] / best[1][0]:.2f} times as high"
+        f"parallel: {best[0][0] / best[0][1]:.2f} times as fast, CPU time "
+        f"{best[1][1] / best[1][0]:.2f} times as high"
     )
 
 

@@ -51,7 +51,10 @@ html_theme = "pydata_sphinx_theme"
 html_title = f"skindb {release}"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
-html_sidebars = {page: [] for page in ("index", "getting_started", "tutorial", "contributing")}  # no subpages
+# no subpages
+html_sidebars = {
+    page: [] for page in ("index", "getting_started", "tutorial", "contributing")
+}
 html_show_sourcelink = False
 html_copy_source = False
 html_theme_options = {
@@ -68,7 +71,9 @@ html_theme_options = {
 
 
 def _copy_notebooks() -> None:
-    """Copy the executed notebooks to the folder that Sphinx reads, or the notebooks without output if not executed."""
+    """Copy the executed notebooks to the folder that Sphinx reads, or the notebooks
+    without output if not executed.
+    """
     target = HERE / "notebooks"
     target.mkdir(exist_ok=True)
     executed = HERE / "_build" / "notebooks"
@@ -80,7 +85,13 @@ def _copy_notebooks() -> None:
 
 def _help_of(command: click.Command, name: str) -> str:
     """Help of a command as printed by the command line, with lines that fit on the page."""
-    parent = click.Context(cli, info_name="skindb", max_content_width=82, terminal_width=82, **cli.context_settings)
+    parent = click.Context(
+        cli,
+        info_name="skindb",
+        max_content_width=82,
+        terminal_width=82,
+        **cli.context_settings,
+    )
     return command.get_help(click.Context(command, parent=parent, info_name=name))
 
 
@@ -88,7 +99,10 @@ def _write_commands() -> None:
     """Write the page of all commands from their help texts."""
     parts = [
         "# Commands\n",
-        "This page is generated from the help texts of the commands. `skindb COMMAND --help` prints the same text.\n",
+        (
+            "This page is generated from the help texts of the commands. `skindb "
+            "COMMAND --help` prints the same text.\n"
+        ),
     ]
     for name, command in cli.commands.items():
         parts.append(f"## skindb {name}\n\n```text\n{_help_of(command, name)}\n```\n")
@@ -107,4 +121,5 @@ def _prepare(app: Sphinx) -> None:
 
 def setup(app: Sphinx) -> None:
     """Copy and generate pages before Sphinx looks for sources."""
-    app.connect("builder-inited", _prepare, priority=100)  # before autosummary reads the sources
+    # before autosummary reads the sources
+    app.connect("builder-inited", _prepare, priority=100)

@@ -1,4 +1,6 @@
-"""Write docs/pictures/calibration_*.png from simulated calibration frames: python docs/make_calibration.py."""
+"""Write docs/pictures/calibration_*.png from simulated calibration frames: python
+docs/make_calibration.py.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,11 @@ BLACK = 1024.0
 WHITE = 65520.0
 FULL = 20000.0
 READ = 6.0
-STACKS = {2: (0.04, 0.005), 4: (0.04, 0.02, 0.01, 0.005), 8: tuple(0.08 / 2.0**i for i in range(8))}
+STACKS = {
+    2: (0.04, 0.005),
+    4: (0.04, 0.02, 0.01, 0.005),
+    8: tuple(0.08 / 2.0**i for i in range(8)),
+}
 
 
 def main() -> None:
@@ -37,13 +43,17 @@ def encoded(exposure):
     toe = 0.004
     slope = power * toe ** (power - 1)
     lift = toe**power - slope * toe
-    return np.where(exposure < toe, slope * exposure, np.maximum(exposure, toe) ** power - lift) / (1 - lift)
+    return np.where(
+        exposure < toe, slope * exposure, np.maximum(exposure, toe) ** power - lift
+    ) / (1 - lift)
 
 
 def photograph(radiance, seconds, rng):
     """Frame of 12 bits in 16 with shot and read noise."""
     electrons = radiance * seconds * FULL
-    electrons = electrons + np.sqrt(electrons + READ**2) * rng.standard_normal(radiance.shape)
+    electrons = electrons + np.sqrt(electrons + READ**2) * rng.standard_normal(
+        radiance.shape
+    )
     return np.rint(64 + encoded(np.clip(electrons / FULL, 0, 1)) * 4031) * 16
 
 
@@ -60,9 +70,17 @@ def draw_response(rng) -> None:
         value = (table[:, 0] - BLACK) / (WHITE - BLACK)
         left.loglog(table[1:, 2], value[1:], lw=1, label=f"{count} exposures")
         error = np.interp(encoded(exposure), value, table[:, 2]) / exposure
-        right.semilogx(exposure, 100 * (error / np.median(error[exposure > 0.05]) - 1), lw=1)
-    left.set(xlabel="relative exposure", ylabel="value, 0 black, 1 white", xlim=(1e-4, 1))
-    right.set(xlabel="relative exposure", ylabel="error of the recovered exposure [%]", ylim=(-5, 5))
+        right.semilogx(
+            exposure, 100 * (error / np.median(error[exposure > 0.05]) - 1), lw=1
+        )
+    left.set(
+        xlabel="relative exposure", ylabel="value, 0 black, 1 white", xlim=(1e-4, 1)
+    )
+    right.set(
+        xlabel="relative exposure",
+        ylabel="error of the recovered exposure [%]",
+        ylim=(-5, 5),
+    )
     left.legend()
     figure.savefig(PICTURES / "calibration_response.png", dpi=80)
 
@@ -72,18 +90,35 @@ def draw_noise(rng) -> None:
     pairs = []
     pattern = 1 + 0.02 * rng.standard_normal((100, 100))
     for level in (0.0, 0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 0.6, 0.9):
-        electrons = rng.poisson(level * FULL * pattern, (2, 100, 100)) + READ * rng.standard_normal((2, 100, 100))
-        pairs.append(np.clip(np.rint((BLACK + electrons / FULL * (WHITE - BLACK)) / 16) * 16, 0, WHITE))
+        electrons = rng.poisson(
+            level * FULL * pattern, (2, 100, 100)
+        ) + READ * rng.standard_normal((2, 100, 100))
+        pairs.append(
+            np.clip(
+                np.rint((BLACK + electrons / FULL * (WHITE - BLACK)) / 16) * 16,
+                0,
+                WHITE,
+            )
+        )
     fit = fit_noise(np.array(pairs), black=BLACK, white=WHITE, step=16.0)
     figure, ax = plt.subplots(figsize=(5, 3.3), layout="constrained")
     signal = fit.mean * fit.electrons_per_dn
-    ax.loglog(np.maximum(signal, 1), np.sqrt(fit.variance) * fit.electrons_per_dn, "o", label="pairs of flat frames")
+    ax.loglog(
+        np.maximum(signal, 1),
+        np.sqrt(fit.variance) * fit.electrons_per_dn,
+        "o",
+        label="pairs of flat frames",
+    )
     line = np.logspace(0, 4.3, 100)
     label = (
         f"fit: read noise {fit.read_noise:.2f} ± {fit.read_noise_error:.2f} e,\n"
         f"{fit.electrons_per_dn:.4f} ± {fit.electrons_per_dn_error:.4f} e per value"
     )
-    ax.loglog(line, np.sqrt(line + fit.read_noise**2 + (16 * fit.electrons_per_dn) ** 2 / 12), label=label)
+    ax.loglog(
+        line,
+        np.sqrt(line + fit.read_noise**2 + (16 * fit.electrons_per_dn) ** 2 / 12),
+        label=label,
+    )
     ax.set(xlabel="signal [electrons]", ylabel="noise [electrons]")
     ax.legend()
     figure.savefig(PICTURES / "calibration_noise.png", dpi=80)
@@ -93,7 +128,9 @@ def draw_residuals(rng) -> None:
     """Draw a flat frame, and its residual after the fit of the vignette."""
     row, column = np.mgrid[:48, :64] + 0.5
     r2 = ((column - 31) ** 2 + (row - 24.5) ** 2) / 40.0**2
-    frame = (1 - 0.21 * r2 - 0.06 * r2**2 - 0.03 * r2**3) * (1 + 0.005 * rng.standard_normal(r2.shape))
+    frame = (1 - 0.21 * r2 - 0.06 * r2**2 - 0.03 * r2**3) * (
+        1 + 0.005 * rng.standard_normal(r2.shape)
+    )
     frame[12:15, 16:20] *= 0.97  # dust
     a2, a4, a6 = fit_vignette(frame, [31.0, 24.5]).coefficients
     gain = 1 + r2 * (a2 + r2 * (a4 + r2 * a6))
@@ -101,7 +138,11 @@ def draw_residuals(rng) -> None:
     figure, axes = plt.subplots(1, 2, figsize=(8, 2.8), layout="constrained")
     for ax, image, title in (
         (axes[0], frame, "flat frame, relative"),
-        (axes[1], 100 * (flat / np.median(flat) - 1), "residual of the fit [%], with dust"),
+        (
+            axes[1],
+            100 * (flat / np.median(flat) - 1),
+            "residual of the fit [%], with dust",
+        ),
     ):
         figure.colorbar(ax.imshow(image), ax=ax)
         ax.set_title(title)
@@ -116,17 +157,31 @@ def draw_isotropy(rng) -> None:
     figure, axes = plt.subplots(1, 2, figsize=(8, 3.3), layout="constrained")
     for stretch, name in ((0.0, "isotropic"), (0.1, "10 % anisotropic")):
         decay = 0.9 * (1 - stretch * np.cos(2 * (azimuth - 0.7)))
-        value = (np.exp(-decay[:, None] * distance) / distance**2)[..., None] * np.ones(3)
+        value = (np.exp(-decay[:, None] * distance) / distance**2)[..., None] * np.ones(
+            3
+        )
         error = 0.05 * value
-        found = compare_azimuths(value + error * rng.standard_normal(value.shape), error, distance, azimuth)
+        found = compare_azimuths(
+            value + error * rng.standard_normal(value.shape), error, distance, azimuth
+        )
         colour = "C1" if stretch else "C0"
         axes[0].semilogy(distance, value[..., 1].T, color=colour, lw=0.7)
-        label = f"{name}: p = {found.p_value[1]:.2g}, ratio {found.anisotropy[1]:.3f} ± {found.anisotropy_error[1]:.3f}"
+        label = (
+            f"{name}: p = {found.p_value[1]:.2g}, ratio {found.anisotropy[1]:.3f} ± "
+            f"{found.anisotropy_error[1]:.3f}"
+        )
         axes[1].errorbar(
-            np.degrees(azimuth), found.slope[:, 1], found.slope_error[:, 1], fmt="o", color=colour, label=label
+            np.degrees(azimuth),
+            found.slope[:, 1],
+            found.slope_error[:, 1],
+            fmt="o",
+            color=colour,
+            label=label,
         )
     axes[0].set(xlabel="distance [mm]", ylabel="R, arbitrary unit")
-    axes[1].set(xlabel="azimuth [degrees]", ylabel="decay minus mean [1/mm]", ylim=(-0.13, 0.2))
+    axes[1].set(
+        xlabel="azimuth [degrees]", ylabel="decay minus mean [1/mm]", ylim=(-0.13, 0.2)
+    )
     axes[1].legend(loc="upper center", fontsize=8)
     figure.savefig(PICTURES / "calibration_isotropy.png", dpi=80)
 

@@ -10,33 +10,59 @@ from skindb.schema import GROUPS, Explained, FitStatus, ProbeStatus
 PAGE = Path(__file__).with_name("variables.md")
 HEAD = """# Variables
 
-This page is generated from `skindb/schema` by `make docs`. It lists every stored variable with dims, dtype and units.
+This page is generated from `skindb/schema` by `make docs`. It lists every stored
+variable with dims, dtype and units.
 """
 
 
 def _group(name: str) -> str:
     rows = [
-        f"| `{v.name}` | {' '.join(v.dims)} | {v.dtype} | {v.units} | {v.doc} | {v.source} |".replace("||", "|")
+        (
+            f"| `{v.name}` | {' '.join(v.dims)} | {v.dtype} | {v.units} | {v.doc} | "
+            f"{v.source} |"
+        ).replace("||", "|")
         for v in GROUPS[name]
     ]
     return "\n".join(
-        [f"\n## {name}\n", "| variable | dims | dtype | units | meaning | source |", "|---|---|---|---|---|---|", *rows]
+        [
+            f"\n## {name}\n",
+            "| variable | dims | dtype | units | meaning | source |",
+            "|---|---|---|---|---|---|",
+            *rows,
+        ]
     )
 
 
 def _status(status: type[Explained], variable: str) -> str:
-    rows = [f"| {int(member)} | {member.name.lower()} | {member.explanation} |" for member in status]
-    return "\n".join([f"\n## Values of `{variable}`\n", "| value | name | meaning |", "|---|---|---|", *rows])
+    rows = [
+        f"| {int(member)} | {member.name.lower()} | {member.explanation} |"
+        for member in status
+    ]
+    return "\n".join(
+        [
+            f"\n## Values of `{variable}`\n",
+            "| value | name | meaning |",
+            "|---|---|---|",
+            *rows,
+        ]
+    )
 
 
 def main() -> int:
     """Write the page, or check it."""
-    parts = [HEAD, *map(_group, GROUPS), _status(FitStatus, "fit_status"), _status(ProbeStatus, "site_status")]
+    parts = [
+        HEAD,
+        *map(_group, GROUPS),
+        _status(FitStatus, "fit_status"),
+        _status(ProbeStatus, "site_status"),
+    ]
     text = "\n".join(parts) + "\n"
     if "--check" in sys.argv[1:]:
         if PAGE.read_text(encoding="utf-8") == text:
             return 0
-        sys.stderr.write("docs/variables.md is out of date; run `make docs` and commit it\n")
+        sys.stderr.write(
+            "docs/variables.md is out of date; run `make docs` and commit it\n"
+        )
         return 1
     PAGE.write_text(text, encoding="utf-8")
     return 0

@@ -11,7 +11,9 @@ from skindb.errors import Fault, InputError
 
 if TYPE_CHECKING:
     from skindb import analysis, bench, demo, export, fit, ingest, render, workflow
-    from skindb.store.opening import open  # noqa: A004  the first word of a notebook, as in xarray and zarr
+
+    # the first word of a notebook, as in xarray and zarr
+    from skindb.store.opening import open  # noqa: A004
     from skindb.workflow.simulation import simulate
 
 __all__ = [
@@ -30,9 +32,19 @@ __all__ = [
     "workflow",
 ]
 
-# SPEC 1: subpackages are imported at their first use, so that `import skindb` and the command line start fast
+# SPEC 1: subpackages are imported at their first use, so that `import skindb` and the
+# command line start fast
 __getattr__, __dir__, _ = lazy_loader.attach(
     __name__,
-    submodules=["analysis", "bench", "demo", "export", "fit", "ingest", "render", "workflow"],
+    submodules=[
+        "analysis",
+        "bench",
+        "demo",
+        "export",
+        "fit",
+        "ingest",
+        "render",
+        "workflow",
+    ],
     submod_attrs={"store.opening": ["open"], "workflow.simulation": ["simulate"]},
 )

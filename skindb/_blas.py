@@ -7,7 +7,9 @@ from functools import wraps
 from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
-import scipy.linalg  # noqa: F401  SciPy has its own BLAS, and only loaded libraries can be limited
+
+# SciPy has its own BLAS, and only loaded libraries can be limited
+import scipy.linalg  # noqa: F401
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
@@ -18,7 +20,8 @@ Result = TypeVar("Result")
 def one_blas_thread() -> threadpool_limits:
     """Context in which matrix products and decompositions do not depend on the number of threads.
 
-    The order of sums in BLAS depends on its threads, and fits amplify the last digit to 1e-3 of a weight.
+    The order of sums in BLAS depends on its threads, and fits amplify the last digit to
+    1e-3 of a weight.
     """
     return threadpool_limits(1)
 
@@ -35,5 +38,7 @@ def on_one_blas_thread(function: Callable[P, Result]) -> Callable[P, Result]:
 
 
 def c_contiguous(array: NDArray[Any]) -> NDArray[Any]:
-    """The array in C order and aligned; an array that was received over a network may be neither."""
+    """The array in C order and aligned; an array that was received over a network may
+    be neither.
+    """
     return np.require(array, requirements=["C", "A"])

@@ -24,7 +24,9 @@ SUMS = "sums.json"  # digests of the files of an entry
 
 
 def cache_folder() -> Path | None:
-    """Folder SKINDB_CACHE, or `skindb` in the user's cache folder; None if SKINDB_CACHE is empty."""
+    """Folder SKINDB_CACHE, or `skindb` in the user's cache folder; None if SKINDB_CACHE
+    is empty.
+    """
     named = os.environ.get("SKINDB_CACHE")
     if named is not None:
         return Path(named) if named else None
@@ -32,7 +34,11 @@ def cache_folder() -> Path | None:
 
 
 def cached_arrays(
-    name: str, arguments: tuple[Any, ...], *, sources: tuple[str, ...], make: Callable[[], Mapping[str, NDArray[Any]]]
+    name: str,
+    arguments: tuple[Any, ...],
+    *,
+    sources: tuple[str, ...],
+    make: Callable[[], Mapping[str, NDArray[Any]]],
 ) -> Arrays:
     """Result of `make`, from the cache if available.
 
@@ -43,15 +49,16 @@ def cached_arrays(
     arguments
         Arguments on which the tables depend; their `repr` must distinguish all values.
     sources
-        Names of the modules that compute the tables; if their source changes, the tables are computed again.
+        Names of the modules that compute the tables; if their source changes, the
+        tables are computed again.
     make
         Function without arguments that returns arrays by name.
 
     Returns
     -------
     dict
-        Read-only arrays, memory-mapped if there is a cache. Files whose digests do not match are computed again; a
-        cache that cannot be written is ignored.
+        Read-only arrays, memory-mapped if there is a cache. Files whose digests do not
+        match are computed again; a cache that cannot be written is ignored.
     """
     folder = cache_folder()
     if folder is None:
@@ -86,7 +93,10 @@ def _read(place: Path) -> Arrays | None:
         sums = json.loads((place / SUMS).read_text(encoding="utf-8"))
         if any(_digest(place / f"{key}.npy") != digest for key, digest in sums.items()):
             return None
-        return {key: np.asarray(np.load(place / f"{key}.npy", mmap_mode="r")) for key in sums}
+        return {
+            key: np.asarray(np.load(place / f"{key}.npy", mmap_mode="r"))
+            for key in sums
+        }
     except (OSError, ValueError, AttributeError, EOFError):
         return None
 

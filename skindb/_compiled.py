@@ -13,11 +13,14 @@ from typing import Any
 import numba as nb
 from numba.core import event
 
-# sums may be reordered and products fused; NaN and inf keep their meaning (`fastmath=True` would drop tests for them)
+# sums may be reordered and products fused; NaN and inf keep their meaning
+# (`fastmath=True` would drop tests for them)
 FAST = {"reassoc", "contract", "arcp", "nsz", "afn"}
-# cached on disk; without the GIL; a division by zero gives inf, because tests for it would prevent vectorised loops
+# cached on disk; without the GIL; a division by zero gives inf, because tests for it
+# would prevent vectorised loops
 OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
-INTRINSICS = os.environ.get("SKINDB_INTRINSICS", "1") != "0"  # 0: only code that Numba compiles itself, see `_vectors`
+# 0: only code that Numba compiles itself, see `_vectors`
+INTRINSICS = os.environ.get("SKINDB_INTRINSICS", "1") != "0"
 
 
 def kernel(function: Any) -> Any:
@@ -28,9 +31,9 @@ def kernel(function: Any) -> Any:
 def fast_kernel(function: Any) -> Any:
     """Compile a kernel whose loops may run in vector registers, see FAST.
 
-    The kernel is always inlined into its callers. Otherwise a process that has just compiled both would call the
-    separately compiled copy, and a process that reads them from the disk the copy next to the caller, which may sum in
-    another order.
+    The kernel is always inlined into its callers. Otherwise a process that has just
+    compiled both would call the separately compiled copy, and a process that reads them
+    from the disk the copy next to the caller, which may sum in another order.
     """
     return _stamped(nb.njit(fastmath=FAST, forceinline=True, **OPTIONS)(function))
 
@@ -48,8 +51,8 @@ def inline_fast_kernel(function: Any) -> Any:
 def _stamped(compiled: Any) -> Any:
     """Make the cache on disk valid only as long as no kernel changes.
 
-    Numba only compares the date of the file of a function. Compiled code also contains the functions of other files
-    that it calls, which would not be updated.
+    Numba only compares the date of the file of a function. Compiled code also contains
+    the functions of other files that it calls, which would not be updated.
     """
     compiled._cache._cache_file._source_stamp = _sources()
     return compiled
@@ -67,7 +70,9 @@ def _sources() -> str:
 
 @contextmanager
 def reported_compilation(call: Callable[[], None]) -> Iterator[None]:
-    """Call `call` before each kernel that is compiled instead of read from the disk, as after an installation."""
+    """Call `call` before each kernel that is compiled instead of read from the disk, as
+    after an installation.
+    """
 
     class Listener(event.Listener):  # type: ignore[misc]
         def on_start(self, event: Any) -> None:  # noqa: ARG002

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
-FORMULA = frozenset("=+-@\t\r\n\uff1d\uff0b\uff0d\uff20")  # first characters of formulas, also in full width
+# first characters of formulas, also in full width
+FORMULA = frozenset("=+-@\t\r\n\uff1d\uff0b\uff0d\uff20")
 
 
 def csv_text(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
@@ -20,7 +21,9 @@ def csv_text(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     Text that a spreadsheet would evaluate begins with an apostrophe (OWASP, "CSV Injection").
     """
     buffer = io.StringIO()
-    csv.writer(buffer).writerows([_cell(value) for value in row] for row in (header, *rows))
+    csv.writer(buffer).writerows(
+        [_cell(value) for value in row] for row in (header, *rows)
+    )
     return buffer.getvalue()
 
 

@@ -1,4 +1,6 @@
-"""Files of captures and databases: opens only regular files of limited size, and creates private folders."""
+"""Files of captures and databases: opens only regular files of limited size, and
+creates private folders.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,8 @@ PRIVATE = 0o700  # permissions of folders with personal data
 PRIVATE_FILE = 0o600  # and of files
 CURE_MISSING = "copy the file into the folder, or correct its name"
 CURE_KIND = "replace it with the file itself"
-# a JSON string, also an unterminated one; runs without a backslash are matched in one step, which is much faster
+# a JSON string, also an unterminated one; runs without a backslash are matched in one
+# step, which is much faster
 STRING = re.compile(r'(?s)"[^"\\]*+(?:\\.?[^"\\]*+)*+(?:"|\Z)')
 KINDS = (
     (stat.S_ISDIR, "a folder"),
@@ -45,7 +48,9 @@ def open_regular(path: Path, most_bytes: int) -> BufferedReader:
     except OSError as error:
         raise _not_opened(path, error) from None
     except ValueError as error:  # a zero byte or an unpaired surrogate in the name
-        raise InputError(Fault(where, "the file must exist", str(error), "correct its name")) from None
+        raise InputError(
+            Fault(where, "the file must exist", str(error), "correct its name")
+        ) from None
     try:
         status = os.fstat(number)
         if not stat.S_ISREG(status.st_mode):
@@ -53,8 +58,16 @@ def open_regular(path: Path, most_bytes: int) -> BufferedReader:
         if status.st_size > most_bytes:
             rule = f"the file must be at most {_size(most_bytes)}"
             found = _size(status.st_size)
-            raise InputError(Fault(where, rule, found, "check that it is the right file, or make it smaller"))
-        return open(path, "rb", opener=lambda *_: number)  # keeps the name, which readers of TIFF use
+            raise InputError(
+                Fault(
+                    where,
+                    rule,
+                    found,
+                    "check that it is the right file, or make it smaller",
+                )
+            )
+        # keeps the name, which readers of TIFF use
+        return open(path, "rb", opener=lambda *_: number)
     except BaseException:
         os.close(number)
         raise
@@ -64,13 +77,16 @@ def read_regular(path: Path, most_bytes: int) -> bytes:
     """Content of a file that `open_regular` opens."""
     with open_regular(path, most_bytes) as stream:
         try:
-            return stream.read(os.fstat(stream.fileno()).st_size)  # the exact size, so that no more is allocated
+            # the exact size, so that no more is allocated
+            return stream.read(os.fstat(stream.fileno()).st_size)
         except OSError as error:
             raise _not_opened(path, error) from None
 
 
 def json_depth(text: str) -> int:
-    """Largest depth of nested brackets, computed before parsing, which needs stack and memory in proportion."""
+    """Largest depth of nested brackets, computed before parsing, which needs stack and
+    memory in proportion.
+    """
     if (count := text.count("[") + text.count("{")) <= 1:
         return count
     bare = np.frombuffer(STRING.sub("", text).encode("utf-8"), np.uint8)
@@ -85,12 +101,23 @@ def _not_opened(path: Path, error: OSError) -> InputError:
     try:
         mode = path.stat().st_mode
     except (OSError, ValueError):
-        found = "no such file" if isinstance(error, FileNotFoundError) else error.strerror or str(error)
+        found = (
+            "no such file"
+            if isinstance(error, FileNotFoundError)
+            else error.strerror or str(error)
+        )
         return InputError(Fault(where, "the file must exist", found, CURE_MISSING))
     if not stat.S_ISREG(mode):
         return _of_kind(where, mode)
     found = error.strerror or str(error)
-    return InputError(Fault(where, "the file must be readable", found, "check its permissions and the disk"))
+    return InputError(
+        Fault(
+            where,
+            "the file must be readable",
+            found,
+            "check its permissions and the disk",
+        )
+    )
 
 
 def _of_kind(where: str, mode: int) -> InputError:
@@ -99,13 +126,17 @@ def _of_kind(where: str, mode: int) -> InputError:
 
 
 def _size(count: int) -> str:
-    return f"{count / 1e6:,.1f} MB" if count % 1_000_000 else f"{count // 1_000_000:,} MB"
+    return (
+        f"{count / 1e6:,.1f} MB" if count % 1_000_000 else f"{count // 1_000_000:,} MB"
+    )
 
 
 def private_file(path: str | os.PathLike[str]) -> Path:
-    """The path of a file, which only its owner can read or write from now on, for a function that writes it.
+    """The path of a file, which only its owner can read or write from now on, for a
+    function that writes it.
 
-    A file that is missing is created, so that libraries which open it by its name do not choose its permissions.
+    A file that is missing is created, so that libraries which open it by its name do
+    not choose its permissions.
     """
     file = Path(path)
     if file.is_file() or not file.exists():  # no pipe or device, such as /dev/stdout
@@ -119,7 +150,9 @@ def private_file(path: str | os.PathLike[str]) -> Path:
 
 @contextmanager
 def private_umask() -> Iterator[None]:
-    """Context in which everything that this process creates is private; for processes that skindb owns."""
+    """Context in which everything that this process creates is private; for processes
+    that skindb owns.
+    """
     before = os.umask(~PRIVATE & 0o777)
     try:
         yield
@@ -140,7 +173,9 @@ def make_private(folder: Path, mode: int = PRIVATE) -> None:
 
 
 def write_private(path: Path, content: bytes) -> None:
-    """Write a file that only its owner can read, whatever the umask; an existing file is replaced."""
+    """Write a file that only its owner can read, whatever the umask; an existing file
+    is replaced.
+    """
     path.unlink(missing_ok=True)
     number = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
     with os.fdopen(number, "wb") as file:

@@ -1,4 +1,6 @@
-"""Conversion of samples from half to single precision, scaled so that their squares neither vanish nor overflow."""
+"""Conversion of samples from half to single precision, scaled so that their squares
+neither vanish nor overflow.
+"""
 
 from __future__ import annotations
 
@@ -27,14 +29,22 @@ def _single(value: Any) -> Any:
 
 
 def sample_bits(sample: NDArray[Any]) -> NDArray[Any]:
-    """Half floats as uint16 bits, because Numba has no half type; other samples in single precision."""
+    """Half floats as uint16 bits, because Numba has no half type; other samples in
+    single precision.
+    """
     is_half = sample.dtype == np.float16
-    return np.ascontiguousarray(sample).view(np.uint16) if is_half else np.ascontiguousarray(sample, np.float32)
+    return (
+        np.ascontiguousarray(sample).view(np.uint16)
+        if is_half
+        else np.ascontiguousarray(sample, np.float32)
+    )
 
 
 @kernel
 def unpack(sample: Any, out: Any) -> None:
-    """Write the samples (lights, cameras, 3) of a surfel to `out` (lights cameras 3,) in single precision."""
+    """Write the samples (lights, cameras, 3) of a surfel to `out` (lights cameras 3,)
+    in single precision.
+    """
     flat = sample.reshape(-1)
     for i in range(flat.shape[0]):
         out[i] = single(flat[i])
@@ -52,7 +62,9 @@ def largest_finite(values: Any) -> Any:
 
 @kernel
 def scale_to_one(values: Any) -> float:
-    """Multiply values by the power of two that brings the largest to [0.5, 1), which is exact; returns the power."""
+    """Multiply values by the power of two that brings the largest to [0.5, 1), which is
+    exact; returns the power.
+    """
     largest = np.float64(largest_finite(values))
     if largest <= 0.0:
         return 1.0

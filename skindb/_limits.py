@@ -1,6 +1,8 @@
-"""Limits of a capture: sizes of files, depth and counts of JSON, pixels. All are checked before the data are used.
+"""Limits of a capture: sizes of files, depth and counts of JSON, pixels. All are
+checked before the data are used.
 
-Each limit is about ten times the largest value that known domes and scanners write; docs/capture_format.md lists them.
+Each limit is about ten times the largest value that known domes and scanners write;
+docs/capture_format.md lists them.
 """
 
 from __future__ import annotations
@@ -11,11 +13,14 @@ MAX_JSON_BYTES = 32 * MB  # regions list a few million vertices
 MAX_JSON_DEPTH = 32  # nested brackets; the format needs 5
 MAX_OBJECT_KEYS = 1_000  # of one JSON object
 MAX_NAME_CHARACTERS = 64  # of ids, regions and landmarks
-MAX_TEXT_CHARACTERS = 256  # of the value of an attribute, a reference or a path inside a capture
+# of the value of an attribute, a reference or a path inside a capture
+MAX_TEXT_CHARACTERS = 256
 MAX_NAMED_UNKNOWN_KEYS = 20  # listed individually in a warning
 
-MAX_STORE_JSON_BYTES = 128 * MB  # of a record, manifest or table: a manifest lists about 9,000 files in 1 MB
-RESUMABLE_SECONDS = 24 * 3600.0  # for which the scratch of a killed ingest or fit is kept, so that it can resume
+# of a record, manifest or table: a manifest lists about 9,000 files in 1 MB
+MAX_STORE_JSON_BYTES = 128 * MB
+# for which the scratch of a killed ingest or fit is kept, so that it can resume
+RESUMABLE_SECONDS = 24 * 3600.0
 
 MAX_CAMERAS = 256
 MAX_LIGHTS = 2_048
@@ -29,12 +34,14 @@ MAX_SEQUENCE_STEPS = 200_000  # lights x exposures, and repetitions
 MAX_BALL_PLACES = 64  # of the mirror ball in a calibration
 MAX_KNOWN_POINTS = 10_000  # of a calibration, for the reprojection error
 MAX_REGIONS = 128  # each needs one byte per surfel, and eight while it is computed
-MAX_FRAMES = 50_000  # cameras x lights x exposures of the face, of dark frames or of the white target
+# cameras x lights x exposures of the face, of dark frames or of the white target
+MAX_FRAMES = 50_000
 
 MAX_FRAME_BYTES = 1_000 * MB
 MAX_FRAME_SIDE_PX = 32_768
 MAX_FRAME_PIXELS = 64_000_000  # merging two exposures of this size needs 2 GB
-# compression of deflate: a stored byte expands to at most 1,032 bytes, so a small file cannot contain a large picture
+# compression of deflate: a stored byte expands to at most 1,032 bytes, so a small file
+# cannot contain a large picture
 MAX_PNG_RATIO = 1_032
 
 MAX_SCAN_BYTES = 1_000 * MB
@@ -51,7 +58,8 @@ MAX_RECHECKED_BYTES = 1_000 * MB
 # of commands; sizes beyond these are typing errors, and most would not fit into memory
 MAX_COHORT = 10_000  # simulated subjects
 MAX_VIRTUAL_PIXELS = 8_000_000  # of a simulated frame, which needs 250 bytes each
-MAX_PICTURE_PIXELS = 16_000_000  # of a picture rendered at another scale, which needs 700 bytes each
+# of a picture rendered at another scale, which needs 700 bytes each
+MAX_PICTURE_PIXELS = 16_000_000
 MAX_WORKERS = 256
 MAX_WAIT_S = 7 * 24 * 3600.0
 MAX_SEED = 2**63 - 1

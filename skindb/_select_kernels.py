@@ -1,4 +1,6 @@
-"""Compiled order statistics without branches, so that the loops over values run in vector registers."""
+"""Compiled order statistics without branches, so that the loops over values run in
+vector registers.
+"""
 
 from __future__ import annotations
 
@@ -8,15 +10,18 @@ import numpy as np
 
 from skindb._compiled import fast_kernel, kernel
 
-INFINITE = np.int32(0x7F800000)  # bits of +inf; the bits of non-negative floats have the order of their values
+# bits of +inf; the bits of non-negative floats have the order of their values
+INFINITE = np.int32(0x7F800000)
 WINDOW = np.int32(256)  # units in the last place: a relative 3e-5
 
 
 @kernel
 def median_of(values: Any, bits: Any, n: int, count: int) -> float:
-    """Median of n non-negative float32 of which `count` are finite and the others inf, to a relative error of 3e-5.
+    """Median of n non-negative float32 of which `count` are finite and the others inf,
+    to a relative error of 3e-5.
 
-    `bits` is the same memory as int32. The bits are bisected by counting; values within WINDOW count as equal.
+    `bits` is the same memory as int32. The bits are bisected by counting; values within
+    WINDOW count as equal.
     """
     if count == 0:
         return 0.0
@@ -27,7 +32,8 @@ def median_of(values: Any, bits: Any, n: int, count: int) -> float:
         high = max(high, bits[i] if bits[i] < INFINITE else np.int32(0))
     k = np.int32((count - 1) // 2)
     low = np.int32(low - 1)
-    while high - low > WINDOW:  # at most k values are below or at `low`, more than k below or at `high`
+    # at most k values are below or at `low`, more than k below or at `high`
+    while high - low > WINDOW:
         middle = np.int32(low + (high - low) // 2)
         below = np.int32(0)
         for i in range(n):

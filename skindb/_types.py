@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.floating[Any]]
 Mask = NDArray[np.bool_]
-Progress = Callable[[str, int, int], None]  # called with the stage, the steps done and the steps in all
+# called with the stage, the steps done and the steps in all
+Progress = Callable[[str, int, int], None]
 
 
 def silent(stage: str, done: int, total: int) -> None:

@@ -6,7 +6,8 @@ import time
 from collections.abc import Callable
 from typing import Protocol
 
-TICK_SECONDS = 0.005  # of simulated time: a 115,200 baud line needs as long for a message
+# of simulated time: a 115,200 baud line needs as long for a message
+TICK_SECONDS = 0.005
 SIMULATED_START = 1_700_000_000.0  # s since 1970
 
 

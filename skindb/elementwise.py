@@ -28,8 +28,9 @@ def elementwise(
     Parameters
     ----------
     kernel
-        Function of one array per input, in order and with the dims of `ds`, and of `params` by keyword; returns one
-        array per output with `over` first. It must treat elements independently, because blocks are arbitrary.
+        Function of one array per input, in order and with the dims of `ds`, and of
+        `params` by keyword; returns one array per output with `over` first. It must
+        treat elements independently, because blocks are arbitrary.
     ds
         Dataset with the inputs; `over` must be the first dim of those that have it.
     over
@@ -51,21 +52,37 @@ def elementwise(
     lengths = {str(dim): size for dim, size in ds.sizes.items()} | dict(sizes or {})
 
     def declared(*blocks: np.ndarray[Any, Any]) -> Any:
-        # convert the results of the kernel to the dtype of the schema, which the lazy array declares
+        # convert the results of the kernel to the dtype of the schema, which the lazy
+        # array declares
         results = kernel(*blocks, **params)
-        kept = tuple(np.asarray(r, spec.dtype) for r, spec in zip(results, specs, strict=True))
-        return kept if len(kept) > 1 else kept[0]  # apply_ufunc expects a single output without a tuple
+        kept = tuple(
+            np.asarray(r, spec.dtype) for r, spec in zip(results, specs, strict=True)
+        )
+        # apply_ufunc expects a single output without a tuple
+        return kept if len(kept) > 1 else kept[0]
 
-    # one call of the kernel per block gives all outputs; inputs without `over` are shared by every block
+    # one call of the kernel per block gives all outputs; inputs without `over` are
+    # shared by every block
     results = xr.apply_ufunc(
         declared,
         *arrays,
-        input_core_dims=[[dim for dim in array.dims if dim != over] for array in arrays],
+        input_core_dims=[
+            [dim for dim in array.dims if dim != over] for array in arrays
+        ],
         output_core_dims=[[dim for dim in spec.dims if dim != over] for spec in specs],
         dask="parallelized",
         output_dtypes=[spec.dtype for spec in specs],
-        dask_gufunc_kwargs={"output_sizes": {dim: lengths[dim] for spec in specs for dim in spec.dims if dim != over}},
+        dask_gufunc_kwargs={
+            "output_sizes": {
+                dim: lengths[dim] for spec in specs for dim in spec.dims if dim != over
+            }
+        },
     )
     results = results if isinstance(results, tuple) else (results,)
-    coords = {dim: ds.coords[dim] for spec in specs for dim in spec.dims if dim in ds.coords}
-    return xr.Dataset({name: label(name, r.data) for name, r in zip(outputs, results, strict=True)}, coords)
+    coords = {
+        dim: ds.coords[dim] for spec in specs for dim in spec.dims if dim in ds.coords
+    }
+    return xr.Dataset(
+        {name: label(name, r.data) for name, r in zip(outputs, results, strict=True)},
+        coords,
+    )

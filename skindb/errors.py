@@ -1,4 +1,6 @@
-"""Faults of user input as data: place, rule, what was found and cure, reported together, one line each."""
+"""Faults of user input as data: place, rule, what was found and cure, reported
+together, one line each.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,8 @@ CURES = {
     errno.EACCES: CURE_PERMISSIONS,
     errno.EPERM: CURE_PERMISSIONS,
 }
-MAX_SIMILAR_FAULTS = 3  # faults with the same place and rule that are listed individually
+# faults with the same place and rule that are listed individually
+MAX_SIMILAR_FAULTS = 3
 MAX_PART_CHARACTERS = 300  # of each of place, rule, finding and cure
 
 
@@ -37,7 +40,9 @@ class Fault:
 
 
 def printable(text: str, most: int = MAX_PART_CHARACTERS) -> str:
-    """Text on one line for a terminal: white space is folded, control characters are escaped, the middle is cut."""
+    """Text on one line for a terminal: white space is folded, control characters are
+    escaped, the middle is cut.
+    """
     if len(text) > most:
         head = most * 2 // 3
         text = f"{text[:head]}...{text[len(text) - (most - head - 3) :]}"
@@ -45,32 +50,49 @@ def printable(text: str, most: int = MAX_PART_CHARACTERS) -> str:
 
 
 def escaped(text: str) -> str:
-    """Text with escapes in place of all characters that cannot be printed, such as control characters."""
-    return text if text.isprintable() else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+    """Text with escapes in place of all characters that cannot be printed, such as
+    control characters.
+    """
+    return (
+        text
+        if text.isprintable()
+        else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+    )
 
 
 def grouped(faults: Iterable[Fault]) -> list[Fault]:
-    """The faults, with many of the same place and rule replaced by one that gives the first finding and the number."""
+    """The faults, with many of the same place and rule replaced by one that gives the
+    first finding and the number.
+    """
     alike = dict[tuple[str, str], list[Fault]]()
     for fault in dict.fromkeys(faults):
         alike.setdefault((fault.where, fault.rule), []).append(fault)
     out = list[Fault]()
     for same in alike.values():
         found = f"{same[0].found}, and {len(same) - 1} more"
-        out += same if len(same) <= MAX_SIMILAR_FAULTS else [replace(same[0], found=found)]
+        out += (
+            same if len(same) <= MAX_SIMILAR_FAULTS else [replace(same[0], found=found)]
+        )
     return out
 
 
 def system_fault(error: OSError, where: str) -> Fault:
     """Fault for an error of the operating system; `where` is used if the error names no file."""
-    cure = CURES.get(error.errno or 0, "check that it is a file of the right kind, its permissions and the disk")
+    cure = CURES.get(
+        error.errno or 0,
+        "check that it is a file of the right kind, its permissions and the disk",
+    )
     found = error.strerror or str(error)
-    return Fault(str(error.filename or where), "must be readable and writable", found, cure)
+    return Fault(
+        str(error.filename or where), "must be readable and writable", found, cure
+    )
 
 
 @contextmanager
 def add_filename(where: str) -> Iterator[None]:
-    """Context that adds a file name to errors of the operating system that have none, such as those of writing."""
+    """Context that adds a file name to errors of the operating system that have none,
+    such as those of writing.
+    """
     try:
         yield
     except OSError as error:
@@ -84,7 +106,9 @@ class SkindbWarning(UserWarning):
 
 
 class InputError(ValueError):
-    """Invalid input, with all faults that were found, so that the user can correct them together."""
+    """Invalid input, with all faults that were found, so that the user can correct them
+    together.
+    """
 
     def __init__(self, faults: Fault | Iterable[Fault]) -> None:
         self.faults = (faults,) if isinstance(faults, Fault) else tuple(faults)

@@ -32,8 +32,15 @@ def s3_server(kind: str) -> Iterator[str]:
     """Context with the address of a server."""
     port = free_port()
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, *COMMANDS[kind], str(port), *([folder] if kind == "localbucket" else [])]
-        with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as server:
+        command = [
+            sys.executable,
+            *COMMANDS[kind],
+            str(port),
+            *([folder] if kind == "localbucket" else []),
+        ]
+        with subprocess.Popen(
+            command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        ) as server:
             try:
                 wait_for(port, server)
                 yield f"http://127.0.0.1:{port}"
@@ -79,7 +86,9 @@ def new_bucket(address: str) -> str:
 
 
 def own_cache(folder: Path) -> Path:
-    """A new cache without the scratch of other databases, with links to the tables that take seconds to compute."""
+    """A new cache without the scratch of other databases, with links to the tables that
+    take seconds to compute.
+    """
     folder.mkdir(mode=0o700)
     if known := cache_folder():
         for place in known.glob("*-*"):

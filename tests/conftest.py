@@ -1,4 +1,6 @@
-"""Shared fixtures. Property tests use the same examples in every run; HYPOTHESIS_PROFILE=search draws new ones."""
+"""Shared fixtures. Property tests use the same examples in every run;
+HYPOTHESIS_PROFILE=search draws new ones.
+"""
 
 from __future__ import annotations
 
@@ -30,14 +32,18 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture(scope="session", autouse=True)
 def _one_blas_thread():
-    """Threads of BLAS wait for each other in loops, which takes the cores from the other workers of the tests."""
+    """Threads of BLAS wait for each other in loops, which takes the cores from the
+    other workers of the tests.
+    """
     with one_blas_thread():
         yield
 
 
 @pytest.fixture(scope="session", autouse=True)
 def _do_not_wait_for_the_disk():
-    """What was flushed only shows after a power loss: tests/destructive/power_loss.py, a process of its own."""
+    """What was flushed only shows after a power loss: tests/destructive/power_loss.py,
+    a process of its own.
+    """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "fsync", os.fstat)  # which also needs an open file
         yield
@@ -74,7 +80,9 @@ def small_dictionary():
     whole = embedded_dictionary()
     chosen = [3, 12, 20, 31, 44, 57]
     table = np.ascontiguousarray(whole.table[..., chosen])
-    return Dictionary(tuple(whole.names[i] for i in chosen), table, whole.grid, "six of them")
+    return Dictionary(
+        tuple(whole.names[i] for i in chosen), table, whole.grid, "six of them"
+    )
 
 
 @pytest.fixture(scope="session")
@@ -115,7 +123,9 @@ def s3_address():
 
 @pytest.fixture
 def new_database(s3_address, monkeypatch, tmp_path_factory):
-    """Function that returns the URL of a new database in a bucket; the environment is set for its server."""
+    """Function that returns the URL of a new database in a bucket; the environment is
+    set for its server.
+    """
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path_factory.mktemp("share")))
 
     def url(kind):

@@ -40,7 +40,15 @@ class FaultyProxy(ThreadingHTTPServer):
     daemon_threads = True
 
     def __init__(
-        self, target: str, *, fraction=0.0, faults=FAULTS, seed=0, late_s=1.0, delay_s=0.0, without=()
+        self,
+        target: str,
+        *,
+        fraction=0.0,
+        faults=FAULTS,
+        seed=0,
+        late_s=1.0,
+        delay_s=0.0,
+        without=(),
     ) -> None:
         super().__init__(("127.0.0.1", 0), _Handler)
         self.target = urlsplit(target)
@@ -84,11 +92,17 @@ class _Handler(BaseHTTPRequestHandler):
             return None
         body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
         time.sleep(self.server.delay_s)
-        self.server.headers = {name.lower(): value for name, value in self.headers.items()}
+        self.server.headers = {
+            name.lower(): value for name, value in self.headers.items()
+        }
         fault = self.server.fault(self.command, self.path)
         if fault in REFUSED:
             text = b"<Error><Code>%s</Code></Error>" % REFUSED[fault]
-            return self._answer(int(fault), {"Content-Length": str(len(text))}, b"" if self.command == "HEAD" else text)
+            return self._answer(
+                int(fault),
+                {"Content-Length": str(len(text))},
+                b"" if self.command == "HEAD" else text,
+            )
         if fault == "dropped":
             return self._end()
         if fault == "half a request":
@@ -112,9 +126,13 @@ class _Handler(BaseHTTPRequestHandler):
         return self.parse_request()
 
     def _forward(self, body: bytes, *, half: bool = False):
-        server = HTTPConnection(self.server.target.hostname, self.server.target.port, timeout=30)
+        server = HTTPConnection(
+            self.server.target.hostname, self.server.target.port, timeout=30
+        )
         try:
-            server.putrequest(self.command, self.path, skip_host=True, skip_accept_encoding=True)
+            server.putrequest(
+                self.command, self.path, skip_host=True, skip_accept_encoding=True
+            )
             for name, value in self.headers.items():
                 if name.lower() not in self.server.without:
                     server.putheader(name, value)
@@ -144,7 +162,9 @@ class _Handler(BaseHTTPRequestHandler):
 def faulty_proxy(target: str, **options) -> Iterator[FaultyProxy]:
     """Context with a proxy that serves until its end."""
     proxy = FaultyProxy(target, **options)
-    thread = threading.Thread(target=proxy.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
+    thread = threading.Thread(
+        target=proxy.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True
+    )
     thread.start()
     try:
         yield proxy

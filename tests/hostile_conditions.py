@@ -17,7 +17,8 @@ COLUMNS = {
 }
 REFUSED = "refused in one line with a cure"
 HARMLESS = "truth values, as of a harmless condition"
-WORDS = ("pandas", "numpy", "Traceback", "<ast", "object at")  # of messages of libraries
+# of messages of libraries
+WORDS = ("pandas", "numpy", "Traceback", "<ast", "object at")
 PARTS = (
     "age",
     "condition",
@@ -137,18 +138,31 @@ OPERANDS = (  # of one kind, or of a column and what may follow it
 def comparison(rng: random.Random) -> str:
     """A chain of comparisons, whose operands are mostly of one kind."""
     alike = rng.choice(OPERANDS)
-    operands = [rng.choice(alike if rng.random() < 0.9 else PARTS) for _ in range(rng.choice([2, 2, 2, 3]))]
-    return operands[0] + "".join(f" {rng.choice(SIGNS)} {operand}" for operand in operands[1:])
+    operands = [
+        rng.choice(alike if rng.random() < 0.9 else PARTS)
+        for _ in range(rng.choice([2, 2, 2, 3]))
+    ]
+    return operands[0] + "".join(
+        f" {rng.choice(SIGNS)} {operand}" for operand in operands[1:]
+    )
 
 
 def hostile(rng: random.Random) -> str:
-    """A combination of comparisons, or a random sequence of parts of Python; some are nested deeply."""
+    """A combination of comparisons, or a random sequence of parts of Python; some are
+    nested deeply.
+    """
     count = rng.randrange(1, 6)
     if rng.random() < 0.5:
-        parts = [f"{rng.choice(['', '', 'not '])}{comparison(rng)}" for _ in range(count)]
-        text = parts[0] + "".join(f" {rng.choice(['and', 'or'])} {part}" for part in parts[1:])
+        parts = [
+            f"{rng.choice(['', '', 'not '])}{comparison(rng)}" for _ in range(count)
+        ]
+        text = parts[0] + "".join(
+            f" {rng.choice(['and', 'or'])} {part}" for part in parts[1:]
+        )
     else:
-        text = "".join(rng.choice(PARTS) + rng.choice(JOINTS) for _ in range(count)) + rng.choice(PARTS)
+        text = "".join(
+            rng.choice(PARTS) + rng.choice(JOINTS) for _ in range(count)
+        ) + rng.choice(PARTS)
     if rng.random() < 0.1:
         text = "not " * rng.randrange(400) + text
     if rng.random() < 0.1:
@@ -163,14 +177,23 @@ def hostile_conditions(count: int, *, seed: int) -> Iterator[str]:
 
 
 def outcome(text: str) -> str:
-    """What becomes of a condition: `REFUSED`, `HARMLESS`, or a fault of the language of conditions."""
+    """What becomes of a condition: `REFUSED`, `HARMLESS`, or a fault of the language of
+    conditions.
+    """
     try:
         truth, _ = evaluate(text, COLUMNS)
     except InputError as error:
         line = str(error)
-        good = line.isprintable() and "; found " in line and not any(word in line for word in WORDS)
+        good = (
+            line.isprintable()
+            and "; found " in line
+            and not any(word in line for word in WORDS)
+        )
         return REFUSED if good and len(error.faults) == 1 else f"a bad message: {line}"
     except Exception as error:  # noqa: BLE001  any other one is an outcome
         return f"{type(error).__name__} of {text!r}"
-    good = len(truth) == len(COLUMNS["age"]) and {*map(type, truth)} <= {bool, type(None)}
+    good = len(truth) == len(COLUMNS["age"]) and {*map(type, truth)} <= {
+        bool,
+        type(None),
+    }
     return HARMLESS if good else f"other values of {text!r}"

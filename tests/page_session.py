@@ -51,16 +51,33 @@ class Session:
         """
         path = path if path.startswith("/") else self.address.path + path
         sent = {"Host": self.host} | ({"Cookie": self.cookie} if self.cookie else {})
-        sent |= {"Origin": f"http://{self.host}", "Content-Type": "application/json"} if method == "POST" else {}
+        sent |= (
+            {"Origin": f"http://{self.host}", "Content-Type": "application/json"}
+            if method == "POST"
+            else {}
+        )
         sent |= {name.replace("_", "-"): value for name, value in headers.items()}
-        sent |= {} if body is None else {"Content-Length": sent.get("Content-Length", str(len(body)))}
+        sent |= (
+            {}
+            if body is None
+            else {"Content-Length": sent.get("Content-Length", str(len(body)))}
+        )
         lines = [f"{method} {path} HTTP/1.0"]
         for name, value in sent.items():
-            lines += [f"{name}: {one}" for one in (value if isinstance(value, list) else [value]) if one is not None]
-        with socket.create_connection((self.address.hostname, self.address.port), timeout=30) as connection:
-            connection.sendall("\r\n".join([*lines, "", ""]).encode("latin-1") + (body or b""))
+            lines += [
+                f"{name}: {one}"
+                for one in (value if isinstance(value, list) else [value])
+                if one is not None
+            ]
+        with socket.create_connection(
+            (self.address.hostname, self.address.port), timeout=30
+        ) as connection:
+            connection.sendall(
+                "\r\n".join([*lines, "", ""]).encode("latin-1") + (body or b"")
+            )
             with connection.makefile("rb") as stream:
-                received = stream.read()  # all of it, so that nothing is hidden behind the first answer
+                # all of it, so that nothing is hidden behind the first answer
+                received = stream.read()
         answer = http.client.HTTPResponse(_Received(received), method="GET")
         answer.begin()
         answer.body = received.partition(b"\r\n\r\n")[2]
@@ -72,4 +89,6 @@ class Session:
 
     def post(self, name, value, **headers):
         """The JSON of the answer to a JSON object."""
-        return json.loads(self.request("POST", name, json.dumps(value).encode(), **headers).body)
+        return json.loads(
+            self.request("POST", name, json.dumps(value).encode(), **headers).body
+        )

@@ -1,4 +1,6 @@
-"""A database of fitted takes of a few subjects: one in two conditions, one without probe, one without consent."""
+"""A database of fitted takes of a few subjects: one in two conditions, one without
+probe, one without consent.
+"""
 
 from __future__ import annotations
 
@@ -31,18 +33,31 @@ def few_materials() -> Dictionary:
     whole = embedded_dictionary()
     chosen = [3, 20, 44, 57]
     table = np.ascontiguousarray(whole.table[..., chosen])
-    return Dictionary(tuple(whole.names[i] for i in chosen), table, whole.grid, "four of them")
+    return Dictionary(
+        tuple(whole.names[i] for i in chosen), table, whole.grid, "four of them"
+    )
 
 
 def capture(take: str, person: dict[str, Any], seed: int) -> Any:
     """Capture of one take."""
     skin = make_skin(surfels=90, lights=30, cameras=4, seed=seed)
-    tree = capture_of(skin, probe=person.get("sites", True) != [], scope=list(person.get("scope", EVERYTHING)))
+    tree = capture_of(
+        skin,
+        probe=person.get("sites", True) != [],
+        scope=list(person.get("scope", EVERYTHING)),
+    )
     if sites := person.get("sites", ["cheek", "neck"]):
         probe = tree["probe"].to_dataset().isel(site=[0] * len(sites))
-        tree["probe"] = probe.assign_coords(site=np.array(sites, np.dtypes.StringDType()))
+        tree["probe"] = probe.assign_coords(
+            site=np.array(sites, np.dtypes.StringDType())
+        )
     subject, _, condition = take.partition(".")
-    tree.attrs |= {"subject": subject, "condition": condition or "normal", "traits": person["traits"], "take": take}
+    tree.attrs |= {
+        "subject": subject,
+        "condition": condition or "normal",
+        "traits": person["traits"],
+        "take": take,
+    }
     return tree
 
 

@@ -1,4 +1,6 @@
-"""Takes whose surfels lie on a sheet or on a face, with texture coordinates that differ by planted warps."""
+"""Takes whose surfels lie on a sheet or on a face, with texture coordinates that differ
+by planted warps.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,10 @@ SIDE = 33
 SIZE = 1.1  # of B's head to A's
 NAMES = [f"point{i}" for i in range(9)]
 STORED = 1e-6  # single precision of coordinates below 2
-PLACES = np.stack(np.meshgrid([0.2, 0.5, 0.8], [0.2, 0.5, 0.8]), axis=-1).reshape(-1, 2) + 0.01
+PLACES = (
+    np.stack(np.meshgrid([0.2, 0.5, 0.8], [0.2, 0.5, 0.8]), axis=-1).reshape(-1, 2)
+    + 0.01
+)
 FACE = {
     "forehead_centre": (0.50, 0.12),
     "forehead_right": (0.35, 0.15),
@@ -29,15 +34,26 @@ FACE = {
     "chin": (0.5, 0.712),
     "jaw_right": (0.231, 0.676),
 }
-FACE |= {name.replace("right", "left"): (1 - u, v) for name, (u, v) in FACE.items() if "right" in name}
+FACE |= {
+    name.replace("right", "left"): (1 - u, v)
+    for name, (u, v) in FACE.items()
+    if "right" in name
+}
 
 
 def sheet() -> tuple[np.ndarray, np.ndarray]:
-    """Regular (u, v) (n, 2) with v downwards, and triangles with the orientation of an outer surface."""
+    """Regular (u, v) (n, 2) with v downwards, and triangles with the orientation of an
+    outer surface.
+    """
     side = np.linspace(0, 1, SIDE)
     uv = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
     i = (np.arange(SIDE - 1)[:, None] * SIDE + np.arange(SIDE - 1)).ravel()
-    faces = np.concatenate([np.column_stack([i, i + SIDE, i + 1]), np.column_stack([i + 1, i + SIDE, i + SIDE + 1])])
+    faces = np.concatenate(
+        [
+            np.column_stack([i, i + SIDE, i + 1]),
+            np.column_stack([i + 1, i + SIDE, i + SIDE + 1]),
+        ]
+    )
     assert (signed_areas(uv, faces) > 0).all()
     return uv, faces
 
@@ -49,8 +65,12 @@ def lifted(uv: np.ndarray) -> np.ndarray:
     return np.column_stack([x, y, -(x**2 + y**2) / 400])
 
 
-def sheet_take(uv: np.ndarray, landmarks: np.ndarray, names=NAMES, size=1.0, **attrs) -> xr.DataTree:
-    """A take with surfels at the points of the sheet, the given texture coordinates, and landmarks on the sheet."""
+def sheet_take(
+    uv: np.ndarray, landmarks: np.ndarray, names=NAMES, size=1.0, **attrs
+) -> xr.DataTree:
+    """A take with surfels at the points of the sheet, the given texture coordinates,
+    and landmarks on the sheet.
+    """
     plane, faces = sheet()
     fitted = {
         "surfel_position": lifted(plane) * size,
@@ -64,7 +84,10 @@ def sheet_take(uv: np.ndarray, landmarks: np.ndarray, names=NAMES, size=1.0, **a
     groups = {
         "basis": dataset({"disc_angular_radius": 0.0}),
         "fitted": dataset(fitted),
-        "mesh": dataset({"triangle": faces, "landmark_position": landmarks}, coords={"landmark": list(names)}),
+        "mesh": dataset(
+            {"triangle": faces, "landmark_position": landmarks},
+            coords={"landmark": list(names)},
+        ),
     }
     tree = xr.DataTree.from_dict(groups)
     tree.attrs = {"consent_scope": ["statistics"], "condition": "normal", **attrs}
@@ -83,7 +106,9 @@ def nodes() -> np.ndarray:
 
 
 def planted_uv(seed: int, by: float = 0.03) -> np.ndarray:
-    """Texture coordinates of the sheet's points after a warp that moves the landmarks but not the rim."""
+    """Texture coordinates of the sheet's points after a warp that moves the landmarks
+    but not the rim.
+    """
     plane = sheet()[0]
     moved = nodes() + np.random.default_rng(seed).normal(size=(9, 2)) * by
     window = 4 * np.sqrt((plane * (1 - plane)).prod(axis=1, keepdims=True))
@@ -92,13 +117,20 @@ def planted_uv(seed: int, by: float = 0.03) -> np.ndarray:
 
 def sheet_pair() -> dict[str, xr.DataTree]:
     points = on_sheet(nodes())
-    return {"A": sheet_take(sheet()[0], points), "B": sheet_take(planted_uv(1), points * SIZE, size=SIZE)}
+    return {
+        "A": sheet_take(sheet()[0], points),
+        "B": sheet_take(planted_uv(1), points * SIZE, size=SIZE),
+    }
 
 
 def face_take(own: bool = False, seed: int = 1) -> xr.DataTree:
-    """A take with the landmarks of a face, and if `own` with a region mask whose beard is the forehead."""
+    """A take with the landmarks of a face, and if `own` with a region mask whose beard
+    is the forehead.
+    """
     names = list(FACE)
-    take = sheet_take(planted_uv(seed, 0.01), lifted(np.array([FACE[n] for n in names])), names=names)
+    take = sheet_take(
+        planted_uv(seed, 0.01), lifted(np.array([FACE[n] for n in names])), names=names
+    )
     if own:
         upper = (sheet()[0][:, 1] < 0.4)[:, None]
         mask = dataset({"region_mask": upper}, coords={"region": ["beard"]})

@@ -1,4 +1,6 @@
-"""A small dome, and skin with known truth: one made without the package's tables and rows, one from its tables."""
+"""A small dome, and skin with known truth: one made without the package's tables and
+rows, one from its tables.
+"""
 
 from __future__ import annotations
 
@@ -47,27 +49,50 @@ class Skin:
 
 
 def make_skin(
-    *, surfels=40, lights=60, cameras=8, gloss=0.04, sharpness=40.0, noise=0.005, scan_error=3.0, grey=False, seed=1
+    *,
+    surfels=40,
+    lights=60,
+    cameras=8,
+    gloss=0.04,
+    sharpness=40.0,
+    noise=0.005,
+    scan_error=3.0,
+    grey=False,
+    seed=1,
 ):
-    """Points on a head-sized cap with BRDF F_t F_t R_d / pi plus a white Blinn-Phong lobe of albedo `gloss`."""
+    """Points on a head-sized cap with BRDF F_t F_t R_d / pi plus a white Blinn-Phong
+    lobe of albedo `gloss`.
+    """
     rng = np.random.default_rng(seed)
     normal = _unit(_fibonacci(surfels, 0.6) + 0.05 * rng.normal(size=(surfels, 3)))
     position = 80 * _fibonacci(surfels, 0.6)
     light = 880 * _fibonacci(lights, 0.1)
     camera = 830 * _fibonacci(cameras, 0.5)
     base = np.array([0.45, 0.45, 0.45]) if grey else np.array([0.5, 0.33, 0.24])
-    diffuse = base * rng.uniform(0.7, 1.2, (surfels, 1)) * rng.uniform(0.95, 1.05, (surfels, 3))
+    diffuse = (
+        base
+        * rng.uniform(0.7, 1.2, (surfels, 1))
+        * rng.uniform(0.95, 1.05, (surfels, 3))
+    )
     wi = _unit(light[None] - position[:, None])
     wo = _unit(camera[None] - position[:, None])
     ci = np.einsum("nk,ntk->nt", normal, wi)
     co = np.einsum("nk,ntk->nt", normal, wo)
     half = _unit(wi[:, :, None] + wo[:, None])
-    lobe = np.clip(np.einsum("nk,nlck->nlc", normal, half), 0, 1) ** sharpness * (sharpness + 8) / (8 * np.pi)
-    body = (_transmitted(ci)[:, :, None] * _transmitted(co)[:, None] / np.pi)[..., None] * diffuse[:, None, None]
+    lobe = (
+        np.clip(np.einsum("nk,nlck->nlc", normal, half), 0, 1) ** sharpness
+        * (sharpness + 8)
+        / (8 * np.pi)
+    )
+    body = (_transmitted(ci)[:, :, None] * _transmitted(co)[:, None] / np.pi)[
+        ..., None
+    ] * diffuse[:, None, None]
     sample = ci[:, :, None, None] * (body + gloss * lobe[..., None])
     sample = sample * (1 + noise * rng.normal(size=sample.shape))
     sample[(ci <= 0)[:, :, None] | (co <= 0)[:, None]] = np.nan
-    scan = _unit(normal + np.deg2rad(scan_error) / np.sqrt(2) * rng.normal(size=normal.shape))
+    scan = _unit(
+        normal + np.deg2rad(scan_error) / np.sqrt(2) * rng.normal(size=normal.shape)
+    )
     lumitexels = dataset(
         {
             "reflectance_sample": sample,
@@ -89,7 +114,9 @@ def make_skin(
 
 
 def plant_skin(skin, dictionary, rng, *, noise=0.0, scale=0.3):
-    """Replace the samples by F_t F_t R_d / pi plus a random mixture of interpolated BRDFs of the dictionary."""
+    """Replace the samples by F_t F_t R_d / pi plus a random mixture of interpolated
+    BRDFs of the dictionary.
+    """
     ds = skin.lumitexels
     position = ds["surfel_position"].values.astype(float)
     wi = ds["light_position"].values - position[:, None]
@@ -106,9 +133,16 @@ def plant_skin(skin, dictionary, rng, *, noise=0.0, scale=0.3):
     sample = np.empty((len(normal), *shape, 3))
     for i, n in enumerate(normal):
         a, b = np.broadcast_arrays(wi[i][:, None], wo[i][None])
-        table = lookup(dictionary.table, *half_difference(a, b, np.broadcast_to(n, a.shape)))
-        body = fresnel_transmittance(np.abs(ci[i]), 1.3)[:, None] * fresnel_transmittance(np.abs(co[i]), 1.3)[None]
-        sample[i] = (body / np.pi)[..., None] * skin.diffuse[i] + (table @ weight[i])[..., None]
+        table = lookup(
+            dictionary.table, *half_difference(a, b, np.broadcast_to(n, a.shape))
+        )
+        body = (
+            fresnel_transmittance(np.abs(ci[i]), 1.3)[:, None]
+            * fresnel_transmittance(np.abs(co[i]), 1.3)[None]
+        )
+        sample[i] = (body / np.pi)[..., None] * skin.diffuse[i] + (table @ weight[i])[
+            ..., None
+        ]
         sample[i] *= ci[i][:, None, None]
     sample *= 1 + noise * rng.normal(size=sample.shape)
     sample[(ci <= 0)[:, :, None] | (co <= 0)[:, None]] = np.nan
@@ -162,5 +196,10 @@ def capture_of(skin, *, scope=("fit",), probe=True, unseen=(), **attrs):
             coords={"site": ["cheek"], "channel": ["R", "G", "B"]},
         )
     tree = xr.DataTree.from_dict(groups)
-    tree.attrs = {"subject": "S1", "condition": "normal", "traits": {"age": 30}, "consent_scope": list(scope)} | attrs
+    tree.attrs = {
+        "subject": "S1",
+        "condition": "normal",
+        "traits": {"age": 30},
+        "consent_scope": list(scope),
+    } | attrs
     return tree

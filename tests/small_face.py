@@ -30,7 +30,12 @@ def small_face(albedo=(0.6, 0.4, 0.3), components=3) -> xr.DataTree:
     z = 25 * np.sqrt(np.maximum(2.2 - u**2 - v**2, 0)) + nose
     position = np.stack([SIZE * u, SIZE * v, z], axis=1)
     i = (np.arange(SIDE - 1)[:, None] * SIDE + np.arange(SIDE - 1)).ravel()
-    faces = np.concatenate([np.stack([i, i + 1, i + SIDE], 1), np.stack([i + 1, i + SIDE + 1, i + SIDE], 1)])
+    faces = np.concatenate(
+        [
+            np.stack([i, i + 1, i + SIDE], 1),
+            np.stack([i + 1, i + SIDE + 1, i + SIDE], 1),
+        ]
+    )
     normal = np.zeros_like(position)
     a, b, c = (position[faces[:, k]] for k in range(3))
     for k in range(3):
@@ -70,7 +75,9 @@ def small_face(albedo=(0.6, 0.4, 0.3), components=3) -> xr.DataTree:
     groups = {
         "/fitted": dataset(values),
         "/mesh": dataset({"triangle": faces}),
-        "/basis": dataset({"basis_brdf": stored_brdf(tables), "disc_angular_radius": 0.0}),
+        "/basis": dataset(
+            {"basis_brdf": stored_brdf(tables), "disc_angular_radius": 0.0}
+        ),
         "/dome": dataset(dome, coords={"light": ["l0", "l1", "l2"], "camera": ["c0"]}),
     }
     tree = xr.DataTree.from_dict(groups)

@@ -1,4 +1,6 @@
-"""The stress set, with one test per promise; `skindb bench` end to end, and its result for a broken promise."""
+"""The stress set, with one test per promise; `skindb bench` end to end, and its result
+for a broken promise.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,9 @@ def test_cases__cover_every_kernel_once_each():
 
 
 def _run(out, *args):
-    return CliRunner().invoke(cli, ["bench", "--out", str(out), "--quick", "--no-progress", *args])
+    return CliRunner().invoke(
+        cli, ["bench", "--out", str(out), "--quick", "--no-progress", *args]
+    )
 
 
 def _strict(text):
@@ -43,7 +47,9 @@ def _strict(text):
 
 
 def test_bench__writes_the_json_that_it_prints(tmp_path):
-    done = _run(tmp_path / "new/bench", "--only", "inverse", "--only", "exposures", "--json")
+    done = _run(
+        tmp_path / "new/bench", "--only", "inverse", "--only", "exposures", "--json"
+    )
     assert done.exit_code == 0, done.output
     said = _strict(done.stdout)
     assert said == _strict((tmp_path / "new/bench/bench.json").read_text())
@@ -53,14 +59,21 @@ def test_bench__writes_the_json_that_it_prints(tmp_path):
         assert p["reference"]
         assert p["error_of"]
         assert p["seconds"] is None or (p["seconds"] > 0 and p["ratio"] > 0)
-    for kernel in ("inverse", "exposures"):  # the method of reference is part of the run
+    # the method of reference is part of the run
+    for kernel in ("inverse", "exposures"):
         assert any(p["ratio"] == 1 for p in said["points"] if p["kernel"] == kernel)
         assert (tmp_path / f"new/bench/{kernel}.png").read_bytes()[:4] == b"\x89PNG"
     own = {p["method"]: p for p in said["points"] if p["kernel"] == "inverse"}
     assert own["skindb dipole_s"]["error"] < 1e-12
-    assert own["alpha' in single precision"]["error"] > 0.3  # an unsuitable method, with the reason
-    assert any("alpha' in single precision" in line and "cancellation" in line for line in said["failures"])
-    assert [c["name"] for c in said["stress"]] == [c.name for c in CASES if c.kernel in ("inverse", "exposures")]
+    # an unsuitable method, with the reason
+    assert own["alpha' in single precision"]["error"] > 0.3
+    assert any(
+        "alpha' in single precision" in line and "cancellation" in line
+        for line in said["failures"]
+    )
+    assert [c["name"] for c in said["stress"]] == [
+        c.name for c in CASES if c.kernel in ("inverse", "exposures")
+    ]
     assert said["broken"] == 0
 
 
@@ -89,7 +102,14 @@ def test_bench__unknown_kernel_is_bad_usage(tmp_path):
 
 
 def test_curve__ratio_is_to_the_stated_method():
-    curve = Curve("k", "e", "r", "s", "a, 1", (Point("a", "1", 2.0, 0.1), Point("b", "", 0.5, 0.2)))
+    curve = Curve(
+        "k",
+        "e",
+        "r",
+        "s",
+        "a, 1",
+        (Point("a", "1", 2.0, 0.1), Point("b", "", 0.5, 0.2)),
+    )
     assert [curve.ratio(p) for p in curve.points] == [1.0, 0.25]
     assert math.isnan(curve.ratio(Point("c", "", math.nan, 0.1)))
 
@@ -99,5 +119,8 @@ def test_transport_curves__distances_are_mean_free_paths():
     (curve,) = transport_curves(quick=True)
     (point,) = [p for p in curve.points if p.name == "skindb dipole, albedo 0.7"]
     for r in (1.0, 2.0):
-        ratio = dipole_profile(r, 0.3, 0.7, eta=1.3) / transport_profile(r, 0.3, 0.7, eta=1.3)
-        assert point.more[f"at_{r:g}"] == pytest.approx(float(ratio) - 1, abs=0.25)  # noise 8 %
+        ratio = dipole_profile(r, 0.3, 0.7, eta=1.3) / transport_profile(
+            r, 0.3, 0.7, eta=1.3
+        )
+        # noise 8 %
+        assert point.more[f"at_{r:g}"] == pytest.approx(float(ratio) - 1, abs=0.25)

@@ -71,7 +71,9 @@ def test_cached_arrays__damaged_ones_are_made_again(folder, file, damage):
     assert make.calls == calls  # stored again
 
 
-def test_cached_arrays__a_folder_that_cannot_be_written_is_no_error(tmp_path, monkeypatch):
+def test_cached_arrays__a_folder_that_cannot_be_written_is_no_error(
+    tmp_path, monkeypatch
+):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("SKINDB_CACHE", str(tmp_path / "file" / "cache"))
     make = Maker()
@@ -82,7 +84,9 @@ def test_cached_arrays__only_the_newest_entries_remain(folder):
     make = Maker()
     for i in range(MAX_ENTRIES + 3):
         _get(make, i)
-        for age, place in enumerate(sorted(folder.glob("tables-*"), key=lambda p: p.stat().st_mtime)):
+        for age, place in enumerate(
+            sorted(folder.glob("tables-*"), key=lambda p: p.stat().st_mtime)
+        ):
             os.utime(place, (age, age))
     assert len(list(folder.glob("tables-*"))) == MAX_ENTRIES
 

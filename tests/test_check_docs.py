@@ -1,4 +1,6 @@
-"""The programs that check the documentation find all kinds of faults, and run the quick commands."""
+"""The programs that check the documentation find all kinds of faults, and run the quick
+commands.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,9 @@ def test_term_faults__finds_terms_outside_code(text, found):
 
 
 def test_term_faults__names_the_line():
-    (fault,) = check_docs.term_faults("page", "```text\nx\n```\n\nOne is left out here.\n")
+    (fault,) = check_docs.term_faults(
+        "page", "```text\nx\n```\n\nOne is left out here.\n"
+    )
     assert fault.startswith("page:5: 'left out'")
 
 
@@ -67,7 +71,10 @@ def test_command_fault__is_the_message_of_click(call, fault):
 
 
 def test_commands__joins_lines_and_drops_prompts_and_comments():
-    page = "```console\n$ skindb info DB  # takes\n$ skindb fit DB \\\n    --k 3 && skindb verify DB\nprinted\n```\n"
+    page = (
+        "```console\n$ skindb info DB  # takes\n$ skindb fit DB \\\n    --k 3 && "
+        "skindb verify DB\nprinted\n```\n"
+    )
     calls = [words for _, words in check_docs.commands(page)]
     assert calls == [
         ["skindb", "info", "DB"],
@@ -78,15 +85,22 @@ def test_commands__joins_lines_and_drops_prompts_and_comments():
 
 
 def test_figure_faults__requires_a_command_in_every_section_with_figures():
-    page = "# Results\n\n## Good\n\n```bash\nskindb bench\n```\n\n3 s\n\n## Bad\n\n4 s\n\n## Words\n\nNothing.\n"
+    page = (
+        "# Results\n\n## Good\n\n```bash\nskindb bench\n```\n\n3 s\n\n## Bad\n\n4 "
+        "s\n\n## Words\n\nNothing.\n"
+    )
     (fault,) = check_docs.figure_faults("page", page)
     assert "'## Bad'" in fault
 
 
 def test_link_faults__names_files_that_do_not_exist():
     page = check_docs.ROOT / "README.md"
-    text = "[a](docs/index.md), [b](docs/absent.md#c), [d](#e), [f](https://example.org/g)"
-    assert list(check_docs.link_faults(page, text)) == ["README.md: docs/absent.md does not exist"]
+    text = (
+        "[a](docs/index.md), [b](docs/absent.md#c), [d](#e), [f](https://example.org/g)"
+    )
+    assert list(check_docs.link_faults(page, text)) == [
+        "README.md: docs/absent.md does not exist"
+    ]
 
 
 @pytest.mark.parametrize(

@@ -19,17 +19,45 @@ ALL = ("S01", "S02")
 LOGGED = [
     (("fit", "{db}", "S02", "--explain"), "fit", ("S02",), {"explain": True}),
     (("fit", "{db}", "--refit", "--rank", "3"), "fit", ALL, {"refit": True}),
-    (("register", "{db}"), "register", ALL, {}),  # refused, because the takes have no landmarks
+    # refused, because the takes have no landmarks
+    (("register", "{db}"), "register", ALL, {}),
     (("analyze", "{db}", "coverage"), "study", ALL, {"what": "coverage"}),
-    (("analyze", "{db}", "translucency", "--take", "S01"), "study", ("S01",), {"what": "translucency"}),
-    (("edit", "{db}", "S01", "--trait", "lotion=1"), "edit", ("S01",), {}),  # refused without a study of traits
-    (("edit", "{db}", "S01", "--trait", "lotion=1", "--grid", "{out}/grid.png"), "render", ("S01",), {}),
-    (("render", "{db}", "--out", "{out}", "--explain"), "render", ALL, {"explain": True}),
-    (("render", "{db}", "S02", "--out", "{out}/a.png", "--scale", "0.1"), "render", ("S02",), {}),
-    (("compare", "{db}", "S01"), "compare", ("S01",), {}),  # refused without photographs
+    (
+        ("analyze", "{db}", "translucency", "--take", "S01"),
+        "study",
+        ("S01",),
+        {"what": "translucency"},
+    ),
+    # refused without a study of traits
+    (("edit", "{db}", "S01", "--trait", "lotion=1"), "edit", ("S01",), {}),
+    (
+        ("edit", "{db}", "S01", "--trait", "lotion=1", "--grid", "{out}/grid.png"),
+        "render",
+        ("S01",),
+        {},
+    ),
+    (
+        ("render", "{db}", "--out", "{out}", "--explain"),
+        "render",
+        ALL,
+        {"explain": True},
+    ),
+    (
+        ("render", "{db}", "S02", "--out", "{out}/a.png", "--scale", "0.1"),
+        "render",
+        ("S02",),
+        {},
+    ),
+    # refused without photographs
+    (("compare", "{db}", "S01"), "compare", ("S01",), {}),
     (("show", "{db}", "S01", "fit_status", "{out}/a.png"), "show", ("S01",), {}),
     (("info", "{db}", "-v"), "show", ALL, {}),
-    (("export", "{db}", "S01", "S01.lotion", "--out", "{out}", "--gltf"), "export", ("S01",), {"gltf": True}),
+    (
+        ("export", "{db}", "S01", "S01.lotion", "--out", "{out}", "--gltf"),
+        "export",
+        ("S01",),
+        {"gltf": True},
+    ),
     (("view", "{db}", "--out", "{out}/page"), "view", ALL, {}),
     (("view", "{db}", "--explain"), "view", ALL, {"explain": True}),
     (("consent", "{db}", "S02", "--scope", "fit"), "consent", ("S02",), {}),
@@ -62,7 +90,10 @@ def called(fitted_database, tmp_path, monkeypatch):
 
     def call(args):
         before = len(fitted_database.audit()[0])
-        done = _run(*(arg.format(db=fitted_database.root, out=out) for arg in args), "--no-progress")
+        done = _run(
+            *(arg.format(db=fitted_database.root, out=out) for arg in args),
+            "--no-progress",
+        )
         entries, faults = fitted_database.audit()
         assert faults == []
         return done, entries[before:]
@@ -71,17 +102,25 @@ def called(fitted_database, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(("args", "action", "subjects", "parameters"), LOGGED)
-def test_command__logs_one_entry(fitted_database, called, args, action, subjects, parameters):
+def test_command__logs_one_entry(
+    fitted_database, called, args, action, subjects, parameters
+):
     done, entries = called((*args, "--actor", "anna"))
     assert "Traceback" not in done.stderr
     [entry] = entries
     assert (entry.action, entry.actor, entry.parameters) == (action, "anna", parameters)
-    assert entry.subjects == sorted(subject_hash(Folder(fitted_database.root), one) for one in subjects)
+    assert entry.subjects == sorted(
+        subject_hash(Folder(fitted_database.root), one) for one in subjects
+    )
 
 
 def _files(folder):
     """Files of a folder with their content, without the cache of the catalogue."""
-    files = [path for path in folder.rglob("*") if path.is_file() and path.name != "catalogue.json"]
+    files = [
+        path
+        for path in folder.rglob("*")
+        if path.is_file() and path.name != "catalogue.json"
+    ]
     return {str(path): path.read_bytes() for path in files}
 
 
@@ -90,7 +129,9 @@ class _StopError(Exception):
 
 
 @pytest.mark.parametrize("args", [args for args, *_ in LOGGED])
-def test_command__logs_before_anything_is_changed_or_disclosed(fitted_database, called, tmp_path, monkeypatch, args):
+def test_command__logs_before_anything_is_changed_or_disclosed(
+    fitted_database, called, tmp_path, monkeypatch, args
+):
     before = _files(tmp_path)
 
     def stop(*_, **__):
@@ -114,7 +155,15 @@ def test_audit__lists_entries_and_checks_the_chain(fitted_database, called):
     called(("show", "{db}", "S01", "fit_status", "{out}/a.png", "--actor", "anna"))
     done, _ = called(("audit", "{db}"))
     lines = done.stdout.splitlines()
-    assert lines[0].split() == ["number", "when", "actor", "action", "subjects", "counts", "parameters"]
+    assert lines[0].split() == [
+        "number",
+        "when",
+        "actor",
+        "action",
+        "subjects",
+        "counts",
+        "parameters",
+    ]
     assert [line.split()[3] for line in lines[1:]] == [*log, "show"]
     assert lines[-1].split()[2:] == ["anna", "show", "1", "takes", "1"]
     assert "S01" not in done.stdout
@@ -126,7 +175,10 @@ def test_audit__lists_entries_and_checks_the_chain(fitted_database, called):
     for command in ("audit", "verify"):
         damaged = _run(command, str(fitted_database.root))
         assert damaged.returncode == 1
-        assert "entry 2 must exist; found no such file; restore it from a backup" in damaged.stderr
+        assert (
+            "entry 2 must exist; found no such file; restore it from a backup"
+            in damaged.stderr
+        )
 
 
 @pytest.mark.parametrize("actor", ["", " anna", "a" * 65, "anna\x1b[31m", "a\nb"])
@@ -142,10 +194,16 @@ def test_actor__must_be_short_and_printable(called, monkeypatch, actor):
         assert "SKINDB_ACTOR: must be" in done.stderr
 
 
-def test_actor__is_that_of_the_option_or_the_environment_or_the_user(called, monkeypatch):
+def test_actor__is_that_of_the_option_or_the_environment_or_the_user(
+    called, monkeypatch
+):
     monkeypatch.delenv("SKINDB_ACTOR", raising=False)
     args = ("clean", "{db}", "--yes")
-    monkeypatch.setattr(audit.pwd, "getpwuid", lambda _: audit.pwd.struct_passwd(("carla", "", 0, 0, "", "", "")))
+    monkeypatch.setattr(
+        audit.pwd,
+        "getpwuid",
+        lambda _: audit.pwd.struct_passwd(("carla", "", 0, 0, "", "", "")),
+    )
     actors = [called(args)[1][0].actor]
     monkeypatch.setenv("SKINDB_ACTOR", "Bärbel")
     actors.append(called(args)[1][0].actor)
@@ -161,13 +219,18 @@ def test_ingest__of_several_captures_is_one_entry(tmp_path):
     takes = [str(tmp_path / "c" / take) for take in ("V001", "V001.lotion")]
     (tmp_path / "c" / "broken").mkdir()
     (tmp_path / "c" / "broken" / "capture.json").write_text("[")
-    done = _run("ingest", str(db.root), *takes, str(tmp_path / "c" / "broken"), "--spacing", "8")
+    done = _run(
+        "ingest", str(db.root), *takes, str(tmp_path / "c" / "broken"), "--spacing", "8"
+    )
     assert done.returncode == 1
     [entry] = db.audit()[0]
     assert (entry.action, entry.counts) == ("ingest", {"captures": 3})
     assert entry.subjects == [subject_hash(Folder(db.root), "V001")]
     assert _run("ingest", str(db.root), takes[0], "--spacing", "8").returncode == 0
-    assert [entry.counts for entry in db.audit(subject="V001")[0]] == [{"captures": 3}, {"takes": 1}]
+    assert [entry.counts for entry in db.audit(subject="V001")[0]] == [
+        {"captures": 3},
+        {"takes": 1},
+    ]
     shutil.rmtree(tmp_path / "db")
     assert _run("ingest", str(db.root), str(tmp_path / "c" / "broken")).returncode == 1
     assert not db.root.exists()  # a capture that was refused creates no database

@@ -25,7 +25,15 @@ def db(tmp_path):
     db = Database(tmp_path / "db")
     for number, take in enumerate((SUBJECT, "B")):
         capture = commit(db.root, 1.0 + number, take, consent_scope=["fit"], n=2)
-        commit(db.root, 3.0 + number, take, "model", n=2, inputs=[capture.as_input()], consent_scope=["fit"])
+        commit(
+            db.root,
+            3.0 + number,
+            take,
+            "model",
+            n=2,
+            inputs=[capture.as_input()],
+            consent_scope=["fit"],
+        )
     db.create_release("r1")
     return db
 
@@ -65,7 +73,10 @@ def test_backup_and_restore__print_what_they_did(db, dest, tmp_path):
     assert Database(copy).takes("model") == ["B", SUBJECT]
     entries, faults = Database(copy).audit()
     assert faults == []
-    assert [(entry.action, entry.counts["takes"]) for entry in entries] == [("backup", 2), ("restore", 2)]
+    assert [(entry.action, entry.counts["takes"]) for entry in entries] == [
+        ("backup", 2),
+        ("restore", 2),
+    ]
 
 
 def test_restore__prints_what_the_marker_file_changed(db, dest, tmp_path):
@@ -85,7 +96,10 @@ def test_restore__prints_what_the_marker_file_changed(db, dest, tmp_path):
     assert traces(tmp_path / "copy", SUBJECT) == []
     assert Database(tmp_path / "copy").consent("B") == []
     _, risk, *_ = _done("restore", dest, tmp_path / "all", "--without-markers")
-    assert risk == "subjects who were withdrawn after this state are in the database again: withdraw them again"
+    assert risk == (
+        "subjects who were withdrawn after this state are in the database again: "
+        "withdraw them again"
+    )
 
 
 def test_restore__of_a_lost_database_uses_the_file_beside_it(db, dest):
@@ -100,20 +114,35 @@ def test_restore__of_a_lost_database_uses_the_file_beside_it(db, dest):
 
 
 def test_backup__is_refused_in_one_line(db, dest, tmp_path):
-    assert "the database must exist; found nothing" in _refused("backup", tmp_path / "none", dest)
-    assert "must be a backup; found another folder" in _refused("restore", db.root, tmp_path / "x", "--without-markers")
-    assert "must be a backup; found nothing" in _refused("restore", tmp_path / "none", "--list")
+    assert "the database must exist; found nothing" in _refused(
+        "backup", tmp_path / "none", dest
+    )
+    assert "must be a backup; found another folder" in _refused(
+        "restore", db.root, tmp_path / "x", "--without-markers"
+    )
+    assert "must be a backup; found nothing" in _refused(
+        "restore", tmp_path / "none", "--list"
+    )
     _done("backup", db.root, dest)
-    assert "a restore needs an empty or missing folder" in _refused("restore", dest, db.root)
-    assert "--without-markers to accept this risk" in _refused("restore", dest, tmp_path / "x")
+    assert "a restore needs an empty or missing folder" in _refused(
+        "restore", dest, db.root
+    )
+    assert "--without-markers to accept this risk" in _refused(
+        "restore", dest, tmp_path / "x"
+    )
     for command in ("info", "verify", "clean"):
-        assert "must be a complete database; found a backup; run skindb restore" in _refused(command, dest)
+        assert (
+            "must be a complete database; found a backup; run skindb restore"
+            in _refused(command, dest)
+        )
     for options in ([], [tmp_path / "x", "--markers", "f", "--without-markers"]):
         assert _run("restore", dest, *map(str, options)).returncode == 2
     place = place_at(dest)
     place.is_unlocked = True
     with Lease(place, "backup", ("release",), command="skindb backup"):
-        assert "only one run at a time may work on it; found skindb backup" in _refused("backup", db.root, dest)
+        assert "only one run at a time may work on it; found skindb backup" in _refused(
+            "backup", db.root, dest
+        )
 
 
 def test_backup__names_damage_and_exits_with_1(db, dest, tmp_path):
@@ -121,28 +150,57 @@ def test_backup__names_damage_and_exits_with_1(db, dest, tmp_path):
     digest = db._place.digest(f"{db.record('model', 'B').path}/surfels/surfel_area/c/0")
     file = Path(dest) / "files" / digest[:2] / digest
     file.write_bytes(b"x")
-    for command in (("backup", db.root, dest, "--verify"), ("restore", dest, tmp_path / "a", "--without-markers")):
+    for command in (
+        ("backup", db.root, dest, "--verify"),
+        ("restore", dest, tmp_path / "a", "--without-markers"),
+    ):
         line = _refused(*command)
-        assert line.startswith(f"skindb: {file}: a file of a backup must be as it was written; found different content")
+        assert line.startswith(
+            f"skindb: {file}: a file of a backup must be as it was written; found different content"
+        )
     assert "surfels/surfel_area/c/0" in _refused("verify", tmp_path / "a")
 
 
 def test_withdraw__reaches_backups_that_are_given(db, dest, tmp_path):
     _done("backup", db.root, dest)
-    lines = _done("withdraw", db.root, SUBJECT, "--yes", "--backup", dest, "--report", tmp_path / "report")
+    lines = _done(
+        "withdraw",
+        db.root,
+        SUBJECT,
+        "--yes",
+        "--backup",
+        dest,
+        "--report",
+        tmp_path / "report",
+    )
     assert any(line.startswith(f"removed from {dest}: ") for line in lines)
     assert traces(Path(dest), SUBJECT) == []
     report = json.loads((tmp_path / "report.json").read_text())
     assert report["erased_backups"] == 1
-    assert "backups that were not given to the command, which may still contain the subject" in report["not_reached"]
-    assert "Backups from which the subject was erased: 1" in (tmp_path / "report.txt").read_text()
+    assert (
+        "backups that were not given to the command, which may still contain the subject"
+        in report["not_reached"]
+    )
+    assert (
+        "Backups from which the subject was erased: 1"
+        in (tmp_path / "report.txt").read_text()
+    )
 
 
 def test_withdraw__reaches_backups_that_are_given_later(db, dest, tmp_path):
     _done("backup", db.root, dest)
     _done("withdraw", db.root, SUBJECT, "--yes")
     assert traces(Path(dest), SUBJECT)
-    _done("withdraw", db.root, SUBJECT, "--yes", "--backup", dest, "--report", tmp_path / "report")
+    _done(
+        "withdraw",
+        db.root,
+        SUBJECT,
+        "--yes",
+        "--backup",
+        dest,
+        "--report",
+        tmp_path / "report",
+    )
     assert traces(Path(dest), SUBJECT) == []
     assert json.loads((tmp_path / "report.json").read_text())["removed_versions"] == {
         "capture": 1,
@@ -154,7 +212,9 @@ def test_withdraw__reaches_backups_that_are_given_later(db, dest, tmp_path):
 
 def test_withdraw__with_a_wrong_or_damaged_backup(db, dest, tmp_path):
     before = db.takes("model")
-    assert "must be a backup" in _refused("withdraw", db.root, SUBJECT, "--yes", "--backup", tmp_path / "none")
+    assert "must be a backup" in _refused(
+        "withdraw", db.root, SUBJECT, "--yes", "--backup", tmp_path / "none"
+    )
     assert db.takes("model") == before
     _done("backup", db.root, dest)
     state = Path(dest) / "states/000001.json"

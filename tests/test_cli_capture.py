@@ -1,4 +1,6 @@
-"""`skindb capture`: a rehearsal from an empty folder to a capture that ingest reads, with faults and without."""
+"""`skindb capture`: a rehearsal from an empty folder to a capture that ingest reads,
+with faults and without.
+"""
 
 from __future__ import annotations
 
@@ -27,13 +29,28 @@ def rehearsal(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         for name, pixels in SMALL.items():
             patch.setitem(VIRTUAL_SIZE, name, pixels)
-        result = CliRunner().invoke(cli, ["capture", str(out), "--virtual", "--sites", "cheek,neck", "--log", str(log)])
+        result = CliRunner().invoke(
+            cli,
+            [
+                "capture",
+                str(out),
+                "--virtual",
+                "--sites",
+                "cheek,neck",
+                "--log",
+                str(log),
+            ],
+        )
     assert result.exit_code == 0, result.output + str(result.exception)
     return out
 
 
 def test_capture__its_folders_belong_to_their_owner_alone(rehearsal):
-    assert {path.name for path in rehearsal.parent.iterdir()} == {"C", "C.log", "C.virtual"}
+    assert {path.name for path in rehearsal.parent.iterdir()} == {
+        "C",
+        "C.log",
+        "C.virtual",
+    }
     assert open_to_others(rehearsal.parent, itself=False) == {}
 
 
@@ -42,7 +59,9 @@ def _use_subject(rehearsal, tmp_path):
     beside = tmp_path / "C.virtual"
     if not beside.exists():
         beside.mkdir()
-        (beside / "subject-2005").symlink_to(rehearsal.parent / "C.virtual/subject-2005")
+        (beside / "subject-2005").symlink_to(
+            rehearsal.parent / "C.virtual/subject-2005"
+        )
 
 
 def _again(rehearsal, tmp_path, *options):
@@ -50,18 +69,28 @@ def _again(rehearsal, tmp_path, *options):
     out = tmp_path / "C"
     _use_subject(rehearsal, tmp_path)
     sites = () if "--sites" in options else ("--sites", "cheek")
-    return out, CliRunner().invoke(cli, ["capture", str(out), "--virtual", *sites, *options])
+    return out, CliRunner().invoke(
+        cli, ["capture", str(out), "--virtual", *sites, *options]
+    )
 
 
 def _same_frames(out, rehearsal):
-    files = sorted(path.relative_to(rehearsal) for path in rehearsal.glob("dome/frames/*/*"))
-    assert files == sorted(path.relative_to(out) for path in out.glob("dome/frames/*/*"))
-    return all((out / name).read_bytes() == (rehearsal / name).read_bytes() for name in files)
+    files = sorted(
+        path.relative_to(rehearsal) for path in rehearsal.glob("dome/frames/*/*")
+    )
+    assert files == sorted(
+        path.relative_to(out) for path in out.glob("dome/frames/*/*")
+    )
+    return all(
+        (out / name).read_bytes() == (rehearsal / name).read_bytes() for name in files
+    )
 
 
 def _flashes(out):
     """Recorded flashes per second of a rehearsal."""
-    return json.loads((out / "capture.json").read_text())["rehearsal"]["flashes_per_second"]
+    return json.loads((out / "capture.json").read_text())["rehearsal"][
+        "flashes_per_second"
+    ]
 
 
 def test_capture__rehearsal_is_a_capture(rehearsal):
@@ -79,8 +108,15 @@ def test_capture__rehearsal_is_a_capture(rehearsal):
 
 
 def test_capture__three_faults_only_cost_time(rehearsal, tmp_path):
-    faults = ["dropped_frame=c02:11", "dome.lost_triggers=7", "hot_pixels=2", "probe.lost_triggers=4"]
-    out, result = _again(rehearsal, tmp_path, *(part for fault in faults for part in ("--fault", fault)))
+    faults = [
+        "dropped_frame=c02:11",
+        "dome.lost_triggers=7",
+        "hot_pixels=2",
+        "probe.lost_triggers=4",
+    ]
+    out, result = _again(
+        rehearsal, tmp_path, *(part for fault in faults for part in ("--fault", fault))
+    )
     assert result.exit_code == 0, result.output + str(result.exception)
     assert "repeated" in result.output
     assert "camera c00: 2 hot pixels in its dark frame" in result.output
@@ -90,7 +126,9 @@ def test_capture__three_faults_only_cost_time(rehearsal, tmp_path):
     assert read_capture(out).dome.sequence is not None
 
 
-@pytest.mark.parametrize("fault", ["dome.open_interlock_at=20", "dome.vanish_after=115"])
+@pytest.mark.parametrize(
+    "fault", ["dome.open_interlock_at=20", "dome.vanish_after=115"]
+)
 def test_capture__continues_after_a_stop(rehearsal, tmp_path, fault):
     out, result = _again(rehearsal, tmp_path, "--fault", fault)
     assert isinstance(result.exception, InputError)
@@ -106,12 +144,23 @@ def test_capture__continues_after_a_stop(rehearsal, tmp_path, fault):
 @pytest.mark.parametrize(
     ("fault", "said"),
     [
-        ("dead_light=l005", "light l005: must be as bright as the others; found its picture has 0% of the brightness"),
-        ("stuck_light=l020", "light l020: must be as bright as the others; found 100% of the current"),
+        (
+            "dead_light=l005",
+            (
+                "light l005: must be as bright as the others; found its picture has 0% "
+                "of the brightness"
+            ),
+        ),
+        (
+            "stuck_light=l020",
+            "light l020: must be as bright as the others; found 100% of the current",
+        ),
         ("silently_stuck_light=l020", "dark frame: all lights must be off; found "),
     ],
 )
-def test_capture__frames_of_a_light_that_failed_are_taken_again(rehearsal, tmp_path, fault, said):
+def test_capture__frames_of_a_light_that_failed_are_taken_again(
+    rehearsal, tmp_path, fault, said
+):
     out, result = _again(rehearsal, tmp_path, "--fault", f"dome.{fault}")
     assert said in str(result.exception)
     light = fault.partition("=")[2]
@@ -130,16 +179,29 @@ def test_capture__one_session_at_a_time_writes_into_a_folder(rehearsal, tmp_path
     assert not (tmp_path / "C").exists()
 
 
-def test_capture__a_set_up_that_ingest_cannot_read_is_refused_before_the_session(rehearsal, tmp_path):
+def test_capture__a_set_up_that_ingest_cannot_read_is_refused_before_the_session(
+    rehearsal, tmp_path
+):
     setup = tmp_path / "lab"
     (setup / "dome").mkdir(parents=True)
     dome = json.loads((rehearsal / "dome/dome.json").read_text())
     del dome["cameras"][2]["R"], dome["white"]
     dome["lights"][3]["position"] = [0, 0]
     (setup / "dome/dome.json").write_text(json.dumps(dome))
-    options = ["--subject", "S1", "--reference", "f", "--consent", "fit", "--scan", str(rehearsal / "scan.ply")]
+    options = [
+        "--subject",
+        "S1",
+        "--reference",
+        "f",
+        "--consent",
+        "fit",
+        "--scan",
+        str(rehearsal / "scan.ply"),
+    ]
     options += ["--dome", "socket://127.0.0.1:1", "--cameras", str(tmp_path)]
-    result = CliRunner().invoke(cli, ["capture", str(tmp_path / "C"), "--setup", str(setup), *options])
+    result = CliRunner().invoke(
+        cli, ["capture", str(tmp_path / "C"), "--setup", str(setup), *options]
+    )
     assert "[cameras][2][R]: this key is required" in str(result.exception)
     assert "[lights][3][position]: must be 3 numbers" in str(result.exception)
     assert not (tmp_path / "C").exists()
@@ -157,7 +219,10 @@ def test_capture__a_leak_is_refused_and_the_dome_s_frames_are_kept(rehearsal, tm
 
 def test_capture__plan_only_prints(rehearsal, tmp_path):
     out, result = _again(rehearsal, tmp_path, "--plan", "--slower")
-    assert "24 lights, 2 exposures, 4 cameras: at most 3 flashes in any second" in result.output
+    assert (
+        "24 lights, 2 exposures, 4 cameras: at most 3 flashes in any second"
+        in result.output
+    )
     assert not out.exists()
     _, result = _again(rehearsal, tmp_path, "--plan", "--json")
     told = json.loads(result.output)
@@ -171,8 +236,14 @@ def test_capture__plan_only_prints(rehearsal, tmp_path):
         ([], "--setup: a capture needs it"),
         (["--fault", "dropped_frame=c0:1"], "--fault: belongs to --virtual"),
         (["--virtual", "--dome", "/dev/x"], "--dome: belongs to a real laboratory"),
-        (["--virtual", "--fault", "dome.earthquake=1"], "must be dropped_frame=CAMERA:NUMBER"),
-        (["--virtual", "--fault", "hot_pixels=many"], "must be dropped_frame=CAMERA:NUMBER"),
+        (
+            ["--virtual", "--fault", "dome.earthquake=1"],
+            "must be dropped_frame=CAMERA:NUMBER",
+        ),
+        (
+            ["--virtual", "--fault", "hot_pixels=many"],
+            "must be dropped_frame=CAMERA:NUMBER",
+        ),
     ],
 )
 def test_capture__mistakes(rehearsal, tmp_path, options, said):
@@ -184,50 +255,118 @@ def test_capture__mistakes(rehearsal, tmp_path, options, said):
 def test_capture__mistakes_of_a_real_session(rehearsal, tmp_path):
     """Options that a real session lacks are reported, with the set-up of the rehearsal."""
     subject = rehearsal.parent / "C.virtual/subject-2005"
-    own = ["--setup", str(subject), "--subject", "S1", "--reference", "form 1", "--scan", str(subject / "scan.ply")]
+    own = [
+        "--setup",
+        str(subject),
+        "--subject",
+        "S1",
+        "--reference",
+        "form 1",
+        "--scan",
+        str(subject / "scan.ply"),
+    ]
 
     def said(*options):
-        return str(CliRunner().invoke(cli, ["capture", str(tmp_path / "R"), *own, *options]).exception)
+        return str(
+            CliRunner()
+            .invoke(cli, ["capture", str(tmp_path / "R"), *own, *options])
+            .exception
+        )
 
     assert "--consent: a capture needs it" in said()
-    assert "--consent: must be from fit, statistics, export, publish; found sell" in said("--consent", "sell")
+    assert (
+        "--consent: must be from fit, statistics, export, publish; found sell"
+        in said("--consent", "sell")
+    )
     assert "--trait: must be NAME=VALUE" in said("--consent", "fit", "--trait", "age")
     assert "--confirm-screening: an operator must be responsible for it" in said(
         "--consent", "fit", "--confirm-screening"
     )
-    assert "--base-light: an operator must be responsible for it" in said("--consent", "fit", "--base-light", "10")
+    assert "--base-light: an operator must be responsible for it" in said(
+        "--consent", "fit", "--base-light", "10"
+    )
     for operator in ("", "  ", "a b"):
         assert "--operator: must be 1 to 64 letters" in said(
             "--consent", "fit", "--confirm-screening", "--operator", operator
         )
-    assert "capture.json[traits][age]: a trait must be a number" in said("--consent", "fit", "--trait", "age=nan")
-    named = said("--consent", "fit", "--trait", "subject=S2", "--trait", "hair=red\x1b[2J")
-    assert "capture.json[traits][subject]: an attribute must not have the name of another column" in named
-    assert "capture.json[traits][hair]: a text must be at most 256 characters that can be printed" in named
-    assert "capture.json[subject]: must be 1 to 64 letters" in said("--consent", "fit", "--subject", "Anna Müller")
-    assert "capture.json[calibration]: must be 1 to 64" in said("--consent", "fit", "--calibration", "a b")
-    assert "--sites: a name must be 1 to 64 letters" in said("--consent", "fit", "--sites", "left cheek")
+    assert "capture.json[traits][age]: a trait must be a number" in said(
+        "--consent", "fit", "--trait", "age=nan"
+    )
+    named = said(
+        "--consent", "fit", "--trait", "subject=S2", "--trait", "hair=red\x1b[2J"
+    )
+    assert (
+        "capture.json[traits][subject]: an attribute must not have the name of another column"
+        in named
+    )
+    assert (
+        "capture.json[traits][hair]: a text must be at most 256 characters that can be printed"
+        in named
+    )
+    assert "capture.json[subject]: must be 1 to 64 letters" in said(
+        "--consent", "fit", "--subject", "Anna Müller"
+    )
+    assert "capture.json[calibration]: must be 1 to 64" in said(
+        "--consent", "fit", "--calibration", "a b"
+    )
+    assert "--sites: a name must be 1 to 64 letters" in said(
+        "--consent", "fit", "--sites", "left cheek"
+    )
     assert "--dome: a capture needs it" in said("--consent", "fit")
     for scope in ("statistics", "export,publish", " ", ","):
-        assert "--consent: must contain fit, without which nothing may be computed" in said("--consent", scope)
-    wrong = ["--consent", "sell", "--trait", "age", "--sites", "a b", "--operator", " ", "--landmarks", "absent.json"]
+        assert (
+            "--consent: must contain fit, without which nothing may be computed"
+            in said("--consent", scope)
+        )
+    wrong = [
+        "--consent",
+        "sell",
+        "--trait",
+        "age",
+        "--sites",
+        "a b",
+        "--operator",
+        " ",
+        "--landmarks",
+        "absent.json",
+    ]
     together = said(*wrong, "--seed", "3", "--fault", "hot_pixels=2")
-    for name in ("consent", "trait", "sites", "operator", "landmarks", "seed", "fault", "dome", "cameras"):
+    for name in (
+        "consent",
+        "trait",
+        "sites",
+        "operator",
+        "landmarks",
+        "seed",
+        "fault",
+        "dome",
+        "cameras",
+    ):
         assert f"--{name}: " in together
     assert not (tmp_path / "R").exists()
     (tmp_path / "frames").mkdir()
     cameras = ["--consent", "fit", "--cameras", str(tmp_path / "frames")]
-    assert "must have a subfolder for each camera" in said(*cameras, "--dome", "socket://127.0.0.1:1")
+    assert "must have a subfolder for each camera" in said(
+        *cameras, "--dome", "socket://127.0.0.1:1"
+    )
     for name in ("c00", "c01", "c02", "c03"):
         (tmp_path / "frames" / name).mkdir()
-    assert "a device must be at this address" in said(*cameras, "--dome", "socket://127.0.0.1:1")
+    assert "a device must be at this address" in said(
+        *cameras, "--dome", "socket://127.0.0.1:1"
+    )
     shutil.copytree(tmp_path / "frames", tmp_path / "R")
-    result = CliRunner().invoke(cli, ["capture", str(tmp_path / "C"), "--setup", str(tmp_path), "--plan"])
+    result = CliRunner().invoke(
+        cli, ["capture", str(tmp_path / "C"), "--setup", str(tmp_path), "--plan"]
+    )
     assert "dome.json" in str(result.exception)
 
 
-def test_capture__an_unfinished_capture_is_continued_for_the_same_subject_only(rehearsal, tmp_path):
-    """Subjects must not be mixed, so another name, consent, condition, lamp or set-up needs another folder."""
+def test_capture__an_unfinished_capture_is_continued_for_the_same_subject_only(
+    rehearsal, tmp_path
+):
+    """Subjects must not be mixed, so another name, consent, condition, lamp or set-up
+    needs another folder.
+    """
     out, result = _again(rehearsal, tmp_path, "--fault", "dome.open_interlock_at=20")
     assert "must run to its end" in str(result.exception)
     before = json.loads((out / "unfinished.json").read_text())
@@ -237,19 +376,32 @@ def test_capture__an_unfinished_capture_is_continued_for_the_same_subject_only(r
         "steady lamp": ["--base-light", "10", "--operator", "OP-1"],
     }.items():
         _, result = _again(rehearsal, tmp_path, *options)
-        assert f"an unfinished capture must be resumed with the same {name}" in str(result.exception)
+        assert f"an unfinished capture must be resumed with the same {name}" in str(
+            result.exception
+        )
         assert json.loads((out / "unfinished.json").read_text()) == before
     for name, value in {"consent": {"scope": ["fit"]}, "set-up": "0" * 16}.items():
-        (out / "unfinished.json").write_text(json.dumps(before | {"identity": before["identity"] | {name: value}}))
+        (out / "unfinished.json").write_text(
+            json.dumps(before | {"identity": before["identity"] | {name: value}})
+        )
         _, result = _again(rehearsal, tmp_path)
-        assert f"an unfinished capture must be resumed with the same {name}" in str(result.exception)
-    for damaged in ({}, [], {"sequence": 3}, before | {"sequence": [{"light": "l000"}]}):
+        assert f"an unfinished capture must be resumed with the same {name}" in str(
+            result.exception
+        )
+    for damaged in (
+        {},
+        [],
+        {"sequence": 3},
+        before | {"sequence": [{"light": "l000"}]},
+    ):
         (out / "unfinished.json").write_text(json.dumps(damaged))
         _, result = _again(rehearsal, tmp_path)
         assert "must be the record of an unfinished capture" in str(result.exception)
 
 
-def test_capture__may_be_continued_more_slowly_and_reports_its_flashes(rehearsal, tmp_path):
+def test_capture__may_be_continued_more_slowly_and_reports_its_flashes(
+    rehearsal, tmp_path
+):
     out, result = _again(rehearsal, tmp_path, "--fault", "dome.open_interlock_at=20")
     assert "must run to its end" in str(result.exception)
     out, result = _again(rehearsal, tmp_path, "--slower")
@@ -260,7 +412,9 @@ def test_capture__may_be_continued_more_slowly_and_reports_its_flashes(rehearsal
 
 def test_capture__a_slow_capture_is_repeated_slowly(rehearsal, tmp_path):
     """Missing steps are repeated at the same pace, without a confirmation."""
-    out, result = _again(rehearsal, tmp_path, "--slower", "--fault", "dropped_frame=c02:11")
+    out, result = _again(
+        rehearsal, tmp_path, "--slower", "--fault", "dropped_frame=c02:11"
+    )
     assert result.exit_code == 0, str(result.exception)
     assert "repeated" in result.output
     assert "at most 3 flashes in any second" in result.output
@@ -274,7 +428,9 @@ def dome_with_lamp(rehearsal):
     setup = rehearsal.parent / "lamp"
     shutil.copytree(rehearsal.parent / "C.virtual/subject-2005", setup)
     record = json.loads((setup / "dome/dome.json").read_text())
-    record["exposures"] = [exposure for exposure in record["exposures"] if exposure["id"] == "e1"]
+    record["exposures"] = [
+        exposure for exposure in record["exposures"] if exposure["id"] == "e1"
+    ]
     record["sequence"] = None
     (setup / "dome/dome.json").write_text(json.dumps(record))
     return setup
@@ -283,11 +439,24 @@ def dome_with_lamp(rehearsal):
 def _beside_lamp(dome_with_lamp, tmp_path, *options):
     """A rehearsal beside a lamp that is stated to be as bright as ten lights."""
     out = tmp_path / "C"
-    lamp = ["--setup", str(dome_with_lamp), "--sites", "cheek", "--base-light", "10", "--operator", "OP-1"]
-    return out, CliRunner().invoke(cli, ["capture", str(out), "--virtual", *lamp, *options])
+    lamp = [
+        "--setup",
+        str(dome_with_lamp),
+        "--sites",
+        "cheek",
+        "--base-light",
+        "10",
+        "--operator",
+        "OP-1",
+    ]
+    return out, CliRunner().invoke(
+        cli, ["capture", str(out), "--virtual", *lamp, *options]
+    )
 
 
-def test_capture__a_steady_lamp_is_measured_and_makes_flashes_safe(dome_with_lamp, tmp_path):
+def test_capture__a_steady_lamp_is_measured_and_makes_flashes_safe(
+    dome_with_lamp, tmp_path
+):
     out, result = _beside_lamp(dome_with_lamp, tmp_path)
     assert result.exit_code == 0, str(result.exception)
     assert "at most 0 flashes in any second" in result.output
@@ -301,15 +470,32 @@ def test_capture__a_steady_lamp_is_measured_and_makes_flashes_safe(dome_with_lam
 @pytest.mark.parametrize(
     ("fraction", "said"),
     [
-        (0, "steady lamp: must be as bright as 10 lights; found dark frames of 0.0% of white, so no lamp is on"),
-        (0.3, "steady lamp: must be as bright as 10 lights, and at least 50% of that; found 3.0 lights"),
+        (
+            0,
+            (
+                "steady lamp: must be as bright as 10 lights; found dark frames of "
+                "0.0% of white, so no lamp is on"
+            ),
+        ),
+        (
+            0.3,
+            (
+                "steady lamp: must be as bright as 10 lights, and at least 50% of "
+                "that; found 3.0 lights"
+            ),
+        ),
         (
             9,
-            "steady lamp: must leave room for a light in every exposure, at most 90% of white; found a dark",
+            (
+                "steady lamp: must leave room for a light in every exposure, at most "
+                "90% of white; found a dark"
+            ),
         ),
     ],
 )
-def test_capture__a_steady_lamp_that_is_not_as_stated_is_refused(dome_with_lamp, tmp_path, fraction, said):
+def test_capture__a_steady_lamp_that_is_not_as_stated_is_refused(
+    dome_with_lamp, tmp_path, fraction, said
+):
     _, result = _beside_lamp(dome_with_lamp, tmp_path, "--fault", f"lamp={fraction}")
     assert said in str(result.exception)
 
@@ -317,26 +503,39 @@ def test_capture__a_steady_lamp_that_is_not_as_stated_is_refused(dome_with_lamp,
 def test_capture__an_exposure_that_the_lamp_fills_is_refused(rehearsal, tmp_path):
     """The exposures of a dome without a lamp are too long beside one."""
     _, result = _again(rehearsal, tmp_path, "--base-light", "10", "--operator", "OP-1")
-    assert "found a dark frame of 100% in exposure e0; shorten that exposure" in str(result.exception)
+    assert "found a dark frame of 100% in exposure e0; shorten that exposure" in str(
+        result.exception
+    )
 
 
-def test_capture__flashes_are_counted_beside_the_measured_lamp(dome_with_lamp, tmp_path):
+def test_capture__flashes_are_counted_beside_the_measured_lamp(
+    dome_with_lamp, tmp_path
+):
     """A lamp as bright as seven lights is not bright enough, although ten were stated."""
     out, result = _beside_lamp(dome_with_lamp, tmp_path, "--fault", "lamp=0.7")
     assert result.exit_code == 0, str(result.exception)
-    assert "a real session would be refused: sequence: an operator must confirm screening" in result.output
+    assert (
+        "a real session would be refused: sequence: an operator must confirm screening"
+        in result.output
+    )
     assert "luminance steps of 12%" in result.output
     assert _flashes(out) > 3
 
 
-def test_capture__a_full_disk_is_found_before_a_light_is_switched_on(rehearsal, tmp_path, monkeypatch):
-    monkeypatch.setattr("shutil.disk_usage", lambda _: shutil._ntuple_diskusage(10**12, 10**12, 10**6))
+def test_capture__a_full_disk_is_found_before_a_light_is_switched_on(
+    rehearsal, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(
+        "shutil.disk_usage", lambda _: shutil._ntuple_diskusage(10**12, 10**12, 10**6)
+    )
     _, result = _again(rehearsal, tmp_path)
     assert "need up to 0.0 GB; found 0.0 GB free" in str(result.exception)
     monkeypatch.undo()
     assert _again(rehearsal, tmp_path)[1].exit_code == 0
     _, result = _again(rehearsal, tmp_path)
-    assert "that of an unfinished capture; found a complete capture" in str(result.exception)
+    assert "that of an unfinished capture; found a complete capture" in str(
+        result.exception
+    )
 
 
 @pytest.mark.parametrize(
@@ -364,20 +563,26 @@ def test_capture__an_interrupted_rehearsal_can_begin_again(tmp_path):
     made = tmp_path / "C.virtual/made"
     made.mkdir(parents=True)
     (made / "half").write_text("of a subject")
-    result = CliRunner().invoke(cli, ["capture", str(tmp_path / "C"), "--virtual", "--plan"])
+    result = CliRunner().invoke(
+        cli, ["capture", str(tmp_path / "C"), "--virtual", "--plan"]
+    )
     assert result.exit_code == 0, str(result.exception)
 
 
 def test_capture__logs_of_earlier_sessions_are_kept(rehearsal, tmp_path):
     log = tmp_path / "log"
-    _again(rehearsal, tmp_path, "--log", str(log), "--fault", "dome.open_interlock_at=20")
+    _again(
+        rehearsal, tmp_path, "--log", str(log), "--fault", "dome.open_interlock_at=20"
+    )
     first = (log / "dome.log").read_text()
     assert _again(rehearsal, tmp_path, "--log", str(log))[1].exit_code == 0
     assert (log / "dome.log").read_text() == first
     assert "HELLO" in (log / "dome-2.log").read_text()
 
 
-def test_capture__ctrl_c_at_the_probe_keeps_earlier_measurements(rehearsal, tmp_path, monkeypatch):
+def test_capture__ctrl_c_at_the_probe_keeps_earlier_measurements(
+    rehearsal, tmp_path, monkeypatch
+):
     """If the second site is interrupted, the first one is not measured again."""
     placed = []
 
@@ -390,14 +595,19 @@ def test_capture__ctrl_c_at_the_probe_keeps_earlier_measurements(rehearsal, tmp_
     monkeypatch.setattr("skindb.virtual.laboratory.Laboratory.place", place)
     sites = ["--sites", "cheek,neck"]
     out, result = _again(rehearsal, tmp_path, *sites)
-    assert "stopped by the operator at neck, placement 1; run the same command again" in str(result.exception)
+    assert (
+        "stopped by the operator at neck, placement 1; run the same command again"
+        in str(result.exception)
+    )
     out, result = _again(rehearsal, tmp_path, *sites)
     assert result.exit_code == 0, str(result.exception)
     assert placed == ["cheek", "neck", "neck"]
     assert read_capture(out).probe.sites == ("cheek", "neck")
 
 
-def test_capture__a_refused_session_does_not_fix_the_subject(rehearsal, tmp_path, monkeypatch):
+def test_capture__a_refused_session_does_not_fix_the_subject(
+    rehearsal, tmp_path, monkeypatch
+):
     """Until something of a subject is recorded, the folder may be used for another one."""
 
     def refuse(self, values):
@@ -413,8 +623,19 @@ def test_capture__a_refused_session_does_not_fix_the_subject(rehearsal, tmp_path
     assert read_capture(out).subject == "S2"
 
 
-def test_capture__a_rehearsal_records_what_its_options_say_and_that_it_is_one(rehearsal, tmp_path):
-    said = ["--consent", "fit,publish", "--reference", "form 1", "--trait", "age=34", "--condition", "lotion"]
+def test_capture__a_rehearsal_records_what_its_options_say_and_that_it_is_one(
+    rehearsal, tmp_path
+):
+    said = [
+        "--consent",
+        "fit,publish",
+        "--reference",
+        "form 1",
+        "--trait",
+        "age=34",
+        "--condition",
+        "lotion",
+    ]
     out, result = _again(rehearsal, tmp_path, *said)
     assert result.exit_code == 0, str(result.exception)
     record = json.loads((out / "capture.json").read_text())
@@ -436,17 +657,25 @@ def test_capture__a_rehearsal_records_that_nobody_was_present(rehearsal):
 def test_capture__a_rehearsal_shows_the_refusal_of_a_real_session(rehearsal, tmp_path):
     _, result = _again(rehearsal, tmp_path)
     refusal = (
-        "a real session would be refused: sequence: an operator must confirm screening, consent and closed eyes for "
+        "a real session would be refused: sequence: an operator must confirm "
+        "screening, consent and closed eyes for "
         "more than 3 flashes in a second; found at most 43 flashes in any second"
     )
     assert refusal in result.output
     assert "give --confirm-screening --operator ID, or --slower" in result.output
 
 
-def test_capture__a_rehearsal_shows_whose_confirmation_a_real_session_needs(rehearsal, tmp_path):
-    out, result = _again(rehearsal, tmp_path, "--confirm-screening", "--operator", "OP-1")
+def test_capture__a_rehearsal_shows_whose_confirmation_a_real_session_needs(
+    rehearsal, tmp_path
+):
+    out, result = _again(
+        rehearsal, tmp_path, "--confirm-screening", "--operator", "OP-1"
+    )
     assert "a real session would be refused" not in result.output
-    confirmed = "a real session would run because OP-1 confirms screening, consent and closed eyes for 43 flashes"
+    confirmed = (
+        "a real session would run because OP-1 confirms screening, consent and closed "
+        "eyes for 43 flashes"
+    )
     assert confirmed in result.output
     record = json.loads((out / "capture.json").read_text())
     assert "override" not in record
@@ -456,16 +685,28 @@ def test_capture__a_rehearsal_shows_whose_confirmation_a_real_session_needs(rehe
 @pytest.mark.parametrize(
     ("gauge", "said"),
     [
-        ("nan", "probe: must send as kpa a number from -101.4 to 1,000 kPa; found 'nan'"),
-        ("silent", "probe: must have a reading of the gauge in the last 0.5 s; found none for 0.5"),
-        ("late", "probe: must send readings of the gauge in order, with their times since PUMP"),
+        (
+            "nan",
+            "probe: must send as kpa a number from -101.4 to 1,000 kPa; found 'nan'",
+        ),
+        (
+            "silent",
+            "probe: must have a reading of the gauge in the last 0.5 s; found none for 0.5",
+        ),
+        (
+            "late",
+            "probe: must send readings of the gauge in order, with their times since PUMP",
+        ),
         ("wild", "probe: must hold a pressure from -6 to 1 kPa; found 500.00 kPa"),
     ],
 )
-def test_capture__a_gauge_that_fails_ends_the_session_and_is_recorded(rehearsal, tmp_path, gauge, said):
+def test_capture__a_gauge_that_fails_ends_the_session_and_is_recorded(
+    rehearsal, tmp_path, gauge, said
+):
     out, result = _again(rehearsal, tmp_path, "--fault", f"probe.gauge={gauge}")
     assert said in str(result.exception)
-    [line] = (out / "contact/failed_placements.jsonl").read_text().splitlines()  # it is not tried again
+    # it is not tried again
+    [line] = (out / "contact/failed_placements.jsonl").read_text().splitlines()
     record = json.loads(line)
     assert (record["site"], record["number"]) == ("cheek", 1)
     assert said in record["reason"]
@@ -477,7 +718,9 @@ def test_capture__a_gauge_that_fails_ends_the_session_and_is_recorded(rehearsal,
 
 def test_capture__a_controller_without_progress_is_stopped(rehearsal, tmp_path):
     out, result = _again(rehearsal, tmp_path, "--fault", "dome.frozen_at=20")
-    assert "dome must finish step 20 within 4.7 s: no progress after 4.8 s" in str(result.exception)
+    assert "dome must finish step 20 within 4.7 s: no progress after 4.8 s" in str(
+        result.exception
+    )
     kept = json.loads((out / "unfinished.json").read_text())["sequence"]
     assert len(kept) == 20 - 8  # the first eight steps are dark frames
     out, result = _again(rehearsal, tmp_path)
@@ -488,34 +731,57 @@ def test_capture__a_controller_without_progress_is_stopped(rehearsal, tmp_path):
 def test_capture__another_seed_is_another_subject(rehearsal, tmp_path):
     out, result = _again(rehearsal, tmp_path, "--fault", "dome.open_interlock_at=20")
     assert "must run to its end" in str(result.exception)
-    (tmp_path / "C.virtual/subject-7").symlink_to(rehearsal.parent / "C.virtual/subject-2005")
+    (tmp_path / "C.virtual/subject-7").symlink_to(
+        rehearsal.parent / "C.virtual/subject-2005"
+    )
     _, result = _again(rehearsal, tmp_path, "--seed", "7")
     assert "must be resumed with the same virtual subject" in str(result.exception)
     assert not (out / "capture.json").exists()
 
 
-def test_capture__a_slow_sequence_has_the_wanted_length_or_is_refused(rehearsal, tmp_path):
+def test_capture__a_slow_sequence_has_the_wanted_length_or_is_refused(
+    rehearsal, tmp_path
+):
     _, result = _again(rehearsal, tmp_path, "--plan", "--slower", "--seconds", "5")
-    assert "with at most 3 flashes in a second the sequence lasts at least 15." in str(result.exception)
+    assert "with at most 3 flashes in a second the sequence lasts at least 15." in str(
+        result.exception
+    )
     assert "found 5 s; allow more time, or omit --slower" in str(result.exception)
-    _, result = _again(rehearsal, tmp_path, "--plan", "--slower", "--seconds", "60", "--json")
+    _, result = _again(
+        rehearsal, tmp_path, "--plan", "--slower", "--seconds", "60", "--json"
+    )
     plan = json.loads(result.output)
     assert 60 <= plan["seconds"] <= 64  # with dark frames
     assert plan["flashes_per_second"] <= 1
 
 
 def test_capture__a_capture_of_the_own_dome_can_be_rehearsed(rehearsal, tmp_path):
-    """A complete capture provides the lights, cameras and frames of the rehearsal; it is not changed."""
+    """A complete capture provides the lights, cameras and frames of the rehearsal; it
+    is not changed.
+    """
     before = {path: path.read_bytes() for path in rehearsal.rglob("*.json")}
     out = tmp_path / "R"
-    options = ["--virtual", "--setup", str(rehearsal), "--subject", "R1", "--sites", "neck"]
+    options = [
+        "--virtual",
+        "--setup",
+        str(rehearsal),
+        "--subject",
+        "R1",
+        "--sites",
+        "neck",
+    ]
     result = CliRunner().invoke(cli, ["capture", str(out), *options])
     assert result.exit_code == 0, str(result.exception)
     assert _same_frames(out, rehearsal)
     assert read_capture(out).probe.sites == ("neck",)
     assert before == {path: path.read_bytes() for path in rehearsal.rglob("*.json")}
-    result = CliRunner().invoke(cli, ["capture", str(tmp_path / "Q"), *options, "--seed", "3"])
-    assert "--seed: makes a virtual subject, which a capture given by --setup replaces" in str(result.exception)
+    result = CliRunner().invoke(
+        cli, ["capture", str(tmp_path / "Q"), *options, "--seed", "3"]
+    )
+    assert (
+        "--seed: makes a virtual subject, which a capture given by --setup replaces"
+        in str(result.exception)
+    )
     (tmp_path / "lab").mkdir()
     options[2] = str(tmp_path / "lab")
     result = CliRunner().invoke(cli, ["capture", str(tmp_path / "Q"), *options])
@@ -524,25 +790,81 @@ def test_capture__a_capture_of_the_own_dome_can_be_rehearsed(rehearsal, tmp_path
 
 
 def test_capture__a_set_up_copied_from_a_capture_is_accepted(rehearsal, tmp_path):
-    """Its dark frames and its sequence are those of the capture, of which the session takes its own."""
+    """Its dark frames and its sequence are those of the capture, of which the session
+    takes its own.
+    """
     (tmp_path / "lab").mkdir()
-    shutil.copytree(rehearsal / "contact", tmp_path / "lab/contact", ignore=shutil.ignore_patterns("*.png"))
-    shutil.copytree(rehearsal / "dome", tmp_path / "lab/dome", ignore=shutil.ignore_patterns("frames", "dark"))
-    own = ["--setup", str(tmp_path / "lab"), "--subject", "S1", "--reference", "f", "--consent", "fit"]
-    own += ["--scan", str(rehearsal / "scan.ply"), "--cameras", str(tmp_path), "--dome", "socket://127.0.0.1:1"]
+    shutil.copytree(
+        rehearsal / "contact",
+        tmp_path / "lab/contact",
+        ignore=shutil.ignore_patterns("*.png"),
+    )
+    shutil.copytree(
+        rehearsal / "dome",
+        tmp_path / "lab/dome",
+        ignore=shutil.ignore_patterns("frames", "dark"),
+    )
+    own = [
+        "--setup",
+        str(tmp_path / "lab"),
+        "--subject",
+        "S1",
+        "--reference",
+        "f",
+        "--consent",
+        "fit",
+    ]
+    own += [
+        "--scan",
+        str(rehearsal / "scan.ply"),
+        "--cameras",
+        str(tmp_path),
+        "--dome",
+        "socket://127.0.0.1:1",
+    ]
     result = CliRunner().invoke(cli, ["capture", str(tmp_path / "C"), *own])
-    assert "must have a subfolder for each camera" in str(result.exception)  # the set-up itself is sound
+    # the set-up itself is sound
+    assert "must have a subfolder for each camera" in str(result.exception)
 
 
 def test_capture__the_session_of_the_paper(tmp_path):
-    """150 lights, two exposures and 16 cameras in 25 s, with small frames: 4,800 frames, of which three are lost."""
-    sim = ["simulate", str(tmp_path / "sim"), "--takes", "1", "--lights", "150", "--cameras", "16"]
+    """150 lights, two exposures and 16 cameras in 25 s, with small frames: 4,800
+    frames, of which three are lost.
+    """
+    sim = [
+        "simulate",
+        str(tmp_path / "sim"),
+        "--takes",
+        "1",
+        "--lights",
+        "150",
+        "--cameras",
+        "16",
+    ]
     result = CliRunner().invoke(cli, [*sim, "--width", "24", "--height", "30"])
     assert result.exit_code == 0, str(result.exception)
     subject = next(path for path in (tmp_path / "sim").iterdir() if path.is_dir())
-    options = ["--virtual", "--setup", str(subject), "--seconds", "25", "--confirm-screening", "--operator", "OP-1"]
-    faults = ["--fault", "dropped_frame=c03:100", "--fault", "dropped_frame=c15:5", "--fault", "dome.lost_triggers=222"]
-    result = CliRunner().invoke(cli, ["capture", str(tmp_path / "C"), *options, *faults, "--sites", "cheek"])
+    options = [
+        "--virtual",
+        "--setup",
+        str(subject),
+        "--seconds",
+        "25",
+        "--confirm-screening",
+        "--operator",
+        "OP-1",
+    ]
+    faults = [
+        "--fault",
+        "dropped_frame=c03:100",
+        "--fault",
+        "dropped_frame=c15:5",
+        "--fault",
+        "dome.lost_triggers=222",
+    ]
+    result = CliRunner().invoke(
+        cli, ["capture", str(tmp_path / "C"), *options, *faults, "--sites", "cheek"]
+    )
     assert result.exit_code == 0, str(result.exception)
     assert "repeated" in result.output
     capture = read_capture(tmp_path / "C")

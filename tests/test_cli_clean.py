@@ -29,14 +29,20 @@ def test_fit__a_take_in_use_is_refused_in_one_line(db):
         done = _run("fit", str(db.root), "A1", "--wait", "0.1")
     assert done.returncode == 1
     (line,) = done.stderr.splitlines()
-    assert line.startswith("skindb: model of A1: only one run at a time may work on it; found skindb fit on ")
-    assert line.endswith("(--wait SECONDS) or end it; its lease expires 60 s after its last renewal")
+    assert line.startswith(
+        "skindb: model of A1: only one run at a time may work on it; found skindb fit on "
+    )
+    assert line.endswith(
+        "(--wait SECONDS) or end it; its lease expires 60 s after its last renewal"
+    )
     assert _run("fit", str(db.root), "A1", "--wait", "-1").returncode == 2
 
 
 def test_clean__lists_first_and_removes_on_request(db, monkeypatch):
     with monkeypatch.context() as patch:
-        patch.setattr(lease_module, "this_process", lambda: this_process() | {"started": "1"})
+        patch.setattr(
+            lease_module, "this_process", lambda: this_process() | {"started": "1"}
+        )
         lease = db.lease("A1", "capture", command="skindb ingest")
         lease.__enter__()
         lease._ended.set()
@@ -46,14 +52,22 @@ def test_clean__lists_first_and_removes_on_request(db, monkeypatch):
     assert told.returncode == 0
     whole, *notes = told.stdout.splitlines()
     assert whole == "Every version is intact."
-    assert [note.startswith("garbage, see skindb clean: ") for note in notes] == [True, True]
+    assert [note.startswith("garbage, see skindb clean: ") for note in notes] == [
+        True,
+        True,
+    ]
     listed = _run("clean", str(db.root)).stdout.splitlines()
-    assert listed[0].startswith(f"{stage.path}  0.0 MB  a version without a record, left by a killed run")
+    assert listed[0].startswith(
+        f"{stage.path}  0.0 MB  a version without a record, left by a killed run"
+    )
     assert listed[-1] == "2 to remove, 0.0 MB; --yes removes them"
     assert (db.root / stage.path).exists()
     removed = json.loads(_run("clean", str(db.root), "--yes", "--json").stdout)
     assert removed["removed"]
-    assert {one["key"] for one in removed["items"]} == {stage.path, "leases/capture/A1/00000001.json"}
+    assert {one["key"] for one in removed["items"]} == {
+        stage.path,
+        "leases/capture/A1/00000001.json",
+    }
     assert removed["bytes"] == sum(one["bytes"] for one in removed["items"]) > 0
     assert not (db.root / stage.path).exists()
     assert _run("clean", str(db.root)).stdout == "0 to remove, 0.0 MB\n"
@@ -61,9 +75,12 @@ def test_clean__lists_first_and_removes_on_request(db, monkeypatch):
 
 
 def test_clean__names_old_generations_and_why_they_are_kept(db):
-    (line, total) = _run("clean", str(db.root), "--generations", "1").stdout.splitlines()
+    (line, total) = _run(
+        "clean", str(db.root), "--generations", "1"
+    ).stdout.splitlines()
     assert line.startswith(
-        "log/capture/A1/00000001.json  0.0 MB  generation 1, which is not an input of a kept version"
+        "log/capture/A1/00000001.json  0.0 MB  generation 1, which is not an input "
+        "of a kept version"
     )
     assert "(kept: written 0 minutes ago, kept for 1 h)" in line
     assert total == "0 to remove, 0.0 MB"

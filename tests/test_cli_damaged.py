@@ -1,4 +1,6 @@
-"""Every command reports a damaged record of a database in a line with a cure, also with --json, without traceback."""
+"""Every command reports a damaged record of a database in a line with a cure, also with
+--json, without traceback.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,9 @@ DAMAGES = {
     "lost": lambda path: path.unlink(),
     "pipe": lambda path: (path.unlink(), os.mkfifo(path)),
     "nested": lambda path: path.write_text("[" * 9000 + "]" * 9000),
-    "no provenance": lambda path: path.write_text(path.read_text().replace("provenance", "provenence")),
+    "no provenance": lambda path: path.write_text(
+        path.read_text().replace("provenance", "provenence")
+    ),
 }
 
 
@@ -38,7 +42,13 @@ DAMAGES = {
 def db(tmp_path):
     scope = ["fit", "statistics", "export"]
     record = commit(tmp_path / "db", take="A1", consent_scope=scope)
-    commit(tmp_path / "db", take="A1", kind="model", consent_scope=scope, inputs=[record.as_input()])
+    commit(
+        tmp_path / "db",
+        take="A1",
+        kind="model",
+        consent_scope=scope,
+        inputs=[record.as_input()],
+    )
     commit(tmp_path / "db", take="traits", kind="population")  # an edit reads it first
     return tmp_path / "db"
 
@@ -55,7 +65,10 @@ def test_cli__a_damaged_record_is_a_line_of_every_command(db, tmp_path, damage):
         assert errors, command
         assert all(one["cure"] and one["found"] for one in errors), (command, errors)
         text = " ".join(one["rule"] for one in errors)
-        assert "generation 1 must exist" in text or "must be as committed" in text, (command, errors)
+        assert "generation 1 must exist" in text or "must be as committed" in text, (
+            command,
+            errors,
+        )
 
 
 def test_info__a_damaged_version_hides_no_other(db):
@@ -75,4 +88,7 @@ def test_cli__errors_of_the_system_have_a_cure(db):
     (db / "log").mkdir()
     (db / "log/capture").touch()
     done = _run("info", str(db), "--json")
-    assert "generation 1 must exist" in json.loads(done.stdout)["takes"]["A1"]["capture"]["fault"]
+    assert (
+        "generation 1 must exist"
+        in json.loads(done.stdout)["takes"]["A1"]["capture"]["fault"]
+    )

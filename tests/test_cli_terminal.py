@@ -36,15 +36,23 @@ def test_main__escapes_results_faults_and_wrong_usage(tmp_path):
     root = str(tmp_path / "db")
     commit(root, take="S1", consent_scope=["fit", HOSTILE])
     assert f"fit, {SAFE}" in lines_of(_run("consent", root, "S1").stdout)[0]
-    shown = HOSTILE.replace("\0", "").replace("\udc80", "")  # which no argument can hold
+    # which no argument can hold
+    shown = HOSTILE.replace("\0", "").replace("\udc80", "")
     assert r"\x1b[2J" in lines_of(_run("info", shown).stderr)[0]
-    assert any(r"No such option '--S1\x1b[2J" in line for line in lines_of(_run("info", f"--{shown}").stderr))
-    assert lines_of(_run("analyze", "x").stderr)[-2].strip() == "surface"  # a message of several lines
+    assert any(
+        r"No such option '--S1\x1b[2J" in line
+        for line in lines_of(_run("info", f"--{shown}").stderr)
+    )
+    # a message of several lines
+    assert lines_of(_run("analyze", "x").stderr)[-2].strip() == "surface"
 
 
 def test_main__escapes_warnings():
     assert _one_line(HOSTILE, SkindbWarning, "f.py", 3) == f"skindb: warning: {SAFE}\n"
-    assert _one_line(HOSTILE, UserWarning, "f.py", 3) == f"skindb: warning: f.py:3: UserWarning: {SAFE}\n"
+    assert (
+        _one_line(HOSTILE, UserWarning, "f.py", 3)
+        == f"skindb: warning: f.py:3: UserWarning: {SAFE}\n"
+    )
 
 
 def test_progress__escapes_stages(capsys, monkeypatch):
@@ -59,12 +67,27 @@ def test_progress__escapes_stages(capsys, monkeypatch):
 
 def test_cli__prints_through_one_module():
     """Modules of the command line call no other function that prints."""
-    printing = {"echo", "secho", "print", "prompt", "confirm", "pause", "echo_via_pager", "write"}
+    printing = {
+        "echo",
+        "secho",
+        "print",
+        "prompt",
+        "confirm",
+        "pause",
+        "echo_via_pager",
+        "write",
+    }
     folder = Path(skindb.__file__).parent / "cli"
     for path in folder.glob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
             if path.name != "terminal.py" and isinstance(node, ast.Call):
                 called = node.func
-                of_click = isinstance(called, ast.Attribute) and ast.unparse(called.value) in ("click", "sys.stdout")
-                assert not of_click or called.attr not in printing, f"{path.name}:{node.lineno}"
-                assert not isinstance(called, ast.Name) or called.id != "print", f"{path.name}:{node.lineno}"
+                of_click = isinstance(called, ast.Attribute) and ast.unparse(
+                    called.value
+                ) in ("click", "sys.stdout")
+                assert not of_click or called.attr not in printing, (
+                    f"{path.name}:{node.lineno}"
+                )
+                assert not isinstance(called, ast.Name) or called.id != "print", (
+                    f"{path.name}:{node.lineno}"
+                )

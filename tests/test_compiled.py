@@ -12,7 +12,9 @@ import skindb._compiled
 
 CALL = "from package._outer_kernels import outer; print(outer(1.0))"
 INNER = "from package._compiled import kernel\n\n@kernel\ndef inner(x):\n    return x + {}\n"
-OUTER = "from package._compiled import kernel\nfrom package._inner_kernels import inner\n\n"
+OUTER = (
+    "from package._compiled import kernel\nfrom package._inner_kernels import inner\n\n"
+)
 OUTER += "@kernel\ndef outer(x):\n    return 10 * inner(x)\n"
 
 
@@ -24,7 +26,13 @@ def test_kernel__is_compiled_again_when_a_kernel_of_another_file_changes(tmp_pat
     (package / "_outer_kernels.py").write_text(OUTER)
 
     def printed() -> str:
-        done = subprocess.run([sys.executable, "-c", CALL], cwd=tmp_path, capture_output=True, text=True, check=True)
+        done = subprocess.run(
+            [sys.executable, "-c", CALL],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
         return done.stdout.strip()
 
     for step, expected in (("1", "20.0"), ("1", "20.0"), ("4", "50.0")):
@@ -33,11 +41,20 @@ def test_kernel__is_compiled_again_when_a_kernel_of_another_file_changes(tmp_pat
     assert list(package.glob("__pycache__/*.nbc"))  # the cache is used
 
 
-IMPORTED = ("fit", "ingest", "render.picture", "export.gltf", "virtual.takes", "bench.run")
+IMPORTED = (
+    "fit",
+    "ingest",
+    "render.picture",
+    "export.gltf",
+    "virtual.takes",
+    "bench.run",
+)
 
 
 def test_import__compiles_nothing():
-    """Kernels are compiled or read from the disk at their first call, not when modules import them."""
+    """Kernels are compiled or read from the disk at their first call, not when modules
+    import them.
+    """
     names = ", ".join(f"skindb.{name}" for name in IMPORTED)
     code = f"""
 from skindb._compiled import reported_compilation
@@ -45,11 +62,14 @@ from numba.core.registry import CPUDispatcher
 calls = []
 with reported_compilation(lambda: calls.append(1)):
     import sys, {names}
-kernels = [one for name, module in sys.modules.items() if name.startswith("skindb.") and name.endswith("_kernels")
+names = [name for name in sys.modules if name.startswith("skindb.") and name.endswith("_kernels")]
+kernels = [one for module in map(sys.modules.get, names)
            for one in vars(module).values() if isinstance(one, CPUDispatcher)]
 print(len(calls), sum(len(one.signatures) for one in kernels), len(kernels) > 50)
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
     assert done.stdout.split() == ["0", "0", "True"]
 
 
@@ -67,11 +87,18 @@ print(hashlib.sha256(found.weight.tobytes()).hexdigest())
 
 
 @pytest.mark.slow
-def test_fast_kernel__the_same_bits_just_compiled_and_read_from_the_disk(tmp_path, monkeypatch):
-    """The first worker after an installation compiles, and its results must equal those of the others."""
+def test_fast_kernel__the_same_bits_just_compiled_and_read_from_the_disk(
+    tmp_path, monkeypatch
+):
+    """The first worker after an installation compiles, and its results must equal those
+    of the others.
+    """
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     printed = [
-        subprocess.run([sys.executable, "-c", FIT], capture_output=True, text=True, check=True).stdout for _ in "12"
+        subprocess.run(
+            [sys.executable, "-c", FIT], capture_output=True, text=True, check=True
+        ).stdout
+        for _ in "12"
     ]
     assert len(printed[0].strip()) == 64
     assert printed[0] == printed[1]

@@ -1,4 +1,6 @@
-"""`elementwise`: eager and lazy results agree, the kernel runs once per block, labels are from the schema."""
+"""`elementwise`: eager and lazy results agree, the kernel runs once per block, labels
+are from the schema.
+"""
 
 from __future__ import annotations
 
@@ -30,9 +32,20 @@ def _kernel(position, light, area, *, scale=1.0):
 @pytest.mark.parametrize("chunk", [1, 3, 10])
 def test_elementwise__any_chunking_same_bits(chunk):
     ds = _inputs()
-    call = {"over": "surfel", "inputs": ["surfel_position", "light_position", "surfel_area"], "scale": 2.0}
-    eager = elementwise(_kernel, ds, outputs=["light_visible_fraction", "fit_residual"], **call)
-    lazy = elementwise(_kernel, ds.chunk(surfel=chunk), outputs=["light_visible_fraction", "fit_residual"], **call)
+    call = {
+        "over": "surfel",
+        "inputs": ["surfel_position", "light_position", "surfel_area"],
+        "scale": 2.0,
+    }
+    eager = elementwise(
+        _kernel, ds, outputs=["light_visible_fraction", "fit_residual"], **call
+    )
+    lazy = elementwise(
+        _kernel,
+        ds.chunk(surfel=chunk),
+        outputs=["light_visible_fraction", "fit_residual"],
+        **call,
+    )
     assert lazy["fit_residual"].chunks is not None
     assert lazy.compute().identical(eager)
     assert eager["fit_residual"].attrs["units"] == "1"
@@ -54,7 +67,8 @@ def test_elementwise__one_call_per_block():
         inputs=["surfel_position", "light_position", "surfel_area"],
         outputs=["light_visible_fraction", "fit_residual"],
     )
-    calls.clear()  # dask may have called it on empty blocks to infer the type of the result
+    # dask may have called it on empty blocks to infer the type of the result
+    calls.clear()
     with dask.config.set(scheduler="synchronous"):
         lazy.compute()
     assert sorted(c for c in calls if c) == [2, 4, 4]

@@ -9,8 +9,18 @@ from pathlib import Path
 import skindb
 
 TABLE = Path(__file__).parents[1] / "docs/equations.md"
-PARTS = sorted(path.name for path in Path(skindb.__file__).parent.iterdir() if (path / "__init__.py").is_file())
-NAMES = sorted(set(re.findall(rf"`((?:{'|'.join(PARTS)})(?:\.\w+)+)`", TABLE.read_text(encoding="utf-8"))))
+PARTS = sorted(
+    path.name
+    for path in Path(skindb.__file__).parent.iterdir()
+    if (path / "__init__.py").is_file()
+)
+NAMES = sorted(
+    set(
+        re.findall(
+            rf"`((?:{'|'.join(PARTS)})(?:\.\w+)+)`", TABLE.read_text(encoding="utf-8")
+        )
+    )
+)
 
 
 def _resolve(name):

@@ -1,4 +1,6 @@
-"""What skindb writes belongs to its owner alone, whatever the umask is and whichever library writes it."""
+"""What skindb writes belongs to its owner alone, whatever the umask is and whichever
+library writes it.
+"""
 
 from __future__ import annotations
 
@@ -99,16 +101,22 @@ def write_landmarks(out, model):
     scan = private_file(out / "scan.ply")
     trimesh.Trimesh(head.vertices, head.faces, process=False).export(scan)
     task = landmark_task(scan, out / "landmarks.json")
-    save_landmarks(task, head.landmarks, Crop((-200, -200, -200), (200, 200, 200), None))
+    save_landmarks(
+        task, head.landmarks, Crop((-200, -200, -200), (200, 200, 200), None)
+    )
 
 
 def write_captures(out, model):
-    skindb.workflow.simulate(out / "captures", takes=1, cameras=2, lights=3, width=16, height=20)
+    skindb.workflow.simulate(
+        out / "captures", takes=1, cameras=2, lights=3, width=16, height=20
+    )
 
 
 def write_cache(out, model):
     os.environ["SKINDB_CACHE"] = str(out / "cache/skindb")
-    cached_arrays("x", (1,), sources=("skindb._cache",), make=lambda: {"a": np.zeros(3)})
+    cached_arrays(
+        "x", (1,), sources=("skindb._cache",), make=lambda: {"a": np.zeros(3)}
+    )
 
 
 WRITERS = (
@@ -132,7 +140,8 @@ def test_writers__their_files_are_private(tmp_path, model, write, monkeypatch):
     assert open_to_others(tmp_path, itself=False) == {}
     for path in written:
         path.chmod(0o666)
-    if write in (write_images, write_pages, write_landmarks):  # which replace their files
+    # which replace their files
+    if write in (write_images, write_pages, write_landmarks):
         write(tmp_path, full)
         assert open_to_others(tmp_path, itself=False) == {}
 
@@ -179,8 +188,12 @@ def test_package__every_writer_makes_its_files_private():
                 continue
             text = ast.unparse(node)
             called = ast.unparse(node.func)
-            opens = called.rpartition(".")[2] == "open" and any(f"'{how}" in text for how in ("w", "a", "x"))
-            if (opens or {called, called.rpartition(".")[2]} & CALLS) and "private_file(" not in text:
+            opens = called.rpartition(".")[2] == "open" and any(
+                f"'{how}" in text for how in ("w", "a", "x")
+            )
+            if (
+                opens or {called, called.rpartition(".")[2]} & CALLS
+            ) and "private_file(" not in text:
                 found.append(f"{name}:{node.lineno}: {text}")
     assert found == []
 

@@ -1,4 +1,6 @@
-"""Steps with explicit vectors, and the equivalent plain loops, compared with NumPy in double precision."""
+"""Steps with explicit vectors, and the equivalent plain loops, compared with NumPy in
+double precision.
+"""
 
 from __future__ import annotations
 
@@ -18,11 +20,20 @@ WAYS = ("vector", "plain")
 
 
 def _compiled(way):
-    blend, products, dots, half = (getattr(_vectors, f"{way}_{name}") for name in ("blend", "products", "dots", "half"))
+    blend, products, dots, half = (
+        getattr(_vectors, f"{way}_{name}")
+        for name in ("blend", "products", "dots", "half")
+    )
 
     @nb.njit
     def call_blend(table, places, weights, rows, row):
-        blend(table, (places[0], places[1], places[2]), (weights[0], weights[1], weights[2]), rows, row)
+        blend(
+            table,
+            (places[0], places[1], places[2]),
+            (weights[0], weights[1], weights[2]),
+            rows,
+            row,
+        )
 
     @nb.njit
     def call_products(rows, weight, given, left, right, begin, end, out):
@@ -37,7 +48,12 @@ def _compiled(way):
         for i in range(len(bits)):
             out[i] = half(bits[i])
 
-    return {"blend": call_blend, "products": call_products, "dots": call_dots, "half": call_half}
+    return {
+        "blend": call_blend,
+        "products": call_products,
+        "dots": call_dots,
+        "half": call_half,
+    }
 
 
 @pytest.fixture(scope="module", params=WAYS)
@@ -67,8 +83,12 @@ def test_products__of_a_range_of_rows_with_other_columns(calls):
         calls["products"](rows, weight, given, 8, 16, 5, 69, out)
     part = rows[5:69].astype(float)
     w = weight[5:69]
-    np.testing.assert_allclose(out[:LANES], (part[:, 8:16] * w[:, None]).T @ part[:, 16:], atol=64 * ROUNDING)
-    np.testing.assert_allclose(out[LANES], given[5:69] @ part[:, 16:], atol=64 * ROUNDING)
+    np.testing.assert_allclose(
+        out[:LANES], (part[:, 8:16] * w[:, None]).T @ part[:, 16:], atol=64 * ROUNDING
+    )
+    np.testing.assert_allclose(
+        out[LANES], given[5:69] @ part[:, 16:], atol=64 * ROUNDING
+    )
     calls["products"](rows, weight, given, 0, 0, 7, 7, out)
     assert (out == 0).all()
 
@@ -79,7 +99,9 @@ def test_dots__of_the_first_rows_only(calls):
     factors = rng.normal(size=2 * LANES).astype(np.float32)
     out = np.full(9, 7, np.float32)
     calls["dots"](rows, factors, 6, out)
-    np.testing.assert_allclose(out[:6], rows[:6].astype(float) @ factors, atol=16 * ROUNDING)
+    np.testing.assert_allclose(
+        out[:6], rows[:6].astype(float) @ factors, atol=16 * ROUNDING
+    )
     assert (out[6:] == 7).all()
 
 
@@ -113,7 +135,9 @@ def test_fit__the_same_without_intrinsics(tmp_path):
         if setting == "0":
             more["NUMBA_CACHE_DIR"] = str(tmp_path)
         call = [sys.executable, "-c", PRINT_FIT]
-        done = subprocess.run(call, env=os.environ | more, capture_output=True, text=True, check=True)
+        done = subprocess.run(
+            call, env=os.environ | more, capture_output=True, text=True, check=True
+        )
         found.append(np.array(done.stdout.split(), float))
     # sums have another order, so that iterations end at other values within their tolerance
     np.testing.assert_allclose(found[0], found[1], rtol=1e-3, atol=1e-6)

@@ -12,7 +12,8 @@ MARK = np.float32(0.12345679)  # planted in the data of a subject
 
 
 def traces(root: Path, subject: str) -> list[str]:
-    """Files and folders whose names or contents, with every chunk decompressed, contain the subject or `MARK`.
+    """Files and folders whose names or contents, with every chunk decompressed, contain
+    the subject or `MARK`.
 
     Parameters
     ----------
@@ -36,8 +37,8 @@ def traces(root: Path, subject: str) -> list[str]:
 
 
 def _marked_arrays(version: Path, subject: str) -> list[str]:
-    """Names of the arrays of a version that contain the mark or the subject; unfinished arrays are read as far as
-    possible.
+    """Names of the arrays of a version that contain the mark or the subject; unfinished
+    arrays are read as far as possible.
     """
     found = []
     for file in sorted(version.rglob("zarr.json")):
@@ -45,7 +46,9 @@ def _marked_arrays(version: Path, subject: str) -> list[str]:
             continue
         values = np.asarray(zarr.open_array(file.parent, mode="r")[...])
         is_marked = values.dtype.kind == "f" and bool((values == MARK).any())
-        is_named = values.dtype.kind == "T" and any(subject in str(text) for text in values.ravel())
+        is_named = values.dtype.kind == "T" and any(
+            subject in str(text) for text in values.ravel()
+        )
         if is_marked or is_named:
             found.append(file.parent.relative_to(version).as_posix())
     return found
@@ -53,4 +56,8 @@ def _marked_arrays(version: Path, subject: str) -> list[str]:
 
 def contents(root: Path) -> dict[str, bytes]:
     """Content of every file below a folder, by its path."""
-    return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
+    return {
+        str(path.relative_to(root)): path.read_bytes()
+        for path in sorted(root.rglob("*"))
+        if path.is_file()
+    }

@@ -1,4 +1,6 @@
-"""Studies of a population of models: basis size, translucency, albedo, traits, edits, and the common (u, v)."""
+"""Studies of a population of models: basis size, translucency, albedo, traits, edits,
+and the common (u, v).
+"""
 
 from skindb.analysis.albedo import albedo_histograms, albedo_table, plot_albedo
 from skindb.analysis.basis_size import (
@@ -8,8 +10,16 @@ from skindb.analysis.basis_size import (
     plot_basis_size,
     tabulate_basis_size,
 )
-from skindb.analysis.brdf_plots import plot_brdf_space, plot_group_lobes, plot_group_spheres
-from skindb.analysis.brdf_space import brdf_space, describe_brdf_space, tabulate_brdf_space
+from skindb.analysis.brdf_plots import (
+    plot_brdf_space,
+    plot_group_lobes,
+    plot_group_spheres,
+)
+from skindb.analysis.brdf_space import (
+    brdf_space,
+    describe_brdf_space,
+    tabulate_brdf_space,
+)
 from skindb.analysis.chromophores import (
     chromophore_axes,
     chromophore_maps,
@@ -20,12 +30,25 @@ from skindb.analysis.chromophores import (
 )
 from skindb.analysis.common_maps import common_maps
 from skindb.analysis.components import face_components, principal_components
-from skindb.analysis.correlations import component_correlations, describe_correlations, plot_correlations
+from skindb.analysis.correlations import (
+    component_correlations,
+    describe_correlations,
+    plot_correlations,
+)
 from skindb.analysis.coverage import coverage_report, describe_coverage, plot_coverage
 from skindb.analysis.detail import transfer_detail
 from skindb.analysis.edit import apply_traits, describe_edit
-from skindb.analysis.effect_maps import describe_effect_maps, effect_maps, plot_effect_maps, tabulate_effect_maps
-from skindb.analysis.group_effects import describe_group_effects, group_effects, plot_group_effects
+from skindb.analysis.effect_maps import (
+    describe_effect_maps,
+    effect_maps,
+    plot_effect_maps,
+    tabulate_effect_maps,
+)
+from skindb.analysis.group_effects import (
+    describe_group_effects,
+    group_effects,
+    plot_group_effects,
+)
 from skindb.analysis.masks import mask_agreement, region_masks, take_masks
 from skindb.analysis.mean_face import mean_face, plot_mean_face
 from skindb.analysis.members import groups_by, sides, trait_names
@@ -37,7 +60,12 @@ from skindb.analysis.registration import (
     register,
     tabulate_registration,
 )
-from skindb.analysis.summary import cohort_of, region_tables, sample_surfels, summary_tables
+from skindb.analysis.summary import (
+    cohort_of,
+    region_tables,
+    sample_surfels,
+    summary_tables,
+)
 from skindb.analysis.tabulate import describe_study, plot_study, tabulate_study
 from skindb.analysis.traits import plot_traits, trait_vectors
 from skindb.analysis.translucency import plot_translucency, translucency_table

@@ -1,4 +1,6 @@
-"""Colour statistics of diffuse albedo that are comparable between takes (Weyrich et al. 2005, section 10.2)."""
+"""Colour statistics of diffuse albedo that are comparable between takes (Weyrich et al.
+2005, section 10.2).
+"""
 
 from __future__ import annotations
 
@@ -22,12 +24,21 @@ from skindb.schema.regions import FACE
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-COLOUR_VARIABLES = ("diffuse_reflectance", "surfel_area", "region_mask", "surfel_index", "take", "region")
+COLOUR_VARIABLES = (
+    "diffuse_reflectance",
+    "surfel_area",
+    "region_mask",
+    "surfel_index",
+    "take",
+    "region",
+)
 BINS = 256
 MAX_LEGEND_ENTRIES = 30  # takes; plots of more lines have no legend
 LINES = ("-", "--", ":", "-.", (0, (1, 3)))
 LEVELS = 256  # values of a quantile function
-SLOPE = 1e-3  # minimum slope of a cumulative sum, so that it can be inverted where a histogram is empty
+# minimum slope of a cumulative sum, so that it can be inverted where a histogram is
+# empty
+SLOPE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -49,27 +60,30 @@ def albedo_histograms(
 ) -> xr.Dataset:
     """Histograms of decorrelated colour for every take and region.
 
-    The colour axes are the principal axes of the surfels of all takes, each take with the same weight, divided by
-    their standard deviations (Heeger and Bergen 1995, section 3.5); all takes have the same bin edges. Surfels are
-    weighted by their area: the texels of an area-preserving map would give the same histogram.
+    The colour axes are the principal axes of the surfels of all takes, each take with
+    the same weight, divided by their standard deviations (Heeger and Bergen 1995,
+    section 3.5); all takes have the same bin edges. Surfels are weighted by their area:
+    the texels of an area-preserving map would give the same histogram.
 
     Parameters
     ----------
     cohort
         ``db.cohort("surfels")``.
     regions
-        Names of region masks; "face" is the whole surface. Results are NaN for a take without such a region.
+        Names of region masks; "face" is the whole surface. Results are NaN for a take
+        without such a region.
     drawn
-        ``db.cohort("surfels", kind="registration")`` of the same sample, with the regions defined by landmarks, which
-        are used for takes whose capture lacks them.
+        ``db.cohort("surfels", kind="registration")`` of the same sample, with the
+        regions defined by landmarks, which are used for takes whose capture lacks them.
     mixed_fits
         Accept takes that were fitted with different parameters.
 
     Returns
     -------
     Dataset
-        `colour_mean`, `colour_axis`, `histogram_edge`, `albedo_histogram` (fractions that sum to 1), `albedo_mean`.
-        Attribute `regions_by_landmarks`: region -> takes for which the region is defined by landmarks.
+        `colour_mean`, `colour_axis`, `histogram_edge`, `albedo_histogram` (fractions
+        that sum to 1), `albedo_mean`. Attribute `regions_by_landmarks`: region -> takes
+        for which the region is defined by landmarks.
     """
     if not mixed_fits:
         require_same_fit(cohort)
@@ -85,11 +99,15 @@ def albedo_histograms(
     by_landmarks: dict[str, list[str]] = {}
     for t, (one, x) in enumerate(zip(samples, decorrelated, strict=True)):
         for r, region in enumerate(regions):
-            inside = np.ones(len(x), np.bool_) if region == FACE else one.regions.get(region)
+            inside = (
+                np.ones(len(x), np.bool_) if region == FACE else one.regions.get(region)
+            )
             if inside is None or not inside.any():
                 continue
             counted[t, r] = histogram(x[inside], one.area[inside], edges)
-            means[t, r] = np.average(one.colour[inside], axis=0, weights=one.area[inside])
+            means[t, r] = np.average(
+                one.colour[inside], axis=0, weights=one.area[inside]
+            )
             if region in one.drawn:
                 by_landmarks.setdefault(region, []).append(takes[t])
     return dataset(
@@ -101,23 +119,37 @@ def albedo_histograms(
             "albedo_mean": means,
         },
         coords={"take": takes, "region": list(regions), "channel": ["R", "G", "B"]},
-        attrs={"skipped": list(cohort.attrs.get("skipped", [])), "regions_by_landmarks": by_landmarks},
+        attrs={
+            "skipped": list(cohort.attrs.get("skipped", [])),
+            "regions_by_landmarks": by_landmarks,
+        },
     )
 
 
 def _colours(one: xr.Dataset, drawn: xr.Dataset | None) -> Colours:
-    """Sampled surfels of one take of a cohort, with the regions of its capture or those defined by landmarks."""
-    good = np.isfinite(one["diffuse_reflectance"].values).all(axis=-1) & (one["surfel_area"].values > 0)
+    """Sampled surfels of one take of a cohort, with the regions of its capture or those
+    defined by landmarks.
+    """
+    good = np.isfinite(one["diffuse_reflectance"].values).all(axis=-1) & (
+        one["surfel_area"].values > 0
+    )
     if not good.any():
         where = str(one["take"].values)
         cure = "skip the take or fit it again"
-        raise InputError(Fault(where, "a take of a population must have fitted surfels", "none", cure))
+        raise InputError(
+            Fault(
+                where, "a take of a population must have fitted surfels", "none", cure
+            )
+        )
     own = _masks(one, good)
     name = one["take"].values.item()
     more: dict[str, Mask] = {}
     if drawn is not None and name in drawn["take"].values:
         other = drawn.sel(take=name)
-        same = np.array_equal(other["surfel_index"].values[: len(good)][good], one["surfel_index"].values[good])
+        same = np.array_equal(
+            other["surfel_index"].values[: len(good)][good],
+            one["surfel_index"].values[good],
+        )
         if not same:
             rule = "regions by landmarks must belong to the sampled surfels"
             cure = "open both cohorts with the same seed"
@@ -125,15 +157,26 @@ def _colours(one: xr.Dataset, drawn: xr.Dataset | None) -> Colours:
         more = _masks(other, good)
     by_landmarks = frozenset(region for region in more if region not in own)
     colour = one["diffuse_reflectance"].values[good].astype(np.float64)
-    return Colours(colour, one["surfel_area"].values[good].astype(np.float64), more | own, by_landmarks)
+    return Colours(
+        colour,
+        one["surfel_area"].values[good].astype(np.float64),
+        more | own,
+        by_landmarks,
+    )
 
 
 def _masks(take: xr.Dataset, good: Mask) -> dict[str, Mask]:
     """Masks of the sampled surfels by region, for the regions that contain any."""
     if "region_mask" not in take:
         return {}
-    mask = take["region_mask"].transpose("surfel", "region").values[: len(good)][good] > 0
-    return {str(name): mask[:, i] for i, name in enumerate(take["region"].values) if mask[:, i].any()}
+    mask = (
+        take["region_mask"].transpose("surfel", "region").values[: len(good)][good] > 0
+    )
+    return {
+        str(name): mask[:, i]
+        for i, name in enumerate(take["region"].values)
+        if mask[:, i].any()
+    }
 
 
 def _colour_axes(samples: Sequence[Colours]) -> tuple[Array, Array]:
@@ -147,9 +190,12 @@ def _colour_axes(samples: Sequence[Colours]) -> tuple[Array, Array]:
     mean = np.mean(means, axis=0)
     # the variance includes differences between takes
     between = np.stack(means) - mean
-    values, vectors = np.linalg.eigh(np.mean(spreads, axis=0) + between.T @ between / len(means))
+    values, vectors = np.linalg.eigh(
+        np.mean(spreads, axis=0) + between.T @ between / len(means)
+    )
     axes = (vectors / np.sqrt(np.maximum(values, 1e-12))).T[::-1]
-    return mean, axes * np.where(axes.sum(axis=1, keepdims=True) < 0, -1.0, 1.0)  # brighter is larger on every axis
+    # brighter is larger on every axis
+    return mean, axes * np.where(axes.sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
 
 
 def _shared_edges(decorrelated: Sequence[Array]) -> Array:
@@ -160,43 +206,62 @@ def _shared_edges(decorrelated: Sequence[Array]) -> Array:
     return np.linspace(low - margin, high + margin, BINS + 1, axis=1)
 
 
-def albedo_table(cohort: xr.Dataset, *, albedo: xr.Dataset, group_by: str | None = None) -> xr.Dataset:
+def albedo_table(
+    cohort: xr.Dataset, *, albedo: xr.Dataset, group_by: str | None = None
+) -> xr.Dataset:
     """Mean albedo and mean histogram of groups of takes.
 
     Parameters
     ----------
     cohort
-        Any cohort of the takes; only its coordinates are used. Takes in other conditions than normal are used only if
-        `group_by` is "condition" or a trait of it, so that no subject counts several times.
+        Any cohort of the takes; only its coordinates are used. Takes in other
+        conditions than normal are used only if `group_by` is "condition" or a trait of
+        it, so that no subject counts several times.
     albedo
         From `albedo_histograms` of these takes.
     group_by
-        Attribute or trait (gender, ancestry, gender:male, age:older, ...); None puts all takes into the group "all".
+        Attribute or trait (gender, ancestry, gender:male, age:older, ...); None puts
+        all takes into the group "all".
 
     Returns
     -------
     Dataset
-        (group, region, channel) count, mean with Student's 95 % interval, standard deviation; (group, region, axis,
-        bin) mean histogram. NaN where a group has too few takes with such a region. The noise of surfels averages out
-        over a region. Errors of whole takes (light, white target) differ between takes, so that the standard deviation
-        and the interval include them. They do not include the error that is common to all takes: even reflection of
-        the surface is counted as albedo, up to `group_even_reflection_limit`; `group_albedo_level_low` is the lower end
-        of the interval including it. This error shifts all groups equally, so that it cancels in differences of groups
-        but not in ratios, and it matters most for dark skin.
+        (group, region, channel) count, mean with Student's 95 % interval, standard
+        deviation; (group, region, axis, bin) mean histogram. NaN where a group has too
+        few takes with such a region. The noise of surfels averages out over a region.
+        Errors of whole takes (light, white target) differ between takes, so that the
+        standard deviation and the interval include them. They do not include the error
+        that is common to all takes: even reflection of the surface is counted as
+        albedo, up to `group_even_reflection_limit`; `group_albedo_level_low` is the
+        lower end of the interval including it. This error shifts all groups equally, so
+        that it cancels in differences of groups but not in ratios, and it matters most
+        for dark skin.
     """
     takes = takes_to_compare(cohort, group_by)
     groups = groups_by(takes, group_by)
     names = sorted(set(groups))
     even = _even_reflection(takes)
     labels = [str(take) for take in takes["take"].values]
-    members = [[take for take, group in zip(labels, groups, strict=True) if group == name] for name in names]
+    members = [
+        [take for take, group in zip(labels, groups, strict=True) if group == name]
+        for name in names
+    ]
     parts = [Moments.of(albedo["albedo_mean"].sel(take=own).values) for own in members]
-    stacked = Moments(*(np.stack([getattr(part, f) for part in parts]) for f in ("count", "mean", "second")))
+    stacked = Moments(
+        *(
+            np.stack([getattr(part, f) for part in parts])
+            for f in ("count", "mean", "second")
+        )
+    )
     low, high = stacked.mean_interval()
     known = stacked.count > 0
     limits = np.array([max(even[take] for take in own) for own in members])
-    histograms = [Moments.of(albedo["albedo_histogram"].sel(take=own).values) for own in members]
-    mean_histograms = np.stack([np.where(h.count > 0, h.mean, np.nan) for h in histograms])
+    histograms = [
+        Moments.of(albedo["albedo_histogram"].sel(take=own).values) for own in members
+    ]
+    mean_histograms = np.stack(
+        [np.where(h.count > 0, h.mean, np.nan) for h in histograms]
+    )
     return dataset(
         {
             "group_albedo_count": stacked.count,
@@ -208,7 +273,11 @@ def albedo_table(cohort: xr.Dataset, *, albedo: xr.Dataset, group_by: str | None
             "group_albedo_standard_deviation": stacked.standard_deviation,
             "group_histogram": mean_histograms,
         },
-        coords={"group": names, "region": albedo["region"].values, "channel": ["R", "G", "B"]},
+        coords={
+            "group": names,
+            "region": albedo["region"].values,
+            "channel": ["R", "G", "B"],
+        },
         attrs={
             "takes": sorted(map(str, takes["take"].values)),
             "group_by": group_by or "",
@@ -218,14 +287,22 @@ def albedo_table(cohort: xr.Dataset, *, albedo: xr.Dataset, group_by: str | None
 
 
 def _even_reflection(takes: xr.Dataset) -> dict[str, float]:
-    """Limit of the excess of R_d due to even reflection, for every take; NaN for models fitted before it was stored."""
+    """Limit of the excess of R_d due to even reflection, for every take; NaN for models
+    fitted before it was stored.
+    """
     stated = "fit_even_reflection" in takes.coords
-    values = takes["fit_even_reflection"].values.astype(float) if stated else np.full(takes.sizes["take"], np.nan)
+    values = (
+        takes["fit_even_reflection"].values.astype(float)
+        if stated
+        else np.full(takes.sizes["take"], np.nan)
+    )
     return dict(zip(map(str, takes["take"].values), values, strict=True))
 
 
 def _level_low(mean: Array, low: Array, limits: Array) -> Array:
-    """Lower ends of the intervals, with the error that is common to all takes added in quadrature."""
+    """Lower ends of the intervals, with the error that is common to all takes added in
+    quadrature.
+    """
     down = mean - low
     return np.asarray(mean - np.hypot(down, limits.reshape(-1, *[1] * (down.ndim - 1))))
 
@@ -237,7 +314,12 @@ def decorrelate(colour: Array, mean: Array, axes: Array) -> Array:
 
 def histogram(values: Array, area: Array, edges: Array) -> Array:
     """Histograms (3, bins) as fractions of the area, one per axis; edges (3, bins + 1)."""
-    counts = np.stack([np.histogram(values[:, a], edges[a], weights=area)[0] for a in range(values.shape[1])])
+    counts = np.stack(
+        [
+            np.histogram(values[:, a], edges[a], weights=area)[0]
+            for a in range(values.shape[1])
+        ]
+    )
     return np.asarray(counts / area.sum())
 
 
@@ -259,7 +341,10 @@ def levels() -> Array:
 def cumulative(fractions: Array) -> Array:
     """Strictly increasing cumulative sum (bins + 1,) from 0 to 1 of a histogram (bins,)."""
     total = np.concatenate([[0.0], np.cumsum(fractions)])
-    return np.asarray((1 - SLOPE) * total / max(total[-1], 1e-12) + SLOPE * np.linspace(0.0, 1.0, len(total)))
+    return np.asarray(
+        (1 - SLOPE) * total / max(total[-1], 1e-12)
+        + SLOPE * np.linspace(0.0, 1.0, len(total))
+    )
 
 
 def plot_albedo(
@@ -270,17 +355,28 @@ def plot_albedo(
     region: str = FACE,
     ax: Axes | None = None,
 ) -> Axes:
-    """Plot histograms of one decorrelated axis, one line per take, or per group of `table` (from `albedo_table`)."""
+    """Plot histograms of one decorrelated axis, one line per take, or per group of
+    `table` (from `albedo_table`).
+    """
     from matplotlib import pyplot
 
     if ax is None:
         _, ax = pyplot.subplots(figsize=(6, 3.6))
     edges = histograms["histogram_edge"].isel(axis=axis).values
-    width = 8  # bins that are joined for the plot; the full number is needed only for matching
+    # bins that are joined for the plot; the full number is needed only for matching
+    width = 8
     centres = edges[:-1].reshape(-1, width).mean(axis=1)
     if table is not None and table.attrs["group_by"]:
-        counts = table["group_albedo_count"].sel(region=region).max("channel").values.tolist()
-        names = [f"{name} (n = {n})" for name, n in zip(table["group"].values.tolist(), counts, strict=True)]
+        counts = (
+            table["group_albedo_count"]
+            .sel(region=region)
+            .max("channel")
+            .values.tolist()
+        )
+        names = [
+            f"{name} (n = {n})"
+            for name, n in zip(table["group"].values.tolist(), counts, strict=True)
+        ]
         lines = table["group_histogram"].sel(region=region).isel(axis=axis).values
     else:
         names = [str(take) for take in histograms["take"].values]
@@ -288,7 +384,9 @@ def plot_albedo(
     ax.set_prop_cycle(color=colours.CYCLE)
     for i, (name, fractions) in enumerate(zip(names, lines, strict=True)):
         own: dict[str, Any] = (
-            {"label": name} if len(names) <= MAX_LEGEND_ENTRIES else {"color": "0.4", "linewidth": 0.5}
+            {"label": name}
+            if len(names) <= MAX_LEGEND_ENTRIES
+            else {"color": "0.4", "linewidth": 0.5}
         )
         ax.plot(
             centres,
@@ -299,7 +397,9 @@ def plot_albedo(
     if len(names) > MAX_LEGEND_ENTRIES:
         ax.set_title(f"{len(names)} takes", fontsize=8)
     else:
-        ax.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+        ax.legend(
+            fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False
+        )
     ax.set_xlabel(f"decorrelated colour, axis {axis} [standard deviations]")
     ax.set_ylabel("fraction of the area")
     ax.set_ylim(bottom=0)

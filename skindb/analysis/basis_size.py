@@ -36,10 +36,20 @@ BASIS_SIZE_VARIABLES = (
 NEEDED = (*BASIS_SIZE_VARIABLES, "fit_eta")
 DEFAULT_ETA = 1.3  # refractive index of models without parameters of the fit
 BLOCK = 128  # surfels at a time: rows of 2,400 samples and 59 bases take 72 MB
-STEP = 0.003  # see `choose_size`; tuned on planted problems, where 0.2 % and 0.4 % distinguish fewer sizes
-TABLE_HEADER = ("k", "error [% of that with all bases]", "low [%]", "high [%]", "error / error of next k")
+# see `choose_size`; tuned on planted problems, where 0.2 % and 0.4 % distinguish fewer
+# sizes
+STEP = 0.003
+TABLE_HEADER = (
+    "k",
+    "error [% of that with all bases]",
+    "low [%]",
+    "high [%]",
+    "error / error of next k",
+)
 MAX_DECIMALS = 6  # of the percentages in the table
-MAX_FACTORED = 2000  # surfels of all takes together from which the bases are computed: 56 MB of normal equations
+# surfels of all takes together from which the bases are computed: 56 MB of normal
+# equations
+MAX_FACTORED = 2000
 
 
 def basis_size_curve(
@@ -53,18 +63,21 @@ def basis_size_curve(
 ) -> xr.Dataset:
     """Reconstruction error of reflectance as a function of the number of basis BRDFs.
 
-    Bases of every size are computed from the reflectance of up to 2,000 of the sampled surfels; then the samples of
-    each surfel (minus the diffuse term) are fitted with the k mixtures by linear NNLS, take by take. Factorising the
-    stored weights instead, as in the paper, gave 1.02 to 3.7 times the error on planted problems at the planted size,
-    because the weights are not unique.
+    Bases of every size are computed from the reflectance of up to 2,000 of the sampled
+    surfels; then the samples of each surfel (minus the diffuse term) are fitted with
+    the k mixtures by linear NNLS, take by take. Factorising the stored weights instead,
+    as in the paper, gave 1.02 to 3.7 times the error on planted problems at the planted
+    size, because the weights are not unique.
 
     Parameters
     ----------
     cohort
-        ``db.cohort("surfels", surfels=200, variables=BASIS_SIZE_VARIABLES)``, with the reflectance samples (the paper
-        drew 5,000 surfels of dataset A and 2,000 of every subject of dataset B).
+        ``db.cohort("surfels", surfels=200, variables=BASIS_SIZE_VARIABLES)``, with the
+        reflectance samples (the paper drew 5,000 surfels of dataset A and 2,000 of
+        every subject of dataset B).
     tables
-        (nh, nd, np, m) tables of the dictionary of the fits [sr^-1], or a Dask object that computes them.
+        (nh, nd, np, m) tables of the dictionary of the fits [sr^-1], or a Dask object
+        that computes them.
     ks
         Sizes to try, ascending; only these sizes can be chosen.
     tolerance
@@ -77,10 +90,11 @@ def basis_size_curve(
     Returns
     -------
     Dataset
-        `relative_error` with its interval; `smallest_size` and `sufficient_size`, the bounds of the smallest size on
-        the plateau (`sufficient_size` is 0 if there is no plateau); `plateau_tolerance`; `dictionary_error`, the
-        relative RMS residual with the whole dictionary. Attributes: `size_status`, the result as a sentence, and
-        `surfels`, their number.
+        `relative_error` with its interval; `smallest_size` and `sufficient_size`, the
+        bounds of the smallest size on the plateau (`sufficient_size` is 0 if there is
+        no plateau); `plateau_tolerance`; `dictionary_error`, the relative RMS residual
+        with the whole dictionary. Attributes: `size_status`, the result as a sentence,
+        and `surfels`, their number.
     """
     if not mixed_fits:
         require_same_fit(cohort)
@@ -98,7 +112,9 @@ def basis_size_curve(
     else:  # take by take: 2,000 surfels of 87 takes at once would need 5 GB
         del factored
         errors = np.concatenate(each_take(_take_errors, cohort, NEEDED, once, tried))
-    error, low, high, (fewest, most) = choose_size(errors, ks, tolerance=tolerance, rng=rng)
+    error, low, high, (fewest, most) = choose_size(
+        errors, ks, tolerance=tolerance, rng=rng
+    )
     variables = {
         "relative_error": error,
         "relative_error_low": low,
@@ -106,7 +122,9 @@ def basis_size_curve(
         "smallest_size": fewest,
         "sufficient_size": most,
         "plateau_tolerance": tolerance,
-        "dictionary_error": float(np.sqrt(errors[:, 0, -1].sum() / errors[:, 2, -1].sum())),
+        "dictionary_error": float(
+            np.sqrt(errors[:, 0, -1].sum() / errors[:, 2, -1].sum())
+        ),
     }
     attrs = {"size_status": size_status(fewest, most), "surfels": len(errors)}
     attrs["skipped"] = list(cohort.attrs.get("skipped", []))
@@ -114,9 +132,11 @@ def basis_size_curve(
 
 
 def surfel_errors(systems: Systems, bases: Sequence[Array]) -> Array:
-    """Squared residual, degrees of freedom and squared reflectance (n, 3, sizes + 1); the last is for the dictionary.
+    """Squared residual, degrees of freedom and squared reflectance (n, 3, sizes + 1);
+    the last is for the dictionary.
 
-    The degrees of freedom are the number of values minus the number of non-zero weights, as each fits some noise.
+    The degrees of freedom are the number of values minus the number of non-zero
+    weights, as each fits some noise.
     """
     out = np.empty((len(systems.square), 3, len(bases) + 1))
     for j, basis in enumerate([*bases, None]):
@@ -131,33 +151,46 @@ def choose_size(
 ) -> tuple[Array, Array, Array, tuple[int, int]]:
     """Bounds of the smallest size on the plateau of the error.
 
-    A size is on the plateau if its error is within `tolerance` of that of the largest size tried, and if no larger size
-    reduces the error by more than STEP compared with the next smaller one. The plateau must be within `tolerance` of
-    the error with the whole dictionary. These are ratios of errors of the same surfels, so that their 95 % bootstrap
-    intervals show whether a size is on the plateau, is not, or may be.
+    A size is on the plateau if its error is within `tolerance` of that of the largest
+    size tried, and if no larger size reduces the error by more than STEP compared with
+    the next smaller one. The plateau must be within `tolerance` of the error with the
+    whole dictionary. These are ratios of errors of the same surfels, so that their 95 %
+    bootstrap intervals show whether a size is on the plateau, is not, or may be.
 
     Returns
     -------
     error, low, high, (fewest, most)
-        (sizes,) RMS residual divided by that with the whole dictionary, and its interval; the first size that may be on
-        the plateau, and the first that is significantly on it (0 if there is none or only the largest).
+        (sizes,) RMS residual divided by that with the whole dictionary, and its
+        interval; the first size that may be on the plateau, and the first that is
+        significantly on it (0 if there is none or only the largest).
     """
     sizes = len(ks)
 
     def statistic(drawn: Array) -> Array:
         total = drawn.sum(axis=0)
         rms = np.sqrt(total[0] / np.maximum(total[1], 1))
-        return np.concatenate([rms[:-1] / rms[-1], rms[:-1] / rms[-2], rms[:-2] / rms[1:-1]])
+        return np.concatenate(
+            [rms[:-1] / rms[-1], rms[:-1] / rms[-2], rms[:-2] / rms[1:-1]]
+        )
 
     low, high = bootstrap_interval(errors[:, :2], statistic, rng=rng, draws=500)
     error = statistic(errors)[:sizes]
-    surely, perhaps = (_first_on_plateau(ends[sizes:], sizes, tolerance) for ends in (high, low))
+    surely, perhaps = (
+        _first_on_plateau(ends[sizes:], sizes, tolerance) for ends in (high, low)
+    )
     resolved = surely < sizes - 1 and error[-1] <= 1 + tolerance
-    return error, low[:sizes], high[:sizes], (ks[perhaps], ks[surely] if resolved else 0)
+    return (
+        error,
+        low[:sizes],
+        high[:sizes],
+        (ks[perhaps], ks[surely] if resolved else 0),
+    )
 
 
 def _first_on_plateau(ratios: Array, sizes: int, tolerance: float) -> int:
-    """Index of the first size on the plateau, from ratios of its error to that of the last and of the next size."""
+    """Index of the first size on the plateau, from ratios of its error to that of the
+    last and of the next size.
+    """
     further = np.append(ratios[sizes:], 1.0)
     steepest = np.maximum.accumulate(further[::-1])[::-1]
     return int(np.argmax((ratios[:sizes] <= 1 + tolerance) & (steepest <= 1 + STEP)))
@@ -169,7 +202,9 @@ def size_status(fewest: int, most: int) -> str:
         return f"at least {fewest}: the error has no plateau within the sizes tried"
     beyond = f"no further basis reduces the error by more than {STEP:.1%}"
     if fewest < most:
-        return f"{fewest} to {most}: the sample does not distinguish these sizes; {beyond}"
+        return (
+            f"{fewest} to {most}: the sample does not distinguish these sizes; {beyond}"
+        )
     return f"{most}: smaller sizes are significantly worse; {beyond}"
 
 
@@ -184,26 +219,38 @@ def tabulate_basis_size(curve: xr.Dataset) -> tuple[list[str], list[list[Any]]]:
     Returns
     -------
     header, rows
-        Size; error in per cent of the error with the whole dictionary, with the ends of its 95 % interval; ratio of the
-        error to that of the next size ("-" for the last one). Numbers are texts with enough decimals to distinguish
-        neighbouring rows.
+        Size; error in per cent of the error with the whole dictionary, with the ends of
+        its 95 % interval; ratio of the error to that of the next size ("-" for the last
+        one). Numbers are texts with enough decimals to distinguish neighbouring rows.
     """
-    error, low, high = (100 * curve[f"relative_error{end}"].values for end in ("", "_low", "_high"))
+    error, low, high = (
+        100 * curve[f"relative_error{end}"].values for end in ("", "_low", "_high")
+    )
     ratio = error[:-1] / error[1:]
     digits = _digits_to_differ(error)
     ratio_digits = _digits_to_differ(ratio, least=4)
     steps = [*(f"{one:.{ratio_digits}f}" for one in ratio), "-"]
     rows = [
-        [int(k), *(f"{column[i]:.{digits}f}" for column in (error, low, high)), steps[i]]
+        [
+            int(k),
+            *(f"{column[i]:.{digits}f}" for column in (error, low, high)),
+            steps[i],
+        ]
         for i, k in enumerate(curve["k"].values)
     ]
     return list(TABLE_HEADER), rows
 
 
 def _digits_to_differ(values: Array, *, least: int = 2) -> int:
-    """Number of decimals, up to MAX_DECIMALS, with which different neighbours are printed differently."""
+    """Number of decimals, up to MAX_DECIMALS, with which different neighbours are
+    printed differently.
+    """
     pairs = [(a, b) for a, b in pairwise(values.tolist()) if a != b]
-    enough = (d for d in range(least, MAX_DECIMALS) if all(f"{a:.{d}f}" != f"{b:.{d}f}" for a, b in pairs))
+    enough = (
+        d
+        for d in range(least, MAX_DECIMALS)
+        if all(f"{a:.{d}f}" != f"{b:.{d}f}" for a, b in pairs)
+    )
     return next(enough, MAX_DECIMALS)
 
 
@@ -222,15 +269,20 @@ def describe_basis_size(curve: xr.Dataset) -> str:
         )
     if not most:
         return (
-            f"At least {fewest} bases: no size below {largest}, the largest one tried, is significantly on a plateau "
+            f"At least {fewest} bases: no size below {largest}, the largest one "
+            "tried, is significantly on a plateau "
             "of the error. Try larger sizes or draw more surfels."
         )
     reason = (
-        f"With {most} the error is significantly within {tolerance} of that with {largest}, the largest size tried, "
+        f"With {most} the error is significantly within {tolerance} of that with "
+        f"{largest}, the largest size tried, "
         f"and no further basis reduces it by more than {100 * STEP:.3g} %"
     )
     if fewest < most:
-        open_question = f"this sample does not show whether {_sizes(fewest, most - 1)} would suffice"
+        open_question = (
+            f"this sample does not show whether {_sizes(fewest, most - 1)} would "
+            "suffice"
+        )
         return f"{fewest} to {most} bases. {reason}; {open_question}."
     return f"{most} {'basis' if most == 1 else 'bases'}. {reason}" + (
         "; smaller sizes are significantly worse." if most > ks[0] else "."
@@ -251,31 +303,56 @@ def _systems(take: xr.Dataset, tables: Array, part: slice) -> Systems:
     known = np.isfinite(take["diffuse_reflectance"].values).all(axis=1)
     there = take.isel(surfel=np.flatnonzero(known)[part])
     eta = float(take["fit_eta"]) if "fit_eta" in take else np.nan
-    eta = eta if np.isfinite(eta) else DEFAULT_ETA  # for models that do not state the parameters of their fit
+    # for models that do not state the parameters of their fit
+    eta = eta if np.isfinite(eta) else DEFAULT_ETA
     parts = []
     for start in range(0, max(there.sizes["surfel"], 1), BLOCK):
         one = there.isel(surfel=slice(start, start + BLOCK))
-        (rows, offsets), target = _surface_rows(one["reflectance_sample"].values, one, one, tables, eta)
+        (rows, offsets), target = _surface_rows(
+            one["reflectance_sample"].values, one, one, tables, eta
+        )
         parts.append(Systems.of(rows, offsets, target))
     return Systems.joined(parts)
 
 
 def _surface_rows(
-    samples: NDArray[np.float16], dome: xr.Dataset, fitted: xr.Dataset, tables: Array, eta: float
+    samples: NDArray[np.float16],
+    dome: xr.Dataset,
+    fitted: xr.Dataset,
+    tables: Array,
+    eta: float,
 ) -> tuple[tuple[NDArray[np.float32], NDArray[np.int64]], Array]:
-    """Basis rows with their offsets, and the samples (total, 3) minus the diffuse term, for a few surfels."""
-    position, normal = (fitted[n].values.astype(np.float64) for n in ("surfel_position", "shading_normal"))
+    """Basis rows with their offsets, and the samples (total, 3) minus the diffuse term,
+    for a few surfels.
+    """
+    position, normal = (
+        fitted[n].values.astype(np.float64)
+        for n in ("surfel_position", "shading_normal")
+    )
     to_light = _directions(dome["light_position"].values, position)
     to_camera = _directions(dome["camera_position"].values, position)
     values = samples.astype(np.float64)
     rows, offsets, index = basis_rows(
-        tables, TableGrid(*tables.shape[:3]), normal, to_light, to_camera, np.asarray(np.isfinite(values).all(axis=-1))
+        tables,
+        TableGrid(*tables.shape[:3]),
+        normal,
+        to_light,
+        to_camera,
+        np.asarray(np.isfinite(values).all(axis=-1)),
     )
     surfel = np.repeat(np.arange(len(position)), np.diff(offsets))
     cos_i = np.einsum("nc,nc->n", normal[surfel], to_light[surfel, index[:, 0]])
     cos_o = np.einsum("nc,nc->n", normal[surfel], to_camera[surfel, index[:, 1]])
-    passed = cos_i * fresnel_transmittance(cos_i, eta) * fresnel_transmittance(cos_o, eta) / np.pi
-    diffuse = fitted["diffuse_reflectance"].values.astype(np.float64)[surfel] * passed[:, None]
+    passed = (
+        cos_i
+        * fresnel_transmittance(cos_i, eta)
+        * fresnel_transmittance(cos_o, eta)
+        / np.pi
+    )
+    diffuse = (
+        fitted["diffuse_reflectance"].values.astype(np.float64)[surfel]
+        * passed[:, None]
+    )
     return (rows, offsets), values[surfel, index[:, 0], index[:, 1]] - diffuse
 
 
@@ -292,13 +369,26 @@ def plot_basis_size(curve: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     if ax is None:
         _, ax = pyplot.subplots(figsize=(6, 3.6))
     k = curve["k"].values
-    ax.fill_between(k, curve["relative_error_low"], curve["relative_error_high"], alpha=0.25, label="95 % interval")
+    ax.fill_between(
+        k,
+        curve["relative_error_low"],
+        curve["relative_error_high"],
+        alpha=0.25,
+        label="95 % interval",
+    )
     ax.plot(k, curve["relative_error"], "o-", label="error")
     fewest = int(curve["smallest_size"])
     most = int(curve["sufficient_size"])
     if most:
         chosen = str(most) if fewest == most else f"{fewest} to {most}"
-        ax.axvspan(fewest - 0.05, most + 0.05, color="0.4", alpha=0.4, lw=0, label=f"chosen size: {chosen}")
+        ax.axvspan(
+            fewest - 0.05,
+            most + 0.05,
+            color="0.4",
+            alpha=0.4,
+            lw=0,
+            label=f"chosen size: {chosen}",
+        )
     ax.set_xlabel("number of basis BRDFs k")
     ax.set_ylabel("error of reflectance / error with whole dictionary")
     ax.legend(fontsize=8)

@@ -1,4 +1,6 @@
-"""Plots of the space of surface BRDFs: map of the takes, spheres and lobes (Weyrich et al. 2005, figures 7 and 14)."""
+"""Plots of the space of surface BRDFs: map of the takes, spheres and lobes (Weyrich et
+al. 2005, figures 7 and 14).
+"""
 
 from __future__ import annotations
 
@@ -46,25 +48,43 @@ def plot_brdf_space(space: xr.Dataset, *, ax: Axes | None = None) -> Axes:
         _, ax = pyplot.subplots(figsize=(5, 4.4))
     named = np.array(space.attrs["groups_of_takes"])
     place = space["take_place"].values
-    for i, (group, count) in enumerate(zip(space["group"].values, space["group_subject_count"].values, strict=True)):
+    for i, (group, count) in enumerate(
+        zip(space["group"].values, space["group_subject_count"].values, strict=True)
+    ):
         own = place[named == str(group)]
         takes = int((named == str(group)).sum())
         subjects = f"n = {count}" if takes == count else f"n = {count}, {takes} takes"
-        ax.plot(*own.T, MARKERS[i % 6], color=_colour(i), markersize=4, alpha=0.75, label=f"{group} ({subjects})")
+        ax.plot(
+            *own.T,
+            MARKERS[i % 6],
+            color=_colour(i),
+            markersize=4,
+            alpha=0.75,
+            label=f"{group} ({subjects})",
+        )
     first, second = (f"{one:.1%}" for one in space["explained_fraction"].values)
     ax.set_xlabel(f"axis 1, {first} of the scatter [length of the mean BRDF]")
-    ax.set_ylabel(f"axis 2, {second}; relative error of the map {float(space['map_error']):.1%}")
+    ax.set_ylabel(
+        f"axis 2, {second}; relative error of the map {float(space['map_error']):.1%}"
+    )
     ax.set_aspect("equal", adjustable="datalim")
     ax.set_box_aspect(1)
-    ax.legend(fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False)
+    ax.legend(
+        fontsize=8,
+        loc="lower center",
+        bbox_to_anchor=(0.5, 1.0),
+        ncols=2,
+        frameon=False,
+    )
     return ax
 
 
 def plot_group_spheres(space: xr.Dataset, *, ax: Axes | None = None) -> Axes:
-    """Render a sphere with the mean surface BRDF of each group, under a frontal and a grazing light, at equal exposure.
+    """Render a sphere with the mean surface BRDF of each group, under a frontal and a
+    grazing light, at equal exposure.
 
-    The lights are 15 degrees above the viewer and 100 degrees to the right, of equal irradiance; diffuse light is
-    omitted. The brightest 0.5 % of the pixels are white.
+    The lights are 15 degrees above the viewer and 100 degrees to the right, of equal
+    irradiance; diffuse light is omitted. The brightest 0.5 % of the pixels are white.
 
     Parameters
     ----------
@@ -88,20 +108,29 @@ def plot_group_spheres(space: xr.Dataset, *, ax: Axes | None = None) -> Axes:
         x = step_x * (i % columns)
         y = -step_y * (i // columns)
         picture = np.ones((*inside.shape, 3))
-        picture[inside] = np.clip(radiance[inside][:, i, None] / white, 0, 1) ** (1 / GAMMA)
-        ax.imshow(picture, extent=(x - 0.5, x + 0.5, y - 0.5, y + 0.5), interpolation="antialiased")
+        picture[inside] = np.clip(radiance[inside][:, i, None] / white, 0, 1) ** (
+            1 / GAMMA
+        )
+        ax.imshow(
+            picture,
+            extent=(x - 0.5, x + 0.5, y - 0.5, y + 0.5),
+            interpolation="antialiased",
+        )
         label = f"{name}\n(n = {int(space['group_subject_count'][i])})"
         ax.text(x, y - 0.53, label, ha="center", va="top", fontsize=8)
     ax.set_xlim(-0.6, step_x * (columns - 1) + 0.6)
     ax.set_ylim(-step_y * (rows - 1) - 0.9, 0.6)
     ax.set_aspect("equal")
     ax.set_axis_off()
-    ax.set_title("surface BRDF under a frontal and a grazing light, equal exposure", fontsize=9)
+    ax.set_title(
+        "surface BRDF under a frontal and a grazing light, equal exposure", fontsize=9
+    )
     return ax
 
 
 def plot_group_lobes(space: xr.Dataset, *, ax: PolarAxes | None = None) -> PolarAxes:
-    """Plot the lobes f cos(theta_i) [sr^-1] of the groups in the plane of incidence, at 30 and 60 degrees of incidence.
+    """Plot the lobes f cos(theta_i) [sr^-1] of the groups in the plane of incidence, at
+    30 and 60 degrees of incidence.
 
     The lobes are drawn up to 80 degrees of exitance.
 
@@ -119,7 +148,9 @@ def plot_group_lobes(space: xr.Dataset, *, ax: PolarAxes | None = None) -> Polar
         _, ax = pyplot.subplots(figsize=(6, 3.8), subplot_kw={"projection": "polar"})
     angle = np.radians(np.linspace(-MAX_EXITANCE, MAX_EXITANCE, 321))
     tables = _tables(space)
-    groups = list(zip(space["group"].values, space["group_subject_count"].values, strict=True))
+    groups = list(
+        zip(space["group"].values, space["group_subject_count"].values, strict=True)
+    )
     for incidence, line in zip(INCIDENCES, LINES, strict=True):
         for i, (group, count) in enumerate(groups):
             values = lobe(tables[..., [i]], np.radians(incidence), angle)[:, 0]
@@ -132,8 +163,16 @@ def plot_group_lobes(space: xr.Dataset, *, ax: PolarAxes | None = None) -> Polar
     ax.set_rlabel_position(-90)
     ax.yaxis.set_major_locator(MaxNLocator(4))
     ax.tick_params(labelsize=7)
-    ax.set_title("f cos θᵢ [sr⁻¹] against the angle of exitance; light from the left", fontsize=9)
-    ax.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, 0.08), ncols=2, frameon=False)
+    ax.set_title(
+        "f cos θᵢ [sr⁻¹] against the angle of exitance; light from the left", fontsize=9
+    )
+    ax.legend(
+        fontsize=7,
+        loc="upper center",
+        bbox_to_anchor=(0.5, 0.08),
+        ncols=2,
+        frameon=False,
+    )
     return ax
 
 
@@ -152,7 +191,8 @@ def plot_space(space: xr.Dataset) -> Axes:
 
 
 def sphere_radiance(tables: NDArray[Any]) -> tuple[Array, NDArray[np.bool_]]:
-    """Radiance (pixels, pixels, groups) of spheres per irradiance of the lights [sr^-1], and the mask of their pixels.
+    """Radiance (pixels, pixels, groups) of spheres per irradiance of the lights
+    [sr^-1], and the mask of their pixels.
 
     Parameters
     ----------
@@ -162,7 +202,9 @@ def sphere_radiance(tables: NDArray[Any]) -> tuple[Array, NDArray[np.bool_]]:
     at = (np.arange(SPHERE) + 0.5) / SPHERE * 2 - 1
     x, y = np.meshgrid(at, -at)
     inside = x**2 + y**2 < 1
-    normal = np.stack([x, y, np.sqrt(np.clip(1 - x**2 - y**2, 0, None))], axis=-1)[inside]
+    normal = np.stack([x, y, np.sqrt(np.clip(1 - x**2 - y**2, 0, None))], axis=-1)[
+        inside
+    ]
     lights = [
         np.array([0.0, np.sin(FRONTAL), np.cos(FRONTAL)]),
         np.array([np.sin(GRAZING), 0.0, np.cos(GRAZING)]),
@@ -173,15 +215,21 @@ def sphere_radiance(tables: NDArray[Any]) -> tuple[Array, NDArray[np.bool_]]:
 
 
 def lobe(tables: NDArray[Any], incidence: float, angle: Array) -> Array:
-    """Values f cos(theta_i) [sr^-1] (angles, groups) in the plane of incidence; the mirror is at +incidence [rad]."""
+    """Values f cos(theta_i) [sr^-1] (angles, groups) in the plane of incidence; the
+    mirror is at +incidence [rad].
+    """
     to_light = np.array([-np.sin(incidence), 0.0, np.cos(incidence)])
     to_camera = np.stack([np.sin(angle), np.zeros_like(angle), np.cos(angle)], axis=-1)
-    values = lookup(tables, *half_difference(np.broadcast_to(to_light, to_camera.shape), to_camera))
+    values = lookup(
+        tables, *half_difference(np.broadcast_to(to_light, to_camera.shape), to_camera)
+    )
     return np.asarray(values * np.cos(incidence))
 
 
 def _shaded(tables: NDArray[Any], normal: Array, light: Array) -> Array:
-    """Values f cos(theta_i) (n, groups) for normals seen from the direction z; the BRDF is isotropic."""
+    """Values f cos(theta_i) (n, groups) for normals seen from the direction z; the BRDF
+    is isotropic.
+    """
     view = np.array([0.0, 0.0, 1.0])
     cos_i = normal @ light
     cos_o = normal @ view
@@ -190,7 +238,8 @@ def _shaded(tables: NDArray[Any], normal: Array, light: Array) -> Array:
     n = normal[lit]
     wi_z = cos_i[lit]
     wo_z = cos_o[lit]
-    first = view - wo_z[:, None] * n  # local frame of the normal with the viewer in its x, z plane
+    # local frame of the normal with the viewer in its x, z plane
+    first = view - wo_z[:, None] * n
     length = np.linalg.norm(first, axis=1, keepdims=True)
     first = np.where(length > 1e-9, first / np.maximum(length, 1e-9), [1.0, 0.0, 0.0])
     second = np.cross(n, first)
@@ -201,8 +250,12 @@ def _shaded(tables: NDArray[Any], normal: Array, light: Array) -> Array:
 
 
 def _tables(space: xr.Dataset) -> NDArray[np.float32]:
-    """Tables (nh, nd, np, group) of `group_brdf`, without the last azimuth, which repeats the first."""
-    stored = space["group_brdf"].transpose("theta_h", "theta_d", "phi_d", "group").values
+    """Tables (nh, nd, np, group) of `group_brdf`, without the last azimuth, which
+    repeats the first.
+    """
+    stored = (
+        space["group_brdf"].transpose("theta_h", "theta_d", "phi_d", "group").values
+    )
     return np.ascontiguousarray(stored[:, :, :-1])
 
 

@@ -1,4 +1,5 @@
-"""Space of the surface BRDFs of a population: means and distances of groups, and a map of the takes.
+"""Space of the surface BRDFs of a population: means and distances of groups, and a map
+of the takes.
 
 Weyrich et al. 2005, section 10.1 and figures 7, 14 and 15.
 """
@@ -18,31 +19,56 @@ from numpy.typing import NDArray
 from skindb._blas import c_contiguous
 from skindb._types import Array
 from skindb.analysis.each_take import each_item
-from skindb.analysis.members import NORMAL, OTHER, UNKNOWN, groups_by, numeric_attributes, takes_to_compare, texts
+from skindb.analysis.members import (
+    NORMAL,
+    OTHER,
+    UNKNOWN,
+    groups_by,
+    numeric_attributes,
+    takes_to_compare,
+    texts,
+)
 from skindb.errors import Fault, InputError
-from skindb.numerics.group_distance import between_groups_p, classical_scaling, within_subjects_p
+from skindb.numerics.group_distance import (
+    between_groups_p,
+    classical_scaling,
+    within_subjects_p,
+)
 from skindb.numerics.statistics import known_mean
 from skindb.optics.brdf_table import TableGrid, brdf_metric
 from skindb.schema import dataset
 from skindb.schema.brdf import brdf_coords, stored_brdf
 from skindb.schema.cohort import require_same_fit
 
-FEW = 10  # subjects of a group, below which p values are approximate if the groups have different variances
+# subjects of a group, below which p values are approximate if the groups have different
+# variances
+FEW = 10
 SIGNIFICANT = 0.05  # of adjusted p values
-IDENTICAL = 1e-6  # relative distance due to rounding: coefficients are stored in single precision
-INDEPENDENT = 1e-5  # minimum ratio of the smallest to the largest singular value of the normalised mixtures
+# relative distance due to rounding: coefficients are stored in single precision
+IDENTICAL = 1e-6
+# minimum ratio of the smallest to the largest singular value of the normalised mixtures
+INDEPENDENT = 1e-5
 ONE_PAIR = "one pair"
 SIDES = ("first", "second")
-COLUMNS = ("group_distance", "group_distance_noise", "group_distance_p", "group_distance_p_adjusted")
+COLUMNS = (
+    "group_distance",
+    "group_distance_noise",
+    "group_distance_p",
+    "group_distance_p_adjusted",
+)
 
 
 @dataclass(frozen=True)
 class _Subjects:
-    """Means over the takes of each subject in each group; NaN where a subject has no take in a group."""
+    """Means over the takes of each subject in each group; NaN where a subject has no
+    take in a group.
+    """
 
     groups: tuple[str, ...]
     coefficient: Array  # (subject, group, component)
-    place: Array  # (subject, group, component) in coordinates in which Euclidean distance is the distance of BRDFs
+    # (subject, group, component) in coordinates in which Euclidean distance is the
+    # distance of BRDFs
+    place: Array
 
     @property
     def there(self) -> NDArray[np.bool_]:
@@ -60,13 +86,16 @@ def brdf_space(
     mixed_fits: bool = False,
     rng: np.random.Generator,
 ) -> xr.Dataset:
-    """Mean surface BRDFs of groups, distances between groups and between takes, and a map of the takes.
+    """Mean surface BRDFs of groups, distances between groups and between takes, and a
+    map of the takes.
 
-    The distance of two BRDFs is that of `skindb.optics.brdf_table.brdf_metric`, divided by the length of the mean BRDF.
-    The unit is the subject: the takes of a subject in a group are averaged first. Groups with different subjects are
-    compared by permutation of the subjects. Groups with subjects in common, such as conditions, are compared within
-    these subjects. The statistic is the squared distance of the means divided by its squared standard error
-    (`skindb.numerics.group_distance`), so that groups that differ only in variance are not reported as different.
+    The distance of two BRDFs is that of `skindb.optics.brdf_table.brdf_metric`, divided
+    by the length of the mean BRDF. The unit is the subject: the takes of a subject in a
+    group are averaged first. Groups with different subjects are compared by permutation
+    of the subjects. Groups with subjects in common, such as conditions, are compared
+    within these subjects. The statistic is the squared distance of the means divided by
+    its squared standard error (`skindb.numerics.group_distance`), so that groups that
+    differ only in variance are not reported as different.
 
     Parameters
     ----------
@@ -75,10 +104,12 @@ def brdf_space(
     basis
         From `population_basis` of the same takes.
     tables
-        (nh, nd, np, m) tables of the dictionary of the fits [sr^-1], or a Dask object that computes them.
+        (nh, nd, np, m) tables of the dictionary of the fits [sr^-1], or a Dask object
+        that computes them.
     group_by
-        Attribute or trait; see `skindb.analysis.groups_by`. Takes without it are excluded, and so are takes in other
-        conditions than normal unless conditions are compared.
+        Attribute or trait; see `skindb.analysis.groups_by`. Takes without it are
+        excluded, and so are takes in other conditions than normal unless conditions are
+        compared.
     permutations
         Maximum number of permutations for p values; if there are fewer, all of them are used.
     mixed_fits
@@ -89,14 +120,16 @@ def brdf_space(
     Returns
     -------
     Dataset
-        See the variables of the group "brdf_space". p values are NaN where fewer than two subjects can be compared.
-        Attributes: `groups_of_takes` (group of each take), `flags` (limitations and warnings), `adjusted_by`.
+        See the variables of the group "brdf_space". p values are NaN where fewer than
+        two subjects can be compared. Attributes: `groups_of_takes` (group of each
+        take), `flags` (limitations and warnings), `adjusted_by`.
 
     Raises
     ------
     InputError
-        If there are fewer than two groups or subjects, if the attribute is numeric, if a take has no fitted surfels,
-        if components are linearly dependent (k above the rank), or if all takes have the same BRDF.
+        If there are fewer than two groups or subjects, if the attribute is numeric, if
+        a take has no fitted surfels, if components are linearly dependent (k above the
+        rank), or if all takes have the same BRDF.
 
     References
     ----------
@@ -106,14 +139,27 @@ def brdf_space(
         require_same_fit(cohort)
     takes, named, flags = grouped_takes(cohort, group_by)
     coefficient = _coefficients(takes, basis)
-    [(metric, brdf)] = each_item(_metric_and_basis(basis["population_mixture"].values.astype(np.float64)), [tables])
+    [(metric, brdf)] = each_item(
+        _metric_and_basis(basis["population_mixture"].values.astype(np.float64)),
+        [tables],
+    )
     place = coefficient @ _metric_root(metric)
     subjects = _by_subject(takes, named, coefficient, place)
-    length = float(np.linalg.norm(known_mean(known_mean(np.moveaxis(subjects.place, 1, 0))))) or 1.0
+    length = (
+        float(np.linalg.norm(known_mean(known_mean(np.moveaxis(subjects.place, 1, 0)))))
+        or 1.0
+    )
     distance = np.linalg.norm(place[:, None] - place[None], axis=-1) / length
     if not distance.max() > IDENTICAL:  # also true if the mean BRDF is 0
         rule = "the BRDFs of takes must differ"
-        raise InputError(Fault(f"group by {group_by}", rule, "the same BRDF in all takes", "check the fits"))
+        raise InputError(
+            Fault(
+                f"group by {group_by}",
+                rule,
+                "the same BRDF in all takes",
+                "check the fits",
+            )
+        )
     mapped, explained, error = classical_scaling(distance)
     compared, adjusted_by, more = _pairs(subjects, permutations, rng)
     compared["group_distance"] /= length
@@ -132,13 +178,32 @@ def brdf_space(
     }
     pairs = [f"{a} to {b}" for a, b in combinations(subjects.groups, 2)]
     labels = [str(take) for take in takes["take"].values]
-    coords: dict[str, Any] = {"group": list(subjects.groups), "pair": pairs, "side": list(SIDES)}
-    coords |= {"take": labels, "take_2": labels, **brdf_coords(TableGrid(*averaged.shape[:3]))}
-    attrs = {"group_by": group_by, "groups_of_takes": named, "adjusted_by": adjusted_by, "flags": flags + more}
-    return dataset(variables, coords=coords, attrs=attrs | {"skipped": list(cohort.attrs.get("skipped", []))})
+    coords: dict[str, Any] = {
+        "group": list(subjects.groups),
+        "pair": pairs,
+        "side": list(SIDES),
+    }
+    coords |= {
+        "take": labels,
+        "take_2": labels,
+        **brdf_coords(TableGrid(*averaged.shape[:3])),
+    }
+    attrs = {
+        "group_by": group_by,
+        "groups_of_takes": named,
+        "adjusted_by": adjusted_by,
+        "flags": flags + more,
+    }
+    return dataset(
+        variables,
+        coords=coords,
+        attrs=attrs | {"skipped": list(cohort.attrs.get("skipped", []))},
+    )
 
 
-def grouped_takes(cohort: xr.Dataset, group_by: str) -> tuple[xr.Dataset, list[str], list[str]]:
+def grouped_takes(
+    cohort: xr.Dataset, group_by: str
+) -> tuple[xr.Dataset, list[str], list[str]]:
     """Takes that belong to a group, the names of their groups, and a flag about excluded takes.
 
     Raises
@@ -147,8 +212,19 @@ def grouped_takes(cohort: xr.Dataset, group_by: str) -> tuple[xr.Dataset, list[s
         If there are fewer than two groups or subjects, or if the attribute is numeric.
     """
     if group_by in numeric_attributes(cohort):
-        cure = "group by a trait, such as age:older" if group_by == "age" else "group by another attribute"
-        raise InputError(Fault(f"group by {group_by}", "must not be numeric", "a numeric attribute", cure))
+        cure = (
+            "group by a trait, such as age:older"
+            if group_by == "age"
+            else "group by another attribute"
+        )
+        raise InputError(
+            Fault(
+                f"group by {group_by}",
+                "must not be numeric",
+                "a numeric attribute",
+                cure,
+            )
+        )
     counted = takes_to_compare(cohort, group_by)
     named = groups_by(counted, group_by)
     kept = [i for i, name in enumerate(named) if name not in (UNKNOWN, OTHER)]
@@ -156,37 +232,71 @@ def grouped_takes(cohort: xr.Dataset, group_by: str) -> tuple[xr.Dataset, list[s
     if len(groups) < 2:
         found = f"only {groups[0]}" if groups else "no take with this attribute"
         rule = "there must be subjects of two groups"
-        raise InputError(Fault(f"group by {group_by}", rule, found, "group by another attribute"))
+        raise InputError(
+            Fault(f"group by {group_by}", rule, found, "group by another attribute")
+        )
     if len(set(texts(counted["subject"].isel(take=kept)))) < 2:
         cure = "add the takes of other subjects"
-        raise InputError(Fault(f"group by {group_by}", "there must be at least two subjects", "one", cure))
+        raise InputError(
+            Fault(
+                f"group by {group_by}",
+                "there must be at least two subjects",
+                "one",
+                cure,
+            )
+        )
     left = len(named) - len(kept)
-    flags = [f"{left} of {len(named)} takes are excluded because they belong to none of the groups"] if left else []
+    flags = (
+        [
+            f"{left} of {len(named)} takes are excluded because they belong to none of the groups"
+        ]
+        if left
+        else []
+    )
     return counted.isel(take=kept), [named[i] for i in kept], flags
 
 
 def _coefficients(takes: xr.Dataset, basis: xr.Dataset) -> Array:
-    """Coefficients (take, component) of the takes; raises `InputError` for missing ones and for a dependent basis."""
+    """Coefficients (take, component) of the takes; raises `InputError` for missing ones
+    and for a dependent basis.
+    """
     mixture = basis["population_mixture"].values.astype(np.float64)
     lengths = np.linalg.norm(mixture, axis=1, keepdims=True)
-    values = np.linalg.svd(mixture / np.where(lengths > 0, lengths, 1.0), compute_uv=False)
+    values = np.linalg.svd(
+        mixture / np.where(lengths > 0, lengths, 1.0), compute_uv=False
+    )
     rank = int((values > INDEPENDENT * values[0]).sum())
     if rank < len(mixture):
         found = f"{len(mixture)} components of rank {rank}"
-        raise InputError(Fault("basis", "the components must be linearly independent", found, "choose a smaller k"))
+        raise InputError(
+            Fault(
+                "basis",
+                "the components must be linearly independent",
+                found,
+                "choose a smaller k",
+            )
+        )
     names = [str(take) for take in takes["take"].values]
     known = {str(take): i for i, take in enumerate(basis["take"].values)}
     stored = basis["take_coefficient"].values.astype(np.float64)
-    bad = [name for name in names if name not in known or not np.isfinite(stored[known[name]]).all()]
+    bad = [
+        name
+        for name in names
+        if name not in known or not np.isfinite(stored[known[name]]).all()
+    ]
     if bad:
         rule = "a take must have fitted surfels"
         cure = "fit it again, or exclude it"
-        raise InputError(Fault(f"take {name}", rule, "none in the basis", cure) for name in bad)
+        raise InputError(
+            Fault(f"take {name}", rule, "none in the basis", cure) for name in bad
+        )
     return stored[[known[name] for name in names]]
 
 
 def _metric_and_basis(mixture: Array) -> Any:
-    """Function from tables to the Gram matrix (k, k) and the tables (nh, nd, np, k) of the components."""
+    """Function from tables to the Gram matrix (k, k) and the tables (nh, nd, np, k) of
+    the components.
+    """
 
     def of(tables: NDArray[Any]) -> tuple[Array, Array]:
         own = c_contiguous(mixture)
@@ -196,26 +306,38 @@ def _metric_and_basis(mixture: Array) -> Any:
 
 
 def _metric_root(metric: Array) -> Array:
-    """Matrix R with R R^T = metric: the length of c R is that of the BRDF with the coefficients c."""
+    """Matrix R with R R^T = metric: the length of c R is that of the BRDF with the
+    coefficients c.
+    """
     values, vectors = np.linalg.eigh(metric)
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
-def _by_subject(takes: xr.Dataset, named: Sequence[str], coefficient: Array, place: Array) -> _Subjects:
+def _by_subject(
+    takes: xr.Dataset, named: Sequence[str], coefficient: Array, place: Array
+) -> _Subjects:
     """Average the takes of every subject within each group; the group "normal" is the first."""
     who = np.array([str(one) for one in texts(takes["subject"])])
     group = np.array(named)
     groups = sorted(set(named), key=lambda name: (name != NORMAL, name))
-    members = [[(who == s) & (group == g) for g in groups] for s in dict.fromkeys(who.tolist())]
+    members = [
+        [(who == s) & (group == g) for g in groups] for s in dict.fromkeys(who.tolist())
+    ]
     means = [
-        np.stack([np.stack([known_mean(values[own]) for own in row]) for row in members])
+        np.stack(
+            [np.stack([known_mean(values[own]) for own in row]) for row in members]
+        )
         for values in (coefficient, place)
     ]
     return _Subjects(tuple(groups), *means)
 
 
-def _pairs(subjects: _Subjects, most: int, rng: np.random.Generator) -> tuple[dict[str, Array], str, list[str]]:
-    """Distances [length of a BRDF] and p values of every pair, the method of adjustment, and flags."""
+def _pairs(
+    subjects: _Subjects, most: int, rng: np.random.Generator
+) -> tuple[dict[str, Array], str, list[str]]:
+    """Distances [length of a BRDF] and p values of every pair, the method of
+    adjustment, and flags.
+    """
     there = subjects.there
     groups = subjects.groups
     rows = []
@@ -238,19 +360,29 @@ def _pairs(subjects: _Subjects, most: int, rng: np.random.Generator) -> tuple[di
         drawn = 0
         if min(count) < 2:
             flags.append(
-                f"{name}: no p value with fewer than two subjects {'in both groups' if within[-1] else 'per group'}"
+                f"{name}: no p value with fewer than two subjects "
+                f"{'in both groups' if within[-1] else 'per group'}"
             )
         elif within[-1]:
             (statistic,), (p,), drawn = within_subjects_p(values, most=most, rng=rng)
         else:
-            one = np.concatenate([values[there[:, side], i] for i, side in enumerate((a, b))])
-            (statistic,), (p,), drawn = between_groups_p(one, np.repeat([0, 1], count), most=most, rng=rng)
+            one = np.concatenate(
+                [values[there[:, side], i] for i, side in enumerate((a, b))]
+            )
+            (statistic,), (p,), drawn = between_groups_p(
+                one, np.repeat([0, 1], count), most=most, rng=rng
+            )
         if 2 <= min(count) < FEW:
-            flags.append(f"{name}: {count[0]} and {count[1]} subjects; p values are approximate with fewer than {FEW}")
+            flags.append(
+                f"{name}: {count[0]} and {count[1]} subjects; p values are "
+                f"approximate with fewer than {FEW}"
+            )
         length = float(np.linalg.norm(step))
         noise = length / np.sqrt(statistic) if statistic > 0 else np.nan
         rows.append((length, noise, p, np.array(count), drawn))
-    distances, noises, ps, counts, permuted = (np.array(column) for column in zip(*rows, strict=True))
+    distances, noises, ps, counts, permuted = (
+        np.array(column) for column in zip(*rows, strict=True)
+    )
     adjusted, how = _adjusted(subjects, ps, within, most, rng)
     return (
         {
@@ -267,13 +399,20 @@ def _pairs(subjects: _Subjects, most: int, rng: np.random.Generator) -> tuple[di
 
 
 def _adjusted(
-    subjects: _Subjects, p: Array, within: Sequence[bool], most: int, rng: np.random.Generator
+    subjects: _Subjects,
+    p: Array,
+    within: Sequence[bool],
+    most: int,
+    rng: np.random.Generator,
 ) -> tuple[Array, str]:
-    """P values adjusted for all pairs, and the method: joint permutations of all groups if these are valid."""
+    """P values adjusted for all pairs, and the method: joint permutations of all groups
+    if these are valid.
+    """
     finite = np.isfinite(p)
     if finite.sum() < 2:
         return p, ONE_PAIR
-    if not finite.all() or len(set(within)) > 1:  # no single permutation scheme is valid for all pairs
+    # no single permutation scheme is valid for all pairs
+    if not finite.all() or len(set(within)) > 1:
         return np.minimum(p * finite.sum(), 1.0), "Bonferroni"
     if within[0]:
         _, largest, _ = within_subjects_p(subjects.place, most=most, rng=rng)
@@ -288,7 +427,10 @@ def tabulate_brdf_space(space: xr.Dataset) -> tuple[list[str], list[list[Any]]]:
     """Header and rows of the table of `brdf_space`, one row per pair of groups."""
     counts = space["pair_subject_count"].values.tolist()
     columns = [space[name].values.tolist() for name in COLUMNS]
-    rows = [[str(pair), *counts[i], *(c[i] for c in columns)] for i, pair in enumerate(space["pair"].values)]
+    rows = [
+        [str(pair), *counts[i], *(c[i] for c in columns)]
+        for i, pair in enumerate(space["pair"].values)
+    ]
     return ["pair", *(f"subjects_{side}" for side in SIDES), *COLUMNS], rows
 
 
@@ -302,7 +444,8 @@ def describe_brdf_space(space: xr.Dataset) -> list[str]:
     fractions = ", ".join(f"{one:.0%}" for one in space["explained_fraction"].values)
     return [
         f"{differ} of {compared} pairs of groups differ (p < {SIGNIFICANT:g}; {how})",
-        "distances are relative to the length of the mean BRDF; group_distance_noise is the distance expected from the "
+        "distances are relative to the length of the mean BRDF; "
+        "group_distance_noise is the distance expected from the "
         "scatter of subjects alone",
         f"map of {space.sizes['take']} takes: its axes explain {fractions} of the scatter; "
         f"the RMS error of its distances is {float(space['map_error']):.1%}",

@@ -1,10 +1,12 @@
-"""Maps of melanin and haemoglobin by unmixing log albedo into two independent pigments (Tsumura et al. 2003).
+"""Maps of melanin and haemoglobin by unmixing log albedo into two independent pigments
+(Tsumura et al. 2003).
 
-The model is -ln R_d = melanin * m + haemoglobin * h + offset. If two pigments vary independently over skin, the
-independent components in the plane of the two largest principal components of -ln R_d are their absorption vectors m
-and h (Tsumura et al. 2003, Image-based skin color and texture analysis/synthesis by extracting hemoglobin and melanin
-information in the skin, ACM Transactions on Graphics 22, 770-779). Unlike the photographs of the paper, R_d contains no
-shading.
+The model is -ln R_d = melanin * m + haemoglobin * h + offset. If two pigments vary
+independently over skin, the independent components in the plane of the two largest
+principal components of -ln R_d are their absorption vectors m and h (Tsumura et al.
+2003, Image-based skin color and texture analysis/synthesis by extracting hemoglobin and
+melanin information in the skin, ACM Transactions on Graphics 22, 770-779). Unlike the
+photographs of the paper, R_d contains no shading.
 """
 
 from __future__ import annotations
@@ -36,28 +38,44 @@ if TYPE_CHECKING:
 
 CHROMOPHORES = ("melanin", "haemoglobin")
 CHANNELS = ("R", "G", "B")
-# absorption in Gaussian bands (standard deviation 30 nm) at 600, 540 and 450 nm relative to that at 540 nm: eumelanin
-# (Sarna and Swartz 1988), haemoglobin with 75 % oxygenation (Prahl 1999); a test computes them from the tables
+# absorption in Gaussian bands (standard deviation 30 nm) at 600, 540 and 450 nm
+# relative to that at 540 nm: eumelanin (Sarna and Swartz 1988), haemoglobin with 75 %
+# oxygenation (Prahl 1999); a test computes them from the tables
 TABLE_AXES = np.array([[0.687, 1.0, 1.683], [0.490, 1.0, 4.210]])
-# maximum angles [deg] between components and these. That of haemoglobin is wide because blue light hardly reaches the
-# blood: the peak at 420 nm is far weaker in reflectance than in the transmission of a cuvette
+# maximum angles [deg] between components and these. That of haemoglobin is wide because
+# blue light hardly reaches the blood: the peak at 420 nm is far weaker in reflectance
+# than in the transmission of a cuvette
 MAX_TABLE_ANGLE = np.array([30.0, 60.0])
-MAX_AXIS_SPREAD = 10.0  # [deg] RMS over bootstrap samples; it is about 30 for normally distributed pigments
-MIN_PLANE_RATIO = 1.5  # of the second to the third principal variance, below which noise hides a second pigment
-MAX_PLANE_CONDITION = 1e3  # of the red and green rows of the plane, above which they do not determine a vector in it
-MAX_NEGATIVE = 0.1  # relative to green: no pigment brightens skin, but noise rotates an axis slightly
-MIN_SEPARATION = 5.0  # [deg] between both axes: the noise of the amounts is inversely proportional to it
+# [deg] RMS over bootstrap samples; it is about 30 for normally distributed pigments
+MAX_AXIS_SPREAD = 10.0
+# of the second to the third principal variance, below which noise hides a second
+# pigment
+MIN_PLANE_RATIO = 1.5
+# of the red and green rows of the plane, above which they do not determine a vector in
+# it
+MAX_PLANE_CONDITION = 1e3
+# relative to green: no pigment brightens skin, but noise rotates an axis slightly
+MAX_NEGATIVE = 0.1
+# [deg] between both axes: the noise of the amounts is inversely proportional to it
+MIN_SEPARATION = 5.0
 SAMPLES = 24_000  # texels of all takes together from which the axes are computed
-TILES = 4  # along each side; the bootstrap draws whole tiles because neighbouring texels are correlated
+# along each side; the bootstrap draws whole tiles because neighbouring texels are
+# correlated
+TILES = 4
 DRAWS = 20  # bootstrap samples
 CONSTANT = 1e-12  # variance of -ln R_d up to which maps count as constant
 INDEPENDENT = "independent components"
-PROJECTED = "published absorption of red and green, in the plane of the two largest principal components"
+PROJECTED = (
+    "published absorption of red and green, in the plane of the two largest principal "
+    "components"
+)
 PUBLISHED = "published absorption"
 
 
 class _Sampled(NamedTuple):
-    """Texels of a take: -ln R_d (n, 3) minus its mean, the mean (3,), and the tile of each texel (n,)."""
+    """Texels of a take: -ln R_d (n, 3) minus its mean, the mean (3,), and the tile of
+    each texel (n,).
+    """
 
     density: Array
     mean: Array
@@ -66,7 +84,9 @@ class _Sampled(NamedTuple):
 
 @dataclass(frozen=True)
 class _Plane:
-    """The two largest principal components (3, 2), scaled by their standard deviations, and all three variances."""
+    """The two largest principal components (3, 2), scaled by their standard deviations,
+    and all three variances.
+    """
 
     axes: Array
     variance: Array
@@ -81,19 +101,21 @@ def chromophore_axes(
 ) -> xr.Dataset:
     """Absorption vectors of melanin and haemoglobin, from the variation of albedo within takes.
 
-    Differences between takes are excluded, because a chance correlation of melanin and blood among a few people would
-    rotate the axes. Every take has the same weight. Melanin is the component that absorbs more red relative to green.
-    If independent components cannot be identified, or are not plausible absorption vectors, published absorption is
-    used instead, and "flags" gives the reason. Amounts are then approximate, because the absorption of blue light by
-    blood is weaker in skin than in a cuvette.
+    Differences between takes are excluded, because a chance correlation of melanin and
+    blood among a few people would rotate the axes. Every take has the same weight.
+    Melanin is the component that absorbs more red relative to green. If independent
+    components cannot be identified, or are not plausible absorption vectors, published
+    absorption is used instead, and "flags" gives the reason. Amounts are then
+    approximate, because the absorption of blue light by blood is weaker in skin than in
+    a cuvette.
 
     Parameters
     ----------
     cohort
         ``db.cohort("maps", variables=skindb.analysis.texture.MAPPED)``.
     landmarks
-        Name -> (2,) position in the common (u, v), to restrict the texels to skin without beard, brows and lips. By
-        default all measured texels are used.
+        Name -> (2,) position in the common (u, v), to restrict the texels to skin
+        without beard, brows and lips. By default all measured texels are used.
     mixed_fits
         Accept takes that were fitted with different parameters.
     rng
@@ -102,9 +124,10 @@ def chromophore_axes(
     Returns
     -------
     Dataset
-        `chromophore_axis` (chromophore, channel), 1 in green; `chromophore_offset`, the mean -ln R_d, at which amounts
-        are 0; `chromophore_table_axis`, published absorption, and `chromophore_table_angle` to it;
-        `chromophore_axis_spread` by bootstrap over tiles of maps; `density_variance` of the principal components.
+        `chromophore_axis` (chromophore, channel), 1 in green; `chromophore_offset`, the
+        mean -ln R_d, at which amounts are 0; `chromophore_table_axis`, published
+        absorption, and `chromophore_table_angle` to it; `chromophore_axis_spread` by
+        bootstrap over tiles of maps; `density_variance` of the principal components.
         Attributes: `axes_origin`, `flags`, `skipped`.
 
     Raises
@@ -119,9 +142,15 @@ def chromophore_axes(
     flags = []
     inside = drawn.get("no_beard", drawn[FACE])
     if "no_beard" not in drawn:
-        flags.append("no landmarks: beards, brows and lips are used as skin and may rotate the axes")
+        flags.append(
+            "no landmarks: beards, brows and lips are used as skin and may rotate the axes"
+        )
     count = max(SAMPLES // max(cohort.sizes["take"], 1), 64)
-    found = [one for one in each_take(_sampled, cohort, MAPPED, inside, count) if one is not None]
+    found = [
+        one
+        for one in each_take(_sampled, cohort, MAPPED, inside, count)
+        if one is not None
+    ]
     if not found:
         rule = "some texels of skin must be measured"
         cure = "fit or register more takes"
@@ -134,7 +163,11 @@ def chromophore_axes(
     plane = _principal_plane(density)
     mixing, spread = _components(found, plane, rng)
     reasons = _rejection_reasons(mixing, spread, plane)
-    axes, origin = (np.maximum(mixing, 0.0), INDEPENDENT) if not reasons else _published_axes(plane)
+    axes, origin = (
+        (np.maximum(mixing, 0.0), INDEPENDENT)
+        if not reasons
+        else _published_axes(plane)
+    )
     if reasons:
         flags.append(
             f"independent components are not used ({'; '.join(reasons)}): "
@@ -150,7 +183,11 @@ def chromophore_axes(
             "density_variance": plane.variance,
         },
         coords={"chromophore": list(CHROMOPHORES), "channel": list(CHANNELS)},
-        attrs={"axes_origin": origin, "flags": flags, "skipped": list(cohort.attrs.get("skipped", []))},
+        attrs={
+            "axes_origin": origin,
+            "flags": flags,
+            "skipped": list(cohort.attrs.get("skipped", [])),
+        },
     )
 
 
@@ -167,25 +204,36 @@ def chromophore_maps(maps: xr.Dataset, axes: xr.Dataset) -> xr.Dataset:
     Returns
     -------
     Dataset
-        `texel_chromophore` (v, u, chromophore): optical density (-ln R_d) at green due to the pigment, relative to the
-        mean of the cohort (amounts may be negative); `texel_chromophore_residual` (v, u): the part of -ln R_d along the
-        third direction, which neither pigment explains. NaN where nothing was measured.
+        `texel_chromophore` (v, u, chromophore): optical density (-ln R_d) at green due
+        to the pigment, relative to the mean of the cohort (amounts may be negative);
+        `texel_chromophore_residual` (v, u): the part of -ln R_d along the third
+        direction, which neither pigment explains. NaN where nothing was measured.
     """
     density, measured = _density(maps)
-    amounts, residual = _unmixed(density, axes["chromophore_axis"].values, axes["chromophore_offset"].values)
+    amounts, residual = _unmixed(
+        density, axes["chromophore_axis"].values, axes["chromophore_offset"].values
+    )
     return dataset(
         {
-            "texel_chromophore": np.where(measured[..., None], amounts, np.nan).astype(np.float32),
-            "texel_chromophore_residual": np.where(measured, residual, np.nan).astype(np.float32),
+            "texel_chromophore": np.where(measured[..., None], amounts, np.nan).astype(
+                np.float32
+            ),
+            "texel_chromophore_residual": np.where(measured, residual, np.nan).astype(
+                np.float32
+            ),
         },
         coords={"chromophore": list(CHROMOPHORES)},
     )
 
 
 def chromophore_statistics(
-    cohort: xr.Dataset, *, axes: xr.Dataset, landmarks: Mapping[str, Array] | None = None
+    cohort: xr.Dataset,
+    *,
+    axes: xr.Dataset,
+    landmarks: Mapping[str, Array] | None = None,
 ) -> xr.Dataset:
-    """Mean and standard deviation of melanin and haemoglobin over the texels of every take and region.
+    """Mean and standard deviation of melanin and haemoglobin over the texels of every
+    take and region.
 
     Parameters
     ----------
@@ -197,15 +245,18 @@ def chromophore_statistics(
     Returns
     -------
     Dataset
-        `take_chromophore`, `take_chromophore_deviation` (take, region, chromophore), `take_chromophore_residual` (take,
-        region) and `take_chromophore_coverage`. NaN for regions of which less than half was measured.
+        `take_chromophore`, `take_chromophore_deviation` (take, region, chromophore),
+        `take_chromophore_residual` (take, region) and `take_chromophore_coverage`. NaN
+        for regions of which less than half was measured.
     """
     drawn = chromophore_regions(landmarks or {}, cohort.sizes["v"])
     masks = np.stack(list(drawn.values()))
     vectors = axes["chromophore_axis"].values
     offset = axes["chromophore_offset"].values
     rows = each_take(_statistics, cohort, MAPPED, masks, vectors, offset)
-    mean, deviation, residual, covered = (np.stack(column) for column in zip(*rows, strict=True))
+    mean, deviation, residual, covered = (
+        np.stack(column) for column in zip(*rows, strict=True)
+    )
     return dataset(
         {
             "take_chromophore": mean,
@@ -222,7 +273,9 @@ def chromophore_statistics(
     )
 
 
-def chromophore_table(cohort: xr.Dataset, *, statistics: xr.Dataset, group_by: str | None = None) -> xr.Dataset:
+def chromophore_table(
+    cohort: xr.Dataset, *, statistics: xr.Dataset, group_by: str | None = None
+) -> xr.Dataset:
     """Mean melanin and haemoglobin of groups of subjects, with Student's 95 % interval.
 
     Parameters
@@ -232,8 +285,9 @@ def chromophore_table(cohort: xr.Dataset, *, statistics: xr.Dataset, group_by: s
     statistics
         From `chromophore_statistics` of these takes.
     group_by
-        Attribute or trait; None puts all takes into the group "all". Takes in other conditions than normal are used
-        only if it is "condition" or a trait of it. The takes of a subject in a group are averaged first.
+        Attribute or trait; None puts all takes into the group "all". Takes in other
+        conditions than normal are used only if it is "condition" or a trait of it. The
+        takes of a subject in a group are averaged first.
 
     Returns
     -------
@@ -244,16 +298,29 @@ def chromophore_table(cohort: xr.Dataset, *, statistics: xr.Dataset, group_by: s
     groups = groups_by(takes, group_by)
     subjects = [str(one) for one in takes["subject"].values.tolist()]
     names = sorted(set(groups))
-    values = statistics["take_chromophore"].sel(take=[str(take) for take in takes["take"].values]).values
+    values = (
+        statistics["take_chromophore"]
+        .sel(take=[str(take) for take in takes["take"].values])
+        .values
+    )
     parts = []
     for name in names:
         own: dict[str, list[int]] = {}
         for i, (group, subject) in enumerate(zip(groups, subjects, strict=True)):
             if group == name:
                 own.setdefault(subject, []).append(i)
-        parts.append(Moments.of(np.stack([known_mean(values[rows]) for rows in own.values()])))
-    stacked = Moments(*(np.stack([getattr(part, f) for part in parts]) for f in ("count", "mean", "second")))
-    low, high = (np.where(stacked.count > 1, end, np.nan) for end in stacked.mean_interval())
+        parts.append(
+            Moments.of(np.stack([known_mean(values[rows]) for rows in own.values()]))
+        )
+    stacked = Moments(
+        *(
+            np.stack([getattr(part, f) for part in parts])
+            for f in ("count", "mean", "second")
+        )
+    )
+    low, high = (
+        np.where(stacked.count > 1, end, np.nan) for end in stacked.mean_interval()
+    )
     return dataset(
         {
             "group_chromophore_count": stacked.count,
@@ -262,7 +329,11 @@ def chromophore_table(cohort: xr.Dataset, *, statistics: xr.Dataset, group_by: s
             "group_chromophore_mean_high": high,
             "group_chromophore_standard_deviation": stacked.standard_deviation,
         },
-        coords={"group": names, "region": statistics["region"].values, "chromophore": list(CHROMOPHORES)},
+        coords={
+            "group": names,
+            "region": statistics["region"].values,
+            "chromophore": list(CHROMOPHORES),
+        },
         attrs={
             "takes": sorted(map(str, takes["take"].values)),
             "group_by": group_by or "",
@@ -278,18 +349,27 @@ def chromophore_regions(landmarks: Mapping[str, Array], size: int) -> dict[str, 
         return whole
     centre = (np.arange(size) + 0.5) / size
     at = np.stack(np.meshgrid(centre, centre), axis=-1).reshape(-1, 2)
-    return whole | {name: mask.reshape(size, size) for name, mask in region_masks(at, landmarks).items()}
+    return whole | {
+        name: mask.reshape(size, size)
+        for name, mask in region_masks(at, landmarks).items()
+    }
 
 
 def _density(maps: xr.Dataset) -> tuple[Array, Mask]:
     """-ln R_d (v, u, 3), 0 where nothing was measured, and the mask (v, u) of measured texels."""
     albedo = maps["texel_diffuse_reflectance"].values.astype(np.float64)
-    measured = (maps["texel_coverage"].values > COVERED) & np.isfinite(albedo).all(axis=-1)
-    return -np.log(np.maximum(np.where(measured[..., None], albedo, 1.0), DARKEST)), measured
+    measured = (maps["texel_coverage"].values > COVERED) & np.isfinite(albedo).all(
+        axis=-1
+    )
+    return -np.log(
+        np.maximum(np.where(measured[..., None], albedo, 1.0), DARKEST)
+    ), measured
 
 
 def _sampled(maps: xr.Dataset, inside: Mask, count: int) -> _Sampled | None:
-    """Evenly spaced texels of the skin of one take; `count` texels, so that each take has the same weight."""
+    """Evenly spaced texels of the skin of one take; `count` texels, so that each take
+    has the same weight.
+    """
     density, measured = _density(maps)
     rows, columns = np.nonzero(measured & inside)
     if not len(rows):
@@ -300,7 +380,9 @@ def _sampled(maps: xr.Dataset, inside: Mask, count: int) -> _Sampled | None:
     height, width = measured.shape
     tile = rows * TILES // height * TILES + columns * TILES // width
     values = density[rows, columns]
-    return _Sampled(values - values.mean(axis=0), density[measured & inside].mean(axis=0), tile)
+    return _Sampled(
+        values - values.mean(axis=0), density[measured & inside].mean(axis=0), tile
+    )
 
 
 def _principal_plane(density: Array) -> _Plane:
@@ -310,28 +392,45 @@ def _principal_plane(density: Array) -> _Plane:
     return _Plane(vectors[:, :0:-1] * np.sqrt(values[:2]), values)
 
 
-def _components(found: list[_Sampled], plane: _Plane, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Independent components (2, 3), melanin first, and their RMS rotation [deg] in bootstrap samples.
+def _components(
+    found: list[_Sampled], plane: _Plane, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Independent components (2, 3), melanin first, and their RMS rotation [deg] in
+    bootstrap samples.
 
     Both are NaN if the density varies in one direction only.
     """
     nothing = np.full((2, 3), np.nan), np.full(2, np.nan)
     if plane.variance[1] <= 1e-9 * plane.variance[0]:
         return nothing
-    blocks = [one.density[one.tile == tile] for one in found for tile in np.unique(one.tile)]
+    blocks = [
+        one.density[one.tile == tile] for one in found for tile in np.unique(one.tile)
+    ]
     best = _independent(np.concatenate(blocks), rng)
-    draws = [[blocks[i] for i in rng.integers(len(blocks), size=len(blocks))] for _ in range(DRAWS)]
+    draws = [
+        [blocks[i] for i in rng.integers(len(blocks), size=len(blocks))]
+        for _ in range(DRAWS)
+    ]
     turned = [_angle(_independent(np.concatenate(draw), rng), best) for draw in draws]
     return best, np.sqrt(np.mean(np.square(turned), axis=0))
 
 
 def _independent(density: Array, rng: np.random.Generator) -> Array:
-    """Independent components (2, 3) in the principal plane, 1 in green; the one that absorbs more red is the first."""
+    """Independent components (2, 3) in the principal plane, 1 in green; the one that
+    absorbs more red is the first.
+    """
     axes = _principal_plane(density).axes
     white = density @ np.linalg.pinv(axes).T
     white -= white.mean(axis=0)
-    # no warning is needed: a component that has not converged rotates in the bootstrap and is then rejected
-    ica = FastICA(whiten=False, fun="logcosh", max_iter=500, tol=1e-5, random_state=int(rng.integers(2**31)))
+    # no warning is needed: a component that has not converged rotates in the bootstrap
+    # and is then rejected
+    ica = FastICA(
+        whiten=False,
+        fun="logcosh",
+        max_iter=500,
+        tol=1e-5,
+        random_state=int(rng.integers(2**31)),
+    )
     mixing = (axes @ _mixing_matrix(ica, white)).T
     green = mixing[:, 1:2]
     mixing = mixing / np.where(np.abs(green) > 1e-6, green, 1e-6)
@@ -352,29 +451,43 @@ def _rejection_reasons(mixing: Array, spread: Array, plane: _Plane) -> list[str]
     why = []
     ratio = plane.variance[1] / max(plane.variance[2], 1e-300)
     if ratio < MIN_PLANE_RATIO:
-        why.append(f"the second principal variance is {ratio:.2f} times the third, as with one pigment and noise")
+        why.append(
+            f"the second principal variance is {ratio:.2f} times the third, as "
+            "with one pigment and noise"
+        )
     if spread.max() > MAX_AXIS_SPREAD:
-        why.append(f"they rotate by {spread.max():.0f} degrees between samples, as with normally distributed pigments")
+        why.append(
+            f"they rotate by {spread.max():.0f} degrees between samples, as with "
+            "normally distributed pigments"
+        )
     if mixing.min() < -MAX_NEGATIVE:
         channel = CHANNELS[int(np.argmin(mixing.min(axis=0)))]
         why.append(f"one of them would brighten {channel}, which no pigment does")
     angle = _angle(mixing, TABLE_AXES)
-    for name, is_far, value in zip(CHROMOPHORES, angle > MAX_TABLE_ANGLE, angle, strict=True):
+    for name, is_far, value in zip(
+        CHROMOPHORES, angle > MAX_TABLE_ANGLE, angle, strict=True
+    ):
         if is_far:
-            why.append(f"the axis of {name} is {value:.0f} degrees from published absorption")
+            why.append(
+                f"the axis of {name} is {value:.0f} degrees from published absorption"
+            )
     if (apart := float(_angle(mixing[:1], mixing[1:])[0])) < MIN_SEPARATION:
         why.append(f"they are {apart:.1f} degrees apart")
     return why
 
 
 def _published_axes(plane: _Plane) -> tuple[Array, str]:
-    """Axes with the published absorption of red and green; that of blue follows from the plane if this is possible.
+    """Axes with the published absorption of red and green; that of blue follows from
+    the plane if this is possible.
 
-    An orthogonal projection to the plane would exchange the pigments: haemoglobin absorbs blue more than melanin in a
-    cuvette, but less in skin.
+    An orthogonal projection to the plane would exchange the pigments: haemoglobin
+    absorbs blue more than melanin in a cuvette, but less in skin.
     """
     red_green = plane.axes[:2]
-    if plane.variance[1] > MIN_PLANE_RATIO * plane.variance[2] and np.linalg.cond(red_green) < MAX_PLANE_CONDITION:
+    if (
+        plane.variance[1] > MIN_PLANE_RATIO * plane.variance[2]
+        and np.linalg.cond(red_green) < MAX_PLANE_CONDITION
+    ):
         within = (plane.axes @ np.linalg.solve(red_green, TABLE_AXES[:, :2].T)).T
         if (within > 0).all() and _angle(within[:1], within[1:])[0] >= MIN_SEPARATION:
             return within / within[:, 1:2], PROJECTED
@@ -388,8 +501,12 @@ def _unmixed(density: Array, axes: Array, offset: Array) -> tuple[Array, Array]:
     return inner @ np.linalg.pinv(axes), inner @ (normal / np.linalg.norm(normal))
 
 
-def _statistics(maps: xr.Dataset, masks: Array, axes: Array, offset: Array) -> tuple[Array, Array, Array, Array]:
-    """Mean and standard deviation (region, chromophore), RMS residual (region,) and coverage (region,)."""
+def _statistics(
+    maps: xr.Dataset, masks: Array, axes: Array, offset: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Mean and standard deviation (region, chromophore), RMS residual (region,) and
+    coverage (region,).
+    """
     density, measured = _density(maps)
     covered = np.array([(measured & mask).sum() / max(mask.sum(), 1) for mask in masks])
     mean, deviation = np.full((2, len(masks), len(CHROMOPHORES)), np.nan)
@@ -399,13 +516,19 @@ def _statistics(maps: xr.Dataset, masks: Array, axes: Array, offset: Array) -> t
         if not (covered[r] >= LEAST_COVERED if r else measured.any()):
             continue
         amounts, residual = _unmixed(density[measured & mask], axes, offset)
-        mean[r], deviation[r], left[r] = amounts.mean(axis=0), amounts.std(axis=0), np.sqrt(np.mean(residual**2))
+        mean[r], deviation[r], left[r] = (
+            amounts.mean(axis=0),
+            amounts.std(axis=0),
+            np.sqrt(np.mean(residual**2)),
+        )
     return mean, deviation, left, covered
 
 
 def _angle(a: Array, b: Array) -> Array:
     """Angles [deg] between the rows (n, 3) of two arrays."""
-    cosine = (a * b).sum(axis=-1) / np.linalg.norm(a, axis=-1) / np.linalg.norm(b, axis=-1)
+    cosine = (
+        (a * b).sum(axis=-1) / np.linalg.norm(a, axis=-1) / np.linalg.norm(b, axis=-1)
+    )
     return np.asarray(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))))
 
 
@@ -416,20 +539,28 @@ def describe_chromophores(axes: xr.Dataset) -> list[str]:
         one = axes.sel(chromophore=name)
         vector = ", ".join(f"{value:.2f}" for value in one["chromophore_axis"].values)
         lines.append(
-            f"{name}: absorbs R, G, B as {vector}; {float(one['chromophore_table_angle']):.0f} degrees from "
+            f"{name}: absorbs R, G, B as {vector}; "
+            f"{float(one['chromophore_table_angle']):.0f} degrees from "
             f"published absorption; independent components rotate by "
             f"{float(one['chromophore_axis_spread']):.1f} degrees "
             "between samples"
         )
-    lines.append("amounts are optical densities (-ln R_d) of a pigment at green, relative to the mean of all takes")
+    lines.append(
+        "amounts are optical densities (-ln R_d) of a pigment at green, relative "
+        "to the mean of all takes"
+    )
     return [*lines, *axes.attrs["flags"]]
 
 
-def plot_chromophores(statistics: xr.Dataset, *, table: xr.Dataset | None = None, ax: Axes | None = None) -> Axes:
+def plot_chromophores(
+    statistics: xr.Dataset, *, table: xr.Dataset | None = None, ax: Axes | None = None
+) -> Axes:
     """Plot mean melanin and haemoglobin of the groups in every region, with 95 % intervals."""
     from matplotlib import pyplot
 
-    shown = [name for name in statistics["region"].values.tolist() if str(name) != "neck"]
+    shown = [
+        name for name in statistics["region"].values.tolist() if str(name) != "neck"
+    ]
     if ax is None:
         _, ax = pyplot.subplots(figsize=(6.5, 1.4 + 0.55 * len(shown)))
     ax.axvline(0, color="0.6", linewidth=1)
@@ -438,12 +569,19 @@ def plot_chromophores(statistics: xr.Dataset, *, table: xr.Dataset | None = None
     groups = [str(name) for name in table["group"].values]
     lines = len(groups) * len(CHROMOPHORES)
     for g, group in enumerate(groups):
-        for c, (name, colour) in enumerate(zip(CHROMOPHORES, (colours.BLUE, colours.RED), strict=True)):
+        for c, (name, colour) in enumerate(
+            zip(CHROMOPHORES, (colours.BLUE, colours.RED), strict=True)
+        ):
             one = table.sel(group=group, chromophore=name, region=shown)
-            y = np.arange(len(shown)) + 0.7 * ((g * len(CHROMOPHORES) + c + 0.5) / lines - 0.5)
+            y = np.arange(len(shown)) + 0.7 * (
+                (g * len(CHROMOPHORES) + c + 0.5) / lines - 0.5
+            )
             mean = one["group_chromophore_mean"].values
             bars = np.nan_to_num(
-                [mean - one["group_chromophore_mean_low"].values, one["group_chromophore_mean_high"].values - mean]
+                [
+                    mean - one["group_chromophore_mean_low"].values,
+                    one["group_chromophore_mean_high"].values - mean,
+                ]
             )
             count = int(one["group_chromophore_count"].max())
             ax.errorbar(
@@ -460,6 +598,14 @@ def plot_chromophores(statistics: xr.Dataset, *, table: xr.Dataset | None = None
             )
     ax.set_yticks(range(len(shown)), shown)
     ax.invert_yaxis()
-    ax.set_xlabel("amount relative to the mean of all takes, with 95 % CI [-ln R_d at green]")
-    ax.legend(fontsize=7, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False)
+    ax.set_xlabel(
+        "amount relative to the mean of all takes, with 95 % CI [-ln R_d at green]"
+    )
+    ax.legend(
+        fontsize=7,
+        loc="lower center",
+        bbox_to_anchor=(0.5, 1.0),
+        ncols=2,
+        frameon=False,
+    )
     return ax

@@ -21,34 +21,39 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 UNIT = {"units": "1", "long_name": "unit vector"}
-LEAST_KNOWN = 0.5  # minimum fraction of known entries of a take; an entry unknown in one take is dropped for all takes
+# minimum fraction of known entries of a take; an entry unknown in one take is dropped
+# for all takes
+LEAST_KNOWN = 0.5
 
 
-def principal_components(values: xr.DataArray, *, most: int = 10, least_known: float = LEAST_KNOWN) -> xr.Dataset:
+def principal_components(
+    values: xr.DataArray, *, most: int = 10, least_known: float = LEAST_KNOWN
+) -> xr.Dataset:
     """Mean, principal axes and scores of the takes of a cohort.
 
-    Every take is read by its own tasks. The vectors of all takes are kept in memory in their own precision (550 MB for
-    174 maps of 512 x 512 texels).
+    Every take is read by its own tasks. The vectors of all takes are kept in memory in
+    their own precision (550 MB for 174 maps of 512 x 512 texels).
 
     Parameters
     ----------
     values
-        Variable of a cohort with the dimension ``take`` and any others: histograms, maps in the common (u, v), or
-        colours.
+        Variable of a cohort with the dimension ``take`` and any others: histograms,
+        maps in the common (u, v), or colours.
     most
         Maximum number of components; it is also at most the number of takes minus one.
     least_known
-        Takes with a smaller fraction of known entries are excluded. Only entries that are known in all other takes are
-        used.
+        Takes with a smaller fraction of known entries are excluded. Only entries that
+        are known in all other takes are used.
 
     Returns
     -------
     Dataset
-        `mean` and `axis` (component, ...) in the units of `values`, NaN where an entry was not used; `score` (take,
-        component), so that mean + score * axis approximates the take; `explained_variance` and
-        `explained_variance_ratio` (component,); `residual` (take,), the root mean square of the part that the
-        components do not explain.
-        Attributes: `skipped`, and `used_fraction`, the fraction of the entries that was used.
+        `mean` and `axis` (component, ...) in the units of `values`, NaN where an entry
+        was not used; `score` (take, component), so that mean + score * axis
+        approximates the take; `explained_variance` and `explained_variance_ratio`
+        (component,); `residual` (take,), the root mean square of the part that the
+        components do not explain. Attributes: `skipped`, and `used_fraction`, the
+        fraction of the entries that was used.
 
     Raises
     ------
@@ -67,20 +72,35 @@ def principal_components(values: xr.DataArray, *, most: int = 10, least_known: f
     fraction = np.array([one.mean() for one in known])
     kept = np.flatnonzero((fraction >= least_known) & (fraction > 0))
     skipped = [
-        note(takes[i], f"only {fraction[i]:.0%} of its entries are known") for i in range(len(takes)) if i not in kept
+        note(takes[i], f"only {fraction[i]:.0%} of its entries are known")
+        for i in range(len(takes))
+        if i not in kept
     ]
     if len(kept) < 2:
         rule = "at least two takes must have enough values"
         there = f"{len(kept)} of {len(takes)}"
-        raise InputError(Fault("principal components", rule, there, "fit or register more takes"))
+        raise InputError(
+            Fault("principal components", rule, there, "fit or register more takes")
+        )
     used: Mask = np.logical_and.reduce([known[i] for i in kept])
     if not used.any():
         there = f"none of {used.size}"
         cure = "set a larger least_known to exclude takes that cover other parts"
-        raise InputError(Fault("principal components", "some entries must be known in every take", there, cure))
+        raise InputError(
+            Fault(
+                "principal components",
+                "some entries must be known in every take",
+                there,
+                cure,
+            )
+        )
     once = shared_once(used)
-    most = min(most, max(len(kept) - 1, 1))  # the mean uses up one dimension: one more axis would be rounding error
-    found = principal_axes(np.stack(each_take(_used_entries, cohort.isel(take=kept), ["values"], once)), most)
+    # the mean uses up one dimension: one more axis would be rounding error
+    most = min(most, max(len(kept) - 1, 1))
+    found = principal_axes(
+        np.stack(each_take(_used_entries, cohort.isel(take=kept), ["values"], once)),
+        most,
+    )
     ratio = found.variance / (found.total or 1.0)
     shape = tuple(cohort.sizes[dim] for dim in others)
     units = values.attrs.get("units", "1")
@@ -93,14 +113,27 @@ def principal_components(values: xr.DataArray, *, most: int = 10, least_known: f
                 UNIT,
             ),
             "score": (["take", "component"], found.score, {"units": units}),
-            "explained_variance": (["component"], found.variance, {"long_name": "variance of the score"}),
+            "explained_variance": (
+                ["component"],
+                found.variance,
+                {"long_name": "variance of the score"},
+            ),
             "explained_variance_ratio": (["component"], ratio),
-            "residual": (["take"], found.residual, {"units": units, "long_name": "root mean square residual"}),
+            "residual": (
+                ["take"],
+                found.residual,
+                {"units": units, "long_name": "root mean square residual"},
+            ),
         },
-        coords={"component": np.arange(len(found.variance)), "take": cohort["take"].values[kept]},
+        coords={
+            "component": np.arange(len(found.variance)),
+            "take": cohort["take"].values[kept],
+        },
         attrs={"skipped": skipped, "used_fraction": float(used.mean())},
     )
-    return ds.assign_coords({dim: cohort[dim] for dim in others if dim in cohort.coords})
+    return ds.assign_coords(
+        {dim: cohort[dim] for dim in others if dim in cohort.coords}
+    )
 
 
 def _finite_entries(take: xr.Dataset) -> Mask:
@@ -118,7 +151,9 @@ def _expand(values: Array, used: Mask, shape: tuple[int, ...]) -> NDArray[np.flo
     return out.reshape(*values.shape[:-1], *shape)
 
 
-def face_components(cohort: xr.Dataset, *, most: int = 5, mixed_fits: bool = False) -> xr.Dataset:
+def face_components(
+    cohort: xr.Dataset, *, most: int = 5, mixed_fits: bool = False
+) -> xr.Dataset:
     """Principal components of the albedo maps of a cohort, with the variable names of the store.
 
     Parameters
@@ -133,8 +168,9 @@ def face_components(cohort: xr.Dataset, *, most: int = 5, mixed_fits: bool = Fal
     Returns
     -------
     Dataset
-        `principal_mean`, `principal_axis`, `principal_score`, `principal_variance_ratio`, `principal_residual`.
-        Attributes: `skipped`, and `used_fraction`, the fraction of the texels that was used.
+        `principal_mean`, `principal_axis`, `principal_score`,
+        `principal_variance_ratio`, `principal_residual`. Attributes: `skipped`, and
+        `used_fraction`, the fraction of the texels that was used.
     """
     if not mixed_fits:
         require_same_fit(cohort)
@@ -148,7 +184,10 @@ def face_components(cohort: xr.Dataset, *, most: int = 5, mixed_fits: bool = Fal
             "principal_variance_ratio": found["explained_variance_ratio"].values,
             "principal_residual": found["residual"].values,
         },
-        coords={"take": [str(take) for take in found["take"].values], "channel": ["R", "G", "B"]},
+        coords={
+            "take": [str(take) for take in found["take"].values],
+            "channel": ["R", "G", "B"],
+        },
         attrs={
             "skipped": [*cohort.attrs.get("skipped", []), *found.attrs["skipped"]],
             "used_fraction": found.attrs["used_fraction"],
@@ -162,16 +201,26 @@ def tabulate_components(table: xr.Dataset) -> tuple[list[str], list[list[Any]]]:
     scores = table["principal_score"].values
     left = table["principal_residual"].values
     takes = table["take"].values.tolist()
-    rows = [[take, *own, rest] for take, own, rest in zip(takes, scores.tolist(), left.tolist(), strict=True)]
+    rows = [
+        [take, *own, rest]
+        for take, own, rest in zip(takes, scores.tolist(), left.tolist(), strict=True)
+    ]
     return ["take", *names, "principal_residual"], rows
 
 
 def describe_components(table: xr.Dataset) -> list[str]:
     """Fractions of the variance that the components explain, and what counts, one line each."""
-    ratios = ", ".join(f"{ratio:.0%}" for ratio in table["principal_variance_ratio"].values)
+    ratios = ", ".join(
+        f"{ratio:.0%}" for ratio in table["principal_variance_ratio"].values
+    )
     used = f"{table.attrs['used_fraction']:.0%} of the texels, which all takes have"
-    lines = [f"components explain {ratios} of the variance between {table.sizes['take']} takes ({used})"]
-    return [*lines, "each take counts once, so that subjects with several takes count more"]
+    lines = [
+        f"components explain {ratios} of the variance between {table.sizes['take']} takes ({used})"
+    ]
+    return [
+        *lines,
+        "each take counts once, so that subjects with several takes count more",
+    ]
 
 
 def plot_components(table: xr.Dataset, *, most: int = 3) -> Figure:
@@ -186,10 +235,14 @@ def plot_components(table: xr.Dataset, *, most: int = 3) -> Figure:
     figure, axes = pyplot.subplots(count, 3, figsize=(6, 2.2 * count), squeeze=False)
     for i, line in enumerate(axes):
         for ax, by in zip(line, (-1, 0, 1), strict=True):
-            face = np.nan_to_num(mean + by * deviation[i] * table["principal_axis"].values[i])
+            face = np.nan_to_num(
+                mean + by * deviation[i] * table["principal_axis"].values[i]
+            )
             ax.imshow(tone_map(np.clip(face, 0, None), exposure=gain))
             ax.set(xticks=[], yticks=[])
-            ax.set_title({-1: "mean - 1 sd", 0: "mean", 1: "mean + 1 sd"}[by], fontsize=8)
+            ax.set_title(
+                {-1: "mean - 1 sd", 0: "mean", 1: "mean + 1 sd"}[by], fontsize=8
+            )
         ratio = float(table["principal_variance_ratio"][i])
         line[0].set_ylabel(f"axis {i + 1}\n{ratio:.0%} of the variance", fontsize=8)
     figure.suptitle(f"albedo of {table.sizes['take']} takes", fontsize=9)

@@ -24,9 +24,14 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 MIN_SUBJECTS = 5  # subjects needed for a correlation
-FEW = 10  # subjects, below which the bootstrap has too few distinct samples for an interval
+# subjects, below which the bootstrap has too few distinct samples for an interval
+FEW = 10
 RESAMPLES = 2000
-COMPONENTS = (*(f"R_d {channel}" for channel in CHANNELS), SURFACE, *(f"log sigma_tr {c}" for c in CHANNELS))
+COMPONENTS = (
+    *(f"R_d {channel}" for channel in CHANNELS),
+    SURFACE,
+    *(f"log sigma_tr {c}" for c in CHANNELS),
+)
 
 
 def component_correlations(
@@ -37,10 +42,12 @@ def component_correlations(
     mixed_fits: bool = False,
     rng: np.random.Generator,
 ) -> xr.Dataset:
-    """Correlations between subjects of the three components of skin: albedo, surface reflectance and translucency.
+    """Correlations between subjects of the three components of skin: albedo, surface
+    reflectance and translucency.
 
-    Each subject counts once, in the condition normal. The values are the mean albedo and surface reflectance of a
-    region, and the mean over probe sites of log sigma_tr after the mean of each site is subtracted.
+    Each subject counts once, in the condition normal. The values are the mean albedo
+    and surface reflectance of a region, and the mean over probe sites of log sigma_tr
+    after the mean of each site is subtracted.
 
     Parameters
     ----------
@@ -58,10 +65,11 @@ def component_correlations(
     Returns
     -------
     Dataset
-        (pair,) `component_correlation` with its 95 % interval by bootstrap over subjects (BCa, Efron 1987; NaN with
-        fewer than ten), `correlation_p` by permutation of subjects (statistic: the absolute
-        correlation; exact if the components are independent), `correlation_p_false_discovery` controlled over
-        all pairs, and `correlation_count`, the number of subjects. Attribute "flags".
+        (pair,) `component_correlation` with its 95 % interval by bootstrap over
+        subjects (BCa, Efron 1987; NaN with fewer than ten), `correlation_p` by
+        permutation of subjects (statistic: the absolute correlation; exact if the
+        components are independent), `correlation_p_false_discovery` controlled over all
+        pairs, and `correlation_count`, the number of subjects. Attribute "flags".
 
     Raises
     ------
@@ -74,11 +82,20 @@ def component_correlations(
     takes = takes_to_compare(cohort, None)
     if "region" in takes.coords and region not in takes["region"].values:
         cure = f"choose one of {', '.join(map(str, takes['region'].values))}"
-        raise InputError(Fault(f"region {region}", "must be a region of the takes", "an unknown name", cure))
+        raise InputError(
+            Fault(
+                f"region {region}",
+                "must be a region of the takes",
+                "an unknown name",
+                cure,
+            )
+        )
     values = _components(quantities_of(takes), region)
     known = np.isfinite(values)
     pairs = [
-        (i, j) for i, j in combinations(range(len(COMPONENTS)), 2) if (known[:, i] & known[:, j]).sum() >= MIN_SUBJECTS
+        (i, j)
+        for i, j in combinations(range(len(COMPONENTS)), 2)
+        if (known[:, i] & known[:, j]).sum() >= MIN_SUBJECTS
     ]
     pairs = [(i, j) for i, j in pairs if _varies(values[:, [i, j]])]
     if not pairs:
@@ -86,8 +103,14 @@ def component_correlations(
         cure = "fit more subjects"
         raise InputError(Fault("correlations", rule, f"{len(values)} subjects", cure))
     rows = [_pair(values[:, [i, j]], permutations, rng) for i, j in pairs]
-    found, low, high, p, count = (np.array(column) for column in zip(*rows, strict=True))
-    flags = [] if count.min() >= FEW else [f"fewer than {FEW} subjects: there are no intervals"]
+    found, low, high, p, count = (
+        np.array(column) for column in zip(*rows, strict=True)
+    )
+    flags = (
+        []
+        if count.min() >= FEW
+        else [f"fewer than {FEW} subjects: there are no intervals"]
+    )
     return dataset(
         {
             "component_correlation": found,
@@ -98,7 +121,11 @@ def component_correlations(
             "correlation_count": count,
         },
         coords={"pair": [f"{COMPONENTS[i]} with {COMPONENTS[j]}" for i, j in pairs]},
-        attrs={"region": region, "flags": flags, "skipped": list(cohort.attrs.get("skipped", []))},
+        attrs={
+            "region": region,
+            "flags": flags,
+            "skipped": list(cohort.attrs.get("skipped", [])),
+        },
     )
 
 
@@ -110,9 +137,18 @@ def _components(every: Quantities, region: str) -> Array:
     out = [columns.get(f"R_d {region} {channel}", nothing) for channel in CHANNELS]
     out.append(columns.get(f"{SURFACE} {region}", nothing))
     for channel in CHANNELS:
-        sites = [x for name, x in columns.items() if name.startswith("sigma_tr ") and name.endswith(f" {channel}")]
-        # subtract the mean of each site: subjects who were measured at other sites must not appear to differ
-        out.append(known_mean(np.stack([x - known_mean(x) for x in sites])) if sites else nothing)
+        sites = [
+            x
+            for name, x in columns.items()
+            if name.startswith("sigma_tr ") and name.endswith(f" {channel}")
+        ]
+        # subtract the mean of each site: subjects who were measured at other sites must
+        # not appear to differ
+        out.append(
+            known_mean(np.stack([x - known_mean(x) for x in sites]))
+            if sites
+            else nothing
+        )
     return np.stack(out, axis=1)
 
 
@@ -122,7 +158,9 @@ def _varies(two: Array) -> bool:
     return bool((np.ptp(known, axis=0) > 0).all())
 
 
-def _pair(two: Array, permutations: int, rng: np.random.Generator) -> tuple[float, float, float, float, int]:
+def _pair(
+    two: Array, permutations: int, rng: np.random.Generator
+) -> tuple[float, float, float, float, int]:
     """Correlation, ends of its interval, p value and number of subjects of two columns."""
     x, y = two[np.isfinite(two).all(axis=1)].T
     # pairs of subjects are drawn anew; all of them are used if there are at most `permutations`
@@ -138,7 +176,13 @@ def _pair(two: Array, permutations: int, rng: np.random.Generator) -> tuple[floa
     low = high = float("nan")
     if len(x) >= FEW:
         made = stats.bootstrap(
-            (x, y), _pearson, paired=True, vectorized=True, n_resamples=RESAMPLES, method="BCa", rng=rng
+            (x, y),
+            _pearson,
+            paired=True,
+            vectorized=True,
+            n_resamples=RESAMPLES,
+            method="BCa",
+            rng=rng,
         ).confidence_interval
         low = float(made.low)
         high = float(made.high)
@@ -149,7 +193,9 @@ def _pearson(x: Array, y: Array, axis: int = -1) -> Array:
     """Correlation along an axis; 0 where a resample does not vary."""
     x, y = (one - one.mean(axis=axis, keepdims=True) for one in (x, y))
     size = np.sqrt((x**2).sum(axis=axis) * (y**2).sum(axis=axis))
-    return np.asarray(np.divide((x * y).sum(axis=axis), size, out=np.zeros_like(size), where=size > 0))
+    return np.asarray(
+        np.divide((x * y).sum(axis=axis), size, out=np.zeros_like(size), where=size > 0)
+    )
 
 
 def describe_correlations(table: xr.Dataset) -> list[str]:
@@ -170,7 +216,10 @@ def plot_correlations(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     found = table["component_correlation"].values
     place = np.arange(len(names))[::-1]
     bars = np.stack(
-        [found - table["component_correlation_low"].values, table["component_correlation_high"].values - found]
+        [
+            found - table["component_correlation_low"].values,
+            table["component_correlation_high"].values - found,
+        ]
     )
     bars = np.maximum(np.nan_to_num(bars), 0.0)
     significant = table["correlation_p_false_discovery"].values < 0.05
@@ -189,8 +238,13 @@ def plot_correlations(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     ax.set_yticks(place, names, fontsize=7)
     ax.set_xlim(-1, 1)
     count = int(table["correlation_count"].max())
-    interval = ", 95 % CI" if np.isfinite(table["component_correlation_low"].values).any() else ""
+    interval = (
+        ", 95 % CI"
+        if np.isfinite(table["component_correlation_low"].values).any()
+        else ""
+    )
     ax.set_xlabel(
-        f"correlation between subjects{interval} (n = {count})\nfilled: p < 0.05 at a false discovery rate of 5 %"
+        f"correlation between subjects{interval} (n = {count})\nfilled: p < 0.05 "
+        "at a false discovery rate of 5 %"
     )
     return ax

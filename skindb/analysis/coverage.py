@@ -13,7 +13,13 @@ from scipy.stats.contingency import association
 from skindb._types import Array
 from skindb.analysis.group_effects import ASSOCIATED, FEW
 from skindb.analysis.members import AGE, CONDITION, NORMAL, attributes, is_normal, texts
-from skindb.analysis.quantities import attribute_notes, attribute_of_subjects, columns_of, is_age, is_number
+from skindb.analysis.quantities import (
+    attribute_notes,
+    attribute_of_subjects,
+    columns_of,
+    is_age,
+    is_number,
+)
 from skindb.errors import Fault, InputError
 from skindb.schema import IDENTIFIED, dataset
 from skindb.schema.cohort import require_takes
@@ -25,17 +31,21 @@ GENDER = "gender"
 ANCESTRY = "ancestry"
 AGE_BAND = "age band"
 SITE = "site"
-CROSSED = (GENDER, ANCESTRY, AGE_BAND)  # factors of which pairs and the triple are counted
+# factors of which pairs and the triple are counted
+CROSSED = (GENDER, ANCESTRY, AGE_BAND)
 DECADE = 10  # years in an age band
 AND = " x "
 DARK = 0.6  # fraction of the colour scale above which numbers are white
 MAX_LISTED = 12  # cells named in a line
-MAX_VALUES = 12  # different values of an attribute; one with more is treated as a name, not as groups
-Factor = list[frozenset[str]]  # values of each subject: one value, several conditions or sites, or none
+# different values of an attribute; one with more is treated as a name, not as groups
+MAX_VALUES = 12
+# values of each subject: one value, several conditions or sites, or none
+Factor = list[frozenset[str]]
 
 
 def coverage_report(cohort: xr.Dataset) -> xr.Dataset:
-    """Numbers of subjects by gender, ancestry and age and their crossings, and by condition and probe site.
+    """Numbers of subjects by gender, ancestry and age and their crossings, and by
+    condition and probe site.
 
     Parameters
     ----------
@@ -45,13 +55,16 @@ def coverage_report(cohort: xr.Dataset) -> xr.Dataset:
     Returns
     -------
     Dataset
-        `coverage_count` (cell,): number of subjects for every value ("gender: female") and crossing ("gender: female x
-        ancestry: african"), including empty ones; `coverage_unknown` (attribute,): number of subjects without the
-        attribute; `coverage_association` (attribute, attribute_2) between subjects: Cramer's V of two categorical
-        attributes (corrected for its bias, Bergsma 2013), the multiple correlation of a numeric with a categorical
-        attribute (adjusted for the number of values), the absolute correlation of two numeric attributes. Attribute
-        "flags": empty cells, cells with fewer than 10 subjects, and attributes that are confounded. Values that no
-        subject has cannot be listed, except for age bands between the youngest and the oldest.
+        `coverage_count` (cell,): number of subjects for every value ("gender: female")
+        and crossing ("gender: female x ancestry: african"), including empty ones;
+        `coverage_unknown` (attribute,): number of subjects without the attribute;
+        `coverage_association` (attribute, attribute_2) between subjects: Cramer's V of
+        two categorical attributes (corrected for its bias, Bergsma 2013), the multiple
+        correlation of a numeric with a categorical attribute (adjusted for the number
+        of values), the absolute correlation of two numeric attributes. Attribute
+        "flags": empty cells, cells with fewer than 10 subjects, and attributes that are
+        confounded. Values that no subject has cannot be listed, except for age bands
+        between the youngest and the oldest.
 
     Raises
     ------
@@ -60,76 +73,141 @@ def coverage_report(cohort: xr.Dataset) -> xr.Dataset:
     """
     require_takes(cohort, "tables")
     if not cohort.sizes["take"]:
-        raise InputError(Fault("coverage", "the cohort must have a take", "none", "fit a take first"))
+        raise InputError(
+            Fault("coverage", "the cohort must have a take", "none", "fit a take first")
+        )
     subjects = tuple(dict.fromkeys(str(one) for one in texts(cohort["subject"])))
     stated = {
-        name: attribute_of_subjects(cohort, name, subjects) for name in sorted(attributes(cohort)) if name != CONDITION
+        name: attribute_of_subjects(cohort, name, subjects)
+        for name in sorted(attributes(cohort))
+        if name != CONDITION
     }
     factors = _factors(cohort, subjects, stated)
     levels = {name: _values(name, factor) for name, factor in factors.items()}
     if SITE in factors:  # including sites without measurements
         levels[SITE] = [str(site) for site in cohort["site"].values]
     counts = dict(_cells(factors, levels))
-    names = [name for name in stated if is_number(stated[name]) or 1 < len(_words(stated[name])) <= MAX_VALUES]
-    between = np.array([[_association(stated[a], stated[b]) for b in names] for a in names]).reshape(
-        len(names), len(names)
-    )
+    names = [
+        name
+        for name in stated
+        if is_number(stated[name]) or 1 < len(_words(stated[name])) <= MAX_VALUES
+    ]
+    between = np.array(
+        [[_association(stated[a], stated[b]) for b in names] for a in names]
+    ).reshape(len(names), len(names))
     unknown = {
-        name: sum(not one for one in factor) for name, factor in factors.items() if name not in (CONDITION, SITE)
+        name: sum(not one for one in factor)
+        for name, factor in factors.items()
+        if name not in (CONDITION, SITE)
     }
     return dataset(
         {
             "coverage_count": np.array(list(counts.values()), np.int32),
             "coverage_association": between,
-            "coverage_unknown": np.array([_unknown(stated[name]) for name in names], np.int32),
+            "coverage_unknown": np.array(
+                [_unknown(stated[name]) for name in names], np.int32
+            ),
         },
-        coords={"cell": [AND.join(key) for key in counts], "attribute": names, "attribute_2": names},
+        coords={
+            "cell": [AND.join(key) for key in counts],
+            "attribute": names,
+            "attribute_2": names,
+        },
         attrs={
             "subjects": len(subjects),
             "takes": sorted(map(str, cohort["take"].values)),
             "flags": _flags(counts, unknown, names, stated, between, len(subjects))
-            + [line for name, values in stated.items() for line in attribute_notes(name, values)],
+            + [
+                line
+                for name, values in stated.items()
+                for line in attribute_notes(name, values)
+            ],
             "skipped": list(cohort.attrs.get("skipped", [])),
         },
     )
 
 
-def _factors(cohort: xr.Dataset, subjects: Sequence[str], stated: Mapping[str, list[object]]) -> dict[str, Factor]:
-    """Factors by which subjects are counted: categorical attributes, age in decades, conditions and sites."""
+def _factors(
+    cohort: xr.Dataset, subjects: Sequence[str], stated: Mapping[str, list[object]]
+) -> dict[str, Factor]:
+    """Factors by which subjects are counted: categorical attributes, age in decades,
+    conditions and sites.
+    """
     factors: dict[str, Factor] = {}
     for name, values in stated.items():
         if name == AGE:
-            factors[AGE_BAND] = [frozenset([_band(one)]) if is_age(one) else frozenset() for one in values]
+            factors[AGE_BAND] = [
+                frozenset([_band(one)]) if is_age(one) else frozenset()
+                for one in values
+            ]
         elif not is_number(values) and 1 <= len(_words(values)) <= MAX_VALUES:
-            factors[name] = [frozenset() if one is None else frozenset([str(one)]) for one in values]
+            factors[name] = [
+                frozenset() if one is None else frozenset([str(one)]) for one in values
+            ]
     owner = [str(one) for one in texts(cohort["subject"])]
-    known = texts(cohort[CONDITION]) if CONDITION in cohort.coords else [NORMAL] * len(owner)
+    known = (
+        texts(cohort[CONDITION])
+        if CONDITION in cohort.coords
+        else [NORMAL] * len(owner)
+    )
     factors[CONDITION] = [
-        frozenset(str(one) for one, own in zip(known, owner, strict=True) if own == subject and one is not None)
+        frozenset(
+            str(one)
+            for one, own in zip(known, owner, strict=True)
+            if own == subject and one is not None
+        )
         for subject in subjects
     ]
     if "site_status" in cohort:
-        good = cohort["site_status"].isin(IDENTIFIED).transpose("take", "site", ...).values
-        good = good.reshape(*good.shape[:2], -1).any(axis=-1) & is_normal(cohort)[:, None]
+        good = (
+            cohort["site_status"].isin(IDENTIFIED).transpose("take", "site", ...).values
+        )
+        good = (
+            good.reshape(*good.shape[:2], -1).any(axis=-1) & is_normal(cohort)[:, None]
+        )
         rows = [np.array([one == subject for one in owner]) for subject in subjects]
         sites = [str(site) for site in cohort["site"].values]
-        factors[SITE] = [frozenset(itertools.compress(sites, good[own].any(axis=0).tolist())) for own in rows]
+        factors[SITE] = [
+            frozenset(itertools.compress(sites, good[own].any(axis=0).tolist()))
+            for own in rows
+        ]
     order = [*CROSSED, CONDITION, SITE]
-    return {name: factors[name] for name in [*order, *sorted(set(factors) - set(order))] if name in factors}
+    return {
+        name: factors[name]
+        for name in [*order, *sorted(set(factors) - set(order))]
+        if name in factors
+    }
 
 
-def _cells(factors: Mapping[str, Factor], levels: Mapping[str, Sequence[str]]) -> Iterator[tuple[tuple[str, ...], int]]:
-    """Cells with their numbers of subjects: single factors, pairs, and the triple of gender, ancestry and age."""
+def _cells(
+    factors: Mapping[str, Factor], levels: Mapping[str, Sequence[str]]
+) -> Iterator[tuple[tuple[str, ...], int]]:
+    """Cells with their numbers of subjects: single factors, pairs, and the triple of
+    gender, ancestry and age.
+    """
     crossed = [name for name in CROSSED if name in factors]
     combined: list[tuple[str, ...]] = [(name,) for name in factors]
     combined += list(itertools.combinations(crossed, 2))
-    combined += [(name, other) for name in crossed for other in (CONDITION, SITE) if other in factors]
+    combined += [
+        (name, other)
+        for name in crossed
+        for other in (CONDITION, SITE)
+        if other in factors
+    ]
     combined += [tuple(crossed)] if len(crossed) == 3 else []
     for chosen in combined:
         for cell in itertools.product(*(levels[name] for name in chosen)):
             subjects = zip(*(factors[name] for name in chosen), strict=True)
-            count = sum(all(value in has for value, has in zip(cell, one, strict=True)) for one in subjects)
-            yield tuple(f"{name}: {value}" for name, value in zip(chosen, cell, strict=True)), count
+            count = sum(
+                all(value in has for value, has in zip(cell, one, strict=True))
+                for one in subjects
+            )
+            yield (
+                tuple(
+                    f"{name}: {value}" for name, value in zip(chosen, cell, strict=True)
+                ),
+                count,
+            )
 
 
 def _values(name: str, factor: Factor) -> list[str]:
@@ -149,30 +227,55 @@ def _flags(
     between: Array,
     subjects: int,
 ) -> list[str]:
-    """Lines about empty and small cells of every crossing, unknown attributes, and associated attributes."""
+    """Lines about empty and small cells of every crossing, unknown attributes, and
+    associated attributes.
+    """
     flags = []
     kinds: dict[tuple[str, ...], dict[tuple[str, ...], int]] = {}
     for cell, count in counts.items():
-        kinds.setdefault(tuple(one.partition(": ")[0] for one in cell), {})[cell] = count
+        kinds.setdefault(tuple(one.partition(": ")[0] for one in cell), {})[cell] = (
+            count
+        )
     for kind, cells in kinds.items():
         if len(kind) == 3:  # too many cells to list; they are in the table
             few = sum(count < FEW for count in cells.values())
             empty = sum(count == 0 for count in cells.values())
-            flags.append(f"{AND.join(kind)}: {empty} of {len(cells)} cells are empty, {few} have fewer than {FEW}")
+            flags.append(
+                f"{AND.join(kind)}: {empty} of {len(cells)} cells are empty, {few} "
+                f"have fewer than {FEW}"
+            )
             continue
         # crossings of a value without subjects are not listed again
-        reported = {cell: count for cell, count in cells.items() if all(counts[one,] for one in cell)}
+        reported = {
+            cell: count
+            for cell, count in cells.items()
+            if all(counts[one,] for one in cell)
+        }
         empty_ones = [
-            _cell_values(cell) for cell, count in (reported if len(kind) > 1 else cells).items() if count == 0
+            _cell_values(cell)
+            for cell, count in (reported if len(kind) > 1 else cells).items()
+            if count == 0
         ]
-        small = [f"{_cell_values(cell)} ({count})" for cell, count in cells.items() if 0 < count < FEW]
+        small = [
+            f"{_cell_values(cell)} ({count})"
+            for cell, count in cells.items()
+            if 0 < count < FEW
+        ]
         if empty_ones:
             flags.append(f"{AND.join(kind)}: no subjects in {_join_names(empty_ones)}")
         if small and len(small) == sum(map(bool, cells.values())) and len(kind) > 1:
-            flags.append(f"{AND.join(kind)}: all {len(small)} cells with subjects have fewer than {FEW}")
+            flags.append(
+                f"{AND.join(kind)}: all {len(small)} cells with subjects have fewer than {FEW}"
+            )
         elif small:
-            flags.append(f"{AND.join(kind)}: fewer than {FEW} subjects: {_join_names(small)}")
-    flags += [f"{name}: unknown for {n} of {subjects} subjects" for name, n in unknown.items() if n]
+            flags.append(
+                f"{AND.join(kind)}: fewer than {FEW} subjects: {_join_names(small)}"
+            )
+    flags += [
+        f"{name}: unknown for {n} of {subjects} subjects"
+        for name, n in unknown.items()
+        if n
+    ]
     flags += [
         f"{name}: no subject has this attribute"
         for name in (GENDER, ANCESTRY, AGE)
@@ -182,7 +285,8 @@ def _flags(
         if between[i, j] >= ASSOCIATED:
             measure = _measure_name(stated[names[i]], stated[names[j]])
             flags.append(
-                f"{names[i]} and {names[j]} are associated ({measure} {between[i, j]:.2f}): their effects can "
+                f"{names[i]} and {names[j]} are associated ({measure} "
+                f"{between[i, j]:.2f}): their effects can "
                 "hardly be separated"
             )
     return flags
@@ -190,7 +294,9 @@ def _flags(
 
 def _association(a: list[object], b: list[object]) -> float:
     """Strength of association of two attributes, from 0 to 1; NaN if too few subjects have both."""
-    both = [(x, y) for x, y in zip(a, b, strict=True) if x is not None and y is not None]
+    both = [
+        (x, y) for x, y in zip(a, b, strict=True) if x is not None and y is not None
+    ]
     if len(both) < 3:
         return float("nan")
     first, second = ([pair[i] for pair in both] for i in (0, 1))
@@ -200,16 +306,26 @@ def _association(a: list[object], b: list[object]) -> float:
         return float(np.abs(np.corrcoef(_numbers(first), _numbers(second))[0, 1]))
     if is_number(a) or is_number(b):
         return _multiple(first, second) if is_number(a) else _multiple(second, first)
-    table = np.array([[sum(pair == (x, y) for pair in _as_words(both)) for y in _words(second)] for x in _words(first)])
+    table = np.array(
+        [
+            [sum(pair == (x, y) for pair in _as_words(both)) for y in _words(second)]
+            for x in _words(first)
+        ]
+    )
     return _cramer(table)
 
 
 def _cramer(table: Array) -> float:
-    """Cramer's V of a table of counts, corrected for its bias (Bergsma 2013); NaN for a single row or column."""
+    """Cramer's V of a table of counts, corrected for its bias (Bergsma 2013); NaN for a
+    single row or column.
+    """
     n, (rows, columns) = table.sum(), table.shape
     square = float(association(table, method="cramer")) ** 2 * (min(rows, columns) - 1)
     corrected = max(0.0, square - (rows - 1) * (columns - 1) / (n - 1))
-    most = min(rows - (rows - 1) ** 2 / (n - 1), columns - (columns - 1) ** 2 / (n - 1)) - 1
+    most = (
+        min(rows - (rows - 1) ** 2 / (n - 1), columns - (columns - 1) ** 2 / (n - 1))
+        - 1
+    )
     return float(min(1.0, np.sqrt(corrected / most))) if most > 0 else float("nan")
 
 
@@ -262,27 +378,44 @@ def _join_names(names: Sequence[str]) -> str:
 
 def describe_coverage(report: xr.Dataset) -> list[str]:
     """Numbers of subjects and takes, and the flags of a coverage report, one line each."""
-    return [f"{report.attrs['subjects']} subjects, {len(report.attrs['takes'])} takes", *report.attrs["flags"]]
+    return [
+        f"{report.attrs['subjects']} subjects, {len(report.attrs['takes'])} takes",
+        *report.attrs["flags"],
+    ]
 
 
 def plot_coverage(report: xr.Dataset, *, ax: Axes | None = None) -> Axes:
-    """Plot numbers of subjects by gender and ancestry against age as a table; empty cells are white."""
+    """Plot numbers of subjects by gender and ancestry against age as a table; empty
+    cells are white.
+    """
     from matplotlib import pyplot
     from matplotlib.colors import LogNorm
 
     cells = {
         tuple(str(name).split(AND)): int(count)
-        for name, count in zip(report["cell"].values, report["coverage_count"].values, strict=True)
+        for name, count in zip(
+            report["cell"].values, report["coverage_count"].values, strict=True
+        )
     }
     rows, columns, counts = _plot_table(cells)
     if ax is None:
-        _, ax = pyplot.subplots(figsize=(2.6 + 0.75 * len(columns), 1.1 + 0.4 * len(rows)))
+        _, ax = pyplot.subplots(
+            figsize=(2.6 + 0.75 * len(columns), 1.1 + 0.4 * len(rows))
+        )
     most = max(int(counts.max()), FEW)
     norm = LogNorm(0.5, 2 * most)
     ax.imshow(np.ma.masked_equal(counts, 0), cmap="Blues", norm=norm, aspect="auto")
     for i, j in np.ndindex(counts.shape):
         dark = norm(max(int(counts[i, j]), 1)) > DARK
-        ax.text(j, i, str(counts[i, j]), ha="center", va="center", fontsize=8, color="white" if dark else "black")
+        ax.text(
+            j,
+            i,
+            str(counts[i, j]),
+            ha="center",
+            va="center",
+            fontsize=8,
+            color="white" if dark else "black",
+        )
     ax.set_xticks(range(len(columns)), columns, fontsize=8)
     ax.set_yticks(range(len(rows)), rows, fontsize=8)
     has_ages = any(name[0].startswith(AGE_BAND) for name in cells)
@@ -291,20 +424,45 @@ def plot_coverage(report: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     return ax
 
 
-def _plot_table(cells: Mapping[tuple[str, ...], int]) -> tuple[list[str], list[str], Array]:
-    """Row labels, column labels and counts: factors crossed with age, or all values in one column without ages."""
-    bands = [name[0] for name in cells if len(name) == 1 and name[0].startswith(f"{AGE_BAND}: ")]
-    others = [name for name in cells if len(name) < 3 and not any(one.startswith(AGE_BAND) for one in name)]
+def _plot_table(
+    cells: Mapping[tuple[str, ...], int],
+) -> tuple[list[str], list[str], Array]:
+    """Row labels, column labels and counts: factors crossed with age, or all values in
+    one column without ages.
+    """
+    bands = [
+        name[0]
+        for name in cells
+        if len(name) == 1 and name[0].startswith(f"{AGE_BAND}: ")
+    ]
+    others = [
+        name
+        for name in cells
+        if len(name) < 3 and not any(one.startswith(AGE_BAND) for one in name)
+    ]
     kinds = (GENDER, ANCESTRY, CONDITION, SITE)
-    single = [name[0] for name in others if len(name) == 1 and (not bands or name[0].partition(":")[0] in kinds)]
+    single = [
+        name[0]
+        for name in others
+        if len(name) == 1 and (not bands or name[0].partition(":")[0] in kinds)
+    ]
     pairs = [
-        name for name in others if len(name) == 2 and {one.partition(":")[0] for one in name} == {GENDER, ANCESTRY}
+        name
+        for name in others
+        if len(name) == 2
+        and {one.partition(":")[0] for one in name} == {GENDER, ANCESTRY}
     ]
     if not bands:
         keys: list[tuple[str, ...]] = [*((name,) for name in single), *pairs]
-        return [_cell_values(key) for key in keys], ["all"], np.array([[cells[key]] for key in keys])
+        return (
+            [_cell_values(key) for key in keys],
+            ["all"],
+            np.array([[cells[key]] for key in keys]),
+        )
     rows = [*((name,) for name in single), *pairs]
-    table = np.array([[_cell_count(cells, (*row, band)) for band in bands] for row in rows])
+    table = np.array(
+        [[_cell_count(cells, (*row, band)) for band in bands] for row in rows]
+    )
     labels = [row[0] if len(row) == 1 else _cell_values(row) for row in rows]
     return labels, [band.partition(": ")[2] for band in bands], table
 

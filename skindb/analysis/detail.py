@@ -1,4 +1,6 @@
-"""Transfer of fine detail, such as moles, freckles and follicles, between faces (Weyrich et al. 2005, section 11)."""
+"""Transfer of fine detail, such as moles, freckles and follicles, between faces
+(Weyrich et al. 2005, section 11).
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,9 @@ from skindb.numerics.texture import level_fractions
 from skindb.schema.consent import honour_consent
 from skindb.schema.regions import FACE
 
-COARSEST = 8.0  # mm, default wavelength of the coarsest detail transferred: freckles, small moles, follicles
+# mm, default wavelength of the coarsest detail transferred: freckles, small moles,
+# follicles
+COARSEST = 8.0
 EDGE = 2.0  # mm, standard deviation of the Gaussian that blends the edge of the region
 
 
@@ -36,8 +40,9 @@ def transfer_detail(
 ) -> xr.DataTree:
     """Copy of a model that has the fine albedo detail of another take within a region.
 
-    The bands of the steerable pyramid of log albedo in the common (u, v), up to a wavelength, are replaced by those of
-    the source; coarser bands and the mean colour are kept. Nothing changes where the source was not measured.
+    The bands of the steerable pyramid of log albedo in the common (u, v), up to a
+    wavelength, are replaced by those of the source; coarser bands and the mean colour
+    are kept. Nothing changes where the source was not measured.
 
     Parameters
     ----------
@@ -46,8 +51,8 @@ def transfer_detail(
     registered, source_registered
         Registrations of both models, made together (see `register`).
     region
-        Name of a region defined by landmarks (see `region_masks`), "face" for the whole face, or a mask (v, u) of shape
-        (size, size).
+        Name of a region defined by landmarks (see `region_masks`), "face" for the whole
+        face, or a mask (v, u) of shape (size, size).
     coarsest
         Largest wavelength that is transferred [mm].
     size
@@ -56,57 +61,94 @@ def transfer_detail(
     Returns
     -------
     DataTree
-        As `apply_traits` returns it; attribute `edit` names the source, the region and the wavelength.
+        As `apply_traits` returns it; attribute `edit` names the source, the region and
+        the wavelength.
 
     Raises
     ------
     InputError
-        If the consent of one of them does not cover statistics, if the region is unknown, if the takes were not
-        registered together, or if the wavelength is below four texels.
+        If the consent of one of them does not cover statistics, if the region is
+        unknown, if the takes were not registered together, or if the wavelength is
+        below four texels.
     """
     for one in (model, source):
         honour_consent(one.attrs, "statistics")
-    if not np.array_equal(registered["landmark"].values, source_registered["landmark"].values):
+    if not np.array_equal(
+        registered["landmark"].values, source_registered["landmark"].values
+    ):
         rule = "both takes must be registered together"
         cure = "run skindb register"
-        raise InputError(Fault("transfer of detail", rule, "different sets of landmarks", cure))
+        raise InputError(
+            Fault("transfer of detail", rule, "different sets of landmarks", cure)
+        )
     per_texel = float(registered["mm_per_uv"]) / size
     levels = math.floor(math.log2(coarsest / per_texel)) - 1 if coarsest > 0 else 0
     levels = min(levels, size.bit_length() - 2)
     if levels < 1:
         rule = f"must be at least four texels of {per_texel:.2g} mm"
-        raise InputError(Fault("coarsest", rule, f"{coarsest:g} mm", "choose a larger wavelength or more texels"))
+        raise InputError(
+            Fault(
+                "coarsest",
+                rule,
+                f"{coarsest:g} mm",
+                "choose a larger wavelength or more texels",
+            )
+        )
     own, other = (
-        common_maps(one, placed, size=size) for one, placed in ((model, registered), (source, source_registered))
+        common_maps(one, placed, size=size)
+        for one, placed in ((model, registered), (source, source_registered))
     )
     (log, _), (log_source, there) = log_albedo(own), log_albedo(other)
-    fraction = np.asarray(_region(region, registered, source_registered, size) & there, np.float32)
-    fraction = gaussian_filter(fraction, EDGE / per_texel) * fraction  # 0 where the source was not measured
-    change = np.stack([_detail_change(log[..., c], log_source[..., c], fraction, levels) for c in range(3)], axis=-1)
+    fraction = np.asarray(
+        _region(region, registered, source_registered, size) & there, np.float32
+    )
+    # 0 where the source was not measured
+    fraction = gaussian_filter(fraction, EDGE / per_texel) * fraction
+    change = np.stack(
+        [
+            _detail_change(log[..., c], log_source[..., c], fraction, levels)
+            for c in range(3)
+        ],
+        axis=-1,
+    )
     fitted = model["fitted"].to_dataset().load()
     colour = fitted["diffuse_reflectance"].values.astype(np.float64)
-    moved = with_albedo(fitted, colour * np.exp(at_surfels(change, registered["common_uv"].values)))
+    moved = with_albedo(
+        fitted, colour * np.exp(at_surfels(change, registered["common_uv"].values))
+    )
     tree = model.copy()
     tree["fitted"] = xr.DataTree(moved[[name for name in KEPT if name in moved]])
     named = region if isinstance(region, str) else "mask"
-    edited = {"detail": str(source.attrs.get("take", "")), "region": named, "coarsest_mm": float(coarsest)}
-    tree.attrs = {name: model.attrs[name] for name in KEPT_ATTRS if name in model.attrs} | {"edit": edited}
+    edited = {
+        "detail": str(source.attrs.get("take", "")),
+        "region": named,
+        "coarsest_mm": float(coarsest),
+    }
+    tree.attrs = {
+        name: model.attrs[name] for name in KEPT_ATTRS if name in model.attrs
+    } | {"edit": edited}
     return tree
 
 
 def _detail_change(image: Array, other: Array, fraction: Array, levels: int) -> Array:
-    """Change (v, u) of an image that replaces its finest levels by those of another image where `fraction` is 1."""
+    """Change (v, u) of an image that replaces its finest levels by those of another
+    image where `fraction` is 1.
+    """
     mine = build(image, levels)
     theirs = build(other, levels)
     parts = mine.parts()
     others = theirs.parts()
     weights = level_fractions(fraction, [part.shape for part in parts])
-    steps: list[Image] = [weight * (b - a) for a, b, weight in zip(parts, others, weights, strict=True)]
+    steps: list[Image] = [
+        weight * (b - a) for a, b, weight in zip(parts, others, weights, strict=True)
+    ]
     steps[-1] = np.zeros_like(parts[-1])  # the low-pass residual of the face is kept
     return reconstruct(mine.with_parts(steps))
 
 
-def _region(region: str | Mask, registered: xr.Dataset, other: xr.Dataset, size: int) -> Mask:
+def _region(
+    region: str | Mask, registered: xr.Dataset, other: xr.Dataset, size: int
+) -> Mask:
     if not isinstance(region, str):
         mask = np.asarray(region, np.bool_)
         if mask.shape != (size, size):
@@ -122,6 +164,11 @@ def _region(region: str | Mask, registered: xr.Dataset, other: xr.Dataset, size:
     if region not in drawn:
         cure = f"choose one of {', '.join([FACE, *drawn])}"
         raise InputError(
-            Fault(f"region {region}", "must be a region defined by the landmarks", "an unknown name", cure)
+            Fault(
+                f"region {region}",
+                "must be a region defined by the landmarks",
+                "an unknown name",
+                cure,
+            )
         )
     return drawn[region].reshape(size, size)

@@ -17,18 +17,23 @@ Result = TypeVar("Result")
 
 
 def each_take(
-    function: Callable[..., Result], cohort: xr.Dataset, variables: Iterable[str], *shared: Any
+    function: Callable[..., Result],
+    cohort: xr.Dataset,
+    variables: Iterable[str],
+    *shared: Any,
 ) -> list[Result]:
     """Apply a function to every take of a cohort and return the results in the order of the takes.
 
     Parameters
     ----------
     function
-        Called with the loaded Dataset of one take and with the shared values; its result should be small.
+        Called with the loaded Dataset of one take and with the shared values; its
+        result should be small.
     cohort
         Dataset with the dimension ``take``.
     variables
-        Names of the variables and coordinates that the function receives; names that the cohort lacks are ignored.
+        Names of the variables and coordinates that the function receives; names that
+        the cohort lacks are ignored.
     shared
         Arrays, or Dask collections, that every call receives; the graph holds one copy of each.
     """
@@ -53,8 +58,9 @@ def each_item(function: Callable[[Any], Result], items: Iterable[Any]) -> list[R
 class _InOrder:
     """Call a function with arrays that are in C order and aligned in memory.
 
-    Arrays from the store or the network may have another layout. NumPy and BLAS would then add in another order, and
-    the last digits of results would depend on the scheduler.
+    Arrays from the store or the network may have another layout. NumPy and BLAS would
+    then add in another order, and the last digits of results would depend on the
+    scheduler.
     """
 
     function: Callable[..., Any]
@@ -66,10 +72,18 @@ class _InOrder:
 
 def _in_order(value: Any) -> Any:
     if isinstance(value, xr.Dataset):
-        return value.map(lambda one: one.copy(data=c_contiguous(one.values)), keep_attrs=True)
+        return value.map(
+            lambda one: one.copy(data=c_contiguous(one.values)), keep_attrs=True
+        )
     return c_contiguous(value) if isinstance(value, np.ndarray) else value
 
 
 def shared_once(value: Any) -> Delayed:
-    """Wrap a value so that a Dask graph holds one copy for all tasks; Dask collections are returned unchanged."""
-    return value if isinstance(value, Delayed) else delayed(value, pure=False, traverse=False)
+    """Wrap a value so that a Dask graph holds one copy for all tasks; Dask collections
+    are returned unchanged.
+    """
+    return (
+        value
+        if isinstance(value, Delayed)
+        else delayed(value, pure=False, traverse=False)
+    )

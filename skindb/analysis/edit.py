@@ -27,9 +27,12 @@ Report = dict[str, Any]
 # limits of an edited albedo
 DARKEST = 1e-3
 BRIGHTEST = 0.999
-SIGMA_TR_RANGE = (1e-2, 1e2)  # mm^-1; limits of an edited value, far beyond the 0.4 to 2 of skin
-MAX_AMOUNT = 100.0  # of a trait vector; the exponential of a larger shift of log sigma_tr may overflow
-# variables that an edit changes or that stay valid; errors, residuals and weights belong to the unedited model
+# mm^-1; limits of an edited value, far beyond the 0.4 to 2 of skin
+SIGMA_TR_RANGE = (1e-2, 1e2)
+# of a trait vector; the exponential of a larger shift of log sigma_tr may overflow
+MAX_AMOUNT = 100.0
+# variables that an edit changes or that stay valid; errors, residuals and weights
+# belong to the unedited model
 KEPT = (
     "surfel_position",
     "surfel_normal",
@@ -46,7 +49,8 @@ KEPT = (
 )
 KEPT_ATTRS = ("subject", "condition", "session", "traits", "consent_scope", "take")
 PROBED = "probe"  # measurements of the unedited skin
-KEPT_SITES = ("site_sigma_tr", "site_position", "site_status")  # what rendering and export need of a site
+# what rendering and export need of a site
+KEPT_SITES = ("site_sigma_tr", "site_position", "site_status")
 MIN_REPORTED = 1e-3  # fraction of a change above which an omission is reported
 TEXTURE_SHIFT = "trait_texture_shift"  # only where takes are registered
 ONE_SUBJECT = "unknown: only one subject"
@@ -74,14 +78,16 @@ def apply_traits(
     model
         Version of kind "model".
     amounts
-        Trait -> multiple of its vector that is added; 1 is the mean difference between takes with and without it.
+        Trait -> multiple of its vector that is added; 1 is the mean difference between
+        takes with and without it.
     traits, basis, albedo
         From `trait_vectors`, `population_basis`, `albedo_histograms`.
     tables
         (nh, nd, np, m) tables of the dictionary the model was fitted with [sr^-1].
     texture, maps, registered
-        From `texture_statistics` of the takes, `common_maps` of the model at the same size, and `register`. If they are
-        given, the albedo changes at every scale, region by region (see `edit_texture`); otherwise only its colours do.
+        From `texture_statistics` of the takes, `common_maps` of the model at the same
+        size, and `register`. If they are given, the albedo changes at every scale,
+        region by region (see `edit_texture`); otherwise only its colours do.
     parts
         Parts of the model that are edited.
     rng
@@ -90,31 +96,38 @@ def apply_traits(
     Returns
     -------
     DataTree
-        The surface is refitted to the basis of the population. A component that becomes weaker is multiplied everywhere
-        by the same factor, and one that becomes stronger is increased everywhere by the same step: the mean moves by
-        the trait vector (or by the part of it that keeps the mean non-negative), and every weight stays non-negative.
-        The quantile functions of log albedo and of its bands are shifted, made monotone (so that they belong to valid
-        histograms) and imposed on the map of the take; without a registration, only those of its colours. Histograms
-        are not added, which would mix two skins. sigma_tr is scaled in the map and at the probe sites. The copy has
-        all that is needed for rendering. It omits what belongs to the unedited model: errors, residuals and report of
-        the fit and, if sigma_tr changes, the profiles of the probe, sigma_a and sigma_s' (which sigma_tr alone does not
-        determine).
+        The surface is refitted to the basis of the population. A component that becomes
+        weaker is multiplied everywhere by the same factor, and one that becomes
+        stronger is increased everywhere by the same step: the mean moves by the trait
+        vector (or by the part of it that keeps the mean non-negative), and every weight
+        stays non-negative. The quantile functions of log albedo and of its bands are
+        shifted, made monotone (so that they belong to valid histograms) and imposed on
+        the map of the take; without a registration, only those of its colours.
+        Histograms are not added, which would mix two skins. sigma_tr is scaled in the
+        map and at the probe sites. The copy has all that is needed for rendering. It
+        omits what belongs to the unedited model: errors, residuals and report of the
+        fit and, if sigma_tr changes, the profiles of the probe, sigma_a and sigma_s'
+        (which sigma_tr alone does not determine).
 
         The attributes are:
 
         * `edit`, the amounts;
-        * `edit_distance`, the distance of the edited means from the nearest take (or from the unedited model, if that
-          is nearer) divided by the median distance between takes, for the part where it is largest; above 1 the edit
-          is an extrapolation;
+        * `edit_distance`, the distance of the edited means from the nearest take (or
+          from the unedited model, if that is nearer) divided by the median distance
+          between takes, for the part where it is largest; above 1 the edit is an
+          extrapolation;
         * `trait_notes`, the numbers of takes of each trait that was used, and warnings;
-        * `edit_report`, for each part: requested and applied (mean change of the coefficients or of the diffuse
-          reflectance R G B, or factor on sigma_tr R G B), clipped (fraction of the area limited to physical values; for
-          the surface, the fraction of the requested vector that was omitted), distance (of the edited mean from that of
-          the population, in standard deviations over takes; a text if it is unknown). For the albedo also how:
-          "texture", with trace (RMS difference from the target quantiles before each iteration and after the last, for
-          every axis) and distance_before, or "colours", with projected (mean change by making quantiles monotone, in
-          standard deviations of colour). For the translucency also unknown (traits whose shift was not measured, so
-          that it is not applied).
+        * `edit_report`, for each part: requested and applied (mean change of the
+          coefficients or of the diffuse reflectance R G B, or factor on sigma_tr R G
+          B), clipped (fraction of the area limited to physical values; for the surface,
+          the fraction of the requested vector that was omitted), distance (of the
+          edited mean from that of the population, in standard deviations over takes; a
+          text if it is unknown). For the albedo also how: "texture", with trace (RMS
+          difference from the target quantiles before each iteration and after the last,
+          for every axis) and distance_before, or "colours", with projected (mean change
+          by making quantiles monotone, in standard deviations of colour). For the
+          translucency also unknown (traits whose shift was not measured, so that it is
+          not applied).
     """
     honour_consent(model.attrs, "statistics")
     check(
@@ -134,27 +147,46 @@ def apply_traits(
         tree["basis"] = xr.DataTree(_common_basis(model, basis, tables))
         moves.append(move)
     if "albedo" in parts:
-        shifts = traits[TEXTURE_SHIFT].values[amount != 0] if TEXTURE_SHIFT in traits else None
-        if texture is not None and maps is not None and registered is not None and shifts is not None:
+        shifts = (
+            traits[TEXTURE_SHIFT].values[amount != 0]
+            if TEXTURE_SHIFT in traits
+            else None
+        )
+        if (
+            texture is not None
+            and maps is not None
+            and registered is not None
+            and shifts is not None
+        ):
             moved = np.tensordot(amount[amount != 0], shifts.astype(np.float64), 1)
             uv = registered["common_uv"].values
             rng = np.random.default_rng(0) if rng is None else rng
-            fitted, reports["albedo"], move = _moved_texture(fitted, moved, texture, maps, uv, albedo, rng)
+            fitted, reports["albedo"], move = _moved_texture(
+                fitted, moved, texture, maps, uv, albedo, rng
+            )
         else:
             moved = np.tensordot(amount, traits["trait_quantile_shift"].values, 1)
             fitted, reports["albedo"], move = _moved_albedo(fitted, moved, albedo)
         moves.append(move)
     if "translucency" in parts and "sigma_tr" in fitted:
-        fitted, reports["translucency"], move = _moved_translucency(fitted, amount, traits)
+        fitted, reports["translucency"], move = _moved_translucency(
+            fitted, amount, traits
+        )
         moves.append(move)
         tree = tree.drop_nodes([name for name in (PROBED,) if name in tree.children])
         if "translucency" in tree.children:
-            tree["translucency"] = xr.DataTree(_moved_sites(tree["translucency"].to_dataset().load(), amount, traits))
+            tree["translucency"] = xr.DataTree(
+                _moved_sites(tree["translucency"].to_dataset().load(), amount, traits)
+            )
     tree["fitted"] = xr.DataTree(fitted[[name for name in KEPT if name in fitted]])
     kept = {name: model.attrs[name] for name in KEPT_ATTRS if name in model.attrs}
     far = max(moves, default=0.0)
     used = [str(traits["trait"].values[i]) for i in np.flatnonzero(amount)]
-    tree.attrs = kept | {"edit": dict(amounts), "edit_distance": far, "edit_report": reports}
+    tree.attrs = kept | {
+        "edit": dict(amounts),
+        "edit_distance": far,
+        "edit_report": reports,
+    }
     tree.attrs["trait_notes"] = _notes(traits, used)
     return tree
 
@@ -162,14 +194,22 @@ def apply_traits(
 def _notes(traits: xr.Dataset, used: list[str]) -> list[str]:
     """A line for each trait: its number of takes, or the warning of the study about it."""
     flagged = {flag.partition(": ")[0]: flag for flag in traits.attrs.get("flags", [])}
-    counts = {str(t): traits["trait_count"].sel(trait=t).values.tolist() for t in traits["trait"].values}
+    counts = {
+        str(t): traits["trait_count"].sel(trait=t).values.tolist()
+        for t in traits["trait"].values
+    }
     # for a numeric attribute, all takes are counted on one side
-    sides = {t: f"{n} takes with, {without} without" if without else f"{n} takes" for t, (n, without) in counts.items()}
+    sides = {
+        t: f"{n} takes with, {without} without" if without else f"{n} takes"
+        for t, (n, without) in counts.items()
+    }
     return [flagged.get(name, f"{name}: {sides[name]}") for name in used]
 
 
 def _trait_amounts(amounts: Mapping[str, float], traits: xr.Dataset) -> Array:
-    """Amounts (trait,); raises `InputError` for unknown traits and for amounts that are not finite or too large."""
+    """Amounts (trait,); raises `InputError` for unknown traits and for amounts that are
+    not finite or too large.
+    """
     known = [str(t) for t in traits["trait"].values]
     found = np.zeros(len(known))
     faults = list[Fault]()
@@ -181,17 +221,28 @@ def _trait_amounts(amounts: Mapping[str, float], traits: xr.Dataset) -> Array:
     if faults:
         raise InputError(faults)
     if not np.isfinite(found).all():
-        raise InputError(Fault("amount", "must be a finite number", str(dict(amounts)), "give a number such as 0.5"))
+        raise InputError(
+            Fault(
+                "amount",
+                "must be a finite number",
+                str(dict(amounts)),
+                "give a number such as 0.5",
+            )
+        )
     if np.abs(found).max(initial=0.0) > MAX_AMOUNT:
         rule = f"must be between -{MAX_AMOUNT:g} and {MAX_AMOUNT:g}; 1 is the whole difference"
-        raise InputError(Fault("amount", rule, str(dict(amounts)), "give a number such as 0.5"))
+        raise InputError(
+            Fault("amount", rule, str(dict(amounts)), "give a number such as 0.5")
+        )
     return found
 
 
 def _moved_surface(
     fitted: xr.Dataset, shift: Array, basis: xr.Dataset, metric: Array
 ) -> tuple[xr.Dataset, Report, float]:
-    """Refit the surface to the basis of the population, and move its mean coefficients (component,) by the shift."""
+    """Refit the surface to the basis of the population, and move its mean coefficients
+    (component,) by the shift.
+    """
     weights = fitted["dictionary_weight"].values.astype(np.float64)
     good = np.isfinite(weights).all(axis=1)
     area = fitted["surfel_area"].values[good].astype(np.float64)
@@ -205,22 +256,30 @@ def _moved_surface(
     moved[good] = here * weaker + np.maximum(step, 0.0)
     takes = [str(t) for t in basis["take"].values]
     gram = H @ metric @ H.T
-    distance, move = _distances(wanted, own, basis["take_coefficient"].values, takes, gram)
+    distance, move = _distances(
+        wanted, own, basis["take_coefficient"].values, takes, gram
+    )
     report = _report(shift, step, np.zeros(len(area), np.bool_), area, distance)
-    report["clipped"] = float(_length(step - shift, gram)) / max(float(_length(shift, gram)), 1e-300)
+    report["clipped"] = float(_length(step - shift, gram)) / max(
+        float(_length(shift, gram)), 1e-300
+    )
     rest = fitted.drop_dims("component")  # the components of another basis differ
     return rest.assign(basis_weight=label("basis_weight", moved)), report, move
 
 
-def with_basis(model: xr.DataTree, *, mixture: Array, names: Sequence[str], tables: Array) -> xr.DataTree:
-    """Copy of a model whose surface is the nearest non-negative mixture of other basis BRDFs (figure 7).
+def with_basis(
+    model: xr.DataTree, *, mixture: Array, names: Sequence[str], tables: Array
+) -> xr.DataTree:
+    """Copy of a model whose surface is the nearest non-negative mixture of other basis
+    BRDFs (figure 7).
 
     Parameters
     ----------
     model
         Version of kind "model".
     mixture
-        (k, m) basis as mixtures of the dictionary: `population_mixture`, or the unit matrix for the dictionary itself.
+        (k, m) basis as mixtures of the dictionary: `population_mixture`, or the unit
+        matrix for the dictionary itself.
     names
         (m,) names of the BRDFs of the dictionary.
     tables
@@ -231,10 +290,15 @@ def with_basis(model: xr.DataTree, *, mixture: Array, names: Sequence[str], tabl
     weights = fitted["dictionary_weight"].values.astype(np.float64)
     good = np.isfinite(weights).all(axis=1)
     found = np.full((len(weights), len(mixture)), np.nan)
-    found[good] = project(weights[good], np.asarray(mixture, np.float64), brdf_metric(tables))
+    found[good] = project(
+        weights[good], np.asarray(mixture, np.float64), brdf_metric(tables)
+    )
     rest = fitted.drop_dims("component")  # the components of another basis differ
     fitted = rest.assign(basis_weight=label("basis_weight", found))
-    basis = xr.Dataset({"population_mixture": (("component", "dictionary"), mixture)}, {"dictionary": list(names)})
+    basis = xr.Dataset(
+        {"population_mixture": (("component", "dictionary"), mixture)},
+        {"dictionary": list(names)},
+    )
     tree["basis"] = xr.DataTree(_common_basis(model, basis, tables))
     tree["fitted"] = xr.DataTree(fitted[[name for name in KEPT if name in fitted]])
     tree.attrs = {name: model.attrs[name] for name in KEPT_ATTRS if name in model.attrs}
@@ -248,7 +312,10 @@ def _common_basis(model: xr.DataTree, basis: xr.Dataset, tables: Array) -> xr.Da
     source = model["basis"].attrs.get("dictionary")
     return dataset(
         {"basis_mixture": H, "basis_brdf": brdf, "disc_angular_radius": disc},
-        coords={"dictionary": basis["dictionary"].values, **brdf_coords(TableGrid(*tables.shape[:3]))},
+        coords={
+            "dictionary": basis["dictionary"].values,
+            **brdf_coords(TableGrid(*tables.shape[:3])),
+        },
         attrs={} if source is None else {"dictionary": source},
     )
 
@@ -262,16 +329,25 @@ def _moved_texture(
     albedo: xr.Dataset,
     rng: np.random.Generator,
 ) -> tuple[xr.Dataset, Report, float]:
-    """Shift the distributions of log albedo and of its bands in the map, and apply the change to the surfels."""
+    """Shift the distributions of log albedo and of its bands in the map, and apply the
+    change to the surfels.
+    """
     edit = edit_texture(maps, shift, texture, rng=rng)
     colour = fitted["diffuse_reflectance"].values.astype(np.float64)
     wanted = colour * np.exp(at_surfels(edit.change, uv))
     fitted, report, move = _with_albedo(fitted, wanted, albedo)
     report["distance"] = ONE_SUBJECT if edit.distance is None else edit.distance
-    report |= {"how": "texture", "trace": [list(one) for one in edit.trace], "distance_before": edit.distance_before}
+    report |= {
+        "how": "texture",
+        "trace": [list(one) for one in edit.trace],
+        "distance_before": edit.distance_before,
+    }
     # requested change of the mean of the whole face, like the other values of the report
     at = [str(name) for name in texture["region"].values].index(FACE)
-    step = np.nan_to_num(shift[at, :, 0]).mean(axis=-1) @ np.linalg.inv(texture["texture_colour_axis"].values).T
+    step = (
+        np.nan_to_num(shift[at, :, 0]).mean(axis=-1)
+        @ np.linalg.inv(texture["texture_colour_axis"].values).T
+    )
     good = np.isfinite(colour).all(axis=1)
     own = np.average(colour[good], axis=0, weights=fitted["surfel_area"].values[good])
     report["requested"] = [float(v) for v in own * np.expm1(step)]
@@ -283,13 +359,20 @@ def with_albedo(fitted: xr.Dataset, wanted: Array) -> xr.Dataset:
     colour = fitted["diffuse_reflectance"].values.astype(np.float64)
     out = np.where(wanted == colour, colour, np.clip(wanted, DARKEST, BRIGHTEST))
     s, _ = dipole_s(out, eta=float(fitted["refractive_index"]))
-    return fitted.assign(diffuse_reflectance=label("diffuse_reflectance", out), dipole_s=label("dipole_s", s))
+    return fitted.assign(
+        diffuse_reflectance=label("diffuse_reflectance", out),
+        dipole_s=label("dipole_s", s),
+    )
 
 
-def _with_albedo(fitted: xr.Dataset, wanted: Array, albedo: xr.Dataset) -> tuple[xr.Dataset, Report, float]:
+def _with_albedo(
+    fitted: xr.Dataset, wanted: Array, albedo: xr.Dataset
+) -> tuple[xr.Dataset, Report, float]:
     """The fitted surface with new albedos (n, 3), the report of the change, and its distance."""
     moved = with_albedo(fitted, wanted)
-    colour, out = (one["diffuse_reflectance"].values.astype(np.float64) for one in (fitted, moved))
+    colour, out = (
+        one["diffuse_reflectance"].values.astype(np.float64) for one in (fitted, moved)
+    )
     good = np.isfinite(colour).all(axis=1)
     area = fitted["surfel_area"].values[good].astype(np.float64)
     own, now = (np.average(x[good], axis=0, weights=area) for x in (colour, out))
@@ -297,17 +380,25 @@ def _with_albedo(fitted: xr.Dataset, wanted: Array, albedo: xr.Dataset) -> tuple
     takes = albedo["albedo_mean"].values[:, whole]
     axes = albedo["colour_axis"].values
     # on the decorrelated axes, the unit is the standard deviation of skin in that direction
-    distance, move = _distances(now, own, takes, [str(t) for t in albedo["take"].values], axes.T @ axes)
-    cut = (np.clip(wanted, DARKEST, BRIGHTEST) != wanted)[good] & (wanted != colour)[good]
+    distance, move = _distances(
+        now, own, takes, [str(t) for t in albedo["take"].values], axes.T @ axes
+    )
+    cut = (np.clip(wanted, DARKEST, BRIGHTEST) != wanted)[good] & (wanted != colour)[
+        good
+    ]
     report = _report(now - own, now - own, cut.any(axis=1), area, distance)
     return moved, report, move
 
 
-def _moved_albedo(fitted: xr.Dataset, shift: Array, albedo: xr.Dataset) -> tuple[xr.Dataset, Report, float]:
+def _moved_albedo(
+    fitted: xr.Dataset, shift: Array, albedo: xr.Dataset
+) -> tuple[xr.Dataset, Report, float]:
     """Shift the quantiles of albedo by the shift of the whole face."""
     colour = fitted["diffuse_reflectance"].values.astype(np.float64)
     good = np.isfinite(colour).all(axis=1)
-    mean, axes, edges = (albedo[n].values for n in ("colour_mean", "colour_axis", "histogram_edge"))
+    mean, axes, edges = (
+        albedo[n].values for n in ("colour_mean", "colour_axis", "histogram_edge")
+    )
     area = fitted["surfel_area"].values[good].astype(np.float64)
     values = decorrelate(colour[good], mean, axes)
     here = histogram(np.clip(values, edges[:, 0], edges[:, -1]), area, edges)
@@ -316,7 +407,11 @@ def _moved_albedo(fitted: xr.Dataset, shift: Array, albedo: xr.Dataset) -> tuple
     wanted = source + shift[whole]
     target = valid_quantiles(wanted)
     matched = np.stack(
-        [shift_quantiles(values[:, a], here[a], target[a] - source[a], edges[a]) for a in range(3)], axis=1
+        [
+            shift_quantiles(values[:, a], here[a], target[a] - source[a], edges[a])
+            for a in range(3)
+        ],
+        axis=1,
     )
     back = np.linalg.inv(axes).T
     edited = colour.copy()
@@ -327,8 +422,12 @@ def _moved_albedo(fitted: xr.Dataset, shift: Array, albedo: xr.Dataset) -> tuple
     return fitted, report, move
 
 
-def _moved_translucency(fitted: xr.Dataset, amount: Array, traits: xr.Dataset) -> tuple[xr.Dataset, Report, float]:
-    """Scale sigma_tr; traits without a measured shift are not applied, and the report names them."""
+def _moved_translucency(
+    fitted: xr.Dataset, amount: Array, traits: xr.Dataset
+) -> tuple[xr.Dataset, Report, float]:
+    """Scale sigma_tr; traits without a measured shift are not applied, and the report
+    names them.
+    """
     log, known = _log_shift(amount, traits)
     before = np.log(fitted["sigma_tr"].values.astype(np.float64))
     after = np.clip(before + log, *np.log(SIGMA_TR_RANGE))
@@ -339,27 +438,45 @@ def _moved_translucency(fitted: xr.Dataset, amount: Array, traits: xr.Dataset) -
     measured = np.isfinite(population.values).all(axis=1)
     names = [str(t) for t in population["take"].values[measured]]
     distance, move = _distances(now, own, population.values[measured], names, np.eye(3))
-    report = _report(np.exp(log), np.exp(now - own), (after != before + log)[good].any(axis=1), area, distance)
+    report = _report(
+        np.exp(log),
+        np.exp(now - own),
+        (after != before + log)[good].any(axis=1),
+        area,
+        distance,
+    )
     report["unknown"] = [str(t) for t in traits["trait"].values[~known & (amount != 0)]]
     return fitted.assign(sigma_tr=label("sigma_tr", np.exp(after))), report, move
 
 
 def _moved_sites(sites: xr.Dataset, amount: Array, traits: xr.Dataset) -> xr.Dataset:
-    """Probe sites with sigma_tr scaled like the map; errors are omitted, as they do not include those of the vector."""
+    """Probe sites with sigma_tr scaled like the map; errors are omitted, as they do not
+    include those of the vector.
+    """
     log, _ = _log_shift(amount, traits)
-    moved = np.clip(sites["site_sigma_tr"].values.astype(np.float64) * np.exp(log), *SIGMA_TR_RANGE)
+    moved = np.clip(
+        sites["site_sigma_tr"].values.astype(np.float64) * np.exp(log), *SIGMA_TR_RANGE
+    )
     kept = sites[[name for name in KEPT_SITES if name in sites]].drop_attrs(deep=False)
     return kept.assign(site_sigma_tr=label("site_sigma_tr", moved))
 
 
 def _log_shift(amount: Array, traits: xr.Dataset) -> tuple[Array, NDArray[np.bool_]]:
-    """Shift of log sigma_tr (channel,), and the mask (trait,) of the traits with a measured shift."""
+    """Shift of log sigma_tr (channel,), and the mask (trait,) of the traits with a
+    measured shift.
+    """
     shifts = traits["trait_log_sigma_tr_shift"].values
     known = np.isfinite(shifts).all(axis=1)
     return np.asarray(amount[known] @ shifts[known]), known
 
 
-def _report(requested: Array, applied: Array, cut: NDArray[np.bool_], area: Array, distance: float | str) -> Report:
+def _report(
+    requested: Array,
+    applied: Array,
+    cut: NDArray[np.bool_],
+    area: Array,
+    distance: float | str,
+) -> Report:
     return {
         "requested": [float(v) for v in requested],
         "applied": [float(v) for v in applied],
@@ -368,11 +485,15 @@ def _report(requested: Array, applied: Array, cut: NDArray[np.bool_], area: Arra
     }
 
 
-def _distances(now: Array, own: Array, takes: Array, names: list[str], metric: Array) -> tuple[float | str, float]:
-    """Distances of a mean `now` (d,) from the mean of the takes (t, d), and from the nearest take or its `own` mean.
+def _distances(
+    now: Array, own: Array, takes: Array, names: list[str], metric: Array
+) -> tuple[float | str, float]:
+    """Distances of a mean `now` (d,) from the mean of the takes (t, d), and from the
+    nearest take or its `own` mean.
 
-    The first is in standard deviations of the takes over all directions, or a text if these are unknown. The second is
-    relative to the median distance between two takes, and infinite if that is 0.
+    The first is in standard deviations of the takes over all directions, or a text if
+    these are unknown. The second is relative to the median distance between two takes,
+    and infinite if that is 0.
     """
     i, j = np.triu_indices(len(takes), 1)
     typical = float(np.median(_length(takes[i] - takes[j], metric))) if len(i) else 0.0
@@ -381,37 +502,61 @@ def _distances(now: Array, own: Array, takes: Array, names: list[str], metric: A
     if len({name.partition(".")[0] for name in names}) < 2:
         return ONE_SUBJECT if names else NO_SUBJECT, far
     mean = takes.mean(axis=0)
-    spread = float(np.sqrt((_length(takes - mean, metric) ** 2).sum() / (len(takes) - 1)))
-    return (float(_length(now - mean, metric)) / spread if spread > 0 else "unknown: all takes are alike"), far
+    spread = float(
+        np.sqrt((_length(takes - mean, metric) ** 2).sum() / (len(takes) - 1))
+    )
+    return (
+        float(_length(now - mean, metric)) / spread
+        if spread > 0
+        else "unknown: all takes are alike"
+    ), far
 
 
 def describe_edit(report: Mapping[str, Report]) -> list[str]:
-    """Limitations of an edit and changes that were omitted, one line each; `report` is its attribute `edit_report`."""
+    """Limitations of an edit and changes that were omitted, one line each; `report` is
+    its attribute `edit_report`.
+    """
     lines = []
     surface = report.get("brdf", {})
     albedo = report.get("albedo", {})
     if surface.get("clipped", 0.0) > MIN_REPORTED:
         rule = "would have made weights negative and was omitted"
         lines.append(f"brdf: {surface['clipped']:.1%} of the requested change {rule}")
-    cuts = {part: report.get(part, {}).get("clipped", 0.0) for part in ("albedo", "translucency")}
+    cuts = {
+        part: report.get(part, {}).get("clipped", 0.0)
+        for part in ("albedo", "translucency")
+    }
     limited = "values were limited to the physical range on"
-    lines += [f"{part}: {limited} {cut:.1%} of the area" for part, cut in cuts.items() if cut]
+    lines += [
+        f"{part}: {limited} {cut:.1%} of the area" for part, cut in cuts.items() if cut
+    ]
     if albedo.get("how") == "colours":
-        lines.append("albedo: only colours were edited; textures need a registration of the take and of the study")
+        lines.append(
+            "albedo: only colours were edited; textures need a registration of the "
+            "take and of the study"
+        )
     if albedo.get("how") == "texture" and not isinstance(albedo["distance"], str):
         before = albedo["distance_before"]
         after = albedo["distance"]
         lines.append(
-            f"albedo: {after:.2f} standard deviations from the mean of the takes, {before:.2f} before the edit"
+            f"albedo: {after:.2f} standard deviations from the mean of the takes, "
+            f"{before:.2f} before the edit"
         )
     unknown = report.get("translucency", {}).get("unknown", [])
-    lines += [f"translucency: the change with {trait} is unknown and was omitted" for trait in unknown]
+    lines += [
+        f"translucency: the change with {trait} is unknown and was omitted"
+        for trait in unknown
+    ]
     return lines
 
 
 def _length(vectors: Array, metric: Array) -> Array:
     """Lengths (...) of vectors (..., d)."""
-    return np.asarray(np.sqrt(np.maximum(np.einsum("...d,de,...e->...", vectors, metric, vectors), 0.0)))
+    return np.asarray(
+        np.sqrt(
+            np.maximum(np.einsum("...d,de,...e->...", vectors, metric, vectors), 0.0)
+        )
+    )
 
 
 def shift_quantiles(values: Array, source: Array, shift: Array, edges: Array) -> Array:

@@ -25,17 +25,25 @@ from skindb.analysis.group_effects import (
 from skindb.analysis.members import texts
 from skindb.analysis.quantities import CHANNELS, SURFACE, Quantities
 from skindb.errors import Fault, InputError
-from skindb.numerics.inference import effects, paired_effects, permutation_p, sign_flip_p
+from skindb.numerics.inference import (
+    effects,
+    paired_effects,
+    permutation_p,
+    sign_flip_p,
+)
 from skindb.schema import dataset
 from skindb.schema.cohort import require_same_fit, require_takes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-SIZE = 256  # texels along each side: about 1 mm each, which is also the accuracy of landmarks
-MIN_FRACTION = 0.8  # minimum fraction of the compared subjects that must have a value at a texel
+# texels along each side: about 1 mm each, which is also the accuracy of landmarks
+SIZE = 256
+# minimum fraction of the compared subjects that must have a value at a texel
+MIN_FRACTION = 0.8
 COVERED = 0.5  # minimum fraction of a texel that must be measured
-# variable of the maps -> name of the quantity; p values are adjusted for all texels and channels of a variable
+# variable of the maps -> name of the quantity; p values are adjusted for all texels and
+# channels of a variable
 MAPPED = {
     "texel_diffuse_reflectance": "R_d",
     "texel_surface_reflectance": SURFACE,
@@ -57,11 +65,14 @@ def effect_maps(
     mixed_fits: bool = False,
     rng: np.random.Generator,
 ) -> xr.Dataset:
-    """Effect of an attribute on albedo, surface reflectance and log sigma_tr at every texel, adjusted for others.
+    """Effect of an attribute on albedo, surface reflectance and log sigma_tr at every
+    texel, adjusted for others.
 
-    The regression, its intervals and the permutations are those of `group_effects`, with every texel as one quantity.
-    The value of a texel in a take is the mean of the measured texels of the finer map. The p values are adjusted for
-    all texels and channels of a variable by the largest statistic, which accounts for the correlation of neighbours.
+    The regression, its intervals and the permutations are those of `group_effects`,
+    with every texel as one quantity. The value of a texel in a take is the mean of the
+    measured texels of the finer map. The p values are adjusted for all texels and
+    channels of a variable by the largest statistic, which accounts for the correlation
+    of neighbours.
 
     Parameters
     ----------
@@ -79,8 +90,9 @@ def effect_maps(
     Returns
     -------
     Dataset
-        (contrast, quantity, v, u) `map_effect`, `map_effect_half_width` of its 95 % interval, `map_effect_p` of the
-        single texel, `map_effect_p_adjusted`, and `map_effect_count`, the number of subjects.
+        (contrast, quantity, v, u) `map_effect`, `map_effect_half_width` of its 95 %
+        interval, `map_effect_p` of the single texel, `map_effect_p_adjusted`, and
+        `map_effect_count`, the number of subjects.
 
     Raises
     ------
@@ -115,25 +127,56 @@ def effect_maps(
         found = []
         for one in contrasts(cohort, group_by, adjust, measure):
             try:
-                found.append((one.name, *_contrast_statistics(one, permutations, min_fraction, rng)))
+                found.append(
+                    (
+                        one.name,
+                        *_contrast_statistics(one, permutations, min_fraction, rng),
+                    )
+                )
                 associated = associations(one, cohort, others)
-                flags += contrast_flags(one, cohort, associated, adjust, contrast_counts(one))
+                flags += contrast_flags(
+                    one, cohort, associated, adjust, contrast_counts(one)
+                )
             except ValueError as error:
-                faults.append(Fault(f"{one.name}, {called}", CONTRAST_RULE, str(error), CONTRAST_CURE))
+                faults.append(
+                    Fault(
+                        f"{one.name}, {called}",
+                        CONTRAST_RULE,
+                        str(error),
+                        CONTRAST_CURE,
+                    )
+                )
         if not found:
             continue
-        if names and [name for name, _, _ in found] != names:  # a contrast is missing for this variable only
-            faults.append(Fault(called, "every comparison must have texels", "none for some", "exclude takes"))
+        # a contrast is missing for this variable only
+        if names and [name for name, _, _ in found] != names:
+            faults.append(
+                Fault(
+                    called,
+                    "every comparison must have texels",
+                    "none for some",
+                    "exclude takes",
+                )
+            )
             continue
         names = [name for name, _, _ in found]
         counts = [count for _, _, count in found]
         quantities += own
         for name in found[0][1]:
-            stacked = np.stack([values[name] for _, values, _ in found])  # (contrast, texel * channel)
+            # one row a contrast, of texels and channels
+            stacked = np.stack([values[name] for _, values, _ in found])
             placed = stacked.reshape(len(found), size, size, len(own))
             columns.setdefault(name, []).append(np.moveaxis(placed, -1, 1))
     if not names:
-        raise InputError(faults or Fault("maps", "some texels must be measured", "none", "fit or register more takes"))
+        raise InputError(
+            faults
+            or Fault(
+                "maps",
+                "some texels must be measured",
+                "none",
+                "fit or register more takes",
+            )
+        )
     return dataset(
         {name: np.concatenate(values, axis=1) for name, values in columns.items()},
         coords={"contrast": names, "quantity": quantities},
@@ -141,7 +184,9 @@ def effect_maps(
             "group_by": group_by,
             "adjust": list(adjust),
             "permutations": counts,
-            "logarithmic": [name for name in quantities if name.startswith(LOGARITHMIC)],
+            "logarithmic": [
+                name for name in quantities if name.startswith(LOGARITHMIC)
+            ],
             "flags": [
                 *dict.fromkeys([*flags, *notes_on_attributes(cohort)]),
                 *(f"{fault.where}: excluded, {fault.found}" for fault in faults),
@@ -153,7 +198,9 @@ def effect_maps(
 
 def _texel_quantities(takes: xr.Dataset, variable: str, size: int) -> Quantities:
     """Values of a variable at every texel (and channel) of every take, as quantities."""
-    values = np.stack(each_take(_block_means, takes, [variable, "texel_coverage"], variable, size))
+    values = np.stack(
+        each_take(_block_means, takes, [variable, "texel_coverage"], variable, size)
+    )
     count = values.shape[1]
     subject = tuple(str(one) for one in texts(takes["subject"]))
     nothing = np.full(values.shape, np.nan, np.float32)  # errors of texels are not used
@@ -168,7 +215,9 @@ def _texel_quantities(takes: xr.Dataset, variable: str, size: int) -> Quantities
 
 
 def _block_means(take: xr.Dataset, variable: str, size: int) -> Array:
-    """Means (size * size * channels,) of the measured texels in blocks of texels; NaN where too few were measured."""
+    """Means (size * size * channels,) of the measured texels in blocks of texels; NaN
+    where too few were measured.
+    """
     values = take[variable].values.astype(np.float64)
     values = values.reshape(*values.shape[:2], -1)
     if variable.endswith(LOGARITHMIC):
@@ -178,26 +227,36 @@ def _block_means(take: xr.Dataset, variable: str, size: int) -> Array:
     block = len(values) // size
     shape = (size, block, size, block, -1)
     total = weight.reshape(shape).sum(axis=(1, 3))
-    mean = (np.nan_to_num(values) * weight).reshape(shape).sum(axis=(1, 3)) / np.maximum(total, 1e-12)
-    return np.where(total >= COVERED * block**2, mean, np.nan).astype(np.float32).ravel()
+    mean = (np.nan_to_num(values) * weight).reshape(shape).sum(
+        axis=(1, 3)
+    ) / np.maximum(total, 1e-12)
+    return (
+        np.where(total >= COVERED * block**2, mean, np.nan).astype(np.float32).ravel()
+    )
 
 
 def _contrast_statistics(
     one: Contrast, most: int, min_fraction: float, rng: np.random.Generator
 ) -> tuple[dict[str, Array], int]:
-    """Statistics of a contrast at all texels (NaN for too few subjects), and the number of permutations."""
+    """Statistics of a contrast at all texels (NaN for too few subjects), and the number
+    of permutations.
+    """
     values = one.quantities.values
     count = np.isfinite(values).sum(axis=0)
     able = np.flatnonzero(count >= max(min_fraction * len(values), 1))
     if not able.size:
-        raise ValueError(f"no texel with values of {min_fraction:.0%} of the {len(values)} subjects")
+        raise ValueError(
+            f"no texel with values of {min_fraction:.0%} of the {len(values)} subjects"
+        )
     chosen = values[:, able].astype(np.float64)
     if one.is_paired:
         fit = paired_effects(chosen)
         p, adjusted, drawn = sign_flip_p(chosen, most=most, rng=rng)
     else:
         fit = effects(chosen, one.regressor, one.covariates)
-        p, adjusted, drawn = permutation_p(chosen, one.regressor, one.covariates, most=most, rng=rng)
+        p, adjusted, drawn = permutation_p(
+            chosen, one.regressor, one.covariates, most=most, rng=rng
+        )
     found = {
         "map_effect": fit.slope,
         "map_effect_half_width": (fit.high - fit.low) / 2,
@@ -211,8 +270,18 @@ def _contrast_statistics(
 
 
 def tabulate_effect_maps(maps: xr.Dataset) -> tuple[list[str], list[list[Any]]]:
-    """Header and one row per comparison and quantity: texels, fraction that differs, mean and largest effect."""
-    header = ["contrast", "quantity", "subjects", "texels", "fraction_that_differs", "mean_effect", "largest_effect"]
+    """Header and one row per comparison and quantity: texels, fraction that differs,
+    mean and largest effect.
+    """
+    header = [
+        "contrast",
+        "quantity",
+        "subjects",
+        "texels",
+        "fraction_that_differs",
+        "mean_effect",
+        "largest_effect",
+    ]
     rows: list[list[Any]] = []
     for contrast in maps["contrast"].values.tolist():
         for quantity in maps["quantity"].values.tolist():
@@ -226,13 +295,17 @@ def tabulate_effect_maps(maps: xr.Dataset) -> tuple[list[str], list[list[Any]]]:
             largest = effect[known][np.abs(effect[known]).argmax()]
             numbers = (differ.mean(), effect[known].mean(), largest)
             subjects = int(one["map_effect_count"].values[known].max())
-            rows.append([contrast, quantity, subjects, int(known.sum()), *map(float, numbers)])
+            rows.append(
+                [contrast, quantity, subjects, int(known.sum()), *map(float, numbers)]
+            )
     return header, rows
 
 
 def describe_effect_maps(maps: xr.Dataset) -> list[str]:
     """Notes on the table, one line each."""
-    counts = zip(maps["contrast"].values.tolist(), maps.attrs["permutations"], strict=True)
+    counts = zip(
+        maps["contrast"].values.tolist(), maps.attrs["permutations"], strict=True
+    )
     note = "p values are adjusted for all texels of a variable by the largest statistic"
     lines = [f"{name}: {note}; {count} permutations" for name, count in counts]
     if maps.attrs["logarithmic"]:
@@ -241,7 +314,8 @@ def describe_effect_maps(maps: xr.Dataset) -> list[str]:
 
 
 def plot_effect_maps(maps: xr.Dataset, *, contrast: str | None = None) -> Figure:
-    """Plot maps of the effect, of the half-width of its 95 % interval and of the number of subjects.
+    """Plot maps of the effect, of the half-width of its 95 % interval and of the number
+    of subjects.
 
     Lines surround regions of adjusted p < 0.05.
 
@@ -259,19 +333,40 @@ def plot_effect_maps(maps: xr.Dataset, *, contrast: str | None = None) -> Figure
     names = one["quantity"].values.tolist()
     shown = [quantity for quantity in SHOWN if quantity in names] or names[:1]
     figure: Figure
-    figure, axes = pyplot.subplots(len(shown), 3, figsize=(9, 2.9 * len(shown)), squeeze=False)
+    figure, axes = pyplot.subplots(
+        len(shown), 3, figsize=(9, 2.9 * len(shown)), squeeze=False
+    )
     rows, columns = _finite_extent(one["map_effect_p"].sel(quantity=shown).values)
     for line, quantity in zip(axes, shown, strict=True):
         own = one.sel(quantity=quantity).isel(v=rows, u=columns)
         known = np.isfinite(own["map_effect_p"].values)
-        unit = "change of the logarithm" if quantity in maps.attrs["logarithmic"] else "difference"
-        largest = max(float(np.quantile(np.abs(own["map_effect"].values[known]), SHOWN_FRACTION)), 1e-12)
+        unit = (
+            "change of the logarithm"
+            if quantity in maps.attrs["logarithmic"]
+            else "difference"
+        )
+        largest = max(
+            float(np.quantile(np.abs(own["map_effect"].values[known]), SHOWN_FRACTION)),
+            1e-12,
+        )
         wide = own["map_effect_half_width"].values
         widest = float(np.quantile(wide[known], SHOWN_FRACTION))
         parts: list[tuple[Array, dict[str, Any], str]] = [
-            (own["map_effect"].values, {"cmap": "RdBu_r", "vmin": -largest, "vmax": largest}, f"effect on {quantity}"),
-            (wide, {"cmap": "cividis", "vmin": 0.0, "vmax": widest}, "half-width of the 95 % CI"),
-            (np.where(known, own["map_effect_count"].values, np.nan), {"cmap": "cividis"}, "subjects"),
+            (
+                own["map_effect"].values,
+                {"cmap": "RdBu_r", "vmin": -largest, "vmax": largest},
+                f"effect on {quantity}",
+            ),
+            (
+                wide,
+                {"cmap": "cividis", "vmin": 0.0, "vmax": widest},
+                "half-width of the 95 % CI",
+            ),
+            (
+                np.where(known, own["map_effect_count"].values, np.nan),
+                {"cmap": "cividis"},
+                "subjects",
+            ),
         ]
         for ax, (values, options, title) in zip(line, parts, strict=True):
             image = ax.imshow(values, interpolation="none", **options)
@@ -279,10 +374,16 @@ def plot_effect_maps(maps: xr.Dataset, *, contrast: str | None = None) -> Figure
             figure.colorbar(image, ax=ax, shrink=0.8, label=label)
             ax.set(title=title, xticks=[], yticks=[])
             ax.title.set_fontsize(8)
-        differ = np.nan_to_num(own["map_effect_p_adjusted"].values, nan=1.0) < SIGNIFICANT
+        differ = (
+            np.nan_to_num(own["map_effect_p_adjusted"].values, nan=1.0) < SIGNIFICANT
+        )
         if differ.any() and not differ.all():
             line[0].contour(differ, levels=[0.5], colors="black", linewidths=0.6)
-    adjusted = f", adjusted for {', '.join(maps.attrs['adjust'])}" if maps.attrs["adjust"] else ""
+    adjusted = (
+        f", adjusted for {', '.join(maps.attrs['adjust'])}"
+        if maps.attrs["adjust"]
+        else ""
+    )
     figure.suptitle(f"{name}{adjusted}; lines surround adjusted p < 0.05", fontsize=9)
     figure.tight_layout()
     return figure

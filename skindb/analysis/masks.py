@@ -1,6 +1,8 @@
-"""Regions of the face in the common (u, v), drawn around the landmarks; regions of the capture have priority.
+"""Regions of the face in the common (u, v), drawn around the landmarks; regions of the
+capture have priority.
 
-Weyrich et al. 2005, section 10.2, defines a beard and a no-beard region; the finer regions are an addition.
+Weyrich et al. 2005, section 10.2, defines a beard and a no-beard region; the finer
+regions are an addition.
 """
 
 from __future__ import annotations
@@ -16,9 +18,10 @@ Array = NDArray[np.floating[Any]]
 Mask = NDArray[np.bool_]
 Corner = tuple[str, float, float]
 
-# Outlines from the middle of the top along the subject's right side to the middle of the bottom; the left side is
-# mirrored. A corner is a landmark with an offset to the subject's left, as a fraction of the width between the outer
-# corners of the eyes, and an offset down, as a fraction of the height from nasion to chin.
+# Outlines from the middle of the top along the subject's right side to the middle of
+# the bottom; the left side is mirrored. A corner is a landmark with an offset to the
+# subject's left, as a fraction of the width between the outer corners of the eyes, and
+# an offset down, as a fraction of the height from nasion to chin.
 _MIDDLE: dict[str, tuple[Corner, ...]] = {
     "lips": (
         ("lip_upper", 0, -0.03),
@@ -104,7 +107,9 @@ FINE = (
     "forehead",
     "neck",
 )  # where two overlap, the earlier one has priority
-LOWER_LIP = 0.85  # ratio of the height of the lower lip below the corners of the mouth to that of the upper lip above
+# ratio of the height of the lower lip below the corners of the mouth to that of the
+# upper lip above
+LOWER_LIP = 0.85
 SMOOTH_SKIN = ("forehead", "nose", "cheek")
 
 
@@ -121,10 +126,15 @@ def region_masks(common_uv: Array, landmarks: Mapping[str, Array]) -> dict[str, 
     Returns
     -------
     dict
-        Name -> (n,) mask. Forehead, nose, cheek, lips, chin, eyelid and neck do not overlap; "beard" is where a beard
-        may grow, without the lips; "no_beard" is the skin of forehead, nose and cheeks outside the beard.
+        Name -> (n,) mask. Forehead, nose, cheek, lips, chin, eyelid and neck do not
+        overlap; "beard" is where a beard may grow, without the lips; "no_beard" is the
+        skin of forehead, nose and cheeks outside the beard.
     """
-    known = {name: np.asarray(p, np.float64) for name, p in landmarks.items() if np.isfinite(p).all()}
+    known = {
+        name: np.asarray(p, np.float64)
+        for name, p in landmarks.items()
+        if np.isfinite(p).all()
+    }
     if {"lip_upper", "mouth_corner_right", "mouth_corner_left"} <= known.keys():
         corners = (known["mouth_corner_right"] + known["mouth_corner_left"]) / 2
         known["lip_lower"] = corners + LOWER_LIP * (corners - known["lip_upper"])
@@ -138,7 +148,9 @@ def region_masks(common_uv: Array, landmarks: Mapping[str, Array]) -> dict[str, 
     if drawn["beard"] is not None and "lips" in masks:
         masks["beard"] = drawn["beard"] & ~masks["lips"]
         if all(name in masks for name in SMOOTH_SKIN):
-            masks["no_beard"] = np.any([masks[name] for name in SMOOTH_SKIN], axis=0) & ~masks["beard"]
+            masks["no_beard"] = (
+                np.any([masks[name] for name in SMOOTH_SKIN], axis=0) & ~masks["beard"]
+            )
     return masks
 
 
@@ -146,26 +158,38 @@ def own_masks(fitted: xr.Dataset) -> dict[str, Mask]:
     """Masks (n,) of the regions that were stored with the capture."""
     if "region_mask" not in fitted:
         return {}
-    mask = fitted["region_mask"].values.astype(bool)  # read once: the store keeps all regions of a surfel together
+    # read once: the store keeps all regions of a surfel together
+    mask = fitted["region_mask"].values.astype(bool)
     return {str(name): mask[:, i] for i, name in enumerate(fitted["region"].values)}
 
 
 def landmark_masks(registered: xr.Dataset | None) -> dict[str, Mask]:
-    """Masks (n,) of the regions defined by the landmarks of a registered take; none without a registration."""
+    """Masks (n,) of the regions defined by the landmarks of a registered take; none
+    without a registration.
+    """
     if registered is None:
         return {}
     points = registered["common_landmark"]
-    named = {str(name): points.sel(landmark=name).values for name in points["landmark"].values}
+    named = {
+        str(name): points.sel(landmark=name).values
+        for name in points["landmark"].values
+    }
     return region_masks(registered["common_uv"].values, named)
 
 
-def take_masks(model: xr.DataTree, registered: xr.Dataset | None = None) -> dict[str, Mask]:
-    """Masks (n,) of the regions of a take; those of its capture replace those defined by the landmarks."""
+def take_masks(
+    model: xr.DataTree, registered: xr.Dataset | None = None
+) -> dict[str, Mask]:
+    """Masks (n,) of the regions of a take; those of its capture replace those defined
+    by the landmarks.
+    """
     return landmark_masks(registered) | own_masks(model["fitted"].to_dataset())
 
 
 def mask_agreement(mask: Mask, other: Mask, area: Array) -> float:
-    """Area of the intersection of two masks divided by the area of their union; NaN if both are empty."""
+    """Area of the intersection of two masks divided by the area of their union; NaN if
+    both are empty.
+    """
     either = float(area[mask | other].sum())
     return float(area[mask & other].sum()) / either if either else float("nan")
 
@@ -173,7 +197,9 @@ def mask_agreement(mask: Mask, other: Mask, area: Array) -> float:
 def _region_mask(name: str, uv: Array, landmarks: Mapping[str, Array]) -> Mask | None:
     """Mask (n,) of one region on both sides of the face; None if a landmark is missing."""
     try:
-        right = _corners(_MIDDLE.get(name, _SIDE.get(name, ())), landmarks, mirror=False)
+        right = _corners(
+            _MIDDLE.get(name, _SIDE.get(name, ())), landmarks, mirror=False
+        )
         left = _corners(_MIDDLE.get(name, _SIDE.get(name, ())), landmarks, mirror=True)
     except KeyError:
         return None
@@ -182,14 +208,24 @@ def _region_mask(name: str, uv: Array, landmarks: Mapping[str, Array]) -> Mask |
     return inside_outline(uv, right) | inside_outline(uv, left)
 
 
-def _corners(outline: tuple[Corner, ...], landmarks: Mapping[str, Array], *, mirror: bool) -> Array:
+def _corners(
+    outline: tuple[Corner, ...], landmarks: Mapping[str, Array], *, mirror: bool
+) -> Array:
     """Corners (m, 2) of an outline on the subject's right side, or mirrored to the left."""
     across = landmarks["eye_outer_left"] - landmarks["eye_outer_right"]
     down = landmarks["chin"] - landmarks["nasion"]
     if mirror:
         across = -across
-        outline = tuple((name.replace("_right", "_left"), right, below) for name, right, below in outline)
-    return np.array([landmarks[name] + right * across + below * down for name, right, below in outline])
+        outline = tuple(
+            (name.replace("_right", "_left"), right, below)
+            for name, right, below in outline
+        )
+    return np.array(
+        [
+            landmarks[name] + right * across + below * down
+            for name, right, below in outline
+        ]
+    )
 
 
 def inside_outline(points: Array, outline: Array) -> Mask:
@@ -199,5 +235,7 @@ def inside_outline(points: Array, outline: Array) -> Mask:
     y = points[:, 1]
     for (ax, ay), (bx, by) in zip(outline, np.roll(outline, -1, axis=0), strict=True):
         if ay != by:
-            inside ^= ((ay > y) != (by > y)) & (x < ax + (y - ay) / (by - ay) * (bx - ax))
+            inside ^= ((ay > y) != (by > y)) & (
+                x < ax + (y - ay) / (by - ay) * (bx - ax)
+            )
     return inside

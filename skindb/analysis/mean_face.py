@@ -1,4 +1,6 @@
-"""Mean face of a cohort in the common (u, v), and the standard deviation between subjects at every texel."""
+"""Mean face of a cohort in the common (u, v), and the standard deviation between
+subjects at every texel.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,8 @@ from skindb.schema.cohort import require_same_fit
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-LEAST_SUBJECTS = 3  # the spread of fewer is unknown, and their mean would show the face of a single subject
+# the spread of fewer is unknown, and their mean would show the face of a single subject
+LEAST_SUBJECTS = 3
 COVERAGE = "texel_coverage"
 # map -> (name, whether it is averaged on the log scale)
 AVERAGED = {
@@ -28,13 +31,18 @@ AVERAGED = {
 }
 
 
-def mean_face(cohort: xr.Dataset, *, least: int = LEAST_SUBJECTS, mixed_fits: bool = False) -> xr.Dataset:
-    """Mean and standard deviation over subjects of albedo, sigma_tr and surface reflectance, texel by texel.
+def mean_face(
+    cohort: xr.Dataset, *, least: int = LEAST_SUBJECTS, mixed_fits: bool = False
+) -> xr.Dataset:
+    """Mean and standard deviation over subjects of albedo, sigma_tr and surface
+    reflectance, texel by texel.
 
-    Takes in another condition than normal are excluded, and the takes of a subject are averaged first. Albedo and
-    sigma_tr are averaged on the log scale and transformed back: the mean is the geometric one, and the standard
-    deviation is that of the natural logarithm (pigments multiply). Surface reflectance is averaged as it is. Only one
-    subject is in memory at a time; its sums are merged with those of the others (Chan et al. 1979).
+    Takes in another condition than normal are excluded, and the takes of a subject are
+    averaged first. Albedo and sigma_tr are averaged on the log scale and transformed
+    back: the mean is the geometric one, and the standard deviation is that of the
+    natural logarithm (pigments multiply). Surface reflectance is averaged as it is.
+    Only one subject is in memory at a time; its sums are merged with those of the
+    others (Chan et al. 1979).
 
     Parameters
     ----------
@@ -48,8 +56,9 @@ def mean_face(cohort: xr.Dataset, *, least: int = LEAST_SUBJECTS, mixed_fits: bo
     Returns
     -------
     Dataset
-        `face_diffuse_reflectance`, `face_sigma_tr` (v, u, channel), `face_surface_reflectance` (v, u), each with
-        `_log_deviation` or `_deviation` and `_count`, the number of subjects.
+        `face_diffuse_reflectance`, `face_sigma_tr` (v, u, channel),
+        `face_surface_reflectance` (v, u), each with `_log_deviation` or `_deviation`
+        and `_count`, the number of subjects.
 
     Raises
     ------
@@ -65,7 +74,11 @@ def mean_face(cohort: xr.Dataset, *, least: int = LEAST_SUBJECTS, mixed_fits: bo
     for subject in dict.fromkeys(subjects):
         rows = [i for i, one in enumerate(subjects) if one == subject]
         for name, values in _subject_maps(takes.isel(take=rows), names).items():
-            sums[name] = sums[name] + Moments.of(values[None]) if name in sums else Moments.of(values[None])
+            sums[name] = (
+                sums[name] + Moments.of(values[None])
+                if name in sums
+                else Moments.of(values[None])
+            )
     found: dict[str, Array] = {}
     for name, moments in sums.items():
         short, is_log = AVERAGED[name]
@@ -73,13 +86,17 @@ def mean_face(cohort: xr.Dataset, *, least: int = LEAST_SUBJECTS, mixed_fits: bo
         mean = np.exp(moments.mean) if is_log else moments.mean
         deviation = f"{short}_log_deviation" if is_log else f"{short}_deviation"
         found[short] = np.where(enough, mean, np.nan).astype(np.float32)
-        found[deviation] = np.where(enough, moments.standard_deviation, np.nan).astype(np.float32)
+        found[deviation] = np.where(enough, moments.standard_deviation, np.nan).astype(
+            np.float32
+        )
         count = moments.count.min(axis=-1) if moments.count.ndim == 3 else moments.count
         found[f"{short}_count"] = count.astype(np.int32)
     if not any(np.isfinite(found[AVERAGED[name][0]]).any() for name in names):
         rule = f"at least one texel must be measured in {least} subjects"
         cure = "fit or register more subjects"
-        raise InputError(Fault("mean face", rule, f"none among {len(set(subjects))} subjects", cure))
+        raise InputError(
+            Fault("mean face", rule, f"none among {len(set(subjects))} subjects", cure)
+        )
     return dataset(
         found,
         coords={"channel": ["R", "G", "B"]},
@@ -93,14 +110,18 @@ def mean_face(cohort: xr.Dataset, *, least: int = LEAST_SUBJECTS, mixed_fits: bo
 
 
 def _subject_maps(takes: xr.Dataset, names: list[str]) -> dict[str, Array]:
-    """Means of the maps over the takes of a subject, on the scale of averaging; NaN where nothing was measured."""
+    """Means of the maps over the takes of a subject, on the scale of averaging; NaN
+    where nothing was measured.
+    """
     kept: dict[str, list[Array]] = {name: [] for name in names}
     for i in range(takes.sizes["take"]):
         one = takes[[*names, COVERAGE]].isel(take=i).load()
         measured = one[COVERAGE].values > COVERED
         for name in names:
             values = one[name].values.astype(np.float64)
-            known = (measured if values.ndim == 2 else measured[..., None]) & np.isfinite(values)
+            known = (
+                measured if values.ndim == 2 else measured[..., None]
+            ) & np.isfinite(values)
             if AVERAGED[name][1]:
                 known &= values > 0
                 values = np.log(np.where(known, values, 1.0))
@@ -116,7 +137,9 @@ def plot_mean_face(face: xr.Dataset, *, ax: Axes | None = None) -> Axes:
         _, ax = pyplot.subplots(figsize=(4, 4))
     linear = face["face_diffuse_reflectance"].values
     clipped = np.clip(np.nan_to_num(linear, nan=1.0), 0.0, 1.0)
-    shown = np.where(clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055)
+    shown = np.where(
+        clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055
+    )
     ax.imshow(shown, extent=(0, 1, 1, 0), interpolation="nearest")
     ax.set_xlabel("common u")
     ax.set_ylabel("common v")

@@ -1,8 +1,8 @@
 """Selection of the takes of a cohort for comparisons, their groups and their traits.
 
-A trait is an attribute with a value, such as ``condition:lotion`` or ``gender:male``; a boolean attribute is a trait by
-itself, and ``age:older`` is an age above the median of the subjects. The value alone can name a trait if no other
-attribute has this value.
+A trait is an attribute with a value, such as ``condition:lotion`` or ``gender:male``; a
+boolean attribute is a trait by itself, and ``age:older`` is an age above the median of
+the subjects. The value alone can name a trait if no other attribute has this value.
 """
 
 from __future__ import annotations
@@ -23,28 +23,47 @@ OLDER = "age:older"
 ALL_TAKES = "all"
 UNKNOWN = "unknown"
 OTHER = "other conditions"
-NO_ATTRIBUTES = ("take", "subject", "session", "model_generation")  # coordinates along "take" that describe no subject
+# coordinates along "take" that describe no subject
+NO_ATTRIBUTES = ("take", "subject", "session", "model_generation")
 FIT = "fit_"  # prefix of coordinates that are parameters of the fit
 
 
 def attributes(cohort: xr.Dataset) -> dict[str, xr.DataArray]:
-    """Attributes of the takes, by the names that the captures give them, with their values along "take"."""
-    named = {str(name): coord for name, coord in cohort.coords.items() if coord.dims == ("take",)}
-    return {name: coord for name, coord in named.items() if name not in NO_ATTRIBUTES and not name.startswith(FIT)}
+    """Attributes of the takes, by the names that the captures give them, with their
+    values along "take".
+    """
+    named = {
+        str(name): coord
+        for name, coord in cohort.coords.items()
+        if coord.dims == ("take",)
+    }
+    return {
+        name: coord
+        for name, coord in named.items()
+        if name not in NO_ATTRIBUTES and not name.startswith(FIT)
+    }
 
 
 def texts(coord: xr.DataArray) -> list[str | None]:
     """Values as text; None where a value is missing (None, NaN or empty text)."""
-    return [None if one is None or one != one or one == "" else str(one) for one in coord.values.tolist()]
+    return [
+        None if one is None or one != one or one == "" else str(one)
+        for one in coord.values.tolist()
+    ]
 
 
 def trait_names(cohort: xr.Dataset) -> list[str]:
     """All traits that some takes have and others lack, in alphabetical order."""
-    return [name for name in known_traits(cohort) if all(side.any() for side in sides(cohort, name))]
+    return [
+        name
+        for name in known_traits(cohort)
+        if all(side.any() for side in sides(cohort, name))
+    ]
 
 
 def trait_name(name: str, known: Iterable[str]) -> str:
-    """Full name of the trait that a name refers to: a full name, or a value that only one trait has.
+    """Full name of the trait that a name refers to: a full name, or a value that only
+    one trait has.
 
     Raises
     ------
@@ -59,7 +78,14 @@ def trait_name(name: str, known: Iterable[str]) -> str:
         return meant[0]
     found = f"{len(meant)} matches: {', '.join(meant)}" if meant else "an unknown name"
     cure = f"choose from: {', '.join(traits) or 'none'}"
-    raise InputError(Fault(f"trait {name}", "must name exactly one trait of the population", found, cure))
+    raise InputError(
+        Fault(
+            f"trait {name}",
+            "must name exactly one trait of the population",
+            found,
+            cure,
+        )
+    )
 
 
 def sides(cohort: xr.Dataset, trait: str) -> tuple[Mask, Mask]:
@@ -84,7 +110,11 @@ def has_trait(cohort: xr.Dataset, trait: str) -> Mask:
     if coord is None:
         return np.zeros(cohort.sizes["take"], np.bool_)
     return np.array(
-        [one is True or one is np.True_ if not value else one == value for one in coord.values.tolist()], np.bool_
+        [
+            one is True or one is np.True_ if not value else one == value
+            for one in coord.values.tolist()
+        ],
+        np.bool_,
     )
 
 
@@ -93,21 +123,31 @@ def has_attribute(cohort: xr.Dataset, trait: str) -> Mask:
     if trait == OLDER:
         return np.isfinite(number_of_takes(cohort, AGE))
     coord = attributes(cohort).get(trait.partition(":")[0])
-    return np.array([False] * cohort.sizes["take"] if coord is None else [one is not None for one in texts(coord)])
+    return np.array(
+        [False] * cohort.sizes["take"]
+        if coord is None
+        else [one is not None for one in texts(coord)]
+    )
 
 
 def comparable_takes(cohort: xr.Dataset, trait: str) -> Mask:
-    """Mask (take,) of the takes that are compared for a trait; takes without its attribute are excluded.
+    """Mask (take,) of the takes that are compared for a trait; takes without its
+    attribute are excluded.
 
-    A condition is compared within the subjects that were measured with and without it, if there are any: between
-    subjects it would be confounded with everything else that differs.
+    A condition is compared within the subjects that were measured with and without it,
+    if there are any: between subjects it would be confounded with everything else that
+    differs.
     """
     carries = has_trait(cohort, trait)
     subjects = np.array([str(one) for one in texts(cohort["subject"])])
     plain = is_normal(cohort)
     if not trait.startswith(f"{CONDITION}:"):
-        # takes in other conditions are used only if no take with the trait is in the condition normal
-        return np.asarray(has_attribute(cohort, trait) & (plain if (carries & plain).any() else plain | carries))
+        # takes in other conditions are used only if no take with the trait is in the
+        # condition normal
+        return np.asarray(
+            has_attribute(cohort, trait)
+            & (plain if (carries & plain).any() else plain | carries)
+        )
     paired = {s for s in subjects[carries] if ((subjects == s) & plain).any()}
     if not paired:
         return np.asarray(carries | plain)
@@ -115,15 +155,20 @@ def comparable_takes(cohort: xr.Dataset, trait: str) -> Mask:
 
 
 def subjects_without_normal(cohort: xr.Dataset) -> list[Note]:
-    """One note for each subject without a take in the condition normal; such subjects are not compared with others."""
+    """One note for each subject without a take in the condition normal; such subjects
+    are not compared with others.
+    """
     subjects = np.array([str(one) for one in texts(cohort["subject"])])
     plain = is_normal(cohort)
-    others = [str(one) for one in dict.fromkeys(subjects) if not plain[subjects == one].any()]
+    others = [
+        str(one) for one in dict.fromkeys(subjects) if not plain[subjects == one].any()
+    ]
     return [note(subject, "no take in the condition normal") for subject in others]
 
 
 def takes_to_compare(cohort: xr.Dataset, group_by: str | None) -> xr.Dataset:
-    """Takes that are used in a comparison: those in the condition normal, or all takes if conditions are compared.
+    """Takes that are used in a comparison: those in the condition normal, or all takes
+    if conditions are compared.
 
     Raises
     ------
@@ -143,7 +188,8 @@ def takes_to_compare(cohort: xr.Dataset, group_by: str | None) -> xr.Dataset:
 
 
 def groups_by(cohort: xr.Dataset, name: str | None) -> list[str]:
-    """Name of the group of every take, by an attribute or a trait; None puts all takes into one group.
+    """Name of the group of every take, by an attribute or a trait; None puts all takes
+    into one group.
 
     Raises
     ------
@@ -155,24 +201,40 @@ def groups_by(cohort: xr.Dataset, name: str | None) -> list[str]:
     if name in attributes(cohort):
         coord = attributes(cohort)[name]
         known = [one is not None for one in texts(coord)]
-        return [_text(one) if there else UNKNOWN for one, there in zip(coord.values.tolist(), known, strict=True)]
+        return [
+            _text(one) if there else UNKNOWN
+            for one, there in zip(coord.values.tolist(), known, strict=True)
+        ]
     trait = trait_of(cohort, name)
     words = {(True, True): trait, (False, True): f"not {trait}"}
-    pairs = list(zip(has_trait(cohort, trait).tolist(), has_attribute(cohort, trait).tolist(), strict=True))
-    if trait.startswith(f"{CONDITION}:"):  # only takes in the condition normal count as without it
+    pairs = list(
+        zip(
+            has_trait(cohort, trait).tolist(),
+            has_attribute(cohort, trait).tolist(),
+            strict=True,
+        )
+    )
+    # only takes in the condition normal count as without it
+    if trait.startswith(f"{CONDITION}:"):
         plain = is_normal(cohort)
-        return [trait if carries else f"not {trait}" if plain[i] else OTHER for i, (carries, _) in enumerate(pairs)]
+        return [
+            trait if carries else f"not {trait}" if plain[i] else OTHER
+            for i, (carries, _) in enumerate(pairs)
+        ]
     return [words.get(pair, UNKNOWN) for pair in pairs]
 
 
 def trait_of(cohort: xr.Dataset, name: str) -> str:
-    """Full name of the trait that a name refers to; the error lists the attributes and traits that can be used."""
+    """Full name of the trait that a name refers to; the error lists the attributes and
+    traits that can be used.
+    """
     known = known_traits(cohort)
     try:
         return trait_name(name, known)
     except InputError as error:
         there = (
-            f"choose from the attributes: {', '.join(sorted(attributes(cohort)))}; traits: {', '.join(known) or 'none'}"
+            f"choose from the attributes: {', '.join(sorted(attributes(cohort)))}; "
+            f"traits: {', '.join(known) or 'none'}"
         )
         found = error.faults[0].found
         rule = "must be an attribute or a trait"
@@ -184,7 +246,9 @@ def known_traits(cohort: xr.Dataset) -> list[str]:
     found = set()
     for name, coord in attributes(cohort).items():
         values = coord.values.tolist()
-        found |= {f"{name}:{one}" for one in values if isinstance(one, str) and one} - {f"{CONDITION}:{NORMAL}"}
+        found |= {f"{name}:{one}" for one in values if isinstance(one, str) and one} - {
+            f"{CONDITION}:{NORMAL}"
+        }
         found |= {name for one in values if isinstance(one, bool | np.bool_) and one}
     if np.isfinite(number_of_takes(cohort, AGE)).any():
         found.add(OLDER)
@@ -200,7 +264,11 @@ def is_normal(cohort: xr.Dataset) -> Mask:
 
 def numeric_attributes(cohort: xr.Dataset) -> list[str]:
     """Numeric attributes: those with more than two different numbers."""
-    return [name for name in sorted(attributes(cohort)) if len(set(_finite(number_of_takes(cohort, name)))) > 2]
+    return [
+        name
+        for name in sorted(attributes(cohort))
+        if len(set(_finite(number_of_takes(cohort, name)))) > 2
+    ]
 
 
 def number_of_takes(cohort: xr.Dataset, name: str) -> Array:
@@ -209,8 +277,16 @@ def number_of_takes(cohort: xr.Dataset, name: str) -> Array:
     if coord is None:
         return np.full(cohort.sizes["take"], np.nan)
     values = coord.values.tolist()
-    numbers = [isinstance(one, int | float | np.number) and not isinstance(one, bool) for one in values]
-    return np.array([float(one) if good else np.nan for one, good in zip(values, numbers, strict=True)])
+    numbers = [
+        isinstance(one, int | float | np.number) and not isinstance(one, bool)
+        for one in values
+    ]
+    return np.array(
+        [
+            float(one) if good else np.nan
+            for one, good in zip(values, numbers, strict=True)
+        ]
+    )
 
 
 def _finite(values: Array) -> list[float]:
@@ -218,4 +294,8 @@ def _finite(values: Array) -> list[float]:
 
 
 def _text(value: object) -> str:
-    return str(int(value)) if isinstance(value, float) and value.is_integer() else str(value)
+    return (
+        str(int(value))
+        if isinstance(value, float) and value.is_integer()
+        else str(value)
+    )

@@ -1,4 +1,6 @@
-"""One reduced basis for all takes, and the coefficients of each take in it (Weyrich et al. 2005, section 10.1)."""
+"""One reduced basis for all takes, and the coefficients of each take in it (Weyrich et
+al. 2005, section 10.1).
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,8 @@ from skindb.optics.brdf_table import brdf_metric
 from skindb.schema import dataset
 from skindb.schema.cohort import require_same_fit
 
-MAX_START_SURFELS = 5000  # of all takes together, from which the starting basis is computed
+# of all takes together, from which the starting basis is computed
+MAX_START_SURFELS = 5000
 
 
 def population_basis(
@@ -27,11 +30,13 @@ def population_basis(
     mixed_fits: bool = False,
     rng: np.random.Generator,
 ) -> xr.Dataset:
-    """Basis of `k` components for the sampled surfels of all takes: of a person, a set of conditions or a population.
+    """Basis of `k` components for the sampled surfels of all takes: of a person, a set
+    of conditions or a population.
 
-    The starting basis is the best of four factorisations of some of the surfels. Every later pass reads the surfels
-    take by take and reduces them to sums of a few thousand numbers, from which the next basis is computed: memory does
-    not grow with the number of takes. Every take has the same weight.
+    The starting basis is the best of four factorisations of some of the surfels. Every
+    later pass reads the surfels take by take and reduces them to sums of a few thousand
+    numbers, from which the next basis is computed: memory does not grow with the number
+    of takes. Every take has the same weight.
 
     Parameters
     ----------
@@ -40,9 +45,11 @@ def population_basis(
     tables
         (nh, nd, np, m) tables of that dictionary [sr^-1], or a Dask object that computes them.
     k
-        Number of components; the paper needed 6 for one person in several conditions and 8 for a population.
+        Number of components; the paper needed 6 for one person in several conditions
+        and 8 for a population.
     in_metric
-        Minimise the error of BRDFs (`brdf_metric`). By default the error of coefficients is minimised, as in the paper.
+        Minimise the error of BRDFs (`brdf_metric`). By default the error of
+        coefficients is minimised, as in the paper.
     mixed_fits
         Accept takes that were fitted with different parameters.
     rng
@@ -51,27 +58,39 @@ def population_basis(
     Returns
     -------
     Dataset
-        `population_mixture`, `take_coefficient`. Attributes: relative error over all surfels, relative error of the
-        starting basis, spread of the errors of the sample over the starts, number of passes and surfels, and metric.
+        `population_mixture`, `take_coefficient`. Attributes: relative error over all
+        surfels, relative error of the starting basis, spread of the errors of the
+        sample over the starts, number of passes and surfels, and metric.
 
     Raises
     ------
     InputError
-        If takes were fitted with different parameters or dictionaries, or if a take has no fitted surfels.
+        If takes were fitted with different parameters or dictionaries, or if a take has
+        no fitted surfels.
     """
     if not mixed_fits:
         require_same_fit(cohort)
     names = same_dictionary(cohort)
     takes = [str(take) for take in cohort["take"].values]
     part = max(1, MAX_START_SURFELS // len(takes))
-    first = each_take(_fitted_weights, cohort.isel(surfel=slice(2 * part)), ["dictionary_weight"])
-    if lost := [take for take, known in zip(takes, first, strict=True) if not len(known)]:
+    first = each_take(
+        _fitted_weights, cohort.isel(surfel=slice(2 * part)), ["dictionary_weight"]
+    )
+    if lost := [
+        take for take, known in zip(takes, first, strict=True) if not len(known)
+    ]:
         rule = "a take must have fitted surfels"
         cure = "fit it again, or exclude it"
         raise InputError(Fault(f"take {take}", rule, "none", cure) for take in lost)
     X = np.concatenate([rng.permutation(one)[:part] for one in first])
     [metric] = each_item(brdf_metric, [tables])
-    start = nmf(X, min(k, *X.shape), metric=metric if in_metric else None, rng=rng, each=each_item)
+    start = nmf(
+        X,
+        min(k, *X.shape),
+        metric=metric if in_metric else None,
+        rng=rng,
+        each=each_item,
+    )
     A = metric if in_metric else np.eye(X.shape[1])
 
     def sums_of_takes(H: Array) -> list[Sums]:
@@ -99,7 +118,13 @@ def _mean(take: xr.Dataset) -> Array:
     weights = take["dictionary_weight"].values
     area = take["surfel_area"].values
     good = np.isfinite(weights).all(axis=1)
-    return np.asarray(np.average(weights[good].astype(np.float64), axis=0, weights=area[good].astype(np.float64)))
+    return np.asarray(
+        np.average(
+            weights[good].astype(np.float64),
+            axis=0,
+            weights=area[good].astype(np.float64),
+        )
+    )
 
 
 def _sums(take: xr.Dataset, H: Array, A: Array) -> Sums:
@@ -108,13 +133,17 @@ def _sums(take: xr.Dataset, H: Array, A: Array) -> Sums:
 
 
 def _fitted_weights(take: xr.Dataset) -> Array:
-    """Weights (n, m) of the fitted surfels; a sample with fewer surfels than requested is padded with NaN."""
+    """Weights (n, m) of the fitted surfels; a sample with fewer surfels than requested
+    is padded with NaN.
+    """
     weights = take["dictionary_weight"].values
     return np.asarray(weights[np.isfinite(weights).all(axis=1)].astype(np.float64))
 
 
 def project(weights: Array, H: Array, metric: Array) -> Array:
-    """Non-negative coefficients (n, k) of the BRDFs nearest to `weights` (n, m) in the space of H (k, m)."""
+    """Non-negative coefficients (n, k) of the BRDFs nearest to `weights` (n, m) in the
+    space of H (k, m).
+    """
     gram = H @ metric @ H.T
     rhs = weights @ metric @ H.T
     x, _, _, _ = solve_nnls(np.broadcast_to(gram, (len(rhs), *gram.shape)), rhs)
@@ -122,10 +151,21 @@ def project(weights: Array, H: Array, metric: Array) -> Array:
 
 
 def same_dictionary(cohort: xr.Dataset) -> list[str]:
-    """Names of the BRDFs with which all takes were fitted; raises `InputError` if the dictionaries differ."""
+    """Names of the BRDFs with which all takes were fitted; raises `InputError` if the
+    dictionaries differ.
+    """
     if "fit_dictionary" in cohort.coords:
-        sources = sorted({str(value) for value in cohort["fit_dictionary"].dropna("take").values})
+        sources = sorted(
+            {str(value) for value in cohort["fit_dictionary"].dropna("take").values}
+        )
         if len(sources) > 1:
             rule = "all takes of a population must be fitted with one dictionary"
-            raise InputError(Fault("dictionary", rule, ", ".join(sources), "fit them again with the same dictionary"))
+            raise InputError(
+                Fault(
+                    "dictionary",
+                    rule,
+                    ", ".join(sources),
+                    "fit them again with the same dictionary",
+                )
+            )
     return [str(name) for name in cohort["dictionary"].values]

@@ -1,4 +1,6 @@
-"""Registration: warps of takes to common (u, v) by their landmarks (Weyrich et al. 2005, section 10.2)."""
+"""Registration: warps of takes to common (u, v) by their landmarks (Weyrich et al.
+2005, section 10.2).
+"""
 
 from __future__ import annotations
 
@@ -25,47 +27,55 @@ Array = NDArray[np.floating[Any]]
 Takes = Mapping[str, xr.DataTree]
 Registered = Mapping[str, xr.Dataset]
 MEAN = "mean"
-# a landmark is doubtful if its prediction error [mm], its ratio to the error in other takes, and its ratio to the
-# largest error of its own take are above these
+# a landmark is doubtful if its prediction error [mm], its ratio to the error in other
+# takes, and its ratio to the largest error of its own take are above these
 DOUBTFUL_ERROR = 5.0
 DOUBTFUL_RATIO = 3.0
 DOUBTFUL_FRACTION = 0.7
 IMPOSSIBLE_ERROR = 20.0  # mm, more than faces can differ
-TEMPLATE_FRACTION = 0.75  # minimum number of landmarks of the template, as a fraction of the largest number in a take
+# minimum number of landmarks of the template, as a fraction of the largest number in a
+# take
+TEMPLATE_FRACTION = 0.75
 HEIGHT = 1e-2  # of the plane from which rays start, in units of uv
 
 
-def register(models: Takes, *, reference: str | None = None, smoothing: float | None = None) -> dict[str, xr.Dataset]:
+def register(
+    models: Takes, *, reference: str | None = None, smoothing: float | None = None
+) -> dict[str, xr.Dataset]:
     """Common texture coordinates of takes that have landmarks; takes without landmarks are omitted.
 
-    The landmarks of a face do not constrain ears, neck and scalp. There, corresponding points on the surface of a
-    template are used in addition (see `anchors.corresponding_uv`). The template is the reference, or the take that
-    shows most of its head.
+    The landmarks of a face do not constrain ears, neck and scalp. There, corresponding
+    points on the surface of a template are used in addition (see
+    `anchors.corresponding_uv`). The template is the reference, or the take that shows
+    most of its head.
 
     Parameters
     ----------
     models
         Take -> version of kind "model".
     reference
-        Take whose coordinates are the common ones. By default these are given by the mean landmarks of all takes,
-        after rotation, scale and translation are removed.
+        Take whose coordinates are the common ones. By default these are given by the
+        mean landmarks of all takes, after rotation, scale and translation are removed.
     smoothing
         See `fit_warp`.
 
     Returns
     -------
     dict
-        Take -> `common_uv`, `common_landmark`, `landmark_residual`, `landmark_prediction_error`, `landmark_used`.
-        Attributes describe the warp: `warp_kind`, `warp_condition`, `warp_smoothing`, `warp_anchors`, `warp_flips`
-        (number of flipped triangles), `reference` and `template`. `mm_per_uv` is the scale of the common coordinates,
-        from the distances of the landmarks.
+        Take -> `common_uv`, `common_landmark`, `landmark_residual`,
+        `landmark_prediction_error`, `landmark_used`. Attributes describe the warp:
+        `warp_kind`, `warp_condition`, `warp_smoothing`, `warp_anchors`, `warp_flips`
+        (number of flipped triangles), `reference` and `template`. `mm_per_uv` is the
+        scale of the common coordinates, from the distances of the landmarks.
     """
     return dict(registrations(models, reference=reference, smoothing=smoothing))
 
 
 @dataclass(frozen=True)
 class Outline:
-    """Landmarks and area of a take before registration; small, so that those of all takes fit into memory."""
+    """Landmarks and area of a take before registration; small, so that those of all
+    takes fit into memory.
+    """
 
     landmark: NDArray[np.float64]  # (k, 3) mm
     landmark_uv: NDArray[np.float64]  # (k, 2)
@@ -78,7 +88,8 @@ class Frame:
     """The common coordinates: positions of the landmarks, and the template take."""
 
     names: tuple[str, ...]  # of the landmarks
-    at: Mapping[str, NDArray[np.float64]]  # take -> (k, 2) landmarks in the (u, v) of the take
+    # take -> (k, 2) landmarks in the (u, v) of the take
+    at: Mapping[str, NDArray[np.float64]]
     target: NDArray[np.float64]  # (k, 2) landmarks in the common (u, v)
     template: str
     reference: str
@@ -88,7 +99,9 @@ class Frame:
 def registrations(
     models: Takes, *, reference: str | None = None, smoothing: float | None = None
 ) -> Iterator[tuple[str, xr.Dataset]]:
-    """Items of the result of `register`; only the surfaces of the template and one other take are in memory."""
+    """Items of the result of `register`; only the surfaces of the template and one
+    other take are in memory.
+    """
     takes = with_landmarks(models)
     for take, model in takes.items():
         honour_consent({**model.attrs, "take": take}, "statistics")
@@ -103,17 +116,28 @@ def registrations(
 
 def landmark_names(models: Iterable[xr.DataTree]) -> tuple[str, ...]:
     """Names of the landmarks of all takes."""
-    return tuple(dict.fromkeys(str(n) for m in models for n in m["mesh"].to_dataset()["landmark"].values))
+    return tuple(
+        dict.fromkeys(
+            str(n) for m in models for n in m["mesh"].to_dataset()["landmark"].values
+        )
+    )
 
 
 def outline(model: xr.DataTree, names: Sequence[str]) -> Outline:
     """Outline of a take, the input of `common_frame`."""
     sheet = _sheet(model, list(names))
-    return Outline(np.asarray(sheet.landmark, np.float64), _landmark_uv(sheet), sheet.area(), sheet.alignable())
+    return Outline(
+        np.asarray(sheet.landmark, np.float64),
+        _landmark_uv(sheet),
+        sheet.area(),
+        sheet.alignable(),
+    )
 
 
 def with_names(one: Outline, own: Sequence[str], names: Sequence[str]) -> Outline:
-    """An outline with the landmarks `own`, extended to and sorted by the names of the landmarks of all takes."""
+    """An outline with the landmarks `own`, extended to and sorted by the names of the
+    landmarks of all takes.
+    """
     landmark = np.full((len(names), 3), np.nan)
     uv = np.full((len(names), 2), np.nan)
     at = [list(names).index(name) for name in own]
@@ -143,7 +167,14 @@ def common_frame(
         there = ", ".join(outlines) or "none"
         rule = "must be a take with landmarks"
         found = "another name"
-        raise InputError(Fault(f"reference {reference}", rule, found, f"choose from takes with landmarks: {there}"))
+        raise InputError(
+            Fault(
+                f"reference {reference}",
+                rule,
+                found,
+                f"choose from takes with landmarks: {there}",
+            )
+        )
     if not outlines:
         return None
     at = {take: one.landmark_uv for take, one in outlines.items()}
@@ -152,7 +183,9 @@ def common_frame(
     return Frame(tuple(names), at, target, template, reference or MEAN, smoothing)
 
 
-def register_one(take: str, model: xr.DataTree, template: xr.DataTree, frame: Frame) -> xr.Dataset:
+def register_one(
+    take: str, model: xr.DataTree, template: xr.DataTree, frame: Frame
+) -> xr.Dataset:
     """Common texture coordinates of one take; see `register`."""
     names = list(frame.names)
     at = frame.at
@@ -163,10 +196,17 @@ def register_one(take: str, model: xr.DataTree, template: xr.DataTree, frame: Fr
     if take != frame.template:
         other = _sheet(template, names)
         chosen = anchor_vertices(other)
-        weak = (corresponding_uv(other, chosen, sheet), apply_warp(warp, other.uv[chosen]))
+        weak = (
+            corresponding_uv(other, chosen, sheet),
+            apply_warp(warp, other.uv[chosen]),
+        )
         warp = fit_warp(at[take], target, smoothing=smoothing, weak=weak)
     about = {"reference": frame.reference, "template": frame.template}
-    return _registration_dataset(sheet, at[take], target, warp).assign_coords(landmark=names).assign_attrs(about)
+    return (
+        _registration_dataset(sheet, at[take], target, warp)
+        .assign_coords(landmark=names)
+        .assign_attrs(about)
+    )
 
 
 def _template_take(outlines: Mapping[str, Outline], target: Array) -> str:
@@ -174,13 +214,21 @@ def _template_take(outlines: Mapping[str, Outline], target: Array) -> str:
 
     Among several, it is the one that shows most of its head, of those with many landmarks.
     """
-    known = {take: np.isfinite(one.landmark).all(axis=1) for take, one in outlines.items()}
+    known = {
+        take: np.isfinite(one.landmark).all(axis=1) for take, one in outlines.items()
+    }
     sound = [take for take in outlines if outlines[take].alignable] or [*outlines]
-    served = {take: sum((known[take] & one).sum() >= ALIGNED for one in known.values()) for take in sound}
+    served = {
+        take: sum((known[take] & one).sum() >= ALIGNED for one in known.values())
+        for take in sound
+    }
     best = [take for take in sound if served[take] == max(served.values())]
     most = max(known[take].sum() for take in best)
     many = [take for take in best if known[take].sum() >= TEMPLATE_FRACTION * most]
-    shown = {take: outlines[take].area / _mm_per_uv(outlines[take].landmark, target) ** 2 for take in many}
+    shown = {
+        take: outlines[take].area / _mm_per_uv(outlines[take].landmark, target) ** 2
+        for take in many
+    }
     return max(shown, key=lambda take: np.nan_to_num(shown[take]))
 
 
@@ -193,50 +241,71 @@ def _sheet(model: xr.DataTree, names: list[str]) -> Sheet:
     """Surface of a take and its landmarks (k, 3); NaN for landmarks that the take lacks."""
     mesh = model["mesh"].to_dataset()
     landmark = np.full((len(names), 3), np.nan)
-    landmark[[names.index(str(name)) for name in mesh["landmark"].values]] = _landmarks_mm(model)
+    landmark[[names.index(str(name)) for name in mesh["landmark"].values]] = (
+        _landmarks_mm(model)
+    )
     return Sheet.of(*_surface(model), landmark)
 
 
 def _landmark_uv(sheet: Sheet) -> NDArray[np.float64]:
-    """Texture coordinates (k, 2) of the surface points nearest to the landmarks; NaN for landmarks that are missing."""
+    """Texture coordinates (k, 2) of the surface points nearest to the landmarks; NaN
+    for landmarks that are missing.
+    """
     known = sheet.known()
-    face, corner, _ = closest_on_mesh(sheet.position, sheet.faces, sheet.landmark[known])
+    face, corner, _ = closest_on_mesh(
+        sheet.position, sheet.faces, sheet.landmark[known]
+    )
     out = np.full((len(known), 2), np.nan)
     out[known] = _interpolate(sheet.uv, sheet.faces[face], corner)
     return out
 
 
 def _landmarks_mm(model: xr.DataTree) -> NDArray[np.float64]:
-    return np.asarray(model["mesh"].to_dataset()["landmark_position"].values, np.float64)
+    return np.asarray(
+        model["mesh"].to_dataset()["landmark_position"].values, np.float64
+    )
 
 
 def _mm_per_uv(landmark: Array, target: Array) -> float:
-    """Ratio of the spread of landmarks (k, 3) in mm to their spread (k, 2) in common (u, v); NaN for fewer than 2."""
+    """Ratio of the spread of landmarks (k, 3) in mm to their spread (k, 2) in common
+    (u, v); NaN for fewer than 2.
+    """
     known = np.isfinite(landmark).all(axis=1) & np.isfinite(target).all(axis=1)
     if known.sum() < 2:
         return float("nan")
-    face, flat = (float(np.sqrt(points[known].var(axis=0).sum())) for points in (landmark, target))
+    face, flat = (
+        float(np.sqrt(points[known].var(axis=0).sum())) for points in (landmark, target)
+    )
     return face / flat if flat > 0 else float("nan")
 
 
 def has_landmarks(model: xr.DataTree) -> bool:
     """Whether a take has at least one landmark."""
-    if "mesh" not in model.children or "landmark_position" not in model["mesh"].data_vars:
+    if (
+        "mesh" not in model.children
+        or "landmark_position" not in model["mesh"].data_vars
+    ):
         return False
     return bool(np.isfinite(_landmarks_mm(model)).all(axis=1).any())
 
 
-def _registration_dataset(sheet: Sheet, source: Array, target: Array, warp: Warp) -> xr.Dataset:
+def _registration_dataset(
+    sheet: Sheet, source: Array, target: Array, warp: Warp
+) -> xr.Dataset:
     """Common coordinates of a take and the quality of its warp."""
     common = apply_warp(warp, sheet.uv).astype(np.float32)
-    turned = (signed_areas(common, sheet.faces) < 0) & (signed_areas(sheet.uv, sheet.faces) >= 0)
+    turned = (signed_areas(common, sheet.faces) < 0) & (
+        signed_areas(sheet.uv, sheet.faces) >= 0
+    )
     # anchors near a landmark depend on its position; the prediction error must be independent of it
     alone = fit_warp(source, target, smoothing=warp.smoothing)
     return dataset(
         {
             "common_uv": common,
             "common_landmark": target,
-            "landmark_residual": np.linalg.norm(apply_warp(warp, source) - target, axis=1),
+            "landmark_residual": np.linalg.norm(
+                apply_warp(warp, source) - target, axis=1
+            ),
             "landmark_prediction_error": left_out_error(alone),
             "landmark_used": warp.used.astype(np.int8),
             "mm_per_uv": _mm_per_uv(sheet.landmark, target),
@@ -251,17 +320,33 @@ def _registration_dataset(sheet: Sheet, source: Array, target: Array, warp: Warp
     )
 
 
-def corresponding_points(model: xr.DataTree, registered: xr.Dataset, common: Array) -> NDArray[np.float64]:
-    """Surface points (n, 3) [mm] of a take at common texture coordinates (n, 2); NaN outside its surface."""
+def corresponding_points(
+    model: xr.DataTree, registered: xr.Dataset, common: Array
+) -> NDArray[np.float64]:
+    """Surface points (n, 3) [mm] of a take at common texture coordinates (n, 2); NaN
+    outside its surface.
+    """
     position, _, faces = _surface(model)
-    # the map has no folds: a ray perpendicular to the plane meets the only triangle that contains the point
-    flat = RayScene(np.pad(registered["common_uv"].values.astype(np.float64), ((0, 0), (0, 1))), faces)
-    start = np.pad(np.asarray(common, np.float64), ((0, 0), (0, 1)), constant_values=HEIGHT)
+    # the map has no folds: a ray perpendicular to the plane meets the only triangle
+    # that contains the point
+    flat = RayScene(
+        np.pad(registered["common_uv"].values.astype(np.float64), ((0, 0), (0, 1))),
+        faces,
+    )
+    start = np.pad(
+        np.asarray(common, np.float64), ((0, 0), (0, 1)), constant_values=HEIGHT
+    )
     face, corner, _ = flat.first_hit(start, np.array([[0.0, 0.0, -1.0]]))
-    return np.where((face >= 0)[:, None], _interpolate(position, faces[np.maximum(face, 0)], corner), np.nan)
+    return np.where(
+        (face >= 0)[:, None],
+        _interpolate(position, faces[np.maximum(face, 0)], corner),
+        np.nan,
+    )
 
 
-def correspondence_error(models: Takes, registered: Registered, points: Mapping[str, Array]) -> NDArray[np.float64]:
+def correspondence_error(
+    models: Takes, registered: Registered, points: Mapping[str, Array]
+) -> NDArray[np.float64]:
     """Errors of correspondences at points where the true ones are known.
 
     Parameters
@@ -271,13 +356,15 @@ def correspondence_error(models: Takes, registered: Registered, points: Mapping[
     registered
         From `register` of these takes, or `unregistered`.
     points
-        Take -> (p, 3) points [mm] on or near the surface; row i is the same anatomical point of every face.
+        Take -> (p, 3) points [mm] on or near the surface; row i is the same anatomical
+        point of every face.
 
     Returns
     -------
     ndarray
-        (pair, p) distances [mm] for every ordered pair of takes, between point i of the first take and the point of
-        its surface that corresponds to point i of the second; NaN where there is no corresponding point.
+        (pair, p) distances [mm] for every ordered pair of takes, between point i of the
+        first take and the point of its surface that corresponds to point i of the
+        second; NaN where there is no corresponding point.
     """
     true = {}
     common = {}
@@ -285,70 +372,122 @@ def correspondence_error(models: Takes, registered: Registered, points: Mapping[
         position, _, faces = _surface(models[take])
         face, corner, _ = closest_on_mesh(position, faces, wanted)
         true[take] = _interpolate(position, faces[face], corner)
-        common[take] = _interpolate(registered[take]["common_uv"].values, faces[face], corner)
+        common[take] = _interpolate(
+            registered[take]["common_uv"].values, faces[face], corner
+        )
     error = []
-    for b in points:  # all others at once, because every call builds a ray tracing scene
+    # all others at once, because every call builds a ray tracing scene
+    for b in points:
         there = np.concatenate([common[a] for a in points if a != b])
-        found = corresponding_points(models[b], registered[b], there).reshape(len(points) - 1, -1, 3)
+        found = corresponding_points(models[b], registered[b], there).reshape(
+            len(points) - 1, -1, 3
+        )
         error.append(np.linalg.norm(found - true[b], axis=2))
     return np.concatenate(error)
 
 
 def unregistered(models: Takes) -> dict[str, xr.Dataset]:
-    """The texture coordinates of each take as if they were common: the baseline for the errors of a registration."""
-    return {take: dataset({"common_uv": _surface(model)[1]}) for take, model in models.items()}
+    """The texture coordinates of each take as if they were common: the baseline for the
+    errors of a registration.
+    """
+    return {
+        take: dataset({"common_uv": _surface(model)[1]})
+        for take, model in models.items()
+    }
 
 
 def tabulate_registration(registered: Registered) -> tuple[list[str], list[list[Any]]]:
-    """Header and one row per take: its warp, prediction errors of the landmarks [mm], and number of further anchors."""
-    header = "take warp landmarks condition_number smoothing misfit_mm predicted_mm worst_mm worst anchors".split()
+    """Header and one row per take: its warp, prediction errors of the landmarks [mm],
+    and number of further anchors.
+    """
+    header = (
+        "take warp landmarks condition_number smoothing misfit_mm predicted_mm "
+        "worst_mm worst anchors"
+    ).split()
     rows: list[list[Any]] = []
     for take, one in registered.items():
         scale = float(one["mm_per_uv"])
-        misfit, error = (scale * one[f"landmark_{name}"].values for name in ("residual", "prediction_error"))
+        misfit, error = (
+            scale * one[f"landmark_{name}"].values
+            for name in ("residual", "prediction_error")
+        )
         row = [take, one.attrs["warp_kind"], int(one["landmark_used"].sum())]
         row += [float(one.attrs["warp_condition"]), float(one.attrs["warp_smoothing"])]
-        row += [float(np.nanmax(misfit))] if np.isfinite(misfit).any() and len(registered) > 1 else [float("nan")]
-        if np.isfinite(error).any() and len(registered) > 1:  # a single take has no other to compare with
+        row += (
+            [float(np.nanmax(misfit))]
+            if np.isfinite(misfit).any() and len(registered) > 1
+            else [float("nan")]
+        )
+        # a single take has no other to compare with
+        if np.isfinite(error).any() and len(registered) > 1:
             at = int(np.nanargmax(error))
-            row += [float(np.nanmedian(error)), float(error[at]), str(one["landmark"].values[at])]
+            row += [
+                float(np.nanmedian(error)),
+                float(error[at]),
+                str(one["landmark"].values[at]),
+            ]
         else:
             row += [float("nan"), float("nan"), "-"]
         anchors = int(one.attrs.get("warp_anchors", 0))
-        rows.append([*row, "template" if one.attrs.get("template") == take else anchors])
+        rows.append(
+            [*row, "template" if one.attrs.get("template") == take else anchors]
+        )
     return header, rows
 
 
 def doubtful_landmarks(registered: Registered) -> list[Note]:
-    """Notes on takes with landmarks that may be misplaced, swapped or misnamed, at most two for each take.
+    """Notes on takes with landmarks that may be misplaced, swapped or misnamed, at most
+    two for each take.
 
-    A landmark is doubtful if the other landmarks of its take predict it with a much larger error than in other takes.
-    Errors are compared by landmark, because some landmarks, such as those of the jaw, are less predictable than others.
-    Errors of neighbours that a misplaced landmark causes are not reported.
+    A landmark is doubtful if the other landmarks of its take predict it with a much
+    larger error than in other takes. Errors are compared by landmark, because some
+    landmarks, such as those of the jaw, are less predictable than others. Errors of
+    neighbours that a misplaced landmark causes are not reported.
     """
     errors = {
-        take: float(one["mm_per_uv"]) * one["landmark_prediction_error"].values for take, one in registered.items()
+        take: float(one["mm_per_uv"]) * one["landmark_prediction_error"].values
+        for take, one in registered.items()
     }
     notes = []
     for take, error in errors.items():
         count = int(registered[take]["landmark_used"].sum())
         if count > 3 and registered[take].attrs["warp_kind"] != "thin plate":
             why = "left and right may be swapped, or they may lie on a line"
-            notes.append(note(take, f"no map without folds fits its {count} landmarks; {why}"))
+            notes.append(
+                note(take, f"no map without folds fits its {count} landmarks; {why}")
+            )
         others = [e for other, e in errors.items() if other != take]
         if not others or not np.isfinite(error).any():
             continue
         known = [column[np.isfinite(column)] for column in np.transpose(others)]
         # a landmark that no other take has is compared with the other landmarks of its take
-        usual = np.array([np.median(column if len(column) else error[np.isfinite(error)]) for column in known])
-        # a gross error bends the mean and appears in all takes: only the take with the largest error is reported
+        usual = np.array(
+            [
+                np.median(column if len(column) else error[np.isfinite(error)])
+                for column in known
+            ]
+        )
+        # a gross error bends the mean and appears in all takes: only the take with the
+        # largest error is reported
         worst = np.nanmax([error, *others], axis=0, initial=0.0)
-        unlike = (error > DOUBTFUL_RATIO * usual) | ((error > IMPOSSIBLE_ERROR) & (error >= worst))
-        odd = (error > DOUBTFUL_ERROR) & unlike & (error > DOUBTFUL_FRACTION * np.nanmax(error))
+        unlike = (error > DOUBTFUL_RATIO * usual) | (
+            (error > IMPOSSIBLE_ERROR) & (error >= worst)
+        )
+        odd = (
+            (error > DOUBTFUL_ERROR)
+            & unlike
+            & (error > DOUBTFUL_FRACTION * np.nanmax(error))
+        )
         names = registered[take]["landmark"].values
-        found = [f"{names[i]} by {error[i]:.1f} mm (other takes {usual[i]:.1f})" for i in np.flatnonzero(odd)]
+        found = [
+            f"{names[i]} by {error[i]:.1f} mm (other takes {usual[i]:.1f})"
+            for i in np.flatnonzero(odd)
+        ]
         if found:
-            reason = f"check landmarks that differ from the prediction of the others: {', '.join(found)}"
+            reason = (
+                "check landmarks that differ from the prediction of the others: "
+                f"{', '.join(found)}"
+            )
             notes.append(note(take, reason))
     return notes
 
@@ -357,29 +496,54 @@ def describe_registration(registered: Registered, takes: Iterable[str]) -> list[
     """Notes on a registration for the report of a study that uses it."""
     without = [take for take in takes if take not in registered]
     if not registered:
-        return [note("", "no take has landmarks; only the regions of the captures are available")]
+        return [
+            note(
+                "",
+                "no take has landmarks; only the regions of the captures are available",
+            )
+        ]
     _, rows = tabulate_registration(registered)
     kinds = sorted({str(row[1]) for row in rows})
-    line = f"{len(rows)} takes with up to {max(row[2] for row in rows)} landmarks ({', '.join(kinds)})"
+    line = (
+        f"{len(rows)} takes with up to {max(row[2] for row in rows)} landmarks "
+        f"({', '.join(kinds)})"
+    )
     known = [row for row in rows if np.isfinite(row[7])]
     largest = []
     if known:
         worst = max(known, key=lambda row: row[7])
         middle = float(np.median([row[6] for row in known]))
-        line += f"; error of a landmark predicted by the others: median {middle:.1f} mm, largest {worst[7]:.1f} mm"
+        line += (
+            f"; error of a landmark predicted by the others: median {middle:.1f} mm, "
+            f"largest {worst[7]:.1f} mm"
+        )
         largest = [note(worst[0], f"the largest error is that of {worst[8]}")]
     doubts = doubtful_landmarks(registered)
-    return [note("", line), *largest, *doubts, *(note(take, "no landmarks") for take in without)]
+    return [
+        note("", line),
+        *largest,
+        *doubts,
+        *(note(take, "no landmarks") for take in without),
+    ]
 
 
-def _surface(model: xr.DataTree) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+def _surface(
+    model: xr.DataTree,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
     """Positions (n, 3) in mm, texture coordinates (n, 2) and triangles (f, 3) of a take."""
     fitted = model["fitted"].to_dataset()
     faces = model["mesh"].to_dataset()["triangle"].values
-    position, uv = (fitted[name].values.astype(np.float64) for name in ("surfel_position", "surfel_uv"))
+    position, uv = (
+        fitted[name].values.astype(np.float64)
+        for name in ("surfel_position", "surfel_uv")
+    )
     return position, uv, faces.astype(np.int64)
 
 
-def _interpolate(values: Array, at: NDArray[np.int64], corner: Array) -> NDArray[np.float64]:
-    """Values (n, c) at barycentric coordinates `corner` (n, 3) of triangles with the vertices `at` (n, 3)."""
+def _interpolate(
+    values: Array, at: NDArray[np.int64], corner: Array
+) -> NDArray[np.float64]:
+    """Values (n, c) at barycentric coordinates `corner` (n, 3) of triangles with the
+    vertices `at` (n, 3).
+    """
     return np.asarray(np.einsum("nk,nkc->nc", corner, values[at].astype(np.float64)))

@@ -1,4 +1,6 @@
-"""Summaries of a model for population studies: tables of regions and sites, and a sample of surfels."""
+"""Summaries of a model for population studies: tables of regions and sites, and a
+sample of surfels.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,9 @@ from skindb.schema.notes import note
 from skindb.schema.regions import FACE
 from skindb.schema.status import MAX_CONDITION_TRUSTED, MIN_SAMPLES_TRUSTED
 
-SAMPLED = 5000  # surfels per take; the paper drew 2,000 of each subject, and 5,000 for the conditions of one subject
+# surfels per take; the paper drew 2,000 of each subject, and 5,000 for the conditions
+# of one subject
+SAMPLED = 5000
 STREAM = 7  # random stream of the sample
 # variables of the group "fitted" that a sample keeps
 KEPT = (
@@ -62,7 +66,9 @@ MEASURES = (
 )
 
 
-def sample_surfels(model: xr.DataTree, *, surfels: int = SAMPLED, seed: int = 0) -> xr.Dataset:
+def sample_surfels(
+    model: xr.DataTree, *, surfels: int = SAMPLED, seed: int = 0
+) -> xr.Dataset:
     """A random sample of the fitted surfels of a model.
 
     Parameters
@@ -77,8 +83,9 @@ def sample_surfels(model: xr.DataTree, *, surfels: int = SAMPLED, seed: int = 0)
     Returns
     -------
     Dataset
-        Variables of the group "fitted" along "surfel", and `surfel_index`. Surfels are drawn without replacement, each
-        with the same probability, and are in random order: the first n of them are a random sample as well.
+        Variables of the group "fitted" along "surfel", and `surfel_index`. Surfels are
+        drawn without replacement, each with the same probability, and are in random
+        order: the first n of them are a random sample as well.
 
     Raises
     ------
@@ -92,10 +99,18 @@ def sample_surfels(model: xr.DataTree, *, surfels: int = SAMPLED, seed: int = 0)
     drawn = np.random.default_rng([seed, STREAM]).permutation(good)[:surfels]
     order = np.argsort(drawn)
     # read in the order of storage, then reorder as drawn
-    sample = fitted[[name for name in KEPT if name in fitted]].isel(surfel=drawn[order]).load()
+    sample = (
+        fitted[[name for name in KEPT if name in fitted]]
+        .isel(surfel=drawn[order])
+        .load()
+    )
     back = np.empty_like(order)
     back[order] = np.arange(len(order))
-    return sample.isel(surfel=back).merge(dataset({"surfel_index": drawn})).drop_attrs(deep=False)
+    return (
+        sample.isel(surfel=back)
+        .merge(dataset({"surfel_index": drawn}))
+        .drop_attrs(deep=False)
+    )
 
 
 def summary_tables(model: xr.DataTree) -> xr.Dataset:
@@ -104,18 +119,26 @@ def summary_tables(model: xr.DataTree) -> xr.Dataset:
     Returns
     -------
     Dataset
-        For every region (those of the capture, and "face" for all surfels): number and area of the trusted surfels,
-        area-weighted means of diffuse and surface reflectance with their errors, and covariance of the colours. For
-        every site: sigma_tr with its errors and status. Coefficients and mixtures of the reduced basis, mean weights of
-        the dictionary, and medians of the residuals and of the errors at held-out samples.
+        For every region (those of the capture, and "face" for all surfels): number and
+        area of the trusted surfels, area-weighted means of diffuse and surface
+        reflectance with their errors, and covariance of the colours. For every site:
+        sigma_tr with its errors and status. Coefficients and mixtures of the reduced
+        basis, mean weights of the dictionary, and medians of the residuals and of the
+        errors at held-out samples.
     """
     fitted = model["fitted"].to_dataset().load()
     masks = {FACE: np.ones(fitted.sizes["surfel"], np.bool_)} | own_masks(fitted)
-    parts = [region_tables(fitted, masks), _basis_tables(model, fitted), _median_errors(fitted)]
+    parts = [
+        region_tables(fitted, masks),
+        _basis_tables(model, fitted),
+        _median_errors(fitted),
+    ]
     if "translucency" in model.children:
         sites = model["translucency"].to_dataset()
         parts.append(sites[[name for name in SITES if name in sites]].load())
-    return xr.merge(parts, combine_attrs="override", join="outer", compat="no_conflicts")
+    return xr.merge(
+        parts, combine_attrs="override", join="outer", compat="no_conflicts"
+    )
 
 
 def region_tables(fitted: xr.Dataset, masks: Mapping[str, Mask]) -> xr.Dataset:
@@ -131,16 +154,23 @@ def region_tables(fitted: xr.Dataset, masks: Mapping[str, Mask]) -> xr.Dataset:
     Returns
     -------
     Dataset
-        `region_surfels`, `region_area`, `region_diffuse_reflectance` with `_error` (from independent errors of the
-        surfels) and `_total_error` (including the part that all surfels have in common, which averaging does not
-        reduce), `region_diffuse_covariance`, `region_surface_reflectance` with its error. NaN for a region without
-        trusted surfels.
+        `region_surfels`, `region_area`, `region_diffuse_reflectance` with `_error`
+        (from independent errors of the surfels) and `_total_error` (including the part
+        that all surfels have in common, which averaging does not reduce),
+        `region_diffuse_covariance`, `region_surface_reflectance` with its error. NaN
+        for a region without trusted surfels.
     """
     trusted = trusted_surfels(fitted)
     area = fitted["surfel_area"].values.astype(np.float64)
     colour = fitted["diffuse_reflectance"].values.astype(np.float64)
-    noise, total = (_values(fitted, f"diffuse_reflectance_{name}", (3,)) for name in ("error", "total_error"))
-    shine, shine_error = (_values(fitted, name, ()) for name in ("surface_reflectance", "surface_reflectance_error"))
+    noise, total = (
+        _values(fitted, f"diffuse_reflectance_{name}", (3,))
+        for name in ("error", "total_error")
+    )
+    shine, shine_error = (
+        _values(fitted, name, ())
+        for name in ("surface_reflectance", "surface_reflectance_error")
+    )
     rows = []
     for mask in masks.values():
         inside = mask & trusted
@@ -157,32 +187,50 @@ def region_tables(fitted: xr.Dataset, masks: Mapping[str, Mask]) -> xr.Dataset:
                 "region_diffuse_reflectance_error": error,
                 "region_diffuse_reflectance_total_error": np.hypot(error, common),
                 "region_diffuse_covariance": _covariance(colour[inside], weight),
-                "region_surface_reflectance": _weighted_mean(shine[inside], shine[inside], weight)[0],
-                "region_surface_reflectance_error": _weighted_mean(shine[inside], shine_error[inside], weight)[1],
+                "region_surface_reflectance": _weighted_mean(
+                    shine[inside], shine[inside], weight
+                )[0],
+                "region_surface_reflectance_error": _weighted_mean(
+                    shine[inside], shine_error[inside], weight
+                )[1],
             }
         )
-    variables = {name: np.stack([np.asarray(row[name]) for row in rows]) for name in rows[0]}
+    variables = {
+        name: np.stack([np.asarray(row[name]) for row in rows]) for name in rows[0]
+    }
     if "even_reflection_limit" in fitted:
         variables["even_reflection_limit"] = fitted["even_reflection_limit"].values
     channels = ["R", "G", "B"]
-    return dataset(variables, coords={"region": list(masks), "channel": channels, "channel_2": channels})
+    return dataset(
+        variables,
+        coords={"region": list(masks), "channel": channels, "channel_2": channels},
+    )
 
 
 def trusted_surfels(fitted: xr.Dataset) -> Mask:
-    """Mask (surfel,) of surfels that are fitted, well-conditioned and have enough samples; see `TexelStatus`."""
+    """Mask (surfel,) of surfels that are fitted, well-conditioned and have enough
+    samples; see `TexelStatus`.
+    """
     good = fitted["fit_status"].values == FitStatus.FITTED
     if "fit_condition" in fitted:
         good &= ~(fitted["fit_condition"].values > MAX_CONDITION_TRUSTED)
     if "fit_samples" in fitted:
         good &= fitted["fit_samples"].values >= MIN_SAMPLES_TRUSTED
-    return np.asarray(good & np.isfinite(fitted["diffuse_reflectance"].values).all(axis=1))
+    return np.asarray(
+        good & np.isfinite(fitted["diffuse_reflectance"].values).all(axis=1)
+    )
 
 
 def no_surfels_error(model: xr.DataTree) -> InputError:
     """Error for a take without fitted surfels, which a population cannot use."""
     where = str(model.attrs.get("take", model.attrs.get("subject", "take")))
     return InputError(
-        Fault(where, "a take of a population must have fitted surfels", "none", "skip the take or fit it again")
+        Fault(
+            where,
+            "a take of a population must have fitted surfels",
+            "none",
+            "skip the take or fit it again",
+        )
     )
 
 
@@ -191,15 +239,29 @@ def _basis_tables(model: xr.DataTree, fitted: xr.Dataset) -> xr.Dataset:
     basis = model["basis"].to_dataset()
     names = ("basis_mixture", "mean_dictionary_weight", "disc_angular_radius")
     tables = basis[[name for name in names if name in basis]].load()
-    good = np.isfinite(fitted["basis_weight"].values).all(axis=1) & (fitted["fit_status"].values == FitStatus.FITTED)
+    good = np.isfinite(fitted["basis_weight"].values).all(axis=1) & (
+        fitted["fit_status"].values == FitStatus.FITTED
+    )
     area = fitted["surfel_area"].values[good].astype(np.float64)
     weights = fitted["basis_weight"].values[good].astype(np.float64)
-    mean = np.average(weights, axis=0, weights=area) if good.any() else np.full(weights.shape[1:], np.nan)
-    coords = {"component": fitted["component"].values} if "component" in fitted.coords else {}
+    mean = (
+        np.average(weights, axis=0, weights=area)
+        if good.any()
+        else np.full(weights.shape[1:], np.nan)
+    )
+    coords = (
+        {"component": fitted["component"].values}
+        if "component" in fitted.coords
+        else {}
+    )
     # a cohort needs the labels of the dictionary even if the model stores no mixtures
     own = dataset({"mean_basis_weight": mean}, coords=coords)
     eta = fitted[["refractive_index"]] if "refractive_index" in fitted else xr.Dataset()
-    return xr.merge([tables, own, eta.reset_coords(drop=True)], combine_attrs="override", join="outer")
+    return xr.merge(
+        [tables, own, eta.reset_coords(drop=True)],
+        combine_attrs="override",
+        join="outer",
+    )
 
 
 def _median_errors(fitted: xr.Dataset) -> xr.Dataset:
@@ -209,13 +271,19 @@ def _median_errors(fitted: xr.Dataset) -> xr.Dataset:
         values = fitted[name].values if name in fitted else np.zeros(0)
         known = values[np.isfinite(values)]
         found[name] = float(np.median(known)) if known.size else np.nan
-    return dataset({"median_error": list(found.values())}, coords={"measure": list(found)})
+    return dataset(
+        {"median_error": list(found.values())}, coords={"measure": list(found)}
+    )
 
 
 def _values(fitted: xr.Dataset, name: str, shape: tuple[int, ...]) -> Array:
     """Values (surfel, *shape) of a variable; NaN if the model does not have it."""
     whole = (fitted.sizes["surfel"], *shape)
-    return np.asarray(fitted[name].values.astype(np.float64) if name in fitted else np.full(whole, np.nan))
+    return np.asarray(
+        fitted[name].values.astype(np.float64)
+        if name in fitted
+        else np.full(whole, np.nan)
+    )
 
 
 def _weighted_mean(values: Array, errors: Array, weight: Array) -> tuple[Array, Array]:
@@ -223,7 +291,8 @@ def _weighted_mean(values: Array, errors: Array, weight: Array) -> tuple[Array, 
     weight = weight.reshape(-1, *(1,) * (values.ndim - 1))
     known = np.isfinite(values)
     stated = np.isfinite(errors)
-    if stated.any():  # weights at the bound 0 have no error: the RMS error of the others is used
+    # weights at the bound 0 have no error: the RMS error of the others is used
+    if stated.any():
         errors = np.where(stated, errors, np.sqrt(np.mean(errors[stated] ** 2)))
     total = np.where(known, weight, 0).sum(axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -247,7 +316,8 @@ def cohort_of(
     surfels: int = 2000,
     seed: int = 0,
 ) -> xr.Dataset:
-    """Combine models in memory into a cohort with the layout of `Database.cohort`, without the table of predictions.
+    """Combine models in memory into a cohort with the layout of `Database.cohort`,
+    without the table of predictions.
 
     Parameters
     ----------
@@ -256,26 +326,40 @@ def cohort_of(
     layout
         "tables" or "surfels".
     captures
-        Take -> capture of the model; if given, the reflectance samples of the sampled surfels are included.
+        Take -> capture of the model; if given, the reflectance samples of the sampled
+        surfels are included.
     surfels, seed
         Number of surfels of each take, and the random seed of the sample.
 
     Returns
     -------
     Dataset
-        Takes whose consent does not cover statistics are skipped; the attribute "skipped" names them.
+        Takes whose consent does not cover statistics are skipped; the attribute
+        "skipped" names them.
 
     Raises
     ------
     InputError
         If there is no take whose consent covers statistics.
     """
-    allowed = {take: model for take, model in models.items() if "statistics" in consent_scope(model.attrs)}
+    allowed = {
+        take: model
+        for take, model in models.items()
+        if "statistics" in consent_scope(model.attrs)
+    }
     if not allowed:
         found = f"none of {len(models)} takes"
         cure = "see consent.scope in capture.json"
-        raise InputError(Fault("population", "the consent of a take must cover statistics", found, cure))
-    skipped = [note(take, "its consent does not cover statistics") for take in models if take not in allowed]
+        raise InputError(
+            Fault(
+                "population", "the consent of a take must cover statistics", found, cure
+            )
+        )
+    skipped = [
+        note(take, "its consent does not cover statistics")
+        for take in models
+        if take not in allowed
+    ]
     parts = []
     for take, model in allowed.items():
         if layout == "tables":
@@ -286,11 +370,22 @@ def cohort_of(
                 ds = ds.merge(_samples_of(captures[take], ds["surfel_index"].values))
         parts.append(Held.part(take, take_coords(take, model.attrs, model.attrs), ds))
     sizes = {"surfel": surfels} if layout == "surfels" else {}
-    return combine(parts, sizes=sizes, attrs={"layout": layout, "kind": "model", "skipped": skipped, "outdated": []})
+    return combine(
+        parts,
+        sizes=sizes,
+        attrs={"layout": layout, "kind": "model", "skipped": skipped, "outdated": []},
+    )
 
 
 def _samples_of(capture: xr.DataTree, index: NDArray[np.int64]) -> xr.Dataset:
-    """Reflectance samples of the selected surfels, and the positions of the lights and cameras of the dome."""
+    """Reflectance samples of the selected surfels, and the positions of the lights and
+    cameras of the dome.
+    """
     dome = capture["dome"].to_dataset()[["light_position", "camera_position"]].load()
-    samples = capture["samples"].to_dataset()[["reflectance_sample"]].isel(surfel=index).load()
+    samples = (
+        capture["samples"]
+        .to_dataset()[["reflectance_sample"]]
+        .isel(surfel=index)
+        .load()
+    )
     return xr.merge([samples, dome], combine_attrs="override")

@@ -12,14 +12,26 @@ import xarray as xr
 from skindb._files import private_file
 from skindb._plots import plain_text
 from skindb.analysis.albedo import plot_albedo
-from skindb.analysis.basis_size import describe_basis_size, plot_basis_size, tabulate_basis_size
+from skindb.analysis.basis_size import (
+    describe_basis_size,
+    plot_basis_size,
+    tabulate_basis_size,
+)
 from skindb.analysis.brdf_plots import plot_space
 from skindb.analysis.brdf_space import describe_brdf_space, tabulate_brdf_space
 from skindb.analysis.chromophores import describe_chromophores, plot_chromophores
-from skindb.analysis.components import describe_components, plot_components, tabulate_components
+from skindb.analysis.components import (
+    describe_components,
+    plot_components,
+    tabulate_components,
+)
 from skindb.analysis.correlations import describe_correlations, plot_correlations
 from skindb.analysis.coverage import describe_coverage, plot_coverage
-from skindb.analysis.effect_maps import describe_effect_maps, plot_effect_maps, tabulate_effect_maps
+from skindb.analysis.effect_maps import (
+    describe_effect_maps,
+    plot_effect_maps,
+    tabulate_effect_maps,
+)
 from skindb.analysis.group_effects import describe_group_effects, plot_group_effects
 from skindb.analysis.traits import describe_traits, plot_traits
 from skindb.analysis.translucency import describe_translucency, plot_translucency
@@ -75,7 +87,8 @@ def tabulate_study(study: xr.DataTree) -> tuple[list[str], list[list[Any]]]:
             "sigma_tr_people_fraction",
             "sigma_tr_repeat_deviation",
         ]
-        names = [name for name in names if name in table]  # studies of earlier versions lack some
+        # studies of earlier versions lack some
+        names = [name for name in names if name in table]
         dims = ["group", "site", "channel"]
     elif "correlations" in study.children:
         table = study["correlations"].to_dataset()
@@ -84,7 +97,10 @@ def tabulate_study(study: xr.DataTree) -> tuple[list[str], list[list[Any]]]:
     elif "effects" in study.children:
         table = study["effects"].to_dataset()
         table = table.assign(
-            {f"subjects_{s}": table["effect_count"].sel(side=s, drop=True) for s in table["side"].values.tolist()}
+            {
+                f"subjects_{s}": table["effect_count"].sel(side=s, drop=True)
+                for s in table["side"].values.tolist()
+            }
         )
         names = ["subjects_with", "subjects_without", *EFFECT_COLUMNS]
         dims = ["contrast", "quantity"]
@@ -112,8 +128,13 @@ def tabulate_study(study: xr.DataTree) -> tuple[list[str], list[list[Any]]]:
         names = ["albedo_mean"]
         dims = ["take", "region", "channel"]
     stacked = table[names].stack(row=dims, create_index=False).load()
-    keys = [list(key) for key in itertools.product(*(table[d].values.tolist() for d in dims))]
-    return [*dims, *names], [[*k, *(stacked[n].values[i].item() for n in names)] for i, k in enumerate(keys)]
+    keys = [
+        list(key)
+        for key in itertools.product(*(table[d].values.tolist() for d in dims))
+    ]
+    return [*dims, *names], [
+        [*k, *(stacked[n].values[i].item() for n in names)] for i, k in enumerate(keys)
+    ]
 
 
 def describe_study(study: xr.DataTree) -> list[str]:
@@ -143,12 +164,21 @@ def describe_study(study: xr.DataTree) -> list[str]:
 
 def _side_counts(table: xr.Dataset) -> dict[str, xr.DataArray]:
     """Numbers of takes with and without each trait."""
-    return {f"takes_{side}": table["trait_count"].sel(side=side, drop=True) for side in ("with", "without")}
+    return {
+        f"takes_{side}": table["trait_count"].sel(side=side, drop=True)
+        for side in ("with", "without")
+    }
 
 
 def _vector_lengths(table: xr.Dataset) -> dict[str, xr.DataArray]:
-    """RMS lengths of the parts of trait vectors, and the lengths that noise alone would give them."""
-    face = table.sel(region=FACE, drop=True) if FACE in table["region"].values else table.isel(region=0, drop=True)
+    """RMS lengths of the parts of trait vectors, and the lengths that noise alone would
+    give them.
+    """
+    face = (
+        table.sel(region=FACE, drop=True)
+        if FACE in table["region"].values
+        else table.isel(region=0, drop=True)
+    )
     parts = {
         "brdf": (table, "trait_brdf_shift", ["component"]),
         "colour": (face, "trait_quantile_shift", ["axis", "level"]),
@@ -158,7 +188,9 @@ def _vector_lengths(table: xr.Dataset) -> dict[str, xr.DataArray]:
     for name, (ds, variable, dims) in parts.items():
         for suffix, part in (("shift", variable), ("noise", f"{variable}_error")):
             if part in ds:  # studies of earlier versions have no errors
-                found[f"{name}_{suffix}"] = (ds[part] ** 2).mean(dims, skipna=False) ** 0.5
+                found[f"{name}_{suffix}"] = (ds[part] ** 2).mean(
+                    dims, skipna=False
+                ) ** 0.5
     return found
 
 

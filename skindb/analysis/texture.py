@@ -1,4 +1,6 @@
-"""Distributions of albedo at every scale, which are comparable between takes (Weyrich et al. 2005, section 10.2)."""
+"""Distributions of albedo at every scale, which are comparable between takes (Weyrich
+et al. 2005, section 10.2).
+"""
 
 from __future__ import annotations
 
@@ -45,7 +47,8 @@ class Moments:
 
 
 def texel_regions(landmarks: Mapping[str, Array], size: int = SIZE) -> dict[str, Mask]:
-    """Masks (v, u) of the regions in the common (u, v): the whole face, the beard, and the skin without a beard.
+    """Masks (v, u) of the regions in the common (u, v): the whole face, the beard, and
+    the skin without a beard.
 
     Parameters
     ----------
@@ -58,27 +61,37 @@ def texel_regions(landmarks: Mapping[str, Array], size: int = SIZE) -> dict[str,
     at = np.stack(np.meshgrid(centre, centre), axis=-1).reshape(-1, 2)
     drawn = region_masks(at, landmarks)
     whole = {FACE: np.ones((size, size), np.bool_)}
-    return whole | {name: drawn[name].reshape(size, size) for name in REGIONS if name in drawn}
+    return whole | {
+        name: drawn[name].reshape(size, size) for name in REGIONS if name in drawn
+    }
 
 
 def common_landmarks(registered: Mapping[str, xr.Dataset]) -> dict[str, Array]:
-    """Mean positions (2,) of the landmarks in the common (u, v), each over the takes that have it."""
+    """Mean positions (2,) of the landmarks in the common (u, v), each over the takes
+    that have it.
+    """
     found: dict[str, list[Array]] = {}
     for one in registered.values():
-        for name, at in zip(one["landmark"].values.tolist(), one["common_landmark"].values, strict=True):
+        for name, at in zip(
+            one["landmark"].values.tolist(), one["common_landmark"].values, strict=True
+        ):
             if np.isfinite(at).all():
                 found.setdefault(str(name), []).append(at)
     return {name: np.mean(places, axis=0) for name, places in found.items()}
 
 
-def texture_statistics(cohort: xr.Dataset, *, landmarks: Mapping[str, Array], mixed_fits: bool = False) -> xr.Dataset:
+def texture_statistics(
+    cohort: xr.Dataset, *, landmarks: Mapping[str, Array], mixed_fits: bool = False
+) -> xr.Dataset:
     """Histograms and quantile functions of log albedo and of its bands, for every take and region.
 
-    The logarithm is used because pigments attenuate by a factor: a change of pigment adds the same step at every texel,
-    and no sum of steps leads to a negative albedo. Colour is decorrelated with the principal axes of the texels of all
-    takes, each take with the same weight, divided by their standard deviations (Heeger and Bergen 1995, section 3.5).
-    Every axis is decomposed into a steerable pyramid of 7 levels and 4 orientations; its 30 parts and the image itself
-    have 256 bins each, with the same edges for all takes: 23,808 numbers for each take and region.
+    The logarithm is used because pigments attenuate by a factor: a change of pigment
+    adds the same step at every texel, and no sum of steps leads to a negative albedo.
+    Colour is decorrelated with the principal axes of the texels of all takes, each take
+    with the same weight, divided by their standard deviations (Heeger and Bergen 1995,
+    section 3.5). Every axis is decomposed into a steerable pyramid of 7 levels and 4
+    orientations; its 30 parts and the image itself have 256 bins each, with the same
+    edges for all takes: 23,808 numbers for each take and region.
 
     Parameters
     ----------
@@ -92,9 +105,10 @@ def texture_statistics(cohort: xr.Dataset, *, landmarks: Mapping[str, Array], mi
     Returns
     -------
     Dataset
-        `texture_colour_mean`, `texture_colour_axis` (of log R_d), `texture_edge`, `texture_histogram`,
-        `texture_quantile`, `texture_coverage` (fraction of the texels of the region that the take has measured; below
-        one half, its distributions are NaN), `texture_region`.
+        `texture_colour_mean`, `texture_colour_axis` (of log R_d), `texture_edge`,
+        `texture_histogram`, `texture_quantile`, `texture_coverage` (fraction of the
+        texels of the region that the take has measured; below one half, its
+        distributions are NaN), `texture_region`.
 
     Raises
     ------
@@ -113,7 +127,9 @@ def texture_statistics(cohort: xr.Dataset, *, landmarks: Mapping[str, Array], mi
         rule = "at least one take must have measured half of a region"
         cure = "fit or register more takes"
         raise InputError(Fault("texture", rule, f"none of {len(found)} takes", cure))
-    quantiles, low, high, covered = (np.stack(column) for column in zip(*found, strict=True))
+    quantiles, low, high, covered = (
+        np.stack(column) for column in zip(*found, strict=True)
+    )
     edges = _edges(np.nanmin(low, axis=(0, 1)), np.nanmax(high, axis=(0, 1)))
     histograms = each_take(_histograms, cohort, MAPPED, drawn, mean, axes, edges)
     return dataset(
@@ -137,9 +153,13 @@ def texture_statistics(cohort: xr.Dataset, *, landmarks: Mapping[str, Array], mi
 
 
 def log_albedo(maps: xr.Dataset) -> tuple[Array, Mask]:
-    """Log R_d (v, u, 3) of a map, extrapolated to texels without measurements, and the mask (v, u) of measured ones."""
+    """Log R_d (v, u, 3) of a map, extrapolated to texels without measurements, and the
+    mask (v, u) of measured ones.
+    """
     albedo = maps["texel_diffuse_reflectance"].values
-    measured = (maps["texel_coverage"].values > COVERED) & np.isfinite(albedo).all(axis=-1)
+    measured = (maps["texel_coverage"].values > COVERED) & np.isfinite(albedo).all(
+        axis=-1
+    )
     log = np.log(np.maximum(np.nan_to_num(albedo, nan=1.0), DARKEST))
     if not measured.any():
         return np.zeros_like(log), measured
@@ -164,23 +184,39 @@ def _axes(found: list[Moments | None]) -> tuple[Array, Array]:
     """Common mean (3,) and axes (3, 3) in rows; the variance includes differences between takes."""
     known = [one for one in found if one is not None]
     if not known:
-        raise InputError(Fault("texture", "some texels must be measured", "none", "fit or register more takes"))
+        raise InputError(
+            Fault(
+                "texture",
+                "some texels must be measured",
+                "none",
+                "fit or register more takes",
+            )
+        )
     means = np.stack([one.mean for one in known])
     mean = means.mean(axis=0)
     between = means - mean
-    spread = np.mean([one.scatter for one in known], axis=0) + between.T @ between / len(known)
+    spread = np.mean(
+        [one.scatter for one in known], axis=0
+    ) + between.T @ between / len(known)
     values, vectors = np.linalg.eigh(spread)
     axes = (vectors / np.sqrt(np.maximum(values, 1e-12))).T[::-1]
-    return mean, axes * np.where(axes.sum(axis=1, keepdims=True) < 0, -1.0, 1.0)  # brighter is larger on every axis
+    # brighter is larger on every axis
+    return mean, axes * np.where(axes.sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
 
 
 def _covered(measured: Mask, drawn: Array) -> Array:
-    """Fraction (region,) of the texels of each region that are measured; for the face, of the whole map."""
+    """Fraction (region,) of the texels of each region that are measured; for the face,
+    of the whole map.
+    """
     return np.array([(measured & one).sum() / max(one.sum(), 1) for one in drawn])
 
 
-def _distributions(maps: xr.Dataset, drawn: Array, mean: Array, axes: Array) -> tuple[Array, Array, Array, Array]:
-    """Quantiles (region, axis, part, level), minima and maxima (region, axis, part), and coverage (region,)."""
+def _distributions(
+    maps: xr.Dataset, drawn: Array, mean: Array, axes: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Quantiles (region, axis, part, level), minima and maxima (region, axis, part),
+    and coverage (region,).
+    """
     log, measured = log_albedo(maps)
     covered = _covered(measured, drawn)
     count = len(part_names())
@@ -199,12 +235,23 @@ def _distributions(maps: xr.Dataset, drawn: Array, mean: Array, axes: Array) -> 
     return quantiles, low, high, covered
 
 
-def _part_weights(drawn: Array, measured: Mask, covered: Array, parts: list[Array]) -> dict[int, list[Array]]:
-    """Weights of the measured texels in each part of the pyramid, for the regions that the take has measured."""
+def _part_weights(
+    drawn: Array, measured: Mask, covered: Array, parts: list[Array]
+) -> dict[int, list[Array]]:
+    """Weights of the measured texels in each part of the pyramid, for the regions that
+    the take has measured.
+    """
     shapes = [part.shape for part in parts]
     # the first region is the face, which needs no minimum coverage
-    there = [r for r in range(len(drawn)) if (covered[r] >= LEAST_COVERED if r else measured.any())]
-    return {r: level_fractions((drawn[r] & measured).astype(np.float32), shapes) for r in there}
+    there = [
+        r
+        for r in range(len(drawn))
+        if (covered[r] >= LEAST_COVERED if r else measured.any())
+    ]
+    return {
+        r: level_fractions((drawn[r] & measured).astype(np.float32), shapes)
+        for r in there
+    }
 
 
 def _edges(low: Array, high: Array) -> Array:
@@ -215,7 +262,9 @@ def _edges(low: Array, high: Array) -> Array:
     return np.moveaxis(np.linspace(low - margin, high + margin, BINS + 1), 0, -1)
 
 
-def _histograms(maps: xr.Dataset, drawn: Array, mean: Array, axes: Array, edges: Array) -> Array:
+def _histograms(
+    maps: xr.Dataset, drawn: Array, mean: Array, axes: Array, edges: Array
+) -> Array:
     """Histograms (region, axis, part, bin) as fractions of the texels."""
     log, measured = log_albedo(maps)
     covered = _covered(measured, drawn)

@@ -1,4 +1,6 @@
-"""Edits of the distributions of albedo at every scale, region by region (Weyrich et al. 2005, section 11)."""
+"""Edits of the distributions of albedo at every scale, region by region (Weyrich et al.
+2005, section 11).
+"""
 
 from __future__ import annotations
 
@@ -14,13 +16,23 @@ from skindb._types import Array
 from skindb.analysis.texture import REGIONS, decorrelated, log_albedo
 from skindb.geometry.texture import bilinear
 from skindb.numerics.principal import principal_axes
-from skindb.numerics.texture import Synthesis, image_parts, level_fractions, part_quantiles, synthesise
+from skindb.numerics.texture import (
+    Synthesis,
+    image_parts,
+    level_fractions,
+    part_quantiles,
+    synthesise,
+)
 from skindb.schema.regions import FACE
 
 ITERATIONS = 5
-BLEND = 0.02  # standard deviation of the Gaussian that blends a region's edge, in units of (u, v): about 5 mm on a face
+# standard deviation of the Gaussian that blends a region's edge, in units of (u, v):
+# about 5 mm on a face
+BLEND = 0.02
 BEARD, REST = REGIONS[1:]
-KEPT_VARIANCE = 0.99  # fraction of the variance in the components along which the distance from the data is measured
+# fraction of the variance in the components along which the distance from the data is
+# measured
+KEPT_VARIANCE = 0.99
 MIN_TAKES_DISTANCE = 4  # takes needed for that distance
 
 
@@ -30,7 +42,8 @@ class TextureEdit:
 
     change: Array  # (v, u, channel) change of log R_d at every texel
     trace: tuple[tuple[float, ...], ...]  # for each axis, see `Synthesis`
-    distance: float | None  # Mahalanobis distance over the square root of the number of axes; None if unknown
+    # Mahalanobis distance over the square root of the number of axes; None if unknown
+    distance: float | None
     distance_before: float | None  # the same for the unedited take
 
 
@@ -45,15 +58,17 @@ def edit_texture(
 ) -> TextureEdit:
     """Shift the distributions of a take's albedo in the common (u, v).
 
-    The beard region is matched to its own distributions, the rest of the face to those of the region without a beard.
-    If the population has no such regions, or if `whole` is set, the face is matched as one region.
+    The beard region is matched to its own distributions, the rest of the face to those
+    of the region without a beard. If the population has no such regions, or if `whole`
+    is set, the face is matched as one region.
 
     Parameters
     ----------
     maps
         `common_maps` of the take, of the same size as those of the population.
     shift
-        (region, axis, part, level) shift of the quantiles of `texture`; NaN leaves a quantile unchanged.
+        (region, axis, part, level) shift of the quantiles of `texture`; NaN leaves a
+        quantile unchanged.
     texture
         From `texture_statistics`.
     iterations
@@ -69,7 +84,9 @@ def edit_texture(
     drawn = texture["texture_region"].values.astype(np.float32)
     log, measured = log_albedo(maps)
     halves = not whole and {BEARD, REST} <= set(names)
-    halves = halves and bool(np.isfinite(shift[[names.index(BEARD), names.index(REST)], :, 0]).all())
+    halves = halves and bool(
+        np.isfinite(shift[[names.index(BEARD), names.index(REST)], :, 0]).all()
+    )
     if halves:
         at = [names.index(BEARD), names.index(REST)]
         beard = gaussian_filter(drawn[at[0]], BLEND * len(drawn[0]))
@@ -82,19 +99,30 @@ def edit_texture(
 
     def synthesised(axis: int, own: np.random.Generator) -> Synthesis:
         wanted = shift[at, axis].astype(np.float64)
-        return synthesise(images[axis], regions, wanted, measured=counted, iterations=iterations, rng=own)
+        return synthesise(
+            images[axis],
+            regions,
+            wanted,
+            measured=counted,
+            iterations=iterations,
+            rng=own,
+        )
 
     with ThreadPoolExecutor(thread_count()) as pool:
         found = list(pool.map(synthesised, range(len(images)), rng.spawn(len(images))))
     moved = [own.image - image for own, image in zip(found, images, strict=True)]
     change = np.moveaxis(np.stack(moved), 0, -1) @ np.linalg.inv(axes).T
     after = [image + step for image, step in zip(images, moved, strict=True)]
-    distances = _distances(texture, at, [_quantiles(one, counted) for one in (images, after)])
+    distances = _distances(
+        texture, at, [_quantiles(one, counted) for one in (images, after)]
+    )
     return TextureEdit(change, tuple(own.trace for own in found), *distances)
 
 
 def at_surfels(change: Array, uv: Array) -> Array:
-    """Values (n, channel) of a map (v, u, channel) at texture coordinates (n, 2), clamped to the map."""
+    """Values (n, channel) of a map (v, u, channel) at texture coordinates (n, 2),
+    clamped to the map.
+    """
     size = np.array(change.shape[1::-1])
     return bilinear(change, np.clip(uv, 0.0, 1.0) * size)
 
@@ -105,15 +133,23 @@ def _quantiles(images: Array | list[Array], counted: list[Array]) -> Array:
     for image in images:
         parts = image_parts(np.asarray(image, np.float32))
         shapes = [part.shape for part in parts]
-        out.append([part_quantiles(parts, level_fractions(own.astype(np.float32), shapes)) for own in counted])
+        out.append(
+            [
+                part_quantiles(parts, level_fractions(own.astype(np.float32), shapes))
+                for own in counted
+            ]
+        )
     return np.moveaxis(np.array(out), 0, 1)
 
 
-def _distances(texture: xr.Dataset, at: list[int], quantiles: list[Array]) -> tuple[float | None, float | None]:
+def _distances(
+    texture: xr.Dataset, at: list[int], quantiles: list[Array]
+) -> tuple[float | None, float | None]:
     """Distances of the edited and the unedited take from the mean of the takes.
 
-    The unit is the standard deviation of the scores on the principal axes of the takes' distributions; the distance is
-    the root mean square over the axes, which is about 1 for takes of the population. None if there are too few takes.
+    The unit is the standard deviation of the scores on the principal axes of the takes'
+    distributions; the distance is the root mean square over the axes, which is about 1
+    for takes of the population. None if there are too few takes.
     """
     known = texture["texture_quantile"].values[:, at].astype(np.float64)
     known = known.reshape(len(known), -1)

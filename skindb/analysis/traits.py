@@ -1,4 +1,6 @@
-"""Trait vectors: differences of the means with and without a trait (Weyrich et al. 2005, section 11)."""
+"""Trait vectors: differences of the means with and without a trait (Weyrich et al.
+2005, section 11).
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,11 @@ from skindb.analysis.members import (
     trait_name,
     trait_names,
 )
-from skindb.analysis.quantities import attribute_of_subjects, columns_of, require_adjustable
+from skindb.analysis.quantities import (
+    attribute_of_subjects,
+    columns_of,
+    require_adjustable,
+)
 from skindb.errors import Fault, InputError
 from skindb.numerics.inference import missing_patterns
 from skindb.numerics.statistics import known_mean
@@ -33,7 +39,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 SIDES = ("with", "without")
-FEW = 10  # subjects with or without a trait, below which individual differences dominate its vector
+# subjects with or without a trait, below which individual differences dominate its
+# vector
+FEW = 10
 WITHOUT_ERRORS = {"trait_histogram_shift", "trait_texture_shift"}
 MIN_VECTOR_TO_ERROR = 3.0  # recommended ratio of the length of a vector to its error
 RESAMPLES = 200  # of subjects in the bootstrap, which gives standard errors to 5 %
@@ -44,13 +52,18 @@ class Units:
     """Units of a comparison for a trait: subjects, or differences within subjects."""
 
     takes: tuple[Mask, ...]  # (take,) mask of the takes of each unit
-    against: tuple[Mask, ...]  # takes whose mean is subtracted; empty where subjects are compared
+    # takes whose mean is subtracted; empty where subjects are compared
+    against: tuple[Mask, ...]
     design: Array  # (n, p) regressors; the coefficient of the first is the vector
 
     def values(self, of_takes: Array) -> Array:
         """Mean values (n, ...) of the units."""
         means = np.stack([known_mean(of_takes[own]) for own in self.takes])
-        return means - np.stack([known_mean(of_takes[own]) for own in self.against]) if self.against else means
+        return (
+            means - np.stack([known_mean(of_takes[own]) for own in self.against])
+            if self.against
+            else means
+        )
 
 
 def trait_vectors(
@@ -75,11 +88,13 @@ def trait_vectors(
     texture
         From `texture_statistics` of the registered ones of these takes.
     traits
-        Names such as "condition:lotion", or numeric attributes such as "age", whose vector is that of one unit (a
-        year). By default every trait that some takes have and others lack, and every numeric attribute. A condition is
-        compared within the subjects measured with and without it, if there are any.
+        Names such as "condition:lotion", or numeric attributes such as "age", whose
+        vector is that of one unit (a year). By default every trait that some takes have
+        and others lack, and every numeric attribute. A condition is compared within the
+        subjects measured with and without it, if there are any.
     adjust
-        Attributes for which comparisons between subjects are adjusted; subjects without them are excluded.
+        Attributes for which comparisons between subjects are adjusted; subjects without
+        them are excluded.
     mixed_fits
         Accept takes that were fitted with different parameters.
     rng
@@ -88,32 +103,45 @@ def trait_vectors(
     Returns
     -------
     Dataset
-        `trait_brdf_shift`, `trait_histogram_shift`, `trait_quantile_shift`, `trait_log_sigma_tr_shift`, with `texture`
-        also `trait_texture_shift`, and standard errors of all except histograms and texture by bootstrap over subjects
-        (NaN if a side has fewer than two); `trait_count` (side: with, without; for numeric attributes all takes are
-        "with"); `take_log_sigma_tr` (reference for the distance of an edit). NaN where a side has no such region, or
-        no probe site was measured on both sides. Attribute `flags`: traits with few subjects on a side.
+        `trait_brdf_shift`, `trait_histogram_shift`, `trait_quantile_shift`,
+        `trait_log_sigma_tr_shift`, with `texture` also `trait_texture_shift`, and
+        standard errors of all except histograms and texture by bootstrap over subjects
+        (NaN if a side has fewer than two); `trait_count` (side: with, without; for
+        numeric attributes all takes are "with"); `take_log_sigma_tr` (reference for the
+        distance of an edit). NaN where a side has no such region, or no probe site was
+        measured on both sides. Attribute `flags`: traits with few subjects on a side.
 
     Raises
     ------
     InputError
-        If no take or every take has a trait, if a trait is determined by the attributes in `adjust`, or if the takes
-        were fitted with different parameters.
+        If no take or every take has a trait, if a trait is determined by the attributes
+        in `adjust`, or if the takes were fitted with different parameters.
     """
     if not mixed_fits:
         require_same_fit(cohort)
     known = trait_names(cohort)
     numbers = numeric_attributes(cohort)
     named = sorted({*_requestable_traits(cohort, known), *numbers})
-    names = [*known, *numbers] if traits is None else [trait_name(name, named) for name in traits]
+    names = (
+        [*known, *numbers]
+        if traits is None
+        else [trait_name(name, named) for name in traits]
+    )
     split = [_sides(cohort, name, numbers) for name in names]
     both = list(zip(names, split, strict=True))
-    bad = [(n, w, o) for n, (w, o) in both if not w.any() or (n not in numbers and not o.any())]
+    bad = [
+        (n, w, o)
+        for n, (w, o) in both
+        if not w.any() or (n not in numbers and not o.any())
+    ]
     if bad:
         there = ", ".join(known) or "none"
         rule = "there must be takes with and without it"
         cure = f"choose from: {there}"
-        raise InputError(Fault(f"trait {n}", rule, f"{w.sum()} with, {o.sum()} without", cure) for n, w, o in bad)
+        raise InputError(
+            Fault(f"trait {n}", rule, f"{w.sum()} with, {o.sum()} without", cure)
+            for n, w, o in bad
+        )
     require_adjustable(cohort, adjust)
     units = dict[str, Units]()
     flags = list[str]()
@@ -135,28 +163,51 @@ def trait_vectors(
         "trait_log_sigma_tr_shift": log_tr,
     }
     if texture is not None:
-        columns["trait_texture_shift"] = _texture_quantiles(texture, takes, albedo["region"].values)
+        columns["trait_texture_shift"] = _texture_quantiles(
+            texture, takes, albedo["region"].values
+        )
     rng = np.random.default_rng(0) if rng is None else rng
     shifts: dict[str, list[Array]] = {name: [] for name in columns}
     errors: dict[str, list[Array]] = {name: [] for name in columns}
     for own in units.values():
-        drawn = rng.multinomial(len(own.design), np.full(len(own.design), 1 / len(own.design)), RESAMPLES)
+        drawn = rng.multinomial(
+            len(own.design), np.full(len(own.design), 1 / len(own.design)), RESAMPLES
+        )
         for name, values in columns.items():
-            resamples = drawn.astype(np.float64) if name not in WITHOUT_ERRORS else np.empty((0, len(own.design)))
+            resamples = (
+                drawn.astype(np.float64)
+                if name not in WITHOUT_ERRORS
+                else np.empty((0, len(own.design)))
+            )
             shift, resampled = _coefficients(own.values(values), own.design, resamples)
-            if values is log_tr:  # averaged over sites last: differences between sites must not appear as a trait
+            # averaged over sites last: differences between sites must not appear as a
+            # trait
+            if values is log_tr:
                 shift = known_mean(shift)
                 resampled = known_mean(np.moveaxis(resampled, 1, 0))
             shifts[name].append(shift)
             if name not in WITHOUT_ERRORS:
                 errors[name].append(_deviation(resampled))
-    counts = np.array([[w.sum(), o.sum()] for n, (w, o) in both if n in units]).reshape(len(names), 2)
-    shapes = {name: (0, *x.shape[1:]) if x is not log_tr else (0, 3) for name, x in columns.items()}
-    stacked = {name: np.stack(x) if x else np.empty(shapes[name]) for name, x in shifts.items()}
+    counts = np.array([[w.sum(), o.sum()] for n, (w, o) in both if n in units]).reshape(
+        len(names), 2
+    )
+    shapes = {
+        name: (0, *x.shape[1:]) if x is not log_tr else (0, 3)
+        for name, x in columns.items()
+    }
+    stacked = {
+        name: np.stack(x) if x else np.empty(shapes[name]) for name, x in shifts.items()
+    }
     for name in columns.keys() - WITHOUT_ERRORS:
-        stacked[f"{name}_error"] = np.stack(errors[name]) if names else np.empty(shapes[name])
+        stacked[f"{name}_error"] = (
+            np.stack(errors[name]) if names else np.empty(shapes[name])
+        )
     return dataset(
-        {"trait_count": counts, "take_log_sigma_tr": _mean_over_sites(log_tr), **stacked},
+        {
+            "trait_count": counts,
+            "take_log_sigma_tr": _mean_over_sites(log_tr),
+            **stacked,
+        },
         coords={
             "take": [str(take) for take in takes],
             "trait": names,
@@ -174,7 +225,9 @@ def trait_vectors(
 
 
 def _sides(cohort: xr.Dataset, trait: str, numbers: Sequence[str]) -> tuple[Mask, Mask]:
-    """Masks of takes with and without a trait; for a numeric attribute, those in the condition normal that have it."""
+    """Masks of takes with and without a trait; for a numeric attribute, those in the
+    condition normal that have it.
+    """
     if trait not in numbers:
         return sides(cohort, trait)
     known = np.isfinite(number_of_takes(cohort, trait)) & is_normal(cohort)
@@ -182,27 +235,41 @@ def _sides(cohort: xr.Dataset, trait: str, numbers: Sequence[str]) -> tuple[Mask
 
 
 def _units(
-    cohort: xr.Dataset, trait: str, side: tuple[Mask, Mask], adjust: Sequence[str], numbers: Sequence[str]
+    cohort: xr.Dataset,
+    trait: str,
+    side: tuple[Mask, Mask],
+    adjust: Sequence[str],
+    numbers: Sequence[str],
 ) -> Units:
-    """Subjects with and without a trait; differences within subjects if all with it were also measured without it.
+    """Subjects with and without a trait; differences within subjects if all with it
+    were also measured without it.
 
-    A value that a subject has on one side only is then ignored, because differences between people must not appear as
-    the trait.
+    A value that a subject has on one side only is then ignored, because differences
+    between people must not appear as the trait.
     """
     carries, lacks = side
     who = np.array([str(subject) for subject in texts(cohort["subject"])])
     pairs = sorted(set(who[carries]))
     if trait not in numbers and set(pairs) <= set(who[lacks]):
-        own, other = (tuple(mask & (who == s) for s in pairs) for mask in (carries, lacks))
+        own, other = (
+            tuple(mask & (who == s) for s in pairs) for mask in (carries, lacks)
+        )
         return Units(own, other, np.ones((len(pairs), 1)))
     if trait in numbers:
         values = number_of_takes(cohort, trait)
-        whose = [(s, float(values[carries & (who == s)][0]), carries & (who == s)) for s in pairs]
+        whose = [
+            (s, float(values[carries & (who == s)][0]), carries & (who == s))
+            for s in pairs
+        ]
     else:
         whose = [(s, 1.0, carries & (who == s)) for s in pairs]
-        whose += [(s, 0.0, lacks & (who == s)) for s in sorted(set(who[lacks]) - set(pairs))]
+        whose += [
+            (s, 0.0, lacks & (who == s)) for s in sorted(set(who[lacks]) - set(pairs))
+        ]
     subjects = tuple(s for s, _, _ in whose)
-    held = [columns_of(attribute_of_subjects(cohort, name, subjects)) for name in adjust]
+    held = [
+        columns_of(attribute_of_subjects(cohort, name, subjects)) for name in adjust
+    ]
     design = np.column_stack([[x for _, x, _ in whose], np.ones(len(whose)), *held])
     complete = np.isfinite(design).all(axis=1)
     design = design[complete]
@@ -211,11 +278,16 @@ def _units(
         found = ", ".join(adjust) or "one value"
         cure = "adjust for fewer attributes, or exclude the trait"
         raise InputError(Fault(f"trait {trait}", rule, found, cure))
-    return Units(tuple(own for (_, _, own), kept in zip(whose, complete, strict=True) if kept), (), design)
+    return Units(
+        tuple(own for (_, _, own), kept in zip(whose, complete, strict=True) if kept),
+        (),
+        design,
+    )
 
 
 def _coefficients(values: Array, design: Array, drawn: Array) -> tuple[Array, Array]:
-    """First regression coefficient (...) of values (n, ...) on a design (n, p), and of resamples with counts (b, n).
+    """First regression coefficient (...) of values (n, ...) on a design (n, p), and of
+    resamples with counts (b, n).
 
     NaN where the subjects with a value, or a resample of them, do not determine the coefficient.
     """
@@ -230,18 +302,31 @@ def _coefficients(values: Array, design: Array, drawn: Array) -> tuple[Array, Ar
         out[columns] = np.linalg.pinv(own)[0] @ flat[np.ix_(rows, columns)]
         counts = drawn[:, rows]
         square = np.einsum("bi,ip,iq->bpq", counts, own, own)
-        able = np.linalg.matrix_rank(square, hermitian=True) == np.linalg.matrix_rank(own)
-        weights = np.einsum("bq,iq,bi->bi", np.linalg.pinv(square[able], hermitian=True)[:, 0], own, counts[able])
+        able = np.linalg.matrix_rank(square, hermitian=True) == np.linalg.matrix_rank(
+            own
+        )
+        weights = np.einsum(
+            "bq,iq,bi->bi",
+            np.linalg.pinv(square[able], hermitian=True)[:, 0],
+            own,
+            counts[able],
+        )
         resampled[np.ix_(able, columns)] = weights @ flat[np.ix_(rows, columns)]
-    return out.reshape(values.shape[1:]), resampled.reshape(len(drawn), *values.shape[1:])
+    return out.reshape(values.shape[1:]), resampled.reshape(
+        len(drawn), *values.shape[1:]
+    )
 
 
 def _deviation(resampled: Array) -> Array:
-    """Standard deviation over resamples; NaN where over 10 % are undefined, or all are the same (a single subject)."""
+    """Standard deviation over resamples; NaN where over 10 % are undefined, or all are
+    the same (a single subject).
+    """
     known = np.isfinite(resampled).sum(axis=0)
     squares = known_mean((resampled - known_mean(resampled)) ** 2)
     rounding = (1e-9 * np.abs(np.nan_to_num(known_mean(resampled)))) ** 2
-    return np.where((known > 0.9 * len(resampled)) & (squares > rounding), np.sqrt(squares), np.nan)
+    return np.where(
+        (known > 0.9 * len(resampled)) & (squares > rounding), np.sqrt(squares), np.nan
+    )
 
 
 def _flags(names: Sequence[str], counts: Array, numbers: Sequence[str]) -> list[str]:
@@ -249,17 +334,28 @@ def _flags(names: Sequence[str], counts: Array, numbers: Sequence[str]) -> list[
     for name, count in zip(names, counts.tolist(), strict=True):
         least = count[0] if name in numbers else min(count)
         if least == 1:
-            flags.append(f"{name}: only one take {SIDES[count.index(1)]} it, so that the vector contains an individual")
+            flags.append(
+                f"{name}: only one take {SIDES[count.index(1)]} it, so that the "
+                "vector contains an individual"
+            )
         elif least < FEW:
-            among = f"{count[0]} takes" if name in numbers else f"{count[0]} takes with and {count[1]} without"
+            among = (
+                f"{count[0]} takes"
+                if name in numbers
+                else f"{count[0]} takes with and {count[1]} without"
+            )
             flags.append(f"{name}: {among}; the vector contains individual differences")
     return flags
 
 
 def _texture_quantiles(texture: xr.Dataset, takes: Array, regions: Array) -> Array:
-    """Quantiles (take, region, axis, part, level) of takes and regions; NaN where `texture` has none."""
+    """Quantiles (take, region, axis, part, level) of takes and regions; NaN where
+    `texture` has none.
+    """
     values = texture["texture_quantile"].values
-    rows, columns = ([str(one) for one in texture[dim].values] for dim in ("take", "region"))
+    rows, columns = (
+        [str(one) for one in texture[dim].values] for dim in ("take", "region")
+    )
     out = np.full((len(takes), len(regions), *values.shape[2:]), np.nan, np.float32)
     for t, take in enumerate(map(str, takes)):
         for r, region in enumerate(map(str, regions)):
@@ -282,18 +378,25 @@ def _log_sigma_tr(cohort: xr.Dataset) -> Array:
 
 
 def _requestable_traits(cohort: xr.Dataset, known: Sequence[str]) -> list[str]:
-    """Traits that can be requested, including those that every take has, for which a specific error is raised."""
+    """Traits that can be requested, including those that every take has, for which a
+    specific error is raised.
+    """
     return sorted({*known, *known_traits(cohort)})
 
 
 def describe_traits(traits: xr.Dataset) -> list[str]:
-    """Flags of trait vectors, and estimates of the number of takes that their colours need, one line each.
+    """Flags of trait vectors, and estimates of the number of takes that their colours
+    need, one line each.
 
-    The squared length of a measured vector is the sum of the squared length of the true vector and that of its error,
-    which is inversely proportional to the number of takes.
+    The squared length of a measured vector is the sum of the squared length of the true
+    vector and that of its error, which is inversely proportional to the number of
+    takes.
     """
     lines = list(traits.attrs.get("flags", []))
-    if "trait_quantile_shift_error" not in traits or FACE not in traits["region"].values:
+    if (
+        "trait_quantile_shift_error" not in traits
+        or FACE not in traits["region"].values
+    ):
         return lines
     face = traits.sel(region=FACE)
     for name in traits["trait"].values.tolist():
@@ -304,10 +407,16 @@ def describe_traits(traits: xr.Dataset) -> list[str]:
         if not np.isfinite(error):
             continue
         if true <= error / takes:
-            lines.append(f"{name}: with {takes} takes, the colour vector cannot be distinguished from noise")
+            lines.append(
+                f"{name}: with {takes} takes, the colour vector cannot be distinguished from noise"
+            )
         elif true < MIN_VECTOR_TO_ERROR**2 * error:
             needed = takes * MIN_VECTOR_TO_ERROR**2 * error / true
-            many = f"about {_rounded(needed)}" if needed < 10 * takes else f"more than {10 * takes}"
+            many = (
+                f"about {_rounded(needed)}"
+                if needed < 10 * takes
+                else f"more than {10 * takes}"
+            )
             aim = f"for a colour vector {MIN_VECTOR_TO_ERROR:g} times as long as its error"
             lines.append(f"{name}: {many} takes would be needed {aim}")
     return lines
@@ -320,7 +429,9 @@ def _rounded(count: float) -> int:
 
 
 def plot_traits(traits: xr.Dataset, *, ax: Axes | None = None) -> Axes:
-    """Plot the shift of the coefficients of the surface BRDF: rows are traits, columns are components of the basis."""
+    """Plot the shift of the coefficients of the surface BRDF: rows are traits, columns
+    are components of the basis.
+    """
     from matplotlib import pyplot
 
     if ax is None:
@@ -328,8 +439,15 @@ def plot_traits(traits: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     shift = traits["trait_brdf_shift"].values
     largest = max(float(np.abs(shift).max(initial=0.0)), 1e-12)
     image = ax.imshow(shift, cmap="RdBu_r", vmin=-largest, vmax=largest, aspect="auto")
-    counts = [f"{t} ({w}/{o})" for t, (w, o) in zip(traits["trait"].values, traits["trait_count"].values, strict=True)]
+    counts = [
+        f"{t} ({w}/{o})"
+        for t, (w, o) in zip(
+            traits["trait"].values, traits["trait_count"].values, strict=True
+        )
+    ]
     ax.set_yticks(range(len(counts)), counts)
     ax.set_xlabel("component of the common basis")
-    ax.figure.colorbar(image, ax=ax, label="difference of the coefficient with and without the trait")
+    ax.figure.colorbar(
+        image, ax=ax, label="difference of the coefficient with and without the trait"
+    )
     return ax

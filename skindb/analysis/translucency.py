@@ -21,37 +21,46 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-def translucency_table(cohort: xr.Dataset, *, group_by: str | None = None, mixed_fits: bool = False) -> xr.Dataset:
-    """Count, mean, standard deviation and variance of sigma_tr per site and channel, with 95 % intervals.
+def translucency_table(
+    cohort: xr.Dataset, *, group_by: str | None = None, mixed_fits: bool = False
+) -> xr.Dataset:
+    """Count, mean, standard deviation and variance of sigma_tr per site and channel,
+    with 95 % intervals.
 
     Parameters
     ----------
     cohort
-        ``db.cohort("tables")``. Takes in other conditions than normal are used only if `group_by` is "condition" or a
-        trait of it, so that no subject counts several times.
+        ``db.cohort("tables")``. Takes in other conditions than normal are used only if
+        `group_by` is "condition" or a trait of it, so that no subject counts several
+        times.
     group_by
-        Attribute or trait to group by (condition, gender, gender:male, age:older, ...); None puts all takes into the
-        group "all".
+        Attribute or trait to group by (condition, gender, gender:male, age:older, ...);
+        None puts all takes into the group "all".
     mixed_fits
         Accept takes that were fitted with different parameters.
 
     Returns
     -------
     Dataset
-        (group, site, channel); NaN where a group has too few values. The interval of the mean is Student's; that of
-        the standard deviation assumes a normal distribution. Errors of single takes differ between takes, so that both
-        intervals and the standard deviation include them. `sigma_tr_measurement_error` is the RMS of these errors due
-        to the noise of the fibres, `sigma_tr_total_error` their RMS including the error of the profile's model; NaN
-        where no take has an error. `sigma_tr_people_fraction` is the fraction of the variance that the noise of the
-        fibres does not explain: differences between people and, because the probe is never placed identically, within
-        people. `sigma_tr_repeat_deviation` is the standard deviation between the takes of one subject, from subjects
-        with several takes in a group (restricted maximum likelihood). The intervals do not include model errors that
-        are common to all takes. Attribute "statuses": number of profiles of each status.
+        (group, site, channel); NaN where a group has too few values. The interval of
+        the mean is Student's; that of the standard deviation assumes a normal
+        distribution. Errors of single takes differ between takes, so that both
+        intervals and the standard deviation include them. `sigma_tr_measurement_error`
+        is the RMS of these errors due to the noise of the fibres,
+        `sigma_tr_total_error` their RMS including the error of the profile's model; NaN
+        where no take has an error. `sigma_tr_people_fraction` is the fraction of the
+        variance that the noise of the fibres does not explain: differences between
+        people and, because the probe is never placed identically, within people.
+        `sigma_tr_repeat_deviation` is the standard deviation between the takes of one
+        subject, from subjects with several takes in a group (restricted maximum
+        likelihood). The intervals do not include model errors that are common to all
+        takes. Attribute "statuses": number of profiles of each status.
 
     Raises
     ------
     InputError
-        If the takes were fitted with different parameters, or if no take has the attribute `group_by`.
+        If the takes were fitted with different parameters, or if no take has the
+        attribute `group_by`.
     """
     require_takes(cohort, "tables")
     if not mixed_fits:
@@ -70,14 +79,22 @@ def translucency_table(cohort: xr.Dataset, *, group_by: str | None = None, mixed
 
     def moments(name: str) -> Moments:
         parts = [Moments.of(measured.get(name, empty)[own]) for own in members]
-        return Moments(*(np.stack([getattr(part, field) for part in parts]) for field in ("count", "mean", "second")))
+        return Moments(
+            *(
+                np.stack([getattr(part, field) for part in parts])
+                for field in ("count", "mean", "second")
+            )
+        )
 
     stacked = moments("site_sigma_tr")
     subjects = np.array([str(one) for one in takes["subject"].values.tolist()])
     low, high = stacked.mean_interval()
     deviation_low, deviation_high = stacked.deviation_interval()
     known = stacked.count > 0
-    attrs = {"takes": sorted(map(str, takes["take"].values)), "group_by": group_by or ""}
+    attrs = {
+        "takes": sorted(map(str, takes["take"].values)),
+        "group_by": group_by or "",
+    }
     return dataset(
         {
             "sigma_tr_count": stacked.count,
@@ -90,36 +107,68 @@ def translucency_table(cohort: xr.Dataset, *, group_by: str | None = None, mixed
             "sigma_tr_variance": stacked.variance,
             "sigma_tr_measurement_error": _rms(moments("site_sigma_tr_error")),
             "sigma_tr_total_error": _rms(moments("site_sigma_tr_total_error")),
-            "sigma_tr_people_fraction": _people_fraction(stacked.variance, moments("site_sigma_tr_error")),
+            "sigma_tr_people_fraction": _people_fraction(
+                stacked.variance, moments("site_sigma_tr_error")
+            ),
             "sigma_tr_repeat_deviation": np.stack(
-                [_repeat_deviation(measured.get("site_sigma_tr", empty)[own], subjects[own]) for own in members]
+                [
+                    _repeat_deviation(
+                        measured.get("site_sigma_tr", empty)[own], subjects[own]
+                    )
+                    for own in members
+                ]
             ),
         },
         coords={"group": names, "site": sites, "channel": ["R", "G", "B"]},
-        attrs=attrs | {"statuses": _statuses(takes), "skipped": list(cohort.attrs.get("skipped", []))},
+        attrs=attrs
+        | {
+            "statuses": _statuses(takes),
+            "skipped": list(cohort.attrs.get("skipped", [])),
+        },
     )
 
 
 def describe_translucency(table: xr.Dataset) -> list[str]:
-    """Statuses of the profiles, and groups whose intervals depend on an assumption, one line each."""
-    statuses = ", ".join(f"{count} {name}" for name, count in table.attrs.get("statuses", {}).items())
-    lines = [f"status of the profiles: {statuses}; only fitted and poor_fit are used"] if statuses else []
+    """Statuses of the profiles, and groups whose intervals depend on an assumption, one
+    line each.
+    """
+    statuses = ", ".join(
+        f"{count} {name}" for name, count in table.attrs.get("statuses", {}).items()
+    )
+    lines = (
+        [f"status of the profiles: {statuses}; only fitted and poor_fit are used"]
+        if statuses
+        else []
+    )
     for group in map(str, table["group"].values):
         count = table["sigma_tr_count"].sel(group=group).values
         if count.size and 0 < (most := int(count.max())) < FEW:
             low = (table["sigma_tr_mean_low"].sel(group=group) < 0).any()
             ends = "; some reach below 0, where sigma_tr cannot be" if low else ""
             takes = f"{most} take{'s' if most > 1 else ''}"
-            lines.append(f"{group}: {takes}; with fewer than {FEW} the intervals assume normal values{ends}")
+            lines.append(
+                f"{group}: {takes}; with fewer than {FEW} the intervals assume normal values{ends}"
+            )
     return lines
 
 
 def _trusted(takes: xr.Dataset) -> dict[str, Array]:
-    """Variables (take, site, channel) of trusted fits; NaN where a take lacks a site or its fit is not trusted."""
-    names = ("site_sigma_tr", "site_sigma_tr_error", "site_sigma_tr_total_error", "site_status")
+    """Variables (take, site, channel) of trusted fits; NaN where a take lacks a site or
+    its fit is not trusted.
+    """
+    names = (
+        "site_sigma_tr",
+        "site_sigma_tr_error",
+        "site_sigma_tr_total_error",
+        "site_status",
+    )
     node = takes[[name for name in names if name in takes]].load()
     good = node["site_status"].isin(IDENTIFIED)
-    return {str(name): np.asarray(node[name].where(good).values, np.float64) for name in node if name != names[-1]}
+    return {
+        str(name): np.asarray(node[name].where(good).values, np.float64)
+        for name in node
+        if name != names[-1]
+    }
 
 
 def _statuses(takes: xr.Dataset) -> dict[str, int]:
@@ -127,24 +176,40 @@ def _statuses(takes: xr.Dataset) -> dict[str, int]:
     if "site_status" not in takes:
         return {}
     found = takes["site_status"].values
-    counts = {member.name.lower(): int((found == member).sum()) for member in ProbeStatus}
-    return {name: count for name, count in counts.items() if count and name != ProbeStatus.NOT_MEASURED.name.lower()}
+    counts = {
+        member.name.lower(): int((found == member).sum()) for member in ProbeStatus
+    }
+    return {
+        name: count
+        for name, count in counts.items()
+        if count and name != ProbeStatus.NOT_MEASURED.name.lower()
+    }
 
 
 def _people_fraction(variance: Array, errors: Moments) -> Array:
-    """Fraction of a variance that measurement errors do not explain; NaN where the variance is 0 or unknown."""
+    """Fraction of a variance that measurement errors do not explain; NaN where the
+    variance is 0 or unknown.
+    """
     noise = _rms(errors) ** 2
-    return np.where(variance > 0, np.clip(1 - noise / np.where(variance > 0, variance, 1.0), 0.0, 1.0), np.nan)
+    return np.where(
+        variance > 0,
+        np.clip(1 - noise / np.where(variance > 0, variance, 1.0), 0.0, 1.0),
+        np.nan,
+    )
 
 
 def _repeat_deviation(values: Array, subjects: NDArray[np.str_]) -> Array:
-    """Standard deviation (site, channel) between the takes of one subject, from values (take, site, channel)."""
+    """Standard deviation (site, channel) between the takes of one subject, from values
+    (take, site, channel).
+    """
     out = np.full(values.shape[1:], np.nan)
     for index in np.ndindex(out.shape):
         known = np.isfinite(values[:, *index])
         people = len(set(subjects[known].tolist()))
         if people >= 2 and known.sum() > people:
-            out[index] = np.sqrt(variance_components(values[known, *index], subjects[known])[2])
+            out[index] = np.sqrt(
+                variance_components(values[known, *index], subjects[known])[2]
+            )
     return out
 
 
@@ -154,7 +219,9 @@ def _rms(moments: Moments) -> Array:
 
 
 def plot_translucency(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
-    """Plot mean sigma_tr with its 95 % interval per site; colours are channels, markers are groups."""
+    """Plot mean sigma_tr with its 95 % interval per site; colours are channels, markers
+    are groups.
+    """
     from matplotlib import pyplot
 
     if ax is None:
@@ -165,12 +232,23 @@ def plot_translucency(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
             one = table.isel(group=g, channel=c)
             x = np.arange(len(sites)) + 0.12 * (c - 1) + 0.03 * g
             mean = one["sigma_tr_mean"].values
-            low = np.maximum(one["sigma_tr_mean_low"].values, 0.0)  # sigma_tr is never negative
+            # sigma_tr is never negative
+            low = np.maximum(one["sigma_tr_mean_low"].values, 0.0)
             bars = np.nan_to_num([mean - low, one["sigma_tr_mean_high"].values - mean])
             count = int(one["sigma_tr_count"].max())
-            name = f"{table['channel'].values[c]}" + (f", {group}" if table.sizes["group"] > 1 else "")
+            name = f"{table['channel'].values[c]}" + (
+                f", {group}" if table.sizes["group"] > 1 else ""
+            )
             label = f"{name} (n = {count})"
-            ax.errorbar(x, mean, yerr=bars, fmt="os^Dv"[g % 5], color=colour, capsize=3, label=label)
+            ax.errorbar(
+                x,
+                mean,
+                yerr=bars,
+                fmt="os^Dv"[g % 5],
+                color=colour,
+                capsize=3,
+                label=label,
+            )
     ax.set_xticks(range(len(sites)), sites)
     ax.set_ylim(bottom=0)
     ax.set_ylabel("mean sigma_tr with 95 % CI [mm-1]")

@@ -1,4 +1,6 @@
-"""Curves of error against CPU time for every kernel of the fit, and the stress set; `skindb bench` runs both."""
+"""Curves of error against CPU time for every kernel of the fit, and the stress set;
+`skindb bench` runs both.
+"""
 
 from __future__ import annotations
 
@@ -14,4 +16,6 @@ if TYPE_CHECKING:
 __all__ = ["KERNELS", "run_bench", "table_of"]
 
 # imported lazily, because the command line only needs the names for its options
-__getattr__, __dir__, _ = lazy_loader.attach(__name__, submod_attrs={"run": ["run_bench", "table_of"]})
+__getattr__, __dir__, _ = lazy_loader.attach(
+    __name__, submod_attrs={"run": ["run_bench", "table_of"]}
+)

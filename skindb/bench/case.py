@@ -14,7 +14,9 @@ SCALES = (1e-30, 1e-12, 1e12, 1e30)
 
 @dataclass(frozen=True)
 class Case:
-    """A kernel, the name of its input, the promised behaviour, and a check that raises if the promise is broken."""
+    """A kernel, the name of its input, the promised behaviour, and a check that raises
+    if the promise is broken.
+    """
 
     kernel: str
     name: str
@@ -22,14 +24,23 @@ class Case:
     check: Callable[[], None]
 
 
-def each(kernel: str, name: str, promise: str, check: Callable[..., None], *values: Any) -> tuple[Case, ...]:
-    """One case per value (a tuple holds several arguments of `check`); `name` is formatted with the value."""
+def each(
+    kernel: str, name: str, promise: str, check: Callable[..., None], *values: Any
+) -> tuple[Case, ...]:
+    """One case per value (a tuple holds several arguments of `check`); `name` is
+    formatted with the value.
+    """
     arguments = [value if isinstance(value, tuple) else (value,) for value in values]
-    return tuple(Case(kernel, name.format(*one), promise, partial(check, *one)) for one in arguments)
+    return tuple(
+        Case(kernel, name.format(*one), promise, partial(check, *one))
+        for one in arguments
+    )
 
 
 def combinations(first: tuple[Any, ...], *second: Any) -> list[tuple[Any, ...]]:
-    """All combinations of `first` and `second` (a tuple holds several arguments), as values for `each`."""
+    """All combinations of `first` and `second` (a tuple holds several arguments), as
+    values for `each`.
+    """
     return [(a, *(b if isinstance(b, tuple) else (b,))) for a in first for b in second]
 
 

@@ -22,7 +22,8 @@ class Point:
     seconds: float  # CPU time of all threads; NaN where the time is not comparable
     error: float
     failure: str = ""  # reason why the method is unsuitable, if it is
-    more: dict[str, float] = field(default_factory=dict)  # other results of the same run
+    # other results of the same run
+    more: dict[str, float] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -43,11 +44,15 @@ class Curve:
 
     def ratio(self, point: Point) -> float:
         """CPU time of a point over that of the base; below 1 is faster."""
-        return point.seconds / next(p.seconds for p in self.points if p.name == self.base)
+        return point.seconds / next(
+            p.seconds for p in self.points if p.name == self.base
+        )
 
 
 def cpu_time(work: Callable[[], T], per: float = 1.0) -> tuple[float, T]:
-    """CPU time [s] divided by `per`, the best of up to three rounds, and the result; warm up before."""
+    """CPU time [s] divided by `per`, the best of up to three rounds, and the result;
+    warm up before.
+    """
     times: list[float] = []
     while len(times) < ROUNDS and sum(times) < LONG:
         start = time.process_time()

@@ -1,4 +1,6 @@
-"""Subsurface light: the inverse of eq. 5, profiles R(r), and fits of profiles, against mpmath and Monte Carlo."""
+"""Subsurface light: the inverse of eq. 5, profiles R(r), and fits of profiles, against
+mpmath and Monte Carlo.
+"""
 
 from __future__ import annotations
 
@@ -40,41 +42,89 @@ SKIN = (
 @lru_cache(maxsize=1)
 def _walk(quick: bool) -> Walk:
     rng = np.random.default_rng(0)
-    return random_walk(40_000 if quick else 200_000, eta=ETA, longest=60.0 if quick else 240.0, rng=rng)
+    return random_walk(
+        40_000 if quick else 200_000, eta=ETA, longest=60.0 if quick else 240.0, rng=rng
+    )
 
 
 def inverse_curves(quick: bool) -> list[Curve]:
     """The dipole's s from R_d, from nearly black to nearly white."""
     n = 20 if quick else 60
-    diffuse = np.concatenate([np.geomspace(1e-6, 0.5, n), 1 - np.geomspace(0.5, 1e-9, n)[1:]])
+    diffuse = np.concatenate(
+        [np.geomspace(1e-6, 0.5, n), 1 - np.geomspace(0.5, 1e-9, n)[1:]]
+    )
     exact = np.array([_exact(float(value)) for value in diffuse])
     dipole_s(diffuse, eta=ETA)  # caches F_dr
     own, s = cpu_time(lambda: dipole_s(diffuse, eta=ETA)[0], len(diffuse))
-    took, plain = cpu_time(lambda: np.array([_bracketed(value) for value in diffuse]), len(diffuse))
-    single = np.sqrt(3 * (1 - reduced_albedo(exact).astype(np.float32).astype(np.float64)))
+    took, plain = cpu_time(
+        lambda: np.array([_bracketed(value) for value in diffuse]), len(diffuse)
+    )
+    single = np.sqrt(
+        3 * (1 - reduced_albedo(exact).astype(np.float32).astype(np.float64))
+    )
     double = np.sqrt(3 * (1 - reduced_albedo(exact)))
     cancels = "1 - R_d(s) is lost to cancellation where R_d is near 1"
     bright = _exact(0.999)
     wrong = abs((1 - np.float32(reduced_albedo(bright))) / (bright**2 / 3) - 1)
-    stored = f"1 - alpha' is lost to cancellation: {wrong:.0%} off at R_d = 0.999, all of it at 1 - 1e-9"
+    stored = (
+        f"1 - alpha' is lost to cancellation: {wrong:.0%} off at R_d = 0.999, all of "
+        "it at 1 - 1e-9"
+    )
     points = (
         _inverse("skindb dipole_s", own, s, exact),
-        _inverse("skindb dipole_s, stored in single precision", own, s.astype(np.float32), exact),
+        _inverse(
+            "skindb dipole_s, stored in single precision",
+            own,
+            s.astype(np.float32),
+            exact,
+        ),
         _inverse("SciPy brentq on eq. 5", took, plain, exact, cancels),
-        _inverse("alpha' in double precision", own, double, exact, "1 - alpha' is lost to cancellation near 1"),
+        _inverse(
+            "alpha' in double precision",
+            own,
+            double,
+            exact,
+            "1 - alpha' is lost to cancellation near 1",
+        ),
         _inverse("alpha' in single precision", own, single, exact, stored),
     )
     label = f"largest relative error of s over {len(diffuse)} R_d from 1e-6 to 1 - 1e-9"
-    return [Curve("inverse", label, "mpmath, 40 digits", "a value", "SciPy brentq on eq. 5", points)]
+    return [
+        Curve(
+            "inverse",
+            label,
+            "mpmath, 40 digits",
+            "a value",
+            "SciPy brentq on eq. 5",
+            points,
+        )
+    ]
 
 
-def _inverse(name: str, took: float, s: Array, exact: Array, failure: str = "") -> Point:
+def _inverse(
+    name: str, took: float, s: Array, exact: Array, failure: str = ""
+) -> Point:
     relative = np.abs(s / exact - 1)
-    return Point(name, "", took, float(relative.max()), failure, {"median": float(np.median(relative))})
+    return Point(
+        name,
+        "",
+        took,
+        float(relative.max()),
+        failure,
+        {"median": float(np.median(relative))},
+    )
 
 
 def _bracketed(value: float) -> float:
-    return float(brentq(lambda s: float(diffuse_reflectance(s, eta=ETA)) - value, 0, S_MAX, xtol=1e-300, rtol=1e-15))
+    return float(
+        brentq(
+            lambda s: float(diffuse_reflectance(s, eta=ETA)) - value,
+            0,
+            S_MAX,
+            xtol=1e-300,
+            rtol=1e-15,
+        )
+    )
 
 
 def require_mpmath() -> Any:
@@ -83,7 +133,9 @@ def require_mpmath() -> Any:
         import mpmath
     except ImportError:
         cure = "pip install 'skindb[bench]', or choose other kernels with --only"
-        raise InputError(Fault("bench inverse", "mpmath must be installed", "no module mpmath", cure)) from None
+        raise InputError(
+            Fault("bench inverse", "mpmath must be installed", "no module mpmath", cure)
+        ) from None
     return mpmath
 
 
@@ -94,35 +146,78 @@ def _exact(value: float) -> float:
         bracket = (mpmath.mpf("1e-12"), mpmath.sqrt(3))
 
         def off(s: Any) -> Any:
-            return (1 - s * s / 3) / 2 * (1 + mpmath.exp(-b * s)) * mpmath.exp(-s) - mpmath.mpf(value)
+            return (1 - s * s / 3) / 2 * (1 + mpmath.exp(-b * s)) * mpmath.exp(
+                -s
+            ) - mpmath.mpf(value)
 
         return float(mpmath.findroot(off, bracket, solver="anderson", tol=1e-60))
 
 
 def transport_curves(quick: bool) -> list[Curve]:
-    """R(r) of a medium by model, and by moments of several degrees, from which the table is made."""
+    """R(r) of a medium by model, and by moments of several degrees, from which the
+    table is made.
+    """
     walk = _walk(quick)
     points = []
     r = np.linspace(0.5, 20, 1000)
     for albedo in (0.7, 0.9) if quick else (0.3, 0.7, 0.9, 0.99):
         ratio = (1 - albedo) / albedo
-        middle = np.array(DISTANCE) * albedo  # in units of 1 / sigma_s', of which a mean free path is `albedo`
+        # in units of 1 / sigma_s', of which a mean free path is `albedo`
+        middle = np.array(DISTANCE) * albedo
         (value, noise), ring = rings(walk, ratio, middle), across(middle)
         for name, model in MODELS.items():
             model.profile(1.0, ratio, 1.0, eta=ETA)  # makes the table
-            took, _ = cpu_time(lambda m=model, a=ratio: m.profile(r, a, 1.0, eta=ETA), 1000)  # type: ignore[misc]
+            took, _ = cpu_time(
+                lambda m=model, a=ratio: m.profile(r, a, 1.0, eta=ETA),  # type: ignore[misc]
+                1000,
+            )
             found = model.profile(ring, ratio, 1.0, eta=ETA)
-            points.append(_profile(f"skindb {name}", albedo, took, ring_mean(found, middle), value, noise))
+            points.append(
+                _profile(
+                    f"skindb {name}",
+                    albedo,
+                    took,
+                    ring_mean(found, middle),
+                    value,
+                    noise,
+                )
+            )
         for degree in (3, 7, 11) if quick else (3, 5, 7, 9, 11, 13):
             basis = moments(degree, eta=ETA, anisotropy=transport.ANISOTROPY)
-            took, (level, kappa) = cpu_time(lambda a=ratio, b=basis: half_space_profile(r, a, b), 1000)  # type: ignore[misc]
+            took, (level, kappa) = cpu_time(
+                lambda a=ratio, b=basis: half_space_profile(r, a, b),  # type: ignore[misc]
+                1000,
+            )
             with np.errstate(invalid="ignore"):
-                level, kappa = half_space_profile(ring.ravel().astype(np.float64), ratio, basis)
+                level, kappa = half_space_profile(
+                    ring.ravel().astype(np.float64), ratio, basis
+                )
             found = np.exp(level - kappa * ring.ravel()).reshape(ring.shape)
-            points.append(_profile(f"moments of degree {degree}", albedo, took, ring_mean(found, middle), value, noise))
-    label = f"RMS over {', '.join(f'{d:g}' for d in DISTANCE)} mean free paths of the relative error of R(r)"
+            points.append(
+                _profile(
+                    f"moments of degree {degree}",
+                    albedo,
+                    took,
+                    ring_mean(found, middle),
+                    value,
+                    noise,
+                )
+            )
+    label = (
+        f"RMS over {', '.join(f'{d:g}' for d in DISTANCE)} mean free paths of the "
+        "relative error of R(r)"
+    )
     noise_of = f"random walk of {walk.packets:,} photons, with the noise `walk_noise`"
-    return [Curve("transport", label, noise_of, "a distance", f"skindb dipole, {_albedo(0.9)}", tuple(points))]
+    return [
+        Curve(
+            "transport",
+            label,
+            noise_of,
+            "a distance",
+            f"skindb dipole, {_albedo(0.9)}",
+            tuple(points),
+        )
+    ]
 
 
 def _albedo(value: float) -> str:
@@ -140,30 +235,62 @@ def ring_mean(found: Array, middle: Array, width: float = WIDTH) -> Array:
     return np.asarray((found * r).sum(axis=0) / r.sum(axis=0))
 
 
-def rings(walk: Walk, ratio: float, middle: Array, width: float = WIDTH) -> tuple[Array, Array]:
-    """R in a ring around each distance, and its relative standard error; sigma_s' = 1, sigma_a = `ratio`."""
-    found = [radial_profile(walk, ratio, 1.0, np.array([r / width, r * width])) for r in middle]
+def rings(
+    walk: Walk, ratio: float, middle: Array, width: float = WIDTH
+) -> tuple[Array, Array]:
+    """R in a ring around each distance, and its relative standard error; sigma_s' = 1,
+    sigma_a = `ratio`.
+    """
+    found = [
+        radial_profile(walk, ratio, 1.0, np.array([r / width, r * width]))
+        for r in middle
+    ]
     value = np.concatenate([v for v, _ in found])
     error = np.concatenate([e for _, e in found])
     with np.errstate(invalid="ignore", divide="ignore"):
         return value, np.asarray(np.where(value > 0, error / value, np.inf))
 
 
-def _profile(name: str, albedo: float, took: float, mean: Array, value: Array, noise: Array) -> Point:
+def _profile(
+    name: str, albedo: float, took: float, mean: Array, value: Array, noise: Array
+) -> Point:
     known = (noise < NOISY) & np.isfinite(mean)
     off = mean[known] / value[known] - 1
-    more = {f"at_{d:g}": float(e) for d, e in zip(np.array(DISTANCE)[known], off, strict=True)}
+    more = {
+        f"at_{d:g}": float(e)
+        for d, e in zip(np.array(DISTANCE)[known], off, strict=True)
+    }
     more["walk_noise"] = float(np.sqrt((noise[known] ** 2).mean()))
-    diffusion = "the diffusion approximation is invalid within some mean free paths and for strong absorption"
+    diffusion = (
+        "the diffusion approximation is invalid within some mean free paths and for "
+        "strong absorption"
+    )
     error = float(np.sqrt((off**2).mean()))
-    few = f"{error:.0%} off: too few moments" if name.startswith("moments") and error > 0.1 else ""
+    few = (
+        f"{error:.0%} off: too few moments"
+        if name.startswith("moments") and error > 0.1
+        else ""
+    )
     negative = ", ".join(f"{d:g}" for d in np.array(DISTANCE)[np.isnan(mean)])
-    few = f"negative at {negative} mean free paths (not in the error): too few moments" if negative else few
-    return Point(name, _albedo(albedo), took, error, diffusion if name.endswith("dipole") else few, more)
+    few = (
+        f"negative at {negative} mean free paths (not in the error): too few moments"
+        if negative
+        else few
+    )
+    return Point(
+        name,
+        _albedo(albedo),
+        took,
+        error,
+        diffusion if name.endswith("dipole") else few,
+        more,
+    )
 
 
 def probe_curves(quick: bool) -> list[Curve]:
-    """sigma_tr from the fibres of the probe, by profile model, number of fibres, and known or fitted gain."""
+    """sigma_tr from the fibres of the probe, by profile model, number of fibres, and
+    known or fitted gain.
+    """
     walk = _walk(quick)
     points = []
     skin = SKIN[1:4:2] if quick else SKIN
@@ -175,25 +302,58 @@ def probe_curves(quick: bool) -> list[Curve]:
             for fibres in (28,) if quick else (4, 6, 8, 12, 28):
                 fit = _fitter(model, free, fibres, photons)
                 took, found = cpu_time(fit, len(skin))
-                off = np.array([f.sigma_tr / sigma_tr(*x) - 1 for f, x in zip(found, skin, strict=True)])
-                more = {f"{a:g}, {s:g}": float(e) for (a, s), e in zip(skin, off, strict=True)}
-                why = "" if np.isfinite(off).all() else "some profiles were not fitted, see `more`"
+                off = np.array(
+                    [
+                        f.sigma_tr / sigma_tr(*x) - 1
+                        for f, x in zip(found, skin, strict=True)
+                    ]
+                )
+                more = {
+                    f"{a:g}, {s:g}": float(e)
+                    for (a, s), e in zip(skin, off, strict=True)
+                }
+                why = (
+                    ""
+                    if np.isfinite(off).all()
+                    else "some profiles were not fitted, see `more`"
+                )
                 if np.nanmax(np.abs(off)) > FAR_OFF:
                     why = f"{np.nanmax(np.abs(off)):.0%} off in one medium: " + (
                         FAILS_WITH_FREE_GAIN if free else FAILS_WHERE_NEAR
                     )
                 name = f"skindb {model}, gain {'fitted' if free else 'known'}"
-                points.append(Point(name, f"{fibres} fibres", took, float(np.sqrt(np.nanmean(off**2))), why, more))
+                points.append(
+                    Point(
+                        name,
+                        f"{fibres} fibres",
+                        took,
+                        float(np.sqrt(np.nanmean(off**2))),
+                        why,
+                        more,
+                    )
+                )
     label = f"RMS over {len(skin)} kinds of skin of the relative error of sigma_tr"
-    reference = f"random walk of {walk.packets:,} photons through media of known coefficients"
+    reference = (
+        f"random walk of {walk.packets:,} photons through media of known coefficients"
+    )
     base = f"skindb dipole, gain known, {len(FIBRES)} fibres"
     return [Curve("probe", label, reference, "a profile", base, tuple(points))]
 
 
-def _fitter(model: str, free: bool, fibres: int, photons: Sequence[tuple[Array, Array]]) -> Callable[[], list[Any]]:
+def _fitter(
+    model: str, free: bool, fibres: int, photons: Sequence[tuple[Array, Array]]
+) -> Callable[[], list[Any]]:
     def fit() -> list[Any]:
         return [
-            fit_profile(FIBRES[:fibres], v[:fibres], e[:fibres], radius=0.0, eta=ETA, model=model, free_gain=free)
+            fit_profile(
+                FIBRES[:fibres],
+                v[:fibres],
+                e[:fibres],
+                radius=0.0,
+                eta=ETA,
+                model=model,
+                free_gain=free,
+            )
             for v, e in photons
         ]
 

@@ -1,4 +1,6 @@
-"""Names of the kernels that have curves of error against CPU time; the stress set uses the same names."""
+"""Names of the kernels that have curves of error against CPU time; the stress set uses
+the same names.
+"""
 
 KERNELS = (
     "surface",

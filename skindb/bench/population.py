@@ -1,4 +1,6 @@
-"""Kernels of populations: pyramids, textures, principal components, effects and their permutations."""
+"""Kernels of populations: pyramids, textures, principal components, effects and their
+permutations.
+"""
 
 from __future__ import annotations
 
@@ -12,29 +14,64 @@ from skindb.bench.curve import Curve, Point, cpu_time
 from skindb.numerics.inference import permutation_p
 from skindb.numerics.principal import principal_axes
 from skindb.numerics.pyramid import build, reconstruct
-from skindb.numerics.texture import image_parts, level_fractions, part_quantiles, synthesise
+from skindb.numerics.texture import (
+    image_parts,
+    level_fractions,
+    part_quantiles,
+    synthesise,
+)
 
 TAKES = 87
 
 
 def pyramid_curves(quick: bool) -> list[Curve]:
-    """Round trip of images of several sizes in both precisions, relative to a Fourier transform and its inverse."""
+    """Round trip of images of several sizes in both precisions, relative to a Fourier
+    transform and its inverse.
+    """
     points = []
     base = ""
     for size in (256, 512) if quick else (512, 1024, 2048):
         image = np.random.default_rng(size).standard_normal((size, size))
-        took, back = cpu_time(lambda x=image: np.fft.irfft2(np.fft.rfft2(x), x.shape), size**2)  # type: ignore[misc]
-        points.append(Point("Fourier transform and inverse", f"{size} x {size}", took, _largest(back - image)))
+        took, back = cpu_time(
+            lambda x=image: np.fft.irfft2(np.fft.rfft2(x), x.shape),  # type: ignore[misc]
+            size**2,
+        )
+        points.append(
+            Point(
+                "Fourier transform and inverse",
+                f"{size} x {size}",
+                took,
+                _largest(back - image),
+            )
+        )
         base = base or points[-1].name
         for dtype in (np.float64, np.float32):
             given = image.astype(dtype)
             took, again = cpu_time(lambda x=given: reconstruct(build(x)), size**2)  # type: ignore[misc]
-            points.append(Point("skindb", f"{size} x {size}, {dtype.__name__}", took, _largest(again - image)))
-    return [Curve("pyramid", "largest error of a round trip", "the image", "an entry", base, tuple(points))]
+            points.append(
+                Point(
+                    "skindb",
+                    f"{size} x {size}, {dtype.__name__}",
+                    took,
+                    _largest(again - image),
+                )
+            )
+    return [
+        Curve(
+            "pyramid",
+            "largest error of a round trip",
+            "the image",
+            "an entry",
+            base,
+            tuple(points),
+        )
+    ]
 
 
 def textures_curves(quick: bool) -> list[Curve]:
-    """White noise that is matched to the distributions of streaks: distance from them by number of iterations."""
+    """White noise that is matched to the distributions of streaks: distance from them
+    by number of iterations.
+    """
     size, levels = (128, 4) if quick else (512, 7)
     rng = np.random.default_rng(0)
     wanted = gaussian_filter(rng.standard_normal((size, size)), (1, 4), mode="wrap")
@@ -45,48 +82,95 @@ def textures_curves(quick: bool) -> list[Curve]:
     def made(iterations: int) -> Array:
         every = [np.ones(image.shape)]
         own = np.random.default_rng(1)
-        return synthesise(image, every, shift, iterations=iterations, levels=levels, rng=own).image
+        return synthesise(
+            image, every, shift, iterations=iterations, levels=levels, rng=own
+        ).image
 
     points = []
     for iterations in (1, 5) if quick else (1, 2, 5, 10, 20):
         took, found = cpu_time(lambda n=iterations: made(n), size**2)  # type: ignore[misc]
-        error = float(np.sqrt(((_quantiles(found, levels) - goal) ** 2).mean() / (shift**2).mean()))
+        error = float(
+            np.sqrt(
+                ((_quantiles(found, levels) - goal) ** 2).mean() / (shift**2).mean()
+            )
+        )
         points.append(Point("skindb", f"{iterations} iterations", took, error))
     name = "RMS difference of quantiles over that of the source"
-    return [Curve("textures", name, "a planted texture", "an entry", "skindb, 5 iterations", tuple(points))]
+    return [
+        Curve(
+            "textures",
+            name,
+            "a planted texture",
+            "an entry",
+            "skindb, 5 iterations",
+            tuple(points),
+        )
+    ]
 
 
 def components_curves(quick: bool) -> list[Curve]:
     """Principal axes of a few long vectors, compared with scikit-learn."""
     length = 10_000 if quick else 300_000
     rng = np.random.default_rng(0)
-    vectors = rng.standard_normal((TAKES, 5)) @ rng.standard_normal((5, length)) + 0.1 * rng.standard_normal(
-        (TAKES, length)
-    )
+    vectors = rng.standard_normal((TAKES, 5)) @ rng.standard_normal(
+        (5, length)
+    ) + 0.1 * rng.standard_normal((TAKES, length))
     exact = PCA(5, svd_solver="full").fit(vectors)
     points = []
     for name, solver in (("scikit-learn", "full"), ("scikit-learn", "randomized")):
-        took, found = cpu_time(lambda s=solver: PCA(5, svd_solver=s, random_state=0).fit(vectors))  # type: ignore[misc]
-        points.append(Point(name, solver, took, _axes_off(found.components_, exact.components_)))
+        took, found = cpu_time(
+            lambda s=solver: PCA(5, svd_solver=s, random_state=0).fit(vectors)  # type: ignore[misc]
+        )
+        points.append(
+            Point(name, solver, took, _axes_off(found.components_, exact.components_))
+        )
     took, own = cpu_time(lambda: principal_axes(vectors, 5))
     points.append(Point("skindb", "", took, _axes_off(own.axes, exact.components_)))
     single = vectors.astype(np.float32)
     took, own = cpu_time(lambda: principal_axes(single, 5))
-    points.append(Point("skindb", "vectors in single precision", took, _axes_off(own.axes, exact.components_)))
+    points.append(
+        Point(
+            "skindb",
+            "vectors in single precision",
+            took,
+            _axes_off(own.axes, exact.components_),
+        )
+    )
     label = f"largest difference of 5 axes of {TAKES} vectors of {length:,}"
-    return [Curve("components", label, "scikit-learn, full", "an analysis", "scikit-learn, full", tuple(points))]
+    return [
+        Curve(
+            "components",
+            label,
+            "scikit-learn, full",
+            "an analysis",
+            "scikit-learn, full",
+            tuple(points),
+        )
+    ]
 
 
 def permutations_curves(quick: bool) -> list[Curve]:
-    """P values of 30 quantities of 87 subjects by number of permutations, and of scipy.stats.permutation_test."""
+    """P values of 30 quantities of 87 subjects by number of permutations, and of
+    scipy.stats.permutation_test.
+    """
     rng = np.random.default_rng(0)
     group = (np.arange(TAKES) % 4 == 0).astype(float)
-    values = rng.standard_normal((TAKES, 30)) + 0.4 * group[:, None] * np.linspace(0, 1, 30)
-    exact, _, _ = permutation_p(values, group, most=20_000 if quick else 200_000, rng=np.random.default_rng(7))
+    values = rng.standard_normal((TAKES, 30)) + 0.4 * group[:, None] * np.linspace(
+        0, 1, 30
+    )
+    exact, _, _ = permutation_p(
+        values, group, most=20_000 if quick else 200_000, rng=np.random.default_rng(7)
+    )
     points = []
     for most in (100, 1000) if quick else (100, 1000, 10_000):
-        took, (p, _, _) = cpu_time(lambda n=most: permutation_p(values, group, most=n, rng=np.random.default_rng(1)))  # type: ignore[misc]
-        points.append(Point("skindb", f"{most} permutations", took, _largest(p - exact)))
+        took, (p, _, _) = cpu_time(
+            lambda n=most: permutation_p(  # type: ignore[misc]
+                values, group, most=n, rng=np.random.default_rng(1)
+            )
+        )
+        points.append(
+            Point("skindb", f"{most} permutations", took, _largest(p - exact))
+        )
     most = 100 if quick else 1000
 
     def welch(x: Array, y: Array, axis: int = 0) -> Array:
@@ -103,15 +187,28 @@ def permutations_curves(quick: bool) -> list[Curve]:
         )
     )
     name = "SciPy permutation_test of Welch's statistic, which differs from HC3's"
-    points.append(Point(name, f"{most} permutations", took, _largest(found.pvalue - exact)))
+    points.append(
+        Point(name, f"{most} permutations", took, _largest(found.pvalue - exact))
+    )
     count = "20,000" if quick else "200,000"
     base = f"skindb, {1000} permutations"
-    return [Curve("permutations", "largest error of a p value", f"{count} permutations", "a test", base, tuple(points))]
+    return [
+        Curve(
+            "permutations",
+            "largest error of a p value",
+            f"{count} permutations",
+            "a test",
+            base,
+            tuple(points),
+        )
+    ]
 
 
 def _quantiles(image: Array, levels: int) -> Array:
     parts = image_parts(image, levels)
-    return part_quantiles(parts, level_fractions(np.ones(image.shape), [part.shape for part in parts]))
+    return part_quantiles(
+        parts, level_fractions(np.ones(image.shape), [part.shape for part in parts])
+    )
 
 
 def _axes_off(found: Array, exact: Array) -> float:

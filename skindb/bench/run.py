@@ -1,4 +1,6 @@
-"""One run of `skindb bench`: measures the curves, runs the stress set, writes bench.json and one plot per kernel."""
+"""One run of `skindb bench`: measures the curves, runs the stress set, writes
+bench.json and one plot per kernel.
+"""
 
 from __future__ import annotations
 
@@ -15,12 +17,22 @@ from threadpoolctl import threadpool_limits
 from skindb._files import make_private, private_file
 from skindb._types import Progress
 from skindb.bench.curve import Curve
-from skindb.bench.diffusion import inverse_curves, probe_curves, require_mpmath, transport_curves
+from skindb.bench.diffusion import (
+    inverse_curves,
+    probe_curves,
+    require_mpmath,
+    transport_curves,
+)
 from skindb.bench.factors import nmf_curves
 from skindb.bench.light import disc_curves, exposures_curves, subsurface_curves
 from skindb.bench.photometry import albedo_curves, normals_curves
 from skindb.bench.plot import plot_curves
-from skindb.bench.population import components_curves, permutations_curves, pyramid_curves, textures_curves
+from skindb.bench.population import (
+    components_curves,
+    permutations_curves,
+    pyramid_curves,
+    textures_curves,
+)
 from skindb.bench.stress import CASES, failure_of
 from skindb.bench.surface import refit_curves, surface_curves
 from skindb.schema.plain import plain
@@ -45,7 +57,11 @@ CURVES: dict[str, Callable[[bool], list[Curve]]] = {
 
 
 def run_bench(
-    out: Path, *, only: Sequence[str] = (), quick: bool = False, progress: Progress | None = None
+    out: Path,
+    *,
+    only: Sequence[str] = (),
+    quick: bool = False,
+    progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Measure every kernel, or those of `only`, and run the stress set on them.
 
@@ -63,9 +79,10 @@ def run_bench(
     Returns
     -------
     dict
-        Content of bench.json: `points` (kernel, method, parameter, CPU time and its unit of work, its ratio to
-        `ratio_to`, error and its definition, reference, failure), `stress` (kernel, name, promise, failure) and
-        `failures` (one line for each unsuitable method and each broken promise).
+        Content of bench.json: `points` (kernel, method, parameter, CPU time and its
+        unit of work, its ratio to `ratio_to`, error and its definition, reference,
+        failure), `stress` (kernel, name, promise, failure) and `failures` (one line for
+        each unsuitable method and each broken promise).
     """
     kernels = [kernel for kernel in CURVES if kernel in only or not only]
     if "inverse" in kernels:
@@ -88,7 +105,10 @@ def run_bench(
     flat = [point for curve in points for point in curve]
     result = {
         "quick": quick,
-        "software": {name: version(name) for name in ("skindb", "numpy", "numba", "scipy", "scikit-learn")},
+        "software": {
+            name: version(name)
+            for name in ("skindb", "numpy", "numba", "scipy", "scikit-learn")
+        },
         "machine": f"{platform.machine()}, Python {platform.python_version()}",
         "seconds": seconds | {"all": round(time.perf_counter() - begin, 1)},
         "points": flat,
@@ -96,16 +116,27 @@ def run_bench(
         "failures": _failures(flat, stress),
         "broken": sum(bool(case["failure"]) for case in stress),
     }
-    private_file(out / "bench.json").write_text(json.dumps(plain(result), indent=1, allow_nan=False), encoding="utf-8")
+    private_file(out / "bench.json").write_text(
+        json.dumps(plain(result), indent=1, allow_nan=False), encoding="utf-8"
+    )
     return result
 
 
 def _flat(curve: Curve) -> list[dict[str, Any]]:
-    shared = {"kernel": curve.kernel, "error_of": curve.error_of, "reference": curve.reference}
+    shared = {
+        "kernel": curve.kernel,
+        "error_of": curve.error_of,
+        "reference": curve.reference,
+    }
     shared |= {"seconds_of": curve.seconds_of, "ratio_to": curve.base}
     return [
         shared
-        | {"method": p.method, "parameter": p.parameter, "seconds": p.seconds, "ratio": curve.ratio(p)}
+        | {
+            "method": p.method,
+            "parameter": p.parameter,
+            "seconds": p.seconds,
+            "ratio": curve.ratio(p),
+        }
         | {"error": p.error, "failure": p.failure, "more": p.more}
         for p in curve.points
     ]
@@ -122,16 +153,48 @@ def _stress(kernels: Sequence[str], tell: Progress) -> list[dict[str, str]]:
     return found
 
 
-def _failures(points: Sequence[dict[str, Any]], stress: Sequence[dict[str, str]]) -> list[str]:
-    said = {f"{p['kernel']}: {p['method']}, {p['parameter']}: {p['failure']}": None for p in points if p["failure"]}
-    broken = [f"{c['kernel']}: {c['name']}: broken: {c['promise']} {c['failure']}" for c in stress if c["failure"]]
+def _failures(
+    points: Sequence[dict[str, Any]], stress: Sequence[dict[str, str]]
+) -> list[str]:
+    said = {
+        f"{p['kernel']}: {p['method']}, {p['parameter']}: {p['failure']}": None
+        for p in points
+        if p["failure"]
+    }
+    broken = [
+        f"{c['kernel']}: {c['name']}: broken: {c['promise']} {c['failure']}"
+        for c in stress
+        if c["failure"]
+    ]
     return [*(line.replace(", : ", ": ") for line in said), *broken]
 
 
 def table_of(result: dict[str, Any]) -> list[list[Any]]:
-    """Header and rows: kernel, method, setting, relative CPU time, CPU time, error, and its definition."""
-    rows: list[list[Any]] = [["kernel", "method", "setting", "relative time", "CPU time [s]", "error", "error of"]]
+    """Header and rows: kernel, method, setting, relative CPU time, CPU time, error, and
+    its definition.
+    """
+    rows: list[list[Any]] = [
+        [
+            "kernel",
+            "method",
+            "setting",
+            "relative time",
+            "CPU time [s]",
+            "error",
+            "error of",
+        ]
+    ]
     for p in result["points"]:
         ratio = "1 (base)" if p["ratio"] == 1 else float(p["ratio"])
-        rows.append([p["kernel"], p["method"], p["parameter"] or "-", ratio, p["seconds"], p["error"], p["error_of"]])
+        rows.append(
+            [
+                p["kernel"],
+                p["method"],
+                p["parameter"] or "-",
+                ratio,
+                p["seconds"],
+                p["error"],
+                p["error_of"],
+            ]
+        )
     return rows

@@ -1,4 +1,6 @@
-"""Fits of all measured BRDFs, and of four mixtures of them, compared with loops over SciPy's solver."""
+"""Fits of all measured BRDFs, and of four mixtures of them, compared with loops over
+SciPy's solver.
+"""
 
 from __future__ import annotations
 
@@ -27,15 +29,21 @@ DISC = float(np.radians(0.8))
 MIN_COSINE_SAMPLES = 0.1  # to light and camera, as in `skindb.optics.truncation`
 LINEAR = "RMS error of the surface's reflectance at the samples over its RMS"
 ROOTS = "the same error in cube-root space"
-TRUTH = "planted mixtures of the 59 BRDFs under 150 lights and 16 cameras; samples are half floats with 5 % noise"
+TRUTH = (
+    "planted mixtures of the 59 BRDFs under 150 lights and 16 cameras; samples are "
+    "half floats with 5 % noise"
+)
 SCIPY = "SciPy nnls, precomputed rows, three channels"
 
 
 @dataclass(frozen=True)
 class Strip:
-    """Samples of a coherent strip of surfels on a head-sized ball, and the inputs of a loop over SciPy."""
+    """Samples of a coherent strip of surfels on a head-sized ball, and the inputs of a
+    loop over SciPy.
+    """
 
-    arrays: tuple[Array, ...]  # sample, position, light, camera, normal, diffuse of `surface_weights`
+    # sample, position, light, camera, normal, diffuse of `surface_weights`
+    arrays: tuple[Array, ...]
     offsets: Array  # (n + 1,) index of the first row of each surfel, and the total
     rows: Array  # (total, 59) float64
     target: Array  # (total, 3) samples minus the diffuse term
@@ -46,7 +54,14 @@ class Strip:
     def first(self, count: int) -> list[Array]:
         """The arguments of `surface_weights` for the first `count` surfels."""
         sample, position, light, camera, normal, diffuse = self.arrays
-        return [sample[:count], position[:count], light, camera, normal[:count], diffuse[:count]]
+        return [
+            sample[:count],
+            position[:count],
+            light,
+            camera,
+            normal[:count],
+            diffuse[:count],
+        ]
 
 
 def _spiral(count: int, radius: float, share: float) -> Array:
@@ -57,8 +72,12 @@ def _spiral(count: int, radius: float, share: float) -> Array:
     return np.asarray(radius * np.stack([s * np.cos(phi), s * np.sin(phi), z], axis=-1))
 
 
-def strip(surfels: int, dictionary: Dictionary, *, noise: float = 0.05, seed: int = 0) -> Strip:
-    """Samples of surfels with four random materials and a diffuse colour each; some samples are hidden."""
+def strip(
+    surfels: int, dictionary: Dictionary, *, noise: float = 0.05, seed: int = 0
+) -> Strip:
+    """Samples of surfels with four random materials and a diffuse colour each; some
+    samples are hidden.
+    """
     rng = np.random.default_rng(seed)
     light = _spiral(150, 1000, 1.0)
     camera = _spiral(16, 1200, 0.8)
@@ -67,7 +86,11 @@ def strip(surfels: int, dictionary: Dictionary, *, noise: float = 0.05, seed: in
     b = 0.9 * (np.arange(surfels) % side) / side - 0.45
     normal = np.stack([np.sin(b), np.sin(a) * np.cos(b), np.cos(a) * np.cos(b)], -1)
     normal += 0.01 * rng.normal(size=normal.shape)
-    normal = (normal / np.linalg.norm(normal, axis=1, keepdims=True)).astype(np.float32).astype(float)
+    normal = (
+        (normal / np.linalg.norm(normal, axis=1, keepdims=True))
+        .astype(np.float32)
+        .astype(float)
+    )
     position = (90 * normal).astype(np.float32).astype(float)
     wi, wo = ((t[None] - position[:, None]) for t in (light, camera))
     wi = wi / np.linalg.norm(wi, axis=-1, keepdims=True)
@@ -76,7 +99,9 @@ def strip(surfels: int, dictionary: Dictionary, *, noise: float = 0.05, seed: in
     co = np.einsum("nk,ntk->nt", normal, wo)
     seen = (rng.random((surfels, 150, 1)) < 0.85) & (rng.random((surfels, 1, 16)) < 0.8)
     seen &= (ci > MIN_COSINE_SAMPLES)[:, :, None] & (co > MIN_COSINE_SAMPLES)[:, None]
-    rows, offsets, index = basis_rows(dictionary.table, dictionary.grid, normal, wi, wo, seen)
+    rows, offsets, index = basis_rows(
+        dictionary.table, dictionary.grid, normal, wi, wo, seen
+    )
     owner, (i, o) = np.repeat(np.arange(surfels), np.diff(offsets)), index.T
     diffuse = rng.uniform(0.2, 0.6, (surfels, 3))
     weight = np.zeros((surfels, rows.shape[1]))
@@ -84,7 +109,9 @@ def strip(surfels: int, dictionary: Dictionary, *, noise: float = 0.05, seed: in
         w[rng.choice(len(w), 4, replace=False)] = rng.uniform(0, 0.4, 4)
     c = ci[owner, i]
     d = co[owner, o]
-    scattered = (c * fresnel_transmittance(c, ETA) * fresnel_transmittance(d, ETA) / np.pi)[:, None] * diffuse[owner]
+    scattered = (
+        c * fresnel_transmittance(c, ETA) * fresnel_transmittance(d, ETA) / np.pi
+    )[:, None] * diffuse[owner]
     true = np.einsum("tm,tm->t", rows, weight[owner])
     value = true[:, None] + scattered
     value *= 1 + noise * rng.normal(size=value.shape)
@@ -107,7 +134,9 @@ def _problem(quick: bool) -> tuple[Dictionary, Strip, int]:
 def _tables(quick: bool, roots: bool, rank: int) -> Tables:
     """The dictionary, or its cube roots, reduced to `rank` dimensions."""
     dictionary = _problem(quick)[0]
-    reduced, lift = reduce_dictionary(np.cbrt(dictionary.table) if roots else dictionary.table, rank)
+    reduced, lift = reduce_dictionary(
+        np.cbrt(dictionary.table) if roots else dictionary.table, rank
+    )
     return Tables(reduced, dictionary.grid, lift)
 
 
@@ -115,7 +144,14 @@ def _parts(made: Strip, count: int) -> list[slice]:
     return [slice(*made.offsets[s : s + 2]) for s in range(count)]
 
 
-def scipy_loop(made: Strip, count: int, *, channels: int, table: Array | None = None, H: Array | None = None) -> Array:
+def scipy_loop(
+    made: Strip,
+    count: int,
+    *,
+    channels: int,
+    table: Array | None = None,
+    H: Array | None = None,
+) -> Array:
     """Weights of `count` surfels, from the mean of the channels or all three.
 
     Rows are precomputed, or interpolated in `table` by NumPy.
@@ -129,12 +165,20 @@ def scipy_loop(made: Strip, count: int, *, channels: int, table: Array | None = 
             M = lookup(table, *angles) * made.cosine[part, None]
         M = M if H is None else M @ H.T
         target = made.target[part]
-        found.append(nnls(np.repeat(M, 3, 0), target.ravel())[0] if channels == 3 else nnls(M, target.mean(1))[0])
+        found.append(
+            nnls(np.repeat(M, 3, 0), target.ravel())[0]
+            if channels == 3
+            else nnls(M, target.mean(1))[0]
+        )
     return np.array(found)
 
 
-def _errors(made: Strip, count: int, predict: Callable[[slice, int], Array]) -> tuple[float, float, float]:
-    """Medians over surfels of the true errors, linear and in cube-root space, and of |M x - R| / |R|."""
+def _errors(
+    made: Strip, count: int, predict: Callable[[slice, int], Array]
+) -> tuple[float, float, float]:
+    """Medians over surfels of the true errors, linear and in cube-root space, and of |M
+    x - R| / |R|.
+    """
     linear = []
     roots = []
     residual = []
@@ -143,14 +187,21 @@ def _errors(made: Strip, count: int, predict: Callable[[slice, int], Array]) -> 
         true = made.true[part]
         given = made.target[part]
         linear.append(np.linalg.norm(y - true) / np.linalg.norm(true))
-        roots.append(np.linalg.norm(np.cbrt(y) - np.cbrt(true)) / np.linalg.norm(np.cbrt(true)))
+        roots.append(
+            np.linalg.norm(np.cbrt(y) - np.cbrt(true)) / np.linalg.norm(np.cbrt(true))
+        )
         residual.append(np.linalg.norm(y[:, None] - given) / np.linalg.norm(given))
     return float(np.median(linear)), float(np.median(roots)), float(np.median(residual))
 
 
 def _fit(made: Strip, tables: Tables, mode: str) -> tuple[float, Weights]:
     """CPU time per surfel [s], and weights of all surfels."""
-    options: dict[str, Any] = {"eta": ETA, "mode": mode, "noise_floor": NOISE_FLOOR_SURFACE, "min_samples": MIN_SAMPLES}
+    options: dict[str, Any] = {
+        "eta": ETA,
+        "mode": mode,
+        "noise_floor": NOISE_FLOOR_SURFACE,
+        "min_samples": MIN_SAMPLES,
+    }
     n = len(made.offsets) - 1
     surface_weights(*made.first(2), tables=tables, **options)  # compiles
     return cpu_time(lambda: surface_weights(*made.arrays, tables=tables, **options), n)
@@ -163,26 +214,58 @@ def _mixed(made: Strip, weight: Array) -> Callable[[slice, int], Array]:
 def surface_curves(quick: bool) -> list[Curve]:
     """All 59 BRDFs by mode and rank."""
     dictionary, made, few = _problem(quick)
-    measured: list[tuple[str, str, float, tuple[float, float, float], str, dict[str, float]]] = []
+    measured: list[
+        tuple[str, str, float, tuple[float, float, float], str, dict[str, float]]
+    ] = []
     for name, channels, table in (
         ("SciPy nnls, precomputed rows, mean of channels", 1, None),
         (SCIPY, 3, None),
         ("SciPy nnls, rows by NumPy, mean of channels", 1, dictionary.table),
         ("SciPy nnls, rows by NumPy, three channels", 3, dictionary.table),
     ):
-        took, weight = cpu_time(lambda c=channels, t=table: scipy_loop(made, few, channels=c, table=t), few)  # type: ignore[misc]
-        measured.append((name, "", took, _errors(made, few, _mixed(made, weight)), "", {}))
+        took, weight = cpu_time(
+            lambda c=channels, t=table: scipy_loop(made, few, channels=c, table=t),  # type: ignore[misc]
+            few,
+        )
+        measured.append(
+            (name, "", took, _errors(made, few, _mixed(made, weight)), "", {})
+        )
     for mode in ("linear", "perceptual", "paper"):
         table = np.cbrt(dictionary.table) if mode == "paper" else dictionary.table
         for rank in (16, 59) if quick else (8, 12, 16, 24, 59):
             took, found = _fit(made, _tables(quick, mode == "paper", rank), mode)
-            more = {"kkt": float(found.kkt.max()), "not_fitted": float((found.status != 0).sum())}
-            cubes = _cubes(made, table, found.weight) if mode == "paper" else _mixed(made, found.weight)
-            measured.append((f"skindb {mode}", f"rank {rank}", took, _errors(made, few, cubes), "", more))
+            more = {
+                "kkt": float(found.kkt.max()),
+                "not_fitted": float((found.status != 0).sum()),
+            }
+            cubes = (
+                _cubes(made, table, found.weight)
+                if mode == "paper"
+                else _mixed(made, found.weight)
+            )
+            measured.append(
+                (
+                    f"skindb {mode}",
+                    f"rank {rank}",
+                    took,
+                    _errors(made, few, cubes),
+                    "",
+                    more,
+                )
+            )
             if mode == "paper" and rank == 59:
                 why = "cbrt(M x) is not cbrt(M) x, so weights of cube roots do not mix reflectance"
                 errors = _errors(made, few, _mixed(made, found.weight))
-                measured.append(("paper's weights used as linear weights", "rank 59", took, errors, why, more))
+                measured.append(
+                    (
+                        "paper's weights used as linear weights",
+                        "rank 59",
+                        took,
+                        errors,
+                        why,
+                        more,
+                    )
+                )
     return [
         Curve(
             "surface",
@@ -212,12 +295,18 @@ def _cubes(made: Strip, roots: Array, weight: Array) -> Callable[[slice, int], A
 def refit_curves(quick: bool) -> list[Curve]:
     """Four mixtures of the BRDFs, from the full linear weights."""
     dictionary, made, few = _problem(quick)
-    _, full = _fit(made, Tables(dictionary.table, dictionary.grid, np.eye(len(dictionary.names))), "linear")
+    _, full = _fit(
+        made,
+        Tables(dictionary.table, dictionary.grid, np.eye(len(dictionary.names))),
+        "linear",
+    )
     H = nmf(full.weight, 4, rng=np.random.default_rng(0)).H
     measured = []
     took, weight = cpu_time(lambda: scipy_loop(made, few, channels=3, H=H), few)
     measured.append((SCIPY, took, weight))
-    four = Tables((dictionary.table @ H.T).astype(np.float32), dictionary.grid, np.eye(4))
+    four = Tables(
+        (dictionary.table @ H.T).astype(np.float32), dictionary.grid, np.eye(4)
+    )
     for mode in ("linear", "perceptual"):
         took, found = _fit(made, four, mode)
         measured.append((f"skindb {mode}", took, found.weight))

@@ -1,4 +1,6 @@
-"""The command line: each command parses its options, makes one public call and prints the result."""
+"""The command line: each command parses its options, makes one public call and prints
+the result.
+"""
 
 from __future__ import annotations
 
@@ -30,10 +32,14 @@ from skindb.errors import Fault, InputError, SkindbWarning, escaped, system_faul
 INTERRUPTED = 130
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"], "show_default": True})
+@click.group(
+    context_settings={"help_option_names": ["-h", "--help"], "show_default": True}
+)
 @click.version_option(skindb.__version__, prog_name="skindb")
 def cli() -> None:
-    """Measure human skin: ingest captures, fit reflectance models, study populations, edit, render and export."""
+    """Measure human skin: ingest captures, fit reflectance models, study populations,
+    edit, render and export.
+    """
 
 
 for _command in (
@@ -74,7 +80,10 @@ def _give_up(code: int, faults: Sequence[Fault], done: Any = None) -> NoReturn:
     The option is looked up in `sys.argv`, because a faulty call may not have been parsed.
     """
     if "--json" in sys.argv:
-        errors = [{"what": f.where, "rule": f.rule, "found": f.found, "cure": f.cure} for f in faults]
+        errors = [
+            {"what": f.where, "rule": f.rule, "found": f.found, "cure": f.cure}
+            for f in faults
+        ]
         echo_json({"error": errors} | ({"done": done} if done else {}))
     sys.exit(code)
 
@@ -84,19 +93,33 @@ def _one_line(
     category: type[Warning],
     filename: str,
     lineno: int,
-    line: str | None = None,  # noqa: ARG001  the signature is that of the standard library
+    # the signature is that of the standard library
+    line: str | None = None,  # noqa: ARG001
 ) -> str:
-    """Format a warning: only its text if it is meant for users, otherwise with its place in the code."""
-    place = "" if issubclass(category, SkindbWarning) else f"{filename}:{lineno}: {category.__name__}: "
+    """Format a warning: only its text if it is meant for users, otherwise with its
+    place in the code.
+    """
+    place = (
+        ""
+        if issubclass(category, SkindbWarning)
+        else f"{filename}:{lineno}: {category.__name__}: "
+    )
     return f"skindb: warning: {escaped(f'{place}{message}')}\n"
 
 
 def _silence_libraries() -> None:
-    """Keep lines that C libraries print about damaged files from the terminal, and from the output of --json.
+    """Keep lines that C libraries print about damaged files from the terminal, and from
+    the output of --json.
 
-    They write to the descriptors 1 and 2, which become the null device; `sys.stdout` and `sys.stderr` get others.
+    They write to the descriptors 1 and 2, which become the null device; `sys.stdout`
+    and `sys.stderr` get others.
     """
-    if sys.stdout is not sys.__stdout__ or sys.stderr is not sys.__stderr__ or sys.stdout is None or sys.stderr is None:
+    if (
+        sys.stdout is not sys.__stdout__
+        or sys.stderr is not sys.__stderr__
+        or sys.stdout is None
+        or sys.stderr is None
+    ):
         return  # closed, or replaced by a program that calls this one
     sys.stdout = _moved(sys.stdout)
     sys.stderr = _moved(sys.stderr)
@@ -109,25 +132,32 @@ def _moved(stream: TextIO) -> TextIO:
     null = os.open(os.devnull, os.O_WRONLY)
     os.dup2(null, stream.fileno())
     os.close(null)
-    return os.fdopen(number, "w", buffering=1, encoding=stream.encoding, errors=stream.errors)
+    return os.fdopen(
+        number, "w", buffering=1, encoding=stream.encoding, errors=stream.errors
+    )
 
 
 def main() -> None:
     """Run the command line.
 
-    Each fault of the input is printed as one line, and the exit code is 1; wrong usage gives exit code 2.
+    Each fault of the input is printed as one line, and the exit code is 1; wrong usage
+    gives exit code 2.
     """
     verbose = bool({"-v", "--verbose"} & set(sys.argv))
     _silence_libraries()
     warnings.formatwarning = _one_line
     if not verbose and not sys.warnoptions:
-        warnings.simplefilter("ignore")  # those of libraries, which name lines of their code
+        # those of libraries, which name lines of their code
+        warnings.simplefilter("ignore")
     warnings.filterwarnings("always", category=SkindbWarning)
     try:
         with private_umask():  # also for what libraries and worker processes write
             cli.main(standalone_mode=False)
     except InputError as error:
-        echo(*(f"skindb: {line}" for line in fault_lines(error.faults, every=verbose)), err=True)
+        echo(
+            *(f"skindb: {line}" for line in fault_lines(error.faults, every=verbose)),
+            err=True,
+        )
         _give_up(1, error.faults, getattr(error, "done", None))
     except click.ClickException as error:
         shown = io.StringIO()
@@ -136,7 +166,10 @@ def main() -> None:
         context = getattr(error, "ctx", None)
         command = context.command_path if context else "skindb"
         rule = "must be called as its --help says"
-        _give_up(error.exit_code, [Fault(command, rule, error.format_message(), f"see {command} --help")])
+        _give_up(
+            error.exit_code,
+            [Fault(command, rule, error.format_message(), f"see {command} --help")],
+        )
     except (click.Abort, KeyboardInterrupt):
         said = "interrupted; no incomplete version was committed"
         echo(f"skindb: {said}", err=True)

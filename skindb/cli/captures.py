@@ -34,29 +34,55 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.option("--out", type=PATH, default=Path("demo"), help="Folder to write.")
-@click.option("--takes", type=click.IntRange(1, 8), default=8, help="Number of virtual takes.")
 @click.option(
-    "--cameras", type=click.IntRange(2, MAX_CAMERAS), default=8, help="Number of cameras of the virtual dome."
+    "--takes", type=click.IntRange(1, 8), default=8, help="Number of virtual takes."
 )
-@click.option("--lights", type=click.IntRange(12, MAX_LIGHTS), default=48, help="Number of lights of the virtual dome.")
-@click.option("--seed", type=Seed(), default=2005, help="Random seed for noise and sampling.")
 @click.option(
-    "--workers", type=click.IntRange(1, 8), help="Number of takes at a time.  [default: one for each core, at most 4]"
+    "--cameras",
+    type=click.IntRange(2, MAX_CAMERAS),
+    default=8,
+    help="Number of cameras of the virtual dome.",
+)
+@click.option(
+    "--lights",
+    type=click.IntRange(12, MAX_LIGHTS),
+    default=48,
+    help="Number of lights of the virtual dome.",
+)
+@click.option(
+    "--seed", type=Seed(), default=2005, help="Random seed for noise and sampling."
+)
+@click.option(
+    "--workers",
+    type=click.IntRange(1, 8),
+    help="Number of takes at a time.  [default: one for each core, at most 4]",
 )
 @common
 def demo(out: Path, **options: Any) -> None:
     """Run every step on simulated subjects, and write a report.
 
-    The subjects are ingested, fitted, analysed, edited, rendered and exported; report.html and viewer.html show them.
+    The subjects are ingested, fitted, analysed, edited, rendered and exported;
+    report.html and viewer.html show them.
     """
     result = skindb.demo.run_demo(out, progress=bar(plain=True), **options)
-    stages = [f"{stage:<10} {seconds:7.1f} s" for stage, seconds in result["seconds"].items()]
-    emit(result, [*(stages if asked("verbose") else []), str(result["report"]), str(result["viewer"])])
+    stages = [
+        f"{stage:<10} {seconds:7.1f} s" for stage, seconds in result["seconds"].items()
+    ]
+    emit(
+        result,
+        [
+            *(stages if asked("verbose") else []),
+            str(result["report"]),
+            str(result["viewer"]),
+        ],
+    )
 
 
 @click.command()
 @click.argument("out", type=PATH)
-@click.option("--takes", type=click.IntRange(1, 8), default=8, help="Number of virtual takes.")
+@click.option(
+    "--takes", type=click.IntRange(1, 8), default=8, help="Number of virtual takes."
+)
 @click.option(
     "--cohort",
     type=click.IntRange(1, MAX_COHORT),
@@ -67,35 +93,85 @@ def demo(out: Path, **options: Any) -> None:
     "conditions",
     type=click.Choice(CONDITIONS[1:]),
     multiple=True,
-    help="Condition in which each subject of the cohort is captured too (may be given several times).",
+    help=(
+        "Condition in which each subject of the cohort is captured too (may be given "
+        "several times)."
+    ),
 )
 @click.option(
-    "--cameras", type=click.IntRange(1, MAX_CAMERAS), default=8, help="Number of cameras of the virtual dome."
+    "--cameras",
+    type=click.IntRange(1, MAX_CAMERAS),
+    default=8,
+    help="Number of cameras of the virtual dome.",
 )
-@click.option("--lights", type=click.IntRange(1, MAX_LIGHTS), default=48, help="Number of lights of the virtual dome.")
-@click.option("--width", type=click.IntRange(16, MAX_FRAME_SIDE_PX), default=160, help="Width of a frame in pixels.")
-@click.option("--height", type=click.IntRange(16, MAX_FRAME_SIDE_PX), default=200, help="Height of a frame in pixels.")
-@click.option("--head", type=PATH, help="File of a head model to use instead of the parametric face.")
-@click.option("--subsurface", is_flag=True, help="Simulate subsurface transport by the dipole.")
+@click.option(
+    "--lights",
+    type=click.IntRange(1, MAX_LIGHTS),
+    default=48,
+    help="Number of lights of the virtual dome.",
+)
+@click.option(
+    "--width",
+    type=click.IntRange(16, MAX_FRAME_SIDE_PX),
+    default=160,
+    help="Width of a frame in pixels.",
+)
+@click.option(
+    "--height",
+    type=click.IntRange(16, MAX_FRAME_SIDE_PX),
+    default=200,
+    help="Height of a frame in pixels.",
+)
+@click.option(
+    "--head",
+    type=PATH,
+    help="File of a head model to use instead of the parametric face.",
+)
+@click.option(
+    "--subsurface", is_flag=True, help="Simulate subsurface transport by the dipole."
+)
 @click.option("--seed", type=Seed(), default=2005, help="Noise seed.")
 @WORKERS
 @common
 def simulate(
-    out: Path, takes: int, cohort: int | None, conditions: tuple[str, ...], workers: int, **options: Any
+    out: Path,
+    takes: int,
+    cohort: int | None,
+    conditions: tuple[str, ...],
+    workers: int,
+    **options: Any,
 ) -> None:
     """Write virtual captures with their true values beside them.
 
-    Each take gets its own folder. With --cohort, the subjects have the groups and ages of table 1 of the paper.
-    Existing takes are kept: the same command continues an interrupted run, and a larger number adds subjects.
+    Each take gets its own folder. With --cohort, the subjects have the groups and ages
+    of table 1 of the paper. Existing takes are kept: the same command continues an
+    interrupted run, and a larger number adds subjects.
     """
     progress = bar()
     if conditions and cohort is None:
-        raise InputError(Fault("--condition", "belongs to a cohort", "no --cohort", "give the number of subjects"))
-    require_sizes(options["lights"], options["cameras"], options["width"], options["height"])
-    people = None if cohort is None else skindb.workflow.begin_cohort(out, cohort, conditions, options)
-    call = partial(skindb.workflow.simulate_one, out, people=people, progress=progress, **options)
+        raise InputError(
+            Fault(
+                "--condition",
+                "belongs to a cohort",
+                "no --cohort",
+                "give the number of subjects",
+            )
+        )
+    require_sizes(
+        options["lights"], options["cameras"], options["width"], options["height"]
+    )
+    people = (
+        None
+        if cohort is None
+        else skindb.workflow.begin_cohort(out, cohort, conditions, options)
+    )
+    call = partial(
+        skindb.workflow.simulate_one, out, people=people, progress=progress, **options
+    )
     numbers = range(takes if people is None else len(people))
-    done, faults = each_take(call, numbers, workers=workers, progress=progress, finish=_simulated)
+    done, faults = each_take(
+        call, numbers, workers=workers, progress=progress, finish=_simulated
+    )
     emit([done[name] for name in sorted(done)], [], faults)
 
 
@@ -134,7 +210,10 @@ def _simulated(made: tuple[int, Path]) -> tuple[str, Any, list[str]]:
     "--soft",
     type=click.Choice(["exclude", "keep"]),
     default="exclude",
-    help="Treatment of samples at soft shadow edges: excluded, or divided by the visible fraction of the light.",
+    help=(
+        "Treatment of samples at soft shadow edges: excluded, or divided by the "
+        "visible fraction of the light."
+    ),
 )
 @click.option(
     "--footprint",
@@ -145,13 +224,19 @@ def _simulated(made: tuple[int, Path]) -> tuple[str, Any, list[str]]:
     "--visibility",
     type=click.Choice(["rays", "splats"]),
     default="rays",
-    help="Method for the visibility of lights and cameras. splats is that of the paper, slower and less exact.",
+    help=(
+        "Method for the visibility of lights and cameras. splats is that of the paper, "
+        "slower and less exact."
+    ),
 )
 @click.option(
     "--calibration",
     type=click.Choice(["refuse", "note"]),
     default="refuse",
-    help="Treatment of captures whose photographs contradict their calibration: refused, or recorded as notes.",
+    help=(
+        "Treatment of captures whose photographs contradict their calibration: "
+        "refused, or recorded as notes."
+    ),
 )
 @click.option(
     "--refine",
@@ -161,9 +246,16 @@ def _simulated(made: tuple[int, Path]) -> tuple[str, Any, list[str]]:
 @click.option(
     "--new-consent",
     type=click.DateTime(["%Y-%m-%d"]),
-    help="Date on which a subject who was withdrawn consented again. Only one capture can be given with it.",
+    help=(
+        "Date on which a subject who was withdrawn consented again. Only one capture "
+        "can be given with it."
+    ),
 )
-@click.option("--explain", is_flag=True, help="Report what was cleaned (with -v also where) and what was skipped.")
+@click.option(
+    "--explain",
+    is_flag=True,
+    help="Report what was cleaned (with -v also where) and what was skipped.",
+)
 @WAIT
 @WORKERS
 @SCHEDULER
@@ -182,14 +274,17 @@ def ingest(
 ) -> None:
     """Ingest capture folders into the database DB.
 
-    The database is created if it is absent. A folder with faults is not committed, and does not stop the others. An
-    interrupted ingest leaves no incomplete version, and the same command resumes it. A capture of a subject who was
-    withdrawn is refused, unless --new-consent states a new consent.
+    The database is created if it is absent. A folder with faults is not committed, and
+    does not stop the others. An interrupted ingest leaves no incomplete version, and
+    the same command resumes it. A capture of a subject who was withdrawn is refused,
+    unless --new-consent states a new consent.
     """
     if new_consent is not None and len(captures) > 1:
         rule = "a new consent is stated for one capture"
         cure = "ingest one capture with it, and then the others"
-        raise InputError(Fault("--new-consent", rule, f"{len(captures)} captures", cure))
+        raise InputError(
+            Fault("--new-consent", rule, f"{len(captures)} captures", cure)
+        )
     low, high = (crop_box[:3], crop_box[3:]) if crop_box else (None, None)
     crop = skindb.ingest.Crop(low, high, crop_reach) if crop_box or crop_reach else None
     progress = bar()
@@ -197,33 +292,55 @@ def ingest(
     options["new_consent"] = None if new_consent is None else new_consent.date()
     database = skindb.open(db)
     call = partial(skindb.workflow.ingest_take, database, **options)
-    work: dict[str, Any] = {"workers": workers, "scheduler": scheduler, "shared": database.folder}
+    work: dict[str, Any] = {
+        "workers": workers,
+        "scheduler": scheduler,
+        "shared": database.folder,
+    }
     finish = partial(_ingested, database, explain=explain)
     folders = [shared_path(one, scheduler) for one in captures]
     with _logged(database, folders):
-        done, faults = each_take(call, folders, **work, progress=progress, finish=finish)
+        done, faults = each_take(
+            call, folders, **work, progress=progress, finish=finish
+        )
     if faults and len(captures) > 1:
         echo(f"{len(done)} of {len(captures)} captures were ingested", err=True)
     emit(done, [], faults)
 
 
-def _logged(database: Database, folders: Sequence[Path]) -> AbstractContextManager[None]:
-    """Context of an ingest of several captures as one action; that of one capture is logged when it was checked."""
+def _logged(
+    database: Database, folders: Sequence[Path]
+) -> AbstractContextManager[None]:
+    """Context of an ingest of several captures as one action; that of one capture is
+    logged when it was checked.
+    """
     if len(folders) == 1:
         return nullcontext()
     subjects = skindb.workflow.captured_subjects(folders)
-    return skindb.workflow.logged_action(database, "ingest", subjects=subjects, counts={"captures": len(folders)})
+    return skindb.workflow.logged_action(
+        database, "ingest", subjects=subjects, counts={"captures": len(folders)}
+    )
 
 
-def _ingested(database: Database, record: Record, *, explain: bool) -> tuple[str, Any, list[str]]:
+def _ingested(
+    database: Database, record: Record, *, explain: bool
+) -> tuple[str, Any, list[str]]:
     """Name, JSON record and printed lines of a capture that was committed."""
     if keys := record.provenance["unknown_keys"]:
-        echo(f"{record.take}: warning: unknown keys of capture.json, kept but not read: {', '.join(keys)}", err=True)
+        echo(
+            (
+                f"{record.take}: warning: unknown keys of capture.json, kept but not "
+                f"read: {', '.join(keys)}"
+            ),
+            err=True,
+        )
     summary = summary_of(record)
     made = summary.get("summary", {})
     lines = [f"{record.take}: capture {summary['generation']}, {summary['path']}"]
     if "surfels" in made:
-        lines.append(f"  {made['surfels']['count']:,} surfels, {made['surfels']['spacing_mm']:.2g} mm apart")
+        lines.append(
+            f"  {made['surfels']['count']:,} surfels, {made['surfels']['spacing_mm']:.2g} mm apart"
+        )
     if "samples" in made:
         lines += [f"  {line}" for line in skindb.ingest.sample_lines(made["samples"])]
     if asked("verbose"):
@@ -231,5 +348,8 @@ def _ingested(database: Database, record: Record, *, explain: bool) -> tuple[str
     lines += [f"  note: {line}" for line in made.get("notes", [])]
     lines += [f"  skipped: {line}" for line in summary.get("skipped", [])]
     if explain:
-        lines += [f"  {line}" for line in skindb.ingest.cleaning_lines(summary, places=asked("verbose"))]
+        lines += [
+            f"  {line}"
+            for line in skindb.ingest.cleaning_lines(summary, places=asked("verbose"))
+        ]
     return record.take, summary, lines

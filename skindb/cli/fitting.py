@@ -11,7 +11,17 @@ import click
 
 import skindb
 from skindb.cli.engine import SCHEDULER, shared_path
-from skindb.cli.options import DB, DICTIONARY, PATH, WAIT, WORKERS, Finite, Seed, asked, common
+from skindb.cli.options import (
+    DB,
+    DICTIONARY,
+    PATH,
+    WAIT,
+    WORKERS,
+    Finite,
+    Seed,
+    asked,
+    common,
+)
 from skindb.cli.shared import aligned, bar, each_take, emit, existing, summary_of
 from skindb.cli.terminal import echo
 from skindb.errors import Fault
@@ -19,16 +29,19 @@ from skindb.errors import Fault
 if TYPE_CHECKING:
     from skindb.store import Database, Record
 
-# median residual above which the model explains nothing: good captures have 2 to 6 %, exchanged exposures or poses
-# 50 to 80 %
+# median residual above which the model explains nothing: good captures have 2 to 6 %,
+# exchanged exposures or poses 50 to 80 %
 MAX_RESIDUAL = 0.2
-MIN_FITTED_FRACTION = 0.5  # below it the errors of the fitted surfels do not describe the face
+# below it the errors of the fitted surfels do not describe the face
+MIN_FITTED_FRACTION = 0.5
 
 
 @click.command()
 @DB
 @click.argument("takes", metavar="[TAKE...]", nargs=-1)
-@click.option("--k", type=click.IntRange(1), help="Number of basis BRDFs.  [default: 4]")
+@click.option(
+    "--k", type=click.IntRange(1), help="Number of basis BRDFs.  [default: 4]"
+)
 @click.option(
     "--profile",
     type=click.Choice(["transport", "dipole"]),
@@ -37,20 +50,35 @@ MIN_FITTED_FRACTION = 0.5  # below it the errors of the fitted surfels do not de
 @click.option(
     "--mode",
     type=click.Choice(["perceptual", "linear", "paper"]),
-    help="Space of the least squares: cube-root space, linear, or that of the paper.  [default: perceptual]",
+    help=(
+        "Space of the least squares: cube-root space, linear, or that of the paper.  "
+        "[default: perceptual]"
+    ),
 )
-@click.option("--rank", type=click.IntRange(1), help="Rank of the reduced dictionary (59 is exact).  [default: 16]")
-@click.option("--eta", type=Finite(1.0, 2.0), help="Refractive index of skin.  [default: 1.3]")
+@click.option(
+    "--rank",
+    type=click.IntRange(1),
+    help="Rank of the reduced dictionary (59 is exact).  [default: 16]",
+)
+@click.option(
+    "--eta", type=Finite(1.0, 2.0), help="Refractive index of skin.  [default: 1.3]"
+)
 @click.option(
     "--even-reflection",
     type=Finite(0, 0.5),
-    help="Fraction of light that the surface may reflect diffusely; it widens the error of R_d.  [default: 0.055]",
+    help=(
+        "Fraction of light that the surface may reflect diffusely; it widens the error "
+        "of R_d.  [default: 0.055]"
+    ),
 )
 @click.option(
     "--light-gains",
     is_flag=True,
     default=None,
-    help="Estimate one gain per light and divide its samples by it, for lights of doubtful intensity.",
+    help=(
+        "Estimate one gain per light and divide its samples by it, for lights of "
+        "doubtful intensity."
+    ),
 )
 @click.option(
     "--inter-reflection",
@@ -58,14 +86,29 @@ MIN_FITTED_FRACTION = 0.5  # below it the errors of the fitted surfels do not de
     default=None,
     help="Subtract inter-reflection between parts of the face (one diffuse bounce).",
 )
-@click.option("--hold-out-lights", type=Finite(0, 0.9), help="Fraction of lights held out.  [default: 0]")
-@click.option("--hold-out-cameras", type=Finite(0, 0.9), help="Fraction of cameras held out.  [default: 0]")
-@click.option("--seed", type=Seed(), help="Random seed for the hold-out and for sampling.  [default: 0]")
+@click.option(
+    "--hold-out-lights",
+    type=Finite(0, 0.9),
+    help="Fraction of lights held out.  [default: 0]",
+)
+@click.option(
+    "--hold-out-cameras",
+    type=Finite(0, 0.9),
+    help="Fraction of cameras held out.  [default: 0]",
+)
+@click.option(
+    "--seed",
+    type=Seed(),
+    help="Random seed for the hold-out and for sampling.  [default: 0]",
+)
 @DICTIONARY
 @click.option(
     "--refit",
     is_flag=True,
-    help="Fit again the takes whose model would change, each with its own parameters except those given here.",
+    help=(
+        "Fit again the takes whose model would change, each with its own parameters "
+        "except those given here."
+    ),
 )
 @click.option("--explain", is_flag=True, help="Only report what the fits would skip.")
 @WAIT
@@ -85,27 +128,45 @@ def fit(
 ) -> None:
     """Fit the named takes, or all without a current model.
 
-    A model is current if it was made from the newest capture of its take. A take that fails does not stop the others.
-    The same command resumes an interrupted run.
+    A model is current if it was made from the newest capture of its take. A take that
+    fails does not stop the others. The same command resumes an interrupted run.
     """
     database = existing(db)
     progress = bar()
     workflow = skindb.workflow
     given = {name: value for name, value in options.items() if value is not None}
     dictionary = shared_path(dictionary, scheduler)
-    workflow.dictionary_at(dictionary)  # its faults are reported once, before the fits start
-    wanted = takes or workflow.takes_to_fit(database, refit=refit, given=given, dictionary=dictionary)
+    # its faults are reported once, before the fits start
+    workflow.dictionary_at(dictionary)
+    wanted = takes or workflow.takes_to_fit(
+        database, refit=refit, given=given, dictionary=dictionary
+    )
     for take in [] if takes else workflow.takes_without_consent(database, "fit"):
         echo(f"skipped: {take}: its consent does not cover fits", err=True)
-    how = partial(workflow.fit_with, given=given, refit=refit, dictionary=dictionary, explain=explain, wait=wait)
+    how = partial(
+        workflow.fit_with,
+        given=given,
+        refit=refit,
+        dictionary=dictionary,
+        explain=explain,
+        wait=wait,
+    )
     call = partial(how, database, progress=progress)
-    work: dict[str, Any] = {"workers": workers, "scheduler": scheduler, "shared": database.folder}
+    work: dict[str, Any] = {
+        "workers": workers,
+        "scheduler": scheduler,
+        "shared": database.folder,
+    }
     finish = partial(_finished, database)
     done: dict[str, Any] = {}
     faults: list[Fault] = []
     if wanted:
-        with workflow.logged_action(database, "fit", wanted, arguments={"refit": refit, "explain": explain}):
-            done, faults = each_take(call, wanted, **work, progress=progress, finish=finish)
+        with workflow.logged_action(
+            database, "fit", wanted, arguments={"refit": refit, "explain": explain}
+        ):
+            done, faults = each_take(
+                call, wanted, **work, progress=progress, finish=finish
+            )
     else:
         echo(_nothing_to_fit(database, refit=refit), err=True)
     emit(done, [], faults)
@@ -116,12 +177,18 @@ def _nothing_to_fit(database: Database, *, refit: bool) -> str:
         return "no captures: ingest some first"
     if refit:
         return (
-            "every take has a model with these parameters from this version of the code; name takes to fit them anyway"
+            "every take has a model with these parameters from this version of the "
+            "code; name takes to fit them anyway"
         )
-    return "every take has a model of its newest capture; --refit fits again those whose model would change"
+    return (
+        "every take has a model of its newest capture; --refit fits again those whose "
+        "model would change"
+    )
 
 
-def _finished(database: Database, result: Record | tuple[str, list[str]]) -> tuple[str, Any, list[str]]:
+def _finished(
+    database: Database, result: Record | tuple[str, list[str]]
+) -> tuple[str, Any, list[str]]:
     """Name, JSON record and printed lines of a fit or of the plan of a fit."""
     if isinstance(result, tuple):
         take, plan = result
@@ -133,22 +200,36 @@ def _finished(database: Database, result: Record | tuple[str, list[str]]) -> tup
 
 def _fit_lines(take: str, report: dict[str, Any]) -> list[str]:
     total = sum(report["seconds"].values())
-    status = ", ".join(f"{fraction:.1%} {name}" for name, fraction in report["status"].items())
-    lines = [f"{take}: model {report['generation']}, {report['surfels']} surfels in {total:.1f} s: {status}"]
+    status = ", ".join(
+        f"{fraction:.1%} {name}" for name, fraction in report["status"].items()
+    )
+    lines = [
+        (
+            f"{take}: model {report['generation']}, {report['surfels']} surfels in "
+            f"{total:.1f} s: {status}"
+        )
+    ]
     if report["status"].get("fitted", 0) < MIN_FITTED_FRACTION:
         lines.append(
-            "  few surfels are fitted, and the errors below refer only to them; draw fit_status with skindb show"
+            "  few surfels are fitted, and the errors below refer only to them; "
+            "draw fit_status with skindb show"
         )
     names = ("fit_residual", "held_out_error", "held_out_camera_error")
     shown = {name: report[name] for name in names if name in report}
-    lines += [f"  {n.replace('_', ' ')}: median {v['median']:.1%}, 95 % {v['p95']:.1%}" for n, v in shown.items()]
+    lines += [
+        f"  {n.replace('_', ' ')}: median {v['median']:.1%}, 95 % {v['p95']:.1%}"
+        for n, v in shown.items()
+    ]
     if report.get("fit_residual", {}).get("median", 0) > MAX_RESIDUAL:
         lines.append(
-            "  the model does not explain the photographs: check the camera poses, exposure seconds, response and "
+            "  the model does not explain the photographs: check the camera poses, "
+            "exposure seconds, response and "
             "positions of the lights before anything else"
         )
     lines += [f"  dictionary, {line}" for line in report.get("dictionary_notes", [])]
-    lines += [_site_line(site, one) for site, one in report.get("translucency", {}).items()]
+    lines += [
+        _site_line(site, one) for site, one in report.get("translucency", {}).items()
+    ]
     lines += [_suspect_line(one) for one in report["suspects"]]
     if gains := report.get("light_gains"):
         lines.append(
@@ -157,42 +238,74 @@ def _fit_lines(take: str, report: dict[str, Any]) -> list[str]:
         )
     lines += [f"  skipped: {line}" for line in report["skipped"]]
     if asked("verbose"):
-        lines += [f"  {line}" for line in aligned(skindb.fit.tabulate_prediction(report["prediction"]))]
-        lines += [f"  {stage}: {seconds:.1f} s" for stage, seconds in report["seconds"].items()]
+        lines += [
+            f"  {line}"
+            for line in aligned(skindb.fit.tabulate_prediction(report["prediction"]))
+        ]
+        lines += [
+            f"  {stage}: {seconds:.1f} s"
+            for stage, seconds in report["seconds"].items()
+        ]
     return lines
 
 
 def _site_line(site: str, one: dict[str, Any]) -> str:
     """sigma_tr of one site with its total error, by channel, and the status of the fit."""
     values = zip("RGB", one["sigma_tr"], one["total_error"], strict=True)
-    shown = ", ".join(f"{c} {v:.3g} +- {e:.1g}" if v is not None else f"{c} unknown" for c, v, e in values)
+    shown = ", ".join(
+        f"{c} {v:.3g} +- {e:.1g}" if v is not None else f"{c} unknown"
+        for c, v, e in values
+    )
     statuses = ", ".join(dict.fromkeys(one["status"]))
     return f"  sigma_tr of {site}: {shown} mm-1 ({statuses})"
 
 
 def _suspect_line(one: dict[str, Any]) -> str:
-    what, why = ("light", "did the face move?") if "light" in one else ("camera", "was it moved?")
+    what, why = (
+        ("light", "did the face move?")
+        if "light" in one
+        else ("camera", "was it moved?")
+    )
     fraction = one["outlier_fraction"]
     misfit = one["misfit"]
     return (
-        f"  {what} {one[what]}: {fraction:.0%} of its samples are outliers, residuals {misfit:.1f} times noise ({why})"
+        f"  {what} {one[what]}: {fraction:.0%} of its samples are outliers, residuals "
+        f"{misfit:.1f} times noise ({why})"
     )
 
 
 @click.command("dictionary")
 @click.argument("path", type=PATH, required=False)
-@click.option("--disc", type=Finite(0, 20), default=0.8, help="Angular radius of the lights in degrees.")
+@click.option(
+    "--disc",
+    type=Finite(0, 20),
+    default=0.8,
+    help="Angular radius of the lights in degrees.",
+)
 @common
 def dictionary_command(path: Path | None, disc: float) -> None:
     """Report on the BRDFs in PATH or of the embedded dictionary.
 
     The report has the energy, reciprocity, errors and missing values of each BRDF.
     """
-    dictionary = skindb.fit.read_dictionary(path) if path else skindb.fit.embedded_dictionary()
-    report = skindb.fit.dictionary_report(dictionary, disc_angular_radius=math.radians(disc))
+    dictionary = (
+        skindb.fit.read_dictionary(path) if path else skindb.fit.embedded_dictionary()
+    )
+    report = skindb.fit.dictionary_report(
+        dictionary, disc_angular_radius=math.radians(disc)
+    )
     columns = {str(name): v for name, v in report.items() if v.dims == ("dictionary",)}
-    rows = [[name, *(float(v[i]) for v in columns.values())] for i, name in enumerate(dictionary.names)]
-    worst = [f"{name}: median {float(v.median()):.3g}, largest {float(v.max()):.3g}" for name, v in columns.items()]
+    rows = [
+        [name, *(float(v[i]) for v in columns.values())]
+        for i, name in enumerate(dictionary.names)
+    ]
+    worst = [
+        f"{name}: median {float(v.median()):.3g}, largest {float(v.max()):.3g}"
+        for name, v in columns.items()
+    ]
     header = ["dictionary", *columns]
     about = report.attrs | {"disc_angular_radius": float(report["disc_angular_radius"])}
-    emit(about | {"header": header, "rows": rows}, [*aligned([header, *rows]), *worst, *report.attrs["notes"]])
+    emit(
+        about | {"header": header, "rows": rows},
+        [*aligned([header, *rows]), *worst, *report.attrs["notes"]],
+    )

@@ -19,7 +19,10 @@ TAKE = click.argument("take")
 DICTIONARY = click.option(
     "--dictionary",
     type=PATH,
-    help="Dictionary to use instead of the embedded one: a folder of MERL files, or an .npz file of tables.",
+    help=(
+        "Dictionary to use instead of the embedded one: a folder of MERL files, or an "
+        ".npz file of tables."
+    ),
 )
 WORKERS = click.option(
     "--workers",
@@ -29,7 +32,9 @@ WORKERS = click.option(
     help="Number of takes processed at a time, each in its own process.",
 )
 GENERATION = click.option(
-    "--generation", type=click.IntRange(1), help="Number of an earlier version.  [default: the newest]"
+    "--generation",
+    type=click.IntRange(1),
+    help="Number of an earlier version.  [default: the newest]",
 )
 
 
@@ -40,9 +45,13 @@ class Finite(click.FloatRange):
 
     def _describe_range(self) -> str:
         """Text of the range in the help; empty without bounds."""
-        return "" if self.min is None and self.max is None else super()._describe_range()
+        return (
+            "" if self.min is None and self.max is None else super()._describe_range()
+        )
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> Any:
         """Convert to a finite number."""
         number = super().convert(value, param, ctx)
         if not math.isfinite(number):
@@ -74,7 +83,9 @@ def _remember(ctx: click.Context, option: click.Parameter, value: bool) -> None:
     ctx.meta.setdefault("since", time.monotonic())
 
 
-def _remember_text(ctx: click.Context, option: click.Parameter, value: str | None) -> None:
+def _remember_text(
+    ctx: click.Context, option: click.Parameter, value: str | None
+) -> None:
     ctx.meta[str(option.name)] = value
 
 
@@ -97,7 +108,10 @@ ACTOR = click.option(
     metavar="NAME",
     expose_value=False,
     callback=_act_as,
-    help="Name under which the action is logged.  [default: SKINDB_ACTOR, or the user of the operating system]",
+    help=(
+        "Name under which the action is logged.  [default: SKINDB_ACTOR, or the user "
+        "of the operating system]"
+    ),
 )
 
 
@@ -108,7 +122,9 @@ def common(command: Callable[..., Any]) -> Callable[..., Any]:
         (("--no-progress",), "Show no progress, as --progress none."),
         (("-v", "--verbose"), "Print more details and the run time."),
     ):
-        command = click.option(*names, is_flag=True, expose_value=False, callback=_remember, help=text)(command)
+        command = click.option(
+            *names, is_flag=True, expose_value=False, callback=_remember, help=text
+        )(command)
     return ACTOR(PROGRESS(command))
 
 
@@ -121,5 +137,7 @@ def progress_style() -> str:
     """How the running command shows its progress: bar, json or none."""
     style = click.get_current_context().meta["progress"]
     if asked("no_progress") and style not in (None, "none"):
-        raise click.UsageError(f"--no-progress and --progress {style} contradict each other; give only one of them")
+        raise click.UsageError(
+            f"--no-progress and --progress {style} contradict each other; give only one of them"
+        )
     return "none" if asked("no_progress") else style or "bar"

@@ -11,7 +11,17 @@ import click
 
 import skindb
 from skindb.cli.engine import SCHEDULER, shared_path
-from skindb.cli.options import DB, GENERATION, PATH, TAKE, WORKERS, Finite, Seed, asked, common
+from skindb.cli.options import (
+    DB,
+    GENERATION,
+    PATH,
+    TAKE,
+    WORKERS,
+    Finite,
+    Seed,
+    asked,
+    common,
+)
 from skindb.cli.shared import aligned, bar, each_take, emit, existing, writable
 from skindb.errors import Fault, InputError
 
@@ -25,7 +35,9 @@ def exposure_option(_: click.Context, __: click.Parameter, value: str) -> float 
     except ValueError:
         factor = 0.0
     if not 1e-9 <= factor <= 1e9:
-        raise click.BadParameter(f"must be fixed, auto, or a number from 1e-9 to 1e9; found {value!r}")
+        raise click.BadParameter(
+            f"must be fixed, auto, or a number from 1e-9 to 1e9; found {value!r}"
+        )
     return factor
 
 
@@ -39,35 +51,75 @@ TAKES = click.argument("takes", metavar="[TAKE...]", nargs=-1)
     "--out",
     type=PATH,
     required=True,
-    help="Picture of one take (.exr linear, .png tone-mapped), or folder for <take>.png of every take.",
+    help=(
+        "Picture of one take (.exr linear, .png tone-mapped), or folder for <take>.png "
+        "of every take."
+    ),
 )
 @click.option(
     "--light",
     "lights",
     multiple=True,
-    help="Name of a light of the dome; several are added.  [default: all, or none with an environment]",
+    help=(
+        "Name of a light of the dome; several are added.  [default: all, or none with "
+        "an environment]"
+    ),
 )
-@click.option("--environment", type=PATH, help="Latitude-longitude image of light from all directions (.exr).")
-@click.option("--camera", help="Name of a camera of the dome.  [default: the most frontal one]")
-@click.option("--spp", "samples", type=click.IntRange(8, 4096), default=32, help="Number of rays per pixel.")
-@click.option("--error", type=Finite(1e-4, 1), help="Relative standard error of the picture at which sampling stops.")
+@click.option(
+    "--environment",
+    type=PATH,
+    help="Latitude-longitude image of light from all directions (.exr).",
+)
+@click.option(
+    "--camera", help="Name of a camera of the dome.  [default: the most frontal one]"
+)
+@click.option(
+    "--spp",
+    "samples",
+    type=click.IntRange(8, 4096),
+    default=32,
+    help="Number of rays per pixel.",
+)
+@click.option(
+    "--error",
+    type=Finite(1e-4, 1),
+    help="Relative standard error of the picture at which sampling stops.",
+)
 @click.option("--seed", type=Seed(), default=0, help="Random seed.")
-@click.option("--scale", type=Finite(0.1, 20), default=1.0, help="Size of the picture relative to that of the camera.")
+@click.option(
+    "--scale",
+    type=Finite(0.1, 20),
+    default=1.0,
+    help="Size of the picture relative to that of the camera.",
+)
 @click.option(
     "--exposure",
     default="fixed",
     callback=exposure_option,
-    help="Exposure of a PNG: fixed (a white matt surface appears white), auto (for each picture), or a factor.",
+    help=(
+        "Exposure of a PNG: fixed (a white matt surface appears white), auto (for each "
+        "picture), or a factor."
+    ),
 )
-@click.option("--subsurface", is_flag=True, help="Simulate subsurface transport by the dipole.")
+@click.option(
+    "--subsurface", is_flag=True, help="Simulate subsurface transport by the dipole."
+)
 @click.option("--edited", is_flag=True, help="Render the edited models.")
 @GENERATION
-@click.option("--explain", is_flag=True, help="Only report what the pictures would skip.")
+@click.option(
+    "--explain", is_flag=True, help="Only report what the pictures would skip."
+)
 @WORKERS
 @SCHEDULER
 @common
 def render(
-    db: str, takes: tuple[str, ...], out: Path, edited: bool, workers: int, scheduler: str | None, **options: Any
+    db: str,
+    takes: tuple[str, ...],
+    out: Path,
+    edited: bool,
+    workers: int,
+    scheduler: str | None,
+    **options: Any,
 ) -> None:
     """Render models with lights of their dome or an environment.
 
@@ -78,21 +130,36 @@ def render(
     if out.suffix:
         writable(out, ".exr", ".png")
         _require_one(out, wanted)
-    call = partial(skindb.workflow.render_take, database, shared_path(out, scheduler), edited=edited, **options)
+    call = partial(
+        skindb.workflow.render_take,
+        database,
+        shared_path(out, scheduler),
+        edited=edited,
+        **options,
+    )
     finish = partial(_rendered, explain=options["explain"], error=options["error"])
     work: dict[str, Any] = {"workers": workers, "scheduler": scheduler}
-    with skindb.workflow.logged_action(database, "render", wanted, arguments={"edited": edited, **options}):
+    with skindb.workflow.logged_action(
+        database, "render", wanted, arguments={"edited": edited, **options}
+    ):
         done, faults = each_take(call, wanted, **work, progress=bar(), finish=finish)
     emit(done, [], faults)
 
 
-def _rendered(about: dict[str, Any], *, explain: bool, error: float | None) -> tuple[str, Any, list[str]]:
+def _rendered(
+    about: dict[str, Any], *, explain: bool, error: float | None
+) -> tuple[str, Any, list[str]]:
     skipped = about["skipped"] or [skindb.render.NOTHING]
     if explain:
         return about["take"], about, [*skipped, *about["kept"]]
     found = about["relative_error"]
-    path = f"{about['path']}: {about['samples']} rays per pixel, relative standard error {found:.2%}"
-    missed = f", above the wanted {error:.2%}" if error is not None and found > error else ""
+    path = (
+        f"{about['path']}: {about['samples']} rays per pixel, relative standard error "
+        f"{found:.2%}"
+    )
+    missed = (
+        f", above the wanted {error:.2%}" if error is not None and found > error else ""
+    )
     plan = [f"plan: {line}" for line in skipped]
     return about["take"], about, [*(plan if asked("verbose") else []), path + missed]
 
@@ -101,21 +168,35 @@ def _rendered(about: dict[str, Any], *, explain: bool, error: float | None) -> t
 @DB
 @TAKE
 @click.option(
-    "--out", type=PATH, help="Folder for pictures: photograph, rendering, diffuse and surface components, difference."
+    "--out",
+    type=PATH,
+    help="Folder for pictures: photograph, rendering, diffuse and surface components, difference.",
 )
-@click.option("--samples", type=click.IntRange(1, 8), default=2, help="Number of rays per pixel and axis.")
-@click.option("--subsurface", is_flag=True, help="Simulate subsurface transport by the dipole.")
+@click.option(
+    "--samples",
+    type=click.IntRange(1, 8),
+    default=2,
+    help="Number of rays per pixel and axis.",
+)
+@click.option(
+    "--subsurface", is_flag=True, help="Simulate subsurface transport by the dipole."
+)
 @GENERATION
 @common
-def compare(db: str, take: str, out: Path | None, generation: int | None, **options: Any) -> None:
+def compare(
+    db: str, take: str, out: Path | None, generation: int | None, **options: Any
+) -> None:
     """Compare the kept photographs with renderings of the model.
 
     The measures are RMSE, PSNR, SSIM and CIEDE2000 for each photograph that ingest kept.
 
-    Likely causes of large residuals are named below the table: a wrong light intensity, a shift, light in shadows,
-    a different gloss, hair. With --json, the figures of each region are printed too.
+    Likely causes of large residuals are named below the table: a wrong light intensity,
+    a shift, light in shadows, a different gloss, hair. With --json, the figures of each
+    region are printed too.
     """
-    found = skindb.workflow.compare_take(existing(db), take, generation=generation, **options)
+    found = skindb.workflow.compare_take(
+        existing(db), take, generation=generation, **options
+    )
     if out:
         skindb.render.write_comparisons(found, out)
     result = [
@@ -130,9 +211,21 @@ def compare(db: str, take: str, out: Path | None, generation: int | None, **opti
         }
         for c in found
     ]
-    header = ["light", "camera", "held_out", "relative_rmse", "psnr", "ssim", "delta_e_median"]
+    header = [
+        "light",
+        "camera",
+        "held_out",
+        "relative_rmse",
+        "psnr",
+        "ssim",
+        "delta_e_median",
+    ]
     lines = aligned([header, *([row[name] for name in header] for row in result)])
-    lines += [f"{c.light} {c.camera}: {'; '.join(c.causes.notable)}" for c in found if c.causes.notable]
+    lines += [
+        f"{c.light} {c.camera}: {'; '.join(c.causes.notable)}"
+        for c in found
+        if c.causes.notable
+    ]
     emit(result, lines)
 
 
@@ -154,7 +247,9 @@ def show(db: str, take: str, variable: str, out: Path, at: tuple[str, ...]) -> N
     A variable is, for example, sample_count or fit_status. OUT is a picture (.png, .pdf, .svg).
     """
     writable(out, ".png", ".pdf", ".svg")
-    about = skindb.workflow.show_take(existing(db), take, variable, out, at=dict(map(_label, at)))
+    about = skindb.workflow.show_take(
+        existing(db), take, variable, out, at=dict(map(_label, at))
+    )
     emit(about, [about["path"]])
 
 
@@ -170,9 +265,16 @@ def show(db: str, take: str, variable: str, out: Path, at: tuple[str, ...]) -> N
 @click.option(
     "--size",
     type=click.IntRange(16, 8192),
-    help="Number of texels along each side of a map.  [default: 1.5 per surfel spacing, rounded up to a power of two]",
+    help=(
+        "Number of texels along each side of a map.  [default: 1.5 per surfel spacing, "
+        "rounded up to a power of two]"
+    ),
 )
-@click.option("--gltf", is_flag=True, help="Write only glTF; for one take, --out may then be a .glb file.")
+@click.option(
+    "--gltf",
+    is_flag=True,
+    help="Write only glTF; for one take, --out may then be a .glb file.",
+)
 @click.option("--no-merl", is_flag=True, help="Skip the MERL binaries (35 MB each).")
 @click.option("--edited", is_flag=True, help="Export the edited models.")
 @GENERATION
@@ -191,8 +293,9 @@ def export(
 ) -> None:
     """Export models, by default all, for other programs.
 
-    The bundle of a take holds maps (EXR), basis BRDFs (MERL binary and npz), glTF, USD with OpenPBR, a program for
-    Mitsuba 3, manifest.json and a README.txt that describes each file and its measured error.
+    The bundle of a take holds maps (EXR), basis BRDFs (MERL binary and npz), glTF, USD
+    with OpenPBR, a program for Mitsuba 3, manifest.json and a README.txt that describes
+    each file and its measured error.
     """
     database = existing(db)
     progress = bar()
@@ -203,12 +306,18 @@ def export(
     elif out.suffix in (".glb", ".gltf"):
         rule = "without --gltf it must be a folder, which gets a bundle for each take"
         cure = "add --gltf, or rename it"
-        raise InputError(Fault(str(out), rule, f"a name that ends in {out.suffix}", cure))
+        raise InputError(
+            Fault(str(out), rule, f"a name that ends in {out.suffix}", cure)
+        )
     options |= {"merl": not no_merl, "edited": edited, "progress": progress}
-    call = partial(skindb.workflow.export_take, database, shared_path(out, scheduler), **options)
+    call = partial(
+        skindb.workflow.export_take, database, shared_path(out, scheduler), **options
+    )
     work: dict[str, Any] = {"workers": workers, "scheduler": scheduler}
     with skindb.workflow.logged_action(database, "export", wanted, arguments=options):
-        done, faults = each_take(call, wanted, **work, progress=progress, finish=_exported)
+        done, faults = each_take(
+            call, wanted, **work, progress=progress, finish=_exported
+        )
     emit(done, [], faults)
 
 
@@ -229,12 +338,19 @@ def _wanted(db: str, takes: tuple[str, ...], *, edited: bool) -> list[str]:
 def _require_one(out: Path, takes: list[str]) -> None:
     if len(takes) > 1:
         raise InputError(
-            Fault(str(out), "a file must hold one take", f"{len(takes)} takes", "name a folder, or one take")
+            Fault(
+                str(out),
+                "a file must hold one take",
+                f"{len(takes)} takes",
+                "name a folder, or one take",
+            )
         )
 
 
 def _label(text: str) -> tuple[str, str]:
     name, _, label = text.partition("=")
     if not label:
-        raise click.UsageError(f"--at needs DIMENSION=LABEL, such as channel=G; found {text!r}")
+        raise click.UsageError(
+            f"--at needs DIMENSION=LABEL, such as channel=G; found {text!r}"
+        )
     return name, label

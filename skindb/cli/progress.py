@@ -18,9 +18,10 @@ MIN_INTERVAL_S = {"bar": 0.2, "json": 1.0}  # between two reports of the same st
 class Progress:
     """Report the stages and takes of a command in the chosen style.
 
-    The style "bar" shows rate and remaining time if standard error is a terminal; otherwise, with `plain`, it prints
-    one line for each stage. The style "json" prints one object per line (docs/howto/cluster.md lists the keys), and
-    "none" prints nothing. A copy that is sent to another process is silent.
+    The style "bar" shows rate and remaining time if standard error is a terminal;
+    otherwise, with `plain`, it prints one line for each stage. The style "json" prints
+    one object per line (docs/howto/cluster.md lists the keys), and "none" prints
+    nothing. A copy that is sent to another process is silent.
     """
 
     def __init__(self, style: str, *, plain: bool = False) -> None:
@@ -37,7 +38,9 @@ class Progress:
         self.takes_done = 0
         self.takes_total = 0
 
-    def __reduce__(self) -> tuple[Callable[[], Callable[[str, int, int], None]], tuple[()]]:
+    def __reduce__(
+        self,
+    ) -> tuple[Callable[[], Callable[[str, int, int], None]], tuple[()]]:
         return _silent_progress, ()
 
     def __call__(self, stage: str, done: int, total: int) -> None:
@@ -61,20 +64,26 @@ class Progress:
             self._bar(stage, done, total)
 
     def begin_takes(self, count: int, *, first: str = "") -> None:
-        """Start to count finished takes; `first` is the take that is processed now, if it is known."""
+        """Start to count finished takes; `first` is the take that is processed now, if
+        it is known.
+        """
         self.begin = time.monotonic()
         self.takes_done = 0
         self.takes_total = count
         self.take = first
 
     def end_take(self, take: str, *, failed: bool, following: str = "") -> None:
-        """Report that a take is finished; `following` is the take that is processed next, if it is known."""
+        """Report that a take is finished; `following` is the take that is processed
+        next, if it is known.
+        """
         self.take = take
         self.takes_done = self.takes_done + 1
         if self.style == "json":
             self._line("failed" if failed else "finished", 1, 1)
         elif self.bars and self.takes_total > 1:
-            rate, left = _pace(self.takes_done, self.takes_total, time.monotonic() - self.begin)
+            rate, left = _pace(
+                self.takes_done, self.takes_total, time.monotonic() - self.begin
+            )
             pace = f"{rate:.3g} takes per minute, {left:.0f} s left"
             echo(f"take {self.takes_done} of {self.takes_total}: {pace}", err=True)
         self.take = following
@@ -88,13 +97,24 @@ class Progress:
             echo(f"dashboard: {link}", err=True)
 
     def _bar(self, stage: str, done: int, total: int) -> None:
-        _, left = _pace(done - self.first, total - self.first, time.monotonic() - self.since)
+        _, left = _pace(
+            done - self.first, total - self.first, time.monotonic() - self.since
+        )
         bar = "#" * round(24 * done / max(total, 1))
-        prefix = f"take {self.takes_done + 1} of {self.takes_total}: " if self.takes_total > 1 else ""
-        redraw(f"{prefix + stage:<44.44} [{bar:<24}] {done}/{total} {left or 0:4.0f} s left", last=done >= total)
+        prefix = (
+            f"take {self.takes_done + 1} of {self.takes_total}: "
+            if self.takes_total > 1
+            else ""
+        )
+        redraw(
+            f"{prefix + stage:<44.44} [{bar:<24}] {done}/{total} {left or 0:4.0f} s left",
+            last=done >= total,
+        )
 
     def _line(self, stage: str, done: int, total: int) -> None:
-        """Print a line of JSON; rate and remaining time refer to the takes if there are several, else to the stage."""
+        """Print a line of JSON; rate and remaining time refer to the takes if there are
+        several, else to the stage.
+        """
         now = time.monotonic()
         several = self.takes_total > 1
         rate, left = (
@@ -102,9 +122,21 @@ class Progress:
             if several
             else _pace(done - self.first, total - self.first, now - self.since)
         )
-        said: dict[str, Any] = {"take": self.take or None, "stage": stage, "done": done, "total": total}
-        said |= {"takes_done": self.takes_done, "takes_total": self.takes_total, "seconds": round(now - self.begin, 2)}
-        said |= {"rate_per_minute": rate and round(rate, 3), "seconds_left": None if left is None else round(left, 1)}
+        said: dict[str, Any] = {
+            "take": self.take or None,
+            "stage": stage,
+            "done": done,
+            "total": total,
+        }
+        said |= {
+            "takes_done": self.takes_done,
+            "takes_total": self.takes_total,
+            "seconds": round(now - self.begin, 2),
+        }
+        said |= {
+            "rate_per_minute": rate and round(rate, 3),
+            "seconds_left": None if left is None else round(left, 1),
+        }
         echo(json.dumps(said), err=True)
 
 
@@ -120,5 +152,7 @@ def _silent_progress() -> Callable[[str, int, int], None]:
 
 
 def bar(*, plain: bool = False) -> Progress:
-    """Progress in the style of the running command; `plain` for long commands whose output goes to a file."""
+    """Progress in the style of the running command; `plain` for long commands whose
+    output goes to a file.
+    """
     return Progress(progress_style(), plain=plain)

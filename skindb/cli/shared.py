@@ -1,4 +1,6 @@
-"""Functions that several commands use: printing results, processing takes, checking databases and files."""
+"""Functions that several commands use: printing results, processing takes, checking
+databases and files.
+"""
 
 from __future__ import annotations
 
@@ -41,7 +43,9 @@ class UnfinishedError(InputError):
 
 
 def emit(result: Any, lines: list[str], faults: Sequence[Fault] = ()) -> None:
-    """Print a result, and raise faults if there are any; with --json, result and faults are printed as one object."""
+    """Print a result, and raise faults if there are any; with --json, result and faults
+    are printed as one object.
+    """
     if faults and asked("json"):
         raise UnfinishedError(faults, result)
     if asked("json"):
@@ -49,15 +53,22 @@ def emit(result: Any, lines: list[str], faults: Sequence[Fault] = ()) -> None:
     elif lines:
         echo(*lines)
     if asked("verbose"):
-        echo(f"{time.monotonic() - click.get_current_context().meta['since']:.1f} s", err=True)
+        echo(
+            f"{time.monotonic() - click.get_current_context().meta['since']:.1f} s",
+            err=True,
+        )
     if faults:
         raise InputError(faults)
 
 
 def serve(server: PageServer, **about: Any) -> None:
-    """Print the address of a page, with --json beside the values `about` it, and serve it until Ctrl-C."""
+    """Print the address of a page, with --json beside the values `about` it, and serve
+    it until Ctrl-C.
+    """
     with server, suppress(KeyboardInterrupt):
-        emit({"address": server.address} | about, [f"{server.address}  (Ctrl-C ends it)"])
+        emit(
+            {"address": server.address} | about, [f"{server.address}  (Ctrl-C ends it)"]
+        )
         server.serve_forever()
 
 
@@ -70,9 +81,16 @@ def echo_json(value: Any) -> None:
 
 def aligned(rows: list[list[Any]]) -> list[str]:
     """Format rows as aligned columns, with numbers to three significant digits."""
-    text = [[f"{c:.3g}" if isinstance(c, float) else str(c) for c in row] for row in rows]
+    text = [
+        [f"{c:.3g}" if isinstance(c, float) else str(c) for c in row] for row in rows
+    ]
     widths = [max(len(row[i]) for row in text) for i in range(len(text[0]))]
-    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in text]
+    return [
+        "  ".join(
+            cell.ljust(width) for cell, width in zip(row, widths, strict=True)
+        ).rstrip()
+        for row in text
+    ]
 
 
 def each_take(
@@ -85,7 +103,8 @@ def each_take(
     progress: Progress,
     finish: Callable[[R], tuple[str, Any, list[str]]],
 ) -> tuple[dict[str, Any], list[Fault]]:
-    """Call a function for every take and print each result when it is available; a fault does not stop other takes.
+    """Call a function for every take and print each result when it is available; a
+    fault does not stop other takes.
 
     Parameters
     ----------
@@ -96,18 +115,23 @@ def each_take(
     progress
         Progress to which `function` reports its stages.
     finish
-        Called in this process with each result; returns its name, what --json prints of it, and lines to print.
+        Called in this process with each result; returns its name, what --json prints of
+        it, and lines to print.
     """
     done: dict[str, Any] = {}
     faults: list[Fault] = []
-    in_turn = scheduler is None and (workers == 1 or len(takes) == 1)  # so that the running take is known
+    # so that the running take is known
+    in_turn = scheduler is None and (workers == 1 or len(takes) == 1)
     following = iter([*map(str, takes[1:]), ""]) if in_turn else repeat("")
     progress.begin_takes(len(takes), first=str(takes[0]) if takes and in_turn else "")
     try:
         for outcome in _outcomes(function, takes, workers, scheduler, shared, progress):
             name = str(outcome.take)
             if outcome.attempts > 1:
-                echo(f"{name}: a worker process was killed; the take was started again", err=True)
+                echo(
+                    f"{name}: a worker process was killed; the take was started again",
+                    err=True,
+                )
             if outcome.error is not None:
                 found = skindb.workflow.faults_of(outcome)
                 faults += [_placed(fault, name) for fault in dict.fromkeys(found)]
@@ -118,7 +142,9 @@ def each_take(
                 done[name] = result
                 if lines and not asked("json"):
                     echo(*lines)
-            progress.end_take(name, failed=outcome.error is not None, following=next(following))
+            progress.end_take(
+                name, failed=outcome.error is not None, following=next(following)
+            )
     except InputError as error:  # of the cluster: no other take can be processed
         faults += error.faults
     return done, faults
@@ -135,16 +161,22 @@ def _outcomes(
     if not takes:
         return
     with client_of(scheduler, progress) as client:
-        yield from skindb.workflow.map_takes(function, takes, workers=workers, client=client, shared=shared)
+        yield from skindb.workflow.map_takes(
+            function, takes, workers=workers, client=client, shared=shared
+        )
 
 
 def _placed(fault: Fault, item: str) -> Fault:
     """The fault with the name of its capture or take, if it does not contain it."""
-    return fault if item in fault.where else replace(fault, where=f"{item}: {fault.where}")
+    return (
+        fault if item in fault.where else replace(fault, where=f"{item}: {fault.where}")
+    )
 
 
 def fault_lines(faults: Iterable[Fault], *, every: bool, most: int = 10) -> list[str]:
-    """One line for each fault; if more than `most` break the same rule, the others are only counted unless `every`."""
+    """One line for each fault; if more than `most` break the same rule, the others are
+    only counted unless `every`.
+    """
     lines = []
     count = Counter[str]()
     for fault in faults:
@@ -152,7 +184,9 @@ def fault_lines(faults: Iterable[Fault], *, every: bool, most: int = 10) -> list
         if every or count[fault.rule] <= most:
             lines.append(str(fault))
     folded = {rule: n - most for rule, n in count.items() if n > most and not every}
-    return lines + [f"and {n} more: {rule} (-v lists them)" for rule, n in folded.items()]
+    return lines + [
+        f"and {n} more: {rule} (-v lists them)" for rule, n in folded.items()
+    ]
 
 
 def existing(db: str) -> Database:
@@ -160,12 +194,25 @@ def existing(db: str) -> Database:
     database = skindb.open(db)
     names = database.names()
     if names is None:
-        raise InputError(Fault(db, "the database must exist", "nothing", "ingest a capture into it first"))
-    begun = {"audit", "data", "leases", "secret", "staging", "tmp"}  # may exist after a first ingest that was killed
+        raise InputError(
+            Fault(
+                db,
+                "the database must exist",
+                "nothing",
+                "ingest a capture into it first",
+            )
+        )
+    # may exist after a first ingest that was killed
+    begun = {"audit", "data", "leases", "secret", "staging", "tmp"}
     # a bucket without records has no log
     if {*names} - begun and not {"log", "tombstones", "withdrawn"} & {*names}:
         raise InputError(
-            Fault(db, "a database must have a log", "a folder without one", "give the folder of the database")
+            Fault(
+                db,
+                "a database must have a log",
+                "a folder without one",
+                "give the folder of the database",
+            )
         )
     return database
 
@@ -174,29 +221,46 @@ def writable(path: Path, *endings: str) -> None:
     """Check the name and folder of a file before the work of which it is the result."""
     if path.suffix.lower() not in endings:
         raise InputError(
-            Fault(str(path), f"must end in {' or '.join(endings)}", path.suffix or "no ending", "rename it")
+            Fault(
+                str(path),
+                f"must end in {' or '.join(endings)}",
+                path.suffix or "no ending",
+                "rename it",
+            )
         )
     if not path.parent.is_dir():
-        raise InputError(Fault(str(path), "its folder must exist", "none", f"make {path.parent}"))
+        raise InputError(
+            Fault(str(path), "its folder must exist", "none", f"make {path.parent}")
+        )
 
 
 def summary_of(record: Record) -> dict[str, Any]:
     """The parts of the record of a version that commands print."""
     names = ("skipped", "cleaning", "cleaning_places", "summary", "registration")
-    said = {name: record.provenance[name] for name in names if name in record.provenance}
+    said = {
+        name: record.provenance[name] for name in names if name in record.provenance
+    }
     return {"generation": record.generation, "path": record.path, **said}
 
 
 def calibration_lines(database: Database, take: str) -> list[str]:
-    """Table of the checks of the calibration; nothing for captures that were ingested without these checks."""
+    """Table of the checks of the calibration; nothing for captures that were ingested
+    without these checks.
+    """
     capture = database.read("capture", take)
-    if "calibration" not in capture.children:  # without a dome, or ingested before calibrations were checked
+    # without a dome, or ingested before calibrations were checked
+    if "calibration" not in capture.children:
         return []
     found = capture["calibration"].to_dataset()
-    return [*skindb.ingest.calibration_lines(found), *aligned(skindb.ingest.calibration_table(found))]
+    return [
+        *skindb.ingest.calibration_lines(found),
+        *aligned(skindb.ingest.calibration_table(found)),
+    ]
 
 
-def trait_amounts(texts: Sequence[str], *, default: float | None = None) -> dict[str, float]:
+def trait_amounts(
+    texts: Sequence[str], *, default: float | None = None
+) -> dict[str, float]:
     """Trait -> amount, from texts NAME=AMOUNT, or also NAME if there is a default amount.
 
     Raises
@@ -215,8 +279,17 @@ def trait_amounts(texts: Sequence[str], *, default: float | None = None) -> dict
             amount = math.nan
         if not name or not math.isfinite(amount):
             form = "NAME=AMOUNT" if default is None else "NAME or NAME=AMOUNT"
-            raise click.UsageError(f"--trait needs {form}, such as lotion=0.5; found {text!r}")
+            raise click.UsageError(
+                f"--trait needs {form}, such as lotion=0.5; found {text!r}"
+            )
         if name in found:
-            raise InputError(Fault("--trait", "must name each trait once", f"{name} more than once", "give one amount"))
+            raise InputError(
+                Fault(
+                    "--trait",
+                    "must name each trait once",
+                    f"{name} more than once",
+                    "give one amount",
+                )
+            )
         found[name] = amount
     return found

@@ -26,14 +26,18 @@ if TYPE_CHECKING:
 @click.option(
     "--scope",
     metavar="SCOPE,...",
-    help="Scopes that the subject consents to: fit, statistics, export, publish, or none.  [default: only show them]",
+    help=(
+        "Scopes that the subject consents to: fit, statistics, export, publish, or "
+        "none.  [default: only show them]"
+    ),
 )
 @common
 def consent(db: str, subject: str, scope: str | None) -> None:
     """Show or record the consent of a subject.
 
-    The newest record takes effect immediately, for every version of the subject. fit allows ingest and fit; statistics
-    allows analyze, register and edit; export allows render, compare, show, view and export; publish labels exports.
+    The newest record takes effect immediately, for every version of the subject. fit
+    allows ingest and fit; statistics allows analyze, register and edit; export allows
+    render, compare, show, view and export; publish labels exports.
     """
     database = existing(db)
     if scope is not None:
@@ -41,26 +45,43 @@ def consent(db: str, subject: str, scope: str | None) -> None:
         if not names or ("none" in names and len(names) > 1):
             rule = "must name scopes, or be the single word none"
             found = repr(scope)
-            raise InputError(Fault("--scope", rule, found, "for example fit,statistics"))
+            raise InputError(
+                Fault("--scope", rule, found, "for example fit,statistics")
+            )
         names = [] if names == ["none"] else names
         skindb.workflow.record_consent(database, subject, names)
     given = database.consent_history(subject)
-    emit(given, [f"{one['created']}  {', '.join(one['scope']) or 'none'}  ({one['source']})" for one in given])
+    emit(
+        given,
+        [
+            f"{one['created']}  {', '.join(one['scope']) or 'none'}  ({one['source']})"
+            for one in given
+        ],
+    )
 
 
 @click.command()
 @DB
 @click.argument("name", required=False)
 @click.option(
-    "--take", "takes", multiple=True, help="Take of the release (may be given several times).  [default: all]"
+    "--take",
+    "takes",
+    multiple=True,
+    help="Take of the release (may be given several times).  [default: all]",
 )
-@click.option("--where", help="Condition that takes must fulfil, for example: condition == 'normal' and age > 40.")
+@click.option(
+    "--where",
+    help="Condition that takes must fulfil, for example: condition == 'normal' and age > 40.",
+)
 @common
-def release(db: str, name: str | None, takes: tuple[str, ...], where: str | None) -> None:
+def release(
+    db: str, name: str | None, takes: tuple[str, ...], where: str | None
+) -> None:
     """Name the present versions of takes as a release.
 
-    By default all fitted takes are in the release. Without NAME, the releases are listed. Studies and cohorts of a
-    release give the same values, whatever is fitted later.
+    By default all fitted takes are in the release. Without NAME, the releases are
+    listed. Studies and cohorts of a release give the same values, whatever is fitted
+    later.
     """
     database = existing(db)
     if name is not None:
@@ -69,8 +90,14 @@ def release(db: str, name: str | None, takes: tuple[str, ...], where: str | None
             fulfilling = set(database.takes("model", where=where))
             chosen = [take for take in chosen if take in fulfilling]
         skindb.workflow.create_release(database, name, chosen)
-    listed = {one: _released(database, one) for one in ([name] if name else database.takes("release"))}
-    lines = [f"{one}  {about['created']}  {len(about['takes'])} takes" for one, about in listed.items()]
+    listed = {
+        one: _released(database, one)
+        for one in ([name] if name else database.takes("release"))
+    }
+    lines = [
+        f"{one}  {about['created']}  {len(about['takes'])} takes"
+        for one, about in listed.items()
+    ]
     emit(listed, lines or ["no releases"])
 
 
@@ -88,14 +115,25 @@ def _released(database: Database, name: str) -> dict[str, Any]:
 @WAIT
 @WORKERS
 @SCHEDULER
-@click.option("--dry-run", is_flag=True, help="Only list the results that are out of date, and the reasons.")
+@click.option(
+    "--dry-run",
+    is_flag=True,
+    help="Only list the results that are out of date, and the reasons.",
+)
 @common
-def refresh(db: str, dictionary: Path | None, wait: float, workers: int, scheduler: str | None, dry_run: bool) -> None:
+def refresh(
+    db: str,
+    dictionary: Path | None,
+    wait: float,
+    workers: int,
+    scheduler: str | None,
+    dry_run: bool,
+) -> None:
     """Compute results that are out of date again.
 
-    The order is models, registrations, studies and edits. A result is out of date when one of its inputs was superseded
-    or withdrawn, or when a subject no longer consents to statistics. Each result is computed again with its own
-    parameters.
+    The order is models, registrations, studies and edits. A result is out of date when
+    one of its inputs was superseded or withdrawn, or when a subject no longer consents
+    to statistics. Each result is computed again with its own parameters.
     """
     database = existing(db)
     workflow = skindb.workflow
@@ -106,7 +144,9 @@ def refresh(db: str, dictionary: Path | None, wait: float, workers: int, schedul
         dictionary = shared_path(dictionary, scheduler)
         with client_of(scheduler, progress) as client:
             where: dict[str, Any] = {"workers": workers, "client": client, "wait": wait}
-            found = workflow.refresh(database, dictionary=dictionary, **where, progress=progress)
+            found = workflow.refresh(
+                database, dictionary=dictionary, **where, progress=progress
+            )
     lines = [_line(one) for one in found] or ["every result is up to date"]
     # refresh has no folders to ingest from
     emit(
@@ -117,8 +157,16 @@ def refresh(db: str, dictionary: Path | None, wait: float, workers: int, schedul
 
 def stale_as_json(one: Refreshed) -> dict[str, Any]:
     """JSON record of a stale version and its replacement."""
-    about = {"kind": one.kind, "take": one.take, "generation": one.generation, "reasons": list(one.reasons)}
-    return about | {"made": one.record.generation if one.record else None, "fault": one.fault}
+    about = {
+        "kind": one.kind,
+        "take": one.take,
+        "generation": one.generation,
+        "reasons": list(one.reasons),
+    }
+    return about | {
+        "made": one.record.generation if one.record else None,
+        "fault": one.fault,
+    }
 
 
 def _line(one: Refreshed) -> str:
@@ -127,7 +175,9 @@ def _line(one: Refreshed) -> str:
     reasons += f" and {len(one.reasons) - 3} more" if len(one.reasons) > 3 else ""
     if one.record is not None:
         return f"{what} -> {one.record.generation} ({reasons})"
-    return f"{what}: {reasons}" + (f"; it cannot be computed again: {one.fault}" if one.fault else "")
+    return f"{what}: {reasons}" + (
+        f"; it cannot be computed again: {one.fault}" if one.fault else ""
+    )
 
 
 @click.command()
@@ -135,7 +185,11 @@ def _line(one: Refreshed) -> str:
 @click.argument("subject")
 @DICTIONARY
 @WAIT
-@click.option("--dry-run", is_flag=True, help="Only list what would be removed and computed again.")
+@click.option(
+    "--dry-run",
+    is_flag=True,
+    help="Only list what would be removed and computed again.",
+)
 @click.option("--yes", is_flag=True, help="Remove without asking.")
 @click.option(
     "--backup",
@@ -147,7 +201,10 @@ def _line(one: Refreshed) -> str:
 @click.option(
     "--report",
     type=PATH,
-    help="Name of a report without personal data, which can be handed out. It is written as NAME.json and NAME.txt.",
+    help=(
+        "Name of a report without personal data, which can be handed out. It is "
+        "written as NAME.json and NAME.txt."
+    ),
 )
 @common
 def withdraw(
@@ -162,16 +219,20 @@ def withdraw(
 ) -> None:
     """Remove SUBJECT permanently, with all results made from it.
 
-    Every version of every take is removed, and so is every result that refers to one of them. Then studies,
-    registrations, releases and edits of others are computed again without the subject; refresh repeats those that fail.
-    A keyed mark of the pseudonym remains, so that neither interrupted runs nor the capture folder bring the subject
-    back. Pictures and exports that were written earlier, and backups that are not given, are not reached.
+    Every version of every take is removed, and so is every result that refers to one of
+    them. Then studies, registrations, releases and edits of others are computed again
+    without the subject; refresh repeats those that fail. A keyed mark of the pseudonym
+    remains, so that neither interrupted runs nor the capture folder bring the subject
+    back. Pictures and exports that were written earlier, and backups that are not
+    given, are not reached.
     """
     database = existing(db)
     workflow = skindb.workflow
     plan = workflow.plan_withdrawal(database, subject, backups=backups)
     if report is not None and not report.parent.is_dir():
-        raise InputError(Fault(str(report), "its folder must exist", "none", f"make {report.parent}"))
+        raise InputError(
+            Fault(str(report), "its folder must exist", "none", f"make {report.parent}")
+        )
     if dry_run:
         emit(_withdrawal_as_json(plan), _plan_lines(plan))
         return
@@ -180,13 +241,20 @@ def withdraw(
         if not _is_confirmed(f"Remove {subject} permanently?"):
             emit(_withdrawal_as_json(plan), ["Nothing was removed."])
             return
-    done = workflow.withdraw(database, subject, dictionary=dictionary, wait=wait, backups=backups)
+    done = workflow.withdraw(
+        database, subject, dictionary=dictionary, wait=wait, backups=backups
+    )
     lines = [_line(one) for one in done.repeated]
     lines += [f"revised without {subject}: release {name}" for name in done.revised]
     lines += [f"removed: {reason}" for reason in done.lost]
-    counts = ", ".join(f"{count} of kind {kind}" for kind, count in done.removed.items())
+    counts = ", ".join(
+        f"{count} of kind {kind}" for kind, count in done.removed.items()
+    )
     lines.append(f"removed versions: {counts or 'none'}")
-    lines += [f"removed from {url}: {count} files" for url, count in zip(backups, done.backups, strict=True)]
+    lines += [
+        f"removed from {url}: {count} files"
+        for url, count in zip(backups, done.backups, strict=True)
+    ]
     if report is not None:
         lines += map(str, workflow.write_erasure_report(done, report))
     emit(_withdrawal_as_json(done), lines)
@@ -198,17 +266,26 @@ def _is_confirmed(question: str) -> bool:
     except click.Abort:
         if sys.stdin.isatty():
             raise
-        raise InputError(Fault("withdraw", "must be confirmed", "no terminal to ask on", "give --yes")) from None
+        raise InputError(
+            Fault(
+                "withdraw", "must be confirmed", "no terminal to ask on", "give --yes"
+            )
+        ) from None
 
 
 def _plan_lines(plan: Withdrawal) -> list[str]:
     users: dict[str, list[str]] = {}
     for kind, generation, _, take in (name.split(" ", 3) for name in plan.users):
         users.setdefault(f"{kind} of {take}", []).append(generation)
-    again = [f"{name} (generations {', '.join(those)})" for name, those in users.items()]
+    again = [
+        f"{name} (generations {', '.join(those)})" for name, those in users.items()
+    ]
     return [
         *(f"remove {line}" for line in plan.versions),
-        *(f"remove, and compute the newest again without {plan.subject}: {name}" for name in again),
+        *(
+            f"remove, and compute the newest again without {plan.subject}: {name}"
+            for name in again
+        ),
     ]
 
 

@@ -1,4 +1,6 @@
-"""Printing: the only module of the command line that writes to the terminal, with control characters escaped."""
+"""Printing: the only module of the command line that writes to the terminal, with
+control characters escaped.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,9 @@ from skindb.errors import escaped
 
 
 def echo(*lines: str, err: bool = False) -> None:
-    """Print lines on standard output or standard error; a line break inside of a line is escaped, too."""
+    """Print lines on standard output or standard error; a line break inside of a line
+    is escaped, too.
+    """
     for line in lines:
         click.echo(escaped(line), err=err)
 

@@ -1,4 +1,6 @@
-"""Commands for the maintenance of databases, and the benchmark: info, audit, verify, clean, bench."""
+"""Commands for the maintenance of databases, and the benchmark: info, audit, verify,
+clean, bench.
+"""
 
 from __future__ import annotations
 
@@ -28,35 +30,56 @@ ATLAS_WEIGHTS = {
 
 @click.command()
 @DB
-@click.option("--where", help="Condition that takes must fulfil, for example: condition == 'lotion' and age > 40.")
-@click.option("--release", metavar="NAME", help="Release whose takes and versions are listed.")
+@click.option(
+    "--where",
+    help="Condition that takes must fulfil, for example: condition == 'lotion' and age > 40.",
+)
+@click.option(
+    "--release", metavar="NAME", help="Release whose takes and versions are listed."
+)
 @common
 def info(db: str, where: str | None, release: str | None) -> None:
     """List takes and their versions with paths and sizes.
 
     With -v, samples, atlas and prediction errors are listed too.
 
-    The condition of --where compares columns of db.table(): attributes of the captures (age, gender, ...), condition,
-    fit_k and other parameters, status_fitted, outdated, capture_created, model_created, consent. Comparisons are
-    combined by and, or, not; there are also in ['a', 'b'] and is missing. Text and dates stand in quotes.
+    The condition of --where compares columns of db.table(): attributes of the captures
+    (age, gender, ...), condition, fit_k and other parameters, status_fitted, outdated,
+    capture_created, model_created, consent. Comparisons are combined by and, or, not;
+    there are also in ['a', 'b'] and is missing. Text and dates stand in quotes.
     """
     database = existing(db)
     of_release = None
     if release is not None:
-        of_release = sorted({*database.takes(release=release), *database.takes("model", release=release)})
+        of_release = sorted(
+            {
+                *database.takes(release=release),
+                *database.takes("model", release=release),
+            }
+        )
     result = database.info(takes=of_release, where=where, release=release)
     details = asked("verbose")
     # figures of merit and translucency are values of subjects
-    log = skindb.workflow.logged_action(database, "show", result["takes"]) if details else nullcontext()
+    log = (
+        skindb.workflow.logged_action(database, "show", result["takes"])
+        if details
+        else nullcontext()
+    )
     with log:
         lines = _info_lines(database, result, details=details)
-    if where is None and release is None and (superseded := skindb.workflow.superseded_calibrations(database)):
+    if (
+        where is None
+        and release is None
+        and (superseded := skindb.workflow.superseded_calibrations(database))
+    ):
         result["superseded_calibrations"] = superseded
         lines += skindb.workflow.superseded_lines(superseded)
     emit(result, lines or ["The database holds no takes."])
 
 
-def _info_lines(database: Database, result: dict[str, Any], *, details: bool) -> list[str]:
+def _info_lines(
+    database: Database, result: dict[str, Any], *, details: bool
+) -> list[str]:
     """One line for each take and kind, and the details of each."""
     lines = []
     parts = [
@@ -66,9 +89,9 @@ def _info_lines(database: Database, result: dict[str, Any], *, details: bool) ->
     ]
     for take, kinds in parts:
         for kind, one in kinds.items():
-            text = (
-                one.get("fault")
-                or f"{one['generation']:3d}  {one['bytes'] / 1e6:8.1f} MB  {one['created']}  {one['path']}"
+            text = one.get("fault") or (
+                f"{one['generation']:3d}  {one['bytes'] / 1e6:8.1f} MB  "
+                f"{one['created']}  {one['path']}"
             )
             text += f"  {', '.join(one['scope']) or 'none'}" if "scope" in one else ""
             text += f"  out of date: {one['stale'][0]}" if one.get("stale") else ""
@@ -88,15 +111,23 @@ def _details(database: Database, kind: str, take: str) -> list[str]:
 
 def _sample_lines(database: Database, take: str) -> list[str]:
     """Table of samples by region; nothing for captures without a dome or without this table."""
-    samples = database.record("capture", take).provenance.get("summary", {}).get("samples")
+    samples = (
+        database.record("capture", take).provenance.get("summary", {}).get("samples")
+    )
     if samples is None:
         return []
     try:
-        return [*skindb.ingest.sample_lines(samples), *aligned(skindb.ingest.sample_table(samples))]
-    except (KeyError, TypeError, ValueError, AttributeError):  # a record that another program wrote
+        return [
+            *skindb.ingest.sample_lines(samples),
+            *aligned(skindb.ingest.sample_table(samples)),
+        ]
+    except (KeyError, TypeError, ValueError, AttributeError):
+        # a record that another program wrote
         rule = "its record must hold the number of samples of surfels"
         cure = "restore it from a backup"
-        raise InputError(Fault(f"capture of {take}", rule, "a different summary", cure)) from None
+        raise InputError(
+            Fault(f"capture of {take}", rule, "a different summary", cure)
+        ) from None
 
 
 def _prediction_lines(database: Database, take: str) -> list[str]:
@@ -104,7 +135,9 @@ def _prediction_lines(database: Database, take: str) -> list[str]:
     fit = skindb.fit
     table = database.tables(record) if record.tables else None
     if table is None:  # a model of an earlier version of skindb
-        table = fit.prediction_table(database.read("model", take)["fitted"].to_dataset())
+        table = fit.prediction_table(
+            database.read("model", take)["fitted"].to_dataset()
+        )
     lines = aligned(fit.tabulate_prediction(fit.describe_prediction(table)))
     header, sites = fit.tabulate_translucency(record.provenance)
     return [*lines, *aligned([header, *sites])] if sites else lines
@@ -123,7 +156,11 @@ def _atlas_lines(database: Database, take: str) -> list[str]:
         "flips": "atlas_flips",
     }
     rows = zip(*(atlas[name].values.tolist() for name in columns.values()), strict=True)
-    made = [f"atlas by {ATLAS_WEIGHTS[atlas.attrs['weights']]}"] if "weights" in atlas.attrs else []
+    made = (
+        [f"atlas by {ATLAS_WEIGHTS[atlas.attrs['weights']]}"]
+        if "weights" in atlas.attrs
+        else []
+    )
     return [*made, *aligned([[*columns], *map(list, rows)])]
 
 
@@ -132,7 +169,8 @@ def _capture_lines(database: Database, take: str) -> list[str]:
     return [line for part in parts for line in part(database, take)]
 
 
-DETAILS = {"capture": _capture_lines, "model": _prediction_lines}  # kind: function of the lines that info -v adds
+# kind: function of the lines that info -v adds
+DETAILS = {"capture": _capture_lines, "model": _prediction_lines}
 
 
 @click.command()
@@ -141,7 +179,8 @@ DETAILS = {"capture": _capture_lines, "model": _prediction_lines}  # kind: funct
 def verify(db: str) -> None:
     """Read every file of every version and report all damage.
 
-    Results that are out of date and garbage, to which no record refers, are listed too; they are not damage.
+    Results that are out of date and garbage, to which no record refers, are listed too;
+    they are not damage.
     """
     database = existing(db)
     faults = database.verify()
@@ -149,25 +188,42 @@ def verify(db: str) -> None:
     stale = skindb.workflow.stale_results(database)
     lines = [f"out of date: {one.name}: {one.reasons[0]}" for one in stale]
     lines += [f"garbage, see skindb clean: {_garbage_line(one)}" for one in garbage]
-    found = {"stale": [stale_as_json(one) for one in stale], "garbage": [asdict(one) for one in garbage]}
+    found = {
+        "stale": [stale_as_json(one) for one in stale],
+        "garbage": [asdict(one) for one in garbage],
+    }
     emit(found, [*([] if faults else ["Every version is intact."]), *lines], faults)
 
 
 @click.command()
 @DB
-@click.option("--subject", help="Pseudonym of a subject, to list only the actions that concern it.")
-@click.option("--where", help="Condition that entries must fulfil, for example: action == 'export' and subjects > 1.")
+@click.option(
+    "--subject",
+    help="Pseudonym of a subject, to list only the actions that concern it.",
+)
+@click.option(
+    "--where",
+    help="Condition that entries must fulfil, for example: action == 'export' and subjects > 1.",
+)
 @common
 def audit(db: str, subject: str | None, where: str | None) -> None:
     """List who changed or disclosed data, and check the audit log.
 
-    The condition of --where compares number, when, actor, action and subjects, which is their number. Entries that are
-    missing, changed or in another order are faults.
+    The condition of --where compares number, when, actor, action and subjects, which is
+    their number. Entries that are missing, changed or in another order are faults.
     """
     entries, faults = existing(db).audit(subject=subject, where=where)
     header = ["number", "when", "actor", "action", "subjects", "counts", "parameters"]
     rows = [
-        [one.number, one.when, one.actor, one.action, len(one.subjects), _pairs(one.counts), _pairs(one.parameters)]
+        [
+            one.number,
+            one.when,
+            one.actor,
+            one.action,
+            len(one.subjects),
+            _pairs(one.counts),
+            _pairs(one.parameters),
+        ]
         for one in entries
     ]
     lines = aligned([header, *rows]) if rows else ["The audit log has no such entry."]
@@ -176,7 +232,9 @@ def audit(db: str, subject: str | None, where: str | None) -> None:
 
 def _pairs(values: Mapping[str, Any]) -> str:
     """Names and values on one line; the name alone of a flag that is set."""
-    return ", ".join(name if value is True else f"{name} {value}" for name, value in values.items())
+    return ", ".join(
+        name if value is True else f"{name} {value}" for name, value in values.items()
+    )
 
 
 @click.command()
@@ -184,7 +242,8 @@ def _pairs(values: Mapping[str, Any]) -> str:
 @click.option(
     "--generations",
     type=click.IntRange(1),
-    help="Number of the newest generations of each kind and take to keep. Older ones are removed too, unless a version "
+    help="Number of the newest generations of each kind and take to keep. Older ones "
+    "are removed too, unless a version "
     "that is kept was made from them.",
 )
 @click.option("--yes", is_flag=True, help="Remove the garbage instead of listing it.")
@@ -194,8 +253,9 @@ def clean(db: str, generations: int | None, yes: bool) -> None:
 
     Garbage is left, for example, by runs that were killed.
 
-    Files of a take that is being processed are kept, and so are files of the last hour unless the process that wrote
-    them has ended. Files from which an interrupted run can resume are kept for a day.
+    Files of a take that is being processed are kept, and so are files of the last hour
+    unless the process that wrote them has ended. Files from which an interrupted run
+    can resume are kept for a day.
     """
     database = existing(db)
     if yes:
@@ -209,17 +269,24 @@ def clean(db: str, generations: int | None, yes: bool) -> None:
     lines.append(
         f"{len(going)} removed, {total / 1e6:.1f} MB"
         if yes
-        else f"{len(going)} to remove, {total / 1e6:.1f} MB" + ("; --yes removes them" if going else "")
+        else f"{len(going)} to remove, {total / 1e6:.1f} MB"
+        + ("; --yes removes them" if going else "")
     )
-    emit({"removed": yes, "bytes": total, "items": [asdict(one) for one in found]}, lines)
+    emit(
+        {"removed": yes, "bytes": total, "items": [asdict(one) for one in found]}, lines
+    )
 
 
 def _garbage_line(one: Garbage) -> str:
-    return f"{one.key}  {one.bytes / 1e6:.1f} MB  {one.what}" + (f"  (kept: {one.kept})" if one.kept else "")
+    return f"{one.key}  {one.bytes / 1e6:.1f} MB  {one.what}" + (
+        f"  (kept: {one.kept})" if one.kept else ""
+    )
 
 
 @click.command()
-@click.option("--out", type=PATH, default=Path("bench"), help="Folder for bench.json and plots.")
+@click.option(
+    "--out", type=PATH, default=Path("bench"), help="Folder for bench.json and plots."
+)
 @click.option(
     "--only",
     multiple=True,
@@ -227,7 +294,9 @@ def _garbage_line(one: Garbage) -> str:
     help="Kernel to measure (may be given several times).  [default: all]",
 )
 @click.option(
-    "--quick", is_flag=True, help="Measure smaller problems, which takes half a minute instead of several minutes."
+    "--quick",
+    is_flag=True,
+    help="Measure smaller problems, which takes half a minute instead of several minutes.",
 )
 @common
 def bench(out: Path, only: tuple[str, ...], quick: bool) -> None:
@@ -237,7 +306,23 @@ def bench(out: Path, only: tuple[str, ...], quick: bool) -> None:
     """
     result = skindb.bench.run_bench(out, only=only, quick=quick, progress=bar())
     failures = [f"fails: {line}" for line in result["failures"]]
-    kept = f"{len(result['stress']) - result['broken']} of {len(result['stress'])} promises of the stress set hold"
+    kept = (
+        f"{len(result['stress']) - result['broken']} of {len(result['stress'])} "
+        "promises of the stress set hold"
+    )
     broken = [case for case in result["stress"] if case["failure"]]
-    faults = [Fault(f"{case['kernel']}: {case['name']}", case["promise"], case["failure"]) for case in broken]
-    emit(result, [*aligned(skindb.bench.table_of(result)), "", *failures, kept, str(out / "bench.json")], faults)
+    faults = [
+        Fault(f"{case['kernel']}: {case['name']}", case["promise"], case["failure"])
+        for case in broken
+    ]
+    emit(
+        result,
+        [
+            *aligned(skindb.bench.table_of(result)),
+            "",
+            *failures,
+            kept,
+            str(out / "bench.json"),
+        ],
+        faults,
+    )

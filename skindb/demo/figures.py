@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 
 SIZE = (4.4, 3.3)  # inches; text is still readable at 360 px, the width of a phone
 DOTS = 160  # per inch, twice the resolution of a page of 360 px
-LIGHT, DARK = ("#ffffff", "#22211f"), ("#262422", "#e9e5df")  # background and foreground, as in report.css
+# background and foreground, as in report.css
+LIGHT, DARK = ("#ffffff", "#22211f"), ("#262422", "#e9e5df")
 MAX_GREY_DIFFERENCE = 0.05  # between the channels of colours that count as grey
 MAX_NORMAL_ANGLE = 15  # degrees, end of the axis
 
@@ -55,7 +56,12 @@ def _png(figure: Figure, paper: str, ink: str) -> bytes:
         ax.tick_params(colors=ink, which="both")
         for spine in ax.spines.values():
             spine.set_edgecolor(ink)
-        for text in (ax.title, ax.xaxis.label, ax.yaxis.label, *(ax.legend_.get_texts() if ax.legend_ else ())):
+        for text in (
+            ax.title,
+            ax.xaxis.label,
+            ax.yaxis.label,
+            *(ax.legend_.get_texts() if ax.legend_ else ()),
+        ):
             text.set_color(ink)
         for line in (*ax.lines, *(ax.legend_.get_lines() if ax.legend_ else ())):
             channels = to_rgb(line.get_color())
@@ -74,7 +80,9 @@ def _axes() -> Axes:
 
 
 def reflectance_plot(recovered: Mapping[str, Recovery]) -> str:
-    """Plot of recovered against true diffuse reflectance, for every fortieth fitted surfel of all takes."""
+    """Plot of recovered against true diffuse reflectance, for every fortieth fitted
+    surfel of all takes.
+    """
     ax = _axes()
     for channel, (name, colour) in enumerate(zip("RGB", colours.CHANNELS, strict=True)):
         true = []
@@ -83,13 +91,23 @@ def reflectance_plot(recovered: Mapping[str, Recovery]) -> str:
             pick = np.flatnonzero(one.fitted)[::40]
             true.append(one.true_diffuse[pick, channel])
             found.append(true[-1] * (1 + one.diffuse_error[pick, channel]))
-        ax.plot(np.concatenate(true), np.concatenate(found), ".", ms=2, color=colour, alpha=0.5)
-        ax.plot([], [], "o", ms=4, color=colour, label=name)  # the points are too small for a legend
+        ax.plot(
+            np.concatenate(true),
+            np.concatenate(found),
+            ".",
+            ms=2,
+            color=colour,
+            alpha=0.5,
+        )
+        # the points are too small for a legend
+        ax.plot([], [], "o", ms=4, color=colour, label=name)
     top = ax.get_xlim()[1]
     ax.plot([0, top], [0, top], "k-", lw=0.7, label="equal")
     ax.set_xlabel("true diffuse reflectance R_d [1]")
     ax.set_ylabel("recovered R_d [1]")
-    return themed_plot(ax, "Recovered against true diffuse reflectance, with the line of equality.")
+    return themed_plot(
+        ax, "Recovered against true diffuse reflectance, with the line of equality."
+    )
 
 
 def normal_plot(recovered: Mapping[str, Recovery]) -> str:
@@ -104,7 +122,10 @@ def normal_plot(recovered: Mapping[str, Recovery]) -> str:
     ax.set_xlim(0, MAX_NORMAL_ANGLE)
     ax.set_xlabel("angle between recovered and true normal [deg]")
     ax.set_ylabel("fitted surfels below [%]")
-    return themed_plot(ax, "Cumulative distribution of the angle between the recovered and the true normal, by take.")
+    return themed_plot(
+        ax,
+        "Cumulative distribution of the angle between the recovered and the true normal, by take.",
+    )
 
 
 def translucency_plot(table: xr.Dataset) -> str:
@@ -115,7 +136,10 @@ def translucency_plot(table: xr.Dataset) -> str:
 
 def basis_size_plot(curve: xr.Dataset) -> str:
     """Plot of the error against the number of basis BRDFs."""
-    alt = "Relative error of the reflectance against the number of basis BRDFs, with its 95 % interval."
+    alt = (
+        "Relative error of the reflectance against the number of basis BRDFs, with its "
+        "95 % interval."
+    )
     return themed_plot(plot_basis_size(curve, ax=_axes()), alt)
 
 

@@ -1,4 +1,6 @@
-"""A self-contained HTML page with pictures, plots and tables, which can be downloaded as CSV files."""
+"""A self-contained HTML page with pictures, plots and tables, which can be downloaded
+as CSV files.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,9 @@ class Table:
     def columns(self, names: Sequence[str]) -> Table:
         """The table with only these columns."""
         at = [list(self.header).index(name) for name in names]
-        return Table(self.name, list(names), [[row[i] for i in at] for row in self.rows])
+        return Table(
+            self.name, list(names), [[row[i] for i in at] for row in self.rows]
+        )
 
     def renamed(self, header: Sequence[str]) -> Table:
         """The table with another header."""
@@ -35,8 +39,13 @@ class Table:
 
 
 def picture(image: NDArray[np.uint8], alt: str, *, caption: str = "") -> str:
-    """An sRGB picture (rows, cols, 3) with an alternative text and, if there is one, a visible caption."""
-    shown = f'<img alt="{html.escape(alt)}" src="{_png(imagecodecs.png_encode(np.ascontiguousarray(image)))}">'
+    """An sRGB picture (rows, cols, 3) with an alternative text and, if there is one, a
+    visible caption.
+    """
+    shown = (
+        f'<img alt="{html.escape(alt)}" '
+        f'src="{_png(imagecodecs.png_encode(np.ascontiguousarray(image)))}">'
+    )
     text = f"<figcaption>{html.escape(caption)}</figcaption>" if caption else ""
     return f"<figure>{shown}{text}</figure>"
 
@@ -49,7 +58,10 @@ def row(pictures: Iterable[str], *, kind: str = "row") -> str:
 def themed(light: bytes, dark: bytes, alt: str) -> str:
     """A plot as two PNG images, of which the browser shows the one for its theme."""
     source = f'<source media="(prefers-color-scheme: dark)" srcset="{_png(dark)}">'
-    return f'<picture>{source}<img class="plot" alt="{html.escape(alt)}" src="{_png(light)}"></picture>'
+    return (
+        f'<picture>{source}<img class="plot" alt="{html.escape(alt)}" '
+        f'src="{_png(light)}"></picture>'
+    )
 
 
 def _png(data: bytes | bytearray) -> str:
@@ -59,7 +71,9 @@ def _png(data: bytes | bytearray) -> str:
 def table(shown: Table) -> str:
     """A table; numbers are printed to three significant digits."""
     head = "".join(f'<th scope="col">{html.escape(name)}</th>' for name in shown.header)
-    body = "".join("<tr>" + "".join(map(_entry, values)) + "</tr>" for values in shown.rows)
+    body = "".join(
+        "<tr>" + "".join(map(_entry, values)) + "</tr>" for values in shown.rows
+    )
     return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
 
 
@@ -69,28 +83,42 @@ def _entry(value: Any) -> str:
 
 
 def cell(value: Any) -> str:
-    """The text of a value: floats with three significant digits, NaN as a dash, counts with commas."""
+    """The text of a value: floats with three significant digits, NaN as a dash, counts
+    with commas.
+    """
     if isinstance(value, (int, np.integer)) and not isinstance(value, bool):
         return f"{value:,}"
     if not isinstance(value, (float, np.floating)):
         return str(value)
     number = float(value)
-    return "-" if np.isnan(number) else f"{number:.3g}" if abs(number) < 1000 else f"{number:,.0f}"
+    return (
+        "-"
+        if np.isnan(number)
+        else f"{number:.3g}"
+        if abs(number) < 1000
+        else f"{number:,.0f}"
+    )
 
 
 def downloads(tables: Iterable[Table]) -> str:
-    """Links for downloading tables as CSV files with all columns and digits; the page contains the files."""
+    """Links for downloading tables as CSV files with all columns and digits; the page
+    contains the files.
+    """
     links = []
     for one in tables:
         data = base64.b64encode(csv_text(one.header, one.rows).encode()).decode()
         name = html.escape(f"{one.name}.csv")
-        links.append(f'<a download="{name}" href="data:text/csv;charset=utf-8;base64,{data}">{name}</a>')
+        links.append(
+            f'<a download="{name}" href="data:text/csv;charset=utf-8;base64,{data}">{name}</a>'
+        )
     return f'<p class="downloads">Download: {", ".join(links)}</p>'
 
 
 def details(summary: str, blocks: Iterable[str]) -> str:
     """Blocks that are hidden until the reader opens them."""
-    return f"<details><summary>{html.escape(summary)}</summary>{''.join(blocks)}</details>"
+    return (
+        f"<details><summary>{html.escape(summary)}</summary>{''.join(blocks)}</details>"
+    )
 
 
 def paragraph(text: str) -> str:
@@ -101,12 +129,18 @@ def paragraph(text: str) -> str:
 def page(title: str, lead: str, sections: Iterable[tuple[str, Sequence[str]]]) -> str:
     """The page: title, lead, and sections of (heading, parts of HTML)."""
     parts = list(sections)
-    links = "".join(f'<a href="#s{i}">{html.escape(name)}</a>' for i, (name, _) in enumerate(parts))
+    links = "".join(
+        f'<a href="#s{i}">{html.escape(name)}</a>' for i, (name, _) in enumerate(parts)
+    )
     body = "".join(
         f'<section><h2 id="s{i}">{html.escape(name)}</h2>{"".join(blocks)}</section>'
         for i, (name, blocks) in enumerate(parts)
     )
-    style = importlib.resources.files("skindb.demo").joinpath("report.css").read_text(encoding="utf-8")
+    style = (
+        importlib.resources.files("skindb.demo")
+        .joinpath("report.css")
+        .read_text(encoding="utf-8")
+    )
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'

@@ -16,7 +16,13 @@ from skindb.render.direct import View, shade_view, trace_view
 from skindb.render.image import auto_exposure, encode_srgb, tone_map
 from skindb.render.photographs import Comparison, side_by_side
 from skindb.render.picture import frontal_camera
-from skindb.render.scene import Lights, Surface, cameras_from_dome, from_model, lights_from_dome
+from skindb.render.scene import (
+    Lights,
+    Surface,
+    cameras_from_dome,
+    from_model,
+    lights_from_dome,
+)
 
 Image = NDArray[np.floating[Any]]
 Picture = NDArray[np.uint8]
@@ -25,7 +31,8 @@ ERRORS = (  # maps of residuals, black where they are unknown
     ("held_out_error", 0.2, "error under lights the fit did not see"),
     ("outlier_fraction", 0.1, "samples the model does not explain"),
 )
-KEY_LIGHTS = ((-0.5, 0.35, 0.8), (0.55, 0.25, 0.8))  # directions of the two lights of a portrait
+# directions of the two lights of a portrait
+KEY_LIGHTS = ((-0.5, 0.35, 0.8), (0.55, 0.25, 0.8))
 MARGIN = 6  # pixels around a face
 
 
@@ -44,12 +51,16 @@ class Portraits:
 
 
 def draw_portraits(models: Mapping[str, xr.DataTree]) -> Portraits:
-    """Portraits with a common exposure that does not clip the brightest skin, so that skin tones are comparable."""
+    """Portraits with a common exposure that does not clip the brightest skin, so that
+    skin tones are comparable.
+    """
     images = {take: portrait(model) for take, model in models.items()}
     return Portraits(images, min(auto_exposure(image) for image in images.values()))
 
 
-def _frontal(model: xr.DataTree, *, scale: float) -> tuple[Surface, View, RayScene, xr.Dataset]:
+def _frontal(
+    model: xr.DataTree, *, scale: float
+) -> tuple[Surface, View, RayScene, xr.Dataset]:
     dome = model["dome"].to_dataset().load()
     surface = from_model(model, fill=True)
     scene = RayScene(surface.vertices, surface.faces)
@@ -68,26 +79,39 @@ def _key(dome: xr.Dataset) -> Lights:
 def portrait(model: xr.DataTree) -> Image:
     """Linear radiance (h, w, 3) of the model from the front under two lights."""
     surface, view, scene, dome = _frontal(model, scale=1.6)
-    return np.asarray(shade_view(view, surface, _key(dome), scene, terms=("diffuse", "surface")).sum(axis=0))
+    return np.asarray(
+        shade_view(view, surface, _key(dome), scene, terms=("diffuse", "surface")).sum(
+            axis=0
+        )
+    )
 
 
-def map_pictures(models: Mapping[str, xr.DataTree]) -> dict[str, list[tuple[Picture, str]]]:
+def map_pictures(
+    models: Mapping[str, xr.DataTree],
+) -> dict[str, list[tuple[Picture, str]]]:
     """Maps of each model from the front, at one scale.
 
     Returns
     -------
     dict
-        For each take normal, albedo, surface reflection, translucency and errors, each with its caption.
+        For each take normal, albedo, surface reflection, translucency and errors, each
+        with its caption.
     """
     drawn = {take: _maps(model) for take, model in models.items()}
     flat = [one for maps in drawn.values() for one in maps]
-    cut = iter(crop_alike([image for image, _, _ in flat], [mask for _, mask, _ in flat]))
-    return {take: [(next(cut), text) for _, _, text in maps] for take, maps in drawn.items()}
+    cut = iter(
+        crop_alike([image for image, _, _ in flat], [mask for _, mask, _ in flat])
+    )
+    return {
+        take: [(next(cut), text) for _, _, text in maps] for take, maps in drawn.items()
+    }
 
 
 def _maps(model: xr.DataTree) -> list[tuple[Picture, Mask, str]]:
     surface, view, _, _ = _frontal(model, scale=1.2)
-    shine = view.interpolate(surface.weights) @ directional_albedo(surface.tables, [1.0])[0]
+    shine = (
+        view.interpolate(surface.weights) @ directional_albedo(surface.tables, [1.0])[0]
+    )
     pictures = [
         ((view.interpolate(surface.normals) + 1) / 2, "normal"),
         (encode_srgb(view.interpolate(surface.diffuse)), "diffuse albedo"),
@@ -101,10 +125,15 @@ def _maps(model: xr.DataTree) -> list[tuple[Picture, Mask, str]]:
         if name in fitted:
             found = view.interpolate(np.nan_to_num(fitted[name].values)[:, None])[:, 0]
             pictures.append((_scaled(found, top), f"{text}, 0 to {100 * top:g} %"))
-    return [(_byte(view.image(values)), view.coverage > 0.5, text) for values, text in pictures]
+    return [
+        (_byte(view.image(values)), view.coverage > 0.5, text)
+        for values, text in pictures
+    ]
 
 
-def crop_alike(pictures: Sequence[Picture], masks: Sequence[Mask], margin: int = MARGIN) -> list[Picture]:
+def crop_alike(
+    pictures: Sequence[Picture], masks: Sequence[Mask], margin: int = MARGIN
+) -> list[Picture]:
     """Crop pictures to one size, so that equal widths on the page correspond to equal scale.
 
     Parameters
@@ -119,29 +148,43 @@ def crop_alike(pictures: Sequence[Picture], masks: Sequence[Mask], margin: int =
     Returns
     -------
     list
-        (rows, cols, 3) each, black beyond the edges of the picture. Without any face, pictures are not cropped.
+        (rows, cols, 3) each, black beyond the edges of the picture. Without any face,
+        pictures are not cropped.
     """
     boxes = [_box(mask) for mask in masks]
-    sizes = [(bottom - top, right - left) for top, bottom, left, right in filter(None, boxes)]
+    sizes = [
+        (bottom - top, right - left) for top, bottom, left, right in filter(None, boxes)
+    ]
     if not sizes:
         return list(pictures)
     rows, cols = (int(size) + 2 * margin for size in np.max(sizes, axis=0))
-    return [_window(image, box, rows, cols) for image, box in zip(pictures, boxes, strict=True)]
+    return [
+        _window(image, box, rows, cols)
+        for image, box in zip(pictures, boxes, strict=True)
+    ]
 
 
 def _box(mask: Mask) -> tuple[int, int, int, int] | None:
     """First row, end row, first column and end column of a face; the ends are exclusive."""
     rows = np.flatnonzero(mask.any(axis=1))
     cols = np.flatnonzero(mask.any(axis=0))
-    return (int(rows[0]), int(rows[-1]) + 1, int(cols[0]), int(cols[-1]) + 1) if rows.size else None
+    return (
+        (int(rows[0]), int(rows[-1]) + 1, int(cols[0]), int(cols[-1]) + 1)
+        if rows.size
+        else None
+    )
 
 
-def _window(image: Picture, box: tuple[int, int, int, int] | None, rows: int, cols: int) -> Picture:
+def _window(
+    image: Picture, box: tuple[int, int, int, int] | None, rows: int, cols: int
+) -> Picture:
     top, bottom, left, right = box or (0, image.shape[0], 0, image.shape[1])
     padded = np.pad(image, ((rows, rows), (cols, cols), (0, 0)))
     first_row = (top + bottom - rows) // 2 + rows
     first_col = (left + right - cols) // 2 + cols
-    return np.ascontiguousarray(padded[first_row : first_row + rows, first_col : first_col + cols])
+    return np.ascontiguousarray(
+        padded[first_row : first_row + rows, first_col : first_col + cols]
+    )
 
 
 def half_size(image: Picture) -> Picture:
@@ -153,7 +196,9 @@ def half_size(image: Picture) -> Picture:
 
 
 def predictions(shown: Sequence[Comparison], exposure: float) -> list[Picture]:
-    """Photograph, prediction and difference of each comparison side by side, all at one exposure and one scale."""
+    """Photograph, prediction and difference of each comparison side by side, all at one
+    exposure and one scale.
+    """
     drawn = list[Picture]()
     masks = list[Mask]()
     for one in shown:

@@ -39,10 +39,13 @@ def write_report(path: Path, results: Results, *, progress: Progress) -> Path:
             sections.append((name, blocks))
     minutes = (time.monotonic() - results.began) / 60
     lead = (
-        f"skindb {__version__} simulated, fitted and analysed {len(results.models)} virtual takes in {minutes:.1f} "
+        f"skindb {__version__} simulated, fitted and analysed "
+        f"{len(results.models)} virtual takes in {minutes:.1f} "
         "minutes. Their true values are known, so that every error on this page is measured."
     )
-    private_file(path).write_text(page.page("skindb: measured faces", lead, sections), encoding="utf-8")
+    private_file(path).write_text(
+        page.page("skindb: measured faces", lead, sections), encoding="utf-8"
+    )
     progress("report", len(parts), len(parts))
     return path
 
@@ -54,40 +57,66 @@ def _statuses(results: Results, _: Portraits) -> list[str]:
 
 def _predicted(results: Results, _: Portraits) -> list[str]:
     full = tables.photograph_table(results)
-    shown = full.columns(["take", "light", "held_out", "relative_rmse", "delta_e_median"])
+    shown = full.columns(
+        ["take", "light", "held_out", "relative_rmse", "delta_e_median"]
+    )
     held = [row for row in shown.rows if row[2] == "yes"]
     found = "The fit used the lights of all photographs."
     if held:
         error, colour = (float(np.median([row[i] for row in held])) for i in (3, 4))
         found = (
-            f"The fit did not use the lights of {len(held)} of {len(shown.rows)} photographs; for these the median "
-            f"relative RMSE is {100 * error:.1f} % and the median colour difference is {colour:.2g} (CIEDE2000)."
+            f"The fit did not use the lights of {len(held)} of {len(shown.rows)} "
+            "photographs; for these the median "
+            f"relative RMSE is {100 * error:.1f} % and the median colour "
+            f"difference is {colour:.2g} (CIEDE2000)."
         )
     text = (
-        "The photographs that ingest kept are predicted by rendering the model and compared over all pixels of the "
+        "The photographs that ingest kept are predicted by rendering the model and "
+        "compared over all pixels of the "
         f"face, including folds and shadow edges. {found}"
     )
     named = shown.renamed(["take", "light", "held out", "relative RMSE", "delta E"])
-    listed = page.details(f"Errors of {len(shown.rows)} photographs", [page.table(named)])
+    listed = page.details(
+        f"Errors of {len(shown.rows)} photographs", [page.table(named)]
+    )
     return [page.paragraph(text), listed, page.downloads([full])]
 
 
 def _recovered(results: Results, _: Portraits) -> list[str]:
     text = (
-        "R_d of dark skin is overestimated, because measured BRDFs reflect about 0.02 evenly in all directions, which "
-        "cannot be separated from diffuse reflection. The errors of sigma_tr include the noise of the simulated "
+        "R_d of dark skin is overestimated, because measured BRDFs reflect about "
+        "0.02 evenly in all directions, which "
+        "cannot be separated from diffuse reflection. The errors of sigma_tr "
+        "include the noise of the simulated "
         "photons of the probe and the effect of the finite size of its fibres."
     )
-    normals = page.details("Distribution of the error of normals", [figures.normal_plot(results.recovered)])
+    normals = page.details(
+        "Distribution of the error of normals", [figures.normal_plot(results.recovered)]
+    )
     full = tables.site_table(results)
     shown = full.renamed(["take", "site", "red [%]", "green [%]", "blue [%]"])
-    sites = [page.details("Errors of sigma_tr at the sites of the probe", [page.table(shown)])] if full.rows else []
-    return [page.paragraph(text), figures.reflectance_plot(results.recovered), normals, *sites, page.downloads([full])]
+    sites = (
+        [
+            page.details(
+                "Errors of sigma_tr at the sites of the probe", [page.table(shown)]
+            )
+        ]
+        if full.rows
+        else []
+    )
+    return [
+        page.paragraph(text),
+        figures.reflectance_plot(results.recovered),
+        normals,
+        *sites,
+        page.downloads([full]),
+    ]
 
 
 def _population(results: Results, _: Portraits) -> list[str]:
     text = (
-        "Mean of sigma_tr over the subjects with its 95 % interval, and the distribution of the area of the face by "
+        "Mean of sigma_tr over the subjects with its 95 % interval, and the "
+        "distribution of the area of the face by "
         "albedo along its first decorrelated axis, which is mostly brightness."
     )
     study = results.studies["translucency"]
@@ -95,26 +124,44 @@ def _population(results: Results, _: Portraits) -> list[str]:
         figures.translucency_plot(study["translucency_table"].to_dataset().load()),
         figures.albedo_plot(results.studies["albedo"]["albedo"].to_dataset().load()),
     ]
-    saved = [tables.study_table(name, results.studies[name]) for name in ("translucency", "brdf", "albedo")]
-    shown = saved[0].columns(["site", "channel", "sigma_tr_mean", "sigma_tr_mean_low", "sigma_tr_mean_high"])
+    saved = [
+        tables.study_table(name, results.studies[name])
+        for name in ("translucency", "brdf", "albedo")
+    ]
+    shown = saved[0].columns(
+        ["site", "channel", "sigma_tr_mean", "sigma_tr_mean_low", "sigma_tr_mean_high"]
+    )
     named = shown.renamed(["site", "channel", "mean", "95 % from", "to"])
     listed = page.details("sigma_tr in 1/mm by site and channel", [page.table(named)])
-    return [page.paragraph(text), page.row(plots, kind="plots"), listed, _basis_size(results), page.downloads(saved)]
+    return [
+        page.paragraph(text),
+        page.row(plots, kind="plots"),
+        listed,
+        _basis_size(results),
+        page.downloads(saved),
+    ]
 
 
 def _basis_size(results: Results) -> str:
     curve = results.studies["brdf"]["basis_size"].to_dataset().load()
     near = 100 * float(curve["plateau_tolerance"])
     text = (
-        f"Sufficient number of basis BRDFs: {curve.attrs['size_status']}. Its error must be within {near:g} % of that "
-        f"of the largest number tried. The error is measured on {curve.attrs['surfels']} surfels of all takes."
+        f"Sufficient number of basis BRDFs: {curve.attrs['size_status']}. Its "
+        f"error must be within {near:g} % of that "
+        "of the largest number tried. The error is measured on "
+        f"{curve.attrs['surfels']} surfels of all takes."
     )
-    return page.details("Number of basis BRDFs", [page.paragraph(text), figures.basis_size_plot(curve)])
+    return page.details(
+        "Number of basis BRDFs", [page.paragraph(text), figures.basis_size_plot(curve)]
+    )
 
 
 def _run_time(results: Results, _: Portraits) -> list[str]:
     demo, fit = tables.time_tables(results)
-    text = "Wall time in seconds. Takes are processed in parallel, and the times of their stages are summed."
+    text = (
+        "Wall time in seconds. Takes are processed in parallel, and the times of their "
+        "stages are summed."
+    )
     listed = [
         page.details("Stages of the demo", [page.table(demo)]),
         page.details("Stages of a fit, mean over takes", [page.table(fit)]),

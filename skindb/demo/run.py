@@ -44,13 +44,14 @@ def run_demo(
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Capture virtual subjects, ingest, fit, analyse, edit, render and export them, and write report.html.
+    """Capture virtual subjects, ingest, fit, analyse, edit, render and export them, and
+    write report.html.
 
     Parameters
     ----------
     out
-        Folder for captures/, db/, export/, the viewer and report.html. It must be absent, empty or from an earlier
-        demo, which is replaced.
+        Folder for captures/, db/, export/, the viewer and report.html. It must be
+        absent, empty or from an earlier demo, which is replaced.
     takes
         Number of virtual takes, at most eight.
     cameras, lights
@@ -65,7 +66,8 @@ def run_demo(
     Returns
     -------
     dict
-        Paths of report, viewer and db, seconds per stage, and the errors of the recovered values of each take.
+        Paths of report, viewer and db, seconds per stage, and the errors of the
+        recovered values of each take.
 
     Raises
     ------
@@ -77,16 +79,20 @@ def run_demo(
     results = Results()
     db = Database(out / "db")
     make = partial(_make_take, out=out, cameras=cameras, lights=lights, seed=seed)
-    results.add(make(0, progress=tell))  # first and alone, as it compiles the kernels that the others use
+    # first and alone, as it compiles the kernels that the others use
+    results.add(make(0, progress=tell))
     if takes > 1:
         tell("the other takes", 0, takes - 1)
     many = workers or min(thread_count(), MAX_WORKERS)
-    for i, made in enumerate(workflow.results_of(workflow.map_takes(make, range(1, takes), workers=many)), 1):
+    for i, made in enumerate(
+        workflow.results_of(workflow.map_takes(make, range(1, takes), workers=many)), 1
+    ):
         results.add(made)
         tell("the other takes", i, takes - 1)
     results.sort_takes([person.take for person in default_people()])
     with results.stage("analyze"):
-        workflow.register_takes(db, workers=many, progress=tell)  # once, for every study
+        # once, for every study
+        workflow.register_takes(db, workers=many, progress=tell)
         results.studies["brdf"] = workflow.basis_size(db, seed=seed)
         results.studies["albedo"] = workflow.albedo(db)
         results.studies["translucency"] = workflow.translucency(db)
@@ -96,7 +102,13 @@ def run_demo(
         _edit(results, db)
     with results.stage("export"):
         first = next(iter(results.models))
-        export_bundle(results.models[first], out / "export" / first, size=1024, merl=False, progress=tell)
+        export_bundle(
+            results.models[first],
+            out / "export" / first,
+            size=1024,
+            merl=False,
+            progress=tell,
+        )
     with results.stage("view"):
         traits = {EDIT_CONDITION: 1.0} if results.edited_take == first else {}
         workflow.view_takes(db, [first], out / VIEWER, traits=traits, progress=tell)
@@ -118,10 +130,20 @@ def _remove_earlier_demo(out: Path) -> None:
     if out.exists() and any(out.iterdir()) and not mark.exists():
         rule = "the folder of the demo must be absent, empty or from an earlier demo"
         raise InputError(Fault(str(out), rule, "other files", "choose another --out"))
-    added = sorted(set(Database(out / "db").subjects()) - {person.subject for person in default_people()})
+    added = sorted(
+        set(Database(out / "db").subjects())
+        - {person.subject for person in default_people()}
+    )
     if added:
         rule = "the database of the demo, which is deleted, must have no other subjects"
-        raise InputError(Fault(str(out / "db"), rule, ", ".join(added), "choose another --out, or move the database"))
+        raise InputError(
+            Fault(
+                str(out / "db"),
+                rule,
+                ", ".join(added),
+                "choose another --out, or move the database",
+            )
+        )
     for name in ("captures", "db", "export"):
         shutil.rmtree(out / name, ignore_errors=True)
     for name in ("report.html", VIEWER):
@@ -130,35 +152,64 @@ def _remove_earlier_demo(out: Path) -> None:
     private_file(mark)
 
 
-def _make_take(i: int, *, out: Path, cameras: int, lights: int, seed: int, progress: Progress | None = None) -> Results:
-    """Simulate, ingest and fit a virtual take, and compare the model with its photographs and its true values."""
+def _make_take(
+    i: int,
+    *,
+    out: Path,
+    cameras: int,
+    lights: int,
+    seed: int,
+    progress: Progress | None = None,
+) -> Results:
+    """Simulate, ingest and fit a virtual take, and compare the model with its
+    photographs and its true values.
+    """
     results = Results()
     db = Database(out / "db")
     with results.stage("simulate"):
         (folder,) = simulate_takes(
-            out / "captures", takes=[i], cameras=cameras, lights=lights, seed=seed, progress=progress
+            out / "captures",
+            takes=[i],
+            cameras=cameras,
+            lights=lights,
+            seed=seed,
+            progress=progress,
         )
     with results.stage("ingest"):
-        take = workflow.ingest_take(db, folder, spacing_mm=SPACING, progress=progress).take
+        take = workflow.ingest_take(
+            db, folder, spacing_mm=SPACING, progress=progress
+        ).take
     with results.stage("fit"):
         parameters = FitParameters(hold_out_lights=HELD_OUT, seed=seed)
-        results.fits[take] = workflow.fit_take(db, take, parameters, progress=progress).provenance
+        results.fits[take] = workflow.fit_take(
+            db, take, parameters, progress=progress
+        ).provenance
     with results.stage("compare"):
         model = db.read("model", take)
         results.models[take] = model.map_over_datasets(lambda ds: ds.load())
         results.models[take].attrs = model.attrs
-        results.compared[take] = compare_photographs(results.models[take], db.read("capture", take))
+        results.compared[take] = compare_photographs(
+            results.models[take], db.read("capture", take)
+        )
         with np.load(folder.with_name(folder.name + ".truth.npz")) as truth:
-            results.recovered[take] = recovered_against_true(results.models[take], dict(truth))
+            results.recovered[take] = recovered_against_true(
+                results.models[take], dict(truth)
+            )
     return results
 
 
 def _edit(results: Results, db: Database) -> None:
-    """Edit a subject who was measured with and without a condition, from one take towards the other."""
-    pairs = [take for take in results.models if f"{take}.{EDIT_CONDITION}" in results.models]
+    """Edit a subject who was measured with and without a condition, from one take
+    towards the other.
+    """
+    pairs = [
+        take for take in results.models if f"{take}.{EDIT_CONDITION}" in results.models
+    ]
     if "traits" not in results.studies or not pairs:
         return
     results.edited_take = pairs[0]
     results.target_take = f"{pairs[0]}.{EDIT_CONDITION}"
     for amount in EDIT_AMOUNTS:
-        results.edits[amount] = workflow.edit(db, results.edited_take, {EDIT_CONDITION: amount})
+        results.edits[amount] = workflow.edit(
+            db, results.edited_take, {EDIT_CONDITION: amount}
+        )

@@ -33,23 +33,46 @@ SUBJECT_HEADER = (
 
 def status_counts(model: xr.DataTree) -> dict[FitStatus, int]:
     """Number of surfels with each status, including zeros."""
-    counts = np.bincount(model["fitted"].to_dataset()["fit_status"].values, minlength=len(FitStatus))
+    counts = np.bincount(
+        model["fitted"].to_dataset()["fit_status"].values, minlength=len(FitStatus)
+    )
     return {status: int(counts[status]) for status in FitStatus}
 
 
 def subject_table(results: Results) -> Table:
-    """One row per take: attributes, number of fitted surfels, and median errors against the truth."""
+    """One row per take: attributes, number of fitted surfels, and median errors against
+    the truth.
+    """
     rows = []
     for take, model in results.models.items():
         counts = status_counts(model)
         traits = dict(model.attrs.get("traits", {}))
         total = sum(counts.values())
         about = [traits.get(name, "") for name in ("age", "gender", "ancestry")]
-        fitted = [total, counts[FitStatus.FITTED], 100 * counts[FitStatus.FITTED] / total]
+        fitted = [
+            total,
+            counts[FitStatus.FITTED],
+            100 * counts[FitStatus.FITTED] / total,
+        ]
         found: Any = results.recovered[take].summary()
-        errors = [found["normal_median_deg"], found["normal_95_deg"], *found["diffuse_median_percent"]]
-        held = 100 * results.fits[take].get("held_out_error", {}).get("median", float("nan"))
-        rows.append([take, *about, model.attrs.get("condition", "normal"), *fitted, *errors, held])
+        errors = [
+            found["normal_median_deg"],
+            found["normal_95_deg"],
+            *found["diffuse_median_percent"],
+        ]
+        held = 100 * results.fits[take].get("held_out_error", {}).get(
+            "median", float("nan")
+        )
+        rows.append(
+            [
+                take,
+                *about,
+                model.attrs.get("condition", "normal"),
+                *fitted,
+                *errors,
+                held,
+            ]
+        )
     return Table("subjects", SUBJECT_HEADER, rows)
 
 
@@ -57,11 +80,19 @@ def status_table(results: Results) -> Table:
     """Number of surfels by take and status."""
     counted = {take: status_counts(model) for take, model in results.models.items()}
     rows = [
-        [take, status.name.lower(), count, 100 * count / sum(counts.values()), status.explanation]
+        [
+            take,
+            status.name.lower(),
+            count,
+            100 * count / sum(counts.values()),
+            status.explanation,
+        ]
         for take, counts in counted.items()
         for status, count in counts.items()
     ]
-    return Table("surfel_statuses", ["take", "status", "surfels", "percent", "explanation"], rows)
+    return Table(
+        "surfel_statuses", ["take", "status", "surfels", "percent", "explanation"], rows
+    )
 
 
 def status_sums(results: Results) -> Table:
@@ -70,7 +101,12 @@ def status_sums(results: Results) -> Table:
     sums = {status: sum(counts[status] for counts in counted) for status in FitStatus}
     total = sum(sums.values())
     rows = [
-        [status.name.lower().replace("_", " "), status.explanation, count, 100 * count / total]
+        [
+            status.name.lower().replace("_", " "),
+            status.explanation,
+            count,
+            100 * count / total,
+        ]
         for status, count in sums.items()
         if count
     ]
@@ -80,11 +116,19 @@ def status_sums(results: Results) -> Table:
 def photograph_table(results: Results) -> Table:
     """Errors of the predicted photographs."""
     rows = [
-        [take, one.light, one.camera, "yes" if one.held_out else "no", *(one.error[name] for name in ERROR_COLUMNS)]
+        [
+            take,
+            one.light,
+            one.camera,
+            "yes" if one.held_out else "no",
+            *(one.error[name] for name in ERROR_COLUMNS),
+        ]
         for take, found in results.compared.items()
         for one in found
     ]
-    return Table("photographs", ["take", "light", "camera", "held_out", *ERROR_COLUMNS], rows)
+    return Table(
+        "photographs", ["take", "light", "camera", "held_out", *ERROR_COLUMNS], rows
+    )
 
 
 def site_table(results: Results) -> Table:
@@ -92,7 +136,10 @@ def site_table(results: Results) -> Table:
     rows = []
     for take, one in results.recovered.items():
         found: Any = one.summary()
-        rows += [[take, site, *map(float, values)] for site, values in found["sigma_tr_percent"].items()]
+        rows += [
+            [take, site, *map(float, values)]
+            for site, values in found["sigma_tr_percent"].items()
+        ]
     header = ["take", "site", "red_percent", "green_percent", "blue_percent"]
     return Table("sigma_tr_errors", header, rows)
 
@@ -108,6 +155,10 @@ def time_tables(results: Results) -> tuple[Table, Table]:
     for fit in results.fits.values():
         for name, seconds in fit["seconds"].items():
             stages.setdefault(name, []).append(seconds)
-    demo = [[name, seconds] for name, seconds in results.seconds.items() if name != "report"]
+    demo = [
+        [name, seconds] for name, seconds in results.seconds.items() if name != "report"
+    ]
     inside = [[name, float(np.mean(values))] for name, values in stages.items()]
-    return Table("times_demo", ["stage", "seconds"], demo), Table("times_fit", ["stage", "seconds"], inside)
+    return Table("times_demo", ["stage", "seconds"], demo), Table(
+        "times_fit", ["stage", "seconds"], inside
+    )

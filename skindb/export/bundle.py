@@ -1,4 +1,6 @@
-"""Export of a model to a folder for other programs: EXR maps, BRDF tables, scenes, and a manifest with the errors."""
+"""Export of a model to a folder for other programs: EXR maps, BRDF tables, scenes, and
+a manifest with the errors.
+"""
 
 from __future__ import annotations
 
@@ -67,7 +69,8 @@ ERRORS = (
     "normal_total_error",
     "surface_reflectance_error",
 )
-# standard_error is from the errors of the fibres; total_error includes the error of the model of the profile
+# standard_error is from the errors of the fibres; total_error includes the error of the
+# model of the profile
 SITE_FIGURES = {
     "sigma_tr": "site_sigma_tr",
     "standard_error": "site_sigma_tr_error",
@@ -77,22 +80,40 @@ CONVENTIONS = {
     "length": "mm in maps and tables, metres in model.glb",
     "frame": "right-handed, +x to the subject's left, +y up, +z out of the face",
     "colour": "scene-linear RGB, Rec. 709 primaries, D65",
-    "texture": "v = 0 at the top row; texel (i, j) has its centre at v = (i + 0.5)/height, u = (j + 0.5)/width",
-    "reflectance": "f_r = F_t(i) F_t(o) albedo / pi + sum over k of weight_k b_k(theta_h, theta_d, phi_d)",
+    "texture": (
+        "v = 0 at the top row; texel (i, j) has its centre at v = (i + 0.5)/height, u "
+        "= (j + 0.5)/width"
+    ),
+    "reflectance": (
+        "f_r = F_t(i) F_t(o) albedo / pi + sum over k of weight_k b_k(theta_h, "
+        "theta_d, phi_d)"
+    ),
     "fresnel": "exact, unpolarised, refractive index eta; the bases contain their own Fresnel term",
-    "angles": "Rusinkiewicz half/difference; tables: nodes uniform in sqrt(theta_h), theta_d and phi_d (period pi)",
-    "light_disc": "bases.npz and the MERL files are averaged over the round lights of the dome, whose angular radius "
-    "seen from the skin is disc_angular_radius [rad]. Use them with point lights, because disc lights would widen "
+    "angles": (
+        "Rusinkiewicz half/difference; tables: nodes uniform in sqrt(theta_h), theta_d "
+        "and phi_d (period pi)"
+    ),
+    "light_disc": "bases.npz and the MERL files are averaged over the round lights of the dome, "
+    "whose angular radius "
+    "seen from the skin is disc_angular_radius [rad]. Use them with point lights, "
+    "because disc lights would widen "
     "highlights twice. If it is 0, the BRDFs are for point lights, as measured",
-    "translucency": "translucency_sites: sigma_tr [1/mm] of R, G, B at the sites of the probe, its standard_error from "
-    "the fibres, its total_error, which includes that of the model, and the status of the fit. maps/translucency.exr "
+    "translucency": "translucency_sites: sigma_tr [1/mm] of R, G, B at the sites of the probe, its "
+    "standard_error from "
+    "the fibres, its total_error, which includes that of the model, and the status "
+    "of the fit. maps/translucency.exr "
     "interpolates 1 / sigma_tr between the sites; its error there is unknown",
     "merl": "90 x 90 x 180 bins, values at bin centres, the three channels equal",
 }
 
 
 def export_bundle(
-    model: xr.DataTree, out: str | Path, *, size: int | None = None, merl: bool = True, progress: Progress | None = None
+    model: xr.DataTree,
+    out: str | Path,
+    *,
+    size: int | None = None,
+    merl: bool = True,
+    progress: Progress | None = None,
 ) -> Path:
     """Write the folder `out`: `maps/*.exr`, `bases/`, `model.glb`, manifest.json and README.txt.
 
@@ -103,7 +124,8 @@ def export_bundle(
     out
         Folder that does not exist or is empty. If the export fails, it is not created.
     size
-        Texels along each side of the maps; default 1.5 texels per spacing of the surfels, rounded up to a power of two.
+        Texels along each side of the maps; default 1.5 texels per spacing of the
+        surfels, rounded up to a power of two.
     merl
         Whether to write each component in the binary format of MERL too (35 MB each).
     progress
@@ -118,7 +140,14 @@ def export_bundle(
     target = Path(out).absolute()  # absolute, as "." has no name
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         found = "files in it" if target.is_dir() else "a file"
-        raise InputError(Fault(str(target), "must be a new or empty folder", found, "choose another folder"))
+        raise InputError(
+            Fault(
+                str(target),
+                "must be a new or empty folder",
+                found,
+                "choose another folder",
+            )
+        )
     tell = progress or silent
     staged = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.partial")
     try:
@@ -126,13 +155,17 @@ def export_bundle(
     except OSError as error:
         rule = "must be a folder that can be created"
         found = error.strerror or str(error)
-        raise InputError(Fault(str(target), rule, found, "choose another folder")) from None
+        raise InputError(
+            Fault(str(target), rule, found, "choose another folder")
+        ) from None
     try:
         described = _write_parts(model, staged, size, merl, tell)
         manifest = _manifest(model, staged, described)
         text = json.dumps(plain(manifest), indent=1, allow_nan=False)
         private_file(staged / "manifest.json").write_text(text + "\n", encoding="utf-8")
-        private_file(staged / "README.txt").write_text(readme(manifest), encoding="utf-8")
+        private_file(staged / "README.txt").write_text(
+            readme(manifest), encoding="utf-8"
+        )
         if target.exists():
             target.rmdir()
         staged.rename(target)
@@ -142,7 +175,9 @@ def export_bundle(
 
 
 def merl_table(table: NDArray[np.float32]) -> NDArray[np.float64]:
-    """One component (nh, nd, np) resampled to the bin centres of MERL, (90, 90, 180, 3), with equal channels."""
+    """One component (nh, nd, np) resampled to the bin centres of MERL, (90, 90, 180,
+    3), with equal channels.
+    """
     h = (np.arange(90) + 0.5) ** 2 / 90**2 * np.pi / 2
     d = (np.arange(90) + 0.5) / 90 * np.pi / 2
     p = (np.arange(180) + 0.5) / 180 * np.pi
@@ -158,21 +193,35 @@ def _write_parts(
     maps = texture_maps(model, size=size)
     described = _write_maps(maps, folder / "maps")
     path = maps.get("mean_free_path")
-    longest = float(path.values.max()) if path is not None and len(path.channels) == 3 else 0.0
+    longest = (
+        float(path.values.max())
+        if path is not None and len(path.channels) == 3
+        else 0.0
+    )
     del path, maps  # large, and the textures need as much memory again
     tell("bases", 1, 3)
     described |= _write_bases(model["basis"].to_dataset(), folder / "bases", merl)
     tell("glTF", 2, 3)
     skin = skin_of(model, size=size)
     error = export_gltf(model, folder / "model.glb", skin=skin)
-    about = "glTF 2.0: mesh, uv, shading normals as a texture, and a metallic-roughness approximation of the material"
-    described["model.glb"] = {"holds": about, "units": "m", "approximation_error": error}
+    about = (
+        "glTF 2.0: mesh, uv, shading normals as a texture, and a metallic-roughness "
+        "approximation of the material"
+    )
+    described["model.glb"] = {
+        "holds": about,
+        "units": "m",
+        "approximation_error": error,
+    }
     export_usd(model, folder / "usd", skin, longest_path=longest)
     described |= _usd_files(skin)
     export_mitsuba(model, folder / "mitsuba")
     about = "mesh for Mitsuba: positions [mm], shading normals, uv"
     described[f"mitsuba/{MESH}"] = {"holds": about, "units": "mm"}
-    about = "Mitsuba 3: the exact BRDFs as a BSDF, and a scene, which python skin.py picture.exr renders"
+    about = (
+        "Mitsuba 3: the exact BRDFs as a BSDF, and a scene, which python skin.py "
+        "picture.exr renders"
+    )
     described[f"mitsuba/{PROGRAM}"] = {"holds": about, "units": "mm"}
     tell("done", 3, 3)
     return described
@@ -181,15 +230,25 @@ def _write_parts(
 def _usd_files(skin: Skin) -> dict[str, dict[str, Any]]:
     """Descriptions of the files of the USD scene."""
     holds = {
-        STAGE: ("USD scene: mesh, and an OpenPBR material (MaterialX) with light under the skin", "mm"),
-        MATERIAL: ("only the OpenPBR material, for programs that read MaterialX; lengths in mm", "mm"),
+        STAGE: (
+            "USD scene: mesh, and an OpenPBR material (MaterialX) with light under the skin",
+            "mm",
+        ),
+        MATERIAL: (
+            "only the OpenPBR material, for programs that read MaterialX; lengths in mm",
+            "mm",
+        ),
         "baseColor.png": ("base colour, sRGB", "1"),
         "roughness.png": ("perceptual roughness, linear", "1"),
         "specularFactor.png": ("factor on all reflection, linear", "1"),
-        "normal.png": ("normals in tangent space, times 0.5 plus 0.5, +y towards the top of the texture", "1"),
+        "normal.png": (
+            "normals in tangent space, times 0.5 plus 0.5, +y towards the top of the texture",
+            "1",
+        ),
     }
     found: dict[str, dict[str, Any]] = {
-        f"usd/{name}": {"holds": text, "units": units} for name, (text, units) in holds.items()
+        f"usd/{name}": {"holds": text, "units": units}
+        for name, (text, units) in holds.items()
     }
     found[f"usd/{STAGE}"] |= {
         "approximation_error": skin.error_of_one_index,
@@ -202,41 +261,69 @@ def _write_maps(maps: dict[str, TextureMap], folder: Path) -> dict[str, dict[str
     make_private(folder)
     described = {}
     for name, texture in maps.items():
-        planes = dict(zip(texture.channels, np.moveaxis(texture.values, -1, 0), strict=True))
+        planes = dict(
+            zip(texture.channels, np.moveaxis(texture.values, -1, 0), strict=True)
+        )
         about = {"units": texture.units, "comments": texture.doc}
         about |= {key: CONVENTIONS[key] for key in ("frame", "colour", "texture")}
         write_exr(folder / f"{name}.exr", planes, attributes=about)
         shape = {"width": texture.values.shape[1], "height": texture.values.shape[0]}
-        holds = {"holds": texture.doc, "units": texture.units, "channels": list(texture.channels)}
+        holds = {
+            "holds": texture.doc,
+            "units": texture.units,
+            "channels": list(texture.channels),
+        }
         described[f"maps/{name}.exr"] = holds | shape
     return described
 
 
-def _write_bases(basis: xr.Dataset, folder: Path, merl: bool) -> dict[str, dict[str, Any]]:
+def _write_bases(
+    basis: xr.Dataset, folder: Path, merl: bool
+) -> dict[str, dict[str, Any]]:
     make_private(folder)
     tables = kernel_tables(basis)
     count = tables.shape[-1]
-    names = basis["component"].values if "component" in basis.coords else [f"component{k}" for k in range(count)]
+    names = (
+        basis["component"].values
+        if "component" in basis.coords
+        else [f"component{k}" for k in range(count)]
+    )
     disc = float(basis["disc_angular_radius"])
-    dictionary = Dictionary(tuple(map(str, names)), tables, TableGrid(*tables.shape[:3]), "basis", disc)
-    more = {"basis_mixture": basis["basis_mixture"].values} if "basis_mixture" in basis else {}
+    dictionary = Dictionary(
+        tuple(map(str, names)), tables, TableGrid(*tables.shape[:3]), "basis", disc
+    )
+    more = (
+        {"basis_mixture": basis["basis_mixture"].values}
+        if "basis_mixture" in basis
+        else {}
+    )
     if "dictionary" in basis.coords:
         more["dictionary_names"] = np.array(list(map(str, basis["dictionary"].values)))
     write_tables(folder / "bases.npz", dictionary, **more)
     about = (
-        "basis_brdf (component, theta_h, theta_d, phi_d), its nodes [rad], mixtures of the measured BRDFs; "
+        "basis_brdf (component, theta_h, theta_d, phi_d), its nodes [rad], "
+        "mixtures of the measured BRDFs; "
         "skindb fit --dictionary reads it"
     )
-    described: dict[str, dict[str, Any]] = {"bases/bases.npz": {"holds": about, "units": "sr-1"}}
+    described: dict[str, dict[str, Any]] = {
+        "bases/bases.npz": {"holds": about, "units": "sr-1"}
+    }
     for k in range(count if merl else 0):
         write_merl(folder / f"component_{k}.binary", merl_table(tables[..., k]))
-        described[f"bases/component_{k}.binary"] = {"holds": f"component {k}, MERL BRDF format", "units": "sr-1"}
+        described[f"bases/component_{k}.binary"] = {
+            "holds": f"component {k}, MERL BRDF format",
+            "units": "sr-1",
+        }
     return described
 
 
-def _manifest(model: xr.DataTree, folder: Path, described: dict[str, dict[str, Any]]) -> dict[str, Any]:
+def _manifest(
+    model: xr.DataTree, folder: Path, described: dict[str, dict[str, Any]]
+) -> dict[str, Any]:
     attrs = model.attrs
-    files = {name: about | _fingerprint(folder / name) for name, about in described.items()}
+    files = {
+        name: about | _fingerprint(folder / name) for name, about in described.items()
+    }
     return {
         "format": "skindb-bundle",
         "version": 1,
@@ -258,20 +345,32 @@ def _manifest(model: xr.DataTree, folder: Path, described: dict[str, dict[str, A
 def _missing(model: xr.DataTree, described: dict[str, dict[str, Any]]) -> list[str]:
     """Parts of a complete bundle that this one lacks, with the reasons."""
     edited = (
-        "error, maps of errors, errors of translucency_sites: they describe the fit, which did not see the edited face"
+        "error, maps of errors, errors of translucency_sites: they describe the fit, "
+        "which did not see the edited face"
     )
     there = described.get("maps/translucency.exr", {}).get("channels", [])
     lost = [channel for channel in "RGB" if channel not in there]
-    unprobed = [f"maps/translucency.exr: {', '.join(lost)}: sigma_tr is unknown at all probe sites"] if lost else []
+    unprobed = (
+        [
+            f"maps/translucency.exr: {', '.join(lost)}: sigma_tr is unknown at all probe sites"
+        ]
+        if lost
+        else []
+    )
     return [edited, *unprobed] if "edit" in model.attrs else unprobed
 
 
 def _errors(fitted: xr.Dataset) -> dict[str, Any]:
-    """Median and 95 % quantile over fitted surfels of every quality measure, and the fraction of each status."""
+    """Median and 95 % quantile over fitted surfels of every quality measure, and the
+    fraction of each status.
+    """
     status = fitted["fit_status"].values
     report: dict[str, Any] = {"surfels": int(status.size)}
     report["status_fraction"] = {
-        member.name.lower(): {"fraction": float((status == member).mean()), "meaning": member.explanation}
+        member.name.lower(): {
+            "fraction": float((status == member).mean()),
+            "meaning": member.explanation,
+        }
         for member in FitStatus
         if (status == member).any()
     }
@@ -280,25 +379,48 @@ def _errors(fitted: xr.Dataset) -> dict[str, Any]:
             continue
         values = fitted[name].values
         finite = values[np.isfinite(values)]
-        quantiles = np.quantile(finite, [0.5, 0.95]) if finite.size else [np.nan, np.nan]
+        quantiles = (
+            np.quantile(finite, [0.5, 0.95]) if finite.size else [np.nan, np.nan]
+        )
         about = {"units": VARIABLES[name].units, "meaning": VARIABLES[name].doc}
-        report[name] = {"median": float(quantiles[0]), "quantile_95": float(quantiles[1])} | about
+        report[name] = {
+            "median": float(quantiles[0]),
+            "quantile_95": float(quantiles[1]),
+        } | about
     return report
 
 
 def _sites(model: xr.DataTree) -> dict[str, Any]:
-    """sigma_tr [mm^-1], its errors and its status per probe site and channel; empty without a probe."""
+    """sigma_tr [mm^-1], its errors and its status per probe site and channel; empty
+    without a probe.
+    """
     for group in (node.to_dataset() for node in model.subtree):
         if "site_sigma_tr" in group.data_vars:
-            sites = group["site"].values if "site" in group.coords else np.arange(group.sizes["site"])
-            have = {key: group[name].values for key, name in SITE_FIGURES.items() if name in group.data_vars}
+            sites = (
+                group["site"].values
+                if "site" in group.coords
+                else np.arange(group.sizes["site"])
+            )
+            have = {
+                key: group[name].values
+                for key, name in SITE_FIGURES.items()
+                if name in group.data_vars
+            }
             if "site_status" in group.data_vars:
                 named = {int(status): status.name.lower() for status in ProbeStatus}
-                have["status"] = np.vectorize(named.__getitem__)(group["site_status"].values)
-            return {str(site): {key: have[key][i] for key in have} for i, site in enumerate(sites)}
+                have["status"] = np.vectorize(named.__getitem__)(
+                    group["site_status"].values
+                )
+            return {
+                str(site): {key: have[key][i] for key in have}
+                for i, site in enumerate(sites)
+            }
     return {}
 
 
 def _fingerprint(path: Path) -> dict[str, Any]:
     with path.open("rb") as file:
-        return {"sha256": hashlib.file_digest(file, "sha256").hexdigest(), "bytes": path.stat().st_size}
+        return {
+            "sha256": hashlib.file_digest(file, "sha256").hexdigest(),
+            "bytes": path.stat().st_size,
+        }

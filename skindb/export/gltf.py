@@ -1,4 +1,6 @@
-"""Export of a fitted model to glTF 2.0: one .glb file with mesh, textures and the error of the approximation."""
+"""Export of a fitted model to glTF 2.0: one .glb file with mesh, textures and the error
+of the approximation.
+"""
 
 from __future__ import annotations
 
@@ -25,16 +27,23 @@ MM = 1e-3  # glTF's unit is the metre
 
 
 def export_gltf(
-    model: xr.DataTree, out: str | Path, *, size: int | None = None, skin: Skin | None = None
+    model: xr.DataTree,
+    out: str | Path,
+    *,
+    size: int | None = None,
+    skin: Skin | None = None,
 ) -> dict[str, float]:
     """Write a binary glTF 2.0 file of a model.
 
-    The material is metallic-roughness with KHR_materials_specular and KHR_materials_ior. The base colour is from R_d
-    and the flat part of the measured BRDFs; roughness, specular factor and specular colour are from the reduced basis,
-    such that pictures differ as little as possible (`fit_material`). Shading normals are a texture in tangent space.
-    If parts of the face, such as an ear, are so thin that they transmit 1 % of the diffuse light, the material also has
-    KHR_materials_diffuse_transmission. glTF has neither measured BRDFs nor subsurface transport over a distance. The
-    resulting error is written to `extras` of the material and returned.
+    The material is metallic-roughness with KHR_materials_specular and
+    KHR_materials_ior. The base colour is from R_d and the flat part of the measured
+    BRDFs; roughness, specular factor and specular colour are from the reduced basis,
+    such that pictures differ as little as possible (`fit_material`). Shading normals
+    are a texture in tangent space. If parts of the face, such as an ear, are so thin
+    that they transmit 1 % of the diffuse light, the material also has
+    KHR_materials_diffuse_transmission. glTF has neither measured BRDFs nor subsurface
+    transport over a distance. The resulting error is written to `extras` of the
+    material and returned.
 
     Parameters
     ----------
@@ -54,38 +63,70 @@ def export_gltf(
     """
     require_consent(model.attrs, "export")
     skin = skin or skin_of(model, size=size)
-    files = {name: bytes(imagecodecs.png_encode(picture)) for name, picture in skin.pictures.items()}
+    files = {
+        name: bytes(imagecodecs.png_encode(picture))
+        for name, picture in skin.pictures.items()
+    }
     document, body = _document(files, _extras(model, skin), skin)
     private_file(out).write_bytes(_glb(document, body))
     return skin.error
 
 
-def _document(textures: dict[str, bytes], extras: dict[str, Any], skin: Skin) -> tuple[dict[str, Any], bytes]:
+def _document(
+    textures: dict[str, bytes], extras: dict[str, Any], skin: Skin
+) -> tuple[dict[str, Any], bytes]:
     """The JSON document of the scene, and the binary data to which it refers."""
     shape = skin.shape
     material = _material(extras, skin)
-    take = str(extras["take"])  # in all names, because programs merge what has the same name in several files
+    # in all names, because programs merge what has the same name in several files
+    take = str(extras["take"])
     position = shape.position * np.float32(MM)
     blocks = {
         "POSITION": (position, VERTEX_BUFFER, FLOAT, "VEC3"),
         "NORMAL": (shape.normal.astype(np.float32), VERTEX_BUFFER, FLOAT, "VEC3"),
         "TEXCOORD_0": (shape.uv, VERTEX_BUFFER, FLOAT, "VEC2"),
         "TANGENT": (shape.tangent.astype(np.float32), VERTEX_BUFFER, FLOAT, "VEC4"),
-        "indices": (shape.triangles.astype(np.uint32).reshape(-1), INDEX_BUFFER, UNSIGNED_INT, "SCALAR"),
+        "indices": (
+            shape.triangles.astype(np.uint32).reshape(-1),
+            INDEX_BUFFER,
+            UNSIGNED_INT,
+            "SCALAR",
+        ),
     }
     views: list[dict[str, int]] = []
     body = b""
     accessors = []
     for array, target, component, kind in blocks.values():
-        accessors.append({"bufferView": len(views), "componentType": component, "count": len(array), "type": kind})
+        accessors.append(
+            {
+                "bufferView": len(views),
+                "componentType": component,
+                "count": len(array),
+                "type": kind,
+            }
+        )
         body = _append(body, views, array.tobytes(), target=target)
-    accessors[0] |= {"min": position.min(axis=0).tolist(), "max": position.max(axis=0).tolist()}
+    accessors[0] |= {
+        "min": position.min(axis=0).tolist(),
+        "max": position.max(axis=0).tolist(),
+    }
     images = []
     for name, png in textures.items():
-        images.append({"bufferView": len(views), "mimeType": "image/png", "name": f"{take}_{name}"})
+        images.append(
+            {
+                "bufferView": len(views),
+                "mimeType": "image/png",
+                "name": f"{take}_{name}",
+            }
+        )
         body = _append(body, views, png)
     attributes = {name: i for i, name in enumerate(blocks) if name != "indices"}
-    primitive = {"attributes": attributes, "indices": len(attributes), "material": 0, "mode": 4}
+    primitive = {
+        "attributes": attributes,
+        "indices": len(attributes),
+        "material": 0,
+        "mode": 4,
+    }
     document = {
         "asset": {"version": "2.0", "generator": f"skindb {__version__}"},
         "extensionsUsed": sorted(material["extensions"]),
@@ -94,7 +135,9 @@ def _document(textures: dict[str, bytes], extras: dict[str, Any], skin: Skin) ->
         "nodes": [{"mesh": 0, "name": take}],
         "meshes": [{"primitives": [primitive], "name": take}],
         "materials": [material],
-        "samplers": [{"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}],
+        "samplers": [
+            {"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}
+        ],
         "textures": [{"sampler": 0, "source": i} for i in range(len(images))],
         "images": images,
         "accessors": accessors,
@@ -105,8 +148,16 @@ def _document(textures: dict[str, bytes], extras: dict[str, Any], skin: Skin) ->
 
 
 def _material(extras: dict[str, Any], skin: Skin) -> dict[str, Any]:
-    pbr = {"baseColorTexture": {"index": 0}, "metallicRoughnessTexture": {"index": 1}, "metallicFactor": 0.0}
-    specular = {"specularFactor": 1.0, "specularTexture": {"index": 2}, "specularColorTexture": {"index": 3}}
+    pbr = {
+        "baseColorTexture": {"index": 0},
+        "metallicRoughnessTexture": {"index": 1},
+        "metallicFactor": 0.0,
+    }
+    specular = {
+        "specularFactor": 1.0,
+        "specularTexture": {"index": 2},
+        "specularColorTexture": {"index": 3},
+    }
     root = np.sqrt(skin.top_f0)
     extensions: dict[str, Any] = {
         "KHR_materials_ior": {"ior": float((1 + root) / (1 - root))},
@@ -133,23 +184,38 @@ def _extras(model: xr.DataTree, skin: Skin) -> dict[str, Any]:
     return {
         "take": str(model.attrs.get("take", model.attrs.get("subject", "face"))),
         "source": "measured skin reflectance (Weyrich et al. 2005), approximated",
-        "conventions": "metres, +x to the subject's left, +y up, +z out of the face; Rec. 709 primaries, D65",
+        "conventions": (
+            "metres, +x to the subject's left, +y up, +z out of the face; Rec. 709 "
+            "primaries, D65"
+        ),
         "edited": describe_edit(model.attrs),
         "approximation_error": skin.error,
         "largest_transmitted_fraction": skin.transmitted,
-        "skipped": ["subsurface transport", "retro-reflection and other details of the measured lobes"],
+        "skipped": [
+            "subsurface transport",
+            "retro-reflection and other details of the measured lobes",
+        ],
     }
 
 
-def _append(body: bytes, views: list[dict[str, int]], data: bytes, *, target: int | None = None) -> bytes:
+def _append(
+    body: bytes, views: list[dict[str, int]], data: bytes, *, target: int | None = None
+) -> bytes:
     view = {"buffer": 0, "byteOffset": len(body), "byteLength": len(data)}
     views.append(view if target is None else view | {"target": target})
     return body + data + b"\0" * (-len(data) % 4)
 
 
 def _glb(document: dict[str, Any], body: bytes) -> bytes:
-    """Container of a JSON chunk and a binary chunk, each padded to four bytes (glTF 2.0, section 4.4)."""
+    """Container of a JSON chunk and a binary chunk, each padded to four bytes (glTF
+    2.0, section 4.4).
+    """
     text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
-    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(body), b"BIN\0") + body
+    chunks = (
+        struct.pack("<I4s", len(text), b"JSON")
+        + text
+        + struct.pack("<I4s", len(body), b"BIN\0")
+        + body
+    )
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks

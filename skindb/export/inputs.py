@@ -20,15 +20,20 @@ REQUIRED = (
     "fit_status",
     "refractive_index",
 )
-TEXELS_PER_SPACING = 1.5  # texels per spacing of surfels; more would only show interpolation, less would lose detail
+# texels per spacing of surfels; more would only show interpolation, less would lose
+# detail
+TEXELS_PER_SPACING = 1.5
 # of the default
 MIN_SIZE = 64
 MAX_SIZE = 8192
-BYTES_PER_TEXEL = 220  # of memory while maps of 30 channels are computed (measured: 190)
+# of memory while maps of 30 channels are computed (measured: 190)
+BYTES_PER_TEXEL = 220
 
 
 def texture_size(model: xr.DataTree) -> int:
-    """Texels along each side of maps without loss: 1.5 per spacing of the surfels, rounded up to a power of two."""
+    """Texels along each side of maps without loss: 1.5 per spacing of the surfels,
+    rounded up to a power of two.
+    """
     uv = model["fitted"].to_dataset()["surfel_uv"].values
     triangles = model["mesh"].to_dataset()["triangle"].values
     corners = uv.astype(np.float64)[triangles]
@@ -53,7 +58,14 @@ def chosen_size(model: xr.DataTree, size: int | None) -> int:
     if needed > free:
         rule = f"maps of {side} x {side} texels need {needed / 1e9:.1f} GB of memory"
         cure = "choose a smaller size"
-        raise InputError(Fault("size", rule, f"{free / 1e9:.1f} GB", f"{cure}, for example {texture_size(model)}"))
+        raise InputError(
+            Fault(
+                "size",
+                rule,
+                f"{free / 1e9:.1f} GB",
+                f"{cure}, for example {texture_size(model)}",
+            )
+        )
     return side
 
 
@@ -63,7 +75,11 @@ def _free_memory() -> float:
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
     except OSError:
         return np.inf
-    found = [float(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")]
+    found = [
+        float(line.split()[1]) * 1024
+        for line in lines
+        if line.startswith("MemAvailable:")
+    ]
     return found[0] if found else np.inf
 
 
@@ -77,10 +93,18 @@ def required(model: xr.DataTree) -> xr.Dataset:
     """
     fitted = model["fitted"].to_dataset()
     check(fitted, REQUIRED, where="fitted")
-    corner = fitted["surfel_uv"].values[model["mesh"].to_dataset()["triangle"].values].astype(np.float64)
+    corner = (
+        fitted["surfel_uv"]
+        .values[model["mesh"].to_dataset()["triangle"].values]
+        .astype(np.float64)
+    )
     if not np.isfinite(corner).all() or not np.ptp(corner, axis=1).any():
         rule = "texture coordinates must be finite and cover an area"
         cure = "ingest and fit the capture again"
-        found = "values that are not finite" if not np.isfinite(corner).all() else "no triangle with an area"
+        found = (
+            "values that are not finite"
+            if not np.isfinite(corner).all()
+            else "no triangle with an area"
+        )
         raise InputError(Fault("fitted[surfel_uv]", rule, found, cure))
     return fitted

@@ -24,10 +24,14 @@ MEASURED = {  # map: variable of the model; edited models have none of these
     "surface_reflectance": "surface_reflectance",
     "surface_reflectance_error": "surface_reflectance_error",
 }
-CONFIDENCE = "1 between fitted surfels, less towards doubtful ones, 0 where values are filled in from the surroundings"
+CONFIDENCE = (
+    "1 between fitted surfels, less towards doubtful ones, 0 where values are filled "
+    "in from the surroundings"
+)
 TRANSLUCENCY = {
     "translucency": "translucency 1 / sigma_tr, the diffusion length",
-    "mean_free_path": "mean free path with which a random walk under the skin, as of OpenPBR, spreads light as far as "
+    "mean_free_path": "mean free path with which a random walk under the skin, as of OpenPBR, "
+    "spreads light as far as "
     "the dipole with this sigma_tr",
 }
 STATUS = "; ".join(f"{int(code)} {code.explanation}" for code in TexelStatus)
@@ -53,9 +57,15 @@ class Atlas:
 
 
 def atlas_images(
-    model: xr.DataTree, columns: dict[str, NDArray[np.float32]], trust: NDArray[np.float32], *, size: int
+    model: xr.DataTree,
+    columns: dict[str, NDArray[np.float32]],
+    trust: NDArray[np.float32],
+    *,
+    size: int,
 ) -> tuple[Image, dict[str, int]]:
-    """Texels (size, size, c) of concatenated values (n, c) at the surfels, and the number of channels of each name."""
+    """Texels (size, size, c) of concatenated values (n, c) at the surfels, and the
+    number of channels of each name.
+    """
     uv = model["fitted"].to_dataset()["surfel_uv"].values
     triangles = model["mesh"].to_dataset()["triangle"].values
     atlas = Atlas(uv, triangles, rasterise_atlas(uv, triangles, size))
@@ -63,7 +73,9 @@ def atlas_images(
     return image, {name: values.shape[1] for name, values in columns.items()}
 
 
-def texture_maps(model: xr.DataTree, *, size: int | None = None) -> dict[str, TextureMap]:
+def texture_maps(
+    model: xr.DataTree, *, size: int | None = None
+) -> dict[str, TextureMap]:
     """Texture maps of albedo, normals, weights of components, translucency, confidence and status.
 
     Parameters
@@ -71,8 +83,8 @@ def texture_maps(model: xr.DataTree, *, size: int | None = None) -> dict[str, Te
     model
         Version of kind "model".
     size
-        Texels along each side, default `texture_size`; texel (i, j) has its centre at v = (i + 0.5) / size and
-        u = (j + 0.5) / size.
+        Texels along each side, default `texture_size`; texel (i, j) has its centre at v
+        = (i + 0.5) / size and u = (j + 0.5) / size.
 
     Returns
     -------
@@ -84,40 +96,69 @@ def texture_maps(model: xr.DataTree, *, size: int | None = None) -> dict[str, Te
         - `normal_tangent`: the same in the tangent frames of the mesh, see `tangent_frames`
         - `weight_<k>` per component
         - `translucency`: 1 / sigma_tr, of the channels in which the model has it
-        - `mean_free_path`: for renderers that trace random walks under the skin, of the same channels
-        - `confidence`: 1 between fitted surfels, lower towards doubtful ones, 0 where values are filled in from the
-          surroundings (push-pull)
+        - `mean_free_path`: for renderers that trace random walks under the skin, of the
+          same channels
+        - `confidence`: 1 between fitted surfels, lower towards doubtful ones, 0 where
+          values are filled in from the surroundings (push-pull)
         - `status`: the reason, as a code of `skindb.schema.TexelStatus`
-        - if the model has them, `albedo_error`, `normal_error` [degree] (both include the error of the model),
-          `surface_reflectance` and `surface_reflectance_error`
+        - if the model has them, `albedo_error`, `normal_error` [degree] (both include
+          the error of the model), `surface_reflectance` and `surface_reflectance_error`
     """
     fitted = required(model)
     trust = surfel_confidence(fitted)
     uv = fitted["surfel_uv"].values
     triangles = model["mesh"].to_dataset()["triangle"].values
-    atlas = Atlas(uv, triangles, rasterise_atlas(uv, triangles, chosen_size(model, size)))
+    atlas = Atlas(
+        uv, triangles, rasterise_atlas(uv, triangles, chosen_size(model, size))
+    )
     columns, layout = _columns(fitted, triangles)
     image, confidence = _spread(columns, trust, atlas)
     status = texel_codes(surfel_texels(fitted), triangles, *atlas.raster)
-    quality = {"confidence": _single_channel(confidence, CONFIDENCE), "status": _single_channel(status, STATUS)}
-    return _fitted_maps(image, layout) | _translucency(fitted, trust, atlas) | _measured(fitted, trust, atlas) | quality
+    quality = {
+        "confidence": _single_channel(confidence, CONFIDENCE),
+        "status": _single_channel(status, STATUS),
+    }
+    return (
+        _fitted_maps(image, layout)
+        | _translucency(fitted, trust, atlas)
+        | _measured(fitted, trust, atlas)
+        | quality
+    )
 
 
-def _spread(columns: NDArray[Any], trust: NDArray[np.float32], atlas: Atlas) -> tuple[Image, Image]:
-    """Texels (size, size, c), interpolated and filled in from the surroundings, and their confidence (size, size)."""
-    image, confidence = atlas_values(columns, trust, atlas.uv, atlas.triangles, atlas.raster)
-    # texels are smoothed only if adjacent ones have a higher confidence, so that evenly doubtful regions stay sharp
-    surest = np.maximum(ndimage.maximum_filter(confidence, 3), np.finfo(np.float32).tiny)
+def _spread(
+    columns: NDArray[Any], trust: NDArray[np.float32], atlas: Atlas
+) -> tuple[Image, Image]:
+    """Texels (size, size, c), interpolated and filled in from the surroundings, and
+    their confidence (size, size).
+    """
+    image, confidence = atlas_values(
+        columns, trust, atlas.uv, atlas.triangles, atlas.raster
+    )
+    # texels are smoothed only if adjacent ones have a higher confidence, so that evenly
+    # doubtful regions stay sharp
+    surest = np.maximum(
+        ndimage.maximum_filter(confidence, 3), np.finfo(np.float32).tiny
+    )
     return push_pull(image, confidence / surest)[0], confidence
 
 
-def _columns(fitted: xr.Dataset, triangles: NDArray[Any]) -> tuple[NDArray[Any], dict[str, slice]]:
-    """Concatenated values (n, c) that every trusted surfel has, and the columns of each variable."""
-    parts = {name: fitted[name].values for name in ("diffuse_reflectance", "shading_normal", "basis_weight")}
+def _columns(
+    fitted: xr.Dataset, triangles: NDArray[Any]
+) -> tuple[NDArray[Any], dict[str, slice]]:
+    """Concatenated values (n, c) that every trusted surfel has, and the columns of each
+    variable.
+    """
+    parts = {
+        name: fitted[name].values
+        for name in ("diffuse_reflectance", "shading_normal", "basis_weight")
+    }
     mesh = fitted["surfel_normal"].values.astype(np.float64)
     uv = fitted["surfel_uv"].values
     frames = tangent_frames(fitted["surfel_position"].values, mesh, uv, triangles)
-    parts["tangent"] = to_tangent_space(parts["shading_normal"], mesh, frames).astype(np.float32)
+    parts["tangent"] = to_tangent_space(parts["shading_normal"], mesh, frames).astype(
+        np.float32
+    )
     layout = {}
     start = 0
     for name, part in parts.items():
@@ -126,33 +167,59 @@ def _columns(fitted: xr.Dataset, triangles: NDArray[Any]) -> tuple[NDArray[Any],
     return np.concatenate(list(parts.values()), axis=1), layout
 
 
-def _translucency(fitted: xr.Dataset, trust: NDArray[np.float32], atlas: Atlas) -> dict[str, TextureMap]:
-    """Maps of the channels that are known at any trusted surfel, each filled separately; empty if there are none."""
+def _translucency(
+    fitted: xr.Dataset, trust: NDArray[np.float32], atlas: Atlas
+) -> dict[str, TextureMap]:
+    """Maps of the channels that are known at any trusted surfel, each filled
+    separately; empty if there are none.
+    """
     if "sigma_tr" not in fitted:
         return {}
     sigma_tr = fitted["sigma_tr"].values
     diffuse = fitted["diffuse_reflectance"].values
     sigma_tr = np.where(sigma_tr > 0, sigma_tr, np.nan)
-    path = mean_free_path(diffuse, sigma_tr, eta=float(fitted["refractive_index"])).astype(np.float32)
-    values: dict[str, NDArray[Any]] = {"translucency": 1 / sigma_tr, "mean_free_path": path}
-    parts = {name + channel: value[:, [c]] for name, value in values.items() for c, channel in enumerate("RGB")}
+    path = mean_free_path(
+        diffuse, sigma_tr, eta=float(fitted["refractive_index"])
+    ).astype(np.float32)
+    values: dict[str, NDArray[Any]] = {
+        "translucency": 1 / sigma_tr,
+        "mean_free_path": path,
+    }
+    parts = {
+        name + channel: value[:, [c]]
+        for name, value in values.items()
+        for c, channel in enumerate("RGB")
+    }
     planes = _spread_known(parts, trust, atlas)
     found = {}
     for name, doc in TRANSLUCENCY.items():
         channels = tuple(channel for channel in "RGB" if name + channel in planes)
         if channels:
-            image = np.concatenate([planes[name + channel] for channel in channels], axis=-1)
+            image = np.concatenate(
+                [planes[name + channel] for channel in channels], axis=-1
+            )
             found[name] = TextureMap(image, channels, "mm", doc)
     return found
 
 
-def _measured(fitted: xr.Dataset, trust: NDArray[np.float32], atlas: Atlas) -> dict[str, TextureMap]:
+def _measured(
+    fitted: xr.Dataset, trust: NDArray[np.float32], atlas: Atlas
+) -> dict[str, TextureMap]:
     """Maps of errors and of surface reflectance, if any trusted surfel has them.
 
-    Errors are interpolated like values, which overestimates them if the errors of surfels are independent.
+    Errors are interpolated like values, which overestimates them if the errors of
+    surfels are independent.
     """
-    values = {name: fitted[variable].values for name, variable in MEASURED.items() if variable in fitted}
-    images = _spread_known({name: value.reshape(len(trust), -1) for name, value in values.items()}, trust, atlas)
+    values = {
+        name: fitted[variable].values
+        for name, variable in MEASURED.items()
+        if variable in fitted
+    }
+    images = _spread_known(
+        {name: value.reshape(len(trust), -1) for name, value in values.items()},
+        trust,
+        atlas,
+    )
     found = {}
     for name, image in images.items():
         spec = VARIABLES[MEASURED[name]]
@@ -161,11 +228,14 @@ def _measured(fitted: xr.Dataset, trust: NDArray[np.float32], atlas: Atlas) -> d
     return found
 
 
-def _spread_known(parts: dict[str, NDArray[Any]], trust: NDArray[np.float32], atlas: Atlas) -> dict[str, Image]:
-    """Texels (size, size, c) by name of values (n, c), each from the trusted surfels where it is finite.
+def _spread_known(
+    parts: dict[str, NDArray[Any]], trust: NDArray[np.float32], atlas: Atlas
+) -> dict[str, Image]:
+    """Texels (size, size, c) by name of values (n, c), each from the trusted surfels
+    where it is finite.
 
-    Names that are known nowhere are omitted. Those that are known at the same surfels are processed together, as
-    triangles take more time than values.
+    Names that are known nowhere are omitted. Those that are known at the same surfels
+    are processed together, as triangles take more time than values.
     """
     together: dict[bytes, list[str]] = {}
     for name, values in parts.items():
@@ -175,7 +245,9 @@ def _spread_known(parts: dict[str, NDArray[Any]], trust: NDArray[np.float32], at
     images: dict[str, Image] = {}
     for mask, names in together.items():
         columns = np.concatenate([parts[name] for name in names], axis=1)
-        image, _ = _spread(columns, np.where(np.frombuffer(mask, bool), trust, np.float32(0)), atlas)
+        image, _ = _spread(
+            columns, np.where(np.frombuffer(mask, bool), trust, np.float32(0)), atlas
+        )
         ends = np.cumsum([parts[name].shape[1] for name in names])[:-1]
         images |= dict(zip(names, np.split(image, ends, axis=-1), strict=True))
     return {name: images[name] for name in parts if name in images}
@@ -190,14 +262,29 @@ def _fitted_maps(image: Image, layout: dict[str, slice]) -> dict[str, TextureMap
     normal = image[..., layout["shading_normal"]]
     normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
     maps = {
-        "albedo": TextureMap(image[..., layout["diffuse_reflectance"]], rgb, "1", "diffuse reflectance R_d"),
-        "normal": TextureMap(normal, rgb, "1", "unit shading normal, with x, y, z of the subject frame in R, G, B"),
+        "albedo": TextureMap(
+            image[..., layout["diffuse_reflectance"]],
+            rgb,
+            "1",
+            "diffuse reflectance R_d",
+        ),
+        "normal": TextureMap(
+            normal,
+            rgb,
+            "1",
+            "unit shading normal, with x, y, z of the subject frame in R, G, B",
+        ),
     }
     bent = image[..., layout["tangent"]]
     bent = bent / np.maximum(np.linalg.norm(bent, axis=-1, keepdims=True), 1e-12)
-    doc = "unit shading normal, with its parts along tangent, bitangent (towards v = 0) and normal in R, G, B"
+    doc = (
+        "unit shading normal, with its parts along tangent, bitangent (towards v = 0) "
+        "and normal in R, G, B"
+    )
     maps["normal_tangent"] = TextureMap(bent, rgb, "1", doc)
     weights = image[..., layout["basis_weight"]]
     for k in range(weights.shape[-1]):
-        maps[f"weight_{k}"] = TextureMap(weights[..., k : k + 1], ("Y",), "1", f"weight of component {k}")
+        maps[f"weight_{k}"] = TextureMap(
+            weights[..., k : k + 1], ("Y",), "1", f"weight of component {k}"
+        )
     return maps

@@ -1,4 +1,6 @@
-"""Light that passes through thin parts of a face, such as an ear, for materials without transport under the skin."""
+"""Light that passes through thin parts of a face, such as an ear, for materials without
+transport under the skin.
+"""
 
 from __future__ import annotations
 
@@ -13,10 +15,11 @@ Float = NDArray[np.floating]
 
 
 def thickness(position: Float, normal: Float, triangles: NDArray[np.integer]) -> Float:
-    """Distance [mm] (n,) from each vertex straight inwards to where the mesh ends; infinity where it does not.
+    """Distance [mm] (n,) from each vertex straight inwards to where the mesh ends;
+    infinity where it does not.
 
-    A ray that first meets a triangle from its outer side has left the body through an opening of the scan: there, too,
-    the thickness counts as infinite.
+    A ray that first meets a triangle from its outer side has left the body through an
+    opening of the scan: there, too, the thickness counts as infinite.
 
     Parameters
     ----------
@@ -25,18 +28,23 @@ def thickness(position: Float, normal: Float, triangles: NDArray[np.integer]) ->
     triangles
         (f, 3), counter-clockwise seen from outside.
     """
-    face, _, distance = RayScene(position, triangles).first_hit(position - RAY_OFFSET_MM * normal, -normal)
+    face, _, distance = RayScene(position, triangles).first_hit(
+        position - RAY_OFFSET_MM * normal, -normal
+    )
     corner = position[triangles[np.maximum(face, 0)]]
     outwards = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     leaves = (face >= 0) & (np.einsum("nc,nc->n", outwards, normal) < 0)
     return np.where(leaves, distance + RAY_OFFSET_MM, np.inf)
 
 
-def transmitted_fraction(distance: Float, diffuse: Float, sigma_tr: Float, *, eta: float) -> Float:
-    """Fraction (n, 3) of the diffuse light at a surface that comes from the other side, if both are lit evenly.
+def transmitted_fraction(
+    distance: Float, diffuse: Float, sigma_tr: Float, *, eta: float
+) -> Float:
+    """Fraction (n, 3) of the diffuse light at a surface that comes from the other side,
+    if both are lit evenly.
 
-    The light of the other side is the dipole's power beyond the thickness, and both sides together give R_d, as in
-    `skindb.optics.dipole_tree.subsurface_exitance`.
+    The light of the other side is the dipole's power beyond the thickness, and both
+    sides together give R_d, as in `skindb.optics.dipole_tree.subsurface_exitance`.
 
     Parameters
     ----------

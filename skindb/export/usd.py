@@ -1,4 +1,6 @@
-"""Export of a fitted model to a USD scene with an OpenPBR material, and of this material to MaterialX."""
+"""Export of a fitted model to a USD scene with an OpenPBR material, and of this
+material to MaterialX.
+"""
 
 from __future__ import annotations
 
@@ -21,14 +23,18 @@ MEAN_FREE_PATH = "../maps/mean_free_path.exr"
 RELATIVE = "subsurface_radius_scale"
 
 
-def export_usd(model: xr.DataTree, folder: Path, skin: Skin, *, longest_path: float) -> None:
+def export_usd(
+    model: xr.DataTree, folder: Path, skin: Skin, *, longest_path: float
+) -> None:
     """Write `face.usda`, `face.mtlx` and their textures into a folder.
 
-    Lengths are in mm (`metersPerUnit` is 0.001). `subsurface_radius` is the longest mean free path in mm, and
-    `subsurface_radius_scale` the ratio of that of a texel and channel to it, which is at most 1. OpenPBR has one index
-    of refraction for the whole face, which is from the mean reflectance at normal incidence over all points, weighted
-    by their specular factor. Renderers without MaterialX use a UsdPreviewSurface. It has no specular factor, so that
-    its index of refraction is from the mean reflectance at normal incidence including that factor.
+    Lengths are in mm (`metersPerUnit` is 0.001). `subsurface_radius` is the longest
+    mean free path in mm, and `subsurface_radius_scale` the ratio of that of a texel and
+    channel to it, which is at most 1. OpenPBR has one index of refraction for the whole
+    face, which is from the mean reflectance at normal incidence over all points,
+    weighted by their specular factor. Renderers without MaterialX use a
+    UsdPreviewSurface. It has no specular factor, so that its index of refraction is
+    from the mean reflectance at normal incidence including that factor.
 
     Parameters
     ----------
@@ -46,7 +52,9 @@ def export_usd(model: xr.DataTree, folder: Path, skin: Skin, *, longest_path: fl
         private_file(folder / f"{name}.png").write_bytes(data)
     inputs = _inputs(index_of(skin.mean_f0), longest_path)
     private_file(folder / MATERIAL).write_text(_materialx(inputs), encoding="utf-8")
-    private_file(folder / STAGE).write_text(_usda(model, inputs, index_of(skin.mean_reflection)), encoding="utf-8")
+    private_file(folder / STAGE).write_text(
+        _usda(model, inputs, index_of(skin.mean_reflection)), encoding="utf-8"
+    )
 
 
 def index_of(f0: float) -> float:
@@ -91,49 +99,86 @@ def _materialx(inputs: Mapping[str, tuple[str, str | float]]) -> str:
     root.append(ElementTree.Comment(f" skindb {__version__}: skin, lengths in mm "))
     place = ElementTree.SubElement(root, "texcoord", name="st", type="vector2")
     ElementTree.SubElement(place, "input", name="index", type="integer", value="0")
-    surface = ElementTree.Element("open_pbr_surface", name="skin_surface", type="surfaceshader")
+    surface = ElementTree.Element(
+        "open_pbr_surface", name="skin_surface", type="surfaceshader"
+    )
     for name, (kind, value) in inputs.items():
         given = ElementTree.SubElement(surface, "input", name=name, type=kind)
         if isinstance(value, float):
             given.set("value", f"{value:.6g}")
             continue
         image = ElementTree.SubElement(root, "image", name=f"{name}_image", type=kind)
-        file = ElementTree.SubElement(image, "input", name="file", type="filename", value=value)
+        file = ElementTree.SubElement(
+            image, "input", name="file", type="filename", value=value
+        )
         if kind == "color3":
             file.set("colorspace", _space(value))
-        ElementTree.SubElement(image, "input", name="texcoord", type="vector2", nodename="st")
+        ElementTree.SubElement(
+            image, "input", name="texcoord", type="vector2", nodename="st"
+        )
         for axis in "uv":
-            ElementTree.SubElement(image, "input", name=f"{axis}addressmode", type="string", value="clamp")
+            ElementTree.SubElement(
+                image, "input", name=f"{axis}addressmode", type="string", value="clamp"
+            )
         source = image.get("name", "")
         if name == "geometry_normal":
-            bent = ElementTree.SubElement(root, "normalmap", name="bent_normal", type="vector3")
-            ElementTree.SubElement(bent, "input", name="in", type="vector3", nodename=source)
+            bent = ElementTree.SubElement(
+                root, "normalmap", name="bent_normal", type="vector3"
+            )
+            ElementTree.SubElement(
+                bent, "input", name="in", type="vector3", nodename=source
+            )
             source = "bent_normal"
         elif name == RELATIVE:
-            ratio = ElementTree.SubElement(root, "multiply", name="relative_length", type="color3")
-            ElementTree.SubElement(ratio, "input", name="in1", type="color3", nodename=source)
-            ElementTree.SubElement(ratio, "input", name="in2", type="float", value=f"{_per_length(inputs):.6g}")
+            ratio = ElementTree.SubElement(
+                root, "multiply", name="relative_length", type="color3"
+            )
+            ElementTree.SubElement(
+                ratio, "input", name="in1", type="color3", nodename=source
+            )
+            ElementTree.SubElement(
+                ratio,
+                "input",
+                name="in2",
+                type="float",
+                value=f"{_per_length(inputs):.6g}",
+            )
             source = "relative_length"
         given.set("nodename", source)
     root.append(surface)
-    material = ElementTree.SubElement(root, "surfacematerial", name="skin", type="material")
-    ElementTree.SubElement(material, "input", name="surfaceshader", type="surfaceshader", nodename="skin_surface")
+    material = ElementTree.SubElement(
+        root, "surfacematerial", name="skin", type="material"
+    )
+    ElementTree.SubElement(
+        material,
+        "input",
+        name="surfaceshader",
+        type="surfaceshader",
+        nodename="skin_surface",
+    )
     ElementTree.indent(root)
-    return '<?xml version="1.0"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"
+    return (
+        '<?xml version="1.0"?>\n'
+        + ElementTree.tostring(root, encoding="unicode")
+        + "\n"
+    )
 
 
-def _usda(model: xr.DataTree, inputs: Mapping[str, tuple[str, str | float]], ior: float) -> str:
+def _usda(
+    model: xr.DataTree, inputs: Mapping[str, tuple[str, str | float]], ior: float
+) -> str:
     fitted = model["fitted"].to_dataset()
     mesh = model["mesh"].to_dataset()
     place = fitted["surfel_position"].values.astype(np.float32)
     triangles = mesh["triangle"].values
-    uv = fitted["surfel_uv"].values.astype(np.float64) * [1, -1] + [0, 1]  # v increases upwards in USD
+    # v increases upwards in USD
+    uv = fitted["surfel_uv"].values.astype(np.float64) * [1, -1] + [0, 1]
     extent = _vectors(np.stack([place.min(axis=0), place.max(axis=0)]))
     shaders = [*_openpbr(inputs), *_preview(ior)]
     return f"""#usda 1.0
 (
     defaultPrim = "Face"
-    doc = "skindb {__version__}: mm, +x to the subject's left, +y up, +z out of the face; colours Rec. 709, D65"
+    doc = "skindb {__version__}: mm, +x to the left of the subject, +y up, +z out; Rec. 709, D65"
     metersPerUnit = 0.001
     upAxis = "Y"
 )
@@ -185,7 +230,11 @@ def _openpbr(inputs: Mapping[str, tuple[str, str | float]]) -> list[str]:
             lines.append(f"{declared} inputs:{name} = {value:.6g}")
             continue
         node = "".join(part.capitalize() for part in name.split("_"))
-        space = f' (\n                    colorSpace = "{_space(value)}"\n                )' if kind == "color3" else ""
+        space = (
+            f' (\n                    colorSpace = "{_space(value)}"\n                )'
+            if kind == "color3"
+            else ""
+        )
         image = [
             f"asset inputs:file = @{value}@{space}",
             f"float2 inputs:texcoord.connect = <{path}/Coordinates.outputs:out>",
@@ -194,16 +243,29 @@ def _openpbr(inputs: Mapping[str, tuple[str, str | float]]) -> list[str]:
         ]
         found.append(_shader(node, f"ND_image_{kind}", image))
         if name == "geometry_normal":
-            bent = [f"float3 inputs:in.connect = <{path}/{node}.outputs:out>", "float3 outputs:out"]
+            bent = [
+                f"float3 inputs:in.connect = <{path}/{node}.outputs:out>",
+                "float3 outputs:out",
+            ]
             found.append(_shader("BentNormal", "ND_normalmap_float", bent))
             node = "BentNormal"
         elif name == RELATIVE:
             ratio = [f"color3f inputs:in1.connect = <{path}/{node}.outputs:out>"]
-            ratio += [f"float inputs:in2 = {_per_length(inputs):.6g}", "color3f outputs:out"]
+            ratio += [
+                f"float inputs:in2 = {_per_length(inputs):.6g}",
+                "color3f outputs:out",
+            ]
             found.append(_shader("RelativeLength", "ND_multiply_color3FA", ratio))
             node = "RelativeLength"
         lines.append(f"{declared} inputs:{name}.connect = <{path}/{node}.outputs:out>")
-    return [*found, _shader("OpenPbr", "ND_open_pbr_surface_surfaceshader", [*lines, "token outputs:out"])]
+    return [
+        *found,
+        _shader(
+            "OpenPbr",
+            "ND_open_pbr_surface_surfaceshader",
+            [*lines, "token outputs:out"],
+        ),
+    ]
 
 
 def _preview(ior: float) -> list[str]:
@@ -223,7 +285,10 @@ def _preview(ior: float) -> list[str]:
             f"float2 inputs:st.connect = <{path}/PreviewCoordinates.outputs:result>",
         ]
         if name == "PreviewNormal":
-            lines += ["float4 inputs:scale = (2, 2, 2, 1)", "float4 inputs:bias = (-1, -1, -1, 0)"]
+            lines += [
+                "float4 inputs:scale = (2, 2, 2, 1)",
+                "float4 inputs:bias = (-1, -1, -1, 0)",
+            ]
         found.append(_shader(name, "UsdUVTexture", [*lines, output]))
     surface = [
         f"color3f inputs:diffuseColor.connect = <{path}/PreviewColor.outputs:rgb>",
@@ -236,14 +301,20 @@ def _preview(ior: float) -> list[str]:
 
 
 def _shader(name: str, kind: str, lines: list[str]) -> str:
-    body = "\n".join(f"                {line}" for line in [f'uniform token info:id = "{kind}"', *lines])
+    body = "\n".join(
+        f"                {line}"
+        for line in [f'uniform token info:id = "{kind}"', *lines]
+    )
     return f'            def Shader "{name}"\n            {{\n{body}\n            }}\n'
 
 
 def _vectors(values: NDArray[np.floating[Any]]) -> str:
-    return f"[{', '.join('(' + ', '.join(f'{x:.7g}' for x in row) + ')' for row in values.tolist())}]"
+    tuples = (", ".join(f"{x:.7g}" for x in row) for row in values.tolist())
+    return f"[{', '.join(f'({one})' for one in tuples)}]"
 
 
 def _normals(fitted: xr.Dataset) -> NDArray[np.float64]:
     normal = fitted["surfel_normal"].values.astype(np.float64)
-    return np.asarray(normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9))
+    return np.asarray(
+        normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
+    )

@@ -1,4 +1,6 @@
-"""From lumitexels to reflectance models: normals, albedo, surface BRDF, reduced basis, translucency."""
+"""From lumitexels to reflectance models: normals, albedo, surface BRDF, reduced basis,
+translucency.
+"""
 
 from skindb.fit.albedo import estimate_diffuse_reflectance, reflectance_interval
 from skindb.fit.basis import reduce_basis
@@ -12,10 +14,19 @@ from skindb.fit.obstructed import find_obstructed
 from skindb.fit.outliers import find_outliers
 from skindb.fit.parameters import FitParameters
 from skindb.fit.plan import FitPlan, plan_fit
-from skindb.fit.prediction import describe_prediction, prediction_table, tabulate_prediction
+from skindb.fit.prediction import (
+    describe_prediction,
+    prediction_table,
+    tabulate_prediction,
+)
 from skindb.fit.sample_noise import sample_variance
 from skindb.fit.surface import fit_surface, refit
-from skindb.fit.translucency import fit_probe, summarise_translucency, tabulate_translucency, translucency_map
+from skindb.fit.translucency import (
+    fit_probe,
+    summarise_translucency,
+    tabulate_translucency,
+    translucency_map,
+)
 from skindb.optics.dictionary import embedded_dictionary
 from skindb.optics.measured import read_dictionary
 

@@ -1,4 +1,5 @@
-"""Compiled separation of diffuse from surface reflection, surfel by surfel; the method is in `skindb.fit.albedo`.
+"""Compiled separation of diffuse from surface reflection, surfel by surfel; the method
+is in `skindb.fit.albedo`.
 
 Sums over samples run in single precision and in vector registers; systems of equations are double.
 """
@@ -27,12 +28,18 @@ from skindb.fit._lumitexel_kernels import (
 from skindb.numerics._nnls_kernels import active_set_memory, factor, solve, solve_scaled
 from skindb.optics._shade_kernels import transmittance
 
-MIN_COSINE_ALBEDO = 0.25  # to light or camera; below it F_t and the footprint of a pixel change too fast
-MIN_SAMPLES_ALBEDO = 10  # of a surfel, above the minimum cosine; fewer cannot separate eight columns
+# to light or camera; below it F_t and the footprint of a pixel change too fast
+MIN_COSINE_ALBEDO = 0.25
+# of a surfel, above the minimum cosine; fewer cannot separate eight columns
+MIN_SAMPLES_ALBEDO = 10
 TUKEY = 4.685  # 95 % efficiency for normal noise
-MEAN_TO_SIGMA = 1.2533  # standard deviation over mean absolute deviation of normal noise
-MIN_BEND = 0.3  # mean slope of the influence function over mean weight, 0.86 for normal noise; reliable above this
-NOISE_FLOOR_ALBEDO = 0.01  # sr^-1; the errors of darker samples are not proportional to their value
+# standard deviation over mean absolute deviation of normal noise
+MEAN_TO_SIGMA = 1.2533
+# mean slope of the influence function over mean weight, 0.86 for normal noise; reliable
+# above this
+MIN_BEND = 0.3
+# sr^-1; the errors of darker samples are not proportional to their value
+NOISE_FLOOR_ALBEDO = 0.01
 MIN_RELATIVE_SCALE = 0.005  # differences by rounding must not produce outliers
 # number of reweighting steps
 SLOPE_STEPS = 5
@@ -94,8 +101,11 @@ def separation_memory(most: int) -> Any:
 
 
 @fast_kernel
-def robust_slope(x: Any, y: Any, weight: Any, residual: Any, n: int) -> tuple[float, float]:
-    """Slope of y on x through the origin by Tukey weights, and its standard error (Huber's sandwich).
+def robust_slope(
+    x: Any, y: Any, weight: Any, residual: Any, n: int
+) -> tuple[float, float]:
+    """Slope of y on x through the origin by Tukey weights, and its standard error
+    (Huber's sandwich).
 
     On return, `weight` holds the change of the slope by the residual of each sample.
     """
@@ -130,8 +140,11 @@ def robust_slope(x: Any, y: Any, weight: Any, residual: Any, n: int) -> tuple[fl
     bend = ZERO
     for i in range(n):
         u = residual[i] * residual[i] * inverse
-        # with x squared, as noise that grows with x is downweighted most where x has the largest weight
-        bend += ((ONE - u) * (ONE - np.float32(5) * u) if u < ONE else ZERO) * x[i] * x[i]
+        # with x squared, as noise that grows with x is downweighted most where x has
+        # the largest weight
+        bend += (
+            ((ONE - u) * (ONE - np.float32(5) * u) if u < ONE else ZERO) * x[i] * x[i]
+        )
         score = weight[i] * residual[i] * x[i]
         meat += score * score
         weight[i] = score
@@ -146,7 +159,9 @@ def _normal_equations(rows: Any, n: int, s: Any) -> None:
     """Write M' w M and M' (w y) of the first COLUMNS columns to `s.gram` and `s.right`."""
     s.gram[:], s.right[:] = 0.0, 0.0
     for begin in range(0, n, ROWS_PER_SUM):
-        products(rows, s.weight, s.aim, 0, 0, begin, min(begin + ROWS_PER_SUM, n), s.block)
+        products(
+            rows, s.weight, s.aim, 0, 0, begin, min(begin + ROWS_PER_SUM, n), s.block
+        )
         for j in range(COLUMNS):
             for k in range(COLUMNS):
                 s.gram[j, k] += s.block[j, k]
@@ -155,21 +170,29 @@ def _normal_equations(rows: Any, n: int, s: Any) -> None:
 
 @fast_kernel
 def _weigh(n: int, noise: Any, s: Any) -> tuple[float, float]:
-    """Tukey weights of the relative residuals; returns the sums of the weights and of the influence function's slope.
+    """Tukey weights of the relative residuals; returns the sums of the weights and of
+    the influence function's slope.
 
-    Residuals are relative to the prediction, or to the noise where that exceeds MODEL_ERROR of the prediction.
+    Residuals are relative to the prediction, or to the noise where that exceeds
+    MODEL_ERROR of the prediction.
     """
     floor = np.float32(NOISE_FLOOR_ALBEDO)
     absolute = ZERO
     total = ZERO
-    factor = np.float32(1.0 / (3.0 * MODEL_ERROR**2))  # the mean of three channels has a third of the variance
+    # the mean of three channels has a third of the variance
+    factor = np.float32(1.0 / (3.0 * MODEL_ERROR**2))
     for i in range(n):
         level = s.predicted[i] if s.predicted[i] > floor else floor
-        s.level[i] = ONE / np.sqrt(level * level + factor * (noise[0, i] + noise[1, i] * level))
+        s.level[i] = ONE / np.sqrt(
+            level * level + factor * (noise[0, i] + noise[1, i] * level)
+        )
         s.residual[i] = (s.mean[i] - s.predicted[i]) * s.level[i]
         absolute += s.keep[i] * abs(s.residual[i])
         total += s.keep[i]
-    scale = MEAN_TO_SIGMA * np.float64(absolute) / max(np.float64(total), 1e-12) + MIN_RELATIVE_SCALE
+    scale = (
+        MEAN_TO_SIGMA * np.float64(absolute) / max(np.float64(total), 1e-12)
+        + MIN_RELATIVE_SCALE
+    )
     inverse = np.float32(1.0 / (TUKEY * scale) ** 2)
     kept = ZERO
     slope = ZERO
@@ -187,7 +210,9 @@ def _weigh(n: int, noise: Any, s: Any) -> tuple[float, float]:
 
 @fast_kernel
 def _pull(n: int, s: Any) -> float:
-    """Convert projections of the rows in `s.predicted` to pulls; returns the sum of squared pulls times residuals."""
+    """Convert projections of the rows in `s.predicted` to pulls; returns the sum of
+    squared pulls times residuals.
+    """
     meat = ZERO
     for i in range(n):
         s.pull[i] = s.predicted[i] * s.weight[i]
@@ -207,11 +232,13 @@ def _predict(rows: Any, n: int, x: Any, at: int, s: Any, out: Any) -> None:
 
 @kernel
 def fit_shape(rows: Any, n: int, noise: Any, s: Any) -> tuple[float, float]:
-    """Weight of the diffuse shape in the mean channel by robust non-negative least squares, and its standard error.
+    """Weight of the diffuse shape in the mean channel by robust non-negative least
+    squares, and its standard error.
 
-    `noise` (2, n) is the variance of a channel at reflectance 0 and its slope; zeros where it is unknown.
-    On return, `s.x` holds the weights of all columns, `s.pull` the derivative of the result by each sample,
-    and `s.aim` the change of the result by the residual of each sample.
+    `noise` (2, n) is the variance of a channel at reflectance 0 and its slope; zeros
+    where it is unknown. On return, `s.x` holds the weights of all columns, `s.pull` the
+    derivative of the result by each sample, and `s.aim` the change of the result by the
+    residual of each sample.
     """
     floor = np.float32(NOISE_FLOOR_ALBEDO)
     for i in range(n):
@@ -255,7 +282,9 @@ def fit_shape(rows: Any, n: int, noise: Any, s: Any) -> tuple[float, float]:
 
 @kernel
 def _first_row(active: Any, k: int, s: Any) -> bool:
-    """Write the row of the diffuse shape of the inverse Gram matrix of the active columns to `s.right`."""
+    """Write the row of the diffuse shape of the inverse Gram matrix of the active
+    columns to `s.right`.
+    """
     length = np.ones(COLUMNS)
     z = np.empty(COLUMNS)
     for p in range(k):
@@ -284,7 +313,9 @@ def _tangents(n: Any, first: Any, second: Any) -> None:
     for k in range(3):
         p = (k + 1) % 3
         q = (k + 2) % 3
-        first[k] = n[p] * (1.0 if q == small else 0.0) - n[q] * (1.0 if p == small else 0.0)
+        first[k] = n[p] * (1.0 if q == small else 0.0) - n[q] * (
+            1.0 if p == small else 0.0
+        )
     size = math.sqrt(first[0] * first[0] + first[1] * first[1] + first[2] * first[2])
     for k in range(3):
         first[k] /= size
@@ -296,23 +327,37 @@ def _tangents(n: Any, first: Any, second: Any) -> None:
 
 @kernel
 def _slide(axes: Any, eta: float, b: Any, light: Any, camera: Any) -> None:
-    """Effect of a rotation of the normal by one radian towards two axes (2, 3): light (lights, 6), camera (cameras, 4).
+    """Effect of a rotation of the normal by one radian towards two axes (2, 3): light
+    (lights, 6), camera (cameras, 4).
 
-    For each axis: change of the cosine, relative change of cos F_t (of F_t for cameras), and for lights of the cosine.
+    For each axis: change of the cosine, relative change of cos F_t (of F_t for
+    cameras), and for lights of the cosine.
     """
     for i in range(b.lit.shape[0]):
         c = b.lit[i]
         if c > 0.0:
             steep = _relative_slope(c, eta)
             for q in range(2):
-                t = axes[q, 0] * b.to_light[i, 0] + axes[q, 1] * b.to_light[i, 1] + axes[q, 2] * b.to_light[i, 2]
-                light[i, 3 * q], light[i, 3 * q + 1], light[i, 3 * q + 2] = t, t / c + t * steep, t / c
+                t = (
+                    axes[q, 0] * b.to_light[i, 0]
+                    + axes[q, 1] * b.to_light[i, 1]
+                    + axes[q, 2] * b.to_light[i, 2]
+                )
+                light[i, 3 * q], light[i, 3 * q + 1], light[i, 3 * q + 2] = (
+                    t,
+                    t / c + t * steep,
+                    t / c,
+                )
     for o in range(b.seen.shape[0]):
         c = b.seen[o]
         if c > 0.0:
             steep = _relative_slope(c, eta)
             for q in range(2):
-                t = axes[q, 0] * b.to_camera[o, 0] + axes[q, 1] * b.to_camera[o, 1] + axes[q, 2] * b.to_camera[o, 2]
+                t = (
+                    axes[q, 0] * b.to_camera[o, 0]
+                    + axes[q, 1] * b.to_camera[o, 1]
+                    + axes[q, 2] * b.to_camera[o, 2]
+                )
                 camera[o, 2 * q], camera[o, 2 * q + 1] = t, t * steep
 
 
@@ -321,16 +366,21 @@ def _relative_slope(c: float, eta: float) -> float:
     """Derivative of the logarithm of F_t with respect to the cosine."""
     high = min(c + 1e-4, 1.0)
     low = c - 1e-4
-    return float((transmittance(high, eta) / transmittance(low, eta) - 1.0) / (high - low))
+    return float(
+        (transmittance(high, eta) / transmittance(low, eta) - 1.0) / (high - low)
+    )
 
 
 @fast_kernel
-def _turn_effect(light: Any, camera: Any, n: int, b: Any, s: Any, mixed: Any, bent: Any, out: Any) -> None:
-    """Effect of rotations of the normal by one radian on the common part, and relative effect on the channels' slopes.
+def _turn_effect(
+    light: Any, camera: Any, n: int, b: Any, s: Any, mixed: Any, bent: Any, out: Any
+) -> None:
+    """Effect of rotations of the normal by one radian on the common part, and relative
+    effect on the channels' slopes.
 
-    First order: the pulls of the samples times the change of their prediction; out is (2 axes, 2). `mixed` and `bent`
-    are the mixture of lobes and its derivative with respect to theta_h; phi_d hardly affects lobes of isotropic
-    materials.
+    First order: the pulls of the samples times the change of their prediction; out is
+    (2 axes, 2). `mixed` and `bent` are the mixture of lobes and its derivative with
+    respect to theta_h; phi_d hardly affects lobes of isotropic materials.
     """
     weight = s.x[SHAPE]
     square = 0.0
@@ -353,7 +403,9 @@ def _turn_effect(light: Any, camera: Any, n: int, b: Any, s: Any, mixed: Any, be
         square += shape * shape
         for q in range(2):
             body = shape * (light[i, 3 * q + 1] + camera[o, 2 * q + 1])
-            lobes = mixed[r] * light[i, 3 * q + 2] - tilt * (light[i, 3 * q] + camera[o, 2 * q])
+            lobes = mixed[r] * light[i, 3 * q + 2] - tilt * (
+                light[i, 3 * q] + camera[o, 2 * q]
+            )
             out[q, 0] += pull * (weight * body + lobes)
             out[q, 1] += shape * body
     for q in range(2):
@@ -361,7 +413,9 @@ def _turn_effect(light: Any, camera: Any, n: int, b: Any, s: Any, mixed: Any, be
 
 
 @kernel
-def _add_by_device(index: Any, moved: Any, n: int, by_light: Any, by_camera: Any) -> None:
+def _add_by_device(
+    index: Any, moved: Any, n: int, by_light: Any, by_camera: Any
+) -> None:
     """Add the change of the result by each residual to the sums of its light and of its camera."""
     for r in range(n):
         by_light[index[r, 0]] += moved[r]
@@ -394,11 +448,13 @@ def separate(
     error: Any,
     total: Any,
 ) -> None:
-    """R_d (3,), its standard error for independent samples, and that for errors by device; NaN for too few samples.
+    """R_d (3,), its standard error for independent samples, and that for errors by
+    device; NaN for too few samples.
 
-    `turn` (2,) is the error of the normal [rad] for either standard error. An error of a light or camera affects all of
-    its samples, so that the variance follows from sums of their residuals: variance by lights + variance by cameras -
-    variance by samples, and not less than the last (Cameron, Gelbach and Miller 2011).
+    `turn` (2,) is the error of the normal [rad] for either standard error. An error of
+    a light or camera affects all of its samples, so that the variance follows from sums
+    of their residuals: variance by lights + variance by cameras - variance by samples,
+    and not less than the last (Cameron, Gelbach and Miller 2011).
     """
     estimate[:], error[:], total[:] = np.nan, np.nan, np.nan
     write_cosines(n, eta, MIN_COSINE_ALBEDO, b)
@@ -426,7 +482,11 @@ def separate(
         estimate[c] = tint[c] + common
         variance[c] += spread * spread
         _add_by_device(b.index, s.aim, count, by_light[c], by_camera[c])
-        by_device = _variance_of_sums(by_light[c]) + _variance_of_sums(by_camera[c]) - variance[c]
+        by_device = (
+            _variance_of_sums(by_light[c])
+            + _variance_of_sums(by_camera[c])
+            - variance[c]
+        )
         shared[c] = max(by_device, variance[c])
     if turn[1] > 0.0:
         axes = np.empty((2, 3))
@@ -475,7 +535,19 @@ def separate_block(
         # squares of values far outside the range of reflectance would overflow
         power = scale_to_one(b.values) if largest_finite(b.values) > MAX_SAMPLE else 1.0
         write_directions(position[i], light, camera, b)
-        separate(normal[i], turn[i], eta, table, noise, i, b, s, estimate[i], error[i], total[i])
+        separate(
+            normal[i],
+            turn[i],
+            eta,
+            table,
+            noise,
+            i,
+            b,
+            s,
+            estimate[i],
+            error[i],
+            total[i],
+        )
         for c in range(3):
             estimate[i, c] /= power
             error[i, c] /= power

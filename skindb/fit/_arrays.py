@@ -8,15 +8,25 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb._types import Array as Array  # also for the modules that import it from here
+# also for the modules that import it from here
+from skindb._types import Array as Array
 
-BATCH = 512  # surfels that a kernel processes at once: 15 MB of single-precision samples of a full dome
+# surfels that a kernel processes at once: 15 MB of single-precision samples of a full
+# dome
+BATCH = 512
 
 
-def in_batches(kernel: Callable[..., tuple[NDArray[Any], ...]], surfel_arrays: Sequence[Array]) -> tuple[Any, ...]:
-    """Run `kernel` on slices along the shared first axis of arrays, and concatenate the results; bounds the memory."""
+def in_batches(
+    kernel: Callable[..., tuple[NDArray[Any], ...]], surfel_arrays: Sequence[Array]
+) -> tuple[Any, ...]:
+    """Run `kernel` on slices along the shared first axis of arrays, and concatenate the
+    results; bounds the memory.
+    """
     n = len(surfel_arrays[0])
-    parts = [kernel(*(a[i : i + BATCH] for a in surfel_arrays)) for i in range(0, max(n, 1), BATCH)]
+    parts = [
+        kernel(*(a[i : i + BATCH] for a in surfel_arrays))
+        for i in range(0, max(n, 1), BATCH)
+    ]
     return tuple(np.concatenate(outputs) for outputs in zip(*parts, strict=True))
 
 
@@ -37,8 +47,12 @@ def cosines(normal: Array, towards: Array) -> Array:
 
 
 def quantile_finite(values: Array, level: float, axis: int) -> Array:
-    """Quantile at `level` of the finite values along an axis, without interpolation; NaN where there is none."""
+    """Quantile at `level` of the finite values along an axis, without interpolation;
+    NaN where there is none.
+    """
     ordered = np.sort(np.where(np.isfinite(values), values, np.nan), axis=axis)
     count = np.isfinite(ordered).sum(axis, keepdims=True)
-    place = np.clip(np.rint(level * (count - 1)).astype(np.int64), 0, values.shape[axis] - 1)
+    place = np.clip(
+        np.rint(level * (count - 1)).astype(np.int64), 0, values.shape[axis] - 1
+    )
     return np.asarray(np.take_along_axis(ordered, place, axis).squeeze(axis))

@@ -18,14 +18,18 @@ COMPILING = "compiling, only after an installation"
 
 @dataclass
 class Clock:
-    """Times stages; `progress` is called with the stage, the steps done and the total number of steps."""
+    """Times stages; `progress` is called with the stage, the steps done and the total
+    number of steps.
+    """
 
     progress: Progress | None
     seconds: dict[str, float] = field(default_factory=dict)
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Time a stage; the tasks of local dask schedulers are its steps, an eager stage is one step."""
+        """Time a stage; the tasks of local dask schedulers are its steps, an eager
+        stage is one step.
+        """
         begin = time.perf_counter()
         if self.progress is None:
             yield
@@ -33,7 +37,12 @@ class Clock:
             tell = self.progress
             ticker = _Ticker(name, self.progress)
             tell(name, 0, 1)
-            with ticker, reported_compilation(lambda: tell(f"{name} ({COMPILING})", ticker.done, ticker.total)):
+            with (
+                ticker,
+                reported_compilation(
+                    lambda: tell(f"{name} ({COMPILING})", ticker.done, ticker.total)
+                ),
+            ):
                 yield
             tell(name, ticker.total, ticker.total)
         self.seconds[name] = round(time.perf_counter() - begin, 3)

@@ -1,4 +1,6 @@
-"""Compiled access to the samples of one surfel: directions, Fresnel factors, selection of samples, rows, targets."""
+"""Compiled access to the samples of one surfel: directions, Fresnel factors, selection
+of samples, rows, targets.
+"""
 
 from __future__ import annotations
 
@@ -11,24 +13,27 @@ from skindb.optics._row_kernels import form_rows, row_memory
 from skindb.optics._shade_kernels import transmittance
 from skindb.schema import FitStatus
 
-FITTED, UNSEEN, FEW, NO_DIFFUSE, CLAMPED, NOT_CONVERGED, NOT_FINITE, _ = (int(status) for status in FitStatus)
+FITTED, UNSEEN, FEW, NO_DIFFUSE, CLAMPED, NOT_CONVERGED, NOT_FINITE, _ = (
+    int(status) for status in FitStatus
+)
 
 
-# relative error of a model in held-out samples without noise, 2 to 6 % (docs/validation.md), with which the noise of a
-# sample is compared
+# relative error of a model in held-out samples without noise, 2 to 6 %
+# (docs/validation.md), with which the noise of a sample is compared
 MODEL_ERROR = 0.05
 
 
 class Noise(NamedTuple):
     """Noise model of the samples of n surfels, mean over the channels.
 
-    For captures without the noise of each sample the arrays are (0, ...); the variance is then floor^2 + shot sample,
-    or unknown if shot is 0.
+    For captures without the noise of each sample the arrays are (0, ...); the variance
+    is then floor^2 + shot sample, or unknown if shot is 0.
     """
 
     per_radiance: Any  # (n, lights) reflectance of radiance 1
     pixels: Any  # (n, cameras) effective number of pixels
-    limit: Any  # (cameras, exposures) radiance up to which an exposure is usable, from the longest
+    # (cameras, exposures) radiance up to which an exposure is usable, from the longest
+    limit: Any
     read: Any  # (cameras, exposures) variance of radiance 0
     slope: Any  # (cameras, exposures) variance over radiance
     floor: float  # sr^-1
@@ -81,7 +86,9 @@ def lumitexel_memory(lights: int, cameras: int, width: int) -> Any:
 
 @fast_kernel
 def sample_status(values: Any) -> int:
-    """Status of the samples of a surfel: UNSEEN, NOT_FINITE, or FITTED if there are finite samples."""
+    """Status of the samples of a surfel: UNSEEN, NOT_FINITE, or FITTED if there are
+    finite samples.
+    """
     known = np.int32(0)
     infinite = np.int32(0)
     for i in range(values.shape[0]):
@@ -117,7 +124,9 @@ def write_cosines(n: Any, eta: float, min_cosine: float, b: Any) -> None:
 
 
 @kernel
-def _transmission(n: Any, towards: Any, eta: float, min_cosine: float, cosine: Any, passed: Any) -> None:
+def _transmission(
+    n: Any, towards: Any, eta: float, min_cosine: float, cosine: Any, passed: Any
+) -> None:
     for i in range(towards.shape[0]):
         c = n[0] * towards[i, 0] + n[1] * towards[i, 1] + n[2] * towards[i, 2]
         above = c > min_cosine and c < 2.0  # also rejects NaN
@@ -134,7 +143,8 @@ def choose(b: Any) -> int:
         above = b.lit[i] > 0.0
         for o in range(cameras):
             at = 3 * (i * cameras + o)
-            # abs of inf and NaN is not below inf; a sum of three half floats is finite if all three are
+            # abs of inf and NaN is not below inf; a sum of three half floats is finite
+            # if all three are
             known = abs(b.values[at] + b.values[at + 1] + b.values[at + 2]) < np.inf
             b.usable[i, o] = known & above & (b.seen[o] > 0.0)
             count += int(b.usable[i, o])
@@ -143,8 +153,12 @@ def choose(b: Any) -> int:
 
 @kernel
 def write_rows(n: Any, table: Any, b: Any) -> int:
-    """Write the rows of the chosen samples for this normal, and the samples; returns their number."""
-    count = form_rows(table, n, b.to_light, b.to_camera, b.usable, b.row_memory, b.rows, b.index)
+    """Write the rows of the chosen samples for this normal, and the samples; returns
+    their number.
+    """
+    count = form_rows(
+        table, n, b.to_light, b.to_camera, b.usable, b.row_memory, b.rows, b.index
+    )
     cameras = b.seen.shape[0]
     for r in range(count):
         at = 3 * (b.index[r, 0] * cameras + b.index[r, 1])
@@ -155,10 +169,11 @@ def write_rows(n: Any, table: Any, b: Any) -> int:
 
 @kernel
 def write_noise(surfel: int, count: int, noise: Any, b: Any) -> bool:
-    """Write the variance of one channel of the chosen samples, linear in reflectance; returns whether it is known.
+    """Write the variance of one channel of the chosen samples, linear in reflectance;
+    returns whether it is known.
 
-    The brightest channel decides which exposures were usable. The variance does not depend on the values otherwise, as
-    this would favour low values.
+    The brightest channel decides which exposures were usable. The variance does not
+    depend on the values otherwise, as this would favour low values.
     """
     if noise.per_radiance.shape[0] == 0:
         b.noise[:, :count] = noise.floor * noise.floor if noise.shot > 0.0 else 0.0

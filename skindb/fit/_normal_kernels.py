@@ -1,4 +1,6 @@
-"""Compiled combination of the estimates of a surfel's normal; the methods are in `skindb.fit.normals`."""
+"""Compiled combination of the estimates of a surfel's normal; the methods are in
+`skindb.fit.normals`.
+"""
 
 from __future__ import annotations
 
@@ -11,9 +13,10 @@ from skindb._compiled import kernel
 from skindb.optics._photometric_kernels import buffers, estimate_one
 
 COMBINED, CHROMATIC, PHOTOMETRIC, PEAK = range(4)
-# Terms of the total error that cover 91 to 96 % of the normals of six independent captures with known truth: shadows,
-# folds and residual highlights affect neighbouring lights alike, which increases the angle between the two estimates
-# the second in degrees
+# Terms of the total error that cover 91 to 96 % of the normals of six independent
+# captures with known truth: shadows, folds and residual highlights affect neighbouring
+# lights alike, which increases the angle between the two estimates the second in
+# degrees
 NOISE_FACTOR_NORMAL = 3.0
 MODEL_ERROR_DEGREES = 1.0
 
@@ -42,8 +45,12 @@ def _mean(first: float, normal: Any, out: Any) -> None:
 
 
 @kernel
-def _variance(first: float, covariance: Any, cross: Any, pull: Any, scan_error: float) -> float:
-    """Squared RMS angle [rad^2] of a mean: noise, which is partly common to both, and error of the scan per axis."""
+def _variance(
+    first: float, covariance: Any, cross: Any, pull: Any, scan_error: float
+) -> float:
+    """Squared RMS angle [rad^2] of a mean: noise, which is partly common to both, and
+    error of the scan per axis.
+    """
     second = 1.0 - first
     noise = 0.0
     scan = 0.0
@@ -77,7 +84,8 @@ def normals_block(
     error: Any,
     total: Any,
 ) -> None:
-    """Normals (n, 3) by the method, angle (n,) of peak and combined, standard and total error (n,) [degree].
+    """Normals (n, 3) by the method, angle (n,) of peak and combined, standard and total
+    error (n,) [degree].
 
     `scan_error` is an angle [rad].
     """
@@ -110,7 +118,8 @@ def normals_block(
             cross,
             pull,
         )
-        # inverse variance: each residual relative to the signal; for skin without colour the first has all the weight
+        # inverse variance: each residual relative to the signal; for skin without
+        # colour the first has all the weight
         white = 1.0 / spread[0] ** 2 if spread[0] == spread[0] else 0.0
         tinted = 1.0 / spread[1] ** 2 if spread[1] == spread[1] else 0.0
         share = white / max(white + tinted, 1e-300)
@@ -130,10 +139,15 @@ def normals_block(
         disagreement[s] = _angle(peak, combined)
         error[s], total[s] = math.nan, math.nan
         if method != PEAK and np.isfinite(chosen[s]).all():
-            error[s] = math.degrees(math.sqrt(_variance(share, covariance, cross, pull, scan_error)))
-            apart = _angle(normal[0], normal[1])  # skin without colour has only one of the two
+            error[s] = math.degrees(
+                math.sqrt(_variance(share, covariance, cross, pull, scan_error))
+            )
+            # skin without colour has only one of the two
+            apart = _angle(normal[0], normal[1])
             apart = apart if apart == apart else 0.0
             if method == COMBINED:
                 total[s] = math.sqrt(
-                    (NOISE_FACTOR_NORMAL * error[s]) ** 2 + apart * apart + MODEL_ERROR_DEGREES * MODEL_ERROR_DEGREES
+                    (NOISE_FACTOR_NORMAL * error[s]) ** 2
+                    + apart * apart
+                    + MODEL_ERROR_DEGREES * MODEL_ERROR_DEGREES
                 )

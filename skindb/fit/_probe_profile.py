@@ -1,4 +1,6 @@
-"""Fit of one diffuse reflectance profile; `skindb.fit.translucency` describes the methods and their sources."""
+"""Fit of one diffuse reflectance profile; `skindb.fit.translucency` describes the
+methods and their sources.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,9 @@ MIN_FIBRES = 3
 # bounds of sigma_tr, sigma_s' [mm^-1] and the logarithm of the gain in units of the profile
 LOWER = np.log([0.01, 0.05, 1e-12])
 UPPER = np.log([30.0, 100.0, 1e12])
-RIVAL = 30.0  # deviance within which other minima are not excluded; 9 for noise alone, more for smooth errors
+# deviance within which other minima are not excluded; 9 for noise alone, more for
+# smooth errors
+RIVAL = 30.0
 MIN_SEPARATION = 0.05  # of log sigma_tr between minima that count as different
 # sigma_s' of skin, mm^-1, and the standard deviation of its logarithm
 TYPICAL = 1.5
@@ -33,18 +37,23 @@ START = 1.0
 SMALL = 1e-4
 MOST = 4
 EVALUATIONS = 200
-# RMS relative residual that the errors do not explain, and probability of a chi-squared as large, beyond both of which
-# no single medium fits. The status states 10 %; the probability prevents false alarms by noise where few fibres are
-# clear. Tested with simulated profiles of one and of several media in tests/fit/test_probe_status.py.
+# RMS relative residual that the errors do not explain, and probability of a chi-squared
+# as large, beyond both of which no single medium fits. The status states 10 %; the
+# probability prevents false alarms by noise where few fibres are clear. Tested with
+# simulated profiles of one and of several media in tests/fit/test_probe_status.py.
 POOR_MISFIT = 0.1
 RARE_CHI_SQUARED = 1e-6
-CLEAR = 0.05  # relative error of a clear fibre: a misfit of 10 % is visible only if the noise is at most half of it
+# relative error of a clear fibre: a misfit of 10 % is visible only if the noise is at
+# most half of it
+CLEAR = 0.05
 PER_FIBRE = ("distance", "face", "log_profile", "error")
 
 
 @dataclass(frozen=True)
 class ProbeFit:
-    """Coefficients of one profile in mm^-1, with diagnostics of the fit; NaN where nothing was fitted."""
+    """Coefficients of one profile in mm^-1, with diagnostics of the fit; NaN where
+    nothing was fitted.
+    """
 
     sigma_a: float
     sigma_s_prime: float
@@ -54,11 +63,13 @@ class ProbeFit:
     sigma_tr_total_error: float  # both in quadrature
     gain: float
     residual: float
-    misfit: float  # RMS of the relative residual of clear fibres that neither error explains
+    # RMS of the relative residual of clear fibres that neither error explains
+    misfit: float
     chi_squared: float  # for both errors, per degree of freedom
     used: int
     correlation: float  # of log sigma_tr and log sigma_s'
-    combination: tuple[float, float]  # exponents (a, b): sigma_tr^a sigma_s'^b is what the profile determines best
+    # exponents (a, b): sigma_tr^a sigma_s'^b is what the profile determines best
+    combination: tuple[float, float]
     status: ProbeStatus
 
 
@@ -69,7 +80,9 @@ class Model:
     profile: Callable[..., Array]
     near: float  # relative error at one transport mean free path; falls like 1/r
     far: float  # relative error at a distance
-    bright: float  # relative error of sigma_tr in fits to noise-free random walks where the albedo is near 1
+    # relative error of sigma_tr in fits to noise-free random walks where the albedo is
+    # near 1
+    bright: float
     dark: float  # additional relative error per 1 - alpha'
 
 
@@ -94,16 +107,24 @@ class Problem:
     def predict(self, p: Array) -> Array:
         """Logarithms (..., f) predicted by the model for parameters (..., 2 or 3)."""
         a, s = (x[..., None, None] for x in _coefficients(p))
-        value = (self.model.profile(self.distance, a, s, eta=self.eta) * self.face).sum(-1)
-        return np.asarray(np.log(np.maximum(value, 1e-300)) + (p[..., 2:] if self.free_gain else 0.0))
+        value = (self.model.profile(self.distance, a, s, eta=self.eta) * self.face).sum(
+            -1
+        )
+        return np.asarray(
+            np.log(np.maximum(value, 1e-300)) + (p[..., 2:] if self.free_gain else 0.0)
+        )
 
     def misfit(self, p: Array, weight: Array | float = 1.0) -> Array:
         """Weighted differences of measured and predicted logarithms."""
         return np.asarray((self.log_profile - self.predict(p)) * weight)
 
     def prior(self, p: Array) -> Array:
-        """Deviation from the prior of sigma_s' in standard deviations, for fits with a free gain."""
-        return np.asarray((p[..., 1] - np.log(TYPICAL)) / TYPICAL_SPREAD * self.free_gain)
+        """Deviation from the prior of sigma_s' in standard deviations, for fits with a
+        free gain.
+        """
+        return np.asarray(
+            (p[..., 1] - np.log(TYPICAL)) / TYPICAL_SPREAD * self.free_gain
+        )
 
     def objective(self, p: Array, weight: Array) -> Array:
         """Weighted misfit, and with a free gain the prior of sigma_s'."""
@@ -114,16 +135,25 @@ class Problem:
         """-2 log likelihood (...) in which the error of the model counts as noise."""
         measured = self.error / np.exp(self.log_profile)
         spread = 2 * np.log(np.hypot(measured, self.discrepancy(p))).sum(-1)
-        return np.asarray((self.misfit(p, self.weight(p)) ** 2).sum(-1) + self.prior(p) ** 2 + spread)
+        return np.asarray(
+            (self.misfit(p, self.weight(p)) ** 2).sum(-1) + self.prior(p) ** 2 + spread
+        )
 
     def relative_error(self, p: Array) -> Array:
-        """Measured error of each logarithm, relative to the predicted value, as noise would bias it otherwise."""
-        return np.asarray(self.error / np.exp(np.maximum(self.predict(p), self.log_profile - 1)))
+        """Measured error of each logarithm, relative to the predicted value, as noise
+        would bias it otherwise.
+        """
+        return np.asarray(
+            self.error / np.exp(np.maximum(self.predict(p), self.log_profile - 1))
+        )
 
     def discrepancy(self, p: Array) -> Array:
         """Error of the model at each distance."""
         a, s = _coefficients(p)
-        return np.asarray(self.model.near / (self.distance.mean(1) * (a + s)[..., None]) + self.model.far)
+        return np.asarray(
+            self.model.near / (self.distance.mean(1) * (a + s)[..., None])
+            + self.model.far
+        )
 
     def weight(self, p: Array) -> Array:
         """Inverse of both errors in quadrature."""
@@ -131,9 +161,18 @@ class Problem:
 
 
 def fit_profile(
-    distance: Array, profile: Array, error: Array, *, radius: float, eta: float, model: str, free_gain: bool
+    distance: Array,
+    profile: Array,
+    error: Array,
+    *,
+    radius: float,
+    eta: float,
+    model: str,
+    free_gain: bool,
 ) -> ProbeFit:
-    """Least squares between logarithms in log sigma_tr, log sigma_s' (and log gain), from a scan over sigma_s'."""
+    """Least squares between logarithms in log sigma_tr, log sigma_s' (and log gain),
+    from a scan over sigma_s'.
+    """
     with np.errstate(invalid="ignore", divide="ignore"):
         good = (
             np.isfinite(profile)
@@ -146,31 +185,46 @@ def fit_profile(
     if used < MIN_FIBRES + int(free_gain):
         return _nothing(used)
     problem = Problem(
-        *_faces(distance[good], radius), np.log(profile[good]), error[good], eta, MODELS[model], free_gain
+        *_faces(distance[good], radius),
+        np.log(profile[good]),
+        error[good],
+        eta,
+        MODELS[model],
+        free_gain,
     )
     found, rival = _best(problem)
     near = 0.0
     if free_gain and used > MIN_FIBRES + 1:
         # the nearest fibres determine the gain, and the error of the model is largest there
-        without = replace(problem, **{name: getattr(problem, name)[1:] for name in PER_FIBRE})
+        without = replace(
+            problem, **{name: getattr(problem, name)[1:] for name in PER_FIBRE}
+        )
         near = abs(float(_descend(without, found.x).x[0] - found.x[0]))
     return _report(found, problem, rival=rival, near=near)
 
 
 def _best(problem: Problem) -> tuple[Any, float]:
-    """The best minimum, and the largest distance in log sigma_tr to another minimum that is not excluded."""
+    """The best minimum, and the largest distance in log sigma_tr to another minimum
+    that is not excluded.
+    """
     tries = [_descend(problem, p) for p in _valleys(problem)]
     cost = np.array([problem.deviance(end.x) for end in tries])
     found = tries[int(np.argmin(cost))]
     excess = max(1.0, 2 * found.cost / max(len(problem.distance) - len(found.x), 1))
-    rivals = [end.x[0] - found.x[0] for end, c in zip(tries, cost, strict=True) if c < cost.min() + RIVAL * excess]
+    rivals = [
+        end.x[0] - found.x[0]
+        for end, c in zip(tries, cost, strict=True)
+        if c < cost.min() + RIVAL * excess
+    ]
     return found, float(np.abs(rivals).max())
 
 
 def _valleys(problem: Problem) -> Array:
-    """Minima (k, 2 or 3) along sigma_s', the deepest first, with the best sigma_tr and gain for each sigma_s'.
+    """Minima (k, 2 or 3) along sigma_s', the deepest first, with the best sigma_tr and
+    gain for each sigma_s'.
 
-    Gauss-Newton steps for all sigma_s' at once: for given sigma_s', sigma_tr has one minimum, and the gain is linear.
+    Gauss-Newton steps for all sigma_s' at once: for given sigma_s', sigma_tr has one
+    minimum, and the gain is linear.
     """
     s = np.linspace(LOWER[1], UPPER[1], SCAN)[1:-1]
     p = np.stack([np.full(len(s), np.log(START)), s, np.zeros(len(s))], axis=1)
@@ -184,7 +238,9 @@ def _valleys(problem: Problem) -> Array:
             total = weight.sum(1, keepdims=True)
             p[:, 2] = (weight * rest).sum(1) / total[:, 0]
             slope = slope - (weight * slope).sum(1, keepdims=True) / total
-        step = (weight * slope * rest).sum(1) / np.maximum((weight * slope**2).sum(1), 1e-300)
+        step = (weight * slope * rest).sum(1) / np.maximum(
+            (weight * slope**2).sum(1), 1e-300
+        )
         p[:, 0] = np.clip(p[:, 0] + np.clip(step, -0.5, 0.5), LOWER[0], UPPER[0])
     depth = problem.deviance(p)
     edge = np.pad(depth, 1, constant_values=np.inf)
@@ -193,9 +249,11 @@ def _valleys(problem: Problem) -> Array:
 
 
 def _faces(distance: Array, radius: float) -> tuple[Array, Array]:
-    """Distances (f, 4) between points of the round faces of the source and of each fibre, and their weights.
+    """Distances (f, 4) between points of the round faces of the source and of each
+    fibre, and their weights.
 
-    Two points per face reproduce the variance: within 0.05 % on skin, and 0.2 % where 1 / sigma_tr is 0.3 mm.
+    Two points per face reproduce the variance: within 0.05 % on skin, and 0.2 % where 1
+    / sigma_tr is 0.3 mm.
     """
     if radius <= 0 or (distance < 2 * radius).any():
         return distance[:, None], np.ones((len(distance), 1))
@@ -206,7 +264,9 @@ def _faces(distance: Array, radius: float) -> tuple[Array, Array]:
 
 
 def _face(distance: Array, radius: float) -> tuple[Array, Array]:
-    """Distances (..., 2) from outside points to a disc, Gauss-Chebyshev of the second kind, and weights of the arcs."""
+    """Distances (..., 2) from outside points to a disc, Gauss-Chebyshev of the second
+    kind, and weights of the arcs.
+    """
     d = distance[..., None]
     r = d + radius * np.array([0.5, -0.5])
     arc = r * np.arccos((r * r + d * d - radius**2) / (2 * r * d))
@@ -220,13 +280,21 @@ def _descend(problem: Problem, start: Array) -> Any:
     for _ in range(2):
         p = np.clip(p, LOWER[:size] + 1e-6, UPPER[:size] - 1e-6)
         bounds = (LOWER[:size], UPPER[:size])
-        found = least_squares(problem.objective, p, args=(problem.weight(p),), bounds=bounds, max_nfev=EVALUATIONS)
+        found = least_squares(
+            problem.objective,
+            p,
+            args=(problem.weight(p),),
+            bounds=bounds,
+            max_nfev=EVALUATIONS,
+        )
         p = found.x
     return found
 
 
 def _coefficients(p: Array) -> tuple[Array, Array]:
-    """sigma_a and sigma_s' (...) of (..., 2 or 3) log sigma_tr and log sigma_s' (eq. 9 without cancellation)."""
+    """sigma_a and sigma_s' (...) of (..., 2 or 3) log sigma_tr and log sigma_s' (eq. 9
+    without cancellation).
+    """
     tr = np.exp(p[..., 0])
     s = np.exp(p[..., 1])
     third = 4 * tr * tr / 3
@@ -234,9 +302,11 @@ def _coefficients(p: Array) -> tuple[Array, Array]:
 
 
 def _report(found: Any, problem: Problem, *, rival: float, near: float) -> ProbeFit:
-    """Estimates with their covariance due to the measured errors, and separately the effect of the model's error.
+    """Estimates with their covariance due to the measured errors, and separately the
+    effect of the model's error.
 
-    Distances in log sigma_tr: `rival` to minima of similar quality; `near` to the fit without the nearest fibre.
+    Distances in log sigma_tr: `rival` to minima of similar quality; `near` to the fit
+    without the nearest fibre.
     """
     p = found.x
     size = len(p)
@@ -248,7 +318,9 @@ def _report(found: Any, problem: Problem, *, rival: float, near: float) -> Probe
     # residuals larger than both errors increase the error
     excess = 2 * float(found.cost) / max(used - size, 1)
     residual = float(np.sqrt(np.mean(problem.misfit(p) ** 2)))
-    covariance = (gain * problem.relative_error(p) ** 2) @ gain.T * max(1.0, excess) + 1e-18 * np.eye(size)
+    covariance = (gain * problem.relative_error(p) ** 2) @ gain.T * max(
+        1.0, excess
+    ) + 1e-18 * np.eye(size)
     covariance += effect[:, used:] @ effect[:, used:].T
     sd = np.sqrt(np.diag(covariance))
     error = float(max(sd[0], rival, near))
@@ -266,7 +338,8 @@ def _report(found: Any, problem: Problem, *, rival: float, near: float) -> Probe
         ProbeStatus.AT_BOUND: bound,
         ProbeStatus.NOT_CONVERGED: found.status <= 0,
         ProbeStatus.OUT_OF_RANGE: a > RATIO_MAX * s or tr * problem.distance.max() < 1,
-        ProbeStatus.AMBIGUOUS: rival > MIN_SEPARATION,  # before POOR_FIT, which statistics count
+        # before POOR_FIT, which statistics count
+        ProbeStatus.AMBIGUOUS: rival > MIN_SEPARATION,
         ProbeStatus.POOR_FIT: unexplained > POOR_MISFIT and chance < RARE_CHI_SQUARED,
     }
     return ProbeFit(
@@ -283,12 +356,15 @@ def _report(found: Any, problem: Problem, *, rival: float, near: float) -> Probe
         used=used,
         correlation=float(covariance[0, 1] / (sd[0] * sd[1])),
         combination=(float(sharp[0]), float(sharp[1])),
-        status=next((verdict for verdict, true in verdicts.items() if true), ProbeStatus.FITTED),
+        status=next(
+            (verdict for verdict, true in verdicts.items() if true), ProbeStatus.FITTED
+        ),
     )
 
 
 def _unexplained(problem: Problem, p: Array) -> tuple[float, float]:
-    """RMS log residual of the clear fibres in excess of both errors, and the probability of their chi-squared.
+    """RMS log residual of the clear fibres in excess of both errors, and the
+    probability of their chi-squared.
 
     Fibres near the noise floor are excluded, as their logarithms are biased.
     """
@@ -299,9 +375,26 @@ def _unexplained(problem: Problem, p: Array) -> tuple[float, float]:
     square = problem.misfit(p)[clear] ** 2
     variance = problem.weight(p)[clear] ** -2
     excess = max(0.0, float((square - variance).mean()))
-    return float(np.sqrt(excess)), float(chdtrc(freedom, float((square / variance).sum())))
+    return float(np.sqrt(excess)), float(
+        chdtrc(freedom, float((square / variance).sum()))
+    )
 
 
 def _nothing(used: int) -> ProbeFit:
     nan = float("nan")
-    return ProbeFit(nan, nan, nan, nan, nan, nan, nan, nan, nan, nan, used, nan, (nan, nan), ProbeStatus.TOO_FEW_FIBRES)
+    return ProbeFit(
+        nan,
+        nan,
+        nan,
+        nan,
+        nan,
+        nan,
+        nan,
+        nan,
+        nan,
+        nan,
+        used,
+        nan,
+        (nan, nan),
+        ProbeStatus.TOO_FEW_FIBRES,
+    )

@@ -19,7 +19,8 @@ class Segments:
         self._begin = offsets[:-1][self._filled]
         self._sizes = sizes[self._filled]
         self.count = len(self._filled)
-        self.owner = np.repeat(self._filled, self._sizes)  # (total,) surfel of each sample
+        # (total,) surfel of each sample
+        self.owner = np.repeat(self._filled, self._sizes)
 
     def sum(self, values: Array) -> Array:
         """(count,) sums over each segment of (total,) values, in float64."""

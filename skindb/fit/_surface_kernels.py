@@ -1,7 +1,8 @@
-"""Compiled fits of BRDFs to the samples minus the diffuse term; `skindb.fit.surface` describes the methods.
+"""Compiled fits of BRDFs to the samples minus the diffuse term; `skindb.fit.surface`
+describes the methods.
 
-They combine the rows of `optics` and the solver of `numerics`, so that the rows of a surfel, 60 kB at rank 16, stay in
-the cache until they are solved.
+They combine the rows of `optics` and the solver of `numerics`, so that the rows of a
+surfel, 60 kB at rank 16, stay in the cache until they are solved.
 """
 
 from __future__ import annotations
@@ -44,17 +45,21 @@ from skindb.numerics._weight_error_kernels import weight_covariance
 from skindb.optics._row_kernels import turn_rows
 from skindb.schema.status import LARGEST_R_D, SMALLEST_R_D
 
-MIN_COSINE_SURFACE = 0.1  # to light or camera; below it lights are partly hidden, and pixels cover a large area
-MIN_COSINE_OUTLIER = 0.2  # below it an error of the normal has a larger effect than a motion of the face
+# to light or camera; below it lights are partly hidden, and pixels cover a large area
+MIN_COSINE_SURFACE = 0.1
+# below it an error of the normal has a larger effect than a motion of the face
+MIN_COSINE_OUTLIER = 0.2
 KKT_TOLERANCE = 1e-10
 NO_FLOOR = 1e-9  # sr^-1; floor of the cube roots for residuals
 LINEAR, PERCEPTUAL, PAPER = range(3)
-# scales of the residuals of the surfel: exceeded by normal noise once in two million, and by 1.1 to 2.6 % of samples of
-# six clean captures of another renderer (partly hidden lights, lobes outside the basis); with 4 scales twice as many
-# would be outliers; halved samples are at 25
+# scales of the residuals of the surfel: exceeded by normal noise once in two million,
+# and by 1.1 to 2.6 % of samples of six clean captures of another renderer (partly
+# hidden lights, lobes outside the basis); with 4 scales twice as many would be
+# outliers; halved samples are at 25
 OUTLIER_SCALES = 5.0
 BINS_PER_SCALE = 16  # of the histograms of scaled residuals
-# smallest scale relative to the cube root of the surfel's mean: samples within 1.5 % of it are not outliers
+# smallest scale relative to the cube root of the surfel's mean: samples within 1.5 % of
+# it are not outliers
 MIN_ROOT_SCALE = 1e-3
 SQRT_3 = math.sqrt(3.0)
 
@@ -99,9 +104,13 @@ class Errors(NamedTuple):
 
     diffuse_error: Any  # (n, 3) given
     turn: Any  # (n,) given: error of the normal along each axis [rad]
-    covariance: Any  # (n, m, m) of the weights above 0, NaN for the others; (n, 0, 0) to skip it
-    held: Any  # (lights, cameras) 0 fitted, 1 a held-out light, 2 a held-out camera, 3 both
-    held_error: Any  # (n, 2, 2) relative errors at held-out lights, in held-out cameras; linear and in cube-root space
+    # (n, m, m) of the weights above 0, NaN for the others; (n, 0, 0) to skip it
+    covariance: Any
+    # (lights, cameras) 0 fitted, 1 a held-out light, 2 a held-out camera, 3 both
+    held: Any
+    # (n, 2, 2) relative errors at held-out lights, in held-out cameras; linear and in
+    # cube-root space
+    held_error: Any
     outlier: Any  # (n,) fraction of the samples
     counts: Any  # (lights, cameras, bins) histograms of scaled residuals
 
@@ -126,7 +135,9 @@ def prepare(position: Any, n: Any, d: Any, block: Any, options: Any, b: Any) -> 
 
 @kernel
 def _cube_roots(count: int, b: Any) -> None:
-    """Convert rows and targets for mode "paper": the table holds cube roots, so that only the cosine is converted."""
+    """Convert rows and targets for mode "paper": the table holds cube roots, so that
+    only the cosine is converted.
+    """
     for r in range(count):
         scale = np.float32(b.lit[b.index[r, 0]] ** (-2.0 / 3.0))
         for q in range(b.rows.shape[1]):
@@ -143,10 +154,14 @@ def _clamped(d: Any) -> bool:
 
 
 @kernel
-def weigh(surfel: int, count: int, noise: Any, options: Any, b: Any, weight: Any) -> None:
-    """Weights of the rows: 1 where the error of the model dominates, less where the noise of the sensor does.
+def weigh(
+    surfel: int, count: int, noise: Any, options: Any, b: Any, weight: Any
+) -> None:
+    """Weights of the rows: 1 where the error of the model dominates, less where the
+    noise of the sensor does.
 
-    The noise is that of the diffuse part, as weights by the noisy samples would favour some of them.
+    The noise is that of the diffuse part, as weights by the noisy samples would favour
+    some of them.
     """
     if options.mode == PAPER or not write_noise(surfel, count, noise, b):
         for r in range(count):
@@ -155,16 +170,23 @@ def weigh(surfel: int, count: int, noise: Any, options: Any, b: Any, weight: Any
     mean = 0.0
     least = options.floor * options.floor
     for r in range(count):
-        mean += (b.scattered[0, r] + b.scattered[1, r] + b.scattered[2, r]) / (3.0 * count)
+        mean += (b.scattered[0, r] + b.scattered[1, r] + b.scattered[2, r]) / (
+            3.0 * count
+        )
     mean = max(mean, options.floor)
     own = MODEL_ERROR * mean
     if options.mode == PERCEPTUAL:
         own = MODEL_ERROR / 3.0 * mean * (mean * mean + least) ** (-1.0 / 3.0)
     for r in range(count):
-        level = max((b.scattered[0, r] + b.scattered[1, r] + b.scattered[2, r]) / 3.0, 0.0)
-        variance = (b.noise[0, r] + b.noise[1, r] * level) / 3.0  # of the mean of three channels
+        level = max(
+            (b.scattered[0, r] + b.scattered[1, r] + b.scattered[2, r]) / 3.0, 0.0
+        )
+        # of the mean of three channels
+        variance = (b.noise[0, r] + b.noise[1, r] * level) / 3.0
         if options.mode == PERCEPTUAL:
-            slope = (level * level / 3.0 + least) * (level * level + least) ** (-4.0 / 3.0)
+            slope = (level * level / 3.0 + least) * (level * level + least) ** (
+                -4.0 / 3.0
+            )
             variance *= slope * slope
         weight[r] = 1.0 / (1.0 + variance / (own * own))
 
@@ -207,7 +229,9 @@ def fit_block(block: Any, table: Any, lift: Any, options: Any, out: Any) -> None
                 x,
                 work,
             )
-            out.status[s] = NOT_CONVERGED if not met else CLAMPED if _clamped(d) else FITTED
+            out.status[s] = (
+                NOT_CONVERGED if not met else CLAMPED if _clamped(d) else FITTED
+            )
         predict(b.rows, count, coefficients(lift, x), y, work.single)
         for c in range(3):
             for r in range(count):
@@ -219,7 +243,9 @@ def fit_block(block: Any, table: Any, lift: Any, options: Any, out: Any) -> None
 
 @kernel
 def _across(a: Any, b: Any, out: Any) -> None:
-    """Unit vector perpendicular to two others; loops, since each array operation takes seconds to compile."""
+    """Unit vector perpendicular to two others; loops, since each array operation takes
+    seconds to compile.
+    """
     for k in range(3):
         out[k] = a[(k + 1) % 3] * b[(k + 2) % 3] - a[(k + 2) % 3] * b[(k + 1) % 3]
     size = math.sqrt(out[0] * out[0] + out[1] * out[1] + out[2] * out[2])
@@ -242,10 +268,12 @@ def _add_turned(
     b: Any,
     work: Any,
 ) -> None:
-    """Add to the covariance `out` the effect of an error `turn` [rad] of the normal about either axis.
+    """Add to the covariance `out` the effect of an error `turn` [rad] of the normal
+    about either axis.
 
-    Weights are computed at the four points of the Gauss-Hermite rule with three points per axis, which is correct to
-    second order: a lobe that is sampled at its peak loses weight for a rotation in any direction.
+    Weights are computed at the four points of the Gauss-Hermite rule with three points
+    per axis, which is correct to second order: a lobe that is sampled at its peak loses
+    weight for a rotation in any direction.
     """
     small = 0
     for k in range(3):
@@ -265,7 +293,9 @@ def _add_turned(
             turned[k] = math.cos(angle) * n[k] + math.sin(angle) * axis[k]
         write_cosines(turned, options.eta, 0.0, b)
         split_diffuse(d, count, b)
-        turn_rows(table, turned, b.to_light, b.to_camera, b.index, count, b.row_memory, b.rows)
+        turn_rows(
+            table, turned, b.to_light, b.to_camera, b.index, count, b.row_memory, b.rows
+        )
         for j in range(x.shape[0]):
             moved[j] = x[j]
         fit_weighted(
@@ -286,40 +316,63 @@ def _add_turned(
 
 
 @fast_kernel
-def _root_residuals(count: int, begin: int, floor: Any, y: Any, b: Any, work: Any) -> float:
-    """Write residuals in cube-root space, averaged over channels, to `work.trial`; returns the mean sample."""
+def _root_residuals(
+    count: int, begin: int, floor: Any, y: Any, b: Any, work: Any
+) -> float:
+    """Write residuals in cube-root space, averaged over channels, to `work.trial`;
+    returns the mean sample.
+    """
     third = np.float32(1.0 / 3.0)
     mean = np.float32(0)
     for r in range(count):
-        work.total[r] = (b.given[0, begin + r] + b.given[1, begin + r] + b.given[2, begin + r]) * third
-        body = b.scattered[0, begin + r] + b.scattered[1, begin + r] + b.scattered[2, begin + r]
+        work.total[r] = (
+            b.given[0, begin + r] + b.given[1, begin + r] + b.given[2, begin + r]
+        ) * third
+        body = (
+            b.scattered[0, begin + r]
+            + b.scattered[1, begin + r]
+            + b.scattered[2, begin + r]
+        )
         work.mixed[r] = body * third + y[begin + r]
         mean += work.total[r]
     square = work.square[:count]
     inverse = work.inverse[:count]
-    to_roots(work.total[:count], floor, square, inverse, work.square_bits, work.inverse_bits)
+    to_roots(
+        work.total[:count], floor, square, inverse, work.square_bits, work.inverse_bits
+    )
     for r in range(count):
         work.trial[r] = work.total[r] * inverse[r]
-    to_roots(work.mixed[:count], floor, square, inverse, work.square_bits, work.inverse_bits)
+    to_roots(
+        work.mixed[:count], floor, square, inverse, work.square_bits, work.inverse_bits
+    )
     for r in range(count):
         work.trial[r] -= work.mixed[r] * inverse[r]
     return np.float64(mean) / max(count, 1)
 
 
 @kernel
-def _outliers(count: int, options: Any, y: Any, b: Any, work: Any, counts: Any) -> float:
-    """Fraction of outlying samples, NaN for too few samples; adds to the histograms (lights, cameras, bins)."""
+def _outliers(
+    count: int, options: Any, y: Any, b: Any, work: Any, counts: Any
+) -> float:
+    """Fraction of outlying samples, NaN for too few samples; adds to the histograms
+    (lights, cameras, bins).
+    """
     mean = _root_residuals(count, 0, np.float32(options.floor), y, b, work)
     steep = 0
     last = counts.shape[2] - 1
     for r in range(count):
-        above = b.lit[b.index[r, 0]] >= MIN_COSINE_OUTLIER and b.seen[b.index[r, 1]] >= MIN_COSINE_OUTLIER
+        above = (
+            b.lit[b.index[r, 0]] >= MIN_COSINE_OUTLIER
+            and b.seen[b.index[r, 1]] >= MIN_COSINE_OUTLIER
+        )
         work.square[r] = abs(work.trial[r]) if above else np.float32(np.inf)
         steep += 1 if above else 0
     if steep < options.least:
         return math.nan
     level = max(mean, options.floor)
-    finest = MIN_ROOT_SCALE * level / np.cbrt(level * level + options.floor * options.floor)
+    finest = (
+        MIN_ROOT_SCALE * level / np.cbrt(level * level + options.floor * options.floor)
+    )
     scale = max(1.4826 * median_of(work.square, work.square_bits, count, steep), finest)
     beyond = 0
     per_scale = BINS_PER_SCALE / scale
@@ -341,7 +394,17 @@ def _mark(held: Any, kind: int, finite: Any, b: Any) -> None:
 
 @kernel
 def _held_out(
-    kind: int, n: Any, d: Any, x: Any, table: Any, finite: Any, held: Any, y: Any, b: Any, work: Any, out: Any
+    kind: int,
+    n: Any,
+    d: Any,
+    x: Any,
+    table: Any,
+    finite: Any,
+    held: Any,
+    y: Any,
+    b: Any,
+    work: Any,
+    out: Any,
 ) -> None:
     """Relative errors (2,) of the predictions of held-out samples of one kind."""
     _mark(held, kind, finite, b)
@@ -351,14 +414,20 @@ def _held_out(
     for c in range(3):
         for r in range(count):
             b.scattered[c, r] += y[r]
-    out[0], out[1] = relative_errors(b.scattered[:, :count], b.given[:, :count], NO_FLOOR, work)
+    out[0], out[1] = relative_errors(
+        b.scattered[:, :count], b.given[:, :count], NO_FLOOR, work
+    )
 
 
 @kernel
-def refit_block(block: Any, table: Any, lift: Any, options: Any, out: Any, more: Any) -> None:
-    """Fit, or only evaluate, every surfel of a block by a reduced basis; its errors, held-out samples and outliers.
+def refit_block(
+    block: Any, table: Any, lift: Any, options: Any, out: Any, more: Any
+) -> None:
+    """Fit, or only evaluate, every surfel of a block by a reduced basis; its errors,
+    held-out samples and outliers.
 
-    `table` is scaled to order one and the lift (m, m) is the identity. Every block of samples is read only once.
+    `table` is scaled to order one and the lift (m, m) is the identity. Every block of
+    samples is read only once.
     """
     lights = block.light.shape[0]
     cameras = block.camera.shape[0]
@@ -413,8 +482,13 @@ def refit_block(block: Any, table: Any, lift: Any, options: Any, out: Any, more:
         if more.counts.shape[2] > 0:
             more.outlier[s] = _outliers(count, options, y, b, work, more.counts)
         if more.covariance.shape[1] > 0:
-            # colour differences do not affect the sum over channels: their common error is at most the smallest one
-            shared = min(more.diffuse_error[s, 0], more.diffuse_error[s, 1], more.diffuse_error[s, 2])
+            # colour differences do not affect the sum over channels: their common error
+            # is at most the smallest one
+            shared = min(
+                more.diffuse_error[s, 0],
+                more.diffuse_error[s, 1],
+                more.diffuse_error[s, 2],
+            )
             for c in range(3):
                 drift[c] = shared / max(d[c], SMALLEST_R_D)
             _restore_total(count, b, work)
@@ -437,10 +511,35 @@ def refit_block(block: Any, table: Any, lift: Any, options: Any, out: Any, more:
             b.scattered[:, :count], b.given[:, :count], NO_FLOOR, work
         )
         if more.covariance.shape[1] > 0 and more.turn[s] > 0.0:
-            _add_turned(n, d, more.turn[s], count, table, lift, options, x, more.covariance[s], weight, b, work)
+            _add_turned(
+                n,
+                d,
+                more.turn[s],
+                count,
+                table,
+                lift,
+                options,
+                x,
+                more.covariance[s],
+                weight,
+                b,
+                work,
+            )
         for kind in range(1, 3):
             if present[kind]:
-                _held_out(kind, n, d, x, table, finite, more.held, y, b, work, more.held_error[s, kind - 1])
+                _held_out(
+                    kind,
+                    n,
+                    d,
+                    x,
+                    table,
+                    finite,
+                    more.held,
+                    y,
+                    b,
+                    work,
+                    more.held_error[s, kind - 1],
+                )
 
 
 @kernel

@@ -20,11 +20,15 @@ from skindb.schema import check, label
 from skindb.schema.status import LARGEST_R_D, SMALLEST_R_D
 
 METHODS = ("separated", "quantile", "minimum")
-LARGEST_TURN = 0.25  # rad; largest error of a normal: no sample above the grazing limit falls below the horizon
-# Coloured highlights, which eq. 7 excludes: under Lafortune's of skin, R_d of five captures was 0.004 to 0.016 too low.
+# rad; largest error of a normal: no sample above the grazing limit falls below the
+# horizon
+LARGEST_TURN = 0.25
+# Coloured highlights, which eq. 7 excludes: under Lafortune's of skin, R_d of five
+# captures was 0.004 to 0.016 too low.
 MODEL_ERROR_ALBEDO = 0.01
-# The surface of skin reflects 4 to 7 % of the light (Anderson and Parrish 1981, J. Invest. Dermatol. 77, 13-19). How
-# evenly is not known: the prior is half a normal distribution, and at its 95 % limit all of the mean of both is even.
+# The surface of skin reflects 4 to 7 % of the light (Anderson and Parrish 1981, J.
+# Invest. Dermatol. 77, 13-19). How evenly is not known: the prior is half a normal
+# distribution, and at its 95 % limit all of the mean of both is even.
 EVEN_REFLECTION = 0.055
 NORMAL_95 = 1.96
 
@@ -42,34 +46,42 @@ def estimate_diffuse_reflectance(
     Parameters
     ----------
     lumitexels
-        Samples with geometry and `shading_normal`; `normal_error`, if present, contributes to the error of R_d. If the
-        noise of the samples is known (`sample_variance`), "separated" limits their weights accordingly.
+        Samples with geometry and `shading_normal`; `normal_error`, if present,
+        contributes to the error of R_d. If the noise of the samples is known
+        (`sample_variance`), "separated" limits their weights accordingly.
     eta
         Refractive index of F_t and of eq. 5.
     method
-        "minimum": the paper's eq. 6, biased down by noise and up by whatever the surface reflects into every
-        direction. "quantile": tenth percentile of the same ratios with half its noise bias taken out. "separated":
-        light from the surface is white, so differences between channels give the differences of R_d by a robust
-        slope; what is common to the channels is split by non-negative least squares between the diffuse shape
-        cos(theta_i) F_t F_t and six microfacet lobes without diffuse part.
+        "minimum": the paper's eq. 6, biased down by noise and up by whatever the
+        surface reflects into every direction. "quantile": tenth percentile of the same
+        ratios with half its noise bias taken out. "separated": light from the surface
+        is white, so differences between channels give the differences of R_d by a
+        robust slope; what is common to the channels is split by non-negative least
+        squares between the diffuse shape cos(theta_i) F_t F_t and six microfacet lobes
+        without diffuse part.
     discard
         Number of smallest ratios that "minimum" ignores.
     even_reflection
-        Largest fraction of light (95 %) that the surface may reflect evenly and without colour. Such light cannot be
-        distinguished from diffuse light, so that R_d of the entire take may be too high by up to this value.
+        Largest fraction of light (95 %) that the surface may reflect evenly and without
+        colour. Such light cannot be distinguished from diffuse light, so that R_d of
+        the entire take may be too high by up to this value.
 
     Returns
     -------
     Dataset
-        `diffuse_reflectance` within [1e-4, 0.9999], `diffuse_reflectance_error`, `diffuse_reflectance_total_error`,
-        `dipole_s`; NaN where fewer than ten samples lie above the grazing limit; and `even_reflection_limit`. The error
-        of "separated" is that of the samples' noise and, at first order, of the normal: 93 to 97 % of the true values
-        lie within 1.96 of it where the model holds, with given and with estimated normals. It ignores that both use the
-        same samples: an efficient estimate of the normal is uncorrelated with that of R_d at a fixed normal. The total
-        error ("separated" alone) has three parts in quadrature: the error of the samples, as residuals that samples of
-        one light or of one camera have in common show it, and of the normal by `normal_total_error`; 0.01; and
-        `even_reflection` / 1.96, which is common to the take and acts to one side (`reflectance_interval`). The errors
-        of the other two methods do not include their bias.
+        `diffuse_reflectance` within [1e-4, 0.9999], `diffuse_reflectance_error`,
+        `diffuse_reflectance_total_error`, `dipole_s`; NaN where fewer than ten samples
+        lie above the grazing limit; and `even_reflection_limit`. The error of
+        "separated" is that of the samples' noise and, at first order, of the normal: 93
+        to 97 % of the true values lie within 1.96 of it where the model holds, with
+        given and with estimated normals. It ignores that both use the same samples: an
+        efficient estimate of the normal is uncorrelated with that of R_d at a fixed
+        normal. The total error ("separated" alone) has three parts in quadrature: the
+        error of the samples, as residuals that samples of one light or of one camera
+        have in common show it, and of the normal by `normal_total_error`; 0.01; and
+        `even_reflection` / 1.96, which is common to the take and acts to one side
+        (`reflectance_interval`). The errors of the other two methods do not include
+        their bias.
 
     Notes
     -----
@@ -84,12 +96,17 @@ def estimate_diffuse_reflectance(
     Lafortune lobes, coloured, 8 x 64  3.4  3.9  4.7   2.7  3.3  3.9   1.9  3.8  5.5
     ================================== =============== =============== ===============
 
-    The measured materials reflect 0.02 evenly into all directions: 4 to 8 % of R_d that no minimum can avoid.
+    The measured materials reflect 0.02 evenly into all directions: 4 to 8 % of R_d that
+    no minimum can avoid.
     """
     if method not in METHODS:
         raise ValueError(f"method must be one of {METHODS}, not {method!r}")
     check(lumitexels, (*GEOMETRY, "shading_normal"), where="lumitexels")
-    errors = ("normal_error", "normal_total_error") if "normal_total_error" in lumitexels else ("normal_error",)
+    errors = (
+        ("normal_error", "normal_total_error")
+        if "normal_total_error" in lumitexels
+        else ("normal_error",)
+    )
     known = errors if "normal_error" in lumitexels else errors[:0]
     found = elementwise(
         _reflectances,
@@ -107,11 +124,14 @@ def estimate_diffuse_reflectance(
         discard=discard,
         even_reflection=even_reflection,
     )
-    return found.assign(even_reflection_limit=label("even_reflection_limit", even_reflection))
+    return found.assign(
+        even_reflection_limit=label("even_reflection_limit", even_reflection)
+    )
 
 
 def reflectance_interval(fitted: xr.Dataset) -> tuple[xr.DataArray, xr.DataArray]:
-    """Lower and upper ends of the 95 % interval of R_d, with even reflection to the lower side alone.
+    """Lower and upper ends of the 95 % interval of R_d, with even reflection to the
+    lower side alone.
 
     Parameters
     ----------
@@ -145,24 +165,46 @@ def _reflectances(
     discard: int,
     even_reflection: float,
 ) -> tuple[Array, Array, Array, Array]:
-    """(n, 3) R_d within SMALLEST_R_D and LARGEST_R_D, its standard error and total error, and dipole s.
+    """(n, 3) R_d within SMALLEST_R_D and LARGEST_R_D, its standard error and total
+    error, and dipole s.
 
-    `others` are the arrays of the noise of the samples, and the standard and total error of the normal, if known.
+    `others` are the arrays of the noise of the samples, and the standard and total
+    error of the normal, if known.
     """
     known = len(NOISE_INPUTS) if len(others) >= len(NOISE_INPUTS) else 0
     errors = others[known:]
-    normal_error, normal_total_error = (errors[i] if i < len(errors) else None for i in range(2))
+    normal_error, normal_total_error = (
+        errors[i] if i < len(errors) else None for i in range(2)
+    )
     if method == "separated":
         larger = normal_error if normal_total_error is None else normal_total_error
-        angle = np.stack([_turn(normal_error, len(sample)), _turn(larger, len(sample))], axis=1)
+        angle = np.stack(
+            [_turn(normal_error, len(sample)), _turn(larger, len(sample))], axis=1
+        )
         estimate, error, shared = (np.empty((len(sample), 3)) for _ in range(3))
-        doubles = (np.ascontiguousarray(a, np.float64) for a in (position, light, camera, normal))
+        doubles = (
+            np.ascontiguousarray(a, np.float64)
+            for a in (position, light, camera, normal)
+        )
         noise = noise_of(others[:known], NO_NOISE)
-        separate_block(sample_bits(sample), *doubles, angle, lobe_table(), noise, float(eta), estimate, error, shared)
+        separate_block(
+            sample_bits(sample),
+            *doubles,
+            angle,
+            lobe_table(),
+            noise,
+            float(eta),
+            estimate,
+            error,
+            shared,
+        )
     else:
         rule = partial(rule_reflectance, method=method, eta=eta, discard=discard)
         estimate, error = in_batches(
-            lambda sample, position, normal: rule(sample, position, light, camera, normal), (sample, position, normal)
+            lambda sample, position, normal: rule(
+                sample, position, light, camera, normal
+            ),
+            (sample, position, normal),
         )
         shared = np.full_like(error, np.nan)
     clamped = np.clip(estimate, SMALLEST_R_D, LARGEST_R_D)
@@ -171,8 +213,11 @@ def _reflectances(
 
 
 def _turn(normal_error: Array | None, surfels: int) -> Array:
-    """Standard error (surfels,) of the normal about each of two axes [rad]; 0 where it is not known."""
+    """Standard error (surfels,) of the normal about each of two axes [rad]; 0 where it
+    is not known.
+    """
     if normal_error is None:
         return np.zeros(surfels)
     radians = np.nan_to_num(np.deg2rad(normal_error, dtype=float))
-    return np.asarray(np.clip(radians, 0, LARGEST_TURN) / np.sqrt(2))  # the RMS angle is that of two axes
+    # the RMS angle is that of two axes
+    return np.asarray(np.clip(radians, 0, LARGEST_TURN) / np.sqrt(2))

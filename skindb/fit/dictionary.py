@@ -13,7 +13,9 @@ if TYPE_CHECKING:
     from skindb.optics.dictionary import Dictionary
 
 
-def dictionary_report(dictionary: Dictionary, *, disc_angular_radius: float) -> xr.Dataset:
+def dictionary_report(
+    dictionary: Dictionary, *, disc_angular_radius: float
+) -> xr.Dataset:
     """Energy, reciprocity, errors and holes of every material, see `dictionary_quality`.
 
     Parameters
@@ -21,12 +23,14 @@ def dictionary_report(dictionary: Dictionary, *, disc_angular_radius: float) -> 
     dictionary
         `embedded_dictionary()` or `read_dictionary(path)`.
     disc_angular_radius
-        Angular radius of the lights as seen from the surface [rad]; ignored if the tables are already averaged.
+        Angular radius of the lights as seen from the surface [rad]; ignored if the
+        tables are already averaged.
 
     Returns
     -------
     Dataset
-        Group `dictionary_report` of the schema and `disc_angular_radius` [rad]; attributes `source` and `notes`.
+        Group `dictionary_report` of the schema and `disc_angular_radius` [rad];
+        attributes `source` and `notes`.
     """
     radius = dictionary.disc_angular_radius or disc_angular_radius
     attrs = {"source": dictionary.source, "notes": list(dictionary.notes)}

@@ -24,7 +24,9 @@ ERRORS = {
 }
 
 
-def hold_out(capture: xr.DataTree, plan: FitPlan, parameters: FitParameters) -> xr.Dataset:
+def hold_out(
+    capture: xr.DataTree, plan: FitPlan, parameters: FitParameters
+) -> xr.Dataset:
     """Choose lights and cameras that are held out of a fit.
 
     Parameters
@@ -39,22 +41,32 @@ def hold_out(capture: xr.DataTree, plan: FitPlan, parameters: FitParameters) -> 
     Returns
     -------
     Dataset
-        `light_held_out` (light) and `camera_held_out` (camera). Those of kept photographs are chosen first,
-        so that a comparison with such a photograph is a prediction.
+        `light_held_out` (light) and `camera_held_out` (camera). Those of kept
+        photographs are chosen first, so that a comparison with such a photograph is a
+        prediction.
     """
     visible = capture["surfels"].to_dataset()["camera_visible_fraction"]
     # cameras that see no surfel are useless for a test
     seeing = np.ones(visible.sizes["camera"], np.bool_)
     if parameters.hold_out_cameras:
         seeing = (visible.max("surfel") > 0).values
-    dark = _drawn(capture, "light", plan.lights, parameters.hold_out_lights, [parameters.seed, 0])
-    away = _drawn(capture, "camera", seeing, parameters.hold_out_cameras, [parameters.seed, 2])
+    dark = _drawn(
+        capture, "light", plan.lights, parameters.hold_out_lights, [parameters.seed, 0]
+    )
+    away = _drawn(
+        capture, "camera", seeing, parameters.hold_out_cameras, [parameters.seed, 2]
+    )
     flags = {
         "light_held_out": np.isin(np.arange(len(plan.lights)), dark),
         "camera_held_out": np.isin(np.arange(len(seeing)), away),
     }
     dome = capture["dome"].to_dataset()
-    return dataset(flags, coords={dim: dome[dim].values for dim in ("light", "camera") if dim in dome.coords})
+    return dataset(
+        flags,
+        coords={
+            dim: dome[dim].values for dim in ("light", "camera") if dim in dome.coords
+        },
+    )
 
 
 def fitted_part(lumitexels: xr.Dataset, held_out: xr.Dataset) -> xr.Dataset:
@@ -67,7 +79,9 @@ def fitted_part(lumitexels: xr.Dataset, held_out: xr.Dataset) -> xr.Dataset:
     return part
 
 
-def _drawn(capture: xr.DataTree, dim: str, useful: Mask, fraction: float, seed: list[int]) -> Indices:
+def _drawn(
+    capture: xr.DataTree, dim: str, useful: Mask, fraction: float, seed: list[int]
+) -> Indices:
     """Indices of the useful lights or cameras that are held out: at least one if any, never all."""
     count = int(useful.sum())
     if fraction and count < 2:
@@ -76,19 +90,25 @@ def _drawn(capture: xr.DataTree, dim: str, useful: Mask, fraction: float, seed: 
         raise InputError(Fault(f"hold_out_{dim}s", rule, str(count), cure))
     order = np.random.default_rng(seed).permutation(np.flatnonzero(useful))
     if "photographs" in capture.children:
-        shown = np.isin(order, capture["photographs"].to_dataset()[f"photograph_{dim}"].values)
+        shown = np.isin(
+            order, capture["photographs"].to_dataset()[f"photograph_{dim}"].values
+        )
         order = order[np.argsort(~shown, kind="stable")]
-    return np.sort(order[: min(max(round(fraction * count), int(fraction > 0)), count - 1)])
+    return np.sort(
+        order[: min(max(round(fraction * count), int(fraction > 0)), count - 1)]
+    )
 
 
-def held_out_error(lumitexels: xr.Dataset, *, basis: xr.Dataset, eta: float = 1.3, of: str = "light") -> xr.Dataset:
+def held_out_error(
+    lumitexels: xr.Dataset, *, basis: xr.Dataset, eta: float = 1.3, of: str = "light"
+) -> xr.Dataset:
     """Relative RMS error of predicted samples, per surfel.
 
     Parameters
     ----------
     lumitexels
-        Samples of the lights or cameras that were held out, with geometry, `shading_normal`, `diffuse_reflectance` and
-        `basis_weight` of the fit.
+        Samples of the lights or cameras that were held out, with geometry,
+        `shading_normal`, `diffuse_reflectance` and `basis_weight` of the fit.
     basis
         `basis_brdf` of the weights.
     eta
@@ -99,8 +119,9 @@ def held_out_error(lumitexels: xr.Dataset, *, basis: xr.Dataset, eta: float = 1.
     Returns
     -------
     Dataset
-        `held_out_error` and, in cube-root space, `held_out_error_perceptual`; of cameras `held_out_camera_error` and
-        `held_out_camera_error_perceptual`. NaN where the surfel has no such sample or nothing was fitted.
+        `held_out_error` and, in cube-root space, `held_out_error_perceptual`; of
+        cameras `held_out_camera_error` and `held_out_camera_error_perceptual`. NaN
+        where the surfel has no such sample or nothing was fitted.
     """
     check(lumitexels, (*NEEDED, "basis_weight"), where="lumitexels")
 

@@ -13,7 +13,9 @@ from skindb.optics.fresnel import fresnel_transmittance
 from skindb.schema import check, dataset
 
 Array = NDArray[np.float64]
-VIEWS = 6_000  # surfels in a camera that are used: twice as many changed gains by 0.1 to 0.4 %, at most 2.2 %
+# surfels in a camera that are used: twice as many changed gains by 0.1 to 0.4 %, at
+# most 2.2 %
+VIEWS = 6_000
 MIN_COSINE_GAIN = 0.25  # to light and camera; below it F_t changes too fast
 MIN_HALF_ANGLE = 25.0  # degrees between half vector and normal; highlights are narrower
 # number of smooth functions that model the shading; required lights in excess of it
@@ -22,21 +24,28 @@ SPARE = 3
 # range of sample over smooth model; outside it are shadows, hair and motion, not gains
 LOWEST = 0.5
 HIGHEST = 1.5
-SMALLEST_SHADING = 0.2  # relative to the median; ratios to smaller values are unreliable
-# weight of the prior that gains are 1, relative to the information of the views on the median light. Chosen on three
-# captures of measured materials; on these and on two with other surfaces, with errors of the lights of 0 to 15 %,
-# errors of 0.2 to 2.5 % remain (docs/validation.md).
+# relative to the median; ratios to smaller values are unreliable
+SMALLEST_SHADING = 0.2
+# weight of the prior that gains are 1, relative to the information of the views on the
+# median light. Chosen on three captures of measured materials; on these and on two with
+# other surfaces, with errors of the lights of 0 to 15 %, errors of 0.2 to 2.5 % remain
+# (docs/validation.md).
 PRIOR = 0.03
 
 
-def estimate_light_gains(lumitexels: xr.Dataset, *, rng: np.random.Generator, eta: float = 1.3) -> xr.Dataset:
-    """Ratio of the true to the calibrated intensity of each light, by comparison of samples under different lights.
+def estimate_light_gains(
+    lumitexels: xr.Dataset, *, rng: np.random.Generator, eta: float = 1.3
+) -> xr.Dataset:
+    """Ratio of the true to the calibrated intensity of each light, by comparison of
+    samples under different lights.
 
-    Away from highlights, one camera sees diffuse light from a surfel: F_t times a linear function of the direction of
-    the light, which is a cosine with some normal. The gains are chosen so that the samples of all surfels are as close
-    to such functions as possible: a least-squares problem that is linear in the inverse gains after the functions are
-    eliminated (variable projection, Golub and Pereyra 1973). Gains that are smooth over the dome cannot be
-    distinguished from rotated normals; a prior keeps them at 1.
+    Away from highlights, one camera sees diffuse light from a surfel: F_t times a
+    linear function of the direction of the light, which is a cosine with some normal.
+    The gains are chosen so that the samples of all surfels are as close to such
+    functions as possible: a least-squares problem that is linear in the inverse gains
+    after the functions are eliminated (variable projection, Golub and Pereyra 1973).
+    Gains that are smooth over the dome cannot be distinguished from rotated normals; a
+    prior keeps them at 1.
 
     Parameters
     ----------
@@ -50,22 +59,34 @@ def estimate_light_gains(lumitexels: xr.Dataset, *, rng: np.random.Generator, et
     Returns
     -------
     Dataset
-        `light_gain` (light) with median 1; 1 for lights without usable surfels. Errors of up to 2.5 % remained on
-        captures with known truth: use the gains for lights whose intensities are less accurate than this.
+        `light_gain` (light) with median 1; 1 for lights without usable surfels. Errors
+        of up to 2.5 % remained on captures with known truth: use the gains for lights
+        whose intensities are less accurate than this.
 
     Examples
     --------
-    >>> gains = estimate_light_gains(lumitexels(capture), rng=np.random.default_rng(0))  # doctest: +SKIP
+    >>> rng = np.random.default_rng(0)
+    >>> gains = estimate_light_gains(lumitexels(capture), rng=rng)  # doctest: +SKIP
     """
-    names = ("reflectance_sample", "surfel_position", "surfel_normal", "light_position", "camera_position")
+    names = (
+        "reflectance_sample",
+        "surfel_position",
+        "surfel_normal",
+        "light_position",
+        "camera_position",
+    )
     check(lumitexels, names, where="lumitexels")
     surfels = lumitexels.sizes["surfel"]
     cameras = lumitexels.sizes["camera"]
-    chosen = np.sort(rng.choice(surfels, min(-(-VIEWS // cameras), surfels), replace=False))
+    chosen = np.sort(
+        rng.choice(surfels, min(-(-VIEWS // cameras), surfels), replace=False)
+    )
     few = lumitexels[list(names)].isel(surfel=chosen).compute()
     samples = few["reflectance_sample"].values.astype(np.float64).mean(axis=3)
     matrix = np.zeros((samples.shape[1],) * 2)
-    position, normal, light, camera = (few[name].values.astype(np.float64) for name in names[1:])
+    position, normal, light, camera = (
+        few[name].values.astype(np.float64) for name in names[1:]
+    )
     to_light = directions(position, light)
     to_camera = directions(position, camera)
     lit = cosines(normal, to_light)
@@ -74,12 +95,23 @@ def estimate_light_gains(lumitexels: xr.Dataset, *, rng: np.random.Generator, et
         axes = _frame(normal[i])
         shading = _shading(to_light[i] @ axes.T, eta)
         for c in np.flatnonzero(seen[i] > MIN_COSINE_GAIN):
-            half = (lit[i] + seen[i, c]) / np.linalg.norm(to_light[i] + to_camera[i, c], axis=1)
-            usable = (lit[i] > MIN_COSINE_GAIN) & (half < np.cos(np.radians(MIN_HALF_ANGLE)))
-            _add_view(samples[i, :, c], shading, np.flatnonzero(usable & np.isfinite(samples[i, :, c])), matrix)
+            half = (lit[i] + seen[i, c]) / np.linalg.norm(
+                to_light[i] + to_camera[i, c], axis=1
+            )
+            usable = (lit[i] > MIN_COSINE_GAIN) & (
+                half < np.cos(np.radians(MIN_HALF_ANGLE))
+            )
+            _add_view(
+                samples[i, :, c],
+                shading,
+                np.flatnonzero(usable & np.isfinite(samples[i, :, c])),
+                matrix,
+            )
     return dataset(
         {"light_gain": _gains(matrix)},
-        coords={"light": lumitexels["light"].values} if "light" in lumitexels.coords else None,
+        coords={"light": lumitexels["light"].values}
+        if "light" in lumitexels.coords
+        else None,
     )
 
 
@@ -88,19 +120,31 @@ def divided_by_gains(lumitexels: xr.Dataset, light_gain: xr.DataArray) -> xr.Dat
     sample = lumitexels["reflectance_sample"]
     gain = light_gain.variable.astype(np.float32)
     right = (sample.astype(np.float32) / gain).astype(sample.dtype)
-    return lumitexels.assign(reflectance_sample=right.transpose(*sample.dims).assign_attrs(sample.attrs))
+    return lumitexels.assign(
+        reflectance_sample=right.transpose(*sample.dims).assign_attrs(sample.attrs)
+    )
 
 
 def summarise_gains(gains: xr.Dataset) -> dict[str, Any]:
-    """Standard deviation of the gains, and the light whose gain is farthest from 1, for attributes."""
+    """Standard deviation of the gains, and the light whose gain is farthest from 1, for
+    attributes.
+    """
     gain = gains["light_gain"].values
     names = gains["light"].values if "light" in gains.coords else np.arange(gain.size)
     far = int(np.abs(np.log(gain)).argmax())
-    return {"spread": float(gain.std()), "light": str(names[far]), "gain": float(gain[far])}
+    return {
+        "spread": float(gain.std()),
+        "light": str(names[far]),
+        "gain": float(gain[far]),
+    }
 
 
-def _add_view(sample: Array, shading: Array, at: NDArray[np.intp], matrix: Array) -> None:
-    """Add to `matrix` (light, light) the squared residuals of a smooth function for the samples of lights `at`."""
+def _add_view(
+    sample: Array, shading: Array, at: NDArray[np.intp], matrix: Array
+) -> None:
+    """Add to `matrix` (light, light) the squared residuals of a smooth function for the
+    samples of lights `at`.
+    """
     if len(at) < SMOOTH + SPARE:
         return
     columns = shading[at]
@@ -117,12 +161,16 @@ def _add_view(sample: Array, shading: Array, at: NDArray[np.intp], matrix: Array
 
 
 def _gains(matrix: Array) -> Array:
-    """Gains (light,) from the quadratic form (light, light) of the residual in the inverse gains."""
+    """Gains (light,) from the quadratic form (light, light) of the residual in the
+    inverse gains.
+    """
     own = np.diagonal(matrix)
     if not (own > 0).any():
         return np.ones(len(matrix))
     prior = PRIOR * float(np.median(own[own > 0]))
-    inverse = np.linalg.solve(matrix + prior * np.eye(len(matrix)), np.full(len(matrix), prior))
+    inverse = np.linalg.solve(
+        matrix + prior * np.eye(len(matrix)), np.full(len(matrix), prior)
+    )
     gain = np.where(own > 0, 1 / inverse, 1.0)
     return np.asarray(np.where(own > 0, gain / np.median(gain[own > 0]), 1.0))
 
@@ -135,6 +183,8 @@ def _frame(normal: Array) -> Array:
 
 
 def _shading(direction: Array, eta: float) -> Array:
-    """F_t times each coordinate (light, SMOOTH) of directions (light, 3) in the frame of the surfel."""
+    """F_t times each coordinate (light, SMOOTH) of directions (light, 3) in the frame
+    of the surfel.
+    """
     enters = fresnel_transmittance(np.clip(direction[:, 2], MIN_COSINE_GAIN, 1.0), eta)
     return np.asarray(direction * enters[:, None])

@@ -22,7 +22,9 @@ GEOMETRY = (
 
 
 def disc_angle(whole: xr.Dataset) -> float:
-    """Median angular radius [rad] of the lights as seen from the middle of the surfels; 0 for point lights."""
+    """Median angular radius [rad] of the lights as seen from the middle of the surfels;
+    0 for point lights.
+    """
     middle = whole["surfel_position"].values.astype(np.float64).mean(axis=0)
     distance = np.linalg.norm(whole["light_position"].values - middle, axis=1)
     return float(np.median(np.arctan2(whole["light_disc_radius"].values, distance)))
@@ -39,8 +41,9 @@ def lumitexels(capture: xr.DataTree) -> xr.Dataset:
     Returns
     -------
     Dataset
-        `reflectance_sample` (surfel, light, camera, channel) [sr^-1], lazy if the capture is, with position, normal and
-        area of the surfels, positions of lights and cameras [mm], and the noise of the samples if it is known.
+        `reflectance_sample` (surfel, light, camera, channel) [sr^-1], lazy if the
+        capture is, with position, normal and area of the surfels, positions of lights
+        and cameras [mm], and the noise of the samples if it is known.
 
     Raises
     ------
@@ -52,8 +55,13 @@ def lumitexels(capture: xr.DataTree) -> xr.Dataset:
     read: list[str] = []
     optional = {"samples": (SHOT, *NOISE_SAMPLES), "dome": NOISE_LIGHTS}
     for group, required in (("samples", SAMPLES), ("surfels", SURFELS), ("dome", DOME)):
-        dataset = capture[group].to_dataset() if group in capture.children else xr.Dataset()
-        names = [*required, *(name for name in optional.get(group, ()) if name in dataset)]
+        dataset = (
+            capture[group].to_dataset() if group in capture.children else xr.Dataset()
+        )
+        names = [
+            *required,
+            *(name for name in optional.get(group, ()) if name in dataset),
+        ]
         try:
             check(dataset, names, where=group)
             parts.append(dataset[names])
@@ -62,8 +70,13 @@ def lumitexels(capture: xr.DataTree) -> xr.Dataset:
             faults += error.faults
     if faults:
         raise InputError(faults)
-    merged = xr.merge(parts, compat="override", join="override", combine_attrs="override")
+    merged = xr.merge(
+        parts, compat="override", join="override", combine_attrs="override"
+    )
     if SHOT not in merged:
         merged = merged.assign({SHOT: label(SHOT, 0.0)})
-    # geometry and noise are read once: 60 bytes per surfel, compared with 14 kB of samples for a full dome
-    return merged.assign({name: merged[name].load() for name in read if name != "reflectance_sample"})
+    # geometry and noise are read once: 60 bytes per surfel, compared with 14 kB of
+    # samples for a full dome
+    return merged.assign(
+        {name: merged[name].load() for name in read if name != "reflectance_sample"}
+    )

@@ -1,4 +1,6 @@
-"""The fit of one take: every stage in order, from a capture to a model, in two passes over the samples."""
+"""The fit of one take: every stage in order, from a capture to a model, in two passes
+over the samples.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,11 @@ from skindb.fit.albedo import estimate_diffuse_reflectance
 from skindb.fit.basis import reduce_basis
 from skindb.fit.held_out import ERRORS, fitted_part, hold_out
 from skindb.fit.inter_reflection import bounced_light, without_bounce
-from skindb.fit.light_gains import divided_by_gains, estimate_light_gains, summarise_gains
+from skindb.fit.light_gains import (
+    divided_by_gains,
+    estimate_light_gains,
+    summarise_gains,
+)
 from skindb.fit.lumitexels import disc_angle, lumitexels
 from skindb.fit.normals import estimate_normals
 from skindb.fit.obstructed import find_obstructed
@@ -58,27 +64,31 @@ def fit_model(
     Parameters
     ----------
     capture
-        Version of kind "capture": groups samples, surfels and dome, and optionally mesh, probe and photographs.
+        Version of kind "capture": groups samples, surfels and dome, and optionally
+        mesh, probe and photographs.
     parameters
         Default `FitParameters()`.
     dictionary
-        BRDFs for point lights that the surface is a mixture of; default the embedded 59, analytic fits to measured
-        BRDFs.
+        BRDFs for point lights that the surface is a mixture of; default the embedded
+        59, analytic fits to measured BRDFs.
     progress
         Called with the stage, the number of finished steps and the total number of steps.
 
     Returns
     -------
     DataTree
-        A model, as the kind "model" is stored: groups fitted, basis, held_out, outliers, the capture's mesh, dome and
-        probe, and translucency if there is a probe. Attributes: parameters, fraction of surfels per status, medians of
-        the residuals and of the errors at held-out samples, lights and cameras that many samples contradict,
-        "translucency" of each site (`summarise_translucency`), skipped parts with reasons, wall times of the stages.
+        A model, as the kind "model" is stored: groups fitted, basis, held_out,
+        outliers, the capture's mesh, dome and probe, and translucency if there is a
+        probe. Attributes: parameters, fraction of surfels per status, medians of the
+        residuals and of the errors at held-out samples, lights and cameras that many
+        samples contradict, "translucency" of each site (`summarise_translucency`),
+        skipped parts with reasons, wall times of the stages.
 
     Raises
     ------
     InputError
-        A capture that does not fit the schema, or whose consent does not cover fits, or no surfel that could be fitted.
+        A capture that does not fit the schema, or whose consent does not cover fits, or
+        no surfel that could be fitted.
 
     Examples
     --------
@@ -111,7 +121,9 @@ def first_pass(
     if parameters.light_gains:
         chosen = np.random.default_rng([parameters.seed, 2])
         with clock.stage("light gains"):
-            groups["light_gains"] = estimate_light_gains(whole, rng=chosen, eta=parameters.eta)
+            groups["light_gains"] = estimate_light_gains(
+                whole, rng=chosen, eta=parameters.eta
+            )
         whole = divided_by_gains(whole, groups["light_gains"]["light_gain"])
     with clock.stage("dictionary"):
         tables = disc_dictionary(dictionary, disc_angle(whole))
@@ -121,12 +133,23 @@ def first_pass(
     work = fitted_part(whole, held_out)
     eta = parameters.eta
     rank = min(parameters.rank, len(tables.names))
-    diffuse = partial(estimate_diffuse_reflectance, eta=eta, even_reflection=parameters.even_reflection)
+    diffuse = partial(
+        estimate_diffuse_reflectance,
+        eta=eta,
+        even_reflection=parameters.even_reflection,
+    )
 
-    def fit(samples: xr.Dataset) -> xr.Dataset:  # one graph: every block of samples is read once
+    # one graph: every block of samples is read once
+    def fit(samples: xr.Dataset) -> xr.Dataset:
         found = estimate_normals(samples, eta=eta)
         found = found.merge(diffuse(samples.merge(found)))
-        surface = fit_surface(samples.merge(found), dictionary=tables, mode=parameters.mode, rank=rank, eta=eta)
+        surface = fit_surface(
+            samples.merge(found),
+            dictionary=tables,
+            mode=parameters.mode,
+            rank=rank,
+            eta=eta,
+        )
         return found.merge(surface).compute()
 
     with clock.stage("first pass"):
@@ -141,7 +164,10 @@ def first_pass(
         [name for name in ("light", "camera") if name in fitted.coords]
     )
     first = xr.DataTree.from_dict({"fitted": fitted, "held_out": held_out, **groups})
-    first.attrs = {"parameters": parameters.as_dict() | {"rank": rank}, "dictionary": tables.source}
+    first.attrs = {
+        "parameters": parameters.as_dict() | {"rank": rank},
+        "dictionary": tables.source,
+    }
     first.attrs |= {"dictionary_digest": _digest(dictionary), "seconds": clock.seconds}
     first.attrs["skipped"] = plan.explain() if plan.omissions else []
     return first
@@ -154,7 +180,8 @@ def second_pass(
     dictionary: Dictionary | None = None,
     progress: Progress | None = None,
 ) -> xr.DataTree:
-    """The second half of `fit_model`: reduced basis, refit, errors at held-out samples, outliers, translucency.
+    """The second half of `fit_model`: reduced basis, refit, errors at held-out samples,
+    outliers, translucency.
 
     Parameters
     ----------
@@ -166,7 +193,8 @@ def second_pass(
     Raises
     ------
     InputError
-        If `first` was made with another dictionary or another number of surfels, or holds no fitted surfel.
+        If `first` was made with another dictionary or another number of surfels, or
+        holds no fitted surfel.
     """
     honour_consent(capture.attrs, "fit")
     parameters = FitParameters.of(first.attrs)
@@ -185,26 +213,49 @@ def second_pass(
         good = int((fitted["fit_status"] == FitStatus.FITTED).sum())
         rng = np.random.default_rng([parameters.seed, 1])
         weighted = fitted.merge(whole[["surfel_area"]])
-        basis = reduce_basis(weighted, dictionary=tables, k=max(1, min(parameters.k, good)), rng=rng)
+        basis = reduce_basis(
+            weighted, dictionary=tables, k=max(1, min(parameters.k, good)), rng=rng
+        )
     with clock.stage("second pass"):
         # only mixtures of BRDFs can be rendered
         mode: Mode = "perceptual" if parameters.mode == "paper" else parameters.mode
-        known = ("shading_normal", "normal_error", "diffuse_reflectance", "diffuse_reflectance_error")
-        judged, outliers = refit_and_evaluate(
-            whole.merge(fitted[list(known)]), held_out=held_out, basis=basis, mode=mode, eta=parameters.eta
+        known = (
+            "shading_normal",
+            "normal_error",
+            "diffuse_reflectance",
+            "diffuse_reflectance_error",
         )
-    groups = _groups(capture, fitted.merge(judged), basis) | {"held_out": held_out, "outliers": outliers}
+        judged, outliers = refit_and_evaluate(
+            whole.merge(fitted[list(known)]),
+            held_out=held_out,
+            basis=basis,
+            mode=mode,
+            eta=parameters.eta,
+        )
+    groups = _groups(capture, fitted.merge(judged), basis) | {
+        "held_out": held_out,
+        "outliers": outliers,
+    }
     if "light_gains" in first.children:
         groups["light_gains"] = first["light_gains"].to_dataset()
-        groups["dome"] = _with_gains(groups["dome"], groups["light_gains"]["light_gain"].values)
+        groups["dome"] = _with_gains(
+            groups["dome"], groups["light_gains"]["light_gain"].values
+        )
     if "probe" in groups:
         with clock.stage("translucency"):
-            sites = fit_probe(groups["probe"], eta=parameters.eta, profile=parameters.profile)
+            sites = fit_probe(
+                groups["probe"], eta=parameters.eta, profile=parameters.profile
+            )
             groups["translucency"] = sites.merge(groups["probe"][["site_position"]])
-            groups["fitted"] = groups["fitted"].merge(translucency_map(groups["fitted"], groups["translucency"]))
+            groups["fitted"] = groups["fitted"].merge(
+                translucency_map(groups["fitted"], groups["translucency"])
+            )
     model = xr.DataTree.from_dict(groups)
-    model.attrs = {name: capture.attrs[name] for name in KEPT_ATTRS if name in capture.attrs}
-    used = parameters.as_dict() | {"k": basis.sizes["component"]}  # the value that was actually used
+    model.attrs = {
+        name: capture.attrs[name] for name in KEPT_ATTRS if name in capture.attrs
+    }
+    # the value that was actually used
+    used = parameters.as_dict() | {"k": basis.sizes["component"]}
     model.attrs |= {"parameters": used, "dictionary": tables.source}
     model.attrs |= {"dictionary_digest": _digest(dictionary)}
     model.attrs |= _report(groups["fitted"], held_out) | _dictionary_files(tables)
@@ -212,7 +263,10 @@ def second_pass(
         model.attrs["translucency"] = summarise_translucency(groups["translucency"])
     if "light_gains" in groups:
         model.attrs["light_gains"] = summarise_gains(groups["light_gains"])
-    model.attrs |= {"suspects": suspects(outliers, fitted_part(whole, held_out)), "skipped": first.attrs["skipped"]}
+    model.attrs |= {
+        "suspects": suspects(outliers, fitted_part(whole, held_out)),
+        "skipped": first.attrs["skipped"],
+    }
     model.attrs["seconds"] = {**first.attrs["seconds"], **clock.seconds}
     return model
 
@@ -220,7 +274,12 @@ def second_pass(
 def _require_components(k: int, most: int) -> None:
     if k > most:  # checked before the fit
         raise InputError(
-            Fault("k", f"a reduced basis of this dictionary has 1 to {most} components", str(k), "choose a smaller k")
+            Fault(
+                "k",
+                f"a reduced basis of this dictionary has 1 to {most} components",
+                str(k),
+                "choose a smaller k",
+            )
         )
 
 
@@ -229,7 +288,9 @@ def _digest(dictionary: Dictionary | None) -> str:
     return (dictionary or embedded_dictionary()).digest
 
 
-def _require_match(first: xr.DataTree, source: str, digest: str, whole: xr.Dataset) -> None:
+def _require_match(
+    first: xr.DataTree, source: str, digest: str, whole: xr.Dataset
+) -> None:
     if first.attrs["dictionary_digest"] != digest:
         rule = "both passes need the same dictionary"
         cure = "give that of the first pass, or repeat it"
@@ -238,7 +299,12 @@ def _require_match(first: xr.DataTree, source: str, digest: str, whole: xr.Datas
     if surfels != whole.sizes["surfel"]:
         rule = "both passes need the same capture"
         raise InputError(
-            Fault("first pass", rule, f"{surfels} surfels of {whole.sizes['surfel']}", "repeat the first pass")
+            Fault(
+                "first pass",
+                rule,
+                f"{surfels} surfels of {whole.sizes['surfel']}",
+                "repeat the first pass",
+            )
         )
 
 
@@ -246,46 +312,89 @@ def _dictionary_files(tables: Dictionary) -> dict[str, Any]:
     """Notes on the files the BRDFs were read from, and their digests."""
     if not tables.origins:
         return {}
-    sums = {name: origin.sha256 for name, origin in zip(tables.names, tables.origins, strict=True)}
+    sums = {
+        name: origin.sha256
+        for name, origin in zip(tables.names, tables.origins, strict=True)
+    }
     return {"dictionary_notes": list(tables.notes), "dictionary_sha256": sums}
 
 
-def _groups(capture: xr.DataTree, fitted: xr.Dataset, basis: xr.Dataset) -> dict[str, xr.Dataset]:
-    """Groups of the model: results of the fit, and groups of the capture that users of the model need."""
+def _groups(
+    capture: xr.DataTree, fitted: xr.Dataset, basis: xr.Dataset
+) -> dict[str, xr.Dataset]:
+    """Groups of the model: results of the fit, and groups of the capture that users of
+    the model need.
+    """
     surfels = capture["surfels"].to_dataset()
-    fitted = fitted.merge(surfels[[name for name in COPIED if name in surfels]].compute())
-    copied = {name: capture[name].to_dataset().compute() for name in COPIED_GROUPS if name in capture.children}
+    fitted = fitted.merge(
+        surfels[[name for name in COPIED if name in surfels]].compute()
+    )
+    copied = {
+        name: capture[name].to_dataset().compute()
+        for name in COPIED_GROUPS
+        if name in capture.children
+    }
     return {"fitted": fitted, "basis": basis, **copied}
 
 
-def _direct_light(capture: xr.DataTree, samples: xr.Dataset, fitted: xr.Dataset, eta: float) -> xr.Dataset:
+def _direct_light(
+    capture: xr.DataTree, samples: xr.Dataset, fitted: xr.Dataset, eta: float
+) -> xr.Dataset:
     """The samples minus inter-reflections between parts of the face."""
     diffuse = fitted["diffuse_reflectance"].values
     surfels = capture["surfels"].to_dataset()
     visible = surfels["light_visible_fraction"].values
     triangles = capture["mesh"].to_dataset()["triangle"].values
-    return without_bounce(samples, bounced_light(samples, diffuse, visible, triangles, eta=eta), diffuse, eta=eta)
+    return without_bounce(
+        samples,
+        bounced_light(samples, diffuse, visible, triangles, eta=eta),
+        diffuse,
+        eta=eta,
+    )
 
 
 def _with_gains(dome: xr.Dataset, gain: NDArray[np.float64]) -> xr.Dataset:
-    """The dome with intensities multiplied by the gains, for renderings that are compared with photographs."""
+    """The dome with intensities multiplied by the gains, for renderings that are
+    compared with photographs.
+    """
     if "light_intensity" not in dome:
         return dome
     intensity = dome["light_intensity"]
-    return dome.assign(light_intensity=(intensity * gain[:, None]).assign_attrs(intensity.attrs))
+    return dome.assign(
+        light_intensity=(intensity * gain[:, None]).assign_attrs(intensity.attrs)
+    )
 
 
 def _report(fitted: xr.Dataset, held_out: xr.Dataset) -> dict[str, Any]:
-    """Fraction of surfels per status, medians of the errors over area, and held-out lights and cameras."""
+    """Fraction of surfels per status, medians of the errors over area, and held-out
+    lights and cameras.
+    """
     status = fitted["fit_status"].values
     skin = status != FitStatus.OBSTRUCTED
-    fractions = {m.name.lower(): float((status == m).mean()) for m in FitStatus if (status == m).any()}
+    fractions = {
+        m.name.lower(): float((status == m).mean())
+        for m in FitStatus
+        if (status == m).any()
+    }
     report: dict[str, Any] = {"surfels": int(status.size), "status": fractions}
     for name in REPORTED:
-        finite = fitted[name].values[skin & np.isfinite(fitted[name].values)] if name in fitted else np.zeros(0)
+        finite = (
+            fitted[name].values[skin & np.isfinite(fitted[name].values)]
+            if name in fitted
+            else np.zeros(0)
+        )
         if finite.size:
-            report[name] = {"median": float(np.median(finite)), "p95": float(np.quantile(finite, 0.95))}
+            report[name] = {
+                "median": float(np.median(finite)),
+                "p95": float(np.quantile(finite, 0.95)),
+            }
     for dim in ("light", "camera"):
-        names = held_out[dim].values if dim in held_out.coords else np.arange(held_out.sizes[dim])
-        report[f"held_out_{dim}s"] = [str(name) for name in names[held_out[f"{dim}_held_out"].values > 0]]
+        names = (
+            held_out[dim].values
+            if dim in held_out.coords
+            else np.arange(held_out.sizes[dim])
+        )
+        report[f"held_out_{dim}s"] = [
+            str(name) for name in names[held_out[f"{dim}_held_out"].values > 0]
+        ]
     return report

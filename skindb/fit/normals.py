@@ -12,11 +12,16 @@ from skindb.fit._normal_kernels import normals_block
 from skindb.fit.lumitexels import GEOMETRY
 from skindb.schema import check
 
-METHODS = ("combined", "chromatic", "photometric", "peak")  # in the order of the codes in `_normal_kernels`
+# in the order of the codes in `_normal_kernels`
+METHODS = ("combined", "chromatic", "photometric", "peak")
 
 
 def estimate_normals(
-    lumitexels: xr.Dataset, *, method: str = "combined", eta: float = 1.3, scan_error: float = 3.0
+    lumitexels: xr.Dataset,
+    *,
+    method: str = "combined",
+    eta: float = 1.3,
+    scan_error: float = 3.0,
 ) -> xr.Dataset:
     """Unit normals per surfel.
 
@@ -25,29 +30,34 @@ def estimate_normals(
     lumitexels
         Samples with geometry, from `lumitexels`.
     method
-        "peak": the paper's rule. "photometric": robust photometric stereo on a low quantile over cameras of the mean
-        channel. "chromatic": the same on the colour difference of the channels, which white highlights do not have.
-        "combined": mean of the last two by inverse variance; the most exact on captures with known truth.
+        "peak": the paper's rule. "photometric": robust photometric stereo on a low
+        quantile over cameras of the mean channel. "chromatic": the same on the colour
+        difference of the channels, which white highlights do not have. "combined": mean
+        of the last two by inverse variance; the most exact on captures with known
+        truth.
     eta
         Refractive index of the Fresnel factors.
     scan_error
-        RMS angle of the scan's normals to the true ones [degree], the prior of all but "peak"; a large
-        value switches it off.
+        RMS angle of the scan's normals to the true ones [degree], the prior of all but
+        "peak"; a large value switches it off.
 
     Returns
     -------
     Dataset
-        `shading_normal` (NaN without samples) and `normal_disagreement` [degree], the angle between "peak" and
-        "combined": large where the surface has no highlight, or where one of the two fails; `normal_error` [degree],
-        the RMS angle due to the noise of the samples and the error of the scan (NaN for "peak"): 95 to 97 % of the
-        angles lie below 1.73 times it on matte skin, 88 to 95 % on glossy skin, where residual highlights rotate
-        normals without visible residuals; and `normal_total_error` [degree] ("combined" alone), three times that, the
-        angle between the two estimates it combines, and one degree, in quadrature.
+        `shading_normal` (NaN without samples) and `normal_disagreement` [degree], the
+        angle between "peak" and "combined": large where the surface has no highlight,
+        or where one of the two fails; `normal_error` [degree], the RMS angle due to the
+        noise of the samples and the error of the scan (NaN for "peak"): 95 to 97 % of
+        the angles lie below 1.73 times it on matte skin, 88 to 95 % on glossy skin,
+        where residual highlights rotate normals without visible residuals; and
+        `normal_total_error` [degree] ("combined" alone), three times that, the angle
+        between the two estimates it combines, and one degree, in quadrature.
 
     Notes
     -----
-    Fraction of angles below 1.73 times the error, on captures with known truth (16 x 150, three 8 x 64, two 6 x 32): 22
-    to 47 % for `normal_error`, 91 to 96 % for `normal_total_error`, whose three numbers were chosen on them.
+    Fraction of angles below 1.73 times the error, on captures with known truth (16 x
+    150, three 8 x 64, two 6 x 32): 22 to 47 % for `normal_error`, 91 to 96 % for
+    `normal_total_error`, whose three numbers were chosen on them.
     """
     if method not in METHODS:
         raise ValueError(f"method must be one of {METHODS}, not {method!r}")
@@ -57,7 +67,12 @@ def estimate_normals(
         lumitexels,
         over="surfel",
         inputs=(*GEOMETRY, "surfel_normal"),
-        outputs=("shading_normal", "normal_disagreement", "normal_error", "normal_total_error"),
+        outputs=(
+            "shading_normal",
+            "normal_disagreement",
+            "normal_error",
+            "normal_total_error",
+        ),
         method=method,
         eta=eta,
         scan_error=scan_error,
@@ -75,10 +90,16 @@ def _normals(
     eta: float,
     scan_error: float,
 ) -> tuple[Array, Array, Array, Array]:
-    """(n, 3) normals by `method`, angle (n,) of peak and combined, standard and total error (n,) [degree]."""
+    """(n, 3) normals by `method`, angle (n,) of peak and combined, standard and total
+    error (n,) [degree].
+    """
     n = len(position)
     out = np.empty((n, 3)), np.empty(n), np.empty(n), np.empty(n)
-    doubles = (np.ascontiguousarray(a, np.float64) for a in (position, light, camera, scan))
+    doubles = (
+        np.ascontiguousarray(a, np.float64) for a in (position, light, camera, scan)
+    )
     prior = float(np.deg2rad(scan_error))
-    normals_block(sample_bits(sample), *doubles, METHODS.index(method), float(eta), prior, *out)
+    normals_block(
+        sample_bits(sample), *doubles, METHODS.index(method), float(eta), prior, *out
+    )
     return out

@@ -23,21 +23,23 @@ class FitParameters:
     k
         Number of components of the reduced basis; fewer if fewer surfels are fitted.
     mode, rank
-        Mode and rank of the fit by the dictionary, see `fit_surface`. After "paper" the refit uses "perceptual".
+        Mode and rank of the fit by the dictionary, see `fit_surface`. After "paper" the
+        refit uses "perceptual".
     eta
         Refractive index of skin.
     profile
         Model of the probe's profiles, see `fit_probe`.
     even_reflection
-        Largest fraction of light (95 %) that the surface of skin is assumed to reflect evenly and without colour, see
-        `estimate_diffuse_reflectance`.
+        Largest fraction of light (95 %) that the surface of skin is assumed to reflect
+        evenly and without colour, see `estimate_diffuse_reflectance`.
     light_gains
         Whether samples are first divided by the gain of their light, see `estimate_light_gains`.
     inter_reflection
-        Whether light from other parts of the face after one diffuse bounce is subtracted, see `bounced_light`; the
-        first pass is then repeated.
+        Whether light from other parts of the face after one diffuse bounce is
+        subtracted, see `bounced_light`; the first pass is then repeated.
     hold_out_lights, hold_out_cameras
-        Fractions of lights and cameras that are held out of the fit, to measure the error of predictions.
+        Fractions of lights and cameras that are held out of the fit, to measure the
+        error of predictions.
     seed
         Random seed for the hold-out, for sampling and for the starts of the factorisation.
 
@@ -63,13 +65,31 @@ class FitParameters:
         """Check the ranges."""
         rules = {
             "k": (self.k >= 1, "must be at least 1"),
-            "mode": (self.mode in get_args(FullMode), f"must be one of {', '.join(get_args(FullMode))}"),
+            "mode": (
+                self.mode in get_args(FullMode),
+                f"must be one of {', '.join(get_args(FullMode))}",
+            ),
             "rank": (self.rank >= 1, "must be at least 1"),
-            "eta": (math.isfinite(self.eta) and 1 <= self.eta <= 2, "must lie in [1, 2]"),
-            "profile": (self.profile in get_args(Profile), f"must be one of {', '.join(get_args(Profile))}"),
-            "even_reflection": (0 <= self.even_reflection <= 0.5, "must be a fraction in [0, 0.5]"),
-            "hold_out_lights": (0 <= self.hold_out_lights < 1, "must be a fraction in [0, 1)"),
-            "hold_out_cameras": (0 <= self.hold_out_cameras < 1, "must be a fraction in [0, 1)"),
+            "eta": (
+                math.isfinite(self.eta) and 1 <= self.eta <= 2,
+                "must lie in [1, 2]",
+            ),
+            "profile": (
+                self.profile in get_args(Profile),
+                f"must be one of {', '.join(get_args(Profile))}",
+            ),
+            "even_reflection": (
+                0 <= self.even_reflection <= 0.5,
+                "must be a fraction in [0, 0.5]",
+            ),
+            "hold_out_lights": (
+                0 <= self.hold_out_lights < 1,
+                "must be a fraction in [0, 1)",
+            ),
+            "hold_out_cameras": (
+                0 <= self.hold_out_cameras < 1,
+                "must be a fraction in [0, 1)",
+            ),
             "seed": (self.seed >= 0, "must not be negative"),
         }
         faults = [
@@ -84,7 +104,9 @@ class FitParameters:
     def of(cls, attrs: Mapping[Any, Any]) -> Self:
         """The parameters in the attributes of a model or of a first pass."""
         given = attrs.get("parameters", {})
-        return cls(**{one.name: given[one.name] for one in fields(cls) if one.name in given})
+        return cls(
+            **{one.name: given[one.name] for one in fields(cls) if one.name in given}
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """The parameters as a dictionary for attributes."""

@@ -14,7 +14,9 @@ from skindb.schema.regions import FACE
 
 Array = NDArray[Any]
 ANY = "any"
-SAMPLES = {"fit": ("fit_residual", "fit_residual_perceptual")} | {f"held_out_{of}s": e for of, e in ERRORS.items()}
+SAMPLES = {"fit": ("fit_residual", "fit_residual_perceptual")} | {
+    f"held_out_{of}s": e for of, e in ERRORS.items()
+}
 SPACES = ("linear", "perceptual")
 QUANTILES = {"median": 0.5, "p95": 0.95}
 
@@ -30,10 +32,12 @@ def prediction_table(fitted: xr.Dataset) -> xr.Dataset:
     Returns
     -------
     Dataset
-        `prediction_surfels`, `prediction_fraction` (of the region's surfels) and `prediction_outlier_fraction` (mean
-        over area) by region and status; `prediction_error`, area-weighted median and 95 % quantile over surfels of the
-        relative RMS error, also by samples ("fit", "held_out_lights", "held_out_cameras") and space ("linear", or
-        "perceptual": cube-root space). Region "face" and status "any" include all surfels.
+        `prediction_surfels`, `prediction_fraction` (of the region's surfels) and
+        `prediction_outlier_fraction` (mean over area) by region and status;
+        `prediction_error`, area-weighted median and 95 % quantile over surfels of the
+        relative RMS error, also by samples ("fit", "held_out_lights",
+        "held_out_cameras") and space ("linear", or "perceptual": cube-root space).
+        Region "face" and status "any" include all surfels.
     """
     check(fitted, ("fit_status", "surfel_area"), where="fitted")
     status = fitted["fit_status"].values
@@ -51,9 +55,14 @@ def prediction_table(fitted: xr.Dataset) -> xr.Dataset:
             index = inside if member is None else inside[status[inside] == member]
             if index.size:
                 count[r, s], share[r, s] = index.size, index.size / inside.size
-                error[r, s] = [[_quantiles(v[index], area[index]) for v in pair] for pair in errors]
+                error[r, s] = [
+                    [_quantiles(v[index], area[index]) for v in pair] for pair in errors
+                ]
                 strange[r, s] = _mean(outliers[index], area[index])
-    coords = {"region": list(regions), "status": [ANY, *(member.name.lower() for member in FitStatus)]}
+    coords = {
+        "region": list(regions),
+        "status": [ANY, *(member.name.lower() for member in FitStatus)],
+    }
     return dataset(
         {
             "prediction_surfels": count,
@@ -61,33 +70,61 @@ def prediction_table(fitted: xr.Dataset) -> xr.Dataset:
             "prediction_outlier_fraction": strange,
             "prediction_error": error,
         },
-        coords=coords | {"samples": list(SAMPLES), "space": list(SPACES), "statistic": list(QUANTILES)},
+        coords=coords
+        | {
+            "samples": list(SAMPLES),
+            "space": list(SPACES),
+            "statistic": list(QUANTILES),
+        },
     )
 
 
 def describe_prediction(table: xr.Dataset) -> dict[str, Any]:
-    """The table as nested dicts, without what is empty: by region all surfels, by status all regions."""
+    """The table as nested dicts, without what is empty: by region all surfels, by
+    status all regions.
+    """
     return {
-        "regions": {str(name): _row(table.sel(region=name, status=ANY)) for name in table["region"].values},
-        "statuses": {str(name): _row(table.sel(region=FACE, status=name)) for name in table["status"].values[1:]},
+        "regions": {
+            str(name): _row(table.sel(region=name, status=ANY))
+            for name in table["region"].values
+        },
+        "statuses": {
+            str(name): _row(table.sel(region=FACE, status=name))
+            for name in table["status"].values[1:]
+        },
     }
 
 
 def tabulate_prediction(described: dict[str, Any]) -> list[list[str]]:
     """Header and rows of `describe_prediction` for a terminal: median / 95 %, in per cent."""
     kinds = [(what, space) for what in SAMPLES for space in SPACES]
-    rows = [(name, row) for part in described.values() for name, row in part.items() if row["surfels"]]
-    kinds = [(what, space) for what, space in kinds if any(what in row for _, row in rows)]
-    titles = ["roots" if space == "perceptual" else what.replace("held_out_", "unseen ") for what, space in kinds]
+    rows = [
+        (name, row)
+        for part in described.values()
+        for name, row in part.items()
+        if row["surfels"]
+    ]
+    kinds = [
+        (what, space) for what, space in kinds if any(what in row for _, row in rows)
+    ]
+    titles = [
+        "roots" if space == "perceptual" else what.replace("held_out_", "unseen ")
+        for what, space in kinds
+    ]
     lines = [["median / 95 % [%]", "surfels", "outliers", *titles]]
     for name, row in rows:
         cells = [row.get(what, {}).get(space) for what, space in kinds]
-        shown = [f"{100 * c['median']:.1f} / {100 * c['p95']:.1f}" if c else "-" for c in cells]
+        shown = [
+            f"{100 * c['median']:.1f} / {100 * c['p95']:.1f}" if c else "-"
+            for c in cells
+        ]
         lines.append(
             [
                 name,
                 str(row["surfels"]),
-                f"{100 * row['outlier_fraction']:.1f}" if "outlier_fraction" in row else "-",
+                f"{100 * row['outlier_fraction']:.1f}"
+                if "outlier_fraction" in row
+                else "-",
                 *shown,
             ]
         )
@@ -102,16 +139,26 @@ def _row(one: xr.Dataset) -> dict[str, Any]:
     if np.isfinite(one["prediction_outlier_fraction"]):
         found["outlier_fraction"] = float(one["prediction_outlier_fraction"])
     for what in SAMPLES:
-        error = one["prediction_error"].sel(samples=what).transpose("space", "statistic").values
+        error = (
+            one["prediction_error"]
+            .sel(samples=what)
+            .transpose("space", "statistic")
+            .values
+        )
         if np.isfinite(error).all():
             found[what] = {
-                k: dict(zip(QUANTILES, map(float, v), strict=True)) for k, v in zip(SPACES, error, strict=True)
+                k: dict(zip(QUANTILES, map(float, v), strict=True))
+                for k, v in zip(SPACES, error, strict=True)
             }
     return found
 
 
 def _values(fitted: xr.Dataset, name: str) -> Array:
-    return fitted[name].values if name in fitted else np.full(fitted.sizes["surfel"], np.nan)
+    return (
+        fitted[name].values
+        if name in fitted
+        else np.full(fitted.sizes["surfel"], np.nan)
+    )
 
 
 def _regions(fitted: xr.Dataset) -> dict[str, Array]:
@@ -120,7 +167,11 @@ def _regions(fitted: xr.Dataset) -> dict[str, Array]:
     if "region_mask" in fitted:
         mask = fitted["region_mask"].transpose("region", "surfel").astype(bool)
         names = mask["region"].values if "region" in mask.coords else range(len(mask))
-        found |= {str(name): np.flatnonzero(one) for name, one in zip(names, mask.values, strict=True) if one.any()}
+        found |= {
+            str(name): np.flatnonzero(one)
+            for name, one in zip(names, mask.values, strict=True)
+            if one.any()
+        }
     return found
 
 
@@ -137,4 +188,6 @@ def _quantiles(values: Array, area: Array) -> Array:
 
 def _mean(values: Array, area: Array) -> float:
     known = np.isfinite(values)
-    return float(np.average(values[known], weights=area[known])) if known.any() else np.nan
+    return (
+        float(np.average(values[known], weights=area[known])) if known.any() else np.nan
+    )

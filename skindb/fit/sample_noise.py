@@ -14,7 +14,13 @@ from skindb.fit._lumitexel_kernels import Noise
 from skindb.schema import check
 
 RADIANCE = ("radiance_limit", "radiance_read_variance", "radiance_shot_variance")
-DEVICES = ("light_position", "light_intensity", "light_axis", "light_falloff", *RADIANCE)
+DEVICES = (
+    "light_position",
+    "light_intensity",
+    "light_axis",
+    "light_falloff",
+    *RADIANCE,
+)
 NOISE_INPUTS = ("surfel_position", "effective_pixels", *DEVICES)
 # captures of an earlier version, of linear files or of unknown electrons have none of these
 NOISE_SAMPLES = ("effective_pixels", *RADIANCE)
@@ -22,7 +28,9 @@ NOISE_LIGHTS = ("light_intensity", "light_axis", "light_falloff")
 
 
 def noise_inputs(lumitexels: xr.Dataset) -> tuple[str, ...]:
-    """Names of the variables that `noise_of` takes; empty if the noise of the samples is unknown."""
+    """Names of the variables that `noise_of` takes; empty if the noise of the samples
+    is unknown.
+    """
     return NOISE_INPUTS if all(name in lumitexels for name in NOISE_INPUTS) else ()
 
 
@@ -43,37 +51,56 @@ def typical_noise(lumitexels: xr.Dataset) -> TypicalNoise:
 
 
 def noise_of(arrays: Sequence[Array], typical: TypicalNoise) -> Noise:
-    """Noise of the samples of a block of surfels from the arrays of `noise_inputs`, or else the typical one."""
+    """Noise of the samples of a block of surfels from the arrays of `noise_inputs`, or
+    else the typical one.
+    """
     if not arrays:
         none = np.zeros((0, 0), np.float32)
         return Noise(none, none, none, none, none, *typical)
     position, pixels, place, intensity, axis, falloff, limit, read, shot = arrays
-    scale = _reflectance_per_radiance(position, place, intensity.mean(axis=1, keepdims=True), axis, falloff)
-    limit, read, shot = (np.ascontiguousarray(part.mean(axis=1), np.float32) for part in (limit, read, shot))
+    scale = _reflectance_per_radiance(
+        position, place, intensity.mean(axis=1, keepdims=True), axis, falloff
+    )
+    limit, read, shot = (
+        np.ascontiguousarray(part.mean(axis=1), np.float32)
+        for part in (limit, read, shot)
+    )
     per_radiance = np.ascontiguousarray(scale[..., 0], np.float32)
-    return Noise(per_radiance, np.ascontiguousarray(pixels, np.float32), limit, read, shot, *typical)
+    return Noise(
+        per_radiance,
+        np.ascontiguousarray(pixels, np.float32),
+        limit,
+        read,
+        shot,
+        *typical,
+    )
 
 
-def sample_variance(lumitexels: xr.Dataset, reflectance: NDArray[Any] | None = None) -> xr.DataArray:
-    """Variance (surfel, light, camera, channel) [sr^-2] of samples due to photons, read noise and quantisation.
+def sample_variance(
+    lumitexels: xr.Dataset, reflectance: NDArray[Any] | None = None
+) -> xr.DataArray:
+    """Variance (surfel, light, camera, channel) [sr^-2] of samples due to photons, read
+    noise and quantisation.
 
     Parameters
     ----------
     lumitexels
         From `lumitexels`.
     reflectance
-        (surfel, light, camera, channel) [sr^-1] samples without noise; default the samples themselves,
-        whose noise makes the variance of low ones too small.
+        (surfel, light, camera, channel) [sr^-1] samples without noise; default the
+        samples themselves, whose noise makes the variance of low ones too small.
 
     Returns
     -------
     DataArray
-        NaN where there is no sample. The result is held in memory: select some surfels of a large capture.
+        NaN where there is no sample. The result is held in memory: select some surfels
+        of a large capture.
 
     Raises
     ------
     InputError
-        If the capture does not hold the noise of its cameras: an earlier version, linear files, unknown electrons.
+        If the capture does not hold the noise of its cameras: an earlier version,
+        linear files, unknown electrons.
 
     Examples
     --------
@@ -86,18 +113,31 @@ def sample_variance(lumitexels: xr.Dataset, reflectance: NDArray[Any] | None = N
     )
     value = sample.values.astype(np.float64)
     expected = np.maximum(value if reflectance is None else reflectance, 0.0)
-    scale = _reflectance_per_radiance(position, place, intensity, axis, falloff)[:, :, None]
+    scale = _reflectance_per_radiance(position, place, intensity, axis, falloff)[
+        :, :, None
+    ]
     # the longest exposure whose limit is not exceeded
     step = (value / scale)[..., None] > limit
     first = np.minimum(step.sum(axis=-1), limit.shape[2] - 1)
     camera, channel = np.ogrid[: limit.shape[0], : limit.shape[1]]
-    variance = scale**2 * read[camera, channel, first] + scale * shot[camera, channel, first] * expected
+    variance = (
+        scale**2 * read[camera, channel, first]
+        + scale * shot[camera, channel, first] * expected
+    )
     variance = np.where(np.isfinite(value), variance / pixels[:, None, :, None], np.nan)
-    return xr.DataArray(variance, dims=sample.dims, attrs={"units": "sr-2", "long_name": "variance of a sample"})
+    return xr.DataArray(
+        variance,
+        dims=sample.dims,
+        attrs={"units": "sr-2", "long_name": "variance of a sample"},
+    )
 
 
-def _reflectance_per_radiance(position: Array, place: Array, intensity: Array, axis: Array, falloff: Array) -> Array:
-    """Distance squared over intensity and fall-off (n, light, channel) of lights at `place` (light, 3)."""
+def _reflectance_per_radiance(
+    position: Array, place: Array, intensity: Array, axis: Array, falloff: Array
+) -> Array:
+    """Distance squared over intensity and fall-off (n, light, channel) of lights at
+    `place` (light, 3).
+    """
     way = position.astype(np.float64)[:, None] - place
     square = np.einsum("nlk,nlk->nl", way, way)
     if falloff.any():

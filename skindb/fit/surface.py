@@ -1,4 +1,6 @@
-"""Surface reflectance per surfel as a mixture of measured BRDFs (Weyrich et al. 2005, section 7, eq. 7 and 8)."""
+"""Surface reflectance per surfel as a mixture of measured BRDFs (Weyrich et al. 2005,
+section 7, eq. 7 and 8).
+"""
 
 from __future__ import annotations
 
@@ -45,7 +47,12 @@ REFITTED = (
 
 
 def fit_surface(
-    lumitexels: xr.Dataset, *, dictionary: Dictionary, mode: FullMode = "perceptual", rank: int = 16, eta: float = 1.3
+    lumitexels: xr.Dataset,
+    *,
+    dictionary: Dictionary,
+    mode: FullMode = "perceptual",
+    rank: int = 16,
+    eta: float = 1.3,
 ) -> xr.Dataset:
     """Non-negative weights of every BRDF of the dictionary.
 
@@ -56,18 +63,21 @@ def fit_surface(
     dictionary
         m measured BRDFs, convolved with the discs of the lights.
     mode
-        "perceptual" (in cube-root space), "linear" (see `skindb.numerics.nnls.fit_reflectance`), or "paper": cube roots
-        of the elements are mixed, and the prediction is the cube of the mixture.
+        "perceptual" (in cube-root space), "linear" (see
+        `skindb.numerics.nnls.fit_reflectance`), or "paper": cube roots of the elements
+        are mixed, and the prediction is the cube of the mixture.
     rank
-        Rank of the reduced dictionary; m is exact. `rank_omissions` bounds the error of a smaller rank.
+        Rank of the reduced dictionary; m is exact. `rank_omissions` bounds the error of
+        a smaller rank.
     eta
         Refractive index of the diffuse term that is subtracted.
 
     Returns
     -------
     Dataset
-        `dictionary_weight`, `kkt_residual`, `fit_iterations`, `fit_samples`, `fit_condition`, `dictionary_residual`
-        (RMS of the samples' error over RMS of the samples), `dictionary_residual_perceptual` (in cube-root space) and
+        `dictionary_weight`, `kkt_residual`, `fit_iterations`, `fit_samples`,
+        `fit_condition`, `dictionary_residual` (RMS of the samples' error over RMS of
+        the samples), `dictionary_residual_perceptual` (in cube-root space) and
         `fit_status`; NaN where the status says that nothing was fitted.
     """
     check(lumitexels, NEEDED, where="lumitexels")
@@ -99,7 +109,13 @@ def noise_floor(lumitexels: xr.Dataset) -> float:
     return max(NOISE_FLOOR_SURFACE, float(lumitexels["noise_floor"]))
 
 
-def refit(lumitexels: xr.Dataset, *, basis: xr.Dataset, mode: Mode = "perceptual", eta: float = 1.3) -> xr.Dataset:
+def refit(
+    lumitexels: xr.Dataset,
+    *,
+    basis: xr.Dataset,
+    mode: Mode = "perceptual",
+    eta: float = 1.3,
+) -> xr.Dataset:
     """Non-negative weights of a reduced basis.
 
     Parameters
@@ -115,11 +131,13 @@ def refit(lumitexels: xr.Dataset, *, basis: xr.Dataset, mode: Mode = "perceptual
     Returns
     -------
     Dataset
-        `basis_weight`, `fit_residual`, `fit_residual_perceptual` (of all samples, diffuse light included);
-        `basis_weight_error`, NaN for weights at their bound 0; `surface_reflectance`, the fraction of light along the
-        normal that the mixture reflects, and `surface_reflectance_error`. The errors include the noise of the samples
-        and the errors of R_d and of the normal, conditional on which weights are above 0: they are too small for lobes
-        so sharp that only a few samples see them, and for weights that noise moves to their bound.
+        `basis_weight`, `fit_residual`, `fit_residual_perceptual` (of all samples,
+        diffuse light included); `basis_weight_error`, NaN for weights at their bound 0;
+        `surface_reflectance`, the fraction of light along the normal that the mixture
+        reflects, and `surface_reflectance_error`. The errors include the noise of the
+        samples and the errors of R_d and of the normal, conditional on which weights
+        are above 0: they are too small for lobes so sharp that only a few samples see
+        them, and for weights that noise moves to their bound.
     """
     check(lumitexels, NEEDED, where="lumitexels")
     known = tuple(name for name in ERROR_INPUTS if name in lumitexels)
@@ -131,8 +149,15 @@ def refit(lumitexels: xr.Dataset, *, basis: xr.Dataset, mode: Mode = "perceptual
         given = len(arrays) - len(known)
         samples = arrays[:given]
         errors = dict(zip(known, arrays[given:], strict=True))
-        diffuse = errors.get("diffuse_reflectance_error", np.zeros((len(samples[0]), 3)))
-        found = refit_weights(*samples, diffuse_error=diffuse, normal_error=errors.get("normal_error"), **params)
+        diffuse = errors.get(
+            "diffuse_reflectance_error", np.zeros((len(samples[0]), 3))
+        )
+        found = refit_weights(
+            *samples,
+            diffuse_error=diffuse,
+            normal_error=errors.get("normal_error"),
+            **params,
+        )
         variables = refitted_variables(found, strength)
         return tuple(variables[name] for name in REFITTED)
 
@@ -150,7 +175,11 @@ def refit(lumitexels: xr.Dataset, *, basis: xr.Dataset, mode: Mode = "perceptual
         noise=typical_noise(lumitexels),
         min_samples=MIN_SAMPLES,
     )
-    return fitted.assign_coords(component=basis["component"]) if "component" in basis.coords else fitted
+    return (
+        fitted.assign_coords(component=basis["component"])
+        if "component" in basis.coords
+        else fitted
+    )
 
 
 def refitted_variables(found: Refit, strength: Array) -> dict[str, Array]:
@@ -158,7 +187,9 @@ def refitted_variables(found: Refit, strength: Array) -> dict[str, Array]:
 
     `strength` (k,) is the fraction of light along the normal that each component reflects.
     """
-    variance = np.einsum("j,njk,k->n", strength, np.nan_to_num(found.covariance), strength)
+    variance = np.einsum(
+        "j,njk,k->n", strength, np.nan_to_num(found.covariance), strength
+    )
     return {
         "basis_weight": found.weight,
         "fit_residual": found.residual,

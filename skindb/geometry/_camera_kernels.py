@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from skindb._compiled import inline_kernel, kernel
 
 Array = NDArray[np.float64]
-NEWTON_STEPS = 25  # 4 to 6 suffice for real lenses; more are needed at the rim of a strong distortion
+# 4 to 6 suffice for real lenses; more are needed at the rim of a strong distortion
+NEWTON_STEPS = 25
 
 
 @inline_kernel
@@ -22,7 +23,9 @@ def _within(x: Any, y: Any, limit: Any) -> Any:
 
 
 @kernel
-def undistorted(bent: Array, coefficients: Array, limit: float, tolerance: float, out: Array) -> None:
+def undistorted(
+    bent: Array, coefficients: Array, limit: float, tolerance: float, out: Array
+) -> None:
     """Write ideal points `out` (n, 2) for distorted points `bent` (n, 2), by Newton's method.
 
     Parameters
@@ -59,7 +62,9 @@ def undistorted(bent: Array, coefficients: Array, limit: float, tolerance: float
             if abs(determinant) < 1e-12:
                 determinant = 1e-12
             x, y = _within(
-                x - (yy * right - xy * below) / determinant, y - (xx * below - xy * right) / determinant, limit
+                x - (yy * right - xy * below) / determinant,
+                y - (xx * below - xy * right) / determinant,
+                limit,
             )
         good = left < tolerance
         out[i, 0] = x if good else math.nan

@@ -1,4 +1,6 @@
-"""Compiled check of the pixels around a projected point; see `skindb.ingest.visibility.camera_visibility`."""
+"""Compiled check of the pixels around a projected point; see
+`skindb.ingest.visibility.camera_visibility`.
+"""
 
 from __future__ import annotations
 
@@ -64,12 +66,18 @@ def matches_tangent_plane(
         column0 = math.floor(pixels[i, 0] - 0.5)
         row0 = math.floor(pixels[i, 1] - 0.5)
         for row in range(max(row0 - span + 1, 0), min(row0 + span + 1, height)):
-            for column in range(max(column0 - span + 1, 0), min(column0 + span + 1, width)):
+            for column in range(
+                max(column0 - span + 1, 0), min(column0 + span + 1, width)
+            ):
                 dx = column + 0.5 - pixels[i, 0]
                 dy = row + 0.5 - pixels[i, 1]
                 if dx * dx + dy * dy > reach * reach:
                     continue
-                facing = rays[row, column, 0] * nx + rays[row, column, 1] * ny + rays[row, column, 2] * nz
+                facing = (
+                    rays[row, column, 0] * nx
+                    + rays[row, column, 1] * ny
+                    + rays[row, column, 2] * nz
+                )
                 foretold = level / facing if facing != 0 else math.inf
                 found = distance[row, column]
                 smooth = abs(found - foretold) <= slack + abs(foretold - own)

@@ -40,9 +40,11 @@ def aim(
     centre
         (3,) mm; origin of the coordinates of the rays.
     offset, ahead, short
-        mm; a ray starts `offset` along the lift and `ahead` along itself, and ends `short` before the target.
+        mm; a ray starts `offset` along the lift and `ahead` along itself, and ends
+        `short` before the target.
     start, way, reach
-        (m, 3) mm, unit directions and (m,) mm, output; reach is at least 0, and not finite if a point is not.
+        (m, 3) mm, unit directions and (m,) mm, output; reach is at least 0, and not
+        finite if a point is not.
     """
     for k in range(len(at)):
         i = at[k] if len(origin) > 1 else 0
@@ -58,7 +60,11 @@ def aim(
         dx = dx / length
         dy = dy / length
         dz = dz / length
-        start[k, 0], start[k, 1], start[k, 2] = x + ahead * dx, y + ahead * dy, z + ahead * dz
+        start[k, 0], start[k, 1], start[k, 2] = (
+            x + ahead * dx,
+            y + ahead * dy,
+            z + ahead * dz,
+        )
         way[k, 0], way[k, 1], way[k, 2] = dx, dy, dz
         # Embree marks a hit by a negative length, so that the input must not be negative
         left = length - ahead - short

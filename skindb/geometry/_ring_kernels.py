@@ -1,4 +1,6 @@
-"""Compiled operations on the neighbours of vertices, which visit the triangles and need no list of neighbours."""
+"""Compiled operations on the neighbours of vertices, which visit the triangles and need
+no list of neighbours.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,9 @@ Bools = NDArray[np.bool_]
 
 @kernel
 def grown(faces: NDArray[Any], mask: Bools) -> Bools:
-    """Mask (n,) extended by all vertices that share an edge with a vertex of the mask, by triangles (f, 3)."""
+    """Mask (n,) extended by all vertices that share an edge with a vertex of the mask,
+    by triangles (f, 3).
+    """
     out = mask.copy()
     for k in range(len(faces)):
         a, b, c = faces[k]

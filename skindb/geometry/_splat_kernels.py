@@ -15,13 +15,16 @@ ZERO = np.float32(0.0)
 HALF = np.float32(0.5)
 ONE = np.float32(1.0)
 MIN_DEPTH_MM = np.float32(1.0)  # mm in front of the eye
-LEVEL = np.float32(-0.01)  # tangent planes closer to the line of sight are not extrapolated
+# tangent planes closer to the line of sight are not extrapolated
+LEVEL = np.float32(-0.01)
 MAX_DISC_SLOPE = np.float32(50.0)  # depth of a disc per width at most
 
 
 @inline_fast_kernel
 def _project(p: Any, n: Any, frame: Any, eye: Any) -> Any:
-    """Point and normal in the frame of the eye, and the height of the eye over the disc: negative from behind."""
+    """Point and normal in the frame of the eye, and the height of the eye over the
+    disc: negative from behind.
+    """
     dx = p[0] - eye[0]
     dy = p[1] - eye[1]
     dz = p[2] - eye[2]
@@ -36,8 +39,12 @@ def _project(p: Any, n: Any, frame: Any, eye: Any) -> Any:
 
 
 @inline_fast_kernel
-def _ellipse(x: Any, y: Any, z: Any, a: Any, b: Any, c: Any, radius: Any, focal: Any) -> Any:
-    """Conic (3,) in px^-2 and half widths (2,) in px of a disc's picture, wider by a pixel (Zwicker et al. 2001)."""
+def _ellipse(
+    x: Any, y: Any, z: Any, a: Any, b: Any, c: Any, radius: Any, focal: Any
+) -> Any:
+    """Conic (3,) in px^-2 and half widths (2,) in px of a disc's picture, wider by a
+    pixel (Zwicker et al. 2001).
+    """
     side = ONE if c >= 0 else -ONE
     q = -ONE / (side + c)
     w = a * b * q
@@ -59,7 +66,13 @@ def _ellipse(x: Any, y: Any, z: Any, a: Any, b: Any, c: Any, radius: Any, focal:
     xy = j00 * j10 + j01 * j11
     yy = j10 * j10 + j11 * j11 + ONE
     determinant = xx * yy - xy * xy
-    return yy / determinant, -xy / determinant, xx / determinant, math.sqrt(xx), math.sqrt(yy)
+    return (
+        yy / determinant,
+        -xy / determinant,
+        xx / determinant,
+        math.sqrt(xx),
+        math.sqrt(yy),
+    )
 
 
 @fast_kernel
@@ -78,7 +91,8 @@ def splat(
     share: Single,
     counting: bool,
 ) -> None:
-    """Draw the chosen discs into `depth` (h, w), or compute the fraction of each that the depth map leaves visible.
+    """Draw the chosen discs into `depth` (h, w), or compute the fraction of each that
+    the depth map leaves visible.
 
     Parameters
     ----------
@@ -114,7 +128,10 @@ def splat(
         py = focal * y / z - corner[1]
         # the linear approximation fails for discs larger than half of a map
         beside = ZERO if counting else HALF
-        if abs(px - HALF * width) > (HALF + beside) * width or abs(py - HALF * height) > (HALF + beside) * height:
+        if (
+            abs(px - HALF * width) > (HALF + beside) * width
+            or abs(py - HALF * height) > (HALF + beside) * height
+        ):
             continue
         qa, qb, qc, wide, high = _ellipse(x, y, z, a, b, c, radius[i], focal)
         # clamped before the conversion to integers, as a disc beside the eye may project anywhere
@@ -136,7 +153,9 @@ def splat(
                 fx = column + HALF - px
                 if qa * fx * fx + 2 * qb * fx * fy + qc * fy * fy > ONE:
                     continue
-                across = (a * (column + HALF + corner[0]) + b * (row + HALF + corner[1])) / focal + c
+                across = (
+                    a * (column + HALF + corner[0]) + b * (row + HALF + corner[1])
+                ) / focal + c
                 found = plane / across if across < LEVEL else z
                 found = min(max(found, z - reach), z + reach)
                 if counting:

@@ -11,12 +11,15 @@ from skindb._compiled import inline_kernel, kernel
 
 Array = NDArray[Any]
 EDGE = 1e-9  # texels; a texel centre on an edge belongs to both triangles
-CORNERS = 9  # of a triangle clipped by four lines: at most 7, plus a margin for rounding
+# of a triangle clipped by four lines: at most 7, plus a margin for rounding
+CORNERS = 9
 
 
 @kernel
 def rasterise(uv: Array, faces: Array, face: Array, weight: Array) -> None:
-    """Write the first triangle over each texel centre and the weights of its corners; `face` starts as -1."""
+    """Write the first triangle over each texel centre and the weights of its corners;
+    `face` starts as -1.
+    """
     size = face.shape[0]
     for f in range(len(faces)):
         a = faces[f, 0]
@@ -49,12 +52,22 @@ def rasterise(uv: Array, faces: Array, face: Array, weight: Array) -> None:
                 third = max(v, 0)
                 total = first + second + third
                 face[i, j] = f
-                weight[i, j, 0], weight[i, j, 1], weight[i, j, 2] = first / total, second / total, third / total
+                weight[i, j, 0], weight[i, j, 1], weight[i, j, 2] = (
+                    first / total,
+                    second / total,
+                    third / total,
+                )
 
 
 @kernel
 def interpolate(
-    face: Array, weight: Array, faces: Array, trust: Array, values: Array, image: Array, confidence: Array
+    face: Array,
+    weight: Array,
+    faces: Array,
+    trust: Array,
+    values: Array,
+    image: Array,
+    confidence: Array,
 ) -> None:
     """Write value and confidence at the texel centres; corners without trust have no weight."""
     mixed = np.empty(values.shape[1])
@@ -90,9 +103,11 @@ def average(
     other: Array,
     part: Array,
 ) -> None:
-    """Replace the chosen texels by the mean over their covered area, weighted by trust; exact for linear values.
+    """Replace the chosen texels by the mean over their covered area, weighted by trust;
+    exact for linear values.
 
-    `covered` (size, size) starts as 0; `polygon` and `other` (CORNERS, 2) and `part` (3,) are buffers.
+    `covered` (size, size) starts as 0; `polygon` and `other` (CORNERS, 2) and `part`
+    (3,) are buffers.
     """
     size = chosen.shape[0]
     for i in range(size):
@@ -128,7 +143,9 @@ def average(
                 n = 3
                 for side in range(4):  # left, right, top, bottom
                     line = (i if side // 2 else j) + side % 2
-                    n = _clip(polygon, other, n, side // 2, line, 1.0 - 2.0 * (side % 2))
+                    n = _clip(
+                        polygon, other, n, side // 2, line, 1.0 - 2.0 * (side % 2)
+                    )
                     polygon, other = other, polygon
                 part[0], part[1], part[2] = 0.0, 0.0, 0.0
                 # a fan of triangles: area of each times the weights of the corners at its centroid
@@ -141,7 +158,9 @@ def average(
                     x = polygon[0, 0] + (px + qx) / 3 - ax
                     y = polygon[0, 1] + (py + qy) / 3 - ay
                     u = min(max((x * (cy - ay) - y * (cx - ax)) / double_area, 0), 1)
-                    v = min(max(((bx - ax) * y - (by - ay) * x) / double_area, 0), 1 - u)
+                    v = min(
+                        max(((bx - ax) * y - (by - ay) * x) / double_area, 0), 1 - u
+                    )
                     part[0] += area * (1 - u - v)
                     part[1] += area * u
                     part[2] += area * v
@@ -162,8 +181,12 @@ def average(
 
 
 @kernel
-def _clip(polygon: Array, out: Array, n: int, axis: int, line: float, side: float) -> int:
-    """Corners of the part of a convex polygon where side * (x[axis] - line) >= 0 (Sutherland and Hodgman 1974)."""
+def _clip(
+    polygon: Array, out: Array, n: int, axis: int, line: float, side: float
+) -> int:
+    """Corners of the part of a convex polygon where side * (x[axis] - line) >= 0
+    (Sutherland and Hodgman 1974).
+    """
     m = 0
     for k in range(n):
         after = k + 1 if k + 1 < n else 0

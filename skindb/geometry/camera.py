@@ -1,4 +1,6 @@
-"""Pinhole cameras with Brown-Conrady distortion, in the conventions of OpenCV with pixel centres at integer + 0.5."""
+"""Pinhole cameras with Brown-Conrady distortion, in the conventions of OpenCV with
+pixel centres at integer + 0.5.
+"""
 
 from __future__ import annotations
 
@@ -35,15 +37,20 @@ def project(
     Returns
     -------
     pixels : ndarray
-        (..., 2) column and row in px. NaN behind the camera, and beyond the angle where the distortion polynomial
-        folds back (there a point far outside the picture would appear inside it).
+        (..., 2) column and row in px. NaN behind the camera, and beyond the angle where
+        the distortion polynomial folds back (there a point far outside the picture
+        would appear inside it).
     depth : ndarray
         (...) mm along the optical axis.
     """
-    local = np.asarray(points, np.float64) @ np.asarray(R, np.float64).T + np.asarray(t, np.float64)
+    local = np.asarray(points, np.float64) @ np.asarray(R, np.float64).T + np.asarray(
+        t, np.float64
+    )
     depth = local[..., 2]
     with np.errstate(divide="ignore", invalid="ignore"):
-        plane = np.where((depth > 0)[..., None], local[..., :2] / depth[..., None], np.nan)
+        plane = np.where(
+            (depth > 0)[..., None], local[..., :2] / depth[..., None], np.nan
+        )
     coefficients = np.asarray(distortion, np.float64)
     square = np.einsum("...i,...i->...", plane, plane)
     plane[square >= _fold(coefficients)] = np.nan
@@ -52,7 +59,9 @@ def project(
     return np.asarray(bent @ matrix[:2, :2].T + matrix[:2, 2]), depth
 
 
-def undistort(pixels: ArrayLike, K: ArrayLike, distortion: ArrayLike) -> NDArray[np.float64]:
+def undistort(
+    pixels: ArrayLike, K: ArrayLike, distortion: ArrayLike
+) -> NDArray[np.float64]:
     """Ideal image-plane coordinates (..., 2), x/z and y/z, of pixels (..., 2) by Newton's method.
 
     NaN where no point in front of the camera appears at that pixel.
@@ -65,13 +74,21 @@ def undistort(pixels: ArrayLike, K: ArrayLike, distortion: ArrayLike) -> NDArray
         return np.asarray(bent.reshape(offset.shape), np.float64)
     plane = np.empty_like(bent)
     undistorted(
-        np.ascontiguousarray(bent), coefficients, float(np.sqrt(_fold(coefficients))), UNDISTORT_TOLERANCE, plane
+        np.ascontiguousarray(bent),
+        coefficients,
+        float(np.sqrt(_fold(coefficients))),
+        UNDISTORT_TOLERANCE,
+        plane,
     )
     return plane.reshape(offset.shape)
 
 
-def pixel_rays(pixels: ArrayLike, K: ArrayLike, R: ArrayLike, distortion: ArrayLike) -> NDArray[np.float64]:
-    """Unit directions (..., 3) in the subject frame, from the camera through pixels (..., 2); NaN as `undistort`."""
+def pixel_rays(
+    pixels: ArrayLike, K: ArrayLike, R: ArrayLike, distortion: ArrayLike
+) -> NDArray[np.float64]:
+    """Unit directions (..., 3) in the subject frame, from the camera through pixels
+    (..., 2); NaN as `undistort`.
+    """
     plane = undistort(pixels, K, distortion)
     local = np.ones((*plane.shape[:-1], 3))
     local[..., :2] = plane
@@ -87,15 +104,22 @@ def _distort(plane: Float, coefficients: Float) -> Float:
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
     return np.stack(
-        [x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y], -1
+        [
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+        ],
+        -1,
     )
 
 
 def _fold(coefficients: Float) -> float:
-    """Square radius beyond which r (1 + k1 r^2 + k2 r^4 + k3 r^6) no longer grows; infinity if it always does."""
+    """Square radius beyond which r (1 + k1 r^2 + k2 r^4 + k3 r^6) no longer grows;
+    infinity if it always does.
+    """
     k1, k2, _, _, k3 = coefficients
     growth = np.array([7 * k3, 5 * k2, 3 * k1, 1.0])
-    # a coefficient of 1e-12 folds beyond a thousand focal lengths; division by a smaller one may overflow
+    # a coefficient of 1e-12 folds beyond a thousand focal lengths; division by a
+    # smaller one may overflow
     roots = np.roots(np.where(np.abs(growth) < 1e-12, 0.0, growth))
     real = roots.real[(np.abs(roots.imag) < 1e-9 * np.abs(roots)) & (roots.real > 0)]
     return float(real.min()) if len(real) else np.inf

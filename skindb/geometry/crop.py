@@ -25,17 +25,28 @@ class Crop:
 
     def __post_init__(self) -> None:
         """Check that the limits are not empty."""
-        if self.low is not None and self.high is not None and not (np.array(self.low) < self.high).all():
+        if (
+            self.low is not None
+            and self.high is not None
+            and not (np.array(self.low) < self.high).all()
+        ):
             found = f"{self.low} and {self.high}"
             rule = "its lower corner must lie below the higher one, in mm"
             raise InputError(Fault("crop", rule, found, "exchange them"))
         if self.reach_mm is not None and not self.reach_mm > 0:
             raise InputError(
-                Fault("crop", "its reach must be positive, in mm", str(self.reach_mm), "give a positive one")
+                Fault(
+                    "crop",
+                    "its reach must be positive, in mm",
+                    str(self.reach_mm),
+                    "give a positive one",
+                )
             )
 
 
-def crop_faces(vertices: Float, faces: Faces, crop: Crop, *, landmarks: Float | None = None) -> NDArray[np.bool_]:
+def crop_faces(
+    vertices: Float, faces: Faces, crop: Crop, *, landmarks: Float | None = None
+) -> NDArray[np.bool_]:
     """Mask (f,) of the faces whose corners are all kept, so that none extends beyond the box.
 
     Parameters

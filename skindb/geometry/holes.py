@@ -9,14 +9,17 @@ from numpy.typing import NDArray
 
 Float = NDArray[np.floating[Any]]
 Index = NDArray[np.int64]
-MIN_HEIGHT_RATIO = 1e-3  # height over longest side: 4 um on a scan, a tenth of its noise; valid scans have 1e-2
+# height over longest side: 4 um on a scan, a tenth of its noise; valid scans have 1e-2
+MIN_HEIGHT_RATIO = 1e-3
 MIN_FILL_HEIGHT_RATIO = 1e-4  # of a triangle that closes a slit, which may be thinner
 
 
 def sliver_mask(
     vertices: Float, faces: NDArray[np.integer[Any]], thinnest: float = MIN_HEIGHT_RATIO
 ) -> NDArray[np.bool_]:
-    """Mask (f,) of triangles with a height below `thinnest` of their longest side, or with coinciding corners."""
+    """Mask (f,) of triangles with a height below `thinnest` of their longest side, or
+    with coinciding corners.
+    """
     p = np.asarray(vertices, np.float64)[faces]
     sides = p - np.roll(p, -1, axis=1)
     longest = np.einsum("fki,fki->fk", sides, sides).max(axis=1, initial=0.0)
@@ -24,7 +27,9 @@ def sliver_mask(
     return np.asarray(double_area <= thinnest * longest)
 
 
-def fill_hole(vertices: Float, loop: Index, taken: set[tuple[int, int]]) -> Index | None:
+def fill_hole(
+    vertices: Float, loop: Index, taken: set[tuple[int, int]]
+) -> Index | None:
     """Triangles that close a boundary loop (Barequet and Sharir 1995, weight: area).
 
     Parameters
@@ -39,9 +44,11 @@ def fill_hole(vertices: Float, loop: Index, taken: set[tuple[int, int]]) -> Inde
     Returns
     -------
     ndarray or None
-        (n - 2, 3) wound like the mesh; None where every triangulation has a sliver or repeats an edge.
+        (n - 2, 3) wound like the mesh; None where every triangulation has a sliver or
+        repeats an edge.
     """
-    ring = loop[::-1]  # the mesh follows the loop, so that the patch follows its reverse
+    # the mesh follows the loop, so that the patch follows its reverse
+    ring = loop[::-1]
     n = len(ring)
     p = np.asarray(vertices, np.float64)[ring]
     cost = np.full((n, n), np.inf)
@@ -53,7 +60,9 @@ def fill_hole(vertices: Float, loop: Index, taken: set[tuple[int, int]]) -> Inde
             if span < n - 1 and (min(ring[i], ring[k]), max(ring[i], ring[k])) in taken:
                 continue
             middle = np.arange(i + 1, k)
-            corners = np.stack([np.full(len(middle), i), middle, np.full(len(middle), k)], axis=1)
+            corners = np.stack(
+                [np.full(len(middle), i), middle, np.full(len(middle), k)], axis=1
+            )
             area = np.linalg.norm(np.cross(p[middle] - p[i], p[k] - p[i]), axis=1)
             total = (
                 cost[i, middle]

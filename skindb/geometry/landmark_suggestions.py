@@ -1,4 +1,6 @@
-"""Where the landmarks of a face that are not set yet may lie, from its surface and from those that are set."""
+"""Where the landmarks of a face that are not set yet may lie, from its surface and from
+those that are set.
+"""
 
 from __future__ import annotations
 
@@ -16,10 +18,13 @@ Points = dict[str, NDArray[np.float64]]
 NOSE = "nose_tip"
 RIGHT = "_right"
 LEFT = "_left"
-MIDDLE_FRACTION = 0.15  # of the width of the scan to each side of its middle, where the nose tip is searched
-MIN_WIDTH = 0.15  # of points over their length, below which they lie on a line and do not determine a rotation
-# positions in mm on a mean face that looks along +z, y up: the virtual head of average proportions, rounded. The
-# subject's left is mirrored.
+# of the width of the scan to each side of its middle, where the nose tip is searched
+MIDDLE_FRACTION = 0.15
+# of points over their length, below which they lie on a line and do not determine a
+# rotation
+MIN_WIDTH = 0.15
+# positions in mm on a mean face that looks along +z, y up: the virtual head of average
+# proportions, rounded. The subject's left is mirrored.
 _MIDDLE = {
     "forehead_centre": (0, 96, 96),
     "nasion": (0, 42, 106),
@@ -39,8 +44,14 @@ _OF_RIGHT = {
 }
 MEAN_FACE: Mapping[str, NDArray[np.float64]] = {
     **{name: np.array(place, np.float64) for name, place in _MIDDLE.items()},
-    **{f"{name}{RIGHT}": np.array(place, np.float64) for name, place in _OF_RIGHT.items()},
-    **{f"{name}{LEFT}": np.array(place, np.float64) * (-1, 1, 1) for name, place in _OF_RIGHT.items()},
+    **{
+        f"{name}{RIGHT}": np.array(place, np.float64)
+        for name, place in _OF_RIGHT.items()
+    },
+    **{
+        f"{name}{LEFT}": np.array(place, np.float64) * (-1, 1, 1)
+        for name, place in _OF_RIGHT.items()
+    },
 }
 
 
@@ -54,7 +65,8 @@ def mate(name: str) -> str:
 def nose_tip(vertices: Float) -> NDArray[np.float64]:
     """The foremost vertex (3,) of the middle of a scan (v, 3) that looks along +z, y up, mm.
 
-    The middle is a strip around the median of x; hair and clothes that stand out farther than the nose mislead it.
+    The middle is a strip around the median of x; hair and clothes that stand out
+    farther than the nose mislead it.
     """
     points = np.asarray(vertices, np.float64)
     across = points[:, 0] - np.median(points[:, 0])
@@ -62,13 +74,16 @@ def nose_tip(vertices: Float) -> NDArray[np.float64]:
     return np.asarray(strip[np.argmax(strip[:, 2])])
 
 
-def suggest_landmarks(vertices: Float, faces: NDArray[np.integer[Any]], points: Mapping[str, Float]) -> Points:
+def suggest_landmarks(
+    vertices: Float, faces: NDArray[np.integer[Any]], points: Mapping[str, Float]
+) -> Points:
     """Positions on the surface for the landmarks of `MEAN_FACE` that are not set.
 
-    A point whose mate is set is its mirror image across the plane of symmetry of the points that are set. The nose tip
-    is the foremost point of the middle, as long as no three points that are not on a line are set. The rest are
-    the mean face after the similarity that brings it nearest to the points that are set (Umeyama 1991). All are moved
-    to the nearest point of the surface.
+    A point whose mate is set is its mirror image across the plane of symmetry of the
+    points that are set. The nose tip is the foremost point of the middle, as long as no
+    three points that are not on a line are set. The rest are the mean face after the
+    similarity that brings it nearest to the points that are set (Umeyama 1991). All are
+    moved to the nearest point of the surface.
 
     Parameters
     ----------
@@ -82,7 +97,11 @@ def suggest_landmarks(vertices: Float, faces: NDArray[np.integer[Any]], points: 
     dict
         Name to position (3,) mm.
     """
-    known = {name: np.asarray(p, np.float64) for name, p in points.items() if name in MEAN_FACE}
+    known = {
+        name: np.asarray(p, np.float64)
+        for name, p in points.items()
+        if name in MEAN_FACE
+    }
     begin = known if _spread(known) else {NOSE: nose_tip(vertices), **known}
     guess = _fitted(begin) | _mirrored(known)
     open_ = [name for name in MEAN_FACE if name not in known]
@@ -90,8 +109,12 @@ def suggest_landmarks(vertices: Float, faces: NDArray[np.integer[Any]], points: 
         return {}
     if NOSE in begin and NOSE in open_:
         guess[NOSE] = begin[NOSE]
-    triangle, weight, _ = closest_on_mesh(vertices, faces, np.array([guess[name] for name in open_]))
-    nearest = (weight[..., None] * np.asarray(vertices, np.float64)[faces[triangle]]).sum(axis=1)
+    triangle, weight, _ = closest_on_mesh(
+        vertices, faces, np.array([guess[name] for name in open_])
+    )
+    nearest = (
+        weight[..., None] * np.asarray(vertices, np.float64)[faces[triangle]]
+    ).sum(axis=1)
     return dict(zip(open_, nearest, strict=True))
 
 
@@ -101,7 +124,9 @@ def _spread(known: Mapping[str, Float]) -> bool:
 
 
 def _fitted(known: Points) -> Points:
-    """The mean face, moved onto the points that are set; only shifted where they determine no rotation."""
+    """The mean face, moved onto the points that are set; only shifted where they
+    determine no rotation.
+    """
     names = [*known]
     mean = np.array([*MEAN_FACE.values()])
     source = np.array([MEAN_FACE[name] for name in names])
@@ -115,11 +140,17 @@ def _fitted(known: Points) -> Points:
 
 
 def _mirrored(known: Points) -> Points:
-    """Mirror images of points whose mate is not set, by the reflection that best maps the others onto their mates."""
+    """Mirror images of points whose mate is not set, by the reflection that best maps
+    the others onto their mates.
+    """
     both = [name for name in known if mate(name) in known]
     if not _spread({name: known[name] for name in both}):
         return {}
     flip = np.array([-1.0, 1, 1])
     source = np.array([known[mate(name)] for name in both]) * flip
     matrix, shift = similarity(source, np.array([known[name] for name in both]))
-    return {mate(name): (p * flip) @ matrix + shift for name, p in known.items() if mate(name) not in known}
+    return {
+        mate(name): (p * flip) @ matrix + shift
+        for name, p in known.items()
+        if mate(name) not in known
+    }

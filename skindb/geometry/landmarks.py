@@ -12,8 +12,11 @@ MAX_SHAPE_ROUNDS = 100  # of the mean shape; a face needs about 5
 SETTLED = 1e-12  # relative change of the mean shape at which it has converged
 
 
-def similarity(source: Float, target: Float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Rotation and scale (d, d) and shift (d,) that best map source to target, without reflection (Umeyama 1991).
+def similarity(
+    source: Float, target: Float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Rotation and scale (d, d) and shift (d,) that best map source to target, without
+    reflection (Umeyama 1991).
 
     Parameters
     ----------
@@ -34,7 +37,11 @@ def similarity(source: Float, target: Float) -> tuple[NDArray[np.float64], NDArr
     sign[-1] = np.sign(np.linalg.det(left @ right))
     length = float((a**2).sum())
     along = float(value @ sign)
-    matrix = along / length * (left * sign) @ right if along > 0 and length > 0 else np.eye(len(value))
+    matrix = (
+        along / length * (left * sign) @ right
+        if along > 0 and length > 0
+        else np.eye(len(value))
+    )
     return matrix, y.mean(axis=0) - x.mean(axis=0) @ matrix
 
 
@@ -45,7 +52,8 @@ def width(points: Float) -> float:
 
 
 def mean_shape(shapes: Float) -> NDArray[np.float64]:
-    """Mean of shapes after rotation, scale and shift are removed (Gower 1975), in the mean pose of the shapes.
+    """Mean of shapes after rotation, scale and shift are removed (Gower 1975), in the
+    mean pose of the shapes.
 
     Parameters
     ----------
@@ -62,7 +70,9 @@ def mean_shape(shapes: Float) -> NDArray[np.float64]:
     size = float(np.nanmax(np.abs(pose - np.nanmean(pose, axis=0)), initial=0.0))
     for _ in range(MAX_SHAPE_ROUNDS):
         before = mean
-        mean = _onto(_known_mean(np.stack([_onto(shape, before) for shape in all_of])), pose)
+        mean = _onto(
+            _known_mean(np.stack([_onto(shape, before) for shape in all_of])), pose
+        )
         if not np.nanmax(np.abs(mean - before), initial=0.0) > SETTLED * size:
             break
     return mean

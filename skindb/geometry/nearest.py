@@ -47,7 +47,9 @@ def closest_on_mesh(
         own = slice(start, start + POINTS_PER_BLOCK)
         row, at = _candidates(classes, p[own], near[own])
         weight = _closest(p[own][row], triangles[at])
-        away = np.linalg.norm(np.einsum("nk,nkc->nc", weight, triangles[at]) - p[own][row], axis=1)
+        away = np.linalg.norm(
+            np.einsum("nk,nkc->nc", weight, triangles[at]) - p[own][row], axis=1
+        )
         order = np.lexsort((at, away, row))
         best = order[np.searchsorted(row[order], np.arange(len(p[own])))]
         face[own], corner[own] = at[best], weight[best]
@@ -65,16 +67,24 @@ class _Class:
 
 
 def _by_reach(triangles: Float) -> list[_Class]:
-    """Classes of triangles (f, 3, 3) by their radius, in powers of two, so that long ones do not slow the others."""
+    """Classes of triangles (f, 3, 3) by their radius, in powers of two, so that long
+    ones do not slow the others.
+    """
     middle = triangles.mean(axis=1)
     reach = np.linalg.norm(triangles - middle[:, None], axis=2).max(axis=1)
     octave = np.frexp(np.maximum(reach, np.median(reach)))[1]
     faces = [np.flatnonzero(octave == one) for one in np.unique(octave)]
-    return [_Class(face, cKDTree(middle[face]), float(reach[face].max())) for face in faces]
+    return [
+        _Class(face, cKDTree(middle[face]), float(reach[face].max())) for face in faces
+    ]
 
 
-def _candidates(classes: list[_Class], points: Float, near: Float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Pairs (m,) of a point and a triangle that may be nearest to it, given the distance `near` of some vertex."""
+def _candidates(
+    classes: list[_Class], points: Float, near: Float
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Pairs (m,) of a point and a triangle that may be nearest to it, given the
+    distance `near` of some vertex.
+    """
     rows = []
     faces = []
     for one in classes:
@@ -86,12 +96,15 @@ def _candidates(classes: list[_Class], points: Float, near: Float) -> tuple[NDAr
 
 
 def _closest(point: Float, triangles: Float) -> Float:
-    """Barycentric (n, 3) of the point of each triangle (n, 3, 3) nearest to a point (n, 3): inside, or on an edge."""
+    """Barycentric (n, 3) of the point of each triangle (n, 3, 3) nearest to a point (n,
+    3): inside, or on an edge.
+    """
     a = triangles[:, 0]
     first = triangles[:, 1] - a
     second = triangles[:, 2] - a
     away = point - a
-    # by orthogonalisation: Gram determinants are squared quantities, which lose precision for needles
+    # by orthogonalisation: Gram determinants are squared quantities, which lose
+    # precision for needles
     base = _square(first)
     along = _dot(first, second) / base
     ahead = _dot(first, away) / base
@@ -125,10 +138,12 @@ def _dot(a: Float, b: Float) -> Float:
 
 
 def winding_number(vertices: Float, faces: Faces, points: Float) -> NDArray[np.float64]:
-    """Winding numbers of a mesh around points (k, 3): solid angle of its back over 4 pi (Jacobson et al. 2013).
+    """Winding numbers of a mesh around points (k, 3): solid angle of its back over 4 pi
+    (Jacobson et al. 2013).
 
-    1 inside a closed surface, 0 outside. For an open surface, the fraction of directions in which its inner side is
-    visible minus that of its outer side, at most one half outside the convex hull.
+    1 inside a closed surface, 0 outside. For an open surface, the fraction of
+    directions in which its inner side is visible minus that of its outer side, at most
+    one half outside the convex hull.
     """
     used = np.asarray(vertices, np.float64)[faces]
     total = []
@@ -139,5 +154,9 @@ def winding_number(vertices: Float, faces: Faces, points: Float) -> NDArray[np.f
         volume = np.einsum("fi,fi->f", a, np.cross(b, c))
         dots = (np.einsum("fi,fi->f", p, q) for p, q in ((a, b), (b, c), (c, a)))
         ab, bc, ca = dots
-        total.append(2 * np.arctan2(volume, la * lb * lc + ab * lc + bc * la + ca * lb).sum() / (4 * np.pi))
+        total.append(
+            2
+            * np.arctan2(volume, la * lb * lc + ab * lc + bc * la + ca * lb).sum()
+            / (4 * np.pi)
+        )
     return np.array(total, np.float64)

@@ -16,14 +16,16 @@ Faces = NDArray[np.integer[Any]]
 RAYS_PER_BLOCK = 1 << 15  # so that the arrays of the rays stay in the cache
 NUDGE = 1e-3 * np.array([0.62, 0.55, -0.56])  # mm
 NO_HIT_DISTANCE_MM = 1e36  # mm; Embree's own start, returned for a miss, is 1e37
-RAY_OFFSET_MM = 0.05  # mm; more than the sag of a 5 mm edge on a head (r = 80 mm), less than any fold of skin
+# mm; more than the sag of a 5 mm edge on a head (r = 80 mm), less than any fold of skin
+RAY_OFFSET_MM = 0.05
 
 
 class RayScene:
     """A mesh prepared for rays; immutable, shared freely between threads (Embree releases the GIL).
 
-    Rays whose origins follow each other in space (Morton order, image rows) are 2.5 to 6 times faster than shuffled
-    ones. Embree computes in float32: the mesh is centred first, and hits are refined in float64.
+    Rays whose origins follow each other in space (Morton order, image rows) are 2.5 to
+    6 times faster than shuffled ones. Embree computes in float32: the mesh is centred
+    first, and hits are refined in float64.
     """
 
     def __init__(self, vertices: Float, faces: Faces) -> None:
@@ -58,10 +60,12 @@ class RayScene:
         origin, target
             (n, 3) mm; they broadcast against each other.
         normal
-            (n, 3) unit normals at the origins. With them a ray starts above the surface, and a smooth surface casts
-            no shadow on itself where light grazes it; without them it starts along the ray.
+            (n, 3) unit normals at the origins. With them a ray starts above the
+            surface, and a smooth surface casts no shadow on itself where light grazes
+            it; without them it starts along the ray.
         at
-            (m,) indices of the origins and normals to use; targets are then (m, 3) or a single one. Default all.
+            (m,) indices of the origins and normals to use; targets are then (m, 3) or a
+            single one. Default all.
         offset_mm
             Distance by which the start is moved, and by which the ray ends before the target.
 
@@ -70,10 +74,20 @@ class RayScene:
         ndarray
             (n,) or (m,) bool. Origins or targets that are not finite count as hidden.
         """
-        begin, end = (np.ascontiguousarray(points, np.float64) for points in (origin, target))
-        lift = np.zeros((1, 3)) if normal is None else np.ascontiguousarray(normal, np.float64)
+        begin, end = (
+            np.ascontiguousarray(points, np.float64) for points in (origin, target)
+        )
+        lift = (
+            np.zeros((1, 3))
+            if normal is None
+            else np.ascontiguousarray(normal, np.float64)
+        )
         ahead = offset_mm if normal is None else 0.0
-        which = np.arange(np.broadcast_shapes(begin.shape, end.shape)[0]) if at is None else np.asarray(at, np.int64)
+        which = (
+            np.arange(np.broadcast_shapes(begin.shape, end.shape)[0])
+            if at is None
+            else np.asarray(at, np.int64)
+        )
         hidden = np.empty(len(which), bool)
         size = min(RAYS_PER_BLOCK, len(which))
         start = np.empty((size, 3), np.float32)
@@ -83,7 +97,17 @@ class RayScene:
             part = which[i : i + RAYS_PER_BLOCK]
             aims = end[i : i + RAYS_PER_BLOCK] if len(end) > 1 else end
             rays = (start[: len(part)], way[: len(part)], reach[: len(part)])
-            aim(begin, part, aims, lift, self._centre, offset_mm, ahead, offset_mm, *rays)
+            aim(
+                begin,
+                part,
+                aims,
+                lift,
+                self._centre,
+                offset_mm,
+                ahead,
+                offset_mm,
+                *rays,
+            )
             found = ~np.isfinite(rays[2])  # Embree overwrites its input
             hidden[i : i + RAYS_PER_BLOCK] = (self._run("OCCLUDED", *rays) >= 0) | found
         return hidden
@@ -107,7 +131,9 @@ class RayScene:
         distance : ndarray
             (n,) mm; infinity for a miss.
         """
-        begin, towards = np.broadcast_arrays(np.asarray(origin, np.float64), np.asarray(direction, np.float64))
+        begin, towards = np.broadcast_arrays(
+            np.asarray(origin, np.float64), np.asarray(direction, np.float64)
+        )
         face = np.full(len(begin), -1, np.int32)
         barycentric = np.zeros((len(begin), 3))
         distance = np.full(len(begin), np.inf)
@@ -124,28 +150,39 @@ class RayScene:
         return face, barycentric, distance
 
     def distances(self, origin: Float, direction: Float) -> NDArray[np.float32]:
-        """Distances (n,) in mm from one origin (3,) to the first triangle along unit directions (n, 3).
+        """Distances (n,) in mm from one origin (3,) to the first triangle along unit
+        directions (n, 3).
 
-        Infinity where a ray misses or is not finite. The precision is that of float32, and one in a hundred rays that
-        aim exactly at a vertex misses the mesh: use this for depth maps; `first_hit` is exact.
+        Infinity where a ray misses or is not finite. The precision is that of float32,
+        and one in a hundred rays that aim exactly at a vertex misses the mesh: use this
+        for depth maps; `first_hit` is exact.
         """
         start = (np.asarray(origin, np.float64) - self._centre).astype(np.float32)
         found = np.empty(len(direction), np.float32)
         for i in range(0, len(direction), RAYS_PER_BLOCK):
             way = direction[i : i + RAYS_PER_BLOCK].astype(np.float32, copy=False)
             origins = np.broadcast_to(start, way.shape)
-            found[i : i + RAYS_PER_BLOCK] = self._scene.run(np.ascontiguousarray(origins), way, query="DISTANCE")
+            found[i : i + RAYS_PER_BLOCK] = self._scene.run(
+                np.ascontiguousarray(origins), way, query="DISTANCE"
+            )
         found[~(found < NO_HIT_DISTANCE_MM)] = np.inf
         return found
 
     def _first(self, start: Float, way: Float) -> NDArray[np.int32]:
         found = self._run("INTERSECT", start, way)
-        # one in a hundred rays that aim exactly at a vertex misses the mesh: misses are repeated with a small shift
+        # one in a hundred rays that aim exactly at a vertex misses the mesh: misses are
+        # repeated with a small shift
         missed = np.flatnonzero((found < 0) & np.isfinite(start + way).all(axis=1))
         found[missed] = self._run("INTERSECT", start[missed] + NUDGE, way[missed])
         return found
 
-    def _run(self, query: str, start: Float, way: Float, reach: NDArray[np.float32] | None = None) -> NDArray[np.int32]:
+    def _run(
+        self,
+        query: str,
+        start: Float,
+        way: Float,
+        reach: NDArray[np.float32] | None = None,
+    ) -> NDArray[np.int32]:
         if len(start) == 0:
             return np.zeros(0, np.int32)
         length = np.full(len(start), 1e37, np.float32) if reach is None else reach
@@ -158,7 +195,9 @@ def _length(vectors: Float) -> Float:
 
 
 def _refine(triangles: Float, origin: Float, direction: Float) -> tuple[Float, Float]:
-    """Barycentric (n, 3) and distance (n,) in float64 of rays that meet their triangles (Moller and Trumbore 1997)."""
+    """Barycentric (n, 3) and distance (n,) in float64 of rays that meet their triangles
+    (Moller and Trumbore 1997).
+    """
     a = triangles[:, 0]
     b = triangles[:, 1]
     c = triangles[:, 2]

@@ -25,24 +25,39 @@ from skindb.errors import Fault, InputError
 MAX_COLOUR = 255  # of the eight bits of a colour of a vertex
 CURE = "export the scan again as a triangle mesh in mm (PLY or OBJ)"
 
-# errors of the readers for damaged files, found by changing bytes; MemoryError: an absurd size in the header
-DAMAGE = (ValueError, LookupError, TypeError, AttributeError, NameError, ArithmeticError, MemoryError, RecursionError)
+# errors of the readers for damaged files, found by changing bytes; MemoryError: an
+# absurd size in the header
+DAMAGE = (
+    ValueError,
+    LookupError,
+    TypeError,
+    AttributeError,
+    NameError,
+    ArithmeticError,
+    MemoryError,
+    RecursionError,
+)
 
 
 class DamageError(ValueError):
-    """Damage of a mesh file that its text describes; errors of the readers describe their own code."""
+    """Damage of a mesh file that its text describes; errors of the readers describe
+    their own code.
+    """
 
 
 @dataclass(frozen=True)
 class Scan:
-    """A mesh as it lies in its file: regions and landmarks refer to vertices by their number there."""
+    """A mesh as it lies in its file: regions and landmarks refer to vertices by their
+    number there.
+    """
 
     vertices: NDArray[np.float64]  # (v, 3) mm
     faces: NDArray[np.int64]  # (f, 3)
 
 
 def read_scan(path: str | Path) -> Scan:
-    """Read a PLY (text or binary) or OBJ file; polygons are split into triangles, textures are not read.
+    """Read a PLY (text or binary) or OBJ file; polygons are split into triangles,
+    textures are not read.
 
     Parameters
     ----------
@@ -57,34 +72,50 @@ def read_scan(path: str | Path) -> Scan:
     Raises
     ------
     InputError
-        With every fault found: unreadable, no triangles, a vertex that is not finite, a face without its vertex.
+        With every fault found: unreadable, no triangles, a vertex that is not finite, a
+        face without its vertex.
     """
     file = Path(path)
     reader = {".ply": _read_ply, ".obj": _read_obj}.get(file.suffix.lower())
     if reader is None:
-        raise _fault(file, "a scan must be a .ply or .obj file", f"{file.suffix or 'no suffix'}")
+        raise _fault(
+            file, "a scan must be a .ply or .obj file", f"{file.suffix or 'no suffix'}"
+        )
     try:
         with open_regular(file, MAX_SCAN_BYTES) as stream:
             vertices, faces = reader(stream)
     except InputError:
         raise
     except OSError as error:
-        raise _fault(file, "the scan must be readable", error.strerror or str(error)) from error
+        raise _fault(
+            file, "the scan must be readable", error.strerror or str(error)
+        ) from error
     except DAMAGE as error:
-        raise _fault(file, "the scan must be a complete mesh file", _damage(error)) from error
+        raise _fault(
+            file, "the scan must be a complete mesh file", _damage(error)
+        ) from error
     if faults := _faults(file, vertices, faces):
         raise InputError(faults)
     return Scan(vertices, faces)
 
 
 def read_colours(path: str | Path, count: int) -> NDArray[np.uint8] | None:
-    """Colours (count, 3) of the vertices of a PLY file that `read_scan` has read; None where it has none of 8 bits."""
+    """Colours (count, 3) of the vertices of a PLY file that `read_scan` has read; None
+    where it has none of 8 bits.
+    """
     file = Path(path)
     if file.suffix.lower() != ".ply":
         return None
     with open_regular(file, MAX_SCAN_BYTES) as stream:
-        colours = load_ply(stream, fix_texture=False, skip_materials=True).get("vertex_colors")
-    if colours is None or len(colours) != count or np.max(colours, initial=0) > MAX_COLOUR or np.min(colours) < 0:
+        colours = load_ply(stream, fix_texture=False, skip_materials=True).get(
+            "vertex_colors"
+        )
+    if (
+        colours is None
+        or len(colours) != count
+        or np.max(colours, initial=0) > MAX_COLOUR
+        or np.min(colours) < 0
+    ):
         return None
     found = np.asarray(colours)[:, :3]
     return found.astype(np.uint8) if found.dtype.kind in "iu" else None
@@ -94,17 +125,30 @@ def _damage(error: Exception) -> str:
     """Description of the damage of a mesh file, for a message."""
     if isinstance(error, OverflowError):
         return "a number beyond 64 bits"
-    return str(error) if isinstance(error, DamageError) else "one that is cut off or damaged"
+    return (
+        str(error)
+        if isinstance(error, DamageError)
+        else "one that is cut off or damaged"
+    )
 
 
 def _fault(file: Path, rule: str, found: str) -> InputError:
     return InputError(Fault(str(file), rule, found, CURE))
 
 
-def _faults(file: Path, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> list[Fault]:
+def _faults(
+    file: Path, vertices: NDArray[np.float64], faces: NDArray[np.int64]
+) -> list[Fault]:
     faults = []
     if len(faces) == 0:
-        faults.append(Fault(str(file), "a scan must have triangles", f"{len(vertices)} vertices and no face", CURE))
+        faults.append(
+            Fault(
+                str(file),
+                "a scan must have triangles",
+                f"{len(vertices)} vertices and no face",
+                CURE,
+            )
+        )
     bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
     if len(bad):
         found = f"{len(bad)} that are not finite, first vertex {bad[0]}"
@@ -112,7 +156,9 @@ def _faults(file: Path, vertices: NDArray[np.float64], faces: NDArray[np.int64])
     wrong = np.flatnonzero(((faces < 0) | (faces >= len(vertices))).any(axis=1))
     if len(wrong):
         found = f"{len(wrong)} other faces, first face {wrong[0]}, for {len(vertices)} vertices"
-        faults.append(Fault(str(file), "faces must refer to vertices of the file", found, CURE))
+        faults.append(
+            Fault(str(file), "faces must refer to vertices of the file", found, CURE)
+        )
     return faults
 
 
@@ -124,7 +170,9 @@ def _read_ply(stream: BinaryIO) -> tuple[NDArray[np.float64], NDArray[np.int64]]
     faces = np.asarray(content.get("faces", np.zeros((0, 3))), np.int64)
     if vertices.ndim != 2 or vertices.shape[1] != 3:
         raise DamageError(f"vertices of shape {vertices.shape}")
-    return vertices, _triangulated([*faces] if faces.ndim == 2 and faces.shape[1] != 3 else faces, vertices)
+    return vertices, _triangulated(
+        [*faces] if faces.ndim == 2 and faces.shape[1] != 3 else faces, vertices
+    )
 
 
 def _require_counts(stream: BinaryIO) -> None:
@@ -144,9 +192,14 @@ def _require_counts(stream: BinaryIO) -> None:
         most = {b"vertex": MAX_SCAN_VERTICES, b"face": MAX_SCAN_FACES}.get(name, size)
         total += count
         if not 0 <= count <= min(most, size):
-            raise DamageError(f"a header that states {count:,} elements {name.decode('latin-1')!a}")
+            raise DamageError(
+                f"a header that states {count:,} elements {name.decode('latin-1')!a}"
+            )
     if b"ascii" in header:
-        lines = sum(block.count(b"\n") + block.count(b"\r") for block in iter(lambda: stream.read(1 << 20), b""))
+        lines = sum(
+            block.count(b"\n") + block.count(b"\r")
+            for block in iter(lambda: stream.read(1 << 20), b"")
+        )
         if lines > MAX_PLY_TEXT_LINES:
             raise DamageError(f"{lines:,} lines of text: write a binary PLY file")
         stream.seek(len(header) + len(end))
@@ -157,7 +210,9 @@ def _require_counts(stream: BinaryIO) -> None:
 
 
 def _read_obj(stream: BinaryIO) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Positions and faces only: general readers split or reorder vertices where texture coordinates differ."""
+    """Positions and faces only: general readers split or reorder vertices where texture
+    coordinates differ.
+    """
     vertices = array("d")
     corners = array("q")
     sizes = array("q")
@@ -173,7 +228,9 @@ def _read_obj(stream: BinaryIO) -> tuple[NDArray[np.float64], NDArray[np.int64]]
             corners.extend(i - 1 if i > 0 else len(vertices) // 3 + i for i in index)
             sizes.append(len(index))
         if len(vertices) > 3 * MAX_SCAN_VERTICES or len(corners) > 3 * MAX_SCAN_FACES:
-            raise DamageError(f"more than {MAX_SCAN_VERTICES:,} vertices or {MAX_SCAN_FACES:,} triangles")
+            raise DamageError(
+                f"more than {MAX_SCAN_VERTICES:,} vertices or {MAX_SCAN_FACES:,} triangles"
+            )
     points = np.array(vertices, np.float64).reshape(-1, 3)
     numbers = np.array(corners, np.int64)
     if all(size == 3 for size in sizes):
@@ -196,17 +253,23 @@ def _obj_lines(stream: BinaryIO) -> Iterator[tuple[bytes, bytes]]:
 
 
 def _triangulated(
-    polygons: list[list[int]] | list[NDArray[np.int64]] | NDArray[np.int64], points: NDArray[np.float64]
+    polygons: list[list[int]] | list[NDArray[np.int64]] | NDArray[np.int64],
+    points: NDArray[np.float64],
 ) -> NDArray[np.int64]:
     if isinstance(polygons, np.ndarray):
         return polygons.reshape(-1, 3)
-    cut = [np.roll(p, -1) if len(p) == 4 and _second_is_shorter(p, points) else p for p in polygons]
+    cut = [
+        np.roll(p, -1) if len(p) == 4 and _second_is_shorter(p, points) else p
+        for p in polygons
+    ]
     fans = [[p[0], p[i], p[i + 1]] for p in cut for i in range(1, len(p) - 1)]
     return np.array(fans, np.int64).reshape(-1, 3)
 
 
 def _second_is_shorter(quad: Any, points: NDArray[np.float64]) -> bool:
-    """Whether corners 1 and 3 are nearer than 0 and 2: a quad cut along its shorter diagonal does not fold."""
+    """Whether corners 1 and 3 are nearer than 0 and 2: a quad cut along its shorter
+    diagonal does not fold.
+    """
     if min(quad) < 0 or max(quad) >= len(points):
         return False  # reported later
     a, b, c, d = points[np.asarray(quad)]

@@ -19,16 +19,19 @@ MAX_NEEDLE_RATIO = 0.01  # shortest over longest side of a sliver that is collap
 
 
 def repair_slivers(vertices: Float, faces: Index) -> tuple[Index, Index, Index]:
-    """Faces (f', 3) without slivers, the repaired slivers (r, 3), and those that could not be repaired (s, 3).
+    """Faces (f', 3) without slivers, the repaired slivers (r, 3), and those that could
+    not be repaired (s, 3).
 
-    The short edge of a needle is collapsed. The long edge of a cap is replaced by the other diagonal of the
-    quadrilateral that it forms with its neighbour, or the cap is dropped if that edge is open.
+    The short edge of a needle is collapsed. The long edge of a cap is replaced by the
+    other diagonal of the quadrilateral that it forms with its neighbour, or the cap is
+    dropped if that edge is open.
     """
     current = np.array(faces, np.int64)
     repaired: list[Index] = []
     for _ in range(MAX_FLIP_ROUNDS):
         bad = sliver_mask(vertices, current)
-        near = np.flatnonzero(np.isin(current, current[bad]).any(axis=1))  # the neighbourhood that a repair needs
+        # the neighbourhood that a repair needs
+        near = np.flatnonzero(np.isin(current, current[bad]).any(axis=1))
         patch = _patch(current[near])
         before = len(repaired)
         for i in np.flatnonzero(bad[near]).tolist():
@@ -39,7 +42,11 @@ def repair_slivers(vertices: Float, faces: Index) -> tuple[Index, Index, Index]:
         current = current[current[:, 0] >= 0]
         if len(repaired) == before:
             break
-    return current, np.array(repaired, np.int64).reshape(-1, 3), current[sliver_mask(vertices, current)]
+    return (
+        current,
+        np.array(repaired, np.int64).reshape(-1, 3),
+        current[sliver_mask(vertices, current)],
+    )
 
 
 @dataclass(frozen=True)
@@ -79,7 +86,9 @@ def _repair(vertices: Float, patch: _Patch, i: int) -> bool:
     short = int(side.argmin())
     long = int(side.argmax())
     ends = int(corner[short]), int(corner[(short + 1) % 3])
-    if side[short] <= MAX_NEEDLE_RATIO * side[long] and _collapse(patch, min(ends), max(ends)):
+    if side[short] <= MAX_NEEDLE_RATIO * side[long] and _collapse(
+        patch, min(ends), max(ends)
+    ):
         return True
     return _flip(patch, i, long)
 
@@ -89,12 +98,17 @@ def _collapse(patch: _Patch, keep: int, gone: int) -> bool:
     at_keep = patch.around(keep)
     at_gone = patch.around(gone)
     between = patch.star[keep] & patch.star[gone]
-    common = (set(at_keep.ravel().tolist()) & set(at_gone.ravel().tolist())) - {keep, gone}
+    common = (set(at_keep.ravel().tolist()) & set(at_gone.ravel().tolist())) - {
+        keep,
+        gone,
+    }
     open_ends = _is_open(at_keep, keep) and _is_open(at_gone, gone)
     if len(common) != len(between) or (open_ends and len(between) == 2):
         return False
     for i in patch.star[gone] - between:
-        a, b, c = (keep if vertex == gone else vertex for vertex in patch.faces[i].tolist())
+        a, b, c = (
+            keep if vertex == gone else vertex for vertex in patch.faces[i].tolist()
+        )
         patch.put(i, (a, b, c))
     for i in between:
         patch.put(i, DROPPED)
@@ -108,7 +122,9 @@ def _is_open(around: Index, vertex: int) -> bool:
 
 
 def _flip(patch: _Patch, i: int, side: int) -> bool:
-    """Replace side `side` of face i by the other diagonal of the two faces at it; drop the face if it is open."""
+    """Replace side `side` of face i by the other diagonal of the two faces at it; drop
+    the face if it is open.
+    """
     a, b, c = np.roll(patch.faces[i], -side).tolist()
     both = patch.star[a] & patch.star[b]
     if len(both) == 1:

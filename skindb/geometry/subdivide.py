@@ -14,7 +14,9 @@ Float = NDArray[np.floating[Any]]
 Faces = NDArray[np.integer[Any]]
 
 
-def loop_matrix(faces: Faces, n_vertices: int) -> tuple[sp.csr_matrix, NDArray[np.int64]]:
+def loop_matrix(
+    faces: Faces, n_vertices: int
+) -> tuple[sp.csr_matrix, NDArray[np.int64]]:
     """One level of Loop subdivision (Loop 1987; boundaries as cubic B-splines, Hoppe et al. 1994).
 
     Parameters
@@ -27,17 +29,27 @@ def loop_matrix(faces: Faces, n_vertices: int) -> tuple[sp.csr_matrix, NDArray[n
     Returns
     -------
     matrix : csr_matrix
-        (v + e, v) of non-negative rows that sum to 1: the old vertices, then one per edge in the order of (low, high).
+        (v + e, v) of non-negative rows that sum to 1: the old vertices, then one per
+        edge in the order of (low, high).
     faces : ndarray
-        (4 f, 3): the children of face i are i, f + i, 2 f + i (at its corners) and 3 f + i (its middle).
+        (4 f, 3): the children of face i are i, f + i, 2 f + i (at its corners) and 3 f
+        + i (its middle).
     """
     corner = np.asarray(faces, np.int64)
     table = edge_table(corner)
     if (table.count > 2).any():
         raise ValueError("an edge belongs to more than two faces; clean the mesh first")
-    matrix = sp.vstack([_even_rows(table, n_vertices), _odd_rows(table, np.roll(corner, 1, axis=1), n_vertices)])
+    matrix = sp.vstack(
+        [
+            _even_rows(table, n_vertices),
+            _odd_rows(table, np.roll(corner, 1, axis=1), n_vertices),
+        ]
+    )
     middle = table.of_face + n_vertices
-    children = [np.stack([corner[:, i], middle[:, i], middle[:, i - 1]], axis=1) for i in range(3)]
+    children = [
+        np.stack([corner[:, i], middle[:, i], middle[:, i - 1]], axis=1)
+        for i in range(3)
+    ]
     return matrix.tocsr(), np.concatenate([*children, middle])
 
 
@@ -58,7 +70,8 @@ def subdivide(
     vertices, faces : ndarray
         (v', 3) mm and (4^levels f, 3).
     matrix : csr_matrix
-        (v', v): apply it to any value of the old vertices (texture coordinates, masks) for that of the new.
+        (v', v): apply it to any value of the old vertices (texture coordinates, masks)
+        for that of the new.
     """
     matrix = sp.identity(len(vertices), format="csr")
     current = np.asarray(faces, np.int64)
@@ -92,29 +105,38 @@ def carry_points(
     for level in range(levels):
         corner = weight.argmax(axis=1)
         middle = weight.max(axis=1) < 1 / 2
-        # child i has corner i, the middle of the side from it and the middle of the side to it; child 3 the middles
+        # child i has corner i, the middle of the side from it and the middle of the
+        # side to it; child 3 the middles
         around = np.take_along_axis(weight, (corner[:, None] + [0, 1, 2]) % 3, axis=1)
-        outer = np.stack([2 * around[:, 0] - 1, 2 * around[:, 1], 2 * around[:, 2]], axis=1)
+        outer = np.stack(
+            [2 * around[:, 0] - 1, 2 * around[:, 1], 2 * around[:, 2]], axis=1
+        )
         weight = np.where(middle[:, None], 1 - 2 * np.roll(weight, 1, axis=1), outer)
         at += np.where(middle, 3, corner) * n_faces * 4**level
     return at, weight
 
 
 def _odd_rows(table: EdgeTable, opposite: Faces, n: int) -> sp.csr_matrix:
-    """New vertices: 3/8 of both ends and 1/8 of both vertices across; the middle of a boundary edge."""
+    """New vertices: 3/8 of both ends and 1/8 of both vertices across; the middle of a
+    boundary edge.
+    """
     on_boundary = table.count == 1
     ends = np.where(on_boundary, 1 / 2, 3 / 8)
     row = np.arange(len(ends))
     side = table.of_face.ravel()
     inner = ~on_boundary[side]
     rows = np.concatenate([row, row, side[inner]])
-    columns = np.concatenate([table.edges[:, 0], table.edges[:, 1], opposite.ravel()[inner]])
+    columns = np.concatenate(
+        [table.edges[:, 0], table.edges[:, 1], opposite.ravel()[inner]]
+    )
     values = np.concatenate([ends, ends, np.full(int(inner.sum()), 1 / 8)])
     return sp.csr_matrix((values, (rows, columns)), shape=(len(ends), n))
 
 
 def _even_rows(table: EdgeTable, n: int) -> sp.csr_matrix:
-    """Old vertices: beta of each neighbour inside; 3/4, 1/8, 1/8 along a boundary; corners and isolated ones stay."""
+    """Old vertices: beta of each neighbour inside; 3/4, 1/8, 1/8 along a boundary;
+    corners and isolated ones stay.
+    """
     neighbours = _adjacency(table.edges, n)
     rim = _adjacency(table.edges[table.count == 1], n)
     valence, rim_valence = (np.diff(a.indptr) for a in (neighbours, rim))
@@ -124,7 +146,11 @@ def _even_rows(table: EdgeTable, n: int) -> sp.csr_matrix:
     # the vertex of a single face is a corner of the outline and stays, as does a bow-tie
     smooth = (rim_valence == 2) & (valence > 2)
     keep = np.where(smooth, 3 / 4, 1 - beta * valence)
-    return sp.csr_matrix(sp.diags(keep) + sp.diags(beta) @ neighbours + sp.diags(np.where(smooth, 1 / 8, 0.0)) @ rim)
+    return sp.csr_matrix(
+        sp.diags(keep)
+        + sp.diags(beta) @ neighbours
+        + sp.diags(np.where(smooth, 1 / 8, 0.0)) @ rim
+    )
 
 
 def _adjacency(edges: Faces, n: int) -> sp.csr_matrix:

@@ -15,15 +15,18 @@ MORTON_BITS = 21  # per axis: 63 bits in all
 def morton_order(points: Float) -> NDArray[np.int64]:
     """Permutation (n,) that puts points (n, 3) along the Morton curve; ties keep their order.
 
-    Neighbours in this order are neighbours in space: ray tracing and table lookups stay in the cache. The cells are
-    cubes, 2^21 along the longest side of the box of the points.
+    Neighbours in this order are neighbours in space: ray tracing and table lookups stay
+    in the cache. The cells are cubes, 2^21 along the longest side of the box of the
+    points.
     """
     p = np.asarray(points, np.float64)
     if len(p) == 0:
         return np.zeros(0, np.int64)
     low = p.min(axis=0)
     side = max(float((p.max(axis=0) - low).max()), np.finfo(np.float64).tiny)
-    cell = np.minimum((p - low) / side * 2.0**MORTON_BITS, 2.0**MORTON_BITS - 1).astype(np.uint64)
+    cell = np.minimum((p - low) / side * 2.0**MORTON_BITS, 2.0**MORTON_BITS - 1).astype(
+        np.uint64
+    )
     spread = _spread_bits(cell)
     key = spread[:, 0] << np.uint64(2) | spread[:, 1] << np.uint64(1) | spread[:, 2]
     return np.argsort(key, kind="stable")
@@ -47,14 +50,19 @@ def vertex_normals(vertices: Float, faces: Faces) -> NDArray[np.float64]:
 
 
 def vertex_areas(vertices: Float, faces: Faces) -> NDArray[np.float64]:
-    """Areas (v,) in mm2: a third of each triangle goes to each corner, so that the sum is the area of the mesh."""
+    """Areas (v,) in mm2: a third of each triangle goes to each corner, so that the sum
+    is the area of the mesh.
+    """
     area = np.linalg.norm(face_crosses(vertices, faces), axis=1, keepdims=True) / 6
     return _sum_at_vertices(area, faces, len(vertices))[:, 0]
 
 
 def _sum_at_vertices(values: Float, faces: Faces, count: int) -> NDArray[np.float64]:
     at = np.asarray(faces).ravel()
-    columns = [np.bincount(at, weights=np.repeat(column, 3), minlength=count) for column in values.T]
+    columns = [
+        np.bincount(at, weights=np.repeat(column, 3), minlength=count)
+        for column in values.T
+    ]
     return np.stack(columns, axis=1)
 
 
@@ -72,13 +80,17 @@ def _spread_bits(x: NDArray[np.uint64]) -> NDArray[np.uint64]:
 
 
 def splat_radius(vertices: Float, faces: Faces) -> NDArray[np.float64]:
-    """Radius (v,) of the disc [mm] that stands for a vertex among its neighbours: 0.7 of its longest edge.
+    """Radius (v,) of the disc [mm] that stands for a vertex among its neighbours: 0.7
+    of its longest edge.
 
     Discs of neighbours then overlap without gaps; 0 where a vertex has no edge.
     """
     out = np.zeros(len(vertices))
     for a, b in ((0, 1), (1, 2), (2, 0)):
-        length = np.linalg.norm(np.asarray(vertices[faces[:, a]] - vertices[faces[:, b]], np.float64), axis=1)
+        length = np.linalg.norm(
+            np.asarray(vertices[faces[:, a]] - vertices[faces[:, b]], np.float64),
+            axis=1,
+        )
         np.maximum.at(out, faces[:, a], length)
         np.maximum.at(out, faces[:, b], length)
     return 0.7 * out

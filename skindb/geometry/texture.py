@@ -7,14 +7,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb.geometry._texture_kernels import CORNERS, average, interpolate, pull, push, rasterise
+from skindb.geometry._texture_kernels import (
+    CORNERS,
+    average,
+    interpolate,
+    pull,
+    push,
+    rasterise,
+)
 
 Float = NDArray[np.floating[Any]]
 Faces = NDArray[np.integer[Any]]
 Image = NDArray[np.float32]
 
 
-def rasterise_atlas(uv: Float, faces: Faces, size: int) -> tuple[NDArray[np.int32], Image]:
+def rasterise_atlas(
+    uv: Float, faces: Faces, size: int
+) -> tuple[NDArray[np.int32], Image]:
     """Triangle and position at every texel centre of a square map.
 
     Parameters
@@ -40,12 +49,16 @@ def rasterise_atlas(uv: Float, faces: Faces, size: int) -> tuple[NDArray[np.int3
 
 
 def atlas_values(
-    values: Float, trust: Float, uv: Float, faces: Faces, raster: tuple[NDArray[np.int32], Image]
+    values: Float,
+    trust: Float,
+    uv: Float,
+    faces: Faces,
+    raster: tuple[NDArray[np.int32], Image],
 ) -> tuple[Image, Image]:
     """Values of the vertices at the texels of a map.
 
-    Values are interpolated linearly at the centre of the texel in triangles larger than a texel, and averaged by area
-    over the texel in smaller triangles.
+    Values are interpolated linearly at the centre of the texel in triangles larger than
+    a texel, and averaged by area over the texel in smaller triangles.
 
     Parameters
     ----------
@@ -112,7 +125,8 @@ def push_pull(image: Float, confidence: Float) -> tuple[Image, Image]:
     image : ndarray
         (h, w, c) filled; NaN only if nothing is known.
     confidence : ndarray
-        (h, w): 1 where known; elsewhere that of the average it was filled from, 0 if nothing is known.
+        (h, w): 1 where known; elsewhere that of the average it was filled from, 0 if
+        nothing is known.
     """
     filled = np.array(image, np.float32)
     known = np.nan_to_num(np.clip(np.asarray(confidence, np.float32), 0, 1))
@@ -123,7 +137,10 @@ def push_pull(image: Float, confidence: Float) -> tuple[Image, Image]:
     levels = [(filled, known)]
     while max(levels[-1][1].shape) > 1:
         height, width = ((n + 1) // 2 for n in levels[-1][1].shape)
-        coarse = (np.empty((height, width, filled.shape[2]), np.float32), np.empty((height, width), np.float32))
+        coarse = (
+            np.empty((height, width, filled.shape[2]), np.float32),
+            np.empty((height, width), np.float32),
+        )
         pull(*levels[-1], *coarse)
         levels.append(coarse)
     for fine, coarse in zip(levels[-2::-1], levels[:0:-1], strict=True):
@@ -144,8 +161,8 @@ def bilinear(image: Float, pixels: Float) -> NDArray[np.float64]:
     Returns
     -------
     ndarray
-        (..., c); the nearest edge in the outer half pixel; NaN outside the image, at NaN pixels, and wherever one of
-        the pixels that take part is NaN.
+        (..., c); the nearest edge in the outer half pixel; NaN outside the image, at
+        NaN pixels, and wherever one of the pixels that take part is NaN.
     """
     values = np.asarray(image)
     height, width = values.shape[:2]

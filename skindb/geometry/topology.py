@@ -28,8 +28,12 @@ def edge_table(faces: Faces) -> EdgeTable:
     corner = np.asarray(faces, np.int64).reshape(-1, 3)
     sides = np.sort(np.stack([corner, np.roll(corner, -1, axis=1)], axis=-1), axis=-1)
     n = int(corner.max(initial=0)) + 1
-    key, inverse, count = np.unique(sides[..., 0] * n + sides[..., 1], return_inverse=True, return_counts=True)
-    return EdgeTable(np.stack([key // n, key % n], axis=1), inverse.reshape(corner.shape), count)
+    key, inverse, count = np.unique(
+        sides[..., 0] * n + sides[..., 1], return_inverse=True, return_counts=True
+    )
+    return EdgeTable(
+        np.stack([key // n, key % n], axis=1), inverse.reshape(corner.shape), count
+    )
 
 
 def boundary_loops(faces: Faces) -> list[Index]:
@@ -40,9 +44,17 @@ def boundary_loops(faces: Faces) -> list[Index]:
     corner = np.asarray(faces, np.int64)
     table = edge_table(corner)
     face, side = np.nonzero(table.count[table.of_face] == 1)
-    after = dict(zip(corner[face, side].tolist(), corner[face, (side + 1) % 3].tolist(), strict=True))
+    after = dict(
+        zip(
+            corner[face, side].tolist(),
+            corner[face, (side + 1) % 3].tolist(),
+            strict=True,
+        )
+    )
     if len(after) != len(face):
-        raise ValueError("two boundaries meet at a vertex, or the winding is inconsistent; clean the mesh first")
+        raise ValueError(
+            "two boundaries meet at a vertex, or the winding is inconsistent; clean the mesh first"
+        )
     loops = []
     while after:
         start, step = after.popitem()
@@ -52,7 +64,10 @@ def boundary_loops(faces: Faces) -> list[Index]:
             step = after.pop(step)
         loops.append(np.array(loop, np.int64))
     # longest first; ties are resolved by the lowest vertex, so that results are reproducible
-    return sorted((np.roll(loop, -int(loop.argmin())) for loop in loops), key=lambda loop: (-len(loop), int(loop[0])))
+    return sorted(
+        (np.roll(loop, -int(loop.argmin())) for loop in loops),
+        key=lambda loop: (-len(loop), int(loop[0])),
+    )
 
 
 def simple_loops(loop: Index) -> list[Index]:
@@ -83,14 +98,20 @@ def outline_first(points: NDArray[np.float64], loops: list[Index]) -> list[Index
 
 
 def face_components(faces: Faces) -> Index:
-    """Label (f,) of the component each face belongs to; faces touch where exactly two share an edge."""
+    """Label (f,) of the component each face belongs to; faces touch where exactly two
+    share an edge.
+    """
     first, second, _ = _pairs(faces)
-    graph = sp.coo_matrix((np.ones(len(first)), (first, second)), shape=(len(faces), len(faces)))
+    graph = sp.coo_matrix(
+        (np.ones(len(first)), (first, second)), shape=(len(faces), len(faces))
+    )
     return np.asarray(connected_components(graph, directed=False)[1], np.int64)
 
 
 def winding_flips(faces: Faces) -> NDArray[np.bool_]:
-    """Mask (f,) of faces to turn over for a consistent winding; in each component the minority is turned."""
+    """Mask (f,) of faces to turn over for a consistent winding; in each component the
+    minority is turned.
+    """
     first, second, alike = _pairs(faces)
     n = len(faces)
     parity = sp.csr_matrix((np.where(alike, 1, 2), (first, second)), shape=(n, n))
@@ -109,7 +130,8 @@ def winding_flips(faces: Faces) -> NDArray[np.bool_]:
 
 
 def fans(faces: Faces) -> Index:
-    """Label (f, 3) of the fan each corner belongs to: corners of one vertex joined across edges of two faces.
+    """Label (f, 3) of the fan each corner belongs to: corners of one vertex joined
+    across edges of two faces.
 
     A vertex with more than one fan is a bow-tie.
     """
@@ -118,9 +140,15 @@ def fans(faces: Faces) -> Index:
     one_end, two_end = (side // 3 * 3 + (side + 1) % 3 for side in (one, two))
     opposite = vertex[one] != vertex[two]
     rows = np.concatenate([one, one_end])
-    columns = np.concatenate([np.where(opposite, two_end, two), np.where(opposite, two, two_end)])
-    graph = sp.coo_matrix((np.ones(len(rows)), (rows, columns)), shape=(len(vertex), len(vertex)))
-    return np.asarray(connected_components(graph, directed=False)[1], np.int64).reshape(-1, 3)
+    columns = np.concatenate(
+        [np.where(opposite, two_end, two), np.where(opposite, two, two_end)]
+    )
+    graph = sp.coo_matrix(
+        (np.ones(len(rows)), (rows, columns)), shape=(len(vertex), len(vertex))
+    )
+    return np.asarray(connected_components(graph, directed=False)[1], np.int64).reshape(
+        -1, 3
+    )
 
 
 def _shared_sides(faces: Faces) -> tuple[Index, Index]:
@@ -133,7 +161,9 @@ def _shared_sides(faces: Faces) -> tuple[Index, Index]:
 
 
 def _pairs(faces: Faces) -> tuple[Index, Index, NDArray[np.bool_]]:
-    """Pairs of faces that share an edge, and whether they traverse it in opposite directions, as they should."""
+    """Pairs of faces that share an edge, and whether they traverse it in opposite
+    directions, as they should.
+    """
     one, two = _shared_sides(faces)
     begin = np.asarray(faces, np.int64).ravel()
     return one // 3, two // 3, begin[one] != begin[two]

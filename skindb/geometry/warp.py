@@ -1,4 +1,6 @@
-"""A smooth map of the plane through given points, without folds: thin-plate splines (Bookstein 1989)."""
+"""A smooth map of the plane through given points, without folds: thin-plate splines
+(Bookstein 1989).
+"""
 
 from __future__ import annotations
 
@@ -12,11 +14,16 @@ from scipy.spatial import cKDTree
 from skindb.geometry.landmarks import similarity, width
 
 Float = NDArray[np.floating[Any]]
-SAME_POINT_FRACTION = 0.01  # of the spread of the points: half a millimetre on a face, less than the error of a click
-SMOOTHING = 0.1  # for errors of clicks of 1 to 2 mm; the condition number for 20 points of a face is then about 50
+# of the spread of the points: half a millimetre on a face, less than the error of a
+# click
+SAME_POINT_FRACTION = 0.01
+# for errors of clicks of 1 to 2 mm; the condition number for 20 points of a face is
+# then about 50
+SMOOTHING = 0.1
 WEAK_SMOOTHING_FACTOR = 3.0  # smoothing at a weak point relative to other points
 LOOSER = (1.0, 4.0, 16.0, 64.0)  # weak points give way before others do
-MIN_WIDTH_RATIO = 1e-2  # width of the points over their length, below which they are treated as a line
+# width of the points over their length, below which they are treated as a line
+MIN_WIDTH_RATIO = 1e-2
 MIN_AREA_RATIO = 0.05  # smallest area of the map relative to that of the similarity
 # smoothing of folding maps: 1e-3 moves a point by a hundredth of its misfit
 SMOOTHEST = 1e4
@@ -26,7 +33,8 @@ STEP = 4.0
 GRID = 64
 MARGIN = 4.0
 NEIGHBOURS = 20  # of a centre, to which lines are checked for folds
-PRODUCTS_PER_BLOCK = 1 << 18  # points times centres: 2 MB of doubles, which stay in the cache
+# points times centres: 2 MB of doubles, which stay in the cache
+PRODUCTS_PER_BLOCK = 1 << 18
 
 
 @dataclass(frozen=True)
@@ -42,34 +50,45 @@ class Warp:
     condition: float  # of the regularised system; 1 without one
     smoothing: float  # added to its diagonal, in units of x
     loose: Float  # (c,) times that
-    used: NDArray[np.bool_]  # (k,) of the points given; False: not finite, or merged with one before
+    # (k,) of the points given; False: not finite, or merged with one before
+    used: NDArray[np.bool_]
 
 
 def fit_warp(
-    source: Float, target: Float, *, smoothing: float | None = None, weak: tuple[Float, Float] | None = None
+    source: Float,
+    target: Float,
+    *,
+    smoothing: float | None = None,
+    weak: tuple[Float, Float] | None = None,
 ) -> Warp:
     """The map of points to other points with the least bending.
 
-    Points that nearly coincide, in the source or in the target, are replaced by their mean. Smoothing is increased,
-    first at the weak points, until the map has no fold among the points and around them; a map that folds even without
-    bending is replaced by a similarity. Three points give an affine map, two (or points on a line) a similarity, one a
-    shift, none the identity: see `Warp.kind`.
+    Points that nearly coincide, in the source or in the target, are replaced by their
+    mean. Smoothing is increased, first at the weak points, until the map has no fold
+    among the points and around them; a map that folds even without bending is replaced
+    by a similarity. Three points give an affine map, two (or points on a line) a
+    similarity, one a shift, none the identity: see `Warp.kind`.
 
     Parameters
     ----------
     source, target
         (k, 2) in the same units; points with NaN in either are ignored.
     smoothing
-        Diagonal of the system in units of the squared spread of the points, default `SMOOTHING`; 0 goes through every
-        point.
+        Diagonal of the system in units of the squared spread of the points, default
+        `SMOOTHING`; 0 goes through every point.
     weak
-        Source and target (m, 2) of less accurate points, which are used if the others determine an affine map.
+        Source and target (m, 2) of less accurate points, which are used if the others
+        determine an affine map.
     """
-    x, y = (np.asarray(points, np.float64).reshape(-1, 2) for points in (source, target))
+    x, y = (
+        np.asarray(points, np.float64).reshape(-1, 2) for points in (source, target)
+    )
     a, b, used = _merged(x, y)
     if len(a) < 2:
         shift = b[0] - a[0] if len(a) else np.zeros(2)
-        return _plain("shift" if len(a) else "identity", used, np.zeros(2), 1.0, np.eye(2), shift)
+        return _plain(
+            "shift" if len(a) else "identity", used, np.zeros(2), 1.0, np.eye(2), shift
+        )
     origin = a.mean(axis=0)
     scale = _spread(a)
     a = (a - origin) / scale
@@ -87,11 +106,26 @@ def fit_warp(
     tried += [(value, tried[-1][1]) for value in grown]
     watched = _watched(centre) * scale + origin
     for value, by in tried if len(centre) > 3 else []:
-        system = _System.of(centre, np.repeat([1.0, by * WEAK_SMOOTHING_FACTOR], [len(a), len(more)]))
+        system = _System.of(
+            centre, np.repeat([1.0, by * WEAK_SMOOTHING_FACTOR], [len(a), len(more)])
+        )
         weight, affine = system.solve(goal, value)
-        found = replace(fallback, kind="thin plate", centre=centre, weight=weight, affine=affine, loose=system.loose)
-        if area_factor(found, watched).min() * scale**2 > least < np.linalg.det(affine[1:]):
-            return replace(found, condition=system.condition(value), smoothing=float(value))
+        found = replace(
+            fallback,
+            kind="thin plate",
+            centre=centre,
+            weight=weight,
+            affine=affine,
+            loose=system.loose,
+        )
+        if (
+            area_factor(found, watched).min() * scale**2
+            > least
+            < np.linalg.det(affine[1:])
+        ):
+            return replace(
+                found, condition=system.condition(value), smoothing=float(value)
+            )
     affine = np.linalg.lstsq(_linear(a), b, rcond=None)[0]
     if np.linalg.det(affine[1:]) <= least:
         return fallback
@@ -113,20 +147,25 @@ def area_factor(warp: Warp, uv: Float) -> NDArray[np.float64]:
     points = (np.asarray(uv, np.float64) - warp.origin) / warp.scale
     out = np.empty(len(points))
     for block in _blocks(points, warp):
-        (a, b), (c, d) = np.moveaxis(warp.affine[1:] + _slope(points[block], warp.centre, warp.weight), 0, 2)
+        (a, b), (c, d) = np.moveaxis(
+            warp.affine[1:] + _slope(points[block], warp.centre, warp.weight), 0, 2
+        )
         out[block] = a * d - b * c
     return out / warp.scale**2
 
 
 def left_out_error(warp: Warp) -> NDArray[np.float64]:
-    """Leave-one-out error (k,): distance of each point from its image by the map of the others (Rippa 1999).
+    """Leave-one-out error (k,): distance of each point from its image by the map of the
+    others (Rippa 1999).
 
-    NaN for points that are not used, and if there is no thin-plate map. The others include weak points.
+    NaN for points that are not used, and if there is no thin-plate map. The others
+    include weak points.
     """
     out = np.full(len(warp.used), np.nan)
     if len(warp.centre):
         inverse = _System.of(warp.centre, warp.loose).inverse(warp.smoothing)
-        error = np.linalg.norm(warp.weight, axis=1) / np.diag(inverse)  # divided by the root of 1: none is weak
+        # divided by the root of 1: none is weak
+        error = np.linalg.norm(warp.weight, axis=1) / np.diag(inverse)
         out[warp.used] = error[: warp.used.sum()]
     return out
 
@@ -135,7 +174,8 @@ def left_out_error(warp: Warp) -> NDArray[np.float64]:
 class _System:
     """Bending energy of centres on the complement of affine maps, where it is positive definite.
 
-    Rows and columns are divided by the square root of `loose`, so that the same is added to all of the diagonal.
+    Rows and columns are divided by the square root of `loose`, so that the same is
+    added to all of the diagonal.
     """
 
     centre: Float  # (c, 2)
@@ -156,7 +196,11 @@ class _System:
         return cls(centre, loose, kernel, linear, complement, value, vector)
 
     def condition(self, smoothing: float) -> float:
-        return float((self.value[-1] + smoothing) / (self.value[0] + smoothing)) if len(self.value) else 1.0
+        return (
+            float((self.value[-1] + smoothing) / (self.value[0] + smoothing))
+            if len(self.value)
+            else 1.0
+        )
 
     def inverse(self, smoothing: float) -> Float:
         """Matrix that maps targets to weights, both scaled like the rows."""
@@ -185,7 +229,10 @@ def _merged(source: Float, target: Float) -> tuple[Float, Float, NDArray[np.bool
     used[:] = False
     used[first] = True
     members = [own[group[own] == group[i]] for i in first]
-    a, b = (np.array([points[m].mean(axis=0) for m in members]).reshape(-1, 2) for points in (source, target))
+    a, b = (
+        np.array([points[m].mean(axis=0) for m in members]).reshape(-1, 2)
+        for points in (source, target)
+    )
     return a, b, used
 
 
@@ -200,9 +247,27 @@ def _finite(source: Float, target: Float) -> tuple[Float, Float]:
     return np.asarray(source, np.float64)[known], np.asarray(target, np.float64)[known]
 
 
-def _plain(kind: str, used: NDArray[np.bool_], origin: Float, scale: float, matrix: Float, shift: Float) -> Warp:
+def _plain(
+    kind: str,
+    used: NDArray[np.bool_],
+    origin: Float,
+    scale: float,
+    matrix: Float,
+    shift: Float,
+) -> Warp:
     none = np.zeros((0, 2))
-    return Warp(kind, origin, scale, none, none, np.vstack([shift, matrix]), 1.0, 0.0, np.zeros(0), used)
+    return Warp(
+        kind,
+        origin,
+        scale,
+        none,
+        none,
+        np.vstack([shift, matrix]),
+        1.0,
+        0.0,
+        np.zeros(0),
+        used,
+    )
 
 
 def _linear(points: Float) -> Float:
@@ -212,11 +277,15 @@ def _linear(points: Float) -> Float:
 def _bending(points: Float, centre: Float) -> Float:
     """r^2 log r (n, c)."""
     squared = (points[:, :1] - centre[:, 0]) ** 2 + (points[:, 1:] - centre[:, 1]) ** 2
-    return np.asarray(0.5 * squared * np.log(np.maximum(squared, np.finfo(np.float64).tiny)))
+    return np.asarray(
+        0.5 * squared * np.log(np.maximum(squared, np.finfo(np.float64).tiny))
+    )
 
 
 def _slope(points: Float, centre: Float, weight: Float) -> Float:
-    """Gradient (n, 2, 2) of the weighted sum of r^2 log r: (2 log r + 1) times the vector from each centre."""
+    """Gradient (n, 2, 2) of the weighted sum of r^2 log r: (2 log r + 1) times the
+    vector from each centre.
+    """
     x = points[:, :1] - centre[:, 0]
     y = points[:, 1:] - centre[:, 1]
     factor = np.log(np.maximum(x * x + y * y, np.finfo(np.float64).tiny)) + 1
@@ -229,10 +298,16 @@ def _blocks(points: Float, warp: Warp) -> list[slice]:
 
 
 def _watched(centre: Float) -> Float:
-    """Points that are checked for folds: an even grid, the centres, and points between neighbouring centres."""
+    """Points that are checked for folds: an even grid, the centres, and points between
+    neighbouring centres.
+    """
     side = np.linspace(-MARGIN, MARGIN, GRID)
     even = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
-    near = cKDTree(centre).query(centre, min(NEIGHBOURS, len(centre)))[1].reshape(len(centre), -1)
+    near = (
+        cKDTree(centre)
+        .query(centre, min(NEIGHBOURS, len(centre)))[1]
+        .reshape(len(centre), -1)
+    )
     i = np.repeat(np.arange(len(centre)), near.shape[1])
     j = near.ravel()
     between = [t * centre[i] + (1 - t) * centre[j] for t in (0.1, 0.5)]

@@ -1,1 +1,3 @@
-"""Control of the dome and the probe: wire protocol, transport, sequence, safety, cameras and sessions."""
+"""Control of the dome and the probe: wire protocol, transport, sequence, safety,
+cameras and sessions.
+"""

@@ -1,4 +1,6 @@
-"""Brightness of lights and of a steady lamp in the pictures, which the controller does not measure."""
+"""Brightness of lights and of a steady lamp in the pictures, which the controller does
+not measure.
+"""
 
 from __future__ import annotations
 
@@ -17,10 +19,15 @@ from skindb.ingest.frames import is_linear, read_frame
 THREADS = 2
 MIN_NEIGHBOURS = 3
 NEIGHBOURS = 6  # number of lights with which a light is compared
-MIN_BRIGHTNESS = 0.1  # relative to the neighbours: a face turned away from a light still reaches a third
-MIN_LEVEL = 0.001  # of the median light, relative to white: below it the pictures are black
-MAX_STUCK = 0.1  # brightness of a dark frame, relative to the median light, above which a light stayed on
-MAX_LAMP_LEVEL = 0.5  # of a steady lamp, relative to white, so that a light can be seen beside it
+# relative to the neighbours: a face turned away from a light still reaches a third
+MIN_BRIGHTNESS = 0.1
+# of the median light, relative to white: below it the pictures are black
+MIN_LEVEL = 0.001
+# brightness of a dark frame, relative to the median light, above which a light stayed
+# on
+MAX_STUCK = 0.1
+# of a steady lamp, relative to white, so that a light can be seen beside it
+MAX_LAMP_LEVEL = 0.5
 LIT_QUANTILE = 0.9  # quantile of the pixels: most of a picture is background
 NO_STEP = -1
 
@@ -44,7 +51,9 @@ class Levels:
         Content of dome.json of the set-up.
     """
 
-    def __init__(self, frames: Mapping[tuple[str, int], Path], dome: Mapping[str, Any]) -> None:
+    def __init__(
+        self, frames: Mapping[tuple[str, int], Path], dome: Mapping[str, Any]
+    ) -> None:
         self.linear = any(is_linear(path) for path in frames.values())
         self._frames = frames
         self._cameras = {str(camera["id"]): camera for camera in dome["cameras"]}
@@ -56,7 +65,11 @@ class Levels:
 
     def of(self, pictures: Sequence[Picture]) -> NDArray[np.float64]:
         """Levels above black or background; NaN if a frame is missing or cannot be decoded."""
-        new = [picture for picture in dict.fromkeys(pictures) if picture not in self._levels]
+        new = [
+            picture
+            for picture in dict.fromkeys(pictures)
+            if picture not in self._levels
+        ]
         with ThreadPoolExecutor(THREADS) as pool:
             self._levels |= zip(new, pool.map(self._measure, new), strict=True)
         return np.array([self._levels[picture] for picture in pictures])
@@ -79,11 +92,15 @@ class Levels:
             return value
         camera = self._cameras[name]
         black = float(camera.get("black_level", 0.0))
-        white = float(camera.get("white_level", 2 ** int(camera.get("bit_depth", 16)) - 1))
+        white = float(
+            camera.get("white_level", 2 ** int(camera.get("bit_depth", 16)) - 1)
+        )
         return (value - black) / (white - black)
 
 
-def failed_lights(schedule: Schedule, levels: Levels, dome: Mapping[str, Any], *, lamp: bool) -> dict[str, str]:
+def failed_lights(
+    schedule: Schedule, levels: Levels, dome: Mapping[str, Any], *, lamp: bool
+) -> dict[str, str]:
     """Lights that failed or stayed on, with a description; `DARK` if the last dark frame is bright.
 
     Each light is measured with the camera nearest to it, which sees the side that it lights, and is
@@ -100,15 +117,24 @@ def failed_lights(schedule: Schedule, levels: Levels, dome: Mapping[str, Any], *
     lamp
         Whether a steady lamp is on.
     """
-    exposure = usable_exposure(schedule, levels, dome) if lamp else _longest_exposure(dome)
+    exposure = (
+        usable_exposure(schedule, levels, dome) if lamp else _longest_exposure(dome)
+    )
     pictures = _light_pictures(schedule, dome, exposure, lamp=lamp)
-    taken = {light: picture for light, picture in pictures.items() if levels.has(picture)}
+    taken = {
+        light: picture for light, picture in pictures.items() if levels.has(picture)
+    }
     lit = dict(zip(taken, levels.of(list(taken.values())), strict=True))
     failed = _darker_lights(lit, dome, least=0.0 if levels.linear else MIN_LEVEL)
     readable = [level for level in lit.values() if not np.isnan(level)]
     last = len(schedule.steps) - 1
     witness = Picture(str(dome["cameras"][0]["id"]), last)
-    if lamp or not readable or schedule.steps[last].light != DARK or not levels.has(witness):
+    if (
+        lamp
+        or not readable
+        or schedule.steps[last].light != DARK
+        or not levels.has(witness)
+    ):
         return failed
     level = levels.of([witness])[0]
     usual = float(np.median(readable))
@@ -119,7 +145,9 @@ def failed_lights(schedule: Schedule, levels: Levels, dome: Mapping[str, Any], *
     return failed
 
 
-def lamp_brightness(schedule: Schedule, levels: Levels, dome: Mapping[str, Any]) -> float:
+def lamp_brightness(
+    schedule: Schedule, levels: Levels, dome: Mapping[str, Any]
+) -> float:
     """Brightness of a steady lamp relative to the light beside which it is darkest; NaN if unknown.
 
     Each light is measured with the camera nearest to it, above a dark frame of the same exposure.
@@ -143,11 +171,16 @@ def lamp_brightness(schedule: Schedule, levels: Levels, dome: Mapping[str, Any])
     return float((lamp / light).min())
 
 
-def dark_levels(schedule: Schedule, levels: Levels, dome: Mapping[str, Any]) -> dict[str, float]:
+def dark_levels(
+    schedule: Schedule, levels: Levels, dome: Mapping[str, Any]
+) -> dict[str, float]:
     """Level of the first dark frame of every exposure, in the brightest camera."""
     cameras = [str(camera["id"]) for camera in dome["cameras"]]
     steps = _dark_steps(schedule).items()
-    return {name: float(levels.of([Picture(c, step) for c in cameras]).max()) for name, step in steps}
+    return {
+        name: float(levels.of([Picture(c, step) for c in cameras]).max())
+        for name, step in steps
+    }
 
 
 def usable_exposure(schedule: Schedule, levels: Levels, dome: Mapping[str, Any]) -> str:
@@ -161,7 +194,9 @@ def usable_exposure(schedule: Schedule, levels: Levels, dome: Mapping[str, Any])
     return usable
 
 
-def _light_pictures(schedule: Schedule, dome: Mapping[str, Any], exposure: str, *, lamp: bool) -> dict[str, Picture]:
+def _light_pictures(
+    schedule: Schedule, dome: Mapping[str, Any], exposure: str, *, lamp: bool
+) -> dict[str, Picture]:
     """The picture in which each light is measured, above a dark frame if a lamp is on."""
     viewers = _nearest_cameras(dome)
     background = _dark_steps(schedule).get(exposure, NO_STEP) if lamp else NO_STEP
@@ -172,16 +207,31 @@ def _light_pictures(schedule: Schedule, dome: Mapping[str, Any], exposure: str, 
     return pictures
 
 
-def _darker_lights(lit: Mapping[str, float], dome: Mapping[str, Any], *, least: float) -> dict[str, str]:
+def _darker_lights(
+    lit: Mapping[str, float], dome: Mapping[str, Any], *, least: float
+) -> dict[str, str]:
     """Lights whose pictures are black or much darker than those of their neighbours."""
-    failed = {name: "its picture cannot be read" for name, level in lit.items() if np.isnan(level)}
+    failed = {
+        name: "its picture cannot be read"
+        for name, level in lit.items()
+        if np.isnan(level)
+    }
     level = {name: value for name, value in lit.items() if name not in failed}
     if level and not np.median(list(level.values())) > least:
-        return failed | dict.fromkeys(level, "its picture is black, like those of most lights")
+        return failed | dict.fromkeys(
+            level, "its picture is black, like those of most lights"
+        )
     places = {str(light["id"]): _unit(light["position"]) for light in dome["lights"]}
     for name, value in level.items():
-        distance = {other: -float(places[other] @ places[name]) for other in level if other != name}
-        near = [level[other] for other in sorted(distance, key=distance.__getitem__)[:NEIGHBOURS]]
+        distance = {
+            other: -float(places[other] @ places[name])
+            for other in level
+            if other != name
+        }
+        near = [
+            level[other]
+            for other in sorted(distance, key=distance.__getitem__)[:NEIGHBOURS]
+        ]
         usual = float(np.median(near)) if len(near) >= MIN_NEIGHBOURS else 0.0
         if usual > 0 and not value >= MIN_BRIGHTNESS * usual:
             fraction = max(value, 0.0) / usual
@@ -202,7 +252,9 @@ def _dark_steps(schedule: Schedule) -> dict[str, int]:
 def _nearest_cameras(dome: Mapping[str, Any]) -> dict[str, str]:
     """Light -> the camera that sees most of the side that it lights."""
     names = [str(camera["id"]) for camera in dome["cameras"]]
-    poses = [(np.array(camera["R"]), np.array(camera["t"])) for camera in dome["cameras"]]
+    poses = [
+        (np.array(camera["R"]), np.array(camera["t"])) for camera in dome["cameras"]
+    ]
     centres = [_unit(-rotation.T @ shift) for rotation, shift in poses]
     nearest = {}
     for light in dome["lights"]:
@@ -212,11 +264,15 @@ def _nearest_cameras(dome: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _longest_exposure(dome: Mapping[str, Any]) -> str:
-    return str(max(dome["exposures"], key=lambda exposure: float(exposure["seconds"]))["id"])
+    return str(
+        max(dome["exposures"], key=lambda exposure: float(exposure["seconds"]))["id"]
+    )
 
 
 def _seconds(dome: Mapping[str, Any], exposure: str) -> float:
-    return next(float(one["seconds"]) for one in dome["exposures"] if str(one["id"]) == exposure)
+    return next(
+        float(one["seconds"]) for one in dome["exposures"] if str(one["id"]) == exposure
+    )
 
 
 def _ratio(dome: Mapping[str, Any], exposure: str, other: str) -> float:

@@ -18,10 +18,13 @@ from skindb.ingest.frames import frame_size
 
 FRAME_SUFFIXES = (".png", ".tif", ".tiff", ".exr")
 LOOK_SECONDS = 0.05  # interval at which the folders are polled
-AMBIGUOUS = 0.2  # fraction of the reach: two assignments whose mean errors differ by less are ambiguous
-CANDIDATES = 3  # number of frames tried with every trigger to find the offset of the clocks
+# fraction of the reach: two assignments whose mean errors differ by less are ambiguous
+AMBIGUOUS = 0.2
+# number of frames tried with every trigger to find the offset of the clocks
+CANDIDATES = 3
 PRECISE = 0.2  # fraction of the reach within which times are precise
-MIN_PRECISE_FRACTION = 0.8  # of the frames, with which precise times overrule their number
+# of the frames, with which precise times overrule their number
+MIN_PRECISE_FRACTION = 0.8
 MIN_PRECISE_FRAMES = 8
 QUIET_SECONDS = 2.0  # without a new file, after which no more are expected
 
@@ -35,7 +38,9 @@ class Shot:
 
 
 class Cameras(Protocol):
-    """Cameras that take a frame at every trigger of the controller; see docs/howto/capture.md on adding others."""
+    """Cameras that take a frame at every trigger of the controller; see
+    docs/howto/capture.md on adding others.
+    """
 
     @property
     def ids(self) -> tuple[str, ...]:
@@ -44,14 +49,16 @@ class Cameras(Protocol):
     def start(self, since: float | None = None) -> None:
         """Prepare for a run; existing frames are ignored from now on.
 
-        With `since`, a time [s since 1970], the frames that were taken later are those of a run that was interrupted.
-        Cameras that do not have them any more may ignore it.
+        With `since`, a time [s since 1970], the frames that were taken later are those
+        of a run that was interrupted. Cameras that do not have them any more may ignore
+        it.
         """
 
     def collect(self, expected: int, seconds: float) -> Mapping[str, list[Shot]]:
         """Return the frames of every camera since `start`, in the order in which they were taken.
 
-        Returns when every camera has delivered the expected number, or after the given number of seconds.
+        Returns when every camera has delivered the expected number, or after the given
+        number of seconds.
         """
 
 
@@ -90,7 +97,11 @@ class FolderCameras:
         if missing := [name for name in ids if not (self.root / name).is_dir()]:
             rule = "must have a subfolder for each camera"
             cure = "set the folders in the tethering tool"
-            raise InputError(Fault(str(self.root), rule, f"no subfolder {', '.join(missing[:5])}", cure))
+            raise InputError(
+                Fault(
+                    str(self.root), rule, f"no subfolder {', '.join(missing[:5])}", cure
+                )
+            )
         self._before: dict[Path, int] = {}  # file -> modification time [ns]
 
     @property
@@ -99,16 +110,22 @@ class FolderCameras:
         return self._ids
 
     def start(self, since: float | None = None) -> None:
-        """Record the existing files, or those before a time [s since 1970], which `collect` ignores.
+        """Record the existing files, or those before a time [s since 1970], which
+        `collect` ignores.
 
-        That time is compared with when a file came into the folder (`st_ctime`), not with the clock of the camera.
+        That time is compared with when a file came into the folder (`st_ctime`), not
+        with the clock of the camera.
         """
         last = np.inf if since is None else since
         files = [one for name in self._ids for one in self._files(name)]
-        self._before = {path: status.st_mtime_ns for path, status in files if status.st_ctime < last}
+        self._before = {
+            path: status.st_mtime_ns for path, status in files if status.st_ctime < last
+        }
 
     def collect(self, expected: int, seconds: float) -> dict[str, list[Shot]]:
-        """Return the complete frames since `start`: files whose size is stable and whose header can be read."""
+        """Return the complete frames since `start`: files whose size is stable and
+        whose header can be read.
+        """
         end = self._clock.monotonic() + seconds
         changed = self._clock.monotonic()
         sizes = dict[Path, int]()
@@ -118,7 +135,10 @@ class FolderCameras:
                 for path, status in self._files(name, complete[name]):
                     if self._before.get(path) == status.st_mtime_ns:
                         continue
-                    if sizes.get(path) == status.st_size > 0 and frame_size(path) is not None:
+                    if (
+                        sizes.get(path) == status.st_size > 0
+                        and frame_size(path) is not None
+                    ):
                         complete[name][path] = Shot(path, status.st_mtime)
                     if sizes.get(path) != status.st_size:
                         sizes[path] = status.st_size
@@ -130,8 +150,12 @@ class FolderCameras:
             self._clock.sleep(LOOK_SECONDS)
         return {name: _in_order(shots.values()) for name, shots in complete.items()}
 
-    def _files(self, name: str, complete: Collection[Path] = ()) -> list[tuple[Path, os.stat_result]]:
-        """Image files of a camera that are not complete; one that is renamed or removed at this moment is skipped."""
+    def _files(
+        self, name: str, complete: Collection[Path] = ()
+    ) -> list[tuple[Path, os.stat_result]]:
+        """Image files of a camera that are not complete; one that is renamed or removed
+        at this moment is skipped.
+        """
         found = list[tuple[Path, os.stat_result]]()
         try:
             for path in (self.root / name).iterdir():
@@ -150,12 +174,12 @@ def _in_order(shots: Iterable[Shot]) -> list[Shot]:
 def match_frames(shots: Sequence[Shot], triggers: Sequence[float]) -> list[Path | None]:
     """Assign a frame to every trigger, or None if its frame is missing.
 
-    If there are as many frames as triggers, they are assigned in order, unless precise times of the
-    files contradict it. Otherwise they are assigned by time: the clocks of camera and controller are
-    assumed to differ by a constant offset, the one that matches most frames to a trigger. A frame
-    matches a trigger if it is off by less than half of the shortest interval between triggers. If
-    two offsets match equally well, no frame is assigned, because repeating frames is better than
-    confusing them.
+    If there are as many frames as triggers, they are assigned in order, unless precise
+    times of the files contradict it. Otherwise they are assigned by time: the clocks of
+    camera and controller are assumed to differ by a constant offset, the one that
+    matches most frames to a trigger. A frame matches a trigger if it is off by less
+    than half of the shortest interval between triggers. If two offsets match equally
+    well, no frame is assigned, because repeating frames is better than confusing them.
 
     Parameters
     ----------
@@ -177,7 +201,9 @@ def match_frames(shots: Sequence[Shot], triggers: Sequence[float]) -> list[Path 
     return [shots[i].path if i >= 0 else None for i in best]
 
 
-def _contradicted(times: NDArray[np.float64], due: NDArray[np.float64], reach: float) -> bool:
+def _contradicted(
+    times: NDArray[np.float64], due: NDArray[np.float64], reach: float
+) -> bool:
     """Whether nearly all frames fit triggers precisely, but not in their order.
 
     This happens if a file is written again, or if the controller reports another trigger as lost.
@@ -192,8 +218,12 @@ def _contradicted(times: NDArray[np.float64], due: NDArray[np.float64], reach: f
     return bool(matched.sum() >= MIN_PRECISE_FRACTION * len(due) and moved.any())
 
 
-def _assignment(times: NDArray[np.float64], due: NDArray[np.float64], reach: float) -> NDArray[np.int64] | None:
-    """Index of the frame of every due time, -1 if there is none; None if two offsets of the clocks fit equally well."""
+def _assignment(
+    times: NDArray[np.float64], due: NDArray[np.float64], reach: float
+) -> NDArray[np.int64] | None:
+    """Index of the frame of every due time, -1 if there is none; None if two offsets of
+    the clocks fit equally well.
+    """
     tried = times[:: max(len(times) // CANDIDATES, 1)]
     offsets = np.unique((tried[:, None] - due).ravel())
     fits = [_nearest(times - offset, due, reach) for offset in offsets]
@@ -212,7 +242,9 @@ def _assignment(times: NDArray[np.float64], due: NDArray[np.float64], reach: flo
     return best
 
 
-def _nearest(at: NDArray[np.float64], due: NDArray[np.float64], reach: float) -> NDArray[np.int64]:
+def _nearest(
+    at: NDArray[np.float64], due: NDArray[np.float64], reach: float
+) -> NDArray[np.int64]:
     """Index of the frame nearest to each due time within reach, -1 if there is none."""
     right = np.clip(np.searchsorted(at, due), 1, max(len(at) - 1, 1))
     left = right - 1

@@ -69,8 +69,10 @@ class Devices:
 class CapturePlan:
     """Settings of a capture."""
 
-    seconds: float | None = None  # length of the sequence; by default as short as the exposures allow
-    slow: bool = False  # whether the sequence is slowed down until nobody needs to be screened
+    # length of the sequence; by default as short as the exposures allow
+    seconds: float | None = None
+    # whether the sequence is slowed down until nobody needs to be screened
+    slow: bool = False
     base: int = 0  # brightness of a steady lamp in units of one light
     operator: str = ""  # id of the operator responsible for that lamp
     sites: tuple[str, ...] = ()  # sites that the probe measures
@@ -92,8 +94,18 @@ def planned_schedule(setup: Setup, plan: CapturePlan) -> Schedule:
         found = slowed_schedule(found)
         least = slowed_schedule(plan_schedule(setup.lights, setup.exposures)).seconds
         if plan.seconds is not None and plan.seconds < least:
-            rule = f"with at most {MAX_FLASHES} flashes in a second the sequence lasts at least {least:.1f} s"
-            raise InputError(Fault("sequence", rule, f"{plan.seconds:g} s", "allow more time, or omit --slower"))
+            rule = (
+                f"with at most {MAX_FLASHES} flashes in a second the sequence lasts at "
+                f"least {least:.1f} s"
+            )
+            raise InputError(
+                Fault(
+                    "sequence",
+                    rule,
+                    f"{plan.seconds:g} s",
+                    "allow more time, or omit --slower",
+                )
+            )
     return with_dark_frames(found)
 
 
@@ -111,7 +123,8 @@ def run_capture(
 ) -> dict[str, Any]:
     """Photograph a subject, measure sites with the probe, and write the capture folder.
 
-    If a capture is interrupted, its complete steps are kept, and the same call resumes with the remaining ones.
+    If a capture is interrupted, its complete steps are kept, and the same call resumes
+    with the remaining ones.
 
     Parameters
     ----------
@@ -124,7 +137,8 @@ def run_capture(
     override
         Confirmation of an operator for more than three flashes in a second, or a rehearsal.
     place
-        Called with site and number before each placement of the probe; returns when the probe is in place.
+        Called with site and number before each placement of the probe; returns when the
+        probe is in place.
     progress
         Called with the stage, the steps done and the steps in all.
 
@@ -136,20 +150,24 @@ def run_capture(
     Raises
     ------
     InputError
-        If frames are missing or a light failed after all repeats (what was captured is kept), or if the folder holds an
-        unfinished capture of another subject or under other conditions.
+        If frames are missing or a light failed after all repeats (what was captured is
+        kept), or if the folder holds an unfinished capture of another subject or under
+        other conditions.
     """
     _require_devices(setup, devices, plan)
     session = open_unfinished(out, identity(setup, subject, plan.base))
     schedule = planned_schedule(setup, plan)
     kept = _keep_interrupted(session, setup, devices)
-    left = remaining_schedule(schedule, session.sequence) if session.sequence else schedule
+    left = (
+        remaining_schedule(schedule, session.sequence) if session.sequence else schedule
+    )
     run = None
     notes = kept
     if any(step.light != DARK for step in left.steps):
         require_space(out, setup, len(left.steps))
         lamp = None
-        if plan.base:  # the flashes are counted with the measured lamp, not with the stated one
+        # the flashes are counted with the measured lamp, not with the stated one
+        if plan.base:
             lamp = measure_lamp(devices.dome, devices.cameras, setup, plan.base)
             left = replace(left, base=min(plan.base, round(lamp)))
         if isinstance(override, Rehearsal):
@@ -166,7 +184,9 @@ def run_capture(
         notes += _hot_pixel_notes(out, setup)
     for site in session.sites:
         if site["lost_readings"]:
-            notes.append(f"{site['site']}: {site['lost_readings']} readings of the gauge were lost")
+            notes.append(
+                f"{site['site']}: {site['lost_readings']} readings of the gauge were lost"
+            )
     return _report(session, schedule, run, notes)
 
 
@@ -189,7 +209,11 @@ def _run_lights(
     def begin(part: Schedule) -> None:
         session.begin_run(part, clock.now())
 
-    options: dict[str, Any] = {"override": override, "begin": begin, "progress": progress}
+    options: dict[str, Any] = {
+        "override": override,
+        "begin": begin,
+        "progress": progress,
+    }
     try:
         run = capture_dome(devices.dome, devices.cameras, left, **options)
     except InputError:  # nothing was lit
@@ -199,7 +223,9 @@ def _run_lights(
     if flashes > found.flashes_per_second:
         session.count(flashes, confirmed)
         planned = f"{found.flashes_per_second} were planned"
-        run.notes.append(f"the controller flashed {flashes} times in a second, and {planned}")
+        run.notes.append(
+            f"the controller flashed {flashes} times in a second, and {planned}"
+        )
     return run
 
 
@@ -224,22 +250,44 @@ def _keep_interrupted(session: Unfinished, setup: Setup, devices: Devices) -> li
     if run is None:
         session.running = None
         session.save()
-        return ["the controller has forgotten the sequence that was interrupted; all of its steps were repeated"]
+        return [
+            (
+                "the controller has forgotten the sequence that was interrupted; all "
+                "of its steps were repeated"
+            )
+        ]
     _keep_run(session, run, setup)
-    return [f"{len(session.sequence) - before} steps were kept from the sequence that was interrupted"]
+    return [
+        f"{len(session.sequence) - before} steps were kept from the sequence that was interrupted"
+    ]
 
 
 def _check_lamp(
-    session: Unfinished, left: Schedule, plan: CapturePlan, before: float, run: DomeRun, setup: Setup
+    session: Unfinished,
+    left: Schedule,
+    plan: CapturePlan,
+    before: float,
+    run: DomeRun,
+    setup: Setup,
 ) -> None:
     """Record the brightness of the steady lamp; if it became darker, count the flashes again."""
     after = lamp_brightness(run.schedule, Levels(run.frames, setup.dome), setup.dome)
-    lamp = {"brightness": plan.base, "operator": plan.operator, "measured": round(before, 2)}
-    session.lamp = lamp | {"measured_after": round(after, 2) if np.isfinite(after) else None}
+    lamp = {
+        "brightness": plan.base,
+        "operator": plan.operator,
+        "measured": round(before, 2),
+    }
+    session.lamp = lamp | {
+        "measured_after": round(after, 2) if np.isfinite(after) else None
+    }
     beside = replace(left, base=round(after) if np.isfinite(after) else 0)
     flashes = assess(beside).flashes_per_second
     if flashes > assess(left).flashes_per_second:
-        found = f"{after:.1f} times as bright as a light" if np.isfinite(after) else "not visible"
+        found = (
+            f"{after:.1f} times as bright as a light"
+            if np.isfinite(after)
+            else "not visible"
+        )
         seen = f"the subject may have seen {flashes} flashes in a second"
         run.notes.append(f"the steady lamp was {found} after the lights, so {seen}")
         session.count(flashes, None)
@@ -251,14 +299,24 @@ def _require_devices(setup: Setup, devices: Devices, plan: CapturePlan) -> None:
     if unknown := sorted(set(setup.lights) - set(devices.dome.lights)):
         rule = "the controller must have every light of dome.json"
         cure = "correct the ids, or the wiring"
-        faults.append(Fault(devices.dome.link.name, rule, f"no light {', '.join(unknown[:5])}", cure))
+        faults.append(
+            Fault(
+                devices.dome.link.name, rule, f"no light {', '.join(unknown[:5])}", cure
+            )
+        )
     if unknown := sorted(set(setup.cameras) - set(devices.cameras.ids)):
         rule = "every camera of dome.json must be connected"
         cure = "set up their folders"
-        faults.append(Fault("cameras", rule, f"no camera {', '.join(unknown[:5])}", cure))
-    if plan.sites and (devices.probe is None or devices.probe_camera is None or setup.probe is None):
+        faults.append(
+            Fault("cameras", rule, f"no camera {', '.join(unknown[:5])}", cure)
+        )
+    if plan.sites and (
+        devices.probe is None or devices.probe_camera is None or setup.probe is None
+    ):
         rule = "a probe, its camera and contact/probe.json must be present to measure sites"
-        faults.append(Fault("probe", rule, "one of them missing", "connect it, or name no sites"))
+        faults.append(
+            Fault("probe", rule, "one of them missing", "connect it, or name no sites")
+        )
     if faults:
         raise InputError(faults)
 
@@ -289,7 +347,9 @@ def _measure_sites(
             except KeyboardInterrupt:
                 cure = "run the same command again; it resumes with this placement"
                 found = f"stopped by the operator at {site}, placement {number}"
-                raise InputError(Fault("capture", "must run to its end", found, cure)) from None
+                raise InputError(
+                    Fault("capture", "must run to its end", found, cure)
+                ) from None
             except InputError as error:
                 keep_failed_placement(session, site, number, error, readings)
                 if not isinstance(error, PlacementError) or attempt == ATTEMPTS - 1:
@@ -300,16 +360,32 @@ def _measure_sites(
 
 
 def _measure_site(
-    setup: Setup, devices: Devices, plan: CapturePlan, site: str, readings: list[Reading], tell: Progress
+    setup: Setup,
+    devices: Devices,
+    plan: CapturePlan,
+    site: str,
+    readings: list[Reading],
+    tell: Progress,
 ) -> SiteRun:
-    if devices.probe is None or devices.probe_camera is None:  # `_require_devices` asserts it
-        raise InputError(Fault("probe", "must be connected to measure sites", "no probe", "connect it"))
+    # `_require_devices` asserts it
+    if devices.probe is None or devices.probe_camera is None:
+        raise InputError(
+            Fault(
+                "probe", "must be connected to measure sites", "no probe", "connect it"
+            )
+        )
 
     def advance(done: int, total: int) -> None:
         tell(f"probe {site}", done, total)
 
-    options: dict[str, Any] = {"pressure": plan.pressure, "progress": advance, "readings": readings}
-    return capture_site(devices.probe, devices.probe_camera, site, setup.brackets, **options)
+    options: dict[str, Any] = {
+        "pressure": plan.pressure,
+        "progress": advance,
+        "readings": readings,
+    }
+    return capture_site(
+        devices.probe, devices.probe_camera, site, setup.brackets, **options
+    )
 
 
 def _hot_pixel_notes(out: Path, setup: Setup) -> list[str]:
@@ -318,15 +394,21 @@ def _hot_pixel_notes(out: Path, setup: Setup) -> list[str]:
         bits = int(camera.get("bit_depth", 16))
         white = float(camera.get("white_level", 2**bits - 1))
         dark = sorted((out / "dome/dark").glob(f"*_{camera['id']}.*"))
-        if count := max((count_hot_pixels(path, white, bits) for path in dark), default=0):
+        if count := max(
+            (count_hot_pixels(path, white, bits) for path in dark), default=0
+        ):
             notes.append(f"camera {camera['id']}: {count} hot pixels in its dark frame")
     return notes
 
 
-def _report(session: Unfinished, schedule: Schedule, run: DomeRun | None, notes: list[str]) -> dict[str, Any]:
+def _report(
+    session: Unfinished, schedule: Schedule, run: DomeRun | None, notes: list[str]
+) -> dict[str, Any]:
     drift = dict[str, float]()
     for one in session.sites:
-        drift[one["site"]] = max(drift.get(one["site"], one["drift_kpa"]), one["drift_kpa"])
+        drift[one["site"]] = max(
+            drift.get(one["site"], one["drift_kpa"]), one["drift_kpa"]
+        )
     return {
         "path": str(session.folder),
         "steps": len(schedule.steps),

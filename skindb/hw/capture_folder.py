@@ -1,4 +1,6 @@
-"""Writing a session, complete or interrupted, as a capture folder (docs/capture_format.md, version 2)."""
+"""Writing a session, complete or interrupted, as a capture folder
+(docs/capture_format.md, version 2).
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,14 @@ from skindb.hw.safety import partial_schedule
 from skindb.hw.sequence import DARK, Schedule, sequence_entry
 from skindb.hw.session import DomeRun, SiteRun
 from skindb.hw.unfinished import UNFINISHED, Unfinished, digest
-from skindb.ingest.frames import Frame, FrameKind, frame_size, is_linear, read_frame, write_frame
+from skindb.ingest.frames import (
+    Frame,
+    FrameKind,
+    frame_size,
+    is_linear,
+    read_frame,
+    write_frame,
+)
 from skindb.ingest.json_file import read_json
 
 FRAMES = "dome/frames/{exposure}/{light}_{camera}"  # without the suffix of the files
@@ -42,7 +51,9 @@ class Subject:
 
 @dataclass(frozen=True)
 class Setup:
-    """The calibrated laboratory: a folder with dome/dome.json, its white frames, and contact/probe.json."""
+    """The calibrated laboratory: a folder with dome/dome.json, its white frames, and
+    contact/probe.json.
+    """
 
     folder: Path
     dome: Mapping[str, Any]
@@ -66,7 +77,13 @@ class Setup:
     @property
     def brackets(self) -> dict[str, float]:
         """Id of an exposure of the probe -> seconds."""
-        return {} if self.probe is None else {str(one["id"]): float(one["seconds"]) for one in self.probe["exposures"]}
+        return (
+            {}
+            if self.probe is None
+            else {
+                str(one["id"]): float(one["seconds"]) for one in self.probe["exposures"]
+            }
+        )
 
 
 def read_setup(folder: Path) -> Setup:
@@ -87,18 +104,39 @@ def read_setup(folder: Path) -> Setup:
     ):
         for key in keys if record is not None else ():
             items = record.get(key) if isinstance(record, dict) else None
-            if not isinstance(items, list) or not items or not all(isinstance(i, dict) and "id" in i for i in items):
+            if (
+                not isinstance(items, list)
+                or not items
+                or not all(isinstance(i, dict) and "id" in i for i in items)
+            ):
                 rule = "must be a list of objects with an id"
-                faults.append(Fault(f"{folder / name}[{key}]", rule, "something else", "see docs/howto/capture.md"))
+                faults.append(
+                    Fault(
+                        f"{folder / name}[{key}]",
+                        rule,
+                        "something else",
+                        "see docs/howto/capture.md",
+                    )
+                )
     if faults or not isinstance(dome, dict):
         raise InputError(
-            faults or [Fault(str(folder), "must contain dome/dome.json", "no such file", "see docs/howto/capture.md")]
+            faults
+            or [
+                Fault(
+                    str(folder),
+                    "must contain dome/dome.json",
+                    "no such file",
+                    "see docs/howto/capture.md",
+                )
+            ]
         )
     return Setup(folder, dome, probe if isinstance(probe, dict) else None)
 
 
 def identity(setup: Setup, subject: Subject, base: int) -> dict[str, Any]:
-    """Record that must be the same in all sessions of a capture; `base` is the brightness of the steady lamp."""
+    """Record that must be the same in all sessions of a capture; `base` is the
+    brightness of the steady lamp.
+    """
     return {
         "subject": subject.subject,
         "condition": subject.condition,
@@ -109,21 +147,36 @@ def identity(setup: Setup, subject: Subject, base: int) -> dict[str, Any]:
 
 
 def require_space(folder: Path, setup: Setup, steps: int) -> None:
-    """Raise `InputError` with the needed and free space if the uncompressed frames do not fit on the disk."""
-    pixels = sum(int(one["width"]) * int(one["height"]) for one in setup.dome["cameras"])
+    """Raise `InputError` with the needed and free space if the uncompressed frames do
+    not fit on the disk.
+    """
+    pixels = sum(
+        int(one["width"]) * int(one["height"]) for one in setup.dome["cameras"]
+    )
     needed = steps * pixels * 3 * 2  # bytes of three channels of 16 bits
     free = shutil.disk_usage(folder).free
     if free < needed:
         rule = f"{steps} steps of {len(setup.cameras)} cameras need up to {needed / 1e9:.1f} GB"
         raise InputError(
-            Fault(str(folder), rule, f"{free / 1e9:.1f} GB free", "free some space, or choose another disk")
+            Fault(
+                str(folder),
+                rule,
+                f"{free / 1e9:.1f} GB free",
+                "free some space, or choose another disk",
+            )
         )
 
 
-def remaining_schedule(schedule: Schedule, entries: Sequence[Mapping[str, Any]]) -> Schedule:
+def remaining_schedule(
+    schedule: Schedule, entries: Sequence[Mapping[str, Any]]
+) -> Schedule:
     """Steps of a schedule that are not among these entries, with the intervals of the schedule."""
     done = {(entry["light"], entry["exposure"]) for entry in entries}
-    left = [i for i, step in enumerate(schedule.steps) if (step.light, step.exposure) not in done]
+    left = [
+        i
+        for i, step in enumerate(schedule.steps)
+        if (step.light, step.exposure) not in done
+    ]
     return partial_schedule(schedule, left)
 
 
@@ -135,15 +188,21 @@ def keep_frames(session: Unfinished, run: DomeRun, setup: Setup) -> None:
     offset = max((float(entry["t_off"]) for entry in entries), default=0.0)
     suffix = next((path.suffix for path in run.frames.values()), ".png")
     kept = []
-    for i, (step, measured) in enumerate(zip(run.schedule.steps, run.measured, strict=True)):
+    for i, (step, measured) in enumerate(
+        zip(run.schedule.steps, run.measured, strict=True)
+    ):
         if i in missing or measured is None or step.light == DARK:
             continue
         for camera in cameras:
-            name = FRAMES.format(exposure=step.exposure, light=step.light, camera=camera)
+            name = FRAMES.format(
+                exposure=step.exposure, light=step.light, camera=camera
+            )
             _copy(run.frames[camera, i], session.folder / f"{name}{suffix}")
         entry = sequence_entry(step, measured)
         kept.append(entry | {key: entry[key] + offset for key in ("t_on", "t_off")})
-    bits = {str(one["id"]): int(one.get("bit_depth", 16)) for one in setup.dome["cameras"]}
+    bits = {
+        str(one["id"]): int(one.get("bit_depth", 16)) for one in setup.dome["cameras"]
+    }
     _keep_dark_frames(session.folder, run, cameras, suffix, bits)
     session.sequence = sorted([*entries, *kept], key=lambda entry: float(entry["t_on"]))
     session.save()
@@ -154,17 +213,31 @@ def keep_site(session: Unfinished, run: SiteRun, number: int) -> None:
     suffix = next(iter(run.frames.values())).suffix
     for exposure, path in run.frames.items():
         _copy(
-            path, session.folder / f"{SITE_FRAMES.format(site=run.site, exposure=exposure, placement=number)}{suffix}"
+            path,
+            session.folder
+            / f"{SITE_FRAMES.format(site=run.site, exposure=exposure, placement=number)}{suffix}",
         )
     placement = run.placement
-    entry = {"site": run.site, "number": number, "suffix": suffix, "drift_kpa": placement.drift}
-    entry |= {"pressure": np.round(placement.pressure, 4).tolist(), "lost_readings": placement.lost_readings}
+    entry = {
+        "site": run.site,
+        "number": number,
+        "suffix": suffix,
+        "drift_kpa": placement.drift,
+    }
+    entry |= {
+        "pressure": np.round(placement.pressure, 4).tolist(),
+        "lost_readings": placement.lost_readings,
+    }
     session.sites.append(entry)
     session.save()
 
 
 def keep_failed_placement(
-    session: Unfinished, site: str, number: int, error: InputError, readings: Sequence[Reading]
+    session: Unfinished,
+    site: str,
+    number: int,
+    error: InputError,
+    readings: Sequence[Reading],
 ) -> None:
     """Record a failed placement of the probe with its readings of the gauge."""
     path = session.folder / FAILED_PLACEMENTS
@@ -180,7 +253,13 @@ def keep_failed_placement(
         raise InputError([*error.faults, system_fault(problem, str(path))]) from None
 
 
-def _keep_dark_frames(out: Path, run: DomeRun, cameras: Sequence[str], suffix: str, bits: Mapping[str, int]) -> None:
+def _keep_dark_frames(
+    out: Path,
+    run: DomeRun,
+    cameras: Sequence[str],
+    suffix: str,
+    bits: Mapping[str, int],
+) -> None:
     """Write the mean of the dark frames of every exposure and camera.
 
     The last dark frame is excluded: it only shows whether a light stayed on.
@@ -189,7 +268,11 @@ def _keep_dark_frames(out: Path, run: DomeRun, cameras: Sequence[str], suffix: s
     for camera in cameras:
         by_exposure = dict[str, list[Path]]()
         for i, step in enumerate(run.schedule.steps):
-            if step.light == DARK and (camera, i) in run.frames and (i < last or not by_exposure):
+            if (
+                step.light == DARK
+                and (camera, i) in run.frames
+                and (i < last or not by_exposure)
+            ):
                 by_exposure.setdefault(step.exposure, []).append(run.frames[camera, i])
         for exposure, paths in by_exposure.items():
             target = out / f"dome/dark/{exposure}_{camera}{suffix}"
@@ -212,8 +295,11 @@ def _write_mean(paths: Sequence[Path], target: Path, bits: int) -> None:
         write_frame(target, np.rint(np.mean(frames, axis=0)).astype(frames[0].dtype))
 
 
-def write_capture(session: Unfinished, setup: Setup, subject: Subject, *, files: Mapping[str, Path]) -> None:
-    """Write the records of a capture folder that already has its frames, and remove its `unfinished.json`.
+def write_capture(
+    session: Unfinished, setup: Setup, subject: Subject, *, files: Mapping[str, Path]
+) -> None:
+    """Write the records of a capture folder that already has its frames, and remove its
+    `unfinished.json`.
 
     Parameters
     ----------
@@ -228,7 +314,9 @@ def write_capture(session: Unfinished, setup: Setup, subject: Subject, *, files:
     """
     out = session.folder
     record: dict[str, Any] = capture_record(subject)
-    record |= {"dome": "dome/dome.json"} | ({"override": session.override} if session.override else {})
+    record |= {"dome": "dome/dome.json"} | (
+        {"override": session.override} if session.override else {}
+    )
     if subject.virtual:
         flashes = session.flashes_per_second
         record["rehearsal"] = {"person_present": False, "flashes_per_second": flashes}
@@ -236,11 +324,23 @@ def write_capture(session: Unfinished, setup: Setup, subject: Subject, *, files:
         name = f"scan{path.suffix}" if key == "mesh" else f"{key}{path.suffix}"
         _copy(path, out / name)
         record[key] = name
-    dome = {key: value for key, value in setup.dome.items() if key not in ("frames", "dark", "sequence")}
+    dome = {
+        key: value
+        for key, value in setup.dome.items()
+        if key not in ("frames", "dark", "sequence")
+    }
     suffix = next((out / "dome/frames").glob("*/*")).suffix
     dark = f"dome/dark/{{exposure}}_{{camera}}{suffix}"
-    has_dark = all((out / dark.format(exposure=e, camera=c)).is_file() for e in setup.exposures for c in setup.cameras)
-    dome |= {"frames": f"{FRAMES}{suffix}", "sequence": session.sequence, "dark": dark if has_dark else None}
+    has_dark = all(
+        (out / dark.format(exposure=e, camera=c)).is_file()
+        for e in setup.exposures
+        for c in setup.cameras
+    )
+    dome |= {
+        "frames": f"{FRAMES}{suffix}",
+        "sequence": session.sequence,
+        "dark": dark if has_dark else None,
+    }
     dome |= {"steady_lamp": session.lamp} if session.lamp else {}
     _copy_white(setup, out)
     _dump(out / "dome/dome.json", dome)
@@ -253,21 +353,41 @@ def write_capture(session: Unfinished, setup: Setup, subject: Subject, *, files:
 
 def capture_record(subject: Subject) -> dict[str, Any]:
     """Content of capture.json that describes the subject."""
-    record = {"format": "skindb-capture", "version": 2, "subject": subject.subject, "session": subject.session}
-    record |= {"condition": subject.condition, "traits": dict(subject.traits), "consent": dict(subject.consent)}
+    record = {
+        "format": "skindb-capture",
+        "version": 2,
+        "subject": subject.subject,
+        "session": subject.session,
+    }
+    record |= {
+        "condition": subject.condition,
+        "traits": dict(subject.traits),
+        "consent": dict(subject.consent),
+    }
     record |= {"calibration": subject.calibration} if subject.calibration else {}
     return record | ({"virtual": True} if subject.virtual else {})
 
 
 def _write_probe(session: Unfinished, probe: Mapping[str, Any]) -> None:
     sites = dict.fromkeys(str(one["site"]) for one in session.sites)
-    own = {site: [one for one in session.sites if one["site"] == site] for site in sites}
-    record = {key: value for key, value in probe.items() if key not in ("frames", "sites", "pressure", "placements")}
+    own = {
+        site: [one for one in session.sites if one["site"] == site] for site in sites
+    }
+    record = {
+        key: value
+        for key, value in probe.items()
+        if key not in ("frames", "sites", "pressure", "placements")
+    }
     record |= {
         "sites": list(sites),
         "frames": f"{SITE_FRAMES}{session.sites[0]['suffix']}",
-        "placements": {site: [str(one["number"]) for one in found] for site, found in own.items()},
-        "pressure": {site: {str(one["number"]): one["pressure"] for one in found} for site, found in own.items()},
+        "placements": {
+            site: [str(one["number"]) for one in found] for site, found in own.items()
+        },
+        "pressure": {
+            site: {str(one["number"]): one["pressure"] for one in found}
+            for site, found in own.items()
+        },
     }
     _dump(session.folder / "contact/probe.json", record)
 
@@ -278,7 +398,9 @@ def _copy_white(setup: Setup, out: Path) -> None:
     if isinstance(white, dict) and isinstance(white.get("frames"), str):
         top = Path(white["frames"].split("{")[0]).parts[:2]
         if top and ".." not in top:
-            shutil.copytree(setup.folder.joinpath(*top), out.joinpath(*top), dirs_exist_ok=True)
+            shutil.copytree(
+                setup.folder.joinpath(*top), out.joinpath(*top), dirs_exist_ok=True
+            )
 
 
 def _copy(path: Path, target: Path) -> None:

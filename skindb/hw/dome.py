@@ -1,4 +1,6 @@
-"""The light controller of a dome: uploads a sequence, arms it, runs it, and reads back the measurements."""
+"""The light controller of a dome: uploads a sequence, arms it, runs it, and reads back
+the measurements.
+"""
 
 from __future__ import annotations
 
@@ -31,10 +33,14 @@ from skindb.hw.sequence import Measured, Schedule
 POLL_SECONDS = 0.1  # interval of status requests during a run
 REPORTS_AT_A_TIME = 10  # read between two status requests
 KIND = "dome"
-EMULATED = "emulated"  # name of the emulated controller, by which a rehearsal recognises it
+# name of the emulated controller, by which a rehearsal recognises it
+EMULATED = "emulated"
 LIGHTS_CURE = "see that the lights are off, or switch off the power of the controller"
 STOPPED = {
-    "watchdog": "it received nothing from this computer for half a second and switched the lights off",
+    "watchdog": (
+        "it received nothing from this computer for half a second and switched the "
+        "lights off"
+    ),
     "interlock": "the interlock was opened",
     "stop": "it was stopped",
     "": "it gave no reason",
@@ -96,7 +102,9 @@ class Dome:
                 rule = f"must accept {len(schedule.steps)} steps within {seconds:.1f} s"
                 raise self.link.error(rule, f"{index} steps")
             light = {"light": step.light, "exposure": step.exposure}
-            self.link.request("STEP", index=index, **light, on=step.on_us, off=step.off_us)
+            self.link.request(
+                "STEP", index=index, **light, on=step.on_us, off=step.off_us
+            )
         if not self.holds(schedule):
             held = self.link.request("PLAN").values
             found = f"{held.get('steps')} steps, digest {held.get('digest')}"
@@ -109,7 +117,9 @@ class Dome:
         plan = (held.get("steps"), held.get("digest"))
         return plan == (str(len(schedule.steps)), schedule.digest)
 
-    def arm(self, schedule: Schedule, override: Override | Rehearsal | None = None) -> None:
+    def arm(
+        self, schedule: Schedule, override: Override | Rehearsal | None = None
+    ) -> None:
         """Arm the controller; needs a closed interlock, and `override` above the limit of flashes.
 
         Raises
@@ -197,7 +207,9 @@ class Dome:
         if state in ("", "running"):
             self.link.clock.sleep(SILENCE_SECONDS)
             rule = "must confirm that it stopped"
-            raise self.link.error(rule, f"{found}, so that lights may be on", LIGHTS_CURE)
+            raise self.link.error(
+                rule, f"{found}, so that lights may be on", LIGHTS_CURE
+            )
 
     def report_step(self, schedule: Schedule, index: int) -> Measured:
         """Measurements of a step.
@@ -213,9 +225,13 @@ class Dome:
         step = schedule.steps[index]
         early = step.on_us * CLOCK_ERROR + EARLY_SECONDS * 1e6
         late = step.on_us * CLOCK_ERROR + SLACK_SECONDS * 1e6
-        on_times = Range(round(max(step.on_us - early, 0)), round(step.on_us + late), "us")
+        on_times = Range(
+            round(max(step.on_us - early, 0)), round(step.on_us + late), "us"
+        )
         on_us = self.link.value(reply, "on", on_times)
-        off_us = self.link.value(reply, "off", Range(on_us, round(step.off_us + late), "us"))
+        off_us = self.link.value(
+            reply, "off", Range(on_us, round(step.off_us + late), "us")
+        )
         return Measured(
             round(on_us),
             round(off_us),
@@ -224,7 +240,9 @@ class Dome:
             self.link.value(reply, "rest", REST_CURRENT),
         )
 
-    def _progress(self, schedule: Schedule, before: DomeState, start: Start) -> DomeState:
+    def _progress(
+        self, schedule: Schedule, before: DomeState, start: Start
+    ) -> DomeState:
         """The next state of a running sequence, which must be the one that is due by the plan."""
         sent = self.link.clock.monotonic()
         state = self.state(len(schedule.steps))
@@ -233,19 +251,25 @@ class Dome:
             rule = "must be running, done or stopped after START"
             raise self.link.error(rule, state.state, FIRMWARE_CURE)
         if state.state == "running" and state.interlock == "open":
-            raise self.link.error("must stop when the interlock is open", "running", FIRMWARE_CURE)
+            raise self.link.error(
+                "must stop when the interlock is open", "running", FIRMWARE_CURE
+            )
         if state.state == "done" and state.step < len(schedule.steps):
             rule = f"must finish {len(schedule.steps)} steps before it is done"
             raise self.link.error(rule, f"{state.step} steps", FIRMWARE_CURE)
         if state.step < before.step:
             rule = "must not count fewer finished steps than before"
-            raise self.link.error(rule, f"{state.step} after {before.step}", FIRMWARE_CURE)
+            raise self.link.error(
+                rule, f"{state.step} after {before.step}", FIRMWARE_CURE
+            )
         at_least = sent - start.replied
         at_most = now - start.requested
         self._require_due(schedule, state, at_least=at_least, at_most=at_most)
         return state
 
-    def _require_due(self, schedule: Schedule, state: DomeState, *, at_least: float, at_most: float) -> None:
+    def _require_due(
+        self, schedule: Schedule, state: DomeState, *, at_least: float, at_most: float
+    ) -> None:
         """Refuse progress that is slower or faster than the plan; times are seconds since START."""
         last = schedule.steps[-1]
         step = schedule.steps[state.step] if state.step < len(schedule.steps) else last

@@ -1,4 +1,6 @@
-"""A steady lamp, beside which lights are no flashes: it is measured before the lights flash fast."""
+"""A steady lamp, beside which lights are no flashes: it is measured before the lights
+flash fast.
+"""
 
 from __future__ import annotations
 
@@ -19,8 +21,10 @@ from skindb.hw.safety import slowed_schedule
 from skindb.hw.sequence import DARK, plan_schedule
 from skindb.hw.session import capture_dome, require_complete, with_dark_frames
 
-MIN_LAMP = 0.5  # measured over stated brightness: cameras see lamp and lights from different sides
-MAX_FILLED_LEVEL = 0.9  # of a dark frame relative to white: with a light, a tenth of the lamp, it is white
+# measured over stated brightness: cameras see lamp and lights from different sides
+MIN_LAMP = 0.5
+# of a dark frame relative to white: with a light, a tenth of the lamp, it is white
+MAX_FILLED_LEVEL = 0.9
 MIN_LAMP_LEVEL = 0.005  # of a dark frame relative to white, below which no lamp is on
 REFERENCE_LIGHTS = 4  # flashed at the safe rate of three in a second
 
@@ -45,7 +49,9 @@ def measure_lamp(dome: Dome, cameras: Cameras, setup: Setup, stated: int) -> flo
     """
     exposure = _require_visible(dome, cameras, setup, stated)
     lights = setup.lights[:: -(-len(setup.lights) // REFERENCE_LIGHTS)]
-    flashes = slowed_schedule(plan_schedule(lights, {exposure: setup.exposures[exposure]}))
+    flashes = slowed_schedule(
+        plan_schedule(lights, {exposure: setup.exposures[exposure]})
+    )
     schedule = with_dark_frames(flashes, count=1)
     run = capture_dome(dome, cameras, schedule)
     require_complete(run, setup.cameras)
@@ -54,14 +60,18 @@ def measure_lamp(dome: Dome, cameras: Cameras, setup: Setup, stated: int) -> flo
         found = f"{brightness:.1f} lights"
         if np.isnan(brightness):
             found = "lights that are not visible beside it"
-        rule = f"must be as bright as {stated} lights, and at least {MIN_LAMP:.0%} of that"
+        rule = (
+            f"must be as bright as {stated} lights, and at least {MIN_LAMP:.0%} of that"
+        )
         cure = "make it brighter, or state its brightness with --base-light"
         raise InputError(Fault("steady lamp", rule, found, cure))
     return brightness
 
 
 def _require_visible(dome: Dome, cameras: Cameras, setup: Setup, stated: int) -> str:
-    """Require dark frames that show the lamp; returns the longest exposure that it does not fill."""
+    """Require dark frames that show the lamp; returns the longest exposure that it does
+    not fill.
+    """
     schedule = plan_schedule([DARK], setup.exposures)
     run = capture_dome(dome, cameras, schedule)
     require_complete(run, setup.cameras)
@@ -69,7 +79,10 @@ def _require_visible(dome: Dome, cameras: Cameras, setup: Setup, stated: int) ->
     level = dark_levels(schedule, levels, setup.dome)
     filled = [name for name in level if not level[name] <= MAX_FILLED_LEVEL]
     if filled:
-        rule = f"must leave room for a light in every exposure, at most {MAX_FILLED_LEVEL:.0%} of white"
+        rule = (
+            "must leave room for a light in every exposure, at most "
+            f"{MAX_FILLED_LEVEL:.0%} of white"
+        )
         cure = "shorten that exposure in dome.json, or make the lamp darker"
         found = f"a dark frame of {level[filled[0]]:.0%} in exposure {filled[0]}"
         raise InputError(Fault("steady lamp", rule, found, cure))
@@ -77,9 +90,15 @@ def _require_visible(dome: Dome, cameras: Cameras, setup: Setup, stated: int) ->
     if not exposure:
         rule = f"must be at most {MAX_LAMP_LEVEL:.0%} of white in the shortest exposure"
         found = f"a dark frame of {min(level.values()):.0%}"
-        raise InputError(Fault("steady lamp", rule, found, "add a shorter exposure to dome.json"))
+        raise InputError(
+            Fault("steady lamp", rule, found, "add a shorter exposure to dome.json")
+        )
     if not level[exposure] > (0.0 if levels.linear else MIN_LAMP_LEVEL):
         rule = f"must be as bright as {stated} lights"
-        found = f"dark frames of {max(level[exposure], 0.0):.1%} of white, so no lamp is on"
-        raise InputError(Fault("steady lamp", rule, found, "switch it on, or omit --base-light"))
+        found = (
+            f"dark frames of {max(level[exposure], 0.0):.1%} of white, so no lamp is on"
+        )
+        raise InputError(
+            Fault("steady lamp", rule, found, "switch it on, or omit --base-light")
+        )
     return exposure

@@ -1,4 +1,6 @@
-"""Connection to a device over a serial line or a socket: requests with deadlines, events, and a log of all bytes."""
+"""Connection to a device over a serial line or a socket: requests with deadlines,
+events, and a log of all bytes.
+"""
 
 from __future__ import annotations
 
@@ -14,13 +16,25 @@ import serial
 
 from skindb.clock import SYSTEM_CLOCK, Clock
 from skindb.errors import Fault, InputError, system_fault
-from skindb.hw.protocol import ERROR, EVENT, MAX_NUMBER, OK, PROTOCOL, REPLY, REQUEST, Lines, Message
+from skindb.hw.protocol import (
+    ERROR,
+    EVENT,
+    MAX_NUMBER,
+    OK,
+    PROTOCOL,
+    REPLY,
+    REQUEST,
+    Lines,
+    Message,
+)
 
 BAUD_RATE = 115_200
 REPLY_SECONDS = 0.3  # within which a device must answer
-ATTEMPTS = 3  # of a request, together less than a second, after which a device counts as lost
+# of a request, together less than a second, after which a device counts as lost
+ATTEMPTS = 3
 READ_SECONDS = 0.005  # timeout of one read of the port
-WATCHDOG_SECONDS = 0.5  # without a request, after which a device switches everything off
+# without a request, after which a device switches everything off
+WATCHDOG_SECONDS = 0.5
 SILENCE_SECONDS = 0.6  # without a request, after a STOP that a device did not confirm
 MAX_WAITING_EVENTS = 1_000  # the gauge of the probe sends ten in a second
 CURE = "check its power and its cable, then run the command again"
@@ -79,7 +93,14 @@ class Link:
         added to the name.
     """
 
-    def __init__(self, port: Port, name: str, *, clock: Clock = SYSTEM_CLOCK, log: Path | None = None) -> None:
+    def __init__(
+        self,
+        port: Port,
+        name: str,
+        *,
+        clock: Clock = SYSTEM_CLOCK,
+        log: Path | None = None,
+    ) -> None:
         self.name = name
         self.clock = clock
         self.lost_events = 0
@@ -120,8 +141,12 @@ class Link:
         seconds = ATTEMPTS * REPLY_SECONDS
         noise = ""
         if self.damaged:
-            noise = f", and {self.damaged} damaged lines, the last {self._lines.sample!r}"
-        raise self.error(f"must answer {verb} within {seconds:.1f} s", f"no reply{noise}")
+            noise = (
+                f", and {self.damaged} damaged lines, the last {self._lines.sample!r}"
+            )
+        raise self.error(
+            f"must answer {verb} within {seconds:.1f} s", f"no reply{noise}"
+        )
 
     def value(self, message: Message, name: str, accepted: Accepted[T]) -> T:
         """A value of a reply or an event.
@@ -139,15 +164,26 @@ class Link:
             return accepted.parse(text)
         except ValueError:
             found = f"{text!r} in {message.kind}{message.number}"
-            raise self.error(f"must send as {name} {accepted}", found, FIRMWARE_CURE) from None
+            raise self.error(
+                f"must send as {name} {accepted}", found, FIRMWARE_CURE
+            ) from None
 
     def hello(self, kind: str) -> Message:
-        """Identify the device; raises `DeviceError` unless it has this kind and the supported protocol."""
+        """Identify the device; raises `DeviceError` unless it has this kind and the
+        supported protocol.
+        """
         found = self.request("HELLO")
-        said = found.values.get("kind", "an unknown device"), found.values.get("protocol", "?")
+        said = (
+            found.values.get("kind", "an unknown device"),
+            found.values.get("protocol", "?"),
+        )
         if said != (kind, str(PROTOCOL)):
             rule = f"must be a {kind} with protocol {PROTOCOL}"
-            raise self.error(rule, f"{said[0]} with protocol {said[1]}", "check which device has which address")
+            raise self.error(
+                rule,
+                f"{said[0]} with protocol {said[1]}",
+                "check which device has which address",
+            )
         return found
 
     def events(self) -> list[Message]:
@@ -185,7 +221,11 @@ class Link:
         for message in self._lines.feed(data):
             if message.kind == EVENT:
                 self._store_event(message)
-            elif message.kind == REPLY and message.number == self._number and self._reply is None:
+            elif (
+                message.kind == REPLY
+                and message.number == self._number
+                and self._reply is None
+            ):
                 self._reply = message  # late replies to earlier requests are ignored
 
     def error(self, rule: str, found: str, cure: str = CURE) -> DeviceError:
@@ -196,7 +236,8 @@ class Link:
         """Close the port and the log."""
         own = getattr(self._port, "_socket", None)
         self._port.close()
-        if own is not None:  # pyserial leaves the socket open if the other end is closed
+        # pyserial leaves the socket open if the other end is closed
+        if own is not None:
             own.close()
         if self._log is not None:
             self._log.close()
@@ -213,7 +254,9 @@ class Link:
             found = reply.values.get("text", "a refusal without a reason")
             raise RefusedError(Fault(self.name, f"must accept {verb}", found, ""))
         if reply.verb != OK:
-            raise self.error(f"must answer {verb} by OK or ERR", repr(reply.verb), FIRMWARE_CURE)
+            raise self.error(
+                f"must answer {verb} by OK or ERR", repr(reply.verb), FIRMWARE_CURE
+            )
         return reply
 
     def _store_event(self, event: Message) -> None:
@@ -225,7 +268,9 @@ class Link:
         if skipped > MAX_NUMBER // 2:
             self._disorder = f"event {event.number} where {self._next_event} was due"
         elif len(self._events) >= MAX_WAITING_EVENTS:
-            self._disorder = f"more than {MAX_WAITING_EVENTS} events that were not asked for"
+            self._disorder = (
+                f"more than {MAX_WAITING_EVENTS} events that were not asked for"
+            )
         else:
             self.lost_events += skipped
             self._next_event = event.number % MAX_NUMBER + 1
@@ -258,11 +303,14 @@ class Link:
 def _new_file(path: Path) -> Path:
     """The path, with a number added if it exists, so that logs of earlier sessions are kept."""
     numbered = (path.with_stem(f"{path.stem}-{i}") for i in count(2))
-    return path if not path.exists() else next(one for one in numbered if not one.exists())
+    return (
+        path if not path.exists() else next(one for one in numbered if not one.exists())
+    )
 
 
 def open_port(url: str) -> Port:
-    """Open a port by its pyserial URL: ``/dev/ttyACM0``, ``socket://host:port``, ``loop://``, ``spy://...``.
+    """Open a port by its pyserial URL: ``/dev/ttyACM0``, ``socket://host:port``,
+    ``loop://``, ``spy://...``.
 
     Raises
     ------
@@ -270,17 +318,30 @@ def open_port(url: str) -> Port:
         If the port cannot be opened.
     """
     try:
-        port: Port = serial.serial_for_url(url, baudrate=BAUD_RATE, timeout=READ_SECONDS, write_timeout=REPLY_SECONDS)
-    except (OSError, ValueError, LookupError, AttributeError, TypeError, serial.SerialException) as error:
+        port: Port = serial.serial_for_url(
+            url, baudrate=BAUD_RATE, timeout=READ_SECONDS, write_timeout=REPLY_SECONDS
+        )
+    except (
+        OSError,
+        ValueError,
+        LookupError,
+        AttributeError,
+        TypeError,
+        serial.SerialException,
+    ) as error:
         # pyserial parses its URLs without checks and does not catch the errors of parsing
         rule = "a device must be at this address"
         cure = "give an address like /dev/ttyACM0 or socket://127.0.0.1:7000"
-        raise DeviceError(Fault(f"address {url}", rule, _system_reason(error), cure)) from None
+        raise DeviceError(
+            Fault(f"address {url}", rule, _system_reason(error), cure)
+        ) from None
     return port
 
 
 def _system_reason(error: BaseException | None) -> str:
-    """Reason of the operating system why a port was not opened, without the repetitions of pyserial."""
+    """Reason of the operating system why a port was not opened, without the repetitions
+    of pyserial.
+    """
     while error is not None:
         if isinstance(error, OSError) and error.errno is not None:
             return os.strerror(error.errno)
@@ -353,7 +414,9 @@ class ReplayPort:
         if recorded != data:
             rule = f"the next request of a replay must be {recorded!r}"
             found = f"{data!r}"
-            raise DeviceError(Fault(str(self.path), rule, found, "replay it with the same commands"))
+            raise DeviceError(
+                Fault(str(self.path), rule, found, "replay it with the same commands")
+            )
 
     def close(self) -> None:
         """Do nothing: no file is open."""

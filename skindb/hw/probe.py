@@ -9,7 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
-from skindb.hw.link import FIRMWARE_CURE, SILENCE_SECONDS, DeviceError, Link, stopped_at_end
+from skindb.hw.link import (
+    FIRMWARE_CURE,
+    SILENCE_SECONDS,
+    DeviceError,
+    Link,
+    stopped_at_end,
+)
 from skindb.hw.readings import (
     CLOCK_ERROR,
     EARLY_SECONDS,
@@ -21,14 +27,17 @@ from skindb.hw.readings import (
 )
 
 KIND = "probe"
-PRESSURE_KPA = -5.0  # of the gauge: the probe adheres to the skin without leaving a mark
+# of the gauge: the probe adheres to the skin without leaving a mark
+PRESSURE_KPA = -5.0
 MAX_SUCTION_KPA = 20.0  # stronger suction leaves marks
 SETTLE_SECONDS = 5.0  # within which the pressure must be reached
 PRESSURE_TOLERANCE_KPA = 1.0  # difference from the target during a measurement
-SETTLED_KPA = 0.3  # difference from the target below which the pressure counts as reached
+# difference from the target below which the pressure counts as reached
+SETTLED_KPA = 0.3
 MAX_AGE_SECONDS = 0.5  # of the last reading of the gauge, which sends one every 0.1 s
 TIME_PRECISION_SECONDS = 1e-3  # of the times of the gauge
-MAX_AHEAD_SECONDS = 0.2  # by which the clock of the gauge may be fast, in the two minutes of a site
+# by which the clock of the gauge may be fast, in the two minutes of a site
+MAX_AHEAD_SECONDS = 0.2
 POLL_SECONDS = 0.1  # interval of status requests
 RELEASE_SECONDS = 0.25  # without a reading, after which the pump counts as off
 # exposures, and their ratio (Weyrich et al. 2005, section 8)
@@ -79,10 +88,12 @@ class Gauge:
 
     def __init__(self, link: Link, target: float, readings: list[Reading]) -> None:
         self.readings = readings
-        self.settled = False  # whether the pressure was reached, so that it must be held
+        # whether the pressure was reached, so that it must be held
+        self.settled = False
         self._link = link
         self._target = target
-        self._start = link.clock.monotonic()  # before PUMP is sent, so that ages are never too low
+        # before PUMP is sent, so that ages are never too low
+        self._start = link.clock.monotonic()
 
     @property
     def kpa(self) -> float:
@@ -126,10 +137,16 @@ class Gauge:
         """Refuse suction stronger than wanted, overpressure, which lifts the probe, and leaks."""
         least = self._target - PRESSURE_TOLERANCE_KPA
         if not least <= kpa <= PRESSURE_TOLERANCE_KPA:
-            rule = f"must hold a pressure from {least:g} to {PRESSURE_TOLERANCE_KPA:g} kPa"
-            raise self._link.error(rule, f"{kpa:.2f} kPa", "check the pump and the gauge")
+            rule = (
+                f"must hold a pressure from {least:g} to {PRESSURE_TOLERANCE_KPA:g} kPa"
+            )
+            raise self._link.error(
+                rule, f"{kpa:.2f} kPa", "check the pump and the gauge"
+            )
         if self.settled and not kpa <= self._target + PRESSURE_TOLERANCE_KPA:
-            rule = f"must hold {self._target:g} kPa within {PRESSURE_TOLERANCE_KPA:g} kPa"
+            rule = (
+                f"must hold {self._target:g} kPa within {PRESSURE_TOLERANCE_KPA:g} kPa"
+            )
             found = f"{kpa:.2f} kPa after {t:.1f} s, so it leaks"
             cure = "press it on, check its seal, and place it again"
             raise PlacementError(Fault(self._link.name, rule, found, cure))
@@ -152,7 +169,8 @@ class Probe:
         progress: Callable[[int, int], None] | None = None,
         readings: list[Reading] | None = None,
     ) -> Placement:
-        """Apply suction, expose every bracket, and release; the light and the suction end also after an error.
+        """Apply suction, expose every bracket, and release; the light and the suction
+        end also after an error.
 
         Requests, which reset the watchdog of the probe, are sent only while its gauge is in order.
 
@@ -176,7 +194,9 @@ class Probe:
         """
         if not -MAX_SUCTION_KPA <= pressure < 0:
             rule = f"the suction must be from {-MAX_SUCTION_KPA:g} to 0 kPa"
-            raise InputError(Fault("probe", rule, f"{pressure:g} kPa", "use about -5 kPa"))
+            raise InputError(
+                Fault("probe", rule, f"{pressure:g} kPa", "use about -5 kPa")
+            )
         self.link.discard_events()
         lost = self.link.lost_events
         with stopped_at_end(self.stop):
@@ -215,7 +235,9 @@ class Probe:
         if found:
             self.link.clock.sleep(SILENCE_SECONDS)
             cure = "take the probe off, and switch off its power"
-            raise self.link.error("must confirm that it released the suction", found, cure)
+            raise self.link.error(
+                "must confirm that it released the suction", found, cure
+            )
 
     def _settle(self, gauge: Gauge, pressure: float) -> None:
         """Wait until the pressure is reached."""

@@ -1,6 +1,7 @@
 """Wire protocol of light controller and probe: lines of text with a number and a checksum.
 
-docs/protocol.md is its specification for authors of firmware. This module only encodes and decodes; it does no I/O.
+docs/protocol.md is its specification for authors of firmware. This module only encodes
+and decodes; it does no I/O.
 """
 
 from __future__ import annotations
@@ -12,14 +13,17 @@ from dataclasses import dataclass, field
 from urllib.parse import quote, unquote
 
 PROTOCOL = 1  # version that HELLO reports
-MAX_LINE_BYTES = 8192  # HELLO of a dome lists its lights: 150 ids of four characters need 750 bytes
+# HELLO of a dome lists its lights: 150 ids of four characters need 750 bytes
+MAX_LINE_BYTES = 8192
 MAX_NUMBER = 99_999
 REQUEST = "Q"
 REPLY = "R"
 EVENT = "E"
 OK = "OK"
 ERROR = "ERR"
-LINE = re.compile(rb"([QRE])(\d{1,5}) ([A-Z]{1,16})((?: [a-z_]{1,16}=[!-)+-~]{0,8000})*)\*([0-9A-F]{4})")
+LINE = re.compile(
+    rb"([QRE])(\d{1,5}) ([A-Z]{1,16})((?: [a-z_]{1,16}=[!-)+-~]{0,8000})*)\*([0-9A-F]{4})"
+)
 
 
 class ProtocolError(ValueError):
@@ -35,7 +39,8 @@ class Message:
     kind
         `REQUEST`, `REPLY` or `EVENT`.
     number
-        Number of the request; a reply has the number of its request, and events are counted separately.
+        Number of the request; a reply has the number of its request, and events are
+        counted separately.
     verb
         Name of the request or event; `OK` or `ERR` in replies.
     values
@@ -49,7 +54,10 @@ class Message:
 
     def encode(self) -> bytes:
         """The line of this message, with its newline."""
-        values = "".join(f" {name}={quote(value, safe='/:.,+-')}" for name, value in self.values.items())
+        values = "".join(
+            f" {name}={quote(value, safe='/:.,+-')}"
+            for name, value in self.values.items()
+        )
         body = f"{self.kind}{self.number} {self.verb}{values}".encode("ascii")
         line = body + b"*%04X\n" % checksum(body)
         if len(line) > MAX_LINE_BYTES or LINE.fullmatch(line[:-1]) is None:
@@ -71,11 +79,18 @@ def decode(line: bytes) -> Message:
     if checksum(line[:-5]) != int(crc, 16):
         raise ProtocolError(f"{line[:80]!r} has a wrong checksum")
     pairs = [text.partition("=") for text in values.decode("ascii").split()]
-    return Message(kind.decode(), int(number), verb.decode(), {name: unquote(value) for name, _, value in pairs})
+    return Message(
+        kind.decode(),
+        int(number),
+        verb.decode(),
+        {name: unquote(value) for name, _, value in pairs},
+    )
 
 
 class Lines:
-    """Splits bytes that arrive in arbitrary pieces into messages; other lines are counted and skipped."""
+    """Splits bytes that arrive in arbitrary pieces into messages; other lines are
+    counted and skipped.
+    """
 
     def __init__(self) -> None:
         self._rest = b""
@@ -85,7 +100,8 @@ class Lines:
     def feed(self, data: bytes) -> list[Message]:
         """Add bytes and return the messages that are now complete."""
         *lines, self._rest = (self._rest + data).split(b"\n")
-        if len(self._rest) > MAX_LINE_BYTES:  # noise without newlines must not fill the memory
+        # noise without newlines must not fill the memory
+        if len(self._rest) > MAX_LINE_BYTES:
             lines = [*lines, self._rest]
             self._rest = b""
         messages = []

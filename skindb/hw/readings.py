@@ -6,7 +6,9 @@ import math
 import re
 from dataclasses import dataclass
 
-NUMBER = re.compile(r"[+-]?[0-9]{1,12}(\.[0-9]{1,12})?(e[+-]?[0-9]{1,2})?", re.IGNORECASE)
+NUMBER = re.compile(
+    r"[+-]?[0-9]{1,12}(\.[0-9]{1,12})?(e[+-]?[0-9]{1,2})?", re.IGNORECASE
+)
 SLACK_SECONDS = 2.0  # by which a device may take longer than planned
 EARLY_SECONDS = 0.05  # by which it may take less
 CLOCK_ERROR = 0.002  # relative, of its clock; one without a crystal is wrong by 0.01
@@ -73,8 +75,10 @@ class Word:
 STATES = Word(("idle", "armed", "running", "done", "stopped"))
 INTERLOCKS = Word(("closed", "open"))
 TRIGGERS = Count(0, 1)  # of the cameras, by step or exposure
-CURRENT = Range(-0.1, 10.0, "of the nominal current")  # the zero of a current sensor may be off
-REST_CURRENT = Range(-0.1, 1_000.0, "of the current of a light")  # of all lights together
+# the zero of a current sensor may be off
+CURRENT = Range(-0.1, 10.0, "of the nominal current")
+# of all lights together
+REST_CURRENT = Range(-0.1, 1_000.0, "of the current of a light")
 
 # of the probe
 PROBE_STATES = Word(("idle", "exposing"))

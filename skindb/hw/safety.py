@@ -1,9 +1,10 @@
 """Limits of flashes against photosensitive seizures, and the confirmation that overrides them.
 
-Flashes at 3 to 30 per second provoke seizures in photosensitive people; guidelines allow at most three in any second
-(WCAG 2.2, success criterion 2.3.1; Harding and Jeavons 1994; ITU-R BT.1702). A flash is a pair of opposing changes of
-luminance of at least 10 % of the brighter one. Every light that is switched on counts, even if another one is switched
-off at the same time, because it shines from another direction.
+Flashes at 3 to 30 per second provoke seizures in photosensitive people; guidelines
+allow at most three in any second (WCAG 2.2, success criterion 2.3.1; Harding and
+Jeavons 1994; ITU-R BT.1702). A flash is a pair of opposing changes of luminance of at
+least 10 % of the brighter one. Every light that is switched on counts, even if another
+one is switched off at the same time, because it shines from another direction.
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ from skindb.errors import Fault, InputError
 from skindb.hw.sequence import DARK, Measured, Schedule, Step
 
 MAX_FLASHES = 3  # in any second
-MIN_LUMINANCE_STEP = 0.1  # smallest relative change of luminance that counts as one half of a flash
+# smallest relative change of luminance that counts as one half of a flash
+MIN_LUMINANCE_STEP = 0.1
 WINDOW_US = 1_000_000
 MAX_JITTER_US = 1_000  # of a measured time
 
@@ -26,7 +28,8 @@ class Assessment:
     """Flashes and luminance steps of a sequence."""
 
     flashes_per_second: int  # largest number in any second
-    luminance_step: float  # when a light is switched on, relative to the luminance with that light
+    # when a light is switched on, relative to the luminance with that light
+    luminance_step: float
     seconds: float  # duration of the sequence
 
     @property
@@ -37,14 +40,17 @@ class Assessment:
     def __str__(self) -> str:
         """Describe the assessment in words."""
         rate = (
-            f"at most {self.flashes_per_second} {'flash' if self.flashes_per_second == 1 else 'flashes'} in any second"
+            f"at most {self.flashes_per_second} "
+            f"{'flash' if self.flashes_per_second == 1 else 'flashes'} in any second"
         )
         return f"{rate}, luminance steps of {self.luminance_step:.0%}, {self.seconds:.1f} s"
 
 
 @dataclass(frozen=True)
 class Override:
-    """Confirmation of an operator that the subject was screened, gave consent, and keeps the eyes closed."""
+    """Confirmation of an operator that the subject was screened, gave consent, and
+    keeps the eyes closed.
+    """
 
     operator: str
     time: str  # ISO 8601
@@ -55,7 +61,12 @@ class Override:
     @property
     def complete(self) -> bool:
         """Whether a named operator confirmed all of it."""
-        return bool(self.operator) and self.screened and self.consented and self.eyes_closed
+        return (
+            bool(self.operator)
+            and self.screened
+            and self.consented
+            and self.eyes_closed
+        )
 
     def recorded(self, found: Assessment) -> dict[str, Any]:
         """Record that is stored with the capture."""
@@ -72,7 +83,11 @@ class Rehearsal:
 
 def assess(schedule: Schedule, *, window_us: int = WINDOW_US) -> Assessment:
     """Flashes and luminance steps of a schedule, in any second or window of another length."""
-    step = 1 / (1 + schedule.base) if any(one.light != DARK for one in schedule.steps) else 0.0
+    step = (
+        1 / (1 + schedule.base)
+        if any(one.light != DARK for one in schedule.steps)
+        else 0.0
+    )
     starts = sorted(one.on_us for one in schedule.steps if one.light != DARK)
     if step < MIN_LUMINANCE_STEP:
         starts = []
@@ -96,22 +111,32 @@ def measured_flashes(schedule: Schedule, measured: Sequence[Measured | None]) ->
 
 
 def slowed_schedule(schedule: Schedule, flashes: int = MAX_FLASHES) -> Schedule:
-    """The schedule with longer intervals, so that at most `flashes` lights are switched on in any second."""
+    """The schedule with longer intervals, so that at most `flashes` lights are switched
+    on in any second.
+    """
     period = WINDOW_US // max(flashes, 1) + 1
     after = [step.on_us for step in schedule.steps[1:]] + [0]
     steps = list[Step]()
     start = 0
     for step, following in zip(schedule.steps, after, strict=False):
-        steps.append(replace(step, on_us=start, off_us=start + step.off_us - step.on_us))
+        steps.append(
+            replace(step, on_us=start, off_us=start + step.off_us - step.on_us)
+        )
         start += max(period if step.light != DARK else 0, following - step.on_us)
     return replace(schedule, steps=tuple(steps))
 
 
 def partial_schedule(schedule: Schedule, steps: Iterable[int]) -> Schedule:
-    """Schedule of some of the steps, with at most as many flashes in any second as the whole schedule."""
+    """Schedule of some of the steps, with at most as many flashes in any second as the
+    whole schedule.
+    """
     part = schedule.subset(steps)
     allowed = assess(schedule).flashes_per_second
-    return part if assess(part).flashes_per_second <= allowed else slowed_schedule(part, allowed)
+    return (
+        part
+        if assess(part).flashes_per_second <= allowed
+        else slowed_schedule(part, allowed)
+    )
 
 
 def with_base_light(schedule: Schedule) -> Schedule:
@@ -120,19 +145,24 @@ def with_base_light(schedule: Schedule) -> Schedule:
 
 
 def alternatives(schedule: Schedule) -> list[str]:
-    """Descriptions of alternative schedules that need no override, one line each, with their cost."""
+    """Descriptions of alternative schedules that need no override, one line each, with
+    their cost.
+    """
     late = slowed_schedule(schedule)
     lit = with_base_light(schedule)
     noise = (1 + lit.base) ** 0.5
     return [
         f"slower (--slower): {assess(late)}, {late.seconds - schedule.seconds:.1f} s longer",
-        f"a steady lamp as bright as {lit.base} lights (--base-light {lit.base}): {assess(lit)}; photon "
+        f"a steady lamp as bright as {lit.base} lights (--base-light {lit.base}): "
+        f"{assess(lit)}; photon "
         f"noise {noise:.1f} times as high, and dark frames must be taken with the lamp on; its "
         "brightness is measured before the lights flash",
     ]
 
 
-def require_safe(schedule: Schedule, override: Override | Rehearsal | None) -> Assessment:
+def require_safe(
+    schedule: Schedule, override: Override | Rehearsal | None
+) -> Assessment:
     """Assess a schedule, and refuse one that needs an override and has none.
 
     Raises
@@ -164,8 +194,12 @@ def rehearsal_notes(schedule: Schedule, rehearsal: Rehearsal) -> list[str]:
 
 def _flash_fault(schedule: Schedule, found: Assessment) -> Fault:
     rule = (
-        f"an operator must confirm screening, consent and closed eyes for more than {MAX_FLASHES} flashes in a second"
+        "an operator must confirm screening, consent and closed eyes for more than "
+        f"{MAX_FLASHES} flashes in a second"
     )
     longer = assess(slowed_schedule(schedule)).seconds - found.seconds
-    cure = f"give --confirm-screening --operator ID, or --slower ({longer:.1f} s longer), or a steady lamp (see --plan)"
+    cure = (
+        f"give --confirm-screening --operator ID, or --slower ({longer:.1f} s longer), "
+        "or a steady lamp (see --plan)"
+    )
     return Fault("sequence", rule, str(found), cure)

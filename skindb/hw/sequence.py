@@ -1,4 +1,6 @@
-"""The sequence of lights and exposures of a dome: its plan, and the measurements that are stored with the capture."""
+"""The sequence of lights and exposures of a dome: its plan, and the measurements that
+are stored with the capture.
+"""
 
 from __future__ import annotations
 
@@ -10,13 +12,17 @@ from typing import Any
 from skindb.errors import Fault, InputError
 
 DARK = "-"  # id in place of a light when all lights are off
-GAP_SECONDS = 0.002  # between two steps, while the lights are off and the cameras read out
-PAPER_SECONDS = 25.0  # for 150 lights and two exposures (Weyrich et al. 2005, section 5)
+# between two steps, while the lights are off and the cameras read out
+GAP_SECONDS = 0.002
+# for 150 lights and two exposures (Weyrich et al. 2005, section 5)
+PAPER_SECONDS = 25.0
 
 
 @dataclass(frozen=True)
 class Step:
-    """One light for one exposure; times in whole microseconds since the start, as the controller counts."""
+    """One light for one exposure; times in whole microseconds since the start, as the
+    controller counts.
+    """
 
     light: str  # DARK for none
     exposure: str
@@ -26,7 +32,9 @@ class Step:
 
 @dataclass(frozen=True)
 class Schedule:
-    """Steps in order; `base` is the brightness of a steady lamp beside them, in units of one light."""
+    """Steps in order; `base` is the brightness of a steady lamp beside them, in units
+    of one light.
+    """
 
     steps: tuple[Step, ...]
     base: int = 0
@@ -38,18 +46,28 @@ class Schedule:
 
     @property
     def digest(self) -> str:
-        """CRC-32 over the lines of the steps, by which the controller identifies the plan that it holds."""
-        return f"{binascii.crc32(''.join(map(step_line, self.steps)).encode('ascii')):08X}"
+        """CRC-32 over the lines of the steps, by which the controller identifies the
+        plan that it holds.
+        """
+        return (
+            f"{binascii.crc32(''.join(map(step_line, self.steps)).encode('ascii')):08X}"
+        )
 
     def subset(self, steps: Iterable[int]) -> Schedule:
-        """Schedule of some of the steps, starting at zero, each followed by the same interval as in this one."""
+        """Schedule of some of the steps, starting at zero, each followed by the same
+        interval as in this one.
+        """
         start = 0
         made = list[Step]()
         for index in sorted(set(steps)):
             step = self.steps[index]
             length = step.off_us - step.on_us
             made.append(replace(step, on_us=start, off_us=start + length))
-            after = self.steps[index + 1].on_us if index + 1 < len(self.steps) else step.off_us
+            after = (
+                self.steps[index + 1].on_us
+                if index + 1 < len(self.steps)
+                else step.off_us
+            )
             start += max(after - step.on_us, length + round(GAP_SECONDS * 1e6))
         return replace(self, steps=tuple(made))
 
@@ -62,7 +80,8 @@ class Measured:
     off_us: int
     triggers: int
     level: float  # current of the light while it was on, relative to its nominal one
-    rest: float  # current of all lights after it was switched off, relative to one light
+    # current of all lights after it was switched off, relative to one light
+    rest: float
 
 
 def step_line(step: Step) -> str:
@@ -71,7 +90,11 @@ def step_line(step: Step) -> str:
 
 
 def plan_schedule(
-    lights: Sequence[str], exposures: Mapping[str, float], *, seconds: float | None = None, period: float = 0.0
+    lights: Sequence[str],
+    exposures: Mapping[str, float],
+    *,
+    seconds: float | None = None,
+    period: float = 0.0,
 ) -> Schedule:
     """Plan a sequence of single lights: all lights with one exposure, then with the next.
 
@@ -93,7 +116,14 @@ def plan_schedule(
     """
     pairs = [(light, name) for name in exposures for light in lights]
     if not pairs:
-        raise InputError(Fault("sequence", "must have lights and exposures", "none", "name at least one of each"))
+        raise InputError(
+            Fault(
+                "sequence",
+                "must have lights and exposures",
+                "none",
+                "name at least one of each",
+            )
+        )
     if bad := [name for name, time in exposures.items() if not 1e-6 <= time <= 60]:
         rule = "an exposure must last 1e-6 to 60 s"
         found = f"{exposures[bad[0]]} s for {bad[0]}"
@@ -101,7 +131,11 @@ def plan_schedule(
     least = sum(max(exposures[name] + GAP_SECONDS, period) for _, name in pairs)
     if seconds is not None and seconds < least - 1e-9:
         cure = "allow more time, or shorten the exposures"
-        raise InputError(Fault("sequence", f"must last at least {least:.3f} s", f"{seconds:g} s", cure))
+        raise InputError(
+            Fault(
+                "sequence", f"must last at least {least:.3f} s", f"{seconds:g} s", cure
+            )
+        )
     stretch = 0.0 if seconds is None else (seconds - least) / len(pairs)
     steps = list[Step]()
     start = 0.0

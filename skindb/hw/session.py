@@ -1,4 +1,6 @@
-"""A session: runs a sequence, counts triggers and frames, and repeats the steps whose frames are missing."""
+"""A session: runs a sequence, counts triggers and frames, and repeats the steps whose
+frames are missing.
+"""
 
 from __future__ import annotations
 
@@ -22,11 +24,15 @@ from skindb.hw.safety import (
 )
 from skindb.hw.sequence import DARK, Measured, Schedule, Step
 
-MAX_REPEATS = 3  # runs after the first one; frames that are still missing then indicate a broken device
+# runs after the first one; frames that are still missing then indicate a broken device
+MAX_REPEATS = 3
 FRAME_SECONDS = 10.0  # timeout for the last frames to be written
 LOST_FRAME_SECONDS = 1.0  # the same timeout if the expected number of frames is unknown
-DARK_FRAMES = 4  # per exposure before the lights, of which the mean is kept: they take 1.5 s for two exposures
-PAUSE_US = 250_000  # around dark frames: with uneven intervals a missing frame can be identified
+# per exposure before the lights, of which the mean is kept: they take 1.5 s for two
+# exposures
+DARK_FRAMES = 4
+# around dark frames: with uneven intervals a missing frame can be identified
+PAUSE_US = 250_000
 # current of a light, relative to its nominal current
 MIN_LEVEL = 0.9
 MAX_LEVEL = 1.1
@@ -43,9 +49,11 @@ class DomeRun:
     schedule: Schedule
     assessment: Assessment
     measured: list[Measured | None]
-    frames: dict[tuple[str, int], Path] = field(default_factory=dict)  # camera, step -> file
+    # camera, step -> file
+    frames: dict[tuple[str, int], Path] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
-    faulty_lights: dict[str, str] = field(default_factory=dict)  # light -> description of its failure
+    # light -> description of its failure
+    faulty_lights: dict[str, str] = field(default_factory=dict)
     stopped: str = ""  # reason if the run ended early
 
     def forget(self, step: int) -> None:
@@ -56,12 +64,17 @@ class DomeRun:
     def missing(self, cameras: Sequence[str]) -> dict[int, list[str]]:
         """Cameras that lack a frame, by step."""
         steps = range(len(self.schedule.steps))
-        lost = {i: [camera for camera in cameras if (camera, i) not in self.frames] for i in steps}
+        lost = {
+            i: [camera for camera in cameras if (camera, i) not in self.frames]
+            for i in steps
+        }
         return {i: names for i, names in lost.items() if names}
 
 
 def with_dark_frames(schedule: Schedule, *, count: int = DARK_FRAMES) -> Schedule:
-    """The schedule with `count` dark frames of every exposure before it, and one after it to detect stuck lights."""
+    """The schedule with `count` dark frames of every exposure before it, and one after
+    it to detect stuck lights.
+    """
     lengths = {step.exposure: step.off_us - step.on_us for step in schedule.steps}
     steps = list[Step]()
     start = 0
@@ -70,7 +83,9 @@ def with_dark_frames(schedule: Schedule, *, count: int = DARK_FRAMES) -> Schedul
             steps.append(Step(DARK, name, start, start + length))
             start += length + PAUSE_US
     for step in schedule.steps:
-        steps.append(Step(step.light, step.exposure, start + step.on_us, start + step.off_us))
+        steps.append(
+            Step(step.light, step.exposure, start + step.on_us, start + step.off_us)
+        )
     start = steps[-1].off_us + PAUSE_US
     shortest = min(lengths, key=lengths.__getitem__)
     steps.append(Step(DARK, shortest, start, start + lengths[shortest]))
@@ -97,24 +112,29 @@ def capture_dome(
     override
         Confirmation of an operator for more than three flashes in a second, or a rehearsal.
     begin
-        Called with the steps that are about to run: the whole schedule, and then those that are repeated.
+        Called with the steps that are about to run: the whole schedule, and then those
+        that are repeated.
     progress
         Called with the stage, the steps done and the steps in all.
 
     Returns
     -------
     DomeRun
-        Frames and measurements. After an emergency stop, an opened interlock or a lost device, `stopped` gives the
-        reason, the frames captured so far are kept, and the lights are off.
+        Frames and measurements. After an emergency stop, an opened interlock or a lost
+        device, `stopped` gives the reason, the frames captured so far are kept, and the
+        lights are off.
 
     Raises
     ------
     InputError
-        If the sequence is not allowed or the controller refuses it, before any light is switched on. A refused
-        repetition is not an error: `stopped` gives the reason, and the frames captured so far are kept.
+        If the sequence is not allowed or the controller refuses it, before any light is
+        switched on. A refused repetition is not an error: `stopped` gives the reason,
+        and the frames captured so far are kept.
     """
     tell = progress or silent
-    run = DomeRun(schedule, require_safe(schedule, override), [None] * len(schedule.steps))
+    run = DomeRun(
+        schedule, require_safe(schedule, override), [None] * len(schedule.steps)
+    )
     clock = dome.link.clock
     wanted = list(range(len(schedule.steps)))
     first = 0.0  # when the first run began
@@ -125,7 +145,8 @@ def capture_dome(
         try:
             dome.upload(part)
             dome.arm(part, override)
-        except InputError as error:  # keep the captured frames if a repetition is refused
+        except InputError as error:
+            # keep the captured frames if a repetition is refused
             if not attempt:
                 raise
             run.stopped = _reason(error)
@@ -135,30 +156,48 @@ def capture_dome(
         first = first or now
         done = list[Measured]()
         try:
-            state = dome.run(part, lambda number, total, stage=stage: tell(stage, number, total), done)  # type: ignore[misc]
+            state = dome.run(
+                part,
+                lambda number, total, stage=stage: tell(stage, number, total),  # type: ignore[misc]
+                done,
+            )
             if state.state == "stopped":
-                run.stopped = f"{dome.link.name}: {STOPPED.get(state.reason, state.reason)}"
+                run.stopped = (
+                    f"{dome.link.name}: {STOPPED.get(state.reason, state.reason)}"
+                )
         except (DeviceError, KeyboardInterrupt) as error:
             run.stopped = _reason(error)
         finished, lost_device = _read_reports(dome, part, done)
         run.stopped = run.stopped or lost_device
         since = round(1e6 * (now - first))
-        done = [replace(one, on_us=one.on_us + since, off_us=one.off_us + since) for one in done]
-        _collect(run, cameras, wanted, part, done, finished=finished, known=not lost_device)
+        done = [
+            replace(one, on_us=one.on_us + since, off_us=one.off_us + since)
+            for one in done
+        ]
+        _collect(
+            run, cameras, wanted, part, done, finished=finished, known=not lost_device
+        )
         lost = run.missing(cameras.ids)
         if run.stopped or not lost:
             break
         wanted = sorted(lost)
         run.notes.append(f"{_describe_missing(schedule, lost)}: repeated")
-    run.notes += [f"{dome.link.name}: {dome.link.damaged} damaged lines"] if dome.link.damaged else []
+    run.notes += (
+        [f"{dome.link.name}: {dome.link.damaged} damaged lines"]
+        if dome.link.damaged
+        else []
+    )
     run.faulty_lights = _faulty_lights(run)
     return run
 
 
-def recover_run(dome: Dome, cameras: Cameras, schedule: Schedule, started: float) -> DomeRun | None:
+def recover_run(
+    dome: Dome, cameras: Cameras, schedule: Schedule, started: float
+) -> DomeRun | None:
     """The part of a run that was finished when the process that drove it was killed.
 
-    The watchdog of the controller has switched the lights off, and it still has the plan and the measured steps.
+    The watchdog of the controller has switched the lights off, and it still has the
+    plan and the measured steps.
 
     Parameters
     ----------
@@ -180,7 +219,9 @@ def recover_run(dome: Dome, cameras: Cameras, schedule: Schedule, started: float
     done = list[Measured]()
     finished, lost_device = _read_reports(dome, schedule, done)
     wanted = range(len(schedule.steps))
-    _collect(run, cameras, wanted, schedule, done, finished=finished, known=not lost_device)
+    _collect(
+        run, cameras, wanted, schedule, done, finished=finished, known=not lost_device
+    )
     run.faulty_lights = _faulty_lights(run)
     return run
 
@@ -189,7 +230,9 @@ def _reason(error: BaseException) -> str:
     """Reason why a run ended, as a phrase within a message that has its own rule and cure."""
     if not isinstance(error, InputError):
         return "stopped by the operator"
-    return "; ".join(f"{fault.where} {fault.rule}: {fault.found}" for fault in error.faults)
+    return "; ".join(
+        f"{fault.where} {fault.rule}: {fault.found}" for fault in error.faults
+    )
 
 
 def _read_reports(dome: Dome, part: Schedule, done: list[Measured]) -> tuple[int, str]:
@@ -221,8 +264,9 @@ def _collect(
 ) -> None:
     """Assign frames to the finished steps of a part; steps without a trigger have no frame.
 
-    `known` is whether the controller reported all of its steps. Otherwise it may have continued after its last report,
-    so frames are matched with the whole plan, and only those of reported steps are kept.
+    `known` is whether the controller reported all of its steps. Otherwise it may have
+    continued after its last report, so frames are matched with the whole plan, and only
+    those of reported steps are kept.
     """
     steps = [i for i, measured in enumerate(done) if measured.triggers > 0]
     if not known:
@@ -231,13 +275,17 @@ def _collect(
     for index, measured in zip(wanted, done[:finished], strict=False):
         run.measured[index] = measured
     try:
-        taken = cameras.collect(len(steps), FRAME_SECONDS if known else LOST_FRAME_SECONDS)
+        taken = cameras.collect(
+            len(steps), FRAME_SECONDS if known else LOST_FRAME_SECONDS
+        )
     except InputError as error:  # such as a folder that is gone
         run.stopped = run.stopped or _reason(error)
         return
     for camera, shots in taken.items():
         if known and len(shots) != len(steps):
-            run.notes.append(f"camera {camera}: {len(shots)} frames for {len(steps)} triggers")
+            run.notes.append(
+                f"camera {camera}: {len(shots)} frames for {len(steps)} triggers"
+            )
         paths = match_frames(shots, times)
         for i, path in zip(steps, paths, strict=True):
             if path is not None and i < finished:
@@ -245,7 +293,9 @@ def _collect(
 
 
 def forget_faulty_steps(run: DomeRun) -> None:
-    """Discard the frames of lights that failed, and all frames after a light stayed on, so that they are repeated."""
+    """Discard the frames of lights that failed, and all frames after a light stayed on,
+    so that they are repeated.
+    """
     measured = [(i, done) for i, done in enumerate(run.measured) if done is not None]
     since = (i for i, done in measured if not done.rest <= MAX_REST)
     stuck = next(since, 0 if DARK in run.faulty_lights else len(run.measured))
@@ -255,7 +305,8 @@ def forget_faulty_steps(run: DomeRun) -> None:
 
 
 def require_complete(run: DomeRun, cameras: Sequence[str]) -> None:
-    """Refuse a capture that lacks frames or in which lights failed, while the subject is still seated.
+    """Refuse a capture that lacks frames or in which lights failed, while the subject
+    is still seated.
 
     Raises
     ------
@@ -263,17 +314,30 @@ def require_complete(run: DomeRun, cameras: Sequence[str]) -> None:
         With the frames to repeat, the lights that failed, and why the sequence was stopped.
     """
     cure = "keep the subject seated and run the capture again; it resumes with the missing steps"
-    faults = [Fault("capture", "must run to its end", run.stopped, cure)] if run.stopped else []
+    faults = (
+        [Fault("capture", "must run to its end", run.stopped, cure)]
+        if run.stopped
+        else []
+    )
     if lost := run.missing(cameras):
         faults.append(
             Fault(
-                "capture", "every step must have a frame of every camera", _describe_missing(run.schedule, lost), cure
+                "capture",
+                "every step must have a frame of every camera",
+                _describe_missing(run.schedule, lost),
+                cure,
             )
         )
     for light, what in run.faulty_lights.items():
-        rule = "all lights must be off" if light == DARK else "must be as bright as the others"
+        rule = (
+            "all lights must be off"
+            if light == DARK
+            else "must be as bright as the others"
+        )
         cure = "repair the light, and run the capture again; it repeats the frames of that light"
-        faults.append(Fault("dark frame" if light == DARK else f"light {light}", rule, what, cure))
+        faults.append(
+            Fault("dark frame" if light == DARK else f"light {light}", rule, what, cure)
+        )
     if faults:
         raise InputError(faults)
 
@@ -297,16 +361,23 @@ def _faulty_lights(run: DomeRun) -> dict[str, str]:
             continue
         error = abs((done.off_us - done.on_us) - (step.off_us - step.on_us))
         level = done.level - steady
-        if not done.rest <= MAX_REST and not steady:  # the steps after it show the same light
+        # the steps after it show the same light
+        if not done.rest <= MAX_REST and not steady:
             steady = done.rest
-            text = f"{done.rest:.0%} of the current of a light after it was switched off"
+            text = (
+                f"{done.rest:.0%} of the current of a light after it was switched off"
+            )
             faulty.setdefault(step.light, text)
         elif step.light == DARK and not level <= MAX_REST:
-            faulty.setdefault(DARK, f"{level:.0%} of the current of a light in a dark frame")
+            faulty.setdefault(
+                DARK, f"{level:.0%} of the current of a light in a dark frame"
+            )
         elif step.light != DARK and not MIN_LEVEL <= level <= MAX_LEVEL:
             faulty.setdefault(step.light, f"{done.level:.0%} of its nominal current")
         elif not error <= MAX_TIME_ERROR_US:
-            faulty.setdefault(step.light, f"a duration that differs by {error} us from the plan")
+            faulty.setdefault(
+                step.light, f"a duration that differs by {error} us from the plan"
+            )
     return faulty
 
 
@@ -348,12 +419,16 @@ def capture_site(
         If the probe does not answer, or sends what cannot be right.
     """
     camera.start()
-    placement = probe.measure(exposures, pressure=pressure, progress=progress, readings=readings)
+    placement = probe.measure(
+        exposures, pressure=pressure, progress=progress, readings=readings
+    )
     [(name, shots)] = camera.collect(len(exposures), FRAME_SECONDS).items()
     triggers = sum(placement.triggers.values())
     if not len(shots) == triggers == len(exposures):
         rule = "must take a frame of every exposure"
         found = f"{len(shots)} frames for {triggers} triggers and {len(exposures)} exposures"
-        raise PlacementError(Fault(f"camera {name}", rule, found, f"measure {site} again"))
+        raise PlacementError(
+            Fault(f"camera {name}", rule, found, f"measure {site} again")
+        )
     paths = (shot.path for shot in shots)
     return SiteRun(site, placement, dict(zip(exposures, paths, strict=True)))

@@ -1,4 +1,6 @@
-"""The file `unfinished.json` of an interrupted capture: its identity, and the steps completed so far."""
+"""The file `unfinished.json` of an interrupted capture: its identity, and the steps
+completed so far.
+"""
 
 from __future__ import annotations
 
@@ -24,22 +26,33 @@ class Unfinished:
     """State of an unfinished capture; call `save` after every change."""
 
     folder: Path
-    identity: dict[str, Any]  # values that must not change between the sessions of a capture
-    sequence: list[dict[str, Any]] = field(default_factory=list)  # complete steps, as dome.json keeps them
-    sites: list[dict[str, Any]] = field(default_factory=list)  # complete placements of the probe
-    override: dict[str, Any] | None = None  # the confirmation for the session with the most flashes per second
+    # values that must not change between the sessions of a capture
+    identity: dict[str, Any]
+    # complete steps, as dome.json keeps them
+    sequence: list[dict[str, Any]] = field(default_factory=list)
+    # complete placements of the probe
+    sites: list[dict[str, Any]] = field(default_factory=list)
+    # the confirmation for the session with the most flashes per second
+    override: dict[str, Any] | None = None
     flashes_per_second: int = 0  # of the session with the most
-    lamp: dict[str, Any] | None = None  # the steady lamp: stated and measured brightness, and responsible operator
+    # the steady lamp: stated and measured brightness, and responsible operator
+    lamp: dict[str, Any] | None = None
     running: dict[str, Any] | None = None  # steps that are running, see `begin_run`
 
     @property
     def started(self) -> bool:
-        """Whether the subject was photographed or measured; a session that was refused before has no subject."""
+        """Whether the subject was photographed or measured; a session that was refused
+        before has no subject.
+        """
         recorded = self.sequence or self.sites or self.flashes_per_second
-        return bool(recorded) or any((self.folder / name).exists() for name in ("dome", "contact"))
+        return bool(recorded) or any(
+            (self.folder / name).exists() for name in ("dome", "contact")
+        )
 
     def save(self) -> None:
-        """Replace the file atomically, so that a killed process leaves the old or the new content."""
+        """Replace the file atomically, so that a killed process leaves the old or the
+        new content.
+        """
         record = {name: value for name, value in vars(self).items() if name != "folder"}
         temporary = self.folder / f"{UNFINISHED}.new"
         with temporary.open("w", encoding="utf-8") as file:
@@ -57,15 +70,21 @@ class Unfinished:
 
     def begin_run(self, part: Schedule, now: float) -> None:
         """Record the steps that run from now on [s since 1970], in case this process is killed."""
-        steps = [[step.light, step.exposure, step.on_us, step.off_us] for step in part.steps]
+        steps = [
+            [step.light, step.exposure, step.on_us, step.off_us] for step in part.steps
+        ]
         self.running = {"steps": steps, "base": part.base, "started": now}
         self.save()
 
     def interrupted_run(self) -> tuple[Schedule, float] | None:
-        """Steps that ran when the process was killed, and when they began [s since 1970]; None without such a run."""
+        """Steps that ran when the process was killed, and when they began [s since
+        1970]; None without such a run.
+        """
         if self.running is None:
             return None
-        schedule = Schedule(tuple(Step(*step) for step in self.running["steps"]), self.running["base"])
+        schedule = Schedule(
+            tuple(Step(*step) for step in self.running["steps"]), self.running["base"]
+        )
         return schedule, self.running["started"]
 
 
@@ -87,7 +106,8 @@ def open_unfinished(folder: Path, identity: Mapping[str, Any]) -> Unfinished:
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         folder.mkdir(parents=True, exist_ok=True)
         begun = Unfinished(folder, dict(identity))
-        begun.save()  # also verifies that the folder is writable before any light is switched on
+        # also verifies that the folder is writable before any light is switched on
+        begun.save()
         return begun
     path = folder / UNFINISHED
     faults = list[Fault]()
@@ -95,7 +115,11 @@ def open_unfinished(folder: Path, identity: Mapping[str, Any]) -> Unfinished:
     if faults:
         raise InputError(faults)
     if note is None:
-        found = "a complete capture" if (folder / "capture.json").is_file() else "other files"
+        found = (
+            "a complete capture"
+            if (folder / "capture.json").is_file()
+            else "other files"
+        )
         rule = "must be a new folder, or that of an unfinished capture"
         raise InputError(Fault(str(folder), rule, found, "choose another folder"))
     begun = _read(folder, path, note)
@@ -112,13 +136,33 @@ def _read(folder: Path, path: Path, note: Any) -> Unfinished:
     override = record.get("override")
     sequence = _entries(record.get("sequence"), STEP_KEYS)
     sites = _entries(record.get("sites"), SITE_KEYS)
-    flashes, lamp, running = (record.get(name) for name in ("flashes_per_second", "lamp", "running"))
-    sound = all(isinstance(one, dict | None) for one in (override, lamp)) and isinstance(flashes, int)
+    flashes, lamp, running = (
+        record.get(name) for name in ("flashes_per_second", "lamp", "running")
+    )
+    sound = all(
+        isinstance(one, dict | None) for one in (override, lamp)
+    ) and isinstance(flashes, int)
     sound = sound and (running is None or _is_run(running))
     if not isinstance(identity, dict) or sequence is None or sites is None or not sound:
         cure = "choose another folder; the existing frames are kept"
-        raise InputError(Fault(str(path), "must be the record of an unfinished capture", "other content", cure))
-    return Unfinished(folder, identity, sequence, sites, override, int(record["flashes_per_second"]), lamp, running)
+        raise InputError(
+            Fault(
+                str(path),
+                "must be the record of an unfinished capture",
+                "other content",
+                cure,
+            )
+        )
+    return Unfinished(
+        folder,
+        identity,
+        sequence,
+        sites,
+        override,
+        int(record["flashes_per_second"]),
+        lamp,
+        running,
+    )
 
 
 def _is_run(value: Any) -> bool:
@@ -130,17 +174,24 @@ def _is_run(value: Any) -> bool:
     if not isinstance(steps, list) or not isinstance(value.get("started"), int | float):
         return False
     return all(
-        isinstance(step, list) and len(step) == len(kinds) and all(map(isinstance, step, kinds)) for step in steps
+        isinstance(step, list)
+        and len(step) == len(kinds)
+        and all(map(isinstance, step, kinds))
+        for step in steps
     )
 
 
 def _entries(value: Any, keys: set[str]) -> list[dict[str, Any]] | None:
     """The value if it is a list of objects with these keys, else None."""
-    sound = isinstance(value, list) and all(isinstance(one, dict) and keys <= one.keys() for one in value)
+    sound = isinstance(value, list) and all(
+        isinstance(one, dict) and keys <= one.keys() for one in value
+    )
     return value if sound else None
 
 
-def _require_same(folder: Path, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+def _require_same(
+    folder: Path, before: Mapping[str, Any], now: Mapping[str, Any]
+) -> None:
     """Refuse to mix subjects, or frames under different conditions."""
     faults = []
     for name in {**before, **now}:

@@ -2,7 +2,13 @@
 
 from skindb.geometry.crop import Crop
 from skindb.ingest.folder import Capture, read_capture
-from skindb.ingest.report import calibration_lines, calibration_table, cleaning_lines, sample_lines, sample_table
+from skindb.ingest.report import (
+    calibration_lines,
+    calibration_table,
+    cleaning_lines,
+    sample_lines,
+    sample_table,
+)
 from skindb.ingest.run import IngestParameters, ingest_capture, scratch_name
 
 __all__ = [

@@ -9,7 +9,8 @@ from skindb._compiled import kernel
 
 @kernel
 def interpolate(images: Any, pixels: Any, out: Any) -> None:
-    """Bilinear values (picture, n) of pictures (picture, h, w) at pixels (n, 2); 0 outside, also where these are NaN.
+    """Bilinear values (picture, n) of pictures (picture, h, w) at pixels (n, 2); 0
+    outside, also where these are NaN.
 
     Positions are the outer loop: where they lie in a picture is computed once for all pictures.
     """
@@ -17,7 +18,14 @@ def interpolate(images: Any, pixels: Any, out: Any) -> None:
     for k in range(len(pixels)):
         x = pixels[k, 0]
         y = pixels[k, 1]
-        if not (x >= 0 and x <= width and y >= 0 and y <= height and width > 0 and height > 0):
+        if not (
+            x >= 0
+            and x <= width
+            and y >= 0
+            and y <= height
+            and width > 0
+            and height > 0
+        ):
             out[:, k] = 0.0
             continue
         column = min(max(x - 0.5, 0.0), width - 1.0)

@@ -1,4 +1,6 @@
-"""Kernels of ingest: exposures to radiance, radiance to samples. A frame is read once, with the GIL released."""
+"""Kernels of ingest: exposures to radiance, radiance to samples. A frame is read once,
+with the GIL released.
+"""
 
 from __future__ import annotations
 
@@ -12,22 +14,30 @@ from numba.extending import intrinsic
 from skindb._compiled import inline_kernel, kernel
 from skindb.ingest.pixel_flags import DARK, DARK_SIGMA, OK, SATURATED
 
-# outcomes of a sample besides those of a pixel: usable, but no pixel has two exposures; no sample was requested
+# outcomes of a sample besides those of a pixel: usable, but no pixel has two exposures;
+# no sample was requested
 SINGLE = 3
 NONE = 4
 NAN_BITS = np.uint16(0x7E00)  # the half float NaN
 MAX_HALF_FLOAT = 65504.0  # larger numbers are infinite in half precision
 MIN_DARK_FRACTION = (
-    0.999  # fraction of dark pixels above which a sample is dark; the rest allows for rounding in the sum of weights
+    # fraction of dark pixels above which a sample is dark; the rest allows for rounding
+    # in the sum of weights
+    0.999
 )
-FOOTPRINT_REACH = 8.0  # where the weight (1 - q / FOOTPRINT_REACH)^2 ends; its second moments are those of exp(-q / 2)
-MIN_VARIANCE = np.float32(1e-30)  # of relative exposure; the weight 1 / variance stays finite
+# end of the weight (1 - q / FOOTPRINT_REACH)^2, whose second moments are those of a
+# Gaussian
+FOOTPRINT_REACH = 8.0
+# of relative exposure; the weight 1 / variance stays finite
+MIN_VARIANCE = np.float32(1e-30)
 ZERO = np.float32(0.0)
 ONE = np.float32(1.0)
 ENDLESS = np.float32(np.inf)
 NO_USABLE_EXPOSURE = np.float32(
     100.0
-)  # marks a channel that was saturated in every exposure; larger than any number of exposures
+    # marks a channel that was saturated in every exposure; larger than any number of
+    # exposures
+)
 
 
 @kernel
@@ -49,10 +59,12 @@ def develop(
     flag: Any,
     usable: Any,
 ) -> None:
-    """Merge the exposures of one view to radiance with the formulas of `skindb.ingest.radiance.merge_exposures`.
+    """Merge the exposures of one view to radiance with the formulas of
+    `skindb.ingest.radiance.merge_exposures`.
 
-    The picture is processed row by row, so that intermediate values stay in the cache. Loops have few branches and few
-    arrays: LLVM does not vectorise a loop for which it would have to compare more than eight pairs of addresses.
+    The picture is processed row by row, so that intermediate values stay in the cache.
+    Loops have few branches and few arrays: LLVM does not vectorise a loop for which it
+    would have to compare more than eight pairs of addresses.
 
     Parameters
     ----------
@@ -61,8 +73,8 @@ def develop(
     dark
         (e, h, w, 3) dark frames, which are subtracted; or an array without rows.
     curve
-        (m, 3, 2) float32 relative exposure and its read variance at value + offset; or (0, 3, 2) for a linear
-        response, (value - zero) / span with `variance`.
+        (m, 3, 2) float32 relative exposure and its read variance at value + offset; or
+        (0, 3, 2) for a linear response, (value - zero) / span with `variance`.
     offset, zero, span, variance
         See `curve`.
     white
@@ -78,7 +90,8 @@ def develop(
     spans
         (h, 2) first column of each row to process, and the one after the last.
     radiance
-        (h, w, 3) float32 output within the spans: NaN where a channel was saturated in every exposure.
+        (h, w, 3) float32 output within the spans: NaN where a channel was saturated in
+        every exposure.
     flag
         (h, w) uint8 output; SATURATED outside the spans, where no sample uses the pixel.
     usable
@@ -107,7 +120,11 @@ def develop(
             own = signal[e, :size]
             spread = noise[e, :size]
             if curve.shape[0]:
-                shade = dark[e, y].reshape(3 * width)[begin : begin + size] if dark.shape[0] else dark[:0, 0, 0, 0]
+                shade = (
+                    dark[e, y].reshape(3 * width)[begin : begin + size]
+                    if dark.shape[0]
+                    else dark[:0, 0, 0, 0]
+                )
                 _tabulated_response(value, shade, curve, offset, own, spread)
             else:
                 if dark.shape[0]:
@@ -116,7 +133,16 @@ def develop(
                 spread[:] = np.float32(variance)
             if usable.shape[0]:
                 _count(value, np.float32(white), own, spread, usable[y, first:last])
-            _collect(value, np.float32(white), own, spread, seconds[e], total[:size], time[:size], above[:size])
+            _collect(
+                value,
+                np.float32(white),
+                own,
+                spread,
+                seconds[e],
+                total[:size],
+                time[:size],
+                above[:size],
+            )
         for k in range(size):
             expected = total[k] / time[k]
             total[k] = np.float32(photon) * (expected if expected > ZERO else ZERO)
@@ -131,7 +157,9 @@ def _linear_response(value: Any, black: Any, slope: float, signal: Any) -> None:
 
 
 @kernel
-def _tabulated_response(value: Any, dark: Any, curve: Any, offset: int, signal: Any, noise: Any) -> None:
+def _tabulated_response(
+    value: Any, dark: Any, curve: Any, offset: int, signal: Any, noise: Any
+) -> None:
     """Relative exposure by a table; `dark` is empty if the table includes it."""
     for k in range(value.shape[0]):
         at = np.int64(value[k]) + offset - (np.int64(dark[k]) if dark.shape[0] else 0)
@@ -140,7 +168,9 @@ def _tabulated_response(value: Any, dark: Any, curve: Any, offset: int, signal: 
 
 @kernel
 def _count(value: Any, white: float, signal: Any, noise: Any, usable: Any) -> None:
-    """Count the exposure at pixels where a channel is above the noise and none is at the white level."""
+    """Count the exposure at pixels where a channel is above the noise and none is at
+    the white level.
+    """
     for x in range(usable.shape[0]):
         lit = 0
         white_channels = 0
@@ -152,9 +182,17 @@ def _count(value: Any, white: float, signal: Any, noise: Any, usable: Any) -> No
 
 @kernel
 def _collect(
-    value: Any, white: float, signal: Any, noise: Any, seconds: float, total: Any, time: Any, above: Any
+    value: Any,
+    white: float,
+    signal: Any,
+    noise: Any,
+    seconds: float,
+    total: Any,
+    time: Any,
+    above: Any,
 ) -> None:
-    """Accumulate sums over the exposures below the white level; at the white level the noise is infinite.
+    """Accumulate sums over the exposures below the white level; at the white level the
+    noise is infinite.
 
     `above` counts the exposures in which a value is above the noise.
     """
@@ -169,7 +207,9 @@ def _collect(
 
 @kernel
 def _average(signal: Any, noise: Any, seconds: Any, photons: Any, weights: Any) -> None:
-    """Write the inverse-variance weighted mean of the exposures to `photons`; 0 / 0 where none is usable."""
+    """Write the inverse-variance weighted mean of the exposures to `photons`; 0 / 0
+    where none is usable.
+    """
     weights[:] = ZERO
     mean = np.zeros_like(weights)
     for e in range(signal.shape[0]):
@@ -186,7 +226,17 @@ def _average(signal: Any, noise: Any, seconds: Any, photons: Any, weights: Any) 
 
 
 @kernel
-def _finish(y: int, first: int, value: Any, time: Any, above: Any, gain: Any, matrix: Any, out: Any, flag: Any) -> None:
+def _finish(
+    y: int,
+    first: int,
+    value: Any,
+    time: Any,
+    above: Any,
+    gain: Any,
+    matrix: Any,
+    out: Any,
+    flag: Any,
+) -> None:
     """Apply vignette and colour matrix to a row, and set its flags."""
     pixels = value.shape[0] // 3
     row = out[y, first : first + pixels].reshape(value.shape[0])
@@ -211,7 +261,9 @@ def _finish(y: int, first: int, value: Any, time: Any, above: Any, gain: Any, ma
         above[k] = NO_USABLE_EXPOSURE if time[k] == ZERO else min(above[k], ONE)
     for x in range(pixels):
         found = above[3 * x] + above[3 * x + 1] + above[3 * x + 2]
-        flag[y, first + x] = SATURATED if found >= NO_USABLE_EXPOSURE else DARK if found == ZERO else OK
+        flag[y, first + x] = (
+            SATURATED if found >= NO_USABLE_EXPOSURE else DARK if found == ZERO else OK
+        )
 
 
 @kernel
@@ -222,27 +274,44 @@ def pixel_spans(wanted: Any, pixels: Any, spread: Any, height: int, width: int) 
     for i in range(wanted.shape[0]):
         if wanted[i]:
             if spread.shape[0] and not np.isnan(spread[i, 0]):
-                left, right, top, bottom = _footprint_bounds(pixels[i, 0], pixels[i, 1], spread[i], height, width)
+                left, right, top, bottom = _footprint_bounds(
+                    pixels[i, 0], pixels[i, 1], spread[i], height, width
+                )
             else:
-                left, right, top, bottom = _bilinear_bounds(pixels[i, 0], pixels[i, 1], height, width)
+                left, right, top, bottom = _bilinear_bounds(
+                    pixels[i, 0], pixels[i, 1], height, width
+                )
             for row in range(top, bottom + 1):
-                spans[row, 0], spans[row, 1] = min(spans[row, 0], left), max(spans[row, 1], right + 1)
+                spans[row, 0], spans[row, 1] = (
+                    min(spans[row, 0], left),
+                    max(spans[row, 1], right + 1),
+                )
     return spans
 
 
 @kernel
 def _bilinear_bounds(column: float, row: float, height: int, width: int) -> Any:
-    """First and last column and row of the four pixels around a position; an empty range outside the picture."""
+    """First and last column and row of the four pixels around a position; an empty
+    range outside the picture.
+    """
     if not (column >= 0 and column <= width and row >= 0 and row <= height):
         return 0, -1, 0, -1
     left = int(max(column - 0.5, 0.0))
     top = int(max(row - 0.5, 0.0))
-    return min(left, width - 1), min(left + 1, width - 1), min(top, height - 1), min(top + 1, height - 1)
+    return (
+        min(left, width - 1),
+        min(left + 1, width - 1),
+        min(top, height - 1),
+        min(top + 1, height - 1),
+    )
 
 
 @kernel
-def _footprint_bounds(column: float, row: float, spread: Any, height: int, width: int) -> Any:
-    """First and last column and row of the pixels inside a footprint; an empty range if it leaves the picture.
+def _footprint_bounds(
+    column: float, row: float, spread: Any, height: int, width: int
+) -> Any:
+    """First and last column and row of the pixels inside a footprint; an empty range if
+    it leaves the picture.
 
     The mean over a part of a footprint would belong to another position.
     """
@@ -279,7 +348,8 @@ def gather(
     out: Any,
     outcome: Any,
 ) -> None:
-    """Reflectance rho = L d^2 / (I falloff fraction) of every surfel in one view (Weyrich et al. 2005, eq. 3).
+    """Reflectance rho = L d^2 / (I falloff fraction) of every surfel in one view
+    (Weyrich et al. 2005, eq. 3).
 
     Parameters
     ----------
@@ -288,21 +358,25 @@ def gather(
     wanted
         (n,) bool; surfels to sample. Those that face away from the light get no sample.
     light_fraction
-        (n,) float32 visible fraction of the light's disc, 0 for no sample; or (0,) if all of it is visible.
+        (n,) float32 visible fraction of the light's disc, 0 for no sample; or (0,) if
+        all of it is visible.
     pixels
         (n, 2) float32 projections.
     spread
-        (n, 3) float32 variances xx, xy, yy [px^2] of the footprint: weights (1 - q / 8)^2, where q is the squared
-        distance in units of these variances. NaN, or (0, 3), for bilinear interpolation.
+        (n, 3) float32 variances xx, xy, yy [px^2] of the footprint: weights (1 - q /
+        8)^2, where q is the squared distance in units of these variances. NaN, or (0,
+        3), for bilinear interpolation.
     position, normal
         (n, 3) float64 in mm, and unit vectors.
     light, axis, falloff, intensity
-        Position (3,) mm, axis (3,), exponent of the cosine to the axis, and intensity (3,) in radiance mm^2.
+        Position (3,) mm, axis (3,), exponent of the cosine to the axis, and intensity
+        (3,) in radiance mm^2.
     out
         (3, n) uint16 output: half floats, NaN where there is no sample.
     outcome
-        (n,) uint8 output: OK, SINGLE (no contributing pixel has two exposures), NONE, SATURATED (a contributing pixel
-        was saturated), DARK (all contributing pixels were dark).
+        (n,) uint8 output: OK, SINGLE (no contributing pixel has two exposures), NONE,
+        SATURATED (a contributing pixel was saturated), DARK (all contributing pixels
+        were dark).
     """
     found = np.empty(5)
     factor = 1.0 / intensity
@@ -313,7 +387,8 @@ def gather(
         x = position[i, 0] - light[0]
         y = position[i, 1] - light[1]
         z = position[i, 2] - light[2]
-        if not x * normal[i, 0] + y * normal[i, 1] + z * normal[i, 2] < 0:  # also rejects NaN
+        # also rejects NaN
+        if not x * normal[i, 0] + y * normal[i, 1] + z * normal[i, 2] < 0:
             continue
         scale = x * x + y * y + z * z
         if falloff:
@@ -324,7 +399,9 @@ def gather(
         if light_fraction.shape[0]:
             scale /= light_fraction[i]
         if spread.shape[0] and not np.isnan(spread[i, 0]):
-            state = _footprint(radiance, flag, usable, pixels[i, 0], pixels[i, 1], spread[i], found)
+            state = _footprint(
+                radiance, flag, usable, pixels[i, 0], pixels[i, 1], spread[i], found
+            )
         else:
             state = _bilinear(radiance, flag, usable, pixels[i, 0], pixels[i, 1], found)
         outcome[i] = SINGLE if state == OK and found[4] < 2.0 else state
@@ -332,12 +409,20 @@ def gather(
             r = found[0] * scale * factor[0]
             g = found[1] * scale * factor[1]
             b = found[2] * scale * factor[2]
-            out[0, i], out[1, i], out[2, i] = _half_or_nan(r), _half_or_nan(g), _half_or_nan(b)
+            out[0, i], out[1, i], out[2, i] = (
+                _half_or_nan(r),
+                _half_or_nan(g),
+                _half_or_nan(b),
+            )
 
 
 @kernel
-def pixel_counts(wanted: Any, pixels: Any, spread: Any, height: int, width: int, out: Any) -> None:
-    """Effective number of pixels (n,) that `gather` averages for each surfel; NaN where it takes no sample."""
+def pixel_counts(
+    wanted: Any, pixels: Any, spread: Any, height: int, width: int, out: Any
+) -> None:
+    """Effective number of pixels (n,) that `gather` averages for each surfel; NaN where
+    it takes no sample.
+    """
     out[:] = np.nan
     for i in range(wanted.shape[0]):
         if not wanted[i]:
@@ -353,11 +438,15 @@ def pixel_counts(wanted: Any, pixels: Any, spread: Any, height: int, width: int,
             y = min(max(row - 0.5, 0.0), height - 1.0)
             x = x - int(x)
             y = y - int(y)
-            out[i] = 1.0 / ((x * x + (1.0 - x) * (1.0 - x)) * (y * y + (1.0 - y) * (1.0 - y)))
+            out[i] = 1.0 / (
+                (x * x + (1.0 - x) * (1.0 - x)) * (y * y + (1.0 - y) * (1.0 - y))
+            )
 
 
 @kernel
-def _footprint_weights(column: float, row: float, spread: Any, height: int, width: int) -> tuple[float, float]:
+def _footprint_weights(
+    column: float, row: float, spread: Any, height: int, width: int
+) -> tuple[float, float]:
     """Sum of the weights of `_footprint`, and sum of their squares."""
     left, right, top, bottom = _footprint_bounds(column, row, spread, height, width)
     xx = float(spread[0])
@@ -379,7 +468,9 @@ def _footprint_weights(column: float, row: float, spread: Any, height: int, widt
 
 @kernel
 def tally(outcome: Any, counts: Any) -> int:
-    """Add the outcome of each surfel (n,) to its counts (state, n), SINGLE also to OK; return how many are usable."""
+    """Add the outcome of each surfel (n,) to its counts (state, n), SINGLE also to OK;
+    return how many are usable.
+    """
     usable = 0
     for i in range(outcome.shape[0]):
         if outcome[i] < counts.shape[0]:
@@ -390,8 +481,12 @@ def tally(outcome: Any, counts: Any) -> int:
 
 
 @kernel
-def _bilinear(radiance: Any, flag: Any, usable: Any, column: float, row: float, found: Any) -> int:
-    """Interpolate bilinearly between the four pixels around a position; the outer half pixel repeats the edge."""
+def _bilinear(
+    radiance: Any, flag: Any, usable: Any, column: float, row: float, found: Any
+) -> int:
+    """Interpolate bilinearly between the four pixels around a position; the outer half
+    pixel repeats the edge.
+    """
     height, width = flag.shape
     if not (column >= 0 and column <= width and row >= 0 and row <= height):
         return NONE
@@ -402,15 +497,31 @@ def _bilinear(radiance: Any, flag: Any, usable: Any, column: float, row: float, 
     found[:] = 0.0
     for down in range(2):
         for right in range(2):
-            weight = (x - left if right else 1.0 - (x - left)) * (y - top if down else 1.0 - (y - top))
+            weight = (x - left if right else 1.0 - (x - left)) * (
+                y - top if down else 1.0 - (y - top)
+            )
             # a neighbour of weight 0 may lie outside
-            if weight > 0 and _add(radiance, flag, usable, left + right, top + down, weight, found) == SATURATED:
+            if (
+                weight > 0
+                and _add(
+                    radiance, flag, usable, left + right, top + down, weight, found
+                )
+                == SATURATED
+            ):
                 return SATURATED
     return DARK if found[3] > MIN_DARK_FRACTION else OK
 
 
 @kernel
-def _footprint(radiance: Any, flag: Any, usable: Any, column: float, row: float, spread: Any, found: Any) -> int:
+def _footprint(
+    radiance: Any,
+    flag: Any,
+    usable: Any,
+    column: float,
+    row: float,
+    spread: Any,
+    found: Any,
+) -> int:
     """Weighted mean over an ellipse of pixels (Heckbert 1989, the elliptical weighted average)."""
     left, right, top, bottom = _footprint_bounds(column, row, spread, *flag.shape)
     xx = float(spread[0])
@@ -437,7 +548,9 @@ def _footprint(radiance: Any, flag: Any, usable: Any, column: float, row: float,
 
 
 @inline_kernel
-def _add(radiance: Any, flag: Any, usable: Any, u: int, v: int, weight: float, found: Any) -> int:
+def _add(
+    radiance: Any, flag: Any, usable: Any, u: int, v: int, weight: float, found: Any
+) -> int:
     """Add one pixel to a sample, and return the flag of the pixel."""
     state = flag[v, u]
     found[0] += weight * radiance[v, u, 0]
@@ -450,7 +563,9 @@ def _add(radiance: Any, flag: Any, usable: Any, u: int, v: int, weight: float, f
 
 @intrinsic
 def _half_bits(_typing: Any, number: Any) -> Any:
-    """Bits of the half float nearest to a double, by a CPU instruction that rounds to single precision first."""
+    """Bits of the half float nearest to a double, by a CPU instruction that rounds to
+    single precision first.
+    """
 
     def codegen(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
         single = builder.fptrunc(arguments[0], ir.FloatType())

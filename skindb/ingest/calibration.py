@@ -1,4 +1,6 @@
-"""Check of a calibration against the photographs: poses of the cameras, and positions of the lights by the shading."""
+"""Check of a calibration against the photographs: poses of the cameras, and positions
+of the lights by the shading.
+"""
 
 from __future__ import annotations
 
@@ -31,14 +33,21 @@ Array = NDArray[np.float64]
 Pair = tuple[int, int]  # light, camera
 LIGHTS_PER_CAMERA = 3  # those that illuminate the largest part of what the camera sees
 MAX_SURFELS = 4_000  # surfels that are compared: 4 mm apart on a head
-# mm; smaller scans, such as cropped ones, lack parts that cast shadows, and are shaded too evenly: measured agreements
-# are 0.1 to 0.9 for patches of up to 180 mm, and at least 0.77 for parts of faces of 240 mm
+# mm; smaller scans, such as cropped ones, lack parts that cast shadows, and are shaded
+# too evenly: measured agreements are 0.1 to 0.9 for patches of up to 180 mm, and at
+# least 0.77 for parts of faces of 240 mm
 MIN_DIAGONAL_MM = 200.0
 MIN_SURFELS = 150  # surfels in a usable view: a patch of 50 x 50 mm
-MIN_VARIATION = 0.1  # relative, of the square roots of the irradiance: evenly lit skin carries no information
-BLACK_FRACTION = 0.01  # of the median brightness of all views, relative to their irradiance
-MIN_SEEN_FRACTION = 0.1  # of the area that a camera sees under the light that illuminates most of it
-ALBEDO_ROUNDS = 2  # albedo and offsets improve each other; a third round changed offsets by less than 0.05 mm
+# relative, of the square roots of the irradiance: evenly lit skin carries no
+# information
+MIN_VARIATION = 0.1
+# of the median brightness of all views, relative to their irradiance
+BLACK_FRACTION = 0.01
+# of the area that a camera sees under the light that illuminates most of it
+MIN_SEEN_FRACTION = 0.1
+# albedo and offsets improve each other; a third round changed offsets by less than 0.05
+# mm
+ALBEDO_ROUNDS = 2
 MIN_AGREEMENT = 0.7  # correlation of the square roots of photograph and prediction
 MAX_OFFSET_MM = 10.0  # mm on the face, a tenth of a head's radius
 # gain in correlation, and correlation, from which another explanation is named
@@ -50,15 +59,18 @@ GOOD_AGREEMENT = 0.8
 class Calibration:
     """How well the photographs fit the calibration; NaN where too little is visible to decide."""
 
-    camera_agreement: Array  # (camera,) correlation of the square roots of photograph and prediction
+    # (camera,) correlation of the square roots of photograph and prediction
+    camera_agreement: Array
     camera_offset: Array  # (camera,) mm on the face
     camera_scale: Array  # (camera,) relative excess size of the face in the photographs
     light_agreement: Array  # (light,) correlation under this light
-    light_similar: NDArray[np.int64]  # (light,) the light with the most similar shading; -1: unknown
+    # (light,) the light with the most similar shading; -1: unknown
+    light_similar: NDArray[np.int64]
     light_similar_agreement: Array  # (light,) its correlation
     scan_translation: Array  # (3,) mm that would bring the scan to the photographs
     scan_rotation: Array  # (3,) degrees about x, y, z through the centre of the scan
-    camera_residual: Array  # (camera,) mm of the offset that the pose of the scan does not explain
+    # (camera,) mm of the offset that the pose of the scan does not explain
+    camera_residual: Array
     brightness: Brightness  # of the photographs, relative to a matte face
     explanations: Mapping[int, str]  # by camera, a likely cause of its mismatch
 
@@ -91,11 +103,21 @@ class CalibrationCheck:
         """The views to compare; empty for a patch of skin."""
         if np.linalg.norm(np.ptp(self.surfels.position, axis=0)) < MIN_DIAGONAL_MM:
             return frozenset()
-        area = np.stack([self._seen_area(camera) for camera in self.dome.cameras], axis=1) * self._clear
-        seen = (self.irradiance > 0) @ area  # (light, camera) mm2 that are lit and visible
-        pairs = {(int(j), c) for c in range(seen.shape[1]) for j in np.argsort(-seen[:, c])[:LIGHTS_PER_CAMERA]}
+        area = (
+            np.stack([self._seen_area(camera) for camera in self.dome.cameras], axis=1)
+            * self._clear
+        )
+        # (light, camera) mm2 that are lit and visible
+        seen = (self.irradiance > 0) @ area
+        pairs = {
+            (int(j), c)
+            for c in range(seen.shape[1])
+            for j in np.argsort(-seen[:, c])[:LIGHTS_PER_CAMERA]
+        }
         pairs |= {(j, int(seen[j].argmax())) for j in range(seen.shape[0])}
-        return frozenset(pair for pair in pairs if seen[pair] > MIN_SEEN_FRACTION * seen.max())
+        return frozenset(
+            pair for pair in pairs if seen[pair] > MIN_SEEN_FRACTION * seen.max()
+        )
 
     @cached_property
     def irradiance(self) -> Array:
@@ -105,7 +127,9 @@ class CalibrationCheck:
             square, falloff = light_falloff(light, self._position)
             way = light.position - self._position
             cosine = np.einsum("ni,ni->n", way, self._normal) / np.sqrt(square)
-            lit = np.maximum(cosine, 0) * self.light_visible[self.compared, j].astype(np.float64)
+            lit = np.maximum(cosine, 0) * self.light_visible[self.compared, j].astype(
+                np.float64
+            )
             rows.append(lit * falloff / square * self.intensity[j].mean())
         return np.array(rows)
 
@@ -119,16 +143,28 @@ class CalibrationCheck:
         offsets, albedo = self._offsets(views)
         agreement, offset, scale = np.full((3, len(self.dome.cameras)), np.nan)
         for c, one in offsets.items():
-            agreement[c], offset[c], scale[c] = one.agreement, one.length * self._mm(c), one.scale
+            agreement[c], offset[c], scale[c] = (
+                one.agreement,
+                one.length * self._mm(c),
+                one.scale,
+            )
         wrong = self._wrong(offsets)
         good = {c: one for c, one in offsets.items() if c not in wrong} or offsets
-        table = self._light_table([view for view in views if view.camera in good], offsets, albedo)
+        table = self._light_table(
+            [view for view in views if view.camera in good], offsets, albedo
+        )
         own = np.diagonal(table).copy()
         np.fill_diagonal(table, -1.0)
-        alike = np.where(np.isfinite(own), np.nan_to_num(table, nan=-1.0).argmax(axis=1), -1)
-        explanations = {c: self._explanation(c, views, offsets[c], albedo) for c in wrong}
+        alike = np.where(
+            np.isfinite(own), np.nan_to_num(table, nan=-1.0).argmax(axis=1), -1
+        )
+        explanations = {
+            c: self._explanation(c, views, offsets[c], albedo) for c in wrong
+        }
         pose = self._scan_pose(good)
-        brightness = self._brightness([view for view in views if view.camera in good], pictures, offsets, albedo)
+        brightness = self._brightness(
+            [view for view in views if view.camera in good], pictures, offsets, albedo
+        )
         return Calibration(
             agreement,
             offset,
@@ -141,7 +177,9 @@ class CalibrationCheck:
             {c: said for c, said in explanations.items() if said},
         )
 
-    def good_offsets(self, pictures: Mapping[Pair, NDArray[np.float32]]) -> dict[int, Offset]:
+    def good_offsets(
+        self, pictures: Mapping[Pair, NDArray[np.float32]]
+    ) -> dict[int, Offset]:
         """Offset of each camera whose photographs show the face near the scan."""
         offsets, _ = self._offsets(self._views(pictures))
         wrong = self._wrong(offsets)
@@ -160,7 +198,11 @@ class CalibrationCheck:
             pixels = moved_pixels(view, offsets[view.camera])
             colour = self.intensity[view.light] / self.intensity[view.light].mean()
             irradiance = self.irradiance[view.light][:, None] * colour
-            factors.append(view_factors(view, pictures[view.light, view.camera], pixels, irradiance, albedo))
+            factors.append(
+                view_factors(
+                    view, pictures[view.light, view.camera], pixels, irradiance, albedo
+                )
+            )
         lights = [view.light for view in views]
         cameras = [view.camera for view in views]
         shape = (len(self.dome.lights), len(self.dome.cameras))
@@ -191,27 +233,45 @@ class CalibrationCheck:
 
     def factor(self, camera: int) -> int:
         """Downsampling factor of a camera."""
-        return reduction(pixel_width(self.dome.cameras[camera], self.surfels.position.mean(axis=0)))
+        return reduction(
+            pixel_width(self.dome.cameras[camera], self.surfels.position.mean(axis=0))
+        )
 
     def _mm(self, camera: int) -> float:
         """Width [mm] of a downsampled pixel on the face."""
-        width = pixel_width(self.dome.cameras[camera], self.surfels.position.mean(axis=0))
+        width = pixel_width(
+            self.dome.cameras[camera], self.surfels.position.mean(axis=0)
+        )
         return self.factor(camera) * width
 
     def _seen(self, light: int, camera: int, image: NDArray[np.float32]) -> ReducedView:
-        pixels = self.pixels[self.compared, camera].astype(np.float64) / self.factor(camera)
-        return ReducedView(light, camera, square_root_image(image.mean(axis=2)), pixels, self._clear[:, camera])
+        pixels = self.pixels[self.compared, camera].astype(np.float64) / self.factor(
+            camera
+        )
+        return ReducedView(
+            light,
+            camera,
+            square_root_image(image.mean(axis=2)),
+            pixels,
+            self._clear[:, camera],
+        )
 
     def _views(self, pictures: Mapping[Pair, NDArray[np.float32]]) -> list[ReducedView]:
-        return self._usable([self._seen(j, c, image) for (j, c), image in sorted(pictures.items())])
+        return self._usable(
+            [self._seen(j, c, image) for (j, c), image in sorted(pictures.items())]
+        )
 
     def _usable(self, views: Iterable[ReducedView]) -> list[ReducedView]:
-        """Views with enough surfels of varying irradiance that are not black, as they are when a lamp fails."""
+        """Views with enough surfels of varying irradiance that are not black, as they
+        are when a lamp fails.
+        """
         kept = list[ReducedView]()
         bright = list[float]()
         for view in views:
             light = self.irradiance[view.light, view.clear]
-            if view.clear.sum() < MIN_SURFELS or np.std(np.sqrt(light)) < MIN_VARIATION * np.mean(np.sqrt(light)):
+            if view.clear.sum() < MIN_SURFELS or np.std(
+                np.sqrt(light)
+            ) < MIN_VARIATION * np.mean(np.sqrt(light)):
                 continue
             seen = bilinear(view.image, view.pixels[view.clear])
             kept.append(view)
@@ -229,8 +289,11 @@ class CalibrationCheck:
         for turn in range(ALBEDO_ROUNDS + 1):
             for c in cameras:
                 mine = [view for view in views if view.camera == c]
-                offsets[c] = camera_offset(mine, self.irradiance, albedo, search=turn in (0, ALBEDO_ROUNDS))
-            if turn < ALBEDO_ROUNDS:  # wrong photographs would produce an albedo that agrees with them
+                offsets[c] = camera_offset(
+                    mine, self.irradiance, albedo, search=turn in (0, ALBEDO_ROUNDS)
+                )
+            # wrong photographs would produce an albedo that agrees with them
+            if turn < ALBEDO_ROUNDS:
                 wrong = self._wrong(offsets)
                 good = [view for view in views if view.camera not in wrong]
                 albedo = surfel_albedo(good or views, self.irradiance, offsets)
@@ -238,21 +301,38 @@ class CalibrationCheck:
 
     def _wrong(self, offsets: Mapping[int, Offset]) -> list[int]:
         """Cameras whose photographs do not show the face where the scan is."""
-        return [c for c, x in offsets.items() if x.agreement < MIN_AGREEMENT or x.length * self._mm(c) > MAX_OFFSET_MM]
+        return [
+            c
+            for c, x in offsets.items()
+            if x.agreement < MIN_AGREEMENT or x.length * self._mm(c) > MAX_OFFSET_MM
+        ]
 
-    def _light_table(self, views: Sequence[ReducedView], offsets: Mapping[int, Offset], albedo: Array) -> Array:
-        """Correlation (light, light) of the best view under each light with the prediction for every light."""
+    def _light_table(
+        self, views: Sequence[ReducedView], offsets: Mapping[int, Offset], albedo: Array
+    ) -> Array:
+        """Correlation (light, light) of the best view under each light with the
+        prediction for every light.
+        """
         table = np.full((len(self.dome.lights),) * 2, np.nan)
         for view in views:
             at = view.clear
             seen = bilinear(view.image, moved_pixels(view, offsets[view.camera])[at])
-            row = np.array([correlation(seen, one) for one in np.sqrt(self.irradiance[:, at] * albedo[at])])
+            row = np.array(
+                [
+                    correlation(seen, one)
+                    for one in np.sqrt(self.irradiance[:, at] * albedo[at])
+                ]
+            )
             if not row[view.light] <= table[view.light, view.light]:
                 table[view.light] = row
         return table
 
-    def _explanation(self, camera: int, views: Sequence[ReducedView], found: Offset, albedo: Array) -> str:
-        """Exchange of pictures or parameters that explains the photographs of a camera; empty if none does."""
+    def _explanation(
+        self, camera: int, views: Sequence[ReducedView], found: Offset, albedo: Array
+    ) -> str:
+        """Exchange of pictures or parameters that explains the photographs of a camera;
+        empty if none does.
+        """
         mine = [view for view in views if view.camera == camera]
         best = max(found.agreement + BETTER_AGREEMENT, GOOD_AGREEMENT)
         said = ""
@@ -261,35 +341,65 @@ class CalibrationCheck:
             if clear.sum() < MIN_SURFELS:
                 continue
             offset = camera_offset(others, self.irradiance, albedo)
-            if offset.agreement > best and offset.length * self._mm(camera) < MAX_OFFSET_MM:
+            if (
+                offset.agreement > best
+                and offset.length * self._mm(camera) < MAX_OFFSET_MM
+            ):
                 best = offset.agreement
                 said = text
         return said
 
     def _alternatives(self, c: int) -> Iterator[tuple[str, Array, NDArray[np.bool_]]]:
-        """Possible exchanges, each with the pixels (n, 2) and the visibility (n,) of the surfels that it implies."""
+        """Possible exchanges, each with the pixels (n, 2) and the visibility (n,) of
+        the surfels that it implies.
+        """
         camera = self.dome.cameras[c]
         factor = self.factor(c)
         pixels = self.pixels[self.compared, c].astype(np.float64) / factor
         clear = self._clear[:, c]
         size = np.array([camera.width, camera.height]) / factor
         yield "they look upside down", size - pixels, clear
-        yield "they look mirrored", np.stack([size[0] - pixels[:, 0], pixels[:, 1]], axis=1), clear
-        yield "they look mirrored top to bottom", np.stack([pixels[:, 0], size[1] - pixels[:, 1]], axis=1), clear
+        yield (
+            "they look mirrored",
+            np.stack([size[0] - pixels[:, 0], pixels[:, 1]], axis=1),
+            clear,
+        )
+        yield (
+            "they look mirrored top to bottom",
+            np.stack([pixels[:, 0], size[1] - pixels[:, 1]], axis=1),
+            clear,
+        )
         for k, other in enumerate(self.dome.cameras):
             if k != c and (other.width, other.height) == (camera.width, camera.height):
                 theirs = self.pixels[self.compared, k].astype(np.float64) / factor
-                yield f"they look as if camera {other.id} had taken them", theirs, self._clear[:, k]
+                yield (
+                    f"they look as if camera {other.id} had taken them",
+                    theirs,
+                    self._clear[:, k],
+                )
         middle = camera.K[:2, 2] / factor
-        yield "the focal length looks twice too long", middle + (pixels - middle) / 2, clear
-        yield "the focal length looks half of what it should be", middle + (pixels - middle) * 2, clear
+        yield (
+            "the focal length looks twice too long",
+            middle + (pixels - middle) / 2,
+            clear,
+        )
+        yield (
+            "the focal length looks half of what it should be",
+            middle + (pixels - middle) * 2,
+            clear,
+        )
         turned = replace(camera, R=camera.R.T)
-        there, depth = project(self._position, turned.K, turned.R, turned.t, turned.distortion)
-        faces = (self._seen_area(turned) > 0) & (depth > 0) & np.isfinite(there).all(axis=1)
+        there, depth = project(
+            self._position, turned.K, turned.R, turned.t, turned.distortion
+        )
+        faces = (
+            (self._seen_area(turned) > 0) & (depth > 0) & np.isfinite(there).all(axis=1)
+        )
         yield "R looks transposed", np.nan_to_num(there / factor, nan=-1.0), faces
 
     def _scan_pose(self, offsets: Mapping[int, Offset]) -> tuple[Array, Array, Array]:
-        """Translation [mm] and rotation [degrees] of the scan about its centre that fit best, and the residuals.
+        """Translation [mm] and rotation [degrees] of the scan about its centre that fit
+        best, and the residuals.
 
         They are a least-squares fit to the displacements of 200 surfels in each picture.
         """
@@ -297,7 +407,9 @@ class CalibrationCheck:
         if not offsets:
             return np.full(3, np.nan), np.full(3, np.nan), left
         rows = {c: self._pose_rows(c, one) for c, one in offsets.items()}
-        matrix, right = (np.concatenate([pair[i] for pair in rows.values()]) for i in (0, 1))
+        matrix, right = (
+            np.concatenate([pair[i] for pair in rows.values()]) for i in (0, 1)
+        )
         x = np.linalg.lstsq(matrix, right, rcond=None)[0]
         for c, (slopes, moves) in rows.items():
             residual = (moves - slopes @ x).reshape(-1, 2)
@@ -305,7 +417,9 @@ class CalibrationCheck:
         return x[:3], np.degrees(x[3:]), left
 
     def _pose_rows(self, c: int, offset: Offset) -> tuple[Array, Array]:
-        """Derivatives (2 m, 6) of m pixels by translation [mm] and rotation [rad], and displacements (2 m,)."""
+        """Derivatives (2 m, 6) of m pixels by translation [mm] and rotation [rad], and
+        displacements (2 m,).
+        """
         camera = self.dome.cameras[c]
         middle = self.surfels.position.mean(axis=0)
         at = np.flatnonzero(self._clear[:, c])
@@ -315,11 +429,21 @@ class CalibrationCheck:
         steps += [np.cross(axis, points - middle) for axis in np.eye(3)]
 
         def pixels(places: Array) -> Array:
-            return project(places, camera.K, camera.R, camera.t, camera.distortion)[0] / self.factor(c)
+            return project(places, camera.K, camera.R, camera.t, camera.distortion)[
+                0
+            ] / self.factor(c)
 
         small = 1e-3
-        slopes = np.stack([(pixels(points + small * step) - pixels(points)) / small for step in steps], axis=-1)
-        return slopes.reshape(-1, 6), offset.moves(self.pixels[self.compared, c][at] / self.factor(c)).ravel()
+        slopes = np.stack(
+            [
+                (pixels(points + small * step) - pixels(points)) / small
+                for step in steps
+            ],
+            axis=-1,
+        )
+        return slopes.reshape(-1, 6), offset.moves(
+            self.pixels[self.compared, c][at] / self.factor(c)
+        ).ravel()
 
 
 def pixel_width(camera: CameraRecord, point: Array) -> float:

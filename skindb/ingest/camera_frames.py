@@ -1,4 +1,6 @@
-"""`dome/calibration.json` of a set-up: the frames from which its cameras and light positions are calibrated."""
+"""`dome/calibration.json` of a set-up: the frames from which its cameras and light
+positions are calibrated.
+"""
 
 from __future__ import annotations
 
@@ -32,8 +34,8 @@ BRACKETED = ("response", "flat", "chart", "edge")  # kinds that need the key exp
 class CameraFrames:
     """Templates of the frames of one kind, and where its target lies in each camera.
 
-    `places` are, by camera, the centres (24, 2) of the patches of a chart or the corners (2, 2) of the region of an
-    edge: column and row in px.
+    `places` are, by camera, the centres (24, 2) of the patches of a chart or the
+    corners (2, 2) of the region of an edge: column and row in px.
     """
 
     frames: str
@@ -67,17 +69,25 @@ class CalibrationFrames:
     ball: BallFrames | None
 
     def read(
-        self, template: str, camera: CameraRecord, exposures: Sequence[str] = ("",), repeats: int = 1
+        self,
+        template: str,
+        camera: CameraRecord,
+        exposures: Sequence[str] = ("",),
+        repeats: int = 1,
     ) -> list[list[Frame]]:
         """Read the frames: the repeats of each exposure.
 
         Raises
         ------
         InputError
-            With every frame that is missing, damaged, or of another size or depth than the camera's.
+            With every frame that is missing, damaged, or of another size or depth than
+            the camera's.
         """
         names = product(exposures, range(1, repeats + 1))
-        paths = [self.folder / filled(template, camera=camera.id, exposure=e, repeat=str(r)) for e, r in names]
+        paths = [
+            self.folder / filled(template, camera=camera.id, exposure=e, repeat=str(r))
+            for e, r in names
+        ]
         frames = read_frames(paths, camera.sensor.kind)
         return [frames[i * repeats : (i + 1) * repeats] for i in range(len(exposures))]
 
@@ -106,7 +116,11 @@ def read_calibration_frames(dome: DomeRecord) -> CalibrationFrames | None:
     bracketed = [kind for kind in BRACKETED if fields.data.get(kind) is not None]
     exposures = {
         item.text("id", rule=IDENTIFIER): item.number("seconds", least=least, most=most)
-        for item in (fields.items("exposures", most=MAX_EXPOSURES) if bracketed or "exposures" in fields.data else ())
+        for item in (
+            fields.items("exposures", most=MAX_EXPOSURES)
+            if bracketed or "exposures" in fields.data
+            else ()
+        )
     }
     read = _Reader(dome, fields)
     found = CalibrationFrames(
@@ -121,8 +135,17 @@ def read_calibration_frames(dome: DomeRecord) -> CalibrationFrames | None:
         ball=read_ball(dome, fields),
     )
     if unknown := fields.unknown():
-        rule = "its keys are exposures, dark, response, flat, chart, edge, points and ball"
-        faults.append(Fault(str(file), rule, ", ".join(unknown), "correct the name, or remove the key"))
+        rule = (
+            "its keys are exposures, dark, response, flat, chart, edge, points and ball"
+        )
+        faults.append(
+            Fault(
+                str(file),
+                rule,
+                ", ".join(unknown),
+                "correct the name, or remove the key",
+            )
+        )
     if faults:
         raise InputError(faults)
     return found
@@ -151,10 +174,14 @@ class _Reader:
         template = self._template(item, "frames", needed)
         return CameraFrames(
             template,
-            item.integer("repeats", least=least_repeats, most=MAX_REPEATS) if least_repeats else 1,
+            item.integer("repeats", least=least_repeats, most=MAX_REPEATS)
+            if least_repeats
+            else 1,
             self._template(item, "white", needed) if key == "chart" else "",
             item.number("radius", above=0.0) if key == "chart" else 0.0,
-            item.number("contrast", least=0.0, most=0.9, default=0.0) if key == "edge" else 0.0,
+            item.number("contrast", least=0.0, most=0.9, default=0.0)
+            if key == "edge"
+            else 0.0,
             None if target is None else self._places(item, *target),
         )
 
@@ -162,19 +189,35 @@ class _Reader:
         template = item.template(key, needed, set())
         if template:
             names = {CAMERA: self.dome.cameras[0].id, EXPOSURE: "e", REPEAT: "1"}
-            inside(self.dome.folder, filled(template, **names), item.place(key), item.faults)
+            inside(
+                self.dome.folder,
+                filled(template, **names),
+                item.place(key),
+                item.faults,
+            )
         return template
 
-    def _places(self, item: Fields, key: str, shape: tuple[int, int]) -> dict[str, NDArray[np.float64]]:
+    def _places(
+        self, item: Fields, key: str, shape: tuple[int, int]
+    ) -> dict[str, NDArray[np.float64]]:
         """Position of the target in the picture of every camera."""
         given = Fields(item.get(key, {}), item.place(key), item.faults)
-        places = {camera.id: given.array(camera.id, shape, default=None) for camera in self.dome.cameras}
-        sizes = {camera.id: (camera.width, camera.height) for camera in self.dome.cameras}
+        places = {
+            camera.id: given.array(camera.id, shape, default=None)
+            for camera in self.dome.cameras
+        }
+        sizes = {
+            camera.id: (camera.width, camera.height) for camera in self.dome.cameras
+        }
         for name in sorted(set(given.data) - set(places)):
             given.fault(name, "must be a camera of the dome", shown(name))
         for name in set(given.data) & set(places):
             if (places[name] < 0).any() or (places[name] > sizes[name]).any():
-                given.fault(name, "must lie inside the picture of the camera", shown(places[name]))
+                given.fault(
+                    name,
+                    "must lie inside the picture of the camera",
+                    shown(places[name]),
+                )
         return {name: place for name, place in places.items() if name in given.data}
 
 
@@ -200,7 +243,10 @@ def _known_points(dome: DomeRecord, fields: Fields) -> dict[str, KnownPoints]:
             pixels.fault(name, "must be one of the points in positions", shown(name))
         both = [name for name in pixel if name in position]
         if both:
-            found[camera] = KnownPoints(np.array([position[n] for n in both]), np.array([pixel[n] for n in both]))
+            found[camera] = KnownPoints(
+                np.array([position[n] for n in both]),
+                np.array([pixel[n] for n in both]),
+            )
     return found
 
 

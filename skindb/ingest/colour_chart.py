@@ -10,16 +10,19 @@ from numpy.typing import ArrayLike, NDArray
 from skindb.errors import Fault, InputError
 
 Array = NDArray[np.float64]
-CHART = "ColorChecker24 - After November 2014"  # the manufacturer's reference values, as in colour-science
-MIN_PATCHES = 9  # usable patches for nine unknowns; three channels leave residuals for the standard error
+# the manufacturer's reference values, as in colour-science
+CHART = "ColorChecker24 - After November 2014"
+# usable patches for nine unknowns; three channels leave residuals for the standard
+# error
+MIN_PATCHES = 9
 
 
 @dataclass(frozen=True)
 class ColourFit:
     """Colour matrix of the capture format, and CIEDE2000 differences (patch,) before and after it.
 
-    `error` (3, 3) is the standard error of the matrix by the scatter of the patches. A patch that is not used has a
-    NaN in the differences.
+    `error` (3, 3) is the standard error of the matrix by the scatter of the patches. A
+    patch that is not used has a NaN in the differences.
     """
 
     matrix: Array
@@ -29,24 +32,34 @@ class ColourFit:
 
 
 def chart_reference() -> Array:
-    """Linear sRGB (24, 3) of the ColorChecker under D65, row by row, by chromatic adaptation from D50."""
+    """Linear sRGB (24, 3) of the ColorChecker under D65, row by row, by chromatic
+    adaptation from D50.
+    """
     import colour  # takes longer to import than the rest of the ingest
 
     chart = colour.CCS_COLOURCHECKERS[CHART]
     tristimulus = colour.xyY_to_XYZ(np.array(list(chart.data.values())))
-    return np.asarray(colour.XYZ_to_sRGB(tristimulus, illuminant=chart.illuminant, apply_cctf_encoding=False))
+    return np.asarray(
+        colour.XYZ_to_sRGB(
+            tristimulus, illuminant=chart.illuminant, apply_cctf_encoding=False
+        )
+    )
 
 
-def fit_colour_matrix(patches: ArrayLike, reference: ArrayLike | None = None) -> ColourFit:
-    """Matrix that takes linear camera values to linear sRGB, by least squares over the patches (Cheung et al. 2004).
+def fit_colour_matrix(
+    patches: ArrayLike, reference: ArrayLike | None = None
+) -> ColourFit:
+    """Matrix that takes linear camera values to linear sRGB, by least squares over the
+    patches (Cheung et al. 2004).
 
-    The green of the white patch keeps its value, so that the unit of radiance stays that of the white target.
+    The green of the white patch keeps its value, so that the unit of radiance stays
+    that of the white target.
 
     Parameters
     ----------
     patches
-        (patch, 3) mean radiance of each patch over that of a white surface in its place, so that uneven light is
-        divided out; NaN where a patch was saturated.
+        (patch, 3) mean radiance of each patch over that of a white surface in its
+        place, so that uneven light is divided out; NaN where a patch was saturated.
     reference
         (patch, 3) linear sRGB; default `chart_reference()`. The brightest patch is the white one.
 
@@ -56,17 +69,31 @@ def fit_colour_matrix(patches: ArrayLike, reference: ArrayLike | None = None) ->
         Wrong shapes, too few usable patches, an unusable white patch, or patches of one colour.
     """
     values = np.asarray(patches, np.float64)
-    target = chart_reference() if reference is None else np.asarray(reference, np.float64)
+    target = (
+        chart_reference() if reference is None else np.asarray(reference, np.float64)
+    )
     if values.shape != target.shape or values.shape[1:] != (3,):
         rule = "its values must have the shape (patch, 3) of the reference"
         cure = "give the patches row by row"
-        raise InputError(Fault("colour chart", rule, f"{values.shape} and {target.shape}", cure))
+        raise InputError(
+            Fault("colour chart", rule, f"{values.shape} and {target.shape}", cure)
+        )
     good: NDArray[np.bool_] = np.asarray(np.isfinite(values).all(axis=1))
     white = int(target.sum(axis=1).argmax())
     usable = good.sum() >= MIN_PATCHES and good[white] and values[white, 1] > 0
     if not usable or np.linalg.cond(values[good]) > 1e4:
-        rule = f"{MIN_PATCHES} patches of different colours must be usable, the white one among them"
-        raise InputError(Fault("colour chart", rule, f"{int(good.sum())} usable patches", "expose the chart shorter"))
+        rule = (
+            f"{MIN_PATCHES} patches of different colours must be usable, the white one "
+            "among them"
+        )
+        raise InputError(
+            Fault(
+                "colour chart",
+                rule,
+                f"{int(good.sum())} usable patches",
+                "expose the chart shorter",
+            )
+        )
     scale = target[white, 1] / values[white, 1]
     camera = values[good] * scale
     solution, *_ = np.linalg.lstsq(camera, target[good], rcond=None)
@@ -85,5 +112,8 @@ def _difference(found: Array, expected: Array) -> Array:
     """CIEDE2000 (n,) between linear sRGB colours (n, 3)."""
     import colour
 
-    lab = [colour.XYZ_to_Lab(colour.sRGB_to_XYZ(c, apply_cctf_decoding=False)) for c in (found, expected)]
+    lab = [
+        colour.XYZ_to_Lab(colour.sRGB_to_XYZ(c, apply_cctf_decoding=False))
+        for c in (found, expected)
+    ]
     return np.asarray(colour.delta_E(*lab, method="CIE 2000"))

@@ -24,9 +24,13 @@ def parsed_crop(value: Any, where: str) -> Crop:
     InputError
         If it is not that, or its corners are exchanged.
     """
-    if not isinstance(value, dict) or not (is_point(value.get("low")) and is_point(value.get("high"))):
+    if not isinstance(value, dict) or not (
+        is_point(value.get("low")) and is_point(value.get("high"))
+    ):
         rule = 'a crop box must be {"low": [x, y, z], "high": [x, y, z]} in mm'
-        raise InputError(Fault(where, rule, str(value)[:80], "correct it, or remove the file"))
+        raise InputError(
+            Fault(where, rule, str(value)[:80], "correct it, or remove the file")
+        )
     low, high = (tuple(map(float, value[corner])) for corner in ("low", "high"))
     return Crop((low[0], low[1], low[2]), (high[0], high[1], high[2]))
 
@@ -34,4 +38,7 @@ def parsed_crop(value: Any, where: str) -> Crop:
 def is_point(value: Any) -> bool:
     """Whether JSON holds three finite numbers."""
     sound = isinstance(value, list) and len(value) == 3
-    return sound and all(type(x) in (int, float) and abs(x) < MAX_COORDINATE_MM for x in value)  # not NaN either
+    # not NaN either
+    return sound and all(
+        type(x) in (int, float) and abs(x) < MAX_COORDINATE_MM for x in value
+    )

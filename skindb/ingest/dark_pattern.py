@@ -1,7 +1,8 @@
-"""Check of dark frames by the fixed pattern of the sensor, which they share with the dark parts of photographs.
+"""Check of dark frames by the fixed pattern of the sensor, which they share with the
+dark parts of photographs.
 
-The pattern differs from pixel to pixel, so that even a small part of it shows whether dark frames are turned, mirrored,
-or of another camera.
+The pattern differs from pixel to pixel, so that even a small part of it shows whether
+dark frames are turned, mirrored, or of another camera.
 """
 
 from __future__ import annotations
@@ -17,18 +18,26 @@ from skindb.ingest.frames import Frame, read_frame
 from skindb.ingest.radiance import FrameMerger
 
 Array = NDArray[np.float32]
-MAX_PHOTOGRAPHS = 12  # of a camera that are averaged; more reduce noise that is already below the pattern
+# of a camera that are averaged; more reduce noise that is already below the pattern
+MAX_PHOTOGRAPHS = 12
 MAX_PIXELS = 250_000  # in whole rows, evenly spread over the picture
 MIN_PIXELS = 1_000
-DARK_QUANTILE = 0.25  # of the pixels, by their mean value: the noise of light hides the pattern in the others
-MAX_DEVIATIONS = 3.0  # robust standard deviations, beyond which hot pixels and edges are clipped
-MIN_CORRELATION = 6.0  # standard deviations of the correlations with shifted frames, which are unrelated
+# of the pixels, by their mean value: the noise of light hides the pattern in the others
+DARK_QUANTILE = 0.25
+# robust standard deviations, beyond which hot pixels and edges are clipped
+MAX_DEVIATIONS = 3.0
+# standard deviations of the correlations with shifted frames, which are unrelated
+MIN_CORRELATION = 6.0
 SHIFTS = 16
-MIN_CORRELATION_RATIO = 2.0  # to the correlation as given; a pattern of columns is the same upside down
+# to the correlation as given; a pattern of columns is the same upside down
+MIN_CORRELATION_RATIO = 2.0
 
 
-def dark_pattern_fault(dome: DomeRecord, camera: str, mergers: Mapping[str, FrameMerger]) -> Fault | None:
-    """Fault of the dark frames of a camera that match its photographs only turned, or those of another camera.
+def dark_pattern_fault(
+    dome: DomeRecord, camera: str, mergers: Mapping[str, FrameMerger]
+) -> Fault | None:
+    """Fault of the dark frames of a camera that match its photographs only turned, or
+    those of another camera.
 
     Compared is the shortest exposure, in which the least light hides the pattern.
 
@@ -41,12 +50,19 @@ def dark_pattern_fault(dome: DomeRecord, camera: str, mergers: Mapping[str, Fram
     shortest = int(np.argmin(merger.seconds))
     if merger.dark is None:
         return None
-    step = -(-merger.dark[shortest].shape[0] * merger.dark[shortest].shape[1] // MAX_PIXELS)
+    step = -(
+        -merger.dark[shortest].shape[0] * merger.dark[shortest].shape[1] // MAX_PIXELS
+    )
     lights = dome.lights[:: -(-len(dome.lights) // MAX_PHOTOGRAPHS)]
     exposure = [*dome.exposures][shortest]
     kind = merger.camera.sensor.kind
-    photographs = (read_frame(dome.frame(light.id, camera, exposure), kind)[::step] for light in lights)
-    mean = np.mean([photograph.astype(np.float32) for photograph in photographs], axis=0)
+    photographs = (
+        read_frame(dome.frame(light.id, camera, exposure), kind)[::step]
+        for light in lights
+    )
+    mean = np.mean(
+        [photograph.astype(np.float32) for photograph in photographs], axis=0
+    )
     inner = mean[:, 1:-1]
     dark = inner <= np.quantile(inner, DARK_QUANTILE)
     if dark.sum() < MIN_PIXELS:
@@ -62,13 +78,20 @@ def dark_pattern_fault(dome: DomeRecord, camera: str, mergers: Mapping[str, Fram
     for said, frame in _alternatives(camera, mergers, shortest):
         if _correlation(pattern, _pattern(frame[::step], dark)) > least:
             rule = "dark frames must show the pattern of the sensor where the photographs show it"
-            cure = "write them like the photographs: in the same orientation, under the id of their camera"
+            cure = (
+                "write them like the photographs: in the same orientation, under the "
+                "id of their camera"
+            )
             return Fault(f"{dome.file}[dark]", rule, f"camera {camera}: {said}", cure)
     return None
 
 
-def _alternatives(camera: str, mergers: Mapping[str, FrameMerger], exposure: int) -> Iterator[tuple[str, Frame]]:
-    """What the dark frames of a camera may be instead, each with the frame that would then be the right one."""
+def _alternatives(
+    camera: str, mergers: Mapping[str, FrameMerger], exposure: int
+) -> Iterator[tuple[str, Frame]]:
+    """What the dark frames of a camera may be instead, each with the frame that would
+    then be the right one.
+    """
     own = mergers[camera].dark
     assert own is not None
     yield "they look upside down", own[exposure][::-1, ::-1]
@@ -80,7 +103,9 @@ def _alternatives(camera: str, mergers: Mapping[str, FrameMerger], exposure: int
 
 
 def _pattern(frame: Frame | Array, chosen: NDArray[np.bool_]) -> Array:
-    """Differences (n,) of chosen values (h, w - 2, 3) from both neighbours in their row, without outliers."""
+    """Differences (n,) of chosen values (h, w - 2, 3) from both neighbours in their
+    row, without outliers.
+    """
     values = frame.astype(np.float32)
     difference = (values[:, 1:-1] - (values[:, :-2] + values[:, 2:]) / 2)[chosen]
     limit = MAX_DEVIATIONS * 1.4826 * np.median(np.abs(difference))

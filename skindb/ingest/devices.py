@@ -43,7 +43,8 @@ from skindb.ingest.sequence import SequenceRecord, read_sequence
 
 Array = NDArray[np.float64]
 ROTATION_TOLERANCE = 1e-4  # of R R^T - 1: five digits in the file
-VIGNETTE_STEPS = 1000  # radii from the centre to a corner at which the gain of a lens is checked
+# radii from the centre to a corner at which the gain of a lens is checked
+VIGNETTE_STEPS = 1000
 GAIN_ERROR = 0.005  # relative error of a fibre's gain, where the file does not state it
 EXPOSURE = "exposure"
 LIGHT = "light"
@@ -111,10 +112,14 @@ class DomeRecord:
         """Number of frames of the face."""
         return len(self.cameras) * len(self.lights) * len(self.exposures)
 
-    def frame(self, light: str, camera: str, exposure: str, *, white: bool = False) -> Path:
+    def frame(
+        self, light: str, camera: str, exposure: str, *, white: bool = False
+    ) -> Path:
         """File of a frame."""
         template = self.white.frames if white and self.white else self.frames
-        return self.folder / filled(template, exposure=exposure, light=light, camera=camera)
+        return self.folder / filled(
+            template, exposure=exposure, light=light, camera=camera
+        )
 
 
 @dataclass(frozen=True)
@@ -123,7 +128,8 @@ class ProbeRecord:
 
     folder: Path
     sites: tuple[str, ...]
-    placements: Mapping[str, tuple[str, ...]]  # names of the placements at each site; ("",) for a single one
+    # names of the placements at each site; ("",) for a single one
+    placements: Mapping[str, tuple[str, ...]]
     distance: Array  # (fibre,) mm
     azimuth: Array  # (fibre,) degrees about the source fibre; NaN if unknown
     centre: Array  # (fibre, 2) px
@@ -141,7 +147,9 @@ class ProbeRecord:
 
     def frame(self, site: str, exposure: str, placement: str = "") -> Path:
         """File of a frame."""
-        return self.folder / filled(self.frames, site=site, exposure=exposure, placement=placement)
+        return self.folder / filled(
+            self.frames, site=site, exposure=exposure, placement=placement
+        )
 
     def frame_files(self) -> Iterator[Path]:
         """Files of all frames."""
@@ -158,30 +166,65 @@ def filled(template: str, **names: str) -> str:
 
 
 def read_dome(
-    folder: Path, fields: Fields, version: int = 2, *, calibrated: bool = False, face: bool = True
+    folder: Path,
+    fields: Fields,
+    version: int = 2,
+    *,
+    calibrated: bool = False,
+    face: bool = True,
 ) -> DomeRecord:
-    """The dome of `dome.json`; its faults, and those of the headers of its frames, are recorded in `fields`.
+    """The dome of `dome.json`; its faults, and those of the headers of its frames, are
+    recorded in `fields`.
 
-    If it is `calibrated`, a calibration provides the intensities; without `face` it is a set-up without face frames.
+    If it is `calibrated`, a calibration provides the intensities; without `face` it is
+    a set-up without face frames.
     """
     exposures = _exposures(fields)
     several = {EXPOSURE} if len(exposures) > 1 else set()
-    frames = fields.template("frames", {LIGHT, CAMERA} | several, {EXPOSURE}) if face else ""
+    frames = (
+        fields.template("frames", {LIGHT, CAMERA} | several, {EXPOSURE}) if face else ""
+    )
     target = fields.get("white", None)
-    linear = is_linear(frames or (str(target.get("frames", "")) if isinstance(target, dict) else ""))
+    linear = is_linear(
+        frames or (str(target.get("frames", "")) if isinstance(target, dict) else "")
+    )
     if linear:
         _require_merged(fields, exposures)
-    cameras = tuple(_camera(folder, item, linear=linear) for item in fields.items("cameras", most=MAX_CAMERAS))
+    cameras = tuple(
+        _camera(folder, item, linear=linear)
+        for item in fields.items("cameras", most=MAX_CAMERAS)
+    )
     lights = tuple(_light(item) for item in fields.items("lights", most=MAX_LIGHTS))
     dark = fields.template("dark", {CAMERA} | several, {EXPOSURE}, default=None) or None
     white = _white(fields, {c.id for c in cameras}, several)
-    if white is None and not calibrated and (unknown := [light.id for light in lights if light.intensity is None]):
+    if (
+        white is None
+        and not calibrated
+        and (unknown := [light.id for light in lights if light.intensity is None])
+    ):
         found = f"{len(unknown)} lights without intensity, first {unknown[0]}"
-        fields.fault("white", "lights need an intensity or a white target", found, "measure one of them")
+        fields.fault(
+            "white",
+            "lights need an intensity or a white target",
+            found,
+            "measure one of them",
+        )
     # version 1 keeps the sequence as an unchecked attribute
-    order = read_sequence(fields, [light.id for light in lights], exposures) if version > 1 else None
+    order = (
+        read_sequence(fields, [light.id for light in lights], exposures)
+        if version > 1
+        else None
+    )
     dome = DomeRecord(
-        folder, cameras, lights, exposures, frames, None if linear else dark, white, Path(fields.where), order
+        folder,
+        cameras,
+        lights,
+        exposures,
+        frames,
+        None if linear else dark,
+        white,
+        Path(fields.where),
+        order,
     )
     _check_frames(dome, fields)
     return dome
@@ -195,7 +238,9 @@ def read_probe(folder: Path, fields: Fields) -> ProbeRecord:
     several = {EXPOSURE} if len(exposures) > 1 else set()
     sites = fields.names("sites", most=MAX_SITES)
     placements = _placements(fields, sites)
-    several |= {PLACEMENT} if any(len(own) > 1 for own in placements.values()) else set()
+    several |= (
+        {PLACEMENT} if any(len(own) > 1 for own in placements.values()) else set()
+    )
     frames = fields.template("frames", {SITE} | several, {EXPOSURE, PLACEMENT})
     if is_linear(frames):
         _require_merged(fields, exposures)
@@ -206,51 +251,80 @@ def read_probe(folder: Path, fields: Fields) -> ProbeRecord:
         placements=placements,
         azimuth=np.array([_azimuth(fibre) for fibre in fibres]),
         distance=np.array([fibre.number("distance", above=0.0) for fibre in fibres]),
-        centre=np.array([fibre.array("centre", (2,)) for fibre in fibres]).reshape(-1, 2),
+        centre=np.array([fibre.array("centre", (2,)) for fibre in fibres]).reshape(
+            -1, 2
+        ),
         radius=np.array([fibre.number("radius", above=0.0) for fibre in fibres]),
         exposures=exposures,
         frames=frames,
         gain=fields.gains("gain", len(fibres)),
-        gain_error=fields.number("gain_error", default=GAIN_ERROR, least=0.0, most=MAX_GAIN_ERROR),
-        face=fields.number("fibre_radius", default=0.0, least=0.0, most=MAX_FIBRE_RADIUS_MM),
+        gain_error=fields.number(
+            "gain_error", default=GAIN_ERROR, least=0.0, most=MAX_GAIN_ERROR
+        ),
+        face=fields.number(
+            "fibre_radius", default=0.0, least=0.0, most=MAX_FIBRE_RADIUS_MM
+        ),
         scale=None if scale is None else fields.number("scale", above=0.0),
-        sensor=read_sensor(folder, fields, FrameKind(0, 0, 0), linear=is_linear(frames)),
+        sensor=read_sensor(
+            folder, fields, FrameKind(0, 0, 0), linear=is_linear(frames)
+        ),
         fibres=tuple(fibre.text("id", rule=IDENTIFIER) for fibre in fibres),
         pressure=read_pressure(fields, placements),
         file=Path(fields.where),
     )
     if len(fields.faults) == noted:
-        fields.faults += fibre_faults(fields.where, probe.distance, probe.centre, probe.radius, probe.face)
+        fields.faults += fibre_faults(
+            fields.where, probe.distance, probe.centre, probe.radius, probe.face
+        )
         fields.faults += gain_faults(fields.where, probe.gain)
     _check_probe_frames(probe, fields)
     return probe
 
 
 def _placements(fields: Fields, sites: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """Names of the placements of the probe at each site; a site without names has a single placement."""
-    given = Fields(fields.get("placements", {}), f"{fields.where}[placements]", fields.faults)
+    """Names of the placements of the probe at each site; a site without names has a
+    single placement.
+    """
+    given = Fields(
+        fields.get("placements", {}), f"{fields.where}[placements]", fields.faults
+    )
     if unknown := sorted(set(given.data) - set(sites)):
         given.fault(unknown[0], "must be one of the sites", shown(unknown[0]))
-    return {site: given.names(site, most=MAX_PLACEMENTS) if site in given.data else ("",) for site in sites}
+    return {
+        site: given.names(site, most=MAX_PLACEMENTS) if site in given.data else ("",)
+        for site in sites
+    }
 
 
 def _azimuth(fibre: Fields) -> float:
     given = fibre.get("azimuth", None)
-    return np.nan if given is None else fibre.number("azimuth", least=-360.0, most=360.0)
+    return (
+        np.nan if given is None else fibre.number("azimuth", least=-360.0, most=360.0)
+    )
 
 
 def _exposures(fields: Fields) -> dict[str, float]:
     items = fields.items("exposures", most=MAX_EXPOSURES)
     least, most = EXPOSURE_SECONDS
-    return {item.text("id", rule=IDENTIFIER): item.number("seconds", least=least, most=most) for item in items}
+    return {
+        item.text("id", rule=IDENTIFIER): item.number("seconds", least=least, most=most)
+        for item in items
+    }
 
 
 def _require_merged(fields: Fields, exposures: Mapping[str, float]) -> None:
-    """Require one exposure of one second: merged radiance is per second, and another time would scale it again."""
+    """Require one exposure of one second: merged radiance is per second, and another
+    time would scale it again.
+    """
     if exposures and [*exposures.values()] != [1.0]:
         found = ", ".join(f"{seconds:g} s" for seconds in exposures.values())
         rule = "OpenEXR frames are merged radiance: one exposure of 1 second"
-        fields.fault("exposures", rule, found, "merge them, divide by their seconds, and give one exposure of 1 second")
+        fields.fault(
+            "exposures",
+            rule,
+            found,
+            "merge them, divide by their seconds, and give one exposure of 1 second",
+        )
 
 
 def _camera(folder: Path, item: Fields, *, linear: bool) -> CameraRecord:
@@ -259,19 +333,27 @@ def _camera(folder: Path, item: Fields, *, linear: bool) -> CameraRecord:
     R = item.array("R", (3, 3), fallback=np.eye(3))
     error = float(np.abs(R @ R.T - np.eye(3)).max())
     if error > ROTATION_TOLERANCE or np.linalg.det(R) < 0:
-        found = f"R R^T differs from 1 by {error:.2g}, determinant {np.linalg.det(R):.3g}"
+        found = (
+            f"R R^T differs from 1 by {error:.2g}, determinant {np.linalg.det(R):.3g}"
+        )
         item.fault("R", "must be a rotation", found, "calibrate the camera again")
     if K[0, 0] <= 0 or K[1, 1] <= 0 or K[1, 0] != 0 or (K[2] != (0, 0, 1)).any():
-        item.fault("K", "must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]] in pixels", shown(K))
+        item.fault(
+            "K", "must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]] in pixels", shown(K)
+        )
     colours = item.array("colour_matrix", (3, 3), default=np.eye(3).tolist())
     if not (colours.sum(axis=1) > 0).all():
         item.fault(
-            "colour_matrix", "must give white a positive R, G and B: each row sums to more than 0", shown(colours)
+            "colour_matrix",
+            "must give white a positive R, G and B: each row sums to more than 0",
+            shown(colours),
         )
     width, height = _size(item)
     vignette = item.array("vignette", (3,), default=[0.0] * 3)
     lens = item.array("distortion", (5,), default=[0.0] * 5, fallback=0.0)
-    if len(item.faults) == noted and (fault := distortion_fault(item.where, lens, K, np.array([width, height]))):
+    if len(item.faults) == noted and (
+        fault := distortion_fault(item.where, lens, K, np.array([width, height]))
+    ):
         item.faults.append(fault)
     if not linear and len(item.faults) == noted:
         _require_light(item, vignette, K[:2, 2], np.array([width, height]))
@@ -302,23 +384,33 @@ def _size(item: Fields) -> tuple[int, int]:
 
 
 def _require_light(item: Fields, vignette: Array, centre: Array, size: Array) -> None:
-    """Require a vignette within limits: a polynomial fitted to the centre alone may be negative at the corners."""
+    """Require a vignette within limits: a polynomial fitted to the centre alone may be
+    negative at the corners.
+    """
     near = np.clip(centre, 0, size) - centre
     far = np.maximum(np.abs(centre), np.abs(size - centre))
     r2 = np.linspace(near @ near, far @ far, VIGNETTE_STEPS) / (size @ size / 4)
     gain = 1 + r2 * (vignette[0] + r2 * (vignette[1] + r2 * vignette[2]))
     if not ((gain > MIN_VIGNETTE_GAIN) & (gain <= MAX_VIGNETTE_GAIN)).all():
         rule = (
-            f"1 + a2 r^2 + a4 r^4 + a6 r^6 must be above {MIN_VIGNETTE_GAIN:g} and at most {MAX_VIGNETTE_GAIN:g} "
+            f"1 + a2 r^2 + a4 r^4 + a6 r^6 must be above {MIN_VIGNETTE_GAIN:g} and "
+            f"at most {MAX_VIGNETTE_GAIN:g} "
             "in the whole picture"
         )
         worst = gain.argmax() if gain.max() > MAX_VIGNETTE_GAIN else gain.argmin()
         found = f"{gain[worst]:.3g} at r = {np.sqrt(r2[worst]):.3g}"
-        item.fault("vignette", rule, found, "r is 1 at half the image diagonal; measure the lens up to the corners")
+        item.fault(
+            "vignette",
+            rule,
+            found,
+            "r is 1 at half the image diagonal; measure the lens up to the corners",
+        )
 
 
 def _light(item: Fields) -> LightRecord:
-    intensity = None if item.get("intensity", None) is None else item.array("intensity", (3,))
+    intensity = (
+        None if item.get("intensity", None) is None else item.array("intensity", (3,))
+    )
     if intensity is not None and (intensity <= 0).any():
         item.fault("intensity", "must be positive", shown(intensity))
     position = item.array("position", (3,))
@@ -329,7 +421,9 @@ def _light(item: Fields) -> LightRecord:
     return LightRecord(
         id=item.text("id", rule=IDENTIFIER),
         position=position,
-        disc_radius=item.number("disc_radius", least=0.0, most=MAX_DISC_RADIUS_MM, default=0.0),
+        disc_radius=item.number(
+            "disc_radius", least=0.0, most=MAX_DISC_RADIUS_MM, default=0.0
+        ),
         intensity=intensity,
         axis=axis / (length or 1.0),
         falloff=item.number("falloff", least=0.0, most=MAX_FALLOFF, default=0.0),
@@ -358,11 +452,15 @@ def _white(fields: Fields, cameras: set[str], several: set[str]) -> WhiteRecord 
         reflectance=reflectance,
         point=white.array("point", (3,)),
         normal=normal / (length or 1.0),
-        half_size=white.number("half_size", least=TARGET_HALF_SIZES_MM[0], most=TARGET_HALF_SIZES_MM[1]),
+        half_size=white.number(
+            "half_size", least=TARGET_HALF_SIZES_MM[0], most=TARGET_HALF_SIZES_MM[1]
+        ),
         cameras=white.names("cameras", most=MAX_CAMERAS),
     )
     if unknown := set(record.cameras) - cameras:
-        white.fault("cameras", "must be cameras of the dome", ", ".join(sorted(unknown)))
+        white.fault(
+            "cameras", "must be cameras of the dome", ", ".join(sorted(unknown))
+        )
     return record
 
 
@@ -371,11 +469,17 @@ def _check_frames(dome: DomeRecord, fields: Fields) -> None:
     if dome.frame_count > MAX_FRAMES:
         found = f"{dome.frame_count:,}: cameras x lights x exposures"
         cure = "remove those that were not used"
-        fields.fault("frames", f"a capture must have at most {MAX_FRAMES:,} frames", found, cure)
+        fields.fault(
+            "frames", f"a capture must have at most {MAX_FRAMES:,} frames", found, cure
+        )
         return
     known = dict[Path, bool]()
-    # for one light and camera, frames of the face and of the white target differ only in their template
-    views = ((key, filled(t, **names), {"template": key, **names}) for key, t, names, _ in _views(dome))
+    # for one light and camera, frames of the face and of the white target differ only
+    # in their template
+    views = (
+        (key, filled(t, **names), {"template": key, **names})
+        for key, t, names, _ in _views(dome)
+    )
     _require_own_files(fields, views)
     for key, name, camera in promised_frames(dome):
         where = f"{fields.where}[{key}]"
@@ -384,28 +488,45 @@ def _check_frames(dome: DomeRecord, fields: Fields) -> None:
             fields.faults += header_faults(path, camera.sensor.kind, where)
 
 
-def _require_own_files(fields: Fields, views: Iterable[tuple[str, str, dict[str, str]]]) -> None:
-    """Require a separate file for every view: ids such as a_b and a with c and b_c can form the same path."""
+def _require_own_files(
+    fields: Fields, views: Iterable[tuple[str, str, dict[str, str]]]
+) -> None:
+    """Require a separate file for every view: ids such as a_b and a with c and b_c can
+    form the same path.
+    """
     first = dict[Path, dict[str, str]]()
     shared = list[tuple[str, str]]()
     for key, name, names in views:
         if (other := first.setdefault(Path(name), names)) != names:
             one, two = (
-                ", ".join(f"{k} {v}" for k, v in view.items() if other[k] != names[k]) for view in (other, names)
+                ", ".join(f"{k} {v}" for k, v in view.items() if other[k] != names[k])
+                for view in (other, names)
             )
             shared.append((key, f"{Path(name).name} of {one} and of {two}"))
     if shared:
         key, found = shared[0]
         cure = "rename the ids, or separate them by folders in the template"
-        fields.fault(key, "every view must have its own file", f"{len(shared)} shared, {found}", cure)
+        fields.fault(
+            key,
+            "every view must have its own file",
+            f"{len(shared)} shared, {found}",
+            cure,
+        )
 
 
 def _views(dome: DomeRecord) -> Iterator[tuple[str, str, dict[str, str], CameraRecord]]:
     """Key, template and names of every frame the folder must hold, and its camera."""
 
-    def names(key: str, template: str, lights: Sequence[str], cameras: Sequence[CameraRecord]) -> Any:
+    def names(
+        key: str, template: str, lights: Sequence[str], cameras: Sequence[CameraRecord]
+    ) -> Any:
         for exposure, light, camera in product(dome.exposures, lights, cameras):
-            yield key, template, {EXPOSURE: exposure, LIGHT: light, CAMERA: camera.id}, camera
+            yield (
+                key,
+                template,
+                {EXPOSURE: exposure, LIGHT: light, CAMERA: camera.id},
+                camera,
+            )
 
     lights = [light.id for light in dome.lights]
     if dome.frames:
@@ -413,7 +534,9 @@ def _views(dome: DomeRecord) -> Iterator[tuple[str, str, dict[str, str], CameraR
     if dome.dark:
         yield from names("dark", dome.dark, [""], dome.cameras)
     if dome.white is not None and dome.white.frames:
-        with_white = [camera for camera in dome.cameras if camera.id in dome.white.cameras]
+        with_white = [
+            camera for camera in dome.cameras if camera.id in dome.white.cameras
+        ]
         yield from names("white", dome.white.frames, lights, with_white)
 
 
@@ -431,7 +554,9 @@ def _check_probe_frames(probe: ProbeRecord, fields: Fields) -> None:
         for site in (probe.sites if probe.frames else ())
         for placement, exposure in product(probe.placements[site], probe.exposures)
     ]
-    _require_own_files(fields, (("frames", filled(probe.frames, **names), names) for names in views))
+    _require_own_files(
+        fields, (("frames", filled(probe.frames, **names), names) for names in views)
+    )
     for names in views:
         where = f"{fields.where}[frames]"
         path = inside(probe.folder, filled(probe.frames, **names), where, fields.faults)

@@ -1,4 +1,6 @@
-"""Sanity checks of a dome against the scan: units, devices inside the head, scans that no picture shows."""
+"""Sanity checks of a dome against the scan: units, devices inside the head, scans that
+no picture shows.
+"""
 
 from __future__ import annotations
 
@@ -15,16 +17,22 @@ from skindb.ingest.devices import CameraRecord, DomeRecord
 from skindb.ingest.scan_checks import HEAD_DIAGONAL, UNITS, likely_unit, rescaling
 
 Array = NDArray[np.float64]
-MIN_WINDING_NUMBER = 0.5  # of a point inside; outside the convex hull of a surface it is at most 0.5
-# of the longest side of a picture. Heads in a dome span 0.7 to 1; ten times too far away they span at most 0.1
+# of a point inside; outside the convex hull of a surface it is at most 0.5
+MIN_WINDING_NUMBER = 0.5
+# of the longest side of a picture. Heads in a dome span 0.7 to 1; ten times too far
+# away they span at most 0.1
 LEAST_SPAN = 0.1
 USUAL_SPAN = 0.8
-PATCH_SPAN = 0.005  # for a small scan: a patch of 20 mm in a picture of a person of 1.7 m spans 0.01
-FACE_DIAGONAL = 200.0  # mm, of a child's face; a scan of this size is not a patch of skin
+# for a small scan: a patch of 20 mm in a picture of a person of 1.7 m spans 0.01
+PATCH_SPAN = 0.005
+# mm, of a child's face; a scan of this size is not a patch of skin
+FACE_DIAGONAL = 200.0
 LARGEST_HEAD = 700.0  # mm, with neck and shoulders
-# |sum of normals| over area: at most 0.47 for faces and heads, 0.75 to 1 for patches of cheek, forehead and jaw
+# |sum of normals| over area: at most 0.47 for faces and heads, 0.75 to 1 for patches of
+# cheek, forehead and jaw
 MAX_MEAN_NORMAL = 0.6
-DOME_RADIUS_RATIO = 2.0  # distance of the devices over the diagonal of a head; domes of 0.8 m have 2.1 to 2.5
+# distance of the devices over the diagonal of a head; domes of 0.8 m have 2.1 to 2.5
+DOME_RADIUS_RATIO = 2.0
 
 
 def device_faults(where: str, dome: DomeRecord, surface: CleanMesh) -> list[Fault]:
@@ -34,26 +42,45 @@ def device_faults(where: str, dome: DomeRecord, surface: CleanMesh) -> list[Faul
         ("cameras", device_positions(dome)),
         ("lights", {light.id: light.position for light in dome.lights}),
     ):
-        far = [name for name, place in places.items() if np.linalg.norm(place) > MAX_DEVICE_DISTANCE_MM]
+        far = [
+            name
+            for name, place in places.items()
+            if np.linalg.norm(place) > MAX_DEVICE_DISTANCE_MM
+        ]
         if far:
-            rule = f"{key} must be within {MAX_DEVICE_DISTANCE_MM / 1000:g} m of the origin of the scan's frame"
-            found = f"{len(far)} of {len(places)} farther: {', '.join(far[:3])}{', ..' * (len(far) > 3)}"
+            rule = (
+                f"{key} must be within {MAX_DEVICE_DISTANCE_MM / 1000:g} m of the "
+                "origin of the scan's frame"
+            )
+            found = (
+                f"{len(far)} of {len(places)} farther: "
+                f"{', '.join(far[:3])}{', ..' * (len(far) > 3)}"
+            )
             faults.append(Fault(f"{where}[{key}]", rule, found, "give positions in mm"))
         inside = [name for name, place in places.items() if _inside(surface, place)]
         if inside:
-            found = f"{len(inside)} of {len(places)} inside it: {', '.join(inside[:3])}{', ..' * (len(inside) > 3)}"
+            found = (
+                f"{len(inside)} of {len(places)} inside it: "
+                f"{', '.join(inside[:3])}{', ..' * (len(inside) > 3)}"
+            )
             cure = "calibrate in mm and in the frame of the scan; the centre of a camera is -R^T t"
-            faults.append(Fault(f"{where}[{key}]", f"{key} must be outside the head", found, cure))
+            faults.append(
+                Fault(f"{where}[{key}]", f"{key} must be outside the head", found, cure)
+            )
     return faults
 
 
-def unit_fault(where: str, dome: DomeRecord, mesh: str, surface: CleanMesh, *, sized: bool) -> Fault | None:
+def unit_fault(
+    where: str, dome: DomeRecord, mesh: str, surface: CleanMesh, *, sized: bool
+) -> Fault | None:
     """Fault of a dome and a scan that cannot both be in mm, or cannot be in the same frame.
 
-    Only impossible captures are faults: a dome within the bounding box of the scan; a scan that no camera shows; a scan
-    that is large enough for a face but spans less than a tenth of every picture. A small scan that spans as little is a
-    fault if it is probably a head in centimetres or inches: it curves around the origin of its frame, which a patch of
-    skin does not. If scan and dome are both too small by the same factor, only the landmarks reveal it.
+    Only impossible captures are faults: a dome within the bounding box of the scan; a
+    scan that no camera shows; a scan that is large enough for a face but spans less
+    than a tenth of every picture. A small scan that spans as little is a fault if it is
+    probably a head in centimetres or inches: it curves around the origin of its frame,
+    which a patch of skin does not. If scan and dome are both too small by the same
+    factor, only the landmarks reveal it.
 
     Parameters
     ----------
@@ -67,21 +94,38 @@ def unit_fault(where: str, dome: DomeRecord, mesh: str, surface: CleanMesh, *, s
     low = surface.vertices.min(axis=0)
     high = surface.vertices.max(axis=0)
     diagonal = float(np.linalg.norm(high - low))
-    places = np.array([*device_positions(dome).values(), *(light.position for light in dome.lights)])
+    places = np.array(
+        [*device_positions(dome).values(), *(light.position for light in dome.lights)]
+    )
     if ((places > low) & (places < high)).all():
-        distance = float(np.median(np.linalg.norm(places, axis=1)))  # the origin is near the centre of the dome
+        # the origin is near the centre of the dome
+        distance = float(np.median(np.linalg.norm(places, axis=1)))
         cure = (
-            f"{rescaling(likely_unit(distance, DOME_RADIUS_RATIO * diagonal))}, or calibrate in the frame of the scan"
+            f"{rescaling(likely_unit(distance, DOME_RADIUS_RATIO * diagonal))}, or "
+            "calibrate in the frame of the scan"
         )
         rule = "lengths must be in mm, and a dome must surround the scan"
         return Fault(where, rule, "all of it within the bounding box of the scan", cure)
-    spans = [span for camera in dome.cameras if (span := picture_span(camera, surface.vertices)) is not None]
+    spans = [
+        span
+        for camera in dome.cameras
+        if (span := picture_span(camera, surface.vertices)) is not None
+    ]
     if not spans:
-        cure = "calibrate in mm and in the frame of the scan: x_cam = R x + t, z forwards"
-        return Fault(where, "the picture of a camera must show the scan", f"none of {len(dome.cameras)} does", cure)
+        cure = (
+            "calibrate in mm and in the frame of the scan: x_cam = R x + t, z forwards"
+        )
+        return Fault(
+            where,
+            "the picture of a camera must show the scan",
+            f"none of {len(dome.cameras)} does",
+            cure,
+        )
     span = max(spans)
     if not sized and span < LEAST_SPAN and _shrunken_head(surface, diagonal):
-        rule = "lengths must be in mm, and a head must span at least a tenth of a picture"
+        rule = (
+            "lengths must be in mm, and a head must span at least a tenth of a picture"
+        )
         found = f"{diagonal:.0f} mm across, {span:.1%} of a picture's side"
         return Fault(mesh, rule, found, rescaling(likely_unit(diagonal, HEAD_DIAGONAL)))
     if span < (LEAST_SPAN if diagonal > FACE_DIAGONAL else PATCH_SPAN):
@@ -93,20 +137,33 @@ def unit_fault(where: str, dome: DomeRecord, mesh: str, surface: CleanMesh, *, s
 
 def device_positions(dome: DomeRecord) -> dict[str, Array]:
     """Centres of the cameras."""
-    return {camera.id: np.asarray(camera_centre(camera.R, camera.t), np.float64) for camera in dome.cameras}
+    return {
+        camera.id: np.asarray(camera_centre(camera.R, camera.t), np.float64)
+        for camera in dome.cameras
+    }
 
 
 def _inside(surface: CleanMesh, place: Array) -> bool:
-    within = (place > surface.vertices.min(axis=0)) & (place < surface.vertices.max(axis=0))
-    return bool(within.all() and winding_number(surface.vertices, surface.faces, place)[0] > MIN_WINDING_NUMBER)
+    within = (place > surface.vertices.min(axis=0)) & (
+        place < surface.vertices.max(axis=0)
+    )
+    return bool(
+        within.all()
+        and winding_number(surface.vertices, surface.faces, place)[0]
+        > MIN_WINDING_NUMBER
+    )
 
 
-def picture_span(camera: CameraRecord, vertices: Array, *, factor: float = 1.0) -> float | None:
-    """Fraction of the picture's side that the scan spans; None if it is outside the picture or behind the camera.
+def picture_span(
+    camera: CameraRecord, vertices: Array, *, factor: float = 1.0
+) -> float | None:
+    """Fraction of the picture's side that the scan spans; None if it is outside the
+    picture or behind the camera.
 
     The camera is taken to be `factor` times as far away.
 
-    Distortion is ignored, and the picture is extended by half its size: only scans clearly outside count as invisible.
+    Distortion is ignored, and the picture is extended by half its size: only scans
+    clearly outside count as invisible.
     """
     local = vertices @ camera.R.T + factor * camera.t
     if (local[:, 2] <= 0).all():
@@ -117,15 +174,22 @@ def picture_span(camera: CameraRecord, vertices: Array, *, factor: float = 1.0) 
     places = pixels[:, :2] / pixels[:, 2:] / [camera.width, camera.height]
     low = places.min(axis=0)
     high = places.max(axis=0)
-    return float((high - low).max()) if (low < 1.5).all() and (high > -0.5).all() else None
+    return (
+        float((high - low).max()) if (low < 1.5).all() and (high > -0.5).all() else None
+    )
 
 
 def _shrunken_head(surface: CleanMesh, diagonal: float) -> bool:
-    """Whether a surface has the size of a head in inches or centimetres, and curves around the origin of its frame."""
+    """Whether a surface has the size of a head in inches or centimetres, and curves
+    around the origin of its frame.
+    """
     unit = UNITS[likely_unit(diagonal, HEAD_DIAGONAL)]
     cross = face_crosses(surface.vertices, surface.faces)
     facing = np.linalg.norm(cross.sum(axis=0)) / np.linalg.norm(cross, axis=1).sum()
     away = np.linalg.norm(surface.vertices.mean(axis=0))
     return bool(
-        unit > 1 and FACE_DIAGONAL < unit * diagonal < LARGEST_HEAD and facing < MAX_MEAN_NORMAL and away < diagonal
+        unit > 1
+        and FACE_DIAGONAL < unit * diagonal < LARGEST_HEAD
+        and facing < MAX_MEAN_NORMAL
+        and away < diagonal
     )

@@ -1,4 +1,6 @@
-"""Keys of a JSON file, read one by one; every fault is recorded with file and key, and reading continues."""
+"""Keys of a JSON file, read one by one; every fault is recorded with file and key, and
+reading continues.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb._limits import MAX_FRAME_SIDE_PX, MAX_NAME_CHARACTERS, MAX_NAMED_UNKNOWN_KEYS, MAX_TEXT_CHARACTERS
+from skindb._limits import (
+    MAX_FRAME_SIDE_PX,
+    MAX_NAME_CHARACTERS,
+    MAX_NAMED_UNKNOWN_KEYS,
+    MAX_TEXT_CHARACTERS,
+)
 from skindb.errors import Fault
 from skindb.ingest.json_file import CURE, MAX_MAGNITUDE, is_number, short, shown
 
@@ -31,19 +38,26 @@ class TextRule(NamedTuple):
 
 NON_EMPTY = TextRule(r"(?s).+", "must be text, and not empty")
 NAME = TextRule(r"[A-Za-z0-9_-]{1,64}", "must be 1 to 64 letters, digits, '-' or '_'")
-IDENTIFIER = TextRule(r"[A-Za-z0-9_.-]{1,64}", "must be 1 to 64 letters, digits, '-', '_' or '.'")
+IDENTIFIER = TextRule(
+    r"[A-Za-z0-9_.-]{1,64}", "must be 1 to 64 letters, digits, '-', '_' or '.'"
+)
 
 
 class Fields:
-    """The keys of one JSON object; a faulty value is recorded in `faults` and replaced by a valid default."""
+    """The keys of one JSON object; a faulty value is recorded in `faults` and replaced
+    by a valid default.
+    """
 
     def __init__(self, data: Any, where: str, faults: list[Fault]) -> None:
         self.where = where
         self.faults = faults
         self.used = set[str]()
-        self.whole = isinstance(data, dict)  # otherwise missing keys are not reported in addition
+        # otherwise missing keys are not reported in addition
+        self.whole = isinstance(data, dict)
         if not self.whole:
-            faults.append(Fault(where, "must be a JSON object {...}", shown(data), CURE))
+            faults.append(
+                Fault(where, "must be a JSON object {...}", shown(data), CURE)
+            )
         self.data: dict[str, Any] = data if self.whole else {}
 
     def place(self, key: str) -> str:
@@ -59,7 +73,12 @@ class Fields:
         self.used.add(key)
         value = self.data.get(key)
         if value is None and default is REQUIRED and self.whole:
-            self.fault(key, "this key is required", "nothing", "add it, see docs/capture_format.md")
+            self.fault(
+                key,
+                "this key is required",
+                "nothing",
+                "add it, see docs/capture_format.md",
+            )
         return default if value is None and default is not REQUIRED else value
 
     def rest(self) -> dict[str, Any]:
@@ -67,11 +86,15 @@ class Fields:
         return {key: value for key, value in self.data.items() if key not in self.used}
 
     def unknown(self, *, besides: Collection[str] = ()) -> tuple[str, ...]:
-        """Keys that were not read, except `besides`, each with the most similar key that was read."""
+        """Keys that were not read, except `besides`, each with the most similar key
+        that was read.
+        """
         found = []
         keys = sorted(self.rest().keys() - set(besides))
         for key in keys[:MAX_NAMED_UNKNOWN_KEYS]:
-            near = difflib.get_close_matches(key[:MAX_NAME_CHARACTERS].lower(), self.used - self.data.keys(), n=1)
+            near = difflib.get_close_matches(
+                key[:MAX_NAME_CHARACTERS].lower(), self.used - self.data.keys(), n=1
+            )
             name = short(key)
             found.append(f"{name} (did you mean {near[0]}?)" if near else name)
         left = len(keys) - len(found)
@@ -81,7 +104,14 @@ class Fields:
         """Whether the object has at most `most` keys, all of which are printable names."""
         if len(self.data) > most:
             cure = "remove those that are not needed"
-            self.faults.append(Fault(self.where, f"must name at most {most} {things}", f"{len(self.data)}", cure))
+            self.faults.append(
+                Fault(
+                    self.where,
+                    f"must name at most {most} {things}",
+                    f"{len(self.data)}",
+                    cure,
+                )
+            )
             return False
         for name in self.data:
             if not 0 < len(name) <= MAX_NAME_CHARACTERS or not name.isprintable():
@@ -89,7 +119,9 @@ class Fields:
                 self.fault(name, rule, f"{len(name)} characters", "rename it")
         return True
 
-    def text(self, key: str, *, rule: TextRule = NON_EMPTY, default: Any = REQUIRED) -> str:
+    def text(
+        self, key: str, *, rule: TextRule = NON_EMPTY, default: Any = REQUIRED
+    ) -> str:
         """Text that satisfies a rule."""
         value = self.get(key, default)
         if value is None:
@@ -100,12 +132,19 @@ class Fields:
         return value if self.require_printable(key, value) else ""
 
     def require_printable(self, key: str, value: str) -> bool:
-        """Whether a text is short and has only characters that can be printed, such as no control characters."""
+        """Whether a text is short and has only characters that can be printed, such as
+        no control characters.
+        """
         hidden = sum(not character.isprintable() for character in value)
         if len(value) <= MAX_TEXT_CHARACTERS and not hidden:
             return True
         rule = f"a text must be at most {MAX_TEXT_CHARACTERS} characters that can be printed"
-        self.fault(key, rule, f"{len(value)} characters, {hidden} of which cannot be printed", "shorten or correct it")
+        self.fault(
+            key,
+            rule,
+            f"{len(value)} characters, {hidden} of which cannot be printed",
+            "shorten or correct it",
+        )
         return False
 
     def number(
@@ -122,10 +161,15 @@ class Fields:
         if value is None:
             return 1.0
         if not is_number(value) or not abs(value) <= MAX_MAGNITUDE:
-            self.fault(key, f"must be a finite number, at most {MAX_MAGNITUDE:g}", shown(value))
+            self.fault(
+                key, f"must be a finite number, at most {MAX_MAGNITUDE:g}", shown(value)
+            )
             return 1.0
         if value < least or value <= above:
-            rule = f"must be {f'greater than {above:g}' if value <= above else f'at least {least:g}'}"
+            rule = (
+                "must be "
+                f"{f'greater than {above:g}' if value <= above else f'at least {least:g}'}"
+            )
             self.fault(key, rule, shown(value))
             return 1.0
         if value > most:
@@ -133,7 +177,14 @@ class Fields:
             return 1.0
         return float(value)
 
-    def integer(self, key: str, *, least: int, most: int = MAX_FRAME_SIDE_PX, default: Any = REQUIRED) -> int:
+    def integer(
+        self,
+        key: str,
+        *,
+        least: int,
+        most: int = MAX_FRAME_SIDE_PX,
+        default: Any = REQUIRED,
+    ) -> int:
         """An integer from `least` to `most`; `least` if the value is faulty."""
         value = self.number(key, default=default, least=least)
         if value != int(value):
@@ -144,14 +195,25 @@ class Fields:
         return int(value) if least <= value <= most else least
 
     def array(
-        self, key: str, shape: tuple[int, ...], *, default: Any = REQUIRED, fallback: Any = 1.0
+        self,
+        key: str,
+        shape: tuple[int, ...],
+        *,
+        default: Any = REQUIRED,
+        fallback: Any = 1.0,
     ) -> NDArray[np.float64]:
         """Finite numbers of exactly this shape; `fallback` if they are faulty."""
         value = self.get(key, default)
         found = None if value is None else self._array(key, value, (shape,))
-        return np.broadcast_to(np.float64(fallback), shape).copy() if found is None else found
+        return (
+            np.broadcast_to(np.float64(fallback), shape).copy()
+            if found is None
+            else found
+        )
 
-    def _array(self, key: str, value: Any, shapes: Sequence[tuple[int, ...]]) -> NDArray[np.float64] | None:
+    def _array(
+        self, key: str, value: Any, shapes: Sequence[tuple[int, ...]]
+    ) -> NDArray[np.float64] | None:
         rule = " or ".join(" x ".join(map(str, shape)) for shape in shapes)
         if not any(_has_shape(value, shape) for shape in shapes):
             self.fault(key, f"must be {rule} numbers", shown(value))
@@ -161,12 +223,16 @@ class Fields:
         except OverflowError:  # integers of hundreds of digits
             found = np.full(shapes[0], np.inf)
         if not (np.abs(found) <= MAX_MAGNITUDE).all():
-            self.fault(key, f"must be finite numbers, at most {MAX_MAGNITUDE:g}", shown(value))
+            self.fault(
+                key, f"must be finite numbers, at most {MAX_MAGNITUDE:g}", shown(value)
+            )
             return None
         return found
 
     def gains(self, key: str, count: int) -> NDArray[np.float64]:
-        """Positive factors, one per element or one per element and channel, as (count, 3); default 1."""
+        """Positive factors, one per element or one per element and channel, as (count,
+        3); default 1.
+        """
         value = self.get(key, None)
         if value is None:
             return np.ones((count, 3))
@@ -189,7 +255,9 @@ class Fields:
             return ()
         for name in value:
             if not isinstance(name, str) or not re.fullmatch(IDENTIFIER.pattern, name):
-                self.fault(key, f"must be a list of names: each {IDENTIFIER.said}", shown(name))
+                self.fault(
+                    key, f"must be a list of names: each {IDENTIFIER.said}", shown(name)
+                )
                 return ()
         if len(value) < least:
             cure = "give at least one name, or remove the enclosing part"
@@ -207,13 +275,21 @@ class Fields:
             return []
         if not self._within(key, value, most):
             return []
-        out = [Fields(item, f"{self.where}[{key}][{i}]", self.faults) for i, item in enumerate(value)]
+        out = [
+            Fields(item, f"{self.where}[{key}][{i}]", self.faults)
+            for i, item in enumerate(value)
+        ]
         self._unique(key, [item.data.get("id") for item in out])
         return out
 
     def _within(self, key: str, value: list[Any], most: int) -> bool:
         if len(value) > most:
-            self.fault(key, f"must be a list of at most {most}", f"{len(value)}", "remove those that are not needed")
+            self.fault(
+                key,
+                f"must be a list of at most {most}",
+                f"{len(value)}",
+                "remove those that are not needed",
+            )
         return len(value) <= most
 
     def _unique(self, key: str, ids: list[Any]) -> None:
@@ -222,20 +298,33 @@ class Fields:
             found = f"{short(', '.join(twice))} more than once"
             self.fault(key, "ids must differ", found, "rename them")
 
-    def template(self, key: str, needed: set[str], allowed: set[str], *, default: Any = REQUIRED) -> str:
+    def template(
+        self, key: str, needed: set[str], allowed: set[str], *, default: Any = REQUIRED
+    ) -> str:
         """A path template with the placeholders `needed` and, optionally, `allowed`."""
-        value = self.text(key, default=default) if self.get(key, default) is not None else ""
+        value = (
+            self.text(key, default=default)
+            if self.get(key, default) is not None
+            else ""
+        )
         if not value:
             return ""
         try:
             parts = [
-                (name, spec, conversion) for _, name, spec, conversion in Formatter().parse(value) if name is not None
+                (name, spec, conversion)
+                for _, name, spec, conversion in Formatter().parse(value)
+                if name is not None
             ]
         except ValueError as error:
-            self.fault(key, "must be a path with placeholders", f"{short(value)}: {error}")
+            self.fault(
+                key, "must be a path with placeholders", f"{short(value)}: {error}"
+            )
             return ""
         found = {name for name, _, _ in parts}
-        if any(spec or conversion for _, spec, conversion in parts) or not needed <= found <= needed | allowed:
+        if (
+            any(spec or conversion for _, spec, conversion in parts)
+            or not needed <= found <= needed | allowed
+        ):
             must = " and ".join(f"{{{name}}}" for name in sorted(needed))
             self.fault(key, f"must name {must}", shown(value))
             return ""
@@ -243,9 +332,14 @@ class Fields:
 
 
 def inside(
-    folder: Path, name: str, where: str, faults: list[Fault], known: dict[Path, bool] | None = None
+    folder: Path,
+    name: str,
+    where: str,
+    faults: list[Fault],
+    known: dict[Path, bool] | None = None,
 ) -> Path | None:
-    """The file `name` of the folder; None and a fault if it lies outside, directly or through a link.
+    """The file `name` of the folder; None and a fault if it lies outside, directly or
+    through a link.
 
     `known` caches which folders lie inside; it is updated.
     """
@@ -267,14 +361,18 @@ def inside(
 
 
 def _within(path: Path, folder: Path, known: dict[Path, bool]) -> bool:
-    """Whether a path stays inside a folder with every link followed; the parent folders are checked once."""
+    """Whether a path stays inside a folder with every link followed; the parent folders
+    are checked once.
+    """
     try:
         link = stat.S_ISLNK(path.lstat().st_mode)
     except (FileNotFoundError, NotADirectoryError):
         link = False
     if link:
         with contextlib.suppress(FileNotFoundError, NotADirectoryError):
-            path.stat()  # fails for cyclic links and names that are too long, which `resolve` of Python 3.13 ignores
+            # fails for cyclic links and names that are too long, which `resolve` of
+            # Python 3.13 ignores
+            path.stat()
         return path.resolve().is_relative_to(folder.resolve())
     parent = path.parent
     if parent not in known:
@@ -290,4 +388,8 @@ def _has_shape(value: Any, shape: tuple[int, ...]) -> bool:
     """Whether lists of lists of numbers have exactly this shape."""
     if not shape:
         return is_number(value)
-    return isinstance(value, list) and len(value) == shape[0] and all(_has_shape(v, shape[1:]) for v in value)
+    return (
+        isinstance(value, list)
+        and len(value) == shape[0]
+        and all(_has_shape(v, shape[1:]) for v in value)
+    )

@@ -1,4 +1,6 @@
-"""Sanity checks of frames: exchanged exposures, dark frames that are not dark, wrong levels, blank pictures."""
+"""Sanity checks of frames: exchanged exposures, dark frames that are not dark, wrong
+levels, blank pictures.
+"""
 
 from __future__ import annotations
 
@@ -18,35 +20,49 @@ from skindb.ingest.sensor import SensorRecord
 
 Array = NDArray[np.float32]
 Values = NDArray[np.float64]
-MAX_COMPARED_PIXELS = 40_000  # of a frame, evenly spread: takes 1 % of the time to decode 10 megapixels
-# standard deviations of read noise above black, and relative exposure: the effect of dark frames is small above both
+# of a frame, evenly spread: takes 1 % of the time to decode 10 megapixels
+MAX_COMPARED_PIXELS = 40_000
+# standard deviations of read noise above black, and relative exposure: the effect of
+# dark frames is small above both
 MIN_SIGNAL_DEVIATIONS = 20.0
 MIN_SIGNAL = 0.005
 MAX_SIGNAL = 0.7  # relative exposure that is clearly below the white level
 MIN_RATIO_VALUES = 50  # values that are needed for a ratio
 # largest ratio between the radiance of two exposures
 MAX_RADIANCE_RATIO = 1.4
-# of the compared values of two exposures, those that differ by more than this ratio and noise: 0.01 if the head moved
-# by 0.3 mm between them, 0.14 and more if one was mirrored, 0.7 if it was taken under another light
+# of the compared values of two exposures, those that differ by more than this ratio and
+# noise: 0.01 if the head moved by 0.3 mm between them, 0.14 and more if one was
+# mirrored, 0.7 if it was taken under another light
 MAX_APART_FRACTION = 0.1
-# of the white level: larger than the dark current of warm cameras in seconds; beyond it, black_level is wrong
+# of the white level: larger than the dark current of warm cameras in seconds; beyond
+# it, black_level is wrong
 MAX_DARK_OFFSET = 0.05
 NOTED_DARK_OFFSET = 0.01
-# standard deviations of read noise and relative exposure below black, and fraction of pixels; noise reaches one in 1e9
+# standard deviations of read noise and relative exposure below black, and fraction of
+# pixels; noise reaches one in 1e9
 MAX_BELOW_DEVIATIONS = 6.0
 MAX_BELOW = 0.005
 MAX_BELOW_FRACTION = 0.05
-# values at the highest one, of those in the upper tenth below it, in a picture that is cut off there; noise has one
+# values at the highest one, of those in the upper tenth below it, in a picture that is
+# cut off there; noise has one
 MIN_CLIPPED_FRACTION = 0.3
 MIN_CLIPPED_VALUES = 50
 MIN_CLIPPED_VIEWS = 2
-MAX_ABOVE_WHITE = 1.25  # highest value over white_level, both above black; cameras are linear up to at least 0.8
+# highest value over white_level, both above black; cameras are linear up to at least
+# 0.8
+MAX_ABOVE_WHITE = 1.25
 MIN_USED_RANGE = 0.02  # of the range of values, by the brightest photograph of a camera
-MIN_POSITIVE_FRACTION = 0.01  # of the pixels of linear radiance; of noise around zero, half are positive
+# of the pixels of linear radiance; of noise around zero, half are positive
+MIN_POSITIVE_FRACTION = 0.01
 
 
 def view_faults(
-    dome: DomeRecord, light: str, merger: FrameMerger, frames: Sequence[Frame], *, white: bool = False
+    dome: DomeRecord,
+    light: str,
+    merger: FrameMerger,
+    frames: Sequence[Frame],
+    *,
+    white: bool = False,
 ) -> list[Fault]:
     """Fault of the exposures of one light and camera, in a list of at most one.
 
@@ -68,12 +84,22 @@ def view_faults(
     if sensor.kind.bits == 0:
         fault = _linear_fault(where, frames[0])
     else:
-        dark = None if merger.dark is None else [frame[::step, ::step] for frame in merger.dark]
-        fault = _saturated_fault(where, some, sensor) or _below_fault(where, names, some, dark, sensor)
+        dark = (
+            None
+            if merger.dark is None
+            else [frame[::step, ::step] for frame in merger.dark]
+        )
+        fault = _saturated_fault(where, some, sensor) or _below_fault(
+            where, names, some, dark, sensor
+        )
         said += "" if fault else "exposure "
         seconds = dict(zip(names, merger.seconds, strict=True))
         fault = fault or disagreement(where, seconds, some, sensor, dark=dark)
-    return [] if fault is None else [Fault(fault.where, fault.rule, said + fault.found, fault.cure)]
+    return (
+        []
+        if fault is None
+        else [Fault(fault.where, fault.rule, said + fault.found, fault.cure)]
+    )
 
 
 def disagreement(
@@ -84,31 +110,50 @@ def disagreement(
     *,
     dark: Sequence[Frame] | None = None,
 ) -> Fault | None:
-    """Fault of two neighbouring exposures with different radiance; `frames` are in the order of `seconds`."""
-    signals = [relative_exposure(f, None if dark is None else dark[i], sensor)[0] for i, f in enumerate(frames)]
-    by_time = sorted(zip(seconds.items(), signals, frames, strict=True), key=lambda one: one[0][1])
+    """Fault of two neighbouring exposures with different radiance; `frames` are in the
+    order of `seconds`.
+    """
+    signals = [
+        relative_exposure(f, None if dark is None else dark[i], sensor)[0]
+        for i, f in enumerate(frames)
+    ]
+    by_time = sorted(
+        zip(seconds.items(), signals, frames, strict=True), key=lambda one: one[0][1]
+    )
     for ((short, a), low, dim), ((long, b), high, bright) in pairwise(by_time):
         ratio, apart = _radiance_ratio(sensor, (dim, low, a), (bright, high, b))
-        if np.isnan(ratio) or (1 / MAX_RADIANCE_RATIO < ratio < MAX_RADIANCE_RATIO and apart <= MAX_APART_FRACTION):
+        if np.isnan(ratio) or (
+            1 / MAX_RADIANCE_RATIO < ratio < MAX_RADIANCE_RATIO
+            and apart <= MAX_APART_FRACTION
+        ):
             continue
-        rule = "exposures of one view must have the same radiance: check seconds, black_level and response"
+        rule = (
+            "exposures of one view must have the same radiance: check seconds, "
+            "black_level and response"
+        )
         found = f"{short} ({a:.3g} s) has {ratio:.3g} times the radiance of {long} ({b:.3g} s)"
         if 1 / MAX_RADIANCE_RATIO < ratio < MAX_RADIANCE_RATIO:
             found = f"{short} and {long} differ in {apart:.0%} of the values that both must contain"
-        return Fault(where, rule, found, "assign the correct seconds and frames to each exposure")
+        return Fault(
+            where, rule, found, "assign the correct seconds and frames to each exposure"
+        )
     return None
 
 
 def _radiance_ratio(
-    sensor: SensorRecord, short: tuple[Frame, Array, float], long: tuple[Frame, Array, float]
+    sensor: SensorRecord,
+    short: tuple[Frame, Array, float],
+    long: tuple[Frame, Array, float],
 ) -> tuple[float, float]:
-    """Median ratio of the radiance of a short exposure to that of a long one, and the fraction of values that differ.
+    """Median ratio of the radiance of a short exposure to that of a long one, and the
+    fraction of values that differ.
 
-    Compared are values that, according to one of them, both must record well, so that a black or white frame also
-    contradicts the other one. NaN for too few values.
+    Compared are values that, according to one of them, both must record well, so that a
+    black or white frame also contradicts the other one. NaN for too few values.
     """
     (dim, low, a), (bright, high, b) = short, long
-    slope = np.asarray([1 / (sensor.white - sensor.black)], np.float32)  # for a linear response
+    # for a linear response
+    slope = np.asarray([1 / (sensor.white - sensor.black)], np.float32)
     read = float(read_sigma(slope, sensor)[0])
     least = max(MIN_SIGNAL, MIN_SIGNAL_DEVIATIONS * read)
     # the short one is noisier: near the limit it would select pixels that noise has raised
@@ -120,12 +165,17 @@ def _radiance_ratio(
     one = np.maximum(low[good], 0)
     other = np.maximum(high[good] * np.float32(a / b), 0)
     larger = np.maximum(one, other)
-    noise = MAX_BELOW_DEVIATIONS * np.sqrt(read**2 + larger / sensor.full_electrons) + MIN_SIGNAL
+    noise = (
+        MAX_BELOW_DEVIATIONS * np.sqrt(read**2 + larger / sensor.full_electrons)
+        + MIN_SIGNAL
+    )
     apart = np.abs(one - other) > (MAX_RADIANCE_RATIO - 1) * larger + noise
     return float(np.median(one / np.maximum(other, 1e-9))), float(apart.mean())
 
 
-def _saturated_fault(where: str, frames: Sequence[Frame], sensor: SensorRecord) -> Fault | None:
+def _saturated_fault(
+    where: str, frames: Sequence[Frame], sensor: SensorRecord
+) -> Fault | None:
     """Fault of a picture that is at the white level everywhere, in every exposure."""
     if all((frame >= sensor.white).all() for frame in frames):
         rule = "a photograph must not be saturated everywhere"
@@ -135,24 +185,43 @@ def _saturated_fault(where: str, frames: Sequence[Frame], sensor: SensorRecord) 
 
 
 def _below_fault(
-    where: str, names: Sequence[str], frames: Sequence[Frame], dark: Sequence[Frame] | None, sensor: SensorRecord
+    where: str,
+    names: Sequence[str],
+    frames: Sequence[Frame],
+    dark: Sequence[Frame] | None,
+    sensor: SensorRecord,
 ) -> Fault | None:
-    """Fault of a picture that is darker than black: the black level or the dark frames are too high."""
+    """Fault of a picture that is darker than black: the black level or the dark frames
+    are too high.
+    """
     for i, frame in enumerate(frames):
-        signal, slope = relative_exposure(frame, None if dark is None else dark[i], sensor)
-        below = float((signal < -MAX_BELOW - MAX_BELOW_DEVIATIONS * read_sigma(slope, sensor)).mean())
+        signal, slope = relative_exposure(
+            frame, None if dark is None else dark[i], sensor
+        )
+        below = float(
+            (
+                signal < -MAX_BELOW - MAX_BELOW_DEVIATIONS * read_sigma(slope, sensor)
+            ).mean()
+        )
         if below > MAX_BELOW_FRACTION:
             key = "black_level" if dark is None else "the dark frame"
-            rule = f"at most {MAX_BELOW_FRACTION:.0%} of a frame may be darker than {key}, beyond noise"
+            rule = (
+                f"at most {MAX_BELOW_FRACTION:.0%} of a frame may be darker than "
+                f"{key}, beyond noise"
+            )
             cure = (
-                "correct black_level" if dark is None else "take the dark frames again, with the exposures of the face"
+                "correct black_level"
+                if dark is None
+                else "take the dark frames again, with the exposures of the face"
             )
             return Fault(where, rule, f"{below:.0%} of exposure {names[i]}", cure)
     return None
 
 
 def _linear_fault(where: str, frame: Frame) -> Fault | None:
-    """Fault of merged radiance that is negative or constant; zero is allowed, for lights behind the face."""
+    """Fault of merged radiance that is negative or constant; zero is allowed, for
+    lights behind the face.
+    """
     finite = np.isfinite(frame)
     low = float(np.min(frame, where=finite, initial=np.inf))
     high = float(np.max(frame, where=finite, initial=-np.inf))
@@ -161,11 +230,21 @@ def _linear_fault(where: str, frame: Frame) -> Fault | None:
     if not low <= high:
         return Fault(where, rule, "no finite value", cure)
     if max(-low, high) > MAX_MAGNITUDE:
-        return Fault(where, f"radiance must be at most {MAX_MAGNITUDE:g}", f"{low:.3g} to {high:.3g}", cure)
+        return Fault(
+            where,
+            f"radiance must be at most {MAX_MAGNITUDE:g}",
+            f"{low:.3g} to {high:.3g}",
+            cure,
+        )
     if low == high != 0:
         return Fault(where, rule, f"{low:.3g} everywhere", cure)
     if low < 0 and float((frame > 0).mean()) < MIN_POSITIVE_FRACTION:
-        return Fault(where, rule, f"values from {low:.3g} to {high:.3g}, nearly all negative", cure)
+        return Fault(
+            where,
+            rule,
+            f"values from {low:.3g} to {high:.3g}, nearly all negative",
+            cure,
+        )
     return None
 
 
@@ -176,10 +255,14 @@ def highest_value(merger: FrameMerger, frames: Sequence[Frame]) -> tuple[float, 
     highest = float(values.max())
     near = values > highest - 0.1 * (highest - merger.camera.sensor.black)
     count = int((values == highest).sum())
-    return highest, count >= max(MIN_CLIPPED_VALUES, MIN_CLIPPED_FRACTION * int(near.sum()))
+    return highest, count >= max(
+        MIN_CLIPPED_VALUES, MIN_CLIPPED_FRACTION * int(near.sum())
+    )
 
 
-def level_notes(dome: DomeRecord, highest: Values, clipped: NDArray[np.bool_]) -> list[str]:
+def level_notes(
+    dome: DomeRecord, highest: Values, clipped: NDArray[np.bool_]
+) -> list[str]:
     """Warnings about white levels that the photographs contradict.
 
     Parameters
@@ -200,33 +283,58 @@ def level_notes(dome: DomeRecord, highest: Values, clipped: NDArray[np.bool_]) -
         said = f"camera {camera.id}: its photographs have values up to {top:g}"
         if used > MAX_ABOVE_WHITE:
             notes.append(
-                f"{said}, above white_level {sensor.white:g}, from which pixels count as saturated; correct it"
+                f"{said}, above white_level {sensor.white:g}, from which pixels "
+                "count as saturated; correct it"
             )
         elif used < MIN_USED_RANGE:
             notes.append(
-                f"{said}, {used:.1%} of the range to white_level {sensor.white:g}; correct it, or expose longer"
+                f"{said}, {used:.1%} of the range to white_level {sensor.white:g}; "
+                "correct it, or expose longer"
             )
-        elif top < sensor.white and (clipped[:, c] & (highest[:, c] == top)).sum() >= MIN_CLIPPED_VIEWS:
+        elif (
+            top < sensor.white
+            and (clipped[:, c] & (highest[:, c] == top)).sum() >= MIN_CLIPPED_VIEWS
+        ):
             notes.append(
-                f"{said} and are cut off there; set white_level to it, so that these pixels count as saturated"
+                f"{said} and are cut off there; set white_level to it, so that "
+                "these pixels count as saturated"
             )
     return notes
 
 
 def dark_faults(dome: DomeRecord, merger: FrameMerger) -> list[Fault]:
-    """Faults of dark frames that are bright, all zero, or far from the black level of their camera."""
+    """Faults of dark frames that are bright, all zero, or far from the black level of
+    their camera.
+    """
     faults = []
     key = f"{dome.file}[dark]"
     for i, (name, offset) in enumerate(_dark_offsets(dome, merger).items()):
         said = f"exposure {name} of camera {merger.camera.id}"
-        if merger.dark is not None and not merger.dark[i].any() and merger.camera.sensor.black > 0:
+        if (
+            merger.dark is not None
+            and not merger.dark[i].any()
+            and merger.camera.sensor.black > 0
+        ):
             rule = "dark frames must hold the values of black"
             cure = "take them again, with the lens covered"
-            faults.append(Fault(key, rule, f"0 everywhere, {said}, black_level {merger.camera.sensor.black:g}", cure))
+            faults.append(
+                Fault(
+                    key,
+                    rule,
+                    f"0 everywhere, {said}, black_level {merger.camera.sensor.black:g}",
+                    cure,
+                )
+            )
         elif abs(offset) > MAX_DARK_OFFSET:
-            rule = f"dark frames and black_level must differ by at most {MAX_DARK_OFFSET:.0%} of the range"
+            rule = (
+                "dark frames and black_level must differ by at most "
+                f"{MAX_DARK_OFFSET:.0%} of the range"
+            )
             found = f"{offset:+.1%}, {said}, black_level {merger.camera.sensor.black:g}"
-            cure = "set black_level to the camera's value without light, and cover the lens for dark frames"
+            cure = (
+                "set black_level to the camera's value without light, and cover the "
+                "lens for dark frames"
+            )
             faults.append(Fault(key, rule, found, cure))
     return faults
 
@@ -234,12 +342,18 @@ def dark_faults(dome: DomeRecord, merger: FrameMerger) -> list[Fault]:
 def dark_notes(dome: DomeRecord, merger: FrameMerger) -> list[str]:
     """Warnings about dark frames that differ noticeably from the black level."""
     worst = max(_dark_offsets(dome, merger).values(), key=abs, default=0.0)
-    said = f"dark frames of camera {merger.camera.id} differ from its black_level by {worst:+.1%} of the range"
+    said = (
+        f"dark frames of camera {merger.camera.id} differ from its black_level by "
+        f"{worst:+.1%} of the range"
+    )
     return [said] if abs(worst) > NOTED_DARK_OFFSET else []
 
 
-def repeated_frame_faults(folder: Path, digests: Digests, *, besides: Collection[Path] = ()) -> list[Fault]:
-    """Faults of frames with the same content, which noise makes impossible; frames of one value are allowed.
+def repeated_frame_faults(
+    folder: Path, digests: Digests, *, besides: Collection[Path] = ()
+) -> list[Fault]:
+    """Faults of frames with the same content, which noise makes impossible; frames of
+    one value are allowed.
 
     Parameters
     ----------
@@ -256,7 +370,12 @@ def repeated_frame_faults(folder: Path, digests: Digests, *, besides: Collection
     rule = "every frame must have been taken by itself"
     cure = "copy the right frames from the camera again"
     return [
-        Fault(str(folder), rule, f"{first.relative_to(folder)} is a copy of {second.relative_to(folder)}", cure)
+        Fault(
+            str(folder),
+            rule,
+            f"{first.relative_to(folder)} is a copy of {second.relative_to(folder)}",
+            cure,
+        )
         for first, second in (same[:2] for same in alike.values() if len(same) > 1)
         if np.ptp(read_frame(first)) > 0
     ]
@@ -268,7 +387,8 @@ def _dark_offsets(dome: DomeRecord, merger: FrameMerger) -> dict[str, float]:
         return {}
     sensor = merger.camera.sensor
     return {
-        name: float(np.median(frame[:: _step(frame), :: _step(frame)]) - sensor.black) / (sensor.white - sensor.black)
+        name: float(np.median(frame[:: _step(frame), :: _step(frame)]) - sensor.black)
+        / (sensor.white - sensor.black)
         for name, frame in zip(dome.exposures, merger.dark, strict=True)
     }
 

@@ -1,4 +1,6 @@
-"""Frames of cameras: 8- and 16-bit PNG and TIFF, linear OpenEXR; the content is checked after every load."""
+"""Frames of cameras: 8- and 16-bit PNG and TIFF, linear OpenEXR; the content is checked
+after every load.
+"""
 
 from __future__ import annotations
 
@@ -32,12 +34,24 @@ Digests = dict[Path, str]  # sha256 of the bytes that were decoded
 PNG_HEAD = b"\x89PNG\r\n\x1a\n"
 PNG_TAIL = b"IEND\xaeB`\x82"
 PNG_CHANNELS = {0: 1, 2: 3, 3: 3, 4: 2, 6: 4}  # colour type of IHDR
-EXR_LINES = {0: 1, 1: 1, 2: 1, 3: 16, 4: 32, 5: 16, 6: 32, 7: 32, 8: 32, 9: 256}  # lines per chunk, by compression
-MAX_CHANNELS = 16  # of a file; a count far above R, G, B, alpha and depth indicates damage
+# lines per chunk, by compression
+EXR_LINES = {0: 1, 1: 1, 2: 1, 3: 16, 4: 32, 5: 16, 6: 32, 7: 32, 8: 32, 9: 256}
+# of a file; a count far above R, G, B, alpha and depth indicates damage
+MAX_CHANNELS = 16
 CURE = "copy the file from the camera again"
-logging.getLogger("tifffile").addHandler(logging.NullHandler())  # otherwise its messages on damage go to standard error
-# errors of tifffile for damaged tags, found by changing bytes; MemoryError: an absurd size in the header
-TIFF_DAMAGE = (ValueError, RuntimeError, LookupError, TypeError, ArithmeticError, MemoryError, struct.error)
+# otherwise its messages on damage go to standard error
+logging.getLogger("tifffile").addHandler(logging.NullHandler())
+# errors of tifffile for damaged tags, found by changing bytes; MemoryError: an absurd
+# size in the header
+TIFF_DAMAGE = (
+    ValueError,
+    RuntimeError,
+    LookupError,
+    TypeError,
+    ArithmeticError,
+    MemoryError,
+    struct.error,
+)
 FLOAT = Imath.PixelType(Imath.PixelType.FLOAT)
 DAMAGED = "one that is cut off or damaged"
 
@@ -53,7 +67,9 @@ class FrameKind:
     @property
     def dtype(self) -> np.dtype[Any]:
         """Type of the pixels: float32, uint8 or uint16."""
-        return np.dtype("float32" if self.bits == 0 else "uint8" if self.bits <= 8 else "uint16")
+        return np.dtype(
+            "float32" if self.bits == 0 else "uint8" if self.bits <= 8 else "uint16"
+        )
 
 
 class UnreadableError(ValueError):
@@ -81,18 +97,43 @@ def header_faults(path: Path, kind: FrameKind, key: str) -> list[Fault]:
     try:
         width, height, channels, dtype = _header(path)
     except InputError as error:
-        return [Fault(where, fault.rule, fault.found, fault.cure) for fault in error.faults]
+        return [
+            Fault(where, fault.rule, fault.found, fault.cure) for fault in error.faults
+        ]
     faults = []
     if (width, height) != (kind.width, kind.height):
         rule = f"a frame must be {kind.width} x {kind.height} pixels, as declared for its camera"
-        faults.append(Fault(where, rule, f"{width} x {height}", "correct width and height, or the frames"))
+        faults.append(
+            Fault(
+                where,
+                rule,
+                f"{width} x {height}",
+                "correct width and height, or the frames",
+            )
+        )
     if channels != 3:
         faults.append(
-            Fault(where, "a frame must have the channels R, G, B", f"{channels} channels", "write RGB frames")
+            Fault(
+                where,
+                "a frame must have the channels R, G, B",
+                f"{channels} channels",
+                "write RGB frames",
+            )
         )
     if dtype != kind.dtype:
-        promised = f"bit_depth {kind.bits} means {kind.dtype}" if kind.bits else "OpenEXR holds half or float"
-        faults.append(Fault(where, promised, str(dtype), "correct bit_depth, or write frames of that depth"))
+        promised = (
+            f"bit_depth {kind.bits} means {kind.dtype}"
+            if kind.bits
+            else "OpenEXR holds half or float"
+        )
+        faults.append(
+            Fault(
+                where,
+                promised,
+                str(dtype),
+                "correct bit_depth, or write frames of that depth",
+            )
+        )
     return faults
 
 
@@ -105,21 +146,35 @@ def frame_size(path: Path) -> tuple[int, int] | None:
 
 
 def _header(path: Path) -> Header:
-    """Width, height, channels and type of a frame; the file must be regular and within the size limit."""
+    """Width, height, channels and type of a frame; the file must be regular and within
+    the size limit.
+    """
     where = str(path)
     try:
         with open_regular(path, MAX_FRAME_BYTES) as stream:
             width, height, channels, dtype = _reader(path, _HEADERS)(path, stream)
     except UnreadableError as error:
-        raise InputError(Fault(where, "a frame must be a whole image file", str(error), CURE)) from None
+        raise InputError(
+            Fault(where, "a frame must be a whole image file", str(error), CURE)
+        ) from None
     except OSError as error:
         found = error.strerror or str(error)
         raise InputError(
-            Fault(where, "a frame must be readable", found, "check its permissions and the disk")
+            Fault(
+                where,
+                "a frame must be readable",
+                found,
+                "check its permissions and the disk",
+            )
         ) from None
     if channels > MAX_CHANNELS:
         raise InputError(
-            Fault(where, "a frame must have the channels R, G, B", f"{channels} channels", "write RGB frames")
+            Fault(
+                where,
+                "a frame must have the channels R, G, B",
+                f"{channels} channels",
+                "write RGB frames",
+            )
         )
     if min(width, height) < 1 or width * height > MAX_FRAME_PIXELS:
         rule = f"a frame must have 1 to {MAX_FRAME_PIXELS:,} pixels"
@@ -128,7 +183,9 @@ def _header(path: Path) -> Header:
     return width, height, channels, dtype
 
 
-def read_frame(path: Path, kind: FrameKind | None = None, digests: Digests | None = None) -> Frame:
+def read_frame(
+    path: Path, kind: FrameKind | None = None, digests: Digests | None = None
+) -> Frame:
     """Decode a frame completely.
 
     Parameters
@@ -156,19 +213,30 @@ def read_frame(path: Path, kind: FrameKind | None = None, digests: Digests | Non
         content = read_regular(path, MAX_FRAME_BYTES)
         frame: Frame = decode(path, content)
     except UnreadableError as error:
-        raise InputError(Fault(str(path), "a frame must be a whole image file", str(error), CURE)) from None
+        raise InputError(
+            Fault(str(path), "a frame must be a whole image file", str(error), CURE)
+        ) from None
     shape = frame.shape[:2] if kind is None else (kind.height, kind.width)
     dtype = frame.dtype if kind is None else kind.dtype
     if frame.shape != (*shape, 3) or frame.dtype != dtype:
         rule = f"a frame must be {shape[1]} x {shape[0]} with R, G, B of {dtype}"
         found = f"an array of {' x '.join(map(str, frame.shape))} {frame.dtype}"
-        raise InputError(Fault(str(path), rule, found, "correct the JSON file that describes it, or the frames"))
+        raise InputError(
+            Fault(
+                str(path),
+                rule,
+                found,
+                "correct the JSON file that describes it, or the frames",
+            )
+        )
     if digests is not None:
         digests[path] = hashlib.sha256(content).hexdigest()
     return frame
 
 
-def read_frames(paths: Iterable[Path], kind: FrameKind | None = None, digests: Digests | None = None) -> list[Frame]:
+def read_frames(
+    paths: Iterable[Path], kind: FrameKind | None = None, digests: Digests | None = None
+) -> list[Frame]:
     """Several frames; `InputError` with the faults of all of them."""
     frames = list[Frame]()
     faults = list[Fault]()
@@ -183,16 +251,22 @@ def read_frames(paths: Iterable[Path], kind: FrameKind | None = None, digests: D
 
 
 def write_frame(path: Path, frame: Frame) -> None:
-    """Write (h, w, 3): uint8 or uint16 values as PNG or TIFF, floats as OpenEXR, by the suffix of the path."""
+    """Write (h, w, 3): uint8 or uint16 values as PNG or TIFF, floats as OpenEXR, by the
+    suffix of the path.
+    """
     suffix = path.suffix.lower()
     if is_linear(path) != (frame.dtype.kind == "f"):
         raise ValueError(f"{suffix} does not hold {frame.dtype}")
     if suffix == ".exr":
         write_exr(path, frame)
     elif suffix == ".png":
-        private_file(path).write_bytes(imagecodecs.png_encode(np.ascontiguousarray(frame)))
+        private_file(path).write_bytes(
+            imagecodecs.png_encode(np.ascontiguousarray(frame))
+        )
     elif suffix in (".tif", ".tiff"):
-        tifffile.imwrite(private_file(path), frame, photometric="rgb", compression="zstd")
+        tifffile.imwrite(
+            private_file(path), frame, photometric="rgb", compression="zstd"
+        )
     else:
         raise ValueError(f"frames are .png, .tif or .exr, not {suffix!r}")
 
@@ -208,12 +282,21 @@ def _png_header(_: Path, stream: BinaryIO) -> Header:
         raise UnreadableError(DAMAGED)
     width, height, bits, colour = struct.unpack(">IIBB", head[16:26])
     if width * height * PNG_CHANNELS.get(colour, 1) * bits > 8 * MAX_PNG_RATIO * size:
-        raise UnreadableError(f"a PNG file of {size:,} bytes whose header states {width} x {height} pixels")
-    return width, height, PNG_CHANNELS.get(colour, 0), np.dtype("uint16" if bits == 16 else "uint8")
+        raise UnreadableError(
+            f"a PNG file of {size:,} bytes whose header states {width} x {height} pixels"
+        )
+    return (
+        width,
+        height,
+        PNG_CHANNELS.get(colour, 0),
+        np.dtype("uint16" if bits == 16 else "uint8"),
+    )
 
 
 def _png_ends(stream: BinaryIO, size: int) -> bool:
-    """Whether the chunks end within the file; data after the end, such as padding to blocks, is allowed."""
+    """Whether the chunks end within the file; data after the end, such as padding to
+    blocks, is allowed.
+    """
     at = len(PNG_HEAD)
     while at + 12 <= size:
         stream.seek(at)
@@ -228,7 +311,8 @@ def _tiff_header(_: Path, stream: BinaryIO) -> Header:
     try:
         with tifffile.TiffFile(stream) as file:
             page = file.pages[0]
-            height, width, *channels = (operator.index(side) for side in page.shape)  # damaged tags are tuples or text
+            # damaged tags are tuples or text
+            height, width, *channels = (operator.index(side) for side in page.shape)
             dtype = np.dtype(page.dtype) if page.dtype is not None else None
     except TIFF_DAMAGE:
         raise UnreadableError(DAMAGED) from None
@@ -239,7 +323,9 @@ def _tiff_header(_: Path, stream: BinaryIO) -> Header:
 
 def _exr_header(path: Path, stream: BinaryIO) -> Header:
     try:
-        part = OpenEXR.File(str(path), separate_channels=True, header_only=True).parts[0]
+        part = OpenEXR.File(str(path), separate_channels=True, header_only=True).parts[
+            0
+        ]
     except (ValueError, RuntimeError, IndexError):
         raise UnreadableError(DAMAGED) from None
     low, high = (np.asarray(corner) for corner in part.header["dataWindow"])
@@ -249,18 +335,27 @@ def _exr_header(path: Path, stream: BinaryIO) -> Header:
         names = {channel.name for channel in part.header["channels"]}
         if len(names) > MAX_CHANNELS:
             raise UnreadableError(f"an OpenEXR file of {len(names)} channels")
-    except (struct.error, IndexError, UnicodeDecodeError):  # the library also opens incomplete headers
+    except (struct.error, IndexError, UnicodeDecodeError):
+        # the library also opens incomplete headers
         raise UnreadableError(DAMAGED) from None
-    return width, height, 3 if {"R", "G", "B"} <= names else len(names), np.dtype("float32")
+    return (
+        width,
+        height,
+        3 if {"R", "G", "B"} <= names else len(names),
+        np.dtype("float32"),
+    )
 
 
 def _require_chunks(stream: BinaryIO, height: int) -> None:
-    """Require that the last chunk of a scan-line file ends inside it; the library only prints a message."""
+    """Require that the last chunk of a scan-line file ends inside it; the library only
+    prints a message.
+    """
     size = stream.seek(0, os.SEEK_END)
 
     def content(at: int, count: int) -> bytes:
         stream.seek(min(at, size))
-        return stream.read(min(max(count, 0), size))  # a damaged file may contain any number
+        # a damaged file may contain any number
+        return stream.read(min(max(count, 0), size))
 
     at = 8
     lines = 0
@@ -268,10 +363,14 @@ def _require_chunks(stream: BinaryIO, height: int) -> None:
         name, _, rest = attribute.partition(b"\0")
         kind = rest.partition(b"\0")[0]
         value = at + len(name) + len(kind) + 6
-        lines = EXR_LINES.get(content(value, 1)[0], 0) if name == b"compression" else lines
-        at = value + int(struct.unpack("<I", content(value - 4, 4))[0])  # unsigned: no step back
+        lines = (
+            EXR_LINES.get(content(value, 1)[0], 0) if name == b"compression" else lines
+        )
+        # unsigned: no step back
+        at = value + int(struct.unpack("<I", content(value - 4, 4))[0])
     flags = content(5, 1)[0]
-    if not lines or flags & 0b11010:  # tiled, deep and multi-part files are left to the decoder
+    # tiled, deep and multi-part files are left to the decoder
+    if not lines or flags & 0b11010:
         return
     count = -(-height // lines)
     table = content(at + 1, 8 * count)
@@ -279,7 +378,9 @@ def _require_chunks(stream: BinaryIO, height: int) -> None:
         raise UnreadableError(DAMAGED)
     offsets = np.frombuffer(table, "<u8")
     last = int(offsets.max())
-    length = int.from_bytes(content(last + 4, 4), "little") if last + 8 <= size else size
+    length = (
+        int.from_bytes(content(last + 4, 4), "little") if last + 8 <= size else size
+    )
     if last + 8 + length > size or int(offsets.min()) == 0:
         raise UnreadableError(DAMAGED)
 
@@ -300,7 +401,8 @@ def _decode_tiff(_: Path, content: bytes) -> Frame:
 
 def _decode_exr(path: Path, _: bytes) -> Frame:
     try:
-        file = OpenEXR.InputFile(str(path))  # `OpenEXR.File` prints a warning about damaged pixels
+        # `OpenEXR.File` prints a warning about damaged pixels
+        file = OpenEXR.InputFile(str(path))
         window = file.header()["dataWindow"]
         planes = file.channels("RGB", FLOAT)
     except TypeError:
@@ -308,7 +410,9 @@ def _decode_exr(path: Path, _: bytes) -> Frame:
     except (OSError, ValueError, RuntimeError, LookupError):
         raise UnreadableError(DAMAGED) from None
     shape = (window.max.y - window.min.y + 1, window.max.x - window.min.x + 1)
-    return np.stack([np.frombuffer(plane, np.float32).reshape(shape) for plane in planes], axis=-1)
+    return np.stack(
+        [np.frombuffer(plane, np.float32).reshape(shape) for plane in planes], axis=-1
+    )
 
 
 _HEADERS: dict[str, Callable[[Path, BinaryIO], Header]] = {

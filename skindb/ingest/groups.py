@@ -42,10 +42,16 @@ def surfel_group(
     }
     coords: dict[str, list[str]] = {"region": list(surfels.region_names)}
     if dome is not None:
-        variables |= {"light_visible_fraction": light_fraction, "camera_visible_fraction": camera_share}
+        variables |= {
+            "light_visible_fraction": light_fraction,
+            "camera_visible_fraction": camera_share,
+        }
         variables["soft_light_count"] = np.zeros(len(surfels.position), np.int32)
-        for share in () if light_fraction is None else light_fraction.T:  # not all at once: memory
-            variables["soft_light_count"] += (share >= FULL_SHADOW) & (share < MIN_LIT_FRACTION)
+        # not all at once: memory
+        for share in () if light_fraction is None else light_fraction.T:
+            variables["soft_light_count"] += (share >= FULL_SHADOW) & (
+                share < MIN_LIT_FRACTION
+            )
         coords |= _dome_names(dome)
     if not surfels.region_names:
         variables.pop("region_mask")
@@ -67,13 +73,19 @@ def mesh_group(capture: Capture, surfels: SurfelSet) -> xr.Dataset:
 
 
 def atlas_group(surfels: SurfelSet) -> xr.Dataset:
-    """Group "atlas": distortion by the texture coordinates, of the entire face as region "all" and of each region.
+    """Group "atlas": distortion by the texture coordinates, of the entire face as
+    region "all" and of each region.
 
-    Its attribute `weights` names the method: "intrinsic" (Desbrun et al. 2002) or "mean_value" (Floater 2003).
+    Its attribute `weights` names the method: "intrinsic" (Desbrun et al. 2002) or
+    "mean_value" (Floater 2003).
     """
     found = distortion(surfels.position, surfels.faces, surfels.uv, surfels.region)
     variables = {f"atlas_{name}": values for name, values in found.items()}
-    return dataset(variables, coords={"region": ["all", *surfels.region_names]}, attrs={"weights": surfels.uv_weights})
+    return dataset(
+        variables,
+        coords={"region": ["all", *surfels.region_names]},
+        attrs={"weights": surfels.uv_weights},
+    )
 
 
 def dome_group(dome: DomeRecord, intensity: Array) -> xr.Dataset:
@@ -96,8 +108,11 @@ def dome_group(dome: DomeRecord, intensity: Array) -> xr.Dataset:
     return dataset(variables, coords=_dome_names(dome) | {"channel": list(CHANNELS)})
 
 
-def calibration_group(dome: DomeRecord, found: Calibration, applied: NDArray[np.float64]) -> xr.Dataset:
-    """Group "calibration": how well the photographs fit the poses of cameras and scan and the positions of the lights.
+def calibration_group(
+    dome: DomeRecord, found: Calibration, applied: NDArray[np.float64]
+) -> xr.Dataset:
+    """Group "calibration": how well the photographs fit the poses of cameras and scan
+    and the positions of the lights.
 
     `applied` are the rotation vectors (camera, 3) [degrees] of the refinement.
     """
@@ -134,11 +149,18 @@ def sample_group(dome: DomeRecord, found: Lumitexels) -> xr.Dataset:
             "radiance_read_variance": noise.read_variance,
             "radiance_shot_variance": noise.shot_variance,
         }
-        coords["exposure"] = sorted(dome.exposures, key=lambda name: -dome.exposures[name])
+        coords["exposure"] = sorted(
+            dome.exposures, key=lambda name: -dome.exposures[name]
+        )
     return dataset(variables, coords=coords)
 
 
-def probe_group(probe: ProbeRecord, profiles: Profiles, position: Array, isotropy: Array | None = None) -> xr.Dataset:
+def probe_group(
+    probe: ProbeRecord,
+    profiles: Profiles,
+    position: Array,
+    isotropy: Array | None = None,
+) -> xr.Dataset:
     """Group "probe"; `position` (site, 3) [mm] and p values of isotropy (site, 3)."""
     variables = {
         "fibre_distance": probe.distance,
@@ -157,14 +179,25 @@ def probe_group(probe: ProbeRecord, profiles: Profiles, position: Array, isotrop
         variables["site_isotropy_p_value"] = isotropy
     if any(len(own) > 1 for own in probe.placements.values()):
         variables["placement_profile"] = _padded(profiles.placements)
-    logs = [[probe.pressure.get((site, name)) for name in probe.placements[site]] for site in probe.sites]
+    logs = [
+        [probe.pressure.get((site, name)) for name in probe.placements[site]]
+        for site in probe.sites
+    ]
     if any(log is not None and len(log) > 1 for site in logs for log in site):
-        # (site, placement, sample, time and pressure); a value without a time is a log with one entry
+        # (site, placement, sample, time and pressure); a value without a time is a log
+        # with one entry
         empty = np.full((0, 2), np.nan)
-        padded = _padded([_padded([empty if log is None else log for log in site]) for site in logs])
+        padded = _padded(
+            [_padded([empty if log is None else log for log in site]) for site in logs]
+        )
         variables |= {"pressure_time": padded[..., 0], "pressure": padded[..., 1]}
     return dataset(
-        variables, coords={"site": list(probe.sites), "fibre": list(probe.fibres), "channel": list(CHANNELS)}
+        variables,
+        coords={
+            "site": list(probe.sites),
+            "fibre": list(probe.fibres),
+            "channel": list(CHANNELS),
+        },
     )
 
 
@@ -184,7 +217,10 @@ def sequence_group(sequence: SequenceRecord, dome: DomeRecord) -> xr.Dataset:
 
 def _mean_pressures(probe: ProbeRecord) -> list[float]:
     """Mean pressure (site,) over time and placements; NaN for a site without a gauge."""
-    logs = [[probe.pressure.get((site, name)) for name in probe.placements[site]] for site in probe.sites]
+    logs = [
+        [probe.pressure.get((site, name)) for name in probe.placements[site]]
+        for site in probe.sites
+    ]
     means = [[log[:, 1].mean() for log in site if log is not None] for site in logs]
     return [float(np.mean(site)) if site else np.nan for site in means]
 
@@ -201,7 +237,9 @@ def _padded(arrays: Sequence[Array]) -> Array:
 def photograph_group(photographs: Mapping[tuple[int, int], Image]) -> xr.Dataset:
     """Group "photographs"; smaller ones are padded with NaN on the right and at the bottom."""
     pairs = sorted(photographs)
-    height, width = (max(photographs[pair].shape[axis] for pair in pairs) for axis in (0, 1))
+    height, width = (
+        max(photographs[pair].shape[axis] for pair in pairs) for axis in (0, 1)
+    )
     radiance = np.full((len(pairs), height, width, 3), np.nan, np.float32)
     for i, pair in enumerate(pairs):
         image = photographs[pair]
@@ -215,4 +253,7 @@ def photograph_group(photographs: Mapping[tuple[int, int], Image]) -> xr.Dataset
 
 
 def _dome_names(dome: DomeRecord) -> dict[str, list[str]]:
-    return {"light": [light.id for light in dome.lights], "camera": [camera.id for camera in dome.cameras]}
+    return {
+        "light": [light.id for light in dome.lights],
+        "camera": [camera.id for camera in dome.cameras],
+    }

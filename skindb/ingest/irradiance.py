@@ -18,18 +18,26 @@ from skindb.ingest.pixel_flags import OK
 from skindb.ingest.radiance import FrameMerger, read_view
 
 Array = NDArray[np.float64]
-TARGET_INTERIOR_FRACTION = 0.8  # of the half size: a disc inside the square, however the square is rotated
-MIN_TARGET_PIXELS = 12  # neither dark nor saturated; the median and spread of fewer are unreliable
-MIN_COSINE_TARGET = 0.05  # cosine of incidence below which a light does not illuminate the target
-MAX_DEVIATIONS = 4.0  # robust standard deviations from the median; larger deviations are dirt or highlights
-PIXELS_PER_GROUP = 16  # neighbouring pixels that are averaged before their spread is measured
-# relative spread of the intensity over the target: 0.02 in captures, 0.35 and more if a face stands in its place
+# of the half size: a disc inside the square, however the square is rotated
+TARGET_INTERIOR_FRACTION = 0.8
+# neither dark nor saturated; the median and spread of fewer are unreliable
+MIN_TARGET_PIXELS = 12
+# cosine of incidence below which a light does not illuminate the target
+MIN_COSINE_TARGET = 0.05
+# robust standard deviations from the median; larger deviations are dirt or highlights
+MAX_DEVIATIONS = 4.0
+# neighbouring pixels that are averaged before their spread is measured
+PIXELS_PER_GROUP = 16
+# relative spread of the intensity over the target: 0.02 in captures, 0.35 and more if a
+# face stands in its place
 MAX_UNEVENNESS = 0.2
 PIXELS_PER_BLOCK = 1 << 16  # pixels whose rays are in memory at a time: 130 bytes each
 
 
 def light_falloff(light: LightRecord, points: Array) -> tuple[Array, Array]:
-    """Squared distance (n,) mm2 of points (n, 3) from a light and its angular fall-off (n,) towards them."""
+    """Squared distance (n,) mm2 of points (n, 3) from a light and its angular fall-off
+    (n,) towards them.
+    """
     way = points - light.position
     square = np.einsum("ni,ni->n", way, way)
     if light.falloff == 0:
@@ -39,17 +47,26 @@ def light_falloff(light: LightRecord, points: Array) -> tuple[Array, Array]:
 
 
 def light_intensities(
-    dome: DomeRecord, mergers: Mapping[str, FrameMerger], pool: Executor, digests: Digests | None = None
+    dome: DomeRecord,
+    mergers: Mapping[str, FrameMerger],
+    pool: Executor,
+    digests: Digests | None = None,
 ) -> Array:
-    """Radiant intensity (light, 3) in radiance mm2: given, or I = pi L d^2 / (reflectance cos falloff) by the target.
+    """Radiant intensity (light, 3) in radiance mm2: given, or I = pi L d^2 /
+    (reflectance cos falloff) by the target.
 
     Raises
     ------
     InputError
-        With every light that does not illuminate the target, and every frame that cannot be decoded.
+        With every light that does not illuminate the target, and every frame that
+        cannot be decoded.
     """
     white = dome.white
-    targets = [] if white is None else [target_pixels(c, white) for c in dome.cameras if c.id in white.cameras]
+    targets = (
+        []
+        if white is None
+        else [target_pixels(c, white) for c in dome.cameras if c.id in white.cameras]
+    )
     faults: list[Fault] = []
 
     def one(light: LightRecord) -> Array:
@@ -57,7 +74,10 @@ def light_intensities(
             return light.intensity
         parts = [np.zeros((0, 3))]
         try:
-            parts += [_intensities(dome, light, mergers[target.camera], target, digests) for target in targets]
+            parts += [
+                _intensities(dome, light, mergers[target.camera], target, digests)
+                for target in targets
+            ]
         except InputError as error:
             faults.extend(error.faults)
             return np.ones(3)
@@ -86,32 +106,48 @@ class Target:
 
     camera: str
     at: NDArray[np.int64]  # (n,) index into the flattened picture
-    spans: NDArray[np.int64]  # (h, 2) first column in each row, and the one after the last
+    # (h, 2) first column in each row, and the one after the last
+    spans: NDArray[np.int64]
     points: Array  # (n, 3) mm on the target
 
 
 def target_pixels(camera: CameraRecord, white: WhiteRecord) -> Target:
     """Pixels at which a camera sees the interior of the white target."""
     step = max(PIXELS_PER_BLOCK // camera.width, 1)
-    blocks = [(first, min(first + step, camera.height)) for first in range(0, camera.height, step)]
+    blocks = [
+        (first, min(first + step, camera.height))
+        for first in range(0, camera.height, step)
+    ]
     parts = [_target_rows(camera, white, *block) for block in blocks]
     inside = np.concatenate([part[0] for part in parts])
     first = inside.argmax(axis=1)
     last = camera.width - inside[:, ::-1].argmax(axis=1)
     spans = np.stack([first, np.where(inside.any(axis=1), last, first)], axis=1)
-    return Target(camera.id, np.flatnonzero(inside), spans, np.concatenate([part[1] for part in parts]))
+    return Target(
+        camera.id,
+        np.flatnonzero(inside),
+        spans,
+        np.concatenate([part[1] for part in parts]),
+    )
 
 
-def _target_rows(camera: CameraRecord, white: WhiteRecord, first: int, last: int) -> tuple[NDArray[np.bool_], Array]:
-    """Mask (rows, width) of the pixels on the target in rows first to last - 1, and their points (n, 3) in mm."""
+def _target_rows(
+    camera: CameraRecord, white: WhiteRecord, first: int, last: int
+) -> tuple[NDArray[np.bool_], Array]:
+    """Mask (rows, width) of the pixels on the target in rows first to last - 1, and
+    their points (n, 3) in mm.
+    """
     row, column = np.mgrid[first:last, : camera.width]
-    ray = pixel_rays(np.stack([column, row], axis=-1) + 0.5, camera.K, camera.R, camera.distortion)
+    ray = pixel_rays(
+        np.stack([column, row], axis=-1) + 0.5, camera.K, camera.R, camera.distortion
+    )
     centre = camera_centre(camera.R, camera.t)
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = (white.point - centre) @ white.normal / (ray @ white.normal)
         points = centre + distance[..., None] * ray
         inside = (distance > 0) & (
-            np.linalg.norm(points - white.point, axis=-1) < TARGET_INTERIOR_FRACTION * white.half_size
+            np.linalg.norm(points - white.point, axis=-1)
+            < TARGET_INTERIOR_FRACTION * white.half_size
         )
     return inside, points[inside]
 
@@ -124,12 +160,18 @@ def robust_mean(values: Array) -> Array:
     known = np.ascontiguousarray(known.T)  # medians are taken along rows
     middle = np.median(known, axis=1, keepdims=True)
     apart = np.abs(known - middle)
-    good = (apart <= MAX_DEVIATIONS * 1.4826 * np.median(apart, axis=1, keepdims=True)).all(axis=0)
+    good = (
+        apart <= MAX_DEVIATIONS * 1.4826 * np.median(apart, axis=1, keepdims=True)
+    ).all(axis=0)
     return np.asarray(known[:, good].mean(axis=1) if good.any() else middle[:, 0])
 
 
 def _intensities(
-    dome: DomeRecord, light: LightRecord, merger: FrameMerger, target: Target, digests: Digests | None
+    dome: DomeRecord,
+    light: LightRecord,
+    merger: FrameMerger,
+    target: Target,
+    digests: Digests | None,
 ) -> Array:
     """Intensity (m, 3) computed from each usable pixel of the target."""
     white = dome.white
@@ -140,27 +182,42 @@ def _intensities(
         raise InputError(faults)
     radiance, flag = merger.merge(frames, target.spans)
     square, falloff = light_falloff(light, target.points)
-    cosine = falloff * ((light.position - target.points) @ white.normal) / np.sqrt(square)
+    cosine = (
+        falloff * ((light.position - target.points) @ white.normal) / np.sqrt(square)
+    )
     usable = (cosine > MIN_COSINE_TARGET) & (flag.ravel()[target.at] == OK)
     factor = np.pi / white.reflectance * square[usable] / cosine[usable]
-    found = np.asarray(radiance.reshape(-1, 3)[target.at[usable]] * factor[:, None], np.float64)
+    found = np.asarray(
+        radiance.reshape(-1, 3)[target.at[usable]] * factor[:, None], np.float64
+    )
     if (uneven := unevenness(found)) > MAX_UNEVENNESS:
-        rule = f"the white target must be evenly bright: radiance * d^2 / cos varies by at most {MAX_UNEVENNESS:.0%}"
-        cure = "point, normal and half_size must be those of the target, and its frames must show it and not the face"
+        rule = (
+            "the white target must be evenly bright: radiance * d^2 / cos varies by "
+            f"at most {MAX_UNEVENNESS:.0%}"
+        )
+        cure = (
+            "point, normal and half_size must be those of the target, and its frames "
+            "must show it and not the face"
+        )
         said = f"camera {merger.camera.id}, light {light.id}: by {uneven:.0%}"
         raise InputError(Fault(f"{dome.file}[white]", rule, said, cure))
     return found
 
 
 def unevenness(values: Array) -> float:
-    """Relative robust standard deviation of values (n, c) in the order of the pixels; 0 if there are too few.
+    """Relative robust standard deviation of values (n, c) in the order of the pixels; 0
+    if there are too few.
 
     It is that of means over groups of neighbours, which suppresses the noise of single pixels.
     """
     count = len(values) // PIXELS_PER_GROUP
     if count < MIN_TARGET_PIXELS:
         return 0.0
-    means = values[: count * PIXELS_PER_GROUP].reshape(count, PIXELS_PER_GROUP, -1).mean(axis=1)
+    means = (
+        values[: count * PIXELS_PER_GROUP]
+        .reshape(count, PIXELS_PER_GROUP, -1)
+        .mean(axis=1)
+    )
     middle = np.median(means, axis=0)
     spread = 1.4826 * np.median(np.abs(means - middle), axis=0)
     return float((spread / np.maximum(np.abs(middle), 1e-300)).max())

@@ -1,4 +1,6 @@
-"""Test of isotropic subsurface scattering by profiles along several azimuths (Weyrich et al. 2005, figure 10)."""
+"""Test of isotropic subsurface scattering by profiles along several azimuths (Weyrich
+et al. 2005, figure 10).
+"""
 
 from __future__ import annotations
 
@@ -11,8 +13,10 @@ from scipy import stats
 from skindb.errors import Fault, InputError
 
 Array = NDArray[np.float64]
-MIN_SIGNAL_TO_NOISE = 5.0  # of every azimuth at a distance that is used: logarithms of noisier signals are biased
-MIN_AZIMUTHS = 6  # the mean and two harmonics have five unknowns; one degree of freedom remains
+# of every azimuth at a distance that is used: logarithms of noisier signals are biased
+MIN_SIGNAL_TO_NOISE = 5.0
+# the mean and two harmonics have five unknowns; one degree of freedom remains
+MIN_AZIMUTHS = 6
 MIN_DISTANCES = 3
 
 
@@ -20,13 +24,15 @@ MIN_DISTANCES = 3
 class Isotropy:
     """Decay of each profile relative to the mean one, per channel.
 
-    The decay is -d ln (r^2 R) / dr, which far from the source is close to sigma_tr (Farrell, Patterson and Wilson
-    1992). `slope` (azimuth, 3) and `slope_error` are its differences from the mean `decay` (3,), in mm^-1. `p_value`
-    (3,) is the probability of differences this large in isotropic tissue. `amplitude` (3,) in mm^-1 and `direction`
-    (3,) in radians, 0 to pi, belong to the second harmonic of the slope: tissue in which light travels farther along
-    one line. `anisotropy` (3,) is the largest over the smallest decay of that harmonic, with its `anisotropy_error`.
-    `shift` (3,) is the amplitude of the first harmonic in mm^-1, which indicates uneven pressure of the probe.
-    `distances` (fibre,) marks the distances that were used.
+    The decay is -d ln (r^2 R) / dr, which far from the source is close to sigma_tr
+    (Farrell, Patterson and Wilson 1992). `slope` (azimuth, 3) and `slope_error` are its
+    differences from the mean `decay` (3,), in mm^-1. `p_value` (3,) is the probability
+    of differences this large in isotropic tissue. `amplitude` (3,) in mm^-1 and
+    `direction` (3,) in radians, 0 to pi, belong to the second harmonic of the slope:
+    tissue in which light travels farther along one line. `anisotropy` (3,) is the
+    largest over the smallest decay of that harmonic, with its `anisotropy_error`.
+    `shift` (3,) is the amplitude of the first harmonic in mm^-1, which indicates uneven
+    pressure of the probe. `distances` (fibre,) marks the distances that were used.
     """
 
     slope: Array
@@ -41,12 +47,15 @@ class Isotropy:
     distances: NDArray[np.bool_]
 
 
-def compare_azimuths(value: ArrayLike, error: ArrayLike, distance: ArrayLike, azimuth: ArrayLike) -> Isotropy:
+def compare_azimuths(
+    value: ArrayLike, error: ArrayLike, distance: ArrayLike, azimuth: ArrayLike
+) -> Isotropy:
     """Compare the decay of profiles along several azimuths.
 
-    ln (r^2 R) is fitted by a level and a slope for each azimuth. The level absorbs gain and contact of its fibres;
-    differences of the slope are differences in transport. A chi-squared test of the slopes shows whether they are
-    equal, and their first and second harmonics describe them. The form of the mean profile cancels.
+    ln (r^2 R) is fitted by a level and a slope for each azimuth. The level absorbs gain
+    and contact of its fibres; differences of the slope are differences in transport. A
+    chi-squared test of the slopes shows whether they are equal, and their first and
+    second harmonics describe them. The form of the mean profile cancels.
 
     Parameters
     ----------
@@ -60,7 +69,8 @@ def compare_azimuths(value: ArrayLike, error: ArrayLike, distance: ArrayLike, az
     Raises
     ------
     InputError
-        Wrong shapes, too few azimuths, or too few distances at which all profiles are clear of noise.
+        Wrong shapes, too few azimuths, or too few distances at which all profiles are
+        clear of noise.
     """
     profile = np.asarray(value, np.float64)
     sigma = np.asarray(error, np.float64)
@@ -68,21 +78,40 @@ def compare_azimuths(value: ArrayLike, error: ArrayLike, distance: ArrayLike, az
     phi = np.asarray(azimuth, np.float64)
     shape = (len(phi), len(r), 3)
     if profile.shape != shape or sigma.shape != shape or len(phi) < MIN_AZIMUTHS:
-        rule = f"value and error must have the shape (azimuth, fibre, 3), with {MIN_AZIMUTHS} azimuths or more"
-        raise InputError(Fault("test of isotropy", rule, f"{profile.shape}, {sigma.shape}, {shape}", "measure more"))
+        rule = (
+            "value and error must have the shape (azimuth, fibre, 3), with "
+            f"{MIN_AZIMUTHS} azimuths or more"
+        )
+        raise InputError(
+            Fault(
+                "test of isotropy",
+                rule,
+                f"{profile.shape}, {sigma.shape}, {shape}",
+                "measure more",
+            )
+        )
     with np.errstate(invalid="ignore"):
-        clear = np.asarray((sigma > 0) & (profile > MIN_SIGNAL_TO_NOISE * sigma)).all(axis=(0, 2)) & (r > 0)
+        clear = np.asarray((sigma > 0) & (profile > MIN_SIGNAL_TO_NOISE * sigma)).all(
+            axis=(0, 2)
+        ) & (r > 0)
     if len(np.unique(r[clear])) < MIN_DISTANCES:
-        rule = f"all profiles must be {MIN_SIGNAL_TO_NOISE:g} times their error at {MIN_DISTANCES} distances or more"
+        rule = (
+            f"all profiles must be {MIN_SIGNAL_TO_NOISE:g} times their error at "
+            f"{MIN_DISTANCES} distances or more"
+        )
         cure = "add longer exposures, and remove profiles without contact"
-        raise InputError(Fault("test of isotropy", rule, f"{int(clear.sum())} distances", cure))
+        raise InputError(
+            Fault("test of isotropy", rule, f"{int(clear.sum())} distances", cure)
+        )
     log = np.log(profile[:, clear] * r[clear, None] ** 2)
     slope, variance = _slopes(log, sigma[:, clear] / profile[:, clear], r[clear])
     decay = slope.mean(axis=0)
     level = (slope / variance).sum(axis=0) / (1 / variance).sum(axis=0)
     chi_square = ((slope - level) ** 2 / variance).sum(axis=0)
     parts = [_harmonics(slope[:, c] - level[c], variance[:, c], phi) for c in range(3)]
-    first, amplitude, direction, amplitude_error = (np.array(part) for part in zip(*parts, strict=True))
+    first, amplitude, direction, amplitude_error = (
+        np.array(part) for part in zip(*parts, strict=True)
+    )
     ratio = _ratio(decay, amplitude)
     steep = np.maximum(np.abs(decay) - amplitude, 1e-12)
     return Isotropy(
@@ -102,7 +131,8 @@ def compare_azimuths(value: ArrayLike, error: ArrayLike, distance: ArrayLike, az
 def _slopes(log: Array, sigma: Array, r: Array) -> tuple[Array, Array]:
     """Decay -d ln (r^2 R) / dr (azimuth, 3) by weighted lines over r, and its variance.
 
-    All azimuths have the same weights, so that the mean profile, which is not a straight line, cancels.
+    All azimuths have the same weights, so that the mean profile, which is not a
+    straight line, cancels.
     """
     weight = 1 / np.median(sigma**2, axis=0)
     way = r[:, None] - (weight * r[:, None]).sum(axis=0) / weight.sum(axis=0)
@@ -110,9 +140,14 @@ def _slopes(log: Array, sigma: Array, r: Array) -> tuple[Array, Array]:
     return -(factor * log).sum(axis=1), (factor**2 * sigma**2).sum(axis=1)
 
 
-def _harmonics(slope: Array, variance: Array, phi: Array) -> tuple[float, float, float, float]:
+def _harmonics(
+    slope: Array, variance: Array, phi: Array
+) -> tuple[float, float, float, float]:
     """Amplitude of the first harmonic; amplitude, direction and error of the second one."""
-    design = np.stack([np.ones_like(phi), np.cos(phi), np.sin(phi), np.cos(2 * phi), np.sin(2 * phi)], axis=1)
+    design = np.stack(
+        [np.ones_like(phi), np.cos(phi), np.sin(phi), np.cos(2 * phi), np.sin(2 * phi)],
+        axis=1,
+    )
     covariance = np.linalg.pinv(design.T @ (design / variance[:, None]))
     found = covariance @ (design.T @ (slope / variance))
     amplitude = float(np.hypot(found[3], found[4]))
@@ -126,4 +161,6 @@ def _harmonics(slope: Array, variance: Array, phi: Array) -> tuple[float, float,
 def _ratio(decay: Array, amplitude: Array) -> Array:
     """Largest over smallest decay; infinite where the smallest is not positive."""
     low = np.abs(decay) - amplitude
-    return np.where(low > 0, (np.abs(decay) + amplitude) / np.where(low > 0, low, 1.0), np.inf)
+    return np.where(
+        low > 0, (np.abs(decay) + amplitude) / np.where(low > 0, low, 1.0), np.inf
+    )

@@ -1,4 +1,6 @@
-"""Reading JSON files of a capture within limits and without repeated keys, and their values in messages."""
+"""Reading JSON files of a capture within limits and without repeated keys, and their
+values in messages.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,9 @@ CURE = "correct it, see docs/capture_format.md"
 
 
 def read_json(path: Path, faults: list[Fault]) -> Any:
-    """Content of a JSON file; None and a fault if it is absent, invalid, null, or beyond a limit."""
+    """Content of a JSON file; None and a fault if it is absent, invalid, null, or
+    beyond a limit.
+    """
     where = str(path)
     noted = len(faults)
     try:
@@ -30,14 +34,17 @@ def read_json(path: Path, faults: list[Fault]) -> Any:
             rule = f"must have at most {MAX_JSON_DEPTH} levels of nested brackets"
             faults.append(Fault(where, rule, f"{depth}", CURE))
             return None
-        content = json.loads(text, object_pairs_hook=lambda pairs: _unique_pairs(pairs, where, faults))
+        content = json.loads(
+            text, object_pairs_hook=lambda pairs: _unique_pairs(pairs, where, faults)
+        )
     except InputError as error:
         faults += error.faults
         return None
     except UnicodeDecodeError as error:
         faults.append(_no_json(where, f"byte {error.start} is not UTF-8"))
         return None
-    except (ValueError, RecursionError) as error:  # ValueError: also of numbers with thousands of digits
+    except (ValueError, RecursionError) as error:
+        # ValueError: also of numbers with thousands of digits
         faults.append(_no_json(where, str(error)))
         return None
     if content is None:
@@ -45,25 +52,41 @@ def read_json(path: Path, faults: list[Fault]) -> Any:
     if re.search(r"\\u[dD][89a-fA-F]", text):
         rule = "must be text that UTF-8 can represent"
         cure = "write the complete character"
-        faults += [Fault(f"{where}{place}", rule, "half a surrogate pair", cure) for place in _broken_texts(content)]
+        faults += [
+            Fault(f"{where}{place}", rule, "half a surrogate pair", cure)
+            for place in _broken_texts(content)
+        ]
     return content if len(faults) == noted else None
 
 
 def _no_json(where: str, found: str) -> Fault:
-    return Fault(where, "must be JSON in UTF-8", found, "correct the file at that place, or write it again")
+    return Fault(
+        where,
+        "must be JSON in UTF-8",
+        found,
+        "correct the file at that place, or write it again",
+    )
 
 
-def _unique_pairs(pairs: list[tuple[str, Any]], where: str, faults: list[Fault]) -> dict[str, Any]:
+def _unique_pairs(
+    pairs: list[tuple[str, Any]], where: str, faults: list[Fault]
+) -> dict[str, Any]:
     """The object of these pairs; repeated keys, and more than `MAX_OBJECT_KEYS`, are faults."""
     data = dict(pairs)
     if len(pairs) > MAX_OBJECT_KEYS:
         rule = f"a JSON object must have at most {MAX_OBJECT_KEYS} keys"
-        faults.append(Fault(where, rule, f"{len(pairs)}", "remove those that are not needed"))
+        faults.append(
+            Fault(where, rule, f"{len(pairs)}", "remove those that are not needed")
+        )
     elif len(data) < len(pairs):
-        for key in sorted(key for key, times in Counter(key for key, _ in pairs).items() if times > 1):
+        for key in sorted(
+            key for key, times in Counter(key for key, _ in pairs).items() if times > 1
+        ):
             rule = "an object must have each key once"
             cure = "remove all but one"
-            faults.append(Fault(f"{where}[{short(key)}]", rule, "the key more than once", cure))
+            faults.append(
+                Fault(f"{where}[{short(key)}]", rule, "the key more than once", cure)
+            )
     return data
 
 
@@ -92,7 +115,9 @@ def is_number(value: Any) -> bool:
 
 
 def shown(value: Any) -> str:
-    """A JSON value as it appears in a message; text is marked as such, to distinguish "1" from 1."""
+    """A JSON value as it appears in a message; text is marked as such, to distinguish
+    "1" from 1.
+    """
     if isinstance(value, str):
         return f'the text "{short(value)}"' if value else "an empty text"
     if isinstance(value, np.generic | np.ndarray):
@@ -100,7 +125,9 @@ def shown(value: Any) -> str:
     if is_number(value) and isinstance(value, int) and abs(value) > MAX_MAGNITUDE:
         return "a number of more than 30 digits"
     if isinstance(value, list) and len(value) > MAX_SHOWN_CHARACTERS:
-        return f"a list of {len(value)}, [{', '.join(shown(v) for v in value[:3])}, ...]"
+        return (
+            f"a list of {len(value)}, [{', '.join(shown(v) for v in value[:3])}, ...]"
+        )
     if isinstance(value, dict) and len(value) > MAX_SHOWN_CHARACTERS:
         return f"an object of {len(value)} keys"
     return short(json.dumps(value, default=str))

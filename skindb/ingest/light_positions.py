@@ -1,4 +1,6 @@
-"""Positions of the lights of a dome from highlights on a mirror ball, and their application to a capture."""
+"""Positions of the lights of a dome from highlights on a mirror ball, and their
+application to a capture.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +42,8 @@ THREADS = 2
 class BallFrames:
     """Frames of a mirror ball: one for each place of the ball, light, and camera with an outline.
 
-    `radius` is that of the ball in mm. `outlines` are, by place and camera, column, row and radius (3,) in px.
+    `radius` is that of the ball in mm. `outlines` are, by place and camera, column, row
+    and radius (3,) in px.
     """
 
     folder: Path
@@ -50,7 +53,9 @@ class BallFrames:
 
 
 def read_ball(dome: DomeRecord, fields: Fields) -> BallFrames | None:
-    """The key "ball" of `dome/calibration.json`; None if it is absent. Its faults are recorded in `fields`."""
+    """The key "ball" of `dome/calibration.json`; None if it is absent. Its faults are
+    recorded in `fields`.
+    """
     given = fields.get("ball", None)
     if given is None:
         return None
@@ -58,7 +63,9 @@ def read_ball(dome: DomeRecord, fields: Fields) -> BallFrames | None:
     template = item.template("frames", {PLACE, LIGHT, CAMERA}, set())
     if template:
         names = {PLACE: "a", LIGHT: dome.lights[0].id, CAMERA: dome.cameras[0].id}
-        inside(dome.folder, filled(template, **names), item.place("frames"), item.faults)
+        inside(
+            dome.folder, filled(template, **names), item.place("frames"), item.faults
+        )
     places = Fields(item.get("outlines"), item.place("outlines"), item.faults)
     outlines = dict[str, dict[str, Array]]()
     if places.at_most(MAX_BALL_PLACES, "places of the ball"):
@@ -67,7 +74,13 @@ def read_ball(dome: DomeRecord, fields: Fields) -> BallFrames | None:
             outlines[place] = _outlines(dome, circles)
     radius = item.number("radius", above=0.0, most=MAX_BALL_RADIUS_MM)
     if unknown := item.unknown():
-        item.faults.append(Fault(item.where, "its keys are frames, radius and outlines", ", ".join(unknown)))
+        item.faults.append(
+            Fault(
+                item.where,
+                "its keys are frames, radius and outlines",
+                ", ".join(unknown),
+            )
+        )
     return BallFrames(dome.folder, template, radius, outlines)
 
 
@@ -80,7 +93,11 @@ def _outlines(dome: DomeRecord, circles: Fields) -> dict[str, Array]:
         if name not in cameras:
             circles.fault(name, "must be a camera of the dome", shown(name))
         elif not _within(circle, cameras[name]):
-            circles.fault(name, "column, row and radius must be those of a circle in the picture", shown(circle))
+            circles.fault(
+                name,
+                "column, row and radius must be those of a circle in the picture",
+                shown(circle),
+            )
         else:
             found[name] = circle
     return found
@@ -89,15 +106,18 @@ def _outlines(dome: DomeRecord, circles: Fields) -> dict[str, Array]:
 def _within(circle: Array, camera: CameraRecord) -> bool:
     column, row, radius = circle
     return bool(
-        radius > 0 and radius <= column <= camera.width - radius and radius <= row <= camera.height - radius
+        radius > 0
+        and radius <= column <= camera.width - radius
+        and radius <= row <= camera.height - radius
     )  # a ball that is cut off may hide its highlight
 
 
 def calibrate_positions(dome: DomeRecord, ball: BallFrames) -> xr.Dataset:
     """Position of every light from its highlights on the ball, with standard errors.
 
-    A light needs its highlight in two frames, of different cameras or places of the ball. Frames without a highlight
-    are skipped: the light may be hidden, or behind the ball.
+    A light needs its highlight in two frames, of different cameras or places of the
+    ball. Frames without a highlight are skipped: the light may be hidden, or behind the
+    ball.
 
     Returns
     -------
@@ -109,15 +129,23 @@ def calibrate_positions(dome: DomeRecord, ball: BallFrames) -> xr.Dataset:
     InputError
         With every frame that cannot be read, and every light that is seen in fewer than two frames.
     """
-    cameras = {camera.id: Pinhole(camera.K, camera.R, camera.t, camera.distortion) for camera in dome.cameras}
+    cameras = {
+        camera.id: Pinhole(camera.K, camera.R, camera.t, camera.distortion)
+        for camera in dome.cameras
+    }
     centres = dict[str, Array]()
     for place, circles in ball.outlines.items():
         try:
             seen = [cameras[name] for name in circles]
-            centres[place] = ball_centre(seen, list(circles.values()), ball.radius).centre
+            centres[place] = ball_centre(
+                seen, list(circles.values()), ball.radius
+            ).centre
         except InputError as error:
             raise InputError(
-                [replace(fault, where=f"{fault.where}, place {place}") for fault in error.faults]
+                [
+                    replace(fault, where=f"{fault.where}, place {place}")
+                    for fault in error.faults
+                ]
             ) from None
     faults = list[Fault]()
 
@@ -130,7 +158,10 @@ def calibrate_positions(dome: DomeRecord, ball: BallFrames) -> xr.Dataset:
                 raise InputError(Fault("mirror ball", rule, f"{len(rays)}", cure))
             return light_position(*zip(*rays, strict=True)), len(rays)
         except InputError as error:
-            faults.extend(replace(fault, where=f"light {light.id}, {fault.where}") for fault in error.faults)
+            faults.extend(
+                replace(fault, where=f"light {light.id}, {fault.where}")
+                for fault in error.faults
+            )
             return None, 0
 
     with ThreadPoolExecutor(THREADS) as pool:
@@ -141,7 +172,9 @@ def calibrate_positions(dome: DomeRecord, ball: BallFrames) -> xr.Dataset:
     return dataset(
         {
             "calibrated_position": [one.position for one in found],
-            "calibrated_position_error": [np.sqrt(np.diag(one.covariance)) for one in found],
+            "calibrated_position_error": [
+                np.sqrt(np.diag(one.covariance)) for one in found
+            ],
             "position_ray_count": [count for _, count in pairs],
             "position_miss": [np.sqrt(np.mean(one.miss**2)) for one in found],
         },
@@ -152,23 +185,31 @@ def calibrate_positions(dome: DomeRecord, ball: BallFrames) -> xr.Dataset:
 def _rays(
     dome: DomeRecord, ball: BallFrames, centres: Mapping[str, Array], light: LightRecord
 ) -> Iterator[tuple[Array, Array]]:
-    """Points of the ball, and directions from them to the light, of all frames that show its highlight."""
+    """Points of the ball, and directions from them to the light, of all frames that
+    show its highlight.
+    """
     for place, circles in ball.outlines.items():
         for camera in dome.cameras:
             if camera.id not in circles:
                 continue
             names = {PLACE: place, LIGHT: light.id, CAMERA: camera.id}
-            frame = read_frame(ball.folder / filled(ball.frames, **names), camera.sensor.kind)
+            frame = read_frame(
+                ball.folder / filled(ball.frames, **names), camera.sensor.kind
+            )
             column, row, radius = circles[camera.id]
             try:
-                highlight = highlight_centre(frame, Outline(np.array([column, row]), radius))
+                highlight = highlight_centre(
+                    frame, Outline(np.array([column, row]), radius)
+                )
             except InputError:
                 continue
             pinhole = Pinhole(camera.K, camera.R, camera.t, camera.distortion)
             yield reflected_ray(pinhole, centres[place], ball.radius, highlight)
 
 
-def positioned_dome(dome: DomeRecord, calibration: xr.Dataset, *, where: str) -> DomeRecord:
+def positioned_dome(
+    dome: DomeRecord, calibration: xr.Dataset, *, where: str
+) -> DomeRecord:
     """The dome with the light positions of a calibration; the axes of the lights are unchanged.
 
     Raises
@@ -180,6 +221,16 @@ def positioned_dome(dome: DomeRecord, calibration: xr.Dataset, *, where: str) ->
     names = set(map(str, known["light"].values))
     if missing := [light.id for light in dome.lights if light.id not in names]:
         found = f"none of {', '.join(missing[:5])}"
-        raise InputError(Fault(where, "a calibration must have every light of the capture", found, "calibrate again"))
-    lights = (replace(light, position=known.sel(light=light.id).values) for light in dome.lights)
+        raise InputError(
+            Fault(
+                where,
+                "a calibration must have every light of the capture",
+                found,
+                "calibrate again",
+            )
+        )
+    lights = (
+        replace(light, position=known.sel(light=light.id).values)
+        for light in dome.lights
+    )
     return replace(dome, lights=tuple(lights))

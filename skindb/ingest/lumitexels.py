@@ -33,16 +33,23 @@ Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 T = TypeVar("T")
 R = TypeVar("R")
-MAX_PENDING_VIEWS = 24  # views that are requested ahead of the one that is waited for: keeps eight threads busy
-MAX_CLEAR_FOOTPRINT_PX = 0.75  # px; wider footprints extend beyond the pixels that `clear` checks
-PIXEL_VARIANCE_PX2 = 0.2  # px^2; about that of bilinear interpolation; larger values blur (3 % at 1 px^2, measured)
+# views that are requested ahead of the one that is waited for: keeps eight threads busy
+MAX_PENDING_VIEWS = 24
+# px; wider footprints extend beyond the pixels that `clear` checks
+MAX_CLEAR_FOOTPRINT_PX = 0.75
+# px^2; about that of bilinear interpolation; larger values blur (3 % at 1 px^2,
+# measured)
+PIXEL_VARIANCE_PX2 = 0.2
 MIN_SPLAT_VARIANCE_PX2 = 0.25  # px^2: a splat with a radius of one pixel
 PenumbraRule = Literal["exclude", "keep"]  # samples at the soft edges of shadows
-MIN_LIT_FRACTION = 0.999  # visible fraction of a light's disc below which a surfel is in the penumbra
+# visible fraction of a light's disc below which a surfel is in the penumbra
+MIN_LIT_FRACTION = 0.999
 FULL_SHADOW = 1e-3
 MIN_COSINE_CAMERA = 0.1  # between the normal and the direction to the camera
-MAX_SMEAR_MM = 12.0  # mm of surface covered by one pixel; beyond it, samples were measured 20 % too bright
-BILINEAR_NOISE = 4 / 9  # variance after bilinear interpolation over that of one pixel, mean over all positions
+# mm of surface covered by one pixel; beyond it, samples were measured 20 % too bright
+MAX_SMEAR_MM = 12.0
+# variance after bilinear interpolation over that of one pixel, mean over all positions
+BILINEAR_NOISE = 4 / 9
 LINEAR_NOISE_FLOOR = 1e-4  # sr^-1; for linear files, whose noise is unknown
 
 
@@ -54,8 +61,10 @@ class Views:
     lit: NDArray[np.bool_]  # (n, light) surfels that get samples, see `fully_lit`
     clear: NDArray[np.bool_]  # (n, camera)
     pixels: NDArray[np.float32]  # (n, camera, 2)
-    light_fraction: NDArray[np.float16] | None = None  # (n, light) visible fraction of the disc; divides samples
-    footprint: bool = False  # samples are means over the surfel's splat; otherwise interpolated bilinearly
+    # (n, light) visible fraction of the disc; divides samples
+    light_fraction: NDArray[np.float16] | None = None
+    # samples are means over the surfel's splat; otherwise interpolated bilinearly
+    footprint: bool = False
 
 
 @dataclass(frozen=True)
@@ -69,7 +78,9 @@ class CameraSampling:
 
 @dataclass(frozen=True)
 class ViewLevels:
-    """Levels of each view (light, camera); NaN, or nothing to report, for views of an earlier run."""
+    """Levels of each view (light, camera); NaN, or nothing to report, for views of an
+    earlier run.
+    """
 
     median: Array  # sr^-1 of its samples; NaN for few samples
     bright: Array  # fraction of its samples that are too large for a surface
@@ -102,15 +113,20 @@ def fully_lit(
     *,
     soft: PenumbraRule = "exclude",
 ) -> NDArray[np.bool_]:
-    """Where (n, light) the entire disc is visible from a surfel and from all neighbours that a pixel may cover.
+    """Where (n, light) the entire disc is visible from a surfel and from all neighbours
+    that a pixel may cover.
 
-    Pixels beside a shadow include a part of it: samples were measured 14 % too dark in the first ring of neighbours.
-    With `soft` "keep", any visible part of the disc is enough, for a surfel and for its neighbours.
+    Pixels beside a shadow include a part of it: samples were measured 14 % too dark in
+    the first ring of neighbours. With `soft` "keep", any visible part of the disc is
+    enough, for a surfel and for its neighbours.
     """
     least = MIN_LIT_FRACTION if soft == "exclude" else FULL_SHADOW
-    pixel = max(pixel_width(camera, surfels.position.mean(axis=0)) for camera in cameras)
+    pixel = max(
+        pixel_width(camera, surfels.position.mean(axis=0)) for camera in cameras
+    )
     rings = max(int(np.ceil(pixel / surfels.spacing())), 1)
-    lit = np.empty_like(light_fraction, bool, order="F")  # the columns of lights are used one by one
+    # the columns of lights are used one by one
+    lit = np.empty_like(light_fraction, bool, order="F")
     for j in range(lit.shape[1]):
         shadow = light_fraction[:, j] < least
         for _ in range(rings):
@@ -153,48 +169,81 @@ def sample_lumitexels(
     refuse
         Whether a calibration that the photographs contradict is an error.
     pool, progress
-        Threads that decode; callback with the stage, the number of views done, and their total number.
+        Threads that decode; callback with the stage, the number of views done, and
+        their total number.
 
     Raises
     ------
     InputError
-        With every frame that cannot be decoded, or for a calibration that the photographs contradict.
+        With every frame that cannot be decoded, or for a calibration that the
+        photographs contradict.
     """
     checked = frozenset[tuple[int, int]]() if check is None else check.pairs
-    shots = list(pool.map(lambda c: _camera_sampling(views, dome.cameras[c], c), range(len(dome.cameras))))
+    shots = list(
+        pool.map(
+            lambda c: _camera_sampling(views, dome.cameras[c], c),
+            range(len(dome.cameras)),
+        )
+    )
 
     def one(pair: tuple[int, int]) -> list[Fault]:
         j, c = pair
         digests: Digests = {}
         try:
-            frames = read_view(dome, dome.lights[j].id, dome.cameras[c], digests=digests)
+            frames = read_view(
+                dome, dome.lights[j].id, dome.cameras[c], digests=digests
+            )
         except InputError as error:
             return list(error.faults)
         merger = mergers[dome.cameras[c].id]
         if found := view_faults(dome, dome.lights[j].id, merger, frames):
             return found
         wanted = shots[c].wanted & views.lit[:, j]
-        radiance, flag, exposures = _developed(merger, frames, shots[c], wanted, whole=pair in kept or pair in checked)
+        radiance, flag, exposures = _developed(
+            merger, frames, shots[c], wanted, whole=pair in kept or pair in checked
+        )
         if pair in kept:
             spool.keep(f"photograph-{j}-{c}", _without_saturated(radiance, flag))
         if check is not None and pair in checked:
-            spool.keep(f"calibration-{j}-{c}", check.reduce(c, _without_saturated(radiance, flag)))
+            spool.keep(
+                f"calibration-{j}-{c}",
+                check.reduce(c, _without_saturated(radiance, flag)),
+            )
         samples, outcome = _sampled(
-            (radiance, flag, exposures), shots[c], wanted, dome.lights[j], intensity[j], views, j
+            (radiance, flag, exposures),
+            shots[c],
+            wanted,
+            dome.lights[j],
+            intensity[j],
+            views,
+            j,
         )
         usable = samples[:, (outcome == OK) | (outcome == SINGLE)].view(np.float16)
-        where = f"{dome.file}[frames], camera {merger.camera.id}, light {dome.lights[j].id}"
+        where = (
+            f"{dome.file}[frames], camera {merger.camera.id}, light {dome.lights[j].id}"
+        )
         if fault := unlit_fault(where, radiance[flag == OK], usable.shape[1]):
             return [fault]
         levels.median[j, c] = view_median(usable)
         levels.bright[j, c] = bright_fraction(usable)
         levels.highest[j, c], levels.clipped[j, c] = highest_value(merger, frames)
-        spool.put(j, c, samples, outcome, {str(path): digest for path, digest in digests.items()})
+        spool.put(
+            j,
+            c,
+            samples,
+            outcome,
+            {str(path): digest for path, digest in digests.items()},
+        )
         return []
 
     faults = list[Fault]()
     shape = spool.done.shape
-    levels = ViewLevels(np.full(shape, np.nan), np.zeros(shape), np.full(shape, np.nan), np.zeros(shape, bool))
+    levels = ViewLevels(
+        np.full(shape, np.nan),
+        np.zeros(shape),
+        np.full(shape, np.nan),
+        np.zeros(shape, bool),
+    )
     missing = [(int(j), int(c)) for j, c in np.argwhere(~spool.done)]
     count = spool.done.size - len(missing)
 
@@ -208,18 +257,39 @@ def sample_lumitexels(
 
     sample(pair for pair in missing if pair in checked)
     calibration = None if check is None or faults else _evaluated(check, spool)
-    wrong = [] if calibration is None or not refuse else calibration_faults(dome, calibration)
+    wrong = (
+        []
+        if calibration is None or not refuse
+        else calibration_faults(dome, calibration)
+    )
     if not wrong:  # otherwise hours of sampling would end with the same faults
         sample(pair for pair in missing if pair not in checked)
     faults += wrong
     if faults:
         raise InputError(faults)
     usable, saturated, dark, single = spool.counts
-    photographs = {(j, c): image for j, c in kept if (image := spool.kept(f"photograph-{j}-{c}")) is not None}
-    noise = noise_floor(dome, intensity, views.surfels), shot_noise(dome, intensity, views.surfels)
+    photographs = {
+        (j, c): image
+        for j, c in kept
+        if (image := spool.kept(f"photograph-{j}-{c}")) is not None
+    }
+    noise = (
+        noise_floor(dome, intensity, views.surfels),
+        shot_noise(dome, intensity, views.surfels),
+    )
     each = sample_noise(dome, views.pixels, _effective_pixels(dome, shots))
     return Lumitexels(
-        spool.samples(), usable, saturated, dark, single, spool.views, levels, *noise, photographs, calibration, each
+        spool.samples(),
+        usable,
+        saturated,
+        dark,
+        single,
+        spool.views,
+        levels,
+        *noise,
+        photographs,
+        calibration,
+        each,
     )
 
 
@@ -263,28 +333,42 @@ def _without_saturated(radiance: Image, flag: NDArray[np.uint8]) -> Image:
 
 
 def _evaluated(check: CalibrationCheck, spool: Spool) -> Calibration:
-    """Check the calibration by the pictures of this run and of an interrupted one that it resumes."""
+    """Check the calibration by the pictures of this run and of an interrupted one that
+    it resumes.
+    """
     pictures = {(j, c): spool.kept(f"calibration-{j}-{c}") for j, c in check.pairs}
-    return check.evaluate({pair: image for pair, image in pictures.items() if image is not None})
+    return check.evaluate(
+        {pair: image for pair, image in pictures.items() if image is not None}
+    )
 
 
 def footprints(surfels: SurfelSet, camera: CameraRecord) -> NDArray[np.float32]:
-    """Variances xx, xy, yy (n, 3) px^2 of the splats in a picture, and of a pixel (Heckbert 1989, section 3).
+    """Variances xx, xy, yy (n, 3) px^2 of the splats in a picture, and of a pixel
+    (Heckbert 1989, section 3).
 
-    The variance of a disc in each direction is a quarter of its squared radius. Its diameters are projected with the
-    distortion of the lens. NaN where the splat is no larger than the footprint of bilinear interpolation.
+    The variance of a disc in each direction is a quarter of its squared radius. Its
+    diameters are projected with the distortion of the lens. NaN where the splat is no
+    larger than the footprint of bilinear interpolation.
     """
     helper = np.eye(3)[np.abs(surfels.normal).argmin(axis=1)]
     first = np.cross(surfels.normal, helper)
-    first *= (surfels.radius / 2 / np.maximum(np.linalg.norm(first, axis=1), 1e-30))[:, None]
+    first *= (surfels.radius / 2 / np.maximum(np.linalg.norm(first, axis=1), 1e-30))[
+        :, None
+    ]
     spread = np.zeros((len(first), 3))
     for arm in (first, np.cross(surfels.normal, first)):
-        ahead, _ = project(surfels.position + arm, camera.K, camera.R, camera.t, camera.distortion)
-        behind, _ = project(surfels.position - arm, camera.K, camera.R, camera.t, camera.distortion)
+        ahead, _ = project(
+            surfels.position + arm, camera.K, camera.R, camera.t, camera.distortion
+        )
+        behind, _ = project(
+            surfels.position - arm, camera.K, camera.R, camera.t, camera.distortion
+        )
         x, y = ((ahead - behind) / 2).T
         spread += np.stack([x * x, x * y, y * y], axis=1)
     spread[spread[:, [0, 2]].max(axis=1) < MIN_SPLAT_VARIANCE_PX2] = np.nan
-    return np.asarray(spread + np.array([PIXEL_VARIANCE_PX2, 0, PIXEL_VARIANCE_PX2]), np.float32)
+    return np.asarray(
+        spread + np.array([PIXEL_VARIANCE_PX2, 0, PIXEL_VARIANCE_PX2]), np.float32
+    )
 
 
 def _camera_sampling(views: Views, camera: CameraRecord, c: int) -> CameraSampling:
@@ -297,19 +381,36 @@ def _camera_sampling(views: Views, camera: CameraRecord, c: int) -> CameraSampli
     return CameraSampling(wanted, np.ascontiguousarray(views.pixels[:, c]), spread)
 
 
-def _effective_pixels(dome: DomeRecord, shots: Sequence[CameraSampling]) -> NDArray[np.float32]:
-    """Effective number of pixels (n, camera) that a sample averages; NaN where a camera takes no sample."""
+def _effective_pixels(
+    dome: DomeRecord, shots: Sequence[CameraSampling]
+) -> NDArray[np.float32]:
+    """Effective number of pixels (n, camera) that a sample averages; NaN where a camera
+    takes no sample.
+    """
     out = np.empty((len(shots), len(shots[0].wanted)), np.float32)
     for camera, shot, row in zip(dome.cameras, shots, out, strict=True):
-        pixel_counts(shot.wanted, shot.pixels, shot.spread, camera.height, camera.width, row)
+        pixel_counts(
+            shot.wanted, shot.pixels, shot.spread, camera.height, camera.width, row
+        )
     return np.ascontiguousarray(out.T)
 
 
 def _developed(
-    merger: FrameMerger, frames: list[Frame], shot: CameraSampling, wanted: Bools, *, whole: bool
+    merger: FrameMerger,
+    frames: list[Frame],
+    shot: CameraSampling,
+    wanted: Bools,
+    *,
+    whole: bool,
 ) -> tuple[Image, NDArray[np.uint8], NDArray[np.uint8]]:
-    """Radiance (h, w, 3), flags and usable exposures (h, w) of a view, or of the pixels that wanted surfels need."""
-    spans = None if whole else pixel_spans(wanted, shot.pixels, shot.spread, *frames[0].shape[:2])
+    """Radiance (h, w, 3), flags and usable exposures (h, w) of a view, or of the pixels
+    that wanted surfels need.
+    """
+    spans = (
+        None
+        if whole
+        else pixel_spans(wanted, shot.pixels, shot.spread, *frames[0].shape[:2])
+    )
     usable = np.zeros(frames[0].shape[:2], np.uint8)
     return *merger.merge(frames, spans, usable=usable), usable
 
@@ -328,7 +429,9 @@ def _sampled(
     out = np.empty((3, n), np.uint16)
     outcome = np.empty(n, np.uint8)
     light_fraction = (
-        np.zeros(0, np.float32) if views.light_fraction is None else views.light_fraction[:, j].astype(np.float32)
+        np.zeros(0, np.float32)
+        if views.light_fraction is None
+        else views.light_fraction[:, j].astype(np.float32)
     )
     gather(
         *picture,
@@ -349,7 +452,9 @@ def _sampled(
 
 
 def _in_turn(pool: Executor, call: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
-    """Results in order, with a limited number of pending calls; no call is still running at the end."""
+    """Results in order, with a limited number of pending calls; no call is still
+    running at the end.
+    """
     waiting: deque[Future[R]] = deque()
     try:
         for item in items:
@@ -365,37 +470,62 @@ def _in_turn(pool: Executor, call: Callable[[T], R], items: Iterable[T]) -> Iter
 
 
 def noise_floor(dome: DomeRecord, intensity: Array, surfels: SurfelSet) -> float:
-    """Reflectance [sr^-1] of one sigma of read noise and quantisation, at the median light and distance."""
-    radiance = float(np.median([radiance_floor(camera.sensor, dome.exposures) for camera in dome.cameras]))
+    """Reflectance [sr^-1] of one sigma of read noise and quantisation, at the median
+    light and distance.
+    """
+    radiance = float(
+        np.median(
+            [radiance_floor(camera.sensor, dome.exposures) for camera in dome.cameras]
+        )
+    )
     floor = radiance * _reflectance_per_radiance(dome, intensity, surfels)
     return floor if floor > 0 else LINEAR_NOISE_FLOOR
 
 
 def shot_noise(dome: DomeRecord, intensity: Array, surfels: SurfelSet) -> float:
-    """Variance by photons over reflectance [sr^-1], at the median light and distance; 0 if electrons are not known.
+    """Variance by photons over reflectance [sr^-1], at the median light and distance; 0
+    if electrons are not known.
 
-    For radiance L, the sensor counts L times the sum of the exposure times times the electrons of full exposure: the
-    variance of merged radiance is L over this number per unit of radiance.
+    For radiance L, the sensor counts L times the sum of the exposure times times the
+    electrons of full exposure: the variance of merged radiance is L over this number
+    per unit of radiance.
     """
     if not all(camera.sensor.noise_known for camera in dome.cameras):
         return 0.0
-    electrons = float(np.median([camera.sensor.full_electrons for camera in dome.cameras]))
+    electrons = float(
+        np.median([camera.sensor.full_electrons for camera in dome.cameras])
+    )
     per_second = 1 / (electrons * sum(dome.exposures.values()))
-    return BILINEAR_NOISE * per_second * _reflectance_per_radiance(dome, intensity, surfels)
+    return (
+        BILINEAR_NOISE
+        * per_second
+        * _reflectance_per_radiance(dome, intensity, surfels)
+    )
 
 
-def _reflectance_per_radiance(dome: DomeRecord, intensity: Array, surfels: SurfelSet) -> float:
+def _reflectance_per_radiance(
+    dome: DomeRecord, intensity: Array, surfels: SurfelSet
+) -> float:
     """Reflectance per radiance at the median light and distance."""
     middle = surfels.position.mean(axis=0)
-    square = np.array([light_falloff(light, middle[None])[0][0] for light in dome.lights])
+    square = np.array(
+        [light_falloff(light, middle[None])[0][0] for light in dome.lights]
+    )
     return float(np.median(square[:, None] / intensity))
 
 
-def choose_photographs(dome: DomeRecord, middle: Array, count: int) -> list[tuple[int, int]]:
-    """(light, camera) pairs of lights that are spread evenly in front of the face, with the most frontal camera."""
+def choose_photographs(
+    dome: DomeRecord, middle: Array, count: int
+) -> list[tuple[int, int]]:
+    """(light, camera) pairs of lights that are spread evenly in front of the face, with
+    the most frontal camera.
+    """
     if count < 1:
         return []
-    centres = np.array([camera_centre(camera.R, camera.t) for camera in dome.cameras]) - middle
+    centres = (
+        np.array([camera_centre(camera.R, camera.t) for camera in dome.cameras])
+        - middle
+    )
     camera = int((centres[:, 2] / np.linalg.norm(centres, axis=1)).argmax())
     towards = np.array([light.position for light in dome.lights]) - middle
     direction = towards / np.linalg.norm(towards, axis=1, keepdims=True)

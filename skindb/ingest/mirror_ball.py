@@ -1,4 +1,6 @@
-"""Directions and positions of lights from their highlights on a mirror ball, and reprojection of known points."""
+"""Directions and positions of lights from their highlights on a mirror ball, and
+reprojection of known points.
+"""
 
 from __future__ import annotations
 
@@ -13,13 +15,19 @@ from skindb.errors import Fault, InputError
 from skindb.geometry.camera import camera_centre, pixel_rays, project
 
 Array = NDArray[np.float64]
-HIGHLIGHT_FRACTION = 0.5  # of the contrast over the ball; pixels above it belong to the highlight
-MAX_HIGHLIGHT_FRACTION = 0.1  # of the ball's area; a larger spot is a window or an overexposed frame
-HIGHLIGHT_MARGIN = 2  # px around a highlight whose light counts: a highlight may be smaller than a pixel
-MIN_BASELINE = 0.02  # rad between rays, at which the error along them is 50 times the error across
+# of the contrast over the ball; pixels above it belong to the highlight
+HIGHLIGHT_FRACTION = 0.5
+# of the ball's area; a larger spot is a window or an overexposed frame
+MAX_HIGHLIGHT_FRACTION = 0.1
+# px around a highlight whose light counts: a highlight may be smaller than a pixel
+HIGHLIGHT_MARGIN = 2
+# rad between rays, at which the error along them is 50 times the error across
+MIN_BASELINE = 0.02
 OUTLINE_POINTS = 32  # lines of sight to the outline of a ball
-MAX_SIZE_MISMATCH = 0.05  # one pixel of a ball with a radius of 20 px; a diameter instead of a radius is 50 % off
-ROUNDS = 20  # of reweighting by distance; five change the position by less than a micrometre
+# one pixel of a ball with a radius of 20 px; a diameter instead of a radius is 50 % off
+MAX_SIZE_MISMATCH = 0.05
+# of reweighting by distance; five change the position by less than a micrometre
+ROUNDS = 20
 
 
 @dataclass(frozen=True)
@@ -42,7 +50,9 @@ class Pinhole:
 
 @dataclass(frozen=True)
 class BallCentre:
-    """Centre (3,) mm of a ball, and largest relative mismatch of its size in the pictures; NaN for one camera."""
+    """Centre (3,) mm of a ball, and largest relative mismatch of its size in the
+    pictures; NaN for one camera.
+    """
 
     centre: Array
     mismatch: float
@@ -50,7 +60,9 @@ class BallCentre:
 
 @dataclass(frozen=True)
 class LightPosition:
-    """Position (3,) mm, its covariance (3, 3) mm2, and the angle (ray,) in degrees by which each ray misses it."""
+    """Position (3,) mm, its covariance (3, 3) mm2, and the angle (ray,) in degrees by
+    which each ray misses it.
+    """
 
     position: Array
     covariance: Array
@@ -59,7 +71,9 @@ class LightPosition:
 
 @dataclass(frozen=True)
 class Reprojection:
-    """Residual (point, 2) px, observed minus predicted; its root mean square and maximum in px; number of points."""
+    """Residual (point, 2) px, observed minus predicted; its root mean square and
+    maximum in px; number of points.
+    """
 
     residual: Array
     rms: float
@@ -86,7 +100,14 @@ def ball_outline(mask: ArrayLike) -> Outline:
             return Outline(centre, radius)
     rule = "the mask of the mirror ball must be one disc"
     cure = "draw it again, without the stand of the ball"
-    raise InputError(Fault("mirror ball", rule, f"{area} pixels that do not fill a disc" if area else "nothing", cure))
+    raise InputError(
+        Fault(
+            "mirror ball",
+            rule,
+            f"{area} pixels that do not fill a disc" if area else "nothing",
+            cure,
+        )
+    )
 
 
 def highlight_centre(picture: ArrayLike, outline: Outline) -> Array:
@@ -107,19 +128,32 @@ def highlight_centre(picture: ArrayLike, outline: Outline) -> Array:
     grey = np.asarray(picture, np.float64)
     grey = grey.mean(axis=-1) if grey.ndim == 3 else grey
     row, column = np.mgrid[: grey.shape[0], : grey.shape[1]] + 0.5
-    ball = np.hypot(column - outline.centre[0], row - outline.centre[1]) < outline.radius
+    ball = (
+        np.hypot(column - outline.centre[0], row - outline.centre[1]) < outline.radius
+    )
     known = bool(ball.any()) and bool(np.isfinite(grey[ball]).all())
-    low, high = (float(np.median(grey[ball])), float(grey[ball].max())) if known else (0.0, 0.0)
+    low, high = (
+        (float(np.median(grey[ball])), float(grey[ball].max())) if known else (0.0, 0.0)
+    )
     if not high > low:
         rule = "the mirror ball must show a highlight"
         cure = "check its position in the picture, or expose it longer"
-        raise InputError(Fault("mirror ball", rule, "a uniform picture" if known else "no finite values", cure))
+        raise InputError(
+            Fault(
+                "mirror ball",
+                rule,
+                "a uniform picture" if known else "no finite values",
+                cure,
+            )
+        )
     level = low + HIGHLIGHT_FRACTION * (high - low)
     labels, _ = ndimage.label(ball & (grey >= level))
     sizes = np.bincount(labels.ravel())[1:]
     spot = labels == 1 + int(sizes.argmax())
     if sizes.max() > MAX_HIGHLIGHT_FRACTION * ball.sum():
-        rule = f"the highlight must cover at most {MAX_HIGHLIGHT_FRACTION:.0%} of the ball"
+        rule = (
+            f"the highlight must cover at most {MAX_HIGHLIGHT_FRACTION:.0%} of the ball"
+        )
         found = f"{sizes.max() / ball.sum():.0%}"
         cure = "expose the frame shorter, and darken the room"
         raise InputError(Fault("mirror ball", rule, found, cure))
@@ -127,25 +161,40 @@ def highlight_centre(picture: ArrayLike, outline: Outline) -> Array:
     row = row[near]
     column = column[near]
     weight = np.maximum(grey[near] - low, 0)
-    return np.array([np.average(column, weights=weight), np.average(row, weights=weight)])
+    return np.array(
+        [np.average(column, weights=weight), np.average(row, weights=weight)]
+    )
 
 
 def distant_light(outline: Outline, highlight: ArrayLike) -> Array:
-    """Unit direction (3,) to a distant light seen by a distant camera: x right, y up, z to the viewer.
+    """Unit direction (3,) to a distant light seen by a distant camera: x right, y up, z
+    to the viewer.
 
-    The view along -z is reflected at the normal of the ball under the highlight (2,) px: l = 2 (n . v) n - v.
+    The view along -z is reflected at the normal of the ball under the highlight (2,)
+    px: l = 2 (n . v) n - v.
     """
-    offset = (np.asarray(highlight, np.float64) - outline.centre) / outline.radius * [1, -1]
+    offset = (
+        (np.asarray(highlight, np.float64) - outline.centre) / outline.radius * [1, -1]
+    )
     square = float(offset @ offset)
     if not square < 1:
         rule = "the highlight must lie on the ball"
         cure = "check the centre and radius of the ball"
-        raise InputError(Fault("mirror ball", rule, f"{np.sqrt(square):.2f} radii from its centre", cure))
+        raise InputError(
+            Fault(
+                "mirror ball",
+                rule,
+                f"{np.sqrt(square):.2f} radii from its centre",
+                cure,
+            )
+        )
     normal = np.array([*offset, np.sqrt(1 - square)])
     return np.asarray(2 * normal[2] * normal - [0, 0, 1])
 
 
-def reflected_ray(camera: Pinhole, ball: ArrayLike, radius: float, highlight: ArrayLike) -> tuple[Array, Array]:
+def reflected_ray(
+    camera: Pinhole, ball: ArrayLike, radius: float, highlight: ArrayLike
+) -> tuple[Array, Array]:
     """Point (3,) mm of the ball at a highlight, and the unit direction (3,) from it to the light.
 
     Parameters
@@ -165,24 +214,38 @@ def reflected_ray(camera: Pinhole, ball: ArrayLike, radius: float, highlight: Ar
         The line of sight misses the ball.
     """
     origin = camera_centre(camera.R, camera.t)
-    view = pixel_rays(np.asarray(highlight, np.float64), camera.K, camera.R, camera.distortion)
+    view = pixel_rays(
+        np.asarray(highlight, np.float64), camera.K, camera.R, camera.distortion
+    )
     way = np.asarray(np.asarray(ball, np.float64) - origin, np.float64)
     along = float(way @ view)
     under = radius**2 - float(way @ way) + along**2
     if not (under > 0 and along > 0):
-        found = f"{np.sqrt(max(float(way @ way) - along**2, 0.0)):.1f} mm from its centre"
+        found = (
+            f"{np.sqrt(max(float(way @ way) - along**2, 0.0)):.1f} mm from its centre"
+        )
         cure = "check the position of the ball"
-        raise InputError(Fault("mirror ball", f"the line of sight must meet the ball of {radius:g} mm", found, cure))
+        raise InputError(
+            Fault(
+                "mirror ball",
+                f"the line of sight must meet the ball of {radius:g} mm",
+                found,
+                cure,
+            )
+        )
     point = origin + (along - np.sqrt(under)) * view
     normal = (point - np.asarray(ball, np.float64)) / radius
     return point, np.asarray(view - 2 * (view @ normal) * normal)
 
 
-def ball_centre(cameras: Sequence[Pinhole], outlines: ArrayLike, radius: float) -> BallCentre:
+def ball_centre(
+    cameras: Sequence[Pinhole], outlines: ArrayLike, radius: float
+) -> BallCentre:
     """Centre of a ball of known radius from its outlines in one or more calibrated cameras.
 
-    The lines of sight to the outline form a cone, whose axis points to the centre and whose angle gives the distance.
-    With several cameras, the centre is where their axes meet, and the distances are compared with it.
+    The lines of sight to the outline form a cone, whose axis points to the centre and
+    whose angle gives the distance. With several cameras, the centre is where their axes
+    meet, and the distances are compared with it.
 
     Parameters
     ----------
@@ -205,7 +268,9 @@ def ball_centre(cameras: Sequence[Pinhole], outlines: ArrayLike, radius: float) 
     axes = list[Array]()
     distances = list[float]()
     for camera, circle in zip(cameras, circles, strict=True):
-        sight = pixel_rays(circle[:2] + circle[2] * around, camera.K, camera.R, camera.distortion)
+        sight = pixel_rays(
+            circle[:2] + circle[2] * around, camera.K, camera.R, camera.distortion
+        )
         # all lines make the same angle with the axis: sight . axis = cos(angle)
         axis = np.linalg.lstsq(sight, np.ones(OUTLINE_POINTS))[0]
         length = float(np.linalg.norm(axis))
@@ -218,9 +283,14 @@ def ball_centre(cameras: Sequence[Pinhole], outlines: ArrayLike, radius: float) 
     if len(start) == 1:
         return BallCentre(start[0] + distance[0] * way[0], np.nan)
     centre = light_position(start, way).position
-    mismatch = float(np.abs(np.linalg.norm(centre - start, axis=1) / distance - 1).max())
+    mismatch = float(
+        np.abs(np.linalg.norm(centre - start, axis=1) / distance - 1).max()
+    )
     if mismatch > MAX_SIZE_MISMATCH:
-        rule = f"its outlines must be of the size of a ball of radius {radius:g} mm, within {MAX_SIZE_MISMATCH:.0%}"
+        rule = (
+            f"its outlines must be of the size of a ball of radius {radius:g} mm, "
+            f"within {MAX_SIZE_MISMATCH:.0%}"
+        )
         cure = "give the radius of the ball in mm, and column, row and radius of its outlines in px"
         raise InputError(Fault("mirror ball", rule, f"{mismatch:.0%} off", cure))
     return BallCentre(centre, mismatch)
@@ -229,9 +299,10 @@ def ball_centre(cameras: Sequence[Pinhole], outlines: ArrayLike, radius: float) 
 def light_position(origins: ArrayLike, directions: ArrayLike) -> LightPosition:
     """Intersection of rays from several positions of the ball, or of several cameras.
 
-    Least squares of the angles by which the rays miss the point: squared distances from the rays, weighted by the
-    inverse squared distance from their origins, which is updated in rounds. The covariance follows from the scatter of
-    the rays; for two rays it is a rough estimate.
+    Least squares of the angles by which the rays miss the point: squared distances from
+    the rays, weighted by the inverse squared distance from their origins, which is
+    updated in rounds. The covariance follows from the scatter of the rays; for two rays
+    it is a rough estimate.
 
     Parameters
     ----------
@@ -247,7 +318,12 @@ def light_position(origins: ArrayLike, directions: ArrayLike) -> LightPosition:
     """
     start = np.asarray(origins, np.float64)
     way = np.asarray(directions, np.float64)
-    if start.ndim != 2 or start.shape != way.shape or len(start) < 2 or not np.isfinite([start, way]).all():
+    if (
+        start.ndim != 2
+        or start.shape != way.shape
+        or len(start) < 2
+        or not np.isfinite([start, way]).all()
+    ):
         rule = "its position needs two or more rays of finite numbers"
         cure = "photograph the ball at another position"
         raise InputError(Fault("light", rule, f"{start.shape} and {way.shape}", cure))
@@ -258,8 +334,12 @@ def light_position(origins: ArrayLike, directions: ArrayLike) -> LightPosition:
         if np.linalg.eigvalsh(normal)[0] < MIN_BASELINE**2 * weight.sum() / 4:
             rule = "its rays must not be parallel"
             cure = "move the ball farther between the photographs"
-            raise InputError(Fault("light", rule, f"{len(start)} rays within about a degree", cure))
-        position = np.linalg.solve(normal, np.einsum("r,rij,rj->i", weight, across, start))
+            raise InputError(
+                Fault("light", rule, f"{len(start)} rays within about a degree", cure)
+            )
+        position = np.linalg.solve(
+            normal, np.einsum("r,rij,rj->i", weight, across, start)
+        )
         weight = 1 / ((position - start) ** 2).sum(axis=1)
     offset = np.einsum("rij,rj->ri", across, position - start)
     angle = np.linalg.norm(offset, axis=1) * np.sqrt(weight)
@@ -268,7 +348,9 @@ def light_position(origins: ArrayLike, directions: ArrayLike) -> LightPosition:
     return LightPosition(position, covariance, np.degrees(angle))
 
 
-def reprojection_error(points: ArrayLike, pixels: ArrayLike, camera: Pinhole) -> Reprojection:
+def reprojection_error(
+    points: ArrayLike, pixels: ArrayLike, camera: Pinhole
+) -> Reprojection:
     """Distance of observed pixels (point, 2) from the projections of known points (point, 3) in mm.
 
     Points that are behind the camera, or that were not observed (NaN), are excluded.
@@ -287,5 +369,8 @@ def reprojection_error(points: ArrayLike, pixels: ArrayLike, camera: Pinhole) ->
         cure = "check the pose of the camera"
         raise InputError(Fault("reprojection", rule, f"none of {len(length)}", cure))
     return Reprojection(
-        residual, float(np.sqrt(np.mean(length[seen] ** 2))), float(length[seen].max()), int(seen.sum())
+        residual,
+        float(np.sqrt(np.mean(length[seen] ** 2))),
+        float(length[seen].max()),
+        int(seen.sum()),
     )

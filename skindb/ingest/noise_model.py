@@ -11,18 +11,22 @@ from skindb.errors import Fault, InputError
 
 Array = NDArray[np.float64]
 MIN_PAIRS = 3  # pairs of different brightness
-MIN_RATIO = 4.0  # brightest over darkest mean; with less, slope and intercept cannot be separated
-SATURATION_FRACTION = 1e-4  # fraction of pixels at the white level above which a pair is excluded
+# brightest over darkest mean; with less, slope and intercept cannot be separated
+MIN_RATIO = 4.0
+# fraction of pixels at the white level above which a pair is excluded
+SATURATION_FRACTION = 1e-4
 ROUNDS = 10  # of reweighting by the fitted variance
 
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """Noise of a linear sensor: electrons per value and read noise in electrons, with their standard errors.
+    """Noise of a linear sensor: electrons per value and read noise in electrons, with
+    their standard errors.
 
-    `covariance` (2, 2) is that of the variance at black and the variance per value, in values of the file. `chi_square`
-    is the chi-squared of the fit per degree of freedom, about 1 if the sensor follows the model. `mean` and `variance`
-    (pair,) are the points of the curve; a pair that is clipped at the white level is NaN.
+    `covariance` (2, 2) is that of the variance at black and the variance per value, in
+    values of the file. `chi_square` is the chi-squared of the fit per degree of
+    freedom, about 1 if the sensor follows the model. `mean` and `variance` (pair,) are
+    the points of the curve; a pair that is clipped at the white level is NaN.
     """
 
     electrons_per_dn: float
@@ -35,18 +39,22 @@ class NoiseModel:
     variance: Array
 
 
-def fit_noise(pairs: ArrayLike, *, black: float, white: float, step: float = 1.0) -> NoiseModel:
-    """Photon transfer: the variance of the difference of two equal frames is a straight line over their mean.
+def fit_noise(
+    pairs: ArrayLike, *, black: float, white: float, step: float = 1.0
+) -> NoiseModel:
+    """Photon transfer: the variance of the difference of two equal frames is a straight
+    line over their mean.
 
-    Half the variance of the difference is free of the fixed pattern and of uneven light. The line is fitted with the
-    relative error sqrt(2 / (n - 1)) of a variance; the quantisation noise step^2 / 12 is subtracted from the read
-    noise.
+    Half the variance of the difference is free of the fixed pattern and of uneven
+    light. The line is fitted with the relative error sqrt(2 / (n - 1)) of a variance;
+    the quantisation noise step^2 / 12 is subtracted from the read noise.
 
     Parameters
     ----------
     pairs
-        (pair, 2, height, width) values of the file of one channel, linear; two frames of the same scene in each pair,
-        which differ in brightness from pair to pair. A dark pair may be among them.
+        (pair, 2, height, width) values of the file of one channel, linear; two frames
+        of the same scene in each pair, which differ in brightness from pair to pair. A
+        dark pair may be among them.
     black, white
         Levels in values of the file.
     step
@@ -55,22 +63,54 @@ def fit_noise(pairs: ArrayLike, *, black: float, white: float, step: float = 1.0
     Raises
     ------
     InputError
-        Wrong shape, values that are not finite, too few unsaturated pairs, or pairs of one brightness.
+        Wrong shape, values that are not finite, too few unsaturated pairs, or pairs of
+        one brightness.
     """
     frames = np.asarray(pairs, np.float64)
-    if frames.ndim != 4 or frames.shape[1] != 2 or frames[0, 0].size < 100 or not np.isfinite(frames).all():
-        rule = "they must be finite, of the shape (pair, 2, height, width), and have 100 pixels or more"
-        raise InputError(Fault("pairs of flat frames", rule, str(frames.shape), "give one channel of each frame"))
+    if (
+        frames.ndim != 4
+        or frames.shape[1] != 2
+        or frames[0, 0].size < 100
+        or not np.isfinite(frames).all()
+    ):
+        rule = (
+            "they must be finite, of the shape (pair, 2, height, width), and have 100 "
+            "pixels or more"
+        )
+        raise InputError(
+            Fault(
+                "pairs of flat frames",
+                rule,
+                str(frames.shape),
+                "give one channel of each frame",
+            )
+        )
     cut = (frames >= white).mean(axis=(1, 2, 3)) > SATURATION_FRACTION
     count = frames[0, 0].size
     mean = np.where(cut, np.nan, frames.mean(axis=(1, 2, 3)) - black)
-    variance = np.where(cut, np.nan, np.var(frames[:, 0] - frames[:, 1], axis=(1, 2), ddof=1) / 2)
+    variance = np.where(
+        cut, np.nan, np.var(frames[:, 0] - frames[:, 1], axis=(1, 2), ddof=1) / 2
+    )
     x = mean[~cut]
     y = variance[~cut]
-    if len(x) < MIN_PAIRS or x.max() < MIN_RATIO * max(x.min(), 0.0) or not (y > 0).all():
-        rule = f"at least {MIN_PAIRS} pairs must be unsaturated, noisy, and differ {MIN_RATIO:g} times in brightness"
+    if (
+        len(x) < MIN_PAIRS
+        or x.max() < MIN_RATIO * max(x.min(), 0.0)
+        or not (y > 0).all()
+    ):
+        rule = (
+            f"at least {MIN_PAIRS} pairs must be unsaturated, noisy, and differ "
+            f"{MIN_RATIO:g} times in brightness"
+        )
         found = f"{len(x)} unsaturated pairs, {int((y > 0).sum())} of them noisy"
-        raise InputError(Fault("pairs of flat frames", rule, found, "photograph them with several exposure times"))
+        raise InputError(
+            Fault(
+                "pairs of flat frames",
+                rule,
+                found,
+                "photograph them with several exposure times",
+            )
+        )
     design = np.stack([np.ones_like(x), x], axis=1)
     expected = y
     for _ in range(ROUNDS):
@@ -82,21 +122,40 @@ def fit_noise(pairs: ArrayLike, *, black: float, white: float, step: float = 1.0
     if slope <= 0:
         rule = "the noise must grow with brightness"
         cure = "check that the frames are linear and not denoised"
-        raise InputError(Fault("pairs of flat frames", rule, f"a slope of {slope:.3g}", cure))
-    chi_square = float((((y - design @ solution) / sigma) ** 2).sum() / max(len(x) - 2, 1))
-    return _electrons(solution, covariance, floor - step**2 / 12, chi_square, (mean, variance))
+        raise InputError(
+            Fault("pairs of flat frames", rule, f"a slope of {slope:.3g}", cure)
+        )
+    chi_square = float(
+        (((y - design @ solution) / sigma) ** 2).sum() / max(len(x) - 2, 1)
+    )
+    return _electrons(
+        solution, covariance, floor - step**2 / 12, chi_square, (mean, variance)
+    )
 
 
 def _electrons(
-    line: Array, covariance: Array, read: float, chi_square: float, points: tuple[Array, Array]
+    line: Array,
+    covariance: Array,
+    read: float,
+    chi_square: float,
+    points: tuple[Array, Array],
 ) -> NoiseModel:
-    """Convert variances in values to electrons; a read noise that is negative by chance becomes 0."""
+    """Convert variances in values to electrons; a read noise that is negative by chance
+    becomes 0.
+    """
     gain = 1 / float(line[1])
     noise = gain * np.sqrt(max(read, 0.0))
-    # d noise = gain / (2 sqrt(read)) d read - noise gain d slope; near zero, the error of the square root
+    # d noise = gain / (2 sqrt(read)) d read - noise gain d slope; near zero, the error
+    # of the square root
     deviation = float(np.sqrt(covariance[0, 0]))
     slopes = np.array([gain / (2 * np.sqrt(max(read, deviation))), -noise * gain])
     error = float(np.sqrt(slopes @ covariance @ slopes))
     return NoiseModel(
-        gain, gain**2 * float(np.sqrt(covariance[1, 1])), float(noise), error, covariance, chi_square, *points
+        gain,
+        gain**2 * float(np.sqrt(covariance[1, 1])),
+        float(noise),
+        error,
+        covariance,
+        chi_square,
+        *points,
     )

@@ -1,4 +1,6 @@
-"""Brightness of photographs relative to a prediction for a matte face: by camera, by light and of the face."""
+"""Brightness of photographs relative to a prediction for a matte face: by camera, by
+light and of the face.
+"""
 
 from __future__ import annotations
 
@@ -11,13 +13,17 @@ from numpy.typing import NDArray
 from skindb.ingest.photo_consistency import FLOOR, ReducedView, bilinear
 
 Array = NDArray[np.float64]
-LIT_FRACTION = 0.3  # of the largest irradiance in a view, above which a surfel is compared
-POLISH_ROUNDS = 10  # of the medians of cameras and lights in turn; three change factors by less than 1 %
+# of the largest irradiance in a view, above which a surfel is compared
+LIT_FRACTION = 0.3
+# of the medians of cameras and lights in turn; three change factors by less than 1 %
+POLISH_ROUNDS = 10
 
 
 @dataclass(frozen=True)
 class Brightness:
-    """Factors of the radiance over that of a matte face of reflectance 1; NaN where too little is visible."""
+    """Factors of the radiance over that of a matte face of reflectance 1; NaN where too
+    little is visible.
+    """
 
     reflectance: Array  # (3,) of the face, the factor of the median camera and light
     camera: Array  # (camera, 3) relative to the median camera
@@ -25,7 +31,11 @@ class Brightness:
 
 
 def view_factors(
-    view: ReducedView, picture: NDArray[np.float32], pixels: Array, irradiance: Array, albedo: Array
+    view: ReducedView,
+    picture: NDArray[np.float32],
+    pixels: Array,
+    irradiance: Array,
+    albedo: Array,
 ) -> Array:
     """Median factor (3,) of the radiance of a view over that of a matte face.
 
@@ -46,13 +56,20 @@ def view_factors(
     at = view.clear & (grey > LIT_FRACTION * grey.max())
     planes = np.moveaxis(np.asarray(picture, np.float64), -1, 0)
     radiance = np.stack([bilinear(plane, pixels[at]) for plane in planes], axis=1)
-    return np.asarray(np.pi * np.median(radiance / (irradiance[at] * albedo[at, None]), axis=0))
+    return np.asarray(
+        np.pi * np.median(radiance / (irradiance[at] * albedo[at, None]), axis=0)
+    )
 
 
 def relative_brightness(
-    factors: Array, lights: Sequence[int], cameras: Sequence[int], *, shape: tuple[int, int]
+    factors: Array,
+    lights: Sequence[int],
+    cameras: Sequence[int],
+    *,
+    shape: tuple[int, int],
 ) -> Brightness:
-    """Split the factors of views into those of lights and cameras, by medians of logarithms in turn (Tukey 1977).
+    """Split the factors of views into those of lights and cameras, by medians of
+    logarithms in turn (Tukey 1977).
 
     Parameters
     ----------
@@ -80,4 +97,6 @@ def relative_brightness(
             mine = light_of == j
             by_light[j] = np.median(log[mine] - by_camera[camera_of[mine]], axis=0)
     level = np.nanmedian(by_light, axis=0)
-    return Brightness(np.exp(level), np.exp(by_camera), np.exp((by_light - level).mean(axis=1)))
+    return Brightness(
+        np.exp(level), np.exp(by_camera), np.exp((by_light - level).mean(axis=1))
+    )

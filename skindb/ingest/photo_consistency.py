@@ -1,8 +1,9 @@
 """Offset between photographs and scan: photographs are compared with predictions for a matte face.
 
-A prediction is albedo x irradiance. The comparison is robust, and uses square roots, which reduces the effect of
-highlights. Pictures are downsampled until a pixel covers about `PIXEL_MM` of the face: the effects that the prediction
-ignores (gloss, light between parts of the face, hair) have a size on the face, independent of the resolution.
+A prediction is albedo x irradiance. The comparison is robust, and uses square roots,
+which reduces the effect of highlights. Pictures are downsampled until a pixel covers
+about `PIXEL_MM` of the face: the effects that the prediction ignores (gloss, light
+between parts of the face, hair) have a size on the face, independent of the resolution.
 """
 
 from __future__ import annotations
@@ -24,10 +25,14 @@ SMALL_STEP = 1e-3
 # range of the search for large offsets in radii of the face, and steps per side
 SEARCH_RADII = 0.75
 SEARCH_STEPS = 7
-ROBUST_SCALE = 2.0  # robust standard deviations at which the weight of a residual is one half
-ALBEDO_QUANTILE = 0.4  # of the ratios measured / predicted of a surfel; highlights raise the larger ones
-ALBEDO_RANGE = (0.2, 3.0)  # relative to the median albedo, from brows and nostrils to the forehead
-STEPS = ([0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5])  # px, whose differences are derivatives
+# robust standard deviations at which the weight of a residual is one half
+ROBUST_SCALE = 2.0
+# of the ratios measured / predicted of a surfel; highlights raise the larger ones
+ALBEDO_QUANTILE = 0.4
+# relative to the median albedo, from brows and nostrils to the forehead
+ALBEDO_RANGE = (0.2, 3.0)
+# px, whose differences are derivatives
+STEPS = ([0.5, 0.0], [-0.5, 0.0], [0.0, 0.5], [0.0, -0.5])
 FLOOR = 1e-30  # keeps quotients finite where a picture is black
 
 
@@ -44,13 +49,18 @@ class ReducedView:
 
 @dataclass(frozen=True)
 class Offset:
-    """Similarity that aligns the photographs of one camera with the scan: shift, relative scale and roll."""
+    """Similarity that aligns the photographs of one camera with the scan: shift,
+    relative scale and roll.
+    """
 
-    agreement: float  # correlation of measured and predicted square roots after alignment, median over photographs
+    # correlation of measured and predicted square roots after alignment, median over
+    # photographs
+    agreement: float
     shift: Array  # (2,) px of the downsampled picture, columns and rows
     scale: float  # relative; 0.01: the face is 1 % larger in the photographs
     roll: float  # radians, clockwise in the picture
-    middle: Array  # (2,) px, centroid of the visible surfels, the centre of roll and scale
+    # (2,) px, centroid of the visible surfels, the centre of roll and scale
+    middle: Array
     radius: float  # px, root mean square distance of the surfels from their centroid
 
     @property
@@ -61,7 +71,9 @@ class Offset:
     def moves(self, pixels: Array) -> Array:
         """Displacements (n, 2) of pixels (n, 2) by shift and roll, without the scale."""
         away = pixels - self.middle
-        return np.asarray(self.shift + self.roll * np.stack([-away[:, 1], away[:, 0]], axis=1))
+        return np.asarray(
+            self.shift + self.roll * np.stack([-away[:, 1], away[:, 0]], axis=1)
+        )
 
 
 def reduction(width_mm: float) -> int:
@@ -70,7 +82,9 @@ def reduction(width_mm: float) -> int:
 
 
 def reduced(image: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
-    """Means (h // factor, w // factor, c) of square blocks of a picture (h, w, c), whose NaN count as its maximum."""
+    """Means (h // factor, w // factor, c) of square blocks of a picture (h, w, c),
+    whose NaN count as its maximum.
+    """
     h, w = (size // factor * factor for size in image.shape[:2])
     whole = image[:h, :w]
     top = float(np.nanmax(whole, initial=0.0)) if np.isfinite(whole).any() else 0.0
@@ -85,11 +99,17 @@ def bilinear(image: Array, pixels: Array) -> Array:
 
 
 def interpolated(images: Array, pixels: Array) -> Array:
-    """Interpolated values (picture, n) of pictures (picture, h, w) at pixels (n, 2); 0 outside the pictures."""
+    """Interpolated values (picture, n) of pictures (picture, h, w) at pixels (n, 2); 0
+    outside the pictures.
+    """
     from skindb.ingest._picture_kernels import interpolate
 
     out = np.empty((len(images), len(pixels)))
-    interpolate(np.ascontiguousarray(images, np.float64), np.ascontiguousarray(pixels, np.float64), out)
+    interpolate(
+        np.ascontiguousarray(images, np.float64),
+        np.ascontiguousarray(pixels, np.float64),
+        out,
+    )
     return out
 
 
@@ -101,8 +121,15 @@ def correlation(a: Array, b: Array) -> float:
     return float(a @ b) / product if product > 0 else 0.0
 
 
-def camera_offset(views: Sequence[ReducedView], irradiance: Array, albedo: Array, *, search: bool = True) -> Offset:
-    """Similarity of the picture that brings the photographs of one camera and the predictions together.
+def camera_offset(
+    views: Sequence[ReducedView],
+    irradiance: Array,
+    albedo: Array,
+    *,
+    search: bool = True,
+) -> Offset:
+    """Similarity of the picture that brings the photographs of one camera and the
+    predictions together.
 
     Parameters
     ----------
@@ -120,15 +147,22 @@ def camera_offset(views: Sequence[ReducedView], irradiance: Array, albedo: Array
     middle = pixels.mean(axis=0)
     radius = float(np.sqrt(((pixels - middle) ** 2).sum(axis=1).mean()))
     images = np.stack([view.image for view in views])
-    predicted = [np.sqrt(np.maximum(irradiance[view.light][at] * albedo[at], 0)) for view in views]
+    predicted = [
+        np.sqrt(np.maximum(irradiance[view.light][at] * albedo[at], 0))
+        for view in views
+    ]
 
     def agreement(places: Array) -> float:
         seen = interpolated(images, places)
-        each = [correlation(one, shade) for one, shade in zip(seen, predicted, strict=True)]
-        return float(np.median(each))  # the median ignores a light with a wrong position
+        each = [
+            correlation(one, shade) for one, shade in zip(seen, predicted, strict=True)
+        ]
+        # the median ignores a light with a wrong position
+        return float(np.median(each))
 
     away = (pixels - middle) / radius
-    moves = np.zeros((len(at), 2, 4))  # px: shift, and displacements at the radius by scale and roll
+    # px: shift, and displacements at the radius by scale and roll
+    moves = np.zeros((len(at), 2, 4))
     moves[:, 0, 0] = moves[:, 1, 1] = 1
     moves[:, :, 2], moves[:, 0, 3], moves[:, 1, 3] = away, -away[:, 1], away[:, 0]
     start = np.zeros(4)
@@ -144,29 +178,52 @@ def camera_offset(views: Sequence[ReducedView], irradiance: Array, albedo: Array
         best = shifts[int(np.argmax([coarse(shift) for shift in shifts]))]
         start[:2] = best if coarse(best) > coarse(np.zeros(2)) + 0.02 else 0
     move = _gauss_newton(images, predicted, pixels, moves, start)
-    if not np.isfinite(move).all() or agreement(pixels + moves @ move) < agreement(pixels + moves @ start):
+    if not np.isfinite(move).all() or agreement(pixels + moves @ move) < agreement(
+        pixels + moves @ start
+    ):
         move = start
     found = agreement(pixels + moves @ move)
-    return Offset(found, move[:2].copy(), float(move[2] / radius), float(move[3] / radius), middle, radius)
+    return Offset(
+        found,
+        move[:2].copy(),
+        float(move[2] / radius),
+        float(move[3] / radius),
+        middle,
+        radius,
+    )
 
 
 def moved_pixels(view: ReducedView, offset: Offset) -> Array:
     """Pixels (n, 2) of the surfels after the alignment."""
-    return np.asarray(view.pixels + offset.moves(view.pixels) + offset.scale * (view.pixels - offset.middle))
+    return np.asarray(
+        view.pixels
+        + offset.moves(view.pixels)
+        + offset.scale * (view.pixels - offset.middle)
+    )
 
 
-def surfel_albedo(views: Sequence[ReducedView], irradiance: Array, offsets: Mapping[int, Offset]) -> Array:
-    """Albedo (n,) relative to the median: a low quantile of measured / predicted over the views that light a surfel."""
+def surfel_albedo(
+    views: Sequence[ReducedView], irradiance: Array, offsets: Mapping[int, Offset]
+) -> Array:
+    """Albedo (n,) relative to the median: a low quantile of measured / predicted over
+    the views that light a surfel.
+    """
     ratios = np.full((len(views), len(views[0].clear)), np.nan)
     for ratio, view in zip(ratios, views, strict=True):
         light = irradiance[view.light]
         at = view.clear & (light > 0.3 * light.max())
-        ratio[at] = bilinear(view.image, moved_pixels(view, offsets[view.camera])[at]) ** 2 / light[at]
-        ratio /= max(float(np.nanmedian(ratio)), FLOOR) if at.any() else 1.0  # removes errors of the intensity
+        ratio[at] = (
+            bilinear(view.image, moved_pixels(view, offsets[view.camera])[at]) ** 2
+            / light[at]
+        )
+        # removes errors of the intensity
+        ratio /= max(float(np.nanmedian(ratio)), FLOOR) if at.any() else 1.0
     known = np.isfinite(ratios).any(axis=0)
     albedo = np.ones(ratios.shape[1])
     albedo[known] = nan_quantile(ratios[:, known], ALBEDO_QUANTILE)
-    return np.asarray(np.clip(albedo / max(float(np.median(albedo[known])), FLOOR), *ALBEDO_RANGE))
+    return np.asarray(
+        np.clip(albedo / max(float(np.median(albedo[known])), FLOOR), *ALBEDO_RANGE)
+    )
 
 
 def nan_quantile(values: Array, level: float) -> Array:
@@ -175,7 +232,8 @@ def nan_quantile(values: Array, level: float) -> Array:
     place = level * ((~np.isnan(ordered)).sum(axis=0) - 1)
     below = np.maximum(place.astype(int), 0)
     low, high = (
-        np.take_along_axis(ordered, at[None], 0)[0] for at in (below, np.ceil(np.maximum(place, 0)).astype(int))
+        np.take_along_axis(ordered, at[None], 0)[0]
+        for at in (below, np.ceil(np.maximum(place, 0)).astype(int))
     )
     part = place - below
     step = high - low
@@ -184,30 +242,47 @@ def nan_quantile(values: Array, level: float) -> Array:
 
 def square_root_image(image: NDArray[np.floating[Any]]) -> Array:
     """Square roots of a picture, slightly smoothed so that its derivatives are smooth."""
-    return np.asarray(np.sqrt(np.maximum(gaussian_filter(np.asarray(image, np.float64), SMOOTHING_PX), 0)))
+    return np.asarray(
+        np.sqrt(
+            np.maximum(gaussian_filter(np.asarray(image, np.float64), SMOOTHING_PX), 0)
+        )
+    )
 
 
-def _gauss_newton(images: Array, predicted: Sequence[Array], pixels: Array, moves: Array, start: Array) -> Array:
-    """Alignment (4,) that minimises the robust sum of (gain predicted - measured)^2 with one gain per picture."""
+def _gauss_newton(
+    images: Array, predicted: Sequence[Array], pixels: Array, moves: Array, start: Array
+) -> Array:
+    """Alignment (4,) that minimises the robust sum of (gain predicted - measured)^2
+    with one gain per picture.
+    """
     move = start.copy()
     for _ in range(MAX_STEPS):
         places = pixels + moves @ move
-        right, left, below, above = (interpolated(images, places + step) for step in STEPS)
+        right, left, below, above = (
+            interpolated(images, places + step) for step in STEPS
+        )
         rows = []
         rest = []
         for seen, across, down, shade in zip(
-            interpolated(images, places), right - left, below - above, predicted, strict=True
+            interpolated(images, places),
+            right - left,
+            below - above,
+            predicted,
+            strict=True,
         ):
             square = max(float(shade @ shade), FLOOR)
             row = across[:, None] * moves[:, 0] + down[:, None] * moves[:, 1]
-            rows.append(row - np.outer(shade, shade @ row) / square)  # the gain is eliminated
+            # the gain is eliminated
+            rows.append(row - np.outer(shade, shade @ row) / square)
             rest.append(float(seen @ shade) / square * shade - seen)
         matrix = np.concatenate(rows)
         residual = np.concatenate(rest)
         scale = ROBUST_SCALE * 1.4826 * float(np.median(np.abs(residual))) + FLOOR
         weight = 1 / (1 + (residual / scale) ** 2)
         normal = (matrix * weight[:, None]).T @ matrix
-        step = np.linalg.lstsq(normal, (matrix * weight[:, None]).T @ residual, rcond=None)[0]
+        step = np.linalg.lstsq(
+            normal, (matrix * weight[:, None]).T @ residual, rcond=None
+        )[0]
         move += step
         if np.abs(step).max() < SMALL_STEP:
             break

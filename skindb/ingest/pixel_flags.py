@@ -7,4 +7,5 @@ import numpy as np
 OK = 0
 SATURATED = 1
 DARK = 2
-DARK_SIGMA = np.float32(2.0)  # standard deviations of read noise above black; a pixel at or below it is dark
+# standard deviations of read noise above black; a pixel at or below it is dark
+DARK_SIGMA = np.float32(2.0)

@@ -1,4 +1,6 @@
-"""Fibre profiles of the contact probe from its bracketed photographs (Weyrich et al. 2005, section 8)."""
+"""Fibre profiles of the contact probe from its bracketed photographs (Weyrich et al.
+2005, section 8).
+"""
 
 from __future__ import annotations
 
@@ -20,8 +22,9 @@ from skindb.ingest.radiance import merge_exposures
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
-# fraction of a fibre's pixels that may be missing in a channel (stuck ones): for a fibre whose centre is 50 % above
-# its mean brightness, the signal is then 0.5 % too low, which is the default error of a gain
+# fraction of a fibre's pixels that may be missing in a channel (stuck ones): for a
+# fibre whose centre is 50 % above its mean brightness, the signal is then 0.5 % too
+# low, which is the default error of a gain
 MAX_LOST_FRACTION = 0.01
 MIN_LIT_FIBRES = 3  # of a site: a decay and a level, and one fibre that confirms them
 
@@ -34,14 +37,15 @@ class Profiles:
     error: Array  # (site, fibre, 3) standard error
     scale_known: bool
     placements: tuple[Array, ...]  # for each site (placement, fibre, 3)
-    repeatability: Array  # (site, 3) relative standard deviation between placements; NaN of a single one
+    # (site, 3) relative standard deviation between placements; NaN of a single one
+    repeatability: Array
 
 
 def fibre_profiles(probe: ProbeRecord, digests: Digests | None = None) -> Profiles:
     """Mean signal of each fibre's pixels over all brackets, times scale, divided by gain.
 
-    The error combines photons, read noise and quantisation, a few 1e-4 near the source, with the gains: about
-    4e-3, independent between fibres but the same at every site.
+    The error combines photons, read noise and quantisation, a few 1e-4 near the source,
+    with the gains: about 4e-3, independent between fibres but the same at every site.
 
     Raises
     ------
@@ -52,40 +56,64 @@ def fibre_profiles(probe: ProbeRecord, digests: Digests | None = None) -> Profil
     faults = list[Fault]()
     for site in probe.sites:
         try:
-            found.append([placement_signal(probe, site, placement, digests) for placement in probe.placements[site]])
+            found.append(
+                [
+                    placement_signal(probe, site, placement, digests)
+                    for placement in probe.placements[site]
+                ]
+            )
         except InputError as problem:
             faults += problem.faults
     if faults:
-        raise InputError(dict.fromkeys(faults))  # the faults of the fibres repeat at every site
+        # the faults of the fibres repeat at every site
+        raise InputError(dict.fromkeys(faults))
     if faults := _light_faults(probe, found):
         raise InputError(faults)
     factor = (probe.scale or 1.0) / probe.gain
-    each = [(np.stack([v for v, _ in one]), np.stack([e for _, e in one])) for one in found]
+    each = [
+        (np.stack([v for v, _ in one]), np.stack([e for _, e in one])) for one in found
+    ]
     together = [combine_placements(value, error) for value, error in each]
     value, error, spread = (np.array(column) for column in zip(*together, strict=True))
     value, error = value * factor, np.hypot(error, probe.gain_error * value) * factor
     if (np.fmax(np.abs(value), error) > MAX_MAGNITUDE).any():
         rule = f"scale * signal / gain must be at most {MAX_MAGNITUDE:g}"
         cure = "correct scale, gain and seconds"
-        raise InputError(Fault(f"{probe.file}[gain]", rule, f"{np.nanmax(np.abs(value)):.3g}", cure))
+        raise InputError(
+            Fault(f"{probe.file}[gain]", rule, f"{np.nanmax(np.abs(value)):.3g}", cure)
+        )
     known = probe.scale is not None
-    fault = energy_fault(str(probe.file), probe.sites, probe.distance, value, error) if known else None
+    fault = (
+        energy_fault(str(probe.file), probe.sites, probe.distance, value, error)
+        if known
+        else None
+    )
     if fault is not None:
         raise InputError(fault)
     return Profiles(value, error, known, tuple(one * factor for one, _ in each), spread)
 
 
-def _light_faults(probe: ProbeRecord, signals: list[list[tuple[Array, Array]]]) -> list[Fault]:
-    """Faults of placements whose frames are black or white: nearly no fibre shows light that is clear of noise."""
+def _light_faults(
+    probe: ProbeRecord, signals: list[list[tuple[Array, Array]]]
+) -> list[Fault]:
+    """Faults of placements whose frames are black or white: nearly no fibre shows light
+    that is clear of noise.
+    """
     faults = list[Fault]()
     least = min(MIN_LIT_FIBRES, len(probe.fibres))
     rule = f"at least {least} fibres must show light, and not be saturated in every bracket"
     cure = "place the probe and take its frames again, or remove the site"
     for site, placements in zip(probe.sites, signals, strict=True):
-        for placement, (value, error) in zip(probe.placements[site], placements, strict=True):
+        for placement, (value, error) in zip(
+            probe.placements[site], placements, strict=True
+        ):
             lit = int((value > MIN_SIGNAL_TO_NOISE * error).any(axis=1).sum())
             if lit < least:
-                at = f"site {site}, placement {placement}" if placement else f"site {site}"
+                at = (
+                    f"site {site}, placement {placement}"
+                    if placement
+                    else f"site {site}"
+                )
                 saturated = int(np.isnan(value).all(axis=1).sum())
                 found = f"{at}: {lit} of {len(value)}, {saturated} saturated"
                 faults.append(Fault(f"{probe.file}[frames]", rule, found, cure))
@@ -93,11 +121,13 @@ def _light_faults(probe: ProbeRecord, signals: list[list[tuple[Array, Array]]]) 
 
 
 def combine_placements(value: Array, error: Array) -> tuple[Array, Array, Array]:
-    """Mean of repeated placements of the probe at one site, its standard error, and their repeatability.
+    """Mean of repeated placements of the probe at one site, its standard error, and
+    their repeatability.
 
-    Each placement changes the coupling of the fibres to the skin. Its relative standard deviation is estimated from all
-    fibres of a channel together, after the variance of photons and read noise is subtracted, and is part of the error
-    of the mean. For a single placement it is unknown, and the error contains noise alone.
+    Each placement changes the coupling of the fibres to the skin. Its relative standard
+    deviation is estimated from all fibres of a channel together, after the variance of
+    photons and read noise is subtracted, and is part of the error of the mean. For a
+    single placement it is unknown, and the error contains noise alone.
 
     Parameters
     ----------
@@ -118,15 +148,20 @@ def combine_placements(value: Array, error: Array) -> tuple[Array, Array, Array]
         return mean, noise, np.full(3, np.nan)
     with np.errstate(invalid="ignore", divide="ignore"):
         relative = (value.var(axis=0, ddof=1) - (error**2).mean(axis=0)) / mean**2
-        weight = np.where(np.isfinite(relative), (mean / noise) ** 2, 0.0)  # far fibres carry little information
-        spread = np.sqrt(np.maximum(np.nansum(weight * relative, axis=0) / weight.sum(axis=0), 0.0))
+        # far fibres carry little information
+        weight = np.where(np.isfinite(relative), (mean / noise) ** 2, 0.0)
+        spread = np.sqrt(
+            np.maximum(np.nansum(weight * relative, axis=0) / weight.sum(axis=0), 0.0)
+        )
     return mean, np.hypot(noise, spread * np.abs(mean) / np.sqrt(count)), spread
 
 
 def placement_signal(
     probe: ProbeRecord, site: str, placement: str = "", digests: Digests | None = None
 ) -> tuple[Array, Array]:
-    """Signal per second (fibre, 3) and its standard error; NaN where pixels are saturated in every bracket."""
+    """Signal per second (fibre, 3) and its standard error; NaN where pixels are
+    saturated in every bracket.
+    """
     fibres = list[Index]()
     strips = list[Frame]()
     faults = dict[Fault, None]()
@@ -141,11 +176,15 @@ def placement_signal(
         strips.append(frame.reshape(-1, 3)[np.unique(np.concatenate(fibres))][None])
     if faults:
         raise InputError(faults)
-    fault = disagreement(f"{probe.file}[exposures]", probe.exposures, strips, probe.sensor)
+    fault = disagreement(
+        f"{probe.file}[exposures]", probe.exposures, strips, probe.sensor
+    )
     if fault is not None:
         at = f"site {site}, placement {placement}" if placement else f"site {site}"
         raise InputError(replace(fault, found=f"{at}: bracket {fault.found}"))
-    radiance, error, _ = merge_exposures(strips, tuple(probe.exposures.values()), probe.sensor)
+    radiance, error, _ = merge_exposures(
+        strips, tuple(probe.exposures.values()), probe.sensor
+    )
     value = np.full((len(fibres), 3), np.nan)
     spread = np.full((len(fibres), 3), np.nan)
     union = np.unique(np.concatenate(fibres))
@@ -162,28 +201,37 @@ def placement_signal(
 
 
 def fibre_pixels(probe: ProbeRecord, shape: tuple[int, ...]) -> list[Index]:
-    """Indices into the flattened picture of each fibre's pixels, whose centres are within its radius.
+    """Indices into the flattened picture of each fibre's pixels, whose centres are
+    within its radius.
 
     Raises
     ------
     InputError
-        With every fibre without a pixel, or if the fibres cover more pixels than the memory is planned for.
+        With every fibre without a pixel, or if the fibres cover more pixels than the
+        memory is planned for.
     """
     fibres = list[Index]()
     total = 0
     for centre, radius in zip(probe.centre, probe.radius, strict=True):
         (left, right), (top, bottom) = (
-            (min(max(math.floor(c - radius), 0), side), min(math.ceil(c + radius), side))
+            (
+                min(max(math.floor(c - radius), 0), side),
+                min(math.ceil(c + radius), side),
+            )
             for c, side in zip(centre, shape[::-1], strict=True)
         )
         total += max(right - left, 0) * max(bottom - top, 0)
         if total > MAX_FIBRE_PIXELS:
             rule = f"the fibres must cover at most {MAX_FIBRE_PIXELS:,} pixels"
             cure = "give centre and radius in pixels of the picture"
-            raise InputError(Fault(f"{probe.file}[fibres]", rule, f"{total:,} or more", cure))
+            raise InputError(
+                Fault(f"{probe.file}[fibres]", rule, f"{total:,} or more", cure)
+            )
         y = np.arange(top, bottom)[:, None] + 0.5
         x = np.arange(left, right) + 0.5
-        row, column = np.nonzero((x - centre[0]) ** 2 + (y - centre[1]) ** 2 <= radius * radius)
+        row, column = np.nonzero(
+            (x - centre[0]) ** 2 + (y - centre[1]) ** 2 <= radius * radius
+        )
         fibres.append((row + top) * shape[1] + column + left)
     faults = [
         Fault(

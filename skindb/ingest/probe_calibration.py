@@ -1,4 +1,6 @@
-"""Calibration of the contact probe: centres and flat field of its fibres, and their application to a capture."""
+"""Calibration of the contact probe: centres and flat field of its fibres, and their
+application to a capture.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,13 @@ from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
 from skindb.ingest.devices import EXPOSURE, SITE, ProbeRecord, read_probe
-from skindb.ingest.fibre_spots import MIN_FRAMES, Spots, fibre_gain, find_fibres, match_fibres
+from skindb.ingest.fibre_spots import (
+    MIN_FRAMES,
+    Spots,
+    fibre_gain,
+    find_fibres,
+    match_fibres,
+)
 from skindb.ingest.fields import Fields
 from skindb.ingest.frames import read_frames
 from skindb.ingest.json_file import read_json
@@ -25,11 +33,13 @@ REPEAT = "repeat"
 MAX_REPEATS = 64
 ROWS = 256  # of the frames that are merged at a time
 GREEN = 1
-OF_SESSIONS = ("sites", "frames", "placements", "pressure")  # keys of probe.json that a set-up may lack
+# keys of probe.json that a set-up may lack
+OF_SESSIONS = ("sites", "frames", "placements", "pressure")
 
 
 def read_flat_frames(folder: Path) -> ProbeRecord | None:
-    """The probe of a set-up, with the repeats of its flat field as sites; None without `contact/calibration.json`.
+    """The probe of a set-up, with the repeats of its flat field as sites; None without
+    `contact/calibration.json`.
 
     Raises
     ------
@@ -43,16 +53,35 @@ def read_flat_frames(folder: Path) -> ProbeRecord | None:
     data = read_json(file, faults)
     probe = read_json(folder / PROBE_FILE, faults)
     if data is None or not isinstance(probe, dict):
-        raise InputError(faults or [Fault(str(folder / PROBE_FILE), "must be a JSON object {...}", "another value")])
+        raise InputError(
+            faults
+            or [
+                Fault(
+                    str(folder / PROBE_FILE),
+                    "must be a JSON object {...}",
+                    "another value",
+                )
+            ]
+        )
     fields = Fields(data, str(file), faults)
     template = fields.template("frames", {REPEAT, EXPOSURE}, set())
     repeats = fields.integer("repeats", least=MIN_FRAMES, most=MAX_REPEATS)
     if unknown := fields.unknown():
-        faults.append(Fault(str(file), "its keys are frames and repeats", ", ".join(unknown), "correct the name"))
+        faults.append(
+            Fault(
+                str(file),
+                "its keys are frames and repeats",
+                ", ".join(unknown),
+                "correct the name",
+            )
+        )
     if faults:
         raise InputError(faults)
     flat = {key: value for key, value in probe.items() if key not in OF_SESSIONS}
-    flat |= {"sites": [str(i + 1) for i in range(repeats)], "frames": template.replace(f"{{{REPEAT}}}", f"{{{SITE}}}")}
+    flat |= {
+        "sites": [str(i + 1) for i in range(repeats)],
+        "frames": template.replace(f"{{{REPEAT}}}", f"{{{SITE}}}"),
+    }
     found = read_probe(folder, Fields(flat, str(folder / PROBE_FILE), faults))
     if faults:
         raise InputError(faults)
@@ -60,10 +89,11 @@ def read_flat_frames(folder: Path) -> ProbeRecord | None:
 
 
 def calibrate_probe(flat: ProbeRecord) -> xr.Dataset:
-    """Centre and gain of every fibre, from frames of an evenly lit surface that is moved between them.
+    """Centre and gain of every fibre, from frames of an evenly lit surface that is
+    moved between them.
 
-    Signals are means within the radius of probe.json around the new centres. The gains of each channel keep the mean
-    of those in probe.json, so that `scale` remains valid.
+    Signals are means within the radius of probe.json around the new centres. The gains
+    of each channel keep the mean of those in probe.json, so that `scale` remains valid.
 
     Parameters
     ----------
@@ -78,15 +108,18 @@ def calibrate_probe(flat: ProbeRecord) -> xr.Dataset:
     Raises
     ------
     InputError
-        If a frame cannot be read, if another number of fibres is visible, if a fibre lies farther from its stated
-        centre than its radius, or if it is dark or saturated in all brackets.
+        If a frame cannot be read, if another number of fibres is visible, if a fibre
+        lies farther from its stated centre than its radius, or if it is dark or
+        saturated in all brackets.
     """
     picture = np.mean([_green(flat, site) for site in flat.sites], axis=0)
     given = Spots(flat.centre, flat.radius)
     spots = find_fibres(picture, count=len(flat.fibres))
     offsets = match_fibres(spots, given)
     moved = replace(flat, centre=flat.centre + offsets.offset)
-    found = fibre_gain(np.stack([placement_signal(moved, site)[0] for site in flat.sites]))
+    found = fibre_gain(
+        np.stack([placement_signal(moved, site)[0] for site in flat.sites])
+    )
     level = flat.gain.mean(axis=0)
     return dataset(
         {
@@ -95,24 +128,37 @@ def calibrate_probe(flat: ProbeRecord) -> xr.Dataset:
             "calibrated_fibre_gain": found.gain * level,
             "calibrated_fibre_gain_error": found.error * level,
         },
-        coords={"fibre": list(flat.fibres), "axis": ["x", "y"], "channel": ["R", "G", "B"]},
+        coords={
+            "fibre": list(flat.fibres),
+            "axis": ["x", "y"],
+            "channel": ["R", "G", "B"],
+        },
     )
 
 
 def _green(flat: ProbeRecord, site: str) -> NDArray[np.float64]:
-    """Merged green channel (h, w) of one repeat; the brightest value where it is saturated in all brackets."""
-    frames = read_frames([flat.frame(site, exposure) for exposure in flat.exposures], None)
+    """Merged green channel (h, w) of one repeat; the brightest value where it is
+    saturated in all brackets.
+    """
+    frames = read_frames(
+        [flat.frame(site, exposure) for exposure in flat.exposures], None
+    )
     seconds = tuple(flat.exposures.values())
     parts = [
-        merge_exposures([frame[top : top + ROWS] for frame in frames], seconds, flat.sensor)[0][..., GREEN]
+        merge_exposures(
+            [frame[top : top + ROWS] for frame in frames], seconds, flat.sensor
+        )[0][..., GREEN]
         for top in range(0, frames[0].shape[0], ROWS)
     ]
     green = np.concatenate(parts).astype(np.float64)
     return np.nan_to_num(green, nan=float(np.nanmax(green, initial=0.0)))
 
 
-def calibrated_probe(probe: ProbeRecord, calibration: xr.Dataset, *, where: str) -> ProbeRecord:
-    """The probe with the centres and gains of a calibration; the error of a gain is the root mean square of theirs.
+def calibrated_probe(
+    probe: ProbeRecord, calibration: xr.Dataset, *, where: str
+) -> ProbeRecord:
+    """The probe with the centres and gains of a calibration; the error of a gain is the
+    root mean square of theirs.
 
     Raises
     ------
@@ -123,8 +169,19 @@ def calibrated_probe(probe: ProbeRecord, calibration: xr.Dataset, *, where: str)
     names = set(map(str, known["fibre"].values))
     if missing := [fibre for fibre in probe.fibres if fibre not in names]:
         found = f"none of {', '.join(missing[:5])}"
-        raise InputError(Fault(where, "a calibration must have every fibre of the capture", found, "calibrate again"))
+        raise InputError(
+            Fault(
+                where,
+                "a calibration must have every fibre of the capture",
+                found,
+                "calibrate again",
+            )
+        )
     own = known.sel(fibre=list(probe.fibres))
     gain = own["calibrated_fibre_gain"].values
-    error = float(np.sqrt(np.mean((own["calibrated_fibre_gain_error"].values / gain) ** 2)))
-    return replace(probe, centre=own["calibrated_fibre_centre"].values, gain=gain, gain_error=error)
+    error = float(
+        np.sqrt(np.mean((own["calibrated_fibre_gain_error"].values / gain) ** 2))
+    )
+    return replace(
+        probe, centre=own["calibrated_fibre_centre"].values, gain=gain, gain_error=error
+    )

@@ -1,4 +1,6 @@
-"""From the values of exposures to radiance: levels, response, exposure time, vignette, colour (format, dome.json)."""
+"""From the values of exposures to radiance: levels, response, exposure time, vignette,
+colour (format, dome.json).
+"""
 
 from __future__ import annotations
 
@@ -32,13 +34,19 @@ class FrameMerger:
     vignette: Image | None = None  # (h, w, 1)
 
     def merge(
-        self, frames: list[Frame], spans: Spans | None = None, *, usable: NDArray[np.uint8] | None = None
+        self,
+        frames: list[Frame],
+        spans: Spans | None = None,
+        *,
+        usable: NDArray[np.uint8] | None = None,
     ) -> tuple[Image, NDArray[np.uint8]]:
-        """Radiance (h, w, 3) and flags (h, w) of the exposures of one view, by the compiled `merge_exposures`.
+        """Radiance (h, w, 3) and flags (h, w) of the exposures of one view, by the
+        compiled `merge_exposures`.
 
-        `spans` (h, 2) are the first wanted column of each row and the one after the last, by default all; pixels
-        outside may be NaN and SATURATED. `usable` (h, w), zeros, receives the number of `usable_exposures`, which is
-        set to two for linear files, whose exposures are unknown.
+        `spans` (h, 2) are the first wanted column of each row and the one after the
+        last, by default all; pixels outside may be NaN and SATURATED. `usable` (h, w),
+        zeros, receives the number of `usable_exposures`, which is set to two for linear
+        files, whose exposures are unknown.
         """
         sensor = self.camera.sensor
         if sensor.kind.bits == 0:
@@ -61,13 +69,28 @@ class FrameMerger:
         sensor = self.camera.sensor
         matrix = self.camera.colour_matrix
         dtype = self.camera.sensor.kind.dtype
-        dark = np.zeros((0, 1, 1, 3), dtype) if self.dark is None else np.ascontiguousarray(self.dark)
+        dark = (
+            np.zeros((0, 1, 1, 3), dtype)
+            if self.dark is None
+            else np.ascontiguousarray(self.dark)
+        )
         curve, offset = _curve(sensor, dark=self.dark is not None)
         zero = np.float32(sensor.black)
         span = sensor.white - sensor.black
-        variance = float(read_sigma(np.asarray([1 / np.float32(span)], np.float32), sensor)[0]) ** 2
+        variance = (
+            float(read_sigma(np.asarray([1 / np.float32(span)], np.float32), sensor)[0])
+            ** 2
+        )
         longest = max(self.seconds)
-        gain = 1 / (np.ones((1, 1)) if self.vignette is None else self.vignette[..., 0].astype(np.float64)) / longest
+        gain = (
+            1
+            / (
+                np.ones((1, 1))
+                if self.vignette is None
+                else self.vignette[..., 0].astype(np.float64)
+            )
+            / longest
+        )
         colours = matrix if (matrix != np.eye(3)).any() else np.zeros((0, 3))
         seconds = np.asarray(self.seconds, np.float32) / np.float32(longest)
         return (
@@ -86,17 +109,25 @@ class FrameMerger:
 
 
 def _curve(sensor: SensorRecord, *, dark: bool) -> tuple[Image, int]:
-    """Exposure and read variance (m, 3, 2) of value - dark + offset, without rows for linear sensors; the offset."""
+    """Exposure and read variance (m, 3, 2) of value - dark + offset, without rows for
+    linear sensors; the offset.
+    """
     if sensor.response is None:
         return np.zeros((0, 3, 2), np.float32), 0
     top = int(np.iinfo(sensor.kind.dtype).max)
     offset = top if dark else 0
-    level = np.arange(-offset, top + 1, dtype=np.float32)[None, :, None] + np.zeros(3, np.float32)
+    level = np.arange(-offset, top + 1, dtype=np.float32)[None, :, None] + np.zeros(
+        3, np.float32
+    )
     signal, slope = relative_exposure(level, np.float32(0) if dark else None, sensor)
-    return np.ascontiguousarray(np.stack([signal[0], read_sigma(slope[0], sensor) ** 2], axis=-1)), offset
+    return np.ascontiguousarray(
+        np.stack([signal[0], read_sigma(slope[0], sensor) ** 2], axis=-1)
+    ), offset
 
 
-def frame_merger(dome: DomeRecord, camera: CameraRecord, digests: Digests | None = None) -> FrameMerger:
+def frame_merger(
+    dome: DomeRecord, camera: CameraRecord, digests: Digests | None = None
+) -> FrameMerger:
     """Read the dark frames of a camera and compute its vignette."""
     kind = camera.sensor.kind
     dark = None
@@ -114,11 +145,18 @@ def dark_frame_files(dome: DomeRecord) -> list[Path]:
 def _dark_files(dome: DomeRecord, camera: CameraRecord) -> list[Path]:
     if not dome.dark:
         return []
-    return [dome.folder / filled(dome.dark, exposure=e, camera=camera.id) for e in dome.exposures]
+    return [
+        dome.folder / filled(dome.dark, exposure=e, camera=camera.id)
+        for e in dome.exposures
+    ]
 
 
-def frame_mergers(dome: DomeRecord, faults: list[Fault], digests: Digests | None = None) -> dict[str, FrameMerger]:
-    """A frame merger for every camera; damaged dark frames are recorded in `faults` and replaced by the black level."""
+def frame_mergers(
+    dome: DomeRecord, faults: list[Fault], digests: Digests | None = None
+) -> dict[str, FrameMerger]:
+    """A frame merger for every camera; damaged dark frames are recorded in `faults` and
+    replaced by the black level.
+    """
     mergers = {}
     for camera in dome.cameras:
         try:
@@ -130,18 +168,30 @@ def frame_mergers(dome: DomeRecord, faults: list[Fault], digests: Digests | None
 
 
 def read_view(
-    dome: DomeRecord, light: str, camera: CameraRecord, *, white: bool = False, digests: Digests | None = None
+    dome: DomeRecord,
+    light: str,
+    camera: CameraRecord,
+    *,
+    white: bool = False,
+    digests: Digests | None = None,
 ) -> list[Frame]:
     """Decode the exposures of one light and camera."""
-    paths: list[Path] = [dome.frame(light, camera.id, exposure, white=white) for exposure in dome.exposures]
+    paths: list[Path] = [
+        dome.frame(light, camera.id, exposure, white=white)
+        for exposure in dome.exposures
+    ]
     return read_frames(paths, camera.sensor.kind, digests)
 
 
 def vignette_gain(camera: CameraRecord) -> Image:
-    """1 + a2 r^2 + a4 r^4 + a6 r^6 (h, w, 1), r from the principal point in half image diagonals."""
+    """1 + a2 r^2 + a4 r^4 + a6 r^6 (h, w, 1), r from the principal point in half image
+    diagonals.
+    """
     column = np.arange(camera.width) + 0.5 - camera.K[0, 2]
     row = np.arange(camera.height) + 0.5 - camera.K[1, 2]
-    r2 = (column**2 + row[:, None] ** 2) / (np.hypot(camera.width, camera.height) / 2) ** 2
+    r2 = (column**2 + row[:, None] ** 2) / (
+        np.hypot(camera.width, camera.height) / 2
+    ) ** 2
     a2, a4, a6 = camera.vignette
     return np.asarray(1 + r2 * (a2 + r2 * (a4 + r2 * a6)), np.float32)[..., None]
 
@@ -156,8 +206,9 @@ def merge_exposures(
 ) -> tuple[Image, Image, NDArray[np.uint8]]:
     """Merge several exposures to one radiance, each weighted by its inverse variance.
 
-    The variance is that of the expected signal, not of the measured value, as weights by noisy values would favour low
-    values. Exposures at the white level are excluded; dark ones are included, as their noise is known.
+    The variance is that of the expected signal, not of the measured value, as weights
+    by noisy values would favour low values. Exposures at the white level are excluded;
+    dark ones are included, as their noise is known.
 
     Parameters
     ----------
@@ -179,8 +230,8 @@ def merge_exposures(
     error : ndarray
         (h, w, 3) its standard error due to read noise, photons and quantisation.
     flag : ndarray
-        (h, w) OK, SATURATED (a channel in every exposure) or DARK (all channels at most black + 2 sigma in every
-        exposure).
+        (h, w) OK, SATURATED (a channel in every exposure) or DARK (all channels at most
+        black + 2 sigma in every exposure).
     """
     if sensor.kind.bits == 0:
         return _linear(frames)
@@ -189,7 +240,8 @@ def merge_exposures(
     time = np.zeros(shape, np.float32)
     signals = []
     flag_dark = np.ones(shape[:2], bool)
-    longest = max(seconds)  # times are relative to it: their squares stay within single precision
+    # times are relative to it: their squares stay within single precision
+    longest = max(seconds)
     for i, frame in enumerate(frames):
         black = dark[i] if dark is not None else None
         signal, slope = relative_exposure(frame, black, sensor)
@@ -202,16 +254,21 @@ def merge_exposures(
         expected = np.maximum(total / time, 0)
         radiance, error = _weighted(signals, expected, sensor)
     saturated = np.any(time == 0, axis=-1)
-    flag = np.where(saturated, SATURATED, np.where(flag_dark, DARK, OK)).astype(np.uint8)
+    flag = np.where(saturated, SATURATED, np.where(flag_dark, DARK, OK)).astype(
+        np.uint8
+    )
     gain = np.float32(longest) if vignette is None else vignette * np.float32(longest)
     return radiance / gain, error / gain, flag
 
 
-def usable_exposures(frames: Sequence[Frame], sensor: SensorRecord) -> NDArray[np.uint8]:
-    """Number of exposures (h, w) in which no channel is at the white level and one is above the dark level.
+def usable_exposures(
+    frames: Sequence[Frame], sensor: SensorRecord
+) -> NDArray[np.uint8]:
+    """Number of exposures (h, w) in which no channel is at the white level and one is
+    above the dark level.
 
-    A pixel with one such exposure has no second value that could confirm its radiance; one with none is saturated,
-    dark, or lies in a gap between the exposures.
+    A pixel with one such exposure has no second value that could confirm its radiance;
+    one with none is saturated, dark, or lies in a gap between the exposures.
     """
     count = np.zeros(frames[0].shape[:2], np.uint8)
     for frame in frames:
@@ -222,25 +279,38 @@ def usable_exposures(frames: Sequence[Frame], sensor: SensorRecord) -> NDArray[n
 
 
 def radiance_floor(sensor: SensorRecord, exposures: Mapping[str, float]) -> float:
-    """Standard deviation of merged radiance due to read noise and quantisation alone; 0 for linear files."""
+    """Standard deviation of merged radiance due to read noise and quantisation alone; 0
+    for linear files.
+    """
     if sensor.kind.bits == 0:
         return 0.0
-    _, slope = relative_exposure(np.full((1, 1, 3), sensor.black, np.uint16), None, sensor)
+    _, slope = relative_exposure(
+        np.full((1, 1, 3), sensor.black, np.uint16), None, sensor
+    )
     time = np.sqrt(sum(t * t for t in exposures.values()))
     return float(read_sigma(slope, sensor).mean() / time)
 
 
 def _linear(frames: list[Frame]) -> tuple[Image, Image, NDArray[np.uint8]]:
-    (radiance,) = (frame.astype(np.float32, copy=False) for frame in frames)  # a single one, as `read_dome` requires
+    # a single one, as `read_dome` requires
+    (radiance,) = (frame.astype(np.float32, copy=False) for frame in frames)
     lost: NDArray[np.bool_] = np.asarray(~np.isfinite(radiance).all(axis=-1))
     flag = np.where(lost, SATURATED, OK).astype(np.uint8)
-    return np.where(lost[..., None], np.float32(np.nan), radiance), np.zeros_like(radiance), flag
+    return (
+        np.where(lost[..., None], np.float32(np.nan), radiance),
+        np.zeros_like(radiance),
+        flag,
+    )
 
 
-def relative_exposure(frame: Frame, dark: Frame | np.float32 | None, sensor: SensorRecord) -> tuple[Image, Image]:
+def relative_exposure(
+    frame: Frame, dark: Frame | np.float32 | None, sensor: SensorRecord
+) -> tuple[Image, Image]:
     """Relative exposure (1 at the white level) and its slope per value of the file."""
     span = np.float32(sensor.white - sensor.black)
-    level = frame.astype(np.float32) - (np.float32(sensor.black) if dark is None else dark.astype(np.float32))
+    level = frame.astype(np.float32) - (
+        np.float32(sensor.black) if dark is None else dark.astype(np.float32)
+    )
     if sensor.response is None:
         return level / span, np.broadcast_to(1 / span, frame.shape)
     table = sensor.response
@@ -249,27 +319,40 @@ def relative_exposure(frame: Frame, dark: Frame | np.float32 | None, sensor: Sen
     slope = np.empty(frame.shape, np.float32)
     for c in range(3):
         rise = np.diff(table[:, c + 1]) / np.diff(table[:, 0])
-        cell = np.clip(np.searchsorted(table[:, 0], value[..., c], side="right") - 1, 0, len(rise) - 1)
+        cell = np.clip(
+            np.searchsorted(table[:, 0], value[..., c], side="right") - 1,
+            0,
+            len(rise) - 1,
+        )
         slope[..., c] = rise[cell]
-        # the first segment is extrapolated below black: clipping the noise would brighten dark pixels
-        signal[..., c] = table[cell, c + 1] + (value[..., c] - table[cell, 0]) * rise[cell]
+        # the first segment is extrapolated below black: clipping the noise would
+        # brighten dark pixels
+        signal[..., c] = (
+            table[cell, c + 1] + (value[..., c] - table[cell, 0]) * rise[cell]
+        )
     return signal, slope
 
 
 def read_sigma(slope: Image, sensor: SensorRecord) -> Image:
-    """Read noise and quantisation of a relative exposure; read noise arises before the response, quantisation after."""
+    """Read noise and quantisation of a relative exposure; read noise arises before the
+    response, quantisation after.
+    """
     steps = np.float32(sensor.step / np.sqrt(12)) * slope
     read = np.float32(sensor.read_noise / sensor.full_electrons)
     return np.asarray(np.sqrt(steps**2 + read**2), np.float32)
 
 
-def _weighted(signals: list[Any], expected: Image, sensor: SensorRecord) -> tuple[Image, Image]:
+def _weighted(
+    signals: list[Any], expected: Image, sensor: SensorRecord
+) -> tuple[Image, Image]:
     weighted = np.zeros_like(expected)
     weights = np.zeros_like(expected)
     for signal, slope, usable, seconds in signals:
         photons = expected * seconds / np.float32(sensor.full_electrons)
         variance = photons + read_sigma(slope, sensor) ** 2
-        weight = np.where(usable, seconds * seconds / np.maximum(variance, np.float32(1e-30)), 0)
+        weight = np.where(
+            usable, seconds * seconds / np.maximum(variance, np.float32(1e-30)), 0
+        )
         weighted += weight * np.where(usable, signal, 0) / seconds
         weights += weight
     return weighted / weights, np.asarray(1 / np.sqrt(weights), np.float32)

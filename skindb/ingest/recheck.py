@@ -1,4 +1,6 @@
-"""Decoding the frames of a folder that is refused, so that their faults are reported together with the others."""
+"""Decoding the frames of a folder that is refused, so that their faults are reported
+together with the others.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,9 @@ from skindb.ingest.devices import DomeRecord, ProbeRecord, promised_frames
 from skindb.ingest.frames import read_frame
 
 
-def decoding_faults(dome: DomeRecord | None, probe: ProbeRecord | None, known: Iterable[Fault]) -> list[Fault]:
+def decoding_faults(
+    dome: DomeRecord | None, probe: ProbeRecord | None, known: Iterable[Fault]
+) -> list[Fault]:
     """Faults of frames with valid headers, within the first `MAX_RECHECKED_BYTES` of files.
 
     Parameters
@@ -24,7 +28,9 @@ def decoding_faults(dome: DomeRecord | None, probe: ProbeRecord | None, known: I
         Faults found so far; the frames that they name are not decoded.
     """
     named = {fault.where.partition(" (")[0] for fault in known}
-    paths = [path for path in dict.fromkeys(_frames(dome, probe)) if str(path) not in named]
+    paths = [
+        path for path in dict.fromkeys(_frames(dome, probe)) if str(path) not in named
+    ]
     with ThreadPoolExecutor(thread_count()) as pool:
         return [fault for found in pool.map(_faults, _first(paths)) for fault in found]
 

@@ -13,20 +13,27 @@ from skindb.errors import Fault, InputError
 from skindb.ingest.response_samples import ResponseSamples, response_samples
 
 Array = NDArray[np.float64]
-# value at which the knots change from even steps to even ratios: below it sensors and encodings are nearly linear
+# value at which the knots change from even steps to even ratios: below it sensors and
+# encodings are nearly linear
 TOE = 0.02
-# least weight of bright values, whose noise is small; with the hat function alone, which is 0 at white, responses that
-# are steep there are 3 to 6 % off at 0.98 of the white level (benchmarks/responses.py), and 1 to 3 % with this. At 0.2
-# the published JPEG files agree less
+# least weight of bright values, whose noise is small; with the hat function alone,
+# which is 0 at white, responses that are steep there are 3 to 6 % off at 0.98 of the
+# white level (benchmarks/responses.py), and 1 to 3 % with this. At 0.2 the published
+# JPEG files agree less
 MIN_BRIGHT_WEIGHT = 0.1
-MAX_SAMPLE_RATIO = 4.0  # misfit relative to the median above which a sample is assumed to have moved
+# misfit relative to the median above which a sample is assumed to have moved
+MAX_SAMPLE_RATIO = 4.0
 ROUNDS = 3  # fits, each without the samples that moved according to the previous one
-# fits, each with means of blocks in the exposure of the previous one: a mean of values of a curved response is biased
-# by noise, 3 % at 1/512 of white in captures of a gamma response; a third changes nothing above 0.1 %
+# fits, each with means of blocks in the exposure of the previous one: a mean of values
+# of a curved response is biased by noise, 3 % at 1/512 of white in captures of a gamma
+# response; a third changes nothing above 0.1 %
 MEANS = 2
-MIN_SIGNAL_TO_NOISE = 2.0  # of a pixel, for means of exposures; 3 and 4 leave 2.2 and 2.8 % at 1/512 of white
+# of a pixel, for means of exposures; 3 and 4 leave 2.2 and 2.8 % at 1/512 of white
+MIN_SIGNAL_TO_NOISE = 2.0
 MEAN_ROWS = 4097  # of the preliminary response, which is interpolated at every pixel
-TABLE_ROWS = 1025  # of the CSV; between them the straight line differs from a gamma of 2.2 by less than 1e-6
+# of the CSV; between them the straight line differs from a gamma of 2.2 by less than
+# 1e-6
+TABLE_ROWS = 1025
 MIN_SAMPLES = 50  # with two usable exposures; fewer would not cover the range of values
 MIN_RISE = 1e-9  # relative exposure between rows of the table, which must increase
 
@@ -35,11 +42,12 @@ MIN_RISE = 1e-9  # relative exposure between rows of the table, which must incre
 class ResponseOptions:
     """Options for the fit of a response.
 
-    `smoothness` is the weight of the integral of the squared second derivative of ln(exposure / value) over the
-    coordinate of the knots, relative to the mean squared misfit. Its default was chosen
-    between 1e-11 and 1e-6 on simulated stacks of two, four and eight exposures and on one generated capture, all of
-    one gamma response; JPEG files in few exposures need more, about 1e-7. `knots` is the number of knots, `samples`
-    the number of blocks of `block` by `block` px.
+    `smoothness` is the weight of the integral of the squared second derivative of
+    ln(exposure / value) over the coordinate of the knots, relative to the mean squared
+    misfit. Its default was chosen between 1e-11 and 1e-6 on simulated stacks of two,
+    four and eight exposures and on one generated capture, all of one gamma response;
+    JPEG files in few exposures need more, about 1e-7. `knots` is the number of knots,
+    `samples` the number of blocks of `block` by `block` px.
     """
 
     smoothness: float = 1e-8
@@ -52,11 +60,12 @@ class ResponseOptions:
 class Response:
     """A response, and measures of its accuracy.
 
-    `table` (row, 4) holds the values of the file and the relative exposures of red, green and blue, from 0 at black
-    to 1 at white. `residual` (3,) is the root mean square of the misfit in natural logarithms, weighted as in the
-    fit. `covered` (3, 2) are the lowest and highest value (0 black, 1 white) of a sample; the response is
-    extrapolated beyond them. `samples` (3,) counts those that were used. `was_rising` (3,) is False where the fit
-    fell somewhere, and the table is its running maximum.
+    `table` (row, 4) holds the values of the file and the relative exposures of red,
+    green and blue, from 0 at black to 1 at white. `residual` (3,) is the root mean
+    square of the misfit in natural logarithms, weighted as in the fit. `covered` (3, 2)
+    are the lowest and highest value (0 black, 1 white) of a sample; the response is
+    extrapolated beyond them. `samples` (3,) counts those that were used. `was_rising`
+    (3,) is False where the fit fell somewhere, and the table is its running maximum.
     """
 
     table: Array
@@ -67,7 +76,9 @@ class Response:
 
     @property
     def nonlinearity(self) -> float:
-        """Largest difference of relative exposure from a linear response, which is small for a linear sensor."""
+        """Largest difference of relative exposure from a linear response, which is
+        small for a linear sensor.
+        """
         table = self.table
         value = (table[:, :1] - table[0, 0]) / (table[-1, 0] - table[0, 0])
         return float(np.abs(table[:, 1:] - value).max())
@@ -83,16 +94,19 @@ def recover_response(
 ) -> Response:
     """Relative exposure as a function of the value, per channel.
 
-    The method is that of Debevec and Malik (1997, eq. 3): ln f(value) = ln radiance + ln seconds for all samples, by
-    least squares with hat-shaped weights and a penalty on curvature. There are three differences. The unknowns are
-    values of ln f - ln value at knots that are even in arsinh(value / TOE), so that files of 16 bits need as many
-    unknowns as files of 8 bits, and linear and gamma responses have no penalty. The weights do not fall to 0 at white.
-    Samples are means of the exposure over flat blocks, and those that moved are excluded.
+    The method is that of Debevec and Malik (1997, eq. 3): ln f(value) = ln radiance +
+    ln seconds for all samples, by least squares with hat-shaped weights and a penalty
+    on curvature. There are three differences. The unknowns are values of ln f - ln
+    value at knots that are even in arsinh(value / TOE), so that files of 16 bits need
+    as many unknowns as files of 8 bits, and linear and gamma responses have no penalty.
+    The weights do not fall to 0 at white. Samples are means of the exposure over flat
+    blocks, and those that moved are excluded.
 
     Parameters
     ----------
     stack
-        (exposure, height, width, 3) values of the file; several views may be stacked along the height.
+        (exposure, height, width, 3) values of the file; several views may be stacked
+        along the height.
     seconds
         (exposure,) exposure times in s, at least two different ones.
     black, white
@@ -103,26 +117,56 @@ def recover_response(
     Raises
     ------
     InputError
-        The stack has a wrong shape or non-finite values, or too few pixels are usable in two exposures.
+        The stack has a wrong shape or non-finite values, or too few pixels are usable
+        in two exposures.
     """
     options = options or ResponseOptions()
     picked = [
-        response_samples(stack, seconds, channel=c, levels=(black, white), count=options.samples, block=options.block)
+        response_samples(
+            stack,
+            seconds,
+            channel=c,
+            levels=(black, white),
+            count=options.samples,
+            block=options.block,
+        )
         for c in range(3)
     ]
     few = [i for i, sample in enumerate(picked) if len(sample.value) < MIN_SAMPLES]
     if few:
-        found = ", ".join(f"{('red', 'green', 'blue')[i]} {len(picked[i].value)}" for i in few)
-        rule = f"at least {MIN_SAMPLES} blocks of pixels must be neither dark nor saturated in two exposures"
-        raise InputError(
-            Fault("the exposure stack", rule, found, "add exposures, or photograph a scene with more range")
+        found = ", ".join(
+            f"{('red', 'green', 'blue')[i]} {len(picked[i].value)}" for i in few
         )
-    return _response(picked, [_fit_channel(sample, options) for sample in picked], (black, white), options.knots)
+        rule = (
+            f"at least {MIN_SAMPLES} blocks of pixels must be neither dark nor "
+            "saturated in two exposures"
+        )
+        raise InputError(
+            Fault(
+                "the exposure stack",
+                rule,
+                found,
+                "add exposures, or photograph a scene with more range",
+            )
+        )
+    return _response(
+        picked,
+        [_fit_channel(sample, options) for sample in picked],
+        (black, white),
+        options.knots,
+    )
 
 
 def write_response(path: Path, response: Response) -> None:
     """Write the CSV `dn,r,g,b` of the capture format."""
-    np.savetxt(private_file(path), response.table, fmt="%.10g", delimiter=",", header="dn,r,g,b", comments="")
+    np.savetxt(
+        private_file(path),
+        response.table,
+        fmt="%.10g",
+        delimiter=",",
+        header="dn,r,g,b",
+        comments="",
+    )
 
 
 def _place(value: Array) -> Array:
@@ -132,27 +176,43 @@ def _place(value: Array) -> Array:
 
 def _curve(value: Array, log_ratio: Array, knots: int) -> Array:
     """Exposure (n,) of values (n,), up to a factor."""
-    return np.asarray(value * np.exp(np.interp(_place(value), np.linspace(0, 1, knots), log_ratio)))
+    return np.asarray(
+        value * np.exp(np.interp(_place(value), np.linspace(0, 1, knots), log_ratio))
+    )
 
 
 def _response(
-    picked: list[ResponseSamples], parts: list[tuple[Array, float, int]], levels: tuple[float, float], knots: int
+    picked: list[ResponseSamples],
+    parts: list[tuple[Array, float, int]],
+    levels: tuple[float, float],
+    knots: int,
 ) -> Response:
     """Table of the fitted curves, forced to rise from 0 at black to 1 at white."""
     value = np.linspace(0.0, 1.0, TABLE_ROWS)
     curves = [_curve(value, part[0], knots) for part in parts]
     rising = [bool((np.diff(curve) > 0).all()) for curve in curves]
-    curves = [np.maximum.accumulate(curve) + MIN_RISE * np.arange(TABLE_ROWS) for curve in curves]
+    curves = [
+        np.maximum.accumulate(curve) + MIN_RISE * np.arange(TABLE_ROWS)
+        for curve in curves
+    ]
     black, white = levels
-    table = np.column_stack([black + value * (white - black), *(curve / curve[-1] for curve in curves)])
-    covered = np.array([[s.value[s.usable].min(), s.value[s.usable].max()] for s in picked])
+    table = np.column_stack(
+        [black + value * (white - black), *(curve / curve[-1] for curve in curves)]
+    )
+    covered = np.array(
+        [[s.value[s.usable].min(), s.value[s.usable].max()] for s in picked]
+    )
     residual = np.array([p[1] for p in parts])
     counts = np.array([p[2] for p in parts], np.int64)
     return Response(table, residual, covered, counts, np.array(rising))
 
 
-def _fit_channel(samples: ResponseSamples, options: ResponseOptions) -> tuple[Array, float, int]:
-    """Log ratio of exposure to value at the knots, weighted residual, and number of samples that did not move."""
+def _fit_channel(
+    samples: ResponseSamples, options: ResponseOptions
+) -> tuple[Array, float, int]:
+    """Log ratio of exposure to value at the knots, weighted residual, and number of
+    samples that did not move.
+    """
     value = samples.value
     for _ in range(MEANS):
         solution, _, _ = _fit_values(samples, value, options)
@@ -161,20 +221,28 @@ def _fit_channel(samples: ResponseSamples, options: ResponseOptions) -> tuple[Ar
 
 
 def _mean_exposure_value(pixels: Array, log_ratio: Array, knots: int) -> Array:
-    """Value (sample, exposure) of the mean exposure of the pixels of each block, by a preliminary response.
+    """Value (sample, exposure) of the mean exposure of the pixels of each block, by a
+    preliminary response.
 
-    Blocks that are darker than their noise keep the mean of their values: their exposures are clipped at black.
+    Blocks that are darker than their noise keep the mean of their values: their
+    exposures are clipped at black.
     """
     grid = np.linspace(0.0, 1.0, MEAN_ROWS)
-    curve = np.maximum.accumulate(_curve(grid, log_ratio, knots)) + MIN_RISE * np.arange(MEAN_ROWS)
+    curve = np.maximum.accumulate(
+        _curve(grid, log_ratio, knots)
+    ) + MIN_RISE * np.arange(MEAN_ROWS)
     exposure = np.interp(pixels, grid, curve)
     mean = exposure.mean(axis=-1)
     noise = exposure.std(axis=-1)
     usable = mean > MIN_SIGNAL_TO_NOISE * noise
-    return np.asarray(np.where(usable, np.interp(mean, curve, grid), pixels.mean(axis=-1)))
+    return np.asarray(
+        np.where(usable, np.interp(mean, curve, grid), pixels.mean(axis=-1))
+    )
 
 
-def _fit_values(samples: ResponseSamples, value: Array, options: ResponseOptions) -> tuple[Array, float, int]:
+def _fit_values(
+    samples: ResponseSamples, value: Array, options: ResponseOptions
+) -> tuple[Array, float, int]:
     """The fit to given values (sample, exposure) of the samples."""
     kept = np.ones(len(value), bool)
     for _ in range(ROUNDS):
@@ -188,17 +256,26 @@ def _fit_values(samples: ResponseSamples, value: Array, options: ResponseOptions
 
 
 def _solve(
-    samples: ResponseSamples, value: Array, kept: NDArray[np.bool_], options: ResponseOptions
+    samples: ResponseSamples,
+    value: Array,
+    kept: NDArray[np.bool_],
+    options: ResponseOptions,
 ) -> tuple[Array, Array]:
-    """Log ratios (knot,) of the kept samples and weighted root mean square misfit (sample,) of all."""
+    """Log ratios (knot,) of the kept samples and weighted root mean square misfit
+    (sample,) of all.
+    """
     value = np.where(samples.usable, value, 0.5)
     hat = np.where(value < 0.5, value, np.maximum(1 - value, MIN_BRIGHT_WEIGHT))
     weight = np.where(samples.usable, hat, 0.0) ** 2
     position = _place(value) * (options.knots - 1)
     cell = np.minimum(position.astype(int), options.knots - 2)
     design = np.zeros((*value.shape, options.knots))
-    np.put_along_axis(design, cell[..., None], (cell + 1 - position)[..., None], axis=-1)
-    np.put_along_axis(design, cell[..., None] + 1, (position - cell)[..., None], axis=-1)
+    np.put_along_axis(
+        design, cell[..., None], (cell + 1 - position)[..., None], axis=-1
+    )
+    np.put_along_axis(
+        design, cell[..., None] + 1, (position - cell)[..., None], axis=-1
+    )
     target = np.log(samples.seconds) - np.log(value)
     # subtracting the weighted mean eliminates the unknown radiance of a sample
     total = weight.sum(axis=1, keepdims=True)
@@ -209,7 +286,8 @@ def _solve(
     heavy = weight[kept].ravel()[:, None]
     bend = np.diff(np.eye(options.knots), 2, axis=0)
     penalty = options.smoothness * (options.knots - 1) ** 3 * bend.T @ bend
-    anchor = np.eye(options.knots)[-1:]  # fixes the free factor of the curve: 1 at white
+    # fixes the free factor of the curve: 1 at white
+    anchor = np.eye(options.knots)[-1:]
     normal = rows.T @ (heavy * rows) / heavy.sum() + penalty + anchor.T @ anchor
     solution = np.linalg.solve(normal, rows.T @ (heavy[:, 0] * known) / heavy.sum())
     misfit = design @ solution - target

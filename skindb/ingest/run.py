@@ -23,7 +23,12 @@ from skindb.ingest.calibration_checks import calibration_faults, calibration_not
 from skindb.ingest.dark_pattern import dark_pattern_fault
 from skindb.ingest.devices import DomeRecord
 from skindb.ingest.folder import Capture
-from skindb.ingest.frame_checks import dark_faults, dark_notes, level_notes, repeated_frame_faults
+from skindb.ingest.frame_checks import (
+    dark_faults,
+    dark_notes,
+    level_notes,
+    repeated_frame_faults,
+)
 from skindb.ingest.frames import Digests
 from skindb.ingest.groups import (
     atlas_group,
@@ -47,14 +52,24 @@ from skindb.ingest.lumitexels import (
 )
 from skindb.ingest.probe import fibre_profiles
 from skindb.ingest.probe_notes import isotropy_p_values, probe_notes
-from skindb.ingest.provenance import capture_provenance, frame_marks, require_fit_consent, samples_digest
+from skindb.ingest.provenance import (
+    capture_provenance,
+    frame_marks,
+    require_fit_consent,
+    samples_digest,
+)
 from skindb.ingest.radiance import dark_frame_files, frame_mergers
 from skindb.ingest.refine import applied_rotations, refine_cameras
 from skindb.ingest.report import describe_samples
 from skindb.ingest.sample_checks import intensity_faults, light_notes, sample_faults
 from skindb.ingest.spool import Spool
 from skindb.ingest.surfels import SurfelSet, build_surfels, site_positions
-from skindb.ingest.visibility import Method, camera_visibility, coarse_maps, light_visibility
+from skindb.ingest.visibility import (
+    Method,
+    camera_visibility,
+    coarse_maps,
+    light_visibility,
+)
 
 T = TypeVar("T")
 OnContradiction = Literal["refuse", "note"]
@@ -71,19 +86,24 @@ class IngestParameters:
     Parameters
     ----------
     spacing_mm
-        Target distance of neighbouring surfels, which subdivision reaches within a factor of sqrt 2.
+        Target distance of neighbouring surfels, which subdivision reaches within a
+        factor of sqrt 2.
     photographs
         Number of merged photographs kept for comparisons.
     soft
-        Samples at the soft edges of shadows: excluded, or kept and divided by the visible fraction of the light.
+        Samples at the soft edges of shadows: excluded, or kept and divided by the
+        visible fraction of the light.
     footprint
-        Whether samples are means over the surfel's splat (elliptical weighted average) or interpolated bilinearly.
+        Whether samples are means over the surfel's splat (elliptical weighted average)
+        or interpolated bilinearly.
     visibility
         Method for the visibility of surfels: "rays", or "splats" as in the paper.
     calibration
-        What to do with a capture whose photographs contradict its calibration: refuse it, or record a warning.
+        What to do with a capture whose photographs contradict its calibration: refuse
+        it, or record a warning.
     refine
-        Whether cameras are first rotated so that their photographs show the face at the scan, see `refine_cameras`.
+        Whether cameras are first rotated so that their photographs show the face at the
+        scan, see `refine_cameras`.
     """
 
     spacing_mm: float = 1.5
@@ -103,7 +123,8 @@ def ingest_capture(
     scratch: str | Path,
     progress: Progress | None = None,
 ) -> Iterator[xr.DataTree]:
-    """Turn a capture folder into a DataTree of kind "capture": samples of light at surfels of the scan.
+    """Turn a capture folder into a DataTree of kind "capture": samples of light at
+    surfels of the scan.
 
     Parameters
     ----------
@@ -112,8 +133,9 @@ def ingest_capture(
     parameters
         Default `IngestParameters()`.
     scratch
-        Folder in which the subfolder `scratch_name` holds the samples until they are stored. A run after a killed one
-        resumes from this subfolder; a run that ends removes the subfolder and nothing else.
+        Folder in which the subfolder `scratch_name` holds the samples until they are
+        stored. A run after a killed one resumes from this subfolder; a run that ends
+        removes the subfolder and nothing else.
     progress
         Called with the stage, the number of finished steps and the total number of steps.
 
@@ -129,7 +151,8 @@ def ingest_capture(
 
     Examples
     --------
-    >>> with ingest_capture(read_capture("captures/S01"), scratch="scratch") as tree:  # doctest: +SKIP
+    >>> capture = read_capture("captures/S01")  # doctest: +SKIP
+    >>> with ingest_capture(capture, scratch="scratch") as tree:  # doctest: +SKIP
     ...     model = skindb.fit.fit_model(tree)
     """
     report = progress or silent
@@ -155,26 +178,46 @@ def ingest_capture(
             groups["surfels"] = surfel_group(surfels)
         else:
             folder = Path(scratch) / scratch_name(capture, asked)
-            spool = stack.enter_context(_spool(folder, capture, len(surfels.position), asked))
-            pool = stack.enter_context(ThreadPoolExecutor(threads(capture.dome)))  # ends before the spool does
-            made, summary = _dome_groups(Plan(capture.dome, surfels, asked), faults, digests, spool, pool, report)
+            spool = stack.enter_context(
+                _spool(folder, capture, len(surfels.position), asked)
+            )
+            # ends before the spool does
+            pool = stack.enter_context(ThreadPoolExecutor(threads(capture.dome)))
+            made, summary = _dome_groups(
+                Plan(capture.dome, surfels, asked), faults, digests, spool, pool, report
+            )
             groups |= made
             if made and capture.dome.sequence is not None:
                 groups["sequence"] = sequence_group(capture.dome.sequence, capture.dome)
             digests |= {Path(path): digest for path, digest in spool.digests.items()}
-        faults += repeated_frame_faults(capture.folder, digests, besides=_copies(capture))
+        faults += repeated_frame_faults(
+            capture.folder, digests, besides=_copies(capture)
+        )
         if faults:
             raise InputError(grouped(faults))
-        summary |= {"surfels": {"count": len(surfels.position), "spacing_mm": surfels.spacing()}}
-        summary["notes"] = [*summary.get("notes", []), *_spacing_notes(surfels, asked.spacing_mm), *touched]
+        summary |= {
+            "surfels": {"count": len(surfels.position), "spacing_mm": surfels.spacing()}
+        }
+        summary["notes"] = [
+            *summary.get("notes", []),
+            *_spacing_notes(surfels, asked.spacing_mm),
+            *touched,
+        ]
         tree = xr.DataTree.from_dict(groups)
-        tree.attrs = capture_provenance(capture, asdict(asked), digests) | {"summary": summary, "take": capture.take}
-        stack.enter_context(dask.config.set(scheduler="threads", num_workers=threads(capture.dome)))
+        tree.attrs = capture_provenance(capture, asdict(asked), digests) | {
+            "summary": summary,
+            "take": capture.take,
+        }
+        stack.enter_context(
+            dask.config.set(scheduler="threads", num_workers=threads(capture.dome))
+        )
         yield tree
 
 
 def _copies(capture: Capture) -> list[Path]:
-    """Frames that may be copies of each other: dark frames, and those of the probe of a rehearsal."""
+    """Frames that may be copies of each other: dark frames, and those of the probe of a
+    rehearsal.
+    """
     dark = [] if capture.dome is None else dark_frame_files(capture.dome)
     if capture.probe is None or capture.attributes.get("virtual") is not True:
         return dark
@@ -183,25 +226,34 @@ def _copies(capture: Capture) -> list[Path]:
 
 def scratch_name(capture: Capture, parameters: IngestParameters | None = None) -> str:
     """Name of the scratch folder, unique to the capture and the parameters of its ingest."""
-    return f"{capture.take}-{samples_digest(capture, asdict(parameters or IngestParameters()))[:16]}"
+    digest = samples_digest(capture, asdict(parameters or IngestParameters()))
+    return f"{capture.take}-{digest[:16]}"
 
 
 def _spacing_notes(surfels: SurfelSet, wanted: float) -> list[str]:
-    """Warning if the spacing of the scan does not allow the target spacing within a factor of sqrt 2."""
+    """Warning if the spacing of the scan does not allow the target spacing within a
+    factor of sqrt 2.
+    """
     found = surfels.spacing()
-    said = f"the points of the scan are {found:.2g} mm apart; a wider spacing leaves the scan unchanged"
+    said = (
+        f"the points of the scan are {found:.2g} mm apart; a wider spacing leaves the "
+        "scan unchanged"
+    )
     return [said] if wanted > 1.5 * found else []
 
 
 def threads(dome: DomeRecord | None) -> int:
-    """Number of threads that decode, trace and write: one per core, limited by memory; they release the GIL.
+    """Number of threads that decode, trace and write: one per core, limited by memory;
+    they release the GIL.
 
-    Each holds the exposures of a view and intermediate arrays: measured 22 to 28 bytes per pixel for two exposures,
-    0.3 GB at 12 megapixels; the estimate uses 32.
+    Each holds the exposures of a view and intermediate arrays: measured 22 to 28 bytes
+    per pixel for two exposures, 0.3 GB at 12 megapixels; the estimate uses 32.
     """
     if dome is None:
         return MIN_THREADS
-    one = max(camera.width * camera.height for camera in dome.cameras) * (16 + 8 * len(dome.exposures))
+    one = max(camera.width * camera.height for camera in dome.cameras) * (
+        16 + 8 * len(dome.exposures)
+    )
     return max(min(thread_count(), MAX_THREADS, MAX_BYTES // one), MIN_THREADS)
 
 
@@ -214,54 +266,105 @@ class Plan:
     asked: IngestParameters
 
 
-def _spool(folder: Path, capture: Capture, surfels: int, parameters: IngestParameters) -> Spool:
+def _spool(
+    folder: Path, capture: Capture, surfels: int, parameters: IngestParameters
+) -> Spool:
     """The spool of this capture and these parameters, new or left by a run that was killed."""
     assert capture.dome is not None
     shape = (len(capture.dome.lights), len(capture.dome.cameras), surfels)
-    return Spool(folder, shape, frame_marks(capture.dome), key=samples_digest(capture, asdict(parameters)))
+    return Spool(
+        folder,
+        shape,
+        frame_marks(capture.dome),
+        key=samples_digest(capture, asdict(parameters)),
+    )
 
 
 def _dome_groups(
-    plan: Plan, faults: list[Fault], digests: Digests, spool: Spool, pool: Executor, report: Progress
+    plan: Plan,
+    faults: list[Fault],
+    digests: Digests,
+    spool: Spool,
+    pool: Executor,
+    report: Progress,
 ) -> tuple[dict[str, xr.Dataset], dict[str, Any]]:
-    """Groups surfels, samples, dome and photographs, and their summary; both empty if faults were found."""
+    """Groups surfels, samples, dome and photographs, and their summary; both empty if
+    faults were found.
+    """
     dome = plan.dome
     surfels = plan.surfels
     mergers = frame_mergers(dome, faults, digests)
-    faults += [fault for merger in mergers.values() for fault in dark_faults(dome, merger)]
+    faults += [
+        fault for merger in mergers.values() for fault in dark_faults(dome, merger)
+    ]
     if not faults:
-        patterns = _attempt(faults, lambda: [*pool.map(lambda name: dark_pattern_fault(dome, name, mergers), mergers)])
+        patterns = _attempt(
+            faults,
+            lambda: [
+                *pool.map(lambda name: dark_pattern_fault(dome, name, mergers), mergers)
+            ],
+        )
         faults += [fault for fault in patterns or [] if fault is not None]
-    intensity = _attempt(faults, lambda: light_intensities(dome, mergers, pool, digests))
+    intensity = _attempt(
+        faults, lambda: light_intensities(dome, mergers, pool, digests)
+    )
     if judged := intensity is not None:
         faults += intensity_faults(dome, intensity)
     else:  # continue, to find damaged frames of the face in the same run
         intensity = np.ones((len(dome.lights), 3))
     report("lights", 1, 1)
     scene = RayScene(surfels.position, surfels.faces)
-    light_fraction = light_visibility(surfels, dome.lights, scene, pool, method=plan.asked.visibility)
-    sees = partial(camera_visibility, surfels, scene=scene, pool=pool, method=plan.asked.visibility)
+    light_fraction = light_visibility(
+        surfels, dome.lights, scene, pool, method=plan.asked.visibility
+    )
+    sees = partial(
+        camera_visibility, surfels, scene=scene, pool=pool, method=plan.asked.visibility
+    )
     camera_share, clear, pixels = sees(dome.cameras)
     report("visibility", 1, 1)
     given = dome
     if plan.asked.refine and not faults:
-        check = CalibrationCheck(dome, surfels, light_fraction, clear, pixels, intensity)
+        check = CalibrationCheck(
+            dome, surfels, light_fraction, clear, pixels, intensity
+        )
         pictures = _attempt(faults, lambda: checked_pictures(check, mergers, pool=pool))
         if pictures is None:
             return {}, {}
         dome = refine_cameras(check, pictures)
         camera_share, clear, pixels = sees(dome.cameras)
         report("refine", 1, 1)
-    kept = choose_photographs(dome, surfels.position.mean(axis=0), plan.asked.photographs)
+    kept = choose_photographs(
+        dome, surfels.position.mean(axis=0), plan.asked.photographs
+    )
     lit = fully_lit(surfels, light_fraction, dome.cameras, soft=plan.asked.soft)
     divisor = light_fraction if plan.asked.soft == "keep" else None
-    views = Views(surfels, lit, clear, pixels, light_fraction=divisor, footprint=plan.asked.footprint)
+    views = Views(
+        surfels,
+        lit,
+        clear,
+        pixels,
+        light_fraction=divisor,
+        footprint=plan.asked.footprint,
+    )
     refuse = plan.asked.calibration == "refuse"
-    final = None if faults else CalibrationCheck(dome, surfels, light_fraction, clear, pixels, intensity)
+    final = (
+        None
+        if faults
+        else CalibrationCheck(dome, surfels, light_fraction, clear, pixels, intensity)
+    )
     found = _attempt(
         faults,
         lambda: sample_lumitexels(
-            dome, intensity, views, mergers, spool, kept=kept, check=final, refuse=refuse, pool=pool, progress=report
+            dome,
+            intensity,
+            views,
+            mergers,
+            spool,
+            kept=kept,
+            check=final,
+            refuse=refuse,
+            pool=pool,
+            progress=report,
         ),
     )
     if found is None:
@@ -286,8 +389,11 @@ def _dome_groups(
     if plan.asked.visibility == "splats":
         notes += coarse_maps(surfels, dome.lights, dome.cameras)
     if found.calibration is not None:
-        groups["calibration"] = calibration_group(dome, found.calibration, applied_rotations(given, dome))
-        notes += [str(fault) for fault in calibration_faults(dome, found.calibration)]  # empty if refused
+        groups["calibration"] = calibration_group(
+            dome, found.calibration, applied_rotations(given, dome)
+        )
+        # empty if refused
+        notes += [str(fault) for fault in calibration_faults(dome, found.calibration)]
         notes += calibration_notes(dome, found.calibration)
     return groups, {"samples": describe_samples(found, surfels, dome), "notes": notes}
 

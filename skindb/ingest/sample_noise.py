@@ -1,4 +1,6 @@
-"""Noise of the samples due to photons, read noise and quantisation of merged exposures (Janesick 2007)."""
+"""Noise of the samples due to photons, read noise and quantisation of merged exposures
+(Janesick 2007).
+"""
 
 from __future__ import annotations
 
@@ -12,22 +14,26 @@ from skindb.ingest.devices import CameraRecord, DomeRecord
 from skindb.ingest.radiance import read_sigma, vignette_gain
 
 Array = NDArray[np.float64]
-RADIANCES = 64  # number of radiances up to the white level at which the linear model is fitted to the variance
+# number of radiances up to the white level at which the linear model is fitted to the
+# variance
+RADIANCES = 64
 
 
 @dataclass(frozen=True)
 class SampleNoise:
     """Noise model of the samples; exposures are ordered from the longest to the shortest.
 
-    Radiance up to `limit` is below the white level in an exposure and in all shorter ones. The radiance of a pixel that
-    is merged from them has the variance read_variance + shot_variance * radiance, and a sample has that variance over
-    its effective pixels.
+    Radiance up to `limit` is below the white level in an exposure and in all shorter
+    ones. The radiance of a pixel that is merged from them has the variance
+    read_variance + shot_variance * radiance, and a sample has that variance over its
+    effective pixels.
     """
 
     limit: Array  # (camera, 3, exposure) radiance
     read_variance: Array  # (camera, 3, exposure) radiance^2
     shot_variance: Array  # (camera, 3, exposure) radiance
-    effective_pixels: NDArray[np.float32]  # (n, camera); NaN where the camera takes no sample
+    # (n, camera); NaN where the camera takes no sample
+    effective_pixels: NDArray[np.float32]
 
 
 def sample_noise(
@@ -50,17 +56,23 @@ def sample_noise(
     parts = []
     for c, camera in enumerate(dome.cameras):
         seen = np.isfinite(effective_pixels[:, c])
-        parts.append(radiance_noise(camera, seconds, _mean_gain(camera, pixels[seen, c])))
+        parts.append(
+            radiance_noise(camera, seconds, _mean_gain(camera, pixels[seen, c]))
+        )
     limit, read, shot = (np.stack(part) for part in zip(*parts, strict=True))
     return SampleNoise(limit, read, shot, effective_pixels)
 
 
-def radiance_noise(camera: CameraRecord, seconds: Sequence[float] | Array, gain: float) -> tuple[Array, Array, Array]:
-    """Limit, read variance and shot variance (3, exposure) of merged radiance for a given gain of the lens.
+def radiance_noise(
+    camera: CameraRecord, seconds: Sequence[float] | Array, gain: float
+) -> tuple[Array, Array, Array]:
+    """Limit, read variance and shot variance (3, exposure) of merged radiance for a
+    given gain of the lens.
 
-    Exposures are merged with weights of inverse variance: the variance is 1 / sum of seconds^2 / (photons + read
-    noise). A straight line, fitted with relative errors, is exact for one exposure, and accurate to 3 % for two
-    exposures with a ratio of eight (5 % for eight exposures). A nonlinear response is replaced by its mean slope, and
+    Exposures are merged with weights of inverse variance: the variance is 1 / sum of
+    seconds^2 / (photons + read noise). A straight line, fitted with relative errors, is
+    exact for one exposure, and accurate to 3 % for two exposures with a ratio of eight
+    (5 % for eight exposures). A nonlinear response is replaced by its mean slope, and
     the colour matrix is applied to grey light.
 
     Parameters
@@ -77,7 +89,10 @@ def radiance_noise(camera: CameraRecord, seconds: Sequence[float] | Array, gain:
     per_value = np.asarray([1 / (sensor.white - sensor.black)], np.float32)
     read = float(read_sigma(per_value, sensor)[0]) ** 2
     # an exposure is the longest usable one where all longer ones are saturated
-    lines = [_line(time[first:] * gain, read, 1 / sensor.full_electrons) for first in range(len(time))]
+    lines = [
+        _line(time[first:] * gain, read, 1 / sensor.full_electrons)
+        for first in range(len(time))
+    ]
     mixed = np.square(camera.colour_matrix).sum(axis=1)[:, None]
     offset, slope = np.array(lines).T
     return np.tile(1 / (time * gain), (3, 1)), mixed * offset, mixed * slope
@@ -85,8 +100,11 @@ def radiance_noise(camera: CameraRecord, seconds: Sequence[float] | Array, gain:
 
 def _line(seconds: Array, read: float, photon: float) -> tuple[float, float]:
     """Offset and slope of the variance over radiance, from noise of relative exposures."""
-    radiance = np.geomspace(read / photon / 10, 1.0, RADIANCES) / seconds[0]  # begins where read noise dominates
-    variance = 1 / (seconds**2 / (photon * radiance[:, None] * seconds + read)).sum(axis=1)
+    # begins where read noise dominates
+    radiance = np.geomspace(read / photon / 10, 1.0, RADIANCES) / seconds[0]
+    variance = 1 / (seconds**2 / (photon * radiance[:, None] * seconds + read)).sum(
+        axis=1
+    )
     design = np.stack([np.ones_like(radiance), radiance], axis=1) / variance[:, None]
     offset, slope = np.linalg.lstsq(design, np.ones(RADIANCES))[0]
     return float(offset), float(slope)

@@ -1,4 +1,6 @@
-"""Temporary file for the samples before they are stored; after a killed ingest, the next run resumes from it."""
+"""Temporary file for the samples before they are stored; after a killed ingest, the
+next run resumes from it.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,8 @@ from skindb.errors import Fault, InputError
 from skindb.ingest._sample_kernels import tally
 from skindb.schema.blocks import SHARD
 
-JOURNAL_INTERVAL_SECONDS = 5.0  # between two entries of the journal: the most that a killed run loses
+# between two entries of the journal: the most that a killed run loses
+JOURNAL_INTERVAL_SECONDS = 5.0
 STALE_SECONDS = RESUMABLE_SECONDS  # after which a spool that no run resumed is removed
 REMOVED_SUFFIX = ".gone"  # of the folder of a spool that is being removed
 JOURNAL = "journal"
@@ -37,16 +40,19 @@ STATES = 4  # usable, saturated, dark, and usable from a single exposure
 
 
 class Spool:
-    """Samples of n surfels by view (light, camera), written in any order by several threads, and their counts.
+    """Samples of n surfels by view (light, camera), written in any order by several
+    threads, and their counts.
 
-    The file holds (light, camera, channel, surfel) half floats. It is written, not memory-mapped, as mapped pages would
-    count as memory of the process. Its journal lists the views that are on disk, with their counts and the digests of
-    their frames; later views are computed again.
+    The file holds (light, camera, channel, surfel) half floats. It is written, not
+    memory-mapped, as mapped pages would count as memory of the process. Its journal
+    lists the views that are on disk, with their counts and the digests of their frames;
+    later views are computed again.
 
     Parameters
     ----------
     folder
-        Folder for this spool alone; its name must contain a digest of everything the samples depend on.
+        Folder for this spool alone; its name must contain a digest of everything the
+        samples depend on.
     shape
         Numbers of lights, cameras and surfels.
     frames
@@ -55,14 +61,22 @@ class Spool:
         Identifies the run: files in the folder with a digest of another key are ignored.
     """
 
-    def __init__(self, folder: Path, shape: tuple[int, int, int], frames: Mapping[str, Any], *, key: str) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        shape: tuple[int, int, int],
+        frames: Mapping[str, Any],
+        *,
+        key: str,
+    ) -> None:
         lights, cameras, surfels = shape
         self.folder = folder
         self.shape = shape
         self._frames = dict(frames)
         self._key = key.encode()
         self.done = np.zeros((lights, cameras), bool)
-        self.views = np.zeros((lights, cameras), np.int64)  # number of samples of each view
+        # number of samples of each view
+        self.views = np.zeros((lights, cameras), np.int64)
         self.counts = np.zeros((STATES, surfels), np.int32)
         self.digests: dict[str, str] = {}
         self._guard = threading.Lock()
@@ -73,9 +87,14 @@ class Spool:
     def __enter__(self) -> Self:
         self._lock = _locked(self.folder)
         try:
-            self._file = os.open(self.folder / "samples", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, PRIVATE_FILE)
+            self._file = os.open(
+                self.folder / "samples",
+                os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW,
+                PRIVATE_FILE,
+            )
             size = 6 * int(np.prod(self.shape))
-            whole = os.fstat(self._file).st_size == size  # otherwise it is new, and its journal is invalid
+            # otherwise it is new, and its journal is invalid
+            whole = os.fstat(self._file).st_size == size
             os.ftruncate(self._file, size)
             self._resume(whole=whole)
         except BaseException:
@@ -84,13 +103,17 @@ class Spool:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         try:
             if kind is None or not self.done.any():
                 _remove(self.folder)
             else:
-                with suppress(OSError):  # a full disk: the error that is being raised reports it
+                # a full disk: the error that is being raised reports it
+                with suppress(OSError):
                     self.checkpoint()
         finally:
             self._close()
@@ -103,7 +126,9 @@ class Spool:
         outcome: NDArray[np.uint8],
         digests: Mapping[str, str],
     ) -> None:
-        """Keep a view: (3, n) bits of half floats, the outcome for each surfel, and the digests of its frames."""
+        """Keep a view: (3, n) bits of half floats, the outcome for each surfel, and the
+        digests of its frames.
+        """
         self._write(light, camera, samples)
         with self._guard:
             self.views[light, camera] = tally(outcome, self.counts)
@@ -129,10 +154,19 @@ class Spool:
         with self._turn:  # otherwise an older entry could replace a newer one
             with self._guard:
                 self._written = time.monotonic()
-                state = np.array(json.dumps({"frames": self._frames, "digests": self.digests}))
+                state = np.array(
+                    json.dumps({"frames": self._frames, "digests": self.digests})
+                )
                 content = io.BytesIO()
-                np.savez(content, done=self.done, views=self.views, counts=self.counts, state=state)
-            os.fsync(self._file)  # the samples first: the journal must not list views that are not on disk
+                np.savez(
+                    content,
+                    done=self.done,
+                    views=self.views,
+                    counts=self.counts,
+                    state=state,
+                )
+            # the samples first: the journal must not list views that are not on disk
+            os.fsync(self._file)
             self._replace(JOURNAL, content.getvalue())
 
     def samples(self) -> da.Array:
@@ -166,8 +200,13 @@ class Spool:
         rows = np.empty((3, cameras, lights, end - begin), np.float16)
         for i, (light, camera, channel) in enumerate(np.ndindex(lights, cameras, 3)):
             row = rows[channel, camera, light]
-            if os.preadv(self._file, [row.data.cast("B")], 2 * (i * n + begin)) != row.nbytes:
-                raise OSError(errno.EIO, "samples are truncated", str(self.folder / "samples"))
+            if (
+                os.preadv(self._file, [row.data.cast("B")], 2 * (i * n + begin))
+                != row.nbytes
+            ):
+                raise OSError(
+                    errno.EIO, "samples are truncated", str(self.folder / "samples")
+                )
         return rows.transpose()
 
     def _resume(self, *, whole: bool) -> None:
@@ -176,22 +215,36 @@ class Spool:
         if content is not None:
             with np.load(content) as journal:
                 state = json.loads(str(journal["state"]))
-                same = journal["counts"].shape == self.counts.shape  # otherwise an earlier version of skindb wrote it
-                if whole and same and state["frames"] == json.loads(json.dumps(self._frames)):
-                    self.done, self.views, self.counts = (journal[name] for name in ("done", "views", "counts"))
+                # otherwise an earlier version of skindb wrote it
+                same = journal["counts"].shape == self.counts.shape
+                if (
+                    whole
+                    and same
+                    and state["frames"] == json.loads(json.dumps(self._frames))
+                ):
+                    self.done, self.views, self.counts = (
+                        journal[name] for name in ("done", "views", "counts")
+                    )
                     self.digests |= state["digests"]
                     return
-        # before the first sample is overwritten, as a later run with the old frames would trust the journal
+        # before the first sample is overwritten, as a later run with the old frames
+        # would trust the journal
         (self.folder / JOURNAL).unlink(missing_ok=True)
 
     def _sealed(self, name: str) -> io.BytesIO | None:
-        """Content that `_replace` wrote under a name; None if it is absent, damaged, or of another run."""
+        """Content that `_replace` wrote under a name; None if it is absent, damaged, or
+        of another run.
+        """
         path = self.folder / name
         if path.is_symlink() or not path.is_file():
             return None
         seal = path.read_bytes()[:SEAL_BYTES]
         content = path.read_bytes()[SEAL_BYTES:]
-        return io.BytesIO(content) if hmac.compare_digest(seal, self._seal(name, content)) else None
+        return (
+            io.BytesIO(content)
+            if hmac.compare_digest(seal, self._seal(name, content))
+            else None
+        )
 
     def _seal(self, name: str, content: bytes) -> bytes:
         return hmac.digest(self._key, name.encode() + b"\0" + content, "sha256")
@@ -212,16 +265,19 @@ class Spool:
 
 
 def remove_stale(own: Path) -> None:
-    """Remove spools beside this one that are unchanged for a day, and those whose removal was interrupted.
+    """Remove spools beside this one that are unchanged for a day, and those whose
+    removal was interrupted.
 
     Only for a folder that contains nothing but spools, such as the folder tmp of a database.
     """
     for folder in own.parent.iterdir() if own.parent.is_dir() else ():
         if folder == own or not (
-            folder.name.endswith(REMOVED_SUFFIX) or time.time() - _touched(folder) > STALE_SECONDS
+            folder.name.endswith(REMOVED_SUFFIX)
+            or time.time() - _touched(folder) > STALE_SECONDS
         ):
             continue
-        with suppress(InputError, OSError):  # in use, or removed by another process at this moment
+        # in use, or removed by another process at this moment
+        with suppress(InputError, OSError):
             lock = _locked(folder, new=False)
             try:
                 _remove(folder)
@@ -239,15 +295,22 @@ def _touched(folder: Path) -> float:
 
 
 def _remove(folder: Path) -> None:
-    """Remove a spool, renaming it first: after a kill, no run finds a journal without its samples."""
-    gone = folder if folder.name.endswith(REMOVED_SUFFIX) else folder.with_name(f"{uuid.uuid4().hex}{REMOVED_SUFFIX}")
+    """Remove a spool, renaming it first: after a kill, no run finds a journal without
+    its samples.
+    """
+    gone = (
+        folder
+        if folder.name.endswith(REMOVED_SUFFIX)
+        else folder.with_name(f"{uuid.uuid4().hex}{REMOVED_SUFFIX}")
+    )
     with suppress(OSError):  # the next call tries again
         folder.rename(gone)
     shutil.rmtree(gone, ignore_errors=True)
 
 
 def _locked(folder: Path, *, new: bool = True) -> int:
-    """Descriptor of the lock of a folder, created if `new`; the system releases it when the process ends.
+    """Descriptor of the lock of a folder, created if `new`; the system releases it when
+    the process ends.
 
     Raises
     ------
@@ -257,7 +320,9 @@ def _locked(folder: Path, *, new: bool = True) -> int:
     while True:
         if new:
             make_private(folder)
-        lock = os.open(folder / "lock", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, PRIVATE_FILE)
+        lock = os.open(
+            folder / "lock", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, PRIVATE_FILE
+        )
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if os.path.samestat(os.fstat(lock), (folder / "lock").stat()):
@@ -267,7 +332,14 @@ def _locked(folder: Path, *, new: bool = True) -> int:
         except BlockingIOError:
             os.close(lock)
             cure = "wait until the other one has ended"
-            raise InputError(Fault(str(folder), "one process ingests a capture", "another one does", cure)) from None
+            raise InputError(
+                Fault(
+                    str(folder),
+                    "one process ingests a capture",
+                    "another one does",
+                    cure,
+                )
+            ) from None
         except OSError:
             os.close(lock)
             raise

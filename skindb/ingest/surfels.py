@@ -1,4 +1,6 @@
-"""From the scan to surfels: subdivision, Morton order, normals, areas, texture coordinates, regions."""
+"""From the scan to surfels: subdivision, Morton order, normals, areas, texture
+coordinates, regions.
+"""
 
 from __future__ import annotations
 
@@ -13,13 +15,19 @@ from skindb.geometry.atlas import disc_atlas
 from skindb.geometry.clean import CleanMesh
 from skindb.geometry.nearest import closest_on_mesh
 from skindb.geometry.subdivide import carry_points, subdivide
-from skindb.geometry.surfels import morton_order, splat_radius, vertex_areas, vertex_normals
+from skindb.geometry.surfels import (
+    morton_order,
+    splat_radius,
+    vertex_areas,
+    vertex_normals,
+)
 from skindb.ingest.folder import Capture
 from skindb.ingest.scan_checks import LANDMARK_REACH, SITE_LANDMARK
 
 Array = NDArray[np.float64]
 MAX_SURFELS = 2_500_000  # the samples of this many surfels in a full dome take 36 GB
-# mm; a landmark that is farther from the cropped than from the complete scan by this distance was cropped away
+# mm; a landmark that is farther from the cropped than from the complete scan by this
+# distance was cropped away
 CROPPED_LANDMARK_MM = 0.5
 NECK_STRIP_HALF_WIDTH_MM = 15.0  # mm; half width of the strip at the front of the neck
 
@@ -49,7 +57,9 @@ def lattice_spacing(area: float) -> float:
 
 
 def build_surfels(capture: Capture, *, spacing_mm: float) -> SurfelSet:
-    """Surfels about `spacing_mm` apart, within a factor of sqrt 2, as each level of subdivision halves the spacing."""
+    """Surfels about `spacing_mm` apart, within a factor of sqrt 2, as each level of
+    subdivision halves the spacing.
+    """
     mesh = capture.surface
     levels = subdivision_levels(mesh, spacing_mm)
     vertices, faces, matrix = subdivide(mesh.vertices, mesh.faces, levels)
@@ -72,7 +82,8 @@ def build_surfels(capture: Capture, *, spacing_mm: float) -> SurfelSet:
 
 
 def subdivision_levels(mesh: CleanMesh, spacing_mm: float) -> int:
-    """Number of levels after which the spacing, of an even triangular lattice, is closest to the target.
+    """Number of levels after which the spacing, of an even triangular lattice, is
+    closest to the target.
 
     Raises
     ------
@@ -90,16 +101,24 @@ def subdivision_levels(mesh: CleanMesh, spacing_mm: float) -> int:
         raise InputError(Fault("scan", rule, found, "decimate the scan, or crop it"))
     finest = int(np.log2(MAX_SURFELS / len(mesh.vertices)) / 2)
     if levels > finest:
-        found = f"{spacing_mm:g} mm, which requires {len(mesh.vertices) * 4.0**levels:,.0f}"
-        raise InputError(Fault("spacing", rule, found, f"choose {spacing / 2**finest:.2g} mm or more"))
+        found = (
+            f"{spacing_mm:g} mm, which requires {len(mesh.vertices) * 4.0**levels:,.0f}"
+        )
+        raise InputError(
+            Fault(
+                "spacing", rule, found, f"choose {spacing / 2**finest:.2g} mm or more"
+            )
+        )
     return levels
 
 
 def transferred_landmarks(capture: Capture, surfels: SurfelSet) -> tuple[Array, Array]:
-    """Landmarks (k, 3) on the surface of the surfels, transferred by subdivision, and their distance (k,) in mm.
+    """Landmarks (k, 3) on the surface of the surfels, transferred by subdivision, and
+    their distance (k,) in mm.
 
-    The distance is that of the given landmark from the cleaned scan. The position is NaN if the landmark was cropped
-    away, so that the complete scan is nearer to it than the surface.
+    The distance is that of the given landmark from the cleaned scan. The position is
+    NaN if the landmark was cropped away, so that the complete scan is nearer to it than
+    the surface.
     """
     given = np.array([*capture.landmarks.values()]).reshape(-1, 3)
     base = capture.surface
@@ -107,28 +126,40 @@ def transferred_landmarks(capture: Capture, surfels: SurfelSet) -> tuple[Array, 
     face, weight, distance = closest_on_mesh(base.vertices, base.faces, given)
     there = distance <= LANDMARK_REACH
     if capture.crop is not None:
-        there &= distance <= closest_on_mesh(scan.vertices, scan.faces, given)[2] + CROPPED_LANDMARK_MM
+        there &= (
+            distance
+            <= closest_on_mesh(scan.vertices, scan.faces, given)[2]
+            + CROPPED_LANDMARK_MM
+        )
     levels = round(np.log2(len(surfels.faces) / len(base.faces)) / 2)
     face, weight = carry_points(face, weight, len(base.faces), levels)
     position = np.einsum("kc,kci->ki", weight, surfels.position[surfels.faces[face]])
     return np.where(there[:, None], position, np.nan), distance
 
 
-def site_positions(capture: Capture, surfels: SurfelSet, sites: tuple[str, ...]) -> Array:
-    """Positions of the probe (site, 3) mm: a landmark, or the surfel nearest to the centre of the region of that name.
+def site_positions(
+    capture: Capture, surfels: SurfelSet, sites: tuple[str, ...]
+) -> Array:
+    """Positions of the probe (site, 3) mm: a landmark, or the surfel nearest to the
+    centre of the region of that name.
 
-    A landmark is used at its transferred position, or as given if it was cropped away. For a region on both sides, the
-    subject's left side (+x) is used, and for the neck its front. NaN if there is no landmark or region of the name.
+    A landmark is used at its transferred position, or as given if it was cropped away.
+    For a region on both sides, the subject's left side (+x) is used, and for the neck
+    its front. NaN if there is no landmark or region of the name.
     """
     carried, _ = transferred_landmarks(capture, surfels)
     landmarks = {
         name: place if np.isfinite(place).all() else given
         for (name, given), place in zip(capture.landmarks.items(), carried, strict=True)
     }
-    return np.array([_site_position(surfels, site, landmarks) for site in sites]).reshape(-1, 3)
+    return np.array(
+        [_site_position(surfels, site, landmarks) for site in sites]
+    ).reshape(-1, 3)
 
 
-def _site_position(surfels: SurfelSet, site: str, landmarks: Mapping[str, Array]) -> Array:
+def _site_position(
+    surfels: SurfelSet, site: str, landmarks: Mapping[str, Array]
+) -> Array:
     for name in (SITE_LANDMARK.get(site, site), site):
         if name in landmarks:
             return np.asarray(landmarks[name], np.float64)
@@ -136,7 +167,9 @@ def _site_position(surfels: SurfelSet, site: str, landmarks: Mapping[str, Array]
         return np.full(3, np.nan)
     member = surfels.region[:, surfels.region_names.index(site)]
     x = surfels.position[:, 0]
-    for wanted in (np.abs(x) < NECK_STRIP_HALF_WIDTH_MM, x > 0) if site == "neck" else (x > 0,):
+    for wanted in (
+        (np.abs(x) < NECK_STRIP_HALF_WIDTH_MM, x > 0) if site == "neck" else (x > 0,)
+    ):
         if (member & wanted).any():
             member = member & wanted
             break
@@ -148,7 +181,9 @@ def _site_position(surfels: SurfelSet, site: str, landmarks: Mapping[str, Array]
     return np.asarray(points[np.linalg.norm(points - middle, axis=1).argmin()])
 
 
-def _regions(mesh: CleanMesh, regions: Mapping[str, NDArray[np.int64]]) -> tuple[tuple[str, ...], Array]:
+def _regions(
+    mesh: CleanMesh, regions: Mapping[str, NDArray[np.int64]]
+) -> tuple[tuple[str, ...], Array]:
     """Membership (v', region) of the cleaned vertices in the regions of the scan."""
     member = np.zeros((len(mesh.vertices), len(regions)))
     for i, ids in enumerate(regions.values()):

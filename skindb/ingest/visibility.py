@@ -23,51 +23,78 @@ Bools = NDArray[np.bool_]
 Places = NDArray[np.int64]
 Method = Literal["rays", "splats"]
 VisibilityTest = Callable[[Places], Bools]  # surfels (m,) that face an eye -> (m,)
-RING_POINTS = 4  # points of a light's disc besides its centre; each stands for a fifth of its area
+# points of a light's disc besides its centre; each stands for a fifth of its area
+RING_POINTS = 4
 # one surfel in this many is tested for all points of a disc, to find isolated penumbrae
 SURFELS_PER_PROBE = 16
-MAX_PIXEL_WIDTH_RATIO = 1.05  # of a depth map's pixels over the wanted width; wider ones are reported
+# of a depth map's pixels over the wanted width; wider ones are reported
+MAX_PIXEL_WIDTH_RATIO = 1.05
 EDGE_PX = 1.5  # pixels within this distance may contribute to a sample
 STRIP_ROWS = 32  # rows of a depth map at a time
 SURFELS_PER_BLOCK = 1 << 14  # surfels at a time
 DEPTH_SLACK = 2.0  # mm, allowance for the error of the scan between neighbouring pixels
-MAX_DEPTH_SLOPE = 10.0  # depth per width, as at a cosine of 0.1; a steeper step is another surface
+# depth per width, as at a cosine of 0.1; a steeper step is another surface
+MAX_DEPTH_SLOPE = 10.0
 
 
 def light_visibility(
-    surfels: SurfelSet, lights: Sequence[LightRecord], scene: RayScene, pool: Executor, *, method: Method = "rays"
+    surfels: SurfelSet,
+    lights: Sequence[LightRecord],
+    scene: RayScene,
+    pool: Executor,
+    *,
+    method: Method = "rays",
 ) -> Half:
-    """Visible fraction (n, light) of the lights' discs; 0 where the surfel faces away from the centre.
+    """Visible fraction (n, light) of the lights' discs; 0 where the surfel faces away
+    from the centre.
 
-    All points of a disc are tested only where their visibility may differ: at the edge of the shadow of the centre, and
-    from there on as long as a penumbra is found. The methods are rays, and splats as in the paper: measured on true
-    heads, the two differ by less than 0.1 % except at eyelids and lips, where rays are right more often (98.1 against
-    97.7 %, 98.9 against 98.3 %); splats with discs take four times as long.
+    All points of a disc are tested only where their visibility may differ: at the edge
+    of the shadow of the centre, and from there on as long as a penumbra is found. The
+    methods are rays, and splats as in the paper: measured on true heads, the two differ
+    by less than 0.1 % except at eyelids and lips, where rays are right more often (98.1
+    against 97.7 %, 98.9 against 98.3 %); splats with discs take four times as long.
     """
     look = _visibility_test(surfels, scene, method)
 
     def one(light: LightRecord) -> Half:
         fraction = np.zeros(len(surfels.position), np.float16)
-        facing = np.einsum("ni,ni->n", light.position - surfels.position, surfels.normal) > 0
+        facing = (
+            np.einsum("ni,ni->n", light.position - surfels.position, surfels.normal) > 0
+        )
         at = np.flatnonzero(facing)
         centre, *ring = disc_points(light)
         fraction[at] = look(centre)(at)
         if ring:
             start = mixed(surfels.faces, fraction > 0)
             start[::SURFELS_PER_PROBE] = True
-            _add_penumbrae(fraction, start & facing, surfels.faces, facing, [look(point) for point in ring])
+            _add_penumbrae(
+                fraction,
+                start & facing,
+                surfels.faces,
+                facing,
+                [look(point) for point in ring],
+            )
         return fraction
 
-    out = np.empty((len(surfels.position), len(lights)), np.float16, order="F")  # used column by column
+    # used column by column
+    out = np.empty((len(surfels.position), len(lights)), np.float16, order="F")
     for j, fraction in enumerate(pool.map(one, lights)):
         out[:, j] = fraction
     return out
 
 
-def _add_penumbrae(fraction: Half, start: Bools, faces: Places, facing: Bools, ring: Sequence[VisibilityTest]) -> None:
-    """Refine `fraction` (n,), the visibility of a disc's centre, to that of the disc, beginning at `start` (n,).
+def _add_penumbrae(
+    fraction: Half,
+    start: Bools,
+    faces: Places,
+    facing: Bools,
+    ring: Sequence[VisibilityTest],
+) -> None:
+    """Refine `fraction` (n,), the visibility of a disc's centre, to that of the disc,
+    beginning at `start` (n,).
 
-    The neighbours of every surfel in a penumbra are also tested, until no further surfel is in a penumbra.
+    The neighbours of every surfel in a penumbra are also tested, until no further
+    surfel is in a penumbra.
     """
     left = facing & ~start
     front = np.flatnonzero(start)
@@ -81,12 +108,16 @@ def _add_penumbrae(fraction: Half, start: Bools, faces: Places, facing: Bools, r
         front = np.flatnonzero(asked)
 
 
-def _visibility_test(surfels: SurfelSet, scene: RayScene, method: Method) -> Callable[[Array], VisibilityTest]:
+def _visibility_test(
+    surfels: SurfelSet, scene: RayScene, method: Method
+) -> Callable[[Array], VisibilityTest]:
     """Function from an eye (3,) in mm to the visibility of surfels from it, by the method."""
     if method == "rays":
         position = surfels.position
         normal = surfels.normal
-        return lambda eye: lambda at: ~scene.occluded(position, eye[None], normal=normal, at=at)
+        return lambda eye: (
+            lambda at: ~scene.occluded(position, eye[None], normal=normal, at=at)
+        )
     if method == "splats":
         splats = SplatScene(surfels.position, surfels.normal, surfels.radius)
 
@@ -98,14 +129,26 @@ def _visibility_test(surfels: SurfelSet, scene: RayScene, method: Method) -> Cal
     raise ValueError(f'method must be "rays" or "splats", not {method!r}')
 
 
-def coarse_maps(surfels: SurfelSet, lights: Sequence[LightRecord], cameras: Sequence[CameraRecord]) -> list[str]:
-    """A warning if the splats of the surfels need finer depth maps than the limit allows for a light or camera."""
+def coarse_maps(
+    surfels: SurfelSet, lights: Sequence[LightRecord], cameras: Sequence[CameraRecord]
+) -> list[str]:
+    """A warning if the splats of the surfels need finer depth maps than the limit
+    allows for a light or camera.
+    """
     splats = SplatScene(surfels.position, surfels.normal, surfels.radius)
-    eyes = [*(light.position for light in lights), *(camera_centre(camera.R, camera.t) for camera in cameras)]
+    eyes = [
+        *(light.position for light in lights),
+        *(camera_centre(camera.R, camera.t) for camera in cameras),
+    ]
     times = max(splats.coarsening(eye) for eye in eyes)
     if times < MAX_PIXEL_WIDTH_RATIO:
         return []
-    return [f"depth maps of splats: pixels are up to {times:.1f} times too wide; use rays, which are exact"]
+    return [
+        (
+            f"depth maps of splats: pixels are up to {times:.1f} times too wide; use "
+            "rays, which are exact"
+        )
+    ]
 
 
 def disc_points(light: LightRecord) -> Array:
@@ -119,12 +162,19 @@ def disc_points(light: LightRecord) -> Array:
     # the centre represents a fifth of the area; the ring is where it halves the area of the rest
     radius = light.disc_radius * np.sqrt(0.6)
     angle = 2 * np.pi * np.arange(RING_POINTS) / RING_POINTS
-    ring = light.position + radius * (np.cos(angle)[:, None] * u + np.sin(angle)[:, None] * v)
+    ring = light.position + radius * (
+        np.cos(angle)[:, None] * u + np.sin(angle)[:, None] * v
+    )
     return np.concatenate([light.position[None], ring])
 
 
 def camera_visibility(
-    surfels: SurfelSet, cameras: Sequence[CameraRecord], scene: RayScene, pool: Executor, *, method: Method = "rays"
+    surfels: SurfelSet,
+    cameras: Sequence[CameraRecord],
+    scene: RayScene,
+    pool: Executor,
+    *,
+    method: Method = "rays",
 ) -> tuple[Half, NDArray[np.bool_], NDArray[np.float32]]:
     """Visibility of the surfels in each camera.
 
@@ -157,7 +207,9 @@ def camera_visibility(
 
 
 def _in_picture(surfels: SurfelSet, camera: CameraRecord) -> tuple[Array, Bools]:
-    """Projections (n, 2) of the surfels, and which of them face the camera and fall inside its picture (n,)."""
+    """Projections (n, 2) of the surfels, and which of them face the camera and fall
+    inside its picture (n,).
+    """
     centre = camera_centre(camera.R, camera.t)
     last = np.array([camera.width, camera.height]) - 0.5
     pixels = np.empty((len(surfels.position), 2))
@@ -165,31 +217,50 @@ def _in_picture(surfels: SurfelSet, camera: CameraRecord) -> tuple[Array, Bools]
     for i in range(0, len(pixels), SURFELS_PER_BLOCK):
         part = slice(i, i + SURFELS_PER_BLOCK)
         position = surfels.position[part]
-        pixels[part], _ = project(position, camera.K, camera.R, camera.t, camera.distortion)
+        pixels[part], _ = project(
+            position, camera.K, camera.R, camera.t, camera.distortion
+        )
         inside[part] = ((pixels[part] >= 0.5) & (pixels[part] <= last)).all(axis=1)
-        inside[part] &= np.einsum("ni,ni->n", centre - position, surfels.normal[part]) > 0
+        inside[part] &= (
+            np.einsum("ni,ni->n", centre - position, surfels.normal[part]) > 0
+        )
     return pixels, inside
 
 
-def depth_map(camera: CameraRecord, scene: RayScene) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Distance (h, w) mm of the surface along the rays (h, w, 3) through the pixel centres; infinity outside it."""
+def depth_map(
+    camera: CameraRecord, scene: RayScene
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Distance (h, w) mm of the surface along the rays (h, w, 3) through the pixel
+    centres; infinity outside it.
+    """
     rays = np.empty((camera.height, camera.width, 3), np.float32)
     distance = np.empty((camera.height, camera.width), np.float32)
     centre = camera_centre(camera.R, camera.t)
     column = np.arange(camera.width) + 0.5
-    # in strips, whose arrays stay in the cache: allocating large arrays takes longer than filling them
+    # in strips, whose arrays stay in the cache: allocating large arrays takes longer
+    # than filling them
     for top in range(0, camera.height, STRIP_ROWS):
         strip = slice(top, min(top + STRIP_ROWS, camera.height))
-        pixels = np.stack(np.meshgrid(column, np.arange(camera.height)[strip] + 0.5), axis=-1)
+        pixels = np.stack(
+            np.meshgrid(column, np.arange(camera.height)[strip] + 0.5), axis=-1
+        )
         rays[strip] = pixel_rays(pixels, camera.K, camera.R, camera.distortion)
-        distance[strip] = scene.distances(centre, rays[strip].reshape(-1, 3)).reshape(distance[strip].shape)
+        distance[strip] = scene.distances(centre, rays[strip].reshape(-1, 3)).reshape(
+            distance[strip].shape
+        )
     return distance, rays
 
 
-def _clear(camera: CameraRecord, scene: RayScene, surfels: SurfelSet, pixels: Array, at: Places) -> Bools:
+def _clear(
+    camera: CameraRecord, scene: RayScene, surfels: SurfelSet, pixels: Array, at: Places
+) -> Bools:
     """Whether the pixels around surfels `at` show the surface that their tangent planes predict."""
     distance, rays = depth_map(camera, scene)
     centre = np.asarray(camera_centre(camera.R, camera.t), np.float64)
-    steepest = EDGE_PX * MAX_DEPTH_SLOPE / float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
+    steepest = (
+        EDGE_PX * MAX_DEPTH_SLOPE / float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
+    )
     where = (surfels.position, surfels.normal, pixels, at, centre)
-    return np.asarray(matches_tangent_plane(*where, rays, distance, EDGE_PX, DEPTH_SLACK, steepest))
+    return np.asarray(
+        matches_tangent_plane(*where, rays, distance, EDGE_PX, DEPTH_SLACK, steepest)
+    )

@@ -1,4 +1,6 @@
-"""Compiled non-negative least squares of normal equations; `skindb.numerics.nnls` states the problem."""
+"""Compiled non-negative least squares of normal equations; `skindb.numerics.nnls`
+states the problem.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,9 @@ import numpy as np
 
 from skindb._compiled import kernel
 
-MIN_PIVOT = 1e-11  # a column whose fraction outside the span of the active ones is below this is collinear with them
+# a column whose fraction outside the span of the active ones is below this is collinear
+# with them
+MIN_PIVOT = 1e-11
 
 
 class ActiveSetMemory(NamedTuple):
@@ -28,7 +32,9 @@ def active_set_memory(m: int) -> Any:
 
 @kernel
 def factor(G: Any, active: Any, begin: int, k: int, L: Any) -> int:
-    """Extend the Cholesky factor of G on `active` from position `begin` to k; returns the first bad pivot, or -1."""
+    """Extend the Cholesky factor of G on `active` from position `begin` to k; returns
+    the first bad pivot, or -1.
+    """
     for a in range(begin, k):
         for c in range(a):
             t = G[active[a], active[c]]
@@ -72,11 +78,14 @@ def _gradient(G: Any, b: Any, x: Any, w: Any) -> None:
 
 
 @kernel
-def _exchange(G: Any, entering: int, active: Any, k: int, L: Any, x: Any, z: Any) -> int:
+def _exchange(
+    G: Any, entering: int, active: Any, k: int, L: Any, x: Any, z: Any
+) -> int:
     """Exchange a column that lies in the span of the k active ones for one of them.
 
-    The entering column takes weight from the active ones until one of them is zero; along this line the misfit changes
-    only by the gradient of the entering column. Returns the position of the removed column, or -1.
+    The entering column takes weight from the active ones until one of them is zero;
+    along this line the misfit changes only by the gradient of the entering column.
+    Returns the position of the removed column, or -1.
     """
     solve(L, G[entering], active, k, z)
     leaving = -1
@@ -102,13 +111,17 @@ def _drop(active: Any, position: int, k: int) -> int:
 
 
 @kernel
-def active_set(G: Any, b: Any, x: Any, tolerance: float, limit: int, memory: Any) -> tuple[float, int, bool, float]:
-    """Minimise x G x / 2 - b x, x >= 0, for a Gram matrix of unit diagonal (0 for empty columns), from a warm x.
+def active_set(
+    G: Any, b: Any, x: Any, tolerance: float, limit: int, memory: Any
+) -> tuple[float, int, bool, float]:
+    """Minimise x G x / 2 - b x, x >= 0, for a Gram matrix of unit diagonal (0 for empty
+    columns), from a warm x.
 
-    Lawson and Hanson's method on the normal equations (Bro and de Jong 1997), with a factor that grows by one row per
-    step; a column that is collinear with the active ones replaces one of them. Returns the KKT residual over all
-    columns relative to max |b|, the iterations, whether the tolerance was met, and the squared ratio of the factor's
-    extreme pivots (a lower bound of the active columns' condition).
+    Lawson and Hanson's method on the normal equations (Bro and de Jong 1997), with a
+    factor that grows by one row per step; a column that is collinear with the active
+    ones replaces one of them. Returns the KKT residual over all columns relative to max
+    |b|, the iterations, whether the tolerance was met, and the squared ratio of the
+    factor's extreme pivots (a lower bound of the active columns' condition).
     """
     m = b.shape[0]
     scale = 0.0
@@ -179,7 +192,8 @@ def active_set(G: Any, b: Any, x: Any, tolerance: float, limit: int, memory: Any
             if not leaving:
                 for a in range(k):
                     if x[active[a]] != z[a]:
-                        barred[:] = False  # after progress, barred columns may enter again
+                        # after progress, barred columns may enter again
+                        barred[:] = False
                     x[active[a]] = z[a]
                 break
             for a in range(k - 1, -1, -1):
@@ -188,7 +202,8 @@ def active_set(G: Any, b: Any, x: Any, tolerance: float, limit: int, memory: Any
                 if z[a] <= 0.0 and x[j] <= 1e-15 * abs(z[a]) + 1e-300:
                     x[j], passive[j] = 0.0, False
                     if j == entering and step == 0.0:
-                        barred[j] = True  # it entered because of rounding and would leave at once
+                        # it entered because of rounding and would leave at once
+                        barred[j] = True
                     k = _drop(active, a, k)
                     valid = min(valid, a)
             if count >= limit:
@@ -205,12 +220,21 @@ def active_set(G: Any, b: Any, x: Any, tolerance: float, limit: int, memory: Any
         low = min(low, L[a, a])
         high = max(high, L[a, a])
     condition = (high / low) ** 2 if high > 0.0 else 1.0
-    return worst / scale, count, worst <= 10.0 * max(tolerance, 1e-12) * scale and count < limit, condition
+    return (
+        worst / scale,
+        count,
+        worst <= 10.0 * max(tolerance, 1e-12) * scale and count < limit,
+        condition,
+    )
 
 
 @kernel
-def solve_scaled(G: Any, b: Any, x: Any, tolerance: float, limit: int, memory: Any) -> tuple[float, int, bool, float]:
-    """`active_set` after scaling the columns to unit length; G and b are overwritten, x is the warm start."""
+def solve_scaled(
+    G: Any, b: Any, x: Any, tolerance: float, limit: int, memory: Any
+) -> tuple[float, int, bool, float]:
+    """`active_set` after scaling the columns to unit length; G and b are overwritten, x
+    is the warm start.
+    """
     m = b.shape[0]
     length = np.zeros(m)
     for j in range(m):
@@ -228,10 +252,21 @@ def solve_scaled(G: Any, b: Any, x: Any, tolerance: float, limit: int, memory: A
 
 
 @kernel
-def solve_many(G: Any, b: Any, x: Any, finite: Any, tolerance: float, kkt: Any, count: Any, met: Any) -> None:
+def solve_many(
+    G: Any,
+    b: Any,
+    x: Any,
+    finite: Any,
+    tolerance: float,
+    kkt: Any,
+    count: Any,
+    met: Any,
+) -> None:
     """`solve_scaled` for every problem that is finite."""
     m = b.shape[1]
     memory = active_set_memory(m)
     for i in range(b.shape[0]):
         if finite[i]:
-            kkt[i], count[i], met[i], _ = solve_scaled(G[i], b[i], x[i], tolerance, 6 * m, memory)
+            kkt[i], count[i], met[i], _ = solve_scaled(
+                G[i], b[i], x[i], tolerance, 6 * m, memory
+            )

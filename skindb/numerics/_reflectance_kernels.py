@@ -1,4 +1,6 @@
-"""Compiled fits of mixtures to reflectance, linear and in cube-root space; see `skindb.numerics.nnls`."""
+"""Compiled fits of mixtures to reflectance, linear and in cube-root space; see
+`skindb.numerics.nnls`.
+"""
 
 from __future__ import annotations
 
@@ -11,19 +13,24 @@ from skindb._compiled import fast_kernel, kernel
 from skindb._vectors import LANES, dots, products
 from skindb.numerics._nnls_kernels import active_set_memory, solve_scaled
 
-MIN_GAIN = 1e-4  # Gauss-Newton ends when a step lowers the misfit by less than this fraction
+# Gauss-Newton ends when a step lowers the misfit by less than this fraction
+MIN_GAIN = 1e-4
 ROWS_PER_SUM = 64  # rows summed in single precision before they are added in double
-MIN_NOISE_FLOOR = 1e-12  # for values of order one, so that its square is a normal number
-MAGIC = np.float32(1419967116.0)  # bits of s^(-1/3) plus a third of the bits of s; accurate to 4 %
-ZERO, HALF, THIRD, ONE, TWO, TWO_NINTHS = (np.float32(c) for c in (0, 1 / 2, 1 / 3, 1, 2, 2 / 9))
+# for values of order one, so that its square is a normal number
+MIN_NOISE_FLOOR = 1e-12
+# bits of s^(-1/3) plus a third of the bits of s; accurate to 4 %
+MAGIC = np.float32(1419967116.0)
+ZERO, HALF, THIRD, ONE, TWO, TWO_NINTHS = (
+    np.float32(c) for c in (0, 1 / 2, 1 / 3, 1, 2, 2 / 9)
+)
 
 
 @fast_kernel
 def inverse_roots(s: Any, out: Any, bits_in: Any, bits_out: Any) -> None:
     """Write s^(-1/3) to `out` for positive float32 s; `bits_*` are int32 views of the same memory.
 
-    A start from a third of the exponent bits, then two iterations of third order: accurate to rounding, and unlike
-    `pow` it runs in vector registers.
+    A start from a third of the exponent bits, then two iterations of third order:
+    accurate to rounding, and unlike `pow` it runs in vector registers.
     """
     for i in range(s.shape[0]):
         bits_out[i] = np.int32(MAGIC - np.float32(bits_in[i]) * THIRD)
@@ -36,7 +43,9 @@ def inverse_roots(s: Any, out: Any, bits_in: Any, bits_out: Any) -> None:
 
 
 class FitMemory(NamedTuple):
-    """Memory for `fit_one`; each thread needs its own. Vectors hold one number per row in single precision."""
+    """Memory for `fit_one`; each thread needs its own. Vectors hold one number per row
+    in single precision.
+    """
 
     total: Any  # sum of the targets over channels
     slope: Any  # weights of the linear problem
@@ -88,10 +97,11 @@ def fit_memory(most: int, width: int, m: int) -> Any:
 
 @kernel
 def gram(rows: Any, n: int, a: Any, t: Any, G: Any, b: Any, block: Any) -> None:
-    """Write G = M' a M and b = M' t of the first n rows, whose width is a multiple of LANES (padded with zeros).
+    """Write G = M' a M and b = M' t of the first n rows, whose width is a multiple of
+    LANES (padded with zeros).
 
-    Sums of ROWS_PER_SUM rows in single precision stay in registers and are added in double, with a rounding error of
-    about 1e-8.
+    Sums of ROWS_PER_SUM rows in single precision stay in registers and are added in
+    double, with a rounding error of about 1e-8.
     """
     width = rows.shape[1]
     G[:], b[:] = 0.0, 0.0
@@ -130,7 +140,9 @@ def to_roots(y: Any, floor: Any, s: Any, q: Any, bits_in: Any, bits_out: Any) ->
 
 @fast_kernel
 def _misfit(y: Any, q: Any, weight: Any, channels: Any, roots: Any) -> float:
-    """Squared distance in cube-root space, without the terms that do not depend on the prediction."""
+    """Squared distance in cube-root space, without the terms that do not depend on the
+    prediction.
+    """
     total = 0.0
     for i in range(y.shape[0]):
         r = y[i] * q[i]
@@ -139,13 +151,21 @@ def _misfit(y: Any, q: Any, weight: Any, channels: Any, roots: Any) -> float:
 
 
 @fast_kernel
-def _linearise(y: Any, q: Any, weight: Any, channels: Any, roots: Any, floor: Any, a: Any, t: Any) -> None:
-    """Weights and right side of the linear problem of a Gauss-Newton step in cube-root space at y."""
+def _linearise(
+    y: Any, q: Any, weight: Any, channels: Any, roots: Any, floor: Any, a: Any, t: Any
+) -> None:
+    """Weights and right side of the linear problem of a Gauss-Newton step in cube-root
+    space at y.
+    """
     for i in range(y.shape[0]):
         square = q[i] * q[i]
         slope = (y[i] * y[i] * THIRD + floor * floor) * square * square
         a[i] = weight[i] * channels * slope * slope
-        t[i] = weight[i] * slope * (channels * slope * y[i] + roots[i] - channels * y[i] * q[i])
+        t[i] = (
+            weight[i]
+            * slope
+            * (channels * slope * y[i] + roots[i] - channels * y[i] * q[i])
+        )
 
 
 @kernel
@@ -156,24 +176,39 @@ def coefficients(lift: Any, x: Any) -> Any:
 
 @kernel
 def _weighted(rows: Any, n: int, lift: Any, tolerance: float, x: Any, work: Any) -> Any:
-    """Minimise the linear problem of `work.slope` and `work.aim` over x >= 0 with the warm start x."""
+    """Minimise the linear problem of `work.slope` and `work.aim` over x >= 0 with the
+    warm start x.
+    """
     r = lift.shape[0]
     right = work.right
-    gram(rows, n, work.slope, work.aim, work.reduced_gram, work.reduced_right, work.block)
+    gram(
+        rows, n, work.slope, work.aim, work.reduced_gram, work.reduced_right, work.block
+    )
     if r == right.shape[0]:
-        for i in range(r):  # loops here and below, because copies of arrays take seconds to compile
+        # loops here and below, because copies of arrays take seconds to compile
+        for i in range(r):
             right[i] = work.reduced_right[i]
             for j in range(r):
                 work.gram[i, j] = work.reduced_gram[i, j]
     else:
-        np.dot(lift.T, np.dot(np.ascontiguousarray(work.reduced_gram[:r, :r]), lift), work.gram)
+        np.dot(
+            lift.T,
+            np.dot(np.ascontiguousarray(work.reduced_gram[:r, :r]), lift),
+            work.gram,
+        )
         np.dot(lift.T, work.reduced_right[:r], right)
-    return solve_scaled(work.gram, right, x, tolerance, 6 * right.shape[0], work.active_set)
+    return solve_scaled(
+        work.gram, right, x, tolerance, 6 * right.shape[0], work.active_set
+    )
 
 
 @fast_kernel
-def slopes(y: Any, floor: Any, s: Any, q: Any, bits_in: Any, bits_out: Any, out: Any) -> None:
-    """Write the squared slope of the cube root at y: the weight of a squared difference at y in cube-root space."""
+def slopes(
+    y: Any, floor: Any, s: Any, q: Any, bits_in: Any, bits_out: Any, out: Any
+) -> None:
+    """Write the squared slope of the cube root at y: the weight of a squared difference
+    at y in cube-root space.
+    """
     to_roots(y, floor, s, q, bits_in, bits_out)
     for i in range(y.shape[0]):
         square = q[i] * q[i]
@@ -183,13 +218,22 @@ def slopes(y: Any, floor: Any, s: Any, q: Any, bits_in: Any, bits_out: Any, out:
 
 @kernel
 def fit_weighted(
-    rows: Any, target: Any, weight: Any, lift: Any, perceptual: bool, floor: float, tolerance: float, x: Any, work: Any
+    rows: Any,
+    target: Any,
+    weight: Any,
+    lift: Any,
+    perceptual: bool,
+    floor: float,
+    tolerance: float,
+    x: Any,
+    work: Any,
 ) -> Any:
     """Fit one surfel linearly with the warm start x, target (channels, n).
 
-    If `perceptual`, rows are weighted with the squared slopes of the cube root at M x. Unlike the distance in cube-root
-    space, this fit is not biased by noise (the cube root is concave). Returns the KKT residual, the iterations, whether
-    it converged, and the condition.
+    If `perceptual`, rows are weighted with the squared slopes of the cube root at M x.
+    Unlike the distance in cube-root space, this fit is not biased by noise (the cube
+    root is concave). Returns the KKT residual, the iterations, whether it converged,
+    and the condition.
     """
     n = target.shape[1]
     channels = np.float32(target.shape[0])
@@ -201,7 +245,15 @@ def fit_weighted(
             work.total[i] += target[c, i]
     if perceptual:
         predict(rows, n, coefficients(lift, x), work.predicted, work.single)
-        slopes(work.predicted[:n], least, work.square, work.inverse, work.square_bits, work.inverse_bits, work.slope)
+        slopes(
+            work.predicted[:n],
+            least,
+            work.square,
+            work.inverse,
+            work.square_bits,
+            work.inverse_bits,
+            work.slope,
+        )
     for i in range(n):
         work.slope[i] *= weight[i]
         work.aim[i] = work.slope[i] * work.total[i]
@@ -211,29 +263,51 @@ def fit_weighted(
 
 @kernel
 def fit_one(
-    rows: Any, target: Any, weight: Any, lift: Any, perceptual: bool, floor: float, tolerance: float, x: Any, work: Any
+    rows: Any,
+    target: Any,
+    weight: Any,
+    lift: Any,
+    perceptual: bool,
+    floor: float,
+    tolerance: float,
+    x: Any,
+    work: Any,
 ) -> Any:
-    """Fit one surfel, target (channels, n), and write the weights to x; all in single precision and of about order one.
+    """Fit one surfel, target (channels, n), and write the weights to x; all in single
+    precision and of about order one.
 
-    A square lift is the identity. Channels share the rows, so each row enters once with summed targets. In cube-root
-    space, x is the start unless it is zero, and a last step fits linearly with the weights found. Returns the KKT
-    residual, the iterations, whether it converged, and the condition.
+    A square lift is the identity. Channels share the rows, so each row enters once with
+    summed targets. In cube-root space, x is the start unless it is zero, and a last
+    step fits linearly with the weights found. Returns the KKT residual, the iterations,
+    whether it converged, and the condition.
     """
     count = 0
     if perceptual:
         count = _fit_roots(rows, target, weight, lift, floor, tolerance, x, work)
     else:
         x[:] = 0.0
-    # a variable, so that the function is compiled only once: each constant would have its own compiled version
-    kkt, more, met, condition = fit_weighted(rows, target, weight, lift, perceptual, floor, tolerance, x, work)
+    # a variable, so that the function is compiled only once: each constant would have
+    # its own compiled version
+    kkt, more, met, condition = fit_weighted(
+        rows, target, weight, lift, perceptual, floor, tolerance, x, work
+    )
     return kkt, count + more, met, condition
 
 
 @kernel
 def _fit_roots(
-    rows: Any, target: Any, weight: Any, lift: Any, floor: float, tolerance: float, x: Any, work: Any
+    rows: Any,
+    target: Any,
+    weight: Any,
+    lift: Any,
+    floor: float,
+    tolerance: float,
+    x: Any,
+    work: Any,
 ) -> int:
-    """Minimise the distance in cube-root space by Gauss-Newton with a line search; returns the iterations."""
+    """Minimise the distance in cube-root space by Gauss-Newton with a line search;
+    returns the iterations.
+    """
     n = target.shape[1]
     channels = np.float32(target.shape[0])
     least = np.float32(floor)
@@ -279,7 +353,9 @@ def _fit_roots(
         predict(rows, n, coefficients(lift, work.new), trial, work.single)
         step: Any = ONE
         value = best
-        for _ in range(6):  # predictions are linear in x, so a shorter step needs no solve and stays non-negative
+        # predictions are linear in x, so a shorter step needs no solve and stays
+        # non-negative
+        for _ in range(6):
             for i in range(n):
                 mixed[i] = y[i] + step * (trial[i] - y[i])
             to_roots(mixed, least, s, q, bits_in, bits_out)
@@ -301,7 +377,9 @@ def _fit_roots(
 
 
 @fast_kernel
-def _squares(found: Any, want: Any, q: Any, roots: Any) -> tuple[float, float, float, float]:
+def _squares(
+    found: Any, want: Any, q: Any, roots: Any
+) -> tuple[float, float, float, float]:
     """Sums of squared differences and of squared values, linear and in cube-root space.
 
     In cube-root space the prediction is `found` q and the target is `roots`.
@@ -321,8 +399,12 @@ def _squares(found: Any, want: Any, q: Any, roots: Any) -> tuple[float, float, f
 
 
 @kernel
-def relative_errors(found: Any, want: Any, floor: float, work: Any) -> tuple[float, float]:
-    """RMS error over RMS of `want`, both (channels, n), linear and in cube-root space; NaN if `want` is zero."""
+def relative_errors(
+    found: Any, want: Any, floor: float, work: Any
+) -> tuple[float, float]:
+    """RMS error over RMS of `want`, both (channels, n), linear and in cube-root space;
+    NaN if `want` is zero.
+    """
     n = want.shape[1]
     least = np.float32(floor)
     s = work.square[:n]
@@ -352,11 +434,20 @@ def _power(value: float) -> float:
 
 @kernel
 def _to_order_one(
-    part: Any, want: Any, w: Any, whole: bool, rows: Any, target: Any, weight: Any, lengths: Any
+    part: Any,
+    want: Any,
+    w: Any,
+    whole: bool,
+    rows: Any,
+    target: Any,
+    weight: Any,
+    lengths: Any,
 ) -> float:
-    """Copy one surfel's rows, targets and weights, scaled to order one; returns the scale of the targets.
+    """Copy one surfel's rows, targets and weights, scaled to order one; returns the
+    scale of the targets.
 
-    `lengths` receives the scale of each column, or the same scale for all if `whole` (when a lift mixes the columns).
+    `lengths` receives the scale of each column, or the same scale for all if `whole`
+    (when a lift mixes the columns).
     """
     for p in range(part.shape[1]):
         lengths[p] = np.abs(part[:, p]).max()
@@ -418,7 +509,12 @@ def fit_many(
         part = rows[lo:hi]
         want = target[lo:hi]
         w = weight[lo:hi]
-        if not (np.isfinite(part).all() and np.isfinite(want).all() and np.isfinite(w).all() and w.min() >= 0.0):
+        if not (
+            np.isfinite(part).all()
+            and np.isfinite(want).all()
+            and np.isfinite(w).all()
+            and w.min() >= 0.0
+        ):
             status[s] = 6
             continue
         scale = _to_order_one(part, want, w, not square, scaled, aim, heavy, lengths)
@@ -431,6 +527,8 @@ def fit_many(
         predict(scaled, n, coefficients(lift, x[s]), y, single)
         for c in range(channels):
             found[c, :n] = y[:n]
-        residual[s], residual_root[s] = relative_errors(found[:, :n], aim[:, :n], level, work)
+        residual[s], residual_root[s] = relative_errors(
+            found[:, :n], aim[:, :n], level, work
+        )
         for j in range(x.shape[1]):
             x[s, j] *= scale / (lengths[j] if square else lengths[0])

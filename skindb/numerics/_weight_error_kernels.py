@@ -13,8 +13,18 @@ from skindb.numerics._reflectance_kernels import ONE, ZERO, gram, slopes
 
 
 @fast_kernel
-def _scores(y: Any, weight: Any, perceptual: bool, floor: float, scattered: Any, drift: Any, work: Any) -> None:
-    """Write to `work`, per row at the solution, the slopes, the right side due to drift, and the squared scores."""
+def _scores(
+    y: Any,
+    weight: Any,
+    perceptual: bool,
+    floor: float,
+    scattered: Any,
+    drift: Any,
+    work: Any,
+) -> None:
+    """Write to `work`, per row at the solution, the slopes, the right side due to
+    drift, and the squared scores.
+    """
     n = y.shape[0]
     channels = np.float32(scattered.shape[0])
     least = np.float32(floor)
@@ -25,7 +35,9 @@ def _scores(y: Any, weight: Any, perceptual: bool, floor: float, scattered: Any,
     for i in range(n):
         t[i], a[i] = ZERO, ONE
     if perceptual:
-        slopes(y, least, work.square, work.inverse, work.square_bits, work.inverse_bits, a)
+        slopes(
+            y, least, work.square, work.inverse, work.square_bits, work.inverse_bits, a
+        )
     for i in range(n):
         a[i] *= weight[i]
     for c in range(scattered.shape[0]):
@@ -53,13 +65,15 @@ def weight_covariance(
     out: Any,
     work: Any,
 ) -> None:
-    """Covariance (m, m) of the positive weights, directly after `fit_one` with a square lift; NaN for the others.
+    """Covariance (m, m) of the positive weights, directly after `fit_one` with a square
+    lift; NaN for the others.
 
     `weight` (n,) are the weights of the rows in that fit.
 
-    The covariance has two parts: a sandwich estimate from the residuals of whole rows (White 1980), which is valid for
-    noise of any size that the channels may share; and the shift of the weights that is caused by a fraction `drift` of
-    the light `scattered` (channels, n).
+    The covariance has two parts: a sandwich estimate from the residuals of whole rows
+    (White 1980), which is valid for noise of any size that the channels may share; and
+    the shift of the weights that is caused by a fraction `drift` of the light
+    `scattered` (channels, n).
     """
     m = x.shape[0]
     n = y.shape[0]
@@ -111,5 +125,6 @@ def weight_covariance(
                     total += inverse[p, i] * G[active[i], active[j]] * inverse[j, c]
             out[active[p], active[c]] = total * n / (n - k) + z[p] * z[c]
     for p in range(k):
-        if not out[active[p], active[p]] > 0.0:  # collinear up to the rounding of the Gram matrix
+        # collinear up to the rounding of the Gram matrix
+        if not out[active[p], active[p]] > 0.0:
             out[:] = np.nan

@@ -19,16 +19,20 @@ from skindb.numerics.nnls import solve_nnls
 MAX_SWEEPS = 200  # alternating over W and H; TOLERANCE ends most runs earlier
 TOLERANCE = 1e-8  # decrease of the squared error per sweep, relative to |X|^2
 MAX_PASSES = 30  # over all blocks; each pass reads all data
-MIN_FALL_PER_PASS = 1e-3  # relative decrease of the error by a pass, below which no further pass is made
+# relative decrease of the error by a pass, below which no further pass is made
+MIN_FALL_PER_PASS = 1e-3
 SWEEPS_PER_PASS = 5  # over all rows of H between two passes; their cost is negligible
 
 
 @dataclass(frozen=True)
 class Factorisation:
-    """W H nearest to X; rows of H have unit sum and are ordered by their contribution to X, so that runs agree."""
+    """W H nearest to X; rows of H have unit sum and are ordered by their contribution
+    to X, so that runs agree.
+    """
 
     H: Array  # (k, m)
-    error: float  # |X - W H| / |X| of the best seed in the metric used, with the best W for this H
+    # |X - W H| / |X| of the best seed in the metric used, with the best W for this H
+    error: float
     spread: float  # largest minus smallest error over the seeds
 
 
@@ -50,8 +54,9 @@ def nmf(
     k
         Number of components, at most the smaller side of `weights`.
     metric
-        (m, m) Gram matrix A of the bases: minimise tr((X - W H) A (X - W H)'), so that distances between weights are
-        distances between BRDFs. None measures in coefficient space, the paper's choice.
+        (m, m) Gram matrix A of the bases: minimise tr((X - W H) A (X - W H)'), so that
+        distances between weights are distances between BRDFs. None measures in
+        coefficient space, the paper's choice.
     seeds
         Number of random starts in addition to the deterministic one; the best result is kept.
     rng
@@ -60,21 +65,44 @@ def nmf(
         Function with the interface of `map` that runs the starts, possibly in parallel.
     """
     X = np.asarray(weights, np.float64)
-    if X.ndim != 2 or not 1 <= k <= min(X.shape) or not np.isfinite(X).all() or (X < 0).any():
-        raise ValueError(f"weights {X.shape} must be finite and non-negative, and k = {k} within both sides")
+    if (
+        X.ndim != 2
+        or not 1 <= k <= min(X.shape)
+        or not np.isfinite(X).all()
+        or (X < 0).any()
+    ):
+        raise ValueError(
+            f"weights {X.shape} must be finite and non-negative, and k = {k} within both sides"
+        )
     if not X.any():
         return Factorisation(np.full((k, X.shape[1]), 1.0 / X.shape[1]), 0.0, 0.0)
     starts = [None, *(int(rng.integers(2**31)) for _ in range(seeds))]
-    with warnings.catch_warnings():  # around all starts, because filters apply to the process, not to a thread
-        warnings.simplefilter("ignore", ConvergenceWarning)  # the error is returned instead
-        found = list(each(partial(_from_start, X, k, None if metric is None else (metric + metric.T) / 2), starts))
+    # around all starts, because filters apply to the process, not to a thread
+    with warnings.catch_warnings():
+        # the error is returned instead
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        found = list(
+            each(
+                partial(
+                    _from_start,
+                    X,
+                    k,
+                    None if metric is None else (metric + metric.T) / 2,
+                ),
+                starts,
+            )
+        )
     errors = [error for error, _ in found]
     return Factorisation(
-        _canonical(found[int(np.argmin(errors))][1], X.mean(axis=0)), min(errors), max(errors) - min(errors)
+        _canonical(found[int(np.argmin(errors))][1], X.mean(axis=0)),
+        min(errors),
+        max(errors) - min(errors),
     )
 
 
-def _from_start(X: Array, k: int, A: Array | None, seed: int | None) -> tuple[float, Array]:
+def _from_start(
+    X: Array, k: int, A: Array | None, seed: int | None
+) -> tuple[float, Array]:
     """Relative error and H (k, m) from one start."""
     X = c_contiguous(X)
     A = None if A is None else c_contiguous(A)
@@ -86,19 +114,25 @@ def _from_start(X: Array, k: int, A: Array | None, seed: int | None) -> tuple[fl
 
 
 def _in_coefficients(X: Array, k: int, seed: int | None) -> tuple[Array, Array]:
-    """W and H that minimise |X - W H|, started from singular vectors, or at random if a seed is given."""
+    """W and H that minimise |X - W H|, started from singular vectors, or at random if a
+    seed is given.
+    """
     # single precision is three times faster, and its rounding is far below the error
     level = X.mean()
     scaled = (X / level).astype(np.float32)
     # the singular vectors also start from random ones: without a seed, from the global generator
     init = "nndsvda" if seed is None else "random"
-    model = NMF(k, init=init, max_iter=MAX_SWEEPS, random_state=0 if seed is None else seed)
+    model = NMF(
+        k, init=init, max_iter=MAX_SWEEPS, random_state=0 if seed is None else seed
+    )
     W = model.fit_transform(scaled)
     return W.astype(np.float64) * level, model.components_.astype(np.float64)
 
 
 def _in_metric(X: Array, W: Array, H: Array, A: Array) -> Array:
-    """H after block descent on tr((X - W H) A (X - W H)'), exact in each column of W and then each row of H."""
+    """H after block descent on tr((X - W H) A (X - W H)'), exact in each column of W
+    and then each row of H.
+    """
     XA = X @ A
     level = float((X * XA).sum())
     last = np.inf
@@ -106,11 +140,15 @@ def _in_metric(X: Array, W: Array, H: Array, A: Array) -> Array:
         gram = H @ A @ H.T
         rhs = XA @ H.T
         for j in np.flatnonzero(np.diag(gram) > 0):
-            W[:, j] = np.maximum(W[:, j] + (rhs[:, j] - W @ gram[:, j]) / gram[j, j], 0.0)
+            W[:, j] = np.maximum(
+                W[:, j] + (rhs[:, j] - W @ gram[:, j]) / gram[j, j], 0.0
+            )
         inner = W.T @ W
         cross = W.T @ X
         H = _next_rows(H, inner, cross, A)
-        square = level - 2 * float((cross @ A * H).sum()) + float((inner @ H @ A * H).sum())
+        square = (
+            level - 2 * float((cross @ A * H).sum()) + float((inner @ H @ A * H).sum())
+        )
         if last - square < TOLERANCE * level:
             break
         last = square
@@ -129,7 +167,9 @@ def _next_rows(H: Array, inner: Array, cross: Array, A: Array) -> Array:
 
 @dataclass(frozen=True)
 class Sums:
-    """Sufficient statistics of a block of X for H, with the best W for H; the sums of blocks can be added."""
+    """Sufficient statistics of a block of X for H, with the best W for H; the sums of
+    blocks can be added.
+    """
 
     inner: Array  # (k, k) W'W
     cross: Array  # (k, m) W'X
@@ -156,18 +196,29 @@ class Sums:
     def mean(self) -> Sums:
         """Sums per row of X, so that takes have equal weight whatever their number of surfels."""
         n = max(self.count, 1)
-        return Sums(self.inner / n, self.cross / n, self.total / n, self.square / n, self.count / n)
+        return Sums(
+            self.inner / n,
+            self.cross / n,
+            self.total / n,
+            self.square / n,
+            self.count / n,
+        )
 
     def error(self, H: Array, A: Array) -> float:
         """|X - W H| / |X|, from differences of sums, so that values below 1e-7 are rounding."""
-        left = self.square - 2 * float((self.cross @ A * H).sum()) + float((self.inner @ H @ A * H).sum())
+        left = (
+            self.square
+            - 2 * float((self.cross @ A * H).sum())
+            + float((self.inner @ H @ A * H).sum())
+        )
         return float(np.sqrt(max(left, 0.0) / self.square)) if self.square > 0 else 0.0
 
 
 def refine(
     H: Array, groups: Callable[[Array], Sequence[Sums]], A: Array
 ) -> tuple[Array, Sequence[Sums], NDArray[np.float64]]:
-    """Refine H (k, m) by passes over data that do not fit into memory, until the error stops decreasing.
+    """Refine H (k, m) by passes over data that do not fit into memory, until the error
+    stops decreasing.
 
     Parameters
     ----------
@@ -181,8 +232,9 @@ def refine(
     Returns
     -------
     H, sums, errors
-        H in canonical form; the sums of the groups, of which only those of X remain valid for this H; relative errors
-        before the first pass and after each, never increasing.
+        H in canonical form; the sums of the groups, of which only those of X remain
+        valid for this H; relative errors before the first pass and after each, never
+        increasing.
     """
     found = groups(H)
     errors = [_mean(found).error(H, A)]
@@ -213,7 +265,9 @@ def _mean(groups: Sequence[Sums]) -> Sums:
 def relative_error(X: Array, H: Array, A: Array) -> float:
     """|X - W H| / |X| in the metric A (m, m) with the best non-negative W."""
     left = X - _best_weights(X @ A, H, A) @ H
-    return float(np.sqrt(max(float((left @ A * left).sum()), 0.0) / float((X @ A * X).sum())))
+    return float(
+        np.sqrt(max(float((left @ A * left).sum()), 0.0) / float((X @ A * X).sum()))
+    )
 
 
 def _best_weights(XA: Array, H: Array, A: Array) -> Array:

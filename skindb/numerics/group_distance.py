@@ -1,9 +1,12 @@
-"""Distances between groups of vectors: permutation tests that are valid for unequal spreads, and maps of distances.
+"""Distances between groups of vectors: permutation tests that are valid for unequal
+spreads, and maps of distances.
 
-The statistic of two groups is the squared distance of their means divided by the sum of their mean squared scatters,
-each over its number of subjects; in one dimension it is the square of Welch's t. Without the scatters, the test would
-report a difference when one group is merely smaller and wider than the other (Anderson and Walsh 2013). Such statistics
-are permuted as in Chung and Romano (2016) and adjusted by the largest statistic as in Westfall and Young (1993).
+The statistic of two groups is the squared distance of their means divided by the sum of
+their mean squared scatters, each over its number of subjects; in one dimension it is
+the square of Welch's t. Without the scatters, the test would report a difference when
+one group is merely smaller and wider than the other (Anderson and Walsh 2013). Such
+statistics are permuted as in Chung and Romano (2016) and adjusted by the largest
+statistic as in Westfall and Young (1993).
 """
 
 from __future__ import annotations
@@ -22,8 +25,11 @@ Labels = NDArray[np.intp]
 REACHED = 1 - 1e-9  # tolerance for the same statistic summed in another order
 
 
-def between_groups_p(values: Array, group: Labels, *, most: int, rng: np.random.Generator) -> tuple[Array, Array, int]:
-    """Statistics and p values of all pairs of groups of different subjects, by permutation of the subjects.
+def between_groups_p(
+    values: Array, group: Labels, *, most: int, rng: np.random.Generator
+) -> tuple[Array, Array, int]:
+    """Statistics and p values of all pairs of groups of different subjects, by
+    permutation of the subjects.
 
     Parameters
     ----------
@@ -39,15 +45,17 @@ def between_groups_p(values: Array, group: Labels, *, most: int, rng: np.random.
     Returns
     -------
     statistic, p, count
-        Statistics (pairs,) in the order of ``itertools.combinations``; p values (pairs,) adjusted by the largest
-        statistic of all pairs; the number of permutations. The smallest p is 1 / (count + 1).
+        Statistics (pairs,) in the order of ``itertools.combinations``; p values
+        (pairs,) adjusted by the largest statistic of all pairs; the number of
+        permutations. The smallest p is 1 / (count + 1).
     """
     sizes = np.bincount(group)
     total = factorial(len(group)) // prod(factorial(int(n)) for n in sizes)
     if total - 1 <= most:
         draws = _arrangements(sizes.tolist())
         count = total - 1
-        observed = next(draws)  # the first arrangement has the groups in order, like the sorted values
+        # the first arrangement has the groups in order, like the sorted values
+        observed = next(draws)
     else:
         observed = np.repeat(np.arange(len(sizes)), sizes)
         draws = (rng.permutation(observed) for _ in range(most))
@@ -63,15 +71,20 @@ def between_groups_p(values: Array, group: Labels, *, most: int, rng: np.random.
     return statistic, (reached + 1) / (count + 1), count
 
 
-def within_subjects_p(values: Array, *, most: int, rng: np.random.Generator) -> tuple[Array, Array, int]:
-    """Statistics and p values of all pairs of conditions of the same subjects, by permutation within subjects.
+def within_subjects_p(
+    values: Array, *, most: int, rng: np.random.Generator
+) -> tuple[Array, Array, int]:
+    """Statistics and p values of all pairs of conditions of the same subjects, by
+    permutation within subjects.
 
     Parameters
     ----------
     values
-        (n, groups, k), NaN where a subject lacks a condition; each pair must have at least two subjects with both.
+        (n, groups, k), NaN where a subject lacks a condition; each pair must have at
+        least two subjects with both.
     most, rng
-        See `between_groups_p`. With two conditions, a permutation changes the signs of the subjects' differences.
+        See `between_groups_p`. With two conditions, a permutation changes the signs of
+        the subjects' differences.
 
     Returns
     -------
@@ -83,7 +96,9 @@ def within_subjects_p(values: Array, *, most: int, rng: np.random.Generator) -> 
     total = prod(lengths)
     chosen: Iterator[Labels]
     if total - 1 <= most:
-        chosen = islice((np.array(one) for one in product(*map(range, lengths))), 1, None)
+        chosen = islice(
+            (np.array(one) for one in product(*map(range, lengths))), 1, None
+        )
         count = total - 1
     else:
         chosen = (rng.integers(lengths) for _ in range(most))
@@ -92,14 +107,21 @@ def within_subjects_p(values: Array, *, most: int, rng: np.random.Generator) -> 
     rows = np.arange(len(values))[:, None]
     reached = np.zeros(len(statistic))
     while batch := list(islice(chosen, max(1, BATCH // max(values.size, 1)))):
-        order = np.stack([own[choice] for own, choice in zip(orders, np.stack(batch).T, strict=True)], axis=1)
+        order = np.stack(
+            [
+                own[choice]
+                for own, choice in zip(orders, np.stack(batch).T, strict=True)
+            ],
+            axis=1,
+        )
         largest = _within(values[rows, order]).max(axis=1)
         reached += (largest[:, None] >= REACHED * statistic).sum(axis=0)
     return statistic, (reached + 1) / (count + 1), count
 
 
 def classical_scaling(distance: Array, axes: int = 2) -> tuple[Array, Array, float]:
-    """Points whose distances approximate the given ones: principal coordinates (Torgerson 1952, Gower 1966).
+    """Points whose distances approximate the given ones: principal coordinates
+    (Torgerson 1952, Gower 1966).
 
     Parameters
     ----------
@@ -111,8 +133,9 @@ def classical_scaling(distance: Array, axes: int = 2) -> tuple[Array, Array, flo
     Returns
     -------
     place, explained, error
-        Centred points (n, axes), with the largest entry of each axis positive; fraction of the scatter along each axis
-        (axes,); RMS difference between distances in the map and the given ones, over the RMS distance.
+        Centred points (n, axes), with the largest entry of each axis positive; fraction
+        of the scatter along each axis (axes,); RMS difference between distances in the
+        map and the given ones, over the RMS distance.
     """
     n = len(distance)
     centre = np.eye(n) - 1 / n
@@ -123,11 +146,15 @@ def classical_scaling(distance: Array, axes: int = 2) -> tuple[Array, Array, flo
     total = variance.sum() or 1.0
     kept = variance[:axes]
     place = vectors[:, :axes] * np.sqrt(np.where(kept > ROUNDING * total, kept, 0.0))
-    place = place * np.where(place[np.abs(place).argmax(axis=0), np.arange(place.shape[1])] < 0, -1.0, 1.0)
+    place = place * np.where(
+        place[np.abs(place).argmax(axis=0), np.arange(place.shape[1])] < 0, -1.0, 1.0
+    )
     place = np.pad(place, ((0, 0), (0, axes - place.shape[1])))
     explained = np.pad(kept, (0, axes - len(kept))) / total
     found = np.linalg.norm(place[:, None] - place[None], axis=-1)
-    error = float(np.sqrt(((found - distance) ** 2).sum() / ((distance**2).sum() or 1.0)))
+    error = float(
+        np.sqrt(((found - distance) ** 2).sum() / ((distance**2).sum() or 1.0))
+    )
     return place, explained, error
 
 
@@ -139,29 +166,40 @@ def _between(values: Array, group: Labels, sizes: Labels) -> Array:
     for g, size in enumerate(sizes.tolist()):
         member = (group == g).astype(np.float64)
         mean = member @ values / size
-        scatter = np.maximum(member @ square - size * (mean**2).sum(axis=1), 0.0) / (size - 1)
+        scatter = np.maximum(member @ square - size * (mean**2).sum(axis=1), 0.0) / (
+            size - 1
+        )
         means.append(mean)
         errors.append(np.where(scatter > ROUNDING * square.max(), scatter, 0.0) / size)
     pairs = combinations(range(len(sizes)), 2)
-    return np.stack([_ratio(means[a] - means[b], errors[a] + errors[b]) for a, b in pairs], axis=1)
+    return np.stack(
+        [_ratio(means[a] - means[b], errors[a] + errors[b]) for a, b in pairs], axis=1
+    )
 
 
 def _within(values: Array) -> Array:
-    """Statistics (b, pairs) of values (b, n, groups, k), from the subjects who have both conditions of a pair."""
+    """Statistics (b, pairs) of values (b, n, groups, k), from the subjects who have
+    both conditions of a pair.
+    """
     found = []
     for a, b in combinations(range(values.shape[2]), 2):
         difference = values[:, :, a] - values[:, :, b]
-        difference = difference[:, np.isfinite(difference[0]).all(axis=1)]  # the same subjects in all permutations
+        # the same subjects in all permutations
+        difference = difference[:, np.isfinite(difference[0]).all(axis=1)]
         n = difference.shape[1]
         mean = difference.mean(axis=1)
         scatter = ((difference - mean[:, None]) ** 2).sum(axis=(1, 2)) / (n - 1)
         largest = (difference**2).sum(axis=2).max(axis=1)
-        found.append(_ratio(mean, np.where(scatter > ROUNDING * largest, scatter, 0.0) / n))
+        found.append(
+            _ratio(mean, np.where(scatter > ROUNDING * largest, scatter, 0.0) / n)
+        )
     return np.stack(found, axis=1)
 
 
 def _ratio(step: Array, error: Array) -> Array:
-    """Squared lengths of steps (b, k) over squared errors (b,); infinite if the error is zero, 0 for a zero step."""
+    """Squared lengths of steps (b, k) over squared errors (b,); infinite if the error
+    is zero, 0 for a zero step.
+    """
     square = (step**2).sum(axis=1)
     lone = np.where(square > 0, np.inf, 0.0)
     return np.divide(square, error, out=lone, where=error > 0)
@@ -172,7 +210,9 @@ def _without_rounding(centred: Array, values: Array) -> Array:
 
 
 def _arrangements(sizes: Sequence[int]) -> Iterator[Labels]:
-    """Every distinct order of labels, given the number of labels of each group; the first is sorted."""
+    """Every distinct order of labels, given the number of labels of each group; the
+    first is sorted.
+    """
 
     def placed(labels: Labels, free: Labels, g: int) -> Iterator[Labels]:
         if g == len(sizes) - 1:
@@ -189,9 +229,13 @@ def _arrangements(sizes: Sequence[int]) -> Iterator[Labels]:
 
 
 def _orders(there: NDArray[np.bool_]) -> Labels:
-    """Permutations (orders, groups) of the conditions that a subject has; the first is the identity."""
+    """Permutations (orders, groups) of the conditions that a subject has; the first is
+    the identity.
+    """
     known = np.flatnonzero(there)
-    every = np.array(list(permutations(known.tolist())), np.intp).reshape(-1, len(known))
+    every = np.array(list(permutations(known.tolist())), np.intp).reshape(
+        -1, len(known)
+    )
     orders = np.tile(np.arange(len(there)), (len(every), 1))
     orders[:, known] = every
     return orders

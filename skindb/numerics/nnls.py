@@ -19,15 +19,21 @@ class ReflectanceFit:
     """Weights and certificates of n surfels; NaN for surfels that were not fitted, see `status`."""
 
     weight: Array  # (n, m)
-    kkt: Array  # (n,) relative KKT residual: dual feasibility and complementarity over max |M' R|
+    # (n,) relative KKT residual: dual feasibility and complementarity over max |M' R|
+    kkt: Array
     iterations: NDArray[np.int32]  # (n,)
     residual: Array  # (n,) |M x - R| / |R|
     residual_perceptual: Array  # (n,) the same in cube-root space
-    status: NDArray[np.uint8]  # (n,) 0 fitted, 2 too few samples, 5 not converged, 6 not finite
+    # (n,) 0 fitted, 2 too few samples, 5 not converged, 6 not finite
+    status: NDArray[np.uint8]
 
 
 def solve_nnls(
-    gram: ArrayLike, rhs: ArrayLike, *, tolerance: float = 1e-10, warm: ArrayLike | None = None
+    gram: ArrayLike,
+    rhs: ArrayLike,
+    *,
+    tolerance: float = 1e-10,
+    warm: ArrayLike | None = None,
 ) -> tuple[Array, Array, NDArray[np.int32], NDArray[np.bool_]]:
     """Minimise |M x - r| over x >= 0 given M'M and M'r.
 
@@ -45,10 +51,15 @@ def solve_nnls(
     x, kkt, iterations, converged
         (n, m) and (n,) each; x is NaN and converged False where the input is not finite.
     """
-    # C order: a broadcast array would be copied in the order of its strides, for which the kernel is compiled again
+    # C order: a broadcast array would be copied in the order of its strides, for which
+    # the kernel is compiled again
     G = np.array(gram, np.float64, order="C")
     b = np.array(rhs, np.float64, order="C")
-    x = np.zeros_like(b) if warm is None else np.maximum(np.array(warm, np.float64, order="C"), 0.0)
+    x = (
+        np.zeros_like(b)
+        if warm is None
+        else np.maximum(np.array(warm, np.float64, order="C"), 0.0)
+    )
     kkt = np.full(len(b), np.nan)
     count = np.zeros(len(b), np.int32)
     met = np.zeros(len(b), np.bool_)
@@ -79,15 +90,18 @@ def fit_reflectance(
     offsets
         (n + 1,) index of the first row of each surfel, and the total.
     target
-        (total, channels) samples minus the diffuse term [sr^-1]; negative values are used unchanged.
+        (total, channels) samples minus the diffuse term [sr^-1]; negative values are
+        used unchanged.
     weight
         (total,) non-negative, or None for ones.
     lift
         (r, m): M = rows @ lift.
     mode
-        "linear": min |M x - R|. "perceptual": min |root(M x) - root(R)| with root(y) = y / (y^2 + floor^2)^(1/3),
-        the signed cube root that is linear below the noise floor, by Gauss-Newton with a line search; then one linear
-        step weighted with the squared slopes of the root, which is not biased by noise as the cube root is.
+        "linear": min |M x - R|. "perceptual": min |root(M x) - root(R)| with root(y) =
+        y / (y^2 + floor^2)^(1/3), the signed cube root that is linear below the noise
+        floor, by Gauss-Newton with a line search; then one linear step weighted with
+        the squared slopes of the root, which is not biased by noise as the cube root
+        is.
     noise_floor
         [sr^-1], positive; not used by "linear".
     min_samples
@@ -109,7 +123,9 @@ def fit_reflectance(
         np.ascontiguousarray(rows),
         np.asarray(offsets, np.int64),
         np.ascontiguousarray(target, np.float64),
-        np.ones(len(rows)) if weight is None else np.ascontiguousarray(weight, np.float64),
+        np.ones(len(rows))
+        if weight is None
+        else np.ascontiguousarray(weight, np.float64),
         np.ascontiguousarray(lift, np.float64),
         mode == "perceptual",
         float(noise_floor),

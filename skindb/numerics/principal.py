@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from skindb._types import Array
 
-BLOCK = 1 << 16  # entries per vector that are held in double precision at a time: 90 MB for 174 vectors
+# entries per vector that are held in double precision at a time: 90 MB for 174 vectors
+BLOCK = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -17,7 +18,8 @@ class Components:
     """Mean and principal axes of vectors, and the scores of each vector."""
 
     mean: Array  # (d,)
-    axes: Array  # (c, d) of unit norm, by decreasing variance; the largest entry of each is positive
+    # (c, d) of unit norm, by decreasing variance; the largest entry of each is positive
+    axes: Array
     score: Array  # (n, c)
     variance: Array  # (c,) unbiased variance of the scores
     total: float  # sum of the variances of all entries
@@ -25,10 +27,12 @@ class Components:
 
 
 def principal_axes(vectors: NDArray[np.floating], most: int) -> Components:
-    """Principal components of vectors (n, d), n at least 2, from the eigenvectors of their inner products.
+    """Principal components of vectors (n, d), n at least 2, from the eigenvectors of
+    their inner products.
 
-    Vectors are read block by block, so that no full copy in double precision is needed. Components whose variance is
-    below 1e-12 of the largest are rounding and are dropped.
+    Vectors are read block by block, so that no full copy in double precision is needed.
+    Components whose variance is below 1e-12 of the largest are rounding and are
+    dropped.
 
     Parameters
     ----------
@@ -56,10 +60,14 @@ def principal_axes(vectors: NDArray[np.floating], most: int) -> Components:
     for block in blocks:
         x = vectors[:, block] - mean[block]
         axes[:, block] = (places[:, :there] / length).T @ x
-        residual += ((x - (places[:, :there] * length) @ axes[:, block]) ** 2).sum(axis=1)
+        residual += ((x - (places[:, :there] * length) @ axes[:, block]) ** 2).sum(
+            axis=1
+        )
     largest = np.abs(axes).argmax(axis=1)
     sign = np.where(axes[np.arange(there), largest] < 0, -1.0, 1.0)
     score = places[:, :there] * (length * sign)
     variance = values[:there] / (n - 1)
     total = float(np.trace(inner)) / (n - 1)
-    return Components(mean, axes * sign[:, None], score, variance, total, np.sqrt(residual / d))
+    return Components(
+        mean, axes * sign[:, None], score, variance, total, np.sqrt(residual / d)
+    )

@@ -1,7 +1,9 @@
-"""Steerable pyramid of an image in the Fourier domain (Simoncelli and Freeman 1995; Portilla and Simoncelli 2000).
+"""Steerable pyramid of an image in the Fourier domain (Simoncelli and Freeman 1995;
+Portilla and Simoncelli 2000).
 
-All masks are functions of the frequency in the whole image, so that images may have any size and aspect ratio.
-Transforms use the number of threads set by `scipy.fft.set_workers`, one by default.
+All masks are functions of the frequency in the whole image, so that images may have any
+size and aspect ratio. Transforms use the number of threads set by
+`scipy.fft.set_workers`, one by default.
 """
 
 from __future__ import annotations
@@ -21,10 +23,14 @@ Spectrum = NDArray[np.complexfloating[Any, Any]]
 
 @dataclass(frozen=True)
 class Pyramid:
-    """High-pass residual, oriented bands of every level, and low-pass residual, from which the image can be rebuilt."""
+    """High-pass residual, oriented bands of every level, and low-pass residual, from
+    which the image can be rebuilt.
+    """
 
     high: Image  # (h, w)
-    bands: list[Image]  # one (orientations, h_k, w_k) per level, each level half as large as the previous one
+    # one (orientations, h_k, w_k) per level, each level half as large as the previous
+    # one
+    bands: list[Image]
     low: Image  # (h_n, w_n)
 
     def parts(self) -> list[Image]:
@@ -49,15 +55,17 @@ def build(image: Image, levels: int = 7, orientations: int = 4) -> Pyramid:
     image
         (h, w), computed in single precision if it is float32, and otherwise in double precision.
     levels
-        Number of octaves; each halves both sides, rounded up, at most until the low-pass residual has one entry.
+        Number of octaves; each halves both sides, rounded up, at most until the
+        low-pass residual has one entry.
     orientations
-        Number of bands per level; the first responds to changes along w, the others follow in steps of
-        pi / orientations.
+        Number of bands per level; the first responds to changes along w, the others
+        follow in steps of pi / orientations.
 
     Returns
     -------
     Pyramid
-        `reconstruct` returns the image to within 1e-12 of its range in double precision, 1e-6 in single precision.
+        `reconstruct` returns the image to within 1e-12 of its range in double
+        precision, 1e-6 in single precision.
 
     Raises
     ------
@@ -67,11 +75,14 @@ def build(image: Image, levels: int = 7, orientations: int = 4) -> Pyramid:
     image = np.asarray(image)
     image = image if image.dtype == np.float32 else image.astype(np.float64)
     if image.ndim != 2 or not image.size or not np.isfinite(image).all():
-        raise ValueError(f"an image must have two dimensions and finite values, not the shape {image.shape}")
+        raise ValueError(
+            f"an image must have two dimensions and finite values, not the shape {image.shape}"
+        )
     if orientations < 1 or levels < 0 or 2**levels > max(image.shape):
         most = max(image.shape).bit_length() - 1
         raise ValueError(
-            f"an image {image.shape} must have 0 to {most} levels of 1 or more bands, not {levels} of {orientations}"
+            f"an image {image.shape} must have 0 to {most} levels of 1 or more "
+            f"bands, not {levels} of {orientations}"
         )
     spectrum = _transform(image)
     whole = image.shape
@@ -83,14 +94,23 @@ def build(image: Image, levels: int = 7, orientations: int = 4) -> Pyramid:
     for level, (size, smaller) in enumerate(_sizes(whole, levels)):
         low, high = _low(size, whole, level + 1, kind)
         ring = spectrum * high * _phase(orientations, kind)
-        bands.append(np.stack([_image(ring * mask, size) for mask in _angular(size, whole, orientations, kind)]))
+        bands.append(
+            np.stack(
+                [
+                    _image(ring * mask, size)
+                    for mask in _angular(size, whole, orientations, kind)
+                ]
+            )
+        )
         spectrum = _cropped(spectrum * low, smaller)
     size = _sizes(image.shape, levels)[-1][1] if levels else image.shape
     return Pyramid(residual, bands, _image(spectrum, size))
 
 
 def reconstruct(pyramid: Pyramid) -> Image:
-    """Rebuild the image of a pyramid as the sum of its parts, filtered with the masks of the decomposition."""
+    """Rebuild the image of a pyramid as the sum of its parts, filtered with the masks
+    of the decomposition.
+    """
     whole = pyramid.high.shape
     kind = pyramid.high.dtype.type
     spectrum = _transform(pyramid.low)
@@ -107,7 +127,9 @@ def reconstruct(pyramid: Pyramid) -> Image:
     return _image(spectrum * low + _transform(pyramid.high) * high, whole)
 
 
-def _sizes(shape: tuple[int, ...], levels: int) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
+def _sizes(
+    shape: tuple[int, ...], levels: int
+) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
     """Sizes of each level and of the next one."""
     found = []
     for _ in range(levels):
@@ -117,17 +139,25 @@ def _sizes(shape: tuple[int, ...], levels: int) -> list[tuple[tuple[int, ...], t
     return found
 
 
-def _frequencies(size: tuple[int, ...], whole: tuple[int, ...], kind: Any) -> tuple[Image, Image]:
-    """Frequencies of the spectrum of a level, in cycles per entry of the whole image, at most 0.5."""
+def _frequencies(
+    size: tuple[int, ...], whole: tuple[int, ...], kind: Any
+) -> tuple[Image, Image]:
+    """Frequencies of the spectrum of a level, in cycles per entry of the whole image,
+    at most 0.5.
+    """
     rows = fftfreq(size[0], 1 / size[0]) / whole[0]
-    return rows[:, None].astype(kind), (rfftfreq(size[1], 1 / size[1]) / whole[1])[None].astype(kind)
+    return rows[:, None].astype(kind), (rfftfreq(size[1], 1 / size[1]) / whole[1])[
+        None
+    ].astype(kind)
 
 
-def _low(size: tuple[int, ...], whole: tuple[int, ...], level: int, kind: Any) -> tuple[Image, Image]:
+def _low(
+    size: tuple[int, ...], whole: tuple[int, ...], level: int, kind: Any
+) -> tuple[Image, Image]:
     """Low-pass and high-pass mask, whose squares add up to 1.
 
-    The first is 1 up to half of the highest frequency of a level, 0 above the highest frequency, and a cosine of the
-    logarithm of the frequency in between.
+    The first is 1 up to half of the highest frequency of a level, 0 above the highest
+    frequency, and a cosine of the logarithm of the frequency in between.
     """
     rows, columns = _frequencies(size, whole, kind)
     square = rows * rows + columns * columns
@@ -140,8 +170,12 @@ def _low(size: tuple[int, ...], whole: tuple[int, ...], level: int, kind: Any) -
     return low, high
 
 
-def _angular(size: tuple[int, ...], whole: tuple[int, ...], orientations: int, kind: Any) -> Iterator[Image]:
-    """Oriented masks, powers of the cosine of the angle to each direction, whose squares add up to 1."""
+def _angular(
+    size: tuple[int, ...], whole: tuple[int, ...], orientations: int, kind: Any
+) -> Iterator[Image]:
+    """Oriented masks, powers of the cosine of the angle to each direction, whose
+    squares add up to 1.
+    """
     rows, columns = _frequencies(size, whole, kind)
     order = orientations - 1
     scale = 2**order * factorial(order) / sqrt(orientations * factorial(2 * order))
@@ -157,7 +191,9 @@ def _angular(size: tuple[int, ...], whole: tuple[int, ...], orientations: int, k
 
 
 def _phase(orientations: int, kind: Any) -> Any:
-    """Factor that makes the bands real, because odd powers of the cosine are odd functions of the frequency."""
+    """Factor that makes the bands real, because odd powers of the cosine are odd
+    functions of the frequency.
+    """
     return np.result_type(kind, np.complex64).type((-1j) ** (orientations - 1))
 
 
@@ -165,7 +201,9 @@ def _cropped(spectrum: Spectrum, size: tuple[int, ...]) -> Spectrum:
     """Crop a spectrum to the frequencies of a smaller image; the mask has set the others to 0."""
     rows = (size[0] + 1) // 2
     columns = size[1] // 2 + 1
-    return np.concatenate([spectrum[:rows, :columns], spectrum[len(spectrum) - size[0] // 2 :, :columns]])
+    return np.concatenate(
+        [spectrum[:rows, :columns], spectrum[len(spectrum) - size[0] // 2 :, :columns]]
+    )
 
 
 def _widened(spectrum: Spectrum, size: tuple[int, ...]) -> Spectrum:

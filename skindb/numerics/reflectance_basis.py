@@ -1,8 +1,10 @@
-"""Bases of non-negative mixtures estimated directly from reflectance (Weyrich et al. 2005, sections 7 and 10.1).
+"""Bases of non-negative mixtures estimated directly from reflectance (Weyrich et al.
+2005, sections 7 and 10.1).
 
-Weights of many similar BRDFs are not unique, so a factorisation of fitted weights may not represent the reflectance
-well. Here the rows of H minimise the residual of the samples: sum over surfels s of |M_s H' w_s - r_s|^2, with w_s and
-H non-negative, by non-negative least squares on the normal equations of the surfels.
+Weights of many similar BRDFs are not unique, so a factorisation of fitted weights may
+not represent the reflectance well. Here the rows of H minimise the residual of the
+samples: sum over surfels s of |M_s H' w_s - r_s|^2, with w_s and H non-negative, by
+non-negative least squares on the normal equations of the surfels.
 """
 
 from __future__ import annotations
@@ -20,9 +22,15 @@ from skindb.numerics.nnls import solve_nnls
 
 STEPS = 100  # iterations of the descent after every change of size
 POLISH = 40  # iterations of the last descent, in the full space of the BRDFs
-MERGES = 3  # number of merges tried per size: with the cheapest alone, the error was 0.7 % above a planted basis
-WORST = 0.02  # fraction of surfels whose mean weights start a new component, so that no single outlier does
-SPACE = 16  # dimensions of the linear space used while searching for H (DESIGN.md: 12 to 16 represent 59 BRDFs)
+# number of merges tried per size: with the cheapest alone, the error was 0.7 % above a
+# planted basis
+MERGES = 3
+# fraction of surfels whose mean weights start a new component, so that no single
+# outlier does
+WORST = 0.02
+# dimensions of the linear space used while searching for H (DESIGN.md: 12 to 16
+# represent 59 BRDFs)
+SPACE = 16
 
 
 @dataclass(frozen=True)
@@ -36,7 +44,9 @@ class Systems:
 
     @classmethod
     def of(cls, rows: Array, offsets: NDArray[np.int64], target: Array) -> Systems:
-        """Normal equations of rows (total, m) and samples (total, channels); `offsets` (n + 1,) start each surfel."""
+        """Normal equations of rows (total, m) and samples (total, channels); `offsets`
+        (n + 1,) start each surfel.
+        """
         n = len(offsets) - 1
         m = rows.shape[1]
         gram = np.zeros((n, m, m))
@@ -47,36 +57,50 @@ class Systems:
             rhs[s] = own.T @ target[start:stop].sum(axis=1)
         surfel = np.repeat(np.arange(n), np.diff(offsets))
         square = np.asarray(np.bincount(surfel, (target**2).sum(axis=1), n), np.float64)
-        return cls(gram, rhs, square, np.diff(offsets).astype(np.float64) * target.shape[1])
+        return cls(
+            gram, rhs, square, np.diff(offsets).astype(np.float64) * target.shape[1]
+        )
 
     def within(self, H: Array) -> Systems:
         """Normal equations for the weights of k mixtures H (k, m)."""
         return Systems(H @ self.gram @ H.T, self.rhs @ H.T, self.square, self.count)
 
     def __getitem__(self, chosen: Any) -> Systems:
-        return Systems(self.gram[chosen], self.rhs[chosen], self.square[chosen], self.count[chosen])
+        return Systems(
+            self.gram[chosen], self.rhs[chosen], self.square[chosen], self.count[chosen]
+        )
 
     @staticmethod
     def joined(parts: list[Systems]) -> Systems:
         """Concatenate the systems of several takes."""
-        return Systems(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Systems)))
+        return Systems(
+            *(
+                np.concatenate([getattr(p, f.name) for p in parts])
+                for f in fields(Systems)
+            )
+        )
 
 
 def residuals(systems: Systems, H: Array | None = None) -> tuple[Array, Array]:
-    """Non-negative weights (n, k) of the mixtures H (k, m), or of all m BRDFs, and squared residuals (n,)."""
+    """Non-negative weights (n, k) of the mixtures H (k, m), or of all m BRDFs, and
+    squared residuals (n,).
+    """
     own = systems if H is None else systems.within(H)
     x, _, _, _ = solve_nnls(own.gram, own.rhs)
-    fitted = np.einsum("nk,nkl,nl->n", x, own.gram, x) - 2 * np.einsum("nk,nk->n", own.rhs, x)
+    fitted = np.einsum("nk,nkl,nl->n", x, own.gram, x) - 2 * np.einsum(
+        "nk,nk->n", own.rhs, x
+    )
     return x, np.maximum(systems.square + fitted, 0.0)
 
 
 def factor_reflectance(systems: Systems, largest: int) -> list[Array]:
     """Bases of 1, 2, ... `largest` mixtures, each H (k, m) non-negative with rows of unit sum.
 
-    The basis first grows one component at a time, each started at the full weights of the surfels with the largest
-    residuals. It then shrinks again, each time by the best of three removals or mergers of two components. Of the two
-    bases of a size the better one is kept; shrinking ends in far better minima than random starts. In a last upward
-    pass every size is also started from the size below.
+    The basis first grows one component at a time, each started at the full weights of
+    the surfels with the largest residuals. It then shrinks again, each time by the best
+    of three removals or mergers of two components. Of the two bases of a size the
+    better one is kept; shrinking ends in far better minima than random starts. In a
+    last upward pass every size is also started from the size below.
     """
     weights, least = residuals(systems)
     small, lift = _compress(systems)
@@ -87,30 +111,51 @@ def factor_reflectance(systems: Systems, largest: int) -> list[Array]:
         up.append(H)
     best = {largest: H}
     for k in range(largest - 1, 0, -1):
-        H = _best(small, lift, [_descend(small, lift, merged) for merged in _cheapest_merges(small, lift, H)])
+        H = _best(
+            small,
+            lift,
+            [
+                _descend(small, lift, merged)
+                for merged in _cheapest_merges(small, lift, H)
+            ],
+        )
         best[k] = _best(small, lift, [up[k - 1], H])
-    for k in range(1, largest):  # one more mixture cannot increase the error, and the size below may be a better start
+    # one more mixture cannot increase the error, and the size below may be a better
+    # start
+    for k in range(1, largest):
         grown = _descend(small, lift, _grown(small, lift, best[k], weights, least))
         best[k + 1] = _best(small, lift, [best[k + 1], grown])
-    whole = np.eye(len(lift))  # the error of the compressed space is a third of the noise, if the noise is 1 %
-    return [_unit_sum(_descend(systems, whole, best[k], steps=POLISH)) for k in range(1, largest + 1)]
+    # the error of the compressed space is a third of the noise, if the noise is 1 %
+    whole = np.eye(len(lift))
+    return [
+        _unit_sum(_descend(systems, whole, best[k], steps=POLISH))
+        for k in range(1, largest + 1)
+    ]
 
 
 def _best(systems: Systems, lift: Array, bases: list[Array]) -> Array:
-    return min(bases, key=lambda basis: float(residuals(systems, basis @ lift)[1].sum()))
+    return min(
+        bases, key=lambda basis: float(residuals(systems, basis @ lift)[1].sum())
+    )
 
 
-def _grown(systems: Systems, lift: Array, H: Array, weights: Array, least: Array) -> Array:
-    """H with one more row: the mean weights of the surfels with the largest excess over a fit of all BRDFs."""
+def _grown(
+    systems: Systems, lift: Array, H: Array, weights: Array, least: Array
+) -> Array:
+    """H with one more row: the mean weights of the surfels with the largest excess over
+    a fit of all BRDFs.
+    """
     excess = residuals(systems, H @ lift)[1] - least
     worst = np.argsort(excess)[-max(1, round(WORST * len(excess))) :]
     return np.concatenate([H, weights[worst].mean(axis=0, keepdims=True)])
 
 
 def _compress(systems: Systems) -> tuple[Systems, Array]:
-    """Systems in the space of SPACE dimensions with most of the reflectance, and lift (m, SPACE); H becomes H lift.
+    """Systems in the space of SPACE dimensions with most of the reflectance, and lift
+    (m, SPACE); H becomes H lift.
 
-    The space is spanned by the leading eigenvectors of the mean Gram matrix of columns of unit norm.
+    The space is spanned by the leading eigenvectors of the mean Gram matrix of columns
+    of unit norm.
     """
     mean = systems.gram.mean(axis=0)
     norm = np.sqrt(np.maximum(np.diag(mean), 0.0))
@@ -121,13 +166,16 @@ def _compress(systems: Systems) -> tuple[Systems, Array]:
 
 
 def _descend(systems: Systems, lift: Array, H: Array, *, steps: int = STEPS) -> Array:
-    """Minimise the residual over H >= 0, with the best weights for each H, by quasi-Newton steps (L-BFGS-B).
+    """Minimise the residual over H >= 0, with the best weights for each H, by
+    quasi-Newton steps (L-BFGS-B).
 
-    Because the weights are optimal, the gradient equals that for fixed weights (Golub and Pereyra 1973). Alternating
-    between weights and H instead stops in long valleys, several tenths of a per cent above the minimum.
+    Because the weights are optimal, the gradient equals that for fixed weights (Golub
+    and Pereyra 1973). Alternating between weights and H instead stops in long valleys,
+    several tenths of a per cent above the minimum.
     """
     mean = lift @ systems.gram.mean(axis=0) @ lift.T
-    norm = np.sqrt(np.maximum(np.diag(mean), 0.0))  # gives matt and glossy BRDFs the same scale
+    # gives matt and glossy BRDFs the same scale
+    norm = np.sqrt(np.maximum(np.diag(mean), 0.0))
     norm = np.where(norm > 0, norm, 1.0)
     x, squares = residuals(systems, H @ lift)
     use = np.sqrt((x**2).mean(axis=0))
@@ -141,18 +189,33 @@ def _descend(systems: Systems, lift: Array, H: Array, *, steps: int = STEPS) -> 
         fitted = x @ own
         slope = (systems.gram @ fitted[..., None])[..., 0] - systems.rhs
         square = systems.square.sum() + float((fitted * (slope - systems.rhs)).sum())
-        return float(square) / total, (2 * (x.T @ slope) @ lift.T / norm / total).ravel()
+        return float(square) / total, (
+            2 * (x.T @ slope) @ lift.T / norm / total
+        ).ravel()
 
     start = np.where(use > 0, use, 1.0)[:, None] * H * norm
-    options = {"maxiter": steps, "maxfun": 2 * steps, "maxcor": 20, "ftol": 1e-7, "gtol": 0.0}
+    options = {
+        "maxiter": steps,
+        "maxfun": 2 * steps,
+        "maxcor": 20,
+        "ftol": 1e-7,
+        "gtol": 0.0,
+    }
     found = minimize(
-        objective, start.ravel(), jac=True, method="L-BFGS-B", bounds=[(0, None)] * H.size, options=options
+        objective,
+        start.ravel(),
+        jac=True,
+        method="L-BFGS-B",
+        bounds=[(0, None)] * H.size,
+        options=options,
     )
     return np.asarray(found.x.reshape(H.shape) / norm)
 
 
 def _cheapest_merges(systems: Systems, lift: Array, H: Array) -> list[Array]:
-    """The MERGES best versions of H with one row less: one removed, or two replaced by their weighted sum."""
+    """The MERGES best versions of H with one row less: one removed, or two replaced by
+    their weighted sum.
+    """
     total = residuals(systems, H @ lift)[0].sum(axis=0)
     few = systems[:: max(1, len(systems.square) // 500)]  # enough to rank candidates
     candidates = [np.delete(H, i, 0) for i in range(len(H))]
@@ -161,7 +224,9 @@ def _cheapest_merges(systems: Systems, lift: Array, H: Array) -> list[Array]:
             merged = np.delete(H, i, 0)
             merged[j] = total[i] * H[i] + total[j] * H[j]
             candidates.append(merged)
-    return sorted(candidates, key=lambda basis: float(residuals(few, basis @ lift)[1].sum()))[:MERGES]
+    return sorted(
+        candidates, key=lambda basis: float(residuals(few, basis @ lift)[1].sum())
+    )[:MERGES]
 
 
 def _unit_sum(H: Array) -> Array:

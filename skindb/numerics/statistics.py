@@ -13,7 +13,9 @@ from skindb._types import Array
 
 @dataclass(frozen=True)
 class Moments:
-    """Count, mean and centred second moment along the first axis; moments of parts of a population can be added."""
+    """Count, mean and centred second moment along the first axis; moments of parts of a
+    population can be added.
+    """
 
     count: Array
     mean: Array
@@ -44,7 +46,9 @@ class Moments:
     @property
     def variance(self) -> Array:
         """Unbiased variance; NaN for fewer than two values."""
-        return np.where(self.count > 1, self.second / np.maximum(self.count - 1.0, 1.0), np.nan)
+        return np.where(
+            self.count > 1, self.second / np.maximum(self.count - 1.0, 1.0), np.nan
+        )
 
     @property
     def standard_deviation(self) -> Array:
@@ -58,7 +62,9 @@ class Moments:
         return self.mean - half, self.mean + half
 
     def deviation_interval(self, *, level: float = 0.95) -> tuple[Array, Array]:
-        """Chi-square interval of the standard deviation of normal values; NaN for fewer than two values."""
+        """Chi-square interval of the standard deviation of normal values; NaN for fewer
+        than two values.
+        """
         free = np.maximum(self.count - 1.0, 1.0)
         low = stats.chi2.ppf((1 + level) / 2, free)
         high = stats.chi2.ppf((1 - level) / 2, free)
@@ -74,11 +80,15 @@ def bootstrap_interval(
     draws: int = 1000,
     level: float = 0.95,
 ) -> tuple[Array, Array]:
-    """Percentile interval of `statistic(values[drawn rows])`, rows drawn with replacement (Efron 1979)."""
+    """Percentile interval of `statistic(values[drawn rows])`, rows drawn with
+    replacement (Efron 1979).
+    """
     n = len(values)
     if n == 0:
         raise ValueError("values must have at least one row for a bootstrap")
-    results = np.stack([statistic(values[rng.integers(n, size=n)]) for _ in range(draws)])
+    results = np.stack(
+        [statistic(values[rng.integers(n, size=n)]) for _ in range(draws)]
+    )
     low, high = np.quantile(results, [(1 - level) / 2, (1 + level) / 2], axis=0)
     return low, high
 

@@ -1,1 +1,3 @@
-"""Numerical optics on plain arrays: Fresnel equations, diffusion, angles, and tables of measured BRDFs."""
+"""Numerical optics on plain arrays: Fresnel equations, diffusion, angles, and tables of
+measured BRDFs.
+"""

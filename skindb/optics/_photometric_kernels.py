@@ -1,7 +1,8 @@
 """Compiled estimates of normals from reflectance samples; see `skindb.optics.photometric`.
 
-Arrays over lights are rows of single precision, so that loops over lights run in vector registers; 3 x 3 sums are in
-double precision. Order statistics come from sorting networks and from counting, which have no branches.
+Arrays over lights are rows of single precision, so that loops over lights run in vector
+registers; 3 x 3 sums are in double precision. Order statistics come from sorting
+networks and from counting, which have no branches.
 """
 
 from __future__ import annotations
@@ -15,18 +16,23 @@ from skindb._compiled import fast_kernel, inline_fast_kernel, inline_kernel, ker
 from skindb._half_kernels import scale_to_one, unpack
 from skindb._select_kernels import median_of, sort_columns
 
-MIN_COSINE_CAMERA = np.float32(0.2)  # below it, a pixel may include the background behind the silhouette
-MIN_COSINE_LIGHT = np.float32(0.1)  # below it, the linear model fails (half-hidden disc, terminator)
+# below it, a pixel may include the background behind the silhouette
+MIN_COSINE_CAMERA = np.float32(0.2)
+# below it, the linear model fails (half-hidden disc, terminator)
+MIN_COSINE_LIGHT = np.float32(0.1)
 SHADE_QUANTILE = 0.25  # over cameras; below the highlights, above the darkest outliers
-# number of lights that count as independent; with all 150, the prior of the scan would be ineffective. It lowers the
-# 95 % quantile of errors from 7.4 to 4.3 degrees
+# number of lights that count as independent; with all 150, the prior of the scan would
+# be ineffective. It lowers the 95 % quantile of errors from 7.4 to 4.3 degrees
 INDEPENDENT_LIGHTS = 8
 # 95 % efficiency for normal noise; converges in 6 to 10 iterations
 TUKEY = 4.685
 MAX_ITERATIONS = 12
-# squared change of the normal that ends the iteration: 0.002 degrees, a hundredth of the smallest error
+# squared change of the normal that ends the iteration: 0.002 degrees, a hundredth of
+# the smallest error
 MIN_SQUARED_CHANGE = 1e-9
-BRIGHTEST = 5  # lights that determine a camera's direction of maximum reflectance; the last one is the base level
+# lights that determine a camera's direction of maximum reflectance; the last one is the
+# base level
+BRIGHTEST = 5
 ZERO = np.float32(0)
 ONE = np.float32(1)
 HALF = np.float32(0.5)
@@ -42,7 +48,8 @@ class Buffers(NamedTuple):
     used: Any  # (cameras,) indices of cameras that are used
     white: Any  # (cameras, lights) mean channel over F_t, inf where there is no sample
     tinted: Any  # (cameras, lights) the part along the skin's colour
-    dark: Any  # (cameras, lights) darkest channel, not below 0, inf where there is no sample
+    # (cameras, lights) darkest channel, not below 0, inf where there is no sample
+    dark: Any
     count: Any  # (lights,) samples
     shade: Any  # (2, lights) signals that the normal explains
     known: Any  # (lights,) 1 where there is a signal, else 0
@@ -95,7 +102,9 @@ def buffers(lights: int, cameras: int) -> Any:
 
 @inline_kernel
 def _finite(value: float) -> bool:
-    """Whether a number is finite; math.isfinite is x - x == x - x, which fast math optimises to True."""
+    """Whether a number is finite; math.isfinite is x - x == x - x, which fast math
+    optimises to True.
+    """
     return abs(value) < np.inf
 
 
@@ -121,8 +130,12 @@ def _unit(v: Any) -> bool:
 
 
 @fast_kernel
-def _point(position: Any, light: Any, camera: Any, scan: Any, square: Any, b: Any) -> int:
-    """Set directions from a surfel, and F_t towards cameras above MIN_COSINE_CAMERA; returns their number."""
+def _point(
+    position: Any, light: Any, camera: Any, scan: Any, square: Any, b: Any
+) -> int:
+    """Set directions from a surfel, and F_t towards cameras above MIN_COSINE_CAMERA;
+    returns their number.
+    """
     for i in range(light.shape[0]):
         x = light[i, 0] - position[0]
         y = light[i, 1] - position[1]
@@ -147,7 +160,9 @@ def _point(position: Any, light: Any, camera: Any, scan: Any, square: Any, b: An
 
 @fast_kernel
 def _shades(used: int, cameras: int, b: Any) -> None:
-    """For each light, low quantile over cameras of the mean channel, and median of the part along the skin's colour."""
+    """For each light, low quantile over cameras of the mean channel, and median of the
+    part along the skin's colour.
+    """
     lights = b.known.shape[0]
     red = 0.0
     green = 0.0
@@ -184,7 +199,11 @@ def _shades(used: int, cameras: int, b: Any) -> None:
             v = b.values[at + 2]
             known = _finite(r + g + v)
             b.white[q, i] = (r + g + v) * third if known else np.float32(np.inf)
-            b.tinted[q, i] = (r * along[0] + g * along[1] + v * along[2]) * inverse if known else np.float32(np.inf)
+            b.tinted[q, i] = (
+                (r * along[0] + g * along[1] + v * along[2]) * inverse
+                if known
+                else np.float32(np.inf)
+            )
             b.dark[q, i] = max(min(r, g, v), ZERO) if known else np.float32(np.inf)
     sort_columns(b.white, used, lights)
     sort_columns(b.tinted, used, lights)
@@ -198,8 +217,12 @@ def _shades(used: int, cameras: int, b: Any) -> None:
 
 
 @fast_kernel
-def _normal_equations(n: Any, shade: Any, square: Any, b: Any, data: Any, right: Any) -> int:
-    """F_t of the lights at the normal n and weighted sums of their directions; returns the number of lights used."""
+def _normal_equations(
+    n: Any, shade: Any, square: Any, b: Any, data: Any, right: Any
+) -> int:
+    """F_t of the lights at the normal n and weighted sums of their directions; returns
+    the number of lights used.
+    """
     nx = np.float32(n[0])
     ny = np.float32(n[1])
     nz = np.float32(n[2])
@@ -267,7 +290,9 @@ def _tukey(spread: float, b: Any) -> None:
 
 @fast_kernel
 def _inverse(a: Any, out: Any) -> None:
-    """Inverse of a 3 x 3 matrix by cofactors; with a ridge of 1e-6 of its trace, 9 digits are accurate."""
+    """Inverse of a 3 x 3 matrix by cofactors; with a ridge of 1e-6 of its trace, 9
+    digits are accurate.
+    """
     for j in range(3):
         p = (j + 1) % 3
         q = (j + 2) % 3
@@ -306,10 +331,12 @@ def _photometric(
     score: Any,
     half: Any,
 ) -> float:
-    """Robust photometric stereo: shade = F_t(n.l) g.l for one g; writes g/|g| and its covariance, returns residual/|g|.
+    """Robust photometric stereo: shade = F_t(n.l) g.l for one g; writes g/|g| and its
+    covariance, returns residual/|g|.
 
-    Tukey weights exclude shadows and remaining highlights. The scan's normal is a prior on the direction of g, which
-    matters where few lights or mixed pixels do not determine the direction.
+    Tukey weights exclude shadows and remaining highlights. The scan's normal is a prior
+    on the direction of g, which matters where few lights or mixed pixels do not
+    determine the direction.
     """
     data = np.empty((3, 3))
     matrix = np.empty((3, 3))
@@ -325,9 +352,14 @@ def _photometric(
     for step in range(MAX_ITERATIONS):
         count = _normal_equations(normal, shade, square, b, data, right)
         if step > 0:
-            # errors of neighbouring lights are correlated, so any number counts as at most INDEPENDENT_LIGHTS
-            share = max(count / INDEPENDENT_LIGHTS, 1.0) * (spread / (size * max(prior, 1e-9))) ** 2
-        # a ridge far below the data, so that surfels without light have the solution zero and hence a NaN normal
+            # errors of neighbouring lights are correlated, so any number counts as at
+            # most INDEPENDENT_LIGHTS
+            share = (
+                max(count / INDEPENDENT_LIGHTS, 1.0)
+                * (spread / (size * max(prior, 1e-9))) ** 2
+            )
+        # a ridge far below the data, so that surfels without light have the solution
+        # zero and hence a NaN normal
         ridge = 1e-6 * (data[0, 0] + data[1, 1] + data[2, 2] + 2.0 * share) + 1e-12
         for j in range(3):
             for k in range(3):
@@ -335,7 +367,11 @@ def _photometric(
             matrix[j, j] += share + ridge
         _inverse(matrix, inverse)
         for k in range(3):
-            g[k] = inverse[k, 0] * right[0] + inverse[k, 1] * right[1] + inverse[k, 2] * right[2]
+            g[k] = (
+                inverse[k, 0] * right[0]
+                + inverse[k, 1] * right[1]
+                + inverse[k, 2] * right[2]
+            )
         size = math.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
         if not size > 0.0:
             normal[:], covariance[:], pull[:], half[:] = np.nan, np.nan, np.nan, np.nan
@@ -345,11 +381,27 @@ def _photometric(
             moved += (g[k] / size - normal[k]) ** 2
             normal[k] = g[k] / size
         _residuals(g, shade, b)
-        spread = 1.4826 * median_of(b.size, b.size_bits, b.size.shape[0], count) + 0.01 * size
+        spread = (
+            1.4826 * median_of(b.size, b.size_bits, b.size.shape[0], count)
+            + 0.01 * size
+        )
         if moved < MIN_SQUARED_CHANGE or step == MAX_ITERATIONS - 1:
             break
         _tukey(spread, b)
-    _covariance(square, spread, share, size, normal, data, matrix, covariance, pull, score, half, b)
+    _covariance(
+        square,
+        spread,
+        share,
+        size,
+        normal,
+        data,
+        matrix,
+        covariance,
+        pull,
+        score,
+        half,
+        b,
+    )
     return spread / size
 
 
@@ -368,9 +420,11 @@ def _covariance(
     half: Any,
     b: Any,
 ) -> None:
-    """Covariance of the normal from the residuals (Huber's sandwich), and its derivative by the scan's normal.
+    """Covariance of the normal from the residuals (Huber's sandwich), and its
+    derivative by the scan's normal.
 
-    It also writes the scores of the lights, and the matrix `half` from a sum of score times direction to a rotation.
+    It also writes the scores of the lights, and the matrix `half` from a sum of score
+    times direction to a rotation.
     """
     slope = 0.0
     total = 0.0
@@ -392,11 +446,19 @@ def _covariance(
         count += 1
         # a rotation of the normal also changes F_t, which matters at grazing angles
         c = normal[0] * way[0] + normal[1] * way[1] + normal[2] * way[2]
-        steep = (_transmittance(c + 1e-4, np.float64(square)) - _transmittance(c - 1e-4, np.float64(square))) / 2e-4
+        steep = (
+            _transmittance(c + 1e-4, np.float64(square))
+            - _transmittance(c - 1e-4, np.float64(square))
+        ) / 2e-4
         score[i] = b.weight[i] * passed * b.residual[i]
         for j in range(3):
             for k in range(3):
-                bent[j, k] += bend * passed * way[j] * (passed * way[k] + c * steep * (way[k] - c * normal[k]))
+                bent[j, k] += (
+                    bend
+                    * passed
+                    * way[j]
+                    * (passed * way[k] + c * steep * (way[k] - c * normal[k]))
+                )
                 meat[j, k] += score[i] * score[i] * way[j] * way[k]
     # correction for three fitted unknowns; the slope of the influence function is below its weights
     more = count / max(count - 3.0, 1.0)
@@ -405,10 +467,16 @@ def _covariance(
     for j in range(3):
         for k in range(3):
             meat[j, k] *= more
-            matrix[j, k] += bent[j, k] - data[j, k] if slope > 0.5 * total else -0.5 * data[j, k]
+            matrix[j, k] += (
+                bent[j, k] - data[j, k] if slope > 0.5 * total else -0.5 * data[j, k]
+            )
     _inverse(matrix, inverse)
     for j in range(3):  # only the part perpendicular to the normal rotates it
-        along = inverse[0, j] * normal[0] + inverse[1, j] * normal[1] + inverse[2, j] * normal[2]
+        along = (
+            inverse[0, j] * normal[0]
+            + inverse[1, j] * normal[1]
+            + inverse[2, j] * normal[2]
+        )
         for k in range(3):
             half[k, j] = (inverse[k, j] - along * normal[k]) / size
     _sandwich(half, meat, half, out)
@@ -437,7 +505,9 @@ def _brightest(dark: Any, best: Any, place: Any) -> None:
 
 @fast_kernel
 def _peak(used: int, b: Any) -> None:
-    """Half vectors of the brightest lights of each camera and their weights; see `PhotometricNormals.peak`."""
+    """Half vectors of the brightest lights of each camera and their weights; see
+    `PhotometricNormals.peak`.
+    """
     best = np.empty(BRIGHTEST)
     place = np.empty(BRIGHTEST, np.int64)
     maximum = np.empty(3)
@@ -479,7 +549,9 @@ def _middle(values: Any, count: int) -> float:
 
 @fast_kernel
 def _robust_mean(used: int, mean: Any, b: Any) -> None:
-    """Mean direction of the half vectors without outliers, each weighted by the inverse of its angle to the mean."""
+    """Mean direction of the half vectors without outliers, each weighted by the inverse
+    of its angle to the mean.
+    """
     for q in range(used):
         b.kept[q] = b.contrast[q]
     for step in range(9):
@@ -491,14 +563,18 @@ def _robust_mean(used: int, mean: Any, b: Any) -> None:
             return
         at = 0
         for q in range(used):
-            cosine = b.half[q, 0] * mean[0] + b.half[q, 1] * mean[1] + b.half[q, 2] * mean[2]
+            cosine = (
+                b.half[q, 0] * mean[0] + b.half[q, 1] * mean[1] + b.half[q, 2] * mean[2]
+            )
             b.angle[q] = math.degrees(math.acos(min(max(cosine, -1.0), 1.0)))
             if b.contrast[q] > 0.0:
                 b.ordered[at] = b.angle[q]
                 at += 1
         limit = 2.5 * max(1.4826 * _middle(b.ordered, at), 2.0)
         for q in range(used):
-            b.kept[q] = b.contrast[q] / max(b.angle[q], 1.0) if b.angle[q] < limit else 0.0
+            b.kept[q] = (
+                b.contrast[q] / max(b.angle[q], 1.0) if b.angle[q] < limit else 0.0
+            )
 
 
 @fast_kernel
@@ -518,22 +594,35 @@ def estimate_one(
     cross: Any,
     pull: Any,
 ) -> None:
-    """Peak normal (3,) of a surfel; normals (2, 3), spreads (2,), covariances and pulls (2, 3, 3) of both signals.
+    """Peak normal (3,) of a surfel; normals (2, 3), spreads (2,), covariances and pulls
+    (2, 3, 3) of both signals.
 
     `cross` (3, 3) is the covariance of the first normal with the second.
     """
     square = np.float32(max(eta * eta - 1.0, 0.0))
     unpack(sample, b.values)
-    scale_to_one(b.values)  # normals do not depend on brightness, and squares must neither underflow nor overflow
+    # normals do not depend on brightness, and squares must neither underflow nor
+    # overflow
+    scale_to_one(b.values)
     used = _point(position, light, camera, scan, square, b)
     _shades(used, camera.shape[0], b)
     turn = np.empty((2, 3, 3))
     meat = np.zeros((3, 3))
     for q in range(2):
         spread[q] = _photometric(
-            b.shade[q], scan, square, prior, b, normal[q], covariance[q], pull[q], b.score[q], turn[q]
+            b.shade[q],
+            scan,
+            square,
+            prior,
+            b,
+            normal[q],
+            covariance[q],
+            pull[q],
+            b.score[q],
+            turn[q],
         )
-    # noise that grows with the signal differs between channels, so both signals have part of it in common
+    # noise that grows with the signal differs between channels, so both signals have
+    # part of it in common
     for i in range(b.score.shape[1]):
         both = b.score[0, i] * b.score[1, i]
         for j in range(3):

@@ -11,7 +11,8 @@ import numpy as np
 from skindb._compiled import fast_kernel, inline_fast_kernel, kernel
 from skindb._vectors import LANES, blend
 
-# arctan(t) = t sum c_k t^2k on [0, 1], minimax fit with error 5.3e-11; unlike atan2 it runs in vector registers
+# arctan(t) = t sum c_k t^2k on [0, 1], minimax fit with error 5.3e-11; unlike atan2 it
+# runs in vector registers
 ARCTAN = (
     0.9999999999476555,
     -0.3333333172329439,
@@ -39,7 +40,9 @@ SINGLE = tuple(
         0.00681179190956116,
     )
 )
-ZERO, ONE, MIN_SQUARE, HALF_PI, PI = (np.float32(c) for c in (0.0, 1.0, 1e-30, math.pi / 2, math.pi))
+ZERO, ONE, MIN_SQUARE, HALF_PI, PI = (
+    np.float32(c) for c in (0.0, 1.0, 1e-30, math.pi / 2, math.pi)
+)
 NONE, STEP, TWO = (np.int32(c) for c in (0, 1, 2))
 X, Y, Z, ACROSS_X, ACROSS_Y, ACROSS_Z, COSINE = range(7)  # rows of `RowMemory.faces`
 THETA_H, THETA_D, PHI_D = range(3)  # rows of `RowMemory.place`
@@ -62,7 +65,9 @@ def _arctangent(y: float, x: float) -> float:
 
 @inline_fast_kernel
 def _angles(n: Any, wi: Any, wo: Any) -> tuple[float, float, float]:
-    """theta_h, theta_d, phi_d of unit 3-tuples; sines from cross products are accurate for narrow lobes."""
+    """theta_h, theta_d, phi_d of unit 3-tuples; sines from cross products are accurate
+    for narrow lobes.
+    """
     hx = wi[0] + wo[0]
     hy = wi[1] + wo[1]
     hz = wi[2] + wo[2]
@@ -81,7 +86,10 @@ def _angles(n: Any, wi: Any, wo: Any) -> tuple[float, float, float]:
     tz = bx * hy - by * hx
     sin_h = math.sqrt(bx * bx + by * by + bz * bz)
     theta_h = _arctangent(sin_h, max(n[0] * hx + n[1] * hy + n[2] * hz, 0.0))
-    theta_d = _arctangent(math.sqrt(cx * cx + cy * cy + cz * cz), max(hx * wi[0] + hy * wi[1] + hz * wi[2], 0.0))
+    theta_d = _arctangent(
+        math.sqrt(cx * cx + cy * cy + cz * cz),
+        max(hx * wi[0] + hy * wi[1] + hz * wi[2], 0.0),
+    )
     across = bx * wi[0] + by * wi[1] + bz * wi[2]
     along = tx * wi[0] + ty * wi[1] + tz * wi[2]
     # phi_d has period pi, so a pair with phi_d < 0 is the pair with both signs reversed
@@ -91,7 +99,9 @@ def _angles(n: Any, wi: Any, wo: Any) -> tuple[float, float, float]:
 
 @fast_kernel
 def _coordinates(n: Any, wi: Any, wo: Any, count: int, shape: Any, out: Any) -> None:
-    """Coordinates [cells] in a table of `shape`, out (3, count), of wi with the columns of wo (3, count)."""
+    """Coordinates [cells] in a table of `shape`, out (3, count), of wi with the columns
+    of wo (3, count).
+    """
     per_h = 2.0 / math.pi
     per_d = (shape[1] - 1) * 2.0 / math.pi
     per_phi = shape[2] / math.pi
@@ -103,8 +113,12 @@ def _coordinates(n: Any, wi: Any, wo: Any, count: int, shape: Any, out: Any) -> 
 
 
 @inline_fast_kernel
-def _interpolate(table: Any, x: float, y: float, z: float, factor: float, out: Any) -> None:
-    """out[:] = factor * trilinear table value at x, y, z in cells; NaN reads cell 0 and gives NaN."""
+def _interpolate(
+    table: Any, x: float, y: float, z: float, factor: float, out: Any
+) -> None:
+    """out[:] = factor * trilinear table value at x, y, z in cells; NaN reads cell 0 and
+    gives NaN.
+    """
     nh, nd, n_phi, size = table.shape
     i = max(min(int(x), nh - 2), 0)
     j = max(min(int(y), nd - 2), 0)
@@ -149,7 +163,8 @@ def _arctangent_single(y: Any, x: Any) -> Any:
 
 @kernel
 def _face_cameras(n: Any, to_camera: Any, faces: Any, cameras: Any) -> int:
-    """Write the input of `_cells`, faces (7, padded), and the indices of cameras above the horizon; returns the number.
+    """Write the input of `_cells`, faces (7, padded), and the indices of cameras above
+    the horizon; returns the number.
 
     The last camera is repeated to complete the last vector.
     """
@@ -174,12 +189,16 @@ def _face_cameras(n: Any, to_camera: Any, faces: Any, cameras: Any) -> int:
 
 
 @inline_fast_kernel
-def _cells(wi: Any, across: Any, cosine: Any, faces: Any, count: int, size: Any, place: Any) -> None:
-    """Coordinates in the table [cells], `place` (3, count), of one light with `count` cameras; `across` is n x wi.
+def _cells(
+    wi: Any, across: Any, cosine: Any, faces: Any, count: int, size: Any, place: Any
+) -> None:
+    """Coordinates in the table [cells], `place` (3, count), of one light with `count`
+    cameras; `across` is n x wi.
 
-    With h = wi + wo unnormalised: tan(theta_h) = |n x h| / n h, tan^2(theta_d) = (1 - wi wo) / (1 + wi wo), and
-    phi_d is the angle between n (wo x wi) / |h| and (cos_o - cos_i) / 2. Single precision has an error of 0.02 cells.
-    `size` is the number of cells per unit of sqrt(theta_h), theta_d and phi_d.
+    With h = wi + wo unnormalised: tan(theta_h) = |n x h| / n h, tan^2(theta_d) = (1 -
+    wi wo) / (1 + wi wo), and phi_d is the angle between n (wo x wi) / |h| and (cos_o -
+    cos_i) / 2. Single precision has an error of 0.02 cells. `size` is the number of
+    cells per unit of sqrt(theta_h), theta_d and phi_d.
     """
     for q in range(count):
         x = faces[X, q]
@@ -194,7 +213,11 @@ def _cells(wi: Any, across: Any, cosine: Any, faces: Any, count: int, size: Any,
         sin_h = math.sqrt(bx * bx + by * by + bz * bz)
         theta_h = _arctangent_single(sin_h, cosine + faces[COSINE, q])
         theta_d = _arctangent_single(far, near)
-        side = (wi[0] * faces[ACROSS_X, q] + wi[1] * faces[ACROSS_Y, q] + wi[2] * faces[ACROSS_Z, q]) / near
+        side = (
+            wi[0] * faces[ACROSS_X, q]
+            + wi[1] * faces[ACROSS_Y, q]
+            + wi[2] * faces[ACROSS_Z, q]
+        ) / near
         along = (faces[COSINE, q] - cosine) * ROOT_HALF
         # phi_d has period pi, so phi_d < 0 is the pair with both signs reversed
         along = along if side >= ZERO else -along
@@ -206,8 +229,12 @@ def _cells(wi: Any, across: Any, cosine: Any, faces: Any, count: int, size: Any,
 
 
 @inline_fast_kernel
-def _row(flat: Any, shape: Any, place: Any, q: int, cosine: Any, rows: Any, row: int) -> None:
-    """One row: cosine times the trilinear sum of the eight corners of the cell around place[:, q]."""
+def _row(
+    flat: Any, shape: Any, place: Any, q: int, cosine: Any, rows: Any, row: int
+) -> None:
+    """One row: cosine times the trilinear sum of the eight corners of the cell around
+    place[:, q].
+    """
     x = place[THETA_H, q]
     y = place[THETA_D, q]
     z = place[PHI_D, q]
@@ -233,39 +260,76 @@ def _row(flat: Any, shape: Any, place: Any, q: int, cosine: Any, rows: Any, row:
     high_far = fx * fy
     blend(
         flat,
-        (a, b, a + along, b + along, a + across, b + across, a + across + along, b + across + along),
-        (low * gz, low * fz, high * gz, high * fz, low_far * gz, low_far * fz, high_far * gz, high_far * fz),
+        (
+            a,
+            b,
+            a + along,
+            b + along,
+            a + across,
+            b + across,
+            a + across + along,
+            b + across + along,
+        ),
+        (
+            low * gz,
+            low * fz,
+            high * gz,
+            high * fz,
+            low_far * gz,
+            low_far * fz,
+            high_far * gz,
+            high_far * fz,
+        ),
         rows,
         row,
     )
 
 
 class RowMemory(NamedTuple):
-    """Memory for `form_rows` and `turn_rows`, one per thread; arrays over cameras are padded to multiples of LANES."""
+    """Memory for `form_rows` and `turn_rows`, one per thread; arrays over cameras are
+    padded to multiples of LANES.
+    """
 
-    faces: Any  # (7, cameras) direction X, Y, Z, normal x direction ACROSS_X, ACROSS_Y, ACROSS_Z, and COSINE
+    # (7, cameras) direction X, Y, Z, normal x direction ACROSS_X, ACROSS_Y, ACROSS_Z,
+    # and COSINE
+    faces: Any
     place: Any  # (3, cameras) coordinates THETA_H, THETA_D, PHI_D in the table [cells]
     above: Any  # (cameras,) indices of cameras above the horizon
-    chosen: Any  # (cameras + 1,) indices into `above` of cameras with a usable sample of a light
+    # (cameras + 1,) indices into `above` of cameras with a usable sample of a light
+    chosen: Any
 
 
 @kernel
 def row_memory(cameras: int) -> Any:
     """Memory for up to `cameras` cameras."""
     padded = (cameras + LANES - 1) // LANES * LANES
-    single = np.empty((10, padded), np.float32)  # one block, for which LLVM checks fewer addresses for aliasing
-    return RowMemory(single[:7], single[7:], np.empty(padded, np.int32), np.empty(padded + 1, np.int32))
+    # one block, for which LLVM checks fewer addresses for aliasing
+    single = np.empty((10, padded), np.float32)
+    return RowMemory(
+        single[:7],
+        single[7:],
+        np.empty(padded, np.int32),
+        np.empty(padded + 1, np.int32),
+    )
 
 
 @fast_kernel
 def form_rows(
-    table: Any, n: Any, to_light: Any, to_camera: Any, usable: Any, memory: Any, rows: Any, index: Any
+    table: Any,
+    n: Any,
+    to_light: Any,
+    to_camera: Any,
+    usable: Any,
+    memory: Any,
+    rows: Any,
+    index: Any,
 ) -> int:
     """Write the rows of one surfel, by light and then by camera; returns their number.
 
-    For each light, the coordinates of all cameras are computed in vector registers, then the rows are interpolated.
-    Neighbouring surfels use the same cells, so surfels in spatial order keep this part of the table in the cache. The
-    width of `table` and `rows` must be a multiple of LANES.
+    For each light, the coordinates of all cameras are computed in vector registers,
+    then the rows are interpolated. Neighbouring surfels use the same cells, so surfels
+    in spatial order keep this part of the table in the cache. The width of `table` and
+    `rows` must be a multiple of LANES.
     """
     faces = memory.faces
     place = memory.place
@@ -312,7 +376,14 @@ def form_rows(
 
 @fast_kernel
 def turn_rows(
-    table: Any, n: Any, to_light: Any, to_camera: Any, index: Any, count: int, memory: Any, rows: Any
+    table: Any,
+    n: Any,
+    to_light: Any,
+    to_camera: Any,
+    index: Any,
+    count: int,
+    memory: Any,
+    rows: Any,
 ) -> None:
     """Rows of the samples `index` (count, 2) as from `form_rows`, with another normal.
 
@@ -345,16 +416,36 @@ def turn_rows(
             np.float32(n[0] * y - n[1] * x),
         )
         padded = (end - begin + LANES - 1) // LANES * LANES
-        _cells((np.float32(x), np.float32(y), np.float32(z)), across, np.float32(cosine), faces, padded, size, place)
+        _cells(
+            (np.float32(x), np.float32(y), np.float32(z)),
+            across,
+            np.float32(cosine),
+            faces,
+            padded,
+            size,
+            place,
+        )
         for r in range(begin, end):
             above = faces[COSINE, r - begin] > ZERO
-            _row(flat, shape, place, r - begin, np.float32(cosine) if above else ZERO, rows, r)
+            _row(
+                flat,
+                shape,
+                place,
+                r - begin,
+                np.float32(cosine) if above else ZERO,
+                rows,
+                r,
+            )
         begin = end
 
 
 @kernel
-def _face_samples(n: Any, to_camera: Any, index: Any, begin: int, end: int, faces: Any) -> None:
-    """Write the input of `_cells` for the cameras of samples begin to end; the cosine is 0 below the horizon."""
+def _face_samples(
+    n: Any, to_camera: Any, index: Any, begin: int, end: int, faces: Any
+) -> None:
+    """Write the input of `_cells` for the cameras of samples begin to end; the cosine
+    is 0 below the horizon.
+    """
     for q in range(end - begin):
         o = index[begin + q, 1]
         x = to_camera[o, 0]
@@ -365,25 +456,45 @@ def _face_samples(n: Any, to_camera: Any, index: Any, begin: int, end: int, face
         faces[ACROSS_Y, q] = n[2] * x - n[0] * z
         faces[ACROSS_Z, q] = n[0] * y - n[1] * x
         faces[COSINE, q] = max(n[0] * x + n[1] * y + n[2] * z, 0.0)
-    for q in range(end - begin, min((end - begin + LANES - 1) // LANES * LANES, faces.shape[1])):
+    for q in range(
+        end - begin, min((end - begin + LANES - 1) // LANES * LANES, faces.shape[1])
+    ):
         for k in range(faces.shape[0]):
             faces[k, q] = faces[k, end - begin - 1]
 
 
 @kernel
 def fill_rows(
-    table: Any, normal: Any, to_light: Any, to_camera: Any, usable: Any, offsets: Any, rows: Any, index: Any
+    table: Any,
+    normal: Any,
+    to_light: Any,
+    to_camera: Any,
+    usable: Any,
+    offsets: Any,
+    rows: Any,
+    index: Any,
 ) -> None:
     """Write the rows of every surfel, starting at its offset."""
     memory = row_memory(to_camera.shape[1])
     for s in range(normal.shape[0]):
         lo = offsets[s]
         hi = offsets[s + 1]
-        form_rows(table, normal[s], to_light[s], to_camera[s], usable[s], memory, rows[lo:hi], index[lo:hi])
+        form_rows(
+            table,
+            normal[s],
+            to_light[s],
+            to_camera[s],
+            usable[s],
+            memory,
+            rows[lo:hi],
+            index[lo:hi],
+        )
 
 
 @fast_kernel
-def average_disc(table: Any, wi: Any, wo: Any, points: Any, weights: Any, out: Any) -> None:
+def average_disc(
+    table: Any, wi: Any, wo: Any, points: Any, weights: Any, out: Any
+) -> None:
     """Add to `out` (n, m) the weighted mean of the table over directions around wi."""
     count = points.shape[0]
     disc = np.empty((3, count))
@@ -405,8 +516,22 @@ def average_disc(table: Any, wi: Any, wo: Any, points: Any, weights: Any, out: A
             scale = 1.0 / math.sqrt(px * px + py * py + pz * pz)
             disc[0, q], disc[1, q], disc[2, q] = px * scale, py * scale, pz * scale
         # the angles are the same if the two directions are exchanged
-        _coordinates((0.0, 0.0, 1.0), (wo[s, 0], wo[s, 1], wo[s, 2]), disc, count, table.shape, place)
+        _coordinates(
+            (0.0, 0.0, 1.0),
+            (wo[s, 0], wo[s, 1], wo[s, 2]),
+            disc,
+            count,
+            table.shape,
+            place,
+        )
         for q in range(count):
-            _interpolate(table, place[THETA_H, q], place[THETA_D, q], place[PHI_D, q], weights[q], value)
+            _interpolate(
+                table,
+                place[THETA_H, q],
+                place[THETA_D, q],
+                place[PHI_D, q],
+                weights[q],
+                value,
+            )
             for m in range(out.shape[1]):
                 out[s, m] += value[m]

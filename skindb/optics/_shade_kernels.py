@@ -1,4 +1,6 @@
-"""Compiled shading of points under one light; see `skindb.optics.shade` for shapes, units and sources."""
+"""Compiled shading of points under one light; see `skindb.optics.shade` for shapes,
+units and sources.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,9 @@ def transmittance(cosine: float, eta: float) -> float:
 
 @inline_fast_kernel
 def _surface(table: Any, weight: Any, n: Any, wi: Any, wo: Any) -> float:
-    """Sum over components of weight times the trilinear table value; n, wi, wo are unit 3-tuples."""
+    """Sum over components of weight times the trilinear table value; n, wi, wo are unit
+    3-tuples.
+    """
     theta_h, theta_d, phi = _angles(n, wi, wo)
     nh, nd, n_phi, size = table.shape
     half = 0.5 * math.pi
@@ -37,10 +41,12 @@ def _surface(table: Any, weight: Any, n: Any, wi: Any, wo: Any) -> float:
     total = 0.0
     for m in range(size):
         if weight[m] != 0.0:
-            low = (1.0 - fy) * ((1.0 - fz) * table[i, j, k, m] + fz * table[i, j, k1, m]) + fy * (
-                (1.0 - fz) * table[i, j + 1, k, m] + fz * table[i, j + 1, k1, m]
-            )
-            high = (1.0 - fy) * ((1.0 - fz) * table[i + 1, j, k, m] + fz * table[i + 1, j, k1, m]) + fy * (
+            low = (1.0 - fy) * (
+                (1.0 - fz) * table[i, j, k, m] + fz * table[i, j, k1, m]
+            ) + fy * ((1.0 - fz) * table[i, j + 1, k, m] + fz * table[i, j + 1, k1, m])
+            high = (1.0 - fy) * (
+                (1.0 - fz) * table[i + 1, j, k, m] + fz * table[i + 1, j, k1, m]
+            ) + fy * (
                 (1.0 - fz) * table[i + 1, j + 1, k, m] + fz * table[i + 1, j + 1, k1, m]
             )
             total += weight[m] * ((1.0 - fx) * low + fx * high)
@@ -91,12 +97,20 @@ def shade(
                 cos_i = dx * nx + dy * ny + dz * nz
                 if cos_i <= 0.0:
                     continue
-                received = lit[i, p] * cos_i / square  # irradiance of the surface per unit of radiant intensity
+                # irradiance of the surface per unit of radiant intensity
+                received = lit[i, p] * cos_i / square
                 if falloff != 0.0:
                     along = -(axis[0] * dx + axis[1] * dy + axis[2] * dz)
                     received *= max(along, 0.0) ** falloff
-                matte += received * transmittance(min(cos_i, 1.0), eta) * out_transmittance / math.pi
+                matte += (
+                    received
+                    * transmittance(min(cos_i, 1.0), eta)
+                    * out_transmittance
+                    / math.pi
+                )
                 if with_surface:
-                    gloss += received * _surface(table, weight[i], (nx, ny, nz), (dx, dy, dz), (vx, vy, vz))
+                    gloss += received * _surface(
+                        table, weight[i], (nx, ny, nz), (dx, dy, dz), (vx, vy, vz)
+                    )
         for c in range(3):
             out[i, c] = (matte * diffuse[i, c] + gloss) / points

@@ -1,6 +1,7 @@
 """Compiled octree of irradiance points; see `skindb.optics.dipole_tree`.
 
-Rows are numbered with the points first and then the nodes, so that a sum over nodes and points is one list of rows.
+Rows are numbered with the points first and then the nodes, so that a sum over nodes and
+points is one list of rows.
 """
 
 from __future__ import annotations
@@ -13,7 +14,9 @@ import numpy as np
 from skindb._compiled import fast_kernel, inline_fast_kernel, kernel
 
 MAX_DEPTH = 10  # levels of the octree, with three bits of the Morton code each
-ROWS_PER_SUM = 1024  # rows evaluated at a time, so that the list and its profiles stay in the first-level cache
+# rows evaluated at a time, so that the list and its profiles stay in the first-level
+# cache
+ROWS_PER_SUM = 1024
 LIGHTS_IN_REGISTERS = 8  # lights whose sums stay in registers
 
 
@@ -21,7 +24,8 @@ LIGHTS_IN_REGISTERS = 8  # lights whose sums stay in registers
 def build(code: Any, points: Any, area: Any, leaf: int) -> Any:
     """Nodes over points sorted by Morton code, which makes every node a contiguous range of points.
 
-    Returns first, last, child, children, box, centre (area-weighted) and node area; children come after their parents.
+    Returns first, last, child, children, box, centre (area-weighted) and node area;
+    children come after their parents.
     """
     most = 2 * len(code) + 16
     first = np.zeros(most, np.int64)
@@ -42,7 +46,10 @@ def build(code: Any, points: Any, area: Any, leaf: int) -> Any:
             node_area[i] += area[j]
             for a in range(3):
                 centre[i, a] += w * points[j, a]
-                box[i, a], box[i, a + 3] = min(box[i, a], points[j, a]), max(box[i, a + 3], points[j, a])
+                box[i, a], box[i, a + 3] = (
+                    min(box[i, a], points[j, a]),
+                    max(box[i, a + 3], points[j, a]),
+                )
         for a in range(3):
             centre[i, a] /= total
         if last[i] - first[i] > leaf and level[i] < MAX_DEPTH:
@@ -65,8 +72,12 @@ def build(code: Any, points: Any, area: Any, leaf: int) -> Any:
 
 
 @kernel
-def sum_nodes(power: Any, points: int, first: Any, last: Any, child: Any, children: Any) -> None:
-    """Fill the rows of the nodes of power (groups, rows, LIGHTS_IN_REGISTERS) from the rows of the points."""
+def sum_nodes(
+    power: Any, points: int, first: Any, last: Any, child: Any, children: Any
+) -> None:
+    """Fill the rows of the nodes of power (groups, rows, LIGHTS_IN_REGISTERS) from the
+    rows of the points.
+    """
     for g in range(power.shape[0]):
         for v in range(len(first) - 1, -1, -1):  # children before their parents
             low = first[v]
@@ -83,12 +94,21 @@ def sum_nodes(power: Any, points: int, first: Any, last: Any, child: Any, childr
 
 @inline_fast_kernel
 def _decay(x: float) -> float:
-    """exp(-x) for x >= 0 without a function call, so that loops are vectorised; relative error below 1e-6.
+    """exp(-x) for x >= 0 without a function call, so that loops are vectorised;
+    relative error below 1e-6.
 
     Taylor polynomial of degree seven in x / 64, then six squarings; constant above 24 (4e-11).
     """
     t = -min(x, 24.0) * 0.015625
-    e = 1.0 + t * (1.0 + t * (0.5 + t * (1 / 6 + t * (1 / 24 + t * (1 / 120 + t * (1 / 720 + t * (1 / 5040)))))))
+    e = 1.0 + t * (
+        1.0
+        + t
+        * (
+            0.5
+            + t
+            * (1 / 6 + t * (1 / 24 + t * (1 / 120 + t * (1 / 720 + t * (1 / 5040)))))
+        )
+    )
     e *= e
     e *= e
     e *= e
@@ -120,9 +140,11 @@ def _add(
     even: Any,
     out: Any,
 ) -> None:
-    """Add the listed rows to the sums of one receiver: even (3,) for unit irradiance, out (groups, 3, lights).
+    """Add the listed rows to the sums of one receiver: even (3,) for unit irradiance,
+    out (groups, 3, lights).
 
-    `square` (ROWS_PER_SUM,) for squared distances and `profile` (3, ROWS_PER_SUM) are working memory.
+    `square` (ROWS_PER_SUM,) for squared distances and `profile` (3, ROWS_PER_SUM) are
+    working memory.
     """
     for e in range(count):
         j = rows[e]
@@ -136,14 +158,17 @@ def _add(
         decay = p[c, 2]
         scale = p[c, 3] * 0.07957747154594767
         for e in range(count):
-            profile[c, e] = scale * (_source(square[e], depth, decay) + _source(square[e], above, decay))
+            profile[c, e] = scale * (
+                _source(square[e], depth, decay) + _source(square[e], above, decay)
+            )
         total = 0.0
         for e in range(count):
             total += profile[c, e] * area[rows[e]]
         even[c] += total
     for g in range(power.shape[0]):
         for c in range(3):
-            a0 = a1 = a2 = a3 = a4 = a5 = a6 = a7 = 0.0  # LIGHTS_IN_REGISTERS variables, unrolled to stay in registers
+            # LIGHTS_IN_REGISTERS variables, unrolled to stay in registers
+            a0 = a1 = a2 = a3 = a4 = a5 = a6 = a7 = 0.0
             for e in range(count):
                 r = profile[c, e]
                 sent = power[g, rows[e]]
@@ -187,9 +212,10 @@ def gather(
 ) -> None:
     """Dipole sums at the points receivers[start:stop], with receivers (m,).
 
-    parameters (n, 3, 4) are z_r, z_v, sigma_tr, alpha' of each point and channel; place (rows, 3), area (rows,) and
-    power (groups, rows, LIGHTS_IN_REGISTERS) of points and nodes. The sums are even (m, 3), under unit irradiance, and
-    out (m, groups, 3, LIGHTS_IN_REGISTERS).
+    parameters (n, 3, 4) are z_r, z_v, sigma_tr, alpha' of each point and channel; place
+    (rows, 3), area (rows,) and power (groups, rows, LIGHTS_IN_REGISTERS) of points and
+    nodes. The sums are even (m, 3), under unit irradiance, and out (m, groups, 3,
+    LIGHTS_IN_REGISTERS).
     """
     points = len(parameters)
     stack = np.empty(8 * (MAX_DEPTH + 2), np.int64)
@@ -226,8 +252,32 @@ def gather(
                         top += 1
             for j in range(low, high):
                 if count == ROWS_PER_SUM:
-                    _add(rows, count, place[i], parameters[i], place, area, power, square, profile, even[k], out[k])
+                    _add(
+                        rows,
+                        count,
+                        place[i],
+                        parameters[i],
+                        place,
+                        area,
+                        power,
+                        square,
+                        profile,
+                        even[k],
+                        out[k],
+                    )
                     count = 0
                 rows[count] = j
                 count += 1
-        _add(rows, count, place[i], parameters[i], place, area, power, square, profile, even[k], out[k])
+        _add(
+            rows,
+            count,
+            place[i],
+            parameters[i],
+            place,
+            area,
+            power,
+            square,
+            profile,
+            even[k],
+            out[k],
+        )

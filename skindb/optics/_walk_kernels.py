@@ -22,12 +22,19 @@ def _escape(cosine: float, eta: float) -> float:
 
 
 @fast_kernel
-def walk(rng: Any, packets: int, g: float, eta: float, longest: float, events: np.ndarray[Any, Any]) -> int:
+def walk(
+    rng: Any,
+    packets: int,
+    g: float,
+    eta: float,
+    longest: float,
+    events: np.ndarray[Any, Any],
+) -> int:
     """Fill `events` (m, 3) with radius, path and weight of every escape; returns their number.
 
-    Lengths are in units of 1/sigma_s'. Packets enter along the normal at the origin and are not absorbed. At the
-    boundary, the fraction of a packet that escapes is recorded, and the rest is reflected. The walk stops when `events`
-    is full.
+    Lengths are in units of 1/sigma_s'. Packets enter along the normal at the origin and
+    are not absorbed. At the boundary, the fraction of a packet that escapes is
+    recorded, and the rest is reflected. The walk stops when `events` is full.
     """
     count = 0
     for _ in range(packets):

@@ -8,7 +8,9 @@ from numpy.typing import ArrayLike
 from skindb._types import Array
 
 
-def half_difference(wi: ArrayLike, wo: ArrayLike, normal: ArrayLike | None = None) -> tuple[Array, Array, Array]:
+def half_difference(
+    wi: ArrayLike, wo: ArrayLike, normal: ArrayLike | None = None
+) -> tuple[Array, Array, Array]:
     """Angles (theta_h, theta_d, phi_d) of unit directions.
 
     Parameters
@@ -21,12 +23,15 @@ def half_difference(wi: ArrayLike, wo: ArrayLike, normal: ArrayLike | None = Non
     Returns
     -------
     tuple
-        theta_h, theta_d in [0, pi/2] and phi_d in [0, pi), as isotropic reciprocal BRDFs have period pi. phi_d is 0
-        where the half vector is the normal.
+        theta_h, theta_d in [0, pi/2] and phi_d in [0, pi), as isotropic reciprocal
+        BRDFs have period pi. phi_d is 0 where the half vector is the normal.
     """
     wi = np.asarray(wi, np.float64)
     wo = np.asarray(wo, np.float64)
-    n = np.broadcast_to(np.array([0.0, 0.0, 1.0]) if normal is None else np.asarray(normal, np.float64), wi.shape)
+    n = np.broadcast_to(
+        np.array([0.0, 0.0, 1.0]) if normal is None else np.asarray(normal, np.float64),
+        wi.shape,
+    )
     h = wi + wo
     h = h / np.maximum(np.linalg.norm(h, axis=-1, keepdims=True), 1e-12)
     # sines from cross products, because an arc cosine is too inaccurate for narrow lobes
@@ -41,9 +46,15 @@ def half_difference(wi: ArrayLike, wo: ArrayLike, normal: ArrayLike | None = Non
     return theta_h, theta_d, np.where(phi >= np.pi, 0.0, phi)
 
 
-def directions(theta_h: ArrayLike, theta_d: ArrayLike, phi_d: ArrayLike) -> tuple[Array, Array]:
-    """Unit directions (wi, wo), each (..., 3), in the local frame (normal +z, half vector in the xz plane)."""
-    th, td, pd = np.broadcast_arrays(*(np.asarray(x, np.float64) for x in (theta_h, theta_d, phi_d)))
+def directions(
+    theta_h: ArrayLike, theta_d: ArrayLike, phi_d: ArrayLike
+) -> tuple[Array, Array]:
+    """Unit directions (wi, wo), each (..., 3), in the local frame (normal +z, half
+    vector in the xz plane).
+    """
+    th, td, pd = np.broadcast_arrays(
+        *(np.asarray(x, np.float64) for x in (theta_h, theta_d, phi_d))
+    )
     dx = np.sin(td) * np.cos(pd)
     dy = np.sin(td) * np.sin(pd)
     dz = np.cos(td)

@@ -1,4 +1,6 @@
-"""Importance sampling of mixtures of tabulated BRDFs by their half vectors, with the exact probability density."""
+"""Importance sampling of mixtures of tabulated BRDFs by their half vectors, with the
+exact probability density.
+"""
 
 from __future__ import annotations
 
@@ -10,18 +12,21 @@ from numpy.typing import NDArray
 from skindb._types import Array
 from skindb.optics.brdf_table import directional_albedo
 
-# fraction of directions drawn by the cosine alone, as tables have tails that do not depend on the half vector
+# fraction of directions drawn by the cosine alone, as tables have tails that do not
+# depend on the half vector
 COSINE_FRACTION = 0.3
 TYPICAL_COSINE = 0.8  # of the view, for the albedo of a basis that weights its lobe
-MIN_COSINE_HALF = 1e-4  # between view and half vector; the density of the mirrored direction diverges towards 0
+# between view and half vector; the density of the mirrored direction diverges towards 0
+MIN_COSINE_HALF = 1e-4
 
 
 @dataclass(frozen=True)
 class LobeSampler:
     """Probability densities of half vectors, one for each basis.
 
-    `density` (k, nh - 1) is the density of u = sqrt(theta_h / (pi/2)) in equal cells of [0, 1], which resolve narrow
-    lobes as finely as the tables; `albedo` (k,) weights the bases.
+    `density` (k, nh - 1) is the density of u = sqrt(theta_h / (pi/2)) in equal cells of
+    [0, 1], which resolve narrow lobes as finely as the tables; `albedo` (k,) weights
+    the bases.
     """
 
     density: Array
@@ -29,28 +34,44 @@ class LobeSampler:
 
     @classmethod
     def of_tables(cls, tables: NDArray[np.float32]) -> LobeSampler:
-        """Densities in proportion to the mean of each table (nh, nd, np, k) over its other angles, times the cosine."""
+        """Densities in proportion to the mean of each table (nh, nd, np, k) over its
+        other angles, times the cosine.
+        """
         # grazing difference angles are excluded, because there a table is large for any half vector
         near = tables[:, : max(2 * tables.shape[1] // 3, 1)]
         profile = np.maximum(near.mean(axis=(1, 2), dtype=np.float64), 0.0).T  # (k, nh)
         edge = np.linspace(0.0, 1.0, tables.shape[0])
         u = (edge[1:] + edge[:-1]) / 2
         theta = u**2 * np.pi / 2
-        weight = (profile[:, 1:] + profile[:, :-1]) / 2 * np.cos(theta) * np.sin(theta) * u
+        weight = (
+            (profile[:, 1:] + profile[:, :-1]) / 2 * np.cos(theta) * np.sin(theta) * u
+        )
         total = weight.sum(axis=1, keepdims=True)
         even = np.cos(theta) * np.sin(theta) * u
-        density = np.where(total > 0, weight / np.where(total > 0, total, 1.0), even / even.sum()) * len(u)
-        return cls(density, np.maximum(directional_albedo(tables, np.array([TYPICAL_COSINE]))[0], 0.0))
+        density = np.where(
+            total > 0, weight / np.where(total > 0, total, 1.0), even / even.sum()
+        ) * len(u)
+        return cls(
+            density,
+            np.maximum(directional_albedo(tables, np.array([TYPICAL_COSINE]))[0], 0.0),
+        )
 
     def mix(self, weights: Array) -> Array:
-        """Probabilities (n, 1 + k) of the cosine and of each basis at points with these weights (n, k)."""
+        """Probabilities (n, 1 + k) of the cosine and of each basis at points with these
+        weights (n, k).
+        """
         lobes = np.maximum(np.asarray(weights, np.float64), 0.0) * self.albedo
         total = lobes.sum(axis=1, keepdims=True)
-        shared = np.where(total > 0, (1 - COSINE_FRACTION) * lobes / np.where(total > 0, total, 1.0), 0.0)
+        shared = np.where(
+            total > 0,
+            (1 - COSINE_FRACTION) * lobes / np.where(total > 0, total, 1.0),
+            0.0,
+        )
         return np.concatenate([1 - shared.sum(axis=1, keepdims=True), shared], axis=1)
 
     def sample(self, mix: Array, normal: Array, view: Array, draw: Array) -> Array:
-        """Directions (n, 3) towards the light, one for each point; those below the surface carry no light.
+        """Directions (n, 3) towards the light, one for each point; those below the
+        surface carry no light.
 
         Parameters
         ----------
@@ -74,13 +95,17 @@ class LobeSampler:
         sine = np.sqrt(np.maximum(1 - cosine**2, 0.0))
         first, second = tangents(normal)
         drawn = (
-            (sine * np.cos(turn))[:, None] * first + (sine * np.sin(turn))[:, None] * second + cosine[:, None] * normal
+            (sine * np.cos(turn))[:, None] * first
+            + (sine * np.sin(turn))[:, None] * second
+            + cosine[:, None] * normal
         )
         mirrored = 2 * np.einsum("nc,nc->n", view, drawn)[:, None] * drawn - view
         return np.asarray(np.where(lobe[:, None], mirrored, drawn))
 
     def pdf(self, mix: Array, normal: Array, view: Array, towards: Array) -> Array:
-        """Density (n,) per steradian with which `sample` draws the directions `towards` (n, 3); 0 below the surface."""
+        """Density (n,) per steradian with which `sample` draws the directions `towards`
+        (n, 3); 0 below the surface.
+        """
         cosine = np.einsum("nc,nc->n", normal, towards)
         half = towards + view
         half = half / np.maximum(np.linalg.norm(half, axis=1, keepdims=True), 1e-12)
@@ -93,12 +118,24 @@ class LobeSampler:
         cell = np.minimum((u * cells).astype(np.int64), cells - 1)
         # p(omega_h) = p(u) / (2 pi sin(theta) dtheta/du), and d omega_i = 4 cos_d d omega_h
         solid = 2 * np.pi * np.maximum(np.sin(theta), 1e-12) * np.pi * u
-        lobes = (mix[:, 1:] * self.density[:, cell].T).sum(axis=1) / solid / (4 * np.maximum(cos_d, MIN_COSINE_HALF))
-        return np.asarray(np.where(cosine > 0, mix[:, 0] * cosine / np.pi + np.where(cos_h > 0, lobes, 0.0), 0.0))
+        lobes = (
+            (mix[:, 1:] * self.density[:, cell].T).sum(axis=1)
+            / solid
+            / (4 * np.maximum(cos_d, MIN_COSINE_HALF))
+        )
+        return np.asarray(
+            np.where(
+                cosine > 0,
+                mix[:, 0] * cosine / np.pi + np.where(cos_h > 0, lobes, 0.0),
+                0.0,
+            )
+        )
 
 
 def tangents(normal: Array) -> tuple[Array, Array]:
-    """Two unit vectors (n, 3) perpendicular to unit normals (n, 3) and to each other (Duff et al. 2017)."""
+    """Two unit vectors (n, 3) perpendicular to unit normals (n, 3) and to each other
+    (Duff et al. 2017).
+    """
     x, y, z = normal.T
     sign = np.where(z >= 0, 1.0, -1.0)
     a = -1.0 / (sign + z)

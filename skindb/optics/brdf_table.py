@@ -1,4 +1,6 @@
-"""Tables of isotropic, reciprocal BRDFs over half and difference angles, and their trilinear interpolation."""
+"""Tables of isotropic, reciprocal BRDFs over half and difference angles, and their
+trilinear interpolation.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,9 @@ Table = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class TableGrid:
-    """Nodes, uniform in sqrt(theta_h) and theta_d over [0, pi/2] including both ends, and in phi_d over a period pi."""
+    """Nodes, uniform in sqrt(theta_h) and theta_d over [0, pi/2] including both ends,
+    and in phi_d over a period pi.
+    """
 
     n_theta_h: int
     n_theta_d: int
@@ -39,26 +43,38 @@ class TableGrid:
         return np.asarray(np.arange(self.n_phi_d) * np.pi / self.n_phi_d)
 
 
-# Interpolation error of the 59 materials, weighted by both cosines, median of the rms: 0.8 % above 6 degrees of
-# elevation, 0.3 % above 12. Grazing light requires many nodes in theta_d, while few suffice in phi_d (90 x 90 x 24:
-# 1.3 % or more).
+# Interpolation error of the 59 materials, weighted by both cosines, median of the rms:
+# 0.8 % above 6 degrees of elevation, 0.3 % above 12. Grazing light requires many nodes
+# in theta_d, while few suffice in phi_d (90 x 90 x 24: 1.3 % or more).
 DEFAULT_GRID = TableGrid(90, 120, 16)
 
 
-def tabulate(evaluate: Callable[[Array, Array], Array], grid: TableGrid = DEFAULT_GRID) -> Table:
+def tabulate(
+    evaluate: Callable[[Array, Array], Array], grid: TableGrid = DEFAULT_GRID
+) -> Table:
     """Values of `evaluate(wi, wo)` -> (..., m) at the nodes, (nh, nd, np, m) float32.
 
-    At some nodes a direction is below the horizon. `evaluate` must be defined there too, for example by clamping the
-    cosines.
+    At some nodes a direction is below the horizon. `evaluate` must be defined there
+    too, for example by clamping the cosines.
     """
-    # at theta_d = pi/2 the directions are opposite and have no half vector; rounding would choose an arbitrary one
+    # at theta_d = pi/2 the directions are opposite and have no half vector; rounding
+    # would choose an arbitrary one
     theta_d = np.minimum(grid.theta_d, np.pi / 2 - 1e-6)
     mesh = np.meshgrid(grid.theta_h, theta_d, grid.phi_d, indexing="ij")
-    return np.stack([evaluate(*directions(*(a[i] for a in mesh))).astype(np.float32) for i in range(grid.n_theta_h)])
+    return np.stack(
+        [
+            evaluate(*directions(*(a[i] for a in mesh))).astype(np.float32)
+            for i in range(grid.n_theta_h)
+        ]
+    )
 
 
-def lookup(table: NDArray[Any], theta_h: ArrayLike, theta_d: ArrayLike, phi_d: ArrayLike) -> Array:
-    """Interpolate a table (nh, nd, np, m) trilinearly at angles [rad], (..., m); phi_d has period pi."""
+def lookup(
+    table: NDArray[Any], theta_h: ArrayLike, theta_d: ArrayLike, phi_d: ArrayLike
+) -> Array:
+    """Interpolate a table (nh, nd, np, m) trilinearly at angles [rad], (..., m); phi_d
+    has period pi.
+    """
     nh, nd, n_phi = table.shape[:3]
     half = np.pi / 2
     x = np.sqrt(np.clip(np.asarray(theta_h, np.float64) / half, 0, 1)) * (nh - 1)
@@ -75,19 +91,28 @@ def lookup(table: NDArray[Any], theta_h: ArrayLike, theta_d: ArrayLike, phi_d: A
     total: Array = np.zeros((*x.shape, table.shape[3]))
     for di, wx in ((0, 1 - fx), (1, fx)):
         for dj, wy in ((0, 1 - fy), (1, fy)):
-            total += wx * wy * ((1 - fz) * table[i + di, j + dj, k] + fz * table[i + di, j + dj, k1])
+            total += (
+                wx
+                * wy
+                * ((1 - fz) * table[i + di, j + dj, k] + fz * table[i + di, j + dj, k1])
+            )
     return total
 
 
-def brdf_metric(tables: NDArray[Any], *, weighted_like: NDArray[Any] | None = None) -> Array:
+def brdf_metric(
+    tables: NDArray[Any], *, weighted_like: NDArray[Any] | None = None
+) -> Array:
     """Gram matrix (m, m) of the bases over pairs of directions above the horizon.
 
-    Pairs are weighted by their solid angles, both cosines, and the mean of the bases to the power -4/3. This amounts
-    to differences in cube-root space, so that highlights do not dominate. `weighted_like` are tables on the same grid
-    whose mean is used instead.
+    Pairs are weighted by their solid angles, both cosines, and the mean of the bases to
+    the power -4/3. This amounts to differences in cube-root space, so that highlights
+    do not dominate. `weighted_like` are tables on the same grid whose mean is used
+    instead.
     """
     grid = TableGrid(*tables.shape[:3])
-    means = (tables if weighted_like is None else weighted_like).mean(axis=-1, dtype=np.float64)
+    means = (tables if weighted_like is None else weighted_like).mean(
+        axis=-1, dtype=np.float64
+    )
     theta_d, phi_d = np.meshgrid(grid.theta_d, grid.phi_d, indexing="ij")
     gram = np.zeros((tables.shape[-1],) * 2)
     for slab, mean, theta_h in zip(tables, means, grid.theta_h, strict=True):
@@ -102,9 +127,11 @@ def brdf_metric(tables: NDArray[Any], *, weighted_like: NDArray[Any] | None = No
 
 
 def directional_albedo(table: NDArray[Any], cos_o: ArrayLike, *, n: int = 96) -> Array:
-    """Fraction (k, m) of the light from a direction that is reflected, for cosines (k,) of that direction.
+    """Fraction (k, m) of the light from a direction that is reflected, for cosines (k,)
+    of that direction.
 
-    The integral is over half vectors, on a grid that is quadratic in theta_h to resolve narrow lobes.
+    The integral is over half vectors, on a grid that is quadratic in theta_h to resolve
+    narrow lobes.
     """
     t, w = np.polynomial.legendre.leggauss(n)
     t = (t + 1) / 2
@@ -118,7 +145,15 @@ def directional_albedo(table: NDArray[Any], cos_o: ArrayLike, *, n: int = 96) ->
         wo = np.broadcast_to([np.sqrt(max(0.0, 1 - c * c)), 0.0, c], h.shape)
         cos_d = (wo * h).sum(-1)
         wi = 2 * cos_d[..., None] * h - wo
-        jacobian = 4 * np.maximum(cos_d, 0) * np.sin(a) * (w * t * np.pi)[:, None] * (np.pi / n)
+        jacobian = (
+            4
+            * np.maximum(cos_d, 0)
+            * np.sin(a)
+            * (w * t * np.pi)[:, None]
+            * (np.pi / n)
+        )
         weight = np.where(wi[..., 2] > 0, jacobian * wi[..., 2], 0.0)
-        rows.append(np.einsum("ij,ijm->m", weight, lookup(table, *half_difference(wi, wo))))
+        rows.append(
+            np.einsum("ij,ijm->m", weight, lookup(table, *half_difference(wi, wo)))
+        )
     return np.stack(rows)

@@ -1,4 +1,5 @@
-"""The dictionary of measured BRDFs whose mixtures describe a surface: 59 embedded materials or those of a file.
+"""The dictionary of measured BRDFs whose mixtures describe a surface: 59 embedded
+materials or those of a file.
 
 See `skindb.optics.measured` for files.
 """
@@ -44,7 +45,9 @@ SOURCES = tuple(
         "_vectors",
     )
 )
-MIN_COSINE_TABLE = 0.03  # cosines are clamped to this, so that cells below the horizon continue the last value above it
+# cosines are clamped to this, so that cells below the horizon continue the last value
+# above it
+MIN_COSINE_TABLE = 0.03
 
 
 @dataclass(frozen=True)
@@ -53,13 +56,17 @@ class Origin:
 
     check: str  # whether it is the published file of its name
     sha256: str
-    hole_fraction: float  # fraction of nodes above the horizon that were not measured and continue their neighbours
-    resampling_error: float  # relative rms error at the measured nodes, see `weighted_error`
+    # fraction of nodes above the horizon that were not measured and continue their
+    # neighbours
+    hole_fraction: float
+    # relative rms error at the measured nodes, see `weighted_error`
+    resampling_error: float
 
 
 @dataclass(frozen=True, eq=False)
 class Dictionary:
-    """Monochrome (mean of RGB), non-negative BRDF tables (nh, nd, np, m) in sr^-1, one per material.
+    """Monochrome (mean of RGB), non-negative BRDF tables (nh, nd, np, m) in sr^-1, one
+    per material.
 
     Dictionaries compare by identity.
     """
@@ -85,26 +92,34 @@ class Dictionary:
         for name, origin in zip(self.names, self.origins, strict=True):
             by_check.setdefault(origin.check, []).append(name)
         lines = [f"{check}: {', '.join(names)}" for check, names in by_check.items()]
-        worst, name = max((origin.hole_fraction, name) for name, origin in zip(self.names, self.origins, strict=True))
+        worst, name = max(
+            (origin.hole_fraction, name)
+            for name, origin in zip(self.names, self.origins, strict=True)
+        )
         if worst > 0:
             count = sum(origin.hole_fraction > 0 for origin in self.origins)
             most = f"most in {name} ({worst:.2%} of its nodes)"
-            lines.append(f"materials with unmeasured nodes above the horizon: {count}, {most}")
+            lines.append(
+                f"materials with unmeasured nodes above the horizon: {count}, {most}"
+            )
         return tuple(lines)
 
 
 def evaluate_abc(parameters: Array, wi: Array, wo: Array) -> Array:
-    """ABC microfacet BRDFs (..., m) for rows (m, 9) of `abc_low2012`, as mean of RGB (Loew et al. 2012).
+    """ABC microfacet BRDFs (..., m) for rows (m, 9) of `abc_low2012`, as mean of RGB
+    (Loew et al. 2012).
 
-    f = kd/pi + A F(theta_d) (1 + B (1 - cos theta_h))^-C G / (pi cos_i cos_o), with G for V grooves. Directions are in
-    the local frame.
+    f = kd/pi + A F(theta_d) (1 + B (1 - cos theta_h))^-C G / (pi cos_i cos_o), with G
+    for V grooves. Directions are in the local frame.
     """
     cos_i = np.maximum(wi[..., 2], MIN_COSINE_TABLE)
     cos_o = np.maximum(wo[..., 2], MIN_COSINE_TABLE)
     theta_h, theta_d, _ = half_difference(wi, wo)
     cos_h = np.maximum(np.cos(theta_h), 1e-6)
     cos_d = np.maximum(np.cos(theta_d), MIN_COSINE_TABLE)
-    masking = np.minimum(1.0, 2 * cos_h * np.minimum(cos_i, cos_o) / cos_d) / (np.pi * cos_i * cos_o)
+    masking = np.minimum(1.0, 2 * cos_h * np.minimum(cos_i, cos_o) / cos_d) / (
+        np.pi * cos_i * cos_o
+    )
     out = np.empty((*cos_i.shape, len(parameters)))
     lean = 2.0 * np.sin(theta_h / 2) ** 2  # 1 - cos theta_h without cancellation
     for m, row in enumerate(parameters):
@@ -114,7 +129,10 @@ def evaluate_abc(parameters: Array, wi: Array, wo: Array) -> Array:
         c = row[7]
         index = row[8]
         lobe = np.exp(-c * np.log1p(b * lean))
-        out[..., m] = kd / np.pi + scale * fresnel_reflectance(cos_d, float(index)) * lobe * masking
+        out[..., m] = (
+            kd / np.pi
+            + scale * fresnel_reflectance(cos_d, float(index)) * lobe * masking
+        )
     return out
 
 
@@ -124,21 +142,30 @@ def embedded_dictionary() -> Dictionary:
     rows = np.array(list(PARAMETERS.values()))
 
     def make() -> dict[str, Table]:
-        return {"table": tabulate(lambda wi, wo: evaluate_abc(rows, wi, wo), DEFAULT_GRID)}
+        return {
+            "table": tabulate(lambda wi, wo: evaluate_abc(rows, wi, wo), DEFAULT_GRID)
+        }
 
-    table = cached_arrays("embedded-dictionary", (DEFAULT_GRID,), sources=SOURCES, make=make)["table"]
+    table = cached_arrays(
+        "embedded-dictionary", (DEFAULT_GRID,), sources=SOURCES, make=make
+    )["table"]
     table.setflags(write=False)
     return Dictionary(tuple(PARAMETERS), table, DEFAULT_GRID, EMBEDDED)
 
 
 def sample_pairs(count: int = 20_000, lowest: float = 0.1) -> tuple[Array, Array]:
-    """Fixed pairs of directions (n, 3), (n, 3), spread evenly over sqrt(theta_h), theta_d and phi_d.
+    """Fixed pairs of directions (n, 3), (n, 3), spread evenly over sqrt(theta_h),
+    theta_d and phi_d.
 
     Both cosines are above `lowest`, by default 6 degrees of elevation.
     """
     # Kronecker sequence of the root of x^4 = x + 1 (Roberts 2018)
-    point = np.mod(np.arange(1, count + 1)[:, None] / 1.2207440846057596 ** np.arange(1, 4), 1.0)
-    wi, wo = directions(point[:, 0] ** 2 * np.pi / 2, point[:, 1] * np.pi / 2, point[:, 2] * np.pi)
+    point = np.mod(
+        np.arange(1, count + 1)[:, None] / 1.2207440846057596 ** np.arange(1, 4), 1.0
+    )
+    wi, wo = directions(
+        point[:, 0] ** 2 * np.pi / 2, point[:, 1] * np.pi / 2, point[:, 2] * np.pi
+    )
     up = np.minimum(wi[:, 2], wo[:, 2]) > lowest
     return wi[up], wo[up]
 
@@ -151,14 +178,19 @@ def weighted_error(found: Array, exact: Array, wi: Array, wo: Array) -> Array:
 
 
 @lru_cache(maxsize=2)
-def reduced_dictionary(dictionary: Dictionary, rank: int, *, cube_roots: bool = False) -> tuple[Table, Array]:
+def reduced_dictionary(
+    dictionary: Dictionary, rank: int, *, cube_roots: bool = False
+) -> tuple[Table, Array]:
     """`reduce_dictionary` of the tables or of their cube roots; cached for the takes of a dome."""
 
     def make() -> dict[str, NDArray[Any]]:
-        reduced, lift = reduce_dictionary(np.cbrt(dictionary.table) if cube_roots else dictionary.table, rank)
+        reduced, lift = reduce_dictionary(
+            np.cbrt(dictionary.table) if cube_roots else dictionary.table, rank
+        )
         return {"reduced": reduced, "lift": lift}
 
-    if rank >= len(dictionary.names):  # without a reduction, the result is not worth the space in the cache
+    # without a reduction, the result is not worth the space in the cache
+    if rank >= len(dictionary.names):
         made = make()
         return made["reduced"], made["lift"]
     arguments = (dictionary.digest, rank, cube_roots)
@@ -168,11 +200,20 @@ def reduced_dictionary(dictionary: Dictionary, rank: int, *, cube_roots: bool = 
 
 @cache
 def _disc_rule(rings: int, spokes: int) -> tuple[Array, Array]:
-    """Quadrature points (q, 2) of the unit disc and weights (q,), Gauss in the squared radius, uniform in angle."""
+    """Quadrature points (q, 2) of the unit disc and weights (q,), Gauss in the squared
+    radius, uniform in angle.
+    """
     x, w = np.polynomial.legendre.leggauss(rings)
     radius = np.sqrt((x + 1) / 2)
-    angle = 2 * np.pi * (np.arange(spokes)[None] + 0.5 * (np.arange(rings)[:, None] % 2)) / spokes
-    points = np.stack([radius[:, None] * np.cos(angle), radius[:, None] * np.sin(angle)], axis=-1)
+    angle = (
+        2
+        * np.pi
+        * (np.arange(spokes)[None] + 0.5 * (np.arange(rings)[:, None] % 2))
+        / spokes
+    )
+    points = np.stack(
+        [radius[:, None] * np.cos(angle), radius[:, None] * np.sin(angle)], axis=-1
+    )
     return points.reshape(-1, 2), np.repeat(w / 2 / spokes, spokes)
 
 
@@ -190,25 +231,30 @@ def average_disc(
     The rules are those of `convolve_disc`.
     """
     theta_h, theta_d, _ = half_difference(wi, wo)
-    reach = angular_radius / (2 * np.cos(theta_d))  # of the half vectors, perpendicular to the plane of both directions
+    # of the half vectors, perpendicular to the plane of both directions
+    reach = angular_radius / (2 * np.cos(theta_d))
     close = theta_h < reach + np.radians(0.5)
     out = np.zeros((len(wi), len(dictionary.names)), np.float32)
     for rule, some in ((far, ~close), (near, close)):
         points, weights = _disc_rule(*rule)
         values = np.zeros((int(some.sum()), out.shape[1]), np.float32)
         disc = points * np.tan(angular_radius)
-        _row_kernels.average_disc(dictionary.table, wi[some], wo[some], disc, weights, values)
+        _row_kernels.average_disc(
+            dictionary.table, wi[some], wo[some], disc, weights, values
+        )
         out[some] = values
     return out
 
 
 def disc_dictionary(dictionary: Dictionary | None, angular_radius: float) -> Dictionary:
-    """The dictionary, by default the embedded one, averaged over lights with this angular radius [rad].
+    """The dictionary, by default the embedded one, averaged over lights with this
+    angular radius [rad].
 
     The radius is rounded to a hundredth of a degree, so that the takes of a dome share the tables.
     """
     return convolve_disc(
-        dictionary or embedded_dictionary(), float(np.radians(np.round(np.degrees(angular_radius), 2)))
+        dictionary or embedded_dictionary(),
+        float(np.radians(np.round(np.degrees(angular_radius), 2))),
     )
 
 
@@ -229,9 +275,11 @@ def convolve_disc(
     angular_radius
         Angular radius of the disc as seen from the surface [rad].
     far, near
-        Gauss points in the squared radius, and points per ring. `near` is used if half vectors over the disc come
-        within half a degree of the normal, where lobes may be narrower than the disc. With `far` alone, the worst error
-        of the 59 materials at 0.8 degrees is 13 % instead of 1.2 % rms above 6 degrees of elevation, in half the time.
+        Gauss points in the squared radius, and points per ring. `near` is used if half
+        vectors over the disc come within half a degree of the normal, where lobes may
+        be narrower than the disc. With `far` alone, the worst error of the 59 materials
+        at 0.8 degrees is 13 % instead of 1.2 % rms above 6 degrees of elevation, in
+        half the time.
 
     Raises
     ------
@@ -240,18 +288,28 @@ def convolve_disc(
 
     Notes
     -----
-    The last two results are kept in memory and all of them on disk, as fits, studies and edits of one dome share them
-    (46 MB, 3 s). Tables that are already averaged over this disc, to a hundredth of a degree, are returned as they are.
-    An average over one direction is not reciprocal, while the tables must have period pi in phi_d. The mean of the
-    averages around either direction is therefore used.
+    The last two results are kept in memory and all of them on disk, as fits, studies
+    and edits of one dome share them (46 MB, 3 s). Tables that are already averaged over
+    this disc, to a hundredth of a degree, are returned as they are. An average over one
+    direction is not reciprocal, while the tables must have period pi in phi_d. The mean
+    of the averages around either direction is therefore used.
     """
     before = dictionary.disc_angular_radius
-    if before and abs(before - angular_radius) > np.radians(0.0101):  # the fit rounds to a hundredth of a degree
+    # the fit rounds to a hundredth of a degree
+    if before and abs(before - angular_radius) > np.radians(0.0101):
         rule = (
-            f"tables must be for point lights or for the disc of these lights, {np.degrees(angular_radius):.2f} degrees"
+            "tables must be for point lights or for the disc of these lights, "
+            f"{np.degrees(angular_radius):.2f} degrees"
         )
         cure = "provide tables for point lights"
-        raise InputError(Fault(dictionary.source, rule, f"a disc of {np.degrees(before):.2f} degrees", cure))
+        raise InputError(
+            Fault(
+                dictionary.source,
+                rule,
+                f"a disc of {np.degrees(before):.2f} degrees",
+                cure,
+            )
+        )
     if before or angular_radius <= 0:
         return dictionary
     arguments = (dictionary.digest, angular_radius, far, near)
@@ -264,20 +322,27 @@ def convolve_disc(
     return replace(dictionary, table=found["table"], disc_angular_radius=angular_radius)
 
 
-def _convolve(dictionary: Dictionary, angular_radius: float, far: Rule, near: Rule) -> Table:
+def _convolve(
+    dictionary: Dictionary, angular_radius: float, far: Rule, near: Rule
+) -> Table:
     """Tables averaged over the discs around both directions."""
     grid = dictionary.grid
     out = np.zeros_like(dictionary.table)
-    # at pi / 2 the directions are opposite and have no half vector; rounding would choose an arbitrary one
+    # at pi / 2 the directions are opposite and have no half vector; rounding would
+    # choose an arbitrary one
     theta_d = np.minimum(grid.theta_d, np.pi / 2 - 1e-4)
 
     def fill(slab: int) -> None:
         th, td, pd = np.meshgrid(grid.theta_h[slab], theta_d, grid.phi_d, indexing="ij")
         wi, wo = directions(th.ravel(), td.ravel(), pd.ravel())
-        sides = [average_disc(dictionary, *pair, angular_radius, far=far, near=near) for pair in ((wi, wo), (wo, wi))]
+        sides = [
+            average_disc(dictionary, *pair, angular_radius, far=far, near=near)
+            for pair in ((wi, wo), (wo, wi))
+        ]
         out[slab] = ((sides[0] + sides[1]) / 2).reshape(out[slab].shape)
 
-    # plain threads, as the kernel releases the GIL and numba's own threads conflict with those of dask and with forks
+    # plain threads, as the kernel releases the GIL and numba's own threads conflict
+    # with those of dask and with forks
     with ThreadPoolExecutor() as pool:
         list(pool.map(fill, range(grid.n_theta_h)))
     return out

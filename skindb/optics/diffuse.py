@@ -1,6 +1,7 @@
 """Diffuse reflectance of a semi-infinite medium and its inverse (Weyrich et al. 2005, eq. 5).
 
-Both use s = sqrt(3 (1 - alpha')), which is also the stored variable, because alpha' near 1 suffers from cancellation.
+Both use s = sqrt(3 (1 - alpha')), which is also the stored variable, because alpha'
+near 1 suffers from cancellation.
 """
 
 from __future__ import annotations
@@ -15,13 +16,16 @@ S_MAX = float(np.sqrt(3.0))
 # range of R_d that is inverted; values outside are clamped
 MIN_R_D = 1e-6
 MAX_R_D = 1.0 - 1e-9
-S_FLOOR = 1e-4  # lower limit of s for scattering coefficients, as sigma_t' = sigma_tr / s diverges
+# lower limit of s for scattering coefficients, as sigma_t' = sigma_tr / s diverges
+S_FLOOR = 1e-4
 
 
 def diffuse_reflectance(s: ArrayLike, *, eta: float) -> Array:
     """R_d = alpha'/2 (1 + exp(-4/3 A s)) exp(-s) for s in [0, sqrt 3]."""
     s = np.asarray(s, np.float64)
-    return np.asarray((1.0 - s * s / 3.0) / 2.0 * (1.0 + np.exp(-_steepness(eta) * s)) * np.exp(-s))
+    return np.asarray(
+        (1.0 - s * s / 3.0) / 2.0 * (1.0 + np.exp(-_steepness(eta) * s)) * np.exp(-s)
+    )
 
 
 def dipole_s(diffuse: ArrayLike, *, eta: float) -> tuple[Array, NDArray[np.bool_]]:
@@ -37,8 +41,8 @@ def dipole_s(diffuse: ArrayLike, *, eta: float) -> tuple[Array, NDArray[np.bool_
     Returns
     -------
     s, clamped
-        s with a relative error below 1e-12 for R_d in [1e-6, 1 - 1e-9], and a mask of values that were outside this
-        range and clamped.
+        s with a relative error below 1e-12 for R_d in [1e-6, 1 - 1e-9], and a mask of
+        values that were outside this range and clamped.
     """
     value = np.asarray(diffuse, np.float64)
     clamped = (value < MIN_R_D) | (value > MAX_R_D)
@@ -62,10 +66,14 @@ def reduced_albedo(s: ArrayLike) -> Array:
 
 
 def scattering_coefficients(s: ArrayLike, sigma_tr: ArrayLike) -> tuple[Array, Array]:
-    """(sigma_a, sigma_s') in mm^-1 from s and sigma_tr (Weyrich et al. 2005, section 9); s is floored at 1e-4."""
+    """(sigma_a, sigma_s') in mm^-1 from s and sigma_tr (Weyrich et al. 2005, section
+    9); s is floored at 1e-4.
+    """
     s = np.maximum(np.asarray(s, np.float64), S_FLOOR)
     extinction = np.asarray(sigma_tr, np.float64) / s
-    return np.asarray(extinction * s * s / 3.0), np.asarray(extinction * (1.0 - s * s / 3.0))
+    return np.asarray(extinction * s * s / 3.0), np.asarray(
+        extinction * (1.0 - s * s / 3.0)
+    )
 
 
 def _steepness(eta: float) -> float:
@@ -85,4 +93,6 @@ def _slope(s: Array, eta: float) -> Array:
     b = 1.0 + _steepness(eta)
     near = np.exp(-s)
     far = np.exp(-b * s)
-    return np.asarray((1.0 - s * s / 3.0) / 2.0 * (near + b * far) + s / 3.0 * (near + far))
+    return np.asarray(
+        (1.0 - s * s / 3.0) / 2.0 * (near + b * far) + s / 3.0 * (near + far)
+    )

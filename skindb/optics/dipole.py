@@ -1,4 +1,6 @@
-"""Diffuse reflectance profile of the dipole (Jensen et al. 2001; Weyrich et al. 2005, section 8 and eq. 9)."""
+"""Diffuse reflectance profile of the dipole (Jensen et al. 2001; Weyrich et al. 2005,
+section 8 and eq. 9).
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,9 @@ def sigma_tr(sigma_a: ArrayLike, sigma_s_prime: ArrayLike) -> Array:
     return np.asarray(np.sqrt(3.0 * a * (a + s)))
 
 
-def dipole_profile(r: ArrayLike, sigma_a: ArrayLike, sigma_s_prime: ArrayLike, *, eta: float) -> Array:
+def dipole_profile(
+    r: ArrayLike, sigma_a: ArrayLike, sigma_s_prime: ArrayLike, *, eta: float
+) -> Array:
     """R(r) in mm^-2: radiant exitance at distance r [mm] per unit of power that enters.
 
     Arguments broadcast. The integral of R over the plane is eq. 5.
@@ -35,11 +39,14 @@ def dipole_profile(r: ArrayLike, sigma_a: ArrayLike, sigma_s_prime: ArrayLike, *
     return np.asarray(s / extinction / (4.0 * np.pi) * total)
 
 
-def dipole_power_beyond(distance: ArrayLike, sigma_a: ArrayLike, sigma_s_prime: ArrayLike, *, eta: float) -> Array:
+def dipole_power_beyond(
+    distance: ArrayLike, sigma_a: ArrayLike, sigma_s_prime: ArrayLike, *, eta: float
+) -> Array:
     """Fraction of the entered power that leaves farther than `distance` [mm] from where it entered.
 
-    The integral of 2 pi r R(r) from `distance` to infinity, in closed form; at 0 it is R_d (eq. 5). Arguments
-    broadcast. It is also the exitance of a plane at that distance from an evenly lit one.
+    The integral of 2 pi r R(r) from `distance` to infinity, in closed form; at 0 it is
+    R_d (eq. 5). Arguments broadcast. It is also the exitance of a plane at that
+    distance from an evenly lit one.
     """
     r, a, s = (np.asarray(x, np.float64) for x in (distance, sigma_a, sigma_s_prime))
     extinction = a + s

@@ -1,4 +1,6 @@
-"""Subsurface transport over a surface by the dipole and an octree (Jensen, Buhler 2002; Weyrich et al. 2005, eq. 9)."""
+"""Subsurface transport over a surface by the dipole and an octree (Jensen, Buhler 2002;
+Weyrich et al. 2005, eq. 9).
+"""
 
 from __future__ import annotations
 
@@ -14,9 +16,11 @@ from skindb.optics.diffuse import S_FLOOR, diffuse_reflectance, reduced_albedo
 from skindb.optics.fresnel import boundary_factor
 
 MAX_LEAF_POINTS = 8  # nodes with more points are divided
-REACH_MEAN_PATHS = 18.0  # mean paths 1 / sigma_tr after which the profile is below 1e-7 of its integral
+# mean paths 1 / sigma_tr after which the profile is below 1e-7 of its integral
+REACH_MEAN_PATHS = 18.0
 RECEIVERS_PER_BLOCK = 2048  # receivers that a thread processes at a time
-LIGHTS_PER_WALK = 32  # lights of one traversal; at 250,000 points 40 MB of power and 190 MB of sums
+# lights of one traversal; at 250,000 points 40 MB of power and 190 MB of sums
+LIGHTS_PER_WALK = 32
 
 
 def subsurface_exitance(
@@ -31,34 +35,41 @@ def subsurface_exitance(
     normalise: bool = True,
     receivers: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.float32]:
-    """Radiant exitance under the boundary at every point, for many lights in one traversal of the tree.
+    """Radiant exitance under the boundary at every point, for many lights in one
+    traversal of the tree.
 
     Parameters
     ----------
     points, areas
-        (n, 3) mm and (n,) mm2, samples of the surface; at most 0.6 / sigma_t' apart for an error below 1 %.
+        (n, 3) mm and (n,) mm2, samples of the surface; at most 0.6 / sigma_t' apart for
+        an error below 1 %.
     irradiance
-        (n, l) irradiance that enters the skin, one column per light. The colour of a light is a factor of the result;
-        light whose colour varies over the surface needs one column per channel.
+        (n, l) irradiance that enters the skin, one column per light. The colour of a
+        light is a factor of the result; light whose colour varies over the surface
+        needs one column per channel.
     s, sigma_tr
         (n, 3) dipole s and sigma_tr [mm^-1] of the receiving point, per channel.
     eta
         Relative index of refraction.
     tolerance
-        A node is treated as one point if its area is below `tolerance` times its squared distance. With 0.1 the error
-        is about 0.2 %; 0 sums over all pairs.
+        A node is treated as one point if its area is below `tolerance` times its
+        squared distance. With 0.1 the error is about 0.2 %; 0 sums over all pairs.
     normalise
-        Whether to divide by the sum of the kernel over the surface and multiply by R_d. Uniform light then gives
-        exactly R_d, and a coarse or curved surface, which captures only part of the kernel, is not darkened.
+        Whether to divide by the sum of the kernel over the surface and multiply by R_d.
+        Uniform light then gives exactly R_d, and a coarse or curved surface, which
+        captures only part of the kernel, is not darkened.
     receivers
-        (n,) points whose exitance is computed, default all; the time is proportional to their number.
+        (n,) points whose exitance is computed, default all; the time is proportional to
+        their number.
 
     Returns
     -------
     ndarray
         (l, n, 3) exitance of each light; 0 at points that are not receivers.
     """
-    points, areas, irradiance = (np.asarray(x, np.float64) for x in (points, areas, irradiance))
+    points, areas, irradiance = (
+        np.asarray(x, np.float64) for x in (points, areas, irradiance)
+    )
     result = np.zeros((irradiance.shape[1], len(points), 3), np.float32)
     if result.size == 0:
         return result
@@ -72,26 +83,55 @@ def subsurface_exitance(
     depth = s / decay
     above = depth * (1.0 + 4.0 / 3.0 * boundary_factor(eta))
     parameters = np.stack([depth, above, decay, reduced_albedo(s)], axis=-1)
-    *tree, box, centre, node_area = _tree_kernels.build(code, points, areas, MAX_LEAF_POINTS)
+    *tree, box, centre, node_area = _tree_kernels.build(
+        code, points, areas, MAX_LEAF_POINTS
+    )
     place = np.concatenate([points, centre])
     area = np.concatenate([areas, node_area])
     reach = REACH_MEAN_PATHS / float(decay.min())
-    wanted = np.arange(len(points)) if receivers is None else np.flatnonzero(receivers[order])
+    wanted = (
+        np.arange(len(points))
+        if receivers is None
+        else np.flatnonzero(receivers[order])
+    )
     for low in range(0, len(result), LIGHTS_PER_WALK):
-        power = _powers(irradiance[order, low : low + LIGHTS_PER_WALK] * areas[:, None], tree, _tree_kernels)
+        power = _powers(
+            irradiance[order, low : low + LIGHTS_PER_WALK] * areas[:, None],
+            tree,
+            _tree_kernels,
+        )
         even = np.zeros((len(wanted), 3))
         sums = np.zeros((len(wanted), len(power), 3, _tree_kernels.LIGHTS_IN_REGISTERS))
 
-        def walk(start: int, power: Array = power, even: Array = even, sums: Array = sums) -> None:
+        def walk(
+            start: int, power: Array = power, even: Array = even, sums: Array = sums
+        ) -> None:
             stop = min(start + RECEIVERS_PER_BLOCK, len(wanted))
             _tree_kernels.gather(
-                start, stop, wanted, parameters, place, area, power, *tree, box, tolerance, reach, even, sums
+                start,
+                stop,
+                wanted,
+                parameters,
+                place,
+                area,
+                power,
+                *tree,
+                box,
+                tolerance,
+                reach,
+                even,
+                sums,
             )
 
-        # plain threads, as the kernel releases the GIL, and numba's own threads abort when two threads render at once
+        # plain threads, as the kernel releases the GIL, and numba's own threads abort
+        # when two threads render at once
         with ThreadPoolExecutor() as pool:
             list(pool.map(walk, range(0, len(wanted), RECEIVERS_PER_BLOCK)))
-        gain = diffuse_reflectance(s[wanted], eta=eta) / np.maximum(even, 1e-300) if normalise else np.ones(1)
+        gain = (
+            diffuse_reflectance(s[wanted], eta=eta) / np.maximum(even, 1e-300)
+            if normalise
+            else np.ones(1)
+        )
         for i in range(low, min(low + LIGHTS_PER_WALK, len(result))):
             group, lane = divmod(i - low, _tree_kernels.LIGHTS_IN_REGISTERS)
             result[i, order[wanted]] = sums[:, group, :, lane] * gain
@@ -99,7 +139,8 @@ def subsurface_exitance(
 
 
 def _powers(power: Array, tree: list[Any], kernels: Any) -> NDArray[np.float32]:
-    """Power (groups, points and nodes, LIGHTS_IN_REGISTERS) [irradiance mm2] from the power (n, l) of points.
+    """Power (groups, points and nodes, LIGHTS_IN_REGISTERS) [irradiance mm2] from the
+    power (n, l) of points.
 
     The last group is padded with zeros.
     """
@@ -107,7 +148,9 @@ def _powers(power: Array, tree: list[Any], kernels: Any) -> NDArray[np.float32]:
     groups = -(-lights // kernels.LIGHTS_IN_REGISTERS)
     out = np.zeros((groups, n + len(tree[0]), kernels.LIGHTS_IN_REGISTERS), np.float32)
     for i in range(lights):
-        out[i // kernels.LIGHTS_IN_REGISTERS, :n, i % kernels.LIGHTS_IN_REGISTERS] = power[:, i]
+        out[i // kernels.LIGHTS_IN_REGISTERS, :n, i % kernels.LIGHTS_IN_REGISTERS] = (
+            power[:, i]
+        )
     kernels.sum_nodes(out, n, *tree)
     return out
 

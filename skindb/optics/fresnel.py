@@ -18,7 +18,8 @@ def fresnel_reflectance(cos_i: ArrayLike, eta: float) -> Array:
     cos_i
         Cosine of the angle to the normal, in [0, 1].
     eta
-        Index of refraction behind the boundary over that in front of it. Total internal reflection gives F_r = 1.
+        Index of refraction behind the boundary over that in front of it. Total internal
+        reflection gives F_r = 1.
     """
     c = np.clip(np.abs(np.asarray(cos_i, np.float64)), 0.0, 1.0)
     square = eta * eta - 1.0 + c * c
@@ -27,7 +28,9 @@ def fresnel_reflectance(cos_i: ArrayLike, eta: float) -> Array:
         across = ((g - c) / (g + c)) ** 2
         along = ((c * (g + c) - 1.0) / (c * (g - c) + 1.0)) ** 2
     # eta = 1 at grazing incidence is 0/0; without a boundary nothing is reflected
-    reflected = np.where(g + c > 0.0, 0.5 * across * (1.0 + along), 0.0 if eta == 1.0 else 1.0)
+    reflected = np.where(
+        g + c > 0.0, 0.5 * across * (1.0 + along), 0.0 if eta == 1.0 else 1.0
+    )
     return np.where(square > 0.0, reflected, reflected if eta == 1.0 else 1.0)
 
 
@@ -38,14 +41,17 @@ def fresnel_transmittance(cos_i: ArrayLike, eta: float) -> Array:
 
 @lru_cache(maxsize=32)
 def internal_diffuse_reflectance(eta: float) -> float:
-    """F_dr, the cosine-weighted mean of F_r from inside, by quadrature (relative error below 1e-12)."""
+    """F_dr, the cosine-weighted mean of F_r from inside, by quadrature (relative error
+    below 1e-12).
+    """
     if eta <= 1.0:
         inside = eta
         low = 0.0
     else:
         inside = eta
         low = float(np.sqrt(1.0 - 1.0 / eta**2))
-    # below the critical cosine all light is reflected; above, c = low + (1 - low) t^2 removes the square-root kink
+    # below the critical cosine all light is reflected; above, c = low + (1 - low) t^2
+    # removes the square-root kink
     x, w = np.polynomial.legendre.leggauss(200)
     t = (x + 1.0) / 2.0
     wt = w / 2.0
@@ -55,7 +61,9 @@ def internal_diffuse_reflectance(eta: float) -> float:
 
 
 def internal_diffuse_reflectance_polynomial(eta: float) -> float:
-    """F_dr by the polynomial of Egan and Hilgeman (1973), which the paper uses; 0.4448 at eta = 1.3."""
+    """F_dr by the polynomial of Egan and Hilgeman (1973), which the paper uses; 0.4448
+    at eta = 1.3.
+    """
     return -1.440 / eta**2 + 0.710 / eta + 0.668 + 0.0636 * eta
 
 

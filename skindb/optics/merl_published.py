@@ -1,7 +1,9 @@
-"""SHA-256 of the hundred files of the MERL database, version 2 of February 2006 (Matusik et al. 2003).
+"""SHA-256 of the hundred files of the MERL database, version 2 of February 2006
+(Matusik et al. 2003).
 
-MERL publishes no checksums. These are the Git LFS object names of the complete public copy in
-github.com/duanwenxi/Mitsuba-3-for-Photometric-Stereo-data, commit 914294a081b1ef36e56f9392c2758bca24868e3a.
+MERL publishes no checksums. These are the Git LFS object names of the complete public
+copy in github.com/duanwenxi/Mitsuba-3-for-Photometric-Stereo-data, commit
+914294a081b1ef36e56f9392c2758bca24868e3a.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""Normals of surfels and their covariance from reflectance samples (Weyrich et al. 2005, section 6)."""
+"""Normals of surfels and their covariance from reflectance samples (Weyrich et al.
+2005, section 6).
+"""
 
 from __future__ import annotations
 
@@ -16,15 +18,18 @@ from skindb.optics import _photometric_kernels
 class PhotometricNormals:
     """Estimates for n surfels; NaN where the samples do not determine them.
 
-    `peak` (n, 3) follows the paper: the normal is half way between each camera and its direction of maximum
-    reflectance. It uses the darkest channel, which has the least diffuse light under the highlight. The four brightest
-    lights are weighted by their excess over the fifth, cameras by the contrast of their brightest light.
+    `peak` (n, 3) follows the paper: the normal is half way between each camera and its
+    direction of maximum reflectance. It uses the darkest channel, which has the least
+    diffuse light under the highlight. The four brightest lights are weighted by their
+    excess over the fifth, cameras by the contrast of their brightest light.
 
-    `normal` (n, 2, 3), `spread` (n, 2) and `covariance` (n, 2, 3, 3) [rad^2] are from robust photometric stereo. The
-    first signal is a low quantile over cameras of the mean channel, below the highlights; the second is the median of
-    the colour difference that is zero for white light (Zickler et al. 2008). The spread is the residual over the
-    signal. The covariance describes the noise of the samples, estimated from the residuals. A small rotation t of the
-    scan's normal rotates the estimate by `pull` t.
+    `normal` (n, 2, 3), `spread` (n, 2) and `covariance` (n, 2, 3, 3) [rad^2] are from
+    robust photometric stereo. The first signal is a low quantile over cameras of the
+    mean channel, below the highlights; the second is the median of the colour
+    difference that is zero for white light (Zickler et al. 2008). The spread is the
+    residual over the signal. The covariance describes the noise of the samples,
+    estimated from the residuals. A small rotation t of the scan's normal rotates the
+    estimate by `pull` t.
     """
 
     peak: Array
@@ -36,7 +41,14 @@ class PhotometricNormals:
 
 
 def photometric_normals(
-    sample: NDArray[np.float32], position: Array, light: Array, camera: Array, scan: Array, *, eta: float, prior: float
+    sample: NDArray[np.float32],
+    position: Array,
+    light: Array,
+    camera: Array,
+    scan: Array,
+    *,
+    eta: float,
+    prior: float,
 ) -> PhotometricNormals:
     """Estimate the normals of surfels by all methods.
 
@@ -60,8 +72,19 @@ def photometric_normals(
     covariance = np.full((n, 2, 3, 3), np.nan)
     pull = np.full((n, 2, 3, 3), np.nan)
     cross = np.full((n, 3, 3), np.nan)
-    points = (np.ascontiguousarray(a, np.float64) for a in (position, light, camera, scan))
+    points = (
+        np.ascontiguousarray(a, np.float64) for a in (position, light, camera, scan)
+    )
     _photometric_kernels.estimate(
-        sample_bits(sample), *points, eta, prior, peak, normal, spread, covariance, cross, pull
+        sample_bits(sample),
+        *points,
+        eta,
+        prior,
+        peak,
+        normal,
+        spread,
+        covariance,
+        cross,
+        pull,
     )
     return PhotometricNormals(peak, normal, spread, covariance, cross, pull)

@@ -23,9 +23,11 @@ def shade_points(
     falloff: float,
     eta: float,
 ) -> NDArray[np.float32]:
-    """Radiance per radiant intensity: the diffuse term plus the weighted measured BRDFs (eq. 1, 3, 8).
+    """Radiance per radiant intensity: the diffuse term plus the weighted measured BRDFs
+    (eq. 1, 3, 8).
 
-        sum over lamp points of lit cos(theta_i) / d^2 falloff (F_t(i) F_t(o) R_d / pi + sum_k w_k b_k) / points
+        sum over lamp points of lit cos(theta_i) / d^2 falloff (F_t(i) F_t(o) R_d / pi +
+        sum_k w_k b_k) / points
 
     Parameters
     ----------
@@ -34,8 +36,8 @@ def shade_points(
     diffuse
         (n, 3) diffuse reflectance R_d; zeros omit the diffuse term.
     weight, table
-        (n, k) weights, and (nh, nd, np, k) tables [sr^-1] on nodes uniform in sqrt(theta_h), theta_d and the period
-        pi of phi_d; k = 0 omits the surface term.
+        (n, k) weights, and (nh, nd, np, k) tables [sr^-1] on nodes uniform in
+        sqrt(theta_h), theta_d and the period pi of phi_d; k = 0 omits the surface term.
     lamp
         (n, p, 3) points [mm] that represent equal parts of the light's disc.
     lit
@@ -48,12 +50,13 @@ def shade_points(
     Returns
     -------
     ndarray
-        (n, 3) float32, sr^-1 mm^-2: radiance per radiant intensity. Zero where the normal faces away from the light
-        or the camera.
+        (n, 3) float32, sr^-1 mm^-2: radiance per radiant intensity. Zero where the
+        normal faces away from the light or the camera.
 
     Notes
     -----
-    Measured BRDFs already contain a Fresnel term, so F_r of eq. 2 is not applied to them (Weyrich et al. 2005).
+    Measured BRDFs already contain a Fresnel term, so F_r of eq. 2 is not applied to
+    them (Weyrich et al. 2005).
     """
     out = np.empty((len(position), 3), np.float32)
     _shade_kernels.shade(

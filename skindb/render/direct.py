@@ -1,4 +1,6 @@
-"""Images of a surface under disc lights: direct light, ray-traced shadows and optional subsurface transport."""
+"""Images of a surface under disc lights: direct light, ray-traced shadows and optional
+subsurface transport.
+"""
 
 from __future__ import annotations
 
@@ -38,26 +40,45 @@ class View:
 
     @property
     def coverage(self) -> Image:
-        """(h, w) fraction of each pixel's rays that meet a known surface facing the camera: the alpha of the image."""
-        count = np.bincount(self.pixel, minlength=self.camera.height * self.camera.width)
-        return (count / self.samples**2).astype(np.float32).reshape(self.camera.height, self.camera.width)
+        """(h, w) fraction of each pixel's rays that meet a known surface facing the
+        camera: the alpha of the image.
+        """
+        count = np.bincount(
+            self.pixel, minlength=self.camera.height * self.camera.width
+        )
+        return (
+            (count / self.samples**2)
+            .astype(np.float32)
+            .reshape(self.camera.height, self.camera.width)
+        )
 
     def shown(self, vertices: int) -> NDArray[np.bool_]:
-        """(vertices,) whether a vertex belongs to a triangle that is hit; the others do not affect the image."""
+        """(vertices,) whether a vertex belongs to a triangle that is hit; the others do
+        not affect the image.
+        """
         mask = np.zeros(vertices, np.bool_)
         mask[self.corners] = True
         return mask
 
     def interpolate(self, values: Float) -> Float:
         """Values (v, c) of the vertices at the hits, (n, c)."""
-        return np.asarray(np.einsum("nk,nkc->nc", self.barycentric, values[self.corners]))
+        return np.asarray(
+            np.einsum("nk,nkc->nc", self.barycentric, values[self.corners])
+        )
 
     def image(self, values: Float) -> Image:
-        """(h, w, c) means over each pixel's rays of values (n, c) at the hits; rays that miss count as 0."""
+        """(h, w, c) means over each pixel's rays of values (n, c) at the hits; rays
+        that miss count as 0.
+        """
         size = self.camera.height * self.camera.width
-        planes = [np.bincount(self.pixel, weights=column, minlength=size) for column in values.T]
+        planes = [
+            np.bincount(self.pixel, weights=column, minlength=size)
+            for column in values.T
+        ]
         stacked = np.stack(planes, axis=-1) / self.samples**2
-        return stacked.astype(np.float32).reshape(self.camera.height, self.camera.width, -1)
+        return stacked.astype(np.float32).reshape(
+            self.camera.height, self.camera.width, -1
+        )
 
 
 def render_view(
@@ -81,9 +102,11 @@ def render_view(
     samples
         Rays per pixel and axis; pixels are averaged over samples**2 rays.
     disc_samples
-        Points on each light's disc per ray. The rays of a pixel use different points; a single point is the centre.
+        Points on each light's disc per ray. The rays of a pixel use different points; a
+        single point is the centre.
     subsurface
-        Whether diffuse light travels through the skin (dipole, eq. 9) instead of leaving where it enters.
+        Whether diffuse light travels through the skin (dipole, eq. 9) instead of
+        leaving where it enters.
     terms
         Terms of the BRDF to include: "diffuse", "surface" or both.
     scene
@@ -94,12 +117,20 @@ def render_view(
     Returns
     -------
     ndarray
-        (l, h, w, 3) float32 radiance; 0 where no surface is visible. `trace_view(...).coverage` is the alpha.
+        (l, h, w, 3) float32 radiance; 0 where no surface is visible.
+        `trace_view(...).coverage` is the alpha.
     """
     rays = RayScene(surface.vertices, surface.faces) if scene is None else scene
     view = trace_view(surface, camera, samples=samples, scene=rays)
     return shade_view(
-        view, surface, lights, rays, disc_samples=disc_samples, subsurface=subsurface, terms=terms, glow=glow
+        view,
+        surface,
+        lights,
+        rays,
+        disc_samples=disc_samples,
+        subsurface=subsurface,
+        terms=terms,
+        glow=glow,
     )
 
 
@@ -114,15 +145,21 @@ def trace_view(
 ) -> View:
     """Trace camera rays through samples x samples sub-pixels.
 
-    The rays go through the centres of the sub-pixels, or with `rng` through a random point of each. With `pixels`
-    (h, w), only the rays of these pixels are traced; they do not depend on it.
+    The rays go through the centres of the sub-pixels, or with `rng` through a random
+    point of each. With `pixels` (h, w), only the rays of these pixels are traced; they
+    do not depend on it.
 
-    Hits are discarded if the triangle is seen from behind, its shading normal faces away, or a vertex has unknown
-    reflectance. There the surface occludes but reflects no light.
+    Hits are discarded if the triangle is seen from behind, its shading normal faces
+    away, or a vertex has unknown reflectance. There the surface occludes but reflects
+    no light.
     """
     rays = RayScene(surface.vertices, surface.faces) if scene is None else scene
     offset = (np.arange(samples) + 0.5) / samples
-    at = np.arange(camera.height * camera.width) if pixels is None else np.flatnonzero(pixels)
+    at = (
+        np.arange(camera.height * camera.width)
+        if pixels is None
+        else np.flatnonzero(pixels)
+    )
     y, x = np.divmod(at[:, None], camera.width)
     # rays of a pixel are adjacent, which keeps the ray tracer and memory access coherent
     sy = np.repeat(offset, samples)
@@ -132,7 +169,9 @@ def trace_view(
         drawn = rng.random((camera.height * camera.width, samples**2, 2))
         place += ((drawn if pixels is None else drawn[at]) - 0.5) / samples
     direction = pixel_rays(place.reshape(-1, 2), camera.K, camera.R, camera.distortion)
-    face, barycentric, _ = rays.first_hit(np.broadcast_to(camera.centre, direction.shape), direction)
+    face, barycentric, _ = rays.first_hit(
+        np.broadcast_to(camera.centre, direction.shape), direction
+    )
     hit = np.flatnonzero(face >= 0)
     corners = np.asarray(surface.faces)[face[hit]].astype(np.int64)
     weight = barycentric[hit]
@@ -142,11 +181,21 @@ def trace_view(
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-20)
         towards = camera.centre - position
         towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-        facing = (np.einsum("nc,nc->n", normal, towards) > 0) & (_facet_cosine(surface, corners, towards) > 0)
+        facing = (np.einsum("nc,nc->n", normal, towards) > 0) & (
+            _facet_cosine(surface, corners, towards) > 0
+        )
     keep = facing & surface.known[corners].all(axis=1)
     pixel, ray = np.divmod(hit[keep], samples**2)
     return View(
-        camera, samples, at[pixel], ray, corners[keep], weight[keep], position[keep], normal[keep], towards[keep]
+        camera,
+        samples,
+        at[pixel],
+        ray,
+        corners[keep],
+        weight[keep],
+        position[keep],
+        normal[keep],
+        towards[keep],
     )
 
 
@@ -164,13 +213,25 @@ def shade_view(
     """Images (l, h, w, 3) of a traced view, one per light; parameters as in `render_view`."""
     if unknown := set(terms) - set(TERMS):
         raise ValueError(f"terms must be among {TERMS}, found {sorted(unknown)}")
-    diffuse = view.interpolate(surface.diffuse) * float("diffuse" in terms and not subsurface)
-    weights = view.interpolate(surface.weights) if "surface" in terms else np.zeros((len(view.pixel), 0))
+    diffuse = view.interpolate(surface.diffuse) * float(
+        "diffuse" in terms and not subsurface
+    )
+    weights = (
+        view.interpolate(surface.weights)
+        if "surface" in terms
+        else np.zeros((len(view.pixel), 0))
+    )
     tables = surface.tables if "surface" in terms else surface.tables[..., :0]
-    escape = escape_factor(view, surface.eta) if subsurface and "diffuse" in terms else None
+    escape = (
+        escape_factor(view, surface.eta) if subsurface and "diffuse" in terms else None
+    )
     if escape is not None and glow is None:
-        glow = exitances(surface, lights, scene, wanted=view.shown(len(surface.vertices)))
-    images = np.empty((len(lights), view.camera.height, view.camera.width, 3), np.float32)
+        glow = exitances(
+            surface, lights, scene, wanted=view.shown(len(surface.vertices))
+        )
+    images = np.empty(
+        (len(lights), view.camera.height, view.camera.width, 3), np.float32
+    )
     for i in range(len(lights)):
         # every ray of a pixel has its own points; together they cover the disc
         chosen = view.ray[:, None] * disc_samples + np.arange(disc_samples)
@@ -206,32 +267,45 @@ def glow_image(view: View, surface: Surface, glow: Image) -> Image:
     return view.image(escape_factor(view, surface.eta) * view.interpolate(glow))
 
 
-def _facet_cosine(surface: Surface, corners: NDArray[np.int64], towards: Float) -> Float:
+def _facet_cosine(
+    surface: Surface, corners: NDArray[np.int64], towards: Float
+) -> Float:
     a, b, c = (surface.vertices[corners[:, i]] for i in range(3))
     return np.asarray(np.einsum("nc,nc->n", np.cross(b - a, c - a), towards))
 
 
 def _lamp_points(lights: Lights, i: int, total: int) -> Float:
-    """(total, 3) points on the disc of light i with equal areas, in a sunflower pattern; one point is the centre."""
+    """(total, 3) points on the disc of light i with equal areas, in a sunflower
+    pattern; one point is the centre.
+    """
     q = np.arange(total)
     radius = lights.disc_radius[i] * np.sqrt((q + 0.5) / total) * float(total > 1)
     axis = lights.axis[i]
     first = np.cross(axis, [0.0, 1.0, 0.0] if abs(axis[1]) < 0.9 else [1.0, 0.0, 0.0])
     first = first / np.linalg.norm(first)
     second = np.cross(axis, first)
-    across = np.cos(q * GOLDEN_ANGLE)[:, None] * first + np.sin(q * GOLDEN_ANGLE)[:, None] * second
+    across = (
+        np.cos(q * GOLDEN_ANGLE)[:, None] * first
+        + np.sin(q * GOLDEN_ANGLE)[:, None] * second
+    )
     return np.asarray(lights.position[i] + radius[:, None] * across)
 
 
 def _lit(scene: RayScene, view: View, lamp: Float) -> NDArray[np.float32]:
-    """(n, p) 1 where the lamp point is above the horizon of the shading normal and not occluded, else 0."""
+    """(n, p) 1 where the lamp point is above the horizon of the shading normal and not
+    occluded, else 0.
+    """
     above = np.einsum("npc,nc->np", lamp - view.position[:, None], view.normal) > 0
     rows, column = np.nonzero(above)
-    above[rows, column] = ~scene.occluded(view.position[rows], lamp[rows, column], normal=view.normal[rows])
+    above[rows, column] = ~scene.occluded(
+        view.position[rows], lamp[rows, column], normal=view.normal[rows]
+    )
     return np.asarray(above, np.float32)
 
 
 def escape_factor(view: View, eta: float) -> Float:
-    """(n, 1) F_t(w_o) / pi: radiance towards the camera per radiant exitance under the boundary (eq. 9)."""
+    """(n, 1) F_t(w_o) / pi: radiance towards the camera per radiant exitance under the
+    boundary (eq. 9).
+    """
     cosine = np.einsum("nc,nc->n", view.normal, view.towards)
     return np.asarray(fresnel_transmittance(cosine, eta) / np.pi)[:, None]

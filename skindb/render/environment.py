@@ -19,10 +19,11 @@ LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # of linear Rec. 709
 
 @dataclass(frozen=True)
 class Environment:
-    """Radiance (h, w, 3) of distant surroundings as an equirectangular image, constant in each texel.
+    """Radiance (h, w, 3) of distant surroundings as an equirectangular image, constant
+    in each texel.
 
-    Row 0 is above the head (+y). The middle column is in front of the face (+z), and columns to the right of it are
-    at the subject's left (+x).
+    Row 0 is above the head (+y). The middle column is in front of the face (+z), and
+    columns to the right of it are at the subject's left (+x).
     """
 
     radiance: Float
@@ -34,8 +35,9 @@ class Environment:
         Raises
         ------
         InputError
-            If the file cannot be read, has no channels R, G and B, is not twice as wide as it is high, has values that
-            are negative or not finite, or is zero everywhere.
+            If the file cannot be read, has no channels R, G and B, is not twice as wide
+            as it is high, has values that are negative or not finite, or is zero
+            everywhere.
         """
         pixels, names = read_exr(path)
         if names[:3] != ("R", "G", "B"):
@@ -46,12 +48,22 @@ class Environment:
         known = np.isfinite(values)
         height, width = values.shape[:2]
         if width != 2 * height:
-            rule = "a latitude-longitude image of all directions must be twice as wide as it is high"
-            raise InputError(Fault(str(path), rule, f"{width} x {height} pixels", "convert the image"))
+            rule = (
+                "a latitude-longitude image of all directions must be twice as wide as "
+                "it is high"
+            )
+            raise InputError(
+                Fault(
+                    str(path), rule, f"{width} x {height} pixels", "convert the image"
+                )
+            )
         if not known.all() or values.min() < 0 or values.max() == 0:
             rule = "radiance must be finite, not negative, and not zero everywhere"
             cure = "correct the image"
-            found = f"{int((~known).sum())} values that are not finite, {int((values < 0).sum())} negative ones"
+            found = (
+                f"{int((~known).sum())} values that are not finite, "
+                f"{int((values < 0).sum())} negative ones"
+            )
             found = "zero everywhere" if known.all() and not values.any() else found
             raise InputError(Fault(str(path), rule, found, cure))
         return cls(values)
@@ -61,13 +73,19 @@ class Environment:
         return np.asarray(self.radiance.reshape(-1, 3)[self._texel(direction)])
 
     def pdf(self, direction: Float) -> Float:
-        """Probability density (n,) per steradian with which `sample` draws unit directions (n, 3)."""
+        """Probability density (n,) per steradian with which `sample` draws unit
+        directions (n, 3).
+        """
         texel = self._texel(direction)
         return np.asarray(self._probability[texel] / self._solid_angle[texel])
 
     def sample(self, draw: Float) -> Float:
-        """Unit directions (n, 3) drawn in proportion to luminance, from uniform numbers (n, 3) in [0, 1)."""
-        place = np.searchsorted(self._rising, draw[:, 0] * self._rising[-1], side="right")
+        """Unit directions (n, 3) drawn in proportion to luminance, from uniform numbers
+        (n, 3) in [0, 1).
+        """
+        place = np.searchsorted(
+            self._rising, draw[:, 0] * self._rising[-1], side="right"
+        )
         texel = np.minimum(place, len(self._rising) - 1)
         height, width, _ = self.radiance.shape
         row, column = np.divmod(texel, width)
@@ -83,7 +101,9 @@ class Environment:
     def _texel(self, direction: Float) -> NDArray[np.int64]:
         height, width, _ = self.radiance.shape
         row = np.arccos(np.clip(direction[:, 1], -1, 1)) / np.pi * height
-        column = (np.arctan2(direction[:, 0], direction[:, 2]) / (2 * np.pi) + 0.5) * width
+        column = (
+            np.arctan2(direction[:, 0], direction[:, 2]) / (2 * np.pi) + 0.5
+        ) * width
         at = np.minimum(row.astype(np.int64), height - 1) * width
         return np.asarray(at + np.minimum(column.astype(np.int64), width - 1))
 

@@ -17,14 +17,17 @@ NEEDED = ("shading_normal", "diffuse_reflectance", "basis_weight", "fit_status")
 MAX_LENGTH_ERROR = 1e-3  # of a unit direction; directions in half precision have 5e-4
 
 
-def evaluate(model: xr.DataTree, surfel: int, wi: ArrayLike, wo: ArrayLike) -> NDArray[np.float32]:
+def evaluate(
+    model: xr.DataTree, surfel: int, wi: ArrayLike, wo: ArrayLike
+) -> NDArray[np.float32]:
     """BRDF f_r of one surfel, as used in rendering (Weyrich et al. 2005, eq. 1 to 4 and 8).
 
         f_r(wi, wo) = F_t(wi) F_t(wo) R_d / pi + sum_k w_k b_k(theta_h, theta_d, phi_d)
 
-    F_t is the Fresnel transmittance at the model's refractive index, R_d the surfel's diffuse reflectance per channel,
-    and w_k its weights of the reduced basis b_k, which is the same for all channels. The angles are those of
-    Rusinkiewicz about the surfel's shading normal.
+    F_t is the Fresnel transmittance at the model's refractive index, R_d the surfel's
+    diffuse reflectance per channel, and w_k its weights of the reduced basis b_k, which
+    is the same for all channels. The angles are those of Rusinkiewicz about the
+    surfel's shading normal.
 
     Parameters
     ----------
@@ -33,28 +36,30 @@ def evaluate(model: xr.DataTree, surfel: int, wi: ArrayLike, wo: ArrayLike) -> N
     surfel
         Index of the surfel along the dimension surfel, from 0.
     wi, wo
-        (..., 3) unit vectors in head coordinates that point away from the surface: to the light and to the camera.
-        Their leading dimensions are broadcast against each other.
+        (..., 3) unit vectors in head coordinates that point away from the surface: to
+        the light and to the camera. Their leading dimensions are broadcast against each
+        other.
 
     Returns
     -------
     ndarray
-        (..., 3) float32 f_r in R, G, B [sr^-1]. 0 where either direction is at or below the horizon of the shading
-        normal.
+        (..., 3) float32 f_r in R, G, B [sr^-1]. 0 where either direction is at or below
+        the horizon of the shading normal.
 
     Raises
     ------
     InputError
-        If the model does not match the schema, the surfel is out of range or was not fitted, or the directions are not
-        unit vectors.
+        If the model does not match the schema, the surfel is out of range or was not
+        fitted, or the directions are not unit vectors.
 
     Notes
     -----
-    f_r does not contain the cosine of the incident light: reflected radiance is f_r times irradiance, and the samples
-    of a capture are f_r cos(theta_i). Where `disc_angular_radius` of the basis is above 0, its tables are averaged
-    over the disc of the dome's lights, and so is the surface term returned here.
-    The diffuse term describes light that leaves where it enters; a BRDF does not include subsurface transport between
-    surfels.
+    f_r does not contain the cosine of the incident light: reflected radiance is f_r
+    times irradiance, and the samples of a capture are f_r cos(theta_i). Where
+    `disc_angular_radius` of the basis is above 0, its tables are averaged over the disc
+    of the dome's lights, and so is the surface term returned here. The diffuse term
+    describes light that leaves where it enters; a BRDF does not include subsurface
+    transport between surfels.
 
     Examples
     --------
@@ -98,14 +103,23 @@ def _values_of(fitted: xr.Dataset, surfel: int) -> dict[str, Array]:
     count = fitted.sizes["surfel"]
     if not 0 <= surfel < count:
         rule = f"surfel must be an index from 0 to {count - 1}"
-        raise InputError(Fault("surfel", rule, str(surfel), "choose a surfel of this model"))
+        raise InputError(
+            Fault("surfel", rule, str(surfel), "choose a surfel of this model")
+        )
     one = fitted[list(NEEDED)].isel(surfel=[surfel]).compute()
     values = {name: np.asarray(one[name].values) for name in NEEDED}
     if not usable_surfels(values)[0]:
         status = FitStatus(int(values["fit_status"][0]))
         found = f"the status {status.name} ({status.explanation})"
         cure = "choose a surfel whose fit_status is FITTED"
-        raise InputError(Fault(f"fitted[fit_status] of surfel {surfel}", "the surfel must be fitted", found, cure))
+        raise InputError(
+            Fault(
+                f"fitted[fit_status] of surfel {surfel}",
+                "the surfel must be fitted",
+                found,
+                cure,
+            )
+        )
     return values
 
 
@@ -114,9 +128,25 @@ def _unit(name: str, direction: ArrayLike) -> Array:
     vectors = np.asarray(direction, np.float64)
     if vectors.ndim == 0 or vectors.shape[-1] != 3:
         found = f"the shape {vectors.shape}"
-        raise InputError(Fault(name, "directions must have the shape (..., 3)", found, "put x, y, z last"))
+        raise InputError(
+            Fault(
+                name,
+                "directions must have the shape (..., 3)",
+                found,
+                "put x, y, z last",
+            )
+        )
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     if not (np.abs(length - 1) < MAX_LENGTH_ERROR).all():
-        worst = length.flat[np.argmax(np.where(np.isfinite(length), np.abs(length - 1), np.inf))]
-        raise InputError(Fault(name, "directions must be unit vectors", f"a length of {worst:.4g}", "normalise them"))
+        worst = length.flat[
+            np.argmax(np.where(np.isfinite(length), np.abs(length - 1), np.inf))
+        ]
+        raise InputError(
+            Fault(
+                name,
+                "directions must be unit vectors",
+                f"a length of {worst:.4g}",
+                "normalise them",
+            )
+        )
     return np.asarray(vectors / length)

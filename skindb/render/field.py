@@ -22,21 +22,30 @@ if TYPE_CHECKING:
 Float = NDArray[np.floating[Any]]
 View = tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]
 TURNS = (0.0, 55.0)  # degrees to the subject's left
-RANGE = (1, 99)  # percentiles of the visible values at the ends of the colour scale, so that outliers do not set it
+# percentiles of the visible values at the ends of the colour scale, so that outliers do
+# not set it
+RANGE = (1, 99)
 UNKNOWN = (0.72, 0.72, 0.72)  # colour of surfels without a value
 MARGIN = 0.03  # border around the head, as a fraction of the longer side
-MIN_ASPECT = 0.05  # shorter side over the longer one; the views of a flat patch may be edge on
+# shorter side over the longer one; the views of a flat patch may be edge on
+MIN_ASPECT = 0.05
 DPI = 90
 RAY_START_MM = 10.0  # in front of the head
 
 
 def field_figure(
-    take: xr.DataTree, variable: str, *, at: Mapping[str, str] | None = None, turns: Sequence[float] = TURNS
+    take: xr.DataTree,
+    variable: str,
+    *,
+    at: Mapping[str, str] | None = None,
+    turns: Sequence[float] = TURNS,
 ) -> Figure:
-    """Draw a variable of the surfels on the face, with a colour bar; statuses and masks are labelled by their names.
+    """Draw a variable of the surfels on the face, with a colour bar; statuses and masks
+    are labelled by their names.
 
-    A variable with the dimension "channel" is drawn as an sRGB picture without shading. Its white is the 99 % quantile
-    of the largest channel, which the title states. Unit vectors n are drawn as the colours (n + 1) / 2.
+    A variable with the dimension "channel" is drawn as an sRGB picture without shading.
+    Its white is the 99 % quantile of the largest channel, which the title states. Unit
+    vectors n are drawn as the colours (n + 1) / 2.
 
     Parameters
     ----------
@@ -45,15 +54,16 @@ def field_figure(
     variable
         Name of a variable with the dimension "surfel".
     at
-        Label for each other dimension of the variable, such as ``{"channel": "G"}``; "channel" and the "xyz" of unit
-        vectors may be omitted.
+        Label for each other dimension of the variable, such as ``{"channel": "G"}``;
+        "channel" and the "xyz" of unit vectors may be omitted.
     turns
         Angles [degrees] by which the views are rotated to the subject's left; 0 is the front.
 
     Raises
     ------
     InputError
-        If there is no such variable, or `at` does not have a valid label for each of its other dimensions.
+        If there is no such variable, or `at` does not have a valid label for each of
+        its other dimensions.
     """
     group, found = _find(take, variable)
     at = dict(at or {})
@@ -63,7 +73,13 @@ def field_figure(
     triangle = take["mesh"].to_dataset()["triangle"].values
     views = [trace_front(position, triangle, turn) for turn in turns]
     who = f"{take.attrs.get('subject') or ''} {take.attrs.get('condition', '')}".strip()
-    title = ", ".join([*([who] if take.attrs.get("subject") else []), variable, *(f"{k} {v}" for k, v in at.items())])
+    title = ", ".join(
+        [
+            *([who] if take.attrs.get("subject") else []),
+            variable,
+            *(f"{k} {v}" for k, v in at.items()),
+        ]
+    )
     if colour:
         images, scale = _colour_images(chosen, views)
         return _figure(images, f"{title} ({scale})")
@@ -76,7 +92,11 @@ def _figure(images: Sequence[NDArray[np.float64]], title: str) -> Figure:
 
     figure: Figure
     figure, axes = pyplot.subplots(
-        1, len(images), figsize=(4 * len(images) + 1, 4.6), squeeze=False, layout="constrained"
+        1,
+        len(images),
+        figsize=(4 * len(images) + 1, 4.6),
+        squeeze=False,
+        layout="constrained",
     )
     for axis, image in zip(axes[0], images, strict=True):
         axis.imshow(image)
@@ -103,21 +123,32 @@ def _scalar_figure(chosen: xr.DataArray, views: Sequence[View], title: str) -> F
         images.append(image)
     figure = _figure(images, title)
     scale = pyplot.cm.ScalarMappable(pyplot.Normalize(low, high), colours)
-    bar = figure.colorbar(scale, ax=figure.axes, shrink=0.7, extend="neither" if names else "both")
+    bar = figure.colorbar(
+        scale, ax=figure.axes, shrink=0.7, extend="neither" if names else "both"
+    )
     if names:
         bar.set_ticks(range(len(names)), labels=names)
     return figure
 
 
-def _colour_images(chosen: xr.DataArray, views: Sequence[View]) -> tuple[list[NDArray[np.float64]], str]:
-    """Pictures of a variable (surfel, 3) of colours or unit vectors, and a description of their scale."""
+def _colour_images(
+    chosen: xr.DataArray, views: Sequence[View]
+) -> tuple[list[NDArray[np.float64]], str]:
+    """Pictures of a variable (surfel, 3) of colours or unit vectors, and a description
+    of their scale.
+    """
     values = chosen.transpose("surfel", ...).values.astype(np.float64)
-    pictures = [np.stack([_field(view, value, nearest=False) for value in values.T], axis=-1) for view in views]
+    pictures = [
+        np.stack([_field(view, value, nearest=False) for value in values.T], axis=-1)
+        for view in views
+    ]
     if "xyz" in chosen.dims:
         images = [np.clip((picture + 1) / 2, 0, 1) for picture in pictures]
         scale = "red, green, blue = (x + 1, y + 1, z + 1) / 2"
     else:
-        exposure = 1 / _white(np.concatenate([picture.reshape(-1, 3) for picture in pictures]))
+        exposure = 1 / _white(
+            np.concatenate([picture.reshape(-1, 3) for picture in pictures])
+        )
         images = [encode_srgb(exposure * picture) for picture in pictures]
         scale = f"sRGB, white is {1 / exposure:.3g}{_plain_units(chosen)}"
     for image, picture, (_, _, shade) in zip(images, pictures, views, strict=True):
@@ -127,14 +158,18 @@ def _colour_images(chosen: xr.DataArray, views: Sequence[View]) -> tuple[list[ND
 
 
 def _white(shown: Float) -> float:
-    """The value of the largest channel that is drawn white, of values (n, 3); 1 if none is above zero."""
+    """The value of the largest channel that is drawn white, of values (n, 3); 1 if none
+    is above zero.
+    """
     peak = shown.max(axis=-1)
     peak = peak[np.isfinite(peak) & (peak > 0)]
     return float(np.percentile(peak, RANGE[1])) if len(peak) else 1.0
 
 
 def _colour_dim(found: xr.DataArray, at: Mapping[str, str]) -> str | None:
-    """The dimension that is drawn as a colour: the only one besides "surfel" that is not in `at`, if it fits."""
+    """The dimension that is drawn as a colour: the only one besides "surfel" that is
+    not in `at`, if it fits.
+    """
     left = [str(dim) for dim in found.dims if dim != "surfel" and dim not in at]
     if len(left) != 1 or found.sizes[left[0]] != 3 or "flag_values" in found.attrs:
         return None
@@ -143,7 +178,11 @@ def _colour_dim(found: xr.DataArray, at: Mapping[str, str]) -> str | None:
 
 
 def write_field(
-    trees: Mapping[str, xr.DataTree], variable: str, out: Path, *, at: Mapping[str, str] | None = None
+    trees: Mapping[str, xr.DataTree],
+    variable: str,
+    out: Path,
+    *,
+    at: Mapping[str, str] | None = None,
 ) -> dict[str, Any]:
     """Write a plot of a variable, from the first version that has it.
 
@@ -168,7 +207,14 @@ def write_field(
     having = [kind for kind, tree in trees.items() if variable in _drawable(tree)]
     if not having:
         known = ", ".join(sorted(set().union(*map(_drawable, trees.values()))))
-        raise InputError(Fault("variable", "must be a variable of the surfels", variable, f"choose {known}"))
+        raise InputError(
+            Fault(
+                "variable",
+                "must be a variable of the surfels",
+                variable,
+                f"choose {known}",
+            )
+        )
     tree = trees[having[0]]
     figure = field_figure(tree, variable, at=at)
     figure.savefig(private_file(out), dpi=DPI)
@@ -176,7 +222,13 @@ def write_field(
     return {"path": str(out), "kind": having[0], "generation": tree.attrs["generation"]}
 
 
-def trace_front(position: Float, triangle: NDArray[np.integer[Any]], turn: float = 0.0, *, size: int = 480) -> View:
+def trace_front(
+    position: Float,
+    triangle: NDArray[np.integer[Any]],
+    turn: float = 0.0,
+    *,
+    size: int = 480,
+) -> View:
     """Intersect a mesh with parallel rays from the front.
 
     Parameters
@@ -195,7 +247,8 @@ def trace_front(position: Float, triangle: NDArray[np.integer[Any]], turn: float
     weight : ndarray
         (rows, columns, 3) barycentric weights of the corners.
     shade : ndarray
-        (rows, columns) cosine between the triangle's normal and the direction to the viewer; NaN where there is no hit.
+        (rows, columns) cosine between the triangle's normal and the direction to the
+        viewer; NaN where there is no hit.
     """
     c = np.cos(np.radians(turn))
     s = np.sin(np.radians(turn))
@@ -205,23 +258,46 @@ def trace_front(position: Float, triangle: NDArray[np.integer[Any]], turn: float
     used = position[np.unique(triangle)].astype(np.float64)
     place = np.column_stack([used @ right, used[:, 1], used @ back])
     (left, bottom, _), (end, top, front) = place.min(axis=0), place.max(axis=0)
-    width, height = (max(extent, MIN_ASPECT * max(end - left, top - bottom)) for extent in (end - left, top - bottom))
+    width, height = (
+        max(extent, MIN_ASPECT * max(end - left, top - bottom))
+        for extent in (end - left, top - bottom)
+    )
     edge = MARGIN * max(width, height)
     step = (max(width, height) + 2 * edge) / size
-    x = (left + end - width) / 2 - edge + (np.arange(np.ceil((width + 2 * edge) / step)) + 0.5) * step
-    y = (top + bottom + height) / 2 + edge - (np.arange(np.ceil((height + 2 * edge) / step)) + 0.5) * step
-    origin = x[None, :, None] * right + y[:, None, None] * np.array([0.0, 1, 0]) + (front + RAY_START_MM) * back
-    face, weight, _ = RayScene(position, triangle).first_hit(origin.reshape(-1, 3), -back[None])
+    x = (
+        (left + end - width) / 2
+        - edge
+        + (np.arange(np.ceil((width + 2 * edge) / step)) + 0.5) * step
+    )
+    y = (
+        (top + bottom + height) / 2
+        + edge
+        - (np.arange(np.ceil((height + 2 * edge) / step)) + 0.5) * step
+    )
+    origin = (
+        x[None, :, None] * right
+        + y[:, None, None] * np.array([0.0, 1, 0])
+        + (front + RAY_START_MM) * back
+    )
+    face, weight, _ = RayScene(position, triangle).first_hit(
+        origin.reshape(-1, 3), -back[None]
+    )
     corner = np.where(face[:, None] >= 0, triangle[face], -1)
     p, q, r = (position[corner[:, k]] for k in range(3))
     normal = np.cross(q - p, r - p)
     shade = np.abs(normal @ back) / np.maximum(np.linalg.norm(normal, axis=1), 1e-30)
     shape = (len(y), len(x))
-    return corner.reshape(*shape, 3), weight.reshape(*shape, 3), np.where(face < 0, np.nan, shade).reshape(shape)
+    return (
+        corner.reshape(*shape, 3),
+        weight.reshape(*shape, 3),
+        np.where(face < 0, np.nan, shade).reshape(shape),
+    )
 
 
 def _field(view: View, values: Float, *, nearest: bool) -> NDArray[np.float64]:
-    """Values (n,) interpolated in a view; NaN beside the face, and where a corner with a weight has no value."""
+    """Values (n,) interpolated in a view; NaN beside the face, and where a corner with
+    a weight has no value.
+    """
     corner, weight, shade = view
     if nearest:
         corner = np.take_along_axis(corner, weight.argmax(axis=-1)[..., None], -1)
@@ -244,23 +320,40 @@ def _find(take: xr.DataTree, variable: str) -> tuple[xr.Dataset, xr.DataArray]:
         if variable in group and "surfel" in group[variable].dims:
             return next(g for g in groups if "surfel_position" in g), group[variable]
     cure = "choose " + ", ".join(sorted(_drawable(take)))
-    raise InputError(Fault("variable", "must be a variable of the surfels", variable, cure))
+    raise InputError(
+        Fault("variable", "must be a variable of the surfels", variable, cure)
+    )
 
 
 def _drawable(take: xr.DataTree) -> set[str]:
-    return {str(name) for group in _groups(take) for name, one in group.items() if "surfel" in one.dims}
+    return {
+        str(name)
+        for group in _groups(take)
+        for name, one in group.items()
+        if "surfel" in one.dims
+    }
 
 
-def _chosen(found: xr.DataArray, at: dict[str, str], *, keep: str | None = None) -> xr.DataArray:
+def _chosen(
+    found: xr.DataArray, at: dict[str, str], *, keep: str | None = None
+) -> xr.DataArray:
     """The variable at one label of each dimension other than "surfel" and the one to keep."""
     for dim in (str(d) for d in found.dims if d not in ("surfel", keep)):
         labels = (
-            [str(x) for x in found[dim].values] if dim in found.coords else [str(i) for i in range(found.sizes[dim])]
+            [str(x) for x in found[dim].values]
+            if dim in found.coords
+            else [str(i) for i in range(found.sizes[dim])]
         )
         if at.get(dim) not in labels:
             given = f"{dim}={at[dim]}" if dim in at else f"no {dim}"
-            cure = f"choose {dim}=" + ", ".join(labels[:12]) + (", ..." if len(labels) > 12 else "")
-            raise InputError(Fault("at", f"must select one {dim} of {found.name}", given, cure))
+            cure = (
+                f"choose {dim}="
+                + ", ".join(labels[:12])
+                + (", ..." if len(labels) > 12 else "")
+            )
+            raise InputError(
+                Fault("at", f"must select one {dim} of {found.name}", given, cure)
+            )
         found = found.isel({dim: labels.index(at.pop(dim))})
     if at:
         rule = f"must name dimensions of {found.name}, which has {', '.join(map(str, found.dims))}"
@@ -286,7 +379,9 @@ def _shades(chosen: xr.DataArray) -> tuple[NDArray[np.float64], list[str]]:
 
 
 def _span(shown: NDArray[np.float64]) -> tuple[float, float]:
-    low, high = (float(v) for v in np.percentile(shown, RANGE)) if len(shown) else (0.0, 1.0)
+    low, high = (
+        (float(v) for v in np.percentile(shown, RANGE)) if len(shown) else (0.0, 1.0)
+    )
     return (low, high) if high > low else (low - 0.5, low + 0.5)
 
 

@@ -45,7 +45,10 @@ def write_grid(
     height, width = every[0][shown].shape[:2]
     size = (CELL * width / max(height, width), CELL * height / max(height, width))
     figure, axes = pyplot.subplots(
-        len(rows), len(titles), figsize=(size[0] * len(titles) + 1.4, size[1] * len(rows) + 0.4), squeeze=False
+        len(rows),
+        len(titles),
+        figsize=(size[0] * len(titles) + 1.4, size[1] * len(rows) + 0.4),
+        squeeze=False,
     )
     for line, (label, row) in zip(axes, rows.items(), strict=True):
         for ax, image in zip(line, row, strict=True):
@@ -56,7 +59,11 @@ def write_grid(
     for ax, title in zip(axes[0], titles, strict=True):
         ax.set_title(title, fontsize=8)
     figure.subplots_adjust(wspace=0.02, hspace=0.02)
-    figure.savefig(private_file(path), dpi=max(150.0, max(height, width) / CELL), bbox_inches="tight")
+    figure.savefig(
+        private_file(path),
+        dpi=max(150.0, max(height, width) / CELL),
+        bbox_inches="tight",
+    )
     pyplot.close(figure)
 
 

@@ -22,7 +22,9 @@ WHITE_QUANTILE = 0.995  # fraction of the lit pixels that a display image does n
 def encode_srgb(linear: ArrayLike) -> NDArray[np.float64]:
     """Encode linear values as sRGB display values, clipped to [0, 1] (IEC 61966-2-1)."""
     x = np.clip(np.asarray(linear, np.float64), 0, 1)
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-12) ** (1 / 2.4) - 0.055)
+    return np.where(
+        x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-12) ** (1 / 2.4) - 0.055
+    )
 
 
 def decode_srgb(display: ArrayLike) -> NDArray[np.float64]:
@@ -31,15 +33,19 @@ def decode_srgb(display: ArrayLike) -> NDArray[np.float64]:
     return np.where(y <= 0.04045, y / 12.92, ((y + 0.055) / 1.055) ** 2.4)
 
 
-def auto_exposure(radiance: ArrayLike, *, mask: NDArray[np.bool_] | None = None) -> float:
-    """Exposure that maps the brightest lit pixels (99.5 % quantile of the largest channel) to display white.
+def auto_exposure(
+    radiance: ArrayLike, *, mask: NDArray[np.bool_] | None = None
+) -> float:
+    """Exposure that maps the brightest lit pixels (99.5 % quantile of the largest
+    channel) to display white.
 
     Parameters
     ----------
     radiance
         (..., 3) in any linear unit; 0 in the background, NaN where unknown.
     mask
-        (...) pixels to include; default all. Pixels that are zero in all channels are always excluded.
+        (...) pixels to include; default all. Pixels that are zero in all channels are
+        always excluded.
 
     Returns
     -------
@@ -52,7 +58,9 @@ def auto_exposure(radiance: ArrayLike, *, mask: NDArray[np.bool_] | None = None)
     return float(1 / np.quantile(values, WHITE_QUANTILE)) if values.size else 1.0
 
 
-def tone_map(radiance: ArrayLike, *, exposure: float | None = None) -> NDArray[np.uint8]:
+def tone_map(
+    radiance: ArrayLike, *, exposure: float | None = None
+) -> NDArray[np.uint8]:
     """Convert linear Rec. 709 radiance to an 8-bit sRGB picture.
 
     The only curve is that of sRGB, so that pictures with equal exposures are comparable.
@@ -64,7 +72,9 @@ def tone_map(radiance: ArrayLike, *, exposure: float | None = None) -> NDArray[n
     exposure
         Factor before encoding; default `auto_exposure`.
     """
-    values = np.nan_to_num(np.asarray(radiance, np.float64), nan=0.0, posinf=np.inf, neginf=0.0)
+    values = np.nan_to_num(
+        np.asarray(radiance, np.float64), nan=0.0, posinf=np.inf, neginf=0.0
+    )
     gain = auto_exposure(radiance) if exposure is None else exposure
     with np.errstate(over="ignore"):
         return np.round(encode_srgb(values * gain) * 255).astype(np.uint8)
@@ -73,8 +83,12 @@ def tone_map(radiance: ArrayLike, *, exposure: float | None = None) -> NDArray[n
 def write_png(path: str | Path, picture: NDArray[Any]) -> None:
     """Write (h, w), (h, w, 3) or (h, w, 4) uint8 or uint16 values as PNG."""
     if picture.dtype not in (np.uint8, np.uint16):
-        raise ValueError(f"the picture must be uint8 or uint16 for PNG, found {picture.dtype}")
-    private_file(path).write_bytes(imagecodecs.png_encode(np.ascontiguousarray(picture)))
+        raise ValueError(
+            f"the picture must be uint8 or uint16 for PNG, found {picture.dtype}"
+        )
+    private_file(path).write_bytes(
+        imagecodecs.png_encode(np.ascontiguousarray(picture))
+    )
 
 
 def read_png(path: str | Path) -> NDArray[Any]:
@@ -82,7 +96,9 @@ def read_png(path: str | Path) -> NDArray[Any]:
     try:
         return np.asarray(imagecodecs.png_decode(_bytes(path)))
     except (ValueError, RuntimeError):  # RuntimeError comes from the decoder
-        raise InputError(Fault(str(path), "must be a PNG image", DAMAGED, "write the file again")) from None
+        raise InputError(
+            Fault(str(path), "must be a PNG image", DAMAGED, "write the file again")
+        ) from None
 
 
 def write_exr(
@@ -102,33 +118,53 @@ def write_exr(
     attributes
         Text attributes of the header, such as units.
     """
-    header = dict(attributes or {}) | {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    planes = {name: np.ascontiguousarray(plane) for name, plane in _planes(channels).items()}
+    header = dict(attributes or {}) | {
+        "compression": OpenEXR.ZIP_COMPRESSION,
+        "type": OpenEXR.scanlineimage,
+    }
+    planes = {
+        name: np.ascontiguousarray(plane) for name, plane in _planes(channels).items()
+    }
     OpenEXR.File(header, planes).write(str(private_file(path)))
 
 
 def read_exr(path: str | Path) -> tuple[Image, tuple[str, ...]]:
-    """Read the channels of an OpenEXR file (h, w, c) as float32, and their names; R, G, B, A come first."""
-    _bytes(path, count=4)  # raises an error for a missing file, for which the library only prints a line
+    """Read the channels of an OpenEXR file (h, w, c) as float32, and their names; R, G,
+    B, A come first.
+    """
+    # raises an error for a missing file, for which the library only prints a line
+    _bytes(path, count=4)
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
-            planes = {name: np.array(plane.pixels, np.float32) for name, plane in file.channels().items()}
+            planes = {
+                name: np.array(plane.pixels, np.float32)
+                for name, plane in file.channels().items()
+            }
     except (RuntimeError, ValueError, UserWarning):
         cure = "convert other formats to OpenEXR; write a damaged file again"
-        raise InputError(Fault(str(path), "must be a complete OpenEXR image", DAMAGED, cure)) from None
+        raise InputError(
+            Fault(str(path), "must be a complete OpenEXR image", DAMAGED, cure)
+        ) from None
     colour = [name for name in "RGBA" if name in planes]
     names = (*colour, *sorted(set(planes) - set(colour)))
     return np.stack([planes[name] for name in names], axis=-1), names
 
 
-def _planes(channels: NDArray[Any] | Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+def _planes(
+    channels: NDArray[Any] | Mapping[str, NDArray[Any]],
+) -> dict[str, NDArray[Any]]:
     if isinstance(channels, Mapping):
         planes = dict(channels)
     elif channels.ndim == 2:
         planes = {"Y": channels}
     else:
-        planes = dict(zip("RGBA"[: channels.shape[2]], np.moveaxis(channels, -1, 0), strict=True))
-    return {name: plane if plane.dtype == np.float16 else plane.astype(np.float32) for name, plane in planes.items()}
+        planes = dict(
+            zip("RGBA"[: channels.shape[2]], np.moveaxis(channels, -1, 0), strict=True)
+        )
+    return {
+        name: plane if plane.dtype == np.float16 else plane.astype(np.float32)
+        for name, plane in planes.items()
+    }
 
 
 def _bytes(path: str | Path, *, count: int = -1) -> bytes:
@@ -136,4 +172,6 @@ def _bytes(path: str | Path, *, count: int = -1) -> bytes:
         with Path(path).open("rb") as file:
             return file.read(count)
     except OSError as error:
-        raise InputError(Fault(str(path), "file must be readable", error.strerror or str(error))) from None
+        raise InputError(
+            Fault(str(path), "file must be readable", error.strerror or str(error))
+        ) from None

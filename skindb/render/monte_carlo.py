@@ -1,4 +1,6 @@
-"""Monte Carlo rendering with the variance of every pixel (Weyrich et al. 2005, eq. 1 to 4, 8 and 9)."""
+"""Monte Carlo rendering with the variance of every pixel (Weyrich et al. 2005, eq. 1 to
+4, 8 and 9).
+"""
 
 from __future__ import annotations
 
@@ -22,12 +24,16 @@ from skindb.render.subsurface import exitance_from_irradiance
 
 Float = NDArray[np.floating[Any]]
 Image = NDArray[np.float32]
-# rays per pixel and axis in one batch; random numbers are stratified over the rays of a pixel. Environments need more
+# rays per pixel and axis in one batch; random numbers are stratified over the rays of a
+# pixel. Environments need more
 RAYS_PER_AXIS = 2
 RAYS_PER_AXIS_ENVIRONMENT = 4
-MIN_BATCHES = 8  # for an estimate of the variance that can be compared with the target error
-MAX_SAMPLES = 4096  # rays per pixel at which rendering ends even if the target error is not reached
-VERTEX_SAMPLES = 32  # directions of an environment at each vertex in one batch, for subsurface light
+# for an estimate of the variance that can be compared with the target error
+MIN_BATCHES = 8
+# rays per pixel at which rendering ends even if the target error is not reached
+MAX_SAMPLES = 4096
+# directions of an environment at each vertex in one batch, for subsurface light
+VERTEX_SAMPLES = 32
 FAR = 1e5  # mm, length of shadow rays towards an environment
 
 
@@ -43,9 +49,10 @@ class Lighting:
 class Quality:
     """Number of rays of a picture, and the light that it includes.
 
-    `samples` is the number of rays per pixel, at least eight. With `error`, rendering ends as soon as the relative
-    standard error (root of the mean variance over the root mean square of the visible surface) is at most this value,
-    or at MAX_SAMPLES. `tolerance` is the opening of the octree for subsurface light.
+    `samples` is the number of rays per pixel, at least eight. With `error`, rendering
+    ends as soon as the relative standard error (root of the mean variance over the root
+    mean square of the visible surface) is at most this value, or at MAX_SAMPLES.
+    `tolerance` is the opening of the octree for subsurface light.
     """
 
     samples: int = 64
@@ -57,7 +64,9 @@ class Quality:
 
 @dataclass(frozen=True)
 class Rendering:
-    """Mean radiance (h, w, 3) of the batches, the variance of that mean, and the fraction of rays that hit (h, w)."""
+    """Mean radiance (h, w, 3) of the batches, the variance of that mean, and the
+    fraction of rays that hit (h, w).
+    """
 
     radiance: Image
     variance: Image
@@ -89,7 +98,11 @@ class _Sums:
             return np.inf
         seen = self.coverage > 0
         level = float(np.mean(np.square(self.mean[seen]))) if seen.any() else 0.0
-        spread = float(np.mean(self.square[seen])) / (self.count * (self.count - 1)) if seen.any() else 0.0
+        spread = (
+            float(np.mean(self.square[seen])) / (self.count * (self.count - 1))
+            if seen.any()
+            else 0.0
+        )
         return float(np.sqrt(spread / level)) if level > 0 else 0.0
 
 
@@ -121,7 +134,8 @@ def render_monte_carlo(
     pixels
         (h, w) pixels that may show the surface; default all.
     progress
-        Called after every batch with the stage, the rays per pixel done, and the rays per pixel in all.
+        Called after every batch with the stage, the rays per pixel done, and the rays
+        per pixel in all.
 
     Returns
     -------
@@ -131,20 +145,39 @@ def render_monte_carlo(
     rays = RayScene(surface.vertices, surface.faces) if scene is None else scene
     lights = lighting.lights
     middle = surface.vertices[surface.known].mean(axis=0)
-    choice = LightChoice.of_lights(lights, middle) if lights is not None and len(lights) else None
-    painter = _Painter(surface, rays, lighting, quality, LobeSampler.of_tables(surface.tables), choice)
-    many = lighting.environment is not None and quality.samples >= 2 * RAYS_PER_AXIS_ENVIRONMENT**2
+    choice = (
+        LightChoice.of_lights(lights, middle)
+        if lights is not None and len(lights)
+        else None
+    )
+    painter = _Painter(
+        surface, rays, lighting, quality, LobeSampler.of_tables(surface.tables), choice
+    )
+    many = (
+        lighting.environment is not None
+        and quality.samples >= 2 * RAYS_PER_AXIS_ENVIRONMENT**2
+    )
     axis = RAYS_PER_AXIS_ENVIRONMENT if many else RAYS_PER_AXIS
     per_batch = axis**2
     sums = _Sums()
     # at least two batches, for the variance
-    most = MAX_SAMPLES if quality.error is not None else max(quality.samples, 2 * per_batch)
+    most = (
+        MAX_SAMPLES
+        if quality.error is not None
+        else max(quality.samples, 2 * per_batch)
+    )
     while sums.count * per_batch < most:
-        view = trace_view(surface, camera, samples=axis, scene=rays, rng=rng, pixels=pixels)
+        view = trace_view(
+            surface, camera, samples=axis, scene=rays, rng=rng, pixels=pixels
+        )
         sums.add(painter.batch(view, rng), view.coverage)
         if progress is not None:
             progress("render", min(sums.count * per_batch, most), most)
-        if quality.error is not None and sums.count >= MIN_BATCHES and sums.relative_error() <= quality.error:
+        if (
+            quality.error is not None
+            and sums.count >= MIN_BATCHES
+            and sums.relative_error() <= quality.error
+        ):
             break
     variance = sums.square / (sums.count * (sums.count - 1))
     return Rendering(
@@ -176,8 +209,11 @@ class _Painter:
         values = np.zeros((len(view.pixel), 3))
         hits = _Hits(
             view,
-            view.interpolate(surface.diffuse) * float("diffuse" in terms and not subsurface),
-            view.interpolate(surface.weights) if "surface" in terms else np.zeros((len(view.pixel), 0)),
+            view.interpolate(surface.diffuse)
+            * float("diffuse" in terms and not subsurface),
+            view.interpolate(surface.weights)
+            if "surface" in terms
+            else np.zeros((len(view.pixel), 0)),
             surface.tables if "surface" in terms else surface.tables[..., :0],
         )
         if self.choice is not None:
@@ -194,8 +230,12 @@ class _Painter:
             values += escape_factor(view, surface.eta) * view.interpolate(glow)
         return view.image(values)
 
-    def _by_lights(self, hits: _Hits, choice: LightChoice, rng: np.random.Generator) -> Float:
-        """Radiance (n, 3) from a few lights per hit, which are drawn in proportion to the power that arrives there."""
+    def _by_lights(
+        self, hits: _Hits, choice: LightChoice, rng: np.random.Generator
+    ) -> Float:
+        """Radiance (n, 3) from a few lights per hit, which are drawn in proportion to
+        the power that arrives there.
+        """
         view = hits.view
         surface = self.surface
         lights = choice.lights
@@ -204,70 +244,121 @@ class _Painter:
             points = points_on_discs(lights, chosen, rng)
             above = np.einsum("nc,nc->n", points - view.position, view.normal) > 0
             rows = np.flatnonzero(above)
-            hidden = self.scene.occluded(view.position[rows], points[rows], normal=view.normal[rows])
+            hidden = self.scene.occluded(
+                view.position[rows], points[rows], normal=view.normal[rows]
+            )
             rows = rows[~hidden]
-            # tables that are averaged over the disc are evaluated at its centre; the shadow is that of the point
+            # tables that are averaged over the disc are evaluated at its centre; the
+            # shadow is that of the point
             lamp = lights.position[chosen] if surface.disc_included else points
             for light in np.unique(chosen[rows]):
                 own = rows[chosen[rows] == light]
-                shaded = hits.shade(own, lamp[own], weight[own], surface.eta, lights.axis[light], lights.falloff[light])
+                shaded = hits.shade(
+                    own,
+                    lamp[own],
+                    weight[own],
+                    surface.eta,
+                    lights.axis[light],
+                    lights.falloff[light],
+                )
                 values[own] += shaded * lights.intensity[light]
         return values
 
-    def _by_environment(self, hits: _Hits, environment: Environment, rng: np.random.Generator) -> Float:
-        """Radiance (n, 3) from the environment: one direction drawn by luminance, one by the BRDF (Veach 1997)."""
+    def _by_environment(
+        self, hits: _Hits, environment: Environment, rng: np.random.Generator
+    ) -> Float:
+        """Radiance (n, 3) from the environment: one direction drawn by luminance, one
+        by the BRDF (Veach 1997).
+        """
         view = hits.view
         values = np.zeros((len(view.pixel), 3))
         mix = self.lobes.mix(
-            hits.weights if hits.weights.shape[1] else np.zeros((len(view.pixel), len(self.lobes.albedo)))
+            hits.weights
+            if hits.weights.shape[1]
+            else np.zeros((len(view.pixel), len(self.lobes.albedo)))
         )
         draw = stratified(view, 7, rng)
-        drawn = (environment.sample(draw[:, :3]), self.lobes.sample(mix, view.normal, view.towards, draw[:, 3:]))
+        drawn = (
+            environment.sample(draw[:, :3]),
+            self.lobes.sample(mix, view.normal, view.towards, draw[:, 3:]),
+        )
         for first, towards in enumerate(drawn):
             above = np.flatnonzero(np.einsum("nc,nc->n", towards, view.normal) > 0)
             target = view.position[above] + FAR * towards[above]
-            rows = above[~self.scene.occluded(view.position[above], target, normal=view.normal[above])]
+            rows = above[
+                ~self.scene.occluded(
+                    view.position[above], target, normal=view.normal[above]
+                )
+            ]
             by_light = environment.pdf(towards[rows])
-            by_lobe = self.lobes.pdf(mix[rows], view.normal[rows], view.towards[rows], towards[rows])
+            by_lobe = self.lobes.pdf(
+                mix[rows], view.normal[rows], view.towards[rows], towards[rows]
+            )
             own = (by_light, by_lobe)[first]
             # power heuristic, divided by the density with which the direction was drawn
-            weight = np.where(own > 0, own / np.maximum(by_light**2 + by_lobe**2, 1e-300), 0.0)
-            shaded = hits.shade(rows, view.position[rows] + towards[rows], weight, self.surface.eta)
+            weight = np.where(
+                own > 0, own / np.maximum(by_light**2 + by_lobe**2, 1e-300), 0.0
+            )
+            shaded = hits.shade(
+                rows, view.position[rows] + towards[rows], weight, self.surface.eta
+            )
             values[rows] += shaded * environment.along(towards[rows])
         return values
 
     def _received(self, rng: np.random.Generator) -> Float:
-        """Irradiance (v, 3) under the boundary, F_t(w_i) E, at the vertices; an independent estimate in each batch."""
+        """Irradiance (v, 3) under the boundary, F_t(w_i) E, at the vertices; an
+        independent estimate in each batch.
+        """
         surface = self.surface
         known = np.flatnonzero(surface.known)
         points = surface.vertices[known]
         normals = surface.normals[known]
         received = np.zeros((len(known), 3))
         if self.lighting.lights is not None and len(self.lighting.lights):
-            received += self._received_from_lights(points, normals, self.lighting.lights, rng)
+            received += self._received_from_lights(
+                points, normals, self.lighting.lights, rng
+            )
         if self.lighting.environment is not None:
-            received += self._received_from_environment(points, normals, self.lighting.environment, rng)
+            received += self._received_from_environment(
+                points, normals, self.lighting.environment, rng
+            )
         out = np.zeros((len(surface.vertices), 3))
         out[known] = received
         return out
 
-    def _received_from_lights(self, points: Float, normals: Float, lights: Lights, rng: np.random.Generator) -> Float:
+    def _received_from_lights(
+        self, points: Float, normals: Float, lights: Lights, rng: np.random.Generator
+    ) -> Float:
         received = np.zeros((len(points), 3))
         for i in range(len(lights)):
             towards = points_on_discs(lights, np.full(len(points), i), rng) - points
             square = np.einsum("nc,nc->n", towards, towards)
             cosine = np.einsum("nc,nc->n", towards, normals) / np.sqrt(square)
             front = np.flatnonzero(cosine > 0)
-            lit = front[~self.scene.occluded(points[front], points[front] + towards[front], normal=normals[front])]
-            along = np.maximum(-(towards[lit] @ lights.axis[i]) / np.sqrt(square[lit]), 0) ** float(lights.falloff[i])
+            lit = front[
+                ~self.scene.occluded(
+                    points[front], points[front] + towards[front], normal=normals[front]
+                )
+            ]
+            along = np.maximum(
+                -(towards[lit] @ lights.axis[i]) / np.sqrt(square[lit]), 0
+            ) ** float(lights.falloff[i])
             passed = fresnel_transmittance(np.minimum(cosine[lit], 1), self.surface.eta)
-            received[lit] += (cosine[lit] / square[lit] * along * passed)[:, None] * lights.intensity[i]
+            received[lit] += (cosine[lit] / square[lit] * along * passed)[
+                :, None
+            ] * lights.intensity[i]
         return received
 
     def _received_from_environment(
-        self, points: Float, normals: Float, environment: Environment, rng: np.random.Generator
+        self,
+        points: Float,
+        normals: Float,
+        environment: Environment,
+        rng: np.random.Generator,
     ) -> Float:
-        """Half of the directions are drawn by luminance, half by the cosine (balance heuristic, Veach 1997)."""
+        """Half of the directions are drawn by luminance, half by the cosine (balance
+        heuristic, Veach 1997).
+        """
         received = np.zeros((len(points), 3))
         first, second = tangents(normals)
         for i in range(VERTEX_SAMPLES):
@@ -277,15 +368,21 @@ class _Painter:
                 height = np.sqrt(rng.random(len(points)))
                 turn = 2 * np.pi * rng.random(len(points))
                 sine = np.sqrt(1 - height**2)
-                towards = (sine * np.cos(turn))[:, None] * first + (sine * np.sin(turn))[:, None] * second
+                towards = (sine * np.cos(turn))[:, None] * first + (
+                    sine * np.sin(turn)
+                )[:, None] * second
                 towards += height[:, None] * normals
             cosine = np.einsum("nc,nc->n", towards, normals)
             front = np.flatnonzero(cosine > 0)
             target = points[front] + FAR * towards[front]
-            lit = front[~self.scene.occluded(points[front], target, normal=normals[front])]
+            lit = front[
+                ~self.scene.occluded(points[front], target, normal=normals[front])
+            ]
             density = (environment.pdf(towards[lit]) + cosine[lit] / np.pi) / 2
             passed = fresnel_transmittance(np.minimum(cosine[lit], 1), self.surface.eta)
-            received[lit] += (cosine[lit] * passed / density)[:, None] * environment.along(towards[lit])
+            received[lit] += (cosine[lit] * passed / density)[
+                :, None
+            ] * environment.along(towards[lit])
         return received / VERTEX_SAMPLES
 
 
@@ -307,7 +404,9 @@ class _Hits:
         axis: Any = (0.0, 0.0, 1.0),
         falloff: Any = 0.0,
     ) -> Float:
-        """Radiance (m, 3) of chosen hits, each under a point light (m, 3) of its own with intensity `weight` (m,)."""
+        """Radiance (m, 3) of chosen hits, each under a point light (m, 3) of its own
+        with intensity `weight` (m,).
+        """
         view = self.view
         lit = np.asarray(weight, np.float64)
         shaded = shade_points(

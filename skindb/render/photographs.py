@@ -1,4 +1,6 @@
-"""Comparison of each kept photograph with the model rendered from the same camera under the same light."""
+"""Comparison of each kept photograph with the model rendered from the same camera under
+the same light.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,8 @@ from skindb.schema import check
 from skindb.schema.consent import honour_consent
 
 MIN_REGION_PIXELS = 30  # below which a region is not compared
-MIN_COVERAGE = 0.999  # fraction of a pixel's rays that must meet known surface, to exclude silhouettes
+# fraction of a pixel's rays that must meet known surface, to exclude silhouettes
+MIN_COVERAGE = 0.999
 
 
 @dataclass(frozen=True)
@@ -44,7 +47,11 @@ class Comparison:
 
 
 def compare_photographs(
-    model: xr.DataTree, capture: xr.DataTree, *, subsurface: bool = False, samples: int = 2
+    model: xr.DataTree,
+    capture: xr.DataTree,
+    *,
+    subsurface: bool = False,
+    samples: int = 2,
 ) -> list[Comparison]:
     """Predict the photographs that ingest kept.
 
@@ -60,10 +67,16 @@ def compare_photographs(
     honour_consent(model.attrs, "export")
     if "photographs" not in capture.children:
         cure = "ingest the capture again with --photographs 4"
-        raise InputError(Fault("capture", "must contain kept photographs", "none", cure))
+        raise InputError(
+            Fault("capture", "must contain kept photographs", "none", cure)
+        )
     kept = capture["photographs"].to_dataset()
     dome = capture["dome"].to_dataset()
-    check(kept, ("photograph_radiance", "photograph_light", "photograph_camera"), where="photographs")
+    check(
+        kept,
+        ("photograph_radiance", "photograph_light", "photograph_camera"),
+        where="photographs",
+    )
     surface = from_model(model)
     if subsurface:
         require_translucency(surface)
@@ -80,10 +93,16 @@ def compare_photographs(
         camera = cameras[at_camera]
         view = trace_view(surface, camera, samples=samples, scene=scene)
         lamp = lights.select(at_light)
-        diffuse = shade_view(view, surface, lamp, scene, subsurface=subsurface, terms=("diffuse",))[0]
+        diffuse = shade_view(
+            view, surface, lamp, scene, subsurface=subsurface, terms=("diffuse",)
+        )[0]
         gloss = shade_view(view, surface, lamp, scene, terms=("surface",))[0]
         rendered = diffuse + gloss
-        photo = kept["photograph_radiance"][i].values[: camera.height, : camera.width].astype(np.float32)
+        photo = (
+            kept["photograph_radiance"][i]
+            .values[: camera.height, : camera.width]
+            .astype(np.float32)
+        )
         mask = (view.coverage >= MIN_COVERAGE) & np.isfinite(photo).all(axis=-1)
         if not mask.any():
             continue  # this camera sees no fitted surfel
@@ -92,18 +111,44 @@ def compare_photographs(
         error = compare_images(rendered, photo, mask=mask)
         parts = _by_region(view, regions, rendered, photo, mask, error["exposure"])
         shown = view.image(view.interpolate(doubtful[:, None]))[..., 0]
-        causes = find_causes(np.nan_to_num(photo), rendered, gloss, mask=mask, doubtful=shown)
+        causes = find_causes(
+            np.nan_to_num(photo), rendered, gloss, mask=mask, doubtful=shown
+        )
         unseen = light in dark or name in away
-        results.append(Comparison(light, name, unseen, photo, rendered, mask, error, diffuse, parts, causes))
+        results.append(
+            Comparison(
+                light,
+                name,
+                unseen,
+                photo,
+                rendered,
+                mask,
+                error,
+                diffuse,
+                parts,
+                causes,
+            )
+        )
     if not results:
         rule = "at least one must show fitted surfels"
-        raise InputError(Fault("photographs", rule, "none", "ingest the capture again with more --photographs"))
+        raise InputError(
+            Fault(
+                "photographs",
+                rule,
+                "none",
+                "ingest the capture again with more --photographs",
+            )
+        )
     return results
 
 
 def _regions(capture: xr.DataTree) -> dict[str, NDArray[np.float64]]:
     """Membership (surfel,) of the regions that the capture names."""
-    found = capture["surfels"].to_dataset() if "surfels" in capture.children else xr.Dataset()
+    found = (
+        capture["surfels"].to_dataset()
+        if "surfels" in capture.children
+        else xr.Dataset()
+    )
     if "region_mask" not in found:
         return {}
     mask = found["region_mask"].transpose("surfel", "region").values.astype(np.float64)
@@ -126,7 +171,9 @@ def _by_region(
     for i, name in enumerate(regions):
         inside = mask & (shown[..., i] > 0.5)
         if inside.sum() >= MIN_REGION_PIXELS:
-            found[name] = compare_images(rendered, photo, mask=inside, exposure=exposure)
+            found[name] = compare_images(
+                rendered, photo, mask=inside, exposure=exposure
+            )
     return found
 
 
@@ -141,7 +188,8 @@ def _held_out(model: xr.DataTree, dim: str) -> set[str]:
 def write_comparisons(comparisons: Sequence[Comparison], folder: Path) -> list[Path]:
     """Write one picture per photograph.
 
-    From left to right: photograph, rendering, diffuse part, surface part, and difference times ten (grey is zero).
+    From left to right: photograph, rendering, diffuse part, surface part, and
+    difference times ten (grey is zero).
     """
     make_private(folder)
     paths = []
@@ -151,14 +199,26 @@ def write_comparisons(comparisons: Sequence[Comparison], folder: Path) -> list[P
     return paths
 
 
-def side_by_side(one: Comparison, *, components: bool = False, exposure: float | None = None) -> NDArray[np.uint8]:
-    """Photograph, rendering and difference (h, 3 w, 3) at one exposure, by default that of the photograph.
+def side_by_side(
+    one: Comparison, *, components: bool = False, exposure: float | None = None
+) -> NDArray[np.uint8]:
+    """Photograph, rendering and difference (h, 3 w, 3) at one exposure, by default that
+    of the photograph.
 
-    With `components`, the diffuse and the surface part of the rendering stand before the difference (h, 5 w, 3).
+    With `components`, the diffuse and the surface part of the rendering stand before
+    the difference (h, 5 w, 3).
     """
     exposure = one.error["exposure"] if exposure is None else exposure
-    images = [one.photographed, one.rendered, *((one.diffuse, one.rendered - one.diffuse) if components else ())]
+    images = [
+        one.photographed,
+        one.rendered,
+        *((one.diffuse, one.rendered - one.diffuse) if components else ()),
+    ]
     shown = [tone_map(np.nan_to_num(image), exposure=exposure) for image in images]
-    gap = np.where(one.mask[..., None], (one.rendered - np.nan_to_num(one.photographed)) * exposure, 0.0)
+    gap = np.where(
+        one.mask[..., None],
+        (one.rendered - np.nan_to_num(one.photographed)) * exposure,
+        0.0,
+    )
     difference = np.clip(127.5 + 10 * 127.5 * gap, 0, 255).astype(np.uint8)
     return np.concatenate([*shown, difference], axis=1)

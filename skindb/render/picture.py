@@ -13,7 +13,14 @@ from skindb.errors import Fault, InputError
 from skindb.geometry.rays import RayScene
 from skindb.render.direct import TERMS, View, glow_image, shade_view, trace_view
 from skindb.render.plan import RenderPlan, plan_render
-from skindb.render.scene import Camera, Lights, Surface, cameras_from_dome, from_model, lights_from_dome
+from skindb.render.scene import (
+    Camera,
+    Lights,
+    Surface,
+    cameras_from_dome,
+    from_model,
+    lights_from_dome,
+)
 from skindb.render.subsurface import require_translucency, total_exitance
 from skindb.schema.consent import honour_consent
 
@@ -33,7 +40,8 @@ class Shot:
 class Picture:
     """Radiance that a camera sees, and what was skipped to compute it."""
 
-    radiance: NDArray[np.float32]  # (h, w, 3) linear; empty if the picture is only planned
+    # (h, w, 3) linear; empty if the picture is only planned
+    radiance: NDArray[np.float32]
     camera: str
     lights: list[str]
     skipped: list[str]
@@ -73,7 +81,10 @@ def radiance_of(
     surface = from_model(model, fill=True)
     if subsurface:
         require_translucency(surface)
-    (lamps, light_names), (seen_by, camera_name) = chosen_lights(dome, lights), chosen_camera(dome, camera)
+    (lamps, light_names), (seen_by, camera_name) = (
+        chosen_lights(dome, lights),
+        chosen_camera(dome, camera),
+    )
     sized = seen_by if scale == 1 else seen_by.scaled(scale)
     shot = trace_shot(surface, lamps, sized, samples=samples, subsurface=subsurface)
     seen = np.empty((0, 0, 3), np.float32) if explain else picture(shot)
@@ -84,7 +95,9 @@ def radiance_of(
 def chosen_lights(dome: xr.Dataset, lights: Sequence[str]) -> tuple[Lights, list[str]]:
     """Lights of a dome by their names, or all if no name is given, and their names."""
     names = [str(name) for name in dome["light"].values]
-    chosen = [_index(names, name, "light") for name in lights] or list(range(len(names)))
+    chosen = [_index(names, name, "light") for name in lights] or list(
+        range(len(names))
+    )
     return lights_from_dome(dome).select(chosen), [names[i] for i in chosen]
 
 
@@ -95,7 +108,9 @@ def chosen_camera(dome: xr.Dataset, camera: str | None) -> tuple[Camera, str]:
     return cameras_from_dome(dome)[at], names[at]
 
 
-def trace_shot(surface: Surface, lamps: Lights, camera: Camera, *, samples: int, subsurface: bool) -> Shot:
+def trace_shot(
+    surface: Surface, lamps: Lights, camera: Camera, *, samples: int, subsurface: bool
+) -> Shot:
     """Trace the rays of a camera and plan the shading."""
     scene = RayScene(surface.vertices, surface.faces)
     view = trace_view(surface, camera, samples=samples, scene=scene)
@@ -111,7 +126,11 @@ def picture(shot: Shot) -> NDArray[np.float32]:
     terms = ("surface",) if plan.subsurface else TERMS
     direct = shade_view(shot.view, surface, lamps, shot.scene, terms=terms).sum(axis=0)
     if plan.subsurface:
-        direct += glow_image(shot.view, surface, total_exitance(surface, lamps, shot.scene, wanted=plan.surfels))
+        direct += glow_image(
+            shot.view,
+            surface,
+            total_exitance(surface, lamps, shot.scene, wanted=plan.surfels),
+        )
     return np.asarray(direct, np.float32)
 
 
@@ -124,5 +143,9 @@ def frontal_camera(dome: xr.Dataset) -> int:
 def _index(names: list[str], name: str, what: str) -> int:
     if name not in names:
         cure = f"choose {', '.join(names)}"
-        raise InputError(Fault(f"{what} {name}", f"must be a {what} of the dome", "no such name", cure))
+        raise InputError(
+            Fault(
+                f"{what} {name}", f"must be a {what} of the dome", "no such name", cure
+            )
+        )
     return names.index(name)

@@ -1,4 +1,6 @@
-"""Plan of a picture: the computations it needs and those it skips, with a bound on the resulting error."""
+"""Plan of a picture: the computations it needs and those it skips, with a bound on the
+resulting error.
+"""
 
 from __future__ import annotations
 
@@ -21,13 +23,19 @@ from skindb.schema.omission import Omission
 
 Float = NDArray[np.floating[Any]]
 Omissions = tuple[Omission, ...]
-NORMAL_MARGIN = 0.1  # rad, by which normals between the rays of a trace differ from those at the rays
+# rad, by which normals between the rays of a trace differ from those at the rays
+NORMAL_MARGIN = 0.1
 ERROR_PART = 0.1  # of the wanted error, which all skipped lights together may cost
 POINTS = 2000  # visible points at which the light of each light is computed
-SAFETY = 2.0  # factor on the light at these points, because other points, and the discs of lights, differ from them
+# factor on the light at these points, because other points, and the discs of lights,
+# differ from them
+SAFETY = 2.0
 KEPT = (  # with costs that benchmarks/omissions.py measured on a face of 23,393 surfels
     "not skipped: basis BRDFs of small weight, because four bases take only 8 % more time than one",
-    "not skipped: light of an environment from below all horizons, because the noise is the same without it",
+    (
+        "not skipped: light of an environment from below all horizons, because the "
+        "noise is the same without it"
+    ),
 )
 
 
@@ -43,15 +51,23 @@ class RenderPlan:
 def plan_render(shown: Mask, *, subsurface: bool) -> RenderPlan:
     """Plan a picture in which the triangles of some surfels (surfel,) are visible.
 
-    Subsurface light is computed at these surfels only. It comes from all surfels, and the picture is interpolated
-    between the visible ones, so the picture stays the same. Subsurface transport is computed even if it reaches less
-    than a pixel: it changes the diffuse term by 3 to 7 % RMS, and the bound from the range of irradiance around a
-    surfel is ten times larger.
+    Subsurface light is computed at these surfels only. It comes from all surfels, and
+    the picture is interpolated between the visible ones, so the picture stays the same.
+    Subsurface transport is computed even if it reaches less than a pixel: it changes
+    the diffuse term by 3 to 7 % RMS, and the bound from the range of irradiance around
+    a surfel is ten times larger.
     """
     skipped: Omissions = ()
     if subsurface and not shown.all():
         hidden = int((~shown).sum())
-        skipped = (Omission("surfels that receive subsurface light", hidden, shown.size, "they are not visible"),)
+        skipped = (
+            Omission(
+                "surfels that receive subsurface light",
+                hidden,
+                shown.size,
+                "they are not visible",
+            ),
+        )
     return RenderPlan(shown, subsurface, skipped)
 
 
@@ -77,18 +93,26 @@ def plan_scene(
 ) -> ScenePlan:
     """Plan a Monte Carlo picture; parameters as in `render_monte_carlo`.
 
-    Without a wanted relative error, only what does not change the picture is skipped, and levels of the octree.
+    Without a wanted relative error, only what does not change the picture is skipped,
+    and levels of the octree.
 
     Notes
     -----
-    Measured by benchmarks/omissions.py on a face that covers 45 % of the picture: without the other pixels a picture
-    takes 46 % less CPU time under one light, 26 % less under the 32 lights of a dome, and 15 % less in an environment.
-    If one of the lights dominates, skipping the others halves what is left. In a dome of even lights none can be
-    skipped, because each contributes 2 to 7 % of a picture. Planning takes 0.1 s. `KEPT` lists what would not pay.
+    Measured by benchmarks/omissions.py on a face that covers 45 % of the picture:
+    without the other pixels a picture takes 46 % less CPU time under one light, 26 %
+    less under the 32 lights of a dome, and 15 % less in an environment. If one of the
+    lights dominates, skipping the others halves what is left. In a dome of even lights
+    none can be skipped, because each contributes 2 to 7 % of a picture. Planning takes
+    0.1 s. `KEPT` lists what would not pay.
     """
     pixels, empty = covered_pixels(surface, camera)
     view = trace_view(surface, camera, scene=scene, pixels=pixels)
-    skipped = [*empty, *plan_render(view.shown(len(surface.vertices)), subsurface=subsurface).omissions]
+    skipped = [
+        *empty,
+        *plan_render(
+            view.shown(len(surface.vertices)), subsurface=subsurface
+        ).omissions,
+    ]
     surface, found = without_unused_bases(surface)
     skipped += found
     lights = lighting.lights
@@ -97,10 +121,14 @@ def plan_scene(
         skipped += found
     if lights is not None and error is not None:
         seen = _with_terms(surface, terms)
-        lights, found = notable_lights(lights, seen, view, scene, error=error, subsurface=subsurface)
+        lights, found = notable_lights(
+            lights, seen, view, scene, error=error, subsurface=subsurface
+        )
         skipped += found
     skipped += (plan_octree(error),) if subsurface else ()
-    return ScenePlan(surface, Lighting(lights, lighting.environment), pixels, tuple(skipped))
+    return ScenePlan(
+        surface, Lighting(lights, lighting.environment), pixels, tuple(skipped)
+    )
 
 
 def _with_terms(surface: Surface, terms: tuple[str, ...]) -> Surface:
@@ -111,10 +139,17 @@ def _with_terms(surface: Surface, terms: tuple[str, ...]) -> Surface:
 
 
 def plan_octree(error: float | None) -> Omission:
-    """The levels of the octree for subsurface light that a picture with this relative error skips."""
+    """The levels of the octree for subsurface light that a picture with this relative
+    error skips.
+    """
     opening, bound = tree_opening(error)
     reason = f"nodes that appear smaller than {opening:.3g} are not opened"
-    return Omission("levels of the octree", reason=reason, bound=bound, bounded="values of subsurface light")
+    return Omission(
+        "levels of the octree",
+        reason=reason,
+        bound=bound,
+        bounded="values of subsurface light",
+    )
 
 
 def without_unused_bases(surface: Surface) -> tuple[Surface, Omissions]:
@@ -122,63 +157,109 @@ def without_unused_bases(surface: Surface) -> tuple[Surface, Omissions]:
     used = (surface.weights != 0).any(axis=0)
     if used.all():
         return surface, ()
-    kept = replace(surface, weights=surface.weights[:, used], tables=np.ascontiguousarray(surface.tables[..., used]))
-    return kept, (Omission("basis BRDFs", int((~used).sum()), used.size, "their weight is zero everywhere"),)
+    kept = replace(
+        surface,
+        weights=surface.weights[:, used],
+        tables=np.ascontiguousarray(surface.tables[..., used]),
+    )
+    return kept, (
+        Omission(
+            "basis BRDFs",
+            int((~used).sum()),
+            used.size,
+            "their weight is zero everywhere",
+        ),
+    )
 
 
 def covered_pixels(surface: Surface, camera: Camera) -> tuple[Mask, Omissions]:
-    """Pixels (h, w) that triangles may cover: those that the box around a projected triangle meets."""
+    """Pixels (h, w) that triangles may cover: those that the box around a projected
+    triangle meets.
+    """
     faces = np.asarray(surface.faces)
     view = (camera.K, camera.R, camera.t, camera.distortion)
     corner = project(surface.vertices, *view)[0][faces]
     middle = project(surface.vertices[faces].mean(axis=1), *view)[0]
     if not (np.isfinite(corner).all() and np.isfinite(middle).all()):
-        return np.ones((camera.height, camera.width), bool), ()  # triangles behind the camera
+        # triangles behind the camera
+        return np.ones((camera.height, camera.width), bool), ()
     # distortion curves edges by about as much as it moves the middle of a triangle
     margin = 1 + 4 * np.abs(middle - corner.mean(axis=1)).max()
     size = (camera.width, camera.height)
     low = np.clip(np.floor(corner.min(axis=1) - margin), 0, size).astype(np.int64)
     high = np.clip(np.ceil(corner.max(axis=1) + margin), 0, size).astype(np.int64)
     edges = np.zeros((camera.height + 1, camera.width + 1), np.int64)
-    for x, y, sign in ((low, low, 1), (high, high, 1), (low, high, -1), (high, low, -1)):
+    for x, y, sign in (
+        (low, low, 1),
+        (high, high, 1),
+        (low, high, -1),
+        (high, low, -1),
+    ):
         np.add.at(edges, (y[:, 1], x[:, 0]), sign)
     mask = edges.cumsum(axis=0).cumsum(axis=1)[:-1, :-1] > 0
     empty = int((~mask).sum())
-    return mask, (Omission("pixels", empty, mask.size, "no triangle covers them"),) if empty else ()
+    return mask, (
+        Omission("pixels", empty, mask.size, "no triangle covers them"),
+    ) if empty else ()
 
 
 def lights_above_horizon(lights: Lights, view: View) -> tuple[Lights, Omissions]:
-    """The lights above the horizon of any visible point, with a margin for their discs and for pixels."""
+    """The lights above the horizon of any visible point, with a margin for their discs
+    and for pixels.
+    """
     if not len(lights) or not len(view.pixel):
         return lights, ()
-    margin = np.linalg.norm(np.ptp(view.position, axis=0)) / min(view.camera.width, view.camera.height)
+    margin = np.linalg.norm(np.ptp(view.position, axis=0)) / min(
+        view.camera.width, view.camera.height
+    )
     lit = np.zeros(len(lights), bool)
     for i in range(len(lights)):
         height = np.einsum("nc,nc->n", lights.position[i] - view.position, view.normal)
-        slack = lights.disc_radius[i] + margin + NORMAL_MARGIN * np.linalg.norm(lights.position[i])
+        slack = (
+            lights.disc_radius[i]
+            + margin
+            + NORMAL_MARGIN * np.linalg.norm(lights.position[i])
+        )
         lit[i] = bool((height > -slack).any())
     if lit.all():
         return lights, ()
     left = int((~lit).sum())
-    return lights.select(lit), (Omission("lights", left, lit.size, "they are below the horizon of all visible points"),)
+    return lights.select(lit), (
+        Omission(
+            "lights", left, lit.size, "they are below the horizon of all visible points"
+        ),
+    )
 
 
 def notable_lights(
-    lights: Lights, surface: Surface, view: View, scene: RayScene, *, error: float, subsurface: bool = False
+    lights: Lights,
+    surface: Surface,
+    view: View,
+    scene: RayScene,
+    *,
+    error: float,
+    subsurface: bool = False,
 ) -> tuple[Lights, Omissions]:
     """The lights without the dimmest ones, whose sum may cost a tenth of the wanted relative error.
 
-    The light of each is computed at visible points without shadows, which cannot make it brighter. The picture is at
-    least as bright as with the shadows at these points. Light under the skin is at most the largest irradiance of any
-    surfel, because its kernel is divided by its sum.
+    The light of each is computed at visible points without shadows, which cannot make
+    it brighter. The picture is at least as bright as with the shadows at these points.
+    Light under the skin is at most the largest irradiance of any surfel, because its
+    kernel is divided by its sum.
     """
     if len(lights) < 2 or not len(view.pixel):
         return lights, ()
-    rows = np.linspace(0, len(view.pixel) - 1, min(len(view.pixel), POINTS)).astype(np.int64)
+    rows = np.linspace(0, len(view.pixel) - 1, min(len(view.pixel), POINTS)).astype(
+        np.int64
+    )
     light = _unshadowed(lights, surface, view, rows)
     shown = np.stack(
         [
-            ~scene.occluded(view.position[rows], lights.position[i : i + 1], normal=view.normal[rows])
+            ~scene.occluded(
+                view.position[rows],
+                lights.position[i : i + 1],
+                normal=view.normal[rows],
+            )
             for i in range(len(lights))
         ]
     )
@@ -203,11 +284,20 @@ def notable_lights(
     kept[dropped] = False
     why = f"together they contribute less than {ERROR_PART:g} of the wanted error"
     return lights.select(kept), (
-        Omission("lights", len(dropped), len(lights), why, bound, "pictures (root mean square)"),
+        Omission(
+            "lights",
+            len(dropped),
+            len(lights),
+            why,
+            bound,
+            "pictures (root mean square)",
+        ),
     )
 
 
-def _unshadowed(lights: Lights, surface: Surface, view: View, rows: NDArray[np.int64]) -> Float:
+def _unshadowed(
+    lights: Lights, surface: Surface, view: View, rows: NDArray[np.int64]
+) -> Float:
     """Radiance (l, m, 3) of chosen hits under each light, from its centre and without shadows."""
     diffuse = view.interpolate(surface.diffuse)[rows]
     weights = view.interpolate(surface.weights)[rows]
@@ -236,7 +326,11 @@ def _irradiance(light: Lights, surface: Surface) -> Float:
     """Irradiance (v, 3) under the boundary of one light, without shadows."""
     towards = light.position[0] - surface.vertices
     square = np.einsum("nc,nc->n", towards, towards)
-    cosine = np.clip(np.einsum("nc,nc->n", towards, surface.normals) / np.sqrt(square), 0, 1)
-    along = np.maximum(-(towards @ light.axis[0]) / np.sqrt(square), 0) ** float(light.falloff[0])
+    cosine = np.clip(
+        np.einsum("nc,nc->n", towards, surface.normals) / np.sqrt(square), 0, 1
+    )
+    along = np.maximum(-(towards @ light.axis[0]) / np.sqrt(square), 0) ** float(
+        light.falloff[0]
+    )
     passed = cosine / square * along * fresnel_transmittance(cosine, surface.eta)
     return np.asarray(passed[:, None] * light.intensity[0])

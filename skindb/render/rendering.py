@@ -27,13 +27,19 @@ from skindb.schema.consent import honour_consent
 from skindb.schema.omission import Omission
 
 UNITS = "radiance"  # in the unit of the photographs, or of the environment
-NO_LIGHTS = Lights(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3)), np.zeros(0))
-DIRECTIONS = 512  # directions over the sphere, for the irradiance of the white surface that defines exposures
+NO_LIGHTS = Lights(
+    np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros((0, 3)), np.zeros(0)
+)
+# directions over the sphere, for the irradiance of the white surface that defines
+# exposures
+DIRECTIONS = 512
 
 
 @dataclass(frozen=True)
 class RenderInputs:
-    """Surface, camera and light of a picture, without the parts that do not change it, and a list of these parts."""
+    """Surface, camera and light of a picture, without the parts that do not change it,
+    and a list of these parts.
+    """
 
     surface: Surface
     camera: Camera
@@ -41,7 +47,8 @@ class RenderInputs:
     scene: RayScene
     names: dict[str, Any]  # names of camera, lights and environment
     pixels: Mask
-    given: Lighting  # with the lights that do not reach the visible part, which count for exposures
+    # with the lights that do not reach the visible part, which count for exposures
+    given: Lighting
     omissions: tuple[Omission, ...]
 
 
@@ -60,24 +67,27 @@ def render(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> xr.Dataset:
-    """Render a model under lights of its dome, other lights or an environment (Weyrich et al. 2005, eq. 1-4, 8, 9).
+    """Render a model under lights of its dome, other lights or an environment (Weyrich
+    et al. 2005, eq. 1-4, 8, 9).
 
     Parameters
     ----------
     model
         Version of kind "model" or "edit".
     lights
-        Names of lights of the dome, whose light is summed, or disc lights. By default all lights of the dome are used,
-        or none of them if an environment is given.
+        Names of lights of the dome, whose light is summed, or disc lights. By default
+        all lights of the dome are used, or none of them if an environment is given.
     environment
-        Light from all directions, or its OpenEXR file; see `skindb.render.Environment` for its orientation.
+        Light from all directions, or its OpenEXR file; see `skindb.render.Environment`
+        for its orientation.
     camera
-        Name of a camera of the dome, or any other camera; default the most frontal camera of the dome.
+        Name of a camera of the dome, or any other camera; default the most frontal
+        camera of the dome.
     samples
         Number of rays per pixel.
     error
-        Target relative standard error of the picture. If given, it determines the number of rays, at most 4,096 per
-        pixel, and `samples` is not used.
+        Target relative standard error of the picture. If given, it determines the
+        number of rays, at most 4,096 per pixel, and `samples` is not used.
     subsurface
         Whether diffuse light travels through the skin (dipole); requires translucency in the model.
     terms
@@ -85,8 +95,9 @@ def render(
     scale
         Size of the picture relative to that of the camera.
     spacing
-        Longest edge [mm] of the triangles on which subsurface light is interpolated; default the mesh of the surfels.
-        A third of the diffusion length makes the edges of shadows smooth in a close-up.
+        Longest edge [mm] of the triangles on which subsurface light is interpolated;
+        default the mesh of the surfels. A third of the diffusion length makes the edges
+        of shadows smooth in a close-up.
     seed
         Random seed.
     progress
@@ -95,19 +106,30 @@ def render(
     Returns
     -------
     Dataset
-        `radiance` (image_row, image_col, channel), linear Rec. 709, in the unit of the photographs or of the
-        environment; `radiance_variance`, the variance of this mean; `coverage` (image_row, image_col), the fraction
-        of rays that meet known skin. Attributes: camera, lights, samples, relative_error (relative standard error of
-        the picture), seconds, skipped.
+        `radiance` (image_row, image_col, channel), linear Rec. 709, in the unit of the
+        photographs or of the environment; `radiance_variance`, the variance of this
+        mean; `coverage` (image_row, image_col), the fraction of rays that meet known
+        skin. Attributes: camera, lights, samples, relative_error (relative standard
+        error of the picture), seconds, skipped.
 
     Raises
     ------
     InputError
-        If a light or camera is not in the dome, the environment cannot be read, the subject does not consent to
-        exports, or subsurface transport is requested and the model has no translucency.
+        If a light or camera is not in the dome, the environment cannot be read, the
+        subject does not consent to exports, or subsurface transport is requested and
+        the model has no translucency.
     """
-    where: dict[str, Any] = {"lights": lights, "environment": environment, "camera": camera}
-    options: dict[str, Any] = {"scale": scale, "spacing": spacing, "error": error, "terms": tuple(terms)}
+    where: dict[str, Any] = {
+        "lights": lights,
+        "environment": environment,
+        "camera": camera,
+    }
+    options: dict[str, Any] = {
+        "scale": scale,
+        "spacing": spacing,
+        "error": error,
+        "terms": tuple(terms),
+    }
     inputs = render_inputs(model, **where, **options, subsurface=subsurface)
     quality = Quality(samples, error, subsurface, tuple(terms), tree_opening(error)[0])
     found = render_monte_carlo(
@@ -125,7 +147,11 @@ def render(
     return xr.Dataset(
         {
             "radiance": ((*space, "channel"), found.radiance, attrs),
-            "radiance_variance": ((*space, "channel"), found.variance, {"units": f"{UNITS}2"}),
+            "radiance_variance": (
+                (*space, "channel"),
+                found.variance,
+                {"units": f"{UNITS}2"},
+            ),
             "coverage": (space, found.coverage, {"units": "1"}),
         },
         coords={"channel": ["R", "G", "B"]},
@@ -151,10 +177,16 @@ def render_inputs(
     error: float | None = None,
     terms: tuple[str, ...] = ("diffuse", "surface"),
 ) -> RenderInputs:
-    """Surface, camera and lights of a picture, without the parts that it does not need for this relative error."""
+    """Surface, camera and lights of a picture, without the parts that it does not need
+    for this relative error.
+    """
     honour_consent(model.attrs, "export")
     dome = model["dome"].to_dataset().load()
-    surroundings = environment if isinstance(environment, Environment | None) else Environment.read(environment)
+    surroundings = (
+        environment
+        if isinstance(environment, Environment | None)
+        else Environment.read(environment)
+    )
     names: dict[str, Any] = {}
     if isinstance(lights, Lights):
         lamps, names["lights"] = lights, [f"{len(lights)} given lights"]
@@ -167,7 +199,9 @@ def render_inputs(
     else:
         seen_by, names["camera"] = chosen_camera(dome, camera)
     names["environment"] = (
-        "" if surroundings is None else str(environment if isinstance(environment, str | Path) else "given")
+        ""
+        if surroundings is None
+        else str(environment if isinstance(environment, str | Path) else "given")
     )
     surface = from_model(model, fill=True)
     if subsurface:
@@ -179,8 +213,19 @@ def render_inputs(
         surface = subdivide_surface(surface, spacing, shown)
         scene = RayScene(surface.vertices, surface.faces)
     given = Lighting(lamps if len(lamps) else None, surroundings)
-    plan = plan_scene(surface, sized, given, scene, subsurface=subsurface, error=error, terms=terms)
-    return RenderInputs(plan.surface, sized, plan.lighting, scene, names, plan.pixels, given, plan.omissions)
+    plan = plan_scene(
+        surface, sized, given, scene, subsurface=subsurface, error=error, terms=terms
+    )
+    return RenderInputs(
+        plan.surface,
+        sized,
+        plan.lighting,
+        scene,
+        names,
+        plan.pixels,
+        given,
+        plan.omissions,
+    )
 
 
 def render_picture(
@@ -191,18 +236,21 @@ def render_picture(
     explain: bool = False,
     **options: Any,
 ) -> dict[str, Any]:
-    """Render a model and write it as linear EXR or tone-mapped PNG, depending on the suffix of `out`.
+    """Render a model and write it as linear EXR or tone-mapped PNG, depending on the
+    suffix of `out`.
 
     Parameters
     ----------
     model
         Version of kind "model" or "edit".
     out
-        Picture to write. An EXR has the channels R, G, B, A (coverage) and variance.R, variance.G, variance.B.
+        Picture to write. An EXR has the channels R, G, B, A (coverage) and variance.R,
+        variance.G, variance.B.
     exposure
-        Factor on the radiance of a PNG. "fixed" shows a white matte surface, which stands in the place of the face and
-        faces the camera, as display white, so that pictures under the same light are comparable. "auto" shows the
-        brightest skin as display white.
+        Factor on the radiance of a PNG. "fixed" shows a white matte surface, which
+        stands in the place of the face and faces the camera, as display white, so that
+        pictures under the same light are comparable. "auto" shows the brightest skin as
+        display white.
     explain
         Only plan the picture and write nothing.
     **options
@@ -211,23 +259,40 @@ def render_picture(
     Returns
     -------
     dict
-        path, camera, lights, environment and skipped; with `explain` kept, which lists what is computed because
-        skipping it does not pay, and otherwise samples, relative_error, seconds, and for a PNG exposure.
+        path, camera, lights, environment and skipped; with `explain` kept, which lists
+        what is computed because skipping it does not pay, and otherwise samples,
+        relative_error, seconds, and for a PNG exposure.
     """
     if out.suffix not in (".exr", ".png"):
         rule = "the name of a picture must end in .exr or .png"
-        raise InputError(Fault(str(out), rule, out.suffix or "no suffix", "change the name"))
+        raise InputError(
+            Fault(str(out), rule, out.suffix or "no suffix", "change the name")
+        )
     keys = ("lights", "environment", "camera")
-    where = {"lights": (), "environment": None, "camera": None} | {k: options[k] for k in keys if k in options}
+    where = {"lights": (), "environment": None, "camera": None} | {
+        k: options[k] for k in keys if k in options
+    }
     subsurface = bool(options.get("subsurface", False))
     scale = float(options.get("scale", 1.0))
     if explain:
-        how = {key: options[key] for key in ("spacing", "error", "terms") if key in options}
-        inputs = render_inputs(model, **where, subsurface=subsurface, scale=scale, **how)
-        return {"path": str(out)} | inputs.names | {"skipped": [str(one) for one in inputs.omissions], "kept": KEPT}
+        how = {
+            key: options[key] for key in ("spacing", "error", "terms") if key in options
+        }
+        inputs = render_inputs(
+            model, **where, subsurface=subsurface, scale=scale, **how
+        )
+        return (
+            {"path": str(out)}
+            | inputs.names
+            | {"skipped": [str(one) for one in inputs.omissions], "kept": KEPT}
+        )
     seen = render(model, **options)
-    summary = {"path": str(out)} | {key: seen.attrs[key] for key in ("camera", "lights", "environment", "skipped")}
-    summary |= {key: seen.attrs[key] for key in ("samples", "relative_error", "seconds")}
+    summary = {"path": str(out)} | {
+        key: seen.attrs[key] for key in ("camera", "lights", "environment", "skipped")
+    }
+    summary |= {
+        key: seen.attrs[key] for key in ("samples", "relative_error", "seconds")
+    }
     radiance = seen["radiance"].values
     if out.suffix == ".exr":
         _write_exr(out, seen)
@@ -242,10 +307,12 @@ def render_picture(
 
 
 def fixed_exposure(lighting: Lighting, camera: Camera) -> float:
-    """Exposure at which a white matte surface at the origin that faces the camera is shown as display white.
+    """Exposure at which a white matte surface at the origin that faces the camera is
+    shown as display white.
 
-    It depends on the light and the camera only. The irradiance of this surface is taken to be at least a fifth of its
-    mean over all orientations, which counts if the light comes from behind.
+    It depends on the light and the camera only. The irradiance of this surface is taken
+    to be at least a fifth of its mean over all orientations, which counts if the light
+    comes from behind.
     """
     normal = camera.centre / np.linalg.norm(camera.centre)
     facing = 0.0
@@ -253,9 +320,17 @@ def fixed_exposure(lighting: Lighting, camera: Camera) -> float:
     if lighting.lights is not None:
         lights = lighting.lights
         square = np.square(lights.position).sum(axis=1)
-        along = np.maximum(np.einsum("lc,lc->l", -lights.position, lights.axis) / np.sqrt(square), 0) ** lights.falloff
+        along = (
+            np.maximum(
+                np.einsum("lc,lc->l", -lights.position, lights.axis) / np.sqrt(square),
+                0,
+            )
+            ** lights.falloff
+        )
         power = lights.intensity.mean(axis=1) * along / square
-        facing += float((power * np.maximum(lights.position @ normal, 0) / np.sqrt(square)).sum())
+        facing += float(
+            (power * np.maximum(lights.position @ normal, 0) / np.sqrt(square)).sum()
+        )
         mean += float(power.sum()) / 4
     if lighting.environment is not None:
         k = np.arange(DIRECTIONS) + 0.5
@@ -278,5 +353,7 @@ def _write_exr(path: Path, seen: xr.Dataset) -> None:
     planes["A"] = seen["coverage"].values
     keys = ("camera", "samples", "relative_error")
     about = {f"skindb.{key}": str(seen.attrs[key]) for key in keys}
-    about |= {"skindb.units": "R, G, B: radiance, linear Rec. 709; variance: of their means; A: coverage"}
+    about |= {
+        "skindb.units": "R, G, B: radiance, linear Rec. 709; variance: of their means; A: coverage"
+    }
     write_exr(path, planes, attributes=about)

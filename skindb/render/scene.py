@@ -16,7 +16,14 @@ from skindb.schema import FitStatus, check
 from skindb.schema.brdf import kernel_tables
 
 Float = NDArray[np.floating[Any]]
-NEEDED = ("surfel_position", "shading_normal", "diffuse_reflectance", "basis_weight", "dipole_s", "fit_status")
+NEEDED = (
+    "surfel_position",
+    "shading_normal",
+    "diffuse_reflectance",
+    "basis_weight",
+    "dipole_s",
+    "fit_status",
+)
 
 
 @dataclass(frozen=True)
@@ -28,18 +35,26 @@ class Surface:
     normals: Float  # (v, 3) unit shading normals
     diffuse: Float  # (v, 3) diffuse reflectance R_d
     weights: Float  # (v, k) weights of the tables
-    tables: NDArray[np.float32]  # (nh, nd, np, k) sr^-1, uniform in sqrt(theta_h), theta_d and phi_d (period pi)
+    # (nh, nd, np, k) sr^-1, uniform in sqrt(theta_h), theta_d and phi_d (period pi)
+    tables: NDArray[np.float32]
     s: Float | None = None  # (v, 3) dipole s, for subsurface transport
     sigma_tr: Float | None = None  # (v, 3) mm^-1, for subsurface transport
     eta: float = 1.3
     disc_included: bool = (
-        False  # whether tables are convolved with the light's disc, so that only its shadow is sampled
+        # whether tables are convolved with the light's disc, so that only its shadow is
+        # sampled
+        False
     )
 
     @property
     def known(self) -> NDArray[np.bool_]:
-        """(v,) vertices with finite values; triangles with any other vertex occlude but reflect no light."""
-        finite = [np.isfinite(x).all(axis=1) for x in (self.normals, self.diffuse, self.weights)]
+        """(v,) vertices with finite values; triangles with any other vertex occlude but
+        reflect no light.
+        """
+        finite = [
+            np.isfinite(x).all(axis=1)
+            for x in (self.normals, self.diffuse, self.weights)
+        ]
         return np.asarray(np.logical_and.reduce(finite), np.bool_)
 
 
@@ -71,7 +86,9 @@ class Camera:
         height = round(self.height * factor)
         if not 1 <= width * height <= MAX_PICTURE_PIXELS:
             rule = f"a picture must have 1 to {MAX_PICTURE_PIXELS:,} pixels"
-            raise InputError(Fault("scale", rule, f"{width} x {height}", "choose a smaller scale"))
+            raise InputError(
+                Fault("scale", rule, f"{width} x {height}", "choose a smaller scale")
+            )
         K = np.diag([factor, factor, 1.0]) @ self.K
         return replace(self, K=K, width=width, height=height)
 
@@ -92,21 +109,42 @@ class Lights:
     def select(self, index: ArrayLike) -> Lights:
         """The lights at `index` (integers or booleans), in this order."""
         i = np.atleast_1d(np.asarray(index))
-        parts = (self.position, self.intensity, self.disc_radius, self.axis, self.falloff)
+        parts = (
+            self.position,
+            self.intensity,
+            self.disc_radius,
+            self.axis,
+            self.falloff,
+        )
         return Lights(*(part[i] for part in parts))
 
 
 def cameras_from_dome(dome: xr.Dataset) -> list[Camera]:
     """Cameras of a stored dome, in its order."""
-    names = ("camera_matrix", "camera_rotation", "camera_translation", "camera_distortion", "camera_size")
+    names = (
+        "camera_matrix",
+        "camera_rotation",
+        "camera_translation",
+        "camera_distortion",
+        "camera_size",
+    )
     check(dome, names, where="dome")
     K, R, t, distortion, size = (dome[name].values for name in names)
-    return [Camera(K[i], R[i], t[i], distortion[i], int(size[i, 0]), int(size[i, 1])) for i in range(len(K))]
+    return [
+        Camera(K[i], R[i], t[i], distortion[i], int(size[i, 0]), int(size[i, 1]))
+        for i in range(len(K))
+    ]
 
 
 def lights_from_dome(dome: xr.Dataset) -> Lights:
     """Lights of a stored dome, in its order."""
-    names = ("light_position", "light_intensity", "light_disc_radius", "light_axis", "light_falloff")
+    names = (
+        "light_position",
+        "light_intensity",
+        "light_disc_radius",
+        "light_axis",
+        "light_falloff",
+    )
     check(dome, names, where="dome")
     return Lights(*(dome[name].values.astype(np.float64) for name in names))
 
@@ -119,8 +157,9 @@ def from_model(model: xr.DataTree, *, fill: bool = False) -> Surface:
     model
         Version of kind "model": groups fitted, mesh and basis.
     fill
-        Whether surfels without a fit take the values of the nearest fitted one, so that pictures have no holes.
-        Otherwise their values are NaN, and they are black and not part of the coverage.
+        Whether surfels without a fit take the values of the nearest fitted one, so that
+        pictures have no holes. Otherwise their values are NaN, and they are black and
+        not part of the coverage.
 
     Returns
     -------
@@ -138,13 +177,18 @@ def from_model(model: xr.DataTree, *, fill: bool = False) -> Surface:
     known = usable_surfels(values)
     if not known.any():
         rule = "at least one surfel must be fitted for a picture"
-        raise InputError(Fault("fitted[fit_status]", rule, "none", "see the report of the fit"))
+        raise InputError(
+            Fault("fitted[fit_status]", rule, "none", "see the report of the fit")
+        )
     del values["fit_status"]
     if fill:
         nearest = _nearest(position, known)
         values = {name: value[nearest] for name, value in values.items()}
     else:
-        values = {name: np.where(known[:, None], value, np.nan) for name, value in values.items()}
+        values = {
+            name: np.where(known[:, None], value, np.nan)
+            for name, value in values.items()
+        }
     sigma_tr = values.get("sigma_tr")
     return Surface(
         vertices=position.astype(np.float64),
@@ -154,16 +198,28 @@ def from_model(model: xr.DataTree, *, fill: bool = False) -> Surface:
         weights=values["basis_weight"],
         tables=kernel_tables(basis),
         s=values["dipole_s"],
-        sigma_tr=sigma_tr if sigma_tr is not None and np.isfinite(sigma_tr).any() else None,
+        sigma_tr=sigma_tr
+        if sigma_tr is not None and np.isfinite(sigma_tr).any()
+        else None,
         eta=float(fitted["refractive_index"]),
         disc_included=float(basis["disc_angular_radius"]) > 0,
     )
 
 
 def usable_surfels(values: dict[str, NDArray[Any]]) -> NDArray[np.bool_]:
-    """(n,) whether a surfel can be rendered: it is fitted, even if doubtfully, and its values are finite."""
+    """(n,) whether a surfel can be rendered: it is fitted, even if doubtfully, and its
+    values are finite.
+    """
     status = values["fit_status"]
-    good = np.isin(status, [FitStatus.FITTED, FitStatus.DIFFUSE_CLAMPED, FitStatus.NOT_CONVERGED, FitStatus.OBSTRUCTED])
+    good = np.isin(
+        status,
+        [
+            FitStatus.FITTED,
+            FitStatus.DIFFUSE_CLAMPED,
+            FitStatus.NOT_CONVERGED,
+            FitStatus.OBSTRUCTED,
+        ],
+    )
     for name in ("shading_normal", "diffuse_reflectance", "basis_weight"):
         good &= np.isfinite(values[name]).all(axis=1)
     return good

@@ -13,13 +13,16 @@ from skindb.schema.status import MAX_CONDITION_TRUSTED, MIN_SAMPLES_TRUSTED
 
 Codes = NDArray[np.uint8]
 STATUS = {FitStatus.FITTED: TexelStatus.MEASURED} | dict.fromkeys(
-    (FitStatus.DIFFUSE_CLAMPED, FitStatus.NOT_CONVERGED, FitStatus.OBSTRUCTED), TexelStatus.DOUBTFUL_FIT
+    (FitStatus.DIFFUSE_CLAMPED, FitStatus.NOT_CONVERGED, FitStatus.OBSTRUCTED),
+    TexelStatus.DOUBTFUL_FIT,
 )
-TRUST = np.array([1.0, 0.5, 0.5, 0.5, 0.0, 0.0, 0.0], np.float32)  # confidence by `TexelStatus`
+# confidence by `TexelStatus`
+TRUST = np.array([1.0, 0.5, 0.5, 0.5, 0.0, 0.0, 0.0], np.float32)
 
 
 def surfel_texels(fitted: xr.Dataset) -> Codes:
-    """(n,) codes of `TexelStatus`, which depend on the condition and number of samples of fits if these are stored.
+    """(n,) codes of `TexelStatus`, which depend on the condition and number of samples
+    of fits if these are stored.
 
     Edited models do not store them.
     """
@@ -27,10 +30,17 @@ def surfel_texels(fitted: xr.Dataset) -> Codes:
     code = np.full(status.shape, TexelStatus.FILLED, np.uint8)
     for member, value in STATUS.items():
         code[status == member] = value
-    for name, doubt in (("fit_samples", TexelStatus.FEW_SAMPLES), ("fit_condition", TexelStatus.ILL_CONDITIONED)):
+    for name, doubt in (
+        ("fit_samples", TexelStatus.FEW_SAMPLES),
+        ("fit_condition", TexelStatus.ILL_CONDITIONED),
+    ):
         if name in fitted:
             values = fitted[name].values
-            wrong = values < MIN_SAMPLES_TRUSTED if name == "fit_samples" else values > MAX_CONDITION_TRUSTED
+            wrong = (
+                values < MIN_SAMPLES_TRUSTED
+                if name == "fit_samples"
+                else values > MAX_CONDITION_TRUSTED
+            )
             code[wrong & (code < TexelStatus.FILLED)] = doubt
     for name in ("shading_normal", "diffuse_reflectance", "basis_weight"):
         code[~np.isfinite(fitted[name].values).all(axis=1)] = TexelStatus.FILLED
@@ -42,20 +52,29 @@ def surfel_confidence(fitted: xr.Dataset) -> NDArray[np.float32]:
     trust: NDArray[np.float32] = TRUST[surfel_texels(fitted)]
     if not trust.any():
         rule = "at least one surfel must be fitted for an export"
-        raise InputError(Fault("fitted[fit_status]", rule, "none", "see the report of the fit"))
+        raise InputError(
+            Fault("fitted[fit_status]", rule, "none", "see the report of the fit")
+        )
     return trust
 
 
 def texel_codes(
-    code: Codes, triangles: NDArray[np.integer], face: NDArray[np.int32], weight: NDArray[np.float32]
+    code: Codes,
+    triangles: NDArray[np.integer],
+    face: NDArray[np.int32],
+    weight: NDArray[np.float32],
 ) -> Codes:
-    """(size, size) codes of texels: on the surface that of the nearest surfel; openings are holes that it encloses."""
+    """(size, size) codes of texels: on the surface that of the nearest surfel; openings
+    are holes that it encloses.
+    """
     empty = face < 0
     piece, n = ndimage.label(empty)
     open_to_border = np.zeros(n + 1, bool)
     for border in (piece[0], piece[-1], piece[:, 0], piece[:, -1]):
         open_to_border[border] = True
-    found = np.where(open_to_border[piece], TexelStatus.OUTSIDE, TexelStatus.OPENING).astype(np.uint8)
+    found = np.where(
+        open_to_border[piece], TexelStatus.OUTSIDE, TexelStatus.OPENING
+    ).astype(np.uint8)
     on = ~empty
     found[on] = code[triangles[face[on], weight[on].argmax(axis=1)]]
     return found

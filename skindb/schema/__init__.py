@@ -4,7 +4,14 @@ from skindb.schema.check import check
 from skindb.schema.declaration import Variable
 from skindb.schema.label import dataset, label, text_labels
 from skindb.schema.notes import note_lines
-from skindb.schema.status import IDENTIFIED, Explained, FitStatus, ProbeStatus, TexelStatus, flag_attrs
+from skindb.schema.status import (
+    IDENTIFIED,
+    Explained,
+    FitStatus,
+    ProbeStatus,
+    TexelStatus,
+    flag_attrs,
+)
 from skindb.schema.variables import GROUPS, SCHEMA_VERSION, VARIABLES
 
 __all__ = [

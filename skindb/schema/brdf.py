@@ -1,4 +1,6 @@
-"""BRDF tables between the stored form, whose phi_d runs over the closed period, and that of the kernels."""
+"""BRDF tables between the stored form, whose phi_d runs over the closed period, and
+that of the kernels.
+"""
 
 from __future__ import annotations
 
@@ -14,17 +16,25 @@ ANGLES = ("theta_h", "theta_d", "phi_d")
 
 
 def stored_brdf(tables: NDArray[Any]) -> NDArray[Any]:
-    """Tables (nh, nd, np, k) of the kernels as `basis_brdf` (k, nh, nd, np + 1): the period's end repeats its begin."""
+    """Tables (nh, nd, np, k) of the kernels as `basis_brdf` (k, nh, nd, np + 1): the
+    period's end repeats its begin.
+    """
     moved = np.moveaxis(tables, -1, 0)
     return np.concatenate([moved, moved[..., :1]], axis=-1)
 
 
 def brdf_coords(grid: TableGrid) -> dict[str, NDArray[Any]]:
     """Nodes of `stored_brdf` [rad]."""
-    return {"theta_h": grid.theta_h, "theta_d": grid.theta_d, "phi_d": np.append(grid.phi_d, np.pi)}
+    return {
+        "theta_h": grid.theta_h,
+        "theta_d": grid.theta_d,
+        "phi_d": np.append(grid.phi_d, np.pi),
+    }
 
 
 def kernel_tables(basis: xr.Dataset) -> Table:
-    """Tables (nh, nd, np, k) of `basis_brdf` for the kernels, contiguous and in single precision."""
+    """Tables (nh, nd, np, k) of `basis_brdf` for the kernels, contiguous and in single
+    precision.
+    """
     closed = basis["basis_brdf"].transpose(*ANGLES, "component").values
     return np.ascontiguousarray(closed[:, :, :-1], np.float32)

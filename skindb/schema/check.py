@@ -12,7 +12,8 @@ from skindb.schema.variables import VARIABLES
 
 
 def check(ds: xr.Dataset, names: Iterable[str], *, where: str = "dataset") -> None:
-    """Raise `InputError` with every fault of the variables `names` in `ds` (absent, dims, dtype, units).
+    """Raise `InputError` with every fault of the variables `names` in `ds` (absent,
+    dims, dtype, units).
 
     Parameters
     ----------
@@ -43,9 +44,23 @@ def _faults(ds: xr.Dataset, name: str, where: str) -> list[Fault]:
     var = ds[name]
     faults = []
     if var.dims != spec.dims:
-        faults.append(Fault(place, f"dims must be {spec.dims}", str(var.dims), "transpose or rename them"))
+        faults.append(
+            Fault(
+                place,
+                f"dims must be {spec.dims}",
+                str(var.dims),
+                "transpose or rename them",
+            )
+        )
     if not np.can_cast(var.dtype, spec.dtype, "same_kind"):
-        faults.append(Fault(place, f"dtype must be {spec.dtype}", str(var.dtype), "convert it before the call"))
+        faults.append(
+            Fault(
+                place,
+                f"dtype must be {spec.dtype}",
+                str(var.dtype),
+                "convert it before the call",
+            )
+        )
     if var.attrs.get("units") != spec.units:
         faults.append(
             Fault(

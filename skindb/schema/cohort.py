@@ -21,7 +21,8 @@ from skindb.schema.status import ProbeStatus, TexelStatus
 from skindb.schema.variables import VARIABLES
 
 TAKE = "take"
-# what stands where a take has no such label; NaN for other floating-point variables, 0 for other integers
+# what stands where a take has no such label; NaN for other floating-point variables, 0
+# for other integers
 ABSENT: dict[str, int] = {
     "site_status": ProbeStatus.NOT_MEASURED,
     "texel_status": TexelStatus.OUTSIDE,
@@ -42,7 +43,8 @@ COMPARED = (
 PARAMETERS = (*COMPARED, "even_reflection")  # the last changes errors alone
 # columns of the catalogue and coordinates of cohorts that are no attributes
 COLUMN = re.compile(
-    r"take|subject|condition|session|consent|outdated|(fit|status|attribute)_.*|(.*_)?(generation|created)", re.DOTALL
+    r"take|subject|condition|session|consent|outdated|(fit|status|attribute)_.*|(.*_)?(generation|created)",
+    re.DOTALL,
 )
 
 
@@ -58,7 +60,8 @@ class Part:
     """The Dataset of one take: its layout, and the source of its values."""
 
     take: str
-    coords: Mapping[str, Any]  # subject, condition, session, attributes and parameters of the fit
+    # subject, condition, session, attributes and parameters of the fit
+    coords: Mapping[str, Any]
     variables: Sequence[str]
     sizes: Mapping[str, int]
     labels: Mapping[str, Sequence[Any]]  # dim -> labels
@@ -78,24 +81,35 @@ class Held:
     @classmethod
     def part(cls, take: str, coords: Mapping[str, Any], ds: xr.Dataset) -> Part:
         """The part of a cohort that a Dataset is."""
-        labels = {str(dim): ds[dim].values.tolist() for dim in ds.dims if dim in ds.coords}
+        labels = {
+            str(dim): ds[dim].values.tolist() for dim in ds.dims if dim in ds.coords
+        }
         sizes = {str(dim): size for dim, size in ds.sizes.items()}
-        return Part(take, coords, [str(name) for name in ds.data_vars], sizes, labels, cls(ds))
+        return Part(
+            take, coords, [str(name) for name in ds.data_vars], sizes, labels, cls(ds)
+        )
 
 
 def imitates_column(name: str) -> bool:
-    """Whether the name of an attribute is that of another column of the catalogue, or looks like it."""
+    """Whether the name of an attribute is that of another column of the catalogue, or
+    looks like it.
+    """
     plain = unicodedata.normalize("NFKC", name).casefold().strip()
     return COLUMN.fullmatch(re.sub(r"[\s-]+", "_", plain)) is not None
 
 
 def attribute_name(name: str) -> str:
-    """Name of the column of an attribute; data that were not ingested may have attributes that imitate columns."""
+    """Name of the column of an attribute; data that were not ingested may have
+    attributes that imitate columns.
+    """
     return f"attribute_{name}" if imitates_column(name) else name
 
 
-def take_coords(take: str, about: Mapping[Any, Any], fit: Mapping[Any, Any] | None = None) -> dict[str, Any]:
-    """Coordinates of one take: subject, condition, session, attributes, and the parameters of its fit.
+def take_coords(
+    take: str, about: Mapping[Any, Any], fit: Mapping[Any, Any] | None = None
+) -> dict[str, Any]:
+    """Coordinates of one take: subject, condition, session, attributes, and the
+    parameters of its fit.
 
     Parameters
     ----------
@@ -107,11 +121,21 @@ def take_coords(take: str, about: Mapping[Any, Any], fit: Mapping[Any, Any] | No
         Attributes of its model, if there is one.
     """
     coords: dict[str, Any] = {"subject": str(about.get("subject", take))}
-    coords |= {"condition": str(about.get("condition", "normal")), "session": about.get("session")}
+    coords |= {
+        "condition": str(about.get("condition", "normal")),
+        "session": about.get("session"),
+    }
     traits = {str(name): value for name, value in dict(about.get("traits", {})).items()}
-    coords |= {attribute_name(name): value for name, value in traits.items() if not isinstance(value, dict | list)}
+    coords |= {
+        attribute_name(name): value
+        for name, value in traits.items()
+        if not isinstance(value, dict | list)
+    }
     if fit is not None:
-        used = {**fit.get("parameters", {}), **{name: fit.get(name) for name in ("dictionary", "dictionary_digest")}}
+        used = {
+            **fit.get("parameters", {}),
+            **{name: fit.get(name) for name in ("dictionary", "dictionary_digest")},
+        }
         coords |= {f"fit_{name}": used.get(name) for name in PARAMETERS}
     return coords
 
@@ -139,9 +163,10 @@ def combine(
     Returns
     -------
     Dataset
-        Labels along a dim are those of all takes together. Where a take lacks a label or an element, the value is NaN,
-        for a status its member for missing values, and 0 for other integers. Coordinates along "take" are what the
-        parts name; a value that a take does not have is missing (NaN).
+        Labels along a dim are those of all takes together. Where a take lacks a label
+        or an element, the value is NaN, for a status its member for missing values, and
+        0 for other integers. Coordinates along "take" are what the parts name; a value
+        that a take does not have is missing (NaN).
 
     Raises
     ------
@@ -152,15 +177,25 @@ def combine(
     wanted = known if variables is None else list(dict.fromkeys(variables))
     if unknown := [name for name in wanted if name not in known]:
         there = f"choose from {', '.join(sorted(known)) or 'none'}"
-        raise InputError(Fault(f"variable {name}", "a cohort has it", "no take with it", there) for name in unknown)
+        raise InputError(
+            Fault(f"variable {name}", "a cohort has it", "no take with it", there)
+            for name in unknown
+        )
     labels = _all_labels(parts, wanted)
     extent = {dim: len(values) for dim, values in labels.items()}
     for part in parts:
-        for dim in {dim for name in part.variables if name in wanted for dim in VARIABLES[name].dims} - set(labels):
+        for dim in {
+            dim
+            for name in part.variables
+            if name in wanted
+            for dim in VARIABLES[name].dims
+        } - set(labels):
             extent[dim] = max(extent.get(dim, 0), int(part.sizes[dim]))
     extent |= {dim: size for dim, size in (sizes or {}).items() if dim in extent}
     arrays = {name: _lazy(name, parts, extent, labels) for name in wanted}
-    coords: dict[Hashable, Any] = {dim: text_labels(values) for dim, values in labels.items()}
+    coords: dict[Hashable, Any] = {
+        dim: text_labels(values) for dim, values in labels.items()
+    }
     coords[TAKE] = np.array([part.take for part in parts], object)
     taken = {*arrays, *coords, *extent}
     for name in dict.fromkeys(name for part in parts for name in part.coords):
@@ -170,50 +205,88 @@ def combine(
 
 
 def column(values: Sequence[Any]) -> NDArray[Any]:
-    """Values of one attribute of takes as an array of numbers, truth values or text; NaN where it is missing."""
+    """Values of one attribute of takes as an array of numbers, truth values or text;
+    NaN where it is missing.
+    """
     known = [value for value in values if value is not None]
     whole = len(known) == len(values)
     if known and all(isinstance(value, bool) for value in known):
-        return np.array(values, bool) if whole else np.array([np.nan if v is None else v for v in values], object)
-    if known and all(isinstance(value, int | float) and not isinstance(value, bool) for value in known):
-        dtype = np.int64 if whole and all(isinstance(value, int) for value in known) else np.float64
+        return (
+            np.array(values, bool)
+            if whole
+            else np.array([np.nan if v is None else v for v in values], object)
+        )
+    if known and all(
+        isinstance(value, int | float) and not isinstance(value, bool)
+        for value in known
+    ):
+        dtype = (
+            np.int64
+            if whole and all(isinstance(value, int) for value in known)
+            else np.float64
+        )
         return np.array([np.nan if value is None else value for value in values], dtype)
-    if any(isinstance(value, int | float) for value in known):  # numbers and words: each stays what it is
-        return np.array([np.nan if value is None else value for value in values], object)
-    return np.array([np.nan if value is None else str(value) for value in values], object)
+    # numbers and words: each stays what it is
+    if any(isinstance(value, int | float) for value in known):
+        return np.array(
+            [np.nan if value is None else value for value in values], object
+        )
+    return np.array(
+        [np.nan if value is None else str(value) for value in values], object
+    )
 
 
 def one_take_each(cohort: xr.Dataset) -> xr.Dataset:
     """One take of every subject, in the condition normal, along the dim "subject".
 
-    A subject who was measured only in other conditions is skipped and named in the attribute "skipped".
+    A subject who was measured only in other conditions is skipped and named in the
+    attribute "skipped".
     """
-    subjects, conditions = ([str(one) for one in cohort[name].values.tolist()] for name in ("subject", "condition"))
+    subjects, conditions = (
+        [str(one) for one in cohort[name].values.tolist()]
+        for name in ("subject", "condition")
+    )
     first: dict[str, int] = {}
     for i, (subject, condition) in enumerate(zip(subjects, conditions, strict=True)):
         if condition == "normal":
             first.setdefault(subject, i)
     others = sorted(set(subjects) - set(first))
-    said = [*cohort.attrs.get("skipped", []), *(note(who, "no take in the condition normal") for who in others)]
+    said = [
+        *cohort.attrs.get("skipped", []),
+        *(note(who, "no take in the condition normal") for who in others),
+    ]
     picked = cohort.isel({TAKE: sorted(first.values())}).swap_dims({TAKE: "subject"})
     return picked.assign_attrs(skipped=said)
 
 
 def require_takes(cohort: xr.Dataset, layout: str) -> None:
-    """Raise `InputError` if a cohort has no dimension "take", or is not of the layout "tables" or "maps"."""
+    """Raise `InputError` if a cohort has no dimension "take", or is not of the layout
+    "tables" or "maps".
+    """
     cure = f'use db.cohort("{layout}")'
     if TAKE not in cohort.dims:
         found = ", ".join(map(str, cohort.dims)) or "none"
-        raise InputError(Fault("cohort", "must have the dimension take", f"the dimensions {found}", cure))
+        raise InputError(
+            Fault(
+                "cohort",
+                "must have the dimension take",
+                f"the dimensions {found}",
+                cure,
+            )
+        )
     if layout == "maps" and "v" not in cohort.dims:
-        raise InputError(Fault("cohort", "must hold maps with the dimensions v and u", "tables", cure))
+        raise InputError(
+            Fault(
+                "cohort", "must hold maps with the dimensions v and u", "tables", cure
+            )
+        )
 
 
 def require_same_fit(cohort: xr.Dataset) -> None:
     """Raise `InputError` if takes of a cohort were fitted with different parameters.
 
-    Results of such takes differ for that reason too: a refractive index of 1.4 instead of 1.3 once made a trait vector
-    seven times as long.
+    Results of such takes differ for that reason too: a refractive index of 1.4 instead
+    of 1.3 once made a trait vector seven times as long.
     """
     faults = []
     for name in COMPARED:
@@ -222,11 +295,16 @@ def require_same_fit(cohort: xr.Dataset) -> None:
             continue
         values = cohort[coordinate].values
         groups: dict[str, list[str]] = {}
-        for take, value in zip(cohort[TAKE].values.tolist(), values.tolist(), strict=True):
-            if value is not None and value == value and value != "":  # models of earlier versions do not say all
+        for take, value in zip(
+            cohort[TAKE].values.tolist(), values.tolist(), strict=True
+        ):
+            # models of earlier versions do not say all
+            if value is not None and value == value and value != "":
                 groups.setdefault(str(value), []).append(str(take))
         if len(groups) > 1:
-            found = "; ".join(f"{value} of {few_names(takes)}" for value, takes in groups.items())
+            found = "; ".join(
+                f"{value} of {few_names(takes)}" for value, takes in groups.items()
+            )
             rule = "the takes of a study are fitted with the same parameters"
             cure = "refit them alike, or name the takes that the study is to use"
             faults.append(Fault(f"parameter {name}", rule, found, cure))
@@ -236,27 +314,41 @@ def require_same_fit(cohort: xr.Dataset) -> None:
 
 def few_names(takes: Sequence[str]) -> str:
     """Names for a message: the first three, and how many more there are."""
-    return ", ".join(takes[:3]) + (f" and {len(takes) - 3} more" if len(takes) > 3 else "")
+    return ", ".join(takes[:3]) + (
+        f" and {len(takes) - 3} more" if len(takes) > 3 else ""
+    )
 
 
 def _all_labels(parts: Sequence[Part], wanted: Sequence[str]) -> dict[str, list[Any]]:
     """Dim -> the labels of all takes, in the order in which they are met."""
     found: dict[str, dict[Any, None]] = {}
     for part in parts:
-        dims = {dim for name in part.variables if name in wanted for dim in VARIABLES[name].dims}
+        dims = {
+            dim
+            for name in part.variables
+            if name in wanted
+            for dim in VARIABLES[name].dims
+        }
         for dim in sorted(dims & part.labels.keys()):
             found.setdefault(dim, {}).update(dict.fromkeys(part.labels[dim]))
     return {dim: list(values) for dim, values in found.items()}
 
 
 def _lazy(
-    name: str, parts: Sequence[Part], extent: Mapping[str, int], labels: Mapping[str, Sequence[Any]]
+    name: str,
+    parts: Sequence[Part],
+    extent: Mapping[str, int],
+    labels: Mapping[str, Sequence[Any]],
 ) -> xr.Variable:
     """A variable of every take, a block for each, whose task carries its own source alone."""
     spec = VARIABLES[name]
     shape = tuple(extent[dim] for dim in spec.dims)
     whole = _absent(name, ())
-    places = {dim: {value: i for i, value in enumerate(labels[dim])} for dim in spec.dims if dim in labels}
+    places = {
+        dim: {value: i for i, value in enumerate(labels[dim])}
+        for dim in spec.dims
+        if dim in labels
+    }
     data = da.map_blocks(  # type: ignore[no-untyped-call]
         _block,
         _one_each([part.source if name in part.variables else None for part in parts]),
@@ -283,7 +375,11 @@ def _one_each(sources: Sequence[Source | None]) -> da.Array:
 
 
 def _block(
-    source: NDArray[Any], *, variable: str, shape: tuple[int, ...], places: Mapping[str, Mapping[Any, int]]
+    source: NDArray[Any],
+    *,
+    variable: str,
+    shape: tuple[int, ...],
+    places: Mapping[str, Mapping[Any, int]],
 ) -> NDArray[Any]:
     """Values (1, ...) of one take in the layout of the cohort."""
     out = _absent(variable, shape)
@@ -292,7 +388,9 @@ def _block(
         where: list[Any] = []
         for dim, size in zip(found.dims, shape, strict=True):
             if dim in places and dim in found.coords:
-                where.append([places[str(dim)][value] for value in found[dim].values.tolist()])
+                where.append(
+                    [places[str(dim)][value] for value in found[dim].values.tolist()]
+                )
             else:
                 where.append(range(min(found.sizes[dim], size)))
         inside = found.values[tuple(slice(len(one)) for one in where)]

@@ -24,10 +24,16 @@ def require_consent(attrs: Mapping[Any, Any], scope: str) -> None:
     who = str(attrs.get("take", attrs.get("subject", "the subject")))
     found = f"only {', '.join(given)}" if given else "no scope at all"
     cure = "ask the subject, then record the answer with skindb consent"
-    raise InputError(Fault(f"{who}: consent_scope", f"this step needs the scope {scope!r}", found, cure))
+    raise InputError(
+        Fault(
+            f"{who}: consent_scope", f"this step needs the scope {scope!r}", found, cure
+        )
+    )
 
 
 def honour_consent(attrs: Mapping[Any, Any], scope: str) -> None:
-    """As `require_consent` for data that carry a consent; data without one belong to nobody or were checked before."""
+    """As `require_consent` for data that carry a consent; data without one belong to
+    nobody or were checked before.
+    """
     if "consent_scope" in attrs:
         require_consent(attrs, scope)

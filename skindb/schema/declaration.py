@@ -19,6 +19,8 @@ class Variable:
     source: str = "skindb"
 
 
-def declare(name: str, dims: str, dtype: str, units: str, doc: str, source: str = "skindb") -> Variable:
+def declare(
+    name: str, dims: str, dtype: str, units: str, doc: str, source: str = "skindb"
+) -> Variable:
     """A declaration whose dims are given in one text."""
     return Variable(name, tuple(dims.split()), dtype, units, doc, source)

@@ -8,7 +8,13 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from skindb.schema.status import Explained, FitStatus, ProbeStatus, TexelStatus, flag_attrs
+from skindb.schema.status import (
+    Explained,
+    FitStatus,
+    ProbeStatus,
+    TexelStatus,
+    flag_attrs,
+)
 from skindb.schema.variables import VARIABLES
 
 # variable -> the enumeration its values are of
@@ -20,9 +26,15 @@ STATUSES: dict[str, type[Explained]] = {
 
 
 def label(name: str, data: Any) -> xr.Variable:
-    """The variable `name` around `data` (numpy or dask); dims, dtype, units and description are the schema's."""
+    """The variable `name` around `data` (numpy or dask); dims, dtype, units and
+    description are the schema's.
+    """
     spec = VARIABLES[name]
-    attrs: dict[str, object] = {"units": spec.units, "long_name": spec.doc, "source": spec.source}
+    attrs: dict[str, object] = {
+        "units": spec.units,
+        "long_name": spec.doc,
+        "source": spec.source,
+    }
     if name in STATUSES:
         attrs |= flag_attrs(STATUSES[name])
     array = data if hasattr(data, "dask") else np.asarray(data)
@@ -30,11 +42,20 @@ def label(name: str, data: Any) -> xr.Variable:
 
 
 def dataset(
-    variables: Mapping[str, Any], *, coords: Mapping[str, Any] | None = None, attrs: Mapping[str, Any] | None = None
+    variables: Mapping[str, Any],
+    *,
+    coords: Mapping[str, Any] | None = None,
+    attrs: Mapping[str, Any] | None = None,
 ) -> xr.Dataset:
-    """A Dataset of schema variables; `coords` maps a dim to its labels (strings become variable-length text)."""
+    """A Dataset of schema variables; `coords` maps a dim to its labels (strings become
+    variable-length text).
+    """
     index = {dim: text_labels(values) for dim, values in (coords or {}).items()}
-    return xr.Dataset({name: label(name, data) for name, data in variables.items()}, index, dict(attrs or {}))
+    return xr.Dataset(
+        {name: label(name, data) for name, data in variables.items()},
+        index,
+        dict(attrs or {}),
+    )
 
 
 def text_labels(values: Any) -> np.ndarray[Any, Any]:

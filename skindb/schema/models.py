@@ -1,4 +1,6 @@
-"""Variables of a version of kind "model": the fit, its quality, its basis, translucency, and data for cohorts."""
+"""Variables of a version of kind "model": the fit, its quality, its basis,
+translucency, and data for cohorts.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,12 @@ MISFIT = "median absolute residual in units of the noise scale of each surfel"
 MODELS: dict[str, tuple[Variable, ...]] = {
     "fitted": (
         declare(
-            "shading_normal", "surfel xyz", "float32", "1", "unit normal from the reflectance", f"{PAPER}, section 6"
+            "shading_normal",
+            "surfel xyz",
+            "float32",
+            "1",
+            "unit normal from the reflectance",
+            f"{PAPER}, section 6",
         ),
         declare(
             "normal_disagreement",
@@ -23,17 +30,37 @@ MODELS: dict[str, tuple[Variable, ...]] = {
             "surfel",
             "float32",
             "degree",
-            "standard error of shading_normal (RMS angle): noise of the samples and error of the scan's prior",
+            (
+                "standard error of shading_normal (RMS angle): noise of the samples "
+                "and error of the scan's prior"
+            ),
         ),
         declare(
             "normal_total_error",
             "surfel",
             "float32",
             "degree",
-            "standard error of shading_normal with the error of the model, as captures with known truth show it",
+            (
+                "standard error of shading_normal with the error of the model, as "
+                "captures with known truth show it"
+            ),
         ),
-        declare("refractive_index", "", "float64", "1", "refractive index eta of the fit", f"{PAPER}, eq. 2"),
-        declare("diffuse_reflectance", "surfel channel", "float32", "1", "diffuse albedo R_d", f"{PAPER}, eq. 6"),
+        declare(
+            "refractive_index",
+            "",
+            "float64",
+            "1",
+            "refractive index eta of the fit",
+            f"{PAPER}, eq. 2",
+        ),
+        declare(
+            "diffuse_reflectance",
+            "surfel channel",
+            "float32",
+            "1",
+            "diffuse albedo R_d",
+            f"{PAPER}, eq. 6",
+        ),
         declare(
             "diffuse_reflectance_error",
             "surfel channel",
@@ -46,14 +73,20 @@ MODELS: dict[str, tuple[Variable, ...]] = {
             "surfel channel",
             "float32",
             "1",
-            "standard error of R_d with errors of lights, cameras, normal and model, and even_reflection_limit / 1.96",
+            (
+                "standard error of R_d with errors of lights, cameras, normal and "
+                "model, and even_reflection_limit / 1.96"
+            ),
         ),
         declare(
             "even_reflection_limit",
             "",
             "float64",
             "1",
-            "R_d of the take may be too high by up to this (95 %): the surface reflects it evenly, without colour",
+            (
+                "R_d of the take may be too high by up to this (95 %): the surface "
+                "reflects it evenly, without colour"
+            ),
             "prior: surface reflection of skin of 4 to 7 %, Anderson and Parrish 1981",
         ),
         declare(
@@ -69,7 +102,10 @@ MODELS: dict[str, tuple[Variable, ...]] = {
             "surfel dictionary",
             "float32",
             "1",
-            "non-negative weights of the BRDFs of the dictionary; not unique: compare BRDFs, not weights",
+            (
+                "non-negative weights of the BRDFs of the dictionary; not unique: "
+                "compare BRDFs, not weights"
+            ),
             f"{PAPER}, eq. 8",
         ),
         declare(
@@ -85,7 +121,10 @@ MODELS: dict[str, tuple[Variable, ...]] = {
             "surfel component",
             "float32",
             "1",
-            "standard error of weights above 0: noise of the samples, errors of R_d and normal; NaN at the bound 0",
+            (
+                "standard error of weights above 0: noise of the samples, errors of "
+                "R_d and normal; NaN at the bound 0"
+            ),
         ),
         declare(
             "surface_reflectance",
@@ -110,7 +149,13 @@ MODELS: dict[str, tuple[Variable, ...]] = {
             f"{PAPER}, eq. 9",
         ),
         declare("fit_status", "surfel", "uint8", "1", "outcome of the fit"),
-        declare("fit_residual", "surfel", "float32", "1", "relative RMS residual of the fit by the reduced basis"),
+        declare(
+            "fit_residual",
+            "surfel",
+            "float32",
+            "1",
+            "relative RMS residual of the fit by the reduced basis",
+        ),
         declare(
             "fit_residual_perceptual",
             "surfel",
@@ -119,7 +164,11 @@ MODELS: dict[str, tuple[Variable, ...]] = {
             "relative RMS residual of the fit by the reduced basis in cube-root space",
         ),
         declare(
-            "dictionary_residual", "surfel", "float32", "1", "relative RMS residual of the fit by the whole dictionary"
+            "dictionary_residual",
+            "surfel",
+            "float32",
+            "1",
+            "relative RMS residual of the fit by the whole dictionary",
         ),
         declare(
             "dictionary_residual_perceptual",
@@ -128,14 +177,29 @@ MODELS: dict[str, tuple[Variable, ...]] = {
             "1",
             "relative RMS residual of the fit by the whole dictionary in cube-root space",
         ),
-        declare("fit_samples", "surfel", "int32", "1", "samples used by the fit of the dictionary"),
-        declare("fit_iterations", "surfel", "int32", "1", "steps of the active set in the fit of the dictionary"),
+        declare(
+            "fit_samples",
+            "surfel",
+            "int32",
+            "1",
+            "samples used by the fit of the dictionary",
+        ),
+        declare(
+            "fit_iterations",
+            "surfel",
+            "int32",
+            "1",
+            "steps of the active set in the fit of the dictionary",
+        ),
         declare(
             "fit_condition",
             "surfel",
             "float32",
             "1",
-            "squared ratio of the extreme pivots of the active BRDFs: a lower bound of their condition number",
+            (
+                "squared ratio of the extreme pivots of the active BRDFs: a lower "
+                "bound of their condition number"
+            ),
         ),
         declare(
             "kkt_residual",
@@ -186,36 +250,92 @@ MODELS: dict[str, tuple[Variable, ...]] = {
             "light",
             "float64",
             "1",
-            "how much brighter the light is than its intensity says; samples were divided by it (fit --light-gains)",
+            (
+                "how much brighter the light is than its intensity says; samples were "
+                "divided by it (fit --light-gains)"
+            ),
         ),
     ),
     "held_out": (
-        declare("light_held_out", "light", "int8", "1", "1 for lights that were held out of the fit, else 0"),
-        declare("camera_held_out", "camera", "int8", "1", "1 for cameras that were held out of the fit, else 0"),
+        declare(
+            "light_held_out",
+            "light",
+            "int8",
+            "1",
+            "1 for lights that were held out of the fit, else 0",
+        ),
+        declare(
+            "camera_held_out",
+            "camera",
+            "int8",
+            "1",
+            "1 for cameras that were held out of the fit, else 0",
+        ),
     ),
     "outliers": (
-        declare("light_outlier_fraction", "light", "float32", "1", "fraction of the light's samples that are outliers"),
-        declare("light_misfit", "light", "float32", "1", f"{MISFIT}, under a light; a moved face raises it"),
         declare(
-            "camera_outlier_fraction", "camera", "float32", "1", "fraction of the camera's samples that are outliers"
+            "light_outlier_fraction",
+            "light",
+            "float32",
+            "1",
+            "fraction of the light's samples that are outliers",
         ),
-        declare("camera_misfit", "camera", "float32", "1", f"{MISFIT}, in a camera; a displaced camera raises it"),
-        declare("frame_misfit", "light camera", "float32", "1", f"{MISFIT}, in a photograph"),
+        declare(
+            "light_misfit",
+            "light",
+            "float32",
+            "1",
+            f"{MISFIT}, under a light; a moved face raises it",
+        ),
+        declare(
+            "camera_outlier_fraction",
+            "camera",
+            "float32",
+            "1",
+            "fraction of the camera's samples that are outliers",
+        ),
+        declare(
+            "camera_misfit",
+            "camera",
+            "float32",
+            "1",
+            f"{MISFIT}, in a camera; a displaced camera raises it",
+        ),
+        declare(
+            "frame_misfit", "light camera", "float32", "1", f"{MISFIT}, in a photograph"
+        ),
     ),
     "prediction": (
-        declare("prediction_surfels", "region status", "int32", "1", "surfels of the region with this status"),
         declare(
-            "prediction_fraction", "region status", "float64", "1", "fraction of the region's surfels with this status"
+            "prediction_surfels",
+            "region status",
+            "int32",
+            "1",
+            "surfels of the region with this status",
         ),
         declare(
-            "prediction_outlier_fraction", "region status", "float64", "1", "mean over the area of outlier_fraction"
+            "prediction_fraction",
+            "region status",
+            "float64",
+            "1",
+            "fraction of the region's surfels with this status",
+        ),
+        declare(
+            "prediction_outlier_fraction",
+            "region status",
+            "float64",
+            "1",
+            "mean over the area of outlier_fraction",
         ),
         declare(
             "prediction_error",
             "region status samples space statistic",
             "float64",
             "1",
-            "median and 95 % quantile over the area of the relative RMS errors of fitted and held-out samples",
+            (
+                "median and 95 % quantile over the area of the relative RMS errors of "
+                "fitted and held-out samples"
+            ),
         ),
     ),
     "basis": (
@@ -232,7 +352,10 @@ MODELS: dict[str, tuple[Variable, ...]] = {
             "component theta_h theta_d phi_d",
             "float32",
             "sr-1",
-            "tables of the reduced basis; phi_d runs over its whole period from 0 to pi, both ends included",
+            (
+                "tables of the reduced basis; phi_d runs over its whole period from 0 "
+                "to pi, both ends included"
+            ),
             f"{PAPER}, section 7",
         ),
         declare(
@@ -252,7 +375,12 @@ MODELS: dict[str, tuple[Variable, ...]] = {
     ),
     "translucency": (
         declare(
-            "site_absorption", "site channel", "float32", "mm-1", "sigma_a of the fitted profile", f"{PAPER}, section 8"
+            "site_absorption",
+            "site channel",
+            "float32",
+            "mm-1",
+            "sigma_a of the fitted profile",
+            f"{PAPER}, section 8",
         ),
         declare(
             "site_reduced_scattering",
@@ -305,31 +433,69 @@ MODELS: dict[str, tuple[Variable, ...]] = {
             "1",
             "exponents a, b of sigma_tr^a sigma_s'^b, the product that the profile determines best",
         ),
-        declare("site_gain", "site channel", "float32", "1", "gain of the probe found by the fit; 1 where it is known"),
-        declare("site_residual", "site channel", "float32", "1", "RMS of the log residual over the fibres used"),
+        declare(
+            "site_gain",
+            "site channel",
+            "float32",
+            "1",
+            "gain of the probe found by the fit; 1 where it is known",
+        ),
+        declare(
+            "site_residual",
+            "site channel",
+            "float32",
+            "1",
+            "RMS of the log residual over the fibres used",
+        ),
         declare(
             "site_misfit",
             "site channel",
             "float32",
             "1",
-            "RMS log residual of the clearly measured fibres that the errors of fibres and model leave unexplained",
+            (
+                "RMS log residual of the clearly measured fibres that the errors of "
+                "fibres and model leave unexplained"
+            ),
         ),
         declare(
             "site_chi_squared",
             "site channel",
             "float32",
             "1",
-            "squared residuals over the errors of fibres and model, per degree of freedom; far above 1: another medium",
+            (
+                "squared residuals over the errors of fibres and model, per degree of "
+                "freedom; far above 1: another medium"
+            ),
         ),
-        declare("site_fibres_used", "site channel", "int32", "1", "fibres above the noise floor"),
+        declare(
+            "site_fibres_used",
+            "site channel",
+            "int32",
+            "1",
+            "fibres above the noise floor",
+        ),
         declare("site_status", "site channel", "uint8", "1", "outcome of the fit"),
     ),
     "sample": (
-        declare("surfel_index", "surfel", "int64", "1", "index among the surfels of the model; -1 where there is none"),
+        declare(
+            "surfel_index",
+            "surfel",
+            "int64",
+            "1",
+            "index among the surfels of the model; -1 where there is none",
+        ),
     ),
     "tables": (
-        declare("region_surfels", "region", "int64", "1", "trusted surfels of the region"),
-        declare("region_area", "region", "float64", "mm2", "area of the trusted surfels of the region"),
+        declare(
+            "region_surfels", "region", "int64", "1", "trusted surfels of the region"
+        ),
+        declare(
+            "region_area",
+            "region",
+            "float64",
+            "mm2",
+            "area of the trusted surfels of the region",
+        ),
         declare(
             "region_diffuse_reflectance",
             "region channel",
@@ -356,7 +522,10 @@ MODELS: dict[str, tuple[Variable, ...]] = {
             "region channel channel_2",
             "float64",
             "1",
-            "area-weighted covariance of R_d between channels over the trusted surfels of the region",
+            (
+                "area-weighted covariance of R_d between channels over the trusted "
+                "surfels of the region"
+            ),
         ),
         declare(
             "region_surface_reflectance",
@@ -377,7 +546,10 @@ MODELS: dict[str, tuple[Variable, ...]] = {
             "component",
             "float64",
             "1",
-            "area-weighted mean of basis_weight; each model has its own basis, so takes are not comparable",
+            (
+                "area-weighted mean of basis_weight; each model has its own basis, so "
+                "takes are not comparable"
+            ),
         ),
         declare(
             "median_error",

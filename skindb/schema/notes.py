@@ -1,4 +1,6 @@
-"""Notes on takes, such as the reason why a take was skipped; they become text only where they are printed."""
+"""Notes on takes, such as the reason why a take was skipped; they become text only
+where they are printed.
+"""
 
 from __future__ import annotations
 
@@ -20,4 +22,7 @@ def unique_notes(notes: Iterable[Note]) -> list[Note]:
 
 def note_lines(notes: Iterable[Note]) -> list[str]:
     """One line for each note."""
-    return [f"{one['take']}: {one['reason']}" if one["take"] else one["reason"] for one in notes]
+    return [
+        f"{one['take']}: {one['reason']}" if one["take"] else one["reason"]
+        for one in notes
+    ]

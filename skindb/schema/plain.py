@@ -9,7 +9,9 @@ import numpy as np
 
 
 def plain(value: Any) -> Any:
-    """JSON types only: arrays become lists, unknown numbers (NaN, infinite) null, anything else its text."""
+    """JSON types only: arrays become lists, unknown numbers (NaN, infinite) null,
+    anything else its text.
+    """
     if isinstance(value, dict):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, np.ndarray):

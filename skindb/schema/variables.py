@@ -11,4 +11,6 @@ SCHEMA_VERSION = 2
 
 # group of a version -> its variables
 GROUPS: dict[str, tuple[Variable, ...]] = CAPTURES | MODELS | STUDIES
-VARIABLES: dict[str, Variable] = {variable.name: variable for group in GROUPS.values() for variable in group}
+VARIABLES: dict[str, Variable] = {
+    variable.name: variable for group in GROUPS.values() for variable in group
+}

@@ -1,4 +1,6 @@
-"""Versions of takes: immutable zarr stores, and the log of current versions. Only this package imports zarr."""
+"""Versions of takes: immutable zarr stores, and the log of current versions. Only this
+package imports zarr.
+"""
 
 from skindb.store.archive import State, backup_states
 from skindb.store.audit import AuditEntry

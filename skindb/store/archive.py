@@ -1,10 +1,11 @@
-"""The files of a backup: contents under their digests, states of a database, and the withdrawals that were applied.
+"""The files of a backup: contents under their digests, states of a database, and the
+withdrawals that were applied.
 
 | key | content |
 |---|---|
 | `files/<2 digits>/<digest>` | a file of the database, under the SHA-256 digest of its content |
-| `states/<number>.json` | a state: digests of the records and other small files; manifests have those of versions |
-| `secret`, `withdrawn/` | as in the database; `withdrawn/backup.json` keeps commands for databases away |
+| `states/<number>.json` | a state: digests of records and small files; manifests have the others |
+| `secret`, `withdrawn/` | as in the database; `withdrawn/backup.json` keeps other commands away |
 | `leases/`, `staging/` | as in a database |
 """
 
@@ -36,7 +37,13 @@ from skindb.store.markers import (
 from skindb.store.paths import KIND, TAKE, TIME_HEX
 from skindb.store.place import Place, UnavailableError
 from skindb.store.record import DIGEST, Record, json_object, record_from_json, seal_of
-from skindb.store.requests import REQUEST_NAME, REQUESTS, Request, request_content, request_from_json
+from skindb.store.requests import (
+    REQUEST_NAME,
+    REQUESTS,
+    Request,
+    request_content,
+    request_from_json,
+)
 from skindb.store.verified import Manifest, manifest_from_json
 
 FORMAT = 1
@@ -56,10 +63,12 @@ CURE_STATE = "remove it; other states can be restored"
 THREADS = 8  # that read and write files; a server answers many requests in parallel
 T = TypeVar("T")
 R = TypeVar("R")
-Item = tuple[str, str, int | None]  # key in the database, digest and, if it is known, size in bytes
+# key in the database, digest and, if it is known, size in bytes
+Item = tuple[str, str, int | None]
 
 
-class Changed(Exception):  # noqa: N818  an event: the database or the backup was changed, and the caller starts again
+# an event: the database or the backup was changed, and the caller starts again
+class Changed(Exception):  # noqa: N818
     """A version or a subject was removed while a backup was written."""
 
 
@@ -71,7 +80,8 @@ class State:
     created: str  # ISO 8601 in UTC
     software_version: str
     versions: int
-    withdrawals: str  # seal of the withdrawals without whose subjects the state was written
+    # seal of the withdrawals without whose subjects the state was written
+    withdrawals: str
     files: dict[str, str] = field(repr=False)  # key in the database -> digest
 
     @property
@@ -82,7 +92,9 @@ class State:
     def content(self) -> bytes:
         """Content of its file."""
         body = asdict(self) | {"format": FORMAT}
-        return json.dumps(body | {"seal": seal_of(body)}, separators=(",", ":")).encode()
+        return json.dumps(
+            body | {"seal": seal_of(body)}, separators=(",", ":")
+        ).encode()
 
 
 class Archive:
@@ -99,10 +111,19 @@ class Archive:
         self.place = place
 
     def require(self) -> None:
-        """Raise an `InputError` unless there is a backup, whose withdrawals are as they were written."""
+        """Raise an `InputError` unless there is a backup, whose withdrawals are as they
+        were written.
+        """
         if self.place.file_type(f"{WITHDRAWN}/{BACKUP}") != "file":
             found = "another folder" if self.place.names() else "nothing"
-            raise InputError(Fault(self.place.name, "must be a backup", found, "give the folder of skindb backup"))
+            raise InputError(
+                Fault(
+                    self.place.name,
+                    "must be a backup",
+                    found,
+                    "give the folder of skindb backup",
+                )
+            )
         faults = marker_faults(self.place)
         if faults:
             raise InputError(faults)
@@ -112,21 +133,31 @@ class Archive:
         if require_secret(place) != require_secret(self.place):
             rule = "all states of a backup must be of the same database"
             cure = "give another folder"
-            raise InputError(Fault(self.place.name, rule, "a backup of another database", cure))
+            raise InputError(
+                Fault(self.place.name, rule, "a backup of another database", cure)
+            )
 
     def adopt(self, place: Place) -> Markers:
-        """Copy the withdrawals of a database, which must be that of the backup; returns those of the backup."""
+        """Copy the withdrawals of a database, which must be that of the backup; returns
+        those of the backup.
+        """
         self.require_of(place)
         for name in place.sizes(WITHDRAWN):
             key = f"{WITHDRAWN}/{name}"
             if ENTRY.fullmatch(name) and not self.place.file_type(key):
                 self.place.create(key, place.read_small(key))
-        self.place.sweep()  # from now on, no suspended writer adds a content of a withdrawn subject, see `markers`
+        # from now on, no suspended writer adds a content of a withdrawn subject, see
+        # `markers`
+        self.place.sweep()
         return read_markers(self.place)
 
     def numbers(self) -> list[int]:
         """Numbers of the states, ascending."""
-        return [int(match[1]) for name in self.place.children(STATES) if (match := STATE.fullmatch(name))]
+        return [
+            int(match[1])
+            for name in self.place.children(STATES)
+            if (match := STATE.fullmatch(name))
+        ]
 
     def state(self, number: int) -> State:
         """A state; `InputError` if it does not exist or is damaged."""
@@ -134,7 +165,14 @@ class Archive:
         cure = CURE_STATE
         if number not in self.numbers():
             found = f"states {', '.join(map(str, self.numbers())) or 'none'}"
-            raise InputError(Fault(self.place.name, f"state {number} must exist", found, "see skindb restore --list"))
+            raise InputError(
+                Fault(
+                    self.place.name,
+                    f"state {number} must exist",
+                    found,
+                    "see skindb restore --list",
+                )
+            )
         try:
             body = json_object(self.place.read_small(key))
             if body.pop("seal", None) != seal_of(body):
@@ -145,14 +183,26 @@ class Archive:
                 raise ValueError(f"a state of format {format_!r}")
             if body["number"] != number:
                 raise ValueError("another state")
-            if not all(STATE_KEY.fullmatch(name) and re.fullmatch(DIGEST, one) for name, one in body["files"].items()):
+            if not all(
+                STATE_KEY.fullmatch(name) and re.fullmatch(DIGEST, one)
+                for name, one in body["files"].items()
+            ):
                 raise ValueError("names that are not those of a database")
             return State(**body)
         except UnavailableError:
             raise
-        except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        except (
+            OSError,
+            ValueError,
+            TypeError,
+            KeyError,
+            AttributeError,
+            RecursionError,
+        ) as error:
             found = getattr(error, "strerror", None) or str(error)
-            raise InputError(Fault(self.place.where(key), AS_WRITTEN, found, cure)) from None
+            raise InputError(
+                Fault(self.place.where(key), AS_WRITTEN, found, cure)
+            ) from None
 
     def states(self) -> tuple[list[State], list[Fault]]:
         """All readable states, and the faults of the others."""
@@ -169,21 +219,43 @@ class Archive:
 
     def contents(self) -> set[str]:
         """Digests of all contents."""
-        return {match[1] for name in self.place.sizes(FILES) if (match := CONTENT.fullmatch(name))}
+        return {
+            match[1]
+            for name in self.place.sizes(FILES)
+            if (match := CONTENT.fullmatch(name))
+        }
 
     def read(self, item: Item) -> bytes:
         """The content of a file of the database, compared with its digest."""
         name, digest, size = item
         key = content_key(digest)
         try:
-            content = self.place.read_small(key) if size is None else self.place.read(key, 0, size)
-            found = "" if hashlib.sha256(content).hexdigest() == digest else "different content"
+            content = (
+                self.place.read_small(key)
+                if size is None
+                else self.place.read(key, 0, size)
+            )
+            found = (
+                ""
+                if hashlib.sha256(content).hexdigest() == digest
+                else "different content"
+            )
         except UnavailableError:
             raise
         except (OSError, InputError) as error:
-            found = getattr(error, "strerror", None) or "something that is not a regular file"
+            found = (
+                getattr(error, "strerror", None)
+                or "something that is not a regular file"
+            )
         if found:
-            raise InputError(Fault(self.place.where(key), AS_WRITTEN, f"{found} for {name}", CURE_CONTENT))
+            raise InputError(
+                Fault(
+                    self.place.where(key),
+                    AS_WRITTEN,
+                    f"{found} for {name}",
+                    CURE_CONTENT,
+                )
+            )
         return content
 
     def put(self, content: bytes, digest: str, guard: Callable[[], None]) -> None:
@@ -192,11 +264,14 @@ class Archive:
         try:
             self.place.create(key, content, guard=guard, flush_names=False)
         except Changed:
-            self.place.remove(key)  # in a bucket, where the guard is called afterwards too
+            # in a bucket, where the guard is called afterwards too
+            self.place.remove(key)
             raise
 
     def guard(self, markers: Markers) -> Callable[[], None]:
-        """Function that raises `Changed` if a subject was withdrawn from the backup since these markers were read."""
+        """Function that raises `Changed` if a subject was withdrawn from the backup
+        since these markers were read.
+        """
 
         def check() -> None:
             if entry_numbers(self.place.sizes(WITHDRAWN)) != markers.numbers:
@@ -205,13 +280,25 @@ class Archive:
         return check
 
     def records(self, state: State, faults: list[Fault]) -> dict[str, Record]:
-        """The records of a state by their keys, ascending; faults of others are added to `faults`."""
-        items: list[Item] = [(key, one, None) for key, one in sorted(state.files.items()) if key.startswith("log/")]
-        return {key: record for (key, _, _), record in intact(self._record, items, faults)}
+        """The records of a state by their keys, ascending; faults of others are added
+        to `faults`.
+        """
+        items: list[Item] = [
+            (key, one, None)
+            for key, one in sorted(state.files.items())
+            if key.startswith("log/")
+        ]
+        return {
+            key: record for (key, _, _), record in intact(self._record, items, faults)
+        }
 
     def requests(self, state: State, faults: list[Fault]) -> list[Request]:
         """The requests of a state; faults of others are added to `faults`."""
-        items: list[Item] = [(key, one, None) for key, one in state.files.items() if key.startswith(f"{REQUESTS}/")]
+        items: list[Item] = [
+            (key, one, None)
+            for key, one in state.files.items()
+            if key.startswith(f"{REQUESTS}/")
+        ]
         return [request for _, request in intact(self._request, items, faults)]
 
     def version_items(self, record: Record) -> list[Item]:
@@ -232,7 +319,9 @@ class Archive:
             List to which faults of records and manifests are added.
         """
         records = self.records(state, faults)
-        fresh = [record for key, record in records.items() if state.files[key] not in known]
+        fresh = [
+            record for key, record in records.items() if state.files[key] not in known
+        ]
         known |= {state.files[key] for key in records}
         items: list[Item] = [(key, digest, None) for key, digest in state.files.items()]
         for _, those in intact(self.version_items, fresh, faults):
@@ -245,8 +334,8 @@ class Archive:
         Parameters
         ----------
         contents
-            Contents that were there before the states were read. Later ones may be those of another run that has taken
-            over the lease of this one.
+            Contents that were there before the states were read. Later ones may be
+            those of another run that has taken over the lease of this one.
         keep
             Contents that are needed.
         lease
@@ -268,13 +357,23 @@ class Archive:
         content = self.read(item)
         try:
             return parse(content)
-        except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        except (
+            ValueError,
+            TypeError,
+            KeyError,
+            AttributeError,
+            RecursionError,
+        ) as error:
             where = self.place.where(content_key(item[1]))
-            raise InputError(Fault(where, AS_WRITTEN, f"{error}, for {item[0]}", CURE_CONTENT)) from None
+            raise InputError(
+                Fault(where, AS_WRITTEN, f"{error}, for {item[0]}", CURE_CONTENT)
+            ) from None
 
 
 def backup_states(url: str) -> list[State]:
-    """The states of the backup at a folder or bucket, oldest first; `InputError` if one is damaged."""
+    """The states of the backup at a folder or bucket, oldest first; `InputError` if one
+    is damaged.
+    """
     archive = Archive(place_at(url))
     archive.require()
     states, faults = archive.states()
@@ -284,13 +383,17 @@ def backup_states(url: str) -> list[State]:
 
 
 def require_apart(backup: Place, database: Place) -> None:
-    """Raise an `InputError` if a backup is inside its database, or the database inside the backup."""
+    """Raise an `InputError` if a backup is inside its database, or the database inside
+    the backup.
+    """
     inner = backup.url(FILES).removesuffix(FILES)
     outer = database.url(FILES).removesuffix(FILES)
     if inner.startswith(outer) or outer.startswith(inner):
         rule = "a backup must not be inside its database, nor the database inside it"
         cure = "give another folder"
-        raise InputError(Fault(backup.name, rule, f"the database {database.name}", cure))
+        raise InputError(
+            Fault(backup.name, rule, f"the database {database.name}", cure)
+        )
 
 
 def content_key(digest: str) -> str:
@@ -300,8 +403,14 @@ def content_key(digest: str) -> str:
 
 def items_of(record: Record, manifest: Manifest) -> list[Item]:
     """The files of a version that its manifest lists, and its tables."""
-    items: list[Item] = [(f"{record.path}/{name}", digest, size) for name, (digest, size) in manifest.items()]
-    return [*items, *([(record.beside("tables"), record.tables, None)] if record.tables else [])]
+    items: list[Item] = [
+        (f"{record.path}/{name}", digest, size)
+        for name, (digest, size) in manifest.items()
+    ]
+    return [
+        *items,
+        *([(record.beside("tables"), record.tables, None)] if record.tables else []),
+    ]
 
 
 def seal_of_withdrawals(markers: Markers) -> str:
@@ -310,7 +419,10 @@ def seal_of_withdrawals(markers: Markers) -> str:
 
 
 def surviving(
-    records: Mapping[str, Record], requests: Iterable[Request], tombstones: Iterable[str], markers: Markers
+    records: Mapping[str, Record],
+    requests: Iterable[Request],
+    tombstones: Iterable[str],
+    markers: Markers,
 ) -> tuple[dict[str, Record], dict[str, bytes]]:
     """Records without those of withdrawn subjects, and the requests and tombstones to be written.
 
@@ -324,22 +436,43 @@ def surviving(
         Withdrawals.
     """
     removed = {*tombstones}
-    present = {key: record for key, record in records.items() if tombstone_of(record.seal) not in removed}
+    present = {
+        key: record
+        for key, record in records.items()
+        if tombstone_of(record.seal) not in removed
+    }
     remainder = remainder_of(present.values(), requests, markers)
     seals = {record.seal for record in remainder.records}
-    additions = {request.key: request_content(request) for request in remainder.requests}
-    additions |= {tombstone_of(record.seal): tombstone_content(record) for record in remainder.removed}
-    return {key: record for key, record in present.items() if record.seal in seals}, additions
+    additions = {
+        request.key: request_content(request) for request in remainder.requests
+    }
+    additions |= {
+        tombstone_of(record.seal): tombstone_content(record)
+        for record in remainder.removed
+    }
+    return {
+        key: record for key, record in present.items() if record.seal in seals
+    }, additions
 
 
-def other_files(files: Mapping[str, str], records: Mapping[str, Record]) -> dict[str, str]:
+def other_files(
+    files: Mapping[str, str], records: Mapping[str, Record]
+) -> dict[str, str]:
     """Those of the small files of a state that belong to these records or to no version."""
     names = {record.beside("names") for record in records.values()}
-    return {key: digest for key, digest in files.items() if key in names or key.startswith(("audit/", "tombstones/"))}
+    return {
+        key: digest
+        for key, digest in files.items()
+        if key in names or key.startswith(("audit/", "tombstones/"))
+    }
 
 
-def intact(function: Callable[[T], R], values: Iterable[T], faults: list[Fault]) -> Iterator[tuple[T, R]]:
-    """Values and the results of a function that waits for files; where it fails, its faults are added to `faults`."""
+def intact(
+    function: Callable[[T], R], values: Iterable[T], faults: list[Fault]
+) -> Iterator[tuple[T, R]]:
+    """Values and the results of a function that waits for files; where it fails, its
+    faults are added to `faults`.
+    """
 
     def attempt(value: T) -> R | InputError:
         try:

@@ -1,9 +1,11 @@
 """The audit log: an entry for each action that changes or discloses data of subjects.
 
-`audit/<block>/<number>.json` is an entry, a sealed JSON record. It names the seal of the entry before it, and its own
-seal is keyed with the random bytes in `secret`, so that it belongs to this database and number. Subjects are named by
-their keyed hashes. An entry is created only if its number is free: of two writers with the same number one starts again
-with the next number. Blocks have a limited size, so that the last number is found by listing one of them.
+`audit/<block>/<number>.json` is an entry, a sealed JSON record. It names the seal of
+the entry before it, and its own seal is keyed with the random bytes in `secret`, so
+that it belongs to this database and number. Subjects are named by their keyed hashes.
+An entry is created only if its number is free: of two writers with the same number one
+starts again with the next number. Blocks have a limited size, so that the last number
+is found by listing one of them.
 """
 
 from __future__ import annotations
@@ -30,7 +32,8 @@ FORMAT = 1
 BLOCK = 1_000  # numbers in a folder
 BLOCK_NAME = r"[0-9]{6}"
 ENTRY_NAME = r"[0-9]{9}\.json"
-MAX_ATTEMPTS = 1_000  # of a writer; each failed attempt means that another writer has created an entry
+# of a writer; each failed attempt means that another writer has created an entry
+MAX_ATTEMPTS = 1_000
 THREADS = 8  # that read entries
 RULE = "an entry of the audit log must be as it was created"
 RESTORE = "restore it from a backup"
@@ -49,7 +52,9 @@ class AuditEntry:
     counts: dict[str, int]
     parameters: dict[str, Any]  # without personal data
     software_version: str
-    previous: str  # seal of the entry before this one; empty if there was none, or if it could not be read
+    # seal of the entry before this one; empty if there was none, or if it could not be
+    # read
+    previous: str
     seal: str = field(compare=False)
 
 
@@ -89,7 +94,8 @@ def append_entry(
     actor
         Who acts.
     takes, subjects
-        Whose data the action changes or discloses; only the hashes of the subjects and the number of takes are stored.
+        Whose data the action changes or discloses; only the hashes of the subjects and
+        the number of takes are stored.
     counts, parameters
         Further numbers, and options, without personal data.
 
@@ -115,7 +121,10 @@ def append_entry(
     }
     for _ in range(MAX_ATTEMPTS):
         last = _last_number(place)
-        body = about | {"number": last + 1, "previous": _seal_of_entry(place, secret, last)}
+        body = about | {
+            "number": last + 1,
+            "previous": _seal_of_entry(place, secret, last),
+        }
         key = entry_key(last + 1)
         content = json.dumps(body | {"seal": keyed_seal(secret, key, body)}).encode()
         if place.create(key, content):
@@ -136,13 +145,16 @@ def read_audit(
     subject
         Pseudonym, for the entries that concern this subject only.
     where
-        Condition, see `skindb.store.condition`, on number, when, actor, action and subjects, which is their number.
+        Condition, see `skindb.store.condition`, on number, when, actor, action and
+        subjects, which is their number.
     """
     file_type = place.file_type(AUDIT)
     if not file_type:
         return [], []
     if file_type != "folder":
-        return [], [Fault(place.where(AUDIT), "must be a folder", f"a {file_type}", RESTORE)]
+        return [], [
+            Fault(place.where(AUDIT), "must be a folder", f"a {file_type}", RESTORE)
+        ]
     numbers, faults = _listed(place)
     try:
         secret = require_secret(place)
@@ -164,7 +176,11 @@ def read_audit(
         name = keyed_hash(secret, subject)
         selected = [entry for entry in selected if name in entry.subjects]
     if where is not None:
-        selected = [entry for entry, is_true in zip(selected, _truth(where, selected), strict=True) if is_true]
+        selected = [
+            entry
+            for entry, is_true in zip(selected, _truth(where, selected), strict=True)
+            if is_true
+        ]
     return selected, faults
 
 
@@ -174,11 +190,17 @@ def entry_key(number: int) -> str:
 
 
 def _last_number(place: Place) -> int:
-    """Number of the last entry, from a list of the blocks and one of the last block; 0 if there is none."""
+    """Number of the last entry, from a list of the blocks and one of the last block; 0
+    if there is none.
+    """
     for block in reversed(place.children(AUDIT, links=True)):
         if not re.fullmatch(BLOCK_NAME, block):
             continue
-        names = [name for name in place.children(f"{AUDIT}/{block}", links=True) if re.fullmatch(ENTRY_NAME, name)]
+        names = [
+            name
+            for name in place.children(f"{AUDIT}/{block}", links=True)
+            if re.fullmatch(ENTRY_NAME, name)
+        ]
         if names:
             return int(names[-1].removesuffix(".json"))
     return 0
@@ -200,7 +222,9 @@ def _listed(place: Place) -> tuple[list[int], list[Fault]]:
             faults.append(_unknown_fault(place, folder))
             continue
         for name in place.children(folder, links=True):
-            number = int(name.removesuffix(".json")) if re.fullmatch(ENTRY_NAME, name) else 0
+            number = (
+                int(name.removesuffix(".json")) if re.fullmatch(ENTRY_NAME, name) else 0
+            )
             if number and f"{folder}/{name}" == entry_key(number):
                 numbers.append(number)
             else:
@@ -209,7 +233,12 @@ def _listed(place: Place) -> tuple[list[int], list[Fault]]:
 
 
 def _unknown_fault(place: Place, key: str) -> Fault:
-    return Fault(place.where(key), "the audit log must contain only its entries", "an unknown name", "remove it")
+    return Fault(
+        place.where(key),
+        "the audit log must contain only its entries",
+        "an unknown name",
+        "remove it",
+    )
 
 
 def _outcome(place: Place, secret: bytes, number: int) -> AuditEntry | Fault:
@@ -228,38 +257,63 @@ def _outcome(place: Place, secret: bytes, number: int) -> AuditEntry | Fault:
     return Fault(place.where(key), RULE, found, RESTORE)
 
 
-def _entry_from_json(secret: bytes, key: str, number: int, content: bytes) -> AuditEntry:
+def _entry_from_json(
+    secret: bytes, key: str, number: int, content: bytes
+) -> AuditEntry:
     body = json_object(content)
     if body.get("number") != number:
         raise ValueError(f"the entry of number {str(body.get('number'))[:20]}")
     if not is_sealed(secret, key, body):
         raise ValueError("content that does not match its seal")
     if body.pop("format", None) != FORMAT:
-        raise ValueError("an entry of another format; if it is of a later version, update skindb")
-    if body.keys() != TYPES.keys() or not all(isinstance(body[name], kind) for name, kind in TYPES.items()):
+        raise ValueError(
+            "an entry of another format; if it is of a later version, update skindb"
+        )
+    if body.keys() != TYPES.keys() or not all(
+        isinstance(body[name], kind) for name, kind in TYPES.items()
+    ):
         raise ValueError("fields that do not match its format")
     return AuditEntry(**body)
 
 
-def _chain_faults(place: Place, numbers: list[int], entries: Mapping[int, AuditEntry]) -> Iterator[Fault]:
+def _chain_faults(
+    place: Place, numbers: list[int], entries: Mapping[int, AuditEntry]
+) -> Iterator[Fault]:
     """Faults of entries that are missing or do not follow the entry before them."""
     expected = 1
     for number in numbers:
         if number > expected:
-            missing = f"entry {expected}" if number == expected + 1 else f"entries {expected} to {number - 1}"
-            yield Fault(place.where(AUDIT), f"{missing} must exist", "no such file", RESTORE)
+            missing = (
+                f"entry {expected}"
+                if number == expected + 1
+                else f"entries {expected} to {number - 1}"
+            )
+            yield Fault(
+                place.where(AUDIT), f"{missing} must exist", "no such file", RESTORE
+            )
         expected = number + 1
         entry = entries.get(number)
         before = entries.get(number - 1)
-        if entry is not None and before is not None and entry.previous not in ("", before.seal):
+        if (
+            entry is not None
+            and before is not None
+            and entry.previous not in ("", before.seal)
+        ):
             rule = f"entry {number} must follow the entry before it"
-            yield Fault(place.where(entry_key(number)), rule, "an entry that names a different predecessor", RESTORE)
+            yield Fault(
+                place.where(entry_key(number)),
+                rule,
+                "an entry that names a different predecessor",
+                RESTORE,
+            )
 
 
 def _truth(where: str, entries: list[AuditEntry]) -> list[bool | None]:
     columns: dict[str, list[Any]] = {
         "number": [entry.number for entry in entries],
-        "when": [datetime.fromisoformat(entry.when).replace(tzinfo=None) for entry in entries],
+        "when": [
+            datetime.fromisoformat(entry.when).replace(tzinfo=None) for entry in entries
+        ],
         "actor": [entry.actor for entry in entries],
         "action": [entry.action for entry in entries],
         "subjects": [len(entry.subjects) for entry in entries],

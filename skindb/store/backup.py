@@ -1,8 +1,11 @@
-"""Backups of a database: consistent while others write, incremental, and without withdrawn subjects.
+"""Backups of a database: consistent while others write, incremental, and without
+withdrawn subjects.
 
-A backup is written in attempts. An attempt lists the database until two lists agree, so that the state is that of one
-moment. It removes contents that no state needs any more, copies those that are missing, and creates the state last,
-unless a subject was withdrawn meanwhile. If a version was removed meanwhile, the next attempt lists the database again.
+A backup is written in attempts. An attempt lists the database until two lists agree, so
+that the state is that of one moment. It removes contents that no state needs any more,
+copies those that are missing, and creates the state last, unless a subject was
+withdrawn meanwhile. If a version was removed meanwhile, the next attempt lists the
+database again.
 """
 
 from __future__ import annotations
@@ -36,7 +39,14 @@ from skindb.store.kinds import KINDS_OF_ONE_SUBJECT, RELEASE
 from skindb.store.lease import Lease
 from skindb.store.log import RESTORE, UPDATE
 from skindb.store.marker_file import note_consents, note_withdrawals
-from skindb.store.markers import BACKUP, SECRET, WITHDRAWN, Markers, marker_faults, read_markers
+from skindb.store.markers import (
+    BACKUP,
+    SECRET,
+    WITHDRAWN,
+    Markers,
+    marker_faults,
+    read_markers,
+)
 from skindb.store.paths import TRANSIENT
 from skindb.store.place import Place, UnavailableError
 from skindb.store.record import LaterError, Record, record_from_json
@@ -46,8 +56,10 @@ from skindb.store.verified import AS_COMMITTED, CHANGED, CURE, read_manifest
 T = TypeVar("T")
 MAX_LISTS = 100
 MAX_ATTEMPTS = 20
-LISTED = (REQUESTS, WITHDRAWN, "log", "tombstones", "audit")  # requests first, because they can appear and vanish again
-NEVER_CHANGE = ("audit/", "tombstones/")  # files whose names always have the same content
+# requests first, because they can appear and vanish again
+LISTED = (REQUESTS, WITHDRAWN, "log", "tombstones", "audit")
+# files whose names always have the same content
+NEVER_CHANGE = ("audit/", "tombstones/")
 Listing = dict[str, Hashable]  # key of a file -> identity
 
 
@@ -61,7 +73,8 @@ class BackupReport:
     present: int  # that were there already
     bytes: int  # that were copied
     removed: int  # contents that no state needed any more
-    faults: tuple[Fault, ...] = ()  # files that could not be copied, and damaged files of the backup
+    # files that could not be copied, and damaged files of the backup
+    faults: tuple[Fault, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -76,7 +89,9 @@ class Draft:
     faults: list[Fault]
 
 
-def create_backup(place: Place, archive: Archive, *, verify: bool = False) -> BackupReport:
+def create_backup(
+    place: Place, archive: Archive, *, verify: bool = False
+) -> BackupReport:
     """Write a new state of a database to a backup, which is created if there is nothing.
 
     Parameters
@@ -89,7 +104,8 @@ def create_backup(place: Place, archive: Archive, *, verify: bool = False) -> Ba
     Raises
     ------
     InputError
-        If the database or the location of the backup cannot be used, or if another run writes to the backup.
+        If the database or the location of the backup cannot be used, or if another run
+        writes to the backup.
     """
     _begin(place, archive)
     with Lease(archive.place, "backup", (RELEASE,), command="skindb backup") as lease:
@@ -99,15 +115,19 @@ def create_backup(place: Place, archive: Archive, *, verify: bool = False) -> Ba
 
 
 def erase_from_archive(place: Place, archive: Archive, *, wait: float = 0.0) -> int:
-    """Remove subjects who were withdrawn from a database from all states of a backup; returns the number of contents.
+    """Remove subjects who were withdrawn from a database from all states of a backup;
+    returns the number of contents.
 
     Raises
     ------
     InputError
-        If it is not a backup of this database, if a state is damaged, or if another run writes to it.
+        If it is not a backup of this database, if a state is damaged, or if another run
+        writes to it.
     """
     archive.require()
-    with Lease(archive.place, "backup", (RELEASE,), wait=wait, command="skindb withdraw") as lease:
+    with Lease(
+        archive.place, "backup", (RELEASE,), wait=wait, command="skindb withdraw"
+    ) as lease:
         return _repeated(lambda: _erase(place, archive, lease), place)
 
 
@@ -118,7 +138,11 @@ def verify_archive(archive: Archive) -> list[Fault]:
     checked: set[str] = set()
     known: set[str] = set()
     for state in states:
-        fresh = {item[1]: item for item in archive.uses(state, known, faults) if item[1] not in checked}
+        fresh = {
+            item[1]: item
+            for item in archive.uses(state, known, faults)
+            if item[1] not in checked
+        }
         checked |= fresh.keys()
         for _ in intact(lambda item: bool(archive.read(item)), fresh.values(), faults):
             pass
@@ -133,25 +157,42 @@ def _repeated(step: Callable[[], T], place: Place) -> T:
         except Changed:
             continue
     rule = "versions and subjects must not be removed all the time while a backup is written"
-    raise InputError(Fault(place.name, rule, f"changes in {MAX_ATTEMPTS} attempts", "run the command again"))
+    raise InputError(
+        Fault(
+            place.name,
+            rule,
+            f"changes in {MAX_ATTEMPTS} attempts",
+            "run the command again",
+        )
+    )
 
 
 def _begin(place: Place, archive: Archive) -> None:
     """Create a backup, or require that there is one of this database."""
     if not place.file_type(SECRET):
         found = "nothing" if place.names() is None else "a folder without its secret"
-        raise InputError(Fault(place.name, "must be a database", found, "give the folder of a database"))
+        raise InputError(
+            Fault(
+                place.name, "must be a database", found, "give the folder of a database"
+            )
+        )
     faults = marker_faults(place)
     if faults:
         raise InputError(faults)
     dest = archive.place
     require_apart(dest, place)
     if not dest.file_type(f"{WITHDRAWN}/{BACKUP}"):
-        others = [name for name in dest.names() or [] if name not in ("staging", SECRET, WITHDRAWN)]
+        others = [
+            name
+            for name in dest.names() or []
+            if name not in ("staging", SECRET, WITHDRAWN)
+        ]
         if others:
             rule = "a backup needs an empty folder, or one with a backup"
             cure = "give another folder"
-            raise InputError(Fault(dest.name, rule, f"other files, such as {others[0]}", cure))
+            raise InputError(
+                Fault(dest.name, rule, f"other files, such as {others[0]}", cure)
+            )
         dest.create(SECRET, place.read_small(SECRET))
         dest.create(f"{WITHDRAWN}/{BACKUP}", b"{}")
     archive.require()
@@ -173,7 +214,9 @@ def _write_state(place: Place, archive: Archive, lease: Lease) -> BackupReport:
     states, faults = _erased_states(archive, markers)
     draft = _draft(place, markers, states)
     note_withdrawals(place)
-    note_consents(place, [record for record in draft.records.values() if record.kind == CONSENT])
+    note_consents(
+        place, [record for record in draft.records.values() if record.kind == CONSENT]
+    )
     lease.require()
     digests = {digest for _, digest, _ in draft.items} | draft.additions.keys()
     removed = 0
@@ -182,7 +225,12 @@ def _write_state(place: Place, archive: Archive, lease: Lease) -> BackupReport:
     there = archive.contents()
     missing = {item[1]: item for item in draft.items if item[1] not in there}
     faults += draft.faults
-    sizes = [size for _, size in intact(partial(_copy, place, archive, guard), missing.values(), faults)]
+    sizes = [
+        size
+        for _, size in intact(
+            partial(_copy, place, archive, guard), missing.values(), faults
+        )
+    ]
     for digest, content in draft.additions.items():
         archive.put(content, digest, guard)
     archive.place.flush_names(content_key(digest) for digest in digests - there)
@@ -199,17 +247,30 @@ def _write_state(place: Place, archive: Archive, lease: Lease) -> BackupReport:
     if not archive.place.create(state.key, state.content(), guard=guard):
         raise Changed
     present = len(digests & there)
-    return BackupReport(state.number, state.versions, len(sizes), present, sum(sizes), removed, tuple(faults))
+    return BackupReport(
+        state.number,
+        state.versions,
+        len(sizes),
+        present,
+        sum(sizes),
+        removed,
+        tuple(faults),
+    )
 
 
 def _needed(archive: Archive, states: Iterable[State]) -> set[str]:
     """Digests of all contents of states."""
     known: set[str] = set()
-    return {digest for state in states for _, digest, _ in archive.uses(state, known, [])}
+    return {
+        digest for state in states for _, digest, _ in archive.uses(state, known, [])
+    }
 
 
-def _erased_states(archive: Archive, markers: Markers) -> tuple[list[State], list[Fault]]:
-    """All states, from which withdrawn subjects were removed, and the faults of those that cannot be read.
+def _erased_states(
+    archive: Archive, markers: Markers
+) -> tuple[list[State], list[Fault]]:
+    """All states, from which withdrawn subjects were removed, and the faults of those
+    that cannot be read.
 
     Records that cannot be read, and therefore cannot be restored, are removed from a state as well.
     """
@@ -219,13 +280,20 @@ def _erased_states(archive: Archive, markers: Markers) -> tuple[list[State], lis
         if state.withdrawals == seal_of_withdrawals(markers):
             continue
         tombstones = [key for key in state.files if key.startswith("tombstones/")]
-        left, additions = surviving(archive.records(state, []), archive.requests(state, []), tombstones, markers)
+        left, additions = surviving(
+            archive.records(state, []), archive.requests(state, []), tombstones, markers
+        )
         files = {key: state.files[key] for key in left} | other_files(state.files, left)
         for key, content in additions.items():
             files[key] = hashlib.sha256(content).hexdigest()
             archive.put(content, files[key], guard)
         archive.place.flush_names(content_key(files[key]) for key in additions)
-        changed = replace(state, files=files, versions=len(left), withdrawals=seal_of_withdrawals(markers))
+        changed = replace(
+            state,
+            files=files,
+            versions=len(left),
+            withdrawals=seal_of_withdrawals(markers),
+        )
         archive.place.replace(state.key, changed.content(), guard=guard)
         states[number] = changed
     return states, faults
@@ -234,31 +302,56 @@ def _erased_states(archive: Archive, markers: Markers) -> tuple[list[State], lis
 def _draft(place: Place, markers: Markers, states: list[State]) -> Draft:
     """The state of a database at one moment, without withdrawn subjects."""
     listing = _list_twice(place)
-    keys = [key for key in sorted(listing) if (match := RECORD_KEY.fullmatch(key)) and match[1] not in TRANSIENT]
+    keys = [
+        key
+        for key in sorted(listing)
+        if (match := RECORD_KEY.fullmatch(key)) and match[1] not in TRANSIENT
+    ]
     faults: list[Fault] = []
     every = dict(intact(partial(_read_record, place), keys, faults))
     tombstones = [key for key in listing if key.startswith("tombstones/")]
     records, texts = surviving(
-        {key: record for key, (record, _) in every.items()}, read_requests(place)[0], tombstones, markers
+        {key: record for key, (record, _) in every.items()},
+        read_requests(place)[0],
+        tombstones,
+        markers,
     )
     files = {key: every[key][1] for key in records}
     known = states[-1].files if states else {}
-    names = [one.beside("names") for one in records.values() if one.kind not in KINDS_OF_ONE_SUBJECT]
-    others = [key for key in listing if key.startswith(NEVER_CHANGE) and STATE_KEY.fullmatch(key)]
+    names = [
+        one.beside("names")
+        for one in records.values()
+        if one.kind not in KINDS_OF_ONE_SUBJECT
+    ]
+    others = [
+        key
+        for key in listing
+        if key.startswith(NEVER_CHANGE) and STATE_KEY.fullmatch(key)
+    ]
     files |= {key: known[key] for key in others if key in known}
     items: list[Item] = []
-    files |= intact(partial(_digest, place), [*names, *(key for key in others if key not in known)], faults)
+    files |= intact(
+        partial(_digest, place),
+        [*names, *(key for key in others if key not in known)],
+        faults,
+    )
     for _, those in intact(partial(_version_items, place), records.values(), faults):
         items += those
     items += [(key, digest, None) for key, digest in files.items()]
-    additions = {hashlib.sha256(content).hexdigest(): content for content in texts.values()}
-    files |= {key: hashlib.sha256(content).hexdigest() for key, content in texts.items()}
+    additions = {
+        hashlib.sha256(content).hexdigest(): content for content in texts.values()
+    }
+    files |= {
+        key: hashlib.sha256(content).hexdigest() for key, content in texts.items()
+    }
     _require_unchanged(place, listing, markers, faults)
     return Draft(listing, records, files, items, additions, faults)
 
 
 def _list_twice(place: Place) -> Listing:
-    """The files of a database that decide what it holds; two equal lists are those of one moment between them."""
+    """The files of a database that decide what it holds; two equal lists are those of
+    one moment between them.
+    """
     before = _list(place)
     for _ in range(MAX_LISTS):
         listing = _list(place)
@@ -266,15 +359,27 @@ def _list_twice(place: Place) -> Listing:
             return listing
         before = listing
     rule = "the database must not change all the time while its files are listed"
-    raise InputError(Fault(place.name, rule, f"changes in {MAX_LISTS} lists", "run the command again"))
+    raise InputError(
+        Fault(
+            place.name, rule, f"changes in {MAX_LISTS} lists", "run the command again"
+        )
+    )
 
 
 def _list(place: Place) -> Listing:
-    return {f"{top}/{name}": one for top in LISTED for name, one in place.identities(top).items()}
+    return {
+        f"{top}/{name}": one
+        for top in LISTED
+        for name, one in place.identities(top).items()
+    }
 
 
-def _require_unchanged(place: Place, listing: Listing, markers: Markers, faults: list[Fault]) -> None:
-    """Raise `Changed` if a subject was withdrawn since a list, or a version removed that may be the cause of faults."""
+def _require_unchanged(
+    place: Place, listing: Listing, markers: Markers, faults: list[Fault]
+) -> None:
+    """Raise `Changed` if a subject was withdrawn since a list, or a version removed
+    that may be the cause of faults.
+    """
     present = read_markers(place).numbers
     if any(number > markers.numbers.get(name, 0) for name, number in present.items()):
         raise Changed
@@ -296,12 +401,17 @@ def _read_record(place: Place, key: str) -> tuple[Record, str]:
         cure = UPDATE
     except (OSError, ValueError, RecursionError) as error:
         found = _reason(error)
-    raise InputError(Fault(place.where(key), "a record of the log must be as committed", found, cure))
+    raise InputError(
+        Fault(place.where(key), "a record of the log must be as committed", found, cure)
+    )
 
 
 def _version_items(place: Place, record: Record) -> list[Item]:
     """All files of a version except for its record."""
-    return [(record.beside("manifest"), record.manifest, None), *items_of(record, read_manifest(place, record))]
+    return [
+        (record.beside("manifest"), record.manifest, None),
+        *items_of(record, read_manifest(place, record)),
+    ]
 
 
 def _digest(place: Place, key: str) -> str:
@@ -326,7 +436,9 @@ def _read(place: Place, item: Item) -> bytes:
     except UnavailableError:
         raise
     except (OSError, InputError) as error:
-        raise InputError(Fault(place.where(name), AS_COMMITTED, _reason(error), CURE)) from None
+        raise InputError(
+            Fault(place.where(name), AS_COMMITTED, _reason(error), CURE)
+        ) from None
 
 
 def _reason(error: Exception) -> str:

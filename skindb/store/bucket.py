@@ -1,8 +1,9 @@
 """An S3 bucket as the location of a database: one object for each file.
 
-An object is written in one request, so that it is either complete or absent. The many small zarr.json files of a
-version are written when it is committed and cached when they are read: zarr requests each of them several times, and a
-request takes as long for 500 bytes as for 500,000.
+An object is written in one request, so that it is either complete or absent. The many
+small zarr.json files of a version are written when it is committed and cached when they
+are read: zarr requests each of them several times, and a request takes as long for 500
+bytes as for 500,000.
 """
 
 from __future__ import annotations
@@ -42,7 +43,8 @@ from skindb.store.s3 import (
 from skindb.store.verified import limits
 
 T = TypeVar("T")
-PAUSES_S = (0.2, 1.0, 5.0)  # before a request is repeated whose answer was lost and that obstore does not repeat
+# before a request is repeated whose answer was lost and that obstore does not repeat
+PAUSES_S = (0.2, 1.0, 5.0)
 METADATA = "/zarr.json"
 MAX_CACHED_METADATA = 20_000  # number of zarr.json objects, some 20 MB
 THREADS = 16  # write zarr.json objects in parallel
@@ -50,7 +52,8 @@ FETCH_BYTES = 1 << 23  # read at a time while a digest is computed
 
 
 class Bucket:
-    """A bucket or a prefix of it; see `place.Place`. Credentials are neither stored in the object nor pickled.
+    """A bucket or a prefix of it; see `place.Place`. Credentials are neither stored in
+    the object nor pickled.
 
     Parameters
     ----------
@@ -63,7 +66,8 @@ class Bucket:
         self.name = f"s3://{bucket}/{prefix}".rstrip("/")
         self._store = connect(bucket, prefix)
         self.is_unlocked = False
-        self._is_conditional = False  # whether the server is known to refuse to overwrite
+        # whether the server is known to refuse to overwrite
+        self._is_conditional = False
         self._pending: dict[str, bytes] = {}  # metadata that are not written yet
         self._kept: dict[str, bytes] = {}  # metadata that were read, which never change
         # key -> digest and entity tag of an object that this process wrote
@@ -76,16 +80,28 @@ class Bucket:
         return Bucket, (self.name,)
 
     def writable(self, key: str) -> Store:
-        """A zarr store at a key, written by this process only; `digest` does not read again what was written to it."""
+        """A zarr store at a key, written by this process only; `digest` does not read
+        again what was written to it.
+        """
         return BucketStore(self, self._path(key))
 
     def scratch(self) -> Path:
-        """A folder of this user in the cache, or in the folder for temporary files if there is no cache."""
+        """A folder of this user in the cache, or in the folder for temporary files if
+        there is no cache.
+        """
         base = cache_folder() or Path(tempfile.gettempdir()) / f"skindb-{os.getuid()}"
-        own = base / "buckets" / hashlib.sha256(f"{endpoint()} {self.name}".encode()).hexdigest()[:24]
+        own = (
+            base
+            / "buckets"
+            / hashlib.sha256(f"{endpoint()} {self.name}".encode()).hexdigest()[:24]
+        )
         make_private(own)
         status = own.lstat()
-        if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & 0o077:
+        if (
+            not stat.S_ISDIR(status.st_mode)
+            or status.st_uid != os.getuid()
+            or status.st_mode & 0o077
+        ):
             rule = "must be a folder of this user with permissions 0700"
             cure = "remove it, or set SKINDB_CACHE"
             found = f"a different owner, or permissions {status.st_mode & 0o777:04o}"
@@ -94,7 +110,9 @@ class Bucket:
 
     def marker_file(self) -> Path:
         """A file in the data folder of this user (XDG_DATA_HOME), named after the bucket."""
-        folder = Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share")
+        folder = Path(
+            os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share"
+        )
         digest = hashlib.sha256(f"{endpoint()} {self.name}".encode()).hexdigest()
         name = self.name.removeprefix("s3://").replace("/", "-")
         return folder / "skindb" / f"{name}-{digest[:8]}.markers"
@@ -111,16 +129,23 @@ class Bucket:
         """Names at the top level; None if there are no objects below the prefix."""
         return self._names_below("") or None
 
-    def children(self, key: str, *, links: bool = False) -> list[str]:  # noqa: ARG002  a bucket has no links
+    # a bucket has no links
+    def children(self, key: str, *, links: bool = False) -> list[str]:  # noqa: ARG002
         """Names directly below a key, sorted; empty if there are none."""
         return self._names_below(self._path(key))
 
     def file_type(self, key: str) -> str:
-        """Type of a key: "file" for an object, "folder" if there are objects below it; empty if it does not exist."""
+        """Type of a key: "file" for an object, "folder" if there are objects below it;
+        empty if it does not exist.
+        """
         try:
             self.identity(key)
         except FileNotFoundError:
-            return "folder" if self._ask(key, lambda: next(iter(self._store.list(key)), [])) else ""
+            return (
+                "folder"
+                if self._ask(key, lambda: next(iter(self._store.list(key)), []))
+                else ""
+            )
         return "file"
 
     def sizes(self, key: str) -> dict[str, int]:
@@ -128,16 +153,25 @@ class Bucket:
         return {path: meta["size"] for path, meta in self._objects(key).items()}
 
     def read(self, key: str, begin: int = 0, end: int | None = None) -> bytes:
-        """Contents of an object from byte `begin`, counted from its end if negative, up to `end`."""
+        """Contents of an object from byte `begin`, counted from its end if negative, up
+        to `end`.
+        """
         path = self._path(key)
         if path.endswith(METADATA) and not begin and end is None:
             return self._metadata(path)
         if end is not None and end <= begin:
             return b""
         if end is not None:
-            return self._ask(key, lambda: bytes(self._store.get_range(path, start=begin, end=end)))
+            return self._ask(
+                key, lambda: bytes(self._store.get_range(path, start=begin, end=end))
+            )
         part: Any = {"offset": begin} if begin > 0 else {"suffix": -begin}
-        return self._ask(key, lambda: bytes(self._store.get(path, options={"range": part} if begin else {}).bytes()))
+        return self._ask(
+            key,
+            lambda: bytes(
+                self._store.get(path, options={"range": part} if begin else {}).bytes()
+            ),
+        )
 
     def read_small(self, key: str) -> bytes:
         """Contents of a JSON object, whose size is limited."""
@@ -146,13 +180,17 @@ class Bucket:
         def fetch() -> bytes:
             found = self._store.get(path)
             if found.meta["size"] > MAX_STORE_JSON_BYTES:
-                raise OSError(errno.EFBIG, f"{found.meta['size'] / 1e6:,.1f} MB", self.where(key))
+                raise OSError(
+                    errno.EFBIG, f"{found.meta['size'] / 1e6:,.1f} MB", self.where(key)
+                )
             return bytes(found.bytes())
 
         return self._ask(key, fetch)
 
     def digest(self, key: str) -> str:
-        """SHA-256 digest of an object, or of the content that this process has just written; see `make_durable`."""
+        """SHA-256 digest of an object, or of the content that this process has just
+        written; see `make_durable`.
+        """
         path = self._path(key)
         if (written := self._written.pop(path, None)) is not None:
             return written[0]
@@ -175,23 +213,39 @@ class Bucket:
         return {path: _identity(meta) for path, meta in self._objects(key).items()}
 
     def proves(self, identity: tuple[Hashable, ...], content: bytes) -> bool:
-        """Whether an identity shows that the object has this content: the entity tag of a plain object is its MD5."""
+        """Whether an identity shows that the object has this content: the entity tag of
+        a plain object is its MD5.
+        """
         size, tag, *_ = *identity, None, None
-        return size == len(content) and tag == f'"{hashlib.md5(content, usedforsecurity=False).hexdigest()}"'
+        return (
+            size == len(content)
+            and tag == f'"{hashlib.md5(content, usedforsecurity=False).hexdigest()}"'
+        )
 
     def modified(self, key: str) -> float:
-        """Time in seconds, by the clock of the bucket, when an object or the newest object below a key was written."""
+        """Time in seconds, by the clock of the bucket, when an object or the newest
+        object below a key was written.
+        """
         path = self._path(key)
         try:
-            return float(self._ask(key, lambda: self._store.head(path))["last_modified"].timestamp())
+            return float(
+                self._ask(key, lambda: self._store.head(path))[
+                    "last_modified"
+                ].timestamp()
+            )
         except FileNotFoundError:
-            times = [meta["last_modified"].timestamp() for meta in self._objects(key).values()]
+            times = [
+                meta["last_modified"].timestamp()
+                for meta in self._objects(key).values()
+            ]
             if not times:
                 raise
             return float(max(times))
 
     def now(self) -> float:
-        """Time of the clock of the bucket in whole seconds, from an object that is written and removed again."""
+        """Time of the clock of the bucket in whole seconds, from an object that is
+        written and removed again.
+        """
         key = f"leases/now/{uuid.uuid4().hex}"
         self._put(key, b"")
         try:
@@ -199,11 +253,14 @@ class Bucket:
         finally:
             self.remove(key)
 
-    def make_durable(self, key: str, *, flush: bool = True) -> None:  # noqa: ARG002  objects are always durable
+    # objects are always durable
+    def make_durable(self, key: str, *, flush: bool = True) -> None:  # noqa: ARG002
         """Write pending metadata, and check that every object is stored as it was acknowledged."""
         names = [f"{key}/{name}" for name in self.pending(key)]
         with ThreadPoolExecutor(THREADS) as threads:
-            list(threads.map(self.write, names, [self._pending[name] for name in names]))
+            list(
+                threads.map(self.write, names, [self._pending[name] for name in names])
+            )
         for name in names:
             del self._pending[name]
         there = self._objects(key)
@@ -211,7 +268,11 @@ class Bucket:
             if path.startswith(f"{key}/"):
                 meta = there.get(path.removeprefix(f"{key}/"))
                 if meta is None or meta["e_tag"] != tag:
-                    found = "a different object than was written" if meta else "no object where one was written"
+                    found = (
+                        "a different object than was written"
+                        if meta
+                        else "no object where one was written"
+                    )
                     raise OSError(errno.EIO, found, self.where(path))
 
     def create(
@@ -224,7 +285,8 @@ class Bucket:
     ) -> bool:
         """Write an object that must not exist yet; returns False and writes nothing if it exists.
 
-        A guard is called before and after; if it raises the second time, the caller must remove the object.
+        A guard is called before and after; if it raises the second time, the caller
+        must remove the object.
         """
         if guard is not None:
             guard()
@@ -239,8 +301,9 @@ class Bucket:
     def _create(self, key: str, data: bytes) -> bool:
         """Write an object that must not exist yet.
 
-        If an answer was lost, the object was created if it has exactly this content. No other writer may therefore
-        write the same content under this key, as is the case for a record.
+        If an answer was lost, the object was created if it has exactly this content. No
+        other writer may therefore write the same content under this key, as is the case
+        for a record.
         """
         path = self._path(key)
         lost = None
@@ -249,19 +312,28 @@ class Bucket:
                 if self._put_new(path, data):
                     self._require_conditional(path, data)
                     return True
-                lost = None  # another writer was faster, or the request was repeated after its answer was lost
+                # another writer was faster, or the request was repeated after its
+                # answer was lost
+                lost = None
             except DeniedError:
                 raise
             except UnavailableError as error:
                 lost = error
             try:
                 return self.read(key) == data
-            except FileNotFoundError:  # the request did not arrive, or the object was removed again
+            except FileNotFoundError:
+                # the request did not arrive, or the object was removed again
                 time.sleep(pause_s)
-        raise lost or OSError(errno.EAGAIN, "an object that is repeatedly created and removed", self.where(key))
+        raise lost or OSError(
+            errno.EAGAIN,
+            "an object that is repeatedly created and removed",
+            self.where(key),
+        )
 
     def replace(self, key: str, data: bytes, *, guard: Guard | None = None) -> None:
-        """Write or replace a small object; it is removed if the guard raises after it was written."""
+        """Write or replace a small object; it is removed if the guard raises after it
+        was written.
+        """
         if guard is not None:
             guard()
         self._put(self._path(key), data)
@@ -281,9 +353,18 @@ class Bucket:
         """Delete an object or all objects below a key, if there are any."""
         path = self._path(key)
         # listed again after a lost answer, so that no deletion of a missing object is requested
-        self._ask(key, lambda: self._store.delete([path, *(f"{path}/{name}" for name in self._objects(key))]))
+        self._ask(
+            key,
+            lambda: self._store.delete(
+                [path, *(f"{path}/{name}" for name in self._objects(key))]
+            ),
+        )
         for known in (self._pending, self._kept, self._written):
-            for name in [name for name in list(known) if name == path or name.startswith(f"{path}/")]:
+            for name in [
+                name
+                for name in list(known)
+                if name == path or name.startswith(f"{path}/")
+            ]:
                 known.pop(name)
 
     def has_written(self, key: str) -> bool:
@@ -292,7 +373,11 @@ class Bucket:
 
     def pending(self, key: str) -> list[str]:
         """Paths, relative to a key, of the objects that `write_later` keeps below it."""
-        return [path.removeprefix(f"{key}/") for path in list(self._pending) if path.startswith(f"{key}/")]
+        return [
+            path.removeprefix(f"{key}/")
+            for path in list(self._pending)
+            if path.startswith(f"{key}/")
+        ]
 
     def write_later(self, key: str, data: bytes) -> None:
         """Keep an object in memory until `make_durable` writes it."""
@@ -327,10 +412,11 @@ class Bucket:
         return True
 
     def _require_conditional(self, path: str, data: bytes) -> None:
-        """Raise an `InputError` if the server ignores the condition, so that a concurrent commit could be lost.
+        """Raise an `InputError` if the server ignores the condition, so that a
+        concurrent commit could be lost.
 
-        Checked once, by writing again an object that was just created; the first object of a commit is a manifest, not
-        a record.
+        Checked once, by writing again an object that was just created; the first object
+        of a commit is a manifest, not a record.
         """
         with suppress(UnavailableError):  # checked with the next object
             if not self._is_conditional and self._put_new(path, data):
@@ -342,21 +428,35 @@ class Bucket:
 
     def _put(self, path: str, data: bytes) -> str:
         """Write an object of any size in one request; returns its entity tag."""
-        return self._ask(path, lambda: self._store.put(path, data, use_multipart=False)["e_tag"] or "")
+        return self._ask(
+            path,
+            lambda: self._store.put(path, data, use_multipart=False)["e_tag"] or "",
+        )
 
     def _objects(self, key: str) -> dict[str, Any]:
         """Metadata of every object below a key, by its path relative to the key."""
         path = self._path(key)
-        found = self._ask(key, lambda: [meta for page in self._store.list(path) for meta in page])
-        return {meta["path"].removeprefix(f"{path}/"): meta for meta in found if meta["path"] != path}
+        found = self._ask(
+            key, lambda: [meta for page in self._store.list(path) for meta in page]
+        )
+        return {
+            meta["path"].removeprefix(f"{path}/"): meta
+            for meta in found
+            if meta["path"] != path
+        }
 
     def _names_below(self, path: str) -> list[str]:
         found = self._ask(path, lambda: self._store.list_with_delimiter(path or None))
-        every = {*found["common_prefixes"], *(meta["path"] for meta in found["objects"])} - {path, ""}
+        every = {
+            *found["common_prefixes"],
+            *(meta["path"] for meta in found["objects"]),
+        } - {path, ""}
         return sorted(one.rsplit("/", 1)[-1] for one in every)
 
     def _ask(self, key: str, request: Callable[[], T]) -> T:
-        """Answer to a request, which is repeated if its answer was incomplete and obstore did not repeat it."""
+        """Answer to a request, which is repeated if its answer was incomplete and
+        obstore did not repeat it.
+        """
         end = time.monotonic() + RETRY_TIMEOUT.total_seconds()
         for pause_s in PAUSES_S:
             try:
@@ -371,7 +471,10 @@ class Bucket:
 
     def _path(self, key: str) -> str:
         """The key; `InputError` if it leads outside the prefix."""
-        if any(part in ("", ".", "..") or "\0" in part or "\\" in part for part in key.split("/")):
+        if any(
+            part in ("", ".", "..") or "\0" in part or "\\" in part
+            for part in key.split("/")
+        ):
             raise InputError(outside_fault(self.name, key, "a path that leaves it"))
         return key
 
@@ -383,8 +486,8 @@ def _identity(meta: Mapping[str, Any]) -> tuple[Hashable, ...]:
 class BucketStore(Store):
     """A version that is being written, as a zarr store.
 
-    In the process that created it, existing objects are known without requests. A copy in another process, which must
-    write different objects, asks the bucket.
+    In the process that created it, existing objects are known without requests. A copy
+    in another process, which must write different objects, asks the bucket.
 
     Parameters
     ----------
@@ -403,28 +506,44 @@ class BucketStore(Store):
         self.is_copy = False
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, BucketStore) and (self.bucket.name, self.key) == (other.bucket.name, other.key)
+        return isinstance(other, BucketStore) and (self.bucket.name, self.key) == (
+            other.bucket.name,
+            other.key,
+        )
 
     __hash__ = object.__hash__
 
     def __reduce__(self) -> tuple[Callable[..., BucketStore], tuple[Bucket, str]]:
         return _copy, (self.bucket, self.key)
 
-    async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
+    async def get(
+        self,
+        key: str,
+        prototype: BufferPrototype,
+        byte_range: ByteRequest | None = None,
+    ) -> Buffer | None:
         """Contents of an object, or None if it does not exist."""
         if not await self.exists(key):
             return None
         part = (0, None) if byte_range is None else limits(byte_range)
         try:
-            return prototype.buffer.from_bytes(await asyncio.to_thread(self.bucket.read, self._of(key), *part))
+            return prototype.buffer.from_bytes(
+                await asyncio.to_thread(self.bucket.read, self._of(key), *part)
+            )
         except FileNotFoundError:
             return None
 
     async def get_partial_values(
-        self, prototype: BufferPrototype, key_ranges: Iterable[tuple[str, ByteRequest | None]]
+        self,
+        prototype: BufferPrototype,
+        key_ranges: Iterable[tuple[str, ByteRequest | None]],
     ) -> list[Buffer | None]:
         """Contents of several objects."""
-        return list(await asyncio.gather(*(self.get(key, prototype, part) for key, part in key_ranges)))
+        return list(
+            await asyncio.gather(
+                *(self.get(key, prototype, part) for key, part in key_ranges)
+            )
+        )
 
     async def exists(self, key: str) -> bool:
         """Whether an object exists."""
@@ -459,7 +578,10 @@ class BucketStore(Store):
     async def list_dir(self, prefix: str) -> AsyncIterator[str]:
         """Names directly below `prefix`."""
         start = f"{prefix.rstrip('/')}/" if prefix else ""
-        for name in {name[len(start) :].split("/", 1)[0] async for name in self.list_prefix(start)}:
+        for name in {
+            name[len(start) :].split("/", 1)[0]
+            async for name in self.list_prefix(start)
+        }:
             yield name
 
     def _of(self, key: str) -> str:

@@ -13,7 +13,8 @@ from skindb.store.condition import evaluate, is_missing
 from skindb.store.known import Known
 from skindb.store.record import Record
 
-CATALOGUE_KINDS = ("capture", "model", "registration")  # kinds whose generation and date the catalogue shows
+# kinds whose generation and date the catalogue shows
+CATALOGUE_KINDS = ("capture", "model", "registration")
 
 
 class MissingWarning(SkindbWarning):
@@ -29,8 +30,11 @@ def table(known: Known) -> pd.DataFrame:
     frame = pd.DataFrame(columns, index=pd.Index(list(rows), name="take"))
     for kind in CATALOGUE_KINDS:
         if (name := f"{kind}_created") in frame:
-            dates = pd.to_datetime([row.get(name) for row in rows.values()], utc=True, errors="coerce")
-            frame[name] = dates.tz_localize(None)  # UTC without a time zone, so that queries can compare dates
+            dates = pd.to_datetime(
+                [row.get(name) for row in rows.values()], utc=True, errors="coerce"
+            )
+            # UTC without a time zone, so that queries can compare dates
+            frame[name] = dates.tz_localize(None)
     return frame
 
 
@@ -54,14 +58,23 @@ def matching(frame: pd.DataFrame, where: str) -> list[str]:
     MissingWarning
         If takes are not selected because they lack an attribute that the condition compares.
     """
-    columns = {str(name): values.tolist() for name, values in frame.reset_index().items()}
+    columns = {
+        str(name): values.tolist() for name, values in frame.reset_index().items()
+    }
     truth, operands = evaluate(where, columns)
     takes = columns["take"]
     undecided = [row for row, one in enumerate(truth) if one is None]
     attributes = [name for name in operands if not imitates_column(name)]
-    lacking = [name for name in attributes if any(is_missing(columns[name][row]) for row in undecided)]
+    lacking = [
+        name
+        for name in attributes
+        if any(is_missing(columns[name][row]) for row in undecided)
+    ]
     if lacking:
-        found = f"{len(undecided)} of {len(takes)} takes ({few_names([takes[row] for row in undecided])})"
+        found = (
+            f"{len(undecided)} of {len(takes)} takes "
+            f"({few_names([takes[row] for row in undecided])})"
+        )
         name = lacking[0] if lacking[0].isidentifier() else f"`{lacking[0]}`"
         cure = f"add 'or {name} is missing' to select them"
         text = f"{found} lack {' or '.join(lacking)} and are not selected by {where!r}; {cure}"
@@ -70,19 +83,35 @@ def matching(frame: pd.DataFrame, where: str) -> list[str]:
 
 
 def _row(known: Known, take: str) -> dict[str, Any]:
-    records = {kind: known.record(kind, take) for kind in CATALOGUE_KINDS if known.has(kind, take)}
+    records = {
+        kind: known.record(kind, take)
+        for kind in CATALOGUE_KINDS
+        if known.has(kind, take)
+    }
     model = records.get("model")
-    row = take_coords(take, known.about(take), None if model is None else model.provenance)
-    row |= {f"{kind}_generation": records[kind].generation if kind in records else None for kind in CATALOGUE_KINDS}
+    row = take_coords(
+        take, known.about(take), None if model is None else model.provenance
+    )
+    row |= {
+        f"{kind}_generation": records[kind].generation if kind in records else None
+        for kind in CATALOGUE_KINDS
+    }
     row |= {f"{kind}_created": record.created for kind, record in records.items()}
     row["consent"] = ", ".join(known.scope(take))
     if model is not None:
-        row |= {f"status_{name}": part for name, part in model.provenance.get("status", {}).items()}
+        row |= {
+            f"status_{name}": part
+            for name, part in model.provenance.get("status", {}).items()
+        }
         row["outdated"] = _is_outdated(model, records.get("capture"))
     return row
 
 
 def _is_outdated(model: Record, capture: Record | None) -> bool:
     """Whether there is a newer capture than that from which a model was made."""
-    made_from = [one["generation"] for one in model.made_from if one["kind"] == "capture"]
-    return capture is not None and bool(made_from) and capture.generation not in made_from
+    made_from = [
+        one["generation"] for one in model.made_from if one["kind"] == "capture"
+    ]
+    return (
+        capture is not None and bool(made_from) and capture.generation not in made_from
+    )

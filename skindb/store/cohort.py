@@ -64,7 +64,14 @@ class Address:
         if record.seal != self.seal:
             where = f"{self.kind} of {self.take}"
             rule = "a version must not change while a cohort refers to it"
-            raise InputError(Fault(where, rule, "a different version of that generation", "open the cohort again"))
+            raise InputError(
+                Fault(
+                    where,
+                    rule,
+                    "a different version of that generation",
+                    "open the cohort again",
+                )
+            )
         return record
 
 
@@ -93,7 +100,9 @@ class StoredGroup:
 
 @dataclass(frozen=True)
 class StoredSamples:
-    """The sample of surfels of a model, with their reflectance samples from the capture of the model."""
+    """The sample of surfels of a model, with their reflectance samples from the capture
+    of the model.
+    """
 
     address: Address
     capture: Address
@@ -108,9 +117,15 @@ class StoredSamples:
             return own[name].compute(scheduler="synchronous")
         index = own["surfel_index"].values[: self.surfels]
         order = np.argsort(index)
-        found = _group(self.capture, "samples")[SAMPLES].isel(surfel=index[order]).compute(scheduler="synchronous")
+        found = (
+            _group(self.capture, "samples")[SAMPLES]
+            .isel(surfel=index[order])
+            .compute(scheduler="synchronous")
+        )
         dome = _group(self.capture, "dome")
-        labels = {dim: dome[dim].values for dim in ("light", "camera") if dim in dome.coords}
+        labels = {
+            dim: dome[dim].values for dim in ("light", "camera") if dim in dome.coords
+        }
         return found.isel(surfel=np.argsort(order)).assign_coords(labels)
 
 
@@ -132,27 +147,52 @@ def cohort(
         rule = f"must be one of {', '.join(GROUP)}"
         raise InputError(Fault("layout", rule, repr(layout), "choose one"))
     if dim not in ("take", "subject"):
-        raise InputError(Fault("dim", "must be take or subject", repr(dim), "choose one"))
+        raise InputError(
+            Fault("dim", "must be take or subject", repr(dim), "choose one")
+        )
     wanted = None if variables is None else list(variables)
     base = "registration" if layout == "maps" else kind
     known = Known(db, release)
     names, skipped = _members(known, base, takes)
     request = CohortRequest(layout, surfels, size, seed)
     records = {take: known.record(base, take) for take in names}
-    stored = {take: _stored_record(known, record, request) for take, record in records.items()}
+    stored = {
+        take: _stored_record(known, record, request) for take, record in records.items()
+    }
     if missing := [take for take, found in stored.items() if found is None]:
-        what = {"tables": "tables", "surfels": f"a sample of {surfels} surfels with seed {seed}"}
-        rule = f"a version of kind {base} must store {what.get(layout, f'maps of {size} texels')} for cohorts"
+        what = {
+            "tables": "tables",
+            "surfels": f"a sample of {surfels} surfels with seed {seed}",
+        }
+        rule = (
+            f"a version of kind {base} must store "
+            f"{what.get(layout, f'maps of {size} texels')} for cohorts"
+        )
         cure = "call skindb.workflow.summarise for them"
-        raise InputError(Fault(few_names(missing), rule, "none, or different ones", cure))
-    parts = [_part(known, records[take], found, request, wanted) for take, found in stored.items() if found is not None]
-    if empty := [part.take for part in parts if layout == "surfels" and "surfel_index" not in part.variables]:
+        raise InputError(
+            Fault(few_names(missing), rule, "none, or different ones", cure)
+        )
+    parts = [
+        _part(known, records[take], found, request, wanted)
+        for take, found in stored.items()
+        if found is not None
+    ]
+    if empty := [
+        part.take
+        for part in parts
+        if layout == "surfels" and "surfel_index" not in part.variables
+    ]:
         parts = [part for part in parts if part.take not in empty]
         skipped += [note(take, "none of its surfels was fitted") for take in empty]
     if layout == "surfels" and wanted is None and not _have_same_dome(parts):
         parts = [_without_variables(part, (SAMPLES, *DOME)) for part in parts]
     sizes = {"surfel": surfels} if layout == "surfels" else {}
-    attrs = {"layout": layout, "kind": base, "skipped": skipped, "outdated": _outdated(known, records)}
+    attrs = {
+        "layout": layout,
+        "kind": base,
+        "skipped": skipped,
+        "outdated": _outdated(known, records),
+    }
     whole = combine(parts, variables=wanted, sizes=sizes, attrs=attrs)
     return one_take_each(whole) if dim == "subject" else whole
 
@@ -163,7 +203,11 @@ def _outdated(known: Known, records: Mapping[str, Record]) -> list[Note]:
     for take in records:
         if known.has("capture", take) and known.has("model", take):
             newest = known.record("capture", take).generation
-            of = [one["generation"] for one in known.record("model", take).made_from if one["kind"] == "capture"]
+            of = [
+                one["generation"]
+                for one in known.record("model", take).made_from
+                if one["kind"] == "capture"
+            ]
             if of and newest not in of:
                 found = f"its model was made from capture {max(of)}, but the newest is {newest}"
                 notes.append(note(take, f"{found}; run skindb fit"))
@@ -171,17 +215,31 @@ def _outdated(known: Known, records: Mapping[str, Record]) -> list[Note]:
 
 
 def lacking(
-    db: Database, kind: str, requests: Iterable[CohortRequest], takes: Iterable[str], *, release: str | None = None
+    db: Database,
+    kind: str,
+    requests: Iterable[CohortRequest],
+    takes: Iterable[str],
+    *,
+    release: str | None = None,
 ) -> list[str]:
-    """Takes whose versions of a kind, and the summaries of these versions, lack data that the cohorts need."""
+    """Takes whose versions of a kind, and the summaries of these versions, lack data
+    that the cohorts need.
+    """
     known = Known(db, release)
     every = list(requests)
     return [
-        take for take in takes if any(_stored_record(known, known.record(kind, take), one) is None for one in every)
+        take
+        for take in takes
+        if any(
+            _stored_record(known, known.record(kind, take), one) is None
+            for one in every
+        )
     ]
 
 
-def _members(known: Known, kind: str, takes: Sequence[str] | None) -> tuple[list[str], list[Note]]:
+def _members(
+    known: Known, kind: str, takes: Sequence[str] | None
+) -> tuple[list[str], list[Note]]:
     """Takes that the cohort may use, and one note for each skipped take."""
     there = sorted(known.takes(kind))
     names = there if takes is None else list(dict.fromkeys(takes))
@@ -190,8 +248,14 @@ def _members(known: Known, kind: str, takes: Sequence[str] | None) -> tuple[list
         cure = f"takes with one: {', '.join(there) or 'none'}"
         raise InputError(Fault(take, rule, "none", cure) for take in unknown)
     if not names:
-        cure = "run skindb register first" if kind == "registration" else "run skindb fit first"
-        raise InputError(Fault(known.db.url, "a study needs fitted takes", f"no {kind}", cure))
+        cure = (
+            "run skindb register first"
+            if kind == "registration"
+            else "run skindb fit first"
+        )
+        raise InputError(
+            Fault(known.db.url, "a study needs fitted takes", f"no {kind}", cure)
+        )
     allowed = []
     skipped = []
     lacks_registration = False
@@ -199,7 +263,12 @@ def _members(known: Known, kind: str, takes: Sequence[str] | None) -> tuple[list
         if "statistics" not in known.scope(take):
             skipped.append(note(take, "its consent does not cover statistics"))
         elif kind == "registration" and not _is_of_current_model(known, take):
-            skipped.append(note(take, "its registration was made from an earlier model; run skindb register"))
+            skipped.append(
+                note(
+                    take,
+                    "its registration was made from an earlier model; run skindb register",
+                )
+            )
             lacks_registration = True
         else:
             allowed.append(take)
@@ -222,12 +291,17 @@ def _is_of_current_model(known: Known, take: str) -> bool:
     if not known.has("model", take):
         return False
     current = known.record("model", take)
-    of = [(one["kind"], one["take"], one["generation"]) for one in known.record("registration", take).made_from]
+    of = [
+        (one["kind"], one["take"], one["generation"])
+        for one in known.record("registration", take).made_from
+    ]
     return ("model", take, current.generation) in of
 
 
 def _largest_frame(known: Known, takes: Sequence[str]) -> tuple[list[str], list[str]]:
-    """The largest group of takes that were registered together, and the others, whose (u, v) differ."""
+    """The largest group of takes that were registered together, and the others, whose
+    (u, v) differ.
+    """
     frames: dict[str, list[str]] = {}
     for take in takes:
         frames.setdefault(frame_of(known.record("registration", take)), []).append(take)
@@ -236,24 +310,43 @@ def _largest_frame(known: Known, takes: Sequence[str]) -> tuple[list[str], list[
 
 
 def frame_of(registration: Record) -> str:
-    """Key of the common (u, v) of a registration, which is equal for takes that were registered together."""
+    """Key of the common (u, v) of a registration, which is equal for takes that were
+    registered together.
+    """
     about = registration.provenance
-    inputs = sorted((str(one["take"]), str(one.get("seal", one["generation"]))) for one in registration.made_from)
-    return json.dumps([inputs, about["parameters"], about["software_version"]], sort_keys=True)
+    inputs = sorted(
+        (str(one["take"]), str(one.get("seal", one["generation"])))
+        for one in registration.made_from
+    )
+    return json.dumps(
+        [inputs, about["parameters"], about["software_version"]], sort_keys=True
+    )
 
 
 def _coords(known: Known, take: str) -> dict[str, Any]:
     """Coordinates of a take: attributes of its capture and parameters of its model."""
     model = known.record("model", take) if known.has("model", take) else None
-    coords = take_coords(take, known.about(take), None if model is None else model.provenance)
+    coords = take_coords(
+        take, known.about(take), None if model is None else model.provenance
+    )
     return coords | ({} if model is None else {"model_generation": model.generation})
 
 
-def _stored_record(known: Known, record: Record, request: CohortRequest) -> Record | None:
-    """The record of the version with the data for a cohort: the given one, or a summary of it; None if neither."""
-    for one in reversed(known.db.history(SUMMARY, record.take) if known.has(SUMMARY, record.take) else []):
+def _stored_record(
+    known: Known, record: Record, request: CohortRequest
+) -> Record | None:
+    """The record of the version with the data for a cohort: the given one, or a summary
+    of it; None if neither.
+    """
+    for one in reversed(
+        known.db.history(SUMMARY, record.take)
+        if known.has(SUMMARY, record.take)
+        else []
+    ):
         of = [(i["kind"], i["generation"], i.get("seal")) for i in one.made_from]
-        if (record.kind, record.generation, record.seal) in of and _has_data_for(one, request):
+        if (record.kind, record.generation, record.seal) in of and _has_data_for(
+            one, request
+        ):
             return one  # preferred, because it is newer than the data of the version
     return record if _has_data_for(record, request) else None
 
@@ -264,31 +357,62 @@ def _has_data_for(record: Record, request: CohortRequest) -> bool:
         return False
     contents = record.contents.get(GROUP[request.layout])
     if contents is None:  # the take of a summary without a sample has no fitted surfels
-        return request.layout == "surfels" and record.kind == SUMMARY and "tables" in record.contents
+        return (
+            request.layout == "surfels"
+            and record.kind == SUMMARY
+            and "tables" in record.contents
+        )
     if request.layout == "surfels":
         kept = contents["sizes"]["surfel"]
         of = record.provenance.get("summary_parameters", {})
-        whole = kept < int(of.get("surfels", 0))  # fewer than requested: the sample contains all fitted surfels
-        return int(of.get("seed", 0)) == request.seed and (kept >= request.surfels or whole)
+        # fewer than requested: the sample contains all fitted surfels
+        whole = kept < int(of.get("surfels", 0))
+        return int(of.get("seed", 0)) == request.seed and (
+            kept >= request.surfels or whole
+        )
     return request.layout == "tables" or contents["sizes"]["u"] == request.size
 
 
-def _part(known: Known, record: Record, stored: Record, request: CohortRequest, wanted: Sequence[str] | None) -> Part:
+def _part(
+    known: Known,
+    record: Record,
+    stored: Record,
+    request: CohortRequest,
+    wanted: Sequence[str] | None,
+) -> Part:
     db = known.db
     layout = request.layout
     address = Address.of(db, stored)
-    contents = stored.contents.get(GROUP[layout], {"variables": [], "sizes": {}, "labels": {}})
+    contents = stored.contents.get(
+        GROUP[layout], {"variables": [], "sizes": {}, "labels": {}}
+    )
     variables = list(contents["variables"])
     sizes = dict(contents["sizes"])
     labels = dict(contents["labels"])
     coords = _coords(known, record.take)
     if layout == "tables":
-        return Part(record.take, coords, variables, sizes, labels, StoredTables(address))
+        return Part(
+            record.take, coords, variables, sizes, labels, StoredTables(address)
+        )
     if layout == "maps" or "surfel_index" not in variables:
-        return Part(record.take, coords, variables, sizes, labels, StoredGroup(address, GROUP[layout]))
+        return Part(
+            record.take,
+            coords,
+            variables,
+            sizes,
+            labels,
+            StoredGroup(address, GROUP[layout]),
+        )
     capture = _capture_of(db, known.record("model", record.take))
     if capture is None or (wanted is not None and not {SAMPLES, *DOME} & set(wanted)):
-        return Part(record.take, coords, variables, sizes, labels, StoredGroup(address, GROUP[layout]))
+        return Part(
+            record.take,
+            coords,
+            variables,
+            sizes,
+            labels,
+            StoredGroup(address, GROUP[layout]),
+        )
     dome_sizes, dome_labels = _dome(db, capture)
     return Part(
         record.take,
@@ -320,15 +444,23 @@ def _dome(db: Database, capture: Record) -> tuple[dict[str, int], dict[str, list
     else:  # the record of a capture of schema version 1 does not contain them
         dome = _group(Address.of(db, capture), "dome")
         sizes = {str(dim): size for dim, size in dome.sizes.items()}
-        labels = {str(dim): dome[dim].values.tolist() for dim in dome.dims if dim in dome.coords}
+        labels = {
+            str(dim): dome[dim].values.tolist()
+            for dim in dome.dims
+            if dim in dome.coords
+        }
     dims = ("light", "camera", "channel", "xyz")
-    return {d: sizes[d] for d in dims if d in sizes}, {d: labels[d] for d in dims if d in labels}
+    return {d: sizes[d] for d in dims if d in sizes}, {
+        d: labels[d] for d in dims if d in labels
+    }
 
 
 def _have_same_dome(parts: Sequence[Part]) -> bool:
     """Whether all takes were measured under the same lights by the same cameras."""
     domes = [(part.labels.get("light"), part.labels.get("camera")) for part in parts]
-    return all(SAMPLES in part.variables for part in parts) and all(dome == domes[0] for dome in domes)
+    return all(SAMPLES in part.variables for part in parts) and all(
+        dome == domes[0] for dome in domes
+    )
 
 
 def _without_variables(part: Part, names: Iterable[str]) -> Part:
@@ -349,8 +481,12 @@ def _group(address: Address, name: str) -> xr.Dataset:
 
 
 def _require_recorded(record: Record, name: str, ds: xr.Dataset) -> xr.Dataset:
-    """Return the group, which must match the description in its record that defines the layout of the cohort."""
+    """Return the group, which must match the description in its record that defines the
+    layout of the cohort.
+    """
     if name in record.contents and describe(ds) != record.contents[name]:
         where = f"{record.kind} {record.generation} of {record.take}"
-        raise InputError(Fault(where, AS_RECORDED, f"a different group {name}", RESTORE))
+        raise InputError(
+            Fault(where, AS_RECORDED, f"a different group {name}", RESTORE)
+        )
     return ds

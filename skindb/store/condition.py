@@ -1,8 +1,9 @@
 """Conditions on the columns of the catalogue, in a small language that evaluates no code.
 
-A condition is parsed by `ast`, and every node must be one of this language: comparisons of columns with literals or
-other columns, which may be chained, ``and``, ``or``, ``not``, ``in``, and ``is missing``. As in SQL, a comparison with
-a missing value is neither true nor false.
+A condition is parsed by `ast`, and every node must be one of this language: comparisons
+of columns with literals or other columns, which may be chained, ``and``, ``or``,
+``not``, ``in``, and ``is missing``. As in SQL, a comparison with a missing value is
+neither true nor false.
 """
 
 from __future__ import annotations
@@ -77,13 +78,20 @@ def evaluate(text: str, columns: Mapping[str, Column]) -> tuple[Truth, list[str]
         If the text is no condition, names an unknown column, or compares values of different kinds.
     """
     tree, quoted = _parsed(text)
-    names = {unicodedata.normalize("NFKC", name): name for name in columns}  # as `ast` normalises names
+    # as `ast` normalises names
+    names = {unicodedata.normalize("NFKC", name): name for name in columns}
     names |= {name: name for name in columns} | quoted
     evaluation = _Evaluation(text, columns, names)
     truth = evaluation.truth(tree, 1)
-    operands = [names[node.id] for node in ast.walk(tree) if isinstance(node, ast.Name) and node.id in names]
+    operands = [
+        names[node.id]
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Name) and node.id in names
+    ]
     if not operands:
-        raise evaluation.fault("must name a column of the catalogue", "values alone", EXAMPLE)
+        raise evaluation.fault(
+            "must name a column of the catalogue", "values alone", EXAMPLE
+        )
     return truth, list(dict.fromkeys(operands))
 
 
@@ -94,7 +102,9 @@ def is_missing(value: Any) -> bool:
 
 @dataclass(frozen=True)
 class _Evaluation:
-    """Evaluation of the parts of one condition, which refuses every part that is not of the language."""
+    """Evaluation of the parts of one condition, which refuses every part that is not of
+    the language.
+    """
 
     text: str
     columns: Mapping[str, Column]
@@ -103,28 +113,58 @@ class _Evaluation:
     def truth(self, node: ast.expr, depth: int) -> Truth:
         """Whether each row fulfils a part of the condition."""
         if depth > MAX_DEPTH:
-            raise self.fault(f"may be nested {MAX_DEPTH} times", "more levels", "write a simpler condition")
+            raise self.fault(
+                f"may be nested {MAX_DEPTH} times",
+                "more levels",
+                "write a simpler condition",
+            )
         match node:
             case ast.BoolOp(op=op, values=parts):
-                return _combined([self.truth(part, depth + 1) for part in parts], decisive=isinstance(op, ast.Or))
+                return _combined(
+                    [self.truth(part, depth + 1) for part in parts],
+                    decisive=isinstance(op, ast.Or),
+                )
             case ast.UnaryOp(op=ast.Not(), operand=operand):
-                return [None if one is None else not one for one in self.truth(operand, depth + 1)]
-            case ast.Compare(left=left, ops=[ast.Is() | ast.IsNot() as op], comparators=[ast.Name(id="missing")]):
-                return [is_missing(value) == isinstance(op, ast.Is) for value in self.values(left)]
-            case ast.Compare(left=left, ops=[ast.In() | ast.NotIn() as op], comparators=[right]):
-                return [one if one is None else one == isinstance(op, ast.In) for one in self.contained(left, right)]
+                return [
+                    None if one is None else not one
+                    for one in self.truth(operand, depth + 1)
+                ]
+            case ast.Compare(
+                left=left,
+                ops=[ast.Is() | ast.IsNot() as op],
+                comparators=[ast.Name(id="missing")],
+            ):
+                return [
+                    is_missing(value) == isinstance(op, ast.Is)
+                    for value in self.values(left)
+                ]
+            case ast.Compare(
+                left=left, ops=[ast.In() | ast.NotIn() as op], comparators=[right]
+            ):
+                return [
+                    one if one is None else one == isinstance(op, ast.In)
+                    for one in self.contained(left, right)
+                ]
             case ast.Compare(left=left, ops=ops, comparators=comparators):
                 if not {*map(type, ops)} <= {*COMPARISONS}:
-                    rule = "must use 'is' as in 'age is missing', and 'in' without other comparisons beside it"
+                    rule = (
+                        "must use 'is' as in 'age is missing', and 'in' without other "
+                        "comparisons beside it"
+                    )
                     raise self.fault(rule, "another use", EXAMPLE)
                 sides = [self.values(side) for side in (left, *comparators)]
-                links = [self.compared(op, *pair) for op, pair in zip(ops, pairwise(sides), strict=True)]
+                links = [
+                    self.compared(op, *pair)
+                    for op, pair in zip(ops, pairwise(sides), strict=True)
+                ]
                 return _combined(links, decisive=False)
             case ast.Name():
                 values = self.values(node)
                 if _kinds(values) - {TRUTH}:
                     found = f"{self.column(node.id)} alone"
-                    raise self.fault("must compare a column of text or numbers", found, EXAMPLE)
+                    raise self.fault(
+                        "must compare a column of text or numbers", found, EXAMPLE
+                    )
                 return [None if is_missing(value) else bool(value) for value in values]
         raise self.refused(node)
 
@@ -140,11 +180,19 @@ class _Evaluation:
         name = self.names.get(name, name)
         if name in self.columns:
             return name
-        shown = name if name.isascii() else f"{name} ({name.encode('ascii', 'backslashreplace').decode()})"
-        near = difflib.get_close_matches(name.lower(), [*self.columns, "True", "False"], n=1)
+        shown = (
+            name
+            if name.isascii()
+            else f"{name} ({name.encode('ascii', 'backslashreplace').decode()})"
+        )
+        near = difflib.get_close_matches(
+            name.lower(), [*self.columns, "True", "False"], n=1
+        )
         hint = f"did you mean {near[0]}? " if near else ""
         cure = f"{hint}Text needs quotes; columns: {', '.join(self.columns)}"
-        raise self.fault("must name columns of the catalogue", f"the name {shown}", cure)
+        raise self.fault(
+            "must name columns of the catalogue", f"the name {shown}", cure
+        )
 
     def literal(self, node: ast.expr) -> Any:
         """The text, number or truth value of a literal."""
@@ -156,7 +204,9 @@ class _Evaluation:
             return node.value
         if isinstance(node, ast.Constant) and node.value is None:
             cure = "write, for example: age is missing"
-            raise self.fault("must write 'is missing' for a missing value", "None", cure)
+            raise self.fault(
+                "must write 'is missing' for a missing value", "None", cure
+            )
         raise self.refused(node)
 
     def compared(self, op: ast.cmpop, left: Column, right: Column) -> Truth:
@@ -169,30 +219,48 @@ class _Evaluation:
         return [_compared(op, *pair) for pair in zip(left, right, strict=True)]
 
     def contained(self, left: ast.expr, right: ast.expr) -> Truth:
-        """Whether the value of each row is in a list of literals, or its text is a part of another text."""
+        """Whether the value of each row is in a list of literals, or its text is a part
+        of another text.
+        """
         values = self.values(left)
         if isinstance(right, ast.List | ast.Tuple | ast.Set):
             elements: Column = [self.literal(element) for element in right.elts]
             if not elements:
-                raise self.fault("must have at least one value after 'in'", "an empty list", EXAMPLE)
+                raise self.fault(
+                    "must have at least one value after 'in'", "an empty list", EXAMPLE
+                )
             if DATE in _kinds(values):
                 elements = self.dates(elements)
             for kind in _kinds(elements):
                 self.require_alike(_kinds(values), {kind})
             keys = {(_kind(element), element) for element in elements}
-            return [None if is_missing(value) else (_kind(value), value) in keys for value in values]
+            return [
+                None if is_missing(value) else (_kind(value), value) in keys
+                for value in values
+            ]
         texts = self.values(right)
         if not _kinds(values) | _kinds(texts) <= {TEXT}:
             cure = "write, for example: condition in ['lotion', 'normal']"
-            raise self.fault("must have a list or a text after 'in', and a text before a text", "other values", cure)
-        return [None if is_missing(a) or is_missing(b) else a in b for a, b in zip(values, texts, strict=True)]
+            raise self.fault(
+                "must have a list or a text after 'in', and a text before a text",
+                "other values",
+                cure,
+            )
+        return [
+            None if is_missing(a) or is_missing(b) else a in b
+            for a, b in zip(values, texts, strict=True)
+        ]
 
-    def require_alike(self, left: set[str], right: set[str], *, order: bool = False) -> None:
+    def require_alike(
+        self, left: set[str], right: set[str], *, order: bool = False
+    ) -> None:
         """Refuse a comparison of two kinds of values; a column of several kinds has no order."""
         if (order and len(left | right) > 1) or (left and right and not left & right):
             found = f"{' and '.join(sorted(left))} beside {' and '.join(sorted(right))}"
             cure = "put text in quotes, and write numbers without them"
-            raise self.fault("must compare text with text and numbers with numbers", found, cure)
+            raise self.fault(
+                "must compare text with text and numbers with numbers", found, cure
+            )
 
     def dates(self, values: Column) -> Column:
         """Dates from texts, in UTC without a time zone as those of the catalogue."""
@@ -203,31 +271,52 @@ class _Evaluation:
                 continue
             try:
                 moment = datetime.fromisoformat(value)
-                dates.append(moment.astimezone(UTC).replace(tzinfo=None) if moment.tzinfo else moment)
+                dates.append(
+                    moment.astimezone(UTC).replace(tzinfo=None)
+                    if moment.tzinfo
+                    else moment
+                )
             except (ValueError, OverflowError):
-                raise self.fault("must compare a date with a date", repr(value), "write it like '2026-11-01'") from None
+                raise self.fault(
+                    "must compare a date with a date",
+                    repr(value),
+                    "write it like '2026-11-01'",
+                ) from None
         return dates
 
     def refused(self, node: ast.AST) -> InputError:
         """Error for a part that is not of the language."""
         found = REFUSED.get(type(node), "another expression")
-        return self.fault("must compare columns of the catalogue with values", found, EXAMPLE)
+        return self.fault(
+            "must compare columns of the catalogue with values", found, EXAMPLE
+        )
 
     def fault(self, rule: str, found: str, cure: str) -> InputError:
         """Error of this condition."""
-        return InputError(Fault("where", f"a condition {rule}", f"{found} in {self.text!r}", cure))
+        return InputError(
+            Fault("where", f"a condition {rule}", f"{found} in {self.text!r}", cure)
+        )
 
 
 def _parsed(text: str) -> tuple[ast.expr, dict[str, str]]:
     """The tree of a condition, and the column by each name that stands for one in backticks."""
     if len(text) > MAX_CHARACTERS:
         rule = f"a condition must have at most {MAX_CHARACTERS:,} characters"
-        raise InputError(Fault("where", rule, f"{len(text):,}", "select the takes in several steps"))
+        raise InputError(
+            Fault("where", rule, f"{len(text):,}", "select the takes in several steps")
+        )
     quoted = dict[str, str]()
 
     def name(token: re.Match[str]) -> str:
         if token[3]:
-            raise InputError(Fault("where", "a condition must have no comment", "the character #", "remove it"))
+            raise InputError(
+                Fault(
+                    "where",
+                    "a condition must have no comment",
+                    "the character #",
+                    "remove it",
+                )
+            )
         if token[2] is None:
             return token[0]
         quoted[f"_quoted_{len(quoted)}"] = token[2]
@@ -240,7 +329,9 @@ def _parsed(text: str) -> tuple[ast.expr, dict[str, str]]:
             return ast.parse(plain, mode="eval").body, quoted
     except (SyntaxError, ValueError, MemoryError, RecursionError) as error:
         found = f"{text!r} ({error.msg if isinstance(error, SyntaxError) else error})"
-        raise InputError(Fault("where", "a condition must follow the grammar", found, EXAMPLE)) from None
+        raise InputError(
+            Fault("where", "a condition must follow the grammar", found, EXAMPLE)
+        ) from None
 
 
 def _compared(op: ast.cmpop, left: Any, right: Any) -> bool | None:

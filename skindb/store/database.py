@@ -20,7 +20,14 @@ from skindb.store.audit import AuditEntry, append_entry, read_audit
 from skindb.store.backup import BackupReport, create_backup, erase_from_archive
 from skindb.store.catalogue import CATALOGUE_KINDS, matching, table
 from skindb.store.cohort import Layout, cohort
-from skindb.store.erasure import Erasure, Holdings, erase, erase_withdrawn, holdings_of, subject_holdings
+from skindb.store.erasure import (
+    Erasure,
+    Holdings,
+    erase,
+    erase_withdrawn,
+    holdings_of,
+    subject_holdings,
+)
 from skindb.store.garbage import Garbage, find_garbage, remove_garbage
 from skindb.store.kinds import CALIBRATION, KINDS_WITHOUT_SUBJECT, RELEASE, STUDY
 from skindb.store.known import Known, Snapshot, consent_of
@@ -28,7 +35,14 @@ from skindb.store.lease import LEASE_SECONDS, Lease
 from skindb.store.location import place_at
 from skindb.store.log import Log
 from skindb.store.marker_file import note_consents, note_withdrawals
-from skindb.store.markers import Entry, Markers, WithdrawnError, last_entry, read_markers, readmit
+from skindb.store.markers import (
+    Entry,
+    Markers,
+    WithdrawnError,
+    last_entry,
+    read_markers,
+    readmit,
+)
 from skindb.store.paths import KIND, TAKE, TRANSIENT, require_text, subject_of
 from skindb.store.place import UnavailableError
 from skindb.store.record import Record, json_object
@@ -41,7 +55,12 @@ from skindb.store.verified import VerifiedStore, read_beside
 from skindb.store.verify import database_faults
 
 # kinds without takes -> section of `Database.info` that lists them
-INFO_SECTIONS = {STUDY: "studies", RELEASE: "releases", CALIBRATION: "calibrations", CONSENT: "consents"}
+INFO_SECTIONS = {
+    STUDY: "studies",
+    RELEASE: "releases",
+    CALIBRATION: "calibrations",
+    CONSENT: "consents",
+}
 
 
 class Database:
@@ -50,7 +69,8 @@ class Database:
     Parameters
     ----------
     url
-        Folder, created by the first commit, or ``s3://bucket/prefix`` in an existing bucket; see docs/howto/bucket.md.
+        Folder, created by the first commit, or ``s3://bucket/prefix`` in an existing
+        bucket; see docs/howto/bucket.md.
     """
 
     def __init__(self, url: str | os.PathLike[str]) -> None:
@@ -62,13 +82,17 @@ class Database:
         return f"<skindb.Database {self.url!r}: {len(self.takes())} takes>"
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Database) and self._absolute_url() == other._absolute_url()
+        return (
+            isinstance(other, Database)
+            and self._absolute_url() == other._absolute_url()
+        )
 
     def __hash__(self) -> int:
         return hash(self._absolute_url())
 
     def __reduce__(self) -> tuple[type[Database], tuple[str]]:
-        return Database, (self._absolute_url(),)  # another process may have another working directory
+        # another process may have another working directory
+        return Database, (self._absolute_url(),)
 
     @property
     def url(self) -> str:
@@ -79,7 +103,14 @@ class Database:
     def root(self) -> Path:
         """The folder of the database; `InputError` if it is in a bucket."""
         if self.folder is None:
-            raise InputError(Fault(self.url, "the database must be in a local folder", "a bucket", "use db.url"))
+            raise InputError(
+                Fault(
+                    self.url,
+                    "the database must be in a local folder",
+                    "a bucket",
+                    "use db.url",
+                )
+            )
         return self.folder
 
     def scratch(self) -> Path:
@@ -87,22 +118,40 @@ class Database:
         return self._place.scratch()
 
     def names(self) -> list[str] | None:
-        """Names at the top level of the folder or bucket; None if the database does not exist yet."""
+        """Names at the top level of the folder or bucket; None if the database does not
+        exist yet.
+        """
         return self._place.names()
 
     def has(self, kind: str, take: str, *, markers: Markers | None = None) -> bool:
         """Whether a take has a version of this kind; for `markers` see `record`."""
         markers = self.markers() if markers is None else markers
-        return not Log(self._place, kind, take).is_empty() and not markers.hides(kind, take)
+        return not Log(self._place, kind, take).is_empty() and not markers.hides(
+            kind, take
+        )
 
     def kinds(self, take: str | None = None) -> list[str]:
         """Kinds of the versions of one take or of all takes, without the transient kinds."""
-        names = sorted({*self._place.children("log"), *self._head_names("")} - {*TRANSIENT})
+        names = sorted(
+            {*self._place.children("log"), *self._head_names("")} - {*TRANSIENT}
+        )
         markers = self.markers()
-        takes = {kind: self._takes(kind, markers) for kind in names if re.fullmatch(KIND, kind)}
-        return [kind for kind, there in takes.items() if (take in there if take else there)]
+        takes = {
+            kind: self._takes(kind, markers)
+            for kind in names
+            if re.fullmatch(KIND, kind)
+        }
+        return [
+            kind for kind, there in takes.items() if (take in there if take else there)
+        ]
 
-    def takes(self, kind: str = "capture", *, where: str | None = None, release: str | None = None) -> list[str]:
+    def takes(
+        self,
+        kind: str = "capture",
+        *,
+        where: str | None = None,
+        release: str | None = None,
+    ) -> list[str]:
         """Takes with a committed version of this kind.
 
         Takes whose records were lost are included; reading them raises an error.
@@ -112,8 +161,8 @@ class Database:
         kind
             Kind of the versions.
         where
-            Condition on the columns of `table`: comparisons with ``and``, ``or``, ``not``, ``in`` and ``is missing``,
-            see docs/howto/database.md.
+            Condition on the columns of `table`: comparisons with ``and``, ``or``,
+            ``not``, ``in`` and ``is missing``, see docs/howto/database.md.
         release
             Name of a release, to list only the takes of which it names such a version.
 
@@ -132,7 +181,11 @@ class Database:
         >>> db.takes(where="condition == 'lotion' and age > 40 and fit_k == 4")  # doctest: +SKIP
         """
         if where is None:
-            return self._takes(kind, self.markers()) if release is None else sorted(Known(self, release).takes(kind))
+            return (
+                self._takes(kind, self.markers())
+                if release is None
+                else sorted(Known(self, release).takes(kind))
+            )
         known = Known(self, release, RecordCache(self, self._place))
         rows = _table(known)
         return sorted(matching(rows[rows.index.isin(known.takes(kind))], where))
@@ -141,14 +194,25 @@ class Database:
         require_text(kind, KIND, "kind")
         known = takes_in_log(self._place, kind)
         cached = {name.removesuffix(".json") for name in self._head_names(kind)} - known
-        lost = {take for take in cached if re.fullmatch(TAKE, take) and not Log(self._place, kind, take).is_empty()}
+        lost = {
+            take
+            for take in cached
+            if re.fullmatch(TAKE, take) and not Log(self._place, kind, take).is_empty()
+        }
         return sorted(take for take in known | lost if not markers.hides(kind, take))
 
     def subjects(self) -> list[str]:
         """Subjects with at least one capture."""
         return sorted({subject_of(take) for take in self.takes("capture")})
 
-    def record(self, kind: str, take: str, generation: int | None = None, *, markers: Markers | None = None) -> Record:
+    def record(
+        self,
+        kind: str,
+        take: str,
+        generation: int | None = None,
+        *,
+        markers: Markers | None = None,
+    ) -> Record:
         """The record of a version, by default the current one.
 
         Parameters
@@ -161,7 +225,8 @@ class Database:
         Raises
         ------
         InputError
-            If the version does not exist, if its record is damaged, or if it refers to a withdrawn subject.
+            If the version does not exist, if its record is damaged, or if it refers to
+            a withdrawn subject.
         """
         markers = self.markers() if markers is None else markers
         try:
@@ -174,7 +239,14 @@ class Database:
                 raise self._missing_error(kind, take)
             what = f"{kind} {record.generation} of {take}"
             rule = "a version must not refer to a withdrawn subject"
-            raise WithdrawnError(Fault(what, rule, "a withdrawal that is not complete", "run skindb refresh"))
+            raise WithdrawnError(
+                Fault(
+                    what,
+                    rule,
+                    "a withdrawal that is not complete",
+                    "run skindb refresh",
+                )
+            )
         return record
 
     def markers(self) -> Markers:
@@ -205,9 +277,20 @@ class Database:
     def readable_history(self, kind: str, take: str) -> list[Record]:
         """All readable records, oldest first; damaged ones are skipped."""
         markers = self.markers()
-        return [record for record in Log(self._place, kind, take).readable() if markers.admits(record)]
+        return [
+            record
+            for record in Log(self._place, kind, take).readable()
+            if markers.admits(record)
+        ]
 
-    def read(self, kind: str, take: str, *, generation: int | None = None, release: str | None = None) -> xr.DataTree:
+    def read(
+        self,
+        kind: str,
+        take: str,
+        *,
+        generation: int | None = None,
+        release: str | None = None,
+    ) -> xr.DataTree:
         """A version as a lazy DataTree, in blocks of 4,096 surfels.
 
         Every file is verified against its committed digest before it is used.
@@ -224,17 +307,23 @@ class Database:
         Returns
         -------
         DataTree
-            The attributes of its root are its provenance. `generation` is the generation of the version, and
-            `consent_scope` is the present consent of the subject, see `consent`: a narrower consent also applies to
-            versions that were made before it.
+            The attributes of its root are its provenance. `generation` is the
+            generation of the version, and `consent_scope` is the present consent of the
+            subject, see `consent`: a narrower consent also applies to versions that
+            were made before it.
 
         Raises
         ------
         InputError
-            If the version does not exist, or if one of its files is missing or has a different size. A file with
-            changed content raises an `InputError` when values that need it are computed.
+            If the version does not exist, or if one of its files is missing or has a
+            different size. A file with changed content raises an `InputError` when
+            values that need it are computed.
         """
-        pinned = None if release is None else pinned_record(self, pins_of(self, release), kind, take)
+        pinned = (
+            None
+            if release is None
+            else pinned_record(self, pins_of(self, release), kind, take)
+        )
         record = pinned or self.record(kind, take, generation)
         store = VerifiedStore(self._place, record)
         # chunks={} would use the inner chunks, which gives sixteen times as many tasks
@@ -247,9 +336,15 @@ class Database:
         return blocked
 
     def _consent_of(self, take: str) -> dict[Any, Any]:
-        """Consent attributes of a version that is read; the scope is empty if the newest record was lost."""
+        """Consent attributes of a version that is read; the scope is empty if the
+        newest record was lost.
+        """
         try:
-            says = self.has(CONSENT, subject_of(take)) or self.has("capture", take) or self.has("model", take)
+            says = (
+                self.has(CONSENT, subject_of(take))
+                or self.has("capture", take)
+                or self.has("model", take)
+            )
             return {"consent_scope": self.consent(take)} if says else {}
         except InputError:
             return {"consent_scope": []}
@@ -257,21 +352,22 @@ class Database:
     def consent(self, take: str) -> list[str]:
         """Scopes that the subject of a take consents to, from the newest record of consent.
 
-        Without such a record they are those of the newest capture of the take, or of its newest model if there is no
-        capture.
+        Without such a record they are those of the newest capture of the take, or of
+        its newest model if there is no capture.
         """
         return list(consent_of(Snapshot(self), take))
 
     def record_consent(self, subject: str, scope: Iterable[str]) -> Record:
-        """Record the consent of a subject, which takes effect immediately for all present and future versions.
+        """Record the consent of a subject, which takes effect immediately for all
+        present and future versions.
 
         Parameters
         ----------
         subject
             A subject with at least one version of a take.
         scope
-            Names from `skindb.schema.consent.SCOPES`; empty for no consent. Captures that are ingested later do not
-            change it.
+            Names from `skindb.schema.consent.SCOPES`; empty for no consent. Captures
+            that are ingested later do not change it.
 
         Raises
         ------
@@ -290,32 +386,52 @@ class Database:
         return record
 
     def consent_history(self, subject: str) -> list[dict[str, Any]]:
-        """History of the consent of a subject, oldest first: created, scope and source (a capture or a record)."""
+        """History of the consent of a subject, oldest first: created, scope and source
+        (a capture or a record).
+        """
         given = [
             (record, f"capture of {take}")
             for take in self.takes("capture")
             if subject_of(take) == subject
             for record in [self.record("capture", take)]
         ]
-        given += [(record, "record") for record in self.history(CONSENT, subject)] if self.has(CONSENT, subject) else []
+        given += (
+            [(record, "record") for record in self.history(CONSENT, subject)]
+            if self.has(CONSENT, subject)
+            else []
+        )
         if not given:
             self._require_subject(subject)
         return [
-            {"created": record.created, "scope": list(consent_scope(record.provenance)), "source": source}
+            {
+                "created": record.created,
+                "scope": list(consent_scope(record.provenance)),
+                "source": source,
+            }
             for record, source in given
         ]
 
     def read_group(self, record: Record, group: str) -> xr.Dataset:
-        """One group of a version, lazy and verified as in `read`, without opening the other groups."""
+        """One group of a version, lazy and verified as in `read`, without opening the
+        other groups.
+        """
         store = VerifiedStore(self._place, record)
-        ds = xr.open_dataset(store, engine="zarr", group=group, consolidated=False, chunks=None)  # type: ignore[arg-type]
+        ds = xr.open_dataset(
+            store,  # type: ignore[arg-type]
+            engine="zarr",
+            group=group,
+            consolidated=False,
+            chunks=None,
+        )
         return _chunked(ds)
 
     def tables(self, record: Record) -> xr.Dataset:
         """The tables kept beside a version; empty if it has none."""
         if not record.tables:
             return xr.Dataset()
-        return tables_from_json(json_object(read_beside(self._place, record, TABLES, record.tables)))
+        return tables_from_json(
+            json_object(read_beside(self._place, record, TABLES, record.tables))
+        )
 
     def cohort(
         self,
@@ -332,50 +448,70 @@ class Database:
     ) -> xr.Dataset:
         """A lazy Dataset of the population with one entry per take.
 
-        Opening it only reads the records of the log; values are read and verified when they are computed.
+        Opening it only reads the records of the log; values are read and verified when
+        they are computed.
 
         Parameters
         ----------
         layout
-            "tables": values per take, region and probe site. "surfels": a random sample of fitted surfels per take,
-            with their weights, albedo and normals and, if all takes share a dome, the reflectance samples that were
-            measured there. "maps": albedo and translucency in the common (u, v) of registered takes.
+            "tables": values per take, region and probe site. "surfels": a random sample
+            of fitted surfels per take, with their weights, albedo and normals and, if
+            all takes share a dome, the reflectance samples that were measured there.
+            "maps": albedo and translucency in the common (u, v) of registered takes.
         kind
             "model", or "registration", which adds the regions that the landmarks define.
         variables
-            Names of variables, by default all. "reflectance_sample" can also be requested if the takes do not share a
-            dome; lights and cameras that a take does not have are then NaN.
+            Names of variables, by default all. "reflectance_sample" can also be
+            requested if the takes do not share a dome; lights and cameras that a take
+            does not have are then NaN.
         takes
-            Names of takes, by default all. Takes whose consent does not cover statistics are skipped and listed in
-            the attribute "skipped".
+            Names of takes, by default all. Takes whose consent does not cover
+            statistics are skipped and listed in the attribute "skipped".
         dim
             "take", or "subject" for one take per subject, in the condition normal.
         surfels, seed
-            Number of surfels of each take, and the random seed of the sample. Models store 5,000 with seed 0.
+            Number of surfels of each take, and the random seed of the sample. Models
+            store 5,000 with seed 0.
         size
             Number of texels along each side of the maps; registrations store 512.
         release
-            Name of a release, whose captures, models and registrations are used instead of the newest ones.
+            Name of a release, whose captures, models and registrations are used instead
+            of the newest ones.
 
         Returns
         -------
         Dataset
-            Coordinates along "take" are subject, condition, session, the attributes of the captures, and the
-            parameters of the fit as ``fit_k``, ``fit_eta`` and so on. Values that a take does not have are NaN.
+            Coordinates along "take" are subject, condition, session, the attributes of
+            the captures, and the parameters of the fit as ``fit_k``, ``fit_eta`` and so
+            on. Values that a take does not have are NaN.
 
         Raises
         ------
         InputError
-            If a take or variable does not exist, if no subject consents to statistics, or if the requested sample or
-            size is not stored; `skindb.workflow.summarise` stores others.
+            If a take or variable does not exist, if no subject consents to statistics,
+            or if the requested sample or size is not stored;
+            `skindb.workflow.summarise` stores others.
 
         Examples
         --------
         >>> cohort = db.cohort("tables")  # doctest: +SKIP
         >>> cohort.region_diffuse_reflectance.groupby("gender").mean()  # doctest: +SKIP
         """
-        options: dict[str, Any] = {"kind": kind, "variables": variables, "takes": takes, "dim": dim}
-        return cohort(self, layout, **options, surfels=surfels, size=size, seed=seed, release=release)
+        options: dict[str, Any] = {
+            "kind": kind,
+            "variables": variables,
+            "takes": takes,
+            "dim": dim,
+        }
+        return cohort(
+            self,
+            layout,
+            **options,
+            surfels=surfels,
+            size=size,
+            seed=seed,
+            release=release,
+        )
 
     def table(self, *, release: str | None = None) -> pd.DataFrame:
         """The catalogue, with one row per take.
@@ -388,18 +524,21 @@ class Database:
         Returns
         -------
         DataFrame
-            Columns: subject, condition, session, the attributes of the captures, the parameters of the fit as
-            ``fit_k`` and so on, generation and date (UTC) of capture, model and registration, consent, the fraction of
-            surfels with each status of the fit, and whether there is a newer capture than that of the model
-            (``outdated``). Values that a take does not have are NaN.
+            Columns: subject, condition, session, the attributes of the captures, the
+            parameters of the fit as ``fit_k`` and so on, generation and date (UTC) of
+            capture, model and registration, consent, the fraction of surfels with each
+            status of the fit, and whether there is a newer capture than that of the
+            model (``outdated``). Values that a take does not have are NaN.
         """
         return _table(Known(self, release, RecordCache(self, self._place)))
 
     def create_release(self, name: str, takes: Sequence[str] | None = None) -> Record:
-        """Record the present versions of takes (capture, model and registration of each) as a release.
+        """Record the present versions of takes (capture, model and registration of
+        each) as a release.
 
-        Cohorts and studies of a release give the same values after later fits. A release never changes; only the
-        withdrawal of a subject creates a new revision of it.
+        Cohorts and studies of a release give the same values after later fits. A
+        release never changes; only the withdrawal of a subject creates a new revision
+        of it.
 
         Parameters
         ----------
@@ -416,11 +555,17 @@ class Database:
         return create_release(self, name, takes)
 
     def commit_release(self, name: str, pins: Iterable[Mapping[str, Any]]) -> Record:
-        """Commit the next revision of a release, which names these versions; prefer `create_release`."""
+        """Commit the next revision of a release, which names these versions; prefer
+        `create_release`.
+        """
         return commit_release(self._place, name, pins)
 
-    def source(self, version: xr.DataTree, kind: str = "capture", take: str | None = None) -> xr.DataTree:
-        """The input of this kind, and of this take if one is given, from which a version was made."""
+    def source(
+        self, version: xr.DataTree, kind: str = "capture", take: str | None = None
+    ) -> xr.DataTree:
+        """The input of this kind, and of this take if one is given, from which a
+        version was made.
+        """
         where = str(version.attrs.get("take", "version"))
         for made_from in version.attrs.get("inputs", []):
             if made_from["kind"] == kind and take in (None, made_from["take"]):
@@ -428,26 +573,55 @@ class Database:
                 if made_from.get("seal", record.seal) != record.seal:
                     rule = f"the {kind} it was made from must exist"
                     found = "a different version of that generation"
-                    raise InputError(Fault(where, rule, found, "compute the version again"))
-                return self.read(kind, made_from["take"], generation=made_from["generation"])
-        raise InputError(Fault(where, f"its provenance must name a {kind}", "none", "compute the version again"))
+                    raise InputError(
+                        Fault(where, rule, found, "compute the version again")
+                    )
+                return self.read(
+                    kind, made_from["take"], generation=made_from["generation"]
+                )
+        raise InputError(
+            Fault(
+                where,
+                f"its provenance must name a {kind}",
+                "none",
+                "compute the version again",
+            )
+        )
 
-    def stage(self, kind: str, take: str, lease: Lease | None = None, *, names: Iterable[str] = ()) -> Stage:
-        """A new version to be written, under a lease if one is given, that refers to the takes `names`; see `Stage`."""
+    def stage(
+        self,
+        kind: str,
+        take: str,
+        lease: Lease | None = None,
+        *,
+        names: Iterable[str] = (),
+    ) -> Stage:
+        """A new version to be written, under a lease if one is given, that refers to
+        the takes `names`; see `Stage`.
+        """
         return Stage(self._place, kind, take, lease, names)
 
     def lease(
-        self, take: str, *kinds: str, wait: float = 0.0, seconds: float = LEASE_SECONDS, command: str = "python"
+        self,
+        take: str,
+        *kinds: str,
+        wait: float = 0.0,
+        seconds: float = LEASE_SECONDS,
+        command: str = "python",
     ) -> Lease:
-        """Lease of versions of these kinds of a take, which only one run can hold at a time; see `Lease`.
+        """Lease of versions of these kinds of a take, which only one run can hold at a
+        time; see `Lease`.
 
         Examples
         --------
-        >>> with db.lease("S01", "model", wait=60) as lease, db.stage("model", "S01", lease) as stage:  # doctest: +SKIP
-        ...     stage.write(groups)
-        ...     stage.commit({"command": "notebook"})
+        >>> with db.lease("S01", "model", wait=60) as lease:  # doctest: +SKIP
+        ...     with db.stage("model", "S01", lease) as stage:
+        ...         stage.write(groups)
+        ...         stage.commit({"command": "notebook"})
         """
-        return Lease(self._place, take, kinds, wait=wait, seconds=seconds, command=command)
+        return Lease(
+            self._place, take, kinds, wait=wait, seconds=seconds, command=command
+        )
 
     def remove(self, record: Record) -> None:
         """Remove a version permanently; a tombstone with the seal of its record remains."""
@@ -458,11 +632,15 @@ class Database:
         return subject_holdings(self._place, subject)
 
     def erase(self, subject: str, *, wait: float = 0.0) -> Erasure:
-        """Withdraw a subject and remove everything that refers to it; prefer `skindb.workflow.withdraw`."""
+        """Withdraw a subject and remove everything that refers to it; prefer
+        `skindb.workflow.withdraw`.
+        """
         return erase(self._place, subject, wait=wait)
 
     def complete_erasures(self) -> Erasure:
-        """Remove what interrupted withdrawals and writers that were suspended left of withdrawn subjects."""
+        """Remove what interrupted withdrawals and writers that were suspended left of
+        withdrawn subjects.
+        """
         return erase_withdrawn(self._place)
 
     def has_remains(self) -> bool:
@@ -470,7 +648,9 @@ class Database:
         return bool(holdings_of(self._place, self.markers()))
 
     def withdrawal(self, subject: str) -> Entry | None:
-        """The last withdrawal or readmission of a subject; None if the subject was never withdrawn."""
+        """The last withdrawal or readmission of a subject; None if the subject was
+        never withdrawn.
+        """
         return last_entry(self._place, subject)
 
     def readmit(self, subject: str, consent: date) -> None:
@@ -479,12 +659,19 @@ class Database:
         Raises
         ------
         InputError
-            If the subject was never withdrawn, if the date is before the withdrawal or in the future, or if data of
-            the subject remain.
+            If the subject was never withdrawn, if the date is before the withdrawal or
+            in the future, or if data of the subject remain.
         """
         if self.has_remains():
             rule = "a withdrawal must be complete before the subject is admitted again"
-            raise InputError(Fault(subject, rule, "data that are not removed yet", "run skindb clean --yes"))
+            raise InputError(
+                Fault(
+                    subject,
+                    rule,
+                    "data that are not removed yet",
+                    "run skindb clean --yes",
+                )
+            )
         readmit(self._place, subject, consent)
         note_withdrawals(self._place)
 
@@ -497,7 +684,8 @@ class Database:
         remove_request(self._place, request)
 
     def discard(self, kind: str, take: str, path: str) -> None:
-        """Remove the data of a version that a killed writer left; a version that a record names is kept.
+        """Remove the data of a version that a killed writer left; a version that a
+        record names is kept.
 
         Raises
         ------
@@ -507,35 +695,53 @@ class Database:
         if not path.startswith(f"data/{kind}/{take}/"):
             where = f"{self.url}: {path[:200]!r}"
             rule = f"must be the path of a {kind} of {take}"
-            raise InputError(Fault(where, rule, "a different path", "remove the folder tmp of the database"))
+            raise InputError(
+                Fault(
+                    where,
+                    rule,
+                    "a different path",
+                    "remove the folder tmp of the database",
+                )
+            )
         log = Log(self._place, kind, take)
         if path not in {log.read(generation).path for generation in log.generations()}:
             remove_version(self._place, path)
 
     def forget(self, kind: str, take: str) -> None:
-        """Remove all versions of a transient kind, such as the first pass of a fit, without a tombstone."""
+        """Remove all versions of a transient kind, such as the first pass of a fit,
+        without a tombstone.
+        """
         Log(self._place, kind, take).forget()
 
     def info(
-        self, *, takes: Sequence[str] | None = None, where: str | None = None, release: str | None = None
+        self,
+        *,
+        takes: Sequence[str] | None = None,
+        where: str | None = None,
+        release: str | None = None,
     ) -> dict[str, Any]:
-        """Summary of the database, {"takes": {take: {kind: {generation, path, created, bytes, status}}}}.
+        """Summary of the database, {"takes": {take: {kind: {generation, path, created,
+        bytes, status}}}}.
 
-        A version with a damaged record has only "fault". A version that is out of date also has "stale", a list of the
-        reasons. Studies, releases, calibrations and consents do not belong to a take: they are listed in the same form
-        under "studies", "releases", "calibrations" and "consents", if there are any; a consent has "scope" instead of
-        "status".
+        A version with a damaged record has only "fault". A version that is out of date
+        also has "stale", a list of the reasons. Studies, releases, calibrations and
+        consents do not belong to a take: they are listed in the same form under
+        "studies", "releases", "calibrations" and "consents", if there are any; a
+        consent has "scope" instead of "status".
 
         Parameters
         ----------
         takes
             Names of the only takes to list, without the other sections.
         where
-            Condition, see `takes`; only takes that fulfil it are listed, without the other sections.
+            Condition, see `takes`; only takes that fulfil it are listed, without the
+            other sections.
         release
             Name of a release, to list the versions that it names.
         """
-        found: dict[str, dict[str, Any]] = {name: {} for name in ("takes", *INFO_SECTIONS.values())}
+        found: dict[str, dict[str, Any]] = {
+            name: {} for name in ("takes", *INFO_SECTIONS.values())
+        }
         records = RecordCache(self, self._place)
         known = Known(self, release, records)
         stale = Staleness(self, records)
@@ -550,17 +756,29 @@ class Database:
             if chosen is not None and kind in INFO_SECTIONS:
                 continue
             part = found[INFO_SECTIONS.get(kind, "takes")]
-            for take in sorted(known.takes(kind) if chosen is None else known.takes(kind) & chosen):
+            for take in sorted(
+                known.takes(kind) if chosen is None else known.takes(kind) & chosen
+            ):
                 source = known if kind in CACHED_KINDS else whole
-                part.setdefault(take, {})[kind] = self._summary(source, stale, kind, take)
+                part.setdefault(take, {})[kind] = self._summary(
+                    source, stale, kind, take
+                )
         records.save()
-        return {name: dict(sorted(part.items())) for name, part in found.items() if part or name == "takes"}
+        return {
+            name: dict(sorted(part.items()))
+            for name, part in found.items()
+            if part or name == "takes"
+        }
 
     def log_action(self, action: str, **about: Any) -> None:
-        """Create an entry of the audit log, see `append_entry`; prefer `skindb.workflow.logged_action`."""
+        """Create an entry of the audit log, see `append_entry`; prefer
+        `skindb.workflow.logged_action`.
+        """
         append_entry(self._place, action, **about)
 
-    def audit(self, *, subject: str | None = None, where: str | None = None) -> tuple[list[AuditEntry], list[Fault]]:
+    def audit(
+        self, *, subject: str | None = None, where: str | None = None
+    ) -> tuple[list[AuditEntry], list[Fault]]:
         """The entries of the audit log, oldest first, and the faults of the whole log.
 
         Parameters
@@ -568,7 +786,8 @@ class Database:
         subject
             Pseudonym, to list only what concerns this subject.
         where
-            Condition, as in `takes`, on number, when, actor, action and subjects, which is their number.
+            Condition, as in `takes`, on number, when, actor, action and subjects, which
+            is their number.
         """
         return read_audit(self._place, subject=subject, where=where)
 
@@ -580,7 +799,9 @@ class Database:
         return self.url if self.folder is None else str(self.folder.absolute())
 
     def backup(self, url: str, *, verify: bool = False) -> BackupReport:
-        """Write a new state to the backup at a folder or bucket; prefer `skindb.workflow.backup`."""
+        """Write a new state to the backup at a folder or bucket; prefer
+        `skindb.workflow.backup`.
+        """
         return create_backup(self._place, Archive(place_at(url)), verify=verify)
 
     def require_backup(self, url: str) -> None:
@@ -590,27 +811,35 @@ class Database:
         archive.require_of(self._place)
 
     def erase_from_backup(self, url: str, *, wait: float = 0.0) -> int:
-        """Remove subjects who were withdrawn from all states of a backup; returns the number of removed files."""
+        """Remove subjects who were withdrawn from all states of a backup; returns the
+        number of removed files.
+        """
         return erase_from_archive(self._place, Archive(place_at(url)), wait=wait)
 
     def garbage(self, *, generations: int | None = None) -> list[Garbage]:
-        """Files to which no record refers, such as those of killed runs, with their sizes and reasons for keeping them.
+        """Files to which no record refers, such as those of killed runs, with their
+        sizes and reasons for keeping them.
 
         Parameters
         ----------
         generations
-            Number of newest generations of each kind and take to keep. Older generations are listed too, unless a
-            version that is kept was made from them. Consents, releases and calibrations are always kept. By default
-            all generations are kept.
+            Number of newest generations of each kind and take to keep. Older
+            generations are listed too, unless a version that is kept was made from
+            them. Consents, releases and calibrations are always kept. By default all
+            generations are kept.
         """
         return find_garbage(self._place, generations)
 
     def clean(self, *, generations: int | None = None) -> list[Garbage]:
-        """Remove and return what `garbage` lists without a reason for keeping it; old generations leave tombstones."""
+        """Remove and return what `garbage` lists without a reason for keeping it; old
+        generations leave tombstones.
+        """
         return remove_garbage(self._place, generations)
 
     def _head_names(self, kind: str) -> list[str]:
-        """Names of the heads of a kind, or of the kinds with heads; empty if this cache is damaged."""
+        """Names of the heads of a kind, or of the kinds with heads; empty if this cache
+        is damaged.
+        """
         try:
             return self._place.children(f"heads/{kind}".rstrip("/"))
         except UnavailableError:
@@ -620,28 +849,49 @@ class Database:
 
     def _require_subject(self, subject: str) -> None:
         known = sorted(
-            {subject_of(t) for kind in self.kinds() if kind not in KINDS_WITHOUT_SUBJECT for t in self.takes(kind)}
+            {
+                subject_of(t)
+                for kind in self.kinds()
+                if kind not in KINDS_WITHOUT_SUBJECT
+                for t in self.takes(kind)
+            }
         )
         if subject not in known:
-            there = f"subjects: {', '.join(known[:8]) or 'none'}" + (", ..." if len(known) > 8 else "")
+            there = f"subjects: {', '.join(known[:8]) or 'none'}" + (
+                ", ..." if len(known) > 8 else ""
+            )
             own = subject_of(subject)
-            cure = f"the subject of that take is {own}" if own in known else "see skindb info"
-            raise InputError(Fault(subject, "the database must hold the subject", there, cure))
+            cure = (
+                f"the subject of that take is {own}"
+                if own in known
+                else "see skindb info"
+            )
+            raise InputError(
+                Fault(subject, "the database must hold the subject", there, cure)
+            )
 
     def _require_version(self, kind: str, take: str) -> None:
-        """Raise an `InputError` that lists the existing takes or kinds, unless the take has a version of this kind."""
+        """Raise an `InputError` that lists the existing takes or kinds, unless the take
+        has a version of this kind.
+        """
         if not self.has(kind, take):
             raise self._missing_error(kind, take)
 
     def _missing_error(self, kind: str, take: str) -> InputError:
         takes = self.takes(kind)
         kinds = self.kinds()
-        there = f"takes: {', '.join(takes)}" if takes else f"no {kind}; kinds: {', '.join(kinds) or 'none'}"
+        there = (
+            f"takes: {', '.join(takes)}"
+            if takes
+            else f"no {kind}; kinds: {', '.join(kinds) or 'none'}"
+        )
         where = f"{self.url}: {kind} of {take}"
         rule = "the database must hold it"
         return InputError(Fault(where, rule, there, "see skindb info"))
 
-    def _summary(self, known: Known, stale: Staleness, kind: str, take: str) -> dict[str, Any]:
+    def _summary(
+        self, known: Known, stale: Staleness, kind: str, take: str
+    ) -> dict[str, Any]:
         try:
             record = known.record(kind, take)
             reasons = stale.reasons(record) if kind in DERIVED else ()
@@ -649,7 +899,12 @@ class Database:
             return {"fault": str(error)}
         path = self._place.url(record.path)
         created = record.created
-        summary = {"generation": record.generation, "path": path, "created": created, "bytes": record.bytes}
+        summary = {
+            "generation": record.generation,
+            "path": path,
+            "created": created,
+            "bytes": record.bytes,
+        }
         if kind == CONSENT:
             return summary | {"scope": list(consent_scope(record.provenance))}
         summary |= {"stale": list(map(str, reasons))} if reasons else {}

@@ -1,7 +1,7 @@
 """What a database holds of withdrawn subjects, and its permanent removal.
 
-Erasure computes nothing and needs no free space. `withdrawn/` alone determines what is removed, so that any run can
-complete an erasure that was interrupted.
+Erasure computes nothing and needs no free space. `withdrawn/` alone determines what is
+removed, so that any run can complete an erasure that was interrupted.
 """
 
 from __future__ import annotations
@@ -20,7 +20,13 @@ from typing import TypeVar
 from skindb.errors import Fault, InputError
 from skindb.schema.consent import CONSENT
 from skindb.store.folder import remove_tree
-from skindb.store.kinds import KINDS_OF_ONE_SUBJECT, KINDS_WITHOUT_SUBJECT, RELEASE, STUDY, SUMMARY
+from skindb.store.kinds import (
+    KINDS_OF_ONE_SUBJECT,
+    KINDS_WITHOUT_SUBJECT,
+    RELEASE,
+    STUDY,
+    SUMMARY,
+)
 from skindb.store.lease import Lease
 from skindb.store.log import Log, committed_logs, names_below
 from skindb.store.marker_file import note_withdrawals
@@ -30,17 +36,29 @@ from skindb.store.place import Place, UnavailableError
 from skindb.store.record import Record, subjects_of
 from skindb.store.record_cache import CATALOGUE, cache_names
 from skindb.store.release import commit_release
-from skindb.store.requests import PINS, TAKES, Request, read_requests, remove_request, write_request
+from skindb.store.requests import (
+    PINS,
+    TAKES,
+    Request,
+    read_requests,
+    remove_request,
+    write_request,
+)
 from skindb.store.stage import read_names, remove_version
 
 T = TypeVar("T")
-FOLDERS_WITH_TAKES = ("log", "data", "heads", "leases")  # folders with one entry per kind, and below it one per take
-REMOVAL_ORDER = ("edit", STUDY, RELEASE, SUMMARY, "registration")  # results before their inputs, and all others last
+# folders with one entry per kind, and below it one per take
+FOLDERS_WITH_TAKES = ("log", "data", "heads", "leases")
+# results before their inputs, and all others last
+REMOVAL_ORDER = ("edit", STUDY, RELEASE, SUMMARY, "registration")
 REGISTRATION = "registration"
 SUBJECT = r"[A-Za-z0-9_-]{1,64}"
-SCRATCH_NAME = re.compile(rf"({TAKE})-[0-9a-f]{{16}}")  # name of the scratch folder of an ingest
-ABANDONED_SCRATCH = ".gone"  # end of the name of a scratch folder whose removal was interrupted
-STEM = re.compile(rf"({TIME_HEX})\.")  # start of the names of a version and of the files beside it
+# name of the scratch folder of an ingest
+SCRATCH_NAME = re.compile(rf"({TAKE})-[0-9a-f]{{16}}")
+# end of the name of a scratch folder whose removal was interrupted
+ABANDONED_SCRATCH = ".gone"
+# start of the names of a version and of the files beside it
+STEM = re.compile(rf"({TIME_HEX})\.")
 READER_THREADS = 8
 Key = tuple[str, str, str]  # kind, take and seal of a version
 
@@ -51,16 +69,26 @@ class Holdings:
 
     # kind and take of everything that is of a subject itself -> number of versions
     takes: Mapping[tuple[str, str], int] = field(default_factory=dict)
-    versions: tuple[Record, ...] = ()  # other versions that refer to a subject, in the order of their removal
-    current: frozenset[Key] = frozenset()  # those that are the newest of their kind and take
-    unrecorded: tuple[str, ...] = ()  # paths of unfinished versions of others that may contain data of a subject
+    # other versions that refer to a subject, in the order of their removal
+    versions: tuple[Record, ...] = ()
+    # those that are the newest of their kind and take
+    current: frozenset[Key] = frozenset()
+    # paths of unfinished versions of others that may contain data of a subject
+    unrecorded: tuple[str, ...] = ()
     damaged: tuple[str, ...] = ()  # keys of unreadable records of such versions
     requests: tuple[Request, ...] = ()
     scratch: tuple[Path, ...] = ()  # folders of killed ingests on this machine
     caches: tuple[str, ...] = ()
 
     def __bool__(self) -> bool:
-        parts = (self.takes, self.versions, self.unrecorded, self.requests, self.scratch, self.caches)
+        parts = (
+            self.takes,
+            self.versions,
+            self.unrecorded,
+            self.requests,
+            self.scratch,
+            self.caches,
+        )
         return any(map(bool, parts))
 
     @property
@@ -82,7 +110,9 @@ class Erasure:
 
 
 def holdings_of(place: Place, markers: Markers) -> Holdings:
-    """What a database holds of the subjects that these entries declare withdrawn; nothing is read if there are none."""
+    """What a database holds of the subjects that these entries declare withdrawn;
+    nothing is read if there are none.
+    """
     if not markers.numbers:
         return Holdings()
     records = _every_record(place)
@@ -92,12 +122,19 @@ def holdings_of(place: Place, markers: Markers) -> Holdings:
     named = {record.path for record in records}
     unrecorded, damaged = _unrecorded(place, markers, named)
     return Holdings(
-        takes={(kind, take): _count(place, kind, take) for kind, take in _own_takes(place, markers)},
+        takes={
+            (kind, take): _count(place, kind, take)
+            for kind, take in _own_takes(place, markers)
+        },
         versions=tuple(doomed),
         current=frozenset(current & {_key(record) for record in doomed}),
         unrecorded=tuple(unrecorded),
         damaged=tuple(damaged),
-        requests=tuple(one for one in read_requests(place)[0] if one.without(markers.is_withdrawn) != one),
+        requests=tuple(
+            one
+            for one in read_requests(place)[0]
+            if one.without(markers.is_withdrawn) != one
+        ),
         scratch=tuple(_scratch(place, markers)),
         caches=(CATALOGUE,) if cache_names(place, markers.is_withdrawn) else (),
     )
@@ -112,7 +149,9 @@ class Remainder:
     requests: list[Request]
 
 
-def remainder_of(records: Iterable[Record], requests: Iterable[Request], markers: Markers) -> Remainder:
+def remainder_of(
+    records: Iterable[Record], requests: Iterable[Request], markers: Markers
+) -> Remainder:
     """The records and requests that remain if these entries declare subjects withdrawn.
 
     Parameters
@@ -126,11 +165,20 @@ def remainder_of(records: Iterable[Record], requests: Iterable[Request], markers
     removed = _doomed(every, markers)
     gone = set(map(_key, removed))
     newest = {(record.kind, record.take): _key(record) for record in every}
-    current = [record for record in removed if newest[record.kind, record.take] == _key(record)]
-    needed = [*requests, *filter(None, [_replacement(record, gone) for record in current])]
+    current = [
+        record for record in removed if newest[record.kind, record.take] == _key(record)
+    ]
+    needed = [
+        *requests,
+        *filter(None, [_replacement(record, gone) for record in current]),
+    ]
     changed = {request.key: request.without(markers.is_withdrawn) for request in needed}
     return Remainder(
-        [record for record in every if _key(record) not in gone and not markers.hides(record.kind, record.take)],
+        [
+            record
+            for record in every
+            if _key(record) not in gone and not markers.hides(record.kind, record.take)
+        ],
         removed,
         [request for request in changed.values() if request is not None],
     )
@@ -151,30 +199,50 @@ def erase(place: Place, subject: str, *, wait: float = 0.0) -> Erasure:
     Raises
     ------
     InputError
-        If the database holds nothing of the subject, or if another run works on one of its takes. Nothing was changed
-        then.
+        If the database holds nothing of the subject, or if another run works on one of
+        its takes. Nothing was changed then.
     """
     holdings = subject_holdings(place, subject)
     if not read_markers(place).is_withdrawn(subject):
-        takes = sorted({take for kind, take in holdings.takes if kind != CONSENT and subject_of(take) == subject})
+        takes = sorted(
+            {
+                take
+                for kind, take in holdings.takes
+                if kind != CONSENT and subject_of(take) == subject
+            }
+        )
         with ExitStack() as leases:
             for take in takes:
-                lease = Lease(place, take, ("capture", "model"), wait=wait, command="skindb withdraw")
+                lease = Lease(
+                    place,
+                    take,
+                    ("capture", "model"),
+                    wait=wait,
+                    command="skindb withdraw",
+                )
                 _with_space(place, holdings, partial(leases.enter_context, lease))
-            _with_space(place, holdings, partial(mark_withdrawn, place, subject, holdings.counts))
+            _with_space(
+                place,
+                holdings,
+                partial(mark_withdrawn, place, subject, holdings.counts),
+            )
         note_withdrawals(place, is_repeated=True)
     return erase_withdrawn(place)
 
 
 def erase_withdrawn(place: Place) -> Erasure:
-    """Remove everything that is of a withdrawn subject or refers to one; the same call completes an interrupted one."""
+    """Remove everything that is of a withdrawn subject or refers to one; the same call
+    completes an interrupted one.
+    """
     done = Erasure()
     markers = read_markers(place)
     while markers.numbers:
         place.sweep()  # before anything is listed, see `markers`
         _erase_holdings(place, holdings_of(place, markers), markers, done)
         later = read_markers(place)
-        if later == markers:  # otherwise a release or a request may name a subject who was withdrawn meanwhile
+        # otherwise a release or a request may name a subject who was withdrawn
+        # meanwhile
+        if later == markers:
             break
         markers = later
     if markers.numbers:
@@ -182,7 +250,9 @@ def erase_withdrawn(place: Place) -> Erasure:
     return done
 
 
-def _erase_holdings(place: Place, holdings: Holdings, markers: Markers, done: Erasure) -> None:
+def _erase_holdings(
+    place: Place, holdings: Holdings, markers: Markers, done: Erasure
+) -> None:
     """Remove everything that was found, results after the requests to compute them again."""
     for folder in [*holdings.scratch, *_abandoned_scratch(place)]:
         remove_tree(folder)
@@ -193,7 +263,11 @@ def _erase_holdings(place: Place, holdings: Holdings, markers: Markers, done: Er
         _replace_request(place, holdings, request, markers)
     for record in holdings.versions:
         if _key(record) in holdings.current:
-            _with_space(place, holdings, partial(_before_removal, place, record, holdings, markers, done))
+            _with_space(
+                place,
+                holdings,
+                partial(_before_removal, place, record, holdings, markers, done),
+            )
     for record in holdings.versions:
         _with_space(place, holdings, partial(_remove_record, place, record))
         done.removed[record.kind] += 1
@@ -213,29 +287,62 @@ def subject_holdings(place: Place, subject: str) -> Holdings:
     """
     rule = "the database must hold the subject"
     if not re.fullmatch(SUBJECT, subject):
-        cure = f"give the subject, {subject_of(subject)}" if re.fullmatch(TAKE, subject) else "see skindb info"
-        raise InputError(Fault(repr(subject)[:200], rule, "a name that is not that of a subject", cure))
+        cure = (
+            f"give the subject, {subject_of(subject)}"
+            if re.fullmatch(TAKE, subject)
+            else "see skindb info"
+        )
+        raise InputError(
+            Fault(
+                repr(subject)[:200], rule, "a name that is not that of a subject", cure
+            )
+        )
     markers = read_markers(place)
     holdings = holdings_of(place, markers.with_withdrawn(subject))
     if markers.is_withdrawn(subject):
         if holdings:
             return holdings
-        raise InputError(Fault(subject, rule, "that the subject was withdrawn, and nothing is left", "see skindb info"))
+        raise InputError(
+            Fault(
+                subject,
+                rule,
+                "that the subject was withdrawn, and nothing is left",
+                "see skindb info",
+            )
+        )
     if holdings == holdings_of(place, markers):
-        takes = {take for kind, take in names_below(place, "log") if kind not in KINDS_WITHOUT_SUBJECT}
-        known = sorted({subject_of(take) for take in takes if not markers.is_withdrawn(subject_of(take))})
-        found = f"subjects: {', '.join(known[:8]) or 'none'}" + (", ..." if len(known) > 8 else "")
+        takes = {
+            take
+            for kind, take in names_below(place, "log")
+            if kind not in KINDS_WITHOUT_SUBJECT
+        }
+        known = sorted(
+            {
+                subject_of(take)
+                for take in takes
+                if not markers.is_withdrawn(subject_of(take))
+            }
+        )
+        found = f"subjects: {', '.join(known[:8]) or 'none'}" + (
+            ", ..." if len(known) > 8 else ""
+        )
         raise InputError(Fault(subject, rule, found, "see skindb info"))
     return holdings
 
 
 def _erase_take(place: Place, kind: str, take: str) -> None:
-    """Remove all files of a kind of a take: versions, records including damaged ones, and files of killed runs.
+    """Remove all files of a kind of a take: versions, records including damaged ones,
+    and files of killed runs.
 
     No tombstones remain, because no other version refers to these versions any more.
     """
     # the records last, so that the same call completes a removal that was interrupted
-    for key in (f"data/{kind}/{take}", f"leases/{kind}/{take}", f"heads/{kind}/{take}.json", f"log/{kind}/{take}"):
+    for key in (
+        f"data/{kind}/{take}",
+        f"leases/{kind}/{take}",
+        f"heads/{kind}/{take}.json",
+        f"log/{kind}/{take}",
+    ):
         place.remove(key)
 
 
@@ -258,66 +365,129 @@ def _count(place: Place, kind: str, take: str) -> int:
 def _every_record(place: Place) -> list[Record]:
     """All readable records, the newest of each kind and take after the others."""
     with ThreadPoolExecutor(READER_THREADS) as threads:
-        return [record for records in threads.map(Log.readable, committed_logs(place)) for record in records]
+        return [
+            record
+            for records in threads.map(Log.readable, committed_logs(place))
+            for record in records
+        ]
 
 
 def _doomed(records: Iterable[Record], markers: Markers) -> list[Record]:
-    """Versions that refer to a withdrawn subject, directly or through their inputs, without those of the subject.
+    """Versions that refer to a withdrawn subject, directly or through their inputs,
+    without those of the subject.
 
-    Captures and models of other subjects remain. If one was made from a product of many subjects that is removed, it is
-    stale.
+    Captures and models of other subjects remain. If one was made from a product of many
+    subjects that is removed, it is stale.
     """
     every = list(records)
     refused = {_key(record) for record in every if not markers.admits(record)}
     affected = set(refused)
-    while more := {_key(one) for one in every if any(_input_key(of) in affected for of in one.made_from)} - affected:
+    while (
+        more := {
+            _key(one)
+            for one in every
+            if any(_input_key(of) in affected for of in one.made_from)
+        }
+        - affected
+    ):
         affected |= more
-    doomed = [record for record in every if _key(record) in affected and _is_removed(record, refused, markers)]
+    doomed = [
+        record
+        for record in every
+        if _key(record) in affected and _is_removed(record, refused, markers)
+    ]
     gone = {_key(record) for record in doomed}
     # a release holds no data: it only names versions, and those that remain do it no harm
-    releases = [record for record in every if record.kind == RELEASE and _key(record) not in refused]
-    doomed += [record for record in releases if any(_input_key(of) in gone for of in record.made_from)]
-    return sorted(doomed, key=lambda record: (_rank(record.kind), record.take, record.generation))
+    releases = [
+        record
+        for record in every
+        if record.kind == RELEASE and _key(record) not in refused
+    ]
+    doomed += [
+        record
+        for record in releases
+        if any(_input_key(of) in gone for of in record.made_from)
+    ]
+    return sorted(
+        doomed, key=lambda record: (_rank(record.kind), record.take, record.generation)
+    )
 
 
 def _is_removed(record: Record, refused: set[Key], markers: Markers) -> bool:
     """Whether an affected version is removed by itself, not with its take."""
-    if record.kind not in KINDS_WITHOUT_SUBJECT and markers.is_withdrawn(subject_of(record.take)):
+    if record.kind not in KINDS_WITHOUT_SUBJECT and markers.is_withdrawn(
+        subject_of(record.take)
+    ):
         return False
-    return _key(record) in refused or record.kind not in (*KINDS_OF_ONE_SUBJECT, RELEASE)
+    return _key(record) in refused or record.kind not in (
+        *KINDS_OF_ONE_SUBJECT,
+        RELEASE,
+    )
 
 
 def _own_takes(place: Place, markers: Markers) -> list[tuple[str, str]]:
-    """Kind and take of everything of withdrawn subjects, including unfinished versions and leases."""
+    """Kind and take of everything of withdrawn subjects, including unfinished versions
+    and leases.
+    """
     own = set()
     for top in FOLDERS_WITH_TAKES:
         for kind, name in names_below(place, top):
             take = name.removesuffix(".json") if top == "heads" else name
-            if re.fullmatch(KIND, kind) and re.fullmatch(TAKE, take) and kind not in KINDS_WITHOUT_SUBJECT:
-                own |= {(kind, take)} if markers.is_withdrawn(subject_of(take)) else set()
+            if (
+                re.fullmatch(KIND, kind)
+                and re.fullmatch(TAKE, take)
+                and kind not in KINDS_WITHOUT_SUBJECT
+            ):
+                own |= (
+                    {(kind, take)} if markers.is_withdrawn(subject_of(take)) else set()
+                )
     return sorted(own, key=lambda one: (_rank(one[0]), one))
 
 
-def _unrecorded(place: Place, markers: Markers, named: set[str]) -> tuple[list[str], list[str]]:
-    """Paths of versions of many subjects that no record names and that may contain data of a withdrawn one.
+def _unrecorded(
+    place: Place, markers: Markers, named: set[str]
+) -> tuple[list[str], list[str]]:
+    """Paths of versions of many subjects that no record names and that may contain data
+    of a withdrawn one.
 
-    These are versions that name a withdrawn subject, and those whose names are unknown: a running writer writes the
-    names first. Keys of unreadable records of the same kind and take are returned too, as one of them may be theirs.
+    These are versions that name a withdrawn subject, and those whose names are unknown:
+    a running writer writes the names first. Keys of unreadable records of the same kind
+    and take are returned too, as one of them may be theirs.
     """
     paths: list[str] = []
     damaged: list[str] = []
     for kind, take in names_below(place, "data"):
-        if not re.fullmatch(KIND, kind) or not re.fullmatch(TAKE, take) or kind in KINDS_OF_ONE_SUBJECT:
+        if (
+            not re.fullmatch(KIND, kind)
+            or not re.fullmatch(TAKE, take)
+            or kind in KINDS_OF_ONE_SUBJECT
+        ):
             continue
         if kind not in KINDS_WITHOUT_SUBJECT and markers.is_withdrawn(subject_of(take)):
             continue
-        stems = {match[1] for name in place.children(f"data/{kind}/{take}") if (match := STEM.match(name))}
-        unnamed = [path for stem in sorted(stems) if (path := f"data/{kind}/{take}/{stem}.zarr") not in named]
-        found = [path for path in unnamed if not _is_admitted(place, markers, path, subjects_of(kind, take, ()))]
+        stems = {
+            match[1]
+            for name in place.children(f"data/{kind}/{take}")
+            if (match := STEM.match(name))
+        }
+        unnamed = [
+            path
+            for stem in sorted(stems)
+            if (path := f"data/{kind}/{take}/{stem}.zarr") not in named
+        ]
+        found = [
+            path
+            for path in unnamed
+            if not _is_admitted(place, markers, path, subjects_of(kind, take, ()))
+        ]
         if found:
             log = Log(place, kind, take)
             readable = {record.generation for record in log.readable()}
-            damaged += [log.record_key(number) for number in log.generations() if number not in readable]
+            damaged += [
+                log.record_key(number)
+                for number in log.generations()
+                if number not in readable
+            ]
         paths += found
     return paths, damaged
 
@@ -341,12 +511,20 @@ def _scratch(place: Place, markers: Markers) -> Iterator[Path]:
 
 
 def _abandoned_scratch(place: Place) -> list[Path]:
-    """Scratch folders whose removal was interrupted; their names do not tell whose data they hold."""
+    """Scratch folders whose removal was interrupted; their names do not tell whose data
+    they hold.
+    """
     folder = place.scratch()
-    return [path for path in folder.iterdir() if path.name.endswith(ABANDONED_SCRATCH)] if folder.is_dir() else []
+    return (
+        [path for path in folder.iterdir() if path.name.endswith(ABANDONED_SCRATCH)]
+        if folder.is_dir()
+        else []
+    )
 
 
-def _replace_request(place: Place, holdings: Holdings, request: Request, markers: Markers) -> None:
+def _replace_request(
+    place: Place, holdings: Holdings, request: Request, markers: Markers
+) -> None:
     """Take withdrawn subjects out of a request."""
     changed = request.without(markers.is_withdrawn)
     if changed is None:
@@ -355,7 +533,9 @@ def _replace_request(place: Place, holdings: Holdings, request: Request, markers
         _with_space(place, holdings, partial(write_request, place, changed))
 
 
-def _before_removal(place: Place, record: Record, holdings: Holdings, markers: Markers, done: Erasure) -> None:
+def _before_removal(
+    place: Place, record: Record, holdings: Holdings, markers: Markers, done: Erasure
+) -> None:
     """Prepare the replacement of the newest version of a kind and take that is to be removed."""
     gone = {_key(version) for version in holdings.versions}
     request = _replacement(record, gone)
@@ -374,29 +554,44 @@ def _replacement(record: Record, gone: set[Key]) -> Request | None:
     if record.kind == RELEASE:
         pins = [one for one in record.made_from if _input_key(one) not in gone]
         takes = {one["take"] for one in pins}
-        lacking = [one["take"] for one in record.made_from if _input_key(one) in gone and one["take"] in takes]
+        lacking = [
+            one["take"]
+            for one in record.made_from
+            if _input_key(one) in gone and one["take"] in takes
+        ]
         return Request(RELEASE, record.take, {TAKES: lacking, PINS: pins})
     if record.kind == REGISTRATION:
         return Request(REGISTRATION, "", {"reference": parameters.get("reference", "")})
-    return Request(record.kind, record.take, parameters) if record.kind in (STUDY, "edit") else None
+    return (
+        Request(record.kind, record.take, parameters)
+        if record.kind in (STUDY, "edit")
+        else None
+    )
 
 
 def _revise(place: Place, request: Request, done: Erasure) -> None:
-    """Commit the next revision of a release, and request the registrations that it lacks until they are made again."""
+    """Commit the next revision of a release, and request the registrations that it
+    lacks until they are made again.
+    """
     parameters = request.parameters
     try:
         if parameters[TAKES]:
-            write_request(place, Request(RELEASE, request.take, {TAKES: parameters[TAKES]}))
+            write_request(
+                place, Request(RELEASE, request.take, {TAKES: parameters[TAKES]})
+            )
         commit_release(place, request.take, parameters[PINS])
         done.revised.append(request.take)
     except UnavailableError:
         raise
-    except InputError:  # a version that it names is damaged: `refresh` tries again when it was restored
+    except InputError:
+        # a version that it names is damaged: `refresh` tries again when it was restored
         write_request(place, request)
 
 
 def _with_space(place: Place, holdings: Holdings, step: Callable[[], T]) -> T:
-    """The result of a step, repeated on a full disk after the data that are to be removed anyway were removed."""
+    """The result of a step, repeated on a full disk after the data that are to be
+    removed anyway were removed.
+    """
     try:
         return step()
     except OSError as error:

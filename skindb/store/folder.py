@@ -22,8 +22,11 @@ from skindb.errors import InputError, add_filename
 from skindb.store.paths import STAGING, inside
 from skindb.store.place import Guard
 
-MAX_FOLDER_DEPTH = 16  # below a version; zarr creates group/array/c and a folder for each dim except the last
-MAX_ATTEMPTS = 10  # to write a file whose temporary file is removed, or to remove a folder in which files are written
+# below a version; zarr creates group/array/c and a folder for each dim except the last
+MAX_FOLDER_DEPTH = 16
+# to write a file whose temporary file is removed, or to remove a folder in which files
+# are written
+MAX_ATTEMPTS = 10
 TYPES = ((stat.S_ISDIR, "folder"), (stat.S_ISREG, "file"), (stat.S_ISLNK, "link"))
 
 
@@ -70,13 +73,19 @@ class Folder:
 
     def names(self) -> list[str] | None:
         """Names at the top level; None if the folder does not exist."""
-        return sorted(entry.name for entry in os.scandir(self.root)) if self.root.is_dir() else None
+        return (
+            sorted(entry.name for entry in os.scandir(self.root))
+            if self.root.is_dir()
+            else None
+        )
 
     def children(self, key: str, *, links: bool = False) -> list[str]:
         """Names directly below a key, sorted; symbolic links are excluded unless `links` is set."""
         place = inside(self.root, key)
         entries = (_entries(place) or []) if place.is_dir() else []
-        return sorted(entry.name for entry in entries if links or not entry.is_symlink())
+        return sorted(
+            entry.name for entry in entries if links or not entry.is_symlink()
+        )
 
     def file_type(self, key: str) -> str:
         """Type of a key: "folder", "file", "link" or "other"; empty if it does not exist."""
@@ -87,17 +96,24 @@ class Folder:
         return next((name for test, name in TYPES if test(mode)), "other")
 
     def sizes(self, key: str) -> dict[str, int]:
-        """Size in bytes of every file below a key, by its path relative to the key; -1 if it is not a regular file.
+        """Size in bytes of every file below a key, by its path relative to the key; -1
+        if it is not a regular file.
 
         Empty folders, and folders nested deeper than those of zarr, are listed with -1.
         """
         place = inside(self.root, key)
-        return {name: one[0] for name, one in _walk(place, "", MAX_FOLDER_DEPTH)} if place.is_dir() else {}
+        return (
+            {name: one[0] for name, one in _walk(place, "", MAX_FOLDER_DEPTH)}
+            if place.is_dir()
+            else {}
+        )
 
     def read(self, key: str, begin: int = 0, end: int | None = None) -> bytes:
         """Contents of a file from byte `begin`, counted from its end if negative, up to `end`."""
         with self._open(key, sys.maxsize) as file:
-            file.seek(begin if begin >= 0 else max(file.seek(0, os.SEEK_END) + begin, 0))
+            file.seek(
+                begin if begin >= 0 else max(file.seek(0, os.SEEK_END) + begin, 0)
+            )
             return file.read() if end is None else file.read(max(end - begin, 0))
 
     def read_small(self, key: str) -> bytes:
@@ -115,7 +131,9 @@ class Folder:
         return _identity(inside(self.root, key).lstat())
 
     def identities(self, key: str) -> dict[str, tuple[Hashable, ...]]:
-        """The identity of every file below a key, by its path relative to the key; (-1,) where `sizes` returns -1."""
+        """The identity of every file below a key, by its path relative to the key;
+        (-1,) where `sizes` returns -1.
+        """
         place = inside(self.root, key)
         return dict(_walk(place, "", MAX_FOLDER_DEPTH)) if place.is_dir() else {}
 
@@ -124,7 +142,9 @@ class Folder:
         return False
 
     def modified(self, key: str) -> float:
-        """Time in seconds, by the clock of the storage, when a file or the newest file below a key was written."""
+        """Time in seconds, by the clock of the storage, when a file or the newest file
+        below a key was written.
+        """
         place = inside(self.root, key)
         times = [place.lstat().st_mtime]
         for folder, _, names in os.walk(place):
@@ -146,7 +166,8 @@ class Folder:
         Without `flush` only the permissions of the files are set.
         """
         place = inside(self.root, key)
-        folders, files = self._modes()  # zarr creates files and folders with the permissions of the umask
+        # zarr creates files and folders with the permissions of the umask
+        folders, files = self._modes()
         for folder, _, names in os.walk(place, topdown=False):
             for name in names:
                 flush_path(Path(folder) / name, mode=files, flush=flush)
@@ -154,15 +175,26 @@ class Folder:
         if flush:
             self._flush_parents(place)
 
-    def create(self, key: str, data: bytes, *, guard: Guard | None = None, flush_names: bool = True) -> bool:
-        """Write a file durably if it does not exist yet; returns False and writes nothing if it exists."""
+    def create(
+        self,
+        key: str,
+        data: bytes,
+        *,
+        guard: Guard | None = None,
+        flush_names: bool = True,
+    ) -> bool:
+        """Write a file durably if it does not exist yet; returns False and writes
+        nothing if it exists.
+        """
         # a link fails if the name exists; it is the only atomic step of a commit
         return self._write(key, data, os.link, guard, flush_names=flush_names)
 
     def flush_names(self, keys: Iterable[str]) -> None:
         """Flush the folders of these files, and the folders above them."""
         folders = {inside(self.root, key).parent for key in keys}
-        for folder in sorted(folders | {above for one in folders for above in one.parents}):
+        for folder in sorted(
+            folders | {above for one in folders for above in one.parents}
+        ):
             if folder == self.root.parent or folder.is_relative_to(self.root):
                 with suppress(FileNotFoundError):  # a file that was not written
                     flush_path(folder)
@@ -172,10 +204,13 @@ class Folder:
         self._write(key, data, os.replace, guard)
 
     def sweep(self) -> None:
-        """Remove the temporary files of all writers, which write them again if their guards permit it."""
+        """Remove the temporary files of all writers, which write them again if their
+        guards permit it.
+        """
         for name in self.children(STAGING, links=True):
             path = self.root / STAGING / name
-            if path.is_symlink() or not path.is_dir():  # a foreign folder is reported by `verify`
+            # a foreign folder is reported by `verify`
+            if path.is_symlink() or not path.is_dir():
                 path.unlink(missing_ok=True)
 
     def remove(self, key: str) -> None:
@@ -186,7 +221,8 @@ class Folder:
         else:
             place.unlink(missing_ok=True)
         if place.parent.is_dir():
-            flush_path(place.parent)  # otherwise a record could reappear after a power loss without its version
+            # otherwise a record could reappear after a power loss without its version
+            flush_path(place.parent)
 
     def _open(self, key: str, most_bytes: int) -> BufferedReader:
         """Open a regular file without blocking; `OSError` for any other type of file."""
@@ -205,7 +241,9 @@ class Folder:
         *,
         flush_names: bool = True,
     ) -> bool:
-        """Write a temporary file, call the guard, and give the file its name by `step`; see `markers`."""
+        """Write a temporary file, call the guard, and give the file its name by `step`;
+        see `markers`.
+        """
         final = inside(self.root, key)
         for _ in range(MAX_ATTEMPTS):
             try:
@@ -216,12 +254,23 @@ class Folder:
             except FileExistsError:
                 return False
             except BaseException:
-                with suppress(OSError):  # so that no empty folder with the name of a withdrawn subject remains
+                # so that no empty folder with the name of a withdrawn subject remains
+                with suppress(OSError):
                     final.parent.rmdir()
                 raise
-        raise OSError(errno.EAGAIN, "temporary files are removed repeatedly", str(self.root / STAGING))
+        raise OSError(
+            errno.EAGAIN,
+            "temporary files are removed repeatedly",
+            str(self.root / STAGING),
+        )
 
-    def _try_write(self, final: Path, data: bytes, step: Callable[[Path, Path], None], guard: Guard | None) -> bool:
+    def _try_write(
+        self,
+        final: Path,
+        data: bytes,
+        step: Callable[[Path, Path], None],
+        guard: Guard | None,
+    ) -> bool:
         """False if a withdrawal has removed the temporary file."""
         temporary = self._temporary(data, for_file=final)
         try:
@@ -251,7 +300,9 @@ class Folder:
         return temporary
 
     def _new_temporary(self) -> Path:
-        """Path of a new temporary file; all of them are in one folder, which a withdrawal can empty."""
+        """Path of a new temporary file; all of them are in one folder, which a
+        withdrawal can empty.
+        """
         temporary = inside(self.root, f"{STAGING}/.{uuid.uuid4().hex}.tmp")
         self._make(temporary.parent)
         return temporary
@@ -259,13 +310,17 @@ class Folder:
     def _make(self, folder: Path) -> None:
         """Create a folder of the database; a new database is accessible to its owner only."""
         make_private(self.root)
-        if not {entry.name for entry in os.scandir(self.root)} - {"tmp"}:  # not for a folder with other files
+        # not for a folder with other files
+        if not {entry.name for entry in os.scandir(self.root)} - {"tmp"}:
             self.root.chmod(PRIVATE)
         make_private(folder, self._modes()[0])
 
     def _modes(self) -> tuple[int, int]:
-        """Permissions of folders and files: those of the root for owner and group, none for other users."""
-        folders = self.root.stat().st_mode & 0o2770  # including the setgid bit, which new folders inherit
+        """Permissions of folders and files: those of the root for owner and group, none
+        for other users.
+        """
+        # including the setgid bit, which new folders inherit
+        folders = self.root.stat().st_mode & 0o2770
         return folders, folders & 0o660
 
     def _flush_parents(self, place: Path) -> None:
@@ -281,8 +336,12 @@ def _identity(status: os.stat_result) -> tuple[int, ...]:
     return status.st_size, status.st_mtime_ns, status.st_ino
 
 
-def _walk(place: str | Path, prefix: str, depth: int) -> Iterator[tuple[str, tuple[int, ...]]]:
-    """Path and identity of every file; (-1,) if it is not a regular file. What is removed meanwhile is not listed."""
+def _walk(
+    place: str | Path, prefix: str, depth: int
+) -> Iterator[tuple[str, tuple[int, ...]]]:
+    """Path and identity of every file; (-1,) if it is not a regular file. What is
+    removed meanwhile is not listed.
+    """
     entries = _entries(place)
     if entries == [] and prefix:  # zarr creates no empty folders
         yield prefix.rstrip("/"), (-1,)

@@ -1,4 +1,6 @@
-"""Finding and removing files to which no record refers; docs/store_format.md describes the rules."""
+"""Finding and removing files to which no record refers; docs/store_format.md describes
+the rules.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,8 @@ from skindb.store.verify import (
 
 STILL_WRITING_SECONDS = 3600.0  # newer files may belong to a run without a lease
 KEPT_KINDS = (CONSENT, RELEASE, CALIBRATION)  # kinds of which all generations are kept
-FIT_IDENTITY = ("inputs", "requested", "dictionary_digest", "method_digest")  # equal in a first pass and its model
+# equal in a first pass and its model
+FIT_IDENTITY = ("inputs", "requested", "dictionary_digest", "method_digest")
 VERSION_FILE = re.compile(rf"({TIME_HEX})\.(zarr|(manifest|tables|names)\.json)")
 OF_WITHDRAWN = "it is of a withdrawn subject, or refers to one"
 Clock = Callable[[], float]
@@ -51,30 +54,49 @@ class Garbage:
         """Kind and take; empty if it does not belong to a take."""
         parts = self.key.split("/")
         if parts[0] == "tmp":
-            return ("capture", match[1]) if (match := SCRATCH_NAME.fullmatch(parts[1])) else ("", "")
+            return (
+                ("capture", match[1])
+                if (match := SCRATCH_NAME.fullmatch(parts[1]))
+                else ("", "")
+            )
         return (parts[1], parts[2]) if len(parts) > 3 else ("", "")
 
 
 def find_garbage(place: Place, generations: int | None = None) -> list[Garbage]:
-    """Files to which no record refers and, if `generations` is given, unused generations older than that number.
+    """Files to which no record refers and, if `generations` is given, unused
+    generations older than that number.
 
-    Damaged parts of a database are skipped, as `database_faults` reports them; with `generations`, a damaged record
-    raises an `InputError`.
+    Damaged parts of a database are skipped, as `database_faults` reports them; with
+    `generations`, a damaged record raises an `InputError`.
     """
-    now = cache(partial(storage_time, place))  # needs a file to be written, so it is only called if there is garbage
+    # needs a file to be written, so it is only called if there is garbage
+    now = cache(partial(storage_time, place))
     markers = read_markers(place)
-    found = [*_of_withdrawn_subjects(place, markers), *_temporary_files(place, now), *_scratch_folders(place, now)]
+    found = [
+        *_of_withdrawn_subjects(place, markers),
+        *_temporary_files(place, now),
+        *_scratch_folders(place, now),
+    ]
     unrecorded = partial(_unrecorded, tombstone_names=tombstones(place))
     for key, of_take in (("data", unrecorded), ("leases", _abandoned_leases)):
         for kind, take in names_below(place, key):
-            if re.fullmatch(KIND, kind) and re.fullmatch(TAKE, take) and not markers.hides(kind, take):
+            if (
+                re.fullmatch(KIND, kind)
+                and re.fullmatch(TAKE, take)
+                and not markers.hides(kind, take)
+            ):
                 with suppress(InputError):
                     found += of_take(place, kind, take, now)
-    return found if generations is None else [*found, *_old_generations(place, generations, now)]
+    return (
+        found
+        if generations is None
+        else [*found, *_old_generations(place, generations, now)]
+    )
 
 
 def remove_garbage(place: Place, generations: int | None = None) -> list[Garbage]:
-    """Remove and return what `find_garbage` lists without a reason for keeping it, under the leases of each take.
+    """Remove and return what `find_garbage` lists without a reason for keeping it,
+    under the leases of each take.
 
     What is left of withdrawn subjects is removed first, without leases: nobody may work on it.
     """
@@ -109,7 +131,8 @@ def _required_leases(kind: str, take: str) -> tuple[tuple[str, ...], str]:
 
 def _remove_one(place: Place, one: Garbage) -> bool:
     kind, take = one.of
-    if one.key.startswith("leases/") and NUMBER.search(one.key):  # it was replaced by the lease of this process
+    # it was replaced by the lease of this process
+    if one.key.startswith("leases/") and NUMBER.search(one.key):
         return True
     if one.generation:
         Log(place, kind, take).remove(one.generation)
@@ -117,7 +140,8 @@ def _remove_one(place: Place, one: Garbage) -> bool:
         Log(place, kind, take).forget()
     elif one.key.endswith(".zarr"):
         records, faults = Log(place, kind, take).faults()
-        if faults or one.key in {record.path for record in records}:  # committed meanwhile
+        # committed meanwhile
+        if faults or one.key in {record.path for record in records}:
             return False
         remove_version(place, one.key)
     else:
@@ -125,10 +149,15 @@ def _remove_one(place: Place, one: Garbage) -> bool:
     return True
 
 
-def _unrecorded(place: Place, kind: str, take: str, now: Clock, *, tombstone_names: set[str]) -> Iterator[Garbage]:
-    """Versions and files beside them that no record names, and records whose removal was interrupted."""
+def _unrecorded(
+    place: Place, kind: str, take: str, now: Clock, *, tombstone_names: set[str]
+) -> Iterator[Garbage]:
+    """Versions and files beside them that no record names, and records whose removal
+    was interrupted.
+    """
     key = f"data/{kind}/{take}"
-    names = place.children(key)  # listed before the log, because a commit writes its record last
+    # listed before the log, because a commit writes its record last
+    names = place.children(key)
     log = Log(place, kind, take)
     records, faults = log.faults()
     if kind in TRANSIENT:
@@ -137,23 +166,40 @@ def _unrecorded(place: Place, kind: str, take: str, now: Clock, *, tombstone_nam
     for record in partly_removed_records(log, records, tombstone_names):
         what = f"generation {record.generation}, whose removal was interrupted"
         kept = _in_use_reason(place, kind, take)
-        yield Garbage(f"{log.key}/{record.generation:08d}.json", what, record.bytes, kept, record.generation)
+        yield Garbage(
+            f"{log.key}/{record.generation:08d}.json",
+            what,
+            record.bytes,
+            kept,
+            record.generation,
+        )
     named = {record.path for record in records}
     stems = {match[1] for name in names if (match := VERSION_FILE.fullmatch(name))}
     stems = {stem for stem in stems if f"{key}/{stem}.zarr" not in named}
     sizes = place.sizes(key) if stems else {}
     for stem in sorted(stems):
-        size = sum(max(count, 0) for name, count in sizes.items() if name.startswith(stem))
+        size = sum(
+            max(count, 0) for name, count in sizes.items() if name.startswith(stem)
+        )
         if faults:
             kept = "its log is damaged, see skindb verify"
         elif f"{stem}.manifest.json" in names and may_have_had_record(log):
-            kept = "its record may have been lost; remove it by hand if its run was killed"
+            kept = (
+                "its record may have been lost; remove it by hand if its run was killed"
+            )
         elif abandoned_holder(place, kind, take):
             kept = ""  # its writer can no longer commit
         else:
             files = [f"{key}/{name}" for name in names if stem in name]
-            kept = _in_use_reason(place, kind, take) or _recent_reason(place, files, now)
-        yield Garbage(f"{key}/{stem}.zarr", "a version without a record, left by a killed run", size, kept)
+            kept = _in_use_reason(place, kind, take) or _recent_reason(
+                place, files, now
+            )
+        yield Garbage(
+            f"{key}/{stem}.zarr",
+            "a version without a record, left by a killed run",
+            size,
+            kept,
+        )
 
 
 def _first_pass(place: Place, log: Log, records: list[Record], now: Clock) -> Garbage:
@@ -174,7 +220,10 @@ def _first_pass(place: Place, log: Log, records: list[Record], now: Clock) -> Ga
 def _has_model(place: Place, first: Record) -> bool:
     fit = Log(place, LEASE_KINDS[first.kind], first.take)
     model = {} if fit.is_empty() else fit.read().provenance
-    return all(name in model and model[name] == first.provenance.get(name) for name in FIT_IDENTITY)
+    return all(
+        name in model and model[name] == first.provenance.get(name)
+        for name in FIT_IDENTITY
+    )
 
 
 def _in_use_reason(place: Place, kind: str, take: str) -> str:
@@ -182,7 +231,12 @@ def _in_use_reason(place: Place, kind: str, take: str) -> str:
     return f"in use by {holder}" if holder else ""
 
 
-def _recent_reason(place: Place, keys: Iterable[str], now: Clock, seconds: float = STILL_WRITING_SECONDS) -> str:
+def _recent_reason(
+    place: Place,
+    keys: Iterable[str],
+    now: Clock,
+    seconds: float = STILL_WRITING_SECONDS,
+) -> str:
     """Reason to keep files that were written within this many seconds; empty if they are older."""
     try:
         age = now() - max(place.modified(key) for key in keys)
@@ -195,18 +249,32 @@ def _recent_reason(place: Place, keys: Iterable[str], now: Clock, seconds: float
 
 
 def _of_withdrawn_subjects(place: Place, markers: Markers) -> Iterator[Garbage]:
-    """What interrupted withdrawals, and writers that were suspended during one, left of withdrawn subjects."""
+    """What interrupted withdrawals, and writers that were suspended during one, left of
+    withdrawn subjects.
+    """
     holdings = holdings_of(place, markers)
     for kind, take in holdings.takes:
         keys = [f"{top}/{kind}/{take}" for top in ("data", "log", "leases")]
-        yield Garbage(f"log/{kind}/{take}", OF_WITHDRAWN, sum(_bytes_below(place, key) for key in keys))
+        yield Garbage(
+            f"log/{kind}/{take}",
+            OF_WITHDRAWN,
+            sum(_bytes_below(place, key) for key in keys),
+        )
     for record in holdings.versions:
         key = f"log/{record.kind}/{record.take}/{record.generation:08d}.json"
         yield Garbage(key, OF_WITHDRAWN, record.bytes)
-    for key in (*holdings.unrecorded, *(request.key for request in holdings.requests), *holdings.caches):
+    for key in (
+        *holdings.unrecorded,
+        *(request.key for request in holdings.requests),
+        *holdings.caches,
+    ):
         yield Garbage(key, OF_WITHDRAWN, _bytes_below(place, key))
     for folder in holdings.scratch:
-        yield Garbage(f"tmp/{folder.name}", OF_WITHDRAWN, _bytes_below(place, f"tmp/{folder.name}"))
+        yield Garbage(
+            f"tmp/{folder.name}",
+            OF_WITHDRAWN,
+            _bytes_below(place, f"tmp/{folder.name}"),
+        )
 
 
 def _bytes_below(place: Place, key: str) -> int:
@@ -219,7 +287,12 @@ def _temporary_files(place: Place, now: Clock) -> Iterator[Garbage]:
         key = f"{STAGING}/{name}"
         with suppress(FileNotFoundError):  # removed by a running writer
             size = cast(int, place.identity(key)[0])
-            yield Garbage(key, "a temporary file of a killed writer", size, _recent_reason(place, [key], now))
+            yield Garbage(
+                key,
+                "a temporary file of a killed writer",
+                size,
+                _recent_reason(place, [key], now),
+            )
 
 
 def _scratch_folders(place: Place, now: Clock) -> Iterator[Garbage]:
@@ -228,16 +301,22 @@ def _scratch_folders(place: Place, now: Clock) -> Iterator[Garbage]:
         key = f"tmp/{name}"
         size = _bytes_below(place, key)
         if match := SCRATCH_NAME.fullmatch(name):
-            kept = _in_use_reason(place, "capture", match[1]) or _recent_reason(place, [key], now, RESUMABLE_SECONDS)
+            kept = _in_use_reason(place, "capture", match[1]) or _recent_reason(
+                place, [key], now, RESUMABLE_SECONDS
+            )
         else:
             kept = _recent_reason(place, [key], now)
         yield Garbage(key, "scratch files of a killed ingest", size, kept)
 
 
-def _abandoned_leases(place: Place, kind: str, take: str, _: Clock) -> Iterator[Garbage]:
+def _abandoned_leases(
+    place: Place, kind: str, take: str, _: Clock
+) -> Iterator[Garbage]:
     if by := abandoned_holder(place, kind, take):
         key = f"leases/{kind}/{take}"
-        name, size = max(item for item in place.sizes(key).items() if NUMBER.fullmatch(item[0]))
+        name, size = max(
+            item for item in place.sizes(key).items() if NUMBER.fullmatch(item[0])
+        )
         yield Garbage(f"{key}/{name}", f"the lease of a killed run: {by}", size)
 
 
@@ -245,7 +324,9 @@ def _old_generations(place: Place, generations: int, now: Clock) -> Iterator[Gar
     """Generations that are neither among the newest ones nor inputs of a version that is kept."""
     if generations < 1:
         rule = "must be at least 1, because the newest generation is kept"
-        raise InputError(Fault("generations", rule, str(generations), "choose a larger number"))
+        raise InputError(
+            Fault("generations", rule, str(generations), "choose a larger number")
+        )
     every: dict[tuple[str, str, int], Record] = {}
     waiting: list[Record] = []
     for log in committed_logs(place):
@@ -260,10 +341,21 @@ def _old_generations(place: Place, generations: int, now: Clock) -> Iterator[Gar
         own = (record.kind, record.take, record.generation)
         if own not in stays:
             stays.add(own)
-            named = [(one["kind"], one["take"], one["generation"]) for one in record.made_from]
+            named = [
+                (one["kind"], one["take"], one["generation"])
+                for one in record.made_from
+            ]
             waiting += [every[one] for one in named if one in every]
     for (kind, take, generation), record in every.items():
         if (kind, take, generation) not in stays:
             what = f"generation {generation}, which is not an input of a kept version"
-            kept = _in_use_reason(place, kind, take) or _recent_reason(place, [record.path], now)
-            yield Garbage(f"log/{kind}/{take}/{generation:08d}.json", what, record.bytes, kept, generation)
+            kept = _in_use_reason(place, kind, take) or _recent_reason(
+                place, [record.path], now
+            )
+            yield Garbage(
+                f"log/{kind}/{take}/{generation:08d}.json",
+                what,
+                record.bytes,
+                kept,
+                generation,
+            )

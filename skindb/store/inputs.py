@@ -1,4 +1,5 @@
-"""Checks of the inputs of a version when it is committed: that they exist and are covered by consent.
+"""Checks of the inputs of a version when it is committed: that they exist and are
+covered by consent.
 
 A subject may be withdrawn, or change the consent, while the version is computed.
 """
@@ -10,13 +11,19 @@ from typing import Any
 
 from skindb.errors import Fault, InputError
 from skindb.schema.consent import CONSENT, consent_scope
-from skindb.store.kinds import KINDS_OF_ONE_SUBJECT, KINDS_WITHOUT_SUBJECT, RELEASE, STUDY
+from skindb.store.kinds import (
+    KINDS_OF_ONE_SUBJECT,
+    KINDS_WITHOUT_SUBJECT,
+    RELEASE,
+    STUDY,
+)
 from skindb.store.log import Log
 from skindb.store.paths import subject_of
 from skindb.store.place import Place, UnavailableError
 from skindb.store.record import Record, own_takes
 
-# kind -> scope that its subjects must consent to when it is committed; a record of consent needs none
+# kind -> scope that its subjects must consent to when it is committed; a record of
+# consent needs none
 REQUIRED_SCOPES = {
     "capture": "fit",
     "model": "fit",
@@ -32,7 +39,8 @@ def require_inputs(place: Place, provenance: Mapping[str, Any]) -> list[Record]:
     Raises
     ------
     InputError
-        If an input no longer exists, or if it was made from a product of many subjects that was withdrawn.
+        If an input no longer exists, or if it was made from a product of many subjects
+        that was withdrawn.
     """
     records = []
     faults = []
@@ -42,57 +50,101 @@ def require_inputs(place: Place, provenance: Mapping[str, Any]) -> list[Record]:
             continue
         record = _record_of(place, one)
         if record is None:
-            faults.append(Fault(_name(one), rule, "it was removed during the run", "run the command again"))
+            faults.append(
+                Fault(
+                    _name(one),
+                    rule,
+                    "it was removed during the run",
+                    "run the command again",
+                )
+            )
             continue
         records.append(record)
-        shared = [of for of in record.made_from if of["kind"] in KINDS_WITHOUT_SUBJECT and "seal" in of]
+        shared = [
+            of
+            for of in record.made_from
+            if of["kind"] in KINDS_WITHOUT_SUBJECT and "seal" in of
+        ]
         for of in shared:
             if _record_of(place, of) is None:
                 rule = "the inputs of an input must exist"
-                faults.append(Fault(_name(one), rule, f"{_name(of)} was removed", "run skindb refresh"))
+                faults.append(
+                    Fault(
+                        _name(one),
+                        rule,
+                        f"{_name(of)} was removed",
+                        "run skindb refresh",
+                    )
+                )
     if faults:
         raise InputError(faults)
     return records
 
 
-def names_of(kind: str, take: str, provenance: Mapping[str, Any], inputs: Iterable[Record]) -> set[str]:
+def names_of(
+    kind: str, take: str, provenance: Mapping[str, Any], inputs: Iterable[Record]
+) -> set[str]:
     """The other takes that a version refers to, directly or through its inputs.
 
-    A capture or a model may be made from a product of many subjects, such as a calibration, and outlives it; it does
-    not refer to these subjects.
+    A capture or a model may be made from a product of many subjects, such as a
+    calibration, and outlives it; it does not refer to these subjects.
     """
-    names = {str(one["take"]) for one in _inputs_of(provenance) if one["kind"] not in KINDS_WITHOUT_SUBJECT}
-    if kind not in (*KINDS_OF_ONE_SUBJECT, RELEASE):  # a release names versions, but has none of their data
+    names = {
+        str(one["take"])
+        for one in _inputs_of(provenance)
+        if one["kind"] not in KINDS_WITHOUT_SUBJECT
+    }
+    # a release names versions, but has none of their data
+    if kind not in (*KINDS_OF_ONE_SUBJECT, RELEASE):
         names = names.union(*(record.names for record in inputs))
     require_own_subject(kind, take, names)
     return names - own_takes(kind, take)
 
 
 def require_own_subject(kind: str, take: str, names: Iterable[str]) -> None:
-    """Raise an `InputError` if a version of a kind of one subject refers to a take of another subject."""
+    """Raise an `InputError` if a version of a kind of one subject refers to a take of
+    another subject.
+    """
     others = sorted(name for name in names if subject_of(name) != subject_of(take))
     if kind in KINDS_OF_ONE_SUBJECT and others:
         rule = f"a {kind} must refer to takes of its own subject only"
-        cure = "commit what many subjects share as a kind of its own, and name that version as the input"
-        raise InputError(Fault(f"{kind} of {take}", rule, f"a reference to {', '.join(others)}", cure))
+        cure = (
+            "commit what many subjects share as a kind of its own, and name that "
+            "version as the input"
+        )
+        raise InputError(
+            Fault(
+                f"{kind} of {take}", rule, f"a reference to {', '.join(others)}", cure
+            )
+        )
 
 
-def require_consents(place: Place, kind: str, take: str, provenance: Mapping[str, Any]) -> None:
+def require_consents(
+    place: Place, kind: str, take: str, provenance: Mapping[str, Any]
+) -> None:
     """Raise an `InputError` if the present consent of a subject does not cover the version."""
     scope = REQUIRED_SCOPES.get(kind)
     if scope is None:
         return
-    of_takes = [one for one in _inputs_of(provenance) if one["kind"] not in KINDS_WITHOUT_SUBJECT]
+    of_takes = [
+        one
+        for one in _inputs_of(provenance)
+        if one["kind"] not in KINDS_WITHOUT_SUBJECT
+    ]
     subjects = {subject_of(one["take"]) for one in of_takes}
     subjects |= set() if kind == STUDY else {subject_of(take)}
     faults = []
     for subject in sorted(subjects):
         log = Log(place, CONSENT, subject)
-        if not log.is_empty() and scope not in consent_scope((record := log.read()).provenance):
+        if not log.is_empty() and scope not in consent_scope(
+            (record := log.read()).provenance
+        ):
             rule = f"its subject must consent to {scope} when it is committed"
             found = f"no such consent since {record.created}"
             where = f"{kind} of {take}" if kind != STUDY else f"study {take}, {subject}"
-            faults.append(Fault(where, rule, found, "nothing was committed; see skindb consent"))
+            faults.append(
+                Fault(where, rule, found, "nothing was committed; see skindb consent")
+            )
     if faults:
         raise InputError(faults)
 

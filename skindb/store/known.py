@@ -45,7 +45,11 @@ def consent_of(records: Snapshot | RecordCache, take: str) -> tuple[str, ...]:
     """See `Database.consent`."""
     if records.has(CONSENT, subject_of(take)):
         return consent_scope(records.record(CONSENT, subject_of(take)).provenance)
-    return consent_scope(records.record("capture" if records.has("capture", take) else "model", take).provenance)
+    return consent_scope(
+        records.record(
+            "capture" if records.has("capture", take) else "model", take
+        ).provenance
+    )
 
 
 class Known:
@@ -61,7 +65,12 @@ class Known:
         Source of takes and records, by default the database itself.
     """
 
-    def __init__(self, db: Database, release: str | None = None, records: RecordCache | None = None) -> None:
+    def __init__(
+        self,
+        db: Database,
+        release: str | None = None,
+        records: RecordCache | None = None,
+    ) -> None:
         self.db = db
         self._cache = records
         self._source: Snapshot | RecordCache = records or Snapshot(db)
@@ -73,15 +82,25 @@ class Known:
         """Takes with a version of this kind."""
         if kind not in self._takes:
             pinned = self._pins is not None and kind in PINNED
-            names = [take for of, take in self._pins or () if of == kind] if pinned else self._source.takes(kind)
+            names = (
+                [take for of, take in self._pins or () if of == kind]
+                if pinned
+                else self._source.takes(kind)
+            )
             self._takes[kind] = frozenset(names)
         return self._takes[kind]
 
     def read_ahead(self, kinds: Iterable[str]) -> None:
         """Read the records of these kinds in parallel, if they come from a `RecordCache`."""
         if self._cache is not None:
-            pins = {} if self._pins is None else {key: int(one["generation"]) for key, one in self._pins.items()}
-            newest = [kind for kind in kinds if self._pins is None or kind not in PINNED]
+            pins = (
+                {}
+                if self._pins is None
+                else {key: int(one["generation"]) for key, one in self._pins.items()}
+            )
+            newest = [
+                kind for kind in kinds if self._pins is None or kind not in PINNED
+            ]
             self._cache.read_ahead(newest, pins)
 
     def save(self) -> None:
@@ -98,17 +117,27 @@ class Known:
         pinned = self._pins is not None and kind in PINNED
         key = (kind, take, pinned)
         if key not in self._records:
-            released = pinned_record(self._source, self._pins, kind, take) if pinned and self._pins else None
+            released = (
+                pinned_record(self._source, self._pins, kind, take)
+                if pinned and self._pins
+                else None
+            )
             self._records[key] = released or self._source.record(kind, take)
         return self._records[key]
 
     def about(self, take: str) -> dict[str, Any]:
         """Provenance of the capture of a take, or of its model if there is no capture."""
-        return self.record("capture" if self.has("capture", take) else "model", take).provenance
+        return self.record(
+            "capture" if self.has("capture", take) else "model", take
+        ).provenance
 
     def scope(self, take: str) -> tuple[str, ...]:
         """Scopes of the present consent of the subject of a take; see `Database.consent`."""
         subject = subject_of(take)
         if self.has(CONSENT, subject):
             return consent_scope(self.record(CONSENT, subject).provenance)
-        return consent_of(self._source, take) if self._pins is not None else consent_scope(self.about(take))
+        return (
+            consent_of(self._source, take)
+            if self._pins is not None
+            else consent_scope(self.about(take))
+        )

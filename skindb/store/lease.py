@@ -1,10 +1,13 @@
-"""Leases, which allow only one run at a time to work on a kind of versions of a take, on all machines of a storage.
+"""Leases, which allow only one run at a time to work on a kind of versions of a take,
+on all machines of a storage.
 
-A lease is the file with the highest number below `leases/<kind>/<take>/`. If that file is free, a process acquires the
-lease by creating the file with the next number, which succeeds only if the file does not exist yet. Numbers are never
-reused, so that a holder that was suspended can always detect another holder. The holder rewrites its file regularly. A
-file that was not rewritten within the duration that it states is free; ages are measured by the clock of the storage,
-because the clocks of the machines may differ. Leases only prevent wasted work: the log alone decides what is committed.
+A lease is the file with the highest number below `leases/<kind>/<take>/`. If that file
+is free, a process acquires the lease by creating the file with the next number, which
+succeeds only if the file does not exist yet. Numbers are never reused, so that a holder
+that was suspended can always detect another holder. The holder rewrites its file
+regularly. A file that was not rewritten within the duration that it states is free;
+ages are measured by the clock of the storage, because the clocks of the machines may
+differ. Leases only prevent wasted work: the log alone decides what is committed.
 """
 
 from __future__ import annotations
@@ -29,7 +32,8 @@ from skindb.store.place import Place
 from skindb.store.process import has_ended, this_process
 from skindb.store.record import json_object
 
-LEASE_SECONDS = 60.0  # without a renewal; a compilation can delay the renewing thread for some of them
+# without a renewal; a compilation can delay the renewing thread for some of them
+LEASE_SECONDS = 60.0
 RENEWALS = 4  # within the duration of a lease
 MAX_LEASE_SECONDS = 3600.0  # limit for the durations in files, which may be damaged
 POLL_SECONDS = 0.5  # between two attempts to acquire a lease
@@ -53,7 +57,11 @@ class Claim:
     def seconds(self) -> float:
         """Duration of the lease after the file was written."""
         value = self.body.get("seconds")
-        usable = isinstance(value, int | float) and not isinstance(value, bool) and 0 < value <= MAX_LEASE_SECONDS
+        usable = (
+            isinstance(value, int | float)
+            and not isinstance(value, bool)
+            and 0 < value <= MAX_LEASE_SECONDS
+        )
         return float(value) if usable else LEASE_SECONDS  # type: ignore[arg-type]
 
     @property
@@ -89,7 +97,8 @@ class Lease:
     Raises
     ------
     InputError
-        On entering, if another run holds one of the leases; the message names the holder and the start of its lease.
+        On entering, if another run holds one of the leases; the message names the
+        holder and the start of its lease.
     """
 
     def __init__(
@@ -110,7 +119,10 @@ class Lease:
         self.place = place
         self.wait = wait
         self.seconds = seconds
-        self.keys = [f"leases/{require_text(kind, KIND, 'kind')}/{take}" for kind in sorted(set(kinds))]
+        self.keys = [
+            f"leases/{require_text(kind, KIND, 'kind')}/{take}"
+            for kind in sorted(set(kinds))
+        ]
         self.token = uuid.uuid4().hex
         self.command = command
         self._clock = clock
@@ -137,11 +149,16 @@ class Lease:
         except BaseException:  # for example an interrupt or a full disk
             self._release()
             raise
-        threading.Thread(target=self._renew_until_end, name="skindb lease", daemon=True).start()
+        threading.Thread(
+            target=self._renew_until_end, name="skindb lease", daemon=True
+        ).start()
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         self._ended.set()
         with self._turn:
@@ -153,13 +170,16 @@ class Lease:
         Raises
         ------
         LeaseLost
-            If another run took over, because this process was suspended for longer than the duration of its lease. A
-            process that was suspended keeps the lease if no other run requested it.
+            If another run took over, because this process was suspended for longer than
+            the duration of its lease. A process that was suspended keeps the lease if
+            no other run requested it.
         """
         if not self._held:
             raise ValueError("a lease must be used inside its with statement")
         self._renew()
-        self.check()  # again, because another run may have found the lease free just before the renewal
+        # again, because another run may have found the lease free just before the
+        # renewal
+        self.check()
 
     def _renew_until_end(self) -> None:
         while not self._ended.wait(self.seconds / RENEWALS):
@@ -167,7 +187,8 @@ class Lease:
                 self._renew()
             except (LeaseLost, WithdrawnError):
                 return  # `require` raises it again
-            except (OSError, InputError):  # a full disk or no connection: the next attempt may succeed
+            except (OSError, InputError):
+                # a full disk or no connection: the next attempt may succeed
                 continue
 
     def _renew(self) -> None:
@@ -176,10 +197,14 @@ class Lease:
                 return
             self.check()
             for key, number in self._held.items():
-                self.place.replace(_file_key(key, number), self._content, guard=self._guard)
+                self.place.replace(
+                    _file_key(key, number), self._content, guard=self._guard
+                )
 
     def check(self) -> None:
-        """Raise `LeaseLost` unless the newest file of every lease is that of this run; nothing is renewed."""
+        """Raise `LeaseLost` unless the newest file of every lease is that of this run;
+        nothing is renewed.
+        """
         for key in self._held:
             newest = _newest(self.place, key)
             if newest is None or newest.body.get("token") != self.token:
@@ -188,8 +213,14 @@ class Lease:
             raise LeaseLost(self._lost)
 
     def _claim_all(self) -> Claim | None:
-        """Acquire all leases and return None, or acquire none and return the claim of another holder."""
-        body = {"token": self.token, "holder": this_process() | {"command": self.command}, "seconds": self.seconds}
+        """Acquire all leases and return None, or acquire none and return the claim of
+        another holder.
+        """
+        body = {
+            "token": self.token,
+            "holder": this_process() | {"command": self.command},
+            "seconds": self.seconds,
+        }
         body["since"] = datetime.now(UTC).isoformat(timespec="seconds")
         self._content = json.dumps(body).encode()
         for key in self.keys:  # sorted, so that two runs never wait for each other
@@ -205,7 +236,9 @@ class Lease:
             return before
         number = 1 + (before.number if before else 0)
         try:
-            created = self.place.create(_file_key(key, number), self._content, guard=self._guard)
+            created = self.place.create(
+                _file_key(key, number), self._content, guard=self._guard
+            )
         except WithdrawnError:
             self.place.remove(_file_key(key, number))
             raise
@@ -220,11 +253,16 @@ class Lease:
         return None
 
     def _is_free(self, claim: Claim) -> bool:
-        """Whether a claim has ended, or this process has seen it unchanged for longer than its duration."""
+        """Whether a claim has ended, or this process has seen it unchanged for longer
+        than its duration.
+        """
         if _has_ended(self.place, claim):
             return True
         try:
-            mark = (claim.number, self.place.modified(_file_key(claim.key, claim.number)))
+            mark = (
+                claim.number,
+                self.place.modified(_file_key(claim.key, claim.number)),
+            )
             now = _uptime()
         except FileNotFoundError:  # removed meanwhile: the next attempt decides
             return False
@@ -234,7 +272,9 @@ class Lease:
 
     def _release(self) -> None:
         """Mark the leases as free, without the holder; their numbers are not reused."""
-        content = json.dumps({"released": datetime.now(UTC).isoformat(timespec="seconds")}).encode()
+        content = json.dumps(
+            {"released": datetime.now(UTC).isoformat(timespec="seconds")}
+        ).encode()
         with suppress(OSError, InputError):  # otherwise the lease expires
             for key, number in self._held.items():
                 newest = _newest(self.place, key)
@@ -245,7 +285,9 @@ class Lease:
     def _free(self, key: str, content: bytes) -> None:
         try:
             self.place.replace(key, content, guard=self._guard)
-        except OSError:  # a full disk: without its file the lease is free, even while this process continues
+        except OSError:
+            # the disk may be full; without its file the lease is free, even while this
+            # process continues
             self.place.remove(key)
 
 
@@ -256,7 +298,9 @@ def holder_of(place: Place, kind: str, take: str) -> str:
 
 
 def abandoned_holder(place: Place, kind: str, take: str) -> str:
-    """The last holder of a lease, if it was killed or lost; empty if it released the lease or still holds it."""
+    """The last holder of a lease, if it was killed or lost; empty if it released the
+    lease or still holds it.
+    """
     newest = _newest(place, f"leases/{kind}/{take}")
     left = newest is not None and not newest.is_released and _has_ended(place, newest)
     return str(newest) if left else ""
@@ -268,7 +312,10 @@ def _has_ended(place: Place, claim: Claim) -> bool:
     if claim.is_released or (isinstance(holder, dict) and has_ended(holder)):
         return True
     try:
-        return storage_time(place) - place.modified(_file_key(claim.key, claim.number)) > claim.seconds
+        return (
+            storage_time(place) - place.modified(_file_key(claim.key, claim.number))
+            > claim.seconds
+        )
     except FileNotFoundError:  # removed meanwhile
         return False
 
@@ -294,7 +341,11 @@ def _newest(place: Place, key: str) -> Claim | None:
 
 
 def _numbers(place: Place, key: str) -> list[int]:
-    return sorted(int(match[1]) for name in place.children(key) if (match := NUMBER.fullmatch(name)))
+    return sorted(
+        int(match[1])
+        for name in place.children(key)
+        if (match := NUMBER.fullmatch(name))
+    )
 
 
 def _file_key(key: str, number: int) -> str:
@@ -307,7 +358,10 @@ def _lease_name(key: str) -> str:
 
 
 def _held_fault(claim: Claim) -> Fault:
-    cure = f"wait for it (--wait SECONDS) or end it; its lease expires {claim.seconds:.0f} s after its last renewal"
+    cure = (
+        "wait for it (--wait SECONDS) or end it; its lease expires "
+        f"{claim.seconds:.0f} s after its last renewal"
+    )
     return Fault(_lease_name(claim.key), ONE_RUN, str(claim), cure)
 
 
@@ -317,7 +371,9 @@ def _lost_fault(key: str, newest: Claim | None) -> Fault:
         found = "the lease was removed"
     elif not newest.is_released:
         found += f": {newest}"
-    return Fault(_lease_name(key), ONE_RUN, found, "nothing was committed; run the command again")
+    return Fault(
+        _lease_name(key), ONE_RUN, found, "nothing was committed; run the command again"
+    )
 
 
 def _uptime() -> float:

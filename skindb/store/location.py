@@ -20,5 +20,7 @@ def place_at(url: str) -> Place:
         rule = "a database must be a local folder or an S3 bucket"
         raise InputError(Fault(f"{scheme}://...", rule, "a different URL", cure))
     if Path(url).exists() and not Path(url).is_dir():
-        raise InputError(Fault(url, "a database must be a folder", "a file", "choose another folder"))
+        raise InputError(
+            Fault(url, "a database must be a folder", "a file", "choose another folder")
+        )
     return Folder(Path(url))

@@ -1,9 +1,11 @@
-"""The commit log: one sealed JSON record per generation, which is created only if it does not exist yet.
+"""The commit log: one sealed JSON record per generation, which is created only if it
+does not exist yet.
 
-`docs/store_format.md` describes its files. The digests of the files of a version are in a manifest beside the version;
-its record contains the digest of the manifest, the seal of the previous record, and its own seal. A removed record
-leaves a tombstone with its seal under an opaque name. A head names the newest record. It is a cache that may be missing
-or outdated, but if it is intact and ahead of the log, a record was lost.
+`docs/store_format.md` describes its files. The digests of the files of a version are in
+a manifest beside the version; its record contains the digest of the manifest, the seal
+of the previous record, and its own seal. A removed record leaves a tombstone with its
+seal under an opaque name. A head names the newest record. It is a cache that may be
+missing or outdated, but if it is intact and ahead of the log, a record was lost.
 """
 
 from __future__ import annotations
@@ -52,7 +54,8 @@ class Log:
 
     def generations(self) -> list[int]:
         """All committed generations, ascending, without left-over temporary files."""
-        names = self.place.children(self.key, links=True)  # a link in place of a record is not hidden
+        # a link in place of a record is not hidden
+        names = self.place.children(self.key, links=True)
         return [int(m[1]) for name in names if (m := GENERATION.fullmatch(name))]
 
     def read_listed(self, known: list[int], is_head: Callable[[bytes], bool]) -> Record:
@@ -68,8 +71,8 @@ class Log:
         Raises
         ------
         InputError
-            If the head names another record. A list that is older than a commit of another run looks like a lost
-            record; the caller should then use `read`.
+            If the head names another record. A list that is older than a commit of
+            another run looks like a lost record; the caller should then use `read`.
         """
         record = self._read(known[-1])
         if is_head(self.head_content(record.generation, record.seal)):
@@ -80,15 +83,24 @@ class Log:
         return record
 
     def read(self, generation: int | None = None) -> Record:
-        """A record, by default the current one; the `InputError` for a missing one lists the existing generations."""
-        head = self.head() if generation is None else {}  # read before the log, which only grows
+        """A record, by default the current one; the `InputError` for a missing one
+        lists the existing generations.
+        """
+        # read before the log, which only grows
+        head = self.head() if generation is None else {}
         known = self.generations()
         if generation is None and (lost := self._lost_fault(head, known)):
             raise InputError(lost)
         if not known or (generation is not None and generation not in known):
-            rule = "the database must hold it" if generation is None else f"generation {generation} must exist"
+            rule = (
+                "the database must hold it"
+                if generation is None
+                else f"generation {generation} must exist"
+            )
             found = f"generations {known}" if known else "nothing"
-            raise InputError(Fault(f"{self.place.name}: {self.what}", rule, found, "see skindb info"))
+            raise InputError(
+                Fault(f"{self.place.name}: {self.what}", rule, found, "see skindb info")
+            )
         record = self._read(known[-1] if generation is None else generation)
         if other := self._mismatch_fault(head, record):
             raise InputError(other)
@@ -96,7 +108,9 @@ class Log:
 
     def is_empty(self) -> bool:
         """Whether no record was ever committed, or all records were removed deliberately."""
-        return not self.generations() and not self._lost_fault(self.head(), self.generations())
+        return not self.generations() and not self._lost_fault(
+            self.head(), self.generations()
+        )
 
     def create(self, record: Record, guard: Guard | None = None) -> Record:
         """Commit `record` as the current one and return it sealed.
@@ -115,14 +129,27 @@ class Log:
         """
         content, seal = record_to_json(record)
         try:
-            created = self.place.create(self.record_key(record.generation), content, guard=guard)
+            created = self.place.create(
+                self.record_key(record.generation), content, guard=guard
+            )
         except WithdrawnError:
-            if record.generation in self.generations() and self._read(record.generation).seal == seal:
-                self.remove(record.generation)  # in a bucket, where another writer may have seen it
+            if (
+                record.generation in self.generations()
+                and self._read(record.generation).seal == seal
+            ):
+                # in a bucket, where another writer may have seen it
+                self.remove(record.generation)
             raise
         if not created:
             found = f"generation {record.generation} was committed by another writer"
-            raise Conflict(Fault(self.what, "a generation must be committed only once", found, "run the command again"))
+            raise Conflict(
+                Fault(
+                    self.what,
+                    "a generation must be committed only once",
+                    found,
+                    "run the command again",
+                )
+            )
         if self.kind not in TRANSIENT:
             self._write_head(record.generation, seal, guard)
         return Record(**{**asdict(record), "seal": seal})
@@ -130,7 +157,8 @@ class Log:
     def remove(self, generation: int) -> None:
         """Remove a record and its version permanently, and leave a tombstone with its seal.
 
-        The record is removed last, so that the same call can complete a removal that was interrupted.
+        The record is removed last, so that the same call can complete a removal that
+        was interrupted.
         """
         record = self._read(generation)
         self.place.create(tombstone_of(record.seal), tombstone_content(record))
@@ -144,15 +172,22 @@ class Log:
             self.place.remove(key)
 
     def forget(self) -> None:
-        """Remove all versions of a transient kind, including those of killed writers, without a tombstone."""
+        """Remove all versions of a transient kind, including those of killed writers,
+        without a tombstone.
+        """
         if self.kind not in TRANSIENT:
-            raise ValueError(f"{self.what} must be removed by `remove`, because the kind {self.kind} is not transient")
+            raise ValueError(
+                f"{self.what} must be removed by `remove`, because the kind "
+                f"{self.kind} is not transient"
+            )
         # the record first, so that it never names a missing version
         for key in (self.key, f"data/{self.kind}/{self.take}"):
             self.place.remove(key)
 
     def faults(self) -> tuple[list[Record], list[Fault]]:
-        """The readable records, and the faults of the other records, of the chain of seals and of the head."""
+        """The readable records, and the faults of the other records, of the chain of
+        seals and of the head.
+        """
         records: list[Record] = []
         faults: list[Fault] = []
         head = self.head()
@@ -172,7 +207,9 @@ class Log:
             records.append(record)
             last = generation
             seal = record.seal
-        return records, faults + ([lost] if (lost := self._lost_fault(head, known)) else [])
+        return records, faults + (
+            [lost] if (lost := self._lost_fault(head, known)) else []
+        )
 
     def readable(self) -> list[Record]:
         """All readable records, oldest first; damaged ones are skipped."""
@@ -187,7 +224,9 @@ class Log:
         return records
 
     def head(self) -> dict[str, Any]:
-        """Generation and seal of the newest record from the cache; empty if the cache is missing or damaged."""
+        """Generation and seal of the newest record from the cache; empty if the cache
+        is missing or damaged.
+        """
         try:
             head = json_object(self.place.read_small(self.head_key))
         except UnavailableError:
@@ -195,7 +234,9 @@ class Log:
         except (OSError, ValueError, RecursionError):
             return {}
         digest = head.pop("digest", None)
-        if not isinstance(head.get("generation"), int) or not isinstance(head.get("seal"), str):
+        if not isinstance(head.get("generation"), int) or not isinstance(
+            head.get("seal"), str
+        ):
             return {}
         return head if digest == self._head_digest(head) else {}
 
@@ -219,10 +260,19 @@ class Log:
             found = str(error)
         except OSError as error:
             found = error.strerror or "an unreadable file"
-        raise InputError(Fault(self.place.where(key), "a record of the log must be as committed", found, cure))
+        raise InputError(
+            Fault(
+                self.place.where(key),
+                "a record of the log must be as committed",
+                found,
+                cure,
+            )
+        )
 
     def _link_faults(self, record: Record, last: int, seal: str) -> list[Fault]:
-        """Faults of the link to the previous record, which must exist unless it was removed deliberately."""
+        """Faults of the link to the previous record, which must exist unless it was
+        removed deliberately.
+        """
         before = record.previous
         missing = record.generation - last - 1
         tombstone = self._tombstone(before)
@@ -233,23 +283,56 @@ class Log:
             missing = missing - 1
             tombstone = self._tombstone(before)
         if missing:
-            lost = f"generation {last + 1}" if missing == 1 else f"generations {last + 1} to {last + missing}"
-            return [Fault(self.what, f"{lost} must exist", "no record and no tombstone", RESTORE)]
+            lost = (
+                f"generation {last + 1}"
+                if missing == 1
+                else f"generations {last + 1} to {last + missing}"
+            )
+            return [
+                Fault(
+                    self.what,
+                    f"{lost} must exist",
+                    "no record and no tombstone",
+                    RESTORE,
+                )
+            ]
         if seal not in ("?", before):
             rule = f"generation {record.generation} must follow the record before it"
-            return [Fault(self.what, rule, "a record that names a different predecessor", RESTORE)]
+            return [
+                Fault(
+                    self.what,
+                    rule,
+                    "a record that names a different predecessor",
+                    RESTORE,
+                )
+            ]
         return []
 
     def _lost_fault(self, head: dict[str, Any], known: list[int]) -> Fault | None:
-        """Fault if the head, a cache that may be outdated, is ahead of the log: then records were lost."""
-        if not head or (known and head["generation"] <= known[-1]) or self.is_removed(head["seal"]):
+        """Fault if the head, a cache that may be outdated, is ahead of the log: then
+        records were lost.
+        """
+        if (
+            not head
+            or (known and head["generation"] <= known[-1])
+            or self.is_removed(head["seal"])
+        ):
             return None
         found = f"generations {known}" if known else "nothing"
-        return Fault(self.what, f"generation {head['generation']} must exist", found, self._head_cure())
+        return Fault(
+            self.what,
+            f"generation {head['generation']} must exist",
+            found,
+            self._head_cure(),
+        )
 
     def _mismatch_fault(self, head: dict[str, Any], record: Record) -> Fault | None:
         """Fault if a record is not the one that the head names for its generation."""
-        if not head or head["generation"] != record.generation or head["seal"] == record.seal:
+        if (
+            not head
+            or head["generation"] != record.generation
+            or head["seal"] == record.seal
+        ):
             return None
         if self.is_removed(head["seal"]):
             return None
@@ -259,9 +342,13 @@ class Log:
     def _head_cure(self) -> str:
         return f"{RESTORE}; if the log is correct, remove {self.head_key}"
 
-    def _write_head(self, generation: int, seal: str, guard: Guard | None = None) -> None:
+    def _write_head(
+        self, generation: int, seal: str, guard: Guard | None = None
+    ) -> None:
         try:
-            self.place.replace(self.head_key, self.head_content(generation, seal), guard=guard)
+            self.place.replace(
+                self.head_key, self.head_content(generation, seal), guard=guard
+            )
         except (OSError, InputError):
             return  # the record is committed, even if the cache cannot be written
 
@@ -271,8 +358,13 @@ class Log:
         return json.dumps(head | {"digest": self._head_digest(head)}).encode()
 
     def _head_digest(self, head: dict[str, Any]) -> str:
-        """Digest of a head of this kind and take, by which a damaged head or that of another take is detected."""
-        return seal_of({name: head[name] for name in ("generation", "seal")} | {"kind": self.kind, "take": self.take})
+        """Digest of a head of this kind and take, by which a damaged head or that of
+        another take is detected.
+        """
+        return seal_of(
+            {name: head[name] for name in ("generation", "seal")}
+            | {"kind": self.kind, "take": self.take}
+        )
 
     def _tombstone(self, seal: str) -> dict[str, str] | None:
         """The tombstone of the record with this seal; None if there is none."""
@@ -284,7 +376,12 @@ class Log:
             raise
         except (OSError, ValueError, RecursionError):
             return None
-        return tombstone if tombstone.get("seal") == seal and isinstance(tombstone.get("previous"), str) else None
+        return (
+            tombstone
+            if tombstone.get("seal") == seal
+            and isinstance(tombstone.get("previous"), str)
+            else None
+        )
 
     def record_key(self, generation: int) -> str:
         """Key of a record."""
@@ -292,8 +389,12 @@ class Log:
 
 
 def tombstone_of(seal: str) -> str:
-    """Key of a tombstone, which reveals nothing about the record, even to a reader who knows its name."""
-    return f"tombstones/{hashlib.sha256(seal.encode(errors='replace')).hexdigest()}.json"
+    """Key of a tombstone, which reveals nothing about the record, even to a reader who
+    knows its name.
+    """
+    return (
+        f"tombstones/{hashlib.sha256(seal.encode(errors='replace')).hexdigest()}.json"
+    )
 
 
 def tombstone_content(record: Record) -> bytes:
@@ -305,9 +406,15 @@ def tombstone_content(record: Record) -> bytes:
 
 def committed_logs(place: Place) -> Iterable[Log]:
     """The logs of all kinds and takes, including those for which only a head exists."""
-    heads = {(kind, name.removesuffix(".json")) for kind, name in names_below(place, "heads")}
+    heads = {
+        (kind, name.removesuffix(".json")) for kind, name in names_below(place, "heads")
+    }
     for kind, take in sorted({*names_below(place, "log"), *heads}):
-        if re.fullmatch(KIND, kind) and re.fullmatch(TAKE, take) and kind not in TRANSIENT:
+        if (
+            re.fullmatch(KIND, kind)
+            and re.fullmatch(TAKE, take)
+            and kind not in TRANSIENT
+        ):
             yield Log(place, kind, take)
 
 

@@ -1,8 +1,10 @@
-"""The marker file: a local file outside the database that notes withdrawals, readmissions and consents.
+"""The marker file: a local file outside the database that notes withdrawals,
+readmissions and consents.
 
-A restore of an earlier backup repeats what the file notes. Each line is a JSON object with a seal that is keyed by the
-secret of the database. Subjects are named by keyed hashes only. Lines are only added; what is missing, for example
-after a full disk, is added by the next command that writes to the file.
+A restore of an earlier backup repeats what the file notes. Each line is a JSON object
+with a seal that is keyed by the secret of the database. Subjects are named by keyed
+hashes only. Lines are only added; what is missing, for example after a full disk, is
+added by the next command that writes to the file.
 """
 
 from __future__ import annotations
@@ -25,13 +27,23 @@ from skindb._limits import MAX_STORE_JSON_BYTES
 from skindb.errors import Fault, InputError, SkindbWarning, system_fault
 from skindb.schema.consent import SCOPES, consent_scope
 from skindb.store.folder import flush_path
-from skindb.store.markers import ENTRY, WITHDRAWN, is_sealed, keyed_hash, keyed_seal, require_secret
+from skindb.store.markers import (
+    ENTRY,
+    WITHDRAWN,
+    is_sealed,
+    keyed_hash,
+    keyed_seal,
+    require_secret,
+)
 from skindb.store.place import Place, UnavailableError
 from skindb.store.record import DIGEST, Record, json_object
 
 FORMAT = 1
 LINE = "line"  # the key in the seals of lines
-CURE = "give the right file; or rename this one, and the next withdrawal, consent or backup writes a new one"
+CURE = (
+    "give the right file; or rename this one, and the next withdrawal, consent or "
+    "backup writes a new one"
+)
 
 
 class MarkerFileWarning(SkindbWarning):
@@ -42,13 +54,18 @@ class MarkerFileWarning(SkindbWarning):
 class Notes:
     """What a marker file notes."""
 
-    entries: dict[str, dict[str, Any]] = field(default_factory=dict)  # key of an entry of `withdrawn/` -> content
-    consents: dict[str, dict[str, Any]] = field(default_factory=dict)  # hash of a subject -> its newest consent
-    records: set[str] = field(default_factory=set)  # keyed hashes of the seals of records of consent
+    # key of an entry of `withdrawn/` -> content
+    entries: dict[str, dict[str, Any]] = field(default_factory=dict)
+    # hash of a subject -> its newest consent
+    consents: dict[str, dict[str, Any]] = field(default_factory=dict)
+    # keyed hashes of the seals of records of consent
+    records: set[str] = field(default_factory=set)
 
 
 def read_marker_file(path: Path, secret: bytes) -> Notes:
-    """The notes of a marker file; `InputError` if it is damaged, or not that of the database with this secret."""
+    """The notes of a marker file; `InputError` if it is damaged, or not that of the
+    database with this secret.
+    """
     content = read_regular(path, MAX_STORE_JSON_BYTES)
     return _notes_from(content, str(path), secret)
 
@@ -64,13 +81,19 @@ def _notes_from(content: bytes, where: str, secret: bytes) -> Notes:
                 raise ValueError("a first line of another format")
             _add_line(notes, body)
         except (ValueError, TypeError, KeyError, RecursionError) as error:
-            fault = Fault(f"{where}, line {number}", "a marker file must be as it was written", str(error), CURE)
+            fault = Fault(
+                f"{where}, line {number}",
+                "a marker file must be as it was written",
+                str(error),
+                CURE,
+            )
             raise InputError(fault) from None
     return notes
 
 
 def note_withdrawals(place: Place, *, is_repeated: bool = False) -> None:
-    """Add the withdrawals and readmissions of a database to its marker file, which is created if it is missing.
+    """Add the withdrawals and readmissions of a database to its marker file, which is
+    created if it is missing.
 
     Parameters
     ----------
@@ -81,17 +104,27 @@ def note_withdrawals(place: Place, *, is_repeated: bool = False) -> None:
     """
 
     def lines(notes: Notes, _: bytes) -> list[dict[str, Any]]:
-        keys = [f"{WITHDRAWN}/{name}" for name in sorted(place.sizes(WITHDRAWN)) if ENTRY.fullmatch(name)]
+        keys = [
+            f"{WITHDRAWN}/{name}"
+            for name in sorted(place.sizes(WITHDRAWN))
+            if ENTRY.fullmatch(name)
+        ]
         return [_entry_line(place, key) for key in keys if key not in notes.entries]
 
     _add_lines(place, lines, is_repeated=is_repeated)
 
 
 def note_consents(place: Place, records: Iterable[Record]) -> None:
-    """Add records of consent to the marker file of their database, which is created if it is missing."""
+    """Add records of consent to the marker file of their database, which is created if
+    it is missing.
+    """
 
     def lines(notes: Notes, secret: bytes) -> list[dict[str, Any]]:
-        return [line for record in records if (line := _consent_line(record, secret))["record"] not in notes.records]
+        return [
+            line
+            for record in records
+            if (line := _consent_line(record, secret))["record"] not in notes.records
+        ]
 
     _add_lines(place, lines, is_repeated=False)
 
@@ -105,7 +138,9 @@ def _add_line(notes: Notes, body: Mapping[str, Any]) -> None:
         notes.entries[f"{WITHDRAWN}/{name}"] = dict(body["content"])
         notes.consents.pop(match[1], None)  # what was agreed to before the withdrawal
     elif "consent" in body:
-        if not re.fullmatch(DIGEST, body["subject"]) or not set(body["consent"]) <= {*SCOPES}:
+        if not re.fullmatch(DIGEST, body["subject"]) or not set(body["consent"]) <= {
+            *SCOPES
+        }:
             raise ValueError("a consent with invalid values")
         notes.consents[body["subject"]] = dict(body)
         notes.records.add(body["record"])
@@ -124,44 +159,69 @@ def _consent_line(record: Record, secret: bytes) -> dict[str, Any]:
     }
 
 
-def _add_lines(place: Place, missing: Callable[[Notes, bytes], list[dict[str, Any]]], *, is_repeated: bool) -> None:
-    """Add the lines that are missing; a file that cannot be written is a warning, because the database is not."""
+def _add_lines(
+    place: Place,
+    missing: Callable[[Notes, bytes], list[dict[str, Any]]],
+    *,
+    is_repeated: bool,
+) -> None:
+    """Add the lines that are missing; a file that cannot be written is a warning,
+    because the database is not.
+    """
     path = place.marker_file()
     try:
         secret = require_secret(place)
         with _locked(path) as number:
             content = os.pread(number, MAX_STORE_JSON_BYTES, 0)
-            whole = content[: content.rfind(b"\n") + 1]  # without a line whose writer was killed
+            # without a line whose writer was killed
+            whole = content[: content.rfind(b"\n") + 1]
             notes = _notes_from(whole, str(path), secret) if whole else Notes()
             bodies = ([] if whole else [{"format": FORMAT}]) + missing(notes, secret)
-            lines = [json.dumps({**body, "seal": keyed_seal(secret, LINE, body)}) for body in bodies]
+            lines = [
+                json.dumps({**body, "seal": keyed_seal(secret, LINE, body)})
+                for body in bodies
+            ]
             _append(number, len(whole), "".join(f"{line}\n" for line in lines).encode())
     except UnavailableError:
         raise
     except (OSError, InputError) as error:
         if is_repeated:
             return
-        rule = "withdrawals and consents must be noted outside the database, so that a restore repeats them"
-        fault = system_fault(error, str(path)) if isinstance(error, OSError) else error.faults[0]
+        rule = (
+            "withdrawals and consents must be noted outside the database, so that a "
+            "restore repeats them"
+        )
+        fault = (
+            system_fault(error, str(path))
+            if isinstance(error, OSError)
+            else error.faults[0]
+        )
         warnings.warn(MarkerFileWarning(str(replace(fault, rule=rule))), stacklevel=2)
 
 
 @contextmanager
 def _locked(path: Path) -> Iterator[int]:
-    """Descriptor of a marker file, which is created if it is missing, and which no other process writes."""
+    """Descriptor of a marker file, which is created if it is missing, and which no
+    other process writes.
+    """
     make_private(path.parent)
     is_new = not path.exists()
-    number = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK, PRIVATE_FILE)
+    number = os.open(
+        path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK, PRIVATE_FILE
+    )
     try:
         if not stat.S_ISREG(os.fstat(number).st_mode):
-            raise OSError(errno.EINVAL, "something that is not a regular file", str(path))
+            raise OSError(
+                errno.EINVAL, "something that is not a regular file", str(path)
+            )
         fcntl.flock(number, fcntl.LOCK_EX)
         try:
             yield number
             if is_new:
                 flush_path(path.resolve().parent)
         finally:
-            fcntl.flock(number, fcntl.LOCK_UN)  # closing alone keeps it while a copy of the descriptor is open
+            # closing alone keeps it while a copy of the descriptor is open
+            fcntl.flock(number, fcntl.LOCK_UN)
     finally:
         os.close(number)
 

@@ -1,20 +1,25 @@
 """Withdrawals and readmissions of subjects, which are kept for good and without pseudonyms.
 
-`withdrawn/<hash>/<number>.json` is an entry. Odd entries state that the subject was withdrawn, even ones that the
-subject was admitted again with a new, dated consent. The hash is that of the pseudonym, keyed with the random bytes in
-`secret`. The number of the last entry of a subject is its *admission*; without entries it is 0. A version records the
-admissions of the subjects that it refers to, and only readers for whom they are the same see it.
+`withdrawn/<hash>/<number>.json` is an entry. Odd entries state that the subject was
+withdrawn, even ones that the subject was admitted again with a new, dated consent. The
+hash is that of the pseudonym, keyed with the random bytes in `secret`. The number of
+the last entry of a subject is its *admission*; without entries it is 0. A version
+records the admissions of the subjects that it refers to, and only readers for whom they
+are the same see it.
 
-No writer can bring a withdrawn subject back, although writers hold no locks and may be suspended at any time. In a
-folder, a record appears in three steps: the writer (W1) writes a temporary file in `staging/`, (W2) lists the entries
-and refuses if an admission has changed, and (W3) links the temporary file to the name of the record. A withdrawal (E1)
-creates its entry, (E2) removes every file in `staging/`, and (E3) lists and removes what refers to the subject. If W2
-comes after E1, the writer sees the entry and refuses. If W2 comes before E1, the temporary file exists before E2
-removes it: either W3 came first, and E3 finds the record, or W3 fails. A writer whose file was removed although its
-subjects are not withdrawn starts again at W1.
+No writer can bring a withdrawn subject back, although writers hold no locks and may be
+suspended at any time. In a folder, a record appears in three steps: the writer (W1)
+writes a temporary file in `staging/`, (W2) lists the entries and refuses if an
+admission has changed, and (W3) links the temporary file to the name of the record. A
+withdrawal (E1) creates its entry, (E2) removes every file in `staging/`, and (E3) lists
+and removes what refers to the subject. If W2 comes after E1, the writer sees the entry
+and refuses. If W2 comes before E1, the temporary file exists before E2 removes it:
+either W3 came first, and E3 finds the record, or W3 fails. A writer whose file was
+removed although its subjects are not withdrawn starts again at W1.
 
-In a bucket, W1 and W3 are one conditional put, and the writer repeats W2 afterwards. If it refuses then, it removes its
-record. If it is killed before, readers ignore the record, because its admissions differ, and `skindb clean` removes it.
+In a bucket, W1 and W3 are one conditional put, and the writer repeats W2 afterwards. If
+it refuses then, it removes its record. If it is killed before, readers ignore the
+record, because its admissions differ, and `skindb clean` removes it.
 """
 
 from __future__ import annotations
@@ -41,7 +46,8 @@ ENTRY = re.compile(r"([0-9a-f]{64})/([0-9]{4})\.json")
 RESTORE_SECRET = "restore it from a backup"
 RESTORING = "restoring.json"
 BACKUP = "backup.json"
-# names of files in `withdrawn/`, which every reader and writer lists -> what they find, and the cure
+# names of files in `withdrawn/`, which every reader and writer lists -> what they find,
+# and the cure
 LOCKS = {
     RESTORING: ("a restore that is not complete", "run skindb restore again"),
     BACKUP: ("a backup", "run skindb restore, which makes a database of it"),
@@ -92,29 +98,38 @@ class Markers:
     def with_withdrawn(self, subject: str) -> Markers:
         """The admissions if a subject were withdrawn too."""
         number = self.admission(subject)
-        return Markers({**self.numbers, keyed_hash(self.secret, subject): number + 1 - number % 2}, self.secret)
+        return Markers(
+            {**self.numbers, keyed_hash(self.secret, subject): number + 1 - number % 2},
+            self.secret,
+        )
 
     def hides(self, kind: str, take: str) -> bool:
         """Whether the versions of a kind of a take are those of a withdrawn subject."""
-        return any(self.is_withdrawn(subject) for subject in subjects_of(kind, take, ()))
+        return any(
+            self.is_withdrawn(subject) for subject in subjects_of(kind, take, ())
+        )
 
     def admits(self, record: Record) -> bool:
         """Whether no subject of a version was withdrawn since it was begun."""
         return self.admits_all(record.subjects, record.admissions)
 
-    def admits_all(self, subjects: Iterable[str], admissions: Mapping[str, int]) -> bool:
+    def admits_all(
+        self, subjects: Iterable[str], admissions: Mapping[str, int]
+    ) -> bool:
         """Whether no subject is withdrawn, and the admissions of all of them are the given ones."""
         if not self.numbers:
             return True
         return all(
-            not self.is_withdrawn(subject) and self.admission(subject) == admissions.get(subject, 0)
+            not self.is_withdrawn(subject)
+            and self.admission(subject) == admissions.get(subject, 0)
             for subject in subjects
         )
 
 
 @dataclass(frozen=True)
 class AdmissionGuard:
-    """The last check before a file of these subjects is created: raises if an admission has changed meanwhile.
+    """The last check before a file of these subjects is created: raises if an admission
+    has changed meanwhile.
 
     Parameters
     ----------
@@ -129,9 +144,13 @@ class AdmissionGuard:
 
     @classmethod
     def begin(cls, place: Place, subjects: Iterable[str]) -> AdmissionGuard:
-        """The guard of a writer that begins; `WithdrawnError` if one of the subjects is withdrawn."""
+        """The guard of a writer that begins; `WithdrawnError` if one of the subjects is
+        withdrawn.
+        """
         markers = read_markers(place)
-        guard = cls(place, {subject: markers.admission(subject) for subject in subjects})
+        guard = cls(
+            place, {subject: markers.admission(subject) for subject in subjects}
+        )
         guard._require(markers)
         return guard
 
@@ -140,21 +159,37 @@ class AdmissionGuard:
         self._require(read_markers(self.place))
 
     def _require(self, markers: Markers) -> None:
-        rule = "the subject must not be withdrawn while a version with its data is written"
+        rule = (
+            "the subject must not be withdrawn while a version with its data is written"
+        )
         cure = "nothing was committed; run the command again without the subject"
-        withdrawn = [subject for subject in self.admissions if not markers.admits_all([subject], self.admissions)]
+        withdrawn = [
+            subject
+            for subject in self.admissions
+            if not markers.admits_all([subject], self.admissions)
+        ]
         if withdrawn:
-            raise WithdrawnError(Fault(subject, rule, "a withdrawal", cure) for subject in withdrawn)
+            raise WithdrawnError(
+                Fault(subject, rule, "a withdrawal", cure) for subject in withdrawn
+            )
 
 
 def subject_hash(place: Place, subject: str) -> str:
-    """Hash of a pseudonym that only shows whose it is to who knows the secret of the database, created if absent."""
+    """Hash of a pseudonym that only shows whose it is to who knows the secret of the
+    database, created if absent.
+    """
     return keyed_hash(require_secret(place), subject)
 
 
 def require_secret(place: Place) -> bytes:
-    """The random bytes of the database, which are created if there are none and nothing was made with them."""
-    if not place.file_type(SECRET) and not _numbers(place) and not place.file_type(AUDIT):
+    """The random bytes of the database, which are created if there are none and nothing
+    was made with them.
+    """
+    if (
+        not place.file_type(SECRET)
+        and not _numbers(place)
+        and not place.file_type(AUDIT)
+    ):
         body = {"secret": os.urandom(SECRET_BYTES).hex()}
         place.create(SECRET, json.dumps(body | {"seal": seal_of(body)}).encode())
     try:
@@ -167,7 +202,9 @@ def require_secret(place: Place) -> bytes:
     except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
         rule = "must be as it was created, because withdrawn subjects and the audit log need it"
         found = getattr(error, "strerror", None) or str(error)
-        raise InputError(Fault(place.where(SECRET), rule, found, RESTORE_SECRET)) from None
+        raise InputError(
+            Fault(place.where(SECRET), rule, found, RESTORE_SECRET)
+        ) from None
 
 
 def read_markers(place: Place) -> Markers:
@@ -195,11 +232,15 @@ def last_entry(place: Place, subject: str) -> Entry | None:
 
 
 def mark_withdrawn(place: Place, subject: str, removed: Mapping[str, int]) -> None:
-    """Create the entry of a withdrawal, with the number of versions of each kind, unless the subject is withdrawn."""
+    """Create the entry of a withdrawal, with the number of versions of each kind,
+    unless the subject is withdrawn.
+    """
     admission = read_markers(place).admission(subject)
     if admission % 2 == 0:
         now = datetime.now(UTC).isoformat(timespec="seconds")
-        _create_entry(place, subject, admission + 1, {"withdrawn": now, "removed": dict(removed)})
+        _create_entry(
+            place, subject, admission + 1, {"withdrawn": now, "removed": dict(removed)}
+        )
 
 
 def readmit(place: Place, subject: str, consent: date) -> None:
@@ -208,24 +249,37 @@ def readmit(place: Place, subject: str, consent: date) -> None:
     Raises
     ------
     InputError
-        If the subject was never withdrawn, or if the date is before the withdrawal or in the future.
+        If the subject was never withdrawn, or if the date is before the withdrawal or
+        in the future.
     """
     entry = last_entry(place, subject)
     rule = "a new consent must be given after the withdrawal of the subject, and not in the future"
     cure = "state the date on which the subject signed it"
     if entry is None:
         rule = "a new consent is only for a subject who was withdrawn"
-        raise InputError(Fault(subject, rule, "no withdrawal", "run the command without it"))
+        raise InputError(
+            Fault(subject, rule, "no withdrawal", "run the command without it")
+        )
     if not entry.is_withdrawal:
         if entry.date == consent:  # the run that admitted the subject was interrupted
             return
         found = f"the new consent of {entry.date}"
-        raise InputError(Fault(subject, "a subject is admitted again once", found, "run the command without it"))
+        raise InputError(
+            Fault(
+                subject,
+                "a subject is admitted again once",
+                found,
+                "run the command without it",
+            )
+        )
     if not entry.date <= consent <= date.today():
         found = f"{consent}, and a withdrawal on {entry.date}"
         raise InputError(Fault(subject, rule, found, cure))
-    if not _create_entry(place, subject, entry.number + 1, {"readmitted": consent.isoformat()}):
-        readmit(place, subject, consent)  # another process was faster, perhaps with another date
+    if not _create_entry(
+        place, subject, entry.number + 1, {"readmitted": consent.isoformat()}
+    ):
+        # another process was faster, perhaps with another date
+        readmit(place, subject, consent)
 
 
 def marker_faults(place: Place) -> list[Fault]:
@@ -257,12 +311,16 @@ def _numbers(place: Place) -> dict[str, int]:
     names = place.sizes(WITHDRAWN)
     for name, (found, cure) in LOCKS.items():
         if name in names and not place.is_unlocked:
-            raise InputError(Fault(place.name, "must be a complete database", found, cure))
+            raise InputError(
+                Fault(place.name, "must be a complete database", found, cure)
+            )
     return entry_numbers(names)
 
 
 def entry_numbers(names: Iterable[str]) -> dict[str, int]:
-    """Number of the last entry of every subject, by the keyed hash, from the names of the entries."""
+    """Number of the last entry of every subject, by the keyed hash, from the names of
+    the entries.
+    """
     numbers: dict[str, int] = {}
     for name in names:
         match = ENTRY.fullmatch(name)
@@ -271,10 +329,14 @@ def entry_numbers(names: Iterable[str]) -> dict[str, int]:
     return numbers
 
 
-def _create_entry(place: Place, subject: str, number: int, body: Mapping[str, Any]) -> bool:
+def _create_entry(
+    place: Place, subject: str, number: int, body: Mapping[str, Any]
+) -> bool:
     secret = require_secret(place)
     key = _entry_key(secret, subject, number)
-    return place.create(key, json.dumps({**body, "seal": keyed_seal(secret, key, body)}).encode())
+    return place.create(
+        key, json.dumps({**body, "seal": keyed_seal(secret, key, body)}).encode()
+    )
 
 
 def _entry_key(secret: bytes, subject: str, number: int) -> str:
@@ -295,9 +357,16 @@ def keyed_seal(secret: bytes, key: str, body: Mapping[str, Any]) -> str:
 
 def keyed_hash(secret: bytes, text: str) -> str:
     """Hash of a text that nobody can compute without the secret."""
-    return hmac.digest(secret, text.encode(errors="surrogatepass"), hashlib.sha256).hex()
+    return hmac.digest(
+        secret, text.encode(errors="surrogatepass"), hashlib.sha256
+    ).hex()
 
 
 def _entry_fault(place: Place, key: str, error: Exception) -> Fault:
     found = getattr(error, "strerror", None) or str(error)
-    return Fault(place.where(key), "an entry of a withdrawal must be as it was created", found, RESTORE_SECRET)
+    return Fault(
+        place.where(key),
+        "an entry of a withdrawal must be as it was created",
+        found,
+        RESTORE_SECRET,
+    )

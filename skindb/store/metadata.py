@@ -23,7 +23,8 @@ DTYPES = {  # bytes per element; that of a string is a reference
     "float64": 8,
     "string": 16,
 }
-MAX_CHUNK_BYTES = 1 << 32  # in memory; samples of 4,096 surfels with 300 lights and 32 cameras have 0.24 GB
+# in memory; samples of 4,096 surfels with 300 lights and 32 cameras have 0.24 GB
+MAX_CHUNK_BYTES = 1 << 32
 MAX_DIMS = 8
 MAX_CODECS = 8  # of an array, and of the chunks inside a shard; skindb writes three
 SHARDING = "sharding_indexed"
@@ -37,7 +38,8 @@ def metadata_faults(content: bytes, chunks: int) -> str:
     content
         Content of the file.
     chunks
-        Number of chunk files of the array; skindb writes every chunk, including those that contain only zeros.
+        Number of chunk files of the array; skindb writes every chunk, including those
+        that contain only zeros.
     """
     try:
         meta = json_object(content)
@@ -58,7 +60,9 @@ def _array_faults(meta: dict[str, Any], chunks: int) -> str:
         return f"a shape {list(shape)} with chunks {list(chunk)}"
     if (size := math.prod(chunk) * DTYPES[dtype]) > MAX_CHUNK_BYTES:
         return f"chunks of {size:.3g} bytes, more than the maximum of {MAX_CHUNK_BYTES:.3g}"
-    promised = math.prod(-(-length // part) for length, part in zip(shape, chunk, strict=True))
+    promised = math.prod(
+        -(-length // part) for length, part in zip(shape, chunk, strict=True)
+    )
     if promised != chunks:
         return f"a shape {list(shape)} with {promised} chunks, but {chunks} chunk files"
     return _codec_faults(meta["codecs"], depth=0)
@@ -67,12 +71,18 @@ def _array_faults(meta: dict[str, Any], chunks: int) -> str:
 def _codec_faults(codecs: list[dict[str, Any]], depth: int) -> str:
     if len(codecs) > MAX_CODECS or depth > 1:
         return "more codecs than skindb writes"
-    inner = [one["configuration"]["codecs"] for one in codecs if one["name"] == SHARDING]
-    return next((fault for those in inner if (fault := _codec_faults(those, depth + 1))), "")
+    inner = [
+        one["configuration"]["codecs"] for one in codecs if one["name"] == SHARDING
+    ]
+    return next(
+        (fault for those in inner if (fault := _codec_faults(those, depth + 1))), ""
+    )
 
 
 def _lengths(value: object) -> tuple[int, ...]:
-    if not isinstance(value, list) or not all(isinstance(one, int) and one >= 0 for one in value):
+    if not isinstance(value, list) or not all(
+        isinstance(one, int) and one >= 0 for one in value
+    ):
         raise ValueError("a shape must be a list of non-negative integers")
     return tuple(value)
 

@@ -11,7 +11,8 @@ def open(url: str) -> Database:  # noqa: A001  as in xarray and zarr
     Parameters
     ----------
     url
-        Folder of the database, created by the first commit if it is absent, or ``s3://bucket/prefix``.
+        Folder of the database, created by the first commit if it is absent, or
+        ``s3://bucket/prefix``.
 
     Returns
     -------

@@ -1,4 +1,6 @@
-"""Patterns of names, and the conversion of keys to paths, which never leads outside the database."""
+"""Patterns of names, and the conversion of keys to paths, which never leads outside the
+database.
+"""
 
 from __future__ import annotations
 
@@ -11,11 +13,14 @@ from skindb.errors import Fault, InputError
 TAKE = r"[A-Za-z0-9_-]{1,64}(\.[A-Za-z0-9_-]{1,64})?"
 KIND = r"[a-z]{1,32}"
 GROUP = r"[a-z_]{1,32}"
-TIME_HEX = r"[0-9]{8}T[0-9]{6}-[0-9a-f]{8}"  # start of the names of a version and of the files beside it
+# start of the names of a version and of the files beside it
+TIME_HEX = r"[0-9]{8}T[0-9]{6}-[0-9a-f]{8}"
 STAGING = "staging"  # folder for temporary files of writers
 AUDIT = "audit"  # folder of the audit log
-TRANSIENT = ("first",)  # kinds of intermediate results of a run, removed when its result is committed
-LEASE_KINDS = {"first": "model"}  # kind -> kind of the lease under which it is written, if it differs
+# kinds of intermediate results of a run, removed when its result is committed
+TRANSIENT = ("first",)
+# kind -> kind of the lease under which it is written, if it differs
+LEASE_KINDS = {"first": "model"}
 VERSION = rf"data/{KIND}/{TAKE}/{TIME_HEX}\.zarr"
 
 
@@ -27,7 +32,11 @@ def subject_of(take: str) -> str:
 def require_text(value: str, pattern: str, what: str) -> str:
     """Return `value` if it matches the whole pattern; otherwise raise an `InputError`."""
     if not isinstance(value, str) or not re.fullmatch(pattern, value):
-        raise InputError(Fault(what, f"must match {pattern}", repr(value)[:200], "choose another name"))
+        raise InputError(
+            Fault(
+                what, f"must match {pattern}", repr(value)[:200], "choose another name"
+            )
+        )
     return value
 
 
@@ -49,15 +58,26 @@ def inside(root: Path, key: str) -> Path:
     parts = key.split("/")
     if any(part in ("", ".", "..") or "\0" in part or "\\" in part for part in parts):
         raise InputError(outside_fault(root, key, "a path that leaves it"))
-    place = os.fspath(root)  # as text: `Path` takes four times as long, and a table of 1,000 takes needs 16,000 paths
+    # as text: `Path` takes four times as long, and a table of 1,000 takes needs 16,000
+    # paths
+    place = os.fspath(root)
     for number, part in enumerate(parts, 1):
         place = f"{place}/{part}"
         if os.path.islink(place):  # noqa: PTH114
-            raise InputError(outside_fault(root, key, f"a symbolic link at {'/'.join(parts[:number])}"))
+            raise InputError(
+                outside_fault(
+                    root, key, f"a symbolic link at {'/'.join(parts[:number])}"
+                )
+            )
     return Path(place)
 
 
 def outside_fault(root: Path | str, key: str, found: str) -> Fault:
     """Fault for a key that leads outside the database."""
     cure = "restore the file that names this path from a backup"
-    return Fault(f"{root}: {key[:200]!r}", "every path must stay inside the database", found, cure)
+    return Fault(
+        f"{root}: {key[:200]!r}",
+        "every path must stay inside the database",
+        found,
+        cure,
+    )

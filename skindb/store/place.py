@@ -14,18 +14,23 @@ Guard = Callable[[], None]  # raises if a file must not be written any more
 
 
 class UnavailableError(InputError):
-    """The place does not answer or refuses access, so that its contents are unknown but not known to be damaged."""
+    """The place does not answer or refuses access, so that its contents are unknown but
+    not known to be damaged.
+    """
 
 
 class Place(Protocol):
     """A place that stores bytes under keys, which are relative paths with "/" as the separator.
 
-    A key that leads outside the place raises an `InputError`, a missing file a `FileNotFoundError`, and a file that
-    cannot be read an `OSError`; both have a readable `strerror`.
+    A key that leads outside the place raises an `InputError`, a missing file a
+    `FileNotFoundError`, and a file that cannot be read an `OSError`; both have a
+    readable `strerror`.
     """
 
     is_unlocked: bool
-    """Whether this process may work on a backup, or on a database that is being restored; see `markers.LOCKS`."""
+    """Whether this process may work on a backup, or on a database that is being
+    restored; see `markers.LOCKS`.
+    """
 
     @property
     def name(self) -> str:
@@ -38,7 +43,9 @@ class Place(Protocol):
         """Path of a local folder for temporary files, which may not exist yet."""
 
     def marker_file(self) -> Path:
-        """Path of the local file outside the place that notes withdrawals and consents; see `marker_file`."""
+        """Path of the local file outside the place that notes withdrawals and consents;
+        see `marker_file`.
+        """
 
     def url(self, key: str) -> str:
         """Address of a key as shown to users."""
@@ -56,7 +63,9 @@ class Place(Protocol):
         """Type of a key: "folder", "file", "link" or "other"; empty if it does not exist."""
 
     def sizes(self, key: str) -> dict[str, int]:
-        """Size in bytes of every file below a key, by its path relative to the key; -1 if it is not a regular file."""
+        """Size in bytes of every file below a key, by its path relative to the key; -1
+        if it is not a regular file.
+        """
 
     def read(self, key: str, begin: int = 0, end: int | None = None) -> bytes:
         """Contents of a file from byte `begin`, counted from its end if negative, up to `end`."""
@@ -71,26 +80,43 @@ class Place(Protocol):
         """Identity of a file, which changes whenever the file is written or replaced."""
 
     def identities(self, key: str) -> dict[str, tuple[Hashable, ...]]:
-        """The identity of every file below a key, by its path relative to the key; (-1,) if not a regular file."""
+        """The identity of every file below a key, by its path relative to the key;
+        (-1,) if not a regular file.
+        """
 
     def proves(self, identity: tuple[Hashable, ...], content: bytes) -> bool:
-        """Whether an identity from `identities` proves, without reading the file, that it has exactly this content."""
+        """Whether an identity from `identities` proves, without reading the file, that
+        it has exactly this content.
+        """
 
     def modified(self, key: str) -> float:
-        """Time in seconds, by the clock of the storage, when a file or the newest file below a key was written."""
+        """Time in seconds, by the clock of the storage, when a file or the newest file
+        below a key was written.
+        """
 
     def now(self) -> float:
         """Time of the clock of the storage, which is the same for all machines that share it."""
 
     def make_durable(self, key: str, *, flush: bool = True) -> None:
-        """Return when everything below a key survives a power loss; without `flush`, when other processes see it."""
+        """Return when everything below a key survives a power loss; without `flush`,
+        when other processes see it.
+        """
 
-    def create(self, key: str, data: bytes, *, guard: Guard | None = None, flush_names: bool = True) -> bool:
-        """Write a file durably if it does not exist yet; returns False and writes nothing if it exists.
+    def create(
+        self,
+        key: str,
+        data: bytes,
+        *,
+        guard: Guard | None = None,
+        flush_names: bool = True,
+    ) -> bool:
+        """Write a file durably if it does not exist yet; returns False and writes
+        nothing if it exists.
 
-        Without `flush_names`, the file may be missing after a power loss until `flush_names` is called.
-        The guard is called in the last step before the file exists. In a bucket it is called again afterwards, and if
-        it raises then, the caller must remove the file.
+        Without `flush_names`, the file may be missing after a power loss until
+        `flush_names` is called. The guard is called in the last step before the file
+        exists. In a bucket it is called again afterwards, and if it raises then, the
+        caller must remove the file.
         """
 
     def flush_names(self, keys: Iterable[str]) -> None:
@@ -99,11 +125,14 @@ class Place(Protocol):
     def replace(self, key: str, data: bytes, *, guard: Guard | None = None) -> None:
         """Write or replace a small file atomically; never for versions and their records.
 
-        The guard is called as by `create`. If it raises after the file was written, the file is removed.
+        The guard is called as by `create`. If it raises after the file was written, the
+        file is removed.
         """
 
     def sweep(self) -> None:
-        """Make the writers whose guards were called already, but whose files do not exist yet, call them again."""
+        """Make the writers whose guards were called already, but whose files do not
+        exist yet, call them again.
+        """
 
     def remove(self, key: str) -> None:
         """Delete a file, or everything below a key; missing files are ignored."""

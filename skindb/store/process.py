@@ -9,17 +9,27 @@ from pathlib import Path
 from typing import Any
 
 PROC = Path("/proc")
-MACHINE_KEYS = ("boot", "namespace")  # equal for processes that can find each other by their ids
+# equal for processes that can find each other by their ids
+MACHINE_KEYS = ("boot", "namespace")
 
 
 def this_process() -> dict[str, Any]:
-    """Host name, process id and, on Linux, the boot id, the namespace of process ids and the start time."""
+    """Host name, process id and, on Linux, the boot id, the namespace of process ids
+    and the start time.
+    """
     number = os.getpid()
-    return {"host": socket.gethostname(), "process": number, "started": _start(number), **_machine()}
+    return {
+        "host": socket.gethostname(),
+        "process": number,
+        "started": _start(number),
+        **_machine(),
+    }
 
 
 def has_ended(holder: Mapping[str, Any]) -> bool:
-    """Whether a process described by `this_process` has certainly ended; False for a process of another machine."""
+    """Whether a process described by `this_process` has certainly ended; False for a
+    process of another machine.
+    """
     here = _machine()
     number = holder.get("process")
     started = holder.get("started")
@@ -46,9 +56,13 @@ def _machine() -> dict[str, str]:
 
 
 def _start(number: int) -> str | None:
-    """Start of a process in clock ticks since the boot; "ended" for a zombie process; None if unknown."""
+    """Start of a process in clock ticks since the boot; "ended" for a zombie process;
+    None if unknown.
+    """
     try:
-        state, *rest = (PROC / str(number) / "stat").read_text().rpartition(")")[2].split()
+        state, *rest = (
+            (PROC / str(number) / "stat").read_text().rpartition(")")[2].split()
+        )
     except (OSError, ValueError):
         return None
     return "ended" if state in "ZX" else rest[18]

@@ -1,4 +1,6 @@
-"""Records of the log: commits as sealed JSON, whose parts are all validated before they are used."""
+"""Records of the log: commits as sealed JSON, whose parts are all validated before they
+are used.
+"""
 
 from __future__ import annotations
 
@@ -58,7 +60,8 @@ class Record:
     admissions: dict[str, int] = field(default_factory=dict, repr=False)
     manifest: str = ""  # sha256 of the manifest
     tables: str = ""  # sha256 of the tables, if the version has any
-    contents: dict[str, Any] = field(default_factory=dict, repr=False)  # group -> sizes, variables and short labels
+    # group -> sizes, variables and short labels
+    contents: dict[str, Any] = field(default_factory=dict, repr=False)
     previous: str = ""  # seal of the record before this one
     seal: str = field(default="", compare=False)
 
@@ -79,11 +82,18 @@ class Record:
 
     def as_input(self) -> dict[str, Any]:
         """Reference to this version in the provenance of another one."""
-        return {"kind": self.kind, "take": self.take, "generation": self.generation, "seal": self.seal}
+        return {
+            "kind": self.kind,
+            "take": self.take,
+            "generation": self.generation,
+            "seal": self.seal,
+        }
 
 
 def own_takes(kind: str, take: str) -> set[str]:
-    """The take of a version; none if its kind has none, such as a study, whose name may be that of a take."""
+    """The take of a version; none if its kind has none, such as a study, whose name may
+    be that of a take.
+    """
     return set() if kind in KINDS_WITHOUT_SUBJECT else {take}
 
 
@@ -110,7 +120,9 @@ def json_object(content: bytes) -> dict[str, Any]:
 
 def record_to_json(record: Record) -> tuple[bytes, str]:
     """Content of the file of a record, and its seal."""
-    body = {name: value for name, value in asdict(record).items() if name in FIELDS} | {"format": FORMAT}
+    body = {name: value for name, value in asdict(record).items() if name in FIELDS} | {
+        "format": FORMAT
+    }
     seal = seal_of(body)
     return json.dumps(body | {"seal": seal}, indent=1).encode(), seal
 
@@ -134,17 +146,23 @@ def record_from_json(content: bytes, key: str) -> Record:
     if seal != seal_of(body):
         raise ValueError("content that does not match its seal")
     if set(body) != FIELDS:
-        raise ValueError(f"fields that do not match its format: {', '.join(sorted(body))[:200]}")
+        raise ValueError(
+            f"fields that do not match its format: {', '.join(sorted(body))[:200]}"
+        )
     provenance = body["provenance"]
     version = provenance.get("schema_version") if isinstance(provenance, dict) else None
     if _is_count(version) and version != SCHEMA_VERSION:
-        raise (LaterError if version > SCHEMA_VERSION else ValueError)(f"schema version {version}")
+        raise (LaterError if version > SCHEMA_VERSION else ValueError)(
+            f"schema version {version}"
+        )
     if wrong := [name for name, holds in CHECKS.items() if not holds(body[name])]:
         raise ValueError(f"invalid values of {', '.join(wrong)}")
     if not {"schema_version", "software_version"} <= provenance.keys():
         raise ValueError("a record without provenance")
     if f"log/{body['kind']}/{body['take']}/{body['generation']:08d}.json" != key:
-        raise ValueError(f"the record of {body['kind']} {body['generation']} of {body['take']}")
+        raise ValueError(
+            f"the record of {body['kind']} {body['generation']} of {body['take']}"
+        )
     if not body["path"].startswith(f"data/{body['kind']}/{body['take']}/"):
         raise ValueError(f"the path of another take, {body['path']}")
     body.pop("format")
@@ -153,7 +171,11 @@ def record_from_json(content: bytes, key: str) -> Record:
 
 
 def _is_count(value: object) -> TypeGuard[int]:
-    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= MAX_COUNT
+    return (
+        isinstance(value, int)
+        and not isinstance(value, bool)
+        and 0 <= value <= MAX_COUNT
+    )
 
 
 def _is_text(value: object, pattern: str | re.Pattern[str] = r"(?s).*") -> bool:
@@ -166,11 +188,15 @@ def _is_digest_or_empty(value: object) -> bool:
 
 def _is_provenance(value: object) -> bool:
     """Whether the parts of a provenance that skindb uses have the right types."""
-    return isinstance(value, dict) and all(holds(value[name]) for name, holds in PROVENANCE.items() if name in value)
+    return isinstance(value, dict) and all(
+        holds(value[name]) for name, holds in PROVENANCE.items() if name in value
+    )
 
 
 def _are_inputs(value: object) -> bool:
-    return isinstance(value, dict) or (isinstance(value, list) and all(_is_input(one) for one in value))
+    return isinstance(value, dict) or (
+        isinstance(value, list) and all(_is_input(one) for one in value)
+    )
 
 
 def _is_input(one: object) -> bool:
@@ -200,11 +226,15 @@ def _are_texts(value: object) -> bool:
 
 
 def _are_contents(value: object) -> bool:
-    return isinstance(value, dict) and all(_is_text(name, GROUP) and _is_group(one) for name, one in value.items())
+    return isinstance(value, dict) and all(
+        _is_text(name, GROUP) and _is_group(one) for name, one in value.items()
+    )
 
 
 def _is_group(one: object) -> bool:
-    """Whether the description of a group has sizes for the dims of all variables, and labels of matching lengths."""
+    """Whether the description of a group has sizes for the dims of all variables, and
+    labels of matching lengths.
+    """
     if not isinstance(one, dict) or one.keys() != {"sizes", "variables", "labels"}:
         return False
     sizes = one["sizes"]
@@ -214,8 +244,14 @@ def _is_group(one: object) -> bool:
         return False
     return (
         all(map(_is_count, sizes.values()))
-        and all(name in VARIABLES and sizes.keys() >= set(VARIABLES[name].dims) for name in variables)
-        and all(_are_labels(those) and len(those) == sizes.get(dim) for dim, those in labels.items())
+        and all(
+            name in VARIABLES and sizes.keys() >= set(VARIABLES[name].dims)
+            for name in variables
+        )
+        and all(
+            _are_labels(those) and len(those) == sizes.get(dim)
+            for dim, those in labels.items()
+        )
     )
 
 
@@ -228,7 +264,9 @@ def _are_admissions(value: object) -> bool:
 
 
 def _are_labels(value: object) -> bool:
-    return isinstance(value, list) and all(isinstance(item, str | int | float) for item in value)
+    return isinstance(value, list) and all(
+        isinstance(item, str | int | float) for item in value
+    )
 
 
 # parts of a provenance that skindb reads without opening the version -> test of their values

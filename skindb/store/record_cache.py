@@ -1,7 +1,9 @@
-"""Cache of the parts of records that the catalogue needs, in one file, so that a query need not read all records.
+"""Cache of the parts of records that the catalogue needs, in one file, so that a query
+need not read all records.
 
-`catalogue.json` may be missing or outdated, like the heads. A cached record is used as long as a listing shows the same
-file of the record and, for the newest record, the same head. All other listed records are read and checked again.
+`catalogue.json` may be missing or outdated, like the heads. A cached record is used as
+long as a listing shows the same file of the record and, for the newest record, the same
+head. All other listed records are read and checked again.
 """
 
 from __future__ import annotations
@@ -27,7 +29,8 @@ if TYPE_CHECKING:
 
 CATALOGUE = "catalogue.json"
 FORMAT = 3
-READER_THREADS = 32  # threads that read records; a bucket takes some 20 ms per record, whatever its size
+# threads that read records; a bucket takes some 20 ms per record, whatever its size
+READER_THREADS = 32
 # parts of a provenance that the catalogue shows or uses
 CACHED_PARTS = (
     "schema_version",
@@ -41,10 +44,21 @@ CACHED_PARTS = (
     "status",
     "consent_scope",
 )
-KINDS_WITH_INPUTS = ("model",)  # not registrations, which name every take: those of 1,000 takes have a million inputs
-CACHED_KINDS = ("capture", *KINDS_WITH_INPUTS, CONSENT)  # kinds whose cached records contain all that `Staleness` needs
+# not registrations, which name every take: those of 1,000 takes have a million inputs
+KINDS_WITH_INPUTS = ("model",)
+# kinds whose cached records contain all that `Staleness` needs
+CACHED_KINDS = ("capture", *KINDS_WITH_INPUTS, CONSENT)
 # cached fields of a record
-CACHED_FIELDS = ("kind", "take", "generation", "path", "created", "bytes", "admissions", "seal")
+CACHED_FIELDS = (
+    "kind",
+    "take",
+    "generation",
+    "path",
+    "created",
+    "bytes",
+    "admissions",
+    "seal",
+)
 Key = tuple[str, str, int]
 
 
@@ -54,11 +68,14 @@ class Entry:
 
     record: Record
     file: str  # identity of the file of the record
-    head: str | None  # identity of the head when the record was the newest; empty without a head, None if not read
+    # identity of the head when the record was the newest; empty without a head, None if
+    # not read
+    head: str | None
 
 
 class RecordCache:
-    """The records of a database as `Known` needs them; only records that are not in the cache are read.
+    """The records of a database as `Known` needs them; only records that are not in the
+    cache are read.
 
     Parameters
     ----------
@@ -84,12 +101,18 @@ class RecordCache:
 
     def kinds(self) -> list[str]:
         """Kinds of the versions of all takes, without the transient kinds."""
-        named = sorted({kind for kind, _ in {*self._generations, *self._heads}} - {*TRANSIENT})
+        named = sorted(
+            {kind for kind, _ in {*self._generations, *self._heads}} - {*TRANSIENT}
+        )
         return [kind for kind in named if re.fullmatch(KIND, kind) and self.takes(kind)]
 
     def takes(self, kind: str) -> list[str]:
         """Takes with a version of this kind, including those whose records were lost."""
-        return sorted(take for of, take in {*self._generations, *self._heads} if of == kind and self.has(kind, take))
+        return sorted(
+            take
+            for of, take in {*self._generations, *self._heads}
+            if of == kind and self.has(kind, take)
+        )
 
     def has(self, kind: str, take: str) -> bool:
         """Whether a take has a version of this kind."""
@@ -97,10 +120,15 @@ class RecordCache:
             return False
         if (kind, take) in self._generations:
             return True
-        return (kind, take) in self._heads and re.fullmatch(TAKE, take) is not None and self.db.has(kind, take)
+        return (
+            (kind, take) in self._heads
+            and re.fullmatch(TAKE, take) is not None
+            and self.db.has(kind, take)
+        )
 
     def record(self, kind: str, take: str, generation: int | None = None) -> Record:
-        """The record of a version, by default the current one, with the parts of its provenance that catalogues need.
+        """The record of a version, by default the current one, with the parts of its
+        provenance that catalogues need.
 
         Its inputs are included only for the kinds `KINDS_WITH_INPUTS`.
         """
@@ -109,8 +137,11 @@ class RecordCache:
             return self._read(kind, take, generation)
         return entry.record
 
-    def read_ahead(self, kinds: Iterable[str], pins: Mapping[tuple[str, str], int]) -> None:
-        """Read in parallel the newest records of these kinds, and the given generations, that are not in the cache.
+    def read_ahead(
+        self, kinds: Iterable[str], pins: Mapping[tuple[str, str], int]
+    ) -> None:
+        """Read in parallel the newest records of these kinds, and the given
+        generations, that are not in the cache.
 
         Errors of single records are ignored here; they are raised when the record is requested.
         """
@@ -125,25 +156,40 @@ class RecordCache:
 
         wanted = {*kinds}
         asked = [(*key, None) for key in self._generations if key[0] in wanted]
-        missing = [key for key in [*asked, *((*key, one) for key, one in pins.items())] if self._entry(*key) is None]
+        missing = [
+            key
+            for key in [*asked, *((*key, one) for key, one in pins.items())]
+            if self._entry(*key) is None
+        ]
         pool = ThreadPoolExecutor(READER_THREADS)
         try:
             list(pool.map(read, missing))
         finally:
-            pool.shutdown(cancel_futures=True)  # if a bucket does not answer one request, it does not answer the others
+            # if a bucket does not answer one request, it does not answer the others
+            pool.shutdown(cancel_futures=True)
 
     def save(self) -> None:
-        """Write the cache for the next query if possible, without records that were removed meanwhile."""
+        """Write the cache for the next query if possible, without records that were
+        removed meanwhile.
+        """
         if not self._changed:
             return
         entries = _unchanged_entries(self._entries, _list_records(self.place))
-        rows = [entry for _, entry in sorted(entries.items()) if self._markers.admits(entry.record)]
+        rows = [
+            entry
+            for _, entry in sorted(entries.items())
+            if self._markers.admits(entry.record)
+        ]
         names = {
             entry.record.names: number for number, entry in enumerate(rows)
         }  # takes registered together share them
-        body: dict[str, Any] = {"format": FORMAT, "names": {str(number): those for those, number in names.items()}}
+        body: dict[str, Any] = {
+            "format": FORMAT,
+            "names": {str(number): those for those, number in names.items()},
+        }
         body["records"] = [_row(entry, names) for entry in rows]
-        with suppress(OSError, InputError):  # for example a read-only folder: the next query reads the log again
+        # for example a read-only folder: the next query reads the log again
+        with suppress(OSError, InputError):
             content = json.dumps(body | {"seal": seal_of(body)}).encode()
             self.place.replace(CATALOGUE, content, guard=self._require_same_markers)
 
@@ -151,7 +197,14 @@ class RecordCache:
         """Raise a `WithdrawnError` if a subject was withdrawn since this query began."""
         if read_markers(self.place) != self._markers:
             rule = "no subject must be withdrawn while the cache is written"
-            raise WithdrawnError(Fault(self.place.where(CATALOGUE), rule, "a withdrawal", "run the command again"))
+            raise WithdrawnError(
+                Fault(
+                    self.place.where(CATALOGUE),
+                    rule,
+                    "a withdrawal",
+                    "run the command again",
+                )
+            )
 
     def _entry(self, kind: str, take: str, generation: int | None) -> Entry | None:
         """Cached entry of a version; None if its files have changed."""
@@ -159,7 +212,8 @@ class RecordCache:
         number = generation if generation is not None or not known else known[-1]
         entry = None if number is None else self._entries.get((kind, take, number))
         is_checked = generation is not None or (
-            entry is not None and entry.head == _identity_text(self._heads.get((kind, take), ()))
+            entry is not None
+            and entry.head == _identity_text(self._heads.get((kind, take), ()))
         )
         return entry if is_checked else None
 
@@ -170,18 +224,26 @@ class RecordCache:
         head = self._heads.get((kind, take), ())
         try:
             if generation is None and known:
-                record = log.read_listed(known, lambda content: self.place.proves(head, content))
+                record = log.read_listed(
+                    known, lambda content: self.place.proves(head, content)
+                )
             else:
                 record = log.read(generation)
         except UnavailableError:
             raise
-        except InputError:  # damaged, or committed or removed since the listing, which the log decides
+        except InputError:
+            # damaged, or committed or removed since the listing, which the log decides
             record = self.db.record(kind, take, generation, markers=self._markers)
         if not self._markers.admits(record):
-            return self.db.record(kind, take, generation, markers=self._markers)  # raises the reason
+            # raises the reason
+            return self.db.record(kind, take, generation, markers=self._markers)
         record, key = _trimmed_record(record), (kind, take, record.generation)
         if key in self._files:
-            self._entries[key] = Entry(record, self._files[key], _identity_text(head) if generation is None else None)
+            self._entries[key] = Entry(
+                record,
+                self._files[key],
+                _identity_text(head) if generation is None else None,
+            )
             self._changed = True
         return record
 
@@ -196,7 +258,11 @@ def cache_names(place: Place, is_named: Callable[[str], bool]) -> bool:
     if not place.file_type(CATALOGUE):
         return False
     entries = _load_entries(place)
-    return entries is None or any(is_named(subject) for entry in entries.values() for subject in entry.record.subjects)
+    return entries is None or any(
+        is_named(subject)
+        for entry in entries.values()
+        for subject in entry.record.subjects
+    )
 
 
 def _generations(files: Iterable[Key]) -> dict[tuple[str, str], list[int]]:
@@ -226,7 +292,11 @@ def _list_heads(place: Place) -> dict[tuple[str, str], tuple[Hashable, ...]]:
         raise
     except InputError:  # a link
         return {}
-    parts = {name: name.removesuffix(".json").partition("/") for name in every if name.endswith(".json")}
+    parts = {
+        name: name.removesuffix(".json").partition("/")
+        for name in every
+        if name.endswith(".json")
+    }
     return {(kind, take): every[name] for name, (kind, _, take) in parts.items()}
 
 
@@ -234,8 +304,12 @@ def _identity_text(identity: tuple[Hashable, ...]) -> str:
     return " ".join(map(str, identity))
 
 
-def _unchanged_entries(entries: Mapping[Key, Entry], files: Mapping[Key, str]) -> dict[Key, Entry]:
-    return {key: entry for key, entry in entries.items() if files.get(key) == entry.file}
+def _unchanged_entries(
+    entries: Mapping[Key, Entry], files: Mapping[Key, str]
+) -> dict[Key, Entry]:
+    return {
+        key: entry for key, entry in entries.items() if files.get(key) == entry.file
+    }
 
 
 def _load_entries(place: Place) -> dict[Key, Entry] | None:
@@ -246,23 +320,41 @@ def _load_entries(place: Place) -> dict[Key, Entry] | None:
             return None
         names = {number: tuple(those) for number, those in body["names"].items()}
         entries = [
-            Entry(Record(**row["record"], names=names[str(row["names"])]), str(row["file"]), row["head"])
+            Entry(
+                Record(**row["record"], names=names[str(row["names"])]),
+                str(row["file"]),
+                row["head"],
+            )
             for row in body["records"]
         ]
     except UnavailableError:
         raise
     except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
         return None
-    return {(one.record.kind, one.record.take, one.record.generation): one for one in entries}
+    return {
+        (one.record.kind, one.record.take, one.record.generation): one
+        for one in entries
+    }
 
 
 def _trimmed_record(record: Record) -> Record:
-    parts = (*CACHED_PARTS, "inputs") if record.kind in KINDS_WITH_INPUTS else CACHED_PARTS
-    provenance = {name: record.provenance[name] for name in parts if name in record.provenance}
+    parts = (
+        (*CACHED_PARTS, "inputs") if record.kind in KINDS_WITH_INPUTS else CACHED_PARTS
+    )
+    provenance = {
+        name: record.provenance[name] for name in parts if name in record.provenance
+    }
     fields = {name: getattr(record, name) for name in CACHED_FIELDS}
     return Record(**fields, names=record.names, provenance=provenance)
 
 
 def _row(entry: Entry, names: Mapping[tuple[str, ...], int]) -> dict[str, Any]:
-    record = {name: getattr(entry.record, name) for name in (*CACHED_FIELDS, "provenance")}
-    return {"record": record, "names": names[entry.record.names], "file": entry.file, "head": entry.head}
+    record = {
+        name: getattr(entry.record, name) for name in (*CACHED_FIELDS, "provenance")
+    }
+    return {
+        "record": record,
+        "names": names[entry.record.names],
+        "file": entry.file,
+        "head": entry.head,
+    }

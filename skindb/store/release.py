@@ -17,8 +17,10 @@ if TYPE_CHECKING:
     from skindb.store.known import Snapshot
     from skindb.store.record_cache import RecordCache
 
-PINNED = ("capture", "model", "registration")  # kinds of the versions that a release names for each take
-Pins = Mapping[tuple[str, str], Mapping[str, Any]]  # (kind, take) -> reference to the version in the provenance
+# kinds of the versions that a release names for each take
+PINNED = ("capture", "model", "registration")
+# (kind, take) -> reference to the version in the provenance
+Pins = Mapping[tuple[str, str], Mapping[str, Any]]
 
 
 def create_release(db: Database, name: str, takes: Sequence[str] | None) -> Record:
@@ -26,7 +28,9 @@ def create_release(db: Database, name: str, takes: Sequence[str] | None) -> Reco
     require_text(name, TAKE, "name of a release")
     if db.has(RELEASE, name):
         there = f"a release of {db.record(RELEASE, name).created}"
-        raise InputError(Fault(name, "a release must have a new name", there, "choose another name"))
+        raise InputError(
+            Fault(name, "a release must have a new name", there, "choose another name")
+        )
     known = db.takes("model")
     names = known if takes is None else list(dict.fromkeys(takes))
     if unknown := [take for take in names if take not in known]:
@@ -34,12 +38,23 @@ def create_release(db: Database, name: str, takes: Sequence[str] | None) -> Reco
         cure = f"takes with a model: {', '.join(known) or 'none'}"
         raise InputError(Fault(take, rule, "no model", cure) for take in unknown)
     if not names:
-        raise InputError(Fault(name, "a release needs fitted takes", "no model", "run skindb fit first"))
-    pins = [db.record(kind, take).as_input() for take in names for kind in PINNED if db.has(kind, take)]
+        raise InputError(
+            Fault(
+                name, "a release needs fitted takes", "no model", "run skindb fit first"
+            )
+        )
+    pins = [
+        db.record(kind, take).as_input()
+        for take in names
+        for kind in PINNED
+        if db.has(kind, take)
+    ]
     return db.commit_release(name, pins)
 
 
-def commit_release(place: Place, name: str, pins: Iterable[Mapping[str, Any]]) -> Record:
+def commit_release(
+    place: Place, name: str, pins: Iterable[Mapping[str, Any]]
+) -> Record:
     """Commit a release, or a new revision of it."""
     inputs = [dict(one) for one in pins]
     with Stage(place, RELEASE, name, names={one["take"] for one in inputs}) as stage:
@@ -50,11 +65,22 @@ def pins_of(db: Database, name: str) -> Pins:
     """The versions that a release names; `InputError` if the release does not exist."""
     if not db.has(RELEASE, name):
         there = ", ".join(db.takes(RELEASE)) or "none"
-        raise InputError(Fault(name, "the release must exist", f"releases: {there}", "see skindb release"))
-    return {(one["kind"], one["take"]): one for one in db.record(RELEASE, name).made_from}
+        raise InputError(
+            Fault(
+                name,
+                "the release must exist",
+                f"releases: {there}",
+                "see skindb release",
+            )
+        )
+    return {
+        (one["kind"], one["take"]): one for one in db.record(RELEASE, name).made_from
+    }
 
 
-def pinned_record(db: Database | Snapshot | RecordCache, pins: Pins, kind: str, take: str) -> Record:
+def pinned_record(
+    db: Database | Snapshot | RecordCache, pins: Pins, kind: str, take: str
+) -> Record:
     """The record of the version that a release names for a take."""
     if (kind, take) not in pins:
         there = sorted(name for of, name in pins if of == kind)
@@ -64,7 +90,9 @@ def pinned_record(db: Database | Snapshot | RecordCache, pins: Pins, kind: str, 
     pin = pins[kind, take]
     record = db.record(kind, take, pin["generation"])
     if record.seal != pin["seal"]:
-        rule = f"generation {pin['generation']} of its {kind} must be that of the release"
+        rule = (
+            f"generation {pin['generation']} of its {kind} must be that of the release"
+        )
         found = "a different version"
         raise InputError(Fault(take, rule, found, "restore it from a backup"))
     return record

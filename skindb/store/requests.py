@@ -1,7 +1,8 @@
 """Requests to compute results again from which a withdrawn subject was removed.
 
-A withdrawal writes a request before it removes a result of others, and `refresh` computes the result and removes the
-request. No result is therefore lost if a withdrawal is killed, or if a result cannot be computed at once.
+A withdrawal writes a request before it removes a result of others, and `refresh`
+computes the result and removes the request. No result is therefore lost if a withdrawal
+is killed, or if a result cannot be computed at once.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ from skindb.store.record import json_object, seal_of
 
 REQUESTS = "requests"
 REQUEST_NAME = r"[0-9a-f]{64}\.json"
-# parameters that name takes: those that a result is limited to, one of a registration, and the versions of a release
+# parameters that name takes: those that a result is limited to, one of a registration,
+# and the versions of a release
 TAKES = "takes"
 REFERENCE = "reference"
 PINS = "pins"
@@ -45,17 +47,28 @@ class Request:
         return f"{REQUESTS}/{name}.json"
 
     def without(self, is_withdrawn: Callable[[str], bool]) -> Request | None:
-        """The request without takes of withdrawn subjects; None if nothing remains to be computed."""
-        if self.kind not in KINDS_WITHOUT_SUBJECT and is_withdrawn(subject_of(self.take)):
+        """The request without takes of withdrawn subjects; None if nothing remains to
+        be computed.
+        """
+        if self.kind not in KINDS_WITHOUT_SUBJECT and is_withdrawn(
+            subject_of(self.take)
+        ):
             return None
         parameters = dict(self.parameters)
         takes = parameters.get(TAKES)
         if takes:
-            parameters[TAKES] = [take for take in takes if not is_withdrawn(subject_of(take))]
-            if not parameters[TAKES] and not parameters.get(PINS):  # an empty list would mean all takes
+            parameters[TAKES] = [
+                take for take in takes if not is_withdrawn(subject_of(take))
+            ]
+            # an empty list would mean all takes
+            if not parameters[TAKES] and not parameters.get(PINS):
                 return None
         if PINS in parameters:
-            parameters[PINS] = [one for one in parameters[PINS] if not is_withdrawn(subject_of(one["take"]))]
+            parameters[PINS] = [
+                one
+                for one in parameters[PINS]
+                if not is_withdrawn(subject_of(one["take"]))
+            ]
             if not any(one["kind"] == "model" for one in parameters[PINS]):
                 return None
         reference = parameters.get(REFERENCE)
@@ -96,18 +109,33 @@ def read_requests(place: Place) -> tuple[list[Request], list[Fault]]:
             raise
         except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
             cure = "remove it, and run the analysis that is missing again"
-            faults.append(Fault(place.where(key), "a request must be as it was written", str(error), cure))
+            faults.append(
+                Fault(
+                    place.where(key),
+                    "a request must be as it was written",
+                    str(error),
+                    cure,
+                )
+            )
     return requests, faults
 
 
 def request_from_json(content: bytes) -> Request:
-    """The request in a file; `ValueError`, `TypeError` or `KeyError` if it is not as it was written."""
+    """The request in a file; `ValueError`, `TypeError` or `KeyError` if it is not as it
+    was written.
+    """
     body = json_object(content)
     if body.pop("seal", None) != seal_of(body):
         raise ValueError("content that does not match its seal")
     request = Request(**body)
-    names = [request.take, *request.parameters.get(TAKES, []), request.parameters.get(REFERENCE, "")]
+    names = [
+        request.take,
+        *request.parameters.get(TAKES, []),
+        request.parameters.get(REFERENCE, ""),
+    ]
     names += [pin["take"] for pin in request.parameters.get(PINS, [])]
-    if not re.fullmatch(KIND, request.kind) or not all(re.fullmatch(TAKE, name) for name in names if name):
+    if not re.fullmatch(KIND, request.kind) or not all(
+        re.fullmatch(TAKE, name) for name in names if name
+    ):
         raise ValueError("names that are not those of kinds and takes")
     return request

@@ -1,7 +1,8 @@
 """Restoring a database from a backup, without subjects who were withdrawn since.
 
-A restore writes into an empty place only. Until it is complete, `withdrawn/restoring.json` refuses every reader and
-writer, and the same call continues it. Nothing of a withdrawn subject is copied.
+A restore writes into an empty place only. Until it is complete,
+`withdrawn/restoring.json` refuses every reader and writer, and the same call continues
+it. Nothing of a withdrawn subject is copied.
 """
 
 from __future__ import annotations
@@ -27,7 +28,12 @@ from skindb.store.kinds import RELEASE
 from skindb.store.lease import Lease
 from skindb.store.location import place_at
 from skindb.store.log import Log
-from skindb.store.marker_file import Notes, note_consents, note_withdrawals, read_marker_file
+from skindb.store.marker_file import (
+    Notes,
+    note_consents,
+    note_withdrawals,
+    read_marker_file,
+)
 from skindb.store.markers import (
     ENTRY,
     RESTORING,
@@ -55,11 +61,13 @@ class Restored:
     created: str  # when the state was written
     versions: int
     bytes: int
-    skipped: int  # versions of the state that refer to a subject who was withdrawn since
+    # versions of the state that refer to a subject who was withdrawn since
+    skipped: int
     requests: int  # results that wait to be computed again
     consents: int  # records of consent that came after the backup
     unknown_consents: int  # those of subjects that the state does not hold
-    faults: tuple[Fault, ...] = ()  # damaged files of the backup, which are not restored
+    # damaged files of the backup, which are not restored
+    faults: tuple[Fault, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -76,21 +84,28 @@ class Plan:
 
 
 def restore(
-    source: str, url: str, *, number: int | None = None, markers: Path | None = None, without_markers: bool = False
+    source: str,
+    url: str,
+    *,
+    number: int | None = None,
+    markers: Path | None = None,
+    without_markers: bool = False,
 ) -> Restored:
-    """Restore a database from a backup, without subjects who were withdrawn since, and with later consents.
+    """Restore a database from a backup, without subjects who were withdrawn since, and
+    with later consents.
 
     Parameters
     ----------
     source
         Folder or bucket of the backup.
     url
-        Folder or bucket of the database, which must be empty or missing. A restore that was interrupted is continued.
+        Folder or bucket of the database, which must be empty or missing. A restore that
+        was interrupted is continued.
     number
         Number of the state; default the newest.
     markers
-        Marker file of the database that was lost; default the file beside `url` with the ending ".markers", and for a
-        bucket that in the user's data folder.
+        Marker file of the database that was lost; default the file beside `url` with
+        the ending ".markers", and for a bucket that in the user's data folder.
     without_markers
         Restore without a marker file. Subjects who were withdrawn after the backup then come back.
 
@@ -102,15 +117,27 @@ def restore(
     place = place_at(url)
     file = markers or place.marker_file()
     if not without_markers and not file.exists():
-        rule = "a restore needs the marker file, because subjects who were withdrawn after the backup would come back"
+        rule = (
+            "a restore needs the marker file, because subjects who were withdrawn "
+            "after the backup would come back"
+        )
         cure = "give --markers FILE, or --without-markers to accept this risk"
         raise InputError(Fault(str(file), rule, "no such file", cure))
     return restore_backup(
-        Archive(place_at(source)), place, number=number, marker_file=None if without_markers else file
+        Archive(place_at(source)),
+        place,
+        number=number,
+        marker_file=None if without_markers else file,
     )
 
 
-def restore_backup(archive: Archive, place: Place, *, number: int | None = None, marker_file: Path | None) -> Restored:
+def restore_backup(
+    archive: Archive,
+    place: Place,
+    *,
+    number: int | None = None,
+    marker_file: Path | None,
+) -> Restored:
     """Restore a state of a backup into an empty place.
 
     Parameters
@@ -125,8 +152,9 @@ def restore_backup(archive: Archive, place: Place, *, number: int | None = None,
     Raises
     ------
     InputError
-        If there is something at the location, or if the state, its withdrawals or the marker file are damaged. Damaged
-        versions do not stop the restore: they are reported, and refused when they are read.
+        If there is something at the location, or if the state, its withdrawals or the
+        marker file are damaged. Damaged versions do not stop the restore: they are
+        reported, and refused when they are read.
     """
     archive.require()
     place.is_unlocked = True
@@ -134,9 +162,20 @@ def restore_backup(archive: Archive, place: Place, *, number: int | None = None,
     _require_empty(place)
     numbers = archive.numbers()
     if not numbers:
-        raise InputError(Fault(archive.place.name, "a backup must hold a state", "none", "run skindb backup again"))
+        raise InputError(
+            Fault(
+                archive.place.name,
+                "a backup must hold a state",
+                "none",
+                "run skindb backup again",
+            )
+        )
     state = archive.state(numbers[-1] if number is None else number)
-    notes = Notes() if marker_file is None else read_marker_file(marker_file, require_secret(archive.place))
+    notes = (
+        Notes()
+        if marker_file is None
+        else read_marker_file(marker_file, require_secret(archive.place))
+    )
     plan = _plan(archive, state, notes)
     place.create(LOCK, b"{}")
     with Lease(place, "restore", (RELEASE,), command="skindb restore"):
@@ -146,7 +185,10 @@ def restore_backup(archive: Archive, place: Place, *, number: int | None = None,
         place.remove(LOCK)
     place.is_unlocked = False
     note_withdrawals(place)
-    note_consents(place, [*consents, *(one for one in plan.records.values() if one.kind == CONSENT)])
+    note_consents(
+        place,
+        [*consents, *(one for one in plan.records.values() if one.kind == CONSENT)],
+    )
     return Restored(
         number=state.number,
         created=state.created,
@@ -167,13 +209,19 @@ def _plan(archive: Archive, state: State, notes: Notes) -> Plan:
         for name in archive.place.sizes(WITHDRAWN)
         if ENTRY.fullmatch(name)
     }
-    entries |= {key: json.dumps(body).encode() for key, body in notes.entries.items() if key not in entries}
+    entries |= {
+        key: json.dumps(body).encode()
+        for key, body in notes.entries.items()
+        if key not in entries
+    }
     numbers = entry_numbers(key.removeprefix(f"{WITHDRAWN}/") for key in entries)
     markers = Markers(numbers, require_secret(archive.place))
     faults: list[Fault] = []
     every = archive.records(state, faults)
     tombstones = [key for key in state.files if key.startswith("tombstones/")]
-    records, texts = surviving(every, archive.requests(state, faults), tombstones, markers)
+    records, texts = surviving(
+        every, archive.requests(state, faults), tombstones, markers
+    )
     texts |= entries | {SECRET: archive.place.read_small(SECRET)}
     for record in records.values():  # in ascending order
         log = Log(archive.place, record.kind, record.take)
@@ -181,16 +229,23 @@ def _plan(archive: Archive, state: State, notes: Notes) -> Plan:
     for key in state.files.keys() - every.keys():
         _, kind, take, *_ = [*key.split("/"), "", ""]
         if key.startswith("log/") and not markers.hides(kind, take):
-            texts[key] = b""  # an unreadable record, so that none before it takes its place
-    files = {key: state.files[key] for key in records} | other_files(state.files, records)
+            # an unreadable record, so that none before it takes its place
+            texts[key] = b""
+    files = {key: state.files[key] for key in records} | other_files(
+        state.files, records
+    )
     items: list[Item] = [(key, digest, None) for key, digest in files.items()]
     for _, those in intact(archive.version_items, records.values(), faults):
         items += those
-    return Plan(items, texts, records, markers, notes, len(every) - len(records), faults)
+    return Plan(
+        items, texts, records, markers, notes, len(every) - len(records), faults
+    )
 
 
 def _require_empty(place: Place) -> None:
-    """Raise an `InputError` if there is anything at a place, except for a restore that was interrupted."""
+    """Raise an `InputError` if there is anything at a place, except for a restore that
+    was interrupted.
+    """
     if place.file_type(LOCK):
         return
     names = place.names() or []
@@ -198,17 +253,31 @@ def _require_empty(place: Place) -> None:
     if others or place.sizes(WITHDRAWN):
         rule = "a restore needs an empty or missing folder"
         cure = "give another folder; nothing was changed"
-        found = "a database or a backup" if {"log", WITHDRAWN} & {*names} else f"other files, such as {others[0]}"
+        found = (
+            "a database or a backup"
+            if {"log", WITHDRAWN} & {*names}
+            else f"other files, such as {others[0]}"
+        )
         raise InputError(Fault(place.name, rule, found, cure))
 
 
 def _copy_all(archive: Archive, place: Place, plan: Plan) -> int:
-    """Copy all files, except for those that are there already; returns the number of bytes of all."""
+    """Copy all files, except for those that are there already; returns the number of
+    bytes of all.
+    """
     keys = {item[0] for item in plan.items} | plan.texts.keys()
     present = _remove_others(place, keys)
-    written = sum(size for _, size in intact(partial(_copy, archive, place, present), plan.items, plan.faults))
+    written = sum(
+        size
+        for _, size in intact(
+            partial(_copy, archive, place, present), plan.items, plan.faults
+        )
+    )
     for key, content in plan.texts.items():
-        if not place.create(key, content, flush_names=False) and place.read_small(key) != content:
+        if (
+            not place.create(key, content, flush_names=False)
+            and place.read_small(key) != content
+        ):
             place.remove(key)
             place.create(key, content, flush_names=False)
     place.flush_names([*keys])
@@ -216,15 +285,20 @@ def _copy_all(archive: Archive, place: Place, plan: Plan) -> int:
 
 
 def _remove_others(place: Place, keys: set[str]) -> set[str]:
-    """Remove everything that an interrupted restore has written if some of it is no longer to be restored.
+    """Remove everything that an interrupted restore has written if some of it is no
+    longer to be restored.
 
-    It may be of a subject who was withdrawn since, whose pseudonym must not remain in the name of an empty folder.
-    Returns the keys of the files that are left.
+    It may be of a subject who was withdrawn since, whose pseudonym must not remain in
+    the name of an empty folder. Returns the keys of the files that are left.
     """
     place.sweep()
     tops = [name for name in place.names() or [] if name not in (STAGING, "leases")]
     present = {f"{top}/{name}" for top in tops for name in place.sizes(top)} - {LOCK}
-    folders = {key.rsplit("/", depth)[0] for key in keys for depth in range(1, key.count("/") + 1)}
+    folders = {
+        key.rsplit("/", depth)[0]
+        for key in keys
+        for depth in range(1, key.count("/") + 1)
+    }
     others = present - keys
     if not others - folders:
         return present
@@ -250,19 +324,31 @@ def _copy(archive: Archive, place: Place, present: set[str], item: Item) -> int:
 
 def _subjects(plan: Plan) -> dict[str, str]:
     """Keyed hash of every subject of the restored versions -> pseudonym."""
-    subjects = {one for record in plan.records.values() for one in subjects_of(record.kind, record.take, ())}
+    subjects = {
+        one
+        for record in plan.records.values()
+        for one in subjects_of(record.kind, record.take, ())
+    }
     return {keyed_hash(plan.markers.secret, subject): subject for subject in subjects}
 
 
 def _repeat_consents(place: Place, plan: Plan) -> list[Record]:
     """Record the newest consents that came after the backup."""
     subjects = _subjects(plan)
-    seals = {keyed_hash(plan.markers.secret, record.seal) for record in plan.records.values() if record.kind == CONSENT}
+    seals = {
+        keyed_hash(plan.markers.secret, record.seal)
+        for record in plan.records.values()
+        if record.kind == CONSENT
+    }
     records = []
     for name, consent in sorted(plan.notes.consents.items()):
         if name in subjects and consent["record"] not in seals:
             subject = subjects[name]
             with Stage(place, CONSENT, subject) as stage:
                 scope = {"subject": subject, "consent_scope": consent["consent"]}
-                records.append(stage.commit(scope | {"command": "restore", "recorded": consent["created"]}))
+                records.append(
+                    stage.commit(
+                        scope | {"command": "restore", "recorded": consent["created"]}
+                    )
+                )
     return records

@@ -19,17 +19,26 @@ if TYPE_CHECKING:
     from obstore.store import BackoffConfig, S3Store
 
 BUCKET = r"[a-z0-9][a-z0-9.-]{1,61}[a-z0-9]"
-PREFIX_PART = r"[A-Za-z0-9._=-]{1,255}"  # characters that are not escaped in requests and their signatures
+# characters that are not escaped in requests and their signatures
+PREFIX_PART = r"[A-Za-z0-9._=-]{1,255}"
 CONNECT_TIMEOUT = timedelta(seconds=5)
-REQUEST_TIMEOUT = timedelta(seconds=120)  # the largest object is a shard of 16 MB, which takes this long at 1 Mbit/s
-RETRY_TIMEOUT = timedelta(seconds=290)  # two requests that time out and a third one; a signature expires after 300 s
-MAX_RETRIES = 10  # half a minute with the pauses below, for servers that restart or limit the rate of requests
+# the largest object is a shard of 16 MB, which takes this long at 1 Mbit/s
+REQUEST_TIMEOUT = timedelta(seconds=120)
+# two requests that time out and a third one; a signature expires after 300 s
+RETRY_TIMEOUT = timedelta(seconds=290)
+# half a minute with the pauses below, for servers that restart or limit the rate of
+# requests
+MAX_RETRIES = 10
 FIRST_PAUSE = timedelta(seconds=0.1)
 LONGEST_PAUSE = timedelta(seconds=10)
 PAUSE_GROWTH = 2
 ENDPOINTS = ("AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT_URL", "AWS_ENDPOINT")
-KEYS = {"access_key_id": "aws_access_key_id", "secret_access_key": "aws_secret_access_key"}
-# environment variables for credentials; other sources are a profile and the metadata service of AWS machines
+KEYS = {
+    "access_key_id": "aws_access_key_id",
+    "secret_access_key": "aws_secret_access_key",
+}
+# environment variables for credentials; other sources are a profile and the metadata
+# service of AWS machines
 SOURCES = (
     "AWS_ACCESS_KEY_ID",
     "AWS_WEB_IDENTITY_TOKEN_FILE",
@@ -59,9 +68,14 @@ def bucket_and_prefix(url: str) -> tuple[str, str]:
         raise InputError(Fault("s3://...", rule, "some", CURE_NO_KEYS))
     bucket, _, prefix = rest.partition("/")
     parts = prefix.split("/") if prefix else []
-    usable = all(re.fullmatch(PREFIX_PART, part) and part not in (".", "..") for part in parts)
+    usable = all(
+        re.fullmatch(PREFIX_PART, part) and part not in (".", "..") for part in parts
+    )
     if not (usable and re.fullmatch(BUCKET, bucket)):
-        rule = "must be s3://BUCKET/PREFIX of lower-case letters, digits, '.', '-'; PREFIX also of capitals, '_', '='"
+        rule = (
+            "must be s3://BUCKET/PREFIX of lower-case letters, digits, '.', '-'; "
+            "PREFIX also of capitals, '_', '='"
+        )
         raise InputError(Fault(url, rule, "a different form", "choose another name"))
     return bucket, prefix
 
@@ -69,7 +83,8 @@ def bucket_and_prefix(url: str) -> tuple[str, str]:
 def connect(bucket: str, prefix: str) -> S3Store:
     """Store of a bucket below a prefix, without sending a request.
 
-    Address and credentials are taken from the environment, or else from the profile of the AWS command line.
+    Address and credentials are taken from the environment, or else from the profile of
+    the AWS command line.
 
     Raises
     ------
@@ -82,28 +97,51 @@ def connect(bucket: str, prefix: str) -> S3Store:
     except ImportError:
         rule = "a database in a bucket needs obstore"
         cure = "pip install 'skindb[s3]'"
-        raise InputError(Fault(f"s3://{bucket}", rule, "it is not installed", cure)) from None
+        raise InputError(
+            Fault(f"s3://{bucket}", rule, "it is not installed", cure)
+        ) from None
     settings: dict[str, Any] = {"endpoint": endpoint()} if endpoint() else {}
-    if not {"AWS_REGION", "AWS_DEFAULT_REGION"} & os.environ.keys() and "region" in _profile():
+    if (
+        not {"AWS_REGION", "AWS_DEFAULT_REGION"} & os.environ.keys()
+        and "region" in _profile()
+    ):
         settings["region"] = _profile()["region"]
     if not set(SOURCES) & os.environ.keys():
         if set(KEYS.values()) <= _profile().keys():
             settings["credential_provider"] = _profile_credentials
-        elif not _is_on_aws():  # without the metadata service of AWS the request times out after a minute
-            raise InputError(Fault(f"s3://{bucket}", "credentials must be set", "none", CURE_NO_KEYS))
-    pauses: BackoffConfig = {"init_backoff": FIRST_PAUSE, "max_backoff": LONGEST_PAUSE, "base": PAUSE_GROWTH}
+        elif not _is_on_aws():
+            # without the metadata service of AWS the request times out after a minute
+            raise InputError(
+                Fault(f"s3://{bucket}", "credentials must be set", "none", CURE_NO_KEYS)
+            )
+    pauses: BackoffConfig = {
+        "init_backoff": FIRST_PAUSE,
+        "max_backoff": LONGEST_PAUSE,
+        "base": PAUSE_GROWTH,
+    }
     try:
         return S3Store(
             bucket,
             prefix=prefix or None,
-            client_options={"timeout": REQUEST_TIMEOUT, "connect_timeout": CONNECT_TIMEOUT, "allow_http": True},
-            retry_config={"max_retries": MAX_RETRIES, "retry_timeout": RETRY_TIMEOUT, "backoff": pauses},
+            client_options={
+                "timeout": REQUEST_TIMEOUT,
+                "connect_timeout": CONNECT_TIMEOUT,
+                "allow_http": True,
+            },
+            retry_config={
+                "max_retries": MAX_RETRIES,
+                "retry_timeout": RETRY_TIMEOUT,
+                "backoff": pauses,
+            },
             **settings,
         )
-    except (BaseError, ValueError, TypeError):  # the text of the error may contain secret values of variables
+    except (BaseError, ValueError, TypeError):
+        # the text of the error may contain secret values of variables
         rule = "the AWS_ variables must have valid values"
         cure = "correct them"
-        raise InputError(Fault(f"s3://{bucket}", rule, "an invalid value", cure)) from None
+        raise InputError(
+            Fault(f"s3://{bucket}", rule, "an invalid value", cure)
+        ) from None
 
 
 def endpoint() -> str:
@@ -114,7 +152,10 @@ def endpoint() -> str:
     InputError
         If it is not a valid URL, or if data of subjects would be sent unencrypted over a network.
     """
-    found = next((os.environ[name] for name in ENDPOINTS if os.environ.get(name)), _profile().get("endpoint_url", ""))
+    found = next(
+        (os.environ[name] for name in ENDPOINTS if os.environ.get(name)),
+        _profile().get("endpoint_url", ""),
+    )
     if not found:
         return ""
     parts = urlsplit(found)
@@ -124,7 +165,11 @@ def endpoint() -> str:
         cure = "correct it"
         raise InputError(Fault("AWS_ENDPOINT_URL", rule, "a different URL", cure))
     loopback = host in ("localhost", "::1") or host.startswith("127.")
-    if parts.scheme == "http" and not loopback and os.environ.get("AWS_ALLOW_HTTP", "").lower() not in ("1", "true"):
+    if (
+        parts.scheme == "http"
+        and not loopback
+        and os.environ.get("AWS_ALLOW_HTTP", "").lower() not in ("1", "true")
+    ):
         rule = "data of subjects must be encrypted when they are sent over a network"
         cure = "use https, or set AWS_ALLOW_HTTP=true in a private network"
         raise InputError(Fault("AWS_ENDPOINT_URL", rule, f"http to {host}", cure))
@@ -141,7 +186,8 @@ class DeniedError(UnavailableError):
 
 @contextmanager
 def readable_errors(where: str) -> Iterator[None]:
-    """Convert errors of obstore to those that `Place` documents, without details of the request except its key.
+    """Convert errors of obstore to those that `Place` documents, without details of the
+    request except its key.
 
     `AlreadyExistsError` is not converted, because it is a valid answer.
     """
@@ -163,31 +209,53 @@ def readable_errors(where: str) -> Iterator[None]:
 
 
 def _require_own_process(where: str) -> None:
-    """Raise an `InputError` in a forked process, which has no threads of obstore and would wait forever."""
+    """Raise an `InputError` in a forked process, which has no threads of obstore and
+    would wait forever.
+    """
     if not _OBSTORE_PROCESS:
         _OBSTORE_PROCESS.append(os.getpid())
     elif _OBSTORE_PROCESS[0] != os.getpid():
-        rule = "a process that uses a bucket must not be forked from another one that does"
+        rule = (
+            "a process that uses a bucket must not be forked from another one that does"
+        )
         cure = "use the workers of skindb, loky or Dask, or the start method spawn"
         raise InputError(Fault(where, rule, "a forked process", cure))
 
 
 def _unavailable(where: str, text: str) -> UnavailableError:
-    """Error with the reason from the text of an obstore error, without the request that the text repeats."""
+    """Error with the reason from the text of an obstore error, without the request that
+    the text repeats.
+    """
     status = re.search(r"status code: (\d{3})([A-Za-z ]*)", text)
-    code, phrase = (int(status[1]), f"{status[1]}{status[2].rstrip()}") if status else (0, "")
+    code, phrase = (
+        (int(status[1]), f"{status[1]}{status[2].rstrip()}") if status else (0, "")
+    )
     if "NoSuchBucket" in text:
-        return _fault(where, "the bucket must exist", "no bucket of this name", "create it, or correct its name")
+        return _fault(
+            where,
+            "the bucket must exist",
+            "no bucket of this name",
+            "create it, or correct its name",
+        )
     if "/latest/" in text and not code:  # the metadata service of a virtual machine
         return _fault(where, "credentials must be set", "none", CURE_NO_KEYS)
     if code in (401, 403) or "AccessDenied" in text:
         rule = "the credentials must permit this request"
-        return DeniedError(Fault(where, rule, phrase or "access denied", CURE_PERMISSION))
+        return DeniedError(
+            Fault(where, rule, phrase or "access denied", CURE_PERMISSION)
+        )
     if 300 <= code < 400:
-        return _fault(where, "the request must be sent to the region of the bucket", phrase, "set AWS_REGION")
+        return _fault(
+            where,
+            "the request must be sent to the region of the bucket",
+            phrase,
+            "set AWS_REGION",
+        )
     reason = phrase or ("a time-out" if "kind: Timeout" in text else "no connection")
     retries = re.search(r"after (\d+) retries", text)
-    found = f"{reason} from {endpoint() or 'AWS'}" + (f", after {retries[1]} retries" if retries else "")
+    found = f"{reason} from {endpoint() or 'AWS'}" + (
+        f", after {retries[1]} retries" if retries else ""
+    )
     given_up = code or (retries and int(retries[1]) >= MAX_RETRIES)
     kind = UnavailableError if given_up else BrokenAnswerError
     return kind(Fault(where, "the server must answer", found, CURE_NETWORK))
@@ -198,23 +266,32 @@ def _fault(where: str, rule: str, found: str, cure: str) -> UnavailableError:
 
 
 def _profile() -> dict[str, str]:
-    """Settings of the profile AWS_PROFILE, by default "default", from the files of the AWS command line."""
+    """Settings of the profile AWS_PROFILE, by default "default", from the files of the
+    AWS command line.
+    """
     name = os.environ.get("AWS_PROFILE", "")
     home = Path.home() / ".aws"
     section = f"profile {name}" if name and name != "default" else "default"
     files = {
         Path(os.environ.get("AWS_CONFIG_FILE") or home / "config"): section,
-        Path(os.environ.get("AWS_SHARED_CREDENTIALS_FILE") or home / "credentials"): name or "default",
+        Path(
+            os.environ.get("AWS_SHARED_CREDENTIALS_FILE") or home / "credentials"
+        ): name or "default",
     }
     found: dict[str, str] = {}
     for path, title in files.items():
-        parser = configparser.ConfigParser(interpolation=None, default_section="no defaults")
+        parser = configparser.ConfigParser(
+            interpolation=None, default_section="no defaults"
+        )
         try:
             parser.read(path, encoding="utf-8")
-        except (configparser.Error, UnicodeDecodeError):  # the text of the error repeats lines of the file
+        except (configparser.Error, UnicodeDecodeError):
+            # the text of the error repeats lines of the file
             rule = "must be a configuration file of the AWS command line"
             cure = "correct it"
-            raise InputError(Fault(str(path), rule, "lines that cannot be parsed", cure)) from None
+            raise InputError(
+                Fault(str(path), rule, "lines that cannot be parsed", cure)
+            ) from None
         found |= dict(parser[title]) if title in parser else {}
     if name and not found:
         rule = "must name a profile of the AWS configuration"

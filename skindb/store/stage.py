@@ -23,7 +23,12 @@ from skindb.errors import Fault, InputError, add_filename
 from skindb.schema import SCHEMA_VERSION, VARIABLES, check, dataset
 from skindb.schema.blocks import SHARD
 from skindb.schema.plain import plain
-from skindb.store.inputs import names_of, require_consents, require_inputs, require_own_subject
+from skindb.store.inputs import (
+    names_of,
+    require_consents,
+    require_inputs,
+    require_own_subject,
+)
 from skindb.store.kinds import KINDS_OF_ONE_SUBJECT
 from skindb.store.lease import Lease
 from skindb.store.log import Log
@@ -34,7 +39,8 @@ from skindb.store.record import Record, json_object, own_takes, subjects_of
 
 MIN_CHUNK_SURFELS = 256  # in a chunk, the smallest unit of reading
 MIN_CHUNK_BYTES = 1 << 19  # a smaller chunk gets more surfels
-# level 2 with the default block size of Blosc takes 1.7 times as long to write, 1.4 times to read, and 6 % more space
+# level 2 with the default block size of Blosc takes 1.7 times as long to write, 1.4
+# times to read, and 6 % more space
 CODEC = BloscCodec(cname="zstd", clevel=1, shuffle="shuffle", blocksize=1 << 20)
 MAX_UNSHARDED_BYTES = 1 << 26  # larger arrays are written shard by shard
 TABLES = "tables"
@@ -43,7 +49,8 @@ MAX_LABELS = 1000  # labels of longer dims are not listed in a record
 
 
 class Stage:
-    """A version to be written, as a context manager; without `commit`, what was written is removed at its end.
+    """A version to be written, as a context manager; without `commit`, what was written
+    is removed at its end.
 
     Parameters
     ----------
@@ -52,8 +59,9 @@ class Stage:
     lease
         Lease under which it is written, if there is one.
     names
-        Other takes that the version will refer to. They are written beside the version before its data, so that a
-        withdrawal removes the data of a killed run if, and only if, they may contain data of the subject.
+        Other takes that the version will refer to. They are written beside the version
+        before its data, so that a withdrawal removes the data of a killed run if, and
+        only if, they may contain data of the subject.
 
     Raises
     ------
@@ -62,20 +70,32 @@ class Stage:
     """
 
     def __init__(
-        self, place: Place, kind: str, take: str, lease: Lease | None = None, names: Iterable[str] = ()
+        self,
+        place: Place,
+        kind: str,
+        take: str,
+        lease: Lease | None = None,
+        names: Iterable[str] = (),
     ) -> None:
         self.place = place
         self.log = Log(place, kind, take)
         self.lease = lease
         names = list(names)
         require_own_subject(kind, take, names)
-        self.names = sorted({require_text(name, TAKE, "take") for name in names} - own_takes(kind, take))
+        self.names = sorted(
+            {require_text(name, TAKE, "take") for name in names} - own_takes(kind, take)
+        )
         self._guard = AdmissionGuard.begin(place, subjects_of(kind, take, self.names))
         now = datetime.now(UTC)
         self.created = now.isoformat(timespec="seconds")
-        self.path = f"data/{kind}/{take}/{now:%Y%m%dT%H%M%S}-{uuid.uuid4().hex[:8]}.zarr"
-        current = None if self.log.is_empty() else self.log.read()  # finds a damaged record before the work
-        self.base, self.previous = (current.generation, current.seal) if current else (0, "")
+        self.path = (
+            f"data/{kind}/{take}/{now:%Y%m%dT%H%M%S}-{uuid.uuid4().hex[:8]}.zarr"
+        )
+        # finds a damaged record before the work
+        current = None if self.log.is_empty() else self.log.read()
+        self.base, self.previous = (
+            (current.generation, current.seal) if current else (0, "")
+        )
         if current is None:
             require_secret(place)
         self.committed = False
@@ -88,19 +108,28 @@ class Stage:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         if isinstance(error, UnavailableError):
             return  # it is unknown whether the record was written
-        # the log decides, because an interrupt may come between the creation of the record and the end of `commit`
+        # the log decides, because an interrupt may come between the creation of the
+        # record and the end of `commit`
         if not self.committed and not self._in_log():
-            with suppress(OSError):  # what cannot be removed is garbage, and `error` says more
+            # what cannot be removed is garbage, and `error` says more
+            with suppress(OSError):
                 self._discard()
         if isinstance(error, OSError):
-            self._guard()  # raises if a withdrawal has removed what could not be written
+            # raises if a withdrawal has removed what could not be written
+            self._guard()
 
-    def write(self, groups: Mapping[str, xr.Dataset], *, tables: xr.Dataset | None = None) -> None:
-        """Write groups whose variables are all declared in the schema; lazy variables are computed shard by shard.
+    def write(
+        self, groups: Mapping[str, xr.Dataset], *, tables: xr.Dataset | None = None
+    ) -> None:
+        """Write groups whose variables are all declared in the schema; lazy variables
+        are computed shard by shard.
 
         Parameters
         ----------
@@ -120,7 +149,10 @@ class Stage:
         if faults:
             raise InputError(faults)
         labels = {
-            str(take) for ds in every.values() if "take" in ds.coords for take in np.atleast_1d(ds["take"].values)
+            str(take)
+            for ds in every.values()
+            if "take" in ds.coords
+            for take in np.atleast_1d(ds["take"].values)
         }
         self._require_named(labels)
         self._declare()
@@ -130,24 +162,44 @@ class Stage:
         for name, ds in groups.items():
             ready = _whole_shards(ds).assign_attrs(plain(ds.attrs))
             encoding = {str(v): _encoding(ready[v]) for v in ready.variables}
-            # write_empty_chunks: the search for empty chunks would take as long as their compression; order: samples
-            # are produced and stored in column-major order, and the other order costs two transpositions
+            # write_empty_chunks: the search for empty chunks would take as long as
+            # their compression; order: samples are produced and stored in column-major
+            # order, and the other order costs two transpositions
             order = "F" if any("filters" in how for how in encoding.values()) else "C"
-            with zarr.config.set({"array.write_empty_chunks": True, "array.order": order}):
+            with zarr.config.set(
+                {"array.write_empty_chunks": True, "array.order": order}
+            ):
                 store = self.place.writable(self.path)
                 with add_filename(self.place.where(self.path)):
-                    ready.to_zarr(store, group=name, mode="a", encoding=encoding, zarr_format=3, consolidated=False)
+                    ready.to_zarr(
+                        store,
+                        group=name,
+                        mode="a",
+                        encoding=encoding,
+                        zarr_format=3,
+                        consolidated=False,
+                    )
 
-    def put(self, group: str, name: str, start: int, values: np.ndarray[Any, Any]) -> None:
+    def put(
+        self, group: str, name: str, start: int, values: np.ndarray[Any, Any]
+    ) -> None:
         """Write whole shards of a variable that `write` has created, from surfel `start`."""
         self._require_open()
         with add_filename(self.place.where(self.path)):
             self._put(group, name, start, values)
 
-    def _put(self, group: str, name: str, start: int, values: np.ndarray[Any, Any]) -> None:
-        array = zarr.open_array(self.place.writable(self.path), path=f"{group}/{name}", mode="r+")
-        if start % SHARD or (len(values) % SHARD and start + len(values) != array.shape[0]):
-            raise ValueError(f"must be whole shards of {SHARD} surfels; found {len(values)} surfels from {start}")
+    def _put(
+        self, group: str, name: str, start: int, values: np.ndarray[Any, Any]
+    ) -> None:
+        array = zarr.open_array(
+            self.place.writable(self.path), path=f"{group}/{name}", mode="r+"
+        )
+        if start % SHARD or (
+            len(values) % SHARD and start + len(values) != array.shape[0]
+        ):
+            raise ValueError(
+                f"must be whole shards of {SHARD} surfels; found {len(values)} surfels from {start}"
+            )
         array[start : start + len(values)] = values
 
     def commit(self, provenance: Mapping[str, Any]) -> Record:
@@ -160,25 +212,41 @@ class Stage:
         LeaseLost
             If the stage has a lease, and another run took it over.
         InputError
-            If an input in the provenance was removed meanwhile, if a subject was withdrawn, if the consent of a subject
-            no longer covers the result, or if the result refers to takes that were not named when it was begun.
+            If an input in the provenance was removed meanwhile, if a subject was
+            withdrawn, if the consent of a subject no longer covers the result, or if
+            the result refers to takes that were not named when it was begun.
         """
         self._require_open()
         self._guard()
         names = self._require_names(provenance)
         self._declare()
-        attrs = {"schema_version": SCHEMA_VERSION, "software_version": __version__, **plain(dict(provenance))}
+        attrs = {
+            "schema_version": SCHEMA_VERSION,
+            "software_version": __version__,
+            **plain(dict(provenance)),
+        }
         with add_filename(self.place.where(self.path)):
-            zarr.open_group(self.place.writable(self.path), mode="a").attrs.update(attrs)
+            zarr.open_group(self.place.writable(self.path), mode="a").attrs.update(
+                attrs
+            )
             # the data first, then the record; transient results need not survive a power loss
             self.place.make_durable(self.path, flush=self.log.kind not in TRANSIENT)
-        sizes = {name: size for name, size in self.place.sizes(self.path).items() if size >= 0}
-        if gone := [name for name in sorted(self.groups) if f"{name}/zarr.json" not in sizes]:
+        sizes = {
+            name: size
+            for name, size in self.place.sizes(self.path).items()
+            if size >= 0
+        }
+        if gone := [
+            name for name in sorted(self.groups) if f"{name}/zarr.json" not in sizes
+        ]:
             rule = "all groups of a version must exist when it is committed"
             found = f"that another process removed {', '.join(gone)}"
             cure = "run the command again"
             raise InputError(Fault(self.log.what, rule, found, cure))
-        files = {name: (self.place.digest(f"{self.path}/{name}"), size) for name, size in sorted(sizes.items())}
+        files = {
+            name: (self.place.digest(f"{self.path}/{name}"), size)
+            for name, size in sorted(sizes.items())
+        }
         record = Record(
             kind=self.log.kind,
             take=self.log.take,
@@ -193,16 +261,25 @@ class Stage:
             previous=self.previous,
         )
         manifest = self._create_beside(record, "manifest", files)
-        tables = "" if self.tables is None else self._create_beside(record, TABLES, tables_to_json(self.tables))
+        tables = (
+            ""
+            if self.tables is None
+            else self._create_beside(record, TABLES, tables_to_json(self.tables))
+        )
         require_consents(self.place, self.log.kind, self.log.take, attrs)
         if self.lease is not None:
-            self.lease.require()  # as late as possible, because a process can be suspended at any time
-        record = self.log.create(replace(record, manifest=manifest, tables=tables), self._guard)
+            # as late as possible, because a process can be suspended at any time
+            self.lease.require()
+        record = self.log.create(
+            replace(record, manifest=manifest, tables=tables), self._guard
+        )
         self.committed = True
         return record
 
     def _require_names(self, provenance: Mapping[str, Any]) -> list[str]:
-        """The other takes that the version refers to, which must have been named when it was begun."""
+        """The other takes that the version refers to, which must have been named when
+        it was begun.
+        """
         inputs = require_inputs(self.place, provenance)
         names = names_of(self.log.kind, self.log.take, provenance, inputs)
         self._require_named(names)
@@ -214,13 +291,21 @@ class Stage:
         take = self.log.take
         unnamed = sorted({*takes} - {*self.names} - own_takes(kind, take))
         if kind not in KINDS_OF_ONE_SUBJECT and unnamed:
-            rule = "a version must name the takes that it refers to before it is written"
+            rule = (
+                "a version must name the takes that it refers to before it is written"
+            )
             cure = f"call db.stage({kind!r}, {take!r}, names=[...])"
-            raise InputError(Fault(self.log.what, rule, f"no {', '.join(unnamed[:8])}", cure))
+            raise InputError(
+                Fault(self.log.what, rule, f"no {', '.join(unnamed[:8])}", cure)
+            )
 
     def _admissions(self) -> dict[str, int]:
         """Admissions of the subjects that were withdrawn and admitted again."""
-        return {subject: number for subject, number in self._guard.admissions.items() if number}
+        return {
+            subject: number
+            for subject, number in self._guard.admissions.items()
+            if number
+        }
 
     def _declare(self) -> None:
         """Write which takes the version refers to, before anything else."""
@@ -231,7 +316,9 @@ class Stage:
             self._is_declared = True
 
     def _discard(self) -> None:
-        """Remove what was written; of a withdrawn subject also the folder, whose name is the pseudonym."""
+        """Remove what was written; of a withdrawn subject also the folder, whose name
+        is the pseudonym.
+        """
         remove_version(self.place, self.path)
         kind = self.log.kind
         take = self.log.take
@@ -248,7 +335,9 @@ class Stage:
 
     def _require_open(self) -> None:
         if self.committed:
-            raise ValueError(f"{self.path} is committed and never changes; stage a new version")
+            raise ValueError(
+                f"{self.path} is committed and never changes; stage a new version"
+            )
 
     def _in_log(self) -> bool:
         mine = self.base + 1
@@ -257,15 +346,23 @@ class Stage:
         try:
             return self.log.read(mine).path == self.path
         except InputError:
-            return True  # the unreadable record may be that of this stage, so the data are kept
+            # the unreadable record may be that of this stage, so the data are kept
+            return True
 
 
 def read_names(place: Place, path: str) -> tuple[list[str], dict[str, int]] | None:
-    """Takes that a version refers to and admissions of their subjects, from beside it; None if they are unknown."""
+    """Takes that a version refers to and admissions of their subjects, from beside it;
+    None if they are unknown.
+    """
     try:
-        content = json_object(place.read_small(f"{path.removesuffix('.zarr')}.{NAMES}.json"))
+        content = json_object(
+            place.read_small(f"{path.removesuffix('.zarr')}.{NAMES}.json")
+        )
         names = [require_text(name, TAKE, "take") for name in content["names"]]
-        return names, {str(subject): int(number) for subject, number in content["admissions"].items()}
+        return names, {
+            str(subject): int(number)
+            for subject, number in content["admissions"].items()
+        }
     except UnavailableError:
         raise
     except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
@@ -280,21 +377,39 @@ def remove_version(place: Place, path: str) -> None:
 
 
 def describe(ds: xr.Dataset) -> dict[str, Any]:
-    """Description of a group in a record: sizes, variables and short labels, which define the layout of a cohort."""
-    labels = {str(dim): plain(ds[dim].values) for dim in ds.dims if dim in ds.coords and ds.sizes[dim] <= MAX_LABELS}
+    """Description of a group in a record: sizes, variables and short labels, which
+    define the layout of a cohort.
+    """
+    labels = {
+        str(dim): plain(ds[dim].values)
+        for dim in ds.dims
+        if dim in ds.coords and ds.sizes[dim] <= MAX_LABELS
+    }
     sizes = {str(dim): size for dim, size in ds.sizes.items()}
-    return {"sizes": sizes, "variables": sorted(map(str, ds.data_vars)), "labels": labels}
+    return {
+        "sizes": sizes,
+        "variables": sorted(map(str, ds.data_vars)),
+        "labels": labels,
+    }
 
 
 def tables_to_json(tables: xr.Dataset) -> dict[str, Any]:
     """Values and labels of a small Dataset of schema variables."""
     labels = {str(name): plain(coord.values) for name, coord in tables.coords.items()}
-    return {"labels": labels, "values": {str(name): plain(array.values) for name, array in tables.data_vars.items()}}
+    return {
+        "labels": labels,
+        "values": {
+            str(name): plain(array.values) for name, array in tables.data_vars.items()
+        },
+    }
 
 
 def tables_from_json(content: Mapping[str, Any]) -> xr.Dataset:
     """The Dataset that was converted by `tables_to_json`; null becomes NaN."""
-    values = {name: np.array(value, VARIABLES[name].dtype) for name, value in content["values"].items()}
+    values = {
+        name: np.array(value, VARIABLES[name].dtype)
+        for name, value in content["values"].items()
+    }
     return dataset(values, coords=content["labels"])
 
 
@@ -314,7 +429,9 @@ def _faults(name: str, ds: xr.Dataset) -> list[Fault]:
 
 
 def _whole_shards(ds: xr.Dataset) -> xr.Dataset:
-    """Copy with one dask block per shard, as two tasks in a shard would lose data, and with variable-length text."""
+    """Copy with one dask block per shard, as two tasks in a shard would lose data, and
+    with variable-length text.
+    """
     ds = ds.copy()
     for name, variable in ds.variables.items():
         variable.encoding.clear()
@@ -323,13 +440,16 @@ def _whole_shards(ds: xr.Dataset) -> xr.Dataset:
             ds[name] = ds[name].chunk(sizes)
         elif variable.dims[:1] == ("surfel",) and variable.nbytes > MAX_UNSHARDED_BYTES:
             ds[name] = variable.copy(data=_shards(variable.values))
-        elif variable.dtype.kind in "UO":  # zarr v3 specifies StringDType, but not fixed-width text
+        elif variable.dtype.kind in "UO":
+            # zarr v3 specifies StringDType, but not fixed-width text
             ds[name] = ds[name].astype(np.dtypes.StringDType())
     return ds
 
 
 def _shards(values: np.ndarray[Any, Any]) -> Any:
-    """An array as lazy shards; `dask.array.from_array` would copy a memory-mapped file into memory."""
+    """An array as lazy shards; `dask.array.from_array` would copy a memory-mapped file
+    into memory.
+    """
     starts = range(0, len(values), SHARD)
     sizes = tuple(len(values[start : start + SHARD]) for start in starts)
 
@@ -361,6 +481,7 @@ def _encoding(array: xr.DataArray) -> dict[str, Any]:
     chunk = min(chunk, array.shape[0])
     shard = min(SHARD, -(-array.shape[0] // chunk) * chunk)
     plain |= {"chunks": (chunk, *rest), "shards": (shard, *rest)}
-    if array.ndim == 4:  # samples compress best with neighbouring surfels next to each other
+    # samples compress best with neighbouring surfels next to each other
+    if array.ndim == 4:
         plain["filters"] = [TransposeCodec(order=(3, 2, 1, 0))]
     return plain

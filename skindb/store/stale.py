@@ -1,4 +1,6 @@
-"""Stale versions: derived versions whose inputs were withdrawn, superseded or are no longer covered by consent."""
+"""Stale versions: derived versions whose inputs were withdrawn, superseded or are no
+longer covered by consent.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,8 @@ REASONS: dict[Why, str] = {
     "not covered": "consent no longer covers statistics",
     "superseded": "was superseded",
 }
-DERIVED = ("model", "registration", STUDY, "edit")  # kinds that can be stale, in order of dependence
+# kinds that can be stale, in order of dependence
+DERIVED = ("model", "registration", STUDY, "edit")
 # made from data of several subjects, whose consent must cover statistics
 KINDS_OF_MANY_SUBJECTS = ("registration", STUDY, "edit")
 CURE = "run: skindb refresh DB"
@@ -80,12 +83,19 @@ class Staleness:
         """
         key = (record.kind, record.take, record.generation)
         if key not in self._known:
-            self._known[key] = ()  # inputs are earlier versions; this ends the recursion in a forged cycle
-            found = dict.fromkeys(reason for one in record.made_from for reason in self._input_reasons(record, one))
+            # inputs are earlier versions; this ends the recursion in a forged cycle
+            self._known[key] = ()
+            found = dict.fromkeys(
+                reason
+                for one in record.made_from
+                for reason in self._input_reasons(record, one)
+            )
             self._known[key] = tuple(found)
         return self._known[key]
 
-    def _input_reasons(self, record: Record, one: Mapping[str, Any]) -> Iterator[Reason]:
+    def _input_reasons(
+        self, record: Record, one: Mapping[str, Any]
+    ) -> Iterator[Reason]:
         kind = str(one["kind"])
         take = str(one["take"])
         generation = int(one["generation"])
@@ -103,18 +113,28 @@ class Staleness:
         if made_from is None or one.get("seal", made_from.seal) != made_from.seal:
             yield Reason("withdrawn", kind, take, generation)
             return
-        if record.kind in KINDS_OF_MANY_SUBJECTS and kind != STUDY and not self._is_covered(take):
+        if (
+            record.kind in KINDS_OF_MANY_SUBJECTS
+            and kind != STUDY
+            and not self._is_covered(take)
+        ):
             yield Reason("not covered", kind, take, generation)
         if not _is_of_release(record) and self._newest_of(kind, take) > generation:
             yield Reason("superseded", kind, take, generation)
         if kind in DERIVED:
             inherited = self.reasons(made_from)
-            yield from (one for one in inherited if not (_is_of_release(record) and one.why == "superseded"))
+            yield from (
+                one
+                for one in inherited
+                if not (_is_of_release(record) and one.why == "superseded")
+            )
 
     def _is_covered(self, take: str) -> bool:
         if take not in self._covered:
             try:
-                self._covered[take] = "statistics" in consent_of(self._records(CONSENT), take)
+                self._covered[take] = "statistics" in consent_of(
+                    self._records(CONSENT), take
+                )
             except UnavailableError:
                 raise
             except InputError:  # the consent of the subject is unknown
@@ -127,10 +147,16 @@ class Staleness:
         return self._newest[kind, take]
 
     def _records(self, kind: str) -> Snapshot | RecordCache:
-        return self._cache if self._cache is not None and kind in CACHED_KINDS else self._snapshot
+        return (
+            self._cache
+            if self._cache is not None and kind in CACHED_KINDS
+            else self._snapshot
+        )
 
 
-def require_fresh(db: Database, kind: str, take: str, generation: int | None = None) -> None:
+def require_fresh(
+    db: Database, kind: str, take: str, generation: int | None = None
+) -> None:
     """Raise an error or warn if a version is stale.
 
     Warns
@@ -141,25 +167,36 @@ def require_fresh(db: Database, kind: str, take: str, generation: int | None = N
     Raises
     ------
     InputError
-        If an input was withdrawn or cannot be read, or if the consent of its subject no longer covers statistics.
+        If an input was withdrawn or cannot be read, or if the consent of its subject no
+        longer covers statistics.
     """
     record = db.record(kind, take, generation)
     what = f"{kind} {record.generation} of {take}"
     reasons = Staleness(db).reasons(record)
     if refused := [reason for reason in reasons if reason.why != "superseded"]:
         rule = "its inputs must exist and be covered by consent"
-        cure = CURE_DAMAGE if any(reason.why == "unreadable" for reason in refused) else CURE
-        raise InputError(Fault(what, rule, found, cure) for found in dict.fromkeys(map(str, refused)))
+        cure = (
+            CURE_DAMAGE
+            if any(reason.why == "unreadable" for reason in refused)
+            else CURE
+        )
+        raise InputError(
+            Fault(what, rule, found, cure) for found in dict.fromkeys(map(str, refused))
+        )
     if reasons:
         more = f" and {len(reasons) - 1} more" if len(reasons) > 1 else ""
-        warnings.warn(f"{what} is out of date: {reasons[0]}{more}; {CURE}", StaleWarning, stacklevel=3)
+        warnings.warn(
+            f"{what} is out of date: {reasons[0]}{more}; {CURE}",
+            StaleWarning,
+            stacklevel=3,
+        )
 
 
 def stale_versions(db: Database) -> list[tuple[Record, tuple[Reason, ...]]]:
     """The newest versions that are stale, with the reasons, in order of dependence.
 
-    Damaged versions and results that were made from them are omitted, because results that are computed again would
-    lack the damaged data.
+    Damaged versions and results that were made from them are omitted, because results
+    that are computed again would lack the damaged data.
     """
     staleness = Staleness(db)
     found = []

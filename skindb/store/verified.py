@@ -1,4 +1,6 @@
-"""Verified reading of a version: every file is compared with its committed digest before it is used."""
+"""Verified reading of a version: every file is compared with its committed digest
+before it is used.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,13 @@ from collections.abc import AsyncIterator, Hashable, Iterable
 from functools import cached_property
 from typing import Any
 
-from zarr.abc.store import ByteRequest, OffsetByteRequest, RangeByteRequest, Store, SuffixByteRequest
+from zarr.abc.store import (
+    ByteRequest,
+    OffsetByteRequest,
+    RangeByteRequest,
+    Store,
+    SuffixByteRequest,
+)
 from zarr.core.buffer import Buffer, BufferPrototype
 
 from skindb.errors import Fault, InputError
@@ -25,13 +33,17 @@ Manifest = dict[str, tuple[str, int]]  # file -> SHA-256 digest and size in byte
 
 
 def read_manifest(place: Place, record: Record) -> Manifest:
-    """Digest and size of every file of a version; `InputError` if the manifest is not the committed one."""
+    """Digest and size of every file of a version; `InputError` if the manifest is not
+    the committed one.
+    """
     return manifest_from_json(read_beside(place, record, "manifest", record.manifest))
 
 
 def manifest_from_json(content: bytes) -> Manifest:
     """The manifest in a file."""
-    return {name: (digest, size) for name, (digest, size) in json_object(content).items()}
+    return {
+        name: (digest, size) for name, (digest, size) in json_object(content).items()
+    }
 
 
 def read_beside(place: Place, record: Record, what: str, digest: str) -> bytes:
@@ -40,7 +52,9 @@ def read_beside(place: Place, record: Record, what: str, digest: str) -> bytes:
     try:
         text = place.read_small(key)
     except OSError as error:
-        fault = Fault(place.where(key), AS_COMMITTED, error.strerror or "an unreadable file", CURE)
+        fault = Fault(
+            place.where(key), AS_COMMITTED, error.strerror or "an unreadable file", CURE
+        )
         raise InputError(fault) from None
     if hashlib.sha256(text).hexdigest() != digest:
         raise InputError(Fault(place.where(key), AS_COMMITTED, CHANGED, CURE))
@@ -48,10 +62,12 @@ def read_beside(place: Place, record: Record, what: str, digest: str) -> bytes:
 
 
 class VerifiedStore(Store):
-    """A version as a read-only zarr store; a missing or changed file raises an `InputError`, and is never a fill value.
+    """A version as a read-only zarr store; a missing or changed file raises an
+    `InputError`, and is never a fill value.
 
-    The manifest alone determines which files exist. The digest of a whole file is compared before any part of it is
-    returned; for later parts only the identity of the file is compared.
+    The manifest alone determines which files exist. The digest of a whole file is
+    compared before any part of it is returned; for later parts only the identity of the
+    file is compared.
 
     Parameters
     ----------
@@ -83,31 +99,50 @@ class VerifiedStore(Store):
         return Counter(map(array_of, self.files))
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, VerifiedStore) and (self.place.name, self.record) == (other.place.name, other.record)
+        return isinstance(other, VerifiedStore) and (self.place.name, self.record) == (
+            other.place.name,
+            other.record,
+        )
 
     __hash__ = object.__hash__
 
     def __getstate__(self) -> tuple[Place, Record]:
-        """Location and record only; another process reads the manifest itself, if it reads any values."""
+        """Location and record only; another process reads the manifest itself, if it
+        reads any values.
+        """
         return self.place, self.record
 
     def __setstate__(self, state: tuple[Place, Record]) -> None:
         super().__init__(read_only=True)
         self.place, self.record = state
-        self._known: dict[str, tuple[Hashable, ...]] = {}  # file -> identity when its digest was compared
+        # file -> identity when its digest was compared
+        self._known: dict[str, tuple[Hashable, ...]] = {}
         self._guards: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
 
-    async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
+    async def get(
+        self,
+        key: str,
+        prototype: BufferPrototype,
+        byte_range: ByteRequest | None = None,
+    ) -> Buffer | None:
         """Contents of a file, or None if the version does not have it."""
         if key not in self.files:
             return None
-        return prototype.buffer.from_bytes(await asyncio.to_thread(self._bytes, key, byte_range))
+        return prototype.buffer.from_bytes(
+            await asyncio.to_thread(self._bytes, key, byte_range)
+        )
 
     async def get_partial_values(
-        self, prototype: BufferPrototype, key_ranges: Iterable[tuple[str, ByteRequest | None]]
+        self,
+        prototype: BufferPrototype,
+        key_ranges: Iterable[tuple[str, ByteRequest | None]],
     ) -> list[Buffer | None]:
         """Contents of several files."""
-        return list(await asyncio.gather(*(self.get(key, prototype, part) for key, part in key_ranges)))
+        return list(
+            await asyncio.gather(
+                *(self.get(key, prototype, part) for key, part in key_ranges)
+            )
+        )
 
     async def exists(self, key: str) -> bool:
         """Whether the version has this file."""
@@ -135,7 +170,11 @@ class VerifiedStore(Store):
     async def list_dir(self, prefix: str) -> AsyncIterator[str]:
         """Names directly below `prefix`."""
         start = f"{prefix.rstrip('/')}/" if prefix else ""
-        for name in {key[len(start) :].split("/", 1)[0] for key in self.files if key.startswith(start)}:
+        for name in {
+            key[len(start) :].split("/", 1)[0]
+            for key in self.files
+            if key.startswith(start)
+        }:
             yield name
 
     def _bytes(self, key: str, byte_range: ByteRequest | None) -> bytes:
@@ -147,7 +186,8 @@ class VerifiedStore(Store):
                 if key.endswith("zarr.json"):
                     self._require_plausible(key, data)
                 return data
-            with self._guards[key]:  # only one of several concurrent requests compares the digest
+            # only one of several concurrent requests compares the digest
+            with self._guards[key]:
                 identity = self.place.identity(name)
                 if self._known.get(key) != identity:
                     self._require(key, self.place.digest(name))
@@ -175,14 +215,22 @@ class VerifiedStore(Store):
             if key not in there:
                 faults += self._fault(key, "no file").faults
             elif there[key] < 0:
-                faults += self._fault(key, "something that is not a regular file").faults
+                faults += self._fault(
+                    key, "something that is not a regular file"
+                ).faults
             elif there[key] != size:
-                faults += self._fault(key, f"{there[key]} bytes instead of {size}").faults
+                faults += self._fault(
+                    key, f"{there[key]} bytes instead of {size}"
+                ).faults
         if faults:
             raise InputError(faults)
 
     def _fault(self, key: str, found: str) -> InputError:
-        return InputError(Fault(self.place.where(f"{self.record.path}/{key}"), AS_COMMITTED, found, CURE))
+        return InputError(
+            Fault(
+                self.place.where(f"{self.record.path}/{key}"), AS_COMMITTED, found, CURE
+            )
+        )
 
 
 def limits(byte_range: Any) -> tuple[int, int | None]:

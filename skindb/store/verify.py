@@ -1,4 +1,6 @@
-"""Verification of a database: all records and files are read and compared, and all faults are reported together."""
+"""Verification of a database: all records and files are read and compared, and all
+faults are reported together.
+"""
 
 from __future__ import annotations
 
@@ -15,12 +17,28 @@ from skindb.store.kinds import KINDS_OF_ONE_SUBJECT
 from skindb.store.lease import NUMBER, abandoned_holder
 from skindb.store.log import GENERATION, RESTORE, Log, committed_logs, tombstone_of
 from skindb.store.markers import SECRET, WITHDRAWN, marker_faults, read_markers
-from skindb.store.paths import AUDIT, KIND, LEASE_KINDS, STAGING, TAKE, TIME_HEX, TRANSIENT
+from skindb.store.paths import (
+    AUDIT,
+    KIND,
+    LEASE_KINDS,
+    STAGING,
+    TAKE,
+    TIME_HEX,
+    TRANSIENT,
+)
 from skindb.store.place import Place, UnavailableError
 from skindb.store.record import AS_RECORDED, Record, json_object
 from skindb.store.requests import REQUEST_NAME, REQUESTS, read_requests
 from skindb.store.stage import TABLES, describe, read_names, tables_from_json
-from skindb.store.verified import AS_COMMITTED, CHANGED, CURE, Manifest, VerifiedStore, read_beside, read_manifest
+from skindb.store.verified import (
+    AS_COMMITTED,
+    CHANGED,
+    CURE,
+    Manifest,
+    VerifiedStore,
+    read_beside,
+    read_manifest,
+)
 
 # patterns of the names in a database, by level; versions are folders, everything else files
 LAYOUT = {
@@ -40,8 +58,14 @@ FILE_BESIDE = re.compile(r"\.(manifest|tables)\.json")
 
 def database_faults(place: Place) -> list[Fault]:
     """All faults of a database."""
-    beside: list[str] = []  # files beside versions, listed before the log because a commit writes its record last
-    layout = [fault for name, levels in LAYOUT.items() for fault in _layout_faults(place, name, levels, beside)]
+    # files beside versions, listed before the log because a commit writes its record
+    # last
+    beside: list[str] = []
+    layout = [
+        fault
+        for name, levels in LAYOUT.items()
+        for fault in _layout_faults(place, name, levels, beside)
+    ]
     faults: list[Fault] = []
     records: list[Record] = []
     tombstone_names = tombstones(place)
@@ -57,12 +81,24 @@ def database_faults(place: Place) -> list[Fault]:
         faults += broken
         damaged |= {log.what} if broken else set()
         for record in readable:
-            faults += [_partly_removed_fault(record)] if record in partly_removed else version_faults(place, record)
+            faults += (
+                [_partly_removed_fault(record)]
+                if record in partly_removed
+                else version_faults(place, record)
+            )
     faults += _input_faults(place, records, damaged)
     faults += _unrecorded_faults(place, beside, records, damaged)
-    faults += [*marker_faults(place), *read_requests(place)[1], *_withdrawn_faults(place), *read_audit(place)[1]]
+    faults += [
+        *marker_faults(place),
+        *read_requests(place)[1],
+        *_withdrawn_faults(place),
+        *read_audit(place)[1],
+    ]
     reported = {fault.where for fault in faults}
-    return [*dict.fromkeys(faults), *(fault for fault in layout if fault.where not in reported)]
+    return [
+        *dict.fromkeys(faults),
+        *(fault for fault in layout if fault.where not in reported),
+    ]
 
 
 def _withdrawn_faults(place: Place) -> list[Fault]:
@@ -74,16 +110,31 @@ def _withdrawn_faults(place: Place) -> list[Fault]:
     except InputError as error:  # of the secret, which `marker_faults` reports
         return [fault for fault in error.faults if fault.where != place.where(SECRET)]
     left = [f"{kind} of {take}" for kind, take in holdings.takes]
-    left += [f"{record.kind} {record.generation} of {record.take}" for record in holdings.versions]
+    left += [
+        f"{record.kind} {record.generation} of {record.take}"
+        for record in holdings.versions
+    ]
     left += [place.where(key) for key in (*holdings.unrecorded, *holdings.caches)]
     left += [*map(str, holdings.requests), *map(str, holdings.scratch)]
     rule = "nothing of a withdrawn subject must remain"
     cure = "run skindb clean --yes"
-    return [Fault(where, rule, "data that the withdrawal did not remove, or that came later", cure) for where in left]
+    return [
+        Fault(
+            where,
+            rule,
+            "data that the withdrawal did not remove, or that came later",
+            cure,
+        )
+        for where in left
+    ]
 
 
-def _layout_faults(place: Place, key: str, levels: tuple[str, ...], beside: list[str]) -> list[Fault]:
-    """Faults of unknown names in the folders of the database, and of links or pipes in place of files."""
+def _layout_faults(
+    place: Place, key: str, levels: tuple[str, ...], beside: list[str]
+) -> list[Fault]:
+    """Faults of unknown names in the folders of the database, and of links or pipes in
+    place of files.
+    """
     found = place.file_type(key)
     if found != "folder":
         return [_type_fault(place, key, "folder", found)] if found else []
@@ -92,7 +143,9 @@ def _layout_faults(place: Place, key: str, levels: tuple[str, ...], beside: list
         child = f"{key}/{name}"
         if not re.fullmatch(levels[0], name):
             rule = "a database must contain only files of skindb"
-            faults.append(Fault(place.where(child), rule, "an unknown name", "remove it"))
+            faults.append(
+                Fault(place.where(child), rule, "an unknown name", "remove it")
+            )
         elif len(levels) > 1:
             faults += _layout_faults(place, child, levels[1:], beside)
         else:
@@ -107,31 +160,48 @@ def _layout_faults(place: Place, key: str, levels: tuple[str, ...], beside: list
 def _type_fault(place: Place, key: str, expected: str, found: str) -> Fault:
     names = {"link": "a symbolic link", "file": "a file", "folder": "a folder"}
     rule = "must be a folder" if expected == "folder" else "must be a regular file"
-    return Fault(place.where(key), rule, names.get(found, "a pipe, socket or device"), RESTORE)
+    return Fault(
+        place.where(key), rule, names.get(found, "a pipe, socket or device"), RESTORE
+    )
 
 
-def _input_faults(place: Place, records: list[Record], damaged: set[str]) -> list[Fault]:
+def _input_faults(
+    place: Place, records: list[Record], damaged: set[str]
+) -> list[Fault]:
     """Faults of inputs of other versions that are missing or were replaced, without a tombstone."""
-    seals = {(record.kind, record.take, record.generation): record.seal for record in records}
+    seals = {
+        (record.kind, record.take, record.generation): record.seal for record in records
+    }
     faults = []
     for record in records:
         for one in record.made_from:
             log = Log(place, one["kind"], one["take"])
             generation = one["generation"]
-            if log.what in damaged or not one.get("seal") or log.is_removed(one["seal"]):
+            if (
+                log.what in damaged
+                or not one.get("seal")
+                or log.is_removed(one["seal"])
+            ):
                 continue
             if seals.get((log.kind, log.take, generation)) != one["seal"]:
                 by = f"{record.kind} {record.generation} of {record.take}"
                 rule = f"generation {generation}, from which {by} was made, must exist"
-                faults.append(Fault(log.what, rule, "no record, or a different one", RESTORE))
+                faults.append(
+                    Fault(log.what, rule, "no record, or a different one", RESTORE)
+                )
     return faults
 
 
-def _unrecorded_faults(place: Place, beside: list[str], records: list[Record], damaged: set[str]) -> list[Fault]:
+def _unrecorded_faults(
+    place: Place, beside: list[str], records: list[Record], damaged: set[str]
+) -> list[Fault]:
     """Faults of versions that were written completely, but whose records were lost."""
     named = {record.beside(what) for record in records for what in ("manifest", TABLES)}
     rule = "a record of the log must name every version that was written completely"
-    cure = "restore its record from a backup; if its run was killed, remove this file and the version beside it"
+    cure = (
+        "restore its record from a backup; if its run was killed, remove this file and "
+        "the version beside it"
+    )
     faults = []
     for key in beside:
         _, kind, take, _ = key.split("/")
@@ -144,8 +214,9 @@ def _unrecorded_faults(place: Place, beside: list[str], records: list[Record], d
 def _has_lost_record(place: Place, kind: str, take: str) -> bool:
     """Whether a version that was written completely must have lost its record.
 
-    The version never had a record if the head names the newest record and the log has it. It may never have had one if
-    there are no records at all, or if the last run under a lease was killed.
+    The version never had a record if the head names the newest record and the log has
+    it. It may never have had one if there are no records at all, or if the last run
+    under a lease was killed.
     """
     log = Log(place, kind, take)
     return bool(log.generations()) and may_have_had_record(log)
@@ -153,14 +224,18 @@ def _has_lost_record(place: Place, kind: str, take: str) -> bool:
 
 def may_have_had_record(log: Log) -> bool:
     """Whether a version without a record may have had a record."""
-    return not log.head() and not abandoned_holder(log.place, LEASE_KINDS.get(log.kind, log.kind), log.take)
+    return not log.head() and not abandoned_holder(
+        log.place, LEASE_KINDS.get(log.kind, log.kind), log.take
+    )
 
 
 def version_faults(place: Place, record: Record) -> list[Fault]:
     """All faults of one version."""
     try:
         manifest = read_manifest(place, record)
-        tables = read_beside(place, record, TABLES, record.tables) if record.tables else b""
+        tables = (
+            read_beside(place, record, TABLES, record.tables) if record.tables else b""
+        )
         faults = _file_faults(place, record, manifest)
         return faults or _record_faults(place, record, tables)
     except InputError as error:
@@ -169,29 +244,50 @@ def version_faults(place: Place, record: Record) -> list[Fault]:
 
 def tombstones(place: Place) -> set[str]:
     """Names of all tombstones."""
-    return set(place.children("tombstones")) if place.file_type("tombstones") == "folder" else set()
+    return (
+        set(place.children("tombstones"))
+        if place.file_type("tombstones") == "folder"
+        else set()
+    )
 
 
-def partly_removed_records(log: Log, records: Iterable[Record], tombstone_names: set[str]) -> list[Record]:
+def partly_removed_records(
+    log: Log, records: Iterable[Record], tombstone_names: set[str]
+) -> list[Record]:
     """Records that already have a tombstone, because their removal was interrupted."""
-    there = [record for record in records if tombstone_of(record.seal).rpartition("/")[2] in tombstone_names]
+    there = [
+        record
+        for record in records
+        if tombstone_of(record.seal).rpartition("/")[2] in tombstone_names
+    ]
     return [record for record in there if log.is_removed(record.seal)]
 
 
 def _partly_removed_fault(record: Record) -> Fault:
     what = f"{record.kind} {record.generation} of {record.take}"
-    return Fault(what, "its removal must be completed", "both a record and a tombstone", "run skindb clean")
+    return Fault(
+        what,
+        "its removal must be completed",
+        "both a record and a tombstone",
+        "run skindb clean",
+    )
 
 
 def _file_faults(place: Place, record: Record, manifest: Manifest) -> list[Fault]:
     there = place.sizes(record.path)
     names = sorted(there.keys() | manifest.keys())
     with ThreadPoolExecutor(THREADS) as threads:
-        found = list(threads.map(lambda name: _file_fault(place, record, manifest, there, name), names))
+        found = list(
+            threads.map(
+                lambda name: _file_fault(place, record, manifest, there, name), names
+            )
+        )
     return [fault for fault in found if fault is not None]
 
 
-def _file_fault(place: Place, record: Record, manifest: Manifest, there: dict[str, int], name: str) -> Fault | None:
+def _file_fault(
+    place: Place, record: Record, manifest: Manifest, there: dict[str, int], name: str
+) -> Fault | None:
     key = f"{record.path}/{name}"
     where = place.where(key)
     if name not in there:
@@ -219,12 +315,24 @@ def _record_faults(place: Place, record: Record, tables: bytes) -> list[Fault]:
     root = json_object(place.read_small(f"{record.path}/zarr.json"))
     wrong = [] if root.get("attributes") == record.provenance else ["provenance"]
     if record.kind not in KINDS_OF_ONE_SUBJECT:
-        wrong += [] if read_names(place, record.path) == ([*record.names], record.admissions) else ["names"]
+        wrong += (
+            []
+            if read_names(place, record.path) == ([*record.names], record.admissions)
+            else ["names"]
+        )
     store = VerifiedStore(place, record)
     tree = xr.open_datatree(store, engine="zarr", consolidated=False, chunks=None)  # type: ignore[arg-type]
-    contents = {str(name): describe(node.to_dataset()) for name, node in tree.children.items()}
-    contents |= {TABLES: describe(tables_from_json(json_object(tables)))} if tables else {}
+    contents = {
+        str(name): describe(node.to_dataset()) for name, node in tree.children.items()
+    }
+    contents |= (
+        {TABLES: describe(tables_from_json(json_object(tables)))} if tables else {}
+    )
     wrong += [] if contents == record.contents else ["contents"]
     wrong += [] if sum(place.sizes(record.path).values()) == record.bytes else ["bytes"]
     where = f"{record.kind} {record.generation} of {record.take}"
-    return [Fault(where, AS_RECORDED, f"different {', '.join(wrong)}", RESTORE)] if wrong else []
+    return (
+        [Fault(where, AS_RECORDED, f"different {', '.join(wrong)}", RESTORE)]
+        if wrong
+        else []
+    )

@@ -1,1 +1,3 @@
-"""Pages for the browser: a viewer in which a fitted face is lit, turned and edited, and an editor of landmarks."""
+"""Pages for the browser: a viewer in which a fitted face is lit, turned and edited, and
+an editor of landmarks.
+"""

@@ -1,4 +1,6 @@
-"""Data of the viewer's page for a fitted model: arrays at the surfels and tables of the bases, compressed as text."""
+"""Data of the viewer's page for a fitted model: arrays at the surfels and tables of the
+bases, compressed as text.
+"""
 
 from __future__ import annotations
 
@@ -35,13 +37,28 @@ STILL_SAMPLES = 16  # rays per pixel of the picture that is shown without WebGL
 MIN_ALBEDO = 1e-4  # below it, ratios of albedos are meaningless
 MEASURED = (  # differences from skindb render (docs/howto/view.md)
     "half precision of albedo, weights, normals and tables: values differ by at most 0.05 %",
-    "shadow maps of 1,024 texels, and lights as points: pictures differ by 0.4 to 0.7 % (measured), more at edges",
-    "light under the skin as one Gaussian in a texture of 384 texels: pictures differ by 1 % (measured)",
-    "light from all directions as 256 lights: the diffuse part differs by 2 %, reflection by 4 % (measured)",
+    (
+        "shadow maps of 1,024 texels, and lights as points: pictures differ by 0.4 to "
+        "0.7 % (measured), more at edges"
+    ),
+    (
+        "light under the skin as one Gaussian in a texture of 384 texels: pictures "
+        "differ by 1 % (measured)"
+    ),
+    (
+        "light from all directions as 256 lights: the diffuse part differs by 2 %, "
+        "reflection by 4 % (measured)"
+    ),
 )
 KEPT = (  # measured by benchmarks/omissions.py on a face of 23,393 surfels
-    "not skipped: surfels, because each is visible from some direction; the page has no other texels of the face",
-    "not skipped: texels of the BRDF tables, because bases with half of them along an axis differ by 0.2 to 8 %",
+    (
+        "not skipped: surfels, because each is visible from some direction; the page "
+        "has no other texels of the face"
+    ),
+    (
+        "not skipped: texels of the BRDF tables, because bases with half of them along "
+        "an axis differ by 0.2 to 8 %"
+    ),
     "not skipped: lights of the surroundings, because none is below the horizon of all surfels",
 )
 KINDS = {"float16": "f2", "float32": "f4", "uint32": "u4"}
@@ -49,7 +66,9 @@ KINDS = {"float16": "f2", "float32": "f4", "uint32": "u4"}
 
 @dataclass(frozen=True)
 class Trait:
-    """A model edited along one trait by `amount`, and by half of it to measure the error of interpolating the edit."""
+    """A model edited along one trait by `amount`, and by half of it to measure the
+    error of interpolating the edit.
+    """
 
     name: str
     whole: xr.DataTree
@@ -76,19 +95,20 @@ def face_record(
     traits
         Edits that the sliders of the page apply.
     environment
-        Light from all directions; default an overcast sky. It is scaled such that a white surface that faces the front
-        is displayed white.
+        Light from all directions; default an overcast sky. It is scaled such that a
+        white surface that faces the front is displayed white.
 
     Returns
     -------
     dict
-        about, arrays and traits. Positions of surfels are in single precision, all other values in half precision
-        (0.05 %).
+        about, arrays and traits. Positions of surfels are in single precision, all
+        other values in half precision (0.05 %).
 
     Raises
     ------
     InputError
-        If the subject does not consent to exports, no surfel was fitted, or there are more than eight bases.
+        If the subject does not consent to exports, no surfel was fitted, or there are
+        more than eight bases.
     """
     honour_consent(model.attrs, "export")
     surface = _surface(model, edited=bool(traits))[0]
@@ -111,14 +131,16 @@ def face_record(
         **({"tableB": tables[1]} if len(tables) > 1 else {}),
     }
     return {
-        "about": _about(model, surface, take, attributes) | {"surroundings": _surroundings(model, environment)},
+        "about": _about(model, surface, take, attributes)
+        | {"surroundings": _surroundings(model, environment)},
         "arrays": {name: _encode(value) for name, value in arrays.items()},
         "traits": [_trait(one, values) for one in traits],
     }
 
 
 def page_omissions(model: xr.DataTree, *, edited: bool = False) -> list[str]:
-    """One line for each thing that the page of a model skips or approximates, with the bound or the measured error.
+    """One line for each thing that the page of a model skips or approximates, with the
+    bound or the measured error.
 
     Further lines state what is not skipped, with the reason.
 
@@ -132,7 +154,9 @@ def page_omissions(model: xr.DataTree, *, edited: bool = False) -> list[str]:
     return [*map(str, _surface(model, edited=edited)[1]), *MEASURED, *KEPT]
 
 
-def _surface(model: xr.DataTree, *, edited: bool) -> tuple[Surface, tuple[Omission, ...]]:
+def _surface(
+    model: xr.DataTree, *, edited: bool
+) -> tuple[Surface, tuple[Omission, ...]]:
     """The surface of the page, without unused bases unless it is edited, and what was omitted."""
     surface = from_model(model, fill=True)
     return (surface, ()) if edited else without_unused_bases(surface)
@@ -142,16 +166,20 @@ def still_picture(model: xr.DataTree) -> str:
     """Picture under all lights of the dome as a data URL, for browsers without WebGL."""
     seen = render(model, samples=STILL_SAMPLES)
     dome = model["dome"].to_dataset().load()
-    gain = fixed_exposure(Lighting(chosen_lights(dome, ())[0]), chosen_camera(dome, None)[0])
+    gain = fixed_exposure(
+        Lighting(chosen_lights(dome, ())[0]), chosen_camera(dome, None)[0]
+    )
     png = imagecodecs.png_encode(tone_map(seen["radiance"].values, exposure=gain))
     return "data:image/png;base64," + base64.b64encode(png).decode("ascii")
 
 
 def diffusion_width(s: Float, eta: float) -> Float:
-    """Standard deviation of the Gaussian with the mean square distance of the dipole, in units of 1 / sigma_tr.
+    """Standard deviation of the Gaussian with the mean square distance of the dipole,
+    in units of 1 / sigma_tr.
 
-    The mean is taken over the profile (eq. 9) in the plane, whose sources are at the depths z_r and z_v. This profile
-    has a sharper peak and longer tails than the Gaussian.
+    The mean is taken over the profile (eq. 9) in the plane, whose sources are at the
+    depths z_r and z_v. This profile has a sharper peak and longer tails than the
+    Gaussian.
 
     Parameters
     ----------
@@ -162,7 +190,8 @@ def diffusion_width(s: Float, eta: float) -> Float:
     """
     depth = np.maximum(np.asarray(s, np.float64), S_FLOOR)  # z_r sigma_tr
     above = depth * (1 + 4 / 3 * boundary_factor(eta))
-    # one source at depth z: the integral of R is exp(-z) / 2, that of r^2 R is z exp(-z), in units of 1 / sigma_tr
+    # one source at depth z: the integral of R is exp(-z) / 2, that of r^2 R is z
+    # exp(-z), in units of 1 / sigma_tr
     power = (np.exp(-depth) + np.exp(-above)) / 2
     square = depth * np.exp(-depth) + above * np.exp(-above)
     return np.asarray(np.sqrt(square / power / 2))
@@ -171,17 +200,23 @@ def diffusion_width(s: Float, eta: float) -> Float:
 def uv_spacing(vertices: Float, faces: NDArray[np.integer[Any]], uv: Float) -> Float:
     """Length (n,) [mm] of one unit of the texture coordinates at each vertex."""
     flat = np.concatenate([uv, np.zeros((len(uv), 1))], axis=1)
-    square = vertex_areas(vertices, faces) / np.maximum(vertex_areas(flat.astype(np.float64), faces), 1e-12)
+    square = vertex_areas(vertices, faces) / np.maximum(
+        vertex_areas(flat.astype(np.float64), faces), 1e-12
+    )
     return np.asarray(np.sqrt(np.clip(square, 1e-6, 1e12)))
 
 
 def _values(surface: Surface) -> dict[str, Float]:
-    """Values that traits change: albedo (n, 3), weights (n, 4) twice, diffusion length (n, 3) [mm]."""
+    """Values that traits change: albedo (n, 3), weights (n, 4) twice, diffusion length
+    (n, 3) [mm].
+    """
     weights = np.zeros((len(surface.vertices), MAX_BASES))
     weights[:, : surface.weights.shape[1]] = surface.weights
     diffusion = np.zeros((len(surface.vertices), 3))
     if surface.sigma_tr is not None:
-        diffusion = np.nan_to_num(1 / np.asarray(surface.sigma_tr, np.float64), nan=0.0, posinf=0.0)
+        diffusion = np.nan_to_num(
+            1 / np.asarray(surface.sigma_tr, np.float64), nan=0.0, posinf=0.0
+        )
     return {
         "albedo": np.maximum(surface.diffuse, MIN_ALBEDO),
         "weightA": weights[:, :4],
@@ -191,10 +226,16 @@ def _values(surface: Surface) -> dict[str, Float]:
 
 
 def _trait(trait: Trait, plain: Mapping[str, Float]) -> dict[str, Any]:
-    """Change of the arrays by a trait: differences of weights, log ratios of albedo and diffusion length."""
-    whole, half = (_values(from_model(tree, fill=True)) for tree in (trait.whole, trait.half))
+    """Change of the arrays by a trait: differences of weights, log ratios of albedo and
+    diffusion length.
+    """
+    whole, half = (
+        _values(from_model(tree, fill=True)) for tree in (trait.whole, trait.half)
+    )
     ratio = {
-        name: np.log(np.maximum(whole[name], MIN_ALBEDO) / np.maximum(plain[name], MIN_ALBEDO))
+        name: np.log(
+            np.maximum(whole[name], MIN_ALBEDO) / np.maximum(plain[name], MIN_ALBEDO)
+        )
         for name in ("albedo", "diffusion")
     }
     between = plain["albedo"] * np.exp(0.5 * ratio["albedo"])
@@ -204,17 +245,25 @@ def _trait(trait: Trait, plain: Mapping[str, Float]) -> dict[str, Any]:
         "name": trait.name,
         "amount": trait.amount,
         "error": error,
-        "arrays": {name: _encode(value.astype(np.float16)) for name, value in moves.items()},
+        "arrays": {
+            name: _encode(value.astype(np.float16)) for name, value in moves.items()
+        },
     }
 
 
 def _tables(tables: NDArray[np.float32]) -> list[NDArray[np.float16]]:
     """Tables (nh, nd, np, k) as arrays (np, nh, nd, 4), one for every four bases."""
     count = tables.shape[-1]
-    padded = np.zeros((*tables.shape[:3], MAX_BASES if count > MAX_BASES // 2 else MAX_BASES // 2), np.float32)
+    padded = np.zeros(
+        (*tables.shape[:3], MAX_BASES if count > MAX_BASES // 2 else MAX_BASES // 2),
+        np.float32,
+    )
     padded[..., :count] = np.clip(tables, -60000, 60000)
     turned = np.ascontiguousarray(padded.transpose(2, 0, 1, 3)).astype(np.float16)
-    return [np.ascontiguousarray(turned[..., i : i + 4]) for i in range(0, turned.shape[-1], 4)]
+    return [
+        np.ascontiguousarray(turned[..., i : i + 4])
+        for i in range(0, turned.shape[-1], 4)
+    ]
 
 
 def _quality(model: xr.DataTree, surface: Surface) -> Float:
@@ -223,18 +272,30 @@ def _quality(model: xr.DataTree, surface: Surface) -> Float:
     error = np.zeros(len(surface.vertices))
     for name in ("diffuse_reflectance_total_error", "diffuse_reflectance_error"):
         if name in fitted:
-            error = (fitted[name].values / np.maximum(surface.diffuse, MIN_ALBEDO)).mean(axis=1)
+            error = (
+                fitted[name].values / np.maximum(surface.diffuse, MIN_ALBEDO)
+            ).mean(axis=1)
             break
-    return np.stack([surfel_confidence(fitted), np.clip(np.nan_to_num(error), 0, 10)], axis=1)
+    return np.stack(
+        [surfel_confidence(fitted), np.clip(np.nan_to_num(error), 0, 10)], axis=1
+    )
 
 
-def _about(model: xr.DataTree, surface: Surface, take: str, attributes: Mapping[str, Any]) -> dict[str, Any]:
+def _about(
+    model: xr.DataTree, surface: Surface, take: str, attributes: Mapping[str, Any]
+) -> dict[str, Any]:
     dome = model["dome"].to_dataset().load()
     used = surface.vertices[np.unique(surface.faces)]
     centre = (used.min(axis=0) + used.max(axis=0)) / 2
-    distance = float(np.median(np.linalg.norm(dome["light_position"].values - centre, axis=1)))
+    distance = float(
+        np.median(np.linalg.norm(dome["light_position"].values - centre, axis=1))
+    )
     intensity = np.median(dome["light_intensity"].values, axis=0)
-    translucent = surface.s is not None and surface.sigma_tr is not None and bool(np.isfinite(surface.sigma_tr).all())
+    translucent = (
+        surface.s is not None
+        and surface.sigma_tr is not None
+        and bool(np.isfinite(surface.sigma_tr).all())
+    )
     s = np.zeros((1, 3)) if surface.s is None else np.asarray(surface.s)
     return {
         "eta": surface.eta,
@@ -244,23 +305,48 @@ def _about(model: xr.DataTree, surface: Surface, take: str, attributes: Mapping[
         "lightIntensity": intensity.tolist(),
         "exposure": float(np.pi * distance**2 / intensity.mean()),
         "translucent": translucent,
-        "diffusionWidth": [float(np.median(diffusion_width(s[:, c], surface.eta))) for c in range(3)],
-        "tableShape": [surface.tables.shape[2], surface.tables.shape[0], surface.tables.shape[1]],
-        "attributes": {"take": take} | {str(name): str(value) for name, value in attributes.items()},
+        "diffusionWidth": [
+            float(np.median(diffusion_width(s[:, c], surface.eta))) for c in range(3)
+        ],
+        "tableShape": [
+            surface.tables.shape[2],
+            surface.tables.shape[0],
+            surface.tables.shape[1],
+        ],
+        "attributes": {"take": take}
+        | {str(name): str(value) for name, value in attributes.items()},
     }
 
 
-def _surroundings(model: xr.DataTree, environment: Environment | None) -> dict[str, Any]:
-    """Distant lights with the irradiance of one light of the dome in front of the face, in the unit of the dome."""
+def _surroundings(
+    model: xr.DataTree, environment: Environment | None
+) -> dict[str, Any]:
+    """Distant lights with the irradiance of one light of the dome in front of the face,
+    in the unit of the dome.
+    """
     lights = distant_lights(environment or overcast_sky())
-    front = (lights.irradiance * np.maximum(lights.direction[:, 2:], 0)).sum(axis=0).mean()
+    front = (
+        (lights.irradiance * np.maximum(lights.direction[:, 2:], 0)).sum(axis=0).mean()
+    )
     dome = model["dome"].to_dataset().load()
     middle = model["fitted"].to_dataset()["surfel_position"].values.mean(axis=0)
-    distance = float(np.median(np.linalg.norm(dome["light_position"].values - middle, axis=1)))
-    unit = float(np.median(dome["light_intensity"].values, axis=0).mean()) / distance**2 / max(float(front), 1e-30)
-    return {"direction": lights.direction.tolist(), "irradiance": (lights.irradiance * unit).tolist()}
+    distance = float(
+        np.median(np.linalg.norm(dome["light_position"].values - middle, axis=1))
+    )
+    unit = (
+        float(np.median(dome["light_intensity"].values, axis=0).mean())
+        / distance**2
+        / max(float(front), 1e-30)
+    )
+    return {
+        "direction": lights.direction.tolist(),
+        "irradiance": (lights.irradiance * unit).tolist(),
+    }
 
 
 def _encode(values: NDArray[Any]) -> dict[str, str]:
     packed = zlib.compress(np.ascontiguousarray(values).tobytes(), 6)
-    return {"kind": KINDS[str(values.dtype)], "data": base64.b64encode(packed).decode("ascii")}
+    return {
+        "kind": KINDS[str(values.dtype)],
+        "data": base64.b64encode(packed).decode("ascii"),
+    }

@@ -51,7 +51,9 @@ PLACES = {
 
 
 def place_sentence(name: str) -> str:
-    """Description of the place of a landmark; for unknown names, that the point is from the file."""
+    """Description of the place of a landmark; for unknown names, that the point is from
+    the file.
+    """
     side = next((side for side in ("right", "left") if name.endswith(f"_{side}")), "")
     sentence = PLACES.get(name.removesuffix(f"_{side}") if side else name)
     if sentence is None:
@@ -72,36 +74,61 @@ def landmark_server(task: LandmarkTask, *, port: int = 0) -> PageServer:
         "": Content(HTML, lambda: _page(reread_task(task)).encode()),
         "mesh": Content("application/octet-stream", lambda: mesh),
     }
-    return PageServer(contents, {"suggest": partial(_suggest, task), "save": partial(_save, task)}, port=port)
+    return PageServer(
+        contents,
+        {"suggest": partial(_suggest, task), "save": partial(_save, task)},
+        port=port,
+    )
 
 
 def _suggest(task: LandmarkTask, asked: dict[str, Any]) -> dict[str, Any]:
-    found = suggest_landmarks(task.scan.vertices, task.scan.faces, parsed_points(asked.get("points"), "points"))
+    found = suggest_landmarks(
+        task.scan.vertices,
+        task.scan.faces,
+        parsed_points(asked.get("points"), "points"),
+    )
     return {"points": {name: p.tolist() for name, p in found.items()}}
 
 
 def _save(task: LandmarkTask, asked: dict[str, Any]) -> dict[str, Any]:
-    """Save the landmarks, unless there are faults or questions that are not yet confirmed, and describe the result."""
+    """Save the landmarks, unless there are faults or questions that are not yet
+    confirmed, and describe the result.
+    """
     points = parsed_points(asked.get("points"), "points")
-    crop: Crop | None = None if asked.get("crop") is None else parsed_crop(asked["crop"], "crop box")
+    crop: Crop | None = (
+        None if asked.get("crop") is None else parsed_crop(asked["crop"], "crop box")
+    )
     if faults := landmark_mistakes(task, points, crop):
         raise InputError(faults)
     confirmed = asked.get("confirmed")
     questions = open_questions(task, points, seen=str(asked.get("seen", "")))
-    if any(not isinstance(confirmed, list) or question not in confirmed for question in questions):
+    if any(
+        not isinstance(confirmed, list) or question not in confirmed
+        for question in questions
+    ):
         return {"questions": questions}
     seen = save_landmarks(task, points, crop)
-    text = f"{len(points)} {'point was' if len(points) == 1 else 'points were'} saved in {task.out}."
-    return {"saved": text + (f" The crop box is in {crop_path(task.out)}." if crop else ""), "seen": seen}
+    text = (
+        f"{len(points)} {'point was' if len(points) == 1 else 'points were'} saved in "
+        f"{task.out}."
+    )
+    return {
+        "saved": text + (f" The crop box is in {crop_path(task.out)}." if crop else ""),
+        "seen": seen,
+    }
 
 
 def _mesh(task: LandmarkTask) -> bytes:
-    """Bytes of positions and normals (float32), triangles (uint32) and colours (uint8), in this order."""
+    """Bytes of positions and normals (float32), triangles (uint32) and colours (uint8),
+    in this order.
+    """
     vertices = task.scan.vertices
     faces = task.scan.faces
     normal = np.nan_to_num(vertex_normals(vertices, faces))
     parts = [vertices.astype("<f4"), normal.astype("<f4"), faces.astype("<u4")]
-    return b"".join(part.tobytes() for part in parts) + (b"" if task.colours is None else task.colours.tobytes())
+    return b"".join(part.tobytes() for part in parts) + (
+        b"" if task.colours is None else task.colours.tobytes()
+    )
 
 
 def _page(task: LandmarkTask) -> str:

@@ -33,7 +33,8 @@ from skindb.ingest.scan_checks import (
 )
 
 Points = Mapping[str, NDArray[np.float64]]
-MAX_OFF_SURFACE_MM = 1.0  # clicks are on the surface; single precision and rounding cause errors of 0.001
+# clicks are on the surface; single precision and rounding cause errors of 0.001
+MAX_OFF_SURFACE_MM = 1.0
 DECIMALS = 3  # of coordinates [mm] in the file
 
 
@@ -64,7 +65,9 @@ def landmark_task(scan_path: Path, out: Path) -> LandmarkTask:
         If the scan or one of the files cannot be read, or the folder of `out` does not exist.
     """
     if not out.parent.is_dir():
-        raise InputError(Fault(str(out), "its folder must exist", "none", f"create {out.parent}"))
+        raise InputError(
+            Fault(str(out), "its folder must exist", "none", f"create {out.parent}")
+        )
     scan = read_scan(scan_path)
     surface = clean_mesh(scan.vertices, scan.faces)
     colours = read_colours(scan_path, len(scan.vertices))
@@ -104,24 +107,49 @@ def parsed_points(value: Any, where: str) -> dict[str, NDArray[np.float64]]:
         If the value is not an object, or a position is not three finite numbers.
     """
     if not isinstance(value, dict):
-        raise InputError(Fault(where, "must be a JSON object {name: [x, y, z]}", type(value).__name__, "correct it"))
+        raise InputError(
+            Fault(
+                where,
+                "must be a JSON object {name: [x, y, z]}",
+                type(value).__name__,
+                "correct it",
+            )
+        )
     rule = "a landmark must be [x, y, z] in mm"
     cure = "correct it, or remove it"
-    wrong = [Fault(f"{where}[{name}]", rule, str(p), cure) for name, p in value.items() if not is_point(p)]
+    wrong = [
+        Fault(f"{where}[{name}]", rule, str(p), cure)
+        for name, p in value.items()
+        if not is_point(p)
+    ]
     if wrong:
         raise InputError(wrong)
     return {name: np.array(p, np.float64) for name, p in value.items()}
 
 
-def landmark_mistakes(task: LandmarkTask, points: Points, crop: Crop | None) -> list[Fault]:
-    """Faults of landmarks: unknown names, positions off the surface, and everything that ingest would refuse."""
+def landmark_mistakes(
+    task: LandmarkTask, points: Points, crop: Crop | None
+) -> list[Fault]:
+    """Faults of landmarks: unknown names, positions off the surface, and everything
+    that ingest would refuse.
+    """
     where = str(task.out)
     if not points:
-        return [Fault(where, "at least one landmark must be set", "none", "click a point on the scan")]
+        return [
+            Fault(
+                where,
+                "at least one landmark must be set",
+                "none",
+                "click a point on the scan",
+            )
+        ]
     unknown = [name for name in points if name not in task.names]
     if unknown:
         rule = "the name of a landmark must be in the list"
-        return [Fault(f"{where}[{name}]", rule, "another name", "choose a name of the list") for name in unknown]
+        return [
+            Fault(f"{where}[{name}]", rule, "another name", "choose a name of the list")
+            for name in unknown
+        ]
     place = np.array([*points.values()])
     distance = closest_on_mesh(task.scan.vertices, task.scan.faces, place)[2]
     rule = f"a landmark must be within {MAX_OFF_SURFACE_MM:g} mm of the scan"
@@ -130,16 +158,28 @@ def landmark_mistakes(task: LandmarkTask, points: Points, crop: Crop | None) -> 
         for name, d in zip(points, distance, strict=True)
         if d > MAX_OFF_SURFACE_MM
     ] + _outside(where, points, crop)
-    faults = faults or discarded_piece_faults(where, points, task.surface) or coincidence_faults(where, points)
+    faults = (
+        faults
+        or discarded_piece_faults(where, points, task.surface)
+        or coincidence_faults(where, points)
+    )
     size = None if faults else face_fault(where, points)
     order = None if faults else order_fault(where, points)
-    return faults or [f for f in (size, order) if f] or swapped_faults(where, points, task.surface)
+    return (
+        faults
+        or [f for f in (size, order) if f]
+        or swapped_faults(where, points, task.surface)
+    )
 
 
 def _outside(where: str, points: Points, crop: Crop | None) -> list[Fault]:
     if crop is None or crop.low is None or crop.high is None:
         return []
-    out = [name for name, p in points.items() if (p < crop.low).any() or (p > crop.high).any()]
+    out = [
+        name
+        for name, p in points.items()
+        if (p < crop.low).any() or (p > crop.high).any()
+    ]
     rule = "a landmark must be inside the crop box"
     cure = "enlarge the box, or move the point"
     return [Fault(f"{where}[{name}]", rule, "a point outside", cure) for name in out]
@@ -153,12 +193,16 @@ def open_questions(task: LandmarkTask, points: Points, *, seen: str) -> list[str
     task, points
         The task and the landmarks to be saved.
     seen
-        Digest of the file that `save_landmarks` returned when this page last wrote it; "" if it has not.
+        Digest of the file that `save_landmarks` returned when this page last wrote it;
+        "" if it has not.
     """
     missing = [name for name in MEAN_FACE if name not in points]
     questions = []
     if missing:
-        number = f"{len(missing)} of the {len(MEAN_FACE)} points {'is' if len(missing) == 1 else 'are'} missing"
+        number = (
+            f"{len(missing)} of the {len(MEAN_FACE)} points "
+            f"{'is' if len(missing) == 1 else 'are'} missing"
+        )
         questions.append(f"{number}: {', '.join(missing)}.")
     if task.out.exists() and _digest(task.out.read_bytes()) != seen:
         questions.append(f"{task.out} exists and will be replaced.")
@@ -170,7 +214,11 @@ def save_landmarks(task: LandmarkTask, points: Points, crop: Crop | None) -> str
 
     Without a crop box, its file is removed. Files are replaced atomically.
     """
-    content = {name: np.round(points[name], DECIMALS).tolist() for name in task.names if name in points}
+    content = {
+        name: np.round(points[name], DECIMALS).tolist()
+        for name in task.names
+        if name in points
+    }
     box = crop_path(task.out)
     if crop is None:
         box.unlink(missing_ok=True)

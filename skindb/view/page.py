@@ -1,4 +1,6 @@
-"""Pages of the viewer: a self-contained file for one face, or a page that requests one of several faces."""
+"""Pages of the viewer: a self-contained file for one face, or a page that requests one
+of several faces.
+"""
 
 from __future__ import annotations
 
@@ -25,15 +27,22 @@ SCRIPTS = (
 MAX_PAGE_BYTES = 30_000_000
 OVERCAST = "overcast sky"
 APPROXIMATIONS = (
-    "Shadows come from maps of 1,024 texels with filtered edges. Light under the skin is the irradiance, blurred in "
-    "the texture by one Gaussian, which has the mean square distance of the dipole and the local diffusion length. "
-    "Light from all directions is that of 256 distant lights, four of which are added in each step. Light that is "
-    "reflected more than once is not included. skindb render omits it too, but has none of the other approximations."
+    "Shadows come from maps of 1,024 texels with filtered edges. Light under the "
+    "skin is the irradiance, blurred in "
+    "the texture by one Gaussian, which has the mean square distance of the dipole "
+    "and the local diffusion length. "
+    "Light from all directions is that of 256 distant lights, four of which are "
+    "added in each step. Light that is "
+    "reflected more than once is not included. skindb render omits it too, but has "
+    "none of the other approximations."
 )
 
 
-def write_page(out: Path, record: Mapping[str, Any], still: str, *, surroundings: str = OVERCAST) -> int:
-    """Write a self-contained page of one face and return its size in bytes; `surroundings` names the environment.
+def write_page(
+    out: Path, record: Mapping[str, Any], still: str, *, surroundings: str = OVERCAST
+) -> int:
+    """Write a self-contained page of one face and return its size in bytes;
+    `surroundings` names the environment.
 
     Raises
     ------
@@ -41,8 +50,16 @@ def write_page(out: Path, record: Mapping[str, Any], still: str, *, surroundings
         If the page would be larger than 30 MB.
     """
     take = str(record["about"]["attributes"]["take"])
-    faces = f'<script type="application/json" id="face-{html.escape(take)}">{embedded_json(record)}</script>'
-    text = _page(f"skindb: {take}", [{"take": take, "title": take, "still": still}], faces, surroundings)
+    faces = (
+        '<script type="application/json" '
+        f'id="face-{html.escape(take)}">{embedded_json(record)}</script>'
+    )
+    text = _page(
+        f"skindb: {take}",
+        [{"take": take, "title": take, "still": still}],
+        faces,
+        surroundings,
+    )
     if (size := len(text.encode())) > MAX_PAGE_BYTES:
         rule = f"a page must have at most {MAX_PAGE_BYTES // 1_000_000} MB"
         cure = "fit with a larger --spacing"
@@ -53,7 +70,9 @@ def write_page(out: Path, record: Mapping[str, Any], still: str, *, surroundings
 
 @dataclass(frozen=True)
 class PagedFace:
-    """One of several faces of a page: its entry in the list of takes, and the data that the page requests."""
+    """One of several faces of a page: its entry in the list of takes, and the data that
+    the page requests.
+    """
 
     take: str
     title: str
@@ -64,26 +83,45 @@ class PagedFace:
     def of(cls, record: Mapping[str, Any], still: str) -> PagedFace:
         """The face of a record of `face_record`."""
         about = record["about"]["attributes"]
-        shown = [f"{name} {about[name]}" for name in ("age", "gender", "condition") if name in about]
-        return cls(about["take"], ", ".join([about["take"], *shown]), still, embedded_json(record).encode())
+        shown = [
+            f"{name} {about[name]}"
+            for name in ("age", "gender", "condition")
+            if name in about
+        ]
+        return cls(
+            about["take"],
+            ", ".join([about["take"], *shown]),
+            still,
+            embedded_json(record).encode(),
+        )
 
 
 def index_text(faces: Iterable[PagedFace], *, surroundings: str = OVERCAST) -> str:
     """The page of several faces, which requests faces/<take>.json."""
-    takes = [{"take": face.take, "title": face.title, "still": face.still} for face in faces]
+    takes = [
+        {"take": face.take, "title": face.title, "still": face.still} for face in faces
+    ]
     return _page("skindb viewer", takes, "", surroundings)
 
 
-def write_folder(out: Path, faces: Iterable[PagedFace], *, surroundings: str = OVERCAST) -> None:
-    """Write index.html and faces/<take>.json for several faces, which browsers can only read over HTTP."""
+def write_folder(
+    out: Path, faces: Iterable[PagedFace], *, surroundings: str = OVERCAST
+) -> None:
+    """Write index.html and faces/<take>.json for several faces, which browsers can only
+    read over HTTP.
+    """
     make_private(out / "faces")
     listed = list(faces)
     for face in listed:
         private_file(out / "faces" / f"{face.take}.json").write_bytes(face.data)
-    private_file(out / "index.html").write_text(index_text(listed, surroundings=surroundings), encoding="utf-8")
+    private_file(out / "index.html").write_text(
+        index_text(listed, surroundings=surroundings), encoding="utf-8"
+    )
 
 
-def _page(title: str, takes: list[dict[str, str]], faces: str, surroundings: str) -> str:
+def _page(
+    title: str, takes: list[dict[str, str]], faces: str, surroundings: str
+) -> str:
     parts = {
         "title": html.escape(title),
         "approximations": APPROXIMATIONS,

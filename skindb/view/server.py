@@ -1,4 +1,6 @@
-"""Server of a page for the person at this machine: contents from memory, in one session that a token opens."""
+"""Server of a page for the person at this machine: contents from memory, in one session
+that a token opens.
+"""
 
 from __future__ import annotations
 
@@ -16,15 +18,18 @@ from typing import Any
 from skindb.errors import Fault, InputError, system_fault
 
 LOCAL = "127.0.0.1"
-HOST = re.compile(r"(127\.0\.0\.1|localhost)(:[0-9]{1,5})?")  # another port is that of a tunnel
+# another port is that of a tunnel
+HOST = re.compile(r"(127\.0\.0\.1|localhost)(:[0-9]{1,5})?")
 HTML = "text/html; charset=utf-8"
 JSON = "application/json"
 MAX_REQUEST_BYTES = 1_000_000  # a hundred landmarks take about 20,000
 REQUEST_SECONDS = 60.0  # for which a connection may be silent
 HEADERS = {
     "Cache-Control": "no-store",
-    "Content-Security-Policy": "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
-    "img-src data: blob:; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "Content-Security-Policy": "default-src 'none'; script-src 'unsafe-inline'; "
+    "style-src 'unsafe-inline'; "
+    "img-src data: blob:; connect-src 'self'; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors 'none'",
     "Cross-Origin-Opener-Policy": "same-origin",
     "Cross-Origin-Resource-Policy": "same-origin",
     "Referrer-Policy": "no-referrer",
@@ -44,8 +49,9 @@ class Content:
 class PageServer(ThreadingHTTPServer):
     """Server at 127.0.0.1 of one page and what the page requests, which is not yet running.
 
-    The address contains a token that is valid for one request, whose answer sets a cookie for all others. The path of
-    the cookie is random, because browsers send cookies to every port of a host, also to servers of other users.
+    The address contains a token that is valid for one request, whose answer sets a
+    cookie for all others. The path of the cookie is random, because browsers send
+    cookies to every port of a host, also to servers of other users.
 
     Parameters
     ----------
@@ -64,7 +70,13 @@ class PageServer(ThreadingHTTPServer):
 
     daemon_threads = True
 
-    def __init__(self, contents: Mapping[str, Content], actions: Mapping[str, Action], *, port: int = 0) -> None:
+    def __init__(
+        self,
+        contents: Mapping[str, Content],
+        actions: Mapping[str, Action],
+        *,
+        port: int = 0,
+    ) -> None:
         self.contents = contents
         self.actions = actions
         self.root = f"/{secrets.token_urlsafe(12)}/"
@@ -75,7 +87,11 @@ class PageServer(ThreadingHTTPServer):
             super().__init__((LOCAL, port), _Handler)
         except OSError as error:
             cure = "choose another port, or omit --port"
-            raise InputError(Fault(f"port {port}", "must be free", error.strerror or str(error), cure)) from None
+            raise InputError(
+                Fault(
+                    f"port {port}", "must be free", error.strerror or str(error), cure
+                )
+            ) from None
 
     @property
     def address(self) -> str:
@@ -83,8 +99,12 @@ class PageServer(ThreadingHTTPServer):
         return f"http://{LOCAL}:{self.server_address[1]}{self.root}?token={self._token}"
 
     def accepts(self, query: str) -> bool:
-        """Whether the query of an address contains the token, which is accepted only the first time."""
-        return _are_equal(query, f"token={self._token}") and self._unused.acquire(blocking=False)
+        """Whether the query of an address contains the token, which is accepted only
+        the first time.
+        """
+        return _are_equal(query, f"token={self._token}") and self._unused.acquire(
+            blocking=False
+        )
 
 
 def _are_equal(one: str, other: str) -> bool:
@@ -114,8 +134,16 @@ class _Handler(BaseHTTPRequestHandler):
         path, _, query = self.path.partition("?")
         refusal = self._foreign()
         if not refusal and not self._has_cookie():
-            self.begins = self.command == "GET" and path == self.server.root and self.server.accepts(query)
-            refusal = "" if self.begins else "open the address that skindb printed; it can be opened once"
+            self.begins = (
+                self.command == "GET"
+                and path == self.server.root
+                and self.server.accepts(query)
+            )
+            refusal = (
+                ""
+                if self.begins
+                else "open the address that skindb printed; it can be opened once"
+            )
         if refusal:
             self.send_error(HTTPStatus.FORBIDDEN, refusal)
         elif path.startswith(self.server.root):
@@ -128,12 +156,16 @@ class _Handler(BaseHTTPRequestHandler):
         origins = self.headers.get_all("Origin", [])
         if len(hosts) != 1 or not HOST.fullmatch(hosts[0]):
             return "only requests to this machine are allowed"
-        if origins not in ([], [f"http://{hosts[0]}"]) or (self.command == "POST" and not origins):
+        if origins not in ([], [f"http://{hosts[0]}"]) or (
+            self.command == "POST" and not origins
+        ):
             return "only requests of the page itself are allowed"
         return ""
 
     def _has_cookie(self) -> bool:
-        """Whether a cookie is that of the session; those of other servers at this host may be malformed."""
+        """Whether a cookie is that of the session; those of other servers at this host
+        may be malformed.
+        """
         cookies = ";".join(self.headers.get_all("Cookie", [])).split(";")
         return any(_are_equal(cookie.strip(), self.server.cookie) for cookie in cookies)
 
@@ -146,10 +178,16 @@ class _Handler(BaseHTTPRequestHandler):
         try:
             self._answer(HTTPStatus.OK, content.kind, content.read())
         except InputError as error:
-            self._answer(HTTPStatus.NOT_FOUND, "text/plain; charset=utf-8", str(error).encode())
+            self._answer(
+                HTTPStatus.NOT_FOUND, "text/plain; charset=utf-8", str(error).encode()
+            )
         except OSError as error:
             fault = system_fault(error, "file system")
-            self._answer(HTTPStatus.INTERNAL_SERVER_ERROR, "text/plain; charset=utf-8", str(fault).encode())
+            self._answer(
+                HTTPStatus.INTERNAL_SERVER_ERROR,
+                "text/plain; charset=utf-8",
+                str(fault).encode(),
+            )
 
     def do_HEAD(self) -> None:
         """Answer as to GET, without the content."""

@@ -32,10 +32,12 @@ def overcast_sky() -> Environment:
 
 
 def distant_lights(environment: Environment, count: int = COUNT) -> DistantLights:
-    """Distant lights that approximate an environment, by the median cut algorithm of Debevec (2005).
+    """Distant lights that approximate an environment, by the median cut algorithm of
+    Debevec (2005).
 
-    The region of the image with the most light is repeatedly divided across its longer side into two equally bright
-    parts. Every region becomes one light at its centre of brightness.
+    The region of the image with the most light is repeatedly divided across its longer
+    side into two equally bright parts. Every region becomes one light at its centre of
+    brightness.
 
     Parameters
     ----------
@@ -51,12 +53,19 @@ def distant_lights(environment: Environment, count: int = COUNT) -> DistantLight
     """
     height, width, _ = environment.radiance.shape
     polar = np.pi * np.arange(height + 1) / height
-    solid = np.repeat((np.cos(polar[:-1]) - np.cos(polar[1:]))[:, None] * 2 * np.pi / width, width, axis=1)
+    solid = np.repeat(
+        (np.cos(polar[:-1]) - np.cos(polar[1:]))[:, None] * 2 * np.pi / width,
+        width,
+        axis=1,
+    )
     energy = environment.radiance * solid[..., None]
     bright = energy @ LUMINANCE
     regions = [(0, height, 0, width)]
     while len(regions) < count:
-        totals = [float(bright[a:b, c:d].sum()) if (b - a) * (d - c) > 1 else -1.0 for a, b, c, d in regions]
+        totals = [
+            float(bright[a:b, c:d].sum()) if (b - a) * (d - c) > 1 else -1.0
+            for a, b, c, d in regions
+        ]
         most = int(np.argmax(totals))
         if totals[most] <= 0:
             break
@@ -71,15 +80,27 @@ def distant_lights(environment: Environment, count: int = COUNT) -> DistantLight
         ],
         axis=-1,
     )
-    lit = [region for region in regions if bright[region[0] : region[1], region[2] : region[3]].sum() > 0]
-    direction = np.array([(bright[a:b, c:d, None] * towards[a:b, c:d]).sum(axis=(0, 1)) for a, b, c, d in lit])
+    lit = [
+        region
+        for region in regions
+        if bright[region[0] : region[1], region[2] : region[3]].sum() > 0
+    ]
+    direction = np.array(
+        [
+            (bright[a:b, c:d, None] * towards[a:b, c:d]).sum(axis=(0, 1))
+            for a, b, c, d in lit
+        ]
+    )
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     irradiance = np.array([energy[a:b, c:d].sum(axis=(0, 1)) for a, b, c, d in lit])
-    order = np.random.default_rng(0).permutation(len(lit))  # so that the first lights already come from all directions
+    # so that the first lights already come from all directions
+    order = np.random.default_rng(0).permutation(len(lit))
     return DistantLights(direction[order], irradiance[order])
 
 
-def _halves(bright: Float, region: tuple[int, int, int, int]) -> list[tuple[int, int, int, int]]:
+def _halves(
+    bright: Float, region: tuple[int, int, int, int]
+) -> list[tuple[int, int, int, int]]:
     """A region (rows a to b, columns c to d), divided into two parts of equal brightness."""
     a, b, c, d = region
     part = bright[a:b, c:d]

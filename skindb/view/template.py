@@ -1,4 +1,6 @@
-"""Pages from templates, whose markers are replaced in one pass: nothing is replaced inside of data."""
+"""Pages from templates, whose markers are replaced in one pass: nothing is replaced
+inside of data.
+"""
 
 from __future__ import annotations
 
@@ -29,5 +31,7 @@ def page_text(folder: str, scripts: Iterable[str], parts: Mapping[str, str]) -> 
 
 
 def embedded_json(value: Any) -> str:
-    """JSON that is safe inside a script element: ASCII without "<", so that no data end the element."""
+    """JSON that is safe inside a script element: ASCII without "<", so that no data end
+    the element.
+    """
     return json.dumps(value, allow_nan=False).replace("<", "\\u003c")

@@ -52,7 +52,8 @@ def simulate_take(
     sensor: Sensor | None = None,
     spacing_mm: float = TRUE_SPACING,
 ) -> None:
-    """Photograph and probe `person`: a folder of CAPTURE_FORMAT version 1 at `out`, the truth at `<out>.truth.npz`.
+    """Photograph and probe `person`: a folder of CAPTURE_FORMAT version 1 at `out`, the
+    truth at `<out>.truth.npz`.
 
     Parameters
     ----------
@@ -67,7 +68,8 @@ def simulate_take(
     eta
         Index of refraction of the skin.
     subsurface
-        Transport diffuse light through the skin by the dipole instead of reflecting it where it enters.
+        Transport diffuse light through the skin by the dipole instead of reflecting it
+        where it enters.
     sensor
         Cameras of the dome.
     spacing_mm
@@ -93,12 +95,24 @@ def simulate_take(
     sensor = sensor or Sensor()
     surface = _surface(head, skin, dictionary, eta)
     photograph(
-        out, surface, dome, sensor=sensor, device_rng=device_rng, rng=frame_rng, subsurface=subsurface, step=report
+        out,
+        surface,
+        dome,
+        sensor=sensor,
+        device_rng=device_rng,
+        rng=frame_rng,
+        subsurface=subsurface,
+        step=report,
     )
     _dump(out / "dome" / "dome.json", dome_record(dome, sensor, session_time(person)))
     _write_truth(out, head, skin, probe, dome, eta=eta, subsurface=subsurface)
     # written last, as a folder without it is incomplete
-    _dump(out / "capture.json", capture_record(person, contact=probe is not None, landmarks=bool(scan.landmarks)))
+    _dump(
+        out / "capture.json",
+        capture_record(
+            person, contact=probe is not None, landmarks=bool(scan.landmarks)
+        ),
+    )
     report()
 
 
@@ -120,28 +134,41 @@ class _Steps:
 def _require_empty(out: Path) -> None:
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(
-            Fault(str(out), "a new capture needs an absent or empty folder", "existing files", "choose another folder")
+            Fault(
+                str(out),
+                "a new capture needs an absent or empty folder",
+                "existing files",
+                "choose another folder",
+            )
         )
 
 
 @cache
 def _materials() -> tuple[Dictionary, Array]:
-    """Materials of the true surface for the dome's lights, and their directional albedo at normal incidence."""
+    """Materials of the true surface for the dome's lights, and their directional albedo
+    at normal incidence.
+    """
     embedded = embedded_dictionary()
     index = [embedded.names.index(name) for name in MATERIALS]
     table = np.ascontiguousarray(embedded.table[..., index])
     # the tables are convolved with the disc of the lights: one ray per pixel and light is enough
-    disc = convolve_disc(replace(embedded, names=MATERIALS, table=table), DISC_RADIUS / LIGHT_RADIUS)
+    disc = convolve_disc(
+        replace(embedded, names=MATERIALS, table=table), DISC_RADIUS / LIGHT_RADIUS
+    )
     return disc, directional_albedo(table, np.ones(1))[0]
 
 
-def _heads(person: Person, spacing_mm: float, rng: np.random.Generator) -> tuple[Head, Head]:
+def _heads(
+    person: Person, spacing_mm: float, rng: np.random.Generator
+) -> tuple[Head, Head]:
     """The true head, and a coarser sampling of it for the scan."""
     if person.head_file is not None:
         return head_of_file(person.head_file, person)
     shape = face_shape(person)
     coarse = max(SCAN_SPACING, 1.8 * spacing_mm)
-    scan = parametric_head(shape, spacing_mm=coarse, jitter=0.25, seed=int(rng.integers(2**31)))
+    scan = parametric_head(
+        shape, spacing_mm=coarse, jitter=0.25, seed=int(rng.integers(2**31))
+    )
     return parametric_head(shape, spacing_mm=spacing_mm), scan
 
 
@@ -162,25 +189,47 @@ def _surface(head: Head, skin: Skin, dictionary: Dictionary, eta: float) -> Surf
 
 
 def _write_scan(out: Path, scan: Head, *, rng: np.random.Generator) -> None:
-    """Write the mesh with the noise of a scanner, landmarks with the errors of clicks, and regions as vertex lists."""
+    """Write the mesh with the noise of a scanner, landmarks with the errors of clicks,
+    and regions as vertex lists.
+    """
     white = rng.standard_normal(len(scan.vertices))
     noise = SCAN_NOISE * (smooth_noise(scan.vertices, 12.0, rng=rng) + white)
     vertices = scan.vertices + noise[:, None] * scan.normals
-    trimesh.Trimesh(vertices, scan.faces, process=False).export(private_file(out / "scan.ply"))
+    trimesh.Trimesh(vertices, scan.faces, process=False).export(
+        private_file(out / "scan.ply")
+    )
     if scan.landmarks:
-        clicked = {name: (p + rng.normal(0, 0.2, 3)).round(3).tolist() for name, p in scan.landmarks.items()}
+        clicked = {
+            name: (p + rng.normal(0, 0.2, 3)).round(3).tolist()
+            for name, p in scan.landmarks.items()
+        }
         _dump(out / "landmarks.json", clicked)
-    regions = {name: [np.flatnonzero(scan.region(name)).tolist()] for name in SCAN_REGIONS if scan.region(name).any()}
+    regions = {
+        name: [np.flatnonzero(scan.region(name)).tolist()]
+        for name in SCAN_REGIONS
+        if scan.region(name).any()
+    }
     _dump(out / "regions.json", regions)
 
 
 def _write_truth(
-    out: Path, head: Head, skin: Skin, probe: ProbeTruth | None, dome: Dome, *, eta: float, subsurface: bool
+    out: Path,
+    head: Head,
+    skin: Skin,
+    probe: ProbeTruth | None,
+    dome: Dome,
+    *,
+    eta: float,
+    subsurface: bool,
 ) -> None:
     """Write the true parameters of the take at the vertices of the true surface."""
-    members = {name: values.astype(np.float32) for name, values in head.membership.items()}
+    members = {
+        name: values.astype(np.float32) for name, values in head.membership.items()
+    }
     touched: dict[str, Any] = (
-        {} if probe is None else {"probe_distance": probe.distance, "probe_profile": probe.profile}
+        {}
+        if probe is None
+        else {"probe_distance": probe.distance, "probe_profile": probe.profile}
     )
     np.savez(
         private_file(out.with_name(out.name + ".truth.npz")),
@@ -191,7 +240,8 @@ def _write_truth(
         surface_weights=skin.weights,
         surface_names=np.array(MATERIALS),
         # includes the Lambertian albedo of the materials, which no fit can distinguish from R_d
-        surface_lambertian=skin.weights @ np.array([np.mean(PARAMETERS[name][:3]) for name in MATERIALS]),
+        surface_lambertian=skin.weights
+        @ np.array([np.mean(PARAMETERS[name][:3]) for name in MATERIALS]),
         sigma_tr=skin.sigma_tr,
         region_names=np.array(list(members)),
         region_membership=np.stack(list(members.values()), axis=1),
@@ -199,10 +249,14 @@ def _write_truth(
         landmark_position=np.array(list(head.landmarks.values())).reshape(-1, 3),
         site_names=np.array([site.name for site in skin.sites]),
         site_position=np.array([site.position for site in skin.sites]).reshape(-1, 3),
-        site_diffuse_reflectance=np.array([site.diffuse_reflectance for site in skin.sites]).reshape(-1, 3),
+        site_diffuse_reflectance=np.array(
+            [site.diffuse_reflectance for site in skin.sites]
+        ).reshape(-1, 3),
         site_sigma_tr=np.array([site.sigma_tr for site in skin.sites]).reshape(-1, 3),
         site_sigma_a=np.array([site.sigma_a for site in skin.sites]).reshape(-1, 3),
-        site_sigma_s_prime=np.array([site.sigma_s_prime for site in skin.sites]).reshape(-1, 3),
+        site_sigma_s_prime=np.array(
+            [site.sigma_s_prime for site in skin.sites]
+        ).reshape(-1, 3),
         light_intensity=np.array([light.intensity for light in dome.lights]),
         eta=np.array(eta),
         subsurface=np.array(subsurface),

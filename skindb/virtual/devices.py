@@ -14,13 +14,24 @@ import numpy as np
 
 from skindb.clock import SYSTEM_CLOCK, Clock, SimulatedClock
 from skindb.hw.link import READ_SECONDS
-from skindb.hw.protocol import ERROR, EVENT, MAX_NUMBER, OK, PROTOCOL, REPLY, REQUEST, Lines, Message
+from skindb.hw.protocol import (
+    ERROR,
+    EVENT,
+    MAX_NUMBER,
+    OK,
+    PROTOCOL,
+    REPLY,
+    REQUEST,
+    Lines,
+    Message,
+)
 
 WATCHDOG_SECONDS = 0.5  # without a message, after which the lights go off
 PRESSURE_PERIOD = 0.1  # s between readings of the gauge
 PUMP_SECONDS = 0.3  # time constant of the suction
 MAX_FLASHES = 3  # in any period of one second
-BASE_FOR_NO_FLASH = 10  # one more light is not a flash beside a steady lamp as bright as this many lights
+# one more light is not a flash beside a steady lamp as bright as this many lights
+BASE_FOR_NO_FLASH = 10
 GAUGE_FAULTS = ("nan", "silent", "late", "wild")
 LATE_SECONDS = 1.0
 WILD_KPA = 500.0
@@ -34,11 +45,13 @@ class RefusedError(Exception):
 class DeviceFaults:
     """Faults of an emulated device; none by default."""
 
-    vanish_after: int = -1  # number of requests after which it stops answering and closes the line
+    # number of requests after which it stops answering and closes the line
+    vanish_after: int = -1
     garbage: float = 0.0  # probability of noise on the line before a reply
     lost_replies: float = 0.0  # probability that a reply does not arrive
     delay: float = 0.0  # s until each reply
-    lost_triggers: tuple[int, ...] = ()  # steps of the first run whose cameras are not triggered
+    # steps of the first run whose cameras are not triggered
+    lost_triggers: tuple[int, ...] = ()
     dim_light: str = ""  # light with half of its current
     stuck_light: str = ""  # light that stays on after its first step
     # faults of lights with a normal current:
@@ -64,7 +77,9 @@ class Emulated:
 
     kind = ""
 
-    def __init__(self, faults: DeviceFaults | None = None, *, clock: Clock = SYSTEM_CLOCK) -> None:
+    def __init__(
+        self, faults: DeviceFaults | None = None, *, clock: Clock = SYSTEM_CLOCK
+    ) -> None:
         self.faults = faults or DeviceFaults()
         self.clock = clock
         self.gone = False  # whether it has closed its line
@@ -72,7 +87,8 @@ class Emulated:
         self._rng = np.random.default_rng(self.faults.seed)
         self._lines = Lines()
         self._inbox = deque[tuple[float, Message]]()  # when each request is handled
-        self._answered: tuple[int, bytes, bytes] = (-1, b"", b"")  # number, request and reply of the last one
+        # number, request and reply of the last one
+        self._answered: tuple[int, bytes, bytes] = (-1, b"", b"")
         self._requests = 0
         self._event = 0
 
@@ -98,10 +114,17 @@ class Emulated:
     def event(self, verb: str, **values: object) -> bytes:
         """The line of an event."""
         self._event = self._event % MAX_NUMBER + 1
-        return Message(EVENT, self._event, verb, {name: str(value) for name, value in values.items()}).encode()
+        return Message(
+            EVENT,
+            self._event,
+            verb,
+            {name: str(value) for name, value in values.items()},
+        ).encode()
 
     def handle(self, verb: str, values: dict[str, str]) -> dict[str, object]:
-        """Execute a request, and return the values of the reply; raises `RefusedError` with the reason."""
+        """Execute a request, and return the values of the reply; raises `RefusedError`
+        with the reason.
+        """
         raise NotImplementedError
 
     def _answer(self, message: Message) -> bytes:
@@ -111,17 +134,29 @@ class Emulated:
             self._inbox.clear()
             return b""
         line = message.encode()
-        if (message.number, line) != self._answered[:2]:  # a repeated request is answered again, but not executed again
+        # a repeated request is answered again, but not executed again
+        if (message.number, line) != self._answered[:2]:
             try:
-                values = {name: str(value) for name, value in self.handle(message.verb, dict(message.values)).items()}
+                values = {
+                    name: str(value)
+                    for name, value in self.handle(
+                        message.verb, dict(message.values)
+                    ).items()
+                }
                 reply = Message(REPLY, message.number, OK, values)
             except (RefusedError, KeyError, ValueError) as error:
-                reply = Message(REPLY, message.number, ERROR, {"text": str(error) or "malformed"})
+                reply = Message(
+                    REPLY, message.number, ERROR, {"text": str(error) or "malformed"}
+                )
             self._answered = message.number, line, reply.encode()
         noise = b""
         if self._rng.random() < self.faults.garbage:
             noise = self._rng.bytes(int(self._rng.integers(1, 40))) + b"\n"
-        return noise if self._rng.random() < self.faults.lost_replies else noise + self._answered[2]
+        return (
+            noise
+            if self._rng.random() < self.faults.lost_replies
+            else noise + self._answered[2]
+        )
 
 
 @dataclass
@@ -142,8 +177,8 @@ class EmulatedDome(Emulated):
     lights
         Ids of its lights.
     trigger
-        Called with the exposure, how bright each light is that shines ("-" for none), and the time [s] since the start,
-        whenever the cameras are triggered.
+        Called with the exposure, how bright each light is that shines ("-" for none),
+        and the time [s] since the start, whenever the cameras are triggered.
     faults, clock
         As for `Emulated`.
     """
@@ -200,7 +235,9 @@ class EmulatedDome(Emulated):
         return known[verb](values)
 
     def act(self) -> bytes:
-        """Switch lights and trigger cameras according to the plan; the watchdog switches the lights off."""
+        """Switch lights and trigger cameras according to the plan; the watchdog
+        switches the lights off.
+        """
         if self.state != "running":
             return b""
         if self.clock.monotonic() - self.heard > WATCHDOG_SECONDS or self.gone:
@@ -234,9 +271,19 @@ class EmulatedDome(Emulated):
         if not lost:
             self._trigger(step.exposure, wrong | {step.light: shines}, step.on_us / 1e6)
         measured = self._stuck != self.faults.silently_stuck_light
-        rest = 1.0 if (self._stuck and measured) or step.light == self.faults.stuck_light else 0.0
-        total = (level if step.light != "-" else 0.0) + (1.0 if self._stuck and measured else 0.0)
-        step.measured = {"on": step.on_us, "off": step.off_us, "triggers": int(not lost)}
+        rest = (
+            1.0
+            if (self._stuck and measured) or step.light == self.faults.stuck_light
+            else 0.0
+        )
+        total = (level if step.light != "-" else 0.0) + (
+            1.0 if self._stuck and measured else 0.0
+        )
+        step.measured = {
+            "on": step.on_us,
+            "off": step.off_us,
+            "triggers": int(not lost),
+        }
         step.measured |= {"level": f"{total:.3f}", "rest": f"{rest:.3f}"}
 
     def _dark(self, step: _Step) -> None:
@@ -254,18 +301,24 @@ class EmulatedDome(Emulated):
         return {}
 
     def _add(self, values: dict[str, str]) -> dict[str, object]:
-        step = _Step(values["light"], values["exposure"], int(values["on"]), int(values["off"]))
+        step = _Step(
+            values["light"], values["exposure"], int(values["on"]), int(values["off"])
+        )
         if step.light not in (*self.lights, "-"):
             raise RefusedError(f"no light {step.light}")
         if int(values["index"]) != len(self.steps):
             raise RefusedError(f"step {len(self.steps)} comes next")
-        if step.off_us <= step.on_us or (self.steps and step.on_us < self.steps[-1].off_us):
+        if step.off_us <= step.on_us or (
+            self.steps and step.on_us < self.steps[-1].off_us
+        ):
             raise RefusedError("steps must not overlap, and end after they begin")
         self.steps.append(step)
         return {}
 
     def _digest(self) -> str:
-        lines = "".join(f"{s.light} {s.exposure} {s.on_us} {s.off_us}\n" for s in self.steps)
+        lines = "".join(
+            f"{s.light} {s.exposure} {s.on_us} {s.off_us}\n" for s in self.steps
+        )
         return f"{binascii.crc32(lines.encode()):08X}"
 
     def _plan(self, _: dict[str, str]) -> dict[str, object]:
@@ -276,10 +329,19 @@ class EmulatedDome(Emulated):
             raise RefusedError("another plan is held")
         if not self.interlock_closed:
             raise RefusedError("the interlock is open")
-        starts = [s.on_us for s in self.steps if s.light != "-"] if self.base < BASE_FOR_NO_FLASH else []
-        often = any(b - a < 1_000_000 for a, b in zip(starts, starts[MAX_FLASHES:], strict=False))
+        starts = (
+            [s.on_us for s in self.steps if s.light != "-"]
+            if self.base < BASE_FOR_NO_FLASH
+            else []
+        )
+        often = any(
+            b - a < 1_000_000
+            for a, b in zip(starts, starts[MAX_FLASHES:], strict=False)
+        )
         if often and not values.get("operator"):
-            raise RefusedError(f"more than {MAX_FLASHES} flashes in a second, and no operator confirmed screening")
+            raise RefusedError(
+                f"more than {MAX_FLASHES} flashes in a second, and no operator confirmed screening"
+            )
         self.state = "armed"
         return {}
 
@@ -294,7 +356,12 @@ class EmulatedDome(Emulated):
 
     def _status(self, _: dict[str, str]) -> dict[str, object]:
         interlock = "closed" if self.interlock_closed else "open"
-        return {"state": self.state, "step": self._done, "interlock": interlock, "reason": self.reason}
+        return {
+            "state": self.state,
+            "step": self._done,
+            "interlock": interlock,
+            "reason": self.reason,
+        }
 
     def _halt(self, reason: str) -> dict[str, object]:
         self.on = None
@@ -304,7 +371,11 @@ class EmulatedDome(Emulated):
         return {}
 
     def _report(self, values: dict[str, str]) -> dict[str, object]:
-        step = self.steps[int(values["index"])] if 0 <= int(values["index"]) < len(self.steps) else None
+        step = (
+            self.steps[int(values["index"])]
+            if 0 <= int(values["index"]) < len(self.steps)
+            else None
+        )
         if step is None or not step.measured:
             raise RefusedError("that step was not executed")
         return step.measured
@@ -345,7 +416,12 @@ class EmulatedProbe(Emulated):
         """The verbs of a probe."""
         now = self.clock.monotonic()
         if verb == "HELLO":
-            return {"kind": self.kind, "name": "emulated", "firmware": "1", "protocol": PROTOCOL}
+            return {
+                "kind": self.kind,
+                "name": "emulated",
+                "firmware": "1",
+                "protocol": PROTOCOL,
+            }
         if verb == "PUMP":
             self.target = float(values["kpa"])
             self._since = now
@@ -372,11 +448,15 @@ class EmulatedProbe(Emulated):
             self._release()
         leaked = self.faults.leak * max(now - self._lit, 0.0)
         aim = min(self.target + leaked, 0.0)
-        self.pressure += (aim - self.pressure) * (1 - np.exp(-(now - self._last) / PUMP_SECONDS))
+        self.pressure += (aim - self.pressure) * (
+            1 - np.exp(-(now - self._last) / PUMP_SECONDS)
+        )
         self._last = now
         out = b""
         while self.target and self._next <= now:
-            out += self._reading(self._next - self._since, failed=self._next > self._lit)
+            out += self._reading(
+                self._next - self._since, failed=self._next > self._lit
+            )
             self._next += PRESSURE_PERIOD
         return out
 
@@ -394,7 +474,10 @@ class EmulatedProbe(Emulated):
             raise RefusedError("the light is off")
         self._exposing, self._until = exposure, self.clock.monotonic() + seconds
         self._triggers = 0
-        if self.faults.lost_triggers and int(exposure.strip("b") or 0) in self.faults.lost_triggers:
+        if (
+            self.faults.lost_triggers
+            and int(exposure.strip("b") or 0) in self.faults.lost_triggers
+        ):
             self.faults = replace(self.faults, lost_triggers=())  # only once
         else:
             self._trigger(exposure)

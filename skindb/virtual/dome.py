@@ -17,7 +17,8 @@ LIGHT_RADIUS = 880.0
 CAMERA_RADIUS = 830.0
 DISC_RADIUS = 12.5  # mm
 INTENSITY = 6.0e7  # radiance mm2
-HEAD = np.array([96.0, 138.0, 92.0])  # half axes of the ellipsoid that every camera frames, mm
+# half axes of the ellipsoid that every camera frames, mm
+HEAD = np.array([96.0, 138.0, 92.0])
 EXPOSURES = 2  # of every view
 FRONT = 78.0  # degrees: lights farther from the front would not reach the white target
 
@@ -61,9 +62,15 @@ class Dome:
 
 
 def build_dome(
-    lights: int = 48, cameras: int = 8, *, width: int = 160, height: int = 200, rng: np.random.Generator
+    lights: int = 48,
+    cameras: int = 8,
+    *,
+    width: int = 160,
+    height: int = 200,
+    rng: np.random.Generator,
 ) -> Dome:
-    """A dome of any size with small individual deviations; the same `rng` state gives the same device.
+    """A dome of any size with small individual deviations; the same `rng` state gives
+    the same device.
 
     Parameters
     ----------
@@ -85,7 +92,9 @@ def build_dome(
     eyes[:, 1] *= 0.7  # concentrated around the head rather than above and below it
     eyes /= np.linalg.norm(eyes, axis=1, keepdims=True)
     return Dome(
-        tuple(_camera(i, e, width, height, rng) for i, e in enumerate(_apart(eyes, lamps))),
+        tuple(
+            _camera(i, e, width, height, rng) for i, e in enumerate(_apart(eyes, lamps))
+        ),
         tuple(_light(i, d, rng) for i, d in enumerate(lamps)),
     )
 
@@ -107,12 +116,19 @@ def require_sizes(lights: int, cameras: int, width: int, height: int) -> None:
     ):
         if not 1 <= size <= most:
             raise InputError(
-                Fault("virtual dome", f"{what} must be 1 to {most:,}", f"{size:,}", "choose another number")
+                Fault(
+                    "virtual dome",
+                    f"{what} must be 1 to {most:,}",
+                    f"{size:,}",
+                    "choose another number",
+                )
             )
 
 
 def _spiral(count: int, reach: float, *, turn: float) -> Array:
-    """`count` unit directions spread evenly over the cap within `reach` of +z (golden-angle spiral)."""
+    """`count` unit directions spread evenly over the cap within `reach` of +z
+    (golden-angle spiral).
+    """
     k = np.arange(count)
     cosine = 1 - (k + 0.5) / count * (1 - np.cos(reach)) if count > 1 else np.ones(1)
     angle = k * np.pi * (3 - 5**0.5) + turn
@@ -121,10 +137,16 @@ def _spiral(count: int, reach: float, *, turn: float) -> Array:
 
 
 def _apart(eyes: Array, lamps: Array) -> Array:
-    """Rotate cameras about +z if a light obstructs their view (a light's disc is 1.6 degrees wide)."""
+    """Rotate cameras about +z if a light obstructs their view (a light's disc is 1.6
+    degrees wide).
+    """
     turn = np.radians(1.5)
-    spin = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
-    lift = np.array([[1, 0, 0], [0, np.cos(turn), -np.sin(turn)], [0, np.sin(turn), np.cos(turn)]])
+    spin = np.array(
+        [[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]]
+    )
+    lift = np.array(
+        [[1, 0, 0], [0, np.cos(turn), -np.sin(turn)], [0, np.sin(turn), np.cos(turn)]]
+    )
     out = eyes.copy()
     for i in range(len(out)):
         for step in range(60):
@@ -135,28 +157,45 @@ def _apart(eyes: Array, lamps: Array) -> Array:
 
 
 def _light(index: int, direction: Array, rng: np.random.Generator) -> DomeLight:
-    position = CENTRE + direction * (LIGHT_RADIUS + rng.normal(0, 3)) + rng.normal(0, 1.5, 3)
+    position = (
+        CENTRE + direction * (LIGHT_RADIUS + rng.normal(0, 3)) + rng.normal(0, 1.5, 3)
+    )
     axis = (CENTRE - position) / np.linalg.norm(CENTRE - position)
-    level = rng.uniform(0.85, 1.15) * (np.array([1.0, 0.97, 1.03]) + 0.02 * rng.standard_normal(3))
+    level = rng.uniform(0.85, 1.15) * (
+        np.array([1.0, 0.97, 1.03]) + 0.02 * rng.standard_normal(3)
+    )
     return DomeLight(f"l{index:03d}", position, axis, INTENSITY * level)
 
 
-def _camera(index: int, direction: Array, width: int, height: int, rng: np.random.Generator) -> DomeCamera:
+def _camera(
+    index: int, direction: Array, width: int, height: int, rng: np.random.Generator
+) -> DomeCamera:
     eye = CENTRE + direction * (CAMERA_RADIUS + rng.normal(0, 5))
-    rotation = _look_at(eye, CENTRE + rng.normal(0, 1.5, 3), np.radians(rng.normal(0, 1.0)))
-    # half extents of the framed ellipsoid as this camera sees it (small-angle: the head is a tenth of the distance)
+    rotation = _look_at(
+        eye, CENTRE + rng.normal(0, 1.5, 3), np.radians(rng.normal(0, 1.0))
+    )
+    # half extents of the framed ellipsoid as this camera sees it (small-angle: the head
+    # is a tenth of the distance)
     extent = np.linalg.norm(rotation[:2] * HEAD, axis=1) / np.linalg.norm(eye - CENTRE)
     focal = 0.97 * min(width / (2 * extent[0]), height / (2 * extent[1]))
     k = np.array(
         [
             [focal, 0.0, width / 2 + rng.normal(0, 0.004 * width)],
-            [0.0, focal * (1 + rng.normal(0, 1e-3)), height / 2 + rng.normal(0, 0.004 * width)],
+            [
+                0.0,
+                focal * (1 + rng.normal(0, 1e-3)),
+                height / 2 + rng.normal(0, 0.004 * width),
+            ],
             [0.0, 0.0, 1.0],
         ]
     )
-    lens = np.array([rng.normal(-0.1, 0.05), rng.normal(0.02, 0.05), *rng.normal(0, 5e-4, 2), 0.0])
+    lens = np.array(
+        [rng.normal(-0.1, 0.05), rng.normal(0.02, 0.05), *rng.normal(0, 5e-4, 2), 0.0]
+    )
     shade = np.array([rng.normal(-0.10, 0.01), rng.normal(0.02, 0.003), 0.0])
-    return DomeCamera(f"c{index:02d}", width, height, k, rotation, -rotation @ eye, lens, shade)
+    return DomeCamera(
+        f"c{index:02d}", width, height, k, rotation, -rotation @ eye, lens, shade
+    )
 
 
 def _look_at(eye: Array, target: Array, roll: float) -> Array:

@@ -1,4 +1,6 @@
-"""The virtual face as one smooth function of space, zero on the skin: smooth unions of simple solids."""
+"""The virtual face as one smooth function of space, zero on the skin: smooth unions of
+simple solids.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +49,9 @@ class FaceShape:
 
 
 def field(points: Array, shape: FaceShape) -> Array:
-    """Approximate signed distance (n,) mm of `points` (n, 3) to the skin, negative inside; smooth near the skin."""
+    """Approximate signed distance (n,) mm of `points` (n, 3) to the skin, negative
+    inside; smooth near the skin.
+    """
     # one row per axis, as NumPy is slow for sums over a short last axis
     x = points[:, 0] / shape.width
     y = points[:, 1] / shape.height
@@ -64,11 +68,15 @@ def field(points: Array, shape: FaceShape) -> Array:
 def normals(points: Array, shape: FaceShape) -> Array:
     """Unit outward normals (n, 3) at points on the skin: the field's gradient."""
     step = STEP * np.eye(3)
-    slope = np.stack([field(points + d, shape) - field(points - d, shape) for d in step], axis=1)
+    slope = np.stack(
+        [field(points + d, shape) - field(points - d, shape) for d in step], axis=1
+    )
     return np.asarray(slope / np.linalg.norm(slope, axis=1, keepdims=True))
 
 
-def _ellipsoid(p: Array, centre: tuple[float, ...] | Array, radii: tuple[float, ...]) -> Array:
+def _ellipsoid(
+    p: Array, centre: tuple[float, ...] | Array, radii: tuple[float, ...]
+) -> Array:
     x, y, z = ((p[i] - centre[i]) / radii[i] for i in range(3))
     length = np.sqrt(x * x + y * y + z * z + 1e-9)
     x = x / radii[0]
@@ -77,7 +85,13 @@ def _ellipsoid(p: Array, centre: tuple[float, ...] | Array, radii: tuple[float, 
     return np.asarray(length * (length - 1) / np.sqrt(x * x + y * y + z * z + 1e-12))
 
 
-def _cone(p: Array, a: tuple[float, ...] | Array, b: tuple[float, ...] | Array, ra: float, rb: float) -> Array:
+def _cone(
+    p: Array,
+    a: tuple[float, ...] | Array,
+    b: tuple[float, ...] | Array,
+    ra: float,
+    rb: float,
+) -> Array:
     """Round cone: a capsule from `a` to `b` whose radius runs from ra to rb."""
     axis = np.asarray(b, float) - np.asarray(a, float)
     x, y, z = (p[i] - a[i] for i in range(3))
@@ -100,7 +114,13 @@ def _carve(a: Array, b: Array, blend: float) -> Array:
     return -_join(-a, b, blend)
 
 
-def _press(p: Array, distance: Array, centre: tuple[float, ...], width: tuple[float, ...], depth: float) -> Array:
+def _press(
+    p: Array,
+    distance: Array,
+    centre: tuple[float, ...],
+    width: tuple[float, ...],
+    depth: float,
+) -> Array:
     """Push the skin in by `depth` under a Gaussian (a negative depth lifts it)."""
     x, y, z = ((p[i] - centre[i]) / width[i] for i in range(3))
     return np.asarray(distance + depth * np.exp(-0.5 * (x * x + y * y + z * z)))
@@ -110,7 +130,11 @@ def _skull(p: Array, s: FaceShape) -> Array:
     d = _ellipsoid(p, (0, 50, 4), (76, 100, 93))
     d = _join(d, _ellipsoid(p, (0, 84, 42), (58, 44, 50)), 40)
     d = _join(d, _ellipsoid(p, (0, -8, 22), (65, 92, 78)), 40)
-    d = _join(d, _cone(p, (s.jaw_width - 14, -38, 18), (10, -70 + 2 * s.sagging, 74), 20, 17), 30)
+    d = _join(
+        d,
+        _cone(p, (s.jaw_width - 14, -38, 18), (10, -70 + 2 * s.sagging, 74), 20, 17),
+        30,
+    )
     neck = _cone(p, (0, -40, -8), (0, -230, -22), s.neck_width, s.neck_width + 6)
     return _join(d, neck, 24)
 
@@ -118,10 +142,20 @@ def _skull(p: Array, s: FaceShape) -> Array:
 def _middle(p: Array, d: Array, s: FaceShape) -> Array:
     d = _join(d, _ellipsoid(p, (0, -29, 74), (35, 34, 34.5)), 26)  # around the teeth
     d = _join(d, _ellipsoid(p, (44, 10, 62), (20, 17, 22 + 4 * s.cheekbone)), 34)
-    d = _join(d, _ellipsoid(p, (37, -22 - 5 * s.sagging, 66), (18, 26, 19 + 6 * s.fullness)), 32)
-    d = _join(d, _ellipsoid(p, (0, -70, 80 + s.chin_forward), (s.chin_width + 3, 15, 19.5)), 26)
+    d = _join(
+        d,
+        _ellipsoid(p, (37, -22 - 5 * s.sagging, 66), (18, 26, 19 + 6 * s.fullness)),
+        32,
+    )
+    d = _join(
+        d,
+        _ellipsoid(p, (0, -70, 80 + s.chin_forward), (s.chin_width + 3, 15, 19.5)),
+        26,
+    )
     d = _press(p, d, (0, -52, 102), (16, 5, 20), 2.6)  # between lower lip and chin
-    furrow = np.sin(2 * np.pi * (p[1] + 0.0015 * p[0] ** 2) / 10.5) * np.exp(-0.5 * (p[0] / 30) ** 4)
+    furrow = np.sin(2 * np.pi * (p[1] + 0.0015 * p[0] ** 2) / 10.5) * np.exp(
+        -0.5 * (p[0] / 30) ** 4
+    )
     d = d + 0.45 * s.sagging * furrow * np.exp(-0.5 * ((p[1] - 84) / 11) ** 4)
     fold = _cone(p, (19, -6, 104), (34, -42, 92), 3.0, 2.0)
     return _carve(d, fold + 4.0 - 3.0 * s.sagging, 7)
@@ -133,14 +167,23 @@ def _eyes(p: Array, d: Array, s: FaceShape) -> Array:
     x = s.eye_distance
     d = _carve(d, _ellipsoid(p, (x, 33, 108), (19, 12.5, 21)), 16)
     d = _carve(d, _ellipsoid(p, (x - 14, 35, 106), (7, 9, 12)), 12)
-    ball = np.sqrt((0.9 * (p[0] - x)) ** 2 + (p[1] - 32.5) ** 2 + (p[2] - 78.5) ** 2) - s.eye_size
+    ball = (
+        np.sqrt((0.9 * (p[0] - x)) ** 2 + (p[1] - 32.5) ** 2 + (p[2] - 78.5) ** 2)
+        - s.eye_size
+    )
     d = _join(d, ball, 5)
     arc = 37.5 - 0.012 * (p[0] - x) ** 2
-    crease = np.hypot((p[1] - arc) / 1.0, (p[2] - 91) / 12) + np.maximum(np.abs(p[0] - x) - 13, 0) ** 2 / 12
+    crease = (
+        np.hypot((p[1] - arc) / 1.0, (p[2] - 91) / 12)
+        + np.maximum(np.abs(p[0] - x) - 13, 0) ** 2 / 12
+    )
     d = d + 0.9 * np.exp(-0.5 * crease**2)
     slit = np.hypot((p[1] - lid_height(p[0], s)) / 0.9, (p[2] - 90) / 12)
-    d = d + 0.7 * np.exp(-0.5 * (slit**2 + (np.maximum(np.abs(p[0] - x) - 13, 0) / 2) ** 2))
-    return _press(p, d, (x - 3, 18, 92), (11, 3.5, 14), 1.6 * s.sagging)  # below the eye
+    d = d + 0.7 * np.exp(
+        -0.5 * (slit**2 + (np.maximum(np.abs(p[0] - x) - 13, 0) / 2) ** 2)
+    )
+    # below the eye
+    return _press(p, d, (x - 3, 18, 92), (11, 3.5, 14), 1.6 * s.sagging)
 
 
 def lid_height(x: Array, s: FaceShape) -> Array:
@@ -150,17 +193,27 @@ def lid_height(x: Array, s: FaceShape) -> Array:
 
 def _nose(p: Array, d: Array, s: FaceShape) -> Array:
     tip = s.nose_tip
-    bridge = _cone(p, (0, 44, 91 - s.bridge_depth), tip + np.array([0.0, 4.0, -3.0]), 8.0, 9.5)
+    bridge = _cone(
+        p, (0, 44, 91 - s.bridge_depth), tip + np.array([0.0, 4.0, -3.0]), 8.0, 9.5
+    )
     d = _join(d, bridge, 18)
     d = _join(d, _ellipsoid(p, tip - np.array([0.0, 0.5, 0.0]), (11.0, 9.5, 11.5)), 12)
     w = s.nose_width
     d = _join(d, _ellipsoid(p, (w, tip[1] - 11, tip[2] - 12), (6.5, 7.5, 10.5)), 9)
-    d = _join(d, _cone(p, tip - np.array([0.0, 7.0, 2.0]), (0, tip[1] - 15, tip[2] - 12), 6, 5), 8)  # columella
+    # columella
+    d = _join(
+        d,
+        _cone(p, tip - np.array([0.0, 7.0, 2.0]), (0, tip[1] - 15, tip[2] - 12), 6, 5),
+        8,
+    )
     groove = np.hypot((p[0] - w + 4.5) / 2.6, (p[1] - tip[1] + 16) / 3.5)
     nostril = np.hypot(groove, (p[2] - tip[2] + 6) / 6)
     d = d + 2.4 * np.exp(-0.5 * nostril**2)
     alar = np.hypot(p[0] - w, (p[1] - tip[1] + 9) * 0.9) - 10.5
-    return np.asarray(d + 0.9 * np.exp(-0.5 * (alar / 2.0) ** 2 - 0.5 * ((p[2] - tip[2] + 14) / 7) ** 2))
+    return np.asarray(
+        d
+        + 0.9 * np.exp(-0.5 * (alar / 2.0) ** 2 - 0.5 * ((p[2] - tip[2] + 14) / 7) ** 2)
+    )
 
 
 def _mouth(p: Array, d: Array, s: FaceShape) -> Array:
@@ -171,17 +224,24 @@ def _mouth(p: Array, d: Array, s: FaceShape) -> Array:
     q = np.stack([p[0], p[1] - bow, p[2] + 0.014 * p[0] ** 2])
     upper = _ellipsoid(q, (0, y + 3.2, 102.0), (w, 5.6 + 3.4 * full, 9.2 + 3.4 * full))
     d = _join(d, upper, 8)
-    lower = _ellipsoid(q, (0, y - 5.2, 100.8), (w - 4, 6.6 + 3.8 * full, 10.0 + 3.6 * full))
+    lower = _ellipsoid(
+        q, (0, y - 5.2, 100.8), (w - 4, 6.6 + 3.8 * full, 10.0 + 3.6 * full)
+    )
     d = _join(d, lower, 9)
     line = y + mouth_line(p[0])
     inside = np.maximum(np.abs(p[0]) - w + 1, 0) / 2.0
-    d = d + 2.6 * np.exp(-0.5 * (((p[1] - line) / 1.5) ** 2 + inside**2 + ((p[2] - 108) / 16) ** 2))
-    d = _press(p, d, (w + 2.0, y - 1.5, 96), (4.5, 5, 12), 1.0 + 0.5 * s.sagging)  # corners
+    d = d + 2.6 * np.exp(
+        -0.5 * (((p[1] - line) / 1.5) ** 2 + inside**2 + ((p[2] - 108) / 16) ** 2)
+    )
+    # corners
+    d = _press(p, d, (w + 2.0, y - 1.5, 96), (4.5, 5, 12), 1.0 + 0.5 * s.sagging)
     return _press(p, d, (0, y + 14, 110), (3.0, 6, 10), 1.3)  # philtrum
 
 
 def mouth_line(x: Array) -> Array:
     """Height of the line between the lips at |x|, above `mouth_height`."""
     return np.asarray(
-        -0.6 * np.exp(-0.5 * (x / 4) ** 2) + 0.8 * np.exp(-0.5 * ((np.abs(x) - 8) / 5) ** 2) - 0.003 * x**2
+        -0.6 * np.exp(-0.5 * (x / 4) ** 2)
+        + 0.8 * np.exp(-0.5 * ((np.abs(x) - 8) / 5) ** 2)
+        - 0.003 * x**2
     )

@@ -39,7 +39,8 @@ def photograph(
     subsurface: bool = False,
     step: Callable[[], None],
 ) -> None:
-    """Write every frame of every camera and light, dark frames of all cameras, white frames of the frontal camera.
+    """Write every frame of every camera and light, dark frames of all cameras, white
+    frames of the frontal camera.
 
     Parameters
     ----------
@@ -50,7 +51,8 @@ def photograph(
     sensor
         Sensor of all cameras.
     device_rng, rng
-        Random generators of the fixed pattern of the cameras and of the noise of this take, with a stream per frame.
+        Random generators of the fixed pattern of the cameras and of the noise of this
+        take, with a stream per frame.
     subsurface
         Transport diffuse light through the skin by the dipole.
     step
@@ -61,11 +63,17 @@ def photograph(
     white = frontal_camera(dome)
     for exposure in EXPOSURES:
         for template in (FRAMES, DARK, WHITE):
-            make_private((folder / template.format(exposure=exposure, light="l", camera="c")).parent)
+            make_private(
+                (
+                    folder / template.format(exposure=exposure, light="l", camera="c")
+                ).parent
+            )
 
     glow = exitances(surface, lights, scene) if subsurface else None
 
-    def shoot(camera: DomeCamera, own: np.random.Generator, stream: np.random.Generator) -> None:
+    def shoot(
+        camera: DomeCamera, own: np.random.Generator, stream: np.random.Generator
+    ) -> None:
         pattern = sensor.pattern((camera.height, camera.width, 3), rng=own)
         images = render_view(
             surface,
@@ -82,10 +90,13 @@ def photograph(
             writer.write(FRAMES, light.name, image)
         writer.write(DARK, "", np.zeros_like(pattern), averaged=DARK_AVERAGE)
         if camera is white:
-            for light, image in zip(dome.lights, _target_radiances(camera, dome.lights), strict=True):
+            for light, image in zip(
+                dome.lights, _target_radiances(camera, dome.lights), strict=True
+            ):
                 writer.write(WHITE, light.name, image)
 
-    # a camera at a time on each of two threads: rays, kernels and compression release the interpreter
+    # a camera at a time on each of two threads: rays, kernels and compression release
+    # the interpreter
     with ThreadPoolExecutor(2) as pool:
         streams = device_rng.spawn(len(dome.cameras)), rng.spawn(len(dome.cameras))
         for _ in pool.map(shoot, dome.cameras, *streams):
@@ -96,7 +107,12 @@ class _FrameWriter:
     """Exposes radiance images with one camera and writes the files."""
 
     def __init__(
-        self, folder: Path, camera: DomeCamera, sensor: Sensor, pattern: Image, rng: np.random.Generator
+        self,
+        folder: Path,
+        camera: DomeCamera,
+        sensor: Sensor,
+        pattern: Image,
+        rng: np.random.Generator,
     ) -> None:
         self.folder = folder
         self.camera = camera
@@ -105,11 +121,17 @@ class _FrameWriter:
         self.rng = rng
         self.gain = _vignette(camera)
 
-    def write(self, template: str, light: str, radiance: Image, *, averaged: int = 1) -> None:
+    def write(
+        self, template: str, light: str, radiance: Image, *, averaged: int = 1
+    ) -> None:
         for exposure, seconds in zip(EXPOSURES, SECONDS, strict=True):
             image = radiance * self.gain * np.float32(seconds)
-            frame = self.sensor.expose(image, self.pattern, averaged=averaged, rng=self.rng)
-            path = template.format(exposure=exposure, light=light, camera=self.camera.name)
+            frame = self.sensor.expose(
+                image, self.pattern, averaged=averaged, rng=self.rng
+            )
+            path = template.format(
+                exposure=exposure, light=light, camera=self.camera.name
+            )
             write_png(self.folder / path, frame)
 
 
@@ -131,7 +153,12 @@ def _render_camera(camera: DomeCamera) -> Camera:
 
 def frontal_camera(dome: Dome) -> DomeCamera:
     """The camera that sees the white target most frontally."""
-    return max(dome.cameras, key=lambda c: float((c.position - CENTRE)[2] / np.linalg.norm(c.position - CENTRE)))
+    return max(
+        dome.cameras,
+        key=lambda c: float(
+            (c.position - CENTRE)[2] / np.linalg.norm(c.position - CENTRE)
+        ),
+    )
 
 
 def _vignette(camera: DomeCamera) -> Image:
@@ -143,17 +170,25 @@ def _vignette(camera: DomeCamera) -> Image:
     return np.asarray(1 + r2 * (a2 + r2 * (a4 + r2 * a6)), np.float32)[..., None]
 
 
-def _target_radiances(camera: DomeCamera, lights: Iterable[DomeLight]) -> Iterator[Image]:
+def _target_radiances(
+    camera: DomeCamera, lights: Iterable[DomeLight]
+) -> Iterator[Image]:
     """A Lambertian white square in the middle of the dome, alone, under each light."""
     y, x = np.mgrid[: camera.height, : camera.width] + 0.5
     pixels = np.stack([x, y], axis=-1).reshape(-1, 2)
     ray = pixel_rays(pixels, camera.matrix, camera.rotation, camera.distortion)
     reach = ((CENTRE - camera.position) @ TARGET_NORMAL) / (ray @ TARGET_NORMAL)
     point = camera.position + reach[:, None] * ray
-    inside = np.flatnonzero((np.abs((point - CENTRE)[:, :2]) <= TARGET_HALF_SIZE).all(axis=1))
+    inside = np.flatnonzero(
+        (np.abs((point - CENTRE)[:, :2]) <= TARGET_HALF_SIZE).all(axis=1)
+    )
     for light in lights:
         towards = light.position - point[inside]
-        irradiance = np.maximum(towards @ TARGET_NORMAL, 0) / (towards**2).sum(axis=1) ** 1.5
+        irradiance = (
+            np.maximum(towards @ TARGET_NORMAL, 0) / (towards**2).sum(axis=1) ** 1.5
+        )
         radiance = np.zeros((len(point), 3), np.float32)
-        radiance[inside] = TARGET_REFLECTANCE / np.pi * irradiance[:, None] * light.intensity
+        radiance[inside] = (
+            TARGET_REFLECTANCE / np.pi * irradiance[:, None] * light.intensity
+        )
         yield radiance.reshape(camera.height, camera.width, 3)

@@ -1,4 +1,6 @@
-"""Parametric heads: the skin's surface as an open disc of triangles, with landmarks and regions known exactly."""
+"""Parametric heads: the skin's surface as an open disc of triangles, with landmarks and
+regions known exactly.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,8 @@ from skindb.virtual.face_regions import landmark_directions, region_membership
 Array = NDArray[np.float64]
 CENTRE = np.array([0.0, -38.0, 0.0])  # the skin is star-shaped about this point
 COARSE = (76, 80)  # grid that is relaxed and then interpolated
-LEAST_SLOPE = 0.1  # of the field, which is 1 on even skin; with less, a step could leave the head
+# of the field, which is 1 on even skin; with less, a step could leave the head
+LEAST_SLOPE = 0.1
 SETTLED_MM = 0.01
 SETTLE_ROUNDS = 20
 RELAX = 8  # rounds that even out the triangles under nose and chin
@@ -37,7 +40,9 @@ class Head:
         return np.asarray(self.membership[name] > 0.5)
 
 
-def parametric_head(shape: FaceShape, *, spacing_mm: float = 1.6, jitter: float = 0.0, seed: int = 0) -> Head:
+def parametric_head(
+    shape: FaceShape, *, spacing_mm: float = 1.6, jitter: float = 0.0, seed: int = 0
+) -> Head:
     """The face of `shape`, sampled about every `spacing_mm`.
 
     Parameters
@@ -47,7 +52,8 @@ def parametric_head(shape: FaceShape, *, spacing_mm: float = 1.6, jitter: float 
     spacing_mm
         Typical edge length, mm.
     jitter, seed
-        Random displacement of inner grid directions as a fraction of a cell, so that two samplings share no vertices.
+        Random displacement of inner grid directions as a fraction of a cell, so that
+        two samplings share no vertices.
 
     Returns
     -------
@@ -56,7 +62,9 @@ def parametric_head(shape: FaceShape, *, spacing_mm: float = 1.6, jitter: float 
     """
     rows = max(round(270 / spacing_mm), 8)
     columns = max(round(285 / spacing_mm), 8)
-    near = _project(_resample(_relaxed_grid(shape), rows, columns, jitter, seed), shape, rounds=2)
+    near = _project(
+        _resample(_relaxed_grid(shape), rows, columns, jitter, seed), shape, rounds=2
+    )
     vertices = _project(near, shape, rounds=3)
     marks = landmark_directions(shape, CENTRE)
     points = _shoot(np.array(list(marks.values())), shape)
@@ -71,9 +79,12 @@ def parametric_head(shape: FaceShape, *, spacing_mm: float = 1.6, jitter: float 
 
 @lru_cache(maxsize=2)
 def _relaxed_grid(shape: FaceShape) -> Array:
-    """A coarse grid (rows, columns, 3) on the skin, from the top down and from the subject's right to the left."""
+    """A coarse grid (rows, columns, 3) on the skin, from the top down and from the
+    subject's right to the left.
+    """
     vertices = _shoot(_directions(*COARSE).reshape(-1, 3), shape)
-    for _ in range(RELAX):  # Laplacian smoothing within the surface; the boundary keeps its place
+    # Laplacian smoothing within the surface; the boundary keeps its place
+    for _ in range(RELAX):
         grid = vertices.reshape(*COARSE, 3).copy()
         mean = (grid[:-2, 1:-1] + grid[2:, 1:-1] + grid[1:-1, :-2] + grid[1:-1, 2:]) / 4
         grid[1:-1, 1:-1] += 0.7 * (mean - grid[1:-1, 1:-1])
@@ -83,7 +94,9 @@ def _relaxed_grid(shape: FaceShape) -> Array:
 
 def _resample(grid: Array, rows: int, columns: int, jitter: float, seed: int) -> Array:
     """Bicubic interpolation of the coarse grid at rows x columns parameters, as (n, 3)."""
-    v, u = np.meshgrid(np.arange(rows) / (rows - 1), np.arange(columns) / (columns - 1), indexing="ij")
+    v, u = np.meshgrid(
+        np.arange(rows) / (rows - 1), np.arange(columns) / (columns - 1), indexing="ij"
+    )
     if jitter:
         move = np.random.default_rng(seed).uniform(-jitter, jitter, (2, rows, columns))
         move[:, [0, -1]] = move[:, :, [0, -1]] = 0
@@ -95,17 +108,25 @@ def _resample(grid: Array, rows: int, columns: int, jitter: float, seed: int) ->
 
 
 def _directions(rows: int, columns: int) -> Array:
-    """Unit directions (rows, columns, 3) from the top row down, from the subject's right to the left."""
-    v, u = np.meshgrid(np.linspace(-1, 1, rows), np.linspace(-1, 1, columns), indexing="ij")
+    """Unit directions (rows, columns, 3) from the top row down, from the subject's
+    right to the left.
+    """
+    v, u = np.meshgrid(
+        np.linspace(-1, 1, rows), np.linspace(-1, 1, columns), indexing="ij"
+    )
     elevation = np.radians(1.0 - 63.0 * v)
     side = 96.0 - 40.0 * np.clip(-v, 0, 1) ** 3 - 30.0 * np.clip(v, 0, 1) ** 2.5
     azimuth = np.radians(side) * u
     cosine = np.cos(elevation)
-    return np.stack([cosine * np.sin(azimuth), np.sin(elevation), cosine * np.cos(azimuth)], axis=-1)
+    return np.stack(
+        [cosine * np.sin(azimuth), np.sin(elevation), cosine * np.cos(azimuth)], axis=-1
+    )
 
 
 def _shoot(direction: Array, shape: FaceShape) -> Array:
-    """Points (n, 3) on the skin along rays from the centre: a search from outside, then a few secant steps."""
+    """Points (n, 3) on the skin along rays from the centre: a search from outside, then
+    a few secant steps.
+    """
     far = np.full(len(direction), 185.0)
     value = field(CENTRE + far[:, None] * direction, shape)
     open_ = np.arange(len(direction))
@@ -121,9 +142,14 @@ def _shoot(direction: Array, shape: FaceShape) -> Array:
 
 
 def _project(points: Array, shape: FaceShape, *, rounds: int = 1) -> Array:
-    """Move points near the skin onto it, along the field's gradient (Newton's method with a constant slope)."""
+    """Move points near the skin onto it, along the field's gradient (Newton's method
+    with a constant slope).
+    """
     value = field(points, shape)
-    slope = np.stack([field(points + d, shape) - value for d in STEP * np.eye(3)], axis=1) / STEP
+    slope = (
+        np.stack([field(points + d, shape) - value for d in STEP * np.eye(3)], axis=1)
+        / STEP
+    )
     slope /= np.maximum((slope**2).sum(axis=1, keepdims=True), LEAST_SLOPE**2)
     points = points - value[:, None] * slope
     for _ in range(rounds - 1):
@@ -132,16 +158,26 @@ def _project(points: Array, shape: FaceShape, *, rounds: int = 1) -> Array:
 
 
 def _settle(points: Array, shape: FaceShape) -> Array:
-    """Move the remaining points onto the skin, those in creases, for which a constant slope fails."""
+    """Move the remaining points onto the skin, those in creases, for which a constant
+    slope fails.
+    """
     value = field(points, shape)
     for _ in range(SETTLE_ROUNDS):
         far = np.flatnonzero(np.abs(value) > SETTLED_MM)
         if not len(far):
             break
         near = points[far]
-        slope = np.stack([field(near + d, shape) - value[far] for d in STEP * np.eye(3)], axis=1) / STEP
-        steepness = np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), LEAST_SLOPE)
-        step = np.clip(value[far, None] / steepness, -0.5, 0.5)  # mm: the range in which the slope is valid
+        slope = (
+            np.stack(
+                [field(near + d, shape) - value[far] for d in STEP * np.eye(3)], axis=1
+            )
+            / STEP
+        )
+        steepness = np.maximum(
+            np.linalg.norm(slope, axis=1, keepdims=True), LEAST_SLOPE
+        )
+        # mm: the range in which the slope is valid
+        step = np.clip(value[far, None] / steepness, -0.5, 0.5)
         points[far] = near - step * slope / steepness
         value[far] = field(points[far], shape)
     return points

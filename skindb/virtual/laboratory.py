@@ -1,4 +1,6 @@
-"""A virtual laboratory: emulated devices around a virtual subject, and cameras that write its frames into folders."""
+"""A virtual laboratory: emulated devices around a virtual subject, and cameras that
+write its frames into folders.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,8 @@ from skindb.clock import Clock, SimulatedClock
 from skindb.virtual.devices import DeviceFaults, DirectPort, EmulatedDome, EmulatedProbe
 
 LAMP_LIGHTS = 8  # among which the brightest one in a camera is looked for
-FIRST_FRAME_TIME = 1_700_000_000.0  # arbitrary wall time, as cameras do not know when the controller started
+# arbitrary wall time, as cameras do not know when the controller started
+FIRST_FRAME_TIME = 1_700_000_000.0
 
 
 @dataclass(frozen=True)
@@ -26,7 +29,8 @@ class LaboratoryFaults:
 
     dome: DeviceFaults = field(default_factory=DeviceFaults)
     probe: DeviceFaults = field(default_factory=DeviceFaults)
-    dropped_frames: tuple[tuple[str, int], ...] = ()  # camera and number of the trigger, counted from 0
+    # camera and number of the trigger, counted from 0
+    dropped_frames: tuple[tuple[str, int], ...] = ()
     dropped_probe_frames: tuple[int, ...] = ()
     hot_pixels: int = 0  # number in the first camera, at the white level in every frame
     lamp: float = 1.0  # brightness of the steady lamp relative to the stated one
@@ -38,9 +42,11 @@ class Laboratory:
     Parameters
     ----------
     subject
-        Folder of a complete capture with PNG frames, simulated or not, which the cameras deliver again.
+        Folder of a complete capture with PNG frames, simulated or not, which the
+        cameras deliver again.
     watched
-        Folder for the frames, emptied at the start, with a folder for each camera and `probe` for that of the probe.
+        Folder for the frames, emptied at the start, with a folder for each camera and
+        `probe` for that of the probe.
     faults
         Simulated faults.
     clock
@@ -62,7 +68,9 @@ class Laboratory:
         self.watched = watched
         self.clock = clock or SimulatedClock()
         self.faults = faults or LaboratoryFaults()
-        self._record: dict[str, Any] = json.loads((subject / "dome/dome.json").read_text(encoding="utf-8"))
+        self._record: dict[str, Any] = json.loads(
+            (subject / "dome/dome.json").read_text(encoding="utf-8")
+        )
         self.cameras = tuple(str(camera["id"]) for camera in self._record["cameras"])
         self.site = ""  # current site of the probe
         self._triggers = dict.fromkeys((*self.cameras, "probe"), 0)
@@ -71,8 +79,12 @@ class Laboratory:
         lit = self.cameras if self._lamp else ()
         self._brightest = {camera: self._brightest_light(camera) for camera in lit}
         lights = tuple(str(light["id"]) for light in self._record["lights"])
-        self.dome = EmulatedDome(lights, self._photograph, self.faults.dome, clock=self.clock)
-        self.probe = EmulatedProbe(self._probe_photograph, self.faults.probe, clock=self.clock)
+        self.dome = EmulatedDome(
+            lights, self._photograph, self.faults.dome, clock=self.clock
+        )
+        self.probe = EmulatedProbe(
+            self._probe_photograph, self.faults.probe, clock=self.clock
+        )
         shutil.rmtree(watched, ignore_errors=True)  # frames of an earlier session
         for name in self._triggers:
             (watched / name).mkdir(parents=True, exist_ok=True)
@@ -80,14 +92,18 @@ class Laboratory:
     def port(self, device: str) -> DirectPort:
         """The line to a device, "dome" or "probe", without a cable and in simulated time."""
         if not isinstance(self.clock, SimulatedClock):
-            raise TypeError("a laboratory with a real clock must be served at a real port")
+            raise TypeError(
+                "a laboratory with a real clock must be served at a real port"
+            )
         return DirectPort(self.dome if device == "dome" else self.probe, self.clock)
 
     def place(self, site: str) -> None:
         """Put the probe on a site of the subject."""
         self.site = site
 
-    def _photograph(self, exposure: str, factors: dict[str, float], seconds: float) -> None:
+    def _photograph(
+        self, exposure: str, factors: dict[str, float], seconds: float
+    ) -> None:
         """Every camera takes a frame under these lights, each with its factor."""
         for camera in self.cameras:
             number = self._count(camera)
@@ -100,46 +116,86 @@ class Laboratory:
                 lit[name] = lit.get(name, 0.0) + self._lamp
             self._write(target, camera, exposure, lit, FIRST_FRAME_TIME + seconds)
 
-    def _write(self, target: Path, camera: str, exposure: str, factors: dict[str, float], stamp: float) -> None:
-        """Write a frame atomically, like tethering tools, which rename a file when it is complete."""
+    def _write(
+        self,
+        target: Path,
+        camera: str,
+        exposure: str,
+        factors: dict[str, float],
+        stamp: float,
+    ) -> None:
+        """Write a frame atomically, like tethering tools, which rename a file when it
+        is complete.
+        """
         whole = target.with_suffix(".part")
         self._expose(whole, camera, exposure, factors)
         os.utime(whole, (stamp, stamp))
         whole.rename(target)
 
-    def _expose(self, target: Path, camera: str, exposure: str, factors: dict[str, float]) -> None:
+    def _expose(
+        self, target: Path, camera: str, exposure: str, factors: dict[str, float]
+    ) -> None:
         dark = self._source("dark", camera, exposure)
-        if [*factors.values()] == [1.0] and not (len(self._hot) and camera == self.cameras[0]):
-            shutil.copyfile(self._required("frames", camera, exposure, next(iter(factors))), target)
+        if [*factors.values()] == [1.0] and not (
+            len(self._hot) and camera == self.cameras[0]
+        ):
+            shutil.copyfile(
+                self._required("frames", camera, exposure, next(iter(factors))), target
+            )
             return
         record = next(one for one in self._record["cameras"] if one["id"] == camera)
         black = float(record.get("black_level", 0.0))
         white = float(record.get("white_level", 2 ** record.get("bit_depth", 16) - 1))
-        value = np.full((record["height"], record["width"], 3), black) if dark is None else _read(dark)
+        value = (
+            np.full((record["height"], record["width"], 3), black)
+            if dark is None
+            else _read(dark)
+        )
         base = value.copy()
         for light, factor in factors.items():
-            value += factor * (_read(self._required("frames", camera, exposure, light)) - base)
+            value += factor * (
+                _read(self._required("frames", camera, exposure, light)) - base
+            )
         if camera == self.cameras[0]:
             value[self._hot[:, 0], self._hot[:, 1]] = white
-        png = imagecodecs.png_encode(np.clip(np.rint(value), 0, white).astype(np.uint16))
+        png = imagecodecs.png_encode(
+            np.clip(np.rint(value), 0, white).astype(np.uint16)
+        )
         target.write_bytes(png)
 
     def _brightest_light(self, camera: str) -> str:
         """The light that looks brightest in a camera; it is one of those nearest to it."""
         record = next(one for one in self._record["cameras"] if one["id"] == camera)
-        exposure = min(self._record["exposures"], key=lambda one: float(one["seconds"]))["id"]
+        exposure = min(
+            self._record["exposures"], key=lambda one: float(one["seconds"])
+        )["id"]
         centre = -np.array(record["R"]).T @ np.array(record["t"])
-        places = np.array([light["position"] for light in self._record["lights"]], np.float64)
-        nearest = np.argsort(-places @ centre / np.linalg.norm(places, axis=1))[:LAMP_LIGHTS]
+        places = np.array(
+            [light["position"] for light in self._record["lights"]], np.float64
+        )
+        nearest = np.argsort(-places @ centre / np.linalg.norm(places, axis=1))[
+            :LAMP_LIGHTS
+        ]
         names = [str(self._record["lights"][i]["id"]) for i in nearest]
-        frames = {name: _read(self._required("frames", camera, exposure, name)) for name in names}
-        return max(names, key=lambda name: float(np.quantile(frames[name].mean(axis=-1), 0.9)))
+        frames = {
+            name: _read(self._required("frames", camera, exposure, name))
+            for name in names
+        }
+        return max(
+            names, key=lambda name: float(np.quantile(frames[name].mean(axis=-1), 0.9))
+        )
 
-    def _source(self, key: str, camera: str, exposure: str, light: str = "") -> Path | None:
+    def _source(
+        self, key: str, camera: str, exposure: str, light: str = ""
+    ) -> Path | None:
         template = str(self._record.get(key) or "")
         if not template:
             return None
-        name = template.replace("{camera}", camera).replace("{exposure}", exposure).replace("{light}", light)
+        name = (
+            template.replace("{camera}", camera)
+            .replace("{exposure}", exposure)
+            .replace("{light}", light)
+        )
         return self.subject / name
 
     def _required(self, key: str, camera: str, exposure: str, light: str) -> Path:
@@ -152,11 +208,19 @@ class Laboratory:
         number = self._count("probe")
         if number in self.faults.dropped_probe_frames:
             return
-        record = json.loads((self.subject / "contact/probe.json").read_text(encoding="utf-8"))
+        record = json.loads(
+            (self.subject / "contact/probe.json").read_text(encoding="utf-8")
+        )
         own = record.get("placements", {}).get(self.site) or [""]
-        name = record["frames"].replace("{site}", self.site).replace("{exposure}", exposure)
+        name = (
+            record["frames"]
+            .replace("{site}", self.site)
+            .replace("{exposure}", exposure)
+        )
         name = name.replace("{placement}", str(own[0]))
-        shutil.copyfile(self.subject / name, self.watched / "probe" / f"IMG_{number:05d}.png")
+        shutil.copyfile(
+            self.subject / name, self.watched / "probe" / f"IMG_{number:05d}.png"
+        )
 
     def _count(self, camera: str) -> int:
         self._triggers[camera] += 1

@@ -16,7 +16,9 @@ CONDITIONS = ("normal", "lotion", "powder", "sweat", "hot", "cold", "makeup", "t
 
 @dataclass(frozen=True)
 class Person:
-    """One virtual subject in one condition; a seed gives the same face and skin in every condition."""
+    """One virtual subject in one condition; a seed gives the same face and skin in
+    every condition.
+    """
 
     subject: str
     age: float
@@ -38,34 +40,81 @@ class Person:
             (self.condition, CONDITIONS, "condition"),
         ):
             if value not in allowed:
-                raise ValueError(f"{what} must be one of {', '.join(allowed)}; found {value!r}")
+                raise ValueError(
+                    f"{what} must be one of {', '.join(allowed)}; found {value!r}"
+                )
 
     @property
     def take(self) -> str:
         """Key of this take: the subject, with the condition unless it is normal."""
-        return self.subject if self.condition == "normal" else f"{self.subject}.{self.condition}"
+        return (
+            self.subject
+            if self.condition == "normal"
+            else f"{self.subject}.{self.condition}"
+        )
 
     def stream(self, purpose: int) -> np.random.Generator:
-        """Random generator for this person, independent of the condition, with one stream per purpose."""
+        """Random generator for this person, independent of the condition, with one
+        stream per purpose.
+        """
         return np.random.default_rng([self.seed, purpose])
 
 
 def default_people() -> tuple[Person, ...]:
     """The demo's eight takes: six subjects, the first of them also under lotion and powder."""
-    first = Person("V001", 31, "female", "european", 11, freckles=0.5, melanin=-0.3, blood=0.3, fullness=0.45)
+    first = Person(
+        "V001",
+        31,
+        "female",
+        "european",
+        11,
+        freckles=0.5,
+        melanin=-0.3,
+        blood=0.3,
+        fullness=0.45,
+    )
     return (
         first,
         replace(first, condition="lotion"),
         replace(first, condition="powder"),
-        Person("V002", 46, "male", "european", 22, beard_density=0.75, melanin=0.5, blood=0.6, fullness=0.55),
-        Person("V003", 27, "male", "african", 33, beard_density=0.35, melanin=0.3, fullness=0.4),
+        Person(
+            "V002",
+            46,
+            "male",
+            "european",
+            22,
+            beard_density=0.75,
+            melanin=0.5,
+            blood=0.6,
+            fullness=0.55,
+        ),
+        Person(
+            "V003",
+            27,
+            "male",
+            "african",
+            33,
+            beard_density=0.35,
+            melanin=0.3,
+            fullness=0.4,
+        ),
         Person("V004", 38, "female", "east_asian", 44, melanin=-0.2, fullness=0.6),
-        Person("V005", 67, "male", "south_asian", 55, beard_density=0.55, melanin=0.2, fullness=0.3),
+        Person(
+            "V005",
+            67,
+            "male",
+            "south_asian",
+            55,
+            beard_density=0.55,
+            melanin=0.2,
+            fullness=0.3,
+        ),
         Person("V006", 22, "female", "african", 66, melanin=-0.9, fullness=0.7),
     )
 
 
-# subjects of the paper's table 1, dataset B: ancestries, gender, how many, least and largest age, conditions
+# subjects of the paper's table 1, dataset B: ancestries, gender, how many, least and
+# largest age, conditions
 TABLE_1 = (
     (("european",), "male", 50, 13, 59, ("normal",)),
     (("european",), "female", 5, 24, 55, ("normal",)),
@@ -76,16 +125,19 @@ TABLE_1 = (
 )
 
 
-def cohort_people(subjects: int = 87, *, conditions: Sequence[str] = (), seed: int = 2005) -> list[Person]:
+def cohort_people(
+    subjects: int = 87, *, conditions: Sequence[str] = (), seed: int = 2005
+) -> list[Person]:
     """A population with the groups and ages of the paper's table 1, dataset B.
 
-    The paper's "Asian" is East Asian and South Asian in turn, "lotion / makeup" the one and the other.
+    The paper's "Asian" is East Asian and South Asian in turn, "lotion / makeup" the one
+    and the other.
 
     Parameters
     ----------
     subjects
-        Number of subjects: the first of 87 in a random order, and further similar ones beyond 87. The first ones do not
-        depend on the number.
+        Number of subjects: the first of 87 in a random order, and further similar ones
+        beyond 87. The first ones do not depend on the number.
     conditions
         Further conditions that every subject is also photographed in.
     seed
@@ -95,12 +147,15 @@ def cohort_people(subjects: int = 87, *, conditions: Sequence[str] = (), seed: i
     order = np.random.default_rng([seed, 87]).permutation(len(kinds))
     people = []
     for number in range(subjects):
-        ancestries, gender, _, youngest, oldest, worn, i = kinds[order[number % len(kinds)]]
+        ancestries, gender, _, youngest, oldest, worn, i = kinds[
+            order[number % len(kinds)]
+        ]
         rng = np.random.default_rng([seed, number])
         male = gender == "male"
         age = int(rng.integers(youngest, oldest + 1))
         ancestry = ancestries[i % len(ancestries)]
-        shadow = rng.uniform(0.0, 0.8) * min(max(age - 14, 0) / 6, 1.0) if male else 0.0  # boys have none
+        # boys have none
+        shadow = rng.uniform(0.0, 0.8) * min(max(age - 14, 0) / 6, 1.0) if male else 0.0
         freckles = rng.uniform(0.0, 0.6) if ancestry == "european" else 0.0
         person = Person(
             f"P{number + 1:03d}",
@@ -115,15 +170,23 @@ def cohort_people(subjects: int = 87, *, conditions: Sequence[str] = (), seed: i
             blood=float(rng.normal(0, 1)),
             fullness=float(rng.uniform(0.3, 0.7)),
         )
-        people += [person, *(replace(person, condition=one) for one in conditions if one != person.condition)]
+        people += [
+            person,
+            *(
+                replace(person, condition=one)
+                for one in conditions
+                if one != person.condition
+            ),
+        ]
     return people
 
 
 def face_shape(person: Person) -> FaceShape:
     """The shape of this person's face: group means, age, and individual variation.
 
-    Differences between groups are the modeller's choice in the direction anthropometry reports (Farkas 1994); they give
-    the virtual population variety and are no claim about anyone.
+    Differences between groups are the modeller's choice in the direction anthropometry
+    reports (Farkas 1994); they give the virtual population variety and are no claim
+    about anyone.
     """
     z = person.stream(1).standard_normal(18)
     male = 1.0 if person.gender == "male" else 0.0
@@ -138,9 +201,26 @@ def face_shape(person: Person) -> FaceShape:
         jaw_width=50.5 + 4.5 * male + 1.5 * z[2],
         chin_forward=-1.5 + 3.0 * male - 1.0 * african + 1.2 * z[3],
         chin_width=13.0 + 4.0 * male + 1.2 * z[4],
-        nose_length=-1.2 + 2.2 * male - 1.0 * african - 1.0 * asian + 2.5 * age - 2.5 * child + 1.0 * z[5],
-        nose_height=0.4 + 1.2 * male - 2.6 * african - 2.2 * asian + 0.8 * south - 2.0 * child + 0.9 * z[6],
-        nose_width=9.6 + 1.1 * male + 2.6 * african + 0.9 * asian + 0.6 * age + 0.4 * z[7],
+        nose_length=-1.2
+        + 2.2 * male
+        - 1.0 * african
+        - 1.0 * asian
+        + 2.5 * age
+        - 2.5 * child
+        + 1.0 * z[5],
+        nose_height=0.4
+        + 1.2 * male
+        - 2.6 * african
+        - 2.2 * asian
+        + 0.8 * south
+        - 2.0 * child
+        + 0.9 * z[6],
+        nose_width=9.6
+        + 1.1 * male
+        + 2.6 * african
+        + 0.9 * asian
+        + 0.6 * age
+        + 0.4 * z[7],
         bridge_depth=0.3 + 1.8 * african + 2.4 * asian - 1.2 * male + 0.7 * z[8],
         brow=float(np.clip(0.1 + 0.7 * male + 0.15 * z[9], 0, 1.2)),
         eye_distance=30.6 + 0.6 * male + 0.8 * african + 0.7 * z[10],
@@ -148,7 +228,16 @@ def face_shape(person: Person) -> FaceShape:
         cheekbone=float(np.clip(0.5 + 0.35 * asian + 0.15 * z[12], 0, 1.2)),
         fullness=float(np.clip(person.fullness + 0.1 * z[13] - 0.3 * age, 0, 1.1)),
         lip_fullness=float(
-            np.clip(0.55 + 0.4 * african + 0.1 * asian - 0.15 * male - 0.35 * age + 0.1 * z[14], 0.05, 1.1)
+            np.clip(
+                0.55
+                + 0.4 * african
+                + 0.1 * asian
+                - 0.15 * male
+                - 0.35 * age
+                + 0.1 * z[14],
+                0.05,
+                1.1,
+            )
         ),
         mouth_width=25.2 + 1.2 * male + 1.6 * african + 0.9 * z[15],
         sagging=float(age),

@@ -1,4 +1,6 @@
-"""The virtual contact probe: profiles by a random walk of photons, and 23 bracketed images of 28 fibres."""
+"""The virtual contact probe: profiles by a random walk of photons, and 23 bracketed
+images of 28 fibres.
+"""
 
 from __future__ import annotations
 
@@ -34,12 +36,21 @@ CELL = 16
 SPOT = 5.0
 INSIDE = 4.0
 GAIN_ERROR = 0.004
-BIN = 0.025  # mm, width of the rings of the profile: reproduces the variance of faces of 0.25 mm within 2 %
+# mm, width of the rings of the profile: reproduces the variance of faces of 0.25 mm
+# within 2 %
+BIN = 0.025
 PACKETS = 160_000
 WALK_SEED = 20050701
-SOURCES = ("skindb.optics._walk_kernels", "skindb.optics.random_walk", "skindb.virtual.probe")
-SMOOTH = 0.15  # expected change of slope of log(r^2 R) from fibre to fibre, per mm of spacing over r
-PROBE_SENSOR = Sensor(black=512, white=65535, step=1, full_well=90000.0, read_noise=8.0, pattern_noise=4.0)
+SOURCES = (
+    "skindb.optics._walk_kernels",
+    "skindb.optics.random_walk",
+    "skindb.virtual.probe",
+)
+# expected change of slope of log(r^2 R) from fibre to fibre, per mm of spacing over r
+SMOOTH = 0.15
+PROBE_SENSOR = Sensor(
+    black=512, white=65535, step=1, full_well=90000.0, read_noise=8.0, pattern_noise=4.0
+)
 
 
 @dataclass(frozen=True)
@@ -53,27 +64,39 @@ class ProbeTruth:
 
 @lru_cache(maxsize=4)
 def shared_walk(eta: float, packets: int = PACKETS) -> Walk:
-    """The absorption-free walk that every site of every take reweights: the same photons each time."""
+    """The absorption-free walk that every site of every take reweights: the same
+    photons each time.
+    """
 
     def make() -> dict[str, NDArray[Any]]:
         return vars(random_walk(packets, eta=eta, rng=np.random.default_rng(WALK_SEED)))
 
     found = cached_arrays("probe-walk", (eta, packets), sources=SOURCES, make=make)
-    radius, path, weight, batch = (found[name] for name in ("radius", "path", "weight", "batch"))
-    return Walk(radius, path, weight, batch, int(found["packets"]), float(found["longest"]))
+    radius, path, weight, batch = (
+        found[name] for name in ("radius", "path", "weight", "batch")
+    )
+    return Walk(
+        radius, path, weight, batch, int(found["packets"]), float(found["longest"])
+    )
 
 
 def fibre_profiles(walk: Walk, sites: Sequence[Site]) -> ProbeTruth:
-    """Diffuse reflectance R(r) averaged over the faces of the source and of each fibre, for every site and channel."""
+    """Diffuse reflectance R(r) averaged over the faces of the source and of each fibre,
+    for every site and channel.
+    """
     distance: Array = FIRST + PITCH * np.arange(FIBRES, dtype=np.float64)
-    edges: Array = BIN * np.arange(round((distance[-1] + 1.0) / BIN) + 1, dtype=np.float64)
+    edges: Array = BIN * np.arange(
+        round((distance[-1] + 1.0) / BIN) + 1, dtype=np.float64
+    )
     middle = (edges[:-1] + edges[1:]) / 2
     face = _disc_shares(middle, distance) @ _disc_shares(middle, middle)
     profile = np.empty((len(sites), FIBRES, 3))
     error = np.empty((len(sites), FIBRES, 3))
     for i, site in enumerate(sites):
         for c in range(3):
-            mean, deviation = radial_profile(walk, site.sigma_a[c], site.sigma_s_prime[c], edges)
+            mean, deviation = radial_profile(
+                walk, site.sigma_a[c], site.sigma_s_prime[c], edges
+            )
             value = face @ mean
             sigma = np.sqrt(face**2 @ deviation**2)
             profile[i, :, c], error[i, :, c] = _smooth(distance, value, sigma), sigma
@@ -81,48 +104,74 @@ def fibre_profiles(walk: Walk, sites: Sequence[Site]) -> ProbeTruth:
 
 
 def _disc_shares(middle: Array, distance: Array) -> Array:
-    """Fraction (n, ring) of each ring around a point that lies inside a face at each of n distances."""
+    """Fraction (n, ring) of each ring around a point that lies inside a face at each of
+    n distances.
+    """
     r = middle[None, :]
     d = distance[:, None]
-    arc = 2 * r * np.arccos(np.clip((r * r + d * d - FIBRE_RADIUS**2) / (2 * r * d), -1, 1))
+    arc = (
+        2
+        * r
+        * np.arccos(np.clip((r * r + d * d - FIBRE_RADIUS**2) / (2 * r * d), -1, 1))
+    )
     return np.asarray(arc / arc.sum(axis=1, keepdims=True))
 
 
 def _smooth(distance: Array, value: Array, error: Array) -> Array:
     """Whittaker smoothing of log(r^2 R), which is linear far from the source by diffusion.
 
-    Each fibre is weighted by the error of the walk: near ones hardly change, far ones (where few photons arrive) follow
-    the straight line, so that the images contain the noise of the sensor and not that of the walk.
+    Each fibre is weighted by the error of the walk: near ones hardly change, far ones
+    (where few photons arrive) follow the straight line, so that the images contain the
+    noise of the sensor and not that of the walk.
     """
     known = (value > 0) & (error < 0.7 * value)
     target = np.where(known, np.log(np.where(known, value, 1) * distance**2), 0)
     weight = np.where(known, (value / np.maximum(error, 1e-3 * value + 1e-300)) ** 2, 0)
-    bend = np.diff(np.eye(len(distance)), 2, axis=0) * (distance[1:-1] / (SMOOTH * PITCH))[:, None]
+    bend = (
+        np.diff(np.eye(len(distance)), 2, axis=0)
+        * (distance[1:-1] / (SMOOTH * PITCH))[:, None]
+    )
     line = np.linalg.solve(np.diag(weight) + bend.T @ bend, weight * target)
     return np.asarray(np.exp(line) / distance**2)
 
 
-def write_probe(folder: Path, sites: Sequence[Site], *, eta: float, rng: np.random.Generator) -> ProbeTruth:
-    """Write contact/probe.json and the bracketed images of every site; returns the true light at the fibres."""
+def write_probe(
+    folder: Path, sites: Sequence[Site], *, eta: float, rng: np.random.Generator
+) -> ProbeTruth:
+    """Write contact/probe.json and the bracketed images of every site; returns the true
+    light at the fibres.
+    """
     truth = fibre_profiles(shared_walk(eta), sites)
-    gain_true = rng.lognormal(0, 0.10, (FIBRES, 1)) * rng.lognormal(0, 0.015, (FIBRES, 3))
+    gain_true = rng.lognormal(0, 0.10, (FIBRES, 1)) * rng.lognormal(
+        0, 0.015, (FIBRES, 3)
+    )
     centre, spot = _layout(rng)
-    gain = gain_true * (1 + GAIN_ERROR * rng.standard_normal((FIBRES, 3)))  # measured flat field, with errors
+    # measured flat field, with errors
+    gain = gain_true * (1 + GAIN_ERROR * rng.standard_normal((FIBRES, 3)))
     seconds = LONGEST * 2.0 ** (-2 / 3 * np.arange(BRACKETS))
     pattern = PROBE_SENSOR.pattern((*spot.shape[1:], 3), rng=rng)
     for site, received in zip(sites, truth.profile, strict=True):
-        rate = np.einsum("fyx,fc->yxc", spot, received * gain_true).astype(np.float32) * np.float32(SIGNAL)
+        rate = np.einsum("fyx,fc->yxc", spot, received * gain_true).astype(
+            np.float32
+        ) * np.float32(SIGNAL)
         for k, time in enumerate(seconds):
             frame = PROBE_SENSOR.expose(rate * np.float32(time), pattern, rng=rng)
             write_png(folder / "contact" / site.name / f"b{k:02d}.png", frame)
     fibres = [
-        {"id": f"f{i:02d}", "distance": float(d), "centre": c.tolist(), "radius": INSIDE}
+        {
+            "id": f"f{i:02d}",
+            "distance": float(d),
+            "centre": c.tolist(),
+            "radius": INSIDE,
+        }
         for i, (d, c) in enumerate(zip(truth.distance, centre, strict=True))
     ]
     meta = {
         "sites": [site.name for site in sites],
         "fibres": fibres,
-        "exposures": [{"id": f"b{k:02d}", "seconds": float(t)} for k, t in enumerate(seconds)],
+        "exposures": [
+            {"id": f"b{k:02d}", "seconds": float(t)} for k, t in enumerate(seconds)
+        ],
         "frames": "contact/{site}/{exposure}.png",
         "gain": gain.tolist(),
         "gain_error": GAIN_ERROR,
@@ -135,14 +184,22 @@ def write_probe(folder: Path, sites: Sequence[Site], *, eta: float, rng: np.rand
         "pressure": {site.name: round(float(rng.normal(-8, 0.3)), 2) for site in sites},
         "fibre_radius": FIBRE_RADIUS,
     }
-    private_file(folder / "contact" / "probe.json").write_text(json.dumps(meta, indent=1), encoding="utf-8")
+    private_file(folder / "contact" / "probe.json").write_text(
+        json.dumps(meta, indent=1), encoding="utf-8"
+    )
     return truth
 
 
 def _layout(rng: np.random.Generator) -> tuple[Array, Array]:
-    """Centres (fibre, 2) px, and spots (fibre, y, x): 1 within INSIDE of the centre, a soft edge, 0 before the next."""
+    """Centres (fibre, 2) px, and spots (fibre, y, x): 1 within INSIDE of the centre, a
+    soft edge, 0 before the next.
+    """
     index = np.arange(FIBRES)
-    centre = np.stack([index % COLUMNS, index // COLUMNS], axis=1) * CELL + CELL / 2 + rng.normal(0, 0.3, (FIBRES, 2))
+    centre = (
+        np.stack([index % COLUMNS, index // COLUMNS], axis=1) * CELL
+        + CELL / 2
+        + rng.normal(0, 0.3, (FIBRES, 2))
+    )
     height = CELL * (FIBRES // COLUMNS)
     width = CELL * COLUMNS
     y, x = np.mgrid[:height, :width] + 0.5

@@ -27,7 +27,9 @@ def session_time(person: Person) -> datetime:
     """A fixed time that depends only on the person and the condition."""
     days = person.seed % 365
     minutes = 40 * CONDITIONS.index(person.condition)
-    return datetime(2005, 1, 10, 9, 0, tzinfo=UTC) + timedelta(days=days, minutes=minutes)
+    return datetime(2005, 1, 10, 9, 0, tzinfo=UTC) + timedelta(
+        days=days, minutes=minutes
+    )
 
 
 def capture_record(person: Person, *, contact: bool, landmarks: bool) -> dict[str, Any]:
@@ -46,7 +48,10 @@ def capture_record(person: Person, *, contact: bool, landmarks: bool) -> dict[st
         "session": session_time(person).isoformat(),
         "condition": person.condition,
         "traits": traits,
-        "consent": {"scope": ["fit", "statistics", "export", "publish"], "reference": "virtual-no-person"},
+        "consent": {
+            "scope": ["fit", "statistics", "export", "publish"],
+            "reference": "virtual-no-person",
+        },
         "mesh": "scan.ply",
         "regions": "regions.json",
         "dome": "dome/dome.json",
@@ -61,7 +66,9 @@ def capture_record(person: Person, *, contact: bool, landmarks: bool) -> dict[st
 
 
 def dome_record(dome: Dome, sensor: Sensor, start: datetime) -> dict[str, Any]:
-    """Content of dome/dome.json, without the intensities of the lights, which the white target determines."""
+    """Content of dome/dome.json, without the intensities of the lights, which the white
+    target determines.
+    """
     cameras = [
         {
             "id": c.name,
@@ -96,7 +103,9 @@ def dome_record(dome: Dome, sensor: Sensor, start: datetime) -> dict[str, Any]:
     return {
         "cameras": cameras,
         "lights": lights,
-        "exposures": [{"id": e, "seconds": s} for e, s in zip(EXPOSURES, SECONDS, strict=True)],
+        "exposures": [
+            {"id": e, "seconds": s} for e, s in zip(EXPOSURES, SECONDS, strict=True)
+        ],
         "frames": FRAMES,
         "dark": DARK,
         "white": {
@@ -122,7 +131,9 @@ def _sequence(dome: Dome, start: datetime) -> list[dict[str, Any]]:
                     "light": light.name,
                     "exposure": EXPOSURES[e],
                     "t_on": on.isoformat(timespec="milliseconds"),
-                    "t_off": (on + timedelta(seconds=seconds)).isoformat(timespec="milliseconds"),
+                    "t_off": (on + timedelta(seconds=seconds)).isoformat(
+                        timespec="milliseconds"
+                    ),
                     "trigger_count": e * len(dome.lights) + i + 1,
                 }
             )

@@ -1,4 +1,6 @@
-"""True skin of a virtual subject: diffuse reflectance, surface weights and translucency of every vertex."""
+"""True skin of a virtual subject: diffuse reflectance, surface weights and translucency
+of every vertex.
+"""
 
 from __future__ import annotations
 
@@ -12,11 +14,18 @@ from skindb.optics.diffuse import dipole_s, scattering_coefficients
 from skindb.virtual.head import Head
 from skindb.virtual.noise import smooth_noise
 from skindb.virtual.person import Person
-from skindb.virtual.skin_colour import BLOOD_SPREAD, HAEMOGLOBIN, MEAN, MELANIN, SITES, SPREAD
+from skindb.virtual.skin_colour import (
+    BLOOD_SPREAD,
+    HAEMOGLOBIN,
+    MEAN,
+    MELANIN,
+    SITES,
+    SPREAD,
+)
 
 Array = NDArray[np.float64]
-# The measured materials with the smallest Lambertian fraction (which a fit cannot distinguish from R_d);
-# two broad lobes, two sharp ones
+# The measured materials with the smallest Lambertian fraction (which a fit cannot
+# distinguish from R_d); two broad lobes, two sharp ones
 MATERIALS = ("special-walnut-224", "black-soft-plastic", "cherry-235", "black-phenolic")
 GLOSS = {  # albedo at normal incidence; fractions of MATERIALS in it
     "forehead": (0.050, (0.28, 0.58, 0.110, 0.030)),
@@ -96,12 +105,18 @@ def skin_of(head: Head, person: Person, *, material_albedo: Array, eta: float) -
     material_albedo
         Directional albedo (k,) of MATERIALS at normal incidence, by which the weights are scaled.
     eta
-        Index of refraction for the conversion of (R_d, sigma_tr) of the sites to sigma_a and sigma_s'.
+        Index of refraction for the conversion of (R_d, sigma_tr) of the sites to
+        sigma_a and sigma_s'.
     """
     effect = EFFECT[person.condition]
     diffuse = _diffuse_reflectance(head, person, effect)
     sites = _sites(head, person, diffuse, effect, eta)
-    return Skin(diffuse, _weights(head, person, effect, material_albedo), _sigma_tr(head.vertices, sites), sites)
+    return Skin(
+        diffuse,
+        _weights(head, person, effect, material_albedo),
+        _sigma_tr(head.vertices, sites),
+        sites,
+    )
 
 
 def _diffuse_reflectance(head: Head, person: Person, effect: ConditionEffect) -> Array:
@@ -109,7 +124,8 @@ def _diffuse_reflectance(head: Head, person: Person, effect: ConditionEffect) ->
     group = (person.ancestry, person.gender)
     m = head.membership
     weight = np.stack([m[site] for site in SITES], axis=1) + 1e-6
-    weight[:, SITES.index("cheek")] += np.clip(1 - weight.sum(axis=1), 0, 1)  # everywhere else
+    # everywhere else
+    weight[:, SITES.index("cheek")] += np.clip(1 - weight.sum(axis=1), 0, 1)
     weight[:, SITES.index("cheek")] += m["lips"]
     log = (weight / weight.sum(axis=1, keepdims=True)) @ np.log(np.array(MEAN[group]))
     melanin, blood = _pigment(head, person)
@@ -118,19 +134,28 @@ def _diffuse_reflectance(head: Head, person: Person, effect: ConditionEffect) ->
     old = np.clip((person.age - 30) / 50, 0, 1)
     melanin += SPREAD[group] * person.melanin + 0.08 * old + effect.melanin
     blood += BLOOD_SPREAD * person.blood + effect.blood
-    pale = float(np.clip(np.exp(log.mean(axis=0))[1] / 0.27, 0.25, 1))  # blood shows less through melanin
+    # blood shows less through melanin
+    pale = float(np.clip(np.exp(log.mean(axis=0))[1] / 0.27, 0.25, 1))
     blood = blood + pale * (0.55 * m["lips"] + 0.10 * m["nose"] + 0.10 * m["eyelid"])
-    melanin = melanin + (0.30 - 0.18 * pale) * m["lips"] + (0.06 + 0.08 * old) * m["eyelid"]
+    melanin = (
+        melanin + (0.30 - 0.18 * pale) * m["lips"] + (0.06 + 0.08 * old) * m["eyelid"]
+    )
     colour = np.exp(log - np.outer(melanin, MELANIN) - np.outer(blood, HAEMOGLOBIN))
     return np.asarray(np.clip(colour * (1 - _hair(head, person)), 0.008, 0.95))
 
 
 def _pigment(head: Head, person: Person) -> tuple[Array, Array]:
-    """Melanin and blood of each vertex about the mean, log green: mottling, freckles, age spots, flushed cheeks."""
+    """Melanin and blood of each vertex about the mean, log green: mottling, freckles,
+    age spots, flushed cheeks.
+    """
     rng = person.stream(2)
     p = head.vertices
     melanin = sum(
-        (a * smooth_noise(p, w, rng=rng) for w, a in ((60, 0.03), (20, 0.03), (8, 0.03), (4, 0.025))), 0 * p[:, 0]
+        (
+            a * smooth_noise(p, w, rng=rng)
+            for w, a in ((60, 0.03), (20, 0.03), (8, 0.03), (4, 0.025))
+        ),
+        0 * p[:, 0],
     )
     blood = 0.05 * smooth_noise(p, 35, rng=rng) + 0.03 * smooth_noise(p, 10, rng=rng)
     blood += 0.10 * head.membership["cheek"] * np.exp(-0.5 * ((p[:, 1] + 2) / 22) ** 2)
@@ -138,10 +163,21 @@ def _pigment(head: Head, person: Person) -> tuple[Array, Array]:
     spots = int(15 + 260 * person.freckles + 60 * old)
     size = rng.uniform(0.7, 1.4, spots) * (1 + 0.8 * old)
     depth = rng.uniform(0.15, 0.55, spots)
-    share = 0.15 + head.membership["cheek"] + head.membership["nose"] + 0.4 * head.membership["forehead"]
+    share = (
+        0.15
+        + head.membership["cheek"]
+        + head.membership["nose"]
+        + 0.4 * head.membership["forehead"]
+    )
     centre = p[rng.choice(len(p), spots, p=share / share.sum())] if len(p) else p
     dark = np.zeros(len(p))
-    for near, c, s, d in zip(cKDTree(p).query_ball_point(centre, 3.5 * size), centre, size, depth, strict=True):
+    for near, c, s, d in zip(
+        cKDTree(p).query_ball_point(centre, 3.5 * size),
+        centre,
+        size,
+        depth,
+        strict=True,
+    ):
         spot = d * np.exp(-0.5 * ((p[near] - c) ** 2).sum(axis=1) / s**2)
         dark[near] = np.maximum(dark[near], spot)
     return np.asarray(melanin + dark), blood
@@ -152,14 +188,18 @@ def _hair(head: Head, person: Person) -> Array:
     rng = person.stream(3)
     m = head.membership
     strands = np.clip(1 + 0.35 * smooth_noise(head.vertices, 3.0, rng=rng), 0.2, 1.6)
-    brow = np.clip((0.62 if person.gender == "male" else 0.5) * m["brow"] * strands, 0, 0.85)
+    brow = np.clip(
+        (0.62 if person.gender == "male" else 0.5) * m["brow"] * strands, 0, 0.85
+    )
     lash = 0.6 * m.get("lash", 0 * brow)
     stubble = np.clip(0.45 * person.beard_density * m["beard"] * strands, 0, 0.75)
     keep = (1 - brow) * (1 - lash)
     return np.asarray(1 - keep[:, None] * (1 - np.outer(stubble, [1.0, 0.95, 0.86])))
 
 
-def _weights(head: Head, person: Person, effect: ConditionEffect, material_albedo: Array) -> Array:
+def _weights(
+    head: Head, person: Person, effect: ConditionEffect, material_albedo: Array
+) -> Array:
     """Smooth non-negative weights with the wanted specular albedo at normal incidence."""
     rng = person.stream(4)
     p = head.vertices
@@ -170,15 +210,29 @@ def _weights(head: Head, person: Person, effect: ConditionEffect, material_albed
     field = member @ table + np.outer(rest, [GLOSS_ELSEWHERE[0], *GLOSS_ELSEWHERE[1]])
     field /= (member.sum(axis=1) + rest)[:, None]
     own = rng.lognormal(0, 0.12, 4)
-    share = field[:, 1:] * np.exp(np.stack([0.15 * smooth_noise(p, 30, rng=rng) for _ in range(4)], axis=1)) * own
+    share = (
+        field[:, 1:]
+        * np.exp(
+            np.stack([0.15 * smooth_noise(p, 30, rng=rng) for _ in range(4)], axis=1)
+        )
+        * own
+    )
     share *= [1.0, 1.0, effect.sharp, effect.sharp]
     share /= share.sum(axis=1, keepdims=True)
-    albedo = field[:, 0] * (1 + 0.05 * smooth_noise(p, 25, rng=rng)) * rng.lognormal(0, 0.06)
-    return np.asarray(np.clip(albedo, 0.03, 0.06)[:, None] * effect.gloss * share / material_albedo)
+    albedo = (
+        field[:, 0] * (1 + 0.05 * smooth_noise(p, 25, rng=rng)) * rng.lognormal(0, 0.06)
+    )
+    return np.asarray(
+        np.clip(albedo, 0.03, 0.06)[:, None] * effect.gloss * share / material_albedo
+    )
 
 
-def _sites(head: Head, person: Person, diffuse: Array, effect: ConditionEffect, eta: float) -> tuple[Site, ...]:
-    """The probe's sites: sigma_tr about table 2, and the coefficients it and the local R_d imply (paper, section 9)."""
+def _sites(
+    head: Head, person: Person, diffuse: Array, effect: ConditionEffect, eta: float
+) -> tuple[Site, ...]:
+    """The probe's sites: sigma_tr about table 2, and the coefficients it and the local
+    R_d imply (paper, section 9).
+    """
     rng = person.stream(5)
     own = person.stream(6).lognormal(0, 0.12)
     sites = []
@@ -191,13 +245,17 @@ def _sites(head: Head, person: Person, diffuse: Array, effect: ConditionEffect, 
         colour = diffuse[near].mean(axis=0)
         sigma_tr = np.clip(np.array(mean) * own * local * effect.translucency, 0.3, 3.0)
         s, _ = dipole_s(colour, eta=eta)
-        sigma_a, sigma_s = (np.asarray(x, np.float64) for x in scattering_coefficients(s, sigma_tr))
+        sigma_a, sigma_s = (
+            np.asarray(x, np.float64) for x in scattering_coefficients(s, sigma_tr)
+        )
         sites.append(Site(name, head.vertices[at], colour, sigma_tr, sigma_a, sigma_s))
     return tuple(sites)
 
 
 def _site_vertex(head: Head, name: str) -> int | None:
-    """Vertex at the centre of a site: the landmark of the forehead, the left cheek, the front of the neck."""
+    """Vertex at the centre of a site: the landmark of the forehead, the left cheek, the
+    front of the neck.
+    """
     member = head.membership[name] > 0.5
     if name == "cheek":
         member &= head.vertices[:, 0] > 0
@@ -217,7 +275,11 @@ def _sigma_tr(points: Array, sites: tuple[Site, ...]) -> Array:
     if not sites:
         return np.broadcast_to(np.array(SIGMA_TR["cheek"]), (len(points), 3)).copy()
     anchors = [(s.position, s.sigma_tr) for s in sites]
-    anchors += [(s.position * (-1, 1, 1), s.sigma_tr) for s in sites if s.name == "cheek"]
-    weight = np.stack([1 / (((points - p) ** 2).sum(axis=1) + 25.0) for p, _ in anchors], axis=1)
+    anchors += [
+        (s.position * (-1, 1, 1), s.sigma_tr) for s in sites if s.name == "cheek"
+    ]
+    weight = np.stack(
+        [1 / (((points - p) ** 2).sum(axis=1) + 25.0) for p, _ in anchors], axis=1
+    )
     weight /= weight.sum(axis=1, keepdims=True)
     return np.asarray(1 / (weight @ np.stack([1 / tr for _, tr in anchors])))

@@ -1,7 +1,7 @@
 """Measured mean colours of facial skin by group and site, and the two axes along which skin varies.
 
-Numbers: International Skin Spectra Archive (Lu et al. 2025), reflectance spectra of faces converted to scene-linear
-Rec. 709 under D65, means over people.
+Numbers: International Skin Spectra Archive (Lu et al. 2025), reflectance spectra of
+faces converted to scene-linear Rec. 709 under D65, means over people.
 """
 
 from __future__ import annotations
@@ -90,6 +90,13 @@ def _axis(light: Array, dark: Array) -> Array:
 
 
 _CHEEK, _CHIN, _NECK = (SITES.index(site) for site in ("cheek", "chin", "neck"))
-# melanin: difference between the cheeks of two groups; haemoglobin: difference between the ruddy chin and pale neck
-MELANIN = _axis(np.array(MEAN["european", "female"][_CHEEK]), np.array(MEAN["african", "female"][_CHEEK]))
-HAEMOGLOBIN = _axis(np.array(MEAN["european", "female"][_NECK]), np.array(MEAN["european", "female"][_CHIN]))
+# melanin: difference between the cheeks of two groups; haemoglobin: difference between
+# the ruddy chin and pale neck
+MELANIN = _axis(
+    np.array(MEAN["european", "female"][_CHEEK]),
+    np.array(MEAN["african", "female"][_CHEEK]),
+)
+HAEMOGLOBIN = _axis(
+    np.array(MEAN["european", "female"][_NECK]),
+    np.array(MEAN["european", "female"][_CHIN]),
+)

@@ -28,7 +28,8 @@ def simulate_takes(
     seed: int = 2005,
     progress: Progress | None = None,
 ) -> list[Path]:
-    """Write `<out>/<take>` and `<out>/<take>.truth.npz` for virtual people; each take is independent of the others.
+    """Write `<out>/<take>` and `<out>/<take>.truth.npz` for virtual people; each take
+    is independent of the others.
 
     Parameters
     ----------
@@ -43,18 +44,27 @@ def simulate_takes(
     head
         Head model file that replaces the parametric face.
     subsurface
-        Transport diffuse light through the skin by the dipole instead of reflecting it where it enters.
+        Transport diffuse light through the skin by the dipole instead of reflecting it
+        where it enters.
     seed
         Random seed of the noise; shapes and skins depend on the people alone.
     progress
         Called with the stage, the steps done and the total number of steps.
     """
     folders = []
-    dome = build_dome(lights, cameras, width=width, height=height, rng=np.random.default_rng(DEVICE_SEED))
+    dome = build_dome(
+        lights,
+        cameras,
+        width=width,
+        height=height,
+        rng=np.random.default_rng(DEVICE_SEED),
+    )
     everybody = default_people() if people is None else people
     for i in range(len(everybody))[:takes] if isinstance(takes, int) else takes:
         person = replace(everybody[i], head_file=head)
         rng = np.random.default_rng([seed, i])
         folders.append(out / person.take)
-        simulate_take(folders[-1], person, dome, subsurface=subsurface, rng=rng, progress=progress)
+        simulate_take(
+            folders[-1], person, dome, subsurface=subsurface, rng=rng, progress=progress
+        )
     return folders

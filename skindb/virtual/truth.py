@@ -13,7 +13,8 @@ from skindb.geometry.rays import RayScene
 from skindb.schema import FitStatus
 
 Array = NDArray[np.floating]
-SEARCH = 5.0  # mm along the normal of the scan within which the true surface is searched
+# mm along the normal of the scan within which the true surface is searched
+SEARCH = 5.0
 
 
 @dataclass(frozen=True)
@@ -30,12 +31,19 @@ class Recovery:
         """Medians and 95 % quantiles over fitted surfels."""
         angle = self.normal_angle[self.fitted]
         error = np.abs(self.diffuse_error[self.fitted])
-        sites = {site: np.round(100 * value, 1).tolist() for site, value in self.sigma_tr_error.items()}
+        sites = {
+            site: np.round(100 * value, 1).tolist()
+            for site, value in self.sigma_tr_error.items()
+        }
         return {
             "normal_median_deg": round(float(np.nanmedian(angle)), 2),
             "normal_95_deg": round(float(np.nanquantile(angle, 0.95)), 2),
-            "diffuse_median_percent": np.round(100 * np.nanmedian(error, axis=0), 1).tolist(),
-            "diffuse_bias_percent": np.round(100 * np.nanmedian(self.diffuse_error[self.fitted], axis=0), 1).tolist(),
+            "diffuse_median_percent": np.round(
+                100 * np.nanmedian(error, axis=0), 1
+            ).tolist(),
+            "diffuse_bias_percent": np.round(
+                100 * np.nanmedian(self.diffuse_error[self.fitted], axis=0), 1
+            ).tolist(),
             "sigma_tr_percent": sites,
         }
 
@@ -48,16 +56,20 @@ def recovered_against_true(model: xr.DataTree, truth: Mapping[str, Array]) -> Re
     model
         Version of kind "model".
     truth
-        Arrays vertices (v, 3) mm, faces (f, 3), normals (v, 3), diffuse_reflectance (v, 3), and where the probe
-        touched site_names (s,) and site_sigma_tr (s, 3) mm^-1.
+        Arrays vertices (v, 3) mm, faces (f, 3), normals (v, 3), diffuse_reflectance (v,
+        3), and where the probe touched site_names (s,) and site_sigma_tr (s, 3) mm^-1.
     """
     fitted = model["fitted"].to_dataset()
     face, corner = _foot_points(fitted, truth)
     at = truth["faces"][np.maximum(face, 0)]
     normal = _mix(truth["normals"][at], corner)
     length = np.linalg.norm(normal, axis=1, keepdims=True)
-    normal = np.divide(normal, length, out=np.full_like(normal, np.nan), where=length > 0)
-    diffuse = np.where((face >= 0)[:, None], _mix(truth["diffuse_reflectance"][at], corner), np.nan)
+    normal = np.divide(
+        normal, length, out=np.full_like(normal, np.nan), where=length > 0
+    )
+    diffuse = np.where(
+        (face >= 0)[:, None], _mix(truth["diffuse_reflectance"][at], corner), np.nan
+    )
     cosine = np.clip((normal * fitted["shading_normal"].values).sum(1), -1, 1)
     return Recovery(
         np.where(face >= 0, np.degrees(np.arccos(cosine)), np.nan),
@@ -68,8 +80,13 @@ def recovered_against_true(model: xr.DataTree, truth: Mapping[str, Array]) -> Re
     )
 
 
-def _foot_points(fitted: xr.Dataset, truth: Mapping[str, Array]) -> tuple[NDArray[np.integer], Array]:
-    position, normal = (fitted[name].values.astype(np.float64) for name in ("surfel_position", "surfel_normal"))
+def _foot_points(
+    fitted: xr.Dataset, truth: Mapping[str, Array]
+) -> tuple[NDArray[np.integer], Array]:
+    position, normal = (
+        fitted[name].values.astype(np.float64)
+        for name in ("surfel_position", "surfel_normal")
+    )
     scene = RayScene(truth["vertices"], truth["faces"].astype(np.int64))
     face, corner, distance = scene.first_hit(position + SEARCH * normal, -normal)
     return np.where(distance <= 2 * SEARCH, face, -1), corner
@@ -84,4 +101,8 @@ def _sites(model: xr.DataTree, truth: Mapping[str, Array]) -> dict[str, Array]:
         return {}
     found = model["translucency"].to_dataset()["site_sigma_tr"]
     true = dict(zip(map(str, truth["site_names"]), truth["site_sigma_tr"], strict=True))
-    return {str(s): found.sel(site=s).values / true[str(s)] - 1 for s in found["site"].values if str(s) in true}
+    return {
+        str(s): found.sel(site=s).values / true[str(s)] - 1
+        for s in found["site"].values
+        if str(s) in true
+    }

@@ -1,4 +1,6 @@
-"""Work on the takes of a database: read versions, call the scientific packages, commit what they return."""
+"""Work on the takes of a database: read versions, call the scientific packages, commit
+what they return.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,12 @@ if TYPE_CHECKING:
         takes_without_consent,
     )
     from skindb.workflow.ingest import captured_subjects, ingest_take
-    from skindb.workflow.pictures import compare_take, export_take, render_take, show_take
+    from skindb.workflow.pictures import (
+        compare_take,
+        export_take,
+        render_take,
+        show_take,
+    )
     from skindb.workflow.registration import register_takes, registered_datasets
     from skindb.workflow.session import capture_session, plan_session
     from skindb.workflow.simulation import begin_cohort, simulate, simulate_one
@@ -45,8 +52,18 @@ if TYPE_CHECKING:
     from skindb.workflow.superseded import superseded_calibrations, superseded_lines
     from skindb.workflow.takes import Outcome, faults_of, map_takes, results_of
     from skindb.workflow.translucency_pictures import translucency_grid
-    from skindb.workflow.upkeep import Refreshed, refresh, repeat_requests, stale_results
-    from skindb.workflow.viewing import explain_view, landmark_page, view_server, view_takes
+    from skindb.workflow.upkeep import (
+        Refreshed,
+        refresh,
+        repeat_requests,
+        stale_results,
+    )
+    from skindb.workflow.viewing import (
+        explain_view,
+        landmark_page,
+        view_server,
+        view_takes,
+    )
     from skindb.workflow.withdrawal import (
         Withdrawal,
         erasure_report,
@@ -172,6 +189,12 @@ __getattr__, __dir__, _ = lazy_loader.attach(
         ],
         "summaries": ["summarise"],
         "takes": ["Outcome", "faults_of", "map_takes", "results_of"],
-        "withdrawal": ["Withdrawal", "erasure_report", "plan_withdrawal", "withdraw", "write_erasure_report"],
+        "withdrawal": [
+            "Withdrawal",
+            "erasure_report",
+            "plan_withdrawal",
+            "withdraw",
+            "write_erasure_report",
+        ],
     },
 )

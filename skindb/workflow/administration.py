@@ -16,7 +16,9 @@ def record_consent(db: Database, subject: str, scope: Iterable[str]) -> Record:
         return db.record_consent(subject, scopes)
 
 
-def create_release(db: Database, name: str, takes: Sequence[str] | None = None) -> Record:
+def create_release(
+    db: Database, name: str, takes: Sequence[str] | None = None
+) -> Record:
     """Name the present versions of takes as a release; see `Database.create_release`."""
     chosen = db.takes("model") if takes is None else list(takes)
     with logged_action(db, "release", chosen):

@@ -1,7 +1,8 @@
 """Logging of actions that change or disclose data of subjects, before they are done.
 
-Every public function of `skindb.workflow` that does so is decorated by `logged`, or uses `logged_action`. What these
-functions call is a part of the same action, also in other processes, and is not logged again.
+Every public function of `skindb.workflow` that does so is decorated by `logged`, or
+uses `logged_action`. What these functions call is a part of the same action, also in
+other processes, and is not logged again.
 """
 
 from __future__ import annotations
@@ -28,17 +29,30 @@ Item = TypeVar("Item")
 
 ACTOR = "SKINDB_ACTOR"  # environment variable
 MAX_ACTOR_CHARACTERS = 64
-# actions that always change the database, and are refused if they cannot be logged; others may only read or erase
+# actions that always change the database, and are refused if they cannot be logged;
+# others may only read or erase
 CHANGES = ("ingest", "calibrate", "fit", "edit", "consent", "release", "restore")
-ERASURES = ("withdrawal", "clean", "refresh")  # actions that are logged at their end if they could not be before
+# actions that are logged at their end if they could not be before
+ERASURES = ("withdrawal", "clean", "refresh")
 BEGINNINGS = ("ingest", "calibrate", "restore")  # actions that may create a database
 # arguments that an entry records if they are numbers or true
-RECORDED = ("edited", "explain", "faces", "generation", "generations", "gltf", "new_consent", "refit")
+RECORDED = (
+    "edited",
+    "explain",
+    "faces",
+    "generation",
+    "generations",
+    "gltf",
+    "new_consent",
+    "refit",
+)
 NO_ARGUMENTS: Mapping[str, Any] = MappingProxyType({})
 
 _stated_actor = ContextVar("skindb_actor", default="")
 # databases of which an action is running that was logged
-_logged_databases: ContextVar[tuple[Database, ...]] = ContextVar("skindb_logged_databases", default=())
+_logged_databases: ContextVar[tuple[Database, ...]] = ContextVar(
+    "skindb_logged_databases", default=()
+)
 
 
 class NotLoggedWarning(SkindbWarning):
@@ -47,7 +61,8 @@ class NotLoggedWarning(SkindbWarning):
 
 @contextmanager
 def acting_as(actor: str) -> Iterator[None]:
-    """Context in which actions are logged under this name in place of that of the operating system's user.
+    """Context in which actions are logged under this name in place of that of the
+    operating system's user.
 
     Raises
     ------
@@ -72,7 +87,8 @@ def logged_action(
     arguments: Mapping[str, Any] = NO_ARGUMENTS,
     **parameters: Any,
 ) -> Iterator[None]:
-    """Context of an action, which is logged before it begins, as one entry with everything that it calls.
+    """Context of an action, which is logged before it begins, as one entry with
+    everything that it calls.
 
     Parameters
     ----------
@@ -85,14 +101,16 @@ def logged_action(
     counts
         Further numbers beside that of the takes.
     arguments
-        Arguments of the action, of which only numbers and flags with a name in `RECORDED` are stored.
+        Arguments of the action, of which only numbers and flags with a name in
+        `RECORDED` are stored.
     **parameters
         Further parameters: numbers, flags and words of the code, nothing that a person typed.
 
     Raises
     ------
     OSError, InputError
-        If an action that always changes the database cannot be logged, or if the name of the actor is invalid.
+        If an action that always changes the database cannot be logged, or if the name
+        of the actor is invalid.
 
     Warns
     -----
@@ -101,8 +119,15 @@ def logged_action(
     """
     running = _logged_databases.get()
     given = {name: arguments.get(name) for name in RECORDED}
-    parameters |= {name: value for name, value in given.items() if isinstance(value, int) and value}
-    about = {"takes": list(takes), "subjects": subjects, "counts": counts or {}, "parameters": parameters}
+    parameters |= {
+        name: value for name, value in given.items() if isinstance(value, int) and value
+    }
+    about = {
+        "takes": list(takes),
+        "subjects": subjects,
+        "counts": counts or {},
+        "parameters": parameters,
+    }
     error = None if db in running else _log(db, action, about)
     if error is not None and action not in ERASURES:
         _warn(db, action, error)
@@ -111,14 +136,18 @@ def logged_action(
         yield
     finally:
         _logged_databases.reset(token)
-    if error is not None and action in ERASURES:  # which may have freed the space that an entry needs
+    # which may have freed the space that an entry needs
+    if error is not None and action in ERASURES:
         error = _log(db, action, about)
         if error is not None:
             _warn(db, action, error)
 
 
-def logged(action: str, **parameters: Any) -> Callable[[Callable[P, Result]], Callable[P, Result]]:
-    """Decorator of functions of a database `db`, which logs each call as an action, see `logged_action`.
+def logged(
+    action: str, **parameters: Any
+) -> Callable[[Callable[P, Result]], Callable[P, Result]]:
+    """Decorator of functions of a database `db`, which logs each call as an action, see
+    `logged_action`.
 
     The takes are those of the argument `take` or `takes`, by default all that have a model.
     """
@@ -142,12 +171,16 @@ def logged(action: str, **parameters: Any) -> Callable[[Callable[P, Result]], Ca
 
 
 def as_part(function: Callable[[Item], Result]) -> Callable[[Item], Result]:
-    """The function, which also in another process is a part of the action that is running here, if there is one."""
+    """The function, which also in another process is a part of the action that is
+    running here, if there is one.
+    """
     running = _logged_databases.get()
     return partial(_call_as_part, function, running) if running else function
 
 
-def _call_as_part(function: Callable[[Item], Result], running: tuple[Database, ...], item: Item) -> Result:
+def _call_as_part(
+    function: Callable[[Item], Result], running: tuple[Database, ...], item: Item
+) -> Result:
     token = _logged_databases.set(running)
     try:
         return function(item)
@@ -162,7 +195,9 @@ def _takes_of(arguments: Mapping[str, Any]) -> list[str]:
     return takes or arguments["db"].takes("model", release=arguments.get("release"))
 
 
-def _log(db: Database, action: str, about: Mapping[str, Any]) -> OSError | InputError | None:
+def _log(
+    db: Database, action: str, about: Mapping[str, Any]
+) -> OSError | InputError | None:
     """Create the entry of an action, or return the error if the action is done all the same."""
     actor = _actor()
     if action not in BEGINNINGS and not {"log", "audit"} & {*(db.names() or ())}:
@@ -177,13 +212,19 @@ def _log(db: Database, action: str, about: Mapping[str, Any]) -> OSError | Input
 
 
 def _warn(db: Database, action: str, error: OSError | InputError) -> None:
-    reason = error.faults[0].found if isinstance(error, InputError) else error.strerror or str(error)
+    reason = (
+        error.faults[0].found
+        if isinstance(error, InputError)
+        else error.strerror or str(error)
+    )
     text = f"{action} was not written to the audit log of {db.url}: {reason}"
     warnings.warn(text, NotLoggedWarning, stacklevel=4)
 
 
 def _actor() -> str:
-    """Who acts: the name that was stated, that of the environment, or the user of the operating system."""
+    """Who acts: the name that was stated, that of the environment, or the user of the
+    operating system.
+    """
     stated = _stated_actor.get()
     if stated:
         return stated
@@ -196,8 +237,15 @@ def _actor() -> str:
 
 
 def _checked_actor(where: str, actor: str) -> str:
-    is_valid = actor.isprintable() and actor == actor.strip() and 0 < len(actor) <= MAX_ACTOR_CHARACTERS
+    is_valid = (
+        actor.isprintable()
+        and actor == actor.strip()
+        and 0 < len(actor) <= MAX_ACTOR_CHARACTERS
+    )
     if not is_valid:
-        rule = f"must be 1 to {MAX_ACTOR_CHARACTERS} characters that can be printed, without spaces around them"
+        rule = (
+            f"must be 1 to {MAX_ACTOR_CHARACTERS} characters that can be printed, "
+            "without spaces around them"
+        )
         raise InputError(Fault(where, rule, repr(actor)[:200], "choose another name"))
     return actor

@@ -12,8 +12,8 @@ from skindb.workflow.audit import logged_action
 def backup(db: Database, destination: str, *, verify: bool = False) -> BackupReport:
     """Write the present state of a database to a backup, which is created if there is none.
 
-    Files that the backup has already are not copied again. Others may write to the database meanwhile. If the process
-    is killed, the same call continues.
+    Files that the backup has already are not copied again. Others may write to the
+    database meanwhile. If the process is killed, the same call continues.
 
     Parameters
     ----------
@@ -44,13 +44,20 @@ def backup_states(source: str) -> list[State]:
 
 
 def restore(
-    source: str, url: str, *, number: int | None = None, markers: Path | None = None, without_markers: bool = False
+    source: str,
+    url: str,
+    *,
+    number: int | None = None,
+    markers: Path | None = None,
+    without_markers: bool = False,
 ) -> Restored:
     """Restore a database from a backup; see `skindb.store.restore`.
 
     It is logged at its end, because the audit log itself is restored.
     """
-    restored = store.restore(source, url, number=number, markers=markers, without_markers=without_markers)
+    restored = store.restore(
+        source, url, number=number, markers=markers, without_markers=without_markers
+    )
     db = Database(url)
     with logged_action(db, "restore", db.takes(), counts={"state": restored.number}):
         return restored

@@ -1,4 +1,6 @@
-"""Calibrations of a dome and its probe: dated, versioned, and named by the captures that used them."""
+"""Calibrations of a dome and its probe: dated, versioned, and named by the captures
+that used them.
+"""
 
 from __future__ import annotations
 
@@ -15,9 +17,18 @@ from skindb.ingest.camera_calibration import calibrate_cameras, calibrated_camer
 from skindb.ingest.camera_frames import read_calibration_frames
 from skindb.ingest.devices import DomeRecord
 from skindb.ingest.folder import Capture
-from skindb.ingest.light_calibration import POSITION_ERROR_MM, calibrate_lights, calibrated_dome, read_setup_dome
+from skindb.ingest.light_calibration import (
+    POSITION_ERROR_MM,
+    calibrate_lights,
+    calibrated_dome,
+    read_setup_dome,
+)
 from skindb.ingest.light_positions import calibrate_positions, positioned_dome
-from skindb.ingest.probe_calibration import calibrate_probe, calibrated_probe, read_flat_frames
+from skindb.ingest.probe_calibration import (
+    calibrate_probe,
+    calibrated_probe,
+    read_flat_frames,
+)
 from skindb.store import CALIBRATION, Database, Record, require_text
 from skindb.workflow.audit import logged_action
 from skindb.workflow.provenance import provenance
@@ -40,25 +51,29 @@ def calibrate(
     fit_falloff: bool = False,
     position_error: float = POSITION_ERROR_MM,
 ) -> Record:
-    """Calibrate lights, cameras and probe of a set-up, and commit the result as the next version of that name.
+    """Calibrate lights, cameras and probe of a set-up, and commit the result as the
+    next version of that name.
 
-    If the set-up has dome/calibration.json, the positions of the lights and the cameras are calibrated by the frames
-    that it names. The intensities of the lights follow from the white target, as the calibrated cameras see it. The
-    probe is calibrated if the set-up has contact/calibration.json.
+    If the set-up has dome/calibration.json, the positions of the lights and the cameras
+    are calibrated by the frames that it names. The intensities of the lights follow
+    from the white target, as the calibrated cameras see it. The probe is calibrated if
+    the set-up has contact/calibration.json.
 
     Parameters
     ----------
     db
         Database to write to.
     setup
-        Folder with dome/dome.json, the frames of the white target, and perhaps dome/calibration.json and
-        contact/calibration.json with the frames that they name, see docs/howto/calibrate.md.
+        Folder with dome/dome.json, the frames of the white target, and perhaps
+        dome/calibration.json and contact/calibration.json with the frames that they
+        name, see docs/howto/calibrate.md.
     name
         Name by which captures refer to it.
     fit_falloff
         Also fit the angular fall-off of every light.
     position_error
-        Standard error of the position of a light relative to the white target along each axis, in mm.
+        Standard error of the position of a light relative to the white target along
+        each axis, in mm.
 
     Returns
     -------
@@ -76,13 +91,23 @@ def calibrate(
     if frames := read_calibration_frames(dome):
         if frames.ball is not None:
             groups["position_calibration"] = calibrate_positions(dome, frames.ball)
-            dome = positioned_dome(dome, groups["position_calibration"], where="the calibrated positions")
+            dome = positioned_dome(
+                dome, groups["position_calibration"], where="the calibrated positions"
+            )
         groups["camera_calibration"] = calibrate_cameras(dome, frames)
-        dome = calibrated_cameras(dome, groups["camera_calibration"], where="the calibrated cameras")
-    groups["light_calibration"] = calibrate_lights(dome, fit_falloff=fit_falloff, position_error=position_error)
+        dome = calibrated_cameras(
+            dome, groups["camera_calibration"], where="the calibrated cameras"
+        )
+    groups["light_calibration"] = calibrate_lights(
+        dome, fit_falloff=fit_falloff, position_error=position_error
+    )
     if (flat := read_flat_frames(Path(setup))) is not None:
         groups["probe_calibration"] = calibrate_probe(flat)
-    parameters = {"setup": Path(setup).name, "fit_falloff": fit_falloff, "position_error": position_error}
+    parameters = {
+        "setup": Path(setup).name,
+        "fit_falloff": fit_falloff,
+        "position_error": position_error,
+    }
     about = provenance("calibrate", [], parameters=parameters)
     with logged_action(db, "calibrate"), db.stage(CALIBRATION, key) as stage:
         stage.write(groups)
@@ -98,7 +123,9 @@ def calibrated_capture(db: Database, capture: Capture) -> Capture:
         rule = "the database must hold the calibration that it names"
         cure = "run skindb calibrate first"
         where = f"{capture.folder / 'capture.json'}[calibration]"
-        raise InputError(Fault(where, rule, f"{capture.calibration}; calibrations: {there}", cure))
+        raise InputError(
+            Fault(where, rule, f"{capture.calibration}; calibrations: {there}", cure)
+        )
     record = db.record(CALIBRATION, capture.calibration)
     stored = db.read(CALIBRATION, capture.calibration, generation=record.generation)
     dome = capture.dome
@@ -108,24 +135,41 @@ def calibrated_capture(db: Database, capture: Capture) -> Capture:
         if dome is not None and group in stored.children:
             dome = apply(dome, stored[group].to_dataset(), where=where)
     if probe is not None and "probe_calibration" in stored.children:
-        probe = calibrated_probe(probe, stored["probe_calibration"].to_dataset(), where=where)
+        probe = calibrated_probe(
+            probe, stored["probe_calibration"].to_dataset(), where=where
+        )
     return replace(capture, dome=dome, probe=probe, calibrated_by=record.as_input())
 
 
 def describe_calibration(db: Database, record: Record) -> dict[str, Any]:
-    """Largest relative errors of intensities, change since the version before, cameras, takes of earlier versions."""
+    """Largest relative errors of intensities, change since the version before, cameras,
+    takes of earlier versions.
+    """
     stored = db.read(CALIBRATION, record.take, generation=record.generation)
     now = stored["light_calibration"].to_dataset().load()
-    relative = (now["calibrated_intensity_error"] / now["calibrated_intensity"]).max("channel")
-    about: dict[str, Any] = {"lights": now.sizes["light"], "largest_relative_error": float(relative.max())}
+    relative = (now["calibrated_intensity_error"] / now["calibrated_intensity"]).max(
+        "channel"
+    )
+    about: dict[str, Any] = {
+        "lights": now.sizes["light"],
+        "largest_relative_error": float(relative.max()),
+    }
     if "glare_fraction" in now:  # calibrations of earlier versions have none
         position = now["calibrated_intensity_position_error"]
         glare = now["glare_fraction"]
-        about |= {"position_error": float(position.median()), "glare": float(glare.median())}
-        about["total_relative_error"] = float(np.sqrt(relative**2 + position**2 + glare**2).max())
+        about |= {
+            "position_error": float(position.median()),
+            "glare": float(glare.median()),
+        }
+        about["total_relative_error"] = float(
+            np.sqrt(relative**2 + position**2 + glare**2).max()
+        )
     if record.generation > 1:
-        before = db.read(CALIBRATION, record.take, generation=record.generation - 1)["light_calibration"].to_dataset()
-        both = now["calibrated_intensity"] / before["calibrated_intensity"].load()  # lights that both have
+        before = db.read(CALIBRATION, record.take, generation=record.generation - 1)[
+            "light_calibration"
+        ].to_dataset()
+        # lights that both have
+        both = now["calibrated_intensity"] / before["calibrated_intensity"].load()
         change = abs(both - 1).max(dim="channel")
         if change.size:
             about |= {
@@ -134,13 +178,20 @@ def describe_calibration(db: Database, record: Record) -> dict[str, Any]:
             }
     if "position_calibration" in stored.children:
         positions = stored["position_calibration"].to_dataset().load()
-        about["largest_position_error_mm"] = float(positions["calibrated_position_error"].max())
+        about["largest_position_error_mm"] = float(
+            positions["calibrated_position_error"].max()
+        )
     if "probe_calibration" in stored.children:
         probe = stored["probe_calibration"].to_dataset().load()
         error = probe["calibrated_fibre_gain_error"] / probe["calibrated_fibre_gain"]
-        about["probe"] = {"fibres": probe.sizes["fibre"], "largest_relative_error": float(error.max())}
+        about["probe"] = {
+            "fibres": probe.sizes["fibre"],
+            "largest_relative_error": float(error.max()),
+        }
     if "camera_calibration" in stored.children:
-        about["cameras"] = _describe_cameras(stored["camera_calibration"].to_dataset().load())
+        about["cameras"] = _describe_cameras(
+            stored["camera_calibration"].to_dataset().load()
+        )
     return about | {"ingest_again": takes_of_earlier(db, record)}
 
 
@@ -157,7 +208,9 @@ def _describe_cameras(found: xr.Dataset) -> dict[str, Any]:
     }
     about = dict[str, Any]()
     for name, variable in measures.items():
-        values = found[variable].max(dim=[dim for dim in found[variable].dims if dim != "camera"])
+        values = found[variable].max(
+            dim=[dim for dim in found[variable].dims if dim != "camera"]
+        )
         if count := int(np.isfinite(values).sum()):
             about[name] = {"cameras": count, variable: float(values.max())}
     return about

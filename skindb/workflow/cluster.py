@@ -30,9 +30,13 @@ if TYPE_CHECKING:
     from distributed import Client, Future, Worker
 
 CONNECT_SECONDS = 10  # until a scheduler that does not answer counts as unreachable
-WAIT_SECONDS = 20.0  # that a take waits for the one its worker is busy with, before it asks for another worker
-MAX_REPEATED_BYTES = 4096  # of a pickled call that is sent with every take; usual ones have some 300
-_ONE_TAKE = threading.Lock()  # a take uses all threads of its worker, and the setting of their number is shared
+# that a take waits for the one its worker is busy with, before it asks for another
+# worker
+WAIT_SECONDS = 20.0
+# of a pickled call that is sent with every take; usual ones have some 300
+MAX_REPEATED_BYTES = 4096
+# a take uses all threads of its worker, and the setting of their number is shared
+_ONE_TAKE = threading.Lock()
 
 
 @dataclass(frozen=True)
@@ -49,12 +53,21 @@ class Expected:
             rule = f"must run the same skindb as this process ({self.version})"
             found = f"version {__version__}"
             found += "" if __version__ != self.version else " with other source code"
-            raise InputError(Fault(f"worker {worker}", rule, found, "install the same version, restart the worker"))
+            raise InputError(
+                Fault(
+                    f"worker {worker}",
+                    rule,
+                    found,
+                    "install the same version, restart the worker",
+                )
+            )
         if self.token and not Path(self.token).is_file():
             folder = str(Path(self.token).parent.parent)
             rule = f"must see the database {folder}"
             cure = "use a folder that all machines share"
-            raise InputError(Fault(f"worker {worker}", rule, "no such folder, or another one", cure))
+            raise InputError(
+                Fault(f"worker {worker}", rule, "no such folder, or another one", cure)
+            )
 
 
 @contextmanager
@@ -64,7 +77,8 @@ def connected(address: str) -> Iterator[Client]:
     Parameters
     ----------
     address
-        Such as tcp://127.0.0.1:8786, or the path of the .json that ``dask scheduler --scheduler-file`` writes.
+        Such as tcp://127.0.0.1:8786, or the path of the .json that ``dask scheduler
+        --scheduler-file`` writes.
 
     Raises
     ------
@@ -78,14 +92,26 @@ def connected(address: str) -> Iterator[Client]:
         cure = "run: pip install 'skindb[cluster]'"
         raise InputError(Fault("--scheduler", rule, str(error), cure)) from None
     try:
-        where = json.loads(Path(address).read_text())["address"] if address.endswith(".json") else address
+        where = (
+            json.loads(Path(address).read_text())["address"]
+            if address.endswith(".json")
+            else address
+        )
         with ThreadPoolExecutor(1) as apart:  # a notebook has its own event loop
             apart.submit(asyncio.run, _greet(where)).result()
         client = Client(where, timeout=CONNECT_SECONDS, set_as_default=False)
-    except Exception as error:  # noqa: BLE001  of any kind: the file and the server are not ours
+    # of any kind: the file and the server are not ours
+    except Exception as error:  # noqa: BLE001
         rule = "a Dask scheduler must answer there"
         cure = "check the address, and that `dask scheduler` runs"
-        raise InputError(Fault(address, rule, f"{type(error).__name__}: {str(error) or 'no answer'}", cure)) from None
+        raise InputError(
+            Fault(
+                address,
+                rule,
+                f"{type(error).__name__}: {str(error) or 'no answer'}",
+                cure,
+            )
+        ) from None
     with client:
         yield client
 
@@ -104,12 +130,14 @@ def computing_on(client: Client | None, shared: Path | None = None) -> Iterator[
     Raises
     ------
     InputError
-        If a worker has another version of skindb or another folder, or if the cluster has no worker.
+        If a worker has another version of skindb or another folder, or if the cluster
+        has no worker.
 
     Examples
     --------
-    >>> with connected("tcp://127.0.0.1:8786") as client, computing_on(client, db.root):  # doctest: +SKIP
-    ...     traits(db)
+    >>> with connected("tcp://127.0.0.1:8786") as client:  # doctest: +SKIP
+    ...     with computing_on(client, db.root):
+    ...         traits(db)
     """
     if client is None:
         yield
@@ -131,10 +159,13 @@ def _require_workers(client: Client, expected: Expected) -> None:
         checked = client.run(_checked, expected)
     except InputError:
         raise
-    except Exception as error:  # noqa: BLE001  workers without skindb, or that were lost
+    # workers without skindb, or that were lost
+    except Exception as error:  # noqa: BLE001
         rule = "every worker must have skindb and answer"
         cure = "install it in the environment of the workers"
-        raise InputError(Fault("cluster", rule, f"{type(error).__name__}: {error}", cure)) from None
+        raise InputError(
+            Fault("cluster", rule, f"{type(error).__name__}: {error}", cure)
+        ) from None
     if not checked:
         rule = "a study needs workers"
         cure = "start one: dask worker ADDRESS"
@@ -148,7 +179,9 @@ def _checked(expected: Expected, dask_worker: Worker) -> bool:
 
 
 def _limit_blas(name: str, dask_worker: Worker) -> None:
-    """For all tasks of a worker, from its main thread: limits that task threads set and restore overlap."""
+    """For all tasks of a worker, from its main thread: limits that task threads set and
+    restore overlap.
+    """
     setattr(dask_worker, name, one_blas_thread())
 
 
@@ -157,12 +190,16 @@ def _restore_blas(name: str, dask_worker: Worker) -> None:
 
 
 async def _greet(address: str) -> None:
-    """Fail soon where no scheduler is: a `Client` would wait, and leave a traceback when it is removed."""
+    """Fail soon where no scheduler is: a `Client` would wait, and leave a traceback
+    when it is removed.
+    """
     from distributed import Security
     from distributed.comm import connect
 
     how = Security().get_connection_args("client")
-    comm = await asyncio.wait_for(connect(address, timeout=CONNECT_SECONDS, **how), CONNECT_SECONDS + 1)
+    comm = await asyncio.wait_for(
+        connect(address, timeout=CONNECT_SECONDS, **how), CONNECT_SECONDS + 1
+    )
     comm.abort()
 
 
@@ -176,7 +213,9 @@ def dashboard_link(client: Client) -> str:
 
 @contextmanager
 def shared_token(folder: Path | None) -> Iterator[str]:
-    """Path of a new file in the folder of a database, by which workers see that it is the same folder."""
+    """Path of a new file in the folder of a database, by which workers see that it is
+    the same folder.
+    """
     if folder is None:
         yield ""
         return
@@ -209,14 +248,17 @@ def calls_on_cluster(
     Raises
     ------
     InputError
-        If a worker has another skindb or another file system, or if the scheduler is lost: then no take can end well.
+        If a worker has another skindb or another file system, or if the scheduler is
+        lost: then no take can end well.
     """
     from distributed import KilledWorker
 
     with shared_token(shared) as token:
         expected = Expected(__version__, method_digest(), token)
         message = bytes(cloudpickle.dumps((expected, call)))
-        suspects = []  # their workers were killed, perhaps by a take beside them: each is tried again alone
+        # their workers were killed, perhaps by a take beside them: each is tried again
+        # alone
+        suspects = []
         for take, answer in _answers(message, takes, client):
             if isinstance(answer, KilledWorker):
                 suspects.append(take)
@@ -227,14 +269,19 @@ def calls_on_cluster(
                 yield take, answer, 2
 
 
-def _answers(message: bytes, takes: Sequence[Any], client: Client) -> Iterator[tuple[Any, bytes | Exception]]:
+def _answers(
+    message: bytes, takes: Sequence[Any], client: Client
+) -> Iterator[tuple[Any, bytes | Exception]]:
     from distributed import as_completed
 
     once: Any = message
     if len(message) > MAX_REPEATED_BYTES:  # its own task: the graph holds it once
         once = client.submit(bytes, message, pure=False)
-        client.replicate(once)  # takes go where it is: if one worker had it, all to that one
-    futures = {client.submit(_on_worker, once, take, pure=False): take for take in takes}
+        # takes go where it is: if one worker had it, all to that one
+        client.replicate(once)
+    futures = {
+        client.submit(_on_worker, once, take, pure=False): take for take in takes
+    }
     try:
         for future in as_completed(list(futures), loop=client.loop):
             yield futures[future], _answer(future, client)
@@ -258,16 +305,20 @@ def _answer(future: Future, client: Client) -> bytes | Exception:
         rule = "every worker must have skindb"
         cure = "install it in the environment of the workers"
         raise InputError(Fault("cluster", rule, str(error), cure)) from None
-    except Exception as error:  # noqa: BLE001  the call could not be sent, or its worker was lost
+    # the call could not be sent, or its worker was lost
+    except Exception as error:  # noqa: BLE001
         return error
 
 
 def _on_worker(message: bytes, take: Any) -> bytes:
-    """One take on a worker, whose threads compute its blocks; while the worker is busy with another, others wait."""
+    """One take on a worker, whose threads compute its blocks; while the worker is busy
+    with another, others wait.
+    """
     from distributed import Reschedule, get_worker
 
     worker = get_worker()
-    threads = max(1, min(worker.state.nthreads, thread_count()))  # libraries with more threads than cores crawl
+    # libraries with more threads than cores crawl
+    threads = max(1, min(worker.state.nthreads, thread_count()))
     expected, call = cloudpickle.loads(message)
     expected.require(worker.address)
     if not _ONE_TAKE.acquire(timeout=WAIT_SECONDS):

@@ -26,7 +26,8 @@ from skindb.workflow.provenance import as_input, groups_of, method_digest, prove
 from skindb.workflow.registration import current_registrations, registered_datasets
 
 GRID_SIDE = 320.0  # pixels, the longer side of a picture in a grid
-METHOD = ("analysis", "numerics", "optics", "geometry", "schema", "workflow/edits")  # what the result depends on
+# what the result depends on
+METHOD = ("analysis", "numerics", "optics", "geometry", "schema", "workflow/edits")
 STRENGTHS = (0.5, 1.0)  # of the edits in a grid, as in figure 19 of the paper
 
 
@@ -40,17 +41,30 @@ class Editable:
     names: set[str]  # takes that the study and the registration refer to
     inputs: list[dict[str, Any]]
     move: Callable[[Mapping[str, float]], xr.DataTree]
-    dictionary: Path | None = None  # whose file may change: an edit with one is always computed
+    # whose file may change: an edit with one is always computed
+    dictionary: Path | None = None
 
     def provenance(self, amounts: Mapping[str, float]) -> dict[str, Any]:
         """Attributes of the version of an edit by these amounts."""
-        about = provenance("edit", self.inputs, parameters={"amounts": dict(amounts), "study": self.study})
-        return about | {"study_takes": self.takes, "method_digest": method_digest(METHOD)}
+        about = provenance(
+            "edit",
+            self.inputs,
+            parameters={"amounts": dict(amounts), "study": self.study},
+        )
+        return about | {
+            "study_takes": self.takes,
+            "method_digest": method_digest(METHOD),
+        }
 
 
 @logged("edit")
 def edit(
-    db: Database, take: str, amounts: Mapping[str, float], *, study: str | None = None, dictionary: Path | None = None
+    db: Database,
+    take: str,
+    amounts: Mapping[str, float],
+    *,
+    study: str | None = None,
+    dictionary: Path | None = None,
 ) -> xr.DataTree:
     """Move the model of a take along traits and commit it as the kind "edit".
 
@@ -73,23 +87,34 @@ def edit(
     Raises
     ------
     InputError
-        Without such a study, without the consent to statistics, or if a subject whose data the study used withdrew it.
+        Without such a study, without the consent to statistics, or if a subject whose
+        data the study used withdrew it.
     """
     source = editable_model(db, take, study, dictionary)
     edited = source.move(amounts)
     with db.stage("edit", take, names=source.names) as stage:
         stage.write(groups_of(edited))
-        stage.commit({str(name): value for name, value in edited.attrs.items()} | source.provenance(amounts))
+        stage.commit(
+            {str(name): value for name, value in edited.attrs.items()}
+            | source.provenance(amounts)
+        )
     return db.read("edit", take)
 
 
-def stored_or_moved(db: Database, take: str, source: Editable, amounts: Mapping[str, float]) -> xr.DataTree:
-    """The model moved along traits: an edit of the database that was made from the same versions, or a new one.
+def stored_or_moved(
+    db: Database, take: str, source: Editable, amounts: Mapping[str, float]
+) -> xr.DataTree:
+    """The model moved along traits: an edit of the database that was made from the same
+    versions, or a new one.
 
     Nothing is committed.
     """
     about = source.provenance(amounts)
-    history = [] if source.dictionary is not None or not db.has("edit", take) else db.readable_history("edit", take)
+    history = (
+        []
+        if source.dictionary is not None or not db.has("edit", take)
+        else db.readable_history("edit", take)
+    )
     for record in reversed(history):
         if {name: record.provenance.get(name) for name in about} == about:
             return db.read("edit", take, generation=record.generation)
@@ -109,7 +134,8 @@ def edit_grid(
     progress: Progress | None = None,
     **options: Any,
 ) -> dict[str, xr.DataTree]:
-    """Draw a model and edits of it, one row each, with one exposure for all; nothing is committed (figure 19).
+    """Draw a model and edits of it, one row each, with one exposure for all; nothing is
+    committed (figure 19).
 
     Parameters
     ----------
@@ -124,13 +150,14 @@ def edit_grid(
     progress
         Called with the stage, the number of finished steps and the total number of steps.
     **options
-        Of `skindb.render.picture.radiance_of`: lights, camera, samples, subsurface, and scale, by default such that
-        a picture's longer side has 320 pixels.
+        Of `skindb.render.picture.radiance_of`: lights, camera, samples, subsurface, and
+        scale, by default such that a picture's longer side has 320 pixels.
 
     Returns
     -------
     dict
-        Label -> edited model at the last strength, which is described in `edit_report` and `trait_notes`.
+        Label -> edited model at the last strength, which is described in `edit_report`
+        and `trait_notes`.
     """
     source = editable_model(db, take, study, dictionary)
     tell = progress or silent
@@ -145,7 +172,9 @@ def edit_grid(
     for label, amounts in rows.items():
         pictures[label] = [plain]
         for strength in strengths:
-            last[label] = source.move({name: strength * amount for name, amount in amounts.items()})
+            last[label] = source.move(
+                {name: strength * amount for name, amount in amounts.items()}
+            )
             pictures[label].append(radiance_of(last[label], **options).radiance)
             done += 1
             tell("edits", done, steps)
@@ -178,7 +207,8 @@ def basis_grid(
     ks
         Numbers of basis BRDFs; each basis is the best one for this take.
     lights
-        Names of lights, summed; default the one nearest to the frontal camera, in which highlights show most.
+        Names of lights, summed; default the one nearest to the frontal camera, in which
+        highlights show most.
     seed
         Random seed of the factorisations.
     **options
@@ -192,7 +222,9 @@ def basis_grid(
     model = db.read("model", take)
     require_consent({**model.attrs, "take": take}, "export")
     names = [str(name) for name in model["fitted"].to_dataset()["dictionary"].values]
-    tables = study_inputs.dictionary_tables(names, float(model["basis/disc_angular_radius"]), dictionary)
+    tables = study_inputs.dictionary_tables(
+        names, float(model["basis/disc_angular_radius"]), dictionary
+    )
     cohort = db.cohort("surfels", takes=[take], surfels=SAMPLED)
     columns = {}
     for k in ks:
@@ -203,7 +235,11 @@ def basis_grid(
     options.setdefault("scale", _grid_scale(model))
     lamps = lights or [_frontal_light(model)]
     pictures = [
-        radiance_of(with_basis(model, mixture=mix, names=names, tables=tables), lights=lamps, **options).radiance
+        radiance_of(
+            with_basis(model, mixture=mix, names=names, tables=tables),
+            lights=lamps,
+            **options,
+        ).radiance
         for mix in columns.values()
     ]
     write_grid(out, {take: pictures}, list(columns))
@@ -224,17 +260,24 @@ def _frontal_light(model: xr.DataTree) -> str:
 
 
 def _grid_scale(model: xr.DataTree) -> float:
-    """Size of the pictures of a grid over that of the camera's: few pixels, of which each costs every light."""
+    """Size of the pictures of a grid over that of the camera's: few pixels, of which
+    each costs every light.
+    """
     dome = model["dome"].to_dataset()
     return GRID_SIDE / float(dome["camera_size"].max())
 
 
 def _sides(edited: xr.DataTree) -> str:
     """How many takes the traits of a row follow from."""
-    return "\n".join(note.partition(": ")[2].partition(";")[0] for note in edited.attrs["trait_notes"])
+    return "\n".join(
+        note.partition(": ")[2].partition(";")[0]
+        for note in edited.attrs["trait_notes"]
+    )
 
 
-def editable_model(db: Database, take: str, study: str | None, dictionary: Path | None) -> Editable:
+def editable_model(
+    db: Database, take: str, study: str | None, dictionary: Path | None
+) -> Editable:
     """A model of a database with what moves it along the traits of a study."""
     study = _trait_study(db, study)
     model = db.read("model", take)
@@ -253,13 +296,34 @@ def editable_model(db: Database, take: str, study: str | None, dictionary: Path 
         placed = {"texture": texture, "maps": maps, "registered": registered}
         inputs.append(records[take].as_input())
         referred.update(records[take].names)
-    traits, basis, albedo = (vectors[name].to_dataset().compute() for name in ("traits", "population_basis", "albedo"))
-    tables = study_inputs.dictionary_tables(names, float(model["basis/disc_angular_radius"]), dictionary)
+    traits, basis, albedo = (
+        vectors[name].to_dataset().compute()
+        for name in ("traits", "population_basis", "albedo")
+    )
+    tables = study_inputs.dictionary_tables(
+        names, float(model["basis/disc_angular_radius"]), dictionary
+    )
 
     def move(amounts: Mapping[str, float]) -> xr.DataTree:
-        return apply_traits(model, amounts=amounts, traits=traits, basis=basis, albedo=albedo, tables=tables, **placed)
+        return apply_traits(
+            model,
+            amounts=amounts,
+            traits=traits,
+            basis=basis,
+            albedo=albedo,
+            tables=tables,
+            **placed,
+        )
 
-    return Editable(model, study, [str(one) for one in traits["take"].values], referred, inputs, move, dictionary)
+    return Editable(
+        model,
+        study,
+        [str(one) for one in traits["take"].values],
+        referred,
+        inputs,
+        move,
+        dictionary,
+    )
 
 
 def _trait_study(db: Database, asked: str | None) -> str:
@@ -267,7 +331,18 @@ def _trait_study(db: Database, asked: str | None) -> str:
     there = [name for name in db.takes(STUDY) if name.partition(".")[0] == "traits"]
     wanted = asked or ("traits" if "traits" in there or len(there) != 1 else there[0])
     if wanted not in there:
-        cure = "name one of them with --study" if there else "run: skindb analyze DB traits"
+        cure = (
+            "name one of them with --study"
+            if there
+            else "run: skindb analyze DB traits"
+        )
         found = f"studies of traits: {', '.join(there) or 'none'}"
-        raise InputError(Fault(f"study {wanted}", "must be a study of traits in the database", found, cure))
+        raise InputError(
+            Fault(
+                f"study {wanted}",
+                "must be a study of traits in the database",
+                found,
+                cure,
+            )
+        )
     return wanted

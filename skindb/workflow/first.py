@@ -1,4 +1,6 @@
-"""The first pass of a fit, kept until the model is committed, so that a killed fit need not repeat it."""
+"""The first pass of a fit, kept until the model is committed, so that a killed fit need
+not repeat it.
+"""
 
 from __future__ import annotations
 
@@ -20,9 +22,14 @@ FIRST = "first"  # transient kind: no result, and gone when the model is there
 
 
 def inputs_of_first_pass(
-    parameters: FitParameters, dictionary: Dictionary | None, capture: Mapping[str, Any], method: str
+    parameters: FitParameters,
+    dictionary: Dictionary | None,
+    capture: Mapping[str, Any],
+    method: str,
 ) -> dict[str, Any]:
-    """What decides the numbers of a first pass: parameters, BRDFs, the capture with its seal, digest of the code."""
+    """What decides the numbers of a first pass: parameters, BRDFs, the capture with its
+    seal, digest of the code.
+    """
     return {
         "requested": parameters.as_dict(),
         "dictionary_digest": (dictionary or embedded_dictionary()).digest,
@@ -33,8 +40,12 @@ def inputs_of_first_pass(
     }
 
 
-def kept_first_pass(db: Database, take: str, inputs: Mapping[str, Any]) -> xr.DataTree | None:
-    """The first pass of a killed fit with the same inputs, in memory; None if there is no such one."""
+def kept_first_pass(
+    db: Database, take: str, inputs: Mapping[str, Any]
+) -> xr.DataTree | None:
+    """The first pass of a killed fit with the same inputs, in memory; None if there is
+    no such one.
+    """
     try:
         if not db.has(FIRST, take):
             return None
@@ -42,14 +53,18 @@ def kept_first_pass(db: Database, take: str, inputs: Mapping[str, Any]) -> xr.Da
         if any(about.get(name) != plain(value) for name, value in inputs.items()):
             return None
         kept = db.read(FIRST, take)
-        first = xr.DataTree.from_dict({name: ds.compute() for name, ds in groups_of(kept).items()})
+        first = xr.DataTree.from_dict(
+            {name: ds.compute() for name, ds in groups_of(kept).items()}
+        )
     except InputError:  # damaged: it is repeated
         return None
     first.attrs = kept.attrs
     return first
 
 
-def keep_first_pass(db: Database, take: str, first: xr.DataTree, inputs: Mapping[str, Any], lease: Lease) -> None:
+def keep_first_pass(
+    db: Database, take: str, first: xr.DataTree, inputs: Mapping[str, Any], lease: Lease
+) -> None:
     """Keep a first pass for the case that the fit is killed; it replaces that of another fit."""
     about = {str(name): value for name, value in first.attrs.items()}
     about |= provenance("fit", inputs["inputs"], parameters=about["parameters"])

@@ -19,7 +19,12 @@ from skindb.optics.measured import read_dictionary
 from skindb.schema.consent import require_consent
 from skindb.store import Database, Record
 from skindb.workflow.audit import logged
-from skindb.workflow.first import FIRST, inputs_of_first_pass, keep_first_pass, kept_first_pass
+from skindb.workflow.first import (
+    FIRST,
+    inputs_of_first_pass,
+    keep_first_pass,
+    kept_first_pass,
+)
 from skindb.workflow.provenance import as_input, groups_of, method_digest, provenance
 from skindb.workflow.summaries import sample_groups, summary_digest, tables_of
 
@@ -52,7 +57,8 @@ def fit_take(
     wait: float = 0.0,
     progress: Progress | None = None,
 ) -> Record:
-    """Fit one take and commit its model; killed after its first pass, the same call continues there.
+    """Fit one take and commit its model; killed after its first pass, the same call
+    continues there.
 
     Parameters
     ----------
@@ -72,22 +78,27 @@ def fit_take(
     Returns
     -------
     Record
-        Of the commit; its provenance holds the report of the fit: seconds per stage, fraction of surfels per status,
-        medians of the residuals and of the errors at held-out samples, suspicious lights and cameras, and what was
-        skipped.
+        Of the commit; its provenance holds the report of the fit: seconds per stage,
+        fraction of surfels per status, medians of the residuals and of the errors at
+        held-out samples, suspicious lights and cameras, and what was skipped.
 
     Raises
     ------
     InputError
-        Without a capture, without the consent "fit", if another run fits or ingests the take, or if the capture cannot
-        be fitted. Nothing is committed then.
+        Without a capture, without the consent "fit", if another run fits or ingests the
+        take, or if the capture cannot be fitted. Nothing is committed then.
     """
-    db.record("capture", take, generation)  # before anything is written for a take that there is not
+    # before anything is written for a take that there is not
+    db.record("capture", take, generation)
     asked = parameters or FitParameters()
     method = method_digest(METHOD)
-    with db.lease(take, "model", wait=wait, command="skindb fit") as lease, one_blas_thread():
+    with (
+        db.lease(take, "model", wait=wait, command="skindb fit") as lease,
+        one_blas_thread(),
+    ):
         capture = db.read("capture", take, generation=generation)
-        require_consent({"consent_scope": db.consent(take), "take": take}, "fit")  # the newest record decides
+        # the newest record decides
+        require_consent({"consent_scope": db.consent(take), "take": take}, "fit")
         made_from = as_input(db, "capture", take, capture)
         inputs = inputs_of_first_pass(asked, dictionary, made_from, method)
         first = kept_first_pass(db, take, inputs)
@@ -98,12 +109,26 @@ def fit_take(
             progress("first pass of the run before", 1, 1)
         model = second_pass(capture, first, dictionary=dictionary, progress=progress)
         used = model.attrs["parameters"]
-        about = provenance("fit", [made_from], parameters=used, seeds={"fit": used["seed"]})
+        about = provenance(
+            "fit", [made_from], parameters=used, seeds={"fit": used["seed"]}
+        )
         about |= {"requested": asked.as_dict(), "method_digest": method}
-        about |= {"summary_parameters": {"surfels": SAMPLED, "seed": 0, "digest": summary_digest()}}
+        about |= {
+            "summary_parameters": {
+                "surfels": SAMPLED,
+                "seed": 0,
+                "digest": summary_digest(),
+            }
+        }
         with db.stage("model", take, lease) as stage:
-            stage.write(groups_of(model) | sample_groups(model), tables=tables_of(model))
-            record = stage.commit({str(name): value for name, value in model.attrs.items()} | {"take": take} | about)
+            stage.write(
+                groups_of(model) | sample_groups(model), tables=tables_of(model)
+            )
+            record = stage.commit(
+                {str(name): value for name, value in model.attrs.items()}
+                | {"take": take}
+                | about
+            )
         db.forget(FIRST, take)
         return record
 
@@ -135,7 +160,9 @@ def fit_with(
     brdfs = dictionary_at(dictionary)
     if explain:
         return take, plan_take(db, take, parameters, dictionary=brdfs).explain()
-    return fit_take(db, take, parameters, dictionary=brdfs, wait=wait, progress=progress)
+    return fit_take(
+        db, take, parameters, dictionary=brdfs, wait=wait, progress=progress
+    )
 
 
 @logged("fit", explain=True)
@@ -148,7 +175,11 @@ def plan_take(
     generation: int | None = None,
 ) -> FitPlan:
     """What `fit_take` would skip, and the bound on the error this costs."""
-    return plan_fit(db.read("capture", take, generation=generation), parameters, dictionary=dictionary)
+    return plan_fit(
+        db.read("capture", take, generation=generation),
+        parameters,
+        dictionary=dictionary,
+    )
 
 
 def takes_to_fit(
@@ -165,10 +196,11 @@ def takes_to_fit(
     db
         Database with captures.
     refit
-        Without it: takes without a model of their newest capture. With it also takes whose model would change: it was
-        made by other code, with other parameters than its own with `given` put in, or with another dictionary. An
-        interrupted refit therefore continues with the takes that are not done. Takes whose consent does not cover fits
-        are skipped, see `takes_without_consent`.
+        Without it: takes without a model of their newest capture. With it also takes
+        whose model would change: it was made by other code, with other parameters than
+        its own with `given` put in, or with another dictionary. An interrupted refit
+        therefore continues with the takes that are not done. Takes whose consent does
+        not cover fits are skipped, see `takes_without_consent`.
     given, dictionary
         As in `parameters_of`.
     """
@@ -178,7 +210,9 @@ def takes_to_fit(
             if "fit" not in db.consent(take):
                 continue
             record = current_model(db, take)
-            if record is None or (refit and not _up_to_date(db, record, given or {}, dictionary)):
+            if record is None or (
+                refit and not _up_to_date(db, record, given or {}, dictionary)
+            ):
                 takes.append(take)
         except InputError:  # its fit reports the reason, and other takes continue
             takes.append(take)
@@ -186,7 +220,9 @@ def takes_to_fit(
 
 
 def takes_without_consent(db: Database, scope: str) -> list[str]:
-    """Takes with a capture whose subject does not agree to a scope; damaged ones are not looked at."""
+    """Takes with a capture whose subject does not agree to a scope; damaged ones are
+    not looked at.
+    """
     found = []
     for take in db.takes("capture"):
         with suppress(InputError):
@@ -195,7 +231,12 @@ def takes_without_consent(db: Database, scope: str) -> list[str]:
 
 
 def parameters_of(
-    db: Database, take: str, given: Mapping[str, Any], *, refit: bool, dictionary: Path | None = None
+    db: Database,
+    take: str,
+    given: Mapping[str, Any],
+    *,
+    refit: bool,
+    dictionary: Path | None = None,
 ) -> FitParameters:
     """The parameters to fit a take with.
 
@@ -221,7 +262,14 @@ def parameters_of(
     if dictionary is None and own.get("dictionary", EMBEDDED) != EMBEDDED:
         rule = "a refit uses the dictionary of the model"
         cure = "name it with --dictionary, or fit without --refit"
-        raise InputError(Fault(take, rule, f"no dictionary for a model made with {own['dictionary']!r}", cure))
+        raise InputError(
+            Fault(
+                take,
+                rule,
+                f"no dictionary for a model made with {own['dictionary']!r}",
+                cure,
+            )
+        )
     return replace(_requested(own), **given)
 
 
@@ -232,7 +280,14 @@ def current_model(db: Database, take: str) -> Record | None:
     record = db.record("model", take)
     newest = db.record("capture", take).generation
     made_from = record.provenance.get("inputs", [])
-    return record if any(one["kind"] == "capture" and one["generation"] == newest for one in made_from) else None
+    return (
+        record
+        if any(
+            one["kind"] == "capture" and one["generation"] == newest
+            for one in made_from
+        )
+        else None
+    )
 
 
 def dictionary_at(path: Path | None) -> Dictionary | None:
@@ -240,7 +295,10 @@ def dictionary_at(path: Path | None) -> Dictionary | None:
     if path is None:
         return None
     files = sorted(path.iterdir()) if path.is_dir() else [path]
-    return _read(path, tuple((file.name, file.stat().st_mtime_ns) for file in files if file.exists()))
+    return _read(
+        path,
+        tuple((file.name, file.stat().st_mtime_ns) for file in files if file.exists()),
+    )
 
 
 @lru_cache(maxsize=1)
@@ -248,15 +306,21 @@ def _read(path: Path, _: tuple[tuple[str, int], ...]) -> Dictionary:
     return read_dictionary(path)
 
 
-def _up_to_date(db: Database, record: Record, given: Mapping[str, Any], dictionary: Path | None) -> bool:
+def _up_to_date(
+    db: Database, record: Record, given: Mapping[str, Any], dictionary: Path | None
+) -> bool:
     """Whether a fit with these parameters and this code would give the model that is there."""
     about = record.provenance
     brdfs = dictionary_at(dictionary) or embedded_dictionary()
     wanted = parameters_of(db, record.take, given, refit=True, dictionary=dictionary)
-    alike = wanted == _requested(about) and about.get("dictionary_digest") == brdfs.digest
+    alike = (
+        wanted == _requested(about) and about.get("dictionary_digest") == brdfs.digest
+    )
     return alike and about.get("method_digest") == method_digest(METHOD)
 
 
 def _requested(about: Mapping[str, Any]) -> FitParameters:
-    """What a fit was asked for: where a take has fewer components, or a dictionary fewer BRDFs, it used less."""
+    """What a fit was asked for: where a take has fewer components, or a dictionary
+    fewer BRDFs, it used less.
+    """
     return FitParameters.of({"parameters": about.get("requested", about["parameters"])})

@@ -13,7 +13,14 @@ from skindb._blas import one_blas_thread
 from skindb._files import private_file
 from skindb._types import Progress
 from skindb.errors import Fault, InputError, add_filename
-from skindb.ingest import Capture, Crop, IngestParameters, ingest_capture, read_capture, scratch_name
+from skindb.ingest import (
+    Capture,
+    Crop,
+    IngestParameters,
+    ingest_capture,
+    read_capture,
+    scratch_name,
+)
 from skindb.ingest.json_file import read_json
 from skindb.ingest.spool import remove_stale
 from skindb.schema.consent import CONSENT, require_consent
@@ -35,7 +42,8 @@ def ingest_take(
     progress: Progress | None = None,
     **parameters: Any,
 ) -> Record:
-    """Ingest a capture folder and commit it; killed at any point, the same call continues where it was.
+    """Ingest a capture folder and commit it; killed at any point, the same call
+    continues where it was.
 
     Parameters
     ----------
@@ -46,13 +54,15 @@ def ingest_take(
     crop
         What to keep of the scan: a box, the surroundings of the landmarks; None for all of it.
     new_consent
-        Date on which a subject who was withdrawn consented again; the scopes are those of the capture.
+        Date on which a subject who was withdrawn consented again; the scopes are those
+        of the capture.
     wait
         Seconds to wait for another run that ingests or fits the same take.
     progress
         Called with the stage, the number of finished steps and the total number of steps.
     **parameters
-        Of `skindb.ingest.IngestParameters`: spacing_mm, photographs, soft, footprint, visibility, calibration.
+        Of `skindb.ingest.IngestParameters`: spacing_mm, photographs, soft, footprint,
+        visibility, calibration.
 
     Returns
     -------
@@ -62,19 +72,27 @@ def ingest_take(
     Raises
     ------
     InputError
-        With every fault of the folder, before anything is visible; also without the consent to fit, if another run
-        ingests or fits the take, or if the subject was withdrawn and no new consent is given.
+        With every fault of the folder, before anything is visible; also without the
+        consent to fit, if another run ingests or fits the take, or if the subject was
+        withdrawn and no new consent is given.
     """
-    if db.folder is not None and Path(folder).resolve() in (db.folder.resolve(), *db.folder.resolve().parents):
+    if db.folder is not None and Path(folder).resolve() in (
+        db.folder.resolve(),
+        *db.folder.resolve().parents,
+    ):
         rule = "a database lies outside the captures it holds"
         cure = "choose another folder for the database"
         raise InputError(Fault(db.url, rule, f"the capture {folder} around it", cure))
     capture = calibrated_capture(db, read_capture(folder, crop=crop))
     asked = IngestParameters(**parameters)
     scratch = db.scratch() / scratch_name(capture, asked)
-    with logged_action(db, "ingest", [capture.take], arguments={"new_consent": new_consent is not None}):
+    with logged_action(
+        db, "ingest", [capture.take], arguments={"new_consent": new_consent is not None}
+    ):
         if new_consent is not None:
-            require_consent({"consent_scope": capture.consent_scope, "take": capture.take}, "fit")
+            require_consent(
+                {"consent_scope": capture.consent_scope, "take": capture.take}, "fit"
+            )
             db.readmit(subject_of(capture.take), new_consent)
         remove_stale(scratch)
         try:
@@ -85,7 +103,9 @@ def ingest_take(
 
 
 def captured_subjects(folders: Iterable[str | Path]) -> list[str]:
-    """Subjects that the files capture.json of these folders name; those of unreadable ones are omitted."""
+    """Subjects that the files capture.json of these folders name; those of unreadable
+    ones are omitted.
+    """
     subjects = []
     for folder in folders:
         record = read_json(Path(folder) / "capture.json", [])
@@ -96,35 +116,60 @@ def captured_subjects(folders: Iterable[str | Path]) -> list[str]:
 
 
 def _ingest(
-    db: Database, capture: Capture, asked: IngestParameters, scratch: Path, wait: float, progress: Progress | None
+    db: Database,
+    capture: Capture,
+    asked: IngestParameters,
+    scratch: Path,
+    wait: float,
+    progress: Progress | None,
 ) -> Record:
-    lease = db.lease(capture.take, "capture", "model", wait=wait, command="skindb ingest")
-    with add_filename(str(scratch)), lease:  # what is read names its file; what the disk refuses is written there
-        if db.has(CONSENT, subject_of(capture.take)):  # what was recorded since counts, not the folder
-            require_consent({"consent_scope": db.consent(capture.take), "take": capture.take}, "fit")
-        with one_blas_thread(), ingest_capture(capture, asked, scratch=scratch.parent, progress=progress) as tree:
+    lease = db.lease(
+        capture.take, "capture", "model", wait=wait, command="skindb ingest"
+    )
+    # what is read names its file; what the disk refuses is written there
+    with add_filename(str(scratch)), lease:
+        # what was recorded since counts, not the folder
+        if db.has(CONSENT, subject_of(capture.take)):
+            require_consent(
+                {"consent_scope": db.consent(capture.take), "take": capture.take}, "fit"
+            )
+        with (
+            one_blas_thread(),
+            ingest_capture(
+                capture, asked, scratch=scratch.parent, progress=progress
+            ) as tree,
+        ):
             _discard_left(db, capture.take, scratch / NOTE)
             with db.stage("capture", capture.take, lease) as stage:
                 if scratch.is_dir():
-                    private_file(scratch / NOTE).write_text(stage.path, encoding="utf-8")
+                    private_file(scratch / NOTE).write_text(
+                        stage.path, encoding="utf-8"
+                    )
                 stage.write(groups_of(tree))
                 if progress is not None:
                     progress("write", 1, 1)
-                return stage.commit({str(name): value for name, value in tree.attrs.items()})
+                return stage.commit(
+                    {str(name): value for name, value in tree.attrs.items()}
+                )
 
 
 def _require_admitted(db: Database, take: str, scratch: Path) -> None:
-    """Raise a `WithdrawnError` and remove the scratch folder if the subject of a take is withdrawn."""
+    """Raise a `WithdrawnError` and remove the scratch folder if the subject of a take
+    is withdrawn.
+    """
     entry = db.withdrawal(subject_of(take))
     if entry is not None and entry.is_withdrawal:
         shutil.rmtree(scratch, ignore_errors=True)
         rule = "a withdrawn subject must consent again before a capture is ingested"
         cure = "if there is a new consent, state its date with --new-consent"
-        raise WithdrawnError(Fault(subject_of(take), rule, f"a withdrawal on {entry.date}", cure))
+        raise WithdrawnError(
+            Fault(subject_of(take), rule, f"a withdrawal on {entry.date}", cure)
+        )
 
 
 def _discard_left(db: Database, take: str, note: Path) -> None:
     """Remove the data that a killed run of this very ingest had begun to write."""
-    with suppress(InputError, OSError, UnicodeDecodeError):  # a damaged note or log: nothing is removed then
+    # a damaged note or log: nothing is removed then
+    with suppress(InputError, OSError, UnicodeDecodeError):
         if not note.is_symlink():
             db.discard("capture", take, note.read_text(encoding="utf-8"))

@@ -23,7 +23,13 @@ from skindb.workflow.audit import logged
 
 @logged("render")
 def render_take(
-    db: Database, out: Path, take: str, *, edited: bool = False, generation: int | None = None, **options: Any
+    db: Database,
+    out: Path,
+    take: str,
+    *,
+    edited: bool = False,
+    generation: int | None = None,
+    **options: Any,
 ) -> dict[str, Any]:
     """Render the model of a take to a picture.
 
@@ -51,21 +57,38 @@ def render_take(
 
 
 @logged("compare")
-def compare_take(db: Database, take: str, *, generation: int | None = None, **options: Any) -> list[Comparison]:
-    """Compare the photographs of a take with the model's prediction; see `skindb.render.compare_photographs`."""
+def compare_take(
+    db: Database, take: str, *, generation: int | None = None, **options: Any
+) -> list[Comparison]:
+    """Compare the photographs of a take with the model's prediction; see
+    `skindb.render.compare_photographs`.
+    """
     model = _model(db, take, generation)
     return compare_photographs(model, db.source(model), **options)
 
 
 @logged("show")
 def show_take(
-    db: Database, take: str, variable: str, out: Path, *, at: Mapping[str, str] | None = None
+    db: Database,
+    take: str,
+    variable: str,
+    out: Path,
+    *,
+    at: Mapping[str, str] | None = None,
 ) -> dict[str, Any]:
-    """Draw a variable of the newest model of a take, or of its newest capture, to a picture; see `write_field`."""
-    trees = {kind: db.read(kind, take) for kind in ("model", "capture") if take in db.takes(kind)}
+    """Draw a variable of the newest model of a take, or of its newest capture, to a
+    picture; see `write_field`.
+    """
+    trees = {
+        kind: db.read(kind, take)
+        for kind in ("model", "capture")
+        if take in db.takes(kind)
+    }
     if not trees:
         known = ", ".join(db.takes("capture")) or "there is none"
-        raise InputError(Fault("take", "a take of the database is drawn", take, f"choose {known}"))
+        raise InputError(
+            Fault("take", "a take of the database is drawn", take, f"choose {known}")
+        )
     require_consent({"consent_scope": db.consent(take), "take": take}, "export")
     return write_field(trees, variable, out, at=at)
 
@@ -111,7 +134,9 @@ def export_take(
     return path
 
 
-def _model(db: Database, take: str, generation: int | None, *, edited: bool = False) -> xr.DataTree:
+def _model(
+    db: Database, take: str, generation: int | None, *, edited: bool = False
+) -> xr.DataTree:
     """A model or an edit whose subject agrees to exports; a stale edit is refused, or warned of."""
     kind = "edit" if edited else "model"
     model = db.read(kind, take, generation=generation)
@@ -122,7 +147,10 @@ def _model(db: Database, take: str, generation: int | None, *, edited: bool = Fa
 
 
 def _require_outside(db: Database, out: Path) -> None:
-    if db.folder is not None and db.folder.resolve() in (out.resolve(), *out.resolve().parents):
+    if db.folder is not None and db.folder.resolve() in (
+        out.resolve(),
+        *out.resolve().parents,
+    ):
         rule = "pictures and exports are written outside of the database"
         cure = "choose another folder"
         raise InputError(Fault(str(out), rule, f"a place inside {db.url}", cure))

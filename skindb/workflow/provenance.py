@@ -20,7 +20,8 @@ def provenance(
     parameters: Mapping[str, Any],
     seeds: Mapping[str, int] | None = None,
 ) -> dict[str, Any]:
-    """Attributes of a version: the command, its parameters and random seeds, and the versions it was made from.
+    """Attributes of a version: the command, its parameters and random seeds, and the
+    versions it was made from.
 
     The store adds the versions of schema and software.
     """
@@ -32,7 +33,9 @@ def provenance(
     }
 
 
-def as_input(db: Database, kind: str, take: str, version: xr.DataTree) -> dict[str, Any]:
+def as_input(
+    db: Database, kind: str, take: str, version: xr.DataTree
+) -> dict[str, Any]:
     """How provenance names a version that was read."""
     return db.record(kind, take, version.attrs["generation"]).as_input()
 

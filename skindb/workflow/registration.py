@@ -61,8 +61,9 @@ def register_takes(
     Returns
     -------
     dict
-        Take -> record of its version of kind "registration". Where these takes, with these models and this reference,
-        are registered already, that of the version there is.
+        Take -> record of its version of kind "registration". Where these takes, with
+        these models and this reference, are registered already, that of the version
+        there is.
 
     Raises
     ------
@@ -79,16 +80,24 @@ def register_takes(
     if done := _registered_alike(db, names, reference or ""):
         return done
     models = {take: db.record("model", take) for take in names}
-    generations = {take: record.generation for take, record in models.items()}  # small: every task gets all of them
+    # small: every task gets all of them
+    generations = {take: record.generation for take, record in models.items()}
     tell = progress or silent
     where: dict[str, Any] = {"workers": workers, "client": client}
     found_outlines: dict[str, tuple[tuple[str, ...], Outline]] = {}
     tell("outlines", 0, len(names))
-    for take, own, one in results_of(map_takes(partial(_outline, db, generations), names, **where)):
+    for take, own, one in results_of(
+        map_takes(partial(_outline, db, generations), names, **where)
+    ):
         found_outlines[take] = (own, one)
         tell("outlines", len(found_outlines), len(names))
-    points = tuple(dict.fromkeys(name for take in names for name in found_outlines[take][0]))
-    outlines = {take: with_names(found_outlines[take][1], found_outlines[take][0], points) for take in names}
+    points = tuple(
+        dict.fromkeys(name for take in names for name in found_outlines[take][0])
+    )
+    outlines = {
+        take: with_names(found_outlines[take][1], found_outlines[take][0], points)
+        for take in names
+    }
     frame = common_frame(outlines, points, reference=reference)
     assert frame is not None
     inputs = [record.as_input() for record in models.values()]
@@ -109,14 +118,21 @@ def takes_with_landmarks(db: Database, takes: Sequence[str] | None = None) -> li
         rule = "a study needs fitted takes"
         cure = "run skindb fit first"
         raise InputError(Fault(db.url, rule, "no model", cure))
-    return [take for take in names if "statistics" in db.consent(take) and _has_landmarks(db, db.record("model", take))]
+    return [
+        take
+        for take in names
+        if "statistics" in db.consent(take)
+        and _has_landmarks(db, db.record("model", take))
+    ]
 
 
 def current_registrations(db: Database, takes: Sequence[str]) -> dict[str, Record]:
-    """The registrations of takes; none if any is missing or out of date, or if they were not registered together.
+    """The registrations of takes; none if any is missing or out of date, or if they
+    were not registered together.
 
-    The common coordinates depend on every take that was registered along: all of these must still have the models that
-    were used, and consent to statistics. More takes than are asked for do no harm.
+    The common coordinates depend on every take that was registered along: all of these
+    must still have the models that were used, and consent to statistics. More takes
+    than are asked for do no harm.
     """
     if not takes or not all(db.has("registration", take) for take in takes):
         return {}
@@ -124,16 +140,28 @@ def current_registrations(db: Database, takes: Sequence[str]) -> dict[str, Recor
     frames = {frame_of(record) for record in records.values()}
     one = next(iter(records.values()))
     along = {str(made["take"]): made for made in one.made_from}
-    same = len(frames) == 1 and one.provenance["software_version"] == __version__ and set(takes) <= set(along)
-    return records if same and all(_is_current(db, take, made) for take, made in along.items()) else {}
+    same = (
+        len(frames) == 1
+        and one.provenance["software_version"] == __version__
+        and set(takes) <= set(along)
+    )
+    return (
+        records
+        if same and all(_is_current(db, take, made) for take, made in along.items())
+        else {}
+    )
 
 
-def _registered_alike(db: Database, names: Sequence[str], reference: str) -> dict[str, Record]:
+def _registered_alike(
+    db: Database, names: Sequence[str], reference: str
+) -> dict[str, Record]:
     """The registrations of exactly these takes, if another run would find the same ones."""
     records = current_registrations(db, names)
     for record in records.values():
         about = record.provenance
-        same = about["parameters"].get("reference", "") == reference and len(record.made_from) == len(names)
+        same = about["parameters"].get("reference", "") == reference and len(
+            record.made_from
+        ) == len(names)
         if not same or about["summary_parameters"]["digest"] != summary_digest():
             return {}
     return records
@@ -145,16 +173,24 @@ def _is_current(db: Database, take: str, made: Mapping[str, Any]) -> bool:
     return current and "statistics" in db.consent(take)
 
 
-def registered_datasets(db: Database, records: Mapping[str, Record]) -> dict[str, xr.Dataset]:
+def registered_datasets(
+    db: Database, records: Mapping[str, Record]
+) -> dict[str, xr.Dataset]:
     """The group "registration" of versions; what belongs to no surfel is in memory."""
     out = {}
     for take, record in records.items():
-        one = db.read("registration", take, generation=record.generation)["registration"].to_dataset()
-        out[take] = one.assign({name: one[name].load() for name in one if "surfel" not in one[name].dims})
+        one = db.read("registration", take, generation=record.generation)[
+            "registration"
+        ].to_dataset()
+        out[take] = one.assign(
+            {name: one[name].load() for name in one if "surfel" not in one[name].dims}
+        )
     return out
 
 
-def _outline(db: Database, generations: Mapping[str, int], take: str) -> tuple[str, tuple[str, ...], Outline]:
+def _outline(
+    db: Database, generations: Mapping[str, int], take: str
+) -> tuple[str, tuple[str, ...], Outline]:
     model = db.read("model", take, generation=generations[take])
     own = landmark_names([model])
     return take, own, outline(model, own)
@@ -168,18 +204,29 @@ def _register(
     reference: str,
     take: str,
 ) -> Record:
-    model, other = (db.read("model", name, generation=generations[name]) for name in (take, frame.template))
+    model, other = (
+        db.read("model", name, generation=generations[name])
+        for name in (take, frame.template)
+    )
     registered = register_one(take, model, other, frame)
     groups, tables = registered_parts(model, registered)
     about = provenance("register", inputs, parameters={"reference": reference})
     about |= {"take": take, "consent_scope": model.attrs.get("consent_scope", [])}
-    about |= {"summary_parameters": {"surfels": SAMPLED, "seed": 0, "digest": summary_digest()}}
+    about |= {
+        "summary_parameters": {
+            "surfels": SAMPLED,
+            "seed": 0,
+            "digest": summary_digest(),
+        }
+    }
     with db.stage("registration", take, names=generations) as stage:
         stage.write({"registration": registered} | groups, tables=tables)
         return stage.commit(about)
 
 
 def _has_landmarks(db: Database, record: Record) -> bool:
-    if record.contents and "landmark_position" not in record.contents.get("mesh", {}).get("variables", []):
+    if record.contents and "landmark_position" not in record.contents.get(
+        "mesh", {}
+    ).get("variables", []):
         return False
     return has_landmarks(db.read("model", record.take, generation=record.generation))

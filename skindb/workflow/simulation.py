@@ -39,16 +39,19 @@ def simulate(
     takes
         Number of takes of the demo's people, at most 8.
     cohort
-        Number of subjects of a population like that of the paper's table 1, in place of the demo's people. Takes that
-        are there already are kept, so that the same call continues a run that was interrupted.
+        Number of subjects of a population like that of the paper's table 1, in place of
+        the demo's people. Takes that are there already are kept, so that the same call
+        continues a run that was interrupted.
     conditions
         Conditions in which every subject of the cohort is photographed too.
     workers
         Number of takes at a time, each in its own process; default one, in this process.
     progress
-        Called with the stage, the number of finished steps and the total number; only in this process.
+        Called with the stage, the number of finished steps and the total number; only
+        in this process.
     **options
-        Of `skindb.virtual.takes.simulate_takes`: cameras, lights, width, height, head, subsurface, seed.
+        Of `skindb.virtual.takes.simulate_takes`: cameras, lights, width, height, head,
+        subsurface, seed.
 
     Returns
     -------
@@ -60,28 +63,53 @@ def simulate(
     InputError
         If the folder holds a cohort that was made with other options.
     """
-    people = None if cohort is None else begin_cohort(Path(out), cohort, conditions, options)
+    people = (
+        None if cohort is None else begin_cohort(Path(out), cohort, conditions, options)
+    )
     call = partial(simulate_one, Path(out), people=people, progress=progress, **options)
-    folders = dict(results_of(map_takes(call, range(takes if people is None else len(people)), workers=workers)))
+    folders = dict(
+        results_of(
+            map_takes(
+                call, range(takes if people is None else len(people)), workers=workers
+            )
+        )
+    )
     return [folders[number] for number in sorted(folders)]
 
 
-def begin_cohort(out: Path, subjects: int, conditions: Sequence[str], options: dict[str, Any]) -> list[Person]:
-    """The people of a cohort, whose options are noted in its folder, or compared with those that are noted there."""
+def begin_cohort(
+    out: Path, subjects: int, conditions: Sequence[str], options: dict[str, Any]
+) -> list[Person]:
+    """The people of a cohort, whose options are noted in its folder, or compared with
+    those that are noted there.
+    """
     seed = options.get("seed", 2005)
-    asked = {name: str(value) if isinstance(value, Path) else value for name, value in sorted(options.items())}
-    asked["conditions"] = list(conditions)  # which takes have which noise depends on them
+    asked = {
+        name: str(value) if isinstance(value, Path) else value
+        for name, value in sorted(options.items())
+    }
+    # which takes have which noise depends on them
+    asked["conditions"] = list(conditions)
     note = out / COHORT
     if note.is_file():
         try:
             found = json.loads(read_regular(note, MOST_BYTES))
         except (ValueError, RecursionError) as error:
-            raise InputError(Fault(str(note), "must be a JSON object", str(error), "choose another folder")) from None
+            raise InputError(
+                Fault(
+                    str(note),
+                    "must be a JSON object",
+                    str(error),
+                    "choose another folder",
+                )
+            ) from None
         if not isinstance(found, dict):
             found = {}
         if found != asked:
             differ = [
-                f"{name} {found.get(name)}" for name in sorted({*found, *asked}) if found.get(name) != asked.get(name)
+                f"{name} {found.get(name)}"
+                for name in sorted({*found, *asked})
+                if found.get(name) != asked.get(name)
             ]
             rule = "a cohort is continued with the same options"
             cure = "give them, or choose another folder"
@@ -95,7 +123,9 @@ def begin_cohort(out: Path, subjects: int, conditions: Sequence[str], options: d
     return cohort_people(subjects, conditions=conditions, seed=seed)
 
 
-def simulate_one(out: Path, number: int, *, people: Sequence[Person] | None = None, **options: Any) -> tuple[int, Path]:
+def simulate_one(
+    out: Path, number: int, *, people: Sequence[Person] | None = None, **options: Any
+) -> tuple[int, Path]:
     """One of the virtual takes, by its number; see `simulate`."""
     if people is not None:
         folder = out / people[number].take

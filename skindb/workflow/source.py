@@ -1,4 +1,6 @@
-"""Digests of the source of skindb: whether two results, or two processes, are of the very same code."""
+"""Digests of the source of skindb: whether two results, or two processes, are of the
+very same code.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,16 @@ def method_digest(modules: tuple[str, ...] = ("",)) -> str:
     root = Path(version_file).parent
     digest = hashlib.sha256()
     for name in modules:
-        files = sorted((root / name).rglob("*.py")) if (root / name).is_dir() else [root / f"{name}.py"]
+        files = (
+            sorted((root / name).rglob("*.py"))
+            if (root / name).is_dir()
+            else [root / f"{name}.py"]
+        )
         for file in files:
-            digest.update(file.relative_to(root).as_posix().encode() + b"\0" + file.read_bytes() + b"\0")
+            digest.update(
+                file.relative_to(root).as_posix().encode()
+                + b"\0"
+                + file.read_bytes()
+                + b"\0"
+            )
     return digest.hexdigest()

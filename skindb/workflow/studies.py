@@ -1,7 +1,8 @@
-"""Population studies of a database: open a cohort, analyse it, commit the result with what it was made from.
+"""Population studies of a database: open a cohort, analyse it, commit the result with
+what it was made from.
 
-A study that is requested again is computed only if something changed: its takes, their attributes, its parameters
-or the code that computes it.
+A study that is requested again is computed only if something changed: its takes, their
+attributes, its parameters or the code that computes it.
 """
 
 from __future__ import annotations
@@ -17,7 +18,11 @@ from skindb._blas import on_one_blas_thread
 from skindb.analysis.albedo import albedo_histograms, albedo_table
 from skindb.analysis.basis_size import BASIS_SIZE_VARIABLES, basis_size_curve
 from skindb.analysis.brdf_space import brdf_space, grouped_takes
-from skindb.analysis.chromophores import chromophore_axes, chromophore_statistics, chromophore_table
+from skindb.analysis.chromophores import (
+    chromophore_axes,
+    chromophore_statistics,
+    chromophore_table,
+)
 from skindb.analysis.components import face_components
 from skindb.analysis.correlations import component_correlations
 from skindb.analysis.coverage import coverage_report
@@ -36,7 +41,14 @@ from skindb.schema.notes import note
 from skindb.schema.regions import FACE
 from skindb.store import Database
 from skindb.workflow.audit import logged
-from skindb.workflow.study_inputs import Frame, brdf_tables, frame_of, registered_maps, require_covered, study_cohort
+from skindb.workflow.study_inputs import (
+    Frame,
+    brdf_tables,
+    frame_of,
+    registered_maps,
+    require_covered,
+    study_cohort,
+)
 from skindb.workflow.study_versions import MAP_PERMUTATIONS, Groups, StudyRequest, made
 from skindb.workflow.summaries import summarise
 
@@ -53,14 +65,16 @@ def translucency(
     release: str | None = None,
     name: str | None = None,
 ) -> xr.DataTree:
-    """Statistics of sigma_tr by site and channel, committed; see `skindb.analysis.translucency_table`.
+    """Statistics of sigma_tr by site and channel, committed; see
+    `skindb.analysis.translucency_table`.
 
     Parameters
     ----------
     db
         Database with models.
     takes
-        Default all whose consent covers statistics. Takes that are named may be fitted with different parameters.
+        Default all whose consent covers statistics. Takes that are named may be fitted
+        with different parameters.
     group_by
         Attribute or trait to group by.
     release
@@ -76,14 +90,21 @@ def translucency(
     Raises
     ------
     InputError
-        Without takes that consent to statistics, or if they were fitted with different parameters and none is named.
+        Without takes that consent to statistics, or if they were fitted with different
+        parameters and none is named.
     """
     cohort = study_cohort(db, "tables", takes, release)
 
     def compute() -> Groups:
-        return {"translucency_table": translucency_table(cohort, group_by=group_by, mixed_fits=bool(takes))}
+        return {
+            "translucency_table": translucency_table(
+                cohort, group_by=group_by, mixed_fits=bool(takes)
+            )
+        }
 
-    asked = StudyRequest("translucency", name, release, tuple(takes), {"group_by": group_by or ""})
+    asked = StudyRequest(
+        "translucency", name, release, tuple(takes), {"group_by": group_by or ""}
+    )
     return made(db, asked, compute, cohort)
 
 
@@ -97,9 +118,11 @@ def albedo(
     release: str | None = None,
     name: str | None = None,
 ) -> xr.DataTree:
-    """Histograms of diffuse albedo by take and region, and means of groups, committed; parameters as `translucency`.
+    """Histograms of diffuse albedo by take and region, and means of groups, committed;
+    parameters as `translucency`.
 
-    Regions that a capture lacks are those of its landmarks; takes are registered for that if need be.
+    Regions that a capture lacks are those of its landmarks; takes are registered for
+    that if need be.
     """
     require_covered(db, release)
     cohort = study_cohort(db, "surfels", takes, release, surfels=SAMPLED)
@@ -109,9 +132,15 @@ def albedo(
 
     def compute() -> Groups:
         found = _albedo(db, cohort, frame, release, mixed=bool(takes))
-        return found | {"albedo_table": albedo_table(cohort, albedo=found["albedo"], group_by=group_by)}
+        return found | {
+            "albedo_table": albedo_table(
+                cohort, albedo=found["albedo"], group_by=group_by
+            )
+        }
 
-    asked = StudyRequest("albedo", name, release, tuple(takes), {"group_by": group_by or ""})
+    asked = StudyRequest(
+        "albedo", name, release, tuple(takes), {"group_by": group_by or ""}
+    )
     return made(db, asked, compute, cohort, frame)
 
 
@@ -126,7 +155,8 @@ def basis_size(
     release: str | None = None,
     name: str | None = None,
 ) -> xr.DataTree:
-    """Error of reflectance against the number of basis BRDFs, committed; see `skindb.analysis.basis_size_curve`.
+    """Error of reflectance against the number of basis BRDFs, committed; see
+    `skindb.analysis.basis_size_curve`.
 
     Parameters
     ----------
@@ -137,15 +167,27 @@ def basis_size(
     dictionary
         Path of the dictionary that the takes were fitted with; default the embedded one.
     """
-    variables = (*BASIS_SIZE_VARIABLES, "dictionary_weight")  # whose labels name the BRDFs of the fits
-    cohort = study_cohort(db, "surfels", takes, release, surfels=BASIS_SURFELS, variables=variables)
+    # whose labels name the BRDFs of the fits
+    variables = (*BASIS_SIZE_VARIABLES, "dictionary_weight")
+    cohort = study_cohort(
+        db, "surfels", takes, release, surfels=BASIS_SURFELS, variables=variables
+    )
 
     def compute() -> Groups:
         tables = brdf_tables(db, cohort, dictionary, release)
         rng = np.random.default_rng(seed)
-        return {"basis_size": basis_size_curve(cohort, tables=tables, mixed_fits=bool(takes), rng=rng)}
+        return {
+            "basis_size": basis_size_curve(
+                cohort, tables=tables, mixed_fits=bool(takes), rng=rng
+            )
+        }
 
-    return made(db, StudyRequest("brdf", name, release, tuple(takes), {"seed": seed}, dictionary), compute, cohort)
+    return made(
+        db,
+        StudyRequest("brdf", name, release, tuple(takes), {"seed": seed}, dictionary),
+        compute,
+        cohort,
+    )
 
 
 @on_one_blas_thread
@@ -162,7 +204,8 @@ def traits(
     release: str | None = None,
     name: str | None = None,
 ) -> xr.DataTree:
-    """A common basis, histograms of albedo and trait vectors, committed; see `skindb.analysis.trait_vectors`.
+    """A common basis, histograms of albedo and trait vectors, committed; see
+    `skindb.analysis.trait_vectors`.
 
     Parameters
     ----------
@@ -186,14 +229,26 @@ def traits(
     def compute() -> Groups:
         rng = np.random.default_rng(seed)
         brdfs = brdf_tables(db, cohort, dictionary, release)
-        basis = population_basis(cohort, tables=brdfs, k=k, in_metric=in_metric, mixed_fits=mixed, rng=rng)
+        basis = population_basis(
+            cohort, tables=brdfs, k=k, in_metric=in_metric, mixed_fits=mixed, rng=rng
+        )
         found = _albedo(db, cohort, frame, release, mixed=mixed)
-        options: dict[str, Any] = {"adjust": adjust, "mixed_fits": mixed, "rng": rng} | found
+        options: dict[str, Any] = {
+            "adjust": adjust,
+            "mixed_fits": mixed,
+            "rng": rng,
+        } | found
         vectors = trait_vectors(tables, basis=basis, **options)
         return {"population_basis": basis, "traits": vectors} | found
 
     given = {"k": k, "in_metric": in_metric, "adjust": list(adjust), "seed": seed}
-    return made(db, StudyRequest("traits", name, release, tuple(takes), given, dictionary), compute, cohort, frame)
+    return made(
+        db,
+        StudyRequest("traits", name, release, tuple(takes), given, dictionary),
+        compute,
+        cohort,
+        frame,
+    )
 
 
 @on_one_blas_thread
@@ -221,12 +276,25 @@ def groups(
         Random seed of the permutations.
     """
     cohort = study_cohort(db, "tables", takes, release)
-    given: dict[str, Any] = {"group_by": group_by, "adjust": list(adjust), "permutations": permutations}
+    given: dict[str, Any] = {
+        "group_by": group_by,
+        "adjust": list(adjust),
+        "permutations": permutations,
+    }
 
     def compute() -> Groups:
-        return {"effects": group_effects(cohort, **given, mixed_fits=bool(takes), rng=np.random.default_rng(seed))}
+        return {
+            "effects": group_effects(
+                cohort, **given, mixed_fits=bool(takes), rng=np.random.default_rng(seed)
+            )
+        }
 
-    return made(db, StudyRequest("groups", name, release, tuple(takes), given | {"seed": seed}), compute, cohort)
+    return made(
+        db,
+        StudyRequest("groups", name, release, tuple(takes), given | {"seed": seed}),
+        compute,
+        cohort,
+    )
 
 
 @on_one_blas_thread
@@ -255,11 +323,18 @@ def correlations(
 
     def compute() -> Groups:
         rng = np.random.default_rng(seed)
-        table = component_correlations(cohort, permutations=permutations, mixed_fits=bool(takes), rng=rng)
+        table = component_correlations(
+            cohort, permutations=permutations, mixed_fits=bool(takes), rng=rng
+        )
         return {"correlations": table}
 
     given = {"permutations": permutations, "seed": seed}
-    return made(db, StudyRequest("correlations", name, release, tuple(takes), given), compute, cohort)
+    return made(
+        db,
+        StudyRequest("correlations", name, release, tuple(takes), given),
+        compute,
+        cohort,
+    )
 
 
 @on_one_blas_thread
@@ -272,7 +347,8 @@ def components(
     release: str | None = None,
     name: str | None = None,
 ) -> xr.DataTree:
-    """Principal components of the albedo maps of takes, committed; see `skindb.analysis.face_components`.
+    """Principal components of the albedo maps of takes, committed; see
+    `skindb.analysis.face_components`.
 
     Parameters
     ----------
@@ -286,7 +362,13 @@ def components(
     def compute() -> Groups:
         return {"components": face_components(cohort, most=k, mixed_fits=bool(takes))}
 
-    return made(db, StudyRequest("components", name, release, tuple(takes), {"k": k}), compute, cohort, frame)
+    return made(
+        db,
+        StudyRequest("components", name, release, tuple(takes), {"k": k}),
+        compute,
+        cohort,
+        frame,
+    )
 
 
 @on_one_blas_thread
@@ -314,12 +396,26 @@ def maps(
         Random seed of the permutations.
     """
     cohort, frame = registered_maps(db, takes, release)
-    given: dict[str, Any] = {"group_by": group_by, "adjust": list(adjust), "permutations": permutations}
+    given: dict[str, Any] = {
+        "group_by": group_by,
+        "adjust": list(adjust),
+        "permutations": permutations,
+    }
 
     def compute() -> Groups:
-        return {"effect_maps": effect_maps(cohort, **given, mixed_fits=bool(takes), rng=np.random.default_rng(seed))}
+        return {
+            "effect_maps": effect_maps(
+                cohort, **given, mixed_fits=bool(takes), rng=np.random.default_rng(seed)
+            )
+        }
 
-    return made(db, StudyRequest("maps", name, release, tuple(takes), given | {"seed": seed}), compute, cohort, frame)
+    return made(
+        db,
+        StudyRequest("maps", name, release, tuple(takes), given | {"seed": seed}),
+        compute,
+        cohort,
+        frame,
+    )
 
 
 @on_one_blas_thread
@@ -335,8 +431,9 @@ def chromophores(
 ) -> xr.DataTree:
     """Melanin and haemoglobin of takes, regions and groups, and the mean face, committed.
 
-    Takes are registered for that if need be. See `skindb.analysis.chromophore_axes`, `chromophore_table` and
-    `mean_face`; the mean face is omitted, with a note, where no texel has enough subjects.
+    Takes are registered for that if need be. See `skindb.analysis.chromophore_axes`,
+    `chromophore_table` and `mean_face`; the mean face is omitted, with a note, where no
+    texel has enough subjects.
 
     Parameters
     ----------
@@ -350,24 +447,42 @@ def chromophores(
     def compute() -> Groups:
         mixed = bool(takes)
         landmarks = common_landmarks(frame.datasets)
-        axes = chromophore_axes(cohort, landmarks=landmarks, mixed_fits=mixed, rng=np.random.default_rng(seed))
+        axes = chromophore_axes(
+            cohort,
+            landmarks=landmarks,
+            mixed_fits=mixed,
+            rng=np.random.default_rng(seed),
+        )
         statistics = chromophore_statistics(cohort, axes=axes, landmarks=landmarks)
         table = chromophore_table(cohort, statistics=statistics, group_by=group_by)
-        found = {"chromophores": axes.merge(statistics, combine_attrs="override"), "chromophore_table": table}
+        found = {
+            "chromophores": axes.merge(statistics, combine_attrs="override"),
+            "chromophore_table": table,
+        }
         try:
             found["mean_face"] = mean_face(cohort, mixed_fits=mixed)
         except InputError as error:  # a few people have pigments, but no mean
             frame.notes.extend(note("", str(fault)) for fault in error.faults)
         return found
 
-    asked = StudyRequest("chromophores", name, release, tuple(takes), {"group_by": group_by or "", "seed": seed})
+    asked = StudyRequest(
+        "chromophores",
+        name,
+        release,
+        tuple(takes),
+        {"group_by": group_by or "", "seed": seed},
+    )
     return made(db, asked, compute, cohort, frame)
 
 
 @on_one_blas_thread
 @logged("study", what="coverage")
 def coverage(
-    db: Database, *, takes: Sequence[str] = (), release: str | None = None, name: str | None = None
+    db: Database,
+    *,
+    takes: Sequence[str] = (),
+    release: str | None = None,
+    name: str | None = None,
 ) -> xr.DataTree:
     """Report which groups the fitted takes represent; see `skindb.analysis.coverage_report`.
 
@@ -381,7 +496,9 @@ def coverage(
     def compute() -> Groups:
         return {"coverage": coverage_report(cohort)}
 
-    return made(db, StudyRequest("coverage", name, release, tuple(takes), {}), compute, cohort)
+    return made(
+        db, StudyRequest("coverage", name, release, tuple(takes), {}), compute, cohort
+    )
 
 
 @on_one_blas_thread
@@ -398,7 +515,8 @@ def surface(
     release: str | None = None,
     name: str | None = None,
 ) -> xr.DataTree:
-    """Surface BRDFs of groups, distances between them and a map of the takes; see `skindb.analysis.brdf_space`.
+    """Surface BRDFs of groups, distances between them and a map of the takes; see
+    `skindb.analysis.brdf_space`.
 
     Parameters
     ----------
@@ -414,7 +532,8 @@ def surface(
     Raises
     ------
     InputError
-        As `translucency` and `skindb.analysis.brdf_space`, and for a k above the number of BRDFs or of surfels.
+        As `translucency` and `skindb.analysis.brdf_space`, and for a k above the number
+        of BRDFs or of surfels.
     """
     mixed = bool(takes)
     tables = study_cohort(db, "tables", takes, release)
@@ -426,15 +545,30 @@ def surface(
         rng = np.random.default_rng(seed)
         basis = population_basis(cohort, tables=brdfs, k=k, mixed_fits=mixed, rng=rng)
         if (found := basis.sizes["component"]) < k:
-            rule = "must not be above the number of BRDFs of the dictionary or of surfels"
-            raise InputError(Fault("k", rule, f"{k}, and {found} of them", "choose a smaller k"))
+            rule = (
+                "must not be above the number of BRDFs of the dictionary or of surfels"
+            )
+            raise InputError(
+                Fault("k", rule, f"{k}, and {found} of them", "choose a smaller k")
+            )
         space = brdf_space(
-            tables, basis=basis, tables=brdfs, group_by=group_by, permutations=permutations, mixed_fits=mixed, rng=rng
+            tables,
+            basis=basis,
+            tables=brdfs,
+            group_by=group_by,
+            permutations=permutations,
+            mixed_fits=mixed,
+            rng=rng,
         )
         return {"population_basis": basis, "brdf_space": space}
 
     given = {"group_by": group_by, "k": k, "permutations": permutations, "seed": seed}
-    return made(db, StudyRequest("surface", name, release, tuple(takes), given, dictionary), compute, cohort)
+    return made(
+        db,
+        StudyRequest("surface", name, release, tuple(takes), given, dictionary),
+        compute,
+        cohort,
+    )
 
 
 STUDIES: dict[str, Callable[..., xr.DataTree]] = {
@@ -455,8 +589,8 @@ STUDIES: dict[str, Callable[..., xr.DataTree]] = {
 def _albedo(
     db: Database, cohort: xr.Dataset, frame: Frame, release: str | None, *, mixed: bool
 ) -> dict[str, xr.Dataset]:
-    """Histograms, in regions by landmarks where a capture names none; distributions at every scale of takes that are
-    registered.
+    """Histograms, in regions by landmarks where a capture names none; distributions at
+    every scale of takes that are registered.
     """
     regions: tuple[str, ...] = (FACE, "beard")
     drawn = None
@@ -464,9 +598,21 @@ def _albedo(
     if names := list(frame.records):
         regions = (FACE, "beard", "no_beard")
         summarise(db, names, release=release)
-        options: dict[str, Any] = {"surfels": SAMPLED, "variables": ["region_mask", "surfel_index"], "release": release}
+        options: dict[str, Any] = {
+            "surfels": SAMPLED,
+            "variables": ["region_mask", "surfel_index"],
+            "release": release,
+        }
         drawn = db.cohort("surfels", kind="registration", takes=names, **options)
         summarise(db, names, release=release, size=TEXELS)
-        maps = db.cohort("maps", size=TEXELS, takes=names, variables=MAPPED, release=release)
-        texture["texture"] = texture_statistics(maps, landmarks=common_landmarks(frame.datasets), mixed_fits=mixed)
-    return {"albedo": albedo_histograms(cohort, regions=regions, drawn=drawn, mixed_fits=mixed)} | texture
+        maps = db.cohort(
+            "maps", size=TEXELS, takes=names, variables=MAPPED, release=release
+        )
+        texture["texture"] = texture_statistics(
+            maps, landmarks=common_landmarks(frame.datasets), mixed_fits=mixed
+        )
+    return {
+        "albedo": albedo_histograms(
+            cohort, regions=regions, drawn=drawn, mixed_fits=mixed
+        )
+    } | texture

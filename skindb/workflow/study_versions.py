@@ -1,4 +1,6 @@
-"""Studies as versions: the names they are stored under, and whether a requested one exists already."""
+"""Studies as versions: the names they are stored under, and whether a requested one
+exists already.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,8 @@ from skindb.workflow.provenance import method_digest, provenance
 from skindb.workflow.study_inputs import Frame
 
 MAP_PERMUTATIONS = 1000  # each of 100,000 texels and more
-OF_NORMAL_TAKES = ("groups", "maps", "surface", "correlations", "translucency")  # unless conditions are compared
+# unless conditions are compared
+OF_NORMAL_TAKES = ("groups", "maps", "surface", "correlations", "translucency")
 STUDY_NAME = r"[A-Za-z0-9_-]{1,64}"
 METHOD = (
     "analysis",
@@ -42,7 +45,10 @@ DEFAULTS = {
     "adjust": [],
     "permutations": 10_000,
 }
-OWN_DEFAULTS: dict[str, dict[str, Any]] = {"maps": {"permutations": MAP_PERMUTATIONS}, "components": {"k": 5}}
+OWN_DEFAULTS: dict[str, dict[str, Any]] = {
+    "maps": {"permutations": MAP_PERMUTATIONS},
+    "components": {"k": 5},
+}
 
 
 @dataclass(frozen=True)
@@ -54,24 +60,34 @@ class StudyRequest:
     release: str | None
     takes: tuple[str, ...]
     parameters: Mapping[str, Any]
-    dictionary: Path | None = None  # whose file may change: a study with one is always computed
+    # whose file may change: a study with one is always computed
+    dictionary: Path | None = None
 
     def recorded(self) -> dict[str, Any]:
         """What another run needs to repeat it."""
-        return {**self.parameters, "takes": list(self.takes), "release": self.release or ""}
+        return {
+            **self.parameters,
+            "takes": list(self.takes),
+            "release": self.release or "",
+        }
 
 
 def study_key(asked: StudyRequest) -> str:
     """What a study is stored as.
 
-    The study of everything with default parameters is stored under its own word, "traits"; with other parameters it is
-    "traits.k-8", and with a name "traits.<name>". No study replaces one that was asked for differently; one with
-    another random seed is the next generation of the same.
+    The study of everything with default parameters is stored under its own word,
+    "traits"; with other parameters it is "traits.k-8", and with a name "traits.<name>".
+    No study replaces one that was asked for differently; one with another random seed
+    is the next generation of the same.
     """
     if asked.name is not None:
         return f"{asked.what}.{require_text(asked.name, STUDY_NAME, 'name of a study')}"
     defaults = DEFAULTS | OWN_DEFAULTS.get(asked.what, {})
-    given = {key: value for key, value in asked.recorded().items() if key != "seed" and value != defaults[key]}
+    given = {
+        key: value
+        for key, value in asked.recorded().items()
+        if key != "seed" and value != defaults[key]
+    }
     if not given:
         return asked.what
     words = dict(given)
@@ -79,17 +95,30 @@ def study_key(asked: StudyRequest) -> str:
         words["adjust"] = "-".join(given["adjust"])
     text = "_".join(f"{key}-{value}" for key, value in words.items())
     if not re.fullmatch(STUDY_NAME, text):
-        text = hashlib.sha256(json.dumps(given, sort_keys=True).encode()).hexdigest()[:16]
+        text = hashlib.sha256(json.dumps(given, sort_keys=True).encode()).hexdigest()[
+            :16
+        ]
     return f"{asked.what}.{text}"
 
 
 def made(
-    db: Database, asked: StudyRequest, compute: Callable[[], Groups], cohort: xr.Dataset, frame: Frame | None = None
+    db: Database,
+    asked: StudyRequest,
+    compute: Callable[[], Groups],
+    cohort: xr.Dataset,
+    frame: Frame | None = None,
 ) -> xr.DataTree:
-    """The stored study if it was made from these very versions in this way, or a new one, committed."""
-    generations = zip(cohort["take"].values, cohort["model_generation"].values, strict=True)
+    """The stored study if it was made from these very versions in this way, or a new
+    one, committed.
+    """
+    generations = zip(
+        cohort["take"].values, cohort["model_generation"].values, strict=True
+    )
     markers = db.markers()
-    used = [db.record("model", str(take), int(generation), markers=markers) for take, generation in generations]
+    used = [
+        db.record("model", str(take), int(generation), markers=markers)
+        for take, generation in generations
+    ]
     used += [*frame.records.values()] if frame else []
     inputs = [record.as_input() for record in used]
     parameters = {"what": asked.what, **asked.recorded()}
@@ -97,17 +126,28 @@ def made(
     key = study_key(asked)
     about = provenance("analyze", inputs, parameters=parameters, seeds=seeds)
     skipped = list(cohort.attrs["skipped"])
-    if asked.what in OF_NORMAL_TAKES and not str(asked.parameters.get("group_by", "")).startswith("condition"):
+    if asked.what in OF_NORMAL_TAKES and not str(
+        asked.parameters.get("group_by", "")
+    ).startswith("condition"):
         skipped += subjects_without_normal(cohort)
-    about |= {"study": key, "skipped": skipped, "outdated": list(cohort.attrs["outdated"])}
-    about |= {"attributes_digest": _attributes_digest(cohort), "method_digest": method_digest(METHOD)}
+    about |= {
+        "study": key,
+        "skipped": skipped,
+        "outdated": list(cohort.attrs["outdated"]),
+    }
+    about |= {
+        "attributes_digest": _attributes_digest(cohort),
+        "method_digest": method_digest(METHOD),
+    }
     if asked.dictionary is None and _is_stored(db, key, about):
         return db.read(STUDY, key)
     groups = compute()
     notes = frame.notes if frame else []
     about |= {"registration": notes} if notes else {}
     names = {record.take for record in used}.union(*(record.names for record in used))
-    names |= {one["take"] for one in [*skipped, *about["outdated"], *notes] if one["take"]}
+    names |= {
+        one["take"] for one in [*skipped, *about["outdated"], *notes] if one["take"]
+    }
     with db.stage(STUDY, key, names=names | {*asked.takes}) as stage:
         stage.write(groups)
         stage.commit(about)
@@ -119,14 +159,20 @@ def _is_stored(db: Database, key: str, about: Mapping[str, Any]) -> bool:
     if not db.has(STUDY, key):
         return False
     stored = db.record(STUDY, key).provenance
-    return json.dumps({name: stored.get(name) for name in about}, sort_keys=True) == json.dumps(about, sort_keys=True)
+    return json.dumps(
+        {name: stored.get(name) for name in about}, sort_keys=True
+    ) == json.dumps(about, sort_keys=True)
 
 
 def _attributes_digest(cohort: xr.Dataset) -> str:
-    """Digest of the coordinates that describe the takes: age, gender, condition, parameters of the fit."""
+    """Digest of the coordinates that describe the takes: age, gender, condition,
+    parameters of the fit.
+    """
     said = {
         str(name): [str(value) for value in coordinate.values]
-        for name, coordinate in sorted(cohort.coords.items(), key=lambda item: str(item[0]))
+        for name, coordinate in sorted(
+            cohort.coords.items(), key=lambda item: str(item[0])
+        )
         if coordinate.dims == ("take",)
     }
     return hashlib.sha256(json.dumps(said, sort_keys=True).encode()).hexdigest()

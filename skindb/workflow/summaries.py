@@ -1,4 +1,6 @@
-"""What cohorts need of versions that do not keep it themselves: kept as versions of kind summary."""
+"""What cohorts need of versions that do not keep it themselves: kept as versions of
+kind summary.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,12 @@ import xarray as xr
 
 from skindb.analysis.common_maps import SIZE, common_maps
 from skindb.analysis.masks import take_masks
-from skindb.analysis.summary import SAMPLED, region_tables, sample_surfels, summary_tables
+from skindb.analysis.summary import (
+    SAMPLED,
+    region_tables,
+    sample_surfels,
+    summary_tables,
+)
 from skindb.fit import prediction_table
 from skindb.schema import FitStatus, dataset
 from skindb.schema.regions import FACE
@@ -46,8 +53,9 @@ def summarise(
 ) -> list[str]:
     """Store what cohorts with these options need, for takes that lack it.
 
-    New models and registrations keep their tables, a sample of 5,000 surfels with the seed 0, and maps of 512 texels;
-    this is for other samples and sizes, and for models of earlier versions of skindb.
+    New models and registrations keep their tables, a sample of 5,000 surfels with the
+    seed 0, and maps of 512 texels; this is for other samples and sizes, and for models
+    of earlier versions of skindb.
 
     Parameters
     ----------
@@ -80,17 +88,26 @@ def summarise(
     sample = CohortRequest("surfels", surfels=surfels, seed=seed, digest=code)
     known = Known(db, release)
     maps = CohortRequest("maps", size=size, digest=code)
-    models = [known.record("model", take) for take in lacking(db, "model", [tables, sample], names, release=release)]
+    models = [
+        known.record("model", take)
+        for take in lacking(db, "model", [tables, sample], names, release=release)
+    ]
     registered = [take for take in names if known.has("registration", take)]
     lack = lacking(db, "registration", [maps, sample], registered, release=release)
     frames = [known.record("registration", take) for take in lack]
-    done = list(results_of(map_takes(partial(_model, db, sample), models, workers=workers)))
-    done += results_of(map_takes(partial(_registration, db, sample, size), frames, workers=workers))
+    done = list(
+        results_of(map_takes(partial(_model, db, sample), models, workers=workers))
+    )
+    done += results_of(
+        map_takes(partial(_registration, db, sample, size), frames, workers=workers)
+    )
     return sorted({record.take for record in done})
 
 
 def summary_digest() -> str:
-    """Digest of the code that computes tables, samples and maps; results of other code are computed again."""
+    """Digest of the code that computes tables, samples and maps; results of other code
+    are computed again.
+    """
     return method_digest(METHOD)
 
 
@@ -99,11 +116,17 @@ def tables_of(model: xr.DataTree) -> xr.Dataset:
     tables = summary_tables(model)
     prediction = prediction_table(model["fitted"].to_dataset().load())
     # a region without any surfel has no row there
-    rows = prediction.reindex(region=tables["region"].values, fill_value={"prediction_surfels": 0})
-    return xr.merge([tables, rows], combine_attrs="override", join="outer", compat="no_conflicts")
+    rows = prediction.reindex(
+        region=tables["region"].values, fill_value={"prediction_surfels": 0}
+    )
+    return xr.merge(
+        [tables, rows], combine_attrs="override", join="outer", compat="no_conflicts"
+    )
 
 
-def sample_groups(model: xr.DataTree, *, surfels: int = SAMPLED, seed: int = 0) -> dict[str, xr.Dataset]:
+def sample_groups(
+    model: xr.DataTree, *, surfels: int = SAMPLED, seed: int = 0
+) -> dict[str, xr.Dataset]:
     """The group "sample" of a model; none if no surfel was fitted."""
     if not bool((model["fitted"].to_dataset()["fit_status"] == FitStatus.FITTED).any()):
         return {}
@@ -111,17 +134,31 @@ def sample_groups(model: xr.DataTree, *, surfels: int = SAMPLED, seed: int = 0) 
 
 
 def registered_parts(
-    model: xr.DataTree, registered: xr.Dataset, *, surfels: int = SAMPLED, seed: int = 0, size: int = SIZE
+    model: xr.DataTree,
+    registered: xr.Dataset,
+    *,
+    surfels: int = SAMPLED,
+    seed: int = 0,
+    size: int = SIZE,
 ) -> tuple[dict[str, xr.Dataset], xr.Dataset]:
-    """Groups and tables that cohorts need of a registered take: maps, and the regions that its landmarks give."""
+    """Groups and tables that cohorts need of a registered take: maps, and the regions
+    that its landmarks give.
+    """
     fitted = model["fitted"].to_dataset().load()
     masks = take_masks(model, registered)
     groups = {"maps": common_maps(model, registered, size=size)}
     if sampled := sample_groups(model, surfels=surfels, seed=seed):
         index = sampled["sample"]["surfel_index"].values
-        mask = np.array([mask[index] for mask in masks.values()]).reshape(len(masks), len(index))
-        groups["sample"] = dataset({"surfel_index": index, "region_mask": mask.T}, coords={"region": list(masks)})
-    return groups, region_tables(fitted, {FACE: np.ones(fitted.sizes["surfel"], np.bool_)} | masks)
+        mask = np.array([mask[index] for mask in masks.values()]).reshape(
+            len(masks), len(index)
+        )
+        groups["sample"] = dataset(
+            {"surfel_index": index, "region_mask": mask.T},
+            coords={"region": list(masks)},
+        )
+    return groups, region_tables(
+        fitted, {FACE: np.ones(fitted.sizes["surfel"], np.bool_)} | masks
+    )
 
 
 def _model(db: Database, sample: CohortRequest, record: Record) -> Record:
@@ -130,7 +167,9 @@ def _model(db: Database, sample: CohortRequest, record: Record) -> Record:
     return _commit(db, record, groups, tables_of(model), sample, 0)
 
 
-def _registration(db: Database, sample: CohortRequest, size: int, record: Record) -> Record:
+def _registration(
+    db: Database, sample: CohortRequest, size: int, record: Record
+) -> Record:
     version = db.read("registration", record.take, generation=record.generation)
     model = db.source(version, "model", record.take)
     registered = version["registration"].to_dataset()
@@ -140,11 +179,21 @@ def _registration(db: Database, sample: CohortRequest, size: int, record: Record
 
 
 def _commit(
-    db: Database, record: Record, groups: dict[str, xr.Dataset], tables: xr.Dataset, sample: CohortRequest, size: int
+    db: Database,
+    record: Record,
+    groups: dict[str, xr.Dataset],
+    tables: xr.Dataset,
+    sample: CohortRequest,
+    size: int,
 ) -> Record:
     asked = {"surfels": sample.surfels, "seed": sample.seed, "digest": summary_digest()}
     asked |= {"size": size} if size else {}
-    about = provenance("summarise", [record.as_input()], parameters=asked, seeds={"sample": sample.seed})
+    about = provenance(
+        "summarise",
+        [record.as_input()],
+        parameters=asked,
+        seeds={"sample": sample.seed},
+    )
     about |= {
         "summary_parameters": asked,
         "consent_scope": record.provenance.get("consent_scope", []),

@@ -1,4 +1,6 @@
-"""Takes whose capture was made with an earlier version of a calibration; only ingest can update them."""
+"""Takes whose capture was made with an earlier version of a calibration; only ingest
+can update them.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,8 @@ def superseded_calibrations(db: Database) -> dict[str, list[str]]:
     Returns
     -------
     dict
-        Name of a calibration -> takes, in order. A damaged record counts as none: `Database.verify` names it.
+        Name of a calibration -> takes, in order. A damaged record counts as none:
+        `Database.verify` names it.
     """
     newest = dict[str, int]()
     for name in db.takes(CALIBRATION):
@@ -47,12 +50,17 @@ def superseded_calibrations(db: Database) -> dict[str, list[str]]:
 
 
 def superseded_lines(found: Mapping[str, Sequence[str]]) -> list[str]:
-    """What `superseded_calibrations` found in words, one line for each calibration: what happened and what to do."""
+    """What `superseded_calibrations` found in words, one line for each calibration:
+    what happened and what to do.
+    """
     lines = []
     for name, takes in found.items():
         count = "1 take was" if len(takes) == 1 else f"{len(takes)} takes were"
-        named = f"{', '.join(takes[:MAX_NAMED])}{', ...' if len(takes) > MAX_NAMED else ''}"
+        named = (
+            f"{', '.join(takes[:MAX_NAMED])}{', ...' if len(takes) > MAX_NAMED else ''}"
+        )
         lines.append(
-            f"{count} ingested with an earlier version of calibration {name}: {named}; run skindb ingest again"
+            f"{count} ingested with an earlier version of calibration {name}: "
+            f"{named}; run skindb ingest again"
         )
     return lines

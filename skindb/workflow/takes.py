@@ -33,8 +33,10 @@ if TYPE_CHECKING:
 Take = TypeVar("Take")
 Result = TypeVar("Result")
 IDLE_SECONDS = 600  # after which an idle worker process ends
-PARENT_SECONDS = 0.5  # between two checks of a worker process whether its parent is alive
-# bytes that a worker may keep between takes: tables are 200 MB, and loky replaces workers that keep 300, with a warning
+# between two checks of a worker process whether its parent is alive
+PARENT_SECONDS = 0.5
+# bytes that a worker may keep between takes: tables are 200 MB, and loky replaces
+# workers that keep 300, with a warning
 LOKY = {"LOKY_MAX_MEMORY_LEAK_SIZE": str(1 << 30)}
 
 
@@ -46,7 +48,8 @@ class Outcome(Generic[Take, Result]):
     value: Result | None = None
     error: InputError | OSError | None = None
     traceback: str = ""  # of an error that is a defect of the program
-    attempts: int = 1  # 2 if a process died while this take, or another one in the pool, was processed
+    # 2 if a process died while this take, or another one in the pool, was processed
+    attempts: int = 1
 
     def result(self) -> Result:
         """The result; raises the error if there is one."""
@@ -63,36 +66,43 @@ def map_takes(
     client: Client | None = None,
     shared: Path | None = None,
 ) -> Iterator[Outcome[Take, Result]]:
-    """Call a function for every take, several at a time, and yield each outcome as soon as it is available.
+    """Call a function for every take, several at a time, and yield each outcome as soon
+    as it is available.
 
-    A take that fails does not stop the others. Each call reads and commits its own data and returns a small result. The
-    threads that a call uses are limited so that all workers together do not use more than there are cores.
+    A take that fails does not stop the others. Each call reads and commits its own data
+    and returns a small result. The threads that a call uses are limited so that all
+    workers together do not use more than there are cores.
 
     Parameters
     ----------
     function
-        Called with one take. With `workers` or `client` it is pickled, by value if it was defined in a notebook.
+        Called with one take. With `workers` or `client` it is pickled, by value if it
+        was defined in a notebook.
     takes
         Names, folders, numbers: whatever `function` takes.
     workers
-        Number of local processes; they stay warm for the next call. Default None and 1 work in this process.
+        Number of local processes; they stay warm for the next call. Default None and 1
+        work in this process.
     client
-        A Dask client to work on instead, see `connected`. A worker does one take at a time, with all its threads.
+        A Dask client to work on instead, see `connected`. A worker does one take at a
+        time, with all its threads.
     shared
         With `client`: folder that every worker must see as the same one.
 
     Yields
     ------
     Outcome
-        In the order in which the calls end. Where a process is killed (usually by a lack of memory), the takes that
-        were being processed are tried again, one at a time; the one whose process is killed again fails. Before
-        that, a cluster itself tries each take on more workers, by default three (its setting
+        In the order in which the calls end. Where a process is killed (usually by a
+        lack of memory), the takes that were being processed are tried again, one at a
+        time; the one whose process is killed again fails. Before that, a cluster itself
+        tries each take on more workers, by default three (its setting
         `distributed.scheduler.allowed-failures`).
 
     Raises
     ------
     InputError
-        If workers of the cluster have another version of skindb, or another folder, or if its scheduler is lost.
+        If workers of the cluster have another version of skindb, or another folder, or
+        if its scheduler is lost.
 
     Examples
     --------
@@ -140,19 +150,28 @@ def _attempt(function: Callable[[Take], Result], take: Take) -> Outcome[Take, Re
         return Outcome(take, error=error)
     except OSError as error:  # plain, so that it can be pickled whatever it was
         where = error.filename if error.filename is None else str(error.filename)
-        return Outcome(take, error=OSError(error.errno, error.strerror or str(error), where))
-    except (Exception, SystemExit) as error:  # noqa: BLE001  a defect that one take shows must not stop the others
-        return Outcome(take, error=_defect(take, error), traceback=traceback.format_exc())
+        return Outcome(
+            take, error=OSError(error.errno, error.strerror or str(error), where)
+        )
+    # a defect that one take shows must not stop the others
+    except (Exception, SystemExit) as error:  # noqa: BLE001
+        return Outcome(
+            take, error=_defect(take, error), traceback=traceback.format_exc()
+        )
 
 
 def _defect(take: Any, error: BaseException) -> InputError:
     found = f"{type(error).__name__}: {error}"
     cure = "this is a defect of skindb: report it with the traceback that -v shows"
-    return InputError(Fault(str(take), "a take must not end in an internal error", found, cure))
+    return InputError(
+        Fault(str(take), "a take must not end in an internal error", found, cure)
+    )
 
 
 def _in_worker(function: Callable[[Take], Result], threads: int, take: Take) -> bytes:
-    """Pickle the outcome of a call in a worker process; a result that cannot be pickled is a fault of its take."""
+    """Pickle the outcome of a call in a worker process; a result that cannot be pickled
+    is a fault of its take.
+    """
     with dask.config.set(scheduler="threads", num_workers=threads):
         outcome = _attempt(function, take)
     try:
@@ -166,7 +185,8 @@ def _in_processes(
 ) -> Iterator[Outcome[Take, Result]]:
     waiting = deque(takes)
     running = dict[Future[bytes], Take]()
-    suspects = deque[Take]()  # being processed when a process died: each is tried again alone
+    # being processed when a process died: each is tried again alone
+    suspects = deque[Take]()
     threads = max(1, thread_count() // workers)
     executor = _executor(workers)
     try:
@@ -175,12 +195,17 @@ def _in_processes(
             broken = False
             while queue and len(running) < most and not broken:
                 try:
-                    running[executor.submit(_in_worker, function, threads, queue[0])] = queue[0]
+                    running[
+                        executor.submit(_in_worker, function, threads, queue[0])
+                    ] = queue[0]
                     queue.popleft()
-                except BrokenProcessPool:  # a process died while the caller was busy with an outcome
+                except BrokenProcessPool:
+                    # a process died while the caller was busy with an outcome
                     broken = True
             alone = most == 1
-            for future in wait(running, return_when=FIRST_COMPLETED).done if running else ():
+            for future in (
+                wait(running, return_when=FIRST_COMPLETED).done if running else ()
+            ):
                 take = running.pop(future)
                 try:
                     outcome = cloudpickle.loads(future.result())
@@ -191,8 +216,11 @@ def _in_processes(
                         yield Outcome(take, error=_killed(take), attempts=2)
                     else:
                         suspects.append(take)
-                except (AttributeError, ImportError, TypeError, PicklingError) as error:  # the call cannot be sent
-                    yield Outcome(take, error=_defect(take, _why_unsent(function, error)))
+                except (AttributeError, ImportError, TypeError, PicklingError) as error:
+                    # the call cannot be sent
+                    yield Outcome(
+                        take, error=_defect(take, _why_unsent(function, error))
+                    )
             if broken:
                 suspects.extend(running.values())
                 running.clear()
@@ -203,7 +231,9 @@ def _in_processes(
 
 
 def _why_unsent(function: Any, error: Exception) -> Exception:
-    """The error of pickling a call, repeated here because an executor only reports that pickling failed."""
+    """The error of pickling a call, repeated here because an executor only reports that
+    pickling failed.
+    """
     try:
         cloudpickle.dumps(function)
     except Exception as cause:  # noqa: BLE001  whatever it holds
@@ -213,14 +243,20 @@ def _why_unsent(function: Any, error: Exception) -> Exception:
 
 def _executor(workers: int) -> Executor:
     start = {"initializer": _start_worker, "initargs": (os.getpid(),)}
-    executor: Executor = get_reusable_executor(workers, timeout=IDLE_SECONDS, env=LOKY, **start)
+    executor: Executor = get_reusable_executor(
+        workers, timeout=IDLE_SECONDS, env=LOKY, **start
+    )
     return executor
 
 
 def _start_worker(parent: int) -> None:
-    """Ignore interrupts, which the parent handles, and end this worker when the parent has ended."""
+    """Ignore interrupts, which the parent handles, and end this worker when the parent
+    has ended.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with, args=(parent,), name="skindb parent", daemon=True).start()
+    threading.Thread(
+        target=_end_with, args=(parent,), name="skindb parent", daemon=True
+    ).start()
 
 
 def _end_with(parent: int) -> None:
@@ -232,11 +268,21 @@ def _end_with(parent: int) -> None:
 
 def _killed(take: Any) -> InputError:
     cure = "a lack of memory is the usual reason: close other programs, or use fewer workers"
-    return InputError(Fault(str(take), "the process of a take must run to its end", "it was killed", cure))
+    return InputError(
+        Fault(
+            str(take),
+            "the process of a take must run to its end",
+            "it was killed",
+            cure,
+        )
+    )
 
 
 def _on_cluster(
-    function: Callable[[Take], Result], takes: list[Take], client: Client, shared: Path | None
+    function: Callable[[Take], Result],
+    takes: list[Take],
+    client: Client,
+    shared: Path | None,
 ) -> Iterator[Outcome[Take, Result]]:
     from distributed import KilledWorker  # of the extra "cluster"
 

@@ -1,4 +1,6 @@
-"""The least and the most translucent take, and what translucency does to the edge of a shadow (figures 17 and 18)."""
+"""The least and the most translucent take, and what translucency does to the edge of a
+shadow (figures 17 and 18).
+"""
 
 from __future__ import annotations
 
@@ -21,20 +23,28 @@ from skindb.workflow.audit import logged
 
 SIDE_PX = 320  # of a picture
 CLOSE_MM = 40.0  # side of a close-up
-LIGHT_DEGREES = 65.0  # from the front to the subject's left: the shadow of the nose is on the cheek
+# from the front to the subject's left: the shadow of the nose is on the cheek
+LIGHT_DEGREES = 65.0
 LIGHT_MM = 800.0  # from the nose
-SPACING = 1 / 3  # of the diffusion length, between the points that receive light in a close-up
+# of the diffusion length, between the points that receive light in a close-up
+SPACING = 1 / 3
 LANDMARK = "nose_tip"
 
 
 @logged("render")
 def translucency_grid(
-    db: Database, out: Path, *, site: str = "cheek", samples: int = 64, progress: Progress | None = None
+    db: Database,
+    out: Path,
+    *,
+    site: str = "cheek",
+    samples: int = 64,
+    progress: Progress | None = None,
 ) -> dict[str, float]:
-    """Draw the takes with the shortest and the longest diffusion length at a site, with one light and one exposure.
+    """Draw the takes with the shortest and the longest diffusion length at a site, with
+    one light and one exposure.
 
-    The columns are the face with light under the skin, the edge of the nose's shadow close up, and the same with light
-    that is reflected where it enters.
+    The columns are the face with light under the skin, the edge of the nose's shadow
+    close up, and the same with light that is reflected where it enters.
 
     Parameters
     ----------
@@ -64,7 +74,10 @@ def translucency_grid(
         rule = f"two takes must have translucency at {site}"
         cure = "name another site, or fit more takes"
         raise InputError(Fault(db.url, rule, f"{len(lengths)}", cure))
-    chosen = [min(lengths, key=lengths.__getitem__), max(lengths, key=lengths.__getitem__)]
+    chosen = [
+        min(lengths, key=lengths.__getitem__),
+        max(lengths, key=lengths.__getitem__),
+    ]
     tell = progress or silent
     rows = {}
     for i, take in enumerate(chosen):
@@ -78,7 +91,9 @@ def translucency_grid(
             render(model, subsurface=True, **close, **options),
             render(model, **close, **options),
         ]
-        rows[f"{take}\n{lengths[take]:.2f} mm"] = [one["radiance"].values for one in pictures]
+        rows[f"{take}\n{lengths[take]:.2f} mm"] = [
+            one["radiance"].values for one in pictures
+        ]
     tell("render", 6, 6)
     write_grid(out, rows, ["light under the skin", "close up", "without"])
     return {take: lengths[take] for take in chosen}
@@ -106,9 +121,15 @@ def _diffusion_lengths(db: Database, site: str) -> dict[str, float]:
 def _nose(model: xr.DataTree) -> np.ndarray[Any, np.dtype[np.float64]]:
     """Tip of the nose (3,), or the middle of the surfels."""
     mesh = model["mesh"].to_dataset()
-    if "landmark_position" in mesh and LANDMARK in [str(name) for name in mesh["landmark"].values]:
-        return np.asarray(mesh["landmark_position"].sel(landmark=LANDMARK).values, np.float64)
-    return np.asarray(model["fitted"].to_dataset()["surfel_position"].values.mean(axis=0), np.float64)
+    if "landmark_position" in mesh and LANDMARK in [
+        str(name) for name in mesh["landmark"].values
+    ]:
+        return np.asarray(
+            mesh["landmark_position"].sel(landmark=LANDMARK).values, np.float64
+        )
+    return np.asarray(
+        model["fitted"].to_dataset()["surfel_position"].values.mean(axis=0), np.float64
+    )
 
 
 def _light(model: xr.DataTree) -> Lights:
@@ -116,12 +137,22 @@ def _light(model: xr.DataTree) -> Lights:
     turn = np.radians(LIGHT_DEGREES)
     towards = np.array([np.sin(turn), 0.15, np.cos(turn)])
     towards /= np.linalg.norm(towards)
-    power = np.median(model["dome"].to_dataset()["light_intensity"].values, axis=0)[None]
-    return Lights(_nose(model)[None] + LIGHT_MM * towards, power, np.full(1, 2.0), -towards[None], np.zeros(1))
+    power = np.median(model["dome"].to_dataset()["light_intensity"].values, axis=0)[
+        None
+    ]
+    return Lights(
+        _nose(model)[None] + LIGHT_MM * towards,
+        power,
+        np.full(1, 2.0),
+        -towards[None],
+        np.zeros(1),
+    )
 
 
 def _cameras(model: xr.DataTree) -> tuple[Camera, Camera]:
-    """The frontal camera of the dome with a small picture, and one that looks at the edge of the nose's shadow."""
+    """The frontal camera of the dome with a small picture, and one that looks at the
+    edge of the nose's shadow.
+    """
     whole, _ = chosen_camera(model["dome"].to_dataset().load(), None)
     scale = SIDE_PX / max(whole.width, whole.height)
     # beside the nose, on the side away from the light

@@ -11,7 +11,15 @@ from typing import TYPE_CHECKING, Any
 
 from skindb._types import Progress, silent
 from skindb.errors import Fault, InputError
-from skindb.store import RELEASE, STUDY, Database, Record, Request, UnavailableError, stale_versions
+from skindb.store import (
+    RELEASE,
+    STUDY,
+    Database,
+    Record,
+    Request,
+    UnavailableError,
+    stale_versions,
+)
 from skindb.workflow.audit import logged
 from skindb.workflow.cluster import computing_on
 from skindb.workflow.edits import edit
@@ -46,7 +54,9 @@ class Refreshed:
 
 
 def stale_results(db: Database) -> list[Refreshed]:
-    """The results that withdrawals removed and the newest versions that are stale, in order of dependence, and why."""
+    """The results that withdrawals removed and the newest versions that are stale, in
+    order of dependence, and why.
+    """
     stale = [_requested(request) for request in db.requests()]
     for record, reasons in stale_versions(db):
         texts = tuple(dict.fromkeys(map(str, reasons)))
@@ -66,7 +76,8 @@ def refresh(
 ) -> list[Refreshed]:
     """Make stale models, registrations, studies and edits again, each with its own parameters.
 
-    Withdrawals that were interrupted are completed first, and results that withdrawals removed are computed again.
+    Withdrawals that were interrupted are completed first, and results that withdrawals
+    removed are computed again.
 
     Parameters
     ----------
@@ -84,9 +95,10 @@ def refresh(
     Returns
     -------
     list of Refreshed
-        One for each stale or removed version, in the order in which they were made. What cannot be computed again, such
-        as a registration of a take whose consent does not cover statistics any more, stays as it is and is refused by
-        every step that would read it.
+        One for each stale or removed version, in the order in which they were made.
+        What cannot be computed again, such as a registration of a take whose consent
+        does not cover statistics any more, stays as it is and is refused by every step
+        that would read it.
     """
     where = {"workers": workers, "client": client}
     makers: dict[str, Callable[[list[Refreshed]], list[Refreshed]]] = {
@@ -103,7 +115,9 @@ def refresh(
         with computing_on(client if kind == STUDY else None, db.folder):
             done += repeat_requests(db, dictionary=dictionary, kinds=(kind,))
             # what was made before made others stale
-            stale = [one for one in stale_results(db) if one.kind == kind and one.generation]
+            stale = [
+                one for one in stale_results(db) if one.kind == kind and one.generation
+            ]
             if stale:
                 done += makers[kind](stale)
     tell("refresh", len(KINDS), len(KINDS))
@@ -111,7 +125,9 @@ def refresh(
 
 
 @logged("refresh")
-def repeat_requests(db: Database, *, dictionary: Path | None = None, kinds: Sequence[str] = KINDS) -> list[Refreshed]:
+def repeat_requests(
+    db: Database, *, dictionary: Path | None = None, kinds: Sequence[str] = KINDS
+) -> list[Refreshed]:
     """Compute the results again that withdrawals removed, each with its own parameters.
 
     Parameters
@@ -124,27 +140,43 @@ def repeat_requests(db: Database, *, dictionary: Path | None = None, kinds: Sequ
     Returns
     -------
     list of Refreshed
-        One for each request, in order of dependence. What fails for any reason is named there, and stays requested.
+        One for each request, in order of dependence. What fails for any reason is named
+        there, and stays requested.
     """
     makers: dict[str, Callable[[Request], Record]] = {
         "registration": lambda request: _repeat_registration(db, request),
-        STUDY: lambda request: repeat_study(db, request.take, request.parameters, dictionary=dictionary),
-        "edit": lambda request: repeat_edit(db, request.take, request.parameters, dictionary=dictionary),
+        STUDY: lambda request: repeat_study(
+            db, request.take, request.parameters, dictionary=dictionary
+        ),
+        "edit": lambda request: repeat_edit(
+            db, request.take, request.parameters, dictionary=dictionary
+        ),
         RELEASE: lambda request: _repeat_release(db, request),
     }
-    requests = sorted(db.requests(), key=lambda request: (KINDS.index(request.kind), request.take))
+    requests = sorted(
+        db.requests(), key=lambda request: (KINDS.index(request.kind), request.take)
+    )
     done = []
     for request in requests:
         if request.kind in kinds:
-            outcome = _again(_requested(request), partial(makers[request.kind], request))
+            outcome = _again(
+                _requested(request), partial(makers[request.kind], request)
+            )
             if outcome.record is not None:
                 db.fulfil(request)
             done.append(outcome)
     return done
 
 
-def repeat_study(db: Database, key: str, parameters: Mapping[str, Any], *, dictionary: Path | None = None) -> Record:
-    """Run a study again with its own parameters, stored as before; takes that no longer exist are skipped.
+def repeat_study(
+    db: Database,
+    key: str,
+    parameters: Mapping[str, Any],
+    *,
+    dictionary: Path | None = None,
+) -> Record:
+    """Run a study again with its own parameters, stored as before; takes that no longer
+    exist are skipped.
 
     Raises
     ------
@@ -158,15 +190,25 @@ def repeat_study(db: Database, key: str, parameters: Mapping[str, Any], *, dicti
     cure = "run skindb analyze"
     if what not in STUDIES:
         raise InputError(Fault(key, rule, f"the study {what!r}", cure))
-    accepted = inspect.signature(STUDIES[what]).parameters.keys() - {"db", "name", "dictionary"}
+    accepted = inspect.signature(STUDIES[what]).parameters.keys() - {
+        "db",
+        "name",
+        "dictionary",
+    }
     if unknown := sorted(options.keys() - accepted):
         raise InputError(Fault(key, rule, f"the parameters {', '.join(unknown)}", cure))
     release = options.pop("release", "") or None
     takes = options.pop("takes", [])
     stored = set(db.takes("model", release=release))
     if takes and not stored & set(takes):
-        raise InputError(Fault(key, "a study needs fitted takes", "no version of it is left", cure))
-    options |= {"takes": [take for take in takes if take in stored], "release": release, "name": name or None}
+        raise InputError(
+            Fault(key, "a study needs fitted takes", "no version of it is left", cure)
+        )
+    options |= {
+        "takes": [take for take in takes if take in stored],
+        "release": release,
+        "name": name or None,
+    }
     if "group_by" in options:
         options["group_by"] = options["group_by"] or None
     if "dictionary" in inspect.signature(STUDIES[what]).parameters:
@@ -175,7 +217,13 @@ def repeat_study(db: Database, key: str, parameters: Mapping[str, Any], *, dicti
     return db.record(STUDY, key, study.attrs["generation"])
 
 
-def repeat_edit(db: Database, take: str, parameters: Mapping[str, Any], *, dictionary: Path | None = None) -> Record:
+def repeat_edit(
+    db: Database,
+    take: str,
+    parameters: Mapping[str, Any],
+    *,
+    dictionary: Path | None = None,
+) -> Record:
     """Edit a model again by the same amounts, with the newest study of that name."""
     study = parameters.get("study", "traits")
     tree = edit(db, take, parameters["amounts"], study=study, dictionary=dictionary)
@@ -191,16 +239,31 @@ def _repeat_registration(db: Database, request: Request) -> Record:
 
 
 def _repeat_release(db: Database, request: Request) -> Record:
-    """The next revision of a release, with the registrations that were made again of the models that it names."""
+    """The next revision of a release, with the registrations that were made again of
+    the models that it names.
+    """
     pins = request.parameters.get("pins") or db.record(RELEASE, request.take).made_from
     models = {one["take"]: one["seal"] for one in pins if one["kind"] == "model"}
     if any(other.kind == "registration" for other in db.requests()):
-        rule = "the registrations of a release must be computed before its next revision"
-        raise InputError(Fault(str(request), rule, "that they could not be computed yet", "run skindb refresh"))
+        rule = (
+            "the registrations of a release must be computed before its next revision"
+        )
+        raise InputError(
+            Fault(
+                str(request),
+                rule,
+                "that they could not be computed yet",
+                "run skindb refresh",
+            )
+        )
     registrations = []
     for take in request.parameters.get("takes", []):
-        record = db.record("registration", take) if db.has("registration", take) else None
-        if record is not None and models.get(take) in {one.get("seal") for one in record.made_from}:
+        record = (
+            db.record("registration", take) if db.has("registration", take) else None
+        )
+        if record is not None and models.get(take) in {
+            one.get("seal") for one in record.made_from
+        }:
             registrations.append(record.as_input())
     if not registrations and "pins" not in request.parameters:
         return db.record(RELEASE, request.take)
@@ -212,18 +275,26 @@ def _requested(request: Request) -> Refreshed:
 
 
 def _fit_again(
-    db: Database, dictionary: Path | None, wait: float, where: Mapping[str, Any], stale: Sequence[Refreshed]
+    db: Database,
+    dictionary: Path | None,
+    wait: float,
+    where: Mapping[str, Any],
+    stale: Sequence[Refreshed],
 ) -> list[Refreshed]:
     known = {one.take: one for one in stale}
     call = partial(fit_with, db, given={}, refit=True, dictionary=dictionary, wait=wait)
     done = []
     for outcome in map_takes(call, list(known), **where, shared=db.folder):
         record = outcome.value if isinstance(outcome.value, Record) else None
-        done.append(replace(known[outcome.take], record=record, fault=str(outcome.error or "")))
+        done.append(
+            replace(known[outcome.take], record=record, fault=str(outcome.error or ""))
+        )
     return done
 
 
-def _register_again(db: Database, where: Mapping[str, Any], stale: Sequence[Refreshed]) -> list[Refreshed]:
+def _register_again(
+    db: Database, where: Mapping[str, Any], stale: Sequence[Refreshed]
+) -> list[Refreshed]:
     """All takes together: the common (u, v) depends on each of them."""
     first = db.record("registration", stale[0].take)
     reference = first.provenance.get("parameters", {}).get("reference") or None
@@ -235,19 +306,34 @@ def _register_again(db: Database, where: Mapping[str, Any], stale: Sequence[Refr
         return [replace(one, fault=str(error)) for one in stale]
     rule = "its consent does not cover statistics, or its model has no landmarks"
     return [
-        replace(one, record=records[one.take]) if one.take in records else replace(one, fault=rule) for one in stale
+        replace(one, record=records[one.take])
+        if one.take in records
+        else replace(one, fault=rule)
+        for one in stale
     ]
 
 
-def _study_again(db: Database, dictionary: Path | None, stale: Sequence[Refreshed]) -> list[Refreshed]:
-    return [_again(one, partial(_repeat_stored, repeat_study, db, one, dictionary)) for one in stale]
+def _study_again(
+    db: Database, dictionary: Path | None, stale: Sequence[Refreshed]
+) -> list[Refreshed]:
+    return [
+        _again(one, partial(_repeat_stored, repeat_study, db, one, dictionary))
+        for one in stale
+    ]
 
 
-def _edit_again(db: Database, dictionary: Path | None, stale: Sequence[Refreshed]) -> list[Refreshed]:
-    return [_again(one, partial(_repeat_stored, repeat_edit, db, one, dictionary)) for one in stale]
+def _edit_again(
+    db: Database, dictionary: Path | None, stale: Sequence[Refreshed]
+) -> list[Refreshed]:
+    return [
+        _again(one, partial(_repeat_stored, repeat_edit, db, one, dictionary))
+        for one in stale
+    ]
 
 
-def _repeat_stored(repeat: Callable[..., Record], db: Database, one: Refreshed, dictionary: Path | None) -> Record:
+def _repeat_stored(
+    repeat: Callable[..., Record], db: Database, one: Refreshed, dictionary: Path | None
+) -> Record:
     parameters = db.record(one.kind, one.take).provenance.get("parameters", {})
     return repeat(db, one.take, parameters, dictionary=dictionary)
 
@@ -258,5 +344,9 @@ def _again(one: Refreshed, make: Callable[[], Record]) -> Refreshed:
         return replace(one, record=make())
     except InputError as error:
         return replace(one, fault=str(error))
-    except Exception as error:  # noqa: BLE001  for example parameters of another version of skindb, or too little memory
-        return replace(one, fault=f"cannot be computed by this version: {type(error).__name__}: {error}")
+    # for example parameters of another version of skindb, or too little memory
+    except Exception as error:  # noqa: BLE001
+        return replace(
+            one,
+            fault=f"cannot be computed by this version: {type(error).__name__}: {error}",
+        )

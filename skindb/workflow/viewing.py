@@ -24,7 +24,8 @@ from skindb.workflow.audit import logged
 from skindb.workflow.edits import editable_model, stored_or_moved
 
 NO_TRAITS: Mapping[str, float] = MappingProxyType({})
-SHOWN = ("subject", "condition", "session")  # attributes of a model that a page shows, besides those of the capture
+# attributes of a model that a page shows, besides those of the capture
+SHOWN = ("subject", "condition", "session")
 
 
 @logged("view")
@@ -48,8 +49,8 @@ def view_takes(
     out
         A file that ends in .html, or a folder.
     traits, study, dictionary
-        Trait -> amount at the end of its slider (as in `skindb.workflow.edit`), the study of the traits, and the
-        dictionary of the fits.
+        Trait -> amount at the end of its slider (as in `skindb.workflow.edit`), the
+        study of the traits, and the dictionary of the fits.
     environment
         Light from all directions, an OpenEXR file; default an overcast sky.
     progress
@@ -61,13 +62,21 @@ def view_takes(
         path, takes, and of a file its bytes.
     """
     named = OVERCAST if environment is None else environment.name
-    options: dict[str, Any] = {"traits": traits, "study": study, "dictionary": dictionary}
+    options: dict[str, Any] = {
+        "traits": traits,
+        "study": study,
+        "dictionary": dictionary,
+    }
     faces = _faces(db, takes, environment=environment, progress=progress, **options)
     about: dict[str, Any] = {"path": str(out), "takes": list(takes)}
     if out.suffix == ".html":
         [(record, still)] = faces
         return about | {"bytes": write_page(out, record, still, surroundings=named)}
-    write_folder(out, [PagedFace.of(record, still) for record, still in faces], surroundings=named)
+    write_folder(
+        out,
+        [PagedFace.of(record, still) for record, still in faces],
+        surroundings=named,
+    )
     return about
 
 
@@ -83,8 +92,9 @@ def view_server(
 ) -> PageServer:
     """A server of the page of several takes, which does not run yet; see `view_takes`.
 
-    Faces are kept in memory only. Each request checks the consent of the subject: the face of one that does not consent
-    to exports any more, or was withdrawn, is removed from the memory and not served.
+    Faces are kept in memory only. Each request checks the consent of the subject: the
+    face of one that does not consent to exports any more, or was withdrawn, is removed
+    from the memory and not served.
 
     Parameters
     ----------
@@ -102,24 +112,42 @@ def view_server(
     """
     named = OVERCAST if environment is None else environment.name
     made = _faces(db, takes, environment=environment, progress=progress, **options)
-    faces = {take: PagedFace.of(record, still) for take, (record, still) in zip(takes, made, strict=True)}
+    faces = {
+        take: PagedFace.of(record, still)
+        for take, (record, still) in zip(takes, made, strict=True)
+    }
 
     def index() -> bytes:
         permitted = [_permitted(db, faces, take) for take in takes]
-        return index_text([face for face in permitted if face is not None], surroundings=named).encode()
+        return index_text(
+            [face for face in permitted if face is not None], surroundings=named
+        ).encode()
 
     def data(take: str) -> bytes:
         face = _permitted(db, faces, take)
         if face is None:
-            raise InputError(Fault(take, "its subject must consent to exports", "no such consent", "show another take"))
+            raise InputError(
+                Fault(
+                    take,
+                    "its subject must consent to exports",
+                    "no such consent",
+                    "show another take",
+                )
+            )
         return face.data
 
-    contents = {f"faces/{take}.json": Content(JSON, partial(data, take)) for take in takes}
+    contents = {
+        f"faces/{take}.json": Content(JSON, partial(data, take)) for take in takes
+    }
     return PageServer(contents | {"": Content(HTML, index)}, {}, port=port)
 
 
-def _permitted(db: Database, faces: dict[str, PagedFace], take: str) -> PagedFace | None:
-    """The face of a take; None, and the face is removed, if its subject does not consent to exports any more."""
+def _permitted(
+    db: Database, faces: dict[str, PagedFace], take: str
+) -> PagedFace | None:
+    """The face of a take; None, and the face is removed, if its subject does not
+    consent to exports any more.
+    """
     try:
         scope = db.consent(take)
     except UnavailableError:
@@ -151,12 +179,18 @@ def _faces(
         require_fresh(db, "model", take)
         shown, moved = _moved(db, take, model, traits, study, dictionary)
         about = _attributes(db, take, model)
-        yield face_record(shown, take=take, attributes=about, traits=moved, environment=around), still_picture(model)
+        yield (
+            face_record(
+                shown, take=take, attributes=about, traits=moved, environment=around
+            ),
+            still_picture(model),
+        )
     tell("view", len(takes), len(takes))
 
 
 def landmark_page(scan: Path, out: Path, *, port: int = 0) -> PageServer:
-    """A server of the page in which the landmarks of a scan are set and saved in `out`; it does not run yet.
+    """A server of the page in which the landmarks of a scan are set and saved in `out`;
+    it does not run yet.
 
     Raises
     ------
@@ -167,15 +201,24 @@ def landmark_page(scan: Path, out: Path, *, port: int = 0) -> PageServer:
 
 
 @logged("view", explain=True)
-def explain_view(db: Database, take: str, *, traits: Mapping[str, float] = NO_TRAITS) -> list[str]:
-    """What the page of a take would skip and approximate, with bounds, one line each; see `view_takes`."""
+def explain_view(
+    db: Database, take: str, *, traits: Mapping[str, float] = NO_TRAITS
+) -> list[str]:
+    """What the page of a take would skip and approximate, with bounds, one line each;
+    see `view_takes`.
+    """
     model = db.read("model", take)
     require_consent({**model.attrs, "take": take}, "export")
     return page_omissions(model, edited=bool(traits))
 
 
 def _moved(
-    db: Database, take: str, model: xr.DataTree, traits: Mapping[str, float], study: str | None, dictionary: Path | None
+    db: Database,
+    take: str,
+    model: xr.DataTree,
+    traits: Mapping[str, float],
+    study: str | None,
+    dictionary: Path | None,
 ) -> tuple[xr.DataTree, tuple[Trait, ...]]:
     """The model on the basis of its edits, and the edits."""
     if not traits:
@@ -184,12 +227,19 @@ def _moved(
     plain = stored_or_moved(db, take, source, dict.fromkeys(traits, 0.0))
     moved = []
     for name, amount in traits.items():
-        whole, half = (stored_or_moved(db, take, source, {name: part * amount}) for part in (1.0, 0.5))
+        whole, half = (
+            stored_or_moved(db, take, source, {name: part * amount})
+            for part in (1.0, 0.5)
+        )
         moved.append(Trait(name, whole, half, amount))
     return plain, tuple(moved)
 
 
 def _attributes(db: Database, take: str, model: xr.DataTree) -> dict[str, Any]:
     found = {name: model.attrs[name] for name in SHOWN if name in model.attrs}
-    traits = db.record("capture", take).provenance.get("traits", {}) if db.has("capture", take) else {}
+    traits = (
+        db.record("capture", take).provenance.get("traits", {})
+        if db.has("capture", take)
+        else {}
+    )
     return found | (dict(traits) if isinstance(traits, dict) else {})

@@ -1,6 +1,7 @@
 """A subject removed from a database, with everything that was made from it.
 
-The data are erased before anything is computed again, and this module imports no code that computes.
+The data are erased before anything is computed again, and this module imports no code
+that computes.
 """
 
 from __future__ import annotations
@@ -39,22 +40,27 @@ class Withdrawal:
 
     subject: str
     versions: tuple[str, ...]  # of the subject
-    users: tuple[str, ...]  # versions of others and of populations that refer to the subject
+    # versions of others and of populations that refer to the subject
+    users: tuple[str, ...]
     removed: dict[str, int]  # kind -> number of versions
-    repeated: tuple[Refreshed, ...] = ()  # removed results that were computed again, or that wait for it
+    # removed results that were computed again, or that wait for it
+    repeated: tuple[Refreshed, ...] = ()
     revised: tuple[str, ...] = ()  # releases with a new revision
     lost: tuple[str, ...] = ()  # removed results for which no other take was used
     backups: tuple[int, ...] = ()  # number of files that were removed from each backup
     date: str = ""
 
 
-def plan_withdrawal(db: Database, subject: str, *, backups: Sequence[str] = ()) -> Withdrawal:
+def plan_withdrawal(
+    db: Database, subject: str, *, backups: Sequence[str] = ()
+) -> Withdrawal:
     """What `withdraw` would remove from the database.
 
     Raises
     ------
     InputError
-        If nothing of the subject is stored, or if there is no backup of this database at one of `backups`.
+        If nothing of the subject is stored, or if there is no backup of this database
+        at one of `backups`.
     """
     for url in backups:
         db.require_backup(url)
@@ -62,10 +68,17 @@ def plan_withdrawal(db: Database, subject: str, *, backups: Sequence[str] = ()) 
     holdings = Holdings() if is_erased else db.holdings(subject)
     entry = db.withdrawal(subject)
     removed = holdings.counts
-    if entry is not None and entry.is_withdrawal:  # which was interrupted, and may have removed some of them
+    # which was interrupted, and may have removed some of them
+    if entry is not None and entry.is_withdrawal:
         removed |= Counter(entry.body.get("removed", {}))
-    own = tuple(f"{kind} of {take}: {_count(number)}" for (kind, take), number in holdings.takes.items())
-    users = tuple(f"{record.kind} {record.generation} of {record.take}" for record in holdings.versions)
+    own = tuple(
+        f"{kind} of {take}: {_count(number)}"
+        for (kind, take), number in holdings.takes.items()
+    )
+    users = tuple(
+        f"{record.kind} {record.generation} of {record.take}"
+        for record in holdings.versions
+    )
     return Withdrawal(subject, own, users, dict(sorted(removed.items())))
 
 
@@ -79,9 +92,10 @@ def withdraw(
 ) -> Withdrawal:
     """Remove a subject: every version of every take, and every result that refers to one of them.
 
-    First everything is erased, also in the backups, and releases get a new revision. Then studies, registrations and
-    edits of others are computed again without the subject. One that cannot be computed now waits for `refresh`. If the
-    process is killed at any point, the same call removes the rest.
+    First everything is erased, also in the backups, and releases get a new revision.
+    Then studies, registrations and edits of others are computed again without the
+    subject. One that cannot be computed now waits for `refresh`. If the process is
+    killed at any point, the same call removes the rest.
 
     Parameters
     ----------
@@ -94,8 +108,9 @@ def withdraw(
     wait
         Seconds to wait for a run that works on a take of the subject.
     backups
-        Folders or buckets of backups of the database, from whose states the subject is erased too. They can also be
-        given later, when the database holds nothing of the subject any more.
+        Folders or buckets of backups of the database, from whose states the subject is
+        erased too. They can also be given later, when the database holds nothing of the
+        subject any more.
 
     Returns
     -------
@@ -110,7 +125,11 @@ def withdraw(
     plan = plan_withdrawal(db, subject, backups=backups)
     counts = plan.removed | ({"backups": len(backups)} if backups else {})
     with logged_action(db, "withdrawal", subjects=[subject], counts=counts):
-        erasure = db.complete_erasures() if _is_erased(db, subject) else db.erase(subject, wait=wait)
+        erasure = (
+            db.complete_erasures()
+            if _is_erased(db, subject)
+            else db.erase(subject, wait=wait)
+        )
         erased, faults = _erase_from_backups(db, backups, wait)
         repeated = skindb.workflow.repeat_requests(db, dictionary=dictionary)
     if faults:
@@ -128,8 +147,12 @@ def withdraw(
     )
 
 
-def _erase_from_backups(db: Database, backups: Sequence[str], wait: float) -> tuple[tuple[int, ...], list[Fault]]:
-    """Remove withdrawn subjects from every backup, and collect the faults of those where that failed."""
+def _erase_from_backups(
+    db: Database, backups: Sequence[str], wait: float
+) -> tuple[tuple[int, ...], list[Fault]]:
+    """Remove withdrawn subjects from every backup, and collect the faults of those
+    where that failed.
+    """
     erased: list[int] = []
     faults: list[Fault] = []
     for url in backups:
@@ -137,12 +160,17 @@ def _erase_from_backups(db: Database, backups: Sequence[str], wait: float) -> tu
             erased.append(db.erase_from_backup(url, wait=wait))
         except InputError as error:  # the others are erased nevertheless
             where = f"backup {url}, from which the subject is not removed yet"
-            faults += [replace(fault, where=f"{where}: {fault.where}") for fault in error.faults]
+            faults += [
+                replace(fault, where=f"{where}: {fault.where}")
+                for fault in error.faults
+            ]
     return tuple(erased), faults
 
 
 def erasure_report(withdrawal: Withdrawal) -> dict[str, Any]:
-    """A report of a withdrawal that can be handed out: it contains no pseudonym, attribute, name or path."""
+    """A report of a withdrawal that can be handed out: it contains no pseudonym,
+    attribute, name or path.
+    """
     again = Counter(one.kind for one in withdrawal.repeated if one.record is not None)
     waiting = Counter(one.kind for one in withdrawal.repeated if one.record is None)
     body = {
@@ -160,10 +188,15 @@ def erasure_report(withdrawal: Withdrawal) -> dict[str, Any]:
 
 
 def write_erasure_report(withdrawal: Withdrawal, path: Path) -> list[Path]:
-    """Write a report as JSON and as text, under a path without or with one of the endings .json and .txt."""
+    """Write a report as JSON and as text, under a path without or with one of the
+    endings .json and .txt.
+    """
     report = erasure_report(withdrawal)
     stem = path.with_suffix("") if path.suffix in (".json", ".txt") else path
-    contents = {".json": json.dumps(report, indent=1), ".txt": "\n".join(_report_lines(report))}
+    contents = {
+        ".json": json.dumps(report, indent=1),
+        ".txt": "\n".join(_report_lines(report)),
+    }
     paths = []
     for ending, content in contents.items():
         file = stem.with_name(f"{stem.name}{ending}")

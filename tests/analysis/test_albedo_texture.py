@@ -8,7 +8,12 @@ import xarray as xr
 from scipy.ndimage import gaussian_filter
 from sklearn.decomposition import PCA
 
-from skindb.analysis.texture import BINS, common_landmarks, texel_regions, texture_statistics
+from skindb.analysis.texture import (
+    BINS,
+    common_landmarks,
+    texel_regions,
+    texture_statistics,
+)
 from skindb.analysis.texture_edit import at_surfels, edit_texture
 from skindb.errors import InputError
 from skindb.numerics.texture import quantile_function
@@ -45,17 +50,22 @@ BEARD = texel_regions(POINTS, SIZE)["beard"]
 
 def stubble(seed, density=1.0):
     """Fine dark strands where a beard grows, as the fraction of light that they absorb."""
-    strands = gaussian_filter(np.random.default_rng([seed, 9]).standard_normal((SIZE, SIZE)), 0.7)
+    strands = gaussian_filter(
+        np.random.default_rng([seed, 9]).standard_normal((SIZE, SIZE)), 0.7
+    )
     return density * BEARD * np.clip(0.4 + 0.6 * strands, 0.0, 0.8)
 
 
 def face(seed, melanin=0.0, beard=0.0):
     """Albedo (v, u, 3) of one person."""
     rng = np.random.default_rng(seed)
-    patches = sum(gaussian_filter(rng.standard_normal((SIZE, SIZE)), w, mode="wrap") * w * 0.1 for w in (2, 8))
-    log = np.log([0.5, 0.35, 0.28]) - np.outer(melanin + 0.02 * rng.standard_normal() + patches, PIGMENT).reshape(
-        SIZE, SIZE, 3
+    patches = sum(
+        gaussian_filter(rng.standard_normal((SIZE, SIZE)), w, mode="wrap") * w * 0.1
+        for w in (2, 8)
     )
+    log = np.log([0.5, 0.35, 0.28]) - np.outer(
+        melanin + 0.02 * rng.standard_normal() + patches, PIGMENT
+    ).reshape(SIZE, SIZE, 3)
     return np.exp(log) * (1 - stubble(seed, beard))[..., None]
 
 
@@ -64,14 +74,22 @@ def maps_of(faces, coverage=None):
     covered = np.ones(albedo.shape[:3], np.float32) if coverage is None else coverage
     dims = ("take", "v", "u")
     return xr.Dataset(
-        {"texel_diffuse_reflectance": ((*dims, "channel"), albedo), "texel_coverage": (dims, covered)},
+        {
+            "texel_diffuse_reflectance": ((*dims, "channel"), albedo),
+            "texel_coverage": (dims, covered),
+        },
         coords={"take": list(faces)},
     )
 
 
 def population(n=8):
     """Women without and men with a beard, half of both darker."""
-    return {f"{'M' if i % 2 else 'F'}{i}": face(i, melanin=0.5 * (i // 2 % 2), beard=0.7 * (i % 2)) for i in range(n)}
+    return {
+        f"{'M' if i % 2 else 'F'}{i}": face(
+            i, melanin=0.5 * (i // 2 % 2), beard=0.7 * (i % 2)
+        )
+        for i in range(n)
+    }
 
 
 @pytest.fixture(scope="module")
@@ -89,8 +107,11 @@ def shift_of(texture, with_trait, without):
 
 def test_texture_statistics__counts_and_sums(studied):
     _, texture = studied
-    assert texture.sizes["part"] * texture.sizes["bin"] * texture.sizes["axis"] == 23_808
-    np.testing.assert_allclose(texture["texture_histogram"].sum("bin"), 1.0, atol=1e-5)  # float32
+    assert (
+        texture.sizes["part"] * texture.sizes["bin"] * texture.sizes["axis"] == 23_808
+    )
+    # float32
+    np.testing.assert_allclose(texture["texture_histogram"].sum("bin"), 1.0, atol=1e-5)
     assert (np.diff(texture["texture_quantile"].values, axis=-1) >= 0).all()
     np.testing.assert_allclose(texture["texture_coverage"], 1.0)
 
@@ -102,22 +123,37 @@ def test_texture_statistics__histogram_and_quantiles_say_the_same(studied):
     middle = (edges[..., 1:] + edges[..., :-1]) / 2
     by_bins = (texture["texture_histogram"].values * middle).sum(axis=-1)
     width = (edges[..., -1] - edges[..., 0]) / BINS
-    assert (np.abs(by_bins - texture["texture_quantile"].values.mean(axis=-1)) < width + 1e-6).all()
+    assert (
+        np.abs(by_bins - texture["texture_quantile"].values.mean(axis=-1))
+        < width + 1e-6
+    ).all()
 
 
 def test_texture_statistics__first_axis_is_the_pigment(studied):
     _, texture = studied
-    values, vectors = np.linalg.eigh(np.cov(np.log(np.stack(list(population().values()))).reshape(-1, 3).T))
+    values, vectors = np.linalg.eigh(
+        np.cov(np.log(np.stack(list(population().values()))).reshape(-1, 3).T)
+    )
     axis = texture["texture_colour_axis"].values[0]
-    np.testing.assert_allclose(abs(axis @ vectors[:, -1]) * np.sqrt(values[-1]), 1.0, rtol=0.01)
+    np.testing.assert_allclose(
+        abs(axis @ vectors[:, -1]) * np.sqrt(values[-1]), 1.0, rtol=0.01
+    )
 
 
 def test_texture_statistics__the_image_part_is_the_histogram_of_the_region(studied):
     maps, texture = studied
     log = np.log(maps["texel_diffuse_reflectance"].values[3][BEARD].astype(np.float64))
-    want = (log - texture["texture_colour_mean"].values) @ texture["texture_colour_axis"].values.T
-    found = texture["texture_quantile"].sel(region="beard", part="image").isel(take=3).values
-    np.testing.assert_allclose(found[0], quantile_function(want[:, 0]), atol=1e-4)  # single precision
+    want = (log - texture["texture_colour_mean"].values) @ texture[
+        "texture_colour_axis"
+    ].values.T
+    found = (
+        texture["texture_quantile"]
+        .sel(region="beard", part="image")
+        .isel(take=3)
+        .values
+    )
+    # single precision
+    np.testing.assert_allclose(found[0], quantile_function(want[:, 0]), atol=1e-4)
 
 
 def test_texture_statistics__what_was_not_measured_does_not_count():
@@ -129,7 +165,9 @@ def test_texture_statistics__what_was_not_measured_does_not_count():
     wild = population()
     wild["F0"][:, :4] = 1e-6
     two = texture_statistics(maps_of(wild, covered), landmarks=POINTS)
-    np.testing.assert_allclose(one["texture_quantile"], two["texture_quantile"], atol=1e-4)
+    np.testing.assert_allclose(
+        one["texture_quantile"], two["texture_quantile"], atol=1e-4
+    )
     assert np.isnan(one["texture_quantile"].sel(region="beard").isel(take=1)).all()
     assert np.isfinite(one["texture_quantile"].sel(region="no_beard")).all()
     assert float(one["texture_coverage"].sel(region="beard").isel(take=1)) == 0
@@ -137,14 +175,20 @@ def test_texture_statistics__what_was_not_measured_does_not_count():
 
 def test_texture_statistics__nothing_measured_is_refused():
     with pytest.raises(InputError, match="some texels must be measured"):
-        texture_statistics(maps_of({"A": face(0)}, np.zeros((1, SIZE, SIZE), np.float32)), landmarks=POINTS)
+        texture_statistics(
+            maps_of({"A": face(0)}, np.zeros((1, SIZE, SIZE), np.float32)),
+            landmarks=POINTS,
+        )
 
 
 def test_texture_statistics__without_landmarks_the_face_is_one_region():
     texture = texture_statistics(maps_of({"A": face(0), "B": face(1)}), landmarks={})
     assert texture["region"].values.tolist() == ["face"]
     edit = edit_texture(
-        maps_of({"A": face(0)}).isel(take=0), shift_of(texture, ["B"], ["A"]), texture, rng=np.random.default_rng(0)
+        maps_of({"A": face(0)}).isel(take=0),
+        shift_of(texture, ["B"], ["A"]),
+        texture,
+        rng=np.random.default_rng(0),
     )
     assert np.isfinite(edit.change).all()
     assert edit.distance is None
@@ -153,7 +197,9 @@ def test_texture_statistics__without_landmarks_the_face_is_one_region():
 def test_common_landmarks__mean_over_takes_that_have_them():
     at = np.array([[0.1, 0.2], [np.nan, np.nan]])
     one = dataset({"common_landmark": at}, coords={"landmark": ["chin", "nasion"]})
-    other = dataset({"common_landmark": at + 0.2}, coords={"landmark": ["chin", "nasion"]})
+    other = dataset(
+        {"common_landmark": at + 0.2}, coords={"landmark": ["chin", "nasion"]}
+    )
     found = common_landmarks({"A": one, "B": other})
     assert set(found) == {"chin"}
     np.testing.assert_allclose(found["chin"], [0.2, 0.3])
@@ -162,7 +208,10 @@ def test_common_landmarks__mean_over_takes_that_have_them():
 def test_edit_texture__no_shift_returns_the_source(studied):
     maps, texture = studied
     edit = edit_texture(
-        maps.sel(take="F0"), 0 * shift_of(texture, ["M1"], ["F0"]), texture, rng=np.random.default_rng(0)
+        maps.sel(take="F0"),
+        0 * shift_of(texture, ["M1"], ["F0"]),
+        texture,
+        rng=np.random.default_rng(0),
     )
     np.testing.assert_array_equal(edit.change, 0.0)
     assert edit.distance == pytest.approx(edit.distance_before)
@@ -172,16 +221,28 @@ def test_edit_texture__a_darker_skin_is_darker_by_the_planted_pigment(studied):
     """Half a step of melanin, everywhere, on a subject of another seed."""
     _, texture = studied
     shift = shift_of(texture, ["F2", "F6", "M3", "M7"], ["F0", "F4", "M1", "M5"])
-    edit = edit_texture(maps_of({"X": face(50)}).isel(take=0), shift, texture, rng=np.random.default_rng(0))
+    edit = edit_texture(
+        maps_of({"X": face(50)}).isel(take=0),
+        shift,
+        texture,
+        rng=np.random.default_rng(0),
+    )
     # 0.02 of melanin differs between subjects: of 4 on each side 0.014 of the 0.5
-    np.testing.assert_allclose(edit.change.mean(axis=(0, 1)), -0.5 * PIGMENT, atol=3 * 0.014 * PIGMENT.max())
+    np.testing.assert_allclose(
+        edit.change.mean(axis=(0, 1)), -0.5 * PIGMENT, atol=3 * 0.014 * PIGMENT.max()
+    )
 
 
 def test_edit_texture__a_beard_grows_where_it_can_and_with_its_strands(studied):
     _, texture = studied
     shift = shift_of(texture, ["M1", "M3", "M5", "M7"], ["F0", "F2", "F4", "F6"])
     source = face(50)
-    edit = edit_texture(maps_of({"X": source}).isel(take=0), shift, texture, rng=np.random.default_rng(0))
+    edit = edit_texture(
+        maps_of({"X": source}).isel(take=0),
+        shift,
+        texture,
+        rng=np.random.default_rng(0),
+    )
     want = np.log(1 - stubble(50, 0.7))
     inside = gaussian_filter(BEARD.astype(float), 4) > 0.98
     outside = gaussian_filter(BEARD.astype(float), 4) < 0.02
@@ -196,26 +257,36 @@ def test_edit_texture__a_beard_grows_where_it_can_and_with_its_strands(studied):
 
 
 def test_edit_texture__whole_spreads_the_beard(studied):
-    """With the face as one region the beard spreads, which is why the beard is a separate region."""
+    """With the face as one region the beard spreads, which is why the beard is a
+    separate region.
+    """
     _, texture = studied
     shift = shift_of(texture, ["M1", "M3", "M5", "M7"], ["F0", "F2", "F4", "F6"])
     maps = maps_of({"X": face(50)}).isel(take=0)
     edit = edit_texture(maps, shift, texture, whole=True, rng=np.random.default_rng(0))
-    assert np.abs(edit.change[BEARD].mean()) < 0.5 * np.abs(np.log(1 - stubble(50, 0.7))[BEARD].mean())
+    assert np.abs(edit.change[BEARD].mean()) < 0.5 * np.abs(
+        np.log(1 - stubble(50, 0.7))[BEARD].mean()
+    )
 
 
 def test_edit_texture__ten_times_too_strong_converges_and_is_far(studied):
     _, texture = studied
     shift = shift_of(texture, ["M1", "M3"], ["F0", "F2"])
     maps = maps_of({"X": face(50)}).isel(take=0)
-    mild, wild = (edit_texture(maps, by * shift, texture, rng=np.random.default_rng(0)) for by in (1.0, 10.0))
+    mild, wild = (
+        edit_texture(maps, by * shift, texture, rng=np.random.default_rng(0))
+        for by in (1.0, 10.0)
+    )
     assert np.isfinite(wild.change).all()
     assert wild.distance > 3 * mild.distance
-    assert all(trace[-1] < 0.3 * trace[0] for trace in mild.trace[:2])  # the third axis is only rounding
+    # the third axis is only rounding
+    assert all(trace[-1] < 0.3 * trace[0] for trace in mild.trace[:2])
 
 
 def test_edit_texture__distance_is_mahalanobis(studied):
-    """The distance of a member is the root mean square of its standardised scores from scikit-learn."""
+    """The distance of a member is the root mean square of its standardised scores from
+    scikit-learn.
+    """
     maps, texture = studied
     names = texture["region"].values.tolist()
     at = [names.index("beard"), names.index("no_beard")]
@@ -224,9 +295,14 @@ def test_edit_texture__distance_is_mahalanobis(studied):
     count = int(np.searchsorted(share, 0.99)) + 1
     score = PCA(count, whiten=True).fit_transform(known)
     edit = edit_texture(
-        maps.sel(take="M3"), 0 * shift_of(texture, ["M1"], ["F0"]), texture, rng=np.random.default_rng(0)
+        maps.sel(take="M3"),
+        0 * shift_of(texture, ["M1"], ["F0"]),
+        texture,
+        rng=np.random.default_rng(0),
     )
-    assert edit.distance_before == pytest.approx(np.sqrt((score[3] ** 2).mean()), rel=1e-3)
+    assert edit.distance_before == pytest.approx(
+        np.sqrt((score[3] ** 2).mean()), rel=1e-3
+    )
 
 
 def test_at_surfels__beyond_the_map_its_edge():

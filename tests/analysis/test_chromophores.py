@@ -1,4 +1,6 @@
-"""Melanin and haemoglobin from maps with planted pigments, and populations where they cannot be separated."""
+"""Melanin and haemoglobin from maps with planted pigments, and populations where they
+cannot be separated.
+"""
 
 from __future__ import annotations
 
@@ -56,7 +58,9 @@ POINTS = {name: np.array(at) for name, at in LANDMARKS.items()}
 def freckles(rng):
     """Melanin (v, u): small dark spots on mottled skin."""
     spots = gaussian_filter((rng.random((SIZE, SIZE)) < 0.004).astype(float), 1.5)
-    return 4.0 * spots + 0.03 * gaussian_filter(rng.standard_normal((SIZE, SIZE)), 4) * 8
+    return (
+        4.0 * spots + 0.03 * gaussian_filter(rng.standard_normal((SIZE, SIZE)), 4) * 8
+    )
 
 
 def flush(rng):
@@ -66,9 +70,14 @@ def flush(rng):
 
 
 def pigments(n=6, *, melanin=freckles, blood=flush):
-    """Amounts (take, v, u, 2): persons have different mean levels, in which both pigments are correlated."""
+    """Amounts (take, v, u, 2): persons have different mean levels, in which both
+    pigments are correlated.
+    """
     rng = np.random.default_rng(5)
-    people = [np.stack([melanin(rng) + 0.3 * i, blood(rng) + 0.05 * i], axis=-1) for i in range(n)]
+    people = [
+        np.stack([melanin(rng) + 0.3 * i, blood(rng) + 0.05 * i], axis=-1)
+        for i in range(n)
+    ]
     return np.stack(people)
 
 
@@ -80,14 +89,22 @@ def maps_of(amounts, axes=PLANTED, noise=0.004, coverage=None):
     n = len(amounts)
     return xr.Dataset(
         {
-            "texel_diffuse_reflectance": ((*dims, "channel"), np.exp(-density).astype(np.float32)),
+            "texel_diffuse_reflectance": (
+                (*dims, "channel"),
+                np.exp(-density).astype(np.float32),
+            ),
             "texel_coverage": (dims, covered),
         },
         coords={
             "take": [f"T{i}" for i in range(n)],
             "subject": ("take", np.array([f"S{i // 2}" for i in range(n)], object)),
             "condition": ("take", np.array(["normal"] * n, object)),
-            "gender": ("take", np.array(["female" if i < n // 2 else "male" for i in range(n)], object)),
+            "gender": (
+                "take",
+                np.array(
+                    ["female" if i < n // 2 else "male" for i in range(n)], object
+                ),
+            ),
         },
     )
 
@@ -112,11 +129,15 @@ def test_chromophore_axes__planted_pigments(planted):
     """Within four degrees, although people differ along a mixture of both."""
     _, _, axes = planted
     assert axes.attrs["axes_origin"] == INDEPENDENT
-    assert axes.attrs["flags"] == ["no landmarks: beards, brows and lips are used as skin and may rotate the axes"]
+    assert axes.attrs["flags"] == [
+        "no landmarks: beards, brows and lips are used as skin and may rotate the axes"
+    ]
     assert degrees(axes["chromophore_axis"].values, PLANTED).max() < 4
     assert (axes["chromophore_axis"].sel(channel="G") == 1).all()
     np.testing.assert_allclose(
-        axes["chromophore_table_angle"], degrees(axes["chromophore_axis"].values, TABLE_AXES), atol=1e-6
+        axes["chromophore_table_angle"],
+        degrees(axes["chromophore_axis"].values, TABLE_AXES),
+        atol=1e-6,
     )
     assert "haemoglobin: absorbs R, G, B as" in "\n".join(describe_chromophores(axes))
 
@@ -124,7 +145,10 @@ def test_chromophore_axes__planted_pigments(planted):
 def test_chromophore_axes__do_not_depend_on_seed_or_chunks(planted):
     _, maps, axes = planted
     other = chromophore_axes(maps.chunk(take=1, v=50), rng=np.random.default_rng(77))
-    assert degrees(other["chromophore_axis"].values, axes["chromophore_axis"].values).max() < 0.1
+    assert (
+        degrees(other["chromophore_axis"].values, axes["chromophore_axis"].values).max()
+        < 0.1
+    )
     same = found_axes(maps.chunk(take=2))
     np.testing.assert_array_equal(same["chromophore_axis"], axes["chromophore_axis"])
 
@@ -134,7 +158,10 @@ def test_chromophore_maps__amounts_are_the_planted_ones(planted):
     for i in range(len(amounts)):
         found = chromophore_maps(maps.isel(take=i), axes)["texel_chromophore"].values
         for c in range(2):
-            assert np.corrcoef(found[..., c].ravel(), amounts[i, ..., c].ravel())[0, 1] > 0.95
+            assert (
+                np.corrcoef(found[..., c].ravel(), amounts[i, ..., c].ravel())[0, 1]
+                > 0.95
+            )
     # mean levels of persons too
     each = [chromophore_maps(maps.isel(take=i), axes) for i in range(len(amounts))]
     means = np.stack([one["texel_chromophore"].mean(("v", "u")) for one in each])
@@ -143,18 +170,28 @@ def test_chromophore_maps__amounts_are_the_planted_ones(planted):
 
 def test_chromophore_maps__exact_with_known_axes(planted):
     _, _, axes = planted
-    known = axes.assign(chromophore_axis=(("chromophore", "channel"), PLANTED), chromophore_offset=("channel", BASE))
+    known = axes.assign(
+        chromophore_axis=(("chromophore", "channel"), PLANTED),
+        chromophore_offset=("channel", BASE),
+    )
     normal = np.cross(*PLANTED) / np.linalg.norm(np.cross(*PLANTED))
     density = BASE + np.array([0.3, -0.1]) @ PLANTED + 0.02 * normal
     one = xr.Dataset(
         {
-            "texel_diffuse_reflectance": (("v", "u", "channel"), np.exp(-np.tile(density, (2, 2, 1)))),
+            "texel_diffuse_reflectance": (
+                ("v", "u", "channel"),
+                np.exp(-np.tile(density, (2, 2, 1))),
+            ),
             "texel_coverage": (("v", "u"), np.array([[1.0, 1.0], [1.0, 0.2]])),
         }
     )
     found = chromophore_maps(one, known)
-    np.testing.assert_allclose(found["texel_chromophore"].values[0, 0], [0.3, -0.1], atol=1e-6)
-    np.testing.assert_allclose(found["texel_chromophore_residual"].values[0, 1], 0.02, atol=1e-6)
+    np.testing.assert_allclose(
+        found["texel_chromophore"].values[0, 0], [0.3, -0.1], atol=1e-6
+    )
+    np.testing.assert_allclose(
+        found["texel_chromophore_residual"].values[0, 1], 0.02, atol=1e-6
+    )
     assert np.isnan(found["texel_chromophore"].values[1, 1]).all()
     assert np.isnan(found["texel_chromophore_residual"].values[1, 1])
 
@@ -166,12 +203,19 @@ def normally(scale):
 @pytest.mark.parametrize(
     ("melanin", "blood", "noise", "why"),
     [
-        (normally(0.2), normally(0.1), 0.002, "between samples, as with normally distributed"),
+        (
+            normally(0.2),
+            normally(0.1),
+            0.002,
+            "between samples, as with normally distributed",
+        ),
         (freckles, normally(0.0), 0.01, "as with one pigment and noise"),
         (freckles, normally(0.0), 0.0, "as with one pigment"),
     ],
 )
-def test_chromophore_axes__falls_back_where_pigments_cannot_be_separated(melanin, blood, noise, why):
+def test_chromophore_axes__falls_back_where_pigments_cannot_be_separated(
+    melanin, blood, noise, why
+):
     amounts = pigments(melanin=melanin, blood=blood)
     axes = found_axes(maps_of(amounts, noise=noise))
     assert axes.attrs["axes_origin"].startswith("published absorption")
@@ -181,8 +225,12 @@ def test_chromophore_axes__falls_back_where_pigments_cannot_be_separated(melanin
 
 
 def test_chromophore_axes__projected_fallback_lies_in_the_plane():
-    axes = found_axes(maps_of(pigments(melanin=normally(0.2), blood=normally(0.1)), noise=0.002))
-    assert axes.attrs["axes_origin"].endswith("in the plane of the two largest principal components")
+    axes = found_axes(
+        maps_of(pigments(melanin=normally(0.2), blood=normally(0.1)), noise=0.002)
+    )
+    assert axes.attrs["axes_origin"].endswith(
+        "in the plane of the two largest principal components"
+    )
     normal = np.cross(*PLANTED)
     found = axes["chromophore_axis"].values
     assert np.abs(found @ normal).max() < 0.02 * np.linalg.norm(normal)
@@ -202,7 +250,10 @@ def test_chromophore_axes__refuses_components_that_brighten_skin():
 def test_chromophore_axes__refuses_what_does_not_vary(case):
     flat = np.zeros((2, 32, 32, 2))
     covered = None if case == "constant" else np.zeros((2, 32, 32), np.float32)
-    with pytest.raises(InputError, match={"constant": "found constant maps", "nothing": "must be measured"}[case]):
+    with pytest.raises(
+        InputError,
+        match={"constant": "found constant maps", "nothing": "must be measured"}[case],
+    ):
         found_axes(maps_of(flat, noise=0.0, coverage=covered))
 
 
@@ -217,7 +268,9 @@ def test_chromophore_axes__beards_do_not_turn_them():
     maps = maps_of(amounts)
     beard = chromophore_regions(POINTS, SIZE)["beard"]
     strands = np.random.default_rng(3).random((SIZE, SIZE)) * beard
-    maps["texel_diffuse_reflectance"] = maps["texel_diffuse_reflectance"] * (1 - 0.7 * strands[None, ..., None])
+    maps["texel_diffuse_reflectance"] = maps["texel_diffuse_reflectance"] * (
+        1 - 0.7 * strands[None, ..., None]
+    )
     axes = found_axes(maps.astype(np.float32), landmarks=POINTS)
     assert axes.attrs["axes_origin"] == INDEPENDENT
     assert not axes.attrs["flags"]
@@ -234,13 +287,21 @@ def test_chromophore_statistics__as_numpy(planted):
     one = chromophore_maps(maps.isel(take=2), axes)
     inside = one["texel_chromophore"].values[masks["cheek"]].astype(np.float64)
     cheek = found.sel(take="T2", region="cheek")
-    np.testing.assert_allclose(cheek["take_chromophore"], inside.mean(axis=0), atol=1e-5)
-    np.testing.assert_allclose(cheek["take_chromophore_deviation"], inside.std(axis=0), atol=1e-5)
+    np.testing.assert_allclose(
+        cheek["take_chromophore"], inside.mean(axis=0), atol=1e-5
+    )
+    np.testing.assert_allclose(
+        cheek["take_chromophore_deviation"], inside.std(axis=0), atol=1e-5
+    )
     residual = one["texel_chromophore_residual"].values[masks["cheek"]]
-    np.testing.assert_allclose(cheek["take_chromophore_residual"], np.sqrt((residual**2).mean()), atol=1e-5)
+    np.testing.assert_allclose(
+        cheek["take_chromophore_residual"], np.sqrt((residual**2).mean()), atol=1e-5
+    )
     assert found["take_chromophore"].sel(take="T1", region="forehead").isnull().all()
     assert found["take_chromophore"].sel(take="T1", region="face").notnull().all()
-    assert float(found["take_chromophore_coverage"].sel(take="T1", region="face")) == 0.5
+    assert (
+        float(found["take_chromophore_coverage"].sel(take="T1", region="face")) == 0.5
+    )
 
 
 def test_chromophore_table__the_unit_is_the_subject(planted):
@@ -252,8 +313,12 @@ def test_chromophore_table__the_unit_is_the_subject(planted):
     subjects = takes.reshape(3, 2, 2).mean(axis=1)
     own = table.sel(group="all", region="face")
     np.testing.assert_allclose(own["group_chromophore_mean"], subjects.mean(axis=0))
-    np.testing.assert_allclose(own["group_chromophore_standard_deviation"], subjects.std(axis=0, ddof=1))
-    alone = chromophore_table(maps.isel(take=[0, 1]), statistics=statistics, group_by="gender")
+    np.testing.assert_allclose(
+        own["group_chromophore_standard_deviation"], subjects.std(axis=0, ddof=1)
+    )
+    alone = chromophore_table(
+        maps.isel(take=[0, 1]), statistics=statistics, group_by="gender"
+    )
     assert alone["group_chromophore_mean_low"].isnull().all()
     with pytest.raises(InputError, match="must be an attribute or a trait"):
         chromophore_table(maps, statistics=statistics, group_by="shoes")
@@ -262,7 +327,10 @@ def test_chromophore_table__the_unit_is_the_subject(planted):
 def test_plot_chromophores__names_groups_and_counts(planted):
     _, maps, axes = planted
     statistics = chromophore_statistics(maps, axes=axes)
-    ax = plot_chromophores(statistics, table=chromophore_table(maps, statistics=statistics, group_by="gender"))
+    ax = plot_chromophores(
+        statistics,
+        table=chromophore_table(maps, statistics=statistics, group_by="gender"),
+    )
     labels = [text.get_text() for text in ax.get_legend().get_texts()]
     assert labels[0] == "melanin, female (n = 2)"
     assert "-ln R_d at green" in ax.get_xlabel()

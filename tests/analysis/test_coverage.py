@@ -26,7 +26,10 @@ def cohort_of(subjects, conditions=None, status=None, **attributes):
     coords |= {name: column(values) for name, values in attributes.items()}
     variables = {}
     if status is not None:
-        variables["site_status"] = (("take", "site", "channel"), np.repeat(np.array(status)[..., None], 3, axis=-1))
+        variables["site_status"] = (
+            ("take", "site", "channel"),
+            np.repeat(np.array(status)[..., None], 3, axis=-1),
+        )
         coords["site"] = ["cheek", "neck"]
     return xr.Dataset(variables, coords)
 
@@ -37,7 +40,9 @@ NOTHING = int(ProbeStatus.NOT_MEASURED)
 
 @pytest.fixture
 def population():
-    """24 women aged 20 to 39, and 12 men, one of them aged 62 and without a probe; S0 was also measured with lotion."""
+    """24 women aged 20 to 39, and 12 men, one of them aged 62 and without a probe; S0
+    was also measured with lotion.
+    """
     subjects = [f"S{i}" for i in range(36)]
     gender = ["female"] * 24 + ["male"] * 12
     age = [20 + i % 20 for i in range(35)] + [62]
@@ -54,7 +59,13 @@ def population():
 
 
 def counts_of(report):
-    return dict(zip(report["cell"].values.tolist(), report["coverage_count"].values.tolist(), strict=True))
+    return dict(
+        zip(
+            report["cell"].values.tolist(),
+            report["coverage_count"].values.tolist(),
+            strict=True,
+        )
+    )
 
 
 def test_coverage_report__counts_subjects_not_takes(population):
@@ -63,16 +74,27 @@ def test_coverage_report__counts_subjects_not_takes(population):
     assert (report.attrs["subjects"], len(report.attrs["takes"])) == (36, 37)
     assert (counts["gender: female"], counts["gender: male"]) == (24, 12)
     assert (counts["condition: normal"], counts["condition: lotion"]) == (36, 1)
-    assert (counts["site: cheek"], counts["site: neck"]) == (35, 0)  # the neck was measured with lotion only
+    # the neck was measured with lotion only
+    assert (counts["site: cheek"], counts["site: neck"]) == (35, 0)
     bands = [counts[f"age band: {decade}-{decade + 9}"] for decade in range(20, 70, 10)]
     assert bands == [20, 15, 0, 0, 1]
     assert counts["gender: male x condition: lotion"] == 0
     assert counts["gender: female x age band: 20-29"] == 14
     assert counts["gender: male x ancestry: african x age band: 20-29"] == 3
-    assert counts["gender: male x ancestry: african"] + counts["gender: male x ancestry: european"] == 11
-    singles = sum(count for name, count in counts.items() if name.startswith("gender") and " x " not in name)
+    assert (
+        counts["gender: male x ancestry: african"]
+        + counts["gender: male x ancestry: european"]
+        == 11
+    )
+    singles = sum(
+        count
+        for name, count in counts.items()
+        if name.startswith("gender") and " x " not in name
+    )
     crossed = sum(
-        count for name, count in counts.items() if name.count(" x ") == 1 and "gender" in name and "age" in name
+        count
+        for name, count in counts.items()
+        if name.count(" x ") == 1 and "gender" in name and "age" in name
     )
     assert singles == crossed == 36
 
@@ -82,7 +104,8 @@ def test_coverage_report__names_empty_and_small_cells(population):
     assert "age band: no subjects in 40-49, 50-59" in flags
     assert "age band: fewer than 10 subjects: 60-69 (1)" in flags
     assert "site: no subjects in neck" in flags
-    assert "gender x age band: no subjects in female x 60-69" in flags  # the only line names 40-49
+    # the only line names 40-49
+    assert "gender x age band: no subjects in female x 60-69" in flags
     assert "gender x condition: no subjects in male x lotion" in flags
     assert "ancestry: unknown for 1 of 36 subjects" in flags
     lines = describe_coverage(coverage_report(population))
@@ -96,7 +119,11 @@ def test_coverage_report__attributes_that_go_together():
     eyes = ["blue" if i // 2 % 2 else "brown" for i in range(n)]
     age = [20.0 + i // 4 for i in range(n)]
     weight = [60.0 + one for one in age]
-    report = coverage_report(cohort_of(list(range(n)), gender=gender, hair=hair, eyes=eyes, age=age, weight=weight))
+    report = coverage_report(
+        cohort_of(
+            list(range(n)), gender=gender, hair=hair, eyes=eyes, age=age, weight=weight
+        )
+    )
     between = report["coverage_association"].to_pandas()
     np.testing.assert_allclose(between, between.T)
     assert between.loc["gender", "hair"] == pytest.approx(1.0)
@@ -105,7 +132,12 @@ def test_coverage_report__attributes_that_go_together():
     assert between.loc["gender", "age"] < 0.2
     together = [flag for flag in report.attrs["flags"] if "are associated" in flag]
     assert len(together) == 2
-    assert any(flag.startswith("gender and hair are associated (Cramer's V 1.00): their effects") for flag in together)
+    assert any(
+        flag.startswith(
+            "gender and hair are associated (Cramer's V 1.00): their effects"
+        )
+        for flag in together
+    )
 
 
 def test_coverage_report__cramers_v_is_bergsmas():
@@ -113,12 +145,18 @@ def test_coverage_report__cramers_v_is_bergsmas():
     rng = np.random.default_rng(3)
     a = rng.integers(3, size=200)
     b = np.where(rng.random(200) < 0.4, a, rng.integers(4, size=200))
-    report = coverage_report(cohort_of(list(range(200)), a=[f"a{x}" for x in a], b=[f"b{x}" for x in b]))
-    table = np.array([[((a == x) & (b == y)).sum() for y in range(4)] for x in range(3)])
+    report = coverage_report(
+        cohort_of(list(range(200)), a=[f"a{x}" for x in a], b=[f"b{x}" for x in b])
+    )
+    table = np.array(
+        [[((a == x) & (b == y)).sum() for y in range(4)] for x in range(3)]
+    )
     square = stats.chi2_contingency(table, correction=False).statistic / 200
     corrected = max(0, square - 2 * 3 / 199)
     want = np.sqrt(corrected / (min(3 - 4 / 199, 4 - 9 / 199) - 1))
-    assert float(report["coverage_association"].sel(attribute="a", attribute_2="b")) == pytest.approx(want)
+    assert float(
+        report["coverage_association"].sel(attribute="a", attribute_2="b")
+    ) == pytest.approx(want)
     assert 0.1 < want < 0.9
 
 
@@ -126,13 +164,17 @@ def test_coverage_report__multiple_correlation_of_a_number():
     rng = np.random.default_rng(4)
     group = np.repeat([0, 1, 2], 20)
     age = 30 + 8.0 * group + rng.normal(0, 5, 60)
-    report = coverage_report(cohort_of(list(range(60)), age=age.tolist(), site_of_birth=[f"g{x}" for x in group]))
+    report = coverage_report(
+        cohort_of(
+            list(range(60)), age=age.tolist(), site_of_birth=[f"g{x}" for x in group]
+        )
+    )
     f = stats.f_oneway(*(age[group == one] for one in range(3))).statistic
     plain = 2 * f / (2 * f + 57)
     want = np.sqrt(1 - (1 - plain) * 59 / 57)
-    assert float(report["coverage_association"].sel(attribute="age", attribute_2="site_of_birth")) == pytest.approx(
-        want
-    )
+    assert float(
+        report["coverage_association"].sel(attribute="age", attribute_2="site_of_birth")
+    ) == pytest.approx(want)
 
 
 def test_coverage_report__nothing_is_said():
@@ -140,7 +182,8 @@ def test_coverage_report__nothing_is_said():
     assert counts_of(report) == {"condition: normal": 2}
     assert report.sizes["attribute"] == 0
     assert [
-        f"{name}: no subject has this attribute" in report.attrs["flags"] for name in ("gender", "ancestry", "age")
+        f"{name}: no subject has this attribute" in report.attrs["flags"]
+        for name in ("gender", "ancestry", "age")
     ] == [True] * 3
     assert plot_coverage(report).get_xlabel() == "subjects"
     mpl.pyplot.close("all")
@@ -155,7 +198,10 @@ def test_plot_coverage__shows_the_counts(population):
     ax = plot_coverage(coverage_report(population))
     labels = [text.get_text() for text in ax.get_yticklabels()]
     bands = [text.get_text() for text in ax.get_xticklabels()]
-    texts = {(round(t.get_position()[1]), round(t.get_position()[0])): t.get_text() for t in ax.texts}
+    texts = {
+        (round(t.get_position()[1]), round(t.get_position()[0])): t.get_text()
+        for t in ax.texts
+    }
     assert texts[labels.index("gender: female"), bands.index("20-29")] == "14"
     assert texts[labels.index("gender: male"), bands.index("60-69")] == "1"
     assert ax.get_title() == "number of subjects (n = 36)"

@@ -25,11 +25,17 @@ def takes(**attrs):
     places = np.array(list(FACE.values()))
     made = {}
     for name, level, spots in (("A", 0.5, 0.0), ("B", 0.3, SPOT)):
-        model = sheet_take(plane, on_sheet(places), names=list(FACE), take=name, **attrs)
+        model = sheet_take(
+            plane, on_sheet(places), names=list(FACE), take=name, **attrs
+        )
         log = np.log(level) - spots * spotted()
         fitted = model["fitted"].to_dataset()
         colour = np.repeat(np.exp(log)[:, None], 3, axis=1).astype(np.float32)
-        extra = {"diffuse_reflectance": colour, "dipole_s": np.full((len(plane), 3), 0.5), "refractive_index": 1.3}
+        extra = {
+            "diffuse_reflectance": colour,
+            "dipole_s": np.full((len(plane), 3), 0.5),
+            "refractive_index": 1.3,
+        }
         model["fitted"] = fitted.assign(dataset(extra).data_vars)
         made[name] = model
     return made
@@ -52,9 +58,18 @@ def spotted():
 def moved(region="face", **options):
     models = takes()
     placed = registered()
-    call = {"registered": placed["A"], "source_registered": placed["B"], "size": SIZE, "coarsest": COARSEST, **options}
+    call = {
+        "registered": placed["A"],
+        "source_registered": placed["B"],
+        "size": SIZE,
+        "coarsest": COARSEST,
+        **options,
+    }
     tree = transfer_detail(models["A"], models["B"], region=region, **call)
-    change = np.log(tree["fitted/diffuse_reflectance"].values / models["A"]["fitted/diffuse_reflectance"].values)
+    change = np.log(
+        tree["fitted/diffuse_reflectance"].values
+        / models["A"]["fitted/diffuse_reflectance"].values
+    )
     return tree, change[:, 1], placed["A"]["common_uv"].values
 
 
@@ -66,7 +81,11 @@ def test_transfer_detail__spots_come_and_colour_stays():
     depth = between - change[inside & spots].mean()
     assert depth == pytest.approx(SPOT, rel=0.25)  # the map is linear between texels
     assert np.abs(change[inside].mean()) < 0.1 * np.log(0.5 / 0.3)
-    assert tree.attrs["edit"] == {"detail": "B", "region": "face", "coarsest_mm": COARSEST}
+    assert tree.attrs["edit"] == {
+        "detail": "B",
+        "region": "face",
+        "coarsest_mm": COARSEST,
+    }
     assert "basis_weight" in tree["fitted"]
 
 
@@ -74,9 +93,16 @@ def test_transfer_detail__of_itself_changes_nothing():
     models = takes()
     placed = registered()
     tree = transfer_detail(
-        models["B"], models["B"], registered=placed["B"], source_registered=placed["B"], size=SIZE, coarsest=COARSEST
+        models["B"],
+        models["B"],
+        registered=placed["B"],
+        source_registered=placed["B"],
+        size=SIZE,
+        coarsest=COARSEST,
     )
-    np.testing.assert_array_equal(tree["fitted/diffuse_reflectance"], models["B"]["fitted/diffuse_reflectance"])
+    np.testing.assert_array_equal(
+        tree["fitted/diffuse_reflectance"], models["B"]["fitted/diffuse_reflectance"]
+    )
 
 
 def test_transfer_detail__stays_within_its_mask():
@@ -84,7 +110,10 @@ def test_transfer_detail__stays_within_its_mask():
     mask[:, : SIZE // 2] = True
     _, change, uv = moved(mask)
     spots = spotted() > 0.99
-    left, right = (spots & (np.abs(uv[:, 1] - 0.5) < 0.3) & side for side in (uv[:, 0] < 0.4, uv[:, 0] > 0.65))
+    left, right = (
+        spots & (np.abs(uv[:, 1] - 0.5) < 0.3) & side
+        for side in (uv[:, 0] < 0.4, uv[:, 0] > 0.65)
+    )
     assert change[left].mean() < -0.5 * SPOT
     assert np.abs(change[right]).max() < 0.05 * SPOT
 
@@ -105,8 +134,15 @@ def test_transfer_detail__refuses_what_cannot_be():
     placed = registered()
     models["B"].attrs["consent_scope"] = ["fit"]
     with pytest.raises(InputError, match="statistics"):
-        transfer_detail(models["A"], models["B"], registered=placed["A"], source_registered=placed["B"])
+        transfer_detail(
+            models["A"],
+            models["B"],
+            registered=placed["A"],
+            source_registered=placed["B"],
+        )
     other = placed["B"].isel(landmark=slice(3))
     models = takes()
     with pytest.raises(InputError, match="registered together"):
-        transfer_detail(models["A"], models["B"], registered=placed["A"], source_registered=other)
+        transfer_detail(
+            models["A"], models["B"], registered=placed["A"], source_registered=other
+        )

@@ -23,7 +23,9 @@ def _product(take, matrix):
     return take["value"].values @ matrix.T
 
 
-@pytest.mark.parametrize("change", [_misaligned, np.asfortranarray, lambda a: np.repeat(a, 2, axis=0)[::2]])
+@pytest.mark.parametrize(
+    "change", [_misaligned, np.asfortranarray, lambda a: np.repeat(a, 2, axis=0)[::2]]
+)
 def test_each_take__gives_the_same_bits_for_any_layout_in_memory(change):
     rng = np.random.default_rng(3)
     value = rng.random((2, 700, 59))
@@ -31,7 +33,9 @@ def test_each_take__gives_the_same_bits_for_any_layout_in_memory(change):
     cohort = xr.Dataset({"value": (("take", "surfel", "dictionary"), value)})
     changed = xr.Dataset({"value": (("take", "surfel", "dictionary"), change(value))})
     expected = each_take(_product, cohort, ["value"], matrix)
-    for one, other in zip(expected, each_take(_product, changed, ["value"], change(matrix)), strict=True):
+    for one, other in zip(
+        expected, each_take(_product, changed, ["value"], change(matrix)), strict=True
+    ):
         np.testing.assert_array_equal(one, other)
     [one], [other] = each_item(_squares, [value]), each_item(_squares, [change(value)])
     np.testing.assert_array_equal(one, other)

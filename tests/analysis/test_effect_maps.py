@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from skindb.analysis import describe_effect_maps, effect_maps, plot_effect_maps, tabulate_effect_maps
+from skindb.analysis import (
+    describe_effect_maps,
+    effect_maps,
+    plot_effect_maps,
+    tabulate_effect_maps,
+)
 from skindb.errors import InputError
 from skindb.numerics.inference import effects
 
@@ -20,7 +25,11 @@ def cohort(n=24, step=STEP, seed=0, confounded=False):
     rng = np.random.default_rng(seed)
     men = np.arange(n) % 2 == 1
     age = 20.0 + 40 * rng.random(n) + (20 * men if confounded else 0)
-    albedo = 0.4 + 0.05 * rng.standard_normal((n, SIZE, SIZE, 3)) + 0.05 * rng.standard_normal((n, 1, 1, 1))
+    albedo = (
+        0.4
+        + 0.05 * rng.standard_normal((n, SIZE, SIZE, 3))
+        + 0.05 * rng.standard_normal((n, 1, 1, 1))
+    )
     albedo[men, PATCH[0], PATCH[1]] -= step
     if confounded:
         albedo -= 0.005 * (age - 40)[:, None, None, None]
@@ -29,7 +38,10 @@ def cohort(n=24, step=STEP, seed=0, confounded=False):
     dims = ("take", "v", "u")
     return xr.Dataset(
         {
-            "texel_diffuse_reflectance": ((*dims, "channel"), albedo.astype(np.float32)),
+            "texel_diffuse_reflectance": (
+                (*dims, "channel"),
+                albedo.astype(np.float32),
+            ),
             "texel_sigma_tr": ((*dims, "channel"), sigma.astype(np.float32)),
             "texel_coverage": (dims, np.ones((n, SIZE, SIZE), np.float32)),
         },
@@ -45,7 +57,12 @@ def cohort(n=24, step=STEP, seed=0, confounded=False):
 
 def maps_of(ds, group_by="gender", **options):
     return effect_maps(
-        ds, group_by=group_by, **({"size": SIZE, "permutations": 200, "rng": np.random.default_rng(1)} | options)
+        ds,
+        group_by=group_by,
+        **(
+            {"size": SIZE, "permutations": 200, "rng": np.random.default_rng(1)}
+            | options
+        ),
     )
 
 
@@ -56,25 +73,36 @@ def test_effect_maps__find_the_planted_patch_and_nothing_else():
     differ[PATCH] = False
     assert not differ.any()
     effect = found["map_effect"].sel(quantity="R_d G").values
-    assert effect[PATCH].mean() == pytest.approx(-STEP, abs=0.06)  # 0.05 of the level differs between subjects
-    np.testing.assert_allclose(found["map_effect"].sel(quantity="sigma_tr R").mean(), np.log(1.5), atol=0.01)
+    # 0.05 of the level differs between subjects
+    assert effect[PATCH].mean() == pytest.approx(-STEP, abs=0.06)
+    np.testing.assert_allclose(
+        found["map_effect"].sel(quantity="sigma_tr R").mean(), np.log(1.5), atol=0.01
+    )
     assert (found["map_effect_count"] == 24).all()
 
 
 def test_effect_maps__texels_are_regressions_of_their_own():
     """One texel is compared with `effects`, which is itself tested against statsmodels."""
     ds = cohort()
-    found = maps_of(ds, adjust=["age"]).sel(contrast="male less female", quantity="R_d R").isel(v=9, u=20)
+    found = (
+        maps_of(ds, adjust=["age"])
+        .sel(contrast="male less female", quantity="R_d R")
+        .isel(v=9, u=20)
+    )
     value = ds["texel_diffuse_reflectance"].values[:, 9, 20, 0].astype(np.float64)
     men = (ds["gender"].values == "male").astype(float)
     want = effects(value[:, None], men, ds["age"].values[:, None])
     assert float(found["map_effect"]) == pytest.approx(float(want.slope[0]), rel=1e-5)
-    assert float(found["map_effect_half_width"]) == pytest.approx(float(want.high[0] - want.slope[0]), rel=1e-5)
+    assert float(found["map_effect_half_width"]) == pytest.approx(
+        float(want.high[0] - want.slope[0]), rel=1e-5
+    )
 
 
 @pytest.mark.slow
 def test_effect_maps__family_wise_errors():
-    """Of 60 cohorts without any difference, about 5 % have a texel that differs (binomial, 99.9 %)."""
+    """Of 60 cohorts without any difference, about 5 % have a texel that differs
+    (binomial, 99.9 %).
+    """
     found = [
         maps_of(
             cohort(16, step=0.0, seed=seed).drop_vars("texel_sigma_tr"),
@@ -89,7 +117,9 @@ def test_effect_maps__family_wise_errors():
 
 def test_effect_maps__a_confounder_is_held_fixed():
     plain, held = (
-        maps_of(cohort(60, step=0.0, confounded=True), adjust=adjust).sel(quantity="R_d G")["map_effect"].mean()
+        maps_of(cohort(60, step=0.0, confounded=True), adjust=adjust)
+        .sel(quantity="R_d G")["map_effect"]
+        .mean()
         for adjust in ((), ("age",))
     )
     assert float(plain) < -0.07
@@ -100,11 +130,15 @@ def test_effect_maps__blocks_are_means_of_what_is_measured():
     ds = cohort(8)
     ds["texel_coverage"][:, 0, 0] = 0
     ds["texel_diffuse_reflectance"][:, 0, 0] = 100.0
-    found = maps_of(ds, size=SIZE // 2).sel(contrast="male less female", quantity="R_d G")["map_effect"]
+    found = maps_of(ds, size=SIZE // 2).sel(
+        contrast="male less female", quantity="R_d G"
+    )["map_effect"]
     other = ds["texel_diffuse_reflectance"].values[..., 1].astype(np.float64)
     block = (other[:, 0, 1] + other[:, 1, 0] + other[:, 1, 1]) / 3
     men = ds["gender"].values == "male"
-    assert float(found[0, 0]) == pytest.approx(block[men].mean() - block[~men].mean(), rel=1e-4)
+    assert float(found[0, 0]) == pytest.approx(
+        block[men].mean() - block[~men].mean(), rel=1e-4
+    )
 
 
 def test_effect_maps__too_few_subjects_make_no_texel():
@@ -119,7 +153,9 @@ def test_effect_maps__too_few_subjects_make_no_texel():
     assert np.isfinite(found["map_effect"][10:22]).all()
     assert (found["map_effect_count"][10:22] == 11).all()
     ds["texel_coverage"][:] = 0
-    with pytest.raises(InputError, match="no texel with values of 80% of the 12 subjects"):
+    with pytest.raises(
+        InputError, match="no texel with values of 80% of the 12 subjects"
+    ):
         maps_of(ds)
 
 
@@ -132,8 +168,12 @@ def test_effect_maps__conditions_within_subjects_and_numbers():
     )
     both = xr.concat([ds, other], "take")
     found = maps_of(both, group_by="condition").sel(contrast="lotion less normal")
-    np.testing.assert_allclose(found["map_effect"].sel(quantity="R_d B"), 0.1, atol=1e-6)
-    np.testing.assert_allclose(found["map_effect"].sel(quantity="sigma_tr B"), 0.0, atol=1e-6)
+    np.testing.assert_allclose(
+        found["map_effect"].sel(quantity="R_d B"), 0.1, atol=1e-6
+    )
+    np.testing.assert_allclose(
+        found["map_effect"].sel(quantity="sigma_tr B"), 0.0, atol=1e-6
+    )
     assert "age, per unit" in maps_of(ds, group_by="age")["contrast"].values
 
 
@@ -154,4 +194,8 @@ def test_effect_maps__table_and_plot(tmp_path):
     assert "200 permutations" in describe_effect_maps(found)[0]
     figure = plot_effect_maps(found)
     figure.savefig(tmp_path / "maps.png")
-    assert [ax.get_title() for ax in figure.axes[:3]] == ["effect on R_d G", "half-width of the 95 % CI", "subjects"]
+    assert [ax.get_title() for ax in figure.axes[:3]] == [
+        "effect on R_d G",
+        "half-width of the 95 % CI",
+        "subjects",
+    ]

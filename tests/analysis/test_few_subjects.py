@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 from planted_tables import planted_tables
 
-from skindb.analysis import component_correlations, coverage_report, effect_maps, group_effects, translucency_table
+from skindb.analysis import (
+    component_correlations,
+    coverage_report,
+    effect_maps,
+    group_effects,
+    translucency_table,
+)
 from skindb.analysis.group_effects import describe_group_effects
 from skindb.analysis.members import subjects_without_normal
 from skindb.analysis.translucency import describe_translucency
@@ -16,16 +22,23 @@ from skindb.numerics.inference import effects, permutation_p
 
 @pytest.mark.parametrize("others", [3, 5, 20])
 def test_effects__a_group_of_one_has_no_error(others):
-    """Rounding would break ties of the p value: 5 against 1 gave 0.006, but the smallest valid value is 1/6."""
+    """Rounding would break ties of the p value: 5 against 1 gave 0.006, but the
+    smallest valid value is 1/6.
+    """
     values = np.random.default_rng(others).standard_normal((others + 1, 40))
     group = np.array([1.0] + [0.0] * others)
-    for call in (lambda: effects(values, group), lambda: permutation_p(values, group, rng=np.random.default_rng(0))):
+    for call in (
+        lambda: effects(values, group),
+        lambda: permutation_p(values, group, rng=np.random.default_rng(0)),
+    ):
         with pytest.raises(ValueError, match="the effect depends on one subject"):
             call()
 
 
 def test_effects__a_subject_alone_in_a_category_is_harmless():
-    """The only subject of a category that is held fixed contains no information about the effect, and is harmless."""
+    """The only subject of a category that is held fixed contains no information about
+    the effect, and is harmless.
+    """
     rng = np.random.default_rng(1)
     values = rng.standard_normal((12, 5))
     group = np.array([0.0, 1.0] * 6)
@@ -48,24 +61,36 @@ def test_effects__quantities_that_only_one_of_a_group_has_are_unknown():
 
 
 def _compare(cohort, group_by):
-    return group_effects(cohort, group_by=group_by, permutations=500, rng=np.random.default_rng(0))
+    return group_effects(
+        cohort, group_by=group_by, permutations=500, rng=np.random.default_rng(0)
+    )
 
 
 def test_group_effects__a_group_of_one_is_refused():
-    cohort = planted_tables([f"S{i}" for i in range(6)], gender=["male"] + ["female"] * 5)
+    cohort = planted_tables(
+        [f"S{i}" for i in range(6)], gender=["male"] + ["female"] * 5
+    )
     with pytest.raises(InputError, match="the effect depends on one subject"):
         _compare(cohort, "gender")
 
 
 def test_group_effects__nothing_can_differ_with_so_few_subjects():
-    """Two against three subjects have ten assignments, so that no p is below 0.1 and no effect is detectable."""
-    cohort = planted_tables([f"S{i}" for i in range(5)], gender=["male"] * 2 + ["female"] * 3)
+    """Two against three subjects have ten assignments, so that no p is below 0.1 and no
+    effect is detectable.
+    """
+    cohort = planted_tables(
+        [f"S{i}" for i in range(5)], gender=["male"] * 2 + ["female"] * 3
+    )
     found = _compare(cohort, "gender")
     assert np.nanmin(found["effect_p"]) >= 0.1
     assert np.isnan(found["effect_detectable"]).all()
     lines = describe_group_effects(found)
     assert any(
-        "with 5 subjects no p value can be below 0.1, so that no difference can be significant at 5 %" in line
+        (
+            "with 5 subjects no p value can be below 0.1, so that no difference can be "
+            "significant at 5 %"
+        )
+        in line
         for line in lines
     )
     assert not any("detectable differences" in line for line in lines if "nan" in line)
@@ -73,9 +98,17 @@ def test_group_effects__nothing_can_differ_with_so_few_subjects():
 
 @pytest.mark.parametrize("most", [500, 720, 50])
 def test_group_effects__three_against_three_cannot_differ(most):
-    """Each of the twenty assignments has the same |t| as its mirror image, so that no p is below 0.1."""
-    cohort = planted_tables([f"S{i}" for i in range(6)], gender=["male", "female"] * 3, albedo=[0.2, 0.0] * 3)
-    found = group_effects(cohort, group_by="gender", permutations=most, rng=np.random.default_rng(0))
+    """Each of the twenty assignments has the same |t| as its mirror image, so that no p
+    is below 0.1.
+    """
+    cohort = planted_tables(
+        [f"S{i}" for i in range(6)],
+        gender=["male", "female"] * 3,
+        albedo=[0.2, 0.0] * 3,
+    )
+    found = group_effects(
+        cohort, group_by="gender", permutations=most, rng=np.random.default_rng(0)
+    )
     assert found.attrs["smallest_p"] == pytest.approx([0.1])
     if most == 720:
         assert np.nanmin(found["effect_p"]) == pytest.approx(0.1)
@@ -89,7 +122,9 @@ def test_group_effects__three_against_three_cannot_differ(most):
 def test_group_effects__pairs_with_all_signs_changed_count_as_well(pairs, least):
     people = [f"S{i}" for i in range(pairs)]
     conditions = ["normal"] * pairs + ["lotion"] * pairs
-    cohort = planted_tables(people * 2, conditions=conditions, albedo=[0.0] * pairs + [0.2] * pairs)
+    cohort = planted_tables(
+        people * 2, conditions=conditions, albedo=[0.0] * pairs + [0.2] * pairs
+    )
     found = _compare(cohort, "condition")
     assert found.attrs["smallest_p"] == pytest.approx([least])
     assert np.nanmin(found["effect_p"]) == pytest.approx(least)
@@ -99,17 +134,26 @@ def test_group_effects__pairs_with_all_signs_changed_count_as_well(pairs, least)
 def test_group_effects__values_of_two_kinds_are_refused_and_mistakes_are_named():
     people = [f"S{i}" for i in range(8)]
     age = np.array(["22", "55 years", "31", "40", "28", "61", "35", "50"])
-    cohort = planted_tables(people, age=age, gender=["male", "Male", "male", "male"] + ["female"] * 4)
-    with pytest.raises(InputError, match=r"attribute age: must be a number .* found numbers and '55 years'"):
+    cohort = planted_tables(
+        people, age=age, gender=["male", "Male", "male", "male"] + ["female"] * 4
+    )
+    with pytest.raises(
+        InputError,
+        match=r"attribute age: must be a number .* found numbers and '55 years'",
+    ):
         _compare(cohort, "age")
     with pytest.raises(InputError, match="attribute age"):
-        group_effects(cohort, group_by="gender", adjust="age", rng=np.random.default_rng(0))
+        group_effects(
+            cohort, group_by="gender", adjust="age", rng=np.random.default_rng(0)
+        )
     cohort = planted_tables(people, age=age, gender=["male"] * 4 + ["female"] * 4)
     lines = describe_group_effects(_compare(cohort, "gender"))
     assert any(line.startswith("age: numbers and '55 years'") for line in lines)
     assert not any("correlated with age" in line for line in lines)
     years = np.array([22.0, 31, -3, 40, 492, 61, 35, 50])
-    cohort = planted_tables(people, age=years, gender=["male", "Male", "male", "male"] + ["female"] * 4)
+    cohort = planted_tables(
+        people, age=years, gender=["male", "Male", "male", "male"] + ["female"] * 4
+    )
     notes = coverage_report(cohort).attrs["flags"]
     assert "age: must be in years, from 0 to 130; found -3.0, 492.0" in notes
     assert "gender: 'Male' and 'male' count as different values" in notes
@@ -117,9 +161,15 @@ def test_group_effects__values_of_two_kinds_are_refused_and_mistakes_are_named()
 
 def test_describe_translucency__names_small_groups_and_impossible_intervals():
     groups = ["male"] * 2 + ["female"] * 12
-    cohort = planted_tables([f"S{i}" for i in range(14)], gender=groups, log_tr=[1.5, -1.5] + [0.0] * 12)
+    cohort = planted_tables(
+        [f"S{i}" for i in range(14)], gender=groups, log_tr=[1.5, -1.5] + [0.0] * 12
+    )
     lines = describe_translucency(translucency_table(cohort, group_by="gender"))
-    assert [line for line in lines if line.startswith("male: 2 takes; with fewer than 10 the intervals")]
+    assert [
+        line
+        for line in lines
+        if line.startswith("male: 2 takes; with fewer than 10 the intervals")
+    ]
     assert "some reach below 0" in lines[-1]
     assert not any(line.startswith("female") for line in lines)
 
@@ -134,7 +184,10 @@ def test_cohorts_of_another_layout_are_refused():
         lambda: translucency_table(other),
         lambda: coverage_report(other),
     ):
-        with pytest.raises(InputError, match=r'cohort: must have the dimension take.*db.cohort\("tables"\)'):
+        with pytest.raises(
+            InputError,
+            match=r'cohort: must have the dimension take.*db.cohort\("tables"\)',
+        ):
             call()
     with pytest.raises(InputError, match="must hold maps"):
         effect_maps(cohort, group_by="gender", rng=rng)
@@ -151,5 +204,8 @@ def test_group_effects__older_means_older_than_the_median_of_all_subjects():
     )
     found = _compare(cohort, "age:older")
     with_it, without = found["effect_count"].isel(contrast=0).max("quantity").values
-    assert (with_it, without) == (2, 4)  # above the median of seven, 50; that of six is 44, with three above
-    assert subjects_without_normal(cohort) == [{"take": "G", "reason": "no take in the condition normal"}]
+    # above the median of seven, 50; that of six is 44, with three above
+    assert (with_it, without) == (2, 4)
+    assert subjects_without_normal(cohort) == [
+        {"take": "G", "reason": "no take in the condition normal"}
+    ]

@@ -25,7 +25,9 @@ def _compare(cohort, group_by, **options):
 
 def test_group_effects__a_planted_difference_is_found_and_nothing_else():
     gender = np.where(np.arange(40) % 2, "male", "female")
-    cohort = planted_tables(_people(40), albedo=-0.06 * (gender == "male"), gender=gender)
+    cohort = planted_tables(
+        _people(40), albedo=-0.06 * (gender == "male"), gender=gender
+    )
     found = _compare(cohort, "gender")
     assert found["contrast"].values.tolist() == ["male less female"]
     one = found.sel(contrast="male less female")
@@ -33,21 +35,32 @@ def test_group_effects__a_planted_difference_is_found_and_nothing_else():
     assert r_d["effect_low"] < -0.06 < r_d["effect_high"]
     assert r_d["effect_p_adjusted"] < 0.05
     assert one["effect_count"].sel(quantity=FACE_R).values.tolist() == [20, 20]
-    rest = [name for name in one["quantity"].values.tolist() if not name.startswith("R_d")]
+    rest = [
+        name for name in one["quantity"].values.tolist() if not name.startswith("R_d")
+    ]
     assert (one["effect_p_adjusted"].sel(quantity=rest) > 0.05).all()
 
 
 def test_group_effects__are_student_s_test_where_nothing_is_adjusted():
-    """The permutation p of two groups against SciPy's Welch and permutation tests, on the log scale of sigma_tr."""
+    """The permutation p of two groups against SciPy's Welch and permutation tests, on
+    the log scale of sigma_tr.
+    """
     gender = np.where(np.arange(30) < 12, "male", "female")
-    cohort = planted_tables(_people(30), log_tr=0.08 * (gender == "male"), gender=gender)
-    one = _compare(cohort, "gender", permutations=20_000).sel(contrast="male less female", quantity=CHEEK_G)
+    cohort = planted_tables(
+        _people(30), log_tr=0.08 * (gender == "male"), gender=gender
+    )
+    one = _compare(cohort, "gender", permutations=20_000).sel(
+        contrast="male less female", quantity=CHEEK_G
+    )
     logs = np.log(cohort["site_sigma_tr"].values[:, 0, 1])
     men = logs[gender == "male"]
     women = logs[gender == "female"]
     np.testing.assert_allclose(one["effect"], men.mean() - women.mean(), rtol=1e-12)
-    np.testing.assert_allclose(one["effect_percent"], 100 * np.expm1(men.mean() - women.mean()), rtol=1e-12)
-    assert abs(float(one["effect_p"]) - stats.ttest_ind(men, women).pvalue) < 0.02  # 20,000 draws, nearly normal values
+    np.testing.assert_allclose(
+        one["effect_percent"], 100 * np.expm1(men.mean() - women.mean()), rtol=1e-12
+    )
+    # 20,000 draws, nearly normal values
+    assert abs(float(one["effect_p"]) - stats.ttest_ind(men, women).pvalue) < 0.02
 
 
 def test_group_effects__a_confounder_misleads_the_plain_comparison_and_not_the_adjusted_one():
@@ -57,12 +70,23 @@ def test_group_effects__a_confounder_misleads_the_plain_comparison_and_not_the_a
     for seed in range(100):
         rng = np.random.default_rng([5, seed])
         age = rng.uniform(20, 60, 40)
-        ancestry = np.where(rng.random(40) < 1 / (1 + np.exp(-(age - 40) / 5)), "asian", "european")
-        cohort = planted_tables(_people(40), albedo=-0.002 * (age - 40), seed=seed, age=age, ancestry=ancestry)
+        ancestry = np.where(
+            rng.random(40) < 1 / (1 + np.exp(-(age - 40) / 5)), "asian", "european"
+        )
+        cohort = planted_tables(
+            _people(40),
+            albedo=-0.002 * (age - 40),
+            seed=seed,
+            age=age,
+            ancestry=ancestry,
+        )
         for adjust, into in (((), plain), (("age",), held)):
-            found = _compare(cohort, "ancestry", adjust=adjust, permutations=100).isel(contrast=0)
+            found = _compare(cohort, "ancestry", adjust=adjust, permutations=100).isel(
+                contrast=0
+            )
             into.append(found["effect"].sel(quantity=FACE_R).item())
-    # European minus Asian, of which age explains about 0.03; two standard errors of the mean of 100 cohorts
+    # European minus Asian, of which age explains about 0.03; two standard errors of the
+    # mean of 100 cohorts
     assert np.mean(plain) > 0.02
     assert abs(np.mean(held)) < 2 * np.std(held) / 10
 
@@ -70,21 +94,28 @@ def test_group_effects__a_confounder_misleads_the_plain_comparison_and_not_the_a
 def test_group_effects__of_one_s_own_attribute_that_another_explains_are_flagged():
     gender = np.where(np.arange(30) % 2, "male", "female")
     hair = np.where(np.arange(30) % 2, "dark", "red")
-    cohort = planted_tables(_people(30), gender=gender, hair=hair, age=np.arange(30) + 20.0)
+    cohort = planted_tables(
+        _people(30), gender=gender, hair=hair, age=np.arange(30) + 20.0
+    )
     found = _compare(cohort, "gender")
     assert found["attribute_association"].sel(attribute="hair") == pytest.approx(1)
     assert found["attribute_association"].sel(attribute="age") < 0.3
     assert any(
-        "is correlated with hair (adjusted multiple correlation 1.00); adjust for hair" in line
+        "is correlated with hair (adjusted multiple correlation 1.00); adjust for hair"
+        in line
         for line in found.attrs["flags"]
     )
-    with pytest.raises(InputError, match="male less female: the subjects must determine the effect"):
+    with pytest.raises(
+        InputError, match="male less female: the subjects must determine the effect"
+    ):
         _compare(cohort, "gender", adjust=["hair"])
 
 
 def test_group_effects__a_number_is_an_axis():
     age = np.random.default_rng(3).uniform(20, 70, 50)
-    found = _compare(planted_tables(_people(50), albedo=-0.003 * (age - 45), age=age), "age")
+    found = _compare(
+        planted_tables(_people(50), albedo=-0.003 * (age - 45), age=age), "age"
+    )
     assert found["contrast"].values.tolist() == ["age, per unit"]
     one = found.sel(contrast="age, per unit", quantity=FACE_R)
     assert one["effect_low"] < -0.003 < one["effect_high"]
@@ -96,17 +127,34 @@ def test_group_effects__conditions_are_compared_within_subjects():
     who = [name for name in _people(8) for _ in range(2)]
     conditions = ["normal", "lotion"] * 8
     change = 0.01 * (np.array(conditions) == "lotion")
-    found = _compare(planted_tables(who, conditions=conditions, albedo=change, spread=0.1, seed=1), "condition")
+    found = _compare(
+        planted_tables(who, conditions=conditions, albedo=change, spread=0.1, seed=1),
+        "condition",
+    )
     one = found.sel(contrast="lotion less normal", quantity=FACE_R)
     assert one["effect_low"] < 0.01 < one["effect_high"]
     assert one["effect_high"] - one["effect_low"] < 0.01
-    assert one["effect_p"] == pytest.approx(2 / 256)  # all 2^8 signs: the observed one and its opposite
-    with_one = planted_tables([*who, "S00"], conditions=[*conditions, "hot"], albedo=[*change, 0.0], spread=0.1)
+    # all 2^8 signs: the observed one and its opposite
+    assert one["effect_p"] == pytest.approx(2 / 256)
+    with_one = planted_tables(
+        [*who, "S00"],
+        conditions=[*conditions, "hot"],
+        albedo=[*change, 0.0],
+        spread=0.1,
+    )
     with_one = _compare(with_one, "condition")
     assert with_one["contrast"].values.tolist() == ["lotion less normal"]
-    assert "hot less normal: excluded, paired differences need at least two subjects" in with_one.attrs["flags"]
-    with pytest.raises(InputError, match=r"adjust: conditions are compared within subjects.*omit this option"):
-        _compare(planted_tables(who, conditions=conditions), "condition", adjust=["gender"])
+    assert (
+        "hot less normal: excluded, paired differences need at least two subjects"
+        in with_one.attrs["flags"]
+    )
+    with pytest.raises(
+        InputError,
+        match=r"adjust: conditions are compared within subjects.*omit this option",
+    ):
+        _compare(
+            planted_tables(who, conditions=conditions), "condition", adjust=["gender"]
+        )
 
 
 def test_group_effects__two_takes_of_a_subject_are_one_subject():
@@ -114,14 +162,28 @@ def test_group_effects__two_takes_of_a_subject_are_one_subject():
     gender = np.repeat(np.where(np.arange(10) % 2, "male", "female"), 3)
     found = _compare(planted_tables(who, gender=gender), "gender")
     assert found["effect_count"].sel(quantity=FACE_R).values.tolist() == [[5, 5]]
-    assert any("5 subjects with and 5 without; with fewer than 10" in line for line in found.attrs["flags"])
+    assert any(
+        "5 subjects with and 5 without; with fewer than 10" in line
+        for line in found.attrs["flags"]
+    )
 
 
 def test_group_effects__an_attribute_of_three_values_is_three_comparisons():
     ancestry = np.array(["asian", "european", "african"] * 8)
-    found = _compare(planted_tables(_people(24), albedo=-0.2 * (ancestry == "african"), ancestry=ancestry), "ancestry")
-    assert found["contrast"].values.tolist() == ["african less others", "asian less others", "european less others"]
-    assert found["effect"].sel(contrast="african less others", quantity=FACE_R) == pytest.approx(-0.2, abs=0.05)
+    found = _compare(
+        planted_tables(
+            _people(24), albedo=-0.2 * (ancestry == "african"), ancestry=ancestry
+        ),
+        "ancestry",
+    )
+    assert found["contrast"].values.tolist() == [
+        "african less others",
+        "asian less others",
+        "european less others",
+    ]
+    assert found["effect"].sel(
+        contrast="african less others", quantity=FACE_R
+    ) == pytest.approx(-0.2, abs=0.05)
 
 
 def test_group_effects__skips_subjects_without_the_quantity_or_attribute():
@@ -135,34 +197,66 @@ def test_group_effects__skips_subjects_without_the_quantity_or_attribute():
 
 
 def test_group_effects__per_cent_hold_for_levels_that_even_reflection_raised():
-    """If all R_d are 0.045 too high, 0.15 is 0.105: the true relative difference is -57 %, not -40 %."""
+    """If all R_d are 0.045 too high, 0.15 is 0.105: the true relative difference is -57
+    %, not -40 %.
+    """
     gender = np.where(np.arange(60) % 2, "male", "female")
-    cohort = planted_tables(_people(60), albedo=-0.15 - 0.06 * (gender == "male"), gender=gender, spread=0.005)
+    cohort = planted_tables(
+        _people(60),
+        albedo=-0.15 - 0.06 * (gender == "male"),
+        gender=gender,
+        spread=0.005,
+    )
     one = _compare(cohort, "gender").isel(contrast=0).sel(quantity="R_d face B")
     assert one["effect_percent_low"] < 100 * -0.06 / (0.15 - 0.045) < -50
     assert -45 < one["effect_percent"] < one["effect_percent_high"] < -35
-    darker = _compare(cohort.assign(region_diffuse_reflectance=cohort.region_diffuse_reflectance - 0.05), "gender")
-    assert darker["effect_percent_low"].isel(contrast=0).sel(quantity="R_d face B") == -100  # not below black
+    darker = _compare(
+        cohort.assign(
+            region_diffuse_reflectance=cohort.region_diffuse_reflectance - 0.05
+        ),
+        "gender",
+    )
+    # not below black
+    assert (
+        darker["effect_percent_low"].isel(contrast=0).sel(quantity="R_d face B") == -100
+    )
 
 
 @pytest.mark.parametrize(
     ("group_by", "adjust", "message"),
     [
         ("wealth", (), "group by wealth: must be an attribute or a trait"),
-        ("gender", ("gender",), "adjust gender: must be an attribute other than the compared one"),
+        (
+            "gender",
+            ("gender",),
+            "adjust gender: must be an attribute other than the compared one",
+        ),
         (
             "gender",
             ("wealth",),
-            "adjust wealth: must be an attribute other than the compared one; found an unknown name; choose from: age",
+            (
+                "adjust wealth: must be an attribute other than the compared one; "
+                "found an unknown name; choose from: age"
+            ),
         ),
-        ("same", (), "group by same: there must be subjects of two groups; found only yes"),
-        ("condition", (), "group by condition: some subjects must be measured in both conditions; found none"),
+        (
+            "same",
+            (),
+            "group by same: there must be subjects of two groups; found only yes",
+        ),
+        (
+            "condition",
+            (),
+            "group by condition: some subjects must be measured in both conditions; found none",
+        ),
         ("lone", (), "the subjects must determine the effect"),
     ],
 )
 def test_group_effects__what_cannot_be_compared_is_one_line(group_by, adjust, message):
     gender = np.where(np.arange(4) % 2, "male", "female")
-    cohort = planted_tables(_people(4), gender=gender, age=np.arange(4.0), same=["yes"] * 4)
+    cohort = planted_tables(
+        _people(4), gender=gender, age=np.arange(4.0), same=["yes"] * 4
+    )
     if group_by == "lone":
         cohort = cohort.isel(take=slice(2))
         group_by = "gender"
@@ -180,13 +274,20 @@ def test_group_effects__an_extreme_cohort_gives_no_number_that_is_none():
     assert one["effect"].sel(quantity="surface reflectance face") == 0
     assert one["effect_p"].sel(quantity="surface reflectance face") == 1
     assert np.isnan(one["effect"].sel(quantity="R_d beard R"))
-    assert not np.isinf(np.concatenate([one[name].values.ravel() for name in one])).any()
+    assert not np.isinf(
+        np.concatenate([one[name].values.ravel() for name in one])
+    ).any()
 
 
 def test_group_effects__small_differences_of_albedo_between_surfaces_that_differ_are_flagged():
     gender = np.where(np.arange(40) % 2, "male", "female")
-    cohort = planted_tables(_people(40), albedo=0.02 * (gender == "male"), gender=gender, spread=0.005)
-    line = "male less female: the surface reflectance differs as well; differences of R_d up to 0.055 may be due"
+    cohort = planted_tables(
+        _people(40), albedo=0.02 * (gender == "male"), gender=gender, spread=0.005
+    )
+    line = (
+        "male less female: the surface reflectance differs as well; differences of R_d "
+        "up to 0.055 may be due"
+    )
     assert not any(line in flag for flag in _compare(cohort, "gender").attrs["flags"])
     cohort["region_surface_reflectance"][np.flatnonzero(gender == "male")] += 0.01
     assert any(line in flag for flag in _compare(cohort, "gender").attrs["flags"])
@@ -194,16 +295,21 @@ def test_group_effects__small_differences_of_albedo_between_surfaces_that_differ
 
 def test_describe_group_effects__states_the_detectable_effect():
     gender = np.where(np.arange(30) % 2, "male", "female")
-    lines = describe_group_effects(_compare(planted_tables(_people(30), gender=gender), "gender"))
+    lines = describe_group_effects(
+        _compare(planted_tables(_people(30), gender=gender), "gender")
+    )
     assert lines[0] == (
-        "male less female: 0 of 11 quantities differ (adjusted p < 0.05; 500 permutations of 30 subjects)"
+        "male less female: 0 of 11 quantities differ (adjusted p < 0.05; 500 "
+        "permutations of 30 subjects)"
     )
     assert "detectable differences (power 80 %): R_d face R 0.0" in lines[1]
 
 
 def test_plot_group_effects__has_a_row_for_each_quantity(tmp_path):
     age = np.random.default_rng(3).uniform(20, 70, 50)
-    table = _compare(planted_tables(_people(50), albedo=-0.003 * (age - 45), age=age), "age")
+    table = _compare(
+        planted_tables(_people(50), albedo=-0.003 * (age - 45), age=age), "age"
+    )
     ax = plot_group_effects(table)
     assert len(ax.get_yticklabels()) == table.sizes["quantity"]
     assert "(n = 50)" in ax.get_legend().get_texts()[0].get_text()

@@ -31,8 +31,14 @@ def cohort():
     return xr.Dataset(
         {
             "texel_diffuse_reflectance": ((*dims, "channel"), albedo),
-            "texel_sigma_tr": ((*dims, "channel"), rng.uniform(0.5, 2.0, albedo.shape).astype(np.float32)),
-            "texel_surface_reflectance": (dims, rng.uniform(0.0, 0.06, coverage.shape).astype(np.float32)),
+            "texel_sigma_tr": (
+                (*dims, "channel"),
+                rng.uniform(0.5, 2.0, albedo.shape).astype(np.float32),
+            ),
+            "texel_surface_reflectance": (
+                dims,
+                rng.uniform(0.0, 0.06, coverage.shape).astype(np.float32),
+            ),
             "texel_coverage": (dims, coverage),
         },
         coords={
@@ -49,12 +55,17 @@ def by_numpy(values, coverage):
     covered = coverage.reshape(coverage.shape + (1,) * (values.ndim - 3)) > 0.5
     known = np.where(covered, values.astype(np.float64), np.nan)
     with np.errstate(invalid="ignore"):
-        both = np.where(np.isnan(known[0]), known[1], np.where(np.isnan(known[1]), known[0], known[:2].mean(axis=0)))
+        both = np.where(
+            np.isnan(known[0]),
+            known[1],
+            np.where(np.isnan(known[1]), known[0], known[:2].mean(axis=0)),
+        )
     return np.stack([both, known[2], known[3], known[4]])
 
 
 @pytest.mark.parametrize(
-    ("name", "is_log"), [("diffuse_reflectance", True), ("sigma_tr", True), ("surface_reflectance", False)]
+    ("name", "is_log"),
+    [("diffuse_reflectance", True), ("sigma_tr", True), ("surface_reflectance", False)],
 )
 @pytest.mark.parametrize("chunks", [None, {"take": 1}, {"take": 2, "v": 3}])
 def test_mean_face__as_numpy(cohort, name, is_log, chunks):
@@ -62,12 +73,17 @@ def test_mean_face__as_numpy(cohort, name, is_log, chunks):
     coverage = cohort["texel_coverage"].values
     people = by_numpy(np.log(values) if is_log else values, coverage)
     count = np.isfinite(people).sum(axis=0)
-    centre = np.where(count, np.nan_to_num(people).sum(axis=0) / np.maximum(count, 1), np.nan)
-    spread = np.sqrt(np.nansum((people - centre) ** 2, axis=0) / np.maximum(count - 1, 1))
+    centre = np.where(
+        count, np.nan_to_num(people).sum(axis=0) / np.maximum(count, 1), np.nan
+    )
+    spread = np.sqrt(
+        np.nansum((people - centre) ** 2, axis=0) / np.maximum(count - 1, 1)
+    )
     enough = count >= 3
     found = mean_face(cohort if chunks is None else cohort.chunk(chunks))
     mean = np.where(enough, np.exp(centre) if is_log else centre, np.nan)
-    np.testing.assert_allclose(found[f"face_{name}"], mean, rtol=1e-5)  # stored in single precision
+    # stored in single precision
+    np.testing.assert_allclose(found[f"face_{name}"], mean, rtol=1e-5)
     deviation = found[f"face_{name}{'_log' if is_log else ''}_deviation"]
     np.testing.assert_allclose(deviation, np.where(enough, spread, np.nan), rtol=1e-5)
     least = count.min(axis=-1) if count.ndim == 3 else count
@@ -77,20 +93,31 @@ def test_mean_face__as_numpy(cohort, name, is_log, chunks):
 def test_mean_face__texels_of_few_are_nan(cohort):
     found = mean_face(cohort)
     count = found["face_diffuse_reflectance_count"].values
-    assert (count[1].tolist(), count[2].tolist(), count[7].tolist()) == ([2] * SIZE, [4] * SIZE, [0] * SIZE)
+    assert (count[1].tolist(), count[2].tolist(), count[7].tolist()) == (
+        [2] * SIZE,
+        [4] * SIZE,
+        [0] * SIZE,
+    )
     assert np.isnan(found["face_diffuse_reflectance"].values[[1, 7]]).all()
-    assert np.isfinite(mean_face(cohort, least=2)["face_diffuse_reflectance"].values[1]).all()
+    assert np.isfinite(
+        mean_face(cohort, least=2)["face_diffuse_reflectance"].values[1]
+    ).all()
     assert found.attrs["subjects"] == 4
     assert found.attrs["takes"] == ["T0", "T1", "T2", "T3", "T4"]
 
 
 def test_mean_face__without_sigma_tr(cohort):
     found = mean_face(cohort.drop_vars(["texel_sigma_tr", "texel_surface_reflectance"]))
-    assert set(found.data_vars) == {f"face_diffuse_reflectance{end}" for end in ("", "_log_deviation", "_count")}
+    assert set(found.data_vars) == {
+        f"face_diffuse_reflectance{end}" for end in ("", "_log_deviation", "_count")
+    }
 
 
 def test_mean_face__refuses_too_few(cohort):
-    with pytest.raises(InputError, match="one texel must be measured in 3 subjects; found none among 1 subj"):
+    with pytest.raises(
+        InputError,
+        match="one texel must be measured in 3 subjects; found none among 1 subj",
+    ):
         mean_face(cohort.isel(take=[0, 1]))
     with pytest.raises(InputError, match="one texel must be measured in 3 subjects"):
         mean_face(cohort.assign(texel_coverage=0 * cohort["texel_coverage"]))

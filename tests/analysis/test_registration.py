@@ -1,4 +1,6 @@
-"""Takes whose texture coordinates differ by planted warps, brought into one space by their landmarks."""
+"""Takes whose texture coordinates differ by planted warps, brought into one space by
+their landmarks.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,13 @@ from planted_sheet import (
 )
 
 from skindb.analysis.albedo import albedo_histograms
-from skindb.analysis.masks import FINE, inside_outline, mask_agreement, region_masks, take_masks
+from skindb.analysis.masks import (
+    FINE,
+    inside_outline,
+    mask_agreement,
+    region_masks,
+    take_masks,
+)
 from skindb.analysis.registration import (
     correspondence_error,
     corresponding_points,
@@ -41,18 +49,28 @@ from skindb.workflow.summaries import registered_parts
 
 
 def test_register__brings_back_a_planted_warp():
-    """The coordinates of B are a planted warp of those of A; with B as the reference, the warp of A is found."""
+    """The coordinates of B are a planted warp of those of A; with B as the reference,
+    the warp of A is found.
+    """
     models = sheet_pair()
     found = register(models, reference="B", smoothing=0.0)
     np.testing.assert_allclose(found["B"]["common_uv"], planted_uv(1), atol=STORED)
     # of the planted 0.03: anchors lie within a triangle of 0.03
     assert np.median(np.abs(found["A"]["common_uv"] - planted_uv(1))) < 0.003
     assert {f.attrs["warp_kind"] for f in found.values()} == {"thin plate"}
-    assert all(f["landmark_used"].all() and f["landmark_residual"].max() < STORED for f in found.values())
+    assert all(
+        f["landmark_used"].all() and f["landmark_residual"].max() < STORED
+        for f in found.values()
+    )
     assert (found["A"].attrs["reference"], found["A"].attrs["template"]) == ("B", "B")
-    assert (found["A"].attrs["warp_anchors"] > 150, found["B"].attrs["warp_anchors"]) == (True, 0)
+    assert (
+        found["A"].attrs["warp_anchors"] > 150,
+        found["B"].attrs["warp_anchors"],
+    ) == (True, 0)
     truth = {"A": lifted(sheet()[0])[::7], "B": SIZE * lifted(sheet()[0])[::7]}
-    before, after = (correspondence_error(models, r, truth) for r in (unregistered(models), found))
+    before, after = (
+        correspondence_error(models, r, truth) for r in (unregistered(models), found)
+    )
     assert before.shape == (2, len(truth["A"]))
     assert np.nanmedian(before) > 1
     assert np.nanmedian(after) < 0.2 * np.nanmedian(before)
@@ -61,13 +79,21 @@ def test_register__brings_back_a_planted_warp():
 
 
 def test_register__anchors_help_where_no_landmark_is():
-    """Landmarks are in the middle of the sheet only; beyond them, points are matched by the surface."""
-    models = {"A": sheet_take(sheet()[0], on_sheet(nodes())), "B": sheet_take(planted_uv(1, 0.05), on_sheet(nodes()))}
+    """Landmarks are in the middle of the sheet only; beyond them, points are matched by
+    the surface.
+    """
+    models = {
+        "A": sheet_take(sheet()[0], on_sheet(nodes())),
+        "B": sheet_take(planted_uv(1, 0.05), on_sheet(nodes())),
+    }
     few = {take: model.copy() for take, model in models.items()}
     for model in few.values():
         model["mesh"] = model["mesh"].to_dataset().isel(landmark=[1, 3, 4])
     truth = {take: on_sheet(nodes()[[0, 2, 6, 7, 8]]) for take in models}
-    own, by_few = (correspondence_error(models, r, truth) for r in (unregistered(models), register(few)))
+    own, by_few = (
+        correspondence_error(models, r, truth)
+        for r in (unregistered(models), register(few))
+    )
     assert np.nanmedian(by_few) < 0.7 * np.nanmedian(own)
 
 
@@ -84,15 +110,23 @@ def test_register__the_mean_of_all_is_between_them():
     common = found["A"]["common_landmark"].values
     np.testing.assert_allclose(found["B"]["common_landmark"], common, atol=STORED)
     between = (
-        nodes() + nodes() + planted_uv(1)[[np.linalg.norm(sheet()[0] - p, axis=1).argmin() for p in nodes()]]
+        nodes()
+        + nodes()
+        + planted_uv(1)[
+            [np.linalg.norm(sheet()[0] - p, axis=1).argmin() for p in nodes()]
+        ]
     ) / 2
     between -= nodes() / 2
-    assert np.abs(common - between).max() < 0.01  # rotation and scale are removed; they differ by 0.03
+    # rotation and scale are removed; they differ by 0.03
+    assert np.abs(common - between).max() < 0.01
     for take, model in models.items():
         for name, point in zip(NAMES, common, strict=True):
             there = corresponding_points(model, found[take], point[None])[0]
             np.testing.assert_allclose(
-                there, model["mesh/landmark_position"].sel(landmark=name), atol=0.01, err_msg=f"{take} {name}"
+                there,
+                model["mesh/landmark_position"].sel(landmark=name),
+                atol=0.01,
+                err_msg=f"{take} {name}",
             )
 
 
@@ -111,8 +145,14 @@ def test_register__skips_a_missing_landmark():
 
 def test_register__skips_takes_without_landmarks():
     models = sheet_pair()
-    mesh = models["B"]["mesh"].to_dataset()[["triangle"]].drop_vars("landmark", errors="ignore")
-    models["B"] = xr.DataTree.from_dict({"fitted": models["B"]["fitted"].to_dataset(), "mesh": mesh})
+    mesh = (
+        models["B"]["mesh"]
+        .to_dataset()[["triangle"]]
+        .drop_vars("landmark", errors="ignore")
+    )
+    models["B"] = xr.DataTree.from_dict(
+        {"fitted": models["B"]["fitted"].to_dataset(), "mesh": mesh}
+    )
     models["C"] = sheet_take(planted_uv(2), np.full((9, 3), np.nan))
     assert list(register(models)) == ["A"]
     assert register({"B": models["B"]}) == {}
@@ -125,7 +165,9 @@ def test_register__a_wrong_click_stands_out():
     models = sheet_pair()
     points = on_sheet(nodes())
     points[4] += [0, 16, 0]  # 0.1 of the side
-    models |= {f"C{i}": sheet_take(planted_uv(i, 0.005), on_sheet(nodes())) for i in range(3)}
+    models |= {
+        f"C{i}": sheet_take(planted_uv(i, 0.005), on_sheet(nodes())) for i in range(3)
+    }
     models["wrong"] = sheet_take(planted_uv(3, 0.005), points)
     error = register(models)["wrong"]["landmark_prediction_error"].values
     assert error.argmax() == 4
@@ -136,29 +178,48 @@ def test_register__a_wrong_click_stands_out():
 def test_doubtful_landmarks__names_the_wrong_ones(wrong):
     models = sheet_pair()
     points = on_sheet(nodes())
-    models |= {f"C{i}": sheet_take(planted_uv(i, 0.005), on_sheet(nodes())) for i in range(3)}
-    points = {"click": points + 16 * np.eye(9)[4][:, None] * [0, 1, 0], "swap": points[[1, 0, *range(2, 9)]]}.get(
-        wrong, points
-    )
+    models |= {
+        f"C{i}": sheet_take(planted_uv(i, 0.005), on_sheet(nodes())) for i in range(3)
+    }
+    points = {
+        "click": points + 16 * np.eye(9)[4][:, None] * [0, 1, 0],
+        "swap": points[[1, 0, *range(2, 9)]],
+    }.get(wrong, points)
     models["wrong"] = sheet_take(planted_uv(3, 0.005), points)
     found = register(models)
     notes = [one for one in doubtful_landmarks(found) if one["take"] == "wrong"]
     named = {name for name in NAMES for one in notes if f" {name} " in one["reason"]}
-    assert named == {"click": {"point4"}, "swap": {"point0", "point1"}, None: set()}[wrong]
+    assert (
+        named == {"click": {"point4"}, "swap": {"point0", "point1"}, None: set()}[wrong]
+    )
     if wrong:
         assert notes[0] in describe_registration(found, models)
 
 
 def test_doubtful_landmarks__names_a_take_whose_sides_are_swapped():
     models = sheet_pair() | {"C": sheet_take(planted_uv(2, 0.005), on_sheet(nodes()))}
-    models["wrong"] = sheet_take(planted_uv(3, 0.005), on_sheet(nodes())[[2, 1, 0, 5, 4, 3, 8, 7, 6]])
-    (reason,) = (one["reason"] for one in doubtful_landmarks(register(models)) if one["take"] == "wrong")
-    assert reason.startswith("no map without folds fits its 9 landmarks; left and right may be swapped")
+    models["wrong"] = sheet_take(
+        planted_uv(3, 0.005), on_sheet(nodes())[[2, 1, 0, 5, 4, 3, 8, 7, 6]]
+    )
+    (reason,) = (
+        one["reason"]
+        for one in doubtful_landmarks(register(models))
+        if one["take"] == "wrong"
+    )
+    assert reason.startswith(
+        "no map without folds fits its 9 landmarks; left and right may be swapped"
+    )
 
 
 def test_doubtful_landmarks__names_an_exchange_that_distorts_the_mean_of_few():
-    """The mean of three takes is distorted so much that the points of all takes look wrong; the worst is named."""
-    models = sheet_pair() | {"wrong": sheet_take(planted_uv(3, 0.005), on_sheet(nodes())[[7, *range(1, 7), 0, 8]])}
+    """The mean of three takes is distorted so much that the points of all takes look
+    wrong; the worst is named.
+    """
+    models = sheet_pair() | {
+        "wrong": sheet_take(
+            planted_uv(3, 0.005), on_sheet(nodes())[[7, *range(1, 7), 0, 8]]
+        )
+    }
     notes = doubtful_landmarks(register(models))
     assert [one["take"] for one in notes] == ["wrong"]
     assert any(f" {NAMES[i]} " in notes[0]["reason"] for i in (0, 7))
@@ -175,8 +236,14 @@ def test_doubtful_landmarks__of_one_take_and_of_none():
     points = on_sheet(nodes())
     points[4] += [0, 30, 0]
     wrong = {"A": sheet_take(sheet()[0], points)}
-    assert doubtful_landmarks(register(wrong)) == []  # it is its own mean, so that there is no comparison
-    assert doubtful_landmarks(register({"A": sheet_take(sheet()[0], points[:1], names=NAMES[:1])})) == []
+    # it is its own mean, so that there is no comparison
+    assert doubtful_landmarks(register(wrong)) == []
+    assert (
+        doubtful_landmarks(
+            register({"A": sheet_take(sheet()[0], points[:1], names=NAMES[:1])})
+        )
+        == []
+    )
     assert doubtful_landmarks({}) == []
 
 
@@ -184,8 +251,14 @@ def test_register__takes_with_other_names():
     """Three common names are enough; without any, a take keeps the result of its own landmarks."""
     models = sheet_pair()
     points = on_sheet(nodes())
-    models["few"] = sheet_take(planted_uv(2), points[[0, 2, 4, 6]], names=[NAMES[0], NAMES[2], NAMES[4], "mole"])
-    models["other"] = sheet_take(planted_uv(3), points, names=[f"mark{i}" for i in range(9)])
+    models["few"] = sheet_take(
+        planted_uv(2),
+        points[[0, 2, 4, 6]],
+        names=[NAMES[0], NAMES[2], NAMES[4], "mole"],
+    )
+    models["other"] = sheet_take(
+        planted_uv(3), points, names=[f"mark{i}" for i in range(9)]
+    )
     found = register(models)
     assert {take: int(one["landmark_used"].sum()) for take, one in found.items()} == {
         "A": 9,
@@ -210,7 +283,11 @@ def test_register__turns_no_triangle_over(swapped):
     """The clicks are so wrong that every map through them folds."""
     models = sheet_pair()
     points = on_sheet(nodes())
-    points = points[[1, 0, *range(2, 9)]] if swapped else points + np.random.default_rng(3).normal(size=(9, 3)) * 12
+    points = (
+        points[[1, 0, *range(2, 9)]]
+        if swapped
+        else points + np.random.default_rng(3).normal(size=(9, 3)) * 12
+    )
     models["A"] = sheet_take(sheet()[0], points)
     for reference in ("B", None):
         found = register(models, reference=reference)
@@ -221,11 +298,17 @@ def test_register__turns_no_triangle_over(swapped):
 
 def test_corresponding_points__outside_is_nan():
     models = sheet_pair()
-    found = corresponding_points(models["A"], register(models)["A"], np.array([[5.0, 5.0], [0.5, 0.5], [np.nan, 0]]))
+    found = corresponding_points(
+        models["A"],
+        register(models)["A"],
+        np.array([[5.0, 5.0], [0.5, 0.5], [np.nan, 0]]),
+    )
     assert np.isfinite(found).all(axis=1).tolist() == [False, True, False]
 
 
-TEXELS = np.stack(np.meshgrid(*2 * [(np.arange(200) + 0.5) / 200]), axis=-1).reshape(-1, 2)
+TEXELS = np.stack(np.meshgrid(*2 * [(np.arange(200) + 0.5) / 200]), axis=-1).reshape(
+    -1, 2
+)
 PLACE = {
     "forehead": (0.4, 0.15),
     "nose": (0.47, 0.45),
@@ -252,16 +335,23 @@ def test_region_masks__lie_where_they_should():
 
 
 def test_region_masks__move_with_the_landmarks():
-    """Rotated, scaled and shifted landmarks and points give the same surfels; outlines are polygons."""
+    """Rotated, scaled and shifted landmarks and points give the same surfels; outlines
+    are polygons.
+    """
     turn = 1.3 * np.array([[np.cos(0.2), np.sin(0.2)], [-np.sin(0.2), np.cos(0.2)]])
-    found = region_masks(TEXELS @ turn + 3, {name: np.array(p) @ turn + 3 for name, p in FACE.items()})
+    found = region_masks(
+        TEXELS @ turn + 3, {name: np.array(p) @ turn + 3 for name, p in FACE.items()}
+    )
     for name, mask in region_masks(TEXELS, FACE).items():
         assert (found[name] != mask).sum() <= 2, name  # rounding at an outline
 
 
 def test_region_masks__skips_regions_that_cannot_be_drawn():
-    some = {name: p for name, p in FACE.items() if "ala" not in name} | {"chin": (np.nan, 0.0)}
-    assert set(region_masks(TEXELS, some)) == set()  # all outlines are scaled with the help of the chin
+    some = {name: p for name, p in FACE.items() if "ala" not in name} | {
+        "chin": (np.nan, 0.0)
+    }
+    # all outlines are scaled with the help of the chin
+    assert set(region_masks(TEXELS, some)) == set()
     some = {name: p for name, p in FACE.items() if "ala" not in name}
     assert set(region_masks(TEXELS, some)) == set(PLACE) - {"nose", "cheek", "no_beard"}
 
@@ -274,7 +364,9 @@ def test_inside_outline__is_odd_winding():
         inside = inside_outline(points, outline)
         angles = np.arctan2(*(outline[None] - points[:, None])[..., ::-1].T).T
         turns = np.diff(np.concatenate([angles, angles[:, :1]], axis=1), axis=1)
-        winding = np.rint(((turns + np.pi) % (2 * np.pi) - np.pi).sum(axis=1) / (2 * np.pi)).astype(int)
+        winding = np.rint(
+            ((turns + np.pi) % (2 * np.pi) - np.pi).sum(axis=1) / (2 * np.pi)
+        ).astype(int)
         np.testing.assert_array_equal(inside, winding % 2 == 1)
 
 
@@ -282,13 +374,16 @@ def test_take_masks__the_capture_wins():
     models = {"A": face_take(own=True), "B": face_take(seed=2)}
     registered = register(models)
     upper = sheet()[0][:, 1] < 0.4
-    masks = {take: take_masks(model, registered[take]) for take, model in models.items()}
+    masks = {
+        take: take_masks(model, registered[take]) for take, model in models.items()
+    }
     np.testing.assert_array_equal(masks["A"]["beard"], upper)
     assert not (masks["B"]["beard"] & upper).any()
     assert set(masks["A"]) == set(masks["B"]) == set(PLACE)
     assert set(take_masks(models["A"])) == {"beard"}
     area = np.ones(len(upper))
-    assert mask_agreement(masks["A"]["lips"], masks["B"]["lips"], area) > 0.8  # the same point on both faces
+    # the same point on both faces
+    assert mask_agreement(masks["A"]["lips"], masks["B"]["lips"], area) > 0.8
     assert mask_agreement(masks["A"]["beard"], masks["B"]["beard"], area) == 0
     assert np.isnan(mask_agreement(np.zeros(3, bool), np.zeros(3, bool), np.ones(3)))
 
@@ -304,9 +399,13 @@ def test_albedo_histograms__regions_by_landmarks_where_the_capture_has_none():
     registered = register(models)
     count = SIDE**2
     cohort = cohort_of(models, "surfels", surfels=count)
-    parts = {take: registered_parts(model, registered[take], size=16)[0]["sample"] for take, model in models.items()}
+    parts = {
+        take: registered_parts(model, registered[take], size=16)[0]["sample"]
+        for take, model in models.items()
+    }
     drawn = combine(
-        [Held.part(take, {}, one) for take, one in parts.items()], variables=["region_mask", "surfel_index"]
+        [Held.part(take, {}, one) for take, one in parts.items()],
+        variables=["region_mask", "surfel_index"],
     )
     found = albedo_histograms(cohort, regions=("beard", "nose"), drawn=drawn)
     assert found.attrs["regions_by_landmarks"] == {"beard": ["B"], "nose": ["A", "B"]}
@@ -314,7 +413,9 @@ def test_albedo_histograms__regions_by_landmarks_where_the_capture_has_none():
         for region in ("beard", "nose"):
             inside = take_masks(model, registered[take])[region]
             mean = model["fitted/diffuse_reflectance"].values[inside].mean(axis=0)
-            np.testing.assert_allclose(found["albedo_mean"].sel(take=take, region=region), mean, rtol=1e-5)
+            np.testing.assert_allclose(
+                found["albedo_mean"].sel(take=take, region=region), mean, rtol=1e-5
+            )
     alone = albedo_histograms(cohort, regions=("beard", "nose"))
     assert np.isnan(alone["albedo_mean"].sel(take="B", region="beard")).all()
     assert alone.attrs["regions_by_landmarks"] == {}
@@ -324,29 +425,46 @@ def test_register__mm_per_uv_is_of_the_face():
     """The sheet is 160 mm wide for 1 in u; its depth adds a little."""
     found = register(sheet_pair(), reference="A")
     assert float(found["A"]["mm_per_uv"]) == pytest.approx(160, rel=0.05)
-    assert float(found["B"]["mm_per_uv"]) == pytest.approx(SIZE * float(found["A"]["mm_per_uv"]), rel=1e-6)
+    assert float(found["B"]["mm_per_uv"]) == pytest.approx(
+        SIZE * float(found["A"]["mm_per_uv"]), rel=1e-6
+    )
 
 
-@pytest.mark.parametrize(("reference", "worst"), [("A", {"B": 16}), ("B", {"A": 16}), (None, {"A": 8, "B": 8})])
-def test_tabulate__a_wrong_click_is_as_many_mm_whatever_the_scale_of_an_atlas(reference, worst):
-    """The atlas of A covers a whole head, a quarter of which is the face; the mean of two takes halves the error."""
+@pytest.mark.parametrize(
+    ("reference", "worst"),
+    [("A", {"B": 16}), ("B", {"A": 16}), (None, {"A": 8, "B": 8})],
+)
+def test_tabulate__a_wrong_click_is_as_many_mm_whatever_the_scale_of_an_atlas(
+    reference, worst
+):
+    """The atlas of A covers a whole head, a quarter of which is the face; the mean of
+    two takes halves the error.
+    """
     points = on_sheet(nodes())
     wrong = points.copy()
     wrong[4] += [0, 16, 0]
-    models = {"A": sheet_take(0.25 + 0.5 * sheet()[0], wrong), "B": sheet_take(sheet()[0], points)}
+    models = {
+        "A": sheet_take(0.25 + 0.5 * sheet()[0], wrong),
+        "B": sheet_take(sheet()[0], points),
+    }
     header, rows = tabulate_registration(register(models, reference=reference))
     told = {row[0]: dict(zip(header, row, strict=True)) for row in rows}
     for take, mm in worst.items():
         assert told[take]["worst"] == NAMES[4]
         assert told[take]["worst_mm"] == pytest.approx(mm, rel=0.05)
     assert "template" in [one["anchors"] for one in told.values()]
-    assert any(one["anchors"] != "template" and one["anchors"] > 80 for one in told.values())
+    assert any(
+        one["anchors"] != "template" and one["anchors"] > 80 for one in told.values()
+    )
 
 
 @pytest.mark.parametrize("few", [[3, 4], [1, 3, 4]])
 def test_register__a_take_of_few_landmarks_is_not_the_template_of_all(few):
     points = on_sheet(nodes())
-    models = {"A": sheet_take(sheet()[0], points), "B": sheet_take(planted_uv(1), points)}
+    models = {
+        "A": sheet_take(sheet()[0], points),
+        "B": sheet_take(planted_uv(1), points),
+    }
     both = register(models, reference="A")
     models["C"] = sheet_take(planted_uv(2), points[few], names=[NAMES[i] for i in few])
     for reference in ("A", None):

@@ -20,7 +20,11 @@ def _fitted(seed=0, *, noise=0.02, common=0.0):
     rng = np.random.default_rng(seed)
     area = rng.uniform(0.5, 2.0, N)
     sigma = noise * rng.uniform(0.5, 2.0, (N, 3))
-    colour = np.array([0.5, 0.3, 0.2]) + sigma * rng.normal(size=(N, 3)) + common * rng.normal(size=3)
+    colour = (
+        np.array([0.5, 0.3, 0.2])
+        + sigma * rng.normal(size=(N, 3))
+        + common * rng.normal(size=3)
+    )
     return dataset(
         {
             "diffuse_reflectance": colour,
@@ -38,14 +42,25 @@ def _fitted(seed=0, *, noise=0.02, common=0.0):
 def test_region_tables__means_by_hand():
     fitted = _fitted()
     mask = np.arange(N) < 100
-    table = region_tables(fitted, {"face": np.ones(N, bool), "left": mask, "none": np.zeros(N, bool)})
-    area, colour = (fitted[name].values.astype(float) for name in ("surfel_area", "diffuse_reflectance"))
+    table = region_tables(
+        fitted, {"face": np.ones(N, bool), "left": mask, "none": np.zeros(N, bool)}
+    )
+    area, colour = (
+        fitted[name].values.astype(float)
+        for name in ("surfel_area", "diffuse_reflectance")
+    )
     want = (area[mask, None] * colour[mask]).sum(0) / area[mask].sum()
-    np.testing.assert_allclose(table["region_diffuse_reflectance"].sel(region="left"), want, rtol=1e-6)
+    np.testing.assert_allclose(
+        table["region_diffuse_reflectance"].sel(region="left"), want, rtol=1e-6
+    )
     assert table["region_surfels"].values.tolist() == [N, 100, 0]
-    assert float(table["region_area"].sel(region="left")) == pytest.approx(area[mask].sum())
+    assert float(table["region_area"].sel(region="left")) == pytest.approx(
+        area[mask].sum()
+    )
     covariance = np.cov(colour[mask].T, aweights=area[mask], ddof=0)
-    np.testing.assert_allclose(table["region_diffuse_covariance"].sel(region="left"), covariance, rtol=1e-6)
+    np.testing.assert_allclose(
+        table["region_diffuse_covariance"].sel(region="left"), covariance, rtol=1e-6
+    )
     empty = table.sel(region="none")
     assert np.isnan(empty["region_diffuse_reflectance"]).all()
     assert float(empty["region_area"]) == 0
@@ -53,56 +68,90 @@ def test_region_tables__means_by_hand():
 
 @pytest.mark.parametrize("common", [0.0, 0.01])
 def test_region_tables__stated_errors_are_the_scatter_of_means(common):
-    """300 measurements of one face give the scatter of means to 4 %; three times that is allowed."""
+    """300 measurements of one face give the scatter of means to 4 %; three times that
+    is allowed.
+    """
     face = {"face": np.ones(N, bool)}
-    tables = [region_tables(_fitted(seed, common=common), face).isel(region=0) for seed in range(300)]
+    tables = [
+        region_tables(_fitted(seed, common=common), face).isel(region=0)
+        for seed in range(300)
+    ]
     means = np.array([one["region_diffuse_reflectance"].values for one in tables])
-    stated = np.array([one["region_diffuse_reflectance_total_error"].values for one in tables]).mean(0)
+    stated = np.array(
+        [one["region_diffuse_reflectance_total_error"].values for one in tables]
+    ).mean(0)
     np.testing.assert_allclose(stated, means.std(axis=0, ddof=1), rtol=0.13)
-    noise = np.array([one["region_diffuse_reflectance_error"].values for one in tables]).mean(0)
+    noise = np.array(
+        [one["region_diffuse_reflectance_error"].values for one in tables]
+    ).mean(0)
     assert (noise < stated).all() if common else np.allclose(noise, stated, rtol=1e-4)
 
 
 def test_region_tables__surfels_without_an_error_leave_the_mean_one():
-    """A surfel with all weights at the bound has no error, but the mean of 400 surfels must have one."""
+    """A surfel with all weights at the bound has no error, but the mean of 400 surfels
+    must have one.
+    """
     fitted = _fitted()
     face = {"face": np.ones(N, bool)}
     whole = float(region_tables(fitted, face)["region_surface_reflectance_error"][0])
     fitted["surface_reflectance_error"][:5] = np.nan
-    assert float(region_tables(fitted, face)["region_surface_reflectance_error"][0]) == pytest.approx(whole, rel=1e-6)
+    assert float(
+        region_tables(fitted, face)["region_surface_reflectance_error"][0]
+    ) == pytest.approx(whole, rel=1e-6)
 
 
 def test_trusted_surfels__are_fitted_well_conditioned_and_seen_often():
     fitted = _fitted()
     fitted["fit_status"][0] = 4
     fitted = fitted.assign(
-        fit_condition=("surfel", np.where(np.arange(N) == 1, 2 * MAX_CONDITION_TRUSTED, 1.0)),
-        fit_samples=("surfel", np.where(np.arange(N) == 2, MIN_SAMPLES_TRUSTED - 1, MIN_SAMPLES_TRUSTED)),
+        fit_condition=(
+            "surfel",
+            np.where(np.arange(N) == 1, 2 * MAX_CONDITION_TRUSTED, 1.0),
+        ),
+        fit_samples=(
+            "surfel",
+            np.where(np.arange(N) == 2, MIN_SAMPLES_TRUSTED - 1, MIN_SAMPLES_TRUSTED),
+        ),
     )
     fitted["diffuse_reflectance"][3] = np.nan
-    np.testing.assert_array_equal(np.flatnonzero(~trusted_surfels(fitted)), [0, 1, 2, 3])
+    np.testing.assert_array_equal(
+        np.flatnonzero(~trusted_surfels(fitted)), [0, 1, 2, 3]
+    )
 
 
 def test_sample_surfels__is_of_fitted_surfels_in_the_order_of_the_draw():
     model = model_of(1)
     whole = sample_surfels(model)
     fitted = model["fitted"].to_dataset()
-    assert sorted(whole["surfel_index"].values.tolist()) == list(range(1, fitted.sizes["surfel"]))
+    assert sorted(whole["surfel_index"].values.tolist()) == list(
+        range(1, fitted.sizes["surfel"])
+    )
     few = sample_surfels(model, surfels=7)
     np.testing.assert_array_equal(few["surfel_index"], whole["surfel_index"][:7])
     index = few["surfel_index"].values
-    np.testing.assert_array_equal(few["diffuse_reflectance"], fitted["diffuse_reflectance"].values[index])
-    assert (sample_surfels(model, surfels=7, seed=1)["surfel_index"].values != index).any()
+    np.testing.assert_array_equal(
+        few["diffuse_reflectance"], fitted["diffuse_reflectance"].values[index]
+    )
+    assert (
+        sample_surfels(model, surfels=7, seed=1)["surfel_index"].values != index
+    ).any()
     model["fitted/fit_status"][:] = 1
-    with pytest.raises(InputError, match="a take of a population must have fitted surfels"):
+    with pytest.raises(
+        InputError, match="a take of a population must have fitted surfels"
+    ):
         sample_surfels(model)
 
 
 @pytest.mark.slow
 def test_sample_surfels__every_surfel_is_as_likely_as_any_other():
-    """Counts of 59 surfels in 2,000 samples of 10: chi-squared with 58 degrees exceeds 110 once in 100,000 runs."""
+    """Counts of 59 surfels in 2,000 samples of 10: chi-squared with 58 degrees exceeds
+    110 once in 100,000 runs.
+    """
     model = model_of(1)
-    drawn = [sample_surfels(model, surfels=10, seed=seed)["surfel_index"].values for seed in range(2000)]
+    drawn = [
+        sample_surfels(model, surfels=10, seed=seed)["surfel_index"].values
+        for seed in range(2000)
+    ]
     counts = np.bincount(np.concatenate(drawn))[1:]
     expected = 2000 * 10 / 59
     variance = expected * (1 - 10 / 59)  # drawn without replacement
@@ -111,7 +160,9 @@ def test_sample_surfels__every_surfel_is_as_likely_as_any_other():
 
 def test_summary_tables__sites_keep_their_errors_and_statuses():
     tables = summary_tables(model_of(1))
-    np.testing.assert_allclose(tables["site_sigma_tr"].sel(site="cheek"), [0.5, 1.0, 1.5], rtol=1e-6)
+    np.testing.assert_allclose(
+        tables["site_sigma_tr"].sel(site="cheek"), [0.5, 1.0, 1.5], rtol=1e-6
+    )
     assert (tables["site_status"] == 0).all()
     assert "site_sigma_tr" not in summary_tables(model_of(1, probe=False))
 
@@ -121,5 +172,7 @@ def test_cohort_of__who_refused_is_skipped():
     models["B"].attrs["consent_scope"] = ["fit"]
     cohort = cohort_of(models)
     assert cohort["take"].values.tolist() == ["A", "A.lotion", "C"]
-    assert cohort.attrs["skipped"] == [{"take": "B", "reason": "its consent does not cover statistics"}]
+    assert cohort.attrs["skipped"] == [
+        {"take": "B", "reason": "its consent does not cover statistics"}
+    ]
     assert cohort["age"].values.tolist() == [20, 20, 50]

@@ -15,18 +15,26 @@ LOG_TR = "trait_log_sigma_tr_shift"
 
 
 def _vectors(cohort, *, coefficient=None, **options):
-    """Trait vectors of a cohort whose takes have these coefficients (take,) and otherwise equal histograms."""
+    """Trait vectors of a cohort whose takes have these coefficients (take,) and
+    otherwise equal histograms.
+    """
     takes = cohort["take"].values
     n = len(takes)
     values = np.zeros(n) if coefficient is None else np.asarray(coefficient)
     basis = dataset(
-        {"population_mixture": np.eye(2), "take_coefficient": np.stack([values, -values], axis=1)},
+        {
+            "population_mixture": np.eye(2),
+            "take_coefficient": np.stack([values, -values], axis=1),
+        },
         coords={"take": takes, "dictionary": ["a", "b"]},
     )
     edges = np.tile(np.linspace(-3, 3, 257), (3, 1))
     shares = np.zeros((n, 1, 3, 256))
     shares[..., 120:136] = 1 / 16
-    albedo = dataset({"albedo_histogram": shares, "histogram_edge": edges}, coords={"take": takes, "region": ["face"]})
+    albedo = dataset(
+        {"albedo_histogram": shares, "histogram_edge": edges},
+        coords={"take": takes, "region": ["face"]},
+    )
     return trait_vectors(cohort, basis=basis, albedo=albedo, **options)
 
 
@@ -46,37 +54,54 @@ def test_trait_vectors__a_number_has_the_vector_of_one_unit():
 def test_trait_vectors__adjusted_ones_leave_out_what_goes_with_another_attribute():
     rng = np.random.default_rng(2)
     age = rng.uniform(20, 60, 60)
-    gender = np.where(rng.random(60) < 1 / (1 + np.exp(-(age - 40) / 5)), "male", "female")
+    gender = np.where(
+        rng.random(60) < 1 / (1 + np.exp(-(age - 40) / 5)), "male", "female"
+    )
     cohort = planted_tables(_people(60), gender=gender, age=age)
     plain = _vectors(cohort, coefficient=0.01 * age, traits=["gender:male"])
-    held = _vectors(cohort, coefficient=0.01 * age, traits=["gender:male"], adjust=["age"])
+    held = _vectors(
+        cohort, coefficient=0.01 * age, traits=["gender:male"], adjust=["age"]
+    )
     assert plain["trait_brdf_shift"].values[0, 0] > 0.1
     np.testing.assert_allclose(held["trait_brdf_shift"], 0, atol=1e-12)
     assert held.attrs["adjust"] == ["age"]
 
 
 def test_trait_vectors__errors_are_those_of_means():
-    """Errors by bootstrap agree with the standard error of a difference of means; 200 resamples give about 5 %."""
+    """Errors by bootstrap agree with the standard error of a difference of means; 200
+    resamples give about 5 %.
+    """
     gender = np.where(np.arange(80) % 4, "male", "female")
     values = np.random.default_rng(3).normal(size=80)
-    found = _vectors(planted_tables(_people(80), gender=gender), coefficient=values).sel(trait="gender:male")
+    found = _vectors(
+        planted_tables(_people(80), gender=gender), coefficient=values
+    ).sel(trait="gender:male")
     men = values[gender == "male"]
     women = values[gender == "female"]
     expected = np.sqrt(men.var(ddof=1) / len(men) + women.var(ddof=1) / len(women))
     np.testing.assert_allclose(found["trait_brdf_shift_error"], expected, rtol=0.2)
-    assert found["trait_brdf_shift"].values[0] == pytest.approx(men.mean() - women.mean())
+    assert found["trait_brdf_shift"].values[0] == pytest.approx(
+        men.mean() - women.mean()
+    )
 
 
 @pytest.mark.slow
 def test_trait_vectors__errors_cover_what_was_planted():
-    """Over 60 cohorts, one standard error covers 68 % of the planted differences of log sigma_tr."""
+    """Over 60 cohorts, one standard error covers 68 % of the planted differences of log
+    sigma_tr.
+    """
     inside = []
     gender = np.where(np.arange(40) % 2, "male", "female")
     for seed in range(60):
-        cohort = planted_tables(_people(40), log_tr=0.1 * (gender == "male"), seed=seed, gender=gender)
+        cohort = planted_tables(
+            _people(40), log_tr=0.1 * (gender == "male"), seed=seed, gender=gender
+        )
         found = _vectors(cohort, traits=["gender:male"]).sel(trait="gender:male")
-        inside.append(abs(found[LOG_TR].values[1] - 0.1) < found[f"{LOG_TR}_error"].values[1])
-    assert 0.68 - 3 * 0.06 < np.mean(inside) < 0.68 + 3 * 0.06  # three binomial standard deviations
+        inside.append(
+            abs(found[LOG_TR].values[1] - 0.1) < found[f"{LOG_TR}_error"].values[1]
+        )
+    # three binomial standard deviations
+    assert 0.68 - 3 * 0.06 < np.mean(inside) < 0.68 + 3 * 0.06
 
 
 def test_trait_vectors__conditions_are_differences_within_subjects():
@@ -84,18 +109,28 @@ def test_trait_vectors__conditions_are_differences_within_subjects():
     conditions = ["normal", "lotion"] * 12
     own = np.repeat(np.random.default_rng(4).normal(size=12), 2)
     change = np.tile([0.0, 1.0], 12)
-    found = _vectors(planted_tables(who.tolist(), conditions=conditions), coefficient=own + change)
+    found = _vectors(
+        planted_tables(who.tolist(), conditions=conditions), coefficient=own + change
+    )
     one = found.sel(trait="condition:lotion")
     np.testing.assert_allclose(one["trait_brdf_shift"], [1, -1], rtol=1e-12)
-    assert np.isnan(one["trait_brdf_shift_error"]).all() or (one["trait_brdf_shift_error"] < 1e-12).all()
+    assert (
+        np.isnan(one["trait_brdf_shift_error"]).all()
+        or (one["trait_brdf_shift_error"] < 1e-12).all()
+    )
 
 
 def test_trait_vectors__of_one_subject_have_no_error_and_say_so():
     gender = ["male", *["female"] * 5]
-    found = _vectors(planted_tables(_people(6), gender=gender), coefficient=np.arange(6.0))
+    found = _vectors(
+        planted_tables(_people(6), gender=gender), coefficient=np.arange(6.0)
+    )
     male = found.sel(trait="gender:male")
     assert np.isfinite(male["trait_brdf_shift"]).all()
-    assert "gender:male: only one take with it, so that the vector contains an individual" in found.attrs["flags"]
+    assert (
+        "gender:male: only one take with it, so that the vector contains an individual"
+        in found.attrs["flags"]
+    )
     assert np.isnan(found.sel(trait="gender:male")["trait_brdf_shift_error"]).all()
 
 
@@ -105,18 +140,29 @@ def test_trait_vectors__what_is_held_fixed_has_no_vector():
     cohort = planted_tables(_people(20), gender=gender, hair=hair, age=np.arange(20.0))
     found = _vectors(cohort, adjust=["hair"])
     assert [str(name) for name in found["trait"].values] == ["age:older", "age"]
-    assert sum(line.startswith("excluded: trait gender:") for line in found.attrs["flags"]) == 2
-    with pytest.raises(InputError, match="trait gender:male: must vary independently of the attributes"):
+    assert (
+        sum(line.startswith("excluded: trait gender:") for line in found.attrs["flags"])
+        == 2
+    )
+    with pytest.raises(
+        InputError, match="trait gender:male: must vary independently of the attributes"
+    ):
         _vectors(cohort, traits=["gender:male"], adjust=["hair"])
-    with pytest.raises(InputError, match="adjust wealth: must be an attribute other than the compared one"):
+    with pytest.raises(
+        InputError,
+        match="adjust wealth: must be an attribute other than the compared one",
+    ):
         _vectors(cohort, adjust=["wealth"])
 
 
 def test_describe_traits__takes_that_a_vector_needs():
-    """A true vector of length 2 with an error of length 1 at 10 takes needs 22.5 for three times its error."""
+    """A true vector of length 2 with an error of length 1 at 10 takes needs 22.5 for
+    three times its error.
+    """
     levels = 256
     quarter = 0.5 / np.sqrt(3 * 256)
-    shift = np.full((3, 1, 3, levels), np.sqrt(5.0) * 2 * quarter)  # 2 squared and 1 squared
+    # 2 squared and 1 squared
+    shift = np.full((3, 1, 3, levels), np.sqrt(5.0) * 2 * quarter)
     error = np.full((3, 1, 3, levels), 2 * quarter)
     shift[1] = error[1]
     error[2] = 0.1 * shift[2]
@@ -126,10 +172,20 @@ def test_describe_traits__takes_that_a_vector_needs():
             "trait_quantile_shift_error": error,
             "trait_count": np.array([[4, 6], [4, 6], [4, 6]]),
         },
-        coords={"trait": ["a", "b", "c"], "region": ["face"], "side": ["with", "without"]},
+        coords={
+            "trait": ["a", "b", "c"],
+            "region": ["face"],
+            "side": ["with", "without"],
+        },
         attrs={"flags": ["a: few"]},
     )
     few, needs, noise = describe_traits(traits)
     assert few == "a: few"
-    assert needs == "a: about 23 takes would be needed for a colour vector 3 times as long as its error"
-    assert noise == "b: with 10 takes, the colour vector cannot be distinguished from noise"
+    assert (
+        needs
+        == "a: about 23 takes would be needed for a colour vector 3 times as long as its error"
+    )
+    assert (
+        noise
+        == "b: with 10 takes, the colour vector cannot be distinguished from noise"
+    )

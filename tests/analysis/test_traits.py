@@ -30,7 +30,10 @@ def test_trait_vectors__planted_differences():
     lotion = traits.sel(trait="condition:lotion")
     np.testing.assert_array_equal(lotion["trait_count"], [1, 1])
     change = lotion["trait_brdf_shift"].values @ basis["population_mixture"].values
-    want = 2.0 * np.mean(np.random.default_rng(1).gamma(4.0, 0.02, (N, 3))[1:, 0]) * H[0]  # same seed as take A
+    # same seed as take A
+    want = (
+        2.0 * np.mean(np.random.default_rng(1).gamma(4.0, 0.02, (N, 3))[1:, 0]) * H[0]
+    )
     np.testing.assert_allclose(change, want, atol=0.15 * np.linalg.norm(want))
     np.testing.assert_allclose(lotion["trait_histogram_shift"], 0.0, atol=1e-12)
     male = traits.sel(trait="gender:male")["trait_log_sigma_tr_shift"].values
@@ -55,7 +58,9 @@ def test_trait_vectors__sites_do_not_pass_for_traits():
     """Male takes were measured at the neck only; the level of the other site must not matter."""
     models = population()
     for take in ("B", "C"):
-        models[take]["translucency"] = models[take]["translucency"].to_dataset().isel(site=[1])
+        models[take]["translucency"] = (
+            models[take]["translucency"].to_dataset().isel(site=[1])
+        )
     shift = analysed(models)[2].sel(trait="gender:male")["trait_log_sigma_tr_shift"]
     np.testing.assert_allclose(shift, np.log([1.2, 0.8]).mean(), atol=1e-6)
 
@@ -69,27 +74,49 @@ def test_trait_vectors__a_value_of_one_side_alone_is_no_difference():
         "B.lotion": model_of(2, tr=3.0, subject="B", condition="lotion"),
     }
     models["A.lotion"]["translucency/site_status"][:] = 1
-    shift = analysed(models)[2].sel(trait="condition:lotion")["trait_log_sigma_tr_shift"]
+    shift = analysed(models)[2].sel(trait="condition:lotion")[
+        "trait_log_sigma_tr_shift"
+    ]
     np.testing.assert_allclose(shift, 0, atol=1e-6)
 
 
 def test_trait_vectors__takes_go_by_name():
-    """Studies of more takes in another order give the same differences, because takes are found by name."""
+    """Studies of more takes in another order give the same differences, because takes
+    are found by name.
+    """
     models = population()
     basis, albedo, traits = analysed(models)
     turned = {take: models[take] for take in ("C", "A", "B")}
     order = ["C", "A.lotion", "B", "A"]
-    again = trait_vectors(tables(turned), basis=basis.sel(take=order), albedo=albedo.sel(take=order), traits=["male"])
-    for name in ("trait_brdf_shift", "trait_histogram_shift", "trait_quantile_shift", "trait_log_sigma_tr_shift"):
+    again = trait_vectors(
+        tables(turned),
+        basis=basis.sel(take=order),
+        albedo=albedo.sel(take=order),
+        traits=["male"],
+    )
+    for name in (
+        "trait_brdf_shift",
+        "trait_histogram_shift",
+        "trait_quantile_shift",
+        "trait_log_sigma_tr_shift",
+    ):
         np.testing.assert_allclose(
-            again[name].sel(trait="gender:male"), traits[name].sel(trait="gender:male"), atol=1e-12
+            again[name].sel(trait="gender:male"),
+            traits[name].sel(trait="gender:male"),
+            atol=1e-12,
         )
 
 
 def test_trait_vectors__single_takes_are_flagged():
     traits = analysed(population())[2]
-    assert "condition:lotion: only one take with it, so that the vector contains an individual" in traits.attrs["flags"]
-    assert not any(flag.startswith("gender:male: one take with it") for flag in traits.attrs["flags"])
+    assert (
+        "condition:lotion: only one take with it, so that the vector contains an individual"
+        in traits.attrs["flags"]
+    )
+    assert not any(
+        flag.startswith("gender:male: one take with it")
+        for flag in traits.attrs["flags"]
+    )
     assert plot_traits(traits).get_xlabel()
 
 
@@ -98,7 +125,14 @@ def test_trait_vectors__one_subject_has_none():
     basis, albedo, traits = analysed(models)
     assert traits.sizes["trait"] == 0
     with pytest.raises(InputError, match="choose from: none"):
-        apply_traits(models["A"], amounts={"male": 1.0}, traits=traits, basis=basis, albedo=albedo, tables=TABLES)
+        apply_traits(
+            models["A"],
+            amounts={"male": 1.0},
+            traits=traits,
+            basis=basis,
+            albedo=albedo,
+            tables=TABLES,
+        )
 
 
 def test_apply_traits__moves_every_part():
@@ -107,14 +141,21 @@ def test_apply_traits__moves_every_part():
     call = {"traits": traits, "basis": basis, "albedo": albedo, "tables": TABLES}
     same = apply_traits(models["B"], amounts={"lotion": 0.0}, **call)
     np.testing.assert_allclose(
-        same["fitted/diffuse_reflectance"][1:], models["B"]["fitted/diffuse_reflectance"][1:], atol=2e-3
+        same["fitted/diffuse_reflectance"][1:],
+        models["B"]["fitted/diffuse_reflectance"][1:],
+        atol=2e-3,
     )  # one bin of the histogram
     edited = apply_traits(models["B"], amounts={"lotion": 1.0, "male": -1.0}, **call)
     assert (edited["fitted/basis_weight"].values[1:] >= 0).all()
     assert edited["fitted/basis_weight"].sum() > same["fitted/basis_weight"].sum()
-    assert edited["fitted/diffuse_reflectance"].mean() > 1.2 * same["fitted/diffuse_reflectance"].mean()
+    assert (
+        edited["fitted/diffuse_reflectance"].mean()
+        > 1.2 * same["fitted/diffuse_reflectance"].mean()
+    )
     assert not np.allclose(edited["fitted/sigma_tr"], same["fitted/sigma_tr"])
-    s, rd = (edited[f"fitted/{n}"].values[1:] for n in ("dipole_s", "diffuse_reflectance"))
+    s, rd = (
+        edited[f"fitted/{n}"].values[1:] for n in ("dipole_s", "diffuse_reflectance")
+    )
     np.testing.assert_allclose(diffuse_reflectance(s, eta=1.3), rd, rtol=1e-5)
     assert edited.attrs["edit"] == {"lotion": 1.0, "male": -1.0}
     assert edited.attrs["edit_distance"] > 0
@@ -138,21 +179,33 @@ def test_apply_traits__reports_what_was_asked_and_done():
     area = models["B"]["fitted/surfel_area"].values[1:]
     good = slice(1, None)
     still = apply_traits(models["B"], amounts={}, **call)
-    change = tree["fitted/basis_weight"].values[good] - still["fitted/basis_weight"].values[good]
-    np.testing.assert_allclose(report["brdf"]["applied"], np.average(change, axis=0, weights=area), atol=1e-6)
+    change = (
+        tree["fitted/basis_weight"].values[good]
+        - still["fitted/basis_weight"].values[good]
+    )
+    np.testing.assert_allclose(
+        report["brdf"]["applied"], np.average(change, axis=0, weights=area), atol=1e-6
+    )
     mine = np.average(still["fitted/basis_weight"].values[good], axis=0, weights=area)
     assert report["albedo"]["clipped"] == report["translucency"]["clipped"] == 0
     assert report["albedo"]["projected"] == pytest.approx(0, abs=1e-12)
-    np.testing.assert_allclose(report["translucency"]["requested"], 1.0)  # A and A.lotion have the same sites
+    # A and A.lotion have the same sites
+    np.testing.assert_allclose(report["translucency"]["requested"], 1.0)
     for part in still.attrs["edit_report"].values():
         np.testing.assert_allclose(part["requested"], part["applied"], atol=1e-4)
     # standard deviations over takes, in the metric of the basis
-    gram = basis["population_mixture"].values @ brdf_metric(TABLES) @ basis["population_mixture"].values.T
+    gram = (
+        basis["population_mixture"].values
+        @ brdf_metric(TABLES)
+        @ basis["population_mixture"].values.T
+    )
     root = np.linalg.cholesky(gram)
     takes = basis["take_coefficient"].values
     spread = np.sqrt((takes @ root).var(axis=0, ddof=1).sum())
     want = np.linalg.norm((mine - takes.mean(axis=0)) @ root) / spread
-    assert still.attrs["edit_report"]["brdf"]["distance"] == pytest.approx(want, rel=1e-4)
+    assert still.attrs["edit_report"]["brdf"]["distance"] == pytest.approx(
+        want, rel=1e-4
+    )
     assert still.attrs["edit_distance"] == pytest.approx(0.0, abs=1e-3)
 
 
@@ -161,14 +214,32 @@ def test_apply_traits__drops_what_an_edit_makes_untrue():
     basis, albedo, traits = analysed(models)
     model = models["B"]
     fitted = model["fitted"].to_dataset()
-    wrong = {name: ("surfel", np.full(N, 0.1)) for name in ("fit_residual", "held_out_error", "kkt_residual")}
-    model["fitted"] = fitted.assign(wrong | {"diffuse_reflectance_error": fitted["diffuse_reflectance"]})
+    wrong = {
+        name: ("surfel", np.full(N, 0.1))
+        for name in ("fit_residual", "held_out_error", "kkt_residual")
+    }
+    model["fitted"] = fitted.assign(
+        wrong | {"diffuse_reflectance_error": fitted["diffuse_reflectance"]}
+    )
     model["basis"].attrs |= {"nmf_error": 0.1, "dictionary": "embedded"}
     model["probe"] = dataset({"fibre_distance": [1.0, 2.0]})
-    model.attrs |= {"fit_residual": {"median": 0.1}, "k": 2, "software_version": "0.0.1", "take": "B"}
-    call = {"amounts": {"lotion": 1.0}, "traits": traits, "basis": basis, "albedo": albedo, "tables": TABLES}
+    model.attrs |= {
+        "fit_residual": {"median": 0.1},
+        "k": 2,
+        "software_version": "0.0.1",
+        "take": "B",
+    }
+    call = {
+        "amounts": {"lotion": 1.0},
+        "traits": traits,
+        "basis": basis,
+        "albedo": albedo,
+        "tables": TABLES,
+    }
     edited = apply_traits(model, **call)
-    assert set(edited["fitted"].data_vars) == set(fitted.data_vars) - {"dictionary_weight"}
+    assert set(edited["fitted"].data_vars) == set(fitted.data_vars) - {
+        "dictionary_weight"
+    }
     assert edited["basis"].attrs == {"dictionary": "embedded"}
     assert set(edited.children) == {"fitted", "basis", "translucency"}
     assert set(edited["translucency"].data_vars) == {"site_sigma_tr", "site_status"}
@@ -184,20 +255,35 @@ def test_apply_traits__drops_what_an_edit_makes_untrue():
         "trait_notes",
     }
     assert set(model.children) == {"fitted", "basis", "translucency", "probe"}
-    assert set(apply_traits(model, **call, parts=("albedo",)).children) == set(model.children)
+    assert set(apply_traits(model, **call, parts=("albedo",)).children) == set(
+        model.children
+    )
 
 
 def test_apply_traits__mean_albedo_moves_by_the_mean_difference():
     models = population()
     basis, albedo, traits = analysed(models)
-    call = {"traits": traits, "basis": basis, "albedo": albedo, "tables": TABLES, "parts": ("albedo",)}
+    call = {
+        "traits": traits,
+        "basis": basis,
+        "albedo": albedo,
+        "tables": TABLES,
+        "parts": ("albedo",),
+    }
     mean = albedo["albedo_mean"].sel(region="face")
     want = mean.sel(take=["B", "C"]).mean("take").values - mean.sel(take="A").values
-    report = apply_traits(models["A"], amounts={"male": 1.0}, **call).attrs["edit_report"]["albedo"]
-    np.testing.assert_allclose(report["requested"], want, atol=2e-3)  # a tenth of a bin's width in reflectance
+    report = apply_traits(models["A"], amounts={"male": 1.0}, **call).attrs[
+        "edit_report"
+    ]["albedo"]
+    # a tenth of a bin's width in reflectance
+    np.testing.assert_allclose(report["requested"], want, atol=2e-3)
     np.testing.assert_allclose(report["applied"], want, atol=2e-3)
     same = apply_traits(models["A"], amounts={"male": 0.0}, **call)
-    np.testing.assert_allclose(same["fitted/diffuse_reflectance"], models["A"]["fitted/diffuse_reflectance"], rtol=1e-6)
+    np.testing.assert_allclose(
+        same["fitted/diffuse_reflectance"],
+        models["A"]["fitted/diffuse_reflectance"],
+        rtol=1e-6,
+    )
 
 
 @pytest.mark.parametrize("amount", [30.0, -30.0, 100.0])
@@ -205,10 +291,16 @@ def test_apply_traits__an_extreme_edit_is_physical_and_reported(amount):
     models = population()
     basis, albedo, traits = analysed(models)
     tree = apply_traits(
-        models["A"], amounts={"male": amount, "lotion": -1.0}, traits=traits, basis=basis, albedo=albedo, tables=TABLES
+        models["A"],
+        amounts={"male": amount, "lotion": -1.0},
+        traits=traits,
+        basis=basis,
+        albedo=albedo,
+        tables=TABLES,
     )
     weight, colour, transport, s = (
-        tree[f"fitted/{name}"].values[1:] for name in ("basis_weight", "diffuse_reflectance", "sigma_tr", "dipole_s")
+        tree[f"fitted/{name}"].values[1:]
+        for name in ("basis_weight", "diffuse_reflectance", "sigma_tr", "dipole_s")
     )
     assert np.isfinite(weight).all()
     assert (weight >= 0).all()
@@ -216,7 +308,8 @@ def test_apply_traits__an_extreme_edit_is_physical_and_reported(amount):
     assert (np.isfinite(transport) & (transport > 0)).all()
     assert (np.isfinite(s) & (s > 0)).all()
     report = tree.attrs["edit_report"]
-    assert (report["brdf"]["clipped"] > 0.2) == (amount < 0)  # larger weights are physical, negative ones are not
+    # larger weights are physical, negative ones are not
+    assert (report["brdf"]["clipped"] > 0.2) == (amount < 0)
     assert report["albedo"]["projected"] > 0.1
     assert report["albedo"]["clipped"] > 0.5
     assert report["translucency"]["clipped"] == 0  # its shift is small
@@ -234,12 +327,20 @@ def test_apply_traits__what_cannot_be_known_is_named():
         np.log([[0.5, 1, 1.5], [0.6, 1.1, 1.6]]).mean(axis=0),
         atol=1e-6,  # stored in single precision
     )
-    call = {"basis": basis, "albedo": albedo, "tables": TABLES, "amounts": {"lotion": 1.0}}
+    call = {
+        "basis": basis,
+        "albedo": albedo,
+        "tables": TABLES,
+        "amounts": {"lotion": 1.0},
+    }
     report = apply_traits(models["A"], traits=traits, **call).attrs["edit_report"]
-    assert {part["distance"] for part in report.values()} == {"unknown: only one subject"}
+    assert {part["distance"] for part in report.values()} == {
+        "unknown: only one subject"
+    }
     assert report["translucency"]["unknown"] == ["condition:lotion"]
     assert report["translucency"]["applied"] == pytest.approx([1, 1, 1])
-    with pytest.raises(InputError, match="run skindb analyze DB traits again"):  # a study of an older version
+    # a study of an older version
+    with pytest.raises(InputError, match="run skindb analyze DB traits again"):
         apply_traits(models["A"], traits=traits.drop_vars("take_log_sigma_tr"), **call)
 
 
@@ -257,7 +358,8 @@ def test_valid_quantiles__are_the_nearest_monotone_ones():
             method="SLSQP",
             constraints={"type": "ineq", "fun": np.diff},
         )
-        assert ((found - wanted) ** 2).sum() <= best.fun + 1e-6  # the solver's own tolerance
+        # the solver's own tolerance
+        assert ((found - wanted) ** 2).sum() <= best.fun + 1e-6
 
 
 def test_quantiles__are_those_of_the_values():
@@ -268,7 +370,8 @@ def test_quantiles__are_those_of_the_values():
     found = quantiles(shares, edges)
     want = np.quantile(x, levels(), axis=1).T
     middle = slice(5, -5)
-    np.testing.assert_allclose(found[:, middle], want[:, middle], atol=21 / 256)  # a bin
+    # a bin
+    np.testing.assert_allclose(found[:, middle], want[:, middle], atol=21 / 256)
     assert np.isnan(quantiles(np.full((2, 256), np.nan), edges)).all()
 
 
@@ -285,36 +388,56 @@ def test_carry__moves_the_mean_and_keeps_the_order():
 
 
 def test_apply_traits__moves_the_probe_sites_like_the_map():
-    """The map of the edited sites equals the edited map, since interpolation of 1/sigma_tr is linear."""
+    """The map of the edited sites equals the edited map, since interpolation of
+    1/sigma_tr is linear.
+    """
     models = population()
     basis, albedo, traits = analysed(models)
     traits["trait_log_sigma_tr_shift"].values[:] = np.linspace(
         -0.4, 0.3, traits["trait_log_sigma_tr_shift"].size
     ).reshape(traits["trait_log_sigma_tr_shift"].shape)
     model = models["B"]
-    place = dataset({"site_position": [[30.0, 0, 60], [0, -40, 50]]}, coords={"site": ["cheek", "neck"]})
+    place = dataset(
+        {"site_position": [[30.0, 0, 60], [0, -40, 50]]},
+        coords={"site": ["cheek", "neck"]},
+    )
     fitted = model["fitted"].to_dataset()
     sites = model["translucency"].to_dataset().merge(place)
     model["translucency"] = xr.DataTree(sites)
-    model["fitted"] = fitted.merge(translucency_map(fitted, sites), overwrite_vars="sigma_tr")
+    model["fitted"] = fitted.merge(
+        translucency_map(fitted, sites), overwrite_vars="sigma_tr"
+    )
     edited = apply_traits(
-        model, amounts={"lotion": 1.0, "male": 0.5}, traits=traits, basis=basis, albedo=albedo, tables=TABLES
+        model,
+        amounts={"lotion": 1.0, "male": 0.5},
+        traits=traits,
+        basis=basis,
+        albedo=albedo,
+        tables=TABLES,
     )
     moved = edited["translucency"].to_dataset()
     assert not np.allclose(moved["site_sigma_tr"], sites["site_sigma_tr"], rtol=0.05)
     again = translucency_map(fitted, moved)["sigma_tr"]
-    np.testing.assert_allclose(edited["fitted/sigma_tr"], again, rtol=1e-5)  # both are stored in float32
+    # both are stored in float32
+    np.testing.assert_allclose(edited["fitted/sigma_tr"], again, rtol=1e-5)
 
 
 def test_with_basis__the_whole_dictionary_is_the_model_itself():
     model = population()["A"]
-    whole = with_basis(model, mixture=np.eye(8), names=[f"b{i}" for i in range(8)], tables=TABLES)
+    whole = with_basis(
+        model, mixture=np.eye(8), names=[f"b{i}" for i in range(8)], tables=TABLES
+    )
     own = model["fitted/dictionary_weight"].values
     np.testing.assert_allclose(
         whole["fitted/basis_weight"].values[1:], own[1:], atol=1e-5
     )  # stored in single precision
     brdf = whole["basis/basis_brdf"]
     np.testing.assert_allclose(brdf.values, stored_brdf(TABLES), rtol=1e-3)
-    one = with_basis(model, mixture=np.ones((1, 8)) / 8, names=[f"b{i}" for i in range(8)], tables=TABLES)
+    one = with_basis(
+        model,
+        mixture=np.ones((1, 8)) / 8,
+        names=[f"b{i}" for i in range(8)],
+        tables=TABLES,
+    )
     assert one["fitted/basis_weight"].shape == (N, 1)
     assert (one["fitted/basis_weight"].values[1:] > 0).all()

@@ -23,23 +23,31 @@ def _cohort(subjects, repeats, *, people, repeat, noise, seed):
 def test_translucency_table__parts_of_the_variance_are_those_that_were_planted():
     """Means over 20 cohorts, within two of their standard errors."""
     found = [
-        translucency_table(_cohort(30, 3, people=0.2, repeat=0.05, noise=0.1, seed=seed)).isel(
-            group=0, site=0, channel=0
-        )
+        translucency_table(
+            _cohort(30, 3, people=0.2, repeat=0.05, noise=0.1, seed=seed)
+        ).isel(group=0, site=0, channel=0)
         for seed in range(20)
     ]
     fractions = np.array([float(one["sigma_tr_people_fraction"]) for one in found])
     repeats = np.array([float(one["sigma_tr_repeat_deviation"]) for one in found])
     total = 0.2**2 + 0.05**2 + 0.1**2
-    assert abs(fractions.mean() - (1 - 0.1**2 / total)) < 2 * fractions.std() / np.sqrt(20) + 0.01
-    assert abs(repeats.mean() - np.hypot(0.05, 0.1)) < 2 * repeats.std() / np.sqrt(20) + 0.001
+    assert (
+        abs(fractions.mean() - (1 - 0.1**2 / total))
+        < 2 * fractions.std() / np.sqrt(20) + 0.01
+    )
+    assert (
+        abs(repeats.mean() - np.hypot(0.05, 0.1))
+        < 2 * repeats.std() / np.sqrt(20) + 0.001
+    )
 
 
 def test_translucency_table__parts_are_nan_if_undetermined():
     alone = translucency_table(_cohort(8, 1, people=0.2, repeat=0.0, noise=0.1, seed=1))
     assert np.isnan(alone["sigma_tr_repeat_deviation"]).all()
     without = translucency_table(
-        _cohort(8, 1, people=0.2, repeat=0.0, noise=0.1, seed=1).drop_vars("site_sigma_tr_error")
+        _cohort(8, 1, people=0.2, repeat=0.0, noise=0.1, seed=1).drop_vars(
+            "site_sigma_tr_error"
+        )
     )
     assert np.isnan(without["sigma_tr_people_fraction"]).all()
     same = translucency_table(_cohort(8, 2, people=0.0, repeat=0.0, noise=0.0, seed=1))

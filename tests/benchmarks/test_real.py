@@ -22,7 +22,9 @@ def _benchmarks(monkeypatch):
 def _lights():
     turn, away = np.meshgrid(np.arange(10) * 0.63, [0.2, 0.5, 0.8, 1.0])
     across = np.sin(away)
-    return np.stack([across * np.cos(turn), across * np.sin(turn), np.cos(away)], axis=-1).reshape(-1, 3)
+    return np.stack(
+        [across * np.cos(turn), across * np.sin(turn), np.cos(away)], axis=-1
+    ).reshape(-1, 3)
 
 
 def _normals():
@@ -41,9 +43,13 @@ def test_fit__recovers_planted_normals_and_unseen_lights():
         observed = peer.shading(parameters, normal, light)
         observed[0, 3] *= 0.2  # a cast shadow
         fitted = peers.fit(peer, observed, observed > 0, light, training)
-        assert (fitted.normal * normal).sum(axis=1).min() > np.cos(np.radians(0.5)), peer.name
+        assert (fitted.normal * normal).sum(axis=1).min() > np.cos(np.radians(0.5)), (
+            peer.name
+        )
         unseen = ~training & (observed > 0)
-        np.testing.assert_allclose(fitted.predicted[unseen], observed[unseen], rtol=0.05, err_msg=peer.name)
+        np.testing.assert_allclose(
+            fitted.predicted[unseen], observed[unseen], rtol=0.05, err_msg=peer.name
+        )
 
 
 def test_common_gains__leaves_the_person_out():
@@ -61,7 +67,9 @@ def test_common_gains__leaves_the_person_out():
         for names in (("a", "b"), ("b", "a"), ("a", "c"))
     ]
     gains = [np.array([9.0, 9.0]), np.array([2.0, 3.0]), np.array([5.0, 7.0])]
-    np.testing.assert_array_equal(real_photographs.common_gains(people, gains, 0), [4.0, 2.0])
+    np.testing.assert_array_equal(
+        real_photographs.common_gains(people, gains, 0), [4.0, 2.0]
+    )
 
 
 def test_spread_lights__are_apart_and_begin_in_front():

@@ -31,9 +31,15 @@ def planted_results(takes: tuple[str, ...] = TAKES) -> Results:
     results = Results()
     for take in takes:
         results.models[take] = _model(take)
-        results.fits[take] = {"seconds": {"first pass": 2.0}, "held_out_error": {"median": HELD_OUT_ERROR}}
+        results.fits[take] = {
+            "seconds": {"first pass": 2.0},
+            "held_out_error": {"median": HELD_OUT_ERROR},
+        }
         results.recovered[take] = _recovery(results.models[take])
-        results.compared[take] = [comparison("l0", held_out=False), comparison("l1", held_out=True)]
+        results.compared[take] = [
+            comparison("l0", held_out=False),
+            comparison("l1", held_out=True),
+        ]
     results.studies = _studies(takes)
     results.seconds = {"simulate": 60.0, "fit": 100.0, "report": 1.0}
     results.edited_take = takes[0]
@@ -47,9 +53,18 @@ def planted_results(takes: tuple[str, ...] = TAKES) -> Results:
 
 
 def _model(take: str) -> xr.DataTree:
-    albedo = (0.25, 0.15, 0.1) if take == "V003" else (0.8, 0.4, 0.3) if take == "V001.lotion" else (0.6, 0.4, 0.3)
+    albedo = (
+        (0.25, 0.15, 0.1)
+        if take == "V003"
+        else (0.8, 0.4, 0.3)
+        if take == "V001.lotion"
+        else (0.6, 0.4, 0.3)
+    )
     model = small_face(albedo)
-    status = np.repeat([FitStatus.FITTED, *PLANTED], [SURFELS - sum(PLANTED.values()), *PLANTED.values()])
+    status = np.repeat(
+        [FitStatus.FITTED, *PLANTED],
+        [SURFELS - sum(PLANTED.values()), *PLANTED.values()],
+    )
     fitted = model["fitted"].to_dataset()
     model["fitted"] = xr.DataTree(fitted.assign(fit_status=label("fit_status", status)))
     _shrink(model)
@@ -67,7 +82,9 @@ def _shrink(model: xr.DataTree) -> None:
         "camera_matrix": matrix * np.array([[SCALE], [SCALE], [1.0]]),
         "camera_size": (size * SCALE).astype(size.dtype),
     }
-    kept = {name: values.assign_attrs(dome[name].attrs) for name, values in smaller.items()}
+    kept = {
+        name: values.assign_attrs(dome[name].attrs) for name, values in smaller.items()
+    }
     model["dome"] = xr.DataTree(dome.assign(kept))
 
 
@@ -84,9 +101,17 @@ def comparison(light: str, *, held_out: bool, exposure: float = 1.0) -> Comparis
     image = np.full((40, 30, 3), 0.5, np.float32)
     mask = np.zeros((40, 30), bool)
     mask[5:35, 5:25] = True
-    error = {"relative_rmse": 0.11, "psnr": 30.0, "ssim": 0.9, "delta_e_median": 1.2, "exposure": exposure}
+    error = {
+        "relative_rmse": 0.11,
+        "psnr": 30.0,
+        "ssim": 0.9,
+        "delta_e_median": 1.2,
+        "exposure": exposure,
+    }
     causes = Causes((0.0, 0.0), 1.0, 1.0, 1.0, 0.0)
-    return Comparison(light, "c0", held_out, image, image, mask, error, image, {}, causes)
+    return Comparison(
+        light, "c0", held_out, image, image, mask, error, image, {}, causes
+    )
 
 
 def _studies(takes: tuple[str, ...]) -> dict[str, xr.DataTree]:
@@ -104,7 +129,10 @@ def _studies(takes: tuple[str, ...]) -> dict[str, xr.DataTree]:
         )
     }
     curve = {
-        **{f"relative_error{end}": ("k", 1 + 0.3 / sizes) for end in ("", "_low", "_high")},
+        **{
+            f"relative_error{end}": ("k", 1 + 0.3 / sizes)
+            for end in ("", "_low", "_high")
+        },
         "smallest_size": 3,
         "sufficient_size": 4,
         "plateau_tolerance": 0.01,
@@ -112,13 +140,22 @@ def _studies(takes: tuple[str, ...]) -> dict[str, xr.DataTree]:
     }
     albedo = {
         "histogram_edge": (("axis", "edge"), np.tile(np.linspace(-2, 2, 257), (3, 1))),
-        "albedo_mean": (("take", "region", "channel"), np.full((len(takes), 1, 3), 0.4)),
-        "albedo_histogram": (("take", "region", "axis", "bin"), np.full((len(takes), 1, 3, 256), 1 / 256)),
+        "albedo_mean": (
+            ("take", "region", "channel"),
+            np.full((len(takes), 1, 3), 0.4),
+        ),
+        "albedo_histogram": (
+            ("take", "region", "axis", "bin"),
+            np.full((len(takes), 1, 3, 256), 1 / 256),
+        ),
     }
     traits = {
         "trait_count": (("trait", "side"), np.ones((1, 2), int)),
         "trait_brdf_shift": (("trait", "component"), np.full((1, 4), 0.0786)),
-        "trait_quantile_shift": (("trait", "region", "axis", "level"), np.full((1, 1, 3, 5), 0.615)),
+        "trait_quantile_shift": (
+            ("trait", "region", "axis", "level"),
+            np.full((1, 1, 3, 5), 0.615),
+        ),
         "trait_log_sigma_tr_shift": (("trait", "channel"), np.full((1, 3), 0.01)),
     }
     where = {"channel": channel, "region": region}
@@ -126,13 +163,25 @@ def _studies(takes: tuple[str, ...]) -> dict[str, xr.DataTree]:
     planted = {
         "translucency": {
             "translucency_table": xr.Dataset(
-                translucency, {"channel": channel, "site": ["cheek", "forehead"], "group": ["all"]}
+                translucency,
+                {"channel": channel, "site": ["cheek", "forehead"], "group": ["all"]},
             )
         },
-        "brdf": {"basis_size": xr.Dataset(curve, {"k": sizes}, {"size_status": "3 to 4", "surfels": 400})},
-        "albedo": {"albedo": xr.Dataset(albedo, where | {"take": list(takes)}), "albedo_table": grouped},
+        "brdf": {
+            "basis_size": xr.Dataset(
+                curve, {"k": sizes}, {"size_status": "3 to 4", "surfels": 400}
+            )
+        },
+        "albedo": {
+            "albedo": xr.Dataset(albedo, where | {"take": list(takes)}),
+            "albedo_table": grouped,
+        },
         "traits": {
-            "traits": xr.Dataset(traits, where | {"trait": ["ancestry:south_asian"], "side": ["with", "without"]})
+            "traits": xr.Dataset(
+                traits,
+                where
+                | {"trait": ["ancestry:south_asian"], "side": ["with", "without"]},
+            )
         },
     }
     return {name: xr.DataTree.from_dict(groups) for name, groups in planted.items()}

@@ -17,9 +17,12 @@ def _disc(row, col, radius, size=60):
 
 def test_crop_alike__windows_of_one_size_around_each_face():
     masks = [_disc(30, 30, 10), _disc(12, 45, 5), _disc(59, 0, 4)]
-    pictures = [np.repeat(mask[..., None], 3, axis=2).astype(np.uint8) for mask in masks]
+    pictures = [
+        np.repeat(mask[..., None], 3, axis=2).astype(np.uint8) for mask in masks
+    ]
     cut = crop_alike(pictures, masks, margin=3)
-    assert [one.shape for one in cut] == [(27, 27, 3)] * 3  # the largest disc has 21 rows
+    # the largest disc has 21 rows
+    assert [one.shape for one in cut] == [(27, 27, 3)] * 3
     for one, mask in zip(cut, masks, strict=True):
         assert one[..., 0].sum() == mask.sum()  # not clipped and not scaled
         rows = np.flatnonzero(one.any(axis=(1, 2)))
@@ -34,24 +37,36 @@ def test_crop_alike__without_a_face_the_whole_picture():
 
 def test_halved__is_the_mean_of_four_pixels():
     picture = np.random.default_rng(0).integers(0, 255, (7, 4, 3), dtype=np.uint8)
-    twin = [[picture[2 * i : 2 * i + 2, 2 * j : 2 * j + 2].mean(axis=(0, 1)) for j in range(2)] for i in range(3)]
+    twin = [
+        [
+            picture[2 * i : 2 * i + 2, 2 * j : 2 * j + 2].mean(axis=(0, 1))
+            for j in range(2)
+        ]
+        for i in range(3)
+    ]
     np.testing.assert_array_equal(half_size(picture), np.round(twin))
 
 
 @pytest.mark.slow
 def test_draw_portraits__darker_skin_is_shown_darker():
-    portraits = draw_portraits({"light": small_face(), "dark": small_face((0.15, 0.1, 0.08))})
+    portraits = draw_portraits(
+        {"light": small_face(), "dark": small_face((0.15, 0.1, 0.08))}
+    )
     shown = portraits.cut(portraits.images)
     mean = {name: image[image.any(axis=2)].mean() for name, image in shown.items()}
-    assert mean["dark"] < 0.8 * mean["light"]  # with separate exposures, both would be equally bright
+    # with separate exposures, both would be equally bright
+    assert mean["dark"] < 0.8 * mean["light"]
     assert shown["dark"].shape == shown["light"].shape
 
 
 def test_predictions__one_exposure_whatever_each_photograph_has():
-    shown = [comparison("l0", held_out=True, exposure=exposure) for exposure in (0.3, 1.0)]
+    shown = [
+        comparison("l0", held_out=True, exposure=exposure) for exposure in (0.3, 1.0)
+    ]
     first, second = predictions(shown, 0.5)
     np.testing.assert_array_equal(first, second)
     photograph = first[20, 15]
     difference = first[20, -15]
-    assert photograph[0] == round(255 * (1.055 * 0.25 ** (1 / 2.4) - 0.055))  # IEC 61966-2-1 of 0.5 times 0.5
+    # IEC 61966-2-1 of 0.5 times 0.5
+    assert photograph[0] == round(255 * (1.055 * 0.25 ** (1 / 2.4) - 0.055))
     np.testing.assert_array_equal(difference, 127)  # grey: the prediction is equal

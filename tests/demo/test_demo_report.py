@@ -10,7 +10,15 @@ import shutil
 
 import numpy as np
 import pytest
-from planted_results import DIFFUSE_ERROR, HELD_OUT_ERROR, NORMAL_ERROR, PLANTED, SURFELS, TAKES, planted_results
+from planted_results import (
+    DIFFUSE_ERROR,
+    HELD_OUT_ERROR,
+    NORMAL_ERROR,
+    PLANTED,
+    SURFELS,
+    TAKES,
+    planted_results,
+)
 
 from skindb.demo import tables
 from skindb.demo.report import write_report
@@ -27,12 +35,18 @@ def results():
 
 @pytest.fixture(scope="module")
 def report(results, tmp_path_factory):
-    return write_report(tmp_path_factory.mktemp("demo") / "report.html", results, progress=lambda *_: None)
+    return write_report(
+        tmp_path_factory.mktemp("demo") / "report.html",
+        results,
+        progress=lambda *_: None,
+    )
 
 
 @pytest.fixture(scope="module")
 def browser():
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    playwright = pytest.importorskip(
+        "playwright.sync_api", reason="playwright is not installed"
+    )
     if BROWSER is None:
         pytest.skip("there is no Chromium")
     with playwright.sync_playwright() as running:
@@ -43,7 +57,10 @@ def browser():
 
 def saved(text, name):
     """Rows of a table that the page lets its reader save, as dictionaries."""
-    data = re.search(rf'download="{name}.csv" href="data:text/csv;charset=utf-8;base64,([^"]+)"', text)[1]
+    data = re.search(
+        rf'download="{name}.csv" href="data:text/csv;charset=utf-8;base64,([^"]+)"',
+        text,
+    )[1]
     return list(csv.DictReader(io.StringIO(base64.b64decode(data).decode())))
 
 
@@ -63,24 +80,32 @@ def test_write_report__one_row_for_each_take(report):
 
 def test_write_report__states_why_surfels_have_no_fit(report):
     text = report.read_text()
-    counts = {(row["take"], row["status"]): int(row["surfels"]) for row in saved(text, "surfel_statuses")}
+    counts = {
+        (row["take"], row["status"]): int(row["surfels"])
+        for row in saved(text, "surfel_statuses")
+    }
     for status, count in PLANTED.items():
         assert counts["V002", status.name.lower()] == count
         assert status.explanation in text
-    assert FitStatus.NOT_FINITE.explanation not in re.sub('base64,[^"]+', "", text)  # no surfel has this status
+    # no surfel has this status
+    assert FitStatus.NOT_FINITE.explanation not in re.sub('base64,[^"]+', "", text)
     assert f"unseen {100 * PLANTED[FitStatus.UNSEEN] / SURFELS:.1f} %" in text
 
 
 def test_write_report__states_the_distance_of_the_edit(report, results):
     text = report.read_text()
     assert "amount 1, distance 0.40: inside the data" in text
-    near = re.search(r"is ([\d.e-]+) for the unedited model and ([\d.e-]+) at amount 1", text)
+    near = re.search(
+        r"is ([\d.e-]+) for the unedited model and ([\d.e-]+) at amount 1", text
+    )
     assert float(near[2]) < 0.05 * float(
         near[1]
     )  # the edit has the colours of the measured take; few surfels are filled
     far = planted_results(TAKES[:2])
     far.edits[1.0].attrs["edit_distance"] = 1.2
-    other = write_report(report.with_name("far.html"), far, progress=lambda *_: None).read_text()
+    other = write_report(
+        report.with_name("far.html"), far, progress=lambda *_: None
+    ).read_text()
     assert "amount 1, distance 1.20: outside the data" in other
 
 
@@ -89,7 +114,9 @@ def test_write_report__without_edits_and_traits(report):
     plain.edits = {}
     plain.edited_take = ""
     del plain.studies["traits"]
-    text = write_report(report.with_name("plain.html"), plain, progress=lambda *_: None).read_text()
+    text = write_report(
+        report.with_name("plain.html"), plain, progress=lambda *_: None
+    ).read_text()
     assert "An edit and its distance" not in text
 
 
@@ -102,20 +129,31 @@ def test_status_sums__count_every_surfel_once(results):
 @pytest.mark.slow
 @pytest.mark.parametrize("theme", ["light", "dark"])
 def test_write_report__fits_a_narrow_page(report, browser, theme):
-    context = browser.new_context(viewport={"width": 400, "height": 800}, color_scheme=theme)
+    context = browser.new_context(
+        viewport={"width": 400, "height": 800}, color_scheme=theme
+    )
     page = context.new_page()
     asked = []
     page.on("request", lambda request: asked.append(request.url))
     page.goto(report.as_uri())
     assert page.evaluate("document.documentElement.scrollHeight") < MAX_HEIGHT
-    page.evaluate("document.querySelectorAll('details').forEach(one => one.open = true)")
+    page.evaluate(
+        "document.querySelectorAll('details').forEach(one => one.open = true)"
+    )
     assert page.evaluate("document.documentElement.scrollWidth") == 400
     unnamed = "[...document.images].filter(one => !one.alt || !one.naturalWidth).length"
     assert page.evaluate(unnamed) == 0
     assert [url for url in asked if not url.startswith("data:")] == [report.as_uri()]
     assert page.locator('a[href="viewer.html"]').count() == 1
     ink, paper = (
-        np.mean([int(part) for part in re.findall(r"\d+", page.evaluate(f"getComputedStyle(document.body).{what}"))])
+        np.mean(
+            [
+                int(part)
+                for part in re.findall(
+                    r"\d+", page.evaluate(f"getComputedStyle(document.body).{what}")
+                )
+            ]
+        )
         for what in ("color", "backgroundColor")
     )
     assert (ink > paper) == (theme == "dark")

@@ -17,7 +17,11 @@ TABLE = page.Table("names", ["name", "x"], [["<i>", 0.123456], ['a, "b"', np.nan
 
 def test_page__self_contained_and_escaped():
     image = np.random.default_rng(0).integers(0, 255, (5, 7, 3), dtype=np.uint8)
-    text = page.page("T & T", "lead", [("First", [page.row([page.picture(image, "a < b")]), page.table(TABLE)])])
+    text = page.page(
+        "T & T",
+        "lead",
+        [("First", [page.row([page.picture(image, "a < b")]), page.table(TABLE)])],
+    )
     assert "http" not in text
     assert "<i>" not in text
     assert "0.123<" in text
@@ -45,11 +49,21 @@ def test_table__columns_keep_their_values():
 
 def test_cell__is_short_and_readable():
     values = (175952, np.int64(23), 0.012345, 1234.5, np.nan, "a", True)
-    assert [page.cell(value) for value in values] == ["175,952", "23", "0.0123", "1,234", "-", "a", "True"]
+    assert [page.cell(value) for value in values] == [
+        "175,952",
+        "23",
+        "0.0123",
+        "1,234",
+        "-",
+        "a",
+        "True",
+    ]
 
 
 def test_themed__names_a_picture_for_dark_pages():
     text = page.themed(b"light", b"dark", "a plot")
-    dark, light = (base64.b64decode(one) for one in re.findall(r"base64,([^\"]+)", text))
+    dark, light = (
+        base64.b64decode(one) for one in re.findall(r"base64,([^\"]+)", text)
+    )
     assert (dark, light) == (b"dark", b"light")
     assert text.index("prefers-color-scheme: dark") < text.index("<img")

@@ -44,7 +44,9 @@ Prepare = Callable[[int, Path], tuple[str, str, Callable[[], Outcome]]]
 
 
 def in_a_process(call: Callable[[], object]) -> None:
-    """Call a function in a separate process, because threads of compiled code must not be forked."""
+    """Call a function in a separate process, because threads of compiled code must not
+    be forked.
+    """
     process = os.fork()
     if not process:
         try:
@@ -64,10 +66,13 @@ class Limits:
     jobs: int = 2  # processes at a time
     seconds: float = TIME_LIMIT_S  # limit of the CPU time of one case
     minutes: float = math.inf  # no other case is started after this time
-    tell: Callable[[Case], object] = lambda _: None  # called with each case as soon as it has ended
+    # called with each case as soon as it has ended
+    tell: Callable[[Case], object] = lambda _: None
 
 
-def run(cases: Iterable[int], prepare: Prepare, folder: Path, limits: Limits) -> list[Case]:
+def run(
+    cases: Iterable[int], prepare: Prepare, folder: Path, limits: Limits
+) -> list[Case]:
     """Make, attempt and judge every case."""
     since = time.monotonic()
     waiting = list(cases)
@@ -81,7 +86,13 @@ def run(cases: Iterable[int], prepare: Prepare, folder: Path, limits: Limits) ->
             work = folder / f"case-{number}"
             work.mkdir()
             variant, damage, attempt = prepare(number, work)
-            running[_start(work, attempt, limits.seconds)] = (number, variant, damage, work, time.monotonic())
+            running[_start(work, attempt, limits.seconds)] = (
+                number,
+                variant,
+                damage,
+                work,
+                time.monotonic(),
+            )
         for process, (number, variant, damage, work, began) in list(running.items()):
             ended, status, usage = os.wait4(process, os.WNOHANG)
             late = not ended and time.monotonic() - began > PATIENCE * limits.seconds
@@ -90,7 +101,14 @@ def run(cases: Iterable[int], prepare: Prepare, folder: Path, limits: Limits) ->
                 ended, status, usage = os.wait4(process, 0)
             if ended:
                 del running[process]
-                done.append(Case(number, variant, damage, *_judged(work, status, usage.ru_maxrss, late=late)))
+                done.append(
+                    Case(
+                        number,
+                        variant,
+                        damage,
+                        *_judged(work, status, usage.ru_maxrss, late=late),
+                    )
+                )
                 limits.tell(done[-1])
                 shutil.rmtree(work)
         time.sleep(0.01)
@@ -106,9 +124,13 @@ def _start(work: Path, attempt: Callable[[], Outcome], seconds: float) -> int:
         target = os.open(work / "output", os.O_WRONLY | os.O_CREAT)
         os.dup2(target, 1)
         os.dup2(target, 2)
-        resource.setrlimit(resource.RLIMIT_AS, (ADDRESS_LIMIT_BYTES, ADDRESS_LIMIT_BYTES))
+        resource.setrlimit(
+            resource.RLIMIT_AS, (ADDRESS_LIMIT_BYTES, ADDRESS_LIMIT_BYTES)
+        )
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-        resource.setrlimit(resource.RLIMIT_CPU, (math.ceil(seconds), math.ceil(seconds) + 1))
+        resource.setrlimit(
+            resource.RLIMIT_CPU, (math.ceil(seconds), math.ceil(seconds) + 1)
+        )
         try:
             outcome = attempt()
         except MemoryError:
@@ -125,7 +147,10 @@ def _judged(work: Path, status: int, peak_kb: int, *, late: bool) -> Outcome:
     if late or (os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGXCPU):
         return "hang", "ended after its time"
     if not (work / "outcome").exists():
-        return "traceback", f"the process died with status {status}: {_output(work)[-300:]}"
+        return (
+            "traceback",
+            f"the process died with status {status}: {_output(work)[-300:]}",
+        )
     outcome, detail = json.loads((work / "outcome").read_text())
     if outcome not in FAILURES and peak_kb > RESIDENT_LIMIT_KB:
         return "memory", f"{peak_kb / 1e6:.1f} GB; {detail}"
@@ -136,7 +161,11 @@ def _judged(work: Path, status: int, peak_kb: int, *, late: bool) -> Outcome:
 
 def _output(work: Path) -> str:
     """What was printed."""
-    return (work / "output").read_text(errors="replace") if (work / "output").exists() else ""
+    return (
+        (work / "output").read_text(errors="replace")
+        if (work / "output").exists()
+        else ""
+    )
 
 
 def program(
@@ -153,7 +182,8 @@ def program(
     doc
         Its first line describes the program.
     run_all
-        Runs cases with a seed, in a folder for temporary files, within limits, with the values of `options`.
+        Runs cases with a seed, in a folder for temporary files, within limits, with the
+        values of `options`.
     outcomes
         The rows of the table, those of `FAILURES` included.
     bad
@@ -162,13 +192,34 @@ def program(
         Arguments of `add_argument` for further options, by name.
     """
     parser = argparse.ArgumentParser(description=doc.partition("\n")[0])
-    parser.add_argument("--cases", type=int, default=1000, help="Number of damaged folders.")
-    parser.add_argument("--first", type=int, default=0, help="Number of the first case, to repeat one.")
+    parser.add_argument(
+        "--cases", type=int, default=1000, help="Number of damaged folders."
+    )
+    parser.add_argument(
+        "--first", type=int, default=0, help="Number of the first case, to repeat one."
+    )
     parser.add_argument("--seed", type=int, default=0, help="Seed of the damage.")
-    parser.add_argument("--jobs", type=int, default=2, help="Number of processes at a time.")
-    parser.add_argument("--minutes", type=float, default=math.inf, help="Begin no other case after so many minutes.")
-    parser.add_argument("--list", nargs="*", default=[], help="Outcomes whose cases are listed beside the failures.")
-    parser.add_argument("--seconds", type=float, default=TIME_LIMIT_S, help="Limit of the CPU time of a case [s].")
+    parser.add_argument(
+        "--jobs", type=int, default=2, help="Number of processes at a time."
+    )
+    parser.add_argument(
+        "--minutes",
+        type=float,
+        default=math.inf,
+        help="Begin no other case after so many minutes.",
+    )
+    parser.add_argument(
+        "--list",
+        nargs="*",
+        default=[],
+        help="Outcomes whose cases are listed beside the failures.",
+    )
+    parser.add_argument(
+        "--seconds",
+        type=float,
+        default=TIME_LIMIT_S,
+        help="Limit of the CPU time of a case [s].",
+    )
     for name, about in options.items():
         parser.add_argument(name, **about)
     asked = parser.parse_args()
@@ -176,12 +227,21 @@ def program(
 
     def tell(case: Case) -> None:
         if case.outcome in (*FAILURES, *bad, *asked.list) or asked.cases == 1:
-            text = f"case {case.number} ({case.variant}): {case.damage}\n{case.outcome}: {case.detail}\n"
+            text = (
+                f"case {case.number} ({case.variant}): {case.damage}\n{case.outcome}: "
+                f"{case.detail}\n"
+            )
             print(text, file=sys.stderr, flush=True)
 
     limits = Limits(asked.jobs, asked.seconds, asked.minutes, tell)
     with tempfile.TemporaryDirectory() as folder:
-        cases = run_all(range(asked.first, asked.first + asked.cases), asked.seed, Path(folder), limits, **further)
+        cases = run_all(
+            range(asked.first, asked.first + asked.cases),
+            asked.seed,
+            Path(folder),
+            limits,
+            **further,
+        )
     count = Counter(case.outcome for case in cases)
     for outcome in outcomes:
         print(f"{outcome:<32} {count[outcome]:>6}")

@@ -1,10 +1,13 @@
-"""Ingest damaged capture folders by the command line, each in its own process, within limits of time and memory.
+"""Ingest damaged capture folders by the command line, each in its own process, within
+limits of time and memory.
 
-    python tests/destructive/fuzz_capture.py --cases 1000 --seed 0
-    python tests/destructive/fuzz_capture.py --cases 1000 --seed 0 --capture FOLDER --capture ANOTHER --tiff
+    python tests/destructive/fuzz_capture.py --cases 1000 --seed 0 python
+    tests/destructive/fuzz_capture.py --cases 1000 --seed 0 --capture FOLDER --capture
+    ANOTHER --tiff
 
-An ingest must end with exit code 1 and lines that each name a place, a rule, what was found and a cure, or with 0 and
-numbers. Tracebacks, hangs, gigabytes of memory and messages of libraries are failures: the program then ends with 1.
+An ingest must end with exit code 1 and lines that each name a place, a rule, what was
+found and a cure, or with 0 and numbers. Tracebacks, hangs, gigabytes of memory and
+messages of libraries are failures: the program then ends with 1.
 """
 
 from __future__ import annotations
@@ -45,10 +48,17 @@ LIBRARY = re.compile(
     r"Traceback|-packages|\.py\b|[a-z]Error\b|Warning\b|EXR_ERR|internal error|0x[0-9a-f]{6}|"
     r"numpy|tifffile|imagecodecs|trimesh"
 )
-ENDS = ("refused", "same numbers", "changed by at most 1 %", "changed and reported", "changed numbers")
+ENDS = (
+    "refused",
+    "same numbers",
+    "changed by at most 1 %",
+    "changed and reported",
+    "changed numbers",
+)
 OUTCOMES = (*ENDS, *BAD, *apart.FAILURES)
 MAX_DIFFERENCE = 0.01  # relative to the median size of a quantity
-Truth = tuple[dict[str, np.ndarray], list[str]]  # numbers of the undamaged capture, and the lines that ingest prints
+# numbers of the undamaged capture, and the lines that ingest prints
+Truth = tuple[dict[str, np.ndarray], list[str]]
 
 
 def variants(folder: Path) -> dict[str, Path]:
@@ -56,12 +66,20 @@ def variants(folder: Path) -> dict[str, Path]:
     out = {name: folder / name for name in ("png", "tif", "exr")}
     write_capture(out["png"])
     values = np.linspace(BLACK, WHITE, 9)
-    rows = [f"{v},{e},{e},{e}" for v, e in zip(values, np.linspace(0, 1, 9), strict=True)]
+    rows = [
+        f"{v},{e},{e},{e}" for v, e in zip(values, np.linspace(0, 1, 9), strict=True)
+    ]
     (out["png"] / "dome/r.csv").write_text("\n".join(["dn,r,g,b", *rows]))
-    _edit(out["png"] / "dome/dome.json", lambda dome: dome["cameras"][0].update(response="dome/r.csv"))
+    _edit(
+        out["png"] / "dome/dome.json",
+        lambda dome: dome["cameras"][0].update(response="dome/r.csv"),
+    )
     for name in ("tif", "exr"):
         shutil.copytree(out["png"], out[name])
-        _edit(out[name] / "dome/dome.json", lambda dome: dome["cameras"][0].pop("response"))
+        _edit(
+            out[name] / "dome/dome.json",
+            lambda dome: dome["cameras"][0].pop("response"),
+        )
         (out[name] / "dome/r.csv").unlink()
     _as_tiff(out["tif"])
     _as_exr(out["exr"])
@@ -94,7 +112,11 @@ def _as_exr(folder: Path) -> None:
     longest = max(SECONDS, key=SECONDS.get)
     for path in [*(folder / "dome").rglob("*.png")]:
         if path.parent.name == longest:
-            radiance = (read_frame(path).astype(np.float32) - BLACK) / (WHITE - BLACK) / SECONDS[longest]
+            radiance = (
+                (read_frame(path).astype(np.float32) - BLACK)
+                / (WHITE - BLACK)
+                / SECONDS[longest]
+            )
             write_frame(path.with_suffix(".exr"), radiance)
         path.unlink()
     path = folder / "dome/dome.json"
@@ -110,7 +132,11 @@ def numbers(place: Path) -> tuple[dict[str, np.ndarray], list[str]]:
     tree = db.read("capture", record.take)
     made = record.provenance
     said = [*made["summary"].get("notes", []), *made["skipped"], *made["unknown_keys"]]
-    said += sample_lines(made["summary"]["samples"])[1:] if "samples" in made["summary"] else []
+    said += (
+        sample_lines(made["summary"]["samples"])[1:]
+        if "samples" in made["summary"]
+        else []
+    )
     said += [f"{kind}: {count}" for kind, count in made["cleaning"].items()]
     stored = {
         name: tree[group][name].values
@@ -123,7 +149,9 @@ def numbers(place: Path) -> tuple[dict[str, np.ndarray], list[str]]:
 
 
 def ingest(capture: Path, work: Path) -> tuple[int, str, str]:
-    """Exit code of `skindb ingest` into a new database, and what it prints to standard output and standard error."""
+    """Exit code of `skindb ingest` into a new database, and what it prints to standard
+    output and standard error.
+    """
     options = ["--spacing", "8", "--photographs", "1", "--progress", "none"]
     sys.argv = ["skindb", "ingest", str(work / "db"), str(capture), *options]
     code: object = 0
@@ -136,12 +164,18 @@ def ingest(capture: Path, work: Path) -> tuple[int, str, str]:
         sys.stderr.flush()
         sys.stdout = sys.__stdout__
         sys.stderr = sys.__stderr__
-    return int(str(code or 0)), (work / "out").read_text(errors="replace"), (work / "err").read_text(errors="replace")
+    return (
+        int(str(code or 0)),
+        (work / "out").read_text(errors="replace"),
+        (work / "err").read_text(errors="replace"),
+    )
 
 
 @contextmanager
 def _printed_to(path: Path, number: int) -> Iterator[None]:
-    """Context in which a descriptor leads to a file, also for libraries that print without Python."""
+    """Context in which a descriptor leads to a file, also for libraries that print
+    without Python.
+    """
     kept = os.dup(number)
     file = os.open(path, os.O_WRONLY | os.O_CREAT)
     os.dup2(file, number)
@@ -153,13 +187,20 @@ def _printed_to(path: Path, number: int) -> Iterator[None]:
         os.close(kept)
 
 
-def difference(found: dict[str, np.ndarray], true: dict[str, np.ndarray]) -> tuple[float, str]:
-    """Largest difference relative to the median size of its quantity, and its name; empty if all are equal."""
+def difference(
+    found: dict[str, np.ndarray], true: dict[str, np.ndarray]
+) -> tuple[float, str]:
+    """Largest difference relative to the median size of its quantity, and its name;
+    empty if all are equal.
+    """
     said = [f"{name} missing" for name in true if name not in found]
     worst = np.inf if said else 0.0
     for name, value in found.items():
         if name not in true or value.shape != true[name].shape:
-            said.append(f"{name} of shape {value.shape}, not {true[name].shape if name in true else 'there'}")
+            said.append(
+                f"{name} of shape {value.shape}, not "
+                f"{true[name].shape if name in true else 'there'}"
+            )
             worst = np.inf
         elif not np.array_equal(value, true[name], equal_nan=value.dtype.kind == "f"):
             a = value.astype(np.float64)
@@ -181,7 +222,15 @@ def attempt(capture: Path, work: Path, true: Truth) -> apart.Outcome:
         return "message of a library", f"{found.group()}: {out + err}"
     lines = err.splitlines()
     if code == 1:
-        bad = [line for line in lines if not LINE.fullmatch(line) or not line.isprintable()] if lines else ["no line"]
+        bad = (
+            [
+                line
+                for line in lines
+                if not LINE.fullmatch(line) or not line.isprintable()
+            ]
+            if lines
+            else ["no line"]
+        )
         return ("refused without a cure", bad[0]) if bad else ("refused", lines[0])
     if code != 0 or not all(re.fullmatch(r"\w+: warning: .+", line) for line in lines):
         return "another exit code", f"{code}: {err}"
@@ -191,7 +240,11 @@ def attempt(capture: Path, work: Path, true: Truth) -> apart.Outcome:
         return "same numbers", ""
     if off <= MAX_DIFFERENCE:
         return "changed by at most 1 %", how
-    return ("changed and reported", f"{how}; reported: {told[0]}") if told else ("changed numbers", how)
+    return (
+        ("changed and reported", f"{how}; reported: {told[0]}")
+        if told
+        else ("changed numbers", how)
+    )
 
 
 def given(captures: list[Path], folder: Path, *, tiff: bool) -> dict[str, Path]:
@@ -199,13 +252,21 @@ def given(captures: list[Path], folder: Path, *, tiff: bool) -> dict[str, Path]:
     out = {capture.name: capture for capture in captures}
     for name, capture in [*out.items()] if tiff else []:
         if any(capture.rglob("dome/frames/**/*.png")):
-            out[f"{name}-tiff"] = Path(shutil.copytree(capture, folder / f"{name}-tiff"))
+            out[f"{name}-tiff"] = Path(
+                shutil.copytree(capture, folder / f"{name}-tiff")
+            )
             _as_tiff(out[f"{name}-tiff"])
     return out
 
 
 def run(
-    cases: range, seed: int, folder: Path, limits: apart.Limits, *, capture: list[Path] | None, tiff: bool
+    cases: range,
+    seed: int,
+    folder: Path,
+    limits: apart.Limits,
+    *,
+    capture: list[Path] | None,
+    tiff: bool,
 ) -> list[apart.Case]:
     """Damage, ingest and judge every case, each with one of the undamaged captures."""
     whole = given(capture, folder, tiff=tiff) if capture else variants(folder)
@@ -214,7 +275,10 @@ def run(
         work = folder / f"true-{name}"
         work.mkdir()
         apart.in_a_process(partial(_keep, place, work))
-        true[name] = dict(np.load(work / "numbers.npz")), json.loads((work / "said").read_text())
+        true[name] = (
+            dict(np.load(work / "numbers.npz")),
+            json.loads((work / "said").read_text()),
+        )
 
     def prepare(number: int, work: Path):
         rng = np.random.default_rng([seed, number])
@@ -235,6 +299,15 @@ def _keep(capture: Path, work: Path) -> None:
 
 
 if __name__ == "__main__":
-    damaged = {"type": Path, "action": "append", "help": "Capture to damage copies of; several allowed."}
-    tiff = {"action": "store_true", "help": "Damage copies with TIFF frames of these captures as well."}
-    apart.program(__doc__, run, OUTCOMES, BAD, options={"--capture": damaged, "--tiff": tiff})
+    damaged = {
+        "type": Path,
+        "action": "append",
+        "help": "Capture to damage copies of; several allowed.",
+    }
+    tiff = {
+        "action": "store_true",
+        "help": "Damage copies with TIFF frames of these captures as well.",
+    }
+    apart.program(
+        __doc__, run, OUTCOMES, BAD, options={"--capture": damaged, "--tiff": tiff}
+    )

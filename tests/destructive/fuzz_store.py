@@ -2,9 +2,10 @@
 
     python tests/destructive/fuzz_store.py --cases 1000 --seed 0
 
-`verify` must name the damage, and nothing that is read may differ from what was committed, or a line with a cure must
-say why it is refused. Tracebacks, hangs, gigabytes of memory and messages of libraries are failures, and the program
-then ends with 1.
+`verify` must name the damage, and nothing that is read may differ from what was
+committed, or a line with a cure must say why it is refused. Tracebacks, hangs,
+gigabytes of memory and messages of libraries are failures, and the program then ends
+with 1.
 """
 
 from __future__ import annotations
@@ -47,39 +48,71 @@ HARMLESS = {
     "tombstone": "harmless: a tombstone",
     "tmp": "harmless: scratch",
     "leases": "harmless: a lease that nobody holds",
-    "audit": "harmless: the end of the audit log was removed",  # other damage of it is named
-    "catalogue.json": "harmless: a damaged catalogue",  # a sealed cache: what is read must be the same without it
+    # other damage of it is named
+    "audit": "harmless: the end of the audit log was removed",
+    # a sealed cache: what is read must be the same without it
+    "catalogue.json": "harmless: a damaged catalogue",
 }
 SAME = "harmless: the same JSON values"
 UNCHANGED = "harmless: nothing was changed"
-BAD = ("undetected change", "changed, but named by verify", "refused, but not named by verify", "message without cure")
-OUTCOMES = ("named by verify", *HARMLESS.values(), SAME, UNCHANGED, *BAD, *apart.FAILURES)
-COMMANDS = (("verify",), ("info",), ("info", "-v"), ("fit", "--explain"), ("analyze", "translucency"))
-Numbers = dict[str, Any]  # what was read -> digest of each part, or the message of the refusal
+BAD = (
+    "undetected change",
+    "changed, but named by verify",
+    "refused, but not named by verify",
+    "message without cure",
+)
+OUTCOMES = (
+    "named by verify",
+    *HARMLESS.values(),
+    SAME,
+    UNCHANGED,
+    *BAD,
+    *apart.FAILURES,
+)
+COMMANDS = (
+    ("verify",),
+    ("info",),
+    ("info", "-v"),
+    ("fit", "--explain"),
+    ("analyze", "translucency"),
+)
+# what was read -> digest of each part, or the message of the refusal
+Numbers = dict[str, Any]
 
 
 def database(root: Path) -> None:
-    """Two virtual takes, the model of one, and three generations of a study, of which the second was removed."""
+    """Two virtual takes, the model of one, and three generations of a study, of which
+    the second was removed.
+    """
     size = {"cameras": 3, "lights": 12, "width": 48, "height": 60}
     db = skindb.open(str(root))
     for folder in workflow.simulate(root.parent / "captures", takes=2, **size):
         workflow.ingest_take(db, folder, spacing_mm=8.0, photographs=1)
-    workflow.fit_take(db, "V001", FitParameters(k=2, rank=4), dictionary=few_materials())
-    for code in "123":  # a study of the same model by the same code would be the same version
-        with patch("skindb.workflow.study_versions.method_digest", lambda _, code=code: code):
+    workflow.fit_take(
+        db, "V001", FitParameters(k=2, rank=4), dictionary=few_materials()
+    )
+    # a study of the same model by the same code would be the same version
+    for code in "123":
+        with patch(
+            "skindb.workflow.study_versions.method_digest", lambda _, code=code: code
+        ):
             workflow.translucency(db)
     Log(db._place, "population", "translucency").remove(2)
     if faults := db.verify():
         raise AssertionError(faults)
 
 
-def read_all(root: Path, versions: list[list[Any]], damage: str = "") -> tuple[Numbers, list[Fault]]:
+def read_all(
+    root: Path, versions: list[list[Any]], damage: str = ""
+) -> tuple[Numbers, list[Fault]]:
     """Digests of all that can be read, and the faults of what is refused.
 
-    Values are loaded of the kinds that the description of the damage names, or of all if it names none; the others are
-    opened.
+    Values are loaded of the kinds that the description of the damage names, or of all
+    if it names none; the others are opened.
     """
-    near = {kind for kind, _, _ in versions if f"/{kind}" in damage} or {kind for kind, _, _ in versions}
+    near = {kind for kind, _, _ in versions if f"/{kind}" in damage} or {
+        kind for kind, _, _ in versions
+    }
     db = skindb.open(str(root))
     found = {}
     faults = []
@@ -96,16 +129,29 @@ def read_all(root: Path, versions: list[list[Any]], damage: str = "") -> tuple[N
     add("table", lambda: db.table().to_json(date_format="iso"))
     for kind, take, generation in versions:
         one = partial(db.read, kind, take, generation=generation)
-        add(f"{kind} {generation} of {take}", lambda r=one, load=kind in near: digests(r(), load=load))
+        add(
+            f"{kind} {generation} of {take}",
+            lambda r=one, load=kind in near: digests(r(), load=load),
+        )
     for kind, take in sorted({(kind, take) for kind, take, _ in versions}):
-        add(f"newest {kind} of {take}", lambda k=kind, t=take: db.record(k, t).generation)
-        add(f"history of {kind} {take}", lambda k=kind, t=take: [r.generation for r in db.history(k, t)])
+        add(
+            f"newest {kind} of {take}",
+            lambda k=kind, t=take: db.record(k, t).generation,
+        )
+        add(
+            f"history of {kind} {take}",
+            lambda k=kind, t=take: [r.generation for r in db.history(k, t)],
+        )
     add("cohort", lambda: digests(xr.DataTree(db.cohort("tables"))))
     return json.loads(json.dumps(found)), faults
 
 
-def takes_of(db: skindb.store.Database, known: set[tuple[str, str]]) -> dict[str, list[str]]:
-    """Kinds and takes, except for unknown ones that are listed because records were lost; reading those is refused."""
+def takes_of(
+    db: skindb.store.Database, known: set[tuple[str, str]]
+) -> dict[str, list[str]]:
+    """Kinds and takes, except for unknown ones that are listed because records were
+    lost; reading those is refused.
+    """
     out: dict[str, list[str]] = {}
     for kind in db.kinds():
         for take in db.takes(kind):
@@ -121,12 +167,22 @@ def without_faults(info: dict[str, Any], root: Path, faults: list[Fault]) -> Any
     for group, takes in info.items():
         for take, kinds in takes.items():
             for kind, one in kinds.items():
-                if "stale" in one:  # results that are out of date are refused, or read with a warning
-                    faults.append(Fault("info", "", one.pop("stale")[0], "skindb refresh"))
-                said[f"{group} {take} {kind}"] = None if "fault" in one else json.dumps(one).replace(str(root), "")
+                # results that are out of date are refused, or read with a warning
+                if "stale" in one:
+                    faults.append(
+                        Fault("info", "", one.pop("stale")[0], "skindb refresh")
+                    )
+                said[f"{group} {take} {kind}"] = (
+                    None if "fault" in one else json.dumps(one).replace(str(root), "")
+                )
                 if "fault" in one:
                     faults.append(
-                        Fault("info", "", one["fault"], one["fault"].partition("; found ")[2].partition("; ")[2])
+                        Fault(
+                            "info",
+                            "",
+                            one["fault"],
+                            one["fault"].partition("; found ")[2].partition("; ")[2],
+                        )
                     )
     return said
 
@@ -135,7 +191,9 @@ def digests(tree: xr.DataTree, *, load: bool = True) -> dict[str, str | None]:
     """Digest of the values of every variable, None if they are not loaded, and the attributes."""
     attrs = plain(tree.attrs)
     # no consent at all is what a version says whose consent cannot be read: a refusal
-    out: dict[str, str | None] = {"consent": json.dumps(attrs.pop("consent_scope", [])).replace("[]", "") or None}
+    out: dict[str, str | None] = {
+        "consent": json.dumps(attrs.pop("consent_scope", [])).replace("[]", "") or None
+    }
     out["attrs"] = json.dumps(attrs, sort_keys=True)
     for node in tree.subtree:
         ds = node.to_dataset()
@@ -146,7 +204,11 @@ def digests(tree: xr.DataTree, *, load: bool = True) -> dict[str, str | None]:
 
 def digest(values: np.ndarray) -> str:
     """Digest of values, shape and type."""
-    raw = values.tobytes() if values.dtype.kind in "fiub" else json.dumps(plain(values)).encode()
+    raw = (
+        values.tobytes()
+        if values.dtype.kind in "fiub"
+        else json.dumps(plain(values)).encode()
+    )
     return hashlib.sha256(raw + str((values.shape, values.dtype)).encode()).hexdigest()
 
 
@@ -157,7 +219,11 @@ def differences(found: Any, true: Any, name: str = "") -> list[str]:
     if not (isinstance(found, dict) and isinstance(true, dict)):
         return [f"{name}: {str(found)[:80]}"]
     gone = [f"{name} {key} is gone" for key in true if key not in found]
-    return gone + [line for key in found for line in differences(found[key], true.get(key), f"{name} {key}")]
+    return gone + [
+        line
+        for key in found
+        for line in differences(found[key], true.get(key), f"{name} {key}")
+    ]
 
 
 def call(*args: str) -> tuple[int, str, str]:
@@ -165,7 +231,11 @@ def call(*args: str) -> tuple[int, str, str]:
     out = io.StringIO()
     err = io.StringIO()
     code = 0
-    with mock.patch.object(sys, "argv", ["skindb", *args]), redirect_stdout(out), redirect_stderr(err):
+    with (
+        mock.patch.object(sys, "argv", ["skindb", *args]),
+        redirect_stdout(out),
+        redirect_stderr(err),
+    ):
         try:
             main()
         except SystemExit as end:
@@ -174,17 +244,23 @@ def call(*args: str) -> tuple[int, str, str]:
 
 
 def command_faults(root: Path, number: int) -> list[Fault]:
-    """Faults of a command with --json, which must print one JSON value, and a reason for each failure."""
+    """Faults of a command with --json, which must print one JSON value, and a reason
+    for each failure.
+    """
     name, *options = COMMANDS[number % len(COMMANDS)]
     code, out, err = call(name, str(root), *options, "--json")
     told = json.loads(out)
     if code not in (0, 1) or (code and not told.get("error")) or "Traceback" in err:
         raise AssertionError(f"{name}: {code} {out} {err}")
     errors = told["error"] if code else []
-    return [Fault(one["what"], one["rule"], one["found"], one["cure"]) for one in errors]
+    return [
+        Fault(one["what"], one["rule"], one["found"], one["cure"]) for one in errors
+    ]
 
 
-def attempt(root: Path, true: Numbers, number: int, what: str, unchanged: str) -> apart.Outcome:
+def attempt(
+    root: Path, true: Numbers, number: int, what: str, unchanged: str
+) -> apart.Outcome:
     """Verify and read the database, and compare."""
     with dask.config.set(scheduler="synchronous"):
         named = skindb.open(str(root)).verify()
@@ -193,11 +269,15 @@ def attempt(root: Path, true: Numbers, number: int, what: str, unchanged: str) -
         told = command_faults(root, number // 4) if number % 4 == 0 else []
     changed = differences(found, true["numbers"])
     faults = [*named, *refused, *told]
-    if bad := [str(fault) for fault in faults if not (fault.cure and str(fault).isprintable())]:
+    if bad := [
+        str(fault) for fault in faults if not (fault.cure and str(fault).isprintable())
+    ]:
         return "message without cure", bad[0]
     if changed:
         where = "; ".join(changed[:3])
-        return ("changed, but named by verify" if named else "undetected change"), f"{where} | {named[:1]}"
+        return (
+            "changed, but named by verify" if named else "undetected change"
+        ), f"{where} | {named[:1]}"
     if named:
         return "named by verify", str(named[0])
     if refused or told:
@@ -208,10 +288,16 @@ def attempt(root: Path, true: Numbers, number: int, what: str, unchanged: str) -
 def unchanged_reason(before: Path, after: Path, kind: str) -> str:
     """The reason why damage that is not reported is harmless."""
     files = [path for path in before.rglob("*") if path.is_file()]
-    others = [path for path in files if not _same(path, after / path.relative_to(before))]
+    others = [
+        path for path in files if not _same(path, after / path.relative_to(before))
+    ]
     if not others:
         return UNCHANGED if kind != "foreign" else "undetected change"
-    values = [path for path in others if not _same_json(path, after / path.relative_to(before))]
+    values = [
+        path
+        for path in others
+        if not _same_json(path, after / path.relative_to(before))
+    ]
     kinds = {kind_of(before, path) for path in values}
     if kinds <= HARMLESS.keys():
         return HARMLESS[kinds.pop()] if kinds else SAME
@@ -220,7 +306,11 @@ def unchanged_reason(before: Path, after: Path, kind: str) -> str:
 
 def _same(one: Path, other: Path) -> bool:
     """Regular files of the same bytes; a sparse file of gigabytes is not read."""
-    if other.is_symlink() or not other.is_file() or one.stat().st_size != other.stat().st_size:
+    if (
+        other.is_symlink()
+        or not other.is_file()
+        or one.stat().st_size != other.stat().st_size
+    ):
         return False
     return one.read_bytes() == other.read_bytes()
 
@@ -234,7 +324,9 @@ def _same_json(one: Path, other: Path) -> bool:
         return False
 
 
-def run(cases: range, seed: int, folder: Path, limits: apart.Limits) -> list[apart.Case]:
+def run(
+    cases: range, seed: int, folder: Path, limits: apart.Limits
+) -> list[apart.Case]:
     """Damage, read and judge every case."""
     whole = folder / "whole/db"
     kept = folder / "true.json"
@@ -254,7 +346,13 @@ def run(cases: range, seed: int, folder: Path, limits: apart.Limits) -> list[apa
     def prepare(number: int, work: Path):
         root = Path(shutil.copytree(whole, work / "db"))
         kind, what = damage(root, np.random.default_rng([seed, number]))
-        return kind, what, partial(attempt, root, true, number, what, unchanged_reason(whole, root, kind))
+        return (
+            kind,
+            what,
+            partial(
+                attempt, root, true, number, what, unchanged_reason(whole, root, kind)
+            ),
+        )
 
     return apart.run(cases, prepare, folder, limits)
 

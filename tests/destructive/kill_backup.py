@@ -1,10 +1,12 @@
-"""Kills backups and restores at every file-system call that concerns the backup or the restored database.
+"""Kills backups and restores at every file-system call that concerns the backup or the
+restored database.
 
     python tests/destructive/kill_backup.py --every 1
 
-A small database is backed up for the second time, after more versions were committed, or restored from a backup. After
-each kill every state that the backup lists must be whole and give the bytes of its database, and a half-restored
-database must refuse every command in one line; the same command must then complete, and give the same bytes. The
+A small database is backed up for the second time, after more versions were committed,
+or restored from a backup. After each kill every state that the backup lists must be
+whole and give the bytes of its database, and a half-restored database must refuse every
+command in one line; the same command must then complete, and give the same bytes. The
 program ends with 1 if that fails once.
 """
 
@@ -58,7 +60,11 @@ def count_calls(place: Path, die_at: int) -> list[int]:
 
 def state(root: Path) -> dict[str, bytes]:
     """Content of the files of a database, without caches and leases."""
-    return {key: content for key, content in contents(root).items() if not key.startswith(CACHES)}
+    return {
+        key: content
+        for key, content in contents(root).items()
+        if not key.startswith(CACHES)
+    }
 
 
 def prepare_whole(folder: Path) -> None:
@@ -101,7 +107,12 @@ def after_backup(folder: Path) -> apart.Outcome:
     if numbers not in ([1], [1, 2]):
         return BROKEN, f"states {numbers}"
     for number in numbers:
-        restore(str(folder / "backup"), str(folder / f"of {number}"), number=number, markers=folder / "db.markers")
+        restore(
+            str(folder / "backup"),
+            str(folder / f"of {number}"),
+            number=number,
+            markers=folder / "db.markers",
+        )
         if state(folder / f"of {number}") != state(folder / str(number)):
             return BROKEN, f"state {number} differs"
     report = Database(folder / "db").backup(str(folder / "backup"), verify=True)
@@ -116,7 +127,9 @@ def after_backup(folder: Path) -> apart.Outcome:
 def after_restore(folder: Path) -> apart.Outcome:
     """Check a database whose restore was begun."""
     copy = folder / "copy"
-    is_complete = (copy / "log").exists() and not (copy / "withdrawn/restoring.json").exists()
+    is_complete = (copy / "log").exists() and not (
+        copy / "withdrawn/restoring.json"
+    ).exists()
     if not is_complete:
         if (copy / "log").exists() and not is_refused(copy):
             return BROKEN, "a half database can be read"
@@ -128,7 +141,11 @@ def after_restore(folder: Path) -> apart.Outcome:
 
 def is_refused(root: Path) -> bool:
     """Whether a database is refused by what reads and writes."""
-    for use in (Database(root).takes, Database(root).verify, partial(commit, root, take="C", n=2)):
+    for use in (
+        Database(root).takes,
+        Database(root).verify,
+        partial(commit, root, take="C", n=2),
+    ):
         try:
             use()
         except InputError as error:
@@ -154,7 +171,11 @@ def kill(variant: str, folder: Path, asked: argparse.Namespace) -> list[apart.Ca
 
     def prepare(number: int, work: Path):
         copy = Path(shutil.copytree(whole, work / "copy"))
-        return variant, f"call {number} of {calls}", partial(attempt, copy, variant, number)
+        return (
+            variant,
+            f"call {number} of {calls}",
+            partial(attempt, copy, variant, number),
+        )
 
     numbers = list(range(calls, 0, -asked.every))
     return apart.run(numbers, prepare, folder, apart.Limits(asked.jobs, seconds=300))
@@ -162,16 +183,28 @@ def kill(variant: str, folder: Path, asked: argparse.Namespace) -> list[apart.Ca
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--every", type=int, default=1, help="Every n-th call is one at which a process is killed.")
-    parser.add_argument("--jobs", type=int, default=2, help="Number of processes at a time.")
+    parser.add_argument(
+        "--every",
+        type=int,
+        default=1,
+        help="Every n-th call is one at which a process is killed.",
+    )
+    parser.add_argument(
+        "--jobs", type=int, default=2, help="Number of processes at a time."
+    )
     asked = parser.parse_args()
     bad = []
     for variant in STEPS:
         with tempfile.TemporaryDirectory() as folder:
             cases = kill(variant, Path(folder), asked)
-        count = [sum(case.outcome == one for case in cases) for one in ("before", "after")]
+        count = [
+            sum(case.outcome == one for case in cases) for one in ("before", "after")
+        ]
         bad += [case for case in cases if case.outcome not in ("before", "after")]
-        print(f"{variant}: {len(cases)} kills, {count[0]} before and {count[1]} after its end, {len(bad)} failures")
+        print(
+            f"{variant}: {len(cases)} kills, {count[0]} before and {count[1]} "
+            f"after its end, {len(bad)} failures"
+        )
     for case in bad:
         print(f"{case.variant}, {case.damage}: {case.outcome}: {case.detail}")
     sys.exit(bool(bad))

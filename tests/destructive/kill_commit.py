@@ -2,9 +2,10 @@
 
     python tests/destructive/kill_commit.py --every 1 --fits 20
 
-A small model is written and killed at every n-th call; whole fits are killed at some calls of theirs. After each kill
-the model before it must be readable as it was, `verify` must pass, and the next model must be committed. The program
-ends with 1 if that fails once.
+A small model is written and killed at every n-th call; whole fits are killed at some
+calls of theirs. After each kill the model before it must be readable as it was,
+`verify` must pass, and the next model must be committed. The program ends with 1 if
+that fails once.
 """
 
 from __future__ import annotations
@@ -32,7 +33,17 @@ from skindb import workflow
 from skindb.schema import dataset
 from skindb.store import Database
 
-EVENTS = ("open", "os.mkdir", "os.link", "os.rename", "os.remove", "os.rmdir", "os.scandir", "os.listdir", "os.fsync")
+EVENTS = (
+    "open",
+    "os.mkdir",
+    "os.link",
+    "os.rename",
+    "os.remove",
+    "os.rmdir",
+    "os.scandir",
+    "os.listdir",
+    "os.fsync",
+)
 PLACES = ("/data/model", "/log/model", "/heads/model")
 TAKE = "S01"
 BROKEN = "broken promise"
@@ -43,7 +54,9 @@ def count_calls(die_at: int) -> list[int]:
     calls = [0]
 
     def count(event: str, args: tuple[object, ...]) -> None:
-        if event in EVENTS and any(place in str(arg) for place in PLACES for arg in args[:2]):
+        if event in EVENTS and any(
+            place in str(arg) for place in PLACES for arg in args[:2]
+        ):
             calls[0] += 1
             if calls[0] == die_at:
                 os.kill(os.getpid(), signal.SIGKILL)
@@ -67,13 +80,20 @@ def write_small(db: Database) -> int:
 
 def fit(db: Database) -> int:
     """Fit the take, and return the generation of its model."""
-    return workflow.fit_take(db, TAKE, PARAMETERS, dictionary=few_materials()).generation
+    return workflow.fit_take(
+        db, TAKE, PARAMETERS, dictionary=few_materials()
+    ).generation
 
 
-WRITERS = {"small model": (write_small, "surfels/surfel_area"), "fit": (fit, "fitted/diffuse_reflectance")}
+WRITERS = {
+    "small model": (write_small, "surfels/surfel_area"),
+    "fit": (fit, "fitted/diffuse_reflectance"),
+}
 
 
-def attempt(root: Path, variant: str, number: int, before: list[float]) -> apart.Outcome:
+def attempt(
+    root: Path, variant: str, number: int, before: list[float]
+) -> apart.Outcome:
     """Write in a process that is killed at a given call, and check every promise."""
     writer, name = WRITERS[variant]
     db = skindb.open(str(root))
@@ -87,7 +107,9 @@ def attempt(root: Path, variant: str, number: int, before: list[float]) -> apart
     if faults := db.verify():
         return BROKEN, str(faults[0])
     there = [record.generation for record in db.history("model", TAKE)]
-    if there not in ([1], [1, 2]) or any(values(db, name, generation) != before for generation in there):
+    if there not in ([1], [1, 2]) or any(
+        values(db, name, generation) != before for generation in there
+    ):
         return BROKEN, f"generations {there}, or other values"
     following = writer(db)
     if following != len(there) + 1 or db.verify():
@@ -97,7 +119,13 @@ def attempt(root: Path, variant: str, number: int, before: list[float]) -> apart
 
 def values(db: Database, name: str, generation: int) -> list[float]:
     """A variable of one version."""
-    return np.nan_to_num(db.read("model", TAKE, generation=generation)[name].values, nan=-1.0).ravel().tolist()
+    return (
+        np.nan_to_num(
+            db.read("model", TAKE, generation=generation)[name].values, nan=-1.0
+        )
+        .ravel()
+        .tolist()
+    )
 
 
 def kill(variant: str, folder: Path, asked: argparse.Namespace) -> list[apart.Case]:
@@ -124,7 +152,11 @@ def kill(variant: str, folder: Path, asked: argparse.Namespace) -> list[apart.Ca
 
     def prepare(number: int, work: Path):
         root = Path(shutil.copytree(whole, work / "db"))
-        return variant, f"call {number} of {calls}", partial(attempt, root, variant, number, before)
+        return (
+            variant,
+            f"call {number} of {calls}",
+            partial(attempt, root, variant, number, before),
+        )
 
     if variant == "fit":
         numbers = sorted(set(np.linspace(1, calls, asked.fits).astype(int).tolist()))
@@ -135,18 +167,30 @@ def kill(variant: str, folder: Path, asked: argparse.Namespace) -> list[apart.Ca
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--every", type=int, default=1, help="The small model is killed at every n-th call.")
-    parser.add_argument("--fits", type=int, default=20, help="Number of fits that are killed.")
-    parser.add_argument("--jobs", type=int, default=2, help="Number of processes at a time.")
+    parser.add_argument(
+        "--every",
+        type=int,
+        default=1,
+        help="The small model is killed at every n-th call.",
+    )
+    parser.add_argument(
+        "--fits", type=int, default=20, help="Number of fits that are killed."
+    )
+    parser.add_argument(
+        "--jobs", type=int, default=2, help="Number of processes at a time."
+    )
     asked = parser.parse_args()
     bad = []
     for variant in WRITERS if asked.fits else ["small model"]:
         with tempfile.TemporaryDirectory() as folder:
             cases = kill(variant, Path(folder), asked)
-        count = [sum(case.outcome == one for case in cases) for one in ("before", "after")]
+        count = [
+            sum(case.outcome == one for case in cases) for one in ("before", "after")
+        ]
         bad += [case for case in cases if case.outcome not in ("before", "after")]
         print(
-            f"{variant}: {len(cases)} kills, the last at {cases[-1].damage}: {count[0]} left the version before as "
+            f"{variant}: {len(cases)} kills, the last at {cases[-1].damage}: "
+            f"{count[0]} left the version before as "
             f"the current one, {count[1]} the new one"
         )
     for case in bad:

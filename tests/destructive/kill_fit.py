@@ -1,13 +1,16 @@
-"""Kills fits, refits and ingests at random moments, in a folder and in a bucket, and runs them again.
+"""Kills fits, refits and ingests at random moments, in a folder and in a bucket, and
+runs them again.
 
     python tests/destructive/kill_fit.py --cases 210 --seed 1 [--bucket]
 
-Each case works on a copy of a small database. A process fits the take, or ingests its folder; it says which stage it
-has begun, and is killed within a stage that is chosen at random, at a random moment. Then every promise is checked:
-`verify` finds no damage, every version that can be seen is the one of a run that was not killed, a run that had said it
-was done has its record, what no record names is listed as garbage. In every second case `clean` runs. The same command
-runs again: it must not wait for the killed one, continue after the first pass if that was kept, give the same numbers,
-and leave nothing but what `clean` lists. The program ends with 1 if that fails once.
+Each case works on a copy of a small database. A process fits the take, or ingests its
+folder; it says which stage it has begun, and is killed within a stage that is chosen at
+random, at a random moment. Then every promise is checked: `verify` finds no damage,
+every version that can be seen is the one of a run that was not killed, a run that had
+said it was done has its record, what no record names is listed as garbage. In every
+second case `clean` runs. The same command runs again: it must not wait for the killed
+one, continue after the first pass if that was kept, give the same numbers, and leave
+nothing but what `clean` lists. The program ends with 1 if that fails once.
 """
 
 from __future__ import annotations
@@ -48,30 +51,55 @@ from skindb.workflow import fit as fit_module
 from skindb.workflow import ingest as ingest_module
 from skindb.workflow.provenance import groups_of
 
-FIT = ("begin", "first pass", "keep first pass", "second pass", "write", "commit", "end")
+FIT = (
+    "begin",
+    "first pass",
+    "keep first pass",
+    "second pass",
+    "write",
+    "commit",
+    "end",
+)
 INGEST = ("begin", "samples", "write", "commit", "end")
 STAGES = {"fit": FIT, "refit": FIT, "ingest": INGEST}
 KINDS = {"fit": "model", "refit": "model", "ingest": "capture"}
 FIT_TAKE = "S01"
 INGEST_TAKE = "T001"
 GOOD = ("not yet committed", "committed", "ended before the kill")
-BAD = ("half-written and visible", "acknowledged and lost", "not continued", "other numbers", "not listed as garbage")
+BAD = (
+    "half-written and visible",
+    "acknowledged and lost",
+    "not continued",
+    "other numbers",
+    "not listed as garbage",
+)
 Tell = Callable[[str], None]
-NewUrl = Callable[[Path], str]  # where a database is that belongs to the work in a folder
+# where a database is that belongs to the work in a folder
+NewUrl = Callable[[Path], str]
 
 
 def fit(db: Database, tell: Tell, _: Path | None = None) -> int:
     """Fit the take, report each stage, and return the generation of its model."""
-    for name, stage in (("first_pass", FIT[1]), ("keep_first_pass", FIT[2]), ("second_pass", FIT[3])):
+    for name, stage in (
+        ("first_pass", FIT[1]),
+        ("keep_first_pass", FIT[2]),
+        ("second_pass", FIT[3]),
+    ):
         setattr(fit_module, name, _telling(getattr(fit_module, name), stage, tell))
     _tell_stages("model", tell)
-    return workflow.fit_take(db, FIT_TAKE, PARAMETERS, dictionary=few_materials()).generation
+    return workflow.fit_take(
+        db, FIT_TAKE, PARAMETERS, dictionary=few_materials()
+    ).generation
 
 
 def ingest(db: Database, tell: Tell, work: Path) -> int:
-    """Ingest the folder below the working folder, report each stage, and return the generation of the capture."""
+    """Ingest the folder below the working folder, report each stage, and return the
+    generation of the capture.
+    """
     spool.JOURNAL_INTERVAL_SECONDS = 0.0  # a small capture ends before the first entry
-    ingest_module.ingest_capture = _telling(ingest_module.ingest_capture, INGEST[1], tell)
+    ingest_module.ingest_capture = _telling(
+        ingest_module.ingest_capture, INGEST[1], tell
+    )
     _tell_stages("capture", tell)
     return workflow.ingest_take(db, work / "folder", photographs=1).generation
 
@@ -120,25 +148,33 @@ def in_new_bucket(address: str, _: Path) -> str:
 
 
 def prepare(folder: Path, sources: Mapping[str, str]) -> None:
-    """The databases that are copied for each case: with a capture, with a model too, and with nothing but a folder."""
+    """The databases that are copied for each case: with a capture, with a model too,
+    and with nothing but a folder.
+    """
     for name in ("fit", "refit"):
         db = skindb.open(sources[name])
         tree = capture(FIT_TAKE, PEOPLE[FIT_TAKE], 0)
         with db.stage("capture", FIT_TAKE) as stage:
             stage.write(groups_of(tree))
             stage.commit(tree.attrs)
-    workflow.fit_take(db, FIT_TAKE, replace(PARAMETERS, k=1), dictionary=few_materials())
+    workflow.fit_take(
+        db, FIT_TAKE, replace(PARAMETERS, k=1), dictionary=few_materials()
+    )
     (folder / "ingest").mkdir()
     write_capture(folder / "ingest/folder")
 
 
 def copied(source: Path, source_url: str, work: Path, new_url: NewUrl) -> str:
-    """URL of a copy of a database and of the files beside it; a bucket is copied by a separate process."""
+    """URL of a copy of a database and of the files beside it; a bucket is copied by a
+    separate process.
+    """
     url = new_url(work)
     if source.is_dir():
         shutil.copytree(source, work)
     if url.startswith("s3://"):
-        apart.in_a_process(lambda: copy_objects(skindb.open(source_url), skindb.open(url)))
+        apart.in_a_process(
+            lambda: copy_objects(skindb.open(source_url), skindb.open(url))
+        )
     return url
 
 
@@ -149,19 +185,27 @@ def measure(work: Path, url: str, variant: str, known_at: Path) -> None:
         db = skindb.open(url)
         marks = [(STAGES[variant][0], time.monotonic())]
         with reported_compilation(lambda: compiled.append(True)):
-            WORK[variant](db, lambda stage, to=marks: to.append((stage, time.monotonic())), work)
+            WORK[variant](
+                db, lambda stage, to=marks: to.append((stage, time.monotonic())), work
+            )
         marks.append(("done", time.monotonic()))
-        if not compiled:  # otherwise again, since the runs that are killed do not compile
+        # otherwise again, since the runs that are killed do not compile
+        if not compiled:
             break
     seconds = {stage: end - begin for (stage, begin), (_, end) in pairwise(marks)}
     kind = KINDS[variant]
     take = FIT_TAKE if KINDS[variant] == "model" else INGEST_TAKE
-    known = {"seconds": seconds, "files": files_of(db, kind, take, db.record(kind, take).generation)}
+    known = {
+        "seconds": seconds,
+        "files": files_of(db, kind, take, db.record(kind, take).generation),
+    }
     known["before"] = [files_of(db, kind, take, 1)] if variant == "refit" else []
     known_at.write_text(json.dumps(known))
 
 
-def files_of(db: Database, kind: str, take: str, generation: int) -> dict[str, list[object]]:
+def files_of(
+    db: Database, kind: str, take: str, generation: int
+) -> dict[str, list[object]]:
     """Digest of every file of a version except for its provenance, and of its tables."""
     record = db.record(kind, take, generation)
     manifest = json.loads(db._place.read(record.beside("manifest")))
@@ -169,12 +213,24 @@ def files_of(db: Database, kind: str, take: str, generation: int) -> dict[str, l
     return manifest | {"tables": [record.tables]}
 
 
-def attempt(work: Path, url: str, variant: str, stage: str, part: float, known: dict, *, clean: bool) -> apart.Outcome:
+def attempt(
+    work: Path,
+    url: str,
+    variant: str,
+    stage: str,
+    part: float,
+    known: dict,
+    *,
+    clean: bool,
+) -> apart.Outcome:
     """Kill a run within a stage, check every promise, and run it again."""
     kind = KINDS[variant]
     take = FIT_TAKE if KINDS[variant] == "model" else INGEST_TAKE
-    marks = killed_within(work, url, variant, stage, part * known["seconds"].get(stage, 0.0))
-    db = skindb.open(url)  # not before: threads of a client of a bucket must not be forked
+    marks = killed_within(
+        work, url, variant, stage, part * known["seconds"].get(stage, 0.0)
+    )
+    # not before: threads of a client of a bucket must not be forked
+    db = skindb.open(url)
     first = db.has("first", take)
     before = known["before"]
     there = generations(db, kind, take)
@@ -198,16 +254,26 @@ def attempt(work: Path, url: str, variant: str, stage: str, part: float, known: 
             or db.verify()
             or db.has("first", take) != (first and not committed)
         ):
-            return BAD[4], f"{said}: clean left {db.garbage()}, or removed what it must not"
+            return BAD[
+                4
+            ], f"{said}: clean left {db.garbage()}, or removed what it must not"
     first = db.has("first", take)
     stages = []
     following = WORK[variant](db, stages.append, work)
     if first and "first pass" in stages:
         return BAD[2], f"{said}: the first pass was repeated"
-    if following != len(there) + 1 or files_of(db, kind, take, following) != known["files"]:
+    if (
+        following != len(there) + 1
+        or files_of(db, kind, take, following) != known["files"]
+    ):
         return BAD[3], f"{said}: generation {following}, or other values"
     db.clean()
-    if db.verify() or unlisted(db) or db.has("first", take) or [*db.scratch().glob("*")]:
+    if (
+        db.verify()
+        or unlisted(db)
+        or db.has("first", take)
+        or [*db.scratch().glob("*")]
+    ):
         return BAD[4], f"{said}: after the second run"
     outcome = GOOD[2] if marks[-1] == "done" else GOOD[len(there) - len(before)]
     return outcome, json.dumps({"stage": marks[-1], "continued": first})
@@ -215,14 +281,22 @@ def attempt(work: Path, url: str, variant: str, stage: str, part: float, known: 
 
 def generations(db: Database, kind: str, take: str) -> list[int]:
     """Generations that can be seen."""
-    return [one.generation for one in db.history(kind, take)] if db.has(kind, take) else []
+    return (
+        [one.generation for one in db.history(kind, take)] if db.has(kind, take) else []
+    )
 
 
 def unlisted(db: Database) -> set[str]:
     """Versions that have no record and are not listed as garbage."""
     below = db._place.children
-    keys = {f"data/{kind}/{take}" for kind in below("data") for take in below(f"data/{kind}")}
-    there = {f"{key}/{name}" for key in keys for name in below(key) if name.endswith(".zarr")}
+    keys = {
+        f"data/{kind}/{take}"
+        for kind in below("data")
+        for take in below(f"data/{kind}")
+    }
+    there = {
+        f"{key}/{name}" for key in keys for name in below(key) if name.endswith(".zarr")
+    }
     named = {
         db.record(kind, take, n).path
         for kind in (*db.kinds(), "first")
@@ -233,8 +307,12 @@ def unlisted(db: Database) -> set[str]:
     return {path for path in there - named - listed if "/first/" not in path}
 
 
-def killed_within(work: Path, url: str, variant: str, stage: str, seconds: float) -> list[str]:
-    """Kill a run so many seconds after it has begun a stage; the stages it had begun, and "done" at its end."""
+def killed_within(
+    work: Path, url: str, variant: str, stage: str, seconds: float
+) -> list[str]:
+    """Kill a run so many seconds after it has begun a stage; the stages it had begun,
+    and "done" at its end.
+    """
     pipe, end = os.pipe()
     process = os.fork()
     if not process:
@@ -290,15 +368,27 @@ def table(done: list[apart.Case]) -> list[str]:
     """Trials by variant and stage in which they were killed."""
     rows = Counter[tuple[str, str, str]]()
     for case in done:
-        told = json.loads(case.detail) if case.outcome in GOOD else {"stage": "?", "continued": False}
+        told = (
+            json.loads(case.detail)
+            if case.outcome in GOOD
+            else {"stage": "?", "continued": False}
+        )
         row = (case.variant, told["stage"])
         rows[*row, "trials"] += 1
         rows[*row, case.outcome if case.outcome in (GOOD[1], *BAD) else "other"] += 1
         rows[*row, "continued"] += bool(told["continued"])
     columns = ("trials", GOOD[1], "continued", *BAD[:2], "other failures")
-    lines = [f"| run | killed in | {' | '.join(columns)} |", f"|---|---|{'---|' * len(columns)}"]
-    for variant, stage in dict.fromkeys((v, s) for v in STAGES for s in (*STAGES[v], "done", "?")):
-        count = {name: rows[variant, stage, name] for name in ("trials", GOOD[1], "continued", *BAD)}
+    lines = [
+        f"| run | killed in | {' | '.join(columns)} |",
+        f"|---|---|{'---|' * len(columns)}",
+    ]
+    for variant, stage in dict.fromkeys(
+        (v, s) for v in STAGES for s in (*STAGES[v], "done", "?")
+    ):
+        count = {
+            name: rows[variant, stage, name]
+            for name in ("trials", GOOD[1], "continued", *BAD)
+        }
         if count["trials"]:
             values = [
                 *(count[name] for name in ("trials", GOOD[1], "continued", *BAD[:2])),
@@ -308,29 +398,47 @@ def table(done: list[apart.Case]) -> list[str]:
     return lines
 
 
-def ready(folder: Path, new_url: NewUrl, variants: Iterable[str] = STAGES) -> dict[str, str]:
-    """Prepare every variant, measure the given ones, and return the URLs of the databases to copy."""
+def ready(
+    folder: Path, new_url: NewUrl, variants: Iterable[str] = STAGES
+) -> dict[str, str]:
+    """Prepare every variant, measure the given ones, and return the URLs of the
+    databases to copy.
+    """
     sources = {variant: new_url(folder / variant) for variant in STAGES}
     apart.in_a_process(partial(prepare, folder, sources))
     for variant in variants:
         work = folder / "measured" / variant
         url = copied(folder / variant, sources[variant], work, new_url)
-        apart.in_a_process(partial(measure, work, url, variant, folder / f"{variant}.json"))
+        apart.in_a_process(
+            partial(measure, work, url, variant, folder / f"{variant}.json")
+        )
     return sources
 
 
 def tell(case: apart.Case) -> None:
     """Print the outcome of a case immediately."""
-    print(f"case {case.number}, {case.variant}, {case.damage}: {case.outcome}", file=sys.stderr, flush=True)
+    print(
+        f"case {case.number}, {case.variant}, {case.damage}: {case.outcome}",
+        file=sys.stderr,
+        flush=True,
+    )
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--cases", type=int, default=30, help="Number of kills.")
-    parser.add_argument("--first", type=int, default=0, help="Number of the first case, to repeat one.")
-    parser.add_argument("--seed", type=int, default=0, help="Random seed of the moments.")
-    parser.add_argument("--jobs", type=int, default=2, help="Number of processes at a time.")
-    parser.add_argument("--bucket", action="store_true", help="In a bucket of a server on this machine.")
+    parser.add_argument(
+        "--first", type=int, default=0, help="Number of the first case, to repeat one."
+    )
+    parser.add_argument(
+        "--seed", type=int, default=0, help="Random seed of the moments."
+    )
+    parser.add_argument(
+        "--jobs", type=int, default=2, help="Number of processes at a time."
+    )
+    parser.add_argument(
+        "--bucket", action="store_true", help="In a bucket of a server on this machine."
+    )
     asked = parser.parse_args()
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
@@ -338,15 +446,21 @@ def main() -> None:
         if asked.bucket:
             address = stack.enter_context(s3_server("localbucket"))
             new_url = partial(in_new_bucket, address)
-            os.environ |= settings(address) | {"SKINDB_CACHE": str(own_cache(folder / "cache"))}
+            os.environ |= settings(address) | {
+                "SKINDB_CACHE": str(own_cache(folder / "cache"))
+            }
         numbers = range(asked.first, asked.first + asked.cases)
         sources = ready(folder, new_url, {variant_of(number) for number in numbers})
         limits = apart.Limits(asked.jobs, seconds=300, tell=tell)
-        done = apart.run(numbers, cases(folder, sources, new_url, asked.seed), folder, limits)
+        done = apart.run(
+            numbers, cases(folder, sources, new_url, asked.seed), folder, limits
+        )
     print("\n".join(table(done)))
     bad = [case for case in done if case.outcome not in GOOD]
     for case in bad:
-        print(f"case {case.number}, {case.variant}, {case.damage}: {case.outcome}: {case.detail}")
+        print(
+            f"case {case.number}, {case.variant}, {case.damage}: {case.outcome}: {case.detail}"
+        )
     sys.exit(bool(bad))
 
 

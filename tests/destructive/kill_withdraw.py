@@ -1,15 +1,17 @@
-"""Kills and suspends withdrawals at random moments, while studies, edits, releases, caches and ingests are written.
+"""Kills and suspends withdrawals at random moments, while studies, edits, releases,
+caches and ingests are written.
 
     python tests/destructive/kill_withdraw.py --cases 100 --seed 1 [--bucket]
 
-Each case copies a small database. Up to three writers that use or name the subject begin and are suspended (SIGSTOP) at
-random moments. Then the subject is withdrawn, and this process is killed (SIGKILL), suspended or left alone at a random
-moment. What it left is completed by another withdrawal, by `refresh` or by `clean`. The writers are continued (SIGCONT)
-or killed, before or after that, and `clean` runs. Then
+Each case copies a small database. Up to three writers that use or name the subject
+begin and are suspended (SIGSTOP) at random moments. Then the subject is withdrawn, and
+this process is killed (SIGKILL), suspended or left alone at a random moment. What it
+left is completed by another withdrawal, by `refresh` or by `clean`. The writers are
+continued (SIGCONT) or killed, before or after that, and `clean` runs. Then
 
 - every version without a reference to the subject has the same bytes as before;
-- nothing of the subject is in any file of the database, with every chunk decompressed, in the cache, in the folder for
-  temporary files, or in a file that a process has open;
+- nothing of the subject is in any file of the database, with every chunk decompressed,
+  in the cache, in the folder for temporary files, or in a file that a process has open;
 - `verify` finds nothing, and results of others exist or are requested.
 
 The program ends with 1 if that fails once, or if a process ends with a traceback.
@@ -61,7 +63,9 @@ WRITERS: dict[str, Callable[[Database], object]] = {
     "release": lambda db: db.create_release("r2"),
     "cache": lambda db: db.info(),
     "consent": lambda db: db.record_consent(SUBJECT, ["fit", "statistics"]),
-    "ingest": lambda db: workflow.ingest_take(db, os.environ["CAPTURE"], spacing_mm=8.0, photographs=0),
+    "ingest": lambda db: workflow.ingest_take(
+        db, os.environ["CAPTURE"], spacing_mm=8.0, photographs=0
+    ),
 }
 COMPLETED_BY: dict[str, Callable[[Database], object]] = {
     "withdraw": lambda db: _withdraw_again(db),
@@ -81,7 +85,12 @@ def fill(db: Database) -> None:
             fitted["diffuse_reflectance"][3] = MARK
             model["fitted"] = fitted
         with db.stage("model", name) as stage:
-            stage.write({str(group): node.to_dataset() for group, node in model.children.items()})
+            stage.write(
+                {
+                    str(group): node.to_dataset()
+                    for group, node in model.children.items()
+                }
+            )
             stage.commit(about)
     workflow.translucency(db)
     workflow.translucency(db, takes=["B", "C"], name="others")
@@ -108,7 +117,9 @@ def _withdraw_again(db: Database) -> None:
 
 
 class Process:
-    """A function in a process of its own, forked from this one, which has imported everything and used nothing."""
+    """A function in a process of its own, forked from this one, which has imported
+    everything and used nothing.
+    """
 
     def __init__(self, work: Callable[[], object], log: Path) -> None:
         self.log = log
@@ -175,7 +186,9 @@ class Trial:
         Source of random choices.
     """
 
-    def __init__(self, url: str, folder: Path, seconds: dict[str, float], draw: random.Random) -> None:
+    def __init__(
+        self, url: str, folder: Path, seconds: dict[str, float], draw: random.Random
+    ) -> None:
         self.url = url
         self.folder = folder
         self.seconds = seconds
@@ -217,15 +230,22 @@ class Trial:
     def _end(self, writers: list[str]) -> None:
         """Continue or kill suspended writers, and wait for them."""
         for name in writers:
-            self.processes[name].signal(self.draw.choice([signal.SIGCONT, signal.SIGKILL]))
+            self.processes[name].signal(
+                self.draw.choice([signal.SIGCONT, signal.SIGKILL])
+            )
         for name in writers:
             self.processes[name].wait()
 
     def _begin(self, name: str, work: Callable[[Database], object]) -> None:
-        self.processes[name] = Process(lambda: work(skindb.open(self.url)), self.folder / f"{name}.log")
+        self.processes[name] = Process(
+            lambda: work(skindb.open(self.url)), self.folder / f"{name}.log"
+        )
 
     def _complete(self, name: str) -> None:
-        process = Process(lambda: COMPLETED_BY[name](skindb.open(self.url)), self.folder / f"{name} again.log")
+        process = Process(
+            lambda: COMPLETED_BY[name](skindb.open(self.url)),
+            self.folder / f"{name} again.log",
+        )
         self.processes[f"{name} again"] = process
         process.wait()
 
@@ -244,7 +264,9 @@ class Trial:
         return found
 
 
-def _examine(url: str, download: Path, expected: dict[str, bytes], folders: list[Path]) -> None:
+def _examine(
+    url: str, download: Path, expected: dict[str, bytes], folders: list[Path]
+) -> None:
     """Raise an error with everything that is wrong after a case."""
     db = skindb.open(url)
     root = db.folder or download
@@ -252,15 +274,35 @@ def _examine(url: str, download: Path, expected: dict[str, bytes], folders: list
         copy_objects(db, Database(root))
     found = []
     left = contents(root)
-    found += [f"changed: {key}" for key, content in expected.items() if left.get(key) != content]
+    found += [
+        f"changed: {key}"
+        for key, content in expected.items()
+        if left.get(key) != content
+    ]
     for folder in (root, *folders):
         found += traces(folder, SUBJECT)
     base = str(download.parents[1])  # of all cases
-    found += [f"open: {path}" for path in _open_files() if path.startswith(base) and SUBJECT in path]
-    found += [f"visible: {kind} of {take}" for kind in db.kinds() for take in db.takes(kind) if SUBJECT in take]
+    found += [
+        f"open: {path}"
+        for path in _open_files()
+        if path.startswith(base) and SUBJECT in path
+    ]
+    found += [
+        f"visible: {kind} of {take}"
+        for kind in db.kinds()
+        for take in db.takes(kind)
+        if SUBJECT in take
+    ]
     requested = {(request.kind, request.take) for request in db.requests()}
-    results = [("population", "translucency"), ("population", "traits.k-3"), ("edit", "B"), ("release", "r1")]
-    found += [f"lost: {one}" for one in results if not db.has(*one) and one not in requested]
+    results = [
+        ("population", "translucency"),
+        ("population", "traits.k-3"),
+        ("edit", "B"),
+        ("release", "r1"),
+    ]
+    found += [
+        f"lost: {one}" for one in results if not db.has(*one) and one not in requested
+    ]
     found += [str(fault) for fault in db.verify()]
     if found:
         raise RuntimeError("\n".join(found))
@@ -279,10 +321,18 @@ def _without_reference(root: Path) -> dict[str, bytes]:
     files = contents(root)
     found = {}
     for key, content in files.items():
-        if key.startswith("log/") and SUBJECT.encode() not in content and SUBJECT not in key:
+        if (
+            key.startswith("log/")
+            and SUBJECT.encode() not in content
+            and SUBJECT not in key
+        ):
             stem = json.loads(content)["path"].removesuffix(".zarr")
             found[key] = content
-            found |= {name: text for name, text in files.items() if name.startswith(f"{stem}.")}
+            found |= {
+                name: text
+                for name, text in files.items()
+                if name.startswith(f"{stem}.")
+            }
     return found
 
 
@@ -294,17 +344,25 @@ def _environment(folder: Path, capture: Path) -> Iterator[list[Path]]:
     share = folder / "share"
     temporary.mkdir()
     own_cache(cache)
-    os.environ |= {"SKINDB_CACHE": str(cache), "TMPDIR": str(temporary), "CAPTURE": str(capture)}
+    os.environ |= {
+        "SKINDB_CACHE": str(cache),
+        "TMPDIR": str(temporary),
+        "CAPTURE": str(capture),
+    }
     os.environ["XDG_DATA_HOME"] = str(share)
     tempfile.tempdir = None
     yield [temporary, cache, share]
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--cases", type=int, default=20)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--bucket", action="store_true", help="In a bucket of a server on this machine.")
+    parser.add_argument(
+        "--bucket", action="store_true", help="In a bucket of a server on this machine."
+    )
     args = parser.parse_args()
     study_inputs.dictionary_tables = lambda *_: TABLES  # 8 of the 59
     Database.lease = partial_lease(Database.lease)
@@ -312,13 +370,17 @@ def main() -> None:
     counts = Counter[str]()
     failures = 0
     with ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="kill-withdraw-")))
+        folder = Path(
+            stack.enter_context(tempfile.TemporaryDirectory(prefix="kill-withdraw-"))
+        )
         address = stack.enter_context(s3_server("localbucket")) if args.bucket else ""
         os.environ |= settings(address) if args.bucket else {}
         capture = folder / "capture"
         write_capture(capture)
         about = json.loads((capture / "capture.json").read_text())
-        (capture / "capture.json").write_text(json.dumps(about | {"subject": SUBJECT, "condition": "wet"}))
+        (capture / "capture.json").write_text(
+            json.dumps(about | {"subject": SUBJECT, "condition": "wet"})
+        )
         first = folder / "first"
         prepared = folder / "prepared"
         prepared.mkdir()
@@ -328,18 +390,32 @@ def main() -> None:
         assert len(expected) > 100, len(expected)
 
         def new_case(number: int | str) -> str:
-            url = f"s3://{new_bucket(address)}/faces" if args.bucket else str(folder / f"case {number}")
-            _seconds(lambda: copy_objects(Database(first), skindb.open(url)), folder / "copy.log")
+            url = (
+                f"s3://{new_bucket(address)}/faces"
+                if args.bucket
+                else str(folder / f"case {number}")
+            )
+            _seconds(
+                lambda: copy_objects(Database(first), skindb.open(url)),
+                folder / "copy.log",
+            )
             return url
 
         seconds = {}
-        for name, work in [("ingest", WRITERS["ingest"]), *WRITERS.items()]:  # the first ingest compiles kernels
+        # the first ingest compiles kernels
+        for name, work in [("ingest", WRITERS["ingest"]), *WRITERS.items()]:
             url = new_case(f"{name} {len(seconds)}")
-            seconds[name] = _seconds(lambda work=work, url=url: work(skindb.open(url)), folder / "time.log")
+            seconds[name] = _seconds(
+                lambda work=work, url=url: work(skindb.open(url)), folder / "time.log"
+            )
         url = new_case("erase")
-        seconds["erase"] = _seconds(lambda: skindb.open(url).erase(SUBJECT), folder / "time.log")
+        seconds["erase"] = _seconds(
+            lambda: skindb.open(url).erase(SUBJECT), folder / "time.log"
+        )
         url = new_case("withdraw")
-        seconds["withdraw"] = _seconds(lambda: workflow.withdraw(skindb.open(url), SUBJECT), folder / "time.log")
+        seconds["withdraw"] = _seconds(
+            lambda: workflow.withdraw(skindb.open(url), SUBJECT), folder / "time.log"
+        )
         print({name: round(value, 2) for name, value in seconds.items()}, flush=True)
         for number in range(args.cases):
             own = folder / f"own {number}"
@@ -354,7 +430,12 @@ def main() -> None:
                 if examiner.wait():
                     faults.append((own / "examine.log").read_text())
             counts[outcome] += 1
-            print(number, outcome, *sorted(name for name in trial.processes if name in WRITERS), flush=True)
+            print(
+                number,
+                outcome,
+                *sorted(name for name in trial.processes if name in WRITERS),
+                flush=True,
+            )
             for fault in faults:
                 failures += 1
                 print(f"  FAILED: {fault}", flush=True)

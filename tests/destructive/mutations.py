@@ -1,4 +1,6 @@
-"""Damage to one file of a capture folder, chosen by a random generator; each function returns a description."""
+"""Damage to one file of a capture folder, chosen by a random generator; each function
+returns a description.
+"""
 
 from __future__ import annotations
 
@@ -60,8 +62,33 @@ VALUES = (
     {str(i): i for i in range(20_000)},
     *JSON_TEXTS,
 )
-SUBSTITUTES = ("nothing", "pipe", "folder", "zeros", "loop", "outside", "socket", "sparse", "secret")
-TOKENS = ("nan", "inf", "-1", "0", "1e308", "9" * 25, "x", "1_0", "\x00", "", "-", "1e5", "4294967296", "a" * 5_000)
+SUBSTITUTES = (
+    "nothing",
+    "pipe",
+    "folder",
+    "zeros",
+    "loop",
+    "outside",
+    "socket",
+    "sparse",
+    "secret",
+)
+TOKENS = (
+    "nan",
+    "inf",
+    "-1",
+    "0",
+    "1e308",
+    "9" * 25,
+    "x",
+    "1_0",
+    "\x00",
+    "",
+    "-",
+    "1e5",
+    "4294967296",
+    "a" * 5_000,
+)
 
 
 def damage(folder: Path, rng: np.random.Generator) -> str:
@@ -74,7 +101,9 @@ def damage(folder: Path, rng: np.random.Generator) -> str:
     choices = [flip, flip, truncate, zero, extend, replace_by, replace_by, swap]
     if path.suffix == ".json":
         choices += [json_value] * 16
-    if path.suffix in (".obj", ".csv") or (path.suffix == ".ply" and b"ascii" in path.read_bytes()[:40]):
+    if path.suffix in (".obj", ".csv") or (
+        path.suffix == ".ply" and b"ascii" in path.read_bytes()[:40]
+    ):
         choices += [token] * 8
     if path.suffix in (".png", ".tif"):
         choices += [picture] * 4
@@ -85,13 +114,19 @@ def damage(folder: Path, rng: np.random.Generator) -> str:
 
 
 def _kind(path: Path) -> str:
-    return path.name if path.suffix in (".json", ".csv", ".ply", ".obj") else f"{path.parts[-3]}{path.suffix}"
+    return (
+        path.name
+        if path.suffix in (".json", ".csv", ".ply", ".obj")
+        else f"{path.parts[-3]}{path.suffix}"
+    )
 
 
 def flip(path: Path, rng: np.random.Generator) -> str:
     content = bytearray(path.read_bytes())
     count = int(rng.choice([1, 1, 10]))
-    places = rng.integers(0, min(len(content), int(rng.choice([200, len(content)]))), count)
+    places = rng.integers(
+        0, min(len(content), int(rng.choice([200, len(content)]))), count
+    )
     for at in places:
         content[at] ^= int(rng.integers(1, 256))
     path.write_bytes(content)
@@ -141,7 +176,10 @@ def put(what: str, path: Path) -> None:
     elif what == "outside":
         path.symlink_to("/etc/hostname")
     elif what == "socket":
-        with tempfile.TemporaryDirectory(dir="/tmp") as short, socket.socket(socket.AF_UNIX) as one:
+        with (
+            tempfile.TemporaryDirectory(dir="/tmp") as short,
+            socket.socket(socket.AF_UNIX) as one,
+        ):
             one.bind(f"{short}/socket")  # their names are limited to 107 bytes
             shutil.move(f"{short}/socket", path)
     elif what == "sparse":
@@ -169,7 +207,21 @@ def picture(path: Path, rng: np.random.Generator) -> str:
     from skindb.ingest.frames import read_frame, write_frame
 
     frame = read_frame(path)
-    what = str(rng.choice(["half", "grey", "alpha", "8 bit", "turned", "mirrored", "brighter", "black", "white"]))
+    what = str(
+        rng.choice(
+            [
+                "half",
+                "grey",
+                "alpha",
+                "8 bit",
+                "turned",
+                "mirrored",
+                "brighter",
+                "black",
+                "white",
+            ]
+        )
+    )
     changed = {
         "half": frame[::2, ::2],
         "grey": frame[..., 0],
@@ -177,7 +229,9 @@ def picture(path: Path, rng: np.random.Generator) -> str:
         "8 bit": (frame // 256).astype(np.uint8),
         "turned": frame.swapaxes(0, 1),
         "mirrored": frame[:, ::-1],
-        "brighter": np.minimum(frame.astype(np.float64) * 1.5, 65535).astype(frame.dtype),
+        "brighter": np.minimum(frame.astype(np.float64) * 1.5, 65535).astype(
+            frame.dtype
+        ),
         "black": frame * 0,
         "white": frame * 0 + 65535,
     }[what]
@@ -247,7 +301,11 @@ def json_value(path: Path, rng: np.random.Generator) -> str:
     else:
         value = VALUES[rng.integers(len(VALUES))]
         parent[key] = value
-        marks = {json.dumps(value): JSON_TEXTS[value]} if isinstance(value, str) and value in JSON_TEXTS else {}
+        marks = (
+            {json.dumps(value): JSON_TEXTS[value]}
+            if isinstance(value, str) and value in JSON_TEXTS
+            else {}
+        )
         said = f"is {str(value)[:30]!r}"
     text = json.dumps(data)
     for mark, put in marks.items():

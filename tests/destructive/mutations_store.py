@@ -1,4 +1,6 @@
-"""Damage to a database, chosen by a random generator; each function returns the kind of file and a description."""
+"""Damage to a database, chosen by a random generator; each function returns the kind of
+file and a description.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +9,16 @@ import shutil
 from pathlib import Path
 
 import numpy as np
-from mutations import SUBSTITUTES, extend, flip, json_value, put, replace_by, truncate, zero
+from mutations import (
+    SUBSTITUTES,
+    extend,
+    flip,
+    json_value,
+    put,
+    replace_by,
+    truncate,
+    zero,
+)
 
 from skindb.store.record import seal_of
 
@@ -34,14 +45,18 @@ def damage(root: Path, rng: np.random.Generator) -> tuple[str, str]:
     """Damage one thing of the database; returns the kind of file, and what was done to which."""
     choices = [_file] * 10 + [_folder, _foreign]
     kind, path, done = choices[rng.integers(len(choices))](root, rng)
-    return kind, f"{path.relative_to(root)}: {done}".encode(errors="backslashreplace").decode()
+    return kind, f"{path.relative_to(root)}: {done}".encode(
+        errors="backslashreplace"
+    ).decode()
 
 
 def kind_of(root: Path, path: Path) -> str:
     """Kind of a file of a database."""
     top = path.relative_to(root).parts[0]
     if top != "data":
-        return {"log": "record", "heads": "head", "tombstones": "tombstone"}.get(top, top)
+        return {"log": "record", "heads": "head", "tombstones": "tombstone"}.get(
+            top, top
+        )
     if path.name.endswith((".manifest.json", ".tables.json")):
         return path.name.split(".")[-2]
     return "metadata" if path.name == "zarr.json" else "chunk"
@@ -75,11 +90,17 @@ def _file(root: Path, rng: np.random.Generator) -> tuple[str, Path, str]:
     path.write_bytes(theirs)
     if at == len(choices):
         other.write_bytes(mine)
-    return kind, path, f"{'exchanged with' if at == len(choices) else 'overwritten by'} {other.relative_to(root)}"
+    return (
+        kind,
+        path,
+        f"{'exchanged with' if at == len(choices) else 'overwritten by'} {other.relative_to(root)}",
+    )
 
 
 def _sealed(path: Path, rng: np.random.Generator) -> str:
-    """A value of a record changed and its seal made to fit; for some the head, too, or the head removed."""
+    """A value of a record changed and its seal made to fit; for some the head, too, or
+    the head removed.
+    """
     said = json_value(path, rng) if rng.random() < 0.8 else _telling(path, rng)
     try:
         body = json.loads(path.read_text())
@@ -124,7 +145,9 @@ def _telling(path: Path, rng: np.random.Generator) -> str:
 def _folder(root: Path, rng: np.random.Generator) -> tuple[str, Path, str]:
     folders = [path for path in sorted(root.rglob("*")) if path.is_dir()]
     depth = int(rng.integers(1, 7))
-    near = [path for path in folders if len(path.relative_to(root).parts) == depth] or folders
+    near = [
+        path for path in folders if len(path.relative_to(root).parts) == depth
+    ] or folders
     path = near[rng.integers(len(near))]
     if rng.random() < 0.3 and len(near) > 1:
         other = near[rng.integers(len(near))]

@@ -2,13 +2,15 @@
 
     python tests/destructive/power_loss.py --every 1 --torn 2 --seed 0
 
-A series of commits under leases, two consents, a first pass that is kept and forgotten, and the removal of old
-generations run once. Before every call that changes a folder or flushes something, what the disk is sure to hold is
-noted: of a file what it held when it was last flushed, of a folder the entries it had when it was last flushed. From
-that, the database is put together as it would be after a power loss: with nothing else, and (torn) with a random part
-of what was not flushed, whose files are whole, cut or empty. Then every commit that had been acknowledged must be
-there, whole and with its values, `verify` must find no damage but removals that `clean` completes, and the next
-commits must succeed. The program ends with 1 if that fails once.
+A series of commits under leases, two consents, a first pass that is kept and forgotten,
+and the removal of old generations run once. Before every call that changes a folder or
+flushes something, what the disk is sure to hold is noted: of a file what it held when
+it was last flushed, of a folder the entries it had when it was last flushed. From that,
+the database is put together as it would be after a power loss: with nothing else, and
+(torn) with a random part of what was not flushed, whose files are whole, cut or empty.
+Then every commit that had been acknowledged must be there, whole and with its values,
+`verify` must find no damage but removals that `clean` completes, and the next commits
+must succeed. The program ends with 1 if that fails once.
 """
 
 from __future__ import annotations
@@ -40,12 +42,15 @@ from skindb.store import Database
 
 CHANGES = ("os.mkdir", "os.link", "os.rename", "os.remove", "os.rmdir", "os.truncate")
 Inode = int
-Acked = dict[tuple[str, str, int], float]  # what was acknowledged: kind, take, generation -> the value it holds
+# what was acknowledged: kind, take, generation -> the value it holds
+Acked = dict[tuple[str, str, int], float]
 
 
 @dataclass
 class State:
-    """What a disk certainly and possibly holds at one moment, and what had been acknowledged by then."""
+    """What a disk certainly and possibly holds at one moment, and what had been
+    acknowledged by then.
+    """
 
     event: str
     entries: dict[Inode, dict[str, Inode]]  # of folders, when they were flushed
@@ -64,7 +69,8 @@ class Disk:
     contents: dict[Inode, bytes] = field(default_factory=dict)
     states: list[State] = field(default_factory=list)
     acked: Acked = field(default_factory=dict)
-    held: list[int] = field(default_factory=list)  # descriptors: the number of an inode is not given again
+    # descriptors: the number of an inode is not given again
+    held: list[int] = field(default_factory=list)
     folders: set[Inode] = field(default_factory=set)  # every folder that ever existed
     on: bool = False
 
@@ -75,13 +81,23 @@ class Disk:
 
         def fsync(number: int) -> None:
             flush(number)
-            if self.on and str(path := Path(f"/proc/self/fd/{number}").readlink()).startswith(str(self.base)):
+            if self.on and str(
+                path := Path(f"/proc/self/fd/{number}").readlink()
+            ).startswith(str(self.base)):
                 self.note(f"fsync {path.name}")
                 self._flushed(number)
 
         def change(event: str, args: tuple[object, ...]) -> None:
-            writing = event == "open" and isinstance(args[2], int) and args[2] & (os.O_WRONLY | os.O_RDWR)
-            if self.on and (writing or event in CHANGES) and any(str(self.base) in str(arg) for arg in args[:2]):
+            writing = (
+                event == "open"
+                and isinstance(args[2], int)
+                and args[2] & (os.O_WRONLY | os.O_RDWR)
+            )
+            if (
+                self.on
+                and (writing or event in CHANGES)
+                and any(str(self.base) in str(arg) for arg in args[:2])
+            ):
                 self.note(f"{event} {Path(str(args[0])).name}")
 
         os.fsync = fsync
@@ -96,7 +112,16 @@ class Disk:
             if inode not in self.folders:
                 self.folders.add(inode)
                 self.held.append(os.open(path, os.O_RDONLY))
-        self.states.append(State(event, dict(self.entries), dict(self.contents), entries, contents, dict(self.acked)))
+        self.states.append(
+            State(
+                event,
+                dict(self.entries),
+                dict(self.contents),
+                entries,
+                contents,
+                dict(self.acked),
+            )
+        )
         self.on = True
 
     def _flushed(self, number: int) -> None:
@@ -105,7 +130,9 @@ class Disk:
         status = os.fstat(number)
         if stat.S_ISDIR(status.st_mode):
             with os.scandir(number) as found:
-                self.entries[status.st_ino] = {entry.name: entry.inode() for entry in found}
+                self.entries[status.st_ino] = {
+                    entry.name: entry.inode() for entry in found
+                }
         else:
             self.contents[status.st_ino] = Path(f"/proc/self/fd/{number}").read_bytes()
         self.on = True
@@ -121,7 +148,10 @@ def _scan(
     for folder, _, names in os.walk(base):
         with suppress(FileNotFoundError), os.scandir(folder) as found:
             inode = Path(folder).stat().st_ino
-            folders[inode], entries[inode] = folder, {entry.name: entry.inode() for entry in found}
+            folders[inode], entries[inode] = (
+                folder,
+                {entry.name: entry.inode() for entry in found},
+            )
         for name in names:
             path = Path(folder) / name
             with suppress(FileNotFoundError):  # zarr writes in several threads
@@ -130,8 +160,16 @@ def _scan(
     return folders, entries, contents
 
 
-def put_together(state: State, base: Inode, folders: set[Inode], out: Path, rng: np.random.Generator | None) -> None:
-    """Write the database after a power loss: only what was flushed, or also a random part of the rest."""
+def put_together(
+    state: State,
+    base: Inode,
+    folders: set[Inode],
+    out: Path,
+    rng: np.random.Generator | None,
+) -> None:
+    """Write the database after a power loss: only what was flushed, or also a random
+    part of the rest.
+    """
     waiting = [(base, out)]
     while waiting:
         inode, folder = waiting.pop()
@@ -140,7 +178,11 @@ def put_together(state: State, base: Inode, folders: set[Inode], out: Path, rng:
         now = state.entries_now.get(inode, {})
         for name in sorted(sure.keys() | now.keys()):
             one = sure.get(name)
-            if rng is not None and sure.get(name) != now.get(name) and rng.random() < 0.5:
+            if (
+                rng is not None
+                and sure.get(name) != now.get(name)
+                and rng.random() < 0.5
+            ):
                 one = now.get(name)
             if one is None:
                 continue
@@ -154,19 +196,29 @@ def _content(state: State, inode: Inode, rng: np.random.Generator | None) -> byt
     if inode in state.contents:
         return state.contents[inode]
     content = state.contents_now.get(inode, b"")
-    return b"" if rng is None else content[: int(rng.choice([0, len(content) // 2, len(content)]))]
+    return (
+        b""
+        if rng is None
+        else content[: int(rng.choice([0, len(content) // 2, len(content)]))]
+    )
 
 
 def work(db: Database, disk: Disk) -> None:
     """The series of commits; each is acknowledged as soon as its call returns."""
 
     def commit(kind: str, take: str, value: float) -> None:
-        tables = dataset({"region_area": [value]}, coords={"region": ["face"]}) if kind == "model" else None
+        tables = (
+            dataset({"region_area": [value]}, coords={"region": ["face"]})
+            if kind == "model"
+            else None
+        )
         with db.lease(take, kind) as lease, db.stage(kind, take, lease) as stage:
             stage.write(groups(value, 3), tables=tables)
             disk.acked[kind, take, stage.commit({"seeds": [1]}).generation] = value
 
-    for value, (kind, take) in enumerate([("capture", "A1"), ("model", "A1"), ("capture", "A1"), ("capture", "B1")], 1):
+    for value, (kind, take) in enumerate(
+        [("capture", "A1"), ("model", "A1"), ("capture", "A1"), ("capture", "B1")], 1
+    ):
         commit(kind, take, float(value))
     for scope in ([], ["fit"]):
         db.record_consent("A1", scope)
@@ -200,10 +252,14 @@ def fault(root: Path, acked: Acked) -> str:
         if float(tree["surfels/surfel_area"][0]) != value:
             return f"{kind} {generation} of {take} has another value"
     with suppress(InputError):  # incomplete: the fit repeats it
-        if db.has("first", "A1") and float(db.read("first", "A1")["surfels/surfel_area"][0]) != 9.0:
+        if (
+            db.has("first", "A1")
+            and float(db.read("first", "A1")["surfels/surfel_area"][0]) != 9.0
+        ):
             return "another first pass"
     if db.has("capture", "A1"):
-        db.record_consent("A1", ["fit"])  # the power may have gone while consent was withdrawn
+        # the power may have gone while consent was withdrawn
+        db.record_consent("A1", ["fit"])
     for kind, take in (("capture", "A1"), ("model", "A1"), ("capture", "C1")):
         newest = max((g for k, t, g in acked if (k, t) == (kind, take)), default=0)
         with db.lease(take, kind) as lease, db.stage(kind, take, lease) as stage:
@@ -215,15 +271,21 @@ def fault(root: Path, acked: Acked) -> str:
 
 
 def run(folder: Path) -> None:
-    """Run the series once and keep every state; the process ends, as by a power loss, so that its leases are free."""
-    resource.setrlimit(resource.RLIMIT_NOFILE, (resource.getrlimit(resource.RLIMIT_NOFILE)[1],) * 2)
+    """Run the series once and keep every state; the process ends, as by a power loss,
+    so that its leases are free.
+    """
+    resource.setrlimit(
+        resource.RLIMIT_NOFILE, (resource.getrlimit(resource.RLIMIT_NOFILE)[1],) * 2
+    )
     disk = Disk(folder / "disk")
     disk.base.mkdir()
     disk.start()
     work(Database(disk.base / "db"), disk)
     disk.note("end")
     disk.on = False
-    (folder / "states").write_bytes(pickle.dumps((disk.base.stat().st_ino, disk.folders, disk.states)))
+    (folder / "states").write_bytes(
+        pickle.dumps((disk.base.stat().st_ino, disk.folders, disk.states))
+    )
 
 
 def check(asked: argparse.Namespace, folder: Path) -> Counter[str]:
@@ -241,10 +303,17 @@ def check(asked: argparse.Namespace, folder: Path) -> Counter[str]:
             put_together(state, base, folders, out, rng)
             what = "torn" if torn else "flushed alone"
             rows[what] += 1
-            said = "no database" if state.acked and not (out / "db").exists() else fault(out / "db", state.acked)
+            said = (
+                "no database"
+                if state.acked and not (out / "db").exists()
+                else fault(out / "db", state.acked)
+            )
             if said:
                 rows["failures"] += 1
-                print(f"after call {number} ({state.event}), {what} {torn}: {said}", flush=True)
+                print(
+                    f"after call {number} ({state.event}), {what} {torn}: {said}",
+                    flush=True,
+                )
             shutil.rmtree(out)
     rows["calls"] = len(states)
     return rows
@@ -252,9 +321,18 @@ def check(asked: argparse.Namespace, folder: Path) -> Counter[str]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--every", type=int, default=1, help="The power is cut after every n-th call.")
-    parser.add_argument("--torn", type=int, default=1, help="Number of random parts of what was not flushed.")
-    parser.add_argument("--seed", type=int, default=0, help="Random seed of these parts.")
+    parser.add_argument(
+        "--every", type=int, default=1, help="The power is cut after every n-th call."
+    )
+    parser.add_argument(
+        "--torn",
+        type=int,
+        default=1,
+        help="Number of random parts of what was not flushed.",
+    )
+    parser.add_argument(
+        "--seed", type=int, default=0, help="Random seed of these parts."
+    )
     with tempfile.TemporaryDirectory() as name:
         rows = check(parser.parse_args(), Path(name).resolve())
     for name in ("calls", "flushed alone", "torn", "failures"):

@@ -1,11 +1,13 @@
-"""Stops a fit for longer than its lease, lets another one take over, and then continues the first one.
+"""Stops a fit for longer than its lease, lets another one take over, and then continues
+the first one.
 
     python tests/destructive/stop_lease.py --cases 10 --seed 0
 
-The first fit is stopped (SIGSTOP) in a stage that is chosen at random. The second one waits until the lease has ended,
-fits the take with other parameters and commits. Then the first one goes on (SIGCONT): it must end with one line that
-says who took over, and must have committed nothing. In every second case it goes on while the second one is still at
-work, which must then succeed. The program ends with 1 if that fails once.
+The first fit is stopped (SIGSTOP) in a stage that is chosen at random. The second one
+waits until the lease has ended, fits the take with other parameters and commits. Then
+the first one goes on (SIGCONT): it must end with one line that says who took over, and
+must have committed nothing. In every second case it goes on while the second one is
+still at work, which must then succeed. The program ends with 1 if that fails once.
 """
 
 from __future__ import annotations
@@ -41,12 +43,18 @@ BAD = ("committed over the new holder", "no line, or another", "second fit refus
 
 
 def stopped_in(root: Path, stage: str) -> tuple[int, int]:
-    """Start a fit that stops itself at a stage, and return its process and a pipe with its last message."""
+    """Start a fit that stops itself at a stage, and return its process and a pipe with
+    its last message.
+    """
     pipe, end = os.pipe()
     process = os.fork()
     if not process:
         os.close(pipe)
-        stop = lambda name: os.kill(os.getpid(), signal.SIGSTOP) if name == stage else None  # noqa: E731
+
+        def stop(name):
+            if name == stage:
+                os.kill(os.getpid(), signal.SIGSTOP)
+
         try:
             said = ["committed", kill_fit.fit(skindb.open(root), stop)]
         except LeaseLost as error:
@@ -73,14 +81,24 @@ def attempt(root: Path, stage: str, *, early: bool) -> apart.Outcome:
     db = skindb.open(root)
     other = replace(PARAMETERS, k=1)
     try:
-        workflow.fit_take(db, kill_fit.FIT_TAKE, other, dictionary=few_materials(), wait=60, progress=progress)
+        workflow.fit_take(
+            db,
+            kill_fit.FIT_TAKE,
+            other,
+            dictionary=few_materials(),
+            wait=60,
+            progress=progress,
+        )
     except InputError as error:
         return BAD[2], str(error)
     go_on()
     with os.fdopen(pipe) as said:
         kind, text = json.loads(said.read())
     os.waitpid(first, 0)
-    models = [record.provenance["parameters"]["k"] for record in db.history("model", kill_fit.FIT_TAKE)]
+    models = [
+        record.provenance["parameters"]["k"]
+        for record in db.history("model", kill_fit.FIT_TAKE)
+    ]
     if kind == "committed" or models != [1]:
         return BAD[0], f"stopped in {stage}: {kind} {text}, models with k = {models}"
     if kind != "lost" or "\n" in text or "another run took over" not in text:
@@ -93,20 +111,30 @@ def attempt(root: Path, stage: str, *, early: bool) -> apart.Outcome:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--cases", type=int, default=5, help="Number of fits that are stopped.")
-    parser.add_argument("--seed", type=int, default=0, help="Random seed of the stages.")
-    parser.add_argument("--jobs", type=int, default=2, help="Number of cases at a time.")
+    parser.add_argument(
+        "--cases", type=int, default=5, help="Number of fits that are stopped."
+    )
+    parser.add_argument(
+        "--seed", type=int, default=0, help="Random seed of the stages."
+    )
+    parser.add_argument(
+        "--jobs", type=int, default=2, help="Number of cases at a time."
+    )
     asked = parser.parse_args()
 
     def prepare(number: int, work: Path):
-        stage = STAGES[np.random.default_rng([asked.seed, number]).integers(len(STAGES))]
+        stage = STAGES[
+            np.random.default_rng([asked.seed, number]).integers(len(STAGES))
+        ]
         root = Path(shutil.copytree(folder / "fit", work / "copy")) / "db"
         return "fit", stage, partial(attempt, root, stage, early=bool(number % 2))
 
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         kill_fit.ready(folder, kill_fit.in_folder, [])  # its fit compiles
-        done = apart.run(range(asked.cases), prepare, folder, apart.Limits(asked.jobs, seconds=300))
+        done = apart.run(
+            range(asked.cases), prepare, folder, apart.Limits(asked.jobs, seconds=300)
+        )
     for outcome, count in Counter(case.outcome for case in done).items():
         print(f"{outcome:<32} {count:>6}")
     bad = [case for case in done if case.outcome not in GOOD]

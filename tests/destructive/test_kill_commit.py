@@ -1,4 +1,6 @@
-"""A few kills of a commit in every run of the tests; docs/reliability.md has the numbers of all of them."""
+"""A few kills of a commit in every run of the tests; docs/reliability.md has the
+numbers of all of them.
+"""
 
 from __future__ import annotations
 

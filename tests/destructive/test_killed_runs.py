@@ -1,4 +1,6 @@
-"""A few killed and stopped runs and power losses in every run of the tests; docs/reliability.md has many more."""
+"""A few killed and stopped runs and power losses in every run of the tests;
+docs/reliability.md has many more.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,6 @@
-"""The program in the guide to exports, which knows the files of a bundle only, computes what skindb computes."""
+"""The program in the guide to exports, which knows the files of a bundle only, computes
+what skindb computes.
+"""
 
 from __future__ import annotations
 
@@ -11,13 +13,19 @@ import skindb
 from skindb.export import export_bundle
 
 PAGE = Path(__file__).parents[2] / "docs/howto/export.md"
-TOLERANCE = 1e-3  # relative; both interpolate the same tables, the page linearly in the angles, skindb in sqrt(theta_h)
+# relative; both interpolate the same tables, the page linearly in the angles, skindb in
+# the root of theta_h
+TOLERANCE = 1e-3
 
 
 def _program():
     """The block of the page that defines `reflectance`."""
     (block,) = [
-        b for b in re.findall(r"^```python\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.S | re.M) if "interpn" in b
+        b
+        for b in re.findall(
+            r"^```python\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.S | re.M
+        )
+        if "interpn" in b
     ]
     return block
 
@@ -34,7 +42,8 @@ def test_export_page__reflectance_is_that_of_skindb(model, tmp_path, monkeypatch
     values = {f"weight_{k}": weights[k : k + 1] for k in range(len(weights))}
     values["normal"] = fitted["shading_normal"].values[surfel].astype(float)
     values["albedo"] = fitted["diffuse_reflectance"].values[surfel].astype(float)
-    names["texel"] = lambda name, _i, _j: values[name]  # the functions of the page look it up here
+    # the functions of the page look it up here
+    names["texel"] = lambda name, _i, _j: values[name]
     draws = np.random.default_rng(3)
     compared = 0
     for light, camera in draws.standard_normal((60, 2, 3)):
@@ -42,6 +51,8 @@ def test_export_page__reflectance_is_that_of_skindb(model, tmp_path, monkeypatch
         camera = camera / np.linalg.norm(camera)
         if min(light @ values["normal"], camera @ values["normal"]) > 0.2:
             expected = skindb.render.evaluate(model, surfel, light, camera)
-            np.testing.assert_allclose(names["reflectance"](0, 0, light, camera), expected, rtol=TOLERANCE)
+            np.testing.assert_allclose(
+                names["reflectance"](0, 0, light, camera), expected, rtol=TOLERANCE
+            )
             compared += 1
     assert compared > 5

@@ -35,24 +35,40 @@ def chunks(path: Path) -> tuple[dict, bytes]:
 
 
 def picture(document: dict, body: bytes, index: int) -> np.ndarray:
-    view = document["bufferViews"][document["images"][document["textures"][index]["source"]]["bufferView"]]
-    return np.asarray(Image.open(io.BytesIO(body[view["byteOffset"] : view["byteOffset"] + view["byteLength"]])))
+    view = document["bufferViews"][
+        document["images"][document["textures"][index]["source"]]["bufferView"]
+    ]
+    return np.asarray(
+        Image.open(
+            io.BytesIO(
+                body[view["byteOffset"] : view["byteOffset"] + view["byteLength"]]
+            )
+        )
+    )
 
 
-def test_export_gltf__another_reader_gets_the_mesh_in_metres(model: xr.DataTree, tmp_path: Path) -> None:
+def test_export_gltf__another_reader_gets_the_mesh_in_metres(
+    model: xr.DataTree, tmp_path: Path
+) -> None:
     export_gltf(model, tmp_path / "a.glb", size=SIZE)
     scene = trimesh.load(tmp_path / "a.glb", process=False)
     (mesh,) = scene.geometry.values()
     fitted = model["fitted"].to_dataset()
-    np.testing.assert_allclose(mesh.vertices * 1000, fitted["surfel_position"], atol=1e-4)
+    np.testing.assert_allclose(
+        mesh.vertices * 1000, fitted["surfel_position"], atol=1e-4
+    )
     np.testing.assert_array_equal(mesh.faces, model["mesh/triangle"])
     # trimesh turns v upside down: its rows start at the bottom
-    np.testing.assert_allclose(mesh.visual.uv * [1, -1] + [0, 1], fitted["surfel_uv"], atol=1e-6)
+    np.testing.assert_allclose(
+        mesh.visual.uv * [1, -1] + [0, 1], fitted["surfel_uv"], atol=1e-6
+    )
     np.testing.assert_allclose(mesh.vertex_normals, fitted["surfel_normal"], atol=1e-5)
     assert mesh.visual.material.baseColorTexture.size == (SIZE, SIZE)
 
 
-def test_export_gltf__obeys_the_container_and_accessor_rules(model: xr.DataTree, tmp_path: Path) -> None:
+def test_export_gltf__obeys_the_container_and_accessor_rules(
+    model: xr.DataTree, tmp_path: Path
+) -> None:
     export_gltf(model, tmp_path / "a.glb", size=SIZE)
     document, body = chunks(tmp_path / "a.glb")
     assert document["asset"]["version"] == "2.0"
@@ -62,17 +78,26 @@ def test_export_gltf__obeys_the_container_and_accessor_rules(model: xr.DataTree,
         assert view["byteOffset"] % 4 == 0
         assert accessor["count"] * sizes[accessor["type"]] == view["byteLength"]
     assert (
-        max(v["byteOffset"] + v["byteLength"] for v in document["bufferViews"]) <= document["buffers"][0]["byteLength"]
+        max(v["byteOffset"] + v["byteLength"] for v in document["bufferViews"])
+        <= document["buffers"][0]["byteLength"]
     )
     assert document["buffers"][0]["byteLength"] <= len(body)
     assert all(view["byteOffset"] % 4 == 0 for view in document["bufferViews"])
     assert len(body) % 4 == 0
-    position = np.frombuffer(body, np.float32, document["accessors"][0]["count"] * 3).reshape(-1, 3)
-    np.testing.assert_array_equal(position.min(axis=0), np.float32(document["accessors"][0]["min"]))
-    assert set(document["materials"][0]["extensions"]) == set(document["extensionsUsed"])
+    position = np.frombuffer(
+        body, np.float32, document["accessors"][0]["count"] * 3
+    ).reshape(-1, 3)
+    np.testing.assert_array_equal(
+        position.min(axis=0), np.float32(document["accessors"][0]["min"])
+    )
+    assert set(document["materials"][0]["extensions"]) == set(
+        document["extensionsUsed"]
+    )
 
 
-def test_export_gltf__textures_hold_the_material(model: xr.DataTree, tmp_path: Path) -> None:
+def test_export_gltf__textures_hold_the_material(
+    model: xr.DataTree, tmp_path: Path
+) -> None:
     export_gltf(model, tmp_path / "a.glb", size=SIZE)
     document, body = chunks(tmp_path / "a.glb")
     material = document["materials"][0]
@@ -84,17 +109,24 @@ def test_export_gltf__textures_hold_the_material(model: xr.DataTree, tmp_path: P
     tables = kernel_tables(model["basis"].to_dataset())
     expected = fit_material(tables, diffuse, weights, eta=1.3)
     # values are fitted at the surfels and interpolated between them; steps of eight bits
-    np.testing.assert_allclose(base[i, j], encode_srgb(expected.base_color[0]) * 255, atol=3)
+    np.testing.assert_allclose(
+        base[i, j], encode_srgb(expected.base_color[0]) * 255, atol=3
+    )
     assert rough[i, j, 1] / 255 == pytest.approx(expected.roughness[0], abs=0.021)
     assert rough[i, j, 2] == 0  # not metallic
     assert specular[i, j, 3] / 255 == pytest.approx(expected.specular[0], abs=0.03)
     ior = material["extensions"]["KHR_materials_ior"]["ior"]
     top = ((ior - 1) / (ior + 1)) ** 2
-    assert top * decode_srgb(colour[i, j, 0] / 255) == pytest.approx(expected.f0[0], rel=0.15)
-    np.testing.assert_allclose(bent[i, j], [127.5, 127.5, 255], atol=1)  # the shading normals are those of the mesh
+    assert top * decode_srgb(colour[i, j, 0] / 255) == pytest.approx(
+        expected.f0[0], rel=0.15
+    )
+    # the shading normals are those of the mesh
+    np.testing.assert_allclose(bent[i, j], [127.5, 127.5, 255], atol=1)
 
 
-def test_export_gltf__normals_come_back_from_tangent_space(model: xr.DataTree, tmp_path: Path) -> None:
+def test_export_gltf__normals_come_back_from_tangent_space(
+    model: xr.DataTree, tmp_path: Path
+) -> None:
     """Bent by up to 20 degrees: the texture of eight bits gives them back within half a degree."""
     fitted = model["fitted"].to_dataset()
     u, v = fitted["surfel_uv"].values.T
@@ -111,7 +143,9 @@ def test_export_gltf__normals_come_back_from_tangent_space(model: xr.DataTree, t
     def read(name: str, width: int) -> np.ndarray:
         accessor = document["accessors"][attributes[name]]
         view = document["bufferViews"][accessor["bufferView"]]
-        return np.frombuffer(body, np.float32, accessor["count"] * width, view["byteOffset"]).reshape(-1, width)
+        return np.frombuffer(
+            body, np.float32, accessor["count"] * width, view["byteOffset"]
+        ).reshape(-1, width)
 
     normal = read("NORMAL", 3)
     tangent = read("TANGENT", 4)
@@ -120,19 +154,29 @@ def test_export_gltf__normals_come_back_from_tangent_space(model: xr.DataTree, t
     at = np.clip((uv * 256).astype(int), 0, 255)
     local = image[at[:, 1], at[:, 0]] / 127.5 - 1
     across = np.cross(normal, tangent[:, :3]) * tangent[:, 3:]
-    found = local[:, :1] * tangent[:, :3] + local[:, 1:2] * across + local[:, 2:] * normal
+    found = (
+        local[:, :1] * tangent[:, :3] + local[:, 1:2] * across + local[:, 2:] * normal
+    )
     found /= np.linalg.norm(found, axis=1, keepdims=True)
     seen = ~unseen.any(axis=1)
     angle = np.degrees(np.arccos(np.clip((found * bent).sum(axis=1), -1, 1)))[seen]
     assert np.median(angle) < 1.0  # of the nearest texel
 
 
-def test_export_gltf__names_contain_the_take(model: xr.DataTree, tmp_path: Path) -> None:
-    """Programs that import several files into one project merge meshes, materials and textures of the same name."""
+def test_export_gltf__names_contain_the_take(
+    model: xr.DataTree, tmp_path: Path
+) -> None:
+    """Programs that import several files into one project merge meshes, materials and
+    textures of the same name.
+    """
     model.attrs["take"] = "S01.lotion"
     export_gltf(model, tmp_path / "a.glb", size=SIZE)
     document = chunks(tmp_path / "a.glb")[0]
-    names = [one["name"] for kind in ("nodes", "meshes", "materials", "images") for one in document[kind]]
+    names = [
+        one["name"]
+        for kind in ("nodes", "meshes", "materials", "images")
+        for one in document[kind]
+    ]
     assert all(name.startswith("S01.lotion") for name in names), names
     assert len({one["name"] for one in document["images"]}) == len(document["images"])
 
@@ -145,12 +189,16 @@ def test_export_gltf__states_its_error(model: xr.DataTree, tmp_path: Path) -> No
     assert "subsurface transport" in extras["skipped"]
 
 
-def test_export_gltf__a_black_model_is_a_black_file(model: xr.DataTree, tmp_path: Path) -> None:
+def test_export_gltf__a_black_model_is_a_black_file(
+    model: xr.DataTree, tmp_path: Path
+) -> None:
     """Nothing reflected, nothing approximated: an error relative to nothing is none."""
     for name in ("diffuse_reflectance", "basis_weight"):
         model[f"fitted/{name}"].values[:] *= 0  # NaN stays where nothing was seen
     error = export_gltf(model, tmp_path / "a.glb", size=SIZE)
-    assert {value for name, value in error.items() if name.startswith("relative")} == {0.0}
+    assert {value for name, value in error.items() if name.startswith("relative")} == {
+        0.0
+    }
     document, body = chunks(tmp_path / "a.glb")
     assert not picture(document, body, 0).any()  # base colour
     assert not picture(document, body, 2)[..., 3].any()  # specular
@@ -160,13 +208,18 @@ def test_export_gltf__a_black_model_is_a_black_file(model: xr.DataTree, tmp_path
 
 def test_export_gltf__needs_fitted_surfels(model: xr.DataTree, tmp_path: Path) -> None:
     model["fitted/fit_status"].values[:] = int(FitStatus.UNSEEN)
-    with pytest.raises(InputError, match="at least one surfel must be fitted for an export; found none"):
+    with pytest.raises(
+        InputError, match="at least one surfel must be fitted for an export; found none"
+    ):
         export_gltf(model, tmp_path / "a.glb", size=SIZE)
     assert not (tmp_path / "a.glb").exists()
 
 
 def test_export_gltf__needs_consent(model: xr.DataTree, tmp_path: Path) -> None:
     model.attrs["consent_scope"] = ["fit"]
-    with pytest.raises(InputError, match="S01: consent_scope: this step needs the scope 'export'; found only fit"):
+    with pytest.raises(
+        InputError,
+        match="S01: consent_scope: this step needs the scope 'export'; found only fit",
+    ):
         export_gltf(model, tmp_path / "a.glb", size=SIZE)
     assert not (tmp_path / "a.glb").exists()

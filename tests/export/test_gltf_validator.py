@@ -1,4 +1,6 @@
-"""The validator of the Khronos Group accepts exported files; `.ci/run` installs it where npm is there."""
+"""The validator of the Khronos Group accepts exported files; `.ci/run` installs it
+where npm is there.
+"""
 
 from __future__ import annotations
 
@@ -15,8 +17,10 @@ from skindb.export.gltf import export_gltf
 from tests.export.test_thin_parts import folded
 
 PROGRAM = """
-const validator = require('gltf-validator'), bytes = require('fs').readFileSync(process.argv[1]);
-validator.validateBytes(new Uint8Array(bytes)).then((report) => console.log(JSON.stringify(report)));
+const validator = require('gltf-validator');
+const bytes = new Uint8Array(require('fs').readFileSync(process.argv[1]));
+const print = (report) => console.log(JSON.stringify(report));
+validator.validateBytes(bytes).then(print);
 """
 
 
@@ -24,36 +28,54 @@ validator.validateBytes(new Uint8Array(bytes)).then((report) => console.log(JSON
 def folder() -> Path:
     found = os.environ.get("SKINDB_GLTF_VALIDATOR", "")
     if not found or shutil.which("node") is None:
-        pytest.skip("SKINDB_GLTF_VALIDATOR must name a folder with the npm package gltf-validator, and node is needed")
+        pytest.skip(
+            "SKINDB_GLTF_VALIDATOR must name a folder with the npm package "
+            "gltf-validator, and node is needed"
+        )
     return Path(found)
 
 
 def report(folder: Path, file: Path) -> dict:
     command = ["node", "-e", PROGRAM, str(file)]
     return json.loads(
-        subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True, timeout=60).stdout
+        subprocess.run(
+            command, cwd=folder, capture_output=True, text=True, check=True, timeout=60
+        ).stdout
     )
 
 
-def test_export_gltf__passes_the_validator(model: xr.DataTree, tmp_path: Path, folder: Path) -> None:
+def test_export_gltf__passes_the_validator(
+    model: xr.DataTree, tmp_path: Path, folder: Path
+) -> None:
     export_gltf(model, tmp_path / "a.glb", size=64)
     found = report(folder, tmp_path / "a.glb")
     assert found["issues"]["messages"] == []
-    assert found["info"]["extensionsUsed"] == ["KHR_materials_ior", "KHR_materials_specular"]
+    assert found["info"]["extensionsUsed"] == [
+        "KHR_materials_ior",
+        "KHR_materials_specular",
+    ]
 
 
-def test_export_gltf__of_a_thin_part_passes_the_validator(model: xr.DataTree, tmp_path: Path, folder: Path) -> None:
-    """It does not know the extension yet, a release candidate, and says so of it and of its texture; nothing else."""
+def test_export_gltf__of_a_thin_part_passes_the_validator(
+    model: xr.DataTree, tmp_path: Path, folder: Path
+) -> None:
+    """It does not know the extension yet, a release candidate, and says so of it and of
+    its texture; nothing else.
+    """
     export_gltf(folded(model, 2.0), tmp_path / "a.glb", size=64)
     issues = report(folder, tmp_path / "a.glb")["issues"]
-    assert {(message["code"], message["pointer"]) for message in issues["messages"]} == {
+    assert {
+        (message["code"], message["pointer"]) for message in issues["messages"]
+    } == {
         ("UNSUPPORTED_EXTENSION", "/extensionsUsed/0"),
         ("UNUSED_OBJECT", "/textures/5"),
     }
     assert (issues["numErrors"], issues["numWarnings"]) == (0, 0)
 
 
-def test_validator__finds_a_broken_file(model: xr.DataTree, tmp_path: Path, folder: Path) -> None:
+def test_validator__finds_a_broken_file(
+    model: xr.DataTree, tmp_path: Path, folder: Path
+) -> None:
     export_gltf(model, tmp_path / "a.glb", size=64)
     raw = (tmp_path / "a.glb").read_bytes().replace(b'"mode":4', b'"mode":9')
     (tmp_path / "a.glb").write_bytes(raw)

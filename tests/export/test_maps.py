@@ -16,15 +16,27 @@ def grid() -> tuple[np.ndarray, np.ndarray]:
     return u, v
 
 
-def test_texture_maps__linear_fields_are_reproduced_where_surfels_were_fitted(model: xr.DataTree) -> None:
+def test_texture_maps__linear_fields_are_reproduced_where_surfels_were_fitted(
+    model: xr.DataTree,
+) -> None:
     maps, (u, v) = texture_maps(model, size=SIZE), grid()
     sure = maps["confidence"].values[..., 0] > 0.999
     assert 0.7 < sure.mean() < 0.81  # the atlas covers 0.9^2 less the unseen corner
     # barycentric interpolation is exact for linear fields; float32
-    np.testing.assert_allclose(maps["albedo"].values[sure, 0], 0.2 + 0.5 * u[sure], atol=2e-6)
-    np.testing.assert_allclose(maps["albedo"].values[sure, 1], 0.2 + 0.5 * v[sure], atol=2e-6)
-    np.testing.assert_allclose(maps["weight_0"].values[sure, 0], 0.4 + 0.2 * u[sure], atol=2e-6)
-    np.testing.assert_allclose(maps["translucency"].values[sure], np.tile([2.0, 1.25, 0.8], (sure.sum(), 1)), rtol=1e-6)
+    np.testing.assert_allclose(
+        maps["albedo"].values[sure, 0], 0.2 + 0.5 * u[sure], atol=2e-6
+    )
+    np.testing.assert_allclose(
+        maps["albedo"].values[sure, 1], 0.2 + 0.5 * v[sure], atol=2e-6
+    )
+    np.testing.assert_allclose(
+        maps["weight_0"].values[sure, 0], 0.4 + 0.2 * u[sure], atol=2e-6
+    )
+    np.testing.assert_allclose(
+        maps["translucency"].values[sure],
+        np.tile([2.0, 1.25, 0.8], (sure.sum(), 1)),
+        rtol=1e-6,
+    )
 
 
 def test_texture_maps__unfitted_parts_are_filled_and_marked(model: xr.DataTree) -> None:
@@ -36,7 +48,9 @@ def test_texture_maps__unfitted_parts_are_filled_and_marked(model: xr.DataTree) 
         assert np.isfinite(texture.values).all(), name
     # filled values lie among those around them
     assert (maps["albedo"].values[unseen, 0] > 0.45).all()
-    np.testing.assert_allclose(np.linalg.norm(maps["normal"].values, axis=-1), 1, atol=1e-5)
+    np.testing.assert_allclose(
+        np.linalg.norm(maps["normal"].values, axis=-1), 1, atol=1e-5
+    )
 
 
 def test_texture_maps__values_without_a_fit_never_enter(model: xr.DataTree) -> None:
@@ -50,7 +64,9 @@ def test_texture_maps__values_without_a_fit_never_enter(model: xr.DataTree) -> N
         np.testing.assert_array_equal(after[name].values, texture.values, err_msg=name)
 
 
-def test_texture_maps__status_says_where_each_texel_comes_from(model: xr.DataTree) -> None:
+def test_texture_maps__status_says_where_each_texel_comes_from(
+    model: xr.DataTree,
+) -> None:
     fitted = model["fitted"].to_dataset()
     triangles = model["mesh/triangle"].values
     u, v = fitted["surfel_uv"].values.T
@@ -58,7 +74,9 @@ def test_texture_maps__status_says_where_each_texel_comes_from(model: xr.DataTre
     top = (u < 0.3) & (v < 0.3)
     middle = np.hypot(u - 0.5, v - 0.5) < 0.15
     lower = (v > 0.7) & (u > 0.4) & (u < 0.6)
-    status = np.where(lower, int(FitStatus.DIFFUSE_CLAMPED), fitted["fit_status"].values)
+    status = np.where(
+        lower, int(FitStatus.DIFFUSE_CLAMPED), fitted["fit_status"].values
+    )
     model["fitted"] = fitted.assign(
         fit_status=label("fit_status", status),
         fit_samples=label("fit_samples", np.where(left, 15, 100)),
@@ -88,7 +106,9 @@ def test_texture_maps__status_says_where_each_texel_comes_from(model: xr.DataTre
         (0.9, 0.9, 0),
         (0.5, 0.5, 0),
     ):
-        np.testing.assert_allclose(confidence[int(y * SIZE), int(x * SIZE)], wanted, rtol=1e-6)
+        np.testing.assert_allclose(
+            confidence[int(y * SIZE), int(x * SIZE)], wanted, rtol=1e-6
+        )
     assert "3 doubtful: the fit had fewer than 16 samples" in maps["status"].doc
 
 
@@ -97,7 +117,9 @@ def noisy(model: xr.DataTree, doubtful: np.ndarray) -> dict[str, np.ndarray]:
     fitted = model["fitted"].to_dataset()
     rng = np.random.default_rng(0)
     fitted["fit_status"].values[:] = int(FitStatus.FITTED)
-    tilted = fitted["surfel_normal"].values + rng.normal(scale=0.1, size=(len(doubtful), 3))
+    tilted = fitted["surfel_normal"].values + rng.normal(
+        scale=0.1, size=(len(doubtful), 3)
+    )
     albedo = rng.uniform(0.1, 0.9, (len(doubtful), 3))
     values = {
         "diffuse_reflectance": albedo,
@@ -107,22 +129,35 @@ def noisy(model: xr.DataTree, doubtful: np.ndarray) -> dict[str, np.ndarray]:
         "sigma_tr": 1 / rng.uniform(1, 2, (len(doubtful), 3)),
         "fit_samples": np.where(doubtful, 10, 100),
     }
-    model["fitted"] = fitted.assign({name: label(name, value) for name, value in values.items()})
-    return {name: texture.values for name, texture in texture_maps(model, size=SIZE).items()}
+    model["fitted"] = fitted.assign(
+        {name: label(name, value) for name, value in values.items()}
+    )
+    return {
+        name: texture.values for name, texture in texture_maps(model, size=SIZE).items()
+    }
 
 
-def test_texture_maps__evenly_doubtful_surfels_are_marked_and_not_blurred(model: xr.DataTree) -> None:
+def test_texture_maps__evenly_doubtful_surfels_are_marked_and_not_blurred(
+    model: xr.DataTree,
+) -> None:
     n = model["fitted"].sizes["surfel"]
     sure = noisy(model, np.zeros(n, bool))
     doubtful = noisy(model, np.ones(n, bool))
     inside = sure["confidence"][..., 0] > 0
-    np.testing.assert_allclose(doubtful["confidence"], sure["confidence"] / 2, rtol=1e-6)
+    np.testing.assert_allclose(
+        doubtful["confidence"], sure["confidence"] / 2, rtol=1e-6
+    )
     assert sure["albedo"][inside].std() > 0.1
     for name in set(sure) - {"confidence", "status"}:
-        np.testing.assert_allclose(doubtful[name][inside], sure[name][inside], atol=2e-6, err_msg=name)  # float32
+        # float32
+        np.testing.assert_allclose(
+            doubtful[name][inside], sure[name][inside], atol=2e-6, err_msg=name
+        )
 
 
-def test_texture_maps__a_doubtful_part_is_blurred_at_its_rim_at_most(model: xr.DataTree) -> None:
+def test_texture_maps__a_doubtful_part_is_blurred_at_its_rim_at_most(
+    model: xr.DataTree,
+) -> None:
     u, _ = grid()
     surfel_u = model["fitted/surfel_uv"].values[:, 0]
     sure = noisy(model, np.zeros(len(surfel_u), bool))
@@ -133,7 +168,9 @@ def test_texture_maps__a_doubtful_part_is_blurred_at_its_rim_at_most(model: xr.D
     assert np.abs(part["albedo"][rim] - sure["albedo"][rim]).max() > 0.01
 
 
-def test_texture_maps__a_lone_doubtful_surfel_is_drawn_towards_those_around(model: xr.DataTree) -> None:
+def test_texture_maps__a_lone_doubtful_surfel_is_drawn_towards_those_around(
+    model: xr.DataTree,
+) -> None:
     fitted = model["fitted"].to_dataset()
     lone = np.arange(fitted.sizes["surfel"]) == 10 * 24 + 10
     albedo = np.repeat(np.where(lone, 0.9, 0.3)[:, None], 3, axis=1)
@@ -147,7 +184,9 @@ def test_texture_maps__a_lone_doubtful_surfel_is_drawn_towards_those_around(mode
     assert 0.35 < peak[1] < peak[0] - 0.1
 
 
-def test_texture_maps__without_translucency_there_is_no_such_map(model: xr.DataTree) -> None:
+def test_texture_maps__without_translucency_there_is_no_such_map(
+    model: xr.DataTree,
+) -> None:
     model["fitted"] = model["fitted"].to_dataset().drop_vars("sigma_tr")
     assert set(texture_maps(model, size=SIZE)) == {
         "albedo",
@@ -160,13 +199,19 @@ def test_texture_maps__without_translucency_there_is_no_such_map(model: xr.DataT
     }
 
 
-def test_texture_maps__unknown_translucency_is_left_out_channel_by_channel(model: xr.DataTree) -> None:
+def test_texture_maps__unknown_translucency_is_left_out_channel_by_channel(
+    model: xr.DataTree,
+) -> None:
     whole = texture_maps(model, size=SIZE)["translucency"]
     transport = model["fitted/sigma_tr"].values
-    transport[300, 1] = np.nan  # a channel known elsewhere than the others keeps its place
-    np.testing.assert_allclose(texture_maps(model, size=SIZE)["translucency"].values, whole.values, rtol=1e-6)
+    # a channel known elsewhere than the others keeps its place
+    transport[300, 1] = np.nan
+    np.testing.assert_allclose(
+        texture_maps(model, size=SIZE)["translucency"].values, whole.values, rtol=1e-6
+    )
     transport[:, 2] = np.nan
-    transport[300, 0] = np.nan  # one trusted surfel: filled from around, where it is 2 mm everywhere
+    # one trusted surfel: filled from around, where it is 2 mm everywhere
+    transport[300, 0] = np.nan
     part = texture_maps(model, size=SIZE)["translucency"]
     assert part.channels == ("R", "G")
     np.testing.assert_allclose(part.values, whole.values[..., :2], rtol=1e-6)
@@ -174,7 +219,9 @@ def test_texture_maps__unknown_translucency_is_left_out_channel_by_channel(model
     assert "translucency" not in texture_maps(model, size=SIZE)
 
 
-def test_texture_maps__errors_are_maps_where_the_model_has_them(model: xr.DataTree) -> None:
+def test_texture_maps__errors_are_maps_where_the_model_has_them(
+    model: xr.DataTree,
+) -> None:
     u, _ = grid()
     fitted = model["fitted"].to_dataset()
     at = fitted["surfel_uv"].values[:, :1]
@@ -183,22 +230,35 @@ def test_texture_maps__errors_are_maps_where_the_model_has_them(model: xr.DataTr
     model["fitted"] = fitted.assign(
         diffuse_reflectance_total_error=label("diffuse_reflectance_total_error", wrong),
         normal_total_error=label("normal_total_error", np.full(len(at), 2.0)),
-        surface_reflectance_error=label("surface_reflectance_error", np.full(len(at), np.nan)),
+        surface_reflectance_error=label(
+            "surface_reflectance_error", np.full(len(at), np.nan)
+        ),
     )
     maps = texture_maps(model, size=SIZE)
     assert set(maps) >= {"albedo_error", "normal_error"}
-    assert not {"surface_reflectance", "surface_reflectance_error"} & set(maps)  # absent; known nowhere
+    # absent; known nowhere
+    assert not {"surface_reflectance", "surface_reflectance_error"} & set(maps)
     assert maps["normal_error"].units == "degree"
     np.testing.assert_allclose(maps["normal_error"].values, 2, rtol=1e-6)
     sure = maps["confidence"].values[..., 0] > 0.999
-    away = np.abs(maps["albedo_error"].values[sure] - (0.01 + 0.02 * u[sure][:, None] * [1, 2, 3])).max(axis=1) > 1e-6
-    assert 0 < away.mean() < 0.02  # around the surfel without; exact elsewhere, the error is linear in u
+    away = (
+        np.abs(
+            maps["albedo_error"].values[sure]
+            - (0.01 + 0.02 * u[sure][:, None] * [1, 2, 3])
+        ).max(axis=1)
+        > 1e-6
+    )
+    # around the surfel without; exact elsewhere, the error is linear in u
+    assert 0 < away.mean() < 0.02
     assert np.isfinite(maps["albedo_error"].values).all()
 
 
 def test_texture_maps__nothing_fitted_is_said(model: xr.DataTree) -> None:
-    fitted = model["fitted"].to_dataset().drop_vars("fit_residual")  # of no use here: it may be absent
+    # of no use here: it may be absent
+    fitted = model["fitted"].to_dataset().drop_vars("fit_residual")
     status = np.full(fitted.sizes["surfel"], int(FitStatus.UNSEEN))
     model["fitted"] = fitted.assign(fit_status=label("fit_status", status))
-    with pytest.raises(InputError, match="at least one surfel must be fitted for an export; found none"):
+    with pytest.raises(
+        InputError, match="at least one surfel must be fitted for an export; found none"
+    ):
         texture_maps(model, size=SIZE)

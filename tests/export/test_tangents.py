@@ -9,13 +9,20 @@ from skindb.export.tangents import tangent_frames, to_tangent_space
 
 
 def patch(seed: int, *, mirrored: bool = False):
-    """A curved patch whose texture is turned and stretched; mirrored ones run against the surface."""
+    """A curved patch whose texture is turned and stretched; mirrored ones run against
+    the surface.
+    """
     rng = np.random.default_rng(seed)
     side = 20
     x, y = (a.ravel() for a in np.meshgrid(*2 * [np.linspace(-1, 1, side)]))
     position = np.stack([40 * x, 40 * y, 8 * np.sin(2 * x) * np.cos(y)], axis=1)
     slope = np.stack(
-        [-16 * np.cos(2 * x) * np.cos(y) / 40, 8 * np.sin(2 * x) * np.sin(y) / 40, np.ones_like(x)], axis=1
+        [
+            -16 * np.cos(2 * x) * np.cos(y) / 40,
+            8 * np.sin(2 * x) * np.sin(y) / 40,
+            np.ones_like(x),
+        ],
+        axis=1,
     )
     normal = slope / np.linalg.norm(slope, axis=1, keepdims=True)
     turn = rng.uniform(0, 2 * np.pi)
@@ -25,7 +32,12 @@ def patch(seed: int, *, mirrored: bool = False):
     s = np.sin(turn)
     uv = 0.5 + 0.2 * flat @ np.array([[c, s], [-s, c]])
     i = (np.arange(side - 1)[:, None] * side + np.arange(side - 1)).ravel()
-    faces = np.concatenate([np.stack([i, i + 1, i + side], 1), np.stack([i + 1, i + side + 1, i + side], 1)])
+    faces = np.concatenate(
+        [
+            np.stack([i, i + 1, i + side], 1),
+            np.stack([i + 1, i + side + 1, i + side], 1),
+        ]
+    )
     return position, normal, uv, faces
 
 
@@ -38,18 +50,23 @@ def test_tangent_frames__follow_the_texture(mirrored):
         sign = frames[:, 3]
         np.testing.assert_allclose(np.linalg.norm(tangent, axis=1), 1)
         np.testing.assert_allclose((tangent * normal).sum(axis=1), 0, atol=1e-12)
-        # v grows downwards: with y up in space and down in the texture, an unmirrored texture has the sign -1
+        # v grows downwards: with y up in space and down in the texture, an unmirrored
+        # texture has the sign -1
         assert set(sign) == {1.0 if mirrored else -1.0}
         # the derivative of the position with u, by finite differences over the triangles' corners
         corner = position[faces]
         place = uv[faces]
-        step = np.linalg.solve((place[:, 1:] - place[:, :1]), corner[:, 1:] - corner[:, :1])  # (f, 2, 3)
+        step = np.linalg.solve(
+            (place[:, 1:] - place[:, :1]), corner[:, 1:] - corner[:, :1]
+        )
         along = step[:, 0] / np.linalg.norm(step[:, 0], axis=1, keepdims=True)
         up = -step[:, 1] / np.linalg.norm(step[:, 1], axis=1, keepdims=True)
         mean = tangent[faces].mean(axis=1)
         bitangent = (np.cross(normal, tangent) * sign[:, None])[faces].mean(axis=1)
-        assert (mean * along).sum(axis=1).min() > 0.97  # triangles of 4 mm on a surface that bends
-        assert (bitangent * up).sum(axis=1).min() > 0.75  # a texture that is stretched at an angle is sheared
+        # triangles of 4 mm on a surface that bends
+        assert (mean * along).sum(axis=1).min() > 0.97
+        # a texture that is stretched at an angle is sheared
+        assert (bitangent * up).sum(axis=1).min() > 0.75
 
 
 def test_to_tangent_space__and_back():
@@ -60,10 +77,14 @@ def test_to_tangent_space__and_back():
     bent /= np.linalg.norm(bent, axis=1, keepdims=True)
     local = to_tangent_space(bent, normal, frames)
     bitangent = np.cross(normal, frames[:, :3]) * frames[:, 3:]
-    back = local[:, :1] * frames[:, :3] + local[:, 1:2] * bitangent + local[:, 2:] * normal
+    back = (
+        local[:, :1] * frames[:, :3] + local[:, 1:2] * bitangent + local[:, 2:] * normal
+    )
     np.testing.assert_allclose(back, bent, atol=1e-12)
     np.testing.assert_allclose(
-        to_tangent_space(normal, normal, frames), np.tile([0.0, 0, 1], (len(normal), 1)), atol=1e-12
+        to_tangent_space(normal, normal, frames),
+        np.tile([0.0, 0, 1], (len(normal), 1)),
+        atol=1e-12,
     )
 
 

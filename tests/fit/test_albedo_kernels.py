@@ -1,4 +1,6 @@
-"""The separation of diffuse reflection, compared with NumPy and SciPy in double precision and with its own scatter."""
+"""The separation of diffuse reflection, compared with NumPy and SciPy in double
+precision and with its own scatter.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,9 @@ def _naive_slope(x, y):
     for _ in range(5):
         slope = (weight * x * y).sum() / (weight * x * x).sum()
         residual = y - slope * x
-        weight = _tukey(residual, 1.2533 * (weight * abs(residual)).sum() / weight.sum())
+        weight = _tukey(
+            residual, 1.2533 * (weight * abs(residual)).sum() / weight.sum()
+        )
     return slope
 
 
@@ -47,9 +51,13 @@ def _naive_shape(columns, y, noise=(0.0, 0.0)):
         root = np.sqrt(keep) / level
         x = nnls(columns * root[:, None], y * root)[0]
         level = np.maximum(columns @ x, FLOOR)
-        level = np.hypot(level, np.sqrt((noise[0] + noise[1] * level) / 3) / MODEL_ERROR)
+        level = np.hypot(
+            level, np.sqrt((noise[0] + noise[1] * level) / 3) / MODEL_ERROR
+        )
         residual = (y - columns @ x) / level
-        keep = _tukey(residual, 1.2533 * (keep * abs(residual)).sum() / keep.sum() + 0.005)
+        keep = _tukey(
+            residual, 1.2533 * (keep * abs(residual)).sum() / keep.sum() + 0.005
+        )
     return x
 
 
@@ -81,7 +89,10 @@ def _samples(rng, count, noise=0.03):
 @pytest.mark.parametrize("count", [12, 40, 300])
 def test_robust_slope__is_the_plain_loop(count):
     shape, _, y = _samples(np.random.default_rng(count), count)
-    assert _slope(shape, -2 * y)[0] == pytest.approx(_naive_slope(shape, -2 * y), rel=2e-5)  # single precision
+    # single precision
+    assert _slope(shape, -2 * y)[0] == pytest.approx(
+        _naive_slope(shape, -2 * y), rel=2e-5
+    )
 
 
 @pytest.mark.parametrize("count", [20, 40, 300])
@@ -100,22 +111,38 @@ def test_errors__are_the_scatter_of_repeated_draws(count):
     lobes = rng.uniform(0, 1, (count, 3)) ** 4
     clean = 0.4 * shape + lobes @ np.array([0.05, 0.07, 0.1])
     # noise of unequal variance, as photographs have
-    slopes = np.array([_slope(shape, 0.4 * shape * (1 + 0.03 * rng.normal(size=count))) for _ in range(1500)])
-    shapes = np.array([_shape(shape, lobes, clean * (1 + 0.03 * rng.normal(size=count))) for _ in range(1500)])
+    slopes = np.array(
+        [
+            _slope(shape, 0.4 * shape * (1 + 0.03 * rng.normal(size=count)))
+            for _ in range(1500)
+        ]
+    )
+    shapes = np.array(
+        [
+            _shape(shape, lobes, clean * (1 + 0.03 * rng.normal(size=count)))
+            for _ in range(1500)
+        ]
+    )
     for value, error in (slopes.T, shapes.T):
-        # the scatter of 1500 draws is known to 2 %; small samples lose up to a tenth in the sandwich
+        # the scatter of 1500 draws is known to 2 %; small samples lose up to a tenth in
+        # the sandwich
         assert 0.88 < np.median(error) / value.std() < 1.08
 
 
 def _directions(ds):
     position = ds["surfel_position"].values.astype(float)
-    ways = (ds[f"{name}_position"].values.astype(float) - position[:, None] for name in ("light", "camera"))
+    ways = (
+        ds[f"{name}_position"].values.astype(float) - position[:, None]
+        for name in ("light", "camera")
+    )
     return [way / np.linalg.norm(way, axis=-1, keepdims=True) for way in ways]
 
 
 def _pairs(sample, normal, wi, wo):
     """Lights and cameras of the samples that count."""
-    steep = (wi @ normal > MIN_COSINE_ALBEDO)[:, None] & (wo @ normal > MIN_COSINE_ALBEDO)
+    steep = (wi @ normal > MIN_COSINE_ALBEDO)[:, None] & (
+        wo @ normal > MIN_COSINE_ALBEDO
+    )
     return np.nonzero(steep & np.isfinite(sample).all(-1))
 
 
@@ -124,7 +151,12 @@ def _plain(sample, normal, wi, wo, pairs):
     ci = wi @ normal
     co = wo @ normal
     i, o = pairs
-    shape = ci[i] * fresnel_transmittance(ci[i], 1.3) * fresnel_transmittance(co[o], 1.3) / np.pi
+    shape = (
+        ci[i]
+        * fresnel_transmittance(ci[i], 1.3)
+        * fresnel_transmittance(co[o], 1.3)
+        / np.pi
+    )
     table, _ = surface_lobes()
     angles = half_difference(wi[i], wo[o], np.broadcast_to(normal, wi[i].shape))
     lobes = ci[i][:, None] * lookup(table, *angles)
@@ -150,15 +182,24 @@ def test_separate__is_the_plain_method(separated):
         expected = _plain(*view, _pairs(*view))
         error = found["diffuse_reflectance_error"].values[i]
         # single precision in sums: a hundredth of the noise
-        assert (np.abs(found["diffuse_reflectance"].values[i] - expected) < 0.02 * error + 1e-5).all()
+        assert (
+            np.abs(found["diffuse_reflectance"].values[i] - expected)
+            < 0.02 * error + 1e-5
+        ).all()
 
 
 def test_separate__error_of_the_normal_is_what_turning_it_does(separated):
-    """The first-order formula compared with R_d fitted again with the normal turned by 0.5 degrees about two axes."""
+    """The first-order formula compared with R_d fitted again with the normal turned by
+    0.5 degrees about two axes.
+    """
     ds = separated
-    blind = estimate_diffuse_reflectance(ds)["diffuse_reflectance_error"].values.astype(float)
+    blind = estimate_diffuse_reflectance(ds)["diffuse_reflectance_error"].values.astype(
+        float
+    )
     turned = ds.assign(normal_error=label("normal_error", np.full(12, 0.5)))
-    error = estimate_diffuse_reflectance(turned)["diffuse_reflectance_error"].values.astype(float)
+    error = estimate_diffuse_reflectance(turned)[
+        "diffuse_reflectance_error"
+    ].values.astype(float)
     part = np.sqrt(error**2 - blind**2)
     wi, wo = _directions(ds)
     expected = np.empty((12, 3))
@@ -172,7 +213,10 @@ def test_separate__error_of_the_normal_is_what_turning_it_does(separated):
         for axis in (first, np.cross(n, first)):
             ends = [(n + s * step * axis) / np.hypot(1, step) for s in (-1, 1)]
             low, high = (_plain(sample, end, wi[i], wo[i], pairs) for end in ends)
-            square = square + ((high - low) / 2 * (np.radians(0.5) / np.sqrt(2) / step)) ** 2
+            square = (
+                square + ((high - low) / 2 * (np.radians(0.5) / np.sqrt(2) / step)) ** 2
+            )
         expected[i] = np.sqrt(square)
-    # a full fit may also change its active lobes; a stated error needs no more than a tenth in the median
+    # a full fit may also change its active lobes; a stated error needs no more than a
+    # tenth in the median
     assert np.median(np.abs(part / expected - 1)) < 0.1

@@ -1,11 +1,17 @@
-"""Diffuse reflectance: recovery, independence of highlights, and the paper's rule compared with a plain loop."""
+"""Diffuse reflectance: recovery, independence of highlights, and the paper's rule
+compared with a plain loop.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from skindb.fit import estimate_diffuse_reflectance, estimate_normals, reflectance_interval
+from skindb.fit import (
+    estimate_diffuse_reflectance,
+    estimate_normals,
+    reflectance_interval,
+)
 from skindb.fit._albedo_rules import low_quantile, stable_minimum, surface_lobes
 from skindb.optics.diffuse import diffuse_reflectance
 from skindb.optics.fresnel import fresnel_transmittance
@@ -17,7 +23,9 @@ def _with_normals(skin):
     return skin.lumitexels.assign(shading_normal=label("shading_normal", skin.normal))
 
 
-@pytest.mark.parametrize(("method", "limit"), [("separated", 0.02), ("quantile", 0.08), ("minimum", 0.08)])
+@pytest.mark.parametrize(
+    ("method", "limit"), [("separated", 0.02), ("quantile", 0.08), ("minimum", 0.08)]
+)
 def test_estimate_diffuse_reflectance__recovers_truth(skin, method, limit):
     found = estimate_diffuse_reflectance(_with_normals(skin), method=method)
     error = np.abs(found["diffuse_reflectance"].values / skin.diffuse - 1)
@@ -26,41 +34,71 @@ def test_estimate_diffuse_reflectance__recovers_truth(skin, method, limit):
 
 def test_estimate_diffuse_reflectance__without_gloss_or_noise_is_exact(new_skin):
     skin = new_skin(gloss=0.0, noise=0.0)
-    for method, limit in (("separated", 1e-3), ("quantile", 2e-3), ("minimum", 3e-3)):  # half floats: 5e-4
-        found = estimate_diffuse_reflectance(_with_normals(skin), method=method)["diffuse_reflectance"].values
+    # half floats: 5e-4
+    for method, limit in (("separated", 1e-3), ("quantile", 2e-3), ("minimum", 3e-3)):
+        found = estimate_diffuse_reflectance(_with_normals(skin), method=method)[
+            "diffuse_reflectance"
+        ].values
         assert np.abs(found / skin.diffuse - 1).max() < limit
 
 
 def test_estimate_diffuse_reflectance__white_gloss_leaves_the_colour_alone(new_skin):
     plain, glossy = (new_skin(gloss=g, noise=0.0) for g in (0.0, 0.12))
-    a, b = (estimate_diffuse_reflectance(_with_normals(s))["diffuse_reflectance"].values for s in (plain, glossy))
+    a, b = (
+        estimate_diffuse_reflectance(_with_normals(s))["diffuse_reflectance"].values
+        for s in (plain, glossy)
+    )
     np.testing.assert_allclose(a[:, 0] - a[:, 2], b[:, 0] - b[:, 2], rtol=0.01)
-    # the common part is separated by shape only: three times the gloss of skin changes it by a few per cent
+    # the common part is separated by shape only: three times the gloss of skin changes
+    # it by a few per cent
     assert np.median(np.abs(b / a - 1)) < 0.03
 
 
-@pytest.mark.parametrize(("lights", "cameras", "noise"), [(60, 8, 0.01), (60, 8, 0.05), (150, 16, 0.03)])
-def test_estimate_diffuse_reflectance__interval_covers_95_percent_of_noise(new_skin, lights, cameras, noise):
-    """Rationale: the sandwich of the residuals. Expected: 93 to 97 %; 1500 values give the fraction to 0.6 %."""
-    ds, diffuse = _of_the_model(new_skin, 400, lights, cameras, noise, np.random.default_rng(7))
+@pytest.mark.parametrize(
+    ("lights", "cameras", "noise"), [(60, 8, 0.01), (60, 8, 0.05), (150, 16, 0.03)]
+)
+def test_estimate_diffuse_reflectance__interval_covers_95_percent_of_noise(
+    new_skin, lights, cameras, noise
+):
+    """Rationale: the sandwich of the residuals. Expected: 93 to 97 %; 1500 values give
+    the fraction to 0.6 %.
+    """
+    ds, diffuse = _of_the_model(
+        new_skin, 400, lights, cameras, noise, np.random.default_rng(7)
+    )
     found = estimate_diffuse_reflectance(ds)
-    z = (found["diffuse_reflectance"].values - diffuse) / found["diffuse_reflectance_error"].values
+    z = (found["diffuse_reflectance"].values - diffuse) / found[
+        "diffuse_reflectance_error"
+    ].values
     assert 0.92 < (np.abs(z) < 1.96).mean() < 0.98
-    error, total = (found[f"diffuse_reflectance_{name}"].values.astype(float) for name in ("error", "total_error"))
-    own = np.sqrt(total**2 - 0.01**2 - (0.055 / 1.96) ** 2)  # errors common to a device, here none
+    error, total = (
+        found[f"diffuse_reflectance_{name}"].values.astype(float)
+        for name in ("error", "total_error")
+    )
+    # errors common to a device, here none
+    own = np.sqrt(total**2 - 0.01**2 - (0.055 / 1.96) ** 2)
     assert (own > 0.99 * error).all()
     assert np.median(own / error) < 1.4
 
 
-def test_estimate_diffuse_reflectance__total_error_counts_what_lights_and_cameras_have_in_common(new_skin):
-    """Rationale: a wrong gain is an error of all samples of a device. Expected: 95 %, less with few cameras."""
+def test_estimate_diffuse_reflectance__total_error_counts_what_lights_and_cameras_have_in_common(
+    new_skin,
+):
+    """Rationale: a wrong gain is an error of all samples of a device. Expected: 95 %,
+    less with few cameras.
+    """
     ds, diffuse = _of_the_model(new_skin, 400, 60, 6, 0.01, np.random.default_rng(9))
     rng = np.random.default_rng(10)
-    gain = (1 + 0.06 * rng.normal(size=(400, 60, 1, 1))) * (1 + 0.06 * rng.normal(size=(400, 1, 6, 1)))
+    gain = (1 + 0.06 * rng.normal(size=(400, 60, 1, 1))) * (
+        1 + 0.06 * rng.normal(size=(400, 1, 6, 1))
+    )
     seen = (ds["reflectance_sample"].values * gain).astype(np.float16)
     wrong = ds.assign(reflectance_sample=label("reflectance_sample", seen))
     found = estimate_diffuse_reflectance(wrong, even_reflection=0.0)
-    error, total = (found[f"diffuse_reflectance_{name}"].values.astype(float) for name in ("error", "total_error"))
+    error, total = (
+        found[f"diffuse_reflectance_{name}"].values.astype(float)
+        for name in ("error", "total_error")
+    )
     off = np.abs(found["diffuse_reflectance"].values - diffuse)
     assert (off < 1.96 * error).mean() < 0.75
     assert 0.85 < (off < 1.96 * np.sqrt(total**2 - 0.01**2)).mean() < 0.97
@@ -70,28 +108,47 @@ def test_reflectance_interval__even_reflection_acts_downwards():
     fitted = dataset(
         {
             "diffuse_reflectance": np.array([[0.4, 0.2, 0.1]], np.float32),
-            "diffuse_reflectance_total_error": np.hypot(np.array([[0.01, 0.0, 0.02]], np.float32), 0.055 / 1.96),
+            "diffuse_reflectance_total_error": np.hypot(
+                np.array([[0.01, 0.0, 0.02]], np.float32), 0.055 / 1.96
+            ),
             "even_reflection_limit": 0.055,
         }
     )
     low, high = reflectance_interval(fitted)
     np.testing.assert_allclose(high, [[0.4196, 0.2, 0.1392]], atol=1e-5)
-    np.testing.assert_allclose(low, [[0.4 - np.hypot(0.0196, 0.055), 0.145, 0.1 - np.hypot(0.0392, 0.055)]], atol=1e-5)
+    np.testing.assert_allclose(
+        low,
+        [[0.4 - np.hypot(0.0196, 0.055), 0.145, 0.1 - np.hypot(0.0392, 0.055)]],
+        atol=1e-5,
+    )
 
 
 @pytest.mark.parametrize("gloss", [0.0, 0.3])
-def test_estimate_diffuse_reflectance__interval_covers_95_percent_with_found_normals(new_skin, gloss):
-    """Rationale: the normal's error reaches R_d through the cosines. Expected: 95 %, without it 80 to 90 %.
+def test_estimate_diffuse_reflectance__interval_covers_95_percent_with_found_normals(
+    new_skin, gloss
+):
+    """Rationale: the normal's error reaches R_d through the cosines. Expected: 95 %,
+    without it 80 to 90 %.
 
-    The channels share most of their error: 400 independent trials know the share to 1.1 %, three of which are allowed.
+    The channels share most of their error: 400 independent trials know the share to 1.1
+    %, three of which are allowed.
     """
-    ds, diffuse = _of_the_model(new_skin, 400, 60, 8, 0.01, np.random.default_rng(8), gloss=gloss)
+    ds, diffuse = _of_the_model(
+        new_skin, 400, 60, 8, 0.01, np.random.default_rng(8), gloss=gloss
+    )
     turned = estimate_normals(ds)
-    found = estimate_diffuse_reflectance(ds.assign(turned[["shading_normal", "normal_error"]]))
+    found = estimate_diffuse_reflectance(
+        ds.assign(turned[["shading_normal", "normal_error"]])
+    )
     blind = estimate_diffuse_reflectance(ds.assign(turned[["shading_normal"]]))
-    np.testing.assert_array_equal(found["diffuse_reflectance"], blind["diffuse_reflectance"])
+    np.testing.assert_array_equal(
+        found["diffuse_reflectance"], blind["diffuse_reflectance"]
+    )
     share, without = (
-        (np.abs(f["diffuse_reflectance"] - diffuse) < 1.96 * f["diffuse_reflectance_error"]).values.mean()
+        (
+            np.abs(f["diffuse_reflectance"] - diffuse)
+            < 1.96 * f["diffuse_reflectance_error"]
+        ).values.mean()
         for f in (found, blind)
     )
     assert abs(share - 0.95) < 0.033
@@ -99,29 +156,48 @@ def test_estimate_diffuse_reflectance__interval_covers_95_percent_with_found_nor
 
 
 def _of_the_model(new_skin, surfels, lights, cameras, noise, rng, gloss=0.3):
-    """Samples of diffuse light and of two lobes that the fit contains, by public functions, with relative noise."""
-    skin = new_skin(surfels=surfels, lights=lights, cameras=cameras, seed=int(rng.integers(1000)))
+    """Samples of diffuse light and of two lobes that the fit contains, by public
+    functions, with relative noise.
+    """
+    skin = new_skin(
+        surfels=surfels, lights=lights, cameras=cameras, seed=int(rng.integers(1000))
+    )
     ds = _with_normals(skin)
     position = ds["surfel_position"].values.astype(float)
-    wi, wo = (ds[f"{name}_position"].values - position[:, None] for name in ("light", "camera"))
+    wi, wo = (
+        ds[f"{name}_position"].values - position[:, None]
+        for name in ("light", "camera")
+    )
     wi, wo = (v / np.linalg.norm(v, axis=-1, keepdims=True) for v in (wi, wo))
     ci = np.einsum("nk,ntk->nt", skin.normal, wi)
     co = np.einsum("nk,ntk->nt", skin.normal, wo)
     table, grid = surface_lobes()
-    rows, offsets, index = basis_rows(table, grid, skin.normal, wi, wo, (ci > 0)[:, :, None] & (co > 0)[:, None])
+    rows, offsets, index = basis_rows(
+        table, grid, skin.normal, wi, wo, (ci > 0)[:, :, None] & (co > 0)[:, None]
+    )
     s, (i, o) = np.repeat(np.arange(surfels), np.diff(offsets)), index.T
-    weight = rng.uniform(0, gloss, (surfels, 6)) * (rng.permuted(np.tile(np.arange(6), (surfels, 1)), axis=1) < 2)
-    body = (ci * fresnel_transmittance(ci.clip(0, 1), 1.3))[s, i] * fresnel_transmittance(co.clip(0, 1), 1.3)[s, o]
-    value = body[:, None] / np.pi * skin.diffuse[s] + np.einsum("tm,tm->t", rows, weight[s])[:, None]
+    weight = rng.uniform(0, gloss, (surfels, 6)) * (
+        rng.permuted(np.tile(np.arange(6), (surfels, 1)), axis=1) < 2
+    )
+    body = (ci * fresnel_transmittance(ci.clip(0, 1), 1.3))[
+        s, i
+    ] * fresnel_transmittance(co.clip(0, 1), 1.3)[s, o]
+    value = (
+        body[:, None] / np.pi * skin.diffuse[s]
+        + np.einsum("tm,tm->t", rows, weight[s])[:, None]
+    )
     sample = np.full((surfels, lights, cameras, 3), np.nan)
     sample[s, i, o] = value * (1 + noise * rng.normal(size=value.shape))
-    return ds.assign(reflectance_sample=label("reflectance_sample", sample)), skin.diffuse
+    return ds.assign(
+        reflectance_sample=label("reflectance_sample", sample)
+    ), skin.diffuse
 
 
 def test_estimate_diffuse_reflectance__dipole_s_inverts_eq5(skin):
     found = estimate_diffuse_reflectance(_with_normals(skin))
     again = diffuse_reflectance(found["dipole_s"].values, eta=1.3)
-    np.testing.assert_allclose(again, found["diffuse_reflectance"].values, rtol=1e-5)  # stored float32
+    # stored float32
+    np.testing.assert_allclose(again, found["diffuse_reflectance"].values, rtol=1e-5)
 
 
 def test_estimate_diffuse_reflectance__too_few_samples_are_nan(skin):
@@ -135,7 +211,9 @@ def test_estimate_diffuse_reflectance__too_few_samples_are_nan(skin):
 def test_estimate_diffuse_reflectance__black_and_overbright_are_clamped(skin):
     lumitexels = _with_normals(skin)
     for factor, limit in ((0.0, 1e-4), (20.0, 0.9999)):
-        scaled = lumitexels.assign(reflectance_sample=lumitexels["reflectance_sample"] * np.float16(factor))
+        scaled = lumitexels.assign(
+            reflectance_sample=lumitexels["reflectance_sample"] * np.float16(factor)
+        )
         scaled["reflectance_sample"].attrs = lumitexels["reflectance_sample"].attrs
         found = estimate_diffuse_reflectance(scaled)["diffuse_reflectance"].values
         np.testing.assert_allclose(found, limit, rtol=1e-6)
@@ -143,7 +221,9 @@ def test_estimate_diffuse_reflectance__black_and_overbright_are_clamped(skin):
 
 def test_stable_minimum__without_penalty_is_the_rank():
     rng = np.random.default_rng(3)
-    ratio = np.where(rng.uniform(size=(5, 40, 3)) < 0.2, np.nan, rng.uniform(0.2, 0.9, (5, 40, 3)))
+    ratio = np.where(
+        rng.uniform(size=(5, 40, 3)) < 0.2, np.nan, rng.uniform(0.2, 0.9, (5, 40, 3))
+    )
     found, _ = stable_minimum(ratio, np.ones((5, 40)), 3)
     np.testing.assert_array_equal(found, np.sort(ratio, axis=1)[:, 3])
 
@@ -159,7 +239,10 @@ def test_stable_minimum__grazing_values_are_passed_over():
 
 def test_low_quantile__bias_does_not_grow_with_the_number_of_samples():
     rng = np.random.default_rng(4)
-    means = [low_quantile(0.4 + 0.02 * rng.normal(size=(200, n, 3)))[0].mean() for n in (100, 1600)]
+    means = [
+        low_quantile(0.4 + 0.02 * rng.normal(size=(200, n, 3)))[0].mean()
+        for n in (100, 1600)
+    ]
     assert abs(means[0] - means[1]) < 0.002
     # the tenth percentile of noise lies 1.2816 deviations low; half of that is given back
     assert abs(means[1] - (0.4 - 0.6408 * 0.02)) < 0.001
@@ -175,13 +258,19 @@ def test_estimate_diffuse_reflectance__grazing_samples_do_not_count(skin, method
     spoiled = lumitexels["reflectance_sample"].copy(deep=True)
     for name, axis in (("light_position", 1), ("camera_position", 2)):
         way = lumitexels[name].values - position[:, None]
-        cosine = np.einsum("nk,ntk->nt", skin.normal, way / np.linalg.norm(way, axis=-1, keepdims=True))
+        cosine = np.einsum(
+            "nk,ntk->nt", skin.normal, way / np.linalg.norm(way, axis=-1, keepdims=True)
+        )
         grazing = np.expand_dims(cosine < 0.24, (3 - axis, 3))
         spoiled.values[np.broadcast_to(grazing, spoiled.shape)] *= 0.3
     assert (spoiled != lumitexels["reflectance_sample"]).any()
-    found = estimate_diffuse_reflectance(lumitexels.assign(reflectance_sample=spoiled), method=method)
+    found = estimate_diffuse_reflectance(
+        lumitexels.assign(reflectance_sample=spoiled), method=method
+    )
     clean = estimate_diffuse_reflectance(lumitexels, method=method)
-    np.testing.assert_allclose(found["diffuse_reflectance"], clean["diffuse_reflectance"], rtol=1e-6)
+    np.testing.assert_allclose(
+        found["diffuse_reflectance"], clean["diffuse_reflectance"], rtol=1e-6
+    )
 
 
 def test_estimate_diffuse_reflectance__any_chunking(skin):

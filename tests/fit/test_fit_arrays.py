@@ -18,7 +18,9 @@ from skindb.fit.sample_noise import NO_NOISE, TypicalNoise, noise_of
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_quantile_finite__is_nanquantile(axis):
     rng = np.random.default_rng(0)
-    values = np.where(rng.uniform(size=(7, 8, 9)) < 0.3, np.nan, rng.normal(size=(7, 8, 9)))
+    values = np.where(
+        rng.uniform(size=(7, 8, 9)) < 0.3, np.nan, rng.normal(size=(7, 8, 9))
+    )
     for share in (0.0, 0.3, 1.0):
         expected = np.nanquantile(values, share, axis=axis, method="nearest")
         np.testing.assert_array_equal(quantile_finite(values, share, axis), expected)
@@ -31,11 +33,19 @@ def test_quantile_finite__nothing_finite_is_nan_without_warning():
 
 def test_quantile_finite__counts_ranks():
     values = np.array([[5.0, np.nan, 1.0, 4.0, 2.0, 3.0]])
-    assert [quantile_finite(values, q, 1)[0] for q in (0.0, 0.25, 0.5, 1.0)] == [1.0, 2.0, 3.0, 5.0]
+    assert [quantile_finite(values, q, 1)[0] for q in (0.0, 0.25, 0.5, 1.0)] == [
+        1.0,
+        2.0,
+        3.0,
+        5.0,
+    ]
 
 
 def test_unit__no_direction_is_nan():
-    np.testing.assert_array_equal(unit(np.array([[0.0, 3.0, 4.0], [0.0, 0.0, 0.0]])), [[0, 0.6, 0.8], [np.nan] * 3])
+    np.testing.assert_array_equal(
+        unit(np.array([[0.0, 3.0, 4.0], [0.0, 0.0, 0.0]])),
+        [[0, 0.6, 0.8], [np.nan] * 3],
+    )
 
 
 def test_in_batches__joins_slices_and_takes_none():
@@ -54,8 +64,12 @@ def test_segments__sums_spread_and_scatter_as_loops_do():
     sums = [values[a:b].sum() for a, b in pairwise(offsets) if b > a]
     np.testing.assert_allclose(segments.sum(values), sums, rtol=1e-14)
     np.testing.assert_array_equal(segments.owner, np.repeat(np.arange(6), sizes))
-    np.testing.assert_array_equal(segments.spread(np.array([1.0, 2.0, 3.0])), [1, 1, 1, 2, 3, 3, 3, 3, 3])
-    np.testing.assert_array_equal(np.isnan(segments.scatter(np.ones((3, 2)))[:, 0]), sizes == 0)
+    np.testing.assert_array_equal(
+        segments.spread(np.array([1.0, 2.0, 3.0])), [1, 1, 1, 2, 3, 3, 3, 3, 3]
+    )
+    np.testing.assert_array_equal(
+        np.isnan(segments.scatter(np.ones((3, 2)))[:, 0]), sizes == 0
+    )
 
 
 def test_segments__without_any_sample():
@@ -85,7 +99,11 @@ def test_weigh__noise_over_the_error_of_models_in_plain_numpy(mode):
         return y / np.cbrt(y * y + floor * floor) if mode == "perceptual" else y
 
     h = 1e-7
-    spread = (root(level + h) - root(level - h)) / (2 * h) * np.sqrt((noise**2 + shot * level) / 3)
+    spread = (
+        (root(level + h) - root(level - h))
+        / (2 * h)
+        * np.sqrt((noise**2 + shot * level) / 3)
+    )
     own = MODEL_ERROR * mean if mode == "linear" else MODEL_ERROR / 3 * root(mean)
     np.testing.assert_allclose(weight[:count], 1 / (1 + (spread / own) ** 2), rtol=1e-4)
     assert weight[:count].max() > 1.1 * weight[:count].min()

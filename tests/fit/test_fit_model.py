@@ -37,7 +37,9 @@ HELD_OUT = FitParameters(k=3, rank=6, hold_out_lights=0.1, hold_out_cameras=0.1,
 
 @pytest.fixture(scope="module")
 def planted(skin, small_dictionary, plant):
-    lumitexels, _ = plant(skin, small_dictionary, np.random.default_rng(9), noise=0.005, scale=0.1)
+    lumitexels, _ = plant(
+        skin, small_dictionary, np.random.default_rng(9), noise=0.005, scale=0.1
+    )
     return capture_of(replace(skin, lumitexels=lumitexels), unseen=[4, 11])
 
 
@@ -55,7 +57,16 @@ def fitted(planted, small_dictionary):
 
 def test_fit_model__returns_what_the_schema_declares(fitted, skin):
     model, _ = fitted
-    groups = {"fitted", "basis", "mesh", "dome", "probe", "translucency", "outliers", "held_out"}
+    groups = {
+        "fitted",
+        "basis",
+        "mesh",
+        "dome",
+        "probe",
+        "translucency",
+        "outliers",
+        "held_out",
+    }
     assert set(model.children) == groups
     for group in ("fitted", "basis", "translucency", "outliers", "held_out"):
         check(model[group].to_dataset(), [v.name for v in GROUPS[group]], where=group)
@@ -70,12 +81,19 @@ def test_fit_model__recovers_truth(fitted, skin):
     cosine = np.einsum("nk,nk->n", found["shading_normal"].values, skin.normal)[seen]
     assert np.degrees(np.arccos(np.clip(cosine, -1, 1))).max() < 2.5
     error = np.abs(found["diffuse_reflectance"].values / skin.diffuse - 1)[seen]
-    assert np.median(error) < 0.15  # the materials have diffuse parts, which cannot be separated
+    # the materials have diffuse parts, which cannot be separated
+    assert np.median(error) < 0.15
     assert np.median(found["held_out_error"].values[seen]) < 0.02
     assert np.median(found["held_out_camera_error"].values[seen]) < 0.02
     true = sigma_tr(SIGMA_A, SIGMA_S)
-    np.testing.assert_allclose(found["sigma_tr"].values, np.tile(true, (len(seen), 1)), rtol=1e-3)
-    assert model.attrs["parameters"]["profile"] == model["translucency"].attrs["profile"] == "transport"
+    np.testing.assert_allclose(
+        found["sigma_tr"].values, np.tile(true, (len(seen), 1)), rtol=1e-3
+    )
+    assert (
+        model.attrs["parameters"]["profile"]
+        == model["translucency"].attrs["profile"]
+        == "transport"
+    )
 
 
 def test_fit_model__unseen_surfels_have_a_status_and_nothing_else(fitted):
@@ -103,7 +121,9 @@ def test_fit_model__report(fitted):
     assert len(attrs["held_out_cameras"]) == 1
     assert attrs["suspects"] == []
     sites = model["translucency"].to_dataset()
-    assert json.loads(json.dumps(attrs["translucency"])) == summarise_translucency(sites)
+    assert json.loads(json.dumps(attrs["translucency"])) == summarise_translucency(
+        sites
+    )
     assert tabulate_translucency(attrs) == tabulate_translucency(sites)
     assert any("2 of 40 are skipped" in line for line in attrs["skipped"])
     assert attrs["parameters"] == HELD_OUT.as_dict()
@@ -116,29 +136,42 @@ def test_fit_model__report(fitted):
 def test_fit_model__same_seed_same_model(fitted, planted, small_dictionary):
     again = fit_model(planted, HELD_OUT, dictionary=small_dictionary)
     for group in ("fitted", "basis", "translucency"):
-        # rounding of BLAS depends on the alignment of arrays, so that the last digit of float32 may differ
-        xr.testing.assert_allclose(fitted[0][group].to_dataset(), again[group].to_dataset(), rtol=1e-6)
+        # rounding of BLAS depends on the alignment of arrays, so that the last digit of
+        # float32 may differ
+        xr.testing.assert_allclose(
+            fitted[0][group].to_dataset(), again[group].to_dataset(), rtol=1e-6
+        )
 
 
 def test_fit_model__blocks_change_nothing(fitted, planted, small_dictionary):
-    """Lazy samples in blocks of 7 surfels give the same as one block, within the rounding of single precision."""
+    """Lazy samples in blocks of 7 surfels give the same as one block, within the
+    rounding of single precision.
+    """
     blocked = planted.copy()
     blocked["samples"] = xr.DataTree(planted["samples"].to_dataset().chunk(surfel=7))
     again = fit_model(blocked, HELD_OUT, dictionary=small_dictionary)
     for group in ("fitted", "basis", "outliers"):
-        xr.testing.assert_allclose(fitted[0][group].to_dataset(), again[group].to_dataset(), rtol=1e-5)
+        xr.testing.assert_allclose(
+            fitted[0][group].to_dataset(), again[group].to_dataset(), rtol=1e-5
+        )
 
 
 def test_fit_model__is_its_two_passes(fitted, planted, small_dictionary):
     first = first_pass(planted, HELD_OUT, dictionary=small_dictionary)
     assert set(first.children) == {"fitted", "held_out"}
     model = second_pass(planted, first, dictionary=small_dictionary)
-    xr.testing.assert_allclose(fitted[0]["fitted"].to_dataset(), model["fitted"].to_dataset(), rtol=1e-6)
+    xr.testing.assert_allclose(
+        fitted[0]["fitted"].to_dataset(), model["fitted"].to_dataset(), rtol=1e-6
+    )
     assert {**model.attrs, "seconds": 0} == {**fitted[0].attrs, "seconds": 0}
 
 
-def test_fit_model__passes_are_their_separate_methods(fitted, planted, small_dictionary):
-    """Each method, called with the results of those before it, gives the same as the fused passes."""
+def test_fit_model__passes_are_their_separate_methods(
+    fitted, planted, small_dictionary
+):
+    """Each method, called with the results of those before it, gives the same as the
+    fused passes.
+    """
     model, _ = fitted
     held_out = model["held_out"].to_dataset()
     found = model["fitted"].to_dataset()
@@ -146,7 +179,11 @@ def test_fit_model__passes_are_their_separate_methods(fitted, planted, small_dic
     work = fitted_part(whole, held_out)
     alone = estimate_normals(work)
     alone = alone.merge(estimate_diffuse_reflectance(work.merge(alone)))
-    alone = alone.merge(fit_surface(work.merge(alone), dictionary=_averaged(small_dictionary, whole), rank=6))
+    alone = alone.merge(
+        fit_surface(
+            work.merge(alone), dictionary=_averaged(small_dictionary, whole), rank=6
+        )
+    )
     basis = model["basis"].to_dataset()
     alone = alone.merge(refit(work.merge(alone), basis=basis))
     known = alone[["shading_normal", "diffuse_reflectance", "basis_weight"]]
@@ -158,11 +195,28 @@ def test_fit_model__passes_are_their_separate_methods(fitted, planted, small_dic
         samples = whole.isel(index)
         alone = alone.merge(held_out_error(samples.merge(known), basis=basis, of=dim))
     names = [name for name in found.data_vars if name in alone]
-    assert {*ERRORS["light"], *ERRORS["camera"], "fit_residual", "outlier_fraction", "basis_weight"} <= set(names)
+    assert {
+        *ERRORS["light"],
+        *ERRORS["camera"],
+        "fit_residual",
+        "outlier_fraction",
+        "basis_weight",
+    } <= set(names)
     for name in names:
-        np.testing.assert_allclose(found[name].values, alone[name].values, rtol=2e-4, atol=2e-6, err_msg=str(name))
+        np.testing.assert_allclose(
+            found[name].values,
+            alone[name].values,
+            rtol=2e-4,
+            atol=2e-6,
+            err_msg=str(name),
+        )
     for name in model["outliers"].data_vars:
-        np.testing.assert_allclose(model["outliers"][name].values, alone[name].values, rtol=1e-6, err_msg=str(name))
+        np.testing.assert_allclose(
+            model["outliers"][name].values,
+            alone[name].values,
+            rtol=1e-6,
+            err_msg=str(name),
+        )
 
 
 def _averaged(dictionary, whole):
@@ -174,16 +228,22 @@ def _averaged(dictionary, whole):
 
 def test_second_pass__refuses_another_first_pass(planted, small_dictionary, skin):
     first = first_pass(planted, HELD_OUT, dictionary=small_dictionary)
-    with pytest.raises(InputError, match="dictionary: both passes need the same dictionary"):
+    with pytest.raises(
+        InputError, match="dictionary: both passes need the same dictionary"
+    ):
         second_pass(planted, first)
     fewer = first.copy()
     fewer["fitted"] = xr.DataTree(first["fitted"].to_dataset().isel(surfel=slice(30)))
-    with pytest.raises(InputError, match="both passes need the same capture; found 30 surfels of 40"):
+    with pytest.raises(
+        InputError, match="both passes need the same capture; found 30 surfels of 40"
+    ):
         second_pass(planted, fewer, dictionary=small_dictionary)
 
 
 def test_fit_model__never_sees_what_is_held_out(fitted, planted, small_dictionary):
-    """Extreme samples, NaN and inf at held-out lights and cameras change nothing except the errors there."""
+    """Extreme samples, NaN and inf at held-out lights and cameras change nothing except
+    the errors there.
+    """
     model, _ = fitted
     wild = planted.copy()
     samples = planted["samples"].to_dataset().copy(deep=True)
@@ -198,7 +258,10 @@ def test_fit_model__never_sees_what_is_held_out(fitted, planted, small_dictionar
     again = fit_model(wild, HELD_OUT, dictionary=small_dictionary)
     errors = [name for pair in ERRORS.values() for name in pair]
     for group in ("fitted", "basis", "translucency"):
-        left, right = (tree[group].to_dataset().drop_vars(errors, errors="ignore") for tree in (model, again))
+        left, right = (
+            tree[group].to_dataset().drop_vars(errors, errors="ignore")
+            for tree in (model, again)
+        )
         xr.testing.assert_allclose(left, right, rtol=1e-6)
     for name in ("held_out_error", "held_out_camera_error"):
         assert np.nanmedian(again["fitted"][name].values) > 0.5
@@ -208,16 +271,25 @@ def test_fit_model__never_sees_what_is_held_out(fitted, planted, small_dictionar
 def _held(capture, **options):
     parameters = FitParameters(**options)
     flags = hold_out(capture, plan_fit(capture, parameters), parameters)
-    return {dim: flags[dim].values[flags[f"{dim}_held_out"].values > 0].tolist() for dim in ("light", "camera")}
+    return {
+        dim: flags[dim].values[flags[f"{dim}_held_out"].values > 0].tolist()
+        for dim in ("light", "camera")
+    }
 
 
 def test_hold_out__those_of_photographs_first(skin):
     capture = capture_of(skin, unseen=[3])
-    capture["photographs"] = xr.DataTree(dataset({"photograph_light": [7, 9], "photograph_camera": [2, 5]}))
+    capture["photographs"] = xr.DataTree(
+        dataset({"photograph_light": [7, 9], "photograph_camera": [2, 5]})
+    )
     found = _held(capture, hold_out_lights=0.03, hold_out_cameras=0.25, seed=1)
     assert found == {"light": ["l07", "l09"], "camera": ["c2", "c5"]}
     options = {"hold_out_lights": 0.5, "hold_out_cameras": 0.5}
-    assert _held(capture, **options, seed=4) == _held(capture, **options, seed=4) != _held(capture, **options, seed=5)
+    assert (
+        _held(capture, **options, seed=4)
+        == _held(capture, **options, seed=4)
+        != _held(capture, **options, seed=5)
+    )
 
 
 def test_hold_out__one_camera_always_remains(skin):
@@ -225,9 +297,14 @@ def test_hold_out__one_camera_always_remains(skin):
     found = _held(capture, hold_out_lights=0.99, hold_out_cameras=0.99, seed=1)
     assert (len(found["light"]), len(found["camera"])) == (59, 7)
     blind = capture["surfels"].to_dataset()
-    blind["camera_visible_fraction"] = blind["camera_visible_fraction"] * (np.arange(8) == 6)
+    blind["camera_visible_fraction"] = blind["camera_visible_fraction"] * (
+        np.arange(8) == 6
+    )
     capture["surfels"] = xr.DataTree(blind)
-    with pytest.raises(InputError, match="to hold out a camera, two or more must reach the subject; found 1"):
+    with pytest.raises(
+        InputError,
+        match="to hold out a camera, two or more must reach the subject; found 1",
+    ):
         _held(capture, hold_out_cameras=0.1, seed=1)
 
 
@@ -237,12 +314,21 @@ def test_fit_model__nothing_to_fit_is_one_line(skin, small_dictionary):
 
 
 def test_fit_model__more_components_than_the_dictionary_has(planted, small_dictionary):
-    with pytest.raises(InputError, match="k: a reduced basis of this dictionary has 1 to 6 components; found 7"):
+    with pytest.raises(
+        InputError,
+        match="k: a reduced basis of this dictionary has 1 to 6 components; found 7",
+    ):
         fit_model(planted, FitParameters(k=7), dictionary=small_dictionary)
 
 
-def test_fit_model__without_a_probe_translucency_is_skipped_and_reported(skin, small_dictionary):
-    model = fit_model(capture_of(skin, probe=False), FitParameters(k=2, rank=6), dictionary=small_dictionary)
+def test_fit_model__without_a_probe_translucency_is_skipped_and_reported(
+    skin, small_dictionary
+):
+    model = fit_model(
+        capture_of(skin, probe=False),
+        FitParameters(k=2, rank=6),
+        dictionary=small_dictionary,
+    )
     assert "translucency" not in model.children
     assert "sigma_tr" not in model["fitted"]
     assert any("translucency" in line for line in model.attrs["skipped"])
@@ -251,18 +337,33 @@ def test_fit_model__without_a_probe_translucency_is_skipped_and_reported(skin, s
 
 def test_fit_parameters__every_fault_at_once():
     with pytest.raises(InputError) as caught:
-        FitParameters(k=0, mode="both", rank=0, eta=float("nan"), hold_out_lights=1.0, seed=-1)  # type: ignore[arg-type]
-    assert [fault.where for fault in caught.value.faults] == ["k", "mode", "rank", "eta", "hold_out_lights", "seed"]
+        FitParameters(
+            k=0, mode="both", rank=0, eta=float("nan"), hold_out_lights=1.0, seed=-1
+        )  # type: ignore[arg-type]
+    assert [fault.where for fault in caught.value.faults] == [
+        "k",
+        "mode",
+        "rank",
+        "eta",
+        "hold_out_lights",
+        "seed",
+    ]
 
 
-def test_fit_model__two_generations_are_subtracted_by_plain_xarray(fitted, planted, small_dictionary):
+def test_fit_model__two_generations_are_subtracted_by_plain_xarray(
+    fitted, planted, small_dictionary
+):
     """Every variable is a number, because the difference of boolean variables raises an error."""
     first = fitted[0]["fitted"].to_dataset()
-    second = fit_model(planted, replace(HELD_OUT, seed=6), dictionary=small_dictionary)["fitted"].to_dataset()
+    second = fit_model(planted, replace(HELD_OUT, seed=6), dictionary=small_dictionary)[
+        "fitted"
+    ].to_dataset()
     apart = (second - first).compute()
     assert set(apart.data_vars) == set(first.data_vars)
     change = apart["diffuse_reflectance"].values
-    expected = second["diffuse_reflectance"].values - first["diffuse_reflectance"].values
+    expected = (
+        second["diffuse_reflectance"].values - first["diffuse_reflectance"].values
+    )
     np.testing.assert_array_equal(change, expected)
     assert np.nanmax(np.abs(change)) > 0  # other lights were held out
     for group in ("basis", "held_out", "outliers", "translucency"):
@@ -275,41 +376,68 @@ def test_fit_model__two_generations_are_subtracted_by_plain_xarray(fitted, plant
 def test_fit_model__basis_brdf_is_interpolated_over_the_closed_period(fitted):
     brdf = fitted[0]["basis"].to_dataset()["basis_brdf"].compute()
     phi = np.linspace(0, np.pi, 181)
-    found = brdf.interp(phi_d=phi, theta_h=[0.0, 0.3, np.pi / 2], theta_d=[0.0, 1.0, np.pi / 2])
+    found = brdf.interp(
+        phi_d=phi, theta_h=[0.0, 0.3, np.pi / 2], theta_d=[0.0, 1.0, np.pi / 2]
+    )
     assert found.sizes["phi_d"] == 181
     assert np.isfinite(found.values).all()
-    np.testing.assert_allclose(found.isel(phi_d=0), found.isel(phi_d=-1), rtol=2e-6)  # single precision
-    # between two nodes the values are theirs in proportion, in the last cell of the period as in any other
+    # single precision
+    np.testing.assert_allclose(found.isel(phi_d=0), found.isel(phi_d=-1), rtol=2e-6)
+    # between two nodes the values are theirs in proportion, in the last cell of the
+    # period as in any other
     nodes = brdf["phi_d"].values
     k = brdf.sizes["phi_d"] - 2
     middle = brdf.interp(phi_d=(nodes[k] + nodes[k + 1]) / 2)
-    np.testing.assert_allclose(middle, (brdf.isel(phi_d=k) + brdf.isel(phi_d=0)) / 2, rtol=1e-6, atol=1e-7)
+    np.testing.assert_allclose(
+        middle, (brdf.isel(phi_d=k) + brdf.isel(phi_d=0)) / 2, rtol=1e-6, atol=1e-7
+    )
 
 
 def test_fit_model__light_gains_lower_the_held_out_error(planted, small_dictionary):
-    gain = 1 + 0.15 * np.clip(np.random.default_rng(3).normal(size=planted["samples"].sizes["light"]), -2, 2)
+    gain = 1 + 0.15 * np.clip(
+        np.random.default_rng(3).normal(size=planted["samples"].sizes["light"]), -2, 2
+    )
     wrong = planted.copy()
     one = np.ones((gain.size, 3))
-    wrong["dome"] = wrong["dome"].to_dataset().assign(light_intensity=label("light_intensity", one))
+    wrong["dome"] = (
+        wrong["dome"].to_dataset().assign(light_intensity=label("light_intensity", one))
+    )
     samples = planted["samples"].to_dataset()
-    brighter = (samples["reflectance_sample"].values.astype(np.float32) * gain[:, None, None]).astype(np.float16)
-    wrong["samples"] = samples.assign(reflectance_sample=label("reflectance_sample", brighter))
+    brighter = (
+        samples["reflectance_sample"].values.astype(np.float32) * gain[:, None, None]
+    ).astype(np.float16)
+    wrong["samples"] = samples.assign(
+        reflectance_sample=label("reflectance_sample", brighter)
+    )
     plain, mended = (
-        fit_model(wrong, FitParameters(k=2, hold_out_lights=0.2, light_gains=on), dictionary=small_dictionary)
+        fit_model(
+            wrong,
+            FitParameters(k=2, hold_out_lights=0.2, light_gains=on),
+            dictionary=small_dictionary,
+        )
         for on in (False, True)
     )
-    assert mended.attrs["held_out_error"]["median"] < 0.5 * plain.attrs["held_out_error"]["median"]
+    assert (
+        mended.attrs["held_out_error"]["median"]
+        < 0.5 * plain.attrs["held_out_error"]["median"]
+    )
     assert "light_gains" not in plain.children
     found = mended["light_gains/light_gain"].values
-    np.testing.assert_allclose(mended["dome/light_intensity"].values, one * found[:, None])
+    np.testing.assert_allclose(
+        mended["dome/light_intensity"].values, one * found[:, None]
+    )
     np.testing.assert_array_equal(plain["dome/light_intensity"].values, one)
     assert mended.attrs["light_gains"]["spread"] == pytest.approx(found.std())
 
 
-def test_fit_model__inter_reflection_of_a_convex_face_is_nothing(fitted, planted, small_dictionary):
+def test_fit_model__inter_reflection_of_a_convex_face_is_nothing(
+    fitted, planted, small_dictionary
+):
     asked = replace(HELD_OUT, inter_reflection=True)
     found = fit_model(planted, asked, dictionary=small_dictionary)
     plain = fitted[0]
     assert {"inter-reflection", "first pass again"} <= set(found.attrs["seconds"])
     for name in ("shading_normal", "diffuse_reflectance", "basis_weight"):
-        np.testing.assert_allclose(found[f"fitted/{name}"], plain[f"fitted/{name}"], rtol=1e-5)
+        np.testing.assert_allclose(
+            found[f"fitted/{name}"], plain[f"fitted/{name}"], rtol=1e-5
+        )

@@ -17,19 +17,29 @@ def _angles(found, true):
 
 @pytest.mark.parametrize(
     ("method", "limit"),
-    [("combined", 0.3), ("chromatic", 0.3), ("photometric", 0.6), ("peak", 8.0)],  # degrees; 60 lights are 13 apart
+    # degrees; 60 lights are 13 apart
+    [("combined", 0.3), ("chromatic", 0.3), ("photometric", 0.6), ("peak", 8.0)],
 )
 def test_estimate_normals__recovers_truth(skin, method, limit):
     found = estimate_normals(skin.lumitexels, method=method)
     assert np.median(_angles(found["shading_normal"].values, skin.normal)) < limit
-    np.testing.assert_allclose(np.linalg.norm(found["shading_normal"], axis=1), 1, atol=1e-6)
+    np.testing.assert_allclose(
+        np.linalg.norm(found["shading_normal"], axis=1), 1, atol=1e-6
+    )
 
 
 def test_estimate_normals__error_falls_with_noise(new_skin):
     errors = []
     for noise in (0.05, 0.0):
         skin = new_skin(noise=noise)
-        errors.append(np.median(_angles(estimate_normals(skin.lumitexels)["shading_normal"].values, skin.normal)))
+        errors.append(
+            np.median(
+                _angles(
+                    estimate_normals(skin.lumitexels)["shading_normal"].values,
+                    skin.normal,
+                )
+            )
+        )
     assert errors[1] < 0.5 * errors[0]
     assert errors[1] < 0.25
 
@@ -45,17 +55,26 @@ def test_estimate_normals__rotates_with_the_scene(skin):
     names = ("surfel_position", "surfel_normal", "light_position", "camera_position")
     moved = skin.lumitexels.copy()
     for name in names:
-        moved[name] = moved[name].copy(data=turn.apply(moved[name].values).astype(np.float32))
-    still, turned = (estimate_normals(x)["shading_normal"].values for x in (skin.lumitexels, moved))
+        moved[name] = moved[name].copy(
+            data=turn.apply(moved[name].values).astype(np.float32)
+        )
+    still, turned = (
+        estimate_normals(x)["shading_normal"].values for x in (skin.lumitexels, moved)
+    )
     # float32 positions of 880 mm: 1e-7 relative
     np.testing.assert_allclose(turned, turn.apply(still), atol=2e-4)
 
 
 def test_estimate_normals__does_not_depend_on_brightness(skin):
-    bright = skin.lumitexels.assign(reflectance_sample=skin.lumitexels["reflectance_sample"] * np.float16(4))
+    bright = skin.lumitexels.assign(
+        reflectance_sample=skin.lumitexels["reflectance_sample"] * np.float16(4)
+    )
     bright["reflectance_sample"].attrs = skin.lumitexels["reflectance_sample"].attrs
-    once, twice = (estimate_normals(x)["shading_normal"].values for x in (skin.lumitexels, bright))
-    np.testing.assert_allclose(once, twice, atol=2e-4)  # half floats round small samples more
+    once, twice = (
+        estimate_normals(x)["shading_normal"].values for x in (skin.lumitexels, bright)
+    )
+    # half floats round small samples more
+    np.testing.assert_allclose(once, twice, atol=2e-4)
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -69,7 +88,9 @@ def test_estimate_normals__unseen_surfel_is_nan_and_leaves_others_alone(skin, me
     for name in ("normal_disagreement", "normal_error", "normal_total_error"):
         assert np.isnan(found[name].values[3])
     others = np.arange(len(whole)) != 3
-    np.testing.assert_allclose(found["shading_normal"].values[others], whole[others], atol=1e-6)
+    np.testing.assert_allclose(
+        found["shading_normal"].values[others], whole[others], atol=1e-6
+    )
 
 
 def test_estimate_normals__few_lights_lean_on_the_scan(skin):
@@ -86,8 +107,9 @@ def test_estimate_normals__error_covers_noise_and_scan(new_skin, method):
     found = estimate_normals(skin.lumitexels, method=method)
     angle = _angles(found["shading_normal"].values, skin.normal)
     error = found["normal_error"].values
-    # two equal axes: 95 % below 1.73 of the RMS angle (chi-square of two degrees of freedom; unequal axes have up to
-    # 3 % less); 300 surfels know the share to 1.3 %, three of which are allowed
+    # two equal axes: 95 % below 1.73 of the RMS angle (chi-square of two degrees of
+    # freedom; unequal axes have up to 3 % less); 300 surfels know the share to 1.3 %,
+    # three of which are allowed
     assert 0.95 - 0.03 - 0.038 < (angle < 1.73 * error).mean() < 0.95 + 0.038
     # the size itself: the RMS over surfels is known to 4 %
     assert 0.88 < np.sqrt((angle**2).mean() / (error**2).mean()) < 1.12
@@ -101,23 +123,29 @@ def test_estimate_normals__error_covers_noise_and_scan(new_skin, method):
 
 @pytest.mark.parametrize("method", ["combined", "photometric", "chromatic"])
 def test_estimate_normals__error_has_the_size_of_the_noise(new_skin, method):
-    """Rationale: matte skin, no prior: noise alone. Expected: RMS angle over RMS error 1; 600 surfels give it to 2 %.
+    """Rationale: matte skin, no prior: noise alone. Expected: RMS angle over RMS error
+    1; 600 surfels give it to 2 %.
 
-    Without the slope of F_t it is 0.8; without the common noise of both signals it is 1.13 for the combined one.
+    Without the slope of F_t it is 0.8; without the common noise of both signals it is
+    1.13 for the combined one.
     """
     skin = new_skin(surfels=600, gloss=0.0, noise=0.05)
     found = estimate_normals(skin.lumitexels, method=method, scan_error=1e3)
     angle = _angles(found["shading_normal"].values, skin.normal)
     error = found["normal_error"].values
     assert abs(np.sqrt((angle**2).mean() / (error**2).mean()) - 1) < 0.06
-    assert abs((angle < 1.73 * error).mean() - 0.95) < 0.027  # three times what 600 surfels know the share to
+    # three times what 600 surfels know the share to
+    assert abs((angle < 1.73 * error).mean() - 0.95) < 0.027
 
 
 def test_estimate_normals__error_follows_the_scan_where_lights_are_few(skin):
     few = skin.lumitexels.isel(light=[0, 1, 2])
-    errors = [estimate_normals(few, scan_error=e)["normal_error"].values for e in (1.0, 5.0)]
+    errors = [
+        estimate_normals(few, scan_error=e)["normal_error"].values for e in (1.0, 5.0)
+    ]
     known = np.isfinite(errors).all(axis=0)
-    # five times the scan's error; what the slope of F_t adds leaves it a little less than a ratio of 1.5
+    # five times the scan's error; what the slope of F_t adds leaves it a little less
+    # than a ratio of 1.5
     assert np.median(errors[1][known] / errors[0][known]) > 1.4
 
 
@@ -127,7 +155,9 @@ def test_estimate_normals__any_chunking(skin, chunk):
     lazy = estimate_normals(skin.lumitexels.chunk(surfel=chunk))
     assert lazy["shading_normal"].chunks is not None
     # sums over other batch shapes round differently
-    np.testing.assert_allclose(lazy["shading_normal"].values, eager["shading_normal"].values, atol=1e-5)
+    np.testing.assert_allclose(
+        lazy["shading_normal"].values, eager["shading_normal"].values, atol=1e-5
+    )
 
 
 def test_estimate_normals__unknown_method_is_refused(skin):

@@ -35,25 +35,51 @@ def _fitted(**more):
 
 
 def _error(table, **where):
-    return table["prediction_error"].sel({"region": "face", "status": "any", "space": "linear"} | where).values
+    return (
+        table["prediction_error"]
+        .sel({"region": "face", "status": "any", "space": "linear"} | where)
+        .values
+    )
 
 
 def test_prediction_table__counts_and_weighs_by_area():
     table = prediction_table(_fitted())
-    assert table["region"].values.tolist() == ["face", "nose"]  # no surfel is in the ear
-    assert table["prediction_surfels"].sel(region="face").values.tolist() == [6, 4, 1, 0, 0, 1, 0, 0, 0]
+    # no surfel is in the ear
+    assert table["region"].values.tolist() == ["face", "nose"]
+    assert table["prediction_surfels"].sel(region="face").values.tolist() == [
+        6,
+        4,
+        1,
+        0,
+        0,
+        1,
+        0,
+        0,
+        0,
+    ]
     assert table["prediction_surfels"].sel(region="nose", status="diffuse_clamped") == 1
     assert table["prediction_fraction"].sel(region="nose", status="fitted") == 2 / 3
-    # of the area 11, the first three have 3 and the fourth 7, which contains the median; 95 % is in the fifth
+    # of the area 11, the first three have 3 and the fourth 7, which contains the
+    # median; 95 % is in the fifth
     np.testing.assert_allclose(_error(table, samples="fit"), [0.4, 0.9], rtol=1e-6)
-    np.testing.assert_allclose(_error(table, samples="fit", region="nose"), [0.2, 0.9], rtol=1e-6)
-    np.testing.assert_allclose(_error(table, samples="fit", status="fitted"), [0.4, 0.4], rtol=1e-6)
-    np.testing.assert_allclose(_error(table, samples="fit", space="perceptual"), [0.04, 0.09], rtol=1e-6)
-    np.testing.assert_allclose(_error(table, samples="held_out_lights"), [0.3, 0.9], rtol=1e-6)
+    np.testing.assert_allclose(
+        _error(table, samples="fit", region="nose"), [0.2, 0.9], rtol=1e-6
+    )
+    np.testing.assert_allclose(
+        _error(table, samples="fit", status="fitted"), [0.4, 0.4], rtol=1e-6
+    )
+    np.testing.assert_allclose(
+        _error(table, samples="fit", space="perceptual"), [0.04, 0.09], rtol=1e-6
+    )
+    np.testing.assert_allclose(
+        _error(table, samples="held_out_lights"), [0.3, 0.9], rtol=1e-6
+    )
     assert np.isnan(_error(table, samples="held_out_cameras")).all()
     assert np.isnan(_error(table, samples="fit", status="unseen")).all()
     np.testing.assert_allclose(
-        table["prediction_outlier_fraction"].sel(region="face", status="any"), 1.2 / 11, rtol=1e-6
+        table["prediction_outlier_fraction"].sel(region="face", status="any"),
+        1.2 / 11,
+        rtol=1e-6,
     )
 
 
@@ -64,15 +90,31 @@ def test_prediction_table__agrees_with_numpy_for_equal_areas():
     mask = rng.uniform(size=(501, 2)) < 0.4
     table = prediction_table(
         dataset(
-            {"fit_status": status, "surfel_area": np.ones(501), "region_mask": mask, "held_out_camera_error": values},
+            {
+                "fit_status": status,
+                "surfel_area": np.ones(501),
+                "region_mask": mask,
+                "held_out_camera_error": values,
+            },
             coords={"region": ["cheek", "chin"]},
         )
     )
-    for region, inside in {"face": np.full(501, True), "cheek": mask[:, 0], "chin": mask[:, 1]}.items():
-        for name, chosen in {"any": inside, "fitted": inside & (status == FITTED)}.items():
-            found = _error(table, samples="held_out_cameras", region=region, status=name)
+    for region, inside in {
+        "face": np.full(501, True),
+        "cheek": mask[:, 0],
+        "chin": mask[:, 1],
+    }.items():
+        for name, chosen in {
+            "any": inside,
+            "fitted": inside & (status == FITTED),
+        }.items():
+            found = _error(
+                table, samples="held_out_cameras", region=region, status=name
+            )
             known = values[chosen].astype(np.float32)
-            np.testing.assert_allclose(found, np.quantile(known, [0.5, 0.95], method="inverted_cdf"), rtol=1e-6)
+            np.testing.assert_allclose(
+                found, np.quantile(known, [0.5, 0.95], method="inverted_cdf"), rtol=1e-6
+            )
 
 
 def test_prediction_table__needs_status_and_area():
@@ -87,6 +129,20 @@ def test_tabulate_prediction__shows_only_what_there_is():
     assert described["statuses"]["unseen"] == {"surfels": 1, "fraction": 1 / 6}
     header, *rows = tabulate_prediction(described)
     assert header[3:] == ["fit", "roots", "unseen lights", "roots"]
-    assert rows[0] == ["face", "6", "10.9", "40.0 / 90.0", "4.0 / 9.0", "30.0 / 90.0", "3.0 / 9.0"]
-    assert [row[0] for row in rows] == ["face", "nose", "fitted", "unseen", "diffuse_clamped"]
+    assert rows[0] == [
+        "face",
+        "6",
+        "10.9",
+        "40.0 / 90.0",
+        "4.0 / 9.0",
+        "30.0 / 90.0",
+        "3.0 / 9.0",
+    ]
+    assert [row[0] for row in rows] == [
+        "face",
+        "nose",
+        "fitted",
+        "unseen",
+        "diffuse_clamped",
+    ]
     assert rows[-2][2:] == ["-"] * 5

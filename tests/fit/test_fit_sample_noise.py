@@ -18,7 +18,13 @@ from skindb.fit._lumitexel_kernels import (
 )
 from skindb.fit._surface_arrays import MODES
 from skindb.fit._surface_kernels import MODEL_ERROR, Options, weigh
-from skindb.fit.sample_noise import NO_NOISE, NOISE_INPUTS, noise_inputs, noise_of, sample_variance
+from skindb.fit.sample_noise import (
+    NO_NOISE,
+    NOISE_INPUTS,
+    noise_inputs,
+    noise_of,
+    sample_variance,
+)
 from skindb.optics.rows import pad_to_lanes
 from skindb.schema import label
 
@@ -32,32 +38,53 @@ def skin():
 
 
 def with_noise(lumitexels, *, electrons=500.0, pixels=2.0, whole=25.0):
-    """The noise of cameras whose longest exposure is white at `whole` times the typical radiance of grey skin."""
-    n, lights, cameras = (lumitexels.sizes[name] for name in ("surfel", "light", "camera"))
+    """The noise of cameras whose longest exposure is white at `whole` times the typical
+    radiance of grey skin.
+    """
+    n, lights, cameras = (
+        lumitexels.sizes[name] for name in ("surfel", "light", "camera")
+    )
     limit = np.broadcast_to(whole * TIMES[0] / TIMES, (cameras, 3, 2))
     sums = np.cumsum(TIMES[::-1])[::-1], np.cumsum(TIMES[::-1] ** 2)[::-1]
     added = {
         "effective_pixels": np.full((n, cameras), pixels),
         "radiance_limit": limit,
-        "radiance_read_variance": np.broadcast_to((whole * TIMES[0] * 6 / electrons) ** 2 / sums[1], limit.shape),
-        "radiance_shot_variance": np.broadcast_to(whole * TIMES[0] / (electrons * sums[0]), limit.shape),
+        "radiance_read_variance": np.broadcast_to(
+            (whole * TIMES[0] * 6 / electrons) ** 2 / sums[1], limit.shape
+        ),
+        "radiance_shot_variance": np.broadcast_to(
+            whole * TIMES[0] / (electrons * sums[0]), limit.shape
+        ),
         "light_intensity": np.linspace(0.8, 1.2, lights)[:, None] * [8e7, 8e7, 8e7],
         "light_axis": -lumitexels["light_position"].values / 880.0,
         "light_falloff": np.full(lights, 2.0),
     }
-    return lumitexels.assign({name: label(name, values) for name, values in added.items()})
+    return lumitexels.assign(
+        {name: label(name, values) for name, values in added.items()}
+    )
 
 
 def by_hand(lumitexels, surfel, i, o, c, level, bright):
     """Variance of one sample of this level, with the exposures that are usable for `bright`."""
     ds = lumitexels
-    way = ds["surfel_position"].values[surfel].astype(float) - ds["light_position"].values[i].astype(float)
+    way = ds["surfel_position"].values[surfel].astype(float) - ds[
+        "light_position"
+    ].values[i].astype(float)
     square = way @ way
     cosine = way @ ds["light_axis"].values[i].astype(float) / np.sqrt(square)
-    scale = square / float(ds["light_intensity"].values[i, c]) / cosine ** float(ds["light_falloff"].values[i])
+    scale = (
+        square
+        / float(ds["light_intensity"].values[i, c])
+        / cosine ** float(ds["light_falloff"].values[i])
+    )
     e = 0 if bright / scale <= ds["radiance_limit"].values[o, c, 0] else 1
-    read, shot = (float(ds[f"radiance_{name}_variance"].values[o, c, e]) for name in ("read", "shot"))
-    return (scale**2 * read + scale * shot * level) / float(ds["effective_pixels"].values[surfel, o])
+    read, shot = (
+        float(ds[f"radiance_{name}_variance"].values[o, c, e])
+        for name in ("read", "shot")
+    )
+    return (scale**2 * read + scale * shot * level) / float(
+        ds["effective_pixels"].values[surfel, o]
+    )
 
 
 @pytest.mark.parametrize("whole", [100.0, 12.0])
@@ -74,7 +101,8 @@ def test_write_noise__variance_of_each_sample_by_hand(skin, whole):
     for s in range(len(sample)):
         b.values[:] = sample[s].astype(np.float32).ravel()
         position, light, camera = (
-            known[name].values.astype(np.float64) for name in ("surfel_position", "light_position", "camera_position")
+            known[name].values.astype(np.float64)
+            for name in ("surfel_position", "light_position", "camera_position")
         )
         write_directions(position[s], light, camera, b)
         write_cosines(skin.normal[s], ETA, 0.1, b)
@@ -84,8 +112,13 @@ def test_write_noise__variance_of_each_sample_by_hand(skin, whole):
         for r in range(count):
             i, o = b.index[r]
             brightest = float(sample[s, i, o].max())
-            want = [by_hand(known, s, i, o, 0, level, brightest) for level in (0.0, 1.0)]
-            np.testing.assert_allclose([b.noise[0, r], b.noise[:, r].sum()], want, rtol=1e-5)  # single precision
+            want = [
+                by_hand(known, s, i, o, 0, level, brightest) for level in (0.0, 1.0)
+            ]
+            # single precision
+            np.testing.assert_allclose(
+                [b.noise[0, r], b.noise[:, r].sum()], want, rtol=1e-5
+            )
             steps.add(float(b.noise[1, r] / noise.per_radiance[s, i]))
         rows += count
     assert rows > 100
@@ -112,12 +145,16 @@ def test_sample_variance__of_captures_that_do_not_say_it(skin):
 
 @pytest.mark.parametrize("mode", ["linear", "perceptual"])
 def test_weigh__no_weight_exceeds_what_noise_permits(skin, mode):
-    """Doubling the noise variance of a sample never increases its weight, and almost halves it if noise dominates."""
+    """Doubling the noise variance of a sample never increases its weight, and almost
+    halves it if noise dominates.
+    """
     known = with_noise(skin.lumitexels, electrons=100.0)
     weights = []
     for pixels in (1.0, 0.5):
         arrays = tuple(known[name].values for name in NOISE_INPUTS)
-        noise = noise_of((arrays[0], np.full_like(arrays[1], pixels), *arrays[2:]), NO_NOISE)
+        noise = noise_of(
+            (arrays[0], np.full_like(arrays[1], pixels), *arrays[2:]), NO_NOISE
+        )
         b = lumitexel_memory(20, 4, 8)
         weight = np.zeros(80, np.float32)
         b.index[:] = [(i, o) for i in range(20) for o in range(4)]
@@ -135,17 +172,22 @@ def test_weigh__no_weight_exceeds_what_noise_permits(skin, mode):
 
 
 def test_estimate_diffuse_reflectance__read_noise_moves_it_less_if_it_is_known():
-    """Noise is as large as most samples; weights by the level of the samples only would favour the darkest ones."""
+    """Noise is as large as most samples; weights by the level of the samples only would
+    favour the darkest ones.
+    """
     skin = make_skin(surfels=150, lights=40, cameras=6, noise=0.0, seed=3)
     rng = np.random.default_rng(5)
     true = skin.lumitexels.assign(shading_normal=label("shading_normal", skin.normal))
     known = with_noise(true, electrons=60.0, pixels=1.0, whole=100.0)
     sample = known["reflectance_sample"].values.astype(np.float64)
-    noisy = sample + np.sqrt(sample_variance(known).values) * rng.standard_normal(sample.shape)
+    noisy = sample + np.sqrt(sample_variance(known).values) * rng.standard_normal(
+        sample.shape
+    )
     noisy = label("reflectance_sample", noisy)
     clean = estimate_diffuse_reflectance(true, eta=ETA)["diffuse_reflectance"].values
     with_it, without = (
-        estimate_diffuse_reflectance(ds.assign(reflectance_sample=noisy), eta=ETA) for ds in (known, true)
+        estimate_diffuse_reflectance(ds.assign(reflectance_sample=noisy), eta=ETA)
+        for ds in (known, true)
     )
     errors = [one["diffuse_reflectance"].values - clean for one in (with_it, without)]
     # measured 0.053 and 0.066 on other 200 surfels, whose means are known to 0.003 and 0.004

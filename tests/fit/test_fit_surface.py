@@ -1,4 +1,6 @@
-"""Surface fits: planted mixtures, certificates, statuses, prediction of unseen lights, reduced bases."""
+"""Surface fits: planted mixtures, certificates, statuses, prediction of unseen lights,
+reduced bases.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,9 @@ def planted(skin, small_dictionary, plant):
 
 @pytest.mark.parametrize("mode", ["linear", "perceptual"])
 @pytest.mark.parametrize("rank", [6, 5])
-def test_fit_surface__reproduces_planted_reflectance(planted, small_dictionary, mode, rank):
+def test_fit_surface__reproduces_planted_reflectance(
+    planted, small_dictionary, mode, rank
+):
     lumitexels, weight = planted
     found = fit_surface(lumitexels, dictionary=small_dictionary, mode=mode, rank=rank)
     assert (found["fit_status"] == FitStatus.FITTED).all()
@@ -40,7 +44,11 @@ def test_fit_surface__reproduces_planted_reflectance(planted, small_dictionary, 
     assert found["kkt_residual"].max() < 1e-9
     assert (found["dictionary_weight"] >= 0).all()
     # compared as BRDFs: weights are not unique
-    cells = small_dictionary.table[5:60, 5:60, ::6].reshape(-1, weight.shape[1]).astype(float)
+    cells = (
+        small_dictionary.table[5:60, 5:60, ::6]
+        .reshape(-1, weight.shape[1])
+        .astype(float)
+    )
     true = weight @ cells.T
     fitted = found["dictionary_weight"].values @ cells.T
     assert np.median(np.abs(fitted - true)) < 0.02 * np.median(true)
@@ -48,38 +56,70 @@ def test_fit_surface__reproduces_planted_reflectance(planted, small_dictionary, 
 
 @pytest.mark.parametrize("rank", [5, 4])
 @pytest.mark.parametrize("mode", ["linear", "perceptual"])
-def test_fit_surface__reduced_rank_agrees_within_the_bound(skin, small_dictionary, plant, mode, rank):
-    """|M x' - R| <= |M x - R| + |E x| + |E x'| with x found by M and x' by M + E, and |E x| <= worst |M x|.
+def test_fit_surface__reduced_rank_agrees_within_the_bound(
+    skin, small_dictionary, plant, mode, rank
+):
+    """|M x' - R| <= |M x - R| + |E x| + |E x'| with x found by M and x' by M + E, and
+    |E x| <= worst |M x|.
 
     Perceptual fits measure all three in cube-root space.
     """
     lumitexels, _ = plant(skin, small_dictionary, np.random.default_rng(6), noise=0.02)
     reduced, lift = reduce_dictionary(small_dictionary.table, rank)
     worst = truncation_bound(small_dictionary.table, reduced, lift).worst
-    assert MIN_COSINE_SAMPLES <= MIN_COSINE_SURFACE  # the bound holds for every sample that is used
-    found = [fit_surface(lumitexels, dictionary=small_dictionary, mode=mode, rank=r) for r in (6, rank)]
+    # the bound holds for every sample that is used
+    assert MIN_COSINE_SAMPLES <= MIN_COSINE_SURFACE
+    found = [
+        fit_surface(lumitexels, dictionary=small_dictionary, mode=mode, rank=r)
+        for r in (6, rank)
+    ]
     place = lumitexels["surfel_position"].values.astype(float)
     gaps = []
     for s, n in enumerate(lumitexels["shading_normal"].values.astype(float)):
-        ways = [lumitexels[name].values - place[s] for name in ("light_position", "camera_position")]
+        ways = [
+            lumitexels[name].values - place[s]
+            for name in ("light_position", "camera_position")
+        ]
         wi, wo = (way / np.linalg.norm(way, axis=1)[:, None] for way in ways)
-        i, o = np.nonzero((wi @ n > MIN_COSINE_SURFACE)[:, None] & (wo @ n > MIN_COSINE_SURFACE))
+        i, o = np.nonzero(
+            (wi @ n > MIN_COSINE_SURFACE)[:, None] & (wo @ n > MIN_COSINE_SURFACE)
+        )
         cosine = wi[i] @ n
         angles = half_difference(wi[i], wo[o], np.broadcast_to(n, (len(i), 3)))
-        body = cosine * fresnel_transmittance(cosine, 1.3) * fresnel_transmittance(wo[o] @ n, 1.3) / np.pi
+        body = (
+            cosine
+            * fresnel_transmittance(cosine, 1.3)
+            * fresnel_transmittance(wo[o] @ n, 1.3)
+            / np.pi
+        )
         given = lumitexels["reflectance_sample"].values[s, i, o].astype(float)
-        given -= body[:, None] * lumitexels["diffuse_reflectance"].values[s].astype(float)
-        whole, low = (lookup(t, *angles) * cosine[:, None] for t in (small_dictionary.table, reduced))
+        given -= body[:, None] * lumitexels["diffuse_reflectance"].values[s].astype(
+            float
+        )
+        whole, low = (
+            lookup(t, *angles) * cosine[:, None]
+            for t in (small_dictionary.table, reduced)
+        )
         x = [f["dictionary_weight"].values[s] for f in found]
 
         def root(y):
-            return y if mode == "linear" else y / (y * y + NOISE_FLOOR_SURFACE**2) ** (1 / 3)
+            return (
+                y
+                if mode == "linear"
+                else y / (y * y + NOISE_FLOOR_SURFACE**2) ** (1 / 3)
+            )
 
         far = [np.linalg.norm(root(whole @ one)[:, None] - root(given)) for one in x]
-        off = [np.sqrt(3) * np.linalg.norm(root(low @ lift @ one) - root(whole @ one)) for one in x]
+        off = [
+            np.sqrt(3) * np.linalg.norm(root(low @ lift @ one) - root(whole @ one))
+            for one in x
+        ]
         gaps.append((far[1] - far[0]) / sum(off))
         if mode == "linear":
-            assert all(off[k] <= worst * np.sqrt(3) * np.linalg.norm(whole @ x[k]) for k in (0, 1))
+            assert all(
+                off[k] <= worst * np.sqrt(3) * np.linalg.norm(whole @ x[k])
+                for k in (0, 1)
+            )
     assert np.max(gaps) <= 1
     assert np.max(gaps) > 0.01  # something was omitted
     assert np.min(gaps) > -1e-3  # and all dimensions fit best, within single precision
@@ -119,9 +159,13 @@ def test_fit_surface__statuses(planted, small_dictionary):
 def test_fit_surface__any_chunking(planted, small_dictionary):
     lumitexels, _ = planted
     eager = fit_surface(lumitexels, dictionary=small_dictionary)
-    lazy = fit_surface(lumitexels.chunk(surfel=9), dictionary=small_dictionary).compute()
+    lazy = fit_surface(
+        lumitexels.chunk(surfel=9), dictionary=small_dictionary
+    ).compute()
     for name in ("dictionary_weight", "dictionary_residual"):
-        np.testing.assert_allclose(lazy[name].values, eager[name].values, rtol=1e-4, atol=1e-6)
+        np.testing.assert_allclose(
+            lazy[name].values, eager[name].values, rtol=1e-4, atol=1e-6
+        )
 
 
 def test_fit_surface__asks_for_normals_and_diffuse(skin, small_dictionary):
@@ -132,26 +176,43 @@ def test_fit_surface__asks_for_normals_and_diffuse(skin, small_dictionary):
 
 def _identity_basis(dictionary):
     k = len(dictionary.names)
-    return dataset({"basis_mixture": np.eye(k), "basis_brdf": stored_brdf(dictionary.table)})
+    return dataset(
+        {"basis_mixture": np.eye(k), "basis_brdf": stored_brdf(dictionary.table)}
+    )
 
 
 def test_refit__every_bases_as_components_is_the_full_fit(planted, small_dictionary):
     lumitexels, _ = planted
     full = fit_surface(lumitexels, dictionary=small_dictionary, rank=6)
     reduced = refit(lumitexels, basis=_identity_basis(small_dictionary))
-    np.testing.assert_allclose(reduced["basis_weight"], full["dictionary_weight"], rtol=1e-6, atol=1e-9)
-    np.testing.assert_allclose(reduced["fit_residual"], full["dictionary_residual"], rtol=1e-6)
+    np.testing.assert_allclose(
+        reduced["basis_weight"], full["dictionary_weight"], rtol=1e-6, atol=1e-9
+    )
+    np.testing.assert_allclose(
+        reduced["fit_residual"], full["dictionary_residual"], rtol=1e-6
+    )
 
 
 @pytest.fixture(scope="module")
 def two_lobes(new_skin, plant):
-    """300 surfels with two distinguishable lobes, their weights, and the fraction each reflects along the normal."""
+    """300 surfels with two distinguishable lobes, their weights, and the fraction each
+    reflects along the normal.
+    """
     table, grid = surface_lobes()
-    dictionary = Dictionary(("broad", "narrow"), np.ascontiguousarray(table[..., [2, 4]]), grid, "two lobes")
+    dictionary = Dictionary(
+        ("broad", "narrow"), np.ascontiguousarray(table[..., [2, 4]]), grid, "two lobes"
+    )
     skin = new_skin(surfels=300)
-    lumitexels, weight = plant(skin, dictionary, np.random.default_rng(2), noise=0.01, scale=0.2)
+    lumitexels, weight = plant(
+        skin, dictionary, np.random.default_rng(2), noise=0.01, scale=0.2
+    )
     assert (weight > 0).all()
-    return lumitexels, _identity_basis(dictionary), weight, directional_albedo(dictionary.table, 1.0)[0]
+    return (
+        lumitexels,
+        _identity_basis(dictionary),
+        weight,
+        directional_albedo(dictionary.table, 1.0)[0],
+    )
 
 
 def _share_inside(found, truth, error):
@@ -161,7 +222,8 @@ def _share_inside(found, truth, error):
 
 @pytest.mark.parametrize("mode", ["linear", "perceptual"])
 def test_refit__errors_cover_weights_and_surface_reflectance(two_lobes, mode):
-    """Rationale: R_d and normals are the true ones, only noise is at work. Expected: 95 % within 1.96 errors.
+    """Rationale: R_d and normals are the true ones, only noise is at work. Expected: 95
+    % within 1.96 errors.
 
     300 trials give the fraction to 1.3 %, three times that is allowed.
     """
@@ -170,9 +232,16 @@ def test_refit__errors_cover_weights_and_surface_reflectance(two_lobes, mode):
     error = found["basis_weight_error"].values
     np.testing.assert_array_equal(np.isfinite(error), found["basis_weight"].values > 0)
     assert np.isfinite(error).mean() > 0.95
-    shares = [_share_inside(found["basis_weight"].values[:, k], weight[:, k], error[:, k]) for k in range(2)]
-    reflected, spread = (found[f"surface_reflectance{end}"].values for end in ("", "_error"))
-    np.testing.assert_allclose(reflected, found["basis_weight"].values @ strength, rtol=1e-5)
+    shares = [
+        _share_inside(found["basis_weight"].values[:, k], weight[:, k], error[:, k])
+        for k in range(2)
+    ]
+    reflected, spread = (
+        found[f"surface_reflectance{end}"].values for end in ("", "_error")
+    )
+    np.testing.assert_allclose(
+        reflected, found["basis_weight"].values @ strength, rtol=1e-5
+    )
     shares.append(_share_inside(reflected, weight @ strength, spread))
     assert min(shares) > 0.95 - 0.039
     assert max(shares) < 0.95 + 0.039
@@ -184,16 +253,25 @@ def test_refit__error_of_diffuse_light_reaches_the_weights(two_lobes):
     lumitexels, basis, _, _ = two_lobes
     step = 1e-3
     higher = lumitexels.assign(
-        diffuse_reflectance=label("diffuse_reflectance", lumitexels["diffuse_reflectance"].values + step)
+        diffuse_reflectance=label(
+            "diffuse_reflectance", lumitexels["diffuse_reflectance"].values + step
+        )
     )
     known = lumitexels.assign(
         diffuse_reflectance_error=label(
-            "diffuse_reflectance_error", np.full(lumitexels["diffuse_reflectance"].shape, step)
+            "diffuse_reflectance_error",
+            np.full(lumitexels["diffuse_reflectance"].shape, step),
         )
     )
-    plain, moved, stated = (refit(ds, basis=basis, mode="linear") for ds in (lumitexels, higher, known))
-    share = np.sqrt(stated["basis_weight_error"] ** 2 - plain["basis_weight_error"] ** 2).values
-    both = ((plain["basis_weight"] > 0) & (moved["basis_weight"] > 0)).values.all(axis=1)
+    plain, moved, stated = (
+        refit(ds, basis=basis, mode="linear") for ds in (lumitexels, higher, known)
+    )
+    share = np.sqrt(
+        stated["basis_weight_error"] ** 2 - plain["basis_weight_error"] ** 2
+    ).values
+    both = ((plain["basis_weight"] > 0) & (moved["basis_weight"] > 0)).values.all(
+        axis=1
+    )
     gone = np.abs(moved["basis_weight"] - plain["basis_weight"]).values
     # linear: exact except for the single precision of the difference of squares
     np.testing.assert_allclose(share[both], gone[both], rtol=0.02, atol=1e-5)
@@ -201,7 +279,9 @@ def test_refit__error_of_diffuse_light_reaches_the_weights(two_lobes):
 
 @pytest.mark.parametrize("mode", ["linear", "perceptual"])
 def test_refit__error_of_the_normal_reaches_the_weights(two_lobes, mode):
-    """For normals that are wrong by their error, errors of the weights cover the truth only if they include it."""
+    """For normals that are wrong by their error, errors of the weights cover the truth
+    only if they include it.
+    """
     lumitexels, basis, weight, _ = two_lobes
     # degrees; the narrow lobe has a half width of some three
     rng = np.random.default_rng(17)
@@ -216,26 +296,44 @@ def test_refit__error_of_the_normal_reaches_the_weights(two_lobes, mode):
     for given in (known, blind):
         found = refit(given, basis=basis, mode=mode)
         error = found["basis_weight_error"].values
-        shares.append([_share_inside(found["basis_weight"].values[:, k], weight[:, k], error[:, k]) for k in range(2)])
-    assert min(shares[0]) > 0.9  # weights spread unlike a Gaussian where the normal is the larger part
+        shares.append(
+            [
+                _share_inside(
+                    found["basis_weight"].values[:, k], weight[:, k], error[:, k]
+                )
+                for k in range(2)
+            ]
+        )
+    # weights spread unlike a Gaussian where the normal is the larger part
+    assert min(shares[0]) > 0.9
     assert shares[1][1] < 0.8
 
 
 def test_held_out_error__is_the_noise_for_the_true_model(skin, small_dictionary, plant):
     noise = 0.04
-    lumitexels, weight = plant(skin, small_dictionary, np.random.default_rng(6), noise=noise)
+    lumitexels, weight = plant(
+        skin, small_dictionary, np.random.default_rng(6), noise=noise
+    )
     lumitexels = lumitexels.assign(basis_weight=label("basis_weight", weight))
-    found = held_out_error(lumitexels.isel(light=slice(0, 20)), basis=_identity_basis(small_dictionary))
+    found = held_out_error(
+        lumitexels.isel(light=slice(0, 20)), basis=_identity_basis(small_dictionary)
+    )
     assert abs(float(found["held_out_error"].median()) - noise) < 0.25 * noise
     # d cbrt(y) / cbrt(y) = dy / (3 y)
-    assert abs(float(found["held_out_error_perceptual"].median()) - noise / 3) < 0.25 * noise / 3
+    assert (
+        abs(float(found["held_out_error_perceptual"].median()) - noise / 3)
+        < 0.25 * noise / 3
+    )
 
 
 def test_held_out_error__wrong_weights_show(planted, small_dictionary):
     lumitexels, weight = planted
     basis = _identity_basis(small_dictionary)
     right, wrong = (
-        held_out_error(lumitexels.assign(basis_weight=label("basis_weight", f * weight)), basis=basis)
+        held_out_error(
+            lumitexels.assign(basis_weight=label("basis_weight", f * weight)),
+            basis=basis,
+        )
         for f in (1.0, 2.0)
     )
     assert right["held_out_error"].max() < HALF
@@ -245,7 +343,11 @@ def test_held_out_error__wrong_weights_show(planted, small_dictionary):
 def _fitted(weight, *, status=FitStatus.FITTED):
     n = len(weight)
     return dataset(
-        {"dictionary_weight": weight, "fit_status": np.full(n, status), "surfel_area": np.linspace(1, 2, n)},
+        {
+            "dictionary_weight": weight,
+            "fit_status": np.full(n, status),
+            "surfel_area": np.linspace(1, 2, n),
+        },
     )
 
 
@@ -254,33 +356,51 @@ def test_reduce_basis__finds_the_planted_space(small_dictionary, in_metric):
     rng = np.random.default_rng(7)
     rows = np.array([[1.0, 0, 0.5, 0, 0, 0], [0, 1.0, 0, 0, 0.2, 0]])
     weight = rng.uniform(0, 1, (300, 2)) @ rows
-    found = reduce_basis(_fitted(weight), dictionary=small_dictionary, k=2, rng=rng, in_metric=in_metric)
+    found = reduce_basis(
+        _fitted(weight), dictionary=small_dictionary, k=2, rng=rng, in_metric=in_metric
+    )
     H = found["basis_mixture"].values
     left = weight - weight @ np.linalg.pinv(H) @ H
     assert np.linalg.norm(left) < 0.02 * np.linalg.norm(weight)
     tables = np.einsum("kj,hdpj->khdp", H, small_dictionary.table)
     np.testing.assert_allclose(found["basis_brdf"].values[..., :-1], tables, rtol=1e-4)
     area = np.linspace(1, 2, 300)
-    np.testing.assert_allclose(found["mean_dictionary_weight"], area @ weight / area.sum(), rtol=1e-5)
+    np.testing.assert_allclose(
+        found["mean_dictionary_weight"], area @ weight / area.sum(), rtol=1e-5
+    )
     assert found["dictionary"].values.tolist() == list(small_dictionary.names)
 
 
 def test_reduce_basis__same_seed_same_basis(small_dictionary):
     weight = np.random.default_rng(8).uniform(0, 1, (200, 6))
     twice = [
-        reduce_basis(_fitted(weight), dictionary=small_dictionary, k=3, rng=np.random.default_rng(1)) for _ in range(2)
+        reduce_basis(
+            _fitted(weight),
+            dictionary=small_dictionary,
+            k=3,
+            rng=np.random.default_rng(1),
+        )
+        for _ in range(2)
     ]
-    xr.testing.assert_allclose(twice[0], twice[1], rtol=1e-6)  # rounding of BLAS depends on the alignment of arrays
+    # rounding of BLAS depends on the alignment of arrays
+    xr.testing.assert_allclose(twice[0], twice[1], rtol=1e-6)
 
 
 def test_reduce_basis__refuses_what_it_cannot_do(small_dictionary):
     weight = np.ones((20, 6))
     for k in (0, 7):
         with pytest.raises(InputError, match="a reduced basis has 1 to 6 components"):
-            reduce_basis(_fitted(weight), dictionary=small_dictionary, k=k, rng=np.random.default_rng(0))
+            reduce_basis(
+                _fitted(weight),
+                dictionary=small_dictionary,
+                k=k,
+                rng=np.random.default_rng(0),
+            )
     with pytest.raises(InputError, match="a basis needs fitted surfels"):
         reduce_basis(
-            _fitted(weight, status=FitStatus.UNSEEN), dictionary=small_dictionary, rng=np.random.default_rng(0)
+            _fitted(weight, status=FitStatus.UNSEEN),
+            dictionary=small_dictionary,
+            rng=np.random.default_rng(0),
         )
 
 
@@ -299,31 +419,57 @@ def test_brdf_metric__is_the_sum_over_cells(small_dictionary):
                 cell = table[i, j, p]
                 total += step * cell[1] * cell[4] / max(cell.mean(), 1e-6) ** (4 / 3)
     # sums of float32 tables in another order
-    np.testing.assert_allclose(brdf_metric(small_dictionary.table)[1, 4], total, rtol=1e-5)
+    np.testing.assert_allclose(
+        brdf_metric(small_dictionary.table)[1, 4], total, rtol=1e-5
+    )
 
 
 def test_fit_surface__paper_rule_against_scipy(planted, small_dictionary):
-    """Cube roots of the elements of M and R, their weights by SciPy, reflectance as the cube of the mixture."""
+    """Cube roots of the elements of M and R, their weights by SciPy, reflectance as the
+    cube of the mixture.
+    """
     lumitexels, _ = planted
-    found = fit_surface(lumitexels.isel(surfel=slice(0, 4)), dictionary=small_dictionary, mode="paper", rank=6)
-    sample, position, light, camera, normal, diffuse = (lumitexels[name].values.astype(float) for name in NEEDED)
+    found = fit_surface(
+        lumitexels.isel(surfel=slice(0, 4)),
+        dictionary=small_dictionary,
+        mode="paper",
+        rank=6,
+    )
+    sample, position, light, camera, normal, diffuse = (
+        lumitexels[name].values.astype(float) for name in NEEDED
+    )
     for s in range(4):
-        wi, wo = ((d - position[s]) / np.linalg.norm(d - position[s], axis=-1, keepdims=True) for d in (light, camera))
+        wi, wo = (
+            (d - position[s]) / np.linalg.norm(d - position[s], axis=-1, keepdims=True)
+            for d in (light, camera)
+        )
         ci = wi @ normal[s]
         co = wo @ normal[s]
-        i, o = np.nonzero(np.isfinite(sample[s]).all(-1) & (ci > 0.1)[:, None] & (co > 0.1))
-        table = lookup(np.cbrt(small_dictionary.table), *half_difference(wi[i], wo[o], normal[s]))
+        i, o = np.nonzero(
+            np.isfinite(sample[s]).all(-1) & (ci > 0.1)[:, None] & (co > 0.1)
+        )
+        table = lookup(
+            np.cbrt(small_dictionary.table), *half_difference(wi[i], wo[o], normal[s])
+        )
         M = table * np.cbrt(ci[i])[:, None]
-        f = ci[i] * fresnel_transmittance(ci[i], 1.3) * fresnel_transmittance(co[o], 1.3) / np.pi
+        f = (
+            ci[i]
+            * fresnel_transmittance(ci[i], 1.3)
+            * fresnel_transmittance(co[o], 1.3)
+            / np.pi
+        )
         given = sample[s, i, o]
         scattered = f[:, None] * diffuse[s]
         x, _ = nnls(np.repeat(M, 3, axis=0), np.cbrt(given - scattered).ravel())
-        # places in the table are single precision, and weights of like columns trade: the fits are compared
+        # places in the table are single precision, and weights of like columns trade:
+        # the fits are compared
         root = np.cbrt(given - scattered)
         ours = found["dictionary_weight"].values[s]
         here, there = (np.linalg.norm(root - (M @ w)[:, None]) for w in (x, ours))
         assert there < here * (1 + 1e-3)
-        error = np.linalg.norm((M @ x)[:, None] ** 3 + scattered - given) / np.linalg.norm(given)
+        error = np.linalg.norm(
+            (M @ x)[:, None] ** 3 + scattered - given
+        ) / np.linalg.norm(given)
         assert float(found["dictionary_residual"][s]) == pytest.approx(error, rel=0.05)
 
 
@@ -332,6 +478,9 @@ def test_fit_surface__counts_and_condition(planted, small_dictionary):
     found = fit_surface(lumitexels, dictionary=small_dictionary, rank=6)
     usable = np.isfinite(lumitexels["reflectance_sample"].values).all(-1).sum((1, 2))
     assert (found["fit_samples"] <= usable).all()
-    assert (found["fit_samples"] > 0.5 * usable).all()  # the other samples are at grazing angles
-    assert (found["fit_iterations"] >= (found["dictionary_weight"] > 0).sum("dictionary")).all()
+    # the other samples are at grazing angles
+    assert (found["fit_samples"] > 0.5 * usable).all()
+    assert (
+        found["fit_iterations"] >= (found["dictionary_weight"] > 0).sum("dictionary")
+    ).all()
     assert (found["fit_condition"] >= 1).all()

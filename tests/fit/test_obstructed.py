@@ -18,10 +18,12 @@ def _face(residual, brightness, status=None):
     return dataset(
         {
             "fit_status": fitted,
-            "dictionary_residual": np.concatenate([np.full(20, 0.03, np.float32), residual]),
-            "diffuse_reflectance": np.concatenate([np.full(20, 0.4, np.float32), brightness])[:, None].repeat(
-                3, axis=1
+            "dictionary_residual": np.concatenate(
+                [np.full(20, 0.03, np.float32), residual]
             ),
+            "diffuse_reflectance": np.concatenate(
+                [np.full(20, 0.4, np.float32), brightness]
+            )[:, None].repeat(3, axis=1),
         }
     )
 
@@ -40,7 +42,9 @@ def test_find_obstructed__limit_grows_with_the_residual_of_the_take():
 
 
 def test_find_obstructed__only_fitted_surfels():
-    assert not find_obstructed(_face([0.3], [0.1], status=FitStatus.DIFFUSE_CLAMPED)).any()
+    assert not find_obstructed(
+        _face([0.3], [0.1], status=FitStatus.DIFFUSE_CLAMPED)
+    ).any()
     nothing = _face([], [])
     nothing["fit_status"][:] = FitStatus.UNSEEN
     assert not find_obstructed(nothing).any()

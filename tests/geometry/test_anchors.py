@@ -21,7 +21,9 @@ from skindb.geometry.anchors import (
 from skindb.geometry.atlas import DISC_RADIUS, signed_areas
 
 TURN = 1.1 * Rotation.from_rotvec([0.2, 0.5, -0.1]).as_matrix()
-MARKS = np.array([[0.0, 0.0], [0.2, 0.15], [-0.2, 0.15], [0.15, -0.2], [-0.15, -0.2], [0.0, 0.3]])
+MARKS = np.array(
+    [[0.0, 0.0], [0.2, 0.15], [-0.2, 0.15], [0.15, -0.2], [-0.15, -0.2], [0.0, 0.3]]
+)
 SPACING = 5.0  # mm, of the surfaces
 
 
@@ -33,14 +35,22 @@ def _disc(seed: int) -> np.ndarray:
     angle = np.pi * (3 - np.sqrt(5)) * np.arange(n) + 6 * rng.random()
     ring = np.linspace(0, 2 * np.pi, 180, endpoint=False)
     rim = np.column_stack([np.cos(ring), np.sin(ring)])
-    return np.concatenate([np.column_stack([r * np.cos(angle), r * np.sin(angle)]), rim])
+    return np.concatenate(
+        [np.column_stack([r * np.cos(angle), r * np.sin(angle)]), rim]
+    )
 
 
 def _lifted(plane: np.ndarray) -> np.ndarray:
     """Points in mm of a cap 200 mm wide with a nose, and with ears far from any landmark."""
     x, y = 100 * plane.T
     z = -(x**2 + y**2) / 150
-    for cx, cy, high, wide in ((0, 0, 25, 12), (70, 10, 20, 9), (-70, 10, 20, 9), (0, -60, 8, 25), (20, 65, 8, 25)):
+    for cx, cy, high, wide in (
+        (0, 0, 25, 12),
+        (70, 10, 20, 9),
+        (-70, 10, 20, 9),
+        (0, -60, 8, 25),
+        (20, 65, 8, 25),
+    ):
         z = z + high * np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / (2 * wide**2))
     return np.column_stack([x, y, z])
 
@@ -48,12 +58,18 @@ def _lifted(plane: np.ndarray) -> np.ndarray:
 def _bent(points: np.ndarray) -> np.ndarray:
     """Up to 6 mm of difference between two heads, smooth over 80 mm, then another pose and size."""
     x, y = points.T[:2] / 40
-    moved = points + 3 * np.column_stack([np.sin(x + 1) + np.sin(y), np.cos(x) * np.sin(y), 0.5 * np.sin(x - y)])
+    moved = points + 3 * np.column_stack(
+        [np.sin(x + 1) + np.sin(y), np.cos(x) * np.sin(y), 0.5 * np.sin(x - y)]
+    )
     return moved @ TURN + [5, -3, 20]
 
 
-def _sheet(seed: int, change=lambda points: points, kept=lambda plane: plane[:, 0] < 9) -> tuple[Sheet, np.ndarray]:
-    """A surface deformed by `change` with its own triangles, and the places of its vertices on the disc."""
+def _sheet(
+    seed: int, change=lambda points: points, kept=lambda plane: plane[:, 0] < 9
+) -> tuple[Sheet, np.ndarray]:
+    """A surface deformed by `change` with its own triangles, and the places of its
+    vertices on the disc.
+    """
     plane = _disc(seed)
     faces = Delaunay(plane).simplices
     faces = faces[np.argsort(faces.min(axis=1), kind="stable")]
@@ -79,15 +95,22 @@ def test_corresponding_uv__follows_a_planted_deformation():
     chosen = anchor_vertices(template)
     away = _away(corresponding_uv(template, chosen, take), chosen, plane)
     assert np.isfinite(away).mean() > 0.75  # those beside the rim may leave the other
-    near = cKDTree(template.landmark).query(template.position[chosen])[0] < MIN_LANDMARK_DISTANCE_MM
+    near = (
+        cKDTree(template.landmark).query(template.position[chosen])[0]
+        < MIN_LANDMARK_DISTANCE_MM
+    )
     assert near.sum() > 10
     assert np.isnan(away[near]).all()  # landmarks are more accurate
-    # a tenth of the deformation's slope over a spacing; without bending, the similarity alone leaves 5 mm
+    # a tenth of the deformation's slope over a spacing; without bending, the similarity
+    # alone leaves 5 mm
     assert np.nanmedian(away) < 1.5
-    ears = (np.abs(np.abs(plane[chosen, 0]) - 0.7) < 0.1) & (np.abs(plane[chosen, 1] - 0.1) < 0.1)
+    ears = (np.abs(np.abs(plane[chosen, 0]) - 0.7) < 0.1) & (
+        np.abs(plane[chosen, 1] - 0.1) < 0.1
+    )
     assert ears.sum() >= 4
     assert np.nanmax(away[ears]) < 3.5
-    assert np.nanmax(away[template.rim[chosen]]) < 1e-6 * 100  # outlines at the same place correspond by their angle
+    # outlines at the same place correspond by their angle
+    assert np.nanmax(away[template.rim[chosen]]) < 1e-6 * 100
 
 
 def test_corresponding_uv__of_the_same_surface_in_another_pose_is_exact():
@@ -95,14 +118,16 @@ def test_corresponding_uv__of_the_same_surface_in_another_pose_is_exact():
     take, _ = _sheet(3, lambda points: points @ TURN + 7)
     chosen = anchor_vertices(template)
     away = _away(corresponding_uv(template, chosen, take), chosen, plane)
-    assert np.nanmedian(away) < 0.2  # triangles of 5 mm on bumps of 9 mm lie up to 0.3 mm below the surface
+    # triangles of 5 mm on bumps of 9 mm lie up to 0.3 mm below the surface
+    assert np.nanmedian(away) < 0.2
     assert np.nanquantile(away, 0.95) < 1.0
 
 
 def test_corresponding_uv__of_removed_parts_is_nan():
     template, plane = _sheet(1)
     take, _ = _sheet(2, _bent, kept=lambda plane: plane[:, 1] > -0.45)
-    take = replace(take, uv=0.5 + DISC_RADIUS * (take.uv - 0.5))  # any other uv: its outline is no circle here
+    # any other uv: its outline is no circle here
+    take = replace(take, uv=0.5 + DISC_RADIUS * (take.uv - 0.5))
     chosen = anchor_vertices(template)
     found = corresponding_uv(template, chosen, take)
     gone = plane[chosen, 1] < -0.5
@@ -111,7 +136,8 @@ def test_corresponding_uv__of_removed_parts_is_nan():
     inside = (plane[chosen, 1] > -0.3) & ~template.rim[chosen]
     assert np.isfinite(found[inside]).mean() > 0.6
     at = 0.5 + (found - 0.5) / DISC_RADIUS
-    assert np.nanmedian(_away(at, chosen, plane)) < 3.0  # beyond the landmarks, and without an outline
+    # beyond the landmarks, and without an outline
+    assert np.nanmedian(_away(at, chosen, plane)) < 3.0
 
 
 @pytest.mark.parametrize("unknown", [slice(2, None), slice(0, None)])
@@ -120,8 +146,12 @@ def test_corresponding_uv__without_a_pose_is_nan(unknown):
     chosen = anchor_vertices(template)[::50]
     landmark = template.landmark.copy()
     landmark[unknown] = np.nan
-    assert np.isnan(corresponding_uv(template, chosen, replace(template, landmark=landmark))).all()
-    line = np.where(np.isfinite(landmark), landmark, np.linspace(0, 1, 6)[:, None] * [50.0, 20, 0])
+    assert np.isnan(
+        corresponding_uv(template, chosen, replace(template, landmark=landmark))
+    ).all()
+    line = np.where(
+        np.isfinite(landmark), landmark, np.linspace(0, 1, 6)[:, None] * [50.0, 20, 0]
+    )
     flat = replace(template, landmark=line if unknown == slice(0, None) else landmark)
     assert np.isnan(corresponding_uv(flat, chosen, flat)).all()
 
@@ -153,9 +183,13 @@ def test_weights__of_equal_errors_are_those_of_each_axis():
     pull = rng.normal(size=(7, 3))
     kernel = np.exp(-np.linalg.norm(points[:, None] - points, axis=2))
     found = _weights(kernel, pull, np.tile(0.3 * np.eye(3), (7, 1, 1)))
-    np.testing.assert_allclose(found, np.linalg.solve(kernel + 0.3 * np.eye(7), pull), atol=1e-12)
+    np.testing.assert_allclose(
+        found, np.linalg.solve(kernel + 0.3 * np.eye(7), pull), atol=1e-12
+    )
     # what is free along x is not pulled along x
     loose = np.tile(np.diag([1e12, 0.3, 0.3]), (7, 1, 1))
     found = _weights(kernel, pull, loose)
     np.testing.assert_allclose(found[:, 0], 0, atol=1e-9)
-    np.testing.assert_allclose(found[:, 1:], np.linalg.solve(kernel + 0.3 * np.eye(7), pull[:, 1:]), atol=1e-9)
+    np.testing.assert_allclose(
+        found[:, 1:], np.linalg.solve(kernel + 0.3 * np.eye(7), pull[:, 1:]), atol=1e-9
+    )

@@ -20,7 +20,9 @@ ROUND_TRIP = 1e-7  # px or rad: Newton ends at 1e-10 of the focal length
 ONE_POINT = 1e-9  # px: two orders of the same sums
 
 
-def project_one(point: np.ndarray, distortion: np.ndarray) -> tuple[float, float, float]:
+def project_one(
+    point: np.ndarray, distortion: np.ndarray
+) -> tuple[float, float, float]:
     """cv2.projectPoints for one point, scalar by scalar."""
     x, y, z = (sum(R[i, j] * point[j] for j in range(3)) + T[i] for i in range(3))
     a = x / z
@@ -50,7 +52,9 @@ def test_project__keeps_the_shape_of_a_grid():
     pixels, depth = project(points, K, R, T, LENS)
     assert pixels.shape == (2, 3, 4, 2)
     assert depth.shape == (2, 3, 4)
-    np.testing.assert_array_equal(pixels[1, 2, 3], project(points[1, 2, 3], K, R, T, LENS)[0])
+    np.testing.assert_array_equal(
+        pixels[1, 2, 3], project(points[1, 2, 3], K, R, T, LENS)[0]
+    )
 
 
 def test_project__optical_axis_meets_the_principal_point():
@@ -68,12 +72,16 @@ def test_project__nan_behind_the_camera():
 
 def test_project__nan_where_the_polynomial_folds_back():
     barrel = np.array([-0.3, 0, 0, 0, 0])  # r (1 - 0.3 r^2) grows up to r = 1.054
-    inside, outside = (camera_centre(R, T) + 500 * (R[2] + r * R[0]) for r in (1.0, 1.1))
+    inside, outside = (
+        camera_centre(R, T) + 500 * (R[2] + r * R[0]) for r in (1.0, 1.1)
+    )
     assert np.isfinite(project(inside, K, R, T, barrel)[0]).all()
     assert np.isnan(project(outside, K, R, T, barrel)[0]).all()
 
 
-@pytest.mark.parametrize("lens", [np.zeros(5), LENS, [0.4, 0.2, 0, 0, 0.1], [-0.3, 0, 0, 0, 0]])
+@pytest.mark.parametrize(
+    "lens", [np.zeros(5), LENS, [0.4, 0.2, 0, 0, 0.1], [-0.3, 0, 0, 0, 0]]
+)
 def test_pixel_rays__pass_through_the_projected_points(lens):
     points = face_points()
     pixels, _ = project(points, K, R, T, lens)
@@ -84,7 +92,13 @@ def test_pixel_rays__pass_through_the_projected_points(lens):
 
 @settings(max_examples=50, deadline=None)
 @example(0.0, 5e-324, 0.0, 0.0, 0.0)
-@given(st.floats(-0.4, 0.4), st.floats(-0.1, 0.1), st.floats(-0.01, 0.01), st.floats(0, 2 * math.pi), st.floats(0, 0.5))
+@given(
+    st.floats(-0.4, 0.4),
+    st.floats(-0.1, 0.1),
+    st.floats(-0.01, 0.01),
+    st.floats(0, 2 * math.pi),
+    st.floats(0, 0.5),
+)
 def test_undistort__inverts_whatever_lens(k1, k2, p, angle, radius):
     lens = np.array([k1, k2, p, -p, 0.0])
     plane = np.array([radius * math.cos(angle), radius * math.sin(angle), 1.0])
@@ -95,8 +109,14 @@ def test_undistort__inverts_whatever_lens(k1, k2, p, angle, radius):
 def test_undistort__nan_at_pixels_no_point_maps_to():
     barrel = np.array([-0.3, 0, 0, 0, 0])  # the rim appears at 0.703 focal lengths
     pixels = K[:2, 2] + 2000 * np.array([[0.6, 0.0], [0.8, 0.0], [np.nan, 0.0]])
-    assert np.isfinite(undistort(pixels, K, barrel)).all(axis=1).tolist() == [True, False, False]
+    assert np.isfinite(undistort(pixels, K, barrel)).all(axis=1).tolist() == [
+        True,
+        False,
+        False,
+    ]
 
 
 def test_camera_centre__projects_to_depth_zero():
-    assert project(camera_centre(R, T), K, R, T, LENS)[1] == pytest.approx(0, abs=ONE_POINT)
+    assert project(camera_centre(R, T), K, R, T, LENS)[1] == pytest.approx(
+        0, abs=ONE_POINT
+    )

@@ -27,7 +27,9 @@ def cap(level: int = 3) -> tuple[np.ndarray, np.ndarray]:
 
 def face_set(faces: np.ndarray) -> Counter[tuple[int, ...]]:
     """Faces as sets of vertices with their winding: each starts at its lowest vertex."""
-    return Counter(tuple(np.roll(face, -int(np.argmin(face))).tolist()) for face in faces)
+    return Counter(
+        tuple(np.roll(face, -int(np.argmin(face))).tolist()) for face in faces
+    )
 
 
 def in_scan(mesh: CleanMesh) -> Counter[tuple[int, ...]]:
@@ -36,7 +38,11 @@ def in_scan(mesh: CleanMesh) -> Counter[tuple[int, ...]]:
 
 def assert_sound(mesh: CleanMesh) -> None:
     """Check with dictionaries that a mesh is one oriented manifold piece."""
-    directed = Counter((int(a), int(b)) for face in mesh.faces for a, b in zip(face, np.roll(face, -1), strict=True))
+    directed = Counter(
+        (int(a), int(b))
+        for face in mesh.faces
+        for a, b in zip(face, np.roll(face, -1), strict=True)
+    )
     assert max(directed.values()) == 1
     onward: dict[int, dict[int, int]] = {}
     for a, b, c in mesh.faces.tolist():
@@ -54,7 +60,9 @@ def assert_sound(mesh: CleanMesh) -> None:
 
 
 def planted(seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """A cap with one defect of each kind: vertices, faces, the sound cap's faces that must survive."""
+    """A cap with one defect of each kind: vertices, faces, the sound cap's faces that
+    must survive.
+    """
     v, f = cap()
     rng = np.random.default_rng(seed)
     inner = np.flatnonzero(v[f].min(axis=1)[:, 2] > 20)
@@ -63,10 +71,20 @@ def planted(seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarr
     tips = v[f[fin]].mean(axis=1) * 1.1
     extra.append(np.stack([f[fin, 0], f[fin, 1], len(v) + np.arange(3)], axis=1))
     on_edge = v[f[needle][:, :2]].mean(axis=1)
-    extra.append(np.stack([f[needle, 0], f[needle, 1], len(v) + 3 + np.arange(3)], axis=1))
+    extra.append(
+        np.stack([f[needle, 0], f[needle, 1], len(v) + 3 + np.arange(3)], axis=1)
+    )
     island = trimesh.creation.icosphere(1, radius=3.0)
     extra.append(np.asarray(island.faces) + len(v) + 6)
-    points = np.concatenate([v, tips, on_edge, np.asarray(island.vertices) + np.array([0, 0, 200]), [[1.0, 2, 3]]])
+    points = np.concatenate(
+        [
+            v,
+            tips,
+            on_edge,
+            np.asarray(island.vertices) + np.array([0, 0, 200]),
+            [[1.0, 2, 3]],
+        ]
+    )
     faces = np.concatenate([np.delete(f, hole, axis=0), *extra])
     return points, rng.permutation(faces), np.delete(f, hole, axis=0), f[hole]
 
@@ -87,13 +105,23 @@ def test_clean_mesh__planted_defects_are_gone():
         assert_sound(mesh)
         assert in_scan(mesh) == face_set(np.concatenate([sound, holes]))
         np.testing.assert_array_equal(mesh.vertices, v[mesh.source_vertex])
-        expected = {"degenerate_faces": 3, "non_manifold_edges": 6, "non_manifold_faces": 6, "islands": 1}
-        expected |= {"island_faces": 80, "pin_holes": 2}  # two of the three removed faces have a common side
+        expected = {
+            "degenerate_faces": 3,
+            "non_manifold_edges": 6,
+            "non_manifold_faces": 6,
+            "islands": 1,
+        }
+        # two of the three removed faces have a common side
+        expected |= {"island_faces": 80, "pin_holes": 2}
         assert expected.items() <= mesh.report.items()
         # the permutation decides which of three equal faces comes first
         assert mesh.report["duplicate_faces"] + mesh.report["flipped_duplicates"] == 6
         # dropped: tips 3, points on edges 3, island 42, unused 1
-        assert (mesh.report["filled_faces"], mesh.report["open_loops"], mesh.report["dropped_vertices"]) == (3, 1, 49)
+        assert (
+            mesh.report["filled_faces"],
+            mesh.report["open_loops"],
+            mesh.report["dropped_vertices"],
+        ) == (3, 1, 49)
 
 
 def test_clean_mesh__defects_of_the_capture_generator(monkeypatch):
@@ -104,7 +132,9 @@ def test_clean_mesh__defects_of_the_capture_generator(monkeypatch):
     from capgen.mesh import plant_defects
 
     v, f = cap(4)
-    spoilt, faces, _, found = plant_defects(v, f, np.zeros((len(f), 3, 2)), np.random.default_rng(5))
+    spoilt, faces, _, found = plant_defects(
+        v, f, np.zeros((len(f), 3, 2)), np.random.default_rng(5)
+    )
     mesh = clean_mesh(spoilt, faces)
     assert_sound(mesh)
     assert mesh.report["degenerate_faces"] == found["index_degenerate"]
@@ -117,7 +147,10 @@ def test_clean_mesh__defects_of_the_capture_generator(monkeypatch):
 
 def test_clean_mesh__winding_is_made_alike_and_outwards():
     v, f = cap()
-    for turned in (np.random.default_rng(0).random(len(f)) < 0.3, np.ones(len(f), bool)):
+    for turned in (
+        np.random.default_rng(0).random(len(f)) < 0.3,
+        np.ones(len(f), bool),
+    ):
         mesh = clean_mesh(v, np.where(turned[:, None], f[:, ::-1], f))
         assert face_set(mesh.faces) == face_set(f)
 
@@ -192,11 +225,20 @@ def test_clean_mesh__large_openings_stay():
 def test_clean_mesh__moebius_strip_is_cut():
     n = 24
     angle = 2 * np.pi * np.arange(n) / n
-    half = np.stack([np.cos(angle / 2) * np.cos(angle), np.cos(angle / 2) * np.sin(angle), np.sin(angle / 2)], 1)
+    half = np.stack(
+        [
+            np.cos(angle / 2) * np.cos(angle),
+            np.cos(angle / 2) * np.sin(angle),
+            np.sin(angle / 2),
+        ],
+        1,
+    )
     ring = 50 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
     v = np.concatenate([ring + 10 * half, ring - 10 * half])
     i = np.arange(n - 1)
-    f = np.concatenate([np.stack([i, i + 1, i + n], 1), np.stack([i + 1, i + n + 1, i + n], 1)])
+    f = np.concatenate(
+        [np.stack([i, i + 1, i + n], 1), np.stack([i + 1, i + n + 1, i + n], 1)]
+    )
     closing = np.array([[n - 1, n, 2 * n - 1], [n, 0, 2 * n - 1]])
     mesh = clean_mesh(v, np.concatenate([f, closing]))
     assert_sound(mesh)
@@ -208,7 +250,11 @@ def test_clean_mesh__large_flap_goes_before_the_small_faces_it_stands_on():
     i = int(np.flatnonzero(v[f].min(axis=1)[:, 2] > 40)[0])
     a, b = f[i, :2]
     # the first face of the flap is large and has no free side: the flap is only known by its size
-    tips = v[[a, b]].mean(axis=0) * np.array([[1.6], [1.7], [1.7]]) + [[0, 0, 0], [30, 0, 0], [-30, 0, 0]]
+    tips = v[[a, b]].mean(axis=0) * np.array([[1.6], [1.7], [1.7]]) + [
+        [0, 0, 0],
+        [30, 0, 0],
+        [-30, 0, 0],
+    ]
     t = len(v) + np.arange(3)
     flap = np.array([[a, b, t[0]], [b, t[1], t[0]], [t[0], t[2], a]])
     mesh = clean_mesh(np.concatenate([v, tips]), np.concatenate([f, flap]))
@@ -219,12 +265,20 @@ def test_clean_mesh__large_flap_goes_before_the_small_faces_it_stands_on():
 def test_clean_mesh__outline_of_few_vertices_is_no_hole():
     inner = np.arange(12) * np.pi / 6
     outer = np.arange(6) * np.pi / 3
-    ring = [np.stack([r * np.cos(x), r * np.sin(x), 0 * x], axis=1) for r, x in ((10, inner), (80, outer))]
+    ring = [
+        np.stack([r * np.cos(x), r * np.sin(x), 0 * x], axis=1)
+        for r, x in ((10, inner), (80, outer))
+    ]
     o = 12 + np.arange(6)
     i = np.arange(0, 12, 2)
     after = 12 + np.arange(1, 7) % 6
     beyond = (i + 2) % 12
-    f = np.concatenate([np.stack(x, 1) for x in ((i, o, i + 1), (i + 1, o, after), (i + 1, after, beyond))])
+    f = np.concatenate(
+        [
+            np.stack(x, 1)
+            for x in ((i, o, i + 1), (i + 1, o, after), (i + 1, after, beyond))
+        ]
+    )
     mesh = clean_mesh(np.concatenate(ring), f)
     assert_sound(mesh)
     assert (mesh.report["filled_faces"], mesh.report["open_loops"]) == (10, 1)
@@ -241,7 +295,10 @@ def test_clean_mesh__sliver_on_the_boundary_is_dropped():
 LATTICE = np.array([[x, y, 0.0] for x in range(4) for y in range(3)])
 
 
-@pytest.mark.parametrize("points", [np.random.default_rng(3).normal(size=(12, 3)) * 10, LATTICE, LATTICE // 2])
+@pytest.mark.parametrize(
+    "points",
+    [np.random.default_rng(3).normal(size=(12, 3)) * 10, LATTICE, LATTICE // 2],
+)
 @settings(max_examples=40, deadline=None)
 @given(st.lists(st.tuples(*[st.integers(0, 11)] * 3), min_size=1, max_size=40))
 def test_clean_mesh__any_rubbish_becomes_sound_or_is_refused(points, faces):

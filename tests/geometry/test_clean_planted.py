@@ -1,4 +1,6 @@
-"""Twenty defects of each kind, alone and together: the report distinguishes them and the original mesh returns."""
+"""Twenty defects of each kind, alone and together: the report distinguishes them and
+the original mesh returns.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,9 @@ N = 20
 
 @dataclass
 class Spoilt:
-    """A mesh to damage: faces may be dropped or changed, vertices and faces are added at the end."""
+    """A mesh to damage: faces may be dropped or changed, vertices and faces are added
+    at the end.
+    """
 
     vertices: np.ndarray
     faces: np.ndarray
@@ -34,7 +38,12 @@ class Spoilt:
         kept = np.delete(self.faces, self.dropped, axis=0)
         return (
             np.concatenate([self.vertices, *[p[None] for p in self.more_vertices]]),
-            np.concatenate([kept, *[np.asarray(f, np.int64).reshape(-1, 3) for f in self.more_faces]]),
+            np.concatenate(
+                [
+                    kept,
+                    *[np.asarray(f, np.int64).reshape(-1, 3) for f in self.more_faces],
+                ]
+            ),
         )
 
 
@@ -62,17 +71,24 @@ def flat_on_edge(s: Spoilt, i: int) -> None:
 
 def hanging(s: Spoilt, i: int) -> None:
     a = s.faces[i, 0]
-    s.more_faces.append([a, s.point(s.vertices[a] * 1.03), s.point(s.vertices[a] * 1.03 + [0, 2, 0])])
+    s.more_faces.append(
+        [a, s.point(s.vertices[a] * 1.03), s.point(s.vertices[a] * 1.03 + [0, 2, 0])]
+    )
 
 
 def island(s: Spoilt, i: int) -> None:
     centre = s.vertices[s.faces[i]].mean(axis=0) * 1.1
-    corners = [s.point(centre + p) for p in np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1.0]])]
+    corners = [
+        s.point(centre + p)
+        for p in np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1.0]])
+    ]
     s.more_faces.append(np.array(corners)[[[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]]])
 
 
 def needle(s: Spoilt, i: int, height: float = 2e-4) -> None:
-    """Insert a vertex near a on the edge ab of two faces, which divides each of them into a needle and the rest."""
+    """Insert a vertex near a on the edge ab of two faces, which divides each of them
+    into a needle and the rest.
+    """
     a, b, _ = s.faces[i]
     m = s.point(s.vertices[a] + height * (s.vertices[b] - s.vertices[a]))
     for j in np.flatnonzero(((s.faces == a) | (s.faces == b)).sum(axis=1) == 2):
@@ -104,10 +120,19 @@ PLANTED: dict[str, tuple[Callable[[Spoilt, int], None], dict[str, int]]] = {
     "duplicates": (duplicate, {"duplicate_faces": N}),
     "flipped duplicates": (flipped_duplicate, {"flipped_duplicates": N}),
     "degenerate": (degenerate, {"degenerate_faces": N}),
-    "fins": (fin, {"non_manifold_edges": N, "non_manifold_faces": N, "dropped_vertices": N}),
-    "flat on an edge": (flat_on_edge, {"non_manifold_edges": N, "non_manifold_faces": N, "dropped_vertices": N}),
+    "fins": (
+        fin,
+        {"non_manifold_edges": N, "non_manifold_faces": N, "dropped_vertices": N},
+    ),
+    "flat on an edge": (
+        flat_on_edge,
+        {"non_manifold_edges": N, "non_manifold_faces": N, "dropped_vertices": N},
+    ),
     "hanging at a vertex": (hanging, {"hanging_faces": N, "dropped_vertices": 2 * N}),
-    "islands": (island, {"islands": N, "island_faces": 4 * N, "dropped_vertices": 4 * N}),
+    "islands": (
+        island,
+        {"islands": N, "island_faces": 4 * N, "dropped_vertices": 4 * N},
+    ),
     "slivers": (needle, {"slivers": N, "dropped_vertices": N}),
     "pin holes": (pin_hole, {"pin_holes": N, "filled_faces": N}),
     "touching pin holes": (touching_holes, {"pin_holes": 2 * N, "filled_faces": 2 * N}),
@@ -144,15 +169,20 @@ def test_clean_mesh__twenty_of_a_kind(kind):
     assert in_scan(mesh) == face_set(f)
     np.testing.assert_array_equal(mesh.vertices, v)
     counts = {name: count for name, count in mesh.report.items() if count}
-    assert counts == {name: count for name, count in (expected | {"open_loops": 1}).items() if count}
+    assert counts == {
+        name: count for name, count in (expected | {"open_loops": 1}).items() if count
+    }
 
 
-WITHOUT_PLACES = {"island_faces", "filled_faces", "dropped_vertices"}  # consequences of other defects
+# consequences of other defects
+WITHOUT_PLACES = {"island_faces", "filled_faces", "dropped_vertices"}
 
 
 @pytest.mark.parametrize("kind", PLANTED)
 def test_clean_mesh__says_where(kind):
-    """Seen from the centre of the sphere, every defect is within an edge length of the face where it was planted."""
+    """Seen from the centre of the sphere, every defect is within an edge length of the
+    face where it was planted.
+    """
     v, f = cap(4)
     spoilt = Spoilt(v, f.copy())
     plant, expected = PLANTED[kind]
@@ -166,8 +196,12 @@ def test_clean_mesh__says_where(kind):
     side = np.linalg.norm(v[f[0, 0]] - v[f[0, 1]]) / np.linalg.norm(v[0])
     for name in set(mesh.places) - {"open_loops"}:
         places = np.array(mesh.places[name])
-        gap = np.linalg.norm((places / np.linalg.norm(places, axis=1, keepdims=True))[:, None] - ways, axis=2)
-        assert gap.min(axis=1).max() < 1.5 * side  # longest sides are 1.2 times the first one
+        gap = np.linalg.norm(
+            (places / np.linalg.norm(places, axis=1, keepdims=True))[:, None] - ways,
+            axis=2,
+        )
+        # longest sides are 1.2 times the first one
+        assert gap.min(axis=1).max() < 1.5 * side
         assert len(places) == min(expected[name], PLACES)
         assert expected[name] > N or set(gap.argmin(axis=1)) == set(range(N))
     (middle,) = mesh.places["open_loops"]
@@ -189,20 +223,28 @@ def test_clean_mesh__twenty_of_each_kind_together():
     np.testing.assert_array_equal(mesh.vertices, v)
     assert {name: count for name, count in mesh.report.items() if count} == total
     assert {name: len(places) for name, places in mesh.places.items()} == {
-        name: min(count, PLACES) for name, count in total.items() if name not in WITHOUT_PLACES
+        name: min(count, PLACES)
+        for name, count in total.items()
+        if name not in WITHOUT_PLACES
     }
     again = clean_mesh(mesh.vertices, mesh.faces)
     np.testing.assert_array_equal(again.faces, mesh.faces)
 
 
 def test_clean_mesh__hole_that_touches_the_outline():
-    """Outline and hole form one boundary, which passes their common vertex twice; only the hole is filled."""
+    """Outline and hole form one boundary, which passes their common vertex twice; only
+    the hole is filled.
+    """
     v, f = cap(3)
     outline = boundary_loops(f)[0]
     touching = np.flatnonzero(np.isin(f, outline).sum(axis=1) == 1)
     mesh = clean_mesh(v, np.delete(f, touching[0], axis=0))
     assert in_scan(mesh) == face_set(f)
-    assert (mesh.report["pin_holes"], mesh.report["bow_ties"], mesh.report["open_loops"]) == (1, 0, 1)
+    assert (
+        mesh.report["pin_holes"],
+        mesh.report["bow_ties"],
+        mesh.report["open_loops"],
+    ) == (1, 0, 1)
 
 
 def test_clean_mesh__openings_that_touch_and_stay_are_parted():
@@ -212,7 +254,11 @@ def test_clean_mesh__openings_that_touch_and_stay_are_parted():
     mesh = clean_mesh(*spoilt.mesh(), hole_edges=2)
     assert_sound(mesh)
     # both openings are one boundary of the surface that is parted between them
-    assert (mesh.report["bow_ties"], mesh.report["pin_holes"], mesh.report["open_loops"]) == (1, 0, 2)
+    assert (
+        mesh.report["bow_ties"],
+        mesh.report["pin_holes"],
+        mesh.report["open_loops"],
+    ) == (1, 0, 2)
     assert in_scan(mesh) == face_set(spoilt.mesh()[1])
 
 

@@ -18,7 +18,10 @@ MARKS = np.array([[0.0, 0, 80], [60, 0, 50]])
 def inside(p, crop):
     low_ok = crop.low is None or all(p[i] >= crop.low[i] for i in range(3))
     high_ok = crop.high is None or all(p[i] <= crop.high[i] for i in range(3))
-    near = crop.reach_mm is None or min(np.linalg.norm(p - m) for m in MARKS) <= crop.reach_mm
+    near = (
+        crop.reach_mm is None
+        or min(np.linalg.norm(p - m) for m in MARKS) <= crop.reach_mm
+    )
     return low_ok and high_ok and near
 
 

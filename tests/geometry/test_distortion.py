@@ -7,7 +7,13 @@ from fractions import Fraction
 import numpy as np
 from scipy.spatial import Delaunay
 
-from skindb.geometry.distortion import area_log2_sd, distortion, flipped, stretches, symmetric_dirichlet
+from skindb.geometry.distortion import (
+    area_log2_sd,
+    distortion,
+    flipped,
+    stretches,
+    symmetric_dirichlet,
+)
 
 
 def square(n: int = 12) -> tuple[np.ndarray, np.ndarray]:
@@ -33,14 +39,20 @@ def test_distortion__of_an_affine_map():
     np.testing.assert_allclose(found["area_log2_sd"], 0, atol=1e-12)
     assert found["flips"].tolist() == [0]
     largest, smallest, area = stretches(v, f, uv)
-    np.testing.assert_allclose([largest, smallest], np.tile([[30.0], [10.0]], len(f)), rtol=1e-12)
+    np.testing.assert_allclose(
+        [largest, smallest], np.tile([[30.0], [10.0]], len(f)), rtol=1e-12
+    )
     np.testing.assert_allclose(area.sum(), 300, rtol=1e-12)
     # stretches sqrt 3 and 1/sqrt 3 of the isometry of the same area, by hand
-    np.testing.assert_allclose(symmetric_dirichlet(largest, smallest, area), (3 + 1 / 3) / 2, rtol=1e-12)
+    np.testing.assert_allclose(
+        symmetric_dirichlet(largest, smallest, area), (3 + 1 / 3) / 2, rtol=1e-12
+    )
 
 
 def test_distortion__by_region_and_of_half_the_area_at_twice_the_size():
-    """The left half of the surface has twice the right one's texels: log2 is 1 apart, its sd 1/2."""
+    """The left half of the surface has twice the right one's texels: log2 is 1 apart,
+    its sd 1/2.
+    """
     uv, f = square(13)
     v = on_paper(uv, 10.0, 10.0)
     left = uv[:, 0] <= 0.5
@@ -48,7 +60,9 @@ def test_distortion__by_region_and_of_half_the_area_at_twice_the_size():
     member = np.column_stack([left, uv[:, 0] >= 0.5, np.zeros(len(uv), bool)])
     found = distortion(v, f, stretched, member)
     np.testing.assert_allclose(found["area_log2_sd"], [0.5, 0, 0, np.nan], atol=1e-7)
-    np.testing.assert_allclose(found["anisotropy_median"][1:], [2, 1, np.nan], rtol=1e-12)
+    np.testing.assert_allclose(
+        found["anisotropy_median"][1:], [2, 1, np.nan], rtol=1e-12
+    )
     np.testing.assert_allclose(found["anisotropy_p99"], [2, 2, 1, np.nan], rtol=1e-12)
     stretched[np.flatnonzero(left & (uv[:, 0] > 0.3))[3]] += [0.4, 0.0]
     flips = distortion(v, f, stretched, member)["flips"]
@@ -57,11 +71,13 @@ def test_distortion__by_region_and_of_half_the_area_at_twice_the_size():
 
 
 def test_distortion__of_lamberts_projection(hemisphere):
-    """Areas are kept; the stretch 1 / cos^2(theta / 2) exceeds 1 / (1 - q / 2) on a fraction q of the hemisphere."""
+    """Areas are kept; the stretch 1 / cos^2(theta / 2) exceeds 1 / (1 - q / 2) on a
+    fraction q of the hemisphere.
+    """
     v, f, lambert = hemisphere
     found = distortion(v, f, 0.5 + lambert * [0.5, -0.5], no_regions(v))
-    # rings of 2 degrees: a quantile is off by one at most; both halves of a quad at the rim are equal on the sphere and
-    # differ by 2 % in the map
+    # rings of 2 degrees: a quantile is off by one at most; both halves of a quad at the
+    # rim are equal on the sphere and differ by 2 % in the map
     np.testing.assert_allclose(found["anisotropy_median"], 4 / 3, rtol=2e-2)
     np.testing.assert_allclose(found["anisotropy_p99"], 1 / (1 - 0.495), rtol=2e-2)
     np.testing.assert_allclose(found["area_log2_sd"], 0, atol=1e-2)
@@ -79,9 +95,13 @@ def test_distortion__triangles_without_area_do_not_count():
 
 
 def test_flipped__is_exact_where_rounding_decides():
-    """Points within 64 roundings of a line (Kettner et al. 2008): double precision has the wrong sign at many."""
+    """Points within 64 roundings of a line (Kettner et al. 2008): double precision has
+    the wrong sign at many.
+    """
     step = 2.0**-53
-    near = np.stack(np.meshgrid(*2 * [0.5 + step * np.arange(64)]), axis=-1).reshape(-1, 2)
+    near = np.stack(np.meshgrid(*2 * [0.5 + step * np.arange(64)]), axis=-1).reshape(
+        -1, 2
+    )
     uv = np.concatenate([near, [[12.0, 12.0], [24.0, 24.0]]])
     n = len(near)
     f = np.column_stack([np.arange(n), np.full(n, n), np.full(n, n + 1)])

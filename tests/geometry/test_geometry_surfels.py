@@ -1,11 +1,19 @@
-"""Morton order compared with interleaved strings; areas and normals compared with spheres and loops."""
+"""Morton order compared with interleaved strings; areas and normals compared with
+spheres and loops.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 import trimesh
 
-from skindb.geometry.surfels import MORTON_BITS, morton_order, splat_radius, vertex_areas, vertex_normals
+from skindb.geometry.surfels import (
+    MORTON_BITS,
+    morton_order,
+    splat_radius,
+    vertex_areas,
+    vertex_normals,
+)
 
 ROUNDING = 1e-12
 
@@ -16,8 +24,19 @@ def sphere(level: int = 3, radius: float = 80.0) -> tuple[np.ndarray, np.ndarray
 
 
 def morton_key(point: np.ndarray, low: np.ndarray, side: float) -> int:
-    cells = [min(int((x - a) / side * 2**MORTON_BITS), 2**MORTON_BITS - 1) for x, a in zip(point, low, strict=True)]
-    return int("".join(a + b + c for a, b, c in zip(*(f"{cell:0{MORTON_BITS}b}" for cell in cells), strict=True)), 2)
+    cells = [
+        min(int((x - a) / side * 2**MORTON_BITS), 2**MORTON_BITS - 1)
+        for x, a in zip(point, low, strict=True)
+    ]
+    return int(
+        "".join(
+            a + b + c
+            for a, b, c in zip(
+                *(f"{cell:0{MORTON_BITS}b}" for cell in cells), strict=True
+            )
+        ),
+        2,
+    )
 
 
 def test_morton_order__sorts_interleaved_bits():
@@ -31,7 +50,9 @@ def test_morton_order__keeps_neighbours_together():
     points = sphere(4)[0]
     shuffled = np.random.default_rng(0).permutation(points)
     step = np.linalg.norm(np.diff(shuffled[morton_order(shuffled)], axis=0), axis=1)
-    assert np.median(step) < 0.1 * np.median(np.linalg.norm(np.diff(shuffled, axis=0), axis=1))
+    assert np.median(step) < 0.1 * np.median(
+        np.linalg.norm(np.diff(shuffled, axis=0), axis=1)
+    )
 
 
 def test_morton_order__equal_and_no_points():
@@ -61,9 +82,12 @@ def test_vertex_areas__give_each_corner_a_third():
     v, f = sphere(2)
     expected = np.zeros(len(v))
     for a, b, c in f:
-        sides = [float(np.linalg.norm(v[i] - v[j])) for i, j in ((a, b), (b, c), (c, a))]
+        sides = [
+            float(np.linalg.norm(v[i] - v[j])) for i, j in ((a, b), (b, c), (c, a))
+        ]
         half = sum(sides) / 2
-        area = (half * (half - sides[0]) * (half - sides[1]) * (half - sides[2])) ** 0.5  # Heron
+        # Heron
+        area = (half * (half - sides[0]) * (half - sides[1]) * (half - sides[2])) ** 0.5
         expected[[a, b, c]] += area / 3
     np.testing.assert_allclose(vertex_areas(v, f), expected, rtol=1e-10)
 
@@ -71,4 +95,6 @@ def test_vertex_areas__give_each_corner_a_third():
 def test_splat_radius__is_of_the_longest_edge():
     vertices = np.array([[0.0, 0, 0], [3, 0, 0], [0, 4, 0], [0, 0, 1], [9, 9, 9]])
     faces = np.array([[0, 1, 2], [0, 2, 3]])
-    np.testing.assert_allclose(splat_radius(vertices, faces), 0.7 * np.array([4, 5, 5, np.sqrt(17), 0]))
+    np.testing.assert_allclose(
+        splat_radius(vertices, faces), 0.7 * np.array([4, 5, 5, np.sqrt(17), 0])
+    )

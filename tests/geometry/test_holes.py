@@ -22,7 +22,10 @@ def all_triangulations(ring: list[int]):
 
 
 def area(v: np.ndarray, triangles) -> float:
-    return sum(float(np.linalg.norm(np.cross(v[b] - v[a], v[c] - v[a]))) / 2 for a, b, c in triangles)
+    return sum(
+        float(np.linalg.norm(np.cross(v[b] - v[a], v[c] - v[a]))) / 2
+        for a, b, c in triangles
+    )
 
 
 def ring(n: int, seed: int = 0) -> np.ndarray:
@@ -43,7 +46,11 @@ def test_fill_hole__has_the_least_area_of_all(n):
 
 def test_fill_hole__runs_against_the_loop():
     patch = fill_hole(ring(6), np.arange(6), set())
-    sides = {(int(a), int(b)) for face in patch for a, b in zip(face, np.roll(face, -1), strict=True)}
+    sides = {
+        (int(a), int(b))
+        for face in patch
+        for a, b in zip(face, np.roll(face, -1), strict=True)
+    }
     assert {((i + 1) % 6, i) for i in range(6)} <= sides
 
 
@@ -52,7 +59,10 @@ def test_fill_hole__repeats_no_edge():
     free = fill_hole(v, np.arange(4), set())
     diagonal = set.intersection(*({int(x) for x in face} for face in free))
     other = fill_hole(v, np.arange(4), {tuple(sorted(diagonal))})
-    assert set.intersection(*({int(x) for x in face} for face in other)) == set(range(4)) - diagonal
+    assert (
+        set.intersection(*({int(x) for x in face} for face in other))
+        == set(range(4)) - diagonal
+    )
     assert fill_hole(v, np.arange(4), {(0, 2), (1, 3)}) is None
 
 
@@ -60,12 +70,20 @@ def test_fill_hole__makes_no_sliver():
     line = np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0]], float)
     assert fill_hole(line, np.arange(3), set()) is None
     # three of four in a line: the diagonal from the middle one is the only one left
-    patch = fill_hole(np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0], [1, 2, 0]], float), np.arange(4), set())
-    assert not sliver_mask(np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0], [1, 2, 0]], float), patch).any()
+    patch = fill_hole(
+        np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0], [1, 2, 0]], float),
+        np.arange(4),
+        set(),
+    )
+    assert not sliver_mask(
+        np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0], [1, 2, 0]], float), patch
+    ).any()
 
 
 def test_sliver_mask__by_height_over_longest_side():
-    v = np.array([[0, 0, 0], [100, 0, 0], [50, 0.2, 0], [50, 0.05, 0], [0, 0, 0]], float)
+    v = np.array(
+        [[0, 0, 0], [100, 0, 0], [50, 0.2, 0], [50, 0.05, 0], [0, 0, 0]], float
+    )
     faces = np.array([[0, 1, 2], [0, 1, 3], [0, 1, 4], [0, 0, 4]])
     assert sliver_mask(v, faces).tolist() == [False, True, True, True]
     assert sliver_mask(v * 1e-6, faces).tolist() == [False, True, True, True]

@@ -3,22 +3,43 @@
 import numpy as np
 import pytest
 
-from skindb.geometry.landmark_suggestions import MEAN_FACE, mate, nose_tip, suggest_landmarks
+from skindb.geometry.landmark_suggestions import (
+    MEAN_FACE,
+    mate,
+    nose_tip,
+    suggest_landmarks,
+)
 from skindb.virtual.head import parametric_head
 from skindb.virtual.person import default_people, face_shape
 
-SEVEN = ("nose_tip", "nasion", "chin", "eye_outer_left", "eye_outer_right", "forehead_centre", "mouth_corner_left")
+SEVEN = (
+    "nose_tip",
+    "nasion",
+    "chin",
+    "eye_outer_left",
+    "eye_outer_right",
+    "forehead_centre",
+    "mouth_corner_left",
+)
 
 
 @pytest.fixture(scope="module")
 def heads():
-    return [parametric_head(face_shape(person), spacing_mm=4.0) for person in default_people()[2:]]
+    return [
+        parametric_head(face_shape(person), spacing_mm=4.0)
+        for person in default_people()[2:]
+    ]
 
 
 def errors(head, given):
     """Distances in mm of the suggestions to the truth, by name."""
-    found = suggest_landmarks(head.vertices, head.faces, {name: head.landmarks[name] for name in given})
-    return {name: float(np.linalg.norm(p - head.landmarks[name])) for name, p in found.items()}
+    found = suggest_landmarks(
+        head.vertices, head.faces, {name: head.landmarks[name] for name in given}
+    )
+    return {
+        name: float(np.linalg.norm(p - head.landmarks[name]))
+        for name, p in found.items()
+    }
 
 
 def test_nose_tip__is_near_the_true_one(heads):
@@ -29,8 +50,14 @@ def test_nose_tip__is_near_the_true_one(heads):
 
 def test_suggest_landmarks__names_exactly_those_that_are_not_set(heads):
     head = heads[0]
-    assert {*suggest_landmarks(head.vertices, head.faces, {})} == {*head.landmarks} == {*MEAN_FACE}
-    found = suggest_landmarks(head.vertices, head.faces, {name: head.landmarks[name] for name in SEVEN})
+    assert (
+        {*suggest_landmarks(head.vertices, head.faces, {})}
+        == {*head.landmarks}
+        == {*MEAN_FACE}
+    )
+    found = suggest_landmarks(
+        head.vertices, head.faces, {name: head.landmarks[name] for name in SEVEN}
+    )
     assert {*found} == {*head.landmarks} - {*SEVEN}
     assert suggest_landmarks(head.vertices, head.faces, head.landmarks) == {}
 
@@ -38,7 +65,8 @@ def test_suggest_landmarks__names_exactly_those_that_are_not_set(heads):
 def test_suggest_landmarks__come_nearer_as_points_are_set(heads):
     none = np.concatenate([[*errors(head, ()).values()] for head in heads])
     seven = np.concatenate([[*errors(head, SEVEN).values()] for head in heads])
-    # measured once on these heads: median 4.9 and 1.3 mm, largest 10.9 and 3.9 mm, the variation of their proportions
+    # measured once on these heads: median 4.9 and 1.3 mm, largest 10.9 and 3.9 mm, the
+    # variation of their proportions
     assert np.median(none) < 6
     assert none.max() < 13
     assert np.median(seven) < 1.6
@@ -50,7 +78,10 @@ def test_suggest_landmarks__mirrors_a_point_whose_mate_is_set(heads):
     for head in heads:
         found = errors(head, given)
         # faces are not quite symmetric: measured 1.0 mm, and 1.7 to 4.1 mm without mirroring
-        assert max(found[mate(name)] for name in ("jaw_left", "brow_left", "ala_left")) < 1.5, found
+        assert (
+            max(found[mate(name)] for name in ("jaw_left", "brow_left", "ala_left"))
+            < 1.5
+        ), found
 
 
 def test_suggest_landmarks__follows_a_turned_and_scaled_head(heads):
@@ -59,7 +90,9 @@ def test_suggest_landmarks__follows_a_turned_and_scaled_head(heads):
     turn *= np.sign(np.linalg.det(turn))
     given = {name: 1.3 * head.landmarks[name] @ turn + 7 for name in SEVEN}
     turned = suggest_landmarks(1.3 * head.vertices @ turn + 7, head.faces, given)
-    plain = suggest_landmarks(head.vertices, head.faces, {name: head.landmarks[name] for name in SEVEN})
+    plain = suggest_landmarks(
+        head.vertices, head.faces, {name: head.landmarks[name] for name in SEVEN}
+    )
     for name, place in plain.items():
         np.testing.assert_allclose(turned[name], 1.3 * place @ turn + 7, atol=1e-6)
 

@@ -12,8 +12,13 @@ from skindb.geometry.nearest import closest_on_mesh, winding_number
 
 
 def every_distance(triangles: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """(n, f): trimesh answers for pairs of triangle and point, by another algorithm (Ericson's regions)."""
-    nearest = [trimesh.triangles.closest_point(triangles, np.tile(p, (len(triangles), 1))) for p in points]
+    """(n, f): trimesh answers for pairs of triangle and point, by another algorithm
+    (Ericson's regions).
+    """
+    nearest = [
+        trimesh.triangles.closest_point(triangles, np.tile(p, (len(triangles), 1)))
+        for p in points
+    ]
     return np.linalg.norm(np.stack(nearest) - points[:, None], axis=2)
 
 
@@ -23,32 +28,49 @@ def test_closest_on_mesh__agrees_with_trimesh():
     points = rng.normal(size=(60, 3)) * 50
     faces = np.asarray(ball.faces)
     face, weight, distance = closest_on_mesh(np.asarray(ball.vertices), faces, points)
-    np.testing.assert_allclose(distance, every_distance(ball.triangles, points).min(axis=1), rtol=1e-12)
+    np.testing.assert_allclose(
+        distance, every_distance(ball.triangles, points).min(axis=1), rtol=1e-12
+    )
     np.testing.assert_allclose(weight.sum(axis=1), 1, rtol=1e-14)
     assert weight.min() >= 0
     there = np.einsum("nk,nki->ni", weight, ball.vertices[faces[face]])
-    np.testing.assert_allclose(np.linalg.norm(there - points, axis=1), distance, rtol=1e-12)
+    np.testing.assert_allclose(
+        np.linalg.norm(there - points, axis=1), distance, rtol=1e-12
+    )
 
 
 def test_closest_on_mesh__corner_side_plane_and_degenerate_triangles():
     v = np.array([[0, 0, 0], [4, 0, 0], [0, 4, 0], [9, 9, 9.0]])
     points = np.array([[1, 1, 2], [-3, -4, 0], [2, -5, 0], [4, 4, 0]], float)
-    face, weight, distance = closest_on_mesh(v, np.array([[3, 3, 3], [0, 1, 2]]), points)
+    face, weight, distance = closest_on_mesh(
+        v, np.array([[3, 3, 3], [0, 1, 2]]), points
+    )
     assert face.tolist() == [1] * 4
-    np.testing.assert_allclose(weight, [[0.5, 0.25, 0.25], [1, 0, 0], [0.5, 0.5, 0], [0, 0.5, 0.5]], atol=1e-15)
+    np.testing.assert_allclose(
+        weight, [[0.5, 0.25, 0.25], [1, 0, 0], [0.5, 0.5, 0], [0, 0.5, 0.5]], atol=1e-15
+    )
     np.testing.assert_allclose(distance, [2, 5, 5, np.sqrt(8)])
-    assert closest_on_mesh(v, np.array([[0, 1, 2]]), np.zeros((0, 3)))[1].shape == (0, 3)
+    assert closest_on_mesh(v, np.array([[0, 1, 2]]), np.zeros((0, 3)))[1].shape == (
+        0,
+        3,
+    )
 
 
 @pytest.mark.parametrize(
-    ("height", "expected"), [(0.0, 0.5), (30.0, 0.5 - 0.5 * 30 / 50), (-30.0, 0.5 + 0.5 * 30 / 50)]
+    ("height", "expected"),
+    [(0.0, 0.5), (30.0, 0.5 - 0.5 * 30 / 50), (-30.0, 0.5 + 0.5 * 30 / 50)],
 )
 def test_winding_number__of_an_open_cap_is_the_solid_angle_of_its_rim(height, expected):
     """A hemisphere of radius r seen from the axis: the rim as a disc in closed form."""
     ball = trimesh.creation.icosphere(5, radius=40.0)
     keep = (ball.vertices[ball.faces][..., 2] < 1e-9).all(axis=1)
-    found = winding_number(np.asarray(ball.vertices), np.asarray(ball.faces)[keep], np.array([[0, 0, height]]))
-    assert found == pytest.approx([expected], abs=5e-3)  # chords: the rim lies 1 % inside
+    found = winding_number(
+        np.asarray(ball.vertices),
+        np.asarray(ball.faces)[keep],
+        np.array([[0, 0, height]]),
+    )
+    # chords: the rim lies 1 % inside
+    assert found == pytest.approx([expected], abs=5e-3)
 
 
 def test_winding_number__closed():
@@ -62,7 +84,9 @@ def test_closest_on_mesh__a_large_triangle_whose_middle_is_far():
     big = [[0, 0, 0], [100, 0, 0], [0, 100, 0]]
     small = [[97, 1, 3], [98, 1, 3], [97, 2, 3]]
     face, _, distance = closest_on_mesh(
-        np.array(big + small, float), np.array([[3, 4, 5], [0, 1, 2]]), np.array([[97, 1, 1.0]])
+        np.array(big + small, float),
+        np.array([[3, 4, 5], [0, 1, 2]]),
+        np.array([[97, 1, 1.0]]),
     )
     assert (face[0], distance[0]) == (1, pytest.approx(1))
 
@@ -73,7 +97,9 @@ def test_closest_on_mesh__needles_down_to_no_height(reach):
     rng = np.random.default_rng(2)
     for height in 10 ** rng.uniform(-17, -1, 500):
         along, across, up = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-        v = np.outer([0, *rng.uniform(0, 5, 2)], along) + np.outer([0, 0, height], across)
+        v = np.outer([0, *rng.uniform(0, 5, 2)], along) + np.outer(
+            [0, 0, height], across
+        )
         v = rng.permutation(v)
         foot = rng.dirichlet([0.3, 0.3, 0.3]) @ v
         point = foot + rng.normal(scale=reach) * up
@@ -81,7 +107,10 @@ def test_closest_on_mesh__needles_down_to_no_height(reach):
         edge = np.roll(v, -1, axis=0) - v
         away = point - v
         t = np.clip((away * edge).sum(axis=1) / (edge**2).sum(axis=1), 0, 1)
-        others = [np.linalg.norm(point - foot), *np.linalg.norm(t[:, None] * edge - away, axis=1)]
+        others = [
+            np.linalg.norm(point - foot),
+            *np.linalg.norm(t[:, None] * edge - away, axis=1),
+        ]
         assert distance[0] <= min(others) + 1e-14  # ten roundings of 5 mm
         assert weight.min() >= 0
 
@@ -91,16 +120,22 @@ def test_closest_on_mesh__triangles_of_all_sizes():
     size = 10 ** rng.uniform(-3, 2, (200, 1, 1))
     triangles = rng.normal(size=(200, 1, 3)) * 20 + size * rng.normal(size=(200, 3, 3))
     points = rng.normal(size=(50, 3)) * 20
-    face, _, distance = closest_on_mesh(triangles.reshape(-1, 3), np.arange(600).reshape(-1, 3), points)
+    face, _, distance = closest_on_mesh(
+        triangles.reshape(-1, 3), np.arange(600).reshape(-1, 3), points
+    )
     every = every_distance(triangles, points)
     np.testing.assert_array_equal(face, every.argmin(axis=1))  # none touch: no ties
-    np.testing.assert_allclose(distance, every.min(axis=1), rtol=1e-9)  # small triangles at 20 mm: 1e-14 mm of 1e-3
+    # small triangles at 20 mm: 1e-14 mm of 1e-3
+    np.testing.assert_allclose(distance, every.min(axis=1), rtol=1e-9)
 
 
 def test_closest_on_mesh__one_long_triangle_costs_the_others_nothing():
     side = np.meshgrid(*2 * [np.arange(100.0)])
     step = np.arange(100 * 100).reshape(100, 100)
-    a, b, c, d = (step[i : i + 99, j : j + 99].ravel() for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)))
+    a, b, c, d = (
+        step[i : i + 99, j : j + 99].ravel()
+        for i, j in ((0, 0), (0, 1), (1, 0), (1, 1))
+    )
     plain = np.concatenate([np.stack([a, b, d], 1), np.stack([a, d, c], 1)])
     v = np.stack([*(x.ravel() / 2 for x in side), np.zeros(100 * 100)], axis=1)
     v = np.concatenate([v, [[-60, 0, 0], [0, -60, 0]]])
@@ -111,4 +146,5 @@ def test_closest_on_mesh__one_long_triangle_costs_the_others_nothing():
         closest_on_mesh(v, faces, points)
         peak.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
-    assert peak[2] < 1.2 * peak[1]  # 40 times if all are searched up to the longest distance
+    # 40 times if all are searched up to the longest distance
+    assert peak[2] < 1.2 * peak[1]

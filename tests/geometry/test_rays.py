@@ -15,12 +15,18 @@ SINGLE = 1e-6  # of float32, some steps of 6e-8
 REFINED = 1e-9  # hits are recomputed in float64
 
 
-def sphere(level: int, radius: float = HEAD, centre: tuple[float, float, float] = (10, -30, 50)):
+def sphere(
+    level: int, radius: float = HEAD, centre: tuple[float, float, float] = (10, -30, 50)
+):
     mesh = trimesh.creation.icosphere(level, radius=radius)
-    return np.asarray(mesh.vertices) + np.array(centre), np.asarray(mesh.faces, np.int64)
+    return np.asarray(mesh.vertices) + np.array(centre), np.asarray(
+        mesh.faces, np.int64
+    )
 
 
-def brute_force(v: np.ndarray, f: np.ndarray, origin: np.ndarray, direction: np.ndarray):
+def brute_force(
+    v: np.ndarray, f: np.ndarray, origin: np.ndarray, direction: np.ndarray
+):
     """Nearest face and distance of one ray: solve for (u, v, distance) with every triangle."""
     best = (np.inf, -1)
     for i, (a, b, c) in enumerate(v[f]):
@@ -33,7 +39,9 @@ def brute_force(v: np.ndarray, f: np.ndarray, origin: np.ndarray, direction: np.
     return best
 
 
-def tangents(normal: np.ndarray, elevation: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def tangents(
+    normal: np.ndarray, elevation: np.ndarray, rng: np.random.Generator
+) -> np.ndarray:
     """Unit directions at `elevation` (rad) above the plane of each normal."""
     along = np.cross(normal, rng.normal(size=normal.shape))
     along /= np.linalg.norm(along, axis=1, keepdims=True)
@@ -45,7 +53,9 @@ def on_facets(v: np.ndarray, f: np.ndarray, n: int, rng: np.random.Generator):
     face = rng.integers(0, len(f), n)
     weight = rng.dirichlet([1, 1, 1], n)
     normal = np.einsum("nk,nkc->nc", weight, vertex_normals(v, f)[f[face]])
-    return np.einsum("nk,nkc->nc", weight, v[f[face]]), normal / np.linalg.norm(normal, axis=1, keepdims=True)
+    return np.einsum("nk,nkc->nc", weight, v[f[face]]), normal / np.linalg.norm(
+        normal, axis=1, keepdims=True
+    )
 
 
 def test_first_hit__agrees_with_brute_force():
@@ -61,14 +71,18 @@ def test_first_hit__agrees_with_brute_force():
     assert 20 < (face >= 0).sum() < 150
     hit = face >= 0
     point = np.einsum("nk,nkc->nc", weight[hit], v[f[face[hit]]])
-    np.testing.assert_allclose(point, origin[hit] + distance[hit, None] * unit[hit], atol=HEAD * REFINED)
+    np.testing.assert_allclose(
+        point, origin[hit] + distance[hit, None] * unit[hit], atol=HEAD * REFINED
+    )
     np.testing.assert_array_equal(weight[~hit], 0)
 
 
 def test_first_hit__finds_every_vertex_and_edge_it_aims_at():
     v, f = sphere(5, centre=(0, 0, 0))  # Embree alone misses 96 of these vertices
     middle = (v[f[:, 0]] + v[f[:, 1]]) / 2
-    face, _, distance = RayScene(v, f).first_hit(np.zeros((1, 3)), np.concatenate([v, middle]))
+    face, _, distance = RayScene(v, f).first_hit(
+        np.zeros((1, 3)), np.concatenate([v, middle])
+    )
     assert (face >= 0).all()
     np.testing.assert_allclose(distance[: len(v)], HEAD, rtol=REFINED)
 
@@ -76,14 +90,18 @@ def test_first_hit__finds_every_vertex_and_edge_it_aims_at():
 def test_first_hit__passes_over_rays_that_are_not_finite():
     scene = RayScene(*sphere(1, centre=(0, 0, 0)))
     origin = np.array([[np.nan, 0, 0], [0, 0, 0], [0, 0, 500], [0, 0, 0]])
-    face, weight, distance = scene.first_hit(origin, np.array([[0, 0, 1.0], [0, 0, 0], [0, 0, 1], [0, 0.1, 1]]))
+    face, weight, distance = scene.first_hit(
+        origin, np.array([[0, 0, 1.0], [0, 0, 0], [0, 0, 1], [0, 0.1, 1]])
+    )
     assert (face >= 0).tolist() == [False, False, False, True]
     assert np.isinf(distance[:3]).all()
     assert weight[:3].max() == 0
 
 
 def test_first_hit__no_rays():
-    face, weight, distance = RayScene(*sphere(0)).first_hit(np.zeros((0, 3)), np.zeros((0, 3)))
+    face, weight, distance = RayScene(*sphere(0)).first_hit(
+        np.zeros((0, 3)), np.zeros((0, 3))
+    )
     assert (face.shape, weight.shape, distance.shape) == ((0,), (0, 3), (0,))
 
 
@@ -92,11 +110,15 @@ def test_distances__are_those_of_the_first_hit(monkeypatch):
     rng = np.random.default_rng(0)
     origin = np.array([40.0, 20, 700])
     direction = rng.normal(size=(500, 3)) * 60 + v.mean(0)
-    direction = (direction - origin) / np.linalg.norm(direction - origin, axis=1)[:, None]
+    direction = (direction - origin) / np.linalg.norm(direction - origin, axis=1)[
+        :, None
+    ]
     direction[::50] = np.nan
     monkeypatch.setattr("skindb.geometry.rays.RAYS_PER_BLOCK", 70)
     found = RayScene(v, f).distances(origin, direction)
-    _, _, expected = RayScene(v, f).first_hit(np.broadcast_to(origin, direction.shape), direction)
+    _, _, expected = RayScene(v, f).first_hit(
+        np.broadcast_to(origin, direction.shape), direction
+    )
     assert 50 < np.isfinite(expected).sum() < 450
     assert np.isinf(found[::50]).all()
     np.testing.assert_allclose(found, expected, atol=700 * SINGLE)
@@ -123,7 +145,10 @@ def test_occluded__smooth_surface_casts_no_shadow_on_itself(level, elevation):
     rng = np.random.default_rng(level)
     scene = RayScene(v, f)
     corner = rng.integers(0, len(v), 10_000)
-    for point, normal in ((v[corner], vertex_normals(v, f)[corner]), on_facets(v, f, 10_000, rng)):
+    for point, normal in (
+        (v[corner], vertex_normals(v, f)[corner]),
+        on_facets(v, f, 10_000, rng),
+    ):
         way = tangents(normal, np.full(10_000, np.radians(elevation)), rng)
         assert scene.occluded(point, point + 1000 * way, normal=normal).sum() == 0
 
@@ -148,9 +173,29 @@ def test_occluded__target_on_the_surface_does_not_hide_itself():
 def test_occluded__plate_between():
     plate = np.array([[-50, -50, 0], [50, -50, 0], [0, 80, 0]], float)
     scene = RayScene(plate, np.array([[0, 1, 2]]))
-    origin = np.array([[0, 0, -10], [0, 0, 10], [200, 0, -10], [0, 0, np.nan], [0, 0, -10], [0, 0, -10]], float)
-    target = np.array([[0, 0, 10], [0, 0, 20], [200, 0, 10], [0, 0, 1], [0, 0, -10], [0, 0, -1]], float)
-    assert scene.occluded(origin, target).tolist() == [True, False, False, True, False, False]
+    origin = np.array(
+        [
+            [0, 0, -10],
+            [0, 0, 10],
+            [200, 0, -10],
+            [0, 0, np.nan],
+            [0, 0, -10],
+            [0, 0, -10],
+        ],
+        float,
+    )
+    target = np.array(
+        [[0, 0, 10], [0, 0, 20], [200, 0, 10], [0, 0, 1], [0, 0, -10], [0, 0, -1]],
+        float,
+    )
+    assert scene.occluded(origin, target).tolist() == [
+        True,
+        False,
+        False,
+        True,
+        False,
+        False,
+    ]
 
 
 @pytest.mark.parametrize("lifted", [False, True])
@@ -162,7 +207,8 @@ def test_aim__as_by_numpy(lifted, one):
     centre = np.array([3.0, -2, 1])
     at = rng.permutation(50)[:30]
     target = rng.normal(size=(1 if one else 30, 3)) * 500
-    target[-1], origin[at[2]] = origin[at[-1]], np.nan  # too near for the offset, and without a position
+    # too near for the offset, and without a position
+    target[-1], origin[at[2]] = origin[at[-1]], np.nan
     lift, ahead = (normal, 0.0) if lifted else (np.zeros((1, 3)), 0.7)
     start = np.empty((30, 3), np.float32)
     way = np.empty((30, 3), np.float32)
@@ -175,7 +221,9 @@ def test_aim__as_by_numpy(lifted, one):
         unit = path / length[:, None]
     np.testing.assert_allclose(way, unit, atol=SINGLE)
     np.testing.assert_allclose(start, begin + ahead * unit, rtol=SINGLE)
-    np.testing.assert_allclose(reach, np.where(length < ahead + 0.3, 0, length - ahead - 0.3), rtol=SINGLE)
+    np.testing.assert_allclose(
+        reach, np.where(length < ahead + 0.3, 0, length - ahead - 0.3), rtol=SINGLE
+    )
     assert np.isnan(reach[2])
 
 
@@ -190,7 +238,9 @@ def test_occluded__chosen_origins_are_those_origins(monkeypatch):
     scene = RayScene(v, f)
     for aims in (eye, target):
         found = scene.occluded(v, aims, normal=normal, at=at)
-        np.testing.assert_array_equal(found, scene.occluded(v[at], aims, normal=normal[at]))
+        np.testing.assert_array_equal(
+            found, scene.occluded(v[at], aims, normal=normal[at])
+        )
         assert 0 < found.sum() < 200
 
 

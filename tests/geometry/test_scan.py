@@ -1,4 +1,6 @@
-"""Files written by hand and by trimesh are read with their vertices in order; broken files are named."""
+"""Files written by hand and by trimesh are read with their vertices in order; broken
+files are named.
+"""
 
 from __future__ import annotations
 
@@ -59,7 +61,9 @@ def save(folder: Path, name: str, text: str) -> Path:
 
 def test_read_scan__obj_with_texture_seams_keeps_order_and_count(tmp_path):
     scan = read_scan(save(tmp_path, "scan.obj", OBJ))
-    np.testing.assert_array_equal(scan.vertices, [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [9, 9, 9]])
+    np.testing.assert_array_equal(
+        scan.vertices, [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [9, 9, 9]]
+    )
     assert scan.faces.tolist() == [[0, 1, 2], [0, 2, 3], [0, 1, 2], [0, 2, 3]]
 
 
@@ -74,15 +78,22 @@ def test_read_scan__ply_polygons_are_cut_and_unused_vertices_kept(tmp_path):
 @pytest.mark.parametrize("encoding", ["ascii", "binary"])
 def test_read_scan__ply_in_any_encoding(tmp_path, encoding):
     mesh = trimesh.creation.icosphere(2, radius=80.0)
-    (tmp_path / "SCAN.PLY").write_bytes(trimesh.exchange.ply.export_ply(mesh, encoding=encoding))
+    (tmp_path / "SCAN.PLY").write_bytes(
+        trimesh.exchange.ply.export_ply(mesh, encoding=encoding)
+    )
     scan = read_scan(tmp_path / "SCAN.PLY")
-    np.testing.assert_allclose(scan.vertices, mesh.vertices, atol=1e-5)  # float32 in the file, 8 digits as text
+    # float32 in the file, 8 digits as text
+    np.testing.assert_allclose(scan.vertices, mesh.vertices, atol=1e-5)
     np.testing.assert_array_equal(scan.faces, mesh.faces)
 
 
 def test_read_scan__ply_with_texture_per_face_keeps_order_and_count(tmp_path):
-    body = PLY_QUADS.replace("vertex_indices\n", "vertex_indices\nproperty list uchar float texcoord\n")
-    body = body.replace("4 0 1 2 3\n3 0 1 2\n", "3 0 1 2 6 0 0 1 0 1 1\n3 0 2 3 6 .1 .1 .9 .9 0 1\n")
+    body = PLY_QUADS.replace(
+        "vertex_indices\n", "vertex_indices\nproperty list uchar float texcoord\n"
+    )
+    body = body.replace(
+        "4 0 1 2 3\n3 0 1 2\n", "3 0 1 2 6 0 0 1 0 1 1\n3 0 2 3 6 .1 .1 .9 .9 0 1\n"
+    )
     scan = read_scan(save(tmp_path, "scan.ply", body))
     assert len(scan.vertices) == 5
     assert scan.faces.tolist() == [[0, 1, 2], [0, 2, 3]]
@@ -94,11 +105,19 @@ def test_read_scan__ply_with_texture_per_face_keeps_order_and_count(tmp_path):
         ("scan.ply", "", "complete mesh file"),
         ("scan.ply", "solid rock", "complete mesh file"),
         ("scan.ply", PLY_QUADS[:-30], "scan"),
-        ("scan.ply", PLY_QUADS.split("4 0 1")[0].replace("element face 2", "element face 0"), "must have triangles"),
+        (
+            "scan.ply",
+            PLY_QUADS.split("4 0 1")[0].replace("element face 2", "element face 0"),
+            "must have triangles",
+        ),
         ("scan.obj", "", "must have triangles"),
         ("scan.obj", "v 0 0 0\nv 1 0\nv 1 1 0\nf 1 2 3\n", "complete mesh file"),
         ("scan.obj", "v 0 zero 0\n", "complete mesh file"),
-        ("scan.obj", "v 0 0 0\nv 1 0 0\nf 1 2 3\n", "faces must refer to vertices of the file"),
+        (
+            "scan.obj",
+            "v 0 0 0\nv 1 0 0\nf 1 2 3\n",
+            "faces must refer to vertices of the file",
+        ),
         ("scan.obj", "v 0 0 0\nv 1 0 nan\nv 1 1 0\nf 1 2 3\n", "finite numbers"),
         ("scan.stl", "solid", r"\.ply or \.obj"),
     ],
@@ -106,11 +125,15 @@ def test_read_scan__ply_with_texture_per_face_keeps_order_and_count(tmp_path):
 def test_read_scan__names_the_fault(tmp_path, name, text, rule):
     with pytest.raises(InputError, match=rule) as caught:
         read_scan(save(tmp_path, name, text))
-    assert all(str(fault).startswith(str(tmp_path / name)) for fault in caught.value.faults)
+    assert all(
+        str(fault).startswith(str(tmp_path / name)) for fault in caught.value.faults
+    )
 
 
 def test_read_scan__binary_ply_cut_short(tmp_path):
-    whole = trimesh.exchange.ply.export_ply(trimesh.creation.icosphere(2), encoding="binary")
+    whole = trimesh.exchange.ply.export_ply(
+        trimesh.creation.icosphere(2), encoding="binary"
+    )
     for cut in (len(whole) // 2, len(whole) - 5, 40):
         (tmp_path / "scan.ply").write_bytes(whole[:cut])
         with pytest.raises(InputError, match="scan"):
@@ -119,7 +142,11 @@ def test_read_scan__binary_ply_cut_short(tmp_path):
 
 def test_read_scan__all_faults_together(tmp_path):
     with pytest.raises(InputError) as caught:
-        read_scan(save(tmp_path, "scan.obj", "v 0 0 0\nv 1 0 inf\nv 1 1 0\nf 1 2 7\nf 1 2 3\n"))
+        read_scan(
+            save(
+                tmp_path, "scan.obj", "v 0 0 0\nv 1 0 inf\nv 1 1 0\nf 1 2 7\nf 1 2 3\n"
+            )
+        )
     assert len(caught.value.faults) == 2
 
 
@@ -137,7 +164,8 @@ def test_read_scan__quads_are_cut_along_the_shorter_diagonal(tmp_path):
         a, b, c = (scan.vertices[scan.faces[:, k]] for k in range(3))
         doubled = np.cross(b - a, c - a)[:, 2]
         assert (doubled > 0).all()
-        assert doubled.sum() / 2 == pytest.approx(18)  # of the dart, by the shoelace formula
+        # of the dart, by the shoelace formula
+        assert doubled.sum() / 2 == pytest.approx(18)
 
 
 def test_read_colours__of_a_file_with_and_without(tmp_path):
@@ -145,21 +173,37 @@ def test_read_colours__of_a_file_with_and_without(tmp_path):
     ball.export(tmp_path / "plain.ply")
     assert read_colours(tmp_path / "plain.ply", len(ball.vertices)) is None
     assert read_colours(tmp_path / "scan.obj", len(ball.vertices)) is None
-    colours = np.random.default_rng(0).integers(0, 256, (len(ball.vertices), 4)).astype(np.uint8)
+    colours = (
+        np.random.default_rng(0)
+        .integers(0, 256, (len(ball.vertices), 4))
+        .astype(np.uint8)
+    )
     path = tmp_path / "coloured.ply"
-    trimesh.Trimesh(ball.vertices, ball.faces, vertex_colors=colours, process=False).export(path)
-    np.testing.assert_array_equal(read_colours(path, len(ball.vertices)), colours[:, :3])
+    trimesh.Trimesh(
+        ball.vertices, ball.faces, vertex_colors=colours, process=False
+    ).export(path)
+    np.testing.assert_array_equal(
+        read_colours(path, len(ball.vertices)), colours[:, :3]
+    )
     assert read_colours(path, len(ball.vertices) + 1) is None
 
 
 def test_read_colours__of_numbers_that_are_not_of_eight_bits(tmp_path):
-    head = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    head = (
+        "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float "
+        "y\nproperty float z\n"
+    )
     for kind, value in (("float", "0.5"), ("ushort", "300"), ("short", "-1")):
-        colour = "".join(f"property {kind} {name}\n" for name in ("red", "green", "blue"))
-        rows = "".join(f"{x} {y} 0 {value} {value} {value}\n" for x, y in ((0, 0), (1, 0), (0, 1)))
+        colour = "".join(
+            f"property {kind} {name}\n" for name in ("red", "green", "blue")
+        )
+        rows = "".join(
+            f"{x} {y} 0 {value} {value} {value}\n" for x, y in ((0, 0), (1, 0), (0, 1))
+        )
         path = tmp_path / f"{kind}.ply"
         path.write_text(
-            f"{head}{colour}element face 1\nproperty list uchar int vertex_indices\nend_header\n{rows}3 0 1 2\n"
+            f"{head}{colour}element face 1\nproperty list uchar int "
+            f"vertex_indices\nend_header\n{rows}3 0 1 2\n"
         )
         assert len(read_scan(path).faces) == 1
         assert read_colours(path, 3) is None

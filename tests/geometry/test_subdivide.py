@@ -27,7 +27,9 @@ def grid(n: int = 4) -> tuple[np.ndarray, np.ndarray]:
     i, j = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
     v = np.stack([j.ravel(), i.ravel(), np.zeros(n * n)], axis=1).astype(float)
     a = (i * n + j)[:-1, :-1].ravel()
-    return v, np.concatenate([np.stack([a, a + 1, a + n + 1], 1), np.stack([a, a + n + 1, a + n], 1)])
+    return v, np.concatenate(
+        [np.stack([a, a + 1, a + n + 1], 1), np.stack([a, a + n + 1, a + n], 1)]
+    )
 
 
 def loop_twin(v: np.ndarray, f: np.ndarray) -> dict[frozenset[int], np.ndarray]:
@@ -45,7 +47,11 @@ def loop_twin(v: np.ndarray, f: np.ndarray) -> dict[frozenset[int], np.ndarray]:
             new[edge] = (v[i] + v[j]) / 2
     for i in range(len(v)):
         ring = [(edge - {i}).__iter__().__next__() for edge in across if i in edge]
-        rim = [(edge - {i}).__iter__().__next__() for edge, o in across.items() if i in edge and len(o) == 1]
+        rim = [
+            (edge - {i}).__iter__().__next__()
+            for edge, o in across.items()
+            if i in edge and len(o) == 1
+        ]
         n = len(ring)
         if n == 2:  # the corner of a single face
             new[frozenset((i,))] = v[i]
@@ -53,7 +59,9 @@ def loop_twin(v: np.ndarray, f: np.ndarray) -> dict[frozenset[int], np.ndarray]:
             new[frozenset((i,))] = 3 / 4 * v[i] + (v[rim[0]] + v[rim[1]]) / 8
         else:
             beta = (5 / 8 - (3 / 8 + math.cos(2 * math.pi / n) / 4) ** 2) / n
-            new[frozenset((i,))] = (1 - n * beta) * v[i] + beta * sum(v[k] for k in ring)
+            new[frozenset((i,))] = (1 - n * beta) * v[i] + beta * sum(
+                v[k] for k in ring
+            )
     return new
 
 
@@ -65,41 +73,59 @@ def test_loop_matrix__agrees_with_the_twin(mesh):
     twin = loop_twin(v, f)
     assert matrix.shape == (len(twin), len(v))
     for i in range(len(v)):
-        np.testing.assert_allclose(positions[i], twin[frozenset((i,))], atol=ROUNDING * 80)
+        np.testing.assert_allclose(
+            positions[i], twin[frozenset((i,))], atol=ROUNDING * 80
+        )
     for i, (a, b, c) in enumerate(f.tolist()):
         middle = children[3 * len(f) + i]
         for at, edge in zip(middle, ((a, b), (b, c), (c, a)), strict=True):
-            np.testing.assert_allclose(positions[at], twin[frozenset(edge)], atol=ROUNDING * 80)
+            np.testing.assert_allclose(
+                positions[at], twin[frozenset(edge)], atol=ROUNDING * 80
+            )
 
 
-def bumpy(mesh: trimesh.Trimesh, faces: slice = slice(None)) -> tuple[np.ndarray, np.ndarray]:
+def bumpy(
+    mesh: trimesh.Trimesh, faces: slice = slice(None)
+) -> tuple[np.ndarray, np.ndarray]:
     v = np.asarray(mesh.vertices)
-    return v + np.random.default_rng(1).normal(size=v.shape), np.asarray(mesh.faces, np.int64)[faces]
+    return v + np.random.default_rng(1).normal(size=v.shape), np.asarray(
+        mesh.faces, np.int64
+    )[faces]
 
 
 @pytest.mark.parametrize(
     "mesh",
     [
         bumpy(trimesh.creation.icosphere(2, radius=80.0)),  # valences 5 and 6
-        bumpy(trimesh.creation.icosphere(0, radius=80.0).subdivide_loop(1), slice(0, -9)),  # open
+        # open
+        bumpy(
+            trimesh.creation.icosphere(0, radius=80.0).subdivide_loop(1), slice(0, -9)
+        ),
         bumpy(trimesh.creation.box([80, 80, 80])),  # 4 and 5
         bumpy(
             trimesh.Trimesh(
-                [[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1.0]], [[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]]
+                [[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1.0]],
+                [[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]],
             )
         ),  # 3
     ],
     ids=["sphere", "open", "box", "tetrahedron"],
 )
 def test_loop_matrix__agrees_with_libigl_in_the_interior(mesh):
-    """libigl has Warren's even weights: those of Loop at valences 3 and 6, 3/8 for the ring at every other."""
+    """libigl has Warren's even weights: those of Loop at valences 3 and 6, 3/8 for the
+    ring at every other.
+    """
     igl = pytest.importorskip("igl")
     v, f = mesh
     theirs, their_faces = igl.loop_matrix(f, len(v))
     theirs = theirs.toarray()
     ours = loop_matrix(f, len(v))[0].toarray()
     assert theirs.shape == ours.shape
-    edges, count = np.unique(np.sort(f[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0, return_counts=True)
+    edges, count = np.unique(
+        np.sort(f[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1),
+        axis=0,
+        return_counts=True,
+    )
     rim = np.unique(edges[count == 1])
     valence = np.bincount(edges.ravel(), minlength=len(v))
     for i in np.setdiff1d(np.unique(f), rim):
@@ -110,12 +136,16 @@ def test_loop_matrix__agrees_with_libigl_in_the_interior(mesh):
         np.testing.assert_allclose(theirs[i], expected, atol=1e-15)
     # new vertices in any order: rows of the matrices as sets, boundary and interior alike
     key = [np.lexsort(rows[len(v) :].round(6).T) for rows in (ours, theirs)]
-    np.testing.assert_allclose(ours[len(v) :][key[0]], theirs[len(v) :][key[1]], atol=1e-15)
+    np.testing.assert_allclose(
+        ours[len(v) :][key[0]], theirs[len(v) :][key[1]], atol=1e-15
+    )
     assert len(their_faces) == 4 * len(f)
 
 
 def test_carry_points__stay_at_their_parameter():
-    """Without smoothing (new vertices in the middle of their edges) a carried point does not move."""
+    """Without smoothing (new vertices in the middle of their edges) a carried point
+    does not move.
+    """
     v, f = open_sphere()
     rng = np.random.default_rng(2)
     face = rng.integers(0, len(f), 200)
@@ -126,14 +156,19 @@ def test_carry_points__stay_at_their_parameter():
     faces = f
     for levels in range(4):
         at, share = carry_points(face, weight, len(f), levels)
-        np.testing.assert_allclose(np.einsum("kc,kci->ki", share, flat[faces[at]]), there, atol=1e-10)
+        np.testing.assert_allclose(
+            np.einsum("kc,kci->ki", share, flat[faces[at]]), there, atol=1e-10
+        )
         np.testing.assert_allclose(share.sum(axis=1), 1)
         assert share.min() >= -1e-12
         matrix, children = loop_matrix(faces, len(flat))
         middle = np.zeros((matrix.shape[0] - len(flat), 3))
-        corner = children[3 * len(faces) :] - len(flat)  # the middle child's corners: one on each side of its parent
+        # the middle child's corners: one on each side of its parent
+        corner = children[3 * len(faces) :] - len(flat)
         for side in range(3):
-            middle[corner[:, side]] = (flat[faces[:, side]] + flat[faces[:, (side + 1) % 3]]) / 2
+            middle[corner[:, side]] = (
+                flat[faces[:, side]] + flat[faces[:, (side + 1) % 3]]
+            ) / 2
         flat = np.concatenate([flat, middle])
         faces = children
 
@@ -145,7 +180,8 @@ def test_loop_matrix__children_tile_the_parent_and_keep_its_winding():
     a, b, c = (flat[children[:, i]] for i in range(3))
     area = np.cross(b - a, c - a)[:, 2] / 2
     assert (area > 0).all()
-    # the two ears with one face keep their corners; the two with two faces are rounded by a known amount
+    # the two ears with one face keep their corners; the two with two faces are rounded
+    # by a known amount
     assert area.sum() == pytest.approx(9 - 2 * loss_at_a_rounded_corner())
     assert np.unique(np.sort(children, axis=1), axis=0).shape == children.shape
 
@@ -189,8 +225,13 @@ def test_subdivide__matrix_carries_any_attribute():
     new, children, matrix = subdivide(v, f, 2)
     assert len(children) == 16 * len(f)
     np.testing.assert_allclose(matrix @ v, new, atol=ROUNDING * 80)
-    linear = v @ np.array([[0.1, 0.2], [-0.3, 0.1], [0.2, 0.5]]) + 3  # e.g. texture coordinates affine in position
-    np.testing.assert_allclose(matrix @ linear, new @ np.array([[0.1, 0.2], [-0.3, 0.1], [0.2, 0.5]]) + 3, atol=1e-10)
+    # e.g. texture coordinates affine in position
+    linear = v @ np.array([[0.1, 0.2], [-0.3, 0.1], [0.2, 0.5]]) + 3
+    np.testing.assert_allclose(
+        matrix @ linear,
+        new @ np.array([[0.1, 0.2], [-0.3, 0.1], [0.2, 0.5]]) + 3,
+        atol=1e-10,
+    )
 
 
 def test_subdivide__no_level_changes_nothing():

@@ -38,7 +38,9 @@ def test_rasterise_atlas__leaves_no_crack_on_edges_through_texel_centres():
     i, j = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
     uv = np.stack([(2 * j.ravel() + 0.5) / 34, (2 * i.ravel() + 0.5) / 34], axis=1)
     a = (i * n + j)[:-1, :-1].ravel()
-    f = np.concatenate([np.stack([a, a + 1, a + n + 1], 1), np.stack([a, a + n + 1, a + n], 1)])
+    f = np.concatenate(
+        [np.stack([a, a + 1, a + n + 1], 1), np.stack([a, a + n + 1, a + n], 1)]
+    )
     face, weight = rasterise_atlas(uv, f, 34)
     assert (face[:33, :33] >= 0).all()
     assert (face[33] == -1).all()
@@ -76,7 +78,11 @@ def test_atlas_values__between_the_corners_of_large_triangles():
     image, confidence = atlas_values(values, trust, uv, f, raster)
     for i, j in np.ndindex(48, 48):
         share = weight[i, j] * trust[f[face[i, j]]] if face[i, j] >= 0 else np.zeros(3)
-        expected = share @ np.nan_to_num(values[f[face[i, j]]]) / share.sum() if share.any() else np.zeros(2)
+        expected = (
+            share @ np.nan_to_num(values[f[face[i, j]]]) / share.sum()
+            if share.any()
+            else np.zeros(2)
+        )
         np.testing.assert_allclose(image[i, j], expected, rtol=FLOAT32)
         np.testing.assert_allclose(confidence[i, j], share.sum(), rtol=FLOAT32)
 
@@ -85,27 +91,38 @@ def test_atlas_values__linear_fields_are_exact_where_triangles_are_smaller_than_
     uv, f = triangulation(9000)
     uv = np.concatenate([uv, [[0, 0], [0, 1], [1, 0], [1, 1]]])
     f = Delaunay(uv).simplices
-    image, confidence = atlas_values(linear(uv), np.ones(len(uv)), uv, f, rasterise_atlas(uv, f, 32))
+    image, confidence = atlas_values(
+        linear(uv), np.ones(len(uv)), uv, f, rasterise_atlas(uv, f, 32)
+    )
     np.testing.assert_allclose(image, linear(centres(32)), rtol=FLOAT32)
     np.testing.assert_allclose(confidence, 1, rtol=FLOAT32)
 
 
 def test_atlas_values__of_a_texel_on_the_rim_the_part_on_the_surface_counts():
-    uv = np.stack(np.meshgrid(*2 * [np.linspace(0.05, 0.95, 60)]), axis=-1).reshape(-1, 2)
+    uv = np.stack(np.meshgrid(*2 * [np.linspace(0.05, 0.95, 60)]), axis=-1).reshape(
+        -1, 2
+    )
     f = Delaunay(uv).simplices
     face, _ = raster = rasterise_atlas(uv, f, 8)
     _, confidence = atlas_values(linear(uv), np.ones(len(uv)), uv, f, raster)
-    np.testing.assert_allclose(confidence, face >= 0, rtol=FLOAT32)  # it covers 0.6 or 0.36 of the outermost
+    # it covers 0.6 or 0.36 of the outermost
+    np.testing.assert_allclose(confidence, face >= 0, rtol=FLOAT32)
 
 
 def test_atlas_values__small_triangles_count_by_their_area_in_the_texel():
-    """Compared with 200 x 200 points per texel, each located in its triangle; the values are not linear."""
+    """Compared with 200 x 200 points per texel, each located in its triangle; the
+    values are not linear.
+    """
     rng = np.random.default_rng(0)
     uv = np.concatenate([rng.random((60, 2)), [[0, 0], [0, 1], [1, 0], [1, 1]]])
     located = Delaunay(uv)
     trust = rng.random(64)
     values = rng.random((64, 1))
-    f = located.simplices[np.argsort(located.find_simplex([0.25, 0.25]) == np.arange(len(located.simplices)))]
+    f = located.simplices[
+        np.argsort(
+            located.find_simplex([0.25, 0.25]) == np.arange(len(located.simplices))
+        )
+    ]
     size = 2
     fine = 400
     image, confidence = atlas_values(values, trust, uv, f, rasterise_atlas(uv, f, size))
@@ -113,7 +130,11 @@ def test_atlas_values__small_triangles_count_by_their_area_in_the_texel():
     share = weight * trust[f[face]]
     blocks = (size, fine // size, size, fine // size)
     total = share.sum(axis=-1).reshape(blocks).mean(axis=(1, 3))
-    mixed = np.einsum("ijk,ijk->ij", share, values[f[face], 0]).reshape(blocks).mean(axis=(1, 3))
+    mixed = (
+        np.einsum("ijk,ijk->ij", share, values[f[face], 0])
+        .reshape(blocks)
+        .mean(axis=(1, 3))
+    )
     # with 40,000 points, less than 1e-3 of the texel is undecided along the edges of triangles
     np.testing.assert_allclose(confidence, total, atol=1e-3)
     np.testing.assert_allclose(image[..., 0], mixed / total, atol=1e-3)
@@ -163,12 +184,19 @@ def test_push_pull__constant_stays_constant(height, width, seed):
 
 
 def enlarged(coarse: np.ndarray, y: int, x: int) -> np.ndarray:
-    """Value of a coarse level at the fine texel (y, x): linear between centres, the nearest beyond the last."""
-    where = [np.clip((p + 0.5) / 2 - 0.5, 0, n - 1) for p, n in zip((y, x), coarse.shape, strict=False)]
+    """Value of a coarse level at the fine texel (y, x): linear between centres, the
+    nearest beyond the last.
+    """
+    where = [
+        np.clip((p + 0.5) / 2 - 0.5, 0, n - 1)
+        for p, n in zip((y, x), coarse.shape, strict=False)
+    ]
     low = [int(p) for p in where]
     high = [min(p + 1, n - 1) for p, n in zip(low, coarse.shape, strict=False)]
     t, s = (p - q for p, q in zip(where, low, strict=True))
-    rows = [(1 - s) * coarse[r, low[1]] + s * coarse[r, high[1]] for r in (low[0], high[0])]
+    rows = [
+        (1 - s) * coarse[r, low[1]] + s * coarse[r, high[1]] for r in (low[0], high[0])
+    ]
     return (1 - t) * rows[0] + t * rows[1]
 
 
@@ -186,7 +214,9 @@ def pushed_and_pulled(image: np.ndarray, known: np.ndarray) -> np.ndarray:
     below = pushed_and_pulled(coarse, np.minimum(total, 1))
     filled = np.empty_like(image)
     for y, x in np.ndindex(h, w):
-        filled[y, x] = known[y, x] * image[y, x] + (1 - known[y, x]) * enlarged(below, y, x)
+        filled[y, x] = known[y, x] * image[y, x] + (1 - known[y, x]) * enlarged(
+            below, y, x
+        )
     return filled
 
 
@@ -196,7 +226,9 @@ def test_push_pull__agrees_with_loops_over_texels(shape):
     image = rng.normal(size=(*shape, 3))
     known = rng.random(shape) * (rng.random(shape) < 0.2)
     known[0, 0] = 0.3
-    np.testing.assert_allclose(push_pull(image, known)[0], pushed_and_pulled(image, known), atol=FLOAT32)
+    np.testing.assert_allclose(
+        push_pull(image, known)[0], pushed_and_pulled(image, known), atol=FLOAT32
+    )
 
 
 def test_push_pull__at_the_border_of_the_face_only_the_face_counts():
@@ -206,7 +238,8 @@ def test_push_pull__at_the_border_of_the_face_only_the_face_counts():
     filled, _ = push_pull(ramp, face)
     np.testing.assert_array_equal(filled[face], ramp[face])
     beside = ~face & (np.hypot(x, y) < 27)
-    # the first ring outside, read by bilinear lookups at the rim, is an average of texels at most 4 away
+    # the first ring outside, read by bilinear lookups at the rim, is an average of
+    # texels at most 4 away
     assert np.abs(filled[beside, 0] - x[beside]).max() < 4
     assert np.abs(filled).max() <= np.abs(x[face]).max()
 
@@ -242,10 +275,13 @@ def test_maps__take_little_more_memory_than_their_values():
     push_pull(np.ones((2, 2, 1)), np.ones((2, 2)))
     atlas_values(values, np.ones(len(uv)), uv, f, rasterise_atlas(uv, f, 8))
     tracemalloc.start()
-    push_pull(*atlas_values(values, np.ones(len(uv)), uv, f, rasterise_atlas(uv, f, 512)))
+    push_pull(
+        *atlas_values(values, np.ones(len(uv)), uv, f, rasterise_atlas(uv, f, 512))
+    )
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    # image, filled image, coarser levels (1/3), which values are finite (1/4), raster (4 of 10) and small change
+    # image, filled image, coarser levels (1/3), which values are finite (1/4), raster
+    # (4 of 10) and small change
     assert peak < 3.2 * 512**2 * 10 * 4
 
 
@@ -255,7 +291,11 @@ def test_bilinear__agrees_with_scipy():
     pixels = rng.uniform(0, 1, (4, 50, 2)) * [30, 20]
     where = [pixels[..., 1] - 0.5, pixels[..., 0] - 0.5]
     expected = np.stack(
-        [map_coordinates(image[..., c].astype(float), where, order=1, mode="nearest") for c in range(3)], -1
+        [
+            map_coordinates(image[..., c].astype(float), where, order=1, mode="nearest")
+            for c in range(3)
+        ],
+        -1,
     )
     np.testing.assert_allclose(bilinear(image, pixels), expected, atol=FLOAT32)
 
@@ -263,14 +303,25 @@ def test_bilinear__agrees_with_scipy():
 def test_bilinear__pixel_centres_are_exact():
     image = np.random.default_rng(0).normal(size=(5, 7, 2))
     j, i = np.meshgrid(np.arange(7), np.arange(5))
-    np.testing.assert_array_equal(bilinear(image, np.stack([j + 0.5, i + 0.5], axis=-1)), image)
+    np.testing.assert_array_equal(
+        bilinear(image, np.stack([j + 0.5, i + 0.5], axis=-1)), image
+    )
 
 
 def test_bilinear__nan_spreads_to_its_neighbours_only():
     image = np.ones((5, 5, 1))
     image[2, 2] = np.nan
-    pixels = np.array([[2.5, 2.5], [2.9, 1.6], [1.5, 2.5], [3.5, 3.5], [1.4, 2.5], [1.6, 2.5]])
-    assert np.isnan(bilinear(image, pixels)[:, 0]).tolist() == [True, True, False, False, False, True]
+    pixels = np.array(
+        [[2.5, 2.5], [2.9, 1.6], [1.5, 2.5], [3.5, 3.5], [1.4, 2.5], [1.6, 2.5]]
+    )
+    assert np.isnan(bilinear(image, pixels)[:, 0]).tolist() == [
+        True,
+        True,
+        False,
+        False,
+        False,
+        True,
+    ]
 
 
 def test_bilinear__nan_outside_the_image():

@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 import trimesh
 
-from skindb.geometry.topology import boundary_loops, edge_table, face_components, fans, winding_flips
+from skindb.geometry.topology import (
+    boundary_loops,
+    edge_table,
+    face_components,
+    fans,
+    winding_flips,
+)
 
 SQUARE = np.array([[0, 1, 2], [0, 2, 3]])  # counter-clockwise, 0 1 2 3 around
 TWO_SQUARES = np.concatenate([SQUARE, SQUARE + 4])
@@ -16,7 +22,10 @@ def test_edge_table__square():
     table = edge_table(SQUARE)
     assert table.edges.tolist() == [[0, 1], [0, 2], [0, 3], [1, 2], [2, 3]]
     assert table.count.tolist() == [1, 2, 1, 1, 1]
-    assert table.edges[table.of_face].tolist() == [[[0, 1], [1, 2], [0, 2]], [[0, 2], [2, 3], [0, 3]]]
+    assert table.edges[table.of_face].tolist() == [
+        [[0, 1], [1, 2], [0, 2]],
+        [[0, 2], [2, 3], [0, 3]],
+    ]
 
 
 def test_boundary_loops__run_along_the_faces_longest_first():
@@ -29,7 +38,11 @@ def test_boundary_loops__none_on_a_closed_surface():
     assert boundary_loops(np.asarray(trimesh.creation.icosphere(1).faces)) == []
 
 
-@pytest.mark.parametrize("faces", [[[0, 1, 2], [0, 3, 4]], [[0, 1, 2], [0, 3, 2]]], ids=["bow-tie", "winding"])
+@pytest.mark.parametrize(
+    "faces",
+    [[[0, 1, 2], [0, 3, 4]], [[0, 1, 2], [0, 3, 2]]],
+    ids=["bow-tie", "winding"],
+)
 def test_boundary_loops__refuse_what_has_no_loops(faces):
     with pytest.raises(ValueError, match="clean the mesh first"):
         boundary_loops(np.array(faces))
@@ -64,4 +77,6 @@ def test_fans__do_not_depend_on_the_winding(turn):
         sphere[::3] = sphere[::3, ::-1]
     label = fans(sphere)
     assert len(np.unique(label)) == sphere.max() + 1
-    assert all(len(set(sphere.ravel()[label.ravel() == fan])) == 1 for fan in np.unique(label))
+    assert all(
+        len(set(sphere.ravel()[label.ravel() == fan])) == 1 for fan in np.unique(label)
+    )

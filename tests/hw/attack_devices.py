@@ -2,10 +2,12 @@
 
     python tests/hw/attack_devices.py --cases 1000 --seed 0
 
-Each case is a session with a controller and a probe whose messages are changed, lost, repeated, delayed or invented,
-whose checksums are right, and which may ignore requests. The clock is simulated. Whatever they do, the session must end
-within its deadlines with the lights off and the suction released, name what was wrong, accept no frame and no reading
-wrongly, and lose nothing that was good before: the same session with sound devices then completes.
+Each case is a session with a controller and a probe whose messages are changed, lost,
+repeated, delayed or invented, whose checksums are right, and which may ignore requests.
+The clock is simulated. Whatever they do, the session must end within its deadlines with
+the lights off and the suction released, name what was wrong, accept no frame and no
+reading wrongly, and lose nothing that was good before: the same session with sound
+devices then completes.
 """
 
 from __future__ import annotations
@@ -23,7 +25,15 @@ from pathlib import Path
 import imagecodecs
 import numpy as np
 import trimesh
-from devices_pair import BRACKETS, CAMERAS, EXPOSURES, LIGHTS, OVERRIDE, subject_folder, value_of
+from devices_pair import (
+    BRACKETS,
+    CAMERAS,
+    EXPOSURES,
+    LIGHTS,
+    OVERRIDE,
+    subject_folder,
+    value_of,
+)
 
 from skindb.clock import SimulatedClock
 from skindb.errors import InputError
@@ -37,14 +47,32 @@ from skindb.hw.protocol import EVENT, OK, REPLY, Lines, Message
 from skindb.virtual.devices import DirectPort
 from skindb.virtual.laboratory import Laboratory
 
-PERSON = Subject("S1", "2026-01-01T10:00:00+00:00", {"scope": ["fit"], "reference": "none"})
+PERSON = Subject(
+    "S1", "2026-01-01T10:00:00+00:00", {"scope": ["fit"], "reference": "none"}
+)
 PLAN = CapturePlan(seconds=2.0, sites=("cheek",))
 ATTACKED_LIGHTS = LIGHTS[::3]
 LONG_BRACKETS = {name: 10 * seconds for name, seconds in BRACKETS.items()}
-# By the simulated clock: four runs of 17 steps with their uploads, reports and last frames, and three placements.
+# By the simulated clock: four runs of 17 steps with their uploads, reports and last
+# frames, and three placements.
 MAX_SECONDS = 4 * (19 * 0.3 + 5.0 + 2.0 + 18 * 0.9 + 10.0) + 3 * 30.0
 ODD_VALUES = (
-    *("nan", "inf", "-inf", "1e308", "-1", "-999999999", "999999999", "0", "1", "17", "0.5", "9" * 30, "", "odd"),
+    *(
+        "nan",
+        "inf",
+        "-inf",
+        "1e308",
+        "-1",
+        "-999999999",
+        "999999999",
+        "0",
+        "1",
+        "17",
+        "0.5",
+        "9" * 30,
+        "",
+        "odd",
+    ),
 )
 PLAUSIBLE_VALUES = {
     "state": ("idle", "armed", "running", "done", "stopped", "exposing"),
@@ -59,7 +87,8 @@ PLAUSIBLE_VALUES = {
     "rest": ("0", "0.1", "1"),
 }
 SCOPES = ("all", "events", "replies")
-# What the message of a session with this single fault contains: of a changed value, and of other faults.
+# What the message of a session with this single fault contains: of a changed value, and
+# of other faults.
 NAMED_VALUES = {
     "state": "state|running|done|exposing|expose|must run|must confirm",
     "step": "step",
@@ -82,7 +111,19 @@ NAMED_FAULTS = {
     "slow": "no reply|reading of the gauge|within",
 }
 NAMES = {
-    "dome": ("state", "step", "interlock", "reason", "on", "off", "triggers", "level", "rest", "steps", "digest"),
+    "dome": (
+        "state",
+        "step",
+        "interlock",
+        "reason",
+        "on",
+        "off",
+        "triggers",
+        "level",
+        "rest",
+        "steps",
+        "digest",
+    ),
     "probe": ("state", "triggers", "t", "kpa"),
 }
 IGNORED = {
@@ -103,7 +144,12 @@ KINDS = (
     "frozen",
     "vanish",
 )
-KINDS = (*KINDS, *3 * ("silent", "late", "frozen"), *5 * ("ignore", "stale"), *12 * ("value",))
+KINDS = (
+    *KINDS,
+    *3 * ("silent", "late", "frozen"),
+    *5 * ("ignore", "stale"),
+    *12 * ("value",),
+)
 
 
 @dataclass(frozen=True)
@@ -124,7 +170,9 @@ class Attack:
     def drawn(cls, rng):
         device = str(rng.choice(["dome", "probe"]))
         name = str(rng.choice(NAMES[device]))
-        texts = PLAUSIBLE_VALUES.get(name, ODD_VALUES) if rng.random() < 0.5 else ODD_VALUES
+        texts = (
+            PLAUSIBLE_VALUES.get(name, ODD_VALUES) if rng.random() < 0.5 else ODD_VALUES
+        )
         return cls(
             kind=str(rng.choice(KINDS)),
             device=device,
@@ -157,8 +205,16 @@ class AttackedPort(DirectPort):
         scopes = SCOPES
         if message is not None:
             scopes = ("all", "events" if message.kind == EVENT else "replies")
-        begun = [attack for attack in self.attacks if attack.kind == kind and self.count >= attack.begin]
-        return [attack for attack in begun if attack.scope in scopes and self.rng.random() < attack.probability]
+        begun = [
+            attack
+            for attack in self.attacks
+            if attack.kind == kind and self.count >= attack.begin
+        ]
+        return [
+            attack
+            for attack in begun
+            if attack.scope in scopes and self.rng.random() < attack.probability
+        ]
 
     def write(self, data):
         self._require_line()
@@ -167,7 +223,9 @@ class AttackedPort(DirectPort):
         for attack in self.active("slow"):
             object.__setattr__(self._device.faults, "delay", attack.seconds)
         for _ in self.active("frozen"):
-            object.__setattr__(self._device.faults, "frozen_at", getattr(self._device, "_done", -1))
+            object.__setattr__(
+                self._device.faults, "frozen_at", getattr(self._device, "_done", -1)
+            )
         if self.active("vanish"):
             self._device.gone = True
         for message in self.requests.feed(data):
@@ -191,15 +249,27 @@ class AttackedPort(DirectPort):
         sent = message
         for attack in self.active("value", message):
             if attack.name in sent.values:
-                sent = Message(sent.kind, sent.number, sent.verb, {**sent.values, attack.name: attack.text})
+                sent = Message(
+                    sent.kind,
+                    sent.number,
+                    sent.verb,
+                    {**sent.values, attack.name: attack.text},
+                )
         for attack in self.active("stale", message):
             if attack.name in sent.values and attack.name in self.before:
                 sent = Message(
-                    sent.kind, sent.number, sent.verb, {**sent.values, attack.name: self.before[attack.name]}
+                    sent.kind,
+                    sent.number,
+                    sent.verb,
+                    {**sent.values, attack.name: self.before[attack.name]},
                 )
-        self.before = {**message.values, **self.before} if self.before else dict(message.values)
+        self.before = (
+            {**message.values, **self.before} if self.before else dict(message.values)
+        )
         if self.active("wrong number", message):
-            sent = Message(sent.kind, int(self.rng.integers(100_000)), sent.verb, sent.values)
+            sent = Message(
+                sent.kind, int(self.rng.integers(100_000)), sent.verb, sent.values
+            )
         line = sent.encode()
         if self.active("silent", message):
             line = b""
@@ -214,7 +284,9 @@ class AttackedPort(DirectPort):
         self.held = []
         if self.active("repeat", message):
             self.held.append(line)
-        delay = max((attack.seconds for attack in self.active("late", message)), default=0.0)
+        delay = max(
+            (attack.seconds for attack in self.active("late", message)), default=0.0
+        )
         if delay or self.late:
             self.late.append((self._clock.monotonic() + delay, line))
         else:
@@ -227,7 +299,9 @@ class AttackedPort(DirectPort):
             return self.rng.bytes(int(self.rng.integers(1, 200)))
         number = int(self.rng.integers(100_000))
         if choice == 1:
-            return Message(EVENT, number, "PRESSURE", {"t": "1.0", "kpa": "-5.0"}).encode()
+            return Message(
+                EVENT, number, "PRESSURE", {"t": "1.0", "kpa": "-5.0"}
+            ).encode()
         if choice == 2:
             return Message(REPLY, number, OK, {"state": "done", "step": "17"}).encode()
         return Message(EVENT, number, "HELP").encode()
@@ -248,7 +322,9 @@ class Session:
         self.out = folder / "C"
 
     def run(self, attacks=(), seed=0):
-        """Run once; returns the text of the refusal, with the laboratory and its clock as they are then."""
+        """Run once; returns the text of the refusal, with the laboratory and its clock
+        as they are then.
+        """
         clock = SimulatedClock()
         laboratory = Laboratory(self.setup, self.folder / "watched", clock=clock)
         rng = np.random.default_rng(seed)
@@ -261,7 +337,12 @@ class Session:
             dome = Dome(Link(ports["dome"], "dome", clock=clock))
             probe = Probe(Link(ports["probe"], "probe", clock=clock))
             cameras = FolderCameras(laboratory.watched, CAMERAS, clock=clock)
-            devices = Devices(dome, cameras, probe, FolderCameras(laboratory.watched, ["probe"], clock=clock))
+            devices = Devices(
+                dome,
+                cameras,
+                probe,
+                FolderCameras(laboratory.watched, ["probe"], clock=clock),
+            )
             run_capture(
                 self.out,
                 read_setup(self.setup),
@@ -278,16 +359,35 @@ class Session:
 
     def kept(self):
         """Everything that the folder holds of the subject: frames, steps and placements."""
-        files = {path.relative_to(self.out): path.read_bytes() for path in self.out.glob("*/*/**/*") if path.is_file()}
+        files = {
+            path.relative_to(self.out): path.read_bytes()
+            for path in self.out.glob("*/*/**/*")
+            if path.is_file()
+        }
         note = self.out / "unfinished.json"
         if note.is_file():
             record = json.loads(note.read_text())
-            return files, record["sequence"], {(one["site"], one["number"]): one["pressure"] for one in record["sites"]}
+            return (
+                files,
+                record["sequence"],
+                {
+                    (one["site"], one["number"]): one["pressure"]
+                    for one in record["sites"]
+                },
+            )
         if not (self.out / "capture.json").is_file():
             return files, [], {}
         sequence = json.loads((self.out / "dome/dome.json").read_text())["sequence"]
         logs = json.loads((self.out / "contact/probe.json").read_text())["pressure"]
-        return files, sequence, {(site, int(number)): log for site, by in logs.items() for number, log in by.items()}
+        return (
+            files,
+            sequence,
+            {
+                (site, int(number)): log
+                for site, by in logs.items()
+                for number, log in by.items()
+            },
+        )
 
 
 def violations(setup, folder, seed):
@@ -304,11 +404,17 @@ def violations(setup, folder, seed):
         wrong.append(f"it took {clock.monotonic():.0f} s")
     if refusal and len(attacks) == 1:
         [attack] = attacks
-        expected = NAMED_VALUES[attack.name] if attack.kind == "value" else NAMED_FAULTS.get(attack.kind, "")
+        expected = (
+            NAMED_VALUES[attack.name]
+            if attack.kind == "value"
+            else NAMED_FAULTS.get(attack.kind, "")
+        )
         if not re.search(expected, refusal):
             wrong.append(f"the message does not name the fault: {refusal}")
     named = re.compile(r"(dome|probe|capture|camera|light|dark frame)\b.*: .*; found .")
-    unnamed = [line for line in refusal.split("\n") if refusal and not named.match(line)]
+    unnamed = [
+        line for line in refusal.split("\n") if refusal and not named.match(line)
+    ]
     wrong += [f"the message names nothing: {line}" for line in unnamed]
     before = session.kept() if session.out.exists() else ({}, [], {})
     wrong += wrong_content(*before)
@@ -319,7 +425,9 @@ def violations(setup, folder, seed):
     after = session.kept()
     wrong += wrong_content(*after)
     wrong += lost_content(before, after)
-    if len(after[1]) != len(ATTACKED_LIGHTS) * len(EXPOSURES) or [*after[2]] != [("cheek", 1)]:
+    if len(after[1]) != len(ATTACKED_LIGHTS) * len(EXPOSURES) or [*after[2]] != [
+        ("cheek", 1)
+    ]:
         wrong.append("the capture is not complete")
     return ("refused" if refusal else "complete"), wrong, refusal
 
@@ -329,18 +437,34 @@ def wrong_content(files, sequence, logs):
     wrong = []
     for entry in sequence:
         for camera in CAMERAS:
-            path = Path(f"dome/frames/{entry['exposure']}/{entry['light']}_{camera}.png")
+            path = Path(
+                f"dome/frames/{entry['exposure']}/{entry['light']}_{camera}.png"
+            )
             value = value_of(entry["light"], camera, entry["exposure"])
-            if path not in files or not (imagecodecs.png_decode(files[path]) == value).all():
+            if (
+                path not in files
+                or not (imagecodecs.png_decode(files[path]) == value).all()
+            ):
                 wrong.append(f"{path} is not the frame of its step")
         times = (entry["t_on"], entry["t_off"])
-        if not np.isfinite(times).all() or entry["trigger_count"] != 1 or not 0 <= times[0] <= times[1]:
+        if (
+            not np.isfinite(times).all()
+            or entry["trigger_count"] != 1
+            or not 0 <= times[0] <= times[1]
+        ):
             wrong.append(f"a step has wrong measurements: {entry}")
     for (site, number), log in logs.items():
         readings = np.array(log)
-        if not len(readings) or not np.isfinite(readings).all() or (np.abs(readings[:, 1] + 5) > 1).any():
+        if (
+            not len(readings)
+            or not np.isfinite(readings).all()
+            or (np.abs(readings[:, 1] + 5) > 1).any()
+        ):
             wrong.append(f"readings of {site} {number} are wrong")
-        elif np.diff(readings[:, 0]).max() > 0.65 or np.ptp(readings[:, 0]) < sum(LONG_BRACKETS.values()) - 1.1:
+        elif (
+            np.diff(readings[:, 0]).max() > 0.65
+            or np.ptp(readings[:, 0]) < sum(LONG_BRACKETS.values()) - 1.1
+        ):
             wrong.append(f"readings of {site} {number} do not cover the exposures")
         for i, bracket in enumerate(BRACKETS):
             path = Path(f"contact/{site}/{bracket}-{number}.png")
@@ -351,9 +475,19 @@ def wrong_content(files, sequence, logs):
 
 def lost_content(before, after):
     """What was kept by the session with misbehaving devices, and is not there any more."""
-    lost = [f"{path} was lost" for path, content in before[0].items() if after[0].get(path) != content]
-    lost += [f"a step was lost: {entry}" for entry in before[1] if entry not in after[1]]
-    return lost + [f"placement {key} was lost" for key, log in before[2].items() if after[2].get(key) != log]
+    lost = [
+        f"{path} was lost"
+        for path, content in before[0].items()
+        if after[0].get(path) != content
+    ]
+    lost += [
+        f"a step was lost: {entry}" for entry in before[1] if entry not in after[1]
+    ]
+    return lost + [
+        f"placement {key} was lost"
+        for key, log in before[2].items()
+        if after[2].get(key) != log
+    ]
 
 
 def attacked_setup(folder):
@@ -361,10 +495,14 @@ def attacked_setup(folder):
     subject_folder(folder)
     path = folder / "dome/dome.json"
     record = json.loads(path.read_text())
-    record["lights"] = [light for light in record["lights"] if light["id"] in ATTACKED_LIGHTS]
+    record["lights"] = [
+        light for light in record["lights"] if light["id"] in ATTACKED_LIGHTS
+    ]
     path.write_text(json.dumps(record))
     path = folder / "contact/probe.json"
-    record = json.loads(path.read_text()) | {"exposures": [{"id": k, "seconds": v} for k, v in LONG_BRACKETS.items()]}
+    record = json.loads(path.read_text()) | {
+        "exposures": [{"id": k, "seconds": v} for k, v in LONG_BRACKETS.items()]
+    }
     path.write_text(json.dumps(record))
     trimesh.creation.icosphere(subdivisions=1).export(folder / "scan.ply")
     return folder
@@ -372,10 +510,19 @@ def attacked_setup(folder):
 
 def main():
     """Run the cases of the command line; the status is 1 if any has a violation."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--cases", type=int, default=300)
-    parser.add_argument("--seed", type=int, default=0, help="seed of the first case; each has the next one")
-    parser.add_argument("--list", action="store_true", help="print attacks and message of every case")
+    parser.add_argument(
+        "--seed",
+        type=int,
+        default=0,
+        help="seed of the first case; each has the next one",
+    )
+    parser.add_argument(
+        "--list", action="store_true", help="print attacks and message of every case"
+    )
     options = parser.parse_args()
     outcomes = Counter()
     failed = 0
@@ -388,9 +535,19 @@ def main():
             outcomes[outcome] += 1
             failed += bool(wrong)
             if wrong or options.list:
-                print(seed, outcome, *attacks_of(seed), refusal, *wrong, sep="\n  ", flush=True)
+                print(
+                    seed,
+                    outcome,
+                    *attacks_of(seed),
+                    refusal,
+                    *wrong,
+                    sep="\n  ",
+                    flush=True,
+                )
     print(
-        ", ".join(f"{count} {outcome}" for outcome, count in outcomes.items()), f"; {failed} with a violation", sep=""
+        ", ".join(f"{count} {outcome}" for outcome, count in outcomes.items()),
+        f"; {failed} with a violation",
+        sep="",
     )
     return int(failed > 0)
 

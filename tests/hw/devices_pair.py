@@ -27,7 +27,9 @@ OVERRIDE = Override("OP-1", "2026-01-01T10:00:00+00:00")
 
 def value_of(light: str, camera: str, exposure: str) -> int:
     """The value of all pixels of a frame: different for each."""
-    return BLACK + (100 + 37 * LIGHTS.index(light) + 11 * CAMERAS.index(camera)) * (8 if exposure == "long" else 1)
+    return BLACK + (100 + 37 * LIGHTS.index(light) + 11 * CAMERAS.index(camera)) * (
+        8 if exposure == "long" else 1
+    )
 
 
 def _save(path: Path, value: int) -> None:
@@ -41,22 +43,32 @@ def subject_folder(folder: Path) -> Path:
         for camera in CAMERAS:
             _save(folder / f"dome/dark/{exposure}_{camera}.png", BLACK)
             for light in LIGHTS:
-                _save(folder / f"dome/frames/{exposure}/{light}_{camera}.png", value_of(light, camera, exposure))
+                _save(
+                    folder / f"dome/frames/{exposure}/{light}_{camera}.png",
+                    value_of(light, camera, exposure),
+                )
     for site in ("cheek", "neck"):
         for number, bracket in enumerate(BRACKETS):
-            _save(folder / f"contact/{site}/{bracket}.png", 1000 * (1 + number) + (site == "neck"))
+            _save(
+                folder / f"contact/{site}/{bracket}.png",
+                1000 * (1 + number) + (site == "neck"),
+            )
     sensor = {"width": 6, "height": 4, "black_level": BLACK, "bit_depth": 16}
     pose = {"R": np.diag([1, -1, -1]).tolist(), "t": [0, 0, 500]}
     cameras = [{"id": name} | sensor | pose for name in CAMERAS]
     dome = {
         "cameras": cameras,
         "lights": [{"id": light, "position": [0, 0, 500]} for light in LIGHTS],
-        "exposures": [{"id": name, "seconds": seconds} for name, seconds in EXPOSURES.items()],
+        "exposures": [
+            {"id": name, "seconds": seconds} for name, seconds in EXPOSURES.items()
+        ],
         "frames": "dome/frames/{exposure}/{light}_{camera}.png",
         "dark": "dome/dark/{exposure}_{camera}.png",
     }
     probe = {
-        "exposures": [{"id": name, "seconds": seconds} for name, seconds in BRACKETS.items()],
+        "exposures": [
+            {"id": name, "seconds": seconds} for name, seconds in BRACKETS.items()
+        ],
         "fibres": [{"id": "f0", "distance": 1.0, "centre": [3, 2], "radius": 1}],
         "sites": ["cheek", "neck"],
         "frames": "contact/{site}/{exposure}.png",
@@ -79,10 +91,16 @@ class Bench:
         lamp: float = 0.0,
     ):
         self.clock = SimulatedClock()
-        self.laboratory = Laboratory(subject, watched, faults, clock=self.clock, lamp=lamp)
+        self.laboratory = Laboratory(
+            subject, watched, faults, clock=self.clock, lamp=lamp
+        )
         self.watched = watched
-        self.dome = Dome(Link(self.laboratory.port("dome"), "dome", clock=self.clock, log=log))
-        self.probe = Probe(Link(self.laboratory.port("probe"), "probe", clock=self.clock))
+        self.dome = Dome(
+            Link(self.laboratory.port("dome"), "dome", clock=self.clock, log=log)
+        )
+        self.probe = Probe(
+            Link(self.laboratory.port("probe"), "probe", clock=self.clock)
+        )
         self.cameras = FolderCameras(watched, CAMERAS, clock=self.clock)
         self.probe_camera = FolderCameras(watched, ["probe"], clock=self.clock)
 

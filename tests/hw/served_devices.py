@@ -14,7 +14,9 @@ TICK_SECONDS = 0.002
 
 
 class Terminal:
-    """An emulated device at a pseudo terminal, like a serial port; use it in a ``with`` statement."""
+    """An emulated device at a pseudo terminal, like a serial port; use it in a ``with``
+    statement.
+    """
 
     def __init__(self, device: Emulated) -> None:
         self.device = device

@@ -1,4 +1,6 @@
-"""The light controller: states, steps and reports that cannot be right end a run, and the lights are off."""
+"""The light controller: states, steps and reports that cannot be right end a run, and
+the lights are off.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +8,15 @@ import shutil
 
 import imagecodecs
 import pytest
-from devices_pair import EXPOSURES, LIGHTS, OVERRIDE, Bench, linked, subject_folder, value_of
+from devices_pair import (
+    EXPOSURES,
+    LIGHTS,
+    OVERRIDE,
+    Bench,
+    linked,
+    subject_folder,
+    value_of,
+)
 
 from skindb.clock import SimulatedClock
 from skindb.hw.dome import Dome
@@ -64,20 +74,35 @@ def _in_run(**changed):
 @pytest.mark.parametrize(
     ("changed", "said"),
     [
-        ({"step": 999_999_999}, "must send as step a whole number from 0 to 33; found '999999999'"),
+        (
+            {"step": 999_999_999},
+            "must send as step a whole number from 0 to 33; found '999999999'",
+        ),
         ({"step": 34}, "must send as step a whole number from 0 to 33"),
         ({"step": -1}, "must send as step a whole number from 0 to 33"),
         ({"step": "nan"}, "must send as step a whole number from 0 to 33"),
         ({"step": "1.0"}, "must send as step a whole number from 0 to 33"),
         ({"step": 33}, r"cannot finish 33 steps in less than 3\.. s; found 0\.0 s"),
         ({"step": 2}, r"cannot finish 2 steps in less than 0\.3 s; found 0\.0 s"),
-        ({"step": 0}, r"must finish step 0 within 2\.0 s; found no progress after 2\.1 s"),
-        ({"state": "banana"}, "must send as state one of idle, armed, running, done, stopped; found 'banana'"),
+        (
+            {"step": 0},
+            r"must finish step 0 within 2\.0 s; found no progress after 2\.1 s",
+        ),
+        (
+            {"state": "banana"},
+            "must send as state one of idle, armed, running, done, stopped; found 'banana'",
+        ),
         ({"state": "idle"}, "must be running, done or stopped after START; found idle"),
-        ({"state": "armed"}, "must be running, done or stopped after START; found armed"),
+        (
+            {"state": "armed"},
+            "must be running, done or stopped after START; found armed",
+        ),
         ({"state": "done"}, "must finish 33 steps before it is done; found 0 steps"),
         ({"interlock": "open"}, "must stop when the interlock is open; found running"),
-        ({"interlock": "ajar"}, "must send as interlock one of closed, open; found 'ajar'"),
+        (
+            {"interlock": "ajar"},
+            "must send as interlock one of closed, open; found 'ajar'",
+        ),
     ],
 )
 def test_run__a_state_that_cannot_be_right_ends_it(changed, said):
@@ -89,7 +114,10 @@ def test_run__steps_never_become_fewer():
     def back(device, reply):
         return reply | {"step": 3} if device._done == 6 else reply
 
-    with pytest.raises(DeviceError, match="must not count fewer finished steps than before; found 3 after "):
+    with pytest.raises(
+        DeviceError,
+        match="must not count fewer finished steps than before; found 3 after ",
+    ):
         _run(OddDome(STATUS=back))
 
 
@@ -97,7 +125,10 @@ def test_run__steps_never_become_fewer():
 def test_run__a_controller_without_progress_is_stopped(at):
     """It answers every request, which would keep its watchdog quiet for ever."""
     device = OddDome(DeviceFaults(frozen_at=at))
-    with pytest.raises(DeviceError, match=rf"must finish step {at} within .* s; found no progress after"):
+    with pytest.raises(
+        DeviceError,
+        match=rf"must finish step {at} within .* s; found no progress after",
+    ):
         _run(device)
     assert device.reason == "stop"
 
@@ -106,19 +137,30 @@ def test_run__an_unfinished_state_is_stopped_after_all_steps():
     def never_done(device, reply):
         return reply | {"state": "running"} if reply["state"] == "done" else reply
 
-    with pytest.raises(DeviceError, match=r"must finish step 33 within .* s; found no progress after"):
+    with pytest.raises(
+        DeviceError, match=r"must finish step 33 within .* s; found no progress after"
+    ):
         _run(OddDome(STATUS=never_done))
 
 
 @pytest.mark.parametrize(
     ("changed", "said"),
     [
-        ({"level": "nan"}, "must send as level a number from -0.1 to 10 of the nominal current; found 'nan'"),
+        (
+            {"level": "nan"},
+            "must send as level a number from -0.1 to 10 of the nominal current; found 'nan'",
+        ),
         ({"level": "inf"}, "must send as level a number"),
         ({"level": "-3"}, "must send as level a number"),
-        ({"rest": "nan"}, "must send as rest a number from -0.1 to 1,000 of the current of a light; found 'nan'"),
+        (
+            {"rest": "nan"},
+            "must send as rest a number from -0.1 to 1,000 of the current of a light; found 'nan'",
+        ),
         ({"rest": "1e99"}, "must send as rest a number"),
-        ({"triggers": "7"}, "must send as triggers a whole number from 0 to 1; found '7'"),
+        (
+            {"triggers": "7"},
+            "must send as triggers a whole number from 0 to 1; found '7'",
+        ),
         ({"triggers": "nan"}, "must send as triggers a whole number from 0 to 1"),
         ({"on": "-1"}, "must send as on a number from 1,362,170 to"),
         ({"on": "nan"}, "must send as on a number from 1,362,170 to"),
@@ -139,7 +181,9 @@ def test_run__a_report_that_cannot_be_right_ends_it(changed, said):
     assert 4 <= len(done) <= 7
 
 
-def test_capture_dome__reports_of_steps_that_never_ran_are_not_asked_for(subject, tmp_path):
+def test_capture_dome__reports_of_steps_that_never_ran_are_not_asked_for(
+    subject, tmp_path
+):
     """The run was stopped at step 20; the controller answers reports of any step, for ever."""
     with Bench(subject, tmp_path) as bench:
         device = bench.laboratory.dome
@@ -150,14 +194,22 @@ def test_capture_dome__reports_of_steps_that_never_ran_are_not_asked_for(subject
         def any_step(values):
             asked.append(int(values["index"]))
             step = device.steps[asked[-1]]
-            ready = {"on": step.on_us, "off": step.off_us, "triggers": 1, "level": 1.0, "rest": 0.0}
+            ready = {
+                "on": step.on_us,
+                "off": step.off_us,
+                "triggers": 1,
+                "level": 1.0,
+                "rest": 0.0,
+            }
             return report(values) if step.measured else ready
 
         device._report = any_step
         run = capture_dome(bench.dome, bench.cameras, SCHEDULE, override=OVERRIDE)
     assert run.stopped == "dome: the interlock was opened"
     assert max(asked) == 20
-    assert [i for i, measured in enumerate(run.measured) if measured is not None] == [*range(20)]
+    assert [i for i, measured in enumerate(run.measured) if measured is not None] == [
+        *range(20)
+    ]
 
 
 def test_capture_dome__a_stop_without_a_reason_ends_the_run(subject, tmp_path):
@@ -185,7 +237,9 @@ def test_capture_dome__current_in_a_dark_frame_is_named(subject, tmp_path):
 
 
 def test_capture_dome__wrong_trigger_counts_do_not_exchange_frames(subject, tmp_path):
-    """One trigger is lost and another one is reported as lost: there are as many frames as reported triggers."""
+    """One trigger is lost and another one is reported as lost: there are as many frames
+    as reported triggers.
+    """
     with Bench(subject, tmp_path) as bench:
         device = bench.laboratory.dome
         device.faults = DeviceFaults(lost_triggers=(12,))
@@ -201,26 +255,42 @@ def test_capture_dome__wrong_trigger_counts_do_not_exchange_frames(subject, tmp_
     for (camera, i), path in run.frames.items():
         step = SCHEDULE.steps[i]
         if step.light != DARK:
-            assert (imagecodecs.png_decode(path.read_bytes()) == value_of(step.light, camera, step.exposure)).all()
+            assert (
+                imagecodecs.png_decode(path.read_bytes())
+                == value_of(step.light, camera, step.exposure)
+            ).all()
 
 
-def test_capture_dome__a_folder_of_a_camera_that_is_gone_ends_the_run(subject, tmp_path):
+def test_capture_dome__a_folder_of_a_camera_that_is_gone_ends_the_run(
+    subject, tmp_path
+):
     with Bench(subject, tmp_path) as bench:
 
         def unmount(stage, done, total):
             if done == total:
                 shutil.rmtree(tmp_path / "c1")
 
-        run = capture_dome(bench.dome, bench.cameras, SCHEDULE, override=OVERRIDE, progress=unmount)
+        run = capture_dome(
+            bench.dome, bench.cameras, SCHEDULE, override=OVERRIDE, progress=unmount
+        )
     assert "must be readable and writable: No such file or directory" in run.stopped
     assert run.frames == {}
 
 
 def test_measured_flashes__are_those_of_the_measured_times():
-    """Each light is late by up to two seconds and the next ones follow at once; a jitter of 1 ms does not count."""
+    """Each light is late by up to two seconds and the next ones follow at once; a
+    jitter of 1 ms does not count.
+    """
     slow = slowed_schedule(plan_schedule(LIGHTS, {"long": 0.01}))
-    assert measured_flashes(slow, _measured(slow, lambda i, on: on + (i % 2) * 1_000)) == 3
-    assert measured_flashes(slow, _measured(slow, lambda i, on: max(on, 2_000_000 + 20_000 * i))) > 3
+    assert (
+        measured_flashes(slow, _measured(slow, lambda i, on: on + (i % 2) * 1_000)) == 3
+    )
+    assert (
+        measured_flashes(
+            slow, _measured(slow, lambda i, on: max(on, 2_000_000 + 20_000 * i))
+        )
+        > 3
+    )
     assert measured_flashes(slow, [None] * len(slow.steps)) == 0
 
 
@@ -266,6 +336,9 @@ def test_arm__a_rehearsal_never_runs_on_a_real_controller():
     device = OddDome(HELLO=lambda _, reply: reply | {"name": "north"})
     dome = Dome(linked(device))
     dome.upload(SCHEDULE)
-    with pytest.raises(DeviceError, match=r"must be emulated in a rehearsal, .*; found 'north'; omit --virtual"):
+    with pytest.raises(
+        DeviceError,
+        match=r"must be emulated in a rehearsal, .*; found 'north'; omit --virtual",
+    ):
         dome.arm(SCHEDULE, Rehearsal())
     assert device.state == "idle"

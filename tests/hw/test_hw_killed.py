@@ -1,4 +1,6 @@
-"""A process that drives a session is killed: what was finished is kept, and the next session takes the rest."""
+"""A process that drives a session is killed: what was finished is kept, and the next
+session takes the rest.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,9 @@ pytestmark = pytest.mark.slow
 
 SECONDS = 1.2  # of the sequence
 PATIENCE_SECONDS = 120.0  # of a test for another process
-PERSON = Subject("S1", "2026-01-01T10:00:00+00:00", {"scope": ["fit"], "reference": "none"})
+PERSON = Subject(
+    "S1", "2026-01-01T10:00:00+00:00", {"scope": ["fit"], "reference": "none"}
+)
 DRIVE = """
 import sys
 from pathlib import Path
@@ -44,7 +48,15 @@ def drive(watched, setup, out, *, url):
     plan = CapturePlan(seconds=SECONDS)
     files = {"mesh": setup / "scan.ply"}
     try:
-        return run_capture(out, read_setup(setup), PERSON, devices, plan, files=files, override=OVERRIDE)
+        return run_capture(
+            out,
+            read_setup(setup),
+            PERSON,
+            devices,
+            plan,
+            files=files,
+            override=OVERRIDE,
+        )
     finally:
         link.close()
 
@@ -72,12 +84,24 @@ def _until(condition):
 
 
 def _kill(laboratory, url, setup, out, frames):
-    """Start a session in another process, and kill it when a camera has so many frames, during that step."""
+    """Start a session in another process, and kill it when a camera has so many frames,
+    during that step.
+    """
     laboratory.dome.faults = DeviceFaults(frozen_at=frames - 1)
-    command = [sys.executable, "-c", DRIVE, url, str(laboratory.watched), str(setup), str(out)]
+    command = [
+        sys.executable,
+        "-c",
+        DRIVE,
+        url,
+        str(laboratory.watched),
+        str(setup),
+        str(out),
+    ]
     process = subprocess.Popen(command, env={"PYTHONPATH": ":".join(sys.path)})
     taken = laboratory.watched / "c1"
-    _until(lambda: len(list(taken.glob("*.png"))) >= frames or process.poll() is not None)
+    _until(
+        lambda: len(list(taken.glob("*.png"))) >= frames or process.poll() is not None
+    )
     assert process.poll() is None
     process.send_signal(signal.SIGKILL)
     process.wait()
@@ -90,7 +114,9 @@ def _require_complete(out):
     for exposure in EXPOSURES:
         for light in LIGHTS:
             for camera in CAMERAS:
-                found = imagecodecs.png_decode((out / f"dome/frames/{exposure}/{light}_{camera}.png").read_bytes())
+                found = imagecodecs.png_decode(
+                    (out / f"dome/frames/{exposure}/{light}_{camera}.png").read_bytes()
+                )
                 assert (found == value_of(light, camera, exposure)).all()
     assert not (out / "unfinished.json").exists()
 
@@ -104,16 +130,24 @@ def test_run_capture__killed_process_loses_no_finished_step(setup, tmp_path, fra
     _require_complete(out)
     dark = DARK_FRAMES * len(EXPOSURES)  # before the lights, in each session
     kept = frames - 1 - dark
-    assert report["notes"][0] == f"{kept} steps were kept from the sequence that was interrupted"
+    assert (
+        report["notes"][0]
+        == f"{kept} steps were kept from the sequence that was interrupted"
+    )
     left = len(LIGHTS) * len(EXPOSURES) - kept
-    assert report["frames_of_this_session"] == len(CAMERAS) * (dark + left + 1)  # and a last dark frame
+    # and a last dark frame
+    assert report["frames_of_this_session"] == len(CAMERAS) * (dark + left + 1)
 
 
 def test_run_capture__controller_without_the_plan_repeats_everything(setup, tmp_path):
     out = tmp_path / "C"
     with _served_laboratory(setup, tmp_path / "watched") as (laboratory, url):
         _kill(laboratory, url, setup, out, 14)
-    with _served_laboratory(setup, tmp_path / "watched") as (laboratory, url):  # as after a loss of power
+    # as after a loss of power
+    with _served_laboratory(setup, tmp_path / "watched") as (laboratory, url):
         report = drive(laboratory.watched, setup, out, url=url)
     _require_complete(out)
-    assert "the controller has forgotten the sequence that was interrupted" in report["notes"][0]
+    assert (
+        "the controller has forgotten the sequence that was interrupted"
+        in report["notes"][0]
+    )

@@ -1,4 +1,6 @@
-"""The probe: a gauge that fails, suction that is wrong, exposures without end; the suction is always released."""
+"""The probe: a gauge that fails, suction that is wrong, exposures without end; the
+suction is always released.
+"""
 
 from __future__ import annotations
 
@@ -51,8 +53,12 @@ def test_measure__keeps_the_readings_of_the_exposures():
     placement = _measure(OddProbe())
     assert placement.triggers == {"b00": 1, "b01": 1}
     assert (np.diff(placement.pressure[:, 0]) > 0).all()
-    assert placement.pressure[-1, 0] - placement.pressure[0, 0] == pytest.approx(4.0, abs=0.3)
-    assert placement.drift == pytest.approx(np.abs(placement.pressure[:, 1] - placement.pressure[0, 1]).max())
+    assert placement.pressure[-1, 0] - placement.pressure[0, 0] == pytest.approx(
+        4.0, abs=0.3
+    )
+    assert placement.drift == pytest.approx(
+        np.abs(placement.pressure[:, 1] - placement.pressure[0, 1]).max()
+    )
 
 
 @pytest.mark.parametrize(
@@ -71,7 +77,9 @@ def test_measure__keeps_the_readings_of_the_exposures():
         ("500", "must hold a pressure from -6 to 1 kPa; found 500.00 kPa"),
     ],
 )
-@pytest.mark.parametrize("seconds", [0.3, 3.0], ids=["while it settles", "while it exposes"])
+@pytest.mark.parametrize(
+    "seconds", [0.3, 3.0], ids=["while it settles", "while it exposes"]
+)
 def test_measure__a_wrong_pressure_ends_it_at_once(kpa, said, seconds):
     device = OddProbe(_from(seconds, kpa=kpa))
     with pytest.raises(DeviceError, match=said) as error:
@@ -88,10 +96,15 @@ def test_measure__readings_until_the_failure_are_kept():
     assert np.isfinite(readings).all()
 
 
-@pytest.mark.parametrize("seconds", [0.0, 0.4, 3.0], ids=["never", "while it settles", "while it exposes"])
+@pytest.mark.parametrize(
+    "seconds", [0.0, 0.4, 3.0], ids=["never", "while it settles", "while it exposes"]
+)
 def test_measure__a_silent_gauge_ends_it_within_its_deadline(seconds):
     device = OddProbe(lambda now, values: None if now >= seconds else values)
-    with pytest.raises(DeviceError, match=r"must have a reading of the gauge in the last 0\.5 s; found none"):
+    with pytest.raises(
+        DeviceError,
+        match=r"must have a reading of the gauge in the last 0\.5 s; found none",
+    ):
         _measure(device)
     released = device.clock.monotonic()
     assert released < seconds + MAX_AGE_SECONDS + 5 * POLL_SECONDS
@@ -108,7 +121,8 @@ def test_measure__a_gap_between_readings_is_refused_although_the_last_one_is_rec
 
     device._answer = lost
     with pytest.raises(
-        DeviceError, match=r"must have a reading of the gauge in the last 0\.5 s; found none for 0\.[67]"
+        DeviceError,
+        match=r"must have a reading of the gauge in the last 0\.5 s; found none for 0\.[67]",
     ):
         _measure(device)
 
@@ -127,7 +141,9 @@ def test_measure__readings_that_arrive_late_are_refused(age):
         return b"".join(due)
 
     device.act = late
-    with pytest.raises(DeviceError, match=r"must have a reading of the gauge in the last 0\.5 s"):
+    with pytest.raises(
+        DeviceError, match=r"must have a reading of the gauge in the last 0\.5 s"
+    ):
         _measure(device)
 
 
@@ -146,20 +162,30 @@ def test_measure__a_reading_with_a_wrong_time_ends_it(t, said):
 
 
 def test_measure__a_clock_of_the_gauge_that_is_fast_ends_it():
-    device = OddProbe(lambda _, values: values | {"t": f"{1.5 * float(values['t']):.3f}"})
-    with pytest.raises(DeviceError, match=r"in order, with their times since PUMP; found 0\.[67]5 s, 0\.[45]"):
+    device = OddProbe(
+        lambda _, values: values | {"t": f"{1.5 * float(values['t']):.3f}"}
+    )
+    with pytest.raises(
+        DeviceError,
+        match=r"in order, with their times since PUMP; found 0\.[67]5 s, 0\.[45]",
+    ):
         _measure(device)
 
 
 def test_measure__a_leak_asks_for_another_placement():
     device = OddProbe(faults=DeviceFaults(leak=2.0))
-    with pytest.raises(PlacementError, match=r"must hold -5 kPa within 1 kPa; found .* so it leaks; press it on"):
+    with pytest.raises(
+        PlacementError,
+        match=r"must hold -5 kPa within 1 kPa; found .* so it leaks; press it on",
+    ):
         _measure(device)
 
 
 def test_measure__suction_that_is_not_reached_asks_for_another_placement():
     device = OddProbe(_from(0.0, kpa="-2.0"))
-    with pytest.raises(PlacementError, match=r"must reach -5 kPa within 5 s; found -2\.00 kPa"):
+    with pytest.raises(
+        PlacementError, match=r"must reach -5 kPa within 5 s; found -2\.00 kPa"
+    ):
         _measure(device)
     assert device.clock.monotonic() == pytest.approx(5.5, abs=0.3)
 
@@ -174,24 +200,42 @@ def test_measure__a_pressure_that_is_not_gentle_suction_is_refused(pressure):
 @pytest.mark.parametrize(
     ("changed", "said"),
     [
-        ({"state": "exposing"}, r"must expose b00 within 5\.0 s; found still exposing after 5"),
+        (
+            {"state": "exposing"},
+            r"must expose b00 within 5\.0 s; found still exposing after 5",
+        ),
         ({"state": "idle"}, r"must expose b00 for 3\.000 s; found 0\.0"),
-        ({"state": "asleep"}, "must send as state one of idle, exposing; found 'asleep'"),
-        ({"triggers": "2"}, "must send as triggers a whole number from 0 to 1; found '2'"),
+        (
+            {"state": "asleep"},
+            "must send as state one of idle, exposing; found 'asleep'",
+        ),
+        (
+            {"triggers": "2"},
+            "must send as triggers a whole number from 0 to 1; found '2'",
+        ),
         ({"triggers": "-1"}, "must send as triggers a whole number from 0 to 1"),
         ({"triggers": "1.0"}, "must send as triggers a whole number from 0 to 1"),
-        ({"triggers": "99999999999999999999"}, "must send as triggers a whole number from 0 to 1"),
+        (
+            {"triggers": "99999999999999999999"},
+            "must send as triggers a whole number from 0 to 1",
+        ),
     ],
 )
 def test_measure__a_state_that_cannot_be_right_ends_it(changed, said):
-    device = OddProbe(change_reply=lambda verb, values: values | changed if verb == "STATUS" else values)
+    device = OddProbe(
+        change_reply=lambda verb, values: (
+            values | changed if verb == "STATUS" else values
+        )
+    )
     with pytest.raises(DeviceError, match=said):
         _measure(device)
     assert device.clock.monotonic() < 2.0 + EXPOSURES["b00"] + SLACK_SECONDS + 1.0
 
 
 def test_measure__a_reply_without_its_values_is_refused():
-    device = OddProbe(change_reply=lambda verb, values: {} if verb == "STATUS" else values)
+    device = OddProbe(
+        change_reply=lambda verb, values: {} if verb == "STATUS" else values
+    )
     with pytest.raises(DeviceError, match="must send the value state; found R"):
         _measure(device)
 
@@ -201,7 +245,10 @@ def test_measure__a_stop_that_is_ignored_is_left_to_the_watchdog():
     device = OddProbe()
     handle = device.handle
     device.handle = lambda verb, values: {} if verb == "STOP" else handle(verb, values)
-    with pytest.raises(DeviceError, match="must confirm that it released the suction; found readings of the gauge"):
+    with pytest.raises(
+        DeviceError,
+        match="must confirm that it released the suction; found readings of the gauge",
+    ):
         _measure(device)
     assert device.clock.monotonic() - device.heard >= SILENCE_SECONDS
 

@@ -10,7 +10,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skindb.hw.protocol import MAX_LINE_BYTES, MAX_NUMBER, Lines, Message, ProtocolError, checksum, decode
+from skindb.hw.protocol import (
+    MAX_LINE_BYTES,
+    MAX_NUMBER,
+    Lines,
+    Message,
+    ProtocolError,
+    checksum,
+    decode,
+)
 
 NAMES = st.text("abcxyz_", min_size=1, max_size=8)
 MESSAGES = st.builds(
@@ -18,7 +26,9 @@ MESSAGES = st.builds(
     st.sampled_from("QRE"),
     st.integers(0, MAX_NUMBER),
     st.text("ABCXYZ", min_size=1, max_size=12),
-    st.dictionaries(NAMES, st.text(st.characters(codec="utf-8"), max_size=8), max_size=4),
+    st.dictionaries(
+        NAMES, st.text(st.characters(codec="utf-8"), max_size=8), max_size=4
+    ),
 )
 
 
@@ -33,7 +43,8 @@ def bitwise_crc(data):
 
 
 def test_checksum__has_the_published_check_value():
-    assert checksum(b"123456789") == 0x29B1  # CRC-16/IBM-3740 in the catalogue of parametrised CRC algorithms
+    # CRC-16/IBM-3740 in the catalogue of parametrised CRC algorithms
+    assert checksum(b"123456789") == 0x29B1
 
 
 @settings(deadline=None)
@@ -52,7 +63,11 @@ def test_encode__round_trip(message):
 
 
 @settings(deadline=None)
-@given(st.one_of(st.binary(max_size=160), MESSAGES.map(lambda message: message.encode()[:-1])))
+@given(
+    st.one_of(
+        st.binary(max_size=160), MESSAGES.map(lambda message: message.encode()[:-1])
+    )
+)
 def test_decode__accepts_lines_of_the_format_only(line):
     try:
         message = decode(line)
@@ -79,7 +94,10 @@ def test_encode__refuses_what_breaks_the_format(message):
 
 
 @settings(deadline=None)
-@given(st.lists(MESSAGES, max_size=6), st.lists(st.integers(1, 40), min_size=1, max_size=30))
+@given(
+    st.lists(MESSAGES, max_size=6),
+    st.lists(st.integers(1, 40), min_size=1, max_size=30),
+)
 def test_feed__any_cuts_of_the_stream_give_the_same_messages(messages, cuts):
     stream = b"".join(message.encode() for message in messages)
     lines = Lines()
@@ -96,14 +114,19 @@ def test_feed__any_cuts_of_the_stream_give_the_same_messages(messages, cuts):
 def test_feed__counts_noise_and_goes_on():
     lines = Lines()
     good = Message("E", 7, "PRESSURE", {"kpa": "-5.0"}).encode()
-    assert len(lines.feed(b"\xff\x00noise\n\n" + good + good.replace(b"-5", b"-6") + good)) == 2
+    assert (
+        len(lines.feed(b"\xff\x00noise\n\n" + good + good.replace(b"-5", b"-6") + good))
+        == 2
+    )
     assert lines.damaged == 2
     assert lines.feed(b"x" * (10 * MAX_LINE_BYTES)) == []
     assert lines.feed(b"\n" + good) == [decode(good[:-1])]
 
 
 def test_feed__attacks_never_raise_nor_pass_a_changed_message():
-    """Flips of one to three bits, cuts, merged lines, random bytes: whatever is accepted was sent."""
+    """Flips of one to three bits, cuts, merged lines, random bytes: whatever is
+    accepted was sent.
+    """
     for seed in range(300):
         _check_feed__attacks_never_raise_nor_pass_a_changed_message(seed)
 
@@ -111,15 +134,23 @@ def test_feed__attacks_never_raise_nor_pass_a_changed_message():
 def _check_feed__attacks_never_raise_nor_pass_a_changed_message(seed):
     rng = np.random.default_rng(seed)
     sent = [
-        Message("R", int(rng.integers(MAX_NUMBER)), "OK", {"v": str(rng.integers(10**8)), "w": str(i)})
+        Message(
+            "R",
+            int(rng.integers(MAX_NUMBER)),
+            "OK",
+            {"v": str(rng.integers(10**8)), "w": str(i)},
+        )
         for i in range(20)
     ]
     wire = []
     for message in sent:
         line = bytearray(message.encode())
         attack = rng.integers(6)
-        if attack == 0:  # the CRC finds any three flipped bits of lines that are so short
-            for bit in rng.choice(8 * (len(line) - 1), rng.integers(1, 4), replace=False):
+        # the CRC finds any three flipped bits of lines that are so short
+        if attack == 0:
+            for bit in rng.choice(
+                8 * (len(line) - 1), rng.integers(1, 4), replace=False
+            ):
                 line[bit // 8] ^= 1 << (bit % 8)
         elif attack == 1:
             del line[int(rng.integers(len(line))) :]

@@ -1,4 +1,6 @@
-"""`skindb capture` without --virtual: devices behind sockets, in real time, and frames in watched folders."""
+"""`skindb capture` without --virtual: devices behind sockets, in real time, and frames
+in watched folders.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,18 @@ from skindb.virtual.laboratory import Laboratory
 
 pytestmark = pytest.mark.slow
 
-SMALL = ["--takes", "1", "--lights", "8", "--cameras", "2", "--width", "24", "--height", "30"]
+SMALL = [
+    "--takes",
+    "1",
+    "--lights",
+    "8",
+    "--cameras",
+    "2",
+    "--width",
+    "24",
+    "--height",
+    "30",
+]
 
 
 @pytest.fixture(scope="module")
@@ -30,16 +43,40 @@ def _capture(setup, out, *options):
     """A session with a laboratory in real time."""
     laboratory = Laboratory(setup, out.parent / "frames", clock=SystemClock())
     with Server(laboratory.dome) as dome:
-        own = ["--setup", str(setup), "--dome", dome.url, "--cameras", str(laboratory.watched), "--subject", "S1"]
-        own += ["--consent", "fit", "--reference", "form 1", "--scan", str(setup / "scan.ply")]
-        return laboratory, CliRunner().invoke(cli, ["capture", str(out), *own, *options])
+        own = [
+            "--setup",
+            str(setup),
+            "--dome",
+            dome.url,
+            "--cameras",
+            str(laboratory.watched),
+            "--subject",
+            "S1",
+        ]
+        own += [
+            "--consent",
+            "fit",
+            "--reference",
+            "form 1",
+            "--scan",
+            str(setup / "scan.ply"),
+        ]
+        return laboratory, CliRunner().invoke(
+            cli, ["capture", str(out), *own, *options]
+        )
 
 
 def test_capture__a_real_session_records_who_confirmed_its_flashes(setup, tmp_path):
-    _, result = _capture(setup, tmp_path / "C", "--confirm-screening", "--operator", "OP-1")
+    _, result = _capture(
+        setup, tmp_path / "C", "--confirm-screening", "--operator", "OP-1"
+    )
     assert result.exit_code == 0, str(result.exception)
     override = read_capture(tmp_path / "C").override
-    assert (override["operator"], override["screened"], override["eyes_closed"]) == ("OP-1", True, True)
+    assert (override["operator"], override["screened"], override["eyes_closed"]) == (
+        "OP-1",
+        True,
+        True,
+    )
     assert override["flashes_per_second"] > 3
     record = json.loads((tmp_path / "C/capture.json").read_text())
     assert not {"virtual", "rehearsal"} & record.keys()
@@ -47,11 +84,18 @@ def test_capture__a_real_session_records_who_confirmed_its_flashes(setup, tmp_pa
 
 def test_capture__a_real_session_without_a_confirmation_is_refused(setup, tmp_path):
     laboratory, result = _capture(setup, tmp_path / "C")
-    assert "sequence: an operator must confirm screening, consent and closed eyes" in str(result.exception)
+    assert (
+        "sequence: an operator must confirm screening, consent and closed eyes"
+        in str(result.exception)
+    )
     assert laboratory.dome._runs == 0
 
 
 def test_capture__a_real_session_without_its_lamp_is_refused(setup, tmp_path):
-    laboratory, result = _capture(setup, tmp_path / "C", "--base-light", "10", "--operator", "OP-1")
-    assert "steady lamp: must be as bright as 10 lights; found dark frames of" in str(result.exception)
+    laboratory, result = _capture(
+        setup, tmp_path / "C", "--base-light", "10", "--operator", "OP-1"
+    )
+    assert "steady lamp: must be as bright as 10 lights; found dark frames of" in str(
+        result.exception
+    )
     assert {step.light for step in laboratory.dome.steps} == {"-"}

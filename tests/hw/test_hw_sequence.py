@@ -22,7 +22,14 @@ from skindb.hw.safety import (
     slowed_schedule,
     with_base_light,
 )
-from skindb.hw.sequence import DARK, Measured, Schedule, Step, plan_schedule, sequence_entry
+from skindb.hw.sequence import (
+    DARK,
+    Measured,
+    Schedule,
+    Step,
+    plan_schedule,
+    sequence_entry,
+)
 from skindb.hw.session import with_dark_frames
 
 LIGHTS = [f"l{i:03d}" for i in range(150)]
@@ -30,11 +37,16 @@ PAPER = plan_schedule(LIGHTS, {"long": 0.04, "short": 0.005}, seconds=25.0)
 
 
 def test_plan_schedule__the_paper_s_capture():
-    """150 lights, two exposures, 25 s: twelve flashes in a second (Weyrich et al. 2005, section 5)."""
+    """150 lights, two exposures, 25 s: twelve flashes in a second (Weyrich et al. 2005,
+    section 5).
+    """
     assert len(PAPER.steps) == 300
     assert PAPER.seconds == pytest.approx(25.0, abs=0.1)
-    assert 11 <= assess(PAPER).flashes_per_second <= 17  # the short exposures follow each other faster
-    assert all(a.off_us < b.on_us for a, b in zip(PAPER.steps, PAPER.steps[1:], strict=False))
+    # the short exposures follow each other faster
+    assert 11 <= assess(PAPER).flashes_per_second <= 17
+    assert all(
+        a.off_us < b.on_us for a, b in zip(PAPER.steps, PAPER.steps[1:], strict=False)
+    )
 
 
 def test_brackets__the_paper_s_probe():
@@ -51,9 +63,18 @@ def test_brackets__the_paper_s_probe():
     [
         ({"lights": [], "exposures": {"e": 1.0}}, "must have lights and exposures"),
         ({"lights": ["a"], "exposures": {}}, "must have lights and exposures"),
-        ({"lights": ["a"], "exposures": {"e": 0.0}}, "an exposure must last 1e-6 to 60 s"),
-        ({"lights": ["a"], "exposures": {"e": float("nan")}}, "an exposure must last 1e-6 to 60 s"),
-        ({"lights": ["a", "b"], "exposures": {"e": 1.0}, "seconds": 1.0}, r"must last at least 2\.004 s"),
+        (
+            {"lights": ["a"], "exposures": {"e": 0.0}},
+            "an exposure must last 1e-6 to 60 s",
+        ),
+        (
+            {"lights": ["a"], "exposures": {"e": float("nan")}},
+            "an exposure must last 1e-6 to 60 s",
+        ),
+        (
+            {"lights": ["a", "b"], "exposures": {"e": 1.0}, "seconds": 1.0},
+            r"must last at least 2\.004 s",
+        ),
     ],
 )
 def test_plan_schedule__mistakes(given, said):
@@ -74,7 +95,9 @@ def _check_assess__is_the_count_in_any_second(seed):
     naive = ((starts >= begins) & (starts < begins + 1_000_000)).sum(axis=1).max()
     found = assess(schedule).flashes_per_second
     assert naive <= found <= naive + 1  # windows that begin between two milliseconds
-    assert found == max(int(((starts >= t) & (starts < t + 1_000_000)).sum()) for t in starts)
+    assert found == max(
+        int(((starts >= t) & (starts < t + 1_000_000)).sum()) for t in starts
+    )
 
 
 def test_alternatives__need_no_override():
@@ -90,48 +113,72 @@ def test_alternatives__need_no_override():
 
 @pytest.mark.parametrize("lacks", ["screened", "consented", "eyes_closed", "operator"])
 def test_require_safe__an_incomplete_confirmation_is_none(lacks):
-    given = {"operator": "OP-1", "time": "now"} | ({"operator": ""} if lacks == "operator" else {lacks: False})
-    with pytest.raises(InputError, match="confirm screening, consent and closed eyes for more than 3 flashes"):
+    given = {"operator": "OP-1", "time": "now"} | (
+        {"operator": ""} if lacks == "operator" else {lacks: False}
+    )
+    with pytest.raises(
+        InputError,
+        match="confirm screening, consent and closed eyes for more than 3 flashes",
+    ):
         require_safe(PAPER, Override(**given))
     assert require_safe(PAPER, Override("OP-1", "now")).flashes_per_second > MAX_FLASHES
 
 
 def test_sequence_entry__measured_times_count():
     entry = sequence_entry(Step("a", "e", 100, 200), Measured(103, 204, 1, 1.0, 0.0))
-    assert (entry["t_on"], entry["t_off"], entry["trigger_count"]) == (103e-6, 204e-6, 1)
+    assert (entry["t_on"], entry["t_off"], entry["trigger_count"]) == (
+        103e-6,
+        204e-6,
+        1,
+    )
     assert (entry["planned_on"], entry["planned_off"]) == (100e-6, 200e-6)
 
 
 def test_partial_schedule__flashes_no_faster_than_the_whole():
-    """Any steps of any schedule, fast or slow, with dark frames or without: a repetition needs no new confirmation."""
+    """Any steps of any schedule, fast or slow, with dark frames or without: a
+    repetition needs no new confirmation.
+    """
     for seed in range(60):
         _check_partial_schedule__flashes_no_faster_than_the_whole(seed)
 
 
 def _check_partial_schedule__flashes_no_faster_than_the_whole(seed):
     rng = np.random.default_rng(seed)
-    exposures = {f"e{i}": float(t) for i, t in enumerate(10 ** rng.uniform(-3, -1, rng.integers(1, 4)))}
+    exposures = {
+        f"e{i}": float(t)
+        for i, t in enumerate(10 ** rng.uniform(-3, -1, rng.integers(1, 4)))
+    }
     planned = plan_schedule(LIGHTS[: rng.integers(3, 30)], exposures)
     whole = slowed_schedule(planned) if rng.random() < 0.5 else planned
     whole = with_dark_frames(whole) if rng.random() < 0.7 else whole
-    steps = rng.choice(len(whole.steps), rng.integers(1, len(whole.steps)), replace=False)
+    steps = rng.choice(
+        len(whole.steps), rng.integers(1, len(whole.steps)), replace=False
+    )
     part = partial_schedule(whole, steps)
     assert [(s.light, s.exposure) for s in part.steps] == [
         (whole.steps[i].light, whole.steps[i].exposure) for i in sorted(steps)
     ]
     assert assess(part).flashes_per_second <= assess(whole).flashes_per_second
-    assert all(a.off_us < b.on_us for a, b in zip(part.steps, part.steps[1:], strict=False))
+    assert all(
+        a.off_us < b.on_us for a, b in zip(part.steps, part.steps[1:], strict=False)
+    )
 
 
 def test_match_frames__any_frames_may_be_lost():
-    """A fifth of the frames lost anywhere, clocks of any difference, jitter of a tenth of a period, extra frames."""
+    """A fifth of the frames lost anywhere, clocks of any difference, jitter of a tenth
+    of a period, extra frames.
+    """
     for seed in range(200):
         _check_match_frames__any_frames_may_be_lost(seed)
 
 
 def _check_match_frames__any_frames_may_be_lost(seed):
     rng = np.random.default_rng(seed)
-    schedule = with_dark_frames(plan_schedule(LIGHTS[: int(rng.integers(5, 40))], {"long": 0.04, "short": 0.005}))
+    schedule = with_dark_frames(
+        plan_schedule(
+            LIGHTS[: int(rng.integers(5, 40))], {"long": 0.04, "short": 0.005}
+        )
+    )
     due = np.array([step.on_us / 1e6 for step in schedule.steps])
     period = np.diff(due).min()
     there = rng.random(len(due)) > rng.uniform(0, 0.2)
@@ -139,7 +186,8 @@ def _check_match_frames__any_frames_may_be_lost(seed):
     shots = [Shot(Path(str(i)), float(at[i])) for i in np.flatnonzero(there)]
     found = match_frames(shots, list(due))
     if found == [None] * len(due):  # nobody could tell: all are taken again
-        assert not there[[0, 1, -1]].all()  # a dark frame is lost, whose pauses tell the place of the others
+        # a dark frame is lost, whose pauses tell the place of the others
+        assert not there[[0, 1, -1]].all()
         return
     right = [i if kept else None for i, kept in enumerate(there)]
     assert [None if path is None else int(path.name) for path in found] == right
@@ -157,11 +205,17 @@ def test_match_frames__a_file_that_was_written_again_does_not_exchange_the_other
     shots = [Shot(Path(str(i)), 50.0 + at) for i, at in enumerate(due)]
     late = Shot(Path("20"), 999.0)
     found = match_frames([*shots[:20], *shots[21:], late], due)
-    assert [None if path is None else int(path.name) for path in found] == [*range(20), None, *range(21, len(due))]
+    assert [None if path is None else int(path.name) for path in found] == [
+        *range(20),
+        None,
+        *range(21, len(due)),
+    ]
 
 
 def test_match_frames__imprecise_times_do_not_matter_if_no_frame_is_missing():
-    """Tethering tools that write the time of the transfer: seconds, or a jitter longer than the steps."""
+    """Tethering tools that write the time of the transfer: seconds, or a jitter longer
+    than the steps.
+    """
     due = np.array([step.on_us / 1e6 for step in with_dark_frames(PAPER).steps])
     for seed in range(15):
         rng = np.random.default_rng(seed)
@@ -188,11 +242,14 @@ def test_folder_cameras__need_their_folders(tmp_path):
     assert cameras.collect(1, 10.0) == {"c0": []}
 
 
-def test_folder_cameras__files_may_be_renamed_while_they_are_listed(tmp_path, monkeypatch):
+def test_folder_cameras__files_may_be_renamed_while_they_are_listed(
+    tmp_path, monkeypatch
+):
     (tmp_path / "c0").mkdir()
     cameras = FolderCameras(tmp_path, ["c0"], clock=SimulatedClock())
     cameras.start()
-    gone = tmp_path / "c0/temporary.png"  # listed by the folder, but renamed before its size is read
+    # listed by the folder, but renamed before its size is read
+    gone = tmp_path / "c0/temporary.png"
     taken = tmp_path / "c0/0001.png"
     taken.write_bytes(imagecodecs.png_encode(np.zeros((2, 2, 3), np.uint16)))
     listed = Path.iterdir

@@ -1,18 +1,34 @@
-"""The fault matrix: what goes wrong in a session is found, named, and repeated or refused; no frame is mistaken."""
+"""The fault matrix: what goes wrong in a session is found, named, and repeated or
+refused; no frame is mistaken.
+"""
 
 from __future__ import annotations
 
 import imagecodecs
 import numpy as np
 import pytest
-from devices_pair import BRACKETS, CAMERAS, EXPOSURES, LIGHTS, OVERRIDE, Bench, subject_folder, value_of
+from devices_pair import (
+    BRACKETS,
+    CAMERAS,
+    EXPOSURES,
+    LIGHTS,
+    OVERRIDE,
+    Bench,
+    subject_folder,
+    value_of,
+)
 
 from skindb.errors import Fault, InputError
 from skindb.hw.cameras import Shot
 from skindb.hw.probe import PlacementError
 from skindb.hw.safety import assess, slowed_schedule
 from skindb.hw.sequence import DARK, plan_schedule
-from skindb.hw.session import capture_dome, capture_site, require_complete, with_dark_frames
+from skindb.hw.session import (
+    capture_dome,
+    capture_site,
+    require_complete,
+    with_dark_frames,
+)
 from skindb.virtual.devices import DeviceFaults
 from skindb.virtual.laboratory import LaboratoryFaults
 
@@ -27,7 +43,8 @@ def subject(tmp_path_factory):
 def _run(subject, watched, faults=None):
     with Bench(subject, watched, faults) as bench:
         run = capture_dome(bench.dome, bench.cameras, SCHEDULE, override=OVERRIDE)
-        assert bench.laboratory.dome.on in (None, "l03")  # all lights are off, except one that cannot be switched off
+        # all lights are off, except one that cannot be switched off
+        assert bench.laboratory.dome.on in (None, "l03")
         return run
 
 
@@ -52,10 +69,16 @@ def test_capture_dome__everything_works(subject, tmp_path):
 REPEATED = {
     "a dropped frame in the middle": LaboratoryFaults(dropped_frames=(("c0", 9),)),
     "the first frame": LaboratoryFaults(dropped_frames=(("c0", 0),)),
-    "the last frame": LaboratoryFaults(dropped_frames=(("c1", len(SCHEDULE.steps) - 1),)),
+    "the last frame": LaboratoryFaults(
+        dropped_frames=(("c1", len(SCHEDULE.steps) - 1),)
+    ),
     "the first frame of a light": LaboratoryFaults(dropped_frames=(("c0", 2),)),
-    "frames of several cameras": LaboratoryFaults(dropped_frames=(("c0", 5), ("c1", 5), ("c1", 6), ("c1", 20))),
-    "a frame, and again when it is repeated": LaboratoryFaults(dropped_frames=(("c0", 5), ("c0", len(SCHEDULE.steps)))),
+    "frames of several cameras": LaboratoryFaults(
+        dropped_frames=(("c0", 5), ("c1", 5), ("c1", 6), ("c1", 20))
+    ),
+    "a frame, and again when it is repeated": LaboratoryFaults(
+        dropped_frames=(("c0", 5), ("c0", len(SCHEDULE.steps)))
+    ),
     "lost triggers": LaboratoryFaults(dome=DeviceFaults(lost_triggers=(4, 17))),
 }
 
@@ -69,7 +92,9 @@ def test_capture_dome__missing_frames_are_repeated(subject, tmp_path, faults):
 
 
 class OwnCameras:
-    """Cameras of another make: frames are counted by the folder of the emulated ones, and numbered by their names."""
+    """Cameras of another make: frames are counted by the folder of the emulated ones,
+    and numbered by their names.
+    """
 
     ids = tuple(CAMERAS)
 
@@ -77,16 +102,26 @@ class OwnCameras:
         self.root = root
 
     def start(self, since=None):
-        self.first = {name: len(list((self.root / name).iterdir())) for name in self.ids}
+        self.first = {
+            name: len(list((self.root / name).iterdir())) for name in self.ids
+        }
 
     def collect(self, expected, seconds):
-        taken = {name: sorted((self.root / name).glob("*.png"))[self.first[name] :] for name in self.ids}
-        return {name: [Shot(path, path.stat().st_mtime) for path in files] for name, files in taken.items()}
+        taken = {
+            name: sorted((self.root / name).glob("*.png"))[self.first[name] :]
+            for name in self.ids
+        }
+        return {
+            name: [Shot(path, path.stat().st_mtime) for path in files]
+            for name, files in taken.items()
+        }
 
 
 def test_capture_dome__takes_any_cameras(subject, tmp_path):
     with Bench(subject, tmp_path) as bench:
-        run = capture_dome(bench.dome, OwnCameras(tmp_path), SCHEDULE, override=OVERRIDE)
+        run = capture_dome(
+            bench.dome, OwnCameras(tmp_path), SCHEDULE, override=OVERRIDE
+        )
     require_complete(run, CAMERAS)
     assert len(run.frames) == len(CAMERAS) * len(SCHEDULE.steps)
     _require_right_frames(run)
@@ -97,7 +132,10 @@ def test_capture_dome__any_frames_may_be_lost(subject, tmp_path):
     for seed in range(12):
         rng = np.random.default_rng(seed)
         count = int(rng.integers(1, 6))
-        lost = {(str(rng.choice(CAMERAS)), int(rng.integers(len(SCHEDULE.steps)))) for _ in range(count)}
+        lost = {
+            (str(rng.choice(CAMERAS)), int(rng.integers(len(SCHEDULE.steps))))
+            for _ in range(count)
+        }
         run = _run(subject, tmp_path, LaboratoryFaults(dropped_frames=tuple(lost)))
         assert run.missing(CAMERAS) == {}, seed
         _require_right_frames(run)
@@ -106,7 +144,10 @@ def test_capture_dome__any_frames_may_be_lost(subject, tmp_path):
 def test_capture_dome__a_camera_that_is_off_is_named(subject, tmp_path):
     every = tuple(("c1", i) for i in range(5 * len(SCHEDULE.steps)))
     run = _run(subject, tmp_path, LaboratoryFaults(dropped_frames=every))
-    with pytest.raises(InputError, match=r"33 missing frames: light - exposure long camera c1; .* keep the subject"):
+    with pytest.raises(
+        InputError,
+        match=r"33 missing frames: light - exposure long camera c1; .* keep the subject",
+    ):
         require_complete(run, CAMERAS)
     _require_right_frames(run)
     assert sum(camera == "c0" for camera, _ in run.frames) == len(SCHEDULE.steps)
@@ -115,7 +156,10 @@ def test_capture_dome__a_camera_that_is_off_is_named(subject, tmp_path):
 @pytest.mark.parametrize(
     ("faults", "said"),
     [
-        (DeviceFaults(dim_light="l05"), "light l05: must be as bright as the others; found 50% of its nominal current"),
+        (
+            DeviceFaults(dim_light="l05"),
+            "light l05: must be as bright as the others; found 50% of its nominal current",
+        ),
         (
             DeviceFaults(stuck_light="l03"),
             "light l03: must be as bright as the others; found 100% of the current of a light",
@@ -124,16 +168,25 @@ def test_capture_dome__a_camera_that_is_off_is_named(subject, tmp_path):
         (DeviceFaults(vanish_after=60), "found dome must "),
     ],
 )
-def test_capture_dome__what_cannot_be_repeated_is_named(subject, tmp_path, faults, said):
+def test_capture_dome__what_cannot_be_repeated_is_named(
+    subject, tmp_path, faults, said
+):
     run = _run(subject, tmp_path, LaboratoryFaults(dome=faults))
     with pytest.raises(InputError) as error:
         require_complete(run, CAMERAS)
     assert said in str(error.value)
-    _require_right_frames(run, but=LIGHTS if faults.stuck_light or faults.dim_light else ())
+    _require_right_frames(
+        run, but=LIGHTS if faults.stuck_light or faults.dim_light else ()
+    )
 
 
 @pytest.mark.parametrize(
-    "faults", [DeviceFaults(garbage=0.3), DeviceFaults(lost_replies=0.03), DeviceFaults(delay=0.02)]
+    "faults",
+    [
+        DeviceFaults(garbage=0.3),
+        DeviceFaults(lost_replies=0.03),
+        DeviceFaults(delay=0.02),
+    ],
 )
 def test_capture_dome__a_bad_line_costs_time_only(subject, tmp_path, faults):
     run = _run(subject, tmp_path, LaboratoryFaults(dome=faults))
@@ -160,8 +213,14 @@ def test_capture_site__everything_works(subject, tmp_path):
     ("faults", "said"),
     [
         (LaboratoryFaults(probe=DeviceFaults(leak=2.0)), "so it leaks; press it on"),
-        (LaboratoryFaults(dropped_probe_frames=(2,)), "4 frames for 5 triggers and 5 exposures; measure cheek again"),
-        (LaboratoryFaults(probe=DeviceFaults(lost_triggers=(2,))), "4 frames for 4 triggers and 5 exposures"),
+        (
+            LaboratoryFaults(dropped_probe_frames=(2,)),
+            "4 frames for 5 triggers and 5 exposures; measure cheek again",
+        ),
+        (
+            LaboratoryFaults(probe=DeviceFaults(lost_triggers=(2,))),
+            "4 frames for 4 triggers and 5 exposures",
+        ),
         (LaboratoryFaults(probe=DeviceFaults(vanish_after=6)), "probe: must "),
     ],
 )
@@ -169,7 +228,9 @@ def test_capture_site__what_goes_wrong_is_named(subject, tmp_path, faults, said)
     with Bench(subject, tmp_path, faults) as bench:
         bench.laboratory.place("cheek")
         with pytest.raises(InputError) as error:
-            capture_site(bench.probe, bench.probe_camera, "cheek", dict.fromkeys(BRACKETS, 2.0))
+            capture_site(
+                bench.probe, bench.probe_camera, "cheek", dict.fromkeys(BRACKETS, 2.0)
+            )
         assert said in str(error.value)
 
 
@@ -185,38 +246,62 @@ def test_capture_site__a_frame_without_its_trigger_is_not_trusted(subject, tmp_p
             return reply | changed.get(exposing, {}) if verb == "STATUS" else reply
 
         bench.laboratory.probe.handle = one_trigger_less
-        with pytest.raises(PlacementError, match="5 frames for 4 triggers and 5 exposures; measure cheek again"):
+        with pytest.raises(
+            PlacementError,
+            match="5 frames for 4 triggers and 5 exposures; measure cheek again",
+        ):
             capture_site(bench.probe, bench.probe_camera, "cheek", BRACKETS)
 
 
 def test_capture_dome__steps_before_the_controller_vanished_are_kept(subject, tmp_path):
-    """What it reported while it ran is kept with its measured times; what it did not report is taken again."""
+    """What it reported while it ran is kept with its measured times; what it did not
+    report is taken again.
+    """
     for requests in range(40, 101, 5):  # 38 before the start, then about 70
-        run = _run(subject, tmp_path, LaboratoryFaults(dome=DeviceFaults(vanish_after=requests)))
+        run = _run(
+            subject,
+            tmp_path,
+            LaboratoryFaults(dome=DeviceFaults(vanish_after=requests)),
+        )
         assert "the device has closed its line" in run.stopped
         _require_right_frames(run)
-        assert {i for _, i in run.frames} <= {i for i, done in enumerate(run.measured) if done is not None}
-        if requests > 80:  # the first lights, whose uneven intervals tell which frame is which
+        assert {i for _, i in run.frames} <= {
+            i for i, done in enumerate(run.measured) if done is not None
+        }
+        # the first lights, whose uneven intervals tell which frame is which
+        if requests > 80:
             assert len(run.frames) >= len(CAMERAS) * 10
 
 
 @pytest.mark.parametrize("slow", [False, True])
-def test_capture_dome__a_repetition_that_is_refused_loses_nothing(subject, tmp_path, slow, monkeypatch):
+def test_capture_dome__a_repetition_that_is_refused_loses_nothing(
+    subject, tmp_path, slow, monkeypatch
+):
     schedule = with_dark_frames(
-        slowed_schedule(plan_schedule(LIGHTS, EXPOSURES)) if slow else plan_schedule(LIGHTS, EXPOSURES)
+        slowed_schedule(plan_schedule(LIGHTS, EXPOSURES))
+        if slow
+        else plan_schedule(LIGHTS, EXPOSURES)
     )
-    with Bench(subject, tmp_path, LaboratoryFaults(dropped_frames=(("c0", 9),))) as bench:
+    with Bench(
+        subject, tmp_path, LaboratoryFaults(dropped_frames=(("c0", 9),))
+    ) as bench:
         arm = bench.dome.arm
         armed = []
 
         def refuse_the_second(part, override):
-            assert assess(part).flashes_per_second <= assess(schedule).flashes_per_second
+            assert (
+                assess(part).flashes_per_second <= assess(schedule).flashes_per_second
+            )
             if armed:
-                raise InputError(Fault("dome", "must be armed", "the interlock is open", ""))
+                raise InputError(
+                    Fault("dome", "must be armed", "the interlock is open", "")
+                )
             armed.append(part)
             arm(part, override)
 
         monkeypatch.setattr(bench.dome, "arm", refuse_the_second)
-        run = capture_dome(bench.dome, bench.cameras, schedule, override=None if slow else OVERRIDE)
+        run = capture_dome(
+            bench.dome, bench.cameras, schedule, override=None if slow else OVERRIDE
+        )
     assert run.stopped == "dome must be armed: the interlock is open"
     assert len(run.frames) == len(CAMERAS) * len(schedule.steps) - 1

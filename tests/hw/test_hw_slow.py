@@ -23,13 +23,24 @@ from skindb.errors import InputError
 from skindb.hw.dome import Dome
 from skindb.hw.link import ATTEMPTS, READ_SECONDS, REPLY_SECONDS
 from skindb.hw.sequence import DARK, plan_schedule
-from skindb.hw.session import capture_dome, capture_site, require_complete, with_dark_frames
+from skindb.hw.session import (
+    capture_dome,
+    capture_site,
+    require_complete,
+    with_dark_frames,
+)
 from skindb.virtual.devices import DeviceFaults
 from skindb.virtual.laboratory import LaboratoryFaults
 
-SCHEDULE = with_dark_frames(plan_schedule(LIGHTS[:3], {"long": EXPOSURES["long"]}), count=1)
-REFUSED = r"(dome|probe): must answer [A-Z]+ within 0\.9 s; found no reply.*; check its power and its cable"
-# Requests of these small sessions: about 20 for what is planned, and those that ask whether a device is ready.
+SCHEDULE = with_dark_frames(
+    plan_schedule(LIGHTS[:3], {"long": EXPOSURES["long"]}), count=1
+)
+REFUSED = (
+    r"(dome|probe): must answer [A-Z]+ within 0\.9 s; found no reply.*; check its "
+    r"power and its cable"
+)
+# Requests of these small sessions: about 20 for what is planned, and those that ask
+# whether a device is ready.
 MAX_REQUESTS = 60
 # What a session may take if every request needs all attempts, with the 10 s of the last frames.
 MAX_SECONDS = MAX_REQUESTS * ATTEMPTS * REPLY_SECONDS + 10
@@ -69,11 +80,16 @@ def test_capture_dome__a_slow_controller(subject, tmp_path, delay):
     for (camera, i), path in run.frames.items():
         step = SCHEDULE.steps[i]
         if step.light != DARK:
-            assert (imagecodecs.png_decode(path.read_bytes()) == value_of(step.light, camera, step.exposure)).all()
+            assert (
+                imagecodecs.png_decode(path.read_bytes())
+                == value_of(step.light, camera, step.exposure)
+            ).all()
 
 
 def _site_session(subject, watched, delay):
-    with Bench(subject, watched, LaboratoryFaults(probe=DeviceFaults(delay=delay))) as bench:
+    with Bench(
+        subject, watched, LaboratoryFaults(probe=DeviceFaults(delay=delay))
+    ) as bench:
         bench.laboratory.place("cheek")
         run = capture_site(bench.probe, bench.probe_camera, "cheek", BRACKETS)
         assert bench.clock.monotonic() < MAX_SECONDS
@@ -82,11 +98,15 @@ def _site_session(subject, watched, delay):
 
 @pytest.mark.parametrize("delay", [0.2, 0.28, 0.29, 0.31, 0.45, 1.0])
 def test_capture_site__a_slow_probe(subject, tmp_path, delay):
-    """The age of a reading counts from the request that switched the pump on, and so includes its delay."""
+    """The age of a reading counts from the request that switched the pump on, and so
+    includes its delay.
+    """
     run = _outcome(lambda: _site_session(subject, tmp_path, delay))
     if isinstance(run, str):
         assert delay > REPLY_SECONDS
-        assert re.match("probe: must (answer|have a reading of the gauge in the last 0.5 s)", run)
+        assert re.match(
+            "probe: must (answer|have a reading of the gauge in the last 0.5 s)", run
+        )
         return
     assert delay < REPLY_SECONDS
     assert [*run.frames] == [*BRACKETS]
@@ -100,7 +120,9 @@ def test_request__each_ends_within_its_deadline(delay):
     for _ in range(3):
         before = device.clock.monotonic()
         outcome = _outcome(lambda: link.request("BEAT"))
-        assert device.clock.monotonic() - before <= ATTEMPTS * (REPLY_SECONDS + READ_SECONDS)
+        assert device.clock.monotonic() - before <= ATTEMPTS * (
+            REPLY_SECONDS + READ_SECONDS
+        )
         assert not isinstance(outcome, str) or re.search(REFUSED, outcome)
 
 
@@ -120,7 +142,10 @@ def test_upload__ends_within_its_deadline(monkeypatch):
     seconds = (len(SCHEDULE.steps) + 2) * REPLY_SECONDS
     before = device.clock.monotonic()
     with pytest.raises(
-        InputError, match=rf"dome: must accept {len(SCHEDULE.steps)} steps within {seconds:.1f} s; found"
+        InputError,
+        match=rf"dome: must accept {len(SCHEDULE.steps)} steps within {seconds:.1f} s; found",
     ):
         dome.upload(SCHEDULE)
-    assert device.clock.monotonic() - before <= seconds + ATTEMPTS * (REPLY_SECONDS + READ_SECONDS)
+    assert device.clock.monotonic() - before <= seconds + ATTEMPTS * (
+        REPLY_SECONDS + READ_SECONDS
+    )

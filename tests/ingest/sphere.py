@@ -1,4 +1,6 @@
-"""A capture made by hand: a Lambertian sphere, its photographs from formulas; nothing of skindb takes part."""
+"""A capture made by hand: a Lambertian sphere, its photographs from formulas; nothing
+of skindb takes part.
+"""
 
 from __future__ import annotations
 
@@ -19,12 +21,23 @@ WHITE = 65535
 ELECTRONS_PER_DN = 0.5
 SECONDS = {"long": 1.0, "short": 0.1}
 INTENSITY = np.array([1.0e6, 0.9e6, 0.8e6])
-LIGHTS = {"l0": (0, 0, 500), "l1": (200, 50, 450), "l2": (-250, 100, 350), "l3": (50, -300, 300)}
+LIGHTS = {
+    "l0": (0, 0, 500),
+    "l1": (200, 50, 450),
+    "l2": (-250, 100, 350),
+    "l3": (50, -300, 300),
+}
 CAMERAS = {"c0": (0, 30, 400), "c1": (180, 0, 380)}
-TARGET = {"reflectance": 0.99, "point": [0, 0, 60], "normal": [0, 0, 1], "half_size": 60}
+TARGET = {
+    "reflectance": 0.99,
+    "point": [0, 0, 60],
+    "normal": [0, 0, 1],
+    "half_size": 60,
+}
 FIBRES = 4
 PROBE_SECONDS = {"b0": 4.0, "b1": 1.0, "b2": 0.25}
-PROBE_R = 0.02 * np.exp(-np.arange(1, FIBRES + 1)[:, None] * np.array([0.5, 0.8, 1.2]))  # mm^-2
+# mm^-2
+PROBE_R = 0.02 * np.exp(-np.arange(1, FIBRES + 1)[:, None] * np.array([0.5, 0.8, 1.2]))
 PROBE_SCALE = 0.05
 PROBE_GAIN = [1.1, 0.9, 1.05, 0.8]
 
@@ -46,7 +59,9 @@ def rays(eye, centre=(WIDTH / 2, HEIGHT / 2), lens=(0, 0, 0, 0, 0)):
 
 
 def straightened(u, v, k1, k2, p1, p2, k3):
-    """Where a lens would show (u, v) without its distortion: Brown's formula, repeated until it stands still."""
+    """Where a lens would show (u, v) without its distortion: Brown's formula, repeated
+    until it stands still.
+    """
     x = u
     y = v
     for _ in range(60):
@@ -70,7 +85,9 @@ def face_radiance(eye, light, **camera):
     way = light - point
     square = (way**2).sum(-1)
     cosine = np.maximum((way * point).sum(-1) / RADIUS / np.sqrt(square), 0)
-    return np.where(inside > 0, cosine / square, 0)[..., None] * ALBEDO / np.pi * INTENSITY
+    return (
+        np.where(inside > 0, cosine / square, 0)[..., None] * ALBEDO / np.pi * INTENSITY
+    )
 
 
 def target_radiance(eye, light, **camera):
@@ -81,7 +98,9 @@ def target_radiance(eye, light, **camera):
     way = light - point
     square = (way**2).sum(-1)
     on = np.abs(point[..., :2]).max(-1) < 60
-    return np.where(on, way[..., 2] / square**1.5, 0)[..., None] * 0.99 / np.pi * INTENSITY
+    return (
+        np.where(on, way[..., 2] / square**1.5, 0)[..., None] * 0.99 / np.pi * INTENSITY
+    )
 
 
 def expose(radiance, seconds, rng, bits=16):
@@ -113,7 +132,12 @@ def write_capture(folder: Path) -> None:
     vertices, faces = half_sphere()
     folder.mkdir()
     trimesh.Trimesh(vertices, faces, process=False).export(folder / "scan.ply")
-    sensor = {"bit_depth": 16, "black_level": BLACK, "white_level": WHITE, "read_noise_e": 5.0}
+    sensor = {
+        "bit_depth": 16,
+        "black_level": BLACK,
+        "white_level": WHITE,
+        "read_noise_e": 5.0,
+    }
     sensor |= {"electrons_per_dn": ELECTRONS_PER_DN}
     K = [[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]]
     cameras = []
@@ -123,23 +147,43 @@ def write_capture(folder: Path) -> None:
         cameras.append(size | {"K": K, "R": R.tolist(), "t": t.tolist()} | sensor)
         for e, seconds in SECONDS.items():
             for light, place in LIGHTS.items():
-                save(folder / f"dome/frames/{e}/{light}_{name}.png", expose(face_radiance(eye, place), seconds, rng))
+                save(
+                    folder / f"dome/frames/{e}/{light}_{name}.png",
+                    expose(face_radiance(eye, place), seconds, rng),
+                )
                 if name == "c0":
-                    save(folder / f"dome/white/{e}/{light}_c0.png", expose(target_radiance(eye, place), seconds, rng))
+                    save(
+                        folder / f"dome/white/{e}/{light}_c0.png",
+                        expose(target_radiance(eye, place), seconds, rng),
+                    )
     dome = {
         "cameras": cameras,
-        "lights": [{"id": i, "position": list(p), "disc_radius": 5.0, "intensity": None} for i, p in LIGHTS.items()],
+        "lights": [
+            {"id": i, "position": list(p), "disc_radius": 5.0, "intensity": None}
+            for i, p in LIGHTS.items()
+        ],
         "exposures": [{"id": e, "seconds": s} for e, s in SECONDS.items()],
         "frames": "dome/frames/{exposure}/{light}_{camera}.png",
-        "white": TARGET | {"frames": "dome/white/{exposure}/{light}_{camera}.png", "cameras": ["c0"]},
+        "white": TARGET
+        | {"frames": "dome/white/{exposure}/{light}_{camera}.png", "cameras": ["c0"]},
     }
     write_json(folder / "dome/dome.json", dome)
     write_probe(folder, sensor, rng)
     x = vertices[:, 0]
     y = vertices[:, 1]
-    regions = {"forehead": y > 50, "cheek": np.hypot(np.abs(x) - 40, y) < 15, "nose": np.hypot(x, y) < 12}
-    write_json(folder / "regions.json", {k: [np.flatnonzero(v).tolist()] for k, v in regions.items()})
-    points = {"nose_tip": [0, 0, RADIUS], "forehead_centre": [0, 0.7 * RADIUS, RADIUS * np.sqrt(0.51)]}
+    regions = {
+        "forehead": y > 50,
+        "cheek": np.hypot(np.abs(x) - 40, y) < 15,
+        "nose": np.hypot(x, y) < 12,
+    }
+    write_json(
+        folder / "regions.json",
+        {k: [np.flatnonzero(v).tolist()] for k, v in regions.items()},
+    )
+    points = {
+        "nose_tip": [0, 0, RADIUS],
+        "forehead_centre": [0, 0.7 * RADIUS, RADIUS * np.sqrt(0.51)],
+    }
     write_json(folder / "landmarks.json", points)
     write_json(
         folder / "capture.json",
@@ -169,7 +213,10 @@ def write_probe(folder, sensor, rng):
             for (cx, cy), r, gain in zip(centres, PROBE_R, PROBE_GAIN, strict=True):
                 image[np.hypot(x - cx, y - cy) <= 4] = r * gain / PROBE_SCALE
             save(folder / f"contact/{site}/{e}.png", expose(image, seconds, rng))
-    fibres = [{"id": f"f{i}", "distance": i + 1.0, "centre": c, "radius": 3.5} for i, c in enumerate(centres)]
+    fibres = [
+        {"id": f"f{i}", "distance": i + 1.0, "centre": c, "radius": 3.5}
+        for i, c in enumerate(centres)
+    ]
     record = {
         "sites": ["cheek", "forehead", "neck"],
         "fibres": fibres,

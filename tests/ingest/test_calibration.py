@@ -55,7 +55,9 @@ class Shoot:
 @pytest.fixture(scope="module")
 def shoot(tmp_path_factory):
     out = tmp_path_factory.mktemp("virtual")
-    [folder] = simulate_takes(out, takes=1, cameras=CAMERAS, lights=LIGHTS, width=120, height=150)
+    [folder] = simulate_takes(
+        out, takes=1, cameras=CAMERAS, lights=LIGHTS, width=120, height=150
+    )
     capture = read_capture(folder)
     dome = capture.dome
     faults = []
@@ -66,8 +68,12 @@ def shoot(tmp_path_factory):
     for j, light in enumerate(dome.lights):
         for c, camera in enumerate(dome.cameras):
             radiance, flag = mergers[camera.id].merge(read_view(dome, light.id, camera))
-            pictures[j, c] = np.where((flag == SATURATED)[..., None], np.float32(np.nan), radiance)
-    return Shoot(folder, dome, build_surfels(capture, spacing_mm=3.0), intensity, pictures)
+            pictures[j, c] = np.where(
+                (flag == SATURATED)[..., None], np.float32(np.nan), radiance
+            )
+    return Shoot(
+        folder, dome, build_surfels(capture, spacing_mm=3.0), intensity, pictures
+    )
 
 
 def _camera(shoot, c, **changed):
@@ -77,12 +83,18 @@ def _camera(shoot, c, **changed):
 
 
 def _lights(shoot, **positions):
-    lights = [replace(light, position=positions.get(light.id, light.position)) for light in shoot.dome.lights]
+    lights = [
+        replace(light, position=positions.get(light.id, light.position))
+        for light in shoot.dome.lights
+    ]
     return replace(shoot, dome=replace(shoot.dome, lights=tuple(lights)))
 
 
 def _exchanged(shoot, first, second):
-    a, b = (next(light for light in shoot.dome.lights if light.id == name) for name in (first, second))
+    a, b = (
+        next(light for light in shoot.dome.lights if light.id == name)
+        for name in (first, second)
+    )
     return _lights(shoot, **{first: b.position, second: a.position})
 
 
@@ -93,14 +105,23 @@ def _pictures(shoot, change):
 def _scan(shoot, rotation=None, move=(0, 0, 0)):
     turn = np.eye(3) if rotation is None else rotation
     position = shoot.surfels.position @ turn.T + move
-    return replace(shoot, surfels=replace(shoot.surfels, position=position, normal=shoot.surfels.normal @ turn.T))
+    return replace(
+        shoot,
+        surfels=replace(
+            shoot.surfels, position=position, normal=shoot.surfels.normal @ turn.T
+        ),
+    )
 
 
 def _found(shoot):
     """The calibration, its faults and its notes."""
     check, pictures = _check(shoot)
     found = check.evaluate(pictures)
-    return found, [str(f) for f in calibration_faults(shoot.dome, found)], calibration_notes(shoot.dome, found)
+    return (
+        found,
+        [str(f) for f in calibration_faults(shoot.dome, found)],
+        calibration_notes(shoot.dome, found),
+    )
 
 
 def test_calibration__of_a_true_capture_is_good(shoot):
@@ -132,7 +153,10 @@ def _poses(shoot):
 
 
 def _of_1(change):
-    return lambda shoot: _pictures(shoot, lambda j, c: change(shoot.pictures[j, c]) if c == 1 else shoot.pictures[j, c])
+    return lambda shoot: _pictures(
+        shoot,
+        lambda j, c: change(shoot.pictures[j, c]) if c == 1 else shoot.pictures[j, c],
+    )
 
 
 def _intensity(shoot, light, factor):
@@ -142,20 +166,47 @@ def _intensity(shoot, light, factor):
 
 
 REFUSED = {
-    "rotation transposed": (lambda s: _camera(s, 2, R=s.dome.cameras[2].R.T), "camera c02: its photographs"),
-    "focal length doubled": (lambda s: _focal(s, 2), "camera c01: .*the focal length looks twice too long"),
+    "rotation transposed": (
+        lambda s: _camera(s, 2, R=s.dome.cameras[2].R.T),
+        "camera c02: its photographs",
+    ),
+    "focal length doubled": (
+        lambda s: _focal(s, 2),
+        "camera c01: .*the focal length looks twice too long",
+    ),
     "centre far off": (_centre, "camera c01: .*mm away from the scan"),
-    "distance of a camera": (lambda s: _camera(s, 1, t=s.dome.cameras[1].t * 1.25), "camera c01: .*% larger"),
-    "poses exchanged": (_poses, "camera c00: .*they look as if camera c01 had taken them"),
+    "distance of a camera": (
+        lambda s: _camera(s, 1, t=s.dome.cameras[1].t * 1.25),
+        "camera c01: .*% larger",
+    ),
+    "poses exchanged": (
+        _poses,
+        "camera c00: .*they look as if camera c01 had taken them",
+    ),
     "frames of two cameras exchanged": (
         lambda s: _pictures(s, lambda j, c: s.pictures[j, {0: 1, 1: 0}.get(c, c)]),
         "camera c01: .*they look as if camera c00 had taken them",
     ),
-    "upside down": (_of_1(lambda image: image[::-1, ::-1]), "camera c01: .*they look upside down"),
-    "mirrored": (_of_1(lambda image: image[:, ::-1]), "camera c01: .*they look mirrored;"),
-    "shifted": (_of_1(lambda image: np.roll(image, 8, axis=0)), "camera c01: .*mm away from the scan"),
-    "scan far off": (lambda s: _scan(s, move=(0, 20, 0)), "none of 4 cameras does; align the scan: a shift by"),
-    "two lights exchanged": (lambda s: _exchanged(s, "l002", "l009"), "light l002: .*with light l009"),
+    "upside down": (
+        _of_1(lambda image: image[::-1, ::-1]),
+        "camera c01: .*they look upside down",
+    ),
+    "mirrored": (
+        _of_1(lambda image: image[:, ::-1]),
+        "camera c01: .*they look mirrored;",
+    ),
+    "shifted": (
+        _of_1(lambda image: np.roll(image, 8, axis=0)),
+        "camera c01: .*mm away from the scan",
+    ),
+    "scan far off": (
+        lambda s: _scan(s, move=(0, 20, 0)),
+        "none of 4 cameras does; align the scan: a shift by",
+    ),
+    "two lights exchanged": (
+        lambda s: _exchanged(s, "l002", "l009"),
+        "light l002: .*with light l009",
+    ),
     "frames of two lights exchanged": (
         lambda s: _pictures(s, lambda j, c: s.pictures[{2: 9, 9: 2}.get(j, j), c]),
         "light l009: .*with light l002",
@@ -166,15 +217,24 @@ REFUSED = {
     ),
     "blue, green, red of one camera": (
         _of_1(lambda image: image[..., ::-1]),
-        "more red than blue; found a ratio of 0\\.\\d+ in the frames of camera c01; write the channels",
+        (
+            "more red than blue; found a ratio of 0\\.\\d+ in the frames of camera "
+            "c01; write the channels"
+        ),
     ),
     "colour matrix three times too large": (
         _of_1(lambda image: image * np.float32(3)),
-        r"camera c01: its photographs must be as bright as those of the .* found [23][\.\d]* times as bright in",
+        (
+            r"camera c01: its photographs must be as bright as those of the .* found "
+            r"[23][\.\d]* times as bright in"
+        ),
     ),
     "white target of another light": (
         lambda s: _intensity(s, 5, 0.4),
-        r"light l005: its photographs must be as bright .* found 2\.\d times as bright; correct its intensity",
+        (
+            r"light l005: its photographs must be as bright .* found 2\.\d times as "
+            r"bright; correct its intensity"
+        ),
     ),
 }
 
@@ -189,19 +249,29 @@ def test_calibration_faults__name_what_is_exchanged_or_off(shoot, name):
 
 
 DOUBTFUL = {
-    "scan moved": (lambda s: _scan(s, move=(0, 3.0, 0)), r"a shift by \(.*-[23]\.\d, .*\) mm"),
+    "scan moved": (
+        lambda s: _scan(s, move=(0, 3.0, 0)),
+        r"a shift by \(.*-[23]\.\d, .*\) mm",
+    ),
     "scan turned": (
         lambda s: _scan(s, Rotation.from_euler("y", 5, degrees=True).as_matrix()),
         "the scan is not where the photographs show",
     ),
-    "focal length 6 % off": (lambda s: _focal(s, 1.06), "camera c01: .*[567].[0-9]% smaller"),
+    "focal length 6 % off": (
+        lambda s: _focal(s, 1.06),
+        "camera c01: .*[567].[0-9]% smaller",
+    ),
     "a light ten times too far": (
-        lambda s: _intensity(_lights(s, l004=10 * s.dome.lights[4].position), 4, 100),  # as the white target has it
+        # as the white target has it
+        lambda s: _intensity(_lights(s, l004=10 * s.dome.lights[4].position), 4, 100),
         "light l004: 10 times as far away",
     ),
     "one channel of a camera": (
         _of_1(lambda image: image * np.float32([1, 1.5, 1])),
-        r"camera c01: its photographs are 1\.[45]\d* times as bright in green as those of the others",
+        (
+            r"camera c01: its photographs are 1\.[45]\d* times as bright in green as "
+            r"those of the others"
+        ),
     ),
     "intensity of a light": (
         lambda s: _intensity(s, 5, 1.7),
@@ -212,7 +282,9 @@ DOUBTFUL = {
         r"the face reflects [345]% of red light, and skin 10% to 90%; check the white target",
     ),
     "a lamp that failed": (
-        lambda s: _pictures(s, lambda j, c: s.pictures[j, c] * np.float32(1e-4 if j == 3 else 1)),
+        lambda s: _pictures(
+            s, lambda j, c: s.pictures[j, c] * np.float32(1e-4 if j == 3 else 1)
+        ),
         "light l003: its photographs are too dark",
     ),
 }
@@ -228,7 +300,10 @@ def test_calibration_notes__warn_of_smaller_errors(shoot, name):
 
 def test_ingest_capture__refuses_or_notes_exchanged_frames(shoot, tmp_path):
     folder = Path(shutil.copytree(shoot.folder, tmp_path / "V001"))
-    frames = sorted((folder / "dome/frames").rglob("*l002*")), sorted((folder / "dome/frames").rglob("*l009*"))
+    frames = (
+        sorted((folder / "dome/frames").rglob("*l002*")),
+        sorted((folder / "dome/frames").rglob("*l009*")),
+    )
     assert len(frames[0]) == len(frames[1]) > 0
     for first, second in zip(*frames, strict=True):
         first.rename(tmp_path / "kept")
@@ -239,34 +314,53 @@ def test_ingest_capture__refuses_or_notes_exchanged_frames(shoot, tmp_path):
     coarse = {"spacing_mm": 4.0}
     with (
         pytest.raises(InputError, match=message),
-        ingest_capture(capture, IngestParameters(**coarse), scratch=tmp_path / "scratch"),
+        ingest_capture(
+            capture, IngestParameters(**coarse), scratch=tmp_path / "scratch"
+        ),
     ):
         pass
     lenient = IngestParameters(**coarse, calibration="note")
     with ingest_capture(capture, lenient, scratch=tmp_path / "scratch") as tree:
-        assert any("light l002: the shading of the face" in note for note in tree.attrs["summary"]["notes"])
+        assert any(
+            "light l002: the shading of the face" in note
+            for note in tree.attrs["summary"]["notes"]
+        )
         found = tree["calibration"].to_dataset()
-        assert found["light_agreement"].sel(light="l002") < 0.8 < found["light_agreement"].sel(light="l001")
+        assert (
+            found["light_agreement"].sel(light="l002")
+            < 0.8
+            < found["light_agreement"].sel(light="l001")
+        )
         assert found["camera_offset"].max() < 3.0
 
 
 def test_scan_pose__is_the_planted_one(shoot):
     true, _, _ = _found(shoot)
     found, _, _ = _found(_scan(shoot, move=(1.0, -2.0, 3.0)))
-    np.testing.assert_allclose(found.scan_translation - true.scan_translation, [-1, 2, -3], atol=0.5)
+    np.testing.assert_allclose(
+        found.scan_translation - true.scan_translation, [-1, 2, -3], atol=0.5
+    )
 
 
 def _check(shoot):
     scene = RayScene(shoot.surfels.position, shoot.surfels.faces)
     with ThreadPoolExecutor(2) as pool:
         share = light_visibility(shoot.surfels, shoot.dome.lights, scene, pool)
-        _, clear, pixels = camera_visibility(shoot.surfels, shoot.dome.cameras, scene, pool)
-    check = CalibrationCheck(shoot.dome, shoot.surfels, share, clear, pixels, shoot.intensity)
-    return check, {pair: check.reduce(pair[1], shoot.pictures[pair]) for pair in check.pairs}
+        _, clear, pixels = camera_visibility(
+            shoot.surfels, shoot.dome.cameras, scene, pool
+        )
+    check = CalibrationCheck(
+        shoot.dome, shoot.surfels, share, clear, pixels, shoot.intensity
+    )
+    return check, {
+        pair: check.reduce(pair[1], shoot.pictures[pair]) for pair in check.pairs
+    }
 
 
 def test_refine_cameras__turns_back_what_was_turned(shoot):
-    """Rationale: shifts are found to 1.5 mm where pixels are 4 mm. Planted: 0.6 degrees, 9 mm, and a roll."""
+    """Rationale: shifts are found to 1.5 mm where pixels are 4 mm. Planted: 0.6
+    degrees, 9 mm, and a roll.
+    """
     camera = shoot.dome.cameras[1]
     turn = Rotation.from_rotvec([0.004, -0.008, 0.01]).as_matrix()
     wrong = _camera(shoot, 1, R=turn @ camera.R, t=turn @ camera.t)
@@ -277,7 +371,11 @@ def test_refine_cameras__turns_back_what_was_turned(shoot):
             left = Rotation.from_matrix(refined.cameras[c].R @ own.R.T).as_rotvec()
             assert np.linalg.norm(left[:2]) * distance < 1.5
             assert abs(left[2]) < 0.005  # 0.5 mm at the edge of the face
-            np.testing.assert_allclose(refined.cameras[c].R.T @ refined.cameras[c].t, own.R.T @ own.t, atol=1e-9)
+            np.testing.assert_allclose(
+                refined.cameras[c].R.T @ refined.cameras[c].t,
+                own.R.T @ own.t,
+                atol=1e-9,
+            )
     applied = np.radians(applied_rotations(wrong.dome, planted)[1])
     np.testing.assert_allclose(applied, [-0.004, 0.008, -0.01], atol=0.003)
 
@@ -290,12 +388,15 @@ def test_refine_cameras__leaves_cameras_that_show_something_else(shoot):
 
 def test_ingest_capture__refine_stores_the_rotations(shoot, tmp_path):
     parameters = IngestParameters(spacing_mm=4.0, refine=True)
-    with ingest_capture(read_capture(shoot.folder), parameters, scratch=tmp_path) as tree:
+    with ingest_capture(
+        read_capture(shoot.folder), parameters, scratch=tmp_path
+    ) as tree:
         applied = tree["calibration/camera_rotation_applied"].values
         rotation = tree["dome/camera_rotation"].values
     given = np.array([camera.R for camera in shoot.dome.cameras])
     expected = [
-        Rotation.from_matrix(new @ old.T).as_rotvec(degrees=True) for new, old in zip(rotation, given, strict=True)
+        Rotation.from_matrix(new @ old.T).as_rotvec(degrees=True)
+        for new, old in zip(rotation, given, strict=True)
     ]
     np.testing.assert_allclose(applied, expected, atol=1e-5)
     assert 0 < np.abs(applied).max() < 0.3
@@ -322,12 +423,17 @@ def test_camera_offset__finds_a_planted_move_of_a_smooth_picture():
 
 
 def test_calibration__of_nothing_that_is_seen_is_unknown(shoot):
-    few = replace(shoot.surfels, **{n: getattr(shoot.surfels, n)[:20] for n in ("position", "normal", "area")})
+    few = replace(
+        shoot.surfels,
+        **{n: getattr(shoot.surfels, n)[:20] for n in ("position", "normal", "area")},
+    )
     share = np.ones((20, LIGHTS), np.float16)
     clear = np.ones((20, CAMERAS), bool)
     pixels = np.full((20, CAMERAS, 2), 60, np.float32)
     check = CalibrationCheck(shoot.dome, few, share, clear, pixels, shoot.intensity)
-    found = check.evaluate({pair: check.reduce(pair[1], shoot.pictures[pair]) for pair in check.pairs})
+    found = check.evaluate(
+        {pair: check.reduce(pair[1], shoot.pictures[pair]) for pair in check.pairs}
+    )
     assert np.isnan(found.camera_agreement).all()
     assert calibration_faults(shoot.dome, found) == []
 
@@ -340,9 +446,15 @@ def test_relative_brightness__recovers_the_factors_of_cameras_and_lights():
     lights, cameras = zip(*pairs, strict=True)
     factors = np.array([0.4 * light[j] * camera[c] for j, c in pairs])
     found = relative_brightness(factors, lights, cameras, shape=(10, 6))
-    np.testing.assert_allclose(found.camera[:5], camera / np.median(camera, axis=0), rtol=1e-3)
-    np.testing.assert_allclose(found.light[:9], light[:, 0] / np.median(light), rtol=1e-3)
-    np.testing.assert_allclose(found.reflectance, 0.4 * np.median(camera, axis=0) * np.median(light), rtol=1e-3)
+    np.testing.assert_allclose(
+        found.camera[:5], camera / np.median(camera, axis=0), rtol=1e-3
+    )
+    np.testing.assert_allclose(
+        found.light[:9], light[:, 0] / np.median(light), rtol=1e-3
+    )
+    np.testing.assert_allclose(
+        found.reflectance, 0.4 * np.median(camera, axis=0) * np.median(light), rtol=1e-3
+    )
     assert np.isnan(found.camera[5]).all()
     assert np.isnan(found.light[9])
 
@@ -355,7 +467,9 @@ def test_calibration__of_a_patch_is_not_evaluated(shoot):
 
 def test_reduced__means_of_blocks_and_saturated_is_bright():
     image = np.arange(24, dtype=np.float32).reshape(4, 6, 1)
-    np.testing.assert_allclose(reduced(image, 2)[..., 0], [[3.5, 5.5, 7.5], [15.5, 17.5, 19.5]])
+    np.testing.assert_allclose(
+        reduced(image, 2)[..., 0], [[3.5, 5.5, 7.5], [15.5, 17.5, 19.5]]
+    )
     image[0, 0] = np.nan
     assert reduced(image, 2)[0, 0, 0] == (23 + 1 + 6 + 7) / 4
 
@@ -371,10 +485,15 @@ def test_interpolated__every_picture_as_by_scipy(shape):
     rng = np.random.default_rng(3)
     images = rng.random((3, *shape))
     pixels = rng.uniform(-1, 10, (400, 2))
-    expected = [map_coordinates(one, pixels.T[::-1] - 0.5, order=1, mode="nearest") for one in images]
+    expected = [
+        map_coordinates(one, pixels.T[::-1] - 0.5, order=1, mode="nearest")
+        for one in images
+    ]
     inside = ((pixels >= 0) & (pixels <= shape[::-1])).all(axis=1)
     assert 0 < inside.sum() < 400
-    np.testing.assert_allclose(interpolated(images, pixels), np.where(inside, expected, 0), atol=1e-14)
+    np.testing.assert_allclose(
+        interpolated(images, pixels), np.where(inside, expected, 0), atol=1e-14
+    )
 
 
 @pytest.mark.parametrize("level", [0.0, 0.4, 0.5, 1.0])
@@ -383,4 +502,6 @@ def test_nan_quantile__the_same_bits_as_numpy(level):
     values = rng.random((6, 500))
     values[rng.random(values.shape) < 0.5] = np.nan
     values = values[:, np.isfinite(values).any(axis=0)]
-    np.testing.assert_array_equal(nan_quantile(values, level), np.nanquantile(values, level, axis=0))
+    np.testing.assert_array_equal(
+        nan_quantile(values, level), np.nanquantile(values, level, axis=0)
+    )

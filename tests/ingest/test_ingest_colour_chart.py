@@ -12,10 +12,12 @@ MIX = np.array([[0.7, 0.2, 0.1], [0.15, 0.75, 0.1], [0.05, 0.2, 0.75]])
 def test_chart_reference__has_six_neutral_patches_and_published_colours():
     reference = chart_reference()
     neutral = reference[18:]
-    np.testing.assert_allclose(neutral / neutral[:, 1:2], 1, atol=0.06)  # the chart's own greys are not quite neutral
+    # the chart's own greys are not quite neutral
+    np.testing.assert_allclose(neutral / neutral[:, 1:2], 1, atol=0.06)
     assert (np.diff(neutral[:, 1]) < 0).all()
     encoded = 255 * (1.055 * np.clip(reference[14], 0, 1) ** (1 / 2.4) - 0.055)
-    np.testing.assert_allclose(encoded, [175, 54, 60], atol=6)  # "red" as published by its maker in sRGB
+    # "red" as published by its maker in sRGB
+    np.testing.assert_allclose(encoded, [175, 54, 60], atol=6)
 
 
 def test_fit_colour_matrix__inverts_a_camera():
@@ -24,7 +26,8 @@ def test_fit_colour_matrix__inverts_a_camera():
     fit = fit_colour_matrix(camera * (1 + 0.002 * rng.standard_normal(camera.shape)))
     expected = np.linalg.inv(MIX)
     expected = expected * (camera[18, 1] / (expected @ camera[18])[1])
-    np.testing.assert_allclose(fit.matrix, expected, atol=0.03)  # noise of 0.2 % times the condition of the colours
+    # noise of 0.2 % times the condition of the colours
+    np.testing.assert_allclose(fit.matrix, expected, atol=0.03)
     assert fit.delta_e_after.max() < 1.0
     assert np.median(fit.delta_e_before) > 5.0
     assert abs((fit.matrix @ camera[18])[1] / camera[18, 1] - 1) < 0.005

@@ -1,4 +1,6 @@
-"""Scans and domes of different units are refused with one line; patches, people and odd cameras are not."""
+"""Scans and domes of different units are refused with one line; patches, people and odd
+cameras are not.
+"""
 
 from __future__ import annotations
 
@@ -69,7 +71,10 @@ def test_read_capture__dome_of_another_unit_is_one_fault(capture_folder, factor)
     scale_dome(capture_folder, factor)
     fault = only_fault(capture_folder)
     assert "dome.json: all lengths must be in mm; found diagonal of the scan 2" in fault
-    assert f"these look like {OTHERS[factor].format('t of the cameras and position of the lights')}" in fault
+    assert (
+        f"these look like {OTHERS[factor].format('t of the cameras and position of the lights')}"
+        in fault
+    )
 
 
 def test_read_capture__scan_in_centimetres_without_names_is_a_fault(capture_folder):
@@ -77,17 +82,25 @@ def test_read_capture__scan_in_centimetres_without_names_is_a_fault(capture_fold
     put_scan(capture_folder, vertices / 10, faces)
     without(capture_folder, "landmarks", "regions", "contact")
     fault = only_fault(capture_folder)
-    assert "scan.ply (mesh): all lengths must be in mm; found diagonal of the scan 24" in fault
-    assert fault.endswith("these look like centimetres: multiply the vertices of the scan by 10")
+    assert (
+        "scan.ply (mesh): all lengths must be in mm; found diagonal of the scan 24"
+        in fault
+    )
+    assert fault.endswith(
+        "these look like centimetres: multiply the vertices of the scan by 10"
+    )
 
 
-def test_read_capture__scan_and_dome_in_centimetres_are_told_by_the_regions(capture_folder):
+def test_read_capture__scan_and_dome_in_centimetres_are_told_by_the_regions(
+    capture_folder,
+):
     """Both alike are a smaller dome: only the names on the face have a size."""
     vertices, faces = half_sphere()
     put_scan(capture_folder, vertices / 10, faces)
     scale_dome(capture_folder, 0.1)
     without(capture_folder, "landmarks", "contact")
-    assert read_capture(capture_folder).dome is not None  # a dome of 50 mm around a fingertip, for all that is known
+    # a dome of 50 mm around a fingertip, for all that is known
+    assert read_capture(capture_folder).dome is not None
     chin = np.flatnonzero(vertices[:, 1] < -50).tolist()
     edit(capture_folder, "regions.json", lambda record: record.update(chin=[chin]))
     fault = only_fault(capture_folder)
@@ -98,13 +111,21 @@ def test_read_capture__scan_and_dome_in_centimetres_are_told_by_the_regions(capt
 
 @pytest.mark.parametrize("factor", [0.1, 1 / 25.4, 1e-3, 1000])
 @pytest.mark.parametrize("part", ["cameras", "lights"])
-def test_read_capture__cameras_or_lights_of_another_unit_are_one_fault(capture_folder, factor, part):
+def test_read_capture__cameras_or_lights_of_another_unit_are_one_fault(
+    capture_folder, factor, part
+):
     kept = json.loads((capture_folder / "dome/dome.json").read_text())
     scale_dome(capture_folder, factor)
     other = "lights" if part == "cameras" else "cameras"
-    edit(capture_folder, "dome/dome.json", lambda record: record.update({other: kept[other]}))
+    edit(
+        capture_folder,
+        "dome/dome.json",
+        lambda record: record.update({other: kept[other]}),
+    )
     length = {"cameras": "t of the cameras", "lights": "position of the lights"}[part]
-    assert f"these look like {OTHERS[factor].format(length)}" in only_fault(capture_folder)
+    assert f"these look like {OTHERS[factor].format(length)}" in only_fault(
+        capture_folder
+    )
 
 
 def test_read_capture__parts_in_two_units_are_one_fault(capture_folder):
@@ -113,7 +134,10 @@ def test_read_capture__parts_in_two_units_are_one_fault(capture_folder):
     without(capture_folder, "landmarks", "regions", "contact")
     scale_dome(capture_folder, 1e-3)
     fault = only_fault(capture_folder)
-    assert "these look like inches: multiply the vertices of the scan by 25.4; these look like metres: " in fault
+    assert (
+        "these look like inches: multiply the vertices of the scan by 25.4; these "
+        "look like metres: "
+    ) in fault
 
 
 @pytest.fixture
@@ -131,23 +155,35 @@ def test_unit_fault__a_patch_of_skin_passes(dome, reach, centred):
     """Cut from the face where it lies, or a sample held into the middle of the dome."""
     surface = patch(reach)
     if centred:
-        surface = replace(surface, vertices=surface.vertices - surface.vertices.mean(axis=0))
+        surface = replace(
+            surface, vertices=surface.vertices - surface.vertices.mean(axis=0)
+        )
     assert judged(dome, surface) is None
-    assert judged(further(dome, 4), surface) is None  # less than a tenth of every picture
+    # less than a tenth of every picture
+    assert judged(further(dome, 4), surface) is None
 
 
 def further(dome, factor):
     cameras = tuple(replace(camera, t=factor * camera.t) for camera in dome.cameras)
-    return replace(dome, cameras=cameras, lights=tuple(replace(x, position=factor * x.position) for x in dome.lights))
+    return replace(
+        dome,
+        cameras=cameras,
+        lights=tuple(replace(x, position=factor * x.position) for x in dome.lights),
+    )
 
 
-def test_unit_fault__a_face_that_spans_a_ninth_of_the_pictures_passes_a_patch_far_less(dome):
+def test_unit_fault__a_face_that_spans_a_ninth_of_the_pictures_passes_a_patch_far_less(
+    dome,
+):
     vertices, faces = half_sphere()
     assert judged(further(dome, 8.5), clean_mesh(vertices, faces)) is None
     assert judged(further(dome, 11), clean_mesh(vertices, faces)) is not None
     assert judged(further(dome, 10), patch(20)) is None
     fault = judged(further(dome, 1000), patch(20))
-    assert (fault.where, fault.cure) == ("dome.json", "these look like micrometres: divide by 1000")
+    assert (fault.where, fault.cure) == (
+        "dome.json",
+        "these look like micrometres: divide by 1000",
+    )
 
 
 def test_unit_fault__a_person_in_a_large_dome_passes(dome):
@@ -156,7 +192,9 @@ def test_unit_fault__a_person_in_a_large_dome_passes(dome):
 
 
 def test_unit_fault__a_nose_whose_landmarks_tell_its_size_passes(dome):
-    """Round, in the middle of its frame and small in the pictures as it is: a head in centimetres else."""
+    """Round, in the middle of its frame and small in the pictures as it is: a head in
+    centimetres else.
+    """
     vertices, faces = half_sphere()
     nose = clean_mesh(vertices / 10, faces)
     afar = further(dome, 2)
@@ -167,7 +205,9 @@ def test_unit_fault__a_nose_whose_landmarks_tell_its_size_passes(dome):
 
 
 def test_unit_fault__a_scan_round_a_camera_is_large_not_unseen(dome):
-    """A camera between the ears of an open scan: some of it lies behind, and no picture's side measures that."""
+    """A camera between the ears of an open scan: some of it lies behind, and no
+    picture's side measures that.
+    """
     vertices, faces = half_sphere()
     rotation = dome.cameras[0].R
     inside = replace(dome.cameras[0], t=-rotation @ np.array([0.0, 0, -1]))
@@ -180,12 +220,15 @@ def test_unit_fault__no_camera_shows_the_scan(dome, how):
     turn = np.diag([-1.0, 1, -1])
     aside = np.array([500.0 if how == "aside" else -500.0, 0, 0])
     cameras = tuple(
-        replace(c, R=turn @ c.R, t=turn @ c.t) if how == "turned away" else replace(c, t=c.t + aside)
+        replace(c, R=turn @ c.R, t=turn @ c.t)
+        if how == "turned away"
+        else replace(c, t=c.t + aside)
         for c in dome.cameras
     )
     fault = judged(replace(dome, cameras=cameras), clean_mesh(vertices, faces))
     assert str(fault).startswith(
-        "dome.json: the picture of a camera must show the scan; found none of 2 does; calibrate in mm"
+        "dome.json: the picture of a camera must show the scan; found none of 2 "
+        "does; calibrate in mm"
     )
     one = (cameras[0], dome.cameras[1])
     assert judged(replace(dome, cameras=one), clean_mesh(vertices, faces)) is None

@@ -12,23 +12,30 @@ from skindb.ingest.fibre_spots import Spots, fibre_gain, find_fibres, match_fibr
 
 def fibre_picture(rng, noise=0.005):
     """28 discs, drawn at 8 times the resolution, of differing brightness on stray light."""
-    centre = np.array([[30 + 22.3 * (i % 7), 28 + 25.7 * (i // 7)] for i in range(28)]) + rng.uniform(-2, 2, (28, 2))
+    centre = np.array(
+        [[30 + 22.3 * (i % 7), 28 + 25.7 * (i // 7)] for i in range(28)]
+    ) + rng.uniform(-2, 2, (28, 2))
     radius = rng.uniform(6.0, 7.0, 28)
     fine = 8
     row, column = (np.mgrid[: 140 * fine, : 200 * fine] + 0.5) / fine
     picture = np.zeros(row.shape)
     for (x, y), r in zip(centre, radius, strict=True):
         picture[(column - x) ** 2 + (row - y) ** 2 < r * r] = rng.uniform(0.6, 1.0)
-    small = ndimage.gaussian_filter(picture.reshape(140, fine, 200, fine).mean(axis=(1, 3)), 0.5)
+    small = ndimage.gaussian_filter(
+        picture.reshape(140, fine, 200, fine).mean(axis=(1, 3)), 0.5
+    )
     order = np.lexsort(centre.T[::-1])
-    return 0.3 + small + noise * rng.standard_normal(small.shape), Spots(centre[order], radius[order])
+    return 0.3 + small + noise * rng.standard_normal(small.shape), Spots(
+        centre[order], radius[order]
+    )
 
 
 def test_find_fibres__finds_centres_and_radii():
     picture, truth = fibre_picture(np.random.default_rng(1))
     found = find_fibres(picture, count=28)
     compared = match_fibres(found, truth)
-    # noise of 0.5 % over 130 px: 0.01 px of the centre and 0.05 % of the area; the middle's percentile adds 0.5 %
+    # noise of 0.5 % over 130 px: 0.01 px of the centre and 0.05 % of the area; the
+    # middle's percentile adds 0.5 %
     assert np.abs(compared.offset).max() < 0.05
     assert np.abs(compared.radius_ratio - 1).max() < 0.01
 
@@ -66,9 +73,12 @@ def test_fibre_gain__knows_its_error():
     z = []
     for _ in range(40):
         level = rng.uniform(0.5, 2.0, (12, 1, 1))
-        found = fibre_gain(level * truth * (1 + 0.004 * rng.standard_normal((12, 28, 3))))
+        found = fibre_gain(
+            level * truth * (1 + 0.004 * rng.standard_normal((12, 28, 3)))
+        )
         z.append((found.gain - truth) / found.error)
-    # Student's t of 11 degrees of freedom has a deviation of 1.106; the means of 28 fibres take 2 % off
+    # Student's t of 11 degrees of freedom has a deviation of 1.106; the means of 28
+    # fibres take 2 % off
     assert abs(np.std(z) - 1.09) < 0.05
     for bad in (np.zeros((5, 28, 3)), np.full((5, 28, 3), np.nan), np.ones((1, 28, 3))):
         with pytest.raises(InputError, match="flat field of the fibres"):

@@ -65,7 +65,9 @@ def test_header_faults__sees_a_cut_without_decoding(tmp_path, name):
 
 @pytest.mark.parametrize("tail", [b"\n", bytes(4096), b"IEND\xaeB`"])
 def test_header_faults__bytes_after_the_end_of_a_png_are_no_fault(tmp_path, tail):
-    """As decoders do: some writers fill the last block of a file. The end itself must still be there."""
+    """As decoders do: some writers fill the last block of a file. The end itself must
+    still be there.
+    """
     frame, bits = FRAMES["a16.png"]
     write_frame(tmp_path / "a.png", frame)
     content = (tmp_path / "a.png").read_bytes()
@@ -78,7 +80,8 @@ def test_header_faults__bytes_after_the_end_of_a_png_are_no_fault(tmp_path, tail
 
 
 def test_header_faults__reads_little_of_a_large_file(tmp_path):
-    frame = np.random.default_rng(2).random((900, 700, 3)).astype(np.float32)  # random bits: it does not compress
+    # random bits: it does not compress
+    frame = np.random.default_rng(2).random((900, 700, 3)).astype(np.float32)
     write_frame(tmp_path / "a.exr", frame)
     assert (tmp_path / "a.exr").stat().st_size > 4e6
     header_faults(tmp_path / "a.exr", FrameKind(700, 900, 0), "frames")  # imports
@@ -91,7 +94,9 @@ def test_header_faults__reads_little_of_a_large_file(tmp_path):
 
 
 @pytest.mark.parametrize("height", [2**31 - 2, -5])
-def test_header_faults__a_damaged_height_asks_for_no_table_larger_than_the_file(tmp_path, height):
+def test_header_faults__a_damaged_height_asks_for_no_table_larger_than_the_file(
+    tmp_path, height
+):
     write_frame(tmp_path / "a.exr", FRAMES["half.exr"][0])
     with pytest.raises(UnreadableError, match="cut off"):
         _require_chunks(io.BytesIO((tmp_path / "a.exr").read_bytes()), height)
@@ -99,9 +104,16 @@ def test_header_faults__a_damaged_height_asks_for_no_table_larger_than_the_file(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("compression", ["zstd", "zlib", None])
-def test_read_frame__no_change_of_a_tiff_header_is_an_internal_error(tmp_path, compression):
+def test_read_frame__no_change_of_a_tiff_header_is_an_internal_error(
+    tmp_path, compression
+):
     """Nor does the message contain one of the library, whose text depends on the damage."""
-    tifffile.imwrite(tmp_path / "a.tif", FRAMES["a16.png"][0], photometric="rgb", compression=compression)
+    tifffile.imwrite(
+        tmp_path / "a.tif",
+        FRAMES["a16.png"][0],
+        photometric="rgb",
+        compression=compression,
+    )
     content = (tmp_path / "a.tif").read_bytes()
     said = set()
     for place in range(len(content)):
@@ -114,12 +126,21 @@ def test_read_frame__no_change_of_a_tiff_header_is_an_internal_error(tmp_path, c
                 read_frame(tmp_path / "a.tif")
             except InputError as error:
                 faults += error.faults
-            said |= {fault.found for fault in faults if fault.rule == "a frame must be a whole image file"}
+            said |= {
+                fault.found
+                for fault in faults
+                if fault.rule == "a frame must be a whole image file"
+            }
     assert said == {"one that is cut off or damaged"}
 
 
-def test_read_frame__damaged_pixels_of_an_openexr_file_print_nothing_in_python(tmp_path, capsys):
-    write_frame(tmp_path / "a.exr", np.linspace(0, 1, 64 * 48 * 3).reshape(64, 48, 3).astype(np.float32))
+def test_read_frame__damaged_pixels_of_an_openexr_file_print_nothing_in_python(
+    tmp_path, capsys
+):
+    write_frame(
+        tmp_path / "a.exr",
+        np.linspace(0, 1, 64 * 48 * 3).reshape(64, 48, 3).astype(np.float32),
+    )
     content = bytearray((tmp_path / "a.exr").read_bytes())
     content[-2000:-1000] = bytes(1000)
     (tmp_path / "a.exr").write_bytes(content)
@@ -135,7 +156,11 @@ def test_read_frame__refuses_another_depth(tmp_path):
 
 
 def test_read_frame__refuses_an_absent_file_and_an_unknown_suffix(tmp_path):
-    for name, message in (("a.png", "must exist"), ("a.exr", "must exist"), ("a.bmp", "not '.bmp'")):
+    for name, message in (
+        ("a.png", "must exist"),
+        ("a.exr", "must exist"),
+        ("a.bmp", "not '.bmp'"),
+    ):
         with pytest.raises(InputError, match=message):
             read_frame(tmp_path / name)
 
@@ -146,8 +171,12 @@ def test_write_frame__refuses_floats_in_a_png(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["a16.png", "a12.tif", "half.exr"])
-def test_header_faults__damaged_bytes_are_a_fault_and_never_a_crash(tmp_path, name, capfd):
-    """Bytes of the header changed at random: whole by luck, or said to be damaged; what passes decodes or says so."""
+def test_header_faults__damaged_bytes_are_a_fault_and_never_a_crash(
+    tmp_path, name, capfd
+):
+    """Bytes of the header changed at random: whole by luck, or said to be damaged; what
+    passes decodes or says so.
+    """
     rng = np.random.default_rng(4)
     frame, bits = FRAMES[name]
     kind = FrameKind(7, len(frame), bits)

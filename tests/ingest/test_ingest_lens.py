@@ -13,7 +13,9 @@ def edge_picture(blur, rng, *, shape=(80, 64), noise=0.002, slant=0.09):
     fine = 8
     row, column = (np.mgrid[: shape[0] * fine, : shape[1] * fine] + 0.5) / fine
     sharp = np.where(column - shape[1] / 2 - slant * (row - shape[0] / 2) > 0, 1.0, 0.0)
-    soft = ndimage.gaussian_filter(sharp, blur * fine, mode="nearest") if blur else sharp
+    soft = (
+        ndimage.gaussian_filter(sharp, blur * fine, mode="nearest") if blur else sharp
+    )
     picture = soft.reshape(shape[0], fine, shape[1], fine).mean(axis=(1, 3))
     return picture + noise * rng.standard_normal(shape)
 
@@ -32,8 +34,14 @@ def test_veiling_glare__is_that_of_an_even_veil():
     rng = np.random.default_rng(6)
     scene = 0.05 + 0.95 * edge_picture(0.6, rng, noise=0.0)
     glare = 0.02
-    image = (1 - glare) * scene + glare * scene.mean() + 0.001 * rng.standard_normal(scene.shape)
-    assert veiling_glare(fit_edge(image), mean=float(image.mean()), contrast=0.05) == pytest.approx(glare, abs=0.001)
+    image = (
+        (1 - glare) * scene
+        + glare * scene.mean()
+        + 0.001 * rng.standard_normal(scene.shape)
+    )
+    assert veiling_glare(
+        fit_edge(image), mean=float(image.mean()), contrast=0.05
+    ) == pytest.approx(glare, abs=0.001)
     with pytest.raises(InputError, match="the mean must be positive"):
         veiling_glare(fit_edge(image), mean=0.0)
 
@@ -44,7 +52,10 @@ def test_veiling_glare__is_that_of_an_even_veil():
         (np.zeros((40, 40)), "a uniform picture"),
         (np.full((40, 40), np.nan), "must be finite"),
         (np.zeros((8, 8)), "16 px"),
-        (np.where(np.arange(40) < 20, 0.0, 1.0) + np.zeros((40, 40)), "slanted by 0.0 degrees"),
+        (
+            np.where(np.arange(40) < 20, 0.0, 1.0) + np.zeros((40, 40)),
+            "slanted by 0.0 degrees",
+        ),
         (np.random.default_rng(7).standard_normal((40, 40)), "slanted edge"),
     ],
 )

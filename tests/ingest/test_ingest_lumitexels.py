@@ -23,7 +23,12 @@ from skindb.ingest.lumitexels import (
     sample_lumitexels,
 )
 from skindb.ingest.radiance import frame_merger
-from skindb.ingest.report import cleaning_lines, describe_samples, sample_lines, sample_table
+from skindb.ingest.report import (
+    cleaning_lines,
+    describe_samples,
+    sample_lines,
+    sample_table,
+)
 from skindb.ingest.run import MAX_THREADS
 from skindb.ingest.spool import Spool
 from skindb.ingest.surfels import SurfelSet, build_surfels
@@ -47,21 +52,27 @@ def test_fully_lit__leaves_out_the_neighbours_of_a_shadow(surfels, capture):
     dark = set(np.flatnonzero(~fully_lit(surfels, share, capture.dome.cameras)[:, 0]))
     ring = set(surfels.faces[(surfels.faces == 100).any(axis=1)].ravel())
     assert dark == ring
-    coarse = [replace(camera, K=camera.K * [[0.5], [0.5], [1]]) for camera in capture.dome.cameras]
+    coarse = [
+        replace(camera, K=camera.K * [[0.5], [0.5], [1]])
+        for camera in capture.dome.cameras
+    ]
     assert len(np.flatnonzero(~fully_lit(surfels, share, coarse)[:, 0])) > 2 * len(ring)
 
 
 def test_fully_lit__keeps_a_pixel_of_the_widest_camera_away_from_a_shadow(capture):
     """A plane lit where x > 0, surfels 0.25 mm apart, pixels of 2 mm in one camera of three.
 
-    A pixel is the mean over itself, a sample lies between two of them: at the nearest kept surfel it may be an eighth
-    of half a pixel too dark at the worst place of the grid of pixels, which is 6 %, and 2 % on average (by hand).
+    A pixel is the mean over itself, a sample lies between two of them: at the nearest
+    kept surfel it may be an eighth of half a pixel too dark at the worst place of the
+    grid of pixels, which is 6 %, and 2 % on average (by hand).
     """
     count = 81
     step = 0.25
     x, y = (axis.ravel() * step for axis in np.mgrid[:count, :count] - count // 2)
     at = np.arange(count * count).reshape(count, count)
-    (a, b), (c, d) = ((row[:, :-1].ravel(), row[:, 1:].ravel()) for row in (at[:-1], at[1:]))
+    (a, b), (c, d) = (
+        (row[:, :-1].ravel(), row[:, 1:].ravel()) for row in (at[:-1], at[1:])
+    )
     place = np.stack([x, y, 0 * x], axis=1)
     faces = np.concatenate([np.stack([a, b, d], 1), np.stack([a, d, c], 1)])
     up = np.tile([0.0, 0, 1], (len(place), 1))
@@ -72,7 +83,13 @@ def test_fully_lit__keeps_a_pixel_of_the_widest_camera_away_from_a_shadow(captur
     plane = SurfelSet(place, up, area, one, uv, faces, (), none, "intrinsic")
     one = capture.dome.cameras[0]
     fine, coarse = (
-        replace(one, K=np.diag([f, f, 1.0]), R=np.diag([1.0, -1, -1]), t=np.array([0, 0, 1000.0])) for f in (4e3, 500.0)
+        replace(
+            one,
+            K=np.diag([f, f, 1.0]),
+            R=np.diag([1.0, -1, -1]),
+            t=np.array([0, 0, 1000.0]),
+        )
+        for f in (4e3, 500.0)
     )
     share = (place[:, :1] > 0).astype(np.float16)
     assert place[fully_lit(plane, share, [fine, fine])[:, 0], 0].min() <= 3 * step
@@ -86,12 +103,14 @@ def test_fully_lit__keeps_a_pixel_of_the_widest_camera_away_from_a_shadow(captur
 
 
 def test_in_turn__as_many_views_are_begun_as_there_may_be_threads():
-    """Every thread waits for all others: the barrier breaks if fewer calls are asked for than there are threads."""
+    """Every thread waits for all others: the barrier breaks if fewer calls are asked
+    for than there are threads.
+    """
     together = Barrier(MAX_THREADS, timeout=120)
     with ThreadPoolExecutor(MAX_THREADS) as pool:
-        assert sorted(_in_turn(pool, lambda _: together.wait(), range(2 * MAX_THREADS))) == sorted(
-            [*range(MAX_THREADS)] * 2
-        )
+        assert sorted(
+            _in_turn(pool, lambda _: together.wait(), range(2 * MAX_THREADS))
+        ) == sorted([*range(MAX_THREADS)] * 2)
 
 
 def test_choose_photographs__frontal_camera_and_lights_apart(capture):
@@ -105,17 +124,26 @@ def test_choose_photographs__frontal_camera_and_lights_apart(capture):
 
 
 def test_noise_floor__by_hand(surfels, capture):
-    """Sigma of one value 10.0 (5 e / 0.5), a step of 1, 65,279 values, 1.005 s in all, times d^2 / I."""
+    """Sigma of one value 10.0 (5 e / 0.5), a step of 1, 65,279 values, 1.005 s in all,
+    times d^2 / I.
+    """
     sigma = np.hypot(10.0, 1 / np.sqrt(12)) / (WHITE - BLACK) / np.hypot(1.0, 0.1)
     middle = surfels.position.mean(axis=0)
     square = [((light.position - middle) ** 2).sum() for light in capture.dome.lights]
     expected = sigma * np.median(np.divide.outer(square, INTENSITY))
-    assert noise_floor(capture.dome, np.tile(INTENSITY, (4, 1)), surfels) == pytest.approx(expected, rel=1e-4)
+    assert noise_floor(
+        capture.dome, np.tile(INTENSITY, (4, 1)), surfels
+    ) == pytest.approx(expected, rel=1e-4)
 
 
 def test_noise_floor__of_linear_files(surfels, capture):
-    sensor = replace(capture.dome.cameras[0].sensor, kind=replace(capture.dome.cameras[0].sensor.kind, bits=0))
-    dome = replace(capture.dome, cameras=(replace(capture.dome.cameras[0], sensor=sensor),))
+    sensor = replace(
+        capture.dome.cameras[0].sensor,
+        kind=replace(capture.dome.cameras[0].sensor.kind, bits=0),
+    )
+    dome = replace(
+        capture.dome, cameras=(replace(capture.dome.cameras[0], sensor=sensor),)
+    )
     assert noise_floor(dome, np.tile(INTENSITY, (4, 1)), surfels) == LINEAR_NOISE_FLOOR
 
 
@@ -125,29 +153,49 @@ def sampled(dome, surfels, folder, *, share=None, lit=None, footprint=False):
     shape = (len(dome.lights), len(dome.cameras))
     n = len(surfels.position)
     lit = np.ones((n, shape[0]), bool) if lit is None else lit
-    with ThreadPoolExecutor(2) as pool, Spool(folder, (*shape, n), {}, key="run") as spool:
-        _, clear, pixels = camera_visibility(surfels, dome.cameras, RayScene(surfels.position, surfels.faces), pool)
-        views = Views(surfels, lit, clear, pixels, light_fraction=share, footprint=footprint)
-        found = sample_lumitexels(dome, np.tile(INTENSITY, (shape[0], 1)), views, mergers, spool, pool=pool)
+    with (
+        ThreadPoolExecutor(2) as pool,
+        Spool(folder, (*shape, n), {}, key="run") as spool,
+    ):
+        _, clear, pixels = camera_visibility(
+            surfels, dome.cameras, RayScene(surfels.position, surfels.faces), pool
+        )
+        views = Views(
+            surfels, lit, clear, pixels, light_fraction=share, footprint=footprint
+        )
+        found = sample_lumitexels(
+            dome, np.tile(INTENSITY, (shape[0], 1)), views, mergers, spool, pool=pool
+        )
         return clear, replace(found, sample=found.sample.compute())
 
 
-def test_sample_lumitexels__kept_soft_edges_are_divided_by_the_share(capture, surfels, tmp_path):
+def test_sample_lumitexels__kept_soft_edges_are_divided_by_the_share(
+    capture, surfels, tmp_path
+):
     share = np.full((len(surfels.position), 4), 0.5, np.float16)
     _, plain = sampled(capture.dome, surfels, tmp_path / "a")
     _, soft = sampled(capture.dome, surfels, tmp_path / "b", share=share)
     assert plain.sample_count.sum() > 1000
-    np.testing.assert_allclose(soft.sample, 2 * plain.sample.astype(np.float64), rtol=2**-10)  # two roundings
+    # two roundings
+    np.testing.assert_allclose(
+        soft.sample, 2 * plain.sample.astype(np.float64), rtol=2**-10
+    )
 
 
-def test_sample_lumitexels__footprints_of_a_smooth_sphere_are_less_noisy(capture, tmp_path):
-    """Splats of 1.5 pixels: the mean over them is the point's value, with a fraction of its noise."""
+def test_sample_lumitexels__footprints_of_a_smooth_sphere_are_less_noisy(
+    capture, tmp_path
+):
+    """Splats of 1.5 pixels: the mean over them is the point's value, with a fraction of
+    its noise.
+    """
     coarse = build_surfels(capture, spacing_mm=8.0)
     coarse = replace(coarse, radius=np.full(len(coarse.position), 4.5))
     _, point = sampled(capture.dome, coarse, tmp_path / "a")
     _, mean = sampled(capture.dome, coarse, tmp_path / "b", footprint=True)
     both = np.isfinite(mean.sample).all(-1) & np.isfinite(point.sample).all(-1)
-    place = coarse.position / np.linalg.norm(coarse.position, axis=1, keepdims=True) * 80.0
+    place = (
+        coarse.position / np.linalg.norm(coarse.position, axis=1, keepdims=True) * 80.0
+    )
     way = np.array([light.position for light in capture.dome.lights]) - place[:, None]
     cosine = np.einsum("nji,ni->nj", way, place) / 80 / np.linalg.norm(way, axis=-1)
     truth = cosine[:, :, None, None] * ALBEDO / np.pi
@@ -159,23 +207,45 @@ def test_sample_lumitexels__footprints_of_a_smooth_sphere_are_less_noisy(capture
 
 
 def test_describe_samples__one_camera_one_light_and_none(capture, surfels, tmp_path):
-    dome = replace(capture.dome, lights=capture.dome.lights[:1], cameras=capture.dome.cameras[:1])
+    dome = replace(
+        capture.dome, lights=capture.dome.lights[:1], cameras=capture.dome.cameras[:1]
+    )
     _, found = sampled(dome, surfels, tmp_path / "a")
     said = describe_samples(found, surfels, dome)
-    assert (said["of"], said["parts"]["all"]["max"], said["lights_without"]) == (1, 1, [])
+    assert (said["of"], said["parts"]["all"]["max"], said["lights_without"]) == (
+        1,
+        1,
+        [],
+    )
     assert said["cameras"] == {"c0": found.sample_count.sum()}
-    assert said["parts"]["all"]["seen"] == pytest.approx((found.sample_count > 0).mean(), abs=1e-4)
-    _, found = sampled(dome, surfels, tmp_path / "b", lit=np.zeros((len(surfels.position), 1), bool))
+    assert said["parts"]["all"]["seen"] == pytest.approx(
+        (found.sample_count > 0).mean(), abs=1e-4
+    )
+    _, found = sampled(
+        dome, surfels, tmp_path / "b", lit=np.zeros((len(surfels.position), 1), bool)
+    )
     said = describe_samples(found, surfels, dome)
     assert sample_lines(said)[1:] == ["camera c0: no sample", "light l0: no sample"]
     assert said["parts"]["nose"]["mean"] == 0
-    assert [row[0] for row in sample_table(said)] == ["samples of", "all", "forehead", "cheek", "nose"]
+    assert [row[0] for row in sample_table(said)] == [
+        "samples of",
+        "all",
+        "forehead",
+        "cheek",
+        "nose",
+    ]
 
 
-def test_sample_lumitexels__counts_samples_of_a_single_exposure(capture_folder, tmp_path):
-    """The noise of a value is 10: the short exposure of 15 above black is dark, of 2000 it is not."""
+def test_sample_lumitexels__counts_samples_of_a_single_exposure(
+    capture_folder, tmp_path
+):
+    """The noise of a value is 10: the short exposure of 15 above black is dark, of 2000
+    it is not.
+    """
     capture = read_capture(capture_folder)
-    dome = replace(capture.dome, lights=capture.dome.lights[:1], cameras=capture.dome.cameras[:1])
+    dome = replace(
+        capture.dome, lights=capture.dome.lights[:1], cameras=capture.dome.cameras[:1]
+    )
     surfels = build_surfels(capture, spacing_mm=8.0)
     for short, expected in ((15, 1.0), (2000, 0.0)):
         for exposure, value in (("long", 10 * short), ("short", short)):
@@ -185,17 +255,24 @@ def test_sample_lumitexels__counts_samples_of_a_single_exposure(capture_folder, 
         assert found.sample_count.sum() > 100
         np.testing.assert_array_equal(found.single_count, expected * found.sample_count)
         said = sample_lines(describe_samples(found, surfels, dome))[0]
-        assert said.endswith("; 100.0% of the samples come from a single exposure") == (expected == 1)
+        assert said.endswith("; 100.0% of the samples come from a single exposure") == (
+            expected == 1
+        )
         assert ("single" in said) == (expected == 1)
 
 
 def test_sample_lumitexels__counts_what_is_lost(capture_folder, tmp_path):
-    """All exposures of one view at the white level except for a corner, and those of another at black."""
+    """All exposures of one view at the white level except for a corner, and those of
+    another at black.
+    """
     white = np.full((64, 72, 3), WHITE, np.uint16)
     white[0, 0] = BLACK
     for exposure in ("long", "short"):
         save(capture_folder / f"dome/frames/{exposure}/l1_c0.png", white)
-        save(capture_folder / f"dome/frames/{exposure}/l0_c1.png", np.full((64, 72, 3), BLACK, np.uint16))
+        save(
+            capture_folder / f"dome/frames/{exposure}/l0_c1.png",
+            np.full((64, 72, 3), BLACK, np.uint16),
+        )
     capture = read_capture(capture_folder)
     dome = capture.dome
     surfels = build_surfels(capture, spacing_mm=8.0)
@@ -207,7 +284,9 @@ def test_sample_lumitexels__counts_what_is_lost(capture_folder, tmp_path):
     assert both.any()
     assert (found.saturated_count[both] == 1).all()
     assert (found.dark_count[both] >= 1).all()
-    np.testing.assert_array_equal(found.sample_count, np.isfinite(store).all(-1).sum((1, 2)))
+    np.testing.assert_array_equal(
+        found.sample_count, np.isfinite(store).all(-1).sum((1, 2))
+    )
 
 
 def test_fully_lit__keeps_soft_edges_but_not_full_shadow(surfels, capture):
@@ -220,24 +299,48 @@ def test_fully_lit__keeps_soft_edges_but_not_full_shadow(surfels, capture):
 
 
 def test_footprints__of_a_disc_that_faces_the_camera_or_is_tilted(surfels, capture):
-    """By hand: f r / (2 z) is the standard deviation; tilted by 60 degrees it halves across the axis."""
+    """By hand: f r / (2 z) is the standard deviation; tilted by 60 degrees it halves
+    across the axis.
+    """
     tilt = np.array([[0, 0, 1], [np.sin(np.pi / 3), 0, 0.5]])
-    two = replace(surfels, position=np.zeros((2, 3)), normal=tilt, radius=np.array([4.0, 4.0]))
-    ahead = {"R": np.diag([1.0, -1, -1]), "t": np.array([0, 0, 400.0]), "distortion": np.zeros(5)}
+    two = replace(
+        surfels, position=np.zeros((2, 3)), normal=tilt, radius=np.array([4.0, 4.0])
+    )
+    ahead = {
+        "R": np.diag([1.0, -1, -1]),
+        "t": np.array([0, 0, 400.0]),
+        "distortion": np.zeros(5),
+    }
     camera = replace(capture.dome.cameras[0], **ahead)
-    np.testing.assert_array_equal(np.isnan(footprints(replace(two, radius=two.radius / 2), camera)[:, 0]), True)
+    np.testing.assert_array_equal(
+        np.isnan(footprints(replace(two, radius=two.radius / 2), camera)[:, 0]), True
+    )
     a, b = footprints(two, camera)
     square = (camera.K[0, 0] * 4 / 2 / 400) ** 2
-    np.testing.assert_allclose(a, [square + PIXEL_VARIANCE_PX2, 0, square + PIXEL_VARIANCE_PX2], rtol=1e-5)
     np.testing.assert_allclose(
-        b, [square / 4 + PIXEL_VARIANCE_PX2, 0, square + PIXEL_VARIANCE_PX2], rtol=1e-4, atol=1e-6
+        a, [square + PIXEL_VARIANCE_PX2, 0, square + PIXEL_VARIANCE_PX2], rtol=1e-5
+    )
+    np.testing.assert_allclose(
+        b,
+        [square / 4 + PIXEL_VARIANCE_PX2, 0, square + PIXEL_VARIANCE_PX2],
+        rtol=1e-4,
+        atol=1e-6,
     )
 
 
 def test_cleaning_lines__with_places_say_where():
-    kept = {"cleaning": {"slivers": 3, "bow_ties": 0}, "cleaning_places": {"slivers": [[1, -2, 3.25], [4, 5, 6]]}}
+    kept = {
+        "cleaning": {"slivers": 3, "bow_ties": 0},
+        "cleaning_places": {"slivers": [[1, -2, 3.25], [4, 5, 6]]},
+    }
     assert cleaning_lines(kept, places=False) == ["slivers: 3", "bow_ties: 0"]
-    told = ["slivers: 3", "  at 1.00 -2.00 3.25", "  at 4.00 5.00 6.00", "  and 1 more", "bow_ties: 0"]
+    told = [
+        "slivers: 3",
+        "  at 1.00 -2.00 3.25",
+        "  at 4.00 5.00 6.00",
+        "  and 1 more",
+        "bow_ties: 0",
+    ]
     assert cleaning_lines(kept, places=True) == told
     kept.pop("cleaning_places")  # ingested before they were kept
     assert cleaning_lines(kept, places=True) == ["slivers: 3", "bow_ties: 0"]

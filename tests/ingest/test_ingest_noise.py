@@ -23,7 +23,9 @@ def _samples(tmp_path, name, folder):
 
 
 @pytest.mark.slow
-def test_ingest__differences_of_repeated_photographs_are_as_large_as_the_stated_noise(tmp_path):
+def test_ingest__differences_of_repeated_photographs_are_as_large_as_the_stated_noise(
+    tmp_path,
+):
     first = tmp_path / "first"
     write_capture(first)
     second = Path(shutil.copytree(first, tmp_path / "second"))
@@ -35,11 +37,18 @@ def test_ingest__differences_of_repeated_photographs_are_as_large_as_the_stated_
                 save(second / f"dome/frames/{exposure}/{light}_{camera}.png", frame)
     one = _samples(tmp_path, "db1", first)
     two = _samples(tmp_path, "db2", second)
-    a, b = (samples["reflectance_sample"].values.astype(np.float64) for samples in (one, two))
+    a, b = (
+        samples["reflectance_sample"].values.astype(np.float64)
+        for samples in (one, two)
+    )
     level = (a + b) / 2
-    stated = np.sqrt(4 / 9 * float(one["noise_floor"]) ** 2 + float(one["shot_noise"]) * np.maximum(level, 0))
+    stated = np.sqrt(
+        4 / 9 * float(one["noise_floor"]) ** 2
+        + float(one["shot_noise"]) * np.maximum(level, 0)
+    )
     z = ((a - b) / np.sqrt(2) / stated)[np.isfinite(level) & (level > 0.02)]
     assert z.size > 10_000
-    # intensities of lights and distances differ from the median ones by a third, half floats round to 0.05 %
+    # intensities of lights and distances differ from the median ones by a third, half
+    # floats round to 0.05 %
     assert 0.8 < 1.4826 * np.median(np.abs(z)) < 1.25
     assert float(two["shot_noise"]) > 0

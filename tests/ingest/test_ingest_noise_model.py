@@ -7,18 +7,29 @@ from skindb.errors import InputError
 from skindb.ingest.noise_model import fit_noise
 
 
-def flat_pairs(rng, gain=0.31, read=6.0, levels=(0.0, 0.01, 0.05, 0.2, 0.5, 0.8), step=1.0):
+def flat_pairs(
+    rng, gain=0.31, read=6.0, levels=(0.0, 0.01, 0.05, 0.2, 0.5, 0.8), step=1.0
+):
     pattern = 1 + 0.02 * rng.standard_normal((100, 100))
     pairs = []
     for level in levels:
-        electrons = rng.poisson(level * 20000 * pattern, (2, 100, 100)) + read * rng.standard_normal((2, 100, 100))
-        pairs.append(np.clip(np.rint((1024 + electrons / gain) / step) * step, 0, 65520))
+        electrons = rng.poisson(
+            level * 20000 * pattern, (2, 100, 100)
+        ) + read * rng.standard_normal((2, 100, 100))
+        pairs.append(
+            np.clip(np.rint((1024 + electrons / gain) / step) * step, 0, 65520)
+        )
     return np.array(pairs)
 
 
 def test_fit_noise__knows_gain_read_noise_and_their_errors():
-    fits = [fit_noise(flat_pairs(np.random.default_rng(s)), black=1024, white=65520) for s in range(40)]
-    gain = np.array([(f.electrons_per_dn - 0.31) / f.electrons_per_dn_error for f in fits])
+    fits = [
+        fit_noise(flat_pairs(np.random.default_rng(s)), black=1024, white=65520)
+        for s in range(40)
+    ]
+    gain = np.array(
+        [(f.electrons_per_dn - 0.31) / f.electrons_per_dn_error for f in fits]
+    )
     read = np.array([(f.read_noise - 6.0) / f.read_noise_error for f in fits])
     # 40 z-scores: their mean has a deviation of 0.16, their deviation one of 0.11
     assert abs(gain.mean()) < 0.6
@@ -29,7 +40,9 @@ def test_fit_noise__knows_gain_read_noise_and_their_errors():
 
 
 def test_fit_noise__takes_quantisation_off_and_leaves_saturated_pairs_out():
-    pairs = flat_pairs(np.random.default_rng(3), levels=(0.0, 0.02, 0.1, 0.4, 1.1), step=32.0)
+    pairs = flat_pairs(
+        np.random.default_rng(3), levels=(0.0, 0.02, 0.1, 0.4, 1.1), step=32.0
+    )
     fit = fit_noise(pairs, black=1024, white=65520, step=32.0)
     assert abs(fit.read_noise - 6) < 4 * fit.read_noise_error
     assert np.isnan(fit.mean).tolist() == [False] * 4 + [True]

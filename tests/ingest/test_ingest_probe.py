@@ -10,18 +10,24 @@ from skindb.ingest.probe import fibre_pixels, fibre_profiles
 
 
 def _spoil(probe, fibre, count, channel):
-    """Put the first `count` pixels of a fibre of the first site at the white level in every bracket."""
+    """Put the first `count` pixels of a fibre of the first site at the white level in
+    every bracket.
+    """
     for e in probe.exposures:
         path = probe.frame(probe.sites[0], e)
         frame = imagecodecs.png_decode(path.read_bytes()).copy()
-        rows, columns = np.divmod(fibre_pixels(probe, frame.shape[:2])[fibre], frame.shape[1])
+        rows, columns = np.divmod(
+            fibre_pixels(probe, frame.shape[:2])[fibre], frame.shape[1]
+        )
         frame[rows[:count], columns[:count], channel] = WHITE
         path.write_bytes(imagecodecs.png_encode(frame))
 
 
 @pytest.mark.parametrize("count", [1, 12])
 def test_fibre_profiles__a_partly_saturated_fibre_is_unknown(capture_folder, count):
-    """One of its 36 pixels is more than 1 %: the rest of the face would be read instead of all of it."""
+    """One of its 36 pixels is more than 1 %: the rest of the face would be read instead
+    of all of it.
+    """
     probe = read_capture(capture_folder).probe
     _spoil(probe, 0, count, 0)
     profiles = fibre_profiles(probe)
@@ -38,4 +44,6 @@ def test_fibre_profiles__a_stuck_pixel_of_a_large_fibre_does_not_count(capture_f
     _spoil(probe, 0, 1, 0)
     after = fibre_profiles(probe)
     # the pixel taken away was of the dark rim: the mean rises by its share
-    assert after.value[0, 0, 0] / before.value[0, 0, 0] - 1 == pytest.approx(1 / 104, rel=0.1)
+    assert after.value[0, 0, 0] / before.value[0, 0, 0] - 1 == pytest.approx(
+        1 / 104, rel=0.1
+    )

@@ -17,7 +17,11 @@ from skindb.cli import cli
 from skindb.errors import InputError
 from skindb.ingest.devices import read_probe
 from skindb.ingest.fields import Fields
-from skindb.ingest.probe_calibration import calibrate_probe, calibrated_probe, read_flat_frames
+from skindb.ingest.probe_calibration import (
+    calibrate_probe,
+    calibrated_probe,
+    read_flat_frames,
+)
 
 sys.path.append(str(Path(__file__).parent))
 from sphere import FIBRES, PROBE_GAIN, PROBE_R, PROBE_SECONDS, write_capture
@@ -30,7 +34,10 @@ BLACK = 256.0
 WHITE = 65535.0
 ELECTRONS = 30000.0
 # (fibre, 3), of which probe.json knows nothing
-GAINS = np.array([1.2, 0.9, 1.0, 0.9])[:, None] * [1.0, 1.02, 0.98] + np.array([0.0, 0.0, 0.05, -0.05])[:, None]
+GAINS = (
+    np.array([1.2, 0.9, 1.0, 0.9])[:, None] * [1.0, 1.02, 0.98]
+    + np.array([0.0, 0.0, 0.05, -0.05])[:, None]
+)
 
 
 @pytest.fixture(scope="module")
@@ -44,12 +51,18 @@ def laboratory(tmp_path_factory):
 
 def write_flats(folder, rng, gains=GAINS, moved=MOVED):
     probe = json.loads((folder / "contact/probe.json").read_text())
-    height, width = imagecodecs.png_decode(next((folder / "contact").rglob("*.png")).read_bytes()).shape[:2]
+    height, width = imagecodecs.png_decode(
+        next((folder / "contact").rglob("*.png")).read_bytes()
+    ).shape[:2]
     row, column = np.mgrid[:height, :width] + 0.5
     (folder / "contact/flat").mkdir(exist_ok=True)
     for repeat in range(1, REPEATS + 1):
         # the surface is 2 % uneven, differently after each move
-        level = 0.3 * (1 + 0.1 * rng.standard_normal()) * (1 + 0.02 * rng.standard_normal(len(probe["fibres"])))
+        level = (
+            0.3
+            * (1 + 0.1 * rng.standard_normal())
+            * (1 + 0.02 * rng.standard_normal(len(probe["fibres"])))
+        )
         light = np.zeros((height, width, 3))
         for fibre, own, gain in zip(probe["fibres"], level, gains, strict=True):
             x, y = np.asarray(fibre["centre"]) + moved
@@ -57,14 +70,23 @@ def write_flats(folder, rng, gains=GAINS, moved=MOVED):
             light += edge[..., None] * own * gain
         for name, seconds in PROBE_SECONDS.items():
             electrons = light * seconds * ELECTRONS
-            electrons = electrons + np.sqrt(electrons + 25.0) * rng.standard_normal(light.shape)
-            value = np.clip(np.rint(BLACK + electrons / ELECTRONS * (WHITE - BLACK)), 0, WHITE)
-            (folder / f"contact/flat/{repeat}_{name}.png").write_bytes(imagecodecs.png_encode(value.astype(np.uint16)))
+            electrons = electrons + np.sqrt(electrons + 25.0) * rng.standard_normal(
+                light.shape
+            )
+            value = np.clip(
+                np.rint(BLACK + electrons / ELECTRONS * (WHITE - BLACK)), 0, WHITE
+            )
+            (folder / f"contact/flat/{repeat}_{name}.png").write_bytes(
+                imagecodecs.png_encode(value.astype(np.uint16))
+            )
     describe(folder)
 
 
 def describe(folder, **changes):
-    record = {"frames": "contact/flat/{repeat}_{exposure}.png", "repeats": REPEATS} | changes
+    record = {
+        "frames": "contact/flat/{repeat}_{exposure}.png",
+        "repeats": REPEATS,
+    } | changes
     (folder / "contact/calibration.json").write_text(json.dumps(record))
 
 
@@ -72,47 +94,74 @@ def test_calibrate_probe__finds_centres_and_gains(laboratory):
     found = calibrate_probe(read_flat_frames(laboratory))
     probe = json.loads((laboratory / "contact/probe.json").read_text())
     centre = np.array([fibre["centre"] for fibre in probe["fibres"]]) + MOVED
-    assert np.abs(found["calibrated_fibre_centre"] - centre).max() < 0.1  # of spots of 64 pixels with noise of 1 %
+    # of spots of 64 pixels with noise of 1 %
+    assert np.abs(found["calibrated_fibre_centre"] - centre).max() < 0.1
     assert np.abs(found["fibre_spot_radius"] - SPOT).max() < 0.1
     expected = GAINS / GAINS.mean(axis=0) * np.mean(PROBE_GAIN)
-    z = (found["calibrated_fibre_gain"] - expected) / found["calibrated_fibre_gain_error"]
+    z = (found["calibrated_fibre_gain"] - expected) / found[
+        "calibrated_fibre_gain_error"
+    ]
     assert np.abs(z).max() < 5  # Student's t of 5 degrees of freedom
     # 2 % of unevenness over the root of 6 frames
-    np.testing.assert_allclose((found["calibrated_fibre_gain_error"] / expected).mean(), 0.02 / 6**0.5, rtol=0.5)
+    np.testing.assert_allclose(
+        (found["calibrated_fibre_gain_error"] / expected).mean(),
+        0.02 / 6**0.5,
+        rtol=0.5,
+    )
 
 
 def test_ingest__takes_the_gains_of_the_named_calibration(laboratory, tmp_path):
     db = skindb.open(str(tmp_path / "db"))
-    meta = json.loads((laboratory / "capture.json").read_text()) | {"version": 2, "calibration": "lab"}
+    meta = json.loads((laboratory / "capture.json").read_text()) | {
+        "version": 2,
+        "calibration": "lab",
+    }
     (laboratory / "capture.json").write_text(json.dumps(meta))
     write_flats(laboratory, np.random.default_rng(4), moved=np.zeros(2))
-    result = CliRunner().invoke(cli, ["calibrate", str(db.folder), str(laboratory), "--name", "lab"])
+    result = CliRunner().invoke(
+        cli, ["calibrate", str(db.folder), str(laboratory), "--name", "lab"]
+    )
     assert result.exit_code == 0, result.output
     assert f"gains of {FIBRES} fibres: known to" in result.output
     workflow.ingest_take(db, laboratory)
     stored = db.read("capture", "T001")["probe"]["fibre_profile"].values
     # the frames of the sites were made with the gains of probe.json
-    gain = db.read("calibration", "lab")["probe_calibration"]["calibrated_fibre_gain"].values
+    gain = db.read("calibration", "lab")["probe_calibration"][
+        "calibrated_fibre_gain"
+    ].values
     expected = PROBE_R * np.array(PROBE_GAIN)[:, None] / gain
-    np.testing.assert_allclose(stored, np.broadcast_to(expected, stored.shape), rtol=0.02)  # noise of the sites
-    np.testing.assert_allclose(gain, GAINS / GAINS.mean(axis=0) * np.mean(PROBE_GAIN), rtol=0.05)  # of the surface
+    # noise of the sites
+    np.testing.assert_allclose(
+        stored, np.broadcast_to(expected, stored.shape), rtol=0.02
+    )
+    # of the surface
+    np.testing.assert_allclose(
+        gain, GAINS / GAINS.mean(axis=0) * np.mean(PROBE_GAIN), rtol=0.05
+    )
 
 
 def test_calibrated_probe__keeps_fibres_apart(laboratory):
     found = calibrate_probe(read_flat_frames(laboratory))
     file = laboratory / "contact/probe.json"
     probe = read_probe(laboratory, Fields(json.loads(file.read_text()), str(file), []))
-    shuffled = calibrated_probe(probe, found.isel(fibre=[2, 0, 3, 1]), where="calibration lab")
+    shuffled = calibrated_probe(
+        probe, found.isel(fibre=[2, 0, 3, 1]), where="calibration lab"
+    )
     np.testing.assert_array_equal(shuffled.gain, found["calibrated_fibre_gain"].values)
     assert 0 < shuffled.gain_error < 0.05
-    with pytest.raises(InputError, match="must have every fibre of the capture; found none of f3"):
+    with pytest.raises(
+        InputError, match="must have every fibre of the capture; found none of f3"
+    ):
         calibrated_probe(probe, found.isel(fibre=[0, 1, 2]), where="calibration lab")
 
 
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"frames": "contact/flat/{exposure}.png"}, r"must name \{exposure\} and \{repeat\}"),
+        (
+            {"frames": "contact/flat/{exposure}.png"},
+            r"must name \{exposure\} and \{repeat\}",
+        ),
         ({"frames": "contact/none/{repeat}_{exposure}.png"}, "none/1_b0.png"),
         ({"frames": "../{repeat}_{exposure}.png"}, "must stay inside"),
         ({"repeats": 2}, "must be at least 3"),
@@ -133,9 +182,14 @@ def test_read_flat_frames__faults_are_named(laboratory, change, said):
 
 
 def test_calibrate_probe__a_covered_fibre_is_named(laboratory):
-    write_flats(laboratory, np.random.default_rng(5), gains=GAINS * [[1], [1], [0], [1]])
+    write_flats(
+        laboratory, np.random.default_rng(5), gains=GAINS * [[1], [1], [0], [1]]
+    )
     with pytest.raises(InputError, match="it must show 4 separate spots; found 3"):
         calibrate_probe(read_flat_frames(laboratory))
     write_flats(laboratory, np.random.default_rng(5), moved=np.array([5.0, 0.0]))
-    with pytest.raises(InputError, match="every fibre must be found within its radius of the given centre"):
+    with pytest.raises(
+        InputError,
+        match="every fibre must be found within its radius of the given centre",
+    ):
         calibrate_probe(read_flat_frames(laboratory))

@@ -29,14 +29,24 @@ def _profiles(probe, rng, anisotropy=0.0):
     decay = 0.6 * (1 + anisotropy * np.cos(2 * np.radians(AZIMUTH)))
     truth = (np.exp(-decay * DISTANCE) / DISTANCE**2)[:, None] * np.ones(3)
     error = 0.01 * truth
-    value = np.stack([truth + error * rng.standard_normal(truth.shape) for _ in probe.sites])
+    value = np.stack(
+        [truth + error * rng.standard_normal(truth.shape) for _ in probe.sites]
+    )
     shape = (len(probe.sites), *error.shape)
-    return Profiles(value, np.broadcast_to(error, shape), False, (), np.full((len(probe.sites), 3), np.nan))
+    return Profiles(
+        value,
+        np.broadcast_to(error, shape),
+        False,
+        (),
+        np.full((len(probe.sites), 3), np.nan),
+    )
 
 
 def test_isotropy_p_values__uniform_for_isotropic_tissue(probe):
     rng = np.random.default_rng(1)
-    found = np.concatenate([isotropy_p_values(probe, _profiles(probe, rng)).ravel() for _ in range(60)])
+    found = np.concatenate(
+        [isotropy_p_values(probe, _profiles(probe, rng)).ravel() for _ in range(60)]
+    )
     # 540 p values: the share below a tenth is known to 0.013; four of these
     assert abs((found < 0.1).mean() - 0.1) < 0.052
     assert abs((found < 0.5).mean() - 0.5) < 0.09
@@ -47,17 +57,33 @@ def test_isotropy_p_values__find_anisotropic_tissue(probe):
     found = isotropy_p_values(probe, profiles)
     assert (found < 1e-6).all()
     assert len(probe_notes(probe, profiles, found)) == len(probe.sites)
-    order = np.random.default_rng(3).permutation(ROWS * FIBRES)  # fibres may be listed in any order
+    # fibres may be listed in any order
+    order = np.random.default_rng(3).permutation(ROWS * FIBRES)
     mixed = replace(probe, distance=DISTANCE[order], azimuth=AZIMUTH[order] - 360)
-    again = replace(profiles, value=profiles.value[:, order], error=profiles.error[:, order])
+    again = replace(
+        profiles, value=profiles.value[:, order], error=profiles.error[:, order]
+    )
     np.testing.assert_allclose(isotropy_p_values(mixed, again), found, rtol=1e-6)
 
 
 def test_isotropy_p_values__only_of_several_complete_rows(probe):
     profiles = _profiles(probe, np.random.default_rng(4))
-    assert isotropy_p_values(replace(probe, azimuth=np.full(ROWS * FIBRES, np.nan)), profiles) is None
-    assert isotropy_p_values(replace(probe, azimuth=np.where(AZIMUTH > 60, 0.0, AZIMUTH)), profiles) is None
-    assert isotropy_p_values(replace(probe, distance=DISTANCE + 1e-4 * AZIMUTH), profiles) is None
+    assert (
+        isotropy_p_values(
+            replace(probe, azimuth=np.full(ROWS * FIBRES, np.nan)), profiles
+        )
+        is None
+    )
+    assert (
+        isotropy_p_values(
+            replace(probe, azimuth=np.where(AZIMUTH > 60, 0.0, AZIMUTH)), profiles
+        )
+        is None
+    )
+    assert (
+        isotropy_p_values(replace(probe, distance=DISTANCE + 1e-4 * AZIMUTH), profiles)
+        is None
+    )
     silent = replace(profiles, value=np.zeros_like(profiles.value))
     assert np.isnan(isotropy_p_values(probe, silent)).all()
 
@@ -82,17 +108,28 @@ def test_probe_notes__a_pressure_that_no_suction_has(probe, pressure):
     log = np.array([[np.nan, pressure]])
     (note,) = probe_notes(replace(probe, pressure={("neck", ""): log}), profiles, None)
     assert note.startswith(
-        f"probe at neck: a pressure of {pressure:g} kPa is outside -40 to 1 kPa; give that of a gauge"
+        f"probe at neck: a pressure of {pressure:g} kPa is outside -40 to 1 kPa; "
+        "give that of a gauge"
     )
 
 
 def _skin(probe, decay=(0.5, 0.8, 1.2), gain=1.0, distance=DISTANCE):
-    """A probe of this gain and the profiles of three sites, which decay differently in the three channels."""
-    truth = np.exp(-np.asarray(decay) * DISTANCE[:, None]) / DISTANCE[:, None] ** 2 * np.reshape(gain, (-1, 1))
+    """A probe of this gain and the profiles of three sites, which decay differently in
+    the three channels.
+    """
+    truth = (
+        np.exp(-np.asarray(decay) * DISTANCE[:, None])
+        / DISTANCE[:, None] ** 2
+        * np.reshape(gain, (-1, 1))
+    )
     shape = (len(probe.sites), *truth.shape)
     value = np.broadcast_to(truth, shape)
-    named = replace(probe, distance=distance, fibres=tuple(f"f{i}" for i in range(len(DISTANCE))))
-    return named, Profiles(value, 0.01 * value, False, (), np.full((len(probe.sites), 3), np.nan))
+    named = replace(
+        probe, distance=distance, fibres=tuple(f"f{i}" for i in range(len(DISTANCE)))
+    )
+    return named, Profiles(
+        value, 0.01 * value, False, (), np.full((len(probe.sites), 3), np.nan)
+    )
 
 
 def test_probe_notes__profiles_of_skin_have_none(probe):
@@ -106,7 +143,10 @@ def test_probe_notes__profiles_of_skin_have_none(probe):
             {"decay": (1.2, 0.8, 0.5)},
             "red light decays by 1.2 and blue light by 0.5 per mm, .* order of the channels",
         ),
-        ({"distance": DISTANCE / 10}, "red light decays by 5 per mm, and by 0.03 to 3 in skin; check the distances"),
+        (
+            {"distance": DISTANCE / 10},
+            "red light decays by 5 per mm, and by 0.03 to 3 in skin; check the distances",
+        ),
     ],
 )
 def test_probe_notes__profiles_of_no_skin(probe, change, said):
@@ -114,14 +154,27 @@ def test_probe_notes__profiles_of_no_skin(probe, change, said):
     assert re.fullmatch(f"probe: {said}", note)
 
 
-@pytest.mark.parametrize(("factor", "notes"), [(1.1, 0), (1.3, 1), (3.0, 1), (1 / 3, 1)])
+@pytest.mark.parametrize(
+    ("factor", "notes"), [(1.1, 0), (1.3, 1), (3.0, 1), (1 / 3, 1)]
+)
 def test_probe_notes__a_fibre_with_another_gain(probe, factor, notes):
-    first = slice(0, FIBRES)  # a probe of one row, whose neighbours are at other distances
-    one_row = {"distance": DISTANCE[first], "azimuth": AZIMUTH[first], "fibres": tuple("abcdefgh")}
+    # a probe of one row, whose neighbours are at other distances
+    first = slice(0, FIBRES)
+    one_row = {
+        "distance": DISTANCE[first],
+        "azimuth": AZIMUTH[first],
+        "fibres": tuple("abcdefgh"),
+    }
     gain = np.ones(len(DISTANCE))
     gain[3] = factor
     named, profiles = _skin(probe, gain=gain)
-    row = replace(profiles, value=profiles.value[:, first], error=profiles.error[:, first])
+    row = replace(
+        profiles, value=profiles.value[:, first], error=profiles.error[:, first]
+    )
     found = probe_notes(replace(named, **one_row), row, None)
     assert len(found) == notes
-    assert all(f"fibre d is {factor:.2f} times as bright as its neighbours; check its gain" in note for note in found)
+    assert all(
+        f"fibre d is {factor:.2f} times as bright as its neighbours; check its gain"
+        in note
+        for note in found
+    )

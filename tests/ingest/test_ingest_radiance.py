@@ -18,23 +18,36 @@ from skindb.ingest.radiance import (
 )
 from skindb.ingest.sensor import SensorRecord
 
-SENSOR = SensorRecord(FrameKind(40, 40, 16), black=256.0, white=65535.0, read_noise=6.0, electrons_per_dn=0.3)
+SENSOR = SensorRecord(
+    FrameKind(40, 40, 16),
+    black=256.0,
+    white=65535.0,
+    read_noise=6.0,
+    electrons_per_dn=0.3,
+)
 SECONDS = (0.04, 0.005)
 
 
 def expose(radiance, seconds, rng, sensor=SENSOR):
     full = sensor.electrons_per_dn * (sensor.white - sensor.black)
-    electrons = rng.poisson(radiance * seconds * full) + sensor.read_noise * rng.standard_normal(radiance.shape)
-    return np.clip(np.rint(sensor.black + electrons / sensor.electrons_per_dn), 0, sensor.white).astype(np.uint16)
+    electrons = rng.poisson(
+        radiance * seconds * full
+    ) + sensor.read_noise * rng.standard_normal(radiance.shape)
+    return np.clip(
+        np.rint(sensor.black + electrons / sensor.electrons_per_dn), 0, sensor.white
+    ).astype(np.uint16)
 
 
 @pytest.mark.parametrize("level", [0.05, 1.0, 20.0, 60.0, 150.0])
 def test_merge_exposures__is_unbiased_and_knows_its_error(level):
     rng = np.random.default_rng(3)
     truth = np.full((120, 120, 3), level)
-    radiance, error, flag = merge_exposures([expose(truth, s, rng) for s in SECONDS], SECONDS, SENSOR)
+    radiance, error, flag = merge_exposures(
+        [expose(truth, s, rng) for s in SECONDS], SECONDS, SENSOR
+    )
     assert (flag == OK).all()
-    # 43,200 values: the mean is known to 1 / 208 of an error, the deviation to 1 / 294; five of them
+    # 43,200 values: the mean is known to 1 / 208 of an error, the deviation to 1 / 294;
+    # five of them
     assert abs((radiance - truth).mean() / error.mean()) < 5 / 208
     # and half a per cent as the estimated variance follows the noise
     assert abs(((radiance - truth) / error).std() - 1) < 5 / 294 + 0.005
@@ -56,7 +69,9 @@ def test_merge_exposures__flags_saturated_and_dark():
     truth[1] = 60.0  # above white in the long one only
     truth[2] = 0.0
     quiet = replace(SENSOR, read_noise=0.1)
-    radiance, _, flag = merge_exposures([expose(truth, s, rng, quiet) for s in SECONDS], SECONDS, quiet)
+    radiance, _, flag = merge_exposures(
+        [expose(truth, s, rng, quiet) for s in SECONDS], SECONDS, quiet
+    )
     assert flag[:, 0].tolist() == [SATURATED, OK, DARK, OK]
     assert np.isnan(radiance[0, :, 1]).all()
     np.testing.assert_allclose(radiance[1], 60.0, rtol=0.1)
@@ -66,7 +81,9 @@ def test_merge_exposures__subtracts_the_dark_frame_and_divides_the_vignette():
     dark = np.full((4, 4, 3), 356, np.uint16)
     frame = np.full((4, 4, 3), 356 + 6528, np.uint16)
     vignette = np.full((4, 4, 1), 0.5, np.float32)
-    radiance, _, _ = merge_exposures([frame], (0.1,), SENSOR, dark=(dark,), vignette=vignette)
+    radiance, _, _ = merge_exposures(
+        [frame], (0.1,), SENSOR, dark=(dark,), vignette=vignette
+    )
     np.testing.assert_allclose(radiance, 6528 / (65535 - 256) / 0.1 / 0.5, rtol=1e-6)
 
 
@@ -77,7 +94,10 @@ def test_merge_exposures__follows_the_response():
     frame = np.full((2, 2, 3), 30000, np.uint16)
     radiance, _, _ = merge_exposures([frame], (0.5,), sensor)
     level = (30000 - 256) / (65535 - 256)
-    np.testing.assert_allclose(radiance[0, 0], level ** np.array([2.2, 2.0, 1.8]) / 0.5, rtol=1e-4)  # 400 pieces
+    # 400 pieces
+    np.testing.assert_allclose(
+        radiance[0, 0], level ** np.array([2.2, 2.0, 1.8]) / 0.5, rtol=1e-4
+    )
 
 
 def test_merge_exposures__linear_files_are_radiance():
@@ -93,7 +113,9 @@ def test_radiance_floor__is_the_noise_of_darkness():
     rng = np.random.default_rng(6)
     sensor = replace(SENSOR, black=2000.0)
     dark = np.zeros((200, 200, 3))
-    radiance, _, _ = merge_exposures([expose(dark, s, rng, sensor) for s in SECONDS], SECONDS, sensor)
+    radiance, _, _ = merge_exposures(
+        [expose(dark, s, rng, sensor) for s in SECONDS], SECONDS, sensor
+    )
     floor = radiance_floor(sensor, dict(zip("ab", SECONDS, strict=True)))
     assert radiance.std() == pytest.approx(floor, rel=0.02)
 
@@ -101,71 +123,125 @@ def test_radiance_floor__is_the_noise_of_darkness():
 def test_darkroom__applies_vignette_and_colour_matrix(pristine):
     dome = read_capture(pristine).dome
     swap = np.array([[0, 1, 0], [1, 0, 0], [0, 0, 2.0]])
-    camera = replace(dome.cameras[0], vignette=np.array([-0.4, 0.1, 0.0]), colour_matrix=swap)
+    camera = replace(
+        dome.cameras[0], vignette=np.array([-0.4, 0.1, 0.0]), colour_matrix=swap
+    )
     frames = [np.full((64, 72, 3), (1000, 2000, 3000), np.uint16)] * 2
     plain, _ = FrameMerger(dome.cameras[0], (1.0, 1.0)).merge(frames)
-    made, _ = frame_merger(replace(dome, exposures={"long": 1.0, "short": 1.0}), camera).merge(frames)
+    made, _ = frame_merger(
+        replace(dome, exposures={"long": 1.0, "short": 1.0}), camera
+    ).merge(frames)
     expected = plain[..., [1, 0, 2]] * (1, 1, 2) / vignette_gain(camera)
     np.testing.assert_allclose(made, expected, rtol=1e-5)
 
 
 def test_vignette_gain__corner_and_centre(pristine):
-    camera = replace(read_capture(pristine).dome.cameras[0], vignette=np.array([-0.4, 0.1, -0.05]))
+    camera = replace(
+        read_capture(pristine).dome.cameras[0], vignette=np.array([-0.4, 0.1, -0.05])
+    )
     gain = vignette_gain(camera)[..., 0]
     r2 = (35.5**2 + 31.5**2) / (36**2 + 32**2)
-    assert gain[0, 0] == pytest.approx(1 - 0.4 * r2 + 0.1 * r2**2 - 0.05 * r2**3, rel=1e-5)
+    assert gain[0, 0] == pytest.approx(
+        1 - 0.4 * r2 + 0.1 * r2**2 - 0.05 * r2**3, rel=1e-5
+    )
     assert gain.max() < 1
 
 
 @pytest.mark.parametrize("with_dark", [False, True])
 @pytest.mark.parametrize("curved", [False, True])
 def test_darkroom__develops_as_merge_exposures(pristine, with_dark, curved):
-    """Twin: the NumPy formulas. Values everywhere between 0 and white, below black and above white among them."""
+    """Twin: the NumPy formulas. Values everywhere between 0 and white, below black and
+    above white among them.
+    """
     for count in [1, 2, 3]:
         for bits in [8, 16]:
             rng = np.random.default_rng(count)
             top = 2**bits - 1
             black, dtype = (256.4, np.uint16) if bits == 16 else (9.5, np.uint8)
             x = np.linspace(0, 1, 60)
-            table = np.column_stack([black + x * (top - black), x**2.2, x**2.0, 0.3 * x + 0.7 * x**1.8])
-            sensor = replace(SENSOR, kind=FrameKind(37, 21, bits), black=black, white=float(top), step=4.0)
+            table = np.column_stack(
+                [black + x * (top - black), x**2.2, x**2.0, 0.3 * x + 0.7 * x**1.8]
+            )
+            sensor = replace(
+                SENSOR,
+                kind=FrameKind(37, 21, bits),
+                black=black,
+                white=float(top),
+                step=4.0,
+            )
             sensor = replace(sensor, response=table) if curved else sensor
             matrix = np.array([[1.2, -0.1, 0.0], [0.1, 0.8, -0.2], [0.0, 0.3, 1.0]])
             camera = read_capture(pristine).dome.cameras[0]
-            camera = replace(camera, sensor=sensor, width=37, height=21, vignette=np.array([-0.4, 0.1, 0.0]))
+            camera = replace(
+                camera,
+                sensor=sensor,
+                width=37,
+                height=21,
+                vignette=np.array([-0.4, 0.1, 0.0]),
+            )
             seconds = (0.04, 0.005, 0.3)[:count]
-            dark = rng.integers(0, int(2 * black), (count, 21, 37, 3)).astype(dtype) if with_dark else None
-            frames = [np.asarray((top + 1) * rng.random((21, 37, 3)) ** 4, dtype) for _ in seconds]
+            dark = (
+                rng.integers(0, int(2 * black), (count, 21, 37, 3)).astype(dtype)
+                if with_dark
+                else None
+            )
+            frames = [
+                np.asarray((top + 1) * rng.random((21, 37, 3)) ** 4, dtype)
+                for _ in seconds
+            ]
             frames[0][:4, :9], frames[-1][2:6, :9] = top, 0
             for frame in frames:
                 frame[9:12, 9:12], frame[9:12, 12:15, 1] = 0, top
             gain = vignette_gain(camera)
-            want, _, want_flag = merge_exposures(frames, seconds, sensor, dark=dark, vignette=gain)
+            want, _, want_flag = merge_exposures(
+                frames, seconds, sensor, dark=dark, vignette=gain
+            )
             usable = np.zeros(want_flag.shape, np.uint8)
-            got, flag = FrameMerger(camera, seconds, dark, gain).merge(frames, usable=usable)
+            got, flag = FrameMerger(camera, seconds, dark, gain).merge(
+                frames, usable=usable
+            )
             np.testing.assert_array_equal(flag, want_flag)
             if not with_dark:  # dark frames move the dark level of each pixel
                 np.testing.assert_array_equal(usable, usable_exposures(frames, sensor))
                 assert len(np.unique(usable)) > 1
             assert set(np.unique(flag)) == {OK, SATURATED, DARK}
-            # single precision: a handful of roundings of 6e-8; differences of nearly equal values need atol
+            # single precision: a handful of roundings of 6e-8; differences of nearly
+            # equal values need atol
             scale = np.nanmax(np.abs(want))
             np.testing.assert_allclose(got, want, rtol=1e-6, atol=1e-8 * scale)
-            coloured, _ = FrameMerger(replace(camera, colour_matrix=matrix), seconds, dark, gain).merge(frames)
-            np.testing.assert_allclose(coloured, want @ matrix.T, rtol=2e-6, atol=1e-7 * scale)
+            coloured, _ = FrameMerger(
+                replace(camera, colour_matrix=matrix), seconds, dark, gain
+            ).merge(frames)
+            np.testing.assert_allclose(
+                coloured, want @ matrix.T, rtol=2e-6, atol=1e-7 * scale
+            )
 
 
 @pytest.mark.parametrize("lens", [0.0, -0.4])
 def test_darkroom__develops_spans_as_it_does_the_whole(pristine, lens):
-    """The same bits inside, and nothing usable beside them; rows of none and of all are among them."""
+    """The same bits inside, and nothing usable beside them; rows of none and of all are
+    among them.
+    """
     rng = np.random.default_rng(5)
-    camera = replace(read_capture(pristine).dome.cameras[0], width=37, height=21, vignette=np.array([lens, 0, 0]))
-    frames = [np.asarray(65536 * rng.random((21, 37, 3)) ** 3, np.uint16) for _ in range(2)]
-    merger = FrameMerger(camera, (0.1, 0.02), None, vignette_gain(camera) if lens else None)
+    camera = replace(
+        read_capture(pristine).dome.cameras[0],
+        width=37,
+        height=21,
+        vignette=np.array([lens, 0, 0]),
+    )
+    frames = [
+        np.asarray(65536 * rng.random((21, 37, 3)) ** 3, np.uint16) for _ in range(2)
+    ]
+    merger = FrameMerger(
+        camera, (0.1, 0.02), None, vignette_gain(camera) if lens else None
+    )
     spans = np.sort(rng.integers(0, 38, (21, 2)), axis=1)
     spans[3], spans[4], spans[5] = (0, 37), (37, 0), (7, 7)
     inside = (np.arange(37) >= spans[:, :1]) & (np.arange(37) < spans[:, 1:])
-    (whole, whole_flag), (part, flag) = merger.merge(frames), merger.merge(frames, spans)
+    (whole, whole_flag), (part, flag) = (
+        merger.merge(frames),
+        merger.merge(frames, spans),
+    )
     np.testing.assert_array_equal(part[inside], whole[inside])
     np.testing.assert_array_equal(flag, np.where(inside, whole_flag, SATURATED))
 

@@ -12,12 +12,17 @@ DISTANCE = 1 + 0.5 * np.arange(28)
 
 def placements(rng, count, *, level=0.05, shape=0.02, noise=0.01):
     value = np.exp(-DISTANCE)[None, :, None] * np.ones((count, 1, 3))
-    value = value * np.exp(level * rng.standard_normal((count, 1, 3)) + shape * rng.standard_normal((count, 28, 3)))
+    value = value * np.exp(
+        level * rng.standard_normal((count, 1, 3))
+        + shape * rng.standard_normal((count, 28, 3))
+    )
     return value * (1 + noise * rng.standard_normal(value.shape)), noise * value
 
 
 def test_placement_variance__separates_level_shape_and_measurement():
-    found = [placement_variance(*placements(np.random.default_rng(s), 8)) for s in range(60)]
+    found = [
+        placement_variance(*placements(np.random.default_rng(s), 8)) for s in range(60)
+    ]
     level = np.sqrt(np.mean([f.level**2 for f in found]))
     shape = np.sqrt(np.mean([f.shape**2 for f in found]))
     # 180 variances of 7 degrees of freedom: 4 % of the deviation 3 sigma 8.5 %
@@ -26,8 +31,14 @@ def test_placement_variance__separates_level_shape_and_measurement():
 
 
 def test_placement_variance__does_not_take_scatter_of_fibres_for_contact():
-    found = [placement_variance(*placements(np.random.default_rng(s), 8, level=0.01, shape=0.05)) for s in range(60)]
-    # the scatter of 28 fibres alone would make 0.0138 of it; variances below zero count as zero, which adds 4 %
+    found = [
+        placement_variance(
+            *placements(np.random.default_rng(s), 8, level=0.01, shape=0.05)
+        )
+        for s in range(60)
+    ]
+    # the scatter of 28 fibres alone would make 0.0138 of it; variances below zero count
+    # as zero, which adds 4 %
     assert np.sqrt(np.mean([f.level**2 for f in found])) == pytest.approx(0.01, rel=0.2)
 
 

@@ -10,7 +10,13 @@ from skindb.errors import InputError
 from skindb.ingest.fields import Fields
 from skindb.ingest.frames import FrameKind
 from skindb.ingest.radiance import merge_exposures
-from skindb.ingest.response import TOE, ResponseOptions, _mean_exposure_value, recover_response, write_response
+from skindb.ingest.response import (
+    TOE,
+    ResponseOptions,
+    _mean_exposure_value,
+    recover_response,
+    write_response,
+)
 from skindb.ingest.response_samples import response_samples
 from skindb.ingest.sensor import SensorRecord, read_sensor
 
@@ -28,7 +34,9 @@ def encoded(exposure, gamma):
     power = 1 / gamma
     slope = power * toe ** (power - 1)
     lift = toe**power - slope * toe
-    return np.where(exposure < toe, slope * exposure, np.maximum(exposure, toe) ** power - lift) / (1 - lift)
+    return np.where(
+        exposure < toe, slope * exposure, np.maximum(exposure, toe) ** power - lift
+    ) / (1 - lift)
 
 
 def scene(rng):
@@ -42,7 +50,9 @@ def photographed(radiance, seconds, rng, gammas=(2.2, 2.15, 2.25)):
     frames = []
     for time in seconds:
         electrons = radiance * time * FULL
-        electrons = electrons + np.sqrt(electrons + READ**2) * rng.standard_normal(radiance.shape)
+        electrons = electrons + np.sqrt(electrons + READ**2) * rng.standard_normal(
+            radiance.shape
+        )
         x = np.clip(electrons / FULL, 0, 1)
         if gammas is not None:
             x = np.stack([encoded(x[..., c], g) for c, g in enumerate(gammas)], axis=-1)
@@ -53,7 +63,9 @@ def photographed(radiance, seconds, rng, gammas=(2.2, 2.15, 2.25)):
 def relative_error(response, gammas=(2.2, 2.15, 2.25), low=0.05):
     value = (response.table[:, 0] - BLACK) / (WHITE - BLACK)
     exposure = np.linspace(0, 1, 200_001)
-    truth = np.stack([np.interp(value, encoded(exposure, g), exposure) for g in gammas], axis=-1)
+    truth = np.stack(
+        [np.interp(value, encoded(exposure, g), exposure) for g in gammas], axis=-1
+    )
     inner = (value > low) & (value < 0.99)
     ratio = response.table[inner, 1:] / truth[inner]
     return ratio / np.median(ratio, axis=0) - 1
@@ -62,7 +74,9 @@ def relative_error(response, gammas=(2.2, 2.15, 2.25), low=0.05):
 @pytest.mark.parametrize(("seconds", "rms"), [(EIGHT, 0.003), ((0.04, 0.005), 0.01)])
 def test_recover_response__finds_a_gamma_response(seconds, rms):
     rng = np.random.default_rng(1)
-    response = recover_response(photographed(scene(rng), seconds, rng), seconds, black=BLACK, white=WHITE)
+    response = recover_response(
+        photographed(scene(rng), seconds, rng), seconds, black=BLACK, white=WHITE
+    )
     # measured: 0.0015 of eight exposures and 0.004 of two; about twice that
     assert (np.sqrt((relative_error(response) ** 2).mean(axis=0)) < rms).all()
     assert response.was_rising.all()
@@ -91,16 +105,26 @@ def test_recover_response__leaves_out_what_moved():
 def test_recover_response__merged_radiance_is_within_one_per_cent():
     rng = np.random.default_rng(4)
     radiance = scene(rng)
-    response = recover_response(photographed(radiance, EIGHT, rng), EIGHT, black=BLACK, white=WHITE)
+    response = recover_response(
+        photographed(radiance, EIGHT, rng), EIGHT, black=BLACK, white=WHITE
+    )
     frames = photographed(radiance, EIGHT, np.random.default_rng(5))
     sensor = SensorRecord(
-        FrameKind(320, 320, 16), BLACK, WHITE, READ, FULL / (WHITE - BLACK), 16.0, response=response.table
+        FrameKind(320, 320, 16),
+        BLACK,
+        WHITE,
+        READ,
+        FULL / (WHITE - BLACK),
+        16.0,
+        response=response.table,
     )
     merged, error, flag = merge_exposures(list(frames), EIGHT, sensor)
     ratio = (merged / radiance)[(flag == 0) & (error / radiance < 0.02).all(axis=-1)]
-    ratio = ratio / np.median(ratio, axis=0)  # the unit of radiance is free in each channel
+    # the unit of radiance is free in each channel
+    ratio = ratio / np.median(ratio, axis=0)
     brightness = np.digitize(
-        np.log(radiance[..., 0][(flag == 0) & (error / radiance < 0.02).all(axis=-1)]), range(-3, 5)
+        np.log(radiance[..., 0][(flag == 0) & (error / radiance < 0.02).all(axis=-1)]),
+        range(-3, 5),
     )
     bias = [ratio[brightness == i].mean(axis=0) - 1 for i in np.unique(brightness)]
     assert np.abs(bias).max() < 0.01  # the bound of the requirement
@@ -119,20 +143,35 @@ def test_mean_exposure_value__is_not_biased_by_noise_of_a_curved_response():
     noisy = level[:, None, None] * (1 + 0.2 * rng.standard_normal((3, 1, 10_000)))
     found = _mean_exposure_value(encoded(noisy, 2.2), log_ratio, 48)[:, 0]
     recovered = np.interp(found, encoded(exposure, 2.2), exposure) / level - 1
-    assert np.abs(recovered).max() < 0.006  # three standard errors; the mean of the values is 0.8 to 1.3 % too low
-    plain = np.interp(encoded(noisy, 2.2).mean(axis=-1)[:, 0], encoded(exposure, 2.2), exposure) / level - 1
+    # three standard errors; the mean of the values is 0.8 to 1.3 % too low
+    assert np.abs(recovered).max() < 0.006
+    plain = (
+        np.interp(
+            encoded(noisy, 2.2).mean(axis=-1)[:, 0], encoded(exposure, 2.2), exposure
+        )
+        / level
+        - 1
+    )
     assert (plain < -0.006).all()
 
 
 def test_write_response__is_read_back_as_a_response(tmp_path):
     rng = np.random.default_rng(6)
-    response = recover_response(photographed(scene(rng), EIGHT, rng), EIGHT, black=BLACK, white=WHITE)
+    response = recover_response(
+        photographed(scene(rng), EIGHT, rng), EIGHT, black=BLACK, white=WHITE
+    )
     write_response(tmp_path / "response.csv", response)
-    levels = {"bit_depth": 16, "black_level": BLACK, "white_level": WHITE, "response": "response.csv"}
+    levels = {
+        "bit_depth": 16,
+        "black_level": BLACK,
+        "white_level": WHITE,
+        "response": "response.csv",
+    }
     fields = Fields(levels, "camera", [])
     sensor = read_sensor(tmp_path, fields, FrameKind(320, 320, 16), linear=False)
     assert fields.faults == []
-    np.testing.assert_allclose(sensor.response, response.table, rtol=1e-9, atol=1e-12)  # ten digits are written
+    # ten digits are written
+    np.testing.assert_allclose(sensor.response, response.table, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -155,7 +194,9 @@ def test_recover_response__refuses_what_tells_nothing(stack, seconds, match):
 def test_response_samples__are_flat_spread_and_unsaturated():
     rng = np.random.default_rng(7)
     stack = photographed(scene(rng), EIGHT, rng)
-    samples = response_samples(stack, EIGHT, channel=1, levels=(BLACK, WHITE), count=400, block=4)
+    samples = response_samples(
+        stack, EIGHT, channel=1, levels=(BLACK, WHITE), count=400, block=4
+    )
     assert samples.value[samples.usable].max() < 1
     assert (samples.usable.sum(axis=1) >= 2).all()
     mean = np.clip(samples.value, 0, 1).mean(axis=1)
@@ -168,16 +209,29 @@ def published_stack():
     if not folder.is_dir():
         pytest.skip("the published exposure stacks are not on this computer")
     names = [folder / f"IMG_{number}.jpg" for number in (2600, 2601, 2602)]
-    reference = folder / "reference" / "test_camera_response_function_Debevec1997_crfs.npy"
-    return np.stack([imagecodecs.imread(str(name)) for name in names]), np.load(reference)
+    reference = (
+        folder / "reference" / "test_camera_response_function_Debevec1997_crfs.npy"
+    )
+    return np.stack([imagecodecs.imread(str(name)) for name in names]), np.load(
+        reference
+    )
 
 
 def test_recover_response__agrees_with_a_published_curve():
     stack, reference = published_stack()
-    options = ResponseOptions(smoothness=1e-7)  # a JPEG of 8 bits in three exposures needs more than raw frames
-    response = recover_response(stack, (0.125, 1.0, 8.0), black=0, white=255, options=options)
+    # a JPEG of 8 bits in three exposures needs more than raw frames
+    options = ResponseOptions(smoothness=1e-7)
+    response = recover_response(
+        stack, (0.125, 1.0, 8.0), black=0, white=255, options=options
+    )
     values = np.arange(20, 251)
-    found = np.stack([np.interp(values, response.table[:, 0], response.table[:, c]) for c in (1, 2, 3)], axis=-1)
+    found = np.stack(
+        [
+            np.interp(values, response.table[:, 0], response.table[:, c])
+            for c in (1, 2, 3)
+        ],
+        axis=-1,
+    )
     apart = np.log(found / reference[values])
     # measured: 0.020, 0.012, 0.011 with a smoothness that was chosen on these files;
     # the two fits choose their samples and their smoothness differently

@@ -22,7 +22,13 @@ from skindb.workflow import ingest_take
 def database(pristine, tmp_path_factory):
     db = Database(tmp_path_factory.mktemp("db") / "faces")
     seen = []
-    ingest_take(db, pristine, spacing_mm=4.0, photographs=2, progress=lambda *step: seen.append(step))
+    ingest_take(
+        db,
+        pristine,
+        spacing_mm=4.0,
+        photographs=2,
+        progress=lambda *step: seen.append(step),
+    )
     assert seen[0][0] == "check"
     assert seen[-1][0] == "write"
     return db
@@ -34,21 +40,42 @@ def take(database):
 
 
 # what a capture of version 1 cannot say
-VERSION_2 = ("fibre_azimuth", "site_isotropy_p_value", "placement_profile", "pressure", "pressure_time")
+VERSION_2 = (
+    "fibre_azimuth",
+    "site_isotropy_p_value",
+    "placement_profile",
+    "pressure",
+    "pressure_time",
+)
 
 
 def test_ingest_capture__writes_every_variable_of_the_schema(take):
-    for group in ("samples", "surfels", "mesh", "atlas", "dome", "probe", "photographs"):
-        check(take[group].to_dataset(), [v.name for v in GROUPS[group] if v.name not in VERSION_2], where=group)
+    for group in (
+        "samples",
+        "surfels",
+        "mesh",
+        "atlas",
+        "dome",
+        "probe",
+        "photographs",
+    ):
+        check(
+            take[group].to_dataset(),
+            [v.name for v in GROUPS[group] if v.name not in VERSION_2],
+            where=group,
+        )
 
 
 def test_ingest_capture__samples_of_a_lambertian_sphere(take):
     """Rationale: rho = albedo / pi cos(theta_i) by hand. Expected: noise of a pixel, no bias."""
     samples = take["samples"]["reflectance_sample"].values.astype(np.float64)
     place = take["surfels"]["surfel_position"].values.astype(np.float64)
-    place *= RADIUS / np.linalg.norm(place, axis=1, keepdims=True)  # the true sphere, not the chords of the scan
+    # the true sphere, not the chords of the scan
+    place *= RADIUS / np.linalg.norm(place, axis=1, keepdims=True)
     to_light = take["dome"]["light_position"].values - place[:, None]
-    cosine = (to_light * place[:, None]).sum(-1) / RADIUS / np.linalg.norm(to_light, axis=-1)
+    cosine = (
+        (to_light * place[:, None]).sum(-1) / RADIUS / np.linalg.norm(to_light, axis=-1)
+    )
     truth = (cosine[..., None] * ALBEDO / np.pi)[:, :, None]
     known = np.isfinite(samples).all(-1) & (cosine > 0.3)[..., None]
     assert known.sum() > 1000
@@ -64,11 +91,15 @@ def test_ingest_capture__no_sample_where_light_or_camera_do_not_reach(take):
     lit = take["surfels"]["light_visible_fraction"].values >= 0.999
     seen = take["surfels"]["camera_visible_fraction"].values == 1
     assert not (known & ~(lit[:, :, None] & seen[:, None])).any()
-    np.testing.assert_array_equal(take["samples"]["sample_count"].values, known.sum((1, 2)))
+    np.testing.assert_array_equal(
+        take["samples"]["sample_count"].values, known.sum((1, 2))
+    )
 
 
 def test_ingest_capture__intensity_from_the_white_target(take):
-    np.testing.assert_allclose(take["dome"]["light_intensity"].values, np.tile(INTENSITY, (4, 1)), rtol=2e-3)
+    np.testing.assert_allclose(
+        take["dome"]["light_intensity"].values, np.tile(INTENSITY, (4, 1)), rtol=2e-3
+    )
 
 
 def test_ingest_capture__probe(take):
@@ -78,12 +109,16 @@ def test_ingest_capture__probe(take):
     assert np.abs(z).max() < 4.5  # 36 values
     relative = probe["fibre_profile_error"].values[:, 0] / PROBE_R[0]
     assert (relative < 0.01).all()
-    assert (relative >= 0.005 * 0.98).all()  # that of the gains, where the file does not say
+    # that of the gains, where the file does not say
+    assert (relative >= 0.005 * 0.98).all()
     x, y, z = probe["site_position"].sel(site="cheek").values
     assert (x, y) == pytest.approx((40, 0), abs=6)
     forehead = probe["site_position"].sel(site="forehead").values
-    np.testing.assert_allclose(forehead, [0, 56, RADIUS * np.sqrt(0.51)], atol=0.13)  # sag of the scan's chords
-    np.testing.assert_array_equal(forehead, take["mesh"]["landmark_position"].sel(landmark="forehead_centre"))
+    # sag of the scan's chords
+    np.testing.assert_allclose(forehead, [0, 56, RADIUS * np.sqrt(0.51)], atol=0.13)
+    np.testing.assert_array_equal(
+        forehead, take["mesh"]["landmark_position"].sel(landmark="forehead_centre")
+    )
     assert np.isnan(probe["site_position"].sel(site="neck").values).all()
 
 
@@ -92,8 +127,12 @@ def test_ingest_capture__surfels_lie_in_order_with_areas_regions_and_faces(take)
     mesh = take["mesh"]["triangle"].values
     place = surfels["surfel_position"].values
     np.testing.assert_allclose(np.linalg.norm(place, axis=1), RADIUS, rtol=0.01)
-    assert float(surfels["surfel_area"].sum()) == pytest.approx(2 * np.pi * RADIUS**2, rel=0.05)
-    outwards = (surfels["surfel_normal"].values * place).sum(1) / np.linalg.norm(place, axis=1)
+    assert float(surfels["surfel_area"].sum()) == pytest.approx(
+        2 * np.pi * RADIUS**2, rel=0.05
+    )
+    outwards = (surfels["surfel_normal"].values * place).sum(1) / np.linalg.norm(
+        place, axis=1
+    )
     assert np.median(outwards) > 0.999
     edge = np.linalg.norm(place[mesh[:, 0]] - place[mesh[:, 1]], axis=1)
     assert edge.max() < 10
@@ -103,23 +142,39 @@ def test_ingest_capture__surfels_lie_in_order_with_areas_regions_and_faces(take)
     assert (surfels["surfel_uv"].values <= 1).all()
 
 
-def test_ingest_capture__the_atlas_as_stored_has_no_flips_and_its_distortion_is_told(take):
+def test_ingest_capture__the_atlas_as_stored_has_no_flips_and_its_distortion_is_told(
+    take,
+):
     atlas = take["atlas"].to_dataset()
     triangle = take["mesh"]["triangle"].values
     assert atlas.attrs["weights"] == "intrinsic"  # few obtuse triangles
     uv = take["surfels"]["surfel_uv"].values
     assert uv.dtype == np.float32
-    (ax, ay), (bx, by), (cx, cy) = (uv[triangle[:, k]].astype(float).T for k in range(3))
+    (ax, ay), (bx, by), (cx, cy) = (
+        uv[triangle[:, k]].astype(float).T for k in range(3)
+    )
     area = ((by - ay) * (cx - ax) - (bx - ax) * (cy - ay)) / 2
     assert (area > 0).all()
     assert (atlas["atlas_flips"] == 0).all()
     assert atlas["region"].values.tolist() == ["all", *take["surfels"]["region"].values]
     place = take["surfels"]["surfel_position"].values[triangle]
-    scanned = np.linalg.norm(np.cross(place[:, 1] - place[:, 0], place[:, 2] - place[:, 0]), axis=1) / 2
+    scanned = (
+        np.linalg.norm(
+            np.cross(place[:, 1] - place[:, 0], place[:, 2] - place[:, 0]), axis=1
+        )
+        / 2
+    )
     spread = np.sqrt(np.cov(np.log2(area / scanned), aweights=scanned, ddof=0))
-    np.testing.assert_allclose(atlas["atlas_area_log2_sd"].sel(region="all"), spread, rtol=1e-4)
+    np.testing.assert_allclose(
+        atlas["atlas_area_log2_sd"].sel(region="all"), spread, rtol=1e-4
+    )
     assert spread < 0.2
-    assert 1 < atlas["atlas_anisotropy_median"].sel(region="all") < atlas["atlas_anisotropy_p99"].sel(region="all") < 4
+    assert (
+        1
+        < atlas["atlas_anisotropy_median"].sel(region="all")
+        < atlas["atlas_anisotropy_p99"].sel(region="all")
+        < 4
+    )
 
 
 def test_ingest_capture__photographs_are_radiance_as_taken(take):
@@ -130,14 +185,20 @@ def test_ingest_capture__photographs_are_radiance_as_taken(take):
     light = list(LIGHTS)[int(photos["photograph_light"][0])]
     truth = face_radiance(CAMERAS["c0"], LIGHTS[light])
     lit = truth.min(-1) > 0.2
-    assert abs(np.median(image[lit] / truth[lit]) - 1) < 0.002  # exposures of a camera by hand
+    # exposures of a camera by hand
+    assert abs(np.median(image[lit] / truth[lit]) - 1) < 0.002
 
 
 @pytest.mark.parametrize("unit", [1.0, 1e-7, 1e6])
 def test_photograph_group__keeps_radiance_in_any_unit(unit):
-    """The unit of radiance is the capture's own: stored with the precision of single floats, whatever it is."""
+    """The unit of radiance is the capture's own: stored with the precision of single
+    floats, whatever it is.
+    """
     rng = np.random.default_rng(3)
-    first, second = (np.float32(unit) * rng.uniform(0, 1, size).astype(np.float32) for size in ((4, 5, 3), (6, 3, 3)))
+    first, second = (
+        np.float32(unit) * rng.uniform(0, 1, size).astype(np.float32)
+        for size in ((4, 5, 3), (6, 3, 3))
+    )
     first[0, 0] = np.nan
     group = photograph_group({(1, 0): second, (0, 1): first})
     stored = group["photograph_radiance"].values
@@ -151,24 +212,41 @@ def test_photograph_group__keeps_radiance_in_any_unit(unit):
 
 @pytest.mark.parametrize(
     ("cores", "megapixels", "expected"),
-    [(None, 1, 2), (1, 1, 2), (6, 1, 6), (64, 1, 8), (64, 12, 8), (64, 24, 5), (64, 150, 2)],
+    [
+        (None, 1, 2),
+        (1, 1, 2),
+        (6, 1, 6),
+        (64, 1, 8),
+        (64, 12, 8),
+        (64, 24, 5),
+        (64, 150, 2),
+    ],
 )
-def test_threads__are_as_many_as_cores_and_memory_allow(pristine, monkeypatch, cores, megapixels, expected):
+def test_threads__are_as_many_as_cores_and_memory_allow(
+    pristine, monkeypatch, cores, megapixels, expected
+):
     monkeypatch.setattr("skindb._threads.cpu_count", lambda: cores)
     dome = read_capture(pristine).dome
-    cameras = [*dome.cameras[:-1], replace(dome.cameras[-1], width=1000, height=1000 * megapixels)]
+    cameras = [
+        *dome.cameras[:-1],
+        replace(dome.cameras[-1], width=1000, height=1000 * megapixels),
+    ]
     assert threads(replace(dome, cameras=cameras)) == expected
     assert threads(None) == 2
 
 
-def test_ingest_capture__numbers_do_not_depend_on_the_threads(pristine, take, tmp_path, monkeypatch):
+def test_ingest_capture__numbers_do_not_depend_on_the_threads(
+    pristine, take, tmp_path, monkeypatch
+):
     monkeypatch.setattr("skindb._threads.cpu_count", lambda: 7)
     assert threads(read_capture(pristine).dome) == 7
     db = Database(tmp_path / "db")
     ingest_take(db, pristine, spacing_mm=4.0, photographs=2)
     for group in ("samples", "surfels", "dome", "photographs"):
         for name, values in db.read("capture", "T001")[group].data_vars.items():
-            np.testing.assert_array_equal(values.values, take[group][name].values, err_msg=name)
+            np.testing.assert_array_equal(
+                values.values, take[group][name].values, err_msg=name
+            )
 
 
 def test_ingest_capture__provenance(take):
@@ -185,11 +263,18 @@ def test_ingest_capture__provenance(take):
         "calibration": "refuse",
         "refine": False,
     }
-    assert {"capture.json", "dome/dome.json", "contact/probe.json", "scan.ply", "frames"} <= set(attrs["inputs"])
+    assert {
+        "capture.json",
+        "dome/dome.json",
+        "contact/probe.json",
+        "scan.ply",
+        "frames",
+    } <= set(attrs["inputs"])
     assert all(len(digest) == 64 for digest in attrs["inputs"].values())
     assert attrs["frame_count"] == 16 + 8 + 9
     assert attrs["cleaning"]["degenerate_faces"] == 0
-    ((outline,),) = attrs["cleaning_places"].values()  # nothing to repair: the middle of the rim, at z = 0 or below
+    # nothing to repair: the middle of the rim, at z = 0 or below
+    ((outline,),) = attrs["cleaning_places"].values()
     np.testing.assert_allclose(outline, [0, 0, -2.5], atol=2.5)
     assert 0 < take["samples/noise_floor"] < 1e-2
 
@@ -198,13 +283,22 @@ def test_ingest_capture__needs_consent_to_fit(capture_folder, tmp_path):
     record = json.loads((capture_folder / "capture.json").read_text())
     record["consent"]["scope"] = ["publish"]
     (capture_folder / "capture.json").write_text(json.dumps(record))
-    with pytest.raises(InputError, match=r"\[consent\]\[scope\]: ingest needs the scope 'fit'; found publish"):
+    with pytest.raises(
+        InputError,
+        match=r"\[consent\]\[scope\]: ingest needs the scope 'fit'; found publish",
+    ):
         ingest_take(Database(tmp_path / "db"), capture_folder)
 
 
-def test_ingest_capture__collects_damage_found_while_decoding_and_writes_nothing(capture_folder, tmp_path):
+def test_ingest_capture__collects_damage_found_while_decoding_and_writes_nothing(
+    capture_folder, tmp_path
+):
     """Headers and ends of these files are whole; only decoding shows the damage."""
-    broken = ["dome/frames/long/l1_c0.png", "dome/frames/short/l2_c1.png", "dome/white/long/l3_c0.png"]
+    broken = [
+        "dome/frames/long/l1_c0.png",
+        "dome/frames/short/l2_c1.png",
+        "dome/white/long/l3_c0.png",
+    ]
     broken.append("contact/cheek/b1.png")
     for name in broken:
         content = bytearray((capture_folder / name).read_bytes())
@@ -218,25 +312,44 @@ def test_ingest_capture__collects_damage_found_while_decoding_and_writes_nothing
     assert db.takes() == []
 
 
-def test_ingest_capture__without_dome_and_probe_keeps_the_surface(capture_folder, tmp_path):
+def test_ingest_capture__without_dome_and_probe_keeps_the_surface(
+    capture_folder, tmp_path
+):
     record = json.loads((capture_folder / "capture.json").read_text())
     for key in ("dome", "contact", "landmarks"):
         del record[key]
     (capture_folder / "capture.json").write_text(json.dumps(record))
     db = Database(tmp_path / "db")
-    assert len(ingest_take(db, capture_folder, spacing_mm=8.0).provenance["skipped"]) == 3
+    assert (
+        len(ingest_take(db, capture_folder, spacing_mm=8.0).provenance["skipped"]) == 3
+    )
     take = db.read("capture", "T001")
     assert set(take.children) == {"surfels", "mesh", "atlas"}
     assert take["surfels"].sizes["surfel"] > 100
 
 
-def test_ingest_capture__by_splats_and_footprints_sees_the_same_face(take, capture_folder, tmp_path):
+def test_ingest_capture__by_splats_and_footprints_sees_the_same_face(
+    take, capture_folder, tmp_path
+):
     db = Database(tmp_path / "db")
-    ingest_take(db, capture_folder, spacing_mm=4.0, photographs=0, visibility="splats", footprint=True)
+    ingest_take(
+        db,
+        capture_folder,
+        spacing_mm=4.0,
+        photographs=0,
+        visibility="splats",
+        footprint=True,
+    )
     other = db.read("capture", "T001")
-    seen, again = (one["surfels"]["light_visible_fraction"].values > 0.5 for one in (take, other))
-    assert (seen == again).mean() > 0.99  # a smooth face: only at the horizon can they differ
-    a, b = (one["samples"]["reflectance_sample"].values.astype(float) for one in (take, other))
+    seen, again = (
+        one["surfels"]["light_visible_fraction"].values > 0.5 for one in (take, other)
+    )
+    # a smooth face: only at the horizon can they differ
+    assert (seen == again).mean() > 0.99
+    a, b = (
+        one["samples"]["reflectance_sample"].values.astype(float)
+        for one in (take, other)
+    )
     assert not np.array_equal(a, b, equal_nan=True)
     both = np.isfinite(a) & np.isfinite(b)
     assert abs(np.median(b[both] / a[both]) - 1) < 0.01
@@ -244,15 +357,30 @@ def test_ingest_capture__by_splats_and_footprints_sees_the_same_face(take, captu
 
 def test_atlas_group__names_the_weights_that_made_the_map(capture_folder, monkeypatch):
     capture = read_capture(capture_folder)
-    assert atlas_group(build_surfels(capture, spacing_mm=6.0)).attrs == {"weights": "intrinsic"}
-    monkeypatch.setattr("skindb.geometry.atlas._intrinsic_weights", lambda p, _: sp.csr_matrix((len(p), len(p))))
-    assert atlas_group(build_surfels(capture, spacing_mm=6.0)).attrs == {"weights": "mean_value"}
+    assert atlas_group(build_surfels(capture, spacing_mm=6.0)).attrs == {
+        "weights": "intrinsic"
+    }
+    monkeypatch.setattr(
+        "skindb.geometry.atlas._intrinsic_weights",
+        lambda p, _: sp.csr_matrix((len(p), len(p))),
+    )
+    assert atlas_group(build_surfels(capture, spacing_mm=6.0)).attrs == {
+        "weights": "mean_value"
+    }
 
 
 @pytest.mark.parametrize("largest", [4096, 64])
-def test_ingest_capture__depth_maps_too_coarse_for_the_splats_are_told(capture_folder, tmp_path, monkeypatch, largest):
+def test_ingest_capture__depth_maps_too_coarse_for_the_splats_are_told(
+    capture_folder, tmp_path, monkeypatch, largest
+):
     monkeypatch.setattr("skindb.geometry.splats.MAX_MAP_SIDE_PX", largest)
     db = Database(tmp_path / "db")
-    record = ingest_take(db, capture_folder, spacing_mm=6.0, photographs=0, visibility="splats")
+    record = ingest_take(
+        db, capture_folder, spacing_mm=6.0, photographs=0, visibility="splats"
+    )
     notes = record.provenance["summary"]["notes"]
-    assert notes == [] if largest == 4096 else "too wide; use rays, which are exact" in notes[0]
+    assert (
+        notes == []
+        if largest == 4096
+        else "too wide; use rays, which are exact" in notes[0]
+    )

@@ -1,4 +1,6 @@
-"""Captures that cannot be of a face are refused with one line and its cure; unusual ones that can be are not."""
+"""Captures that cannot be of a face are refused with one line and its cure; unusual
+ones that can be are not.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,13 @@ from skindb.geometry.crop import Crop
 from skindb.geometry.nearest import closest_on_mesh
 from skindb.geometry.scan import Scan
 from skindb.ingest import read_capture
-from skindb.ingest.scan_checks import coincidence_faults, landmark_faults, order_fault, scan_fault, swapped_faults
+from skindb.ingest.scan_checks import (
+    coincidence_faults,
+    landmark_faults,
+    order_fault,
+    scan_fault,
+    swapped_faults,
+)
 from skindb.ingest.surfels import build_surfels, site_positions, transferred_landmarks
 from skindb.store import Database
 from skindb.workflow import ingest_take
@@ -31,9 +39,13 @@ FLAT = {  # x to the subject's left, y up, of a face on the unit sphere
     "mouth_corner_left": (0.3, -0.4),
     "chin": (0.0, -0.8),
 }
-FACE = {name: RADIUS * np.array([x, y, np.sqrt(1 - x * x - y * y)]) for name, (x, y) in FLAT.items()}
+FACE = {
+    name: RADIUS * np.array([x, y, np.sqrt(1 - x * x - y * y)])
+    for name, (x, y) in FLAT.items()
+}
 MIRRORED = {
-    name: FACE[name.replace("left", "*").replace("right", "left").replace("*", "right")] for name in FACE
+    name: FACE[name.replace("left", "*").replace("right", "left").replace("*", "right")]
+    for name in FACE
 }  # names exchanged
 
 
@@ -50,7 +62,11 @@ def put_scan(folder, vertices, faces):
 
 
 def put_landmarks(folder, points):
-    write(folder, "landmarks.json", {name: list(map(float, p)) for name, p in points.items()})
+    write(
+        folder,
+        "landmarks.json",
+        {name: list(map(float, p)) for name, p in points.items()},
+    )
 
 
 def only_fault(folder):
@@ -70,38 +86,63 @@ def only_fault(folder):
         (0.1, "centimetres: multiply {} by 10"),
     ],
 )
-def test_read_capture__scan_of_another_unit_is_one_fault(capture_folder, scale, unit, landmarks):
+def test_read_capture__scan_of_another_unit_is_one_fault(
+    capture_folder, scale, unit, landmarks
+):
     vertices, faces = half_sphere()
     put_scan(capture_folder, vertices * scale, faces)
-    put_landmarks(capture_folder, {n: p * (scale if landmarks != "in mm" else 1) for n, p in FACE.items()})
+    put_landmarks(
+        capture_folder,
+        {n: p * (scale if landmarks != "in mm" else 1) for n, p in FACE.items()},
+    )
     if landmarks == "none":
         record = json.loads((capture_folder / "capture.json").read_text())
         record.pop("landmarks")
         write(capture_folder, "capture.json", record)
     fault = only_fault(capture_folder)
     both = landmarks == "in the unit of the scan"
-    place = "scan.ply (mesh), " + str(capture_folder / "landmarks.json") if both else "scan.ply (mesh)"
+    place = (
+        "scan.ply (mesh), " + str(capture_folder / "landmarks.json")
+        if both
+        else "scan.ply (mesh)"
+    )
     diagonal = np.linalg.norm(np.ptp(vertices, axis=0)) * scale
-    assert f"{place}: all lengths must be in mm; found diagonal of the scan {diagonal:.3g}" in fault
-    parts = "the vertices of the scan and the landmarks" if both else "the vertices of the scan"
+    assert (
+        f"{place}: all lengths must be in mm; found diagonal of the scan {diagonal:.3g}"
+        in fault
+    )
+    parts = (
+        "the vertices of the scan and the landmarks"
+        if both
+        else "the vertices of the scan"
+    )
     assert fault.endswith(f"; these look like {unit.format(parts)}")
 
 
 @pytest.mark.parametrize(
-    ("scale", "unit"), [(0.1, "centimetres: multiply {} by 10"), (10, "millimetre: divide {} by 10")]
+    ("scale", "unit"),
+    [(0.1, "centimetres: multiply {} by 10"), (10, "millimetre: divide {} by 10")],
 )
-def test_read_capture__face_of_another_unit_though_the_scan_could_be_a_patch(capture_folder, scale, unit):
+def test_read_capture__face_of_another_unit_though_the_scan_could_be_a_patch(
+    capture_folder, scale, unit
+):
     """A head in centimetres is as large as a patch of skin: only its landmarks tell."""
     vertices, faces = half_sphere()
     put_scan(capture_folder, vertices * scale, faces)
     put_landmarks(capture_folder, {name: p * scale for name, p in FACE.items()})
     fault = only_fault(capture_folder)
-    assert "landmarks.json: all lengths must be in mm; found diagonal of the scan" in fault
+    assert (
+        "landmarks.json: all lengths must be in mm; found diagonal of the scan" in fault
+    )
     assert fault.endswith(unit.format("the vertices of the scan and the landmarks"))
 
 
-@pytest.mark.parametrize(("factor", "unit"), [(1e-3, "metres"), (0.1, "centimetres"), (1000, "micrometres")])
-def test_read_capture__landmarks_of_another_unit_are_one_fault(capture_folder, factor, unit):
+@pytest.mark.parametrize(
+    ("factor", "unit"), [(1e-3, "metres"), (0.1, "centimetres"), (1000, "micrometres")]
+)
+def test_read_capture__landmarks_of_another_unit_are_one_fault(
+    capture_folder, factor, unit
+):
     put_landmarks(capture_folder, {name: p * factor for name, p in FACE.items()})
     fault = only_fault(capture_folder)
     assert "landmarks.json: all lengths must be in mm; found" in fault
@@ -113,12 +154,16 @@ def test_landmark_faults__all_in_one_point_are_no_unit(capture_folder):
     """The origin of this frame lies on the nose: divided by 1000 all landmarks would be there."""
     scan = read_capture(capture_folder).scan
     moved = Scan(scan.vertices - [0, 0, RADIUS], scan.faces)
-    found = landmark_faults("f", {name: p + np.array([0, 300, -RADIUS]) for name, p in FACE.items()}, moved)
+    found = landmark_faults(
+        "f", {name: p + np.array([0, 300, -RADIUS]) for name, p in FACE.items()}, moved
+    )
     assert len(found) == len(FACE)
 
 
 def test_read_capture__landmarks_elsewhere_in_mm_are_named_one_by_one(capture_folder):
-    put_landmarks(capture_folder, {name: p + np.array([0, 300, 0]) for name, p in FACE.items()})
+    put_landmarks(
+        capture_folder, {name: p + np.array([0, 300, 0]) for name, p in FACE.items()}
+    )
     with pytest.raises(InputError, match="mark it again") as caught:
         read_capture(capture_folder)
     assert len(caught.value.faults) == len(FACE)
@@ -153,7 +198,12 @@ def test_swapped_faults__hold_for_a_turned_head():
     for turn in rotations():
         surface = sphere_surface(turn)
         found = [
-            [fault.where for fault in swapped_faults("f", {n: turn @ p for n, p in points.items()}, surface)]
+            [
+                fault.where
+                for fault in swapped_faults(
+                    "f", {n: turn @ p for n, p in points.items()}, surface
+                )
+            ]
             for points in (FACE, MIRRORED, one)
         ]
         assert found == [[], ["f"], ["f[brow_left]"]]
@@ -162,16 +212,24 @@ def test_swapped_faults__hold_for_a_turned_head():
 def test_swapped_faults__a_mirrored_scan_is_told():
     vertices, faces = half_sphere()
     mirror = np.array([-1.0, 1, 1])
-    (fault,) = swapped_faults("f", {n: p * mirror for n, p in FACE.items()}, clean_mesh(vertices * mirror, faces))
+    (fault,) = swapped_faults(
+        "f",
+        {n: p * mirror for n, p in FACE.items()},
+        clean_mesh(vertices * mirror, faces),
+    )
     assert "if the scan is a mirror image" in fault.cure
 
 
 def test_swapped_faults__names_as_prefix_count_and_without_pairs_or_heights_nothing_is_judged():
     surface = sphere_surface(np.eye(3))
-    prefixed = {" ".join(reversed(name.rsplit("_", 1))): p for name, p in MIRRORED.items()}
+    prefixed = {
+        " ".join(reversed(name.rsplit("_", 1))): p for name, p in MIRRORED.items()
+    }
     assert len(swapped_faults("f", prefixed, surface)) == 1
     for kept in (["brow_left", "chin"], ["brow_left", "brow_right"], ["nose_tip"]):
-        assert swapped_faults("f", {name: MIRRORED[name] for name in kept}, surface) == []
+        assert (
+            swapped_faults("f", {name: MIRRORED[name] for name in kept}, surface) == []
+        )
 
 
 def test_swapped_faults__a_slanting_pair_is_not_judged():
@@ -182,7 +240,12 @@ def test_swapped_faults__a_slanting_pair_is_not_judged():
 
 @pytest.mark.parametrize(
     ("one", "other"),
-    [("forehead_centre", "chin"), ("nose_tip", "chin"), ("forehead_centre", "nose_tip"), ("brow_left", "nose_tip")],
+    [
+        ("forehead_centre", "chin"),
+        ("nose_tip", "chin"),
+        ("forehead_centre", "nose_tip"),
+        ("brow_left", "nose_tip"),
+    ],
 )
 def test_order_fault__names_exchanged_along_the_middle(one, other):
     for turn in rotations():
@@ -194,16 +257,28 @@ def test_order_fault__names_exchanged_along_the_middle(one, other):
 
 
 def test_read_capture__names_exchanged_along_the_middle_are_one_fault(capture_folder):
-    put_landmarks(capture_folder, FACE | {"nose_tip": FACE["chin"], "chin": FACE["nose_tip"]})
+    put_landmarks(
+        capture_folder, FACE | {"nose_tip": FACE["chin"], "chin": FACE["nose_tip"]}
+    )
     fault = only_fault(capture_folder)
-    assert "landmarks.json[nose_tip]: nose_tip must lie above chin on a face; found it 58 mm below; exchange" in fault
+    assert (
+        "landmarks.json[nose_tip]: nose_tip must lie above chin on a face; found "
+        "it 58 mm below; exchange"
+    ) in fault
 
 
 def test_order_fault__a_hanging_nose_passes_and_without_heights_nothing_is_judged():
-    hanging = FACE | {"subnasale": FACE["nose_tip"] + [0, 5, 0]}  # above the tip of the nose
+    # above the tip of the nose
+    hanging = FACE | {"subnasale": FACE["nose_tip"] + [0, 5, 0]}
     assert order_fault("f", hanging) is None
-    assert order_fault("f", FACE | {"subnasale": FACE["nose_tip"] + [0, 12, 0]}) is not None
-    assert order_fault("f", {name: FACE[name] for name in ("brow_left", "nose_tip")}) is None
+    assert (
+        order_fault("f", FACE | {"subnasale": FACE["nose_tip"] + [0, 12, 0]})
+        is not None
+    )
+    assert (
+        order_fault("f", {name: FACE[name] for name in ("brow_left", "nose_tip")})
+        is None
+    )
     assert order_fault("f", {}) is None
 
 
@@ -213,7 +288,10 @@ def test_doubled_faults__two_names_at_one_point(capture_folder):
     assert str(fault).startswith(
         "f[subnasale]: landmarks must be at least 0.5 mm apart; found nose_tip at the same point;"
     )
-    assert coincidence_faults("f", FACE | {"subnasale": FACE["nose_tip"] + [0, -1, 0]}) == []
+    assert (
+        coincidence_faults("f", FACE | {"subnasale": FACE["nose_tip"] + [0, -1, 0]})
+        == []
+    )
     put_landmarks(capture_folder, points)
     assert "[subnasale]: landmarks must be at least" in only_fault(capture_folder)
 
@@ -222,20 +300,29 @@ def test_doubled_faults__two_names_at_one_point(capture_folder):
 def test_scan_fault__a_patch_a_head_and_a_person_pass(size):
     """Boxes of 22, 590 and 1620 mm across: only what is a unit away from any scan is refused."""
     ball = trimesh.creation.icosphere(1, radius=size / 2)
-    assert scan_fault("m", clean_mesh(np.asarray(ball.vertices), np.asarray(ball.faces))) is None
+    assert (
+        scan_fault("m", clean_mesh(np.asarray(ball.vertices), np.asarray(ball.faces)))
+        is None
+    )
 
 
 def move_camera(folder, index, eye):
     record = dome(folder)
     rotation = look_at((0, 30, 400))[0]
-    record["cameras"][index] |= {"R": rotation.tolist(), "t": (-rotation @ np.asarray(eye, float)).tolist()}
+    record["cameras"][index] |= {
+        "R": rotation.tolist(),
+        "t": (-rotation @ np.asarray(eye, float)).tolist(),
+    }
     write(folder, "dome/dome.json", record)
 
 
 def test_read_capture__camera_inside_the_head(capture_folder):
     move_camera(capture_folder, 1, [10, 5, 40])
     fault = only_fault(capture_folder)
-    assert "dome.json[cameras]: cameras must be outside the head; found 1 of 2 inside it: c1; calibrate in mm" in fault
+    assert (
+        "dome.json[cameras]: cameras must be outside the head; found 1 of 2 inside "
+        "it: c1; calibrate in mm"
+    ) in fault
 
 
 def test_read_capture__dome_in_metres_puts_all_inside(capture_folder):
@@ -243,7 +330,10 @@ def test_read_capture__dome_in_metres_puts_all_inside(capture_folder):
     for light in record["lights"]:
         light["position"] = [x / 1000 for x in light["position"]]
     write(capture_folder, "dome/dome.json", record)
-    cure = "these look like metres: multiply position of the lights by 1000; check disc_radius and the white target too"
+    cure = (
+        "these look like metres: multiply position of the lights by 1000; check "
+        "disc_radius and the white target too"
+    )
     assert only_fault(capture_folder).endswith(cure)
 
 
@@ -254,11 +344,14 @@ def test_read_capture__some_lights_inside_the_head_are_no_unit(capture_folder):
     write(capture_folder, "dome/dome.json", record)
     fault = only_fault(capture_folder)
     assert (
-        "dome.json[lights]: lights must be outside the head; found 2 of 4 inside it: l0, l1; calibrate in mm" in fault
-    )
+        "dome.json[lights]: lights must be outside the head; found 2 of 4 inside "
+        "it: l0, l1; calibrate in mm"
+    ) in fault
 
 
-def test_read_capture__camera_close_to_the_skin_or_behind_an_open_scan_is_fine(capture_folder):
+def test_read_capture__camera_close_to_the_skin_or_behind_an_open_scan_is_fine(
+    capture_folder,
+):
     move_camera(capture_folder, 0, [0, 0, RADIUS + 1])
     move_camera(capture_folder, 1, [0, 0, -20])
     assert len(read_capture(capture_folder).dome.cameras) == 2
@@ -267,7 +360,11 @@ def test_read_capture__camera_close_to_the_skin_or_behind_an_open_scan_is_fine(c
 def test_read_capture__camera_below_a_slanting_rim_is_fine(capture_folder):
     """Within the box of the scan, where a fifth of all directions meet its inner side."""
     ball = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
-    put_scan(capture_folder, ball.vertices, ball.faces[ball.vertices[ball.faces][..., 1:].sum(axis=2).min(axis=1) > 0])
+    put_scan(
+        capture_folder,
+        ball.vertices,
+        ball.faces[ball.vertices[ball.faces][..., 1:].sum(axis=2).min(axis=1) > 0],
+    )
     move_camera(capture_folder, 1, [0, -40, -40])
     assert len(read_capture(capture_folder).dome.cameras) == 2
 
@@ -281,11 +378,17 @@ def test_read_capture__a_faulty_camera_is_not_called_inside(capture_folder):
 
 def reduced(folder, cameras, lights):
     record = dome(folder)
-    record["cameras"], record["lights"] = record["cameras"][:cameras], record["lights"][:lights]
+    record["cameras"], record["lights"] = (
+        record["cameras"][:cameras],
+        record["lights"][:lights],
+    )
     write(folder, "dome/dome.json", record)
 
 
-@pytest.mark.parametrize("kind", ["one camera", "one light", "open mesh", "two components", "three triangles"])
+@pytest.mark.parametrize(
+    "kind",
+    ["one camera", "one light", "open mesh", "two components", "three triangles"],
+)
 def test_ingest_capture__extreme_captures_go_through(capture_folder, tmp_path, kind):
     vertices, faces = half_sphere()
     if kind == "one camera":
@@ -298,7 +401,9 @@ def test_ingest_capture__extreme_captures_go_through(capture_folder, tmp_path, k
         faces = np.concatenate([faces, faces + len(vertices)])
         vertices = np.concatenate([vertices, 0.3 * vertices + [200, 0, 0]])
     else:
-        vertices = np.array([[0, 0, RADIUS], [30, 0, 70], [-15, 30, 70], [-15, -30, 70]])
+        vertices = np.array(
+            [[0, 0, RADIUS], [30, 0, 70], [-15, 30, 70], [-15, -30, 70]]
+        )
         faces = np.array([[0, 1, 2], [0, 2, 3], [0, 3, 1]])
         record = json.loads((capture_folder / "capture.json").read_text())
         for key in ("landmarks", "regions", "contact"):
@@ -322,42 +427,61 @@ def test_ingest_capture__extreme_captures_go_through(capture_folder, tmp_path, k
 def test_read_capture__crops_after_the_whole_was_judged(capture_folder):
     put_landmarks(capture_folder, FACE)
     whole = read_capture(capture_folder)
-    patch = read_capture(capture_folder, crop=Crop((-8, -8, 0), (8, 8, 99)))  # smaller than any scan may be
+    # smaller than any scan may be
+    patch = read_capture(capture_folder, crop=Crop((-8, -8, 0), (8, 8, 99)))
     assert 0 < len(patch.surface.faces) < 40
     assert np.abs(patch.surface.vertices[:, :2]).max() <= 8
-    assert patch.surface.report["cropped_faces"] == len(whole.scan.faces) - len(patch.surface.faces)
+    assert patch.surface.report["cropped_faces"] == len(whole.scan.faces) - len(
+        patch.surface.faces
+    )
     near = read_capture(capture_folder, crop=Crop(reach_mm=30.0)).surface.vertices
     gap = np.linalg.norm(near[:, None] - np.array([*FACE.values()]), axis=2).min(axis=1)
     assert 28 < gap.max() <= 30
 
 
 def test_read_capture__crop_that_leaves_nothing_or_lacks_landmarks(capture_folder):
-    with pytest.raises(InputError, match=r"the crop must leave a part.*0 of .*the scan reaches from -80 -80 -"):
+    with pytest.raises(
+        InputError,
+        match=r"the crop must leave a part.*0 of .*the scan reaches from -80 -80 -",
+    ):
         read_capture(capture_folder, crop=Crop(low=(200, 0, 0)))
     record = json.loads((capture_folder / "capture.json").read_text())
     record.pop("landmarks")
     write(capture_folder, "capture.json", record)
-    with pytest.raises(InputError, match=r"\[landmarks\]: a crop around the landmarks needs landmarks"):
+    with pytest.raises(
+        InputError, match=r"\[landmarks\]: a crop around the landmarks needs landmarks"
+    ):
         read_capture(capture_folder, crop=Crop(reach_mm=30.0))
 
 
 def test_ingest_capture__crop_is_in_the_provenance(capture_folder, tmp_path):
     db = Database(tmp_path / "db")
-    record = ingest_take(db, capture_folder, spacing_mm=6.0, photographs=0, crop=Crop(low=(-99, 0, -99)))
+    record = ingest_take(
+        db, capture_folder, spacing_mm=6.0, photographs=0, crop=Crop(low=(-99, 0, -99))
+    )
     assert record.provenance["parameters"]["crop"]["low"] == [-99, 0, -99]
     assert record.provenance["cleaning"]["cropped_faces"] > 100
-    assert db.read("capture", "T001")["surfels"]["surfel_position"].values[:, 1].min() > -2
+    assert (
+        db.read("capture", "T001")["surfels"]["surfel_position"].values[:, 1].min() > -2
+    )
 
 
 @pytest.mark.parametrize("spacing", [6.0, 2.5])
 def test_carried_landmarks__lie_on_the_surface_of_the_surfels(capture_folder, spacing):
-    """Clicked 0, 1, 2 .. mm beside the sphere: that is the distance, and what is stored lies on the surface."""
+    """Clicked 0, 1, 2 .. mm beside the sphere: that is the distance, and what is stored
+    lies on the surface.
+    """
     lifts = dict(zip(FACE, np.arange(len(FACE)) * 0.7, strict=True))
-    put_landmarks(capture_folder, {name: p * (1 + lifts[name] / RADIUS) for name, p in FACE.items()})
+    put_landmarks(
+        capture_folder,
+        {name: p * (1 + lifts[name] / RADIUS) for name, p in FACE.items()},
+    )
     capture = read_capture(capture_folder)
     surfels = build_surfels(capture, spacing_mm=spacing)
     position, distance = transferred_landmarks(capture, surfels)
-    sag = 0.13  # mm, of the scan's chords: 5 mm on a sphere of 80 mm are 0.04 to 0.1 mm below it at their middle
+    # mm, of the scan's chords: 5 mm on a sphere of 80 mm are 0.04 to 0.1 mm below it at
+    # their middle
+    sag = 0.13
     np.testing.assert_allclose(distance, list(lifts.values()), atol=sag)
     _, _, gap = closest_on_mesh(surfels.position, surfels.faces, position)
     np.testing.assert_allclose(gap, 0, atol=1e-9)
@@ -369,76 +493,131 @@ def test_carried_landmarks__lie_on_the_surface_of_the_surfels(capture_folder, sp
 
 @pytest.mark.parametrize("below", [1.0, 4.0, 8.0, 30.0])
 def test_carried_landmarks__cropped_away_are_nan(capture_folder, below):
-    """Cut that far above the nose: never carried to the cut edge, though that is within the reach of landmarks."""
+    """Cut that far above the nose: never carried to the cut edge, though that is within
+    the reach of landmarks.
+    """
     put_landmarks(capture_folder, FACE)
-    capture = read_capture(capture_folder, crop=Crop(low=(-99, FACE["nose_tip"][1] + below, -99)))
-    position, distance = transferred_landmarks(capture, build_surfels(capture, spacing_mm=6.0))
-    sag = 0.13  # mm, of the scan's chords; what is farther from the cut scan was on a triangle that is gone
+    capture = read_capture(
+        capture_folder, crop=Crop(low=(-99, FACE["nose_tip"][1] + below, -99))
+    )
+    position, distance = transferred_landmarks(
+        capture, build_surfels(capture, spacing_mm=6.0)
+    )
+    # mm, of the scan's chords; what is farther from the cut scan was on a triangle that
+    # is gone
+    sag = 0.13
     given = np.array([*FACE.values()])
     away = np.linalg.norm(position - given, axis=1)
-    assert away[np.isfinite(away)].max() < 0.7  # 0.5 mm, and what subdivision moves points along the surface
+    # 0.5 mm, and what subdivision moves points along the surface
+    assert away[np.isfinite(away)].max() < 0.7
     np.testing.assert_array_equal(np.isnan(away), distance > 0.5 + sag)
     assert np.isnan(away)[list(FACE).index("nose_tip")]
     assert np.isfinite(away).any()
 
 
-def test_carried_landmarks__clicked_beside_the_scan_stay_where_they_are_not_cropped(capture_folder):
-    put_landmarks(capture_folder, {name: p * (1 + 6 / RADIUS) for name, p in FACE.items()})
+def test_carried_landmarks__clicked_beside_the_scan_stay_where_they_are_not_cropped(
+    capture_folder,
+):
+    put_landmarks(
+        capture_folder, {name: p * (1 + 6 / RADIUS) for name, p in FACE.items()}
+    )
     capture = read_capture(capture_folder, crop=Crop(low=(-99, -99, -99)))
-    position, distance = transferred_landmarks(capture, build_surfels(capture, spacing_mm=6.0))
+    position, distance = transferred_landmarks(
+        capture, build_surfels(capture, spacing_mm=6.0)
+    )
     assert np.isfinite(position).all()
     np.testing.assert_allclose(distance, 6, atol=0.13)
 
 
-def test_site_positions__lie_on_the_surface_though_the_landmark_was_clicked_beside_it(capture_folder):
+def test_site_positions__lie_on_the_surface_though_the_landmark_was_clicked_beside_it(
+    capture_folder,
+):
     lifted = FACE | {"forehead_centre": FACE["forehead_centre"] * (1 + 6 / RADIUS)}
     put_landmarks(capture_folder, lifted)
     capture = read_capture(capture_folder)
     surfels = build_surfels(capture, spacing_mm=6.0)
     (place,) = site_positions(capture, surfels, ("forehead",))
-    np.testing.assert_allclose(closest_on_mesh(surfels.position, surfels.faces, place[None])[2], 0, atol=1e-9)
-    assert np.linalg.norm(place - lifted["forehead_centre"]) == pytest.approx(6, abs=0.4)
+    np.testing.assert_allclose(
+        closest_on_mesh(surfels.position, surfels.faces, place[None])[2], 0, atol=1e-9
+    )
+    assert np.linalg.norm(place - lifted["forehead_centre"]) == pytest.approx(
+        6, abs=0.4
+    )
 
 
-def test_site_positions__where_the_scan_was_cropped_away_the_landmark_counts_as_given(capture_folder):
+def test_site_positions__where_the_scan_was_cropped_away_the_landmark_counts_as_given(
+    capture_folder,
+):
     put_landmarks(capture_folder, FACE)
     capture = read_capture(capture_folder, crop=Crop(high=(99, 20, 99)))
-    (place,) = site_positions(capture, build_surfels(capture, spacing_mm=6.0), ("forehead",))
+    (place,) = site_positions(
+        capture, build_surfels(capture, spacing_mm=6.0), ("forehead",)
+    )
     np.testing.assert_array_equal(place, FACE["forehead_centre"])
 
 
 def test_read_capture__landmarks_on_a_smaller_piece_of_the_scan(capture_folder):
-    """A second, larger object in the scan: it would be kept, and the face with its landmarks removed."""
+    """A second, larger object in the scan: it would be kept, and the face with its
+    landmarks removed.
+    """
     vertices, faces = half_sphere()
     other = 1.2 * vertices + [400, 0, 0]
-    put_scan(capture_folder, np.concatenate([vertices, other]), np.concatenate([faces, faces + len(vertices)]))
+    put_scan(
+        capture_folder,
+        np.concatenate([vertices, other]),
+        np.concatenate([faces, faces + len(vertices)]),
+    )
     (capture_folder / "regions.json").write_text("{}")
     put_landmarks(capture_folder, FACE)
-    rule = rf"largest component of the scan, which is kept; found {len(FACE)} of {len(FACE)} up to \d+ mm from it"
-    with pytest.raises(InputError, match=rf"{rule}, such as .*; remove everything from the scan"):
+    rule = (
+        rf"largest component of the scan, which is kept; found {len(FACE)} of "
+        rf"{len(FACE)} up to \d+ mm from it"
+    )
+    with pytest.raises(
+        InputError, match=rf"{rule}, such as .*; remove everything from the scan"
+    ):
         read_capture(capture_folder)
 
 
 def test_read_capture__a_file_without_landmarks_is_told(capture_folder):
     put_landmarks(capture_folder, {})
-    assert any(line.startswith("landmarks: none in the file") for line in read_capture(capture_folder).skipped)
+    assert any(
+        line.startswith("landmarks: none in the file")
+        for line in read_capture(capture_folder).skipped
+    )
 
 
-def test_ingest_capture__what_no_light_and_camera_reach_is_not_committed(capture_folder, tmp_path):
-    """A crop beside the face in the pictures: the rim of the half sphere, which no camera sees steeply."""
+def test_ingest_capture__what_no_light_and_camera_reach_is_not_committed(
+    capture_folder, tmp_path
+):
+    """A crop beside the face in the pictures: the rim of the half sphere, which no
+    camera sees steeply.
+    """
     db = Database(tmp_path / "db")
-    with pytest.raises(InputError, match=r"samples: a surfel must be lit .*; found none is; check the crop"):
-        ingest_take(db, capture_folder, crop=Crop(low=(-99, -99, -99), high=(99, -74, 99)), spacing_mm=4.0)
+    with pytest.raises(
+        InputError,
+        match=r"samples: a surfel must be lit .*; found none is; check the crop",
+    ):
+        ingest_take(
+            db,
+            capture_folder,
+            crop=Crop(low=(-99, -99, -99), high=(99, -74, 99)),
+            spacing_mm=4.0,
+        )
     assert db.takes("capture") == []
 
 
 def test_ingest_capture__a_database_is_not_kept_in_the_capture(capture_folder):
     for root in (capture_folder, capture_folder / "dome" / "db"):
-        with pytest.raises(InputError, match="a database lies outside the captures it holds"):
+        with pytest.raises(
+            InputError, match="a database lies outside the captures it holds"
+        ):
             ingest_take(Database(root), capture_folder)
 
 
-def test_ingest_capture__a_spacing_wider_than_the_scan_is_told(capture_folder, tmp_path):
+def test_ingest_capture__a_spacing_wider_than_the_scan_is_told(
+    capture_folder, tmp_path
+):
     record = ingest_take(Database(tmp_path / "db"), capture_folder, spacing_mm=1000.0)
     summary = record.provenance["summary"]
     (note,) = summary["notes"]
@@ -447,7 +626,9 @@ def test_ingest_capture__a_spacing_wider_than_the_scan_is_told(capture_folder, t
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
     assert summary["surfels"]["count"] == len(vertices)
-    assert summary["surfels"]["spacing_mm"] == pytest.approx(np.sqrt(area / len(vertices) * 2 / np.sqrt(3)), rel=1e-6)
+    assert summary["surfels"]["spacing_mm"] == pytest.approx(
+        np.sqrt(area / len(vertices) * 2 / np.sqrt(3)), rel=1e-6
+    )
 
 
 BOX = {"low": [-8, -8, 0], "high": [8, 8, 99]}
@@ -459,7 +640,8 @@ def test_read_capture__crops_by_the_box_beside_the_landmarks(capture_folder):
     by_file = read_capture(capture_folder)
     assert by_file.crop == by_option.crop
     np.testing.assert_array_equal(by_file.surface.vertices, by_option.surface.vertices)
-    assert capture_folder / "landmarks.crop.json" in by_file.json_files  # part of the digest of the inputs
+    # part of the digest of the inputs
+    assert capture_folder / "landmarks.crop.json" in by_file.json_files
     assert any("landmarks.crop.json" in line for line in by_file.skipped)
     near = read_capture(capture_folder, crop=Crop(reach_mm=30.0))
     assert near.crop == Crop(reach_mm=30.0)  # an option has priority over the file
@@ -472,7 +654,10 @@ def test_read_capture__crops_by_the_box_beside_the_landmarks(capture_folder):
         ("[]", "a crop box must be"),
         ('{"low": [1, 2], "high": [3, 4, 5]}', "a crop box must be"),
         ('{"low": [1, 1, 1], "high": [0, 0, 0]}', "lower corner must lie below"),
-        ('{"low": [900, 900, 900], "high": [901, 901, 901]}', "must leave a part of the scan"),
+        (
+            '{"low": [900, 900, 900], "high": [901, 901, 901]}',
+            "must leave a part of the scan",
+        ),
     ],
 )
 def test_read_capture__refuses_a_wrong_crop_file(capture_folder, content, message):
@@ -484,5 +669,7 @@ def test_read_capture__refuses_a_wrong_crop_file(capture_folder, content, messag
 def test_read_capture__refuses_a_crop_file_outside_the_folder(capture_folder, tmp_path):
     (tmp_path / "elsewhere.json").write_text(json.dumps(BOX))
     (capture_folder / "landmarks.crop.json").symlink_to(tmp_path / "elsewhere.json")
-    with pytest.raises(InputError, match="every path must stay inside the capture folder"):
+    with pytest.raises(
+        InputError, match="every path must stay inside the capture folder"
+    ):
         read_capture(capture_folder)

@@ -35,7 +35,13 @@ def put_all(target, rng):
     lights, cameras, n = target.shape
     content = rng.integers(0, 0x7C00, (lights, cameras, 3, n)).astype(np.uint16)
     for j, c in np.ndindex(lights, cameras):
-        target.put(j, c, content[j, c], np.full(n, (OK, SATURATED, DARK, NONE)[j + c], np.uint8), {f"{j}{c}": "d"})
+        target.put(
+            j,
+            c,
+            content[j, c],
+            np.full(n, (OK, SATURATED, DARK, NONE)[j + c], np.uint8),
+            {f"{j}{c}": "d"},
+        )
     return content
 
 
@@ -45,8 +51,11 @@ def test_spool__gives_back_what_was_put_by_shards(tmp_path):
         content = put_all(target, np.random.default_rng(1))
         lazy = target.samples()
         assert lazy.chunks[0] == (SHARD, SHARD, 17)
-        np.testing.assert_array_equal(lazy.compute().view(np.uint16), np.moveaxis(content, -1, 0))
-        assert target.counts[:, 0].tolist() == [1, 2, 2, 0]  # j + c = 0; 1, 1; 2, 2; and one with no sample
+        np.testing.assert_array_equal(
+            lazy.compute().view(np.uint16), np.moveaxis(content, -1, 0)
+        )
+        # j + c = 0; 1, 1; 2, 2; and one with no sample
+        assert target.counts[:, 0].tolist() == [1, 2, 2, 0]
         assert target.views.sum() == n
     assert not (tmp_path / "a").exists()
 
@@ -61,13 +70,21 @@ def interrupted(folder, frames, *, put):
 
 def interrupt(folder, frames, put, found):
     with Spool(folder, (2, 2, 5), frames, key="run") as target:
-        found += [target.done.tolist(), target.counts.tolist(), dict(target.digests), target.samples().compute()]
+        found += [
+            target.done.tolist(),
+            target.counts.tolist(),
+            dict(target.digests),
+            target.samples().compute(),
+        ]
         for view, bits in put.items():
             target.put(*view, bits, np.zeros(5, np.uint8), {"f": "x"})
         raise KeyboardInterrupt
 
 
-@pytest.mark.parametrize("spoil", [lambda b: b[:-40], lambda b: b[:60], lambda b: b"", lambda b: b"x" * len(b)])
+@pytest.mark.parametrize(
+    "spoil",
+    [lambda b: b[:-40], lambda b: b[:60], lambda b: b"", lambda b: b"x" * len(b)],
+)
 def test_spool__a_damaged_journal_is_no_journal(tmp_path, spoil):
     interrupted(tmp_path / "a", FRAMES, put={(1, 0): np.zeros((3, 5), np.uint16)})
     journal = tmp_path / "a/journal"
@@ -79,15 +96,23 @@ def test_spool__a_damaged_journal_is_no_journal(tmp_path, spoil):
 
 
 def test_ingest_capture__removes_nothing_of_its_callers(pristine, tmp_path):
-    """The scratch folder is the caller's: old neighbours and what else it holds stay, and its own folder goes."""
+    """The scratch folder is the caller's: old neighbours and what else it holds stay,
+    and its own folder goes.
+    """
     mine = tmp_path / "scratch/mine"
     mine.mkdir(parents=True)
     (mine / "thesis.tex").touch()
     os.utime(mine, (time.time() - 3 * STALE_SECONDS,) * 2)
     parameters = IngestParameters(spacing_mm=8.0)
-    with ingest_capture(read_capture(pristine), parameters, scratch=tmp_path / "scratch") as tree:
+    with ingest_capture(
+        read_capture(pristine), parameters, scratch=tmp_path / "scratch"
+    ) as tree:
         count = int(tree["samples/sample_count"].values.sum())
-        assert np.isfinite(tree["samples/reflectance_sample"].values).all(-1).sum() == count > 0
+        assert (
+            np.isfinite(tree["samples/reflectance_sample"].values).all(-1).sum()
+            == count
+            > 0
+        )
     assert [path.name for path in (tmp_path / "scratch").iterdir()] == ["mine"]
     assert (mine / "thesis.tex").exists()
 
@@ -96,15 +121,23 @@ def test_spool__samples_that_are_a_link_are_not_written(tmp_path):
     (tmp_path / "a").mkdir()
     (tmp_path / "victim").write_bytes(b"x" * 1000)
     (tmp_path / "a/samples").symlink_to(tmp_path / "victim")
-    with pytest.raises(OSError, match="symbolic link"), Spool(tmp_path / "a", (1, 1, 5), FRAMES, key="run"):
+    with (
+        pytest.raises(OSError, match="symbolic link"),
+        Spool(tmp_path / "a", (1, 1, 5), FRAMES, key="run"),
+    ):
         pass
     assert (tmp_path / "victim").stat().st_size == 1000
 
 
 @pytest.mark.parametrize("key", ["another", ""])
 def test_spool__what_another_run_sealed_is_not_trusted(tmp_path, key):
-    """A planted journal or note could name views that were never sampled, or files that are not its own."""
-    with suppress(KeyboardInterrupt), Spool(tmp_path / "a", (2, 2, 5), FRAMES, key=key) as target:
+    """A planted journal or note could name views that were never sampled, or files that
+    are not its own.
+    """
+    with (
+        suppress(KeyboardInterrupt),
+        Spool(tmp_path / "a", (2, 2, 5), FRAMES, key=key) as target,
+    ):
         target.put(1, 0, np.zeros((3, 5), np.uint16), np.zeros(5, np.uint8), {"f": "x"})
         target.keep("photograph", np.ones(3))
         target.checkpoint()
@@ -138,7 +171,10 @@ def test_spool__goes_on_from_its_journal_unless_frames_changed(tmp_path):
 
 
 def test_spool__begins_again_after_a_version_that_counted_less(tmp_path):
-    with suppress(KeyboardInterrupt), Spool(tmp_path / "a", (2, 2, 5), FRAMES, key="run") as target:
+    with (
+        suppress(KeyboardInterrupt),
+        Spool(tmp_path / "a", (2, 2, 5), FRAMES, key="run") as target,
+    ):
         target.put(1, 0, np.zeros((3, 5), np.uint16), np.zeros(5, np.uint8), {"f": "x"})
         target.counts = target.counts[:3]
         raise KeyboardInterrupt
@@ -148,7 +184,9 @@ def test_spool__begins_again_after_a_version_that_counted_less(tmp_path):
 
 
 def test_spool__an_older_note_never_replaces_a_newer_one(tmp_path, monkeypatch):
-    """Two threads note their views; the note of the first is held up until the other's is written, or in vain."""
+    """Two threads note their views; the note of the first is held up until the other's
+    is written, or in vain.
+    """
     monkeypatch.setattr("skindb.ingest.spool.JOURNAL_INTERVAL_SECONDS", 0.0)
     plain = Spool._replace
     begun = threading.Event()
@@ -190,7 +228,12 @@ def test_spool__removes_what_nobody_went_on_with(tmp_path):
         for path in (tmp_path / name, tmp_path / name / "journal"):
             os.utime(path, (time.time() - age,) * 2)
     with Spool(tmp_path / "new", (1, 1, 5), FRAMES, key="run"):
-        assert sorted(path.name for path in tmp_path.iterdir()) == ["new", "old", "young"]  # a spool minds its own
+        # a spool minds its own
+        assert sorted(path.name for path in tmp_path.iterdir()) == [
+            "new",
+            "old",
+            "young",
+        ]
     remove_stale(tmp_path / "new")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["young"]
 
@@ -232,11 +275,14 @@ def test_spool__a_journal_without_its_samples_is_not_believed(tmp_path, length):
 
 
 def test_spool__old_frames_come_back_after_samples_of_others_were_written(tmp_path):
-    """A, then B is killed before its first note, then A again: the view B wrote over must not count as one of A."""
+    """A, then B is killed before its first note, then A again: the view B wrote over
+    must not count as one of A.
+    """
     interrupted(tmp_path / "a", FRAMES, put={(1, 0): np.ones((3, 5), np.uint16)})
     script = "import os\nfrom skindb.ingest.spool import Spool\nimport numpy as np\n"
     script += (
-        f"target = Spool(__import__('pathlib').Path({str(tmp_path / 'a')!r}), (2, 2, 5), {{'a': [1, 3]}}, key='run')\n"
+        f"target = Spool(__import__('pathlib').Path({str(tmp_path / 'a')!r}), (2, 2, "
+        f"5), {{'a': [1, 3]}}, key='run')\n"
     )
     script += "target.__enter__()\ntarget._write(1, 0, np.zeros((3, 5), np.uint16))\nos._exit(9)"
     assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 9
@@ -277,7 +323,9 @@ def test_spool__samples_that_are_cut_off_are_an_error(tmp_path):
 
 
 @pytest.mark.parametrize("fails", ["ftruncate", "fstat"])
-def test_spool__lets_go_of_everything_when_it_cannot_begin(tmp_path, monkeypatch, fails):
+def test_spool__lets_go_of_everything_when_it_cannot_begin(
+    tmp_path, monkeypatch, fails
+):
     def full(*_):
         raise OSError(errno.ENOSPC, "no space")
 
@@ -286,10 +334,18 @@ def test_spool__lets_go_of_everything_when_it_cannot_begin(tmp_path, monkeypatch
     begin = os.open
     end = os.close
     with monkeypatch.context() as patch:
-        patch.setattr("skindb.ingest.spool.os.open", lambda *a: opened.append(begin(*a)) or opened[-1])
-        patch.setattr("skindb.ingest.spool.os.close", lambda one: closed.append(one) or end(one))
+        patch.setattr(
+            "skindb.ingest.spool.os.open",
+            lambda *a: opened.append(begin(*a)) or opened[-1],
+        )
+        patch.setattr(
+            "skindb.ingest.spool.os.close", lambda one: closed.append(one) or end(one)
+        )
         patch.setattr(f"skindb.ingest.spool.os.{fails}", full)
-        with pytest.raises(OSError, match="no space"), Spool(tmp_path / "a", (2, 2, 5), FRAMES, key="run"):
+        with (
+            pytest.raises(OSError, match="no space"),
+            Spool(tmp_path / "a", (2, 2, 5), FRAMES, key="run"),
+        ):
             pass
     assert len(opened) == (2 if fails == "ftruncate" else 1)
     assert sorted(closed) == sorted(opened)
@@ -297,16 +353,23 @@ def test_spool__lets_go_of_everything_when_it_cannot_begin(tmp_path, monkeypatch
         pass
 
 
-def test_spool__a_file_system_without_locks_is_not_another_process(tmp_path, monkeypatch):
+def test_spool__a_file_system_without_locks_is_not_another_process(
+    tmp_path, monkeypatch
+):
     def none(*_):
         raise OSError(errno.ENOLCK, "no locks available")
 
     monkeypatch.setattr("skindb.ingest.spool.fcntl.flock", none)
-    with pytest.raises(OSError, match="no locks available"), Spool(tmp_path / "a", (1, 1, 5), FRAMES, key="run"):
+    with (
+        pytest.raises(OSError, match="no locks available"),
+        Spool(tmp_path / "a", (1, 1, 5), FRAMES, key="run"),
+    ):
         pass
 
 
-def test_spool__the_lock_of_a_folder_that_was_removed_meanwhile_is_not_one(tmp_path, monkeypatch):
+def test_spool__the_lock_of_a_folder_that_was_removed_meanwhile_is_not_one(
+    tmp_path, monkeypatch
+):
     plain = fcntl.flock
     times = []
 
@@ -328,9 +391,15 @@ def whole(pristine, tmp_path_factory):
     return db.read("capture", "T001").load()
 
 
-@pytest.mark.parametrize("point", [("visibility", 1), ("sample", 3), ("sample", 8), ("write", 1)])
-def test_ingest_capture__killed_goes_on_where_it_was(pristine, tmp_path, monkeypatch, whole, point):
-    """Nothing is visible after the kill; the second run reads only the frames that lack and gives the same bits."""
+@pytest.mark.parametrize(
+    "point", [("visibility", 1), ("sample", 3), ("sample", 8), ("write", 1)]
+)
+def test_ingest_capture__killed_goes_on_where_it_was(
+    pristine, tmp_path, monkeypatch, whole, point
+):
+    """Nothing is visible after the kill; the second run reads only the frames that lack
+    and gives the same bits.
+    """
     db = Database(tmp_path / "db")
     read = []
 
@@ -344,13 +413,19 @@ def test_ingest_capture__killed_goes_on_where_it_was(pristine, tmp_path, monkeyp
     assert db.verify() == []
 
     plain = lumitexels.read_view
-    monkeypatch.setattr(lumitexels, "read_view", lambda *a, **k: read.append(a) or plain(*a, **k))
+    monkeypatch.setattr(
+        lumitexels, "read_view", lambda *a, **k: read.append(a) or plain(*a, **k)
+    )
     record = ingest_take(db, pristine, spacing_mm=8.0)
-    assert len(read) <= (8 if point[0] == "visibility" else 8 - point[1] if point[0] == "sample" else 0)
+    assert len(read) <= (
+        8 if point[0] == "visibility" else 8 - point[1] if point[0] == "sample" else 0
+    )
     take = db.read("capture", "T001")
     for group in ("samples", "surfels", "dome", "photographs"):
         for name, values in take[group].data_vars.items():
-            np.testing.assert_array_equal(values.values, whole[group][name].values, err_msg=name)
+            np.testing.assert_array_equal(
+                values.values, whole[group][name].values, err_msg=name
+            )
     assert take.attrs["inputs"] == whole.attrs["inputs"]
     assert record.provenance["summary"] == whole.attrs["summary"]
     assert list((tmp_path / "db/tmp").iterdir()) == []
@@ -376,15 +451,26 @@ ingest_take(Database(sys.argv[1]), sys.argv[2], spacing_mm=8.0, progress=die)
 
 @pytest.mark.slow
 @pytest.mark.parametrize("point", ["sample", "write"])
-def test_ingest_capture__survives_a_kill_without_goodbye(pristine, tmp_path, monkeypatch, whole, point):
-    """No `finally` is run: the lock falls with the process, the journal says what is done, written data are removed."""
+def test_ingest_capture__survives_a_kill_without_goodbye(
+    pristine, tmp_path, monkeypatch, whole, point
+):
+    """No `finally` is run: the lock falls with the process, the journal says what is
+    done, written data are removed.
+    """
     folder = tmp_path / "db"
-    assert subprocess.run([sys.executable, "-c", DIE, folder, pristine, point], check=False).returncode == 9
+    assert (
+        subprocess.run(
+            [sys.executable, "-c", DIE, folder, pristine, point], check=False
+        ).returncode
+        == 9
+    )
     db = Database(folder)
     read = []
     assert db.takes() == []
     plain = lumitexels.read_view
-    monkeypatch.setattr(lumitexels, "read_view", lambda *a, **k: read.append(a) or plain(*a, **k))
+    monkeypatch.setattr(
+        lumitexels, "read_view", lambda *a, **k: read.append(a) or plain(*a, **k)
+    )
     ingest_take(db, pristine, spacing_mm=8.0)
     assert len(read) <= (3 if point == "sample" else 0)
     found = db.read("capture", "T001")["samples"]
@@ -396,10 +482,19 @@ def test_ingest_capture__survives_a_kill_without_goodbye(pristine, tmp_path, mon
 
 @pytest.mark.parametrize(
     "planted",
-    ["../victim", "{tmp}/victim", "data/capture/OTHER/x.zarr", "data/capture/T001/../../../../victim", "\x00", ""],
+    [
+        "../victim",
+        "{tmp}/victim",
+        "data/capture/OTHER/x.zarr",
+        "data/capture/T001/../../../../victim",
+        "\x00",
+        "",
+    ],
 )
 def test_ingest_take__a_planted_note_removes_nothing(pristine, tmp_path, planted):
-    """What a killed ingest left may have been changed: nothing but data of this take that no record names may go."""
+    """What a killed ingest left may have been changed: nothing but data of this take
+    that no record names may go.
+    """
     db = Database(tmp_path / "db")
     victims = [tmp_path / "victim/file", tmp_path / "db/data/capture/OTHER/x.zarr/file"]
 
@@ -419,7 +514,9 @@ def test_ingest_take__a_planted_note_removes_nothing(pristine, tmp_path, planted
     assert db.takes() == ["T001"]
 
 
-def test_ingest_capture__a_frame_that_changed_is_read_again(capture_folder, tmp_path, whole):
+def test_ingest_capture__a_frame_that_changed_is_read_again(
+    capture_folder, tmp_path, whole
+):
     db = Database(tmp_path / "db")
 
     def killer(stage, step, _):

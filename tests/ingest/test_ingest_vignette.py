@@ -23,7 +23,8 @@ def test_fit_vignette__knows_its_error():
         fit = fit_vignette(flat_frame(np.random.default_rng(seed))[0], CENTRE)
         off = fit.coefficients - TRUE_VIGNETTE
         z.append(off @ np.linalg.solve(fit.covariance, off) / 3)
-    assert 0.6 < np.mean(z) < 1.4  # the mean of 60 chi squared of 3 degrees has a deviation of 0.105
+    # the mean of 60 chi squared of 3 degrees has a deviation of 0.105
+    assert 0.6 < np.mean(z) < 1.4
 
 
 def test_fit_vignette__withstands_dust_a_gradient_and_lost_pixels():
@@ -34,11 +35,18 @@ def test_fit_vignette__withstands_dust_a_gradient_and_lost_pixels():
     frame[:, 200:210] = np.nan
     frame += 5 * 0.05 * (column - CENTRE[0]) / 200
     a2, a4, a6 = fit_vignette(frame, CENTRE).coefficients
-    np.testing.assert_allclose(1 + r2 * (a2 + r2 * (a4 + r2 * a6)), gain, atol=0.005)  # half a per cent of the light
+    # half a per cent of the light
+    np.testing.assert_allclose(1 + r2 * (a2 + r2 * (a4 + r2 * a6)), gain, atol=0.005)
 
 
 @pytest.mark.parametrize(
-    "frame", [np.zeros((50, 60)), np.full((50, 60), np.nan), np.ones((50, 60, 3)), np.pad(np.ones((9, 12)), 20)]
+    "frame",
+    [
+        np.zeros((50, 60)),
+        np.full((50, 60), np.nan),
+        np.ones((50, 60, 3)),
+        np.pad(np.ones((9, 12)), 20),
+    ],
 )
 def test_fit_vignette__refuses_what_tells_nothing(frame):
     with pytest.raises(InputError, match="flat frame"):

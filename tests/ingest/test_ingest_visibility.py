@@ -32,7 +32,9 @@ def surfels(capture):
 
 
 def plate_with_wall(spacing=1.0):
-    """A plate of 41 x 41 points, `spacing` mm apart in x, 1 mm in y, and a wall of 5 mm height on it at x = 5.5."""
+    """A plate of 41 x 41 points, `spacing` mm apart in x, 1 mm in y, and a wall of 5 mm
+    height on it at x = 5.5.
+    """
     y, x = np.mgrid[-20:21, -20:21] * np.array([1, spacing])[:, None, None]
     plate = np.stack([x.ravel(), y.ravel(), np.zeros(41 * 41)], axis=1)
     cell = np.arange(40)[:, None] * 41 + np.arange(40)
@@ -43,9 +45,17 @@ def plate_with_wall(spacing=1.0):
     all_faces = np.concatenate([faces, [[n, n + 1, n + 2], [n + 1, n + 3, n + 2]]])
     normal = np.tile([0.0, 0, 1], (n, 1))
     one = np.ones(n)
-    return SurfelSet(plate, normal, one, one, plate[:, :2], faces, (), np.zeros((n, 0), bool), "intrinsic"), RayScene(
-        np.concatenate([plate, wall]), all_faces
-    )
+    return SurfelSet(
+        plate,
+        normal,
+        one,
+        one,
+        plate[:, :2],
+        faces,
+        (),
+        np.zeros((n, 0), bool),
+        "intrinsic",
+    ), RayScene(np.concatenate([plate, wall]), all_faces)
 
 
 def test_disc_points__have_the_moments_of_the_disc(capture):
@@ -59,12 +69,20 @@ def test_disc_points__have_the_moments_of_the_disc(capture):
 
 
 def test_light_visibility__shadow_and_penumbra_of_a_wall(capture):
-    """The wall's shadow ends where the line from the light over its edge meets the plate: 5 mm tan(angle)."""
+    """The wall's shadow ends where the line from the light over its edge meets the
+    plate: 5 mm tan(angle).
+    """
     surfels, scene = plate_with_wall()
-    light = replace(capture.dome.lights[0], position=np.array([400.0, 0, 400]), disc_radius=40.0)
+    light = replace(
+        capture.dome.lights[0], position=np.array([400.0, 0, 400]), disc_radius=40.0
+    )
     light = replace(light, axis=-light.position / np.linalg.norm(light.position))
     with ThreadPoolExecutor(1) as pool:
-        share = light_visibility(surfels, [light], scene, pool)[:, 0].reshape(41, 41)[20].astype(float)
+        share = (
+            light_visibility(surfels, [light], scene, pool)[:, 0]
+            .reshape(41, 41)[20]
+            .astype(float)
+        )
     x = np.arange(-20, 21)
     # towards (400, 0, 400) the light over the edge (5.5, 5) leaves the plate at x = 0.4
     assert (share[(x > 2) & (x <= 5)] == 0).all()
@@ -77,19 +95,35 @@ def test_light_visibility__shadow_and_penumbra_of_a_wall(capture):
 
 
 def disc_above(edge, point, light):
-    """Fraction of a light's disc beyond the plane through a point and the line (x, ., z): a segment of the circle."""
+    """Fraction of a light's disc beyond the plane through a point and the line (x, .,
+    z): a segment of the circle.
+    """
     normal = np.cross(np.array([edge[0], 0, edge[1]]) - point, [0, 1, 0])
     normal *= np.sign(normal[2])
     in_plane = normal - (normal @ light.axis) * light.axis
-    h = np.clip(normal @ (light.position - point) / np.linalg.norm(in_plane) / light.disc_radius, -1, 1)
+    h = np.clip(
+        normal
+        @ (light.position - point)
+        / np.linalg.norm(in_plane)
+        / light.disc_radius,
+        -1,
+        1,
+    )
     return 1 - (np.arccos(h) - h * np.sqrt(1 - h * h)) / np.pi
 
 
 def test_light_visibility__share_of_the_disc_beside_a_wall(capture):
-    """Five points of equal weight: off by 0.3 where three of them meet the edge at once, by 0.1 in the mean."""
+    """Five points of equal weight: off by 0.3 where three of them meet the edge at
+    once, by 0.1 in the mean.
+    """
     surfels, scene = plate_with_wall(0.1)
     direction = np.array([np.sqrt(0.5), 0, np.sqrt(0.5)])
-    light = replace(capture.dome.lights[0], position=560 * direction, disc_radius=40.0, axis=-direction)
+    light = replace(
+        capture.dome.lights[0],
+        position=560 * direction,
+        disc_radius=40.0,
+        axis=-direction,
+    )
     with ThreadPoolExecutor(1) as pool:
         share = light_visibility(surfels, [light], scene, pool)[:, 0].astype(float)
     at = np.flatnonzero(np.abs(surfels.position[:, 1]) < 10)
@@ -113,21 +147,42 @@ def head_and_places(count):
     normal = vertex_normals(position, faces)
     radius = splat_radius(position, faces)
     surfels = SurfelSet(
-        position, normal, one, radius, position[:, :2], faces, (), np.zeros((len(order), 0), bool), "intrinsic"
+        position,
+        normal,
+        one,
+        radius,
+        position[:, :2],
+        faces,
+        (),
+        np.zeros((len(order), 0), bool),
+        "intrinsic",
     )
     direction = np.random.default_rng(5).normal(size=(count, 3)) + np.array([0, 0, 1])
-    return surfels, RayScene(position, faces), 700 * direction / np.linalg.norm(direction, axis=1)[:, None]
+    return (
+        surfels,
+        RayScene(position, faces),
+        700 * direction / np.linalg.norm(direction, axis=1)[:, None],
+    )
 
 
 def test_light_visibility__asks_all_points_of_the_disc_wherever_they_differ(capture):
     """At most 1 share in 10,000 differs from the mean of all five points at every surfel."""
     surfels, scene, places = head_and_places(8)
-    lights = [replace(capture.dome.lights[0], position=p, axis=-p / 700, disc_radius=20.0) for p in places]
+    lights = [
+        replace(capture.dome.lights[0], position=p, axis=-p / 700, disc_radius=20.0)
+        for p in places
+    ]
     with ThreadPoolExecutor(2) as pool:
         share = light_visibility(surfels, lights, scene, pool)
-    facing = np.stack([((p - surfels.position) * surfels.normal).sum(axis=1) > 0 for p in places], axis=1)
+    facing = np.stack(
+        [((p - surfels.position) * surfels.normal).sum(axis=1) > 0 for p in places],
+        axis=1,
+    )
     seen = [
-        [~scene.occluded(surfels.position, point[None], normal=surfels.normal) for point in disc_points(light)]
+        [
+            ~scene.occluded(surfels.position, point[None], normal=surfels.normal)
+            for point in disc_points(light)
+        ]
         for light in lights
     ]
     expected = np.where(facing, np.mean(seen, axis=1).T, 0).astype(np.float16)
@@ -135,25 +190,39 @@ def test_light_visibility__asks_all_points_of_the_disc_wherever_they_differ(capt
     assert (share != expected).sum() < 1e-4 * share.size
 
 
-def test_light_visibility__finds_a_penumbra_with_no_shadow_of_the_centre_beside_it(capture):
-    """A roof whose shadow by the disc's centre misses the plate, and by one point of its rim does not."""
+def test_light_visibility__finds_a_penumbra_with_no_shadow_of_the_centre_beside_it(
+    capture,
+):
+    """A roof whose shadow by the disc's centre misses the plate, and by one point of
+    its rim does not.
+    """
     surfels, _ = plate_with_wall()
     roof = np.array([[22, -10, 280], [30, -10, 280], [22, 10, 280], [30, 10, 280.0]])
-    faces = np.concatenate([surfels.faces, len(surfels.position) + np.array([[0, 1, 2], [1, 3, 2]])])
+    faces = np.concatenate(
+        [surfels.faces, len(surfels.position) + np.array([[0, 1, 2], [1, 3, 2]])]
+    )
     scene = RayScene(np.concatenate([surfels.position, roof]), faces)
-    light = replace(capture.dome.lights[0], position=np.array([0, 0, 560.0]), disc_radius=40.0)
+    light = replace(
+        capture.dome.lights[0], position=np.array([0, 0, 560.0]), disc_radius=40.0
+    )
     light = replace(light, axis=np.array([0, 0, -1.0]))
     with ThreadPoolExecutor(1) as pool:
         share = light_visibility(surfels, [light], scene, pool)[:, 0].reshape(41, 41)
-    # the point sqrt 0.6 of 40 mm to the right throws the roof's edge at 22 mm to 2 * 22 - 31 = 13.02 mm
+    # the point sqrt 0.6 of 40 mm to the right throws the roof's edge at 22 mm to 2 * 22
+    # - 31 = 13.02 mm
     expected = np.where(np.arange(-20, 21) > 13.02, 0.8, 1).astype(np.float16)
     np.testing.assert_array_equal(share[1:-1], np.tile(expected, (39, 1)))
 
 
 def test_light_visibility__the_two_methods_agree_away_from_edges(capture):
-    """99.8 % of the surfels that are steeper than cos 0.1 and farther than 3 rings from the edge of a shadow."""
+    """99.8 % of the surfels that are steeper than cos 0.1 and farther than 3 rings from
+    the edge of a shadow.
+    """
     surfels, scene, places = head_and_places(8)
-    lights = [replace(capture.dome.lights[0], position=p, axis=-p / 700, disc_radius=0.0) for p in places]
+    lights = [
+        replace(capture.dome.lights[0], position=p, axis=-p / 700, disc_radius=0.0)
+        for p in places
+    ]
     with ThreadPoolExecutor(2) as pool:
         rays = light_visibility(surfels, lights, scene, pool)
         splats = light_visibility(surfels, lights, scene, pool, method="splats")
@@ -162,7 +231,10 @@ def test_light_visibility__the_two_methods_agree_away_from_edges(capture):
     dark = rays == 0
     for _ in range(4):
         lit, dark = (
-            np.stack([grown(surfels.faces, np.ascontiguousarray(one)) for one in mask.T], axis=1)
+            np.stack(
+                [grown(surfels.faces, np.ascontiguousarray(one)) for one in mask.T],
+                axis=1,
+            )
             for mask in (lit, dark)
         )
     way = places[None] - surfels.position[:, None]
@@ -174,7 +246,9 @@ def test_light_visibility__the_two_methods_agree_away_from_edges(capture):
 
 def test_light_visibility__refuses_another_method(surfels, capture):
     with pytest.raises(ValueError, match='"rays" or "splats", not \'guess\''):
-        light_visibility(surfels, [], RayScene(surfels.position, surfels.faces), None, method="guess")
+        light_visibility(
+            surfels, [], RayScene(surfels.position, surfels.faces), None, method="guess"
+        )
 
 
 def test_light_visibility__half_sphere_sees_by_its_normal(surfels, capture):
@@ -200,8 +274,13 @@ def test_camera_visibility__keeps_off_silhouettes_and_the_border(surfels, captur
     # the outline of the sphere is where the line of sight is a tangent
     eye = np.array([0, 30.0, 400])
     way = surfels.position - eye
-    sine = np.linalg.norm(np.cross(way / np.linalg.norm(way, axis=1)[:, None], eye / np.linalg.norm(eye)), axis=1)
-    rim_px = (np.tan(np.arcsin(RADIUS / np.linalg.norm(eye))) - np.tan(np.arcsin(sine))) * camera.K[0, 0]
+    sine = np.linalg.norm(
+        np.cross(way / np.linalg.norm(way, axis=1)[:, None], eye / np.linalg.norm(eye)),
+        axis=1,
+    )
+    rim_px = (
+        np.tan(np.arcsin(RADIUS / np.linalg.norm(eye))) - np.tan(np.arcsin(sine))
+    ) * camera.K[0, 0]
     # a circle of 1.5 px cut 0.4 px off its middle always holds a pixel centre
     assert not clear[(rim_px < 0.4) & (pixels[:, 0, 1] > 3), 0].any()
     inner = (rim_px > 4) & (visible[:, 0] == 1) & (surfels.position[:, 2] > 10)
@@ -219,7 +298,8 @@ def test_camera_visibility__keeps_off_a_step_in_depth(capture):
     visible = visible[row, 0] == 1
     clear = clear[row, 0]
     x = np.arange(-20, 21)
-    # the line over the edge (5.5, 5) meets the plate at 5.5 + 5 * 65.5 / 75 = 9.87; a pixel is 0.6 mm wide
+    # the line over the edge (5.5, 5) meets the plate at 5.5 + 5 * 65.5 / 75 = 9.87; a
+    # pixel is 0.6 mm wide
     np.testing.assert_array_equal(visible, (x < 5.5) | (x > 9.87))
     assert not clear[x == 10].any()
     assert clear[((x > -18) & (x < 3)) | ((x > 11) & (x < 18))].all()
@@ -228,9 +308,13 @@ def test_camera_visibility__keeps_off_a_step_in_depth(capture):
 def clear_twin(camera, scene, points, normals, pixels):
     """Pixels round each point, one offset at a time, against depths that are exact."""
     row, column = np.indices((camera.height, camera.width))
-    rays = pixel_rays(np.stack([column, row], axis=-1) + 0.5, camera.K, camera.R, camera.distortion)
+    rays = pixel_rays(
+        np.stack([column, row], axis=-1) + 0.5, camera.K, camera.R, camera.distortion
+    )
     eye = camera_centre(camera.R, camera.t)
-    distance = scene.first_hit(np.broadcast_to(eye, (row.size, 3)), rays.reshape(-1, 3))[2].reshape(row.shape)
+    distance = scene.first_hit(
+        np.broadcast_to(eye, (row.size, 3)), rays.reshape(-1, 3)
+    )[2].reshape(row.shape)
     own = np.linalg.norm(points - eye, axis=1)
     level = ((points - eye) * normals).sum(axis=1)
     first = np.floor(pixels - 0.5).astype(int)
@@ -239,7 +323,9 @@ def clear_twin(camera, scene, points, normals, pixels):
         x = first[:, 0] + dx
         y = first[:, 1] + dy
         near = np.hypot(x + 0.5 - pixels[:, 0], y + 0.5 - pixels[:, 1]) <= 1.5
-        at = np.flatnonzero(near & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height))
+        at = np.flatnonzero(
+            near & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
+        )
         foretold = level[at] / (rays[y[at], x[at]] * normals[at]).sum(axis=1)
         found = distance[y[at], x[at]]
         width = own[at] / np.sqrt(camera.K[0, 0] * camera.K[1, 1])
@@ -248,7 +334,9 @@ def clear_twin(camera, scene, points, normals, pixels):
     return clear
 
 
-@pytest.mark.parametrize("distortion", [(0, 0, 0, 0, 0), (-0.1, 0.07, -5e-4, -3e-3, -0.05)])
+@pytest.mark.parametrize(
+    "distortion", [(0, 0, 0, 0, 0), (-0.1, 0.07, -5e-4, -3e-3, -0.05)]
+)
 def test_camera_visibility__clear_pixels_by_a_twin(surfels, capture, distortion):
     with_wall, wall_scene = plate_with_wall()
     R, t = look_at([-60, 0, 80])
@@ -261,7 +349,9 @@ def test_camera_visibility__clear_pixels_by_a_twin(surfels, capture, distortion)
         with ThreadPoolExecutor(1) as pool:
             visible, clear, _ = camera_visibility(what, [camera], where, pool)
         at = np.flatnonzero(visible[:, 0])
-        pixels, _ = project(what.position[at], camera.K, camera.R, camera.t, camera.distortion)
+        pixels, _ = project(
+            what.position[at], camera.K, camera.R, camera.t, camera.distortion
+        )
         expected = clear_twin(camera, where, what.position[at], what.normal[at], pixels)
         np.testing.assert_array_equal(clear[at, 0], expected)
         assert 0.1 < expected.mean() < 0.99
@@ -270,10 +360,14 @@ def test_camera_visibility__clear_pixels_by_a_twin(surfels, capture, distortion)
 @pytest.mark.parametrize("method", ["rays", "splats"])
 def test_visibility__from_inside_the_head_nothing_is_seen(surfels, capture, method):
     scene = RayScene(surfels.position, surfels.faces)
-    camera = replace(capture.dome.cameras[0], t=-capture.dome.cameras[0].R @ np.array([0, 5.0, 20]))
+    camera = replace(
+        capture.dome.cameras[0], t=-capture.dome.cameras[0].R @ np.array([0, 5.0, 20])
+    )
     light = replace(capture.dome.lights[0], position=np.array([0, 5.0, 20]))
     with ThreadPoolExecutor(1) as pool:
-        visible, clear, _ = camera_visibility(surfels, [camera], scene, pool, method=method)
+        visible, clear, _ = camera_visibility(
+            surfels, [camera], scene, pool, method=method
+        )
         share = light_visibility(surfels, [light], scene, pool, method=method)
     assert not visible.any()
     assert not clear.any()
@@ -286,26 +380,49 @@ def test_visibility__one_triangle(capture, method):
     one = np.ones(3)
     normal = np.array([[0, 0, 1.0], [0, 0, 1], [np.nan, 0, 1]])
     faces = np.array([[0, 1, 2]])
-    surfels = SurfelSet(position, normal, one, 0 * one, position[:, :2], faces, (), np.zeros((3, 0), bool), "intrinsic")
+    surfels = SurfelSet(
+        position,
+        normal,
+        one,
+        0 * one,
+        position[:, :2],
+        faces,
+        (),
+        np.zeros((3, 0), bool),
+        "intrinsic",
+    )
     scene = RayScene(position, faces)
     with ThreadPoolExecutor(1) as pool:
-        visible, _, _ = camera_visibility(surfels, capture.dome.cameras[:1], scene, pool, method=method)
-        share = light_visibility(surfels, capture.dome.lights[:1], scene, pool, method=method)
+        visible, _, _ = camera_visibility(
+            surfels, capture.dome.cameras[:1], scene, pool, method=method
+        )
+        share = light_visibility(
+            surfels, capture.dome.lights[:1], scene, pool, method=method
+        )
     assert visible[:, 0].tolist() == [1, 1, 0]
     assert share[:, 0].tolist() == [1, 1, 0]
 
 
-@pytest.mark.parametrize(("spacing", "levels"), [(20.0, 0), (5.0, 0), (2.5, 1), (1.25, 2)])
+@pytest.mark.parametrize(
+    ("spacing", "levels"), [(20.0, 0), (5.0, 0), (2.5, 1), (1.25, 2)]
+)
 def test_subdivision_levels__nearest_to_the_spacing_wanted(capture, spacing, levels):
     assert subdivision_levels(capture.surface, spacing) == levels
 
 
 def test_subdivision_levels__says_what_is_too_fine(capture):
-    with pytest.raises(InputError, match=r"at most 2,500,000 surfels; found 0\.05 mm.*choose (0\.\d+) mm") as caught:
+    with pytest.raises(
+        InputError,
+        match=r"at most 2,500,000 surfels; found 0\.05 mm.*choose (0\.\d+) mm",
+    ) as caught:
         subdivision_levels(capture.surface, 0.05)
     finest = float(str(caught.value).split("choose ")[1].split(" mm")[0])
     levels = subdivision_levels(capture.surface, finest)
-    assert len(capture.surface.vertices) * 4**levels <= 2_500_000 < len(capture.surface.vertices) * 4 ** (levels + 1)
+    assert (
+        len(capture.surface.vertices) * 4**levels
+        <= 2_500_000
+        < len(capture.surface.vertices) * 4 ** (levels + 1)
+    )
 
 
 def test_subdivision_levels__the_scan_alone_may_be_too_fine(capture, monkeypatch):
@@ -313,7 +430,9 @@ def test_subdivision_levels__the_scan_alone_may_be_too_fine(capture, monkeypatch
     monkeypatch.setattr("skindb.ingest.surfels.MAX_SURFELS", count)
     assert subdivision_levels(capture.surface, 20.0) == 0
     monkeypatch.setattr("skindb.ingest.surfels.MAX_SURFELS", count - 1)
-    with pytest.raises(InputError, match=rf"found {count:,} vertices of the scan.*decimate the scan"):
+    with pytest.raises(
+        InputError, match=rf"found {count:,} vertices of the scan.*decimate the scan"
+    ):
         subdivision_levels(capture.surface, 20.0)
 
 

@@ -35,7 +35,9 @@ def test_nmf__two_runs_agree():
 
 
 def test_nmf__the_same_generator_gives_the_same_bits():
-    """The start by singular vectors needs random numbers too, but does not use the global random state."""
+    """The start by singular vectors needs random numbers too, but does not use the
+    global random state.
+    """
     X, _ = _planted(2)
     found = []
     for state in (1, 2):
@@ -54,7 +56,9 @@ def test_nmf__metric_of_identity_changes_nothing():
 def _brdfs():
     """59 collinear lobes (200, 59) in 200 directions, and their Gram matrix."""
     angle = np.linspace(0, np.pi / 2, 200)[:, None]
-    lobes = np.exp(-((angle / np.linspace(0.08, 1.2, 59)) ** 2)) / np.linspace(0.08, 1.2, 59)
+    lobes = np.exp(-((angle / np.linspace(0.08, 1.2, 59)) ** 2)) / np.linspace(
+        0.08, 1.2, 59
+    )
     return lobes, lobes.T @ lobes
 
 
@@ -71,20 +75,25 @@ def test_nmf__error_is_that_of_what_is_returned(in_metric):
     X *= np.random.default_rng(0).lognormal(0, 0.3, X.shape)
     found = nmf(X, 3, metric=gram if in_metric else None, rng=np.random.default_rng(1))
     # two solvers of the same convex problems: rounding times the condition of the Gram matrix
-    assert found.error == pytest.approx(_error(X, found.H, lobes if in_metric else np.eye(59)), rel=1e-5)
+    assert found.error == pytest.approx(
+        _error(X, found.H, lobes if in_metric else np.eye(59)), rel=1e-5
+    )
 
 
 @pytest.mark.parametrize("k", [4, 6, 8])
 def test_nmf__in_metric_the_planted_brdfs_are_spanned(k):
     lobes, gram = _brdfs()
     X, H = _planted(5, n=400, m=59, k=k)
-    X *= np.random.default_rng(0).lognormal(0, 0.2, X.shape)  # weights of collinear columns scatter
+    # weights of collinear columns scatter
+    X *= np.random.default_rng(0).lognormal(0, 0.2, X.shape)
     plain = nmf(X, k, rng=np.random.default_rng(1))
     runs = [nmf(X, k, metric=gram, rng=np.random.default_rng(s)) for s in (1, 2)]
-    assert runs[0].error < 0.95 * _error(X, plain.H, lobes)  # a descent from the same starts
+    # a descent from the same starts
+    assert runs[0].error < 0.95 * _error(X, plain.H, lobes)
     for run in runs:
         angle = np.arcsin(np.minimum([_error(h[None], run.H, lobes) for h in H], 1.0))
-        assert np.degrees(angle.max()) < 1.5  # from planted BRDFs to the cone found; twice the measured value
+        # from planted BRDFs to the cone found; twice the measured value
+        assert np.degrees(angle.max()) < 1.5
     # what agrees between seeds are the BRDFs each cone spans, not the coefficients
     assert max(_error(h[None], runs[1].H, lobes) for h in runs[0].H) < 0.1
 
@@ -94,7 +103,9 @@ def test_nmf__bad_input():
         nmf(-np.ones((4, 4)), 2, rng=np.random.default_rng(0))
     with pytest.raises(ValueError, match="k = 9"):
         nmf(np.ones((4, 4)), 9, rng=np.random.default_rng(0))
-    np.testing.assert_allclose(nmf(np.zeros((4, 4)), 2, rng=np.random.default_rng(0)).H, 0.25)
+    np.testing.assert_allclose(
+        nmf(np.zeros((4, 4)), 2, rng=np.random.default_rng(0)).H, 0.25
+    )
 
 
 @pytest.mark.parametrize("in_metric", [False, True])
@@ -108,20 +119,26 @@ def test_sums__parts_give_the_error_of_the_whole(in_metric):
     assert total.count == 300
     np.testing.assert_allclose(total.total, X.sum(axis=0))
     # two solvers of the same convex problems, see above
-    assert total.error(H, A) == pytest.approx(_error(X, H, lobes if in_metric else np.eye(59)), rel=1e-5)
+    assert total.error(H, A) == pytest.approx(
+        _error(X, H, lobes if in_metric else np.eye(59)), rel=1e-5
+    )
     assert total.mean().error(H, A) == pytest.approx(total.error(H, A))
     assert (parts[1]).mean().error(H, A) == 0.0  # of no take
 
 
 @pytest.mark.parametrize("in_metric", [False, True])
 def test_refine__never_worse_and_level_with_all_in_memory(in_metric):
-    """From the factorisation of a tenth of the surfels to that of all; the tolerance of the stop is 0.1 %."""
+    """From the factorisation of a tenth of the surfels to that of all; the tolerance of
+    the stop is 0.1 %.
+    """
     _, gram = _brdfs()
     X, _ = _planted(7, n=600, m=59, k=6)
     X *= np.random.default_rng(0).lognormal(0, 0.3, X.shape)
     A, metric = (gram, gram) if in_metric else (np.eye(59), None)
     start = nmf(X[:60], 5, metric=metric, rng=np.random.default_rng(1)).H
-    H, sums, errors = refine(start, lambda H: [Sums.of(X[:99], H, A) + Sums.of(X[99:], H, A)], A)
+    H, sums, errors = refine(
+        start, lambda H: [Sums.of(X[:99], H, A) + Sums.of(X[99:], H, A)], A
+    )
     assert (np.diff(errors) < 0).all()
     assert errors[0] == pytest.approx(relative_error(X, start, A), rel=1e-6)
     assert errors[-1] == pytest.approx(relative_error(X, H, A), rel=1e-6)
@@ -140,6 +157,10 @@ def test_refine__groups_count_alike():
     A = np.eye(12)
     start = nmf(X, 2, rng=np.random.default_rng(1)).H
     once = refine(start, lambda H: [Sums.of(X[:50], H, A), Sums.of(X[50:], H, A)], A)
-    often = refine(start, lambda H: [Sums.of(X[:50], H, A), Sums.of(np.tile(X[50:], (20, 1)), H, A)], A)
+    often = refine(
+        start,
+        lambda H: [Sums.of(X[:50], H, A), Sums.of(np.tile(X[50:], (20, 1)), H, A)],
+        A,
+    )
     np.testing.assert_allclose(once[2], often[2], rtol=1e-9)
     np.testing.assert_allclose(once[0], often[0], atol=1e-9)

@@ -1,4 +1,6 @@
-"""Distances between groups compared with SciPy and scikit-learn; calibration over null cohorts, and power."""
+"""Distances between groups compared with SciPy and scikit-learn; calibration over null
+cohorts, and power.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,11 @@ from scipy import stats
 from scipy.spatial.distance import pdist, squareform
 from sklearn.decomposition import PCA
 
-from skindb.numerics.group_distance import between_groups_p, classical_scaling, within_subjects_p
+from skindb.numerics.group_distance import (
+    between_groups_p,
+    classical_scaling,
+    within_subjects_p,
+)
 
 COHORTS = 200
 SHAPE = np.geomspace(1, 0.1, 6)  # spread along each coordinate
@@ -21,7 +27,9 @@ def _statistic(x, y):
 
 def _null(sizes, spreads, seed):
     rng = np.random.default_rng([41, seed])
-    groups = [s * SHAPE * rng.normal(size=(n, 6)) for n, s in zip(sizes, spreads, strict=True)]
+    groups = [
+        s * SHAPE * rng.normal(size=(n, 6)) for n, s in zip(sizes, spreads, strict=True)
+    ]
     return np.concatenate(groups), np.repeat(np.arange(len(sizes)), sizes), rng
 
 
@@ -35,7 +43,11 @@ def test_between_groups_p__is_scipy_s_permutation_test():
         return _statistic(y[np.asarray(a, int)], y[np.asarray(b, int)])
 
     want = stats.permutation_test(
-        (np.arange(5), np.arange(5, 11)), of_rows, vectorized=False, alternative="greater", n_resamples=np.inf
+        (np.arange(5), np.arange(5, 11)),
+        of_rows,
+        vectorized=False,
+        alternative="greater",
+        n_resamples=np.inf,
     )
     np.testing.assert_allclose(statistic, want.statistic, rtol=1e-10)
     assert count == 461
@@ -59,7 +71,8 @@ def test_within_subjects_p__is_scipy_s_test_of_paired_samples():
     (statistic,), (p,), count = within_subjects_p(y, most=10_000, rng=rng)
 
     def of_rows(a, b):
-        d = np.asarray(a, int) - np.asarray(b, int)  # +1 where a subject is exchanged, else -1
+        # +1 where a subject is exchanged, else -1
+        d = np.asarray(a, int) - np.asarray(b, int)
         d = np.sign(d)[:, None] * (y[:, 0] - y[:, 1])
         return (d.mean(axis=0) ** 2).sum() / (d.var(axis=0, ddof=1).sum() / len(d))
 
@@ -78,11 +91,22 @@ def test_within_subjects_p__is_scipy_s_test_of_paired_samples():
 
 @pytest.mark.parametrize(
     ("sizes", "spreads"),
-    [((20, 20), (1, 1)), ((8, 24), (1, 1)), ((8, 24), (3, 1)), ((8, 24), (1, 3)), ((10, 10, 20), (1, 1, 1))],
+    [
+        ((20, 20), (1, 1)),
+        ((8, 24), (1, 1)),
+        ((8, 24), (3, 1)),
+        ((8, 24), (1, 3)),
+        ((10, 10, 20), (1, 1, 1)),
+    ],
 )
 def test_between_groups_p__is_uniform_where_groups_do_not_differ(sizes, spreads):
     """p of the largest statistic of all pairs; also of groups of unequal sizes and spreads."""
-    p = np.array([between_groups_p(y, g, most=199, rng=rng)[1].min() for y, g, rng in _cohorts(sizes, spreads)])
+    p = np.array(
+        [
+            between_groups_p(y, g, most=199, rng=rng)[1].min()
+            for y, g, rng in _cohorts(sizes, spreads)
+        ]
+    )
     assert stats.kstest(p, "uniform").pvalue > 0.001  # fails one seed in a thousand
     assert (p <= 0.05).mean() < 0.10  # 200 cohorts: 5 % and three standard deviations
 
@@ -105,7 +129,9 @@ def test_within_subjects_p__is_uniform_where_conditions_do_not_differ():
 
 
 def test_between_groups_p__finds_what_is_planted():
-    """A step of 1.2 standard deviations along one of six coordinates, 15 and 25 subjects: 80 % of 100 cohorts."""
+    """A step of 1.2 standard deviations along one of six coordinates, 15 and 25
+    subjects: 80 % of 100 cohorts.
+    """
     found = []
     for seed in range(100):
         y, group, rng = _null((15, 25), (1, 1), seed)
@@ -117,10 +143,17 @@ def test_between_groups_p__finds_what_is_planted():
 def test_between_groups_p__without_any_scatter():
     """Identical subjects within groups: the largest statistic there is, and the smallest p."""
     y = np.repeat([[0.1, 0.2], [0.3, 0.2]], 4, axis=0)
-    (statistic,), (p,), count = between_groups_p(y, np.repeat([0, 1], 4), most=1000, rng=np.random.default_rng(0))
+    (statistic,), (p,), count = between_groups_p(
+        y, np.repeat([0, 1], 4), most=1000, rng=np.random.default_rng(0)
+    )
     assert statistic == np.inf
     assert (count, p) == (69, 2 / 70)
-    same = between_groups_p(np.full((8, 2), 0.1), np.repeat([0, 1], 4), most=1000, rng=np.random.default_rng(0))
+    same = between_groups_p(
+        np.full((8, 2), 0.1),
+        np.repeat([0, 1], 4),
+        most=1000,
+        rng=np.random.default_rng(0),
+    )
     assert (same[0][0], same[1][0]) == (0.0, 1.0)
 
 
@@ -131,9 +164,13 @@ def test_classical_scaling__is_the_principal_component_analysis():
     want = PCA(5).fit(x)
     score = want.transform(x)[:, :2]
     np.testing.assert_allclose(np.abs(place), np.abs(score), atol=1e-10)
-    np.testing.assert_allclose(explained, want.explained_variance_ratio_[:2], rtol=1e-10)
+    np.testing.assert_allclose(
+        explained, want.explained_variance_ratio_[:2], rtol=1e-10
+    )
     left = squareform(pdist(score)) - distance
-    np.testing.assert_allclose(error, np.sqrt((left**2).mean() / (distance**2).mean()), rtol=1e-10)
+    np.testing.assert_allclose(
+        error, np.sqrt((left**2).mean() / (distance**2).mean()), rtol=1e-10
+    )
     flat = classical_scaling(squareform(pdist(x[:, :2])))
     assert flat[2] < 1e-12
     one = classical_scaling(np.array([[0.0, 2.0], [2.0, 0.0]]))

@@ -1,4 +1,6 @@
-"""nnls compared with SciPy's dense solver and a general minimiser, and on extremes that must give a status."""
+"""nnls compared with SciPy's dense solver and a general minimiser, and on extremes that
+must give a status.
+"""
 
 from __future__ import annotations
 
@@ -9,11 +11,15 @@ from scipy.optimize import minimize, nnls
 from skindb.numerics import _nnls_kernels, _reflectance_kernels, _weight_error_kernels
 from skindb.numerics.nnls import fit_reflectance, solve_nnls
 
-ROUNDING = 1e-7  # normal equations square the condition number: residuals agree to the root of the rounding error
+# normal equations square the condition number: residuals agree to the root of the
+# rounding error
+ROUNDING = 1e-7
 
 
 def _as_fits_give(values):
-    """Part of a larger array in single precision, as in the fit of a face, so that no other version is compiled."""
+    """Part of a larger array in single precision, as in the fit of a face, so that no
+    other version is compiled.
+    """
     wide = np.zeros((values.shape[0], values.shape[1] + 1), np.float32)
     wide[:, :-1] = values
     return wide[:, :-1]
@@ -24,12 +30,22 @@ def _problem(seed: int, n: int = 60, m: int = 9):
     rows = rng.uniform(0.0, 1.0, (n, m)).astype(np.float32)
     x = np.where(rng.random(m) < 0.5, rng.uniform(0, 1, m), 0)
     clean = rows.astype(np.float64) @ x
-    return rows, clean[:, None] * (1 + 0.1 * rng.normal(size=(n, 3))) + 0.02 * rng.normal(size=(n, 3))
+    return rows, clean[:, None] * (
+        1 + 0.1 * rng.normal(size=(n, 3))
+    ) + 0.02 * rng.normal(size=(n, 3))
 
 
 def _fit(rows, target, *, mode="linear", floor=1e-2, weight=None, lift=None):
     lift = np.eye(rows.shape[1]) if lift is None else lift
-    return fit_reflectance(rows, np.array([0, len(rows)]), target, weight, lift, mode=mode, noise_floor=floor)
+    return fit_reflectance(
+        rows,
+        np.array([0, len(rows)]),
+        target,
+        weight,
+        lift,
+        mode=mode,
+        noise_floor=floor,
+    )
 
 
 def test_fit_reflectance__linear_agrees_with_scipy():
@@ -40,7 +56,9 @@ def test_fit_reflectance__linear_agrees_with_scipy():
         _, reference = nnls(M, target.ravel())
         assert fit.status[0] == 0
         assert fit.kkt[0] < 1e-9
-        assert np.linalg.norm(M @ fit.weight[0] - target.ravel()) <= reference * (1 + ROUNDING)
+        assert np.linalg.norm(M @ fit.weight[0] - target.ravel()) <= reference * (
+            1 + ROUNDING
+        )
 
 
 @pytest.mark.parametrize("apart", [1e-9, 1e-7, 1e-6, 1e-5, 1e-3])
@@ -49,12 +67,18 @@ def test_solve_nnls__the_certificate_holds_for_nearly_collinear_columns(apart):
     for seed in range(6):
         rng = np.random.default_rng(seed)
         a = rng.uniform(size=(60, 8))
-        M = np.concatenate([a, a + apart * rng.normal(size=a.shape)], axis=1)[:, rng.permutation(16)]
-        r = M @ np.where(rng.random(16) < 0.3, rng.uniform(size=16), 0) + 0.05 * rng.normal(size=60)
+        M = np.concatenate([a, a + apart * rng.normal(size=a.shape)], axis=1)[
+            :, rng.permutation(16)
+        ]
+        r = M @ np.where(
+            rng.random(16) < 0.3, rng.uniform(size=16), 0
+        ) + 0.05 * rng.normal(size=60)
         x, kkt, _, met = solve_nnls((M.T @ M)[None], (M.T @ r)[None])
         w = M.T @ (r - M @ x[0])
         length = np.linalg.norm(M, axis=0)
-        true = (np.where(x[0] > 0, abs(w), np.maximum(w, 0)) / length).max() / abs(M.T @ r / length).max()
+        true = (np.where(x[0] > 0, abs(w), np.maximum(w, 0)) / length).max() / abs(
+            M.T @ r / length
+        ).max()
         assert met[0]
         assert kkt[0] < 1e-9
         assert true < kkt[0] + 1e-13  # rounding of the Gram matrix
@@ -82,16 +106,24 @@ def _check_minimum(seed):
         return ((root(M @ x)[:, None] - root(target)) ** 2).sum()
 
     starts = np.random.default_rng(seed).uniform(0, 1, (4, m))
-    best = min(minimize(objective, s, method="L-BFGS-B", bounds=[(0, None)] * m).fun for s in starts)
+    best = min(
+        minimize(objective, s, method="L-BFGS-B", bounds=[(0, None)] * m).fun
+        for s in starts
+    )
     x = np.zeros(m)
     filled = np.pad(rows, ((0, 0), (0, 7)))
     given = _as_fits_give(target.T)
     work = _reflectance_kernels.fit_memory(n, 16, m)
-    _reflectance_kernels._fit_roots(filled, given, np.ones(n, np.float32), np.eye(m), floor, 1e-10, x, work)
+    _reflectance_kernels._fit_roots(
+        filled, given, np.ones(n, np.float32), np.eye(m), floor, 1e-10, x, work
+    )
     assert objective(x) <= best * (1 + 1e-4)  # Gauss-Newton stops at a gain of 1e-6
-    fit = _fit(rows, target, mode="perceptual", floor=floor)  # and a last linear step, which may not cost much
+    # and a last linear step, which may not cost much
+    fit = _fit(rows, target, mode="perceptual", floor=floor)
     assert objective(fit.weight[0]) <= best * 1.01
-    assert fit.residual_perceptual[0] == pytest.approx(np.sqrt(objective(fit.weight[0]) / (root(target) ** 2).sum()))
+    assert fit.residual_perceptual[0] == pytest.approx(
+        np.sqrt(objective(fit.weight[0]) / (root(target) ** 2).sum())
+    )
 
 
 def test_fit_roots__reaches_the_minimum():
@@ -101,7 +133,9 @@ def test_fit_roots__reaches_the_minimum():
 
 
 def test_fit_reflectance__noise_does_not_bias_the_perceptual_fit():
-    """Noise as large as the samples: their mean root is lower than the root of their mean, by 10 % and more here."""
+    """Noise as large as the samples: their mean root is lower than the root of their
+    mean, by 10 % and more here.
+    """
     rng = np.random.default_rng(31)
     rows = rng.uniform(0.1, 1.0, (300, 2)).astype(np.float32)
     clean = rows.astype(np.float64) @ [0.3, 0.2]
@@ -111,9 +145,12 @@ def test_fit_reflectance__noise_does_not_bias_the_perceptual_fit():
     noise = 0.5 * clean.mean()
     for k in range(draws):
         target = clean[:, None] + noise * rng.normal(size=(300, 3))
-        found[k] = _fit(rows, target, mode="perceptual", floor=floor).weight[0] @ rows.mean(axis=0)
+        found[k] = _fit(rows, target, mode="perceptual", floor=floor).weight[
+            0
+        ] @ rows.mean(axis=0)
     off = found.mean() / clean.mean() - 1
-    assert abs(off) < 0.01 + 3 * found.std() / np.sqrt(draws) / clean.mean()  # weights depend on the noise a little
+    # weights depend on the noise a little
+    assert abs(off) < 0.01 + 3 * found.std() / np.sqrt(draws) / clean.mean()
 
 
 @pytest.mark.parametrize("mode", ["linear", "perceptual"])
@@ -124,7 +161,9 @@ def test_fit_reflectance__extremes_are_statuses(mode):
     target[20, 1] = np.inf
     target[30:] = 0.0
     offsets = np.array([0, 0, 3, 15, 30, 45])
-    fit = fit_reflectance(rows, offsets, target, None, np.eye(4), mode=mode, noise_floor=1e-3)
+    fit = fit_reflectance(
+        rows, offsets, target, None, np.eye(4), mode=mode, noise_floor=1e-3
+    )
     np.testing.assert_array_equal(fit.status, [2, 2, 0, 6, 0])
     assert np.isnan(fit.weight[[0, 1, 3]]).all()
     assert np.isfinite(fit.weight[[2, 4]]).all()
@@ -136,19 +175,32 @@ def test_fit_reflectance__weights_of_zero_leave_rows_out():
     weight = np.ones(len(rows))
     weight[:20] = 0
     kept = _fit(rows[20:], target[20:]).weight
-    np.testing.assert_allclose(_fit(rows, target, weight=weight).weight, kept, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(
+        _fit(rows, target, weight=weight).weight, kept, rtol=1e-9, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("mode", ["linear", "perceptual"])
-@pytest.mark.parametrize(("of_rows", "of_target"), [(1e-30, 1.0), (1e30, 1e-30), (1.0, 1e30), (1e-30, 1e30)])
+@pytest.mark.parametrize(
+    ("of_rows", "of_target"), [(1e-30, 1.0), (1e30, 1e-30), (1.0, 1e30), (1e-30, 1e30)]
+)
 def test_fit_reflectance__any_scale(mode, of_rows, of_target):
-    """Sums are in single precision; a problem scaled by a power of two must have exactly the scaled result."""
+    """Sums are in single precision; a problem scaled by a power of two must have
+    exactly the scaled result.
+    """
     rows, target = _problem(3)
     of_rows, of_target = (2.0 ** np.round(np.log2(s)) for s in (of_rows, of_target))
     plain = _fit(rows, target, mode=mode)
-    scaled = _fit((rows * of_rows).astype(np.float32), target * of_target, mode=mode, floor=1e-2 * of_target)
+    scaled = _fit(
+        (rows * of_rows).astype(np.float32),
+        target * of_target,
+        mode=mode,
+        floor=1e-2 * of_target,
+    )
     assert scaled.status[0] == 0
-    np.testing.assert_allclose(scaled.weight[0], plain.weight[0] * (of_target / of_rows), rtol=1e-9)
+    np.testing.assert_allclose(
+        scaled.weight[0], plain.weight[0] * (of_target / of_rows), rtol=1e-9
+    )
     assert scaled.residual[0] == pytest.approx(plain.residual[0])
 
 
@@ -164,7 +216,9 @@ def test_fit_reflectance__lift_is_the_same_as_the_product():
     rows, target = _problem(2)
     lift = np.random.default_rng(5).uniform(size=(9, 6))
     product = (rows.astype(np.float64) @ lift).astype(np.float32)
-    assert _fit(rows, target, lift=lift).residual[0] == pytest.approx(_fit(product, target).residual[0], rel=1e-6)
+    assert _fit(rows, target, lift=lift).residual[0] == pytest.approx(
+        _fit(product, target).residual[0], rel=1e-6
+    )
 
 
 def test_fit_reflectance__wrong_arguments():
@@ -182,7 +236,9 @@ def test_weight_covariance__is_the_sandwich_in_plain_numpy(perceptual):
     floor = 0.02
     drift = np.array([0.1, 0.2, 0.05])
     rows = (rng.uniform(0, 1, (n, 4)) ** [1, 2, 3, 4]).astype(np.float32)
-    target = (rows @ np.array([0.3, 0.2, 0.0, 0.4]) - 0.3 * rows[:, 2])[:, None] * (1 + 0.1 * rng.normal(size=(n, 3)))
+    target = (rows @ np.array([0.3, 0.2, 0.0, 0.4]) - 0.3 * rows[:, 2])[:, None] * (
+        1 + 0.1 * rng.normal(size=(n, 3))
+    )
     scattered = rng.uniform(0, 0.1, (3, n))
     work = _reflectance_kernels.fit_memory(n + 7, 8, 4)
     x = np.zeros(4)
@@ -190,11 +246,22 @@ def test_weight_covariance__is_the_sandwich_in_plain_numpy(perceptual):
     filled = np.pad(rows, ((0, 7), (0, 4)))
     given = _as_fits_give(target.T)
     weight = rng.uniform(0.2, 1, n).astype(np.float32)
-    _reflectance_kernels.fit_one(filled, given, weight, np.eye(4), perceptual, floor, 1e-10, x, work)
+    _reflectance_kernels.fit_one(
+        filled, given, weight, np.eye(4), perceptual, floor, 1e-10, x, work
+    )
     y = rows.astype(np.float64) @ x
     scattered = _as_fits_give(scattered)
     _weight_error_kernels.weight_covariance(
-        filled, y.astype(np.float32), weight, perceptual, floor, scattered, drift, x, covariance, work
+        filled,
+        y.astype(np.float32),
+        weight,
+        perceptual,
+        floor,
+        scattered,
+        drift,
+        x,
+        covariance,
+        work,
     )
     free = x > 0
     assert free.tolist() == [True, True, False, True]
@@ -211,7 +278,8 @@ def test_weight_covariance__is_the_sandwich_in_plain_numpy(perceptual):
     lit = inverse @ (M.T @ (square * (drift @ scattered)))
 
     expected = inverse @ score.T @ score @ inverse * n / (n - 3) + np.outer(lit, lit)
-    np.testing.assert_allclose(covariance[np.ix_(free, free)], expected, rtol=1e-4)  # single precision
+    # single precision
+    np.testing.assert_allclose(covariance[np.ix_(free, free)], expected, rtol=1e-4)
     assert np.isnan(covariance[~free]).all()
     assert np.isnan(covariance[:, ~free]).all()
 
@@ -224,7 +292,9 @@ def test_weight_covariance__collinear_columns_have_none():
     filled = np.pad(rows, ((0, 0), (0, 6)))
     ones = np.ones(50, np.float32)
     given = _as_fits_give(np.repeat(rows[:, :1].T, 3, axis=0))
-    _reflectance_kernels.fit_one(filled, given, ones, np.eye(2), False, 1.0, 1e-10, np.zeros(2), work)
+    _reflectance_kernels.fit_one(
+        filled, given, ones, np.eye(2), False, 1.0, 1e-10, np.zeros(2), work
+    )
     nothing = _as_fits_give(np.zeros((3, 50))), np.zeros(3)
     _weight_error_kernels.weight_covariance(
         filled, 0 * ones, ones, False, 1.0, *nothing, np.full(2, 0.5), covariance, work
@@ -233,10 +303,13 @@ def test_weight_covariance__collinear_columns_have_none():
 
 
 def test_solve_nnls__a_shared_system_compiles_nothing_more():
-    """Each layout of an array needs its own kernel, 5 s of compiling; a common system is passed as a broadcast view."""
+    """Each layout of an array needs its own kernel, 5 s of compiling; a common system
+    is passed as a broadcast view.
+    """
     gram = np.array([[2.0, 0.5], [0.5, 1.0]])
     rhs = np.array([[1.0, -1.0], [0.2, 0.7]])
     x, *_ = solve_nnls(np.broadcast_to(gram, (2, 2, 2)), rhs)
     np.testing.assert_allclose(x, [[0.5, 0.0], [0.0, 0.7]], atol=1e-12)
     compiled = _nnls_kernels.solve_many.signatures
-    assert {kind.layout for one in compiled for kind in one[:3]} == {"C"}  # gram, rhs, x
+    # gram, rhs, x
+    assert {kind.layout for one in compiled for kind in one[:3]} == {"C"}

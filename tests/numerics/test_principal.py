@@ -21,12 +21,20 @@ def test_principal_axes__are_those_of_scikit_learn(n, d, block, monkeypatch):
     # inner products square the rounding of means that are 1e3 times the spread
     np.testing.assert_allclose(found.mean, oracle.mean_, rtol=1e-12)
     np.testing.assert_allclose(found.variance, oracle.explained_variance_, rtol=1e-9)
-    np.testing.assert_allclose(np.abs((found.axes * oracle.components_).sum(axis=1)), 1.0, atol=1e-9)
-    np.testing.assert_allclose(np.abs(found.score), np.abs(oracle.transform(x)), atol=1e-7)
+    np.testing.assert_allclose(
+        np.abs((found.axes * oracle.components_).sum(axis=1)), 1.0, atol=1e-9
+    )
+    np.testing.assert_allclose(
+        np.abs(found.score), np.abs(oracle.transform(x)), atol=1e-7
+    )
     np.testing.assert_allclose(found.total, x.var(axis=0, ddof=1).sum(), rtol=1e-9)
     left = x - oracle.inverse_transform(oracle.transform(x))
-    np.testing.assert_allclose(found.residual, np.sqrt((left**2).mean(axis=1)), atol=1e-7)
-    assert (found.axes[np.arange(len(found.axes)), np.abs(found.axes).argmax(axis=1)] > 0).all()
+    np.testing.assert_allclose(
+        found.residual, np.sqrt((left**2).mean(axis=1)), atol=1e-7
+    )
+    assert (
+        found.axes[np.arange(len(found.axes)), np.abs(found.axes).argmax(axis=1)] > 0
+    ).all()
 
 
 def test_principal_axes__of_equal_vectors_has_no_component():

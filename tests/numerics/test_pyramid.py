@@ -1,4 +1,6 @@
-"""The steerable pyramid: exact for every size, oriented as planted, and equal to that of pyrtools."""
+"""The steerable pyramid: exact for every size, oriented as planted, and equal to that
+of pyrtools.
+"""
 
 from __future__ import annotations
 
@@ -17,10 +19,14 @@ def test_build__reconstructs_any_size(shape):
         for levels in {0, 1, max(shape).bit_length() - 1}:
             pyramid = build(image, levels, orientations)
             assert len(pyramid.parts()) == 2 + levels * orientations
-            np.testing.assert_allclose(reconstruct(pyramid), image, atol=1e-12 * np.ptp(image) + 1e-14)
+            np.testing.assert_allclose(
+                reconstruct(pyramid), image, atol=1e-12 * np.ptp(image) + 1e-14
+            )
             single = build(image.astype(np.float32), levels, orientations)
             assert {part.dtype for part in single.parts()} == {np.dtype(np.float32)}
-            np.testing.assert_allclose(reconstruct(single), image, atol=1e-6 * np.abs(image).max())
+            np.testing.assert_allclose(
+                reconstruct(single), image, atol=1e-6 * np.abs(image).max()
+            )
 
 
 @pytest.mark.parametrize("shape", [(64, 64), (37, 101)])
@@ -38,8 +44,12 @@ def test_build__a_wave_is_in_the_band_of_its_scale_and_direction():
             rows, columns = np.mgrid[:256, :256]
             frequency = 0.25 / 2**level
             angle = np.pi * number / 4
-            wave = np.cos(2 * np.pi * frequency * (columns * np.cos(angle) + rows * np.sin(angle)))
-            energy = np.array([[(band**2).mean() for band in own] for own in build(wave, 5).bands])
+            wave = np.cos(
+                2 * np.pi * frequency * (columns * np.cos(angle) + rows * np.sin(angle))
+            )
+            energy = np.array(
+                [[(band**2).mean() for band in own] for own in build(wave, 5).bands]
+            )
             assert np.unravel_index(energy.argmax(), energy.shape) == (level, number)
 
 
@@ -48,11 +58,19 @@ def test_build__is_that_of_pyrtools():
     image = np.random.default_rng(1).normal(size=(128, 128)).cumsum(axis=0)
     own = build(image, 4)
     other = pyrtools.pyramids.SteerablePyramidFreq(image, height=4, order=3)
-    pairs = [(own.high, other.pyr_coeffs["residual_highpass"]), (own.low, other.pyr_coeffs["residual_lowpass"])]
-    pairs += [(own.bands[k][q], other.pyr_coeffs[k, q]) for k in range(4) for q in range(4)]
-    for mine, theirs in pairs:  # theirs grow with the level, and are looked up in tables
+    pairs = [
+        (own.high, other.pyr_coeffs["residual_highpass"]),
+        (own.low, other.pyr_coeffs["residual_lowpass"]),
+    ]
+    pairs += [
+        (own.bands[k][q], other.pyr_coeffs[k, q]) for k in range(4) for q in range(4)
+    ]
+    # theirs grow with the level, and are looked up in tables
+    for mine, theirs in pairs:
         scale = float((mine * theirs).sum() / (mine * mine).sum())
-        np.testing.assert_allclose(theirs, scale * mine, atol=5e-3 * np.abs(theirs).max())
+        np.testing.assert_allclose(
+            theirs, scale * mine, atol=5e-3 * np.abs(theirs).max()
+        )
 
 
 @pytest.mark.parametrize(
@@ -80,4 +98,7 @@ def test_build__of_a_constant_has_only_a_low_pass_residual():
 def test_with_parts__puts_images_back():
     pyramid = build(np.random.default_rng(3).normal(size=(33, 20)), 3)
     again = pyramid.with_parts(pyramid.parts())
-    assert all(np.array_equal(a, b) for a, b in zip(again.parts(), pyramid.parts(), strict=True))
+    assert all(
+        np.array_equal(a, b)
+        for a, b in zip(again.parts(), pyramid.parts(), strict=True)
+    )

@@ -1,4 +1,6 @@
-"""Bases from reflectance: normal equations compared with rows, weights with SciPy, and planted bases."""
+"""Bases from reflectance: normal equations compared with rows, weights with SciPy, and
+planted bases.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,9 @@ from skindb.numerics.reflectance_basis import Systems, factor_reflectance, resid
 
 
 def _problem(rng, *, n=60, m=20, k=3, noise=0.0):
-    """Surfels of unequal sample counts; columns in a space of 12, of very different size: matt and glossy."""
+    """Surfels of unequal sample counts; columns in a space of 12, of very different
+    size: matt and glossy.
+    """
     counts = rng.integers(30, 60, n)
     counts[0] = 0
     offsets = np.concatenate([[0], np.cumsum(counts)])
@@ -35,7 +39,9 @@ def test_systems__residuals_are_those_of_the_rows():
         for s in range(1, 10):
             own = rows[offsets[s] : offsets[s + 1]].astype(float)
             own = own if basis is None else own @ basis.T
-            want, norm = nnls(np.tile(own, (3, 1)), target[offsets[s] : offsets[s + 1]].T.ravel())
+            want, norm = nnls(
+                np.tile(own, (3, 1)), target[offsets[s] : offsets[s + 1]].T.ravel()
+            )
             np.testing.assert_allclose(squares[s], norm**2, rtol=1e-7)
             np.testing.assert_allclose(x[s], want, atol=1e-6 * want.max())
         assert squares[0] == 0  # no samples
@@ -52,8 +58,11 @@ def test_factor_reflectance__finds_the_planted_basis(noise):
     assert [len(basis) for basis in bases] == [1, 2, 3, 4, 5]
     assert all((basis >= 0).all() for basis in bases)
     np.testing.assert_allclose([basis.sum(axis=1) for basis in bases[2:3]], 1.0)
-    error = np.sqrt([residuals(systems, basis)[1].sum() / systems.square.sum() for basis in bases])
+    error = np.sqrt(
+        [residuals(systems, basis)[1].sum() / systems.square.sum() for basis in bases]
+    )
     truth = np.sqrt(residuals(systems, H)[1].sum() / systems.square.sum())
     assert error[1] > 0.05  # two are not enough
-    assert error[2] < 1.02 * truth + 2e-3  # the alternation stops 0.2 % short of the truth
+    # the alternation stops 0.2 % short of the truth
+    assert error[2] < 1.02 * truth + 2e-3
     assert error[4] <= error[2] + 1e-4

@@ -40,7 +40,9 @@ def test_moments__of_missing_values_and_of_no_values():
 
 
 def test_moments__deviation_interval_covers():
-    """2,000 samples of 8: a 95 % interval covers 95 % to within four standard errors of the count."""
+    """2,000 samples of 8: a 95 % interval covers 95 % to within four standard errors of
+    the count.
+    """
     x = np.random.default_rng(1).normal(size=(8, 2000))
     low, high = Moments.of(x).deviation_interval()
     assert abs(((low < 1) & (high > 1)).mean() - 0.95) < 4 * np.sqrt(0.95 * 0.05 / 2000)

@@ -39,7 +39,9 @@ def test_part_names__one_for_every_part():
     image = noise((128, 128))
     assert len(part_names()) == len(image_parts(image)) == 31
     pyramid = build(image)
-    np.testing.assert_array_equal(image_parts(image)[2 + 4 * 1 + 2], pyramid.bands[1][2])
+    np.testing.assert_array_equal(
+        image_parts(image)[2 + 4 * 1 + 2], pyramid.bands[1][2]
+    )
     assert part_names()[2 + 4 * 1 + 2] == "level 2, 90 degrees"
 
 
@@ -47,7 +49,9 @@ def test_part_names__one_for_every_part():
 def test_quantile_function__is_numpys(n):
     values = noise((n,))
     np.testing.assert_allclose(
-        quantile_function(values), np.quantile(values, quantile_levels(), method="hazen"), atol=1e-12
+        quantile_function(values),
+        np.quantile(values, quantile_levels(), method="hazen"),
+        atol=1e-12,
     )
 
 
@@ -57,7 +61,8 @@ def test_part_histogram__is_numpys():
     edges = np.linspace(-6, 6, 257)
     want = np.histogram(part[share > 0.5], edges)[0] / (share > 0.5).sum()
     np.testing.assert_allclose(part_histogram(part, share, edges), want, atol=1e-15)
-    assert part_histogram(part + 100, share, edges)[-1] == 1  # values beyond the ends are not lost
+    # values beyond the ends are not lost
+    assert part_histogram(part + 100, share, edges)[-1] == 1
     assert np.isnan(part_histogram(part, 0 * share, edges)).all()
 
 
@@ -68,7 +73,8 @@ def test_level_shares__keep_the_area_of_a_region(shape):
     shapes = [part.shape for part in image_parts(noise(shape), **SMALL)]
     shares = level_fractions(mask, shapes)
     assert [share.shape for share in shares] == shapes
-    for share in shares:  # an entry of the coarsest level is 1/8 of the shorter side here
+    # an entry of the coarsest level is 1/8 of the shorter side here
+    for share in shares:
         assert share.mean() == pytest.approx(mask.mean(), abs=0.1)
     np.testing.assert_array_equal(shares[0], mask)
 
@@ -81,9 +87,15 @@ def test_part_quantiles__of_a_region_alone():
     other = image.copy()
     other[:, 90:100] += 5
     same = level_fractions(mask, [part.shape for part in image_parts(image, levels=2)])
-    for a, b, share in zip(image_parts(image, 2), image_parts(other, 2), same, strict=True):
+    for a, b, share in zip(
+        image_parts(image, 2), image_parts(other, 2), same, strict=True
+    ):
         # at this distance, the ripples of the bands are below 2 % of the step
-        np.testing.assert_allclose(quantile_function(a[share > 0.5]), quantile_function(b[share > 0.5]), atol=0.1)
+        np.testing.assert_allclose(
+            quantile_function(a[share > 0.5]),
+            quantile_function(b[share > 0.5]),
+            atol=0.1,
+        )
 
 
 def test_valid_quantiles__nearest_monotone_function_of_the_same_mean():
@@ -98,7 +110,11 @@ def test_valid_quantiles__nearest_monotone_function_of_the_same_mean():
 def test_synthesise__no_shift_returns_the_image():
     image = noise()
     found = synthesise(
-        image, [np.ones(image.shape)], np.zeros((1, 15, QUANTILES)), rng=np.random.default_rng(0), **SMALL
+        image,
+        [np.ones(image.shape)],
+        np.zeros((1, 15, QUANTILES)),
+        rng=np.random.default_rng(0),
+        **SMALL,
     )
     np.testing.assert_array_equal(found.image, image)
     assert found.trace == (0.0,)
@@ -109,11 +125,23 @@ def test_synthesise__gray_values_alone_are_those_of_scikit_image():
     image = noise((200, 200))
     wanted = np.exp(0.5 * noise((200, 200), seed=3))
     shift = np.zeros((1, 3, QUANTILES))
-    shift[0] = quantiles_of(wanted, levels=0, orientations=1) - quantiles_of(image, levels=0, orientations=1)
-    found = synthesise(image, [np.ones(image.shape)], shift, iterations=1, levels=0, orientations=1, rng=Still())
+    shift[0] = quantiles_of(wanted, levels=0, orientations=1) - quantiles_of(
+        image, levels=0, orientations=1
+    )
+    found = synthesise(
+        image,
+        [np.ones(image.shape)],
+        shift,
+        iterations=1,
+        levels=0,
+        orientations=1,
+        rng=Still(),
+    )
     inside = slice(2, -2)  # the quantile functions end half a level before the ends
     np.testing.assert_allclose(
-        quantile_function(found.image)[inside], quantile_function(match_histograms(image, wanted))[inside], atol=0.02
+        quantile_function(found.image)[inside],
+        quantile_function(match_histograms(image, wanted))[inside],
+        atol=0.02,
     )
 
 
@@ -143,13 +171,22 @@ def test_synthesise__regions_move_apart():
     left[:, :48] = 1
     shift = np.zeros((2, 15, QUANTILES))
     shift[0, 0] = shift[0, -1] = 3.0
-    found = synthesise(image, [left, 1 - left], shift, iterations=3, rng=np.random.default_rng(0), **SMALL)
+    found = synthesise(
+        image,
+        [left, 1 - left],
+        shift,
+        iterations=3,
+        rng=np.random.default_rng(0),
+        **SMALL,
+    )
     step = found.image - image
     assert step[:, 8:40].mean() == pytest.approx(3.0, abs=0.3)
     assert np.abs(step[:, 56:88].mean()) < 0.3
 
 
-@pytest.mark.parametrize("case", ["constant", "one texel", "no texel", "odd", "oblong", "huge"])
+@pytest.mark.parametrize(
+    "case", ["constant", "one texel", "no texel", "odd", "oblong", "huge"]
+)
 def test_synthesise__extremes_stay_finite(case):
     shape = {"odd": (33, 47), "oblong": (16, 200)}.get(case, (64, 64))
     image = np.zeros(shape) if case == "constant" else noise(shape)
@@ -159,7 +196,13 @@ def test_synthesise__extremes_stay_finite(case):
         mask[5, 5] = case == "one texel"
     shift = (1e3 if case == "huge" else 1.0) * noise((1, 15, QUANTILES), seed=5)
     found = synthesise(
-        image, [np.ones(shape)], shift, measured=[mask], iterations=2, rng=np.random.default_rng(0), **SMALL
+        image,
+        [np.ones(shape)],
+        shift,
+        measured=[mask],
+        iterations=2,
+        rng=np.random.default_rng(0),
+        **SMALL,
     )
     assert np.isfinite(found.image).all()
     assert found.image.shape == shape
@@ -169,12 +212,20 @@ def test_synthesise__seeded():
     image = np.zeros((32, 32))
     shift = noise((1, 15, QUANTILES))
     options = {"regions": [np.ones((32, 32))], "shifts": np.sort(shift), **SMALL}
-    one, same, other = (synthesise(image, rng=np.random.default_rng(s), **options).image for s in (0, 0, 1))
+    one, same, other = (
+        synthesise(image, rng=np.random.default_rng(s), **options).image
+        for s in (0, 0, 1)
+    )
     np.testing.assert_array_equal(one, same)
     assert np.abs(one - other).max() > 0.01
 
 
 def test_members__more_than_half_of_the_most():
-    np.testing.assert_array_equal(members(np.array([0.0, 0.4, 0.6, 1.0])), [False, False, True, True])
-    np.testing.assert_array_equal(members(np.array([0.0, 0.1, 0.2])), [False, False, True])  # a region of few texels
+    np.testing.assert_array_equal(
+        members(np.array([0.0, 0.4, 0.6, 1.0])), [False, False, True, True]
+    )
+    # a region of few texels
+    np.testing.assert_array_equal(
+        members(np.array([0.0, 0.1, 0.2])), [False, False, True]
+    )
     assert not members(np.zeros(3)).any()

@@ -25,12 +25,14 @@ def test_half_difference__by_definition():
     h = _unit(wi + wo)
     np.testing.assert_allclose(np.cos(th), h[:, 2], atol=1e-12)
     np.testing.assert_allclose(np.cos(td), (wi * h).sum(1), atol=1e-12)
-    # Rusinkiewicz 1998: turn by -phi_h about the normal, then by -theta_h about y; phi_d is what is left
+    # Rusinkiewicz 1998: turn by -phi_h about the normal, then by -theta_h about y;
+    # phi_d is what is left
     phi_h = np.arctan2(h[:, 1], h[:, 0])
     x = wi[:, 0] * np.cos(phi_h) + wi[:, 1] * np.sin(phi_h)
     y = -wi[:, 0] * np.sin(phi_h) + wi[:, 1] * np.cos(phi_h)
     left = np.arctan2(y, x * np.cos(th) - wi[:, 2] * np.sin(th))
-    np.testing.assert_allclose(np.sin(pd - left), 0, atol=1e-9)  # equal or half a turn apart
+    # equal or half a turn apart
+    np.testing.assert_allclose(np.sin(pd - left), 0, atol=1e-9)
     assert ((pd >= 0) & (pd < np.pi)).all()
 
 
@@ -41,14 +43,19 @@ def test_half_difference__reciprocal_and_turned_with_the_normal():
     turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
     turn *= np.sign(np.linalg.det(turn))
     here = half_difference(wi, wo)
-    there = half_difference(wo @ turn.T, wi @ turn.T, np.broadcast_to(turn[:, 2], wi.shape))
+    there = half_difference(
+        wo @ turn.T, wi @ turn.T, np.broadcast_to(turn[:, 2], wi.shape)
+    )
     for a, b in zip(here, there, strict=True):
-        np.testing.assert_allclose(np.exp(2j * a), np.exp(2j * b), atol=1e-9)  # phi_d = 0 is phi_d = pi
+        # phi_d = 0 is phi_d = pi
+        np.testing.assert_allclose(np.exp(2j * a), np.exp(2j * b), atol=1e-9)
 
 
 @pytest.mark.parametrize("tilt", [1e-7, 1e-5, 1e-3])
 def test_half_difference__narrow_lobes_keep_their_angle(tilt):
-    """The half vector is `tilt` away from the normal; an arc cosine would lose angles below 1e-8."""
+    """The half vector is `tilt` away from the normal; an arc cosine would lose angles
+    below 1e-8.
+    """
     wi = np.array([mpmath.sin(0.4 + 2 * tilt), 0, mpmath.cos(0.4 + 2 * tilt)], float)
     wo = np.array([-mpmath.sin(0.4), 0, mpmath.cos(0.4)], float)
     theta_h, theta_d, _ = half_difference(wi, wo)
@@ -59,7 +66,9 @@ def test_half_difference__narrow_lobes_keep_their_angle(tilt):
 def test_half_difference__one_direction_and_the_normal():
     up = np.array([0.0, 0.0, 1.0])
     assert [float(a) for a in half_difference(up, up)] == [0, 0, 0]
-    mirror = half_difference([np.sin(0.5), 0, np.cos(0.5)], [-np.sin(0.5), 0, np.cos(0.5)])
+    mirror = half_difference(
+        [np.sin(0.5), 0, np.cos(0.5)], [-np.sin(0.5), 0, np.cos(0.5)]
+    )
     np.testing.assert_allclose(mirror, [0, 0.5, 0], atol=1e-15)
 
 

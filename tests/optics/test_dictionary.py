@@ -12,11 +12,18 @@ import pytest
 from skindb.optics.abc_low2012 import PARAMETERS
 from skindb.optics.angles import directions, half_difference
 from skindb.optics.brdf_table import TableGrid, directional_albedo, lookup, tabulate
-from skindb.optics.dictionary import Dictionary, convolve_disc, embedded_dictionary, evaluate_abc
+from skindb.optics.dictionary import (
+    Dictionary,
+    convolve_disc,
+    embedded_dictionary,
+    evaluate_abc,
+)
 
 ROWS = np.array(list(PARAMETERS.values()))
 SHARED = Path(__file__).resolve().parents[2] / ".." / "shared" / "data" / "brdf"
-needs_shared = pytest.mark.skipif(not SHARED.is_dir(), reason="the data beside the project are absent")
+needs_shared = pytest.mark.skipif(
+    not SHARED.is_dir(), reason="the data beside the project are absent"
+)
 DISC = 0.0142  # rad, 0.8 degrees: a dome's lamp
 
 
@@ -30,7 +37,9 @@ def _unit(v):
 
 
 def _pairs(rng, n, lowest):
-    wi, wo = directions(rng.random(n) ** 2 * np.pi / 2, rng.random(n) * np.pi / 2, rng.random(n) * np.pi)
+    wi, wo = directions(
+        rng.random(n) ** 2 * np.pi / 2, rng.random(n) * np.pi / 2, rng.random(n) * np.pi
+    )
     up = np.minimum(wi[:, 2], wo[:, 2]) > lowest
     return wi[up], wo[up]
 
@@ -38,7 +47,10 @@ def _pairs(rng, n, lowest):
 @needs_shared
 def test_parameters__as_printed():
     with (SHARED / "abc_low2012.csv").open() as file:
-        table = {row.pop("material"): tuple(map(float, row.values())) for row in csv.DictReader(file)}
+        table = {
+            row.pop("material"): tuple(map(float, row.values()))
+            for row in csv.DictReader(file)
+        }
     names = (SHARED / "merl_skindb59.txt").read_text().split()
     assert list(PARAMETERS) == names
     assert {name: table[name] for name in names} == PARAMETERS
@@ -56,21 +68,31 @@ def _by_the_book(row, wi, wo):
     parallel = (eta * cos_d - cos_t) / (eta * cos_d + cos_t)
     across = (cos_d - eta * cos_t) / (cos_d + eta * cos_t)
     masking = min(1, 2 * h[2] * wi[2] / cos_d, 2 * h[2] * wo[2] / cos_d)
-    lobe = (1 + row[6] * (1 - h[2])) ** -row[7] * (parallel**2 + across**2) / 2 * masking
-    channels = [row[c] / mpmath.pi + row[3 + c] * lobe / (mpmath.pi * wi[2] * wo[2]) for c in range(3)]
+    lobe = (
+        (1 + row[6] * (1 - h[2])) ** -row[7] * (parallel**2 + across**2) / 2 * masking
+    )
+    channels = [
+        row[c] / mpmath.pi + row[3 + c] * lobe / (mpmath.pi * wi[2] * wo[2])
+        for c in range(3)
+    ]
     return float(sum(channels) / 3)
 
 
 def test_evaluate_abc__as_the_formula_in_forty_digits():
     wi, wo = _pairs(np.random.default_rng(7), 12, 0.05)
     got = evaluate_abc(ROWS, wi, wo)
-    want = [[_by_the_book(row, a, b) for row in ROWS[::10]] for a, b in zip(wi, wo, strict=True)]
+    want = [
+        [_by_the_book(row, a, b) for row in ROWS[::10]]
+        for a, b in zip(wi, wo, strict=True)
+    ]
     np.testing.assert_allclose(got[:, ::10], want, rtol=1e-9)
 
 
 @needs_shared
 def test_evaluate_abc__near_the_measured_slices():
-    """phi_d = 90 degrees, above 12 degrees: the median error of the fit is 8.5 %, as its authors' fits have."""
+    """phi_d = 90 degrees, above 12 degrees: the median error of the fit is 8.5 %, as
+    its authors' fits have.
+    """
     slices = np.load(SHARED / "merl_slices_phid90.npz")
     order = [slices["names"].tolist().index(name) for name in PARAMETERS]
     measured = np.moveaxis(slices["f"][order].mean(-1), 0, -1)
@@ -78,13 +100,17 @@ def test_evaluate_abc__near_the_measured_slices():
     th, td = np.meshgrid(centre**2 * np.pi / 2, centre * np.pi / 2)
     wi, wo = directions(th, td, np.pi / 2)
     up = np.minimum(wi[..., 2], wo[..., 2]) > 0.2
-    relative = np.abs(evaluate_abc(ROWS, wi[up], wo[up]) / np.maximum(measured[up], 1e-5) - 1)
+    relative = np.abs(
+        evaluate_abc(ROWS, wi[up], wo[up]) / np.maximum(measured[up], 1e-5) - 1
+    )
     assert np.median(np.median(relative, axis=0)) < 0.1
     assert np.median(relative, axis=0).max() < 0.4
 
 
 def test_embedded_dictionary__trilinear_error_is_small():
-    """0.8 % rms above 6 degrees of elevation, weighted by the two cosines, 1.8 % for the sharpest lobe."""
+    """0.8 % rms above 6 degrees of elevation, weighted by the two cosines, 1.8 % for
+    the sharpest lobe.
+    """
     wi, wo = _pairs(np.random.default_rng(0), 20000, 0.1)
     exact = evaluate_abc(ROWS, wi, wo)
     table = lookup(embedded_dictionary().table, *half_difference(wi, wo))
@@ -97,7 +123,12 @@ def test_embedded_dictionary__trilinear_error_is_small():
 @pytest.mark.parametrize("disc", [False, True])
 def test_embedded_dictionary__fifty_nine_physical_materials(disc, convolved):
     dictionary = convolved if disc else embedded_dictionary()
-    assert len(dictionary.names) == len(set(dictionary.names)) == dictionary.table.shape[-1] == 59
+    assert (
+        len(dictionary.names)
+        == len(set(dictionary.names))
+        == dictionary.table.shape[-1]
+        == 59
+    )
     assert np.isfinite(dictionary.table).all()
     assert (dictionary.table >= 0).all()
     albedo = directional_albedo(dictionary.table, [1.0, 0.7, 0.4])
@@ -112,41 +143,68 @@ def test_embedded_dictionary__shared_and_not_writeable():
 
 
 def test_convolve_disc__matches_averaging_of_the_exact_model(convolved):
-    """Away from the horizon: the average over a dense disc around either direction, as in the docstring."""
+    """Away from the horizon: the average over a dense disc around either direction, as
+    in the docstring.
+    """
     # with the sharpest lobes, as narrow as the disc
     rng = np.random.default_rng(3)
     some = np.r_[0:59:5, 18, 46, 48]
-    wi, wo = directions(rng.random(200) ** 2 * 0.8, rng.random(200) * 0.8, rng.random(200) * np.pi)
+    wi, wo = directions(
+        rng.random(200) ** 2 * 0.8, rng.random(200) * 0.8, rng.random(200) * np.pi
+    )
     k = np.arange(300)
-    disc = np.sqrt((k + 0.5) / 300)[:, None] * np.stack([np.cos(k * 2.399963), np.sin(k * 2.399963)], 1) * np.tan(DISC)
+    disc = (
+        np.sqrt((k + 0.5) / 300)[:, None]
+        * np.stack([np.cos(k * 2.399963), np.sin(k * 2.399963)], 1)
+        * np.tan(DISC)
+    )
     total = np.zeros((200, len(some)))
     for a, b in ((wi, wo), (wo, wi)):
         first = _unit(np.cross(a, [0.3, 0.9, 0.1]))
         second = np.cross(a, first)
         for u, v in disc:
-            total += evaluate_abc(ROWS[some], _unit(a + u * first + v * second), b) / 600
+            total += (
+                evaluate_abc(ROWS[some], _unit(a + u * first + v * second), b) / 600
+            )
     got = lookup(convolved.table[..., some], *half_difference(wi, wo))
     rms = np.sqrt(((got - total) ** 2).sum(0) / (total**2).sum(0))
-    assert np.median(rms) < 0.006  # sharp lobes are over-represented; of all 59 the median is 0.07 %
+    # sharp lobes are over-represented; of all 59 the median is 0.07 %
+    assert np.median(rms) < 0.006
     assert rms.max() < 0.03
 
 
 def test_convolve_disc__takes_the_mean_of_both_directions():
-    """A disc of 0.2 rad before a BRDF that rises to the horizon: the averages around either differ by up to 20 %."""
+    """A disc of 0.2 rad before a BRDF that rises to the horizon: the averages around
+    either differ by up to 20 %.
+    """
     grid = TableGrid(40, 40, 8)
     radius = 0.2
-    table = tabulate(lambda wi, wo: 1 / np.maximum(wi[..., 2:] * wo[..., 2:], 0.01), grid)
-    got = convolve_disc(Dictionary(("rising",), table, grid, "test"), radius).table[..., 0]
-    nodes = np.s_[10:20, 20:26, 0]  # both directions stay above 0.3 rad, at unlike elevations
+    table = tabulate(
+        lambda wi, wo: 1 / np.maximum(wi[..., 2:] * wo[..., 2:], 0.01), grid
+    )
+    got = convolve_disc(Dictionary(("rising",), table, grid, "test"), radius).table[
+        ..., 0
+    ]
+    # both directions stay above 0.3 rad, at unlike elevations
+    nodes = np.s_[10:20, 20:26, 0]
     mesh = np.meshgrid(grid.theta_h, grid.theta_d, grid.phi_d, indexing="ij")
     wi, wo = directions(*(a[nodes] for a in mesh))
     k = np.arange(500)
-    disc = np.sqrt((k + 0.5) / 500)[:, None] * np.stack([np.cos(k * 2.399963), np.sin(k * 2.399963)], 1)
+    disc = np.sqrt((k + 0.5) / 500)[:, None] * np.stack(
+        [np.cos(k * 2.399963), np.sin(k * 2.399963)], 1
+    )
     sides = []
     for a, b in ((wi, wo), (wo, wi)):
         first = _unit(np.cross(a, [0.3, 0.9, 0.1]))
-        moved = [_unit(a + np.tan(radius) * (u * first + v * np.cross(a, first))) for u, v in disc]
-        sides.append(np.mean([lookup(table, *half_difference(m, b))[..., 0] for m in moved], axis=0))
+        moved = [
+            _unit(a + np.tan(radius) * (u * first + v * np.cross(a, first)))
+            for u, v in disc
+        ]
+        sides.append(
+            np.mean(
+                [lookup(table, *half_difference(m, b))[..., 0] for m in moved], axis=0
+            )
+        )
     assert np.abs(sides[0] / sides[1] - 1).max() > 0.1
     np.testing.assert_allclose(got[nodes], (sides[0] + sides[1]) / 2, rtol=0.01)
 
@@ -162,6 +220,10 @@ def test_convolve_disc__keeps_constants_and_reports_its_change():
 
 
 def test_convolve_disc__is_done_once_for_fits_and_studies():
-    """Averaging the embedded tables takes 3 s and 46 MB, so that edits and studies must not repeat it."""
-    flat = Dictionary(("flat",), np.full((4, 4, 4, 1), 0.2, np.float32), TableGrid(4, 4, 4), "test")
+    """Averaging the embedded tables takes 3 s and 46 MB, so that edits and studies must
+    not repeat it.
+    """
+    flat = Dictionary(
+        ("flat",), np.full((4, 4, 4, 1), 0.2, np.float32), TableGrid(4, 4, 4), "test"
+    )
     assert convolve_disc(flat, 0.01) is convolve_disc(flat, 0.01)

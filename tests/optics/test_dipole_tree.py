@@ -33,21 +33,30 @@ def _skin(n: int):
 def _striped(points: np.ndarray, lights: int) -> np.ndarray:
     """(n, lights) light from all sides with hard shadows."""
     towards = np.random.default_rng(3).normal(size=(3, lights))
-    return np.maximum(points @ towards, 0) * (np.sin(points[:, 1:2] + np.arange(lights)) > 0)
+    return np.maximum(points @ towards, 0) * (
+        np.sin(points[:, 1:2] + np.arange(lights)) > 0
+    )
 
 
-# 1e-6: float32, on a sphere so small that every point counts; 0.1 costs about 0.3 % without normalisation
-@pytest.mark.parametrize(("tolerance", "radius", "bound"), [(0.0, 4.0, 1e-6), (0.1, 8.0, 4e-3)])
+# 1e-6: float32, on a sphere so small that every point counts; 0.1 costs about 0.3 %
+# without normalisation
+@pytest.mark.parametrize(
+    ("tolerance", "radius", "bound"), [(0.0, 4.0, 1e-6), (0.1, 8.0, 4e-3)]
+)
 def test_subsurface_exitance__against_the_plain_sum(tolerance, radius, bound):
     points, area = _sphere(4000, radius)
     _, s, tr = _skin(4000)
     light = _striped(points, 11)
-    got = subsurface_exitance(points, area, light, s, tr, eta=ETA, tolerance=tolerance, normalise=False)
+    got = subsurface_exitance(
+        points, area, light, s, tr, eta=ETA, tolerance=tolerance, normalise=False
+    )
     some = np.arange(0, 4000, 97)
     r = np.linalg.norm(points[some, None] - points, axis=-1)
     a, scattered = scattering_coefficients(s, tr)
     for c in range(3):
-        kernel = dipole_profile(r, a[some, c : c + 1], scattered[some, c : c + 1], eta=ETA)
+        kernel = dipole_profile(
+            r, a[some, c : c + 1], scattered[some, c : c + 1], eta=ETA
+        )
         want = (kernel @ (light * area[:, None])).T
         gap = ((got[:, some, c] - want) ** 2).mean(axis=1) / (want**2).mean(axis=1)
         assert np.sqrt(gap).max() < bound
@@ -60,7 +69,9 @@ def test_subsurface_exitance__a_light_does_not_depend_on_the_others(lights):
     light = _striped(points, lights)
     together = subsurface_exitance(points, area, light, s, tr, eta=ETA)
     for i in (0, lights - 1):
-        alone = subsurface_exitance(points, area, light[:, i : i + 1], s, tr, eta=ETA)[0]
+        alone = subsurface_exitance(points, area, light[:, i : i + 1], s, tr, eta=ETA)[
+            0
+        ]
         np.testing.assert_array_equal(together[i], alone)
 
 
@@ -87,7 +98,9 @@ def test_subsurface_exitance__other_receivers_do_not_matter():
     whole = subsurface_exitance(points, area, light, s, tr, eta=ETA)
     part = subsurface_exitance(points, area, light, s, tr, eta=ETA, receivers=wanted)
     np.testing.assert_array_equal(part, np.where(wanted[:, None], whole, 0))
-    assert not subsurface_exitance(points, area, light, s, tr, eta=ETA, receivers=wanted & False).any()
+    assert not subsurface_exitance(
+        points, area, light, s, tr, eta=ETA, receivers=wanted & False
+    ).any()
 
 
 def test_subsurface_exitance__uniform_light_gives_rd():
@@ -98,13 +111,19 @@ def test_subsurface_exitance__uniform_light_gives_rd():
 
 
 def test_subsurface_exitance__plain_sum_of_a_fine_surface_is_rd():
-    """Without normalisation, points 0.5 mm apart: the kernel's integral over a nearly flat surface (radius 30 mm)."""
+    """Without normalisation, points 0.5 mm apart: the kernel's integral over a nearly
+    flat surface (radius 30 mm).
+    """
     points, area = _sphere(45000)
     _, s, tr = _skin(45000)
-    got = subsurface_exitance(points, area, np.ones((45000, 1)), s, tr, eta=ETA, normalise=False)[0]
+    got = subsurface_exitance(
+        points, area, np.ones((45000, 1)), s, tr, eta=ETA, normalise=False
+    )[0]
     ratio = got / diffuse_reflectance(s, eta=ETA)
-    np.testing.assert_allclose(np.median(ratio, axis=0), 1.0, atol=0.02)  # curvature and 0.5 mm spacing
-    assert np.abs(ratio - 1).max() < 0.08  # blue at the poles, where the spiral is uneven
+    # curvature and 0.5 mm spacing
+    np.testing.assert_allclose(np.median(ratio, axis=0), 1.0, atol=0.02)
+    # blue at the poles, where the spiral is uneven
+    assert np.abs(ratio - 1).max() < 0.08
 
 
 def test_decay__against_exp():

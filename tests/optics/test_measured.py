@@ -24,15 +24,24 @@ from skindb.optics.table_file import read_tables, write_tables
 
 def test_read_merl_folder__tables_of_a_known_brdf(tmp_path):
     centre = (np.arange(90) + 0.5) / 90
-    th, td, pd = np.meshgrid(centre**2, centre, (np.arange(180) + 0.5) / 180, indexing="ij")
-    write_merl(tmp_path / "b.binary", np.repeat(_known(th, td, pd)[..., None], 3, axis=-1))
+    th, td, pd = np.meshgrid(
+        centre**2, centre, (np.arange(180) + 0.5) / 180, indexing="ij"
+    )
+    write_merl(
+        tmp_path / "b.binary", np.repeat(_known(th, td, pd)[..., None], 3, axis=-1)
+    )
     write_merl(tmp_path / "a.binary", np.ones((*SHAPE, 3)))
     dictionary = read_merl_folder(tmp_path)
-    want = tabulate(lambda wi, wo: _known(*_shares(*half_difference(wi, wo)))[..., None], DEFAULT_GRID)
+    want = tabulate(
+        lambda wi, wo: _known(*_shares(*half_difference(wi, wo)))[..., None],
+        DEFAULT_GRID,
+    )
     assert dictionary.names == ("a", "b")
     np.testing.assert_allclose(dictionary.table[..., 0], 1, rtol=1e-6)
     middle = np.s_[1:89, 1:119]  # the outermost nodes lie outside the bins' centres
-    np.testing.assert_allclose(dictionary.table[..., 1][middle], want[..., 0][middle], rtol=0.005)
+    np.testing.assert_allclose(
+        dictionary.table[..., 1][middle], want[..., 0][middle], rtol=0.005
+    )
 
 
 def _shares(th, td, pd):
@@ -44,11 +53,19 @@ def _known(th, td, pd):
 
 
 def test_read_merl_folder__holes_continue_their_neighbour(tmp_path):
-    """Holes beyond a theta_d, before one, and in whole planes of theta_h; a negative channel makes a hole in all."""
+    """Holes beyond a theta_d, before one, and in whole planes of theta_h; a negative
+    channel makes a hole in all.
+    """
     write_merl(tmp_path / "a.binary", np.ones((*SHAPE, 3)))
-    raw = np.frombuffer((tmp_path / "a.binary").read_bytes()[12:], "<f8").reshape(3, *SHAPE).copy()
+    raw = (
+        np.frombuffer((tmp_path / "a.binary").read_bytes()[12:], "<f8")
+        .reshape(3, *SHAPE)
+        .copy()
+    )
     raw[1, :, 60:, :90] = raw[0, :, :5, 90:] = raw[2, :3] = -1.0
-    (tmp_path / "a.binary").write_bytes(np.array(SHAPE, "<i4").tobytes() + raw.tobytes())
+    (tmp_path / "a.binary").write_bytes(
+        np.array(SHAPE, "<i4").tobytes() + raw.tobytes()
+    )
     np.testing.assert_allclose(read_merl_folder(tmp_path).table, 1, rtol=1e-6)
 
 
@@ -66,25 +83,46 @@ def test_read_merl_folder__all_damaged_files_at_once(tmp_path):
         (tmp_path / f"{name}.binary").write_bytes(b"short")
     with pytest.raises(InputError, match="download it again") as caught:
         read_merl_folder(tmp_path)
-    assert [Path(fault.where).name for fault in caught.value.faults] == ["a.binary", "b.binary"]
+    assert [Path(fault.where).name for fault in caught.value.faults] == [
+        "a.binary",
+        "b.binary",
+    ]
 
 
-def test_read_merl_folder__says_which_files_are_the_published_ones(tmp_path, monkeypatch):
-    """Four files: the published one, a changed one of such a name, one under another name, a name of the user."""
-    for name, value in (("teflon", 1.0), ("delrin", 0.1), ("mine", 0.2), ("white-paint", 0.3)):
+def test_read_merl_folder__says_which_files_are_the_published_ones(
+    tmp_path, monkeypatch
+):
+    """Four files: the published one, a changed one of such a name, one under another
+    name, a name of the user.
+    """
+    for name, value in (
+        ("teflon", 1.0),
+        ("delrin", 0.1),
+        ("mine", 0.2),
+        ("white-paint", 0.3),
+    ):
         write_merl(tmp_path / f"{name}.binary", np.full((*SHAPE, 3), value))
-    sums = {name: hashlib.sha256((tmp_path / f"{name}.binary").read_bytes()).hexdigest() for name in ("teflon", "mine")}
+    sums = {
+        name: hashlib.sha256((tmp_path / f"{name}.binary").read_bytes()).hexdigest()
+        for name in ("teflon", "mine")
+    }
     monkeypatch.setitem(SHA256, "teflon", sums["teflon"])
     monkeypatch.setitem(SHA256, "ipswich-pine-221", sums["mine"])
     found = read_merl_folder(tmp_path)
-    checks = {name: origin.check for name, origin in zip(found.names, found.origins, strict=True)}
+    checks = {
+        name: origin.check
+        for name, origin in zip(found.names, found.origins, strict=True)
+    }
     assert checks == {
         "teflon": "genuine",
         "delrin": "differs from the published file of that name",
         "mine": "published under the name ipswich-pine-221",
         "white-paint": "differs from the published file of that name",
     }
-    assert "differs from the published file of that name: delrin, white-paint" in found.notes
+    assert (
+        "differs from the published file of that name: delrin, white-paint"
+        in found.notes
+    )
     assert found.origins[found.names.index("teflon")].sha256 == sums["teflon"]
 
 
@@ -95,21 +133,36 @@ def test_sha256__of_the_hundred_materials():
 
 
 def test_read_merl_folder__counts_holes_above_the_horizon_only(tmp_path):
-    """A tenth of the bins of phi_d, at every theta_h below 20 degrees and theta_d below 45: all above the horizon."""
+    """A tenth of the bins of phi_d, at every theta_h below 20 degrees and theta_d below
+    45: all above the horizon.
+    """
     write_merl(tmp_path / "a.binary", np.ones((*SHAPE, 3)))
-    raw = np.frombuffer((tmp_path / "a.binary").read_bytes()[12:], "<f8").reshape(3, *SHAPE).copy()
+    raw = (
+        np.frombuffer((tmp_path / "a.binary").read_bytes()[12:], "<f8")
+        .reshape(3, *SHAPE)
+        .copy()
+    )
     raw[:, :42, :45, ::10] = -1.0
     raw[:, 80:, 80:, :60] = -1.0  # wholly below it: tan tan cos > 1
-    (tmp_path / "a.binary").write_bytes(np.array(SHAPE, "<i4").tobytes() + raw.tobytes())
+    (tmp_path / "a.binary").write_bytes(
+        np.array(SHAPE, "<i4").tobytes() + raw.tobytes()
+    )
     found = read_merl_folder(tmp_path)
     centre = (np.arange(90) + 0.5) / 90
     th, td, pd = np.meshgrid(
-        centre**2 * np.pi / 2, centre * np.pi / 2, (np.arange(180) + 0.5) / 180 * np.pi, indexing="ij"
+        centre**2 * np.pi / 2,
+        centre * np.pi / 2,
+        (np.arange(180) + 0.5) / 180 * np.pi,
+        indexing="ij",
     )
     tilt = np.abs(np.sin(th) * np.sin(td) * np.cos(pd))  # cosines are cos cos -+ this
     above = (np.cos(th) * np.cos(td) > tilt).sum()
-    assert found.origins[0].hole_fraction == pytest.approx(42 * 45 * 18 / above, rel=1e-6)
-    assert found.notes[1].startswith("materials with unmeasured nodes above the horizon: 1, most in a (")
+    assert found.origins[0].hole_fraction == pytest.approx(
+        42 * 45 * 18 / above, rel=1e-6
+    )
+    assert found.notes[1].startswith(
+        "materials with unmeasured nodes above the horizon: 1, most in a ("
+    )
 
 
 def _nodes():
@@ -124,35 +177,57 @@ def _file(path, **change):
     """An .npz of two materials, `change` in place of its arrays (None: without)."""
     mesh = np.meshgrid(*_nodes().values(), indexing="ij")
     brdf = 0.2 * np.stack([_known(*_shares(*mesh)), np.ones(mesh[0].shape)])
-    arrays = {"basis_brdf": brdf, "names": np.array(["known", "flat"]), **_nodes()} | change
-    np.savez(path, **{name: value for name, value in arrays.items() if value is not None})
+    arrays = {
+        "basis_brdf": brdf,
+        "names": np.array(["known", "flat"]),
+        **_nodes(),
+    } | change
+    np.savez(
+        path, **{name: value for name, value in arrays.items() if value is not None}
+    )
     return path
 
 
 def test_resample__linear_in_the_tables_coordinates():
-    """Random values at uneven nodes against SciPy over three periods of phi_d; the outermost values hold beyond."""
+    """Random values at uneven nodes against SciPy over three periods of phi_d; the
+    outermost values hold beyond.
+    """
     rng = np.random.default_rng(4)
     h, d, p = (np.sort(rng.uniform(0.1, 1.4, n)) for n in (6, 5, 4))
     values = rng.uniform(0, 1, (6, 5, 4))
     turns = np.concatenate([p - np.pi, p, p + np.pi])
-    scipy = RegularGridInterpolator((np.sqrt(h), d, turns), np.concatenate([values] * 3, axis=2))
+    scipy = RegularGridInterpolator(
+        (np.sqrt(h), d, turns), np.concatenate([values] * 3, axis=2)
+    )
     grid = DEFAULT_GRID
     at = np.meshgrid(
-        np.sqrt(np.clip(grid.theta_h, h[0], h[-1])), np.clip(grid.theta_d, d[0], d[-1]), grid.phi_d, indexing="ij"
+        np.sqrt(np.clip(grid.theta_h, h[0], h[-1])),
+        np.clip(grid.theta_d, d[0], d[-1]),
+        grid.phi_d,
+        indexing="ij",
     )
     want = scipy(np.stack(at, axis=-1))
     found = resample(values, (h, d, p))
     np.testing.assert_allclose(found[1:], want[1:], atol=1e-6)  # single precision
-    np.testing.assert_allclose(found[0], np.repeat(want[0].mean(axis=1, keepdims=True), 16, axis=1), atol=1e-6)
+    np.testing.assert_allclose(
+        found[0], np.repeat(want[0].mean(axis=1, keepdims=True), 16, axis=1), atol=1e-6
+    )
 
 
 def test_read_tables__a_known_brdf_on_other_nodes(tmp_path):
     found = read_dictionary(_file(tmp_path / "a.npz"))
-    want = 0.2 * tabulate(lambda wi, wo: _known(*_shares(*half_difference(wi, wo)))[..., None], DEFAULT_GRID)[..., 0]
+    want = (
+        0.2
+        * tabulate(
+            lambda wi, wo: _known(*_shares(*half_difference(wi, wo)))[..., None],
+            DEFAULT_GRID,
+        )[..., 0]
+    )
     assert found.names == ("known", "flat")
     assert found.source == "a.npz"
     np.testing.assert_allclose(found.table[..., 1], 0.2, rtol=1e-6)
-    # 0.02 cos(2 phi_d) between 12 nodes: 0.0007; half vectors at the normal and theta_d = 0 have no phi_d
+    # 0.02 cos(2 phi_d) between 12 nodes: 0.0007; half vectors at the normal and theta_d
+    # = 0 have no phi_d
     some = np.s_[1:, 1:-1]
     np.testing.assert_allclose(found.table[..., 0][some], want[some], atol=0.001)
     assert np.ptp(found.table[0, ..., 0], axis=-1).max() == 0
@@ -167,7 +242,9 @@ def test_read_tables__rgb_is_averaged_and_holes_are_filled(tmp_path):
     colour[1, 5, 7, 3, 2] = np.nan  # one channel of one node
     found = read_tables(_file(tmp_path / "rgb.npz", basis_brdf=colour, names=None))
     assert found.names == ("material0", "material1")
-    np.testing.assert_allclose(found.table, read_tables(tmp_path / "grey.npz").table, rtol=1e-5)
+    np.testing.assert_allclose(
+        found.table, read_tables(tmp_path / "grey.npz").table, rtol=1e-5
+    )
     assert found.origins[0].hole_fraction == 0
     assert 0 < found.origins[1].hole_fraction < 1e-3
 
@@ -175,7 +252,9 @@ def test_read_tables__rgb_is_averaged_and_holes_are_filled(tmp_path):
 def test_write_tables__comes_back_bit_for_bit(tmp_path):
     shape = (DEFAULT_GRID.n_theta_h, DEFAULT_GRID.n_theta_d, DEFAULT_GRID.n_phi_d, 2)
     table = np.random.default_rng(0).uniform(0, 0.3, shape).astype(np.float32)
-    write_tables(tmp_path / "a.npz", Dictionary(("x", "y"), table, DEFAULT_GRID, "test", 0.014))
+    write_tables(
+        tmp_path / "a.npz", Dictionary(("x", "y"), table, DEFAULT_GRID, "test", 0.014)
+    )
     found = read_tables(tmp_path / "a.npz")
     np.testing.assert_array_equal(found.table, table)
     assert (found.names, found.disc_angular_radius) == (("x", "y"), 0.014)
@@ -183,9 +262,19 @@ def test_write_tables__comes_back_bit_for_bit(tmp_path):
 
 def test_convolve_disc__never_twice(tmp_path):
     flat = np.full((*(len(v) for v in _nodes().values()),), 0.2)[None]
-    own = read_tables(_file(tmp_path / "a.npz", basis_brdf=flat, names=None, disc_angular_radius=np.radians(0.8)))
+    own = read_tables(
+        _file(
+            tmp_path / "a.npz",
+            basis_brdf=flat,
+            names=None,
+            disc_angular_radius=np.radians(0.8),
+        )
+    )
     assert convolve_disc(own, np.radians(0.805)) is own
-    with pytest.raises(InputError, match=r"disc of these lights, 1.20 degrees; found a disc of 0.80 degrees"):
+    with pytest.raises(
+        InputError,
+        match=r"disc of these lights, 1.20 degrees; found a disc of 0.80 degrees",
+    ):
         convolve_disc(own, np.radians(1.2))
     with pytest.raises(InputError, match=r"disc of these lights, 0\.00 degrees"):
         convolve_disc(own, 0.0)
@@ -195,28 +284,55 @@ def test_convolve_disc__never_twice(tmp_path):
     ("change", "message"),
     [
         ({"theta_h": None, "phi_d": None}, r"found no theta_h, phi_d; add them"),
-        ({"basis_brdf": np.ones((40, 50, 12, 2))}, r"shape \(materials, 40, 50, 12\).* found \(40, 50, 12, 2\)"),
-        ({"basis_brdf": np.ones((2, 40, 50, 12, 4))}, r"with RGB .* found \(2, 40, 50, 12, 4\)"),
+        (
+            {"basis_brdf": np.ones((40, 50, 12, 2))},
+            r"shape \(materials, 40, 50, 12\).* found \(40, 50, 12, 2\)",
+        ),
+        (
+            {"basis_brdf": np.ones((2, 40, 50, 12, 4))},
+            r"with RGB .* found \(2, 40, 50, 12, 4\)",
+        ),
         ({"basis_brdf": np.ones(5)}, r"found \(5,\)"),
-        ({"basis_brdf": np.array(["a"])}, "must be real numbers; found others in basis_brdf"),
-        ({"theta_d": _nodes()["theta_d"][::-1]}, r"\[theta_d\]: nodes must be in strictly ascending order"),
+        (
+            {"basis_brdf": np.array(["a"])},
+            "must be real numbers; found others in basis_brdf",
+        ),
+        (
+            {"theta_d": _nodes()["theta_d"][::-1]},
+            r"\[theta_d\]: nodes must be in strictly ascending order",
+        ),
         (
             {"theta_d": np.ones((50, 1))},
-            r"\[theta_d\]: must be a one-dimensional array of at least 2 nodes; found the shape \(50, 1\)",
+            (
+                r"\[theta_d\]: must be a one-dimensional array of at least 2 nodes; "
+                r"found the shape \(50, 1\)"
+            ),
         ),
         (
             {"theta_h": np.degrees(_nodes()["theta_h"])},
             "angles must be in rad; found 90; convert them with numpy.radians",
         ),
-        ({"theta_h": 0.8 * _nodes()["theta_h"]}, r"must extend from 0 to pi/2 rad.* found \[0, 1.25664\]"),
+        (
+            {"theta_h": 0.8 * _nodes()["theta_h"]},
+            r"must extend from 0 to pi/2 rad.* found \[0, 1.25664\]",
+        ),
         ({"phi_d": 2 * _nodes()["phi_d"]}, r"nodes must lie in \[0, pi\)"),
         (
             {"phi_d": 0.3 * _nodes()["phi_d"]},
             "at most pi/2 apart, also across the end of the period; found a gap of 2.28",
         ),
-        ({"names": np.array(["a", "a"])}, "as many different names; found 2 names, 1 of them different"),
-        ({"units": np.array("percent")}, "the unit of a BRDF must be sr-1; found percent"),
-        ({"disc_angular_radius": np.array(0.8)}, "one angle from 0 to 0.5 rad; found 0.8"),
+        (
+            {"names": np.array(["a", "a"])},
+            "as many different names; found 2 names, 1 of them different",
+        ),
+        (
+            {"units": np.array("percent")},
+            "the unit of a BRDF must be sr-1; found percent",
+        ),
+        (
+            {"disc_angular_radius": np.array(0.8)},
+            "one angle from 0 to 0.5 rad; found 0.8",
+        ),
         (
             {"basis_brdf": np.full((2, 40, 50, 12), -0.1)},
             "must not be negative; found 48000 values below 0; use NaN where nothing",
@@ -236,8 +352,14 @@ def test_read_tables__a_wrong_file_is_one_line(tmp_path, change, message):
 
 
 def test_read_tables__every_fault_at_once(tmp_path):
-    wrong = {"theta_d": _nodes()["theta_d"][::-1], "phi_d": 2 * _nodes()["phi_d"], "names": np.array(["a"])}
-    with pytest.raises(InputError, match="nodes must be in strictly ascending order") as caught:
+    wrong = {
+        "theta_d": _nodes()["theta_d"][::-1],
+        "phi_d": 2 * _nodes()["phi_d"],
+        "names": np.array(["a"]),
+    }
+    with pytest.raises(
+        InputError, match="nodes must be in strictly ascending order"
+    ) as caught:
         read_tables(_file(tmp_path / "a.npz", **wrong))
     assert len(caught.value.faults) == 3
 

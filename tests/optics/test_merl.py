@@ -22,10 +22,14 @@ def test_read_merl__round_trip(tmp_path):
 
 
 def test_read_merl__layout_of_the_published_reader(tmp_path):
-    """BRDFRead.cpp: ind = phi_d + theta_d * 180 + theta_h * 180 * 90; green one table on, scaled by 1.15 / 1500."""
+    """BRDFRead.cpp: ind = phi_d + theta_d * 180 + theta_h * 180 * 90; green one table
+    on, scaled by 1.15 / 1500.
+    """
     raw = np.zeros(3 * 90 * 90 * 180)
     raw[7 + 11 * 180 + 13 * 180 * 90 + 90 * 90 * 180] = 3000.0
-    (tmp_path / "a.binary").write_bytes(np.array(SHAPE, "<i4").tobytes() + raw.tobytes())
+    (tmp_path / "a.binary").write_bytes(
+        np.array(SHAPE, "<i4").tobytes() + raw.tobytes()
+    )
     table, _ = read_merl(tmp_path / "a.binary")
     assert table[13, 11, 7, 1] == pytest.approx(2.3)
     assert np.count_nonzero(table) == 1
@@ -49,7 +53,10 @@ def test_read_merl__holes_are_unknown_and_counted(tmp_path):
         (lambda raw: raw[:5], "and 5 bytes"),
         (lambda raw: b"", "and 0 bytes"),
         (lambda raw: raw[:4] + raw[:4] + raw[4:], r"found the header \(90, 90, 90\)"),
-        (lambda raw: raw[:12] + np.float64(np.nan).tobytes() + raw[20:], "values must be finite; found 1 that are not"),
+        (
+            lambda raw: raw[:12] + np.float64(np.nan).tobytes() + raw[20:],
+            "values must be finite; found 1 that are not",
+        ),
     ],
 )
 def test_read_merl__damage_is_one_line(tmp_path, damage, message):
@@ -59,7 +66,10 @@ def test_read_merl__damage_is_one_line(tmp_path, damage, message):
         read_merl(tmp_path / "a.binary")
 
 
-@pytest.mark.parametrize("wrong", [np.full((*SHAPE, 3), -1.0), np.full((*SHAPE, 3), np.nan), np.ones((90, 90, 180))])
+@pytest.mark.parametrize(
+    "wrong",
+    [np.full((*SHAPE, 3), -1.0), np.full((*SHAPE, 3), np.nan), np.ones((90, 90, 180))],
+)
 def test_write_merl__refuses_what_is_not_a_table(tmp_path, wrong):
     with pytest.raises(ValueError, match="a MERL table must have the shape"):
         write_merl(tmp_path / "a.binary", wrong)

@@ -26,12 +26,20 @@ def _scene(seed, surfels=12, lights=40, cameras=7):
     wo = _unit(camera - position[:, None])
     ci = np.einsum("nk,nlk->nl", normal, wi)
     co = np.einsum("nk,nck->nc", normal, wo)
-    half = np.einsum("nk,nlck->nlc", normal, _unit(wi[:, :, None] + wo[:, None])).clip(0, 1)
-    sample = (ci.clip(0)[:, :, None, None]) * (np.array([0.15, 0.1, 0.07]) + 0.2 * half[..., None] ** 30)
-    sample *= (1 + 0.02 * rng.normal(size=sample.shape)) * np.where(rng.uniform(size=ci.shape) < 0.1, 0.3, 1)[
-        :, :, None, None
-    ]
-    sample[(rng.uniform(size=half.shape) < 0.15) | (ci <= 0)[:, :, None] | (co <= 0)[:, None]] = np.nan
+    half = np.einsum("nk,nlck->nlc", normal, _unit(wi[:, :, None] + wo[:, None])).clip(
+        0, 1
+    )
+    sample = (ci.clip(0)[:, :, None, None]) * (
+        np.array([0.15, 0.1, 0.07]) + 0.2 * half[..., None] ** 30
+    )
+    sample *= (1 + 0.02 * rng.normal(size=sample.shape)) * np.where(
+        rng.uniform(size=ci.shape) < 0.1, 0.3, 1
+    )[:, :, None, None]
+    sample[
+        (rng.uniform(size=half.shape) < 0.15)
+        | (ci <= 0)[:, :, None]
+        | (co <= 0)[:, None]
+    ] = np.nan
     scan = _unit(normal + 0.03 * rng.normal(size=normal.shape))
     return sample.astype(np.float32), position, light, camera, scan
 
@@ -49,7 +57,10 @@ def _naive_photometric(shade, to_light, scan):
     for step in range(12):
         cosine = to_light @ normal
         lit = usable & (cosine > 0.1)
-        row = fresnel_transmittance(np.maximum(cosine, 0.1), ETA)[lit, None] * to_light[lit]
+        row = (
+            fresnel_transmittance(np.maximum(cosine, 0.1), ETA)[lit, None]
+            * to_light[lit]
+        )
         matrix = row.T @ (weight[lit, None] * row)
         if step:
             share = max(lit.sum() / 8, 1) * (spread / (size * PRIOR)) ** 2
@@ -68,7 +79,9 @@ def _naive_photometric(shade, to_light, scan):
 def test_photometric_normals__are_those_of_the_plain_rule():
     for seed in [0, 1, 2]:
         sample, position, light, camera, scan = _scene(seed)
-        found = photometric_normals(sample, position, light, camera, scan, eta=ETA, prior=PRIOR)
+        found = photometric_normals(
+            sample, position, light, camera, scan, eta=ETA, prior=PRIOR
+        )
         for s in range(len(sample)):
             to_light, to_camera = _directions(s, position, light, camera)
             seen = to_camera @ scan[s] > 0.2
@@ -87,7 +100,8 @@ def test_photometric_normals__are_those_of_the_plain_rule():
                     tinted[i] = np.median(part[i, known] @ tint / through[known])
             for q, shade in enumerate((white, tinted)):
                 normal, spread = _naive_photometric(shade, to_light, scan[s])
-                # the kernel stops when a step turns the normal by less than 3e-5 rad; the next ones are shorter
+                # the kernel stops when a step turns the normal by less than 3e-5 rad;
+                # the next ones are shorter
                 np.testing.assert_allclose(found.normal[s, q], normal, atol=1e-4)
                 np.testing.assert_allclose(found.spread[s, q], spread, rtol=2e-3)
 
@@ -117,11 +131,15 @@ def _naive_peak(part, to_light, to_camera):
 def test_photometric_normals__peak_is_that_of_the_plain_rule():
     for seed in [3, 4]:
         sample, position, light, camera, scan = _scene(seed)
-        found = photometric_normals(sample, position, light, camera, scan, eta=ETA, prior=PRIOR)
+        found = photometric_normals(
+            sample, position, light, camera, scan, eta=ETA, prior=PRIOR
+        )
         for s in range(len(sample)):
             to_light, to_camera = _directions(s, position, light, camera)
             seen = to_camera @ scan[s] > 0.2
-            expected = _naive_peak(sample[s][:, seen].astype(np.float64), to_light, to_camera[seen])
+            expected = _naive_peak(
+                sample[s][:, seen].astype(np.float64), to_light, to_camera[seen]
+            )
             np.testing.assert_allclose(found.peak[s], expected, atol=1e-6)
 
 
@@ -130,18 +148,25 @@ def test_photometric_normals__covariance_is_the_scatter_of_repeated_draws():
     _, position, light, camera, scan = _scene(6, surfels=1, lights=60, cameras=1)
     to_light, to_camera = _directions(0, position, light, camera)
     cosine = (to_light @ scan[0]).clip(0)
-    shade = cosine * fresnel_transmittance(cosine, ETA) * fresnel_transmittance(to_camera @ scan[0], ETA)
+    shade = (
+        cosine
+        * fresnel_transmittance(cosine, ETA)
+        * fresnel_transmittance(to_camera @ scan[0], ETA)
+    )
     draws = 800
     clean = shade[:, None, None] * np.array([0.15, 0.1, 0.07])
     sample = clean * (1 + 0.05 * rng.normal(size=(draws, *clean.shape)))
     sample[:, cosine <= 0] = np.nan
     points = (np.repeat(a, draws, axis=0) for a in (position, scan))
     place, scans = points
-    found = photometric_normals(sample.astype(np.float32), place, light, camera, scans, eta=ETA, prior=PRIOR)
+    found = photometric_normals(
+        sample.astype(np.float32), place, light, camera, scans, eta=ETA, prior=PRIOR
+    )
     for q in range(2):
         scatter = np.trace(np.cov(found.normal[:, q].T))
-        # 800 draws give a variance to 5 %; the linear model neglects that F_t decreases towards grazing light, which
-        # also determines the normal: a third too large here
+        # 800 draws give a variance to 5 %; the linear model neglects that F_t decreases
+        # towards grazing light, which also determines the normal: a third too large
+        # here
         assert 0.8 < np.einsum("nkk->n", found.covariance[:, q]).mean() / scatter < 1.5
 
 
@@ -149,12 +174,16 @@ def test_photometric_normals__pull_is_the_derivative_by_the_scan():
     sample, position, light, camera, scan = _scene(7, lights=4, surfels=30)
     turn = np.cross(scan, [0.0, 1.0, 0.0]) * 0.002
     found, moved = (
-        photometric_normals(sample, position, light, camera, _unit(scan + d), eta=ETA, prior=PRIOR) for d in (0, turn)
+        photometric_normals(
+            sample, position, light, camera, _unit(scan + d), eta=ETA, prior=PRIOR
+        )
+        for d in (0, turn)
     )
     step = moved.normal[:, 0] - found.normal[:, 0]
     expected = np.einsum("njk,nk->nj", found.pull[:, 0], turn)
     size = np.linalg.norm(turn, axis=1)
     error = np.linalg.norm(step - expected, axis=1) / size
-    # robust weights and lights at the horizon depend on the scan too, which does not affect the median surfel
+    # robust weights and lights at the horizon depend on the scan too, which does not
+    # affect the median surfel
     assert np.median(error) < 0.15
     assert np.median(np.linalg.norm(step, axis=1) / size) > 0.3

@@ -1,7 +1,12 @@
 import numpy as np
 import pytest
 
-from skindb.optics.random_walk import Walk, radial_profile, random_walk, total_reflectance
+from skindb.optics.random_walk import (
+    Walk,
+    radial_profile,
+    random_walk,
+    total_reflectance,
+)
 
 PACKETS = 40_000
 SIGMA = 4.5  # standard errors allowed: one failure in 150,000
@@ -13,8 +18,16 @@ def isotropic():
 
 
 def test_random_walk__giovanelli_1955():
-    """Isotropic scattering, albedo 0.9, index 1.5: 0.2600 with the reflection at the surface (Giovanelli 1955)."""
-    walk = random_walk(2 * PACKETS, eta=1.5, anisotropy=0.0, longest=200.0, rng=np.random.default_rng(1))
+    """Isotropic scattering, albedo 0.9, index 1.5: 0.2600 with the reflection at the
+    surface (Giovanelli 1955).
+    """
+    walk = random_walk(
+        2 * PACKETS,
+        eta=1.5,
+        anisotropy=0.0,
+        longest=200.0,
+        rng=np.random.default_rng(1),
+    )
     diffuse, error = total_reflectance(walk, 0.1, 0.9)
     surface = 0.04
     assert (1 - surface) * diffuse + surface == pytest.approx(0.2600, abs=SIGMA * error)
@@ -22,15 +35,25 @@ def test_random_walk__giovanelli_1955():
 
 
 def test_random_walk__matched_index_is_chandrasekhar():
-    """No boundary, isotropic, albedo 0.9, normal incidence: 0.41522 (van de Hulst 1980, table 12)."""
-    walk = random_walk(2 * PACKETS, eta=1.0, anisotropy=0.0, longest=200.0, rng=np.random.default_rng(2))
+    """No boundary, isotropic, albedo 0.9, normal incidence: 0.41522 (van de Hulst 1980,
+    table 12).
+    """
+    walk = random_walk(
+        2 * PACKETS,
+        eta=1.0,
+        anisotropy=0.0,
+        longest=200.0,
+        rng=np.random.default_rng(2),
+    )
     diffuse, error = total_reflectance(walk, 0.1, 0.9)
     assert diffuse == pytest.approx(0.41522, abs=SIGMA * error)
 
 
 def test_random_walk__henyey_greenstein_and_matched_index():
     """At equal albedo, less light returns if more of it is scattered forward."""
-    forward = random_walk(PACKETS, eta=1.0, anisotropy=0.75, longest=200.0, rng=np.random.default_rng(4))
+    forward = random_walk(
+        PACKETS, eta=1.0, anisotropy=0.75, longest=200.0, rng=np.random.default_rng(4)
+    )
     # single-scattering albedo 0.9: sigma_a / sigma_s' = (0.1 / 0.9) / (1 - g)
     value, error = total_reflectance(forward, 0.1 / 0.9 / 0.25, 1.0)
     assert value + SIGMA * error < 0.41522
@@ -45,7 +68,9 @@ def _internal_reflectance(eta):
     outside = np.sqrt(np.maximum(1 - sine2, 0))
     a = (eta * cosine - outside) / (eta * cosine + outside)
     b = (cosine - eta * outside) / (cosine + eta * outside)
-    return float((np.where(sine2 >= 1, 1, (a * a + b * b) / 2) * 2 * cosine * weight).sum())
+    return float(
+        (np.where(sine2 >= 1, 1, (a * a + b * b) / 2) * 2 * cosine * weight).sum()
+    )
 
 
 F_DR = _internal_reflectance(1.3)
@@ -54,7 +79,9 @@ A = (1 + F_DR) / (1 - F_DR)
 
 @pytest.mark.parametrize(("albedo", "gap"), [(0.92, 0.03), (0.80, 0.09), (0.65, 0.14)])
 def test_random_walk__near_eq_5(isotropic, albedo, gap):
-    """Diffusion theory is a few per cent off, more where absorption is strong; light enters along the normal here."""
+    """Diffusion theory is a few per cent off, more where absorption is strong; light
+    enters along the normal here.
+    """
     s = np.sqrt(3 * (1 - albedo))
     diffusion = albedo / 2 * (1 + np.exp(-4 / 3 * A * s)) * np.exp(-s)
     value, error = total_reflectance(isotropic, 1 - albedo, albedo)
@@ -62,9 +89,12 @@ def test_random_walk__near_eq_5(isotropic, albedo, gap):
 
 
 def test_random_walk__without_absorption_everything_comes_back():
-    walk = random_walk(4000, eta=1.3, anisotropy=0.0, longest=1e5, rng=np.random.default_rng(5))
+    walk = random_walk(
+        4000, eta=1.3, anisotropy=0.0, longest=1e5, rng=np.random.default_rng(5)
+    )
     value, error = total_reflectance(walk, 0.0, 1.0)
-    assert value == pytest.approx(1.0, abs=SIGMA * error + 0.01)  # 1 % may still be inside after 1e5 free paths
+    # 1 % may still be inside after 1e5 free paths
+    assert value == pytest.approx(1.0, abs=SIGMA * error + 0.01)
 
 
 def test_radial_profile__its_integral_is_the_total(isotropic):
@@ -86,7 +116,10 @@ def _dipole(r, sigma_a, sigma_s):
     z_r = 1 / (sigma_a + sigma_s)
     tr = np.sqrt(3 * sigma_a * sigma_t)
     z_v = z_r * (1 + 4 * A / 3)
-    each = [z * (1 + tr * d) * np.exp(-tr * d) / d**3 for z, d in ((z_r, np.hypot(r, z_r)), (z_v, np.hypot(r, z_v)))]
+    each = [
+        z * (1 + tr * d) * np.exp(-tr * d) / d**3
+        for z, d in ((z_r, np.hypot(r, z_r)), (z_v, np.hypot(r, z_v)))
+    ]
     return sigma_s / sigma_t / (4 * np.pi) * sum(each)
 
 
@@ -96,12 +129,15 @@ def test_radial_profile__has_the_shape_of_the_dipole_at_a_distance(isotropic):
     fine = np.linspace(edges[:-1], edges[1:], 200)
     dipole = (_dipole(fine, 0.05, 0.95) * fine).sum(axis=0) / fine.sum(axis=0)
     ratio = density / dipole
-    assert (np.abs(ratio / ratio[0] - 1) < SIGMA * error / density + 0.05).all()  # 5 %: error of diffusion theory
+    # 5 %: error of diffusion theory
+    assert (np.abs(ratio / ratio[0] - 1) < SIGMA * error / density + 0.05).all()
     assert (np.abs(ratio - 1) < 0.35).all()
 
 
 def test_random_walk__same_seed_same_events_whatever_the_threads():
-    first, second = (random_walk(640, eta=1.3, rng=np.random.default_rng(9)) for _ in range(2))
+    first, second = (
+        random_walk(640, eta=1.3, rng=np.random.default_rng(9)) for _ in range(2)
+    )
     assert isinstance(first, Walk)
     np.testing.assert_array_equal(first.path, second.path)
     np.testing.assert_array_equal(first.radius, second.radius)

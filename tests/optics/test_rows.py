@@ -11,7 +11,8 @@ from skindb.optics.brdf_table import DEFAULT_GRID, TableGrid, lookup
 from skindb.optics.dictionary import convolve_disc, embedded_dictionary
 from skindb.optics.rows import basis_rows, reduce_dictionary
 
-SINGLE = 3e-5  # places in the table to 1e-7 of 30 cells, times the slope of random numbers
+# places in the table to 1e-7 of 30 cells, times the slope of random numbers
+SINGLE = 3e-5
 ARCTAN = 6e-11  # largest error of the polynomial
 
 
@@ -26,7 +27,12 @@ def _upper(rng, shape):
 def _scene(n=20, lights=9, cameras=5):
     rng = np.random.default_rng(4)
     around = _unit(rng.normal(size=(n, 3)) * 0.4 + [0, 0, 1])
-    return around, _upper(rng, (n, lights)), _upper(rng, (n, cameras)), rng.random((n, lights, cameras)) < 0.6
+    return (
+        around,
+        _upper(rng, (n, lights)),
+        _upper(rng, (n, cameras)),
+        rng.random((n, lights, cameras)) < 0.6,
+    )
 
 
 def test_basis_rows__reproduce_lookup_times_cosine():
@@ -46,13 +52,18 @@ def test_basis_rows__exactly_the_usable_samples_above_the_horizon_in_order():
     n, light, camera, usable = _scene()
     light[3, 2], n[7], camera[5, 1] = np.nan, np.nan, np.inf
     usable[11] = False
-    _, offsets, index = basis_rows(embedded_dictionary().table[..., :1], DEFAULT_GRID, n, light, camera, usable)
+    _, offsets, index = basis_rows(
+        embedded_dictionary().table[..., :1], DEFAULT_GRID, n, light, camera, usable
+    )
     want = [
         (s, i, o)
         for s in range(20)
         for i in range(9)
         for o in range(5)
-        if usable[s, i, o] and n[s] @ light[s, i] > 0 and np.isfinite(camera[s, o]).all() and n[s] @ camera[s, o] > 0
+        if usable[s, i, o]
+        and n[s] @ light[s, i] > 0
+        and np.isfinite(camera[s, o]).all()
+        and n[s] @ camera[s, o] > 0
     ]
     s = np.repeat(np.arange(20), np.diff(offsets))
     assert np.column_stack([s, index]).tolist() == [list(w) for w in want]
@@ -75,7 +86,9 @@ def test_basis_rows__reciprocal():
 def test_basis_rows__nothing_usable(n):
     table = embedded_dictionary().table[..., :4]
     shapes = np.zeros((n, 3)), np.zeros((n, 6, 3)), np.zeros((n, 2, 3))
-    rows, offsets, index = basis_rows(table, DEFAULT_GRID, *shapes, np.ones((n, 6, 2), bool))
+    rows, offsets, index = basis_rows(
+        table, DEFAULT_GRID, *shapes, np.ones((n, 6, 2), bool)
+    )
     assert rows.shape == (0, 4)
     assert offsets.tolist() == [0] * (n + 1)
     assert index.shape == (0, 2)
@@ -85,14 +98,26 @@ def test_basis_rows__any_memory_order_and_precision():
     n, light, camera, usable = _scene()
     table = embedded_dictionary().table[..., :4]
     want = basis_rows(table, DEFAULT_GRID, n, light, camera, usable)
-    got = basis_rows(np.asfortranarray(table), DEFAULT_GRID, np.asfortranarray(n), light, camera[:, :, ::1], usable)
+    got = basis_rows(
+        np.asfortranarray(table),
+        DEFAULT_GRID,
+        np.asfortranarray(n),
+        light,
+        camera[:, :, ::1],
+        usable,
+    )
     for a, b in zip(got, want, strict=True):
         np.testing.assert_array_equal(a, b)
 
 
 def test_basis_rows__grid_must_match():
     with pytest.raises(ValueError, match="must have the shape of the grid"):
-        basis_rows(np.zeros((3, 3, 3, 1), np.float32), DEFAULT_GRID, *np.zeros((3, 1, 1, 3)), np.zeros((1, 1, 1), bool))
+        basis_rows(
+            np.zeros((3, 3, 3, 1), np.float32),
+            DEFAULT_GRID,
+            *np.zeros((3, 1, 1, 3)),
+            np.zeros((1, 1, 1), bool),
+        )
 
 
 def test_fill_rows__releases_the_interpreter_lock():
@@ -107,7 +132,9 @@ def test_fill_rows__a_broken_direction_reads_no_wild_address():
     light = np.array([[[np.nan, 0, 1], [np.inf, 0, 1]]])
     every = np.ones((1, 2, 2), bool)
     index = np.zeros((4, 2), np.int32)
-    _row_kernels.fill_rows(table, normal, light, light, every, np.array([0, 4]), rows, index)
+    _row_kernels.fill_rows(
+        table, normal, light, light, every, np.array([0, 4]), rows, index
+    )
     assert (rows == 0).all()
 
 
@@ -121,7 +148,9 @@ def test_arctangent__as_numpy():
 
 
 def test_reduce_dictionary__sixteen_dimensions_hold_every_material():
-    """Relative rms over pairs of directions above 6 degrees, as a dome takes them; 0.6 % and 1.8 % measured."""
+    """Relative rms over pairs of directions above 6 degrees, as a dome takes them; 0.6
+    % and 1.8 % measured.
+    """
     dictionary = convolve_disc(embedded_dictionary(), 0.0142)
     reduced, lift = reduce_dictionary(dictionary.table, 16)
     a = _unit(np.random.default_rng(6).normal(size=(2, 8000, 3)))
@@ -140,14 +169,19 @@ def test_reduce_dictionary__full_rank_and_dependent_tables():
     same, eye = reduce_dictionary(table, 3)
     assert same is table
     np.testing.assert_array_equal(eye, np.eye(3))
-    twice = np.concatenate([table[..., :2], 7 * table[..., :2], np.zeros((6, 5, 4, 1), np.float32)], axis=-1)
+    twice = np.concatenate(
+        [table[..., :2], 7 * table[..., :2], np.zeros((6, 5, 4, 1), np.float32)],
+        axis=-1,
+    )
     reduced, lift = reduce_dictionary(twice, 2)
     np.testing.assert_allclose(reduced @ lift, twice, atol=1e-5)
 
 
 def test_table_grid__nodes():
     grid = TableGrid(5, 3, 4)
-    np.testing.assert_allclose(np.sqrt(grid.theta_h / (np.pi / 2)), [0, 0.25, 0.5, 0.75, 1])
+    np.testing.assert_allclose(
+        np.sqrt(grid.theta_h / (np.pi / 2)), [0, 0.25, 0.5, 0.75, 1]
+    )
     np.testing.assert_allclose(grid.theta_d, [0, np.pi / 4, np.pi / 2])
     np.testing.assert_allclose(grid.phi_d, [0, np.pi / 4, np.pi / 2, 3 * np.pi / 4])
 
@@ -161,12 +195,23 @@ def test_turn_rows__are_the_rows_of_the_other_normal():
     for s in range(len(n)):
         rows = np.empty((45, 8), np.float32)
         index = np.empty((45, 2), np.int32)
-        count = _row_kernels.form_rows(table, n[s], light[s], camera[s], usable[s], memory, rows, index)
-        _row_kernels.turn_rows(table, turned[s], light[s], camera[s], index, count, memory, rows)
+        count = _row_kernels.form_rows(
+            table, n[s], light[s], camera[s], usable[s], memory, rows, index
+        )
+        _row_kernels.turn_rows(
+            table, turned[s], light[s], camera[s], index, count, memory, rows
+        )
         wi = light[s, index[:count, 0]]
         wo = camera[s, index[:count, 1]]
         up = (wi @ turned[s] > 0) & (wo @ turned[s] > 0)
-        want = lookup(table, *half_difference(wi, wo, np.broadcast_to(turned[s], wi.shape))) * (wi @ turned[s])[:, None]
-        np.testing.assert_allclose(rows[:count], np.where(up[:, None], want, 0), rtol=SINGLE)
+        want = (
+            lookup(
+                table, *half_difference(wi, wo, np.broadcast_to(turned[s], wi.shape))
+            )
+            * (wi @ turned[s])[:, None]
+        )
+        np.testing.assert_allclose(
+            rows[:count], np.where(up[:, None], want, 0), rtol=SINGLE
+        )
         below += int((~up).sum())
     assert below > 10

@@ -13,7 +13,9 @@ from skindb.optics.rows import reduce_dictionary
 from skindb.optics.truncation import nodes_above, truncation_bound
 
 GRID = TableGrid(24, 20, 8)
-SINGLE = 1e-4  # of a mixture: tables are single floats, mixed ones sums of terms up to a thousand times their size
+# of a mixture: tables are single floats, mixed ones sums of terms up to a thousand
+# times their size
+SINGLE = 1e-4
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +45,9 @@ def test_truncation_bound__holds_for_mixtures(tables, rank):
     reduced, lift = reduce_dictionary(tables, rank)
     bound = truncation_bound(tables, reduced, lift)
     x = _mixtures(rng, tables.shape[-1])
-    metric = brdf_metric(np.concatenate([tables, tables - reduced @ lift], axis=-1), weighted_like=tables)
+    metric = brdf_metric(
+        np.concatenate([tables, tables - reduced @ lift], axis=-1), weighted_like=tables
+    )
     signs = np.concatenate([0 * x, x], axis=1), np.concatenate([x, 0 * x], axis=1)
     off, whole = (np.sqrt(np.einsum("ij,jk,ik->i", s, metric, s)) for s in signs)
     assert (off <= bound.rms * whole * (1 + SINGLE)).all()
@@ -54,10 +58,13 @@ def test_truncation_bound__holds_for_mixtures(tables, rank):
     near = lookup(reduced, *angles) @ lift @ x.T
     share = np.abs(near - exact) / exact
     assert (share <= bound.worst + SINGLE).all()
-    wi, wo = directions(*np.meshgrid(GRID.theta_h, GRID.theta_d, GRID.phi_d, indexing="ij"))
+    wi, wo = directions(
+        *np.meshgrid(GRID.theta_h, GRID.theta_d, GRID.phi_d, indexing="ij")
+    )
     node = np.minimum(wi[..., 2], wo[..., 2]) > 0.1
     single = np.abs((reduced @ lift)[node] / tables[node] - 1)
-    assert single.max() > 0.3 * bound.worst  # which covers the nodes below the elevation beside these, on a coarse grid
+    # which covers the nodes below the elevation beside these, on a coarse grid
+    assert single.max() > 0.3 * bound.worst
 
 
 def test_truncation_bound__is_zero_at_full_rank(tables):
@@ -74,7 +81,10 @@ def test_truncation_bound__is_infinite_where_a_table_is_zero():
 @pytest.mark.parametrize("n_phi", [7, 8])
 def test_nodes_above__are_those_that_pairs_use(n_phi):
     grid = TableGrid(24, 20, n_phi)
-    x, y, z = np.random.default_rng(1).random((3, 1_000_000)) * np.array([23, 19, n_phi])[:, None]
+    x, y, z = (
+        np.random.default_rng(1).random((3, 1_000_000))
+        * np.array([23, 19, n_phi])[:, None]
+    )
     pairs = directions((x / 23) ** 2 * np.pi / 2, y / 19 * np.pi / 2, z / n_phi * np.pi)
     above = np.min([w[:, 2] for w in pairs], axis=0) > 0.3
     i, j, k = (a[above].astype(int) for a in (x, y, z))

@@ -12,13 +12,17 @@ SIZE = 120
 
 
 def scene():
-    """A rendering with spots of albedo, a shadow to the left and a highlight, and its surface part."""
+    """A rendering with spots of albedo, a shadow to the left and a highlight, and its
+    surface part.
+    """
     rng = np.random.default_rng(3)
     y, x = np.mgrid[:SIZE, :SIZE]
     spots = 1 + 0.4 * ndimage.gaussian_filter(rng.standard_normal((SIZE, SIZE)), 3) * 10
     matte = np.where(x > 30, 0.5 + 0.3 * x / SIZE, 0.0) * spots
     gloss = 0.8 * np.exp(-((x - 80) ** 2 + (y - 60) ** 2) / 200)
-    picture = np.repeat(ndimage.gaussian_filter(matte + gloss, 1)[..., None], 3, axis=-1)
+    picture = np.repeat(
+        ndimage.gaussian_filter(matte + gloss, 1)[..., None], 3, axis=-1
+    )
     return picture, np.repeat(ndimage.gaussian_filter(gloss, 1)[..., None], 3, axis=-1)
 
 
@@ -26,14 +30,20 @@ def found(photo, rendered, gloss, doubtful=None):
     mask = np.zeros((SIZE, SIZE), bool)
     mask[5:-5, 5:-5] = True
     return find_causes(
-        photo, rendered, gloss, mask=mask, doubtful=np.zeros((SIZE, SIZE)) if doubtful is None else doubtful
+        photo,
+        rendered,
+        gloss,
+        mask=mask,
+        doubtful=np.zeros((SIZE, SIZE)) if doubtful is None else doubtful,
     )
 
 
 def test_find_causes__nothing_is_named_where_nothing_is_wrong():
     rendered, gloss = scene()
     rng = np.random.default_rng(1)
-    causes = found(rendered * (1 + 0.01 * rng.standard_normal(rendered.shape)), rendered, gloss)
+    causes = found(
+        rendered * (1 + 0.01 * rng.standard_normal(rendered.shape)), rendered, gloss
+    )
     assert causes.notable == []
     assert np.hypot(*causes.shift) < 0.05
     assert causes.gain == pytest.approx(1, abs=0.005)
@@ -45,7 +55,8 @@ def test_find_causes__a_shift(move):
     rendered, gloss = scene()
     photo = ndimage.shift(rendered, (move[1], move[0], 0), order=3, mode="nearest")
     causes = found(photo, rendered, gloss)
-    np.testing.assert_allclose(causes.shift, move, atol=0.15)  # linear in the shift, of spots that are 3 px wide
+    # linear in the shift, of spots that are 3 px wide
+    np.testing.assert_allclose(causes.shift, move, atol=0.15)
     assert any("calibration of the camera or motion" in one for one in causes.notable)
 
 
@@ -59,7 +70,9 @@ def test_find_causes__intensity_of_the_light():
 def test_find_causes__light_in_the_shadow():
     rendered, gloss = scene()
     causes = found(rendered + 0.05, rendered, gloss)
-    assert causes.shadow == pytest.approx(0.05 / (rendered[rendered > 0.1].mean() + 0.05), rel=0.2)
+    assert causes.shadow == pytest.approx(
+        0.05 / (rendered[rendered > 0.1].mean() + 0.05), rel=0.2
+    )
     assert any("light between parts of the face" in one for one in causes.notable)
 
 
@@ -81,6 +94,8 @@ def test_find_causes__hair():
 
 
 def test_find_causes__a_dark_picture_says_nothing():
-    causes = found(np.zeros((SIZE, SIZE, 3)), np.zeros((SIZE, SIZE, 3)), np.zeros((SIZE, SIZE, 3)))
+    causes = found(
+        np.zeros((SIZE, SIZE, 3)), np.zeros((SIZE, SIZE, 3)), np.zeros((SIZE, SIZE, 3))
+    )
     assert np.isnan(causes.gain)
     assert causes.notable == []

@@ -29,7 +29,9 @@ def test_compare_images__known_scale(photograph: np.ndarray) -> None:
     assert found["rmse"] == pytest.approx(0.1 * np.sqrt((photograph**2).mean()))
 
 
-def test_compare_images__psnr_and_colour_agree_with_another_library(photograph: np.ndarray) -> None:
+def test_compare_images__psnr_and_colour_agree_with_another_library(
+    photograph: np.ndarray,
+) -> None:
     other = photograph * [0.9, 1.05, 1.2]
     found = compare_images(other, photograph, exposure=0.02)
     shown = [encode_srgb(image * 0.02) for image in (photograph, other)]
@@ -40,13 +42,16 @@ def test_compare_images__psnr_and_colour_agree_with_another_library(photograph: 
 
 
 def test_delta_e__published_pair() -> None:
-    # pair 1 of Sharma, Wu and Dalal 2005 is out of gamut; a neutral pair of equal lightness has no difference
+    # pair 1 of Sharma, Wu and Dalal 2005 is out of gamut; a neutral pair of equal
+    # lightness has no difference
     assert delta_e([0.2, 0.2, 0.2], [0.2, 0.2, 0.2]) == pytest.approx(0, abs=1e-12)
     # black against white is 100 by construction of L*
     assert delta_e([0.0, 0.0, 0.0], [1.0, 1.0, 1.0]) == pytest.approx(100, abs=0.01)
 
 
-def test_compare_images__mask_and_unknown_pixels_do_not_count(photograph: np.ndarray) -> None:
+def test_compare_images__mask_and_unknown_pixels_do_not_count(
+    photograph: np.ndarray,
+) -> None:
     broken = photograph.copy()
     mask = np.ones(photograph.shape[:2], bool)
     broken[:10] = 1e4
@@ -58,7 +63,9 @@ def test_compare_images__mask_and_unknown_pixels_do_not_count(photograph: np.nda
     assert found["ssim"] == pytest.approx(1)
 
 
-def test_compare_images__ssim_falls_with_structure_not_with_an_empty_background(photograph: np.ndarray) -> None:
+def test_compare_images__ssim_falls_with_structure_not_with_an_empty_background(
+    photograph: np.ndarray,
+) -> None:
     noisy = photograph * np.random.default_rng(0).uniform(0.7, 1.3, photograph.shape)
     mask = np.zeros(photograph.shape[:2], bool)
     mask[10:30, 10:30] = True
@@ -66,12 +73,15 @@ def test_compare_images__ssim_falls_with_structure_not_with_an_empty_background(
     found = compare_images(*padded, mask=mask, exposure=0.02)["ssim"]
     shown = [encode_srgb(image[10:30, 10:30] * 0.02) for image in (noisy, photograph)]
     _, local = structural_similarity(*shown, data_range=1, channel_axis=-1, full=True)
-    assert found == pytest.approx(local[3:-3, 3:-3].mean())  # windows of 7 pixels inside the square
+    # windows of 7 pixels inside the square
+    assert found == pytest.approx(local[3:-3, 3:-3].mean())
     assert found < 0.9
 
 
 def test_compare_images__nothing_to_compare() -> None:
     with pytest.raises(ValueError, match="mask is empty"):
-        compare_images(np.ones((9, 9, 3)), np.ones((9, 9, 3)), mask=np.zeros((9, 9), bool))
+        compare_images(
+            np.ones((9, 9, 3)), np.ones((9, 9, 3)), mask=np.zeros((9, 9), bool)
+        )
     with pytest.raises(ValueError, match="both images must have the shape"):
         compare_images(np.ones((9, 9, 3)), np.ones((9, 8, 3)))

@@ -1,4 +1,6 @@
-"""Oracles: closed forms of ray-plane and ray-sphere intersection, Lambert's law, the irradiance of a disc."""
+"""Oracles: closed forms of ray-plane and ray-sphere intersection, Lambert's law, the
+irradiance of a disc.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,9 @@ FLOAT32 = 2e-6
 LAMBERT = 1.0  # index at which Fresnel lets everything pass
 
 
-def surface(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, eta: float = LAMBERT) -> Surface:
+def surface(
+    vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, eta: float = LAMBERT
+) -> Surface:
     n = len(vertices)
     return Surface(
         np.asarray(vertices, float),
@@ -36,7 +40,12 @@ def plane(half: float = 100.0, cells: int = 1) -> Surface:
     x, y = np.meshgrid(grid, grid)
     vertices = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
     i = (np.arange(cells)[:, None] * (cells + 1) + np.arange(cells)).ravel()
-    faces = np.concatenate([np.stack([i, i + 1, i + cells + 2], 1), np.stack([i, i + cells + 2, i + cells + 1], 1)])
+    faces = np.concatenate(
+        [
+            np.stack([i, i + 1, i + cells + 2], 1),
+            np.stack([i, i + cells + 2, i + cells + 1], 1),
+        ]
+    )
     return surface(vertices, faces, np.tile([0.0, 0.0, 1.0], (len(vertices), 1)))
 
 
@@ -47,18 +56,29 @@ def camera(width: int = 24, height: int = 18, distance: float = 300.0) -> Camera
     return Camera(K, R, -R @ np.array([0, 0, distance]), np.zeros(5), width, height)
 
 
-def lights(*positions: tuple[float, float, float], radius: float = 0.0, falloff: float = 0.0) -> Lights:
+def lights(
+    *positions: tuple[float, float, float], radius: float = 0.0, falloff: float = 0.0
+) -> Lights:
     position = np.array(positions, float)
     axis = -position / np.linalg.norm(position, axis=1, keepdims=True)
     n = len(position)
-    return Lights(position, np.full((n, 3), [1e5, 2e5, 3e5]), np.full(n, radius), axis, np.full(n, falloff))
+    return Lights(
+        position,
+        np.full((n, 3), [1e5, 2e5, 3e5]),
+        np.full(n, radius),
+        axis,
+        np.full(n, falloff),
+    )
 
 
 def plane_points(view: Camera) -> np.ndarray:
     """Where the rays of the pixel centres meet z = 0."""
     y, x = np.mgrid[: view.height, : view.width] + 0.5
     scale = view.centre[2] / view.K[0, 0]
-    return np.stack([(x - view.K[0, 2]) * scale, -(y - view.K[1, 2]) * scale, np.zeros_like(x)], axis=-1)
+    return np.stack(
+        [(x - view.K[0, 2]) * scale, -(y - view.K[1, 2]) * scale, np.zeros_like(x)],
+        axis=-1,
+    )
 
 
 def test_render_view__lambertian_plane() -> None:
@@ -99,12 +119,21 @@ def test_render_view__sphere() -> None:
     p = view.centre + (-b - np.sqrt(np.maximum(root, 0)))[..., None] * d
     towards = lamps.position[0] - p
     distance = np.linalg.norm(towards, axis=-1)
-    cosine = np.maximum(np.einsum("hwc,hwc->hw", towards / distance[..., None], p / 60), 0)
-    expected = np.where(hit, cosine / distance**2, 0)[..., None] * [0.6e5, 0.8e5, 0.9e5] / np.pi
-    assert (np.abs((seen.coverage > 0).astype(float) - hit) > 0).sum() <= 4  # the rim of a polygon
+    cosine = np.maximum(
+        np.einsum("hwc,hwc->hw", towards / distance[..., None], p / 60), 0
+    )
+    expected = (
+        np.where(hit, cosine / distance**2, 0)[..., None]
+        * [0.6e5, 0.8e5, 0.9e5]
+        / np.pi
+    )
+    # the rim of a polygon
+    assert (np.abs((seen.coverage > 0).astype(float) - hit) > 0).sum() <= 4
     inner = hit & (np.einsum("hwc,hwc->hw", -d, p / 60) > 0.2)
     # facets of 2 degrees: the point moves by 60 (1 - cos 1 deg) = 0.01 mm along the ray
-    np.testing.assert_allclose(image[inner], expected[inner], atol=5e-3 * expected.max())
+    np.testing.assert_allclose(
+        image[inner], expected[inner], atol=5e-3 * expected.max()
+    )
 
 
 def test_render_view__shadow_of_a_sphere_on_a_plane() -> None:
@@ -112,7 +141,9 @@ def test_render_view__shadow_of_a_sphere_on_a_plane() -> None:
     flat = plane(200.0)
     vertices = np.concatenate([flat.vertices, ball.vertices + np.array([0, 0, 60])])
     both = surface(
-        vertices, np.concatenate([flat.faces, ball.faces + 4]), np.concatenate([flat.normals, ball.vertices / 15])
+        vertices,
+        np.concatenate([flat.faces, ball.faces + 4]),
+        np.concatenate([flat.normals, ball.vertices / 15]),
     )
     view = camera(60, 60)
     lamps = lights((250, 0, 300))
@@ -120,10 +151,13 @@ def test_render_view__shadow_of_a_sphere_on_a_plane() -> None:
     points = plane_points(view)
     towards = lamps.position[0] - points
     along = towards / np.linalg.norm(towards, axis=-1, keepdims=True)
-    nearest = np.linalg.norm(np.cross([0, 0, 60] - points, along), axis=-1)  # of the ray to the ball's centre
+    # of the ray to the ball's centre
+    nearest = np.linalg.norm(np.cross([0, 0, 60] - points, along), axis=-1)
     camera_ray = points - view.centre
     camera_ray /= np.linalg.norm(camera_ray, axis=-1, keepdims=True)
-    on_plane = np.linalg.norm(np.cross([0, 0, 60] - view.centre, camera_ray), axis=-1) > 15.5
+    on_plane = (
+        np.linalg.norm(np.cross([0, 0, 60] - view.centre, camera_ray), axis=-1) > 15.5
+    )
     shadow = on_plane & (nearest < 14.8)
     bright = on_plane & (nearest > 15.2)
     assert shadow.sum() > 50
@@ -137,11 +171,16 @@ def test_render_view__disc_light_converges_to_its_irradiance() -> None:
     h = 100.0
     R = 60.0
     irradiance = 2 / R**2 * (1 - h / np.hypot(h, R)) * np.array([0.6e5, 0.8e5, 0.9e5])
-    # midpoint rule in r^2: error falls with the square of the number of points; 16 give 3e-4 on the axis
-    image = render_view(plane(), view, lights((0.0, 0.0, h), radius=R), disc_samples=16)[0]
+    # midpoint rule in r^2: error falls with the square of the number of points; 16 give
+    # 3e-4 on the axis
+    image = render_view(
+        plane(), view, lights((0.0, 0.0, h), radius=R), disc_samples=16
+    )[0]
     np.testing.assert_allclose(image[12, 12] * np.pi, irradiance, rtol=5e-4)
     # the four rays of a pixel share the same points out among them
-    image = render_view(plane(), view, lights((0.0, 0.0, h), radius=R), disc_samples=4, samples=2)[0]
+    image = render_view(
+        plane(), view, lights((0.0, 0.0, h), radius=R), disc_samples=4, samples=2
+    )[0]
     np.testing.assert_allclose(image[12, 12] * np.pi, irradiance, rtol=5e-3)
 
 
@@ -158,23 +197,34 @@ def test_render_view__terms_add_up() -> None:
     glossy = replace(plane(), weights=np.full((4, 1), 0.7), eta=1.3)
     view = camera()
     lamps = lights((200, 100, 400))
-    parts = [render_view(glossy, view, lamps, terms=(term,)) for term in ("diffuse", "surface")]
-    np.testing.assert_allclose(render_view(glossy, view, lamps), parts[0] + parts[1], rtol=FLOAT32)
+    parts = [
+        render_view(glossy, view, lamps, terms=(term,))
+        for term in ("diffuse", "surface")
+    ]
+    np.testing.assert_allclose(
+        render_view(glossy, view, lamps), parts[0] + parts[1], rtol=FLOAT32
+    )
     # a table of ones is Lambertian with albedo pi
     lambert = render_view(plane(), view, lamps, terms=("diffuse",))
-    np.testing.assert_allclose(parts[1] / np.pi, lambert / np.array([0.6, 0.4, 0.3]) * 0.7, rtol=2 * FLOAT32)
+    np.testing.assert_allclose(
+        parts[1] / np.pi, lambert / np.array([0.6, 0.4, 0.3]) * 0.7, rtol=2 * FLOAT32
+    )
     with pytest.raises(ValueError, match="terms must be among"):
         render_view(glossy, view, lamps, terms=("specular",))
 
 
 def test_trace_view__coverage_and_antialiasing() -> None:
     view = camera()
-    half = replace(plane(), vertices=plane().vertices + np.array([100.0, 0, 0]))  # covers x > 0
+    # covers x > 0
+    half = replace(plane(), vertices=plane().vertices + np.array([100.0, 0, 0]))
     traced = trace_view(half, view, samples=4)
     np.testing.assert_allclose(traced.coverage[:, :12], 0)
     np.testing.assert_allclose(traced.coverage[:, 12:], 1)
-    shifted = replace(half, vertices=half.vertices + np.array([300 / 48 / 2, 0, 0]))  # half a pixel more
-    np.testing.assert_allclose(trace_view(shifted, view, samples=4).coverage[:, 12], 0.5)
+    # half a pixel more
+    shifted = replace(half, vertices=half.vertices + np.array([300 / 48 / 2, 0, 0]))
+    np.testing.assert_allclose(
+        trace_view(shifted, view, samples=4).coverage[:, 12], 0.5
+    )
 
 
 def test_trace_view__unknown_vertices_and_backs_do_not_shine() -> None:
@@ -200,7 +250,8 @@ def test_render_view__distorted_pixels_see_what_projects_there() -> None:
 
 
 def test_render_view__uniform_light_under_a_plane_gives_the_local_answer() -> None:
-    # a light so far away that the plane receives the same everywhere: the dipole must return R_d (eq. 5)
+    # a light so far away that the plane receives the same everywhere: the dipole must
+    # return R_d (eq. 5)
     flat = replace(plane(60.0, cells=60), eta=1.3)
     s, _ = dipole_s(flat.diffuse, eta=1.3)
     skin = replace(flat, s=s, sigma_tr=np.full(s.shape, [0.5, 0.8, 1.1]))
@@ -210,8 +261,14 @@ def test_render_view__uniform_light_under_a_plane_gives_the_local_answer() -> No
     spread = render_view(skin, view, lamps, subsurface=True)
     np.testing.assert_allclose(spread, local, rtol=1e-4)
     glow = exitances(skin, lamps, RayScene(skin.vertices, skin.faces))
-    np.testing.assert_allclose(render_view(skin, view, lamps, subsurface=True, glow=glow), spread, rtol=FLOAT32)
-    np.testing.assert_allclose(render_view(skin, view, lamps, subsurface=True, glow=glow * 2), 2 * spread, rtol=FLOAT32)
+    np.testing.assert_allclose(
+        render_view(skin, view, lamps, subsurface=True, glow=glow), spread, rtol=FLOAT32
+    )
+    np.testing.assert_allclose(
+        render_view(skin, view, lamps, subsurface=True, glow=glow * 2),
+        2 * spread,
+        rtol=FLOAT32,
+    )
 
 
 def test_render_view__subsurface_light_crosses_a_shadow_line() -> None:
@@ -232,7 +289,9 @@ def test_render_view__subsurface_light_crosses_a_shadow_line() -> None:
     near = Camera(view.K * [[8], [8], [1]], view.R, view.t, view.distortion, 384, 32)
     image = render_view(skin, near, lamps, subsurface=True)[0, 16]
     local = render_view(skin, near, lamps)[0, 16]
-    received = transmitted_irradiance(skin, lamps, RayScene(skin.vertices, skin.faces))[:n]
+    received = transmitted_irradiance(skin, lamps, RayScene(skin.vertices, skin.faces))[
+        :n
+    ]
     shaded = (flat.vertices[:, 0] < -0.3) & (np.abs(flat.vertices[:, 1]) < 25)
     assert (received[shaded] == 0).all()
     assert (received[flat.vertices[:, 0] > 0.3] > 0).all()

@@ -16,7 +16,8 @@ from skindb.schema.brdf import brdf_coords, stored_brdf
 
 ETA = 1.35
 GRID = TableGrid(12, 10, 6)
-SINGLE = 2e-5  # values, weights and tables are in single precision, and cells are interpolated twice
+# values, weights and tables are in single precision, and cells are interpolated twice
+SINGLE = 2e-5
 
 
 def _unit(v):
@@ -25,7 +26,9 @@ def _unit(v):
 
 @pytest.fixture(scope="module")
 def model() -> xr.DataTree:
-    """Six surfels with random normals, colours and weights of two random tables; the fourth was not fitted."""
+    """Six surfels with random normals, colours and weights of two random tables; the
+    fourth was not fitted.
+    """
     rng = np.random.default_rng(3)
     n = 6
     status = np.zeros(n)
@@ -39,7 +42,10 @@ def model() -> xr.DataTree:
     }
     tables = rng.uniform(0, 1, (GRID.n_theta_h, GRID.n_theta_d, GRID.n_phi_d, 2))
     basis = {"basis_brdf": stored_brdf(tables), "disc_angular_radius": 0.0}
-    groups = {"/fitted": dataset(fitted), "/basis": dataset(basis, coords=brdf_coords(GRID))}
+    groups = {
+        "/fitted": dataset(fitted),
+        "/basis": dataset(basis, coords=brdf_coords(GRID)),
+    }
     return xr.DataTree.from_dict(groups)
 
 
@@ -68,10 +74,17 @@ def _oracle(model, surfel, wi, wo):
     surface = 0.0
     for k, weight in enumerate(fitted["basis_weight"].values[surfel]):
         # nodes are uniform in the root of theta_h, and values linear in it
-        table = RegularGridInterpolator((np.sqrt(nodes[0]), *nodes[1:]), basis["basis_brdf"].values[k].astype(float))
-        surface = surface + weight * table(np.stack([np.sqrt(angles[0]), *angles[1:]], axis=-1))
+        table = RegularGridInterpolator(
+            (np.sqrt(nodes[0]), *nodes[1:]), basis["basis_brdf"].values[k].astype(float)
+        )
+        surface = surface + weight * table(
+            np.stack([np.sqrt(angles[0]), *angles[1:]], axis=-1)
+        )
     through = _transmittance(wi @ normal) * _transmittance(wo @ normal) / np.pi
-    return through[:, None] * fitted["diffuse_reflectance"].values[surfel] + surface[:, None]
+    return (
+        through[:, None] * fitted["diffuse_reflectance"].values[surfel]
+        + surface[:, None]
+    )
 
 
 @pytest.mark.parametrize("surfel", [0, 1, 5])
@@ -85,7 +98,9 @@ def test_evaluate__is_the_formula(model, surfel):
 
 def test_evaluate__is_reciprocal(model):
     wi, wo = _pairs(model, 2)
-    np.testing.assert_allclose(evaluate(model, 2, wi, wo), evaluate(model, 2, wo, wi), rtol=SINGLE)
+    np.testing.assert_allclose(
+        evaluate(model, 2, wi, wo), evaluate(model, 2, wo, wi), rtol=SINGLE
+    )
 
 
 def test_evaluate__is_zero_below_the_horizon(model):
@@ -111,27 +126,46 @@ def test_evaluate__is_the_same_for_a_lazy_model(model):
 
 @pytest.mark.parametrize("surfel", [-1, 6, 1000])
 def test_evaluate__refuses_a_surfel_out_of_range(model, surfel):
-    with pytest.raises(InputError, match=rf"surfel must be an index from 0 to 5; found {surfel}; choose"):
+    with pytest.raises(
+        InputError,
+        match=rf"surfel must be an index from 0 to 5; found {surfel}; choose",
+    ):
         evaluate(model, surfel, [0, 0, 1], [0, 0, 1])
 
 
 def test_evaluate__refuses_a_surfel_that_was_not_fitted(model):
-    with pytest.raises(InputError, match=r"surfel 3: the surfel must be fitted; found the status UNSEEN \("):
+    with pytest.raises(
+        InputError,
+        match=r"surfel 3: the surfel must be fitted; found the status UNSEEN \(",
+    ):
         evaluate(model, 3, [0, 0, 1], [0, 0, 1])
 
 
 def test_evaluate__refuses_what_are_no_directions(model):
-    with pytest.raises(InputError, match=r"wi: directions must be unit vectors; found a length of 2; normalise"):
+    with pytest.raises(
+        InputError,
+        match=r"wi: directions must be unit vectors; found a length of 2; normalise",
+    ):
         evaluate(model, 0, [0, 0, 2], [0, 0, 1])
-    with pytest.raises(InputError, match="wo: directions must be unit vectors; found a length of nan"):
+    with pytest.raises(
+        InputError, match="wo: directions must be unit vectors; found a length of nan"
+    ):
         evaluate(model, 0, [0, 0, 1], [[0, 0, 1], [np.nan, 0, 1]])
-    with pytest.raises(InputError, match=r"wo: directions must have the shape \(\.\.\., 3\); found the shape \(2,\)"):
+    with pytest.raises(
+        InputError,
+        match=r"wo: directions must have the shape \(\.\.\., 3\); found the shape \(2,\)",
+    ):
         evaluate(model, 0, [0, 0, 1], [0, 1])
 
 
 def test_evaluate__a_model_without_weights_is_refused(model):
     other = xr.DataTree.from_dict(
-        {"/fitted": model["fitted"].to_dataset().drop_vars("basis_weight"), "/basis": model["basis"].to_dataset()}
+        {
+            "/fitted": model["fitted"].to_dataset().drop_vars("basis_weight"),
+            "/basis": model["basis"].to_dataset(),
+        }
     )
-    with pytest.raises(InputError, match=r"fitted\[basis_weight\]: variable is required"):
+    with pytest.raises(
+        InputError, match=r"fitted\[basis_weight\]: variable is required"
+    ):
         evaluate(other, 0, [0, 0, 1], [0, 0, 1])

@@ -36,17 +36,34 @@ def take(plate):
     fitted = xr.Dataset(
         {
             "surfel_position": (("surfel", "xyz"), position, {"units": "mm"}),
-            "shading_normal": (("surfel", "xyz"), np.tile([0.6, 0.0, 0.8], (count, 1)), {"units": "1"}),
+            "shading_normal": (
+                ("surfel", "xyz"),
+                np.tile([0.6, 0.0, 0.8], (count, 1)),
+                {"units": "1"},
+            ),
             "basis_weight": (("surfel", "component"), np.ones((count, 3))),
-            "sigma_tr": (("surfel", "channel"), np.tile([0.5, 1.0, 2.0], (count, 1)), {"units": "mm-1"}),
-            "sample": (("surfel", "light", "channel"), np.ones((count, 2, 3)) * [[0.1], [0.4]], {"units": "sr-1"}),
+            "sigma_tr": (
+                ("surfel", "channel"),
+                np.tile([0.5, 1.0, 2.0], (count, 1)),
+                {"units": "mm-1"},
+            ),
+            "sample": (
+                ("surfel", "light", "channel"),
+                np.ones((count, 2, 3)) * [[0.1], [0.4]],
+                {"units": "sr-1"},
+            ),
             "diffuse_reflectance": (("surfel", "channel"), colour, {"units": "1"}),
             "surfel_area": ("surfel", position[:, 1].copy(), {"units": "mm2"}),
             "fit_status": status,
         },
         coords={"channel": ["R", "G", "B"]},
     )
-    return xr.DataTree.from_dict({"fitted": fitted, "mesh": xr.Dataset({"triangle": (("face", "corner"), triangle)})})
+    return xr.DataTree.from_dict(
+        {
+            "fitted": fitted,
+            "mesh": xr.Dataset({"triangle": (("face", "corner"), triangle)}),
+        }
+    )
 
 
 @pytest.mark.parametrize("turn", [0.0, 60.0])
@@ -62,10 +79,14 @@ def test_trace_front__a_plate_in_parallel_rays(plate, turn):
     across = met[:, 0] * np.cos(np.radians(turn))
     longer = max(40, 80 * np.cos(np.radians(turn)))
     pixel = longer * 1.06 / 200
-    np.testing.assert_allclose(met[:, 1], 20 + 0.03 * longer - (rows + 0.5) * pixel, atol=1e-4)
+    np.testing.assert_allclose(
+        met[:, 1], 20 + 0.03 * longer - (rows + 0.5) * pixel, atol=1e-4
+    )
     np.testing.assert_allclose(np.diff(across), np.diff(columns) * pixel, atol=1e-4)
     # the whole plate is in the picture, and nothing else
-    assert hit.sum() == pytest.approx(80 * np.cos(np.radians(turn)) * 40 / pixel**2, rel=0.02)
+    assert hit.sum() == pytest.approx(
+        80 * np.cos(np.radians(turn)) * 40 / pixel**2, rel=0.02
+    )
 
 
 def test_trace_front__a_plate_seen_edge_on_has_a_picture_all_the_same(plate):
@@ -81,14 +102,19 @@ def test_field_figure__colours_say_the_value_and_the_scale_its_unit(take):
     image = figure.axes[0].images[0].get_array()
     bar = figure.axes[1]
     assert figure.get_suptitle() == "surfel_area [mm2]"
-    assert bar.get_ylim() == pytest.approx(np.percentile(take["fitted/surfel_area"], (1, 99)), rel=0.05)
+    assert bar.get_ylim() == pytest.approx(
+        np.percentile(take["fitted/surfel_area"], (1, 99)), rel=0.05
+    )
     bright = image[:, image.shape[1] // 2].sum(axis=-1)
     middle = bright[20:-20]
-    assert middle[5] > middle[len(middle) // 2] > middle[-5]  # y falls from the top; viridis is darkest at the least
+    # y falls from the top; viridis is darkest at the least
+    assert middle[5] > middle[len(middle) // 2] > middle[-5]
 
 
 def test_field_figure__what_is_unknown_is_grey_and_what_is_beside_the_face_white(take):
-    take["fitted/surfel_area"].values[:] = np.where(take["fitted/surfel_position"].values[:, 0] > 1, np.nan, 3.0)
+    take["fitted/surfel_area"].values[:] = np.where(
+        take["fitted/surfel_position"].values[:, 0] > 1, np.nan, 3.0
+    )
     image = field_figure(take, "surfel_area", turns=[0.0]).axes[0].images[0].get_array()
     middle = image[len(image) // 2]
     assert (image[0, 0] == 1).all()
@@ -104,7 +130,9 @@ def test_field_figure__a_status_has_the_names_that_occur(take):
 
 def test_field_figure__a_label_chooses_the_channel(take):
     low = [
-        field_figure(take, "diffuse_reflectance", at={"channel": name}, turns=[0.0]).axes[1].get_ylim()[0]
+        field_figure(take, "diffuse_reflectance", at={"channel": name}, turns=[0.0])
+        .axes[1]
+        .get_ylim()[0]
         for name in "RG"
     ]
     assert low == pytest.approx([-40, -20], rel=0.05)
@@ -115,15 +143,20 @@ def test_field_figure__a_colour_is_a_picture_whose_white_the_title_says(take):
     assert figure.get_suptitle() == "sigma_tr (sRGB, white is 2 mm-1)"
     assert len(figure.axes) == 2  # two views and no scale
     image = figure.axes[0].images[0].get_array()
-    # the transfer function of sRGB at 0.25 and 0.5, by hand: 1.055 x^(1 / 2.4) - 0.055; the tilt does not darken it
+    # the transfer function of sRGB at 0.25 and 0.5, by hand: 1.055 x^(1 / 2.4) - 0.055;
+    # the tilt does not darken it
     for axis in figure.axes:
         image = axis.images[0].get_array()
-        np.testing.assert_allclose(image[len(image) // 2, image.shape[1] // 2], [0.5371, 0.7354, 1], atol=1e-3)
+        np.testing.assert_allclose(
+            image[len(image) // 2, image.shape[1] // 2], [0.5371, 0.7354, 1], atol=1e-3
+        )
         assert (image[0, 0] == 1).all()
 
 
 def test_field_figure__unknown_colours_are_grey(take):
-    take["fitted/sigma_tr"].values[take["fitted/surfel_position"].values[:, 0] > 1, 1] = np.nan
+    take["fitted/sigma_tr"].values[
+        take["fitted/surfel_position"].values[:, 0] > 1, 1
+    ] = np.nan
     image = field_figure(take, "sigma_tr", turns=[0.0]).axes[0].images[0].get_array()
     middle = image[len(image) // 2]
     np.testing.assert_allclose(middle[-60], 0.72)
@@ -131,14 +164,22 @@ def test_field_figure__unknown_colours_are_grey(take):
 
 
 def test_field_figure__a_light_of_the_samples_is_a_picture(take):
-    assert field_figure(take, "sample", at={"light": "1"}).get_suptitle() == "sample, light 1 (sRGB, white is 0.4 sr-1)"
+    assert (
+        field_figure(take, "sample", at={"light": "1"}).get_suptitle()
+        == "sample, light 1 (sRGB, white is 0.4 sr-1)"
+    )
 
 
 def test_field_figure__unit_vectors_are_colours(take):
     figure = field_figure(take, "shading_normal", turns=[0.0])
-    assert figure.get_suptitle() == "shading_normal (red, green, blue = (x + 1, y + 1, z + 1) / 2)"
+    assert (
+        figure.get_suptitle()
+        == "shading_normal (red, green, blue = (x + 1, y + 1, z + 1) / 2)"
+    )
     image = figure.axes[0].images[0].get_array()
-    np.testing.assert_allclose(image[len(image) // 2, image.shape[1] // 2], [0.8, 0.5, 0.9], atol=1e-6)
+    np.testing.assert_allclose(
+        image[len(image) // 2, image.shape[1] // 2], [0.8, 0.5, 0.9], atol=1e-6
+    )
 
 
 def test_field_figure__colours_that_are_all_zero_are_black(take):
@@ -153,13 +194,35 @@ def test_field_figure__colours_that_are_all_zero_are_black(take):
         (
             "nose",
             {},
-            "variable: must be a variable of the surfels; found nose; choose basis_weight, diffuse_reflectance",
+            (
+                "variable: must be a variable of the surfels; found nose; choose "
+                "basis_weight, diffuse_reflectance"
+            ),
         ),
-        ("surfel_position", {}, "must select one xyz of surfel_position; found no xyz; choose xyz=0, 1, 2"),
-        ("basis_weight", {}, "must select one component of basis_weight; found no component; choose component=0, 1, 2"),
-        ("sample", {}, "must select one light of sample; found no light; choose light=0, 1"),
+        (
+            "surfel_position",
+            {},
+            "must select one xyz of surfel_position; found no xyz; choose xyz=0, 1, 2",
+        ),
+        (
+            "basis_weight",
+            {},
+            (
+                "must select one component of basis_weight; found no component; choose "
+                "component=0, 1, 2"
+            ),
+        ),
+        (
+            "sample",
+            {},
+            "must select one light of sample; found no light; choose light=0, 1",
+        ),
         ("sample", {"light": "7"}, "found light=7; choose light=0, 1"),
-        ("diffuse_reflectance", {"channel": "X"}, "found channel=X; choose channel=R, G, B"),
+        (
+            "diffuse_reflectance",
+            {"channel": "X"},
+            "found channel=X; choose channel=R, G, B",
+        ),
         ("surfel_area", {"channel": "R"}, "found channel; remove the others"),
     ],
 )

@@ -17,7 +17,9 @@ def radiance(level):
 
 
 def cells(picture, columns):
-    """Brightest value of each column of pictures: labels are black on white, pictures are on black."""
+    """Brightest value of each column of pictures: labels are black on white, pictures
+    are on black.
+    """
     lit = (picture[..., :3] < 250).any(axis=2) & (picture[..., :3] > 5).any(axis=2)
     found = np.flatnonzero(lit.sum(axis=0) > 50)  # labels are not that tall
     parts = np.split(found, np.flatnonzero(np.diff(found) > 1) + 1)
@@ -27,7 +29,12 @@ def cells(picture, columns):
 
 def test_write_grid__one_exposure_for_all(tmp_path):
     path = tmp_path / "grid.png"
-    write_grid(path, {"lotion": [radiance(0.5), radiance(0.25), radiance(0.5)]}, ["A", r"$\x$", "full"], exposure=1.5)
+    write_grid(
+        path,
+        {"lotion": [radiance(0.5), radiance(0.25), radiance(0.5)]},
+        ["A", r"$\x$", "full"],
+        exposure=1.5,
+    )
     first, half, full = cells(read_png(path), 3)
     assert first == full
     assert first == pytest.approx(255 * (1.055 * 0.75 ** (1 / 2.4) - 0.055), abs=2)

@@ -27,12 +27,17 @@ def radiance() -> np.ndarray:
 
 def test_encode_srgb__known_values_and_inverse() -> None:
     # 0.5 and 0.18 by hand from IEC 61966-2-1; 8-bit 188 and 118
-    np.testing.assert_allclose(encode_srgb([0.5, 0.18, 0.001]) * 255, [187.516, 117.646, 3.2946], atol=2e-3)
+    np.testing.assert_allclose(
+        encode_srgb([0.5, 0.18, 0.001]) * 255, [187.516, 117.646, 3.2946], atol=2e-3
+    )
     x = np.linspace(0, 1, 101)
-    np.testing.assert_allclose(decode_srgb(encode_srgb(x)), x, atol=3e-8)  # the standard's own seam is 3e-8 wide
+    # the standard's own seam is 3e-8 wide
+    np.testing.assert_allclose(decode_srgb(encode_srgb(x)), x, atol=3e-8)
 
 
-def test_tone_map__exposure_takes_the_bright_quantile_to_white(radiance: np.ndarray) -> None:
+def test_tone_map__exposure_takes_the_bright_quantile_to_white(
+    radiance: np.ndarray,
+) -> None:
     picture = tone_map(radiance)
     clipped = (picture.max(axis=-1) == 255).mean()
     assert 0 < clipped < 0.02
@@ -57,11 +62,15 @@ def test_write_png__another_reader_sees_the_same(tmp_path: Path) -> None:
 
 
 def test_write_png__refuses_floats(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="must be uint8 or uint16 for PNG, found float64"):
+    with pytest.raises(
+        ValueError, match="must be uint8 or uint16 for PNG, found float64"
+    ):
         write_png(tmp_path / "a.png", np.zeros((2, 2)))
 
 
-def test_write_exr__keeps_float32_and_names(tmp_path: Path, radiance: np.ndarray) -> None:
+def test_write_exr__keeps_float32_and_names(
+    tmp_path: Path, radiance: np.ndarray
+) -> None:
     write_exr(tmp_path / "a.exr", radiance, attributes={"units": "sr-1"})
     back, names = read_exr(tmp_path / "a.exr")
     assert names == ("R", "G", "B")
@@ -79,8 +88,12 @@ def test_write_exr__single_channel_and_half(tmp_path: Path) -> None:
     np.testing.assert_array_equal(back[..., 0], grey)
 
 
-def test_read_exr__absent_and_truncated_are_the_users_mistakes(tmp_path: Path, radiance: np.ndarray) -> None:
-    with pytest.raises(InputError, match=r"nowhere\.exr: file must be readable; found No such file"):
+def test_read_exr__absent_and_truncated_are_the_users_mistakes(
+    tmp_path: Path, radiance: np.ndarray
+) -> None:
+    with pytest.raises(
+        InputError, match=r"nowhere\.exr: file must be readable; found No such file"
+    ):
         read_exr(tmp_path / "nowhere.exr")
     write_exr(tmp_path / "a.exr", radiance)
     whole = (tmp_path / "a.exr").read_bytes()

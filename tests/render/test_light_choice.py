@@ -19,7 +19,9 @@ def around(count: int = COUNT) -> Lights:
     position = rng.standard_normal((count, 3))
     position *= 500 / np.linalg.norm(position, axis=1, keepdims=True)
     intensity = rng.uniform(1e5, 5e5, (count, 1)) * np.ones(3)
-    return Lights(position, intensity, np.zeros(count), -position / 500, np.zeros(count))
+    return Lights(
+        position, intensity, np.zeros(count), -position / 500, np.zeros(count)
+    )
 
 
 def test_light_choice__draws_by_its_probabilities() -> None:
@@ -29,9 +31,13 @@ def test_light_choice__draws_by_its_probabilities() -> None:
     drawn = [pair for _ in range(50) for pair in choice.draw(view, rng)]
     found = sum(np.bincount(at, minlength=COUNT) for at, _ in drawn)
     # the sum of the inverse probabilities of a light, over the hits, estimates the number of hits
-    weights = sum(np.bincount(at, weights=weight, minlength=COUNT) for at, weight in drawn) / 50
+    weights = (
+        sum(np.bincount(at, weights=weight, minlength=COUNT) for at, weight in drawn)
+        / 50
+    )
     assert found.sum() == 50 * LIGHTS_PER_RAY * len(view.pixel)
-    np.testing.assert_allclose(weights, len(view.pixel), rtol=0.06)  # of the rarest light, which is behind the ball
+    # of the rarest light, which is behind the ball
+    np.testing.assert_allclose(weights, len(view.pixel), rtol=0.06)
 
 
 def test_light_choice__light_from_below_the_horizon_is_rare() -> None:
@@ -47,7 +53,9 @@ def test_light_choice__light_from_below_the_horizon_is_rare() -> None:
 
 def test_light_choice__few_lights_are_all_used() -> None:
     view = trace_view(ball(), camera(), samples=2)
-    pairs = LightChoice.of_lights(around(3), np.zeros(3)).draw(view, np.random.default_rng(1))
+    pairs = LightChoice.of_lights(around(3), np.zeros(3)).draw(
+        view, np.random.default_rng(1)
+    )
     assert [set(at) for at, _ in pairs] == [{0}, {1}, {2}]
     assert all((weight == 1).all() for _, weight in pairs)
 

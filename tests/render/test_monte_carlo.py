@@ -54,15 +54,31 @@ def lights(count: int, radius: float = 30.0) -> Lights:
     position = rng.standard_normal((count, 3)) + np.array([0, 0, 1.5])
     position *= 500 / np.linalg.norm(position, axis=1, keepdims=True)
     intensity = rng.uniform(1e5, 5e5, (count, 3))
-    return Lights(position, intensity, np.full(count, radius), -position / 500, np.full(count, 1.0))
+    return Lights(
+        position,
+        intensity,
+        np.full(count, radius),
+        -position / 500,
+        np.full(count, 1.0),
+    )
 
 
 EVEN = Lighting(None, Environment(np.ones((8, 16, 3))))
-SKY = Lighting(None, Environment(np.random.default_rng(0).random((8, 16, 3)) ** 3 + 0.05))
+SKY = Lighting(
+    None, Environment(np.random.default_rng(0).random((8, 16, 3)) ** 3 + 0.05)
+)
 
 
-def rendered(surface: Surface, lighting: Lighting, seed: int = 1, size: int = 24, **quality):
-    return render_monte_carlo(surface, camera(size), lighting, Quality(**quality), rng=np.random.default_rng(seed))
+def rendered(
+    surface: Surface, lighting: Lighting, seed: int = 1, size: int = 24, **quality
+):
+    return render_monte_carlo(
+        surface,
+        camera(size),
+        lighting,
+        Quality(**quality),
+        rng=np.random.default_rng(seed),
+    )
 
 
 def z_scores(found, expected):
@@ -71,7 +87,9 @@ def z_scores(found, expected):
 
 
 def require_no_bias(found, expected):
-    """The mean of the picture is within the noise that its variances say, pixels being independent."""
+    """The mean of the picture is within the noise that its variances say, pixels being
+    independent.
+    """
     seen = found.coverage == 1
     gap = (found.radiance - expected)[seen].sum(axis=0)
     error = np.sqrt(found.variance[seen].sum(axis=0))
@@ -79,7 +97,9 @@ def require_no_bias(found, expected):
 
 
 def test_furnace__a_white_ball_vanishes() -> None:
-    """A surface that absorbs nothing, in even light of radiance 1, has radiance 1 wherever one looks."""
+    """A surface that absorbs nothing, in even light of radiance 1, has radiance 1
+    wherever one looks.
+    """
     found = rendered(ball(diffuse=1.0), EVEN, samples=64)
     require_no_bias(found, 1.0)
     # 64 pairs of directions, of which the cosine draws one without noise
@@ -96,22 +116,31 @@ def test_furnace__a_lobe_has_its_directional_albedo() -> None:
     expected = view.image(np.repeat(albedo[:, None], 3, axis=1))
     middle = (expected > 0) & (found.coverage == 1)[..., None]
     gap = (found.radiance - expected)[middle].mean() / expected[middle].mean()
-    assert abs(gap) < 0.005  # noise 0.1 %; the expected picture by 64 rays, and quadrature at grazing angles
+    # noise 0.1 %; the expected picture by 64 rays, and quadrature at grazing angles
+    assert abs(gap) < 0.005
 
 
 def test_subsurface__even_light_gives_r_d() -> None:
     surface = ball(eta=1.3)
     n = len(surface.vertices)
-    surface = replace(surface, s=np.full((n, 3), dipole_s(0.6, eta=1.3)[0]), sigma_tr=np.full((n, 3), 1.0))
+    surface = replace(
+        surface,
+        s=np.full((n, 3), dipole_s(0.6, eta=1.3)[0]),
+        sigma_tr=np.full((n, 3), 1.0),
+    )
     found = rendered(surface, EVEN, samples=64, subsurface=True, terms=("diffuse",))
     t, w = np.polynomial.legendre.leggauss(64)
     cosine = (t + 1) / 2
     entered = np.pi * (w * cosine * fresnel_transmittance(cosine, 1.3)).sum()
     view = trace_view(surface, camera(), samples=8)
-    leaves = fresnel_transmittance(np.einsum("nc,nc->n", view.normal, view.towards), 1.3) / np.pi
+    leaves = (
+        fresnel_transmittance(np.einsum("nc,nc->n", view.normal, view.towards), 1.3)
+        / np.pi
+    )
     expected = view.image(np.repeat((leaves * 0.6 * entered)[:, None], 3, axis=1))
     seen = found.coverage == 1
-    # the noise of the irradiance is shared by neighbours; 16 batches of 32 directions at each vertex leave 0.2 %
+    # the noise of the irradiance is shared by neighbours; 16 batches of 32 directions
+    # at each vertex leave 0.2 %
     assert abs(found.radiance[seen].mean() / expected[seen].mean() - 1) < 0.005
 
 
@@ -120,10 +149,13 @@ def test_subsurface__even_light_gives_r_d() -> None:
 def test_lights__as_the_renderer_of_the_fit(count, disc_included) -> None:
     """Against `render_view`, which goes through all lights and regular points of their discs."""
     surface = replace(ball(eta=1.3, weight=0.5), disc_included=disc_included)
-    expected = render_view(surface, camera(), lights(count), samples=6, disc_samples=4).sum(axis=0)
+    expected = render_view(
+        surface, camera(), lights(count), samples=6, disc_samples=4
+    ).sum(axis=0)
     found = rendered(surface, Lighting(lights(count)), samples=128)
     require_no_bias(found, expected)
-    # 32 batches: variances of Student's t with 31 degrees of freedom, and 36 rays of the reference have noise too
+    # 32 batches: variances of Student's t with 31 degrees of freedom, and 36 rays of
+    # the reference have noise too
     spread = 1.4826 * np.median(np.abs(z_scores(found, expected)))
     assert 0.85 < spread < 1.3
 
@@ -137,52 +169,91 @@ def test_environment__as_many_small_lights() -> None:
     theta = (np.arange(height * fine) + 0.5) / (height * fine) * np.pi
     phi = ((np.arange(width * fine) + 0.5) / (width * fine) - 0.5) * 2 * np.pi
     a, b = np.meshgrid(theta, phi, indexing="ij")
-    direction = np.stack([np.sin(a) * np.sin(b), np.cos(a), np.sin(a) * np.cos(b)], axis=-1).reshape(-1, 3)
+    direction = np.stack(
+        [np.sin(a) * np.sin(b), np.cos(a), np.sin(a) * np.cos(b)], axis=-1
+    ).reshape(-1, 3)
     solid = (np.sin(a) * np.pi / (height * fine) * 2 * np.pi / (width * fine)).ravel()
     far = 1e5
-    intensity = np.kron(sky.radiance, np.ones((fine, fine, 1))).reshape(-1, 3) * solid[:, None] * far**2
-    many = Lights(far * direction, intensity, np.zeros(len(solid)), -direction, np.zeros(len(solid)))
+    intensity = (
+        np.kron(sky.radiance, np.ones((fine, fine, 1))).reshape(-1, 3)
+        * solid[:, None]
+        * far**2
+    )
+    many = Lights(
+        far * direction,
+        intensity,
+        np.zeros(len(solid)),
+        -direction,
+        np.zeros(len(solid)),
+    )
     expected = render_view(surface, camera(12), many, samples=3).sum(axis=0)
     found = rendered(surface, SKY, samples=256, size=12)
     seen = found.coverage == 1
     # noise 0.3 % in the mean; points for texels, and nine rays a pixel, leave less than that
-    assert np.abs(found.radiance[seen].mean(axis=0) / expected[seen].mean(axis=0) - 1).max() < 0.01
-    assert np.sqrt(np.mean((found.radiance - expected)[seen] ** 2 / found.variance[seen])) < 1.4
+    assert (
+        np.abs(
+            found.radiance[seen].mean(axis=0) / expected[seen].mean(axis=0) - 1
+        ).max()
+        < 0.01
+    )
+    assert (
+        np.sqrt(np.mean((found.radiance - expected)[seen] ** 2 / found.variance[seen]))
+        < 1.4
+    )
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("lighting", [SKY, Lighting(lights(12)), Lighting(lights(2), SKY.environment)])
+@pytest.mark.parametrize(
+    "lighting", [SKY, Lighting(lights(12)), Lighting(lights(2), SKY.environment)]
+)
 @pytest.mark.parametrize("subsurface", [False, True])
 def test_variance__is_that_of_repeated_pictures(lighting, subsurface) -> None:
     surface = ball(eta=1.3, weight=0.5)
     n = len(surface.vertices)
-    surface = replace(surface, s=np.full((n, 3), dipole_s(0.6, eta=1.3)[0]), sigma_tr=np.full((n, 3), 1.0))
+    surface = replace(
+        surface,
+        s=np.full((n, 3), dipole_s(0.6, eta=1.3)[0]),
+        sigma_tr=np.full((n, 3), 1.0),
+    )
     options = {"samples": 64, "subsurface": subsurface, "size": 10}
     several = [rendered(surface, lighting, seed, **options) for seed in range(8)]
     pictures = np.stack([one.radiance for one in several])
     stated = np.mean([one.variance for one in several], axis=0)
     seen = (several[0].coverage == 1)[..., None] & (stated > 0)
     # variance of eight pictures in 60 pixels of three channels that go together: 25 %
-    assert pictures.var(axis=0, ddof=1)[seen].sum() == pytest.approx(stated[seen].sum(), rel=0.5)
+    assert pictures.var(axis=0, ddof=1)[seen].sum() == pytest.approx(
+        stated[seen].sum(), rel=0.5
+    )
 
 
 def test_render__ends_at_the_wanted_error_and_says_so() -> None:
     calls = []
     found = render_monte_carlo(
-        ball(), camera(), SKY, Quality(error=0.05), rng=np.random.default_rng(1), progress=lambda *a: calls.append(a)
+        ball(),
+        camera(),
+        SKY,
+        Quality(error=0.05),
+        rng=np.random.default_rng(1),
+        progress=lambda *a: calls.append(a),
     )
     assert found.relative_error <= 0.05
     assert found.samples == 16 * len(calls) >= 16 * MIN_BATCHES
     best = rendered(ball(), SKY, seed=9, samples=1024)
     seen = best.coverage == 1
-    gap = np.sqrt(np.mean((found.radiance - best.radiance)[seen] ** 2) / np.mean(best.radiance[seen] ** 2))
-    assert gap == pytest.approx(found.relative_error, rel=0.3)  # and 0.02 of the other picture
+    gap = np.sqrt(
+        np.mean((found.radiance - best.radiance)[seen] ** 2)
+        / np.mean(best.radiance[seen] ** 2)
+    )
+    # and 0.02 of the other picture
+    assert gap == pytest.approx(found.relative_error, rel=0.3)
 
 
 def test_render__the_same_seed_gives_the_same_picture() -> None:
     one, two = (rendered(ball(), SKY, samples=32) for _ in range(2))
     np.testing.assert_array_equal(one.radiance, two.radiance)
-    assert not np.array_equal(one.radiance, rendered(ball(), SKY, seed=2, samples=32).radiance)
+    assert not np.array_equal(
+        one.radiance, rendered(ball(), SKY, seed=2, samples=32).radiance
+    )
 
 
 def test_environment__draws_by_its_density() -> None:
@@ -193,18 +264,29 @@ def test_environment__draws_by_its_density() -> None:
     found = np.bincount(sky._texel(drawn), minlength=8 * 16)
     edge = np.cos(np.pi * np.arange(9) / 8)
     solid = np.repeat((edge[:-1] - edge[1:]) * 2 * np.pi / 16, 16)
-    expected = count * np.array([sky.pdf(drawn[sky._texel(drawn) == i][:1])[0] for i in range(128)]) * solid
+    expected = (
+        count
+        * np.array([sky.pdf(drawn[sky._texel(drawn) == i][:1])[0] for i in range(128)])
+        * solid
+    )
     assert expected.sum() == pytest.approx(count, rel=1e-9)
     assert ((found - expected) ** 2 / expected).sum() < stats.chi2.ppf(1 - LEVEL, 127)
 
 
 def test_environment__directions_of_the_image() -> None:
-    """Top row above the head, middle column in front of the face, right of it the subject's left."""
+    """Top row above the head, middle column in front of the face, right of it the
+    subject's left.
+    """
     image = np.zeros((2, 4, 3))
     image[0, 2] = 1  # above, from the front to the subject's left
     sky = Environment(image)
     assert sky.along(np.array([[0.5, 0.5, 0.7]]))[0, 0] == 1
-    assert sky.along(np.array([[-0.5, 0.5, 0.7], [0.5, -0.5, 0.7], [0.5, 0.5, -0.7]])).max() == 0
+    assert (
+        sky.along(
+            np.array([[-0.5, 0.5, 0.7], [0.5, -0.5, 0.7], [0.5, 0.5, -0.7]])
+        ).max()
+        == 0
+    )
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,12 @@ def model() -> xr.DataTree:
     side = 16
     x, y = (a.ravel() for a in np.meshgrid(*2 * [np.linspace(-20, 20, side)]))
     i = (np.arange(side - 1)[:, None] * side + np.arange(side - 1)).ravel()
-    faces = np.concatenate([np.stack([i, i + 1, i + side], 1), np.stack([i + 1, i + side + 1, i + side], 1)])
+    faces = np.concatenate(
+        [
+            np.stack([i, i + 1, i + side], 1),
+            np.stack([i + 1, i + side + 1, i + side], 1),
+        ]
+    )
     rng = np.random.default_rng(0)
     colour = rng.uniform(0.2, 0.6, (x.size, 3))
     s, _ = dipole_s(colour, eta=1.3)
@@ -58,15 +63,25 @@ def model() -> xr.DataTree:
     groups = {
         "/fitted": dataset(values),
         "/mesh": dataset({"triangle": faces}),
-        "/basis": dataset({"basis_brdf": stored_brdf(rng.uniform(0, 1, (6, 5, 4, 2))), "disc_angular_radius": 0.0}),
+        "/basis": dataset(
+            {
+                "basis_brdf": stored_brdf(rng.uniform(0, 1, (6, 5, 4, 2))),
+                "disc_angular_radius": 0.0,
+            }
+        ),
         "/dome": dataset(dome, coords={"light": ["l0", "l1", "l2"], "camera": ["c0"]}),
     }
     return xr.DataTree.from_dict(groups)
 
 
-def test_render_picture__subsurface_names_the_channel_without_sigma_tr(model: xr.DataTree, tmp_path: Path) -> None:
+def test_render_picture__subsurface_names_the_channel_without_sigma_tr(
+    model: xr.DataTree, tmp_path: Path
+) -> None:
     model["fitted/sigma_tr"][:, 2] = np.nan
-    message = r"must have sigma_tr in R, G and B for subsurface transport; found no probe site with a valid fit in B"
+    message = (
+        r"must have sigma_tr in R, G and B for subsurface transport; found no probe "
+        r"site with a valid fit in B"
+    )
     with pytest.raises(InputError, match=message):
         render_picture(model, tmp_path / "a.exr", subsurface=True)
     photographs = {
@@ -74,49 +89,76 @@ def test_render_picture__subsurface_names_the_channel_without_sigma_tr(model: xr
         "photograph_light": [0],
         "photograph_camera": [0],
     }
-    capture = xr.DataTree.from_dict({"photographs": dataset(photographs), "dome": model["dome"].to_dataset()})
+    capture = xr.DataTree.from_dict(
+        {"photographs": dataset(photographs), "dome": model["dome"].to_dataset()}
+    )
     with pytest.raises(InputError, match=message):
         compare_photographs(model, capture, subsurface=True)
     model["fitted"] = model["fitted"].to_dataset().drop_vars("sigma_tr")
-    with pytest.raises(InputError, match=r"found no probe site with a valid fit in R, G, B; omit --subsurface"):
+    with pytest.raises(
+        InputError,
+        match=r"found no probe site with a valid fit in R, G, B; omit --subsurface",
+    ):
         render_picture(model, tmp_path / "a.exr", subsurface=True)
     render_picture(model, tmp_path / "a.exr")
 
 
 @pytest.mark.parametrize("subsurface", [False, True])
-def test_picture__is_the_sum_over_the_lights(model: xr.DataTree, subsurface: bool) -> None:
+def test_picture__is_the_sum_over_the_lights(
+    model: xr.DataTree, subsurface: bool
+) -> None:
     surface = from_model(model)
     dome = model["dome"].to_dataset()
     camera = cameras_from_dome(dome)[0].scaled(2.0)
     lights = lights_from_dome(dome).select([0, 2])
-    together = picture(trace_shot(surface, lights, camera, samples=2, subsurface=subsurface))
+    together = picture(
+        trace_shot(surface, lights, camera, samples=2, subsurface=subsurface)
+    )
     each = render_view(surface, camera, lights, samples=2, subsurface=subsurface)
     assert each.max(axis=(1, 2, 3)).min() > 0
-    np.testing.assert_allclose(together, each.sum(axis=0), rtol=1e-5)  # float32, 256 surfels summed
+    # float32, 256 surfels summed
+    np.testing.assert_allclose(together, each.sum(axis=0), rtol=1e-5)
 
 
 @pytest.mark.parametrize("subsurface", [False, True])
-def test_render_picture__plan_leaves_the_picture_the_same(model: xr.DataTree, tmp_path: Path, subsurface: bool) -> None:
+def test_render_picture__plan_leaves_the_picture_the_same(
+    model: xr.DataTree, tmp_path: Path, subsurface: bool
+) -> None:
     dome = model["dome"].to_dataset()
     shot = trace_shot(
-        from_model(model), lights_from_dome(dome), cameras_from_dome(dome)[0], samples=1, subsurface=subsurface
+        from_model(model),
+        lights_from_dome(dome),
+        cameras_from_dome(dome)[0],
+        samples=1,
+        subsurface=subsurface,
     )
     seen = int(shot.plan.surfels.sum())
     assert 50 < seen < 200  # of 256: the square is larger than the picture
     everything = replace(shot, plan=replace(shot.plan, surfels=np.ones(256, bool)))
     np.testing.assert_array_equal(picture(shot), picture(everything))  # the bound is 0
-    told = render_picture(model, tmp_path / "a.exr", samples=1, subsurface=subsurface, explain=True)
+    told = render_picture(
+        model, tmp_path / "a.exr", samples=1, subsurface=subsurface, explain=True
+    )
     assert not list(tmp_path.iterdir())
     counts = f"{256 - seen} of 256 are skipped (they are not visible)"
     said = f"surfels that receive subsurface light: {counts}; results stay the same"
     assert told["skipped"][:1] == ([said] if subsurface else [])
-    assert [line.partition(":")[0] for line in told["skipped"][1:]] == (["levels of the octree"] if subsurface else [])
+    assert [line.partition(":")[0] for line in told["skipped"][1:]] == (
+        ["levels of the octree"] if subsurface else []
+    )
     assert told.pop("kept")
-    assert render_picture(model, tmp_path / "a.exr", samples=1, subsurface=subsurface).items() >= told.items()
+    assert (
+        render_picture(
+            model, tmp_path / "a.exr", samples=1, subsurface=subsurface
+        ).items()
+        >= told.items()
+    )
     assert (tmp_path / "a.exr").is_file()
 
 
-def test_picture__all_lights_are_carried_as_three_columns(model: xr.DataTree, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_picture__all_lights_are_carried_as_three_columns(
+    model: xr.DataTree, monkeypatch: pytest.MonkeyPatch
+) -> None:
     columns = []
 
     def counted(points, areas, irradiance, *rest, **options):
@@ -128,17 +170,37 @@ def test_picture__all_lights_are_carried_as_three_columns(model: xr.DataTree, mo
     model["dome"] = model["dome"].to_dataset().isel(light=[0, 1, 2, 0, 1])
     surface = from_model(model)
     dome = model["dome"].to_dataset()
-    picture(trace_shot(surface, lights_from_dome(dome), cameras_from_dome(dome)[0], samples=1, subsurface=True))
+    picture(
+        trace_shot(
+            surface,
+            lights_from_dome(dome),
+            cameras_from_dome(dome)[0],
+            samples=1,
+            subsurface=True,
+        )
+    )
     assert columns == [3]
 
 
-def test_compare_photographs__reads_the_half_floats_of_older_stores(model: xr.DataTree) -> None:
-    radiance = np.random.default_rng(4).uniform(0.1, 1, (1, 24, 32, 3)).astype(np.float16)
-    kept = dataset({"photograph_radiance": radiance, "photograph_light": [0], "photograph_camera": [0]})
+def test_compare_photographs__reads_the_half_floats_of_older_stores(
+    model: xr.DataTree,
+) -> None:
+    radiance = (
+        np.random.default_rng(4).uniform(0.1, 1, (1, 24, 32, 3)).astype(np.float16)
+    )
+    kept = dataset(
+        {
+            "photograph_radiance": radiance,
+            "photograph_light": [0],
+            "photograph_camera": [0],
+        }
+    )
     found = []
     for dtype in (np.float32, np.float16):
         old = kept.assign(photograph_radiance=kept["photograph_radiance"].astype(dtype))
-        capture = xr.DataTree.from_dict({"photographs": old, "dome": model["dome"].to_dataset()})
+        capture = xr.DataTree.from_dict(
+            {"photographs": old, "dome": model["dome"].to_dataset()}
+        )
         (one,) = compare_photographs(model, capture)
         assert one.photographed.dtype == np.float32
         np.testing.assert_array_equal(one.photographed, radiance[0])
@@ -160,7 +222,9 @@ def test_render__is_a_labelled_picture(model: xr.DataTree) -> None:
     assert seen.attrs["samples"] == 256
 
 
-def test_render__what_is_skipped_does_not_change_the_picture(model: xr.DataTree) -> None:
+def test_render__what_is_skipped_does_not_change_the_picture(
+    model: xr.DataTree,
+) -> None:
     fitted = model["fitted"].to_dataset()
     fitted["basis_weight"][:, 1] = 0.0
     model["fitted"] = fitted
@@ -172,13 +236,21 @@ def test_render__what_is_skipped_does_not_change_the_picture(model: xr.DataTree)
         "basis BRDFs: 1 of 2",
         "lights: 1 of 3",
     ]
-    expected = render_view(from_model(model), cameras_from_dome(dome)[0], lights_from_dome(dome), samples=4).sum(axis=0)
+    expected = render_view(
+        from_model(model), cameras_from_dome(dome)[0], lights_from_dome(dome), samples=4
+    ).sum(axis=0)
     np.testing.assert_allclose(seen["radiance"].mean(), expected.mean(), rtol=2e-3)
 
 
-def test_render_picture__exposure_is_that_of_a_white_surface(model: xr.DataTree, tmp_path: Path) -> None:
+def test_render_picture__exposure_is_that_of_a_white_surface(
+    model: xr.DataTree, tmp_path: Path
+) -> None:
     """A darker face stays darker with the fixed exposure, and not with the automatic one."""
-    model["fitted"] = model["fitted"].to_dataset().assign(basis_weight=lambda ds: ds["basis_weight"] * 0.1)
+    model["fitted"] = (
+        model["fitted"]
+        .to_dataset()
+        .assign(basis_weight=lambda ds: ds["basis_weight"] * 0.1)
+    )
     dark = model.copy()
     fitted = dark["fitted"].to_dataset().copy(deep=True)
     fitted["diffuse_reflectance"] *= 0.5
@@ -189,31 +261,48 @@ def test_render_picture__exposure_is_that_of_a_white_surface(model: xr.DataTree,
         for name, one in (("plain", model), ("dark", dark)):
             path = tmp_path / f"{exposure}_{name}.png"
             told = render_picture(one, path, exposure=exposure, lights=["l0"])
-            level[exposure, name] = decode_srgb(read_png(path) / 255).mean(), told["exposure"]
+            level[exposure, name] = (
+                decode_srgb(read_png(path) / 255).mean(),
+                told["exposure"],
+            )
     assert level["fixed", "plain"][1] == level["fixed", "dark"][1]
-    assert level["fixed", "dark"][0] == pytest.approx(level["fixed", "plain"][0] / 2, rel=0.02)  # eight bits
-    assert level["auto", "dark"][0] == pytest.approx(level["auto", "plain"][0], rel=0.05)
+    # eight bits
+    assert level["fixed", "dark"][0] == pytest.approx(
+        level["fixed", "plain"][0] / 2, rel=0.02
+    )
+    assert level["auto", "dark"][0] == pytest.approx(
+        level["auto", "plain"][0], rel=0.05
+    )
     place = np.array([0.0, 100, 300])
     power = model["dome/light_intensity"].values[0].mean()
     expected = np.pi * np.linalg.norm(place) ** 3 / (place[2] * power)
     assert level["fixed", "plain"][1] == pytest.approx(expected, rel=1e-6)
 
 
-def test_render_picture__exposure_counts_lights_that_are_skipped(model: xr.DataTree, tmp_path: Path) -> None:
+def test_render_picture__exposure_counts_lights_that_are_skipped(
+    model: xr.DataTree, tmp_path: Path
+) -> None:
     """It depends on camera and lights only, so that pictures of several faces are comparable."""
     dome = model["dome"].to_dataset()
     # one light from the side, and two from behind, which only the mean over all directions contains
     place = np.array([[300.0, 0.0, 20.0], [0.0, 50.0, -300.0], [40.0, 0.0, -300.0]])
-    dome["light_position"][:], dome["light_axis"][:] = place, -place / np.linalg.norm(place, axis=1, keepdims=True)
+    dome["light_position"][:], dome["light_axis"][:] = (
+        place,
+        -place / np.linalg.norm(place, axis=1, keepdims=True),
+    )
     model["dome"] = dome
     told = render_picture(model, tmp_path / "a.png", samples=8)
     assert any(line.startswith("lights: 2 of 3") for line in told["skipped"])
     lighting = Lighting(lights_from_dome(dome))
     assert told["exposure"] == fixed_exposure(lighting, cameras_from_dome(dome)[0])
-    assert told["exposure"] != fixed_exposure(Lighting(lighting.lights.select([0])), cameras_from_dome(dome)[0])
+    assert told["exposure"] != fixed_exposure(
+        Lighting(lighting.lights.select([0])), cameras_from_dome(dome)[0]
+    )
 
 
-def test_render_picture__an_exr_says_what_it_holds(model: xr.DataTree, tmp_path: Path) -> None:
+def test_render_picture__an_exr_says_what_it_holds(
+    model: xr.DataTree, tmp_path: Path
+) -> None:
     sky = tmp_path / "sky.exr"
     write_exr(sky, np.ones((4, 8, 3), np.float32))
     told = render_picture(model, tmp_path / "a.exr", environment=sky, samples=32)

@@ -13,7 +13,9 @@ from skindb.schema.brdf import stored_brdf
 def model(status: list[int], *, translucent: bool = True) -> xr.DataTree:
     n = 5
     rng = np.random.default_rng(0)
-    position = np.array([[0, 0, 0], [10, 0, 0], [10, 10, 0], [0, 10, 0], [0, 20, 0]], float)
+    position = np.array(
+        [[0, 0, 0], [10, 0, 0], [10, 10, 0], [0, 10, 0], [0, 20, 0]], float
+    )
     values = {
         "surfel_position": position,
         "shading_normal": np.tile([0.0, 0, 1], (n, 1)),
@@ -28,7 +30,12 @@ def model(status: list[int], *, translucent: bool = True) -> xr.DataTree:
     groups = {
         "/fitted": dataset(values),
         "/mesh": dataset({"triangle": np.array([[0, 1, 2], [0, 2, 3], [2, 3, 4]])}),
-        "/basis": dataset({"basis_brdf": stored_brdf(rng.uniform(0, 1, (6, 5, 4, 2))), "disc_angular_radius": 0.0}),
+        "/basis": dataset(
+            {
+                "basis_brdf": stored_brdf(rng.uniform(0, 1, (6, 5, 4, 2))),
+                "disc_angular_radius": 0.0,
+            }
+        ),
     }
     return xr.DataTree.from_dict(groups)
 
@@ -37,31 +44,44 @@ def test_from_model__carries_every_value() -> None:
     tree = model([0, 0, 0, 0, 0])
     surface = from_model(tree)
     np.testing.assert_allclose(surface.diffuse, tree["fitted/diffuse_reflectance"])
-    np.testing.assert_array_equal(surface.tables[..., 1], tree["basis/basis_brdf"].values[1, ..., :-1])
+    np.testing.assert_array_equal(
+        surface.tables[..., 1], tree["basis/basis_brdf"].values[1, ..., :-1]
+    )
     assert surface.eta == 1.35
     assert surface.known.all()
     assert surface.sigma_tr is not None
     assert from_model(model([0] * 5, translucent=False)).sigma_tr is None
 
 
-def test_from_model__surfels_without_a_fit_are_unknown_or_filled_from_the_nearest() -> None:
+def test_from_model__surfels_without_a_fit_are_unknown_or_filled_from_the_nearest() -> (
+    None
+):
     tree = model([0, 0, 0, int(FitStatus.UNSEEN), int(FitStatus.NOT_FINITE)])
-    np.testing.assert_array_equal(from_model(tree).known, [True, True, True, False, False])
+    np.testing.assert_array_equal(
+        from_model(tree).known, [True, True, True, False, False]
+    )
     filled = from_model(tree, fill=True)
     assert filled.known.all()
-    np.testing.assert_array_equal(filled.diffuse[4], filled.diffuse[2])  # (0, 20) is nearest to (10, 10)
+    # (0, 20) is nearest to (10, 10)
+    np.testing.assert_array_equal(filled.diffuse[4], filled.diffuse[2])
     np.testing.assert_array_equal(filled.vertices[4], [0, 20, 0])
 
 
 def test_from_model__nothing_fitted_is_said() -> None:
-    with pytest.raises(InputError, match="at least one surfel must be fitted for a picture; found none"):
+    with pytest.raises(
+        InputError, match="at least one surfel must be fitted for a picture; found none"
+    ):
         from_model(model([1] * 5))
 
 
 def test_from_model__missing_variables_are_listed_together() -> None:
     tree = model([0] * 5)
-    tree["fitted"] = tree["fitted"].to_dataset().drop_vars(["dipole_s", "shading_normal"])
-    with pytest.raises(InputError, match=r"fitted\[shading_normal\].*\n.*fitted\[dipole_s\]"):
+    tree["fitted"] = (
+        tree["fitted"].to_dataset().drop_vars(["dipole_s", "shading_normal"])
+    )
+    with pytest.raises(
+        InputError, match=r"fitted\[shading_normal\].*\n.*fitted\[dipole_s\]"
+    ):
         from_model(tree)
 
 
@@ -98,12 +118,17 @@ def test_cameras_and_lights_from_dome__round_trip() -> None:
     assert len(lamps) == 3
     chosen = lamps.select([2, 0])
     np.testing.assert_array_equal(chosen.falloff, [2, 0])
-    np.testing.assert_array_equal(lamps.select(np.array([False, True, False])).position, lamps.position[1:2])
+    np.testing.assert_array_equal(
+        lamps.select(np.array([False, True, False])).position, lamps.position[1:2]
+    )
 
 
 def test_camera_scaled__refuses_pictures_that_do_not_fit_into_memory() -> None:
     small = Camera(np.eye(3), np.eye(3), np.zeros(3), np.zeros(5), 32, 24)
-    with pytest.raises(InputError, match=r"a picture must have 1 to [\d,]+ pixels; found \d+ x \d+; choose a smaller"):
+    with pytest.raises(
+        InputError,
+        match=r"a picture must have 1 to [\d,]+ pixels; found \d+ x \d+; choose a smaller",
+    ):
         small.scaled(1e4)
 
 

@@ -8,13 +8,24 @@ import numpy as np
 import pytest
 
 from skindb.errors import InputError
-from skindb.schema import GROUPS, VARIABLES, FitStatus, ProbeStatus, TexelStatus, check, dataset
+from skindb.schema import (
+    GROUPS,
+    VARIABLES,
+    FitStatus,
+    ProbeStatus,
+    TexelStatus,
+    check,
+    dataset,
+)
 
 DIMS = set(
-    "surfel face light camera channel channel_2 site fibre dictionary parameter measure v u component region xyz uv "
+    "surfel face light camera channel channel_2 site fibre dictionary parameter "
+    "measure v u component region xyz uv "
     "corner landmark row col coefficient axis theta_h theta_d phi_d photograph image_row image_col "
-    "group k take edge bin trait side level status samples space statistic contrast quantity attribute attribute_2 "
-    "part cell chromophore pair take_2 placement pressure_sample step response_level exposure".split()
+    "group k take edge bin trait side level status samples space statistic "
+    "contrast quantity attribute attribute_2 "
+    "part cell chromophore pair take_2 placement pressure_sample step "
+    "response_level exposure".split()
 )
 
 

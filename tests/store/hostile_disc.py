@@ -2,8 +2,9 @@
 
     unshare --mount --map-root-user python hostile_disc.py PLACE MOUNT < steps.json
 
-MOUNT makes PLACE what it is to be. A step is ["run", arguments of skindb], ["leave", bytes that stay free],
-["free"], or ["read"], which reads by the functions of a database.
+MOUNT makes PLACE what it is to be. A step is ["run", arguments of skindb], ["leave",
+bytes that stay free], ["free"], or ["read"], which reads by the functions of a
+database.
 """
 
 from __future__ import annotations
@@ -25,7 +26,11 @@ def fill(place: Path, left: int) -> None:
     """Write a file until at most so many bytes are free."""
     with (place / "filler").open("wb", buffering=0) as file, suppress(OSError):
         while (status := os.statvfs(place)).f_bavail * status.f_frsize > left:
-            file.write(bytes(max(4096, (status.f_bavail * status.f_frsize - left) // 8192 * 4096)))
+            file.write(
+                bytes(
+                    max(4096, (status.f_bavail * status.f_frsize - left) // 8192 * 4096)
+                )
+            )
 
 
 def read(place: Path) -> dict[str, object]:
@@ -33,7 +38,11 @@ def read(place: Path) -> dict[str, object]:
     db = skindb.open(str(place / "db"))
     cohort = db.cohort("tables").region_diffuse_reflectance.values
     table = json.loads(db.table().to_json(date_format="iso"))
-    return {"takes": db.takes(where="age > 0"), "table": table, "cohort": cohort.tolist().__repr__()}
+    return {
+        "takes": db.takes(where="age > 0"),
+        "table": table,
+        "cohort": cohort.tolist().__repr__(),
+    }
 
 
 def main() -> None:

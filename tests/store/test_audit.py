@@ -35,7 +35,9 @@ def db(tmp_path):
     """A database with five entries."""
     found = Database(tmp_path / "db")
     for number, take in enumerate(("S01", "S01.lotion", "S02", "S01", "S03"), 1):
-        found.log_action("export", actor="anna", takes=[take], parameters={"generation": number})
+        found.log_action(
+            "export", actor="anna", takes=[take], parameters={"generation": number}
+        )
     return found
 
 
@@ -62,7 +64,9 @@ def test_append_entry__states_who_what_and_whose(db):
 
 def test_append_entry__of_many_takes_is_one_entry(tmp_path):
     db = Database(tmp_path / "db")
-    db.log_action("fit", actor="anna", takes=[f"S{n:04d}.lotion" for n in range(1000)] * 2)
+    db.log_action(
+        "fit", actor="anna", takes=[f"S{n:04d}.lotion" for n in range(1000)] * 2
+    )
     [entry] = db.audit()[0]
     assert len(set(entry.subjects)) == len(entry.subjects) == 1000
     assert entry.counts == {"takes": 1000}
@@ -71,24 +75,33 @@ def test_append_entry__of_many_takes_is_one_entry(tmp_path):
 def test_append_entry__writes_no_pseudonym_and_only_private_files(db):
     for path in (db.root / "audit").rglob("*"):
         assert not path.stat().st_mode & 0o077
-        assert path.is_dir() or not any(name in path.read_bytes() for name in (b"S01", b"S02", b"S03", b"lotion"))
+        assert path.is_dir() or not any(
+            name in path.read_bytes() for name in (b"S01", b"S02", b"S03", b"lotion")
+        )
 
 
 def test_append_entry__accepts_any_text_as_take(tmp_path):
     db = Database(tmp_path / "db")
-    db.log_action("render", actor="anna", takes=["a/x", "\udcff", "", "S01\x00", "a" * 10_000])
+    db.log_action(
+        "render", actor="anna", takes=["a/x", "\udcff", "", "S01\x00", "a" * 10_000]
+    )
     assert len(db.audit()[0][0].subjects) == 5
 
 
 def test_append_entry__processes_that_race_lose_nothing(tmp_path):
     db = Database(tmp_path / "db")
     command = [sys.executable, "-c", WRITER, str(db.root)]
-    writers = [subprocess.Popen([*command, name, "50"]) for name in ("a", "b", "c", "d")]
+    writers = [
+        subprocess.Popen([*command, name, "50"]) for name in ("a", "b", "c", "d")
+    ]
     assert [writer.wait() for writer in writers] == [0] * 4
     entries, faults = db.audit()
     assert faults == []
     assert [entry.number for entry in entries] == [*range(1, 201)]
-    turns = {name: [entry.counts["turn"] for entry in entries if entry.actor == name] for name in "abcd"}
+    turns = {
+        name: [entry.counts["turn"] for entry in entries if entry.actor == name]
+        for name in "abcd"
+    }
     assert turns == {name: [*range(50)] for name in "abcd"}
 
 
@@ -107,7 +120,9 @@ def test_append_entry__writers_of_a_bucket_race_also_with_the_same_action(bucket
     assert [entry.number for entry in entries] == [*range(1, 25)]
 
 
-def test_append_entry__a_lost_answer_of_a_bucket_is_no_second_entry(bucket, monkeypatch):
+def test_append_entry__a_lost_answer_of_a_bucket_is_no_second_entry(
+    bucket, monkeypatch
+):
     append_entry(Bucket(bucket), "render", actor="anna")
     with faulty_proxy(os.environ["AWS_ENDPOINT_URL"]) as proxy:
         monkeypatch.setenv("AWS_ENDPOINT_URL", proxy.address)
@@ -151,10 +166,13 @@ def test_append_entry__costs_the_same_after_many_entries(tmp_path):
     place.count = 0
     append_entry(place, "render", actor="anna")
     assert (place.root / entry_key(20 * BLOCK + 1)).exists()
-    assert place.count <= 21 + 1 + 3  # blocks, names in the last one, and the files that are read
+    # blocks, names in the last one, and the files that are read
+    assert place.count <= 21 + 1 + 3
 
 
-@pytest.mark.parametrize("step", ["before the temporary file", "before the link", "after the link"])
+@pytest.mark.parametrize(
+    "step", ["before the temporary file", "before the link", "after the link"]
+)
 def test_append_entry__a_killed_writer_leaves_a_whole_log(db, step):
     code = f"""
 import os
@@ -192,7 +210,9 @@ def test_read_audit__selects_by_subject_and_condition(db):
     numbers = [entry.number for entry in db.audit(subject="S01")[0]]
     assert numbers == [1, 2, 4]
     assert db.audit(subject="S0")[0] == db.audit(subject="")[0] == []
-    assert [entry.number for entry in db.audit(where="number > 3 and action == 'export'")[0]] == [4, 5]
+    assert [
+        entry.number for entry in db.audit(where="number > 3 and action == 'export'")[0]
+    ] == [4, 5]
     assert db.audit(where="when < '2020-01-01'")[0] == []
     with pytest.raises(InputError, match="actor"):
         db.audit(where="aktor == 'anna'")
@@ -252,7 +272,12 @@ def _link_the_log(db):
 
 
 def _nest(db):
-    _file(db, 3).write_text('{"number": 3, "seal": "\\u00e4\\ud800", "counts": ' + "[" * 500 + "]" * 500 + "}")
+    _file(db, 3).write_text(
+        '{"number": 3, "seal": "\\u00e4\\ud800", "counts": '
+        + "[" * 500
+        + "]" * 500
+        + "}"
+    )
 
 
 def _seal_of_other_letters(db):
@@ -265,11 +290,23 @@ def _seal_of_other_letters(db):
     [
         (_remove, ["entries 2 to 3 must exist"]),
         (_change, ["000000003.json: .* does not match its seal"]),
-        (_swap, ["000000003.json: .* the entry of number 4", "000000004.json: .* the entry of number 3"]),
+        (
+            _swap,
+            [
+                "000000003.json: .* the entry of number 4",
+                "000000004.json: .* the entry of number 3",
+            ],
+        ),
         (_forge_without_the_secret, ["000000003.json: .* does not match its seal"]),
-        (_exchange_for_an_entry_of_another_database, ["000000003.json: .* does not match its seal"]),
+        (
+            _exchange_for_an_entry_of_another_database,
+            ["000000003.json: .* does not match its seal"],
+        ),
         (_link, ["000000003.json: .* symbolic link"]),
-        (_misplace, ["000001/000000003.json: .* an unknown name", "entry 3 must exist"]),
+        (
+            _misplace,
+            ["000001/000000003.json: .* an unknown name", "entry 3 must exist"],
+        ),
         (_link_the_block, ["audit/000000: .* an unknown name"]),
         (_link_the_log, ["audit: must be a folder; found a link"]),
         (_nest, ["000000003.json: .* nested brackets"]),
@@ -286,7 +323,9 @@ def test_read_audit__tampering_is_named(db, tamper, reasons):
     assert set(faults) <= set(db.verify())
 
 
-def test_read_audit__an_entry_of_somebody_with_the_secret_must_follow_the_one_before(db):
+def test_read_audit__an_entry_of_somebody_with_the_secret_must_follow_the_one_before(
+    db,
+):
     _sealed_again(db, 3, actor="bert")
     [fault] = db.audit()[1]
     assert "entry 4 must follow the entry before it" in str(fault)
@@ -327,7 +366,10 @@ def test_verify__names_unknown_files_of_the_audit_log(db):
     (db.root / "audit" / "notes.txt").write_text("x")
     (db.root / "audit" / "000000" / "notes.txt").write_text("x")
     found = db.verify()
-    assert sorted(Path(fault.where).parent.name for fault in found) == ["000000", "audit"]
+    assert sorted(Path(fault.where).parent.name for fault in found) == [
+        "000000",
+        "audit",
+    ]
     assert {fault.found for fault in found} == {"an unknown name"}
 
 
@@ -340,14 +382,20 @@ def test_erasure__keeps_the_audit_log(db):
     assert db.verify() == []
 
 
-def test_append_entry__a_bucket_without_permission_is_refused_at_once(bucket, monkeypatch):
+def test_append_entry__a_bucket_without_permission_is_refused_at_once(
+    bucket, monkeypatch
+):
     append_entry(Bucket(bucket), "render", actor="anna")
-    with faulty_proxy(os.environ["AWS_ENDPOINT_URL"], fraction=1.0, faults=("403",)) as proxy:
+    with faulty_proxy(
+        os.environ["AWS_ENDPOINT_URL"], fraction=1.0, faults=("403",)
+    ) as proxy:
         monkeypatch.setenv("AWS_ENDPOINT_URL", proxy.address)
         proxy.part = "000000002.json"
         with pytest.raises(UnavailableError, match="credentials must permit"):
             append_entry(Bucket(bucket), "render", actor="anna")
-    assert [method for method, path in proxy.requests if "000000002.json" in path] == ["PUT"]
+    assert [method for method, path in proxy.requests if "000000002.json" in path] == [
+        "PUT"
+    ]
 
 
 def test_append_entry__a_log_without_a_free_number_is_a_fault(db, monkeypatch):

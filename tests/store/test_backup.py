@@ -1,4 +1,6 @@
-"""Backups: consistent, incremental, verified, without withdrawn subjects, and restored with the same bytes."""
+"""Backups: consistent, incremental, verified, without withdrawn subjects, and restored
+with the same bytes.
+"""
 
 from __future__ import annotations
 
@@ -26,28 +28,66 @@ from skindb.store.location import place_at
 
 SUBJECT = "Xqz7"
 SCOPE = {"consent_scope": ["fit", "statistics"]}
-NAMES = ["backup", "files", "states", "secret", "withdrawn", "release", "43", "-", "--verify", "__proto__", "CON"]
+NAMES = [
+    "backup",
+    "files",
+    "states",
+    "secret",
+    "withdrawn",
+    "release",
+    "43",
+    "-",
+    "--verify",
+    "__proto__",
+    "CON",
+]
 CACHES = ("catalogue.json", "leases/", "staging/", "heads/", "withdrawn/")
 
 
 def _commit(url, kind, take, value=1.0, names=(), **about):
     """A version as small as possible, with an own value."""
-    names = [*names, *(one["take"] for one in about.get("inputs", []) if one["kind"] != "calibration")]
+    names = [
+        *names,
+        *(
+            one["take"]
+            for one in about.get("inputs", [])
+            if one["kind"] != "calibration"
+        ),
+    ]
     with Database(url).stage(kind, take, names=names) as stage:
         stage.write({"surfels": dataset({"surfel_area": np.array([value, value])})})
         return stage.commit(SCOPE | about)
 
 
 def _fill(url, subjects=(SUBJECT, "B"), *, is_calibrated=True) -> None:
-    """Captures and models of subjects, a calibration of the first that the others use, a study and a release."""
+    """Captures and models of subjects, a calibration of the first that the others use,
+    a study and a release.
+    """
     db = Database(url)
-    lights = [_commit(url, "calibration", "dome", names=[subjects[0]]).as_input()] if is_calibrated else []
+    lights = (
+        [_commit(url, "calibration", "dome", names=[subjects[0]]).as_input()]
+        if is_calibrated
+        else []
+    )
     for take in subjects:
         value = float(MARK) if take == SUBJECT else 2.0
         capture = _commit(url, "capture", take, value, inputs=lights)
-        _commit(url, "model", take, 2 * value if take != SUBJECT else value, inputs=[capture.as_input(), *lights])
+        _commit(
+            url,
+            "model",
+            take,
+            2 * value if take != SUBJECT else value,
+            inputs=[capture.as_input(), *lights],
+        )
     models = [db.record("model", take).as_input() for take in subjects]
-    _commit(url, "population", "traits", 3.0, inputs=models, parameters={"what": "traits", "takes": [*subjects]})
+    _commit(
+        url,
+        "population",
+        "traits",
+        3.0,
+        inputs=models,
+        parameters={"what": "traits", "takes": [*subjects]},
+    )
     db.create_release("r1")
 
 
@@ -76,7 +116,11 @@ def _archive(dest) -> Archive:
 
 def _state(root) -> dict[str, bytes]:
     """Content of the files of a database, without caches and leases."""
-    return {key: content for key, content in contents(Path(root)).items() if not key.startswith(CACHES)}
+    return {
+        key: content
+        for key, content in contents(Path(root)).items()
+        if not key.startswith(CACHES)
+    }
 
 
 def _restored(db, dest, target, **options) -> Database:
@@ -86,14 +130,22 @@ def _restored(db, dest, target, **options) -> Database:
 
 def test_restore__gives_the_same_bytes(db, dest, tmp_path):
     report = db.backup(str(dest), verify=True)
-    assert (report.number, report.versions, report.present, report.faults) == (1, 7, 0, ())
+    assert (report.number, report.versions, report.present, report.faults) == (
+        1,
+        7,
+        0,
+        (),
+    )
     copy = _restored(db, dest, tmp_path / "copy")
     assert _state(copy.root) == _state(db.root)
     assert contents(copy.root / "heads") == contents(db.root / "heads")
     assert copy.verify() == []
     assert copy.garbage() == []
     assert float(copy.read("model", "B")["surfels/surfel_area"][0]) == 4.0
-    modes = {stat.S_IMODE(path.stat().st_mode) for path in [*copy.root.rglob("*"), *dest.rglob("*"), copy.root, dest]}
+    modes = {
+        stat.S_IMODE(path.stat().st_mode)
+        for path in [*copy.root.rglob("*"), *dest.rglob("*"), copy.root, dest]
+    }
     assert modes == {0o700, 0o600}
 
 
@@ -112,10 +164,16 @@ def test_restore__of_an_earlier_state(db, dest, tmp_path):
     db.backup(str(dest))
     _commit(db.url, "model", "B", 5.0)
     db.backup(str(dest))
-    assert [(one.number, one.versions) for one in backup_states(str(dest))] == [(1, 7), (2, 8)]
+    assert [(one.number, one.versions) for one in backup_states(str(dest))] == [
+        (1, 7),
+        (2, 8),
+    ]
     assert _state(_restored(db, dest, tmp_path / "old", number=1).root) == before
     assert _restored(db, dest, tmp_path / "new").record("model", "B").generation == 2
-    with pytest.raises(InputError, match="state 3 must exist; found states 1, 2; see skindb restore --list"):
+    with pytest.raises(
+        InputError,
+        match="state 3 must exist; found states 1, 2; see skindb restore --list",
+    ):
         _restored(db, dest, tmp_path / "none", number=3)
     assert not (tmp_path / "none").exists()
 
@@ -139,14 +197,22 @@ def test_restore__brings_back_nobody_who_was_withdrawn_later(db, dest, tmp_path)
     assert traces(copy.root, SUBJECT) == []
     assert traces(tmp_path / "copy.markers", SUBJECT) == []
     assert SUBJECT.encode() not in db._place.marker_file().read_bytes()
-    assert (copy.takes("model"), copy.subjects(), copy.takes("population"), copy.takes("calibration")) == (
+    assert (
+        copy.takes("model"),
+        copy.subjects(),
+        copy.takes("population"),
+        copy.takes("calibration"),
+    ) == (
         ["B"],
         ["B"],
         [],
         [],
     )
     assert copy.verify() == []
-    assert sorted(str(request) for request in copy.requests()) == ["population of traits", "release of r1"]
+    assert sorted(str(request) for request in copy.requests()) == [
+        "population of traits",
+        "release of r1",
+    ]
     assert copy.requests() != []
     [stale] = [one.name for one in workflow.stale_results(copy) if one.kind == "model"]
     assert stale == "model 1 of B"  # its calibration was that of the subject
@@ -161,13 +227,20 @@ def test_restore__requests_what_a_withdrawal_requests(dest, tmp_path):
     db.erase(SUBJECT)
     copy = _restored(db, dest, tmp_path / "copy")
     requests = {request.key: request.parameters for request in copy.requests()}
-    assert requests.items() >= {request.key: request.parameters for request in db.requests()}.items()
+    assert (
+        requests.items()
+        >= {request.key: request.parameters for request in db.requests()}.items()
+    )
     workflow.repeat_requests(copy, kinds=("release",))
-    pins = {(one["kind"], one["take"]) for one in copy.record("release", "r1").made_from}
+    pins = {
+        (one["kind"], one["take"]) for one in copy.record("release", "r1").made_from
+    }
     assert pins == {("capture", "B"), ("model", "B")}
 
 
-def test_backup__erases_subjects_who_were_withdrawn_from_earlier_states(db, dest, tmp_path):
+def test_backup__erases_subjects_who_were_withdrawn_from_earlier_states(
+    db, dest, tmp_path
+):
     db.backup(str(dest))
     db.erase(SUBJECT)
     report = db.backup(str(dest), verify=True)
@@ -181,11 +254,16 @@ def test_backup__erases_subjects_who_were_withdrawn_from_earlier_states(db, dest
 
 
 def test_erase_from_backup__leaves_the_bytes_of_others(db, dest, tmp_path):
-    others = {key: content for key, content in _state(db.root).items() if SUBJECT.encode() not in content}
+    others = {
+        key: content
+        for key, content in _state(db.root).items()
+        if SUBJECT.encode() not in content
+    }
     others = {
         key: content
         for key, content in others.items()
-        if SUBJECT not in key and key.startswith(("data/capture", "data/model", "log/capture", "log/model"))
+        if SUBJECT not in key
+        and key.startswith(("data/capture", "data/model", "log/capture", "log/model"))
     }
     db.backup(str(dest))
     _commit(db.url, "model", "B", 5.0)
@@ -222,15 +300,24 @@ def test_restore__repeats_later_consents(db, dest, tmp_path):
     db.record_consent("B", ["fit"])
     copy = _restored(db, dest, tmp_path / "copy")
     assert copy.consent("B") == ["fit"]
-    assert copy.record("consent", "B").provenance["recorded"] == db.record("consent", "B").created
+    assert (
+        copy.record("consent", "B").provenance["recorded"]
+        == db.record("consent", "B").created
+    )
     assert copy.verify() == []
 
 
 def test_restore__needs_a_marker_file(db, dest, tmp_path):
     db.backup(str(dest))
     target = tmp_path / "copy"
-    rule = "a restore needs the marker file, because subjects who were withdrawn after the backup would come back"
-    with pytest.raises(InputError, match=rf"copy.markers: {rule}; found no such file; give --markers FILE, or"):
+    rule = (
+        "a restore needs the marker file, because subjects who were withdrawn after "
+        "the backup would come back"
+    )
+    with pytest.raises(
+        InputError,
+        match=rf"copy.markers: {rule}; found no such file; give --markers FILE, or",
+    ):
         restore(str(dest), str(target))
     assert not target.exists()
     db.erase(SUBJECT)
@@ -238,7 +325,9 @@ def test_restore__needs_a_marker_file(db, dest, tmp_path):
     assert Database(target).takes("model") == ["B", SUBJECT]
 
 
-@pytest.mark.parametrize("damage", ["line changed", "line removed", "line cut", "other database", "empty"])
+@pytest.mark.parametrize(
+    "damage", ["line changed", "line removed", "line cut", "other database", "empty"]
+)
 def test_restore__refuses_a_damaged_marker_file(db, dest, tmp_path, damage):
     db.backup(str(dest))
     db.erase(SUBJECT)
@@ -258,7 +347,9 @@ def test_restore__refuses_a_damaged_marker_file(db, dest, tmp_path, damage):
     else:
         lines = []
     file.write_bytes(b"".join(lines))
-    with pytest.raises(InputError, match=r"line [12]: a marker file must be as it was written; found") as error:
+    with pytest.raises(
+        InputError, match=r"line [12]: a marker file must be as it was written; found"
+    ) as error:
         _restored(db, dest, tmp_path / "copy")
     assert len(str(error.value).splitlines()) == 1
     assert not (tmp_path / "copy").exists()
@@ -267,7 +358,10 @@ def test_restore__refuses_a_damaged_marker_file(db, dest, tmp_path, damage):
 def test_restore__onto_something_is_refused(db, dest, tmp_path):
     db.backup(str(dest))
     before = contents(db.root)
-    with pytest.raises(InputError, match="a restore needs an empty or missing folder; found a database or a backup"):
+    with pytest.raises(
+        InputError,
+        match="a restore needs an empty or missing folder; found a database or a backup",
+    ):
         _restored(db, dest, db.root)
     assert contents(db.root) == before
     other = tmp_path / "other"
@@ -288,14 +382,20 @@ def test_backup__of_another_database_or_elsewhere_is_refused(db, dest, tmp_path)
     for place, message in [
         (dest, "all states of a backup must be of the same database"),
         (other.root / "backup", "a backup must not be inside its database"),
-        (db.root, "a backup needs an empty folder, or one with a backup; found other files, such as data"),
+        (
+            db.root,
+            "a backup needs an empty folder, or one with a backup; found other files, such as data",
+        ),
     ]:
         with pytest.raises(InputError, match=message):
             other.backup(str(place))
-    assert {key: value for key, value in contents(dest).items() if "leases" not in key} == {
-        key: value for key, value in before.items() if "leases" not in key
-    }
-    with pytest.raises(InputError, match="must be a complete database; found a backup; run skindb restore"):
+    assert {
+        key: value for key, value in contents(dest).items() if "leases" not in key
+    } == {key: value for key, value in before.items() if "leases" not in key}
+    with pytest.raises(
+        InputError,
+        match="must be a complete database; found a backup; run skindb restore",
+    ):
         Database(dest).takes()
     with pytest.raises(InputError, match="found a backup"):
         _commit(dest, "capture", "A")
@@ -318,13 +418,18 @@ def test_backup__names_each_damaged_file(db, dest, tmp_path):
     log.write_bytes(b"{}")
     faults = db.backup(str(dest), verify=True).faults
     assert {fault.where for fault in faults} == {str(chunk), str(log)}
-    assert all(fault.rule == "a file of a backup must be as it was written" for fault in faults)
+    assert all(
+        fault.rule == "a file of a backup must be as it was written" for fault in faults
+    )
     copy = tmp_path / "copy"
     restored = restore(str(dest), str(copy), markers=db._place.marker_file())
     assert {fault.where for fault in restored.faults} == {str(chunk), str(log)}
     again = Database(copy)
-    for kind, take in [("model", "B"), ("capture", SUBJECT)]:  # damaged here too, never silently absent
-        with pytest.raises(InputError, match=r"no file|a record of the log must be as committed"):
+    # damaged here too, never silently absent
+    for kind, take in [("model", "B"), ("capture", SUBJECT)]:
+        with pytest.raises(
+            InputError, match=r"no file|a record of the log must be as committed"
+        ):
             again.read(kind, take)
     assert float(again.read("capture", "B")["surfels/surfel_area"][0]) == 2.0
     named = " ".join(str(fault) for fault in again.verify())
@@ -335,7 +440,9 @@ def test_backup__names_each_damaged_file(db, dest, tmp_path):
     assert db.backup(str(dest), verify=True).faults == ()  # as the messages say
 
 
-def test_backup__of_a_damaged_database_names_the_file_and_saves_the_rest(db, dest, tmp_path):
+def test_backup__of_a_damaged_database_names_the_file_and_saves_the_rest(
+    db, dest, tmp_path
+):
     path = db.root / db.record("model", "B").path / "surfels/surfel_area/c/0"
     path.write_bytes(b"x" * path.stat().st_size)
     (db.root / f"log/capture/{SUBJECT}/00000001.json").write_text("{}")
@@ -344,7 +451,9 @@ def test_backup__of_a_damaged_database_names_the_file_and_saves_the_rest(db, des
         [str(path), str(db.root / f"log/capture/{SUBJECT}/00000001.json")]
     )
     copy = tmp_path / "copy"
-    assert len(restore(str(dest), str(copy), markers=db._place.marker_file()).faults) == 1
+    assert (
+        len(restore(str(dest), str(copy), markers=db._place.marker_file()).faults) == 1
+    )
     assert float(Database(copy).read("capture", "B")["surfels/surfel_area"][0]) == 2.0
     with pytest.raises(InputError, match="no file"):
         Database(copy).read("model", "B")
@@ -364,7 +473,9 @@ def test_restore__refuses_names_that_lead_elsewhere(db, dest, tmp_path):
     ):
         changed = type(state)(**{**vars(state), "files": {name: digest}})
         (dest / state.key).write_bytes(changed.content())
-        with pytest.raises(InputError, match="found names that are not those of a database"):
+        with pytest.raises(
+            InputError, match="found names that are not those of a database"
+        ):
             _restored(db, dest, tmp_path / "copy")
     assert not (tmp_path / "copy").exists()
 
@@ -373,8 +484,13 @@ def test_backup__of_hostile_names(tmp_path, dest):
     db = Database(tmp_path / "db")
     _fill(db.url, NAMES)
     db.backup(str(dest))
-    names = {path.name for path in dest.rglob("*") if path.name not in ("files", "states", "secret", "withdrawn")}
-    assert not names & ({*NAMES} - {"backup", "release"})  # names of folders of its lease
+    names = {
+        path.name
+        for path in dest.rglob("*")
+        if path.name not in ("files", "states", "secret", "withdrawn")
+    }
+    # names of folders of its lease
+    assert not names & ({*NAMES} - {"backup", "release"})
     assert _state(_restored(db, dest, tmp_path / "all").root) == _state(db.root)
     db.erase("backup")
     db.erase_from_backup(str(dest))
@@ -390,10 +506,14 @@ def test_backup__copies_the_audit_log(db, dest, tmp_path):
     db.backup(str(dest))
     db.erase(SUBJECT)
     db.erase_from_backup(str(dest))
-    assert contents(_restored(db, dest, tmp_path / "copy").root / "audit") == contents(db.root / "audit")
+    assert contents(_restored(db, dest, tmp_path / "copy").root / "audit") == contents(
+        db.root / "audit"
+    )
 
 
-def test_backup__of_an_incomplete_withdrawal_is_without_the_subject(db, dest, tmp_path, monkeypatch):
+def test_backup__of_an_incomplete_withdrawal_is_without_the_subject(
+    db, dest, tmp_path, monkeypatch
+):
     monkeypatch.setattr("skindb.store.erasure._erase_holdings", _stopped)
     with pytest.raises(KeyboardInterrupt):
         db.erase(SUBJECT)
@@ -401,7 +521,10 @@ def test_backup__of_an_incomplete_withdrawal_is_without_the_subject(db, dest, tm
     assert traces(dest, SUBJECT) == []
     copy = _restored(db, dest, tmp_path / "copy")
     assert copy.verify() == []
-    assert {str(one) for one in copy.requests()} == {"population of traits", "release of r1"}
+    assert {str(one) for one in copy.requests()} == {
+        "population of traits",
+        "release of r1",
+    }
 
 
 def _stopped(*_args, **_options):
@@ -431,12 +554,22 @@ class Steps:
         return run
 
 
-STEPS = ("create", "read", "read_small", "identities", "replace", "flush_names", "remove")
+STEPS = (
+    "create",
+    "read",
+    "read_small",
+    "identities",
+    "replace",
+    "flush_names",
+    "remove",
+)
 
 
 @pytest.fixture
 def one_thread(monkeypatch):
-    """So that steps have an order, and that leases of interrupted runs are those of processes that have ended."""
+    """So that steps have an order, and that leases of interrupted runs are those of
+    processes that have ended.
+    """
     monkeypatch.setattr("skindb.store.archive.THREADS", 1)
     monkeypatch.setattr(lease_module, "_has_ended", lambda *_: True)
 
@@ -483,7 +616,9 @@ def _withdraw_apart(url, *backups) -> None:
 
 
 @pytest.mark.usefixtures("one_thread")
-def test_backup__suspended_while_a_subject_is_erased_from_it_leaves_nothing(made, tmp_path):
+def test_backup__suspended_while_a_subject_is_erased_from_it_leaves_nothing(
+    made, tmp_path
+):
     refused = 0
     for number in range(0, 10_000, 11):
         work = tmp_path / str(number)
@@ -522,7 +657,9 @@ def test_backup__while_others_commit_and_remove_is_one_moment(made, tmp_path):
                 report = db.backup(str(work / "backup"))
                 assert report.faults == (), seed
         for number in _archive(work / "backup").numbers():
-            copy = _restored(db, work / "backup", work / f"copy {number}", number=number)
+            copy = _restored(
+                db, work / "backup", work / f"copy {number}", number=number
+            )
             assert copy.verify() == [], (seed, number)
             for kind in copy.kinds():
                 for take in copy.takes(kind):
@@ -574,13 +711,17 @@ def test_backup__interrupted_at_any_step_continues(made, tmp_path):
         archive = _archive(work / "backup")
         numbers = archive.numbers() if (work / "backup").exists() else []
         if numbers:
-            assert _state(_restored(db, work / "backup", work / "first").root) == _state(db.root)
+            assert _state(
+                _restored(db, work / "backup", work / "first").root
+            ) == _state(db.root)
         present = len(archive.contents())
         report = db.backup(str(work / "backup"), verify=True)
         assert report.faults == ()
         assert report.number == len(numbers) + 1
         assert report.present == present, number  # nothing is copied twice
-        assert _state(_restored(db, work / "backup", work / "copy").root) == _state(db.root)
+        assert _state(_restored(db, work / "backup", work / "copy").root) == _state(
+            db.root
+        )
         shutil.rmtree(work)
     assert number > 50
 
@@ -589,7 +730,9 @@ def test_backup__interrupted_at_any_step_continues(made, tmp_path):
 def test_restore__interrupted_at_any_step_is_refused_and_continues(db, dest, tmp_path):
     db.backup(str(dest))
     db.record_consent("B", ["fit"])
-    expected = {key: content for key, content in _state(db.root).items() if "consent" not in key}
+    expected = {
+        key: content for key, content in _state(db.root).items() if "consent" not in key
+    }
     for number in range(0, 10_000, 17):
         target = tmp_path / str(number)
         steps = Steps(number, _stopped)
@@ -600,12 +743,23 @@ def test_restore__interrupted_at_any_step_is_refused_and_continues(db, dest, tmp
             break
         if (target / "log").exists() and (target / "withdrawn/restoring.json").exists():
             half = Database(target)
-            for use in (half.takes, half.verify, half.table, half.garbage, partial(half.read, "model", "B")):
-                with pytest.raises(InputError, match="found a restore that is not complete; run skindb restore again"):
+            for use in (
+                half.takes,
+                half.verify,
+                half.table,
+                half.garbage,
+                partial(half.read, "model", "B"),
+            ):
+                with pytest.raises(
+                    InputError,
+                    match="found a restore that is not complete; run skindb restore again",
+                ):
                     use()
             with pytest.raises(InputError, match="a restore that is not complete"):
                 _commit(target, "capture", "D")
-        if (target / "withdrawn/restoring.json").exists() or not (target / "log").exists():
+        if (target / "withdrawn/restoring.json").exists() or not (
+            target / "log"
+        ).exists():
             _restored(db, dest, target)
         copy = Database(target)
         assert copy.verify() == [], number
@@ -616,7 +770,9 @@ def test_restore__interrupted_at_any_step_is_refused_and_continues(db, dest, tmp
 
 
 @pytest.mark.usefixtures("one_thread")
-def test_restore__that_was_interrupted_before_a_withdrawal_keeps_nothing_of_the_subject(db, dest, tmp_path):
+def test_restore__that_was_interrupted_before_a_withdrawal_keeps_nothing_of_the_subject(
+    db, dest, tmp_path
+):
     db.backup(str(dest))
     target = tmp_path / "copy"
     steps = Steps(40, _stopped)
@@ -631,7 +787,9 @@ def test_restore__that_was_interrupted_before_a_withdrawal_keeps_nothing_of_the_
     assert copy.takes("model") == ["B"]
 
 
-def test_backup__from_a_folder_to_a_bucket_and_back(db, new_database, tmp_path, monkeypatch):
+def test_backup__from_a_folder_to_a_bucket_and_back(
+    db, new_database, tmp_path, monkeypatch
+):
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "share"))
     archive = new_database("localbucket")
     copy = new_database("localbucket")

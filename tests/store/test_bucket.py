@@ -40,17 +40,27 @@ WRITERS = 8
 @pytest.fixture(params=["folder", "moto", "localbucket"])
 def home(request, tmp_path, new_database):
     """Place of a new database."""
-    return str(tmp_path / "db") if request.param == "folder" else new_database(request.param)
+    return (
+        str(tmp_path / "db")
+        if request.param == "folder"
+        else new_database(request.param)
+    )
 
 
 @pytest.fixture(params=["folder", "localbucket"])
 def atomic_home(request, tmp_path, new_database):
     """A place whose server tests the condition and writes in one step; moto does so in two."""
-    return str(tmp_path / "db") if request.param == "folder" else new_database(request.param)
+    return (
+        str(tmp_path / "db")
+        if request.param == "folder"
+        else new_database(request.param)
+    )
 
 
 def _area(db, generation=None, take="A1"):
-    return float(db.read("capture", take, generation=generation)["surfels/surfel_area"][3])
+    return float(
+        db.read("capture", take, generation=generation)["surfels/surfel_area"][3]
+    )
 
 
 def test_commit__is_read_back_as_it_was(home):
@@ -62,7 +72,8 @@ def test_commit__is_read_back_as_it_was(home):
         for name, ds in groups(value).items():
             xr.testing.assert_identical(tree[name].to_dataset().compute(), ds)
     assert db.takes() == ["A1"]
-    assert {*db.names()} - {"staging"} == {"data", "heads", "log", "secret"}  # a bucket needs no temporary files
+    # a bucket needs no temporary files
+    assert {*db.names()} - {"staging"} == {"data", "heads", "log", "secret"}
     assert db.verify() == []
 
 
@@ -74,7 +85,9 @@ def test_stage__whole_shards_are_put_and_read_in_parts(home):
         record = stage.commit({})
     area[SHARD : 2 * SHARD] += 1
     db = Database(home)
-    np.testing.assert_array_equal(db.read("capture", "A1")["surfels/surfel_area"].values, area)
+    np.testing.assert_array_equal(
+        db.read("capture", "A1")["surfels/surfel_area"].values, area
+    )
     part = db.read_group(record, "surfels")["surfel_area"][SHARD + 5 : SHARD + 300 : 17]
     np.testing.assert_array_equal(part.values, area[SHARD + 5 : SHARD + 300 : 17])
     assert db.verify() == []
@@ -120,11 +133,20 @@ def test_verify__finds_changed_missing_and_foreign_objects(home):
     _flip(place, "log/capture/A4/00000001.json")
     place.replace("log/capture/A5/note.txt", b"x")
     found = sorted(
-        (fault.where.removeprefix(f"{home}/").split("/")[2], fault.found) for fault in Database(home).verify()
+        (fault.where.removeprefix(f"{home}/").split("/")[2], fault.found)
+        for fault in Database(home).verify()
     )
     assert [take for take, _ in found] == ["A1", "A2", "A3", "A4", "A5"]
-    assert [what for _, what in found[:3]] == [CHANGED, "no file", "an unknown file or folder"]
-    for take, message in {"A1": CHANGED, "A2": "found no file", "A4": "a record of the log must be"}.items():
+    assert [what for _, what in found[:3]] == [
+        CHANGED,
+        "no file",
+        "an unknown file or folder",
+    ]
+    for take, message in {
+        "A1": CHANGED,
+        "A2": "found no file",
+        "A4": "a record of the log must be",
+    }.items():
         with pytest.raises(InputError, match=message):
             Database(home).read("capture", take)["surfels/surfel_area"].compute()
 
@@ -140,7 +162,8 @@ def test_commit__racing_writers_on_one_key(atomic_home):
         won = dict(filter(None, pool.map(attempt, range(3 * WRITERS))))
     db = Database(atomic_home)
     assert sorted(won) == list(range(1, len(won) + 1))
-    for generation, value in won.items():  # each holds what was acknowledged to its writer
+    # each holds what was acknowledged to its writer
+    for generation, value in won.items():
         assert _area(db, generation) == value
     assert len(won) < 3 * WRITERS  # there was a race
     assert db.verify() == []
@@ -158,7 +181,9 @@ def test_commit__racing_writers_on_eight_keys(home):
     with ThreadPoolExecutor(WRITERS) as pool:
         for generation in (1, 2):
             list(pool.map(attempt, takes, [generation] * 8))
-    assert [_area(db, take=take) for take in takes] == [float(take[1:]) for take in takes]
+    assert [_area(db, take=take) for take in takes] == [
+        float(take[1:]) for take in takes
+    ]
     assert db.verify() == []
 
 
@@ -166,7 +191,12 @@ def test_create__one_of_many_wins(atomic_home):
     place = Database(atomic_home)._place
     for number in range(20):
         with ThreadPoolExecutor(WRITERS) as pool:
-            won = list(pool.map(lambda i, n=number: place.create(f"log/{n}", b"%d" % i), range(WRITERS)))
+            won = list(
+                pool.map(
+                    lambda i, n=number: place.create(f"log/{n}", b"%d" % i),
+                    range(WRITERS),
+                )
+            )
         assert won.count(True) == 1
         assert place.read(f"log/{number}") == b"%d" % won.index(True)
 
@@ -184,13 +214,19 @@ while True:
 @pytest.mark.parametrize("delay", [0.15, 0.4])
 def test_commit__killed_at_any_time(bucket, delay):
     code = ENDLESS.format(tests=str(Path(__file__).parent), url=bucket)
-    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as worker:
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, text=True
+    ) as worker:
         assert worker.stdout.readline() == "ready\n"
         time.sleep(delay)
         worker.send_signal(signal.SIGKILL)
         acknowledged = [int(line) for line in worker.stdout.read().split()]
     db = Database(bucket)
-    history = [r.generation for r in db.history("capture", "A1")] if "A1" in db.takes() else []
+    history = (
+        [r.generation for r in db.history("capture", "A1")]
+        if "A1" in db.takes()
+        else []
+    )
     assert history[: len(acknowledged)] == acknowledged
     assert len(history) <= len(acknowledged) + 1
     assert all("must name every version" in fault.rule for fault in db.verify())
@@ -212,7 +248,20 @@ def test_database__is_pickled_without_secrets(bucket):
     assert SECRET not in text
 
 
-@pytest.mark.parametrize("key", ["..", "../victim", "data/../../victim", "/etc", "", "a//b", "a/./b", "a/", "a\\..\\b"])
+@pytest.mark.parametrize(
+    "key",
+    [
+        "..",
+        "../victim",
+        "data/../../victim",
+        "/etc",
+        "",
+        "a//b",
+        "a/./b",
+        "a/",
+        "a\\..\\b",
+    ],
+)
 def test_bucket__no_operation_leaves_the_prefix(bucket, key):
     place = Bucket(bucket)
     outside = Bucket(bucket.rpartition("/")[0])
@@ -234,13 +283,17 @@ def test_bucket__no_operation_leaves_the_prefix(bucket, key):
         lambda: place.url(key),
     )
     for call in calls:
-        with pytest.raises(InputError, match="every path must stay inside the database"):
+        with pytest.raises(
+            InputError, match="every path must stay inside the database"
+        ):
             call()
     assert outside.sizes("victim") == {}
     assert outside.read("victim") == b"keep me"
 
 
-@pytest.mark.parametrize("limits", [(0, None), (3, None), (2, 7), (-4, None), (4, 4), (7, 99)])
+@pytest.mark.parametrize(
+    "limits", [(0, None), (3, None), (2, 7), (-4, None), (4, 4), (7, 99)]
+)
 def test_read__parts_are_those_of_a_folder(bucket, tmp_path, limits):
     parts = []
     for place in (Bucket(bucket), Folder(tmp_path)):
@@ -257,10 +310,22 @@ def test_place__answers_are_those_of_a_folder(home, tmp_path):
         place.replace("log/a/x.json", b"1")
         place.replace("log/a/y/z.json", b"12")
         place.replace("log/ab", b"123")
-        one = [{*place.names()} - {"staging"}, place.children("log"), place.children("log/a"), place.children("none")]
-        one += [place.file_type(key) for key in ("log", "log/a", "log/a/x.json", "log/a/x", "none")]
+        one = [
+            {*place.names()} - {"staging"},
+            place.children("log"),
+            place.children("log/a"),
+            place.children("none"),
+        ]
+        one += [
+            place.file_type(key)
+            for key in ("log", "log/a", "log/a/x.json", "log/a/x", "none")
+        ]
         one += [place.sizes("log"), place.sizes("log/a"), place.sizes("none")]
-        one += [place.create("log/ab", b"other"), place.read_small("log/ab"), place.digest("log/ab")]
+        one += [
+            place.create("log/ab", b"other"),
+            place.read_small("log/ab"),
+            place.digest("log/ab"),
+        ]
         place.remove("log/a")
         place.remove("none")
         answers.append([*one, place.sizes("log")])
@@ -290,7 +355,10 @@ def test_read_small__has_a_limit(bucket, monkeypatch):
 
 def test_commit__reads_nothing_back(bucket, s3_address, monkeypatch):
     """Digests are computed from what was put, and the metadata of a version are put once."""
-    with faulty_proxy(s3_address("localbucket")) as proxy, monkeypatch.context() as patched:
+    with (
+        faulty_proxy(s3_address("localbucket")) as proxy,
+        monkeypatch.context() as patched,
+    ):
         patched.setenv("AWS_ENDPOINT_URL", proxy.address)
         commit(bucket)
     data = [(method, path) for method, path in proxy.requests if ".zarr/" in path]
@@ -308,7 +376,11 @@ def test_commit__refuses_if_what_was_put_is_not_there(bucket, what):
         other.remove(key)
         if what == "replaced":
             other.replace(key, b"of another writer")
-        found = "a different object than was written" if what == "replaced" else "no object where one was written"
+        found = (
+            "a different object than was written"
+            if what == "replaced"
+            else "no object where one was written"
+        )
         with pytest.raises(OSError, match=found):
             stage.commit({})
     assert Database(bucket).takes() == []
@@ -316,7 +388,10 @@ def test_commit__refuses_if_what_was_put_is_not_there(bucket, what):
 
 def test_create__refuses_a_server_that_overwrites(bucket, s3_address, monkeypatch):
     """Some gateways ignore the condition of a put; they are refused before there is any record."""
-    with faulty_proxy(s3_address("localbucket"), without=("if-none-match",)) as proxy, monkeypatch.context() as patched:
+    with (
+        faulty_proxy(s3_address("localbucket"), without=("if-none-match",)) as proxy,
+        monkeypatch.context() as patched,
+    ):
         patched.setenv("AWS_ENDPOINT_URL", proxy.address)
         with pytest.raises(InputError, match="the server must support conditional put"):
             commit(bucket)
@@ -331,28 +406,42 @@ def impatient(monkeypatch):
     monkeypatch.setattr(bucket_module, "PAUSES_S", (0.01, 0.05, 0.2))
 
 
-# localbucket stores half an object if half of one arrives; moto and servers that check the length do not
-SURVIVED = {"localbucket": [fault for fault in FAULTS if fault != "half a request"], "moto": FAULTS}
+# localbucket stores half an object if half of one arrives; moto and servers that check
+# the length do not
+SURVIVED = {
+    "localbucket": [fault for fault in FAULTS if fault != "half a request"],
+    "moto": FAULTS,
+}
 
 
 @pytest.mark.parametrize("kind", SURVIVED)
-def test_bucket__one_request_in_ten_fails(new_database, s3_address, monkeypatch, impatient, kind):
+def test_bucket__one_request_in_ten_fails(
+    new_database, s3_address, monkeypatch, impatient, kind
+):
     url = new_database(kind)
-    with faulty_proxy(s3_address(kind), fraction=0.1, faults=SURVIVED[kind], seed=3) as proxy:
+    with faulty_proxy(
+        s3_address(kind), fraction=0.1, faults=SURVIVED[kind], seed=3
+    ) as proxy:
         monkeypatch.setenv("AWS_ENDPOINT_URL", proxy.address)
         for value in range(5):
             assert commit(url, value).generation == value + 1
         Log(Database(url)._place, "capture", "A1").remove(2)
         db = Database(url)
         assert db.verify() == []
-        assert [_area(db, record.generation) for record in db.history("capture", "A1")] == [0.0, 2.0, 3.0, 4.0]
+        assert [
+            _area(db, record.generation) for record in db.history("capture", "A1")
+        ] == [0.0, 2.0, 3.0, 4.0]
     assert sum(proxy.failed.values()) >= 15
     assert set(proxy.failed) == set(SURVIVED[kind])
 
 
 @pytest.mark.parametrize("fault", ["lost answer", "late answer", "503"])
-def test_create__a_lost_answer_is_no_lost_commit(bucket, s3_address, monkeypatch, impatient, fault):
-    """The writer gets no answer, asks again, and finds its own object, or that of another writer."""
+def test_create__a_lost_answer_is_no_lost_commit(
+    bucket, s3_address, monkeypatch, impatient, fault
+):
+    """The writer gets no answer, asks again, and finds its own object, or that of
+    another writer.
+    """
     with faulty_proxy(s3_address("localbucket"), faults=(fault,)) as proxy:
         monkeypatch.setenv("AWS_ENDPOINT_URL", proxy.address)
         place = Bucket(bucket)
@@ -363,10 +452,14 @@ def test_create__a_lost_answer_is_no_lost_commit(bucket, s3_address, monkeypatch
         assert place.read("log/mine") == b"mine"
 
 
-def test_replace__half_an_upload_is_never_visible(new_database, s3_address, monkeypatch, impatient):
+def test_replace__half_an_upload_is_never_visible(
+    new_database, s3_address, monkeypatch, impatient
+):
     url = new_database("moto")
     monkeypatch.setattr(s3, "MAX_RETRIES", 1)
-    with faulty_proxy(s3_address("moto"), fraction=1.0, faults=("half a request",)) as proxy:
+    with faulty_proxy(
+        s3_address("moto"), fraction=1.0, faults=("half a request",)
+    ) as proxy:
         monkeypatch.setenv("AWS_ENDPOINT_URL", proxy.address)
         place = Bucket(url)
         for call in (place.replace, place.write, place.create):
@@ -390,7 +483,9 @@ def test_write__large_objects_are_one_request(bucket, s3_address, monkeypatch):
         assert [method for method, _ in proxy.requests] == ["PUT"]
 
 
-def test_stage__keeps_what_may_be_committed_where_the_server_is_gone(new_database, s3_address, monkeypatch, impatient):
+def test_stage__keeps_what_may_be_committed_where_the_server_is_gone(
+    new_database, s3_address, monkeypatch, impatient
+):
     """It is then unknown whether the record has arrived, so that nothing is removed."""
     url = new_database("localbucket")
     monkeypatch.setattr(s3, "MAX_RETRIES", 1)
@@ -411,10 +506,14 @@ def test_stage__keeps_what_may_be_committed_where_the_server_is_gone(new_databas
         assert Bucket(url).sizes(stage.path)
 
 
-def test_heads__an_unreachable_server_is_no_damage(bucket, s3_address, monkeypatch, impatient):
+def test_heads__an_unreachable_server_is_no_damage(
+    bucket, s3_address, monkeypatch, impatient
+):
     commit(bucket)
     monkeypatch.setattr(s3, "MAX_RETRIES", 1)
-    with faulty_proxy(s3_address("localbucket"), fraction=1.0, faults=("503",)) as proxy:
+    with faulty_proxy(
+        s3_address("localbucket"), fraction=1.0, faults=("503",)
+    ) as proxy:
         monkeypatch.setenv("AWS_ENDPOINT_URL", proxy.address)
         db = Database(bucket)
         for part in ("/heads/", "/log/", "/data/"):
@@ -425,7 +524,10 @@ def test_heads__an_unreachable_server_is_no_damage(bucket, s3_address, monkeypat
 
 def test_bucket__a_forked_process_is_refused(bucket):
     commit(bucket)
-    refused = pytest.raises(InputError, match="must not be forked from another one that does; found a forked process")
+    refused = pytest.raises(
+        InputError,
+        match="must not be forked from another one that does; found a forked process",
+    )
     with multiprocessing.get_context("fork").Pool(1) as pool, refused:
         pool.apply_async(_takes, (bucket,)).get(timeout=20)
     with multiprocessing.get_context("spawn").Pool(1) as pool:
@@ -451,16 +553,27 @@ with db.lease("A1", "model") as lease, db.stage("model", "A1", lease) as stage:
 
 
 @pytest.mark.parametrize("end", ["killed", "asleep"])
-def test_lease__ends_with_a_killed_holder_and_a_sleeping_one_commits_nothing(bucket, end, monkeypatch):
+def test_lease__ends_with_a_killed_holder_and_a_sleeping_one_commits_nothing(
+    bucket, end, monkeypatch
+):
     code = HOLDER.format(tests=str(Path(__file__).parent), url=bucket)
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    pipes = {
+        "stdin": subprocess.PIPE,
+        "stdout": subprocess.PIPE,
+        "stderr": subprocess.PIPE,
+        "text": True,
+    }
     with subprocess.Popen([sys.executable, "-c", code], **pipes) as holder:
         assert holder.stdout.readline() == "holds it\n"
         holder.send_signal(signal.SIGSTOP)
         os.waitid(os.P_PID, holder.pid, os.WSTOPPED)
         db = Database(bucket)
         with pytest.raises(
-            InputError, match=rf"only one run at a time may work on it; found python on .* \(process {holder.pid}\)"
+            InputError,
+            match=(
+                r"only one run at a time may work on it; found python on .* \(process "
+                rf"{holder.pid}\)"
+            ),
         ):
             db.lease("A1", "model").__enter__()
         if end == "killed":
@@ -468,11 +581,15 @@ def test_lease__ends_with_a_killed_holder_and_a_sleeping_one_commits_nothing(buc
             holder.wait()
         else:
             now = Bucket.now
-            monkeypatch.setattr(Bucket, "now", lambda place: now(place) + LEASE_SECONDS + 2)
+            monkeypatch.setattr(
+                Bucket, "now", lambda place: now(place) + LEASE_SECONDS + 2
+            )
         with db.lease("A1", "model") as lease:
             holder.send_signal(signal.SIGCONT)
             said = holder.communicate("commit\n" if end == "asleep" else None)[1]
-            assert ("LeaseLost: model of A1: only one run at a time" in said) == (end == "asleep")
+            assert ("LeaseLost: model of A1: only one run at a time" in said) == (
+                end == "asleep"
+            )
             with db.stage("model", "A1", lease) as stage:
                 stage.write(groups(1.0))
                 stage.commit({})
@@ -482,7 +599,9 @@ def test_lease__ends_with_a_killed_holder_and_a_sleeping_one_commits_nothing(buc
 
 def test_scratch__belongs_to_the_user_and_the_bucket(bucket, monkeypatch, tmp_path):
     monkeypatch.setenv("SKINDB_CACHE", str(tmp_path / "cache"))
-    one, same, other = (Database(url).scratch() for url in (bucket, f"{bucket}/", f"{bucket}x"))
+    one, same, other = (
+        Database(url).scratch() for url in (bucket, f"{bucket}/", f"{bucket}x")
+    )
     assert one == same != other
     assert (tmp_path / "cache") in one.parents
     assert one.stat().st_mode & 0o777 == 0o700

@@ -24,14 +24,23 @@ SCOPE = {"consent_scope": ["fit", "statistics"]}
 def made(tmp_path_factory):
     """Folder of a database of four takes, which is only copied."""
     root = tmp_path_factory.mktemp("made") / "db"
-    about = {"A1": (30, "normal"), "A1.lotion": (30, "lotion"), "B2": (50, "normal"), "C3": (None, "normal")}
+    about = {
+        "A1": (30, "normal"),
+        "A1.lotion": (30, "lotion"),
+        "B2": (50, "normal"),
+        "C3": (None, "normal"),
+    }
     for take, (age, condition) in about.items():
         traits = {} if age is None else {"age": age}
         where = {"subject": take[:2], "condition": condition, "traits": traits}
         capture = commit(root, take=take, **SCOPE, **where)
         if take != "C3":
             inputs = [capture.as_input()]
-            fit = {"parameters": {"k": 4 if take == "A1" else 6}, "status": {"fitted": 0.9}, "inputs": inputs}
+            fit = {
+                "parameters": {"k": 4 if take == "A1" else 6},
+                "status": {"fitted": 0.9},
+                "inputs": inputs,
+            }
             commit(root, take=take, kind="model", **SCOPE, **where, **fit)
     return root
 
@@ -49,7 +58,10 @@ def db(made, tmp_path):
         ("age < 40 and fit_k == 4", ["A1"]),
         ("'A1' in take", ["A1", "A1.lotion"]),
         ("age is missing or not age > 40", ["A1", "A1.lotion", "C3"]),
-        ("fit_k is not missing and model_created > '2020-01-01' and status_fitted > 0.5", ["A1", "A1.lotion", "B2"]),
+        (
+            "fit_k is not missing and model_created > '2020-01-01' and status_fitted > 0.5",
+            ["A1", "A1.lotion", "B2"],
+        ),
         ("capture_created < '2020-01-01'", []),
         ("model_generation is missing", ["C3"]),  # not fitted
         ("subject in ['B2', 'C3']", ["B2", "C3"]),
@@ -61,14 +73,20 @@ def test_takes__where(db, where, takes):
 
 
 def test_takes__where_names_takes_that_lack_a_value(db):
-    line = r"1 of 4 takes \(C3\) lack age and are not selected by 'not age > 40'; add 'or age is missing' to select"
+    line = (
+        r"1 of 4 takes \(C3\) lack age and are not selected by 'not age > 40'; add 'or "
+        r"age is missing' to select"
+    )
     with pytest.warns(skindb.store.MissingWarning, match=line):
         assert db.takes(where="not age > 40") == ["A1", "A1.lotion"]
 
 
 def test_takes__where_quotes_the_name_of_an_attribute_in_the_cure(db):
     commit(db.root, take="B2", **SCOPE, subject="B2", traits={"skin type": "II"})
-    with pytest.warns(skindb.store.MissingWarning, match="add 'or `skin type` is missing' to select them"):
+    with pytest.warns(
+        skindb.store.MissingWarning,
+        match="add 'or `skin type` is missing' to select them",
+    ):
         assert db.takes(where="`skin type` == 'II'") == ["B2"]
 
 
@@ -83,7 +101,10 @@ def test_takes__where_is_only_asked_of_takes_of_that_kind(db):
 
 
 def test_takes__where_with_an_unknown_column_lists_those_of_the_catalogue(db):
-    with pytest.raises(InputError, match=r"did you mean age\? Text needs quotes; columns: take, subject, condition"):
+    with pytest.raises(
+        InputError,
+        match=r"did you mean age\? Text needs quotes; columns: take, subject, condition",
+    ):
         db.takes(where="agee > 40")
 
 
@@ -113,7 +134,9 @@ def test_table__reads_what_is_new_and_nothing_else(db, monkeypatch):
     assert reads == [("model", "B2", 2)]
 
 
-def test_table__of_a_bucket_needs_as_many_requests_for_many_takes_as_for_few(bucket, monkeypatch):
+def test_table__of_a_bucket_needs_as_many_requests_for_many_takes_as_for_few(
+    bucket, monkeypatch
+):
     with faulty_proxy(os.environ["AWS_ENDPOINT_URL"]) as proxy:
         monkeypatch.setenv("AWS_ENDPOINT_URL", proxy.address)
         counts = []
@@ -126,14 +149,20 @@ def test_table__of_a_bucket_needs_as_many_requests_for_many_takes_as_for_few(buc
     assert counts == [4, 4, 4, 4]  # the log, the heads, the cache, the withdrawals
 
 
-def test_table__the_first_of_a_bucket_reads_one_object_for_each_record(bucket, monkeypatch):
+def test_table__the_first_of_a_bucket_reads_one_object_for_each_record(
+    bucket, monkeypatch
+):
     for take in ("A1", "B2", "C3"):
         commit(bucket, take=take, **SCOPE)
     with faulty_proxy(os.environ["AWS_ENDPOINT_URL"]) as proxy:
         monkeypatch.setenv("AWS_ENDPOINT_URL", proxy.address)
         skindb.open(bucket).table()
         methods = [method for method, path in proxy.requests if "/log/" in path]
-        names = sorted(PurePosixPath(path).parts[-2] for method, path in proxy.requests if "/log/" in path)
+        names = sorted(
+            PurePosixPath(path).parts[-2]
+            for method, path in proxy.requests
+            if "/log/" in path
+        )
     assert (methods, names) == (["GET"] * 3, ["A1", "B2", "C3"])
     assert not [path for _, path in proxy.requests if "/heads/" in path]
 
@@ -144,7 +173,9 @@ def test_table__a_head_in_a_bucket_that_names_another_record_is_read(bucket):
     log = Log(db._place, "capture", "A1")
     for seal in ("0" * 64, "1" * 63 + "0"):
         db._place.replace(log.head_key, log.head_content(1, seal))
-        with pytest.raises(InputError, match="generation 1 must be the record that was committed"):
+        with pytest.raises(
+            InputError, match="generation 1 must be the record that was committed"
+        ):
             db.table()
     log._write_head(1, log._read(1).seal)
     assert list(skindb.open(bucket).table().index) == ["A1"]
@@ -166,7 +197,10 @@ def test_table__a_record_that_was_damaged_after_it_was_read_is_named(db):
     assert db.table().age["B2"] == 50
     path = db.root / "log/capture/B2/00000001.json"
     path.write_text(path.read_text().replace('"age": 50', '"age": 60'))
-    with pytest.raises(InputError, match=r"B2/00000001.json: .* found content that does not match its seal"):
+    with pytest.raises(
+        InputError,
+        match=r"B2/00000001.json: .* found content that does not match its seal",
+    ):
         db.table()
 
 
@@ -204,7 +238,13 @@ def test_info__lists_the_same_stale_versions_with_and_without_the_cache(db):
     commit(db.root, take="A1", kind="registration", **SCOPE, inputs=models)
     db.table()
     commit(db.root, take="B2", **SCOPE, subject="B2")
-    commit(db.root, take="A1.lotion", kind="model", **SCOPE, inputs=[db.record("capture", "A1.lotion").as_input()])
+    commit(
+        db.root,
+        take="A1.lotion",
+        kind="model",
+        **SCOPE,
+        inputs=[db.record("capture", "A1.lotion").as_input()],
+    )
     cached = db.info()
     again = db.info()
     (db.root / "catalogue.json").unlink()
@@ -228,8 +268,12 @@ def test_info__where_agrees_with_the_table(db):
     with pytest.warns(skindb.store.MissingWarning, match="C3"):
         found = db.info(where="age > 20")["takes"]
     assert list(found) == ["A1", "A1.lotion", "B2"]
-    assert found == {take: one for take, one in db.info()["takes"].items() if take != "C3"}
-    assert list(db.info(takes=["B2", "C3"], where="age is not missing and age > 20")["takes"]) == ["B2"]
+    assert found == {
+        take: one for take, one in db.info()["takes"].items() if take != "C3"
+    }
+    assert list(
+        db.info(takes=["B2", "C3"], where="age is not missing and age > 20")["takes"]
+    ) == ["B2"]
     db.create_release("first", ["A1", "B2"])
     assert list(db.info(where="age > 20", release="first")) == ["takes"]
     assert list(db.info(where="age > 20", release="first")["takes"]) == ["A1", "B2"]

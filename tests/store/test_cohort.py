@@ -1,4 +1,6 @@
-"""Cohorts: lazy labelled arrays over takes that equal the values of each take; takes may lack parts."""
+"""Cohorts: lazy labelled arrays over takes that equal the values of each take; takes
+may lack parts.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,9 @@ def test_cohort__tables_are_those_of_every_take(db):
         own = db.tables(db.record("model", take))
         shown = cohort.sel(take=take)
         for name in own.data_vars:
-            found = shown[name].sel({dim: own[dim].values for dim in own[name].dims if dim in own.coords})
+            found = shown[name].sel(
+                {dim: own[dim].values for dim in own[name].dims if dim in own.coords}
+            )
             np.testing.assert_array_equal(found.values, own[name].values, err_msg=name)
 
 
@@ -38,7 +42,9 @@ def test_cohort__what_a_take_lacks_is_missing(db):
     cohort = db.cohort("tables")
     absent = cohort["site_sigma_tr"].sel(take="S02", site="neck")
     assert np.isnan(absent).all()
-    assert (cohort["site_status"].sel(take="S02", site="neck") == ProbeStatus.NOT_MEASURED).all()
+    assert (
+        cohort["site_status"].sel(take="S02", site="neck") == ProbeStatus.NOT_MEASURED
+    ).all()
     assert np.isnan(cohort["age"].sel(take="S03"))
     assert cohort["hair"].isnull().sum() == cohort.sizes["take"] - 1
 
@@ -47,9 +53,15 @@ def test_cohort__coordinates_work_as_anywhere_in_xarray(db):
     cohort = db.cohort("tables")
     colour = cohort["region_diffuse_reflectance"].sel(region="face")
     means = colour.groupby("gender").mean()
-    women = [take for take, person in PEOPLE.items() if person["traits"].get("gender") == "female"]
+    women = [
+        take
+        for take, person in PEOPLE.items()
+        if person["traits"].get("gender") == "female"
+    ]
     shown = [take for take in women if take in cohort["take"].values]
-    np.testing.assert_allclose(means.sel(gender="female"), colour.sel(take=shown).mean("take"))
+    np.testing.assert_allclose(
+        means.sel(gender="female"), colour.sel(take=shown).mean("take")
+    )
     old = cohort.where(cohort.age > 40, drop=True)
     assert old["take"].values.tolist() == ["S02"]
     frame = cohort[["region_area"]].to_dataframe()
@@ -59,14 +71,22 @@ def test_cohort__coordinates_work_as_anywhere_in_xarray(db):
 def test_cohort__consent(db):
     cohort = db.cohort("tables")
     assert "S04" not in cohort["take"].values
-    assert cohort.attrs["skipped"] == [{"take": "S04", "reason": "its consent does not cover statistics"}]
+    assert cohort.attrs["skipped"] == [
+        {"take": "S04", "reason": "its consent does not cover statistics"}
+    ]
     with pytest.raises(InputError, match="statistics need takes that consent to them"):
         db.cohort("tables", takes=["S04"])
 
 
 def test_cohort__surfels_and_their_samples(db):
     cohort = db.cohort("surfels", surfels=50)
-    assert cohort["reflectance_sample"].dims == ("take", "surfel", "light", "camera", "channel")
+    assert cohort["reflectance_sample"].dims == (
+        "take",
+        "surfel",
+        "light",
+        "camera",
+        "channel",
+    )
     for take in ("S01", "S02"):
         one = cohort.sel(take=take)
         model = db.read("model", take)
@@ -76,31 +96,59 @@ def test_cohort__surfels_and_their_samples(db):
         capture = db.source(model)
         for name in ("diffuse_reflectance", "dictionary_weight", "shading_normal"):
             np.testing.assert_array_equal(one[name], fitted[name].isel(surfel=index))
-        samples = capture["samples"].to_dataset()["reflectance_sample"].isel(surfel=index)
+        samples = (
+            capture["samples"].to_dataset()["reflectance_sample"].isel(surfel=index)
+        )
         np.testing.assert_array_equal(one["reflectance_sample"], samples)
-        np.testing.assert_array_equal(one["light_position"], capture["dome"].to_dataset()["light_position"])
+        np.testing.assert_array_equal(
+            one["light_position"], capture["dome"].to_dataset()["light_position"]
+        )
     # the first of a sample are a smaller sample
     few = db.cohort("surfels", surfels=10, variables=["surfel_index"])
-    np.testing.assert_array_equal(few["surfel_index"], cohort["surfel_index"].isel(surfel=slice(10)))
+    np.testing.assert_array_equal(
+        few["surfel_index"], cohort["surfel_index"].isel(surfel=slice(10))
+    )
 
 
 def test_cohort__a_sample_represents_the_face(db):
-    """Means of 200 samples of 60 surfels agree with that of all surfels within 5 standard errors."""
+    """Means of 200 samples of 60 surfels agree with that of all surfels within 5
+    standard errors.
+    """
     model = db.read("model", "S01").load()
     values = model["fitted"].to_dataset()["diffuse_reflectance"].values[:, 0]
     good = values[model["fitted"].to_dataset()["fit_status"].values == 0]
-    means = [float(sample_surfels(model, surfels=60, seed=s)["diffuse_reflectance"][:, 0].mean()) for s in range(200)]
+    means = [
+        float(
+            sample_surfels(model, surfels=60, seed=s)["diffuse_reflectance"][
+                :, 0
+            ].mean()
+        )
+        for s in range(200)
+    ]
     error = good.std(ddof=1) * np.sqrt((1 - 60 / len(good)) / 60)
     assert abs(np.mean(means) - good.mean()) < 5 * error / np.sqrt(200)
-    assert np.std(means) == pytest.approx(error, rel=0.25)  # 200 samples give the deviation to 5 %
+    # 200 samples give the deviation to 5 %
+    assert np.std(means) == pytest.approx(error, rel=0.25)
 
 
 def test_cohort__other_samples_are_made_by_summarise(db):
-    with pytest.raises(InputError, match=r"a sample of 50 surfels with seed 1.*call skindb\.workflow\.summarise"):
+    with pytest.raises(
+        InputError,
+        match=r"a sample of 50 surfels with seed 1.*call skindb\.workflow\.summarise",
+    ):
         db.cohort("surfels", surfels=50, seed=1)
-    assert workflow.summarise(db, seed=1, surfels=50) == ["S01", "S01.lotion", "S02", "S03", "S04"]
+    assert workflow.summarise(db, seed=1, surfels=50) == [
+        "S01",
+        "S01.lotion",
+        "S02",
+        "S03",
+        "S04",
+    ]
     other = db.cohort("surfels", surfels=50, seed=1)
-    assert (other["surfel_index"].values != db.cohort("surfels", surfels=50)["surfel_index"].values).any()
+    assert (
+        other["surfel_index"].values
+        != db.cohort("surfels", surfels=50)["surfel_index"].values
+    ).any()
     assert workflow.summarise(db, seed=1, surfels=50) == []
 
 
@@ -126,14 +174,18 @@ def test_cohort__mistakes(db, options, said):
 
 
 @pytest.mark.slow
-def test_cohort__a_replaced_version_is_not_mistaken_for_the_one_before(db, fitted_database):
+def test_cohort__a_replaced_version_is_not_mistaken_for_the_one_before(
+    db, fitted_database
+):
     own = fitted_database
     cohort = own.cohort("tables", takes=["S01"])
     (record,) = own.history("model", "S01")
     path = own.root / "log/model/S01/00000001.json"
     path.write_bytes((db.root / "log/model/S01/00000001.json").read_bytes())
     assert own.record("model", "S01", 1).seal != record.seal
-    with pytest.raises(InputError, match="a version must not change while a cohort refers to it"):
+    with pytest.raises(
+        InputError, match="a version must not change while a cohort refers to it"
+    ):
         cohort["region_area"].compute(scheduler="synchronous")
 
 
@@ -155,7 +207,12 @@ def test_combine__a_thousand_takes_are_opened_without_being_read():
 
     one = xr.Dataset({"region_area": ("region", np.zeros(3))}, {"region": list("abc")})
     part = Held.part("x", {"subject": "x", "age": 3}, one)
-    parts = [type(part)(f"T{i}", part.coords, part.variables, part.sizes, part.labels, Never()) for i in range(1000)]
+    parts = [
+        type(part)(
+            f"T{i}", part.coords, part.variables, part.sizes, part.labels, Never()
+        )
+        for i in range(1000)
+    ]
     cohort = combine(parts)
     assert cohort.sizes == {"take": 1000, "region": 3}
     with pytest.raises(AssertionError), dask.config.set(scheduler="synchronous"):
@@ -164,18 +221,33 @@ def test_combine__a_thousand_takes_are_opened_without_being_read():
 
 def test_combine__labels_of_all_takes_together():
     def part(take, sites, count):
-        sizes = {"site_status": np.ones((len(sites), 3), np.uint8), "site_sigma_tr": np.full((len(sites), 3), 2.0)}
+        sizes = {
+            "site_status": np.ones((len(sites), 3), np.uint8),
+            "site_sigma_tr": np.full((len(sites), 3), 2.0),
+        }
         sample = {"surfel_area": np.full(count, 3.0), "surfel_index": np.arange(count)}
-        variables = {name: (("site", "channel"), value) for name, value in sizes.items()}
+        variables = {
+            name: (("site", "channel"), value) for name, value in sizes.items()
+        }
         variables |= {name: ("surfel", value) for name, value in sample.items()}
-        return Held.part(take, {"kind": take}, xr.Dataset(variables, {"site": sites, "channel": list("RGB")}))
+        return Held.part(
+            take,
+            {"kind": take},
+            xr.Dataset(variables, {"site": sites, "channel": list("RGB")}),
+        )
 
-    found = combine([part("a", ["cheek"], 2), part("b", ["neck", "cheek"], 4)], sizes={"surfel": 3})
+    found = combine(
+        [part("a", ["cheek"], 2), part("b", ["neck", "cheek"], 4)], sizes={"surfel": 3}
+    )
     assert found["site"].values.tolist() == ["cheek", "neck"]
-    np.testing.assert_array_equal(found["site_status"][:, :, 0], [[1, ProbeStatus.NOT_MEASURED], [1, 1]])
+    np.testing.assert_array_equal(
+        found["site_status"][:, :, 0], [[1, ProbeStatus.NOT_MEASURED], [1, 1]]
+    )
     np.testing.assert_array_equal(found["surfel_index"], [[0, 1, -1], [0, 1, 2]])
     np.testing.assert_array_equal(found["surfel_area"], [[3, 3, np.nan], [3, 3, 3]])
-    assert "site_status" not in combine([part("a", ["cheek"], 2)], variables=["surfel_area"])
+    assert "site_status" not in combine(
+        [part("a", ["cheek"], 2)], variables=["surfel_area"]
+    )
 
 
 @pytest.mark.parametrize(
@@ -199,9 +271,15 @@ def test_column__types(values, dtype, missing):
 
 def test_cohort__groups_that_stay_open_hold_no_values(db):
     """Groups of hundreds of takes stay open; if they kept values, these would fill the memory."""
-    cohort = db.cohort("surfels", surfels=2000, variables=["diffuse_reflectance", "surfel_area"]).load()
+    cohort = db.cohort(
+        "surfels", surfels=2000, variables=["diffuse_reflectance", "surfel_area"]
+    ).load()
     take = str(cohort["take"].values[0])
     record = db.record("model", take)
     opened = _group(Address.of(db, record), "sample")
     assert "diffuse_reflectance" in opened
-    assert [name for name, variable in opened.data_vars.items() if variable.variable._in_memory] == []
+    assert [
+        name
+        for name, variable in opened.data_vars.items()
+        if variable.variable._in_memory
+    ] == []

@@ -45,34 +45,59 @@ def comparison(rng):
         "albedo": round(rng.random(), 2),
         "model_created": f"2026-{rng.randrange(1, 13):02d}-05",
     }[name]
-    return f"{name} {sign} {value!r}", lambda columns: compared(columns[name], sign, value)
+    return f"{name} {sign} {value!r}", lambda columns: compared(
+        columns[name], sign, value
+    )
 
 
 def compared(values, sign, value):
-    operations = {"==": "__eq__", "!=": "__ne__", "<": "__lt__", "<=": "__le__", ">": "__gt__", ">=": "__ge__"}
+    operations = {
+        "==": "__eq__",
+        "!=": "__ne__",
+        "<": "__lt__",
+        "<=": "__le__",
+        ">": "__gt__",
+        ">=": "__ge__",
+    }
     known = [v for v in values if v is not None and v == v]
     limit = datetime.fromisoformat(value) if isinstance(known[0], datetime) else value
-    truth = [pd.NA if v is None or v != v else bool(getattr(v, operations[sign])(limit)) for v in values]
-    return pd.array([one if one is not NotImplemented else None for one in truth], "boolean")
+    truth = [
+        pd.NA if v is None or v != v else bool(getattr(v, operations[sign])(limit))
+        for v in values
+    ]
+    return pd.array(
+        [one if one is not NotImplemented else None for one in truth], "boolean"
+    )
 
 
 def condition(rng, depth=0):
     """A random condition as text, and as a function of the columns by the logic of pandas."""
-    kind = rng.choice(["comparison", "truth", "missing", "in", "and", "or", "not"] if depth < 4 else ["comparison"])
+    kind = rng.choice(
+        ["comparison", "truth", "missing", "in", "and", "or", "not"]
+        if depth < 4
+        else ["comparison"]
+    )
     if kind == "comparison":
         return comparison(rng)
     if kind == "truth":
-        return "outdated", lambda c: pd.array([None if v is None or v != v else v for v in c["outdated"]], "boolean")
+        return "outdated", lambda c: pd.array(
+            [None if v is None or v != v else v for v in c["outdated"]], "boolean"
+        )
     if kind == "missing":
         name = rng.choice(["age", "condition", "model_created"])
         negated = rng.random() < 0.5
         text = f"{name} is {'not ' if negated else ''}missing"
-        return text, lambda c: pd.array(pd.isna(pd.Series(c[name], dtype=object)) != negated, "boolean")
+        return text, lambda c: pd.array(
+            pd.isna(pd.Series(c[name], dtype=object)) != negated, "boolean"
+        )
     if kind == "in":
         chosen = rng.sample(["normal", "lotion", "tan", "none"], 2)
         return (
             f"condition in {chosen}",
-            lambda c: compared(c["condition"], "==", chosen[0]) | compared(c["condition"], "==", chosen[1]),
+            lambda c: (
+                compared(c["condition"], "==", chosen[0])
+                | compared(c["condition"], "==", chosen[1])
+            ),
         )
     if kind == "not":
         text, expected = condition(rng, depth + 1)
@@ -89,7 +114,9 @@ def test_evaluate__is_the_logic_of_pandas_with_missing_values():
         columns = table(rng, missing=rng.random() < 0.7)
         text, expected = condition(rng)
         truth, _ = evaluate(text, columns)
-        assert truth == [None if one is pd.NA else one for one in expected(columns)], text
+        assert truth == [None if one is pd.NA else one for one in expected(columns)], (
+            text
+        )
 
 
 def test_evaluate__chains_and_precedence_are_those_of_python():
@@ -97,20 +124,36 @@ def test_evaluate__chains_and_precedence_are_those_of_python():
     columns = table(rng, missing=False)
     for _ in range(EXPRESSIONS):
         low, high = sorted(rng.sample(range(20, 70), 2))
-        parts = [f"{low} <= age < {high}", comparison(rng)[0], "not outdated", "-1 < albedo < +0.5"]
+        parts = [
+            f"{low} <= age < {high}",
+            comparison(rng)[0],
+            "not outdated",
+            "-1 < albedo < +0.5",
+        ]
         rng.shuffle(parts)
-        text = parts[0] + "".join(f" {rng.choice(['and', 'or'])} {part}" for part in parts[1:])
+        text = parts[0] + "".join(
+            f" {rng.choice(['and', 'or'])} {part}" for part in parts[1:]
+        )
         if "model_created" in text:  # a date and a text, which Python does not compare
             continue
-        rows = [{name: values[row] for name, values in columns.items()} for row in range(ROWS)]
+        rows = [
+            {name: values[row] for name, values in columns.items()}
+            for row in range(ROWS)
+        ]
         assert evaluate(text, columns)[0] == [eval(text, {}, row) for row in rows], text
 
 
-def test_evaluate__hostile_expressions_are_refused_in_one_line_or_harmless(tmp_path, monkeypatch):
-    """No expression writes a file, imports a module, or gives anything but truth values or one line."""
+def test_evaluate__hostile_expressions_are_refused_in_one_line_or_harmless(
+    tmp_path, monkeypatch
+):
+    """No expression writes a file, imports a module, or gives anything but truth values
+    or one line.
+    """
     monkeypatch.chdir(tmp_path)
     modules = {*sys.modules}
-    outcomes = Counter(outcome(text) for text in hostile_conditions(5 * EXPRESSIONS, seed=2012))
+    outcomes = Counter(
+        outcome(text) for text in hostile_conditions(5 * EXPRESSIONS, seed=2012)
+    )
     assert outcomes[REFUSED] > 4 * EXPRESSIONS
     assert {*outcomes} == {REFUSED, HARMLESS}
     assert not [*tmp_path.iterdir()]
@@ -120,11 +163,29 @@ def test_evaluate__hostile_expressions_are_refused_in_one_line_or_harmless(tmp_p
 @pytest.mark.parametrize(
     ("text", "line"),
     [
-        ("agee > 40", r"name columns of the catalogue; found the name agee in 'agee > 40'; did you mean age\?"),
-        ("\u0430ge > 40", r"found the name \u0430ge \(\\u0430ge\) in .*; did you mean age\?"),
+        (
+            "agee > 40",
+            (
+                r"name columns of the catalogue; found the name agee in 'agee > 40'; "
+                r"did you mean age\?"
+            ),
+        ),
+        (
+            "\u0430ge > 40",
+            r"found the name \u0430ge \(\\u0430ge\) in .*; did you mean age\?",
+        ),
         ("condition == lotion", "Text needs quotes"),
-        ("age > '40'", r"text with text and numbers with numbers; found a number beside text in \"age > '40'\""),
-        ("'old' < age", "text with text and numbers with numbers; found text beside a number"),
+        (
+            "age > '40'",
+            (
+                r"text with text and numbers with numbers; found a number beside text "
+                r"in \"age > '40'\""
+            ),
+        ),
+        (
+            "'old' < age",
+            "text with text and numbers with numbers; found text beside a number",
+        ),
         ("age in [20, 'x']", "text with text and numbers with numbers"),
         ("outdated == 1", "found true or false beside a number"),
         ("mixed < 3", "text with text and numbers with numbers"),
@@ -158,22 +219,42 @@ def test_evaluate__says_what_is_wrong(text, line):
 
 
 def test_evaluate__reads_names_in_backticks_and_columns_of_two_kinds():
-    columns = {"skin type": ["II", 2, np.nan], "größe": [1.0, 2.0, 3.0], "text": ["`x`", "# y", "z"]}
-    assert evaluate("`skin type` == 'II'", columns) == ([True, False, None], ["skin type"])
+    columns = {
+        "skin type": ["II", 2, np.nan],
+        "größe": [1.0, 2.0, 3.0],
+        "text": ["`x`", "# y", "z"],
+    }
+    assert evaluate("`skin type` == 'II'", columns) == (
+        [True, False, None],
+        ["skin type"],
+    )
     assert evaluate("`skin type` != 2", columns)[0] == [True, False, None]
     assert evaluate("`skin type` in [2.0, 'III']", columns)[0] == [False, True, None]
     assert evaluate("größe > 1.5", columns)[0] == [False, True, True]
     assert evaluate("text == '`x`' or text == '# y'", columns)[0] == [True, True, False]
-    with pytest.raises(InputError, match=r"found the name skin typ in .*did you mean skin type"):
+    with pytest.raises(
+        InputError, match=r"found the name skin typ in .*did you mean skin type"
+    ):
         evaluate("`skin typ` == 2", columns)
 
 
 def test_evaluate__a_date_with_a_zone_is_compared_in_utc():
     columns = {"model_created": [pd.Timestamp("2026-01-01 11:30"), pd.NaT]}
-    assert evaluate("model_created > '2026-01-01T13:00+02:00'", columns)[0] == [True, None]
+    assert evaluate("model_created > '2026-01-01T13:00+02:00'", columns)[0] == [
+        True,
+        None,
+    ]
     assert evaluate("model_created > '2026-01-01T13:00'", columns)[0] == [False, None]
-    assert evaluate("model_created in ['2026-01-01T13:30+02:00']", columns)[0] == [True, None]
+    assert evaluate("model_created in ['2026-01-01T13:30+02:00']", columns)[0] == [
+        True,
+        None,
+    ]
 
 
 def test_evaluate__of_no_rows_is_empty():
-    assert evaluate("take in ['A', 'B'] and age > 3 or 'A' in take", {"take": [], "age": []})[0] == []
+    assert (
+        evaluate(
+            "take in ['A', 'B'] and age > 3 or 'A' in take", {"take": [], "age": []}
+        )[0]
+        == []
+    )

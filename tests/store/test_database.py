@@ -1,4 +1,6 @@
-"""The guarantees of the store: immutable versions, atomic commits under races, and detection of damage."""
+"""The guarantees of the store: immutable versions, atomic commits under races, and
+detection of damage.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,8 @@ def test_read__gives_back_what_was_written(tmp_path):
     assert tree.attrs["seeds"] == [1]
     assert tree.attrs["schema_version"] == SCHEMA_VERSION
     assert tree.attrs["software_version"] == skindb.__version__
-    plain = xr.open_datatree(tmp_path / record.path, engine="zarr", consolidated=False)  # without skindb
+    # without skindb
+    plain = xr.open_datatree(tmp_path / record.path, engine="zarr", consolidated=False)
     assert float(plain["surfels/surfel_area"][1]) == 0.5
 
 
@@ -52,12 +55,16 @@ def test_commit__generations_are_history(tmp_path):
 
 
 def test_history__a_lost_record_is_named(tmp_path):
-    """A record that was removed on purpose is skipped; one that is missing without a tombstone is an error."""
+    """A record that was removed on purpose is skipped; one that is missing without a
+    tombstone is an error.
+    """
     for value in (1.0, 2.0, 3.0):
         commit(tmp_path, value)
     db = Database(tmp_path)
     (tmp_path / "log/capture/A1/00000001.json").unlink()
-    with pytest.raises(InputError, match="generation 1 must exist; found no record and no tombstone"):
+    with pytest.raises(
+        InputError, match="generation 1 must exist; found no record and no tombstone"
+    ):
         db.history("capture", "A1")
 
 
@@ -74,12 +81,14 @@ def test_read__consent_is_that_of_the_newest_capture(tmp_path):
     assert db.read("model", "A1").attrs["consent_scope"] == ["fit", "export"]
     _with(tmp_path, "capture", consent_scope=["fit"])
     assert db.read("model", "A1").attrs["consent_scope"] == ["fit"]
-    assert db.read("capture", "A1", generation=1).attrs["consent_scope"] == ["fit"]  # the newest counts for all of them
+    # the newest counts for all of them
+    assert db.read("capture", "A1", generation=1).attrs["consent_scope"] == ["fit"]
 
 
 def test_info__studies_are_no_takes(tmp_path):
     _with(tmp_path, "capture")
-    with Database(tmp_path).stage("population", "A1") as stage:  # a pseudonym that is also a study's name
+    # a pseudonym that is also a study's name
+    with Database(tmp_path).stage("population", "A1") as stage:
         stage.write(groups())
         stage.commit({})
     told = Database(tmp_path).info()
@@ -89,7 +98,14 @@ def test_info__studies_are_no_takes(tmp_path):
 
 def test_source__is_the_version_that_was_used(tmp_path):
     first = commit(tmp_path, 1.0)
-    inputs = [{"kind": "capture", "take": "A1", "generation": first.generation, "path": first.path}]
+    inputs = [
+        {
+            "kind": "capture",
+            "take": "A1",
+            "generation": first.generation,
+            "path": first.path,
+        }
+    ]
     _with(tmp_path, "model", inputs=inputs)
     commit(tmp_path, 2.0)
     db = Database(tmp_path)
@@ -137,7 +153,11 @@ def test_stage__large_arrays_are_written_shard_by_shard(tmp_path, monkeypatch):
     ds = dataset({"reflectance_sample": mapped % 1000})
     blocks = []
     monkeypatch.setattr(stage_module, "MAX_UNSHARDED_BYTES", 1000)
-    monkeypatch.setattr(stage_module, "_shards", lambda values: blocks.append(_shards(values)) or blocks[-1])
+    monkeypatch.setattr(
+        stage_module,
+        "_shards",
+        lambda values: blocks.append(_shards(values)) or blocks[-1],
+    )
     with Database(tmp_path / "db").stage("capture", "A1") as stage:
         stage.write({"samples": ds})
         stage.commit({})
@@ -147,15 +167,24 @@ def test_stage__large_arrays_are_written_shard_by_shard(tmp_path, monkeypatch):
 
 
 def test_stage__chunks_of_few_bytes_hold_more_surfels(tmp_path):
-    """Chunks have at least half a megabyte or are a whole shard; zeros are stored like other values."""
+    """Chunks have at least half a megabyte or are a whole shard; zeros are stored like
+    other values.
+    """
     n = SHARD + 300
     samples = np.arange(n * 6 * 50 * 3).reshape(n, 6, 50, 3) % 1000
     samples[SHARD:] = 0
-    ds = dataset({"reflectance_sample": samples.astype(np.float16), "sample_count": np.zeros(n, np.int32)})
+    ds = dataset(
+        {
+            "reflectance_sample": samples.astype(np.float16),
+            "sample_count": np.zeros(n, np.int32),
+        }
+    )
     with Database(tmp_path).stage("capture", "A1") as stage:
         stage.write({"samples": ds})
         stage.commit({})
-    group = zarr.open_group(next((tmp_path / "data/capture/A1").glob("*.zarr")), mode="r")["samples"]
+    group = zarr.open_group(
+        next((tmp_path / "data/capture/A1").glob("*.zarr")), mode="r"
+    )["samples"]
     assert group["reflectance_sample"].chunks == (512, 6, 50, 3)  # 256 are 460 kB
     assert group["sample_count"].chunks == (SHARD,)
     got = Database(tmp_path).read("capture", "A1")["samples"].to_dataset()
@@ -203,7 +232,10 @@ def test_stage__text_of_any_type_is_stored_as_variable_length_text(tmp_path, kin
 
 
 def test_stage__empty_groups_are_stored(tmp_path):
-    empty = dataset({"trait_count": np.zeros((0, 2))}, coords={"trait": [], "side": ["with", "without"]})
+    empty = dataset(
+        {"trait_count": np.zeros((0, 2))},
+        coords={"trait": [], "side": ["with", "without"]},
+    )
     with Database(tmp_path).stage("population", "traits") as stage:
         stage.write({"traits": empty})
         stage.commit({})
@@ -229,9 +261,15 @@ def test_commit__interrupt_around_the_link(tmp_path, monkeypatch, when):
     db = Database(tmp_path)
     assert len(db.history("capture", "A1")) == (2 if when == "after" else 1)
     assert db.verify() == []  # the data of a record in the log was not removed
-    assert float(db.read("capture", "A1")["surfels/surfel_area"][0]) == (2.0 if when == "after" else 1.0)
-    assert len(list((tmp_path / "data/capture/A1").glob("*.zarr"))) == len(db.history("capture", "A1"))
-    assert not [name for name in db._place.children("log/capture/A1") if name.endswith(".tmp")]
+    assert float(db.read("capture", "A1")["surfels/surfel_area"][0]) == (
+        2.0 if when == "after" else 1.0
+    )
+    assert len(list((tmp_path / "data/capture/A1").glob("*.zarr"))) == len(
+        db.history("capture", "A1")
+    )
+    assert not [
+        name for name in db._place.children("log/capture/A1") if name.endswith(".tmp")
+    ]
 
 
 def test_commit__racing_writers_each_generation_once(tmp_path):
@@ -246,9 +284,18 @@ def test_commit__racing_writers_each_generation_once(tmp_path):
     db = Database(tmp_path)
     assert sorted(won) == list(range(1, len(won) + 1))
     assert [r.generation for r in db.history("capture", "A1")] == sorted(won)
-    for generation, value in won.items():  # each holds what was acknowledged to its writer
-        assert float(db.read("capture", "A1", generation=generation)["surfels/surfel_area"][5]) == value
-    assert len(list((tmp_path / "data/capture/A1").glob("*.zarr"))) == len(won)  # other writers left nothing
+    # each holds what was acknowledged to its writer
+    for generation, value in won.items():
+        assert (
+            float(
+                db.read("capture", "A1", generation=generation)["surfels/surfel_area"][
+                    5
+                ]
+            )
+            == value
+        )
+    # other writers left nothing
+    assert len(list((tmp_path / "data/capture/A1").glob("*.zarr"))) == len(won)
     assert db.verify() == []
 
 
@@ -257,7 +304,9 @@ def test_commit__stale_writer_is_refused(tmp_path):
     with db.stage("capture", "A1") as slow:
         slow.write(groups(1.0))
         commit(tmp_path, 2.0)
-        with pytest.raises(Conflict, match="generation 1 was committed by another writer"):
+        with pytest.raises(
+            Conflict, match="generation 1 was committed by another writer"
+        ):
             slow.commit({})
     assert float(db.read("capture", "A1")["surfels/surfel_area"][0]) == 2.0
     assert db.verify() == []
@@ -270,7 +319,10 @@ def test_read__no_half_version_while_others_commit(tmp_path):
 
     def look():
         tree = db.read("capture", "A1")
-        area, sample = (tree[n].values for n in ("surfels/surfel_area", "samples/reflectance_sample"))
+        area, sample = (
+            tree[n].values
+            for n in ("surfels/surfel_area", "samples/reflectance_sample")
+        )
         assert len({*area.tolist(), *sample[1:].ravel().tolist()}) == 1
         seen.append(float(area[0]))
 
@@ -302,7 +354,11 @@ def test_commit__racing_processes_lose_nothing(tmp_path):
         worker.start()
     for worker in workers:
         worker.join()
-    assert sum(w.exitcode for w in workers) == len(Database(tmp_path).history("capture", "A1")) > 0
+    assert (
+        sum(w.exitcode for w in workers)
+        == len(Database(tmp_path).history("capture", "A1"))
+        > 0
+    )
 
 
 KILLED = """
@@ -324,10 +380,19 @@ DEATHS = {
         "skindb.store.stage._encoding = lambda a: die() if a.name == 'surfel_area' else {}",
         1,
     ),
-    "data written, nothing flushed": ("skindb.store.folder.Folder.make_durable = die", 1),
+    "data written, nothing flushed": (
+        "skindb.store.folder.Folder.make_durable = die",
+        1,
+    ),
     "while flushing": ("skindb.store.folder.Folder.digest = die", 1),
-    "record written, not linked": ("os.link = lambda a, b: die() if 'log' in Path(b).parts else link(a, b)", 1),
-    LINKED: ("os.link = lambda a, b: (link(a, b), 'log' in Path(b).parts and die())", 2),
+    "record written, not linked": (
+        "os.link = lambda a, b: die() if 'log' in Path(b).parts else link(a, b)",
+        1,
+    ),
+    LINKED: (
+        "os.link = lambda a, b: (link(a, b), 'log' in Path(b).parts and die())",
+        2,
+    ),
 }
 
 
@@ -335,16 +400,23 @@ DEATHS = {
 @pytest.mark.parametrize("where", DEATHS)
 def test_commit__killed_at_every_step(tmp_path, where):
     line, commits = DEATHS[where]
-    code = KILLED.format(tests=str(Path(__file__).parent), root=str(tmp_path), where=line)
-    worker = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    code = KILLED.format(
+        tests=str(Path(__file__).parent), root=str(tmp_path), where=line
+    )
+    worker = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60
+    )
     assert worker.returncode == -signal.SIGKILL, worker.stderr
     db = Database(tmp_path)
-    assert [r.generation for r in db.history("capture", "A1")] == list(range(1, commits + 1))
+    assert [r.generation for r in db.history("capture", "A1")] == list(
+        range(1, commits + 1)
+    )
     left = ["a version without a record, left by a killed run"] * (where != LINKED)
     assert db.verify() == []
     assert [one.what for one in db.garbage() if one.key.endswith(".zarr")] == left
     assert float(db.read("capture", "A1")["surfels/surfel_area"][3]) == float(commits)
-    assert commit(tmp_path, 3.0).generation == commits + 1  # and the next writer continues
+    # and the next writer continues
+    assert commit(tmp_path, 3.0).generation == commits + 1
     assert db.verify() == []
 
 
@@ -362,18 +434,33 @@ while True:
 @pytest.mark.parametrize("delay", [0.06, 0.17])
 def test_commit__killed_at_any_time(tmp_path, delay):
     code = ENDLESS.format(tests=str(Path(__file__).parent), root=str(tmp_path))
-    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as worker:
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, text=True
+    ) as worker:
         assert worker.stdout.readline() == "ready\n"
         time.sleep(delay)
         worker.send_signal(signal.SIGKILL)
         acknowledged = [int(line) for line in worker.stdout.read().split()]
     db = Database(tmp_path)
-    history = [r.generation for r in db.history("capture", "A1")] if "A1" in db.takes() else []
-    assert history[: len(acknowledged)] == acknowledged  # an acknowledged commit is never lost
+    history = (
+        [r.generation for r in db.history("capture", "A1")]
+        if "A1" in db.takes()
+        else []
+    )
+    # an acknowledged commit is never lost
+    assert history[: len(acknowledged)] == acknowledged
     assert len(history) <= len(acknowledged) + 1
-    assert all("must name every version" in fault.rule for fault in db.verify())  # left by the killed commit
+    # left by the killed commit
+    assert all("must name every version" in fault.rule for fault in db.verify())
     for generation in history:
-        assert float(db.read("capture", "A1", generation=generation)["surfels/surfel_area"][3]) == 2.0
+        assert (
+            float(
+                db.read("capture", "A1", generation=generation)["surfels/surfel_area"][
+                    3
+                ]
+            )
+            == 2.0
+        )
 
 
 def test_verify__all_damage_at_once(tmp_path):
@@ -409,8 +496,11 @@ def test_verify__any_flipped_byte_is_found(tmp_path):
     commit(tmp_path)
     rng = np.random.default_rng(0)
     files = [p for p in tmp_path.rglob("*") if p.is_file()]
-    assert {"log", "data", "heads", "secret"} == {p.relative_to(tmp_path).parts[0] for p in files}
-    for file in (file for file in files if "heads" not in file.parts):  # heads are caches
+    assert {"log", "data", "heads", "secret"} == {
+        p.relative_to(tmp_path).parts[0] for p in files
+    }
+    # heads are caches
+    for file in (file for file in files if "heads" not in file.parts):
         whole = file.read_bytes()
         for at in rng.integers(len(whole), size=3):
             flipped = bytearray(whole)
@@ -432,7 +522,10 @@ def test_info__paths_open(tmp_path):
     assert Database(tmp_path).subjects() == ["A1"]
 
 
-@pytest.mark.parametrize("take", ["", "..", "../x", "a/b", "/etc", "a.b.c", "x" * 65, "a b", "a\n", "å", "a\0"])
+@pytest.mark.parametrize(
+    "take",
+    ["", "..", "../x", "a/b", "/etc", "a.b.c", "x" * 65, "a b", "a\n", "å", "a\0"],
+)
 def test_stage__names_cannot_leave_the_database(tmp_path, take):
     with pytest.raises(InputError, match="take"):
         Database(tmp_path).stage("capture", take)
@@ -453,6 +546,8 @@ def test_database__must_be_a_folder(tmp_path):
     with pytest.raises(InputError, match="a database must be a folder"):
         Database(tmp_path / "f")
     for url in ("gs://bucket/x", "https://somebody:secret@host/x"):
-        with pytest.raises(InputError, match="a database must be a local folder or an S3 bucket") as caught:
+        with pytest.raises(
+            InputError, match="a database must be a local folder or an S3 bucket"
+        ) as caught:
             Database(url)
         assert "secret" not in str(caught.value)

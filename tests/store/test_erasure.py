@@ -1,4 +1,6 @@
-"""What a withdrawal removes: everything of a subject and everything that refers to one, and nothing else."""
+"""What a withdrawal removes: everything of a subject and everything that refers to one,
+and nothing else.
+"""
 
 from __future__ import annotations
 
@@ -21,11 +23,22 @@ SCOPE = {"consent_scope": ["fit", "statistics"]}
 
 
 def _commit(db, kind, take, inputs=(), names=(), *, groups=None, **about):
-    takes = [*names, *(record.take for record in inputs if record.kind not in ("calibration", "population"))]
+    takes = [
+        *names,
+        *(
+            record.take
+            for record in inputs
+            if record.kind not in ("calibration", "population")
+        ),
+    ]
     takes += [name for record in inputs for name in record.names]
-    with db.stage(kind, take, names=takes if kind not in ("capture", "model") else ()) as stage:
+    with db.stage(
+        kind, take, names=takes if kind not in ("capture", "model") else ()
+    ) as stage:
         stage.write(groups or {})
-        return stage.commit(SCOPE | {"inputs": [record.as_input() for record in inputs]} | about)
+        return stage.commit(
+            SCOPE | {"inputs": [record.as_input() for record in inputs]} | about
+        )
 
 
 def _fitted(db, take, *shared, **about):
@@ -39,13 +52,24 @@ def db(tmp_path):
     return Database(tmp_path / "db")
 
 
-@pytest.mark.parametrize("subject", ["3", "5", "16", "43", "59", "94", "98", "a", "no", "to", "rays"])
-def test_erase__a_pseudonym_that_is_a_word_of_messages_removes_nothing_of_others(db, subject):
-    """Every default fit records these words; earlier versions removed all results of all subjects."""
-    message = "dictionary: 43 of 59 are skipped (rank 16; no rays to a 3 x 5 block); 94 % and 98 % of the energy"
+@pytest.mark.parametrize(
+    "subject", ["3", "5", "16", "43", "59", "94", "98", "a", "no", "to", "rays"]
+)
+def test_erase__a_pseudonym_that_is_a_word_of_messages_removes_nothing_of_others(
+    db, subject
+):
+    """Every default fit records these words; earlier versions removed all results of
+    all subjects.
+    """
+    message = (
+        "dictionary: 43 of 59 are skipped (rank 16; no rays to a 3 x 5 block); 94 % "
+        "and 98 % of the energy"
+    )
     models = [_fitted(db, take, skipped=[message]) for take in ("P1", "P2")]
     _commit(db, "registration", "P1", models, registration=message)
-    _commit(db, "population", "traits", models, skipped=[{"take": "", "reason": message}])
+    _commit(
+        db, "population", "traits", models, skipped=[{"take": "", "reason": message}]
+    )
     before = contents(db.root)
     _commit(db, "capture", subject)
     erasure = db.erase(subject)
@@ -56,8 +80,18 @@ def test_erase__a_pseudonym_that_is_a_word_of_messages_removes_nothing_of_others
 
 
 def test_erase__a_probe_site_named_like_the_subject_removes_no_capture_of_another(db):
-    sites = dataset({"site_sigma_tr": np.ones((2, 3))}, coords={"site": ["1", "2"], "channel": ["R", "G", "B"]})
-    capture = _commit(db, "capture", "P1", groups={"translucency": sites}, traits={"1": "1"}, session="1")
+    sites = dataset(
+        {"site_sigma_tr": np.ones((2, 3))},
+        coords={"site": ["1", "2"], "channel": ["R", "G", "B"]},
+    )
+    capture = _commit(
+        db,
+        "capture",
+        "P1",
+        groups={"translucency": sites},
+        traits={"1": "1"},
+        session="1",
+    )
     _commit(db, "population", "1", [_fitted(db, "P2")])
     _fitted(db, "1")
     db.erase("1")
@@ -74,7 +108,10 @@ def test_erase__of_one_condition_of_a_take_is_not_possible(db):
             db.erase(name)
     db.erase("A")
     assert db.takes() == ["AB"]
-    with pytest.raises(InputError, match="A: the database must hold the subject; found that the subject was withdrawn"):
+    with pytest.raises(
+        InputError,
+        match="A: the database must hold the subject; found that the subject was withdrawn",
+    ):
         db.erase("A")
 
 
@@ -92,11 +129,19 @@ def test_erase__of_a_product_of_many_subjects_keeps_the_models_of_others(db):
     shared = _commit(db, "calibration", "basis", [_fitted(db, "A"), _fitted(db, "B")])
     model = _fitted(db, "C", shared)
     other = _fitted(db, "D")
-    study = _commit(db, "population", "traits", [model, other], parameters={"what": "traits"})
+    study = _commit(
+        db, "population", "traits", [model, other], parameters={"what": "traits"}
+    )
     _commit(db, "population", "albedo", [other])
     db.create_release("r1")
     erasure = db.erase("A")
-    assert erasure.removed == {"calibration": 1, "capture": 1, "model": 1, "population": 1, "release": 1}
+    assert erasure.removed == {
+        "calibration": 1,
+        "capture": 1,
+        "model": 1,
+        "population": 1,
+        "release": 1,
+    }
     assert db.record("model", "C") == model
     assert db.takes("population") == ["albedo"]
     assert db.takes("model", release="r1") == ["B", "C", "D"]
@@ -104,7 +149,8 @@ def test_erase__of_a_product_of_many_subjects_keeps_the_models_of_others(db):
     assert str(reason) == "calibration 1 of basis was removed from the database"
     assert db.requests() == [Request("population", "traits", {"what": "traits"})]
     with pytest.raises(
-        InputError, match=r"model 1 of C: the inputs of an input must exist; found calibration 1 of basis"
+        InputError,
+        match=r"model 1 of C: the inputs of an input must exist; found calibration 1 of basis",
     ):
         _commit(db, "population", "traits", [model, other])
     again = _fitted(db, "C")
@@ -115,10 +161,14 @@ def test_erase__of_a_product_of_many_subjects_keeps_the_models_of_others(db):
 def test_stage__a_capture_or_model_refers_to_no_other_subject(db):
     other = _commit(db, "capture", "B")
     with pytest.raises(
-        InputError, match=r"model of A: a model must refer to takes of its own subject only; found .* B;"
+        InputError,
+        match=r"model of A: a model must refer to takes of its own subject only; found .* B;",
     ):
         _commit(db, "model", "A", [other])
-    with pytest.raises(InputError, match="capture of A: a capture must refer to takes of its own subject only"):
+    with pytest.raises(
+        InputError,
+        match="capture of A: a capture must refer to takes of its own subject only",
+    ):
         db.stage("capture", "A", names=["B.lotion"])
     _commit(db, "model", "B.lotion", [other])
     assert db.takes("model") == ["B.lotion"]
@@ -126,21 +176,32 @@ def test_stage__a_capture_or_model_refers_to_no_other_subject(db):
 
 def test_stage__takes_are_named_before_they_are_written(db):
     model = _fitted(db, "A")
-    line = r"population of traits: a version must name the takes that it refers to .*; found no A; call db.stage\('popu"
-    with pytest.raises(InputError, match=line), db.stage("population", "traits") as stage:
+    line = (
+        r"population of traits: a version must name the takes that it refers to .*; "
+        r"found no A; call db.stage\('popu"
+    )
+    with (
+        pytest.raises(InputError, match=line),
+        db.stage("population", "traits") as stage,
+    ):
         stage.commit({"inputs": [model.as_input()]})
     registration = _commit(db, "registration", "A", [model, _fitted(db, "B")])
     with pytest.raises(InputError, match="found no B;"), db.stage("edit", "A") as stage:
         stage.commit({"inputs": [registration.as_input()]})
     labels = dataset({"take_distance": np.zeros((1, 1))}, coords={"take": ["A"]})
-    with pytest.raises(InputError, match=line), db.stage("population", "traits") as stage:
+    with (
+        pytest.raises(InputError, match=line),
+        db.stage("population", "traits") as stage,
+    ):
         stage.write({"traits": labels})
     assert db.takes("population") == []
     assert db.garbage() == []
 
 
 def test_record__refers_to_takes_through_any_number_of_inputs(db):
-    study = _commit(db, "population", "A", [_fitted(db, "A"), _fitted(db, "B")], names=["C"])
+    study = _commit(
+        db, "population", "A", [_fitted(db, "A"), _fitted(db, "B")], names=["C"]
+    )
     edit = _commit(db, "edit", "D", [_fitted(db, "D"), study])
     assert study.names == ("A", "B", "C")  # although the study has the name of a take
     assert study.subjects == {"A", "B", "C"}
@@ -148,17 +209,24 @@ def test_record__refers_to_takes_through_any_number_of_inputs(db):
     assert edit.subjects == {"A", "B", "C", "D"}
 
 
-def test_erase__unfinished_versions_of_others_are_removed_only_if_they_may_hold_its_data(db):
+def test_erase__unfinished_versions_of_others_are_removed_only_if_they_may_hold_its_data(
+    db,
+):
     a = _fitted(db, "A")
     b = _fitted(db, "B")
-    stages = [db.stage("population", name, names=names) for name, names in (("one", ["A", "B"]), ("two", ["B"]))]
+    stages = [
+        db.stage("population", name, names=names)
+        for name, names in (("one", ["A", "B"]), ("two", ["B"]))
+    ]
     stages.append(db.stage("population", "unknown", names=["B"]))
     for stage in stages:
         stage.write({"surfels": dataset({"surfel_area": np.ones(3)})})
     (db.root / stages[2].path.replace(".zarr", ".names.json")).unlink()
     db.erase("A")
     assert [(db.root / stage.path).exists() for stage in stages] == [False, True, False]
-    with pytest.raises(WithdrawnError, match="A: the subject must not be withdrawn while"):
+    with pytest.raises(
+        WithdrawnError, match="A: the subject must not be withdrawn while"
+    ):
         stages[0].commit({"inputs": [a.as_input(), b.as_input()]})
     stages[1].commit({"inputs": [b.as_input()]})
     assert db.takes("population") == ["two"]
@@ -207,17 +275,30 @@ def test_erase__requests_results_without_takes_of_the_subject(db):
     models = [_fitted(db, take) for take in ("A", "B", "C")]
     parameters = {"what": "traits", "takes": ["A", "B", "C"], "k": 3}
     _commit(db, "population", "traits.three", models, parameters=parameters)
-    _commit(db, "population", "albedo.alone", models[:1], parameters={"what": "albedo", "takes": ["A"]})
+    _commit(
+        db,
+        "population",
+        "albedo.alone",
+        models[:1],
+        parameters={"what": "albedo", "takes": ["A"]},
+    )
     for take in ("B", "C"):
         _commit(db, "registration", take, models, parameters={"reference": "A"})
-    _commit(db, "edit", "C", models, parameters={"amounts": {"A": 0.5}, "study": "traits.three"})
+    _commit(
+        db,
+        "edit",
+        "C",
+        models,
+        parameters={"amounts": {"A": 0.5}, "study": "traits.three"},
+    )
     erasure = db.erase("A")
     assert erasure.lost == ["population of albedo.alone: no other take was used"]
     requests = {str(request): request.parameters for request in db.requests()}
     assert requests == {
         "population of traits.three": {"what": "traits", "takes": ["B", "C"], "k": 3},
         "registration": {"reference": ""},
-        "edit of C": {"amounts": {"A": 0.5}, "study": "traits.three"},  # A is the name of a trait here
+        # A is the name of a trait here
+        "edit of C": {"amounts": {"A": 0.5}, "study": "traits.three"},
     }
     db.erase("C")
     requests = {str(request): request.parameters for request in db.requests()}
@@ -249,7 +330,8 @@ def test_erase__releases_get_a_revision_without_the_subject(db):
     db.create_release("alone", ["A"])
     db.create_release("others", ["C"])
     erasure = db.erase("A")
-    assert erasure.revised == ["all", "others"]  # the registration of the second one contains the subject
+    # the registration of the second one contains the subject
+    assert erasure.revised == ["all", "others"]
     assert erasure.lost == ["release of alone: no other take was used"]
     assert db.takes("release") == ["all", "others"]
     assert db.takes("model", release="all") == ["B", "C"]
@@ -287,7 +369,9 @@ def test_verify__names_a_damaged_request(db):
     [file] = (db.root / "requests").iterdir()
     assert db.verify() == []
     file.write_text(file.read_text().replace("age", "sex"))
-    assert [(fault.where, fault.rule) for fault in db.verify()] == [(str(file), "a request must be as it was written")]
+    assert [(fault.where, fault.rule) for fault in db.verify()] == [
+        (str(file), "a request must be as it was written")
+    ]
     assert db.requests() == []
 
 
@@ -355,7 +439,8 @@ def test_erase__waits_for_a_run_that_works_on_a_take_and_changes_nothing_until_t
     before = contents(db.root / "log")
     with db.lease("A.lotion", "model", command="skindb fit"):
         with pytest.raises(
-            InputError, match=r"model of A.lotion: only one run at a time may work on it; found skindb fit"
+            InputError,
+            match=r"model of A.lotion: only one run at a time may work on it; found skindb fit",
         ):
             db.erase("A")
         assert contents(db.root / "log") == before
@@ -364,7 +449,9 @@ def test_erase__waits_for_a_run_that_works_on_a_take_and_changes_nothing_until_t
     assert db.takes() == []
 
 
-def test_erase__a_second_run_is_refused_before_the_first_has_an_effect_on_it(db, monkeypatch):
+def test_erase__a_second_run_is_refused_before_the_first_has_an_effect_on_it(
+    db, monkeypatch
+):
     """Two processes withdraw the same subject: both succeed."""
     _fitted(db, "A")
     mark = erasure_module.mark_withdrawn
@@ -394,9 +481,13 @@ def test_readmit__new_versions_are_visible_and_old_ones_never(db):
     assert db.takes("model") == ["A", "B"]
     assert db.record("model", "A") == new
     assert db.verify() == []
-    late = db.root / "log/model/A/00000002.json"  # of a writer that was suspended all the time
+    # of a writer that was suspended all the time
+    late = db.root / "log/model/A/00000002.json"
     late.write_text(_with_generation(record, 2))
-    with pytest.raises(WithdrawnError, match="model 2 of A: a version must not refer to a withdrawn subject"):
+    with pytest.raises(
+        WithdrawnError,
+        match="model 2 of A: a version must not refer to a withdrawn subject",
+    ):
         db.record("model", "A")
     assert db.record("model", "A", 1) == new
     db.clean()
@@ -420,7 +511,10 @@ def test_readmit__waits_until_the_erasure_is_complete(db, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(erasure_module, "erase_withdrawn", lambda _: None)
         db.erase("A")
-    with pytest.raises(InputError, match="A: a withdrawal must be complete before the subject is admitted again"):
+    with pytest.raises(
+        InputError,
+        match="A: a withdrawal must be complete before the subject is admitted again",
+    ):
         db.readmit("A", date.today())
     db.clean()
     db.readmit("A", date.today())

@@ -1,4 +1,6 @@
-"""Withdrawals from databases whose pseudonyms are words of everything else: only typed references decide."""
+"""Withdrawals from databases whose pseudonyms are words of everything else: only typed
+references decide.
+"""
 
 from __future__ import annotations
 
@@ -19,12 +21,17 @@ from skindb.schema import dataset
 from skindb.store import Database, Record, stage
 
 DATABASES = 500
-# pseudonyms, and at the same time words of messages, sites, regions, attributes, studies, releases and conditions
+# pseudonyms, and at the same time words of messages, sites, regions, attributes,
+# studies, releases and conditions
 WORDS = (
-    "0 1 2 3 5 16 43 59 94 98 007 1e5 -1 _ - a A aa aA no to of rays rank are skipped model models take takes capture "
-    "registration population edit summary release calibration consent first withdrawn readmitted secret staging tmp "
-    "log data heads leases tombstones requests names tables manifest json zarr now normal lotion face beard cheek neck "
-    "age gender traits translucency albedo statistics fit null true None S0 S01 S012 S01-b S_01 S01_ r1 dome "
+    "0 1 2 3 5 16 43 59 94 98 007 1e5 -1 _ - a A aa aA no to of rays rank are "
+    "skipped model models take takes capture "
+    "registration population edit summary release calibration consent first "
+    "withdrawn readmitted secret staging tmp "
+    "log data heads leases tombstones requests names tables manifest json zarr now "
+    "normal lotion face beard cheek neck "
+    "age gender traits translucency albedo statistics fit null true None S0 S01 "
+    "S012 S01-b S_01 S01_ r1 dome "
     "20261125T010101-0123abcd 0000000000000001 0123456789abcdef"
 ).split()
 # what a fit of 43 lights and others record, in which earlier versions searched for pseudonyms
@@ -50,7 +57,9 @@ class Planted:
 
     @property
     def is_kept(self) -> bool:
-        """Whether it is of one subject, and therefore outlives a product of others that it was made from."""
+        """Whether it is of one subject, and therefore outlives a product of others that
+        it was made from.
+        """
         return self.record.kind in ("capture", "model", "first", "consent")
 
 
@@ -79,25 +88,45 @@ class Planter:
         return [self.draw.choice([*self.subjects, *WORDS]) for _ in range(count)]
 
     def commit(
-        self, kind: str, take: str, inputs: list[Planted], *, named: set[str] = frozenset(), has_labels: bool = False
+        self,
+        kind: str,
+        take: str,
+        inputs: list[Planted],
+        *,
+        named: set[str] = frozenset(),
+        has_labels: bool = False,
     ) -> Planted:
         """Commit a version with misleading words in its provenance and its labels."""
         has_subject = kind not in ("population", "release", "calibration")
         takes = set(named).union({take} if has_subject else set())
-        if kind not in ("capture", "model", "first", "consent"):  # the others take over what their inputs refer to
+        # the others take over what their inputs refer to
+        if kind not in ("capture", "model", "first", "consent"):
             takes = takes.union(*(one.takes for one in inputs))
         about: dict[str, Any] = {
             "consent_scope": ["fit", "statistics"],
             "inputs": [one.record.as_input() for one in inputs],
-            "skipped": [*MESSAGES, *self.words(2), {"take": "", "reason": " ".join(self.words(3))}],
+            "skipped": [
+                *MESSAGES,
+                *self.words(2),
+                {"take": "", "reason": " ".join(self.words(3))},
+            ],
             "traits": dict.fromkeys(self.words(2), self.words(1)[0]),
             "parameters": {"what": self.words(1)[0], self.words(1)[0]: self.words(2)},
             "session": self.words(1)[0],
         }
         with self.db.stage(kind, take, names=takes) as stage:
             if has_labels:
-                labels = {"site": list(dict.fromkeys(self.words(3))), "channel": ["R", "G", "B"]}
-                stage.write({"translucency": dataset({"site_sigma_tr": _ones(labels)}, coords=labels)})
+                labels = {
+                    "site": list(dict.fromkeys(self.words(3))),
+                    "channel": ["R", "G", "B"],
+                }
+                stage.write(
+                    {
+                        "translucency": dataset(
+                            {"site_sigma_tr": _ones(labels)}, coords=labels
+                        )
+                    }
+                )
             record = stage.commit(about)
         planted = Planted(record, takes, inputs)
         self.versions.append(planted)
@@ -115,15 +144,23 @@ class Planter:
             if draw.random() < 0.2:
                 models[take] = self.commit("model", take, [capture])
             if draw.random() < 0.2:
-                products.append(self.commit("calibration", self.words(1)[0], [models[take]]))
+                products.append(
+                    self.commit("calibration", self.words(1)[0], [models[take]])
+                )
             if draw.random() < 0.2:
                 self.commit("consent", take.partition(".")[0], [])
         for _ in range(draw.randint(1, 3)):
             used = draw.sample(sorted(models), draw.randint(1, len(models)))
             named = set(draw.sample(sorted(models), draw.randint(0, 1)))
             inputs = [models[take] for take in used]
-            kind = draw.choice(["population", "release", "registration", "summary", "edit"])
-            take = draw.choice(used) if kind in ("registration", "summary", "edit") else self.words(1)[0]
+            kind = draw.choice(
+                ["population", "release", "registration", "summary", "edit"]
+            )
+            take = (
+                draw.choice(used)
+                if kind in ("registration", "summary", "edit")
+                else self.words(1)[0]
+            )
             made = self.commit(kind, take, inputs, named=named)
             if kind == "population" and draw.random() < 0.7:
                 self.commit("edit", draw.choice(used), [models[used[0]], made])
@@ -136,11 +173,24 @@ class Planter:
             if one.record.kind == "release":
                 refers[id(one)] = own
             else:
-                refers[id(one)] = own or any(refers.get(id(used), False) for used in one.inputs)
-        doomed = [one for one in self.versions if refers[id(one)] and not (one.is_kept and not _is_of(one, subject))]
+                refers[id(one)] = own or any(
+                    refers.get(id(used), False) for used in one.inputs
+                )
+        doomed = [
+            one
+            for one in self.versions
+            if refers[id(one)] and not (one.is_kept and not _is_of(one, subject))
+        ]
         gone = {id(one) for one in doomed}
-        releases = [one for one in self.versions if one.record.kind == "release" and id(one) not in gone]
-        return [*doomed, *(one for one in releases if any(id(used) in gone for used in one.inputs))]
+        releases = [
+            one
+            for one in self.versions
+            if one.record.kind == "release" and id(one) not in gone
+        ]
+        return [
+            *doomed,
+            *(one for one in releases if any(id(used) in gone for used in one.inputs)),
+        ]
 
 
 def _is_of(one: Planted, subject: str) -> bool:
@@ -154,13 +204,24 @@ def _ones(labels: dict[str, list[str]]) -> np.ndarray:
 def _files_of(root: Path, record: Record) -> dict[str, bytes]:
     """Content of everything that belongs to a version."""
     stem = (root / record.path).with_suffix("")
-    files = [path for top in stem.parent.glob(f"{stem.name}.*") for path in [top, *top.rglob("*")] if path.is_file()]
+    files = [
+        path
+        for top in stem.parent.glob(f"{stem.name}.*")
+        for path in [top, *top.rglob("*")]
+        if path.is_file()
+    ]
     files.append(root / f"log/{record.kind}/{record.take}/{record.generation:08d}.json")
-    return {str(path.relative_to(root)): path.read_bytes() for path in files if path.exists()}
+    return {
+        str(path.relative_to(root)): path.read_bytes()
+        for path in files
+        if path.exists()
+    }
 
 
 class _QuickGroup:
-    """A root group without arrays, whose attributes are written directly: zarr takes ten times as long."""
+    """A root group without arrays, whose attributes are written directly: zarr takes
+    ten times as long.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -176,9 +237,15 @@ class _QuickGroup:
 def _quick_commits(monkeypatch):
     def open_group(store, **options):
         is_new = not Path(store.root).exists()
-        return _QuickGroup(Path(store.root)) if is_new else zarr.open_group(store, **options)
+        return (
+            _QuickGroup(Path(store.root))
+            if is_new
+            else zarr.open_group(store, **options)
+        )
 
-    monkeypatch.setattr(stage, "zarr", SimpleNamespace(open_group=open_group, config=zarr.config))
+    monkeypatch.setattr(
+        stage, "zarr", SimpleNamespace(open_group=open_group, config=zarr.config)
+    )
 
 
 @pytest.mark.slow
@@ -222,27 +289,43 @@ def _revisions(db: Database, versions: list[Planted]) -> list[Planted]:
         record = db.record("release", name)
         if record.seal not in by_seal:
             inputs = [by_seal[one["seal"]] for one in record.made_from]
-            found.append(Planted(record, set().union(*(one.takes for one in inputs)), inputs))
+            found.append(
+                Planted(record, set().union(*(one.takes for one in inputs)), inputs)
+            )
     return found
 
 
 def _references(db: Database, subject: str) -> list[str]:
-    """Files and folders with a typed reference to the subject: names of takes, inputs, names, and labels of takes."""
+    """Files and folders with a typed reference to the subject: names of takes, inputs,
+    names, and labels of takes.
+    """
     found = []
     for top in ("log", "data", "heads", "leases"):
         for folder in (db.root / top).glob("*/*"):
-            has_subject = folder.parent.name not in ("population", "release", "calibration")
-            if has_subject and folder.name.removesuffix(".json").partition(".")[0] == subject:
+            has_subject = folder.parent.name not in (
+                "population",
+                "release",
+                "calibration",
+            )
+            if (
+                has_subject
+                and folder.name.removesuffix(".json").partition(".")[0] == subject
+            ):
                 found.append(str(folder))
     for key, content in contents(db.root / "log").items():
         body = json.loads(content)
         takes = [
-            one["take"] for one in body["provenance"]["inputs"] if one["kind"] not in ("population", "calibration")
+            one["take"]
+            for one in body["provenance"]["inputs"]
+            if one["kind"] not in ("population", "calibration")
         ]
         if any(take.partition(".")[0] == subject for take in [*takes, *body["names"]]):
             found.append(key)
     for request in db.requests():
         own = request.take if request.kind == "edit" else ""
-        if subject in {take.partition(".")[0] for take in (own, *request.parameters.get("takes", []))}:
+        if subject in {
+            take.partition(".")[0]
+            for take in (own, *request.parameters.get("takes", []))
+        }:
             found.append(str(request))
     return found

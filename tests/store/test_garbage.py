@@ -56,7 +56,9 @@ def _age(path, seconds):
 def _abandon(db, monkeypatch, *kinds, take="A1"):
     """Leases whose holder was killed."""
     with monkeypatch.context() as patch:
-        patch.setattr(lease_module, "this_process", lambda: this_process() | {"started": "1"})
+        patch.setattr(
+            lease_module, "this_process", lambda: this_process() | {"started": "1"}
+        )
         lease = db.lease(take, *kinds, command="skindb fit")
         lease.__enter__()
         lease._ended.set()
@@ -67,7 +69,11 @@ def _kept(db, **options):
 
 
 def _snapshot(db):
-    return {str(path.relative_to(db.root)): path.read_bytes() for path in db.root.rglob("*") if path.is_file()}
+    return {
+        str(path.relative_to(db.root)): path.read_bytes()
+        for path in db.root.rglob("*")
+        if path.is_file()
+    }
 
 
 def test_garbage__of_a_whole_database_is_nothing(db):
@@ -87,10 +93,14 @@ def test_clean__removes_a_version_without_a_record(db, whole):
     assert db.verify() == []
     (found,) = db.garbage()
     assert (found.key, found.kept) == (path, "")
-    assert found.bytes == sum(len(v) for k, v in _snapshot(db).items() if k not in before)
+    assert found.bytes == sum(
+        len(v) for k, v in _snapshot(db).items() if k not in before
+    )
     assert db.garbage() == [found]  # listing changes nothing
     assert db.clean() == [found]
-    assert {k: v for k, v in _snapshot(db).items() if not k.startswith("leases/")} == before
+    assert {
+        k: v for k, v in _snapshot(db).items() if not k.startswith("leases/")
+    } == before
     assert db.garbage() == []
 
 
@@ -111,7 +121,8 @@ def test_clean__touches_nothing_of_a_take_that_is_worked_on(db, monkeypatch):
     with db.lease("A1", "capture", command="skindb ingest"):
         assert _kept(db)[path].startswith("in use by skindb ingest on")
         assert [one.key for one in db.clean()] == [other]
-        monkeypatch.setattr("skindb.store.garbage.holder_of", lambda *_: "")  # the lease was taken after the listing
+        # the lease was taken after the listing
+        monkeypatch.setattr("skindb.store.garbage.holder_of", lambda *_: "")
         assert db.clean() == []
     assert [one.key for one in db.clean()] == [path]
 
@@ -123,14 +134,21 @@ def test_clean__a_version_that_may_have_lost_its_record_stays(db):
     (db.root / "log/capture/A1/00000002.json").unlink()
     assert _kept(db) == {lost.path: "its log is damaged, see skindb verify"}
     (db.root / "heads/capture/A1.json").unlink()
-    assert _kept(db)[lost.path].startswith("its record may have been lost; remove it by hand")
-    assert "a record of the log must name every version that was written completely" in {f.rule for f in db.verify()}
+    assert _kept(db)[lost.path].startswith(
+        "its record may have been lost; remove it by hand"
+    )
+    assert (
+        "a record of the log must name every version that was written completely"
+        in {f.rule for f in db.verify()}
+    )
     assert db.clean() == []
     assert (db.root / lost.path).exists()
 
 
 def test_clean__keeps_a_whole_version_of_a_take_without_any_record(db):
-    """Its first commit was killed, or its log was lost: this is not damage, but it is not removed automatically."""
+    """Its first commit was killed, or its log was lost: this is not damage, but it is
+    not removed automatically.
+    """
     path = _left(db, "registration", whole=True)
     assert db.verify() == []
     assert "remove it by hand" in _kept(db)[path]
@@ -139,7 +157,9 @@ def test_clean__keeps_a_whole_version_of_a_take_without_any_record(db):
     assert [one.key for one in db.clean()] == [unfinished]
 
 
-def test_verify__the_first_commit_of_a_take_that_was_killed_is_no_damage(db, monkeypatch):
+def test_verify__the_first_commit_of_a_take_that_was_killed_is_no_damage(
+    db, monkeypatch
+):
     _abandon(db, monkeypatch, "model", take="B1")
     path = _left(db, "model", "B1", age=0, whole=True)
     assert db.verify() == []
@@ -165,12 +185,17 @@ def test_clean__keeps_the_scratch_of_an_ingest_for_a_day(db):
         (db.root / "tmp" / name).mkdir(parents=True)
         (db.root / "tmp" / name / "samples").write_bytes(b"12345")
         _age(db.root / "tmp" / name, hours * 3600)
-    assert "kept for 24 h so that the same run can resume" in _kept(db)["tmp/A1-0123456789abcdef"]
+    assert (
+        "kept for 24 h so that the same run can resume"
+        in _kept(db)["tmp/A1-0123456789abcdef"]
+    )
     with db.lease("A1", "capture"):
         assert [one.key for one in db.clean()] == [f"tmp/{HEX}.gone"]
     removed = db.clean()
     assert [(one.key, one.bytes) for one in removed] == [("tmp/A1-123456789abcdef0", 5)]
-    assert [path.name for path in (db.root / "tmp").iterdir()] == ["A1-0123456789abcdef"]
+    assert [path.name for path in (db.root / "tmp").iterdir()] == [
+        "A1-0123456789abcdef"
+    ]
 
 
 def test_clean__ends_the_lease_of_a_killed_run(db, monkeypatch):
@@ -197,7 +222,9 @@ def test_clean__keeps_a_first_pass_until_its_model_is_there(db):
     assert _kept(db)[key] == ""
     _age(db.root / "data/first", 0)
     commit(db.root, kind="model", inputs=[capture], **ABOUT)
-    assert [one.what for one in db.clean()] == ["the first pass of a fit that was committed"]
+    assert [one.what for one in db.clean()] == [
+        "the first pass of a fit that was committed"
+    ]
     assert list(db.root.rglob("first/*")) == []
     assert db.verify() == db.garbage() == []
 
@@ -215,18 +242,30 @@ def test_clean__removes_what_is_left_of_a_first_pass(db):
 
 
 def test_clean__drops_old_generations_that_nothing_names(db):
-    """Captures 1 to 5; model 1 is from capture 2, model 2 from capture 4; a release names capture 3; consents stay."""
+    """Captures 1 to 5; model 1 is from capture 2, model 2 from capture 4; a release
+    names capture 3; consents stay.
+    """
     for value in (3.0, 4.0, 5.0):
         commit(db.root, value)
     commit(db.root, kind="model", inputs=[db.record("capture", "A1", 4).as_input()])
-    commit(db.root, kind=RELEASE, take="paper", inputs=[db.record("capture", "A1", 3).as_input()])
+    commit(
+        db.root,
+        kind=RELEASE,
+        take="paper",
+        inputs=[db.record("capture", "A1", 3).as_input()],
+    )
     commit(db.root, kind=RELEASE, take="paper")
     for scope in (["fit"], []):
         db.record_consent("A1", scope)
     _age(db.root / "data", OLD)
-    old = {f"log/{kind}/A1/0000000{n}.json" for kind, n in (("capture", 1), ("capture", 2), ("model", 1))}
+    old = {
+        f"log/{kind}/A1/0000000{n}.json"
+        for kind, n in (("capture", 1), ("capture", 2), ("model", 1))
+    }
     assert db.garbage(generations=3) == [
-        one for one in db.garbage(generations=3) if one.key.endswith("capture/A1/00000001.json")
+        one
+        for one in db.garbage(generations=3)
+        if one.key.endswith("capture/A1/00000001.json")
     ]
     assert set(_kept(db, generations=1)) == old
     assert db.garbage() == []
@@ -243,19 +282,31 @@ def test_clean__drops_old_generations_that_nothing_names(db):
 
 def test_clean__keeps_what_a_kept_version_was_made_from_at_any_distance(db):
     """A study names model 1, which names capture 2."""
-    commit(db.root, kind="population", take="traits", inputs=[db.record("model", "A1").as_input()])
+    commit(
+        db.root,
+        kind="population",
+        take="traits",
+        inputs=[db.record("model", "A1").as_input()],
+    )
     for value in (3.0, 4.0):
         capture = commit(db.root, value)
     commit(db.root, kind="model", inputs=[capture.as_input()])
     _age(db.root / "data", OLD)
-    assert set(_kept(db, generations=1)) == {"log/capture/A1/00000001.json", "log/capture/A1/00000003.json"}
+    assert set(_kept(db, generations=1)) == {
+        "log/capture/A1/00000001.json",
+        "log/capture/A1/00000003.json",
+    }
 
 
 def test_clean__keeps_an_old_generation_that_is_young_or_in_use(db):
-    assert _kept(db, generations=1)["log/capture/A1/00000001.json"].startswith("written 0 minutes ago")
+    assert _kept(db, generations=1)["log/capture/A1/00000001.json"].startswith(
+        "written 0 minutes ago"
+    )
     _age(db.root / "data", OLD)
     with db.lease("A1", "model", "capture"):
-        assert _kept(db, generations=1)["log/capture/A1/00000001.json"].startswith("in use")
+        assert _kept(db, generations=1)["log/capture/A1/00000001.json"].startswith(
+            "in use"
+        )
         assert db.clean(generations=1) == []
 
 
@@ -287,7 +338,11 @@ def test_commit__of_a_stage_whose_data_were_removed_is_refused(db):
         _age(db.root / stage.path, OLD)
         assert [one.key for one in db.clean()] == [stage.path]
         with pytest.raises(
-            InputError, match="must exist when it is committed; found that another process removed samples, surfels"
+            InputError,
+            match=(
+                "must exist when it is committed; found that another process removed "
+                "samples, surfels"
+            ),
         ):
             stage.commit({})
     assert len(db.history("capture", "A1")) == 2
@@ -295,14 +350,17 @@ def test_commit__of_a_stage_whose_data_were_removed_is_refused(db):
 
 
 def test_clean__killed_between_its_steps_is_continued(db):
-    """There is a tombstone of a record that still exists, and a version whose record is already removed."""
+    """There is a tombstone of a record that still exists, and a version whose record is
+    already removed.
+    """
     _age(db.root / "data", OLD)
     data = shutil.copytree(db.root / "data", db.root.parent / "data")
     record = db.record("capture", "A1", 1)
     log = (db.root / "log/capture/A1/00000001.json").read_bytes()
     db.clean(generations=1)
     (db.root / "log/capture/A1/00000001.json").write_bytes(log)
-    half = [str(fault) for fault in db.verify()]  # its version is removed, as in the middle of a removal
+    # its version is removed, as in the middle of a removal
+    half = [str(fault) for fault in db.verify()]
     line = "its removal must be completed; found both a record and a tombstone; run skindb clean"
     assert half == [f"capture 1 of A1: {line}"]
     assert _kept(db) == {"log/capture/A1/00000001.json": ""}
@@ -312,4 +370,7 @@ def test_clean__killed_between_its_steps_is_continued(db):
     _age(db.root / "data", OLD)
     assert db.verify() == []
     assert [one.key for one in db.clean()] == [record.path]
-    assert json.loads(next((db.root / "tombstones").iterdir()).read_text())["seal"] == record.seal
+    assert (
+        json.loads(next((db.root / "tombstones").iterdir()).read_text())["seal"]
+        == record.seal
+    )

@@ -18,30 +18,58 @@ AREA = "surfels/surfel_area/zarr.json"
 def _nested(depth: int) -> dict:
     codec = {"name": "bytes", "configuration": {"endian": "little"}}
     for _ in range(depth):
-        inner = {"chunk_shape": [1], "codecs": [codec], "index_codecs": [], "index_location": "end"}
+        inner = {
+            "chunk_shape": [1],
+            "codecs": [codec],
+            "index_codecs": [],
+            "index_location": "end",
+        }
         codec = {"name": "sharding_indexed", "configuration": inner}
     return codec
 
 
 HOSTILE = {
-    "absurd shape": ({"shape": [10**12]}, "a shape .* with .* chunks, but 1 chunk files"),
+    "absurd shape": (
+        {"shape": [10**12]},
+        "a shape .* with .* chunks, but 1 chunk files",
+    ),
     "absurd number of dims": ({"shape": [1] * 30}, r"a shape .* with chunks \[10\]"),
-    "absurd chunk": ({"chunk_grid": {"name": "regular", "configuration": {"chunk_shape": [2**40]}}}, "chunks of 4.4e"),
-    "shape and chunk": (
-        {"shape": [2**40], "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": [2**40]}}},
+    "absurd chunk": (
+        {"chunk_grid": {"name": "regular", "configuration": {"chunk_shape": [2**40]}}},
         "chunks of 4.4e",
     ),
-    "negative shape": ({"shape": [-5]}, "a shape must be a list of non-negative integers"),
+    "shape and chunk": (
+        {
+            "shape": [2**40],
+            "chunk_grid": {
+                "name": "regular",
+                "configuration": {"chunk_shape": [2**40]},
+            },
+        },
+        "chunks of 4.4e",
+    ),
+    "negative shape": (
+        {"shape": [-5]},
+        "a shape must be a list of non-negative integers",
+    ),
     "empty chunk": (
         {"chunk_grid": {"name": "regular", "configuration": {"chunk_shape": [0]}}},
         r"a shape .* with chunks \[0\]",
     ),
     "huge elements": (
-        {"data_type": {"name": "fixed_length_utf32", "configuration": {"length_bytes": 2**40}}},
+        {
+            "data_type": {
+                "name": "fixed_length_utf32",
+                "configuration": {"length_bytes": 2**40},
+            }
+        },
         "elements of the type .*fixed_length_utf32",
     ),
     "nested shards": ({"codecs": [_nested(5)]}, "more codecs than skindb writes"),
-    "shards nested deeply": ({"codecs": [_nested(60)]}, "levels of nested brackets|more codecs"),
+    "shards nested deeply": (
+        {"codecs": [_nested(60)]},
+        "levels of nested brackets|more codecs",
+    ),
     "no codecs": ({"codecs": "none"}, "invalid metadata"),
 }
 
@@ -56,18 +84,27 @@ def _commit_hostile(root, change: dict, take: str = "A1") -> None:
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-def test_read__metadata_that_promise_too_much_are_refused_before_allocation(tmp_path, name):
+def test_read__metadata_that_promise_too_much_are_refused_before_allocation(
+    tmp_path, name
+):
     change, found = HOSTILE[name]
     _commit_hostile(tmp_path, change)
     commit(tmp_path, 2.0, take="B2")
     db = Database(tmp_path)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    with pytest.raises(InputError, match=rf"surfel_area/zarr.json: the metadata of an array must .* found .*{found}"):
+    with pytest.raises(
+        InputError,
+        match=rf"surfel_area/zarr.json: the metadata of an array must .* found .*{found}",
+    ):
         db.read("capture", "A1").load()
     faults = [str(fault) for fault in db.verify()]
     assert len(faults) == 1
-    assert "surfel_area/zarr.json: the metadata of an array must match its files" in faults[0]
-    assert float(db.read("capture", "B2")["surfels/surfel_area"][3]) == 2.0  # the rest stays readable
+    assert (
+        "surfel_area/zarr.json: the metadata of an array must match its files"
+        in faults[0]
+    )
+    # the rest stays readable
+    assert float(db.read("capture", "B2")["surfels/surfel_area"][3]) == 2.0
     assert list(db.table().index) == ["A1", "B2"]
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 500_000  # kB
 
@@ -76,12 +113,18 @@ def test_metadata_faults__none_in_what_skindb_writes(tmp_path):
     record = commit(tmp_path)
     files = json.loads((tmp_path / record.beside("manifest")).read_text())
     for name in [name for name in files if name.endswith("zarr.json")]:
-        chunks = sum(one.startswith(name.removesuffix("zarr.json") + "c") for one in files)
-        assert metadata_faults((tmp_path / record.path / name).read_bytes(), chunks) == ""
+        chunks = sum(
+            one.startswith(name.removesuffix("zarr.json") + "c") for one in files
+        )
+        assert (
+            metadata_faults((tmp_path / record.path / name).read_bytes(), chunks) == ""
+        )
 
 
 @pytest.mark.parametrize("years", [-1, 1])
-def test_commit__a_clock_that_jumps_by_a_year_changes_no_order(tmp_path, monkeypatch, years):
+def test_commit__a_clock_that_jumps_by_a_year_changes_no_order(
+    tmp_path, monkeypatch, years
+):
     import skindb.store.stage as module
 
     commit(tmp_path, 1.0)
@@ -107,7 +150,9 @@ def test_read__a_record_of_a_later_schema_hides_nothing_else(tmp_path):
     commit(tmp_path, schema_version=99)
     commit(tmp_path, 2.0, take="B2")
     db = Database(tmp_path)
-    with pytest.raises(InputError, match="written by a later version of skindb; update skindb"):
+    with pytest.raises(
+        InputError, match="written by a later version of skindb; update skindb"
+    ):
         db.read("capture", "A1")
     assert len(db.verify()) == 1
     assert float(db.read("capture", "B2")["surfels/surfel_area"][3]) == 2.0

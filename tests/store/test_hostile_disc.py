@@ -28,9 +28,13 @@ APART = ["unshare", "--mount", "--map-root-user"]
 TRIED = "mount -t tmpfs -o size=64k tmpfs /mnt"
 HAS_MOUNTS = (
     shutil.which("unshare") is not None
-    and not subprocess.run([*APART, "sh", "-c", TRIED], check=False, capture_output=True).returncode
+    and not subprocess.run(
+        [*APART, "sh", "-c", TRIED], check=False, capture_output=True
+    ).returncode
 )
-needs_mounts = pytest.mark.skipif(not HAS_MOUNTS, reason="needs user namespaces of Linux with mounts of their own")
+needs_mounts = pytest.mark.skipif(
+    not HAS_MOUNTS, reason="needs user namespaces of Linux with mounts of their own"
+)
 YEAR = 365 * 86400.0
 
 
@@ -56,7 +60,14 @@ def _writing(place, captures, name):
     """Every command that writes, with the least number of bytes that it writes."""
     db = str(place / "db")
     return [
-        ("ingest", db, str(captures / "V001.lotion"), "--spacing", "6", "--no-progress"),
+        (
+            "ingest",
+            db,
+            str(captures / "V001.lotion"),
+            "--spacing",
+            "6",
+            "--no-progress",
+        ),
         ("fit", db, "V001.lotion", "--no-progress"),
         ("consent", db, "V001", "--scope", "fit,statistics"),
         ("release", db, name),
@@ -79,9 +90,20 @@ def _reading(place):
 
 def _apart(place, mount, steps):
     """Output of `hostile_disc.py` for the steps."""
-    program = [sys.executable, str(Path(__file__).with_name("hostile_disc.py")), str(place), mount]
+    program = [
+        sys.executable,
+        str(Path(__file__).with_name("hostile_disc.py")),
+        str(place),
+        mount,
+    ]
     env = os.environ | {"PYTHONPATH": str(Path(skindb.__file__).parents[1])}
-    done = subprocess.run([*APART, *program], input=json.dumps(steps), capture_output=True, text=True, env=env)
+    done = subprocess.run(
+        [*APART, *program],
+        input=json.dumps(steps),
+        capture_output=True,
+        text=True,
+        env=env,
+    )
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout.splitlines()[-1])
 
@@ -109,7 +131,9 @@ def test_full_disk__is_one_line_of_every_command_and_harms_nothing(made, tmp_pat
             tries.append((left, command[0]))
         steps += [["read"], ["free"]]
     again = [*_writing(place, made / "c", "free"), ("verify", str(place / "db"))]
-    told = _apart(place, mount, [*steps, *(["run", command] for command in again), ["read"]])
+    told = _apart(
+        place, mount, [*steps, *(["run", command] for command in again), ["read"]]
+    )
     ended = iter(told)
     for left, name in tries:
         code, _, stderr = next(ended)
@@ -117,7 +141,11 @@ def test_full_disk__is_one_line_of_every_command_and_harms_nothing(made, tmp_pat
             cure = "free some space there, then run the command again"
             _one_line(code, stderr, "No space left on device", cure, place)
         code, stdout, stderr = next(ended)
-        assert (code, stdout.splitlines()[0]) == (0, "Every version is intact."), (name, left, stderr)
+        assert (code, stdout.splitlines()[0]) == (0, "Every version is intact."), (
+            name,
+            left,
+            stderr,
+        )
         if name == "release":
             assert next(ended)["takes"] == ["V001", "V001.lotion"]
     assert [one[0] for one in (next(ended) for _ in again)] == [0] * len(again)
@@ -130,10 +158,19 @@ def test_full_disk__a_withdrawal_needs_no_space(made, tmp_path):
     place.mkdir()
     mount = f"mount -t tmpfs -o size=24m tmpfs {place} && cp -a {made / 'db'} {place}"
     db = str(place / "db")
-    steps = [["leave", 0], *(["run", command] for command in (("withdraw", db, "V001", "--yes"), ("verify", db)))]
+    steps = [
+        ["leave", 0],
+        *(
+            ["run", command]
+            for command in (("withdraw", db, "V001", "--yes"), ("verify", db))
+        ),
+    ]
     (code, stdout, stderr), verified = _apart(place, mount, [*steps, ["free"]])
     assert (code, stderr) == (0, "")
-    assert stdout.splitlines()[-1] == "removed versions: 2 of kind capture, 1 of kind model"
+    assert (
+        stdout.splitlines()[-1]
+        == "removed versions: 2 of kind capture, 1 of kind model"
+    )
     assert verified == [0, "Every version is intact.\n", ""]
 
 
@@ -158,7 +195,9 @@ def test_read_only_folder__reads_everything_and_refuses_to_write_in_one_line(mad
 
 @pytest.fixture
 def clock(monkeypatch):
-    """A function that sets the clock of this machine by so many seconds, as skindb reads it; files keep theirs."""
+    """A function that sets the clock of this machine by so many seconds, as skindb
+    reads it; files keep theirs.
+    """
     real = datetime_module.datetime
     now = time.time
 
@@ -171,7 +210,9 @@ def clock(monkeypatch):
         monkeypatch.setattr(time, "time", lambda: now() + seconds)
         monkeypatch.setattr(time, "time_ns", lambda: int((now() + seconds) * 1e9))
         for name, module in list(sys.modules.items()):
-            if name.startswith("skindb.") and issubclass(getattr(module, "datetime", int), real):
+            if name.startswith("skindb.") and issubclass(
+                getattr(module, "datetime", int), real
+            ):
                 monkeypatch.setattr(module, "datetime", Shifted)
 
     return set_by
@@ -184,7 +225,8 @@ def test_commands__by_a_clock_that_is_a_year_back(made, tmp_path, clock):
     clock(-YEAR)
     for command in _writing(tmp_path, made / "c", "back"):
         _done(*command)
-    assert db.record("capture", "V001.lotion").created < before.created  # so the clock of the commands was set
+    # so the clock of the commands was set
+    assert db.record("capture", "V001.lotion").created < before.created
     assert db.record("capture", "V001.lotion").generation == 2
     assert db.record("model", "V001.lotion").made_from[0]["generation"] == 2
     assert db.consent("V001") == ["fit", "statistics"]
@@ -197,16 +239,23 @@ def test_commands__by_a_clock_that_is_a_year_back(made, tmp_path, clock):
         assert list(db.cohort("tables").take.values) == ["V001", "V001.lotion"]
         assert [one.kept for one in db.garbage()] == []
     _done("consent", tmp_path / "db", "V001", "--scope", "fit")
-    assert db.consent("V001") == ["fit"]  # the newest by its generation, whatever its date
+    # the newest by its generation, whatever its date
+    assert db.consent("V001") == ["fit"]
 
 
 @pytest.mark.parametrize("hours", [-1, 1])
-def test_lease__of_a_machine_whose_clock_is_an_hour_off(tmp_path, clock, monkeypatch, hours):
+def test_lease__of_a_machine_whose_clock_is_an_hour_off(
+    tmp_path, clock, monkeypatch, hours
+):
     """That machine holds a lease and has left a version; files have the time of the storage."""
     db = skindb.open(str(tmp_path / "db"))
     commit(db.root)
     with monkeypatch.context() as other:
-        other.setattr(lease_module, "this_process", lambda: this_process() | {"host": "other", "boot": "another"})
+        other.setattr(
+            lease_module,
+            "this_process",
+            lambda: this_process() | {"host": "other", "boot": "another"},
+        )
         clock(3600.0 * hours)
         lease = db.lease("A1", "capture")
         lease.__enter__()
@@ -243,7 +292,9 @@ def test_commit__of_two_machines_an_hour_apart_is_in_order(tmp_path, clock):
 
 
 @pytest.mark.parametrize("call", ["write", "fsync", "link"])
-def test_commit__that_the_disk_refuses_leaves_the_version_before_it(tmp_path, monkeypatch, call):
+def test_commit__that_the_disk_refuses_leaves_the_version_before_it(
+    tmp_path, monkeypatch, call
+):
     commit(tmp_path / "db", 1.0)
 
     def refuse(*_, **__):
@@ -267,23 +318,49 @@ def test_full_disk__a_backup_and_a_restore_end_in_one_line_and_continue(made, tm
     place = tmp_path / "full"
     place.mkdir()
     mount = f"mount -t tmpfs -o size=24m tmpfs {place}"
-    db, backup, copy = (str(one) for one in (made / "db", place / "backup", place / "copy"))
-    commands = [("backup", db, backup), ("restore", backup, copy, "--markers", f"{db}.markers")]
+    db, backup, copy = (
+        str(one) for one in (made / "db", place / "backup", place / "copy")
+    )
+    commands = [
+        ("backup", db, backup),
+        ("restore", backup, copy, "--markers", f"{db}.markers"),
+    ]
     steps = []
     checked = []
     for command in commands:
         for left in (0, 48_000, 400_000):
-            steps += [["leave", left], ["run", command], ["run", ("info", copy)], ["free"]]
+            steps += [
+                ["leave", left],
+                ["run", command],
+                ["run", ("info", copy)],
+                ["free"],
+            ]
         steps += [["run", command]]
         checked += [(command[0], left) for left in (0, 48_000, 400_000, None)]
-    told = iter(_apart(place, mount, [*steps, ["run", ("verify", copy)], ["run", (*commands[0], "--verify")]]))
+    told = iter(
+        _apart(
+            place,
+            mount,
+            [*steps, ["run", ("verify", copy)], ["run", (*commands[0], "--verify")]],
+        )
+    )
     for name, left in checked:
         code, _, stderr = next(told)
         if left is None:
             assert (code, stderr) == (0, ""), name
             continue
-        _one_line(code, stderr, "No space left on device", "free some space there, then run the command again", place)
-        code, stdout, stderr = next(told)  # the copy is never taken for a database with takes
-        assert (code, len(stderr.splitlines())) == (1, 1) or stdout == "The database holds no takes.\n"
+        _one_line(
+            code,
+            stderr,
+            "No space left on device",
+            "free some space there, then run the command again",
+            place,
+        )
+        # the copy is never taken for a database with takes
+        code, stdout, stderr = next(told)
+        assert (code, len(stderr.splitlines())) == (
+            1,
+            1,
+        ) or stdout == "The database holds no takes.\n"
     assert next(told) == [0, "Every version is intact.\n", ""]
     assert next(told)[0] == 0

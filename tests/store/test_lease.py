@@ -1,4 +1,6 @@
-"""Leases: one run at a time, free when the holder has ended, and no commit after another run took over."""
+"""Leases: one run at a time, free when the holder has ended, and no commit after
+another run took over.
+"""
 
 from __future__ import annotations
 
@@ -59,7 +61,10 @@ def _abandon(db, **options):
 
 def test_lease__refuses_a_second_run_and_names_the_holder(db):
     with _hold(db, command="skindb fit"):
-        said = rf"model of A1: only one run at a time .*; found skindb fit on \S+ \(process {os.getpid()}\) since 2"
+        said = (
+            r"model of A1: only one run at a time .*; found skindb fit on \S+ "
+            rf"\(process {os.getpid()}\) since 2"
+        )
         with pytest.raises(InputError, match=said) as error, _hold(db):
             pass
         assert len(error.value.faults) == 1
@@ -76,13 +81,18 @@ def test_lease__can_be_taken_again(db):
         with lease:
             lease.require()
             assert [file.name for file in _files(db)] == [f"0000000{number}.json"]
-    with pytest.raises(ValueError, match="must be above 0 and at most 3600; found 7200"):
+    with pytest.raises(
+        ValueError, match="must be above 0 and at most 3600; found 7200"
+    ):
         _hold(db, 7200)
 
 
 def test_lease__of_several_kinds_is_all_or_nothing(db):
     with _hold(db):
-        with pytest.raises(InputError, match="model of A1"), db.lease("A1", "capture", "model"):
+        with (
+            pytest.raises(InputError, match="model of A1"),
+            db.lease("A1", "capture", "model"),
+        ):
             pass
         with db.lease("A1", "capture"):
             pass
@@ -109,7 +119,11 @@ def test_lease__waits_for_the_other_run(db):
 
 def test_lease__waits_no_longer_than_it_may(db):
     clock = SimulatedClock()
-    with _hold(db), pytest.raises(InputError, match="one run at a time"), _waiting(db, 1.3, clock):
+    with (
+        _hold(db),
+        pytest.raises(InputError, match="one run at a time"),
+        _waiting(db, 1.3, clock),
+    ):
         pass
     assert clock.monotonic() == pytest.approx(1.3)
 
@@ -117,7 +131,14 @@ def test_lease__waits_no_longer_than_it_may(db):
 def test_lease__does_not_name_a_holder_that_has_finished(db):
     with _hold(db, command="skindb fit"):
         body = json.loads(_files(db)[0].read_text())
-        assert set(body["holder"]) == {"host", "process", "started", "boot", "namespace", "command"}
+        assert set(body["holder"]) == {
+            "host",
+            "process",
+            "started",
+            "boot",
+            "namespace",
+            "command",
+        }
     (left,) = _files(db)
     assert list(json.loads(left.read_text())) == ["released"]
 
@@ -179,14 +200,16 @@ def test_lease__of_another_machine_ends_by_the_clock_of_the_storage(db, monkeypa
     with pytest.raises(InputError, match="on other"), _hold(db):
         pass
     _age(file, LEASE_SECONDS + 1)
-    monkeypatch.setattr(time, "time", lambda: 0.0)  # the clock of this machine does not matter
+    # the clock of this machine does not matter
+    monkeypatch.setattr(time, "time", lambda: 0.0)
     with _hold(db) as own:
         own.require()
         with pytest.raises(ValueError, match="inside its with statement"):
             _hold(db).require()
         lost._ended.clear()
         with pytest.raises(
-            LeaseLost, match="another run took over, because this one did not renew its lease: python on"
+            LeaseLost,
+            match="another run took over, because this one did not renew its lease: python on",
         ):
             lost.require()
 
@@ -198,21 +221,35 @@ def test_lease__from_the_future_ends_when_it_was_seen_unchanged(db, monkeypatch)
     _age(_files(db)[0], -3e7)
     clock = SimulatedClock()
     monkeypatch.setattr(lease_module, "_uptime", clock.monotonic)
-    with pytest.raises(InputError, match="one run at a time"), _waiting(db, LEASE_SECONDS - 1, clock):
+    with (
+        pytest.raises(InputError, match="one run at a time"),
+        _waiting(db, LEASE_SECONDS - 1, clock),
+    ):
         pass
     began = clock.monotonic()
     with _waiting(db, 2 * LEASE_SECONDS, clock) as lease:
         lease.require()
-    assert clock.monotonic() - began == pytest.approx(LEASE_SECONDS, abs=2 * POLL_SECONDS)
+    assert clock.monotonic() - began == pytest.approx(
+        LEASE_SECONDS, abs=2 * POLL_SECONDS
+    )
 
 
 def test_lease__that_is_damaged_ends_like_any_other(db):
     _abandon(db)
     (file,) = _files(db)
     file.write_text("{")
-    with pytest.raises(InputError, match="found a lease that cannot be read"), _hold(db):
+    with (
+        pytest.raises(InputError, match="found a lease that cannot be read"),
+        _hold(db),
+    ):
         pass
-    for body in ({"seconds": 1e9}, {"seconds": True}, {"seconds": "1"}, {"holder": 7}, {"holder": {"process": "x"}}):
+    for body in (
+        {"seconds": 1e9},
+        {"seconds": True},
+        {"seconds": "1"},
+        {"holder": 7},
+        {"holder": {"process": "x"}},
+    ):
         file.write_text(json.dumps(body))
         _age(file, LEASE_SECONDS + 1)
         assert lease_module.holder_of(db._place, "model", "A1") == ""
@@ -228,26 +265,41 @@ from skindb.store import Database
 db = Database({str(db.root)!r})
 {code}
 """
-    env = os.environ | {"PYTHONPATH": f"{Path(lease_module.__file__).parents[2]}:{Path(__file__).parent}"}
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    env = os.environ | {
+        "PYTHONPATH": f"{Path(lease_module.__file__).parents[2]}:{Path(__file__).parent}"
+    }
+    pipes = {
+        "stdin": subprocess.PIPE,
+        "stdout": subprocess.PIPE,
+        "stderr": subprocess.PIPE,
+        "text": True,
+    }
     child = subprocess.Popen([sys.executable, "-c", program], env=env, **pipes)
     assert child.stdout.readline() == "holds it\n", child.stderr.read()
     return child
 
 
 def test_lease__of_a_killed_process_of_this_machine_is_free_at_once(db):
-    child = _child(db, "with db.lease('A1', 'model'): print('holds it', flush=True); sys.stdin.read()")
+    child = _child(
+        db,
+        "with db.lease('A1', 'model'): print('holds it', flush=True); sys.stdin.read()",
+    )
     with pytest.raises(InputError, match=rf"process {child.pid}"), _hold(db):
         pass
     child.kill()
-    os.waitid(os.P_PID, child.pid, os.WEXITED | os.WNOWAIT)  # it has ended, and is still in the table of processes
+    # it has ended, and is still in the table of processes
+    os.waitid(os.P_PID, child.pid, os.WEXITED | os.WNOWAIT)
     with _hold(db):
         child.communicate()
     assert [file.name for file in _files(db)] == ["00000002.json"]
 
 
-def test_lease__another_process_with_the_number_of_a_dead_one_is_another(db, monkeypatch):
-    monkeypatch.setattr(lease_module, "this_process", lambda: this_process() | {"started": "1"})
+def test_lease__another_process_with_the_number_of_a_dead_one_is_another(
+    db, monkeypatch
+):
+    monkeypatch.setattr(
+        lease_module, "this_process", lambda: this_process() | {"started": "1"}
+    )
     _abandon(db)
     with _hold(db):
         pass
@@ -275,14 +327,17 @@ def test_commit__of_a_process_that_slept_beyond_its_lease_is_refused(db, monkeyp
         _, said = child.communicate("commit\n")
         assert child.returncode == 1
         assert said.splitlines()[-1].startswith(
-            "skindb.store.lease.LeaseLost: model of A1: only one run at a time may work on it; found ano"
+            "skindb.store.lease.LeaseLost: model of A1: only one run at a time may "
+            "work on it; found ano"
         )
         assert not db.has("model", "A1")
         with db.stage("model", "A1", lease) as stage:
             stage.write(groups(1.0))
             stage.commit({})
     assert float(db.read("model", "A1")["surfels/surfel_area"][0]) == 1.0
-    assert [one.suffix for one in (db.root / "data/model/A1").iterdir()].count(".zarr") == 1
+    assert [one.suffix for one in (db.root / "data/model/A1").iterdir()].count(
+        ".zarr"
+    ) == 1
 
 
 def test_commit__of_a_process_that_slept_while_nobody_asked_is_kept(db):
@@ -298,7 +353,10 @@ def _race(root, takes, count):
     db = Database(root)
     for number in range(count):
         take = takes[number % len(takes)]
-        with db.lease(take, "capture", wait=120) as lease, db.stage("capture", take, lease) as stage:
+        with (
+            db.lease(take, "capture", wait=120) as lease,
+            db.stage("capture", take, lease) as stage,
+        ):
             stage.write(groups(float(stage.base + 1), 1))
             stage.commit({})
 
@@ -309,7 +367,9 @@ def test_lease__racing_writers_lose_nothing_and_conflict_never(db, takes, monkey
     """Without leases, four writers of one take make each other fail."""
     monkeypatch.setattr(lease_module, "POLL_SECONDS", 0.01)  # inherited by the writers
     writers = multiprocessing.get_context("fork")
-    processes = [writers.Process(target=_race, args=(db.root, takes, 4)) for _ in range(4)]
+    processes = [
+        writers.Process(target=_race, args=(db.root, takes, 4)) for _ in range(4)
+    ]
     for process in processes:
         process.start()
     for process in processes:
@@ -317,5 +377,8 @@ def test_lease__racing_writers_lose_nothing_and_conflict_never(db, takes, monkey
     assert [process.exitcode for process in processes] == [0] * 4
     assert sum(len(db.history("capture", take)) for take in takes) == 16
     for take in takes:
-        areas = [db.read("capture", take, generation=n)["surfels/surfel_area"].values[0] for n in (1, 4)]
+        areas = [
+            db.read("capture", take, generation=n)["surfels/surfel_area"].values[0]
+            for n in (1, 4)
+        ]
         assert areas == [1.0, 4.0]

@@ -42,16 +42,29 @@ def test_record__is_sealed_and_carries_the_seal_before_it(db):
     bodies = [json.loads(_record(db, g).read_text()) for g in (1, 2, 3)]
     for body in bodies:
         seal = body.pop("seal")
-        assert seal == hashlib.sha256(json.dumps(body, sort_keys=True).encode()).hexdigest()
+        assert (
+            seal
+            == hashlib.sha256(json.dumps(body, sort_keys=True).encode()).hexdigest()
+        )
         body["seal"] = seal
-    assert [body["previous"] for body in bodies] == ["", bodies[0]["seal"], bodies[1]["seal"]]
+    assert [body["previous"] for body in bodies] == [
+        "",
+        bodies[0]["seal"],
+        bodies[1]["seal"],
+    ]
     assert all(body["format"] == 3 for body in bodies)
-    assert max(_record(db, g).stat().st_size for g in (1, 2, 3)) < 3000  # digests of files are in the manifest
+    # digests of files are in the manifest
+    assert max(_record(db, g).stat().st_size for g in (1, 2, 3)) < 3000
 
 
 def test_record__describes_the_contents_of_the_version(db):
     contents = db.record("capture", "A1").contents
-    assert contents["samples"]["sizes"] == {"surfel": 10, "light": 3, "camera": 2, "channel": 3}
+    assert contents["samples"]["sizes"] == {
+        "surfel": 10,
+        "light": 3,
+        "camera": 2,
+        "channel": 3,
+    }
     assert contents["samples"]["labels"]["light"] == ["l0", "l1", "l2"]
     assert contents["surfels"]["variables"] == ["surfel_area"]
 
@@ -62,7 +75,12 @@ def test_log__a_removed_record_leaves_a_tombstone_and_a_whole_chain(db):
     assert db.verify() == []
     assert [r.generation for r in db.history("capture", "A1")] == [1, 3]
     (stone,) = (db.root / "tombstones").iterdir()
-    assert json.loads(stone.read_text()).keys() == {"format", "seal", "previous", "removed"}
+    assert json.loads(stone.read_text()).keys() == {
+        "format",
+        "seal",
+        "previous",
+        "removed",
+    }
     assert json.loads(stone.read_text())["seal"] == seal
     assert "A1" not in stone.read_text() + stone.name
     assert commit(db.root, 4.0).generation == 4
@@ -98,7 +116,10 @@ def test_verify__a_record_of_another_history(db, tmp_path):
     shutil.copytree(other / record.path, db.root / record.path)
     for what in ("manifest",):
         shutil.copy(other / record.beside(what), db.root / record.beside(what))
-    assert any("a record that names a different predecessor" in str(fault) for fault in db.verify())
+    assert any(
+        "a record that names a different predecessor" in str(fault)
+        for fault in db.verify()
+    )
 
 
 def test_read__a_record_copied_over_that_of_another_take_is_refused(db):
@@ -143,7 +164,9 @@ def test_read__an_edited_record_is_refused_even_if_its_seal_fits(db, changes):
 def test_head__is_a_cache_that_may_be_missing_or_behind(db):
     head = db.root / "heads/capture/A1.json"
     assert json.loads(head.read_text())["generation"] == 3
-    head.write_text(json.dumps({"generation": 2, "seal": db.record("capture", "A1", 2).seal}))
+    head.write_text(
+        json.dumps({"generation": 2, "seal": db.record("capture", "A1", 2).seal})
+    )
     assert db.verify() == []
     for content in ("{", "[]", "null", '{"generation": "7"}', "\x00"):
         head.write_text(content)
@@ -156,10 +179,16 @@ def test_head__is_a_cache_that_may_be_missing_or_behind(db):
 
 
 def test_source__a_replaced_version_is_not_taken_for_the_one_used(db, monkeypatch):
-    monkeypatch.setattr("skindb.store.stage.require_inputs", lambda *_: None)  # no commit would accept this
+    # no commit would accept this
+    monkeypatch.setattr("skindb.store.stage.require_inputs", lambda *_: None)
     with db.stage("model", "A1") as stage:
         stage.write({})
-        stage.commit({"take": "A1", "inputs": [db.record("capture", "A1").as_input() | {"seal": "another"}]})
+        stage.commit(
+            {
+                "take": "A1",
+                "inputs": [db.record("capture", "A1").as_input() | {"seal": "another"}],
+            }
+        )
     with pytest.raises(InputError, match="the capture it was made from must exist"):
         db.source(db.read("model", "A1"))
 

@@ -35,11 +35,16 @@ def test_marker_file__notes_withdrawals_readmissions_and_consents(db):
     db.record_consent(SUBJECT, ["fit"])
     db.record_consent("B", [])
     db.record_consent("B", ["fit", "export"])
-    assert sorted(one["consent"] for one in _notes(db).consents.values()) == [["fit"], ["fit", "export"]]
+    assert sorted(one["consent"] for one in _notes(db).consents.values()) == [
+        ["fit"],
+        ["fit", "export"],
+    ]
     db.erase(SUBJECT)
     notes = _notes(db)
     assert [one["consent"] for one in notes.consents.values()] == [["fit", "export"]]
-    assert [*notes.entries] == [f"withdrawn/{name}" for name in db._place.sizes("withdrawn")]
+    assert [*notes.entries] == [
+        f"withdrawn/{name}" for name in db._place.sizes("withdrawn")
+    ]
     db.readmit(SUBJECT, db.withdrawal(SUBJECT).date)
     assert len(_notes(db).entries) == 2
     file = db._place.marker_file()
@@ -77,26 +82,35 @@ def test_marker_file__continues_after_a_line_that_was_cut_off(db):
 
 
 def test_marker_file__that_cannot_be_written_is_a_warning(db, tmp_path, monkeypatch):
-    rule = "withdrawals and consents must be noted outside the database, so that a restore repeats them"
+    rule = (
+        "withdrawals and consents must be noted outside the database, so that a "
+        "restore repeats them"
+    )
     db._place.marker_file().mkdir()
     with pytest.warns(MarkerFileWarning, match=rule):
         db.record_consent("B", ["fit"])
     assert db.consent("B") == ["fit"]
     db._place.marker_file().rmdir()
     os.mkfifo(db._place.marker_file())
-    with pytest.warns(MarkerFileWarning, match="found something that is not a regular file"):
+    with pytest.warns(
+        MarkerFileWarning, match="found something that is not a regular file"
+    ):
         db.erase(SUBJECT)
     assert db.takes() == ["B"]
     db._place.marker_file().unlink()
     monkeypatch.setattr(os, "pwrite", lambda *_: 0)
-    with pytest.warns(MarkerFileWarning, match="found No space left on device; free some space there"):
+    with pytest.warns(
+        MarkerFileWarning, match="found No space left on device; free some space there"
+    ):
         db.complete_erasures()
     monkeypatch.undo()
     db.complete_erasures()
     assert len(_notes(db).entries) == 1
 
 
-def test_marker_file__is_unlocked_although_a_copy_of_its_descriptor_is_open(db, monkeypatch):
+def test_marker_file__is_unlocked_although_a_copy_of_its_descriptor_is_open(
+    db, monkeypatch
+):
     """Such as that of a process that was forked meanwhile."""
     copies = []
     monkeypatch.setattr(os, "fsync", lambda number: copies.append(os.dup(number)))
@@ -113,7 +127,10 @@ def test_marker_file__of_another_database_is_kept(db, tmp_path):
     other.erase("A1")
     content = other._place.marker_file().read_bytes()
     shutil.copy(other._place.marker_file(), db._place.marker_file())
-    with pytest.warns(MarkerFileWarning, match=r"found a line that is damaged, or of another database; give the right"):
+    with pytest.warns(
+        MarkerFileWarning,
+        match=r"found a line that is damaged, or of another database; give the right",
+    ):
         db.erase(SUBJECT)
     assert db._place.marker_file().read_bytes() == content
 

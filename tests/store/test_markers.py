@@ -12,7 +12,13 @@ from stored import commit
 from skindb.errors import InputError
 from skindb.store import Database, markers
 from skindb.store.folder import Folder
-from skindb.store.markers import last_entry, mark_withdrawn, read_markers, readmit, subject_hash
+from skindb.store.markers import (
+    last_entry,
+    mark_withdrawn,
+    read_markers,
+    readmit,
+    subject_hash,
+)
 
 WITHDRAWN_AT = datetime(2026, 3, 10, 12, tzinfo=UTC)
 
@@ -46,7 +52,11 @@ def place(tmp_path, monkeypatch):
 def test_subject_hash__depends_on_the_secret_and_the_whole_pseudonym(tmp_path):
     one = Folder(tmp_path / "one")
     other = Folder(tmp_path / "other")
-    hashes = [subject_hash(place, name) for place in (one, other) for name in ("S01", "S0", "1")]
+    hashes = [
+        subject_hash(place, name)
+        for place in (one, other)
+        for name in ("S01", "S0", "1")
+    ]
     assert len(set(hashes)) == 6
     assert subject_hash(one, "S01") == hashes[0]
     assert all(len(text) == 64 for text in hashes)
@@ -54,7 +64,11 @@ def test_subject_hash__depends_on_the_secret_and_the_whole_pseudonym(tmp_path):
 
 def test_secret__is_created_once_by_racing_writers(tmp_path):
     with ThreadPoolExecutor(8) as threads:
-        hashes = list(threads.map(lambda _: subject_hash(Folder(tmp_path / "db"), "S01"), range(32)))
+        hashes = list(
+            threads.map(
+                lambda _: subject_hash(Folder(tmp_path / "db"), "S01"), range(32)
+            )
+        )
     assert len(set(hashes)) == 1
 
 
@@ -84,13 +98,18 @@ def test_readmit__alternates_with_withdrawals(place):
     assert last_entry(place, "S01").date == date(2026, 3, 20)
     readmit(place, "S01", date(2026, 3, 20))  # the run that was interrupted after this
     assert last_entry(place, "S01").number == 2
-    with pytest.raises(InputError, match="S01: a subject is admitted again once; found the new consent of 2026-03-20"):
+    with pytest.raises(
+        InputError,
+        match="S01: a subject is admitted again once; found the new consent of 2026-03-20",
+    ):
         readmit(place, "S01", date(2026, 3, 21))
     mark_withdrawn(place, "S01", {})
     assert read_markers(place).admission("S01") == 3
 
 
-def test_readmit__of_two_processes_the_second_finds_the_date_of_the_first(place, monkeypatch):
+def test_readmit__of_two_processes_the_second_finds_the_date_of_the_first(
+    place, monkeypatch
+):
     create = Folder.create
 
     def slower(self, key, data, **options):
@@ -107,7 +126,8 @@ def test_readmit__of_two_processes_the_second_finds_the_date_of_the_first(place,
 @pytest.mark.parametrize("day", [date(2026, 3, 8), date(2026, 4, 3)])
 def test_readmit__needs_a_date_between_the_withdrawal_and_today(place, day):
     line = (
-        f"S01: a new consent must be given after the withdrawal of the subject.*; found {day}, and a withdrawal on 2026"
+        "S01: a new consent must be given after the withdrawal of the subject.*; "
+        f"found {day}, and a withdrawal on 2026"
     )
     with pytest.raises(InputError, match=line):
         readmit(place, "S01", day)
@@ -115,7 +135,9 @@ def test_readmit__needs_a_date_between_the_withdrawal_and_today(place, day):
 
 
 def test_readmit__is_only_for_subjects_that_were_withdrawn(place):
-    with pytest.raises(InputError, match="S02: a new consent is only for a subject who was withdrawn"):
+    with pytest.raises(
+        InputError, match="S02: a new consent is only for a subject who was withdrawn"
+    ):
         readmit(place, "S02", date(2026, 3, 20))
 
 
@@ -138,7 +160,10 @@ def test_read_markers__without_the_secret_nothing_is_read_or_written(tmp_path):
             lambda: db.read("capture", "S02"),
             lambda: commit(db.root, take="S03"),
         ):
-            with pytest.raises(InputError, match=r"secret: must be as it was created.*restore it from a backup"):
+            with pytest.raises(
+                InputError,
+                match=r"secret: must be as it was created.*restore it from a backup",
+            ):
                 call()
         assert [fault.where for fault in db.verify()] == [str(secret)]
     secret.write_bytes(content)
@@ -150,9 +175,16 @@ def test_verify__names_damaged_and_missing_entries(place):
     readmit(place, "S02", date(2026, 3, 20))
     db = Database(place.root)
     assert db.verify() == []
-    first, second = sorted((place.root / "withdrawn" / subject_hash(place, "S02")).iterdir())
+    first, second = sorted(
+        (place.root / "withdrawn" / subject_hash(place, "S02")).iterdir()
+    )
     content = second.read_text()
-    for damage in (None, "{", content.replace("2026-03-20", "2026-03-21"), first.read_text()):
+    for damage in (
+        None,
+        "{",
+        content.replace("2026-03-20", "2026-03-21"),
+        first.read_text(),
+    ):
         second.unlink(missing_ok=True)
         if damage is not None:
             second.write_text(damage)

@@ -1,4 +1,6 @@
-"""Names from files become paths in one module, which makes files outside the database unreachable."""
+"""Names from files become paths in one module, which makes files outside the database
+unreachable.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,18 @@ from skindb.store.folder import Folder
 from skindb.store.paths import inside
 from skindb.store.stage import remove_version
 
-OUTSIDE = ["..", "../victim", "data/../../victim", "/etc/passwd", "", "a//b", "a/./b", "a/", "a\\..\\b", "a\0b"]
+OUTSIDE = [
+    "..",
+    "../victim",
+    "data/../../victim",
+    "/etc/passwd",
+    "",
+    "a//b",
+    "a/./b",
+    "a/",
+    "a\\..\\b",
+    "a\0b",
+]
 
 
 @pytest.fixture
@@ -31,7 +44,9 @@ def place(tmp_path):
 
 
 @pytest.mark.parametrize("removed", ["log/A", "log/A/1", "log/A/2"])
-def test_identities__what_is_removed_during_the_listing_is_left_out(tmp_path, removed, monkeypatch):
+def test_identities__what_is_removed_during_the_listing_is_left_out(
+    tmp_path, removed, monkeypatch
+):
     place = Folder(tmp_path)
     for key in ("log/A/1", "log/A/2", "log/B/1"):
         place.create(key, b"x")
@@ -69,7 +84,9 @@ def test_folder__no_operation_leaves_the_root(place, key):
         lambda: place.url(key),
     )
     for call in calls:
-        with pytest.raises(InputError, match="every path must stay inside the database"):
+        with pytest.raises(
+            InputError, match="every path must stay inside the database"
+        ):
             call()
     assert (victim / "file").read_text() == "keep me"
     assert [p.name for p in victim.iterdir()] == ["file"]
@@ -110,7 +127,11 @@ def test_discard__leaves_what_the_log_names(tmp_path):
     db = Database(tmp_path)
     db.discard("capture", "A1", record.path)
     assert db.verify() == []
-    for path in ("data/capture/A2/20260101T000000-0123abcd.zarr", "../victim", "data/model/A1/x"):
+    for path in (
+        "data/capture/A2/20260101T000000-0123abcd.zarr",
+        "../victim",
+        "data/model/A1/x",
+    ):
         with pytest.raises(InputError, match="must be the path of a capture of A1"):
             db.discard("capture", "A1", path)
     left = tmp_path / "data/capture/A1/20260101T000000-0123abcd.zarr"

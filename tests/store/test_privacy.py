@@ -1,4 +1,6 @@
-"""Permissions of a database: for its owner only, with any umask, or for a group that the owner chose."""
+"""Permissions of a database: for its owner only, with any umask, or for a group that
+the owner chose.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,10 @@ def _commit(db, take="S02"):
 def _modes(root):
     """Permissions of the folders and of the files of a database."""
     every = [root, *root.rglob("*")]
-    return tuple({one.stat().st_mode & 0o7777 for one in every if one.is_dir() == folders} for folders in (True, False))
+    return tuple(
+        {one.stat().st_mode & 0o7777 for one in every if one.is_dir() == folders}
+        for folders in (True, False)
+    )
 
 
 @pytest.fixture(params=[0o000, 0o022, 0o002])
@@ -47,7 +52,9 @@ def test_database__in_an_empty_folder_is_closed_too(tmp_path, umask):
     assert _modes(db.root) == ({0o700}, {0o600})
 
 
-def test_database__leaves_the_permissions_of_a_folder_with_other_things(tmp_path, umask):
+def test_database__leaves_the_permissions_of_a_folder_with_other_things(
+    tmp_path, umask
+):
     root = tmp_path / "home"
     root.mkdir()
     root.chmod(0o755)
@@ -74,4 +81,6 @@ def test_database__is_shared_with_a_group_where_its_root_is(tmp_path, umask):
 def test_make_private__makes_what_is_missing(tmp_path, umask):
     make_private(tmp_path / "a" / "b")
     make_private(tmp_path / "a" / "b")
-    assert {(tmp_path / name).stat().st_mode & 0o777 for name in ("a", "a/b")} == {0o700}
+    assert {(tmp_path / name).stat().st_mode & 0o777 for name in ("a", "a/b")} == {
+        0o700
+    }

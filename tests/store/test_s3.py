@@ -25,7 +25,15 @@ def no_settings(monkeypatch, tmp_path):
     monkeypatch.setenv("AWS_SHARED_CREDENTIALS_FILE", str(tmp_path / "credentials"))
 
 
-@pytest.mark.parametrize("url", ["s3://bucket/a/b", "s3://bucket/a/b/", "s3://my.own-bucket/A_b.c=d", "s3://bucket"])
+@pytest.mark.parametrize(
+    "url",
+    [
+        "s3://bucket/a/b",
+        "s3://bucket/a/b/",
+        "s3://my.own-bucket/A_b.c=d",
+        "s3://bucket",
+    ],
+)
 def test_bucket_and_prefix__of_usable_urls(url):
     bucket, prefix = s3.bucket_and_prefix(url)
     assert f"s3://{bucket}/{prefix}".rstrip("/") == url.rstrip("/")
@@ -52,7 +60,9 @@ def test_bucket_and_prefix__others_are_refused(url):
         Database(f"s3://{url}")
 
 
-@pytest.mark.parametrize("url", [f"s3://{KEY}:{SECRET}@bucket/a", f"s3://bucket/a?secret={SECRET}"])
+@pytest.mark.parametrize(
+    "url", [f"s3://{KEY}:{SECRET}@bucket/a", f"s3://bucket/a?secret={SECRET}"]
+)
 def test_bucket_and_prefix__credentials_are_refused_and_not_repeated(url):
     with pytest.raises(InputError, match="must not contain credentials") as caught:
         Database(url)
@@ -61,19 +71,30 @@ def test_bucket_and_prefix__credentials_are_refused_and_not_repeated(url):
 
 def test_connect__without_credentials_fails_at_once(monkeypatch, tmp_path):
     monkeypatch.setattr(s3, "VENDOR", tmp_path / "none")
-    with pytest.raises(InputError, match="credentials must be set; found none; set AWS_ACCESS_KEY_ID"):
+    with pytest.raises(
+        InputError, match="credentials must be set; found none; set AWS_ACCESS_KEY_ID"
+    ):
         Database("s3://faces/x")
 
 
 def test_connect__takes_a_profile(new_database, monkeypatch, tmp_path):
     url = new_database("localbucket")
     address = os.environ["AWS_ENDPOINT_URL"]
-    for name in ("AWS_ENDPOINT_URL", "AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY", "AWS_REGION"):
+    for name in (
+        "AWS_ENDPOINT_URL",
+        "AWS_ACCESS_KEY_ID",
+        "AWS_SECRET_ACCESS_KEY",
+        "AWS_REGION",
+    ):
         monkeypatch.delenv(name)
     monkeypatch.setenv("AWS_CONFIG_FILE", str(tmp_path / "config"))
     monkeypatch.setenv("AWS_SHARED_CREDENTIALS_FILE", str(tmp_path / "credentials"))
-    (tmp_path / "config").write_text(f"[profile lab]\nregion = eu-central-1\nendpoint_url = {address}\n")
-    (tmp_path / "credentials").write_text(f"[lab]\naws_access_key_id = {KEY}\naws_secret_access_key = {SECRET}\n")
+    (tmp_path / "config").write_text(
+        f"[profile lab]\nregion = eu-central-1\nendpoint_url = {address}\n"
+    )
+    (tmp_path / "credentials").write_text(
+        f"[lab]\naws_access_key_id = {KEY}\naws_secret_access_key = {SECRET}\n"
+    )
     monkeypatch.setenv("AWS_PROFILE", "lab")
     with faulty_proxy(address) as proxy:
         monkeypatch.setattr(s3, "endpoint", lambda: proxy.address)
@@ -90,7 +111,9 @@ def test_connect__takes_a_profile(new_database, monkeypatch, tmp_path):
 
 def test_connect__a_damaged_profile_is_not_repeated(monkeypatch, tmp_path):
     (tmp_path / "credentials").write_text(f"aws_secret_access_key = {SECRET}\n")
-    with pytest.raises(InputError, match="must be a configuration file of the AWS command line") as caught:
+    with pytest.raises(
+        InputError, match="must be a configuration file of the AWS command line"
+    ) as caught:
         Database("s3://faces/x")
     assert SECRET not in str(caught.value)
 
@@ -117,7 +140,10 @@ def test_endpoint__of_one_s_own_network(monkeypatch):
     assert s3.endpoint() == "http://store.example.org:9000"
 
 
-@pytest.mark.parametrize(("variable", "value"), [("AWS_CONDITIONAL_PUT", "maybe"), ("AWS_SKIP_SIGNATURE", SECRET)])
+@pytest.mark.parametrize(
+    ("variable", "value"),
+    [("AWS_CONDITIONAL_PUT", "maybe"), ("AWS_SKIP_SIGNATURE", SECRET)],
+)
 def test_connect__unusable_settings(monkeypatch, variable, value):
     monkeypatch.setenv("AWS_ACCESS_KEY_ID", KEY)
     monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", SECRET)
@@ -131,17 +157,29 @@ def test_connect__unusable_settings(monkeypatch, variable, value):
 def test_readable_errors__a_bucket_that_is_not_there(new_database, kind):
     new_database(kind)
     db = Database("s3://no-such-bucket/x")
-    for call in (db.names, db.takes, lambda: commit(db.url), lambda: db.read("capture", "A1"), db.verify):
-        with pytest.raises(UnavailableError, match="the bucket must exist; found no bucket of this name; create it"):
+    for call in (
+        db.names,
+        db.takes,
+        lambda: commit(db.url),
+        lambda: db.read("capture", "A1"),
+        db.verify,
+    ):
+        with pytest.raises(
+            UnavailableError,
+            match="the bucket must exist; found no bucket of this name; create it",
+        ):
             call()
 
 
 def test_readable_errors__refused_access(new_database, monkeypatch):
     url = new_database("localbucket")
-    with faulty_proxy(os.environ["AWS_ENDPOINT_URL"], fraction=1.0, faults=("403",)) as proxy:
+    with faulty_proxy(
+        os.environ["AWS_ENDPOINT_URL"], fraction=1.0, faults=("403",)
+    ) as proxy:
         monkeypatch.setenv("AWS_ENDPOINT_URL", proxy.address)
         with pytest.raises(
-            UnavailableError, match="must permit this request; found 403 Forbidden; check AWS_ACCESS"
+            UnavailableError,
+            match="must permit this request; found 403 Forbidden; check AWS_ACCESS",
         ) as caught:
             Database(url).takes()
         with pytest.raises(UnavailableError, match="must permit this"):
@@ -151,6 +189,11 @@ def test_readable_errors__refused_access(new_database, monkeypatch):
 
 
 def test_connect__without_obstore_names_what_to_install():
-    code = "import sys; sys.modules['obstore'] = sys.modules['obstore.exceptions'] = None\nimport skindb\nskindb.open('s3://faces/x')"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    code = (
+        "import sys; sys.modules['obstore'] = sys.modules['obstore.exceptions'] = "
+        "None\nimport skindb\nskindb.open('s3://faces/x')"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False
+    )
     assert done.stderr.strip().endswith("it is not installed; pip install 'skindb[s3]'")

@@ -1,4 +1,6 @@
-"""A writer that is suspended at any of its steps while a subject is withdrawn never brings the subject back."""
+"""A writer that is suspended at any of its steps while a subject is withdrawn never
+brings the subject back.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,12 @@ FOLDER_STEPS = [
     (stage_module, "require_inputs"),
     (stage_module, "require_consents"),
 ]
-BUCKET_STEPS = [(Bucket, "_put_new"), (Bucket, "_put"), (AdmissionGuard, "__call__"), (stage_module, "require_inputs")]
+BUCKET_STEPS = [
+    (Bucket, "_put_new"),
+    (Bucket, "_put"),
+    (AdmissionGuard, "__call__"),
+    (stage_module, "require_inputs"),
+]
 
 
 class Steps:
@@ -61,7 +68,8 @@ class Steps:
 
 def partial_method(steps: Steps, call):
     def run(*args, **options):
-        if str(args[0]).endswith(".partial"):  # a file of zarr: one step of all of these is enough
+        # a file of zarr: one step of all of these is enough
+        if str(args[0]).endswith(".partial"):
             return call(*args, **options)
         steps.step()
         result = call(*args, **options)
@@ -71,7 +79,9 @@ def partial_method(steps: Steps, call):
     return run
 
 
-def _commit(url, kind: str, take: str, value: float = 1.0, lease=None, names=(), **about):
+def _commit(
+    url, kind: str, take: str, value: float = 1.0, lease=None, names=(), **about
+):
     """A version as small as possible."""
     names = [*names, *(one["take"] for one in about.get("inputs", []))]
     with Database(url).stage(kind, take, lease, names=names) as stage:
@@ -109,7 +119,9 @@ def _first_pass(db: Database) -> None:
 
 def _study(db: Database) -> None:
     models = [db.record("model", take) for take in (SUBJECT, "B")]
-    _commit(db.url, "population", "traits", inputs=[model.as_input() for model in models])
+    _commit(
+        db.url, "population", "traits", inputs=[model.as_input() for model in models]
+    )
 
 
 def _study_that_names(db: Database) -> None:
@@ -133,11 +145,14 @@ def _withdraw(db: Database) -> None:
     """A withdrawal after the lease of the suspended writer has expired."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(lease_module, "_has_ended", lambda *_: True)
-        Database(db.url).erase(SUBJECT)  # as another process, which knows nothing of what this one keeps in memory
+        # as another process, which knows nothing of what this one keeps in memory
+        Database(db.url).erase(SUBJECT)
 
 
 def _remains(db: Database, others: dict[str, bytes]) -> list[str]:
-    """Files beyond those of others and those that a withdrawal leaves, and everything that names the subject."""
+    """Files beyond those of others and those that a withdrawal leaves, and everything
+    that names the subject.
+    """
     left = contents(db.root)
     known = ("secret", "withdrawn/", "tombstones/", "requests/", "heads/population/")
     known += ("log/release/", "data/release/", "heads/release/")  # the next revision
@@ -148,8 +163,12 @@ def _remains(db: Database, others: dict[str, bytes]) -> list[str]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("writer", WRITERS)
-def test_writer__suspended_at_any_step_of_a_folder_leaves_nothing(made, tmp_path, writer):
-    others = {key: content for key, content in contents(made).items() if SUBJECT not in key}
+def test_writer__suspended_at_any_step_of_a_folder_leaves_nothing(
+    made, tmp_path, writer
+):
+    others = {
+        key: content for key, content in contents(made).items() if SUBJECT not in key
+    }
     refused = 0
     for number in range(1000):
         db = Database(shutil.copytree(made, tmp_path / str(number)))
@@ -189,7 +208,9 @@ def test_writer__of_another_subject_is_never_disturbed(made, tmp_path):
 
 
 @pytest.mark.parametrize("writer", ["capture", "study", "release", "cache"])
-def test_writer__suspended_at_any_step_of_a_bucket_leaves_nothing(bucket, new_database, writer):
+def test_writer__suspended_at_any_step_of_a_bucket_leaves_nothing(
+    bucket, new_database, writer
+):
     for number in range(1000):
         db = Database(new_database("localbucket"))
         _fill(db.url)
@@ -210,14 +231,27 @@ def test_writer__suspended_at_any_step_of_a_bucket_leaves_nothing(bucket, new_da
 def _keys_with(db: Database, subject: str) -> list[str]:
     place = db._place
     files = [top for top in place.names() or [] if place.file_type(top) == "file"]
-    files += [f"{top}/{name}" for top in place.names() or [] for name, size in place.sizes(top).items() if size >= 0]
-    return [key for key in files if subject in key or subject.encode() in place.read(key)]
+    files += [
+        f"{top}/{name}"
+        for top in place.names() or []
+        for name, size in place.sizes(top).items()
+        if size >= 0
+    ]
+    return [
+        key for key in files if subject in key or subject.encode() in place.read(key)
+    ]
 
 
 @pytest.fixture(params=["folder", "bucket"])
 def late(request, tmp_path):
-    """A database in which a writer, whose last check was before a withdrawal, has committed and was killed."""
-    url = str(tmp_path / "db") if request.param == "folder" else request.getfixturevalue("bucket")
+    """A database in which a writer, whose last check was before a withdrawal, has
+    committed and was killed.
+    """
+    url = (
+        str(tmp_path / "db")
+        if request.param == "folder"
+        else request.getfixturevalue("bucket")
+    )
     _fill(url)
     db = Database(url)
     _commit(url, "population", "traits", inputs=[db.record("model", "B").as_input()])
@@ -251,11 +285,17 @@ def test_late_commit__is_not_visible(late):
     assert SUBJECT not in late.info()["takes"]
     assert SUBJECT.encode() not in late._place.read("catalogue.json")
     assert not late.has("capture", f"{SUBJECT}.lotion")
-    assert [record.generation for record in late.readable_history("population", "traits")] == [1]
+    assert [
+        record.generation for record in late.readable_history("population", "traits")
+    ] == [1]
 
 
 def test_late_commit__is_named_by_verify_and_removed_by_clean(late):
-    places = {fault.where for fault in late.verify() if fault.rule == "nothing of a withdrawn subject must remain"}
+    places = {
+        fault.where
+        for fault in late.verify()
+        if fault.rule == "nothing of a withdrawn subject must remain"
+    }
     assert {f"capture of {SUBJECT}.lotion", "population 2 of traits"} <= places
     late.clean()
     assert late.verify() == []
@@ -266,9 +306,16 @@ def test_late_commit__is_named_by_verify_and_removed_by_clean(late):
 def test_stage__of_a_withdrawn_subject_is_refused(made, tmp_path):
     db = Database(shutil.copytree(made, tmp_path / "db"))
     db.erase(SUBJECT)
-    refused = [("capture", f"{SUBJECT}.b", []), ("population", "x", [SUBJECT]), ("edit", "B", [SUBJECT])]
+    refused = [
+        ("capture", f"{SUBJECT}.b", []),
+        ("population", "x", [SUBJECT]),
+        ("edit", "B", [SUBJECT]),
+    ]
     for kind, take, names in refused:
-        with pytest.raises(WithdrawnError, match=f"{SUBJECT}: the subject must not be withdrawn while a version"):
+        with pytest.raises(
+            WithdrawnError,
+            match=f"{SUBJECT}: the subject must not be withdrawn while a version",
+        ):
             db.stage(kind, take, names=names)
     with pytest.raises(WithdrawnError, match=SUBJECT):
         db.lease(f"{SUBJECT}.b", "model").__enter__()

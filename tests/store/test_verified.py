@@ -53,7 +53,8 @@ def test_read__reports_a_missing_file_before_any_work(db):
         content = file.read_bytes()
         file.unlink()
         with pytest.raises(
-            InputError, match=f"{file.name}: a version must be as it was committed; found no file; rest"
+            InputError,
+            match=f"{file.name}: a version must be as it was committed; found no file; rest",
         ):
             db.read("capture", "A1")
         file.write_bytes(content)
@@ -65,7 +66,9 @@ def test_read__reports_a_cut_or_longer_file_before_any_work(db):
         content = file.read_bytes()
         for wrong in (content[:-1], content + b"x", b""):
             file.write_bytes(wrong)
-            with pytest.raises(InputError, match=f"found {len(wrong)} bytes instead of {len(content)}"):
+            with pytest.raises(
+                InputError, match=f"found {len(wrong)} bytes instead of {len(content)}"
+            ):
                 db.read("capture", "A1")
         file.write_bytes(content)
 
@@ -101,7 +104,9 @@ def test_read__a_chunk_of_another_version_is_refused(db, tmp_path):
     for file in _chunks(db):
         relative = file.relative_to(db.root / db.record("capture", "A1").path)
         file.write_bytes((tmp_path / "other" / other.path / relative).read_bytes())
-    with pytest.raises(InputError, match=r"found (content that differs|\d+ bytes instead)"):
+    with pytest.raises(
+        InputError, match=r"found (content that differs|\d+ bytes instead)"
+    ):
         _read_all(db)
 
 
@@ -110,10 +115,14 @@ def test_read__parts_of_a_shard_are_compared_too(db):
     tree = db.read("capture", "A1")
     samples = tree["samples/reflectance_sample"]
     few = zarr.open_array(
-        VerifiedStore(db._place, db.record("capture", "A1")), path="samples/reflectance_sample", mode="r"
+        VerifiedStore(db._place, db.record("capture", "A1")),
+        path="samples/reflectance_sample",
+        mode="r",
     )
     assert few[3:5].shape == (2, 3, 2, 3)
-    (shard,) = (p for p in _chunks(db) if "reflectance_sample" in p.parts and p.parts[-4] == "0")
+    (shard,) = (
+        p for p in _chunks(db) if "reflectance_sample" in p.parts and p.parts[-4] == "0"
+    )
     _flip(shard, shard.stat().st_size // 3)
     with pytest.raises(InputError, match="found content that differs"):
         _ = few[3:5]
@@ -125,7 +134,10 @@ def test_read__parts_of_a_shard_are_compared_too(db):
 def test_read__an_error_reaches_the_caller_through_any_scheduler(db, scheduler):
     for file in _chunks(db):
         _flip(file, file.stat().st_size // 2)
-    with dask.config.set(scheduler=scheduler), pytest.raises(InputError, match="restore this file from a backup"):
+    with (
+        dask.config.set(scheduler=scheduler),
+        pytest.raises(InputError, match="restore this file from a backup"),
+    ):
         db.read("capture", "A1")["surfels/surfel_area"].mean().compute()
 
 
@@ -140,7 +152,9 @@ def test_read__links_and_foreign_files_are_not_followed(db):
     chunk.unlink()
     chunk.write_bytes(secret.read_bytes())
     (db.root / db.record("capture", "A1").path / "surfels/stray").mkdir()
-    (db.root / db.record("capture", "A1").path / "surfels/stray/zarr.json").write_text("{}")
+    (db.root / db.record("capture", "A1").path / "surfels/stray/zarr.json").write_text(
+        "{}"
+    )
     assert "stray" not in db.read("capture", "A1")["surfels"].to_dataset()
     assert any("an unknown file" in str(fault) for fault in db.verify())
 
@@ -149,14 +163,17 @@ def test_read__links_and_foreign_files_are_not_followed(db):
 def test_read__reports_a_damaged_manifest(db, change):
     manifest = db.root / db.record("capture", "A1").beside("manifest")
     manifest.write_bytes(change) if change is not None else manifest.unlink()
-    with pytest.raises(InputError, match=r"manifest.json: a version must be as it was committed"):
+    with pytest.raises(
+        InputError, match=r"manifest.json: a version must be as it was committed"
+    ):
         db.read("capture", "A1")
     assert "manifest.json" in str(db.verify()[0])
 
 
 def test_verified_store__is_small_in_another_process(db):
     store = VerifiedStore(db._place, db.record("capture", "A1"))
-    with mock.patch("skindb.store.verified.read_manifest", side_effect=AssertionError):  # dask copies stores for names
+    # dask copies stores for names
+    with mock.patch("skindb.store.verified.read_manifest", side_effect=AssertionError):
         again = pickle.loads(pickle.dumps(store))
     assert len(pickle.dumps(store)) < 6000
     assert again.files == store.files
@@ -165,7 +182,9 @@ def test_verified_store__is_small_in_another_process(db):
 
 
 def test_stage__tables_are_kept_beside_the_version_and_verified(db):
-    tables = dataset({"region_area": [1.0, np.nan]}, coords={"region": ["face", "nose"]})
+    tables = dataset(
+        {"region_area": [1.0, np.nan]}, coords={"region": ["face", "nose"]}
+    )
     with db.stage("model", "A1") as stage:
         stage.write({"surfels": dataset({"surfel_area": np.ones(3)})}, tables=tables)
         record = stage.commit({})
@@ -174,5 +193,7 @@ def test_stage__tables_are_kept_beside_the_version_and_verified(db):
     assert db.verify() == []
     _flip(db.root / record.beside("tables"), 12)
     assert "tables.json" in str(db.verify()[0])
-    with pytest.raises(InputError, match=r"tables\.json: a version must be as it was committed"):
+    with pytest.raises(
+        InputError, match=r"tables\.json: a version must be as it was committed"
+    ):
         db.tables(record)

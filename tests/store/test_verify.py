@@ -21,7 +21,9 @@ UNNAMED = "a record of the log must name every version that was written complete
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    """Folder of two captures of A1, a model of the second one, a capture of B1, which is only copied."""
+    """Folder of two captures of A1, a model of the second one, a capture of B1, which
+    is only copied.
+    """
     root = tmp_path_factory.mktemp("made")
     for value in (1.0, 2.0):
         record = commit(root, value, consent_scope=["statistics"])
@@ -63,10 +65,15 @@ def test_read__a_lost_newest_record_is_no_older_version(db):
         lambda: db.stage("capture", "A1"),
         lambda: db.record("capture", "A1"),
     ):
-        with pytest.raises(InputError, match=r"generation 2 must exist; found generations \[1\]; restore it"):
+        with pytest.raises(
+            InputError,
+            match=r"generation 2 must exist; found generations \[1\]; restore it",
+        ):
             call()
     assert "generation 2 must exist" in db.info()["takes"]["A1"]["capture"]["fault"]
-    assert float(db.read("capture", "A1", generation=1)["surfels/surfel_area"][0]) == 1.0
+    assert (
+        float(db.read("capture", "A1", generation=1)["surfels/surfel_area"][0]) == 1.0
+    )
 
 
 def test_read__a_link_in_place_of_the_newest_record_is_no_older_version(db):
@@ -74,7 +81,10 @@ def test_read__a_link_in_place_of_the_newest_record_is_no_older_version(db):
     _head(db).unlink()
     _record(db).rename(db.root / "aside")
     _record(db).symlink_to(db.root / "aside")
-    with pytest.raises(InputError, match=r"a symbolic link at log/capture/A1/00000002\.json; restore it"):
+    with pytest.raises(
+        InputError,
+        match=r"a symbolic link at log/capture/A1/00000002\.json; restore it",
+    ):
         db.read("capture", "A1")
 
 
@@ -84,7 +94,9 @@ def test_takes__a_take_whose_records_were_lost_is_still_known(db):
     assert db.kinds("A1") == ["capture", "model"]
     assert "generation 1 must exist" in db.info()["takes"]["A1"]["model"]["fault"]
     for call in (lambda: db.cohort("tables"), lambda: db.history("model", "A1")):
-        with pytest.raises(InputError, match="model of A1: generation 1 must exist; found nothing"):
+        with pytest.raises(
+            InputError, match="model of A1: generation 1 must exist; found nothing"
+        ):
             call()
 
 
@@ -93,7 +105,10 @@ def test_verify__a_lost_record_is_revealed_without_the_head_too(db):
     data = db.root / db.record("capture", "A1").path
     _record(db).unlink()
     _head(db).unlink()
-    assert sorted(_rules(db)) == [UNNAMED, "generation 2, from which model 1 of A1 was made, must exist"]
+    assert sorted(_rules(db)) == [
+        UNNAMED,
+        "generation 2, from which model 1 of A1 was made, must exist",
+    ]
     shutil.rmtree(data)
     for file in data.parent.glob(f"{data.stem}.*"):
         file.unlink()
@@ -113,27 +128,38 @@ def test_read__another_record_in_place_of_the_newest_is_refused(db, tmp_path):
     commit(other.root, take="B1")
     shutil.copy(_record(other, 1, take="B1"), _record(db, 1, take="B1"))
     with pytest.raises(
-        InputError, match="generation 1 must be the record that was committed; found a different record"
+        InputError,
+        match="generation 1 must be the record that was committed; found a different record",
     ):
         db.read("capture", "B1")
     assert "generation 1 must be the record that was committed" in _rules(db)
 
 
-@pytest.mark.parametrize("other", [(1, "capture", "A1"), (1, "model", "A1"), (1, "capture", "B1")])
+@pytest.mark.parametrize(
+    "other", [(1, "capture", "A1"), (1, "model", "A1"), (1, "capture", "B1")]
+)
 def test_verify__a_record_copied_over_another_one(db, other):
     shutil.copy(_record(db, *other), _record(db))
-    with pytest.raises(InputError, match=f"found the record of {other[1]} 1 of {other[2]}; restore it from a backup"):
+    with pytest.raises(
+        InputError,
+        match=f"found the record of {other[1]} 1 of {other[2]}; restore it from a backup",
+    ):
         db.read("capture", "A1")
     assert any("found the record of" in str(fault) for fault in db.verify())
 
 
-@pytest.mark.parametrize("content", ["{head}x", "7", "[" * 5000 + "]" * 5000, "{other}", '{{"generation": true}}'])
+@pytest.mark.parametrize(
+    "content",
+    ["{head}x", "7", "[" * 5000 + "]" * 5000, "{other}", '{{"generation": true}}'],
+)
 def test_head__that_is_damaged_or_of_another_take_changes_nothing(db, content):
     other = _head(db, take="B1").read_text()
     _head(db).write_text(content.format(head=_head(db).read_text(), other=other))
     assert db.verify() == []
     assert float(db.read("capture", "A1")["surfels/surfel_area"][0]) == 2.0
-    _head(db).write_text(_head(db, "model").read_text().replace('"generation": 1', '"generation": 9'))
+    _head(db).write_text(
+        _head(db, "model").read_text().replace('"generation": 1', '"generation": 9')
+    )
     assert db.verify() == []
 
 
@@ -147,18 +173,39 @@ def _nested(depth):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda body: body.update(provenance={}), "a record without provenance; restore"),
+        (
+            lambda body: body.update(provenance={}),
+            "a record without provenance; restore",
+        ),
         (lambda body: body.pop("provenance"), "fields that do not match its format"),
-        (lambda body: body.update(provenance=None), "invalid values of provenance; restore"),
+        (
+            lambda body: body.update(provenance=None),
+            "invalid values of provenance; restore",
+        ),
         (
             lambda body: body["provenance"].update(schema_version=9),
             "schema version 9, written by a later version of skindb; upd",
         ),
-        (lambda body: body["provenance"].update(inputs=[1]), "invalid values of provenance"),
-        (lambda body: body["provenance"].update(consent_scope="fit"), "invalid values of provenance"),
-        (lambda body: body["provenance"].update(traits=[]), "invalid values of provenance"),
-        (lambda body: body["provenance"].update(deep=_nested(40)), "more than 32 levels of nested brackets"),
-        (lambda body: body["provenance"].update(deep=_nested(400)), "more than 32 levels of nested brackets"),
+        (
+            lambda body: body["provenance"].update(inputs=[1]),
+            "invalid values of provenance",
+        ),
+        (
+            lambda body: body["provenance"].update(consent_scope="fit"),
+            "invalid values of provenance",
+        ),
+        (
+            lambda body: body["provenance"].update(traits=[]),
+            "invalid values of provenance",
+        ),
+        (
+            lambda body: body["provenance"].update(deep=_nested(40)),
+            "more than 32 levels of nested brackets",
+        ),
+        (
+            lambda body: body["provenance"].update(deep=_nested(400)),
+            "more than 32 levels of nested brackets",
+        ),
         (
             lambda body: body.update(format=9),
             "a record of format 9, written by a later version of skindb; update skindb",
@@ -167,16 +214,33 @@ def _nested(depth):
         (lambda body: body.update(bytes="1"), "invalid values of bytes"),
         (lambda body: body.update(generation=2.0), "invalid values of generation"),
         (lambda body: body.update(contents=[]), "invalid values of contents"),
-        (lambda body: body["contents"]["samples"]["sizes"].update(light=-1), "invalid values of contents"),
-        (lambda body: body["contents"]["samples"]["variables"].append("nose"), "invalid values of contents"),
-        (lambda body: body["contents"]["samples"]["labels"]["light"].pop(), "invalid values of contents"),
+        (
+            lambda body: body["contents"]["samples"]["sizes"].update(light=-1),
+            "invalid values of contents",
+        ),
+        (
+            lambda body: body["contents"]["samples"]["variables"].append("nose"),
+            "invalid values of contents",
+        ),
+        (
+            lambda body: body["contents"]["samples"]["labels"]["light"].pop(),
+            "invalid values of contents",
+        ),
     ],
 )
-def test_read__a_record_of_odd_values_is_refused_although_its_seal_fits(db, change, said):
+def test_read__a_record_of_odd_values_is_refused_although_its_seal_fits(
+    db, change, said
+):
     _head(db).unlink()
     _edit(_record(db), change)
-    for call in (lambda: db.read("capture", "A1"), db.table, lambda: db.stage("capture", "A1")):
-        with pytest.raises(InputError, match="a record of the log must be as committed; found") as caught:
+    for call in (
+        lambda: db.read("capture", "A1"),
+        db.table,
+        lambda: db.stage("capture", "A1"),
+    ):
+        with pytest.raises(
+            InputError, match="a record of the log must be as committed; found"
+        ) as caught:
             call()
         assert said in str(caught.value)
     assert any(said in str(fault) for fault in db.verify())
@@ -186,7 +250,10 @@ def test_read__a_record_of_odd_values_is_refused_although_its_seal_fits(db, chan
     ("change", "name"),
     [
         (lambda body: body["provenance"].update(seeds=[2]), "provenance"),
-        (lambda body: body["contents"]["surfels"]["sizes"].update(surfel=9), "contents"),
+        (
+            lambda body: body["contents"]["surfels"]["sizes"].update(surfel=9),
+            "contents",
+        ),
         (lambda body: body.update(bytes=7), "bytes"),
     ],
 )
@@ -195,7 +262,9 @@ def test_verify__an_edited_record_contradicts_its_version(db, change, name):
     _head(db, take="B1").unlink()
     _edit(_record(db, 1, take="B1"), change)
     (fault,) = db.verify()
-    assert str(fault).startswith("capture 1 of B1: the record must agree with the attributes of its version;")
+    assert str(fault).startswith(
+        "capture 1 of B1: the record must agree with the attributes of its version;"
+    )
     assert fault.found == f"different {name}"
 
 
@@ -205,12 +274,24 @@ def test_cohort__a_record_that_describes_other_tables_is_refused(db):
     with db.stage("model", "C1") as stage:
         stage.write({}, tables=tables)
         stage.commit({"consent_scope": ["statistics"]})
-    assert db.cohort("tables", takes=["C1"])["region_area"].values.tolist() == [[1.0, 2.0]]
+    assert db.cohort("tables", takes=["C1"])["region_area"].values.tolist() == [
+        [1.0, 2.0]
+    ]
     _head(db, "model", "C1").unlink()
     record = _record(db, 1, "model", "C1")
-    _edit(record, lambda body: body["contents"]["tables"]["labels"].update(region=["nose", "face"]))
-    with pytest.raises(InputError, match="model 1 of C1: the record must agree with the attributes of its version"):
-        db.cohort("tables", takes=["C1"])["region_area"].compute(scheduler="synchronous")
+    _edit(
+        record,
+        lambda body: body["contents"]["tables"]["labels"].update(
+            region=["nose", "face"]
+        ),
+    )
+    with pytest.raises(
+        InputError,
+        match="model 1 of C1: the record must agree with the attributes of its version",
+    ):
+        db.cohort("tables", takes=["C1"])["region_area"].compute(
+            scheduler="synchronous"
+        )
 
 
 @pytest.mark.parametrize(
@@ -256,9 +337,13 @@ SUBSTITUTES = {
 
 
 @pytest.mark.parametrize("what", SUBSTITUTES)
-@pytest.mark.parametrize("name", ["record", "manifest", "head", "chunk", "log", "heads", "take"])
+@pytest.mark.parametrize(
+    "name", ["record", "manifest", "head", "chunk", "log", "heads", "take"]
+)
 def test_verify__only_regular_files_inside_are_opened(db, monkeypatch, name, what):
-    """`verify` ends, and names what replaces a file; reads are refused, except if the head, a cache, is replaced."""
+    """`verify` ends, and names what replaces a file; reads are refused, except if the
+    head, a cache, is replaced.
+    """
     monkeypatch.chdir(db.root)
     record = db.record("capture", "A1")
     path = {
@@ -274,7 +359,9 @@ def test_verify__only_regular_files_inside_are_opened(db, monkeypatch, name, wha
     SUBSTITUTES[what](path)
     told = [str(fault) for fault in db.verify()]
     cache = name in ("head", "heads")
-    assert any(str(path) in line or name in line for line in told) or (what == "folder" and name != "record")
+    assert any(str(path) in line or name in line for line in told) or (
+        what == "folder" and name != "record"
+    )
     assert all(";" in line.partition("; found ")[2] for line in told)  # a cure
     if cache:
         assert float(db.read("capture", "A1")["surfels/surfel_area"][0]) == 2.0
@@ -304,13 +391,23 @@ def test_verify__endless_folders_and_files(db):
     os.truncate(version / "surfels/zarr.json", 1 << 40)
     os.truncate(_record(db, 1, take="B1"), 1 << 40)
     told = [str(fault) for fault in db.verify()]
-    assert [line for line in told if "an unknown file" in line and f"{'d/' * 16}d: " in line]
+    assert [
+        line for line in told if "an unknown file" in line and f"{'d/' * 16}d: " in line
+    ]
     assert any("1099511627776 bytes instead of" in line for line in told)
-    assert any("B1/00000001.json: a record of the log must be as committed; found 1,099,5" in line for line in told)
+    assert any(
+        "B1/00000001.json: a record of the log must be as committed; found 1,099,5"
+        in line
+        for line in told
+    )
 
 
 def test_remove__leaves_nothing_of_the_version(db):
     record = db.record("capture", "B1")
     Log(db._place, "capture", "B1").remove(1)
     assert db.verify() == []
-    assert not [path for path in db.root.rglob("*") if path.stem.startswith(record.path.split("/")[-1][:24])]
+    assert not [
+        path
+        for path in db.root.rglob("*")
+        if path.stem.startswith(record.path.split("/")[-1][:24])
+    ]

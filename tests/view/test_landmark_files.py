@@ -52,14 +52,18 @@ def test_landmark_mistakes__accepts_the_true_points(task, head):
 
 
 def moved(head, **places):
-    return {**head.landmarks, **{name: np.asarray(p, float) for name, p in places.items()}}
+    return {
+        **head.landmarks,
+        **{name: np.asarray(p, float) for name, p in places.items()},
+    }
 
 
 def test_landmark_mistakes__names_each_kind(task, head):
     marks = head.landmarks
     off = moved(head, chin=marks["chin"] + [0, 0, 2.5])
-    assert "[chin]: a landmark must be within 1 mm of the scan; found a distance of 2.5 mm" in rules(
-        landmark_mistakes(task, off, None)
+    assert (
+        "[chin]: a landmark must be within 1 mm of the scan; found a distance of 2.5 mm"
+        in rules(landmark_mistakes(task, off, None))
     )
     near = moved(head, chin=marks["chin"] + [0, 0, 0.5])
     assert landmark_mistakes(task, near, None) == []
@@ -67,13 +71,25 @@ def test_landmark_mistakes__names_each_kind(task, head):
     assert "[nose]: the name of a landmark must be in the list" in unknown
     double = rules(landmark_mistakes(task, moved(head, chin=marks["lip_upper"]), None))
     assert "landmarks must be at least 0.5 mm apart" in double
-    swapped = {name: marks[{"jaw_left": "jaw_right", "jaw_right": "jaw_left"}.get(name, name)] for name in marks}
-    assert "left must be the subject's left" in rules(landmark_mistakes(task, swapped, None))
-    upside = {name: marks[{"chin": "nasion", "nasion": "chin"}.get(name, name)] for name in marks}
+    swapped = {
+        name: marks[{"jaw_left": "jaw_right", "jaw_right": "jaw_left"}.get(name, name)]
+        for name in marks
+    }
+    assert "left must be the subject's left" in rules(
+        landmark_mistakes(task, swapped, None)
+    )
+    upside = {
+        name: marks[{"chin": "nasion", "nasion": "chin"}.get(name, name)]
+        for name in marks
+    }
     assert "must lie above" in rules(landmark_mistakes(task, upside, None))
     small = Crop((-100.0, -60.0, -20.0), (100.0, 150.0, 200.0))
-    assert "[chin]: a landmark must be inside the crop box" in rules(landmark_mistakes(task, marks, small))
-    assert "at least one landmark must be set" in rules(landmark_mistakes(task, {}, None))
+    assert "[chin]: a landmark must be inside the crop box" in rules(
+        landmark_mistakes(task, marks, small)
+    )
+    assert "at least one landmark must be set" in rules(
+        landmark_mistakes(task, {}, None)
+    )
 
 
 def test_save_landmarks__is_read_again(task, head, scan):
@@ -81,12 +97,16 @@ def test_save_landmarks__is_read_again(task, head, scan):
     again = landmark_task(scan, task.out)
     assert [*again.points] == [*MEAN_FACE]
     for name, place in again.points.items():
-        np.testing.assert_allclose(place, head.landmarks[name], atol=0.5e-3)  # three decimals of a mm
+        # three decimals of a mm
+        np.testing.assert_allclose(place, head.landmarks[name], atol=0.5e-3)
     assert again.crop == BOX
     assert (again.crop.low, again.crop.high) == ((-100, -150, -20), (100, 150, 200))
     save_landmarks(again, again.points, None)
     assert not crop_path(task.out).exists()
-    assert [p.name for p in sorted(task.out.parent.iterdir())] == ["landmarks.json", "scan.ply"]
+    assert [p.name for p in sorted(task.out.parent.iterdir())] == [
+        "landmarks.json",
+        "scan.ply",
+    ]
 
 
 def test_save_landmarks__keeps_the_old_file_if_writing_fails(task, head, monkeypatch):
@@ -100,7 +120,10 @@ def test_save_landmarks__keeps_the_old_file_if_writing_fails(task, head, monkeyp
     with pytest.raises(OSError, match="No space"):
         save_landmarks(task, {"chin": head.landmarks["chin"]}, None)
     assert task.out.read_bytes() == before
-    assert [p.name for p in sorted(task.out.parent.iterdir())] == ["landmarks.json", "scan.ply"]
+    assert [p.name for p in sorted(task.out.parent.iterdir())] == [
+        "landmarks.json",
+        "scan.ply",
+    ]
 
 
 def test_save_landmarks__keeps_other_names_of_the_file(scan, tmp_path, head):
@@ -108,20 +131,31 @@ def test_save_landmarks__keeps_other_names_of_the_file(scan, tmp_path, head):
     out.write_text(json.dumps({"lip_lower": head.landmarks["lip_upper"].tolist()}))
     task = landmark_task(scan, out)
     assert task.names[-1] == "lip_lower"
-    assert place_sentence("lip_lower") == "A point from the file that is not one of the 20 landmarks."
+    assert (
+        place_sentence("lip_lower")
+        == "A point from the file that is not one of the 20 landmarks."
+    )
     save_landmarks(task, task.points, None)
     assert [*json.loads(out.read_text())] == ["lip_lower"]
 
 
 def test_open_questions__asks_for_missing_points_and_files_it_did_not_write(task, head):
     assert open_questions(task, head.landmarks, seen="") == []
-    some = {name: p for name, p in head.landmarks.items() if name not in ("chin", "nasion")}
-    assert open_questions(task, some, seen="") == ["2 of the 20 points are missing: nasion, chin."]
+    some = {
+        name: p for name, p in head.landmarks.items() if name not in ("chin", "nasion")
+    }
+    assert open_questions(task, some, seen="") == [
+        "2 of the 20 points are missing: nasion, chin."
+    ]
     seen = save_landmarks(task, head.landmarks, None)
     assert open_questions(task, head.landmarks, seen=seen) == []
-    assert open_questions(task, head.landmarks, seen="") == [f"{task.out} exists and will be replaced."]
+    assert open_questions(task, head.landmarks, seen="") == [
+        f"{task.out} exists and will be replaced."
+    ]
     task.out.write_text("{}")  # another program wrote it
-    assert open_questions(task, head.landmarks, seen=seen) == [f"{task.out} exists and will be replaced."]
+    assert open_questions(task, head.landmarks, seen=seen) == [
+        f"{task.out} exists and will be replaced."
+    ]
 
 
 @pytest.mark.parametrize(
@@ -140,7 +174,9 @@ def test_landmark_task__refuses_a_damaged_file(scan, tmp_path, text, said):
         landmark_task(scan, out)
 
 
-def test_landmark_task__refuses_a_damaged_crop_file_and_a_missing_folder(scan, tmp_path):
+def test_landmark_task__refuses_a_damaged_crop_file_and_a_missing_folder(
+    scan, tmp_path
+):
     (tmp_path / "landmarks.crop.json").write_text('{"low": [0, 0, 0]}')
     with pytest.raises(InputError, match="a crop box must be"):
         landmark_task(scan, tmp_path / "landmarks.json")
@@ -149,5 +185,8 @@ def test_landmark_task__refuses_a_damaged_crop_file_and_a_missing_folder(scan, t
 
 
 def test_place_sentence__is_there_for_all_names():
-    assert all(place_sentence(name).split(".")[0] in "".join(PLACES.values()) for name in MEAN_FACE)
+    assert all(
+        place_sentence(name).split(".")[0] in "".join(PLACES.values())
+        for name in MEAN_FACE
+    )
     assert place_sentence("ala_left").endswith("On the subject's left.")

@@ -26,7 +26,9 @@ MAX_CLICK_ERROR_MM = 0.5  # about a pixel; measured: median 0.02 mm
 
 @pytest.fixture(scope="module")
 def browser():
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    playwright = pytest.importorskip(
+        "playwright.sync_api", reason="playwright is not installed"
+    )
     if BROWSER is None:
         pytest.skip("there is no Chromium")
     with playwright.sync_playwright() as running:
@@ -42,12 +44,16 @@ def head():
 
 @pytest.fixture
 def server(head, tmp_path):
-    """Server of the page of a head that has no landmarks yet; the ball behind it must not be clicked."""
+    """Server of the page of a head that has no landmarks yet; the ball behind it must
+    not be clicked.
+    """
     ball = trimesh.creation.icosphere(2, radius=70.0)
     vertices = np.concatenate([head.vertices, ball.vertices - [0, 0, 100]])
     faces = np.concatenate([head.faces, ball.faces[:, ::-1] + len(head.vertices)])
     colours = np.full((len(vertices), 4), [200, 60, 60, 255], np.uint8)
-    trimesh.Trimesh(vertices, faces, vertex_colors=colours, process=False).export(tmp_path / "scan.ply")
+    trimesh.Trimesh(vertices, faces, vertex_colors=colours, process=False).export(
+        tmp_path / "scan.ply"
+    )
     with served(tmp_path) as found:
         yield found
 
@@ -58,13 +64,18 @@ def address(server):
 
 
 def served(folder):
-    return running(landmark_server(landmark_task(folder / "scan.ply", folder / "landmarks.json")))
+    return running(
+        landmark_server(landmark_task(folder / "scan.ply", folder / "landmarks.json"))
+    )
 
 
 def opened(browser, address, *, width=860, height=500):
     page = browser.new_page(viewport={"width": width, "height": height})
     page.problems = []
-    page.on("console", lambda said: page.problems.append(said.text) if said.type == "error" else None)
+    page.on(
+        "console",
+        lambda said: page.problems.append(said.text) if said.type == "error" else None,
+    )
     page.on("pageerror", lambda error: page.problems.append(str(error)))
     page.goto(address)
     page.evaluate("skindb.ready")
@@ -83,7 +94,10 @@ def point(page, name):
 
 
 def status(page, text):
-    page.wait_for_function("(text) => document.getElementById('status').textContent.includes(text)", arg=text)
+    page.wait_for_function(
+        "(text) => document.getElementById('status').textContent.includes(text)",
+        arg=text,
+    )
 
 
 @pytest.mark.slow
@@ -98,12 +112,16 @@ def test_page__a_click_sets_the_next_point_where_it_is(browser, address, head):
         page.mouse.click(*on_canvas(page, head.landmarks[name]))
     found = np.array([point(page, name) for name in names])
     truth = np.array([head.landmarks[name] for name in names])
-    # triangles of 2 mm cut the true surface, so that the nearest point of the mesh counts; where the surface is seen
-    # at a grazing angle (wings of the nose, jaw), the ray to the true point meets it up to 0.4 mm away
-    on_mesh = trimesh.proximity.closest_point_naive(trimesh.Trimesh(head.vertices, head.faces, process=False), truth)[0]
+    # triangles of 2 mm cut the true surface, so that the nearest point of the mesh
+    # counts; where the surface is seen at a grazing angle (wings of the nose, jaw), the
+    # ray to the true point meets it up to 0.4 mm away
+    on_mesh = trimesh.proximity.closest_point_naive(
+        trimesh.Trimesh(head.vertices, head.faces, process=False), truth
+    )[0]
     error = np.linalg.norm(found - on_mesh, axis=1)
     assert error.max() < MAX_CLICK_ERROR_MM, dict(zip(names, error, strict=True))
-    assert np.median(error) < 0.05  # single precision, and clicks at fractions of a pixel
+    # single precision, and clicks at fractions of a pixel
+    assert np.median(error) < 0.05
     assert page.evaluate("skindb.state.selected") is None
     assert page.locator("#count").inner_text() == "20 of 20 points are set."
     assert not page.problems
@@ -113,7 +131,12 @@ def test_page__a_click_sets_the_next_point_where_it_is(browser, address, head):
 def write_capture(folder):
     """The capture.json of a folder with a scan and landmarks, and nothing else."""
     consent = {"scope": ["fit"], "reference": "test"}
-    record = {"format": "skindb-capture", "version": 2, "subject": "S1", "session": "2026-01-01T10:00:00Z"}
+    record = {
+        "format": "skindb-capture",
+        "version": 2,
+        "subject": "S1",
+        "session": "2026-01-01T10:00:00Z",
+    }
     record |= {"consent": consent, "mesh": "scan.ply", "landmarks": "landmarks.json"}
     (folder / "capture.json").write_text(json.dumps(record))
 
@@ -141,10 +164,12 @@ def test_page__saves_what_ingest_reads(browser, address, head, tmp_path):
     assert capture.crop == Crop(tuple(box["low"]), tuple(box["high"]))
     assert {*capture.landmarks} == {*head.landmarks}
     for name, place in capture.landmarks.items():
-        np.testing.assert_allclose(place, point(page, name), atol=0.5e-3)  # three decimals of a mm
+        # three decimals of a mm
+        np.testing.assert_allclose(place, point(page, name), atol=0.5e-3)
     assert capture.surface.vertices[:, 1].min() >= -100
     page.get_by_label("y from").fill("-105")
-    page.get_by_role("button", name="Save", exact=True).click()  # its own file is replaced without a question
+    # its own file is replaced without a question
+    page.get_by_role("button", name="Save", exact=True).click()
     deadline = time.monotonic() + 30
     while json.loads((tmp_path / "landmarks.crop.json").read_text())["low"][1] != -105:
         assert time.monotonic() < deadline
@@ -152,17 +177,21 @@ def test_page__saves_what_ingest_reads(browser, address, head, tmp_path):
     status(page, "20 points were saved")
     page.get_by_role("button", name="Remove chin").click()
     status(page, "The changes since the last save are not saved yet.")
-    page.on("dialog", lambda dialog: dialog.accept())  # Chromium asks, because there are changes
+    # Chromium asks, because there are changes
+    page.on("dialog", lambda dialog: dialog.accept())
     page.reload()
     page.evaluate("skindb.ready")
-    assert page.locator("#count").inner_text() == "20 of 20 points are set."  # as in the file
+    # as in the file
+    assert page.locator("#count").inner_text() == "20 of 20 points are set."
     assert page.get_by_label("y from").input_value() == "-105"
     assert not page.problems
     page.close()
 
 
 @pytest.mark.slow
-def test_page__reads_an_existing_file_and_asks_before_it_is_replaced(browser, address, head, tmp_path):
+def test_page__reads_an_existing_file_and_asks_before_it_is_replaced(
+    browser, address, head, tmp_path
+):
     out = tmp_path / "landmarks.json"
     out.write_text(json.dumps({name: p.tolist() for name, p in head.landmarks.items()}))
     with served(tmp_path) as again:
@@ -193,7 +222,8 @@ def test_page__points_are_moved_removed_undone_and_accepted(browser, address, he
     page.mouse.move(start[0], start[1] - 20)
     page.mouse.up()
     up = point(page, "nasion")
-    np.testing.assert_allclose(on_canvas(page, up), (start[0], start[1] - 20), atol=0.1)  # px, single precision
+    # px, single precision
+    np.testing.assert_allclose(on_canvas(page, up), (start[0], start[1] - 20), atol=0.1)
     page.keyboard.press("Control+z")
     assert point(page, "nasion") == first
     page.get_by_role("button", name="Remove nasion").click()
@@ -201,8 +231,11 @@ def test_page__points_are_moved_removed_undone_and_accepted(browser, address, he
     page.get_by_role("button", name="Undo").click()
     assert point(page, "nasion") == first
     page.wait_for_function("'chin' in skindb.state.suggestions")
-    accept = page.get_by_role("button", name="Accept chin")  # in one step: the next suggestions may be on their way
-    chin = accept.evaluate("(one) => { const p = skindb.state.suggestions.chin; one.click(); return p; }")
+    # in one step: the next suggestions may be on their way
+    accept = page.get_by_role("button", name="Accept chin")
+    chin = accept.evaluate(
+        "(one) => { const p = skindb.state.suggestions.chin; one.click(); return p; }"
+    )
     assert point(page, "chin") == chin
     turned = page.evaluate("skindb.view.azimuth")
     page.mouse.move(60, 60)
@@ -221,11 +254,14 @@ def test_page__works_with_keys_and_shows_the_scans_colours(browser, address):
     canvas = page.locator("#canvas")
     redness = """() => {
         skindb.draw();
-        const gl = document.getElementById('canvas').getContext('webgl2'), pixel = new Uint8Array(4);
-        gl.readPixels(gl.drawingBufferWidth / 2, gl.drawingBufferHeight * 0.35, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel);
+        const gl = document.getElementById('canvas').getContext('webgl2');
+        const pixel = new Uint8Array(4);
+        const [x, y] = [gl.drawingBufferWidth / 2, gl.drawingBufferHeight * 0.35];
+        gl.readPixels(x, y, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel);
         return pixel[0] / pixel[1];
     }"""
-    page.get_by_label("show suggestions").uncheck()  # one may lie where the pixel is read
+    # one may lie where the pixel is read
+    page.get_by_label("show suggestions").uncheck()
     assert page.evaluate(redness) == pytest.approx(200 / 60, rel=0.05)  # of eight bits
     page.get_by_label("show the colours").uncheck()
     assert page.evaluate(redness) < 1.3
@@ -237,7 +273,9 @@ def test_page__works_with_keys_and_shows_the_scans_colours(browser, address):
     canvas.press("Enter")
     assert page.evaluate("Object.keys(skindb.state.points)") == ["forehead_centre"]
     for control in page.locator("input, button, canvas").all():
-        assert control.evaluate("(one) => one.ariaLabel || one.labels?.[0]?.textContent || one.textContent").strip()
+        assert control.evaluate(
+            "(one) => one.ariaLabel || one.labels?.[0]?.textContent || one.textContent"
+        ).strip()
     assert not page.problems
     page.close()
 
@@ -250,7 +288,9 @@ def test_page__fits_a_width_of_400_px(browser, address):
 
 
 def test_landmark_server__saves_nothing_for_others(server, tmp_path):
-    """A page that knows the address, but not the token, can neither read the scan nor write landmarks."""
+    """A page that knows the address, but not the token, can neither read the scan nor
+    write landmarks.
+    """
     body = json.dumps({"points": {"chin": [0, 0, 0]}}).encode()
     stranger = Session(server.address)
     session = Session.opened(server.address)
@@ -274,7 +314,9 @@ def test_landmark_server__says_what_is_wrong_with_what_it_gets(server, head):
     assert "three" in faults({"chin": "x"}) or "[x, y, z]" in faults({"chin": "x"})
     assert "within 1 mm of the scan" in faults({"chin": [0, 0, 500]})
     chin = head.landmarks["chin"].tolist()
-    assert "lower corner must lie below" in faults({"chin": chin}, crop={"low": [1, 1, 1], "high": [0, 0, 0]})
+    assert "lower corner must lie below" in faults(
+        {"chin": chin}, crop={"low": [1, 1, 1], "high": [0, 0, 0]}
+    )
 
 
 class _Foreign(BaseHTTPRequestHandler):
@@ -298,20 +340,42 @@ FOREIGN_REQUEST = """async ([address, options]) => {
 
 
 @pytest.mark.slow
-def test_landmark_server__a_page_of_another_server_in_the_same_browser_gets_nothing(server, browser, tmp_path):
+def test_landmark_server__a_page_of_another_server_in_the_same_browser_gets_nothing(
+    server, browser, tmp_path
+):
     own = opened(browser, server.address)
-    cookies = own.context.cookies(f"http://127.0.0.1:{server.server_address[1]}{server.root}")
-    assert [(cookie["httpOnly"], cookie["sameSite"]) for cookie in cookies] == [(True, "Strict")]
+    cookies = own.context.cookies(
+        f"http://127.0.0.1:{server.server_address[1]}{server.root}"
+    )
+    assert [(cookie["httpOnly"], cookie["sameSite"]) for cookie in cookies] == [
+        (True, "Strict")
+    ]
     foreign_server = ThreadingHTTPServer(("127.0.0.1", 0), _Foreign)
     foreign_server.cookies = []
     with running(foreign_server):
         own.goto(f"http://127.0.0.1:{foreign_server.server_address[1]}/")
-        save = {"method": "POST", "credentials": "include", "body": json.dumps({"points": {"chin": [0, 0, 0]}})}
-        address = f"http://127.0.0.1:{server.server_address[1]}{server.root}"  # as if it were known
+        save = {
+            "method": "POST",
+            "credentials": "include",
+            "body": json.dumps({"points": {"chin": [0, 0, 0]}}),
+        }
+        # as if it were known
+        address = f"http://127.0.0.1:{server.server_address[1]}{server.root}"
         assert own.evaluate(FOREIGN_REQUEST, [f"{address}save", save]) == "TypeError"
-        assert own.evaluate(FOREIGN_REQUEST, [f"{address}save", save | {"mode": "no-cors"}]) == "TypeError"
-        assert own.evaluate(FOREIGN_REQUEST, [f"{address}mesh", {"credentials": "include"}]) == "TypeError"
-    assert foreign_server.cookies == [""] * len(foreign_server.cookies)  # ports share cookies, but not their paths
+        assert (
+            own.evaluate(
+                FOREIGN_REQUEST, [f"{address}save", save | {"mode": "no-cors"}]
+            )
+            == "TypeError"
+        )
+        assert (
+            own.evaluate(
+                FOREIGN_REQUEST, [f"{address}mesh", {"credentials": "include"}]
+            )
+            == "TypeError"
+        )
+    # ports share cookies, but not their paths
+    assert foreign_server.cookies == [""] * len(foreign_server.cookies)
     assert len(foreign_server.cookies) > 0
     assert [*tmp_path.glob("*landmarks*")] == []
     own.close()
@@ -320,7 +384,9 @@ def test_landmark_server__a_page_of_another_server_in_the_same_browser_gets_noth
 @pytest.mark.slow
 def test_landmark_page__names_are_data(server, browser, tmp_path):
     """Names of landmarks and files are neither markers of the template nor the end of a script."""
-    name = "$script </script><script>document.title = 'x'</script> \u2028 ${out} {about}"
+    name = (
+        "$script </script><script>document.title = 'x'</script> \u2028 ${out} {about}"
+    )
     (tmp_path / "landmarks.json").write_text(json.dumps({name: [0, 0, 60]}))
     page = opened(browser, server.address)
     assert page.title() == "Landmarks of scan.ply"

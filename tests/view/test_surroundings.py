@@ -16,7 +16,11 @@ def irradiance(environment, normal):
     phi = 2 * np.pi * ((np.arange(w) + 0.5) / w - 0.5)
     solid = np.sin(theta) * (np.pi / h) * (2 * np.pi / w)
     towards = np.stack(
-        [np.sin(theta)[:, None] * np.sin(phi), np.cos(theta)[:, None] + 0 * phi, np.sin(theta)[:, None] * np.cos(phi)],
+        [
+            np.sin(theta)[:, None] * np.sin(phi),
+            np.cos(theta)[:, None] + 0 * phi,
+            np.sin(theta)[:, None] * np.cos(phi),
+        ],
         axis=-1,
     )
     cosine = np.maximum(np.einsum("hwk,nk->nhw", towards, normal), 0)
@@ -32,7 +36,9 @@ def test_distant_lights__give_the_irradiance_of_the_environment():
         rng = np.random.default_rng(seed)
         rows = int(rng.integers(4, 40))
         environment = (
-            Environment(rng.random((rows, 2 * rows, 3)) ** rng.uniform(0, 8) + 1e-3) if seed else overcast_sky()
+            Environment(rng.random((rows, 2 * rows, 3)) ** rng.uniform(0, 8) + 1e-3)
+            if seed
+            else overcast_sky()
         )
         lights = distant_lights(environment)
         assert len(lights.direction) <= 256
@@ -41,7 +47,8 @@ def test_distant_lights__give_the_irradiance_of_the_environment():
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         true = irradiance(environment, normal)
         error = np.abs(of_lights(lights, normal) / true - 1)
-        # a region covers about 0.05 sr, a part of which may be below the horizon of a surface: all or nothing counts
+        # a region covers about 0.05 sr, a part of which may be below the horizon of a
+        # surface: all or nothing counts
         assert np.median(error) < 0.03
         assert np.sqrt((error**2).mean()) < 0.08
 
@@ -54,7 +61,8 @@ def test_distant_lights__converge():
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     true = irradiance(environment, normal)
     errors = [
-        np.abs(of_lights(distant_lights(environment, count), normal) / true - 1).mean() for count in (16, 64, 256)
+        np.abs(of_lights(distant_lights(environment, count), normal) / true - 1).mean()
+        for count in (16, 64, 256)
     ]
     assert errors[2] < errors[1] / 2 < errors[0] / 4
 
@@ -64,4 +72,6 @@ def test_distant_lights__of_a_single_texel():
     radiance[3, 5] = [1, 2, 3]
     lights = distant_lights(Environment(radiance))
     assert len(lights.direction) == 1
-    np.testing.assert_allclose(lights.irradiance[0] / lights.irradiance[0, 0], [1, 2, 3])
+    np.testing.assert_allclose(
+        lights.irradiance[0] / lights.irradiance[0, 0], [1, 2, 3]
+    )

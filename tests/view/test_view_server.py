@@ -12,11 +12,30 @@ from page_session import Session, running
 from skindb.errors import Fault, InputError
 from skindb.view.server import HTML, JSON, Content, PageServer
 
-METHODS = ("GET", "HEAD", "POST", "PUT", "DELETE", "OPTIONS", "PATCH", "TRACE", "CONNECT", "PROPFIND", "get")
+METHODS = (
+    "GET",
+    "HEAD",
+    "POST",
+    "PUT",
+    "DELETE",
+    "OPTIONS",
+    "PATCH",
+    "TRACE",
+    "CONNECT",
+    "PROPFIND",
+    "get",
+)
 
 
 def _refuse():
-    raise InputError(Fault("S1", "its subject must consent to exports", "no such consent", "show another take"))
+    raise InputError(
+        Fault(
+            "S1",
+            "its subject must consent to exports",
+            "no such consent",
+            "show another take",
+        )
+    )
 
 
 @pytest.fixture
@@ -28,7 +47,9 @@ def server(tmp_path):
         "faces/S1.json": Content(JSON, lambda: b'{"face": 1}'),
         "faces/S2.json": Content(JSON, _refuse),
     }
-    with running(PageServer(contents, {"save": lambda request: {"seen": request}})) as served:
+    with running(
+        PageServer(contents, {"save": lambda request: {"seen": request}})
+    ) as served:
         yield served
 
 
@@ -68,7 +89,13 @@ def test_server__a_token_is_accepted_once_by_concurrent_requests(server):
 def test_server__only_a_get_of_the_page_uses_the_token(server):
     address = urlsplit(server.address)
     stranger = Session(server.address)
-    for method, path in [("HEAD", ""), ("POST", ""), ("POST", "save"), ("GET", "faces/S1.json"), ("OPTIONS", "")]:
+    for method, path in [
+        ("HEAD", ""),
+        ("POST", ""),
+        ("POST", "save"),
+        ("GET", "faces/S1.json"),
+        ("OPTIONS", ""),
+    ]:
         assert stranger.status(method, f"{path}?{address.query}", b"{}") == 403
     assert stranger.status("GET", f"/?{address.query}") == 403
     assert stranger.status("GET", f"{address.path}?{address.query}&x=1") == 403
@@ -78,7 +105,16 @@ def test_server__only_a_get_of_the_page_uses_the_token(server):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_server__no_method_is_answered_without_the_session(server, session, method):
-    for cookie in (None, "", "skindb", "skindb=", "skindb=x", session.cookie[:-1], session.cookie + "x", "x=y; a=b"):
+    for cookie in (
+        None,
+        "",
+        "skindb",
+        "skindb=",
+        "skindb=x",
+        session.cookie[:-1],
+        session.cookie + "x",
+        "x=y; a=b",
+    ):
         for path in ("", "save", "faces/S1.json", "/", "/etc/passwd", "absent"):
             answer = Session(server.address, cookie=cookie).request(method, path, b"{}")
             assert answer.status == 403, (method, cookie, path)
@@ -116,7 +152,12 @@ def test_server__no_method_is_answered_to_other_hosts_and_origins(session, metho
 
 def test_server__answers_through_a_tunnel_from_another_port(session):
     assert session.status("GET", "", Host="localhost:8000") == 200
-    assert session.status("POST", "save", b"{}", Host="localhost:8000", Origin="http://localhost:8000") == 200
+    assert (
+        session.status(
+            "POST", "save", b"{}", Host="localhost:8000", Origin="http://localhost:8000"
+        )
+        == 200
+    )
 
 
 def test_server__a_post_needs_an_origin_and_json(session):
@@ -146,7 +187,15 @@ def test_server__serves_names_and_no_files(session, tmp_path, monkeypatch):
         "link/passwd",
         "//etc/passwd",
     ]
-    absent += ["/", "/faces/S1.json", "faces/S1.json/", "%66aces/S1.json", "faces%2fS1.json", "\\", "save"]
+    absent += [
+        "/",
+        "/faces/S1.json",
+        "faces/S1.json/",
+        "%66aces/S1.json",
+        "faces%2fS1.json",
+        "\\",
+        "save",
+    ]
     for name in absent:
         assert session.status("GET", name) == 404, name
     head = session.request("HEAD", "faces/S1.json")
@@ -157,11 +206,17 @@ def test_server__serves_names_and_no_files(session, tmp_path, monkeypatch):
 def test_server__names_a_fault_of_a_content(session):
     refused = session.request("GET", "faces/S2.json")
     assert refused.status == 404
-    assert refused.body.startswith(b"S1: its subject must consent to exports; found no such consent")
+    assert refused.body.startswith(
+        b"S1: its subject must consent to exports; found no such consent"
+    )
 
 
 def test_server__every_answer_forbids_caching_framing_and_other_sources(session):
-    for answer in (session.page, session.request("GET", "absent"), session.request("GET", "", Host="x.org")):
+    for answer in (
+        session.page,
+        session.request("GET", "absent"),
+        session.request("GET", "", Host="x.org"),
+    ):
         assert answer.headers["Cache-Control"] == "no-store"
         assert answer.headers["Referrer-Policy"] == "no-referrer"
         assert "default-src 'none'" in answer.headers["Content-Security-Policy"]
@@ -173,6 +228,21 @@ def test_server__every_answer_forbids_caching_framing_and_other_sources(session)
 def test_server__listens_on_this_machine_and_two_servers_have_different_secrets(server):
     assert server.server_address[0] == "127.0.0.1"
     with PageServer({}, {}) as other:
-        assert len({server.root, other.root, server.cookie, other.cookie, server.address, other.address}) == 6
-    with pytest.raises(InputError, match=r"port [0-9]+: must be free; found .*; choose another port, or omit --port"):
+        assert (
+            len(
+                {
+                    server.root,
+                    other.root,
+                    server.cookie,
+                    other.cookie,
+                    server.address,
+                    other.address,
+                }
+            )
+            == 6
+        )
+    with pytest.raises(
+        InputError,
+        match=r"port [0-9]+: must be free; found .*; choose another port, or omit --port",
+    ):
         PageServer({}, {}, port=server.server_address[1])

@@ -18,7 +18,13 @@ from skindb.render.direct import render_view, trace_view
 from skindb.render.environment import Environment
 from skindb.render.image import decode_srgb
 from skindb.render.rendering import render
-from skindb.render.scene import Camera, Lights, cameras_from_dome, from_model, lights_from_dome
+from skindb.render.scene import (
+    Camera,
+    Lights,
+    cameras_from_dome,
+    from_model,
+    lights_from_dome,
+)
 from skindb.schema import dataset
 from skindb.schema.brdf import kernel_tables, stored_brdf
 from skindb.view.face import Trait, face_record, page_omissions, still_picture
@@ -34,7 +40,9 @@ PICTURE = "(skindb.draw(), document.getElementById('canvas').toDataURL('image/pn
 
 @pytest.fixture(scope="module")
 def browser():
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    playwright = pytest.importorskip(
+        "playwright.sync_api", reason="playwright is not installed"
+    )
     if BROWSER is None:
         pytest.skip("there is no Chromium")
     with playwright.sync_playwright() as running:
@@ -52,16 +60,22 @@ def model():
 def page_file(model, tmp_path_factory):
     half = small_face((0.75, 0.4, 0.25))
     whole = small_face((0.9, 0.4, 0.2))
-    record = face_record(model, take="S1", attributes={"age": 30}, traits=(Trait("tan", whole, half),))
+    record = face_record(
+        model, take="S1", attributes={"age": 30}, traits=(Trait("tan", whole, half),)
+    )
     path = tmp_path_factory.mktemp("view") / "face.html"
     write_page(path, record, still_picture(model))
     return path
 
 
-def opened(browser, address, *, width=620, height=320):  # small: every pixel is computed on the CPU
+# small: every pixel is computed on the CPU
+def opened(browser, address, *, width=620, height=320):
     page = browser.new_page(viewport={"width": width, "height": height})
     page.problems = []
-    page.on("console", lambda said: page.problems.append(said.text) if said.type == "error" else None)
+    page.on(
+        "console",
+        lambda said: page.problems.append(said.text) if said.type == "error" else None,
+    )
     page.on("pageerror", lambda error: page.problems.append(str(error)))
     page.goto(address)
     page.evaluate("skindb.ready")
@@ -74,7 +88,9 @@ def pixels(page):
 
 
 def decoded(url):
-    return decode_srgb(imagecodecs.png_decode(base64.b64decode(url.split(",")[1]))[..., :3] / 255)
+    return decode_srgb(
+        imagecodecs.png_decode(base64.b64decode(url.split(",")[1]))[..., :3] / 255
+    )
 
 
 def square(page, *, pixels=WIDTH, **state):
@@ -84,7 +100,8 @@ def square(page, *, pixels=WIDTH, **state):
             const canvas = document.getElementById('canvas');
             skindb.stop();
             canvas.width = canvas.height = size;
-            Object.assign(skindb.state, {eye: [0, 0, 400], target: [0, 0, 0], tangent: 128 / 400, divider: 1,
+            Object.assign(skindb.state, {eye: [0, 0, 400], target: [0, 0, 0], tangent: 128 / 400,
+                divider: 1,
                                          background: [0, 0, 0]}, state);
             return PICTURE;
         }""".replace("PICTURE", PICTURE),
@@ -94,20 +111,31 @@ def square(page, *, pixels=WIDTH, **state):
 
 
 def lamp(position, intensity=(5e5, 4.75e5, 4.5e5)):
-    return {"position": list(map(float, position)), "intensity": list(intensity), "power": 1}
+    return {
+        "position": list(map(float, position)),
+        "intensity": list(intensity),
+        "power": 1,
+    }
 
 
 def rendered(model, lights, **options):
     surface = from_model(model)
     camera = cameras_from_dome(model["dome"].to_dataset())[0]
-    return render_view(surface, camera, lights, samples=2, disc_samples=1, **options).sum(axis=0)
+    return render_view(
+        surface, camera, lights, samples=2, disc_samples=1, **options
+    ).sum(axis=0)
 
 
 def compared(found, expected, camera_view):
-    """RMS difference over RMS, where rays of all sub-pixels meet skin and the display is not clipped."""
-    inside = binary_erosion(camera_view.coverage == 1, iterations=2)  # edges are smoothed in another way
+    """RMS difference over RMS, where rays of all sub-pixels meet skin and the display
+    is not clipped.
+    """
+    # edges are smoothed in another way
+    inside = binary_erosion(camera_view.coverage == 1, iterations=2)
     seen = inside & (expected < 0.95).all(axis=-1)
-    return float(np.sqrt(np.mean((found - expected)[seen] ** 2) / np.mean(expected[seen] ** 2))), seen
+    return float(
+        np.sqrt(np.mean((found - expected)[seen] ** 2) / np.mean(expected[seen] ** 2))
+    ), seen
 
 
 def exposure(model):
@@ -115,17 +143,32 @@ def exposure(model):
 
 
 @pytest.mark.parametrize(
-    ("chosen", "terms"), [([0], ("diffuse",)), ([1], ("surface",)), ([0, 1, 2], ("diffuse", "surface"))]
+    ("chosen", "terms"),
+    [([0], ("diffuse",)), ([1], ("surface",)), ([0, 1, 2], ("diffuse", "surface"))],
 )
-def test_page__pixels_are_those_of_the_renderer(browser, page_file, model, chosen, terms):
+def test_page__pixels_are_those_of_the_renderer(
+    browser, page_file, model, chosen, terms
+):
     page = opened(browser, page_file.as_uri())
     lights = lights_from_dome(model["dome"].to_dataset()).select(chosen)
     point = replace(lights, disc_radius=np.zeros(len(lights)))
     gain = exposure(model) / len(chosen)
     expected = gain * rendered(model, point, terms=terms)
-    state = {"withDiffuse": "diffuse" in terms, "withSurface": "surface" in terms, "glow": False, "softness": 0.5}
-    found = square(page, lights=[lamp(place) for place in LIGHTS[chosen]], exposure=1 / len(chosen), **state)
-    view = trace_view(from_model(model), cameras_from_dome(model["dome"].to_dataset())[0], samples=2)
+    state = {
+        "withDiffuse": "diffuse" in terms,
+        "withSurface": "surface" in terms,
+        "glow": False,
+        "softness": 0.5,
+    }
+    found = square(
+        page,
+        lights=[lamp(place) for place in LIGHTS[chosen]],
+        exposure=1 / len(chosen),
+        **state,
+    )
+    view = trace_view(
+        from_model(model), cameras_from_dome(model["dome"].to_dataset())[0], samples=2
+    )
     error, seen = compared(found, expected, view)
     assert seen.sum() > 10_000
     # eight bits make 0.4 %, half floats 0.05 %, the edges of shadow maps the rest
@@ -135,16 +178,32 @@ def test_page__pixels_are_those_of_the_renderer(browser, page_file, model, chose
 
 
 @pytest.mark.slow
-def test_page__light_under_the_skin_is_near_that_of_the_octree(browser, page_file, model):
+def test_page__light_under_the_skin_is_near_that_of_the_octree(
+    browser, page_file, model
+):
     page = opened(browser, page_file.as_uri())
     place = np.array([500.0, 60, 100])  # grazing: the nose casts a shadow
-    lights = Lights(place[None], np.array([[5e5, 4.75e5, 4.5e5]]), np.array([3.0]), -place[None] / 513, np.zeros(1))
+    lights = Lights(
+        place[None],
+        np.array([[5e5, 4.75e5, 4.5e5]]),
+        np.array([3.0]),
+        -place[None] / 513,
+        np.zeros(1),
+    )
     gain = exposure(model)
     expected = gain * rendered(model, lights, terms=("diffuse",), subsurface=True)
     local = gain * rendered(model, lights, terms=("diffuse",))
-    state = {"exposure": 1, "withDiffuse": True, "withSurface": False, "glow": True, "softness": 1.0}
+    state = {
+        "exposure": 1,
+        "withDiffuse": True,
+        "withSurface": False,
+        "glow": True,
+        "softness": 1.0,
+    }
     found = square(page, lights=[lamp(place)], **state)
-    view = trace_view(from_model(model), cameras_from_dome(model["dome"].to_dataset())[0], samples=2)
+    view = trace_view(
+        from_model(model), cameras_from_dome(model["dome"].to_dataset())[0], samples=2
+    )
     error, _ = compared(found, expected, view)
     without, _ = compared(local, expected, view)
     # a Gaussian stands for the dipole, and 0.7 % is the error of the viewer without it
@@ -155,23 +214,46 @@ def test_page__light_under_the_skin_is_near_that_of_the_octree(browser, page_fil
 
 @pytest.mark.slow
 @pytest.mark.parametrize("sky", [None, "window"])
-def test_page__light_from_all_directions_is_that_of_the_renderer(browser, model, tmp_path, sky):
+def test_page__light_from_all_directions_is_that_of_the_renderer(
+    browser, model, tmp_path, sky
+):
     environment = overcast_sky() if sky is None else Environment(_window())
-    record = face_record(model, take="S1", attributes={}, environment=None if sky is None else environment)
+    record = face_record(
+        model,
+        take="S1",
+        attributes={},
+        environment=None if sky is None else environment,
+    )
     write_page(tmp_path / "face.html", record, "")
     about = record["about"]
-    unit = np.sum(about["surroundings"]["irradiance"]) / distant_lights(environment).irradiance.sum()
-    camera = cameras_from_dome(model["dome"].to_dataset())[0].scaled(0.5)  # a quarter of the rays
-    seen = render(model, environment=Environment(environment.radiance * unit), camera=camera, samples=256)
+    unit = (
+        np.sum(about["surroundings"]["irradiance"])
+        / distant_lights(environment).irradiance.sum()
+    )
+    # a quarter of the rays
+    camera = cameras_from_dome(model["dome"].to_dataset())[0].scaled(0.5)
+    seen = render(
+        model,
+        environment=Environment(environment.radiance * unit),
+        camera=camera,
+        samples=256,
+    )
     expected = about["exposure"] * 0.5 * seen["radiance"].values
     page = opened(browser, (tmp_path / "face.html").as_uri(), width=400, height=200)
     page.get_by_label("light from all directions").check()
-    state = {"exposure": 0.5, "glow": False, "softness": 1.0, "withDiffuse": True, "withSurface": True}
+    state = {
+        "exposure": 0.5,
+        "glow": False,
+        "softness": 1.0,
+        "withDiffuse": True,
+        "withSurface": True,
+    }
     found = square(page, pixels=camera.width, lights=[], **state)
     view = trace_view(from_model(model), camera, samples=2)
     error, inside = compared(found, expected, view)
     assert inside.sum() > 10_000 / 4
-    # noise of 256 rays is 2 %; 256 lights stand for the sky, whose mirror images are 7 degrees apart
+    # noise of 256 rays is 2 %; 256 lights stand for the sky, whose mirror images are 7
+    # degrees apart
     assert error < 0.06, error
     assert not page.problems
     page.close()
@@ -225,12 +307,18 @@ def test_page__controls_do_what_they_say(browser, page_file):
 def test_page__a_trait_changes_the_side_after_the_divider(browser, page_file, model):
     page = opened(browser, page_file.as_uri())
     lights = [lamp([0, 0, 600])]
-    plain = square(page, lights=lights, divider=1, glow=False, withSurface=False, exposure=0.8)
+    plain = square(
+        page, lights=lights, divider=1, glow=False, withSurface=False, exposure=0.8
+    )
     page.get_by_label("tan").fill("1")
-    cut = square(page, lights=lights, divider=0.5, glow=False, withSurface=False, exposure=0.8)
+    cut = square(
+        page, lights=lights, divider=0.5, glow=False, withSurface=False, exposure=0.8
+    )
     np.testing.assert_allclose(cut[:, :120], plain[:, :120], atol=1e-6)
     lit = plain[100:150, 140:180] > 0.02
-    ratio = (cut[100:150, 140:180] / np.maximum(plain[100:150, 140:180], 1e-6))[lit.all(axis=-1)].mean(axis=0)
+    ratio = (cut[100:150, 140:180] / np.maximum(plain[100:150, 140:180], 1e-6))[
+        lit.all(axis=-1)
+    ].mean(axis=0)
     np.testing.assert_allclose(ratio, [1.5, 1.0, 2 / 3], rtol=0.03)  # of eight bits
     page.close()
 
@@ -259,12 +347,20 @@ def test_page__a_slider_ends_at_the_amount_of_its_trait(browser, model, tmp_path
     whole = small_face((0.9, 0.4, 0.2))
     pages = {}
     for amount in (1.0, 20.0, -0.5):
-        record = face_record(model, take="S1", attributes={}, traits=(Trait("tan", whole, half, amount),))
+        record = face_record(
+            model, take="S1", attributes={}, traits=(Trait("tan", whole, half, amount),)
+        )
         write_page(tmp_path / "face.html", record, "")
         page = opened(browser, (tmp_path / "face.html").as_uri())
         slider = page.get_by_label("tan")
-        assert {float(slider.get_attribute(name)) for name in ("min", "max")} == {0.0, amount}
-        assert f"between 0 and {amount:g}; at {amount / 2:g} its" in page.locator("#traits").inner_text()
+        assert {float(slider.get_attribute(name)) for name in ("min", "max")} == {
+            0.0,
+            amount,
+        }
+        assert (
+            f"between 0 and {amount:g}; at {amount / 2:g} its"
+            in page.locator("#traits").inner_text()
+        )
         slider.fill(f"{amount:g}")
         pages[amount] = pixels(page)
         page.close()
@@ -274,14 +370,20 @@ def test_page__a_slider_ends_at_the_amount_of_its_trait(browser, model, tmp_path
 
 @pytest.mark.slow
 @pytest.mark.parametrize("view", [(0, 0), (70, -30), (-150, 60)])
-def test_page__triangles_that_are_not_drawn_do_not_change_the_picture(browser, page_file, view):
+def test_page__triangles_that_are_not_drawn_do_not_change_the_picture(
+    browser, page_file, view
+):
     page = opened(browser, page_file.as_uri())
-    page.evaluate("([a, e]) => Object.assign(skindb.state, {azimuth: a, elevation: e, divider: 0.4})", view)
+    page.evaluate(
+        "([a, e]) => Object.assign(skindb.state, {azimuth: a, elevation: e, divider: 0.4})",
+        view,
+    )
     page.evaluate("skindb.amounts([1])")
     found = pixels(page)
     drawn, triangles = page.evaluate(
         """() => {
-            const painter = skindb.painter(), {triangles} = painter.face, sides = Object.values(painter.sides);
+            const painter = skindb.painter(), {triangles} = painter.face;
+            const sides = Object.values(painter.sides);
             const drawn = sides.map((side) => side.size);
             painter.visible.select = () => triangles;
             sides.forEach((side) => { side.seen = ''; });
@@ -289,7 +391,8 @@ def test_page__triangles_that_are_not_drawn_do_not_change_the_picture(browser, p
         }"""
     )
     np.testing.assert_array_equal(found, pixels(page))
-    assert 0 < sum(drawn) < 1.2 * triangles  # both sides of the divider together; the face has one layer
+    # both sides of the divider together; the face has one layer
+    assert 0 < sum(drawn) < 1.2 * triangles
     assert not page.problems
     page.close()
 
@@ -305,7 +408,8 @@ def test_page__draws_fewer_pixels_only_while_something_moves(browser, page_file)
     widths = page.evaluate(
         """async () => {
             const canvas = skindb.painter().canvas, found = [];
-            for (let press = 0; press < 50 && new Set(found).size < 2; press++) {  // a busy browser may skip the frame
+            // a busy browser may skip the frame
+            for (let press = 0; press < 50 && new Set(found).size < 2; press++) {
                 canvas.dispatchEvent(new KeyboardEvent('keydown', {key: 'ArrowLeft'}));
                 do {
                     await new Promise(requestAnimationFrame);
@@ -318,7 +422,8 @@ def test_page__draws_fewer_pixels_only_while_something_moves(browser, page_file)
     assert {*widths} == {round(width / 2), width}
     moved = pixels(page)
     page.evaluate("skindb.state.azimuth = 0")
-    assert np.abs(moved - pixels(page)).mean() > 1e-3  # the picture at rest is that of the new view
+    # the picture at rest is that of the new view
+    assert np.abs(moved - pixels(page)).mean() > 1e-3
     page.close()
 
 
@@ -331,7 +436,8 @@ def test_page__a_lost_context_is_restored(browser, page_file):
         """async () => {
             const loss = skindb.painter().gl.getExtension('WEBGL_lose_context');
             const canvas = document.getElementById('canvas');
-            const back = new Promise((done) => canvas.addEventListener('webglcontextrestored', done));
+            const restored = 'webglcontextrestored';
+            const back = new Promise((done) => canvas.addEventListener(restored, done));
             loss.loseContext();
             await new Promise((done) => setTimeout(done, 100));
             loss.restoreContext();
@@ -345,7 +451,10 @@ def test_page__a_lost_context_is_restored(browser, page_file):
 @pytest.mark.slow
 def test_page__without_webgl_there_are_still_pictures(browser, page_file):
     page = opened(browser, page_file.as_uri() + "?no-webgl=1")
-    assert page.locator("#status").inner_text() == "WebGL is switched off. Still pictures are shown instead."
+    assert (
+        page.locator("#status").inner_text()
+        == "WebGL is switched off. Still pictures are shown instead."
+    )
     assert page.locator("#still").is_visible()
     assert page.locator("#still").evaluate("(image) => image.naturalWidth") == 256
     assert not page.locator("#canvas").is_visible()
@@ -364,21 +473,30 @@ def test_page__fits_a_width_of_400_px(browser, page_file):
 def faces():
     """Two faces of a page."""
     about = {"S1": ((0.6, 0.4, 0.3), 30), "S2": ((0.2, 0.12, 0.1), 40)}
-    records = [face_record(small_face(rgb), take=take, attributes={"age": age}) for take, (rgb, age) in about.items()]
+    records = [
+        face_record(small_face(rgb), take=take, attributes={"age": age})
+        for take, (rgb, age) in about.items()
+    ]
     return [PagedFace.of(record, "") for record in records]
 
 
 @pytest.mark.slow
 def test_index_text__subjects_are_switched(browser, faces):
-    contents = {f"faces/{face.take}.json": Content(JSON, partial(getattr, face, "data")) for face in faces}
+    contents = {
+        f"faces/{face.take}.json": Content(JSON, partial(getattr, face, "data"))
+        for face in faces
+    }
     contents[""] = Content(HTML, lambda: index_text(faces).encode())
     with running(PageServer(contents, {})) as server:
         page = opened(browser, server.address)
         assert "token" not in page.url
         light = pixels(page).mean()
         page.get_by_label("Take").select_option(label="S2, age 40")
-        page.wait_for_function("() => document.getElementById('status').textContent.startsWith('S2')")
-        assert pixels(page).mean() < 0.8 * light  # the exposure is the same; highlights are
+        page.wait_for_function(
+            "() => document.getElementById('status').textContent.startsWith('S2')"
+        )
+        # the exposure is the same; highlights are
+        assert pixels(page).mean() < 0.8 * light
         assert not page.problems
         page.reload()
         page.evaluate("skindb.ready")
@@ -396,8 +514,13 @@ def test_write_folder__writes_what_the_server_serves(faces, tmp_path):
 
 
 @pytest.mark.slow
-def test_write_page__data_are_neither_markers_nor_the_end_of_a_script(browser, model, tmp_path):
-    text = "$script ${takes} {faces} </script><script>document.title = 'x'</script><!-- \u2028 $ $$ &lt;"
+def test_write_page__data_are_neither_markers_nor_the_end_of_a_script(
+    browser, model, tmp_path
+):
+    text = (
+        "$script ${takes} {faces} </script><script>document.title = 'x'</script><!-- "
+        "\u2028 $ $$ &lt;"
+    )
     record = face_record(model, take="S1", attributes={"hair": text, text: 1})
     write_page(tmp_path / "face.html", record, "", surroundings=text)
     assert (tmp_path / "face.html").read_text().count("function readFace") == 1
@@ -405,7 +528,10 @@ def test_write_page__data_are_neither_markers_nor_the_end_of_a_script(browser, m
     assert page.title() == "skindb: S1"
     page.get_by_text("About this face").click()
     assert page.locator("#about").inner_text().count(text) == 2
-    assert f"light from all directions ({text})" in page.locator("#surroundings").inner_text()
+    assert (
+        f"light from all directions ({text})"
+        in page.locator("#surroundings").inner_text()
+    )
     assert not page.problems
     page.close()
 
@@ -415,14 +541,17 @@ def test_page__every_control_has_a_name(browser, page_file):
     page = opened(browser, page_file.as_uri())
     for control in page.locator("input, select, button, canvas").all():
         name = control.evaluate(
-            "(one) => one.ariaLabel || (one.labels && one.labels[0]?.textContent) || one.textContent"
+            "(one) => one.ariaLabel || (one.labels && one.labels[0]?.textContent) "
+            "|| one.textContent"
         )
         assert name.strip()
     page.close()
 
 
 def test_camera__of_the_page_is_that_of_the_renderer(model):
-    """What `square` assumes: the camera of the model looks along -z from 400 mm with 400 px of focal length."""
+    """What `square` assumes: the camera of the model looks along -z from 400 mm with
+    400 px of focal length.
+    """
     camera = cameras_from_dome(model["dome"].to_dataset())[0]
     assert isinstance(camera, Camera)
     np.testing.assert_allclose(camera.centre, [0, 0, 400])
@@ -434,15 +563,24 @@ def test_face_record__skips_bases_without_weight(model):
     five = model.copy(deep=True)
     fitted = five["fitted"].to_dataset()
     basis = five["basis"].to_dataset()
-    weight = np.concatenate([fitted["basis_weight"].values, 0 * fitted["basis_weight"].values], axis=1)
+    weight = np.concatenate(
+        [fitted["basis_weight"].values, 0 * fitted["basis_weight"].values], axis=1
+    )
     tables = np.concatenate([kernel_tables(basis)] * 2, axis=-1)
     five["fitted"] = dataset(
-        {**{n: v.values for n, v in fitted.data_vars.items() if n != "basis_weight"}, "basis_weight": weight}
+        {
+            **{n: v.values for n, v in fitted.data_vars.items() if n != "basis_weight"},
+            "basis_weight": weight,
+        }
     )
-    five["basis"] = dataset({"basis_brdf": stored_brdf(tables), "disc_angular_radius": 0.0})
+    five["basis"] = dataset(
+        {"basis_brdf": stored_brdf(tables), "disc_angular_radius": 0.0}
+    )
     assert "tableB" not in face_record(five, take="S1", attributes={})["arrays"]
     moved = (Trait("tan", five, five),)
-    assert "tableB" in face_record(five, take="S1", attributes={}, traits=moved)["arrays"]
+    assert (
+        "tableB" in face_record(five, take="S1", attributes={}, traits=moved)["arrays"]
+    )
     said = page_omissions(five)
     assert said[0].startswith(
         "basis BRDFs: 3 of 6 are skipped (their weight is zero everywhere); results stay the same"

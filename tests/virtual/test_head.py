@@ -37,7 +37,9 @@ def head():
 
 
 def _boundary_edges(faces):
-    edge = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    edge = np.sort(
+        np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1
+    )
     unique, count = np.unique(edge, axis=0, return_counts=True)
     assert count.max() == 2
     return unique, unique[count == 1]
@@ -60,7 +62,11 @@ def test_parametric_head__is_a_disc_with_one_boundary_loop(head):
     assert len(seen) == len(boundary)
 
 
-@pytest.mark.parametrize("person", [p for p in default_people() if p.condition == "normal"], ids=lambda p: p.subject)
+@pytest.mark.parametrize(
+    "person",
+    [p for p in default_people() if p.condition == "normal"],
+    ids=lambda p: p.subject,
+)
 def test_parametric_head__every_default_person_has_sound_triangles(person):
     head = parametric_head(face_shape(person), spacing_mm=4.0)
     a, b, c = (head.vertices[head.faces[:, i]] for i in range(3))
@@ -68,7 +74,8 @@ def test_parametric_head__every_default_person_has_sound_triangles(person):
     area = np.linalg.norm(cross, axis=1) / 2
     mean = head.normals[head.faces].sum(axis=1)
     assert area.min() > 0.02  # mm2
-    # no triangle is turned against the true surface (coarse sampling: folds of the lips are rounded off)
+    # no triangle is turned against the true surface (coarse sampling: folds of the lips
+    # are rounded off)
     assert ((cross * mean).sum(axis=1) > 0).mean() > 0.999
     assert np.abs(field(head.vertices, face_shape(person))).max() < ON_SKIN
 
@@ -83,7 +90,8 @@ def test_normals__agree_with_a_finer_sampling_of_the_surface(head):
     summed /= np.linalg.norm(summed, axis=1, keepdims=True)
     angle = np.degrees(np.arccos(np.clip((summed * fine.normals).sum(axis=1), -1, 1)))
     assert np.median(angle) < 0.5
-    assert np.quantile(angle, 0.95) < 4.0  # creases: facets of 1.5 mm cannot follow them
+    # creases: facets of 1.5 mm cannot follow them
+    assert np.quantile(angle, 0.95) < 4.0
 
 
 def test_normals__are_the_gradient(head):
@@ -92,17 +100,35 @@ def test_normals__are_the_gradient(head):
     outside = field(head.vertices + eps * head.normals, shape)
     inside = field(head.vertices - eps * head.normals, shape)
     assert (outside > inside).all()
-    np.testing.assert_allclose(np.linalg.norm(normals(head.vertices, shape), axis=1), 1, atol=1e-12)
+    np.testing.assert_allclose(
+        np.linalg.norm(normals(head.vertices, shape), axis=1), 1, atol=1e-12
+    )
 
 
 def test_parametric_head__landmarks_have_the_known_names_and_lie_on_the_skin(head):
     assert set(head.landmarks) == LANDMARKS
     points = np.array(list(head.landmarks.values()))
     assert np.abs(field(points, FaceShape())).max() < ON_SKIN
-    assert cKDTree(head.vertices).query(points)[0].max() < 5.0  # inside the part that is sampled
+    # inside the part that is sampled
+    assert cKDTree(head.vertices).query(points)[0].max() < 5.0
     mark = head.landmarks
-    assert mark["eye_outer_left"][0] > mark["eye_inner_left"][0] > 0 > mark["eye_inner_right"][0]
-    heights = [mark[n][1] for n in ("forehead_centre", "nasion", "nose_tip", "subnasale", "lip_upper", "chin")]
+    assert (
+        mark["eye_outer_left"][0]
+        > mark["eye_inner_left"][0]
+        > 0
+        > mark["eye_inner_right"][0]
+    )
+    heights = [
+        mark[n][1]
+        for n in (
+            "forehead_centre",
+            "nasion",
+            "nose_tip",
+            "subnasale",
+            "lip_upper",
+            "chin",
+        )
+    ]
     assert heights == sorted(heights, reverse=True)
     assert mark["nose_tip"][2] == max(p[2] for p in mark.values())
 
@@ -138,14 +164,27 @@ def test_parametric_head__two_samplings_are_the_same_surface(head):
 def test_face_shape__differs_between_people_and_not_between_conditions():
     first = Person("A", 30, "female", "european", 1)
     second = Person("B", 30, "female", "european", 2)
-    assert face_shape(first) == face_shape(Person("A", 30, "female", "european", 1, condition="lotion"))
+    assert face_shape(first) == face_shape(
+        Person("A", 30, "female", "european", 1, condition="lotion")
+    )
     assert face_shape(first) != face_shape(second)
 
 
 @pytest.mark.parametrize("key", ["gender", "ancestry", "condition"])
 def test_person__rejects_unknown_words(key):
     with pytest.raises(ValueError, match=key):
-        Person(**({"subject": "A", "age": 30, "gender": "male", "ancestry": "african", "seed": 1} | {key: "unknown"}))
+        Person(
+            **(
+                {
+                    "subject": "A",
+                    "age": 30,
+                    "gender": "male",
+                    "ancestry": "african",
+                    "seed": 1,
+                }
+                | {key: "unknown"}
+            )
+        )
 
 
 def test_default_people__are_eight_takes_of_six_subjects():

@@ -9,13 +9,22 @@ from skindb.virtual.head_file import head_of_file, load_head
 from skindb.virtual.person import Person
 from skindb.virtual.skin import skin_of
 
-POPULATION = Path(__file__).resolve().parents[2] / ".." / "shared" / "data" / "face" / "face_population.npz"
+POPULATION = (
+    Path(__file__).resolve().parents[2]
+    / ".."
+    / "shared"
+    / "data"
+    / "face"
+    / "face_population.npz"
+)
 PERSON = Person("A", 40, "male", "east_asian", 3)
 
 
 def _grid(n=6):
     x, y = np.meshgrid(np.linspace(-30, 30, n), np.linspace(-30, 30, n))
-    vertices = np.stack([x.ravel(), y.ravel(), 90 - 0.01 * (x**2 + y**2).ravel()], axis=1)
+    vertices = np.stack(
+        [x.ravel(), y.ravel(), 90 - 0.01 * (x**2 + y**2).ravel()], axis=1
+    )
     i = np.arange(n * n).reshape(n, n)
     a, b, c, d = (q.ravel() for q in (i[:-1, :-1], i[:-1, 1:], i[1:, 1:], i[1:, :-1]))
     return vertices, np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
@@ -35,7 +44,9 @@ def test_load_head__reads_a_plain_npz(tmp_path):
     )
     model = load_head(tmp_path / "head.npz")
     assert model.landmarks == {"nose_tip": 14}
-    np.testing.assert_array_equal(model.regions["forehead"], np.flatnonzero(region == 1))
+    np.testing.assert_array_equal(
+        model.regions["forehead"], np.flatnonzero(region == 1)
+    )
     true, scan = head_of_file(tmp_path / "head.npz", PERSON)
     np.testing.assert_array_equal(scan.vertices, true.vertices[: len(vertices)])
     np.testing.assert_array_equal(scan.faces, faces)
@@ -75,7 +86,9 @@ def test_load_head__refuses_what_is_no_archive(tmp_path):
         load_head(tmp_path / "absent.npz")
 
 
-@pytest.mark.skipif(not POPULATION.is_file(), reason="the face population beside the project is absent")
+@pytest.mark.skipif(
+    not POPULATION.is_file(), reason="the face population beside the project is absent"
+)
 def test_head_of_file__population_gives_different_people_with_sites():
     first, scan = head_of_file(POPULATION, PERSON)
     second, _ = head_of_file(POPULATION, Person("B", 40, "female", "african", 4))

@@ -11,7 +11,8 @@ from skindb.virtual.person import ANCESTRIES, CONDITIONS, Person
 from skindb.virtual.skin import MATERIALS, SIGMA_TR, skin_of
 from skindb.virtual.skin_colour import HAEMOGLOBIN, MEAN, MELANIN, SITES
 
-ALBEDO = np.array([0.10, 0.05, 0.20, 0.30])  # stand-in albedos of the materials at normal incidence
+# stand-in albedos of the materials at normal incidence
+ALBEDO = np.array([0.10, 0.05, 0.20, 0.30])
 PERSON = Person("A", 35, "female", "european", 7)
 
 
@@ -32,16 +33,24 @@ def _specular(skin):
 @pytest.mark.parametrize("gender", ["female", "male"])
 def test_skin_of__cheek_colour_is_near_the_measured_mean(head, ancestry, gender):
     colours = [
-        _skin(head, Person("A", 30, gender, ancestry, seed)).diffuse[head.membership["cheek"] > 0.9].mean(axis=0)
+        _skin(head, Person("A", 30, gender, ancestry, seed))
+        .diffuse[head.membership["cheek"] > 0.9]
+        .mean(axis=0)
         for seed in range(3)
     ]
     # 25 %: the flush of the cheeks, ageing and low-frequency mottling are real shifts of one person
-    np.testing.assert_allclose(np.mean(colours, axis=0), MEAN[ancestry, gender][SITES.index("cheek")], rtol=0.25)
+    np.testing.assert_allclose(
+        np.mean(colours, axis=0),
+        MEAN[ancestry, gender][SITES.index("cheek")],
+        rtol=0.25,
+    )
 
 
 def test_skin_of__is_within_physical_limits(head):
     for condition in CONDITIONS:
-        skin = _skin(head, replace(PERSON, condition=condition, beard_density=1.0, freckles=1.0))
+        skin = _skin(
+            head, replace(PERSON, condition=condition, beard_density=1.0, freckles=1.0)
+        )
         assert skin.diffuse.min() > 0
         assert skin.diffuse.max() < 1
         assert skin.weights.min() >= 0
@@ -58,25 +67,44 @@ def test_skin_of__normal_condition_has_the_specular_albedo_of_skin(head):
 
 
 def test_skin_of__lotion_is_glossier_and_narrower_powder_the_opposite(head):
-    normal, lotion, powder = (_skin(head, replace(PERSON, condition=c)) for c in ("normal", "lotion", "powder"))
+    normal, lotion, powder = (
+        _skin(head, replace(PERSON, condition=c))
+        for c in ("normal", "lotion", "powder")
+    )
     assert (_specular(lotion) > 1.2 * _specular(normal)).all()
     assert (_specular(powder) < 0.9 * _specular(normal)).all()
-    sharp = [(s.weights[:, 2:] @ ALBEDO[2:]).sum() / _specular(s).sum() for s in (powder, normal, lotion)]
+    sharp = [
+        (s.weights[:, 2:] @ ALBEDO[2:]).sum() / _specular(s).sum()
+        for s in (powder, normal, lotion)
+    ]
     assert sharp == sorted(sharp)
     np.testing.assert_array_equal(lotion.diffuse, normal.diffuse)
 
 
 def test_skin_of__tan_is_darker_and_hot_is_redder(head):
-    normal, tan, hot = (_skin(head, replace(PERSON, condition=c)).diffuse for c in ("normal", "tan", "hot"))
-    np.testing.assert_allclose(np.log(normal / tan).mean(axis=0), 0.22 * MELANIN, rtol=1e-6)
-    np.testing.assert_allclose(np.log(normal / hot).mean(axis=0), 0.12 * HAEMOGLOBIN, rtol=1e-6)
+    normal, tan, hot = (
+        _skin(head, replace(PERSON, condition=c)).diffuse
+        for c in ("normal", "tan", "hot")
+    )
+    np.testing.assert_allclose(
+        np.log(normal / tan).mean(axis=0), 0.22 * MELANIN, rtol=1e-6
+    )
+    np.testing.assert_allclose(
+        np.log(normal / hot).mean(axis=0), 0.12 * HAEMOGLOBIN, rtol=1e-6
+    )
 
 
 def test_skin_of__beard_darkens_the_beard_region_only(head):
-    bare, shadow = (_skin(head, replace(PERSON, gender="male", beard_density=d)).diffuse for d in (0.0, 0.8))
+    bare, shadow = (
+        _skin(head, replace(PERSON, gender="male", beard_density=d)).diffuse
+        for d in (0.0, 0.8)
+    )
     outside = head.membership["beard"] == 0
     np.testing.assert_array_equal(bare[outside], shadow[outside])
-    assert (shadow[head.membership["beard"] > 0.9] < 0.95 * bare[head.membership["beard"] > 0.9]).all()
+    assert (
+        shadow[head.membership["beard"] > 0.9]
+        < 0.95 * bare[head.membership["beard"] > 0.9]
+    ).all()
 
 
 def test_skin_of__sites_lie_on_the_face_and_their_optics_are_consistent(head):
@@ -84,14 +112,21 @@ def test_skin_of__sites_lie_on_the_face_and_their_optics_are_consistent(head):
     assert [site.name for site in skin.sites] == list(SIGMA_TR)
     for site in skin.sites:
         sigma_t = site.sigma_a + site.sigma_s_prime
-        np.testing.assert_allclose(np.sqrt(3 * site.sigma_a * sigma_t), site.sigma_tr, rtol=1e-9)
+        np.testing.assert_allclose(
+            np.sqrt(3 * site.sigma_a * sigma_t), site.sigma_tr, rtol=1e-9
+        )
         s = np.sqrt(3 * site.sigma_a / sigma_t)
-        np.testing.assert_allclose(diffuse_reflectance(s, eta=1.3), site.diffuse_reflectance, rtol=1e-9)
-        np.testing.assert_allclose(reduced_albedo(s), site.sigma_s_prime / sigma_t, rtol=1e-9)
+        np.testing.assert_allclose(
+            diffuse_reflectance(s, eta=1.3), site.diffuse_reflectance, rtol=1e-9
+        )
+        np.testing.assert_allclose(
+            reduced_albedo(s), site.sigma_s_prime / sigma_t, rtol=1e-9
+        )
         assert (np.diff(site.sigma_tr) > 0).all()  # red travels farthest
         at = ((head.vertices - site.position) ** 2).sum(axis=1).argmin()
         assert head.membership[site.name][at] > 0.5
-        np.testing.assert_allclose(skin.sigma_tr[at], site.sigma_tr, rtol=0.1)  # Shepard mixes in the other sites
+        # Shepard mixes in the other sites
+        np.testing.assert_allclose(skin.sigma_tr[at], site.sigma_tr, rtol=0.1)
 
 
 def test_smooth_noise__has_zero_mean_and_unit_variance():

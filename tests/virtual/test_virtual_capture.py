@@ -26,13 +26,17 @@ DOME = build_dome(4, 3, width=64, height=80, rng=np.random.default_rng(1))
 def _simulate(out, **options):
     person = options.pop("person", PERSON)
     seed = options.pop("seed", 7)
-    simulate_take(out, person, DOME, rng=np.random.default_rng(seed), spacing_mm=4.0, **options)
+    simulate_take(
+        out, person, DOME, rng=np.random.default_rng(seed), spacing_mm=4.0, **options
+    )
     return out
 
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory):
-    return _simulate(tmp_path_factory.mktemp("virtual") / "T001", sensor=Sensor(noisy=False))
+    return _simulate(
+        tmp_path_factory.mktemp("virtual") / "T001", sensor=Sensor(noisy=False)
+    )
 
 
 def _read(folder, template, **keys):
@@ -41,18 +45,29 @@ def _read(folder, template, **keys):
 
 def _digest(folder):
     files = sorted(p for p in folder.rglob("*") if p.is_file())
-    return [(str(p.relative_to(folder)), hashlib.sha256(p.read_bytes()).hexdigest()) for p in files]
+    return [
+        (str(p.relative_to(folder)), hashlib.sha256(p.read_bytes()).hexdigest())
+        for p in files
+    ]
 
 
 def test_simulate_take__writes_every_file_the_format_promises(capture):
     record = json.loads((capture / "capture.json").read_text())
-    assert (record["format"], record["version"], record["subject"]) == ("skindb-capture", 1, "T001")
+    assert (record["format"], record["version"], record["subject"]) == (
+        "skindb-capture",
+        1,
+        "T001",
+    )
     assert record["consent"]["scope"] == ["fit", "statistics", "export", "publish"]
     assert {"age", "gender", "ancestry"} <= record["traits"].keys()
     for key in ("mesh", "landmarks", "regions", "dome", "contact"):
         assert (capture / record[key]).is_file()
     dome = json.loads((capture / record["dome"]).read_text())
-    assert (len(dome["cameras"]), len(dome["lights"]), len(dome["exposures"])) == (3, 4, 2)
+    assert (len(dome["cameras"]), len(dome["lights"]), len(dome["exposures"])) == (
+        3,
+        4,
+        2,
+    )
     for camera in dome["cameras"]:
         for exposure in dome["exposures"]:
             keys = {"camera": camera["id"], "exposure": exposure["id"]}
@@ -60,7 +75,9 @@ def test_simulate_take__writes_every_file_the_format_promises(capture):
             for light in dome["lights"]:
                 frame = _read(capture, dome["frames"], light=light["id"], **keys)
                 assert (frame.dtype, frame.shape) == (np.uint16, (80, 64, 3))
-                white = capture / dome["white"]["frames"].format(light=light["id"], **keys)
+                white = capture / dome["white"]["frames"].format(
+                    light=light["id"], **keys
+                )
                 assert white.is_file() == (camera["id"] in dome["white"]["cameras"])
     assert all(light["intensity"] is None for light in dome["lights"])
     assert len(dome["sequence"]) == 8
@@ -73,7 +90,15 @@ def test_simulate_take__scan_landmarks_and_regions_fit_the_true_surface(capture)
     marks = json.loads((capture / "landmarks.json").read_text())
     assert len(marks) == 20
     regions = json.loads((capture / "regions.json").read_text())
-    assert {"forehead", "nose", "cheek", "lips", "chin", "neck", "beard"} == regions.keys()
+    assert {
+        "forehead",
+        "nose",
+        "cheek",
+        "lips",
+        "chin",
+        "neck",
+        "beard",
+    } == regions.keys()
     for (ids,) in regions.values():
         assert max(ids) < len(scan.vertices)
     nose = scan.vertices[regions["nose"][0]]
@@ -89,18 +114,39 @@ def test_simulate_take__white_frames_give_the_true_intensities(capture):
     centre = camera.rotation @ np.array(white["point"]) + camera.translation
     x, y = np.floor((camera.matrix @ centre)[:2] / centre[2]).astype(int)
     for light, expected in zip(dome["lights"], true, strict=True):
-        frame = _read(capture, white["frames"], exposure="e1", light=light["id"], camera=camera.name)[y, x]
+        frame = _read(
+            capture,
+            white["frames"],
+            exposure="e1",
+            light=light["id"],
+            camera=camera.name,
+        )[y, x]
         levels = dome["cameras"][0]
-        radiance = (frame - levels["black_level"]) / (levels["white_level"] - levels["black_level"]) / 0.005
+        radiance = (
+            (frame - levels["black_level"])
+            / (levels["white_level"] - levels["black_level"])
+            / 0.005
+        )
         towards = np.array(light["position"]) - white["point"]
         square = towards @ towards
-        found = np.pi * radiance * square / (white["reflectance"] * towards[2] / np.sqrt(square))
+        found = (
+            np.pi
+            * radiance
+            * square
+            / (white["reflectance"] * towards[2] / np.sqrt(square))
+        )
         # the pixel is not exactly the point: lens, half a pixel; one step of the 12-bit converter
         np.testing.assert_allclose(found, expected, rtol=0.02)
 
 
 def test_simulate_take__frames_hold_a_lit_face_on_black(capture):
-    frame = _read(capture, "dome/frames/{exposure}/{light}_{camera}.png", exposure="e0", light="l000", camera="c00")
+    frame = _read(
+        capture,
+        "dome/frames/{exposure}/{light}_{camera}.png",
+        exposure="e0",
+        light="l000",
+        camera="c00",
+    )
     signal = frame.astype(int) - Sensor().black
     assert (signal[0, :3] == 0).all()
     face = signal[signal[..., 1] > 500]
@@ -109,22 +155,35 @@ def test_simulate_take__frames_hold_a_lit_face_on_black(capture):
 
 
 def test_simulate_take__exposures_and_vignetting_follow_the_format(tmp_path, capture):
-    bare = replace(DOME, cameras=tuple(replace(c, vignette=np.zeros(3)) for c in DOME.cameras))
+    bare = replace(
+        DOME, cameras=tuple(replace(c, vignette=np.zeros(3)) for c in DOME.cameras)
+    )
     plain = tmp_path / "plain"
-    simulate_take(plain, PERSON, bare, rng=np.random.default_rng(7), spacing_mm=4.0, sensor=Sensor(noisy=False, step=1))
+    simulate_take(
+        plain,
+        PERSON,
+        bare,
+        rng=np.random.default_rng(7),
+        spacing_mm=4.0,
+        sensor=Sensor(noisy=False, step=1),
+    )
     camera = DOME.cameras[0]
     sensor = Sensor()
     name = "dome/frames/{exposure}/l000_c00.png"
     long, short = (
-        (_read(folder, name, exposure=e).astype(float) - sensor.black) for folder, e in ((plain, "e0"), (plain, "e1"))
+        (_read(folder, name, exposure=e).astype(float) - sensor.black)
+        for folder, e in ((plain, "e0"), (plain, "e1"))
     )
     used = (short > 500) & (long < 0.95 * (sensor.white - sensor.black))
     assert used.sum() > 500
-    np.testing.assert_allclose(long[used] / short[used], 8, rtol=2e-3)  # 40 ms against 5 ms; rounding of 500
+    # 40 ms against 5 ms; rounding of 500
+    np.testing.assert_allclose(long[used] / short[used], 8, rtol=2e-3)
     y, x = np.mgrid[: camera.height, : camera.width] + 0.5
     r2 = (x - camera.matrix[0, 2]) ** 2 + (y - camera.matrix[1, 2]) ** 2
     r2 /= (camera.width**2 + camera.height**2) / 4
-    expected = long * (1 + camera.vignette[0] * r2 + camera.vignette[1] * r2**2)[..., None]
+    expected = (
+        long * (1 + camera.vignette[0] * r2 + camera.vignette[1] * r2**2)[..., None]
+    )
     shaded = _read(capture, name, exposure="e0").astype(float) - sensor.black
     # half a step of the 12-bit converter, and of this one
     np.testing.assert_allclose(shaded[used], expected[used], atol=9)
@@ -136,24 +195,43 @@ def test_simulate_take__truth_lies_beside_the_folder_and_is_consistent(capture):
         for name in ("normals", "diffuse_reflectance", "sigma_tr"):
             assert truth[name].shape == (n, 3)
         assert truth["surface_weights"].shape == (n, len(truth["surface_names"]))
-        np.testing.assert_allclose(np.linalg.norm(truth["normals"], axis=1), 1, atol=1e-9)
+        np.testing.assert_allclose(
+            np.linalg.norm(truth["normals"], axis=1), 1, atol=1e-9
+        )
         assert truth["site_sigma_tr"].shape == (len(truth["site_names"]), 3)
     assert not list(capture.rglob("*truth*"))
 
 
 def test_simulate_take__same_seed_same_bytes_other_seed_other_noise(tmp_path):
-    first, again, other = (_simulate(tmp_path / f"t{i}", seed=s) for i, s in enumerate((1, 1, 2)))
+    first, again, other = (
+        _simulate(tmp_path / f"t{i}", seed=s) for i, s in enumerate((1, 1, 2))
+    )
     assert _digest(first) == _digest(again)
-    differing = [a[0] for a, b in zip(_digest(first), _digest(other), strict=True) if a[1] != b[1]]
+    differing = [
+        a[0]
+        for a, b in zip(_digest(first), _digest(other), strict=True)
+        if a[1] != b[1]
+    ]
     assert "dome/frames/e0/l000_c00.png" in differing
     assert "dome/dome.json" not in differing  # one device
 
 
-def test_simulate_take__lotion_changes_the_highlights_and_not_the_shape(tmp_path, capture):
-    lotion = _simulate(tmp_path / "lotion", person=replace(PERSON, condition="lotion"), sensor=Sensor(noisy=False))
-    with np.load(str(capture) + ".truth.npz") as a, np.load(str(lotion) + ".truth.npz") as b:
+def test_simulate_take__lotion_changes_the_highlights_and_not_the_shape(
+    tmp_path, capture
+):
+    lotion = _simulate(
+        tmp_path / "lotion",
+        person=replace(PERSON, condition="lotion"),
+        sensor=Sensor(noisy=False),
+    )
+    with (
+        np.load(str(capture) + ".truth.npz") as a,
+        np.load(str(lotion) + ".truth.npz") as b,
+    ):
         np.testing.assert_array_equal(a["vertices"], b["vertices"])
-        assert (b["surface_weights"].sum(axis=1) != a["surface_weights"].sum(axis=1)).all()
+        assert (
+            b["surface_weights"].sum(axis=1) != a["surface_weights"].sum(axis=1)
+        ).all()
     assert json.loads((lotion / "capture.json").read_text())["condition"] == "lotion"
 
 
@@ -171,7 +249,9 @@ def test_simulate_take__reports_its_progress(tmp_path):
     assert seen[-1][1] == seen[-1][2] == 6
 
 
-def test_simulate_take__computes_subsurface_light_once_for_all_cameras(tmp_path, capture, monkeypatch):
+def test_simulate_take__computes_subsurface_light_once_for_all_cameras(
+    tmp_path, capture, monkeypatch
+):
     walks = []
 
     def counted(surface, lights, scene):
@@ -184,9 +264,14 @@ def test_simulate_take__computes_subsurface_light_once_for_all_cameras(tmp_path,
     assert walks == [4]
     for light in ("l000", "l001", "l002", "l003"):
         name = f"dome/frames/e1/{light}_c00.png"
-        spread, local = (_read(folder, name).astype(float) - Sensor().black for folder in (soft, capture))
+        spread, local = (
+            _read(folder, name).astype(float) - Sensor().black
+            for folder in (soft, capture)
+        )
         # the scatter keeps most of the power and moves it: into shadows, furthest in red
-        np.testing.assert_allclose(spread.sum(axis=(0, 1)), local.sum(axis=(0, 1)), rtol=0.1)
+        np.testing.assert_allclose(
+            spread.sum(axis=(0, 1)), local.sum(axis=(0, 1)), rtol=0.1
+        )
         assert (spread != local).any()
         dark = (local.max(axis=-1) <= 0) & (spread[..., 0] > 0)
         assert spread[dark, 0].sum() >= spread[dark, 2].sum()

@@ -17,9 +17,20 @@ SIZE = {"cameras": 2, "lights": 12, "width": 24, "height": 30}
 def test_cohort_people__are_those_of_table_1():
     people = cohort_people()
     assert Counter(one.gender for one in people) == {"male": 70, "female": 17}
-    assert Counter((one.ancestry == "european", one.gender) for one in people)[True, "male"] == 50
-    assert Counter(one.condition for one in people) == {"normal": 79, "lotion": 4, "makeup": 4}
-    ages = [one.age for one in people if one.ancestry == "european" and one.gender == "male"]
+    assert (
+        Counter((one.ancestry == "european", one.gender) for one in people)[
+            True, "male"
+        ]
+        == 50
+    )
+    assert Counter(one.condition for one in people) == {
+        "normal": 79,
+        "lotion": 4,
+        "makeup": 4,
+    }
+    ages = [
+        one.age for one in people if one.ancestry == "european" and one.gender == "male"
+    ]
     assert 13 <= min(ages) < 25 < 50 < max(ages) <= 59
     assert len({one.seed for one in people}) == 87
 
@@ -43,12 +54,17 @@ def test_simulate__continues_a_cohort(tmp_path):
     assert (first[0] / "capture.json").stat().st_mtime_ns == times[0]
     assert (first[1] / "capture.json").read_bytes() == whole
     assert json.loads((out / "cohort.json").read_text())["width"] == 24
-    with pytest.raises(InputError, match=r"cohort.json: a cohort is continued with the same options; found width 24"):
+    with pytest.raises(
+        InputError,
+        match=r"cohort.json: a cohort is continued with the same options; found width 24",
+    ):
         simulate(out, cohort=3, **SIZE | {"width": 32})
 
 
 def test_simulate__spares_a_folder_that_holds_no_cohort(tmp_path):
     (tmp_path / "P001").mkdir()
-    with pytest.raises(InputError, match="a new cohort needs an absent or empty folder"):
+    with pytest.raises(
+        InputError, match="a new cohort needs an absent or empty folder"
+    ):
         simulate(tmp_path, cohort=1, **SIZE)
     assert (tmp_path / "P001").is_dir()

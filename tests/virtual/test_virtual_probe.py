@@ -37,17 +37,23 @@ def test_fibre_profiles__near_fibres_are_the_walk_itself(walk):
     assert truth.profile.shape == (1, FIBRES, 3)
     for c in range(3):
         edges = np.array([0.75, 1.25])  # the ring that the first fibre lies in
-        ring, error = radial_profile(walk, SITE.sigma_a[c], SITE.sigma_s_prime[c], edges)
+        ring, error = radial_profile(
+            walk, SITE.sigma_a[c], SITE.sigma_s_prime[c], edges
+        )
         # 12 %: a fibre's face is not a ring, and the profile is steep there
-        assert truth.profile[0, 0, c] == pytest.approx(ring[0], rel=0.12, abs=5 * error[0])
+        assert truth.profile[0, 0, c] == pytest.approx(
+            ring[0], rel=0.12, abs=5 * error[0]
+        )
 
 
 def test_disc_shares__have_mean_and_variance_of_two_faces():
     middle = BIN * (np.arange(620) + 0.5)
     share = _disc_shares(middle, np.array([14.5])) @ _disc_shares(middle, middle)
     mean = (share @ middle)[0]
-    assert mean == pytest.approx(14.5 + FIBRE_RADIUS**2 / 4 / 14.5, abs=1e-3)  # variance across / (2 r)
-    # half the squared radius: a quarter of each face; rings of a tenth of the radius miss some of it
+    # variance across / (2 r)
+    assert mean == pytest.approx(14.5 + FIBRE_RADIUS**2 / 4 / 14.5, abs=1e-3)
+    # half the squared radius: a quarter of each face; rings of a tenth of the radius
+    # miss some of it
     assert share @ (middle - mean) ** 2 == pytest.approx(FIBRE_RADIUS**2 / 2, rel=0.02)
 
 
@@ -74,7 +80,10 @@ def test_write_probe__the_images_decode_to_the_profile(tmp_path):
     seconds = [e["seconds"] for e in meta["exposures"]]
     np.testing.assert_allclose(np.log2(np.array(seconds[:-1]) / seconds[1:]), 2 / 3)
     frames = [
-        imagecodecs.imread(tmp_path / meta["frames"].format(site="cheek", exposure=e["id"])) for e in meta["exposures"]
+        imagecodecs.imread(
+            tmp_path / meta["frames"].format(site="cheek", exposure=e["id"])
+        )
+        for e in meta["exposures"]
     ]
     assert frames[0].dtype == np.uint16
     y, x = np.mgrid[: frames[0].shape[0], : frames[0].shape[1]] + 0.5
@@ -82,12 +91,17 @@ def test_write_probe__the_images_decode_to_the_profile(tmp_path):
     white = meta["white_level"]
     decoded = np.full((FIBRES, 3), np.nan)
     for i, fibre in enumerate(meta["fibres"]):
-        inside = np.hypot(x - fibre["centre"][0], y - fibre["centre"][1]) <= fibre["radius"]
+        inside = (
+            np.hypot(x - fibre["centre"][0], y - fibre["centre"][1]) <= fibre["radius"]
+        )
         for c in range(3):
-            for frame, time in zip(frames, seconds, strict=True):  # the longest exposure that is not saturated
+            # the longest exposure that is not saturated
+            for frame, time in zip(frames, seconds, strict=True):
                 if frame[inside, c].max() < 0.95 * white:
                     signal = (frame[inside, c].mean() - black) / (white - black) / time
-                    decoded[i, c] = meta["scale"] * signal / np.broadcast_to(meta["gain"][i], 3)[c]
+                    decoded[i, c] = (
+                        meta["scale"] * signal / np.broadcast_to(meta["gain"][i], 3)[c]
+                    )
                     break
     bright = truth.profile[0] > 1e-5
     assert bright.sum() > 30

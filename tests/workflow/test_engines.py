@@ -1,4 +1,6 @@
-"""Results do not depend on where takes are worked on, on the number of workers, or on the order of the takes."""
+"""Results do not depend on where takes are worked on, on the number of workers, or on
+the order of the takes.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,8 @@ pytestmark = pytest.mark.slow
 distributed = pytest.importorskip("distributed")
 SMALL = {"takes": 2, "cameras": 3, "lights": 12, "width": 48, "height": 60}
 GIVEN = {"k": 2, "hold_out_lights": 0.1}
-OF_THE_RUN = ("seconds", "created", "inputs")  # seals of the inputs hold their time of creation
+# seals of the inputs hold their time of creation
+OF_THE_RUN = ("seconds", "created", "inputs")
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -49,7 +52,11 @@ def captures(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def address():
-    options = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": "127.0.0.1:0"}
+    options = {
+        "n_workers": 2,
+        "threads_per_worker": 1,
+        "dashboard_address": "127.0.0.1:0",
+    }
     with distributed.LocalCluster(**options) as cluster:
         yield cluster.scheduler_address
 
@@ -57,7 +64,11 @@ def address():
 def _filled(root, captures, **where):
     """A database of captures, models and registrations."""
     db = skindb.open(str(root))
-    list(results_of(map_takes(partial(ingest_take, db, spacing_mm=6.0), captures, **where)))
+    list(
+        results_of(
+            map_takes(partial(ingest_take, db, spacing_mm=6.0), captures, **where)
+        )
+    )
     takes = db.takes("capture")[:: -1 if "client" in where else 1]
     list(results_of(map_takes(partial(fit_with, db, given=GIVEN), takes, **where)))
     register_takes(db, **where)
@@ -69,21 +80,42 @@ def _filled(root, captures, **where):
 
 
 def _contents(db):
-    """Digest of every file of every version; provenance is compared without the values of the run."""
+    """Digest of every file of every version; provenance is compared without the values
+    of the run.
+    """
     found = {}
     for kind in db.kinds():
         for take in db.takes(kind):
             record = db.record(kind, take)
             manifest = json.loads((db.root / record.beside("manifest")).read_text())
-            digests = {name: digest for name, (digest, _) in manifest.items() if name != "zarr.json"}
-            about = {name: value for name, value in record.provenance.items() if name not in OF_THE_RUN}
-            made_from = [[one.get(name) for name in ("kind", "take", "generation")] for one in record.made_from]
-            found[kind, take] = (digests, about, made_from, record.contents, record.tables)
+            digests = {
+                name: digest
+                for name, (digest, _) in manifest.items()
+                if name != "zarr.json"
+            }
+            about = {
+                name: value
+                for name, value in record.provenance.items()
+                if name not in OF_THE_RUN
+            }
+            made_from = [
+                [one.get(name) for name in ("kind", "take", "generation")]
+                for one in record.made_from
+            ]
+            found[kind, take] = (
+                digests,
+                about,
+                made_from,
+                record.contents,
+                record.tables,
+            )
     return found
 
 
 @pytest.mark.slow
-def test_map_takes__the_same_bytes_on_every_engine_and_in_any_order(captures, address, tmp_path, small_textures):
+def test_map_takes__the_same_bytes_on_every_engine_and_in_any_order(
+    captures, address, tmp_path, small_textures
+):
     expected = _contents(_filled(tmp_path / "here", captures))
     assert len(expected) == 11  # two takes of four kinds, three studies
     assert min(len(digests) for digests, *_ in expected.values()) > 5
@@ -93,11 +125,16 @@ def test_map_takes__the_same_bytes_on_every_engine_and_in_any_order(captures, ad
     with connected(address) as client:
         with computing_on(client):
             assert principal_components(faces).equals(whole)
-        assert _contents(_filled(tmp_path / "cluster", captures[::-1], client=client)) == expected
+        assert (
+            _contents(_filled(tmp_path / "cluster", captures[::-1], client=client))
+            == expected
+        )
 
 
 @pytest.mark.slow
-def test_fit__a_driver_that_is_killed_continues_with_what_is_not_done(captures, address, tmp_path):
+def test_fit__a_driver_that_is_killed_continues_with_what_is_not_done(
+    captures, address, tmp_path
+):
     db = skindb.open(str(tmp_path / "db"))
     ingest_take(db, captures[0], spacing_mm=6.0)
     capture = db.read("capture", "V001")
@@ -105,15 +142,27 @@ def test_fit__a_driver_that_is_killed_continues_with_what_is_not_done(captures, 
         with db.stage("capture", take) as stage:
             stage.write(groups_of(capture))
             stage.commit(capture.attrs | {"subject": take})
-    command = [sys.executable, "-c", "from skindb.cli import main; main()", "fit", str(db.root), "--k", "2"]
+    command = [
+        sys.executable,
+        "-c",
+        "from skindb.cli import main; main()",
+        "fit",
+        str(db.root),
+        "--k",
+        "2",
+    ]
     command += ["--scheduler", address, "--json", "--progress", "json"]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as driver:
         assert driver.stderr is not None
-        finished = next(json.loads(line)["take"] for line in driver.stderr if '"finished"' in line)
+        finished = next(
+            json.loads(line)["take"] for line in driver.stderr if '"finished"' in line
+        )
         driver.kill()
     done = {take for take in db.takes("model") if db.history("model", take)}
     # a worker may still fit a take of the killed driver
-    run = subprocess.run([*command, "--wait", "60"], capture_output=True, text=True, check=False)
+    run = subprocess.run(
+        [*command, "--wait", "60"], capture_output=True, text=True, check=False
+    )
     assert run.returncode == 0, run.stderr
     again = json.loads(run.stdout)
     assert finished in done

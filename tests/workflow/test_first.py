@@ -1,4 +1,6 @@
-"""A fit that was killed after its first pass continues there, and gives the same model as an uninterrupted fit."""
+"""A fit that was killed after its first pass continues there, and gives the same model
+as an uninterrupted fit.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +45,10 @@ def _ingest(db):
 def _fit(db, parameters=PARAMETERS, **options):
     """Fit, and return the record and the stages that were computed."""
     stages = []
-    options = {"dictionary": few_materials(), "progress": lambda stage, *_: stages.append(stage)} | options
+    options = {
+        "dictionary": few_materials(),
+        "progress": lambda stage, *_: stages.append(stage),
+    } | options
     return fit_take(db, TAKE, parameters, **options), [
         stage for stage in dict.fromkeys(stages) if "compil" not in stage
     ]
@@ -83,8 +88,12 @@ def _files(db, record):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("options", [{}, {"light_gains": True, "hold_out_cameras": 0.3}])
-def test_fit_take__continues_after_the_first_pass_of_a_killed_run(db, monkeypatch, options):
+@pytest.mark.parametrize(
+    "options", [{}, {"light_gains": True, "hold_out_cameras": 0.3}]
+)
+def test_fit_take__continues_after_the_first_pass_of_a_killed_run(
+    db, monkeypatch, options
+):
     parameters = replace(PARAMETERS, **options)
     _kill(db, monkeypatch, parameters)
     resumed, stages = _fit(db, parameters)
@@ -93,14 +102,21 @@ def test_fit_take__continues_after_the_first_pass_of_a_killed_run(db, monkeypatc
     again, stages = _fit(db, parameters)  # the first pass was removed with the commit
     assert "first pass" in stages
     assert _files(db, resumed) == _files(db, again)
-    about = [{name: v for name, v in one.provenance.items() if name != "seconds"} for one in (resumed, again)]
+    about = [
+        {name: v for name, v in one.provenance.items() if name != "seconds"}
+        for one in (resumed, again)
+    ]
     assert about[0] == about[1]
     assert resumed.provenance["seconds"].keys() == again.provenance["seconds"].keys()
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("change", ["parameters", "capture", "dictionary", "method", "schema"])
-def test_fit_take__uses_no_first_pass_that_would_be_another(killed, change, monkeypatch):
+@pytest.mark.parametrize(
+    "change", ["parameters", "capture", "dictionary", "method", "schema"]
+)
+def test_fit_take__uses_no_first_pass_that_would_be_another(
+    killed, change, monkeypatch
+):
     parameters = PARAMETERS
     options = {}
     if change == "parameters":
@@ -133,7 +149,9 @@ def test_first_pass__is_no_result_and_leaves_nothing(killed):
     assert killed.verify() == []
     assert not (killed.root / "heads/first").exists()
     _fit(killed)
-    assert [path for path in killed.root.rglob("*") if path.parent.name == "first"] == []
+    assert [
+        path for path in killed.root.rglob("*") if path.parent.name == "first"
+    ] == []
     assert not (killed.root / "tombstones").exists()
     with pytest.raises(ValueError, match="model of S01 must be removed by `remove`"):
         killed.forget("model", TAKE)
@@ -144,7 +162,8 @@ def test_fit_take__refuses_while_another_run_works_on_the_take(db):
         with (
             db.lease(TAKE, *kinds, command="skindb ingest"),
             pytest.raises(
-                InputError, match="model of S01: only one run at a time may work on it; found skindb ingest on"
+                InputError,
+                match="model of S01: only one run at a time may work on it; found skindb ingest on",
             ),
         ):
             _fit(db)

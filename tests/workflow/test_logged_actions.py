@@ -1,4 +1,6 @@
-"""Functions of notebooks are logged once, also in other processes, and where the log cannot be written."""
+"""Functions of notebooks are logged once, also in other processes, and where the log
+cannot be written.
+"""
 
 from __future__ import annotations
 
@@ -18,8 +20,17 @@ from skindb.store.folder import Folder
 from skindb.workflow.audit import NotLoggedWarning, as_part, logged, logged_action
 
 # functions that use `logged_action` themselves
-LOG_THEMSELVES = {"backup", "calibrate", "clean", "create_release", "ingest_take", "record_consent", "withdraw"}
-# functions that compute or list what a command needs, and neither change nor disclose data of subjects
+LOG_THEMSELVES = {
+    "backup",
+    "calibrate",
+    "clean",
+    "create_release",
+    "ingest_take",
+    "record_consent",
+    "withdraw",
+}
+# functions that compute or list what a command needs, and neither change nor disclose
+# data of subjects
 NOT_LOGGED = {
     "describe_calibration",
     "parameters_of",
@@ -46,7 +57,9 @@ def _actions(db):
 
 
 def _takes_a_database(function):
-    return inspect.isfunction(function) and "db" in inspect.signature(function).parameters
+    return (
+        inspect.isfunction(function) and "db" in inspect.signature(function).parameters
+    )
 
 
 def _is_decorated(function):
@@ -59,9 +72,17 @@ def _is_decorated(function):
 
 
 def test_logged__every_function_of_a_database_is_decorated_or_named_here():
-    functions = {name: getattr(workflow, name) for name in workflow.__all__ if name != "logged_action"}
+    functions = {
+        name: getattr(workflow, name)
+        for name in workflow.__all__
+        if name != "logged_action"
+    }
     functions |= workflow.STUDIES
-    plain = {name for name, one in functions.items() if _takes_a_database(one) and not _is_decorated(one)}
+    plain = {
+        name
+        for name, one in functions.items()
+        if _takes_a_database(one) and not _is_decorated(one)
+    }
     assert plain == LOG_THEMSELVES | NOT_LOGGED
 
 
@@ -71,7 +92,13 @@ def test_logged__a_call_in_a_notebook_is_one_entry(db, tmp_path):
     workflow.coverage(db, takes=["S01"])
     workflow.summarise(db, ["S01", "S02"], surfels=20)
     workflow.record_consent(db, "S02", ["fit"])
-    assert _actions(db) == [("show", 1), ("fit", 1), ("study", 1), ("summarise", 2), ("consent", 0)]
+    assert _actions(db) == [
+        ("show", 1),
+        ("fit", 1),
+        ("study", 1),
+        ("summarise", 2),
+        ("consent", 0),
+    ]
     assert db.audit(subject="S02")[0][-1].counts == {"scopes": 1}
 
 
@@ -105,7 +132,9 @@ def test_logged_action__ends_with_an_error(db, tmp_path):
 
 
 def test_as_part__is_a_part_of_the_action_also_in_another_process(db, tmp_path):
-    draw = partial(workflow.show_take, db, variable="fit_status", out=tmp_path / "a.png")
+    draw = partial(
+        workflow.show_take, db, variable="fit_status", out=tmp_path / "a.png"
+    )
     with logged_action(db, "show", ["S01"]):
         sent = pickle.dumps(as_part(draw))
     pickle.loads(sent)("S01")
@@ -127,19 +156,34 @@ def test_logged__records_flags_and_numbers_but_no_text(db):
     def draw(db, take, *, edited=False, generation=None, title="", **options):
         return title
 
-    assert draw(db, "S01", generation=2, title="Anna", explain="Anna", edited=True, gltf=False) == "Anna"
+    assert (
+        draw(
+            db,
+            "S01",
+            generation=2,
+            title="Anna",
+            explain="Anna",
+            edited=True,
+            gltf=False,
+        )
+        == "Anna"
+    )
     [entry] = db.audit()[0]
     assert entry.parameters == {"what": "picture", "generation": 2, "edited": True}
 
 
 def test_logged__a_mistaken_path_does_not_become_a_database(tmp_path):
     with pytest.raises(InputError, match="none"):
-        workflow.show_take(Database(tmp_path / "absent"), "S01", "fit_status", tmp_path / "a.png")
+        workflow.show_take(
+            Database(tmp_path / "absent"), "S01", "fit_status", tmp_path / "a.png"
+        )
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "folder").mkdir()
     (tmp_path / "folder" / "letter.txt").write_text("x")
     with pytest.raises(InputError, match="none"):
-        workflow.show_take(Database(tmp_path / "folder"), "S01", "fit_status", tmp_path / "a.png")
+        workflow.show_take(
+            Database(tmp_path / "folder"), "S01", "fit_status", tmp_path / "a.png"
+        )
     assert [path.name for path in (tmp_path / "folder").iterdir()] == ["letter.txt"]
 
 
@@ -149,7 +193,9 @@ class _Disc:
     def __init__(self, monkeypatch, error):
         self.error = OSError(error, "refused by the disk", "staging")
         self.create = Folder.create
-        monkeypatch.setattr(Folder, "create", lambda *args, **options: self(*args, **options))
+        monkeypatch.setattr(
+            Folder, "create", lambda *args, **options: self(*args, **options)
+        )
 
     def __call__(self, *args, **options):
         if self.error is not None:
@@ -159,7 +205,10 @@ class _Disc:
 
 def test_logged__what_only_reads_is_done_with_a_warning(db, tmp_path, monkeypatch):
     _Disc(monkeypatch, errno.EROFS)
-    with pytest.warns(NotLoggedWarning, match=r"^show was not written to the audit log of .*: refused by the disk$"):
+    with pytest.warns(
+        NotLoggedWarning,
+        match=r"^show was not written to the audit log of .*: refused by the disk$",
+    ):
         workflow.show_take(db, "S01", "fit_status", tmp_path / "a.png")
     assert (tmp_path / "a.png").exists()
 
@@ -176,7 +225,9 @@ def test_logged__a_damaged_secret_does_not_prevent_reading(db, tmp_path):
 
 def test_logged__a_change_that_cannot_be_logged_is_refused(db, monkeypatch):
     _Disc(monkeypatch, errno.EACCES)
-    monkeypatch.setattr(Database, "record_consent", lambda *_: pytest.fail("it was recorded"))
+    monkeypatch.setattr(
+        Database, "record_consent", lambda *_: pytest.fail("it was recorded")
+    )
     with pytest.raises(OSError, match="refused by the disk"):
         workflow.record_consent(db, "S01", [])
 
@@ -198,7 +249,9 @@ def test_withdraw__that_frees_the_disk_is_logged_at_its_end(db, monkeypatch):
 
 
 def test_withdraw__is_logged_before_anything_is_removed(db, monkeypatch):
-    monkeypatch.setattr(Database, "erase", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
+    monkeypatch.setattr(
+        Database, "erase", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt)
+    )
     with pytest.raises(KeyboardInterrupt):
         workflow.withdraw(db, "S02")
     assert _actions(db) == [("withdrawal", 0)]

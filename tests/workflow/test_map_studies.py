@@ -29,10 +29,17 @@ def database(tmp_path_factory):
         level = 0.5 - STEP * (i % 2) + 0.005 * rng.standard_normal()
         colour = np.full(fitted["diffuse_reflectance"].shape, level) * [1.0, 0.7, 0.5]
         colour = colour + 0.01 * rng.standard_normal(colour.shape)
-        model["fitted"] = fitted.assign(diffuse_reflectance=fitted["diffuse_reflectance"].copy(data=colour))
-        model.attrs |= {"subject": f"S{i}", "traits": {"gender": "male" if i % 2 else "female", "age": 20 + 5 * i}}
+        model["fitted"] = fitted.assign(
+            diffuse_reflectance=fitted["diffuse_reflectance"].copy(data=colour)
+        )
+        model.attrs |= {
+            "subject": f"S{i}",
+            "traits": {"gender": "male" if i % 2 else "female", "age": 20 + 5 * i},
+        }
         with db.stage("model", f"S{i}") as stage:
-            stage.write({str(name): node.to_dataset() for name, node in model.children.items()})
+            stage.write(
+                {str(name): node.to_dataset() for name, node in model.children.items()}
+            )
             stage.commit(model.attrs)
     return db
 
@@ -42,8 +49,13 @@ def test_maps__find_the_step(database):
     assert study.attrs["study"] == "maps.group_by-gender_permutations-100"
     header, rows = tabulate_study(study)
     red = dict(zip(header, rows[0], strict=True))
-    assert (red["contrast"], red["quantity"], red["subjects"]) == ("male less female", "R_d R", 8)
-    assert red["mean_effect"] == pytest.approx(-STEP, abs=0.01)  # 0.005 of the level differs between subjects
+    assert (red["contrast"], red["quantity"], red["subjects"]) == (
+        "male less female",
+        "R_d R",
+        8,
+    )
+    # 0.005 of the level differs between subjects
+    assert red["mean_effect"] == pytest.approx(-STEP, abs=0.01)
     assert "permutations" in describe_study(study)[0]
     assert study.attrs["registration"][0]["reason"].startswith("8 takes")
 
@@ -59,7 +71,9 @@ def test_components__first_axis_is_the_step(database):
 def test_correlations__channels_go_together(database):
     study = workflow.correlations(database, permutations=200)
     header, rows = tabulate_study(study)
-    one = {row[0]: dict(zip(header, row, strict=True)) for row in rows}["R_d R with R_d G"]
+    one = {row[0]: dict(zip(header, row, strict=True)) for row in rows}[
+        "R_d R with R_d G"
+    ]
     assert one["component_correlation"] > 0.95
     assert one["correlation_count"] == 8
 
@@ -67,10 +81,16 @@ def test_correlations__channels_go_together(database):
 @pytest.mark.slow
 def test_analyze__writes_tables_and_plots(database, tmp_path):
     url = str(database.folder)
-    for what, options in (("maps", ["--group-by", "age"]), ("components", ["--k", "2"]), ("correlations", [])):
+    for what, options in (
+        ("maps", ["--group-by", "age"]),
+        ("components", ["--k", "2"]),
+        ("correlations", []),
+    ):
         path = tmp_path / f"{what}.png"
         few = [] if what == "components" else ["--permutations", "100"]
-        done = CliRunner().invoke(cli, ["analyze", url, what, *options, *few, "--plot", str(path), "--json"])
+        done = CliRunner().invoke(
+            cli, ["analyze", url, what, *options, *few, "--plot", str(path), "--json"]
+        )
         assert done.exit_code == 0, done.output
         assert json.loads(done.stdout)["rows"]
         assert path.stat().st_size > 1000
@@ -87,7 +107,8 @@ def test_refresh__repeats_all(database):
         record = database.record("population", study.attrs["study"])
         parameters = record.provenance["parameters"]
         assert (
-            repeat_study(database, record.take, parameters).generation == record.generation
+            repeat_study(database, record.take, parameters).generation
+            == record.generation
         )  # the same parameters: nothing to do
 
 

@@ -31,17 +31,28 @@ def _imported(module: str) -> set[str]:
             continue
         seen.add(name)
         for node in ast.walk(ast.parse(_source(name).read_text())):
-            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("skindb"):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(
+                "skindb"
+            ):
                 below = [f"{node.module}.{one.name}" for one in node.names]
                 waiting += [one if _source(one) else node.module for one in below]
     return seen
 
 
 @pytest.mark.parametrize(
-    ("module", "method"), [("skindb.fit.model", fit.METHOD), ("skindb.analysis.summary", summaries.METHOD)]
+    ("module", "method"),
+    [("skindb.fit.model", fit.METHOD), ("skindb.analysis.summary", summaries.METHOD)],
 )
 def test_method__covers_all_that_the_results_are_made_with(module, method):
-    names = {name.removeprefix("skindb.").replace(".", "/") for name in _imported(module)}
+    names = {
+        name.removeprefix("skindb.").replace(".", "/") for name in _imported(module)
+    }
     assert len(names) > 10
-    missing = {name for name in names if not any(f"{name}/".startswith(f"{one}/") for one in method)}
-    assert {name for name in missing if name.split("/")[0] not in WITHOUT_NUMBERS} == set()
+    missing = {
+        name
+        for name in names
+        if not any(f"{name}/".startswith(f"{one}/") for one in method)
+    }
+    assert {
+        name for name in missing if name.split("/")[0] not in WITHOUT_NUMBERS
+    } == set()

@@ -26,14 +26,22 @@ def pigmented(seed, **about):
     fitted = model["fitted"].to_dataset()
     n = round(fitted.sizes["surfel"] ** 0.5)
     rng = np.random.default_rng(seed)
-    melanin = 3 * gaussian_filter((rng.random((n, n)) < 0.02).astype(float), 1.2) + 0.5 * seed
+    melanin = (
+        3 * gaussian_filter((rng.random((n, n)) < 0.02).astype(float), 1.2) + 0.5 * seed
+    )
     field = gaussian_filter(rng.standard_normal((n, n)), 2)
-    amounts = np.stack([melanin, 0.2 * (field > 0.5 * field.std())], axis=-1).reshape(-1, 2)
+    amounts = np.stack([melanin, 0.2 * (field > 0.5 * field.std())], axis=-1).reshape(
+        -1, 2
+    )
     amounts = np.resize(amounts, (fitted.sizes["surfel"], 2))
-    colour = np.exp(np.log([0.45, 0.27, 0.2]) - amounts @ np.stack([MELANIN, HAEMOGLOBIN]))
+    colour = np.exp(
+        np.log([0.45, 0.27, 0.2]) - amounts @ np.stack([MELANIN, HAEMOGLOBIN])
+    )
     dims = fitted["diffuse_reflectance"].dims
     model["fitted"] = fitted.assign(
-        diffuse_reflectance=fitted["diffuse_reflectance"].copy(data=colour).transpose(*dims)
+        diffuse_reflectance=fitted["diffuse_reflectance"]
+        .copy(data=colour)
+        .transpose(*dims)
     )
     model.attrs |= about
     return model
@@ -43,7 +51,9 @@ def stored(folder, models):
     db = Database(folder / "db")
     for take, model in models.items():
         with db.stage("model", take) as stage:
-            stage.write({str(name): node.to_dataset() for name, node in model.children.items()})
+            stage.write(
+                {str(name): node.to_dataset() for name, node in model.children.items()}
+            )
             stage.commit(model.attrs)
     return db
 
@@ -51,7 +61,11 @@ def stored(folder, models):
 @pytest.fixture(scope="module")
 def database(tmp_path_factory):
     people = {
-        f"S{i}": pigmented(i, subject=f"S{i}", traits={"age": age, "gender": "male" if i == 3 else "female"})
+        f"S{i}": pigmented(
+            i,
+            subject=f"S{i}",
+            traits={"age": age, "gender": "male" if i == 3 else "female"},
+        )
         for i, age in enumerate(AGES, 1)
     }
     return stored(tmp_path_factory.mktemp("pigments"), people)
@@ -63,13 +77,21 @@ def test_chromophores__study_is_repeatable_and_reports_its_axes(database):
     assert set(study.children) == {"chromophores", "chromophore_table", "mean_face"}
     header, rows = tabulate_study(study)
     assert header[:4] == ["group", "region", "chromophore", "group_chromophore_count"]
-    assert {(row[0], row[3]) for row in rows if row[1] == "face"} == {("female", 2), ("male", 1)}
+    assert {(row[0], row[3]) for row in rows if row[1] == "face"} == {
+        ("female", 2),
+        ("male", 1),
+    }
     assert describe_study(study)[0].startswith("axes: ")
-    melanin = study["chromophores"]["take_chromophore"].sel(region="no_beard", chromophore="melanin").values
+    melanin = (
+        study["chromophores"]["take_chromophore"]
+        .sel(region="no_beard", chromophore="melanin")
+        .values
+    )
     assert (np.diff(melanin) > 0).all()  # each is darker than the one before
     again = workflow.chromophores(database, group_by="gender")
     np.testing.assert_array_equal(
-        again["chromophores"]["chromophore_axis"].values, study["chromophores"]["chromophore_axis"].values
+        again["chromophores"]["chromophore_axis"].values,
+        study["chromophores"]["chromophore_axis"].values,
     )
     face = study["mean_face"].to_dataset()
     assert int(face["face_diffuse_reflectance_count"].max()) == 3
@@ -79,16 +101,24 @@ def test_chromophores__two_people_have_no_mean_face(tmp_path):
     db = stored(tmp_path, {f"S{i}": pigmented(i, subject=f"S{i}") for i in (1, 2)})
     study = workflow.chromophores(db)
     assert set(study.children) == {"chromophores", "chromophore_table"}
-    assert any("one texel must be measured in 3 subjects" in one["reason"] for one in study.attrs["registration"])
+    assert any(
+        "one texel must be measured in 3 subjects" in one["reason"]
+        for one in study.attrs["registration"]
+    )
 
 
 @pytest.mark.slow
 def test_analyze__writes_tables_and_plots(database, tmp_path):
     url = str(database.folder)
-    done = CliRunner().invoke(cli, ["analyze", url, "chromophores", "--plot", str(tmp_path / "a.png"), "--json"])
+    done = CliRunner().invoke(
+        cli,
+        ["analyze", url, "chromophores", "--plot", str(tmp_path / "a.png"), "--json"],
+    )
     assert done.exit_code == 0, done.output
     assert json.loads(done.stdout)["study"] == "chromophores"
-    done = CliRunner().invoke(cli, ["analyze", url, "coverage", "--plot", str(tmp_path / "b.png")])
+    done = CliRunner().invoke(
+        cli, ["analyze", url, "coverage", "--plot", str(tmp_path / "b.png")]
+    )
     assert done.exit_code == 0, done.output
     assert "age band: no subjects in 40-49, 50-59" in " ".join(done.stdout.split())
     assert {path.name for path in tmp_path.iterdir()} == {"a.png", "b.png"}
@@ -101,7 +131,8 @@ def test_refresh__repeats_both(database):
         workflow.STUDIES[what](database)
         record = database.record("population", what)
         again = repeat_study(database, record.take, record.provenance["parameters"])
-        assert again.generation == record.generation  # the same parameters: nothing to do
+        # the same parameters: nothing to do
+        assert again.generation == record.generation
 
 
 def test_chromophores__takes_without_landmarks(tmp_path):

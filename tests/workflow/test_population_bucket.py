@@ -20,12 +20,17 @@ WORD = "marker-of-nobody"  # planted in the attributes of the subject
 @pytest.fixture
 def db(bucket, monkeypatch):
     """Takes A, A.lotion, B, C in a bucket."""
-    monkeypatch.setattr(study_inputs, "dictionary_tables", lambda *_: TABLES)  # 8 of the 59
+    # 8 of the 59
+    monkeypatch.setattr(study_inputs, "dictionary_tables", lambda *_: TABLES)
     db = skindb.open(bucket)
     for take, model in population().items():
         with db.stage("model", take) as stage:
-            stage.write({str(name): node.to_dataset() for name, node in model.children.items()})
-            stage.commit(model.attrs | ({"remark": WORD} if take.startswith("A") else {}))
+            stage.write(
+                {str(name): node.to_dataset() for name, node in model.children.items()}
+            )
+            stage.commit(
+                model.attrs | ({"remark": WORD} if take.startswith("A") else {})
+            )
     return db
 
 
@@ -33,7 +38,12 @@ def test_withdraw__of_the_only_subject_of_a_bucket(bucket):
     db = skindb.open(bucket)
     with db.stage("capture", "A") as stage:
         stage.commit({"consent_scope": ["fit"]})
-    for command in (["withdraw", bucket, "A", "--yes"], ["verify", bucket], ["info", bucket], ["clean", bucket]):
+    for command in (
+        ["withdraw", bucket, "A", "--yes"],
+        ["verify", bucket],
+        ["info", bucket],
+        ["clean", bucket],
+    ):
         result = CliRunner().invoke(cli, command)
         assert result.exit_code == 0, result.exception
     assert db.names() == ["audit", "secret", "withdrawn"]
@@ -46,10 +56,14 @@ def test_population__of_a_bucket(db):
     db.create_release("r1")
     released = workflow.translucency(db, release="r1")
     assert db.takes("model", where="condition == 'lotion'") == ["A.lotion"]
-    assert db.takes("model", where="condition == 'lotion'") == ["A.lotion"]  # by the catalogue
+    # by the catalogue
+    assert db.takes("model", where="condition == 'lotion'") == ["A.lotion"]
     with (
         db.lease("A", "model"),
-        pytest.raises(InputError, match="model of A: only one run at a time may work on it; found python on"),
+        pytest.raises(
+            InputError,
+            match="model of A: only one run at a time may work on it; found python on",
+        ),
     ):
         workflow.withdraw(db, "A")
     assert db.has("model", "A")

@@ -1,4 +1,6 @@
-"""Captures of a withdrawn subject: refused, suspended while the subject is withdrawn, and admitted by a new consent."""
+"""Captures of a withdrawn subject: refused, suspended while the subject is withdrawn,
+and admitted by a new consent.
+"""
 
 from __future__ import annotations
 
@@ -56,9 +58,14 @@ def _edit(folder, **changes):
 
 def test_ingest__of_a_withdrawn_subject_is_refused_in_one_line(db, folder):
     before = contents(db.root)
-    result = CliRunner().invoke(cli, ["ingest", str(db.root), str(folder), "--spacing", "8"])
+    result = CliRunner().invoke(
+        cli, ["ingest", str(db.root), str(folder), "--spacing", "8"]
+    )
     [line] = str(result.exception).splitlines()
-    assert f"{SUBJECT}: a withdrawn subject must consent again before a capture is ingested; found a withdra" in line
+    assert (
+        f"{SUBJECT}: a withdrawn subject must consent again before a capture is "
+        "ingested; found a withdra"
+    ) in line
     assert line.endswith("if there is a new consent, state its date with --new-consent")
     after = contents(db.root)
     attempt = "audit/000000/000000003.json"  # the attempt is logged
@@ -77,7 +84,9 @@ def test_ingest__with_a_new_consent_is_admitted_from_then_on(db, folder):
     assert db.verify() == []
 
 
-def test_ingest__that_was_killed_after_the_new_consent_continues_by_the_same_call(db, folder, monkeypatch):
+def test_ingest__that_was_killed_after_the_new_consent_continues_by_the_same_call(
+    db, folder, monkeypatch
+):
     def die(*_):
         raise KeyboardInterrupt
 
@@ -86,13 +95,19 @@ def test_ingest__that_was_killed_after_the_new_consent_continues_by_the_same_cal
         with pytest.raises(KeyboardInterrupt):
             workflow.ingest_take(db, folder, new_consent=date.today(), **OPTIONS)
     assert db.takes() == []
-    assert workflow.ingest_take(db, folder, new_consent=date.today(), **OPTIONS).generation == 1
+    assert (
+        workflow.ingest_take(db, folder, new_consent=date.today(), **OPTIONS).generation
+        == 1
+    )
 
 
 @pytest.mark.parametrize("days", [-3, 3])
 def test_ingest__with_an_impossible_date_is_refused(db, folder, days):
     day = date.today() + timedelta(days=days)
-    with pytest.raises(InputError, match=f"a new consent must be given after the withdrawal .* found {day}"):
+    with pytest.raises(
+        InputError,
+        match=f"a new consent must be given after the withdrawal .* found {day}",
+    ):
         workflow.ingest_take(db, folder, new_consent=day, **OPTIONS)
     assert db.withdrawal(SUBJECT).is_withdrawal
 
@@ -105,29 +120,42 @@ def test_ingest__of_a_capture_without_consent_admits_nobody(db, folder, tmp_path
     assert db.withdrawal(SUBJECT).is_withdrawal
 
 
-def test_ingest__a_new_consent_is_stated_for_one_withdrawn_subject(db, folder, tmp_path):
+def test_ingest__a_new_consent_is_stated_for_one_withdrawn_subject(
+    db, folder, tmp_path
+):
     other = Path(shutil.copytree(folder, tmp_path / "P2"))
     _edit(other, subject="P2")
-    with pytest.raises(InputError, match="P2: a new consent is only for a subject who was withdrawn"):
+    with pytest.raises(
+        InputError, match="P2: a new consent is only for a subject who was withdrawn"
+    ):
         workflow.ingest_take(db, other, new_consent=date.today(), **OPTIONS)
     today = date.today().isoformat()
-    result = CliRunner().invoke(cli, ["ingest", str(db.root), str(folder), str(other), "--new-consent", today])
-    assert str(result.exception).startswith("--new-consent: a new consent is stated for one capture; found 2 captures")
+    result = CliRunner().invoke(
+        cli, ["ingest", str(db.root), str(folder), str(other), "--new-consent", today]
+    )
+    assert str(result.exception).startswith(
+        "--new-consent: a new consent is stated for one capture; found 2 captures"
+    )
     assert db.takes() == []
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("stage", ["check", "visibility", "sample", "write"])
-def test_ingest__suspended_while_the_subject_is_withdrawn_leaves_nothing(folder, tmp_path, monkeypatch, stage):
+def test_ingest__suspended_while_the_subject_is_withdrawn_leaves_nothing(
+    folder, tmp_path, monkeypatch, stage
+):
     db = Database(tmp_path / "db")
     workflow.ingest_take(db, folder, **OPTIONS)
 
     def suspend(name, *_):
         if name == stage and not db.withdrawal(SUBJECT):
-            monkeypatch.setattr(lease_module, "_has_ended", lambda *_: True)  # the lease of this run has expired
+            # the lease of this run has expired
+            monkeypatch.setattr(lease_module, "_has_ended", lambda *_: True)
             db.erase(SUBJECT)
 
-    with pytest.raises(WithdrawnError, match=f"{SUBJECT}: a withdrawn subject must consent again"):
+    with pytest.raises(
+        WithdrawnError, match=f"{SUBJECT}: a withdrawn subject must consent again"
+    ):
         workflow.ingest_take(db, folder, progress=suspend, **OPTIONS)
     assert db.withdrawal(SUBJECT)
     assert traces(db.root, SUBJECT) == []

@@ -1,4 +1,6 @@
-"""Stale results are refused or read with a warning, and `refresh` computes them again in order of dependence."""
+"""Stale results are refused or read with a warning, and `refresh` computes them again
+in order of dependence.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,8 @@ from skindb.workflow import edits, study_inputs
 @pytest.fixture(scope="module", autouse=True)
 def _tables():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(study_inputs, "dictionary_tables", lambda *_: TABLES)  # 8 of the 59
+        # 8 of the 59
+        patch.setattr(study_inputs, "dictionary_tables", lambda *_: TABLES)
         yield
 
 
@@ -44,20 +47,35 @@ def db(made, tmp_path):
 def _commit(db, take, **about):
     model = population()[take]
     with db.stage("model", take) as stage:
-        stage.write({str(name): node.to_dataset() for name, node in model.children.items()})
+        stage.write(
+            {str(name): node.to_dataset() for name, node in model.children.items()}
+        )
         stage.commit(model.attrs | about)
 
 
 def _stale(db):
-    return {(r.kind, r.take): sorted({one.why for one in reasons}) for r, reasons in stale_versions(db)}
+    return {
+        (r.kind, r.take): sorted({one.why for one in reasons})
+        for r, reasons in stale_versions(db)
+    }
 
 
 @pytest.mark.slow
 def test_studies__one_asked_for_differently_replaces_no_other(db):
-    assert db.takes("population") == ["traits.three", "translucency", "translucency.group_by-condition"]
-    assert db.read("population", "translucency")["translucency_table"].sizes["group"] == 1
+    assert db.takes("population") == [
+        "traits.three",
+        "translucency",
+        "translucency.group_by-condition",
+    ]
+    assert (
+        db.read("population", "translucency")["translucency_table"].sizes["group"] == 1
+    )
     workflow.translucency(db, takes=["A", "B"])
-    [other] = set(db.takes("population")) - {"traits.three", "translucency", "translucency.group_by-condition"}
+    [other] = set(db.takes("population")) - {
+        "traits.three",
+        "translucency",
+        "translucency.group_by-condition",
+    }
     assert len(other) == len("translucency.") + 16
     with pytest.raises(InputError, match="name of a study: must match"):
         workflow.translucency(db, name="../x")
@@ -68,23 +86,36 @@ def test_groups__are_stored_by_what_is_compared_and_made_again(db):
     for who in ("D", "E"):
         with db.stage("model", who) as stage:
             model = population()["A"]
-            stage.write({str(name): node.to_dataset() for name, node in model.children.items()})
-            traits = {"age": 30 + ord(who), "gender": "male" if who == "D" else "female"}
+            stage.write(
+                {str(name): node.to_dataset() for name, node in model.children.items()}
+            )
+            traits = {
+                "age": 30 + ord(who),
+                "gender": "male" if who == "D" else "female",
+            }
             stage.commit(model.attrs | {"subject": who, "traits": traits})
     first = workflow.groups(db, group_by="gender", adjust=["age"], permutations=100)
     assert first.attrs["study"] == "groups.group_by-gender_adjust-age_permutations-100"
-    assert first["effects"]["effect_count"].sel(quantity="sigma_tr cheek R").values.tolist() == [[3, 2]]
+    assert first["effects"]["effect_count"].sel(
+        quantity="sigma_tr cheek R"
+    ).values.tolist() == [[3, 2]]
     _commit(db, "C")
     assert _stale(db)["population", first.attrs["study"]] == ["superseded"]
     workflow.refresh(db)
     second = db.read("population", first.attrs["study"])
     assert second.attrs["generation"] == first.attrs["generation"] + 1
-    np.testing.assert_array_equal(second["effects"]["effect_p"], first["effects"]["effect_p"])
+    np.testing.assert_array_equal(
+        second["effects"]["effect_p"], first["effects"]["effect_p"]
+    )
 
 
 def test_edit__names_the_studies_there_are(db):
     with pytest.raises(
-        InputError, match=r"study traits.k-9: must be a study of traits .*studies of traits: traits.three; name one"
+        InputError,
+        match=(
+            r"study traits.k-9: must be a study of traits .*studies of traits: "
+            r"traits.three; name one"
+        ),
     ):
         workflow.edit(db, "B", {"lotion": 0.5}, study="traits.k-9")
 
@@ -96,7 +127,10 @@ def test_stored_or_moved__reads_an_edit_only_if_it_was_made_from_the_same_versio
         return edits.stored_or_moved(db, "B", source, amounts)
 
     assert moved(lotion=0.5).attrs["generation"] == 1
-    np.testing.assert_array_equal(moved(lotion=0.5)["fitted/basis_weight"], db.read("edit", "B")["fitted/basis_weight"])
+    np.testing.assert_array_equal(
+        moved(lotion=0.5)["fitted/basis_weight"],
+        db.read("edit", "B")["fitted/basis_weight"],
+    )
     assert "command" not in moved(lotion=0.25).attrs  # computed, and not committed
     assert len(db.history("edit", "B")) == 1
     _commit(db, "B")
@@ -113,7 +147,9 @@ def test_stale_versions__a_new_model_supersedes_what_was_made_from_the_old_one(d
         ("population", "translucency.group_by-condition"): ["superseded"],
         ("edit", "B"): ["superseded"],  # through the study of traits
     }
-    with pytest.warns(StaleWarning, match="edit 1 of B is out of date: model 1 of C was superseded"):
+    with pytest.warns(
+        StaleWarning, match="edit 1 of B is out of date: model 1 of C was superseded"
+    ):
         require_fresh(db, "edit", "B")
 
 
@@ -126,13 +162,24 @@ def test_refresh__makes_results_again_in_order_of_dependence(db):
         ("population", "translucency.group_by-condition"),
         ("edit", "B"),
     ]
-    assert all(one.record is not None and one.record.generation == 2 and not one.fault for one in done)
+    assert all(
+        one.record is not None and one.record.generation == 2 and not one.fault
+        for one in done
+    )
     assert _stale(db) == {}
-    assert db.record("edit", "B").made_from[1] == db.record("population", "traits.three").as_input()
+    assert (
+        db.record("edit", "B").made_from[1]
+        == db.record("population", "traits.three").as_input()
+    )
     again = db.read("population", "traits.three")
-    assert again.attrs["parameters"] == db.read("population", "traits.three", generation=1).attrs["parameters"]
-    np.testing.assert_array_equal(  # the model of C is the same as before, so the result is
-        again["traits/trait_brdf_shift"], db.read("population", "traits.three", generation=1)["traits/trait_brdf_shift"]
+    assert (
+        again.attrs["parameters"]
+        == db.read("population", "traits.three", generation=1).attrs["parameters"]
+    )
+    # the model of C is the same as before, so the result is
+    np.testing.assert_array_equal(
+        again["traits/trait_brdf_shift"],
+        db.read("population", "traits.three", generation=1)["traits/trait_brdf_shift"],
     )
     assert workflow.refresh(db) == []
 
@@ -140,7 +187,10 @@ def test_refresh__makes_results_again_in_order_of_dependence(db):
 def test_refresh__leaves_out_whose_consent_was_narrowed(db):
     db.record_consent("C", ["fit"])
     assert list(_stale(db).values()) == [["not covered"]] * 4
-    with pytest.raises(InputError, match=r"population 1 of traits.three: .*found C: consent no longer covers"):
+    with pytest.raises(
+        InputError,
+        match=r"population 1 of traits.three: .*found C: consent no longer covers",
+    ):
         workflow.edit(db, "B", {"lotion": 0.5})
     workflow.refresh(db)
     assert _stale(db) == {}
@@ -167,12 +217,17 @@ def test_studies__of_a_release_are_repeated_with_the_same_values(db):
     sites = changed["translucency"].to_dataset()
     changed["translucency"] = sites.assign(site_sigma_tr=sites["site_sigma_tr"] * 2)
     with db.stage("model", "B") as stage:
-        stage.write({str(name): node.to_dataset() for name, node in changed.children.items()})
+        stage.write(
+            {str(name): node.to_dataset() for name, node in changed.children.items()}
+        )
         stage.commit(changed.attrs)
     assert ("population", "translucency.release-r1") not in _stale(db)
     second = workflow.translucency(db, release="r1")
     newest = workflow.translucency(db)
-    one, two, other = (tree["translucency_table/sigma_tr_mean"].values for tree in (first, second, newest))
+    one, two, other = (
+        tree["translucency_table/sigma_tr_mean"].values
+        for tree in (first, second, newest)
+    )
     np.testing.assert_array_equal(one, two)
     assert not np.array_equal(one, other, equal_nan=True)
     db.record_consent("A", ["fit"])  # the newest consent counts in a release, too
@@ -180,11 +235,19 @@ def test_studies__of_a_release_are_repeated_with_the_same_values(db):
 
 
 def test_stale_versions__a_damaged_input_is_no_withdrawn_one(db):
-    """Nothing is computed again without the data of a damaged record, and messages do not call it removed."""
+    """Nothing is computed again without the data of a damaged record, and messages do
+    not call it removed.
+    """
     path = db.folder / "log/model/A/00000001.json"
     path.chmod(0o600)
     path.write_text(path.read_text().replace('"contents"', '"content"'))
     assert _stale(db) == {}
-    with pytest.raises(InputError, match=r"model 1 of A cannot be read \(skindb verify.*restore the damaged records"):
+    with pytest.raises(
+        InputError,
+        match=r"model 1 of A cannot be read \(skindb verify.*restore the damaged records",
+    ):
         require_fresh(db, "population", "traits.three")
-    assert "cannot be read" in db.info()["studies"]["traits.three"]["population"]["stale"][0]
+    assert (
+        "cannot be read"
+        in db.info()["studies"]["traits.three"]["population"]["stale"][0]
+    )

@@ -15,7 +15,8 @@ from skindb.workflow import study_inputs, study_versions
 @pytest.fixture(scope="module", autouse=True)
 def _tables():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(study_inputs, "dictionary_tables", lambda *_: TABLES)  # 8 of the 59
+        # 8 of the 59
+        patch.setattr(study_inputs, "dictionary_tables", lambda *_: TABLES)
         yield
 
 
@@ -37,7 +38,9 @@ def db(made, tmp_path):
 
 def _store(db, take, model, **about):
     with db.stage("model", take) as stage:
-        stage.write({str(name): node.to_dataset() for name, node in model.children.items()})
+        stage.write(
+            {str(name): node.to_dataset() for name, node in model.children.items()}
+        )
         stage.commit(model.attrs | about)
 
 
@@ -51,12 +54,16 @@ def _studies(db):
 
 
 def test_made__nothing_changed(db, monkeypatch):
-    monkeypatch.setattr(study_inputs, "dictionary_tables", lambda *_: pytest.fail("computed again"))
+    monkeypatch.setattr(
+        study_inputs, "dictionary_tables", lambda *_: pytest.fail("computed again")
+    )
     assert _studies(db) == [1, 1]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("change", ["a model", "an attribute", "a new take", "consent", "code"])
+@pytest.mark.parametrize(
+    "change", ["a model", "an attribute", "a new take", "consent", "code"]
+)
 def test_made__computed_again_after(db, monkeypatch, change):
     first = "B"
     model = db.read("model", first).load()
@@ -88,4 +95,9 @@ def test_attributes_digest__is_of_what_takes_are_said_to_be(db):
     again = cohort.drop_vars("condition").assign_coords(condition=("take", condition))
     assert study_versions._attributes_digest(again) == before
     condition[0] = "another"
-    assert study_versions._attributes_digest(again.assign_coords(condition=("take", condition))) != before
+    assert (
+        study_versions._attributes_digest(
+            again.assign_coords(condition=("take", condition))
+        )
+        != before
+    )

@@ -1,4 +1,6 @@
-"""Work on many takes in this process, in others or on a cluster; a failing take does not stop the others."""
+"""Work on many takes in this process, in others or on a cluster; a failing take does
+not stop the others.
+"""
 
 from __future__ import annotations
 
@@ -71,7 +73,11 @@ def _strange(take: int):
 @pytest.mark.parametrize("workers", [None, 2])
 def test_map_takes__results_and_errors_that_cannot_be_pickled_are_outcomes(workers):
     outcomes = {one.take: one for one in map_takes(_strange, range(6), workers=workers)}
-    assert {take for take, one in outcomes.items() if one.error is None} == {3, 4, 5} | ({0} if not workers else set())
+    assert {take for take, one in outcomes.items() if one.error is None} == {
+        3,
+        4,
+        5,
+    } | ({0} if not workers else set())
     assert "SystemExit: 3" in str(outcomes[1].error)
     assert "Input/output error" in str(faults_of(outcomes[2])[0])
 
@@ -91,11 +97,17 @@ def test_map_takes__a_process_that_dies_while_the_caller_is_busy():
 
 def _check_mixed(outcomes):
     by_take = {outcome.take: outcome for outcome in outcomes}
-    assert {take: one.value for take, one in by_take.items() if one.error is None} == {1: 1, 3: 3, 5: 5}
+    assert {take: one.value for take, one in by_take.items() if one.error is None} == {
+        1: 1,
+        3: 3,
+        5: 5,
+    }
     assert faults_of(by_take[0]) == [FAULT, FAULT]
     assert "ZeroDivisionError: a defect" in str(by_take[2].error)
     assert "in _mixed" in by_take[2].traceback
-    assert str(faults_of(by_take[4])[0]).startswith("disk: must be readable and writable")
+    assert str(faults_of(by_take[4])[0]).startswith(
+        "disk: must be readable and writable"
+    )
     with pytest.raises(InputError, match="must be readable"):
         by_take[0].result()
 
@@ -122,13 +134,21 @@ def test_map_takes__in_other_processes_that_stay_warm_and_share_the_cores(monkey
 
 def test_map_takes__functions_of_a_notebook():
     offset = 10
-    assert sorted(o.result() for o in map_takes(lambda take: take + offset, range(4), workers=2)) == [10, 11, 12, 13]
+    assert sorted(
+        o.result() for o in map_takes(lambda take: take + offset, range(4), workers=2)
+    ) == [10, 11, 12, 13]
 
 
 @pytest.mark.slow
 def test_map_takes__a_killed_process_fails_its_take_alone():
     outcomes = {one.take: one for one in map_takes(_killed, range(6), workers=2)}
-    assert {take for take, one in outcomes.items() if one.error is None} == {0, 1, 3, 4, 5}
+    assert {take for take, one in outcomes.items() if one.error is None} == {
+        0,
+        1,
+        3,
+        4,
+        5,
+    }
     assert "a lack of memory is the usual reason" in str(outcomes[2].error)
     assert outcomes[2].attempts == 2
     assert outcomes[5].attempts == 1
@@ -147,7 +167,8 @@ def test_map_takes__who_stops_asking_stops_the_work(tmp_path):
     outcomes.close()
     _wait_until(lambda: not any(map(_is_running, workers)))
     (tmp_path / "closed").touch()
-    assert len(list(tmp_path.iterdir())) <= 1 + 3  # those that were being processed, and the file of this test
+    # those that were being processed, and the file of this test
+    assert len(list(tmp_path.iterdir())) <= 1 + 3
 
 
 DRIVER = """
@@ -165,9 +186,13 @@ list(map_takes(note_and_wait, range(4), workers=2))
 
 @pytest.mark.slow
 def test_map_takes__worker_processes_end_with_a_caller_that_is_killed(tmp_path):
-    """Otherwise they would keep their takes, continue with waiting ones, and occupy memory for ten minutes."""
+    """Otherwise they would keep their takes, continue with waiting ones, and occupy
+    memory for ten minutes.
+    """
     with subprocess.Popen([sys.executable, "-c", DRIVER, str(tmp_path)]) as driver:
-        _wait_until(lambda: sum(bool(path.read_text()) for path in tmp_path.iterdir()) >= 2)
+        _wait_until(
+            lambda: sum(bool(path.read_text()) for path in tmp_path.iterdir()) >= 2
+        )
         driver.kill()
     workers = [int(path.read_text()) for path in tmp_path.iterdir()]
     _wait_until(lambda: not any(map(_is_running, workers)))
@@ -186,21 +211,28 @@ def _wait_until(condition):
 
 def _is_running(process):
     try:
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
+        return (
+            Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0]
+            not in "ZX"
+        )
     except FileNotFoundError:
         return False
 
 
 @pytest.mark.parametrize("workers", [None, 2])
 def test_map_takes__libraries_use_one_thread_on_every_engine(monkeypatch, workers):
-    """The order of sums in matrix products depends on the number of threads, and with it the last digit of a result."""
+    """The order of sums in matrix products depends on the number of threads, and with
+    it the last digit of a result.
+    """
     monkeypatch.setattr("skindb._threads.cpu_count", lambda: 8)
 
     def pools(_):
         np.ones((50, 50)) @ np.ones((50, 50))
         return [pool["num_threads"] for pool in threadpool_info()]
 
-    found = [outcome.result() for outcome in map_takes(pools, range(4), workers=workers)]
+    found = [
+        outcome.result() for outcome in map_takes(pools, range(4), workers=workers)
+    ]
     assert found
     assert all(threads == [1] * len(threads) for threads in found)
 
@@ -217,16 +249,33 @@ def test_results_of__all_results_then_all_faults():
 @pytest.mark.slow
 def test_map_takes__on_a_dask_client():
     distributed = pytest.importorskip("distributed")
-    options = {"n_workers": 1, "threads_per_worker": 2, "processes": False, "dashboard_address": "127.0.0.1:0"}
-    with distributed.LocalCluster(**options) as cluster, distributed.Client(cluster) as client:
+    options = {
+        "n_workers": 1,
+        "threads_per_worker": 2,
+        "processes": False,
+        "dashboard_address": "127.0.0.1:0",
+    }
+    with (
+        distributed.LocalCluster(**options) as cluster,
+        distributed.Client(cluster) as client,
+    ):
         _check_mixed(map_takes(_mixed, range(6), client=client))
-        threads = {outcome.result()[2] for outcome in map_takes(partial(_square), range(3), client=client)}
+        threads = {
+            outcome.result()[2]
+            for outcome in map_takes(partial(_square), range(3), client=client)
+        }
     assert threads == {2}
 
 
 def test_map_takes__functions_of_a_notebook_may_use_every_package():
-    """A package with a function that has the name of one of its modules has a type that cannot be pickled."""
-    packages = [one.name for one in pkgutil.iter_modules(skindb.__path__) if one.ispkg and one.name in dir(skindb)]
+    """A package with a function that has the name of one of its modules has a type that
+    cannot be pickled.
+    """
+    packages = [
+        one.name
+        for one in pkgutil.iter_modules(skindb.__path__)
+        if one.ispkg and one.name in dir(skindb)
+    ]
     assert "workflow" in packages
     for name in packages:
         cloudpickle.dumps(getattr(skindb, name))
@@ -235,4 +284,6 @@ def test_map_takes__functions_of_a_notebook_may_use_every_package():
 def test_map_takes__a_call_that_cannot_be_sent_is_explained():
     lock = threading.Lock()
     outcomes = list(map_takes(lambda take: (take, lock), [1, 2], workers=2))
-    assert all("cannot pickle '_thread.lock' object" in str(one.error) for one in outcomes)
+    assert all(
+        "cannot pickle '_thread.lock' object" in str(one.error) for one in outcomes
+    )

@@ -28,7 +28,11 @@ def faces(tmp_path):
     db = skindb.open(str(tmp_path / "db"))
     for take, age in (("S01", 30), ("S02", 60)):
         tree = small_face()
-        about = {"subject": take, "consent_scope": ["fit", "export"], "traits": {"age": age}}
+        about = {
+            "subject": take,
+            "consent_scope": ["fit", "export"],
+            "traits": {"age": age},
+        }
         capture = commit(db.root, take=take, **about)
         with db.stage("model", take) as stage:
             stage.write(groups_of(tree))
@@ -38,7 +42,12 @@ def faces(tmp_path):
 
 def listed(session):
     """Takes that the page of a session lists."""
-    embedded = session.request("GET", "").body.decode().partition('id="takes">')[2].partition("</script>")[0]
+    embedded = (
+        session.request("GET", "")
+        .body.decode()
+        .partition('id="takes">')[2]
+        .partition("</script>")[0]
+    )
     return [take["take"] for take in json.loads(embedded)]
 
 
@@ -51,7 +60,8 @@ def test_view_server__serves_a_face_as_long_as_its_subject_consents(faces):
         assert record["about"]["attributes"]["age"] == "60"
         db.record_consent("S02", ["fit", "statistics"])
         assert listed(session) == ["S01"]
-        db.record_consent("S02", ["export"])  # given again: the face was removed from the memory
+        # given again: the face was removed from the memory
+        db.record_consent("S02", ["export"])
         refused = session.request("GET", "faces/S02.json")
         assert refused.status == 404
         assert b"S02: its subject must consent to exports" in refused.body
@@ -70,7 +80,12 @@ def test_view__leaves_nothing_in_temporary_folders_when_it_is_killed(faces, tmp_
     temporary = tmp_path / "temporary"
     temporary.mkdir()
     command = [sys.executable, "-c", PROGRAM, "view", str(faces.root), "--no-progress"]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env={**os.environ, "TMPDIR": str(temporary)})
+    process = subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "TMPDIR": str(temporary)},
+    )
     try:
         session = Session.opened(process.stdout.readline().split()[0])
         assert listed(session) == ["S01", "S02"]

@@ -1,4 +1,6 @@
-"""Withdrawal: no data of the subject remain in the raw bytes of a database, and the rest is intact."""
+"""Withdrawal: no data of the subject remain in the raw bytes of a database, and the
+rest is intact.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,8 @@ pytestmark = pytest.mark.usefixtures("small_textures")
 @pytest.fixture(scope="module", autouse=True)
 def _tables():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(study_inputs, "dictionary_tables", lambda *_: TABLES)  # 8 of the 59
+        # 8 of the 59
+        patch.setattr(study_inputs, "dictionary_tables", lambda *_: TABLES)
         yield
 
 
@@ -54,7 +57,9 @@ def db(made, tmp_path):
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory):
-    """Folder of a database of takes A, A.lotion, B, C, a study and a release, which is only copied."""
+    """Folder of a database of takes A, A.lotion, B, C, a study and a release, which is
+    only copied.
+    """
     db = Database(tmp_path_factory.mktemp("small") / "db")
     for take, model in population().items():
         if take.startswith("A"):
@@ -67,12 +72,16 @@ def small(tmp_path_factory):
 
 def _commit(db, kind, take, tree, **about):
     with db.stage(kind, take) as stage:
-        stage.write({str(name): node.to_dataset() for name, node in tree.children.items()})
+        stage.write(
+            {str(name): node.to_dataset() for name, node in tree.children.items()}
+        )
         return stage.commit(tree.attrs | about)
 
 
 def _planted(url: Path | str) -> Database:
-    """Takes A, A.lotion, B, C in two generations each; studies, an edit and a release that used all of them."""
+    """Takes A, A.lotion, B, C in two generations each; studies, an edit and a release
+    that used all of them.
+    """
     db = Database(url)
     for take, model in population().items():
         if take.startswith("A"):
@@ -93,7 +102,9 @@ def _planted(url: Path | str) -> Database:
 
 
 def _found(root: Path, subject: str) -> list[str]:
-    """Files that hold the marker, the word or the name of the subject: raw, and with every chunk decompressed."""
+    """Files that hold the marker, the word or the name of the subject: raw, and with
+    every chunk decompressed.
+    """
     name = re.compile(rf"(?<![A-Za-z0-9_-]){subject}(?![A-Za-z0-9_-])".encode())
     hits = []
     for path in root.rglob("*"):
@@ -108,22 +119,34 @@ def _found(root: Path, subject: str) -> list[str]:
         for key, array in zarr.open_group(path, mode="r").members(max_depth=None):
             if isinstance(array, zarr.Array):
                 values = np.asarray(array[...])
-                if values.dtype.kind == "f" and np.isclose(values.astype("f8"), float(MARKER), rtol=1e-7, atol=0).any():
+                if (
+                    values.dtype.kind == "f"
+                    and np.isclose(
+                        values.astype("f8"), float(MARKER), rtol=1e-7, atol=0
+                    ).any()
+                ):
                     hits.append(f"values: {path}/{key}")
-                if values.dtype.kind == "T" and any(name.search(str(one).encode()) for one in values.ravel()):
+                if values.dtype.kind == "T" and any(
+                    name.search(str(one).encode()) for one in values.ravel()
+                ):
                     hits.append(f"labels: {path}/{key}")
     return hits
 
 
 def _outcomes(done) -> dict[str, str]:
-    """Kind and take of every result that was removed -> fault of its computation, or an empty text."""
+    """Kind and take of every result that was removed -> fault of its computation, or an
+    empty text.
+    """
     return {one.name: one.fault for one in done.repeated}
 
 
 def test_withdraw__leaves_nothing_of_a_subject(db):
     assert len(_found(db.root, "A")) > 10  # the search works
     plan = workflow.plan_withdrawal(db, "A")
-    assert plan.versions[-2:] == ("model of A: 2 versions", "model of A.lotion: 2 versions")
+    assert plan.versions[-2:] == (
+        "model of A: 2 versions",
+        "model of A.lotion: 2 versions",
+    )
     assert "population 2 of translucency" in plan.users
     assert "edit 1 of B" in plan.users
     assert len(_found(db.root, "A")) > 10  # a plan removes nothing
@@ -174,7 +197,8 @@ def test_withdraw__leaves_nothing_of_a_subject_in_a_bucket(bucket, tmp_path):
     assert db.verify() == []
     assert stale_versions(db) == []
     assert done.removed["model"] == 4
-    assert [name for name, fault in _outcomes(done).items() if fault] == ["edit of B"]  # as in a folder
+    # as in a folder
+    assert [name for name, fault in _outcomes(done).items() if fault] == ["edit of B"]
     assert db.garbage() == db.clean() == []
 
 
@@ -190,13 +214,22 @@ def test_withdraw__registrations_of_others_are_made_without_the_subject(tmp_path
         _commit(alone, "model", take, face_take(seed=seed))
     wanted = workflow.register_takes(alone)
     done = workflow.withdraw(db, "A")
-    assert _outcomes(done) == {"registration": "", "population of albedo": "", "release of r1": ""}
+    assert _outcomes(done) == {
+        "registration": "",
+        "population of albedo": "",
+        "release of r1": "",
+    }
     assert db.requests() == []
     assert _found(db.root, "A") == []
     for take in "BC":
         found = db.read("registration", take)["registration"].to_dataset().load()
-        xr.testing.assert_identical(found, alone.read("registration", take)["registration"].to_dataset().load())
-        assert [one["take"] for one in db.record("registration", take).made_from] == ["B", "C"]
+        xr.testing.assert_identical(
+            found, alone.read("registration", take)["registration"].to_dataset().load()
+        )
+        assert [one["take"] for one in db.record("registration", take).made_from] == [
+            "B",
+            "C",
+        ]
     assert db.takes("registration", release="r1") == ["B", "C"] == sorted(wanted)
     assert db.verify() == []
     assert stale_versions(db) == []
@@ -205,7 +238,13 @@ def test_withdraw__registrations_of_others_are_made_without_the_subject(tmp_path
 def test_withdraw__a_study_that_only_named_the_subject_as_skipped(tmp_path):
     db = Database(tmp_path / "db")
     for take, model in population().items():
-        _commit(db, "model", take, model, **({"consent_scope": ["fit"]} if take == "C" else {}))
+        _commit(
+            db,
+            "model",
+            take,
+            model,
+            **({"consent_scope": ["fit"]} if take == "C" else {}),
+        )
     workflow.translucency(db)
     assert any("population" in hit for hit in _found(db.root, "C"))
     workflow.withdraw(db, "C")
@@ -215,8 +254,12 @@ def test_withdraw__a_study_that_only_named_the_subject_as_skipped(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("step", range(0, 60, 4))
-def test_withdraw__killed_at_any_step_the_same_call_completes_it(small, tmp_path, monkeypatch, step):
-    """The process may be killed after every change of a file or folder; no result of others is lost."""
+def test_withdraw__killed_at_any_step_the_same_call_completes_it(
+    small, tmp_path, monkeypatch, step
+):
+    """The process may be killed after every change of a file or folder; no result of
+    others is lost.
+    """
     db = Database(shutil.copytree(small, tmp_path / "db"))
     left = [step]
 
@@ -230,11 +273,14 @@ def test_withdraw__killed_at_any_step_the_same_call_completes_it(small, tmp_path
         return run
 
     for name in ("remove", "create", "replace", "sweep"):
-        monkeypatch.setattr(type(db._place), name, counted(getattr(type(db._place), name)))
+        monkeypatch.setattr(
+            type(db._place), name, counted(getattr(type(db._place), name))
+        )
     with contextlib.suppress(KeyboardInterrupt):
         workflow.withdraw(db, "A")
     monkeypatch.undo()
-    shutil.rmtree(db.root / "leases", ignore_errors=True)  # of this process, which has not ended
+    # of this process, which has not ended
+    shutil.rmtree(db.root / "leases", ignore_errors=True)
     if db.withdrawal("A"):
         assert db.cohort("tables")["take"].values.tolist() == ["B", "C"]
     with contextlib.suppress(InputError):  # everything was removed before it was killed
@@ -242,27 +288,38 @@ def test_withdraw__killed_at_any_step_the_same_call_completes_it(small, tmp_path
     workflow.refresh(db)
     assert _found(db.root, "A") == []
     assert [fault for fault in db.verify() if "tmp" not in str(fault)] == []
-    assert [one["take"] for one in db.record("population", "translucency").made_from] == ["B", "C"]
+    assert [
+        one["take"] for one in db.record("population", "translucency").made_from
+    ] == ["B", "C"]
     assert db.takes("model", release="r1") == ["B", "C"]
     assert db.requests() == []
 
 
 @pytest.mark.parametrize("complete", [lambda db: db.clean(), workflow.refresh])
-def test_withdraw__interrupted_is_completed_by_other_commands(small, tmp_path, monkeypatch, complete):
+def test_withdraw__interrupted_is_completed_by_other_commands(
+    small, tmp_path, monkeypatch, complete
+):
     db = Database(shutil.copytree(small, tmp_path / "db"))
     monkeypatch.setattr("skindb.store.erasure.erase_withdrawn", lambda _: None)
     db.erase("A")
     monkeypatch.undo()
     assert len(_found(db.root, "A")) > 5
     faults = db.verify()
-    assert {fault.rule for fault in faults} == {"nothing of a withdrawn subject must remain"}
+    assert {fault.rule for fault in faults} == {
+        "nothing of a withdrawn subject must remain"
+    }
     assert {fault.cure for fault in faults} == {"run skindb clean --yes"}
-    assert any(one.what == "it is of a withdrawn subject, or refers to one" for one in db.garbage())
+    assert any(
+        one.what == "it is of a withdrawn subject, or refers to one"
+        for one in db.garbage()
+    )
     complete(db)
     assert _found(db.root, "A") == []
     assert db.verify() == []
     workflow.refresh(db)
-    assert [one["take"] for one in db.record("population", "translucency").made_from] == ["B", "C"]
+    assert [
+        one["take"] for one in db.record("population", "translucency").made_from
+    ] == ["B", "C"]
 
 
 def test_withdraw__damaged_records_and_scratch_of_the_subject_go_too(db):
@@ -286,20 +343,32 @@ def test_withdraw__of_an_unknown_subject(db):
 
 
 def test_withdraw__a_study_of_another_version_of_skindb_waits(small, tmp_path):
-    """Its parameters are not those of this version; earlier, withdrawals and `refresh` ended in a traceback."""
+    """Its parameters are not those of this version; earlier, withdrawals and `refresh`
+    ended in a traceback.
+    """
     db = Database(shutil.copytree(small, tmp_path / "db"))
     models = [db.record("model", take) for take in ("A", "B")]
     parameters = {"what": "translucency", "frobnicate": 1, "takes": [], "release": ""}
-    for key, given in (("translucency.other", parameters), ("moles", {"what": "moles"})):
+    for key, given in (
+        ("translucency.other", parameters),
+        ("moles", {"what": "moles"}),
+    ):
         with db.stage("population", key, names=["A", "B"]) as stage:
-            stage.commit({"inputs": [model.as_input() for model in models], "parameters": given})
+            stage.commit(
+                {"inputs": [model.as_input() for model in models], "parameters": given}
+            )
     rule = "a study must be one that this version of skindb can compute; found"
     done = workflow.withdraw(db, "A")
-    for outcomes in (_outcomes(done), {one.name: one.fault for one in workflow.refresh(db)}):
+    for outcomes in (
+        _outcomes(done),
+        {one.name: one.fault for one in workflow.refresh(db)},
+    ):
         assert outcomes["population of translucency.other"].startswith(
             f"translucency.other: {rule} the parameters frob"
         )
-        assert outcomes["population of moles"].startswith(f"moles: {rule} the study 'moles'")
+        assert outcomes["population of moles"].startswith(
+            f"moles: {rule} the study 'moles'"
+        )
     assert _found(db.root, "A") == []
     assert db.verify() == []
     assert {one.name for one in workflow.stale_results(db)} == {
@@ -309,9 +378,17 @@ def test_withdraw__a_study_of_another_version_of_skindb_waits(small, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "error", [TypeError("unknown option"), MemoryError(), RecursionError(), ZeroDivisionError("x")]
+    "error",
+    [
+        TypeError("unknown option"),
+        MemoryError(),
+        RecursionError(),
+        ZeroDivisionError("x"),
+    ],
 )
-def test_withdraw__whatever_a_computation_raises_is_named_and_repeated(small, tmp_path, monkeypatch, error):
+def test_withdraw__whatever_a_computation_raises_is_named_and_repeated(
+    small, tmp_path, monkeypatch, error
+):
     db = Database(shutil.copytree(small, tmp_path / "db"))
 
     def fail(*_, **__):
@@ -332,7 +409,9 @@ def test_withdraw__whatever_a_computation_raises_is_named_and_repeated(small, tm
 
 
 def test_withdraw__while_a_study_is_computed(small, tmp_path, monkeypatch):
-    """The study is suspended, for example by a closed laptop, and continues after the withdrawal."""
+    """The study is suspended, for example by a closed laptop, and continues after the
+    withdrawal.
+    """
     db = Database(shutil.copytree(small, tmp_path / "db"))
     compute = studies.translucency_table
 
@@ -343,15 +422,21 @@ def test_withdraw__while_a_study_is_computed(small, tmp_path, monkeypatch):
         return table
 
     monkeypatch.setattr(studies, "translucency_table", suspended)
-    with pytest.raises(WithdrawnError, match="A: the subject must not be withdrawn while a version"):
+    with pytest.raises(
+        WithdrawnError, match="A: the subject must not be withdrawn while a version"
+    ):
         workflow.translucency(db, name="mine")
     assert _found(db.root, "A") == []
     assert db.verify() == []
     workflow.translucency(db, name="mine")
-    assert [one["take"] for one in db.record("population", "translucency.mine").made_from] == ["B", "C"]
+    assert [
+        one["take"] for one in db.record("population", "translucency.mine").made_from
+    ] == ["B", "C"]
 
 
-def test_withdraw__a_release_is_revised_again_with_the_new_registrations(tmp_path, monkeypatch):
+def test_withdraw__a_release_is_revised_again_with_the_new_registrations(
+    tmp_path, monkeypatch
+):
     db = Database(tmp_path / "db")
     for seed, take in enumerate(("A", "B", "C"), 1):
         _commit(db, "model", take, face_take(seed=seed))
@@ -365,7 +450,10 @@ def test_withdraw__a_release_is_revised_again_with_the_new_registrations(tmp_pat
         patch.setattr("skindb.workflow.registration.common_frame", fail)
         outcomes = _outcomes(workflow.withdraw(db, "A"))
     assert all(outcomes.values())
-    assert "the registrations of a release must be computed before" in outcomes["release of r1"]
+    assert (
+        "the registrations of a release must be computed before"
+        in outcomes["release of r1"]
+    )
     assert db.takes("registration", release="r1") == []
     assert db.takes("model", release="r1") == ["B", "C"]
     workflow.refresh(db)
@@ -375,14 +463,30 @@ def test_withdraw__a_release_is_revised_again_with_the_new_registrations(tmp_pat
 
 
 def test_withdraw_command__writes_a_report_without_personal_data(db, tmp_path):
-    arguments = ["withdraw", str(db.root), "A", "--yes", "--report", str(tmp_path / "erasure.txt")]
+    arguments = [
+        "withdraw",
+        str(db.root),
+        "A",
+        "--yes",
+        "--report",
+        str(tmp_path / "erasure.txt"),
+    ]
     result = CliRunner().invoke(cli, arguments)
     assert result.exit_code == 0, result.output
     assert "revised without A: release r1" in result.stdout
-    assert "removed versions: 1 of kind edit, 4 of kind model, 4 of kind population, 1 of kind release" in result.stdout
+    assert (
+        "removed versions: 1 of kind edit, 4 of kind model, 4 of kind population, 1 of kind release"
+        in result.stdout
+    )
     report = json.loads((tmp_path / "erasure.json").read_text())
     text = (tmp_path / "erasure.txt").read_text()
-    assert report["removed_versions"] == {"edit": 1, "model": 4, "population": 4, "release": 1, "summary": 4}
+    assert report["removed_versions"] == {
+        "edit": 1,
+        "model": 4,
+        "population": 4,
+        "release": 1,
+        "summary": 4,
+    }
     assert report["computed_again"] == {"population": 3}
     assert report["waiting_for_refresh"] == {"edit": 1}
     assert report["revised_releases"] == 1
@@ -391,21 +495,37 @@ def test_withdraw_command__writes_a_report_without_personal_data(db, tmp_path):
     seal = report.pop("seal")
     assert seal == seal_of(report)
     assert seal in text
-    words = {"A", "B", "lotion", "female", "r1", "translucency", str(tmp_path), str(db.root)}
+    words = {
+        "A",
+        "B",
+        "lotion",
+        "female",
+        "r1",
+        "translucency",
+        str(tmp_path),
+        str(db.root),
+    }
     for content in (json.dumps(report), text):
         assert not words & set(re.findall(r"[\w./-]+", content))
     for file in ("erasure.json", "erasure.txt"):
         assert (tmp_path / file).stat().st_mode & 0o777 == 0o600
 
 
-def test_withdraw_command__refuses_a_report_in_a_missing_folder_before_anything_is_removed(db, tmp_path):
+def test_withdraw_command__refuses_a_report_in_a_missing_folder_before_anything_is_removed(
+    db, tmp_path
+):
     before = len(_found(db.root, "A"))
-    result = CliRunner().invoke(cli, ["withdraw", str(db.root), "A", "--yes", "--report", str(tmp_path / "none/x")])
+    result = CliRunner().invoke(
+        cli,
+        ["withdraw", str(db.root), "A", "--yes", "--report", str(tmp_path / "none/x")],
+    )
     assert "its folder must exist" in str(result.exception)
     assert len(_found(db.root, "A")) == before
 
 
-def test_withdraw__erases_although_no_code_that_computes_can_be_imported(small, tmp_path):
+def test_withdraw__erases_although_no_code_that_computes_can_be_imported(
+    small, tmp_path
+):
     """A broken installation of numba does not block an erasure."""
     root = shutil.copytree(small, tmp_path / "db")
     code = (
@@ -415,7 +535,12 @@ def test_withdraw__erases_although_no_code_that_computes_can_be_imported(small, 
         "import skindb\n"
         "skindb.workflow.withdraw(skindb.open(sys.argv[1]), 'A')\n"
     )
-    done = subprocess.run([sys.executable, "-c", code, str(root)], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(root)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert "ModuleNotFoundError" in done.stderr or "ImportError" in done.stderr
     assert _found(root, "A") == []
     db = Database(root)

@@ -27,7 +27,9 @@ def _commit(folder, capture):
     return db
 
 
-def test_fit_take__commits_the_model_and_its_provenance(tmp_path, skin, small_dictionary):
+def test_fit_take__commits_the_model_and_its_provenance(
+    tmp_path, skin, small_dictionary
+):
     db = _commit(tmp_path / "db", capture_of(skin))
     record = fit_take(db, "S1", SMALL, dictionary=small_dictionary)
     assert (record.kind, record.take, record.generation) == ("model", "S1", 1)
@@ -59,7 +61,9 @@ def test_plan_take__reports_what_the_fit_skips(tmp_path, skin, small_dictionary)
 
 def test_fit_take__refuses_without_consent_and_commits_nothing(tmp_path, skin):
     db = _commit(tmp_path / "db", capture_of(skin, scope=["statistics"]))
-    with pytest.raises(InputError, match="needs the scope 'fit'; found only statistics"):
+    with pytest.raises(
+        InputError, match="needs the scope 'fit'; found only statistics"
+    ):
         fit_take(db, "S1")
     assert db.takes("model") == []
 
@@ -71,14 +75,22 @@ def test_fit_take__keeps_what_cohorts_need(tmp_path, skin, small_dictionary):
     model = db.read("model", "S1")
     fitted = model["fitted"].to_dataset()
     good = fitted["fit_status"].values == 0
-    assert int(tables["prediction_surfels"].sel(region="face", status="fitted")) == good.sum()
+    assert (
+        int(tables["prediction_surfels"].sel(region="face", status="fitted"))
+        == good.sum()
+    )
     area = fitted["surfel_area"].values[good]
     colour = fitted["diffuse_reflectance"].values[good]
     trusted = int(tables["region_surfels"].sel(region="face"))
     if trusted == good.sum():
         want = np.average(colour, axis=0, weights=area)
-        np.testing.assert_allclose(tables["region_diffuse_reflectance"].sel(region="face"), want, rtol=1e-6)
-    assert sorted(model["sample/surfel_index"].values.tolist()) == np.flatnonzero(good).tolist()
+        np.testing.assert_allclose(
+            tables["region_diffuse_reflectance"].sel(region="face"), want, rtol=1e-6
+        )
+    assert (
+        sorted(model["sample/surfel_index"].values.tolist())
+        == np.flatnonzero(good).tolist()
+    )
 
 
 @pytest.fixture(scope="module")
@@ -97,13 +109,16 @@ def made(tmp_path_factory, skin):
 
 @pytest.fixture
 def three(made, tmp_path):
-    """Three takes, fitted with different parameters by the embedded dictionary, the third not at all."""
+    """Three takes, fitted with different parameters by the embedded dictionary, the
+    third not at all.
+    """
     return skindb.open(str(shutil.copytree(made, tmp_path / "db")))
 
 
 def test_takes_to_fit__a_refit_continues_with_what_is_not_done(three):
     assert takes_to_fit(three) == ["S3"]
-    assert takes_to_fit(three, refit=True) == ["S3"]  # takes whose model would not change are not fitted again
+    # takes whose model would not change are not fitted again
+    assert takes_to_fit(three, refit=True) == ["S3"]
     given = {"eta": 1.4}
     assert takes_to_fit(three, refit=True, given=given) == ["S1", "S2", "S3"]
     own = parameters_of(three, "S2", given, refit=True)
@@ -114,7 +129,9 @@ def test_takes_to_fit__a_refit_continues_with_what_is_not_done(three):
     assert parameters_of(three, "S2", {"k": 5}, refit=False) == FitParameters(k=5)
 
 
-def test_takes_to_fit__another_method_or_capture_is_a_reason_to_refit(three, skin, monkeypatch):
+def test_takes_to_fit__another_method_or_capture_is_a_reason_to_refit(
+    three, skin, monkeypatch
+):
     fit_take(three, "S3", FitParameters(k=2, rank=6))
     assert takes_to_fit(three, refit=True) == []
     capture = capture_of(skin, probe=False)
@@ -122,31 +139,45 @@ def test_takes_to_fit__another_method_or_capture_is_a_reason_to_refit(three, ski
         stage.write(groups_of(capture))
         stage.commit(capture.attrs)
     assert takes_to_fit(three) == ["S2"]
-    monkeypatch.setattr("skindb.workflow.fit.method_digest", lambda _: "a better method")
+    monkeypatch.setattr(
+        "skindb.workflow.fit.method_digest", lambda _: "a better method"
+    )
     assert takes_to_fit(three, refit=True) == ["S1", "S2", "S3"]
 
 
-def test_takes_to_fit__fewer_components_than_asked_for_are_no_reason(tmp_path, skin, small_dictionary):
-    """A fit records its actual and its requested parameters, so that a rank above the number of BRDFs is up to date."""
+def test_takes_to_fit__fewer_components_than_asked_for_are_no_reason(
+    tmp_path, skin, small_dictionary
+):
+    """A fit records its actual and its requested parameters, so that a rank above the
+    number of BRDFs is up to date.
+    """
     db = _commit(tmp_path / "db", capture_of(skin, probe=False))
     fit_take(db, "S1", FitParameters(k=2, rank=40), dictionary=small_dictionary)
     assert db.record("model", "S1").provenance["parameters"]["rank"] == 6
     assert parameters_of(db, "S1", {}, refit=True, dictionary=tmp_path).rank == 40
 
 
-def test_parameters_of__a_refit_needs_the_dictionary_of_the_model(tmp_path, skin, small_dictionary):
+def test_parameters_of__a_refit_needs_the_dictionary_of_the_model(
+    tmp_path, skin, small_dictionary
+):
     db = _commit(tmp_path / "db", capture_of(skin, probe=False))
     fit_take(db, "S1", SMALL, dictionary=small_dictionary)
-    with pytest.raises(InputError, match=r"a refit uses the dictionary of the model.*'six of them'"):
+    with pytest.raises(
+        InputError, match=r"a refit uses the dictionary of the model.*'six of them'"
+    ):
         parameters_of(db, "S1", {}, refit=True)
 
 
-def test_takes_to_fit__a_model_that_cannot_be_refitted_stops_no_other(three, skin, small_dictionary):
+def test_takes_to_fit__a_model_that_cannot_be_refitted_stops_no_other(
+    three, skin, small_dictionary
+):
     fit_take(three, "S1", SMALL, dictionary=small_dictionary)
     assert takes_to_fit(three, refit=True, given={"eta": 1.4}) == ["S1", "S2", "S3"]
 
 
-def test_takes_to_fit__dictionaries_are_compared_by_their_values(tmp_path, skin, small_dictionary):
+def test_takes_to_fit__dictionaries_are_compared_by_their_values(
+    tmp_path, skin, small_dictionary
+):
     db = _commit(tmp_path / "db", capture_of(skin, probe=False))
     brighter = replace(small_dictionary, table=small_dictionary.table * np.float32(1.1))
     for folder, one in (("a", small_dictionary), ("b", brighter)):
@@ -157,7 +188,9 @@ def test_takes_to_fit__dictionaries_are_compared_by_their_values(tmp_path, skin,
     assert takes_to_fit(db, refit=True, dictionary=tmp_path / "b/mine.npz") == ["S1"]
 
 
-def test_fit_take__the_newest_capture_has_the_consent_that_counts(tmp_path, skin, small_dictionary):
+def test_fit_take__the_newest_capture_has_the_consent_that_counts(
+    tmp_path, skin, small_dictionary
+):
     db = _commit(tmp_path / "db", capture_of(skin, probe=False))
     _commit(tmp_path / "db", capture_of(skin, probe=False, scope=["statistics"]))
     with pytest.raises(InputError, match="needs the scope 'fit'"):

@@ -17,7 +17,12 @@ Array = NDArray[Any]
 
 
 def _sensor(**changes: Any) -> SensorRecord:
-    levels: dict[str, Any] = {"black": 256.0, "white": 65535.0, "read_noise": 6.0, "electrons_per_dn": 0.3}
+    levels: dict[str, Any] = {
+        "black": 256.0,
+        "white": 65535.0,
+        "read_noise": 6.0,
+        "electrons_per_dn": 0.3,
+    }
     return SensorRecord(FrameKind(4, 3, 16), **(levels | changes))
 
 
@@ -44,25 +49,36 @@ def _one_white() -> None:
 def _no_exposure_black(value: int) -> None:
     radiance, error, flag = merge_exposures(_frames(value), SECONDS, _sensor())
     expect((flag == DARK).all(), flag)
-    expect((np.abs(radiance) <= 3 * error).all() and np.isfinite(error).all(), (radiance, error))
+    expect(
+        (np.abs(radiance) <= 3 * error).all() and np.isfinite(error).all(),
+        (radiance, error),
+    )
 
 
 def _dead_noise() -> None:
     """A sensor without noise gives the value over the time, without a division by zero."""
-    radiance, error, flag = merge_exposures(_frames(256 + 6528)[:1], SECONDS[:1], _sensor(read_noise=0.0, step=0.0))
+    radiance, error, flag = merge_exposures(
+        _frames(256 + 6528)[:1], SECONDS[:1], _sensor(read_noise=0.0, step=0.0)
+    )
     close(radiance, 6528 / (65535 - 256) / 0.04, rtol=1e-6)
     expect(np.isfinite(error).all() and (flag == OK).all(), (error, flag))
 
 
 def _shot_noise_unknown() -> None:
-    frames = [np.full((3, 4, 3), 256 + round(6528 * s / 0.04), np.uint16) for s in SECONDS]
-    radiance, error, flag = merge_exposures(frames, SECONDS, _sensor(electrons_per_dn=np.inf, read_noise=0.0))
+    frames = [
+        np.full((3, 4, 3), 256 + round(6528 * s / 0.04), np.uint16) for s in SECONDS
+    ]
+    radiance, error, flag = merge_exposures(
+        frames, SECONDS, _sensor(electrons_per_dn=np.inf, read_noise=0.0)
+    )
     close(radiance, 6528 / (65535 - 256) / 0.04, rtol=1e-3)
     expect(np.isfinite(error).all() and (flag == OK).all(), (error, flag))
 
 
 def _scaled_times(scale: float) -> None:
-    frames = [np.full((3, 4, 3), 256 + round(6528 * s / 0.04), np.uint16) for s in SECONDS]
+    frames = [
+        np.full((3, 4, 3), 256 + round(6528 * s / 0.04), np.uint16) for s in SECONDS
+    ]
     want, want_error, _ = merge_exposures(frames, SECONDS, _sensor())
     times = tuple(s * scale for s in SECONDS)
     radiance, error, flag = merge_exposures(frames, times, _sensor())
@@ -72,8 +88,14 @@ def _scaled_times(scale: float) -> None:
 
 
 def _odd_sizes(rows: int, columns: int) -> None:
-    radiance, error, flag = merge_exposures(_frames(6784, (rows, columns, 3))[:1], SECONDS[:1], _sensor())
-    expect(radiance.shape == error.shape == (rows, columns, 3) and flag.shape == (rows, columns), radiance.shape)
+    radiance, error, flag = merge_exposures(
+        _frames(6784, (rows, columns, 3))[:1], SECONDS[:1], _sensor()
+    )
+    expect(
+        radiance.shape == error.shape == (rows, columns, 3)
+        and flag.shape == (rows, columns),
+        radiance.shape,
+    )
     close(radiance, 6528 / (65535 - 256) / 0.04, rtol=1e-6)
 
 
@@ -89,7 +111,10 @@ def _linear(bad: float) -> None:
     frame = np.full((2, 2, 3), 0.25, np.float32)
     frame[0, 1, 2] = bad
     radiance, _, flag = merge_exposures([frame], (1.0,), _linear_sensor())
-    expect(flag.tolist() == [[OK, SATURATED], [OK, OK]] and np.isnan(radiance[0, 1]).all(), (flag, radiance))
+    expect(
+        flag.tolist() == [[OK, SATURATED], [OK, OK]] and np.isnan(radiance[0, 1]).all(),
+        (flag, radiance),
+    )
     close(radiance[1], 0.25)
 
 
@@ -99,7 +124,9 @@ def _linear_sensor() -> SensorRecord:
 
 EXPOSURES = (
     Case("exposures", "all saturated", "The result is NaN and flagged.", _white),
-    Case("exposures", "one of two saturated", "The other exposure is used.", _one_white),
+    Case(
+        "exposures", "one of two saturated", "The other exposure is used.", _one_white
+    ),
     *each(
         "exposures",
         "all black, value {}",
@@ -108,20 +135,43 @@ EXPOSURES = (
         256,
         250,
     ),
-    Case("exposures", "no noise", "The result is the value over the time.", _dead_noise),
+    Case(
+        "exposures", "no noise", "The result is the value over the time.", _dead_noise
+    ),
     Case(
         "exposures",
         "shot noise unknown",
         "The result is the value over the time, with the error of quantisation.",
         _shot_noise_unknown,
     ),
-    *each("exposures", "times multiplied by {:g}", "Radiance and error are divided by it.", _scaled_times, *SCALES),
-    *each("exposures", "{} x {} pixels", "Shapes and values are right.", _odd_sizes, (0, 4), (1, 1), (3, 7)),
+    *each(
+        "exposures",
+        "times multiplied by {:g}",
+        "Radiance and error are divided by it.",
+        _scaled_times,
+        *SCALES,
+    ),
+    *each(
+        "exposures",
+        "{} x {} pixels",
+        "Shapes and values are right.",
+        _odd_sizes,
+        (0, 4),
+        (1, 1),
+        (3, 7),
+    ),
     Case(
         "exposures",
         "the same exposure twice",
         "The radiance is the same, and the error smaller by sqrt 2.",
         _duplicates,
     ),
-    *each("exposures", "a linear pixel is {}", "Only that pixel is NaN and flagged.", _linear, np.nan, np.inf),
+    *each(
+        "exposures",
+        "a linear pixel is {}",
+        "Only that pixel is NaN and flagged.",
+        _linear,
+        np.nan,
+        np.inf,
+    ),
 )

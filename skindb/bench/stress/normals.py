@@ -9,7 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skindb.bench.case import SCALES, Case, close, combinations, each, expect
-from skindb.bench.stress.surfels import ETA, WEIGHT, Surfels, filled, first, spoiled, surfels, unit
+from skindb.bench.stress.surfels import (
+    ETA,
+    WEIGHT,
+    Surfels,
+    filled,
+    first,
+    spoiled,
+    surfels,
+    unit,
+)
 from skindb.fit.albedo import _reflectances as diffuse_reflectances
 from skindb.fit.normals import _normals as normals
 from skindb.schema.status import LARGEST_R_D, SMALLEST_R_D
@@ -20,7 +29,9 @@ NORMALS = ("combined", "chromatic", "photometric", "peak")
 # normals
 
 
-def _normals(skin: Surfels, method: str = "combined", eta: float = ETA, scan: Array | None = None) -> Array:
+def _normals(
+    skin: Surfels, method: str = "combined", eta: float = ETA, scan: Array | None = None
+) -> Array:
     """Normals (3, 3); those of the scan have an error of three degrees."""
     scan = _scan(skin) if scan is None else scan
     geometry = skin.position, skin.light, skin.camera, scan
@@ -32,13 +43,16 @@ def _scan(skin: Surfels) -> Array:
 
 
 def _angle(found: Array, true: Array) -> Array:
-    return np.asarray(np.degrees(np.arccos(np.clip(np.einsum("nk,nk->n", found, true), -1, 1))))
+    return np.asarray(
+        np.degrees(np.arccos(np.clip(np.einsum("nk,nk->n", found, true), -1, 1)))
+    )
 
 
 def _matte_normals(method: str, eta: float) -> None:
     skin = surfels(150, 16, eta=eta, weight=0 * WEIGHT)
     off = _angle(_normals(skin, method, eta), skin.normal)
-    # half a degree, because the prior of the scan has an error of three degrees that noise-free samples outweigh
+    # half a degree, because the prior of the scan has an error of three degrees that
+    # noise-free samples outweigh
     expect(off.max() < 0.5, off)
 
 
@@ -62,7 +76,9 @@ def _few_normals(method: str, lights: int, cameras: int) -> None:
 
 def _scaled_normals(method: str, scale: float) -> None:
     skin = surfels(weight=0 * WEIGHT)
-    bright = replace(skin, sample=(skin.sample.astype(np.float64) * scale).astype(np.float32))
+    bright = replace(
+        skin, sample=(skin.sample.astype(np.float64) * scale).astype(np.float32)
+    )
     close(_normals(bright, method), _normals(skin, method), atol=1e-5)
 
 
@@ -89,7 +105,12 @@ def _no_scan(method: str) -> None:
 
 def _no_surfels_normals() -> None:
     skin = surfels()
-    empty = replace(skin, **{f: getattr(skin, f)[:0] for f in ("sample", "position", "normal", "diffuse")})
+    empty = replace(
+        skin,
+        **{
+            f: getattr(skin, f)[:0] for f in ("sample", "position", "normal", "diffuse")
+        },
+    )
     expect(_normals(empty).shape == (0, 3), _normals(empty).shape)
 
 
@@ -131,28 +152,49 @@ def _one_albedo_lost(method: str, value: float) -> None:
 
 def _clamped_albedo(method: str, factor: float) -> None:
     skin = surfels(weight=0 * WEIGHT)
-    found = _albedo(replace(skin, sample=(skin.sample.astype(np.float64) * factor).astype(np.float32)), method)[0]
+    found = _albedo(
+        replace(
+            skin, sample=(skin.sample.astype(np.float64) * factor).astype(np.float32)
+        ),
+        method,
+    )[0]
     close(found, SMALLEST_R_D if factor < 1 else LARGEST_R_D, rtol=1e-6)
 
 
 def _grazing_albedo(method: str) -> None:
-    skin = replace(surfels(weight=0 * WEIGHT), normal=np.tile([0.0, 0, 1], (3, 1)), position=np.zeros((3, 3)))
+    skin = replace(
+        surfels(weight=0 * WEIGHT),
+        normal=np.tile([0.0, 0, 1], (3, 1)),
+        position=np.zeros((3, 3)),
+    )
     low = 900 * np.array([[np.cos(a), np.sin(a), 0.2] for a in (0.1, 2.0, 4.0)])
     wild = np.full((3, 3, *skin.sample.shape[2:]), 1e-3, np.float32)
-    more = replace(skin, light=np.concatenate([skin.light, low]), sample=np.concatenate([skin.sample, wild], axis=1))
+    more = replace(
+        skin,
+        light=np.concatenate([skin.light, low]),
+        sample=np.concatenate([skin.sample, wild], axis=1),
+    )
     close(_albedo(more, method)[0], _albedo(skin, method)[0], rtol=1e-6)
 
 
 def _precision_albedo(method: str) -> None:
     skin = surfels()
     half = skin.sample.astype(np.float16)
-    found = [_albedo(replace(skin, sample=half.astype(t)), method)[0] for t in ("float16", "float32", "float64")]
+    found = [
+        _albedo(replace(skin, sample=half.astype(t)), method)[0]
+        for t in ("float16", "float32", "float64")
+    ]
     close(found[1:], [found[0]] * 2, rtol=1e-6)
 
 
 def _no_surfels_albedo(method: str) -> None:
     skin = surfels()
-    empty = replace(skin, **{f: getattr(skin, f)[:0] for f in ("sample", "position", "normal", "diffuse")})
+    empty = replace(
+        skin,
+        **{
+            f: getattr(skin, f)[:0] for f in ("sample", "position", "normal", "diffuse")
+        },
+    )
     expect(_albedo(empty, method)[0].shape == (0, 3), _albedo(empty, method)[0].shape)
 
 
@@ -179,7 +221,11 @@ NORMAL = (
         *combinations(NORMALS, (1, 1), (3, 1)),
     ),
     *each(
-        "normals", "{}: samples times {:g}", "Normals are unchanged.", _scaled_normals, *combinations(NORMALS, *SCALES)
+        "normals",
+        "{}: samples times {:g}",
+        "Normals are unchanged.",
+        _scaled_normals,
+        *combinations(NORMALS, *SCALES),
     ),
     *each(
         "normals",
@@ -189,8 +235,19 @@ NORMAL = (
         *combinations(NORMALS[:3], np.nan, np.inf),
     ),
     Case("normals", "constant", "Normals are unit vectors or NaN.", _even_light),
-    *each("normals", "{}: no normal of the scan", "The normal is NaN.", _no_scan, *NORMALS[:3]),
-    Case("normals", "no surfels", "Arrays are empty and have the right shapes.", _no_surfels_normals),
+    *each(
+        "normals",
+        "{}: no normal of the scan",
+        "The normal is NaN.",
+        _no_scan,
+        *NORMALS[:3],
+    ),
+    Case(
+        "normals",
+        "no surfels",
+        "Arrays are empty and have the right shapes.",
+        _no_surfels_normals,
+    ),
 )
 ALBEDO = (
     *each(
@@ -207,7 +264,13 @@ ALBEDO = (
         _few_albedo,
         *combinations(METHODS, (1, 1), (3, 1)),
     ),
-    *each("albedo", "{}: all saturated", "R_d is NaN; neighbours are unchanged.", _no_albedo, *METHODS),
+    *each(
+        "albedo",
+        "{}: all saturated",
+        "R_d is NaN; neighbours are unchanged.",
+        _no_albedo,
+        *METHODS,
+    ),
     *each(
         "albedo",
         "{}: a sample is {}",
@@ -222,7 +285,25 @@ ALBEDO = (
         _clamped_albedo,
         *combinations(METHODS, 0.0, 1e-30, 1e3, 1e30),
     ),
-    *each("albedo", "{}: grazing lights", "Their samples are ignored.", _grazing_albedo, *METHODS),
-    *each("albedo", "{}: any precision", "Results agree to rounding.", _precision_albedo, *METHODS),
-    *each("albedo", "{}: no surfels", "Arrays are empty and have the right shapes.", _no_surfels_albedo, *METHODS),
+    *each(
+        "albedo",
+        "{}: grazing lights",
+        "Their samples are ignored.",
+        _grazing_albedo,
+        *METHODS,
+    ),
+    *each(
+        "albedo",
+        "{}: any precision",
+        "Results agree to rounding.",
+        _precision_albedo,
+        *METHODS,
+    ),
+    *each(
+        "albedo",
+        "{}: no surfels",
+        "Arrays are empty and have the right shapes.",
+        _no_surfels_albedo,
+        *METHODS,
+    ),
 )

@@ -1,4 +1,6 @@
-"""Stress cases of diffuse reflection: eq. 5, diffusion profiles and subsurface light at the extremes."""
+"""Stress cases of diffuse reflection: eq. 5, diffusion profiles and subsurface light at
+the extremes.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,13 @@ from numpy.typing import NDArray
 from scipy.integrate import quad
 
 from skindb.bench.case import SCALES, Case, close, combinations, each, expect
-from skindb.optics.diffuse import S_MAX, diffuse_reflectance, dipole_s, reduced_albedo, scattering_coefficients
+from skindb.optics.diffuse import (
+    S_MAX,
+    diffuse_reflectance,
+    dipole_s,
+    reduced_albedo,
+    scattering_coefficients,
+)
 from skindb.optics.dipole import dipole_profile, sigma_tr
 from skindb.optics.dipole_tree import subsurface_exitance
 from skindb.optics.fresnel import fresnel_reflectance, internal_diffuse_reflectance
@@ -24,9 +32,12 @@ SINGLE = 2e-6  # results in single precision
 
 
 def _round_trip(eta: float) -> None:
-    s = np.concatenate([np.geomspace(1e-8, 0.1, 30), np.linspace(0.1, S_MAX - 1e-5, 30)])
+    s = np.concatenate(
+        [np.geomspace(1e-8, 0.1, 30), np.linspace(0.1, S_MAX - 1e-5, 30)]
+    )
     diffuse = diffuse_reflectance(s, eta=eta)
-    inside = (diffuse > 1e-6) & (diffuse < 1 - 1e-6)  # nearer to 1, the rounding of R_d dominates s
+    # nearer to 1, the rounding of R_d dominates s
+    inside = (diffuse > 1e-6) & (diffuse < 1 - 1e-6)
     close(dipole_s(diffuse[inside], eta=eta)[0], s[inside], rtol=1e-9)
 
 
@@ -37,7 +48,8 @@ def _bright(eta: float) -> None:
     lost = np.array([1e-7, 1e-8, 1e-9])
     s, clamped = dipole_s(1 - lost, eta=eta)
     expect(not clamped.any(), clamped)
-    close(s, lost / slope, rtol=1e-6)  # the next term, s^2, and the rounding of 1 - 1e-9 (1e-7)
+    # the next term, s^2, and the rounding of 1 - 1e-9 (1e-7)
+    close(s, lost / slope, rtol=1e-6)
 
 
 def _dark(eta: float) -> None:
@@ -52,24 +64,41 @@ def _dark(eta: float) -> None:
 
 
 def _outside() -> None:
-    s, clamped = dipole_s([-np.inf, -1.0, 0.0, 1e-30, 0.5, 1.0, 2.0, 1e30, np.inf, np.nan], eta=ETA)
+    s, clamped = dipole_s(
+        [-np.inf, -1.0, 0.0, 1e-30, 0.5, 1.0, 2.0, 1e30, np.inf, np.nan], eta=ETA
+    )
     expect(clamped.tolist() == [True] * 4 + [False] + [True] * 4 + [False], clamped)
-    expect(np.isnan(s[-1]) and ((s[:-1] > 0) & (s[:-1] < S_MAX)).all() and (np.diff(s[:-1]) <= 0).all(), s)
+    expect(
+        np.isnan(s[-1])
+        and ((s[:-1] > 0) & (s[:-1] < S_MAX)).all()
+        and (np.diff(s[:-1]) <= 0).all(),
+        s,
+    )
 
 
 def _single_precision() -> None:
     value = np.linspace(0.01, 0.99, 25).astype(np.float32)
-    close(dipole_s(value, eta=ETA)[0], dipole_s(value.astype(np.float64), eta=ETA)[0], rtol=0)
+    close(
+        dipole_s(value, eta=ETA)[0],
+        dipole_s(value.astype(np.float64), eta=ETA)[0],
+        rtol=0,
+    )
 
 
 def _no_values() -> None:
-    expect(dipole_s(np.zeros((0, 3)), eta=ETA)[0].shape == (0, 3), dipole_s(np.zeros((0, 3)), eta=ETA)[0].shape)
+    expect(
+        dipole_s(np.zeros((0, 3)), eta=ETA)[0].shape == (0, 3),
+        dipole_s(np.zeros((0, 3)), eta=ETA)[0].shape,
+    )
 
 
 def _coefficients(tr: float) -> None:
     s = np.array([0.0, 1e-30, 1e-4, 0.5, S_MAX])
     a, scattered = scattering_coefficients(s, tr)
-    expect(np.isfinite([a, scattered]).all() and (np.array([a, scattered]) >= 0).all(), (a, scattered))
+    expect(
+        np.isfinite([a, scattered]).all() and (np.array([a, scattered]) >= 0).all(),
+        (a, scattered),
+    )
     close(sigma_tr(a, scattered), tr, rtol=1e-12)
 
 
@@ -82,7 +111,9 @@ def _no_boundary() -> None:
 def _grazing_light(eta: float) -> None:
     """F_r -> 1 - 4 cos F(eta) towards the horizon: continuous, and one at the horizon."""
     close(fresnel_reflectance([0.0, 1e-30, 1e-12], eta), 1.0, atol=1e-10)
-    expect((np.diff(fresnel_reflectance(np.linspace(0, 0.2, 50), eta)) < 0).all(), "a rise")
+    expect(
+        (np.diff(fresnel_reflectance(np.linspace(0, 0.2, 50), eta)) < 0).all(), "a rise"
+    )
     close(fresnel_reflectance([0.0, 0.1], 1 / eta), 1.0)  # total internal reflection
 
 
@@ -90,26 +121,40 @@ def _grazing_light(eta: float) -> None:
 
 
 def _near(name: str) -> None:
-    """R decreases with distance, and grows towards 0 at most like exp(-sigma_t' r) / r, as single scattering does."""
+    """R decreases with distance, and grows towards 0 at most like exp(-sigma_t' r) / r,
+    as single scattering does.
+    """
     r = np.geomspace(1e-12, 0.015, 60)  # mean free paths are 0.6
     value = PROFILES[name](r, 0.1, 1.5, eta=ETA)
-    expect(np.isfinite(value).all() and (value > 0).all() and (np.diff(value) <= 0).all(), value)
+    expect(
+        np.isfinite(value).all() and (value > 0).all() and (np.diff(value) <= 0).all(),
+        value,
+    )
     alone = value * r * np.exp(1.6 * r)
-    expect((np.diff(alone) >= -1e-12 * alone[1:]).all(), "steeper than exp(-sigma_t' r)/r")
+    expect(
+        (np.diff(alone) >= -1e-12 * alone[1:]).all(), "steeper than exp(-sigma_t' r)/r"
+    )
 
 
 def _far(name: str) -> None:
-    """Far away R decays at the rate sigma_tr (the dipole) or at the exact rate, which absorption makes lower."""
+    """Far away R decays at the rate sigma_tr (the dipole) or at the exact rate, which
+    absorption makes lower.
+    """
     r = np.array([40.0, 50.0, 60.0])
     value = PROFILES[name](r, 0.3, 1.0, eta=ETA)
     rate = -np.diff(np.log(value * r**2)) / np.diff(r)
     tr = sigma_tr(0.3, 1.0)
     expect((rate < tr * 1.02).all() and (rate > 0.75 * tr).all(), rate / tr)
-    expect(np.isfinite(PROFILES[name](np.array([1e6, 1e30]), 0.3, 1.0, eta=ETA)).all(), "not finite")
+    expect(
+        np.isfinite(PROFILES[name](np.array([1e6, 1e30]), 0.3, 1.0, eta=ETA)).all(),
+        "not finite",
+    )
 
 
 def _no_absorption(name: str) -> None:
-    """With sigma_a = 0 the mean free path is the only length, so R ~ r^-3 far away, the limit of small sigma_a."""
+    """With sigma_a = 0 the mean free path is the only length, so R ~ r^-3 far away, the
+    limit of small sigma_a.
+    """
     r = np.array([30.0, 100.0])
     value = PROFILES[name](r, 0.0, 1.0, eta=ETA)
     rate = np.log(value[0] / value[1]) / np.log(r[1] / r[0])
@@ -121,7 +166,10 @@ def _no_scattering(name: str) -> None:
     """As sigma_s' -> 0, R vanishes, for the dipole in proportion to sigma_s'."""
     r = np.array([0.5, 1.0, 3.0])
     small, less = (PROFILES[name](r, 0.5, s, eta=ETA) for s in (1e-4, 1e-6))
-    expect(np.isfinite([small, less]).all() and (less >= 0).all() and (less < small).all(), (small, less))
+    expect(
+        np.isfinite([small, less]).all() and (less >= 0).all() and (less < small).all(),
+        (small, less),
+    )
     if name == "dipole":
         close(less / small, 0.01, rtol=1e-3)
         close(PROFILES[name](r, 0.5, 0.0, eta=ETA), 0.0)
@@ -155,14 +203,22 @@ def _integral(eta: float, albedo: float) -> None:
     s = albedo
     far = 60 / float(sigma_tr(a, s))
     total = sum(
-        quad(lambda r: 2 * np.pi * r * float(dipole_profile(r, a, s, eta=eta)), low, high, epsrel=1e-10, limit=400)[0]
+        quad(
+            lambda r: 2 * np.pi * r * float(dipole_profile(r, a, s, eta=eta)),
+            low,
+            high,
+            epsrel=1e-10,
+            limit=400,
+        )[0]
         for low, high in ((0, 1), (1, 30), (30, max(far, 31)))
     )
     close(total, diffuse_reflectance(np.sqrt(3 * a), eta=eta), rtol=1e-6)
 
 
 def _medium(name: str, sigma_a: float, sigma_s: float) -> None:
-    """R is finite and decreases with distance; it may vanish only where absorption is far above scattering."""
+    """R is finite and decreases with distance; it may vanish only where absorption is
+    far above scattering.
+    """
     r = np.geomspace(1e-6, 2000, 200)
     value = PROFILES[name](r, sigma_a, sigma_s, eta=ETA)
     expect(np.isfinite(value).all() and (np.diff(value) <= 0).all(), value)
@@ -176,13 +232,17 @@ def _more_absorption(name: str) -> None:
 
 
 def _no_distances(name: str) -> None:
-    expect(PROFILES[name](np.zeros(0), 0.1, 1.5, eta=ETA).shape == (0,), "another shape")
+    expect(
+        PROFILES[name](np.zeros(0), 0.1, 1.5, eta=ETA).shape == (0,), "another shape"
+    )
 
 
 # subsurface
 
 
-def _exitance(points: Array, light: Array, s: float = 0.7, tr: float = 1.0, *, eta: float = ETA) -> Array:
+def _exitance(
+    points: Array, light: Array, s: float = 0.7, tr: float = 1.0, *, eta: float = ETA
+) -> Array:
     n = len(points)
     skin = np.full((n, 3), s), np.full((n, 3), tr)
     return subsurface_exitance(points, np.full(n, 0.04), light, *skin, eta=eta)
@@ -196,7 +256,8 @@ def _patch(n: int = 900) -> Array:
 
 def _uniform(s: float, tr: float, eta: float = ETA) -> None:
     out = _exitance(_patch(), np.ones((900, 2)), s, tr, eta=eta)
-    close(out, diffuse_reflectance(np.maximum(s, 1e-4), eta=eta), rtol=SINGLE)  # s has a lower bound in the code
+    # s has a lower bound in the code
+    close(out, diffuse_reflectance(np.maximum(s, 1e-4), eta=eta), rtol=SINGLE)
 
 
 def _few_points(n: int) -> None:
@@ -205,17 +266,24 @@ def _few_points(n: int) -> None:
 
 
 def _no_lights() -> None:
-    expect(_exitance(np.zeros((1, 3)), np.ones((1, 0))).shape == (0, 1, 3), "another shape")
+    expect(
+        _exitance(np.zeros((1, 3)), np.ones((1, 0))).shape == (0, 1, 3), "another shape"
+    )
 
 
 def _same_place() -> None:
     out = _exitance(np.zeros((50, 3)), np.linspace(0, 2, 50)[:, None])
-    close(out, diffuse_reflectance(0.7, eta=ETA), rtol=SINGLE)  # all points receive the mean of the light, which is one
+    # all points receive the mean of the light, which is one
+    close(out, diffuse_reflectance(0.7, eta=ETA), rtol=SINGLE)
 
 
 def _in_a_line() -> None:
     points = np.stack([0.2 * np.arange(300), np.zeros(300), np.zeros(300)], axis=1)
-    close(_exitance(points, np.ones((300, 1))), diffuse_reflectance(0.7, eta=ETA), rtol=SINGLE)
+    close(
+        _exitance(points, np.ones((300, 1))),
+        diffuse_reflectance(0.7, eta=ETA),
+        rtol=SINGLE,
+    )
 
 
 def _far_apart() -> None:
@@ -229,14 +297,21 @@ def _far_apart() -> None:
 
 def _scaled_light(scale: float) -> None:
     light = np.linspace(0, 1, 900)[:, None]
-    close(_exitance(_patch(), light * scale) / scale, _exitance(_patch(), light), rtol=SINGLE, atol=1e-12)
+    close(
+        _exitance(_patch(), light * scale) / scale,
+        _exitance(_patch(), light),
+        rtol=SINGLE,
+        atol=1e-12,
+    )
 
 
 def _scaled_lengths(scale: float) -> None:
     light = np.linspace(0, 1, 900)[:, None]
     n = 900
     skin = np.full((n, 3), 0.7), np.full((n, 3), 1.0 / scale)
-    grown = subsurface_exitance(_patch() * scale, np.full(n, 0.04 * scale * scale), light, *skin, eta=ETA)
+    grown = subsurface_exitance(
+        _patch() * scale, np.full(n, 0.04 * scale * scale), light, *skin, eta=ETA
+    )
     close(grown, _exitance(_patch(), light), rtol=1e-5)
 
 
@@ -255,14 +330,43 @@ def _broken_light() -> None:
 
 NAMES = tuple(PROFILES)
 OPTICS = (
-    *each("inverse", "eta {}", "s is recovered from R_d(s).", _round_trip, 1.0, 1.3, 1.5),
-    *each("inverse", "alpha' to 1, eta {}", "s follows the first term of the series.", _bright, 1.0, 1.3),
-    *each("inverse", "alpha' to 0, eta {}", "s follows the first term of the series.", _dark, 1.0, 1.3),
-    Case(
-        "inverse", "black, white, out of range, NaN and inf", "Clamped and flagged, monotone; NaN stays NaN.", _outside
+    *each(
+        "inverse", "eta {}", "s is recovered from R_d(s).", _round_trip, 1.0, 1.3, 1.5
     ),
-    Case("inverse", "single precision", "Computed in double precision: the same bits.", _single_precision),
-    Case("inverse", "no values", "Arrays are empty and have the right shapes.", _no_values),
+    *each(
+        "inverse",
+        "alpha' to 1, eta {}",
+        "s follows the first term of the series.",
+        _bright,
+        1.0,
+        1.3,
+    ),
+    *each(
+        "inverse",
+        "alpha' to 0, eta {}",
+        "s follows the first term of the series.",
+        _dark,
+        1.0,
+        1.3,
+    ),
+    Case(
+        "inverse",
+        "black, white, out of range, NaN and inf",
+        "Clamped and flagged, monotone; NaN stays NaN.",
+        _outside,
+    ),
+    Case(
+        "inverse",
+        "single precision",
+        "Computed in double precision: the same bits.",
+        _single_precision,
+    ),
+    Case(
+        "inverse",
+        "no values",
+        "Arrays are empty and have the right shapes.",
+        _no_values,
+    ),
     *each(
         "inverse",
         "coefficients at sigma_tr {:g}",
@@ -272,7 +376,12 @@ OPTICS = (
         1.0,
         1e30,
     ),
-    Case("inverse", "Fresnel at eta 1", "Nothing is reflected at any angle.", _no_boundary),
+    Case(
+        "inverse",
+        "Fresnel at eta 1",
+        "Nothing is reflected at any angle.",
+        _no_boundary,
+    ),
     *each(
         "inverse",
         "Fresnel towards the horizon, eta {}",
@@ -282,8 +391,20 @@ OPTICS = (
         1.3,
         2.0,
     ),
-    *each("transport", "{}: r to 0", "Positive, finite, and not steeper than single scattering.", _near, *NAMES),
-    *each("transport", "{}: r far", "Decays to zero at the rate of its medium.", _far, *NAMES),
+    *each(
+        "transport",
+        "{}: r to 0",
+        "Positive, finite, and not steeper than single scattering.",
+        _near,
+        *NAMES,
+    ),
+    *each(
+        "transport",
+        "{}: r far",
+        "Decays to zero at the rate of its medium.",
+        _far,
+        *NAMES,
+    ),
     *each(
         "transport",
         "{}: sigma_a = 0",
@@ -291,7 +412,13 @@ OPTICS = (
         _no_absorption,
         *NAMES,
     ),
-    *each("transport", "{}: sigma_s' to 0", "No light is scattered back.", _no_scattering, *NAMES),
+    *each(
+        "transport",
+        "{}: sigma_s' to 0",
+        "No light is scattered back.",
+        _no_scattering,
+        *NAMES,
+    ),
     *each(
         "transport",
         "{}: lengths times {:g}",
@@ -300,18 +427,38 @@ OPTICS = (
         *((name, s) for name in NAMES for s in SCALES),
     ),
     *each(
-        "transport", "{}: single precision", "Computed in double precision: the same bits.", _profile_precision, *NAMES
+        "transport",
+        "{}: single precision",
+        "Computed in double precision: the same bits.",
+        _profile_precision,
+        *NAMES,
     ),
-    *each("transport", "{}: NaN and inf", "NaN gives NaN, and infinity no positive number.", _profile_nan, *NAMES),
+    *each(
+        "transport",
+        "{}: NaN and inf",
+        "NaN gives NaN, and infinity no positive number.",
+        _profile_nan,
+        *NAMES,
+    ),
     *each(
         "transport",
         "{}: sigma_a {:g}, sigma_s' {:g}",
         "Finite, and decreasing with distance.",
         _medium,
-        *combinations(NAMES, (0.0, 1.0), (1e-12, 1.0), (0.1, 1e-4), (30.0, 1.0), (0.1, 100.0)),
+        *combinations(
+            NAMES, (0.0, 1.0), (1e-12, 1.0), (0.1, 1e-4), (30.0, 1.0), (0.1, 100.0)
+        ),
     ),
-    *each("transport", "{}: more absorption", "There is less light at every distance.", _more_absorption, *NAMES),
-    *each("transport", "{}: no distances", "The array is empty.", _no_distances, *NAMES),
+    *each(
+        "transport",
+        "{}: more absorption",
+        "There is less light at every distance.",
+        _more_absorption,
+        *NAMES,
+    ),
+    *each(
+        "transport", "{}: no distances", "The array is empty.", _no_distances, *NAMES
+    ),
     *each(
         "transport",
         "dipole: eta {}, albedo {:g}",
@@ -332,7 +479,13 @@ OPTICS = (
         (0.7, 100.0),
         (S_MAX - 1e-6, 1.0),
     ),
-    *each("subsurface", "uniform light, eta {2}", "Exitance is R_d.", _uniform, (0.7, 1.0, 1.0)),
+    *each(
+        "subsurface",
+        "uniform light, eta {2}",
+        "Exitance is R_d.",
+        _uniform,
+        (0.7, 1.0, 1.0),
+    ),
     *each(
         "subsurface",
         "{} point(s)",
@@ -343,12 +496,40 @@ OPTICS = (
         3,
         2400,
     ),
-    Case("subsurface", "no lights", "Arrays are empty and have the right shapes.", _no_lights),
-    Case("subsurface", "50 points in one place", "All receive the mean of their light.", _same_place),
-    Case("subsurface", "points in a line", "Exitance is R_d in uniform light.", _in_a_line),
+    Case(
+        "subsurface",
+        "no lights",
+        "Arrays are empty and have the right shapes.",
+        _no_lights,
+    ),
+    Case(
+        "subsurface",
+        "50 points in one place",
+        "All receive the mean of their light.",
+        _same_place,
+    ),
+    Case(
+        "subsurface",
+        "points in a line",
+        "Exitance is R_d in uniform light.",
+        _in_a_line,
+    ),
     Case("subsurface", "a kilometre apart", "No light is exchanged.", _far_apart),
-    *each("subsurface", "light times {:g}", "Exitance is multiplied by it.", _scaled_light, *SCALES),
-    *each("subsurface", "lengths times {:g}", "Exitance is unchanged.", _scaled_lengths, 1e-6, 1e6),
+    *each(
+        "subsurface",
+        "light times {:g}",
+        "Exitance is multiplied by it.",
+        _scaled_light,
+        *SCALES,
+    ),
+    *each(
+        "subsurface",
+        "lengths times {:g}",
+        "Exitance is unchanged.",
+        _scaled_lengths,
+        1e-6,
+        1e6,
+    ),
     Case("subsurface", "no light", "Exitance is zero.", _no_light),
     Case("subsurface", "NaN in one light", "Only this light has NaN.", _broken_light),
 )

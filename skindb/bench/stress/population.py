@@ -1,4 +1,6 @@
-"""Stress cases of kernels of populations: no texture, one texel, few subjects, values of any size."""
+"""Stress cases of kernels of populations: no texture, one texel, few subjects, values
+of any size.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,13 @@ from skindb.bench.case import SCALES, Case, close, each, expect
 from skindb.numerics.inference import effects, permutation_p
 from skindb.numerics.principal import principal_axes
 from skindb.numerics.pyramid import build, reconstruct
-from skindb.numerics.texture import QUANTILES, image_parts, part_quantiles, synthesise, valid_quantiles
+from skindb.numerics.texture import (
+    QUANTILES,
+    image_parts,
+    part_quantiles,
+    synthesise,
+    valid_quantiles,
+)
 
 
 def _noise(*shape: int) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
@@ -18,43 +26,78 @@ def _noise(*shape: int) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
 
 def _round_trip(height: int, width: int, scale: float) -> None:
     image = scale * _noise(height, width)
-    close(reconstruct(build(image, levels=min(4, max(height, width).bit_length() - 1))), image, atol=1e-12 * scale)
+    close(
+        reconstruct(build(image, levels=min(4, max(height, width).bit_length() - 1))),
+        image,
+        atol=1e-12 * scale,
+    )
 
 
 def _constant(value: float) -> None:
     pyramid = build(np.full((64, 64), value), levels=4)
-    expect(all(np.abs(part).max() <= 1e-12 * value for part in pyramid.parts()[:-1]), "detail in a constant image")
+    expect(
+        all(np.abs(part).max() <= 1e-12 * value for part in pyramid.parts()[:-1]),
+        "detail in a constant image",
+    )
 
 
 def _texture(scale: float) -> None:
     image = _noise(64, 64)
     wanted = gaussian_filter(image.T, 2)
-    every = [[np.ones(part.shape) for part in image_parts(x, 3)] for x in (image, wanted)]
-    before, after = (part_quantiles(image_parts(x, 3), one) for x, one in zip((image, wanted), every, strict=True))
+    every = [
+        [np.ones(part.shape) for part in image_parts(x, 3)] for x in (image, wanted)
+    ]
+    before, after = (
+        part_quantiles(image_parts(x, 3), one)
+        for x, one in zip((image, wanted), every, strict=True)
+    )
     image = scale * image
     shift = scale * (after - before)[None]
-    found = synthesise(image, [np.ones((64, 64))], shift, levels=3, iterations=2, rng=np.random.default_rng(0))
-    expect(np.isfinite(found.image).all() and found.trace[-1] < found.trace[0], found.trace)
+    found = synthesise(
+        image,
+        [np.ones((64, 64))],
+        shift,
+        levels=3,
+        iterations=2,
+        rng=np.random.default_rng(0),
+    )
+    expect(
+        np.isfinite(found.image).all() and found.trace[-1] < found.trace[0], found.trace
+    )
 
 
 def _flat_texture() -> None:
     shift = np.sort(_noise(1, 15, QUANTILES))
     blank = np.zeros((64, 64))
     rng = np.random.default_rng(0)
-    found = synthesise(blank, [np.ones((64, 64))], shift, levels=3, iterations=3, rng=rng)
-    expect(np.isfinite(found.image).all() and found.image.std() > 0.1, found.image.std())
+    found = synthesise(
+        blank, [np.ones((64, 64))], shift, levels=3, iterations=3, rng=rng
+    )
+    expect(
+        np.isfinite(found.image).all() and found.image.std() > 0.1, found.image.std()
+    )
 
 
 def _no_texture_asked() -> None:
     image = _noise(64, 64)
-    found = synthesise(image, [np.ones((64, 64))], np.zeros((1, 15, QUANTILES)), levels=3, rng=np.random.default_rng(0))
+    found = synthesise(
+        image,
+        [np.ones((64, 64))],
+        np.zeros((1, 15, QUANTILES)),
+        levels=3,
+        rng=np.random.default_rng(0),
+    )
     close(found.image, image)
 
 
 def _quantiles(scale: float) -> None:
     found = valid_quantiles(scale * _noise(3, QUANTILES))
     expect((np.diff(found) >= 0).all(), "a decreasing quantile function")
-    close(found.mean(axis=1), scale * _noise(3, QUANTILES).mean(axis=1), atol=1e-12 * scale)
+    close(
+        found.mean(axis=1),
+        scale * _noise(3, QUANTILES).mean(axis=1),
+        atol=1e-12 * scale,
+    )
 
 
 def _alike(count: int) -> None:
@@ -83,7 +126,9 @@ def _equal_values() -> None:
     group = (np.arange(10) % 2).astype(float)
     found = effects(values, group)
     close(found.slope, [0.0, 0.0], atol=1e-15)
-    p, adjusted, _ = permutation_p(values, group, most=200, rng=np.random.default_rng(0))
+    p, adjusted, _ = permutation_p(
+        values, group, most=200, rng=np.random.default_rng(0)
+    )
     expect((p == 1).all() and (adjusted == 1).all(), p)
 
 
@@ -95,7 +140,9 @@ def _far_apart() -> None:
 
 
 POPULATION: tuple[Case, ...] = (
-    Case("pyramid", "constant image", "No band has any detail.", lambda: _constant(1e6)),
+    Case(
+        "pyramid", "constant image", "No band has any detail.", lambda: _constant(1e6)
+    ),
     *(
         Case(
             "pyramid",
@@ -103,15 +150,54 @@ POPULATION: tuple[Case, ...] = (
             "A round trip returns the image.",
             lambda h=height, w=width, s=scale: _round_trip(h, w, s),  # type: ignore[misc]
         )
-        for height, width, scale in [(64, 64, s) for s in SCALES] + [(63, 50, 1.0), (1, 17, 1.0), (2, 300, 1.0)]
+        for height, width, scale in [(64, 64, s) for s in SCALES]
+        + [(63, 50, 1.0), (1, 17, 1.0), (2, 300, 1.0)]
     ),
-    *each("textures", "values of {:g}", "The distributions converge, and stay finite.", _texture, *SCALES[1:3]),
-    Case("textures", "image without texture", "The added noise creates texture.", _flat_texture),
-    Case("textures", "no change requested", "The image is unchanged.", _no_texture_asked),
-    *each("textures", "decreasing quantiles of {:g}", "They become monotone and keep their mean.", _quantiles, *SCALES),
+    *each(
+        "textures",
+        "values of {:g}",
+        "The distributions converge, and stay finite.",
+        _texture,
+        *SCALES[1:3],
+    ),
+    Case(
+        "textures",
+        "image without texture",
+        "The added noise creates texture.",
+        _flat_texture,
+    ),
+    Case(
+        "textures", "no change requested", "The image is unchanged.", _no_texture_asked
+    ),
+    *each(
+        "textures",
+        "decreasing quantiles of {:g}",
+        "They become monotone and keep their mean.",
+        _quantiles,
+        *SCALES,
+    ),
     *each("components", "{} equal vectors", "There is no component.", _alike, 2, 10),
-    *each("components", "values of {:g}", "The vectors are rebuilt from the components.", _vectors, *SCALES),
-    *each("permutations", "values of {:g}", "Effects scale, statistics do not.", _scaled, *SCALES),
-    Case("permutations", "equal subjects", "The effect is 0 and p is 1.", _equal_values),
-    Case("permutations", "groups a million apart", "p is small, and not below 1 / (n + 1).", _far_apart),
+    *each(
+        "components",
+        "values of {:g}",
+        "The vectors are rebuilt from the components.",
+        _vectors,
+        *SCALES,
+    ),
+    *each(
+        "permutations",
+        "values of {:g}",
+        "Effects scale, statistics do not.",
+        _scaled,
+        *SCALES,
+    ),
+    Case(
+        "permutations", "equal subjects", "The effect is 0 and p is 1.", _equal_values
+    ),
+    Case(
+        "permutations",
+        "groups a million apart",
+        "p is small, and not below 1 / (n + 1).",
+        _far_apart,
+    ),
 )

@@ -1,4 +1,6 @@
-"""Stress cases of fits of probe profiles, which must return the planted values or a status with the reason."""
+"""Stress cases of fits of probe profiles, which must return the planted values or a
+status with the reason.
+"""
 
 from __future__ import annotations
 
@@ -21,24 +23,37 @@ FIBRES = 1 + 0.5 * np.arange(28)
 MEDIUM = (0.17, 2.3)
 
 
-def _profile(model: str, a: float = MEDIUM[0], s: float = MEDIUM[1], distance: Array = FIBRES) -> Array:
+def _profile(
+    model: str, a: float = MEDIUM[0], s: float = MEDIUM[1], distance: Array = FIBRES
+) -> Array:
     return MODELS[model].profile(distance, a, s, eta=ETA)
 
 
 def _probe(
-    model: str, value: Array, error: Array | None = None, distance: Array = FIBRES, *, free: bool = False
+    model: str,
+    value: Array,
+    error: Array | None = None,
+    distance: Array = FIBRES,
+    *,
+    free: bool = False,
 ) -> ProbeFit:
     error = 0.004 * value if error is None else error
-    return fit_profile(distance, value, error, radius=0.0, eta=ETA, model=model, free_gain=free)
+    return fit_profile(
+        distance, value, error, radius=0.0, eta=ETA, model=model, free_gain=free
+    )
 
 
-def _is_truth(fit: ProbeFit, a: float = MEDIUM[0], s: float = MEDIUM[1], rtol: float = 2e-3) -> None:
+def _is_truth(
+    fit: ProbeFit, a: float = MEDIUM[0], s: float = MEDIUM[1], rtol: float = 2e-3
+) -> None:
     expect(fit.status == ProbeStatus.FITTED, fit.status)
     close([fit.sigma_tr, fit.sigma_s_prime], [sigma_tr(a, s), s], rtol=rtol)
 
 
 def _enough_fibres(model: str, count: int) -> None:
-    _is_truth(_probe(model, _profile(model)[:count], distance=FIBRES[:count]), rtol=0.01)
+    _is_truth(
+        _probe(model, _profile(model)[:count], distance=FIBRES[:count]), rtol=0.01
+    )
 
 
 def _three_fibres(model: str) -> None:
@@ -49,7 +64,12 @@ def _three_fibres(model: str) -> None:
 
 def _too_few_fibres(model: str, count: int) -> None:
     fit = _probe(model, _profile(model)[:count], distance=FIBRES[:count])
-    expect(fit.status == ProbeStatus.TOO_FEW_FIBRES and np.isnan(fit.sigma_tr) and fit.used == count, fit)
+    expect(
+        fit.status == ProbeStatus.TOO_FEW_FIBRES
+        and np.isnan(fit.sigma_tr)
+        and fit.used == count,
+        fit,
+    )
 
 
 def _many_readings(model: str) -> None:
@@ -82,7 +102,9 @@ def _dead_probe(model: str, value: float) -> None:
 def _flagged_or_right(fit: ProbeFit, a: float, s: float) -> None:
     true = float(sigma_tr(a, s))
     near = abs(fit.sigma_tr / true - 1) < 0.02 if true > 0 else False
-    inside = abs(fit.sigma_tr - true) < 3 * np.hypot(fit.sigma_tr_error, fit.sigma_tr_model_error)
+    inside = abs(fit.sigma_tr - true) < 3 * np.hypot(
+        fit.sigma_tr_error, fit.sigma_tr_model_error
+    )
     expect(near or inside or fit.status != ProbeStatus.FITTED, fit)
 
 
@@ -112,13 +134,17 @@ def _near_and_far(model: str, factor: float) -> None:
     """If all lengths are multiplied by `factor`, the fitted coefficients are divided by it."""
     a = MEDIUM[0] / factor
     s = MEDIUM[1] / factor
-    fit = _probe(model, _profile(model, a, s, FIBRES * factor), distance=FIBRES * factor)
+    fit = _probe(
+        model, _profile(model, a, s, FIBRES * factor), distance=FIBRES * factor
+    )
     _is_truth(fit, a, s, rtol=5e-3)
 
 
 def _matched_index(model: str) -> None:
     value = MODELS[model].profile(FIBRES, *MEDIUM, eta=1.0)
-    fit = fit_profile(FIBRES, value, 0.004 * value, radius=0.0, eta=1.0, model=model, free_gain=False)
+    fit = fit_profile(
+        FIBRES, value, 0.004 * value, radius=0.0, eta=1.0, model=model, free_gain=False
+    )
     _is_truth(fit)
 
 
@@ -127,7 +153,13 @@ def _zero_error(model: str) -> None:
 
 
 PROBE = (
-    *each("probe", "{}: {} fibres", RECOVERED, _enough_fibres, *combinations(PROBES, 5, 28)),
+    *each(
+        "probe",
+        "{}: {} fibres",
+        RECOVERED,
+        _enough_fibres,
+        *combinations(PROBES, 5, 28),
+    ),
     *each(
         "probe",
         "{}: 3 fibres",
@@ -170,10 +202,23 @@ PROBE = (
         "sigma_tr is within 2 % or three errors, or flagged.",
         _medium,
         *combinations(
-            PROBES, (0.0, 2.0), (1e-8, 2.0), (1e-6, 2.0), (0.1, 1e-4), (0.1, 1e-3), (20.0, 1.0), (1e-3, 50.0)
+            PROBES,
+            (0.0, 2.0),
+            (1e-8, 2.0),
+            (1e-6, 2.0),
+            (0.1, 1e-4),
+            (0.1, 1e-3),
+            (20.0, 1.0),
+            (1e-3, 50.0),
         ),
     ),
-    *each("probe", "{}: constant", "The fit is flagged, or has a large residual.", _flat_profile, *PROBES),
+    *each(
+        "probe",
+        "{}: constant",
+        "The fit is flagged, or has a large residual.",
+        _flat_profile,
+        *PROBES,
+    ),
     *each(
         "probe",
         "{}: gain {:g}",

@@ -13,8 +13,12 @@ from skindb.numerics.factorise import nmf
 from skindb.numerics.nnls import ReflectanceFit, fit_reflectance, solve_nnls
 
 Array = NDArray[Any]
-ROUNDING = 1e-7  # normal equations square the condition: residuals agree to the root of the rounding error
-SINGLE = 2e-5  # of weights up to 0.5: rows and sums of a surfel are in single precision, and scales no powers of two
+# normal equations square the condition: residuals agree to the root of the rounding
+# error
+ROUNDING = 1e-7
+# of weights up to 0.5: rows and sums of a surfel are in single precision, and scales no
+# powers of two
+SINGLE = 2e-5
 KKT = 1e-9  # largest KKT residual of a solution; the tolerance of the solver is 1e-10
 
 
@@ -26,21 +30,38 @@ def _rows(n: int, m: int = 6, seed: int = 0) -> tuple[Array, Array]:
     return rows, clean[:, None] * (1 + 0.05 * rng.normal(size=(n, 3)))
 
 
-def _fit(rows: Array, target: Array, mode: Any = "linear", floor: float = 1e-3, least: int = 1) -> ReflectanceFit:
+def _fit(
+    rows: Array,
+    target: Array,
+    mode: Any = "linear",
+    floor: float = 1e-3,
+    least: int = 1,
+) -> ReflectanceFit:
     eye = np.eye(rows.shape[1])
     return fit_reflectance(
-        rows, np.array([0, len(rows)]), target, None, eye, mode=mode, noise_floor=floor, min_samples=least
+        rows,
+        np.array([0, len(rows)]),
+        target,
+        None,
+        eye,
+        mode=mode,
+        noise_floor=floor,
+        min_samples=least,
     )
 
 
 def _as_scipy(rows: Array, target: Array) -> None:
-    """Check that the fit is certified and that its residual is not above SciPy's on the same rows."""
+    """Check that the fit is certified and that its residual is not above SciPy's on the
+    same rows.
+    """
     fit = _fit(rows, target)
     M = np.repeat(rows.astype(np.float64), 3, axis=0)
     expect(fit.status[0] == 0 and fit.kkt[0] < KKT, (fit.status, fit.kkt))
     ours = np.linalg.norm(M @ fit.weight[0] - target.ravel())
     theirs = nnls(M, target.ravel())[1]
-    expect(ours <= theirs * (1 + ROUNDING) + 1e-14 * np.linalg.norm(target), (ours, theirs))
+    expect(
+        ours <= theirs * (1 + ROUNDING) + 1e-14 * np.linalg.norm(target), (ours, theirs)
+    )
 
 
 def _no_rows() -> None:
@@ -55,7 +76,11 @@ def _few_are_refused() -> None:
 
 def _columns(change: str) -> None:
     rows, target = _rows(60)
-    extra = {"zero": 0 * rows[:, :1], "duplicate": rows[:, :1], "collinear": rows[:, :1] + rows[:, 1:2]}[change]
+    extra = {
+        "zero": 0 * rows[:, :1],
+        "duplicate": rows[:, :1],
+        "collinear": rows[:, :1] + rows[:, 1:2],
+    }[change]
     _as_scipy(np.concatenate([rows, extra, extra], axis=1), target)
     more = _fit(np.concatenate([extra, rows], axis=1), target)
     less = _fit(rows, target)
@@ -69,13 +94,17 @@ def _columns(change: str) -> None:
 def _scaled_rows(mode: str, scale: float) -> None:
     rows, target = _rows(60)
     want = _fit(rows, target, mode).weight
-    close(_fit((rows * np.float32(scale)), target, mode).weight * scale, want, atol=SINGLE)
+    close(
+        _fit((rows * np.float32(scale)), target, mode).weight * scale, want, atol=SINGLE
+    )
 
 
 def _scaled_samples(mode: str, scale: float) -> None:
     rows, target = _rows(60)
     want = _fit(rows, target, mode).weight
-    close(_fit(rows, target * scale, mode, 1e-3 * scale).weight / scale, want, atol=SINGLE)
+    close(
+        _fit(rows, target * scale, mode, 1e-3 * scale).weight / scale, want, atol=SINGLE
+    )
 
 
 def _scaled_columns(scale: float) -> None:
@@ -96,7 +125,15 @@ def _not_finite(mode: str, bad: float) -> None:
     offsets = np.array([0, 40, 80])
     spoiled = np.concatenate([target, target])
     spoiled[3, 1] = bad
-    fit = fit_reflectance(both, offsets, spoiled, None, np.eye(6), mode=mode, noise_floor=1e-3)  # type: ignore[arg-type]
+    fit = fit_reflectance(
+        both,
+        offsets,
+        spoiled,
+        None,
+        np.eye(6),
+        mode=mode,  # type: ignore[arg-type]
+        noise_floor=1e-3,
+    )
     expect(fit.status.tolist() == [6, 0] and np.isnan(fit.weight[0]).all(), fit.status)
     close(fit.weight[1], _fit(rows, target, mode).weight[0], rtol=1e-12)
 
@@ -109,7 +146,12 @@ def _black(mode: str, level: float) -> None:
 
 def _single_precision() -> None:
     rows, target = _rows(60)
-    close(_fit(rows, target.astype(np.float32)).weight, _fit(rows, target).weight, rtol=1e-5, atol=1e-6)
+    close(
+        _fit(rows, target.astype(np.float32)).weight,
+        _fit(rows, target).weight,
+        rtol=1e-5,
+        atol=1e-6,
+    )
 
 
 def _more_bases_than_samples() -> None:
@@ -137,7 +179,9 @@ def _factors(X: Array, k: int, metric: Array | None = None) -> Any:
 
 def _above_the_rank(space: str) -> None:
     A = np.eye(12) if space == "metric" else None
-    expect(_factors(_planted(k=2), 4, A).error < 0.02, _factors(_planted(k=2), 4, A).error)
+    expect(
+        _factors(_planted(k=2), 4, A).error < 0.02, _factors(_planted(k=2), 4, A).error
+    )
 
 
 def _above_the_size() -> None:
@@ -152,7 +196,8 @@ def _above_the_size() -> None:
 
 def _scaled_weights(scale: float) -> None:
     X = _planted()
-    close(_factors(X * scale, 3).H, _factors(X, 3).H, atol=1e-3)  # starts are in single precision
+    # starts are in single precision
+    close(_factors(X * scale, 3).H, _factors(X, 3).H, atol=1e-3)
     close(_factors(X * scale, 3).error, _factors(X, 3).error, rtol=0.05, atol=1e-4)
 
 
@@ -165,11 +210,17 @@ def _scaled_in_metric(scale: float) -> None:
 
 def _one_surfel(space: str) -> None:
     X = _planted(1)
-    close(_factors(X, 1, np.eye(12) if space == "metric" else None).H, X / X.sum(), atol=1e-6)
+    close(
+        _factors(X, 1, np.eye(12) if space == "metric" else None).H,
+        X / X.sum(),
+        atol=1e-6,
+    )
 
 
 def _constant(space: str) -> None:
-    found = _factors(np.full((30, 12), 0.7), 1, np.eye(12) if space == "metric" else None)
+    found = _factors(
+        np.full((30, 12), 0.7), 1, np.eye(12) if space == "metric" else None
+    )
     close(found.H, 1 / 12, rtol=1e-5)
     expect(found.error < 1e-5, found.error)
 
@@ -223,9 +274,27 @@ MODES = ("linear", "perceptual")
 SPACES = ("weights", "metric")
 BOTH = [(mode, s) for mode in MODES for s in SCALES]
 SOLVERS = (
-    Case("surface", "solver: 0 samples", "Nothing is fitted, and the status says so.", _no_rows),
-    Case("surface", "solver: fewer than required", "Too few samples give a status, not a fit.", _few_are_refused),
-    *each("surface", "solver: {} samples", "Certified, and no worse than SciPy.", _samples, 1, 3, 2400),
+    Case(
+        "surface",
+        "solver: 0 samples",
+        "Nothing is fitted, and the status says so.",
+        _no_rows,
+    ),
+    Case(
+        "surface",
+        "solver: fewer than required",
+        "Too few samples give a status, not a fit.",
+        _few_are_refused,
+    ),
+    *each(
+        "surface",
+        "solver: {} samples",
+        "Certified, and no worse than SciPy.",
+        _samples,
+        1,
+        3,
+        2400,
+    ),
     *each(
         "surface",
         "solver: {} bases",
@@ -235,9 +304,27 @@ SOLVERS = (
         "duplicate",
         "collinear",
     ),
-    *each("surface", "solver: {}, bases times {:g}", "Weights are divided by it.", _scaled_rows, *BOTH),
-    *each("surface", "solver: {}, samples times {:g}", "Weights are multiplied by it.", _scaled_samples, *BOTH),
-    *each("surface", "solver: bases from 1 to {:g}", "No worse than SciPy on equal scales.", _scaled_columns, *SCALES),
+    *each(
+        "surface",
+        "solver: {}, bases times {:g}",
+        "Weights are divided by it.",
+        _scaled_rows,
+        *BOTH,
+    ),
+    *each(
+        "surface",
+        "solver: {}, samples times {:g}",
+        "Weights are multiplied by it.",
+        _scaled_samples,
+        *BOTH,
+    ),
+    *each(
+        "surface",
+        "solver: bases from 1 to {:g}",
+        "No worse than SciPy on equal scales.",
+        _scaled_columns,
+        *SCALES,
+    ),
     *each(
         "surface",
         "solver: {}, a sample is {}",
@@ -252,18 +339,87 @@ SOLVERS = (
         _black,
         *((mode, level) for mode in MODES for level in (0.0, -1.0)),
     ),
-    Case("surface", "solver: single precision", "Weights are the same to rounding.", _single_precision),
-    Case("surface", "solver: 59 bases, 12 samples", "Certified, and no worse than SciPy.", _more_bases_than_samples),
-    Case("surface", "solver: no surfels", "Arrays are empty and have the right shapes.", _empty_batch),
-    *each("nmf", "k above the rank, {}", "The error is small; spare components are valid.", _above_the_rank, *SPACES),
+    Case(
+        "surface",
+        "solver: single precision",
+        "Weights are the same to rounding.",
+        _single_precision,
+    ),
+    Case(
+        "surface",
+        "solver: 59 bases, 12 samples",
+        "Certified, and no worse than SciPy.",
+        _more_bases_than_samples,
+    ),
+    Case(
+        "surface",
+        "solver: no surfels",
+        "Arrays are empty and have the right shapes.",
+        _empty_batch,
+    ),
+    *each(
+        "nmf",
+        "k above the rank, {}",
+        "The error is small; spare components are valid.",
+        _above_the_rank,
+        *SPACES,
+    ),
     Case("nmf", "k above a side", "Refused with the rule.", _above_the_size),
-    *each("nmf", "weights times {:g}", "Basis and relative error are unchanged.", _scaled_weights, *SCALES),
-    *each("nmf", "in the metric, times {:g}", "The basis is unchanged.", _scaled_in_metric, *SCALES),
-    *each("nmf", "one surfel, {}", "The basis is its own reflectance.", _one_surfel, *SPACES),
-    *each("nmf", "constant, {}", "The component is the constant, without error.", _constant, *SPACES),
+    *each(
+        "nmf",
+        "weights times {:g}",
+        "Basis and relative error are unchanged.",
+        _scaled_weights,
+        *SCALES,
+    ),
+    *each(
+        "nmf",
+        "in the metric, times {:g}",
+        "The basis is unchanged.",
+        _scaled_in_metric,
+        *SCALES,
+    ),
+    *each(
+        "nmf",
+        "one surfel, {}",
+        "The basis is its own reflectance.",
+        _one_surfel,
+        *SPACES,
+    ),
+    *each(
+        "nmf",
+        "constant, {}",
+        "The component is the constant, without error.",
+        _constant,
+        *SPACES,
+    ),
     Case("nmf", "weights of zero", "The basis is uniform, without error.", _nothing),
-    *each("nmf", "unused rows, {}", "Unused BRDFs have no weight in the basis.", _idle_rows_and_columns, *SPACES),
-    Case("nmf", "a BRDF of zero", "A singular metric still gives a basis.", _zero_basis_in_metric),
-    *each("nmf", "a weight is {}", "Refused with the rule.", _bad_weights, np.nan, np.inf, -1.0),
-    Case("nmf", "duplicates", "Components are the same, divided equally between duplicates.", _duplicates),
+    *each(
+        "nmf",
+        "unused rows, {}",
+        "Unused BRDFs have no weight in the basis.",
+        _idle_rows_and_columns,
+        *SPACES,
+    ),
+    Case(
+        "nmf",
+        "a BRDF of zero",
+        "A singular metric still gives a basis.",
+        _zero_basis_in_metric,
+    ),
+    *each(
+        "nmf",
+        "a weight is {}",
+        "Refused with the rule.",
+        _bad_weights,
+        np.nan,
+        np.inf,
+        -1.0,
+    ),
+    Case(
+        "nmf",
+        "duplicates",
+        "Components are the same, divided equally between duplicates.",
+        _duplicates,
+    ),
 )

@@ -1,4 +1,6 @@
-"""Stress cases of fits with all BRDFs and with a reduced basis, which must return the planted weights or a status."""
+"""Stress cases of fits with all BRDFs and with a reduced basis, which must return the
+planted weights or a status.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,17 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from skindb.bench.case import SCALES, Case, close, each, expect
-from skindb.bench.stress.surfels import WEIGHT, filled, first, rows, six, six_tables, spoiled, surfels, weights
+from skindb.bench.stress.surfels import (
+    WEIGHT,
+    filled,
+    first,
+    rows,
+    six,
+    six_tables,
+    spoiled,
+    surfels,
+    weights,
+)
 from skindb.fit._surface_arrays import Tables
 from skindb.optics.brdf_table import TableGrid
 from skindb.optics.rows import reduce_dictionary
@@ -18,7 +30,9 @@ from skindb.schema import FitStatus
 from skindb.schema.status import LARGEST_R_D, SMALLEST_R_D
 
 Array = NDArray[Any]
-SINGLE = 1e-4  # error for samples in single precision: positions in a table to 1e-6, times the slope of its lobes
+# error for samples in single precision: positions in a table to 1e-6, times the slope
+# of its lobes
+SINGLE = 1e-4
 TOTAL = 1e-6  # relative: rounding of samples in single precision
 MODES = ("linear", "perceptual")
 
@@ -28,7 +42,10 @@ MODES = ("linear", "perceptual")
 def _recovers(mode: str) -> None:
     skin = surfels(150, 16)
     found = weights(skin, mode)
-    expect((found.status == FitStatus.FITTED).all() and (found.samples == 2400).all(), (found.status, found.samples))
+    expect(
+        (found.status == FitStatus.FITTED).all() and (found.samples == 2400).all(),
+        (found.status, found.samples),
+    )
     expect(found.residual.max() < SINGLE, found.residual)
     for s in range(3):
         M, _ = rows(skin, s)
@@ -37,9 +54,16 @@ def _recovers(mode: str) -> None:
 
 def _few(lights: int, cameras: int) -> None:
     skin = surfels(lights, cameras)
-    skin = replace(skin, sample=skin.sample * np.linspace(0.9, 1.1, 3, dtype=np.float32))  # channels disagree
+    # channels disagree
+    skin = replace(
+        skin, sample=skin.sample * np.linspace(0.9, 1.1, 3, dtype=np.float32)
+    )
     refused = weights(skin)
-    expect((refused.status == FitStatus.TOO_FEW_SAMPLES).all() and np.isnan(refused.weight).all(), refused.status)
+    expect(
+        (refused.status == FitStatus.TOO_FEW_SAMPLES).all()
+        and np.isnan(refused.weight).all(),
+        refused.status,
+    )
     found = weights(skin, min_samples=1)
     for s in range(3):
         M, target = rows(skin, s)
@@ -52,14 +76,22 @@ def _unseen_surfel(mode: str) -> None:
     skin = surfels()
     found = weights(spoiled(skin, filled(np.nan)), mode)
     whole = weights(skin, mode)
-    expect(found.status.tolist() == [FitStatus.UNSEEN, 0, 0] and np.isnan(found.weight[0]).all(), found.status)
+    expect(
+        found.status.tolist() == [FitStatus.UNSEEN, 0, 0]
+        and np.isnan(found.weight[0]).all(),
+        found.status,
+    )
     np.testing.assert_array_equal(found.weight[1:], whole.weight[1:])
 
 
 def _infinite(bad: float) -> None:
     found = weights(first(surfels(), bad))
     whole = weights(surfels())
-    expect(found.status.tolist() == [FitStatus.NOT_FINITE, 0, 0] and np.isnan(found.weight[0]).all(), found.status)
+    expect(
+        found.status.tolist() == [FitStatus.NOT_FINITE, 0, 0]
+        and np.isnan(found.weight[0]).all(),
+        found.status,
+    )
     np.testing.assert_array_equal(found.weight[1:], whole.weight[1:])
 
 
@@ -76,19 +108,28 @@ def _geometry_nan(field: str, status: FitStatus) -> None:
     spoiled[0] = np.nan
     found = weights(replace(skin, **{field: spoiled}))
     whole = weights(skin)
-    expect(found.status.tolist() == [status, 0, 0] and np.isnan(found.weight[0]).all(), found.status)
+    expect(
+        found.status.tolist() == [status, 0, 0] and np.isnan(found.weight[0]).all(),
+        found.status,
+    )
     np.testing.assert_array_equal(found.weight[1:], whole.weight[1:])
 
 
 def _black_surfel(mode: str) -> None:
     found = weights(spoiled(surfels(), filled(0.0)), mode)
-    expect(found.status[0] == FitStatus.FITTED and (found.weight[0] == 0).all(), (found.status[0], found.weight[0]))
+    expect(
+        found.status[0] == FitStatus.FITTED and (found.weight[0] == 0).all(),
+        (found.status[0], found.weight[0]),
+    )
 
 
 def _matte(eta: float) -> None:
     skin = surfels(eta=eta, weight=0 * WEIGHT)
     found = weights(skin, eta=eta)
-    expect(found.residual.max() < TOTAL and np.abs(found.weight).max() < SINGLE, (found.residual, found.weight))
+    expect(
+        found.residual.max() < TOTAL and np.abs(found.weight).max() < SINGLE,
+        (found.residual, found.weight),
+    )
 
 
 def _albedo_bound(value: float) -> None:
@@ -106,7 +147,11 @@ def _grazing_lights() -> None:
     low = 900 * np.array([[np.cos(a), np.sin(a), 0.05] for a in (0.1, 2.0, 4.0)])
     wild = np.full((3, 3, *skin.sample.shape[2:]), 50.0, np.float32)
     flat = replace(skin, normal=np.tile([0.0, 0, 1], (3, 1)), position=np.zeros((3, 3)))
-    more = replace(flat, light=np.concatenate([skin.light, low]), sample=np.concatenate([skin.sample, wild], axis=1))
+    more = replace(
+        flat,
+        light=np.concatenate([skin.light, low]),
+        sample=np.concatenate([skin.sample, wild], axis=1),
+    )
     close(weights(more).weight, weights(flat).weight, rtol=1e-9, atol=1e-12)
 
 
@@ -115,17 +160,26 @@ def _behind() -> None:
     skin = surfels()
     wild = np.full((3, 2, *skin.sample.shape[2:]), 50.0, np.float32)
     behind = np.concatenate([skin.light, [[0.0, 0, -900], [100, 0, -900]]])
-    more = replace(skin, light=behind, sample=np.concatenate([skin.sample, wild], axis=1))
+    more = replace(
+        skin, light=behind, sample=np.concatenate([skin.sample, wild], axis=1)
+    )
     close(weights(more).weight, weights(skin).weight, rtol=1e-9, atol=1e-12)
 
 
 def _precision(dtype: str) -> None:
     skin = surfels()
     half = skin.sample.astype(np.float16)  # values that are exact in every precision
-    found, want = (weights(replace(skin, sample=half.astype(t))) for t in (dtype, np.float16))
-    for s in range(3):  # only the mixed reflectance is determined, not the weights of similar materials
+    found, want = (
+        weights(replace(skin, sample=half.astype(t))) for t in (dtype, np.float16)
+    )
+    # only the mixed reflectance is determined, not the weights of similar materials
+    for s in range(3):
         M, _ = rows(skin, s)
-        close(M @ found.weight[s], M @ want.weight[s], atol=1e-5 * np.abs(M @ WEIGHT).max())
+        close(
+            M @ found.weight[s],
+            M @ want.weight[s],
+            atol=1e-5 * np.abs(M @ WEIGHT).max(),
+        )
 
 
 def _extra_tables(change: str) -> None:
@@ -134,7 +188,10 @@ def _extra_tables(change: str) -> None:
     extra["collinear"] = six()[..., :1] + six()[..., 1:2]
     both = np.concatenate([extra[change], six(), extra[change]], axis=-1)
     found = weights(surfels(), tables=Tables(both, own.grid, np.eye(8)))
-    expect((found.status == FitStatus.FITTED).all() and found.kkt.max() < 1e-9, (found.status, found.kkt))
+    expect(
+        (found.status == FitStatus.FITTED).all() and found.kkt.max() < 1e-9,
+        (found.status, found.kkt),
+    )
     expect(found.residual.max() < SINGLE, found.residual)
     if change == "zero":
         expect((found.weight[:, [0, 7]] == 0).all(), found.weight)
@@ -147,17 +204,27 @@ def _rank_above() -> None:
 
 
 def _rank_of_one_material() -> None:
-    """Six tables that are multiples of one lie in a space of four dimensions, and fits are finite and correct."""
+    """Six tables that are multiples of one lie in a space of four dimensions, and fits
+    are finite and correct.
+    """
     one = six()[..., :1] * np.geomspace(0.5, 4, 6, dtype=np.float32)
     reduced, lift = reduce_dictionary(np.ascontiguousarray(one), 4)
     skin = surfels(weight=np.array([0.4, 0, 0, 0, 0, 0]))
     found = weights(skin, tables=Tables(reduced, six_tables().grid, lift))
-    expect((found.status == FitStatus.FITTED).all() and found.residual.max() < SINGLE, (found.status, found.residual))
+    expect(
+        (found.status == FitStatus.FITTED).all() and found.residual.max() < SINGLE,
+        (found.status, found.residual),
+    )
 
 
 def _no_surfels() -> None:
     skin = surfels()
-    empty = replace(skin, **{f: getattr(skin, f)[:0] for f in ("sample", "position", "normal", "diffuse")})
+    empty = replace(
+        skin,
+        **{
+            f: getattr(skin, f)[:0] for f in ("sample", "position", "normal", "diffuse")
+        },
+    )
     expect(weights(empty).weight.shape == (0, 6), weights(empty).weight.shape)
 
 
@@ -178,7 +245,10 @@ def _true_mixture(mode: str) -> None:
 def _twins(mode: str) -> None:
     found = weights(surfels(), mode, _basis(WEIGHT, WEIGHT, 0 * WEIGHT))
     close(found.weight[:, :2].sum(axis=1), 1.0, rtol=SINGLE)
-    expect((found.weight[:, 2] == 0).all() and (found.status == 0).all(), (found.weight, found.status))
+    expect(
+        (found.weight[:, 2] == 0).all() and (found.status == 0).all(),
+        (found.weight, found.status),
+    )
 
 
 def _scaled_basis(scale: float) -> None:
@@ -188,11 +258,21 @@ def _scaled_basis(scale: float) -> None:
 
 def _refit_nothing() -> None:
     found = weights(spoiled(surfels(), filled(np.nan)), tables=_basis(WEIGHT))
-    expect(found.status.tolist() == [FitStatus.UNSEEN, 0, 0] and np.isnan(found.residual[0]), found.status)
+    expect(
+        found.status.tolist() == [FitStatus.UNSEEN, 0, 0]
+        and np.isnan(found.residual[0]),
+        found.status,
+    )
 
 
 SURFACE = (
-    *each("surface", "2400 samples, {}", "The planted weights are recovered.", _recovers, *MODES),
+    *each(
+        "surface",
+        "2400 samples, {}",
+        "The planted weights are recovered.",
+        _recovers,
+        *MODES,
+    ),
     *each(
         "surface",
         "{} light(s), {} camera",
@@ -216,7 +296,12 @@ SURFACE = (
         np.inf,
         -np.inf,
     ),
-    Case("surface", "a sample is NaN", "The sample is excluded, and nothing else changes.", _one_nan),
+    Case(
+        "surface",
+        "a sample is NaN",
+        "The sample is excluded, and nothing else changes.",
+        _one_nan,
+    ),
     *each(
         "surface",
         "{} is NaN: {!r}",
@@ -226,8 +311,18 @@ SURFACE = (
         ("normal", FitStatus.TOO_FEW_SAMPLES),
         ("diffuse", FitStatus.NO_DIFFUSE_ESTIMATE),
     ),
-    *each("surface", "all black, {}", "Weights are exactly zero.", _black_surfel, *MODES),
-    *each("surface", "matte skin, eta {}", "Weights of the surface are zero.", _matte, 1.0, 1.3, 1.5),
+    *each(
+        "surface", "all black, {}", "Weights are exactly zero.", _black_surfel, *MODES
+    ),
+    *each(
+        "surface",
+        "matte skin, eta {}",
+        "Weights of the surface are zero.",
+        _matte,
+        1.0,
+        1.3,
+        1.5,
+    ),
     *each(
         "surface",
         "R_d {:g}",
@@ -238,7 +333,14 @@ SURFACE = (
     ),
     Case("surface", "grazing lights", "Their samples are ignored.", _grazing_lights),
     Case("surface", "lights behind", "Their samples are ignored.", _behind),
-    *each("surface", "{} samples", "Reflectance is the same as from half floats.", _precision, "float32", "float64"),
+    *each(
+        "surface",
+        "{} samples",
+        "Reflectance is the same as from half floats.",
+        _precision,
+        "float32",
+        "float64",
+    ),
     *each(
         "surface",
         "{} tables",
@@ -248,11 +350,44 @@ SURFACE = (
         "duplicate",
         "collinear",
     ),
-    Case("surface", "rank above the bases", "The weights are those of the exact tables.", _rank_above),
-    Case("surface", "rank above that of the tables", "The fit is finite and correct.", _rank_of_one_material),
-    Case("surface", "no surfels", "Arrays are empty and have the right shapes.", _no_surfels),
-    *each("refit", "one component, {}", "A surfel made from the component has weight one.", _true_mixture, *MODES),
-    *each("refit", "k above the rank, {}", "Duplicates divide the weight, a black component has none.", _twins, *MODES),
-    *each("refit", "component times {:g}", "Weights are divided by it.", _scaled_basis, *SCALES),
+    Case(
+        "surface",
+        "rank above the bases",
+        "The weights are those of the exact tables.",
+        _rank_above,
+    ),
+    Case(
+        "surface",
+        "rank above that of the tables",
+        "The fit is finite and correct.",
+        _rank_of_one_material,
+    ),
+    Case(
+        "surface",
+        "no surfels",
+        "Arrays are empty and have the right shapes.",
+        _no_surfels,
+    ),
+    *each(
+        "refit",
+        "one component, {}",
+        "A surfel made from the component has weight one.",
+        _true_mixture,
+        *MODES,
+    ),
+    *each(
+        "refit",
+        "k above the rank, {}",
+        "Duplicates divide the weight, a black component has none.",
+        _twins,
+        *MODES,
+    ),
+    *each(
+        "refit",
+        "component times {:g}",
+        "Weights are divided by it.",
+        _scaled_basis,
+        *SCALES,
+    ),
     Case("refit", "all saturated", "Weights are NaN with a status.", _refit_nothing),
 )

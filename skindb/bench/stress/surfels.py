@@ -63,10 +63,19 @@ class Surfels:
     @property
     def arrays(self) -> tuple[Array, ...]:
         """Arguments of `surface_weights`."""
-        return self.sample, self.position, self.light, self.camera, self.normal, self.diffuse
+        return (
+            self.sample,
+            self.position,
+            self.light,
+            self.camera,
+            self.normal,
+            self.diffuse,
+        )
 
 
-def surfels(lights: int = 40, cameras: int = 6, *, eta: float = ETA, weight: Array = WEIGHT) -> Surfels:
+def surfels(
+    lights: int = 40, cameras: int = 6, *, eta: float = ETA, weight: Array = WEIGHT
+) -> Surfels:
     """Three surfels with different positions and normals; `weight` (6,) of the six materials."""
     position = np.array([[0.0, 0, 0], [40, 10, -5], [-30, 20, -8]])
     normal = unit(np.array([[0.0, 0, 1], [0.3, 0.1, 1], [-0.2, 0.2, 1]]))
@@ -79,16 +88,27 @@ def surfels(lights: int = 40, cameras: int = 6, *, eta: float = ETA, weight: Arr
     co = np.einsum("nk,ntk->nt", normal, wo)
     a, b, n = np.broadcast_arrays(wi[:, :, None], wo[:, None], normal[:, None, None])
     surface = lookup(six(), *half_difference(a, b, n)) @ weight
-    through = fresnel_transmittance(ci, eta)[:, :, None] * fresnel_transmittance(co, eta)[:, None]
+    through = (
+        fresnel_transmittance(ci, eta)[:, :, None]
+        * fresnel_transmittance(co, eta)[:, None]
+    )
     value = through[..., None] * diffuse[:, None, None] / np.pi + surface[..., None]
     sample = (ci[:, :, None, None] * value).astype(np.float32)
     return Surfels(sample, position, light, camera, normal, diffuse)
 
 
-def weights(skin: Surfels, mode: str = "linear", tables: Tables | None = None, **options: Any) -> Weights:
+def weights(
+    skin: Surfels, mode: str = "linear", tables: Tables | None = None, **options: Any
+) -> Weights:
     """Fit of the six materials, or of `tables`, to the surfels."""
-    ask = {"eta": ETA, "noise_floor": NOISE_FLOOR_SURFACE, "min_samples": MIN_SAMPLES} | options
-    return surface_weights(*skin.arrays, tables=tables or six_tables(), mode=mode, **ask)
+    ask = {
+        "eta": ETA,
+        "noise_floor": NOISE_FLOOR_SURFACE,
+        "min_samples": MIN_SAMPLES,
+    } | options
+    return surface_weights(
+        *skin.arrays, tables=tables or six_tables(), mode=mode, **ask
+    )
 
 
 def spoiled(skin: Surfels, change: Callable[[Array], None]) -> Surfels:
@@ -120,6 +140,10 @@ def rows(skin: Surfels, s: int) -> tuple[Array, Array]:
     ci = wi @ skin.normal[s]
     co = wo @ skin.normal[s]
     M = lookup(six(), *half_difference(a, b, skin.normal[s])) * ci[:, None, None]
-    shape = (ci * fresnel_transmittance(ci, ETA))[:, None] * fresnel_transmittance(co, ETA) / np.pi
+    shape = (
+        (ci * fresnel_transmittance(ci, ETA))[:, None]
+        * fresnel_transmittance(co, ETA)
+        / np.pi
+    )
     target = skin.sample[s].astype(np.float64) - shape[..., None] * skin.diffuse[s]
     return M.reshape(-1, M.shape[-1]), target.reshape(-1, 3)
