@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING
 
 import lazy_loader
 
-from skindb._version import __version__
 from skindb.errors import Fault, InputError
+
+__version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from skindb import analysis, bench, demo, export, fit, ingest, render, workflow

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import dask
 import numpy as np
 import xarray as xr
+from dask.system import cpu_count
 
 from skindb.schema import VARIABLES, label
 
@@ -86,3 +88,13 @@ def elementwise(
         {name: label(name, r.data) for name, r in zip(outputs, results, strict=True)},
         coords,
     )
+
+
+def thread_count() -> int:
+    """Number of threads that this process may use.
+
+    This is the number that Dask is configured to use, or else one per available core (a
+    batch job may use only some cores of its machine). `skindb.workflow.map_takes` sets
+    it, so that parallel takes do not use more threads than cores.
+    """
+    return int(dask.config.get("num_workers", None) or cpu_count() or 1)

@@ -16,7 +16,7 @@ from bucket_server import settings as bucket_settings
 from hypothesis import settings
 
 import skindb
-from skindb._blas import one_blas_thread
+from skindb.threads import one_blas_thread
 
 settings.register_profile("same", derandomize=True)
 settings.register_profile("search", derandomize=False)

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from skindb._cache import MAX_ENTRIES, cache_folder, cached_arrays
+from skindb.cache import MAX_ENTRIES, cache_folder, cached_arrays
 
-SOURCES = ("skindb._cache",)
+SOURCES = ("skindb.files",)
 
 
 @pytest.fixture

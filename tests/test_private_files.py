@@ -16,9 +16,9 @@ from permissions import open_to_others, open_umask
 from small_face import small_face
 
 import skindb
-from skindb._cache import cached_arrays
-from skindb._files import private_file, private_umask
+from skindb.cache import cached_arrays
 from skindb.cli import main
+from skindb.files import private_file, private_umask
 from skindb.geometry.crop import Crop
 from skindb.ingest.frames import write_frame
 from skindb.optics.dictionary import embedded_dictionary
@@ -114,9 +114,7 @@ def write_captures(out, model):
 
 def write_cache(out, model):
     os.environ["SKINDB_CACHE"] = str(out / "cache/skindb")
-    cached_arrays(
-        "x", (1,), sources=("skindb._cache",), make=lambda: {"a": np.zeros(3)}
-    )
+    cached_arrays("x", (1,), sources=("skindb.files",), make=lambda: {"a": np.zeros(3)})
 
 
 WRITERS = (
@@ -167,7 +165,7 @@ CALLS = {
 }
 # reasons why a call that writes does not name `private_file` or `make_private`
 EXCEPTIONS = {
-    "_files.py": "it is where they are",
+    "files.py": "it is where they are",
     "hw": "a session runs with a private umask",
     "virtual/laboratory.py": "a session runs with a private umask",
     "store": "a database has the permissions of its root",

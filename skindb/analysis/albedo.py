@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
-from skindb._types import Array, Mask
 from skindb.analysis import colours
 from skindb.analysis.each_take import each_take
 from skindb.analysis.members import groups_by, takes_to_compare
@@ -20,6 +19,7 @@ from skindb.numerics.statistics import Moments
 from skindb.schema import dataset
 from skindb.schema.cohort import require_same_fit
 from skindb.schema.regions import FACE
+from skindb.types import Array, Mask
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

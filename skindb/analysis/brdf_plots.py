@@ -10,10 +10,10 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from skindb._types import Array
 from skindb.analysis import colours
 from skindb.optics.angles import half_difference
 from skindb.optics.brdf_table import lookup
+from skindb.types import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -16,8 +16,6 @@ import xarray as xr
 from dask.delayed import Delayed
 from numpy.typing import NDArray
 
-from skindb._blas import c_contiguous
-from skindb._types import Array
 from skindb.analysis.each_take import each_item
 from skindb.analysis.members import (
     NORMAL,
@@ -39,6 +37,8 @@ from skindb.optics.brdf_table import TableGrid, brdf_metric
 from skindb.schema import dataset
 from skindb.schema.brdf import brdf_coords, stored_brdf
 from skindb.schema.cohort import require_same_fit
+from skindb.threads import c_contiguous
+from skindb.types import Array
 
 # subjects of a group, below which p values are approximate if the groups have different
 # variances

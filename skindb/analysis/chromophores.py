@@ -21,7 +21,6 @@ import xarray as xr
 from sklearn.decomposition import FastICA
 from sklearn.exceptions import ConvergenceWarning
 
-from skindb._types import Array, Mask
 from skindb.analysis import colours
 from skindb.analysis.each_take import each_take
 from skindb.analysis.masks import region_masks
@@ -32,6 +31,7 @@ from skindb.numerics.statistics import Moments, known_mean
 from skindb.schema import dataset
 from skindb.schema.cohort import require_same_fit
 from skindb.schema.regions import FACE
+from skindb.types import Array, Mask
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

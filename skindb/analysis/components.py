@@ -8,7 +8,6 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from skindb._types import Array, Mask
 from skindb.analysis.each_take import each_take, shared_once
 from skindb.errors import Fault, InputError
 from skindb.numerics.principal import principal_axes
@@ -16,6 +15,7 @@ from skindb.render.image import tone_map
 from skindb.schema import dataset
 from skindb.schema.cohort import require_same_fit
 from skindb.schema.notes import note
+from skindb.types import Array, Mask
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

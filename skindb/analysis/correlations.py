@@ -9,7 +9,6 @@ import numpy as np
 import xarray as xr
 from scipy import stats
 
-from skindb._types import Array
 from skindb.analysis import colours
 from skindb.analysis.members import takes_to_compare
 from skindb.analysis.quantities import CHANNELS, SURFACE, Quantities, quantities_of
@@ -19,6 +18,7 @@ from skindb.numerics.statistics import known_mean
 from skindb.schema import dataset
 from skindb.schema.cohort import require_same_fit, require_takes
 from skindb.schema.regions import FACE
+from skindb.types import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

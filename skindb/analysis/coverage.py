@@ -10,7 +10,6 @@ import numpy as np
 import xarray as xr
 from scipy.stats.contingency import association
 
-from skindb._types import Array
 from skindb.analysis.group_effects import ASSOCIATED, FEW
 from skindb.analysis.members import AGE, CONDITION, NORMAL, attributes, is_normal, texts
 from skindb.analysis.quantities import (
@@ -23,6 +22,7 @@ from skindb.analysis.quantities import (
 from skindb.errors import Fault, InputError
 from skindb.schema import IDENTIFIED, dataset
 from skindb.schema.cohort import require_takes
+from skindb.types import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

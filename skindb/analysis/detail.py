@@ -10,7 +10,6 @@ import numpy as np
 import xarray as xr
 from scipy.ndimage import gaussian_filter
 
-from skindb._types import Array, Mask
 from skindb.analysis.common_maps import common_maps
 from skindb.analysis.edit import KEPT, KEPT_ATTRS, with_albedo
 from skindb.analysis.masks import region_masks
@@ -21,6 +20,7 @@ from skindb.numerics.pyramid import Image, build, reconstruct
 from skindb.numerics.texture import level_fractions
 from skindb.schema.consent import honour_consent
 from skindb.schema.regions import FACE
+from skindb.types import Array, Mask
 
 # mm, default wavelength of the coarsest detail transferred: freckles, small moles,
 # follicles

@@ -11,7 +11,7 @@ import xarray as xr
 from dask.base import compute
 from dask.delayed import Delayed, delayed
 
-from skindb._blas import c_contiguous
+from skindb.threads import c_contiguous
 
 Result = TypeVar("Result")
 

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
-from skindb._types import Array
 from skindb.analysis.each_take import each_take
 from skindb.analysis.group_effects import (
     CONTRAST_CURE,
@@ -33,6 +32,7 @@ from skindb.numerics.inference import (
 )
 from skindb.schema import dataset
 from skindb.schema.cohort import require_same_fit, require_takes
+from skindb.types import Array
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -10,7 +10,6 @@ import numpy as np
 import xarray as xr
 from scipy.special import gammaln
 
-from skindb._types import Array
 from skindb.analysis import colours
 from skindb.analysis.members import (
     CONDITION,
@@ -48,6 +47,7 @@ from skindb.numerics.inference import (
 from skindb.numerics.statistics import known_mean
 from skindb.schema import dataset
 from skindb.schema.cohort import require_same_fit, require_takes
+from skindb.types import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

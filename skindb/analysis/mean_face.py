@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import xarray as xr
 
-from skindb._types import Array
 from skindb.analysis.members import takes_to_compare, texts
 from skindb.analysis.texture import COVERED
 from skindb.errors import Fault, InputError
 from skindb.numerics.statistics import Moments, known_mean
 from skindb.schema import dataset
 from skindb.schema.cohort import require_same_fit
+from skindb.types import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -12,9 +12,9 @@ from collections.abc import Iterable
 import numpy as np
 import xarray as xr
 
-from skindb._types import Array, Mask
 from skindb.errors import Fault, InputError
 from skindb.schema.notes import Note, note
+from skindb.types import Array, Mask
 
 CONDITION = "condition"
 NORMAL = "normal"

@@ -8,7 +8,6 @@ import numpy as np
 import xarray as xr
 from dask.delayed import Delayed
 
-from skindb._types import Array
 from skindb.analysis.each_take import each_item, each_take
 from skindb.errors import Fault, InputError
 from skindb.numerics.factorise import Sums, nmf, refine
@@ -16,6 +15,7 @@ from skindb.numerics.nnls import solve_nnls
 from skindb.optics.brdf_table import brdf_metric
 from skindb.schema import dataset
 from skindb.schema.cohort import require_same_fit
+from skindb.types import Array
 
 # of all takes together, from which the starting basis is computed
 MAX_START_SURFELS = 5000

@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import xarray as xr
 
-from skindb._types import Array, Mask
 from skindb.analysis.members import AGE, CONDITION, attributes, texts
 from skindb.errors import Fault, InputError
 from skindb.numerics.statistics import known_mean
 from skindb.schema import IDENTIFIED
+from skindb.types import Array, Mask
 
 CHANNELS = ("R", "G", "B")
 SURFACE = "surface reflectance"

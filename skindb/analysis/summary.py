@@ -11,7 +11,6 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from skindb._types import Array, Mask
 from skindb.analysis.masks import own_masks
 from skindb.errors import Fault, InputError
 from skindb.schema import FitStatus, dataset
@@ -20,6 +19,7 @@ from skindb.schema.consent import consent_scope
 from skindb.schema.notes import note
 from skindb.schema.regions import FACE
 from skindb.schema.status import MAX_CONDITION_TRUSTED, MIN_SAMPLES_TRUSTED
+from skindb.types import Array, Mask
 
 # surfels per take; the paper drew 2,000 of each subject, and 5,000 for the conditions
 # of one subject

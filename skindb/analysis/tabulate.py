@@ -9,8 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import xarray as xr
 
-from skindb._files import private_file
-from skindb._plots import plain_text
 from skindb.analysis.albedo import plot_albedo
 from skindb.analysis.basis_size import (
     describe_basis_size,
@@ -35,6 +33,8 @@ from skindb.analysis.effect_maps import (
 from skindb.analysis.group_effects import describe_group_effects, plot_group_effects
 from skindb.analysis.traits import describe_traits, plot_traits
 from skindb.analysis.translucency import describe_translucency, plot_translucency
+from skindb.files import private_file
+from skindb.plots import plain_text
 from skindb.schema.regions import FACE
 
 if TYPE_CHECKING:

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 
-from skindb._types import Array, Mask
 from skindb.analysis.each_take import each_take
 from skindb.analysis.masks import region_masks
 from skindb.errors import Fault, InputError
@@ -27,6 +26,7 @@ from skindb.numerics.texture import (
 from skindb.schema import dataset
 from skindb.schema.cohort import require_same_fit
 from skindb.schema.regions import FACE
+from skindb.types import Array, Mask
 
 SIZE = 1024  # texels along each side
 REGIONS = (FACE, "beard", "no_beard")

@@ -11,9 +11,8 @@ import numpy as np
 import xarray as xr
 from scipy.ndimage import gaussian_filter
 
-from skindb._threads import thread_count
-from skindb._types import Array
 from skindb.analysis.texture import REGIONS, decorrelated, log_albedo
+from skindb.elementwise import thread_count
 from skindb.geometry.texture import bilinear
 from skindb.numerics.principal import principal_axes
 from skindb.numerics.texture import (
@@ -24,6 +23,7 @@ from skindb.numerics.texture import (
     synthesise,
 )
 from skindb.schema.regions import FACE
+from skindb.types import Array
 
 ITERATIONS = 5
 # standard deviation of the Gaussian that blends a region's edge, in units of (u, v):

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 import xarray as xr
 
-from skindb._types import Array, Mask
 from skindb.analysis.albedo import quantiles
 from skindb.analysis.members import (
     is_normal,
@@ -34,6 +33,7 @@ from skindb.numerics.statistics import known_mean
 from skindb.schema import IDENTIFIED, dataset
 from skindb.schema.cohort import require_same_fit
 from skindb.schema.regions import FACE
+from skindb.types import Array, Mask
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

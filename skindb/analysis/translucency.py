@@ -8,7 +8,6 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from skindb._types import Array
 from skindb.analysis import colours
 from skindb.analysis.group_effects import FEW
 from skindb.analysis.members import groups_by, takes_to_compare
@@ -16,6 +15,7 @@ from skindb.numerics.inference import variance_components
 from skindb.numerics.statistics import Moments
 from skindb.schema import IDENTIFIED, ProbeStatus, dataset
 from skindb.schema.cohort import require_same_fit, require_takes
+from skindb.types import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from scipy.optimize import brentq
 
-from skindb._types import Array
 from skindb.bench.curve import Curve, Point, cpu_time
 from skindb.errors import Fault, InputError
 from skindb.fit._probe_profile import MODELS, fit_profile
@@ -21,6 +20,7 @@ from skindb.optics.diffuse import S_MAX, diffuse_reflectance, dipole_s, reduced_
 from skindb.optics.dipole import sigma_tr
 from skindb.optics.fresnel import boundary_factor
 from skindb.optics.random_walk import Walk, radial_profile, random_walk
+from skindb.types import Array
 
 ETA = 1.3
 DISTANCE = (0.5, 1.0, 2.0, 5.0, 10.0)  # transport mean free paths

@@ -11,11 +11,11 @@ import numpy as np
 from sklearn.decomposition import NMF
 from sklearn.exceptions import ConvergenceWarning
 
-from skindb._types import Array
 from skindb.bench.curve import Curve, Point, cpu_time
 from skindb.numerics.factorise import nmf, relative_error
 from skindb.optics.brdf_table import brdf_metric
 from skindb.optics.dictionary import embedded_dictionary
+from skindb.types import Array
 
 K = 6
 

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb._types import Array
 from skindb.bench.curve import Curve, Point, cpu_time
 from skindb.ingest.frames import FrameKind
 from skindb.ingest.pixel_flags import OK
@@ -27,6 +26,7 @@ from skindb.optics.dictionary import (
 from skindb.optics.diffuse import diffuse_reflectance, dipole_s, scattering_coefficients
 from skindb.optics.dipole import dipole_profile
 from skindb.optics.dipole_tree import subsurface_exitance
+from skindb.types import Array
 from skindb.virtual.sensor import Sensor
 
 # refractive index, radius of a ball [mm], points of comparison

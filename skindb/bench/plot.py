@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from skindb._files import private_file
 from skindb.bench.curve import Curve, Point
+from skindb.files import private_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

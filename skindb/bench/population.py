@@ -9,7 +9,6 @@ from scipy import stats
 from scipy.ndimage import gaussian_filter
 from sklearn.decomposition import PCA
 
-from skindb._types import Array
 from skindb.bench.curve import Curve, Point, cpu_time
 from skindb.numerics.inference import permutation_p
 from skindb.numerics.principal import principal_axes
@@ -20,6 +19,7 @@ from skindb.numerics.texture import (
     part_quantiles,
     synthesise,
 )
+from skindb.types import Array
 
 TAKES = 87
 

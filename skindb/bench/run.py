@@ -14,8 +14,6 @@ from typing import Any
 
 from threadpoolctl import threadpool_limits
 
-from skindb._files import make_private, private_file
-from skindb._types import Progress
 from skindb.bench.curve import Curve
 from skindb.bench.diffusion import (
     inverse_curves,
@@ -35,7 +33,9 @@ from skindb.bench.population import (
 )
 from skindb.bench.stress import CASES, failure_of
 from skindb.bench.surface import refit_curves, surface_curves
+from skindb.files import make_private, private_file
 from skindb.schema.plain import plain
+from skindb.types import Progress
 
 CURVES: dict[str, Callable[[bool], list[Curve]]] = {
     "surface": surface_curves,

@@ -14,7 +14,6 @@ from typing import Any, NoReturn, TextIO
 import click
 
 import skindb
-from skindb._files import private_umask
 from skindb.cli.backups import backup, restore
 from skindb.cli.capture import calibrate, capture
 from skindb.cli.captures import demo, ingest, simulate
@@ -28,6 +27,7 @@ from skindb.cli.terminal import echo
 from skindb.cli.upkeep import audit, bench, clean, info, verify
 from skindb.cli.view import view
 from skindb.errors import Fault, InputError, SkindbWarning, escaped, system_fault
+from skindb.files import private_umask
 
 INTERRUPTED = 130
 

@@ -12,7 +12,12 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import skindb
-from skindb._limits import (
+from skindb.cli.engine import SCHEDULER, shared_path
+from skindb.cli.options import DB, PATH, WAIT, WORKERS, Finite, Seed, asked, common
+from skindb.cli.shared import bar, calibration_lines, each_take, emit, summary_of
+from skindb.cli.terminal import echo
+from skindb.errors import Fault, InputError
+from skindb.limits import (
     MAX_CAMERAS,
     MAX_COHORT,
     MAX_FRAME_SIDE_PX,
@@ -20,11 +25,6 @@ from skindb._limits import (
     MAX_PHOTOGRAPHS,
     MAX_SPACING_MM,
 )
-from skindb.cli.engine import SCHEDULER, shared_path
-from skindb.cli.options import DB, PATH, WAIT, WORKERS, Finite, Seed, asked, common
-from skindb.cli.shared import bar, calibration_lines, each_take, emit, summary_of
-from skindb.cli.terminal import echo
-from skindb.errors import Fault, InputError
 from skindb.virtual.dome import require_sizes
 from skindb.virtual.person import CONDITIONS
 

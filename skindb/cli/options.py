@@ -11,7 +11,7 @@ from typing import Any
 import click
 
 import skindb
-from skindb._limits import MAX_SEED, MAX_WAIT_S, MAX_WORKERS
+from skindb.limits import MAX_SEED, MAX_WAIT_S, MAX_WORKERS
 
 DB = click.argument("db", metavar="DB")
 PATH = click.Path(path_type=Path)

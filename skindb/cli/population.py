@@ -9,13 +9,12 @@ import click
 from click.core import ParameterSource
 
 import skindb
-from skindb._csv import csv_text
-from skindb._files import private_file
-from skindb._limits import MAX_PERMUTATIONS
 from skindb.cli.engine import SCHEDULER, client_of, shared_path
 from skindb.cli.options import DB, DICTIONARY, PATH, TAKE, WORKERS, Seed, common
 from skindb.cli.shared import aligned, bar, emit, existing, trait_amounts, writable
 from skindb.errors import Fault, InputError
+from skindb.files import csv_text, private_file
+from skindb.limits import MAX_PERMUTATIONS
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -8,9 +8,9 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from skindb._types import silent
 from skindb.cli.options import progress_style
 from skindb.cli.terminal import echo, redraw
+from skindb.types import silent
 
 MIN_INTERVAL_S = {"bar": 0.2, "json": 1.0}  # between two reports of the same stage
 

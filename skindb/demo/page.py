@@ -15,7 +15,7 @@ import imagecodecs
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb._csv import csv_text
+from skindb.files import csv_text
 
 
 @dataclass(frozen=True)

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from skindb._files import private_file
-from skindb._types import Progress
-from skindb._version import __version__
+from skindb import __version__
 from skindb.demo import figures, page, tables
 from skindb.demo.edit_section import edit_section
 from skindb.demo.pictures import Portraits, draw_portraits
 from skindb.demo.results import Results
 from skindb.demo.subjects_section import subjects_section
+from skindb.files import private_file
+from skindb.types import Progress
 
 Section = Callable[[Results, Portraits], list[str]]
 

@@ -10,17 +10,17 @@ from typing import Any
 import numpy as np
 
 from skindb import workflow
-from skindb._files import make_private, private_file
-from skindb._threads import thread_count
-from skindb._types import Progress, silent
 from skindb.demo.report import write_report
 from skindb.demo.results import Results
 from skindb.demo.subjects_section import VIEWER
+from skindb.elementwise import thread_count
 from skindb.errors import Fault, InputError
 from skindb.export.bundle import export_bundle
+from skindb.files import make_private, private_file
 from skindb.fit import FitParameters
 from skindb.render.photographs import compare_photographs
 from skindb.store import Database
+from skindb.types import Progress, silent
 from skindb.virtual.person import default_people
 from skindb.virtual.takes import simulate_takes
 from skindb.virtual.truth import recovered_against_true

@@ -15,9 +15,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from skindb._files import make_private, private_file
-from skindb._types import Progress, silent
-from skindb._version import __version__
+from skindb import __version__
 from skindb.errors import Fault, InputError
 from skindb.export.edited import describe_edit
 from skindb.export.gltf import export_gltf
@@ -26,6 +24,7 @@ from skindb.export.mitsuba_scene import MESH, PROGRAM, export_mitsuba
 from skindb.export.readme import readme
 from skindb.export.textures import Skin, skin_of
 from skindb.export.usd import MATERIAL, STAGE, export_usd
+from skindb.files import make_private, private_file
 from skindb.optics.brdf_table import TableGrid, lookup
 from skindb.optics.dictionary import Dictionary
 from skindb.optics.merl import write_merl
@@ -35,6 +34,7 @@ from skindb.schema import VARIABLES, FitStatus, ProbeStatus
 from skindb.schema.brdf import kernel_tables
 from skindb.schema.consent import require_consent
 from skindb.schema.plain import plain
+from skindb.types import Progress, silent
 
 PROVENANCE = (
     "schema_version",

@@ -13,10 +13,10 @@ import imagecodecs
 import numpy as np
 import xarray as xr
 
-from skindb._files import private_file
-from skindb._version import __version__
+from skindb import __version__
 from skindb.export.edited import describe_edit
 from skindb.export.textures import Skin, skin_of
+from skindb.files import private_file
 from skindb.schema.consent import require_consent
 
 FLOAT = 5126

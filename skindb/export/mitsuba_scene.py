@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from skindb._files import make_private, private_file
 from skindb.export.textures import shading_normals
+from skindb.files import make_private, private_file
 
 MESH = "face.ply"
 PROGRAM = "skin.py"

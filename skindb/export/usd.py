@@ -13,9 +13,9 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from skindb._files import make_private, private_file
-from skindb._version import __version__
+from skindb import __version__
 from skindb.export.textures import Skin
+from skindb.files import make_private, private_file
 
 STAGE = "face.usda"
 MATERIAL = "face.mtlx"

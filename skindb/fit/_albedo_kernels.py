@@ -11,9 +11,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from skindb._compiled import fast_kernel, inline_kernel, kernel
-from skindb._half_kernels import largest_finite, scale_to_one, unpack
-from skindb._vectors import LANES, dots, products
 from skindb.fit._lumitexel_kernels import (
     MODEL_ERROR,
     UNSEEN,
@@ -24,6 +21,17 @@ from skindb.fit._lumitexel_kernels import (
     write_directions,
     write_noise,
     write_rows,
+)
+from skindb.jit import (
+    LANES,
+    dots,
+    fast_kernel,
+    inline_kernel,
+    kernel,
+    largest_finite,
+    products,
+    scale_to_one,
+    unpack,
 )
 from skindb.numerics._nnls_kernels import active_set_memory, factor, solve, solve_scaled
 from skindb.optics._shade_kernels import transmittance

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb._types import Array
 from skindb.fit._albedo_kernels import MIN_COSINE_ALBEDO, MIN_SAMPLES_ALBEDO
 from skindb.fit._arrays import cosines, directions, quantile_finite
 from skindb.optics.abc_low2012 import PARAMETERS
 from skindb.optics.brdf_table import DEFAULT_GRID, TableGrid, tabulate
 from skindb.optics.dictionary import evaluate_abc
 from skindb.optics.fresnel import fresnel_transmittance
+from skindb.types import Array
 
 # quantiles of the method "quantile", and their normal deviates
 LOW = 0.10

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 # also for the modules that import it from here
-from skindb._types import Array as Array
+from skindb.types import Array as Array
 
 # surfels that a kernel processes at once: 15 MB of single-precision samples of a full
 # dome

@@ -10,8 +10,8 @@ from typing import Any
 
 from dask.callbacks import Callback
 
-from skindb._compiled import reported_compilation
-from skindb._types import Progress
+from skindb.jit import reported_compilation
+from skindb.types import Progress
 
 COMPILING = "compiling, only after an installation"
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from skindb._compiled import fast_kernel, kernel
+from skindb.jit import fast_kernel, kernel
 from skindb.optics._row_kernels import form_rows, row_memory
 from skindb.optics._shade_kernels import transmittance
 from skindb.schema import FitStatus

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from skindb._compiled import kernel
+from skindb.jit import kernel
 from skindb.optics._photometric_kernels import buffers, estimate_one
 
 COMBINED, CHROMATIC, PHOTOMETRIC, PEAK = range(4)

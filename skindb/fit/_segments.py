@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb._types import Array
+from skindb.types import Array
 
 
 class Segments:

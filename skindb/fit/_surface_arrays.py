@@ -8,8 +8,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb._half_kernels import sample_bits
-from skindb._types import Array
 from skindb.fit._surface_kernels import (
     BINS_PER_SCALE,
     OUTLIER_SCALES,
@@ -21,8 +19,10 @@ from skindb.fit._surface_kernels import (
     refit_block,
 )
 from skindb.fit.sample_noise import NO_NOISE, TypicalNoise, noise_of
+from skindb.jit import sample_bits
 from skindb.optics.brdf_table import TableGrid
 from skindb.optics.rows import pad_to_lanes
+from skindb.types import Array
 
 # in the order of the codes in `_surface_kernels`
 MODES = ("linear", "perceptual", "paper")

@@ -12,9 +12,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from skindb._compiled import fast_kernel, kernel
-from skindb._half_kernels import unpack
-from skindb._select_kernels import median_of
 from skindb.fit._lumitexel_kernels import (
     CLAMPED,
     FEW,
@@ -32,6 +29,7 @@ from skindb.fit._lumitexel_kernels import (
     write_noise,
     write_rows,
 )
+from skindb.jit import fast_kernel, kernel, median_of, unpack
 from skindb.numerics._reflectance_kernels import (
     coefficients,
     fit_memory,

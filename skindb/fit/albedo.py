@@ -7,17 +7,17 @@ from functools import partial
 import numpy as np
 import xarray as xr
 
-from skindb._half_kernels import sample_bits
-from skindb._types import Array
 from skindb.elementwise import elementwise
 from skindb.fit._albedo_kernels import separate_block
 from skindb.fit._albedo_rules import lobe_table, rule_reflectance
 from skindb.fit._arrays import in_batches
 from skindb.fit.lumitexels import GEOMETRY
 from skindb.fit.sample_noise import NO_NOISE, NOISE_INPUTS, noise_inputs, noise_of
+from skindb.jit import sample_bits
 from skindb.optics.diffuse import dipole_s
 from skindb.schema import check, label
 from skindb.schema.status import LARGEST_R_D, SMALLEST_R_D
+from skindb.types import Array
 
 METHODS = ("separated", "quantile", "minimum")
 # rad; largest error of a normal: no sample above the grazing limit falls below the

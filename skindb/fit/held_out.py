@@ -8,7 +8,6 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from skindb._types import Array, Mask
 from skindb.elementwise import elementwise
 from skindb.errors import Fault, InputError
 from skindb.fit._surface_arrays import refit_weights
@@ -16,6 +15,7 @@ from skindb.fit.parameters import FitParameters
 from skindb.fit.plan import FitPlan
 from skindb.fit.surface import NEEDED, reduced_tables
 from skindb.schema import check, dataset
+from skindb.types import Array, Mask
 
 Indices = NDArray[np.intp]
 ERRORS = {

@@ -11,7 +11,6 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from skindb._types import Progress
 from skindb.errors import Fault, InputError
 from skindb.fit._clock import Clock
 from skindb.fit.albedo import estimate_diffuse_reflectance
@@ -36,6 +35,7 @@ from skindb.numerics.nnls import Mode
 from skindb.optics.dictionary import Dictionary, disc_dictionary, embedded_dictionary
 from skindb.schema import FitStatus, label
 from skindb.schema.consent import honour_consent
+from skindb.types import Progress
 
 COPIED = ("surfel_position", "surfel_normal", "surfel_area", "surfel_uv", "region_mask")
 COPIED_GROUPS = ("mesh", "dome", "probe")

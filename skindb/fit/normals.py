@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 
-from skindb._half_kernels import sample_bits
-from skindb._types import Array
 from skindb.elementwise import elementwise
 from skindb.fit._normal_kernels import normals_block
 from skindb.fit.lumitexels import GEOMETRY
+from skindb.jit import sample_bits
 from skindb.schema import check
+from skindb.types import Array
 
 # in the order of the codes in `_normal_kernels`
 METHODS = ("combined", "chromatic", "photometric", "peak")

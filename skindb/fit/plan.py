@@ -8,8 +8,7 @@ from functools import lru_cache
 import numpy as np
 import xarray as xr
 
-from skindb._cache import cached_arrays
-from skindb._types import Mask
+from skindb.cache import cached_arrays
 from skindb.errors import Fault, InputError
 from skindb.fit.lumitexels import disc_angle, lumitexels
 from skindb.fit.parameters import FitParameters
@@ -21,6 +20,7 @@ from skindb.optics.dictionary import (
 )
 from skindb.optics.truncation import Truncation, truncation_bound
 from skindb.schema.omission import Omission, explain
+from skindb.types import Mask
 
 
 @dataclass(frozen=True)

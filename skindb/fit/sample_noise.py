@@ -9,9 +9,9 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from skindb._types import Array
 from skindb.fit._lumitexel_kernels import Noise
 from skindb.schema import check
+from skindb.types import Array
 
 RADIANCE = ("radiance_limit", "radiance_read_variance", "radiance_shot_variance")
 DEVICES = (

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from skindb._types import Array
 from skindb.elementwise import elementwise
 from skindb.fit._surface_arrays import Refit, Tables, refit_weights, surface_weights
 from skindb.fit.lumitexels import GEOMETRY
@@ -20,6 +19,7 @@ from skindb.optics.brdf_table import TableGrid, directional_albedo
 from skindb.optics.dictionary import Dictionary, reduced_dictionary
 from skindb.schema import check, text_labels
 from skindb.schema.brdf import kernel_tables
+from skindb.types import Array
 
 NEEDED = (*GEOMETRY, "shading_normal", "diffuse_reflectance")
 # sr^-1; noise of a sample of dark skin by photons and resampling; that of the sensor may be larger

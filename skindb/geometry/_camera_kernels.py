@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb._compiled import inline_kernel, kernel
+from skindb.jit import inline_kernel, kernel
 
 Array = NDArray[np.float64]
 # 4 to 6 suffice for real lenses; more are needed at the rim of a strong distortion

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb._compiled import kernel
+from skindb.jit import kernel
 
 Array = NDArray[np.float64]
 Single = NDArray[np.float32]

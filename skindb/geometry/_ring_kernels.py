@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb._compiled import kernel
+from skindb.jit import kernel
 
 Bools = NDArray[np.bool_]
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb._compiled import fast_kernel, inline_fast_kernel
+from skindb.jit import fast_kernel, inline_fast_kernel
 
 Single = NDArray[np.float32]
 ZERO = np.float32(0.0)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb._compiled import inline_kernel, kernel
+from skindb.jit import inline_kernel, kernel
 
 Array = NDArray[Any]
 EDGE = 1e-9  # texels; a texel centre on an edge belongs to both triangles

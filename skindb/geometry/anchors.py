@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from skindb._types import Mask
 from skindb.geometry.landmarks import similarity, width
 from skindb.geometry.nearest import closest_on_mesh
 from skindb.geometry.surfels import vertex_areas, vertex_normals
 from skindb.geometry.topology import boundary_loops, outline_first
+from skindb.types import Mask
 
 Float = NDArray[np.floating[Any]]
 Index = NDArray[np.int64]

@@ -12,15 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 from trimesh.exchange.ply import load_ply
 
-from skindb._files import open_regular
-from skindb._limits import (
+from skindb.errors import Fault, InputError
+from skindb.files import open_regular
+from skindb.limits import (
     MAX_PLY_TEXT_LINES,
     MAX_SCAN_BYTES,
     MAX_SCAN_FACES,
     MAX_SCAN_HEADER_BYTES,
     MAX_SCAN_VERTICES,
 )
-from skindb.errors import Fault, InputError
 
 MAX_COLOUR = 255  # of the eight bits of a colour of a vertex
 CURE = "export the scan again as a triangle mesh in mm (PLY or OBJ)"

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from skindb._types import Progress, silent
 from skindb.errors import Fault, InputError
 from skindb.hw.brightness import Levels, failed_lights, lamp_brightness
 from skindb.hw.cameras import Cameras
@@ -51,6 +50,7 @@ from skindb.hw.session import (
     with_dark_frames,
 )
 from skindb.hw.unfinished import Unfinished, open_unfinished
+from skindb.types import Progress, silent
 
 ATTEMPTS = 3  # to measure a site; if all fail, a device is broken
 

@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from skindb._types import Progress, silent
 from skindb.errors import Fault, InputError
 from skindb.hw.cameras import Cameras, match_frames
 from skindb.hw.dome import STOPPED, Dome
@@ -23,6 +22,7 @@ from skindb.hw.safety import (
     require_safe,
 )
 from skindb.hw.sequence import DARK, Measured, Schedule, Step
+from skindb.types import Progress, silent
 
 # runs after the first one; frames that are still missing then indicate a broken device
 MAX_REPEATS = 3

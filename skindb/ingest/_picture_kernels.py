@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from skindb._compiled import kernel
+from skindb.jit import kernel
 
 
 @kernel

@@ -11,8 +11,8 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from skindb._compiled import inline_kernel, kernel
 from skindb.ingest.pixel_flags import DARK, DARK_SIGMA, OK, SATURATED
+from skindb.jit import inline_kernel, kernel
 
 # outcomes of a sample besides those of a pixel: usable, but no pixel has two exposures;
 # no sample was requested

@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb._limits import MAX_EXPOSURES, MAX_KNOWN_POINTS
 from skindb.errors import Fault, InputError
 from skindb.ingest.device_checks import EXPOSURE_SECONDS
 from skindb.ingest.devices import CameraRecord, DomeRecord, filled
@@ -20,6 +19,7 @@ from skindb.ingest.fields import IDENTIFIER, Fields, inside
 from skindb.ingest.frames import Frame, read_frames
 from skindb.ingest.json_file import read_json, shown
 from skindb.ingest.light_positions import BallFrames, read_ball
+from skindb.limits import MAX_EXPOSURES, MAX_KNOWN_POINTS
 
 FILE = "dome/calibration.json"
 PATCHES = 24  # of a ColorChecker

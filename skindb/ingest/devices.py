@@ -11,16 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb._limits import (
-    MAX_CAMERAS,
-    MAX_EXPOSURES,
-    MAX_FIBRES,
-    MAX_FRAME_PIXELS,
-    MAX_FRAMES,
-    MAX_LIGHTS,
-    MAX_PLACEMENTS,
-    MAX_SITES,
-)
 from skindb.ingest.device_checks import (
     EXPOSURE_SECONDS,
     MAX_DISC_RADIUS_MM,
@@ -40,6 +30,16 @@ from skindb.ingest.json_file import shown
 from skindb.ingest.pressure import read_pressure
 from skindb.ingest.sensor import SensorRecord, read_sensor
 from skindb.ingest.sequence import SequenceRecord, read_sequence
+from skindb.limits import (
+    MAX_CAMERAS,
+    MAX_EXPOSURES,
+    MAX_FIBRES,
+    MAX_FRAME_PIXELS,
+    MAX_FRAMES,
+    MAX_LIGHTS,
+    MAX_PLACEMENTS,
+    MAX_SITES,
+)
 
 Array = NDArray[np.float64]
 ROTATION_TOLERANCE = 1e-4  # of R R^T - 1: five digits in the file

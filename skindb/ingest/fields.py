@@ -17,14 +17,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb._limits import (
+from skindb.errors import Fault
+from skindb.ingest.json_file import CURE, MAX_MAGNITUDE, is_number, short, shown
+from skindb.limits import (
     MAX_FRAME_SIDE_PX,
     MAX_NAME_CHARACTERS,
     MAX_NAMED_UNKNOWN_KEYS,
     MAX_TEXT_CHARACTERS,
 )
-from skindb.errors import Fault
-from skindb.ingest.json_file import CURE, MAX_MAGNITUDE, is_number, short, shown
 
 REQUIRED: Any = object()
 

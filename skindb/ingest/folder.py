@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb._limits import MAX_OBJECT_KEYS, MAX_REGIONS
 from skindb.errors import Fault, InputError
 from skindb.geometry.clean import CleanMesh, clean_mesh
 from skindb.geometry.crop import Crop, crop_faces
@@ -55,6 +54,7 @@ from skindb.ingest.scan_checks import (
     scan_fault,
     swapped_faults,
 )
+from skindb.limits import MAX_OBJECT_KEYS, MAX_REGIONS
 from skindb.schema.cohort import imitates_column
 
 FORMAT = "skindb-capture"

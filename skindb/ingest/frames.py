@@ -23,9 +23,9 @@ import OpenEXR
 import tifffile
 from numpy.typing import NDArray
 
-from skindb._files import open_regular, private_file, read_regular
-from skindb._limits import MAX_FRAME_BYTES, MAX_FRAME_PIXELS, MAX_PNG_RATIO
 from skindb.errors import Fault, InputError
+from skindb.files import open_regular, private_file, read_regular
+from skindb.limits import MAX_FRAME_BYTES, MAX_FRAME_PIXELS, MAX_PNG_RATIO
 from skindb.render.image import write_exr
 
 Frame = NDArray[Any]  # (h, w, 3) uint8, uint16 or float32

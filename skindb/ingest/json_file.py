@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from skindb._files import json_depth, read_regular
-from skindb._limits import MAX_JSON_BYTES, MAX_JSON_DEPTH, MAX_OBJECT_KEYS
 from skindb.errors import Fault, InputError, printable
+from skindb.files import json_depth, read_regular
+from skindb.limits import MAX_JSON_BYTES, MAX_JSON_DEPTH, MAX_OBJECT_KEYS
 
 MAX_MAGNITUDE = 1e30  # squares of larger numbers exceed the range of single precision
 MAX_SHOWN_CHARACTERS = 100  # of a key or value in a message

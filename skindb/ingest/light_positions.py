@@ -13,7 +13,6 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from skindb._limits import MAX_BALL_PLACES
 from skindb.errors import Fault, InputError
 from skindb.ingest.device_checks import MAX_BALL_RADIUS_MM
 from skindb.ingest.devices import CameraRecord, DomeRecord, LightRecord, filled
@@ -29,6 +28,7 @@ from skindb.ingest.mirror_ball import (
     light_position,
     reflected_ray,
 )
+from skindb.limits import MAX_BALL_PLACES
 from skindb.schema import dataset
 
 Array = NDArray[np.float64]

@@ -11,7 +11,6 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb._types import Progress
 from skindb.errors import Fault, InputError
 from skindb.geometry._ring_kernels import grown
 from skindb.geometry.camera import camera_centre, project
@@ -28,6 +27,7 @@ from skindb.ingest.sample_checks import bright_fraction, unlit_fault, view_media
 from skindb.ingest.sample_noise import SampleNoise, sample_noise
 from skindb.ingest.spool import Spool
 from skindb.ingest.surfels import SurfelSet
+from skindb.types import Progress
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]

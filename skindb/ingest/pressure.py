@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb._limits import MAX_PRESSURE_SAMPLES
 from skindb.ingest.device_checks import GAUGE_PRESSURES_KPA
 from skindb.ingest.fields import Fields
 from skindb.ingest.json_file import MAX_MAGNITUDE, is_number, shown
+from skindb.limits import MAX_PRESSURE_SAMPLES
 
 Log = NDArray[np.float64]  # (n, 2) seconds since the start of the placement, kPa
 RULE = "must be a pressure in kPa, or a list of [seconds, kPa] with rising seconds"

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb._limits import MAX_FIBRE_PIXELS
 from skindb.errors import Fault, InputError
 from skindb.ingest.device_checks import energy_fault
 from skindb.ingest.devices import ProbeRecord
@@ -19,6 +18,7 @@ from skindb.ingest.frames import Digests, Frame, read_frame
 from skindb.ingest.isotropy import MIN_SIGNAL_TO_NOISE
 from skindb.ingest.json_file import MAX_MAGNITUDE
 from skindb.ingest.radiance import merge_exposures
+from skindb.limits import MAX_FIBRE_PIXELS
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from skindb._version import __version__
+from skindb import __version__
 from skindb.errors import Fault, InputError
 from skindb.ingest.devices import DomeRecord, ProbeRecord, promised_frames
 from skindb.ingest.folder import Capture

@@ -8,11 +8,11 @@ from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from skindb._limits import MAX_FRAMES, MAX_RECHECKED_BYTES
-from skindb._threads import thread_count
+from skindb.elementwise import thread_count
 from skindb.errors import Fault, InputError
 from skindb.ingest.devices import DomeRecord, ProbeRecord, promised_frames
 from skindb.ingest.frames import read_frame
+from skindb.limits import MAX_FRAMES, MAX_RECHECKED_BYTES
 
 
 def decoding_faults(

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from skindb._files import private_file
 from skindb.errors import Fault, InputError
+from skindb.files import private_file
 from skindb.ingest.response_samples import ResponseSamples, response_samples
 
 Array = NDArray[np.float64]

@@ -14,8 +14,7 @@ import dask
 import numpy as np
 import xarray as xr
 
-from skindb._threads import thread_count
-from skindb._types import Progress, silent
+from skindb.elementwise import thread_count
 from skindb.errors import Fault, InputError, grouped
 from skindb.geometry.rays import RayScene
 from skindb.ingest.calibration import CalibrationCheck
@@ -70,6 +69,7 @@ from skindb.ingest.visibility import (
     coarse_maps,
     light_visibility,
 )
+from skindb.types import Progress, silent
 
 T = TypeVar("T")
 OnContradiction = Literal["refuse", "note"]

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb._files import read_regular
-from skindb._limits import MAX_RESPONSE_BYTES
 from skindb.errors import Fault, InputError
+from skindb.files import read_regular
 from skindb.ingest.device_checks import noise_fault
 from skindb.ingest.fields import Fields, inside
 from skindb.ingest.frames import FrameKind
 from skindb.ingest.json_file import MAX_MAGNITUDE, shown
+from skindb.limits import MAX_RESPONSE_BYTES
 
 Array = NDArray[np.float64]
 UNKNOWN_ELECTRONS = 1e30  # per value, where the file does not state them: no shot noise

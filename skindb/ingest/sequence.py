@@ -11,9 +11,9 @@ from datetime import datetime
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb._limits import MAX_SEQUENCE_STEPS
 from skindb.ingest.fields import Fields
 from skindb.ingest.json_file import shown
+from skindb.limits import MAX_SEQUENCE_STEPS
 
 Array = NDArray[np.float64]
 MAX_SECONDS = 1e6  # of a session; more indicates inconsistent clocks

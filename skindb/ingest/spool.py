@@ -24,10 +24,10 @@ import dask.array as da
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb._files import PRIVATE_FILE, make_private, private_file
-from skindb._limits import RESUMABLE_SECONDS
 from skindb.errors import Fault, InputError
+from skindb.files import PRIVATE_FILE, make_private, private_file
 from skindb.ingest._sample_kernels import tally
+from skindb.limits import RESUMABLE_SECONDS
 from skindb.schema.blocks import SHARD
 
 # between two entries of the journal: the most that a killed run loses

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from skindb._compiled import kernel
+from skindb.jit import kernel
 
 # a column whose fraction outside the span of the active ones is below this is collinear
 # with them

@@ -9,8 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from skindb._compiled import fast_kernel, kernel
-from skindb._vectors import LANES, dots, products
+from skindb.jit import LANES, dots, fast_kernel, kernel, products
 from skindb.numerics._nnls_kernels import active_set_memory, solve_scaled
 
 # Gauss-Newton ends when a step lowers the misfit by less than this fraction

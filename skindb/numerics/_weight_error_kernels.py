@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from skindb._compiled import fast_kernel, kernel
+from skindb.jit import fast_kernel, kernel
 from skindb.numerics._nnls_kernels import factor, solve
 from skindb.numerics._reflectance_kernels import ONE, ZERO, gram, slopes
 

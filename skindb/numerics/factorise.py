@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from sklearn.decomposition import NMF
 from sklearn.exceptions import ConvergenceWarning
 
-from skindb._blas import c_contiguous
-from skindb._types import Array
 from skindb.numerics.nnls import solve_nnls
+from skindb.threads import c_contiguous
+from skindb.types import Array
 
 MAX_SWEEPS = 200  # alternating over W and H; TOLERANCE ends most runs earlier
 TOLERANCE = 1e-8  # decrease of the squared error per sweep, relative to |X|^2

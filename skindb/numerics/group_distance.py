@@ -18,8 +18,8 @@ from math import factorial, prod
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb._types import Array
 from skindb.numerics.inference import BATCH, ROUNDING
+from skindb.types import Array
 
 Labels = NDArray[np.intp]
 REACHED = 1 - 1e-9  # tolerance for the same statistic summed in another order

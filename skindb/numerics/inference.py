@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize, stats
 
-from skindb._types import Array, Mask
+from skindb.types import Array, Mask
 
 ROUNDING = 1e-13  # relative to the largest value
 SUMS = 2  # entries per draw and quantity when products of matrices are used

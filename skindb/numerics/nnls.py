@@ -8,8 +8,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from skindb._types import Array
 from skindb.numerics import _nnls_kernels, _reflectance_kernels
+from skindb.types import Array
 
 Mode = Literal["linear", "perceptual"]
 

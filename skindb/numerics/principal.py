@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb._types import Array
+from skindb.types import Array
 
 # entries per vector that are held in double precision at a time: 90 MB for 174 vectors
 BLOCK = 1 << 16

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from skindb._types import Array
 from skindb.numerics.nnls import solve_nnls
+from skindb.types import Array
 
 STEPS = 100  # iterations of the descent after every change of size
 POLISH = 40  # iterations of the last descent, in the full space of the BRDFs

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from skindb._types import Array
+from skindb.types import Array
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from skindb._compiled import fast_kernel, inline_fast_kernel, inline_kernel, kernel
-from skindb._half_kernels import scale_to_one, unpack
-from skindb._select_kernels import median_of, sort_columns
+from skindb.jit import (
+    fast_kernel,
+    inline_fast_kernel,
+    inline_kernel,
+    kernel,
+    median_of,
+    scale_to_one,
+    sort_columns,
+    unpack,
+)
 
 # below it, a pixel may include the background behind the silhouette
 MIN_COSINE_CAMERA = np.float32(0.2)

@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 import numba as nb
 import numpy as np
 
-from skindb._compiled import fast_kernel, inline_fast_kernel, kernel
-from skindb._vectors import LANES, blend
+from skindb.jit import LANES, blend, fast_kernel, inline_fast_kernel, kernel
 
 # arctan(t) = t sum c_k t^2k on [0, 1], minimax fit with error 5.3e-11; unlike atan2 it
 # runs in vector registers

@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from skindb._compiled import fast_kernel, inline_fast_kernel
+from skindb.jit import fast_kernel, inline_fast_kernel
 from skindb.optics._row_kernels import _angles
 
 

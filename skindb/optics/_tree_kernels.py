@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from skindb._compiled import fast_kernel, inline_fast_kernel, kernel
+from skindb.jit import fast_kernel, inline_fast_kernel, kernel
 
 MAX_DEPTH = 10  # levels of the octree, with three bits of the Morton code each
 # rows evaluated at a time, so that the list and its profiles stay in the first-level

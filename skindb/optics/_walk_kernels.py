@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from skindb._compiled import fast_kernel
+from skindb.jit import fast_kernel
 
 
 @fast_kernel

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from skindb._types import Array
+from skindb.types import Array
 
 
 def half_difference(

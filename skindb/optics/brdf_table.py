@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from skindb._types import Array
 from skindb.optics.angles import directions, half_difference
+from skindb.types import Array
 
 Table = NDArray[np.float32]
 

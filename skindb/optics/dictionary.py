@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb._cache import cached_arrays
-from skindb._types import Array
+from skindb.cache import cached_arrays
 from skindb.errors import Fault, InputError
 from skindb.optics import _row_kernels
 from skindb.optics.abc_low2012 import PARAMETERS
@@ -24,6 +23,7 @@ from skindb.optics.angles import directions, half_difference
 from skindb.optics.brdf_table import DEFAULT_GRID, Table, TableGrid, tabulate
 from skindb.optics.fresnel import fresnel_reflectance
 from skindb.optics.rows import reduce_dictionary
+from skindb.types import Array
 
 Rule = tuple[int, int]  # rings and points per ring of a quadrature over a disc
 # away from the mirror direction and near it; see `convolve_disc`
@@ -42,7 +42,7 @@ SOURCES = tuple(
         "optics.abc_low2012",
         "optics._row_kernels",
         "optics.truncation",
-        "_vectors",
+        "jit",
     )
 )
 # cosines are clamped to this, so that cells below the horizon continue the last value

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from skindb._types import Array
 from skindb.optics.abc_low2012 import PARAMETERS
 from skindb.optics.angles import half_difference
 from skindb.optics.brdf_table import directional_albedo, lookup
@@ -18,6 +17,7 @@ from skindb.optics.dictionary import (
     sample_pairs,
     weighted_error,
 )
+from skindb.types import Array
 
 INCIDENCE = np.radians(np.arange(0, 86, 5))
 # rings, spokes; twice as many points change the worst average of the 59 materials by

@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from skindb._types import Array
 from skindb.optics.fresnel import boundary_factor
+from skindb.types import Array
 
 S_MAX = float(np.sqrt(3.0))
 # range of R_d that is inverted; values outside are clamped

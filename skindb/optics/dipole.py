@@ -7,8 +7,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from skindb._types import Array
 from skindb.optics.fresnel import boundary_factor
+from skindb.types import Array
 
 
 def sigma_tr(sigma_a: ArrayLike, sigma_s_prime: ArrayLike) -> Array:

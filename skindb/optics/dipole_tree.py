@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb._types import Array
 from skindb.optics import _tree_kernels
 from skindb.optics.diffuse import S_FLOOR, diffuse_reflectance, reduced_albedo
 from skindb.optics.fresnel import boundary_factor
+from skindb.types import Array
 
 MAX_LEAF_POINTS = 8  # nodes with more points are divided
 # mean paths 1 / sigma_tr after which the profile is below 1e-7 of its integral

@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike
 
-from skindb._types import Array
+from skindb.types import Array
 
 
 def fresnel_reflectance(cos_i: ArrayLike, eta: float) -> Array:

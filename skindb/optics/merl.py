@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from skindb._files import private_file
-from skindb._types import Array
 from skindb.errors import Fault, InputError
+from skindb.files import private_file
+from skindb.types import Array
 
 SHAPE = (90, 90, 180)  # theta_h (quadratic), theta_d, phi_d
 SCALE = np.array([1.0, 1.15, 1.66]) / 1500.0

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb._half_kernels import sample_bits
-from skindb._types import Array
+from skindb.jit import sample_bits
 from skindb.optics import _photometric_kernels
+from skindb.types import Array
 
 
 @dataclass(frozen=True)

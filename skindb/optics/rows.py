@@ -7,11 +7,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb._types import Array
-from skindb._vectors import LANES
+from skindb.jit import LANES
 from skindb.optics import _row_kernels
 from skindb.optics.angles import directions
 from skindb.optics.brdf_table import Table, TableGrid
+from skindb.types import Array
 
 
 def reduce_dictionary(table: Table, rank: int) -> tuple[Table, Array]:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb._types import Array
 from skindb.optics import _shade_kernels
+from skindb.types import Array
 
 
 def shade_points(

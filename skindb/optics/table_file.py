@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb._files import private_file
-from skindb._types import Array
 from skindb.errors import Fault, InputError
+from skindb.files import private_file
 from skindb.optics.brdf_table import DEFAULT_GRID, directional_albedo
 from skindb.optics.dictionary import Dictionary
 from skindb.optics.resample import hole_fraction, to_default_grid
+from skindb.types import Array
 
 TABLE = "basis_brdf"
 NODES = ("theta_h", "theta_d", "phi_d")

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import RectBivariateSpline, make_interp_spline
 
-from skindb._cache import cached_arrays
+from skindb.cache import cached_arrays
 from skindb.optics._moments import half_space_profile, moments
 from skindb.optics.random_walk import radial_profile, random_walk
 

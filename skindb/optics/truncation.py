@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb._types import Array
 from skindb.optics.brdf_table import Table, TableGrid, brdf_metric
+from skindb.types import Array
 
 FRANK_WOLFE_STEPS = 200  # each step gives a valid bound; 500 steps lower it by 1 %
 MIN_COSINE_SAMPLES = 0.1  # cosine to light and camera above which fits use samples

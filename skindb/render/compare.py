@@ -7,8 +7,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import binary_erosion
 from skimage.metrics import structural_similarity
 
-from skindb._types import Mask
 from skindb.render.image import auto_exposure, encode_srgb
+from skindb.types import Mask
 
 # pixels, the default of Wang et al. 2004's uniform window in scikit-image
 SSIM_WINDOW = 7

@@ -6,12 +6,12 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from skindb._types import Array
 from skindb.errors import Fault, InputError
 from skindb.optics.shade import shade_points
 from skindb.render.scene import usable_surfels
 from skindb.schema import FitStatus, check
 from skindb.schema.brdf import kernel_tables
+from skindb.types import Array
 
 NEEDED = ("shading_normal", "diffuse_reflectance", "basis_weight", "fit_status")
 MAX_LENGTH_ERROR = 1e-3  # of a unit direction; directions in half precision have 5e-4

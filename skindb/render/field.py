@@ -10,8 +10,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from skindb._files import private_file
 from skindb.errors import Fault, InputError
+from skindb.files import private_file
 from skindb.geometry.rays import RayScene
 from skindb.render.image import encode_srgb
 from skindb.schema.consent import honour_consent

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb._files import private_file
-from skindb._plots import plain_text
+from skindb.files import private_file
+from skindb.plots import plain_text
 from skindb.render.image import auto_exposure, tone_map
 
 CELL = 2.0  # inches, the longer side of a picture

@@ -11,8 +11,8 @@ import numpy as np
 import OpenEXR
 from numpy.typing import ArrayLike, NDArray
 
-from skindb._files import private_file
 from skindb.errors import Fault, InputError
+from skindb.files import private_file
 
 Image = NDArray[np.float32]
 DAMAGED = "a file that is cut off, damaged or of another format"

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb._types import Mask, Progress
 from skindb.geometry.rays import RayScene
 from skindb.optics.brdf_sampling import LobeSampler, tangents
 from skindb.optics.fresnel import fresnel_transmittance
@@ -21,6 +20,7 @@ from skindb.render.environment import Environment
 from skindb.render.light_choice import LightChoice, points_on_discs, stratified
 from skindb.render.scene import Camera, Lights, Surface
 from skindb.render.subsurface import exitance_from_irradiance
+from skindb.types import Mask, Progress
 
 Float = NDArray[np.floating[Any]]
 Image = NDArray[np.float32]

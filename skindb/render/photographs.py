@@ -12,8 +12,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from skindb._files import make_private
 from skindb.errors import Fault, InputError
+from skindb.files import make_private
 from skindb.geometry.rays import RayScene
 from skindb.render.causes import Causes, find_causes
 from skindb.render.compare import compare_images

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb._types import Mask
 from skindb.geometry.camera import project
 from skindb.geometry.rays import RayScene
 from skindb.optics.fresnel import fresnel_transmittance
@@ -20,6 +19,7 @@ from skindb.render.monte_carlo import Lighting
 from skindb.render.scene import Camera, Lights, Surface
 from skindb.render.subsurface import tree_opening
 from skindb.schema.omission import Omission
+from skindb.types import Mask
 
 Float = NDArray[np.floating[Any]]
 Omissions = tuple[Omission, ...]

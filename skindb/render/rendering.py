@@ -11,7 +11,6 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from skindb._types import Mask, Progress
 from skindb.errors import Fault, InputError
 from skindb.geometry.rays import RayScene
 from skindb.render.direct import trace_view
@@ -25,6 +24,7 @@ from skindb.render.scene import Camera, Lights, Surface, from_model
 from skindb.render.subsurface import require_translucency, tree_opening
 from skindb.schema.consent import honour_consent
 from skindb.schema.omission import Omission
+from skindb.types import Mask, Progress
 
 UNITS = "radiance"  # in the unit of the photographs, or of the environment
 NO_LIGHTS = Lights(

@@ -10,8 +10,8 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from skindb._limits import MAX_PICTURE_PIXELS
 from skindb.errors import Fault, InputError
+from skindb.limits import MAX_PICTURE_PIXELS
 from skindb.schema import FitStatus, check
 from skindb.schema.brdf import kernel_tables
 

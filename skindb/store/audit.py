@@ -20,7 +20,7 @@ from datetime import UTC, datetime
 from functools import partial
 from typing import Any
 
-from skindb._version import __version__
+from skindb import __version__
 from skindb.errors import Fault, InputError
 from skindb.store.condition import evaluate
 from skindb.store.markers import is_sealed, keyed_hash, keyed_seal, require_secret

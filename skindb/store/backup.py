@@ -17,7 +17,7 @@ from datetime import UTC, datetime
 from functools import partial
 from typing import TypeVar
 
-from skindb._version import __version__
+from skindb import __version__
 from skindb.errors import Fault, InputError
 from skindb.schema.consent import CONSENT
 from skindb.store.archive import (

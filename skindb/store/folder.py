@@ -16,9 +16,9 @@ from pathlib import Path
 
 from zarr.storage import LocalStore
 
-from skindb._files import PRIVATE, make_private, open_regular
-from skindb._limits import MAX_STORE_JSON_BYTES
 from skindb.errors import InputError, add_filename
+from skindb.files import PRIVATE, make_private, open_regular
+from skindb.limits import MAX_STORE_JSON_BYTES
 from skindb.store.paths import STAGING, inside
 from skindb.store.place import Guard
 

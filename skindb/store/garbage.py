@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from functools import cache, partial
 from typing import cast
 
-from skindb._limits import RESUMABLE_SECONDS
 from skindb.errors import Fault, InputError
+from skindb.limits import RESUMABLE_SECONDS
 from skindb.schema.consent import CONSENT
 from skindb.store.erasure import SCRATCH_NAME, erase_withdrawn, holdings_of
 from skindb.store.kinds import CALIBRATION, RELEASE

@@ -22,9 +22,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from skindb._files import PRIVATE_FILE, make_private, read_regular
-from skindb._limits import MAX_STORE_JSON_BYTES
 from skindb.errors import Fault, InputError, SkindbWarning, system_fault
+from skindb.files import PRIVATE_FILE, make_private, read_regular
+from skindb.limits import MAX_STORE_JSON_BYTES
 from skindb.schema.consent import SCOPES, consent_scope
 from skindb.store.folder import flush_path
 from skindb.store.markers import (

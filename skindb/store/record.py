@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, TypeGuard
 
-from skindb._files import json_depth
-from skindb._limits import MAX_JSON_DEPTH
+from skindb.files import json_depth
+from skindb.limits import MAX_JSON_DEPTH
 from skindb.schema import SCHEMA_VERSION, VARIABLES
 from skindb.store.kinds import KINDS_WITHOUT_SUBJECT
 from skindb.store.paths import GROUP, KIND, TAKE, VERSION, subject_of

@@ -18,7 +18,7 @@ import xarray as xr
 import zarr
 from zarr.codecs import BloscCodec, TransposeCodec
 
-from skindb._version import __version__
+from skindb import __version__
 from skindb.errors import Fault, InputError, add_filename
 from skindb.schema import SCHEMA_VERSION, VARIABLES, check, dataset
 from skindb.schema.blocks import SHARD

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb._limits import MAX_JSON_BYTES
 from skindb.errors import Fault, InputError
 from skindb.geometry.clean import CleanMesh, clean_mesh
 from skindb.geometry.crop import Crop
@@ -31,6 +30,7 @@ from skindb.ingest.scan_checks import (
     order_fault,
     swapped_faults,
 )
+from skindb.limits import MAX_JSON_BYTES
 
 Points = Mapping[str, NDArray[np.float64]]
 # clicks are on the surface; single precision and rounding cause errors of 0.001

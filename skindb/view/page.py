@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from skindb._files import make_private, private_file
 from skindb.errors import Fault, InputError
+from skindb.files import make_private, private_file
 from skindb.view.template import embedded_json, page_text
 
 SCRIPTS = (

@@ -12,14 +12,14 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from skindb._files import make_private, private_file
-from skindb._types import Progress
 from skindb.errors import Fault, InputError
+from skindb.files import make_private, private_file
 from skindb.optics.abc_low2012 import PARAMETERS
 from skindb.optics.brdf_table import directional_albedo
 from skindb.optics.dictionary import Dictionary, convolve_disc, embedded_dictionary
 from skindb.optics.diffuse import dipole_s
 from skindb.render.scene import Surface
+from skindb.types import Progress
 from skindb.virtual.dome import DISC_RADIUS, LIGHT_RADIUS, Dome
 from skindb.virtual.frames import photograph
 from skindb.virtual.head import Head, parametric_head

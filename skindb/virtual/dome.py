@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb._limits import MAX_CAMERAS, MAX_FRAMES, MAX_LIGHTS, MAX_VIRTUAL_PIXELS
 from skindb.errors import Fault, InputError
+from skindb.limits import MAX_CAMERAS, MAX_FRAMES, MAX_LIGHTS, MAX_VIRTUAL_PIXELS
 
 Array = NDArray[np.float64]
 CENTRE = np.array([0.0, -8.0, 45.0])  # of the dome in the subject frame, mm

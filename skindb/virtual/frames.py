@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from skindb._files import make_private
+from skindb.files import make_private
 from skindb.geometry.camera import pixel_rays
 from skindb.geometry.rays import RayScene
 from skindb.render.direct import render_view

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb._cache import cached_arrays
-from skindb._files import private_file
+from skindb.cache import cached_arrays
+from skindb.files import private_file
 from skindb.optics.random_walk import Walk, radial_profile, random_walk
 from skindb.virtual.sensor import Sensor, write_png
 from skindb.virtual.skin import Site

@@ -9,7 +9,7 @@ import imagecodecs
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb._files import private_file
+from skindb.files import private_file
 
 Image = NDArray[np.float32]
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from skindb._types import Progress
+from skindb.types import Progress
 from skindb.virtual.capture import DEVICE_SEED, simulate_take
 from skindb.virtual.dome import build_dome
 from skindb.virtual.person import Person, default_people

@@ -19,11 +19,11 @@ from typing import TYPE_CHECKING, Any
 import cloudpickle
 import dask
 
-from skindb._blas import one_blas_thread
-from skindb._files import make_private, private_file
-from skindb._threads import thread_count
-from skindb._version import __version__
+from skindb import __version__
+from skindb.elementwise import thread_count
 from skindb.errors import Fault, InputError
+from skindb.files import make_private, private_file
+from skindb.threads import one_blas_thread
 from skindb.workflow.source import method_digest
 
 if TYPE_CHECKING:

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from skindb._types import Progress, silent
 from skindb.analysis.common_maps import common_maps
 from skindb.analysis.edit import apply_traits, with_basis
 from skindb.analysis.population_basis import population_basis
@@ -20,6 +19,7 @@ from skindb.render.grid import write_grid
 from skindb.render.picture import frontal_camera, radiance_of
 from skindb.schema.consent import require_consent
 from skindb.store import STUDY, Database, require_fresh
+from skindb.types import Progress, silent
 from skindb.workflow import study_inputs
 from skindb.workflow.audit import logged
 from skindb.workflow.provenance import as_input, groups_of, method_digest, provenance

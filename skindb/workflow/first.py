@@ -9,7 +9,7 @@ from typing import Any
 
 import xarray as xr
 
-from skindb._version import __version__
+from skindb import __version__
 from skindb.errors import InputError
 from skindb.fit import FitParameters
 from skindb.optics.dictionary import Dictionary, embedded_dictionary

@@ -9,8 +9,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from skindb._blas import one_blas_thread
-from skindb._types import Progress
 from skindb.analysis.summary import SAMPLED
 from skindb.errors import Fault, InputError
 from skindb.fit import FitParameters, FitPlan, first_pass, plan_fit, second_pass
@@ -18,6 +16,8 @@ from skindb.optics.dictionary import EMBEDDED, Dictionary, embedded_dictionary
 from skindb.optics.measured import read_dictionary
 from skindb.schema.consent import require_consent
 from skindb.store import Database, Record
+from skindb.threads import one_blas_thread
+from skindb.types import Progress
 from skindb.workflow.audit import logged
 from skindb.workflow.first import (
     FIRST,
@@ -36,11 +36,8 @@ METHOD = (
     "elementwise",
     "schema/status",
     "schema/brdf",
-    "_compiled",
-    "_vectors",
-    "_blas",
-    "_half_kernels",
-    "_select_kernels",
+    "jit",
+    "threads",
     "geometry/rays",
     "geometry/_ray_kernels",
 )

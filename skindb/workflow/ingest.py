@@ -9,10 +9,8 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
-from skindb._blas import one_blas_thread
-from skindb._files import private_file
-from skindb._types import Progress
 from skindb.errors import Fault, InputError, add_filename
+from skindb.files import private_file
 from skindb.ingest import (
     Capture,
     Crop,
@@ -25,6 +23,8 @@ from skindb.ingest.json_file import read_json
 from skindb.ingest.spool import remove_stale
 from skindb.schema.consent import CONSENT, require_consent
 from skindb.store import Database, Record, WithdrawnError, subject_of
+from skindb.threads import one_blas_thread
+from skindb.types import Progress
 from skindb.workflow.audit import logged_action
 from skindb.workflow.calibration import calibrated_capture
 from skindb.workflow.provenance import groups_of

@@ -8,16 +8,16 @@ from typing import Any
 
 import xarray as xr
 
-from skindb._files import make_private
-from skindb._types import Progress
 from skindb.errors import Fault, InputError
 from skindb.export.bundle import export_bundle
 from skindb.export.gltf import export_gltf
+from skindb.files import make_private
 from skindb.render.field import write_field
 from skindb.render.photographs import Comparison, compare_photographs
 from skindb.render.rendering import render_picture
 from skindb.schema.consent import require_consent
 from skindb.store import Database, require_fresh
+from skindb.types import Progress
 from skindb.workflow.audit import logged
 
 

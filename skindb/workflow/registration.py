@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import xarray as xr
 
-from skindb._types import Progress, silent
-from skindb._version import __version__
+from skindb import __version__
 from skindb.analysis.registration import (
     Frame,
     Outline,
@@ -24,6 +23,7 @@ from skindb.analysis.summary import SAMPLED
 from skindb.errors import Fault, InputError
 from skindb.schema.consent import require_consent
 from skindb.store import Database, Record, frame_of
+from skindb.types import Progress, silent
 from skindb.workflow.audit import logged
 from skindb.workflow.provenance import provenance
 from skindb.workflow.summaries import registered_parts, summary_digest

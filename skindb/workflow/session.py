@@ -14,10 +14,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from skindb._files import make_private, private_file, private_umask
-from skindb._types import Progress
 from skindb.clock import SYSTEM_CLOCK, SimulatedClock
 from skindb.errors import Fault, InputError
+from skindb.files import make_private, private_file, private_umask
 from skindb.geometry.scan import read_scan
 from skindb.hw.cameras import FolderCameras
 from skindb.hw.capture import CapturePlan, Devices, planned_schedule, run_capture
@@ -30,6 +29,7 @@ from skindb.ingest.fields import IDENTIFIER
 from skindb.ingest.folder import read_capture, record_faults
 from skindb.ingest.json_file import read_json
 from skindb.ingest.light_calibration import read_setup_dome
+from skindb.types import Progress
 from skindb.virtual.devices import GAUGE_FAULTS, DeviceFaults
 from skindb.virtual.laboratory import Laboratory, LaboratoryFaults
 from skindb.workflow.simulation import simulate

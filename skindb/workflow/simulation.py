@@ -9,9 +9,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from skindb._files import make_private, private_file, read_regular
-from skindb._types import Progress
 from skindb.errors import Fault, InputError
+from skindb.files import make_private, private_file, read_regular
+from skindb.types import Progress
 from skindb.virtual.person import Person, cohort_people
 from skindb.virtual.takes import simulate_takes
 from skindb.workflow.takes import map_takes, results_of

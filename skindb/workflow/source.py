@@ -8,13 +8,11 @@ import hashlib
 from functools import cache
 from pathlib import Path
 
-from skindb._version import __file__ as version_file
-
 
 @cache
 def method_digest(modules: tuple[str, ...] = ("",)) -> str:
     """Digest of the source of modules and subpackages of skindb, default all of it."""
-    root = Path(version_file).parent
+    root = Path(__file__).parents[1]
     digest = hashlib.sha256()
     for name in modules:
         files = (

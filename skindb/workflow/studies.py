@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from skindb._blas import on_one_blas_thread
 from skindb.analysis.albedo import albedo_histograms, albedo_table
 from skindb.analysis.basis_size import BASIS_SIZE_VARIABLES, basis_size_curve
 from skindb.analysis.brdf_space import brdf_space, grouped_takes
@@ -40,6 +39,7 @@ from skindb.schema.cohort import require_same_fit
 from skindb.schema.notes import note
 from skindb.schema.regions import FACE
 from skindb.store import Database
+from skindb.threads import on_one_blas_thread
 from skindb.workflow.audit import logged
 from skindb.workflow.study_inputs import (
     Frame,

@@ -21,9 +21,9 @@ import dask
 from loky import get_reusable_executor
 from loky.process_executor import BrokenProcessPool
 
-from skindb._blas import one_blas_thread
-from skindb._threads import thread_count
+from skindb.elementwise import thread_count
 from skindb.errors import Fault, InputError, system_fault
+from skindb.threads import one_blas_thread
 from skindb.workflow.audit import as_part
 from skindb.workflow.cluster import calls_on_cluster
 

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from skindb._types import Progress, silent
 from skindb.errors import Fault, InputError
 from skindb.render.grid import write_grid
 from skindb.render.picture import chosen_camera
@@ -19,6 +18,7 @@ from skindb.render.rendering import render
 from skindb.render.scene import Camera, Lights
 from skindb.schema.consent import require_consent
 from skindb.store import Database
+from skindb.types import Progress, silent
 from skindb.workflow.audit import logged
 
 SIDE_PX = 320  # of a picture

@@ -9,7 +9,6 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from skindb._types import Progress, silent
 from skindb.errors import Fault, InputError
 from skindb.store import (
     RELEASE,
@@ -20,6 +19,7 @@ from skindb.store import (
     UnavailableError,
     stale_versions,
 )
+from skindb.types import Progress, silent
 from skindb.workflow.audit import logged
 from skindb.workflow.cluster import computing_on
 from skindb.workflow.edits import edit

@@ -10,11 +10,11 @@ from typing import Any
 
 import xarray as xr
 
-from skindb._types import Progress, silent
 from skindb.errors import Fault, InputError
 from skindb.render.environment import Environment
 from skindb.schema.consent import require_consent
 from skindb.store import Database, UnavailableError, require_fresh
+from skindb.types import Progress, silent
 from skindb.view.face import Trait, face_record, page_omissions, still_picture
 from skindb.view.landmark_page import landmark_server
 from skindb.view.landmarks import landmark_task

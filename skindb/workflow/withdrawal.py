@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import skindb
-from skindb._files import write_private
-from skindb._version import __version__
+from skindb import __version__
 from skindb.errors import Fault, InputError
+from skindb.files import write_private
 from skindb.store import Database, Holdings, seal_of
 from skindb.workflow.audit import logged_action
 

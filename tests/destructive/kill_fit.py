@@ -43,8 +43,8 @@ from sphere import write_capture
 
 import skindb
 from skindb import workflow
-from skindb._compiled import reported_compilation
 from skindb.ingest import spool
+from skindb.jit import reported_compilation
 from skindb.store import Database
 from skindb.store.stage import Stage
 from skindb.workflow import fit as fit_module

@@ -225,7 +225,7 @@ def test_photograph_group__keeps_radiance_in_any_unit(unit):
 def test_threads__are_as_many_as_cores_and_memory_allow(
     pristine, monkeypatch, cores, megapixels, expected
 ):
-    monkeypatch.setattr("skindb._threads.cpu_count", lambda: cores)
+    monkeypatch.setattr("skindb.elementwise.cpu_count", lambda: cores)
     dome = read_capture(pristine).dome
     cameras = [
         *dome.cameras[:-1],
@@ -238,7 +238,7 @@ def test_threads__are_as_many_as_cores_and_memory_allow(
 def test_ingest_capture__numbers_do_not_depend_on_the_threads(
     pristine, take, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr("skindb._threads.cpu_count", lambda: 7)
+    monkeypatch.setattr("skindb.elementwise.cpu_count", lambda: 7)
     assert threads(read_capture(pristine).dome) == 7
     db = Database(tmp_path / "db")
     ingest_take(db, pristine, spacing_mm=4.0, photographs=2)

@@ -10,7 +10,7 @@ import pytest
 from planted_cohort import PEOPLE, capture
 
 import skindb
-from skindb._files import make_private
+from skindb.files import make_private
 from skindb.workflow.provenance import groups_of
 
 

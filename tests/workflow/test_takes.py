@@ -121,7 +121,7 @@ def test_map_takes__in_this_process_in_order():
 
 
 def test_map_takes__in_other_processes_that_stay_warm_and_share_the_cores(monkeypatch):
-    monkeypatch.setattr("skindb._threads.cpu_count", lambda: 4)
+    monkeypatch.setattr("skindb.elementwise.cpu_count", lambda: 4)
     first = [outcome.result() for outcome in map_takes(_square, range(6), workers=2)]
     again = [outcome.result() for outcome in map_takes(_square, range(6), workers=2)]
     assert {value for value, _, _ in first} == {x * x for x in range(6)}
@@ -224,7 +224,7 @@ def test_map_takes__libraries_use_one_thread_on_every_engine(monkeypatch, worker
     """The order of sums in matrix products depends on the number of threads, and with
     it the last digit of a result.
     """
-    monkeypatch.setattr("skindb._threads.cpu_count", lambda: 8)
+    monkeypatch.setattr("skindb.elementwise.cpu_count", lambda: 8)
 
     def pools(_):
         np.ones((50, 50)) @ np.ones((50, 50))

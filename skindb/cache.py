@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb._blas import one_blas_thread
-from skindb._files import make_private, private_file
+from skindb.files import make_private, private_file
+from skindb.threads import one_blas_thread
 
 Arrays = dict[str, NDArray[Any]]
 MAX_ENTRIES = 8  # per name; the oldest are removed

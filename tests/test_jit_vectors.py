@@ -12,8 +12,8 @@ import numba as nb
 import numpy as np
 import pytest
 
-from skindb import _vectors
-from skindb._vectors import LANES
+from skindb import jit
+from skindb.jit import LANES
 
 ROUNDING = 1e-6  # error of sums in single precision relative to their largest terms
 WAYS = ("vector", "plain")
@@ -21,8 +21,7 @@ WAYS = ("vector", "plain")
 
 def _compiled(way):
     blend, products, dots, half = (
-        getattr(_vectors, f"{way}_{name}")
-        for name in ("blend", "products", "dots", "half")
+        getattr(jit, f"{way}_{name}") for name in ("blend", "products", "dots", "half")
     )
 
     @nb.njit

@@ -10,7 +10,7 @@ import pandas as pd
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skindb._csv import csv_text
+from skindb.files import csv_text
 
 FORMULAS = [
     "=1+1",

@@ -1,16 +1,19 @@
-"""Files of captures and databases: opens only regular files of limited size, and
-creates private folders.
+"""Files: opens only regular files of limited size, creates private folders, writes tables
+as comma-separated values.
 """
 
 from __future__ import annotations
 
+import csv
+import io
 import os
 import re
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from io import BufferedReader
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -180,3 +183,31 @@ def write_private(path: Path, content: bytes) -> None:
     number = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
     with os.fdopen(number, "wb") as file:
         file.write(content)
+
+
+NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+# first characters of formulas, also in full width
+FORMULA = frozenset("=+-@\t\r\n\uff1d\uff0b\uff0d\uff20")
+
+
+def csv_text(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    """A table as CSV (RFC 4180), in which missing values are empty.
+
+    Text that a spreadsheet would evaluate begins with an apostrophe (OWASP, "CSV Injection").
+    """
+    buffer = io.StringIO()
+    csv.writer(buffer).writerows(
+        [_cell(value) for value in row] for row in (header, *rows)
+    )
+    return buffer.getvalue()
+
+
+def _cell(value: Any) -> Any:
+    if isinstance(value, np.generic):
+        value = value.item()  # whose digits do not depend on the print options of NumPy
+    if value is None or value != value:
+        return ""
+    if not isinstance(value, str) or NUMBER.fullmatch(value):
+        return value
+    first = {value[:1], value.lstrip()[:1]}
+    return f"'{value}" if first & FORMULA else value

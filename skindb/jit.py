@@ -1,23 +1,102 @@
-"""Steps of compiled kernels, written with explicit vector instructions and inlined, and
-the same steps as plain loops.
+"""Compiled kernels: decorators, vector steps, half floats, order statistics.
 
 LLVM vectorises loops only if their width is constant, and a call with many arrays costs
-more than such a step. With SKINDB_INTRINSICS=0 in the environment the plain loops are
-used, for processors or versions of LLVM on which the vector code does not compile. The
-fit then takes about four times the CPU time.
+more than a step of a few vectors. These steps are therefore written with explicit vector
+instructions and inlined, and again as plain loops. With SKINDB_INTRINSICS=0 in the
+environment the plain loops are used, for processors or versions of LLVM on which the
+vector code does not compile. The fit then takes about four times the CPU time.
 """
 
 from __future__ import annotations
 
+import hashlib
+import math
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
 from typing import Any
 
+import numba as nb
 import numpy as np
 from llvmlite import ir
 from numba import types
-from numba.core import cgutils
-from numba.extending import intrinsic
+from numba.core import cgutils, event
+from numba.extending import intrinsic, overload
+from numpy.typing import NDArray
 
-from skindb._compiled import INTRINSICS, inline_fast_kernel, kernel
+# sums may be reordered and products fused; NaN and inf keep their meaning
+# (`fastmath=True` would drop tests for them)
+FAST = {"reassoc", "contract", "arcp", "nsz", "afn"}
+# cached on disk; without the GIL; a division by zero gives inf, because tests for it
+# would prevent vectorised loops
+OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
+# 0: only code that Numba compiles itself, see the vector steps below
+INTRINSICS = os.environ.get("SKINDB_INTRINSICS", "1") != "0"
+
+
+def kernel(function: Any) -> Any:
+    """Compile a kernel whose sums keep their order."""
+    return _stamped(nb.njit(**OPTIONS)(function))
+
+
+def fast_kernel(function: Any) -> Any:
+    """Compile a kernel whose loops may run in vector registers, see FAST.
+
+    The kernel is always inlined into its callers. Otherwise a process that has just
+    compiled both would call the separately compiled copy, and a process that reads them
+    from the disk the copy next to the caller, which may sum in another order.
+    """
+    return _stamped(nb.njit(fastmath=FAST, forceinline=True, **OPTIONS)(function))
+
+
+def inline_kernel(function: Any) -> Any:
+    """Like `kernel`, but inlined by Numba into each of its callers."""
+    return _stamped(nb.njit(inline="always", **OPTIONS)(function))
+
+
+def inline_fast_kernel(function: Any) -> Any:
+    """Like `fast_kernel`, but inlined by Numba into each of its callers."""
+    return _stamped(nb.njit(fastmath=FAST, inline="always", **OPTIONS)(function))
+
+
+def _stamped(compiled: Any) -> Any:
+    """Make the cache on disk valid only as long as no kernel changes.
+
+    Numba only compares the date of the file of a function. Compiled code also contains
+    the functions of other files that it calls, which would not be updated.
+    """
+    compiled._cache._cache_file._source_stamp = _sources()
+    return compiled
+
+
+@cache
+def _sources() -> str:
+    """Digest of the source of all modules with compiled code."""
+    root = Path(__file__).parent
+    digest = hashlib.sha256(str(INTRINSICS).encode())
+    for path in [root / "jit.py", *sorted(root.glob("*/_*kernels.py"))]:
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+@contextmanager
+def reported_compilation(call: Callable[[], None]) -> Iterator[None]:
+    """Call `call` before each kernel that is compiled instead of read from the disk, as
+    after an installation.
+    """
+
+    class Listener(event.Listener):  # type: ignore[misc]
+        def on_start(self, event: Any) -> None:  # noqa: ARG002
+            call()
+
+        def on_end(self, event: Any) -> None:
+            pass
+
+    with event.install_listener("numba:compile", Listener()):
+        yield
+
 
 # single-precision values per vector register; the width of the arrays below is a
 # multiple of it
@@ -249,3 +328,140 @@ blend = vector_blend if INTRINSICS else plain_blend
 products = vector_products if INTRINSICS else plain_products
 dots = vector_dots if INTRINSICS else plain_dots
 half = vector_half if INTRINSICS else plain_half
+
+
+def single(value: Any) -> Any:
+    """A sample in single precision; half floats are passed as their bits, see `sample_bits`."""
+    return value
+
+
+@overload(single, inline="always", strict=False)
+def _single(value: Any) -> Any:
+    if value == types.uint16:
+        return lambda value: half(value)
+    return lambda value: value
+
+
+def sample_bits(sample: NDArray[Any]) -> NDArray[Any]:
+    """Half floats as uint16 bits, because Numba has no half type; other samples in
+    single precision.
+    """
+    is_half = sample.dtype == np.float16
+    return (
+        np.ascontiguousarray(sample).view(np.uint16)
+        if is_half
+        else np.ascontiguousarray(sample, np.float32)
+    )
+
+
+@kernel
+def unpack(sample: Any, out: Any) -> None:
+    """Write the samples (lights, cameras, 3) of a surfel to `out` (lights cameras 3,)
+    in single precision.
+    """
+    flat = sample.reshape(-1)
+    for i in range(flat.shape[0]):
+        out[i] = single(flat[i])
+
+
+@fast_kernel
+def largest_finite(values: Any) -> Any:
+    """Largest finite absolute value of (n,) values in single precision; 0 if there is none."""
+    largest = np.float32(0)
+    for i in range(values.shape[0]):
+        size = abs(values[i])
+        largest = max(largest, size if size < np.inf else np.float32(0))
+    return largest
+
+
+@kernel
+def scale_to_one(values: Any) -> float:
+    """Multiply values by the power of two that brings the largest to [0.5, 1), which is
+    exact; returns the power.
+    """
+    largest = np.float64(largest_finite(values))
+    if largest <= 0.0:
+        return 1.0
+    factor = np.float32(min(math.ldexp(1.0, -math.frexp(largest)[1]), 1e38))
+    for i in range(values.shape[0]):
+        values[i] *= factor
+    return float(factor)
+
+
+# bits of +inf; the bits of non-negative floats have the order of their values
+INFINITE = np.int32(0x7F800000)
+WINDOW = np.int32(256)  # units in the last place: a relative 3e-5
+
+
+@kernel
+def median_of(values: Any, bits: Any, n: int, count: int) -> float:
+    """Median of n non-negative float32 of which `count` are finite and the others inf,
+    to a relative error of 3e-5.
+
+    `bits` is the same memory as int32. The bits are bisected by counting; values within
+    WINDOW count as equal.
+    """
+    if count == 0:
+        return 0.0
+    low = INFINITE
+    high = np.int32(0)
+    for i in range(n):
+        low = min(low, bits[i])
+        high = max(high, bits[i] if bits[i] < INFINITE else np.int32(0))
+    k = np.int32((count - 1) // 2)
+    low = np.int32(low - 1)
+    # at most k values are below or at `low`, more than k below or at `high`
+    while high - low > WINDOW:
+        middle = np.int32(low + (high - low) // 2)
+        below = np.int32(0)
+        for i in range(n):
+            below += np.int32(bits[i] <= middle)
+        if below > k:
+            high = middle
+        else:
+            low = middle
+    below = np.int32(0)
+    first = np.float32(np.inf)
+    second = np.float32(np.inf)
+    for i in range(n):
+        below += np.int32(bits[i] <= high)
+        first = min(first, values[i] if bits[i] > low else np.float32(np.inf))
+        second = min(second, values[i] if bits[i] > high else np.float32(np.inf))
+    if count % 2 or below > k + 1:
+        second = first
+    return 0.5 * (np.float64(first) + np.float64(second))
+
+
+@fast_kernel
+def _exchange(first: Any, second: Any, n: int) -> None:
+    for i in range(n):
+        a = first[i]
+        b = second[i]
+        first[i] = a if a < b else b
+        second[i] = b if a < b else a
+
+
+@kernel
+def sort_columns(x: Any, rows: int, n: int) -> None:
+    """Sort the first n columns of `x` along its first `rows` rows, all columns at once.
+
+    Batcher's merge exchange (Knuth, volume 3, algorithm 5.2.2M). Values are finite or +inf.
+    """
+    top = 1
+    while 2 * top < rows:
+        top *= 2
+    p = top
+    while p > 0 and rows > 1:
+        q = top
+        r = 0
+        d = p
+        while True:
+            for i in range(rows - d):
+                if i & p == r:
+                    _exchange(x[i], x[i + d], n)
+            if q == p:
+                break
+            d = q - p
+            q = q // 2
+            r = p
+        p //= 2

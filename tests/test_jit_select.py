@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from skindb._select_kernels import median_of, sort_columns
+from skindb.jit import median_of, sort_columns
 
 RELATIVE = 3e-5  # 256 units in the last place of single precision
 

@@ -8,13 +8,11 @@ from pathlib import Path
 
 import pytest
 
-import skindb._compiled
+import skindb.jit
 
 CALL = "from package._outer_kernels import outer; print(outer(1.0))"
-INNER = "from package._compiled import kernel\n\n@kernel\ndef inner(x):\n    return x + {}\n"
-OUTER = (
-    "from package._compiled import kernel\nfrom package._inner_kernels import inner\n\n"
-)
+INNER = "from package.jit import kernel\n\n@kernel\ndef inner(x):\n    return x + {}\n"
+OUTER = "from package.jit import kernel\nfrom package._inner_kernels import inner\n\n"
 OUTER += "@kernel\ndef outer(x):\n    return 10 * inner(x)\n"
 
 
@@ -22,7 +20,7 @@ def test_kernel__is_compiled_again_when_a_kernel_of_another_file_changes(tmp_pat
     package = tmp_path / "package"
     package.mkdir()
     (package / "__init__.py").write_text("")
-    (package / "_compiled.py").write_bytes(Path(skindb._compiled.__file__).read_bytes())
+    (package / "jit.py").write_bytes(Path(skindb.jit.__file__).read_bytes())
     (package / "_outer_kernels.py").write_text(OUTER)
 
     def printed() -> str:
@@ -57,7 +55,7 @@ def test_import__compiles_nothing():
     """
     names = ", ".join(f"skindb.{name}" for name in IMPORTED)
     code = f"""
-from skindb._compiled import reported_compilation
+from skindb.jit import reported_compilation
 from numba.core.registry import CPUDispatcher
 calls = []
 with reported_compilation(lambda: calls.append(1)):

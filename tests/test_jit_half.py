@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from skindb._half_kernels import sample_bits, unpack
+from skindb.jit import sample_bits, unpack
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32])
