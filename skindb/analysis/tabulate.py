@@ -87,8 +87,6 @@ def tabulate_study(study: xr.DataTree) -> tuple[list[str], list[list[Any]]]:
             "sigma_tr_people_fraction",
             "sigma_tr_repeat_deviation",
         ]
-        # studies of earlier versions lack some
-        names = [name for name in names if name in table]
         dims = ["group", "site", "channel"]
     elif "correlations" in study.children:
         table = study["correlations"].to_dataset()
@@ -187,10 +185,8 @@ def _vector_lengths(table: xr.Dataset) -> dict[str, xr.DataArray]:
     found: dict[str, xr.DataArray] = {}
     for name, (ds, variable, dims) in parts.items():
         for suffix, part in (("shift", variable), ("noise", f"{variable}_error")):
-            if part in ds:  # studies of earlier versions have no errors
-                found[f"{name}_{suffix}"] = (ds[part] ** 2).mean(
-                    dims, skipna=False
-                ) ** 0.5
+            square = (ds[part] ** 2).mean(dims, skipna=False)
+            found[f"{name}_{suffix}"] = square**0.5
     return found
 
 

@@ -133,11 +133,7 @@ def _sample_lines(database: Database, take: str) -> list[str]:
 def _prediction_lines(database: Database, take: str) -> list[str]:
     record = database.record("model", take)
     fit = skindb.fit
-    table = database.tables(record) if record.tables else None
-    if table is None:  # a model of an earlier version of skindb
-        table = fit.prediction_table(
-            database.read("model", take)["fitted"].to_dataset()
-        )
+    table = database.tables(record)
     lines = aligned(fit.tabulate_prediction(fit.describe_prediction(table)))
     header, sites = fit.tabulate_translucency(record.provenance)
     return [*lines, *aligned([header, *sites])] if sites else lines

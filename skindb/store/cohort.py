@@ -413,7 +413,7 @@ def _part(
             labels,
             StoredGroup(address, GROUP[layout]),
         )
-    dome_sizes, dome_labels = _dome(db, capture)
+    dome_sizes, dome_labels = _dome(capture)
     return Part(
         record.take,
         coords,
@@ -425,30 +425,22 @@ def _part(
 
 
 def _capture_of(db: Database, model: Record) -> Record | None:
-    """The capture from which a model was made; None if it no longer exists."""
+    """The capture with samples from which a model was made; None if there is none."""
     for one in model.made_from:
         if one["kind"] == "capture":
             try:
-                return db.record("capture", one["take"], one["generation"])
+                capture = db.record("capture", one["take"], one["generation"])
             except InputError:
                 return None
+            return capture if {"dome", "samples"} <= capture.contents.keys() else None
     return None
 
 
-def _dome(db: Database, capture: Record) -> tuple[dict[str, int], dict[str, list[Any]]]:
+def _dome(capture: Record) -> tuple[dict[str, int], dict[str, list[Any]]]:
     """Sizes and labels of the lights, cameras and channels of a capture."""
     contents = capture.contents
-    if "dome" in contents and "samples" in contents:
-        sizes = dict(contents["dome"]["sizes"])
-        labels = dict(contents["dome"]["labels"])
-    else:  # the record of a capture of schema version 1 does not contain them
-        dome = _group(Address.of(db, capture), "dome")
-        sizes = {str(dim): size for dim, size in dome.sizes.items()}
-        labels = {
-            str(dim): dome[dim].values.tolist()
-            for dim in dome.dims
-            if dim in dome.coords
-        }
+    sizes = contents["dome"]["sizes"]
+    labels = contents["dome"]["labels"]
     dims = ("light", "camera", "channel", "xyz")
     return {d: sizes[d] for d in dims if d in sizes}, {
         d: labels[d] for d in dims if d in labels

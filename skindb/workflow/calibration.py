@@ -154,16 +154,14 @@ def describe_calibration(db: Database, record: Record) -> dict[str, Any]:
         "lights": now.sizes["light"],
         "largest_relative_error": float(relative.max()),
     }
-    if "glare_fraction" in now:  # calibrations of earlier versions have none
-        position = now["calibrated_intensity_position_error"]
-        glare = now["glare_fraction"]
-        about |= {
-            "position_error": float(position.median()),
-            "glare": float(glare.median()),
-        }
-        about["total_relative_error"] = float(
-            np.sqrt(relative**2 + position**2 + glare**2).max()
-        )
+    position = now["calibrated_intensity_position_error"]
+    glare = now["glare_fraction"]
+    total = np.sqrt(relative**2 + position**2 + glare**2)
+    about |= {
+        "position_error": float(position.median()),
+        "glare": float(glare.median()),
+        "total_relative_error": float(total.max()),
+    }
     if record.generation > 1:
         before = db.read(CALIBRATION, record.take, generation=record.generation - 1)[
             "light_calibration"
