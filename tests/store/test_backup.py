@@ -484,11 +484,9 @@ def test_backup__of_hostile_names(tmp_path, dest):
     db = Database(tmp_path / "db")
     _fill(db.url, NAMES)
     db.backup(str(dest))
-    names = {
-        path.name
-        for path in dest.rglob("*")
-        if path.name not in ("files", "states", "secret", "withdrawn")
-    }
+    # folders below `files` are called as digests begin, by chance "43"
+    fixed = (dest, dest / "files")
+    names = {path.name for path in dest.rglob("*") if path.parent not in fixed}
     # names of folders of its lease
     assert not names & ({*NAMES} - {"backup", "release"})
     assert _state(_restored(db, dest, tmp_path / "all").root) == _state(db.root)
