@@ -76,7 +76,7 @@ def _sources() -> str:
     """Digest of the source of all modules with compiled code."""
     root = Path(__file__).parent
     digest = hashlib.sha256(str(INTRINSICS).encode())
-    for path in [root / "jit.py", *sorted(root.glob("*/_*kernels.py"))]:
+    for path in [root / "jit.py", *sorted(root.rglob("_*_kernels.py"))]:
         digest.update(path.read_bytes())
     return digest.hexdigest()
 
