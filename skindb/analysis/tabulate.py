@@ -87,6 +87,7 @@ def tabulate_study(study: xr.DataTree) -> tuple[list[str], list[list[Any]]]:
             "sigma_tr_people_fraction",
             "sigma_tr_repeat_deviation",
         ]
+        names = [name for name in names if name in table]
         dims = ["group", "site", "channel"]
     elif "correlations" in study.children:
         table = study["correlations"].to_dataset()
@@ -185,8 +186,9 @@ def _vector_lengths(table: xr.Dataset) -> dict[str, xr.DataArray]:
     found: dict[str, xr.DataArray] = {}
     for name, (ds, variable, dims) in parts.items():
         for suffix, part in (("shift", variable), ("noise", f"{variable}_error")):
-            square = (ds[part] ** 2).mean(dims, skipna=False)
-            found[f"{name}_{suffix}"] = square**0.5
+            if part in ds:
+                square = (ds[part] ** 2).mean(dims, skipna=False)
+                found[f"{name}_{suffix}"] = square**0.5
     return found
 
 
