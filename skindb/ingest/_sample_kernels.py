@@ -20,11 +20,9 @@ SINGLE = 3
 NONE = 4
 NAN_BITS = np.uint16(0x7E00)  # the half float NaN
 MAX_HALF_FLOAT = 65504.0  # larger numbers are infinite in half precision
-MIN_DARK_FRACTION = (
-    # fraction of dark pixels above which a sample is dark; the rest allows for rounding
-    # in the sum of weights
-    0.999
-)
+# fraction of dark pixels above which a sample is dark; the rest allows for rounding in
+# the sum of weights
+MIN_DARK_FRACTION = 0.999
 # end of the weight (1 - q / FOOTPRINT_REACH)^2, whose second moments are those of a
 # Gaussian
 FOOTPRINT_REACH = 8.0
@@ -33,11 +31,9 @@ MIN_VARIANCE = np.float32(1e-30)
 ZERO = np.float32(0.0)
 ONE = np.float32(1.0)
 ENDLESS = np.float32(np.inf)
-NO_USABLE_EXPOSURE = np.float32(
-    100.0
-    # marks a channel that was saturated in every exposure; larger than any number of
-    # exposures
-)
+# marks a channel that was saturated in every exposure; larger than any number of
+# exposures
+NO_USABLE_EXPOSURE = np.float32(100.0)
 
 
 @kernel
