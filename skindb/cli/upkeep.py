@@ -134,6 +134,10 @@ def _prediction_lines(database: Database, take: str) -> list[str]:
     record = database.record("model", take)
     fit = skindb.fit
     table = database.tables(record)
+    if not table:  # committed by a program of its own, without tables
+        table = fit.prediction_table(
+            database.read("model", take)["fitted"].to_dataset()
+        )
     lines = aligned(fit.tabulate_prediction(fit.describe_prediction(table)))
     header, sites = fit.tabulate_translucency(record.provenance)
     return [*lines, *aligned([header, *sites])] if sites else lines
