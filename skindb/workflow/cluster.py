@@ -24,7 +24,7 @@ from skindb.elementwise import thread_count
 from skindb.errors import Fault, InputError
 from skindb.files import make_private, private_file
 from skindb.threads import one_blas_thread
-from skindb.workflow.source import method_digest
+from skindb.workflow.code_digest import package_digest
 
 if TYPE_CHECKING:
     from distributed import Client, Future, Worker
@@ -49,7 +49,7 @@ class Expected:
 
     def require(self, worker: str) -> None:
         """Raise an `InputError` if this process, which is the named worker, has something else."""
-        if (self.version, self.code) != (__version__, method_digest()):
+        if (self.version, self.code) != (__version__, package_digest()):
             rule = f"must run the same skindb as this process ({self.version})"
             found = f"version {__version__}"
             found += "" if __version__ != self.version else " with other source code"
@@ -143,7 +143,7 @@ def computing_on(client: Client | None, shared: Path | None = None) -> Iterator[
         yield
         return
     with shared_token(shared) as token:
-        _require_workers(client, Expected(__version__, method_digest(), token))
+        _require_workers(client, Expected(__version__, package_digest(), token))
     limited = f"skindb-{uuid.uuid4().hex}"
     client.run(_limit_blas, limited)
     try:
@@ -254,7 +254,7 @@ def calls_on_cluster(
     from distributed import KilledWorker
 
     with shared_token(shared) as token:
-        expected = Expected(__version__, method_digest(), token)
+        expected = Expected(__version__, package_digest(), token)
         message = bytes(cloudpickle.dumps((expected, call)))
         # their workers were killed, perhaps by a take beside them: each is tried again
         # alone

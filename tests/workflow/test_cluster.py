@@ -20,7 +20,7 @@ import pytest
 from skindb.errors import InputError
 from skindb.workflow import connected, map_takes
 from skindb.workflow.cluster import Expected, shared_token
-from skindb.workflow.source import method_digest
+from skindb.workflow.code_digest import package_digest
 
 pytestmark = pytest.mark.slow
 
@@ -156,7 +156,7 @@ def _wait_briefly() -> None:
 def test_map_takes__workers_with_another_skindb_end_the_run(address, monkeypatch):
     with connected(address) as client:
         monkeypatch.setattr(
-            "skindb.workflow.cluster.method_digest", lambda: "of other files"
+            "skindb.workflow.cluster.package_digest", lambda: "of other files"
         )
         with pytest.raises(
             InputError,
@@ -170,16 +170,16 @@ def test_expected__names_the_other_version_and_the_folder_that_is_not_shared(tmp
         InputError,
         match=r"worker w: must run the same skindb as this process \(9\.9\); found version",
     ):
-        Expected("9.9", method_digest(), "").require("w")
+        Expected("9.9", package_digest(), "").require("w")
     from skindb import __version__
 
     with shared_token(tmp_path / "db") as token:
-        Expected(__version__, method_digest(), token).require("w")
+        Expected(__version__, package_digest(), token).require("w")
     with pytest.raises(
         InputError,
         match=r"must see the database .*/db; found no such folder, or another one",
     ):
-        Expected(__version__, method_digest(), token).require("w")
+        Expected(__version__, package_digest(), token).require("w")
 
 
 def test_map_takes__workers_see_the_shared_folder_while_they_work(address, tmp_path):
