@@ -9,16 +9,9 @@ import xarray as xr
 
 from skindb.geometry.texture import atlas_values, push_pull, rasterise_atlas
 from skindb.render.texels import surfel_texels, texel_codes
-from skindb.schema import TexelStatus, dataset
+from skindb.schema import TexelStatus, Use, dataset, names_of
 
 SIZE = 512  # texels along each side of the stored maps of a registration
-# variable of the surfels -> variable of the map
-MAPPED = {
-    "diffuse_reflectance": "texel_diffuse_reflectance",
-    "diffuse_reflectance_total_error": "texel_diffuse_reflectance_total_error",
-    "surface_reflectance": "texel_surface_reflectance",
-    "sigma_tr": "texel_sigma_tr",
-}
 
 
 def common_maps(
@@ -53,7 +46,7 @@ def common_maps(
     outside = status == TexelStatus.OUTSIDE
     maps: dict[str, np.ndarray] = {}
     coverage = np.zeros((size, size), np.float32)
-    for name, target in MAPPED.items():
+    for name in names_of(Use.MAPPED):
         if name not in fitted:
             continue
         values = fitted[name].values.reshape(len(codes), -1).astype(np.float32)
@@ -65,7 +58,7 @@ def common_maps(
             push_pull(image, found)[0] if trust.any() else np.full_like(image, np.nan)
         )
         filled = np.where(outside[..., None], np.float32(np.nan), filled)
-        maps[target] = filled if fitted[name].ndim == 2 else filled[..., 0]
+        maps[f"texel_{name}"] = filled if fitted[name].ndim == 2 else filled[..., 0]
         if name == "diffuse_reflectance":
             coverage = np.where(outside, np.float32(0), found)
     if "even_reflection_limit" in fitted:

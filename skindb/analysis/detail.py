@@ -11,7 +11,7 @@ import xarray as xr
 from scipy.ndimage import gaussian_filter
 
 from skindb.analysis.common_maps import common_maps
-from skindb.analysis.edit import KEPT, KEPT_ATTRS, with_albedo
+from skindb.analysis.edit import KEPT_ATTRS, surviving, with_albedo
 from skindb.analysis.masks import region_masks
 from skindb.analysis.texture import SIZE, common_landmarks, log_albedo
 from skindb.analysis.texture_edit import at_surfels
@@ -117,7 +117,7 @@ def transfer_detail(
         fitted, colour * np.exp(at_surfels(change, registered["common_uv"].values))
     )
     tree = model.copy()
-    tree["fitted"] = xr.DataTree(moved[[name for name in KEPT if name in moved]])
+    tree["fitted"] = xr.DataTree(surviving(moved))
     named = region if isinstance(region, str) else "mask"
     edited = {
         "detail": str(source.attrs.get("take", "")),

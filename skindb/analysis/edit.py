@@ -17,7 +17,7 @@ from skindb.errors import Fault, InputError
 from skindb.numerics.texture import valid_quantiles
 from skindb.optics.brdf_table import TableGrid, brdf_metric
 from skindb.optics.diffuse import dipole_s
-from skindb.schema import GROUPS, check, dataset, label
+from skindb.schema import GROUPS, Use, check, dataset, label, names_of
 from skindb.schema.brdf import brdf_coords, stored_brdf
 from skindb.schema.consent import honour_consent
 from skindb.schema.regions import FACE
@@ -31,26 +31,8 @@ BRIGHTEST = 0.999
 SIGMA_TR_RANGE = (1e-2, 1e2)
 # of a trait vector; the exponential of a larger shift of log sigma_tr may overflow
 MAX_AMOUNT = 100.0
-# variables that an edit changes or that stay valid; errors, residuals and weights
-# belong to the unedited model
-KEPT = (
-    "surfel_position",
-    "surfel_normal",
-    "surfel_area",
-    "surfel_uv",
-    "region_mask",
-    "shading_normal",
-    "fit_status",
-    "diffuse_reflectance",
-    "dipole_s",
-    "basis_weight",
-    "sigma_tr",
-    "refractive_index",
-)
 KEPT_ATTRS = ("subject", "condition", "session", "traits", "consent_scope", "take")
 PROBED = "probe"  # measurements of the unedited skin
-# what rendering and export need of a site
-KEPT_SITES = ("site_sigma_tr", "site_position", "site_status")
 MIN_REPORTED = 1e-3  # fraction of a change above which an omission is reported
 TEXTURE_SHIFT = "trait_texture_shift"  # only where takes are registered
 ONE_SUBJECT = "unknown: only one subject"
@@ -178,7 +160,7 @@ def apply_traits(
             tree["translucency"] = xr.DataTree(
                 _moved_sites(tree["translucency"].to_dataset().load(), amount, traits)
             )
-    tree["fitted"] = xr.DataTree(fitted[[name for name in KEPT if name in fitted]])
+    tree["fitted"] = xr.DataTree(surviving(fitted))
     kept = {name: model.attrs[name] for name in KEPT_ATTRS if name in model.attrs}
     far = max(moves, default=0.0)
     used = [str(traits["trait"].values[i]) for i in np.flatnonzero(amount)]
@@ -300,7 +282,7 @@ def with_basis(
         {"dictionary": list(names)},
     )
     tree["basis"] = xr.DataTree(_common_basis(model, basis, tables))
-    tree["fitted"] = xr.DataTree(fitted[[name for name in KEPT if name in fitted]])
+    tree["fitted"] = xr.DataTree(surviving(fitted))
     tree.attrs = {name: model.attrs[name] for name in KEPT_ATTRS if name in model.attrs}
     return tree
 
@@ -449,6 +431,13 @@ def _moved_translucency(
     return fitted.assign(sigma_tr=label("sigma_tr", np.exp(after))), report, move
 
 
+def surviving(ds: xr.Dataset) -> xr.Dataset:
+    """The variables that an edit changes or that stay valid; errors, residuals and
+    weights belong to the unedited model.
+    """
+    return ds[[name for name in names_of(Use.SURVIVES_EDIT) if name in ds]]
+
+
 def _moved_sites(sites: xr.Dataset, amount: Array, traits: xr.Dataset) -> xr.Dataset:
     """Probe sites with sigma_tr scaled like the map; errors are omitted, as they do not
     include those of the vector.
@@ -457,7 +446,7 @@ def _moved_sites(sites: xr.Dataset, amount: Array, traits: xr.Dataset) -> xr.Dat
     moved = np.clip(
         sites["site_sigma_tr"].values.astype(np.float64) * np.exp(log), *SIGMA_TR_RANGE
     )
-    kept = sites[[name for name in KEPT_SITES if name in sites]].drop_attrs(deep=False)
+    kept = surviving(sites).drop_attrs(deep=False)
     return kept.assign(site_sigma_tr=label("site_sigma_tr", moved))
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from skindb.analysis.masks import own_masks
 from skindb.errors import Fault, InputError
-from skindb.schema import FitStatus, dataset
+from skindb.schema import FitStatus, Use, dataset, names_of
 from skindb.schema.cohort import Held, combine, take_coords
 from skindb.schema.consent import consent_scope
 from skindb.schema.notes import note
@@ -25,45 +25,6 @@ from skindb.types import Array, Mask
 # of one subject
 SAMPLED = 5000
 STREAM = 7  # random stream of the sample
-# variables of the group "fitted" that a sample keeps
-KEPT = (
-    "surfel_position",
-    "surfel_uv",
-    "surfel_area",
-    "region_mask",
-    "shading_normal",
-    "normal_error",
-    "diffuse_reflectance",
-    "diffuse_reflectance_error",
-    "diffuse_reflectance_total_error",
-    "dictionary_weight",
-    "basis_weight",
-    "basis_weight_error",
-    "surface_reflectance",
-    "surface_reflectance_error",
-    "sigma_tr",
-    "fit_residual",
-    "fit_residual_perceptual",
-    "held_out_error",
-    "held_out_camera_error",
-    "outlier_fraction",
-)
-SITES = (
-    "site_sigma_tr",
-    "site_sigma_tr_error",
-    "site_sigma_tr_model_error",
-    "site_sigma_tr_total_error",
-    "site_status",
-)
-MEASURES = (
-    "dictionary_residual",
-    "fit_residual",
-    "fit_residual_perceptual",
-    "held_out_error",
-    "held_out_error_perceptual",
-    "held_out_camera_error",
-    "held_out_camera_error_perceptual",
-)
 
 
 def sample_surfels(
@@ -100,7 +61,7 @@ def sample_surfels(
     order = np.argsort(drawn)
     # read in the order of storage, then reorder as drawn
     sample = (
-        fitted[[name for name in KEPT if name in fitted]]
+        fitted[[name for name in names_of(Use.SAMPLED) if name in fitted]]
         .isel(surfel=drawn[order])
         .load()
     )
@@ -135,7 +96,9 @@ def summary_tables(model: xr.DataTree) -> xr.Dataset:
     ]
     if "translucency" in model.children:
         sites = model["translucency"].to_dataset()
-        parts.append(sites[[name for name in SITES if name in sites]].load())
+        parts.append(
+            sites[[name for name in names_of(Use.SAMPLED) if name in sites]].load()
+        )
     return xr.merge(
         parts, combine_attrs="override", join="outer", compat="no_conflicts"
     )
@@ -267,7 +230,7 @@ def _basis_tables(model: xr.DataTree, fitted: xr.Dataset) -> xr.Dataset:
 def _median_errors(fitted: xr.Dataset) -> xr.Dataset:
     """Medians over the surfels of the residuals and of the errors at held-out samples."""
     found = {}
-    for name in MEASURES:
+    for name in names_of(Use.MEDIAN):
         values = fitted[name].values if name in fitted else np.zeros(0)
         known = values[np.isfinite(values)]
         found[name] = float(np.median(known)) if known.size else np.nan

@@ -30,7 +30,7 @@ from skindb.optics.dictionary import Dictionary
 from skindb.optics.merl import write_merl
 from skindb.optics.table_file import write_tables
 from skindb.render.image import write_exr
-from skindb.schema import VARIABLES, FitStatus, ProbeStatus
+from skindb.schema import VARIABLES, FitStatus, ProbeStatus, Use, names_of
 from skindb.schema.brdf import kernel_tables
 from skindb.schema.consent import require_consent
 from skindb.schema.plain import plain
@@ -55,19 +55,6 @@ PROVENANCE = (
     "generation",
     "edit",
     "edit_distance",
-)
-ERRORS = (
-    "fit_residual",
-    "fit_residual_perceptual",
-    "dictionary_residual",
-    "held_out_error",
-    "held_out_camera_error",
-    "kkt_residual",
-    "normal_disagreement",
-    "diffuse_reflectance_error",
-    "diffuse_reflectance_total_error",
-    "normal_total_error",
-    "surface_reflectance_error",
 )
 # standard_error is from the errors of the fibres; total_error includes the error of the
 # model of the profile
@@ -374,7 +361,7 @@ def _errors(fitted: xr.Dataset) -> dict[str, Any]:
         for member in FitStatus
         if (status == member).any()
     }
-    for name in ERRORS:
+    for name in names_of(Use.EXPORTED):
         if name not in fitted:
             continue
         values = fitted[name].values

@@ -15,7 +15,7 @@ from skindb.errors import Fault, InputError
 from skindb.fit._clock import Clock
 from skindb.fit.albedo import estimate_diffuse_reflectance
 from skindb.fit.basis import reduce_basis
-from skindb.fit.held_out import ERRORS, fitted_part, hold_out
+from skindb.fit.held_out import fitted_part, hold_out
 from skindb.fit.inter_reflection import bounced_light, without_bounce
 from skindb.fit.light_gains import (
     divided_by_gains,
@@ -33,23 +33,12 @@ from skindb.fit.surface import fit_surface
 from skindb.fit.translucency import fit_probe, summarise_translucency, translucency_map
 from skindb.numerics.nnls import Mode
 from skindb.optics.dictionary import Dictionary, disc_dictionary, embedded_dictionary
-from skindb.schema import FitStatus, label
+from skindb.schema import FitStatus, Use, label, names_of
 from skindb.schema.consent import honour_consent
 from skindb.types import Progress
 
-COPIED = ("surfel_position", "surfel_normal", "surfel_area", "surfel_uv", "region_mask")
 COPIED_GROUPS = ("mesh", "dome", "probe")
 KEPT_ATTRS = ("subject", "condition", "session", "traits", "consent_scope", "take")
-REPORTED = (
-    "dictionary_residual",
-    "fit_residual",
-    "fit_residual_perceptual",
-    "kkt_residual",
-    *ERRORS["light"],
-    *ERRORS["camera"],
-    "outlier_fraction",
-    "normal_disagreement",
-)
 
 
 def fit_model(
@@ -327,7 +316,7 @@ def _groups(
     """
     surfels = capture["surfels"].to_dataset()
     fitted = fitted.merge(
-        surfels[[name for name in COPIED if name in surfels]].compute()
+        surfels[[name for name in names_of(Use.COPIED) if name in surfels]].compute()
     )
     copied = {
         name: capture[name].to_dataset().compute()
@@ -377,7 +366,7 @@ def _report(fitted: xr.Dataset, held_out: xr.Dataset) -> dict[str, Any]:
         if (status == m).any()
     }
     report: dict[str, Any] = {"surfels": int(status.size), "status": fractions}
-    for name in REPORTED:
+    for name in names_of(Use.REPORTED):
         finite = (
             fitted[name].values[skin & np.isfinite(fitted[name].values)]
             if name in fitted

@@ -1,7 +1,7 @@
 """Every stored variable, declared once: name, dims, dtype, units, one sentence, source."""
 
 from skindb.schema.check import check
-from skindb.schema.declaration import Variable
+from skindb.schema.declaration import Use, Variable, names_of
 from skindb.schema.label import dataset, label, text_labels
 from skindb.schema.notes import note_lines
 from skindb.schema.status import (
@@ -23,11 +23,13 @@ __all__ = [
     "FitStatus",
     "ProbeStatus",
     "TexelStatus",
+    "Use",
     "Variable",
     "check",
     "dataset",
     "flag_attrs",
     "label",
+    "names_of",
     "note_lines",
     "text_labels",
 ]

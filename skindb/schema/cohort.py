@@ -17,18 +17,9 @@ from numpy.typing import NDArray
 from skindb.errors import Fault, InputError
 from skindb.schema.label import label, text_labels
 from skindb.schema.notes import note
-from skindb.schema.status import ProbeStatus, TexelStatus
 from skindb.schema.variables import VARIABLES
 
 TAKE = "take"
-# what stands where a take has no such label; NaN for other floating-point variables, 0
-# for other integers
-ABSENT: dict[str, int] = {
-    "site_status": ProbeStatus.NOT_MEASURED,
-    "texel_status": TexelStatus.OUTSIDE,
-    "surfel_index": -1,
-    "region_mask": -1,
-}
 COMPARED = (
     "k",
     "mode",
@@ -399,5 +390,6 @@ def _block(
 
 
 def _absent(name: str, shape: tuple[int, ...]) -> NDArray[Any]:
-    dtype = np.dtype(VARIABLES[name].dtype)
-    return np.full(shape, ABSENT.get(name, 0) if dtype.kind in "iu" else np.nan, dtype)
+    spec = VARIABLES[name]
+    dtype = np.dtype(spec.dtype)
+    return np.full(shape, spec.absent if dtype.kind in "iu" else np.nan, dtype)

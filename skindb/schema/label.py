@@ -8,21 +8,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from skindb.schema.status import (
-    Explained,
-    FitStatus,
-    ProbeStatus,
-    TexelStatus,
-    flag_attrs,
-)
+from skindb.schema.status import flag_attrs
 from skindb.schema.variables import VARIABLES
-
-# variable -> the enumeration its values are of
-STATUSES: dict[str, type[Explained]] = {
-    "fit_status": FitStatus,
-    "site_status": ProbeStatus,
-    "texel_status": TexelStatus,
-}
 
 
 def label(name: str, data: Any) -> xr.Variable:
@@ -35,8 +22,8 @@ def label(name: str, data: Any) -> xr.Variable:
         "long_name": spec.doc,
         "source": spec.source,
     }
-    if name in STATUSES:
-        attrs |= flag_attrs(STATUSES[name])
+    if spec.statuses is not None:
+        attrs |= flag_attrs(spec.statuses)
     array = data if hasattr(data, "dask") else np.asarray(data)
     return xr.Variable(spec.dims, array.astype(spec.dtype, copy=False), attrs)
 

@@ -1,16 +1,20 @@
-"""The one list of stored variables."""
+"""The names of all stored variables as constants, and their declarations.
+
+Code refers to a stored variable as ``variables.DIFFUSE_REFLECTANCE``.
+"""
 
 from __future__ import annotations
 
-from skindb.schema.captures import CAPTURES
-from skindb.schema.declaration import Variable
-from skindb.schema.models import MODELS
-from skindb.schema.studies import STUDIES
+from skindb.schema.captures import *  # noqa: F403
+from skindb.schema.declaration import DECLARED, Variable
+from skindb.schema.models import *  # noqa: F403
+from skindb.schema.studies import *  # noqa: F403
 
 SCHEMA_VERSION = 2
 
+VARIABLES: dict[str, Variable] = DECLARED
 # group of a version -> its variables
-GROUPS: dict[str, tuple[Variable, ...]] = CAPTURES | MODELS | STUDIES
-VARIABLES: dict[str, Variable] = {
-    variable.name: variable for group in GROUPS.values() for variable in group
+GROUPS: dict[str, tuple[Variable, ...]] = {
+    group: tuple(declared for declared in VARIABLES.values() if declared.group == group)
+    for group in dict.fromkeys(declared.group for declared in VARIABLES.values())
 }

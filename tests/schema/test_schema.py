@@ -14,9 +14,13 @@ from skindb.schema import (
     FitStatus,
     ProbeStatus,
     TexelStatus,
+    Use,
     check,
     dataset,
+    names_of,
+    variables,
 )
+from skindb.schema.declaration import DECLARED, declare
 
 DIMS = set(
     "surfel face light camera channel channel_2 site fibre dictionary parameter "
@@ -33,6 +37,37 @@ def test_variables__declared_once_with_known_dims():
     assert sum(map(len, GROUPS.values())) == len(VARIABLES)
     assert {dim for v in VARIABLES.values() for dim in v.dims} <= DIMS
     assert all(v.doc and v.units and np.dtype(v.dtype) for v in VARIABLES.values())
+    for name in VARIABLES:  # each has its constant
+        assert getattr(variables, name.upper()) == name
+
+
+@pytest.mark.parametrize(
+    ("header", "rule"),
+    [
+        ("float32 fitted/gloss(surfel)", "is declared as"),
+        ("float32 gloss(surfel) [1]", "is declared as"),
+        ("float32 fitted/fit_status(surfel) [1]", "declared twice"),
+    ],
+)
+def test_declare__header(header, rule):
+    with pytest.raises(ValueError, match=rule):
+        declare(header, "gloss of a surfel")
+
+
+def test_declare__returns_the_name():
+    header = "float32 fitted/gloss(surfel, channel) [sr-1]"
+    try:
+        assert declare(header, "gloss of a surfel", uses=Use.MAPPED) == "gloss"
+        assert DECLARED["gloss"].dims == ("surfel", "channel")
+        assert DECLARED["gloss"].units == "sr-1"
+        assert names_of(Use.MAPPED)[-1] == "gloss"
+    finally:
+        del DECLARED["gloss"]
+
+
+def test_names_of__maps_of_registered_takes_are_declared():
+    for name in names_of(Use.MAPPED):
+        assert VARIABLES[f"texel_{name}"].dims[:2] == ("v", "u")
 
 
 def test_check__every_fault_at_once():
