@@ -26,6 +26,8 @@ from numba.core import cgutils, event
 from numba.extending import intrinsic, overload
 from numpy.typing import NDArray
 
+from skindb.types import IntVector32, Matrix32, Vector32
+
 # sums may be reordered and products fused; NaN and inf keep their meaning
 # (`fastmath=True` would drop tests for them)
 FAST = {"reassoc", "contract", "arcp", "nsz", "afn"}
@@ -107,9 +109,9 @@ FUSED = ("contract",)  # a product and a sum may be one instruction
 
 
 def _load(builder: Any, pointer: Any) -> Any:
-    found = builder.load(builder.bitcast(pointer, VECTOR.as_pointer()))
-    found.align = 4
-    return found
+    vector = builder.load(builder.bitcast(pointer, VECTOR.as_pointer()))
+    vector.align = 4
+    return vector
 
 
 def _store(builder: Any, value: Any, pointer: Any) -> None:
@@ -120,8 +122,8 @@ def _spread(builder: Any, value: Any) -> Any:
     """A vector with one value in all lanes."""
     lanes = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
     empty = ir.Constant(VECTOR, ir.Undefined)
-    first = builder.insert_element(empty, value, ir.Constant(ir.IntType(32), 0))
-    return builder.shuffle_vector(first, empty, lanes)
+    lane = builder.insert_element(empty, value, ir.Constant(ir.IntType(32), 0))
+    return builder.shuffle_vector(lane, empty, lanes)
 
 
 @intrinsic
@@ -147,17 +149,17 @@ def vector_blend(
         ]
         begin = builder.mul(arguments[4], width)
         with cgutils.for_range(builder, builder.udiv(width, STEP)) as loop:
-            at = builder.mul(loop.index, STEP)
+            offset = builder.mul(loop.index, STEP)
             total = None
             for start, factor in zip(starts, factors, strict=True):
-                value = _load(
-                    builder, builder.gep(source.data, [builder.add(start, at)])
-                )
+                position = builder.add(start, offset)
+                value = _load(builder, builder.gep(source.data, [position]))
                 part = builder.fmul(value, factor, flags=FUSED)
                 total = (
                     part if total is None else builder.fadd(total, part, flags=FUSED)
                 )
-            _store(builder, total, builder.gep(out.data, [builder.add(begin, at)]))
+            position = builder.add(begin, offset)
+            _store(builder, total, builder.gep(out.data, [position]))
         return context.get_dummy_value()
 
     return types.void(table, places, weights, rows, row), codegen
@@ -168,7 +170,7 @@ def vector_products(
     _typing: Any,
     rows: Any,
     weight: Any,
-    given: Any,
+    target: Any,
     left: Any,
     right: Any,
     begin: Any,
@@ -178,14 +180,14 @@ def vector_products(
     """Sums over rows i from begin to end, all float32, out (9, 8).
 
     out[k, j] is that of weight[i] rows[i, left + k] rows[i, right + j], out[8, j] that
-    of given[i] rows[i, right + j].
+    of target[i] rows[i, right + j].
     """
 
     def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        source = context.make_array(signature.args[0])(context, builder, arguments[0])
-        scale = context.make_array(signature.args[1])(context, builder, arguments[1])
-        aim = context.make_array(signature.args[2])(context, builder, arguments[2])
-        target = context.make_array(signature.args[7])(context, builder, arguments[7])
+        source, scale, aim, destination = (
+            context.make_array(signature.args[k])(context, builder, arguments[k])
+            for k in (0, 1, 2, 7)
+        )
         width = cgutils.unpack_tuple(builder, source.shape, 2)[1]
         left, right, begin, end = arguments[3:7]
         sums = [cgutils.alloca_once(builder, VECTOR) for _ in range(LANES + 1)]
@@ -195,33 +197,29 @@ def vector_products(
             builder, begin, end, ir.Constant(ir.IntType(64), 1)
         ) as (row, _):
             start = builder.mul(row, width)
-            across = _load(
-                builder, builder.gep(source.data, [builder.add(start, right)])
-            )
-            weighted = builder.fmul(
-                across, _spread(builder, builder.load(builder.gep(scale.data, [row])))
-            )
+            position = builder.add(start, right)
+            across = _load(builder, builder.gep(source.data, [position]))
+            row_weight = builder.load(builder.gep(scale.data, [row]))
+            weighted = builder.fmul(across, _spread(builder, row_weight))
             lane = builder.add(start, left)
-            ones = [
-                builder.gep(
-                    source.data, [builder.add(lane, ir.Constant(ir.IntType(64), k))]
-                )
-                for k in range(LANES)
-            ]
-            for k, place in enumerate([*ones, builder.gep(aim.data, [row])]):
-                factor = _spread(builder, builder.load(place))
-                part = builder.fmul(
-                    factor, weighted if k < LANES else across, flags=FUSED
-                )
-                builder.store(
-                    builder.fadd(builder.load(sums[k]), part, flags=FUSED), sums[k]
-                )
+            for k, total in enumerate(sums):
+                if k < LANES:
+                    column = builder.add(lane, ir.Constant(ir.IntType(64), k))
+                    pointer = builder.gep(source.data, [column])
+                else:
+                    pointer = builder.gep(aim.data, [row])
+                factor = _spread(builder, builder.load(pointer))
+                step = weighted if k < LANES else across
+                part = builder.fmul(factor, step, flags=FUSED)
+                added = builder.fadd(builder.load(total), part, flags=FUSED)
+                builder.store(added, total)
         for k, total in enumerate(sums):
-            place = builder.gep(target.data, [ir.Constant(ir.IntType(64), k * LANES)])
-            _store(builder, builder.load(total), place)
+            start = ir.Constant(ir.IntType(64), k * LANES)
+            pointer = builder.gep(destination.data, [start])
+            _store(builder, builder.load(total), pointer)
         return context.get_dummy_value()
 
-    return types.void(rows, weight, given, left, right, begin, end, out), codegen
+    return types.void(rows, weight, target, left, right, begin, end, out), codegen
 
 
 @intrinsic
@@ -243,19 +241,18 @@ def vector_dots(_typing: Any, rows: Any, factors: Any, count: Any, out: Any) -> 
             start = builder.mul(rows_loop.index, width)
             builder.store(ir.Constant(VECTOR, [0.0] * LANES), total)
             with cgutils.for_range(builder, builder.udiv(width, STEP)) as loop:
-                at = builder.mul(loop.index, STEP)
-                row = _load(builder, builder.gep(source.data, [builder.add(start, at)]))
-                part = builder.fmul(
-                    row, _load(builder, builder.gep(other.data, [at])), flags=FUSED
-                )
-                builder.store(
-                    builder.fadd(builder.load(total), part, flags=FUSED), total
-                )
+                offset = builder.mul(loop.index, STEP)
+                position = builder.add(start, offset)
+                row = _load(builder, builder.gep(source.data, [position]))
+                factor = _load(builder, builder.gep(other.data, [offset]))
+                part = builder.fmul(row, factor, flags=FUSED)
+                added = builder.fadd(builder.load(total), part, flags=FUSED)
+                builder.store(added, total)
             zero = ir.Constant(ir.FloatType(), 0.0)
-            found = builder.call(
+            dot = builder.call(
                 reduce, [zero, builder.load(total)], fastmath=("reassoc",)
             )
-            builder.store(found, builder.gep(target.data, [rows_loop.index]))
+            builder.store(dot, builder.gep(target.data, [rows_loop.index]))
         return context.get_dummy_value()
 
     return types.void(rows, factors, count, out), codegen
@@ -274,7 +271,13 @@ def vector_half(_typing: Any, bits: Any) -> Any:
 
 
 @inline_fast_kernel
-def plain_blend(table: Any, places: Any, weights: Any, rows: Any, row: Any) -> None:
+def plain_blend(
+    table: Matrix32,
+    places: tuple[int, ...],
+    weights: tuple[float, ...],
+    rows: Matrix32,
+    row: int,
+) -> None:
     """`vector_blend` as loops."""
     width = rows.shape[1]
     flat = table.reshape(-1)
@@ -288,14 +291,14 @@ def plain_blend(table: Any, places: Any, weights: Any, rows: Any, row: Any) -> N
 
 @kernel
 def plain_products(
-    rows: Any,
-    weight: Any,
-    given: Any,
-    left: Any,
-    right: Any,
-    begin: Any,
-    end: Any,
-    out: Any,
+    rows: Matrix32,
+    weight: Vector32,
+    target: Vector32,
+    left: int,
+    right: int,
+    begin: int,
+    end: int,
+    out: Matrix32,
 ) -> None:
     """`vector_products` as loops."""
     out[:] = np.float32(0)
@@ -304,11 +307,11 @@ def plain_products(
             weighted = rows[i, right + j] * weight[i]
             for k in range(LANES):
                 out[k, j] += rows[i, left + k] * weighted
-            out[LANES, j] += given[i] * rows[i, right + j]
+            out[LANES, j] += target[i] * rows[i, right + j]
 
 
 @kernel
-def plain_dots(rows: Any, factors: Any, count: Any, out: Any) -> None:
+def plain_dots(rows: Matrix32, factors: Vector32, count: int, out: Vector32) -> None:
     """`vector_dots` as loops."""
     for i in range(count):
         total = np.float32(0)
@@ -346,16 +349,13 @@ def sample_bits(sample: NDArray[Any]) -> NDArray[Any]:
     """Half floats as uint16 bits, because Numba has no half type; other samples in
     single precision.
     """
-    is_half = sample.dtype == np.float16
-    return (
-        np.ascontiguousarray(sample).view(np.uint16)
-        if is_half
-        else np.ascontiguousarray(sample, np.float32)
-    )
+    if sample.dtype == np.float16:
+        return np.ascontiguousarray(sample).view(np.uint16)
+    return np.ascontiguousarray(sample, np.float32)
 
 
 @kernel
-def unpack(sample: Any, out: Any) -> None:
+def unpack(sample: NDArray[Any], out: Vector32) -> None:
     """Write the samples (lights, cameras, 3) of a surfel to `out` (lights cameras 3,)
     in single precision.
     """
@@ -365,7 +365,7 @@ def unpack(sample: Any, out: Any) -> None:
 
 
 @fast_kernel
-def largest_finite(values: Any) -> Any:
+def largest_finite(values: Vector32) -> np.float32:
     """Largest finite absolute value of (n,) values in single precision; 0 if there is none."""
     largest = np.float32(0)
     for i in range(values.shape[0]):
@@ -375,7 +375,7 @@ def largest_finite(values: Any) -> Any:
 
 
 @kernel
-def scale_to_one(values: Any) -> float:
+def scale_to_one(values: Vector32) -> float:
     """Multiply values by the power of two that brings the largest to [0.5, 1), which is
     exact; returns the power.
     """
@@ -394,7 +394,7 @@ WINDOW = np.int32(256)  # units in the last place: a relative 3e-5
 
 
 @kernel
-def median_of(values: Any, bits: Any, n: int, count: int) -> float:
+def median_of(values: Vector32, bits: IntVector32, n: int, count: int) -> float:
     """Median of n non-negative float32 of which `count` are finite and the others inf,
     to a relative error of 3e-5.
 
@@ -421,28 +421,28 @@ def median_of(values: Any, bits: Any, n: int, count: int) -> float:
         else:
             low = middle
     below = np.int32(0)
-    first = np.float32(np.inf)
-    second = np.float32(np.inf)
+    lower = np.float32(np.inf)
+    upper = np.float32(np.inf)
     for i in range(n):
         below += np.int32(bits[i] <= high)
-        first = min(first, values[i] if bits[i] > low else np.float32(np.inf))
-        second = min(second, values[i] if bits[i] > high else np.float32(np.inf))
+        lower = min(lower, values[i] if bits[i] > low else np.float32(np.inf))
+        upper = min(upper, values[i] if bits[i] > high else np.float32(np.inf))
     if count % 2 or below > k + 1:
-        second = first
-    return 0.5 * (np.float64(first) + np.float64(second))
+        upper = lower
+    return 0.5 * (np.float64(lower) + np.float64(upper))
 
 
 @fast_kernel
-def _exchange(first: Any, second: Any, n: int) -> None:
+def _exchange(low: Vector32, high: Vector32, n: int) -> None:
     for i in range(n):
-        a = first[i]
-        b = second[i]
-        first[i] = a if a < b else b
-        second[i] = b if a < b else a
+        a = low[i]
+        b = high[i]
+        low[i] = a if a < b else b
+        high[i] = b if a < b else a
 
 
 @kernel
-def sort_columns(x: Any, rows: int, n: int) -> None:
+def sort_columns(x: Matrix32, rows: int, n: int) -> None:
     """Sort the first n columns of `x` along its first `rows` rows, all columns at once.
 
     Batcher's merge exchange (Knuth, volume 3, algorithm 5.2.2M). Values are finite or +inf.

@@ -10,6 +10,23 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.floating[Any]]
 Mask = NDArray[np.bool_]
+
+# Arrays of compiled kernels by rank and dtype; docstrings name the lengths, such as
+# "rows (n, m)". Float64 unless the name ends with the bits.
+Vector = np.ndarray[tuple[int], np.dtype[np.float64]]
+Matrix = np.ndarray[tuple[int, int], np.dtype[np.float64]]
+Cube = np.ndarray[tuple[int, int, int], np.dtype[np.float64]]
+Vector32 = np.ndarray[tuple[int], np.dtype[np.float32]]
+Matrix32 = np.ndarray[tuple[int, int], np.dtype[np.float32]]
+Cube32 = np.ndarray[tuple[int, int, int], np.dtype[np.float32]]
+IntVector = np.ndarray[tuple[int], np.dtype[np.int64]]
+IntMatrix = np.ndarray[tuple[int, int], np.dtype[np.int64]]
+IntVector32 = np.ndarray[tuple[int], np.dtype[np.int32]]
+IntMatrix32 = np.ndarray[tuple[int, int], np.dtype[np.int32]]
+BoolVector = np.ndarray[tuple[int], np.dtype[np.bool_]]
+BoolMatrix = np.ndarray[tuple[int, int], np.dtype[np.bool_]]
+ByteVector = np.ndarray[tuple[int], np.dtype[np.uint8]]
+
 # called with the stage, the steps done and the steps in all
 Progress = Callable[[str, int, int], None]
 
