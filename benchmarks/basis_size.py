@@ -18,10 +18,10 @@ from collections import Counter
 import numpy as np
 
 from skindb.analysis.basis_size import choose_size, size_status, surfel_errors
-from skindb.numerics.reflectance_basis import Systems, factor_reflectance, residuals
-from skindb.optics.brdf_table import TableGrid
-from skindb.optics.dictionary import embedded_dictionary
-from skindb.optics.rows import basis_rows
+from skindb.reflectance.dictionary import embedded_dictionary
+from skindb.reflectance.factor import Systems, factor_reflectance, residuals
+from skindb.reflectance.rows import basis_rows
+from skindb.reflectance.tables import TableGrid
 
 SIZES = (4, 6, 8)
 NOISES = (0.01, 0.03, 0.05)

@@ -148,7 +148,7 @@ def _tables(whole: xr.Dataset) -> Any:
     """The dictionary averaged over the disc of the lights."""
     if TWO_PASSES:
         from skindb.fit.lumitexels import disc_angle
-        from skindb.optics.dictionary import disc_dictionary
+        from skindb.reflectance.dictionary import disc_dictionary
 
         return disc_dictionary(None, disc_angle(whole))
     from skindb.fit.run import _convolved, _disc_angle

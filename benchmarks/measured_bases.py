@@ -22,21 +22,20 @@ import numpy as np
 from scipy.optimize import nnls
 
 from skindb.fit import dictionary_report
-from skindb.optics.abc_low2012 import PARAMETERS
 from skindb.optics.angles import directions, half_difference
-from skindb.optics.brdf_table import lookup, tabulate
-from skindb.optics.dictionary import (
+from skindb.reflectance.abc_low2012 import PARAMETERS, evaluate_abc
+from skindb.reflectance.dictionary import (
     FAR_RULE,
     NEAR_RULE,
     average_disc,
     convolve_disc,
     embedded_dictionary,
-    evaluate_abc,
     sample_pairs,
     weighted_error,
 )
-from skindb.optics.measured import read_dictionary
-from skindb.optics.merl import SHAPE, write_merl
+from skindb.reflectance.merl import SHAPE, write_merl
+from skindb.reflectance.table_file import read_dictionary
+from skindb.reflectance.tables import lookup, tabulate
 
 DISC = np.radians(0.8)
 ROWS = np.array(list(PARAMETERS.values()))

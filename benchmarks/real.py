@@ -42,10 +42,9 @@ from skindb.fit import (
     refit,
 )
 from skindb.optics.angles import half_difference
-from skindb.optics.brdf_table import lookup
 from skindb.optics.fresnel import fresnel_transmittance
+from skindb.reflectance.tables import kernel_tables, lookup
 from skindb.schema import dataset
-from skindb.schema.brdf import kernel_tables
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 from peers import WIDTHS
 from scipy.optimize import least_squares, nnls
 
-from skindb.optics.abc_low2012 import PARAMETERS
 from skindb.optics.angles import directions
-from skindb.optics.dictionary import evaluate_abc
 from skindb.optics.fresnel import fresnel_reflectance
+from skindb.reflectance.abc_low2012 import PARAMETERS, evaluate_abc
 
 Array = NDArray[np.float64]
 

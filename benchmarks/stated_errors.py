@@ -21,9 +21,8 @@ import xarray as xr
 from skindb.bench.photometry import ETA, SCAN_ERROR, Array, ModelSamples, model_samples
 from skindb.fit import estimate_diffuse_reflectance, estimate_normals, refit
 from skindb.fit._albedo_rules import surface_lobes
-from skindb.optics.brdf_table import directional_albedo
+from skindb.reflectance.tables import directional_albedo, stored_brdf
 from skindb.schema import dataset, label
-from skindb.schema.brdf import stored_brdf
 
 QUICK = ((32, 6), (60, 8))
 FULL = (*QUICK, (150, 16))

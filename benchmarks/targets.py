@@ -22,7 +22,7 @@ import xarray as xr
 
 from skindb.fit import estimate_diffuse_reflectance, fit_surface, reduce_basis, refit
 from skindb.optics.angles import half_difference
-from skindb.optics.dictionary import embedded_dictionary
+from skindb.reflectance.dictionary import embedded_dictionary
 from skindb.schema import dataset
 
 MODES = ("linear", "perceptual", "paper")

@@ -16,7 +16,7 @@ import sys
 import numpy as np
 
 import skindb
-from skindb.optics.brdf_table import TableGrid, directions
+from skindb.reflectance.tables import TableGrid, directions
 from skindb.render.scene import from_model
 
 RANKS = (1, 2, 3, 4, 6, 8, 12)

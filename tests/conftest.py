@@ -75,7 +75,7 @@ def new_skin():
 @pytest.fixture(scope="session")
 def small_dictionary():
     """Six of the embedded materials."""
-    from skindb.optics.dictionary import Dictionary, embedded_dictionary
+    from skindb.reflectance.dictionary import Dictionary, embedded_dictionary
 
     whole = embedded_dictionary()
     chosen = [3, 12, 20, 31, 44, 57]

@@ -13,7 +13,7 @@ from planted_skin import capture_of, make_skin
 import skindb
 from skindb import workflow
 from skindb.fit import FitParameters
-from skindb.optics.dictionary import Dictionary, embedded_dictionary
+from skindb.reflectance.dictionary import Dictionary, embedded_dictionary
 from skindb.store import Database
 from skindb.workflow.provenance import groups_of
 

@@ -11,10 +11,9 @@ from skindb.analysis import (
     population_basis,
     trait_vectors,
 )
-from skindb.optics.brdf_table import TableGrid
-from skindb.optics.dictionary import embedded_dictionary
+from skindb.reflectance.dictionary import embedded_dictionary
+from skindb.reflectance.tables import TableGrid, stored_brdf
 from skindb.schema import dataset
-from skindb.schema.brdf import stored_brdf
 
 TABLES = np.ascontiguousarray(embedded_dictionary().table[..., :8])
 NAMES = list(embedded_dictionary().names[:8])

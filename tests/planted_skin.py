@@ -10,9 +10,9 @@ import numpy as np
 import xarray as xr
 
 from skindb.optics.angles import half_difference
-from skindb.optics.brdf_table import lookup
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.optics.transport import transport_profile
+from skindb.reflectance.tables import lookup
 from skindb.schema import dataset, label
 
 ETA = 1.3

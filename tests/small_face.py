@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 
-from skindb.optics.brdf_table import TableGrid, tabulate
 from skindb.optics.diffuse import dipole_s
+from skindb.reflectance.tables import TableGrid, stored_brdf, tabulate
 from skindb.schema import dataset
-from skindb.schema.brdf import stored_brdf
 
 # vertices and mm along each axis
 SIDE = 120

@@ -115,7 +115,7 @@ PRINT_FIT = """
 import numpy as np
 from planted_skin import make_skin
 from skindb.fit import estimate_diffuse_reflectance, estimate_normals, fit_surface
-from skindb.optics.dictionary import embedded_dictionary
+from skindb.reflectance.dictionary import embedded_dictionary
 lumitexels = make_skin(surfels=5, lights=40, cameras=6).lumitexels
 found = estimate_normals(lumitexels)
 found = found.merge(estimate_diffuse_reflectance(lumitexels.merge(found)))

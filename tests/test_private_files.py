@@ -21,9 +21,9 @@ from skindb.cli import main
 from skindb.files import private_file, private_umask
 from skindb.geometry.crop import Crop
 from skindb.ingest.frames import write_frame
-from skindb.optics.dictionary import embedded_dictionary
-from skindb.optics.merl import write_merl
-from skindb.optics.table_file import write_tables
+from skindb.reflectance.dictionary import embedded_dictionary
+from skindb.reflectance.merl import write_merl
+from skindb.reflectance.table_file import write_tables
 from skindb.render.field import write_field
 from skindb.render.image import write_exr, write_png
 from skindb.view.face import face_record

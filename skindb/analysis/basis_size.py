@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from skindb.analysis.each_take import each_take, shared_once
 from skindb.analysis.population_basis import same_dictionary
-from skindb.numerics.reflectance_basis import Systems, factor_reflectance, residuals
 from skindb.numerics.statistics import bootstrap_interval
-from skindb.optics.brdf_table import TableGrid
 from skindb.optics.fresnel import fresnel_transmittance
-from skindb.optics.rows import basis_rows
+from skindb.reflectance.factor import Systems, factor_reflectance, residuals
+from skindb.reflectance.rows import basis_rows
+from skindb.reflectance.tables import TableGrid
 from skindb.schema import dataset
 from skindb.schema.cohort import require_same_fit
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from skindb.analysis import colours
 from skindb.optics.angles import half_difference
-from skindb.optics.brdf_table import lookup
+from skindb.reflectance.tables import lookup
 from skindb.types import Array
 
 if TYPE_CHECKING:

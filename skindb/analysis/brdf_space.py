@@ -33,9 +33,8 @@ from skindb.numerics.group_distance import (
     within_subjects_p,
 )
 from skindb.numerics.statistics import known_mean
-from skindb.optics.brdf_table import TableGrid, brdf_metric
+from skindb.reflectance.tables import TableGrid, brdf_coords, brdf_metric, stored_brdf
 from skindb.schema import dataset
-from skindb.schema.brdf import brdf_coords, stored_brdf
 from skindb.schema.cohort import require_same_fit
 from skindb.threads import c_contiguous
 from skindb.types import Array
@@ -89,7 +88,7 @@ def brdf_space(
     """Mean surface BRDFs of groups, distances between groups and between takes, and a
     map of the takes.
 
-    The distance of two BRDFs is that of `skindb.optics.brdf_table.brdf_metric`, divided
+    The distance of two BRDFs is that of `skindb.reflectance.tables.brdf_metric`, divided
     by the length of the mean BRDF. The unit is the subject: the takes of a subject in a
     group are averaged first. Groups with different subjects are compared by permutation
     of the subjects. Groups with subjects in common, such as conditions, are compared

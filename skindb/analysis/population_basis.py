@@ -12,7 +12,7 @@ from skindb.analysis.each_take import each_item, each_take
 from skindb.errors import Fault, InputError
 from skindb.numerics.factorise import Sums, nmf, refine
 from skindb.numerics.nnls import solve_nnls
-from skindb.optics.brdf_table import brdf_metric
+from skindb.reflectance.tables import brdf_metric
 from skindb.schema import dataset
 from skindb.schema.cohort import require_same_fit
 from skindb.types import Array

@@ -13,8 +13,8 @@ from sklearn.exceptions import ConvergenceWarning
 
 from skindb.bench.curve import Curve, Point, cpu_time
 from skindb.numerics.factorise import nmf, relative_error
-from skindb.optics.brdf_table import brdf_metric
-from skindb.optics.dictionary import embedded_dictionary
+from skindb.reflectance.dictionary import embedded_dictionary
+from skindb.reflectance.tables import brdf_metric
 from skindb.types import Array
 
 K = 6

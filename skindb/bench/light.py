@@ -15,17 +15,17 @@ from skindb.ingest.pixel_flags import OK
 from skindb.ingest.radiance import merge_exposures
 from skindb.ingest.sensor import SensorRecord
 from skindb.optics.angles import directions, half_difference
-from skindb.optics.brdf_table import lookup
-from skindb.optics.dictionary import (
+from skindb.optics.diffuse import diffuse_reflectance, dipole_s, scattering_coefficients
+from skindb.optics.dipole import dipole_profile
+from skindb.optics.dipole_tree import subsurface_exitance
+from skindb.reflectance.dictionary import (
     FAR_RULE,
     NEAR_RULE,
     Dictionary,
     convolve_disc,
     embedded_dictionary,
 )
-from skindb.optics.diffuse import diffuse_reflectance, dipole_s, scattering_coefficients
-from skindb.optics.dipole import dipole_profile
-from skindb.optics.dipole_tree import subsurface_exitance
+from skindb.reflectance.tables import lookup
 from skindb.types import Array
 from skindb.virtual.sensor import Sensor
 

@@ -18,15 +18,16 @@ from skindb.fit._surface_arrays import Tables, Weights, surface_weights
 from skindb.fit.surface import MIN_SAMPLES, NOISE_FLOOR_SURFACE
 from skindb.numerics.factorise import nmf
 from skindb.optics.angles import half_difference
-from skindb.optics.brdf_table import lookup
-from skindb.optics.dictionary import Dictionary, convolve_disc, embedded_dictionary
 from skindb.optics.fresnel import fresnel_transmittance
-from skindb.optics.rows import basis_rows, reduce_dictionary
+from skindb.reflectance.dictionary import Dictionary, convolve_disc, embedded_dictionary
+from skindb.reflectance.reduction import reduce_dictionary
+from skindb.reflectance.rows import basis_rows
+from skindb.reflectance.tables import lookup
 
 Array = NDArray[Any]
 ETA = 1.3
 DISC = float(np.radians(0.8))
-MIN_COSINE_SAMPLES = 0.1  # to light and camera, as in `skindb.optics.truncation`
+MIN_COSINE_SAMPLES = 0.1  # to light and camera, as in `skindb.reflectance.reduction`
 LINEAR = "RMS error of the surface's reflectance at the samples over its RMS"
 ROOTS = "the same error in cube-root space"
 TRUTH = (

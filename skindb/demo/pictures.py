@@ -11,7 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from skindb.geometry.rays import RayScene
-from skindb.optics.brdf_table import directional_albedo
+from skindb.reflectance.tables import directional_albedo
 from skindb.render.direct import View, shade_view, trace_view
 from skindb.render.image import auto_exposure, encode_srgb, tone_map
 from skindb.render.photographs import Comparison, side_by_side

@@ -25,13 +25,12 @@ from skindb.export.readme import readme
 from skindb.export.textures import Skin, skin_of
 from skindb.export.usd import MATERIAL, STAGE, export_usd
 from skindb.files import make_private, private_file
-from skindb.optics.brdf_table import TableGrid, lookup
-from skindb.optics.dictionary import Dictionary
-from skindb.optics.merl import write_merl
-from skindb.optics.table_file import write_tables
+from skindb.reflectance.dictionary import Dictionary
+from skindb.reflectance.merl import write_merl
+from skindb.reflectance.table_file import write_tables
+from skindb.reflectance.tables import TableGrid, kernel_tables, lookup
 from skindb.render.image import write_exr
 from skindb.schema import VARIABLES, FitStatus, ProbeStatus, Use, names_of
-from skindb.schema.brdf import kernel_tables
 from skindb.schema.consent import require_consent
 from skindb.schema.plain import plain
 from skindb.types import Progress, silent

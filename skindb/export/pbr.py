@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skindb.optics.angles import directions
-from skindb.optics.brdf_table import lookup
 from skindb.optics.fresnel import fresnel_transmittance
+from skindb.reflectance.tables import lookup
 
 Float = NDArray[np.floating]
 # values of perceptual roughness that are tried for each point

@@ -18,9 +18,9 @@ from skindb.export.maps import atlas_images
 from skindb.export.pbr import Material, approximation_error, fit_material
 from skindb.export.tangents import tangent_frames, to_tangent_space
 from skindb.export.thin_parts import thickness, transmitted_fraction
+from skindb.reflectance.tables import kernel_tables
 from skindb.render.image import encode_srgb
 from skindb.render.texels import surfel_confidence
-from skindb.schema.brdf import kernel_tables
 
 ERROR_POINTS = 512  # surfels on which the approximation is compared with the model
 MIN_F0 = 1e-3  # reflectance at normal incidence, for the index of refraction in files

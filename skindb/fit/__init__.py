@@ -27,8 +27,8 @@ from skindb.fit.translucency import (
     tabulate_translucency,
     translucency_map,
 )
-from skindb.optics.dictionary import embedded_dictionary
-from skindb.optics.measured import read_dictionary
+from skindb.reflectance.dictionary import embedded_dictionary
+from skindb.reflectance.table_file import read_dictionary
 
 __all__ = [
     "FitParameters",

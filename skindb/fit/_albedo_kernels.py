@@ -34,7 +34,7 @@ from skindb.jit import (
     unpack,
 )
 from skindb.numerics._nnls_kernels import active_set_memory, factor, solve, solve_scaled
-from skindb.optics._shade_kernels import transmittance
+from skindb.reflectance._shade_kernels import transmittance
 
 # to light or camera; below it F_t and the footprint of a pixel change too fast
 MIN_COSINE_ALBEDO = 0.25

@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from skindb.fit._albedo_kernels import MIN_COSINE_ALBEDO, MIN_SAMPLES_ALBEDO
 from skindb.fit._arrays import cosines, directions, quantile_finite
-from skindb.optics.abc_low2012 import PARAMETERS
-from skindb.optics.brdf_table import DEFAULT_GRID, TableGrid, tabulate
-from skindb.optics.dictionary import evaluate_abc
 from skindb.optics.fresnel import fresnel_transmittance
+from skindb.reflectance.abc_low2012 import PARAMETERS, evaluate_abc
+from skindb.reflectance.tables import DEFAULT_GRID, TableGrid, tabulate
 from skindb.types import Array
 
 # quantiles of the method "quantile", and their normal deviates

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from skindb.jit import fast_kernel, kernel
-from skindb.optics._row_kernels import form_rows, row_memory
-from skindb.optics._shade_kernels import transmittance
+from skindb.reflectance._row_kernels import form_rows, row_memory
+from skindb.reflectance._shade_kernels import transmittance
 from skindb.schema import FitStatus
 
 FITTED, UNSEEN, FEW, NO_DIFFUSE, CLAMPED, NOT_CONVERGED, NOT_FINITE, _ = (

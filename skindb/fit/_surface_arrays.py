@@ -20,8 +20,7 @@ from skindb.fit._surface_kernels import (
 )
 from skindb.fit.sample_noise import NO_NOISE, TypicalNoise, noise_of
 from skindb.jit import sample_bits
-from skindb.optics.brdf_table import TableGrid
-from skindb.optics.rows import pad_to_lanes
+from skindb.reflectance.tables import TableGrid, pad_to_lanes
 from skindb.types import Array
 
 # in the order of the codes in `_surface_kernels`

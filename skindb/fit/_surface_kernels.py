@@ -30,7 +30,7 @@ from skindb.fit._lumitexel_kernels import (
     write_rows,
 )
 from skindb.jit import fast_kernel, kernel, median_of, unpack
-from skindb.numerics._reflectance_kernels import (
+from skindb.reflectance._mixture_kernels import (
     coefficients,
     fit_memory,
     fit_one,
@@ -38,9 +38,9 @@ from skindb.numerics._reflectance_kernels import (
     predict,
     relative_errors,
     to_roots,
+    weight_covariance,
 )
-from skindb.numerics._weight_error_kernels import weight_covariance
-from skindb.optics._row_kernels import turn_rows
+from skindb.reflectance._row_kernels import turn_rows
 from skindb.schema.status import LARGEST_R_D, SMALLEST_R_D
 
 # to light or camera; below it lights are partly hidden, and pixels cover a large area

@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
 from skindb.numerics.factorise import nmf
-from skindb.optics.brdf_table import brdf_metric
+from skindb.reflectance.tables import brdf_coords, brdf_metric, stored_brdf
 from skindb.schema import FitStatus, check, dataset
-from skindb.schema.brdf import brdf_coords, stored_brdf
 
 if TYPE_CHECKING:
-    from skindb.optics.dictionary import Dictionary
+    from skindb.reflectance.dictionary import Dictionary
 
 MAX_SAMPLED_SURFELS = 5000  # surfels, as in the paper's basis of one person
 SEEDS = 3

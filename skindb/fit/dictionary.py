@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 import xarray as xr
 
-from skindb.optics.dictionary_quality import dictionary_quality
+from skindb.reflectance.dictionary import dictionary_quality
 from skindb.schema import dataset
 
 if TYPE_CHECKING:
-    from skindb.optics.dictionary import Dictionary
+    from skindb.reflectance.dictionary import Dictionary
 
 
 def dictionary_report(

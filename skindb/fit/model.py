@@ -31,8 +31,12 @@ from skindb.fit.plan import plan_fit
 from skindb.fit.second import refit_and_evaluate
 from skindb.fit.surface import fit_surface
 from skindb.fit.translucency import fit_probe, summarise_translucency, translucency_map
-from skindb.numerics.nnls import Mode
-from skindb.optics.dictionary import Dictionary, disc_dictionary, embedded_dictionary
+from skindb.reflectance.dictionary import (
+    Dictionary,
+    disc_dictionary,
+    embedded_dictionary,
+)
+from skindb.reflectance.rows import Mode
 from skindb.schema import FitStatus, Use, label, names_of
 from skindb.schema.consent import honour_consent
 from skindb.types import Progress

@@ -12,13 +12,12 @@ from skindb.cache import cached_arrays
 from skindb.errors import Fault, InputError
 from skindb.fit.lumitexels import disc_angle, lumitexels
 from skindb.fit.parameters import FitParameters
-from skindb.optics.dictionary import (
-    SOURCES,
-    Dictionary,
-    disc_dictionary,
+from skindb.reflectance.dictionary import SOURCES, Dictionary, disc_dictionary
+from skindb.reflectance.reduction import (
+    Truncation,
     reduced_dictionary,
+    truncation_bound,
 )
-from skindb.optics.truncation import Truncation, truncation_bound
 from skindb.schema.omission import Omission, explain
 from skindb.types import Mask
 

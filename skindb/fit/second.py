@@ -24,7 +24,7 @@ from skindb.fit.surface import (
     refitted_variables,
     surface_strength,
 )
-from skindb.numerics.nnls import Mode
+from skindb.reflectance.rows import Mode
 from skindb.schema import check, dataset
 
 SURFELS_PER_BLOCK = 4096  # surfels per task if the samples are not lazy

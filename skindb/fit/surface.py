@@ -14,11 +14,11 @@ from skindb.fit._surface_arrays import Refit, Tables, refit_weights, surface_wei
 from skindb.fit.lumitexels import GEOMETRY
 from skindb.fit.parameters import FullMode
 from skindb.fit.sample_noise import noise_inputs, typical_noise
-from skindb.numerics.nnls import Mode
-from skindb.optics.brdf_table import TableGrid, directional_albedo
-from skindb.optics.dictionary import Dictionary, reduced_dictionary
+from skindb.reflectance.dictionary import Dictionary
+from skindb.reflectance.reduction import reduced_dictionary
+from skindb.reflectance.rows import Mode
+from skindb.reflectance.tables import TableGrid, directional_albedo, kernel_tables
 from skindb.schema import check, text_labels
-from skindb.schema.brdf import kernel_tables
 from skindb.types import Array
 
 NEEDED = (*GEOMETRY, "shading_normal", "diffuse_reflectance")
@@ -64,7 +64,7 @@ def fit_surface(
         m measured BRDFs, convolved with the discs of the lights.
     mode
         "perceptual" (in cube-root space), "linear" (see
-        `skindb.numerics.nnls.fit_reflectance`), or "paper": cube roots of the elements
+        `skindb.reflectance.rows.fit_reflectance`), or "paper": cube roots of the elements
         are mixed, and the prediction is the cube of the mixture.
     rank
         Rank of the reduced dictionary; m is exact. `rank_omissions` bounds the error of

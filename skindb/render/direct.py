@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from skindb.geometry.camera import pixel_rays
 from skindb.geometry.rays import RayScene
 from skindb.optics.fresnel import fresnel_transmittance
-from skindb.optics.shade import shade_points
+from skindb.reflectance.shade import shade_points
 from skindb.render.scene import Camera, Lights, Surface
 from skindb.render.subsurface import exitances
 

@@ -7,10 +7,10 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from skindb.errors import Fault, InputError
-from skindb.optics.shade import shade_points
+from skindb.reflectance.shade import shade_points
+from skindb.reflectance.tables import kernel_tables
 from skindb.render.scene import usable_surfels
 from skindb.schema import FitStatus, check
-from skindb.schema.brdf import kernel_tables
 from skindb.types import Array
 
 NEEDED = ("shading_normal", "diffuse_reflectance", "basis_weight", "fit_status")

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb.optics.brdf_sampling import tangents
+from skindb.reflectance.sampling import tangents
 from skindb.render.direct import View
 from skindb.render.scene import Lights
 

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skindb.geometry.rays import RayScene
-from skindb.optics.brdf_sampling import LobeSampler, tangents
 from skindb.optics.fresnel import fresnel_transmittance
-from skindb.optics.shade import shade_points
+from skindb.reflectance.sampling import LobeSampler, tangents
+from skindb.reflectance.shade import shade_points
 from skindb.render.direct import View, escape_factor, trace_view
 from skindb.render.environment import Environment
 from skindb.render.light_choice import LightChoice, points_on_discs, stratified

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from skindb.geometry.camera import project
 from skindb.geometry.rays import RayScene
 from skindb.optics.fresnel import fresnel_transmittance
-from skindb.optics.shade import shade_points
+from skindb.reflectance.shade import shade_points
 from skindb.render.direct import View, trace_view
 from skindb.render.monte_carlo import Lighting
 from skindb.render.scene import Camera, Lights, Surface

@@ -12,8 +12,8 @@ from scipy.spatial import cKDTree
 
 from skindb.errors import Fault, InputError
 from skindb.limits import MAX_PICTURE_PIXELS
+from skindb.reflectance.tables import kernel_tables
 from skindb.schema import FitStatus, check
-from skindb.schema.brdf import kernel_tables
 
 Float = NDArray[np.floating[Any]]
 NEEDED = (

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
 from skindb.files import make_private, private_file
-from skindb.optics.abc_low2012 import PARAMETERS
-from skindb.optics.brdf_table import directional_albedo
-from skindb.optics.dictionary import Dictionary, convolve_disc, embedded_dictionary
 from skindb.optics.diffuse import dipole_s
+from skindb.reflectance.abc_low2012 import PARAMETERS
+from skindb.reflectance.dictionary import Dictionary, convolve_disc, embedded_dictionary
+from skindb.reflectance.tables import directional_albedo
 from skindb.render.scene import Surface
 from skindb.types import Progress
 from skindb.virtual.dome import DISC_RADIUS, LIGHT_RADIUS, Dome

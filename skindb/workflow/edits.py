@@ -27,7 +27,15 @@ from skindb.workflow.registration import current_registrations, registered_datas
 
 GRID_SIDE = 320.0  # pixels, the longer side of a picture in a grid
 # what the result depends on
-METHOD = ("analysis", "numerics", "optics", "geometry", "schema", "workflow/edits")
+METHOD = (
+    "analysis",
+    "numerics",
+    "optics",
+    "reflectance",
+    "geometry",
+    "schema",
+    "workflow/edits",
+)
 STRENGTHS = (0.5, 1.0)  # of the edits in a grid, as in figure 19 of the paper
 
 

@@ -12,7 +12,7 @@ import xarray as xr
 from skindb import __version__
 from skindb.errors import InputError
 from skindb.fit import FitParameters
-from skindb.optics.dictionary import Dictionary, embedded_dictionary
+from skindb.reflectance.dictionary import Dictionary, embedded_dictionary
 from skindb.schema import SCHEMA_VERSION
 from skindb.schema.plain import plain
 from skindb.store import Database, Lease

@@ -12,8 +12,8 @@ from typing import Any
 from skindb.analysis.summary import SAMPLED
 from skindb.errors import Fault, InputError
 from skindb.fit import FitParameters, FitPlan, first_pass, plan_fit, second_pass
-from skindb.optics.dictionary import EMBEDDED, Dictionary, embedded_dictionary
-from skindb.optics.measured import read_dictionary
+from skindb.reflectance.dictionary import EMBEDDED, Dictionary, embedded_dictionary
+from skindb.reflectance.table_file import read_dictionary
 from skindb.schema.consent import require_consent
 from skindb.store import Database, Record
 from skindb.threads import one_blas_thread
@@ -33,9 +33,9 @@ METHOD = (
     "fit",
     "numerics",
     "optics",
+    "reflectance",
     "elementwise",
     "schema/status",
-    "schema/brdf",
     "jit",
     "threads",
     "geometry/rays",

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from skindb.analysis.registration import describe_registration
 from skindb.errors import Fault, InputError
-from skindb.optics.dictionary import convolve_disc, embedded_dictionary
-from skindb.optics.measured import read_dictionary
+from skindb.reflectance.dictionary import convolve_disc, embedded_dictionary
+from skindb.reflectance.table_file import read_dictionary
 from skindb.schema.cohort import require_same_fit
 from skindb.schema.notes import Note, note, unique_notes
 from skindb.store import Database, Known, Record, Staleness

@@ -27,6 +27,7 @@ METHOD = (
     "analysis",
     "numerics",
     "optics",
+    "reflectance",
     "geometry",
     "render/texels",
     "schema",

@@ -26,7 +26,7 @@ from skindb.analysis import (
 from skindb.analysis.brdf_plots import lobe, sphere_radiance
 from skindb.errors import InputError
 from skindb.optics.angles import half_difference
-from skindb.optics.brdf_table import brdf_metric, lookup
+from skindb.reflectance.tables import brdf_metric, lookup
 from skindb.schema import check, dataset
 from skindb.store import Database
 from skindb.workflow import study_inputs

@@ -32,9 +32,9 @@ from skindb.analysis.population_basis import project
 from skindb.errors import InputError
 from skindb.numerics.factorise import relative_error
 from skindb.optics.angles import half_difference
-from skindb.optics.brdf_table import brdf_metric, lookup
 from skindb.optics.fresnel import fresnel_transmittance
-from skindb.optics.rows import basis_rows
+from skindb.reflectance.rows import basis_rows
+from skindb.reflectance.tables import brdf_metric, lookup
 from skindb.schema import dataset
 from skindb.schema.cohort import Part, combine
 from skindb.store import Database, StaleWarning

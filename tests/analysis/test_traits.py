@@ -19,10 +19,9 @@ from skindb.analysis.albedo import levels, quantiles
 from skindb.analysis.edit import shift_quantiles, valid_quantiles, with_basis
 from skindb.errors import InputError
 from skindb.fit.translucency import translucency_map
-from skindb.optics.brdf_table import brdf_metric
 from skindb.optics.diffuse import diffuse_reflectance
+from skindb.reflectance.tables import brdf_metric, stored_brdf
 from skindb.schema import dataset
-from skindb.schema.brdf import stored_brdf
 
 
 def test_trait_vectors__planted_differences():

@@ -7,8 +7,8 @@ import pytest
 import xarray as xr
 
 from skindb.export.bundle import export_bundle
+from skindb.reflectance.tables import stored_brdf
 from skindb.schema import FitStatus, ProbeStatus, dataset
-from skindb.schema.brdf import stored_brdf
 
 SIDE = 24  # surfels along each side of the patch
 SIZE = 64  # texels of the maps of bundles

@@ -22,7 +22,7 @@ import xarray as xr
 from scipy.ndimage import binary_erosion, map_coordinates
 
 from skindb.export.bundle import export_bundle
-from skindb.optics.measured import read_dictionary
+from skindb.reflectance.table_file import read_dictionary
 from skindb.render.direct import render_view
 from skindb.render.image import read_exr, write_exr
 from skindb.render.scene import Camera, Lights, Surface, from_model

@@ -15,8 +15,8 @@ from skindb.export.bundle import export_bundle
 from skindb.export.mean_free_path import mean_free_path
 from skindb.export.pbr import fit_material
 from skindb.export.usd import index_of
+from skindb.reflectance.tables import kernel_tables
 from skindb.render.image import read_exr
-from skindb.schema.brdf import kernel_tables
 
 SIZE = 64
 

@@ -21,8 +21,8 @@ from skindb.fit._albedo_kernels import (
 )
 from skindb.fit._albedo_rules import surface_lobes
 from skindb.optics.angles import half_difference
-from skindb.optics.brdf_table import lookup
 from skindb.optics.fresnel import fresnel_transmittance
+from skindb.reflectance.tables import lookup
 from skindb.schema import label
 
 FLOOR = 0.01  # sr^-1

@@ -15,7 +15,7 @@ from skindb.fit import (
 from skindb.fit._albedo_rules import low_quantile, stable_minimum, surface_lobes
 from skindb.optics.diffuse import diffuse_reflectance
 from skindb.optics.fresnel import fresnel_transmittance
-from skindb.optics.rows import basis_rows
+from skindb.reflectance.rows import basis_rows
 from skindb.schema import dataset, label
 
 

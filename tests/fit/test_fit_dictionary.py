@@ -7,9 +7,9 @@ import pytest
 
 from skindb.fit import dictionary_report
 from skindb.fit.model import _dictionary_files as _files
-from skindb.optics.dictionary import Dictionary, embedded_dictionary
-from skindb.optics.measured import read_dictionary
-from skindb.optics.merl import SHAPE, write_merl
+from skindb.reflectance.dictionary import Dictionary, embedded_dictionary
+from skindb.reflectance.merl import SHAPE, write_merl
+from skindb.reflectance.table_file import read_dictionary
 from skindb.schema import GROUPS, check
 
 

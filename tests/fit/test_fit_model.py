@@ -221,7 +221,7 @@ def test_fit_model__passes_are_their_separate_methods(
 
 def _averaged(dictionary, whole):
     from skindb.fit.lumitexels import disc_angle
-    from skindb.optics.dictionary import disc_dictionary
+    from skindb.reflectance.dictionary import disc_dictionary
 
     return disc_dictionary(dictionary, disc_angle(whole))
 

@@ -15,10 +15,9 @@ from skindb.fit import find_outliers, refit
 from skindb.fit.outliers import joined_blocks, suspects
 from skindb.fit.surface import noise_floor
 from skindb.optics.angles import half_difference
-from skindb.optics.brdf_table import lookup
 from skindb.optics.fresnel import fresnel_transmittance
+from skindb.reflectance.tables import kernel_tables, lookup, stored_brdf
 from skindb.schema import dataset, label
-from skindb.schema.brdf import kernel_tables, stored_brdf
 
 NOISE = 0.01  # relative, of every sample
 SURFELS = 300

@@ -25,7 +25,7 @@ from skindb.fit.sample_noise import (
     noise_of,
     sample_variance,
 )
-from skindb.optics.rows import pad_to_lanes
+from skindb.reflectance.tables import pad_to_lanes
 from skindb.schema import label
 
 ETA = 1.3

@@ -15,13 +15,20 @@ from skindb.fit._albedo_rules import surface_lobes
 from skindb.fit._surface_kernels import MIN_COSINE_SURFACE
 from skindb.fit.surface import NEEDED, NOISE_FLOOR_SURFACE
 from skindb.optics.angles import half_difference
-from skindb.optics.brdf_table import brdf_metric, directional_albedo, lookup
-from skindb.optics.dictionary import Dictionary
 from skindb.optics.fresnel import fresnel_transmittance
-from skindb.optics.rows import reduce_dictionary
-from skindb.optics.truncation import MIN_COSINE_SAMPLES, truncation_bound
+from skindb.reflectance.dictionary import Dictionary
+from skindb.reflectance.reduction import (
+    MIN_COSINE_SAMPLES,
+    reduce_dictionary,
+    truncation_bound,
+)
+from skindb.reflectance.tables import (
+    brdf_metric,
+    directional_albedo,
+    lookup,
+    stored_brdf,
+)
 from skindb.schema import FitStatus, dataset, label
-from skindb.schema.brdf import stored_brdf
 
 HALF = 2e-3  # samples are half floats: 5e-4 each, relative to the surface term more
 

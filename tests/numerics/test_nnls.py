@@ -8,8 +8,11 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize, nnls
 
-from skindb.numerics import _nnls_kernels, _reflectance_kernels, _weight_error_kernels
-from skindb.numerics.nnls import fit_reflectance, solve_nnls
+from skindb.numerics import _nnls_kernels
+from skindb.numerics.nnls import solve_nnls
+from skindb.reflectance import _mixture_kernels as _reflectance_kernels
+from skindb.reflectance import _mixture_kernels as _weight_error_kernels
+from skindb.reflectance.rows import fit_reflectance
 
 # normal equations square the condition number: residuals agree to the root of the
 # rounding error

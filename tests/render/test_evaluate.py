@@ -9,10 +9,9 @@ from scipy.interpolate import RegularGridInterpolator
 
 from skindb.errors import InputError
 from skindb.optics.angles import half_difference
-from skindb.optics.brdf_table import TableGrid
+from skindb.reflectance.tables import TableGrid, brdf_coords, stored_brdf
 from skindb.render import evaluate
 from skindb.schema import FitStatus, dataset
-from skindb.schema.brdf import brdf_coords, stored_brdf
 
 ETA = 1.35
 GRID = TableGrid(12, 10, 6)

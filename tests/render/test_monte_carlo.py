@@ -10,9 +10,9 @@ import trimesh
 from scipy import stats
 
 from skindb.errors import InputError
-from skindb.optics.brdf_table import TableGrid, directional_albedo, tabulate
 from skindb.optics.diffuse import dipole_s
 from skindb.optics.fresnel import fresnel_transmittance
+from skindb.reflectance.tables import TableGrid, directional_albedo, tabulate
 from skindb.render.direct import render_view, trace_view
 from skindb.render.environment import Environment
 from skindb.render.image import write_exr

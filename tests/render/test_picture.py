@@ -9,6 +9,7 @@ import xarray as xr
 
 from skindb.errors import InputError
 from skindb.optics.diffuse import dipole_s
+from skindb.reflectance.tables import stored_brdf
 from skindb.render import subsurface as subsurface_module
 from skindb.render.direct import render_view
 from skindb.render.image import decode_srgb, read_exr, read_png, write_exr
@@ -18,7 +19,6 @@ from skindb.render.picture import picture, trace_shot
 from skindb.render.rendering import fixed_exposure, render, render_picture
 from skindb.render.scene import cameras_from_dome, from_model, lights_from_dome
 from skindb.schema import dataset
-from skindb.schema.brdf import stored_brdf
 
 
 @pytest.fixture

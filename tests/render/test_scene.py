@@ -5,9 +5,9 @@ import pytest
 import xarray as xr
 
 from skindb.errors import InputError
+from skindb.reflectance.tables import stored_brdf
 from skindb.render.scene import Camera, cameras_from_dome, from_model, lights_from_dome
 from skindb.schema import FitStatus, dataset, label
-from skindb.schema.brdf import stored_brdf
 
 
 def model(status: list[int], *, translucent: bool = True) -> xr.DataTree:

@@ -14,6 +14,7 @@ from page_session import running
 from scipy.ndimage import binary_erosion
 from small_face import LIGHTS, small_face
 
+from skindb.reflectance.tables import kernel_tables, stored_brdf
 from skindb.render.direct import render_view, trace_view
 from skindb.render.environment import Environment
 from skindb.render.image import decode_srgb
@@ -26,7 +27,6 @@ from skindb.render.scene import (
     lights_from_dome,
 )
 from skindb.schema import dataset
-from skindb.schema.brdf import kernel_tables, stored_brdf
 from skindb.view.face import Trait, face_record, page_omissions, still_picture
 from skindb.view.page import PagedFace, index_text, write_folder, write_page
 from skindb.view.server import HTML, JSON, Content, PageServer

@@ -10,7 +10,8 @@ from scipy.optimize import nnls
 
 from skindb.bench.case import SCALES, Case, close, each, expect
 from skindb.numerics.factorise import nmf
-from skindb.numerics.nnls import ReflectanceFit, fit_reflectance, solve_nnls
+from skindb.numerics.nnls import solve_nnls
+from skindb.reflectance.rows import ReflectanceFit, fit_reflectance
 
 Array = NDArray[Any]
 # normal equations square the condition: residuals agree to the root of the rounding

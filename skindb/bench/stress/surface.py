@@ -24,8 +24,8 @@ from skindb.bench.stress.surfels import (
     weights,
 )
 from skindb.fit._surface_arrays import Tables
-from skindb.optics.brdf_table import TableGrid
-from skindb.optics.rows import reduce_dictionary
+from skindb.reflectance.reduction import reduce_dictionary
+from skindb.reflectance.tables import TableGrid
 from skindb.schema import FitStatus
 from skindb.schema.status import LARGEST_R_D, SMALLEST_R_D
 

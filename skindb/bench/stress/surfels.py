@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from skindb.fit._surface_arrays import Tables, Weights, surface_weights
 from skindb.fit.surface import MIN_SAMPLES, NOISE_FLOOR_SURFACE
 from skindb.optics.angles import half_difference
-from skindb.optics.brdf_table import lookup
-from skindb.optics.dictionary import embedded_dictionary
 from skindb.optics.fresnel import fresnel_transmittance
+from skindb.reflectance.dictionary import embedded_dictionary
+from skindb.reflectance.tables import lookup
 
 Array = NDArray[Any]
 ETA = 1.3

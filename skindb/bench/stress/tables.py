@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from skindb.bench.case import SCALES, Case, close, each, expect
 from skindb.optics.angles import half_difference
-from skindb.optics.brdf_table import TableGrid, lookup, tabulate
-from skindb.optics.dictionary import Dictionary, convolve_disc
-from skindb.optics.rows import basis_rows
+from skindb.reflectance.dictionary import Dictionary, convolve_disc
+from skindb.reflectance.rows import basis_rows
+from skindb.reflectance.tables import TableGrid, lookup, tabulate
 
 Array = NDArray[Any]
 GRID = TableGrid(24, 20, 8)

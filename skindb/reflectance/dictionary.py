@@ -1,7 +1,7 @@
 """The dictionary of measured BRDFs whose mixtures describe a surface: 59 embedded
 materials or those of a file.
 
-See `skindb.optics.measured` for files.
+See `skindb.reflectance.table_file` for files.
 """
 
 from __future__ import annotations
@@ -10,19 +10,22 @@ import hashlib
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, lru_cache
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skindb.cache import cached_arrays
 from skindb.errors import Fault, InputError
-from skindb.optics import _row_kernels
-from skindb.optics.abc_low2012 import PARAMETERS
 from skindb.optics.angles import directions, half_difference
-from skindb.optics.brdf_table import DEFAULT_GRID, Table, TableGrid, tabulate
-from skindb.optics.fresnel import fresnel_reflectance
-from skindb.optics.rows import reduce_dictionary
+from skindb.reflectance import _row_kernels
+from skindb.reflectance.abc_low2012 import PARAMETERS, evaluate_abc
+from skindb.reflectance.tables import (
+    DEFAULT_GRID,
+    Table,
+    TableGrid,
+    directional_albedo,
+    lookup,
+    tabulate,
+)
 from skindb.types import Array
 
 Rule = tuple[int, int]  # rings and points per ring of a quadrature over a disc
@@ -31,23 +34,20 @@ FAR_RULE = (4, 12)
 NEAR_RULE = (12, 36)
 EMBEDDED = "analytic fits to measured BRDFs (ABC parameters of Loew et al. 2012)"
 # modules that determine the tables; a change of their source invalidates the cache
-SOURCES = tuple(
-    f"skindb.{name}"
-    for name in (
-        "optics.dictionary",
-        "optics.rows",
-        "optics.brdf_table",
-        "optics.angles",
-        "optics.fresnel",
-        "optics.abc_low2012",
-        "optics._row_kernels",
-        "optics.truncation",
-        "jit",
-    )
+SOURCES = (
+    "skindb.reflectance.dictionary",
+    "skindb.reflectance.reduction",
+    "skindb.reflectance.tables",
+    "skindb.reflectance.abc_low2012",
+    "skindb.reflectance._row_kernels",
+    "skindb.optics.angles",
+    "skindb.optics.fresnel",
+    "skindb.jit",
 )
-# cosines are clamped to this, so that cells below the horizon continue the last value
-# above it
-MIN_COSINE_TABLE = 0.03
+INCIDENCE = np.radians(np.arange(0, 86, 5))
+# rings, spokes; twice as many points change the worst average of the 59 materials by
+# 0.6 %
+FINE = (24, 72)
 
 
 @dataclass(frozen=True)
@@ -105,37 +105,6 @@ class Dictionary:
         return tuple(lines)
 
 
-def evaluate_abc(parameters: Array, wi: Array, wo: Array) -> Array:
-    """ABC microfacet BRDFs (..., m) for rows (m, 9) of `abc_low2012`, as mean of RGB
-    (Loew et al. 2012).
-
-    f = kd/pi + A F(theta_d) (1 + B (1 - cos theta_h))^-C G / (pi cos_i cos_o), with G
-    for V grooves. Directions are in the local frame.
-    """
-    cos_i = np.maximum(wi[..., 2], MIN_COSINE_TABLE)
-    cos_o = np.maximum(wo[..., 2], MIN_COSINE_TABLE)
-    theta_h, theta_d, _ = half_difference(wi, wo)
-    cos_h = np.maximum(np.cos(theta_h), 1e-6)
-    cos_d = np.maximum(np.cos(theta_d), MIN_COSINE_TABLE)
-    masking = np.minimum(1.0, 2 * cos_h * np.minimum(cos_i, cos_o) / cos_d) / (
-        np.pi * cos_i * cos_o
-    )
-    out = np.empty((*cos_i.shape, len(parameters)))
-    lean = 2.0 * np.sin(theta_h / 2) ** 2  # 1 - cos theta_h without cancellation
-    for m, row in enumerate(parameters):
-        kd = row[:3].mean()
-        scale = row[3:6].mean()
-        b = row[6]
-        c = row[7]
-        index = row[8]
-        lobe = np.exp(-c * np.log1p(b * lean))
-        out[..., m] = (
-            kd / np.pi
-            + scale * fresnel_reflectance(cos_d, float(index)) * lobe * masking
-        )
-    return out
-
-
 @cache
 def embedded_dictionary() -> Dictionary:
     """The 59 dielectrics of `abc_low2012`, analytic fits to measured BRDFs, on the default grid."""
@@ -175,27 +144,6 @@ def weighted_error(found: Array, exact: Array, wi: Array, wo: Array) -> Array:
     weight = (wi[:, 2] * wo[:, 2])[:, None]
     total = np.maximum((weight * exact**2).sum(axis=0), 1e-300)
     return np.asarray(np.sqrt((weight * (found - exact) ** 2).sum(axis=0) / total))
-
-
-@lru_cache(maxsize=2)
-def reduced_dictionary(
-    dictionary: Dictionary, rank: int, *, cube_roots: bool = False
-) -> tuple[Table, Array]:
-    """`reduce_dictionary` of the tables or of their cube roots; cached for the takes of a dome."""
-
-    def make() -> dict[str, NDArray[Any]]:
-        reduced, lift = reduce_dictionary(
-            np.cbrt(dictionary.table) if cube_roots else dictionary.table, rank
-        )
-        return {"reduced": reduced, "lift": lift}
-
-    # without a reduction, the result is not worth the space in the cache
-    if rank >= len(dictionary.names):
-        made = make()
-        return made["reduced"], made["lift"]
-    arguments = (dictionary.digest, rank, cube_roots)
-    found = cached_arrays("reduced-dictionary", arguments, sources=SOURCES, make=make)
-    return found["reduced"], found["lift"]
 
 
 @cache
@@ -346,3 +294,98 @@ def _convolve(
     with ThreadPoolExecutor() as pool:
         list(pool.map(fill, range(grid.n_theta_h)))
     return out
+
+
+def dictionary_quality(
+    dictionary: Dictionary, angular_radius: float, *, pairs: int = 6000
+) -> dict[str, Array]:
+    """Quality measures (m,) of every material; errors are relative, see `weighted_error`.
+
+    Parameters
+    ----------
+    dictionary
+        Tables for point lights, or already averaged over a disc.
+    angular_radius
+        Angular radius of the lights' disc [rad], for tables of point lights.
+    pairs
+        Number of pairs of directions to sample, see `sample_pairs`; two in three are
+        above the horizon.
+
+    Returns
+    -------
+    dict
+        Measures by name, NaN where one does not apply:
+
+        - normal_albedo, largest_albedo: fraction of light reflected at normal
+          incidence, and its maximum up to 85 degrees.
+        - energy_excess: largest albedo minus 1 (at least 0), before or after averaging
+          over the disc.
+        - reciprocity_error: difference of the fitted tables when both directions are exchanged.
+        - one_sided_error: difference of the averages over the disc around either
+          direction, whose mean is tabulated.
+        - disc_quadrature_error: error of the quadrature of `convolve_disc` against FINE.
+        - disc_table_error: error of the interpolated tables against FINE.
+        - interpolation_error: error of the tables before averaging against their source.
+        - hole_fraction: fraction of unmeasured nodes above the horizon.
+    """
+    fitted = convolve_disc(dictionary, dictionary.disc_angular_radius or angular_radius)
+    wi, wo = sample_pairs(pairs)
+    there, back = (
+        lookup(fitted.table, *half_difference(a, b)) for a, b in ((wi, wo), (wo, wi))
+    )
+    albedo = directional_albedo(dictionary.table, np.cos(INCIDENCE))
+    after = (
+        albedo
+        if fitted is dictionary
+        else directional_albedo(fitted.table, np.cos(INCIDENCE))
+    )
+    figures = {
+        "normal_albedo": albedo[0],
+        "largest_albedo": albedo.max(axis=0),
+        "energy_excess": np.maximum(np.maximum(albedo, after).max(axis=0) - 1, 0),
+        "reciprocity_error": weighted_error(back, there, wi, wo),
+    }
+    unknown = np.full(len(dictionary.names), np.nan)
+    disc = dict.fromkeys(
+        ("one_sided_error", "disc_quadrature_error", "disc_table_error"), unknown
+    )
+    if fitted is not dictionary:
+        disc = _disc_errors(dictionary, angular_radius, there, wi, wo)
+    figures |= disc | {"interpolation_error": unknown, "hole_fraction": unknown}
+    if dictionary.origins:
+        figures["interpolation_error"] = np.array(
+            [origin.resampling_error for origin in dictionary.origins]
+        )
+        figures["hole_fraction"] = np.array(
+            [origin.hole_fraction for origin in dictionary.origins]
+        )
+    elif dictionary.names == tuple(PARAMETERS) and not dictionary.disc_angular_radius:
+        exact = evaluate_abc(np.array(list(PARAMETERS.values())), wi, wo)
+        found = lookup(dictionary.table, *half_difference(wi, wo))
+        figures |= {
+            "interpolation_error": weighted_error(found, exact, wi, wo),
+            "hole_fraction": np.zeros(len(unknown)),
+        }
+    return figures
+
+
+def _disc_errors(
+    dictionary: Dictionary, angular_radius: float, found: Array, wi: Array, wo: Array
+) -> dict[str, Array]:
+    """Errors of averaging over the disc; `found` are interpolated values of the tables
+    from `convolve_disc`.
+    """
+    pairs = (wi, wo), (wo, wi)
+    used = np.mean(
+        [average_disc(dictionary, *pair, angular_radius) for pair in pairs], axis=0
+    )
+    one, other = (
+        average_disc(dictionary, *pair, angular_radius, far=FINE, near=FINE)
+        for pair in pairs
+    )
+    mean = (one + other) / 2
+    return {
+        "one_sided_error": weighted_error(mean + one - other, mean, wi, wo),
+        "disc_quadrature_error": weighted_error(used, mean, wi, wo),
+        "disc_table_error": weighted_error(found, mean, wi, wo),
+    }

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb.optics import _shade_kernels
+from skindb.reflectance import _shade_kernels
 from skindb.types import Array
 
 

@@ -1,5 +1,5 @@
-"""Tables of isotropic, reciprocal BRDFs over half and difference angles, and their
-trilinear interpolation.
+"""Tables of isotropic, reciprocal BRDFs over half and difference angles: grid,
+interpolation, integrals, and the stored form.
 """
 
 from __future__ import annotations
@@ -9,12 +9,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
+from skindb.jit import LANES
 from skindb.optics.angles import directions, half_difference
 from skindb.types import Array
 
 Table = NDArray[np.float32]
+ANGLES = ("theta_h", "theta_d", "phi_d")
 
 
 @dataclass(frozen=True)
@@ -157,3 +160,40 @@ def directional_albedo(table: NDArray[Any], cos_o: ArrayLike, *, n: int = 96) ->
             np.einsum("ij,ijm->m", weight, lookup(table, *half_difference(wi, wo)))
         )
     return np.stack(rows)
+
+
+def pad_to_lanes(table: Table) -> Table:
+    """The table with its last axis padded by zeros to a multiple of LANES, as the
+    kernels require.
+    """
+    missing = -table.shape[-1] % LANES
+    if not missing:
+        return np.ascontiguousarray(table, np.float32)
+    return np.concatenate(
+        [table, np.zeros((*table.shape[:-1], missing))], axis=-1, dtype=np.float32
+    )
+
+
+def stored_brdf(tables: NDArray[Any]) -> NDArray[Any]:
+    """Tables (nh, nd, np, k) of the kernels as `basis_brdf` (k, nh, nd, np + 1): the
+    period's end repeats its begin.
+    """
+    moved = np.moveaxis(tables, -1, 0)
+    return np.concatenate([moved, moved[..., :1]], axis=-1)
+
+
+def brdf_coords(grid: TableGrid) -> dict[str, NDArray[Any]]:
+    """Nodes of `stored_brdf` [rad]."""
+    return {
+        "theta_h": grid.theta_h,
+        "theta_d": grid.theta_d,
+        "phi_d": np.append(grid.phi_d, np.pi),
+    }
+
+
+def kernel_tables(basis: xr.Dataset) -> Table:
+    """Tables (nh, nd, np, k) of `basis_brdf` for the kernels, contiguous and in single
+    precision.
+    """
+    closed = basis["basis_brdf"].transpose(*ANGLES, "component").values
+    return np.ascontiguousarray(closed[:, :, :-1], np.float32)

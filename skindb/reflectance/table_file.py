@@ -1,4 +1,4 @@
-"""Files (.npz) with tables of measured BRDFs."""
+"""Files with measured BRDFs: .npz files of tables, or folders of MERL binaries."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
 from skindb.files import private_file
-from skindb.optics.brdf_table import DEFAULT_GRID, directional_albedo
-from skindb.optics.dictionary import Dictionary
-from skindb.optics.resample import hole_fraction, to_default_grid
+from skindb.reflectance.dictionary import Dictionary
+from skindb.reflectance.merl import read_merl_folder
+from skindb.reflectance.resample import hole_fraction, to_default_grid
+from skindb.reflectance.tables import DEFAULT_GRID, directional_albedo
 from skindb.types import Array
 
 TABLE = "basis_brdf"
@@ -23,6 +24,18 @@ NODES = ("theta_h", "theta_d", "phi_d")
 UNITS = ("sr-1", "sr^-1", "1/sr")
 # of the nodes above the horizon, above which a table is mostly extrapolated
 MAX_HOLE_FRACTION = 0.5
+
+
+def read_dictionary(path: str | Path) -> Dictionary:
+    """Read the dictionary in a folder of MERL binaries, an .npz file of tables, or the
+    folder `bases` of an export.
+    """
+    path = Path(path)
+    # bases.npz of an export stores its disc, the MERL files beside it do not
+    if path.is_dir():
+        inside = path / "bases.npz"
+        return read_tables(inside) if inside.is_file() else read_merl_folder(path)
+    return read_tables(path)
 
 
 def read_tables(path: str | Path) -> Dictionary:
@@ -114,7 +127,7 @@ def _load(path: Path) -> dict[str, NDArray[Any]]:
             )
         ) from None
     except (ValueError, TypeError, AttributeError, EOFError, zipfile.BadZipFile):
-        cure = "write it with skindb.optics.table_file.write_tables or numpy.savez"
+        cure = "write it with skindb.reflectance.table_file.write_tables or numpy.savez"
         raise InputError(
             Fault(
                 str(path), "must be an .npz file of plain arrays", "another file", cure

@@ -9,15 +9,10 @@ import mpmath
 import numpy as np
 import pytest
 
-from skindb.optics.abc_low2012 import PARAMETERS
 from skindb.optics.angles import directions, half_difference
-from skindb.optics.brdf_table import TableGrid, directional_albedo, lookup, tabulate
-from skindb.optics.dictionary import (
-    Dictionary,
-    convolve_disc,
-    embedded_dictionary,
-    evaluate_abc,
-)
+from skindb.reflectance.abc_low2012 import PARAMETERS, evaluate_abc
+from skindb.reflectance.dictionary import Dictionary, convolve_disc, embedded_dictionary
+from skindb.reflectance.tables import TableGrid, directional_albedo, lookup, tabulate
 
 ROWS = np.array(list(PARAMETERS.values()))
 SHARED = Path(__file__).resolve().parents[2] / ".." / "shared" / "data" / "brdf"

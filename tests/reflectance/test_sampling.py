@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from skindb.optics.brdf_sampling import LobeSampler, tangents
-from skindb.optics.brdf_table import TableGrid, tabulate
+from skindb.reflectance.sampling import LobeSampler, tangents
+from skindb.reflectance.tables import TableGrid, tabulate
 
 GRID = TableGrid(60, 40, 8)
 LEVEL = 1e-4  # probability with which a correct sampler fails one of the tests

@@ -1,4 +1,4 @@
-"""Compiled computation of basis rows; see `skindb.optics.rows` for shapes and sources."""
+"""Compiled computation of basis rows; see `skindb.reflectance.rows` for shapes and sources."""
 
 from __future__ import annotations
 

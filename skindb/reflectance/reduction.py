@@ -1,19 +1,109 @@
-"""Bounds on the error of mixtures of BRDFs whose tables are reduced to a linear space
-of few dimensions.
+"""Reduction of the tables of a dictionary to a linear space of few dimensions, and
+bounds on the error that this causes in mixtures.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb.optics.brdf_table import Table, TableGrid, brdf_metric
+from skindb.cache import cached_arrays
+from skindb.optics.angles import directions
+from skindb.reflectance.dictionary import SOURCES, Dictionary
+from skindb.reflectance.tables import Table, TableGrid, brdf_metric
 from skindb.types import Array
 
 FRANK_WOLFE_STEPS = 200  # each step gives a valid bound; 500 steps lower it by 1 %
 MIN_COSINE_SAMPLES = 0.1  # cosine to light and camera above which fits use samples
+
+
+def reduce_dictionary(table: Table, rank: int) -> tuple[Table, Array]:
+    """Linear space of `rank` dimensions that is nearest to the m tables.
+
+    Parameters
+    ----------
+    table
+        (nh, nd, np, m) sr^-1.
+    rank
+        Number of dimensions; with m or more, the tables are returned unchanged.
+
+    Returns
+    -------
+    reduced, lift
+        (nh, nd, np, rank) float32 and (rank, m) such that reduced @ lift approximates
+        the table by weighted least squares. All materials have the same weight (each is
+        scaled to unit norm), cells that of `_cell_weight`.
+
+    Notes
+    -----
+    For the 59 materials, convolved with a disc of 0.8 degrees, over all pairs of
+    directions above 6 degrees, the error at rank 16 is 0.6 % rms for the median
+    material and 1.8 % for the worst; with the inverse root of the mean alone, the worst
+    is 29 %. Fits of mixtures with 5 % noise have 0.25 % more residual than at full rank
+    (1.3 % with the inverse root alone).
+    """
+    m = table.shape[-1]
+    if rank >= m:
+        return table, np.eye(m)
+    cells = table.reshape(-1, m).astype(np.float64)
+    weighted = (
+        cells * _cell_weight(cells.mean(axis=1), TableGrid(*table.shape[:3]))[:, None]
+    )
+    norm = np.linalg.norm(weighted, axis=0)
+    scale = 1.0 / np.where(norm > 0, norm, 1.0)
+    weighted *= scale
+    _, vectors = np.linalg.eigh(weighted.T @ weighted)
+    vectors = vectors[:, ::-1][:, :rank]
+    reduced = (
+        (cells @ (scale[:, None] * vectors))
+        .astype(np.float32)
+        .reshape(*table.shape[:-1], rank)
+    )
+    return reduced, np.ascontiguousarray(vectors.T / scale)
+
+
+def _cell_weight(mean: Array, grid: TableGrid) -> Array:
+    """Weights of cells (nh nd np,) in the error of a reduction, from their mean over materials.
+
+    The inverse root of the mean is a compromise between absolute accuracy, which
+    highlights dominate, and relative accuracy, which noise dominates. The fourth root
+    of the measure of direction pairs is a compromise between equal weights of cells and
+    of samples. Cells with a direction below 3 degrees, which fits exclude, have no
+    weight.
+    """
+    th, td, pd = np.meshgrid(grid.theta_h, grid.theta_d, grid.phi_d, indexing="ij")
+    wi, wo = directions(th, td, pd)
+    # d omega_i d omega_o = 4 cos(theta_d) d omega_h d omega_d; d theta_h = 2
+    # sqrt(theta_h) d sqrt(theta_h)
+    pairs = np.sin(th) * np.sqrt(np.maximum(th, 1e-4)) * np.sin(td) * np.cos(td) + 1e-6
+    measure = np.maximum(wi[..., 2] * wo[..., 2], 0.0) * pairs
+    measure[np.minimum(wi[..., 2], wo[..., 2]) < 0.05] = 0.0
+    return np.asarray(measure.ravel() ** 0.25 / np.sqrt(np.maximum(mean, 1e-6)))
+
+
+@lru_cache(maxsize=2)
+def reduced_dictionary(
+    dictionary: Dictionary, rank: int, *, cube_roots: bool = False
+) -> tuple[Table, Array]:
+    """`reduce_dictionary` of the tables or of their cube roots; cached for the takes of a dome."""
+
+    def make() -> dict[str, NDArray[Any]]:
+        reduced, lift = reduce_dictionary(
+            np.cbrt(dictionary.table) if cube_roots else dictionary.table, rank
+        )
+        return {"reduced": reduced, "lift": lift}
+
+    # without a reduction, the result is not worth the space in the cache
+    if rank >= len(dictionary.names):
+        made = make()
+        return made["reduced"], made["lift"]
+    arguments = (dictionary.digest, rank, cube_roots)
+    found = cached_arrays("reduced-dictionary", arguments, sources=SOURCES, make=make)
+    return found["reduced"], found["lift"]
 
 
 @dataclass(frozen=True)

@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from skindb.optics import _row_kernels
 from skindb.optics.angles import half_difference
-from skindb.optics.brdf_table import DEFAULT_GRID, TableGrid, lookup
-from skindb.optics.dictionary import convolve_disc, embedded_dictionary
-from skindb.optics.rows import basis_rows, reduce_dictionary
+from skindb.reflectance import _row_kernels
+from skindb.reflectance.dictionary import convolve_disc, embedded_dictionary
+from skindb.reflectance.reduction import reduce_dictionary
+from skindb.reflectance.rows import basis_rows
+from skindb.reflectance.tables import DEFAULT_GRID, TableGrid, lookup
 
 # places in the table to 1e-7 of 30 cells, times the slope of random numbers
 SINGLE = 3e-5

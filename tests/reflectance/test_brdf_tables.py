@@ -6,7 +6,7 @@ import numpy as np
 from scipy.interpolate import RegularGridInterpolator
 
 from skindb.optics.angles import half_difference
-from skindb.optics.brdf_table import (
+from skindb.reflectance.tables import (
     DEFAULT_GRID,
     TableGrid,
     directional_albedo,

@@ -11,15 +11,13 @@ import pytest
 from scipy.interpolate import RegularGridInterpolator
 
 from skindb.errors import InputError
-from skindb.optics.abc_low2012 import PARAMETERS
 from skindb.optics.angles import half_difference
-from skindb.optics.brdf_table import DEFAULT_GRID, tabulate
-from skindb.optics.dictionary import Dictionary, convolve_disc
-from skindb.optics.measured import read_dictionary, read_merl_folder
-from skindb.optics.merl import SHAPE, write_merl
-from skindb.optics.merl_published import SHA256
-from skindb.optics.resample import resample
-from skindb.optics.table_file import read_tables, write_tables
+from skindb.reflectance.abc_low2012 import PARAMETERS
+from skindb.reflectance.dictionary import Dictionary, convolve_disc
+from skindb.reflectance.merl import SHA256, SHAPE, read_merl_folder, write_merl
+from skindb.reflectance.resample import resample
+from skindb.reflectance.table_file import read_dictionary, read_tables, write_tables
+from skindb.reflectance.tables import DEFAULT_GRID, tabulate
 
 
 def test_read_merl_folder__tables_of_a_known_brdf(tmp_path):

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb.optics.brdf_table import directional_albedo
+from skindb.reflectance.tables import directional_albedo
 from skindb.types import Array
 
 # fraction of directions drawn by the cosine alone, as tables have tails that do not

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from skindb.errors import InputError
-from skindb.optics.merl import SHAPE, read_merl, write_merl
+from skindb.reflectance.merl import SHAPE, read_merl, write_merl
 
 
 def _cells() -> np.ndarray:

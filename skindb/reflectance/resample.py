@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 
 from skindb.optics.angles import half_difference
-from skindb.optics.brdf_table import DEFAULT_GRID, Table, lookup
-from skindb.optics.dictionary import Origin, sample_pairs, weighted_error
+from skindb.reflectance.dictionary import Origin, sample_pairs, weighted_error
+from skindb.reflectance.tables import DEFAULT_GRID, Table, lookup
 from skindb.types import Array
 
 Nodes = tuple[Array, Array, Array]  # theta_h, theta_d, phi_d [rad]

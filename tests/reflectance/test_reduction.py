@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from skindb.optics.abc_low2012 import PARAMETERS
 from skindb.optics.angles import directions, half_difference
-from skindb.optics.brdf_table import TableGrid, brdf_metric, lookup, tabulate
-from skindb.optics.dictionary import evaluate_abc
-from skindb.optics.rows import reduce_dictionary
-from skindb.optics.truncation import nodes_above, truncation_bound
+from skindb.reflectance.abc_low2012 import PARAMETERS, evaluate_abc
+from skindb.reflectance.reduction import (
+    nodes_above,
+    reduce_dictionary,
+    truncation_bound,
+)
+from skindb.reflectance.tables import TableGrid, brdf_metric, lookup, tabulate
 
 GRID = TableGrid(24, 20, 8)
 # of a mixture: tables are single floats, mixed ones sums of terms up to a thousand

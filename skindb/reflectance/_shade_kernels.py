@@ -1,4 +1,4 @@
-"""Compiled shading of points under one light; see `skindb.optics.shade` for shapes,
+"""Compiled shading of points under one light; see `skindb.reflectance.shade` for shapes,
 units and sources.
 """
 
@@ -8,7 +8,7 @@ import math
 from typing import Any
 
 from skindb.jit import fast_kernel, inline_fast_kernel
-from skindb.optics._row_kernels import _angles
+from skindb.reflectance._row_kernels import _angles
 
 
 @inline_fast_kernel

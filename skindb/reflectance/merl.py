@@ -1,13 +1,154 @@
-"""SHA-256 of the hundred files of the MERL database, version 2 of February 2006
-(Matusik et al. 2003).
-
-MERL publishes no checksums. These are the Git LFS object names of the complete public
-copy in github.com/duanwenxi/Mitsuba-3-for-Photometric-Stereo-data, commit
-914294a081b1ef36e56f9392c2758bca24868e3a.
-"""
+"""MERL binary files of measured isotropic BRDFs (Matusik et al. 2003)."""
 
 from __future__ import annotations
 
+import hashlib
+from pathlib import Path
+
+import numpy as np
+
+from skindb.errors import Fault, InputError
+from skindb.files import private_file
+from skindb.reflectance.dictionary import Dictionary, Origin
+from skindb.reflectance.resample import to_default_grid
+from skindb.reflectance.tables import DEFAULT_GRID, Table
+from skindb.types import Array
+
+SHAPE = (90, 90, 180)  # theta_h (quadratic), theta_d, phi_d
+SCALE = np.array([1.0, 1.15, 1.66]) / 1500.0
+GENUINE = "genuine"
+DIFFERS = "differs from the published file of that name"
+UNKNOWN = "not in the published set"
+
+
+def read_merl(path: str | Path) -> tuple[Array, int]:
+    """Read one material.
+
+    Returns
+    -------
+    table, holes
+        (90, 90, 180, 3) sr^-1 over theta_h (bins quadratic), theta_d and phi_d in [0,
+        pi), and the number of cells with a negative channel. These were not measured
+        and are NaN in every channel.
+
+    Notes
+    -----
+    The reader that MERL provides takes bin floor(x). The value of bin i is thus for [i,
+    i + 1), and its centre is i + 1/2.
+    """
+    try:
+        data = Path(path).read_bytes()
+    except OSError as error:
+        fault = Fault(
+            str(path),
+            "must be a readable file",
+            str(error.strerror),
+            "choose a MERL .binary file",
+        )
+        raise InputError(fault) from None
+    dims = tuple(np.frombuffer(data[: min(len(data), 12) // 4 * 4], "<i4").tolist())
+    want = 12 + 8 * 3 * int(np.prod(SHAPE))
+    if dims != SHAPE or len(data) != want:
+        found = f"the header {dims} and {len(data)} bytes"
+        rule = f"a MERL binary must have the header {SHAPE} and {want} bytes"
+        raise InputError(Fault(str(path), rule, found, "download it again"))
+    values = np.frombuffer(data[12:], "<f8").reshape(3, *SHAPE)
+    wrong = int((~np.isfinite(values)).sum())
+    if wrong:
+        raise InputError(
+            Fault(
+                str(path),
+                "values must be finite",
+                f"{wrong} that are not",
+                "download it again",
+            )
+        )
+    table = np.moveaxis(values, 0, -1) * SCALE
+    hole = np.asarray((table < 0).any(axis=-1))
+    if hole.all():
+        rule = "some cells must be measured"
+        found = "only negative values"
+        raise InputError(Fault(str(path), rule, found, "download it again"))
+    return np.where(hole[..., None], np.nan, table), int(hole.sum())
+
+
+def write_merl(path: str | Path, table: Array) -> None:
+    """Write a table (90, 90, 180, 3) in sr^-1, whose values must be finite and non-negative."""
+    table = np.asarray(table, np.float64)
+    wrong = int((~(np.isfinite(table) & (table >= 0))).sum())
+    if table.shape != (*SHAPE, 3) or wrong:
+        found = f"the shape {table.shape} and {wrong} other values"
+        raise ValueError(
+            f"a MERL table must have the shape {(*SHAPE, 3)}, finite and "
+            f"non-negative; found {found}"
+        )
+    values = np.ascontiguousarray(np.moveaxis(table / SCALE, -1, 0))
+    private_file(path).write_bytes(
+        np.array(SHAPE, "<i4").tobytes() + values.astype("<f8").tobytes()
+    )
+
+
+def read_merl_folder(path: str | Path) -> Dictionary:
+    """Read every `*.binary` file of a folder, in the order of their names, resampled to
+    the default grid.
+
+    Cells without a measurement take the value at the next smaller theta_d.
+
+    Raises
+    ------
+    InputError
+        With the faults of all damaged files.
+    """
+    files = sorted(Path(path).glob("*.binary"))
+    if not files:
+        rule = "the folder must contain MERL .binary files"
+        cure = "choose their folder, or an .npz file of tables"
+        raise InputError(Fault(str(path), rule, "none", cure))
+    # centres of bins; theta_h is quadratic
+    h, d, p = ((np.arange(n) + 0.5) / n for n in SHAPE)
+    nodes = (h**2 * np.pi / 2, d * np.pi / 2, p * np.pi)
+    tables: list[Table] = []
+    origins: list[Origin] = []
+    faults: list[Fault] = []
+    for file in files:
+        try:
+            table, origin = to_default_grid(
+                read_merl(file)[0].mean(axis=-1), nodes, *_publication_check(file)
+            )
+        except InputError as error:
+            faults.extend(error.faults)
+        else:
+            tables.append(table)
+            origins.append(origin)
+    if faults:
+        raise InputError(faults)
+    names = tuple(file.stem for file in files)
+    return Dictionary(
+        names,
+        np.stack(tables, axis=-1),
+        DEFAULT_GRID,
+        Path(path).resolve().name,
+        origins=tuple(origins),
+    )
+
+
+def _publication_check(file: Path) -> tuple[str, str]:
+    """Whether a file is the published one, in words, and its SHA-256."""
+    with file.open("rb") as data:
+        found = hashlib.file_digest(data, "sha256").hexdigest()
+    if found in SHA256.values():
+        name = next(name for name, value in SHA256.items() if value == found)
+        return (
+            GENUINE if name == file.stem else f"published under the name {name}",
+            found,
+        )
+    return DIFFERS if file.stem in SHA256 else UNKNOWN, found
+
+
+# SHA-256 of the hundred files of the database, version 2 of February 2006. MERL
+# publishes no checksums. These are the Git LFS object names of the complete public copy
+# in github.com/duanwenxi/Mitsuba-3-for-Photometric-Stereo-data, commit
+# 914294a081b1ef36e56f9392c2758bca24868e3a.
 SHA256: dict[str, str] = {
     "alum-bronze": "d6506c69e44430bfe8ea676f3950599ca3a6bfb1f46b9906da336d13991bd37d",
     "alumina-oxide": "c3e49d638d96245845b5361ccec502af69923bbedd09b74a0a058e3f6e9e90fc",

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import RegularGridInterpolator
 
-from skindb.optics.shade import shade_points
+from skindb.reflectance.shade import shade_points
 
 ETA = 1.3
 FLOAT32 = 2e-6  # relative: tables and results are float32, eight corners are summed

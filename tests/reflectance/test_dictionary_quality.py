@@ -8,18 +8,17 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from skindb.optics.abc_low2012 import PARAMETERS
 from skindb.optics.angles import half_difference
-from skindb.optics.brdf_table import DEFAULT_GRID, TableGrid, lookup, tabulate
-from skindb.optics.dictionary import (
+from skindb.reflectance.abc_low2012 import PARAMETERS, evaluate_abc
+from skindb.reflectance.dictionary import (
     Dictionary,
     average_disc,
     convolve_disc,
+    dictionary_quality,
     embedded_dictionary,
-    evaluate_abc,
     sample_pairs,
 )
-from skindb.optics.dictionary_quality import dictionary_quality
+from skindb.reflectance.tables import DEFAULT_GRID, TableGrid, lookup, tabulate
 
 DISC = np.radians(0.8)
 NAMES = tuple(PARAMETERS)

@@ -1,0 +1,1 @@
+"""Models of the reflection at the surface of skin: tables, dictionaries, mixtures, fits."""
