@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from skindb.ingest.frames import FrameKind
-from skindb.ingest.radiance import merge_exposures
-from skindb.ingest.sensor import SensorRecord
+from skindb.calibration.radiance import merge_exposures
+from skindb.format.frames import FrameKind
+from skindb.format.sensor import SensorRecord
 
 SIDE = 512  # px
 SENSOR = SensorRecord(

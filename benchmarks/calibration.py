@@ -18,14 +18,14 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from skindb.calibration.irradiance import light_intensities
+from skindb.calibration.pixel_flags import SATURATED
+from skindb.calibration.radiance import frame_mergers, read_view
+from skindb.format.devices import DomeRecord
+from skindb.format.folder import read_capture
 from skindb.geometry.rays import RayScene
-from skindb.ingest.calibration import CalibrationCheck
-from skindb.ingest.calibration_checks import calibration_faults, calibration_notes
-from skindb.ingest.devices import DomeRecord
-from skindb.ingest.folder import read_capture
-from skindb.ingest.irradiance import light_intensities
-from skindb.ingest.pixel_flags import SATURATED
-from skindb.ingest.radiance import frame_mergers, read_view
+from skindb.ingest.consistency import CalibrationCheck
+from skindb.ingest.consistency_checks import calibration_faults, calibration_notes
 from skindb.ingest.surfels import SurfelSet, build_surfels
 from skindb.ingest.visibility import camera_visibility, light_visibility
 

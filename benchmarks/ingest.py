@@ -22,11 +22,11 @@ from typing import Any
 from stages import Stages, stage_lines
 
 import skindb
-from skindb.ingest.devices import promised_frames
-from skindb.ingest.folder import read_capture
-from skindb.ingest.frames import FrameKind, read_frame
+from skindb.format.devices import promised_frames
+from skindb.format.folder import read_capture
+from skindb.format.frames import FrameKind, read_frame
+from skindb.ingest.capture import threads
 from skindb.ingest.report import sample_lines
-from skindb.ingest.run import threads
 from skindb.workflow import ingest_take
 
 

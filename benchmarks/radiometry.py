@@ -16,14 +16,14 @@ from pathlib import Path
 import imagecodecs
 import numpy as np
 
-from skindb.ingest.folder import read_capture
-from skindb.ingest.frames import read_frame
-from skindb.ingest.irradiance import light_intensities, target_pixels
-from skindb.ingest.light_calibration import calibrate_lights
-from skindb.ingest.mirror_ball import ball_outline, distant_light, highlight_centre
-from skindb.ingest.radiance import frame_mergers, merge_exposures, read_view
-from skindb.ingest.response import ResponseOptions, recover_response
-from skindb.ingest.white_target import TargetPixels, fit_light
+from skindb.calibration.irradiance import light_intensities, target_pixels
+from skindb.calibration.lights import calibrate_lights
+from skindb.calibration.mirror_ball import ball_outline, distant_light, highlight_centre
+from skindb.calibration.radiance import frame_mergers, merge_exposures, read_view
+from skindb.calibration.response import ResponseOptions, recover_response
+from skindb.calibration.white_target import TargetPixels, fit_light
+from skindb.format.folder import read_capture
+from skindb.format.frames import read_frame
 
 # of radiance, where 0 is the white level of the longest exposure
 OCTAVES = range(-9, 1)

@@ -27,9 +27,9 @@ from scipy.spatial import cKDTree
 from skindb.analysis import correspondence_error, mask_agreement, register
 from skindb.analysis.masks import own_masks, region_masks
 from skindb.analysis.registration import unregistered
+from skindb.format.folder import read_capture
 from skindb.geometry.atlas import disc_atlas
 from skindb.geometry.clean import clean_mesh
-from skindb.ingest.folder import read_capture
 from skindb.ingest.groups import mesh_group, surfel_group
 from skindb.ingest.surfels import build_surfels
 from skindb.schema import dataset

@@ -14,7 +14,7 @@ import argparse
 
 import numpy as np
 
-from skindb.ingest.response import recover_response
+from skindb.calibration.response import recover_response
 
 BLACK = 1024.0
 WHITE = 65520.0

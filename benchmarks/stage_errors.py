@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 import skindb
+from skindb.calibration.irradiance import light_falloff
+from skindb.calibration.radiance import frame_mergers, read_view
+from skindb.format.devices import DomeRecord
+from skindb.format.folder import read_capture
 from skindb.geometry.camera import project
 from skindb.geometry.nearest import closest_on_mesh
 from skindb.geometry.texture import bilinear
-from skindb.ingest.devices import DomeRecord
-from skindb.ingest.folder import read_capture
-from skindb.ingest.irradiance import light_falloff
-from skindb.ingest.radiance import frame_mergers, read_view
 from skindb.render.image import read_exr
 from skindb.virtual.truth import recovered_against_true
 

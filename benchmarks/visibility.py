@@ -26,11 +26,11 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from skindb.format.devices import CameraRecord, LightRecord
+from skindb.format.folder import read_capture
 from skindb.geometry._ring_kernels import grown, mixed
 from skindb.geometry.rays import RayScene
 from skindb.geometry.splats import PIXEL, THRESHOLD, SplatScene
-from skindb.ingest.devices import CameraRecord, LightRecord
-from skindb.ingest.folder import read_capture
 from skindb.ingest.surfels import SurfelSet, build_surfels
 from skindb.ingest.visibility import camera_visibility, disc_points, light_visibility
 

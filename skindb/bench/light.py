@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skindb.bench.curve import Curve, Point, cpu_time
-from skindb.ingest.frames import FrameKind
-from skindb.ingest.pixel_flags import OK
-from skindb.ingest.radiance import merge_exposures
-from skindb.ingest.sensor import SensorRecord
+from skindb.calibration.pixel_flags import OK
+from skindb.calibration.radiance import merge_exposures
+from skindb.format.frames import FrameKind
+from skindb.format.sensor import SensorRecord
 from skindb.optics.angles import directions, half_difference
 from skindb.optics.diffuse import diffuse_reflectance, dipole_s, scattering_coefficients
 from skindb.optics.dipole import dipole_profile

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skindb.errors import InputError
+from skindb.format.frames import is_linear, read_frame
 from skindb.hw.sequence import DARK, Schedule
-from skindb.ingest.frames import is_linear, read_frame
 
 THREADS = 2
 MIN_NEIGHBOURS = 3

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from skindb.clock import SYSTEM_CLOCK, Clock
 from skindb.errors import Fault, InputError, system_fault
-from skindb.ingest.frames import frame_size
+from skindb.format.frames import frame_size
 
 FRAME_SUFFIXES = (".png", ".tif", ".tiff", ".exr")
 LOOK_SECONDS = 0.05  # interval at which the folders are polled

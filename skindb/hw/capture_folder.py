@@ -16,12 +16,7 @@ from typing import Any
 import numpy as np
 
 from skindb.errors import Fault, InputError, system_fault
-from skindb.hw.probe import Reading
-from skindb.hw.safety import partial_schedule
-from skindb.hw.sequence import DARK, Schedule, sequence_entry
-from skindb.hw.session import DomeRun, SiteRun
-from skindb.hw.unfinished import UNFINISHED, Unfinished, digest
-from skindb.ingest.frames import (
+from skindb.format.frames import (
     Frame,
     FrameKind,
     frame_size,
@@ -29,7 +24,12 @@ from skindb.ingest.frames import (
     read_frame,
     write_frame,
 )
-from skindb.ingest.json_file import read_json
+from skindb.format.json_file import read_json
+from skindb.hw.probe import Reading
+from skindb.hw.safety import partial_schedule
+from skindb.hw.sequence import DARK, Schedule, sequence_entry
+from skindb.hw.session import DomeRun, SiteRun
+from skindb.hw.unfinished import UNFINISHED, Unfinished, digest
 
 FRAMES = "dome/frames/{exposure}/{light}_{camera}"  # without the suffix of the files
 SITE_FRAMES = "contact/{site}/{exposure}-{placement}"

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from skindb.errors import Fault, InputError
+from skindb.format.json_file import read_json
 from skindb.hw.sequence import Schedule, Step
-from skindb.ingest.json_file import read_json
 
 UNFINISHED = "unfinished.json"  # removed when the capture is complete
 STEP_KEYS = {"light", "exposure", "t_on", "t_off", "trigger_count"}

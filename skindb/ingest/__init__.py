@@ -1,7 +1,8 @@
 """Ingest: from a capture folder to reflectance samples at the surfels of the scan."""
 
+from skindb.format.folder import Capture, read_capture
 from skindb.geometry.crop import Crop
-from skindb.ingest.folder import Capture, read_capture
+from skindb.ingest.capture import IngestParameters, ingest_capture, scratch_name
 from skindb.ingest.report import (
     calibration_lines,
     calibration_table,
@@ -9,7 +10,6 @@ from skindb.ingest.report import (
     sample_lines,
     sample_table,
 )
-from skindb.ingest.run import IngestParameters, ingest_capture, scratch_name
 
 __all__ = [
     "Capture",

@@ -11,7 +11,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from skindb.ingest.pixel_flags import DARK, DARK_SIGMA, OK, SATURATED
+from skindb.calibration.pixel_flags import DARK, DARK_SIGMA, OK, SATURATED
 from skindb.jit import inline_kernel, kernel
 
 # outcomes of a sample besides those of a pixel: usable, but no pixel has two exposures;
@@ -56,7 +56,7 @@ def develop(
     usable: Any,
 ) -> None:
     """Merge the exposures of one view to radiance with the formulas of
-    `skindb.ingest.radiance.merge_exposures`.
+    `skindb.calibration.radiance.merge_exposures`.
 
     The picture is processed row by row, so that intermediate values stay in the cache.
     Loops have few branches and few arrays: LLVM does not vectorise a loop for which it
@@ -91,7 +91,7 @@ def develop(
     flag
         (h, w) uint8 output; SATURATED outside the spans, where no sample uses the pixel.
     usable
-        (h, w) uint8 zeros, output: see `skindb.ingest.radiance.usable_exposures`; or (0, 0).
+        (h, w) uint8 zeros, output: see `skindb.calibration.radiance.usable_exposures`; or (0, 0).
     """
     count, (height, width) = len(frames), flag.shape
     signal = np.empty((count, 3 * width), np.float32)

@@ -9,15 +9,15 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from skindb.calibration.radiance import Image
+from skindb.format.devices import DomeRecord, ProbeRecord
+from skindb.format.folder import Capture
+from skindb.format.sequence import SequenceRecord
 from skindb.geometry.camera import camera_centre
 from skindb.geometry.distortion import distortion
-from skindb.ingest.calibration import Calibration
-from skindb.ingest.devices import DomeRecord, ProbeRecord
-from skindb.ingest.folder import Capture
+from skindb.ingest.consistency import Calibration
 from skindb.ingest.lumitexels import FULL_SHADOW, MIN_LIT_FRACTION, Lumitexels
-from skindb.ingest.probe import Profiles
-from skindb.ingest.radiance import Image
-from skindb.ingest.sequence import SequenceRecord
+from skindb.ingest.probe_profiles import Profiles
 from skindb.ingest.surfels import SurfelSet, transferred_landmarks
 from skindb.schema import dataset
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb.ingest.photo_consistency import FLOOR, ReducedView, bilinear
+from skindb.ingest.photo_offsets import FLOOR, ReducedView, bilinear
 
 Array = NDArray[np.float64]
 # of the largest irradiance in a view, above which a surfel is compared

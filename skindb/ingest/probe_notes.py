@@ -9,11 +9,15 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from skindb.calibration.isotropy import (
+    MIN_AZIMUTHS,
+    MIN_SIGNAL_TO_NOISE,
+    compare_azimuths,
+)
 from skindb.errors import InputError
-from skindb.ingest.device_checks import USUAL_PRESSURES_KPA
-from skindb.ingest.devices import ProbeRecord
-from skindb.ingest.isotropy import MIN_AZIMUTHS, MIN_SIGNAL_TO_NOISE, compare_azimuths
-from skindb.ingest.probe import Profiles
+from skindb.format.device_checks import USUAL_PRESSURES_KPA
+from skindb.format.devices import ProbeRecord
+from skindb.ingest.probe_profiles import Profiles
 
 Array = NDArray[np.float64]
 # within a placement; more presses blood out of the skin, or indicates a leak

@@ -13,8 +13,8 @@ import numpy as np
 
 from skindb import __version__
 from skindb.errors import Fault, InputError
-from skindb.ingest.devices import DomeRecord, ProbeRecord, promised_frames
-from skindb.ingest.folder import Capture
+from skindb.format.devices import DomeRecord, ProbeRecord, promised_frames
+from skindb.format.folder import Capture
 
 FRAMES = "frames"  # name of the digest over all frames
 

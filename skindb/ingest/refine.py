@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from skindb.format.devices import CameraRecord, DomeRecord
 from skindb.geometry.camera import project
-from skindb.ingest.calibration import CalibrationCheck, Pair
-from skindb.ingest.devices import CameraRecord, DomeRecord
-from skindb.ingest.photo_consistency import Offset
+from skindb.ingest.consistency import CalibrationCheck, Pair
+from skindb.ingest.photo_offsets import Offset
 
 Array = NDArray[np.float64]
 ROUNDS = 2  # a third round shifted the photographs of four captures by at most 0.06 mm

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from skindb.ingest.devices import DomeRecord
-from skindb.ingest.folder import WHOLE_SURFACE
+from skindb.format.devices import DomeRecord
+from skindb.format.folder import WHOLE_SURFACE
 from skindb.ingest.lumitexels import Lumitexels
 from skindb.ingest.surfels import SurfelSet
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skindb.errors import Fault
-from skindb.ingest.devices import DomeRecord
+from skindb.format.devices import DomeRecord
 
 Array = NDArray[np.float64]
 MIN_MEDIAN_SAMPLES = 50  # of a view, for a reliable median

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb.ingest.devices import CameraRecord, DomeRecord
-from skindb.ingest.radiance import read_sigma, vignette_gain
+from skindb.calibration.radiance import read_sigma, vignette_gain
+from skindb.format.devices import CameraRecord, DomeRecord
 
 Array = NDArray[np.float64]
 # number of radiances up to the white level at which the linear model is fitted to the

@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
+from skindb.format.folder import Capture
+from skindb.format.scan_checks import LANDMARK_REACH, SITE_LANDMARK
 from skindb.geometry.atlas import disc_atlas
 from skindb.geometry.clean import CleanMesh
 from skindb.geometry.nearest import closest_on_mesh
@@ -21,8 +23,6 @@ from skindb.geometry.surfels import (
     vertex_areas,
     vertex_normals,
 )
-from skindb.ingest.folder import Capture
-from skindb.ingest.scan_checks import LANDMARK_REACH, SITE_LANDMARK
 
 Array = NDArray[np.float64]
 MAX_SURFELS = 2_500_000  # the samples of this many surfels in a full dome take 36 GB

@@ -9,12 +9,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from skindb.format.devices import CameraRecord, LightRecord
 from skindb.geometry._depth_kernels import matches_tangent_plane
 from skindb.geometry._ring_kernels import grown, mixed
 from skindb.geometry.camera import camera_centre, pixel_rays, project
 from skindb.geometry.rays import RayScene
 from skindb.geometry.splats import THRESHOLD, SplatScene
-from skindb.ingest.devices import CameraRecord, LightRecord
 from skindb.ingest.surfels import SurfelSet
 
 Array = NDArray[np.float64]

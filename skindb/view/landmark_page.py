@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from skindb.errors import InputError
+from skindb.format.crop_file import crop_path, parsed_crop
 from skindb.geometry.crop import Crop
 from skindb.geometry.landmark_suggestions import suggest_landmarks
 from skindb.geometry.surfels import vertex_normals
-from skindb.ingest.crop_file import crop_path, parsed_crop
 from skindb.view.landmarks import (
     LandmarkTask,
     landmark_mistakes,

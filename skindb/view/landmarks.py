@@ -16,20 +16,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
-from skindb.geometry.clean import CleanMesh, clean_mesh
-from skindb.geometry.crop import Crop
-from skindb.geometry.landmark_suggestions import MEAN_FACE
-from skindb.geometry.nearest import closest_on_mesh
-from skindb.geometry.scan import Scan, read_colours, read_scan
-from skindb.ingest.crop_file import crop_path, is_point, parsed_crop
-from skindb.ingest.json_file import read_json
-from skindb.ingest.scan_checks import (
+from skindb.format.crop_file import crop_path, is_point, parsed_crop
+from skindb.format.json_file import read_json
+from skindb.format.scan_checks import (
     coincidence_faults,
     discarded_piece_faults,
     face_fault,
     order_fault,
     swapped_faults,
 )
+from skindb.geometry.clean import CleanMesh, clean_mesh
+from skindb.geometry.crop import Crop
+from skindb.geometry.landmark_suggestions import MEAN_FACE
+from skindb.geometry.nearest import closest_on_mesh
+from skindb.geometry.scan import Scan, read_colours, read_scan
 from skindb.limits import MAX_JSON_BYTES
 
 Points = Mapping[str, NDArray[np.float64]]

@@ -12,23 +12,23 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from skindb.errors import Fault, InputError
-from skindb.ingest.camera_calibration import calibrate_cameras, calibrated_cameras
-from skindb.ingest.camera_frames import read_calibration_frames
-from skindb.ingest.devices import DomeRecord
-from skindb.ingest.folder import Capture
-from skindb.ingest.light_calibration import (
+from skindb.calibration.cameras import calibrate_cameras, calibrated_cameras
+from skindb.calibration.fibres import (
+    calibrate_probe,
+    calibrated_probe,
+    read_flat_frames,
+)
+from skindb.calibration.light_positions import calibrate_positions, positioned_dome
+from skindb.calibration.lights import (
     POSITION_ERROR_MM,
     calibrate_lights,
     calibrated_dome,
     read_setup_dome,
 )
-from skindb.ingest.light_positions import calibrate_positions, positioned_dome
-from skindb.ingest.probe_calibration import (
-    calibrate_probe,
-    calibrated_probe,
-    read_flat_frames,
-)
+from skindb.calibration.setup import read_calibration_frames
+from skindb.errors import Fault, InputError
+from skindb.format.devices import DomeRecord
+from skindb.format.folder import Capture
 from skindb.store import CALIBRATION, Database, Record, require_text
 from skindb.workflow.audit import logged_action
 from skindb.workflow.provenance import provenance

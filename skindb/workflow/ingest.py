@@ -11,6 +11,7 @@ from typing import Any
 
 from skindb.errors import Fault, InputError, add_filename
 from skindb.files import private_file
+from skindb.format.json_file import read_json
 from skindb.ingest import (
     Capture,
     Crop,
@@ -19,7 +20,6 @@ from skindb.ingest import (
     read_capture,
     scratch_name,
 )
-from skindb.ingest.json_file import read_json
 from skindb.ingest.spool import remove_stale
 from skindb.schema.consent import CONSENT, require_consent
 from skindb.store import Database, Record, WithdrawnError, subject_of

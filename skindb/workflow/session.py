@@ -14,9 +14,13 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from skindb.calibration.lights import read_setup_dome
 from skindb.clock import SYSTEM_CLOCK, SimulatedClock
 from skindb.errors import Fault, InputError
 from skindb.files import make_private, private_file, private_umask
+from skindb.format.fields import IDENTIFIER
+from skindb.format.folder import read_capture, record_faults
+from skindb.format.json_file import read_json
 from skindb.geometry.scan import read_scan
 from skindb.hw.cameras import FolderCameras
 from skindb.hw.capture import CapturePlan, Devices, planned_schedule, run_capture
@@ -25,10 +29,6 @@ from skindb.hw.dome import Dome
 from skindb.hw.link import Link, open_port
 from skindb.hw.probe import Probe
 from skindb.hw.safety import Override, Rehearsal, alternatives, assess
-from skindb.ingest.fields import IDENTIFIER
-from skindb.ingest.folder import read_capture, record_faults
-from skindb.ingest.json_file import read_json
-from skindb.ingest.light_calibration import read_setup_dome
 from skindb.types import Progress
 from skindb.virtual.devices import GAUGE_FAULTS, DeviceFaults
 from skindb.virtual.laboratory import Laboratory, LaboratoryFaults

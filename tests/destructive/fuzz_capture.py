@@ -31,9 +31,9 @@ from sphere import BLACK, SECONDS, WHITE, write_capture
 
 import skindb
 import skindb.cli
-import skindb.ingest.run
+import skindb.ingest.capture
+from skindb.format.frames import read_frame, write_frame
 from skindb.ingest import sample_lines
-from skindb.ingest.frames import read_frame, write_frame
 
 COMPARED = {
     "samples": ("reflectance_sample", "sample_count"),

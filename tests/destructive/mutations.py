@@ -204,7 +204,7 @@ def swap(path: Path, rng: np.random.Generator) -> str:
 
 
 def picture(path: Path, rng: np.random.Generator) -> str:
-    from skindb.ingest.frames import read_frame, write_frame
+    from skindb.format.frames import read_frame, write_frame
 
     frame = read_frame(path)
     what = str(

@@ -13,15 +13,17 @@ import pytest
 from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
+from skindb.calibration.irradiance import light_intensities
+from skindb.calibration.pixel_flags import SATURATED
+from skindb.calibration.radiance import frame_mergers, read_view
 from skindb.errors import InputError
+from skindb.format.folder import read_capture
 from skindb.geometry.rays import RayScene
 from skindb.ingest import IngestParameters, ingest_capture
-from skindb.ingest.calibration import CalibrationCheck
-from skindb.ingest.calibration_checks import calibration_faults, calibration_notes
-from skindb.ingest.folder import read_capture
-from skindb.ingest.irradiance import light_intensities
+from skindb.ingest.consistency import CalibrationCheck
+from skindb.ingest.consistency_checks import calibration_faults, calibration_notes
 from skindb.ingest.photo_brightness import relative_brightness
-from skindb.ingest.photo_consistency import (
+from skindb.ingest.photo_offsets import (
     ReducedView,
     bilinear,
     camera_offset,
@@ -30,8 +32,6 @@ from skindb.ingest.photo_consistency import (
     reduced,
     square_root_image,
 )
-from skindb.ingest.pixel_flags import SATURATED
-from skindb.ingest.radiance import frame_mergers, read_view
 from skindb.ingest.refine import applied_rotations, refine_cameras
 from skindb.ingest.surfels import build_surfels
 from skindb.ingest.visibility import camera_visibility, light_visibility

@@ -12,9 +12,9 @@ import pytest
 from sphere import FIBRES, LIGHTS, PROBE_R, SECONDS
 
 from skindb.errors import InputError
+from skindb.format.folder import read_capture
 from skindb.ingest import ingest_capture
-from skindb.ingest.folder import read_capture
-from skindb.ingest.probe import combine_placements, fibre_profiles
+from skindb.ingest.probe_profiles import combine_placements, fibre_profiles
 from skindb.schema import GROUPS, check
 
 OVERRIDE = {

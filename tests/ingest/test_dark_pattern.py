@@ -7,11 +7,11 @@ import pytest
 from sphere import BLACK, CAMERAS, HEIGHT, LIGHTS, SECONDS, WIDTH, save
 from spoil import D, put
 
+from skindb.calibration.dark_pattern import dark_pattern_fault
+from skindb.calibration.radiance import frame_mergers
 from skindb.errors import InputError
+from skindb.format.frames import read_frame
 from skindb.ingest import read_capture
-from skindb.ingest.dark_pattern import dark_pattern_fault
-from skindb.ingest.frames import read_frame
-from skindb.ingest.radiance import frame_mergers
 from skindb.store import Database
 from skindb.workflow import ingest_take
 

@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from skindb.calibration.dark_frames import average_dark
 from skindb.errors import InputError
-from skindb.ingest.dark_frames import average_dark
 
 
 def test_average_dark__marks_hot_stuck_and_noisy_pixels():

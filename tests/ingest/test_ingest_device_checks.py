@@ -11,7 +11,7 @@ from spoil import D, P, drop, edited, put
 
 from skindb.errors import InputError
 from skindb.ingest import read_capture
-from skindb.ingest.probe import fibre_profiles
+from skindb.ingest.probe_profiles import fibre_profiles
 
 
 def fibres(key, *values):

@@ -13,9 +13,9 @@ import trimesh
 from sphere import RADIUS, half_sphere
 
 from skindb.errors import InputError
+from skindb.format.dome_checks import unit_fault
 from skindb.geometry.clean import CleanMesh, clean_mesh
 from skindb.ingest import read_capture
-from skindb.ingest.dome_checks import unit_fault
 
 OTHERS = {  # mm to this unit, and what is said of it
     0.1: "centimetres: multiply {} by 10",

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from skindb.calibration.fibre_spots import Spots, fibre_gain, find_fibres, match_fibres
 from skindb.errors import InputError
-from skindb.ingest.fibre_spots import Spots, fibre_gain, find_fibres, match_fibres
 
 
 def fibre_picture(rng, noise=0.005):

@@ -16,7 +16,8 @@ import trimesh
 from spoil import C, D, P, drop, edit, edited, put
 
 from skindb.errors import InputError
-from skindb.ingest import devices, folder, pressure, read_capture, sensor, sequence
+from skindb.format import devices, folder, pressure, sensor, sequence
+from skindb.ingest import read_capture
 
 
 def save_png(name, shape, dtype):

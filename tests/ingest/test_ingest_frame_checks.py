@@ -26,12 +26,12 @@ from sphere import (
 )
 from spoil import D, P, edit, put
 
+from skindb.calibration.frame_checks import highest_value, level_notes, view_faults
+from skindb.calibration.irradiance import unevenness
+from skindb.calibration.radiance import FrameMerger, read_view
 from skindb.errors import InputError
+from skindb.format.frames import write_frame
 from skindb.ingest import read_capture
-from skindb.ingest.frame_checks import highest_value, level_notes, view_faults
-from skindb.ingest.frames import write_frame
-from skindb.ingest.irradiance import unevenness
-from skindb.ingest.radiance import FrameMerger, read_view
 from skindb.store import Database
 from skindb.workflow import ingest_take
 

@@ -9,7 +9,7 @@ import pytest
 import tifffile
 
 from skindb.errors import InputError
-from skindb.ingest.frames import (
+from skindb.format.frames import (
     FrameKind,
     UnreadableError,
     _require_chunks,

@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 from sphere import TARGET
 
-from skindb.errors import InputError
-from skindb.geometry.camera import project
-from skindb.ingest.devices import CameraRecord, WhiteRecord
-from skindb.ingest.folder import read_capture
-from skindb.ingest.irradiance import (
+from skindb.calibration.irradiance import (
     PIXELS_PER_BLOCK,
     TARGET_INTERIOR_FRACTION,
     light_intensities,
     target_pixels,
 )
-from skindb.ingest.radiance import frame_mergers
+from skindb.calibration.radiance import frame_mergers
+from skindb.errors import InputError
+from skindb.format.devices import CameraRecord, WhiteRecord
+from skindb.format.folder import read_capture
+from skindb.geometry.camera import project
 
 Z = 900.0
 FOCAL = 2000.0

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from skindb.calibration.isotropy import compare_azimuths
 from skindb.errors import InputError
-from skindb.ingest.isotropy import compare_azimuths
 
 DISTANCE = 1 + 0.5 * np.arange(28)
 AZIMUTH = 2 * np.pi * np.arange(16) / 16

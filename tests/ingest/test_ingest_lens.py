@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from skindb.calibration.lens import fit_edge, veiling_glare
 from skindb.errors import InputError
-from skindb.ingest.lens import fit_edge, veiling_glare
 
 
 def edge_picture(blur, rng, *, shape=(80, 64), noise=0.002, slant=0.09):

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from mirror import ball_outline_of, ball_picture
 
+from skindb.calibration.light_positions import calibrate_positions, positioned_dome
+from skindb.calibration.lights import read_setup_dome
+from skindb.calibration.mirror_ball import Pinhole, ball_centre
+from skindb.calibration.setup import read_calibration_frames
 from skindb.errors import InputError
-from skindb.ingest.camera_frames import read_calibration_frames
-from skindb.ingest.light_calibration import read_setup_dome
-from skindb.ingest.light_positions import calibrate_positions, positioned_dome
-from skindb.ingest.mirror_ball import Pinhole, ball_centre
 
 RADIUS = 30.0
 LIGHTS = {

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from sphere import ALBEDO, BLACK, INTENSITY, WHITE, save
 
+from skindb.calibration.radiance import frame_merger
+from skindb.format.folder import read_capture
 from skindb.geometry.rays import RayScene
 from skindb.geometry.surfels import vertex_areas
-from skindb.ingest.folder import read_capture
+from skindb.ingest.capture import MAX_THREADS
 from skindb.ingest.lumitexels import (
     LINEAR_NOISE_FLOOR,
     PIXEL_VARIANCE_PX2,
@@ -22,14 +24,12 @@ from skindb.ingest.lumitexels import (
     noise_floor,
     sample_lumitexels,
 )
-from skindb.ingest.radiance import frame_merger
 from skindb.ingest.report import (
     cleaning_lines,
     describe_samples,
     sample_lines,
     sample_table,
 )
-from skindb.ingest.run import MAX_THREADS
 from skindb.ingest.spool import Spool
 from skindb.ingest.surfels import SurfelSet, build_surfels
 from skindb.ingest.visibility import camera_visibility

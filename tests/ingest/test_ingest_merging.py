@@ -7,9 +7,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from skindb.ingest.frames import FrameKind
-from skindb.ingest.radiance import merge_exposures, usable_exposures
-from skindb.ingest.sensor import SensorRecord
+from skindb.calibration.radiance import merge_exposures, usable_exposures
+from skindb.format.frames import FrameKind
+from skindb.format.sensor import SensorRecord
 
 BLACK = 1024.0
 WHITE = 65520.0

@@ -8,9 +8,7 @@ import pytest
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
-from skindb.errors import InputError
-from skindb.geometry.camera import camera_centre, project
-from skindb.ingest.mirror_ball import (
+from skindb.calibration.mirror_ball import (
     Outline,
     Pinhole,
     ball_outline,
@@ -20,6 +18,8 @@ from skindb.ingest.mirror_ball import (
     reflected_ray,
     reprojection_error,
 )
+from skindb.errors import InputError
+from skindb.geometry.camera import camera_centre, project
 
 PUBLISHED = Path("/work/shared/data/photometric/uw")
 RADIUS = 25.0  # mm

@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from skindb.calibration.sensor_noise import fit_noise
 from skindb.errors import InputError
-from skindb.ingest.noise_model import fit_noise
 
 
 def flat_pairs(

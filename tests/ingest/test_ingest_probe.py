@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from sphere import WHITE
 
-from skindb.ingest.folder import read_capture
-from skindb.ingest.probe import fibre_pixels, fibre_profiles
+from skindb.format.folder import read_capture
+from skindb.ingest.probe_profiles import fibre_pixels, fibre_profiles
 
 
 def _spoil(probe, fibre, count, channel):

@@ -13,15 +13,15 @@ from click.testing import CliRunner
 
 import skindb
 from skindb import workflow
-from skindb.cli import cli
-from skindb.errors import InputError
-from skindb.ingest.devices import read_probe
-from skindb.ingest.fields import Fields
-from skindb.ingest.probe_calibration import (
+from skindb.calibration.fibres import (
     calibrate_probe,
     calibrated_probe,
     read_flat_frames,
 )
+from skindb.cli import cli
+from skindb.errors import InputError
+from skindb.format.devices import read_probe
+from skindb.format.fields import Fields
 
 sys.path.append(str(Path(__file__).parent))
 from sphere import FIBRES, PROBE_GAIN, PROBE_R, PROBE_SECONDS, write_capture

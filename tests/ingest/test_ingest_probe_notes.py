@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from skindb.ingest.folder import read_capture
-from skindb.ingest.probe import Profiles
+from skindb.format.folder import read_capture
 from skindb.ingest.probe_notes import isotropy_p_values, probe_notes
+from skindb.ingest.probe_profiles import Profiles
 
 ROWS = 16
 FIBRES = 8

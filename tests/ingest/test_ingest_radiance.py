@@ -5,10 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from skindb.ingest.folder import read_capture
-from skindb.ingest.frames import FrameKind
-from skindb.ingest.pixel_flags import DARK, OK, SATURATED
-from skindb.ingest.radiance import (
+from skindb.calibration.pixel_flags import DARK, OK, SATURATED
+from skindb.calibration.radiance import (
     FrameMerger,
     frame_merger,
     merge_exposures,
@@ -16,7 +14,9 @@ from skindb.ingest.radiance import (
     usable_exposures,
     vignette_gain,
 )
-from skindb.ingest.sensor import SensorRecord
+from skindb.format.folder import read_capture
+from skindb.format.frames import FrameKind
+from skindb.format.sensor import SensorRecord
 
 SENSOR = SensorRecord(
     FrameKind(40, 40, 16),

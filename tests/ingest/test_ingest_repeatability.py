@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from skindb.calibration.repeatability import level_trend, placement_variance
 from skindb.errors import InputError
-from skindb.ingest.repeatability import level_trend, placement_variance
 
 DISTANCE = 1 + 0.5 * np.arange(28)
 

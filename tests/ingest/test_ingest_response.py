@@ -6,19 +6,19 @@ import imagecodecs
 import numpy as np
 import pytest
 
-from skindb.errors import InputError
-from skindb.ingest.fields import Fields
-from skindb.ingest.frames import FrameKind
-from skindb.ingest.radiance import merge_exposures
-from skindb.ingest.response import (
+from skindb.calibration.radiance import merge_exposures
+from skindb.calibration.response import (
     TOE,
     ResponseOptions,
     _mean_exposure_value,
     recover_response,
     write_response,
 )
-from skindb.ingest.response_samples import response_samples
-from skindb.ingest.sensor import SensorRecord, read_sensor
+from skindb.calibration.response_samples import response_samples
+from skindb.errors import InputError
+from skindb.format.fields import Fields
+from skindb.format.frames import FrameKind
+from skindb.format.sensor import SensorRecord, read_sensor
 
 BLACK = 1024.0
 WHITE = 65520.0

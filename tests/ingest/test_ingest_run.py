@@ -10,8 +10,8 @@ from sphere import ALBEDO, CAMERAS, INTENSITY, LIGHTS, PROBE_R, RADIUS, face_rad
 
 from skindb.errors import InputError
 from skindb.ingest import read_capture
+from skindb.ingest.capture import threads
 from skindb.ingest.groups import atlas_group, photograph_group
-from skindb.ingest.run import threads
 from skindb.ingest.surfels import build_surfels
 from skindb.schema import GROUPS, check
 from skindb.store import Database

@@ -8,7 +8,7 @@ from sphere import CAMERAS, INTENSITY, LIGHTS, face_radiance
 from spoil import D, edit
 
 from skindb.errors import InputError
-from skindb.ingest.frames import write_frame
+from skindb.format.frames import write_frame
 from skindb.store import Database
 from skindb.workflow import ingest_take
 

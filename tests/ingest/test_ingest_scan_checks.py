@@ -12,18 +12,18 @@ import trimesh
 from sphere import RADIUS, half_sphere, look_at
 
 from skindb.errors import InputError
-from skindb.geometry.clean import CleanMesh, clean_mesh
-from skindb.geometry.crop import Crop
-from skindb.geometry.nearest import closest_on_mesh
-from skindb.geometry.scan import Scan
-from skindb.ingest import read_capture
-from skindb.ingest.scan_checks import (
+from skindb.format.scan_checks import (
     coincidence_faults,
     landmark_faults,
     order_fault,
     scan_fault,
     swapped_faults,
 )
+from skindb.geometry.clean import CleanMesh, clean_mesh
+from skindb.geometry.crop import Crop
+from skindb.geometry.nearest import closest_on_mesh
+from skindb.geometry.scan import Scan
+from skindb.ingest import read_capture
 from skindb.ingest.surfels import build_surfels, site_positions, transferred_landmarks
 from skindb.store import Database
 from skindb.workflow import ingest_take

@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from skindb.calibration.pixel_flags import DARK, OK, SATURATED
 from skindb.errors import InputError
 from skindb.ingest import IngestParameters, ingest_capture, lumitexels, read_capture
 from skindb.ingest._sample_kernels import NONE
-from skindb.ingest.pixel_flags import DARK, OK, SATURATED
 from skindb.ingest.spool import STALE_SECONDS, Spool, remove_stale
 from skindb.store import Database
 from skindb.store.stage import SHARD

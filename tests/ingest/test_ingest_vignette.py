@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from skindb.calibration.vignette import fit_vignette
 from skindb.errors import InputError
-from skindb.ingest.vignette import fit_vignette
 
 TRUE_VIGNETTE = np.array([-0.21, -0.06, -0.03])
 CENTRE = np.array([158.0, 124.0])

@@ -5,8 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from skindb.calibration.white_target import (
+    TargetPixels,
+    fit_light,
+    position_sensitivity,
+)
 from skindb.errors import InputError
-from skindb.ingest.white_target import TargetPixels, fit_light, position_sensitivity
 
 INTENSITY = np.array([900.0, 1000.0, 800.0])
 POSITION = np.array([200.0, 150.0, 700.0])

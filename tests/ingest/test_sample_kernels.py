@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.special import jv
 
+from skindb.calibration.pixel_flags import DARK, OK, SATURATED
 from skindb.geometry.texture import bilinear
 from skindb.ingest._sample_kernels import (
     NONE,
@@ -13,7 +14,6 @@ from skindb.ingest._sample_kernels import (
     pixel_spans,
     tally,
 )
-from skindb.ingest.pixel_flags import DARK, OK, SATURATED
 
 LIGHT = np.array([10.0, -20.0, 300.0])
 AXIS = np.array([0.0, 0.1, -1.0]) / np.hypot(1, 0.1)

@@ -9,9 +9,9 @@ import pytest
 import trimesh
 
 from skindb.errors import InputError
+from skindb.format.crop_file import crop_path
 from skindb.geometry.crop import Crop
 from skindb.geometry.landmark_suggestions import MEAN_FACE
-from skindb.ingest.crop_file import crop_path
 from skindb.view.landmark_page import PLACES, place_sentence
 from skindb.view.landmarks import (
     landmark_mistakes,

@@ -15,11 +15,11 @@ from scipy.special import ndtr
 
 import skindb
 from skindb import workflow
+from skindb.calibration.cameras import calibrate_cameras
+from skindb.calibration.lights import read_setup_dome
+from skindb.calibration.setup import read_calibration_frames
 from skindb.cli import cli
 from skindb.errors import InputError
-from skindb.ingest.camera_calibration import calibrate_cameras
-from skindb.ingest.camera_frames import read_calibration_frames
-from skindb.ingest.light_calibration import read_setup_dome
 
 sys.path.append(str(Path(__file__).parents[1] / "ingest"))
 from sphere import BLACK, HEIGHT, WHITE, WIDTH, write_capture

@@ -15,10 +15,10 @@ from click.testing import CliRunner
 
 import skindb
 from skindb import workflow
+from skindb.calibration.lights import _view, calibrate_lights, read_setup_dome
+from skindb.calibration.radiance import frame_mergers
 from skindb.cli import cli
 from skindb.errors import InputError
-from skindb.ingest.light_calibration import _view, calibrate_lights, read_setup_dome
-from skindb.ingest.radiance import frame_mergers
 
 sys.path.append(str(Path(__file__).parents[1] / "ingest"))
 from mirror import ball_outline_of, ball_picture

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skindb.bench.case import SCALES, Case, close, each, expect
-from skindb.ingest.frames import FrameKind
-from skindb.ingest.pixel_flags import DARK, OK, SATURATED
-from skindb.ingest.radiance import merge_exposures
-from skindb.ingest.sensor import SensorRecord
+from skindb.calibration.pixel_flags import DARK, OK, SATURATED
+from skindb.calibration.radiance import merge_exposures
+from skindb.format.frames import FrameKind
+from skindb.format.sensor import SensorRecord
 
 Array = NDArray[Any]
 

@@ -12,16 +12,14 @@ from math import inf, log
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb.geometry.nearest import closest_on_mesh
-from skindb.geometry.scan import Scan
-from skindb.ingest.devices import DomeRecord
-from skindb.ingest.dome_checks import (
+from skindb.format.devices import DomeRecord
+from skindb.format.dome_checks import (
     DOME_RADIUS_RATIO,
     USUAL_SPAN,
     device_positions,
     picture_span,
 )
-from skindb.ingest.scan_checks import (
+from skindb.format.scan_checks import (
     FACE_HEIGHT,
     FACE_HEIGHTS,
     HEAD_DIAGONAL,
@@ -30,6 +28,8 @@ from skindb.ingest.scan_checks import (
     UNITS,
     face_height,
 )
+from skindb.geometry.nearest import closest_on_mesh
+from skindb.geometry.scan import Scan
 
 Array = NDArray[np.float64]
 SCAN = "scan"

@@ -13,13 +13,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from skindb.errors import Fault, InputError
-from skindb.ingest.device_checks import MAX_BALL_RADIUS_MM
-from skindb.ingest.devices import CameraRecord, DomeRecord, LightRecord, filled
-from skindb.ingest.fields import Fields, inside
-from skindb.ingest.frames import read_frame
-from skindb.ingest.json_file import shown
-from skindb.ingest.mirror_ball import (
+from skindb.calibration.mirror_ball import (
     LightPosition,
     Outline,
     Pinhole,
@@ -28,6 +22,12 @@ from skindb.ingest.mirror_ball import (
     light_position,
     reflected_ray,
 )
+from skindb.errors import Fault, InputError
+from skindb.format.device_checks import MAX_BALL_RADIUS_MM
+from skindb.format.devices import CameraRecord, DomeRecord, LightRecord, filled
+from skindb.format.fields import Fields, inside
+from skindb.format.frames import read_frame
+from skindb.format.json_file import shown
 from skindb.limits import MAX_BALL_PLACES
 from skindb.schema import dataset
 

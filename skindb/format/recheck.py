@@ -10,8 +10,8 @@ from pathlib import Path
 
 from skindb.elementwise import thread_count
 from skindb.errors import Fault, InputError
-from skindb.ingest.devices import DomeRecord, ProbeRecord, promised_frames
-from skindb.ingest.frames import read_frame
+from skindb.format.devices import DomeRecord, ProbeRecord, promised_frames
+from skindb.format.frames import read_frame
 from skindb.limits import MAX_FRAMES, MAX_RECHECKED_BYTES
 
 

@@ -10,26 +10,30 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from skindb.calibration.frame_checks import view_faults
+from skindb.calibration.irradiance import (
+    TARGET_INTERIOR_FRACTION,
+    Target,
+    target_pixels,
+)
+from skindb.calibration.pixel_flags import OK, SATURATED
+from skindb.calibration.radiance import FrameMerger, frame_mergers, read_view
+from skindb.calibration.white_target import (
+    LightFit,
+    TargetPixels,
+    fit_light,
+    position_sensitivity,
+)
 from skindb.errors import Fault, InputError
-from skindb.ingest.devices import (
+from skindb.format.devices import (
     CameraRecord,
     DomeRecord,
     LightRecord,
     WhiteRecord,
     read_dome,
 )
-from skindb.ingest.fields import Fields
-from skindb.ingest.frame_checks import view_faults
-from skindb.ingest.irradiance import TARGET_INTERIOR_FRACTION, Target, target_pixels
-from skindb.ingest.json_file import read_json
-from skindb.ingest.pixel_flags import OK, SATURATED
-from skindb.ingest.radiance import FrameMerger, frame_mergers, read_view
-from skindb.ingest.white_target import (
-    LightFit,
-    TargetPixels,
-    fit_light,
-    position_sensitivity,
-)
+from skindb.format.fields import Fields
+from skindb.format.json_file import read_json
 from skindb.schema import dataset
 
 THREADS = 2

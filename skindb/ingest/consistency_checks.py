@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skindb.errors import Fault
-from skindb.ingest.calibration import MAX_OFFSET_MM, MIN_AGREEMENT, Calibration
-from skindb.ingest.devices import DomeRecord
+from skindb.format.devices import DomeRecord
+from skindb.ingest.consistency import MAX_OFFSET_MM, MIN_AGREEMENT, Calibration
 
 # Heads in domes with common errors (lights 1 mm, cameras 0.03 degrees, hair, motion)
 # have offsets of up to 1.4 mm, scales of 1.5 %, agreements of 0.93 and more, a scan

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skindb.errors import Fault
-from skindb.ingest.json_file import CURE, MAX_MAGNITUDE, is_number, short, shown
+from skindb.format.json_file import CURE, MAX_MAGNITUDE, is_number, short, shown
 from skindb.limits import (
     MAX_FRAME_SIDE_PX,
     MAX_NAME_CHARACTERS,

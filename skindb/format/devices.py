@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb.ingest.device_checks import (
+from skindb.format.device_checks import (
     EXPOSURE_SECONDS,
     MAX_DISC_RADIUS_MM,
     MAX_FALLOFF,
@@ -24,12 +24,12 @@ from skindb.ingest.device_checks import (
     fibre_faults,
     gain_faults,
 )
-from skindb.ingest.fields import IDENTIFIER, Fields, inside
-from skindb.ingest.frames import FrameKind, frame_size, header_faults, is_linear
-from skindb.ingest.json_file import shown
-from skindb.ingest.pressure import read_pressure
-from skindb.ingest.sensor import SensorRecord, read_sensor
-from skindb.ingest.sequence import SequenceRecord, read_sequence
+from skindb.format.fields import IDENTIFIER, Fields, inside
+from skindb.format.frames import FrameKind, frame_size, header_faults, is_linear
+from skindb.format.json_file import shown
+from skindb.format.pressure import read_pressure
+from skindb.format.sensor import SensorRecord, read_sensor
+from skindb.format.sequence import SequenceRecord, read_sequence
 from skindb.limits import (
     MAX_CAMERAS,
     MAX_EXPOSURES,

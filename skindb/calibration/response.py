@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from skindb.calibration.response_samples import ResponseSamples, response_samples
 from skindb.errors import Fault, InputError
 from skindb.files import private_file
-from skindb.ingest.response_samples import ResponseSamples, response_samples
 
 Array = NDArray[np.float64]
 # value at which the knots change from even steps to even ratios: below it sensors and

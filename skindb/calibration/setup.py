@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from skindb.calibration.light_positions import BallFrames, read_ball
 from skindb.errors import Fault, InputError
-from skindb.ingest.device_checks import EXPOSURE_SECONDS
-from skindb.ingest.devices import CameraRecord, DomeRecord, filled
-from skindb.ingest.fields import IDENTIFIER, Fields, inside
-from skindb.ingest.frames import Frame, read_frames
-from skindb.ingest.json_file import read_json, shown
-from skindb.ingest.light_positions import BallFrames, read_ball
+from skindb.format.device_checks import EXPOSURE_SECONDS
+from skindb.format.devices import CameraRecord, DomeRecord, filled
+from skindb.format.fields import IDENTIFIER, Fields, inside
+from skindb.format.frames import Frame, read_frames
+from skindb.format.json_file import read_json, shown
 from skindb.limits import MAX_EXPOSURES, MAX_KNOWN_POINTS
 
 FILE = "dome/calibration.json"

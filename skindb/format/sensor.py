@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
 from skindb.files import read_regular
-from skindb.ingest.device_checks import noise_fault
-from skindb.ingest.fields import Fields, inside
-from skindb.ingest.frames import FrameKind
-from skindb.ingest.json_file import MAX_MAGNITUDE, shown
+from skindb.format.device_checks import noise_fault
+from skindb.format.fields import Fields, inside
+from skindb.format.frames import FrameKind
+from skindb.format.json_file import MAX_MAGNITUDE, shown
 from skindb.limits import MAX_RESPONSE_BYTES
 
 Array = NDArray[np.float64]

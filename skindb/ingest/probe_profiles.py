@@ -10,14 +10,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from skindb.calibration.frame_checks import disagreement
+from skindb.calibration.isotropy import MIN_SIGNAL_TO_NOISE
+from skindb.calibration.radiance import merge_exposures
 from skindb.errors import Fault, InputError
-from skindb.ingest.device_checks import energy_fault
-from skindb.ingest.devices import ProbeRecord
-from skindb.ingest.frame_checks import disagreement
-from skindb.ingest.frames import Digests, Frame, read_frame
-from skindb.ingest.isotropy import MIN_SIGNAL_TO_NOISE
-from skindb.ingest.json_file import MAX_MAGNITUDE
-from skindb.ingest.radiance import merge_exposures
+from skindb.format.device_checks import energy_fault
+from skindb.format.devices import ProbeRecord
+from skindb.format.frames import Digests, Frame, read_frame
+from skindb.format.json_file import MAX_MAGNITUDE
 from skindb.limits import MAX_FIBRE_PIXELS
 
 Array = NDArray[np.float64]

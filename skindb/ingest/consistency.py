@@ -11,11 +11,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from skindb.calibration.irradiance import light_falloff
+from skindb.format.devices import CameraRecord, DomeRecord
 from skindb.geometry.camera import camera_centre, project
-from skindb.ingest.devices import CameraRecord, DomeRecord
-from skindb.ingest.irradiance import light_falloff
 from skindb.ingest.photo_brightness import Brightness, relative_brightness, view_factors
-from skindb.ingest.photo_consistency import (
+from skindb.ingest.photo_offsets import (
     Offset,
     ReducedView,
     bilinear,

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb.ingest.device_checks import GAUGE_PRESSURES_KPA
-from skindb.ingest.fields import Fields
-from skindb.ingest.json_file import MAX_MAGNITUDE, is_number, shown
+from skindb.format.device_checks import GAUGE_PRESSURES_KPA
+from skindb.format.fields import Fields
+from skindb.format.json_file import MAX_MAGNITUDE, is_number, shown
 from skindb.limits import MAX_PRESSURE_SAMPLES
 
 Log = NDArray[np.float64]  # (n, 2) seconds since the start of the placement, kPa

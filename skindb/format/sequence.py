@@ -11,8 +11,8 @@ from datetime import datetime
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb.ingest.fields import Fields
-from skindb.ingest.json_file import shown
+from skindb.format.fields import Fields
+from skindb.format.json_file import shown
 from skindb.limits import MAX_SEQUENCE_STEPS
 
 Array = NDArray[np.float64]

@@ -12,10 +12,10 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from skindb.calibration.radiance import FrameMerger
 from skindb.errors import Fault
-from skindb.ingest.devices import DomeRecord
-from skindb.ingest.frames import Frame, read_frame
-from skindb.ingest.radiance import FrameMerger
+from skindb.format.devices import DomeRecord
+from skindb.format.frames import Frame, read_frame
 
 Array = NDArray[np.float32]
 # of a camera that are averaged; more reduce noise that is already below the pattern

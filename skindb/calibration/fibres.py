@@ -11,20 +11,20 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from skindb.errors import Fault, InputError
-from skindb.ingest.devices import EXPOSURE, SITE, ProbeRecord, read_probe
-from skindb.ingest.fibre_spots import (
+from skindb.calibration.fibre_spots import (
     MIN_FRAMES,
     Spots,
     fibre_gain,
     find_fibres,
     match_fibres,
 )
-from skindb.ingest.fields import Fields
-from skindb.ingest.frames import read_frames
-from skindb.ingest.json_file import read_json
-from skindb.ingest.probe import placement_signal
-from skindb.ingest.radiance import merge_exposures
+from skindb.calibration.radiance import merge_exposures
+from skindb.errors import Fault, InputError
+from skindb.format.devices import EXPOSURE, SITE, ProbeRecord, read_probe
+from skindb.format.fields import Fields
+from skindb.format.frames import read_frames
+from skindb.format.json_file import read_json
+from skindb.ingest.probe_profiles import placement_signal
 from skindb.schema import dataset
 
 FILE = "contact/calibration.json"

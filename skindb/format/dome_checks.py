@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skindb.errors import Fault
+from skindb.format.device_checks import MAX_DEVICE_DISTANCE_MM
+from skindb.format.devices import CameraRecord, DomeRecord
+from skindb.format.scan_checks import HEAD_DIAGONAL, UNITS, likely_unit, rescaling
 from skindb.geometry.camera import camera_centre
 from skindb.geometry.clean import CleanMesh
 from skindb.geometry.nearest import winding_number
 from skindb.geometry.surfels import face_crosses
-from skindb.ingest.device_checks import MAX_DEVICE_DISTANCE_MM
-from skindb.ingest.devices import CameraRecord, DomeRecord
-from skindb.ingest.scan_checks import HEAD_DIAGONAL, UNITS, likely_unit, rescaling
 
 Array = NDArray[np.float64]
 # of a point inside; outside the convex hull of a surface it is at most 0.5

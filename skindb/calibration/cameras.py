@@ -13,25 +13,29 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from skindb.errors import Fault, InputError
-from skindb.ingest.calibration import pixel_width
-from skindb.ingest.camera_frames import (
+from skindb.calibration.colour_chart import fit_colour_matrix
+from skindb.calibration.dark_frames import average_dark
+from skindb.calibration.lens import fit_edge, veiling_glare
+from skindb.calibration.mirror_ball import Pinhole, reprojection_error
+from skindb.calibration.pixel_flags import OK
+from skindb.calibration.radiance import (
+    merge_exposures,
+    relative_exposure,
+    vignette_gain,
+)
+from skindb.calibration.response import TABLE_ROWS, recover_response
+from skindb.calibration.sensor_noise import fit_noise
+from skindb.calibration.setup import (
     FILE,
     CalibrationFrames,
     CameraFrames,
     KnownPoints,
     regions,
 )
-from skindb.ingest.colour_chart import fit_colour_matrix
-from skindb.ingest.dark_frames import average_dark
-from skindb.ingest.devices import CameraRecord, DomeRecord
-from skindb.ingest.lens import fit_edge, veiling_glare
-from skindb.ingest.mirror_ball import Pinhole, reprojection_error
-from skindb.ingest.noise_model import fit_noise
-from skindb.ingest.pixel_flags import OK
-from skindb.ingest.radiance import merge_exposures, relative_exposure, vignette_gain
-from skindb.ingest.response import TABLE_ROWS, recover_response
-from skindb.ingest.vignette import fit_vignette
+from skindb.calibration.vignette import fit_vignette
+from skindb.errors import Fault, InputError
+from skindb.format.devices import CameraRecord, DomeRecord
+from skindb.ingest.consistency import pixel_width
 from skindb.schema import dataset
 
 Array = NDArray[np.float64]

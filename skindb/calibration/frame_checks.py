@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from skindb.calibration.radiance import FrameMerger, read_sigma, relative_exposure
 from skindb.errors import Fault
-from skindb.ingest.devices import DomeRecord
-from skindb.ingest.frames import Digests, Frame, read_frame
-from skindb.ingest.json_file import MAX_MAGNITUDE
-from skindb.ingest.radiance import FrameMerger, read_sigma, relative_exposure
-from skindb.ingest.sensor import SensorRecord
+from skindb.format.devices import DomeRecord
+from skindb.format.frames import Digests, Frame, read_frame
+from skindb.format.json_file import MAX_MAGNITUDE
+from skindb.format.sensor import SensorRecord
 
 Array = NDArray[np.float32]
 Values = NDArray[np.float64]

@@ -9,13 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from skindb.calibration.frame_checks import view_faults
+from skindb.calibration.pixel_flags import OK
+from skindb.calibration.radiance import FrameMerger, read_view
 from skindb.errors import Fault, InputError
+from skindb.format.devices import CameraRecord, DomeRecord, LightRecord, WhiteRecord
+from skindb.format.frames import Digests
 from skindb.geometry.camera import camera_centre, pixel_rays
-from skindb.ingest.devices import CameraRecord, DomeRecord, LightRecord, WhiteRecord
-from skindb.ingest.frame_checks import view_faults
-from skindb.ingest.frames import Digests
-from skindb.ingest.pixel_flags import OK
-from skindb.ingest.radiance import FrameMerger, read_view
 
 Array = NDArray[np.float64]
 # of the half size: a disc inside the square, however the square is rotated

@@ -17,14 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
-from skindb.geometry.clean import CleanMesh, clean_mesh
-from skindb.geometry.crop import Crop, crop_faces
-from skindb.geometry.scan import Scan, read_scan
-from skindb.ingest.crop_file import crop_path, parsed_crop
-from skindb.ingest.devices import DomeRecord, ProbeRecord, read_dome, read_probe
-from skindb.ingest.dome_checks import device_faults, unit_fault
-from skindb.ingest.fields import IDENTIFIER, NAME, Fields, inside
-from skindb.ingest.json_file import (
+from skindb.format.crop_file import crop_path, parsed_crop
+from skindb.format.devices import DomeRecord, ProbeRecord, read_dome, read_probe
+from skindb.format.dome_checks import device_faults, unit_fault
+from skindb.format.fields import IDENTIFIER, NAME, Fields, inside
+from skindb.format.json_file import (
     CURE,
     MAX_MAGNITUDE,
     is_number,
@@ -32,7 +29,7 @@ from skindb.ingest.json_file import (
     short,
     shown,
 )
-from skindb.ingest.length_units import (
+from skindb.format.length_units import (
     CAMERAS,
     LANDMARKS,
     LIGHTS,
@@ -42,8 +39,8 @@ from skindb.ingest.length_units import (
     likely_units,
     unit_text,
 )
-from skindb.ingest.recheck import decoding_faults
-from skindb.ingest.scan_checks import (
+from skindb.format.recheck import decoding_faults
+from skindb.format.scan_checks import (
     SITE_LANDMARK,
     coincidence_faults,
     discarded_piece_faults,
@@ -54,6 +51,9 @@ from skindb.ingest.scan_checks import (
     scan_fault,
     swapped_faults,
 )
+from skindb.geometry.clean import CleanMesh, clean_mesh
+from skindb.geometry.crop import Crop, crop_faces
+from skindb.geometry.scan import Scan, read_scan
 from skindb.limits import MAX_OBJECT_KEYS, MAX_REGIONS
 from skindb.schema.cohort import imitates_column
 
