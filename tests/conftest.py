@@ -8,6 +8,7 @@ import os
 import shutil
 import sys
 from contextlib import ExitStack
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -58,6 +59,22 @@ def _close_figures():
 
 
 # the fixtures below import what they make, because a run of other tests needs none of it
+
+
+@pytest.fixture(scope="session")
+def pristine(tmp_path_factory):
+    """Capture folder of a sphere, which is only copied."""
+    from sphere import write_capture
+
+    folder = tmp_path_factory.mktemp("capture") / "T001"
+    write_capture(folder)
+    return folder
+
+
+@pytest.fixture
+def capture_folder(pristine, tmp_path):
+    """A capture folder of a sphere, to be changed."""
+    return Path(shutil.copytree(pristine, tmp_path / "T001"))
 
 
 @pytest.fixture(scope="session")

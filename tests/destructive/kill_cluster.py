@@ -35,7 +35,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 HERE = Path(__file__).parent
-sys.path[:0] = [str(HERE.parent), str(HERE.parent / "ingest"), str(HERE)]
+sys.path[:0] = [str(HERE.parent), str(HERE)]
 
 from distributed import Client
 from kill_fit import files_of, generations, unlisted

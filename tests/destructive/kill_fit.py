@@ -32,7 +32,7 @@ from itertools import pairwise
 from pathlib import Path
 
 HERE = Path(__file__).parent
-sys.path[:0] = [str(HERE.parent), str(HERE.parent / "ingest"), str(HERE)]
+sys.path[:0] = [str(HERE.parent), str(HERE)]
 
 import apart
 import numpy as np

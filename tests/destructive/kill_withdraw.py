@@ -36,7 +36,7 @@ from functools import partial
 from pathlib import Path
 
 HERE = Path(__file__).parent
-sys.path[:0] = [str(HERE.parent), str(HERE.parent / "ingest")]
+sys.path.insert(0, str(HERE.parent))
 
 from bucket_server import new_bucket, own_cache, s3_server, settings
 from planted_population import TABLES, population

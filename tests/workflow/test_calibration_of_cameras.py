@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 from pathlib import Path
 
 import imagecodecs
@@ -12,6 +11,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from scipy.special import ndtr
+from sphere import BLACK, HEIGHT, WHITE, WIDTH, write_capture
 
 import skindb
 from skindb import workflow
@@ -20,9 +20,6 @@ from skindb.calibration.lights import read_setup_dome
 from skindb.calibration.setup import read_calibration_frames
 from skindb.cli import cli
 from skindb.errors import InputError
-
-sys.path.append(str(Path(__file__).parents[1] / "ingest"))
-from sphere import BLACK, HEIGHT, WHITE, WIDTH, write_capture
 
 SECONDS = {f"e{i}": 0.4 / 2.0**i for i in range(7)}
 FULL = 20000.0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 from itertools import product
 from pathlib import Path
 
@@ -12,6 +11,8 @@ import imagecodecs
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from mirror import ball_outline_of, ball_picture
+from sphere import BLACK, INTENSITY, LIGHTS, save, write_capture
 
 import skindb
 from skindb import workflow
@@ -19,10 +20,6 @@ from skindb.calibration.lights import _view, calibrate_lights, read_setup_dome
 from skindb.calibration.radiance import frame_mergers
 from skindb.cli import cli
 from skindb.errors import InputError
-
-sys.path.append(str(Path(__file__).parents[1] / "ingest"))
-from mirror import ball_outline_of, ball_picture
-from sphere import BLACK, INTENSITY, LIGHTS, save, write_capture
 
 
 def _edit(file, **changes):

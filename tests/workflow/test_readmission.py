@@ -6,12 +6,12 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 from datetime import date, timedelta
 from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
+from sphere import write_capture
 from traces import contents, traces
 
 from skindb import workflow
@@ -19,9 +19,6 @@ from skindb.cli import cli
 from skindb.errors import InputError
 from skindb.store import Database, WithdrawnError
 from skindb.store import lease as lease_module
-
-sys.path.append(str(Path(__file__).parents[1] / "ingest"))
-from sphere import write_capture
 
 SUBJECT = "Xqz7"
 OPTIONS = {"spacing_mm": 8.0, "photographs": 0}
