@@ -34,8 +34,7 @@ from skindb.calibration.setup import (
 )
 from skindb.calibration.vignette import fit_vignette
 from skindb.errors import Fault, InputError
-from skindb.format.devices import CameraRecord, DomeRecord
-from skindb.ingest.consistency import pixel_width
+from skindb.format.devices import CameraRecord, DomeRecord, pixel_width
 from skindb.schema import dataset
 
 Array = NDArray[np.float64]

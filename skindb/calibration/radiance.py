@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from skindb.calibration._merge_kernels import develop
 from skindb.calibration.pixel_flags import DARK, DARK_SIGMA, OK, SATURATED
 from skindb.errors import Fault, InputError
 from skindb.format.devices import CameraRecord, DomeRecord, filled
 from skindb.format.frames import Digests, Frame, read_frames
 from skindb.format.sensor import SensorRecord
-from skindb.ingest._sample_kernels import develop
 
 Image = NDArray[np.float32]
 Spans = NDArray[np.int64]

@@ -30,6 +30,7 @@ from skindb.format.json_file import shown
 from skindb.format.pressure import read_pressure
 from skindb.format.sensor import SensorRecord, read_sensor
 from skindb.format.sequence import SequenceRecord, read_sequence
+from skindb.geometry.camera import camera_centre
 from skindb.limits import (
     MAX_CAMERAS,
     MAX_EXPOSURES,
@@ -156,6 +157,12 @@ class ProbeRecord:
         for site in self.sites:
             for placement, exposure in product(self.placements[site], self.exposures):
                 yield self.frame(site, exposure, placement)
+
+
+def pixel_width(camera: CameraRecord, point: Array) -> float:
+    """Width [mm] of a pixel at the distance of a point."""
+    distance = float(np.linalg.norm(camera_centre(camera.R, camera.t) - point))
+    return distance / float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
 
 
 def filled(template: str, **names: str) -> str:

@@ -1,6 +1,4 @@
-"""Kernels of ingest: exposures to radiance, radiance to samples. A frame is read once,
-with the GIL released.
-"""
+"""Kernels of ingest: pictures to values at many positions, and radiance to samples."""
 
 from __future__ import annotations
 
@@ -11,7 +9,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from skindb.calibration.pixel_flags import DARK, DARK_SIGMA, OK, SATURATED
+from skindb.calibration.pixel_flags import DARK, OK, SATURATED
 from skindb.jit import inline_kernel, kernel
 
 # outcomes of a sample besides those of a pixel: usable, but no pixel has two exposures;
@@ -26,240 +24,6 @@ MIN_DARK_FRACTION = 0.999
 # end of the weight (1 - q / FOOTPRINT_REACH)^2, whose second moments are those of a
 # Gaussian
 FOOTPRINT_REACH = 8.0
-# of relative exposure; the weight 1 / variance stays finite
-MIN_VARIANCE = np.float32(1e-30)
-ZERO = np.float32(0.0)
-ONE = np.float32(1.0)
-ENDLESS = np.float32(np.inf)
-# marks a channel that was saturated in every exposure; larger than any number of
-# exposures
-NO_USABLE_EXPOSURE = np.float32(100.0)
-
-
-@kernel
-def develop(
-    frames: Any,
-    dark: Any,
-    curve: Any,
-    offset: int,
-    zero: float,
-    span: float,
-    variance: float,
-    white: float,
-    seconds: Any,
-    photon: float,
-    gain: Any,
-    matrix: Any,
-    spans: Any,
-    radiance: Any,
-    flag: Any,
-    usable: Any,
-) -> None:
-    """Merge the exposures of one view to radiance with the formulas of
-    `skindb.calibration.radiance.merge_exposures`.
-
-    The picture is processed row by row, so that intermediate values stay in the cache.
-    Loops have few branches and few arrays: LLVM does not vectorise a loop for which it
-    would have to compare more than eight pairs of addresses.
-
-    Parameters
-    ----------
-    frames
-        One array (h, w, 3) of uint8 or uint16 per exposure.
-    dark
-        (e, h, w, 3) dark frames, which are subtracted; or an array without rows.
-    curve
-        (m, 3, 2) float32 relative exposure and its read variance at value + offset; or
-        (0, 3, 2) for a linear response, (value - zero) / span with `variance`.
-    offset, zero, span, variance
-        See `curve`.
-    white
-        Values at or above this level are saturated.
-    seconds
-        (e,) float32 exposure times as fractions of the longest one.
-    photon
-        Variance of photon noise per relative exposure: 1 / electrons at the white level.
-    gain
-        (h, w) float32 factor of the relative radiance, or (1, 1).
-    matrix
-        (3, 3) float32 colour matrix, or (0, 3) for none.
-    spans
-        (h, 2) first column of each row to process, and the one after the last.
-    radiance
-        (h, w, 3) float32 output within the spans: NaN where a channel was saturated in
-        every exposure.
-    flag
-        (h, w) uint8 output; SATURATED outside the spans, where no sample uses the pixel.
-    usable
-        (h, w) uint8 zeros, output: see `skindb.calibration.radiance.usable_exposures`; or (0, 0).
-    """
-    count, (height, width) = len(frames), flag.shape
-    signal = np.empty((count, 3 * width), np.float32)
-    noise = np.empty((count, 3 * width), np.float32)
-    total = np.empty(3 * width, np.float32)
-    time = np.empty(3 * width, np.float32)
-    above = np.empty(3 * width, np.float32)
-    weights = np.empty(3 * width, np.float32)
-    black = np.full(3 * width, np.float32(zero), np.float32)
-    slope = ONE / np.float32(span)
-    for y in range(height):
-        first = spans[y, 0]
-        last = max(spans[y, 0], spans[y, 1])
-        flag[y, :first], flag[y, last:] = SATURATED, SATURATED
-        begin = 3 * first
-        size = 3 * (last - first)
-        if size == 0:
-            continue
-        total[:size], time[:size], above[:size] = ZERO, ZERO, ZERO
-        for e in range(count):
-            value = frames[e][y].reshape(3 * width)[begin : begin + size]
-            own = signal[e, :size]
-            spread = noise[e, :size]
-            if curve.shape[0]:
-                shade = (
-                    dark[e, y].reshape(3 * width)[begin : begin + size]
-                    if dark.shape[0]
-                    else dark[:0, 0, 0, 0]
-                )
-                _tabulated_response(value, shade, curve, offset, own, spread)
-            else:
-                if dark.shape[0]:
-                    black[:size] = dark[e, y].reshape(3 * width)[begin : begin + size]
-                _linear_response(value, black, slope, own)
-                spread[:] = np.float32(variance)
-            if usable.shape[0]:
-                _count(value, np.float32(white), own, spread, usable[y, first:last])
-            _collect(
-                value,
-                np.float32(white),
-                own,
-                spread,
-                seconds[e],
-                total[:size],
-                time[:size],
-                above[:size],
-            )
-        for k in range(size):
-            expected = total[k] / time[k]
-            total[k] = np.float32(photon) * (expected if expected > ZERO else ZERO)
-        _average(signal, noise, seconds, total[:size], weights[:size])
-        _finish(y, first, total[:size], time, above, gain, matrix, radiance, flag)
-
-
-@kernel
-def _linear_response(value: Any, black: Any, slope: float, signal: Any) -> None:
-    for k in range(value.shape[0]):
-        signal[k] = (np.float32(value[k]) - black[k]) * slope
-
-
-@kernel
-def _tabulated_response(
-    value: Any, dark: Any, curve: Any, offset: int, signal: Any, noise: Any
-) -> None:
-    """Relative exposure by a table; `dark` is empty if the table includes it."""
-    for k in range(value.shape[0]):
-        at = np.int64(value[k]) + offset - (np.int64(dark[k]) if dark.shape[0] else 0)
-        signal[k], noise[k] = curve[at, k % 3, 0], curve[at, k % 3, 1]
-
-
-@kernel
-def _count(value: Any, white: float, signal: Any, noise: Any, usable: Any) -> None:
-    """Count the exposure at pixels where a channel is above the noise and none is at
-    the white level.
-    """
-    for x in range(usable.shape[0]):
-        lit = 0
-        white_channels = 0
-        for k in range(3 * x, 3 * x + 3):
-            lit += 1 if signal[k] > DARK_SIGMA * np.sqrt(noise[k]) else 0
-            white_channels += 0 if np.float32(value[k]) < white else 1
-        usable[x] += np.uint8(lit > 0 and white_channels == 0)
-
-
-@kernel
-def _collect(
-    value: Any,
-    white: float,
-    signal: Any,
-    noise: Any,
-    seconds: float,
-    total: Any,
-    time: Any,
-    above: Any,
-) -> None:
-    """Accumulate sums over the exposures below the white level; at the white level the
-    noise is infinite.
-
-    `above` counts the exposures in which a value is above the noise.
-    """
-    for k in range(value.shape[0]):
-        above[k] += ONE if signal[k] > DARK_SIGMA * np.sqrt(noise[k]) else ZERO
-    for k in range(value.shape[0]):
-        noise[k] = noise[k] if np.float32(value[k]) < white else ENDLESS
-    for k in range(value.shape[0]):
-        total[k] += signal[k] if noise[k] < ENDLESS else ZERO
-        time[k] += seconds if noise[k] < ENDLESS else ZERO
-
-
-@kernel
-def _average(signal: Any, noise: Any, seconds: Any, photons: Any, weights: Any) -> None:
-    """Write the inverse-variance weighted mean of the exposures to `photons`; 0 / 0
-    where none is usable.
-    """
-    weights[:] = ZERO
-    mean = np.zeros_like(weights)
-    for e in range(signal.shape[0]):
-        second = seconds[e]
-        own = signal[e]
-        spread = noise[e]
-        for k in range(weights.shape[0]):
-            variance = photons[k] * second + spread[k]
-            weight = second / (variance if variance > MIN_VARIANCE else MIN_VARIANCE)
-            mean[k] += weight * own[k]
-            weights[k] += weight * second
-    for k in range(weights.shape[0]):
-        photons[k] = mean[k] / weights[k]
-
-
-@kernel
-def _finish(
-    y: int,
-    first: int,
-    value: Any,
-    time: Any,
-    above: Any,
-    gain: Any,
-    matrix: Any,
-    out: Any,
-    flag: Any,
-) -> None:
-    """Apply vignette and colour matrix to a row, and set its flags."""
-    pixels = value.shape[0] // 3
-    row = out[y, first : first + pixels].reshape(value.shape[0])
-    if gain.shape[0] == 1:
-        scale = gain[0, 0]
-        for k in range(value.shape[0]):
-            row[k] = value[k] * scale
-    else:
-        for x in range(pixels):
-            factor = gain[y, first + x]
-            for k in range(3 * x, 3 * x + 3):
-                row[k] = value[k] * factor
-    if matrix.shape[0]:
-        for k in range(0, value.shape[0], 3):
-            r = row[k]
-            g = row[k + 1]
-            b = row[k + 2]
-            row[k] = matrix[0, 0] * r + matrix[0, 1] * g + matrix[0, 2] * b
-            row[k + 1] = matrix[1, 0] * r + matrix[1, 1] * g + matrix[1, 2] * b
-            row[k + 2] = matrix[2, 0] * r + matrix[2, 1] * g + matrix[2, 2] * b
-    for k in range(value.shape[0]):  # sums over channels distinguish the three cases
-        above[k] = NO_USABLE_EXPOSURE if time[k] == ZERO else min(above[k], ONE)
-    for x in range(pixels):
-        found = above[3 * x] + above[3 * x + 1] + above[3 * x + 2]
-        flag[y, first + x] = (
-            SATURATED if found >= NO_USABLE_EXPOSURE else DARK if found == ZERO else OK
-        )
 
 
 @kernel
@@ -573,3 +337,38 @@ def _half_bits(_typing: Any, number: Any) -> Any:
 @kernel
 def _half_or_nan(number: float) -> Any:
     return _half_bits(np.float64(number)) if abs(number) < MAX_HALF_FLOAT else NAN_BITS
+
+
+@kernel
+def interpolate(images: Any, pixels: Any, out: Any) -> None:
+    """Bilinear values (picture, n) of pictures (picture, h, w) at pixels (n, 2); 0
+    outside, also where these are NaN.
+
+    Positions are the outer loop: where they lie in a picture is computed once for all pictures.
+    """
+    count, height, width = images.shape
+    for k in range(len(pixels)):
+        x = pixels[k, 0]
+        y = pixels[k, 1]
+        if not (
+            x >= 0
+            and x <= width
+            and y >= 0
+            and y <= height
+            and width > 0
+            and height > 0
+        ):
+            out[:, k] = 0.0
+            continue
+        column = min(max(x - 0.5, 0.0), width - 1.0)
+        row = min(max(y - 0.5, 0.0), height - 1.0)
+        left = min(int(column), max(width - 2, 0))
+        top = min(int(row), max(height - 2, 0))
+        right = min(left + 1, width - 1)
+        below = min(top + 1, height - 1)
+        a = column - left
+        b = row - top
+        for i in range(count):
+            upper = images[i, top, left] * (1 - a) + images[i, top, right] * a
+            lower = images[i, below, left] * (1 - a) + images[i, below, right] * a
+            out[i, k] = upper * (1 - b) + lower * b

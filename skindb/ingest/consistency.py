@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skindb.calibration.irradiance import light_falloff
-from skindb.format.devices import CameraRecord, DomeRecord
+from skindb.format.devices import CameraRecord, DomeRecord, pixel_width
 from skindb.geometry.camera import camera_centre, project
 from skindb.ingest.photo_brightness import Brightness, relative_brightness, view_factors
 from skindb.ingest.photo_offsets import (
@@ -444,9 +444,3 @@ class CalibrationCheck:
         return slopes.reshape(-1, 6), offset.moves(
             self.pixels[self.compared, c][at] / self.factor(c)
         ).ravel()
-
-
-def pixel_width(camera: CameraRecord, point: Array) -> float:
-    """Width [mm] of a pixel at the distance of a point."""
-    distance = float(np.linalg.norm(camera_centre(camera.R, camera.t) - point))
-    return distance / float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))

@@ -102,7 +102,7 @@ def interpolated(images: Array, pixels: Array) -> Array:
     """Interpolated values (picture, n) of pictures (picture, h, w) at pixels (n, 2); 0
     outside the pictures.
     """
-    from skindb.ingest._picture_kernels import interpolate
+    from skindb.ingest._sample_kernels import interpolate
 
     out = np.empty((len(images), len(pixels)))
     interpolate(

@@ -4,28 +4,20 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb.calibration.frame_checks import disagreement
+from skindb.calibration.fibres import placement_signal
 from skindb.calibration.isotropy import MIN_SIGNAL_TO_NOISE
-from skindb.calibration.radiance import merge_exposures
 from skindb.errors import Fault, InputError
 from skindb.format.device_checks import energy_fault
 from skindb.format.devices import ProbeRecord
-from skindb.format.frames import Digests, Frame, read_frame
+from skindb.format.frames import Digests
 from skindb.format.json_file import MAX_MAGNITUDE
-from skindb.limits import MAX_FIBRE_PIXELS
 
 Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-# fraction of a fibre's pixels that may be missing in a channel (stuck ones): for a
-# fibre whose centre is 50 % above its mean brightness, the signal is then 0.5 % too
-# low, which is the default error of a gain
-MAX_LOST_FRACTION = 0.01
 MIN_LIT_FIBRES = 3  # of a site: a decay and a level, and one fibre that confirms them
 
 
@@ -154,95 +146,3 @@ def combine_placements(value: Array, error: Array) -> tuple[Array, Array, Array]
             np.maximum(np.nansum(weight * relative, axis=0) / weight.sum(axis=0), 0.0)
         )
     return mean, np.hypot(noise, spread * np.abs(mean) / np.sqrt(count)), spread
-
-
-def placement_signal(
-    probe: ProbeRecord, site: str, placement: str = "", digests: Digests | None = None
-) -> tuple[Array, Array]:
-    """Signal per second (fibre, 3) and its standard error; NaN where pixels are
-    saturated in every bracket.
-    """
-    fibres = list[Index]()
-    strips = list[Frame]()
-    faults = dict[Fault, None]()
-    for exposure in probe.exposures:
-        try:
-            frame = read_frame(probe.frame(site, exposure, placement), None, digests)
-            fibres = fibres or fibre_pixels(probe, frame.shape[:2])
-        except InputError as problem:
-            faults |= dict.fromkeys(problem.faults)
-            continue
-        # only the fibres' pixels are kept and merged: a few percent of the picture
-        strips.append(frame.reshape(-1, 3)[np.unique(np.concatenate(fibres))][None])
-    if faults:
-        raise InputError(faults)
-    fault = disagreement(
-        f"{probe.file}[exposures]", probe.exposures, strips, probe.sensor
-    )
-    if fault is not None:
-        at = f"site {site}, placement {placement}" if placement else f"site {site}"
-        raise InputError(replace(fault, found=f"{at}: bracket {fault.found}"))
-    radiance, error, _ = merge_exposures(
-        strips, tuple(probe.exposures.values()), probe.sensor
-    )
-    value = np.full((len(fibres), 3), np.nan)
-    spread = np.full((len(fibres), 3), np.nan)
-    union = np.unique(np.concatenate(fibres))
-    for i, pixels in enumerate(fibres):
-        own = np.searchsorted(union, pixels)
-        signal = radiance[0, own].astype(np.float64)
-        noise = error[0, own].astype(np.float64)
-        for c in range(3):
-            usable = np.isfinite(signal[:, c])
-            if 1 - usable.mean() <= MAX_LOST_FRACTION:
-                value[i, c] = signal[usable, c].mean()
-                spread[i, c] = np.sqrt((noise[usable, c] ** 2).sum()) / usable.sum()
-    return value, spread
-
-
-def fibre_pixels(probe: ProbeRecord, shape: tuple[int, ...]) -> list[Index]:
-    """Indices into the flattened picture of each fibre's pixels, whose centres are
-    within its radius.
-
-    Raises
-    ------
-    InputError
-        With every fibre without a pixel, or if the fibres cover more pixels than the
-        memory is planned for.
-    """
-    fibres = list[Index]()
-    total = 0
-    for centre, radius in zip(probe.centre, probe.radius, strict=True):
-        (left, right), (top, bottom) = (
-            (
-                min(max(math.floor(c - radius), 0), side),
-                min(math.ceil(c + radius), side),
-            )
-            for c, side in zip(centre, shape[::-1], strict=True)
-        )
-        total += max(right - left, 0) * max(bottom - top, 0)
-        if total > MAX_FIBRE_PIXELS:
-            rule = f"the fibres must cover at most {MAX_FIBRE_PIXELS:,} pixels"
-            cure = "give centre and radius in pixels of the picture"
-            raise InputError(
-                Fault(f"{probe.file}[fibres]", rule, f"{total:,} or more", cure)
-            )
-        y = np.arange(top, bottom)[:, None] + 0.5
-        x = np.arange(left, right) + 0.5
-        row, column = np.nonzero(
-            (x - centre[0]) ** 2 + (y - centre[1]) ** 2 <= radius * radius
-        )
-        fibres.append((row + top) * shape[1] + column + left)
-    faults = [
-        Fault(
-            f"{probe.file}[fibres][{i}]",
-            "a fibre must lie in the picture",
-            f"no pixel of {shape[1]} x {shape[0]}",
-            "correct its centre and radius, in pixels",
-        )
-        for i, pixels in enumerate(fibres)
-        if not len(pixels)
-    ]
-    if faults:
-        raise InputError(faults)
-    return fibres

@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 from sphere import WHITE
 
+from skindb.calibration.fibres import fibre_pixels
 from skindb.format.folder import read_capture
-from skindb.ingest.probe_profiles import fibre_pixels, fibre_profiles
+from skindb.ingest.probe_profiles import fibre_profiles
 
 
 def _spoil(probe, fibre, count, channel):
