@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from skindb.calibration.irradiance import light_intensities
 from skindb.calibration.pixel_flags import SATURATED
 from skindb.calibration.radiance import frame_mergers, read_view
-from skindb.format.devices import DomeRecord
+from skindb.format.dome import DomeRecord
 from skindb.format.folder import read_capture
 from skindb.geometry.rays import RayScene
 from skindb.ingest.consistency import CalibrationCheck

@@ -22,7 +22,7 @@ from typing import Any
 from stages import Stages, stage_lines
 
 import skindb
-from skindb.format.devices import promised_frames
+from skindb.format.dome import promised_frames
 from skindb.format.folder import read_capture
 from skindb.format.frames import FrameKind, read_frame
 from skindb.ingest.capture import threads

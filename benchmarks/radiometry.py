@@ -16,12 +16,16 @@ from pathlib import Path
 import imagecodecs
 import numpy as np
 
-from skindb.calibration.irradiance import light_intensities, target_pixels
+from skindb.calibration.irradiance import (
+    TargetPixels,
+    fit_light,
+    light_intensities,
+    target_pixels,
+)
 from skindb.calibration.lights import calibrate_lights
 from skindb.calibration.mirror_ball import ball_outline, distant_light, highlight_centre
 from skindb.calibration.radiance import frame_mergers, merge_exposures, read_view
 from skindb.calibration.response import ResponseOptions, recover_response
-from skindb.calibration.white_target import TargetPixels, fit_light
 from skindb.format.folder import read_capture
 from skindb.format.frames import read_frame
 

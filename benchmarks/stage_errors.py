@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 import skindb
 from skindb.calibration.irradiance import light_falloff
 from skindb.calibration.radiance import frame_mergers, read_view
-from skindb.format.devices import DomeRecord
+from skindb.format.dome import DomeRecord
 from skindb.format.folder import read_capture
 from skindb.geometry.camera import project
 from skindb.geometry.nearest import closest_on_mesh

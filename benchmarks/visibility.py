@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from skindb.format.devices import CameraRecord, LightRecord
+from skindb.format.dome import CameraRecord, LightRecord
 from skindb.format.folder import read_capture
 from skindb.geometry._ring_kernels import grown, mixed
 from skindb.geometry.rays import RayScene

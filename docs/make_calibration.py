@@ -12,10 +12,10 @@ matplotlib.use("agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from skindb.calibration.isotropy import compare_azimuths
+from skindb.calibration.lens import fit_vignette
+from skindb.calibration.profile_statistics import compare_azimuths
 from skindb.calibration.response import recover_response
 from skindb.calibration.sensor_noise import fit_noise
-from skindb.calibration.vignette import fit_vignette
 
 PICTURES = Path(__file__).parent / "pictures"
 BLACK = 1024.0

@@ -14,8 +14,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from skindb.calibration.colour_chart import fit_colour_matrix
-from skindb.calibration.dark_frames import average_dark
-from skindb.calibration.lens import fit_edge, veiling_glare
+from skindb.calibration.lens import fit_edge, fit_vignette, veiling_glare
 from skindb.calibration.mirror_ball import Pinhole, reprojection_error
 from skindb.calibration.pixel_flags import OK
 from skindb.calibration.radiance import (
@@ -24,7 +23,7 @@ from skindb.calibration.radiance import (
     vignette_gain,
 )
 from skindb.calibration.response import TABLE_ROWS, recover_response
-from skindb.calibration.sensor_noise import fit_noise
+from skindb.calibration.sensor_noise import average_dark, fit_noise
 from skindb.calibration.setup import (
     FILE,
     CalibrationFrames,
@@ -32,9 +31,8 @@ from skindb.calibration.setup import (
     KnownPoints,
     regions,
 )
-from skindb.calibration.vignette import fit_vignette
 from skindb.errors import Fault, InputError
-from skindb.format.devices import CameraRecord, DomeRecord, pixel_width
+from skindb.format.dome import CameraRecord, DomeRecord, pixel_width
 from skindb.schema import dataset
 
 Array = NDArray[np.float64]

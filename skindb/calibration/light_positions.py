@@ -23,9 +23,9 @@ from skindb.calibration.mirror_ball import (
     reflected_ray,
 )
 from skindb.errors import Fault, InputError
-from skindb.format.device_checks import MAX_BALL_RADIUS_MM
-from skindb.format.devices import CameraRecord, DomeRecord, LightRecord, filled
-from skindb.format.fields import Fields, inside
+from skindb.format.dome import CameraRecord, DomeRecord, LightRecord
+from skindb.format.fields import Fields
+from skindb.format.frame_paths import filled, inside
 from skindb.format.frames import read_frame
 from skindb.format.json_file import shown
 from skindb.limits import MAX_BALL_PLACES
@@ -35,6 +35,7 @@ Array = NDArray[np.float64]
 PLACE = "place"
 LIGHT = "light"
 CAMERA = "camera"
+MAX_BALL_RADIUS_MM = 1_000.0  # mm; mirror balls have 5 to 200
 THREADS = 2
 
 

@@ -13,19 +13,17 @@ from numpy.typing import NDArray
 from skindb.calibration.frame_checks import view_faults
 from skindb.calibration.irradiance import (
     TARGET_INTERIOR_FRACTION,
+    LightFit,
     Target,
+    TargetPixels,
+    fit_light,
+    position_sensitivity,
     target_pixels,
 )
 from skindb.calibration.pixel_flags import OK, SATURATED
 from skindb.calibration.radiance import FrameMerger, frame_mergers, read_view
-from skindb.calibration.white_target import (
-    LightFit,
-    TargetPixels,
-    fit_light,
-    position_sensitivity,
-)
 from skindb.errors import Fault, InputError
-from skindb.format.devices import (
+from skindb.format.dome import (
     CameraRecord,
     DomeRecord,
     LightRecord,

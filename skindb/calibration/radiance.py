@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from skindb.calibration._merge_kernels import develop
 from skindb.calibration.pixel_flags import DARK, DARK_SIGMA, OK, SATURATED
 from skindb.errors import Fault, InputError
-from skindb.format.devices import CameraRecord, DomeRecord, filled
+from skindb.format.dome import CameraRecord, DomeRecord
+from skindb.format.frame_paths import filled
 from skindb.format.frames import Digests, Frame, read_frames
 from skindb.format.sensor import SensorRecord
 

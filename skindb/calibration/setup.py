@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from skindb.calibration.light_positions import BallFrames, read_ball
 from skindb.errors import Fault, InputError
-from skindb.format.device_checks import EXPOSURE_SECONDS
-from skindb.format.devices import CameraRecord, DomeRecord, filled
-from skindb.format.fields import IDENTIFIER, Fields, inside
+from skindb.format.dome import CameraRecord, DomeRecord
+from skindb.format.fields import IDENTIFIER, Fields
+from skindb.format.frame_paths import EXPOSURE_SECONDS, filled, inside
 from skindb.format.frames import Frame, read_frames
 from skindb.format.json_file import read_json, shown
 from skindb.limits import MAX_EXPOSURES, MAX_KNOWN_POINTS

@@ -4,13 +4,10 @@ reading continues.
 
 from __future__ import annotations
 
-import contextlib
 import difflib
 import re
-import stat
 from collections import Counter
 from collections.abc import Collection, Sequence
-from pathlib import Path
 from string import Formatter
 from typing import Any, NamedTuple
 
@@ -329,59 +326,6 @@ class Fields:
             self.fault(key, f"must name {must}", shown(value))
             return ""
         return value
-
-
-def inside(
-    folder: Path,
-    name: str,
-    where: str,
-    faults: list[Fault],
-    known: dict[Path, bool] | None = None,
-) -> Path | None:
-    """The file `name` of the folder; None and a fault if it lies outside, directly or
-    through a link.
-
-    `known` caches which folders lie inside; it is updated.
-    """
-    path = folder / name
-    try:
-        within = _within(path, folder, {} if known is None else known)
-    except (OSError, ValueError, RuntimeError) as error:
-        rule = "must be a path that this system can follow"
-        cure = "rename the file, and correct the path"
-        faults.append(Fault(where, rule, f"{short(name)}: {_reason(error)}", cure))
-        return None
-    given = Path(name)
-    if given.is_absolute() or ".." in given.parts or not within:
-        rule = "every path must stay inside the capture folder"
-        found = short(name) if within else f"{short(name)}, which leads out of it"
-        faults.append(Fault(where, rule, found, "copy the file into the folder"))
-        return None
-    return path
-
-
-def _within(path: Path, folder: Path, known: dict[Path, bool]) -> bool:
-    """Whether a path stays inside a folder with every link followed; the parent folders
-    are checked once.
-    """
-    try:
-        link = stat.S_ISLNK(path.lstat().st_mode)
-    except (FileNotFoundError, NotADirectoryError):
-        link = False
-    if link:
-        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
-            # fails for cyclic links and names that are too long, which `resolve` of
-            # Python 3.13 ignores
-            path.stat()
-        return path.resolve().is_relative_to(folder.resolve())
-    parent = path.parent
-    if parent not in known:
-        known[parent] = parent.resolve().is_relative_to(folder.resolve())
-    return known[parent]
-
-
-def _reason(error: Exception) -> str:
-    return (error.strerror if isinstance(error, OSError) else None) or str(error)
 
 
 def _has_shape(value: Any, shape: tuple[int, ...]) -> bool:

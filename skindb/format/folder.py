@@ -7,7 +7,7 @@ from __future__ import annotations
 import difflib
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -17,10 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
+from skindb.format.contact_probe import ProbeRecord, read_probe
 from skindb.format.crop_file import crop_path, parsed_crop
-from skindb.format.devices import DomeRecord, ProbeRecord, read_dome, read_probe
-from skindb.format.dome_checks import device_faults, unit_fault
-from skindb.format.fields import IDENTIFIER, NAME, Fields, inside
+from skindb.format.dome import DomeRecord, promised_frames, read_dome
+from skindb.format.fields import IDENTIFIER, NAME, Fields
+from skindb.format.frame_paths import decoding_faults, inside
 from skindb.format.json_file import (
     CURE,
     MAX_MAGNITUDE,
@@ -36,10 +37,11 @@ from skindb.format.length_units import (
     SCAN,
     SIZES,
     Lengths,
+    device_faults,
     likely_units,
+    unit_fault,
     unit_text,
 )
-from skindb.format.recheck import decoding_faults
 from skindb.format.scan_checks import (
     SITE_LANDMARK,
     coincidence_faults,
@@ -54,7 +56,7 @@ from skindb.format.scan_checks import (
 from skindb.geometry.clean import CleanMesh, clean_mesh
 from skindb.geometry.crop import Crop, crop_faces
 from skindb.geometry.scan import Scan, read_scan
-from skindb.limits import MAX_OBJECT_KEYS, MAX_REGIONS
+from skindb.limits import MAX_FRAMES, MAX_OBJECT_KEYS, MAX_REGIONS
 from skindb.schema.cohort import imitates_column
 
 FORMAT = "skindb-capture"
@@ -146,7 +148,7 @@ def read_capture(path: str | Path, *, crop: Crop | None = None) -> Capture:
     reader = _Reader(folder, fields, faults, crop)
     capture = reader.capture()
     if faults or capture is None:
-        faults += decoding_faults(reader.dome, reader.probe, faults)
+        faults += decoding_faults(reader.frame_files(), faults)
         raise InputError(faults)
     return capture
 
@@ -234,6 +236,14 @@ class _Reader:
         said |= {"session": self._session(), "traits": self._traits()}
         said["consent_scope"], said["consent_reference"] = self._consent()
         return said | {"calibration": self._calibration(), "override": self._override()}
+
+    def frame_files(self) -> Iterator[Path]:
+        """All frames of the dome and of the probe, as far as these could be read."""
+        dome = self.dome
+        if dome is not None and dome.frame_count <= MAX_FRAMES:
+            yield from (dome.folder / name for _, name, _ in promised_frames(dome))
+        if self.probe is not None and self.probe.frames:
+            yield from self.probe.frame_files()
 
     def _path(self, key: str, *, required: bool = False) -> Path | None:
         name = (

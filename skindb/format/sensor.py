@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
 from skindb.files import read_regular
-from skindb.format.device_checks import noise_fault
-from skindb.format.fields import Fields, inside
+from skindb.format.fields import Fields
+from skindb.format.frame_paths import inside
 from skindb.format.frames import FrameKind
 from skindb.format.json_file import MAX_MAGNITUDE, shown
 from skindb.limits import MAX_RESPONSE_BYTES
@@ -19,6 +19,10 @@ from skindb.limits import MAX_RESPONSE_BYTES
 Array = NDArray[np.float64]
 UNKNOWN_ELECTRONS = 1e30  # per value, where the file does not state them: no shot noise
 RESPONSE_ERROR = 0.01  # tolerance at the ends of a response, in values and in exposure
+
+# electrons at the white level; cameras of phones have thousands
+MIN_FULL_ELECTRONS = 100.0
+MAX_READ_NOISE_FRACTION = 0.1  # of the white level; cameras have at most 0.01
 
 
 @dataclass(frozen=True)
@@ -188,3 +192,31 @@ def _require_ends(
             found,
             "measure it over all values, and divide it by that at the white level",
         )
+
+
+def noise_fault(where: str, read_noise: float, full_electrons: float) -> Fault | None:
+    """Fault of a sensor with too few electrons, or too much noise, for a picture."""
+    if full_electrons < MIN_FULL_ELECTRONS:
+        rule = (
+            "electrons_per_dn * (white_level - black_level) must be at least "
+            f"{MIN_FULL_ELECTRONS:g} electrons"
+        )
+        return Fault(
+            f"{where}[electrons_per_dn]",
+            rule,
+            f"{full_electrons:.3g}",
+            "measure it by a photon transfer curve",
+        )
+    if read_noise > MAX_READ_NOISE_FRACTION * full_electrons:
+        rule = (
+            f"read noise must be at most {MAX_READ_NOISE_FRACTION:g} of the electrons "
+            "at the white level"
+        )
+        found = f"{read_noise:.3g} of {full_electrons:.3g} electrons"
+        return Fault(
+            f"{where}[read_noise_e]",
+            rule,
+            found,
+            "give it in electrons: values times electrons_per_dn",
+        )
+    return None

@@ -14,10 +14,10 @@ import dask
 import numpy as np
 import xarray as xr
 
-from skindb.calibration.dark_pattern import dark_pattern_fault
 from skindb.calibration.frame_checks import (
     dark_faults,
     dark_notes,
+    dark_pattern_fault,
     level_notes,
     repeated_frame_faults,
 )
@@ -25,11 +25,15 @@ from skindb.calibration.irradiance import light_intensities
 from skindb.calibration.radiance import dark_frame_files, frame_mergers
 from skindb.elementwise import thread_count
 from skindb.errors import Fault, InputError, grouped
-from skindb.format.devices import DomeRecord
+from skindb.format.dome import DomeRecord
 from skindb.format.folder import Capture
 from skindb.format.frames import Digests
 from skindb.geometry.rays import RayScene
-from skindb.ingest.consistency import CalibrationCheck
+from skindb.ingest.consistency import (
+    CalibrationCheck,
+    applied_rotations,
+    refine_cameras,
+)
 from skindb.ingest.consistency_checks import calibration_faults, calibration_notes
 from skindb.ingest.groups import (
     atlas_group,
@@ -50,17 +54,15 @@ from skindb.ingest.lumitexels import (
     fully_lit,
     sample_lumitexels,
 )
-from skindb.ingest.probe_notes import isotropy_p_values, probe_notes
-from skindb.ingest.probe_profiles import fibre_profiles
+from skindb.ingest.probe_profiles import fibre_profiles, isotropy_p_values, probe_notes
 from skindb.ingest.provenance import (
     capture_provenance,
     frame_marks,
     require_fit_consent,
     samples_digest,
 )
-from skindb.ingest.refine import applied_rotations, refine_cameras
 from skindb.ingest.report import describe_samples
-from skindb.ingest.sample_checks import intensity_faults, light_notes, sample_faults
+from skindb.ingest.sample_quality import intensity_faults, light_notes, sample_faults
 from skindb.ingest.spool import Spool
 from skindb.ingest.surfels import SurfelSet, build_surfels, site_positions
 from skindb.ingest.visibility import (

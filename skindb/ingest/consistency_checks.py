@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skindb.errors import Fault
-from skindb.format.devices import DomeRecord
+from skindb.format.dome import DomeRecord
 from skindb.ingest.consistency import MAX_OFFSET_MM, MIN_AGREEMENT, Calibration
 
 # Heads in domes with common errors (lights 1 mm, cameras 0.03 degrees, hair, motion)

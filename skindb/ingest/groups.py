@@ -10,9 +10,9 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from skindb.calibration.radiance import Image
-from skindb.format.devices import DomeRecord, ProbeRecord
+from skindb.format.contact_probe import ProbeRecord
+from skindb.format.dome import DomeRecord, SequenceRecord
 from skindb.format.folder import Capture
-from skindb.format.sequence import SequenceRecord
 from skindb.geometry.camera import camera_centre
 from skindb.geometry.distortion import distortion
 from skindb.ingest.consistency import Calibration

@@ -16,15 +16,20 @@ from skindb.calibration.irradiance import light_falloff
 from skindb.calibration.pixel_flags import OK, SATURATED
 from skindb.calibration.radiance import FrameMerger, Image, radiance_floor, read_view
 from skindb.errors import Fault, InputError
-from skindb.format.devices import CameraRecord, DomeRecord, LightRecord, pixel_width
+from skindb.format.dome import CameraRecord, DomeRecord, LightRecord, pixel_width
 from skindb.format.frames import Digests, Frame
 from skindb.geometry._ring_kernels import grown
 from skindb.geometry.camera import camera_centre, project
 from skindb.ingest._sample_kernels import SINGLE, gather, pixel_counts, pixel_spans
 from skindb.ingest.consistency import Calibration, CalibrationCheck
 from skindb.ingest.consistency_checks import calibration_faults
-from skindb.ingest.sample_checks import bright_fraction, unlit_fault, view_median
-from skindb.ingest.sample_noise import SampleNoise, sample_noise
+from skindb.ingest.sample_quality import (
+    SampleNoise,
+    bright_fraction,
+    sample_noise,
+    unlit_fault,
+    view_median,
+)
 from skindb.ingest.spool import Spool
 from skindb.ingest.surfels import SurfelSet
 from skindb.types import Progress

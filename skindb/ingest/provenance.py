@@ -13,7 +13,8 @@ import numpy as np
 
 from skindb import __version__
 from skindb.errors import Fault, InputError
-from skindb.format.devices import DomeRecord, ProbeRecord, promised_frames
+from skindb.format.contact_probe import ProbeRecord
+from skindb.format.dome import DomeRecord, promised_frames
 from skindb.format.folder import Capture
 
 FRAMES = "frames"  # name of the digest over all frames

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from skindb.format.devices import DomeRecord
+from skindb.format.dome import DomeRecord
 from skindb.format.folder import WHOLE_SURFACE
 from skindb.ingest.lumitexels import Lumitexels
 from skindb.ingest.surfels import SurfelSet

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb.format.devices import CameraRecord, LightRecord
+from skindb.format.dome import CameraRecord, LightRecord
 from skindb.geometry._depth_kernels import matches_tangent_plane
 from skindb.geometry._ring_kernels import grown, mixed
 from skindb.geometry.camera import camera_centre, pixel_rays, project

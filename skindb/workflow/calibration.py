@@ -27,7 +27,7 @@ from skindb.calibration.lights import (
 )
 from skindb.calibration.setup import read_calibration_frames
 from skindb.errors import Fault, InputError
-from skindb.format.devices import DomeRecord
+from skindb.format.dome import DomeRecord
 from skindb.format.folder import Capture
 from skindb.store import CALIBRATION, Database, Record, require_text
 from skindb.workflow.audit import logged_action

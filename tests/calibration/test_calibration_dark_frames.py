@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from skindb.calibration.dark_frames import average_dark
+from skindb.calibration.sensor_noise import average_dark
 from skindb.errors import InputError
 
 

@@ -7,7 +7,7 @@ import pytest
 from sphere import BLACK, CAMERAS, HEIGHT, LIGHTS, SECONDS, WIDTH, save
 from spoil import D, put
 
-from skindb.calibration.dark_pattern import dark_pattern_fault
+from skindb.calibration.frame_checks import dark_pattern_fault
 from skindb.calibration.radiance import frame_mergers
 from skindb.errors import InputError
 from skindb.format.frames import read_frame

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from skindb.calibration.fibre_spots import Spots, fibre_gain, find_fibres, match_fibres
+from skindb.calibration.fibres import Spots, fibre_gain, find_fibres, match_fibres
 from skindb.errors import InputError
 
 

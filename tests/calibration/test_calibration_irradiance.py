@@ -18,7 +18,7 @@ from skindb.calibration.irradiance import (
 )
 from skindb.calibration.radiance import frame_mergers
 from skindb.errors import InputError
-from skindb.format.devices import CameraRecord, WhiteRecord
+from skindb.format.dome import CameraRecord, WhiteRecord
 from skindb.format.folder import read_capture
 from skindb.geometry.camera import project
 

@@ -20,7 +20,7 @@ from skindb.calibration.fibres import (
 )
 from skindb.cli import cli
 from skindb.errors import InputError
-from skindb.format.devices import read_probe
+from skindb.format.contact_probe import read_probe
 from skindb.format.fields import Fields
 
 sys.path.append(str(Path(__file__).parent))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from skindb.calibration.repeatability import level_trend, placement_variance
+from skindb.calibration.profile_statistics import level_trend, placement_variance
 from skindb.errors import InputError
 
 DISTANCE = 1 + 0.5 * np.arange(28)

@@ -12,9 +12,9 @@ from skindb.calibration.response import (
     ResponseOptions,
     _mean_exposure_value,
     recover_response,
+    response_samples,
     write_response,
 )
-from skindb.calibration.response_samples import response_samples
 from skindb.errors import InputError
 from skindb.format.fields import Fields
 from skindb.format.frames import FrameKind

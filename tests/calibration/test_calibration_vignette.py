@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from skindb.calibration.vignette import fit_vignette
+from skindb.calibration.lens import fit_vignette
 from skindb.errors import InputError
 
 TRUE_VIGNETTE = np.array([-0.21, -0.06, -0.03])

@@ -5,11 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from skindb.calibration.white_target import (
-    TargetPixels,
-    fit_light,
-    position_sensitivity,
-)
+from skindb.calibration.irradiance import TargetPixels, fit_light, position_sensitivity
 from skindb.errors import InputError
 
 INTENSITY = np.array([900.0, 1000.0, 800.0])

@@ -13,7 +13,7 @@ import trimesh
 from sphere import RADIUS, half_sphere
 
 from skindb.errors import InputError
-from skindb.format.dome_checks import unit_fault
+from skindb.format.length_units import unit_fault
 from skindb.geometry.clean import CleanMesh, clean_mesh
 from skindb.ingest import read_capture
 

@@ -16,7 +16,9 @@ import trimesh
 from spoil import C, D, P, drop, edit, edited, put
 
 from skindb.errors import InputError
-from skindb.format import devices, folder, pressure, sensor, sequence
+from skindb.format import dome as devices
+from skindb.format import folder, sensor, sequence
+from skindb.format import sequence as pressure
 from skindb.ingest import read_capture
 
 

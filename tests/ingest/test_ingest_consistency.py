@@ -20,9 +20,12 @@ from skindb.errors import InputError
 from skindb.format.folder import read_capture
 from skindb.geometry.rays import RayScene
 from skindb.ingest import IngestParameters, ingest_capture
-from skindb.ingest.consistency import CalibrationCheck
+from skindb.ingest.consistency import (
+    CalibrationCheck,
+    applied_rotations,
+    refine_cameras,
+)
 from skindb.ingest.consistency_checks import calibration_faults, calibration_notes
-from skindb.ingest.photo_brightness import relative_brightness
 from skindb.ingest.photo_offsets import (
     ReducedView,
     bilinear,
@@ -30,9 +33,9 @@ from skindb.ingest.photo_offsets import (
     interpolated,
     nan_quantile,
     reduced,
+    relative_brightness,
     square_root_image,
 )
-from skindb.ingest.refine import applied_rotations, refine_cameras
 from skindb.ingest.surfels import build_surfels
 from skindb.ingest.visibility import camera_visibility, light_visibility
 from skindb.virtual.takes import simulate_takes

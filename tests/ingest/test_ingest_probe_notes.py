@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from skindb.format.folder import read_capture
-from skindb.ingest.probe_notes import isotropy_p_values, probe_notes
-from skindb.ingest.probe_profiles import Profiles
+from skindb.ingest.probe_profiles import Profiles, isotropy_p_values, probe_notes
 
 ROWS = 16
 FIBRES = 8

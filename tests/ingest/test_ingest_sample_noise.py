@@ -24,14 +24,14 @@ from sphere import (
 from skindb.calibration.radiance import frame_merger, merge_exposures
 from skindb.fit.lumitexels import lumitexels
 from skindb.fit.sample_noise import noise_inputs, sample_variance
-from skindb.format.devices import CameraRecord
+from skindb.format.dome import CameraRecord
 from skindb.format.folder import read_capture
 from skindb.format.frames import FrameKind
 from skindb.format.sensor import UNKNOWN_ELECTRONS, SensorRecord
 from skindb.geometry.rays import RayScene
 from skindb.ingest.groups import dome_group, sample_group, surfel_group
 from skindb.ingest.lumitexels import Views, sample_lumitexels
-from skindb.ingest.sample_noise import radiance_noise
+from skindb.ingest.sample_quality import radiance_noise
 from skindb.ingest.spool import Spool
 from skindb.ingest.surfels import build_surfels
 from skindb.ingest.visibility import camera_visibility

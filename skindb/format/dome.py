@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -11,47 +12,46 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb.format.device_checks import (
-    EXPOSURE_SECONDS,
-    MAX_DISC_RADIUS_MM,
-    MAX_FALLOFF,
-    MAX_FIBRE_RADIUS_MM,
-    MAX_GAIN_ERROR,
-    MAX_VIGNETTE_GAIN,
-    MIN_VIGNETTE_GAIN,
-    TARGET_HALF_SIZES_MM,
-    distortion_fault,
-    fibre_faults,
-    gain_faults,
+from skindb.errors import Fault
+from skindb.format.fields import IDENTIFIER, Fields
+from skindb.format.frame_paths import (
+    CAMERA,
+    EXPOSURE,
+    LIGHT,
+    filled,
+    inside,
+    read_exposures,
+    require_merged,
+    require_own_files,
 )
-from skindb.format.fields import IDENTIFIER, Fields, inside
-from skindb.format.frames import FrameKind, frame_size, header_faults, is_linear
+from skindb.format.frames import FrameKind, header_faults, is_linear
 from skindb.format.json_file import shown
-from skindb.format.pressure import read_pressure
 from skindb.format.sensor import SensorRecord, read_sensor
-from skindb.format.sequence import SequenceRecord, read_sequence
 from skindb.geometry.camera import camera_centre
 from skindb.limits import (
     MAX_CAMERAS,
-    MAX_EXPOSURES,
-    MAX_FIBRES,
     MAX_FRAME_PIXELS,
     MAX_FRAMES,
     MAX_LIGHTS,
-    MAX_PLACEMENTS,
-    MAX_SITES,
+    MAX_SEQUENCE_STEPS,
 )
 
 Array = NDArray[np.float64]
 ROTATION_TOLERANCE = 1e-4  # of R R^T - 1: five digits in the file
+MAX_DISC_RADIUS_MM = 2_000.0  # mm: the largest soft boxes have a radius of 1 m
+# exponent of the cosine: a narrow spot, half as bright at 1.5 degrees from the axis
+MAX_FALLOFF = 2_000.0
+TARGET_HALF_SIZES_MM = (1.0, 2_000.0)  # mm: from a patch of a colour chart to a wall
+MIN_VIGNETTE_GAIN = 0.05  # at a corner: a lens that darkens by 4 stops has 0.06
+# relative to the principal point; lenses darken towards the corners
+MAX_VIGNETTE_GAIN = 4.0
+# distortion at the farthest corner; fisheyes have 0.5 and 0.01
+RADIAL_FACTORS = (0.1, 10.0)
+MAX_TANGENTIAL = 0.5
+MAX_SECONDS = 1e6  # of a session; more indicates inconsistent clocks
+SEQUENCE_CURE = "write what the controller acknowledged, or remove the sequence"
 # radii from the centre to a corner at which the gain of a lens is checked
 VIGNETTE_STEPS = 1000
-GAIN_ERROR = 0.005  # relative error of a fibre's gain, where the file does not state it
-EXPOSURE = "exposure"
-LIGHT = "light"
-CAMERA = "camera"
-SITE = "site"
-PLACEMENT = "placement"
 
 
 @dataclass(frozen=True)
@@ -95,6 +95,17 @@ class WhiteRecord:
 
 
 @dataclass(frozen=True)
+class SequenceRecord:
+    """Steps in the order in which they were executed."""
+
+    light: tuple[str, ...]  # id of the light of each step
+    exposure: tuple[str, ...]
+    on: Array  # (step,) s since the first light went on
+    off: Array  # (step,) s
+    triggers: NDArray[np.int64]  # (step,) number of trigger pulses
+
+
+@dataclass(frozen=True)
 class DomeRecord:
     """The dome of a capture."""
 
@@ -123,53 +134,10 @@ class DomeRecord:
         )
 
 
-@dataclass(frozen=True)
-class ProbeRecord:
-    """The contact probe of a capture."""
-
-    folder: Path
-    sites: tuple[str, ...]
-    # names of the placements at each site; ("",) for a single one
-    placements: Mapping[str, tuple[str, ...]]
-    distance: Array  # (fibre,) mm
-    azimuth: Array  # (fibre,) degrees about the source fibre; NaN if unknown
-    centre: Array  # (fibre, 2) px
-    radius: Array  # (fibre,) px
-    exposures: Mapping[str, float]
-    frames: str
-    gain: Array  # (fibre, 3)
-    gain_error: float  # relative, of each
-    face: float  # radius of a fibre in mm; 0 if unknown
-    scale: float | None
-    sensor: SensorRecord
-    fibres: tuple[str, ...]
-    pressure: Mapping[tuple[str, str], Array]  # (site, placement) -> (n, 2) s, kPa
-    file: Path  # probe.json
-
-    def frame(self, site: str, exposure: str, placement: str = "") -> Path:
-        """File of a frame."""
-        return self.folder / filled(
-            self.frames, site=site, exposure=exposure, placement=placement
-        )
-
-    def frame_files(self) -> Iterator[Path]:
-        """Files of all frames."""
-        for site in self.sites:
-            for placement, exposure in product(self.placements[site], self.exposures):
-                yield self.frame(site, exposure, placement)
-
-
 def pixel_width(camera: CameraRecord, point: Array) -> float:
     """Width [mm] of a pixel at the distance of a point."""
     distance = float(np.linalg.norm(camera_centre(camera.R, camera.t) - point))
     return distance / float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
-
-
-def filled(template: str, **names: str) -> str:
-    """The template with its placeholders replaced."""
-    for name, value in names.items():
-        template = template.replace(f"{{{name}}}", value)
-    return template
 
 
 def read_dome(
@@ -186,7 +154,7 @@ def read_dome(
     If it is `calibrated`, a calibration provides the intensities; without `face` it is
     a set-up without face frames.
     """
-    exposures = _exposures(fields)
+    exposures = read_exposures(fields)
     several = {EXPOSURE} if len(exposures) > 1 else set()
     frames = (
         fields.template("frames", {LIGHT, CAMERA} | several, {EXPOSURE}) if face else ""
@@ -196,7 +164,7 @@ def read_dome(
         frames or (str(target.get("frames", "")) if isinstance(target, dict) else "")
     )
     if linear:
-        _require_merged(fields, exposures)
+        require_merged(fields, exposures)
     cameras = tuple(
         _camera(folder, item, linear=linear)
         for item in fields.items("cameras", most=MAX_CAMERAS)
@@ -235,103 +203,6 @@ def read_dome(
     )
     _check_frames(dome, fields)
     return dome
-
-
-def read_probe(folder: Path, fields: Fields) -> ProbeRecord:
-    """The probe of `probe.json`; faults are recorded in `fields`."""
-    noted = len(fields.faults)
-    fibres = fields.items("fibres", most=MAX_FIBRES)
-    exposures = _exposures(fields)
-    several = {EXPOSURE} if len(exposures) > 1 else set()
-    sites = fields.names("sites", most=MAX_SITES)
-    placements = _placements(fields, sites)
-    several |= (
-        {PLACEMENT} if any(len(own) > 1 for own in placements.values()) else set()
-    )
-    frames = fields.template("frames", {SITE} | several, {EXPOSURE, PLACEMENT})
-    if is_linear(frames):
-        _require_merged(fields, exposures)
-    scale = fields.get("scale", None)
-    probe = ProbeRecord(
-        folder=folder,
-        sites=sites,
-        placements=placements,
-        azimuth=np.array([_azimuth(fibre) for fibre in fibres]),
-        distance=np.array([fibre.number("distance", above=0.0) for fibre in fibres]),
-        centre=np.array([fibre.array("centre", (2,)) for fibre in fibres]).reshape(
-            -1, 2
-        ),
-        radius=np.array([fibre.number("radius", above=0.0) for fibre in fibres]),
-        exposures=exposures,
-        frames=frames,
-        gain=fields.gains("gain", len(fibres)),
-        gain_error=fields.number(
-            "gain_error", default=GAIN_ERROR, least=0.0, most=MAX_GAIN_ERROR
-        ),
-        face=fields.number(
-            "fibre_radius", default=0.0, least=0.0, most=MAX_FIBRE_RADIUS_MM
-        ),
-        scale=None if scale is None else fields.number("scale", above=0.0),
-        sensor=read_sensor(
-            folder, fields, FrameKind(0, 0, 0), linear=is_linear(frames)
-        ),
-        fibres=tuple(fibre.text("id", rule=IDENTIFIER) for fibre in fibres),
-        pressure=read_pressure(fields, placements),
-        file=Path(fields.where),
-    )
-    if len(fields.faults) == noted:
-        fields.faults += fibre_faults(
-            fields.where, probe.distance, probe.centre, probe.radius, probe.face
-        )
-        fields.faults += gain_faults(fields.where, probe.gain)
-    _check_probe_frames(probe, fields)
-    return probe
-
-
-def _placements(fields: Fields, sites: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """Names of the placements of the probe at each site; a site without names has a
-    single placement.
-    """
-    given = Fields(
-        fields.get("placements", {}), f"{fields.where}[placements]", fields.faults
-    )
-    if unknown := sorted(set(given.data) - set(sites)):
-        given.fault(unknown[0], "must be one of the sites", shown(unknown[0]))
-    return {
-        site: given.names(site, most=MAX_PLACEMENTS) if site in given.data else ("",)
-        for site in sites
-    }
-
-
-def _azimuth(fibre: Fields) -> float:
-    given = fibre.get("azimuth", None)
-    return (
-        np.nan if given is None else fibre.number("azimuth", least=-360.0, most=360.0)
-    )
-
-
-def _exposures(fields: Fields) -> dict[str, float]:
-    items = fields.items("exposures", most=MAX_EXPOSURES)
-    least, most = EXPOSURE_SECONDS
-    return {
-        item.text("id", rule=IDENTIFIER): item.number("seconds", least=least, most=most)
-        for item in items
-    }
-
-
-def _require_merged(fields: Fields, exposures: Mapping[str, float]) -> None:
-    """Require one exposure of one second: merged radiance is per second, and another
-    time would scale it again.
-    """
-    if exposures and [*exposures.values()] != [1.0]:
-        found = ", ".join(f"{seconds:g} s" for seconds in exposures.values())
-        rule = "OpenEXR frames are merged radiance: one exposure of 1 second"
-        fields.fault(
-            "exposures",
-            rule,
-            found,
-            "merge them, divide by their seconds, and give one exposure of 1 second",
-        )
 
 
 def _camera(folder: Path, item: Fields, *, linear: bool) -> CameraRecord:
@@ -487,38 +358,12 @@ def _check_frames(dome: DomeRecord, fields: Fields) -> None:
         (key, filled(t, **names), {"template": key, **names})
         for key, t, names, _ in _views(dome)
     )
-    _require_own_files(fields, views)
+    require_own_files(fields, views)
     for key, name, camera in promised_frames(dome):
         where = f"{fields.where}[{key}]"
         path = inside(dome.folder, name, where, fields.faults, known)
         if path is not None:
             fields.faults += header_faults(path, camera.sensor.kind, where)
-
-
-def _require_own_files(
-    fields: Fields, views: Iterable[tuple[str, str, dict[str, str]]]
-) -> None:
-    """Require a separate file for every view: ids such as a_b and a with c and b_c can
-    form the same path.
-    """
-    first = dict[Path, dict[str, str]]()
-    shared = list[tuple[str, str]]()
-    for key, name, names in views:
-        if (other := first.setdefault(Path(name), names)) != names:
-            one, two = (
-                ", ".join(f"{k} {v}" for k, v in view.items() if other[k] != names[k])
-                for view in (other, names)
-            )
-            shared.append((key, f"{Path(name).name} of {one} and of {two}"))
-    if shared:
-        key, found = shared[0]
-        cure = "rename the ids, or separate them by folders in the template"
-        fields.fault(
-            key,
-            "every view must have its own file",
-            f"{len(shared)} shared, {found}",
-            cure,
-        )
 
 
 def _views(dome: DomeRecord) -> Iterator[tuple[str, str, dict[str, str], CameraRecord]]:
@@ -553,26 +398,111 @@ def promised_frames(dome: DomeRecord) -> Iterator[tuple[str, str, CameraRecord]]
         yield key, filled(template, **names), camera
 
 
-def _check_probe_frames(probe: ProbeRecord, fields: Fields) -> None:
-    """Require that all frames have the size of the first one, and the declared depth."""
-    size: FrameKind | None = None
-    views = [
-        {SITE: site, EXPOSURE: exposure, PLACEMENT: placement}
-        for site in (probe.sites if probe.frames else ())
-        for placement, exposure in product(probe.placements[site], probe.exposures)
-    ]
-    _require_own_files(
-        fields, (("frames", filled(probe.frames, **names), names) for names in views)
+def read_sequence(
+    fields: Fields, lights: Collection[str], exposures: Collection[str]
+) -> SequenceRecord | None:
+    """The sequence of dome.json, or None if it has none; faults are recorded in `fields`."""
+    if fields.get("sequence", None) is None:
+        return None
+    noted = len(fields.faults)
+    steps = fields.items("sequence", most=MAX_SEQUENCE_STEPS)
+    light = tuple(step.text("light") for step in steps)
+    exposure = tuple(step.text("exposure") for step in steps)
+    on = np.array([_seconds(step, "t_on") for step in steps])
+    off = np.array([_seconds(step, "t_off") for step in steps])
+    triggers = np.array(
+        [step.integer("trigger_count", least=0, default=1) for step in steps], np.int64
     )
-    for names in views:
-        where = f"{fields.where}[frames]"
-        path = inside(probe.folder, filled(probe.frames, **names), where, fields.faults)
-        if path is None:
-            continue
-        size = size or _kind_of(path, probe.sensor.kind.bits)
-        fields.faults += header_faults(path, size or probe.sensor.kind, where)
+    if len(fields.faults) > noted:
+        return None
+    for key, given, known in (
+        ("light", light, lights),
+        ("exposure", exposure, exposures),
+    ):
+        if unknown := sorted(set(given) - set(known)):
+            fields.fault(
+                "sequence",
+                f"every {key} must be listed in dome.json",
+                shown(unknown[0]),
+                SEQUENCE_CURE,
+            )
+        if missing := sorted(set(known) - set(given)):
+            fields.fault(
+                "sequence",
+                f"every {key} of dome.json must have a step",
+                f"none of {missing[0]}",
+                SEQUENCE_CURE,
+            )
+    if not (off > on).all():
+        fields.fault(
+            "sequence",
+            "t_off must be after t_on",
+            f"step {int((off <= on).argmax())}",
+            SEQUENCE_CURE,
+        )
+    elif not (np.diff(on) >= 0).all():
+        found = (
+            f"step {int((np.diff(on) < 0).argmax()) + 1} is earlier than the one before"
+        )
+        fields.fault(
+            "sequence",
+            "steps must be in the order in which they were executed",
+            found,
+            SEQUENCE_CURE,
+        )
+    elif off.max() - on[0] > MAX_SECONDS:
+        fields.fault(
+            "sequence",
+            f"a session must last at most {MAX_SECONDS:g} s",
+            f"{off.max() - on[0]:.3g} s",
+            SEQUENCE_CURE,
+        )
+    return SequenceRecord(light, exposure, on - on[0], off - on[0], triggers)
 
 
-def _kind_of(path: Path, bits: int) -> FrameKind | None:
-    size = frame_size(path)
-    return None if size is None else FrameKind(*size, bits)
+def _seconds(step: Fields, key: str) -> float:
+    """A time in seconds, or an ISO 8601 time with its zone as seconds since 1970."""
+    if isinstance(text := step.get(key), str):
+        try:
+            time = datetime.fromisoformat(text)
+        except ValueError:
+            time = datetime.min
+        if time.tzinfo is None:
+            step.fault(
+                key,
+                "must be a number of seconds, or an ISO 8601 time with its zone",
+                shown(text),
+                SEQUENCE_CURE,
+            )
+            return 0.0
+        return time.timestamp()
+    return step.number(key, least=-1e10, most=1e10)
+
+
+def distortion_fault(where: str, lens: Array, K: Array, size: Array) -> Fault | None:
+    """Fault of a distortion k1 k2 p1 p2 k3 that is too large at the corners of the picture."""
+    corners = (np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * size - K[:2, 2]) / [
+        K[0, 0],
+        K[1, 1],
+    ]
+    k1, k2, p1, p2, k3 = lens
+    r2 = float((corners**2).sum(axis=1).max())
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    tangential = 3 * np.hypot(p1, p2) * np.sqrt(r2)
+    if (
+        RADIAL_FACTORS[0] <= radial <= RADIAL_FACTORS[1]
+        and tangential <= MAX_TANGENTIAL
+    ):
+        return None
+    rule = (
+        f"1 + k1 r^2 + k2 r^4 + k3 r^6 must be {RADIAL_FACTORS[0]:g} to "
+        f"{RADIAL_FACTORS[1]:g}, and 3 |p| r at most "
+        f"{MAX_TANGENTIAL:g}, at the corners of the picture"
+    )
+    found = f"{radial:.3g} and {tangential:.3g} at r = {np.sqrt(r2):.3g}"
+    return Fault(
+        f"{where}[distortion]",
+        rule,
+        found,
+        "the order is k1, k2, p1, p2, k3, of distances over the focal length",
+    )
