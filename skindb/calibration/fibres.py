@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import xarray as xr
@@ -14,11 +13,8 @@ from scipy import ndimage, optimize
 from skindb.calibration.frame_checks import disagreement
 from skindb.calibration.radiance import merge_exposures
 from skindb.errors import Fault, InputError
-from skindb.format.contact_probe import ProbeRecord, read_probe
-from skindb.format.fields import Fields
-from skindb.format.frame_paths import EXPOSURE, SITE
+from skindb.format.contact_probe import ProbeRecord
 from skindb.format.frames import Digests, Frame, read_frame, read_frames
-from skindb.format.json_file import read_json
 from skindb.limits import MAX_FIBRE_PIXELS
 from skindb.schema import dataset
 
@@ -29,14 +25,8 @@ Index = NDArray[np.int64]
 # fibre whose centre is 50 % above its mean brightness, the signal is then 0.5 % too
 # low, which is the default error of a gain
 MAX_LOST_FRACTION = 0.01
-FILE = "contact/calibration.json"
-PROBE_FILE = "contact/probe.json"
-REPEAT = "repeat"
-MAX_REPEATS = 64
 ROWS = 256  # of the frames that are merged at a time
 GREEN = 1
-# keys of probe.json that a set-up may lack
-OF_SESSIONS = ("sites", "frames", "placements", "pressure")
 MIN_SPOT_PIXELS = 9
 # contrast of a spot over the robust standard deviation of the background
 MIN_CONTRAST = 8.0
@@ -134,57 +124,6 @@ def fibre_pixels(probe: ProbeRecord, shape: tuple[int, ...]) -> list[Index]:
     if faults:
         raise InputError(faults)
     return fibres
-
-
-def read_flat_frames(folder: Path) -> ProbeRecord | None:
-    """The probe of a set-up, with the repeats of its flat field as sites; None without
-    `contact/calibration.json`.
-
-    Raises
-    ------
-    InputError
-        With every fault of the two files and of the headers of the frames.
-    """
-    file = folder / FILE
-    faults = list[Fault]()
-    if not file.exists():
-        return None
-    data = read_json(file, faults)
-    probe = read_json(folder / PROBE_FILE, faults)
-    if data is None or not isinstance(probe, dict):
-        raise InputError(
-            faults
-            or [
-                Fault(
-                    str(folder / PROBE_FILE),
-                    "must be a JSON object {...}",
-                    "another value",
-                )
-            ]
-        )
-    fields = Fields(data, str(file), faults)
-    template = fields.template("frames", {REPEAT, EXPOSURE}, set())
-    repeats = fields.integer("repeats", least=MIN_FRAMES, most=MAX_REPEATS)
-    if unknown := fields.unknown():
-        faults.append(
-            Fault(
-                str(file),
-                "its keys are frames and repeats",
-                ", ".join(unknown),
-                "correct the name",
-            )
-        )
-    if faults:
-        raise InputError(faults)
-    flat = {key: value for key, value in probe.items() if key not in OF_SESSIONS}
-    flat |= {
-        "sites": [str(i + 1) for i in range(repeats)],
-        "frames": template.replace(f"{{{REPEAT}}}", f"{{{SITE}}}"),
-    }
-    found = read_probe(folder, Fields(flat, str(folder / PROBE_FILE), faults))
-    if faults:
-        raise InputError(faults)
-    return found
 
 
 def calibrate_probe(flat: ProbeRecord) -> xr.Dataset:

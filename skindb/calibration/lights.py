@@ -1,10 +1,12 @@
-"""Calibration of the lights of a dome from its white target, and its application to a capture."""
+"""Calibration of the lights of a dome: intensities from its white target, positions from
+highlights on a mirror ball, and their application to a capture.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import xarray as xr
@@ -20,21 +22,31 @@ from skindb.calibration.irradiance import (
     position_sensitivity,
     target_pixels,
 )
+from skindb.calibration.mirror_ball import (
+    LightPosition,
+    Outline,
+    Pinhole,
+    ball_centre,
+    highlight_centre,
+    light_position,
+    reflected_ray,
+)
 from skindb.calibration.pixel_flags import OK, SATURATED
 from skindb.calibration.radiance import FrameMerger, frame_mergers, read_view
+from skindb.calibration.setup import PLACE, BallFrames
 from skindb.errors import Fault, InputError
 from skindb.format.dome import (
     CameraRecord,
     DomeRecord,
     LightRecord,
     WhiteRecord,
-    read_dome,
 )
-from skindb.format.fields import Fields
-from skindb.format.json_file import read_json
+from skindb.format.frame_paths import CAMERA, LIGHT, filled
+from skindb.format.frames import read_frame
 from skindb.schema import dataset
 
-THREADS = 2
+Array = NDArray[np.float64]
+
 # Standard error of a light relative to the target along each axis, chosen in advance
 # for a careful calibration. In generated captures with errors of 0.6 mm of lights and
 # of cameras, intensities have z-scores of 0.9 to 1.2 with it.
@@ -42,41 +54,7 @@ POSITION_ERROR_MM = 1.0
 # half diagonals of the target: light farther from its centre is not that of its blurred
 # corners
 BESIDE_TARGET = 1.05
-
-
-def read_setup_dome(
-    folder: Path, *, white: bool = True, dark: bool = True
-) -> DomeRecord:
-    """The dome of a set-up folder, which has no frames of a face; frames of a `white`
-    target are required by default.
-
-    Without `dark`, the dark frames and the sequence of the file are ignored, because a
-    session takes its own.
-
-    Raises
-    ------
-    InputError
-        With every fault of `dome/dome.json` and of the frames, or without a white target.
-    """
-    faults = list[Fault]()
-    file = folder / "dome/dome.json"
-    data = read_json(file, faults)
-    if data is None:
-        raise InputError(faults)
-    if not dark and isinstance(data, dict):
-        data = {
-            key: value for key, value in data.items() if key not in ("dark", "sequence")
-        }
-    dome = read_dome(
-        folder, Fields(data, str(file), faults), face=False, calibrated=True
-    )
-    if white and dome.white is None and not faults:
-        rule = "a calibration needs the frames of a white target"
-        cure = "photograph it, see docs/capture_format.md"
-        faults.append(Fault(f"{file}[white]", rule, "none", cure))
-    if faults:
-        raise InputError(faults)
-    return dome
+THREADS = 2
 
 
 @dataclass(frozen=True)
@@ -286,6 +264,130 @@ def calibrated_dome(
             intensity=intensity.sel(light=light.id).values,
             falloff=float(falloff.sel(light=light.id)),
         )
+        for light in dome.lights
+    )
+    return replace(dome, lights=tuple(lights))
+
+
+def calibrate_positions(dome: DomeRecord, ball: BallFrames) -> xr.Dataset:
+    """Position of every light from its highlights on the ball, with standard errors.
+
+    A light needs its highlight in two frames, of different cameras or places of the
+    ball. Frames without a highlight are skipped: the light may be hidden, or behind the
+    ball.
+
+    Returns
+    -------
+    Dataset
+        Group "position_calibration".
+
+    Raises
+    ------
+    InputError
+        With every frame that cannot be read, and every light that is seen in fewer than two frames.
+    """
+    cameras = {
+        camera.id: Pinhole(camera.K, camera.R, camera.t, camera.distortion)
+        for camera in dome.cameras
+    }
+    centres = dict[str, Array]()
+    for place, circles in ball.outlines.items():
+        try:
+            seen = [cameras[name] for name in circles]
+            centres[place] = ball_centre(
+                seen, list(circles.values()), ball.radius
+            ).centre
+        except InputError as error:
+            raise InputError(
+                [
+                    replace(fault, where=f"{fault.where}, place {place}")
+                    for fault in error.faults
+                ]
+            ) from None
+    faults = list[Fault]()
+
+    def one(light: LightRecord) -> tuple[LightPosition | None, int]:
+        try:
+            rays = list(_rays(dome, ball, centres, light))
+            if len(rays) < 2:
+                rule = "its highlight must appear in two frames"
+                cure = "expose them longer, or add a place of the ball"
+                raise InputError(Fault("mirror ball", rule, f"{len(rays)}", cure))
+            return light_position(*zip(*rays, strict=True)), len(rays)
+        except InputError as error:
+            faults.extend(
+                replace(fault, where=f"light {light.id}, {fault.where}")
+                for fault in error.faults
+            )
+            return None, 0
+
+    with ThreadPoolExecutor(THREADS) as pool:
+        pairs = list(pool.map(one, dome.lights))
+    if faults:
+        raise InputError(sorted(faults, key=str))
+    found = [position for position, _ in pairs if position is not None]
+    return dataset(
+        {
+            "calibrated_position": [one.position for one in found],
+            "calibrated_position_error": [
+                np.sqrt(np.diag(one.covariance)) for one in found
+            ],
+            "position_ray_count": [count for _, count in pairs],
+            "position_miss": [np.sqrt(np.mean(one.miss**2)) for one in found],
+        },
+        coords={"light": [light.id for light in dome.lights], "xyz": ["x", "y", "z"]},
+    )
+
+
+def _rays(
+    dome: DomeRecord, ball: BallFrames, centres: Mapping[str, Array], light: LightRecord
+) -> Iterator[tuple[Array, Array]]:
+    """Points of the ball, and directions from them to the light, of all frames that
+    show its highlight.
+    """
+    for place, circles in ball.outlines.items():
+        for camera in dome.cameras:
+            if camera.id not in circles:
+                continue
+            names = {PLACE: place, LIGHT: light.id, CAMERA: camera.id}
+            frame = read_frame(
+                ball.folder / filled(ball.frames, **names), camera.sensor.kind
+            )
+            column, row, radius = circles[camera.id]
+            try:
+                highlight = highlight_centre(
+                    frame, Outline(np.array([column, row]), radius)
+                )
+            except InputError:
+                continue
+            pinhole = Pinhole(camera.K, camera.R, camera.t, camera.distortion)
+            yield reflected_ray(pinhole, centres[place], ball.radius, highlight)
+
+
+def positioned_dome(
+    dome: DomeRecord, calibration: xr.Dataset, *, where: str
+) -> DomeRecord:
+    """The dome with the light positions of a calibration; the axes of the lights are unchanged.
+
+    Raises
+    ------
+    InputError
+        If the calibration lacks a light.
+    """
+    known = calibration["calibrated_position"].load()
+    names = set(map(str, known["light"].values))
+    if missing := [light.id for light in dome.lights if light.id not in names]:
+        found = f"none of {', '.join(missing[:5])}"
+        raise InputError(
+            Fault(
+                where,
+                "a calibration must have every light of the capture",
+                found,
+                "calibrate again",
+            )
+        )
+    lights = (
+        replace(light, position=known.sel(light=light.id).values)
         for light in dome.lights
     )
     return replace(dome, lights=tuple(lights))

@@ -1,5 +1,6 @@
-"""`dome/calibration.json` of a set-up: the frames from which its cameras and light
-positions are calibrated.
+"""Set-up folders: `dome/dome.json` without a face, and `dome/calibration.json` and
+`contact/calibration.json`, which name the frames for the calibration of cameras, lights
+and probe.
 """
 
 from __future__ import annotations
@@ -12,22 +13,71 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb.calibration.light_positions import BallFrames, read_ball
+from skindb.calibration.fibres import MIN_FRAMES
 from skindb.errors import Fault, InputError
-from skindb.format.dome import CameraRecord, DomeRecord
+from skindb.format.contact_probe import ProbeRecord, read_probe
+from skindb.format.dome import CameraRecord, DomeRecord, read_dome
 from skindb.format.fields import IDENTIFIER, Fields
-from skindb.format.frame_paths import EXPOSURE_SECONDS, filled, inside
+from skindb.format.frame_paths import (
+    CAMERA,
+    EXPOSURE,
+    EXPOSURE_SECONDS,
+    LIGHT,
+    SITE,
+    filled,
+    inside,
+)
 from skindb.format.frames import Frame, read_frames
 from skindb.format.json_file import read_json, shown
-from skindb.limits import MAX_EXPOSURES, MAX_KNOWN_POINTS
+from skindb.limits import MAX_BALL_PLACES, MAX_EXPOSURES, MAX_KNOWN_POINTS
 
+Array = NDArray[np.float64]
 FILE = "dome/calibration.json"
+MAX_BALL_RADIUS_MM = 1_000.0  # mm; mirror balls have 5 to 200
+PLACE = "place"
+FLAT_FILE = "contact/calibration.json"
+PROBE_FILE = "contact/probe.json"
+# keys of probe.json that a set-up may lack
+OF_SESSIONS = ("sites", "frames", "placements", "pressure")
 PATCHES = 24  # of a ColorChecker
 MAX_REPEATS = 64
-CAMERA = "camera"
-EXPOSURE = "exposure"
 REPEAT = "repeat"
 BRACKETED = ("response", "flat", "chart", "edge")  # kinds that need the key exposures
+
+
+def read_setup_dome(
+    folder: Path, *, white: bool = True, dark: bool = True
+) -> DomeRecord:
+    """The dome of a set-up folder, which has no frames of a face; frames of a `white`
+    target are required by default.
+
+    Without `dark`, the dark frames and the sequence of the file are ignored, because a
+    session takes its own.
+
+    Raises
+    ------
+    InputError
+        With every fault of `dome/dome.json` and of the frames, or without a white target.
+    """
+    faults = list[Fault]()
+    file = folder / "dome/dome.json"
+    data = read_json(file, faults)
+    if data is None:
+        raise InputError(faults)
+    if not dark and isinstance(data, dict):
+        data = {
+            key: value for key, value in data.items() if key not in ("dark", "sequence")
+        }
+    dome = read_dome(
+        folder, Fields(data, str(file), faults), face=False, calibrated=True
+    )
+    if white and dome.white is None and not faults:
+        rule = "a calibration needs the frames of a white target"
+        cure = "photograph it, see docs/capture_format.md"
+        faults.append(Fault(f"{file}[white]", rule, "none", cure))
+    if faults:
+        raise InputError(faults)
+    return dome
 
 
 @dataclass(frozen=True)
@@ -52,6 +102,20 @@ class KnownPoints:
 
     position: NDArray[np.float64]
     pixel: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class BallFrames:
+    """Frames of a mirror ball: one for each place of the ball, light, and camera with an outline.
+
+    `radius` is that of the ball in mm. `outlines` are, by place and camera, column, row
+    and radius (3,) in px.
+    """
+
+    folder: Path
+    frames: str
+    radius: float
+    outlines: Mapping[str, Mapping[str, Array]]
 
 
 @dataclass(frozen=True)
@@ -247,6 +311,117 @@ def _known_points(dome: DomeRecord, fields: Fields) -> dict[str, KnownPoints]:
                 np.array([position[n] for n in both]),
                 np.array([pixel[n] for n in both]),
             )
+    return found
+
+
+def read_ball(dome: DomeRecord, fields: Fields) -> BallFrames | None:
+    """The key "ball" of `dome/calibration.json`; None if it is absent. Its faults are
+    recorded in `fields`.
+    """
+    given = fields.get("ball", None)
+    if given is None:
+        return None
+    item = Fields(given, fields.place("ball"), fields.faults)
+    template = item.template("frames", {PLACE, LIGHT, CAMERA}, set())
+    if template:
+        names = {PLACE: "a", LIGHT: dome.lights[0].id, CAMERA: dome.cameras[0].id}
+        inside(
+            dome.folder, filled(template, **names), item.place("frames"), item.faults
+        )
+    places = Fields(item.get("outlines"), item.place("outlines"), item.faults)
+    outlines = dict[str, dict[str, Array]]()
+    if places.at_most(MAX_BALL_PLACES, "places of the ball"):
+        for place in places.data:
+            circles = Fields(places.get(place), places.place(place), item.faults)
+            outlines[place] = _outlines(dome, circles)
+    radius = item.number("radius", above=0.0, most=MAX_BALL_RADIUS_MM)
+    if unknown := item.unknown():
+        item.faults.append(
+            Fault(
+                item.where,
+                "its keys are frames, radius and outlines",
+                ", ".join(unknown),
+            )
+        )
+    return BallFrames(dome.folder, template, radius, outlines)
+
+
+def _outlines(dome: DomeRecord, circles: Fields) -> dict[str, Array]:
+    """Outline of the ball in each camera that sees it."""
+    found = dict[str, Array]()
+    cameras = {camera.id: camera for camera in dome.cameras}
+    for name in circles.data:
+        circle = circles.array(name, (3,))
+        if name not in cameras:
+            circles.fault(name, "must be a camera of the dome", shown(name))
+        elif not _within(circle, cameras[name]):
+            circles.fault(
+                name,
+                "column, row and radius must be those of a circle in the picture",
+                shown(circle),
+            )
+        else:
+            found[name] = circle
+    return found
+
+
+def _within(circle: Array, camera: CameraRecord) -> bool:
+    column, row, radius = circle
+    return bool(
+        radius > 0
+        and radius <= column <= camera.width - radius
+        and radius <= row <= camera.height - radius
+    )  # a ball that is cut off may hide its highlight
+
+
+def read_flat_frames(folder: Path) -> ProbeRecord | None:
+    """The probe of a set-up, with the repeats of its flat field as sites; None without
+    `contact/calibration.json`.
+
+    Raises
+    ------
+    InputError
+        With every fault of the two files and of the headers of the frames.
+    """
+    file = folder / FLAT_FILE
+    faults = list[Fault]()
+    if not file.exists():
+        return None
+    data = read_json(file, faults)
+    probe = read_json(folder / PROBE_FILE, faults)
+    if data is None or not isinstance(probe, dict):
+        raise InputError(
+            faults
+            or [
+                Fault(
+                    str(folder / PROBE_FILE),
+                    "must be a JSON object {...}",
+                    "another value",
+                )
+            ]
+        )
+    fields = Fields(data, str(file), faults)
+    template = fields.template("frames", {REPEAT, EXPOSURE}, set())
+    repeats = fields.integer("repeats", least=MIN_FRAMES, most=MAX_REPEATS)
+    if unknown := fields.unknown():
+        faults.append(
+            Fault(
+                str(file),
+                "its keys are frames and repeats",
+                ", ".join(unknown),
+                "correct the name",
+            )
+        )
+    if faults:
+        raise InputError(faults)
+    flat = {key: value for key, value in probe.items() if key not in OF_SESSIONS}
+    flat |= {
+        "sites": [str(i + 1) for i in range(repeats)],
+        "frames": template.replace(f"{{{REPEAT}}}", f"{{{SITE}}}"),
+    }
+    found = read_probe(folder, Fields(flat, str(folder / PROBE_FILE), faults))
+    if faults:
+        raise InputError(faults)
     return found
 
 

@@ -13,19 +13,19 @@ import numpy as np
 import xarray as xr
 
 from skindb.calibration.cameras import calibrate_cameras, calibrated_cameras
-from skindb.calibration.fibres import (
-    calibrate_probe,
-    calibrated_probe,
-    read_flat_frames,
-)
-from skindb.calibration.light_positions import calibrate_positions, positioned_dome
+from skindb.calibration.fibres import calibrate_probe, calibrated_probe
 from skindb.calibration.lights import (
     POSITION_ERROR_MM,
     calibrate_lights,
+    calibrate_positions,
     calibrated_dome,
+    positioned_dome,
+)
+from skindb.calibration.setup import (
+    read_calibration_frames,
+    read_flat_frames,
     read_setup_dome,
 )
-from skindb.calibration.setup import read_calibration_frames
 from skindb.errors import Fault, InputError
 from skindb.format.dome import DomeRecord
 from skindb.format.folder import Capture

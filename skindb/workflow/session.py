@@ -14,7 +14,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from skindb.calibration.lights import read_setup_dome
+from skindb.calibration.setup import read_setup_dome
 from skindb.clock import SYSTEM_CLOCK, SimulatedClock
 from skindb.errors import Fault, InputError
 from skindb.files import make_private, private_file, private_umask

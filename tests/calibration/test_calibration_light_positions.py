@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from mirror import ball_outline_of, ball_picture
 
-from skindb.calibration.light_positions import calibrate_positions, positioned_dome
-from skindb.calibration.lights import read_setup_dome
+from skindb.calibration.lights import calibrate_positions, positioned_dome
 from skindb.calibration.mirror_ball import Pinhole, ball_centre
-from skindb.calibration.setup import read_calibration_frames
+from skindb.calibration.setup import read_calibration_frames, read_setup_dome
 from skindb.errors import InputError
 
 RADIUS = 30.0

@@ -13,11 +13,8 @@ from click.testing import CliRunner
 
 import skindb
 from skindb import workflow
-from skindb.calibration.fibres import (
-    calibrate_probe,
-    calibrated_probe,
-    read_flat_frames,
-)
+from skindb.calibration.fibres import calibrate_probe, calibrated_probe
+from skindb.calibration.setup import read_flat_frames
 from skindb.cli import cli
 from skindb.errors import InputError
 from skindb.format.contact_probe import read_probe

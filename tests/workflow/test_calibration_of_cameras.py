@@ -16,8 +16,7 @@ from sphere import BLACK, HEIGHT, WHITE, WIDTH, write_capture
 import skindb
 from skindb import workflow
 from skindb.calibration.cameras import calibrate_cameras
-from skindb.calibration.lights import read_setup_dome
-from skindb.calibration.setup import read_calibration_frames
+from skindb.calibration.setup import read_calibration_frames, read_setup_dome
 from skindb.cli import cli
 from skindb.errors import InputError
 

@@ -16,8 +16,9 @@ from sphere import BLACK, INTENSITY, LIGHTS, save, write_capture
 
 import skindb
 from skindb import workflow
-from skindb.calibration.lights import _view, calibrate_lights, read_setup_dome
+from skindb.calibration.lights import _view, calibrate_lights
 from skindb.calibration.radiance import frame_mergers
+from skindb.calibration.setup import read_setup_dome
 from skindb.cli import cli
 from skindb.errors import InputError
 
