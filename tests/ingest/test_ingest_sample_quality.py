@@ -1,11 +1,12 @@
-"""Stated variances of samples against repeated frames of an own simulated sensor, and
-against the merging itself.
-"""
+"""Noise and checks of the samples."""
 
 from __future__ import annotations
 
+import shutil
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,6 +22,8 @@ from sphere import (
     save,
 )
 
+import skindb
+from skindb import workflow
 from skindb.calibration.radiance import frame_merger, merge_exposures
 from skindb.fit.lumitexels import lumitexels
 from skindb.fit.sample_noise import noise_inputs, sample_variance
@@ -35,6 +38,15 @@ from skindb.ingest.sample_quality import radiance_noise
 from skindb.ingest.spool import Spool
 from skindb.ingest.surfels import build_surfels
 from skindb.ingest.visibility import camera_visibility
+
+sys.path.append(str(Path(__file__).parent))
+from sphere import expose, write_capture
+from spoil import D, edit
+
+from skindb.errors import InputError
+from skindb.format.frames import write_frame
+from skindb.store import Database
+from skindb.workflow import ingest_take
 
 # electrons; few, so that steps of the files do not matter
 FULL = 2000.0
@@ -215,3 +227,199 @@ def test_sample_noise__is_unknown_without_electrons(capture_folder, tmp_path):
         footprint=False,
     )
     assert noise_inputs(found) == ()
+
+
+def _samples(tmp_path, name, folder):
+    db = skindb.open(str(tmp_path / name))
+    workflow.ingest_take(db, folder)
+    return db.read("capture", "T001")["samples"].to_dataset().load()
+
+
+@pytest.mark.slow
+def test_ingest__differences_of_repeated_photographs_are_as_large_as_the_stated_noise(
+    tmp_path,
+):
+    first = tmp_path / "first"
+    write_capture(first)
+    second = Path(shutil.copytree(first, tmp_path / "second"))
+    rng = np.random.default_rng(2)
+    for camera, eye in CAMERAS.items():
+        for exposure, seconds in SECONDS.items():
+            for light, place in LIGHTS.items():
+                frame = expose(face_radiance(eye, place), seconds, rng)
+                save(second / f"dome/frames/{exposure}/{light}_{camera}.png", frame)
+    one = _samples(tmp_path, "db1", first)
+    two = _samples(tmp_path, "db2", second)
+    a, b = (
+        samples["reflectance_sample"].values.astype(np.float64)
+        for samples in (one, two)
+    )
+    level = (a + b) / 2
+    stated = np.sqrt(
+        4 / 9 * float(one["noise_floor"]) ** 2
+        + float(one["shot_noise"]) * np.maximum(level, 0)
+    )
+    z = ((a - b) / np.sqrt(2) / stated)[np.isfinite(level) & (level > 0.02)]
+    assert z.size > 10_000
+    # intensities of lights and distances differ from the median ones by a third, half
+    # floats round to 0.05 %
+    assert 0.8 < 1.4826 * np.median(np.abs(z)) < 1.25
+    assert float(two["shot_noise"]) > 0
+
+
+def given(*factors):
+    """Intensities in place of the white target, each times a factor of its own."""
+
+    def change(dome):
+        dome["white"] = None
+        for light, factor in zip(dome["lights"], factors, strict=True):
+            light["intensity"] = (INTENSITY * factor).tolist()
+
+    return lambda folder: edit(folder / D, change)
+
+
+def linear(light, factor, *factors):
+    """OpenEXR frames; those of one light times a factor."""
+
+    def write(folder):
+        for camera, eye in CAMERAS.items():
+            for name, place in LIGHTS.items():
+                image = np.asarray(face_radiance(eye, place), np.float32) * (
+                    factor if name == light else 1
+                )
+                write_frame(
+                    folder / f"dome/frames/{name}_{camera}.exr",
+                    np.asarray(image, np.float32),
+                )
+        given(*(factors or (1, 1, 1, 1)))(folder)
+        record = {
+            "frames": "dome/frames/{light}_{camera}.exr",
+            "exposures": [{"id": "one", "seconds": 1}],
+        }
+        edit(folder / D, lambda dome: dome.update(record))
+
+    return write
+
+
+HOSTILE = {
+    "one light 1e6 times brighter": (
+        given(1, 1e6, 1, 1),
+        (
+            r"\[lights\]\[1\]\[intensity\]: .* 1,000 times .*; found 1e\+06 times, of "
+            r"light l1; correct it"
+        ),
+    ),
+    "one light 1e6 times darker": (
+        given(1, 1, 1e-6, 1),
+        r"\[lights\]\[2\]\[intensity\]: .* found 1e-06 times, of",
+    ),
+    "one channel of a light": (
+        given(1, 1, np.array([1, 1, 1e5]), 1),
+        r"\[2\]\[intensity\]: .* found 1e\+05 times",
+    ),
+    "all samples overflow": (
+        given(*[1e-9] * 4),
+        (
+            r"dome\.json\[lights\]: the median reflectance sample of a face must be "
+            r".*; found samples beyond 65504"
+        ),
+    ),
+    "all samples vanish": (
+        given(*[1e9] * 4),
+        r"dome\.json\[lights\]: the median reflectance sample .*; found 0;",
+    ),
+    "intensities of another unit": (
+        given(*[1e3] * 4),
+        r"the median .* must be 0\.0003 to 3 sr\^-1; found [\d.e-]+;",
+    ),
+    "intensity of another unit": (
+        given(1, 1, 1, 100),
+        (
+            r"\[lights\]\[3\]: the median sample of a light must be at most 50 times "
+            r".*; found 0\.0\d* times, of light l3"
+        ),
+    ),
+    "frames of a light of 1e6": (
+        linear("l1", 1e6),
+        r"\[lights\], light l1: its photographs must be as bright",
+    ),
+    "black frames of a light": (
+        linear("l1", 0),
+        (
+            r"\[frames\], camera c0, light l1: a frame must be bright where .*; found "
+            r"none at \d+ surfels; copy the frame"
+        ),
+    ),
+}
+
+
+def ingested(folder, root, **options):
+    record = ingest_take(
+        Database(root), folder, spacing_mm=8.0, photographs=0, **options
+    )
+    return record.provenance["summary"]["notes"]
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_ingest_capture__intensities_and_samples_of_no_dome_are_refused(
+    capture_folder, tmp_path, name
+):
+    spoil, message = HOSTILE[name]
+    spoil(capture_folder)
+    with pytest.raises(InputError, match=message) as caught:
+        ingested(capture_folder, tmp_path / "db")
+    assert all(fault.cure for fault in caught.value.faults)
+    assert Database(tmp_path / "db").takes() == []
+
+
+LEGAL = {
+    "as they are": (given(1, 1, 1, 1), []),
+    "lights of two kinds": (linear("l3", 5, 1, 1, 1, 5), []),
+    "a sitter too dark for skin": (
+        given(*[30] * 4),
+        ["the face reflects 2% of red light, and skin 10% to 90%"],
+    ),
+    "one light that may be wrong": (
+        given(1, 1, 1, 1.7),
+        ["light l3: the face is 0.59 times as bright under it as"],
+    ),
+    "frames of a light that may be wrong": (
+        linear("l1", 1.7),
+        ["light l1: the face is 1.7 times as bright under it"],
+    ),
+}
+NOTED = {
+    "one light": (
+        given(1, 1, 1, 30),
+        ["light l3: its intensity is 30 times", "light l3: its samples are 0.03"],
+    ),
+    "frames of a light": (linear("l1", 12), ["light l1: its samples are 1"]),
+}
+
+
+@pytest.mark.parametrize("name", NOTED)
+def test_ingest_capture__lights_that_are_wrong_are_noted_on_request(
+    capture_folder, tmp_path, name
+):
+    spoil, expected = NOTED[name]
+    spoil(capture_folder)
+    notes = ingested(capture_folder, tmp_path / "db", calibration="note")
+    assert [
+        note.startswith(start) for note, start in zip(notes, expected, strict=False)
+    ] == [True] * len(expected)
+    assert any(
+        "its photographs must be as bright as those of the others" in note
+        for note in notes
+    )
+
+
+@pytest.mark.parametrize("name", LEGAL)
+def test_ingest_capture__unusual_lights_pass_and_are_noted(
+    capture_folder, tmp_path, name
+):
+    spoil, expected = LEGAL[name]
+    spoil(capture_folder)
+    notes = ingested(capture_folder, tmp_path / "db")
+    assert [
+        note.startswith(start) for note, start in zip(notes, expected, strict=True)
+    ] == [True] * len(expected)
