@@ -16,6 +16,7 @@ import tempfile
 import time
 from pathlib import Path
 from statistics import median
+from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
@@ -23,8 +24,7 @@ from planted_skin import capture_of, make_skin
 
 from skindb.store import Database
 from skindb.workflow import fit as fit_module
-from skindb.workflow.first import FIRST
-from skindb.workflow.provenance import groups_of
+from skindb.workflow.derive import FIRST_PASS, groups_of
 
 TAKE = "S01"
 
@@ -35,16 +35,16 @@ def main() -> None:
     parser.add_argument("--repeat", type=int, default=3)
     asked = parser.parse_args()
     seconds: dict[str, list[float]] = {"keep": [], "first pass": [], "fit": []}
-    keep = fit_module.keep_first_pass
+    keep = fit_module._store_first_pass
 
-    def timed(db: Database, *args: object) -> None:
+    def timed(*args: Any) -> None:
         begin = time.perf_counter()
-        keep(db, *args)
+        keep(*args)
         seconds["keep"].append(time.perf_counter() - begin)
-        size.append(db.record(FIRST, TAKE).bytes)
+        size.append(db.record(FIRST_PASS, TAKE).bytes)
 
     size: list[int] = []
-    fit_module.keep_first_pass = timed
+    fit_module._store_first_pass = timed
     with tempfile.TemporaryDirectory() as folder:
         db = Database(folder)
         capture = capture_of(make_skin(surfels=asked.surfels))

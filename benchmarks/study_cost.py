@@ -27,7 +27,7 @@ import xarray as xr
 import skindb
 from skindb.store import Database
 from skindb.workflow import STUDIES, register_takes
-from skindb.workflow.provenance import groups_of
+from skindb.workflow.derive import groups_of
 
 # brdf needs captures, of which there are none
 STEPS = ("register", *(name for name in STUDIES if name != "brdf"))

@@ -15,7 +15,7 @@ from skindb import workflow
 from skindb.fit import FitParameters
 from skindb.reflectance.dictionary import Dictionary, embedded_dictionary
 from skindb.store import Database
-from skindb.workflow.provenance import groups_of
+from skindb.workflow.derive import groups_of
 
 PARAMETERS = FitParameters(k=2, rank=4, hold_out_lights=0.1)
 EVERYTHING = ("fit", "statistics", "export")

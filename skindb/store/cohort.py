@@ -318,9 +318,8 @@ def frame_of(registration: Record) -> str:
         (str(one["take"]), str(one.get("seal", one["generation"])))
         for one in registration.made_from
     )
-    return json.dumps(
-        [inputs, about["parameters"], about["software_version"]], sort_keys=True
-    )
+    code = about.get("code_digest", "")
+    return json.dumps([inputs, about["parameters"], code], sort_keys=True)
 
 
 def _coords(known: Known, take: str) -> dict[str, Any]:

@@ -33,7 +33,7 @@ from skindb.store.verify import (
 STILL_WRITING_SECONDS = 3600.0  # newer files may belong to a run without a lease
 KEPT_KINDS = (CONSENT, RELEASE, CALIBRATION)  # kinds of which all generations are kept
 # equal in a first pass and its model
-FIT_IDENTITY = ("inputs", "requested", "dictionary_digest", "method_digest")
+FIT_IDENTITY = ("inputs", "requested", "dictionary_digest", "code_digest")
 VERSION_FILE = re.compile(rf"({TIME_HEX})\.(zarr|(manifest|tables|names)\.json)")
 OF_WITHDRAWN = "it is of a withdrawn subject, or refers to one"
 Clock = Callable[[], float]

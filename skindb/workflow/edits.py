@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,27 +15,21 @@ from skindb.analysis.edit import apply_traits, with_basis
 from skindb.analysis.population_basis import population_basis
 from skindb.analysis.summary import SAMPLED
 from skindb.errors import Fault, InputError
+from skindb.reflectance.dictionary import embedded_dictionary
 from skindb.render.grid import write_grid
 from skindb.render.picture import frontal_camera, radiance_of
 from skindb.schema.consent import require_consent
+from skindb.schema.plain import plain
 from skindb.store import STUDY, Database, require_fresh
 from skindb.types import Progress, silent
 from skindb.workflow import study_inputs
 from skindb.workflow.audit import logged
-from skindb.workflow.provenance import as_input, groups_of, method_digest, provenance
+from skindb.workflow.derive import Derivation
+from skindb.workflow.fit import dictionary_at
 from skindb.workflow.registration import current_registrations, registered_datasets
 
 GRID_SIDE = 320.0  # pixels, the longer side of a picture in a grid
-# what the result depends on
-METHOD = (
-    "analysis",
-    "numerics",
-    "optics",
-    "reflectance",
-    "geometry",
-    "schema",
-    "workflow/edits",
-)
+METHOD = (apply_traits, common_maps)  # functions that compute an edit
 STRENGTHS = (0.5, 1.0)  # of the edits in a grid, as in figure 19 of the paper
 
 
@@ -45,24 +39,17 @@ class Editable:
 
     model: xr.DataTree
     study: str
-    takes: list[str]  # of the study
-    names: set[str]  # takes that the study and the registration refer to
-    inputs: list[dict[str, Any]]
     move: Callable[[Mapping[str, float]], xr.DataTree]
-    # whose file may change: an edit with one is always computed
-    dictionary: Path | None = None
+    derivation: Derivation  # without the amounts
 
-    def provenance(self, amounts: Mapping[str, float]) -> dict[str, Any]:
-        """Attributes of the version of an edit by these amounts."""
-        about = provenance(
-            "edit",
-            self.inputs,
-            parameters={"amounts": dict(amounts), "study": self.study},
-        )
-        return about | {
-            "study_takes": self.takes,
-            "method_digest": method_digest(METHOD),
+    def derivation_by(self, amounts: Mapping[str, float]) -> Derivation:
+        """What decides an edit by these amounts."""
+        provenance = dict(self.derivation.provenance)
+        provenance["parameters"] = {
+            "study": self.study,
+            "amounts": plain(dict(amounts)),
         }
+        return replace(self.derivation, provenance=provenance)
 
 
 @logged("edit")
@@ -75,6 +62,8 @@ def edit(
     dictionary: Path | None = None,
 ) -> xr.DataTree:
     """Move the model of a take along traits and commit it as the kind "edit".
+
+    If the newest edit is this one already, nothing is computed.
 
     Parameters
     ----------
@@ -99,14 +88,9 @@ def edit(
         data the study used withdrew it.
     """
     source = editable_model(db, take, study, dictionary)
-    edited = source.move(amounts)
-    with db.stage("edit", take, names=source.names) as stage:
-        stage.write(groups_of(edited))
-        stage.commit(
-            {str(name): value for name, value in edited.attrs.items()}
-            | source.provenance(amounts)
-        )
-    return db.read("edit", take)
+    derivation = source.derivation_by(amounts)
+    record = derivation.current() or derivation.commit(source.move(amounts))
+    return db.read("edit", take, generation=record.generation)
 
 
 def stored_or_moved(
@@ -117,14 +101,9 @@ def stored_or_moved(
 
     Nothing is committed.
     """
-    about = source.provenance(amounts)
-    history = (
-        []
-        if source.dictionary is not None or not db.has("edit", take)
-        else db.readable_history("edit", take)
-    )
-    for record in reversed(history):
-        if {name: record.provenance.get(name) for name in about} == about:
+    derivation = source.derivation_by(amounts)
+    for record in reversed(db.readable_history("edit", take)):
+        if derivation.describes(record):
             return db.read("edit", take, generation=record.generation)
     return source.move(amounts)
 
@@ -292,24 +271,22 @@ def editable_model(
     vectors = db.read(STUDY, study)
     require_consent({**model.attrs, "take": take}, "statistics")
     require_fresh(db, STUDY, study)
-    names = [str(name) for name in model["fitted"].to_dataset()["dictionary"].values]
+    brdfs = [str(name) for name in model["fitted"].to_dataset()["dictionary"].values]
     used = db.record(STUDY, study, vectors.attrs["generation"])
-    inputs = [as_input(db, "model", take, model), used.as_input()]
-    referred = {*used.names}
+    inputs = [db.record("model", take, model.attrs["generation"]), used]
     placed: dict[str, Any] = {}
     if "texture" in vectors.children and (records := current_registrations(db, [take])):
         registered = registered_datasets(db, records)[take]
         texture = vectors["texture"].to_dataset().compute()
         maps = common_maps(model, registered, size=texture.sizes["v"])
         placed = {"texture": texture, "maps": maps, "registered": registered}
-        inputs.append(records[take].as_input())
-        referred.update(records[take].names)
+        inputs.append(records[take])
     traits, basis, albedo = (
         vectors[name].to_dataset().compute()
         for name in ("traits", "population_basis", "albedo")
     )
     tables = study_inputs.dictionary_tables(
-        names, float(model["basis/disc_angular_radius"]), dictionary
+        brdfs, float(model["basis/disc_angular_radius"]), dictionary
     )
 
     def move(amounts: Mapping[str, float]) -> xr.DataTree:
@@ -323,34 +300,29 @@ def editable_model(
             **placed,
         )
 
-    return Editable(
-        model,
-        study,
-        [str(one) for one in traits["take"].values],
-        referred,
-        inputs,
-        move,
-        dictionary,
+    derivation = Derivation.of(
+        db,
+        "edit",
+        take,
+        inputs=inputs,
+        code=METHOD,
+        names={name for record in inputs for name in record.names},
+        study_takes=traits["take"].values.tolist(),
+        dictionary_digest=(dictionary_at(dictionary) or embedded_dictionary()).digest,
     )
+    return Editable(model, study, move, derivation)
 
 
-def _trait_study(db: Database, asked: str | None) -> str:
+def _trait_study(db: Database, name: str | None) -> str:
     """What the study of traits that an edit uses is stored as."""
-    there = [name for name in db.takes(STUDY) if name.partition(".")[0] == "traits"]
-    wanted = asked or ("traits" if "traits" in there or len(there) != 1 else there[0])
-    if wanted not in there:
-        cure = (
-            "name one of them with --study"
-            if there
-            else "run: skindb analyze DB traits"
-        )
-        found = f"studies of traits: {', '.join(there) or 'none'}"
-        raise InputError(
-            Fault(
-                f"study {wanted}",
-                "must be a study of traits in the database",
-                found,
-                cure,
-            )
-        )
-    return wanted
+    stored = [name for name in db.takes(STUDY) if name.partition(".")[0] == "traits"]
+    is_only = len(stored) == 1 and "traits" not in stored
+    study = name or (stored[0] if is_only else "traits")
+    if study not in stored:
+        rule = "must be a study of traits in the database"
+        found = f"studies of traits: {', '.join(stored) or 'none'}"
+        cure = "run: skindb analyze DB traits"
+        if stored:
+            cure = "name one of them with --study"
+        raise InputError(Fault(f"study {study}", rule, found, cure))
+    return study

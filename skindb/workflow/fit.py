@@ -9,38 +9,21 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from skindb.analysis.summary import SAMPLED
+import xarray as xr
+
 from skindb.errors import Fault, InputError
 from skindb.fit import FitParameters, FitPlan, first_pass, plan_fit, second_pass
 from skindb.reflectance.dictionary import EMBEDDED, Dictionary, embedded_dictionary
 from skindb.reflectance.table_file import read_dictionary
 from skindb.schema.consent import require_consent
-from skindb.store import Database, Record
+from skindb.store import Database, Lease, Record
 from skindb.threads import one_blas_thread
 from skindb.types import Progress
 from skindb.workflow.audit import logged
-from skindb.workflow.first import (
-    FIRST,
-    inputs_of_first_pass,
-    keep_first_pass,
-    kept_first_pass,
-)
-from skindb.workflow.provenance import as_input, groups_of, method_digest, provenance
-from skindb.workflow.summaries import sample_groups, summary_digest, tables_of
+from skindb.workflow.derive import FIRST_PASS, Derivation, groups_of
+from skindb.workflow.summaries import model_with_summary, summary_parameters
 
-# modules and subpackages that decide the numbers of a fit
-METHOD = (
-    "fit",
-    "numerics",
-    "optics",
-    "reflectance",
-    "elementwise",
-    "schema/status",
-    "jit",
-    "threads",
-    "geometry/rays",
-    "geometry/_ray_kernels",
-)
+METHOD = (first_pass, second_pass)  # functions that compute a model
 
 
 @logged("fit")
@@ -87,8 +70,7 @@ def fit_take(
     """
     # before anything is written for a take that there is not
     db.record("capture", take, generation)
-    asked = parameters or FitParameters()
-    method = method_digest(METHOD)
+    requested = parameters or FitParameters()
     with (
         db.lease(take, "model", wait=wait, command="skindb fit") as lease,
         one_blas_thread(),
@@ -96,38 +78,69 @@ def fit_take(
         capture = db.read("capture", take, generation=generation)
         # the newest record decides
         require_consent({"consent_scope": db.consent(take), "take": take}, "fit")
-        made_from = as_input(db, "capture", take, capture)
-        inputs = inputs_of_first_pass(asked, dictionary, made_from, method)
-        first = kept_first_pass(db, take, inputs)
+        read = db.record("capture", take, capture.attrs["generation"])
+        derivation = fit_derivation(db, read, requested, dictionary)
+        first = _stored_first_pass(derivation)
         if first is None:
-            first = first_pass(capture, asked, dictionary=dictionary, progress=progress)
-            keep_first_pass(db, take, first, inputs, lease)
+            first = first_pass(
+                capture, requested, dictionary=dictionary, progress=progress
+            )
+            _store_first_pass(derivation, first, lease)
         elif progress is not None:
             progress("first pass of the run before", 1, 1)
         model = second_pass(capture, first, dictionary=dictionary, progress=progress)
-        used = model.attrs["parameters"]
-        about = provenance(
-            "fit", [made_from], parameters=used, seeds={"fit": used["seed"]}
-        )
-        about |= {"requested": asked.as_dict(), "method_digest": method}
-        about |= {
-            "summary_parameters": {
-                "surfels": SAMPLED,
-                "seed": 0,
-                "digest": summary_digest(),
-            }
+        model = model_with_summary(model)
+        model.attrs |= {
+            "seeds": {"fit": model.attrs["parameters"]["seed"]},
+            "summary_parameters": summary_parameters(),
         }
-        with db.stage("model", take, lease) as stage:
-            stage.write(
-                groups_of(model) | sample_groups(model), tables=tables_of(model)
-            )
-            record = stage.commit(
-                {str(name): value for name, value in model.attrs.items()}
-                | {"take": take}
-                | about
-            )
-        db.forget(FIRST, take)
+        record = derivation.commit(model, lease)
+        db.forget(FIRST_PASS, take)
         return record
+
+
+def fit_derivation(
+    db: Database,
+    capture: Record,
+    parameters: FitParameters,
+    dictionary: Dictionary | None = None,
+) -> Derivation:
+    """What decides the model of a capture.
+
+    The requested parameters do: where a take has fewer components, or a dictionary
+    fewer BRDFs, the fit uses less.
+    """
+    return Derivation.of(
+        db,
+        "model",
+        capture.take,
+        inputs=[capture],
+        code=METHOD,
+        requested=parameters.as_dict(),
+        dictionary_digest=(dictionary or embedded_dictionary()).digest,
+    )
+
+
+def _stored_first_pass(derivation: Derivation) -> xr.DataTree | None:
+    """The first pass of a killed fit that would give the same model, in memory."""
+    db = derivation.db
+    take = derivation.key
+    try:
+        if replace(derivation, kind=FIRST_PASS).current() is None:
+            return None
+        stored = db.read(FIRST_PASS, take)
+        groups = {name: ds.compute() for name, ds in groups_of(stored).items()}
+    except InputError:  # damaged: it is repeated
+        return None
+    first = xr.DataTree.from_dict(groups)
+    first.attrs = stored.attrs
+    return first
+
+
+def _store_first_pass(derivation: Derivation, first: xr.DataTree, lease: Lease) -> None:
+    """Keep a first pass for the case that the fit is killed; it replaces that of another fit."""
+    derivation.db.forget(FIRST_PASS, derivation.key)
+    replace(derivation, kind=FIRST_PASS).commit(first, lease)
 
 
 @logged("fit")
@@ -255,36 +268,22 @@ def parameters_of(
     """
     if not refit or not db.has("model", take):
         return FitParameters(**given)
-    own = db.record("model", take).provenance
-    if dictionary is None and own.get("dictionary", EMBEDDED) != EMBEDDED:
+    model = db.record("model", take).provenance
+    if dictionary is None and model.get("dictionary", EMBEDDED) != EMBEDDED:
         rule = "a refit uses the dictionary of the model"
+        found = f"no dictionary for a model made with {model['dictionary']!r}"
         cure = "name it with --dictionary, or fit without --refit"
-        raise InputError(
-            Fault(
-                take,
-                rule,
-                f"no dictionary for a model made with {own['dictionary']!r}",
-                cure,
-            )
-        )
-    return replace(_requested(own), **given)
+        raise InputError(Fault(take, rule, found, cure))
+    return replace(FitParameters.of({"parameters": model["requested"]}), **given)
 
 
 def current_model(db: Database, take: str) -> Record | None:
     """The newest model of a take if it was made from the newest capture."""
     if not db.has("model", take):
         return None
-    record = db.record("model", take)
-    newest = db.record("capture", take).generation
-    made_from = record.provenance.get("inputs", [])
-    return (
-        record
-        if any(
-            one["kind"] == "capture" and one["generation"] == newest
-            for one in made_from
-        )
-        else None
-    )
+    model = db.record("model", take)
+    capture = db.record("capture", take).as_input()
+    return model if capture in model.made_from else None
 
 
 def dictionary_at(path: Path | None) -> Dictionary | None:
@@ -306,18 +305,10 @@ def _read(path: Path, _: tuple[tuple[str, int], ...]) -> Dictionary:
 def _up_to_date(
     db: Database, record: Record, given: Mapping[str, Any], dictionary: Path | None
 ) -> bool:
-    """Whether a fit with these parameters and this code would give the model that is there."""
-    about = record.provenance
-    brdfs = dictionary_at(dictionary) or embedded_dictionary()
-    wanted = parameters_of(db, record.take, given, refit=True, dictionary=dictionary)
-    alike = (
-        wanted == _requested(about) and about.get("dictionary_digest") == brdfs.digest
+    """Whether a fit with these parameters and this code would give the same model."""
+    parameters = parameters_of(
+        db, record.take, given, refit=True, dictionary=dictionary
     )
-    return alike and about.get("method_digest") == method_digest(METHOD)
-
-
-def _requested(about: Mapping[str, Any]) -> FitParameters:
-    """What a fit was asked for: where a take has fewer components, or a dictionary
-    fewer BRDFs, it used less.
-    """
-    return FitParameters.of({"parameters": about.get("requested", about["parameters"])})
+    capture = db.record("capture", record.take)
+    brdfs = dictionary_at(dictionary)
+    return fit_derivation(db, capture, parameters, brdfs).describes(record)

@@ -27,7 +27,7 @@ from skindb.threads import one_blas_thread
 from skindb.types import Progress
 from skindb.workflow.audit import logged_action
 from skindb.workflow.calibration import calibrated_capture
-from skindb.workflow.provenance import groups_of
+from skindb.workflow.derive import groups_of
 
 NOTE = "stage"  # file in the scratch folder: path of the data that this run writes
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import xarray as xr
 
-from skindb import __version__
 from skindb.analysis.registration import (
     Frame,
     Outline,
@@ -19,18 +19,27 @@ from skindb.analysis.registration import (
     register_one,
     with_names,
 )
-from skindb.analysis.summary import SAMPLED
 from skindb.errors import Fault, InputError
 from skindb.schema.consent import require_consent
-from skindb.store import Database, Record, frame_of
+from skindb.store import Database, Record
 from skindb.types import Progress, silent
 from skindb.workflow.audit import logged
-from skindb.workflow.provenance import provenance
-from skindb.workflow.summaries import registered_parts, summary_digest
+from skindb.workflow.derive import Derivation
+from skindb.workflow.summaries import registered_parts, summary_parameters
 from skindb.workflow.takes import map_takes, results_of
 
 if TYPE_CHECKING:
     from distributed import Client
+
+# functions that compute a registration
+METHOD = (
+    landmark_names,
+    outline,
+    with_names,
+    common_frame,
+    register_one,
+    registered_parts,
+)
 
 
 @logged("register")
@@ -61,9 +70,7 @@ def register_takes(
     Returns
     -------
     dict
-        Take -> record of its version of kind "registration". Where these takes, with
-        these models and this reference, are registered already, that of the version
-        there is.
+        Take -> record of its version of kind "registration", which may exist already.
 
     Raises
     ------
@@ -72,42 +79,45 @@ def register_takes(
     """
     for take in takes or ():
         require_consent({"consent_scope": db.consent(take), "take": take}, "statistics")
-    names = takes_with_landmarks(db, takes)
+    names = sorted(takes_with_landmarks(db, takes))
     if not names:
         found = "no take has any"
         cure = "name the 20 points in the capture's landmarks.json"
         raise InputError(Fault(db.url, "a registration needs landmarks", found, cure))
-    if done := _registered_alike(db, names, reference or ""):
-        return done
     models = {take: db.record("model", take) for take in names}
+    derivation = _derivation(db, models.values(), reference or "")
+    stored = {take: replace(derivation, key=take).current() for take in names}
+    current = {take: record for take, record in stored.items() if record is not None}
+    if len(current) == len(names):
+        return current
     # small: every task gets all of them
     generations = {take: record.generation for take, record in models.items()}
     tell = progress or silent
     where: dict[str, Any] = {"workers": workers, "client": client}
-    found_outlines: dict[str, tuple[tuple[str, ...], Outline]] = {}
+    outlines: dict[str, Outline] = {}
+    landmarks: dict[str, tuple[str, ...]] = {}
     tell("outlines", 0, len(names))
-    for take, own, one in results_of(
+    for take, points, shape in results_of(
         map_takes(partial(_outline, db, generations), names, **where)
     ):
-        found_outlines[take] = (own, one)
-        tell("outlines", len(found_outlines), len(names))
-    points = tuple(
-        dict.fromkeys(name for take in names for name in found_outlines[take][0])
+        landmarks[take] = points
+        outlines[take] = shape
+        tell("outlines", len(outlines), len(names))
+    every_point = tuple(
+        dict.fromkeys(name for take in names for name in landmarks[take])
     )
-    outlines = {
-        take: with_names(found_outlines[take][1], found_outlines[take][0], points)
-        for take in names
+    aligned = {
+        take: with_names(outlines[take], landmarks[take], every_point) for take in names
     }
-    frame = common_frame(outlines, points, reference=reference)
+    frame = common_frame(aligned, every_point, reference=reference)
     assert frame is not None
-    inputs = [record.as_input() for record in models.values()]
-    call = partial(_register, db, generations, frame, inputs, reference or "")
-    committed: dict[str, Record] = {}
-    tell("register", 0, len(names))
-    for record in results_of(map_takes(call, names, **where)):
-        committed[record.take] = record
-        tell("register", len(committed), len(names))
-    return {take: committed[take] for take in names}
+    call = partial(_register, derivation, generations, frame)
+    tell("register", len(current), len(names))
+    pending = [take for take in names if take not in current]
+    for record in results_of(map_takes(call, pending, **where)):
+        current[record.take] = record
+        tell("register", len(current), len(names))
+    return {take: current[take] for take in names}
 
 
 def takes_with_landmarks(db: Database, takes: Sequence[str] | None = None) -> list[str]:
@@ -137,40 +147,35 @@ def current_registrations(db: Database, takes: Sequence[str]) -> dict[str, Recor
     if not takes or not all(db.has("registration", take) for take in takes):
         return {}
     records = {take: db.record("registration", take) for take in takes}
-    frames = {frame_of(record) for record in records.values()}
-    one = next(iter(records.values()))
-    along = {str(made["take"]): made for made in one.made_from}
-    same = (
-        len(frames) == 1
-        and one.provenance["software_version"] == __version__
-        and set(takes) <= set(along)
+    provenance = records[takes[0]].provenance
+    along = [str(model["take"]) for model in provenance["inputs"]]
+    usable = all(
+        db.has("model", take) and "statistics" in db.consent(take) for take in along
     )
-    return (
-        records
-        if same and all(_is_current(db, take, made) for take, made in along.items())
-        else {}
+    if not usable or not set(takes) <= set(along):
+        return {}
+    models = [db.record("model", take) for take in along]
+    derivation = _derivation(db, models, provenance["parameters"]["reference"])
+    is_current = all(
+        replace(derivation, key=take).describes(record)
+        for take, record in records.items()
     )
+    return records if is_current else {}
 
 
-def _registered_alike(
-    db: Database, names: Sequence[str], reference: str
-) -> dict[str, Record]:
-    """The registrations of exactly these takes, if another run would find the same ones."""
-    records = current_registrations(db, names)
-    for record in records.values():
-        about = record.provenance
-        same = about["parameters"].get("reference", "") == reference and len(
-            record.made_from
-        ) == len(names)
-        if not same or about["summary_parameters"]["digest"] != summary_digest():
-            return {}
-    return records
-
-
-def _is_current(db: Database, take: str, made: Mapping[str, Any]) -> bool:
-    """Whether the newest model of a take is the one that was used, and the take may still be."""
-    current = db.has("model", take) and db.record("model", take).as_input() == made
-    return current and "statistics" in db.consent(take)
+def _derivation(db: Database, models: Iterable[Record], reference: str) -> Derivation:
+    """What decides the registrations of takes that are registered together."""
+    inputs = list(models)
+    return Derivation.of(
+        db,
+        "registration",
+        "",
+        inputs=inputs,
+        code=METHOD,
+        names=[record.take for record in inputs],
+        parameters={"reference": reference},
+        summary_parameters=summary_parameters(),
+    )
 
 
 def registered_datasets(
@@ -179,12 +184,10 @@ def registered_datasets(
     """The group "registration" of versions; what belongs to no surfel is in memory."""
     out = {}
     for take, record in records.items():
-        one = db.read("registration", take, generation=record.generation)[
-            "registration"
-        ].to_dataset()
-        out[take] = one.assign(
-            {name: one[name].load() for name in one if "surfel" not in one[name].dims}
-        )
+        version = db.read("registration", take, generation=record.generation)
+        ds = version["registration"].to_dataset()
+        small = {name: ds[name].load() for name in ds if "surfel" not in ds[name].dims}
+        out[take] = ds.assign(small)
     return out
 
 
@@ -192,36 +195,22 @@ def _outline(
     db: Database, generations: Mapping[str, int], take: str
 ) -> tuple[str, tuple[str, ...], Outline]:
     model = db.read("model", take, generation=generations[take])
-    own = landmark_names([model])
-    return take, own, outline(model, own)
+    points = landmark_names([model])
+    return take, points, outline(model, points)
 
 
 def _register(
-    db: Database,
-    generations: Mapping[str, int],
-    frame: Frame,
-    inputs: Iterable[Mapping[str, Any]],
-    reference: str,
-    take: str,
+    derivation: Derivation, generations: Mapping[str, int], frame: Frame, take: str
 ) -> Record:
-    model, other = (
-        db.read("model", name, generation=generations[name])
+    model, template = (
+        derivation.db.read("model", name, generation=generations[name])
         for name in (take, frame.template)
     )
-    registered = register_one(take, model, other, frame)
-    groups, tables = registered_parts(model, registered)
-    about = provenance("register", inputs, parameters={"reference": reference})
-    about |= {"take": take, "consent_scope": model.attrs.get("consent_scope", [])}
-    about |= {
-        "summary_parameters": {
-            "surfels": SAMPLED,
-            "seed": 0,
-            "digest": summary_digest(),
-        }
-    }
-    with db.stage("registration", take, names=generations) as stage:
-        stage.write({"registration": registered} | groups, tables=tables)
-        return stage.commit(about)
+    registered = register_one(take, model, template, frame)
+    groups = registered_parts(model, registered)
+    version = xr.DataTree.from_dict({"registration": registered} | groups)
+    version.attrs["consent_scope"] = model.attrs.get("consent_scope", [])
+    return replace(derivation, key=take).commit(version)
 
 
 def _has_landmarks(db: Database, record: Record) -> bool:

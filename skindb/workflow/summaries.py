@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -23,21 +24,9 @@ from skindb.schema import FitStatus, dataset
 from skindb.schema.regions import FACE
 from skindb.store import SUMMARY, CohortRequest, Database, Known, Record, lacking
 from skindb.workflow.audit import logged
-from skindb.workflow.provenance import method_digest, provenance
+from skindb.workflow.code_digest import code_digest
+from skindb.workflow.derive import TABLES, Derivation, groups_of
 from skindb.workflow.takes import map_takes, results_of
-
-# modules that decide the numbers of a summary
-METHOD = (
-    "analysis/summary",
-    "analysis/common_maps",
-    "analysis/masks",
-    "fit/prediction",
-    "render/texels",
-    "schema/status",
-    "schema/regions",
-    "geometry/texture",
-    "geometry/_texture_kernels",
-)
 
 
 @logged("summarise")
@@ -55,7 +44,7 @@ def summarise(
 
     New models and registrations keep their tables, a sample of 5,000 surfels with the
     seed 0, and maps of 512 texels; this is for other samples and sizes, and for models
-    of earlier versions of skindb.
+    that were summarised by other code.
 
     Parameters
     ----------
@@ -96,10 +85,14 @@ def summarise(
     lack = lacking(db, "registration", [maps, sample], registered, release=release)
     frames = [known.record("registration", take) for take in lack]
     done = list(
-        results_of(map_takes(partial(_model, db, sample), models, workers=workers))
+        results_of(
+            map_takes(partial(_summarise_model, db, sample), models, workers=workers)
+        )
     )
     done += results_of(
-        map_takes(partial(_registration, db, sample, size), frames, workers=workers)
+        map_takes(
+            partial(_summarise_registration, db, sample, size), frames, workers=workers
+        )
     )
     return sorted({record.take for record in done})
 
@@ -108,7 +101,23 @@ def summary_digest() -> str:
     """Digest of the code that computes tables, samples and maps; results of other code
     are computed again.
     """
-    return method_digest(METHOD)
+    return code_digest(*METHOD)
+
+
+def summary_parameters(
+    *, surfels: int = SAMPLED, seed: int = 0, size: int | None = None
+) -> dict[str, Any]:
+    """How the parts for cohorts are computed, as versions record it."""
+    parameters = {"surfels": surfels, "seed": seed, "digest": summary_digest()}
+    return parameters if size is None else parameters | {"size": size}
+
+
+def model_with_summary(model: xr.DataTree) -> xr.DataTree:
+    """A model with what cohorts need of it: a sample of its surfels, and tables."""
+    groups = groups_of(model) | sample_groups(model) | {TABLES: tables_of(model)}
+    whole = xr.DataTree.from_dict(groups)
+    whole.attrs = model.attrs
+    return whole
 
 
 def tables_of(model: xr.DataTree) -> xr.Dataset:
@@ -140,7 +149,7 @@ def registered_parts(
     surfels: int = SAMPLED,
     seed: int = 0,
     size: int = SIZE,
-) -> tuple[dict[str, xr.Dataset], xr.Dataset]:
+) -> dict[str, xr.Dataset]:
     """Groups and tables that cohorts need of a registered take: maps, and the regions
     that its landmarks give.
     """
@@ -156,49 +165,50 @@ def registered_parts(
             {"surfel_index": index, "region_mask": mask.T},
             coords={"region": list(masks)},
         )
-    return groups, region_tables(
-        fitted, {FACE: np.ones(fitted.sizes["surfel"], np.bool_)} | masks
-    )
+    whole = {FACE: np.ones(fitted.sizes["surfel"], np.bool_)}
+    groups[TABLES] = region_tables(fitted, whole | masks)
+    return groups
 
 
-def _model(db: Database, sample: CohortRequest, record: Record) -> Record:
+def _summarise_model(db: Database, sample: CohortRequest, record: Record) -> Record:
     model = db.read("model", record.take, generation=record.generation)
     groups = sample_groups(model, surfels=sample.surfels, seed=sample.seed)
-    return _commit(db, record, groups, tables_of(model), sample, 0)
+    parameters = summary_parameters(surfels=sample.surfels, seed=sample.seed)
+    return _commit(db, record, groups | {TABLES: tables_of(model)}, parameters)
 
 
-def _registration(
+def _summarise_registration(
     db: Database, sample: CohortRequest, size: int, record: Record
 ) -> Record:
     version = db.read("registration", record.take, generation=record.generation)
     model = db.source(version, "model", record.take)
     registered = version["registration"].to_dataset()
     options = {"surfels": sample.surfels, "seed": sample.seed, "size": size}
-    groups, tables = registered_parts(model, registered, **options)
-    return _commit(db, record, groups, tables, sample, size)
+    groups = registered_parts(model, registered, **options)
+    return _commit(db, record, groups, summary_parameters(**options))
 
 
 def _commit(
     db: Database,
     record: Record,
     groups: dict[str, xr.Dataset],
-    tables: xr.Dataset,
-    sample: CohortRequest,
-    size: int,
+    parameters: dict[str, Any],
 ) -> Record:
-    asked = {"surfels": sample.surfels, "seed": sample.seed, "digest": summary_digest()}
-    asked |= {"size": size} if size else {}
-    about = provenance(
-        "summarise",
-        [record.as_input()],
-        parameters=asked,
-        seeds={"sample": sample.seed},
+    derivation = Derivation.of(
+        db,
+        SUMMARY,
+        record.take,
+        inputs=[record],
+        code=METHOD,
+        names=record.names,
+        parameters=parameters,
+        summary_parameters=parameters,
+        seeds={"sample": parameters["seed"]},
     )
-    about |= {
-        "summary_parameters": asked,
-        "consent_scope": record.provenance.get("consent_scope", []),
-        "take": record.take,
-    }
-    with db.stage(SUMMARY, record.take, names=record.names) as stage:
-        stage.write(groups, tables=tables)
-        return stage.commit(about)
+    summary = xr.DataTree.from_dict(groups)
+    summary.attrs["consent_scope"] = record.provenance.get("consent_scope", [])
+    return derivation.commit(summary)
+
+
+# functions that compute what cohorts need
+METHOD = (tables_of, sample_groups, registered_parts)

@@ -400,7 +400,7 @@ def test_albedo_histograms__regions_by_landmarks_where_the_capture_has_none():
     count = SIDE**2
     cohort = cohort_of(models, "surfels", surfels=count)
     parts = {
-        take: registered_parts(model, registered[take], size=16)[0]["sample"]
+        take: registered_parts(model, registered[take], size=16)["sample"]
         for take, model in models.items()
     }
     drawn = combine(

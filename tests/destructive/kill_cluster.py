@@ -43,7 +43,7 @@ from planted_cohort import EVERYTHING, capture
 
 import skindb
 from skindb.store import Database
-from skindb.workflow.provenance import groups_of
+from skindb.workflow.derive import groups_of
 
 TAKES = 4
 START_S = 120.0

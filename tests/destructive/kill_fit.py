@@ -49,7 +49,7 @@ from skindb.store import Database
 from skindb.store.stage import Stage
 from skindb.workflow import fit as fit_module
 from skindb.workflow import ingest as ingest_module
-from skindb.workflow.provenance import groups_of
+from skindb.workflow.derive import groups_of
 
 FIT = (
     "begin",

@@ -207,7 +207,7 @@ def test_clean__ends_the_lease_of_a_killed_run(db, monkeypatch):
     assert db.garbage() == []
 
 
-ABOUT = {"requested": {"k": 2}, "dictionary_digest": "d", "method_digest": "m"}
+ABOUT = {"requested": {"k": 2}, "dictionary_digest": "d", "code_digest": "m"}
 
 
 def test_clean__keeps_a_first_pass_until_its_model_is_there(db):

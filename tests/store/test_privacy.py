@@ -11,7 +11,7 @@ from planted_cohort import PEOPLE, capture
 
 import skindb
 from skindb.files import make_private
-from skindb.workflow.provenance import groups_of
+from skindb.workflow.derive import groups_of
 
 
 def _commit(db, take="S02"):

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import shutil
+
 import pytest
 
-from skindb.workflow import studies
+from skindb.workflow import code_digest, studies
 
 TEXELS = 128  # along each side; the least for pyramids of 7 levels
 
@@ -13,3 +15,20 @@ TEXELS = 128  # along each side; the least for pyramids of 7 levels
 def small_textures(monkeypatch):
     """The study of albedo computes its textures from small maps."""
     monkeypatch.setattr(studies, "TEXELS", TEXELS)
+
+
+@pytest.fixture
+def change_code(tmp_path, monkeypatch):
+    """Function that changes a file in the copy of skindb whose digests are computed."""
+    copy = tmp_path / "changed" / "skindb"
+    shutil.copytree(
+        code_digest.ROOT, copy, ignore=shutil.ignore_patterns("__pycache__")
+    )
+
+    def change(name, old, new):
+        text = (copy / name).read_text()
+        assert old in text
+        (copy / name).write_text(text.replace(old, new))
+        monkeypatch.setattr(code_digest, "ROOT", copy)
+
+    return change

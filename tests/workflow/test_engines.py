@@ -27,7 +27,7 @@ from skindb.workflow import (
     simulate,
     traits,
 )
-from skindb.workflow.provenance import groups_of
+from skindb.workflow.derive import groups_of
 
 pytestmark = pytest.mark.slow
 

@@ -14,8 +14,8 @@ from planted_cohort import PARAMETERS, PEOPLE, capture, few_materials
 import skindb
 from skindb.errors import InputError
 from skindb.workflow import fit as fit_module
+from skindb.workflow.derive import groups_of
 from skindb.workflow.fit import fit_take
-from skindb.workflow.provenance import groups_of
 
 TAKE = "S01"
 
@@ -111,11 +111,9 @@ def test_fit_take__continues_after_the_first_pass_of_a_killed_run(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "change", ["parameters", "capture", "dictionary", "method", "schema"]
-)
+@pytest.mark.parametrize("change", ["parameters", "capture", "dictionary", "code"])
 def test_fit_take__uses_no_first_pass_that_would_be_another(
-    killed, change, monkeypatch
+    killed, change, change_code
 ):
     parameters = PARAMETERS
     options = {}
@@ -125,10 +123,8 @@ def test_fit_take__uses_no_first_pass_that_would_be_another(
         _ingest(killed)
     elif change == "dictionary":
         options["dictionary"] = None
-    elif change == "method":
-        monkeypatch.setattr(fit_module, "method_digest", lambda _: "another method")
     else:
-        monkeypatch.setattr("skindb.workflow.first.__version__", "9")
+        change_code("fit/normals.py", "return ", "return 1 and ")
     _, stages = _fit(killed, parameters, **options)
     assert "first pass" in stages
 

@@ -14,7 +14,7 @@ from small_face import small_face
 
 import skindb
 from skindb.errors import InputError
-from skindb.workflow.provenance import groups_of
+from skindb.workflow.derive import groups_of
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "store"))
 from stored import commit

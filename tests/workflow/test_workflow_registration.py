@@ -177,7 +177,7 @@ def test_current_registrations__are_used_only_while_they_are_current(tmp_path):
     store()
     assert used() == ["A", "B"]
     _replace(
-        db, "registration", "B", db.read("registration", "B"), software_version="0.0.1"
+        db, "registration", "B", db.read("registration", "B"), code_digest="another"
     )
     assert used() == []
     store()
