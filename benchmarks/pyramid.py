@@ -14,7 +14,7 @@ import numpy as np
 from pyrtools.pyramids import SteerablePyramidFreq
 from scipy.fft import set_workers
 
-from skindb.numerics.pyramid import build, reconstruct
+from skindb.numerics.texture import build, reconstruct
 
 
 def best(call: Callable[[], Any], rounds: int) -> tuple[float, Any]:

@@ -27,7 +27,7 @@ from skindb.analysis.members import (
     texts,
 )
 from skindb.errors import Fault, InputError
-from skindb.numerics.group_distance import (
+from skindb.numerics.inference import (
     between_groups_p,
     classical_scaling,
     within_subjects_p,
@@ -93,7 +93,7 @@ def brdf_space(
     group are averaged first. Groups with different subjects are compared by permutation
     of the subjects. Groups with subjects in common, such as conditions, are compared
     within these subjects. The statistic is the squared distance of the means divided by
-    its squared standard error (`skindb.numerics.group_distance`), so that groups that
+    its squared standard error (`skindb.numerics.inference`), so that groups that
     differ only in variance are not reported as different.
 
     Parameters
@@ -363,13 +363,15 @@ def _pairs(
                 f"{'in both groups' if within[-1] else 'per group'}"
             )
         elif within[-1]:
-            (statistic,), (p,), drawn = within_subjects_p(values, most=most, rng=rng)
+            (statistic,), (p,), drawn = within_subjects_p(
+                values, max_draws=most, rng=rng
+            )
         else:
             one = np.concatenate(
                 [values[there[:, side], i] for i, side in enumerate((a, b))]
             )
             (statistic,), (p,), drawn = between_groups_p(
-                one, np.repeat([0, 1], count), most=most, rng=rng
+                one, np.repeat([0, 1], count), max_draws=most, rng=rng
             )
         if 2 <= min(count) < FEW:
             flags.append(
@@ -414,11 +416,11 @@ def _adjusted(
     if not finite.all() or len(set(within)) > 1:
         return np.minimum(p * finite.sum(), 1.0), "Bonferroni"
     if within[0]:
-        _, largest, _ = within_subjects_p(subjects.place, most=most, rng=rng)
+        _, largest, _ = within_subjects_p(subjects.place, max_draws=most, rng=rng)
     else:
         group = np.argmax(subjects.there, axis=1)
         own = subjects.place[np.arange(len(group)), group]
-        _, largest, _ = between_groups_p(own, group, most=most, rng=rng)
+        _, largest, _ = between_groups_p(own, group, max_draws=most, rng=rng)
     return np.maximum(largest, p), "largest statistic"
 
 

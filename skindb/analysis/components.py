@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from skindb.analysis.each_take import each_take, shared_once
 from skindb.errors import Fault, InputError
-from skindb.numerics.principal import principal_axes
+from skindb.numerics.factorise import principal_axes
 from skindb.render.image import tone_map
 from skindb.schema import dataset
 from skindb.schema.cohort import require_same_fit

@@ -13,8 +13,7 @@ from skindb.analysis import colours
 from skindb.analysis.members import takes_to_compare
 from skindb.analysis.quantities import CHANNELS, SURFACE, Quantities, quantities_of
 from skindb.errors import Fault, InputError
-from skindb.numerics.inference import benjamini_hochberg
-from skindb.numerics.statistics import known_mean
+from skindb.numerics.statistics import benjamini_hochberg, known_mean
 from skindb.schema import dataset
 from skindb.schema.cohort import require_same_fit, require_takes
 from skindb.schema.regions import FACE

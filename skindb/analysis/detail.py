@@ -16,8 +16,7 @@ from skindb.analysis.masks import region_masks
 from skindb.analysis.texture import SIZE, common_landmarks, log_albedo
 from skindb.analysis.texture_edit import at_surfels
 from skindb.errors import Fault, InputError
-from skindb.numerics.pyramid import Image, build, reconstruct
-from skindb.numerics.texture import level_fractions
+from skindb.numerics.texture import Image, build, level_fractions, reconstruct
 from skindb.schema.consent import honour_consent
 from skindb.schema.regions import FACE
 from skindb.types import Array, Mask

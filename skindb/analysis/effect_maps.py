@@ -251,11 +251,11 @@ def _contrast_statistics(
     chosen = values[:, able].astype(np.float64)
     if one.is_paired:
         fit = paired_effects(chosen)
-        p, adjusted, drawn = sign_flip_p(chosen, most=most, rng=rng)
+        p, adjusted, drawn = sign_flip_p(chosen, max_draws=most, rng=rng)
     else:
         fit = effects(chosen, one.regressor, one.covariates)
         p, adjusted, drawn = permutation_p(
-            chosen, one.regressor, one.covariates, most=most, rng=rng
+            chosen, one.regressor, one.covariates, max_draws=most, rng=rng
         )
     found = {
         "map_effect": fit.slope,

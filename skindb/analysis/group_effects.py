@@ -37,14 +37,16 @@ from skindb.analysis.quantities import (
 from skindb.errors import Fault, InputError
 from skindb.numerics.inference import (
     Effects,
-    benjamini_hochberg,
-    detectable_difference,
     effects,
     paired_effects,
     permutation_p,
     sign_flip_p,
 )
-from skindb.numerics.statistics import known_mean
+from skindb.numerics.statistics import (
+    benjamini_hochberg,
+    detectable_difference,
+    known_mean,
+)
 from skindb.schema import dataset
 from skindb.schema.cohort import require_same_fit, require_takes
 from skindb.types import Array
@@ -338,12 +340,12 @@ def _contrast_statistics(
     values = one.quantities.values
     if one.before is not None:
         fit = paired_effects(values)
-        p, adjusted, count = sign_flip_p(values, most=most, rng=rng)
+        p, adjusted, count = sign_flip_p(values, max_draws=most, rng=rng)
         reference = known_mean(np.where(np.isfinite(values), one.before, np.nan))
     else:
         fit = effects(values, one.regressor, one.covariates)
         p, adjusted, count = permutation_p(
-            values, one.regressor, one.covariates, most=most, rng=rng
+            values, one.regressor, one.covariates, max_draws=most, rng=rng
         )
         known = np.isfinite(values)
         centre = known_mean(np.where(known, one.regressor[:, None], np.nan))

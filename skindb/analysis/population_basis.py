@@ -89,7 +89,7 @@ def population_basis(
         min(k, *X.shape),
         metric=metric if in_metric else None,
         rng=rng,
-        each=each_item,
+        mapper=each_item,
     )
     A = metric if in_metric else np.eye(X.shape[1])
 

@@ -14,7 +14,7 @@ from scipy.ndimage import gaussian_filter
 from skindb.analysis.texture import REGIONS, decorrelated, log_albedo
 from skindb.elementwise import thread_count
 from skindb.geometry.texture import bilinear
-from skindb.numerics.principal import principal_axes
+from skindb.numerics.factorise import principal_axes
 from skindb.numerics.texture import (
     Synthesis,
     image_parts,

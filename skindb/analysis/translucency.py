@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from skindb.analysis import colours
 from skindb.analysis.group_effects import FEW
 from skindb.analysis.members import groups_by, takes_to_compare
-from skindb.numerics.inference import variance_components
-from skindb.numerics.statistics import Moments
+from skindb.numerics.statistics import Moments, variance_components
 from skindb.schema import IDENTIFIED, ProbeStatus, dataset
 from skindb.schema.cohort import require_same_fit, require_takes
 from skindb.types import Array

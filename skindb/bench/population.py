@@ -10,13 +10,14 @@ from scipy.ndimage import gaussian_filter
 from sklearn.decomposition import PCA
 
 from skindb.bench.curve import Curve, Point, cpu_time
+from skindb.numerics.factorise import principal_axes
 from skindb.numerics.inference import permutation_p
-from skindb.numerics.principal import principal_axes
-from skindb.numerics.pyramid import build, reconstruct
 from skindb.numerics.texture import (
+    build,
     image_parts,
     level_fractions,
     part_quantiles,
+    reconstruct,
     synthesise,
 )
 from skindb.types import Array
@@ -159,13 +160,16 @@ def permutations_curves(quick: bool) -> list[Curve]:
         0, 1, 30
     )
     exact, _, _ = permutation_p(
-        values, group, most=20_000 if quick else 200_000, rng=np.random.default_rng(7)
+        values,
+        group,
+        max_draws=20_000 if quick else 200_000,
+        rng=np.random.default_rng(7),
     )
     points = []
     for most in (100, 1000) if quick else (100, 1000, 10_000):
         took, (p, _, _) = cpu_time(
             lambda n=most: permutation_p(  # type: ignore[misc]
-                values, group, most=n, rng=np.random.default_rng(1)
+                values, group, max_draws=n, rng=np.random.default_rng(1)
             )
         )
         points.append(

@@ -5,11 +5,12 @@ states the problem.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from skindb.jit import kernel
+from skindb.types import BoolVector, Cube, IntVector, IntVector32, Matrix, Vector
 
 # a column whose fraction outside the span of the active ones is below this is collinear
 # with them
@@ -19,19 +20,19 @@ MIN_PIVOT = 1e-11
 class ActiveSetMemory(NamedTuple):
     """Memory for `active_set` of m columns; each thread needs its own."""
 
-    factor: Any  # (m, m) Cholesky factor of the active columns
-    solution: Any  # (m,) unconstrained minimum on the active columns
-    gradient: Any  # (m,) b - G x
+    factor: Matrix  # (m, m) Cholesky factor of the active columns
+    solution: Vector  # (m,) unconstrained minimum on the active columns
+    gradient: Vector  # (m,) b - G x
 
 
 @kernel
-def active_set_memory(m: int) -> Any:
+def active_set_memory(m: int) -> ActiveSetMemory:
     """Memory for problems of m columns."""
     return ActiveSetMemory(np.zeros((m, m)), np.zeros(m), np.zeros(m))
 
 
 @kernel
-def factor(G: Any, active: Any, begin: int, k: int, L: Any) -> int:
+def factor(G: Matrix, active: IntVector, begin: int, k: int, L: Matrix) -> int:
     """Extend the Cholesky factor of G on `active` from position `begin` to k; returns
     the first bad pivot, or -1.
     """
@@ -51,7 +52,7 @@ def factor(G: Any, active: Any, begin: int, k: int, L: Any) -> int:
 
 
 @kernel
-def solve(L: Any, b: Any, active: Any, k: int, z: Any) -> None:
+def solve(L: Matrix, b: Vector, active: IntVector, k: int, z: Vector) -> None:
     """Write to z the inverse of the factored matrix times b on the active columns."""
     for a in range(k):
         t = b[active[a]]
@@ -66,7 +67,7 @@ def solve(L: Any, b: Any, active: Any, k: int, z: Any) -> None:
 
 
 @kernel
-def _gradient(G: Any, b: Any, x: Any, w: Any) -> None:
+def _gradient(G: Matrix, b: Vector, x: Vector, w: Vector) -> None:
     m = b.shape[0]
     for j in range(m):  # a copy of arrays, `w[:] = b`, would take seconds to compile
         w[j] = b[j]
@@ -79,7 +80,13 @@ def _gradient(G: Any, b: Any, x: Any, w: Any) -> None:
 
 @kernel
 def _exchange(
-    G: Any, entering: int, active: Any, k: int, L: Any, x: Any, z: Any
+    G: Matrix,
+    entering: int,
+    active: IntVector,
+    k: int,
+    L: Matrix,
+    x: Vector,
+    z: Vector,
 ) -> int:
     """Exchange a column that lies in the span of the k active ones for one of them.
 
@@ -104,7 +111,8 @@ def _exchange(
 
 
 @kernel
-def _drop(active: Any, position: int, k: int) -> int:
+def _drop(active: IntVector, position: int, k: int) -> int:
+    """Remove a position of the k active columns, and return their number."""
     for a in range(position, k - 1):
         active[a] = active[a + 1]
     return k - 1
@@ -112,7 +120,12 @@ def _drop(active: Any, position: int, k: int) -> int:
 
 @kernel
 def active_set(
-    G: Any, b: Any, x: Any, tolerance: float, limit: int, memory: Any
+    G: Matrix,
+    b: Vector,
+    x: Vector,
+    tolerance: float,
+    limit: int,
+    memory: ActiveSetMemory,
 ) -> tuple[float, int, bool, float]:
     """Minimise x G x / 2 - b x, x >= 0, for a Gram matrix of unit diagonal (0 for empty
     columns), from a warm x.
@@ -142,7 +155,8 @@ def active_set(
     count = 0
     for j in range(m):
         if x[j] > 0.0:
-            active[k], passive[j] = j, True
+            active[k] = j
+            passive[j] = True
             k += 1
     entering = -1
     warm = k > 0
@@ -157,26 +171,29 @@ def active_set(
                     best = w[j]
             if entering < 0:
                 break
-            active[k], passive[entering] = entering, True
+            active[k] = entering
+            passive[entering] = True
             k += 1
         warm = False
         while True:
             count += 1
-            bad = factor(G, active, valid, k, L)
-            if bad >= 0:
-                valid = bad
-                j = active[bad]
-                if j == entering and bad == k - 1:
-                    out = _exchange(G, entering, active, k - 1, L, x, z)
-                    if out >= 0:  # of two similar columns, the better one is kept
-                        passive[active[out]] = False
-                        k = _drop(active, out, k)
-                        valid = min(valid, out)
+            collinear = factor(G, active, valid, k, L)
+            if collinear >= 0:
+                valid = collinear
+                j = active[collinear]
+                if j == entering and collinear == k - 1:
+                    replaced = _exchange(G, entering, active, k - 1, L, x, z)
+                    if replaced >= 0:  # of two similar columns, the better one stays
+                        passive[active[replaced]] = False
+                        k = _drop(active, replaced, k)
+                        valid = min(valid, replaced)
                         if count < limit:
                             continue
                         break
-                passive[j], barred[j], x[j] = False, True, 0.0
-                k = _drop(active, bad, k)
+                passive[j] = False
+                barred[j] = True
+                x[j] = 0.0
+                k = _drop(active, collinear, k)
                 if j == entering:
                     break
                 continue
@@ -200,7 +217,8 @@ def active_set(
                 j = active[a]
                 x[j] += step * (z[a] - x[j])
                 if z[a] <= 0.0 and x[j] <= 1e-15 * abs(z[a]) + 1e-300:
-                    x[j], passive[j] = 0.0, False
+                    x[j] = 0.0
+                    passive[j] = False
                     if j == entering and step == 0.0:
                         # it entered because of rounding and would leave at once
                         barred[j] = True
@@ -220,17 +238,18 @@ def active_set(
         low = min(low, L[a, a])
         high = max(high, L[a, a])
     condition = (high / low) ** 2 if high > 0.0 else 1.0
-    return (
-        worst / scale,
-        count,
-        worst <= 10.0 * max(tolerance, 1e-12) * scale and count < limit,
-        condition,
-    )
+    converged = worst <= 10.0 * max(tolerance, 1e-12) * scale and count < limit
+    return worst / scale, count, converged, condition
 
 
 @kernel
 def solve_scaled(
-    G: Any, b: Any, x: Any, tolerance: float, limit: int, memory: Any
+    G: Matrix,
+    b: Vector,
+    x: Vector,
+    tolerance: float,
+    limit: int,
+    memory: ActiveSetMemory,
 ) -> tuple[float, int, bool, float]:
     """`active_set` after scaling the columns to unit length; G and b are overwritten, x
     is the warm start.
@@ -253,20 +272,20 @@ def solve_scaled(
 
 @kernel
 def solve_many(
-    G: Any,
-    b: Any,
-    x: Any,
-    finite: Any,
+    G: Cube,
+    b: Matrix,
+    x: Matrix,
+    finite: BoolVector,
     tolerance: float,
-    kkt: Any,
-    count: Any,
-    met: Any,
+    kkt: Vector,
+    count: IntVector32,
+    converged: BoolVector,
 ) -> None:
     """`solve_scaled` for every problem that is finite."""
     m = b.shape[1]
     memory = active_set_memory(m)
     for i in range(b.shape[0]):
         if finite[i]:
-            kkt[i], count[i], met[i], _ = solve_scaled(
+            kkt[i], count[i], converged[i], _ = solve_scaled(
                 G[i], b[i], x[i], tolerance, 6 * m, memory
             )

@@ -1,10 +1,12 @@
-"""Non-negative matrix factorisation of BRDF weights (Weyrich et al. 2005, sections 7 and 10.1)."""
+"""Non-negative factors of BRDF weights (Weyrich et al. 2005, sections 7 and 10.1), and
+principal components of a few long vectors.
+"""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import partial
 
 import numpy as np
@@ -22,6 +24,8 @@ MAX_PASSES = 30  # over all blocks; each pass reads all data
 # relative decrease of the error by a pass, below which no further pass is made
 MIN_FALL_PER_PASS = 1e-3
 SWEEPS_PER_PASS = 5  # over all rows of H between two passes; their cost is negligible
+# entries per vector that are held in double precision at a time: 90 MB for 174 vectors
+BLOCK = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -43,7 +47,7 @@ def nmf(
     metric: Array | None = None,
     seeds: int = 3,
     rng: np.random.Generator,
-    each: Callable[..., Iterable[tuple[float, Array]]] = map,
+    mapper: Callable[..., Iterable[tuple[float, Array]]] = map,
 ) -> Factorisation:
     """Factor non-negative weights (n, m) ~ W H with H (k, m).
 
@@ -61,43 +65,28 @@ def nmf(
         Number of random starts in addition to the deterministic one; the best result is kept.
     rng
         Random generator for the starts.
-    each
+    mapper
         Function with the interface of `map` that runs the starts, possibly in parallel.
     """
     X = np.asarray(weights, np.float64)
-    if (
-        X.ndim != 2
-        or not 1 <= k <= min(X.shape)
-        or not np.isfinite(X).all()
-        or (X < 0).any()
-    ):
+    fits = X.ndim == 2 and 1 <= k <= min(X.shape)
+    if not fits or not np.isfinite(X).all() or (X < 0).any():
         raise ValueError(
             f"weights {X.shape} must be finite and non-negative, and k = {k} within both sides"
         )
     if not X.any():
         return Factorisation(np.full((k, X.shape[1]), 1.0 / X.shape[1]), 0.0, 0.0)
+    A = None if metric is None else (metric + metric.T) / 2
     starts = [None, *(int(rng.integers(2**31)) for _ in range(seeds))]
     # around all starts, because filters apply to the process, not to a thread
     with warnings.catch_warnings():
         # the error is returned instead
         warnings.simplefilter("ignore", ConvergenceWarning)
-        found = list(
-            each(
-                partial(
-                    _from_start,
-                    X,
-                    k,
-                    None if metric is None else (metric + metric.T) / 2,
-                ),
-                starts,
-            )
-        )
-    errors = [error for error, _ in found]
-    return Factorisation(
-        _canonical(found[int(np.argmin(errors))][1], X.mean(axis=0)),
-        min(errors),
-        max(errors) - min(errors),
-    )
+        results = list(mapper(partial(_from_start, X, k, A), starts))
+    errors = [error for error, _ in results]
+    H = results[int(np.argmin(errors))][1]
+    spread = max(errors) - min(errors)
+    return Factorisation(_canonical(H, X.mean(axis=0)), min(errors), spread)
 
 
 def _from_start(
@@ -105,10 +94,10 @@ def _from_start(
 ) -> tuple[float, Array]:
     """Relative error and H (k, m) from one start."""
     X = c_contiguous(X)
-    A = None if A is None else c_contiguous(A)
     W, H = _in_coefficients(X, k, seed)
     if A is None:
         return relative_error(X, H, np.eye(X.shape[1])), H
+    A = c_contiguous(A)
     H = _in_metric(X, W, H, A)
     return relative_error(X, H, A), H
 
@@ -120,11 +109,9 @@ def _in_coefficients(X: Array, k: int, seed: int | None) -> tuple[Array, Array]:
     # single precision is three times faster, and its rounding is far below the error
     level = X.mean()
     scaled = (X / level).astype(np.float32)
-    # the singular vectors also start from random ones: without a seed, from the global generator
+    # the singular vectors also start from random ones, which need a seed
     init = "nndsvda" if seed is None else "random"
-    model = NMF(
-        k, init=init, max_iter=MAX_SWEEPS, random_state=0 if seed is None else seed
-    )
+    model = NMF(k, init=init, max_iter=MAX_SWEEPS, random_state=seed or 0)
     W = model.fit_transform(scaled)
     return W.astype(np.float64) * level, model.components_.astype(np.float64)
 
@@ -135,28 +122,33 @@ def _in_metric(X: Array, W: Array, H: Array, A: Array) -> Array:
     """
     XA = X @ A
     level = float((X * XA).sum())
-    last = np.inf
+    previous = np.inf
     for _ in range(MAX_SWEEPS):
         gram = H @ A @ H.T
         rhs = XA @ H.T
         for j in np.flatnonzero(np.diag(gram) > 0):
-            W[:, j] = np.maximum(
-                W[:, j] + (rhs[:, j] - W @ gram[:, j]) / gram[j, j], 0.0
-            )
+            step = (rhs[:, j] - W @ gram[:, j]) / gram[j, j]
+            W[:, j] = np.maximum(W[:, j] + step, 0.0)
         inner = W.T @ W
         cross = W.T @ X
         H = _next_rows(H, inner, cross, A)
-        square = (
-            level - 2 * float((cross @ A * H).sum()) + float((inner @ H @ A * H).sum())
-        )
-        if last - square < TOLERANCE * level:
+        square = _squared_error(level, inner, cross, H, A)
+        if previous - square < TOLERANCE * level:
             break
-        last = square
+        previous = square
     return H
 
 
+def _squared_error(
+    square: float, inner: Array, cross: Array, H: Array, A: Array
+) -> float:
+    """tr((X - W H) A (X - W H)') for tr(X A X'), W'W (k, k) and W'X (k, m)."""
+    explained = float((cross @ A * H).sum())
+    return square - 2 * explained + float((inner @ H @ A * H).sum())
+
+
 def _next_rows(H: Array, inner: Array, cross: Array, A: Array) -> Array:
-    """H after minimising over its rows one after another, given W'W (k, k) and W'X (k, m)."""
+    """H after minimising over its rows one after another, for W'W (k, k) and W'X (k, m)."""
     H = H.copy()
     for j in np.flatnonzero(np.diag(inner) > 0):  # an unused component is undetermined
         # min over h >= 0 of (h - z)' A (h - z): least squares with Gram matrix A
@@ -185,33 +177,22 @@ class Sums:
         return cls(W.T @ W, W.T @ X, X.sum(axis=0), float((X * XA).sum()), len(X))
 
     def __add__(self, other: Sums) -> Sums:
-        return Sums(
-            self.inner + other.inner,
-            self.cross + other.cross,
-            self.total + other.total,
-            self.square + other.square,
-            self.count + other.count,
-        )
+        return Sums(*(getattr(self, name) + getattr(other, name) for name in _SUMS))
 
     def mean(self) -> Sums:
         """Sums per row of X, so that takes have equal weight whatever their number of surfels."""
         n = max(self.count, 1)
-        return Sums(
-            self.inner / n,
-            self.cross / n,
-            self.total / n,
-            self.square / n,
-            self.count / n,
-        )
+        return Sums(*(getattr(self, name) / n for name in _SUMS))
 
     def error(self, H: Array, A: Array) -> float:
         """|X - W H| / |X|, from differences of sums, so that values below 1e-7 are rounding."""
-        left = (
-            self.square
-            - 2 * float((self.cross @ A * H).sum())
-            + float((self.inner @ H @ A * H).sum())
-        )
-        return float(np.sqrt(max(left, 0.0) / self.square)) if self.square > 0 else 0.0
+        if self.square <= 0:
+            return 0.0
+        residual = _squared_error(self.square, self.inner, self.cross, H, A)
+        return float(np.sqrt(max(residual, 0.0) / self.square))
+
+
+_SUMS = [field.name for field in fields(Sums)]
 
 
 def refine(
@@ -236,23 +217,25 @@ def refine(
         valid for this H; relative errors before the first pass and after each, never
         increasing.
     """
-    found = groups(H)
-    errors = [_mean(found).error(H, A)]
+    sums = groups(H)
+    mean = _mean(sums)
+    errors = [mean.error(H, A)]
     while len(errors) <= MAX_PASSES:
-        mean = _mean(found)
         rows = H
         for _ in range(SWEEPS_PER_PASS):
             rows = _next_rows(rows, mean.inner, mean.cross, A)
-        sums = groups(rows)
-        error = _mean(sums).error(rows, A)
+        row_sums = groups(rows)
+        row_mean = _mean(row_sums)
+        error = row_mean.error(rows, A)
         if not error < errors[-1]:  # rounding
             break
         H = rows
-        found = sums
+        sums = row_sums
+        mean = row_mean
         errors.append(error)
         if errors[-2] - error < MIN_FALL_PER_PASS * error:
             break
-    return _canonical(H, _mean(found).total), found, np.array(errors)
+    return _canonical(H, mean.total), sums, np.array(errors)
 
 
 def _mean(groups: Sequence[Sums]) -> Sums:
@@ -264,22 +247,80 @@ def _mean(groups: Sequence[Sums]) -> Sums:
 
 def relative_error(X: Array, H: Array, A: Array) -> float:
     """|X - W H| / |X| in the metric A (m, m) with the best non-negative W."""
-    left = X - _best_weights(X @ A, H, A) @ H
-    return float(
-        np.sqrt(max(float((left @ A * left).sum()), 0.0) / float((X @ A * X).sum()))
-    )
+    residual = X - _best_weights(X @ A, H, A) @ H
+    square = max(float((residual @ A * residual).sum()), 0.0)
+    return float(np.sqrt(square / float((X @ A * X).sum())))
 
 
 def _best_weights(XA: Array, H: Array, A: Array) -> Array:
-    """Weights W >= 0 (n, k) with W H nearest to X in the metric A, given X A (n, m)."""
+    """Weights W >= 0 (n, k) with W H nearest to X in the metric A, from X A (n, m)."""
     gram = H @ A @ H.T
-    W, _, _, _ = solve_nnls(np.broadcast_to(gram, (len(XA), *gram.shape)), XA @ H.T)
-    return W
+    return solve_nnls(np.broadcast_to(gram, (len(XA), *gram.shape)), XA @ H.T)[0]
 
 
 def _canonical(H: Array, mean: Array) -> Array:
     """H with rows of unit sum, ordered by their contribution to the mean of X (m,)."""
     total = H.sum(axis=1, keepdims=True)
     H = np.where(total > 0, H / np.where(total > 0, total, 1.0), 1.0 / H.shape[1])
-    share = mean @ H.T
-    return np.asarray(H[np.argsort(-share, kind="stable")])
+    contribution = mean @ H.T
+    return np.asarray(H[np.argsort(-contribution, kind="stable")])
+
+
+@dataclass(frozen=True)
+class Components:
+    """Mean and principal axes of vectors, and the scores of each vector."""
+
+    mean: Array  # (d,)
+    # (c, d) of unit norm, by decreasing variance; the largest entry of each is positive
+    axes: Array
+    score: Array  # (n, c)
+    variance: Array  # (c,) unbiased variance of the scores
+    total: float  # sum of the variances of all entries
+    residual: Array  # (n,) root mean square of the residual of each vector
+
+
+def principal_axes(vectors: NDArray[np.floating], max_components: int) -> Components:
+    """Principal components of vectors (n, d), n at least 2, from the eigenvectors of
+    their inner products.
+
+    Vectors are read block by block, so that no full copy in double precision is needed.
+    Components whose variance is below 1e-12 of the largest are rounding and are
+    dropped.
+
+    Parameters
+    ----------
+    vectors
+        (n, d) finite, of any precision.
+    max_components
+        Maximum number of components; never more than n - 1.
+    """
+    n, d = vectors.shape
+    blocks = [slice(start, start + BLOCK) for start in range(0, d, BLOCK)]
+    mean = np.empty(d)
+    inner = np.zeros((n, n))
+    for block in blocks:
+        x = vectors[:, block].astype(np.float64)
+        mean[block] = x.mean(axis=0)
+        x -= mean[block]
+        inner += x @ x.T
+    values, places = np.linalg.eigh(inner)
+    values = values[::-1][: min(max_components, n - 1)]
+    rank = int((values > max(float(values[0]), 0.0) * 1e-12).sum())
+    places = places[:, ::-1][:, :rank]
+    length = np.sqrt(values[:rank])
+    axes = np.empty((rank, d))
+    residual = np.zeros(n)
+    for block in blocks:
+        x = vectors[:, block] - mean[block]
+        axes[:, block] = (places / length).T @ x
+        residual += ((x - (places * length) @ axes[:, block]) ** 2).sum(axis=1)
+    largest = np.abs(axes).argmax(axis=1)
+    sign = np.where(axes[np.arange(rank), largest] < 0, -1.0, 1.0)
+    return Components(
+        mean,
+        axes * sign[:, None],
+        places * (length * sign),
+        variance=values[:rank] / (n - 1),
+        total=float(np.trace(inner)) / (n - 1),
+        residual=np.sqrt(residual / d),
+    )

@@ -1,32 +1,38 @@
-"""Effects, permutation tests and variance components; the unit of observation is a subject.
+"""Effects, permutation tests and distances of groups; the unit of observation is a subject.
 
-The methods are regression with standard errors that are valid for unequal variances
-(HC3, MacKinnon and White 1985), permutation with covariates (Freedman and Lane 1983),
-and correction for many quantities (Westfall and Young 1993; Benjamini and Hochberg
-1995). Permutations compare statistics that contain the standard errors (DiCiccio and
-Romano 2017); otherwise groups of different sizes and spreads would appear to differ.
+Effects are estimated by regression with standard errors that are valid for unequal
+variances (HC3, MacKinnon and White 1985). Permutations respect covariates (Freedman and
+Lane 1983) and correct for many quantities by the largest statistic (Westfall and Young
+1993). They compare statistics that contain the standard errors (DiCiccio and Romano
+2017; Chung and Romano 2016); otherwise groups of different sizes and spreads would
+appear to differ (Anderson and Walsh 2013). The statistic of two groups of vectors is
+the squared distance of their means divided by the sum of their mean squared scatters,
+each over its number of subjects; in one dimension it is the square of Welch's t.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice, permutations, product
-from math import factorial
+from itertools import combinations, islice, permutations, product
+from math import factorial, prod
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import optimize, stats
+from scipy import stats
 
+from skindb.numerics.statistics import ROUNDING
 from skindb.types import Array, Mask
 
-ROUNDING = 1e-13  # relative to the largest value
+Index = NDArray[np.intp]
+Draw = NDArray[Any]  # an order, signs or labels of the subjects, or many of them
 SUMS = 2  # entries per draw and quantity when products of matrices are used
 MANY = 1000  # number of quantities from which products of matrices are faster
 # relative to the sum of weighted squares; smaller differences are dominated by rounding
 CANCELLED = 1e-6
 BATCH = 1 << 22  # number of permuted values in memory at a time: 32 MB
+REACHED = 1 - 1e-9  # tolerance for the same statistic summed in another order
 
 
 @dataclass(frozen=True)
@@ -45,14 +51,77 @@ class Effects:
 
 
 @dataclass(frozen=True)
-class _Part:
-    """Quantities that are known for the same subjects."""
+class _Regression:
+    """Quantities of the same subjects, the adjusted regressor, and the covariates."""
 
     rows: Mask  # (n,) mask of these subjects
-    columns: NDArray[np.intp]  # indices of the quantities
-    own: Array  # residual of the regressor after projection on the basis
-    basis: Array  # orthonormal basis of 1 and the covariates
+    columns: Index  # indices of the quantities
+    regressor: Array  # (rows,) its residual after projection on the basis
+    basis: Array  # (rows, .) orthonormal basis of 1 and the covariates
     values: Array  # (rows, columns)
+
+    @property
+    def leverage(self) -> Array:
+        square = float(self.regressor @ self.regressor)
+        return np.asarray((self.basis**2).sum(axis=1) + self.regressor**2 / square)
+
+    @property
+    def error_weight(self) -> Array:
+        """Weights (rows,) of the squared residuals in the squared HC3 error of the slope."""
+        square = float(self.regressor @ self.regressor)
+        scale = np.maximum(1 - self.leverage, 1e-12)
+        return np.asarray((self.regressor / square / scale) ** 2)
+
+    def residual(self) -> Array:
+        """Values after projection on the basis; 0 where only rounding remains."""
+        y = self.values - self.basis @ (self.basis.T @ self.values)
+        exact = np.abs(y).max(axis=0) > ROUNDING * np.abs(self.values).max(axis=0)
+        return np.where(exact, y, 0.0)
+
+    def statistics(self, values: Array) -> Array:
+        """Slope over its HC3 error (b, q) of values (b, n, q), after projection on the basis."""
+        y = values - self.basis @ (self.basis.T @ values)
+        slope = self.regressor @ y / float(self.regressor @ self.regressor)
+        residual = y - self.regressor[:, None] * slope[:, None]
+        square = np.einsum("i,biq,biq->bq", self.error_weight, residual, residual)
+        return _ratio(slope, np.sqrt(square))
+
+    def permuted_statistics(self, order: Index, sign: Array) -> Array:
+        """Statistics (b, q) of values in another order (b, rows), multiplied by signs (b, rows).
+
+        Sums over subjects are products of matrices. For many quantities, the factors
+        are permuted b times instead of the values. Statistics whose residuals are
+        mostly rounding are computed again from the permuted values.
+        """
+        if len(self.columns) < MANY:
+            return self.statistics(self.values[order] * sign[..., None])
+        weight = self.error_weight
+        # orthogonal columns, all but the last of unit length
+        design = np.column_stack([self.basis, self.regressor])
+        weighted_design = weight[:, None] * design
+        inverse = np.argsort(order, axis=1)
+        factors = np.concatenate([design, weighted_design], axis=1)[inverse]
+        factors = factors * np.take_along_axis(sign, inverse, axis=1)[..., None]
+        b, n, c = factors.shape
+        rows = np.moveaxis(factors, 2, 1).reshape(b * c, n)
+        sums = (rows @ self.values).reshape(b, c, -1)
+        along = sums[:, : c // 2]
+        along[:, -1] /= float(self.regressor @ self.regressor)
+        total = weight[inverse] @ self.values**2
+        cross = np.einsum("bcq,bcq->bq", along, sums[:, c // 2 :])
+        gram = design.T @ weighted_design
+        explained = np.einsum("bcq,cd,bdq->bq", along, gram, along, optimize=True)
+        squares = total - 2 * cross + explained
+        statistics = _ratio(along[:, -1], np.sqrt(np.maximum(squares, 0.0)))
+        for draw, column in np.argwhere(squares <= CANCELLED * total):
+            values = self.values[order[draw], column] * sign[draw]
+            exact = self.statistics(values[None, :, None])
+            statistics[draw, column] = exact[0, 0]
+        return statistics
+
+
+# order (b, rows) and signs (b, rows) of the subjects of a regression in b draws
+Redraw = Callable[[_Regression, Draw], tuple[Index, Array]]
 
 
 def effects(
@@ -88,24 +157,16 @@ def effects(
         If no quantity can be estimated: fewer than two degrees of freedom are left, or
         the covariates determine the regressor.
     """
-    found = np.full((5, values.shape[1]), np.nan)
-    for part in _parts(values, regressor, covariates):
-        own = part.own
-        y = _residual(part.values, part.basis)
-        square = float(own @ own)
-        slope = own @ y / square
-        residual = y - own[:, None] * slope
-        free = len(own) - part.basis.shape[1] - 1
-        error = np.sqrt(_error_weight(own, part.basis) @ residual**2)
-        spread = np.sqrt((residual**2).sum(axis=0) / free)
-        found[:, part.columns] = (
-            slope,
-            error,
-            _ratio(slope, error),
-            spread,
-            np.full_like(slope, free),
-        )
-    return _effects(found, level)
+    slope, error, spread, freedom = np.full((4, values.shape[1]), np.nan)
+    for fit in _regressions(values, regressor, covariates):
+        y = fit.residual()
+        columns = fit.columns
+        slope[columns] = fit.regressor @ y / float(fit.regressor @ fit.regressor)
+        residual = y - fit.regressor[:, None] * slope[columns]
+        error[columns] = np.sqrt(fit.error_weight @ residual**2)
+        freedom[columns] = len(y) - fit.basis.shape[1] - 1
+        spread[columns] = np.sqrt((residual**2).sum(axis=0) / freedom[columns])
+    return _effects(slope, error, spread, freedom, level)
 
 
 def paired_effects(differences: Array, *, level: float = 0.95) -> Effects:
@@ -114,27 +175,28 @@ def paired_effects(differences: Array, *, level: float = 0.95) -> Effects:
     The error is the standard error of the mean, and `spread` the standard deviation of
     the differences.
     """
-    known = np.isfinite(differences)
-    count = known.sum(axis=0)
-    told = count >= 2
-    clean = np.where(known, differences, 0.0)
-    mean = np.where(told, clean.sum(axis=0) / np.maximum(count, 1), np.nan)
-    square = (np.where(known, differences - mean, 0.0) ** 2).sum(axis=0)
+    finite = np.isfinite(differences)
+    count = finite.sum(axis=0)
+    total = np.where(finite, differences, 0.0).sum(axis=0)
+    mean = np.where(count >= 2, total / np.maximum(count, 1), np.nan)
+    square = (np.where(finite, differences - mean, 0.0) ** 2).sum(axis=0)
     spread = np.sqrt(square / np.maximum(count - 1, 1))
+    spread[count < 2] = np.nan
     error = spread / np.sqrt(np.maximum(count, 1))
-    found = np.stack([mean, error, _ratio(mean, error), spread, count - 1.0])
-    found[:, ~told] = np.nan
-    return _effects(found, level)
+    freedom = np.where(count >= 2, count - 1.0, np.nan)
+    return _effects(mean, error, spread, freedom, level)
 
 
-def _effects(found: Array, level: float) -> Effects:
-    slope, error, statistic, spread, free = found
-    half = stats.t.ppf((1 + level) / 2, free) * error
-    return Effects(slope, error, slope - half, slope + half, statistic, spread, free)
+def _effects(
+    slope: Array, error: Array, spread: Array, freedom: Array, level: float
+) -> Effects:
+    half = stats.t.ppf((1 + level) / 2, freedom) * error
+    statistic = np.where(np.isnan(slope), np.nan, _ratio(slope, error))
+    return Effects(slope, error, slope - half, slope + half, statistic, spread, freedom)
 
 
-def _ratio(above: Array, below: Array) -> Array:
-    return np.divide(above, below, out=np.zeros_like(above), where=below > 0)
+def _ratio(slope: Array, error: Array) -> Array:
+    return np.divide(slope, error, out=np.zeros_like(slope), where=error > 0)
 
 
 def permutation_p(
@@ -142,7 +204,7 @@ def permutation_p(
     regressor: Array,
     covariates: Array | None = None,
     *,
-    most: int = 10_000,
+    max_draws: int = 10_000,
     rng: np.random.Generator,
 ) -> tuple[Array, Array, int]:
     """P values of `effects` by permutation of the residuals after regression on the covariates.
@@ -151,7 +213,7 @@ def permutation_p(
     ----------
     values, regressor, covariates
         See `effects`. Subjects who lack a quantity are excluded from it in every permutation.
-    most
+    max_draws
         Maximum number of permutations; all of them are used if there are fewer.
     rng
         Random generator for the permutations.
@@ -164,311 +226,366 @@ def permutation_p(
         positive); the number of permutations. The smallest p is 1 / (count + 1).
     """
     n = len(regressor)
-    if factorial(min(n, 12)) <= most:
+    orders: Iterator[Draw]
+    if factorial(min(n, 12)) <= max_draws:
         orders = (np.array(order) for order in islice(permutations(range(n)), 1, None))
         count = factorial(n) - 1
     else:
-        orders = (rng.permutation(n) for _ in range(most))
-        count = most
+        orders = (rng.permutation(n) for _ in range(max_draws))
+        count = max_draws
 
-    def drawn(part: _Part, order: Array) -> tuple[NDArray[np.intp], Array]:
-        """Permuted residuals; subjects who lack a quantity are excluded, and all orders
-        remain equally likely.
-        """
-        places = np.argsort(order[:, part.rows], axis=1)
+    def redraw(fit: _Regression, order: Draw) -> tuple[Index, Array]:
+        # subjects who lack a quantity are excluded, and all orders remain equally likely
+        places = np.argsort(order[:, fit.rows], axis=1)
         return places, np.ones(places.shape)
 
-    parts = [
-        replace(part, values=_residual(part.values, part.basis))
-        for part in _parts(values, regressor, covariates)
+    fits = [
+        replace(fit, values=fit.residual())
+        for fit in _regressions(values, regressor, covariates)
     ]
-    return _compared(parts, values.shape, orders, count, drawn)
+    return _max_t_p(fits, values.shape, orders, count, redraw)
 
 
 def sign_flip_p(
-    differences: Array, *, most: int = 10_000, rng: np.random.Generator
+    differences: Array, *, max_draws: int = 10_000, rng: np.random.Generator
 ) -> tuple[Array, Array, int]:
     """P values of means of paired differences (n, q), by changing the signs of
     subjects; see `permutation_p`.
     """
     n = len(differences)
-    parts = [
-        _Part(
-            rows,
-            columns,
-            np.ones(rows.sum()),
-            np.empty((rows.sum(), 0)),
-            differences[np.ix_(rows, columns)],
-        )
-        for rows, columns in missing_patterns(differences)
-        if rows.sum() >= 2
-    ]
-    if not parts:
+    fits = []
+    for rows, columns in missing_patterns(differences):
+        if (size := int(rows.sum())) >= 2:
+            block = differences[np.ix_(rows, columns)]
+            fits.append(
+                _Regression(rows, columns, np.ones(size), np.empty((size, 0)), block)
+            )
+    if not fits:
         raise ValueError("paired differences need at least two subjects")
-    if 2.0**n <= most:
-        signs = (
-            np.array(one) for one in islice(product((1.0, -1.0), repeat=n), 1, None)
-        )
+    signs: Iterator[Draw]
+    if 2.0**n <= max_draws:
+        signs = map(np.array, islice(product((1.0, -1.0), repeat=n), 1, None))
         count = 2**n - 1
     else:
-        signs = (rng.choice((1.0, -1.0), n) for _ in range(most))
-        count = most
+        signs = (rng.choice((1.0, -1.0), n) for _ in range(max_draws))
+        count = max_draws
 
-    def drawn(part: _Part, sign: Array) -> tuple[NDArray[np.intp], Array]:
-        own = sign[:, part.rows]
-        return np.tile(np.arange(own.shape[1]), (len(own), 1)), own
+    def redraw(fit: _Regression, sign: Draw) -> tuple[Index, Array]:
+        sign = sign[:, fit.rows]
+        return np.tile(np.arange(sign.shape[1]), (len(sign), 1)), sign
 
-    return _compared(parts, differences.shape, signs, count, drawn)
-
-
-def benjamini_hochberg(p: Array) -> Array:
-    """P values adjusted to control the false discovery rate (Benjamini and Hochberg 1995)."""
-    p = np.asarray(p, np.float64)
-    order = np.argsort(p)
-    raised = p[order] * len(p) / np.arange(1, len(p) + 1)
-    adjusted = np.empty_like(p)
-    adjusted[order] = np.minimum(np.minimum.accumulate(raised[::-1])[::-1], 1.0)
-    return adjusted
+    return _max_t_p(fits, differences.shape, signs, count, redraw)
 
 
-def detectable_difference(
-    error: Array, free: Array | float, *, level: float = 0.05, power: float = 0.8
-) -> Array:
-    """Smallest effect that a test at this level detects with this power, given the
-    standard error of its estimate.
+def missing_patterns(values: Array) -> Iterator[tuple[Mask, Index]]:
+    """Masks of subjects (n,), each with the indices of the quantities that exactly
+    these subjects have.
     """
-    return np.asarray(
-        error * (stats.t.ppf(1 - level / 2, free) + stats.t.ppf(power, free))
+    finite = np.isfinite(values)
+    patterns, pattern = np.unique(
+        np.packbits(finite, axis=0), axis=1, return_inverse=True
     )
+    order = np.argsort(pattern.ravel(), kind="stable")
+    count = np.bincount(pattern.ravel(), minlength=patterns.shape[1])
+    for columns in np.split(order, np.cumsum(count)[:-1]):
+        rows = finite[:, columns[0]]
+        if rows.any():
+            yield rows, columns
 
 
-def variance_components(
-    values: Array, subject: NDArray[Any]
-) -> tuple[float, float, float]:
-    """Mean, variance between subjects and variance of repeats of one subject, by
-    restricted maximum likelihood.
-
-    Parameters
-    ----------
-    values
-        (n,) finite.
-    subject
-        (n,) subject of each value; at least two subjects, one of them with two values.
-    """
-    _, which, count = np.unique(subject, return_inverse=True, return_counts=True)
-    n = len(values)
-    people = len(count)
-    if people < 2 or n == people:
-        raise ValueError(
-            "variance components must come from two subjects or more, one of them with two values"
-        )
-    if np.ptp(values) <= ROUNDING * np.abs(values).max():
-        return float(values.mean()), 0.0, 0.0
-    mean = np.bincount(which, values) / count
-    within = float(((values - mean[which]) ** 2).sum())
-
-    def profile(log_ratio: float) -> tuple[float, float, float]:
-        """-2 log restricted likelihood, mean, and variance of repeats, for a ratio of
-        the two variances.
-        """
-        share = count / (1 + count * np.exp(log_ratio))
-        centre = float(share @ mean / share.sum())
-        square = within + float(share @ (mean - centre) ** 2)
-        repeat = square / (n - 1)
-        if repeat <= 0:
-            return -np.inf, centre, 0.0
-        logs = float(np.log1p(count * np.exp(log_ratio)).sum() + np.log(share.sum()))
-        return (n - 1) * float(np.log(repeat)) + logs, centre, repeat
-
-    grid = np.linspace(-12, 12, 49)  # the likelihood may have two maxima
-    start = grid[int(np.argmin([profile(one)[0] for one in grid]))]
-    best = optimize.minimize_scalar(
-        lambda one: profile(one)[0], bounds=(start - 0.5, start + 0.5), method="bounded"
-    )
-    at = (
-        float(best.x)
-        if start > grid[0] and profile(float(best.x))[0] < profile(-40.0)[0]
-        else -np.inf
-    )
-    _, centre, repeat = profile(at)
-    return centre, float(np.exp(at)) * repeat, repeat
-
-
-def _split(regressor: Array, covariates: Array | None) -> tuple[Array, Array]:
-    """Residual of the regressor after regression on the covariates, and an orthonormal
-    basis of 1 and covariates.
-    """
+def _regressions(
+    values: Array, regressor: Array, covariates: Array | None
+) -> list[_Regression]:
+    """Quantities grouped by the subjects who have them, if their effect can be estimated."""
+    fits = []
+    fault = ValueError("no subject has any of the quantities")
     x = np.asarray(regressor, np.float64)
-    columns = (
-        [np.ones(len(x))]
-        if covariates is None
-        else [np.ones(len(x)), *np.asarray(covariates, np.float64).T]
-    )
-    u, s, _ = np.linalg.svd(
-        np.stack([one / (np.linalg.norm(one) or 1.0) for one in columns], axis=1),
-        full_matrices=False,
-    )
+    design = np.ones((len(x), 1))
+    if covariates is not None:
+        design = np.column_stack([design, np.asarray(covariates, np.float64)])
+    for rows, columns in missing_patterns(values):
+        try:
+            adjusted, basis = _adjusted(x[rows], design[rows])
+            fit = _Regression(
+                rows, columns, adjusted, basis, values[np.ix_(rows, columns)]
+            )
+            _require_several(fit)
+        except ValueError as error:
+            fault = error
+            continue
+        fits.append(fit)
+    if not fits:
+        raise fault
+    return fits
+
+
+def _adjusted(x: Array, design: Array) -> tuple[Array, Array]:
+    """Residual (n,) of a regressor after regression on the design (n, c), and an
+    orthonormal basis of the design.
+    """
+    columns = [column / (np.linalg.norm(column) or 1.0) for column in design.T]
+    u, s, _ = np.linalg.svd(np.stack(columns, axis=1), full_matrices=False)
     basis = u[:, s > 1e-10 * s[0]]
-    own = x - basis @ (basis.T @ x)
+    residual = x - basis @ (basis.T @ x)
     if len(x) - basis.shape[1] < 3:
         raise ValueError(
             f"{len(x)} subjects are too few to estimate {basis.shape[1] + 1} "
             "coefficients and their errors"
         )
-    if own @ own <= 1e-12 * max(float(x @ x), np.finfo(np.float64).tiny):
+    if residual @ residual <= 1e-12 * max(float(x @ x), np.finfo(np.float64).tiny):
         raise ValueError(
             "the regressor is the same for all subjects, or a combination of the covariates"
         )
-    return own, basis
+    return residual, basis
 
 
-def _residual(values: Array, basis: Array) -> Array:
-    """Residuals of values (n, q) after projection on the basis; 0 where only rounding remains."""
-    y = values - basis @ (basis.T @ values)
-    return np.where(
-        np.abs(y).max(axis=0) > ROUNDING * np.abs(values).max(axis=0), y, 0.0
-    )
-
-
-def _statistics(values: Array, own: Array, basis: Array) -> Array:
-    """Slope over its HC3 error (b, q) of values (b, n, q), after removal of their
-    projection on the basis.
-    """
-    y = values - basis @ (basis.T @ values)
-    slope = own @ y / float(own @ own)
-    residual = y - own[:, None] * slope[:, None]
-    error = np.sqrt(
-        np.einsum("i,biq,biq->bq", _error_weight(own, basis), residual, residual)
-    )
-    return _ratio(slope, error)
-
-
-def _redrawn(part: _Part, places: NDArray[np.intp], signs: Array) -> Array:
-    """Result (b, q) of `_statistics` for values that are permuted and multiplied by signs.
-
-    Sums over subjects are products of matrices. For many quantities, the factors are
-    permuted b times instead of the values. Statistics whose residuals are mostly
-    rounding are computed again from the permuted values.
-    """
-    if len(part.columns) < MANY:
-        return _statistics(part.values[places] * signs[..., None], part.own, part.basis)
-    weight = _error_weight(part.own, part.basis)
-    # orthogonal columns, all but the last of unit length
-    design = np.column_stack([part.basis, part.own])
-    square = float(part.own @ part.own)
-    factors = np.concatenate([design, weight[:, None] * design], axis=1)
-    back = np.argsort(places, axis=1)
-    moved = factors[back] * np.take_along_axis(signs, back, axis=1)[..., None]
-    b, n, c = moved.shape
-    sums = (np.moveaxis(moved, 2, 1).reshape(b * c, n) @ part.values).reshape(b, c, -1)
-    along = sums[:, : c // 2]
-    weighted = sums[:, c // 2 :]
-    along[:, -1] /= square
-    whole = weight[back] @ part.values**2
-    cross = np.einsum("bcq,bcq->bq", along, weighted)
-    again = np.einsum(
-        "bcq,cd,bdq->bq",
-        along,
-        design.T @ (weight[:, None] * design),
-        along,
-        optimize=True,
-    )
-    squares = whole - 2 * cross + again
-    found = _ratio(along[:, -1], np.sqrt(np.maximum(squares, 0.0)))
-    for draw, column in np.argwhere(squares <= CANCELLED * whole):
-        values = (part.values[places[draw], column] * signs[draw])[None, :, None]
-        found[draw, column] = _statistics(values, part.own, part.basis)[0, 0]
-    return found
-
-
-def _error_weight(own: Array, basis: Array) -> Array:
-    """Weights (n,) of the squared residuals in the squared HC3 error of the slope."""
-    square = float(own @ own)
-    leverage = (basis**2).sum(axis=1) + own**2 / square
-    return np.asarray((own / square / np.maximum(1 - leverage, 1e-12)) ** 2)
-
-
-def _require_several(own: Array, basis: Array) -> None:
+def _require_several(fit: _Regression) -> None:
     """Refuse a slope that one subject determines alone: its error is unknown, and
     permutations are not comparable.
     """
-    leverage = (basis**2).sum(axis=1) + own**2 / float(own @ own)
-    decides = np.abs(own) > 1e-6 * np.linalg.norm(own)
-    if (decides & (leverage > 1 - 1e-9)).any():
+    length = np.linalg.norm(fit.regressor)
+    decides = np.abs(fit.regressor) > 1e-6 * length
+    if (decides & (fit.leverage > 1 - 1e-9)).any():
         raise ValueError(
             "each group must have two subjects: the effect depends on one subject and has no error"
         )
 
 
-def _parts(values: Array, regressor: Array, covariates: Array | None) -> list[_Part]:
-    """Quantities grouped by the subjects who have them, if their effect can be estimated."""
-    parts = []
-    why = ValueError("no subject has any of the quantities")
-    x = np.asarray(regressor, np.float64)
-    for rows, columns in missing_patterns(values):
-        try:
-            own, basis = _split(
-                x[rows], None if covariates is None else np.asarray(covariates)[rows]
-            )
-            _require_several(own, basis)
-        except ValueError as error:
-            why = error
-            continue
-        parts.append(_Part(rows, columns, own, basis, values[np.ix_(rows, columns)]))
-    if not parts:
-        raise why
-    return parts
+def _batches(draws: Iterator[Draw], entries: int) -> Iterator[Draw]:
+    """Draws of `entries` values, stacked along a first axis in batches of about BATCH values."""
+    while batch := list(islice(draws, max(1, BATCH // max(entries, 1)))):
+        yield np.stack(batch)
 
 
-def missing_patterns(values: Array) -> Iterator[tuple[Mask, NDArray[np.intp]]]:
-    """Masks of subjects (n,), each with the indices of the quantities that exactly
-    these subjects have.
-    """
-    known = np.isfinite(values)
-    kinds, which = np.unique(np.packbits(known, axis=0), axis=1, return_inverse=True)
-    order = np.argsort(which.ravel(), kind="stable")
-    for columns in np.split(
-        order, np.cumsum(np.bincount(which.ravel(), minlength=kinds.shape[1]))[:-1]
-    ):
-        rows = known[:, columns[0]]
-        if rows.any():
-            yield rows, columns
-
-
-def _compared(
-    parts: Sequence[_Part],
+def _max_t_p(
+    fits: Sequence[_Regression],
     shape: tuple[int, ...],
-    draws: Iterator[Array],
+    draws: Iterator[Draw],
     count: int,
-    drawn: Callable[[_Part, Array], tuple[NDArray[np.intp], Array]],
+    redraw: Redraw,
 ) -> tuple[Array, Array, int]:
     """P values of the observed statistics, each alone and against the largest statistic
-    of all parts.
-
-    For b draws, which are common to all parts, `drawn` returns the indices (b, rows) of
-    the permuted values of a part and their signs (b, rows).
+    of all quantities; the draws are common to all fits.
     """
     observed = np.full(shape[1], np.nan)
-    for part in parts:
-        observed[part.columns] = np.abs(
-            _statistics(_residual(part.values, part.basis)[None], part.own, part.basis)[
-                0
-            ]
-        )
-    # tolerance for the same value summed in another order
-    reached = observed * (1 - 1e-9)
+    for fit in fits:
+        observed[fit.columns] = np.abs(fit.statistics(fit.residual()[None])[0])
+    threshold = observed * REACHED
     alone = np.zeros(shape[1])
-    largest = np.zeros(shape[1])
+    family = np.zeros(shape[1])
     entries = shape[1] * (shape[0] if shape[1] < MANY else SUMS)
-    while batch := list(islice(draws, max(1, BATCH // max(entries, 1)))):
-        most = np.zeros(len(batch))
-        for part in parts:
-            found = np.abs(_redrawn(part, *drawn(part, np.stack(batch))))
-            alone[part.columns] += (found >= reached[part.columns]).sum(axis=0)
-            most = np.maximum(most, found.max(axis=1))
-        largest += (most[:, None] >= reached).sum(axis=0)
-    told = np.isfinite(observed)
-    p, adjusted = (
-        np.where(told, (one + 1) / (count + 1), np.nan) for one in (alone, largest)
-    )
+    for batch in _batches(draws, entries):
+        largest = np.zeros(len(batch))
+        for fit in fits:
+            statistics = np.abs(fit.permuted_statistics(*redraw(fit, batch)))
+            alone[fit.columns] += (statistics >= threshold[fit.columns]).sum(axis=0)
+            largest = np.maximum(largest, statistics.max(axis=1))
+        family += (largest[:, None] >= threshold).sum(axis=0)
+    exceeding = np.where(np.isfinite(observed), [alone, family], np.nan)
+    p, adjusted = (exceeding + 1) / (count + 1)
     return p, adjusted, count
+
+
+def between_groups_p(
+    values: Array, group: Index, *, max_draws: int, rng: np.random.Generator
+) -> tuple[Array, Array, int]:
+    """Statistics and p values of all pairs of groups of different subjects, by
+    permutation of the subjects.
+
+    Parameters
+    ----------
+    values
+        (n, k) one vector per subject, in coordinates in which distances are Euclidean.
+    group
+        (n,) group of each subject, counted from 0; each group must have at least two subjects.
+    max_draws
+        Maximum number of permutations; all distinct ones are used if there are fewer.
+    rng
+        Random generator for the permutations.
+
+    Returns
+    -------
+    statistic, p, count
+        Statistics (pairs,) in the order of ``itertools.combinations``; p values
+        (pairs,) adjusted by the largest statistic of all pairs; the number of
+        permutations. The smallest p is 1 / (count + 1).
+    """
+    sizes = np.bincount(group)
+    count = factorial(len(group)) // prod(map(factorial, sizes.tolist())) - 1
+    # all draws label the values in this order, in which the groups follow each other
+    observed = np.repeat(np.arange(len(sizes)), sizes)
+    draws: Iterator[Draw]
+    if count <= max_draws:
+        draws = islice(_arrangements(sizes.tolist()), 1, None)
+    else:
+        draws = (rng.permutation(observed) for _ in range(max_draws))
+        count = max_draws
+    # sorted by group, so that the order of the subjects does not change the bits of the result
+    y = values[np.argsort(group, kind="stable")]
+    y = y - y.mean(axis=0)
+    y = np.where(np.abs(y) > ROUNDING * np.abs(values).max(), y, 0.0)
+    statistic = _between(y, observed[None], sizes)[0]
+    batches = _batches(draws, len(y) * len(sizes))
+    drawn = (_between(y, labels, sizes) for labels in batches)
+    return statistic, _largest_p(statistic, drawn, count), count
+
+
+def within_subjects_p(
+    values: Array, *, max_draws: int, rng: np.random.Generator
+) -> tuple[Array, Array, int]:
+    """Statistics and p values of all pairs of conditions of the same subjects, by
+    permutation within subjects.
+
+    Parameters
+    ----------
+    values
+        (n, groups, k), NaN where a subject lacks a condition; each pair must have at
+        least two subjects with both.
+    max_draws, rng
+        See `between_groups_p`. With two conditions, a permutation changes the signs of
+        the subjects' differences.
+
+    Returns
+    -------
+    statistic, p, count
+        See `between_groups_p`.
+    """
+    orders = [_orders(row) for row in np.asarray(np.isfinite(values).all(axis=2))]
+    lengths = [len(order) for order in orders]
+    count = prod(lengths) - 1
+    choices: Iterator[Draw]
+    if count <= max_draws:
+        choices = map(np.array, islice(product(*map(range, lengths)), 1, None))
+    else:
+        choices = (rng.integers(lengths) for _ in range(max_draws))
+        count = max_draws
+    rows = np.arange(len(values))[:, None]
+
+    def permuted(choice: Index) -> Array:
+        order = [orders[i][choice[:, i]] for i in range(len(orders))]
+        return _within(values[rows, np.stack(order, axis=1)])
+
+    statistic = _within(values[None])[0]
+    drawn = map(permuted, _batches(choices, values.size))
+    return statistic, _largest_p(statistic, drawn, count), count
+
+
+def _largest_p(statistic: Array, drawn: Iterator[Array], count: int) -> Array:
+    """P values (pairs,) against the largest statistic of each of `count` draws (b, pairs)."""
+    exceeding = np.zeros(len(statistic))
+    for statistics in drawn:
+        largest = statistics.max(axis=1)
+        exceeding += (largest[:, None] >= REACHED * statistic).sum(axis=0)
+    return (exceeding + 1) / (count + 1)
+
+
+def classical_scaling(distance: Array, axes: int = 2) -> tuple[Array, Array, float]:
+    """Points whose distances approximate those of a matrix: principal coordinates
+    (Torgerson 1952, Gower 1966).
+
+    Parameters
+    ----------
+    distance
+        (n, n) symmetric.
+    axes
+        Number of dimensions of the map.
+
+    Returns
+    -------
+    place, explained, error
+        Centred points (n, axes), with the largest entry of each axis positive; fraction
+        of the scatter along each axis (axes,); RMS difference between distances in the
+        map and those of the matrix, over the RMS distance.
+    """
+    n = len(distance)
+    centre = np.eye(n) - 1 / n
+    gram = -0.5 * centre @ distance**2 @ centre
+    variance, vectors = np.linalg.eigh((gram + gram.T) / 2)
+    variance = np.maximum(variance[::-1], 0.0)
+    total = variance.sum() or 1.0
+    variance = variance[:axes]
+    scale = np.sqrt(np.where(variance > ROUNDING * total, variance, 0.0))
+    place = vectors[:, ::-1][:, :axes] * scale
+    largest = place[np.abs(place).argmax(axis=0), np.arange(place.shape[1])]
+    place = place * np.where(largest < 0, -1.0, 1.0)
+    place = np.pad(place, ((0, 0), (0, axes - place.shape[1])))
+    explained = np.pad(variance, (0, axes - len(variance))) / total
+    mapped = np.linalg.norm(place[:, None] - place[None], axis=-1)
+    square = ((mapped - distance) ** 2).sum() / ((distance**2).sum() or 1.0)
+    return place, explained, float(np.sqrt(square))
+
+
+def _between(values: Array, group: Index, sizes: Index) -> Array:
+    """Statistics (b, pairs) of centred values (n, k) for labels (b, n)."""
+    square = (values**2).sum(axis=1)
+    means = []
+    errors = []
+    for g, size in enumerate(sizes.tolist()):
+        member = (group == g).astype(np.float64)
+        mean = member @ values / size
+        scatter = member @ square - size * (mean**2).sum(axis=1)
+        scatter = np.maximum(scatter, 0.0) / (size - 1)
+        means.append(mean)
+        errors.append(np.where(scatter > ROUNDING * square.max(), scatter, 0.0) / size)
+    pairs = combinations(range(len(sizes)), 2)
+    statistics = [
+        _distance_ratio(means[a] - means[b], errors[a] + errors[b]) for a, b in pairs
+    ]
+    return np.stack(statistics, axis=1)
+
+
+def _within(values: Array) -> Array:
+    """Statistics (b, pairs) of values (b, n, groups, k), from the subjects who have
+    both conditions of a pair.
+    """
+    statistics = []
+    for a, b in combinations(range(values.shape[2]), 2):
+        difference = values[:, :, a] - values[:, :, b]
+        # the same subjects in all permutations
+        difference = difference[:, np.isfinite(difference[0]).all(axis=1)]
+        n = difference.shape[1]
+        mean = difference.mean(axis=1)
+        scatter = ((difference - mean[:, None]) ** 2).sum(axis=(1, 2)) / (n - 1)
+        largest = (difference**2).sum(axis=2).max(axis=1)
+        scatter = np.where(scatter > ROUNDING * largest, scatter, 0.0)
+        statistics.append(_distance_ratio(mean, scatter / n))
+    return np.stack(statistics, axis=1)
+
+
+def _distance_ratio(step: Array, error: Array) -> Array:
+    """Squared lengths of steps (b, k) over squared errors (b,); infinite if the error
+    is zero, 0 for a zero step.
+    """
+    square = (step**2).sum(axis=1)
+    exact = np.where(square > 0, np.inf, 0.0)
+    return np.divide(square, error, out=exact, where=error > 0)
+
+
+def _arrangements(sizes: Sequence[int]) -> Iterator[Index]:
+    """Every distinct order of labels, by the number of labels of each group; the first
+    is sorted.
+    """
+
+    def arranged(labels: Index, free: Index, g: int) -> Iterator[Index]:
+        if g == len(sizes) - 1:
+            labels[free] = g
+            yield labels.copy()
+            return
+        for places in combinations(free.tolist(), sizes[g]):
+            following = labels.copy()
+            following[list(places)] = g
+            yield from arranged(following, np.setdiff1d(free, places), g + 1)
+
+    n = sum(sizes)
+    yield from arranged(np.zeros(n, np.intp), np.arange(n), 0)
+
+
+def _orders(present: Mask) -> Index:
+    """Permutations (orders, groups) of the conditions that a subject has; the first is
+    the identity.
+    """
+    columns = np.flatnonzero(present)
+    orders = list(permutations(columns.tolist()))
+    out = np.tile(np.arange(len(present)), (len(orders), 1))
+    out[:, columns] = orders
+    return out

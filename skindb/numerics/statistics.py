@@ -1,20 +1,26 @@
-"""Mergeable moments and intervals for population statistics (Chan et al. 1979)."""
+"""Statistics of populations: mergeable moments, intervals, false discoveries, power, and
+variance components; the unit of observation is a subject.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from scipy import stats
+from numpy.typing import NDArray
+from scipy import optimize, stats
 
 from skindb.types import Array
+
+ROUNDING = 1e-13  # relative to the largest value
 
 
 @dataclass(frozen=True)
 class Moments:
     """Count, mean and centred second moment along the first axis; moments of parts of a
-    population can be added.
+    population can be added (Chan et al. 1979).
     """
 
     count: Array
@@ -30,18 +36,18 @@ class Moments:
     def of(cls, values: Array) -> Moments:
         """Moments over the first axis; NaN counts as missing."""
         values = np.asarray(values, np.float64)
-        known = np.isfinite(values)
-        count = known.sum(axis=0).astype(np.float64)
-        mean = np.where(known, values, 0.0).sum(axis=0) / np.maximum(count, 1.0)
-        second = (np.where(known, values - mean, 0.0) ** 2).sum(axis=0)
+        finite = np.isfinite(values)
+        count = finite.sum(axis=0).astype(np.float64)
+        mean = np.where(finite, values, 0.0).sum(axis=0) / np.maximum(count, 1.0)
+        second = (np.where(finite, values - mean, 0.0) ** 2).sum(axis=0)
         return cls(count, mean, second)
 
     def __add__(self, other: Moments) -> Moments:
         count = self.count + other.count
-        share = other.count / np.maximum(count, 1.0)
+        fraction = other.count / np.maximum(count, 1.0)
         step = other.mean - self.mean
-        second = self.second + other.second + step**2 * self.count * share
-        return Moments(count, self.mean + step * share, second)
+        second = self.second + other.second + step**2 * self.count * fraction
+        return Moments(count, self.mean + step * fraction, second)
 
     @property
     def variance(self) -> Array:
@@ -65,11 +71,11 @@ class Moments:
         """Chi-square interval of the standard deviation of normal values; NaN for fewer
         than two values.
         """
-        free = np.maximum(self.count - 1.0, 1.0)
-        low = stats.chi2.ppf((1 + level) / 2, free)
-        high = stats.chi2.ppf((1 - level) / 2, free)
+        freedom = np.maximum(self.count - 1.0, 1.0)
         second = np.where(self.count > 1, self.second, np.nan)
-        return np.sqrt(second / low), np.sqrt(second / high)
+        low = np.sqrt(second / stats.chi2.ppf((1 + level) / 2, freedom))
+        high = np.sqrt(second / stats.chi2.ppf((1 - level) / 2, freedom))
+        return low, high
 
 
 def bootstrap_interval(
@@ -86,15 +92,85 @@ def bootstrap_interval(
     n = len(values)
     if n == 0:
         raise ValueError("values must have at least one row for a bootstrap")
-    results = np.stack(
-        [statistic(values[rng.integers(n, size=n)]) for _ in range(draws)]
-    )
+    results = [statistic(values[rng.integers(n, size=n)]) for _ in range(draws)]
     low, high = np.quantile(results, [(1 - level) / 2, (1 + level) / 2], axis=0)
     return low, high
 
 
 def known_mean(values: Array) -> Array:
     """Mean of the finite values over the first axis; NaN where there are none."""
-    known = np.isfinite(values)
-    total = np.where(known, values, 0.0).sum(axis=0)
-    return np.where(known.any(axis=0), total / np.maximum(known.sum(axis=0), 1), np.nan)
+    finite = np.isfinite(values)
+    count = finite.sum(axis=0)
+    total = np.where(finite, values, 0.0).sum(axis=0)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def benjamini_hochberg(p: Array) -> Array:
+    """P values adjusted to control the false discovery rate (Benjamini and Hochberg 1995)."""
+    p = np.asarray(p, np.float64)
+    order = np.argsort(p)
+    raised = p[order] * len(p) / np.arange(1, len(p) + 1)
+    adjusted = np.empty_like(p)
+    adjusted[order] = np.minimum(np.minimum.accumulate(raised[::-1])[::-1], 1.0)
+    return adjusted
+
+
+def detectable_difference(
+    error: Array, free: Array | float, *, level: float = 0.05, power: float = 0.8
+) -> Array:
+    """Smallest effect that a test at this level detects with this power, from the
+    standard error of its estimate and its degrees of freedom.
+    """
+    quantiles = stats.t.ppf(1 - level / 2, free) + stats.t.ppf(power, free)
+    return np.asarray(error * quantiles)
+
+
+def variance_components(
+    values: Array, subject: NDArray[Any]
+) -> tuple[float, float, float]:
+    """Mean, variance between subjects and variance of repeats of one subject, by
+    restricted maximum likelihood.
+
+    Parameters
+    ----------
+    values
+        (n,) finite.
+    subject
+        (n,) subject of each value; at least two subjects, one of them with two values.
+    """
+    _, member, count = np.unique(subject, return_inverse=True, return_counts=True)
+    n = len(values)
+    if len(count) < 2 or n == len(count):
+        raise ValueError(
+            "variance components must come from two subjects or more, one of them with two values"
+        )
+    if np.ptp(values) <= ROUNDING * np.abs(values).max():
+        return float(values.mean()), 0.0, 0.0
+    mean = np.bincount(member, values) / count
+    within = float(((values - mean[member]) ** 2).sum())
+
+    def profile(log_ratio: float) -> tuple[float, float, float]:
+        """-2 log restricted likelihood, mean, and variance of repeats, for a ratio of
+        the two variances.
+        """
+        weight = count / (1 + count * np.exp(log_ratio))
+        centre = float(weight @ mean / weight.sum())
+        repeat = (within + float(weight @ (mean - centre) ** 2)) / (n - 1)
+        if repeat <= 0:
+            return -np.inf, centre, 0.0
+        logs = np.log1p(count * np.exp(log_ratio)).sum() + np.log(weight.sum())
+        return (n - 1) * float(np.log(repeat)) + float(logs), centre, repeat
+
+    grid = np.linspace(-12, 12, 49)  # the likelihood may have two maxima
+    start = grid[int(np.argmin([profile(log_ratio)[0] for log_ratio in grid]))]
+    log_ratio = float(
+        optimize.minimize_scalar(
+            lambda log_ratio: profile(log_ratio)[0],
+            bounds=(start - 0.5, start + 0.5),
+            method="bounded",
+        ).x
+    )
+    if start == grid[0] or profile(log_ratio)[0] >= profile(-40.0)[0]:
+        log_ratio = -np.inf  # no variance between subjects
+    _, centre, repeat = profile(log_ratio)
+    return centre, float(np.exp(log_ratio)) * repeat, repeat

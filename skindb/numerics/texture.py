@@ -1,5 +1,10 @@
-"""Texture statistics of regions from steerable pyramids, and synthesis of matching
-images (Heeger and Bergen 1995).
+"""Texture: steerable pyramids, statistics of their parts in regions, and synthesis of
+matching images (Heeger and Bergen 1995).
+
+Pyramids are computed in the Fourier domain (Simoncelli and Freeman 1995; Portilla and
+Simoncelli 2000). All masks are functions of the frequency in the whole image, so that
+images may have any size and aspect ratio. Transforms use the number of threads set by
+`scipy.fft.set_workers`, one by default.
 
 The parts of an image are the image itself and those of its pyramid: 31 with 7 levels of
 4 orientations. The distribution of a part is stored as a quantile function, so that
@@ -9,16 +14,20 @@ monotone.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
+from math import factorial, pi, sqrt
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import fftfreq, irfft2, rfft2, rfftfreq
 from scipy.ndimage import uniform_filter
 from scipy.optimize import isotonic_regression
 
-from skindb.numerics.pyramid import Image, build, reconstruct
-
+Image = NDArray[np.floating[Any]]
+Spectrum = NDArray[np.complexfloating[Any, Any]]
 LEVELS = 7
 ORIENTATIONS = 4
 QUANTILES = 256  # entries of a quantile function
@@ -27,6 +36,192 @@ MAX_SORTED = 1 << 17
 # standard deviation of the noise added before matching, relative to that of the
 # requested change
 NOISE = 0.05
+
+
+@dataclass(frozen=True)
+class Pyramid:
+    """High-pass residual, oriented bands of every level, and low-pass residual, from
+    which the image can be rebuilt.
+    """
+
+    high: Image  # (h, w)
+    # one (orientations, h_k, w_k) per level, each level half as large as the previous
+    # one
+    bands: list[Image]
+    low: Image  # (h_n, w_n)
+
+    def parts(self) -> list[Image]:
+        """High-pass residual, every band, low-pass residual: 2 + levels x orientations images."""
+        return [self.high, *(band for level in self.bands for band in level), self.low]
+
+    def with_parts(self, parts: list[Image]) -> Pyramid:
+        """A pyramid of this layout with other images, in the order of `parts`."""
+        ends = np.cumsum([1, *(len(level) for level in self.bands)]).tolist()
+        bands = [np.stack(parts[start:end]) for start, end in pairwise(ends)]
+        return Pyramid(parts[0], bands, parts[-1])
+
+
+def build(
+    image: Image, levels: int = LEVELS, orientations: int = ORIENTATIONS
+) -> Pyramid:
+    """Decompose an image, which is extended periodically.
+
+    Parameters
+    ----------
+    image
+        (h, w), computed in single precision if it is float32, and otherwise in double precision.
+    levels
+        Number of octaves; each halves both sides, rounded up, at most until the
+        low-pass residual has one entry.
+    orientations
+        Number of bands per level; the first responds to changes along w, the others
+        follow in steps of pi / orientations.
+
+    Returns
+    -------
+    Pyramid
+        `reconstruct` returns the image to within 1e-12 of its range in double
+        precision, 1e-6 in single precision.
+
+    Raises
+    ------
+    ValueError
+        If the image is not two-dimensional and finite, or too small for this number of levels.
+    """
+    image = np.asarray(image)
+    image = image if image.dtype == np.float32 else image.astype(np.float64)
+    if image.ndim != 2 or not image.size or not np.isfinite(image).all():
+        raise ValueError(
+            f"an image must have two dimensions and finite values, not the shape {image.shape}"
+        )
+    if orientations < 1 or levels < 0 or 2**levels > max(image.shape):
+        limit = max(image.shape).bit_length() - 1
+        raise ValueError(
+            f"an image {image.shape} must have 0 to {limit} levels of 1 or more "
+            f"bands, not {levels} of {orientations}"
+        )
+    spectrum = _transform(image)
+    whole = image.shape
+    kind = image.dtype.type
+    low, high = _low(whole, whole, 0, kind)
+    residual = _image(spectrum * high, whole)
+    bands = []
+    spectrum *= low
+    size = whole
+    for level in range(levels):
+        low, high = _low(size, whole, level + 1, kind)
+        ring = spectrum * high * _phase(orientations, kind)
+        masks = _angular(size, whole, orientations, kind)
+        bands.append(np.stack([_image(ring * mask, size) for mask in masks]))
+        size = tuple((side + 1) // 2 for side in size)
+        spectrum = _cropped(spectrum * low, size)
+    return Pyramid(residual, bands, _image(spectrum, size))
+
+
+def reconstruct(pyramid: Pyramid) -> Image:
+    """Rebuild the image of a pyramid as the sum of its parts, filtered with the masks
+    of the decomposition.
+    """
+    whole = pyramid.high.shape
+    kind = pyramid.high.dtype.type
+    spectrum = _transform(pyramid.low)
+    for level in reversed(range(len(pyramid.bands))):
+        bands = pyramid.bands[level]
+        size = bands.shape[1:]
+        low, high = _low(size, whole, level + 1, kind)
+        ring = np.zeros(low.shape, spectrum.dtype)
+        masks = _angular(size, whole, len(bands), kind)
+        for band, mask in zip(bands, masks, strict=True):
+            ring += _transform(band) * mask
+        ring *= high * np.conj(_phase(len(bands), kind))
+        spectrum = ring + _widened(spectrum, size) * low
+    low, high = _low(whole, whole, 0, kind)
+    return _image(spectrum * low + _transform(pyramid.high) * high, whole)
+
+
+def _frequencies(
+    size: tuple[int, ...], whole: tuple[int, ...], kind: Any
+) -> tuple[Image, Image]:
+    """Frequencies of the spectrum of a level, in cycles per entry of the whole image,
+    at most 0.5.
+    """
+    rows = fftfreq(size[0], 1 / size[0]) / whole[0]
+    columns = rfftfreq(size[1], 1 / size[1]) / whole[1]
+    return rows[:, None].astype(kind), columns[None].astype(kind)
+
+
+def _low(
+    size: tuple[int, ...], whole: tuple[int, ...], level: int, kind: Any
+) -> tuple[Image, Image]:
+    """Low-pass and high-pass mask, whose squares add up to 1.
+
+    The first is 1 up to half of the highest frequency of a level, 0 above the highest
+    frequency, and a cosine of the logarithm of the frequency in between.
+    """
+    rows, columns = _frequencies(size, whole, kind)
+    square = rows * rows + columns * columns
+    square *= 4.0 ** (level + 1)
+    between = np.flatnonzero((square > 0.25) & (square < 1))
+    low = (square <= 0.25).astype(kind)
+    high = (square >= 1).astype(kind)
+    octave = pi / 4 * np.log2(square.ravel()[between]) + pi / 2
+    low.ravel()[between] = np.cos(octave)
+    high.ravel()[between] = np.sin(octave)
+    return low, high
+
+
+def _angular(
+    size: tuple[int, ...], whole: tuple[int, ...], orientations: int, kind: Any
+) -> Iterator[Image]:
+    """Oriented masks, powers of the cosine of the angle to each direction, whose
+    squares add up to 1.
+    """
+    rows, columns = _frequencies(size, whole, kind)
+    order = orientations - 1
+    scale = 2**order * factorial(order) / sqrt(orientations * factorial(2 * order))
+    inverse = rows * rows + columns * columns
+    inverse.flat[0] = 1  # frequency 0 has no direction; the other masks are 0 there
+    inverse = 1 / np.sqrt(inverse)
+    for angle in pi * np.arange(orientations) / orientations:
+        along = (columns * kind(np.cos(angle)) + rows * kind(np.sin(angle))) * inverse
+        mask = np.full_like(along, scale)
+        for _ in range(order):
+            mask *= along
+        yield mask
+
+
+def _phase(orientations: int, kind: Any) -> Any:
+    """Factor that makes the bands real, because odd powers of the cosine are odd
+    functions of the frequency.
+    """
+    return np.result_type(kind, np.complex64).type((-1j) ** (orientations - 1))
+
+
+def _cropped(spectrum: Spectrum, size: tuple[int, ...]) -> Spectrum:
+    """Crop a spectrum to the frequencies of a smaller image; the mask has set the others to 0."""
+    rows = (size[0] + 1) // 2
+    columns = size[1] // 2 + 1
+    return np.concatenate(
+        [spectrum[:rows, :columns], spectrum[len(spectrum) - size[0] // 2 :, :columns]]
+    )
+
+
+def _widened(spectrum: Spectrum, size: tuple[int, ...]) -> Spectrum:
+    """Pad a spectrum with zeros to that of a larger image."""
+    out = np.zeros((size[0], size[1] // 2 + 1), spectrum.dtype)
+    rows = (len(spectrum) + 1) // 2
+    columns = spectrum.shape[1]
+    out[:rows, :columns] = spectrum[:rows]
+    out[len(out) - len(spectrum) // 2 :, :columns] = spectrum[rows:]
+    return out
+
+
+def _transform(image: Image) -> Spectrum:
+    return np.asarray(rfft2(image, norm="forward"))
+
+
+def _image(spectrum: Spectrum, size: tuple[int, ...]) -> Image:
+    return np.asarray(irfft2(spectrum, s=size, norm="forward"))
 
 
 @dataclass(frozen=True)
@@ -70,26 +265,26 @@ def level_fractions(mask: Image, shapes: Sequence[tuple[int, ...]]) -> list[Imag
         Shapes of the parts; an entry of a smaller image represents a block of entries
         of the whole image.
     """
-    found: dict[tuple[int, ...], Image] = {mask.shape: np.asarray(mask, np.float32)}
-    for shape in dict.fromkeys(shapes):
-        if shape not in found:
-            width = [
-                max(1, round(n / m)) for n, m in zip(mask.shape, shape, strict=True)
-            ]
-            near = uniform_filter(np.asarray(mask, np.float32), width, mode="nearest")
-            at = [
-                np.minimum(np.round(np.arange(m) * n / m), n - 1)
-                for n, m in zip(mask.shape, shape, strict=True)
-            ]
-            found[shape] = near[np.ix_(at[0].astype(int), at[1].astype(int))]
-    return [found[shape] for shape in shapes]
+    mask = np.asarray(mask, np.float32)
+    fractions: dict[tuple[int, ...], Image] = {mask.shape: mask}
+    for shape in shapes:
+        if shape not in fractions:
+            sides = list(zip(mask.shape, shape, strict=True))
+            width = [max(1, round(n / m)) for n, m in sides]
+            near = uniform_filter(mask, width, mode="nearest")
+            rows, columns = (
+                np.minimum(np.round(np.arange(m) * n / m), n - 1).astype(int)
+                for n, m in sides
+            )
+            fractions[shape] = near[np.ix_(rows, columns)]
+    return [fractions[shape] for shape in shapes]
 
 
-def members(share: Image) -> NDArray[np.bool_]:
+def members(fraction: Image) -> NDArray[np.bool_]:
     """Mask of entries whose fraction of a region exceeds half of the largest, since
     coarse ones may only overlap it.
     """
-    return share > 0.5 * float(share.max(initial=0.0))
+    return fraction > 0.5 * float(fraction.max(initial=0.0))
 
 
 def quantile_levels() -> NDArray[np.float64]:
@@ -109,26 +304,22 @@ def quantile_function(values: Image) -> NDArray[np.float64]:
 
 
 def part_quantiles(
-    parts: Sequence[Image], shares: Sequence[Image]
+    parts: Sequence[Image], fractions: Sequence[Image]
 ) -> NDArray[np.float64]:
     """Quantiles (part, QUANTILES) of the entries of each part that belong to a region;
     see `members`.
     """
-    return np.stack(
-        [
-            quantile_function(part[members(share)])
-            for part, share in zip(parts, shares, strict=True)
-        ]
-    )
+    pairs = zip(parts, fractions, strict=True)
+    return np.stack([quantile_function(part[members(mask)]) for part, mask in pairs])
 
 
 def part_histogram(
-    part: Image, share: Image, edges: NDArray[np.float64]
+    part: Image, fraction: Image, edges: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Fractions (bins,) of the entries of a region in bins of equal width; the
     outermost bins include all beyond.
     """
-    inside = part[members(share)]
+    inside = part[members(fraction)]
     bins = len(edges) - 1
     if not inside.size:
         return np.full(bins, np.nan)
@@ -145,9 +336,8 @@ def valid_quantiles(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """
     flat = values.reshape(-1, values.shape[-1])
     out = np.array(flat, np.float64)
-    for i in np.flatnonzero(
-        np.isfinite(flat).all(axis=1) & (np.diff(flat, axis=1) < 0).any(axis=1)
-    ):
+    decreasing = (np.diff(flat, axis=1) < 0).any(axis=1)
+    for i in np.flatnonzero(np.isfinite(flat).all(axis=1) & decreasing):
         out[i] = isotonic_regression(flat[i]).x
     return out.reshape(values.shape)
 
@@ -195,60 +385,85 @@ def synthesise(
     if not np.nan_to_num(shifts).any():
         return Synthesis(image, (0.0,))
     parts = image_parts(image, levels, orientations)
-    shapes = [part.shape for part in parts]
-    blend = [level_fractions(region, shapes) for region in regions]
-    total = [np.maximum(sum(own), 1e-6) for own in zip(*blend, strict=True)]
-    counted = (
-        blend
-        if measured is None
-        else [level_fractions(own, shapes) for own in measured]
-    )
-    sources = np.stack([part_quantiles(parts, own) for own in counted])
-    targets = valid_quantiles(np.where(np.isfinite(shifts), sources + shifts, sources))
-    weight = np.array([part.size for part in parts], np.float64)
-
-    def distance(now: NDArray[np.float64]) -> float:
-        squares = np.nan_to_num(((now - targets) ** 2).mean(axis=-1))
-        return float(np.sqrt((squares * weight).sum() / (weight.sum() * len(regions))))
-
-    def matched(part: Image, at: int, now: NDArray[np.float64]) -> Image:
-        moved = np.zeros_like(part)
-        for region, own in enumerate(blend):
-            if np.isfinite(targets[region, at]).all():
-                step = targets[region, at] - now[region]
-                inside = own[at] > 0
-                moved[inside] += own[at][inside] * np.interp(
-                    part[inside], _strictly_increasing(now[region]), step
-                )
-        return part + moved / total[at]
-
-    def quantiles_of(part: Image, at: int) -> NDArray[np.float64]:
-        return np.stack([quantile_function(part[members(own[at])]) for own in counted])
-
-    asked = float(np.sqrt(np.mean(np.nan_to_num(shifts[:, 0]) ** 2)))
-    image = image + NOISE * asked * rng.standard_normal(image.shape)
+    matching = _Matching.of(parts, regions, shifts, measured)
+    change = float(np.sqrt(np.mean(np.nan_to_num(shifts[:, 0]) ** 2)))
+    image = image + NOISE * change * rng.standard_normal(image.shape)
     trace = []
     for _ in range(iterations):
-        image = matched(image, 0, quantiles_of(image, 0))
+        image = matching.matched(image, 0, matching.quantiles(image, 0))
         pyramid = build(image, levels, orientations)
-        own = pyramid.parts()
-        now = np.stack(
-            [quantiles_of(part, at) for at, part in enumerate([image, *own])], axis=1
-        )
-        trace.append(distance(now))
-        image = reconstruct(
-            pyramid.with_parts(
-                [matched(p, at + 1, now[:, at + 1]) for at, p in enumerate(own)]
-            )
-        )
-    image = matched(image, 0, quantiles_of(image, 0))
-    last = image_parts(image, levels, orientations)
-    trace.append(
-        distance(
-            np.stack([quantiles_of(part, at) for at, part in enumerate(last)], axis=1)
-        )
-    )
+        parts = pyramid.parts()
+        quantiles = matching.all_quantiles([image, *parts])
+        trace.append(matching.distance(quantiles))
+        parts = [
+            matching.matched(part, k, quantiles[:, k])
+            for k, part in enumerate(parts, start=1)
+        ]
+        image = reconstruct(pyramid.with_parts(parts))
+    image = matching.matched(image, 0, matching.quantiles(image, 0))
+    parts = image_parts(image, levels, orientations)
+    trace.append(matching.distance(matching.all_quantiles(parts)))
     return Synthesis(image, tuple(trace))
+
+
+@dataclass(frozen=True)
+class _Matching:
+    """Regions at the size of every part, and the quantile functions to reach in them."""
+
+    blend: list[list[Image]]  # fraction of each region at the size of each part
+    total: list[Image]  # sum of the fractions over the regions, for each part
+    measured: list[list[Image]]  # fractions of the entries that are measured
+    targets: NDArray[np.float64]  # (region, part, QUANTILES)
+    size: NDArray[np.float64]  # (part,) number of entries
+
+    @classmethod
+    def of(
+        cls,
+        parts: list[Image],
+        regions: Sequence[Image],
+        shifts: NDArray[np.float64],
+        measured: Sequence[Image] | None,
+    ) -> _Matching:
+        shapes = [part.shape for part in parts]
+        blend = [level_fractions(region, shapes) for region in regions]
+        total = [np.maximum(sum(masks), 1e-6) for masks in zip(*blend, strict=True)]
+        counted = blend
+        if measured is not None:
+            counted = [level_fractions(mask, shapes) for mask in measured]
+        sources = np.stack([part_quantiles(parts, masks) for masks in counted])
+        sums = np.where(np.isfinite(shifts), sources + shifts, sources)
+        size = np.array([part.size for part in parts], np.float64)
+        return cls(blend, total, counted, valid_quantiles(sums), size)
+
+    def quantiles(self, part: Image, k: int) -> NDArray[np.float64]:
+        """Quantile functions (region, QUANTILES) of part k."""
+        return np.stack(
+            [quantile_function(part[members(masks[k])]) for masks in self.measured]
+        )
+
+    def all_quantiles(self, parts: list[Image]) -> NDArray[np.float64]:
+        """Quantile functions (region, part, QUANTILES)."""
+        rows = [self.quantiles(part, k) for k, part in enumerate(parts)]
+        return np.stack(rows, axis=1)
+
+    def distance(self, quantiles: NDArray[np.float64]) -> float:
+        """RMS difference from the targets."""
+        squares = np.nan_to_num(((quantiles - self.targets) ** 2).mean(axis=-1))
+        count = self.size.sum() * len(self.blend)
+        return float(np.sqrt((squares * self.size).sum() / count))
+
+    def matched(self, part: Image, k: int, quantiles: NDArray[np.float64]) -> Image:
+        """Part k, whose values are mapped to the targets by their rank in each region."""
+        moved = np.zeros_like(part)
+        for masks, source, target in zip(
+            self.blend, quantiles, self.targets[:, k], strict=True
+        ):
+            if np.isfinite(target).all():
+                inside = masks[k] > 0
+                ranks = _strictly_increasing(source)
+                step = np.interp(part[inside], ranks, target - source)
+                moved[inside] += masks[k][inside] * step
+        return part + moved / self.total[k]
 
 
 def _strictly_increasing(values: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.optimize import nnls
+from sklearn.decomposition import PCA
 
-from skindb.numerics.factorise import Sums, nmf, refine, relative_error
+from skindb.numerics import factorise
+from skindb.numerics.factorise import Sums, nmf, principal_axes, refine, relative_error
 
 
 def _planted(seed: int = 0, n: int = 400, m: int = 12, k: int = 3):
@@ -164,3 +166,38 @@ def test_refine__groups_count_alike():
     )
     np.testing.assert_allclose(once[2], often[2], rtol=1e-9)
     np.testing.assert_allclose(once[0], often[0], atol=1e-9)
+
+
+@pytest.mark.parametrize(("n", "d"), [(40, 7), (9, 200), (2, 3), (60, 60)])
+@pytest.mark.parametrize("block", [factorise.BLOCK, 5])
+def test_principal_axes__are_those_of_scikit_learn(n, d, block, monkeypatch):
+    monkeypatch.setattr(factorise, "BLOCK", block)
+    rng = np.random.default_rng([n, d])
+    x = rng.normal(size=(n, d)) * rng.uniform(0.1, 10, d) + 1e3 * rng.normal(size=d)
+    found = principal_axes(x, 5)
+    oracle = PCA(min(5, n - 1, d), svd_solver="full").fit(x)
+    # inner products square the rounding of means that are 1e3 times the spread
+    np.testing.assert_allclose(found.mean, oracle.mean_, rtol=1e-12)
+    np.testing.assert_allclose(found.variance, oracle.explained_variance_, rtol=1e-9)
+    np.testing.assert_allclose(
+        np.abs((found.axes * oracle.components_).sum(axis=1)), 1.0, atol=1e-9
+    )
+    np.testing.assert_allclose(
+        np.abs(found.score), np.abs(oracle.transform(x)), atol=1e-7
+    )
+    np.testing.assert_allclose(found.total, x.var(axis=0, ddof=1).sum(), rtol=1e-9)
+    left = x - oracle.inverse_transform(oracle.transform(x))
+    np.testing.assert_allclose(
+        found.residual, np.sqrt((left**2).mean(axis=1)), atol=1e-7
+    )
+    assert (
+        found.axes[np.arange(len(found.axes)), np.abs(found.axes).argmax(axis=1)] > 0
+    ).all()
+
+
+def test_principal_axes__of_equal_vectors_has_no_component():
+    found = principal_axes(np.ones((4, 3), np.float32), 5)
+    assert found.axes.shape == (0, 3)
+    assert found.score.shape == (4, 0)
+    assert found.total == 0
+    assert (found.residual == 0).all()

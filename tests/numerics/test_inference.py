@@ -4,21 +4,21 @@ SciPy, and on planted cohorts.
 
 from __future__ import annotations
 
-import warnings
-
 import numpy as np
 import pytest
 from scipy import stats
+from scipy.spatial.distance import pdist, squareform
+from sklearn.decomposition import PCA
 
 from skindb.numerics import inference
 from skindb.numerics.inference import (
-    benjamini_hochberg,
-    detectable_difference,
+    between_groups_p,
+    classical_scaling,
     effects,
     paired_effects,
     permutation_p,
     sign_flip_p,
-    variance_components,
+    within_subjects_p,
 )
 
 
@@ -105,50 +105,6 @@ def test_sign_flip_p__of_all_signs_is_that_of_scipy():
     assert (adjusted >= p).all()
 
 
-def test_benjamini_hochberg__is_that_of_scipy():
-    p = np.random.default_rng(3).random(50) ** 3
-    np.testing.assert_allclose(
-        benjamini_hochberg(p), stats.false_discovery_control(p), rtol=1e-12
-    )
-
-
-def test_detectable_difference__is_found_as_often_as_stated():
-    n = 30
-    trials = 2000
-    rng = np.random.default_rng(11)
-    group = np.arange(n) % 2.0
-    error = np.sqrt(4 / n)  # of a difference of means at unit variance
-    step = float(detectable_difference(error, n - 2))
-    values = rng.normal(size=(n, trials)) + step * group[:, None]
-    statistic = effects(values, group).statistic
-    power = np.mean(np.abs(statistic) > stats.t.ppf(0.975, n - 2))
-    # three standard errors of 2,000 trials, and the t approximation
-    assert power == pytest.approx(0.8, abs=0.04)
-
-
-@pytest.mark.parametrize("repeats", ["balanced", "unbalanced"])
-@pytest.mark.parametrize("between", [0.0, 0.3, 2.0])
-def test_variance_components__are_those_of_statsmodels(statsmodels, repeats, between):
-    rng = np.random.default_rng([int(10 * between), len(repeats)])
-    subject = np.repeat(
-        np.arange(25), 3 if repeats == "balanced" else rng.integers(1, 5, 25)
-    )
-    values = (
-        5
-        + rng.normal(0, np.sqrt(between), 25)[subject]
-        + rng.normal(0, 1, len(subject))
-    )
-    mean, people, repeat = variance_components(values, subject)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # for no variance between subjects
-        oracle = statsmodels.MixedLM(values, np.ones(len(values)), subject).fit(
-            reml=True
-        )
-    np.testing.assert_allclose(mean, oracle.fe_params[0], rtol=1e-4)
-    np.testing.assert_allclose(repeat, oracle.scale, rtol=2e-3)
-    np.testing.assert_allclose(people, float(oracle.cov_re[0, 0]), rtol=1e-2, atol=5e-3)
-
-
 @pytest.mark.slow
 def test_permutation_p__is_even_without_an_effect_and_not_misled_by_a_covariate():
     """200 cohorts in which age differs between the groups, and only age has an effect."""
@@ -158,8 +114,8 @@ def test_permutation_p__is_even_without_an_effect_and_not_misled_by_a_covariate(
     covered = 0
     for seed in range(200):
         values, group, age, rng = _cohort(seed, confounded=0.8)
-        plain.append(permutation_p(values, group, most=199, rng=rng)[0][0])
-        p, family, _ = permutation_p(values, group, age, most=199, rng=rng)
+        plain.append(permutation_p(values, group, max_draws=199, rng=rng)[0][0])
+        p, family, _ = permutation_p(values, group, age, max_draws=199, rng=rng)
         adjusted.append(p[0])
         smallest.append(family.min())
         found = effects(values, group, age)
@@ -233,14 +189,14 @@ def test_permutation_p__a_quantity_with_gaps_is_that_of_who_has_it():
     rng = np.random.default_rng(6)
     values, x, covariates = _with_gaps(rng)
     values[:, 1] += 0.8 * x
-    p, adjusted, _ = permutation_p(values, x, covariates, most=4000, rng=rng)
+    p, adjusted, _ = permutation_p(values, x, covariates, max_draws=4000, rng=rng)
     for column in (0, 1, 2, 4):
         rows = np.isfinite(values[:, column])
         alone, _, _ = permutation_p(
             values[rows, column : column + 1],
             x[rows],
             covariates[rows],
-            most=4000,
+            max_draws=4000,
             rng=rng,
         )
         # four binomial standard deviations of either estimate
@@ -272,7 +228,7 @@ def test_permutation_p__is_even_for_quantities_with_gaps_that_follow_the_regress
         values = rng.normal(size=(20, 1))
         values[(rng.random(20) < 0.6) & (x == 1), 0] = np.nan
         if np.isfinite(values[x == 1]).sum() >= 2:
-            found.append(permutation_p(values, x, most=300, rng=rng)[0][0])
+            found.append(permutation_p(values, x, max_draws=300, rng=rng)[0][0])
     assert stats.kstest(found, "uniform").pvalue > 0.01
 
 
@@ -321,9 +277,175 @@ def test_permutation_p__products_of_matrices_give_the_same(
         monkeypatch.setattr(inference, "MANY", many)
         own = np.random.default_rng(1)
         found.append(
-            permutation_p(values, group, held, most=200, rng=own)
+            permutation_p(values, group, held, max_draws=200, rng=own)
             if kind == "permutation"
-            else sign_flip_p(values, most=200, rng=own)
+            else sign_flip_p(values, max_draws=200, rng=own)
         )
     for one, other in zip(*found, strict=True):
         np.testing.assert_array_equal(one, other)
+
+
+COHORTS = 200
+SHAPE = np.geomspace(1, 0.1, 6)  # spread along each coordinate
+
+
+def _statistic(x, y):
+    step = x.mean(axis=0) - y.mean(axis=0)
+    return step @ step / sum(one.var(axis=0, ddof=1).sum() / len(one) for one in (x, y))
+
+
+def _null(sizes, spreads, seed):
+    rng = np.random.default_rng([41, seed])
+    groups = [
+        s * SHAPE * rng.normal(size=(n, 6)) for n, s in zip(sizes, spreads, strict=True)
+    ]
+    return np.concatenate(groups), np.repeat(np.arange(len(sizes)), sizes), rng
+
+
+def test_between_groups_p__is_scipy_s_permutation_test():
+    """All 462 splits of five and six subjects."""
+    y, group, rng = _null((5, 6), (1, 2), 0)
+    y[:5] += 0.6
+    (statistic,), (p,), count = between_groups_p(y, group, max_draws=10_000, rng=rng)
+
+    def of_rows(a, b):
+        return _statistic(y[np.asarray(a, int)], y[np.asarray(b, int)])
+
+    want = stats.permutation_test(
+        (np.arange(5), np.arange(5, 11)),
+        of_rows,
+        vectorized=False,
+        alternative="greater",
+        n_resamples=np.inf,
+    )
+    np.testing.assert_allclose(statistic, want.statistic, rtol=1e-10)
+    assert count == 461
+    np.testing.assert_allclose(p, want.pvalue, rtol=1e-10)
+    order = np.random.default_rng(1).permutation(11)
+    assert (
+        between_groups_p(y[order] + 7, group[order], max_draws=10_000, rng=rng)[1][0]
+        == p
+    )
+
+
+def test_between_groups_p__of_one_coordinate_is_welch_s_t_squared():
+    y, group, rng = _null((9, 14), (1, 2), 1)
+    (statistic,), (p,), count = between_groups_p(
+        y[:, :1], group, max_draws=5000, rng=rng
+    )
+    want = stats.ttest_ind(y[:9, 0], y[9:, 0], equal_var=False)
+    np.testing.assert_allclose(statistic, want.statistic**2, rtol=1e-10)
+    assert count == 5000
+    assert abs(p - want.pvalue) < 0.03  # 5,000 draws, normal values
+
+
+def test_within_subjects_p__is_scipy_s_test_of_paired_samples():
+    rng = np.random.default_rng(2)
+    y = rng.normal(size=(8, 2, 3)) + np.array([0.0, 0.9])[:, None]
+    (statistic,), (p,), count = within_subjects_p(y, max_draws=10_000, rng=rng)
+
+    def of_rows(a, b):
+        # +1 where a subject is exchanged, else -1
+        d = np.asarray(a, int) - np.asarray(b, int)
+        d = np.sign(d)[:, None] * (y[:, 0] - y[:, 1])
+        return (d.mean(axis=0) ** 2).sum() / (d.var(axis=0, ddof=1).sum() / len(d))
+
+    want = stats.permutation_test(
+        (np.zeros(8), np.ones(8)),
+        of_rows,
+        permutation_type="samples",
+        vectorized=False,
+        alternative="greater",
+        n_resamples=np.inf,
+    )
+    np.testing.assert_allclose(statistic, want.statistic, rtol=1e-10)
+    assert count == 255
+    np.testing.assert_allclose(p, want.pvalue, rtol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("sizes", "spreads"),
+    [
+        ((20, 20), (1, 1)),
+        ((8, 24), (1, 1)),
+        ((8, 24), (3, 1)),
+        ((8, 24), (1, 3)),
+        ((10, 10, 20), (1, 1, 1)),
+    ],
+)
+def test_between_groups_p__is_uniform_where_groups_do_not_differ(sizes, spreads):
+    """p of the largest statistic of all pairs; also of groups of unequal sizes and spreads."""
+    p = np.array(
+        [
+            between_groups_p(y, g, max_draws=199, rng=rng)[1].min()
+            for y, g, rng in _cohorts(sizes, spreads)
+        ]
+    )
+    assert stats.kstest(p, "uniform").pvalue > 0.001  # fails one seed in a thousand
+    assert (p <= 0.05).mean() < 0.10  # 200 cohorts: 5 % and three standard deviations
+
+
+def _cohorts(sizes, spreads):
+    return (_null(sizes, spreads, seed) for seed in range(COHORTS))
+
+
+def test_within_subjects_p__is_uniform_where_conditions_do_not_differ():
+    p = []
+    three = []
+    for seed in range(COHORTS):
+        rng = np.random.default_rng([42, seed])
+        y = 3 * rng.normal(size=(12, 1, 6)) + SHAPE * rng.normal(size=(12, 3, 6))
+        y[:3, 2] = np.nan  # subjects whose condition is unknown
+        p.append(within_subjects_p(y[:, :2], max_draws=199, rng=rng)[1][0])
+        three.append(within_subjects_p(y, max_draws=199, rng=rng)[1].min())
+    assert stats.kstest(p, "uniform").pvalue > 0.001
+    assert stats.kstest(three, "uniform").pvalue > 0.001
+
+
+def test_between_groups_p__finds_what_is_planted():
+    """A step of 1.2 standard deviations along one of six coordinates, 15 and 25
+    subjects: 80 % of 100 cohorts.
+    """
+    found = []
+    for seed in range(100):
+        y, group, rng = _null((15, 25), (1, 1), seed)
+        y[group == 1, 0] += 1.2
+        found.append(between_groups_p(y, group, max_draws=199, rng=rng)[1][0] <= 0.05)
+    assert np.mean(found) > 0.8
+
+
+def test_between_groups_p__without_any_scatter():
+    """Identical subjects within groups: the largest statistic there is, and the smallest p."""
+    y = np.repeat([[0.1, 0.2], [0.3, 0.2]], 4, axis=0)
+    (statistic,), (p,), count = between_groups_p(
+        y, np.repeat([0, 1], 4), max_draws=1000, rng=np.random.default_rng(0)
+    )
+    assert statistic == np.inf
+    assert (count, p) == (69, 2 / 70)
+    same = between_groups_p(
+        np.full((8, 2), 0.1),
+        np.repeat([0, 1], 4),
+        max_draws=1000,
+        rng=np.random.default_rng(0),
+    )
+    assert (same[0][0], same[1][0]) == (0.0, 1.0)
+
+
+def test_classical_scaling__is_the_principal_component_analysis():
+    x = np.random.default_rng(3).normal(size=(20, 5)) * [3, 2, 1, 0.5, 0.1]
+    distance = squareform(pdist(x))
+    place, explained, error = classical_scaling(distance)
+    want = PCA(5).fit(x)
+    score = want.transform(x)[:, :2]
+    np.testing.assert_allclose(np.abs(place), np.abs(score), atol=1e-10)
+    np.testing.assert_allclose(
+        explained, want.explained_variance_ratio_[:2], rtol=1e-10
+    )
+    left = squareform(pdist(score)) - distance
+    np.testing.assert_allclose(
+        error, np.sqrt((left**2).mean() / (distance**2).mean()), rtol=1e-10
+    )
+    flat = classical_scaling(squareform(pdist(x[:, :2])))
+    assert flat[2] < 1e-12
+    one = classical_scaling(np.array([[0.0, 2.0], [2.0, 0.0]]))
+    np.testing.assert_allclose(np.abs(one[0]), [[1, 0], [1, 0]], atol=1e-12)

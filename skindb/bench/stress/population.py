@@ -8,13 +8,14 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from skindb.bench.case import SCALES, Case, close, each, expect
+from skindb.numerics.factorise import principal_axes
 from skindb.numerics.inference import effects, permutation_p
-from skindb.numerics.principal import principal_axes
-from skindb.numerics.pyramid import build, reconstruct
 from skindb.numerics.texture import (
     QUANTILES,
+    build,
     image_parts,
     part_quantiles,
+    reconstruct,
     synthesise,
     valid_quantiles,
 )
@@ -127,7 +128,7 @@ def _equal_values() -> None:
     found = effects(values, group)
     close(found.slope, [0.0, 0.0], atol=1e-15)
     p, adjusted, _ = permutation_p(
-        values, group, most=200, rng=np.random.default_rng(0)
+        values, group, max_draws=200, rng=np.random.default_rng(0)
     )
     expect((p == 1).all() and (adjusted == 1).all(), p)
 
@@ -135,7 +136,9 @@ def _equal_values() -> None:
 def _far_apart() -> None:
     group = (np.arange(12) % 2).astype(float)
     values = group[:, None] * 1e6 + _noise(12, 1)
-    p, _, count = permutation_p(values, group, most=999, rng=np.random.default_rng(0))
+    p, _, count = permutation_p(
+        values, group, max_draws=999, rng=np.random.default_rng(0)
+    )
     expect(p[0] < 0.02 and p[0] >= 1 / (count + 1), p)
 
 
