@@ -14,9 +14,10 @@ from permissions import open_to_others
 
 from skindb.cli import cli
 from skindb.errors import InputError
+from skindb.hw.unfinished import one_session
 from skindb.ingest import read_capture
 from skindb.virtual.devices import RefusedError
-from skindb.workflow.session import VIRTUAL_SIZE, one_session
+from skindb.workflow.session import VIRTUAL_SIZE
 
 SMALL = {"width": 80, "height": 100}  # px of the frames of the virtual subject
 

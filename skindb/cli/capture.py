@@ -8,92 +8,15 @@ from typing import Any
 import click
 
 import skindb
-from skindb.cli.options import DB, PATH, Finite, Seed, common
+from skindb.cli.options import DB, PATH, common, options_of
 from skindb.cli.shared import bar, emit
 from skindb.cli.terminal import wait_for_enter
+from skindb.parameters import SessionParameters
 
 
 @click.command()
 @click.argument("out", type=PATH)
-@click.option(
-    "--setup",
-    type=PATH,
-    help=(
-        "Folder with dome/dome.json and contact/probe.json of the laboratory; with "
-        "--virtual, a complete capture."
-    ),
-)
-@click.option(
-    "--dome",
-    help="Address of the light controller: /dev/ttyACM0 or socket://host:port.",
-)
-@click.option("--probe", help="Address of the probe.")
-@click.option(
-    "--cameras",
-    type=PATH,
-    help="Folder that holds a folder of frames for each camera, and one named probe.",
-)
-@click.option("--subject", help="Pseudonym of the subject.")
-@click.option("--condition", default="normal", help="Condition of the skin.")
-@click.option(
-    "--trait",
-    "traits",
-    multiple=True,
-    metavar="NAME=VALUE",
-    help="Attribute (may be given several times).",
-)
-@click.option(
-    "--consent",
-    help=(
-        "Scopes that the subject consents to, separated by commas: fit, statistics, "
-        "export, publish."
-    ),
-)
-@click.option("--reference", help="Reference to the signed consent form.")
-@click.option("--scan", type=PATH, help="Triangle mesh of the face in mm.")
-@click.option("--landmarks", type=PATH, help="Landmarks on the scan (.json).")
-@click.option("--regions", type=PATH, help="Regions of the scan (.json).")
-@click.option(
-    "--calibration",
-    help="Name of the calibration of the dome that ingest takes from the database.",
-)
-@click.option(
-    "--sites",
-    default="",
-    show_default=False,
-    help="Sites that the probe measures, separated by commas.  [default: none]",
-)
-@click.option(
-    "--placements",
-    type=click.IntRange(1, 64),
-    default=1,
-    help="Placements of the probe on each site.",
-)
-@click.option(
-    "--seconds",
-    type=Finite(0, 3600, min_open=True),
-    help="Duration of the light sequence in seconds, without dark frames.  [default: the shortest]",
-)
-@click.option("--slower", is_flag=True, help="Flash at most three times in a second.")
-@click.option(
-    "--base-light",
-    "base",
-    type=click.IntRange(0, 1000),
-    default=0,
-    help=(
-        "Intensity of a steady lamp, in units of one light; it is measured before the "
-        "lights flash."
-    ),
-)
-@click.option(
-    "--confirm-screening",
-    is_flag=True,
-    help="Confirm that the subject was screened, consented, and keeps the eyes closed.",
-)
-@click.option("--operator", help="ID of the operator who confirms the screening.")
-@click.option(
-    "--log", type=PATH, help="Folder for logs of all bytes exchanged with the devices."
-)
+@options_of(SessionParameters)
 @click.option(
     "--plan",
     "only_plan",
@@ -105,23 +28,10 @@ from skindb.cli.terminal import wait_for_enter
     is_flag=True,
     help="Start each placement of the probe without waiting for Enter.",
 )
-@click.option(
-    "--virtual",
-    is_flag=True,
-    help="Rehearse with emulated devices and a virtual subject.",
-)
-@click.option(
-    "--seed", type=Seed(), help="Random seed for the virtual subject.  [default: 2005]"
-)
-@click.option(
-    "--fault",
-    "faults",
-    multiple=True,
-    metavar="NAME=VALUE",
-    help="Fault of an emulated device.",
-)
 @common
-def capture(out: Path, **options: Any) -> None:
+def capture(
+    out: Path, parameters: SessionParameters, only_plan: bool, yes: bool
+) -> None:
     """Control a dome and a probe, and write a capture folder.
 
     Before it runs, the sequence is checked against the limits for photosensitive
@@ -133,12 +43,12 @@ def capture(out: Path, **options: Any) -> None:
     --virtual and --setup, the emulated cameras deliver the frames of the capture that
     --setup names, for example one of your own dome.
     """
-    ask = None if options["virtual"] or options.pop("yes") else _ask
-    if options.pop("only_plan"):
-        plan, lines = skindb.workflow.plan_session(out, options, progress=bar())
+    ask = None if parameters.virtual or yes else _ask
+    if only_plan:
+        plan, lines = skindb.workflow.plan_session(out, parameters, progress=bar())
         emit(plan, lines)
         return
-    found = skindb.workflow.capture_session(out, options, ask=ask, progress=bar())
+    found = skindb.workflow.capture_session(out, parameters, ask=ask, progress=bar())
     count = found["flashes_per_second"]
     rate = f"at most {count} {'flash' if count == 1 else 'flashes'} in any second"
     before = (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import asdict
 from datetime import datetime
 from functools import partial
 from pathlib import Path
@@ -13,18 +14,22 @@ import click
 
 import skindb
 from skindb.cli.engine import SCHEDULER, shared_path
-from skindb.cli.options import DB, PATH, WAIT, WORKERS, Finite, Seed, asked, common
+from skindb.cli.options import (
+    DB,
+    PATH,
+    WAIT,
+    WORKERS,
+    Finite,
+    Seed,
+    asked,
+    common,
+    options_of,
+)
 from skindb.cli.shared import bar, calibration_lines, each_take, emit, summary_of
 from skindb.cli.terminal import echo
 from skindb.errors import Fault, InputError
-from skindb.limits import (
-    MAX_CAMERAS,
-    MAX_COHORT,
-    MAX_FRAME_SIDE_PX,
-    MAX_LIGHTS,
-    MAX_PHOTOGRAPHS,
-    MAX_SPACING_MM,
-)
+from skindb.limits import MAX_CAMERAS, MAX_COHORT, MAX_LIGHTS
+from skindb.parameters import VIRTUAL_SEED, IngestParameters, SimulationParameters
 from skindb.virtual.dome import require_sizes
 from skindb.virtual.person import CONDITIONS
 
@@ -50,7 +55,10 @@ if TYPE_CHECKING:
     help="Number of lights of the virtual dome.",
 )
 @click.option(
-    "--seed", type=Seed(), default=2005, help="Random seed for noise and sampling."
+    "--seed",
+    type=Seed(),
+    default=VIRTUAL_SEED,
+    help="Random seed for noise and sampling.",
 )
 @click.option(
     "--workers",
@@ -98,39 +106,7 @@ def demo(out: Path, **options: Any) -> None:
         "several times)."
     ),
 )
-@click.option(
-    "--cameras",
-    type=click.IntRange(1, MAX_CAMERAS),
-    default=8,
-    help="Number of cameras of the virtual dome.",
-)
-@click.option(
-    "--lights",
-    type=click.IntRange(1, MAX_LIGHTS),
-    default=48,
-    help="Number of lights of the virtual dome.",
-)
-@click.option(
-    "--width",
-    type=click.IntRange(16, MAX_FRAME_SIDE_PX),
-    default=160,
-    help="Width of a frame in pixels.",
-)
-@click.option(
-    "--height",
-    type=click.IntRange(16, MAX_FRAME_SIDE_PX),
-    default=200,
-    help="Height of a frame in pixels.",
-)
-@click.option(
-    "--head",
-    type=PATH,
-    help="File of a head model to use instead of the parametric face.",
-)
-@click.option(
-    "--subsurface", is_flag=True, help="Simulate subsurface transport by the dipole."
-)
-@click.option("--seed", type=Seed(), default=2005, help="Noise seed.")
+@options_of(SimulationParameters)
 @WORKERS
 @common
 def simulate(
@@ -139,7 +115,7 @@ def simulate(
     cohort: int | None,
     conditions: tuple[str, ...],
     workers: int,
-    **options: Any,
+    parameters: SimulationParameters,
 ) -> None:
     """Write virtual captures with their true values beside them.
 
@@ -158,8 +134,9 @@ def simulate(
             )
         )
     require_sizes(
-        options["lights"], options["cameras"], options["width"], options["height"]
+        parameters.lights, parameters.cameras, parameters.width, parameters.height
     )
+    options = asdict(parameters)
     people = (
         None
         if cohort is None
@@ -182,19 +159,7 @@ def _simulated(made: tuple[int, Path]) -> tuple[str, Any, list[str]]:
 @click.command()
 @DB
 @click.argument("captures", metavar="CAPTURE...", nargs=-1, required=True, type=PATH)
-@click.option(
-    "--spacing",
-    "spacing_mm",
-    type=Finite(0.05, MAX_SPACING_MM),
-    default=1.5,
-    help="Distance between neighbouring surfels in mm.",
-)
-@click.option(
-    "--photographs",
-    type=click.IntRange(0, MAX_PHOTOGRAPHS),
-    default=4,
-    help="Number of photographs kept for comparisons.",
-)
+@options_of(IngestParameters)
 @click.option(
     "--crop-box",
     type=Finite(),
@@ -205,43 +170,6 @@ def _simulated(made: tuple[int, Path]) -> tuple[str, Any, list[str]]:
     "--crop-reach",
     type=Finite(0, min_open=True),
     help="Distance from a landmark within which the scan is kept, in mm.",
-)
-@click.option(
-    "--soft",
-    type=click.Choice(["exclude", "keep"]),
-    default="exclude",
-    help=(
-        "Treatment of samples at soft shadow edges: excluded, or divided by the "
-        "visible fraction of the light."
-    ),
-)
-@click.option(
-    "--footprint",
-    is_flag=True,
-    help="Average each sample over the splat of its surfel instead of the pixels at its centre.",
-)
-@click.option(
-    "--visibility",
-    type=click.Choice(["rays", "splats"]),
-    default="rays",
-    help=(
-        "Method for the visibility of lights and cameras. splats is that of the paper, "
-        "slower and less exact."
-    ),
-)
-@click.option(
-    "--calibration",
-    type=click.Choice(["refuse", "note"]),
-    default="refuse",
-    help=(
-        "Treatment of captures whose photographs contradict their calibration: "
-        "refused, or recorded as notes."
-    ),
-)
-@click.option(
-    "--refine",
-    is_flag=True,
-    help="Correct the orientation of each camera so that its photographs match the scan.",
 )
 @click.option(
     "--new-consent",
@@ -265,12 +193,12 @@ def ingest(
     captures: tuple[Path, ...],
     crop_box: tuple[float, float, float, float, float, float] | None,
     crop_reach: float | None,
-    soft: str,
     new_consent: datetime | None,
     explain: bool,
+    wait: float,
     workers: int,
     scheduler: str | None,
-    **options: Any,
+    parameters: IngestParameters,
 ) -> None:
     """Ingest capture folders into the database DB.
 
@@ -288,10 +216,16 @@ def ingest(
     low, high = (crop_box[:3], crop_box[3:]) if crop_box else (None, None)
     crop = skindb.ingest.Crop(low, high, crop_reach) if crop_box or crop_reach else None
     progress = bar()
-    options |= {"crop": crop, "soft": soft, "progress": progress}
-    options["new_consent"] = None if new_consent is None else new_consent.date()
     database = skindb.open(db)
-    call = partial(skindb.workflow.ingest_take, database, **options)
+    call = partial(
+        skindb.workflow.ingest_take,
+        database,
+        crop=crop,
+        new_consent=None if new_consent is None else new_consent.date(),
+        wait=wait,
+        progress=progress,
+        **asdict(parameters),
+    )
     work: dict[str, Any] = {
         "workers": workers,
         "scheduler": scheduler,

@@ -18,13 +18,14 @@ from skindb.cli.options import (
     WAIT,
     WORKERS,
     Finite,
-    Seed,
     asked,
     common,
+    options_of,
 )
 from skindb.cli.shared import aligned, bar, each_take, emit, existing, summary_of
 from skindb.cli.terminal import echo
 from skindb.errors import Fault
+from skindb.parameters import FitParameters
 
 if TYPE_CHECKING:
     from skindb.store import Database, Record
@@ -39,68 +40,7 @@ MIN_FITTED_FRACTION = 0.5
 @click.command()
 @DB
 @click.argument("takes", metavar="[TAKE...]", nargs=-1)
-@click.option(
-    "--k", type=click.IntRange(1), help="Number of basis BRDFs.  [default: 4]"
-)
-@click.option(
-    "--profile",
-    type=click.Choice(["transport", "dipole"]),
-    help="Model of the probe profiles; dipole is that of the paper.  [default: transport]",
-)
-@click.option(
-    "--mode",
-    type=click.Choice(["perceptual", "linear", "paper"]),
-    help=(
-        "Space of the least squares: cube-root space, linear, or that of the paper.  "
-        "[default: perceptual]"
-    ),
-)
-@click.option(
-    "--rank",
-    type=click.IntRange(1),
-    help="Rank of the reduced dictionary (59 is exact).  [default: 16]",
-)
-@click.option(
-    "--eta", type=Finite(1.0, 2.0), help="Refractive index of skin.  [default: 1.3]"
-)
-@click.option(
-    "--even-reflection",
-    type=Finite(0, 0.5),
-    help=(
-        "Fraction of light that the surface may reflect diffusely; it widens the error "
-        "of R_d.  [default: 0.055]"
-    ),
-)
-@click.option(
-    "--light-gains",
-    is_flag=True,
-    default=None,
-    help=(
-        "Estimate one gain per light and divide its samples by it, for lights of "
-        "doubtful intensity."
-    ),
-)
-@click.option(
-    "--inter-reflection",
-    is_flag=True,
-    default=None,
-    help="Subtract inter-reflection between parts of the face (one diffuse bounce).",
-)
-@click.option(
-    "--hold-out-lights",
-    type=Finite(0, 0.9),
-    help="Fraction of lights held out.  [default: 0]",
-)
-@click.option(
-    "--hold-out-cameras",
-    type=Finite(0, 0.9),
-    help="Fraction of cameras held out.  [default: 0]",
-)
-@click.option(
-    "--seed",
-    type=Seed(),
-    help="Random seed for the hold-out and for sampling.  [default: 0]",
-)
+@options_of(FitParameters, only_given=True)
 @DICTIONARY
 @click.option(
     "--refit",
@@ -124,7 +64,7 @@ def fit(
     wait: float,
     workers: int,
     scheduler: str | None,
-    **options: Any,
+    given: dict[str, Any],
 ) -> None:
     """Fit the named takes, or all without a current model.
 
@@ -134,7 +74,6 @@ def fit(
     database = existing(db)
     progress = bar()
     workflow = skindb.workflow
-    given = {name: value for name, value in options.items() if value is not None}
     dictionary = shared_path(dictionary, scheduler)
     # its faults are reported once, before the fits start
     workflow.dictionary_at(dictionary)

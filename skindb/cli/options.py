@@ -5,13 +5,17 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from dataclasses import Field, fields
+from functools import wraps
 from pathlib import Path
-from typing import Any
+from types import UnionType
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import click
 
 import skindb
 from skindb.limits import MAX_SEED, MAX_WAIT_S, MAX_WORKERS
+from skindb.parameters import Option, option_of
 
 DB = click.argument("db", metavar="DB")
 PATH = click.Path(path_type=Path)
@@ -67,6 +71,84 @@ class Seed(click.IntRange):
 
     def _describe_range(self) -> str:
         return "x>=0"
+
+
+Command = Callable[..., Any]
+
+
+def options_of(
+    record: type[Any], *, only_given: bool = False
+) -> Callable[[Command], Command]:
+    """Add the options of the fields of a parameter record to a command.
+
+    The command is called with `parameters`, a record; or, if `only_given`, with `given`,
+    a dictionary of the options that the user gave.
+    """
+    hints = get_type_hints(record)
+    specs = fields(record)
+
+    def decorate(command: Command) -> Command:
+        @wraps(command)
+        def with_record(**values: Any) -> Any:
+            chosen = {spec.name: values.pop(spec.name) for spec in specs}
+            if only_given:
+                given = {k: value for k, value in chosen.items() if value is not None}
+                return command(given=given, **values)
+            return command(parameters=record(**chosen), **values)
+
+        decorated: Command = with_record
+        for spec in reversed(specs):
+            limits = option_of(record, spec.name)
+            add = _click_option(spec, hints[spec.name], limits, unset=only_given)
+            decorated = add(decorated)
+        return decorated
+
+    return decorate
+
+
+def _click_option(
+    spec: Field[Any], hint: Any, limits: Option, *, unset: bool
+) -> Callable[[Command], Command]:
+    """The option of a field; with `unset` its default is None, and the help names the
+    default of the field.
+    """
+    text = limits.help
+    default = spec.default
+    if unset and default is not False:
+        shown = f"{default:g}" if isinstance(default, float) else default
+        text += f"  [default: {shown}]"
+    name = limits.name or spec.name.replace("_", "-")
+    about: dict[str, Any] = {"default": None if unset else default, "help": text}
+    if limits.metavar:
+        about["metavar"] = limits.metavar
+    if not limits.show_default:
+        about["show_default"] = False
+    kind = get_args(hint)[0] if isinstance(hint, UnionType) else hint
+    if kind is bool:
+        about["is_flag"] = True
+    elif get_origin(kind) is tuple:
+        about["multiple"] = True
+    else:
+        about["type"] = _type(kind, limits)
+    return click.option(f"--{name}", spec.name, **about)
+
+
+def _type(kind: Any, limits: Option) -> Any:
+    """The type of an option of one value."""
+    if get_origin(kind) is Literal:
+        return click.Choice(get_args(kind))
+    if kind is Path:
+        return PATH
+    if kind is float:
+        return Finite(limits.minimum, limits.maximum, min_open=limits.above_minimum)
+    if kind is int and limits.maximum == MAX_SEED:
+        return Seed()
+    if kind is int:
+        low, high = (
+            None if x is None else int(x) for x in (limits.minimum, limits.maximum)
+        )
+        return click.IntRange(low, high)
+    return kind
 
 
 WAIT = click.option(

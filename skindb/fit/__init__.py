@@ -12,7 +12,6 @@ from skindb.fit.model import first_pass, fit_model, second_pass
 from skindb.fit.normals import estimate_normals
 from skindb.fit.obstructed import find_obstructed
 from skindb.fit.outliers import find_outliers
-from skindb.fit.parameters import FitParameters
 from skindb.fit.plan import FitPlan, plan_fit
 from skindb.fit.prediction import (
     describe_prediction,
@@ -27,6 +26,7 @@ from skindb.fit.translucency import (
     tabulate_translucency,
     translucency_map,
 )
+from skindb.parameters import FitParameters
 from skindb.reflectance.dictionary import embedded_dictionary
 from skindb.reflectance.table_file import read_dictionary
 

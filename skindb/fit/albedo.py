@@ -15,6 +15,7 @@ from skindb.fit.lumitexels import GEOMETRY
 from skindb.fit.sample_noise import NO_NOISE, NOISE_INPUTS, noise_inputs, noise_of
 from skindb.jit import sample_bits
 from skindb.optics.diffuse import dipole_s
+from skindb.parameters import EVEN_REFLECTION
 from skindb.schema import check, label
 from skindb.schema.status import LARGEST_R_D, SMALLEST_R_D
 from skindb.types import Array
@@ -26,10 +27,6 @@ LARGEST_TURN = 0.25
 # Coloured highlights, which eq. 7 excludes: under Lafortune's of skin, R_d of five
 # captures was 0.004 to 0.016 too low.
 MODEL_ERROR_ALBEDO = 0.01
-# The surface of skin reflects 4 to 7 % of the light (Anderson and Parrish 1981, J.
-# Invest. Dermatol. 77, 13-19). How evenly is not known: the prior is half a normal
-# distribution, and at its 95 % limit all of the mean of both is even.
-EVEN_REFLECTION = 0.055
 NORMAL_95 = 1.96
 
 

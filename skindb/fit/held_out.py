@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from skindb.elementwise import elementwise
 from skindb.errors import Fault, InputError
 from skindb.fit._surface_arrays import refit_weights
-from skindb.fit.parameters import FitParameters
 from skindb.fit.plan import FitPlan
 from skindb.fit.surface import NEEDED, reduced_tables
+from skindb.parameters import FitParameters
 from skindb.schema import check, dataset
 from skindb.types import Array, Mask
 

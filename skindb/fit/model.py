@@ -26,11 +26,11 @@ from skindb.fit.lumitexels import disc_angle, lumitexels
 from skindb.fit.normals import estimate_normals
 from skindb.fit.obstructed import find_obstructed
 from skindb.fit.outliers import suspects
-from skindb.fit.parameters import FitParameters
 from skindb.fit.plan import plan_fit
 from skindb.fit.second import refit_and_evaluate
 from skindb.fit.surface import fit_surface
 from skindb.fit.translucency import fit_probe, summarise_translucency, translucency_map
+from skindb.parameters import FitParameters
 from skindb.reflectance.dictionary import (
     Dictionary,
     disc_dictionary,

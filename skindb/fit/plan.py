@@ -11,7 +11,7 @@ import xarray as xr
 from skindb.cache import cached_arrays
 from skindb.errors import Fault, InputError
 from skindb.fit.lumitexels import disc_angle, lumitexels
-from skindb.fit.parameters import FitParameters
+from skindb.parameters import FitParameters
 from skindb.reflectance.dictionary import SOURCES, Dictionary, disc_dictionary
 from skindb.reflectance.reduction import (
     Truncation,

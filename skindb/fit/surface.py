@@ -12,8 +12,8 @@ import xarray as xr
 from skindb.elementwise import elementwise
 from skindb.fit._surface_arrays import Refit, Tables, refit_weights, surface_weights
 from skindb.fit.lumitexels import GEOMETRY
-from skindb.fit.parameters import FullMode
 from skindb.fit.sample_noise import noise_inputs, typical_noise
+from skindb.parameters import FullMode
 from skindb.reflectance.dictionary import Dictionary
 from skindb.reflectance.reduction import reduced_dictionary
 from skindb.reflectance.rows import Mode

@@ -1,18 +1,21 @@
 """The file `unfinished.json` of an interrupted capture: its identity, and the steps
-completed so far.
+completed so far; and the lock of the folder of a session.
 """
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from skindb.errors import Fault, InputError
+from skindb.files import make_private, private_file
 from skindb.format.json_file import read_json
 from skindb.hw.sequence import Schedule, Step
 
@@ -208,3 +211,30 @@ def digest(*records: Any) -> str:
     """Short digest of the content of JSON records."""
     text = json.dumps(records, sort_keys=True)
     return hashlib.sha256(text.encode("utf-8")).hexdigest()[:16]
+
+
+@contextmanager
+def one_session(out: Path) -> Iterator[None]:
+    """Lock the folder of a capture; the system releases the lock however the session ends.
+
+    Raises
+    ------
+    InputError
+        If another session holds the lock, or the folder cannot be written to.
+    """
+    make_private(out.parent)
+    path = out.parent / f".{out.name}.lock"
+    with private_file(path).open("a") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if not os.path.samestat(os.fstat(lock.fileno()), path.stat()):
+                # the other session ended between opening and locking
+                raise FileNotFoundError
+        except (BlockingIOError, FileNotFoundError):
+            rule = "only one session at a time may write into a folder"
+            cure = "wait until the other session has ended"
+            raise InputError(Fault(str(out), rule, "another session", cure)) from None
+        try:
+            yield
+        finally:
+            path.unlink(missing_ok=True)

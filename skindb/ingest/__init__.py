@@ -2,7 +2,7 @@
 
 from skindb.format.folder import Capture, read_capture
 from skindb.geometry.crop import Crop
-from skindb.ingest.capture import IngestParameters, ingest_capture, scratch_name
+from skindb.ingest.capture import ingest_capture, scratch_name
 from skindb.ingest.report import (
     calibration_lines,
     calibration_table,
@@ -10,6 +10,7 @@ from skindb.ingest.report import (
     sample_lines,
     sample_table,
 )
+from skindb.parameters import IngestParameters
 
 __all__ = [
     "Capture",

@@ -8,7 +8,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import dask
 import numpy as np
@@ -47,7 +47,6 @@ from skindb.ingest.groups import (
     surfel_group,
 )
 from skindb.ingest.lumitexels import (
-    PenumbraRule,
     Views,
     checked_pictures,
     choose_photographs,
@@ -66,55 +65,18 @@ from skindb.ingest.sample_quality import intensity_faults, light_notes, sample_f
 from skindb.ingest.spool import Spool
 from skindb.ingest.surfels import SurfelSet, build_surfels, site_positions
 from skindb.ingest.visibility import (
-    Method,
     camera_visibility,
     coarse_maps,
     light_visibility,
 )
+from skindb.parameters import IngestParameters
 from skindb.types import Progress, silent
 
 T = TypeVar("T")
-OnContradiction = Literal["refuse", "note"]
 # with two, one reads while the other computes
 MIN_THREADS = 2
 MAX_THREADS = 8
 MAX_BYTES = 4 << 30  # of memory for all threads together, unless two threads need more
-
-
-@dataclass(frozen=True)
-class IngestParameters:
-    """Parameters of an ingest.
-
-    Parameters
-    ----------
-    spacing_mm
-        Target distance of neighbouring surfels, which subdivision reaches within a
-        factor of sqrt 2.
-    photographs
-        Number of merged photographs kept for comparisons.
-    soft
-        Samples at the soft edges of shadows: excluded, or kept and divided by the
-        visible fraction of the light.
-    footprint
-        Whether samples are means over the surfel's splat (elliptical weighted average)
-        or interpolated bilinearly.
-    visibility
-        Method for the visibility of surfels: "rays", or "splats" as in the paper.
-    calibration
-        What to do with a capture whose photographs contradict its calibration: refuse
-        it, or record a warning.
-    refine
-        Whether cameras are first rotated so that their photographs show the face at the
-        scan, see `refine_cameras`.
-    """
-
-    spacing_mm: float = 1.5
-    photographs: int = 4
-    soft: PenumbraRule = "exclude"
-    footprint: bool = False
-    visibility: Method = "rays"
-    calibration: OnContradiction = "refuse"
-    refine: bool = False
 
 
 @contextmanager

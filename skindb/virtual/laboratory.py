@@ -7,7 +7,8 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from dataclasses import dataclass, field
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +17,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skindb.clock import Clock, SimulatedClock
-from skindb.virtual.devices import DeviceFaults, DirectPort, EmulatedDome, EmulatedProbe
+from skindb.errors import Fault, InputError
+from skindb.virtual.devices import (
+    GAUGE_FAULTS,
+    DeviceFaults,
+    DirectPort,
+    EmulatedDome,
+    EmulatedProbe,
+)
 
 LAMP_LIGHTS = 8  # among which the brightest one in a camera is looked for
 # arbitrary wall time, as cameras do not know when the controller started
 FIRST_FRAME_TIME = 1_700_000_000.0
+PROBABILITIES = ("garbage", "lost_replies")  # of `DeviceFaults`
+MAX_FAULT = 1e6  # of any number of a fault
 
 
 @dataclass(frozen=True)
@@ -235,3 +245,82 @@ class Laboratory:
 
 def _read(path: Path) -> NDArray[np.float64]:
     return np.asarray(imagecodecs.png_decode(path.read_bytes()), np.float64)
+
+
+def laboratory_faults(
+    texts: Sequence[str], lights: Collection[str], cameras: Collection[str]
+) -> LaboratoryFaults | None:
+    """Faults from texts NAME=VALUE: those of `DeviceFaults` for dome or probe, dropped
+    frames, hot pixels and a dark lamp; None if there are no texts.
+
+    Parameters
+    ----------
+    texts
+        The faults.
+    lights, cameras
+        Ids of the laboratory.
+
+    Raises
+    ------
+    InputError
+        For a fault that does not exist or can never happen.
+    """
+    kinds = {spec.name: str(spec.type) for spec in fields(DeviceFaults)}
+    devices: dict[str, dict[str, Any]] = {"dome": {}, "probe": {}}
+    about: dict[str, Any] = {}
+    for text in texts:
+        name, _, value = text.partition("=")
+        device, _, what = name.rpartition(".")
+        try:
+            if device in devices and what in kinds:
+                devices[device][what] = _fault_value(what, kinds[what], value, lights)
+            elif what == "dropped_frame":
+                camera, number = value.split(":")
+                if camera not in cameras:
+                    raise ValueError(camera)
+                dropped = about.get("dropped_frames", ())
+                about["dropped_frames"] = (*dropped, (camera, _count(number)))
+            elif what == "hot_pixels":
+                about["hot_pixels"] = _count(value)
+            elif what == "lamp":
+                about["lamp"] = _fault_value(what, "float", value, lights)
+            else:
+                raise ValueError(name)
+        except ValueError:
+            names = ", ".join(f"dome.{n}" for n in kinds)
+            rule = (
+                "must be dropped_frame=CAMERA:NUMBER, hot_pixels=N, lamp=FRACTION, "
+                f"{names}, or the same with probe"
+            )
+            cure = (
+                "numbers are not negative, probabilities at most 1, lights and cameras "
+                "those of the set-up"
+            )
+            raise InputError(Fault("--fault", rule, repr(text), cure)) from None
+    if not texts:
+        return None
+    dome = DeviceFaults(**devices["dome"])
+    return LaboratoryFaults(dome, DeviceFaults(**devices["probe"]), **about)
+
+
+def _fault_value(what: str, kind: str, value: str, lights: Collection[str]) -> Any:
+    """The value of a fault of a device; ValueError if it can never happen."""
+    if kind.startswith("tuple"):
+        return tuple(_count(number) for number in value.split(":"))
+    if kind == "str":
+        if value not in (GAUGE_FAULTS if what == "gauge" else lights):
+            raise ValueError(value)
+        return value
+    if kind == "int":
+        return _count(value)
+    number = float(value)
+    if not 0.0 <= number <= (1.0 if what in PROBABILITIES else MAX_FAULT):
+        raise ValueError(value)
+    return number
+
+
+def _count(text: str) -> int:
+    number = int(text)
+    if number < 0 or number > MAX_FAULT:
+        raise ValueError(text)
+    return number

@@ -1,0 +1,367 @@
+"""Parameters of fits, ingests, simulations and capture sessions, as frozen records.
+
+The options of the command line are generated from the fields: each has its default, its
+help and its limits here, and nowhere else. This module imports nothing heavy, because
+``--help`` reads it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any, Literal, Self, get_args, get_origin, get_type_hints
+
+from skindb.errors import Fault, InputError
+from skindb.limits import (
+    MAX_CAMERAS,
+    MAX_FRAME_SIDE_PX,
+    MAX_LIGHTS,
+    MAX_PHOTOGRAPHS,
+    MAX_PLACEMENTS,
+    MAX_SEED,
+    MAX_SPACING_MM,
+)
+
+# The surface of skin reflects 4 to 7 % of the light (Anderson and Parrish 1981, J.
+# Invest. Dermatol. 77, 13-19). How evenly is not known: the prior is half a normal
+# distribution, and at its 95 % limit all of the mean of both is even.
+EVEN_REFLECTION = 0.055
+VIRTUAL_SEED = 2005
+FullMode = Literal["perceptual", "linear", "paper"]
+
+
+@dataclass(frozen=True)
+class Option:
+    """Help and limits of a parameter."""
+
+    help: str
+    minimum: int | float | None = None
+    maximum: int | float | None = None
+    above_minimum: bool = False  # the minimum itself is out of range
+    name: str = ""  # on the command line, if it is not the name of the field
+    metavar: str | None = None
+    show_default: bool = True
+
+
+def option(default: Any, help: str, **limits: Any) -> Any:  # noqa: A002
+    """A field of a record with this default; `limits` are those of `Option`."""
+    return field(default=default, metadata={"option": Option(help, **limits)})
+
+
+def option_of(record: type, name: str) -> Option:
+    """Help and limits of a field of a record."""
+    found: Option = record.__dataclass_fields__[name].metadata["option"]  # type: ignore[attr-defined]
+    return found
+
+
+def require_limits(parameters: Any) -> None:
+    """Raise `InputError` with every field of a record that is out of its limits."""
+    record = type(parameters)
+    hints = get_type_hints(record)
+    faults = []
+    for spec in fields(record):
+        value = getattr(parameters, spec.name)
+        rule = _rule(option_of(record, spec.name), hints[spec.name], value)
+        if rule:
+            faults.append(Fault(spec.name, rule, repr(value), "give another value"))
+    if faults:
+        raise InputError(faults)
+
+
+def _rule(limits: Option, hint: Any, value: Any) -> str:
+    """The rule that a value breaks; empty if there is none."""
+    if get_origin(hint) is Literal:
+        choices = get_args(hint)
+        return "" if value in choices else f"must be one of {', '.join(choices)}"
+    low = limits.minimum
+    high = limits.maximum
+    if low is None or value is None:
+        return ""
+    inside = value > low if limits.above_minimum else value >= low
+    if inside and (high is None or value <= high):
+        return ""
+    if high is None or high == MAX_SEED:
+        return f"must be at least {low:g}"
+    return f"must lie in {'(' if limits.above_minimum else '['}{low:g}, {high:g}]"
+
+
+@dataclass(frozen=True)
+class FitParameters:
+    """Parameters of a fit.
+
+    Parameters
+    ----------
+    k
+        Number of components of the reduced basis; fewer if fewer surfels are fitted.
+    profile
+        Model of the probe's profiles, see `fit_probe`.
+    mode, rank
+        Mode and rank of the fit by the dictionary, see `fit_surface`. After "paper" the
+        refit uses "perceptual".
+    eta
+        Refractive index of skin.
+    even_reflection
+        Largest fraction of light (95 %) that the surface of skin is assumed to reflect
+        evenly and without colour, see `estimate_diffuse_reflectance`.
+    light_gains
+        Whether samples are first divided by the gain of their light, see `estimate_light_gains`.
+    inter_reflection
+        Whether light from other parts of the face after one diffuse bounce is
+        subtracted, see `bounced_light`; the first pass is then repeated.
+    hold_out_lights, hold_out_cameras
+        Fractions of lights and cameras that are held out of the fit, to measure the
+        error of predictions.
+    seed
+        Random seed for the hold-out, for sampling and for the starts of the factorisation.
+
+    Raises
+    ------
+    InputError
+        With every parameter that is out of range.
+    """
+
+    k: int = option(4, "Number of basis BRDFs.", minimum=1)
+    profile: Literal["transport", "dipole"] = option(
+        "transport", "Model of the probe profiles; dipole is that of the paper."
+    )
+    mode: FullMode = option(
+        "perceptual",
+        "Space of the least squares: cube-root space, linear, or that of the paper.",
+    )
+    rank: int = option(16, "Rank of the reduced dictionary (59 is exact).", minimum=1)
+    eta: float = option(1.3, "Refractive index of skin.", minimum=1.0, maximum=2.0)
+    even_reflection: float = option(
+        EVEN_REFLECTION,
+        "Fraction of light that the surface may reflect diffusely; it widens the error "
+        "of R_d.",
+        minimum=0,
+        maximum=0.5,
+    )
+    light_gains: bool = option(
+        False,
+        "Estimate one gain per light and divide its samples by it, for lights of "
+        "doubtful intensity.",
+    )
+    inter_reflection: bool = option(
+        False,
+        "Subtract inter-reflection between parts of the face (one diffuse bounce).",
+    )
+    hold_out_lights: float = option(
+        0.0, "Fraction of lights held out.", minimum=0, maximum=0.9
+    )
+    hold_out_cameras: float = option(
+        0.0, "Fraction of cameras held out.", minimum=0, maximum=0.9
+    )
+    seed: int = option(
+        0,
+        "Random seed for the hold-out and for sampling.",
+        minimum=0,
+        maximum=MAX_SEED,
+    )
+
+    def __post_init__(self) -> None:
+        """Check the limits."""
+        require_limits(self)
+
+    @classmethod
+    def of(cls, attrs: Mapping[Any, Any]) -> Self:
+        """The parameters in the attributes of a model or of a first pass."""
+        stored = attrs.get("parameters", {})
+        names = [spec.name for spec in fields(cls) if spec.name in stored]
+        return cls(**{name: stored[name] for name in names})
+
+    def as_dict(self) -> dict[str, Any]:
+        """The parameters as a dictionary for attributes."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class IngestParameters:
+    """Parameters of an ingest.
+
+    Parameters
+    ----------
+    spacing_mm
+        Target distance of neighbouring surfels, which subdivision reaches within a
+        factor of sqrt 2.
+    photographs
+        Number of merged photographs kept for comparisons.
+    soft
+        Samples at the soft edges of shadows: excluded, or kept and divided by the
+        visible fraction of the light.
+    footprint
+        Whether samples are means over the surfel's splat (elliptical weighted average)
+        or interpolated bilinearly.
+    visibility
+        Method for the visibility of surfels: "rays", or "splats" as in the paper.
+    calibration
+        What to do with a capture whose photographs contradict its calibration: refuse
+        it, or record a warning.
+    refine
+        Whether cameras are first rotated so that their photographs show the face at the
+        scan, see `refine_cameras`.
+    """
+
+    spacing_mm: float = option(
+        1.5,
+        "Distance between neighbouring surfels in mm.",
+        name="spacing",
+        minimum=0.05,
+        maximum=MAX_SPACING_MM,
+    )
+    photographs: int = option(
+        4,
+        "Number of photographs kept for comparisons.",
+        minimum=0,
+        maximum=MAX_PHOTOGRAPHS,
+    )
+    soft: Literal["exclude", "keep"] = option(
+        "exclude",
+        "Treatment of samples at soft shadow edges: excluded, or divided by the "
+        "visible fraction of the light.",
+    )
+    footprint: bool = option(
+        False,
+        "Average each sample over the splat of its surfel instead of the pixels at its centre.",
+    )
+    visibility: Literal["rays", "splats"] = option(
+        "rays",
+        "Method for the visibility of lights and cameras. splats is that of the paper, "
+        "slower and less exact.",
+    )
+    calibration: Literal["refuse", "note"] = option(
+        "refuse",
+        "Treatment of captures whose photographs contradict their calibration: "
+        "refused, or recorded as notes.",
+    )
+    refine: bool = option(
+        False,
+        "Correct the orientation of each camera so that its photographs match the scan.",
+    )
+
+
+@dataclass(frozen=True)
+class SimulationParameters:
+    """Parameters of virtual captures: the dome, its frames in pixels, and the skin.
+
+    Parameters
+    ----------
+    cameras, lights, width, height
+        The dome and its frames in pixels.
+    head
+        Head model file that replaces the parametric face.
+    subsurface
+        Transport diffuse light through the skin by the dipole instead of reflecting it
+        where it enters.
+    seed
+        Random seed of the noise; shapes and skins depend on the people alone.
+    """
+
+    cameras: int = option(
+        8, "Number of cameras of the virtual dome.", minimum=1, maximum=MAX_CAMERAS
+    )
+    lights: int = option(
+        48, "Number of lights of the virtual dome.", minimum=1, maximum=MAX_LIGHTS
+    )
+    width: int = option(
+        160, "Width of a frame in pixels.", minimum=16, maximum=MAX_FRAME_SIDE_PX
+    )
+    height: int = option(
+        200, "Height of a frame in pixels.", minimum=16, maximum=MAX_FRAME_SIDE_PX
+    )
+    head: Path | None = option(
+        None, "File of a head model to use instead of the parametric face."
+    )
+    subsurface: bool = option(False, "Simulate subsurface transport by the dipole.")
+    seed: int = option(VIRTUAL_SEED, "Noise seed.", minimum=0, maximum=MAX_SEED)
+
+
+@dataclass(frozen=True)
+class SessionParameters:
+    """Parameters of a capture session in a real or a virtual laboratory.
+
+    A real session needs `setup`, `dome`, `cameras`, `subject`, `consent`, `reference` and
+    `scan`. A rehearsal (`virtual`) needs none of them: its subject is simulated, or taken
+    from the capture that `setup` names.
+    """
+
+    setup: Path | None = option(
+        None,
+        "Folder with dome/dome.json and contact/probe.json of the laboratory; with "
+        "--virtual, a complete capture.",
+    )
+    dome: str | None = option(
+        None, "Address of the light controller: /dev/ttyACM0 or socket://host:port."
+    )
+    probe: str | None = option(None, "Address of the probe.")
+    cameras: Path | None = option(
+        None,
+        "Folder that holds a folder of frames for each camera, and one named probe.",
+    )
+    subject: str | None = option(None, "Pseudonym of the subject.")
+    condition: str = option("normal", "Condition of the skin.")
+    traits: tuple[str, ...] = option(
+        (),
+        "Attribute (may be given several times).",
+        name="trait",
+        metavar="NAME=VALUE",
+    )
+    consent: str | None = option(
+        None,
+        "Scopes that the subject consents to, separated by commas: fit, statistics, "
+        "export, publish.",
+    )
+    reference: str | None = option(None, "Reference to the signed consent form.")
+    scan: Path | None = option(None, "Triangle mesh of the face in mm.")
+    landmarks: Path | None = option(None, "Landmarks on the scan (.json).")
+    regions: Path | None = option(None, "Regions of the scan (.json).")
+    calibration: str | None = option(
+        None, "Name of the calibration of the dome that ingest takes from the database."
+    )
+    sites: str = option(
+        "",
+        "Sites that the probe measures, separated by commas.  [default: none]",
+        show_default=False,
+    )
+    placements: int = option(
+        1, "Placements of the probe on each site.", minimum=1, maximum=MAX_PLACEMENTS
+    )
+    seconds: float | None = option(
+        None,
+        "Duration of the light sequence in seconds, without dark frames.  [default: the shortest]",
+        minimum=0,
+        maximum=3600,
+        above_minimum=True,
+    )
+    slower: bool = option(False, "Flash at most three times in a second.")
+    base: int = option(
+        0,
+        "Intensity of a steady lamp, in units of one light; it is measured before the "
+        "lights flash.",
+        name="base-light",
+        minimum=0,
+        maximum=1000,
+    )
+    confirm_screening: bool = option(
+        False,
+        "Confirm that the subject was screened, consented, and keeps the eyes closed.",
+    )
+    operator: str | None = option(
+        None, "ID of the operator who confirms the screening."
+    )
+    log: Path | None = option(
+        None, "Folder for logs of all bytes exchanged with the devices."
+    )
+    virtual: bool = option(
+        False, "Rehearse with emulated devices and a virtual subject."
+    )
+    seed: int | None = option(
+        None,
+        f"Random seed for the virtual subject.  [default: {VIRTUAL_SEED}]",
+        minimum=0,
+        maximum=MAX_SEED,
+    )
+    faults: tuple[str, ...] = option(
+        (), "Fault of an emulated device.", name="fault", metavar="NAME=VALUE"
+    )
