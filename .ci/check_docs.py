@@ -170,6 +170,9 @@ def command_fault(words: list[str]) -> str:
         and f"\n{words[1]}:" not in (ROOT / "Makefile").read_text("utf-8")
     ):
         return f"the Makefile has no target {words[1]}"
+    if words[:3] == ["python", "-m", "benchmarks"] and len(words) > 3:
+        program = f"benchmarks/{words[3]}.py"
+        return "" if (ROOT / program).is_file() else f"{program} does not exist"
     own = ("benchmarks/", "tests/", "docs/", ".ci/")
     missing = [
         word

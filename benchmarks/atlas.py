@@ -1,6 +1,6 @@
 """Distortion of the atlas of a scan in each round, and time and memory of maps in its layout.
 
-    python benchmarks/atlas.py CAPTURE [--levels 3] [--size 2048] [--channels 10]
+    python -m benchmarks atlas CAPTURE [--levels 3] [--size 2048] [--channels 10]
 
 Rounds are shown for both kinds of weights until one folds; `chosen` is the result of
 `disc_atlas` on the mesh after `--levels` subdivisions. Maps have random values at 95 %
@@ -9,7 +9,6 @@ of the vertices; memory is the peak of the process.
 
 from __future__ import annotations
 
-import argparse
 import resource
 import time
 from pathlib import Path
@@ -26,16 +25,13 @@ from skindb.geometry.texture import atlas_values, push_pull, rasterise_atlas
 from skindb.geometry.topology import boundary_loops, outline_first
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("capture", type=Path)
-    for name, value in (("levels", 3), ("size", 2048), ("channels", 10)):
-        parser.add_argument(f"--{name}", type=int, default=value)
-    args = parser.parse_args()
-    scan = read_scan(next(args.capture.glob("scan.*")))
+def main(
+    capture: Path, *, levels: int = 3, size: int = 2048, channels: int = 10
+) -> None:
+    scan = read_scan(next(capture.glob("scan.*")))
     mesh = clean_mesh(scan.vertices, scan.faces)
     rounds(mesh.vertices, mesh.faces)
-    vertices, faces, matrix = subdivide(mesh.vertices, mesh.faces, args.levels)
+    vertices, faces, matrix = subdivide(mesh.vertices, mesh.faces, levels)
     start = time.process_time()
     uv, report = atlas.disc_atlas(mesh.vertices, mesh.faces, finer=(matrix, faces))
     print(
@@ -46,7 +42,7 @@ def main() -> None:
     order = morton_order(vertices)
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
-    maps(uv[order], rank[faces], args.size, args.channels)
+    maps(uv[order], rank[faces], size, channels)
 
 
 def rounds(vertices: np.ndarray, faces: np.ndarray) -> None:
@@ -99,7 +95,3 @@ def maps(uv: np.ndarray, faces: np.ndarray, size: int, channels: int) -> None:
         f"peak {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20:.2f} "
         "GiB, for the whole process"
     )
-
-
-if __name__ == "__main__":
-    main()

@@ -1,7 +1,7 @@
 """How often the basis-size rule recovers the number k of planted mixtures of the
 measured BRDFs, with noise.
 
-    python benchmarks/basis_size.py [--seeds N] [--first S] [--lights L] [--cameras C] [--surfels S]
+    python -m benchmarks basis_size [--seeds N] [--first S] [--lights L] [--cameras C] [--surfels S]
 
 A planted component can only be found if removing it increases the error. The least
 important component is therefore redrawn until removing any of them increases the error
@@ -12,7 +12,6 @@ threshold of the rule was chosen on seeds 0 to 2.
 
 from __future__ import annotations
 
-import argparse
 from collections import Counter
 
 import numpy as np
@@ -102,21 +101,18 @@ def _unit(v):
     return v / np.linalg.norm(v, axis=-1, keepdims=True)
 
 
-def main() -> None:
+def main(
+    *,
+    seeds: int = 4,
+    first: int = 10,
+    lights: int = 40,
+    cameras: int = 4,
+    surfels: int = 300,
+) -> None:
     """Print one line per problem, and the counts."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    for name, default in (
-        ("seeds", 4),
-        ("first", 10),
-        ("lights", 40),
-        ("cameras", 4),
-        ("surfels", 300),
-    ):
-        parser.add_argument(f"--{name}", type=int, default=default)
-    args = parser.parse_args()
-    shape = {"surfels": args.surfels, "lights": args.lights, "cameras": args.cameras}
+    shape = {"surfels": surfels, "lights": lights, "cameras": cameras}
     counts = {True: Counter(), False: Counter()}
-    seeds = range(args.first, args.first + args.seeds)
+    seeds = range(first, first + seeds)
     for size, noise, seed in ((k, e, s) for k in SIZES for e in NOISES for s in seeds):
         systems, needed, H = planted(size, noise, seed, **shape)
         (fewest, most), error = found_sizes(systems)
@@ -149,7 +145,3 @@ def judged(size, fewest, most):
         return "right" if size == most else "wrong"
     holds = fewest <= size and (size <= most or not most)
     return "range that contains the truth" if holds else "range without the truth"
-
-
-if __name__ == "__main__":
-    main()

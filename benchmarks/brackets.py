@@ -1,11 +1,10 @@
 """Error and time of merging exposures, by the number of brackets that span the same range.
 
-python benchmarks/brackets.py [--picture FILE]
+python -m benchmarks brackets [--picture FILE]
 """
 
 from __future__ import annotations
 
-import argparse
 import time
 from pathlib import Path
 
@@ -64,11 +63,8 @@ def _rms(error, usable):
     return np.sqrt(np.mean(error[usable] ** 2)) if usable.mean() > 0.5 else np.nan
 
 
-def main() -> None:
+def main(*, picture: Path | None = None) -> None:
     """Print the table, and plot error against radiance."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--picture", type=Path, default=None)
-    arguments = parser.parse_args()
     rng = np.random.default_rng(1)
     exposure = 10 ** rng.uniform(-3, np.log10(60), (SIDE, SIDE, 1))
     radiance = np.broadcast_to(exposure / LONGEST, (SIDE, SIDE, 3))
@@ -83,8 +79,8 @@ def main() -> None:
         print(
             f"| {count} | {shot:.3f} | {spent:.2f} | {shown} | {z:.3f} | {100 * lost:.1f} % |"
         )
-    if arguments.picture:
-        draw(rows, arguments.picture)
+    if picture:
+        draw(rows, picture)
 
 
 def draw(rows, path):
@@ -115,7 +111,3 @@ def draw(rows, path):
         frameon=False,
     )
     figure.savefig(path, dpi=80)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,7 +1,7 @@
 """Times of a database in a bucket compared with a folder: commit, read, a small sample
 and verify of one capture.
 
-    python benchmarks/bucket.py [--surfels 20480] [--repeat 3] [--delay-ms 20]
+    python -m benchmarks bucket [--surfels 20480] [--repeat 3] [--delay-ms 20]
 
 The bucket is in an S3 server on this machine, in its own process, behind a proxy that
 delays every request by `--delay-ms` like a network. Folder and bucket alternate within
@@ -10,23 +10,18 @@ one run; medians and requests are printed.
 
 from __future__ import annotations
 
-import argparse
 import os
-import sys
 import tempfile
 import time
-from pathlib import Path
 from statistics import median
 
 import numpy as np
+from bucket_server import new_bucket, s3_server, settings
+from faulty_proxy import faulty_proxy
 
 from skindb.schema import dataset
 from skindb.store import Database
 from skindb.store.stage import SHARD
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from bucket_server import new_bucket, s3_server, settings
-from faulty_proxy import faulty_proxy
 
 LIGHTS = 150
 CAMERAS = 16
@@ -64,22 +59,17 @@ def steps(url: str, values: np.ndarray):
     yield "verify", clock() - begin
 
 
-def main() -> None:
+def main(*, surfels: int = 5 * SHARD, repeat: int = 3, delay_ms: float = 20.0) -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--surfels", type=int, default=5 * SHARD)
-    parser.add_argument("--repeat", type=int, default=3)
-    parser.add_argument("--delay-ms", type=float, default=20.0)
-    args = parser.parse_args()
-    values = samples(args.surfels)
+    values = samples(surfels)
     found: dict[tuple[str, str], list[float]] = {}
     requests: dict[str, int] = {}
     with (
         s3_server("localbucket") as address,
-        faulty_proxy(address, delay_s=args.delay_ms / 1000) as proxy,
+        faulty_proxy(address, delay_s=delay_ms / 1000) as proxy,
     ):
         os.environ.update(settings(proxy.address))
-        for _ in range(args.repeat):
+        for _ in range(repeat):
             with tempfile.TemporaryDirectory() as folder:
                 for name, url in (
                     ("folder", folder),
@@ -91,9 +81,7 @@ def main() -> None:
                         if name == "bucket":
                             requests[step] = len(proxy.requests)
                             proxy.requests.clear()
-    print(
-        f"{values.nbytes / 1e6:.0f} MB of samples, {args.delay_ms:g} ms delay per request"
-    )
+    print(f"{values.nbytes / 1e6:.0f} MB of samples, {delay_ms:g} ms delay per request")
     for step, count in requests.items():
         folder = median(found[step, "folder"])
         bucket = median(found[step, "bucket"])
@@ -101,7 +89,3 @@ def main() -> None:
             f"{step:32} folder {folder:6.2f} s  bucket {bucket:6.2f} s  ratio "
             f"{bucket / folder:5.1f}  {count} requests"
         )
-
-
-if __name__ == "__main__":
-    main()

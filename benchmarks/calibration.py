@@ -1,15 +1,14 @@
 """Plant errors in the calibration of captures, and print the result of the check
 against their photographs.
 
-    python benchmarks/calibration.py CAPTURE...
+    python -m benchmarks calibration CAPTURE...
 
 The first row of each capture is the unchanged capture.
 """
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -34,13 +33,14 @@ Case = tuple[str, DomeRecord, SurfelSet, Pictures]
 SPACING_MM = 3.0
 
 
-def main(folders: list[str]) -> None:
+def main(captures: Sequence[Path]) -> None:
+    """Print one row for each planted error."""
     print(
         "| capture | planted | largest offset [mm] | agreement of cameras, lights "
         "| result |\n|---|---|---|---|---|"
     )
-    for folder in folders:
-        for row in _rows(Path(folder)):
+    for folder in captures:
+        for row in _rows(folder):
             print("| " + " | ".join(row) + " |", flush=True)
 
 
@@ -187,7 +187,3 @@ def _with_cameras(dome: DomeRecord, changed: dict[int, Any]) -> DomeRecord:
         dome,
         cameras=tuple(changed.get(c, camera) for c, camera in enumerate(dome.cameras)),
     )
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])

@@ -1,7 +1,7 @@
 """Times of queries over the catalogue of many takes, in a folder and in buckets with
 different delays.
 
-    python benchmarks/catalogue.py [--takes 1000] [--delay-ms 0 20] [--repeat 3] [--out
+    python -m benchmarks catalogue [--takes 1000] [--delay-ms 0 20] [--repeat 3] [--out
     catalogue.json]
 
 Captures and models have realistic records (about 10 kB of provenance) and no data. The
@@ -14,27 +14,25 @@ Medians are printed.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import Annotated, Any
+
+from bucket_server import new_bucket, s3_server, settings
+from faulty_proxy import faulty_proxy
 
 import skindb
 from skindb.store import Database
 from skindb.store.bucket import Bucket
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from bucket_server import new_bucket, s3_server, settings
-from faulty_proxy import faulty_proxy
 
 QUERY = "condition == 'lotion' and age > 40 and fit_k == 4 and status_fitted > 0.5"
 CATALOGUE = "catalogue.json"
@@ -108,7 +106,7 @@ def copied(folder: Path, url: str) -> None:
         )
 
 
-def query(url: str, name: str) -> None:
+def time_query(url: str, name: str) -> None:
     """Run a query in this process, and print its time."""
     db = skindb.open(url)
     wall = time.perf_counter()
@@ -123,7 +121,7 @@ def query(url: str, name: str) -> None:
 
 def in_new_process(url: str, name: str) -> dict[str, float]:
     """Times of a query that runs in a new process."""
-    run = [sys.executable, __file__, "--query", url, name]
+    run = [sys.executable, "-m", "benchmarks", "catalogue", "--query", url, name]
     return dict(
         json.loads(subprocess.run(run, check=True, stdout=subprocess.PIPE).stdout)
     )
@@ -167,38 +165,31 @@ def bucket_of(folder: Path, delay_s: float) -> Iterator[tuple[str, list[Any]]]:
             yield url, proxy.requests
 
 
-def main() -> None:
+def main(
+    *,
+    takes: int = 1000,
+    repeat: int = 3,
+    delay_ms: Sequence[float] = (0.0, 20.0),
+    out: Path | None = None,
+    query: Annotated[Sequence[str], "Database and query; for internal use."] = (),
+) -> None:
     """Measure and print."""
-    if sys.argv[1:2] == ["--query"]:
-        query(*sys.argv[2:])
+    if query:
+        time_query(*query)
         return
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--takes", type=int, default=1000)
-    parser.add_argument("--repeat", type=int, default=3)
-    parser.add_argument("--delay-ms", type=float, nargs="*", default=[0.0, 20.0])
-    parser.add_argument("--out", type=Path)
-    args = parser.parse_args()
     found: dict[str, dict[str, dict[str, float]]] = {}
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) / "db"
-        fill(skindb.open(str(folder)), args.takes)
-        found["folder"] = dict(measure(str(folder), args.repeat, []))
-        for delay in args.delay_ms:
+        fill(skindb.open(str(folder)), takes)
+        found["folder"] = dict(measure(str(folder), repeat, []))
+        for delay in delay_ms:
             with bucket_of(folder, delay / 1000) as (url, requests):
-                found[f"bucket, {delay:g} ms"] = dict(
-                    measure(url, args.repeat, requests)
-                )
+                found[f"bucket, {delay:g} ms"] = dict(measure(url, repeat, requests))
     for place, queries in found.items():
         for name, one in queries.items():
             requests = f", {one['requests']:.0f} requests" if one["requests"] else ""
             print(
                 f"{place:14} {name:24} {one['wall']:6.2f} s, CPU {one['cpu']:5.2f} s{requests}"
             )
-    if args.out:
-        args.out.write_text(json.dumps({"takes": args.takes, "found": found}, indent=1))
-
-
-if __name__ == "__main__":
-    main()
+    if out:
+        out.write_text(json.dumps({"takes": takes, "found": found}, indent=1))

@@ -2,7 +2,7 @@
 
     skindb simulate captures --cohort 87 --workers 2
     skindb ingest db captures/*/ --workers 2 && skindb fit db --workers 2
-    python benchmarks/cohort.py captures db [--group-by gender] [--adjust age]
+    python -m benchmarks cohort captures db [--group-by gender] [--adjust age]
 
 For every quantity that `analyze groups` compares and whose truth is known (R_d of
 regions, sigma_tr of sites), the table has the mean over subjects and its truth, the
@@ -14,7 +14,7 @@ true values share.
 
 from __future__ import annotations
 
-import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -50,19 +50,13 @@ def truth_of(path: Path, cohort: xr.Dataset) -> xr.Dataset:
     )
 
 
-def main() -> None:
+def main(
+    captures: Path, db: str, *, group_by: str = "gender", adjust: Sequence[str] = ()
+) -> None:
     """Compare and print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("captures", type=Path)
-    parser.add_argument("db")
-    parser.add_argument("--group-by", default="gender")
-    parser.add_argument("--adjust", nargs="*", default=[])
-    args = parser.parse_args()
-    cohort = skindb.open(args.db).cohort("tables").load()
+    cohort = skindb.open(db).cohort("tables").load()
     true = [
-        truth_of(args.captures / f"{take}.truth.npz", cohort)
+        truth_of(captures / f"{take}.truth.npz", cohort)
         for take in cohort["take"].values.tolist()
     ]
     planted = xr.concat(true, "take").assign_coords(cohort.coords)
@@ -76,7 +70,7 @@ def main() -> None:
     planted = cohort.drop_vars(
         [name for name in cohort if str(name).endswith("_error")]
     ).assign(kept)
-    options = {"group_by": args.group_by, "adjust": args.adjust, "permutations": 1000}
+    options = {"group_by": group_by, "adjust": adjust, "permutations": 1000}
     found, want = (
         group_effects(one, rng=np.random.default_rng(0), **options)
         for one in (cohort, planted)
@@ -120,7 +114,3 @@ def _mean(cohort: xr.Dataset, quantity: str) -> float:
     return float(
         cohort[variable].sel({dim: place}).isel(channel=labels.index(channel)).mean()
     )
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """Pictures of an exported bundle in Blender and Mitsuba 3, compared with those of skindb.
 
-python benchmarks/exports.py DB [--take NAME] [--blender PYTHON] [--mitsuba PYTHON]
+python -m benchmarks exports DB [--take NAME] [--blender PYTHON] [--mitsuba PYTHON]
 [--out FOLDER] [--picture FILE]
 
 DB contains a fitted model with translucency. PYTHON is an interpreter with the package
@@ -20,12 +20,12 @@ a plate is compared with the dipole.
 
 from __future__ import annotations
 
-import argparse
 import json
 import subprocess
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import OpenEXR
@@ -316,7 +316,7 @@ def run(python: str, program: str, jobs: list[dict], folder: Path) -> None:
     described = folder / "jobs.json"
     described.write_text(json.dumps(jobs), encoding="utf-8")
     subprocess.run(
-        [python, str(HERE / program), str(described)],
+        [python, str(HERE / "programs" / program), str(described)],
         check=True,
         stdout=subprocess.DEVNULL,
     )
@@ -346,25 +346,22 @@ def described(camera: Camera, light: Lights) -> dict:
     }
 
 
-def main() -> None:
+def main(
+    db: str,
+    *,
+    take: str | None = None,
+    blender: Annotated[str | None, "Python with bpy"] = None,
+    mitsuba: Annotated[str | None, "Python with mitsuba and numpy"] = None,
+    out: Path | None = None,
+    picture: Annotated[
+        Path | None,
+        "picture of the second light, without and with light under the skin",
+    ] = None,
+) -> None:
     """Print the differences, and write pictures and figures."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("db")
-    parser.add_argument("--take")
-    parser.add_argument("--blender", help="Python with bpy")
-    parser.add_argument("--mitsuba", help="Python with mitsuba and numpy")
-    parser.add_argument("--out", type=Path)
-    parser.add_argument(
-        "--picture",
-        type=Path,
-        help="picture of the second light, without and with light under the skin",
-    )
-    options = parser.parse_args()
-    out = (options.out or Path(tempfile.mkdtemp())).absolute()
-    db = skindb.open(options.db)
-    model = db.read("model", options.take or db.takes("model")[0])
+    out = (out or Path(tempfile.mkdtemp())).absolute()
+    db = skindb.open(db)
+    model = db.read("model", take or db.takes("model")[0])
     bundle = export_bundle(model, out / "bundle", merl=False).parent
     stage = set_stage(model)
     figures = {}
@@ -388,35 +385,31 @@ def main() -> None:
             "true": "whole",
             "out": f"{out}/{angle}_mitsuba.exr",
         }
-        if options.blender:
-            run(options.blender, "exports_blender.py", jobs, out)
-        if options.mitsuba:
-            run(options.mitsuba, "exports_mitsuba.py", [exact], out)
+        if blender:
+            run(blender, "exports_blender.py", jobs, out)
+        if mitsuba:
+            run(mitsuba, "exports_mitsuba.py", [exact], out)
         for job in [
-            *(jobs if options.blender else []),
-            *([exact] if options.mitsuba else []),
+            *(jobs if blender else []),
+            *([exact] if mitsuba else []),
         ]:
             path = Path(job["out"])
             found = read(path, "" if job is exact else "ViewLayer.Combined.")
             figures[f"{angle}: {job['name']}"] = compare(
                 stage, job, true[job["true"]], found, path.with_suffix(".png")
             )
-        if options.blender:
+        if blender:
             controls(stage, Path(jobs[0]["out"]))
-    if options.blender:
-        run(options.blender, "exports_blender.py", spread_jobs(out), out)
+    if blender:
+        run(blender, "exports_blender.py", spread_jobs(out), out)
         report_spread(out)
-        if options.picture:
+        if picture:
             angle = list(point_lights(model, stage.view))[1]
             draw(
                 [out / f"{angle}_{list(WAYS).index(name)}.png" for name in SHOWN],
-                options.picture,
+                picture,
             )
     (out / "figures.json").write_text(
         json.dumps(figures, indent=1) + "\n", encoding="utf-8"
     )
     print(f"pictures, and the figures of each region: {out}")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,7 +1,7 @@
 """Time and size of storing the first pass of a fit, compared with the time that a
 resumed fit saves.
 
-    python benchmarks/first_pass.py [--surfels 16384] [--repeat 3]
+    python -m benchmarks first_pass [--surfels 16384] [--repeat 3]
 
 Planted skin under 60 lights and 8 cameras is fitted with the embedded dictionary by
 `fit_take`. The first fit compiles and is not counted; medians of the others are
@@ -10,15 +10,10 @@ printed.
 
 from __future__ import annotations
 
-import argparse
-import sys
 import tempfile
 import time
-from pathlib import Path
 from statistics import median
 from typing import Any
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from planted_skin import capture_of, make_skin
 
@@ -29,11 +24,7 @@ from skindb.workflow.derive import FIRST_PASS, groups_of
 TAKE = "S01"
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--surfels", type=int, default=16384)
-    parser.add_argument("--repeat", type=int, default=3)
-    asked = parser.parse_args()
+def main(*, surfels: int = 16384, repeat: int = 3) -> None:
     seconds: dict[str, list[float]] = {"keep": [], "first pass": [], "fit": []}
     keep = fit_module._store_first_pass
 
@@ -47,11 +38,11 @@ def main() -> None:
     fit_module._store_first_pass = timed
     with tempfile.TemporaryDirectory() as folder:
         db = Database(folder)
-        capture = capture_of(make_skin(surfels=asked.surfels))
+        capture = capture_of(make_skin(surfels=surfels))
         with db.stage("capture", TAKE) as stage:
             stage.write(groups_of(capture))
             stage.commit(capture.attrs)
-        for _ in range(asked.repeat + 1):
+        for _ in range(repeat + 1):
             begin = time.perf_counter()
             record = fit_module.fit_take(db, TAKE)
             seconds["fit"].append(time.perf_counter() - begin)
@@ -60,11 +51,7 @@ def main() -> None:
         median(seconds[name][1:]) for name in ("fit", "keep", "first pass")
     )
     print(
-        f"{asked.surfels} surfels: fit {whole:.1f} s, of which first pass "
+        f"{surfels} surfels: fit {whole:.1f} s, of which first pass "
         f"{first:.1f} s and storing it {kept:.2f} s"
     )
     print(f"storing it: {kept / whole:.1%} of the fit, {size[-1] / 1e6:.1f} MB")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """Time and results of the fit of one take, by an earlier revision and by the current code.
 
-    python benchmarks/fit.py CAPTURE [--before df1cf9e] [--repeats 3] [--json OUT] [--folder FOLDER]
+    python -m benchmarks fit CAPTURE [--before df1cf9e] [--repeats 3] [--json OUT] [--folder FOLDER]
 
 The earlier revision is extracted from git and ingests CAPTURE into a temporary
 database, of which each side fits a copy. Every fit runs in its own process; the two
@@ -9,7 +9,6 @@ sides alternate, and medians are printed. Compilation is not timed.
 
 from __future__ import annotations
 
-import argparse
 import io
 import json
 import os
@@ -21,7 +20,7 @@ import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import xarray as xr
@@ -30,7 +29,7 @@ import skindb
 from skindb.schema import FitStatus
 
 ROOT = Path(__file__).resolve().parent.parent
-DRIVER = Path(__file__).with_name("fit_driver.py")
+DRIVER = Path(__file__).parent / "programs/fit_driver.py"
 SIDES = ("before", "after")
 STAGES = {  # stage of the current code -> stages of the earlier revision
     "dictionary": ("dictionary",),
@@ -235,32 +234,23 @@ def measure(capture: Path, revision: str, repeats: int, folder: Path) -> dict[st
     }
 
 
-def main() -> None:
+def main(
+    capture: Path,
+    *,
+    before: Annotated[
+        str, "Revision to compare with, from before schema version 2."
+    ] = "df1cf9e",
+    repeats: Annotated[int, "Number of timed runs per side."] = 3,
+    json_: Annotated[Path | None, "File for all results."] = None,
+    folder: Annotated[
+        Path | None,
+        "Folder that keeps the earlier code and the databases (default: temporary).",
+    ] = None,
+) -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("capture", type=Path)
-    parser.add_argument(
-        "--before",
-        default="df1cf9e",
-        help="Revision to compare with, from before schema version 2.",
-    )
-    parser.add_argument(
-        "--repeats", type=int, default=3, help="Number of timed runs per side."
-    )
-    parser.add_argument("--json", type=Path, help="File for all results.")
-    parser.add_argument(
-        "--folder",
-        type=Path,
-        help="Folder that keeps the earlier code and the databases (default: temporary).",
-    )
-    args = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
-        folder = (args.folder or Path(temporary)).resolve()
-        results = measure(args.capture.resolve(), args.before, args.repeats, folder)
+        folder = (folder or Path(temporary)).resolve()
+        results = measure(capture.resolve(), before, repeats, folder)
     print(report(results))
-    if args.json:
-        args.json.write_text(json.dumps(results, indent=1), encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()
+    if json_:
+        json_.write_text(json.dumps(results, indent=1), encoding="utf-8")

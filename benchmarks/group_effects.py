@@ -1,6 +1,6 @@
 """P values, intervals and power of group comparisons over many planted cohorts.
 
-    python benchmarks/group_effects.py [--cohorts 200] [--subjects 87] [--permutations
+    python -m benchmarks group_effects [--cohorts 200] [--subjects 87] [--permutations
     1000] [--seed 0]
 
 Each cohort has the tables of `--subjects` subjects. The smaller of two groups is a
@@ -14,19 +14,14 @@ after adjustment for age.
 
 from __future__ import annotations
 
-import argparse
-import sys
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import xarray as xr
+from planted_tables import planted_tables
 from scipy import stats
 
 from skindb.analysis import group_effects
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from planted_tables import planted_tables
 
 R_D = "R_d face G"
 SIGMA_TR = "sigma_tr cheek G"
@@ -83,30 +78,24 @@ def paired(n: int, seed: int) -> xr.Dataset:
     )
 
 
-def main() -> None:
+def main(
+    *, cohorts: int = 200, subjects: int = 87, permutations: int = 1000, seed: int = 0
+) -> None:
     """Compare all cohorts and print a table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--cohorts", type=int, default=200)
-    parser.add_argument("--subjects", type=int, default=87)
-    parser.add_argument("--permutations", type=int, default=1000)
-    parser.add_argument("--seed", type=int, default=0)
-    args = parser.parse_args()
-    n = args.subjects
+    n = subjects
 
     def over(
         cohort: Callable[[int], xr.Dataset], group_by: str, **options: tuple[str, ...]
     ) -> xr.Dataset:
         """First contrast of every cohort."""
         every = []
-        for i in range(args.cohorts):
-            seed = args.seed * 100_000 + i
-            rng = np.random.default_rng([4, seed])
+        for i in range(cohorts):
+            number = seed * 100_000 + i
+            rng = np.random.default_rng([4, number])
             table = group_effects(
-                cohort(seed),
+                cohort(number),
                 group_by=group_by,
-                permutations=args.permutations,
+                permutations=permutations,
                 rng=rng,
                 **options,
             )
@@ -156,7 +145,7 @@ def main() -> None:
         found = over(lambda seed: confounded(n, seed), "ancestry", adjust=adjust)[
             "effect"
         ].sel(quantity=R_D)
-        error = float(found.std()) / np.sqrt(args.cohorts)
+        error = float(found.std()) / np.sqrt(cohorts)
         print(
             f"| confounded by age, {name} | {R_D} | mean effect "
             f"{float(found.mean()):.4f}, standard error {error:.4f} |"
@@ -165,7 +154,3 @@ def main() -> None:
     print(
         f"| conditions within subjects | {R_D} | covered: {covered(both, R_D, 0.001)} |"
     )
-
-
-if __name__ == "__main__":
-    main()

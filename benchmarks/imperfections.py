@@ -1,7 +1,7 @@
 """Captures of imperfect domes: accuracy of the recovered parameters, and coverage of
 their stated errors.
 
-    python benchmarks/imperfections.py DB CAPTURE [CAPTURE...]
+    python -m benchmarks imperfections DB CAPTURE [CAPTURE...]
 
 Each capture folder has its truth beside it as <folder>.truth.npz (keys of
 skindb.virtual.truth). The captures are ingested into DB, which must be new, and fitted
@@ -14,15 +14,15 @@ captures.
 
 from __future__ import annotations
 
-import argparse
 import json
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
-from validate import header
 
 import skindb
+from benchmarks.validate import header
 from skindb.errors import InputError
 from skindb.fit import FitParameters, reflectance_interval
 from skindb.store import Database
@@ -104,24 +104,22 @@ def numbers(values: Any, form: str = ".1f") -> str:
     return " ".join(f"{value:{form}}" for value in values)
 
 
-def main() -> None:
+def main(
+    db: str,
+    captures: Sequence[Path],
+    *,
+    corrected: Annotated[
+        bool, "Ingest with --refine, and fit with --inter-reflection."
+    ] = False,
+    json_: Annotated[Path | None, "File for all results."] = None,
+) -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("db")
-    parser.add_argument("captures", nargs="+", type=Path)
-    parser.add_argument(
-        "--corrected",
-        action="store_true",
-        help="Ingest with --refine, and fit with --inter-reflection.",
-    )
-    parser.add_argument("--json", type=Path, help="File for all results.")
-    args = parser.parse_args()
-    db = skindb.open(args.db)
+    db = skindb.open(db)
     results = []
     print(header(*COLUMNS))
-    for folder in args.captures:
+    for folder in captures:
         try:
-            results.append(measure(db, folder, corrected=args.corrected))
+            results.append(measure(db, folder, corrected=corrected))
         except InputError as error:
             results.append(
                 {"capture": folder.name, "refused": str(error).splitlines()[0]}
@@ -138,11 +136,5 @@ def main() -> None:
         print(
             f"Median half-width of the interval, R G B: {numbers(100 * width, '.0f')} %"
         )
-    if args.json:
-        args.json.write_text(
-            json.dumps(results, indent=1, default=str), encoding="utf-8"
-        )
-
-
-if __name__ == "__main__":
-    main()
+    if json_:
+        json_.write_text(json.dumps(results, indent=1, default=str), encoding="utf-8")

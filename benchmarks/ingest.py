@@ -1,7 +1,7 @@
 """Ingest compared with decoding alone: CPU time, wall time and peak anonymous memory of
 every stage.
 
-    python benchmarks/ingest.py CAPTURE [--spacing MM] [--every N] [--json FILE]
+    python -m benchmarks ingest CAPTURE [--spacing MM] [--every N] [--json FILE]
 
 The CPU times are compared. Every N-th frame of each kind (face, white target, dark) is
 decoded with the same number of threads before and after the ingest, and the mean of
@@ -11,7 +11,6 @@ of the code also compiles, so run it twice.
 
 from __future__ import annotations
 
-import argparse
 import json
 import tempfile
 import time
@@ -19,9 +18,8 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from stages import Stages, stage_lines
-
 import skindb
+from benchmarks.stages import Stages, stage_lines
 from skindb.format.dome import promised_frames
 from skindb.format.folder import read_capture
 from skindb.format.frames import FrameKind, read_frame
@@ -56,31 +54,29 @@ def decoding(folder: Path, every: int) -> dict[str, dict[str, float]]:
     return found
 
 
-def main() -> None:
+def main(
+    capture: Path,
+    *,
+    spacing: float = 1.5,
+    every: int = 10,
+    footprint: bool = False,
+    json_: Path | None = None,
+) -> None:
     """Print a table, and write the results."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("capture", type=Path)
-    parser.add_argument("--spacing", type=float, default=1.5)
-    parser.add_argument("--every", type=int, default=10)
-    parser.add_argument("--footprint", action="store_true")
-    parser.add_argument("--json", type=Path)
-    options = parser.parse_args()
-    before = decoding(options.capture, options.every)
+    before = decoding(capture, every)
     with (
-        tempfile.TemporaryDirectory(dir=options.capture.parent) as folder,
+        tempfile.TemporaryDirectory(dir=capture.parent) as folder,
         Stages() as stages,
     ):
         record = ingest_take(
             skindb.open(folder),
-            options.capture,
-            spacing_mm=options.spacing,
-            footprint=options.footprint,
+            capture,
+            spacing_mm=spacing,
+            footprint=footprint,
             progress=stages,
         )
         stages.end("commit")
-    after = decoding(options.capture, options.every)
+    after = decoding(capture, every)
     alone = {
         kind: {key: (before[kind][key] + after[kind][key]) / 2 for key in before[kind]}
         for kind in before
@@ -91,8 +87,8 @@ def main() -> None:
     table = stages.table()
     ratio = table["all"]["cpu"] / decoded["cpu"]
     result: dict[str, Any] = {
-        "capture": options.capture.name,
-        "spacing_mm": options.spacing,
+        "capture": capture.name,
+        "spacing_mm": spacing,
         "decoding": alone,
     }
     result |= {"stages": table, "ratio_cpu": ratio, "bytes": record.bytes}
@@ -103,9 +99,5 @@ def main() -> None:
     print("\n".join(stage_lines({**rows, "decode all": decoded, **table})))
     print(f"ratio {ratio:.2f}, {record.bytes / 1e6:.0f} MB")
     print("\n".join(sample_lines(result["samples"])))
-    if options.json:
-        options.json.write_text(json.dumps(result, indent=1), encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()
+    if json_:
+        json_.write_text(json.dumps(result, indent=1), encoding="utf-8")

@@ -1,6 +1,6 @@
 """Distances of suggested landmarks to the true ones, for scans whose landmarks are known.
 
-    python benchmarks/landmark_suggestions.py FOLDER...
+    python -m benchmarks landmark_suggestions FOLDER...
 
 Each FOLDER has scan.ply and landmarks.json, as a capture has. One Markdown row for each
 case: the points that are set, the scan as it is, and turned.
@@ -8,8 +8,8 @@ case: the points that are set, the scan as it is, and turned.
 
 from __future__ import annotations
 
-import argparse
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -38,10 +38,8 @@ CASES = {  # points that are set, and the turn about the vertical in degrees
 Scan = tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("folders", type=Path, nargs="+")
-    scans = [read(folder) for folder in parser.parse_args().folders]
+def main(folders: Sequence[Path]) -> None:
+    scans = [read(folder) for folder in folders]
     print(
         f"{len(scans)} scans\n\n| points that are set | median [mm] | 95 % | "
         "largest | farthest point |"
@@ -79,7 +77,3 @@ def errors(scan: Scan, given: tuple[str, ...], turn: float) -> dict[str, float]:
     mirrored = {name for name in found if mate(name) in given and mate(name) != name}
     kept = mirrored if set(RIGHT) <= set(given) else set(found)
     return {name: float(np.linalg.norm(found[name] - turned[name])) for name in kept}
-
-
-if __name__ == "__main__":
-    main()

@@ -1,7 +1,7 @@
 """Estimation of planted gains of the lights in captures with known truth: residual
 gains, and effect on the errors.
 
-    python benchmarks/light_gains.py DB CAPTURE [CAPTURE...]
+    python -m benchmarks light_gains DB CAPTURE [CAPTURE...]
 
 Each capture folder has its truth beside it as <folder>.truth.npz (keys of
 skindb.virtual.truth). The captures are ingested into DB; their samples are multiplied
@@ -11,15 +11,15 @@ out. The Markdown table has one row for each capture and size of the gains.
 
 from __future__ import annotations
 
-import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import xarray as xr
-from validate import header
 
 import skindb
+from benchmarks.validate import header
 from skindb.fit import FitParameters, fit_model
 from skindb.virtual.truth import recovered_against_true
 from skindb.workflow import ingest_take
@@ -47,15 +47,11 @@ def planted(capture: xr.DataTree, gain: np.ndarray[Any, Any]) -> xr.DataTree:
     return out
 
 
-def main() -> None:
+def main(db: str, captures: Sequence[Path]) -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("db")
-    parser.add_argument("captures", nargs="+", type=Path)
-    args = parser.parse_args()
-    db = skindb.open(args.db)
+    db = skindb.open(db)
     print(header(*COLUMNS))
-    for folder in args.captures:
+    for folder in captures:
         capture = db.read("capture", ingest_take(db, folder, calibration="note").take)
         truth = dict(np.load(folder.with_name(folder.name + ".truth.npz")))
         normal = (
@@ -85,7 +81,3 @@ def main() -> None:
                 "{:.1f}, {:.1f}".format(*errors),
             )
             print(f"| {folder.name} | {' | '.join(cells)} |", flush=True)
-
-
-if __name__ == "__main__":
-    main()

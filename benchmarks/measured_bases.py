@@ -1,9 +1,9 @@
 """Measured bases: errors of the embedded ABC set, of grids of tables, and of dense
 reconstructions of MERL.
 
-    python benchmarks/measured_bases.py            the embedded materials at a disc of 0.8 degrees
-    python benchmarks/measured_bases.py --grid       error of the tables by number of nodes and size
-    python benchmarks/measured_bases.py --merl DIR with nbrdf_weights.npz, merl_slices_phid90.npz
+    python -m benchmarks measured_bases            the embedded materials at a disc of 0.8 degrees
+    python -m benchmarks measured_bases --grid       error of the tables by number of nodes and size
+    python -m benchmarks measured_bases --merl DIR with nbrdf_weights.npz, merl_slices_phid90.npz
 
 `--merl`: networks fitted to MERL (Sztrajman et al. 2021) are written as MERL binaries,
 read back, compared with the measured slices at phi_d = 90 degrees and with the ABC
@@ -12,7 +12,6 @@ formula, and fitted with mixtures of the embedded 59.
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 from pathlib import Path
 from time import process_time
@@ -265,21 +264,11 @@ def _network(weights, x):
     return x
 
 
-def main() -> None:
+def main(*, grid_: bool = False, merl_: Path | None = None) -> None:
     """Print the requested tables."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--grid", action="store_true")
-    parser.add_argument("--merl", type=Path, metavar="DIR")
-    arguments = parser.parse_args()
-    if arguments.grid:
+    if grid_:
         grid()
-    elif arguments.merl:
-        merl(arguments.merl)
+    elif merl_:
+        merl(merl_)
     else:
         embedded()
-
-
-if __name__ == "__main__":
-    main()

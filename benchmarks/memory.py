@@ -1,6 +1,6 @@
 """Peak memory and time of the fit of a take with many surfels, made by repeating a capture.
 
-    python benchmarks/memory.py DB TAKE [--surfels 600000]
+    python -m benchmarks memory DB TAKE [--surfels 600000]
 
 Samples are read block by block from DB, as for a real take of that size. The model is
 committed to a temporary database.
@@ -8,16 +8,14 @@ committed to a temporary database.
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 from pathlib import Path
 
 import xarray as xr
 from dask.graph_manipulation import clone
-from fit_driver import peak
-from stages import Stages, stage_lines
 
 import skindb
+from benchmarks.stages import Stages, peak, stage_lines
 from skindb.fit import FitParameters, fit_model
 from skindb.store import Database
 from skindb.workflow.fit import groups_of
@@ -38,33 +36,25 @@ def repeated(capture: xr.DataTree, surfels: int) -> xr.DataTree:
     return tree
 
 
-def main() -> None:
+def main(
+    db: str, take: str, *, surfels: int = 600000, hold_out_lights: float = 0.1
+) -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("db")
-    parser.add_argument("take")
-    parser.add_argument("--surfels", type=int, default=600_000)
-    parser.add_argument("--hold-out-lights", type=float, default=0.1)
-    args = parser.parse_args()
-    capture = repeated(skindb.open(args.db).read("capture", args.take), args.surfels)
-    parameters = FitParameters(hold_out_lights=args.hold_out_lights)
+    capture = repeated(skindb.open(db).read("capture", take), surfels)
+    parameters = FitParameters(hold_out_lights=hold_out_lights)
     before = peak()
     with tempfile.TemporaryDirectory() as folder, Stages() as stages:
         model = fit_model(capture, parameters, progress=stages)
         stages.end("rest")
-        with Database(Path(folder)).stage("model", args.take) as stage:
+        with Database(Path(folder)).stage("model", take) as stage:
             stage.write(groups_of(model))
-            stage.commit({"take": args.take})
+            stage.commit({"take": take})
         stages.end("commit")
     print("\n".join(stage_lines(stages.table())))
     print("peaks of stages are anonymous memory, without memory-mapped files")
     lights, cameras = (capture["samples"].sizes[dim] for dim in ("light", "camera"))
     fitted = model.attrs["status"].get("fitted", 0.0)
     print(
-        f"{args.surfels:,} surfels, {fitted:.1%} fitted, {lights} lights, {cameras} cameras"
+        f"{surfels:,} surfels, {fitted:.1%} fitted, {lights} lights, {cameras} cameras"
     )
     print(f"peak resident memory: {peak():.2f} GiB ({before:.2f} before the fit)")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """What plans of pictures and pages skip, what it gains, and what it would not gain.
 
-python benchmarks/omissions.py DB [--take NAME]
+python -m benchmarks omissions DB [--take NAME]
 
 DB contains a fitted model with translucency. CPU times are of pictures with and without
 their plan; both have the same random numbers. The other lines are about what is not
@@ -10,14 +10,13 @@ no view shows, and nodes of the BRDF tables of the viewer's page.
 
 from __future__ import annotations
 
-import argparse
 import time
 from dataclasses import replace
 
 import numpy as np
-from rendering import sky
 
 import skindb
+from benchmarks.rendering import sky
 from skindb.geometry.rays import RayScene
 from skindb.optics.angles import directions
 from skindb.render.direct import trace_view
@@ -217,16 +216,10 @@ def resampled(values, place):
     return values[low] * (1 - part) + values[low + 1] * part
 
 
-def main() -> None:
+def main(db: str, *, take: str | None = None) -> None:
     """Print the results."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("db")
-    parser.add_argument("--take")
-    options = parser.parse_args()
-    db = skindb.open(options.db)
-    model = db.read("model", options.take or db.takes("model")[0])
+    db = skindb.open(db)
+    model = db.read("model", take or db.takes("model")[0])
     dome = model["dome"].to_dataset().load()
     surface, (camera, _), lights = (
         from_model(model, fill=True),
@@ -243,7 +236,3 @@ def main() -> None:
     behind(surface, scene)
     hidden(surface, scene)
     nodes(surface.tables)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,12 +1,10 @@
 """Coverage of the 95 % intervals of sigma_tr, for noisy profiles of random media with
 known and free gain.
 
-python benchmarks/probe_intervals.py [--profiles N]
+python -m benchmarks probe_intervals [--profiles N]
 """
 
 from __future__ import annotations
-
-import argparse
 
 import numpy as np
 
@@ -45,13 +43,11 @@ def draws(count, *, relative, floor, free, seed=1):
             yield fit, true
 
 
-def main() -> None:
+def main(*, profiles: int = 200) -> None:
     """Print coverage, errors of profiles with the status fitted, and the fraction that
     is flagged.
     """
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--profiles", type=int, default=200)
-    count = parser.parse_args().profiles
+    count = profiles
     print(
         "| gain | noise | floor [mm^-2] | in the interval | median error | largest "
         "error, status fitted | flagged |"
@@ -77,7 +73,3 @@ def main() -> None:
                     f" | {100 * np.mean(~fitted):.0f} % |",
                     flush=True,
                 )
-
-
-if __name__ == "__main__":
-    main()

@@ -1,15 +1,15 @@
 """Error of every profile R(r) relative to a random walk, and its time.
 
-    python benchmarks/profiles.py [--png FILE]
+    python -m benchmarks profiles [--png FILE]
 
 `work_precision()` returns the rows; the command prints the table and plots the curves.
 """
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 from time import perf_counter
+from typing import Annotated
 
 import numpy as np
 
@@ -137,11 +137,10 @@ def plot(rows, path: Path) -> None:
     figure.savefig(path, dpi=110)
 
 
-def main() -> None:
+def main(
+    *, png: Annotated[Path | None, "File for the plot of the curves."] = None
+) -> None:
     """Print the table of errors (noise of the walk) in per cent."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--png", type=Path, help="File for the plot of the curves.")
-    args = parser.parse_args()
     rows = work_precision()
     print(
         "| albedo | model | "
@@ -163,9 +162,5 @@ def main() -> None:
             f"| {first['albedo']} | {first['model']} | {' | '.join(cells)} | "
             f"{1e3 * first['seconds']:.2f} |"
         )
-    if args.png:
-        plot(rows, args.png)
-
-
-if __name__ == "__main__":
-    main()
+    if png:
+        plot(rows, png)

@@ -1,11 +1,10 @@
 """Time and error of the steerable pyramid compared with pyrtools, in one run.
 
-python benchmarks/pyramid.py [--size 2048] [--rounds 3] [--threads 1]
+python -m benchmarks pyramid [--size 2048] [--rounds 3] [--threads 1]
 """
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable
 from typing import Any
@@ -27,14 +26,9 @@ def best(call: Callable[[], Any], rounds: int) -> tuple[float, Any]:
     return min(seconds), found
 
 
-def main() -> None:
+def main(*, size: int = 2048, rounds: int = 3, threads: int = 1) -> None:
     """Run and print."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--size", type=int, default=2048)
-    parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--threads", type=int, default=1)
-    asked = parser.parse_args()
-    image = np.random.default_rng(0).normal(size=(asked.size, asked.size))
+    image = np.random.default_rng(0).normal(size=(size, size))
     print(
         f"{'':<22} {'build [s]':>10} {'reconstruct [s]':>16} {'largest error / range':>22}"
     )
@@ -43,17 +37,15 @@ def main() -> None:
         ("skindb, float64", image),
         ("skindb, float32", image.astype(np.float32)),
     ):
-        with set_workers(asked.threads):
-            built, pyramid = best(lambda x=x: build(x), asked.rounds)
-            back, again = best(lambda p=pyramid: reconstruct(p), asked.rounds)
+        with set_workers(threads):
+            built, pyramid = best(lambda x=x: build(x), rounds)
+            back, again = best(lambda p=pyramid: reconstruct(p), rounds)
         whole[name] = built + back
         print(
             f"{name:<22} {built:>10.2f} {back:>16.2f} {np.abs(again - x).max() / np.ptp(x):>22.1e}"
         )
-    built, other = best(
-        lambda: SteerablePyramidFreq(image, height=7, order=3), asked.rounds
-    )
-    back, again = best(other.recon_pyr, asked.rounds)
+    built, other = best(lambda: SteerablePyramidFreq(image, height=7, order=3), rounds)
+    back, again = best(other.recon_pyr, rounds)
     print(
         f"{'pyrtools':<22} {built:>10.2f} {back:>16.2f} "
         f"{np.abs(again - image).max() / np.ptp(image):>22.1e}"
@@ -64,7 +56,3 @@ def main() -> None:
             for name, seconds in whole.items()
         )
     )
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """Error of responses and of light intensities, from simulated captures with known truth.
 
-python benchmarks/radiometry.py CAPTURE... [--exposures FOLDER] [--photometric FOLDER]
+python -m benchmarks radiometry CAPTURE... [--exposures FOLDER] [--photometric FOLDER]
 
 The truth of each CAPTURE is in CAPTURE.truth.npz. FOLDER contains the published
 exposure stacks or the photographs of the chrome ball.
@@ -8,7 +8,7 @@ exposure stacks or the photographs of the chrome ball.
 
 from __future__ import annotations
 
-import argparse
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -203,13 +203,13 @@ def chrome_directions(folder):
     return np.array(angles)
 
 
-def main() -> None:
+def main(
+    captures: Sequence[Path] = (),
+    *,
+    exposures: Path | None = None,
+    photometric: Path | None = None,
+) -> None:
     """Print one table for the captures and one line for each set of published data."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("captures", type=Path, nargs="*")
-    parser.add_argument("--exposures", type=Path)
-    parser.add_argument("--photometric", type=Path)
-    arguments = parser.parse_args()
     print(
         "| capture | largest error of `light_intensities` | of `fit_light` | fitted fall-off ",
         end="",
@@ -217,7 +217,7 @@ def main() -> None:
     print("| `calibrate_lights`: mean error, largest error, glare, rms z |")
     print("|---" * 5 + "|")
     curved = {}
-    for folder in arguments.captures:
+    for folder in captures:
         capture = read_capture(folder)
         truth = np.load(folder.with_name(folder.name + ".truth.npz"))
         used, own, falloff = light_errors(capture, truth)
@@ -242,18 +242,14 @@ def main() -> None:
                 f"2^{o} {100 * b:+.2f} %" for o, b in zip(OCTAVES, bias, strict=True)
             )
             print(f"{name}, bias of radiance with the {response} response: {shown}")
-    if arguments.exposures:
+    if exposures:
         print(
             "frobisher, RMS difference of ln exposure, R G B:",
-            published_response(arguments.exposures)[2].round(4),
+            published_response(exposures)[2].round(4),
         )
-    if arguments.photometric:
-        angles = chrome_directions(arguments.photometric)
+    if photometric:
+        angles = chrome_directions(photometric)
         print(
             f"chrome ball: median {np.median(angles):.2f} degrees, largest "
             f"{angles.max():.2f} degrees"
         )
-
-
-if __name__ == "__main__":
-    main()

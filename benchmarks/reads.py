@@ -1,7 +1,7 @@
 """Time of verified reads: digests of the record compared with zarr's crc32c codec and
 with no check.
 
-    python benchmarks/reads.py [--surfels 20480] [--repeat 5]
+    python -m benchmarks reads [--surfels 20480] [--repeat 5]
 
 Samples in the layout of the store (150 lights x 16 cameras) are read completely by
 shards, and in part by chunks of 256 surfels, from the page cache. The three methods
@@ -10,7 +10,6 @@ alternate within one run; ratios of medians are printed.
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 import time
 from pathlib import Path
@@ -79,15 +78,11 @@ def part(array: zarr.Array) -> None:
         array[start + 2 * CHUNK : start + 3 * CHUNK]
 
 
-def main() -> None:
+def main(*, surfels: int = 5 * stage_module.SHARD, repeat: int = 5) -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--surfels", type=int, default=5 * stage_module.SHARD)
-    parser.add_argument("--repeat", type=int, default=5)
-    args = parser.parse_args()
     zarr.config.set({"array.order": "F"})
     with tempfile.TemporaryDirectory() as folder:
-        values = samples(args.surfels)
+        values = samples(surfels)
         summed = write_checksums(Path(folder) / "crc32c", values)
         db = Database(Path(folder) / "db")
         with db.stage("capture", "A1") as stage:
@@ -100,7 +95,7 @@ def main() -> None:
             "digests of the record": lambda: VerifiedStore(db._place, record),
         }
         seconds: dict[tuple[str, str], list[float]] = {}
-        for _ in range(args.repeat):
+        for _ in range(repeat):
             for name, store in stores.items():
                 for what, read in (("whole", whole), ("part", part)):
                     begin = time.perf_counter()
@@ -108,9 +103,9 @@ def main() -> None:
                     seconds.setdefault((name, what), []).append(
                         time.perf_counter() - begin
                     )
-        stored = record.bytes / args.surfels
+        stored = record.bytes / surfels
         print(
-            f"{args.surfels} surfels, {values.nbytes / 1e6:.0f} MB, {stored:.0f} "
+            f"{surfels} surfels, {values.nbytes / 1e6:.0f} MB, {stored:.0f} "
             "bytes stored per surfel"
         )
         for name in stores:
@@ -121,7 +116,3 @@ def main() -> None:
                 f"{what} {a:.3f} s ({a / b:.2f} x)" for what, a, b in columns
             )
             print(f"{name:<24} {ratios}")
-
-
-if __name__ == "__main__":
-    main()

@@ -1,7 +1,7 @@
 """Errors on photographs of real faces and objects and on measured BRDFs, of skindb and
 of simple models.
 
-    python benchmarks/real.py DATA [--parts faces cat lights sphere brdfs] [--json results.json]
+    python -m benchmarks real DATA [--parts faces cat lights sphere brdfs] [--json results.json]
 
 DATA contains photometric/yale, photometric/diligent, photometric/uw and
 brdf/merl_slices_phid90.npz. A part whose files are absent is skipped with the reason.
@@ -11,19 +11,20 @@ samples over their RMS, and the table has the median over pixels.
 
 from __future__ import annotations
 
-import argparse
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
-from peers import GGX, PEERS, Fit, fit, mixture
-from real_brdfs import brdf_rows
-from real_photographs import (
+
+from benchmarks.peers import GGX, PEERS, Fit, fit, mixture
+from benchmarks.real_brdfs import brdf_rows
+from benchmarks.real_photographs import (
     Photographs,
     cat,
     common_gains,
@@ -31,7 +32,6 @@ from real_photographs import (
     gray_sphere,
     spread_lights,
 )
-
 from skindb.fit import (
     embedded_dictionary,
     estimate_diffuse_reflectance,
@@ -373,29 +373,19 @@ def measure(data: Path, part: str) -> list[list[str]] | str:
     return brdf_rows(needed)
 
 
-def main() -> None:
+def main(
+    data: Annotated[Path, "Folder of the photographs and measured BRDFs."],
+    *,
+    parts: Annotated[Sequence[str], "What is measured.", PARTS] = tuple(PARTS),
+    json_: Annotated[Path | None, "File for the results."] = None,
+) -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "data", type=Path, help="Folder of the photographs and measured BRDFs."
-    )
-    parser.add_argument(
-        "--parts",
-        nargs="+",
-        choices=PARTS,
-        default=list(PARTS),
-        help="What is measured.",
-    )
-    parser.add_argument("--json", type=Path, help="File for the results.")
-    args = parser.parse_args()
     results = {}
-    for part in args.parts:
-        results[part] = measure(args.data, part)
+    for part in parts:
+        results[part] = measure(data, part)
         print("\n".join(_lines(results[part])), end="\n\n", flush=True)
-    if args.json:
-        args.json.write_text(json.dumps(results, indent=1), encoding="utf-8")
+    if json_:
+        json_.write_text(json.dumps(results, indent=1), encoding="utf-8")
 
 
 def _lines(rows: list[list[str]] | str) -> list[str]:
@@ -404,7 +394,3 @@ def _lines(rows: list[list[str]] | str) -> list[str]:
         return [rows]
     lines = [f"| {' | '.join(row)} |" for row in rows]
     return [lines[0], "|---" * len(rows[0]) + "|", *lines[1:]]
-
-
-if __name__ == "__main__":
-    main()

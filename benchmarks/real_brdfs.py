@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from peers import WIDTHS
 from scipy.optimize import least_squares, nnls
 
+from benchmarks.peers import WIDTHS
 from skindb.optics.angles import directions
 from skindb.optics.fresnel import fresnel_reflectance
 from skindb.reflectance.abc_low2012 import PARAMETERS, evaluate_abc

@@ -1,7 +1,7 @@
 """Errors of a common (u, v): correspondences of virtual heads with known corresponding
 points, and regions.
 
-    python benchmarks/registration.py CAPTURE ... [--shared N] [--every N] [--brief]
+    python -m benchmarks registration CAPTURE ... [--shared N] [--every N] [--brief]
 
 Only the scan, landmarks and regions of the folder CAPTURE are read, not its frames.
 CAPTURE.truth.npz beside it has `vertices` (v, 3) in mm, `region` (v,) and
@@ -14,10 +14,9 @@ Use other heads than those on which thresholds were chosen.
 
 from __future__ import annotations
 
-import argparse
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import xarray as xr
@@ -220,43 +219,26 @@ def regions(models: Models, registered: Mapping[str, xr.Dataset]) -> None:
         print(f"| {name} | {np.mean(values):.2f} | {min(values):.2f} |")
 
 
-def main() -> None:
+def main(
+    capture: Sequence[Path],
+    *,
+    spacing: Annotated[float, "Spacing of surfels [mm]."] = 4.0,
+    shared: Annotated[int, "Number of leading vertices that all heads share."] = 9409,
+    every: Annotated[int, "Use every N-th of them."] = 3,
+    outside: Annotated[
+        str, "Regions that are not part of the face."
+    ] = "ear,scalp,neck,neck_beard,other",
+    brief: Annotated[bool, "Skip the table by landmarks and smoothing."] = False,
+) -> None:
     """Print the tables."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("capture", nargs="+", type=Path)
-    parser.add_argument(
-        "--spacing", type=float, default=4.0, help="Spacing of surfels [mm]."
-    )
-    parser.add_argument(
-        "--shared",
-        type=int,
-        default=9409,
-        help="Number of leading vertices that all heads share.",
-    )
-    parser.add_argument("--every", type=int, default=3, help="Use every N-th of them.")
-    parser.add_argument(
-        "--outside",
-        default="ear,scalp,neck,neck_beard,other",
-        help="Regions that are not part of the face.",
-    )
-    parser.add_argument(
-        "--brief",
-        action="store_true",
-        help="Skip the table by landmarks and smoothing.",
-    )
-    args = parser.parse_args()
-    models = {folder.name: scanned(folder, args.spacing) for folder in args.capture}
+    models = {folder.name: scanned(folder, spacing) for folder in capture}
     points = {}
     region = np.zeros(0, str)
-    for folder in args.capture:
+    for folder in capture:
         with np.load(f"{folder}.truth.npz") as truth:
-            points[folder.name] = truth["vertices"][: args.shared : args.every].astype(
-                np.float64
-            )
-            region = truth["region_names"][truth["region"][: args.shared : args.every]]
-    face = ~np.isin(region, args.outside.split(","))
+            points[folder.name] = truth["vertices"][:shared:every].astype(np.float64)
+            region = truth["region_names"][truth["region"][:shared:every]]
+    face = ~np.isin(region, outside.split(","))
     first = sorted(models)[0]
     cut = cut_differently(models)
     for title, takes in {
@@ -283,10 +265,6 @@ def main() -> None:
         for click in (0.0, 2.0)
         for value in SMOOTHINGS
     ]
-    if not args.brief:
+    if not brief:
         against(models, points, face, cases)
     regions(models, register(models))
-
-
-if __name__ == "__main__":
-    main()

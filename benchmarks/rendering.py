@@ -1,7 +1,7 @@
 """Error of Monte Carlo pictures by time, by samples, by the opening of the octree, and
 compared with Mitsuba 3.
 
-python benchmarks/rendering.py DB [--take NAME] [--picture FILE]
+python -m benchmarks rendering DB [--take NAME] [--picture FILE]
 
 DB contains a fitted model. If Mitsuba is installed (pip install mitsuba), the diffuse
 term without Fresnel factors is compared for an environment and for a point light, which
@@ -10,7 +10,6 @@ both programs support.
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 import time
 from dataclasses import replace
@@ -207,15 +206,10 @@ def against_mitsuba(surface, camera, lighting):
     )
 
 
-def main() -> None:
+def main(db: str, *, take: str | None = None, picture: Path | None = None) -> None:
     """Print the results, and plot them."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("db")
-    parser.add_argument("--take")
-    parser.add_argument("--picture", type=Path)
-    options = parser.parse_args()
-    db = skindb.open(options.db)
-    model = db.read("model", options.take or db.takes("model")[0])
+    db = skindb.open(db)
+    model = db.read("model", take or db.takes("model")[0])
     dome = model["dome"].to_dataset().load()
     surface, (camera, _), lights = (
         from_model(model, fill=True),
@@ -268,8 +262,8 @@ def main() -> None:
         print(
             "the comparison with Mitsuba is skipped, because Mitsuba is not installed"
         )
-    if options.picture:
-        draw(curves, options.picture)
+    if picture:
+        draw(curves, picture)
 
 
 def draw(curves, path: Path) -> None:
@@ -284,7 +278,3 @@ def draw(curves, path: Path) -> None:
     axis.set(xlabel="wall time [s]", ylabel="relative RMS error [%]")
     axis.legend(fontsize=8)
     figure.savefig(path, dpi=110)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,7 +1,7 @@
 """Error of recovered responses by form of the response, number of exposures and noise,
 on simulated stacks.
 
-python benchmarks/responses.py [--electrons N] [--read-noise E]
+python -m benchmarks responses [--electrons N] [--read-noise E]
 
 Prints the root mean square over three channels and two scenes of the relative error of
 recovered exposures, by octaves below the white level, after the unit of each channel is
@@ -9,8 +9,6 @@ set by the brightest octaves.
 """
 
 from __future__ import annotations
-
-import argparse
 
 import numpy as np
 
@@ -79,12 +77,8 @@ def errors(form, seconds, noise):
     return np.sqrt((np.concatenate(found) ** 2).mean(axis=0))
 
 
-def main() -> None:
+def main(*, electrons: float = 20000.0, read_noise: float = 6.0) -> None:
     """Print one row for each form and number of exposures."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--electrons", type=float, default=20000.0)
-    parser.add_argument("--read-noise", type=float, default=6.0)
-    given = parser.parse_args()
     print(
         "| response | exposures | "
         + " | ".join(f"1/{2**o}" if o else "0.98" for o in OCTAVES)
@@ -95,10 +89,6 @@ def main() -> None:
         for count, seconds in EXPOSURES.items():
             cells = " | ".join(
                 f"{100 * e:.2f} %"
-                for e in errors(form, seconds, (given.electrons, given.read_noise))
+                for e in errors(form, seconds, (electrons, read_noise))
             )
             print(f"| {name} | {count} | {cells} |")
-
-
-if __name__ == "__main__":
-    main()

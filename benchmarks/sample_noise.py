@@ -1,6 +1,6 @@
 """Stated noise of samples against that of simulated sensors, as standard deviations of z-scores.
 
-    python benchmarks/sample_noise.py CAPTURE --electrons 20000 500
+    python -m benchmarks sample_noise CAPTURE --electrons 20000 500
 
 CAPTURE has 16-bit PNG frames without noise and known intensities of the lights. Its
 frames of the face are exposed again by sensors with a full well of so many electrons,
@@ -9,11 +9,10 @@ and both captures are ingested.
 
 from __future__ import annotations
 
-import argparse
 import json
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import imagecodecs
@@ -31,34 +30,29 @@ VALUES = ((0, 0.01), (0.01, 0.05), (0.05, 0.2), (0.2, 0.5))  # sr^-1
 MIN_SAMPLES = 200
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("capture", type=Path)
-    parser.add_argument("--electrons", type=float, nargs="+", default=[20_000, 500])
-    parser.add_argument("--seed", type=int, default=1)
-    args = parser.parse_args()
+def main(
+    capture: Path, *, electrons: Sequence[float] = (20000, 500), seed: int = 1
+) -> None:
     print(
         "| full well | samples | number | standard deviation of z |\n|---|---|---|---|"
     )
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        clean = ingested(folder / "clean", args.capture)
-        for electrons in args.electrons:
-            noisy = folder / f"capture-{electrons:.0f}"
-            expose_again(
-                args.capture, noisy, electrons, np.random.default_rng(args.seed)
-            )
+        clean = ingested(folder / "clean", capture)
+        for full_well in electrons:
+            noisy = folder / f"capture-{full_well:.0f}"
+            expose_again(capture, noisy, full_well, np.random.default_rng(seed))
             for label, z in groups(
-                clean, ingested(folder / f"db-{electrons:.0f}", noisy)
+                clean, ingested(folder / f"db-{full_well:.0f}", noisy)
             ):
                 print(
-                    f"| {electrons:,.0f} | {label} | {len(z):,} | {z.std():.3f} |",
+                    f"| {full_well:,.0f} | {label} | {len(z):,} | {z.std():.3f} |",
                     flush=True,
                 )
 
 
 def expose_again(
-    source: Path, target: Path, electrons: float, rng: np.random.Generator
+    source: Path, target: Path, full_well: float, rng: np.random.Generator
 ) -> None:
     """Copy a capture, and add photon and read noise to its frames of the face."""
     shutil.copytree(source, target)
@@ -67,7 +61,7 @@ def expose_again(
     for camera in dome["cameras"]:
         black = camera["black_level"]
         white = camera["white_level"]
-        per_value = electrons / (white - black)
+        per_value = full_well / (white - black)
         camera |= {"electrons_per_dn": per_value, "read_noise_e": READ_NOISE}
         for path in sorted((target / "dome/frames").glob(f"*/*_{camera['id']}.png")):
             values = imagecodecs.png_decode(path.read_bytes())
@@ -113,7 +107,3 @@ def groups(clean: xr.Dataset, noisy: xr.Dataset) -> Iterator[tuple[str, np.ndarr
             part = z[(values >= low) & (values < high)]
             if len(part) >= MIN_SAMPLES:
                 yield f"{kind} {low:g} to {high:g}{unit}", part
-
-
-if __name__ == "__main__":
-    main()

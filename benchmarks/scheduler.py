@@ -1,6 +1,6 @@
 """Load of many takes on the scheduler of a cluster: tasks, bytes, memory, and takes per second.
 
-    python benchmarks/scheduler.py [--takes 1000] [--workers 2] [--out scheduler.json]
+    python -m benchmarks scheduler [--takes 1000] [--workers 2] [--out scheduler.json]
 
 `dask scheduler` and `dask worker` are started as processes on 127.0.0.1. The task of
 each take contains the call of `skindb fit` (`fit_with` with its database and
@@ -11,7 +11,6 @@ tasks per take, 300 MB of memory of the scheduler, 4 kB of messages to it per ta
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import subprocess
@@ -25,11 +24,11 @@ from pathlib import Path
 from typing import Any
 
 import cloudpickle
-from catalogue import about
 from distributed import Client
 from distributed.diagnostics.plugin import SchedulerPlugin
 
 import skindb
+from benchmarks.catalogue import about
 from skindb import workflow
 
 GIVEN = {"k": 4, "hold_out_lights": 0.1, "hold_out_cameras": 0.0, "seed": 0}
@@ -105,7 +104,7 @@ def memory_mb(process: int, name: str = "VmRSS") -> float:
 def process(*arguments: str) -> Iterator[int]:
     """Context with the id of a process that is terminated at its end."""
     here = os.pathsep.join(
-        [str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]
+        [str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")]
     )
     options: dict[str, Any] = {
         "stdout": subprocess.DEVNULL,
@@ -192,35 +191,24 @@ def run(client: Client, scheduler: int, db: skindb.Database) -> dict[str, float]
     }
 
 
-def main() -> int:
+def main(*, takes: int = 1000, workers: int = 2, out: Path | None = None) -> int:
     """Measure, print and compare with the limits."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--takes", type=int, default=1000)
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--out", type=Path)
-    args = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
         db = skindb.open(f"{temporary}/db")
-        fill(db, args.takes)
+        fill(db, takes)
         with (
-            cluster(Path(temporary), args.workers) as (address, scheduler),
+            cluster(Path(temporary), workers) as (address, scheduler),
             workflow.connected(address) as client,
         ):
-            client.wait_for_workers(args.workers, timeout=START_SECONDS)
+            client.wait_for_workers(workers, timeout=START_SECONDS)
             found = run(client, scheduler, db)
     for name, value in found.items():
         print(f"{name:36} {value:12,.1f}")
-    if args.out:
-        args.out.write_text(json.dumps(found, indent=1))
+    if out:
+        out.write_text(json.dumps(found, indent=1))
     reached = (
         found["tasks per take"] <= MAX_TASKS
         and found["scheduler peak [MB]"] <= MAX_MEMORY_MB
         and found["bytes per take"] <= MAX_BYTES
     )
     return 0 if reached else 1
-
-
-if __name__ == "__main__":
-    sys.exit(main())

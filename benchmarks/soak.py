@@ -1,7 +1,7 @@
 """Soak test of many takes through every step with several workers: times, memory over
 time, failures.
 
-    python benchmarks/soak.py OUT [--subjects 87] [--workers 2] [--scheduler ADDRESS]
+    python -m benchmarks soak OUT [--subjects 87] [--workers 2] [--scheduler ADDRESS]
     [--json soak.json]
 
 Every subject is simulated twice (normal and with lotion), with small frames and few
@@ -12,7 +12,6 @@ captures (removed after ingest) and the database; 174 takes need 3 GB.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import shutil
@@ -242,38 +241,31 @@ def summary(name: str, stage: dict[str, Any]) -> str:
     )
 
 
-def main() -> None:
+def main(
+    out: Path,
+    *,
+    scheduler: str | None = None,
+    json_: Path | None = None,
+    subjects: int = 87,
+    workers: int = 2,
+    lights: int = 24,
+    cameras: int = 3,
+    width: int = 48,
+    height: int = 60,
+) -> None:
     """Run all steps, print the tables, and write the results."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("out", type=Path)
-    parser.add_argument("--scheduler")
-    parser.add_argument("--json", type=Path)
-    for name, value in (
-        ("subjects", 87),
-        ("workers", 2),
-        ("lights", 24),
-        ("cameras", 3),
-        ("width", 48),
-        ("height", 60),
-    ):
-        parser.add_argument(f"--{name}", type=int, default=value)
-    args = parser.parse_args()
-    args.out.mkdir(parents=True, exist_ok=True)
-    size = {
-        name: getattr(args, name) for name in ("lights", "cameras", "width", "height")
-    }
-    db = skindb.open(str(args.out.absolute() / "db"))
-    persons = people(args.subjects)
+    out.mkdir(parents=True, exist_ok=True)
+    size = {"lights": lights, "cameras": cameras, "width": width, "height": height}
+    db = skindb.open(str(out.absolute() / "db"))
+    persons = people(subjects)
     studies = {}
     stages = {}
-    captures = args.out.absolute() / "captures"
+    captures = out.absolute() / "captures"
     with (
         Watch() as watch,
-        workflow.connected(args.scheduler)
-        if args.scheduler
-        else nullcontext() as client,
+        workflow.connected(scheduler) if scheduler else nullcontext() as client,
     ):
-        where = {"client": client} if client else {"workers": args.workers}
+        where = {"client": client} if client else {"workers": workers}
         stages["simulate"] = worked(
             "simulate", partial(simulated, captures, size), persons, watch, where
         )
@@ -316,7 +308,7 @@ def main() -> None:
     for kind in ("capture", "model", "registration"):
         sizes = [db.record(kind, take).bytes for take in db.takes(kind)]
         print(f"{kind}: {len(sizes)} versions, {np.mean(sizes) / 1e6:.2f} MB each")
-    if args.json:
+    if json_:
         for stage in stages.values():
             for task in stage["tasks"]:
                 task["value"] = (
@@ -325,13 +317,9 @@ def main() -> None:
                     else str(task["value"])
                 )
         whole = {
-            "arguments": vars(args),
+            "arguments": {"subjects": subjects, "workers": workers, **size},
             "stages": stages,
             "studies": studies,
             "memory": watch.samples,
         }
-        args.json.write_text(json.dumps(whole, default=str))
-
-
-if __name__ == "__main__":
-    main()
+        json_.write_text(json.dumps(whole, default=str))

@@ -1,7 +1,7 @@
 """Error of every stage of a fitted take relative to the truth of an independent
 capture, one Markdown row per stage.
 
-    python benchmarks/stage_errors.py DB CAPTURE
+    python -m benchmarks stage_errors DB CAPTURE
 
 CAPTURE.truth.npz contains the truth, and CAPTURE.truth/<light>_<camera>.exr the
 noise-free radiance of some frames. The take must have been ingested into DB and fitted,
@@ -10,7 +10,6 @@ for example by benchmarks/validate.py.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -41,17 +40,13 @@ SOME = 20_000  # number of surfels whose distance is measured
 Row = tuple[str, str, str]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("db")
-    parser.add_argument("capture", type=Path)
-    args = parser.parse_args()
-    folder = args.capture
+def main(db: str, capture: Path) -> None:
+    folder = capture
     with np.load(folder.with_name(folder.name + ".truth.npz")) as file:
         truth = dict(file)
     record = read_capture(folder)
     assert record.dome is not None
-    db = skindb.open(args.db)
+    db = skindb.open(db)
     capture = db.read("capture", record.take)
     model = db.read("model", record.take)
     print("| stage | error | of what |\n|---|---|---|")
@@ -210,7 +205,3 @@ def quantiles(x: NDArray) -> str:
 
 def relative(off: NDArray) -> str:
     return f"{100 * np.median(np.abs(off)):.2f} % median, bias {100 * np.median(off):+.3f} %"
-
-
-if __name__ == "__main__":
-    main()

@@ -77,6 +77,13 @@ def anonymous() -> float:
     return int(line.split()[1]) / 1024
 
 
+def peak() -> float:
+    """Peak resident memory of this process [GiB]; `ru_maxrss` would include that of the parent."""
+    lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+    (line,) = [line for line in lines if line.startswith("VmHWM")]
+    return int(line.split()[1]) / 2**20
+
+
 def stage_lines(table: Mapping[str, Mapping[str, float]]) -> list[str]:
     """One line per stage."""
     lines = []

@@ -1,7 +1,7 @@
 """Coverage of the stated errors: fraction of true values within the 95 % interval, for
 samples of the model.
 
-    python benchmarks/stated_errors.py [--surfels N] [--full]
+    python -m benchmarks stated_errors [--surfels N] [--full]
 
 Samples are diffuse light, surface lobes and noise (a fraction of the sample and a floor
 in quadrature), made with the public functions of `skindb.optics`. Prints two Markdown
@@ -12,8 +12,7 @@ standard error of a coverage is sqrt(0.0475 / N).
 
 from __future__ import annotations
 
-import argparse
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import xarray as xr
@@ -165,23 +164,15 @@ def weights(
                     )
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--surfels", type=int, default=400)
-    parser.add_argument(
-        "--full",
-        action="store_true",
-        help="Include the dome of 150 lights and 16 cameras.",
-    )
-    args = parser.parse_args()
-    domes = FULL if args.full else QUICK
+def main(
+    *,
+    surfels: int = 400,
+    full: Annotated[bool, "Include the dome of 150 lights and 16 cameras."] = False,
+) -> None:
+    domes = FULL if full else QUICK
     print(
         "Percentage within 1.96 stated errors (mean, standard deviation of error "
         "over stated error)\n"
     )
-    albedo_and_normals(np.random.default_rng(11), args.surfels, domes)
-    weights(np.random.default_rng(12), args.surfels, domes[1:2])
-
-
-if __name__ == "__main__":
-    main()
+    albedo_and_normals(np.random.default_rng(11), surfels, domes)
+    weights(np.random.default_rng(12), surfels, domes[1:2])

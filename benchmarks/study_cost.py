@@ -1,6 +1,6 @@
 """Time and peak memory of population studies of growing cohorts, each in its own process.
 
-    python benchmarks/study_cost.py DB --work FOLDER [--takes 22 44 87] [--studies
+    python -m benchmarks study_cost DB --work FOLDER [--takes 22 44 87] [--studies
     albedo traits ...] [--subdivide N]
 
 DB contains fitted takes with landmarks. In FOLDER a database with as many virtual
@@ -13,13 +13,14 @@ into four, N times.
 
 from __future__ import annotations
 
-import argparse
 import json
 import resource
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import xarray as xr
@@ -119,41 +120,42 @@ def measure(url: str, step: str, takes: int) -> None:
     print(json.dumps({"seconds": time.perf_counter() - start, "peak": peak}))
 
 
-def main() -> None:
+def main(
+    db: str,
+    *,
+    work: Path,
+    takes: Sequence[int] = (22, 44, 87),
+    studies: Annotated[Sequence[str], STEPS] = tuple(STEPS),
+    subdivide: int = 0,
+    child: Annotated[Sequence[str], "Step and number of takes; for internal use."] = (),
+) -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("db")
-    parser.add_argument("--work", type=Path, required=True)
-    parser.add_argument("--takes", type=int, nargs="+", default=[22, 44, 87])
-    parser.add_argument("--studies", nargs="+", choices=STEPS, default=list(STEPS))
-    parser.add_argument("--subdivide", type=int, default=0)
-    parser.add_argument("--child", nargs=2, help=argparse.SUPPRESS)
-    args = parser.parse_args()
-    if args.child:
-        measure(args.db, args.child[0], int(args.child[1]))
+    if child:
+        step, count = child
+        measure(db, step, int(count))
         return
     grow(
-        skindb.open(args.db),
-        skindb.open(str(args.work)),
-        max(args.takes),
-        args.subdivide,
+        skindb.open(db),
+        skindb.open(str(work)),
+        max(takes),
+        subdivide,
     )
-    print("| step | " + " | ".join(f"{n} takes" for n in args.takes) + " |")
-    print("|---|" + "---|" * len(args.takes))
-    for step in args.studies:
+    print("| step | " + " | ".join(f"{n} takes" for n in takes) + " |")
+    print("|---|" + "---|" * len(takes))
+    for step in studies:
         cells = []
-        for takes in args.takes:
+        for count in takes:
             command = [
                 sys.executable,
-                __file__,
-                str(args.work),
+                "-m",
+                "benchmarks",
+                "study_cost",
+                str(work),
                 "--work",
-                str(args.work),
+                str(work),
                 "--child",
                 step,
-                str(takes),
+                str(count),
             ]
             done = subprocess.run(command, capture_output=True, text=True, check=False)
             if done.returncode:
@@ -162,7 +164,3 @@ def main() -> None:
             found = json.loads(done.stdout.splitlines()[-1])
             cells.append(f"{found['seconds']:.0f} s, {found['peak']:.0f} MiB")
         print(f"| {step} | " + " | ".join(cells) + " |", flush=True)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,7 +1,7 @@
 """Measured BRDFs outside the dictionary, fitted with its 59 materials and with reduced
 bases (docs/validation.md).
 
-    python benchmarks/targets.py PATH... [--only WORD...] [--surfels N] [--noise FRACTION]
+    python -m benchmarks targets PATH... [--only WORD...] [--surfels N] [--noise FRACTION]
 
 PATH is a file of Lafortune lobes (.csv with term, Cxy_*, Cz_*, n_* of r, g, b and a row
 diffuse_albedo, as fitted to skin by Marschner et al. 1999) or of networks (.npz with
@@ -12,9 +12,8 @@ the diffuse and the surface part are estimated with the public functions.
 
 from __future__ import annotations
 
-import argparse
 import csv
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -157,18 +156,18 @@ def _table(heads, rows):
         print("| " + " | ".join(row) + " |")
 
 
-def main() -> None:
+def main(
+    path: Sequence[Path],
+    *,
+    only: Sequence[str] = (),
+    surfels: int = 60,
+    noise: float = 0.0,
+) -> None:
     """Print two tables: residuals of the full dictionary by mode, and of reduced bases by size."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("path", type=Path, nargs="+")
-    parser.add_argument("--only", nargs="*", default=[])
-    parser.add_argument("--surfels", type=int, default=60)
-    parser.add_argument("--noise", type=float, default=0.0)
-    args = parser.parse_args()
     dictionary = embedded_dictionary()
     samples = {
-        name: sampled(target, surfels=args.surfels, noise=args.noise)
-        for name, target in read_targets(args.path, args.only).items()
+        name: sampled(target, surfels=surfels, noise=noise)
+        for name, target in read_targets(path, only).items()
     }
     rows = []
     weights = {}
@@ -211,7 +210,3 @@ def main() -> None:
         ["target", *(f"k = {k}" for k in SIZES)],
         [[name, *cells] for name, cells in columns.items()],
     )
-
-
-if __name__ == "__main__":
-    main()

@@ -1,7 +1,7 @@
 """Errors of fits of captures made by an independent renderer, relative to their truth
 (docs/validation.md).
 
-    python benchmarks/validate.py DB CAPTURE [CAPTURE...]
+    python -m benchmarks validate DB CAPTURE [CAPTURE...]
 
 The truth of each capture folder is in <folder>.truth.npz (keys of
 skindb.virtual.truth). The captures are ingested into DB and fitted. Two Markdown tables
@@ -10,17 +10,16 @@ are printed: errors, and surfels by status with times and memory.
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
-from stages import Stages, stage_lines
 
 import skindb
+from benchmarks.stages import Stages, stage_lines
 from skindb.fit import FitParameters
 from skindb.store import Database
 from skindb.virtual.truth import recovered_against_true
@@ -109,31 +108,29 @@ def _triple(values: Iterable[float], form: str) -> str:
     return " ".join(f"{value:{form}}" for value in values)
 
 
-def main() -> None:
+def main(
+    db: str,
+    captures: Sequence[Path],
+    *,
+    spacing: float = 1.5,
+    hold_out_lights: float = 0.1,
+    hold_out_cameras: float = 0.0,
+    stages: Annotated[
+        bool, "Print time and memory of every stage to standard error."
+    ] = False,
+    json_: Annotated[Path | None, "File for all results."] = None,
+) -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("db")
-    parser.add_argument("captures", nargs="+", type=Path)
-    parser.add_argument("--spacing", type=float, default=1.5)
-    parser.add_argument("--hold-out-lights", type=float, default=0.1)
-    parser.add_argument("--hold-out-cameras", type=float, default=0.0)
-    parser.add_argument(
-        "--stages",
-        action="store_true",
-        help="Print time and memory of every stage to standard error.",
-    )
-    parser.add_argument("--json", type=Path, help="File for all results.")
-    args = parser.parse_args()
-    db = skindb.open(args.db)
+    db = skindb.open(db)
     results = []
     parameters = FitParameters(
-        hold_out_lights=args.hold_out_lights, hold_out_cameras=args.hold_out_cameras
+        hold_out_lights=hold_out_lights, hold_out_cameras=hold_out_cameras
     )
     print(header(*COLUMNS))
-    for folder in args.captures:
-        results.append(measure(db, folder, spacing=args.spacing, parameters=parameters))
+    for folder in captures:
+        results.append(measure(db, folder, spacing=spacing, parameters=parameters))
         print(error_row(results[-1]), flush=True)
-        for name, table in results[-1]["stages"].items() if args.stages else ():
+        for name, table in results[-1]["stages"].items() if stages else ():
             print("\n".join([name, *stage_lines(table)]), file=sys.stderr)
     print(
         "\n"
@@ -146,11 +143,5 @@ def main() -> None:
         )
     )
     print("\n".join(time_row(result) for result in results))
-    if args.json:
-        args.json.write_text(
-            json.dumps(results, indent=1, default=str), encoding="utf-8"
-        )
-
-
-if __name__ == "__main__":
-    main()
+    if json_:
+        json_.write_text(json.dumps(results, indent=1, default=str), encoding="utf-8")

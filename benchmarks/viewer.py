@@ -1,12 +1,11 @@
 """Frames per second of the viewer in headless Chromium with software rendering, and the
 size of a page.
 
-python benchmarks/viewer.py PAGE.html
+python -m benchmarks viewer PAGE.html
 """
 
 from __future__ import annotations
 
-import argparse
 import shutil
 from pathlib import Path
 
@@ -47,11 +46,9 @@ CASES = (  # lights, subsurface scattering, amount of the traits, whether at res
 )
 
 
-def main() -> None:
+def main(page: Path) -> None:
     """Print the frame rate for each number of lights."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("page", type=Path)
-    page_file = parser.parse_args().page
+    page_file = page
     print(f"{page_file.stat().st_size / 1e6:.1f} MB")
     with sync_playwright() as running:
         browser = running.chromium.launch(
@@ -74,7 +71,3 @@ def main() -> None:
             parts.append("full resolution" if still else "while the view turns")
             print(f"{', '.join(parts)}: {rate:.1f} frames per second")
         browser.close()
-
-
-if __name__ == "__main__":
-    main()

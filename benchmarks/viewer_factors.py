@@ -6,12 +6,10 @@ v_r(theta_d, phi_d), with the optimal factors for every rank (singular values). 
 error of the BRDF is weighted with both cosines and the solid angles as in
 `brdf_metric`, but without the compression of highlights.
 
-    python benchmarks/viewer_factors.py DB [TAKE]
+    python -m benchmarks viewer_factors DB [TAKE]
 """
 
 from __future__ import annotations
-
-import sys
 
 import numpy as np
 
@@ -84,7 +82,3 @@ def main(db: str, take: str = "") -> None:
             f"{rank:4d}  {size_mb:6.3f}  {2 * rank * groups:7d}  "
             f"{' '.join(f'{e:6.1%}' for e in each)}  {mixed:6.1%}"
         )
-
-
-if __name__ == "__main__":
-    main(*sys.argv[1:])

@@ -1,7 +1,7 @@
 """Visibility by rays and by splats: time for all lights and cameras, agreement, and
 error relative to the truth.
 
-    python benchmarks/visibility.py CAPTURE [--truth TRUTH.npz] [--spacing 0.4] [--every
+    python -m benchmarks visibility CAPTURE [--truth TRUTH.npz] [--spacing 0.4] [--every
     10] [--picture FILE.png]
 
 CAPTURE is a capture folder; TRUTH has `vertices`, `normals`, `region`, `region_names`
@@ -12,7 +12,6 @@ with wall time and CPU time, since other programs may be running.
 
 from __future__ import annotations
 
-import argparse
 import json
 import resource
 import time
@@ -21,7 +20,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -46,29 +45,27 @@ WIDTH = 1300
 HEIGHT = 1030
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("capture", type=Path)
-    parser.add_argument("--truth", type=Path)
-    parser.add_argument("--spacing", type=float, default=0.4)
-    parser.add_argument(
-        "--every", type=int, default=10, help="Compare every N-th light."
-    )
-    parser.add_argument("--picture", type=Path)
-    args = parser.parse_args()
-    capture = read_capture(args.capture)
+def main(
+    capture: Path,
+    *,
+    truth: Path | None = None,
+    spacing: float = 0.4,
+    every: Annotated[int, "Compare every N-th light."] = 10,
+    picture: Path | None = None,
+) -> None:
+    capture = read_capture(capture)
     dome = capture.dome
-    surfels = build_surfels(capture, spacing_mm=args.spacing)
+    surfels = build_surfels(capture, spacing_mm=spacing)
     scene = RayScene(surfels.position, surfels.faces)
     scene.occluded(surfels.position[:1], np.zeros((1, 3)))  # builds the tree
     cameras = [enlarged(camera) for camera in dome.cameras]
-    some = dome.lights[:: args.every]
+    some = dome.lights[::every]
     timings(surfels, scene, dome.lights, cameras)
     compare(surfels, scene, some)
-    if args.truth:
-        against_truth(surfels, scene, dome.lights, args.every, args.truth)
-    if args.picture:
-        draw(surfels, scene, dome.lights, args.picture)
+    if truth:
+        against_truth(surfels, scene, dome.lights, every, truth)
+    if picture:
+        draw(surfels, scene, dome.lights, picture)
 
 
 def say(**figures: Any) -> None:
@@ -383,7 +380,3 @@ def draw(
     )
     figure.tight_layout()
     figure.savefig(path, dpi=90)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,7 +1,7 @@
 """Time of two one-thread workers that fit two takes in parallel, compared with one
 worker that fits them in sequence.
 
-    python benchmarks/workers.py DB TAKE [TAKE] [--repeats 3]
+    python -m benchmarks workers DB TAKE [TAKE] [--repeats 3]
 
 Every worker is a process with one thread on its own copy of DB; its start is timed,
 compilation is not. Both methods alternate. The ratio of the wall times is only
@@ -11,7 +11,6 @@ two workers, they compete for memory or caches.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import shutil
@@ -21,8 +20,9 @@ import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated
 
-from fit import DRIVER, ONE_THREAD, ROOT
+from benchmarks.fit import DRIVER, ONE_THREAD, ROOT
 
 WORKERS = 2
 
@@ -57,27 +57,25 @@ def timed(
     return time.perf_counter() - begin, cpu
 
 
-def main() -> None:
+def main(
+    db: Path,
+    takes: Annotated[Sequence[str], "One take, which is fitted twice, or two takes."],
+    *,
+    repeats: int = 3,
+) -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("db", type=Path)
-    parser.add_argument(
-        "takes", nargs="+", help="One take, which is fitted twice, or two takes."
-    )
-    parser.add_argument("--repeats", type=int, default=3)
-    args = parser.parse_args()
-    takes = (args.takes * WORKERS)[:WORKERS]
+    takes = (takes * WORKERS)[:WORKERS]
     with tempfile.TemporaryDirectory() as temporary:
         folders = [Path(temporary) / str(i) for i in range(WORKERS)]
         for folder in folders:
-            shutil.copytree(args.db, folder)
+            shutil.copytree(db, folder)
         timed(folders[:1], takes[:1], together=False)  # compiles
         runs = [
             (
                 timed(folders, takes, together=False),
                 timed(folders, takes, together=True),
             )
-            for _ in range(args.repeats)
+            for _ in range(repeats)
         ]
     best = [[min(run[way][what] for run in runs) for way in (0, 1)] for what in (0, 1)]
     for way, name in enumerate(("in sequence", "in parallel")):
@@ -89,7 +87,3 @@ def main() -> None:
         f"parallel: {best[0][0] / best[0][1]:.2f} times as fast, CPU time "
         f"{best[1][1] / best[1][0]:.2f} times as high"
     )
-
-
-if __name__ == "__main__":
-    main()

@@ -60,7 +60,8 @@ def test_source_faults__reads_comments_and_strings(source, found):
         ("skindb fit DB --ranks 8", "No such option"),
         ("skindb fit DB --mode sharp", "not one of"),
         ("skindb compare DB", "Missing argument"),
-        ("python benchmarks/absent.py DB", "does not exist"),
+        ("python -m benchmarks fit CAPTURE", ""),
+        ("python -m benchmarks absent DB", "does not exist"),
         ("make absent", "no target"),
     ],
 )
@@ -113,7 +114,7 @@ def test_link_faults__names_files_that_do_not_exist():
         ("skindb fit faces", False),
         ("skindb analyze faces traits", False),
         ("skindb info other", False),
-        ("python benchmarks/bucket.py", False),
+        ("python -m benchmarks bucket", False),
     ],
 )
 def test_is_run__selects_quick_commands_on_the_database_of_the_pages(call, run):

@@ -2,21 +2,9 @@
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import numpy as np
-import pytest
 
-BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
-
-
-@pytest.fixture(autouse=True)
-def _benchmarks(monkeypatch):
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    yield
-    for name in ("real", "real_brdfs", "real_photographs", "peers"):
-        sys.modules.pop(name, None)
+from benchmarks import peers, real, real_photographs
 
 
 def _lights():
@@ -33,8 +21,6 @@ def _normals():
 
 
 def test_fit__recovers_planted_normals_and_unseen_lights():
-    import peers
-
     light = _lights()
     normal = _normals()
     training = np.arange(len(light)) % 5 > 0
@@ -53,8 +39,6 @@ def test_fit__recovers_planted_normals_and_unseen_lights():
 
 
 def test_common_gains__leaves_the_person_out():
-    import real_photographs
-
     people = [
         real_photographs.Photographs(
             name="p",
@@ -73,8 +57,6 @@ def test_common_gains__leaves_the_person_out():
 
 
 def test_spread_lights__are_apart_and_begin_in_front():
-    import real_photographs
-
     light = _lights()
     chosen = light[real_photographs.spread_lights(light, 4)]
     gram = chosen @ chosen.T - 2 * np.eye(4)
@@ -83,7 +65,5 @@ def test_spread_lights__are_apart_and_begin_in_front():
 
 
 def test_measure__absent_data_is_skipped_with_the_reason(tmp_path):
-    import real
-
     for part in real.PARTS:
         assert "does not exist" in real.measure(tmp_path, part)

@@ -1,7 +1,7 @@
 """Render an exported face in Mitsuba 3, for benchmarks/exports.py, which calls this
 program with the Python of Mitsuba.
 
-python benchmarks/exports_mitsuba.py JOBS.json
+python benchmarks/programs/exports_mitsuba.py JOBS.json
 """
 
 from __future__ import annotations

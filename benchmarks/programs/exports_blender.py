@@ -1,7 +1,7 @@
 """Render exported files in Blender, for benchmarks/exports.py, which calls this program
 with the Python of bpy.
 
-python benchmarks/exports_blender.py JOBS.json
+python benchmarks/programs/exports_blender.py JOBS.json
 """
 
 from __future__ import annotations

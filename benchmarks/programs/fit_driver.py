@@ -1,10 +1,10 @@
 """One measurement of the fit in its own process, by the current code or by an earlier revision.
 
-    PYTHONPATH=REVISION python benchmarks/fit_driver.py ingest DB CAPTURE
-    PYTHONPATH=REVISION python benchmarks/fit_driver.py fit DB TAKE
-    PYTHONPATH=REVISION python benchmarks/fit_driver.py fit-one-thread DB TAKE
-    PYTHONPATH=REVISION python benchmarks/fit_driver.py parts DB TAKE
-    PYTHONPATH=REVISION python benchmarks/fit_driver.py read DB TAKE
+    PYTHONPATH=REVISION python benchmarks/programs/fit_driver.py ingest DB CAPTURE
+    PYTHONPATH=REVISION python benchmarks/programs/fit_driver.py fit DB TAKE
+    PYTHONPATH=REVISION python benchmarks/programs/fit_driver.py fit-one-thread DB TAKE
+    PYTHONPATH=REVISION python benchmarks/programs/fit_driver.py parts DB TAKE
+    PYTHONPATH=REVISION python benchmarks/programs/fit_driver.py read DB TAKE
 
 `benchmarks/fit.py` and `benchmarks/workers.py` call it. The last printed line is the
 result as JSON. It works with revisions from before and after the fit in two passes
@@ -24,10 +24,13 @@ import dask
 import numpy as np
 import xarray as xr
 from dask.delayed import delayed
-from stages import Stages
 from threadpoolctl import threadpool_limits
 
 import skindb
+
+# by its path: `benchmarks` may be that of the earlier revision
+sys.path.append(str(Path(__file__).parents[1]))
+from stages import Stages, peak
 
 try:
     from skindb.fit import FitParameters
@@ -50,13 +53,6 @@ KNOWN = (
     "diffuse_reflectance",
     "diffuse_reflectance_error",
 )
-
-
-def peak() -> float:
-    """Peak resident memory of this process [GiB]; `ru_maxrss` would include that of the parent."""
-    lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
-    (line,) = [line for line in lines if line.startswith("VmHWM")]
-    return int(line.split()[1]) / 2**20
 
 
 def ingest(db: Any, capture: str) -> dict[str, Any]:
