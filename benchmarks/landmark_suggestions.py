@@ -16,7 +16,7 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from skindb.geometry.landmark_suggestions import MEAN_FACE, mate, suggest_landmarks
+from skindb.geometry.landmarks import MEAN_FACE, mate, suggest_landmarks
 
 SEVEN = (
     "nose_tip",

@@ -24,7 +24,7 @@ from skindb.calibration.radiance import frame_mergers, read_view
 from skindb.format.dome import DomeRecord
 from skindb.format.folder import read_capture
 from skindb.geometry.camera import project
-from skindb.geometry.nearest import closest_on_mesh
+from skindb.geometry.mesh import closest_on_mesh
 from skindb.geometry.texture import bilinear
 from skindb.render.image import read_exr
 from skindb.virtual.truth import recovered_against_true

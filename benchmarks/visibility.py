@@ -27,7 +27,7 @@ from scipy.spatial import cKDTree
 
 from skindb.format.dome import CameraRecord, LightRecord
 from skindb.format.folder import read_capture
-from skindb.geometry._ring_kernels import grown, mixed
+from skindb.geometry._mesh_kernels import grown, mixed
 from skindb.geometry.rays import RayScene
 from skindb.geometry.splats import PIXEL, THRESHOLD, SplatScene
 from skindb.ingest.surfels import SurfelSet, build_surfels

@@ -13,7 +13,7 @@ import numpy as np
 
 import skindb
 from skindb.demo.pictures import map_pictures
-from skindb.geometry.distortion import stretches
+from skindb.geometry.atlas import stretches
 from skindb.render.field import trace_front
 from skindb.render.image import write_png
 from skindb.render.photographs import compare_photographs, side_by_side

@@ -9,7 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.floating[Any]]
+Float64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Index = NDArray[np.int64]  # numbers of vertices, surfels, ...
+Faces = NDArray[np.integer[Any]]  # (f, 3) vertices of triangles
 
 # Arrays of compiled kernels by rank and dtype; docstrings name the lengths, such as
 # "rows (n, m)". Float64 unless the name ends with the bits.

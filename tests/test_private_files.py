@@ -20,7 +20,7 @@ from skindb.cache import cached_arrays
 from skindb.cli import main
 from skindb.files import private_file, private_umask
 from skindb.format.frames import write_frame
-from skindb.geometry.crop import Crop
+from skindb.geometry.scan import Crop
 from skindb.reflectance.dictionary import embedded_dictionary
 from skindb.reflectance.merl import write_merl
 from skindb.reflectance.table_file import write_tables

@@ -13,10 +13,15 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
-from skindb.geometry.anchors import ALIGNED, Sheet, anchor_vertices, corresponding_uv
 from skindb.geometry.atlas import signed_areas
+from skindb.geometry.correspondence import (
+    ALIGNED,
+    Sheet,
+    anchor_vertices,
+    corresponding_uv,
+)
 from skindb.geometry.landmarks import mean_shape
-from skindb.geometry.nearest import closest_on_mesh
+from skindb.geometry.mesh import closest_on_mesh
 from skindb.geometry.rays import RayScene
 from skindb.geometry.warp import Warp, apply_warp, fit_warp, left_out_error
 from skindb.schema import dataset
@@ -46,7 +51,7 @@ def register(
 
     The landmarks of a face do not constrain ears, neck and scalp. There, corresponding
     points on the surface of a template are used in addition (see
-    `anchors.corresponding_uv`). The template is the reference, or the take that shows
+    `correspondence.corresponding_uv`). The template is the reference, or the take that shows
     most of its head.
 
     Parameters

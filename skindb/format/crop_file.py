@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from skindb.errors import Fault, InputError
-from skindb.geometry.crop import Crop
+from skindb.geometry.scan import Crop
 
 MAX_COORDINATE_MM = 1e30  # smaller than infinity in single precision
 

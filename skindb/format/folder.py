@@ -54,8 +54,7 @@ from skindb.format.scan_checks import (
     swapped_faults,
 )
 from skindb.geometry.clean import CleanMesh, clean_mesh
-from skindb.geometry.crop import Crop, crop_faces
-from skindb.geometry.scan import Scan, read_scan
+from skindb.geometry.scan import Crop, Scan, crop_faces, read_scan
 from skindb.limits import MAX_FRAMES, MAX_OBJECT_KEYS, MAX_REGIONS
 from skindb.schema.cohort import imitates_column
 

@@ -27,9 +27,8 @@ from skindb.format.scan_checks import (
 )
 from skindb.geometry.camera import camera_centre
 from skindb.geometry.clean import CleanMesh
-from skindb.geometry.nearest import closest_on_mesh, winding_number
+from skindb.geometry.mesh import closest_on_mesh, face_crosses, winding_number
 from skindb.geometry.scan import Scan
-from skindb.geometry.surfels import face_crosses
 
 Array = NDArray[np.float64]
 

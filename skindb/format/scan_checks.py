@@ -10,9 +10,8 @@ from scipy.spatial import cKDTree
 
 from skindb.errors import Fault
 from skindb.geometry.clean import CleanMesh
-from skindb.geometry.nearest import closest_on_mesh
+from skindb.geometry.mesh import closest_on_mesh, vertex_normals
 from skindb.geometry.scan import Scan
-from skindb.geometry.surfels import vertex_normals
 
 Array = NDArray[np.float64]
 UNITS = {

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import math
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from skindb.jit import inline_kernel, kernel
+from skindb.types import Matrix, Vector
 
-Array = NDArray[np.float64]
 # 4 to 6 suffice for real lenses; more are needed at the rim of a strong distortion
 NEWTON_STEPS = 25
 
 
 @inline_kernel
-def _within(x: Any, y: Any, limit: Any) -> Any:
+def _within(x: float, y: float, limit: float) -> tuple[float, float]:
     """A point, moved towards the axis to a distance of at most `limit`."""
     scale = limit / max(math.sqrt(x * x + y * y), limit) if limit < math.inf else 1.0
     return x * scale, y * scale
@@ -24,7 +20,7 @@ def _within(x: Any, y: Any, limit: Any) -> Any:
 
 @kernel
 def undistorted(
-    bent: Array, coefficients: Array, limit: float, tolerance: float, out: Array
+    bent: Matrix, coefficients: Vector, limit: float, tolerance: float, out: Matrix
 ) -> None:
     """Write ideal points `out` (n, 2) for distorted points `bent` (n, 2), by Newton's method.
 
@@ -39,21 +35,21 @@ def undistorted(
     tolerance
         Largest allowed residual of the distorted coordinates.
     out
-        (n, 2) output; NaN where no point within the limit is distorted to the given one.
+        (n, 2) output; NaN where no point within the limit is distorted to that point.
     """
     k1, k2, p1, p2, k3 = coefficients
     for i in range(len(bent)):
         u, v = bent[i]
         x, y = _within(u, v, 0.9 * limit)
-        left = math.inf
+        error = math.inf
         for _ in range(NEWTON_STEPS):
             r2 = x * x + y * y
             radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
             slope = k1 + r2 * (2 * k2 + r2 * 3 * k3)  # d radial / d r2
             right = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) - u
             below = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y - v
-            left = max(abs(right), abs(below))
-            if left < 1e-3 * tolerance:
+            error = max(abs(right), abs(below))
+            if error < 1e-3 * tolerance:
                 break
             xx = radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
             xy = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
@@ -66,6 +62,5 @@ def undistorted(
                 y - (xx * below - xy * right) / determinant,
                 limit,
             )
-        good = left < tolerance
-        out[i, 0] = x if good else math.nan
-        out[i, 1] = y if good else math.nan
+        out[i, 0] = x if error < tolerance else math.nan
+        out[i, 1] = y if error < tolerance else math.nan

@@ -6,11 +6,10 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skindb.jit import fast_kernel, inline_fast_kernel
+from skindb.types import IntVector, Matrix32, Vector32
 
-Single = NDArray[np.float32]
 ZERO = np.float32(0.0)
 HALF = np.float32(0.5)
 ONE = np.float32(1.0)
@@ -21,7 +20,9 @@ MAX_DISC_SLOPE = np.float32(50.0)  # depth of a disc per width at most
 
 
 @inline_fast_kernel
-def _project(p: Any, n: Any, frame: Any, eye: Any) -> Any:
+def _project(
+    p: Vector32, n: Vector32, frame: Matrix32, eye: Vector32
+) -> tuple[float, float, float, float, float, float, float]:
     """Point and normal in the frame of the eye, and the height of the eye over the
     disc: negative from behind.
     """
@@ -40,8 +41,15 @@ def _project(p: Any, n: Any, frame: Any, eye: Any) -> Any:
 
 @inline_fast_kernel
 def _ellipse(
-    x: Any, y: Any, z: Any, a: Any, b: Any, c: Any, radius: Any, focal: Any
-) -> Any:
+    x: float,
+    y: float,
+    z: float,
+    a: float,
+    b: float,
+    c: float,
+    radius: float,
+    focal: float,
+) -> tuple[Any, ...]:
     """Conic (3,) in px^-2 and half widths (2,) in px of a disc's picture, wider by a
     pixel (Zwicker et al. 2001).
     """
@@ -66,29 +74,26 @@ def _ellipse(
     xy = j00 * j10 + j01 * j11
     yy = j10 * j10 + j11 * j11 + ONE
     determinant = xx * yy - xy * xy
-    return (
-        yy / determinant,
-        -xy / determinant,
-        xx / determinant,
-        math.sqrt(xx),
-        math.sqrt(yy),
-    )
+    qa = yy / determinant
+    qb = -xy / determinant
+    qc = xx / determinant
+    return qa, qb, qc, math.sqrt(xx), math.sqrt(yy)
 
 
 @fast_kernel
 def splat(
-    position: Single,
-    normal: Single,
-    radius: Single,
-    chosen: NDArray[np.int64],
-    frame: Single,
-    eye: Single,
+    position: Matrix32,
+    normal: Matrix32,
+    radius: Vector32,
+    chosen: IntVector,
+    frame: Matrix32,
+    eye: Vector32,
     focal: np.float32,
-    corner: Single,
+    corner: Vector32,
     slope: np.float32,
     bias: np.float32,
-    depth: Single,
-    share: Single,
+    depth: Matrix32,
+    fraction: Vector32,
     counting: bool,
 ) -> None:
     """Draw the chosen discs into `depth` (h, w), or compute the fraction of each that
@@ -108,7 +113,7 @@ def splat(
         Allowed depth of a disc behind the map: `slope` pixels along its own tilt, and `bias` mm.
     depth
         (h, w) mm along the axis; written when drawing.
-    share
+    fraction
         (m,) blended over rasterised pixels; written when counting, for centres inside the map.
     counting
         Whether to count instead of to draw.
@@ -128,10 +133,9 @@ def splat(
         py = focal * y / z - corner[1]
         # the linear approximation fails for discs larger than half of a map
         beside = ZERO if counting else HALF
-        if (
-            abs(px - HALF * width) > (HALF + beside) * width
-            or abs(py - HALF * height) > (HALF + beside) * height
-        ):
+        if abs(px - HALF * width) > (HALF + beside) * width:
+            continue
+        if abs(py - HALF * height) > (HALF + beside) * height:
             continue
         qa, qb, qc, wide, high = _ellipse(x, y, z, a, b, c, radius[i], focal)
         # clamped before the conversion to integers, as a disc beside the eye may project anywhere
@@ -156,12 +160,12 @@ def splat(
                 across = (
                     a * (column + HALF + corner[0]) + b * (row + HALF + corner[1])
                 ) / focal + c
-                found = plane / across if across < LEVEL else z
-                found = min(max(found, z - reach), z + reach)
+                surface = plane / across if across < LEVEL else z
+                surface = min(max(surface, z - reach), z + reach)
                 if counting:
                     rasterised += 1
-                    blended += found <= depth[row, column] + behind
-                elif found < depth[row, column]:
-                    depth[row, column] = found
+                    blended += surface <= depth[row, column] + behind
+                elif surface < depth[row, column]:
+                    depth[row, column] = surface
         if counting and rasterised > 0:
-            share[k] = np.float32(blended) / np.float32(rasterised)
+            fraction[k] = np.float32(blended) / np.float32(rasterised)

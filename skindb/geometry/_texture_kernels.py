@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
 from skindb.jit import inline_kernel, kernel
+from skindb.types import (
+    BoolMatrix,
+    Cube32,
+    IntMatrix32,
+    IntVector,
+    Matrix,
+    Matrix32,
+    Vector,
+    Vector32,
+)
 
-Array = NDArray[Any]
 EDGE = 1e-9  # texels; a texel centre on an edge belongs to both triangles
 # of a triangle clipped by four lines: at most 7, plus a margin for rounding
 CORNERS = 9
 
 
 @kernel
-def rasterise(uv: Array, faces: Array, face: Array, weight: Array) -> None:
+def rasterise(
+    uv: Matrix, faces: IntMatrix32, face: IntMatrix32, weight: Cube32
+) -> None:
     """Write the first triangle over each texel centre and the weights of its corners;
     `face` starts as -1.
     """
@@ -47,27 +55,25 @@ def rasterise(uv: Array, faces: Array, face: Array, weight: Array) -> None:
                 v = ((bx - ax) * (i - ay) - (by - ay) * (j - ax)) / double_area
                 if min(u, v, 1 - u - v) < -EDGE:
                     continue
-                first = max(1 - u - v, 0)
-                second = max(u, 0)
-                third = max(v, 0)
-                total = first + second + third
+                at_a = max(1 - u - v, 0)
+                at_b = max(u, 0)
+                at_c = max(v, 0)
+                total = at_a + at_b + at_c
                 face[i, j] = f
-                weight[i, j, 0], weight[i, j, 1], weight[i, j, 2] = (
-                    first / total,
-                    second / total,
-                    third / total,
-                )
+                weight[i, j, 0] = at_a / total
+                weight[i, j, 1] = at_b / total
+                weight[i, j, 2] = at_c / total
 
 
 @kernel
 def interpolate(
-    face: Array,
-    weight: Array,
-    faces: Array,
-    trust: Array,
-    values: Array,
-    image: Array,
-    confidence: Array,
+    face: IntMatrix32,
+    weight: Cube32,
+    faces: IntMatrix32,
+    trust: Vector32,
+    values: Matrix32,
+    image: Cube32,
+    confidence: Matrix32,
 ) -> None:
     """Write value and confidence at the texel centres; corners without trust have no weight."""
     mixed = np.empty(values.shape[1])
@@ -78,11 +84,11 @@ def interpolate(
             mixed[:] = 0
             for k in range(3 if f >= 0 else 0):
                 corner = faces[f, k]
-                share = np.float64(weight[i, j, k]) * trust[corner]
-                if share > 0:
-                    total += share
+                trusted = np.float64(weight[i, j, k]) * trust[corner]
+                if trusted > 0:
+                    total += trusted
                     for c in range(len(mixed)):
-                        mixed[c] += share * values[corner, c]
+                        mixed[c] += trusted * values[corner, c]
             if total > 0:
                 confidence[i, j] = total
                 for c in range(len(mixed)):
@@ -91,22 +97,22 @@ def interpolate(
 
 @kernel
 def average(
-    uv: Array,
-    faces: Array,
-    chosen: Array,
-    trust: Array,
-    values: Array,
-    image: Array,
-    confidence: Array,
-    covered: Array,
-    polygon: Array,
-    other: Array,
-    part: Array,
+    uv: Matrix,
+    faces: IntMatrix32,
+    chosen: BoolMatrix,
+    trust: Vector32,
+    values: Matrix32,
+    image: Cube32,
+    confidence: Matrix32,
+    covered: Matrix32,
+    polygon: Matrix,
+    clipped: Matrix,
+    part: Vector,
 ) -> None:
     """Replace the chosen texels by the mean over their covered area, weighted by trust;
     exact for linear values.
 
-    `covered` (size, size) starts as 0; `polygon` and `other` (CORNERS, 2) and `part`
+    `covered` (size, size) starts as 0; `polygon` and `clipped` (CORNERS, 2) and `part`
     (3,) are buffers.
     """
     size = chosen.shape[0]
@@ -143,11 +149,11 @@ def average(
                 n = 3
                 for side in range(4):  # left, right, top, bottom
                     line = (i if side // 2 else j) + side % 2
-                    n = _clip(
-                        polygon, other, n, side // 2, line, 1.0 - 2.0 * (side % 2)
-                    )
-                    polygon, other = other, polygon
-                part[0], part[1], part[2] = 0.0, 0.0, 0.0
+                    sign = 1.0 - 2.0 * (side % 2)
+                    n = _clip(polygon, clipped, n, side // 2, line, sign)
+                    polygon, clipped = clipped, polygon
+                for k in range(3):
+                    part[k] = 0.0
                 # a fan of triangles: area of each times the weights of the corners at its centroid
                 for k in range(1, n - 1):
                     px = polygon[k, 0] - polygon[0, 0]
@@ -167,11 +173,11 @@ def average(
                 covered[i, j] += part[0] + part[1] + part[2]
                 for k in range(3):
                     corner = faces[f, k]
-                    share = part[k] * trust[corner]
-                    if share > 0:
-                        confidence[i, j] += share
+                    trusted = part[k] * trust[corner]
+                    if trusted > 0:
+                        confidence[i, j] += trusted
                         for channel in range(values.shape[1]):
-                            image[i, j, channel] += share * values[corner, channel]
+                            image[i, j, channel] += trusted * values[corner, channel]
     for i in range(size):
         for j in range(size):
             if chosen[i, j] and confidence[i, j] > 0:
@@ -182,21 +188,22 @@ def average(
 
 @kernel
 def _clip(
-    polygon: Array, out: Array, n: int, axis: int, line: float, side: float
+    polygon: Matrix, out: Matrix, n: int, axis: int, line: float, sign: float
 ) -> int:
-    """Corners of the part of a convex polygon where side * (x[axis] - line) >= 0
+    """Corners of the part of a convex polygon where sign * (x[axis] - line) >= 0
     (Sutherland and Hodgman 1974).
     """
     m = 0
     for k in range(n):
         after = k + 1 if k + 1 < n else 0
-        here = side * (polygon[k, axis] - line)
-        there = side * (polygon[after, axis] - line)
-        if here >= 0:
-            out[m, 0], out[m, 1] = polygon[k, 0], polygon[k, 1]
+        start = sign * (polygon[k, axis] - line)
+        end = sign * (polygon[after, axis] - line)
+        if start >= 0:
+            out[m, 0] = polygon[k, 0]
+            out[m, 1] = polygon[k, 1]
             m += 1
-        if (here > 0 and there < 0) or (here < 0 and there > 0):
-            t = here / (here - there)
+        if (start > 0 and end < 0) or (start < 0 and end > 0):
+            t = start / (start - end)
             out[m, 0] = polygon[k, 0] + t * (polygon[after, 0] - polygon[k, 0])
             out[m, 1] = polygon[k, 1] + t * (polygon[after, 1] - polygon[k, 1])
             out[m, axis] = line
@@ -205,28 +212,28 @@ def _clip(
 
 
 @kernel
-def pull(values: Array, weight: Array, coarse: Array, total: Array) -> None:
+def pull(values: Cube32, weight: Matrix32, coarse: Cube32, total: Matrix32) -> None:
     """Halve the size: weighted mean of 2 x 2 texels, and their summed weight up to 1."""
     height, width = weight.shape
     for i in range(total.shape[0]):
         for j in range(total.shape[1]):
             rows = min(2 * i + 2, height)
             columns = min(2 * j + 2, width)
-            known = 0.0
+            weights = 0.0
             for y in range(2 * i, rows):
                 for x in range(2 * j, columns):
-                    known += weight[y, x]
-            total[i, j] = min(known, 1.0)
+                    weights += weight[y, x]
+            total[i, j] = min(weights, 1.0)
             for c in range(values.shape[2]):
                 mixed = 0.0
                 for y in range(2 * i, rows):
                     for x in range(2 * j, columns):
                         mixed += np.float64(weight[y, x]) * values[y, x, c]
-                coarse[i, j, c] = mixed / known if known > 0 else 0.0
+                coarse[i, j, c] = mixed / weights if weights > 0 else 0.0
 
 
 @kernel
-def push(values: Array, weight: Array, coarse: Array, total: Array) -> None:
+def push(values: Cube32, weight: Matrix32, coarse: Cube32, total: Matrix32) -> None:
     """Blend texels with a weight below 1 with the interpolated coarser level, in place."""
     rows = np.empty(2, np.int64)
     columns = np.empty(2, np.int64)
@@ -246,7 +253,7 @@ def push(values: Array, weight: Array, coarse: Array, total: Array) -> None:
 
 
 @inline_kernel
-def _between(plane: Array, rows: Array, columns: Array) -> float:
+def _between(plane: Matrix32, rows: IntVector, columns: IntVector) -> float:
     near = 0.75 * plane[rows[0], columns[0]] + 0.25 * plane[rows[0], columns[1]]
     far = 0.75 * plane[rows[1], columns[0]] + 0.25 * plane[rows[1], columns[1]]
     return 0.75 * near + 0.25 * far

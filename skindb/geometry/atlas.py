@@ -1,10 +1,11 @@
 """Texture coordinates for a surface with one outline: a map to a disc without folds and
-with even areas.
+with even areas, and its distortion (areas, stretch, triangles turned over).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -13,13 +14,7 @@ from numpy.typing import NDArray
 from scipy.sparse.linalg import splu
 
 from skindb.errors import Fault, InputError
-from skindb.geometry.distortion import (
-    area_log2_sd,
-    flipped,
-    stretches,
-    symmetric_dirichlet,
-)
-from skindb.geometry.surfels import face_crosses
+from skindb.geometry.mesh import face_crosses
 from skindb.geometry.topology import (
     boundary_loops,
     edge_table,
@@ -27,10 +22,8 @@ from skindb.geometry.topology import (
     outline_first,
     side_lengths,
 )
+from skindb.types import Array, Faces, Float64, Index, Mask
 
-Float = NDArray[np.floating[Any]]
-Faces = NDArray[np.integer[Any]]
-Index = NDArray[np.int64]
 EQUALISATION_ROUNDS = 9  # of area equalisation
 # exponent of the squared stretch: the published 0.5 needs 13 rounds for the result of 8
 # with this; 1 oscillates
@@ -45,10 +38,14 @@ EQUAL = 1.005
 MIX = 0.5
 # of the disc, so that its rim keeps a texel from the border of a map of 1,000 and more
 DISC_RADIUS = 0.5 - 1e-3
+TRIANGLES_PER_BLOCK = 1 << 17  # takes 50 MB
+# relative to the summed products: the sign of a larger difference is correct (Shewchuk
+# 1997)
+CERTAIN = 3.4e-16
 
 
 def disc_atlas(
-    vertices: Float, faces: Faces, *, finer: tuple[sp.csr_matrix, Faces] | None = None
+    vertices: Array, faces: Faces, *, finer: tuple[sp.csr_matrix, Faces] | None = None
 ) -> tuple[NDArray[np.float32], dict[str, float]]:
     """Map a surface with at least one boundary into the unit square.
 
@@ -88,16 +85,11 @@ def disc_atlas(
     corner = np.asarray(faces, np.int64)
     loops = outline_first(points, boundary_loops(corner))
     _check(len(points), corner, loops)
-    surface = Surface(
-        *_cap_holes(points, corner, loops[1:]),
-        len(corner),
-        loops[0],
-        _circle(points[loops[0]]),
-    )
-    matrix, fine = (
-        (sp.identity(len(points), format="csr"), corner) if finer is None else finer
-    )
-    left = len(fine)
+    capped = _cap_holes(points, corner, loops[1:])
+    outline = loops[0]
+    surface = Surface(*capped, len(corner), outline, _circle(points[outline]))
+    matrix, fine = finer or (sp.identity(len(points), format="csr"), corner)
+    fewest_flips = len(fine)
     for intrinsic, weights in ((1, _intrinsic_weights), (0, _mean_value_weights)):
         maps = _equalised(surface, weights(surface.points, surface.faces))
         if intrinsic and len(maps) < EQUALISATION_ROUNDS:
@@ -108,75 +100,60 @@ def disc_atlas(
             stored = np.clip(matrix @ upright, 0.0, 1.0).astype(np.float32)
             flips = int(flipped(stored, fine).sum())
             if not flips:
-                return stored, {
-                    "flips": 0.0,
-                    "area_log2_sd": spread,
-                    "intrinsic": float(intrinsic),
-                }
-            left = min(left, flips)
+                report = {"area_log2_sd": spread, "intrinsic": float(intrinsic)}
+                return stored, {"flips": 0.0, **report}
+            fewest_flips = min(fewest_flips, flips)
+    rule = "no triangle may be turned over in the atlas"
     cure = "remove the smallest triangles from the scan, or choose a wider spacing"
-    raise InputError(
-        Fault(
-            "mesh",
-            "no triangle may be turned over in the atlas",
-            f"{left} of {len(fine)}",
-            cure,
-        )
-    )
+    found = f"{fewest_flips} of {len(fine)}"
+    raise InputError(Fault("mesh", rule, found, cure))
 
 
 @dataclass(frozen=True)
 class Surface:
     """A surface with closed holes, and the target of its outline."""
 
-    points: NDArray[np.float64]  # (v, 3) mm
+    points: Array  # (v, 3) mm
     faces: Index  # (f, 3), those of the caps last
     real: int  # faces before the caps
     rim: Index  # (r,) vertices of the outline
-    rim_uv: NDArray[np.float64]  # (r, 2)
+    rim_uv: Array  # (r, 2)
 
 
-def signed_areas(uv: Float, faces: Faces) -> NDArray[np.float64]:
+def signed_areas(uv: Array, faces: Faces) -> Float64:
     """Areas (f,) of triangles in the map; positive if they face outwards (u to the
     right, v down).
     """
-    a, b, c = (np.asarray(uv, np.float64)[faces[:, i]] for i in range(3))
-    first = b - a
-    second = c - a
-    return np.asarray(first[:, 1] * second[:, 0] - first[:, 0] * second[:, 1]) / 2
+    plus, minus = _area_products(*(np.asarray(uv)[faces[:, i]] for i in range(3)))
+    return (plus - minus) / 2
+
+
+def _area_products(a: Array, b: Array, c: Array) -> tuple[Float64, Float64]:
+    """Terms (f,) whose difference is twice the area of triangles in the map."""
+    a, b, c = (corner.astype(np.float64) for corner in (a, b, c))
+    ab = b - a
+    ac = c - a
+    return ab[:, 1] * ac[:, 0], ab[:, 0] * ac[:, 1]
 
 
 def _check(n: int, faces: Index, loops: list[Index]) -> None:
-    where = "mesh"
     cure = "cut the scan so that one open surface remains"
     if not loops:
-        raise InputError(
-            Fault(
-                where,
-                "a surface must have a boundary to be flattened",
-                "a closed surface",
-                cure,
-            )
-        )
+        rule = "a surface must have a boundary to be flattened"
+        raise InputError(Fault("mesh", rule, "a closed surface", cure))
     if len(np.unique(faces)) != n or face_components(faces).max() > 0:
         rule = "a surface must be connected to be flattened"
         found = "several components or unused vertices"
-        raise InputError(Fault(where, rule, found, "clean it"))
+        raise InputError(Fault("mesh", rule, found, "clean it"))
     handles = (2 - len(loops) - (n - len(edge_table(faces).edges) + len(faces))) // 2
     if handles:
-        raise InputError(
-            Fault(
-                where,
-                "a surface must not have handles to be flattened",
-                f"{handles} handles",
-                cure,
-            )
-        )
+        rule = "a surface must not have handles to be flattened"
+        raise InputError(Fault("mesh", rule, f"{handles} handles", cure))
 
 
 def _cap_holes(
-    points: NDArray[np.float64], faces: Index, holes: list[Index]
-) -> tuple[NDArray[np.float64], Index]:
+    points: Array, faces: Index, holes: list[Index]
+) -> tuple[Float64, Index]:
     """Close inner holes by a fan around their centre, without which their rims could fold."""
     centres = [points[loop].mean(axis=0, keepdims=True) for loop in holes]
     caps = [
@@ -186,7 +163,7 @@ def _cap_holes(
     return np.concatenate([points, *centres]), np.concatenate([faces, *caps])
 
 
-def _circle(path: NDArray[np.float64]) -> NDArray[np.float64]:
+def _circle(path: Array) -> Float64:
     """Points (n, 2) on the circle, spaced as along the path; counter-clockwise on the
     page, where v runs down.
     """
@@ -195,7 +172,7 @@ def _circle(path: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(DISC_RADIUS * np.stack([np.cos(angle), -np.sin(angle)], axis=1))
 
 
-def _intrinsic_weights(points: NDArray[np.float64], faces: Index) -> sp.csr_matrix:
+def _intrinsic_weights(points: Array, faces: Index) -> sp.csr_matrix:
     """Row i: cot of the angles across edge ij, and of those at j beside it over |p_j -
     p_i|^2 times the area around i.
 
@@ -220,15 +197,19 @@ def _intrinsic_weights(points: NDArray[np.float64], faces: Index) -> sp.csr_matr
         square = np.maximum(np.einsum("ni,ni->n", sides[k], sides[k]), tiny)
         forth = MIX * cot[k] + (1 - MIX) * around[i] * cot[(k + 2) % 3] / square
         back = MIX * cot[k] + (1 - MIX) * around[j] * cot[(k + 1) % 3] / square
-        rows = np.concatenate([i, j])
-        columns = np.concatenate([j, i])
-        weights = weights + sp.csr_matrix(
-            (np.concatenate([forth, back]), (rows, columns)), shape=(n, n)
-        )
+        weights = weights + _matrix(n, (i, j, forth), (j, i, back))
     return weights
 
 
-def _mean_value_weights(points: NDArray[np.float64], faces: Index) -> sp.csr_matrix:
+def _matrix(n: int, *entries: tuple[Index, Index, Array]) -> sp.csr_matrix:
+    """Sparse matrix (n, n) of rows, columns and values."""
+    rows, columns, values = (
+        np.concatenate(parts) for parts in zip(*entries, strict=True)
+    )
+    return sp.csr_matrix((values, (rows, columns)), shape=(n, n))
+
+
+def _mean_value_weights(points: Array, faces: Index) -> sp.csr_matrix:
     """Row i: (tan(a/2) + tan(b/2)) / |p_j - p_i| of both angles at i beside edge ij
     (Floater 2003, eq. 2.1).
     """
@@ -236,25 +217,21 @@ def _mean_value_weights(points: NDArray[np.float64], faces: Index) -> sp.csr_mat
     weights = sp.csr_matrix((n, n))
     tiny = 1e-9 * float(np.ptp(points, axis=0).max())
     for k in range(3):
-        i, j, l = faces[:, k], faces[:, (k + 1) % 3], faces[:, (k + 2) % 3]  # noqa: E741
-        first = points[j] - points[i]
-        second = points[l] - points[i]
-        a, b = (np.maximum(np.linalg.norm(x, axis=1), tiny) for x in (first, second))
-        cosine = np.einsum("ni,ni->n", first, second) / (a * b)
+        here, left, right = np.roll(faces, -k, axis=1).T
+        to_left = points[left] - points[here]
+        to_right = points[right] - points[here]
+        a = np.maximum(np.linalg.norm(to_left, axis=1), tiny)
+        b = np.maximum(np.linalg.norm(to_right, axis=1), tiny)
+        cosine = np.einsum("ni,ni->n", to_left, to_right) / (a * b)
         # at least 1e-6 and at most 1e6, so that coinciding or opposite sides have
         # positive, finite weights
         half = np.sqrt(np.clip(1 - cosine, 1e-12, 2) / np.clip(1 + cosine, 1e-12, 2))
-        rows = np.concatenate([i, i])
-        columns = np.concatenate([j, l])
-        weights = weights + sp.csr_matrix(
-            (np.concatenate([half / a, half / b]), (rows, columns)), shape=(n, n)
-        )
+        beside = _matrix(n, (here, left, half / a), (here, right, half / b))
+        weights = weights + beside
     return weights
 
 
-def _solve(
-    weights: sp.csr_matrix, rim: Index, rim_uv: NDArray[np.float64]
-) -> NDArray[np.float64] | None:
+def _solve(weights: sp.csr_matrix, rim: Index, rim_uv: Array) -> Float64 | None:
     """Positions (n, 2) in which every inner vertex is the weighted mean of its
     neighbours; None if singular.
     """
@@ -263,11 +240,9 @@ def _solve(
     uv[rim] = rim_uv
     inner = np.setdiff1d(np.arange(n), rim)
     if len(inner):
-        system = (
-            (sp.diags(np.asarray(weights.sum(axis=1)).ravel()) - weights)
-            .tocsr()[inner][:, inner]
-            .tocsc()
-        )
+        total = np.asarray(weights.sum(axis=1)).ravel()
+        laplacian = (sp.diags(total) - weights).tocsr()
+        system = laplacian[inner][:, inner].tocsc()
         # positive weights are diagonally dominant and need no pivoting, which allows a
         # symmetric ordering (8 x less fill); errors with negative weights are detected
         # as flips
@@ -284,20 +259,17 @@ def _solve(
     return uv if np.isfinite(uv).all() else None
 
 
-def _equalised(
-    surface: Surface, weights: sp.csr_matrix
-) -> list[tuple[NDArray[np.float64], float]]:
+def _equalised(surface: Surface, weights: sp.csr_matrix) -> list[tuple[Float64, float]]:
     """Maps without flips and the sd of their log2 area, the best first.
 
     In each round the weights of neighbours in stretched areas are reduced (Yoshizawa et al. 2004).
     """
-    # excludes the caps of holes
     points = surface.points
     faces = surface.faces
-    real = slice(0, surface.real)
+    real = slice(0, surface.real)  # excludes the caps of holes
     area = np.linalg.norm(face_crosses(points, faces), axis=1) / 2
-    share = np.bincount(faces.ravel(), np.repeat(area, 3), minlength=len(points))
-    found: list[tuple[float, float, NDArray[np.float64]]] = []
+    around = np.bincount(faces.ravel(), np.repeat(area, 3), minlength=len(points))
+    maps: list[tuple[float, float, Float64]] = []  # energy, sd of log2 area, uv
     for _ in range(EQUALISATION_ROUNDS):
         uv = _solve(weights, surface.rim, surface.rim_uv)
         if uv is None:
@@ -306,34 +278,24 @@ def _equalised(
         if (flat[real] <= 0).any():
             break
         stretch = stretches(points, faces[real], uv)
-        found.append((symmetric_dirichlet(*stretch), area_log2_sd(*stretch), uv))
+        maps.append((symmetric_dirichlet(*stretch), area_log2_sd(*stretch), uv))
         # area times squared stretch
         pull = area * area / np.maximum(flat, 1e-12 * np.abs(flat).sum())
-        at_vertex = np.bincount(
-            faces.ravel(), np.repeat(pull, 3), minlength=len(points)
-        ) / np.maximum(share, 1e-300)
-        weights = weights @ sp.diags(
-            (at_vertex / at_vertex.mean()) ** -STRETCH_EXPONENT
-        )
-    least = min((energy for energy, _, _ in found), default=0.0)
+        sums = np.bincount(faces.ravel(), np.repeat(pull, 3), minlength=len(points))
+        at_vertex = sums / np.maximum(around, 1e-300)
+        factor = (at_vertex / at_vertex.mean()) ** -STRETCH_EXPONENT
+        weights = weights @ sp.diags(factor)
+    limit = EQUAL * min((energy for energy, _, _ in maps), default=0.0)
     # the most even of the best, then the others by their energy
-    order = sorted(
-        found,
-        key=lambda one: (
-            one[0] > EQUAL * least,
-            one[1] if one[0] <= EQUAL * least else one[0],
-        ),
-    )
-    return [(uv, spread) for _, spread, uv in order]
+    best = sorted((m for m in maps if m[0] <= limit), key=lambda m: m[1])
+    others = sorted((m for m in maps if m[0] > limit), key=lambda m: m[0])
+    return [(uv, spread) for _, spread, uv in best + others]
 
 
-def _upright(
-    uv: NDArray[np.float64], points: NDArray[np.float64], faces: Index
-) -> NDArray[np.float64]:
+def _upright(uv: Array, points: Array, faces: Index) -> Float64:
     """Turn the disc so that height y grows upwards in the map, and move it into the unit square."""
-    area = np.bincount(
-        faces.ravel(), np.repeat(np.linalg.norm(face_crosses(points, faces), axis=1), 3)
-    )
+    double_area = np.linalg.norm(face_crosses(points, faces), axis=1)
+    area = np.bincount(faces.ravel(), np.repeat(double_area, 3))
     height = points[:, 1] - area @ points[:, 1] / area.sum()
     up = (area * height) @ (uv - area @ uv / area.sum())
     angle = np.arctan2(up[0], -up[1])  # of `up` from the top of the page, clockwise
@@ -341,3 +303,140 @@ def _upright(
     sine = np.sin(angle)
     turned = uv @ np.array([[cosine, -sine], [sine, cosine]])
     return np.asarray(turned + 0.5)
+
+
+def flipped(uv: Array, faces: Faces) -> Mask:
+    """Mask (f,) of the triangles that are turned over in the map, v downwards; exact
+    for these coordinates.
+    """
+    wrong = np.empty(len(faces), bool)
+    for start in range(0, len(faces), TRIANGLES_PER_BLOCK):
+        part = faces[start : start + TRIANGLES_PER_BLOCK]
+        corners = np.asarray(uv)[part]
+        plus, minus = _area_products(*np.moveaxis(corners, 1, 0))
+        wrong[start : start + TRIANGLES_PER_BLOCK] = plus <= minus
+        error = CERTAIN * (np.abs(plus) + np.abs(minus))
+        for i in np.flatnonzero(np.abs(plus - minus) <= error):
+            wrong[start + i] = _turned(*corners[i].astype(np.float64))
+    return wrong
+
+
+def _turned(*corners: Array) -> bool:
+    exact = (map(Fraction, corner.tolist()) for corner in corners)
+    (ax, ay), (bx, by), (cx, cy) = exact
+    return (by - ay) * (cx - ax) <= (bx - ax) * (cy - ay)
+
+
+def stretches(
+    vertices: Array, faces: Faces, uv: Array
+) -> tuple[Float64, Float64, Float64]:
+    """Largest and smallest length on the surface of a unit step in the map, and the
+    area (Sander et al. 2001).
+
+    Parameters
+    ----------
+    vertices, faces, uv
+        (v, 3) mm, (f, 3), (v, 2).
+
+    Returns
+    -------
+    largest, smallest, area : ndarray
+        (f,) mm, mm and mm2; infinite and 0 where the triangle has no area in the map.
+    """
+    parts = [
+        _stretches(vertices, faces[i : i + TRIANGLES_PER_BLOCK], uv)
+        for i in range(0, len(faces), TRIANGLES_PER_BLOCK)
+    ]
+    largest, smallest, area = (np.concatenate(x) for x in zip(*parts, strict=True))
+    return largest, smallest, area
+
+
+def _stretches(
+    vertices: Array, faces: Faces, uv: Array
+) -> tuple[Float64, Float64, Float64]:
+    p, q, r = (np.asarray(vertices)[faces[:, k]].astype(np.float64) for k in range(3))
+    s, t = (np.asarray(uv)[:, axis].astype(np.float64)[faces].T for axis in (0, 1))
+    pq = q - p
+    pr = r - p
+    area = np.linalg.norm(np.cross(pq, pr), axis=1) / 2
+    double = (s[1] - s[0]) * (t[2] - t[0]) - (t[1] - t[0]) * (s[2] - s[0])
+    flat = double == 0
+    safe = np.where(flat, 1.0, double)[:, None]
+    along_u = (pq * (t[2] - t[0])[:, None] - pr * (t[1] - t[0])[:, None]) / safe
+    along_v = (pr * (s[1] - s[0])[:, None] - pq * (s[2] - s[0])[:, None]) / safe
+    a = np.einsum("ni,ni->n", along_u, along_u)
+    b = np.einsum("ni,ni->n", along_u, along_v)
+    c = np.einsum("ni,ni->n", along_v, along_v)
+    largest = np.sqrt((a + c + np.hypot(a - c, 2 * b)) / 2)
+    # from their product, 2 area / |double|, as their difference would suffer from cancellation
+    smallest = 2 * area / np.abs(safe[:, 0]) / np.where(largest > 0, largest, 1.0)
+    smallest = np.where(flat, 0.0, np.minimum(smallest, largest))
+    return np.where(flat, np.inf, largest), smallest, area
+
+
+def area_log2_sd(largest: Array, smallest: Array, area: Array) -> float:
+    """Standard deviation over the surface of log2 of area in the map over area on the surface."""
+    used = (area > 0) & (smallest > 0)
+    weight = area[used] / area[used].sum()
+    ratio = np.log2(largest[used] * smallest[used])
+    return float(np.sqrt(weight @ (ratio - weight @ ratio) ** 2))
+
+
+def symmetric_dirichlet(largest: Array, smallest: Array, area: Array) -> float:
+    """Mean over the surface of (a^2 + b^2 + a^-2 + b^-2) / 4, a and b the stretches at
+    equal total area; 1 at best.
+
+    The energy of Smith and Schaefer (2015): it weighs uneven areas and stretch against each other.
+    """
+    used = (area > 0) & (smallest > 0)
+    if not used.any():
+        return float("inf")
+    high = largest[used] ** 2
+    low = smallest[used] ** 2
+    weight = area[used] / area[used].sum()
+    # mm2 of a unit of the map
+    scale = area[used].sum() / (area[used] / (largest[used] * smallest[used])).sum()
+    return float(weight @ (high / scale + low / scale + scale / high + scale / low) / 4)
+
+
+def distortion(
+    vertices: Array, faces: Faces, uv: Array, member: Mask
+) -> dict[str, NDArray[Any]]:
+    """Distortion of an atlas, for the entire surface and by region.
+
+    Parameters
+    ----------
+    vertices, faces, uv
+        (v, 3) mm, (f, 3), (v, 2), as stored.
+    member
+        (v, r) vertices of each region; a triangle with all corners in a region belongs to it.
+
+    Returns
+    -------
+    dict
+        (1 + r,) each, the entire surface first: `area_log2_sd`, `anisotropy_median`,
+        `anisotropy_p99` (largest over smallest stretch, quantiles over the area), NaN
+        where a region has no triangle, and `flips`.
+    """
+    largest, smallest, area = stretches(vertices, faces, uv)
+    wrong = flipped(uv, faces)
+    regions = [column[faces].all(axis=1) for column in member.T]
+    masks = [np.ones(len(faces), bool), *regions]
+    rows = [_summary(largest[mask], smallest[mask], area[mask]) for mask in masks]
+    names = ("area_log2_sd", "anisotropy_median", "anisotropy_p99")
+    columns = dict(zip(names, np.array(rows).T, strict=True))
+    return {**columns, "flips": np.array([int(wrong[mask].sum()) for mask in masks])}
+
+
+def _summary(
+    largest: Array, smallest: Array, area: Array
+) -> tuple[float, float, float]:
+    used = (area > 0) & (smallest > 0)
+    if not used.any():
+        return (np.nan,) * 3
+    ratio = largest[used] / smallest[used]
+    order = np.argsort(ratio)
+    fraction = np.cumsum(area[used][order]) / area[used].sum()
+    places = np.minimum(np.searchsorted(fraction, (0.5, 0.99)), len(order) - 1)
+    median, high = ratio[order[places]]
+    return area_log2_sd(largest, smallest, area), float(median), float(high)

@@ -4,25 +4,23 @@ pixel centres at integer + 0.5.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from skindb.geometry._camera_kernels import undistorted
+from skindb.types import Array, Float64
 
-Float = NDArray[np.floating[Any]]
 UNDISTORT_TOLERANCE = 1e-10  # in units of the focal length: 1e-7 px
 
 
-def camera_centre(R: ArrayLike, t: ArrayLike) -> Float:
+def camera_centre(R: ArrayLike, t: ArrayLike) -> Float64:
     """Centre of projection (3,) in mm of the camera `x_cam = R x + t`."""
     return np.asarray(-np.asarray(R, np.float64).T @ np.asarray(t, np.float64))
 
 
 def project(
     points: ArrayLike, K: ArrayLike, R: ArrayLike, t: ArrayLike, distortion: ArrayLike
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Float64, Float64]:
     """Pixels at which points appear.
 
     Parameters
@@ -43,14 +41,12 @@ def project(
     depth : ndarray
         (...) mm along the optical axis.
     """
-    local = np.asarray(points, np.float64) @ np.asarray(R, np.float64).T + np.asarray(
-        t, np.float64
-    )
+    rotated = np.asarray(points, np.float64) @ np.asarray(R, np.float64).T
+    local = rotated + np.asarray(t, np.float64)
     depth = local[..., 2]
     with np.errstate(divide="ignore", invalid="ignore"):
-        plane = np.where(
-            (depth > 0)[..., None], local[..., :2] / depth[..., None], np.nan
-        )
+        ratio = local[..., :2] / depth[..., None]
+    plane = np.where((depth > 0)[..., None], ratio, np.nan)
     coefficients = np.asarray(distortion, np.float64)
     square = np.einsum("...i,...i->...", plane, plane)
     plane[square >= _fold(coefficients)] = np.nan
@@ -59,9 +55,7 @@ def project(
     return np.asarray(bent @ matrix[:2, :2].T + matrix[:2, 2]), depth
 
 
-def undistort(
-    pixels: ArrayLike, K: ArrayLike, distortion: ArrayLike
-) -> NDArray[np.float64]:
+def undistort(pixels: ArrayLike, K: ArrayLike, distortion: ArrayLike) -> Float64:
     """Ideal image-plane coordinates (..., 2), x/z and y/z, of pixels (..., 2) by Newton's method.
 
     NaN where no point in front of the camera appears at that pixel.
@@ -73,19 +67,15 @@ def undistort(
     if not coefficients.any():
         return np.asarray(bent.reshape(offset.shape), np.float64)
     plane = np.empty_like(bent)
-    undistorted(
-        np.ascontiguousarray(bent),
-        coefficients,
-        float(np.sqrt(_fold(coefficients))),
-        UNDISTORT_TOLERANCE,
-        plane,
-    )
+    limit = float(np.sqrt(_fold(coefficients)))
+    bent = np.ascontiguousarray(bent)
+    undistorted(bent, coefficients, limit, UNDISTORT_TOLERANCE, plane)
     return plane.reshape(offset.shape)
 
 
 def pixel_rays(
     pixels: ArrayLike, K: ArrayLike, R: ArrayLike, distortion: ArrayLike
-) -> NDArray[np.float64]:
+) -> Float64:
     """Unit directions (..., 3) in the subject frame, from the camera through pixels
     (..., 2); NaN as `undistort`.
     """
@@ -96,23 +86,19 @@ def pixel_rays(
     return np.asarray(local @ np.asarray(R, np.float64))
 
 
-def _distort(plane: Float, coefficients: Float) -> Float:
+def _distort(plane: Array, coefficients: Array) -> Float64:
     """Distorted coordinates (..., 2) (OpenCV, camera calibration, 5 coefficients)."""
     k1, k2, p1, p2, k3 = coefficients
     x = plane[..., 0]
     y = plane[..., 1]
     r2 = x * x + y * y
     radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    return np.stack(
-        [
-            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-        ],
-        -1,
-    )
+    bent_x = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    bent_y = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    return np.stack([bent_x, bent_y], -1)
 
 
-def _fold(coefficients: Float) -> float:
+def _fold(coefficients: Array) -> float:
     """Square radius beyond which r (1 + k1 r^2 + k2 r^4 + k3 r^6) no longer grows;
     infinity if it always does.
     """

@@ -1,37 +1,32 @@
 """Repair of scanned meshes: the result is one oriented manifold surface without slivers
-or small holes.
+or small holes. Slivers are collapsed (needles) or flipped away (caps), and holes are
+filled with the triangulation of least area.
 """
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
-from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
-from numpy.typing import NDArray
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from skindb.errors import Fault, InputError
-from skindb.geometry.holes import fill_hole
-from skindb.geometry.slivers import repair_slivers
-from skindb.geometry.surfels import face_crosses
+from skindb.geometry.mesh import face_crosses
 from skindb.geometry.topology import (
     boundary_loops,
     edge_table,
     face_components,
     fans,
     outline_first,
+    pair_components,
     simple_loops,
     winding_flips,
 )
+from skindb.types import Faces, Float64, Index, Mask
 
-Float = NDArray[np.floating[Any]]
-Faces = NDArray[np.integer[Any]]
-Index = NDArray[np.int64]
 # of the diagonal of the mesh: 0.3 um on a face, far below any scanner's spacing
 WELD_DISTANCE_RATIO = 1e-6
 # longer loops are openings (neck, hair line, mouth), not scanner faults
@@ -63,13 +58,19 @@ PLACES = 20  # positions of each kind that are kept for inspection
 # enclosed volume over area^1.5 below which the outside of a sheet is undetermined, and
 # it keeps its winding
 MIN_VOLUME_RATIO = 1e-3
+# height over longest side: 4 um on a scan, a tenth of its noise; valid scans have 1e-2
+MIN_HEIGHT_RATIO = 1e-3
+MIN_FILL_HEIGHT_RATIO = 1e-4  # of a triangle that closes a slit, which may be thinner
+MAX_FLIP_ROUNDS = 10  # a flip can create a sliver in the neighbour
+DROPPED = (-1, -1, -1)
+MAX_NEEDLE_RATIO = 0.01  # shortest over longest side of a sliver that is collapsed
 
 
 @dataclass(frozen=True)
 class CleanMesh:
     """A repaired mesh and where its vertices came from."""
 
-    vertices: NDArray[np.float64]  # (v', 3) mm
+    vertices: Float64  # (v', 3) mm
     faces: Index  # (f', 3) wound outwards
     source_vertex: Index  # (v',) number in the scan; twice where a bow-tie was split
     # (v,) number here of each vertex of the scan (welded ones share it); -1 if it is
@@ -77,40 +78,39 @@ class CleanMesh:
     clean_vertex: Index
     report: dict[str, int]  # what was found and repaired
     # (3,) mm, positions of the first PLACES of each kind, without crops
-    places: dict[str, list[NDArray[np.float64]]]
+    places: dict[str, list[Float64]]
 
 
 @dataclass(frozen=True)
-class _Found:
-    """Findings so far: number of each kind, and centres of the first ones."""
+class _Report:
+    """Findings so far: number of each kind, and centres of the first PLACES."""
 
     count: dict[str, int] = field(default_factory=lambda: dict.fromkeys(KINDS, 0))
-    places: dict[str, list[NDArray[np.float64]]] = field(default_factory=dict)
+    places: dict[str, list[Float64]] = field(default_factory=dict)
 
-    def note(
-        self, kind: str, points: NDArray[np.float64], parts: Iterable[Index], count: int
+    def add(
+        self, kind: str, points: Float64, parts: Iterable[Index], count: int
     ) -> None:
-        """Add `count` of a kind, each a set of vertices; `parts` may be the first ones only."""
+        """Add `count` of a kind, each a set of vertices."""
         self.count[kind] += count
-        known = self.places.get(kind, [])
-        if more := [
-            points[part].mean(axis=0) for part in islice(parts, PLACES - len(known))
-        ]:
-            self.places[kind] = known + more
+        places = self.places.get(kind, [])
+        parts = islice(parts, PLACES - len(places))
+        if centres := [points[part].mean(axis=0) for part in parts]:
+            self.places[kind] = places + centres
 
-    def note_all(
-        self, kind: str, points: NDArray[np.float64], parts: Sequence[Index] | Index
+    def add_all(
+        self, kind: str, points: Float64, parts: Sequence[Index] | Index
     ) -> None:
         """Add every one of `parts`: faces (n, 3), edges (n, 2), vertices (n, 1), loops."""
-        self.note(kind, points, parts, len(parts))
+        self.add(kind, points, parts, len(parts))
 
 
 def clean_mesh(
-    vertices: Float,
+    vertices: Float64,
     faces: Faces,
     *,
     hole_edges: int = MAX_HOLE_EDGES,
-    keep: NDArray[np.bool_] | None = None,
+    keep: Mask | None = None,
 ) -> CleanMesh:
     """Make one oriented manifold of a scan.
 
@@ -142,81 +142,72 @@ def clean_mesh(
     """
     points = np.asarray(vertices, np.float64)
     current = np.asarray(faces, np.int64)
-    found = _Found()
+    report = _Report()
     if keep is not None:
-        found.count["cropped_faces"] = int((~keep).sum())
+        report.count["cropped_faces"] = int((~keep).sum())
         current = current[keep]
-    current, weld = _weld(points, _drop_repeated(points, current, found), found)
-    current = _drop_overfull(points, current, found)
-    current = _orient(points, current, found)
-    current, repaired, left = repair_slivers(points, current)
-    found.note_all("slivers", points, repaired)
-    found.note_all("slivers_left", points, left)
-    current = _largest_component(points, current, found)
+    current = _drop_repeated(points, current, report)
+    current, weld = _weld(points, current, report)
+    current = _drop_overfull(points, current, report)
+    current = _orient(points, current, report)
+    current, repaired, remaining = repair_slivers(points, current)
+    report.add_all("slivers", points, repaired)
+    report.add_all("slivers_left", points, remaining)
+    current = _largest_component(points, current, report)
     if not len(current):
-        raise InputError(
-            Fault(
-                "mesh",
-                "a scan must have a surface",
-                "no non-degenerate face",
-                "export it again",
-            )
-        )
-    current, source = _split_bow_ties(
-        _fill_small_holes(points, current, hole_edges, found), len(points)
-    )
-    found.note_all("bow_ties", points, source[len(points) :, None])
+        rule = "a scan must have a surface"
+        found = "no non-degenerate face"
+        raise InputError(Fault("mesh", rule, found, "export it again"))
+    current = _fill_small_holes(points, current, hole_edges, report)
+    current, source = _split_bow_ties(current, len(points))
+    report.add_all("bow_ties", points, source[len(points) :, None])
     points = points[source]
-    return _compact(points, _outwards(points, current, found), source, weld, found)
+    current = _outwards(points, current, report)
+    return _compact(points, current, source, weld, report)
 
 
-def _drop_repeated(points: NDArray[np.float64], faces: Index, found: _Found) -> Index:
+def _drop_repeated(points: Float64, faces: Index, report: _Report) -> Index:
     degenerate = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
-    found.note_all("degenerate_faces", points, faces[degenerate])
+    report.add_all("degenerate_faces", points, faces[degenerate])
     faces = faces[~degenerate]
-    _, first, inverse = np.unique(
+    _, index, inverse = np.unique(
         np.sort(faces, axis=1), axis=0, return_index=True, return_inverse=True
     )
-    original = first[inverse.ravel()]
-    again = original != np.arange(len(faces))
+    original = index[inverse.ravel()]
+    repeated = original != np.arange(len(faces))
     # an odd permutation of ascending corners
     odd = np.prod(np.sign(np.roll(faces, -1, axis=1) - faces), axis=1) > 0
-    flipped = again & (odd != odd[original])
-    found.note_all("duplicate_faces", points, faces[again & ~flipped])
-    found.note_all("flipped_duplicates", points, faces[flipped])
-    return np.asarray(faces[~again])
+    flipped = repeated & (odd != odd[original])
+    report.add_all("duplicate_faces", points, faces[repeated & ~flipped])
+    report.add_all("flipped_duplicates", points, faces[flipped])
+    return np.asarray(faces[~repeated])
 
 
-def _weld(
-    points: NDArray[np.float64], faces: Index, found: _Found
-) -> tuple[Index, Index]:
+def _weld(points: Float64, faces: Index, report: _Report) -> tuple[Index, Index]:
     """Join coinciding vertices of open boundaries (seams of a texture, unconnected triangles)."""
     table = edge_table(faces)
     rim = np.unique(table.edges[table.count == 1])
-    to = np.arange(len(points))
+    weld = np.arange(len(points))
     if len(rim):
-        tolerance = WELD_DISTANCE_RATIO * float(
-            np.linalg.norm(np.ptp(points[np.unique(faces)], axis=0))
-        )
-        pairs = cKDTree(points[rim]).query_pairs(tolerance, output_type="ndarray")
-        graph = sp.coo_matrix(
-            (np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])),
-            shape=(len(rim), len(rim)),
-        )
-        label = connected_components(graph, directed=False)[1]
-        _, first = np.unique(label, return_index=True)
-        to[rim] = rim[first[label]]
-    welded = np.flatnonzero(to != np.arange(len(points)))
-    found.note_all("welded_vertices", points, welded[:, None])
-    return _drop_repeated(points, to[faces], found) if len(welded) else faces, to
+        diagonal = float(np.linalg.norm(np.ptp(points[np.unique(faces)], axis=0)))
+        reach = WELD_DISTANCE_RATIO * diagonal
+        pairs = cKDTree(points[rim]).query_pairs(reach, output_type="ndarray")
+        label = pair_components(pairs[:, 0], pairs[:, 1], len(rim))
+        _, index = np.unique(label, return_index=True)
+        weld[rim] = rim[index[label]]
+    welded = np.flatnonzero(weld != np.arange(len(points)))
+    report.add_all("welded_vertices", points, welded[:, None])
+    if len(welded):
+        faces = _drop_repeated(points, weld[faces], report)
+    return faces, weld
 
 
-def _drop_overfull(points: NDArray[np.float64], faces: Index, found: _Found) -> Index:
+def _drop_overfull(points: Float64, faces: Index, report: _Report) -> Index:
     """Keep two faces at every edge: fins and flaps are removed before the surface to
     which they are attached.
     """
     table = edge_table(faces)
-    found.note_all("non_manifold_edges", points, table.edges[table.count > 2])
+    report.add_all("non_manifold_edges", points, table.edges[table.count > 2])
     while len(faces):
         table = edge_table(faces)
         face, side = np.nonzero(table.count[table.of_face] > 2)
@@ -228,106 +219,300 @@ def _drop_overfull(points: NDArray[np.float64], faces: Index, found: _Found) -> 
         edge = table.of_face[face, side]
         size = np.bincount(label)[label]
         order = np.lexsort((area[face], -free[face], size[face], edge))
-        _, first = np.unique(edge[order], return_index=True)
-        extra = np.unique(face[order[first]])
-        found.note_all("non_manifold_faces", points, faces[extra])
+        _, index = np.unique(edge[order], return_index=True)
+        extra = np.unique(face[order[index]])
+        report.add_all("non_manifold_faces", points, faces[extra])
         faces = np.delete(faces, extra, axis=0)
     return faces
 
 
-def _orient(points: NDArray[np.float64], faces: Index, found: _Found) -> Index:
+def _orient(points: Float64, faces: Index, report: _Report) -> Index:
     flip = winding_flips(faces) if len(faces) else np.zeros(0, bool)
     turned = np.where(flip[:, None], faces[:, ::-1], faces)
-    found.note_all("turned_faces", points, faces[flip])
+    report.add_all("turned_faces", points, faces[flip])
     # a one-sided strip has no consistent winding: cut it where two faces still traverse
     # an edge in the same direction
     key = turned * (len(points) + 1) + np.roll(turned, -1, axis=1)
     _, inverse, count = np.unique(key, return_inverse=True, return_counts=True)
     drop = np.asarray((count[inverse].reshape(-1, 3) > 1).any(axis=1))
-    found.note_all("one_sided_faces", points, faces[drop])
+    report.add_all("one_sided_faces", points, faces[drop])
     return np.asarray(turned[~drop])
 
 
-def _largest_component(
-    points: NDArray[np.float64], faces: Index, found: _Found
-) -> Index:
+def _largest_component(points: Float64, faces: Index, report: _Report) -> Index:
     label = face_components(faces) if len(faces) else np.zeros(0, np.int64)
     area = np.linalg.norm(face_crosses(points, faces), axis=1)
     keep = np.asarray(label == np.bincount(label, area, minlength=1).argmax(), bool)
     touching = np.isin(faces, faces[keep]).any(axis=1)
     hanging = ~keep & np.isin(label, label[touching])
     island = ~keep & ~hanging
-    found.note_all("hanging_faces", points, faces[hanging])
-    found.count["island_faces"] = int(island.sum())
-    names = np.unique(label[island])
-    found.note(
-        "islands", points, (faces[label == name].ravel() for name in names), len(names)
-    )
+    report.add_all("hanging_faces", points, faces[hanging])
+    report.count["island_faces"] = int(island.sum())
+    islands = np.unique(label[island])
+    corners = (faces[label == name].ravel() for name in islands)
+    report.add("islands", points, corners, len(islands))
     return np.asarray(faces[keep])
 
 
 def _split_bow_ties(faces: Index, n: int) -> tuple[Index, Index]:
     """One vertex per fan; the first fan keeps the vertex, the others get new ones at the end."""
     label = fans(faces).ravel()
-    _, first, inverse = np.unique(label, return_index=True, return_inverse=True)
-    vertex = faces.ravel()[first]  # vertex of each fan
-    _, lead = np.unique(vertex, return_index=True)
+    _, index, inverse = np.unique(label, return_index=True, return_inverse=True)
+    vertex = faces.ravel()[index]  # vertex of each fan
     extra = np.ones(len(vertex), bool)
-    extra[lead] = False
-    name = vertex.copy()
-    name[extra] = n + np.arange(int(extra.sum()))
-    return name[inverse].reshape(-1, 3), np.concatenate([np.arange(n), vertex[extra]])
+    extra[np.unique(vertex, return_index=True)[1]] = False
+    number = vertex.copy()
+    number[extra] = n + np.arange(int(extra.sum()))
+    source = np.concatenate([np.arange(n), vertex[extra]])
+    return number[inverse].reshape(-1, 3), source
 
 
 def _fill_small_holes(
-    points: NDArray[np.float64], faces: Index, hole_edges: int, found: _Found
+    points: Float64, faces: Index, hole_edges: int, report: _Report
 ) -> Index:
     """Fill small holes; holes that touch in a vertex form one boundary, which is split
     into them.
     """
     split, source = _split_bow_ties(faces, len(points))
-    parts = [
-        part for loop in boundary_loops(split) for part in simple_loops(source[loop])
-    ]
-    taken = {(int(a), int(b)) for a, b in edge_table(faces).edges}
+    loops = list[Index]()
+    for loop in boundary_loops(split):
+        loops += simple_loops(source[loop])
+    edges = set(map(tuple, edge_table(faces).edges.tolist()))
     patches = [faces]
     holes = []
-    for loop in outline_first(points, parts)[1:]:
-        patch = fill_hole(points, loop, taken) if len(loop) <= hole_edges else None
+    for loop in outline_first(points, loops)[1:]:
+        patch = fill_hole(points, loop, edges) if len(loop) <= hole_edges else None
         if patch is not None:
             patches.append(patch)
             holes.append(loop)
-            taken |= {(int(a), int(b)) for a, b in edge_table(patch).edges}
+            edges |= set(map(tuple, edge_table(patch).edges.tolist()))
     filled = np.concatenate(patches)
-    found.note_all("pin_holes", points, holes)
-    found.count["filled_faces"] = len(filled) - len(faces)
+    report.add_all("pin_holes", points, holes)
+    report.count["filled_faces"] = len(filled) - len(faces)
     return filled
 
 
-def _outwards(points: NDArray[np.float64], faces: Index, found: _Found) -> Index:
+def _outwards(points: Float64, faces: Index, report: _Report) -> Index:
     """Turn the mesh over if it encloses negative volume after its longest boundary is
     closed by a fan.
     """
     loops = outline_first(points, boundary_loops(faces))
-    found.note_all("open_loops", points, loops)
+    report.add_all("open_loops", points, loops)
     # seen from the middle of the boundary, the fan that closes it adds no volume
     origin = points[loops[0]].mean(axis=0) if loops else points[faces[0, 0]]
     cross = face_crosses(points, faces)
     volume = float(np.einsum("fi,fi->", points[faces[:, 0]] - origin, cross)) / 6
     scale = (float(np.linalg.norm(cross, axis=1).sum()) / 2) ** 1.5
     inside_out = volume < -MIN_VOLUME_RATIO * scale
-    found.count["turned_mesh"] = int(inside_out)
+    report.count["turned_mesh"] = int(inside_out)
     return np.asarray(faces[:, ::-1] if inside_out else faces)
 
 
 def _compact(
-    points: NDArray[np.float64], faces: Index, source: Index, weld: Index, found: _Found
+    points: Float64,
+    faces: Index,
+    source: Index,
+    weld: Index,
+    report: _Report,
 ) -> CleanMesh:
     used, inverse = np.unique(faces, return_inverse=True)
-    back = np.full(len(points), -1, np.int64)
-    back[used] = np.arange(len(used))
-    found.count["dropped_vertices"] = len(weld) - len(np.unique(source[used]))
-    faces = inverse.reshape(-1, 3).astype(np.int64)
+    number = np.full(len(points), -1, np.int64)
+    number[used] = np.arange(len(used))
+    report.count["dropped_vertices"] = len(weld) - len(np.unique(source[used]))
     return CleanMesh(
-        points[used], faces, source[used], back[weld], found.count, found.places
+        vertices=points[used],
+        faces=inverse.reshape(-1, 3).astype(np.int64),
+        source_vertex=source[used],
+        clean_vertex=number[weld],
+        report=report.count,
+        places=report.places,
     )
+
+
+def sliver_mask(
+    vertices: Float64, faces: Faces, min_ratio: float = MIN_HEIGHT_RATIO
+) -> Mask:
+    """Mask (f,) of triangles with a height below `min_ratio` of their longest side, or
+    with coinciding corners.
+    """
+    p = np.asarray(vertices, np.float64)[faces]
+    sides = p - np.roll(p, -1, axis=1)
+    longest = np.einsum("fki,fki->fk", sides, sides).max(axis=1, initial=0.0)
+    double_area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+    return np.asarray(double_area <= min_ratio * longest)
+
+
+def fill_hole(
+    vertices: Float64, loop: Index, edges: set[tuple[int, int]]
+) -> Index | None:
+    """Triangles that close a boundary loop (Barequet and Sharir 1995, weight: area).
+
+    Parameters
+    ----------
+    vertices
+        (v, 3) mm.
+    loop
+        (n,) vertices along the faces of the mesh (as `boundary_loops` returns).
+    edges
+        Edges (lower, higher) of the mesh, which no new diagonal may repeat.
+
+    Returns
+    -------
+    ndarray or None
+        (n - 2, 3) wound like the mesh; None where every triangulation has a sliver or
+        repeats an edge.
+    """
+    # the mesh follows the loop, so that the patch follows its reverse
+    ring = loop[::-1]
+    n = len(ring)
+    p = np.asarray(vertices, np.float64)[ring]
+    cost = np.full((n, n), np.inf)
+    split = np.zeros((n, n), np.int64)
+    cost[np.arange(n - 1), np.arange(1, n)] = 0.0
+    for span in range(2, n):
+        for i in range(n - span):
+            k = i + span
+            diagonal = min(ring[i], ring[k]), max(ring[i], ring[k])
+            if span < n - 1 and diagonal in edges:
+                continue
+            middle = np.arange(i + 1, k)
+            ends = np.full((k - i - 1, 2), [i, k])
+            corners = np.column_stack([ends[:, 0], middle, ends[:, 1]])
+            area = np.linalg.norm(np.cross(p[middle] - p[i], p[k] - p[i]), axis=1)
+            area[sliver_mask(p, corners, MIN_FILL_HEIGHT_RATIO)] = np.inf
+            total = cost[i, middle] + cost[middle, k] + area
+            split[i, k] = middle[total.argmin()]
+            cost[i, k] = total.min()
+    if not np.isfinite(cost[0, n - 1]):
+        return None
+    triangles = []
+    sides = [(0, n - 1)]
+    while sides:
+        i, k = sides.pop()
+        if k - i > 1:
+            j = int(split[i, k])
+            triangles.append((ring[i], ring[j], ring[k]))
+            sides += [(i, j), (j, k)]
+    return np.array(triangles, np.int64)
+
+
+def repair_slivers(vertices: Float64, faces: Index) -> tuple[Index, Index, Index]:
+    """Faces (f', 3) without slivers, the repaired slivers (r, 3), and those that could
+    not be repaired (s, 3).
+
+    The short edge of a needle is collapsed. The long edge of a cap is replaced by the
+    other diagonal of the quadrilateral that it forms with its neighbour, or the cap is
+    dropped if that edge is open.
+    """
+    current = np.array(faces, np.int64)
+    repaired: list[Index] = []
+    for _ in range(MAX_FLIP_ROUNDS):
+        slivers = sliver_mask(vertices, current)
+        # the neighbourhood that a repair needs
+        near = np.flatnonzero(np.isin(current, current[slivers]).any(axis=1))
+        patch = _Patch.of(current[near])
+        before = len(repaired)
+        for i in np.flatnonzero(slivers[near]).tolist():
+            corners = patch.faces[i].copy()
+            if _repair(vertices, patch, i):
+                repaired.append(corners)
+        current[near] = patch.faces
+        current = current[current[:, 0] >= 0]
+        if len(repaired) == before:
+            break
+    remaining = current[sliver_mask(vertices, current)]
+    return current, np.array(repaired, np.int64).reshape(-1, 3), remaining
+
+
+@dataclass(frozen=True)
+class _Patch:
+    """Faces under repair, -1 where dropped, and which of them are at each vertex."""
+
+    faces: Index
+    star: defaultdict[int, set[int]]
+
+    @classmethod
+    def of(cls, faces: Index) -> _Patch:
+        star = defaultdict[int, set[int]](set)
+        for i, corners in enumerate(faces.tolist()):
+            for vertex in corners:
+                star[vertex].add(i)
+        return cls(faces, star)
+
+    def put(self, i: int, corners: Sequence[int]) -> None:
+        """Replace the corners of face i."""
+        for vertex in self.faces[i].tolist():
+            self.star[vertex].discard(i)
+        self.faces[i] = corners
+        for vertex in corners:
+            self.star[vertex].add(i)
+
+    def around(self, vertex: int) -> Index:
+        """Faces (k, 3) at a vertex."""
+        return self.faces[list(self.star[vertex])]
+
+
+def _repair(vertices: Float64, patch: _Patch, i: int) -> bool:
+    """Repair face i in place, and return whether it was changed."""
+    corner = patch.faces[i]
+    if corner[0] < 0 or not sliver_mask(vertices, corner[None])[0]:
+        return False  # removed by an earlier repair
+    side = np.linalg.norm(vertices[np.roll(corner, -1)] - vertices[corner], axis=1)
+    short = int(side.argmin())
+    long = int(side.argmax())
+    ends = int(corner[short]), int(corner[(short + 1) % 3])
+    is_needle = side[short] <= MAX_NEEDLE_RATIO * side[long]
+    if is_needle and _collapse(patch, min(ends), max(ends)):
+        return True
+    return _flip(patch, i, long)
+
+
+def _collapse(patch: _Patch, keep: int, gone: int) -> bool:
+    """Move a vertex onto another unless that would pinch the surface (link condition)."""
+    at_keep = patch.around(keep)
+    at_gone = patch.around(gone)
+    between = patch.star[keep] & patch.star[gone]
+    common = set(at_keep.ravel().tolist()) & set(at_gone.ravel().tolist())
+    common -= {keep, gone}
+    open_ends = _is_open(at_keep, keep) and _is_open(at_gone, gone)
+    if len(common) != len(between) or (open_ends and len(between) == 2):
+        return False
+    for i in patch.star[gone] - between:
+        corners = patch.faces[i]
+        patch.put(i, np.where(corners == gone, keep, corners).tolist())
+    for i in between:
+        patch.put(i, DROPPED)
+    return True
+
+
+def _is_open(around: Index, vertex: int) -> bool:
+    """Whether a vertex lies on the boundary: some neighbour is in only one of its faces."""
+    _, count = np.unique(around[around != vertex], return_counts=True)
+    return bool((count == 1).any())
+
+
+def _flip(patch: _Patch, i: int, side: int) -> bool:
+    """Replace side `side` of face i by the other diagonal of the two faces at it; drop
+    the face if it is open.
+    """
+    a, b, c = np.roll(patch.faces[i], -side).tolist()
+    both = patch.star[a] & patch.star[b]
+    if len(both) == 1:
+        return _drop(patch, i, a, b, c)
+    j = min(both - {i})
+    d = next(vertex for vertex in patch.faces[j].tolist() if vertex not in (a, b))
+    if patch.star[c] & patch.star[d]:
+        return False
+    patch.put(i, (a, d, c))
+    patch.put(j, (d, b, c))
+    return True
+
+
+def _drop(patch: _Patch, i: int, a: int, b: int, c: int) -> bool:
+    """Drop face i, whose side ab is open, unless the boundary already passes c."""
+    star = patch.star
+    hangs = min(len(star[b] & star[c]), len(star[a] & star[c])) == 1
+    if not hangs and _is_open(patch.around(c), c):
+        return False
+    patch.put(i, DROPPED)
+    return True

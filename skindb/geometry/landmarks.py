@@ -1,20 +1,57 @@
-"""Named points of a surface: the mean shape of many takes."""
+"""Named points of a face: the similarity between two sets of points, the mean shape of
+many takes, and where landmarks that are not set yet may lie.
+"""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float = NDArray[np.floating[Any]]
+from skindb.geometry.mesh import closest_on_mesh
+from skindb.types import Array, Faces, Float64
+
 MAX_SHAPE_ROUNDS = 100  # of the mean shape; a face needs about 5
 SETTLED = 1e-12  # relative change of the mean shape at which it has converged
+Points = dict[str, Float64]
+NOSE = "nose_tip"
+RIGHT = "_right"
+LEFT = "_left"
+# of the width of the scan to each side of its middle, where the nose tip is searched
+MIDDLE_FRACTION = 0.15
+# of points over their length, below which they lie on a line and do not determine a
+# rotation
+MIN_WIDTH = 0.15
+# positions in mm on a mean face that looks along +z, y up: the virtual head of average
+# proportions, rounded. The subject's left is mirrored.
+_MIDDLE = {
+    "forehead_centre": (0, 96, 96),
+    "nasion": (0, 42, 106),
+    NOSE: (0, 8, 125),
+    "subnasale": (0, -10, 107),
+    "lip_upper": (0, -30, 113),
+    "chin": (0, -72, 101),
+}
+_OF_RIGHT = {
+    "forehead": (-46, 88, 80),
+    "brow": (-37, 59, 93),
+    "ala": (-16, -5, 107),
+    "eye_outer": (-44, 32, 85),
+    "eye_inner": (-17, 32, 90),
+    "mouth_corner": (-25, -36, 97),
+    "jaw": (-57, -55, 37),
+}
+MEAN_FACE: Mapping[str, Float64] = {
+    name: np.array(place, np.float64)
+    for name, place in (
+        *_MIDDLE.items(),
+        *((f"{name}{RIGHT}", place) for name, place in _OF_RIGHT.items()),
+        *((f"{name}{LEFT}", (-x, y, z)) for name, (x, y, z) in _OF_RIGHT.items()),
+    )
+}
 
 
-def similarity(
-    source: Float, target: Float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def similarity(source: Array, target: Array) -> tuple[Float64, Float64]:
     """Rotation and scale (d, d) and shift (d,) that best map source to target, without
     reflection (Umeyama 1991).
 
@@ -37,21 +74,19 @@ def similarity(
     sign[-1] = np.sign(np.linalg.det(left @ right))
     length = float((a**2).sum())
     along = float(value @ sign)
-    matrix = (
-        along / length * (left * sign) @ right
-        if along > 0 and length > 0
-        else np.eye(len(value))
-    )
+    matrix = np.eye(len(value))
+    if along > 0 and length > 0:
+        matrix = along / length * (left * sign) @ right
     return matrix, y.mean(axis=0) - x.mean(axis=0) @ matrix
 
 
-def width(points: Float) -> float:
+def width(points: Array) -> float:
     """Second largest extent of points (k, d) over the largest; 0 for a single point."""
     value = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return float(value[1] / value[0]) if len(value) > 1 and value[0] > 0 else 0.0
 
 
-def mean_shape(shapes: Float) -> NDArray[np.float64]:
+def mean_shape(shapes: Array) -> Float64:
     """Mean of shapes after rotation, scale and shift are removed (Gower 1975), in the
     mean pose of the shapes.
 
@@ -65,29 +100,133 @@ def mean_shape(shapes: Float) -> NDArray[np.float64]:
     ndarray
         (k, 2); NaN for a point no shape has.
     """
-    all_of = np.asarray(shapes, np.float64)
-    pose = mean = _known_mean(all_of)
+    shapes = np.asarray(shapes, np.float64)
+    pose = _mean_of_complete(shapes)
+    mean = pose
     size = float(np.nanmax(np.abs(pose - np.nanmean(pose, axis=0)), initial=0.0))
     for _ in range(MAX_SHAPE_ROUNDS):
         before = mean
-        mean = _onto(
-            _known_mean(np.stack([_onto(shape, before) for shape in all_of])), pose
-        )
+        aligned = np.stack([_onto(shape, before) for shape in shapes])
+        mean = _onto(_mean_of_complete(aligned), pose)
         if not np.nanmax(np.abs(mean - before), initial=0.0) > SETTLED * size:
             break
     return mean
 
 
-def _onto(shape: Float, target: Float) -> NDArray[np.float64]:
-    known = np.isfinite(shape).all(axis=1) & np.isfinite(target).all(axis=1)
-    if not known.any():
+def _onto(shape: Array, target: Array) -> Float64:
+    """A shape (k, 2) after the similarity that best maps it to another."""
+    shared = np.isfinite(shape).all(axis=1) & np.isfinite(target).all(axis=1)
+    if not shared.any():
         return np.asarray(shape, np.float64)
-    matrix, shift = similarity(shape[known], target[known])
+    matrix, shift = similarity(shape[shared], target[shared])
     return np.asarray(shape @ matrix + shift)
 
 
-def _known_mean(shapes: Float) -> NDArray[np.float64]:
-    known = np.isfinite(shapes).all(axis=2, keepdims=True)
-    total = np.where(known, shapes, 0.0).sum(axis=0)
-    count = known.sum(axis=0)
+def _mean_of_complete(shapes: Array) -> Float64:
+    """Mean (k, 2) over the shapes that have a point."""
+    complete = np.isfinite(shapes).all(axis=2, keepdims=True)
+    total = np.where(complete, shapes, 0.0).sum(axis=0)
+    count = complete.sum(axis=0)
     return np.asarray(np.where(count > 0, total / np.maximum(count, 1), np.nan))
+
+
+def mate(name: str) -> str:
+    """The name of the point on the other side; points of the middle are their own."""
+    if name.endswith(RIGHT):
+        return name.removesuffix(RIGHT) + LEFT
+    if name.endswith(LEFT):
+        return name.removesuffix(LEFT) + RIGHT
+    return name
+
+
+def nose_tip(vertices: Array) -> Float64:
+    """The foremost vertex (3,) of the middle of a scan (v, 3) that looks along +z, y up, mm.
+
+    The middle is a strip around the median of x; hair and clothes that stand out
+    farther than the nose mislead it.
+    """
+    points = np.asarray(vertices, np.float64)
+    across = points[:, 0] - np.median(points[:, 0])
+    strip = points[np.abs(across) <= MIDDLE_FRACTION * np.ptp(points[:, 0])]
+    return np.asarray(strip[np.argmax(strip[:, 2])])
+
+
+def suggest_landmarks(
+    vertices: Array, faces: Faces, points: Mapping[str, Array]
+) -> Points:
+    """Positions on the surface for the landmarks of `MEAN_FACE` that are not set.
+
+    A point whose mate is set is its mirror image across the plane of symmetry of the
+    points that are set. The nose tip is the foremost point of the middle, as long as no
+    three points that are not on a line are set. The rest are the mean face after the
+    similarity that brings it nearest to the points that are set (Umeyama 1991). All are
+    moved to the nearest point of the surface.
+
+    Parameters
+    ----------
+    vertices, faces
+        (v, 3) mm and (f, 3); the face looks along +z, y up, unless three points are set.
+    points
+        Name to position (3,) mm of those that are set; names that the mean face lacks are ignored.
+
+    Returns
+    -------
+    dict
+        Name to position (3,) mm.
+    """
+    fixed = {
+        name: np.asarray(points[name], np.float64)
+        for name in points
+        if name in MEAN_FACE
+    }
+    names = [name for name in MEAN_FACE if name not in fixed]
+    if not names:
+        return {}
+    if _determine_rotation(fixed):
+        guess = _fitted(fixed) | _mirrored(fixed)
+    else:
+        start = {NOSE: nose_tip(vertices), **fixed}
+        guess = _fitted(start) | _mirrored(fixed)
+        guess[NOSE] = start[NOSE]
+    places = np.array([guess[name] for name in names])
+    triangle, weight, _ = closest_on_mesh(vertices, faces, places)
+    corners = np.asarray(vertices, np.float64)[faces[triangle]]
+    nearest = (weight[..., None] * corners).sum(axis=1)
+    return dict(zip(names, nearest, strict=True))
+
+
+def _determine_rotation(points: Mapping[str, Array]) -> bool:
+    """Whether points determine the rotation of the head."""
+    return len(points) > 2 and width(np.array([*points.values()])) > MIN_WIDTH
+
+
+def _fitted(points: Points) -> Points:
+    """The mean face, moved onto the points that are set; only shifted where they
+    determine no rotation.
+    """
+    mean = np.array([*MEAN_FACE.values()])
+    source = np.array([MEAN_FACE[name] for name in points])
+    target = np.array([*points.values()])
+    if _determine_rotation(points):
+        matrix, shift = similarity(source, target)
+    else:
+        matrix = np.eye(3)
+        shift = (target - source).mean(axis=0)
+    return dict(zip(MEAN_FACE, mean @ matrix + shift, strict=True))
+
+
+def _mirrored(points: Points) -> Points:
+    """Mirror images of points whose mate is not set, by the reflection that best maps
+    the others onto their mates.
+    """
+    both = {name: p for name, p in points.items() if mate(name) in points}
+    if not _determine_rotation(both):
+        return {}
+    flip = np.array([-1.0, 1, 1])
+    source = np.array([points[mate(name)] for name in both]) * flip
+    matrix, shift = similarity(source, np.array([*both.values()]))
+    return {
+        mate(name): (p * flip) @ matrix + shift
+        for name, p in points.items()
+        if mate(name) not in points
+    }

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
 from skindb.geometry._ray_kernels import aim
+from skindb.types import Array, Faces, Float64, Mask
 
-Float = NDArray[np.floating[Any]]
-Faces = NDArray[np.integer[Any]]
 RAYS_PER_BLOCK = 1 << 15  # so that the arrays of the rays stay in the cache
 NUDGE = 1e-3 * np.array([0.62, 0.55, -0.56])  # mm
 NO_HIT_DISTANCE_MM = 1e36  # mm; Embree's own start, returned for a miss, is 1e37
@@ -28,7 +25,7 @@ class RayScene:
     first, and hits are refined in float64.
     """
 
-    def __init__(self, vertices: Float, faces: Faces) -> None:
+    def __init__(self, vertices: Array, faces: Faces) -> None:
         """Build the tree over vertices (v, 3) in mm and faces (f, 3)."""
         corners = np.asarray(vertices, np.float64)
         index = np.asarray(faces, np.int64)
@@ -46,13 +43,12 @@ class RayScene:
 
     def occluded(
         self,
-        origin: Float,
-        target: Float,
+        origin: Array,
+        target: Array,
         *,
-        normal: Float | None = None,
-        at: NDArray[np.integer[Any]] | None = None,
-        offset_mm: float = RAY_OFFSET_MM,
-    ) -> NDArray[np.bool_]:
+        normal: Array | None = None,
+        at: Faces | None = None,
+    ) -> Mask:
         """Whether the mesh stands between points of its surface and targets.
 
         Parameters
@@ -60,61 +56,48 @@ class RayScene:
         origin, target
             (n, 3) mm; they broadcast against each other.
         normal
-            (n, 3) unit normals at the origins. With them a ray starts above the
-            surface, and a smooth surface casts no shadow on itself where light grazes
-            it; without them it starts along the ray.
+            (n, 3) unit normals at the origins. With them a ray starts RAY_OFFSET_MM
+            above the surface, and a smooth surface casts no shadow on itself where
+            light grazes it; without them it starts that far along the ray. Every ray
+            ends RAY_OFFSET_MM before its target.
         at
             (m,) indices of the origins and normals to use; targets are then (m, 3) or a
             single one. Default all.
-        offset_mm
-            Distance by which the start is moved, and by which the ray ends before the target.
 
         Returns
         -------
         ndarray
             (n,) or (m,) bool. Origins or targets that are not finite count as hidden.
         """
-        begin, end = (
-            np.ascontiguousarray(points, np.float64) for points in (origin, target)
-        )
-        lift = (
-            np.zeros((1, 3))
-            if normal is None
-            else np.ascontiguousarray(normal, np.float64)
-        )
-        ahead = offset_mm if normal is None else 0.0
-        which = (
-            np.arange(np.broadcast_shapes(begin.shape, end.shape)[0])
-            if at is None
-            else np.asarray(at, np.int64)
-        )
-        hidden = np.empty(len(which), bool)
-        size = min(RAYS_PER_BLOCK, len(which))
-        start = np.empty((size, 3), np.float32)
-        way = np.empty((size, 3), np.float32)
-        reach = np.empty(size, np.float32)
-        for i in range(0, len(which), RAYS_PER_BLOCK):
-            part = which[i : i + RAYS_PER_BLOCK]
-            aims = end[i : i + RAYS_PER_BLOCK] if len(end) > 1 else end
-            rays = (start[: len(part)], way[: len(part)], reach[: len(part)])
-            aim(
-                begin,
-                part,
-                aims,
-                lift,
-                self._centre,
-                offset_mm,
-                ahead,
-                offset_mm,
-                *rays,
-            )
-            found = ~np.isfinite(rays[2])  # Embree overwrites its input
-            hidden[i : i + RAYS_PER_BLOCK] = (self._run("OCCLUDED", *rays) >= 0) | found
+        begin = np.ascontiguousarray(origin, np.float64)
+        end = np.ascontiguousarray(target, np.float64)
+        lift = np.zeros((1, 3))
+        ahead = RAY_OFFSET_MM
+        if normal is not None:
+            lift = np.ascontiguousarray(normal, np.float64)
+            ahead = 0.0
+        if at is None:
+            at = np.arange(np.broadcast_shapes(begin.shape, end.shape)[0])
+        chosen = np.asarray(at, np.int64)
+        hidden = np.empty(len(chosen), bool)
+        size = min(RAYS_PER_BLOCK, len(chosen))
+        memory = np.empty((2, size, 3), np.float32)
+        lengths = np.empty(size, np.float32)
+        for i in range(0, len(chosen), RAYS_PER_BLOCK):
+            block = slice(i, i + RAYS_PER_BLOCK)
+            part = chosen[block]
+            start, way = memory[:, : len(part)]
+            reach = lengths[: len(part)]
+            aims = end[block] if len(end) > 1 else end
+            points = (begin, part, aims, lift, self._centre)
+            aim(*points, RAY_OFFSET_MM, ahead, RAY_OFFSET_MM, start, way, reach)
+            invalid = ~np.isfinite(reach)  # Embree overwrites its input
+            hidden[block] = (self._run("OCCLUDED", start, way, reach) >= 0) | invalid
         return hidden
 
     def first_hit(
-        self, origin: Float, direction: Float
-    ) -> tuple[NDArray[np.int32], NDArray[np.float64], NDArray[np.float64]]:
+        self, origin: Array, direction: Array
+    ) -> tuple[NDArray[np.int32], Float64, Float64]:
         """First triangle along rays, from either side.
 
         Parameters
@@ -142,14 +125,15 @@ class RayScene:
             start = begin[part] - self._centre
             with np.errstate(invalid="ignore", divide="ignore"):
                 way = towards[part] / _length(towards[part])[:, None]
-            found = face[part] = self._first(start, way)
-            hit = np.flatnonzero(found >= 0)
-            barycentric[i + hit], distance[i + hit] = _refine(
-                self._corners[self._faces[found[hit]]], start[hit], way[hit]
-            )
+            faces = self._first(start, way)
+            face[part] = faces
+            hit = np.flatnonzero(faces >= 0)
+            triangles = self._corners[self._faces[faces[hit]]]
+            refined = _refine(triangles, start[hit], way[hit])
+            barycentric[i + hit], distance[i + hit] = refined
         return face, barycentric, distance
 
-    def distances(self, origin: Float, direction: Float) -> NDArray[np.float32]:
+    def distances(self, origin: Array, direction: Array) -> NDArray[np.float32]:
         """Distances (n,) in mm from one origin (3,) to the first triangle along unit
         directions (n, 3).
 
@@ -158,29 +142,28 @@ class RayScene:
         for depth maps; `first_hit` is exact.
         """
         start = (np.asarray(origin, np.float64) - self._centre).astype(np.float32)
-        found = np.empty(len(direction), np.float32)
+        distance = np.empty(len(direction), np.float32)
         for i in range(0, len(direction), RAYS_PER_BLOCK):
-            way = direction[i : i + RAYS_PER_BLOCK].astype(np.float32, copy=False)
-            origins = np.broadcast_to(start, way.shape)
-            found[i : i + RAYS_PER_BLOCK] = self._scene.run(
-                np.ascontiguousarray(origins), way, query="DISTANCE"
-            )
-        found[~(found < NO_HIT_DISTANCE_MM)] = np.inf
-        return found
+            block = slice(i, i + RAYS_PER_BLOCK)
+            way = direction[block].astype(np.float32, copy=False)
+            origins = np.ascontiguousarray(np.broadcast_to(start, way.shape))
+            distance[block] = self._scene.run(origins, way, query="DISTANCE")
+        distance[~(distance < NO_HIT_DISTANCE_MM)] = np.inf
+        return distance
 
-    def _first(self, start: Float, way: Float) -> NDArray[np.int32]:
-        found = self._run("INTERSECT", start, way)
+    def _first(self, start: Array, way: Array) -> NDArray[np.int32]:
+        face = self._run("INTERSECT", start, way)
         # one in a hundred rays that aim exactly at a vertex misses the mesh: misses are
         # repeated with a small shift
-        missed = np.flatnonzero((found < 0) & np.isfinite(start + way).all(axis=1))
-        found[missed] = self._run("INTERSECT", start[missed] + NUDGE, way[missed])
-        return found
+        missed = np.flatnonzero((face < 0) & np.isfinite(start + way).all(axis=1))
+        face[missed] = self._run("INTERSECT", start[missed] + NUDGE, way[missed])
+        return face
 
     def _run(
         self,
         query: str,
-        start: Float,
-        way: Float,
+        start: Array,
+        way: Array,
         reach: NDArray[np.float32] | None = None,
     ) -> NDArray[np.int32]:
         if len(start) == 0:
@@ -190,23 +173,23 @@ class RayScene:
         return np.asarray(self._scene.run(*single, length, query=query))
 
 
-def _length(vectors: Float) -> Float:
+def _length(vectors: Array) -> Float64:
     return np.asarray(np.sqrt(np.einsum("ni,ni->n", vectors, vectors)))
 
 
-def _refine(triangles: Float, origin: Float, direction: Float) -> tuple[Float, Float]:
+def _refine(
+    triangles: Array, origin: Array, direction: Array
+) -> tuple[Float64, Float64]:
     """Barycentric (n, 3) and distance (n,) in float64 of rays that meet their triangles
     (Moller and Trumbore 1997).
     """
-    a = triangles[:, 0]
-    b = triangles[:, 1]
-    c = triangles[:, 2]
-    first = b - a
-    second = c - a
+    a, b, c = np.moveaxis(triangles, 1, 0)
+    ab = b - a
+    ac = c - a
     from_a = origin - a
-    p = np.cross(direction, second)
-    q = np.cross(from_a, first)
-    determinant = np.einsum("ni,ni->n", first, p)
+    p = np.cross(direction, ac)
+    q = np.cross(from_a, ab)
+    determinant = np.einsum("ni,ni->n", ab, p)
     # edge-on in float64 although Embree reports a hit: corner a replaces the hit
     safe = np.where(np.abs(determinant) > 0, determinant, np.inf)
     u = np.einsum("ni,ni->n", from_a, p) / safe

@@ -1,4 +1,6 @@
-"""Reading scanned meshes (PLY, OBJ) without touching the order of their vertices."""
+"""Reading scanned meshes (PLY, OBJ) without touching the order of their vertices, and the
+part of a scan that is kept.
+"""
 
 from __future__ import annotations
 
@@ -6,10 +8,11 @@ from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from trimesh.exchange.ply import load_ply
 
 from skindb.errors import Fault, InputError
@@ -21,6 +24,7 @@ from skindb.limits import (
     MAX_SCAN_HEADER_BYTES,
     MAX_SCAN_VERTICES,
 )
+from skindb.types import Array, Faces, Float64, Index, Mask
 
 MAX_COLOUR = 255  # of the eight bits of a colour of a vertex
 CURE = "export the scan again as a triangle mesh in mm (PLY or OBJ)"
@@ -51,8 +55,8 @@ class Scan:
     number there.
     """
 
-    vertices: NDArray[np.float64]  # (v, 3) mm
-    faces: NDArray[np.int64]  # (f, 3)
+    vertices: Float64  # (v, 3) mm
+    faces: Index  # (f, 3)
 
 
 def read_scan(path: str | Path) -> Scan:
@@ -78,23 +82,20 @@ def read_scan(path: str | Path) -> Scan:
     file = Path(path)
     reader = {".ply": _read_ply, ".obj": _read_obj}.get(file.suffix.lower())
     if reader is None:
-        raise _fault(
-            file, "a scan must be a .ply or .obj file", f"{file.suffix or 'no suffix'}"
-        )
+        rule = "a scan must be a .ply or .obj file"
+        raise _fault(file, rule, file.suffix or "no suffix")
     try:
         with open_regular(file, MAX_SCAN_BYTES) as stream:
             vertices, faces = reader(stream)
     except InputError:
         raise
     except OSError as error:
-        raise _fault(
-            file, "the scan must be readable", error.strerror or str(error)
-        ) from error
+        found = error.strerror or str(error)
+        raise _fault(file, "the scan must be readable", found) from error
     except DAMAGE as error:
-        raise _fault(
-            file, "the scan must be a complete mesh file", _damage(error)
-        ) from error
-    if faults := _faults(file, vertices, faces):
+        rule = "the scan must be a complete mesh file"
+        raise _fault(file, rule, _damage(error)) from error
+    if faults := _faults(str(file), vertices, faces):
         raise InputError(faults)
     return Scan(vertices, faces)
 
@@ -107,62 +108,49 @@ def read_colours(path: str | Path, count: int) -> NDArray[np.uint8] | None:
     if file.suffix.lower() != ".ply":
         return None
     with open_regular(file, MAX_SCAN_BYTES) as stream:
-        colours = load_ply(stream, fix_texture=False, skip_materials=True).get(
-            "vertex_colors"
-        )
-    if (
-        colours is None
-        or len(colours) != count
-        or np.max(colours, initial=0) > MAX_COLOUR
-        or np.min(colours) < 0
-    ):
+        content = load_ply(stream, fix_texture=False, skip_materials=True)
+    colours = content.get("vertex_colors")
+    if colours is None or len(colours) != count:
         return None
-    found = np.asarray(colours)[:, :3]
-    return found.astype(np.uint8) if found.dtype.kind in "iu" else None
+    colours = np.asarray(colours)
+    if colours.dtype.kind not in "iu":
+        return None
+    if np.max(colours, initial=0) > MAX_COLOUR or np.min(colours) < 0:
+        return None
+    return colours[:, :3].astype(np.uint8)
 
 
 def _damage(error: Exception) -> str:
     """Description of the damage of a mesh file, for a message."""
     if isinstance(error, OverflowError):
         return "a number beyond 64 bits"
-    return (
-        str(error)
-        if isinstance(error, DamageError)
-        else "one that is cut off or damaged"
-    )
+    if isinstance(error, DamageError):
+        return str(error)
+    return "one that is cut off or damaged"
 
 
 def _fault(file: Path, rule: str, found: str) -> InputError:
     return InputError(Fault(str(file), rule, found, CURE))
 
 
-def _faults(
-    file: Path, vertices: NDArray[np.float64], faces: NDArray[np.int64]
-) -> list[Fault]:
+def _faults(where: str, vertices: Array, faces: Index) -> list[Fault]:
     faults = []
     if len(faces) == 0:
-        faults.append(
-            Fault(
-                str(file),
-                "a scan must have triangles",
-                f"{len(vertices)} vertices and no face",
-                CURE,
-            )
-        )
+        found = f"{len(vertices)} vertices and no face"
+        faults.append(Fault(where, "a scan must have triangles", found, CURE))
     bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
     if len(bad):
         found = f"{len(bad)} that are not finite, first vertex {bad[0]}"
-        faults.append(Fault(str(file), "vertices must be finite numbers", found, CURE))
+        faults.append(Fault(where, "vertices must be finite numbers", found, CURE))
     wrong = np.flatnonzero(((faces < 0) | (faces >= len(vertices))).any(axis=1))
     if len(wrong):
+        rule = "faces must refer to vertices of the file"
         found = f"{len(wrong)} other faces, first face {wrong[0]}, for {len(vertices)} vertices"
-        faults.append(
-            Fault(str(file), "faces must refer to vertices of the file", found, CURE)
-        )
+        faults.append(Fault(where, rule, found, CURE))
     return faults
 
 
-def _read_ply(stream: BinaryIO) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _read_ply(stream: BinaryIO) -> tuple[Float64, Index]:
     _require_counts(stream)
     # fix_texture would split vertices along texture seams and so renumber them
     content = load_ply(stream, fix_texture=False, skip_materials=True)
@@ -170,9 +158,9 @@ def _read_ply(stream: BinaryIO) -> tuple[NDArray[np.float64], NDArray[np.int64]]
     faces = np.asarray(content.get("faces", np.zeros((0, 3))), np.int64)
     if vertices.ndim != 2 or vertices.shape[1] != 3:
         raise DamageError(f"vertices of shape {vertices.shape}")
-    return vertices, _triangulated(
-        [*faces] if faces.ndim == 2 and faces.shape[1] != 3 else faces, vertices
-    )
+    if faces.ndim == 2 and faces.shape[1] != 3:
+        return vertices, _triangulated(list(faces), vertices)
+    return vertices, faces.reshape(-1, 3)
 
 
 def _require_counts(stream: BinaryIO) -> None:
@@ -189,17 +177,15 @@ def _require_counts(stream: BinaryIO) -> None:
             continue
         name = rest[0]
         count = int(rest[1])
-        most = {b"vertex": MAX_SCAN_VERTICES, b"face": MAX_SCAN_FACES}.get(name, size)
+        limit = {b"vertex": MAX_SCAN_VERTICES, b"face": MAX_SCAN_FACES}.get(name, size)
         total += count
-        if not 0 <= count <= min(most, size):
+        if not 0 <= count <= min(limit, size):
             raise DamageError(
                 f"a header that states {count:,} elements {name.decode('latin-1')!a}"
             )
     if b"ascii" in header:
-        lines = sum(
-            block.count(b"\n") + block.count(b"\r")
-            for block in iter(lambda: stream.read(1 << 20), b"")
-        )
+        blocks = iter(lambda: stream.read(1 << 20), b"")
+        lines = sum(block.count(b"\n") + block.count(b"\r") for block in blocks)
         if lines > MAX_PLY_TEXT_LINES:
             raise DamageError(f"{lines:,} lines of text: write a binary PLY file")
         stream.seek(len(header) + len(end))
@@ -209,7 +195,7 @@ def _require_counts(stream: BinaryIO) -> None:
     stream.seek(0)
 
 
-def _read_obj(stream: BinaryIO) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _read_obj(stream: BinaryIO) -> tuple[Float64, Index]:
     """Positions and faces only: general readers split or reorder vertices where texture
     coordinates differ.
     """
@@ -252,25 +238,72 @@ def _obj_lines(stream: BinaryIO) -> Iterator[tuple[bytes, bytes]]:
     yield word, rest
 
 
-def _triangulated(
-    polygons: list[list[int]] | list[NDArray[np.int64]] | NDArray[np.int64],
-    points: NDArray[np.float64],
-) -> NDArray[np.int64]:
-    if isinstance(polygons, np.ndarray):
-        return polygons.reshape(-1, 3)
-    cut = [
-        np.roll(p, -1) if len(p) == 4 and _second_is_shorter(p, points) else p
-        for p in polygons
-    ]
-    fans = [[p[0], p[i], p[i + 1]] for p in cut for i in range(1, len(p) - 1)]
-    return np.array(fans, np.int64).reshape(-1, 3)
+def _triangulated(polygons: list[Index], points: Array) -> Index:
+    """Triangles (f, 3) of polygons, quads along their shorter diagonal."""
+    triangles = []
+    for polygon in polygons:
+        corners = polygon
+        if len(polygon) == 4 and _second_is_shorter(polygon, points):
+            corners = np.roll(polygon, -1)
+        triangles += [
+            [corners[0], corners[i], corners[i + 1]] for i in range(1, len(corners) - 1)
+        ]
+    return np.array(triangles, np.int64).reshape(-1, 3)
 
 
-def _second_is_shorter(quad: Any, points: NDArray[np.float64]) -> bool:
+def _second_is_shorter(quad: Index, points: Array) -> bool:
     """Whether corners 1 and 3 are nearer than 0 and 2: a quad cut along its shorter
     diagonal does not fold.
     """
     if min(quad) < 0 or max(quad) >= len(points):
         return False  # reported later
-    a, b, c, d = points[np.asarray(quad)]
+    a, b, c, d = points[quad]
     return bool(np.linalg.norm(b - d) < np.linalg.norm(a - c))
+
+
+@dataclass(frozen=True)
+class Crop:
+    """Limits of the part of a scan that is kept; all of them apply."""
+
+    low: tuple[float, float, float] | None = None  # corner of a box along the axes, mm
+    high: tuple[float, float, float] | None = None
+    reach_mm: float | None = None  # largest distance from the nearest landmark
+
+    def __post_init__(self) -> None:
+        """Check that the limits are not empty."""
+        is_box = self.low is not None and self.high is not None
+        if is_box and not np.less(np.array(self.low), np.array(self.high)).all():
+            found = f"{self.low} and {self.high}"
+            rule = "its lower corner must lie below the higher one, in mm"
+            raise InputError(Fault("crop", rule, found, "exchange them"))
+        if self.reach_mm is not None and not self.reach_mm > 0:
+            rule = "its reach must be positive, in mm"
+            cure = "give a positive one"
+            raise InputError(Fault("crop", rule, str(self.reach_mm), cure))
+
+
+def crop_faces(
+    vertices: Array, faces: Faces, crop: Crop, *, landmarks: Array | None = None
+) -> Mask:
+    """Mask (f,) of the faces whose corners are all kept, so that none extends beyond the box.
+
+    Parameters
+    ----------
+    vertices, faces
+        (v, 3) mm and (f, 3).
+    crop
+        Limits.
+    landmarks
+        (k, 3) mm, needed where the crop has a reach.
+    """
+    points = np.asarray(vertices, np.float64)
+    kept = np.ones(len(points), bool)
+    if crop.low is not None:
+        kept &= (points >= crop.low).all(axis=1)
+    if crop.high is not None:
+        kept &= (points <= crop.high).all(axis=1)
+    if crop.reach_mm is not None:
+        if landmarks is None or not len(landmarks):
+            raise ValueError("a crop around the landmarks needs landmarks")
+        kept &= cKDTree(landmarks).query(points)[0] <= crop.reach_mm
+    return np.asarray(kept[faces].all(axis=1))

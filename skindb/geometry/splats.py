@@ -13,14 +13,13 @@ points of a light each), and ten of twice the side take 2.5 GiB.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from skindb.geometry._splat_kernels import splat
+from skindb.types import Array, Faces, Float64, Index
 
-Float = NDArray[np.floating[Any]]
 # of blended over rasterised pixels; 0.5 was measured to hide 0.2 to 0.9 % more than
 # rays
 THRESHOLD = 0.25
@@ -37,7 +36,7 @@ MIN_DEPTH_RATIO = 0.2
 
 
 # frame, focal, corner as of a DepthMap; height and width
-_View = tuple[Float, float, Float, tuple[int, int]]
+_View = tuple[Float64, float, Float64, tuple[int, int]]
 
 
 @dataclass(frozen=True)
@@ -60,9 +59,9 @@ class SplatScene:
 
     def __init__(
         self,
-        position: Float,
-        normal: Float,
-        radius: Float,
+        position: Array,
+        normal: Array,
+        radius: Array,
         *,
         pixel_mm: float | None = None,
     ) -> None:
@@ -72,46 +71,36 @@ class SplatScene:
         `pixel_mm` is the width of a pixel of the depth maps at the middle of the discs;
         by default PIXEL of their median radius.
         """
-        given = np.concatenate(
-            [position, normal, np.asarray(radius)[:, None]], axis=1
-        ).astype(np.float64)
-        sound = np.isfinite(given).all(axis=1) & (given[:, 6] >= 0)
-        used = given[sound, :3]
-        self._low = used.min(axis=0) if len(used) else np.zeros(3)
-        self._high = used.max(axis=0) if len(used) else np.zeros(3)
+        columns = [position, normal, np.asarray(radius)[:, None]]
+        discs = np.concatenate(columns, axis=1).astype(np.float64)
+        self._valid = np.isfinite(discs).all(axis=1) & (discs[:, 6] >= 0)
+        self._drawn = np.flatnonzero(self._valid)
+        drawn = discs[self._drawn] if len(self._drawn) else np.zeros((1, 7))
+        self._low = drawn[:, :3].min(axis=0)
+        self._high = drawn[:, :3].max(axis=0)
         self._centre = (self._low + self._high) / 2  # float32 serves relative to it
-        self._position = np.ascontiguousarray(given[:, :3] - self._centre, np.float32)
-        self._normal = np.ascontiguousarray(given[:, 3:6], np.float32)
-        self._radius = given[:, 6].astype(np.float32)
-        self._sound = sound
-        self._drawn = np.flatnonzero(sound)
-        wanted = PIXEL * float(np.median(given[sound, 6])) if len(used) else 1.0
+        self._position = np.ascontiguousarray(discs[:, :3] - self._centre, np.float32)
+        self._normal = np.ascontiguousarray(discs[:, 3:6], np.float32)
+        self._radius = discs[:, 6].astype(np.float32)
         # discs without a size are points, which any map resolves
-        self._pixel = (
-            pixel_mm
-            or wanted
-            or float(np.linalg.norm(self._high - self._low)) / MAX_MAP_SIDE_PX
-            or 1.0
-        )
+        self._extent = float(np.linalg.norm(self._high - self._low))
+        intended = pixel_mm or PIXEL * float(np.median(drawn[:, 6]))
+        self._pixel = intended or self._extent / MAX_MAP_SIDE_PX or 1.0
 
     def draw(self, eye: ArrayLike) -> list[DepthMap]:
         """Depth maps from an eye (3,) in mm: one that contains all discs, or six if the
         eye is among them.
         """
-        place = np.asarray(eye, np.float64)
-        maps = (
-            self._maps(place) if np.isfinite(place).all() and len(self._drawn) else []
-        )
+        maps = [_empty(*view) for view in self._layout(eye)[1]]
         for view in maps:
-            self._splat(
-                place, self._drawn, view, np.zeros(0, np.float32), counting=False
-            )
+            unused = np.zeros(0, np.float32)
+            self._splat(eye, self._drawn, view, unused, counting=False)
         return maps
 
     def visible_fraction(
         self,
         eye: ArrayLike,
-        at: NDArray[np.integer[Any]] | None = None,
+        at: Faces | None = None,
         *,
         maps: list[DepthMap] | None = None,
     ) -> NDArray[np.float32]:
@@ -132,97 +121,79 @@ class SplatScene:
             (m,) in [0, 1]; the paper calls a disc visible above a threshold. 0 for
             discs that face away.
         """
-        chosen = (
-            np.arange(len(self._radius)) if at is None else np.asarray(at, np.int64)
-        )
-        share = np.zeros(len(chosen), np.float32)
-        asked = np.flatnonzero(self._sound[chosen])
-        found = np.zeros(len(asked), np.float32)
+        if at is None:
+            at = np.arange(len(self._radius))
+        chosen = np.asarray(at, np.int64)
+        valid = self._valid[chosen]
+        discs = chosen[valid]
+        visible = np.zeros(len(discs), np.float32)
         for view in self.draw(eye) if maps is None else maps:
-            self._splat(
-                np.asarray(eye, np.float64), chosen[asked], view, found, counting=True
-            )
-        share[asked] = found
-        return share
+            self._splat(eye, discs, view, visible, counting=True)
+        fraction = np.zeros(len(chosen), np.float32)
+        fraction[valid] = visible
+        return fraction
 
     def coarsening(self, eye: ArrayLike) -> float:
         """Width of the pixels of an eye's maps over the intended width: 1 if
         MAX_MAP_SIDE_PX is sufficient.
         """
-        place = np.asarray(eye, np.float64)
-        wanted, layout = (
-            self._layout(place)
-            if np.isfinite(place).all() and len(self._drawn)
-            else (1.0, [])
-        )
-        return max((wanted / focal for _, focal, _, _ in layout), default=1.0)
+        intended, views = self._layout(eye)
+        return max((intended / focal for _, focal, _, _ in views), default=1.0)
 
     def _splat(
         self,
-        eye: Float,
-        at: NDArray[np.int64],
+        eye: ArrayLike,
+        chosen: Index,
         view: DepthMap,
-        share: Float,
+        fraction: NDArray[np.float32],
         *,
         counting: bool,
     ) -> None:
-        discs = (self._position, self._normal, self._radius, at)
-        local = (eye - self._centre).astype(np.float32)
-        seen = (view.frame, local, np.float32(view.focal), view.corner)
-        splat(
-            *discs,
-            *seen,
-            np.float32(SLOPE_PX),
-            np.float32(BIAS_MM),
-            view.depth,
-            share,
-            counting,
-        )
+        discs = (self._position, self._normal, self._radius, chosen)
+        local = (np.asarray(eye, np.float64) - self._centre).astype(np.float32)
+        projection = (view.frame, local, np.float32(view.focal), view.corner)
+        tolerance = (np.float32(SLOPE_PX), np.float32(BIAS_MM))
+        splat(*discs, *projection, *tolerance, view.depth, fraction, counting)
 
-    def _maps(self, eye: Float) -> list[DepthMap]:
-        """Empty maps."""
-        return [_empty(*one) for one in self._layout(eye)[1]]
-
-    def _layout(self, eye: Float) -> tuple[float, list[_View]]:
+    def _layout(self, eye: ArrayLike) -> tuple[float, list[_View]]:
         """The intended focal length, and the views within the limit of pixels."""
-        corners = np.stack(
-            np.meshgrid(*np.stack([self._low, self._high], axis=1), indexing="ij"), -1
-        ).reshape(-1, 3)
-        way = self._centre - eye
+        place = np.asarray(eye, np.float64)
+        if not np.isfinite(place).all() or not len(self._drawn):
+            return 1.0, []
+        ends = np.stack([self._low, self._high], axis=1)
+        corners = np.stack(np.meshgrid(*ends, indexing="ij"), -1).reshape(-1, 3)
+        way = self._centre - place
         distance = float(np.linalg.norm(way))
         frame = _looking(way / distance if distance > 0 else np.array([0.0, 0, 1]))
-        local = (corners - eye) @ frame.T
+        local = (corners - place) @ frame.T
         depth = local[:, 2]
         if depth.min() > MIN_DEPTH_RATIO * depth.max():
             plane = local[:, :2] / depth[:, None]
             low = plane.min(axis=0)
             high = plane.max(axis=0)
-            wanted = max(distance, self._pixel) / self._pixel
-            focal = min(
-                wanted, (MAX_MAP_SIDE_PX - 4) / max(float((high - low).max()), 1e-9)
-            )
+            intended = max(distance, self._pixel) / self._pixel
+            span = max(float((high - low).max()), 1e-9)
+            focal = min(intended, (MAX_MAP_SIDE_PX - 4) / span)
             corner = np.floor(low * focal) - 1
             width, height = (np.ceil(high * focal) + 1 - corner).astype(int)
-            return wanted, [(frame, focal, corner, (height, width))]
-        wanted = max(
-            float(np.linalg.norm(self._high - self._low)) / 2 / self._pixel, 16
-        )
-        half = int(min(wanted, MAX_MAP_SIDE_PX // 2))
+            return intended, [(frame, focal, corner, (height, width))]
+        intended = max(self._extent / 2 / self._pixel, 16)
+        half = int(min(intended, MAX_MAP_SIDE_PX // 2))
+        corner = np.full(2, -half, np.float64)
         axes = np.concatenate([np.eye(3), -np.eye(3)])
-        return int(wanted), [
-            (_looking(axis), half, np.full(2, -half), (2 * half, 2 * half))
-            for axis in axes
-        ]
+        size = (2 * half, 2 * half)
+        views: list[_View] = [(_looking(axis), half, corner, size) for axis in axes]
+        return int(intended), views
 
 
 def _empty(
-    frame: Float, focal: float, corner: Float, shape: tuple[int, int]
+    frame: Array, focal: float, corner: Array, shape: tuple[int, int]
 ) -> DepthMap:
     depth = np.full(shape, np.float32(np.inf))
     return DepthMap(frame.astype(np.float32), focal, corner.astype(np.float32), depth)
 
 
-def _looking(forwards: Float) -> NDArray[np.float64]:
+def _looking(forwards: Array) -> Float64:
     """Rows right, down, forwards (3, 3) of a frame that looks along a unit vector."""
     helper = np.eye(3)[np.abs(forwards).argmin()]
     right = np.cross(helper, forwards)

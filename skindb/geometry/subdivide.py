@@ -2,21 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
 
 from skindb.geometry.topology import EdgeTable, edge_table
-
-Float = NDArray[np.floating[Any]]
-Faces = NDArray[np.integer[Any]]
+from skindb.types import Array, Faces, Float64, Index
 
 
-def loop_matrix(
-    faces: Faces, n_vertices: int
-) -> tuple[sp.csr_matrix, NDArray[np.int64]]:
+def loop_matrix(faces: Faces, n_vertices: int) -> tuple[sp.csr_matrix, Index]:
     """One level of Loop subdivision (Loop 1987; boundaries as cubic B-splines, Hoppe et al. 1994).
 
     Parameters
@@ -39,23 +32,19 @@ def loop_matrix(
     table = edge_table(corner)
     if (table.count > 2).any():
         raise ValueError("an edge belongs to more than two faces; clean the mesh first")
-    matrix = sp.vstack(
-        [
-            _even_rows(table, n_vertices),
-            _odd_rows(table, np.roll(corner, 1, axis=1), n_vertices),
-        ]
-    )
+    even = _even_rows(table, n_vertices)
+    odd = _odd_rows(table, np.roll(corner, 1, axis=1), n_vertices)
     middle = table.of_face + n_vertices
     children = [
-        np.stack([corner[:, i], middle[:, i], middle[:, i - 1]], axis=1)
+        np.column_stack([corner[:, i], middle[:, i], middle[:, i - 1]])
         for i in range(3)
     ]
-    return matrix.tocsr(), np.concatenate([*children, middle])
+    return sp.vstack([even, odd]).tocsr(), np.concatenate([*children, middle])
 
 
 def subdivide(
-    vertices: Float, faces: Faces, levels: int
-) -> tuple[NDArray[np.float64], NDArray[np.int64], sp.csr_matrix]:
+    vertices: Array, faces: Faces, levels: int
+) -> tuple[Float64, Index, sp.csr_matrix]:
     """`levels` levels of Loop subdivision.
 
     Parameters
@@ -82,8 +71,8 @@ def subdivide(
 
 
 def carry_points(
-    face: NDArray[np.int64], barycentric: Float, n_faces: int, levels: int
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    face: Index, barycentric: Array, n_faces: int, levels: int
+) -> tuple[Index, Float64]:
     """Positions of points of a mesh after `levels` levels of subdivision, at the same parameters.
 
     Parameters
@@ -100,7 +89,7 @@ def carry_points(
     face, barycentric
         (k,) triangles of the new mesh and (k, 3) weights of their corners.
     """
-    at = np.array(face, np.int64)
+    triangle = np.array(face, np.int64)
     weight = np.array(barycentric, np.float64).reshape(-1, 3)
     for level in range(levels):
         corner = weight.argmax(axis=1)
@@ -108,12 +97,10 @@ def carry_points(
         # child i has corner i, the middle of the side from it and the middle of the
         # side to it; child 3 the middles
         around = np.take_along_axis(weight, (corner[:, None] + [0, 1, 2]) % 3, axis=1)
-        outer = np.stack(
-            [2 * around[:, 0] - 1, 2 * around[:, 1], 2 * around[:, 2]], axis=1
-        )
+        outer = 2 * around - [1, 0, 0]
         weight = np.where(middle[:, None], 1 - 2 * np.roll(weight, 1, axis=1), outer)
-        at += np.where(middle, 3, corner) * n_faces * 4**level
-    return at, weight
+        triangle += np.where(middle, 3, corner) * n_faces * 4**level
+    return triangle, weight
 
 
 def _odd_rows(table: EdgeTable, opposite: Faces, n: int) -> sp.csr_matrix:
@@ -145,12 +132,9 @@ def _even_rows(table: EdgeTable, n: int) -> sp.csr_matrix:
     beta = np.where((rim_valence == 0) & (valence > 0), beta, 0.0)
     # the vertex of a single face is a corner of the outline and stays, as does a bow-tie
     smooth = (rim_valence == 2) & (valence > 2)
-    keep = np.where(smooth, 3 / 4, 1 - beta * valence)
-    return sp.csr_matrix(
-        sp.diags(keep)
-        + sp.diags(beta) @ neighbours
-        + sp.diags(np.where(smooth, 1 / 8, 0.0)) @ rim
-    )
+    diagonal = sp.diags(np.where(smooth, 3 / 4, 1 - beta * valence))
+    along_rim = sp.diags(np.where(smooth, 1 / 8, 0.0)) @ rim
+    return sp.csr_matrix(diagonal + sp.diags(beta) @ neighbours + along_rim)
 
 
 def _adjacency(edges: Faces, n: int) -> sp.csr_matrix:

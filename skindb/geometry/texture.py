@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,14 +13,13 @@ from skindb.geometry._texture_kernels import (
     push,
     rasterise,
 )
+from skindb.types import Array, Faces, Float64, Index
 
-Float = NDArray[np.floating[Any]]
-Faces = NDArray[np.integer[Any]]
 Image = NDArray[np.float32]
 
 
 def rasterise_atlas(
-    uv: Float, faces: Faces, size: int
+    uv: Array, faces: Faces, size: int
 ) -> tuple[NDArray[np.int32], Image]:
     """Triangle and position at every texel centre of a square map.
 
@@ -49,9 +46,9 @@ def rasterise_atlas(
 
 
 def atlas_values(
-    values: Float,
-    trust: Float,
-    uv: Float,
+    values: Array,
+    trust: Array,
+    uv: Array,
     faces: Faces,
     raster: tuple[NDArray[np.int32], Image],
 ) -> tuple[Image, Image]:
@@ -80,20 +77,20 @@ def atlas_values(
     """
     face, weight = raster
     corner = _indices(faces)
-    at = _doubles(uv)
+    place = _doubles(uv)
     mixed, trusted = (np.ascontiguousarray(x, np.float32) for x in (values, trust))
     image = np.zeros((*face.shape, values.shape[1]), np.float32)
     confidence = np.zeros(face.shape, np.float32)
     interpolate(face, weight, corner, trusted, mixed, image, confidence)
-    tiny = _areas(at, corner) * face.size < 1
+    tiny = _areas(place, corner) * face.size < 1
     if tiny.any():
         chosen = (face >= 0) & tiny[face]
         memory = np.zeros_like(confidence), *np.empty((2, CORNERS, 2)), np.empty(3)
-        average(at, corner, chosen, trusted, mixed, image, confidence, *memory)
+        average(place, corner, chosen, trusted, mixed, image, confidence, *memory)
     return image, confidence
 
 
-def _doubles(x: Float) -> NDArray[np.float64]:
+def _doubles(x: Array) -> Float64:
     """Convert to one type, so that kernels are compiled once."""
     return np.ascontiguousarray(x, np.float64)
 
@@ -102,15 +99,14 @@ def _indices(faces: Faces) -> NDArray[np.int32]:
     return np.ascontiguousarray(faces, np.int32)
 
 
-def _areas(uv: Float, faces: Faces) -> Image:
+def _areas(uv: Array, faces: Faces) -> Image:
     a, b, c = (np.asarray(uv, np.float32)[faces[:, k]] for k in range(3))
-    first = b - a
-    second = c - a
-    area: Image = np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]) / 2
-    return area
+    ab = b - a
+    ac = c - a
+    return np.asarray(np.abs(ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]) / 2)
 
 
-def push_pull(image: Float, confidence: Float) -> tuple[Image, Image]:
+def push_pull(image: Array, confidence: Array) -> tuple[Image, Image]:
     """Fill unknown texels from increasingly coarse averages (Gortler et al. 1996, section 3.5).
 
     Parameters
@@ -129,12 +125,12 @@ def push_pull(image: Float, confidence: Float) -> tuple[Image, Image]:
         nothing is known.
     """
     filled = np.array(image, np.float32)
-    known = np.nan_to_num(np.clip(np.asarray(confidence, np.float32), 0, 1))
-    known[~np.isfinite(filled).all(axis=-1)] = 0
-    if not known.any():
-        return np.full_like(filled, np.nan), known
-    filled[known == 0] = 0
-    levels = [(filled, known)]
+    weight = np.nan_to_num(np.clip(np.asarray(confidence, np.float32), 0, 1))
+    weight[~np.isfinite(filled).all(axis=-1)] = 0
+    if not weight.any():
+        return np.full_like(filled, np.nan), weight
+    filled[weight == 0] = 0
+    levels = [(filled, weight)]
     while max(levels[-1][1].shape) > 1:
         height, width = ((n + 1) // 2 for n in levels[-1][1].shape)
         coarse = (
@@ -145,10 +141,10 @@ def push_pull(image: Float, confidence: Float) -> tuple[Image, Image]:
         levels.append(coarse)
     for fine, coarse in zip(levels[-2::-1], levels[:0:-1], strict=True):
         push(*fine, *coarse)
-    return filled, known
+    return filled, weight
 
 
-def bilinear(image: Float, pixels: Float) -> NDArray[np.float64]:
+def bilinear(image: Array, pixels: Array) -> Float64:
     """Interpolate an image bilinearly between its pixel centres.
 
     Parameters
@@ -180,7 +176,7 @@ def bilinear(image: Float, pixels: Float) -> NDArray[np.float64]:
     return np.asarray(np.where(inside[..., None], top * (1 - y) + bottom * y, np.nan))
 
 
-def _cell(place: Float, size: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _cell(place: Array, size: int) -> tuple[Index, Float64]:
     """Pixel before a position along one axis, and the weight of the pixel after it."""
     centred = np.clip(place - 0.5, 0.0, size - 1.0)
     index = np.minimum(centred.astype(np.int64), size - 1)

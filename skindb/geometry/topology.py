@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
-from numpy.typing import NDArray
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 
-Faces = NDArray[np.integer[Any]]
-Index = NDArray[np.int64]
+from skindb.types import Array, Faces, Float64, Index, Mask
 
 
 @dataclass(frozen=True)
@@ -44,13 +41,8 @@ def boundary_loops(faces: Faces) -> list[Index]:
     corner = np.asarray(faces, np.int64)
     table = edge_table(corner)
     face, side = np.nonzero(table.count[table.of_face] == 1)
-    after = dict(
-        zip(
-            corner[face, side].tolist(),
-            corner[face, (side + 1) % 3].tolist(),
-            strict=True,
-        )
-    )
+    ends = corner[face, (side + 1) % 3]
+    after = dict(zip(corner[face, side].tolist(), ends.tolist(), strict=True))
     if len(after) != len(face):
         raise ValueError(
             "two boundaries meet at a vertex, or the winding is inconsistent; clean the mesh first"
@@ -64,10 +56,8 @@ def boundary_loops(faces: Faces) -> list[Index]:
             step = after.pop(step)
         loops.append(np.array(loop, np.int64))
     # longest first; ties are resolved by the lowest vertex, so that results are reproducible
-    return sorted(
-        (np.roll(loop, -int(loop.argmin())) for loop in loops),
-        key=lambda loop: (-len(loop), int(loop[0])),
-    )
+    loops = [np.roll(loop, -int(loop.argmin())) for loop in loops]
+    return sorted(loops, key=lambda loop: (-len(loop), int(loop[0])))
 
 
 def simple_loops(loop: Index) -> list[Index]:
@@ -87,12 +77,12 @@ def simple_loops(loop: Index) -> list[Index]:
     return [*parts, np.array(path, np.int64)]
 
 
-def side_lengths(path: NDArray[np.float64]) -> NDArray[np.float64]:
+def side_lengths(path: Array) -> Float64:
     """Length of each side of a closed path (n, d)."""
     return np.asarray(np.linalg.norm(np.roll(path, -1, axis=0) - path, axis=1))
 
 
-def outline_first(points: NDArray[np.float64], loops: list[Index]) -> list[Index]:
+def outline_first(points: Array, loops: list[Index]) -> list[Index]:
     """Loops by their length in mm: the outline of the surface, then its holes."""
     return sorted(loops, key=lambda loop: -float(side_lengths(points[loop]).sum()))
 
@@ -101,20 +91,23 @@ def face_components(faces: Faces) -> Index:
     """Label (f,) of the component each face belongs to; faces touch where exactly two
     share an edge.
     """
-    first, second, _ = _pairs(faces)
-    graph = sp.coo_matrix(
-        (np.ones(len(first)), (first, second)), shape=(len(faces), len(faces))
-    )
+    face, neighbour, _ = _pairs(faces)
+    return pair_components(face, neighbour, len(faces))
+
+
+def pair_components(a: Index, b: Index, n: int) -> Index:
+    """Label (n,) of the component of each of n items, of which the pairs (a, b) belong together."""
+    graph = sp.coo_matrix((np.ones(len(a)), (a, b)), shape=(n, n))
     return np.asarray(connected_components(graph, directed=False)[1], np.int64)
 
 
-def winding_flips(faces: Faces) -> NDArray[np.bool_]:
+def winding_flips(faces: Faces) -> Mask:
     """Mask (f,) of faces to turn over for a consistent winding; in each component the
     minority is turned.
     """
-    first, second, alike = _pairs(faces)
+    face, neighbour, alike = _pairs(faces)
     n = len(faces)
-    parity = sp.csr_matrix((np.where(alike, 1, 2), (first, second)), shape=(n, n))
+    parity = sp.csr_matrix((np.where(alike, 1, 2), (face, neighbour)), shape=(n, n))
     parity = parity.maximum(parity.T).tocsr()
     flip = np.zeros(n, bool)
     for members in _groups(face_components(faces)):
@@ -136,37 +129,31 @@ def fans(faces: Faces) -> Index:
     A vertex with more than one fan is a bow-tie.
     """
     vertex = np.asarray(faces, np.int64).ravel()
-    one, two = _shared_sides(faces)
-    one_end, two_end = (side // 3 * 3 + (side + 1) % 3 for side in (one, two))
-    opposite = vertex[one] != vertex[two]
-    rows = np.concatenate([one, one_end])
-    columns = np.concatenate(
-        [np.where(opposite, two_end, two), np.where(opposite, two, two_end)]
-    )
-    graph = sp.coo_matrix(
-        (np.ones(len(rows)), (rows, columns)), shape=(len(vertex), len(vertex))
-    )
-    return np.asarray(connected_components(graph, directed=False)[1], np.int64).reshape(
-        -1, 3
-    )
+    start, other = _shared_sides(faces)
+    end, other_end = (side // 3 * 3 + (side + 1) % 3 for side in (start, other))
+    opposite = vertex[start] != vertex[other]
+    at_start = np.where(opposite, other_end, other)
+    at_end = np.where(opposite, other, other_end)
+    rows = np.concatenate([start, end])
+    columns = np.concatenate([at_start, at_end])
+    return pair_components(rows, columns, len(vertex)).reshape(-1, 3)
 
 
 def _shared_sides(faces: Faces) -> tuple[Index, Index]:
     """The two sides, as 3 face + side, at every edge of exactly two faces."""
     table = edge_table(faces)
     order = np.argsort(table.of_face.ravel(), kind="stable")
-    first = np.cumsum(table.count) - table.count
-    start = first[table.count == 2]
+    start = (np.cumsum(table.count) - table.count)[table.count == 2]
     return order[start], order[start + 1]
 
 
-def _pairs(faces: Faces) -> tuple[Index, Index, NDArray[np.bool_]]:
+def _pairs(faces: Faces) -> tuple[Index, Index, Mask]:
     """Pairs of faces that share an edge, and whether they traverse it in opposite
     directions, as they should.
     """
-    one, two = _shared_sides(faces)
-    begin = np.asarray(faces, np.int64).ravel()
-    return one // 3, two // 3, begin[one] != begin[two]
+    side, other = _shared_sides(faces)
+    start = np.asarray(faces, np.int64).ravel()
+    return side // 3, other // 3, start[side] != start[other]
 
 
 def _groups(labels: Index) -> list[Index]:

@@ -1,19 +1,17 @@
-"""A smooth map of the plane through given points, without folds: thin-plate splines
-(Bookstein 1989).
+"""A smooth map of the plane through points, without folds: thin-plate splines (Bookstein
+1989).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from skindb.geometry.landmarks import similarity, width
+from skindb.types import Array, Float64, Mask
 
-Float = NDArray[np.floating[Any]]
 # of the spread of the points: half a millimetre on a face, less than the error of a
 # click
 SAME_POINT_FRACTION = 0.01
@@ -21,14 +19,14 @@ SAME_POINT_FRACTION = 0.01
 # then about 50
 SMOOTHING = 0.1
 WEAK_SMOOTHING_FACTOR = 3.0  # smoothing at a weak point relative to other points
-LOOSER = (1.0, 4.0, 16.0, 64.0)  # weak points give way before others do
+LOOSENING = (1.0, 4.0, 16.0, 64.0)  # weak points give way before others do
 # width of the points over their length, below which they are treated as a line
 MIN_WIDTH_RATIO = 1e-2
 MIN_AREA_RATIO = 0.05  # smallest area of the map relative to that of the similarity
 # smoothing of folding maps: 1e-3 moves a point by a hundredth of its misfit
-SMOOTHEST = 1e4
-FIRST = 1e-3
-STEP = 4.0
+MAX_SMOOTHING = 1e4
+MIN_SMOOTHING = 1e-3
+SMOOTHING_STEP = 4.0
 # points per side of the grid that is checked for folds, and its half length in spreads
 GRID = 64
 MARGIN = 4.0
@@ -42,24 +40,24 @@ class Warp:
     """A map of the plane: `affine` of (1, x), and `weight` of r^2 log r round each centre."""
 
     kind: str  # "thin plate", "affine", "similarity", "shift" or "identity"
-    origin: Float  # (2,)
+    origin: Array  # (2,)
     scale: float  # x = (uv - origin) / scale
-    centre: Float  # (c, 2) in x
-    weight: Float  # (c, 2)
-    affine: Float  # (3, 2)
+    centre: Array  # (c, 2) in x
+    weight: Array  # (c, 2)
+    affine: Array  # (3, 2)
     condition: float  # of the regularised system; 1 without one
     smoothing: float  # added to its diagonal, in units of x
-    loose: Float  # (c,) times that
-    # (k,) of the points given; False: not finite, or merged with one before
-    used: NDArray[np.bool_]
+    loose: Array  # (c,) times that
+    # (k,) of the points; False: not finite, or merged with one before
+    used: Mask
 
 
 def fit_warp(
-    source: Float,
-    target: Float,
+    source: Array,
+    target: Array,
     *,
     smoothing: float | None = None,
-    weak: tuple[Float, Float] | None = None,
+    weak: tuple[Array, Array] | None = None,
 ) -> Warp:
     """The map of points to other points with the least bending.
 
@@ -84,11 +82,10 @@ def fit_warp(
         np.asarray(points, np.float64).reshape(-1, 2) for points in (source, target)
     )
     a, b, used = _merged(x, y)
-    if len(a) < 2:
-        shift = b[0] - a[0] if len(a) else np.zeros(2)
-        return _plain(
-            "shift" if len(a) else "identity", used, np.zeros(2), 1.0, np.eye(2), shift
-        )
+    if not len(a):
+        return _plain("identity", used, np.zeros(2), 1.0, np.eye(2), np.zeros(2))
+    if len(a) == 1:
+        return _plain("shift", used, np.zeros(2), 1.0, np.eye(2), b[0] - a[0])
     origin = a.mean(axis=0)
     scale = _spread(a)
     a = (a - origin) / scale
@@ -96,43 +93,53 @@ def fit_warp(
     fallback = _plain("similarity", used, origin, scale, matrix, shift)
     if len(a) < 3 or width(a) < MIN_WIDTH_RATIO or width(b) < MIN_WIDTH_RATIO:
         return fallback
-    least = MIN_AREA_RATIO * np.linalg.det(matrix)
-    more, there = (np.zeros((0, 2)),) * 2 if weak is None else _finite(*weak)
-    centre = np.concatenate([a, (more - origin) / scale])
-    goal = np.concatenate([b, there])
-    start = max(0.0, SMOOTHING if smoothing is None else smoothing)
-    grown = [v for v in FIRST * STEP ** np.arange(20) if start < v < SMOOTHEST]
-    tried = [(start, by) for by in (LOOSER if len(more) else LOOSER[:1])]
-    tried += [(value, tried[-1][1]) for value in grown]
-    watched = _watched(centre) * scale + origin
-    for value, by in tried if len(centre) > 3 else []:
-        system = _System.of(
-            centre, np.repeat([1.0, by * WEAK_SMOOTHING_FACTOR], [len(a), len(more)])
-        )
-        weight, affine = system.solve(goal, value)
-        found = replace(
+    min_area = MIN_AREA_RATIO * np.linalg.det(matrix)
+    centre = a
+    goal = b
+    if weak is not None:
+        weak_source, weak_target = _finite(*weak)
+        centre = np.concatenate([a, (weak_source - origin) / scale])
+        goal = np.concatenate([b, weak_target])
+    is_weak = np.arange(len(centre)) >= len(a)
+    checked = _check_points(centre) * scale + origin
+    attempts = _attempts(smoothing, len(centre) > len(a)) if len(centre) > 3 else []
+    for smooth, loosening in attempts:
+        loose = np.where(is_weak, loosening * WEAK_SMOOTHING_FACTOR, 1.0)
+        system = _System.of(centre, loose)
+        weight, affine = system.solve(goal, smooth)
+        warp = replace(
             fallback,
             kind="thin plate",
             centre=centre,
             weight=weight,
             affine=affine,
-            loose=system.loose,
+            condition=system.condition(smooth),
+            smoothing=smooth,
+            loose=loose,
         )
-        if (
-            area_factor(found, watched).min() * scale**2
-            > least
-            < np.linalg.det(affine[1:])
-        ):
-            return replace(
-                found, condition=system.condition(value), smoothing=float(value)
-            )
+        if np.linalg.det(affine[1:]) <= min_area:
+            continue
+        if area_factor(warp, checked).min() * scale**2 > min_area:
+            return warp
     affine = np.linalg.lstsq(_linear(a), b, rcond=None)[0]
-    if np.linalg.det(affine[1:]) <= least:
+    if np.linalg.det(affine[1:]) <= min_area:
         return fallback
     return replace(fallback, kind="affine", affine=affine)
 
 
-def apply_warp(warp: Warp, uv: Float) -> NDArray[np.float64]:
+def _attempts(smoothing: float | None, has_weak: bool) -> list[tuple[float, float]]:
+    """Smoothing and loosening of the weak points, in the order in which they are tried."""
+    start = max(0.0, SMOOTHING if smoothing is None else smoothing)
+    loosening = LOOSENING if has_weak else LOOSENING[:1]
+    steps = (MIN_SMOOTHING * SMOOTHING_STEP ** np.arange(20)).tolist()
+    larger = [value for value in steps if start < value < MAX_SMOOTHING]
+    return [
+        *((start, factor) for factor in loosening),
+        *((value, loosening[-1]) for value in larger),
+    ]
+
+
+def apply_warp(warp: Warp, uv: Array) -> Float64:
     """Apply the map to points (n, 2)."""
     points = (np.asarray(uv, np.float64) - warp.origin) / warp.scale
     out = _linear(points) @ warp.affine
@@ -142,19 +149,18 @@ def apply_warp(warp: Warp, uv: Float) -> NDArray[np.float64]:
     return np.asarray(out)
 
 
-def area_factor(warp: Warp, uv: Float) -> NDArray[np.float64]:
+def area_factor(warp: Warp, uv: Array) -> Float64:
     """Determinant of the Jacobian (n,) at points (n, 2): negative where the map is folded."""
     points = (np.asarray(uv, np.float64) - warp.origin) / warp.scale
     out = np.empty(len(points))
     for block in _blocks(points, warp):
-        (a, b), (c, d) = np.moveaxis(
-            warp.affine[1:] + _slope(points[block], warp.centre, warp.weight), 0, 2
-        )
+        slope = _slope(points[block], warp.centre, warp.weight)
+        (a, b), (c, d) = np.moveaxis(warp.affine[1:] + slope, 0, 2)
         out[block] = a * d - b * c
     return out / warp.scale**2
 
 
-def left_out_error(warp: Warp) -> NDArray[np.float64]:
+def left_out_error(warp: Warp) -> Float64:
     """Leave-one-out error (k,): distance of each point from its image by the map of the
     others (Rippa 1999).
 
@@ -178,16 +184,16 @@ class _System:
     added to all of the diagonal.
     """
 
-    centre: Float  # (c, 2)
-    loose: Float  # (c,)
-    kernel: Float  # (c, c)
-    linear: Float  # (c, 3)
-    complement: Float  # (c, c - 3) orthonormal, orthogonal to `linear`
-    value: Float  # (c - 3,) eigenvalues, ascending
-    vector: Float  # (c - 3, c - 3)
+    centre: Array  # (c, 2)
+    loose: Array  # (c,)
+    kernel: Array  # (c, c)
+    linear: Array  # (c, 3)
+    complement: Array  # (c, c - 3) orthonormal, orthogonal to `linear`
+    value: Array  # (c - 3,) eigenvalues, ascending
+    vector: Array  # (c - 3, c - 3)
 
     @classmethod
-    def of(cls, centre: Float, loose: Float) -> _System:
+    def of(cls, centre: Array, loose: Array) -> _System:
         root = np.sqrt(loose)[:, None]
         kernel = _bending(centre, centre) / (root * root.T)
         linear = _linear(centre) / root
@@ -196,93 +202,91 @@ class _System:
         return cls(centre, loose, kernel, linear, complement, value, vector)
 
     def condition(self, smoothing: float) -> float:
-        return (
-            float((self.value[-1] + smoothing) / (self.value[0] + smoothing))
-            if len(self.value)
-            else 1.0
-        )
+        if not len(self.value):
+            return 1.0
+        return float((self.value[-1] + smoothing) / (self.value[0] + smoothing))
 
-    def inverse(self, smoothing: float) -> Float:
+    def inverse(self, smoothing: float) -> Float64:
         """Matrix that maps targets to weights, both scaled like the rows."""
         vector = self.complement @ self.vector
         return vector / (self.value + smoothing) @ vector.T
 
-    def solve(self, target: Float, smoothing: float) -> tuple[Float, Float]:
+    def solve(self, target: Array, smoothing: float) -> tuple[Array, Array]:
         root = np.sqrt(self.loose)[:, None]
         weight = self.inverse(smoothing) @ (target / root)
-        left = target / root - self.kernel @ weight - smoothing * weight
-        return weight / root, np.linalg.lstsq(self.linear, left, rcond=None)[0]
+        residual = target / root - self.kernel @ weight - smoothing * weight
+        affine = np.linalg.lstsq(self.linear, residual, rcond=None)[0]
+        return weight / root, affine
 
 
-def _merged(source: Float, target: Float) -> tuple[Float, Float, NDArray[np.bool_]]:
-    """Distinct points of both, and mask of the given points that represent them."""
-    used: NDArray[np.bool_] = np.isfinite(np.hstack([source, target])).all(axis=1)
-    own = np.flatnonzero(used)
+def _merged(source: Array, target: Array) -> tuple[Float64, Float64, Mask]:
+    """Distinct points of both, and mask of the points that represent them."""
+    used: Mask = np.isfinite(np.hstack([source, target])).all(axis=1)
+    finite = np.flatnonzero(used)
     group = np.arange(len(source))
     for points in (source, target):
-        near = SAME_POINT_FRACTION * _spread(points[own])
-        for n, i in enumerate(own):
-            for j in own[:n]:
+        near = SAME_POINT_FRACTION * _spread(points[finite])
+        for n, i in enumerate(finite):
+            for j in finite[:n]:
                 if np.linalg.norm(points[i] - points[j]) <= near:
                     group[group == group[i]] = group[j]
-    first = [int(i) for i in own if not (group[own[own < i]] == group[i]).any()]
+    _, places = np.unique(group[finite], return_index=True)
+    leaders = finite[np.sort(places)]
     used[:] = False
-    used[first] = True
-    members = [own[group[own] == group[i]] for i in first]
+    used[leaders] = True
+    members = [finite[group[finite] == group[i]] for i in leaders]
     a, b = (
-        np.array([points[m].mean(axis=0) for m in members]).reshape(-1, 2)
+        np.array([points[rows].mean(axis=0) for rows in members]).reshape(-1, 2)
         for points in (source, target)
     )
     return a, b, used
 
 
-def _spread(points: Float) -> float:
+def _spread(points: Array) -> float:
     """Root mean square distance from the centroid; 0 for coinciding points or none."""
     return float(np.sqrt(points.var(axis=0).sum())) if len(points) else 0.0
 
 
-def _finite(source: Float, target: Float) -> tuple[Float, Float]:
-    """Points that are known in both."""
-    known = np.isfinite(np.hstack([source, target])).all(axis=1)
-    return np.asarray(source, np.float64)[known], np.asarray(target, np.float64)[known]
+def _finite(source: Array, target: Array) -> tuple[Float64, Float64]:
+    """Points that are finite in both."""
+    finite = np.isfinite(np.hstack([source, target])).all(axis=1)
+    return np.asarray(source)[finite], np.asarray(target)[finite]
 
 
 def _plain(
     kind: str,
-    used: NDArray[np.bool_],
-    origin: Float,
+    used: Mask,
+    origin: Array,
     scale: float,
-    matrix: Float,
-    shift: Float,
+    matrix: Array,
+    shift: Array,
 ) -> Warp:
-    none = np.zeros((0, 2))
     return Warp(
         kind,
         origin,
         scale,
-        none,
-        none,
-        np.vstack([shift, matrix]),
-        1.0,
-        0.0,
-        np.zeros(0),
-        used,
+        centre=np.zeros((0, 2)),
+        weight=np.zeros((0, 2)),
+        affine=np.vstack([shift, matrix]),
+        condition=1.0,
+        smoothing=0.0,
+        loose=np.zeros(0),
+        used=used,
     )
 
 
-def _linear(points: Float) -> Float:
+def _linear(points: Array) -> Float64:
     return np.concatenate([np.ones((len(points), 1)), points], axis=1)
 
 
-def _bending(points: Float, centre: Float) -> Float:
+def _bending(points: Array, centre: Array) -> Float64:
     """r^2 log r (n, c)."""
     squared = (points[:, :1] - centre[:, 0]) ** 2 + (points[:, 1:] - centre[:, 1]) ** 2
-    return np.asarray(
-        0.5 * squared * np.log(np.maximum(squared, np.finfo(np.float64).tiny))
-    )
+    logarithm = np.log(np.maximum(squared, np.finfo(np.float64).tiny))
+    return np.asarray(0.5 * squared * logarithm)
 
 
-def _slope(points: Float, centre: Float, weight: Float) -> Float:
+def _slope(points: Array, centre: Array, weight: Array) -> Float64:
     """Gradient (n, 2, 2) of the weighted sum of r^2 log r: (2 log r + 1) times the
     vector from each centre.
     """
@@ -292,23 +296,19 @@ def _slope(points: Float, centre: Float, weight: Float) -> Float:
     return np.stack([(factor * x) @ weight, (factor * y) @ weight], axis=1)
 
 
-def _blocks(points: Float, warp: Warp) -> list[slice]:
+def _blocks(points: Array, warp: Warp) -> list[slice]:
     size = max(1, PRODUCTS_PER_BLOCK // max(1, len(warp.centre)))
     return [slice(i, i + size) for i in range(0, len(points), size)]
 
 
-def _watched(centre: Float) -> Float:
+def _check_points(centre: Array) -> Float64:
     """Points that are checked for folds: an even grid, the centres, and points between
     neighbouring centres.
     """
     side = np.linspace(-MARGIN, MARGIN, GRID)
     even = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
-    near = (
-        cKDTree(centre)
-        .query(centre, min(NEIGHBOURS, len(centre)))[1]
-        .reshape(len(centre), -1)
-    )
-    i = np.repeat(np.arange(len(centre)), near.shape[1])
-    j = near.ravel()
+    count = min(NEIGHBOURS, len(centre))
+    i = np.repeat(np.arange(len(centre)), count)
+    j = cKDTree(centre).query(centre, count)[1].ravel()
     between = [t * centre[i] + (1 - t) * centre[j] for t in (0.1, 0.5)]
     return np.concatenate([even, centre, *between])

@@ -1,7 +1,7 @@
 """Ingest: from a capture folder to reflectance samples at the surfels of the scan."""
 
 from skindb.format.folder import Capture, read_capture
-from skindb.geometry.crop import Crop
+from skindb.geometry.scan import Crop
 from skindb.ingest.capture import ingest_capture, scratch_name
 from skindb.ingest.report import (
     calibration_lines,

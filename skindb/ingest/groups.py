@@ -13,8 +13,8 @@ from skindb.calibration.radiance import Image
 from skindb.format.contact_probe import ProbeRecord
 from skindb.format.dome import DomeRecord, SequenceRecord
 from skindb.format.folder import Capture
+from skindb.geometry.atlas import distortion
 from skindb.geometry.camera import camera_centre
-from skindb.geometry.distortion import distortion
 from skindb.ingest.consistency import Calibration
 from skindb.ingest.lumitexels import FULL_SHADOW, MIN_LIT_FRACTION, Lumitexels
 from skindb.ingest.probe_profiles import Profiles

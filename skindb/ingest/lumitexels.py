@@ -18,7 +18,7 @@ from skindb.calibration.radiance import FrameMerger, Image, radiance_floor, read
 from skindb.errors import Fault, InputError
 from skindb.format.dome import CameraRecord, DomeRecord, LightRecord, pixel_width
 from skindb.format.frames import Digests, Frame
-from skindb.geometry._ring_kernels import grown
+from skindb.geometry._mesh_kernels import grown
 from skindb.geometry.camera import camera_centre, project
 from skindb.ingest._sample_kernels import SINGLE, gather, pixel_counts, pixel_spans
 from skindb.ingest.consistency import Calibration, CalibrationCheck

@@ -15,14 +15,14 @@ from skindb.format.folder import Capture
 from skindb.format.scan_checks import LANDMARK_REACH, SITE_LANDMARK
 from skindb.geometry.atlas import disc_atlas
 from skindb.geometry.clean import CleanMesh
-from skindb.geometry.nearest import closest_on_mesh
-from skindb.geometry.subdivide import carry_points, subdivide
-from skindb.geometry.surfels import (
+from skindb.geometry.mesh import (
+    closest_on_mesh,
     morton_order,
     splat_radius,
     vertex_areas,
     vertex_normals,
 )
+from skindb.geometry.subdivide import carry_points, subdivide
 
 Array = NDArray[np.float64]
 MAX_SURFELS = 2_500_000  # the samples of this many surfels in a full dome take 36 GB

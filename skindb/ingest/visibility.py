@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skindb.format.dome import CameraRecord, LightRecord
-from skindb.geometry._depth_kernels import matches_tangent_plane
-from skindb.geometry._ring_kernels import grown, mixed
+from skindb.geometry._mesh_kernels import grown, mixed
+from skindb.geometry._ray_kernels import matches_tangent_plane
 from skindb.geometry.camera import camera_centre, pixel_rays, project
 from skindb.geometry.rays import RayScene
 from skindb.geometry.splats import THRESHOLD, SplatScene

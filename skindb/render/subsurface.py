@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
+from skindb.geometry.mesh import vertex_areas
 from skindb.geometry.rays import RayScene
-from skindb.geometry.surfels import vertex_areas
 from skindb.optics.dipole_tree import subsurface_exitance
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.render.scene import Lights, Surface

@@ -16,7 +16,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
-from skindb.geometry.surfels import vertex_areas
+from skindb.geometry.mesh import vertex_areas
 from skindb.optics.diffuse import S_FLOOR
 from skindb.optics.fresnel import boundary_factor
 from skindb.render.environment import Environment

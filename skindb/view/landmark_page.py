@@ -10,9 +10,9 @@ import numpy as np
 
 from skindb.errors import InputError
 from skindb.format.crop_file import crop_path, parsed_crop
-from skindb.geometry.crop import Crop
-from skindb.geometry.landmark_suggestions import suggest_landmarks
-from skindb.geometry.surfels import vertex_normals
+from skindb.geometry.landmarks import suggest_landmarks
+from skindb.geometry.mesh import vertex_normals
+from skindb.geometry.scan import Crop
 from skindb.view.landmarks import (
     LandmarkTask,
     landmark_mistakes,

@@ -26,10 +26,9 @@ from skindb.format.scan_checks import (
     swapped_faults,
 )
 from skindb.geometry.clean import CleanMesh, clean_mesh
-from skindb.geometry.crop import Crop
-from skindb.geometry.landmark_suggestions import MEAN_FACE
-from skindb.geometry.nearest import closest_on_mesh
-from skindb.geometry.scan import Scan, read_colours, read_scan
+from skindb.geometry.landmarks import MEAN_FACE
+from skindb.geometry.mesh import closest_on_mesh
+from skindb.geometry.scan import Crop, Scan, read_colours, read_scan
 from skindb.limits import MAX_JSON_BYTES
 
 Points = Mapping[str, NDArray[np.float64]]

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from skindb.errors import Fault, InputError
+from skindb.geometry.mesh import vertex_normals
 from skindb.geometry.subdivide import subdivide
-from skindb.geometry.surfels import vertex_normals
 from skindb.virtual.face_regions import REGIONS
 from skindb.virtual.head import Head
 from skindb.virtual.person import Person

@@ -20,9 +20,8 @@ from skindb.format.scan_checks import (
     swapped_faults,
 )
 from skindb.geometry.clean import CleanMesh, clean_mesh
-from skindb.geometry.crop import Crop
-from skindb.geometry.nearest import closest_on_mesh
-from skindb.geometry.scan import Scan
+from skindb.geometry.mesh import closest_on_mesh
+from skindb.geometry.scan import Crop, Scan
 from skindb.ingest import read_capture
 from skindb.ingest.surfels import build_surfels, site_positions, transferred_landmarks
 from skindb.store import Database

@@ -10,9 +10,17 @@ import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial import Delaunay
 
 from skindb.errors import InputError
-from skindb.geometry.clean import CleanMesh, clean_mesh
+from skindb.geometry.clean import (
+    CleanMesh,
+    clean_mesh,
+    fill_hole,
+    repair_slivers,
+    sliver_mask,
+)
+from skindb.geometry.topology import edge_table, fans
 
 
 def cap(level: int = 3) -> tuple[np.ndarray, np.ndarray]:
@@ -313,3 +321,178 @@ def test_clean_mesh__any_rubbish_becomes_sound_or_is_refused(points, faces):
 def test_clean_mesh__nothing_left():
     with pytest.raises(InputError, match="a scan must have a surface"):
         clean_mesh(np.zeros((3, 3)), np.array([[0, 0, 1]]))
+
+
+ROUNDING = 1e-9
+
+
+def all_triangulations(ring: list[int]):
+    """Every triangulation of a convex polygon with these corners."""
+    if len(ring) < 3:
+        yield []
+        return
+    for j in range(1, len(ring) - 1):
+        for left in all_triangulations(ring[: j + 1]):
+            for right in all_triangulations(ring[j:]):
+                yield [*left, *right, (ring[0], ring[j], ring[-1])]
+
+
+def area(v: np.ndarray, triangles) -> float:
+    return sum(
+        float(np.linalg.norm(np.cross(v[b] - v[a], v[c] - v[a]))) / 2
+        for a, b, c in triangles
+    )
+
+
+def ring(n: int, seed: int = 0) -> np.ndarray:
+    angle = 2 * np.pi * np.arange(n) / n
+    flat = 5 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    return flat + np.random.default_rng(seed).normal(size=(n, 3))
+
+
+@pytest.mark.parametrize("n", [3, 4, 5, 8])
+def test_fill_hole__has_the_least_area_of_all(n):
+    v = ring(n)
+    patch = fill_hole(v, np.arange(n), set())
+    assert patch is not None
+    assert patch.shape == (n - 2, 3)
+    least = min(area(v, t) for t in all_triangulations(list(range(n))))
+    assert area(v, patch) == pytest.approx(least, rel=ROUNDING)
+
+
+def test_fill_hole__runs_against_the_loop():
+    patch = fill_hole(ring(6), np.arange(6), set())
+    sides = {
+        (int(a), int(b))
+        for face in patch
+        for a, b in zip(face, np.roll(face, -1), strict=True)
+    }
+    assert {((i + 1) % 6, i) for i in range(6)} <= sides
+
+
+def test_fill_hole__repeats_no_edge():
+    v = ring(4)
+    free = fill_hole(v, np.arange(4), set())
+    diagonal = set.intersection(*({int(x) for x in face} for face in free))
+    other = fill_hole(v, np.arange(4), {tuple(sorted(diagonal))})
+    assert (
+        set.intersection(*({int(x) for x in face} for face in other))
+        == set(range(4)) - diagonal
+    )
+    assert fill_hole(v, np.arange(4), {(0, 2), (1, 3)}) is None
+
+
+def test_fill_hole__makes_no_sliver():
+    line = np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0]], float)
+    assert fill_hole(line, np.arange(3), set()) is None
+    # three of four in a line: the diagonal from the middle one is the only one left
+    patch = fill_hole(
+        np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0], [1, 2, 0]], float),
+        np.arange(4),
+        set(),
+    )
+    assert not sliver_mask(
+        np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0], [1, 2, 0]], float), patch
+    ).any()
+
+
+def test_sliver_mask__by_height_over_longest_side():
+    v = np.array(
+        [[0, 0, 0], [100, 0, 0], [50, 0.2, 0], [50, 0.05, 0], [0, 0, 0]], float
+    )
+    faces = np.array([[0, 1, 2], [0, 1, 3], [0, 1, 4], [0, 0, 4]])
+    assert sliver_mask(v, faces).tolist() == [False, True, True, True]
+    assert sliver_mask(v * 1e-6, faces).tolist() == [False, True, True, True]
+
+
+def assert_manifold(faces: np.ndarray) -> None:
+    assert edge_table(faces).count.max() <= 2
+    assert len(np.unique(fans(faces))) == len(np.unique(faces))
+
+
+def test_repair_slivers__needle_collapses():
+    v = np.array(
+        [[0, 0, 0], [1e-5, 0, 0], [1, 9, 0], [1, -9, 0], [-8, 0, 0], [8, 0, 0]], float
+    )
+    f = np.array([[0, 1, 2], [1, 0, 3], [4, 0, 2], [4, 3, 0], [5, 2, 1], [5, 1, 3]])
+    left, repaired, stay = repair_slivers(v, f)
+    assert (len(left), len(repaired), len(stay)) == (4, 1, 0)
+    assert not sliver_mask(v, left).any()
+    assert_manifold(left)
+
+
+def test_repair_slivers__cap_gives_up_its_long_side():
+    v = np.array([[0, 0, 0], [10, 0, 0], [5, 1e-5, 0], [5, -8, 0]], float)
+    left, repaired, stay = repair_slivers(v, np.array([[0, 1, 2], [1, 0, 3]]))
+    assert (len(repaired), len(stay)) == (1, 0)
+    assert sorted(map(sorted, left.tolist())) == [[0, 2, 3], [1, 2, 3]]
+    a, b, c = (v[left[:, i]] for i in range(3))
+    assert (np.cross(b - a, c - a)[:, 2] > 0).all()  # wound as before
+
+
+def test_repair_slivers__no_collapse_that_doubles_faces():
+    # both ends of the short side are neighbours of vertex 4, and no face has all three
+    v = np.array(
+        [[0, 0, 0], [1e-7, 0, 0], [10, 5, 0], [10, -5, 0], [-5, 0, 3.0], [-5, 0, -3.0]]
+    )
+    f = np.array(
+        [[0, 1, 2], [1, 0, 3], [0, 2, 4], [2, 1, 5], [1, 3, 4], [1, 4, 5], [0, 4, 3]]
+    )
+    assert_manifold(f)
+    left, _, _ = repair_slivers(v, f)
+    assert edge_table(left).count.max() <= 2
+    assert len(np.unique(np.sort(left, axis=1), axis=0)) == len(left)
+
+
+def test_repair_slivers__no_collapse_that_pinches_a_waist():
+    # two sheets joined by a waist as narrow as the short side, whose ends both lie on the boundary
+    v = np.array(
+        [[0, 0, 0], [0, 1e-5, 0], [9, 0, 0], [-9, 0, 0], [5, -5, 0], [-5, -5, 0]], float
+    )
+    f = np.array([[1, 0, 2], [0, 1, 3], [0, 4, 2], [0, 3, 5]])
+    assert_manifold(f)
+    left, repaired, stay = repair_slivers(v, f)
+    np.testing.assert_array_equal(left, f)
+    assert (len(repaired), len(stay)) == (0, 2)
+
+
+def test_repair_slivers__cap_with_an_open_long_side_is_dropped():
+    v = np.array([[0, 0, 0], [10, 0, 0], [5, 1e-5, 0], [5, 8, 1]], float)
+    left, repaired, stay = repair_slivers(
+        v, np.array([[0, 2, 3], [2, 1, 3], [0, 1, 2]])
+    )
+    assert (left.tolist(), len(repaired), len(stay)) == ([[0, 2, 3], [2, 1, 3]], 1, 0)
+    alone, repaired, stay = repair_slivers(v, np.array([[0, 1, 2]]))
+    assert (len(alone), len(repaired), len(stay)) == (0, 1, 0)
+
+
+def test_repair_slivers__no_flip_onto_an_edge_that_exists():
+    v = np.array([[0, 0, 0], [10, 0, 0], [5, 1e-5, 0], [5, -8, 3]], float)
+    tetrahedron = np.array([[0, 1, 2], [1, 0, 3], [0, 2, 3], [2, 1, 3]])
+    left, repaired, stay = repair_slivers(v, tetrahedron)
+    np.testing.assert_array_equal(left, tetrahedron)
+    assert (len(repaired), len(stay)) == (0, 1)
+
+
+def test_repair_slivers__nothing_to_do():
+    v = np.array([[0, 0, 0], [10, 0, 0], [5, 5, 0]], float)
+    left, repaired, stay = repair_slivers(v, np.array([[0, 1, 2]]))
+    assert (left.tolist(), len(repaired), len(stay)) == ([[0, 1, 2]], 0, 0)
+
+
+def test_repair_slivers__many_that_touch():
+    """Points in pairs and on lines: repairs change the faces that later ones look at."""
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        flat = np.concatenate(
+            [rng.integers(0, 6, (40, 2)), rng.normal(size=(20, 2)) * 3]
+        )
+        flat = flat + rng.normal(size=flat.shape) * 10 ** rng.uniform(-6, -4, (60, 1))
+        f = Delaunay(flat).simplices.astype(np.int64)
+        v = np.c_[flat, np.zeros(60)]
+        left, repaired, stay = repair_slivers(v, f)
+        assert len(repaired) > 10
+        assert_manifold(left)
+        assert sliver_mask(v, left).sum() == len(stay) < len(repaired)
+        # one sheet without holes, as before: needles take a vertex with them, caps none
+        assert len(np.unique(left)) - len(edge_table(left).edges) + len(left) == 1

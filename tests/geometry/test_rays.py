@@ -7,8 +7,8 @@ import pytest
 import trimesh
 
 from skindb.geometry._ray_kernels import aim
+from skindb.geometry.mesh import vertex_normals
 from skindb.geometry.rays import RayScene
-from skindb.geometry.surfels import vertex_normals
 
 HEAD = 80.0  # mm
 SINGLE = 1e-6  # of float32, some steps of 6e-8

@@ -7,8 +7,8 @@ import pytest
 import trimesh
 
 from skindb.geometry import splats
+from skindb.geometry.mesh import splat_radius, vertex_normals
 from skindb.geometry.splats import THRESHOLD, SplatScene
-from skindb.geometry.surfels import splat_radius, vertex_normals
 
 EDGE = 0.7  # mm; two pixels of the maps below, and the bias seen at the angles below
 

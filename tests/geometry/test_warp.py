@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from trimesh.triangles import closest_point
 
 from skindb.geometry.landmarks import mean_shape, similarity, width
-from skindb.geometry.nearest import closest_on_mesh
+from skindb.geometry.mesh import closest_on_mesh
 from skindb.geometry.warp import (
     MIN_AREA_RATIO,
     MIN_WIDTH_RATIO,

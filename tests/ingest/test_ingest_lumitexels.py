@@ -10,8 +10,8 @@ from sphere import ALBEDO, BLACK, INTENSITY, WHITE, save
 
 from skindb.calibration.radiance import frame_merger
 from skindb.format.folder import read_capture
+from skindb.geometry.mesh import vertex_areas
 from skindb.geometry.rays import RayScene
-from skindb.geometry.surfels import vertex_areas
 from skindb.ingest.capture import MAX_THREADS
 from skindb.ingest.lumitexels import (
     LINEAR_NOISE_FLOOR,

@@ -10,8 +10,8 @@ import trimesh
 
 from skindb.errors import InputError
 from skindb.format.crop_file import crop_path
-from skindb.geometry.crop import Crop
-from skindb.geometry.landmark_suggestions import MEAN_FACE
+from skindb.geometry.landmarks import MEAN_FACE
+from skindb.geometry.scan import Crop
 from skindb.view.landmark_page import PLACES, place_sentence
 from skindb.view.landmarks import (
     landmark_mistakes,

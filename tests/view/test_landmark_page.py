@@ -13,7 +13,7 @@ import trimesh
 from page_session import Session, running
 
 from skindb.format.folder import read_capture
-from skindb.geometry.crop import Crop
+from skindb.geometry.scan import Crop
 from skindb.view.landmark_page import landmark_server
 from skindb.view.landmarks import landmark_task
 from skindb.virtual.face_field import FaceShape

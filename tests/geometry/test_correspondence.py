@@ -9,16 +9,16 @@ import pytest
 from scipy.spatial import Delaunay, cKDTree
 from scipy.spatial.transform import Rotation
 
-from skindb.geometry.anchors import (
-    INNER,
+from skindb.geometry.atlas import DISC_RADIUS, signed_areas
+from skindb.geometry.correspondence import (
+    INNER_POINTS,
     MIN_LANDMARK_DISTANCE_MM,
-    RIM,
+    OUTLINE_POINTS,
     Sheet,
     _weights,
     anchor_vertices,
     corresponding_uv,
 )
-from skindb.geometry.atlas import DISC_RADIUS, signed_areas
 
 TURN = 1.1 * Rotation.from_rotvec([0.2, 0.5, -0.1]).as_matrix()
 MARKS = np.array(
@@ -159,12 +159,12 @@ def test_corresponding_uv__without_a_pose_is_nan(unknown):
 def test_anchor_vertices__are_far_from_each_other_and_the_landmarks():
     template, _ = _sheet(1)
     chosen = anchor_vertices(template)
-    assert len(np.unique(chosen)) == len(chosen) == INNER + RIM
-    assert template.rim[chosen].sum() == RIM
-    inner = template.position[chosen[:INNER]]
+    assert len(np.unique(chosen)) == len(chosen) == INNER_POINTS + OUTLINE_POINTS
+    assert template.rim[chosen].sum() == OUTLINE_POINTS
+    inner = template.position[chosen[:INNER_POINTS]]
     near = cKDTree(np.vstack([inner, template.landmark])).query(inner, 2)[0][:, 1]
     # 200 discs of half that distance cover at most the area, which is 1.2 to 1.5 of the disc's
-    assert near.min() > 0.5 * np.sqrt(1.2 * np.pi * 100**2 / INNER)
+    assert near.min() > 0.5 * np.sqrt(1.2 * np.pi * 100**2 / INNER_POINTS)
 
 
 def test_sheet__area_and_whether_it_can_be_aligned():

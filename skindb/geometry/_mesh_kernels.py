@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skindb.jit import kernel
-
-Bools = NDArray[np.bool_]
+from skindb.types import BoolVector
 
 
 @kernel
-def grown(faces: NDArray[Any], mask: Bools) -> Bools:
+def grown(faces: NDArray[Any], mask: BoolVector) -> BoolVector:
     """Mask (n,) extended by all vertices that share an edge with a vertex of the mask,
     by triangles (f, 3).
     """
@@ -28,7 +27,7 @@ def grown(faces: NDArray[Any], mask: Bools) -> Bools:
 
 
 @kernel
-def mixed(faces: NDArray[Any], mask: Bools) -> Bools:
+def mixed(faces: NDArray[Any], mask: BoolVector) -> BoolVector:
     """Vertices (n,) that share an edge with a vertex of another mask value, by triangles (f, 3)."""
     out = np.zeros(len(mask), np.bool_)
     for k in range(len(faces)):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from skindb.geometry.landmark_suggestions import (
+from skindb.geometry.landmarks import (
     MEAN_FACE,
     mate,
     nose_tip,
