@@ -17,8 +17,8 @@ from collections import Counter
 import numpy as np
 
 from skindb.analysis.basis_size import choose_size, size_status, surfel_errors
+from skindb.reflectance.basis import Systems, factor_reflectance, residuals
 from skindb.reflectance.dictionary import embedded_dictionary
-from skindb.reflectance.factor import Systems, factor_reflectance, residuals
 from skindb.reflectance.rows import basis_rows
 from skindb.reflectance.tables import TableGrid
 

@@ -19,6 +19,7 @@ import skindb
 from benchmarks.rendering import sky
 from skindb.geometry.rays import RayScene
 from skindb.optics.angles import directions
+from skindb.reflectance.mixture import Mixture
 from skindb.render.direct import trace_view
 from skindb.render.environment import Environment
 from skindb.render.monte_carlo import Lighting, Quality, render_monte_carlo
@@ -100,8 +101,8 @@ def bases(surface, camera, lights, scene) -> None:
     """Time with all bases, and with the first one alone."""
     one = replace(
         surface,
-        weights=surface.weights[:, :1],
-        tables=np.ascontiguousarray(surface.tables[..., :1]),
+        parameters=surface.parameters[:, :1],
+        model=Mixture(np.ascontiguousarray(surface.model.table[..., :1])),
     )
     for name, lighting in (
         ("one light", Lighting(lights.select([0]))),
@@ -115,7 +116,9 @@ def bases(surface, camera, lights, scene) -> None:
             for _ in range(3)
         ]
         many, few = np.min(times, axis=0)
-        print(f"{name}: {surface.weights.shape[1]} bases {many:.1f} s, one {few:.1f} s")
+        print(
+            f"{name}: {surface.parameters.shape[1]} bases {many:.1f} s, one {few:.1f} s"
+        )
 
 
 def behind(surface, scene) -> None:
@@ -235,4 +238,4 @@ def main(db: str, *, take: str | None = None) -> None:
     bases(surface, camera, lights, scene)
     behind(surface, scene)
     hidden(surface, scene)
-    nodes(surface.tables)
+    nodes(surface.model.table)

@@ -43,6 +43,7 @@ from skindb.fit import (
 )
 from skindb.optics.angles import half_difference
 from skindb.optics.fresnel import fresnel_transmittance
+from skindb.reflectance.mixture import Mixture
 from skindb.reflectance.tables import kernel_tables, lookup
 from skindb.schema import dataset
 
@@ -111,7 +112,7 @@ def skindb_fit(photographs: Photographs, training: Mask, *, eta: float) -> Fitte
         estimate_normals(samples, eta=eta, scan_error=NO_SCAN_DEGREES)
     )
     samples = samples.merge(estimate_diffuse_reflectance(samples, eta=eta))
-    surface = fit_surface(samples, dictionary=dictionary, eta=eta)
+    surface = fit_surface(samples, surface=Mixture.of_dictionary(dictionary), eta=eta)
     basis = reduce_basis(
         surface.merge(samples), dictionary=dictionary, rng=np.random.default_rng(1)
     )

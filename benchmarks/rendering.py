@@ -124,7 +124,7 @@ def against_mitsuba(surface, camera, lighting):
         surface,
         eta=1.0,
         diffuse=np.full_like(surface.diffuse, 0.5),
-        weights=0 * surface.weights,
+        parameters=0 * surface.parameters,
     )
     straight = replace(camera, distortion=np.zeros(5))
     ours = render_monte_carlo(

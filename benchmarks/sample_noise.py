@@ -22,7 +22,7 @@ import xarray as xr
 import skindb
 from skindb import workflow
 from skindb.fit import lumitexels
-from skindb.fit.sample_noise import sample_variance
+from skindb.fit.lumitexels import sample_variance
 
 READ_NOISE = 6.0  # electrons
 PIXELS = ((1, 1.5), (1.5, 2.5), (2.5, 4.1))

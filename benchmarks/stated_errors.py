@@ -19,7 +19,7 @@ import xarray as xr
 
 from skindb.bench.photometry import ETA, SCAN_ERROR, Array, ModelSamples, model_samples
 from skindb.fit import estimate_diffuse_reflectance, estimate_normals, refit
-from skindb.fit._albedo_rules import surface_lobes
+from skindb.reflectance.dictionary import surface_lobes
 from skindb.reflectance.tables import directional_albedo, stored_brdf
 from skindb.schema import dataset, label
 

@@ -22,6 +22,7 @@ import xarray as xr
 from skindb.fit import estimate_diffuse_reflectance, fit_surface, reduce_basis, refit
 from skindb.optics.angles import half_difference
 from skindb.reflectance.dictionary import embedded_dictionary
+from skindb.reflectance.mixture import Mixture
 from skindb.schema import dataset
 
 MODES = ("linear", "perceptual", "paper")
@@ -173,7 +174,10 @@ def main(
     weights = {}
     for name, ds in samples.items():
         fits = {
-            mode: fit_surface(ds, dictionary=dictionary, mode=mode) for mode in MODES
+            mode: fit_surface(
+                ds, surface=Mixture.of_dictionary(dictionary, mode=mode), mode=mode
+            )
+            for mode in MODES
         }
         weights[name] = fits["perceptual"]
         rd = ds["diffuse_reflectance"].median("surfel").values

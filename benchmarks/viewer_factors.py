@@ -46,7 +46,7 @@ def main(db: str, take: str = "") -> None:
     surface = from_model(
         database.read("model", take or database.takes("model")[0]), fill=True
     )
-    tables = np.asarray(surface.tables, np.float64)
+    tables = np.asarray(surface.model.table, np.float64)
     nh, nd, nphi, count = tables.shape
     weight = measure(TableGrid(nh, nd, nphi))
     groups = -(-count // 4)
@@ -58,7 +58,7 @@ def main(db: str, take: str = "") -> None:
     print(
         "rank  MB      fetches  error of each basis, and of the mean mixture of the face"
     )
-    mixture = np.nanmean(surface.weights, axis=0)
+    mixture = np.nanmean(surface.parameters, axis=0)
     for rank in RANKS:
         near = np.empty_like(tables)
         for k in range(count):

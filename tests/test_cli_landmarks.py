@@ -17,8 +17,6 @@ from page_session import Session
 from skindb.virtual.face_field import FaceShape
 from skindb.virtual.head import parametric_head
 
-pytestmark = pytest.mark.slow
-
 
 def call(*args):
     return [

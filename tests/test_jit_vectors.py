@@ -114,12 +114,14 @@ def test_half__every_one(calls):
 PRINT_FIT = """
 import numpy as np
 from planted_skin import make_skin
+from skindb.reflectance.mixture import Mixture
 from skindb.fit import estimate_diffuse_reflectance, estimate_normals, fit_surface
 from skindb.reflectance.dictionary import embedded_dictionary
 lumitexels = make_skin(surfels=5, lights=40, cameras=6).lumitexels
 found = estimate_normals(lumitexels)
 found = found.merge(estimate_diffuse_reflectance(lumitexels.merge(found)))
-found = found.merge(fit_surface(lumitexels.merge(found), dictionary=embedded_dictionary(), rank=8))
+surface = Mixture.of_dictionary(embedded_dictionary(), rank=8)
+found = found.merge(fit_surface(lumitexels.merge(found), surface=surface))
 for name in ("shading_normal", "diffuse_reflectance", "dictionary_residual"):
     print(*found[name].values.ravel())
 """

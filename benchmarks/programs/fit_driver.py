@@ -105,6 +105,7 @@ def parts(db: Any, take: str) -> dict[str, float]:
         reduce_basis,
     )
     from skindb.fit.lumitexels import lumitexels
+    from skindb.reflectance.mixture import Mixture
 
     dask.config.set(scheduler="synchronous")
     capture = db.read("capture", take)
@@ -129,7 +130,10 @@ def parts(db: Any, take: str) -> dict[str, float]:
     lit = work.merge(fitted)
     fitted = fitted.merge(timed("albedo", lambda: estimate_diffuse_reflectance(lit)))
     known = work.merge(fitted[list(KNOWN)])
-    surface = timed("dictionary fit", lambda: fit_surface(known, dictionary=tables))
+    surface = timed(
+        "dictionary fit",
+        lambda: fit_surface(known, surface=Mixture.of_dictionary(tables)),
+    )
     weighted = surface.merge(work[["surfel_area"]])
     basis = reduce_basis(
         weighted, dictionary=tables, k=COMPONENTS, rng=np.random.default_rng(0)
@@ -157,7 +161,7 @@ def _second_pass(
 ) -> Callable[[], Any]:
     """Refit with its errors, held-out errors, and outliers."""
     if TWO_PASSES:
-        from skindb.fit.second import refit_and_evaluate
+        from skindb.fit.surface import refit_and_evaluate
         from skindb.schema import dataset
 
         flags = {
@@ -183,21 +187,16 @@ def _second_pass(
 
 def _linear_refit(known: xr.Dataset, basis: xr.Dataset) -> Callable[[], Any]:
     """Weights and residuals without their errors."""
-    from skindb.fit.surface import MIN_SAMPLES, NEEDED, noise_floor, reduced_tables
+    from skindb.fit.lumitexels import block_of, take_noise
+    from skindb.fit.surface import MIN_SAMPLES, NEEDED, noise_floor
+    from skindb.reflectance.kinds import surface_model
+    from skindb.reflectance.model import Comparison, Judgement
 
-    if TWO_PASSES:
-        from skindb.fit._surface_arrays import refit_weights as weights
-    else:
-        from skindb.fit._surface_kernels import surface_weights as weights
-    arrays = [known[name].values for name in NEEDED]
-    options = {
-        "eta": 1.3,
-        "mode": "linear",
-        "noise_floor": noise_floor(known),
-        "min_samples": MIN_SAMPLES,
-    }
-    tables = reduced_tables(basis)
-    return lambda: weights(*arrays, tables=tables, **options)
+    arrays = {name: known[name].values for name in NEEDED}
+    block = block_of(arrays, take_noise(known))
+    comparison = Comparison("linear", 1.3, noise_floor(known), MIN_SAMPLES)
+    surface = surface_model(basis)
+    return lambda: surface.judge(block, comparison, Judgement())
 
 
 ACTIONS = {

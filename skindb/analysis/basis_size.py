@@ -15,7 +15,7 @@ from skindb.analysis.each_take import each_take, shared_once
 from skindb.analysis.population_basis import same_dictionary
 from skindb.numerics.statistics import bootstrap_interval
 from skindb.optics.fresnel import fresnel_transmittance
-from skindb.reflectance.factor import Systems, factor_reflectance, residuals
+from skindb.reflectance.basis import Systems, factor_reflectance, residuals
 from skindb.reflectance.rows import basis_rows
 from skindb.reflectance.tables import TableGrid
 from skindb.schema import dataset

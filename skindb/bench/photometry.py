@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from skindb.bench.curve import Curve, Point, cpu_time
 from skindb.fit import albedo, estimate_diffuse_reflectance, estimate_normals, normals
-from skindb.fit._albedo_rules import surface_lobes
 from skindb.optics.fresnel import fresnel_transmittance
+from skindb.reflectance.dictionary import surface_lobes
 from skindb.reflectance.rows import basis_rows
 from skindb.schema import dataset, label
 

@@ -11,7 +11,6 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from skindb.geometry.rays import RayScene
-from skindb.reflectance.tables import directional_albedo
 from skindb.render.direct import View, shade_view, trace_view
 from skindb.render.image import auto_exposure, encode_srgb, tone_map
 from skindb.render.photographs import Comparison, side_by_side
@@ -109,9 +108,7 @@ def map_pictures(
 
 def _maps(model: xr.DataTree) -> list[tuple[Picture, Mask, str]]:
     surface, view, _, _ = _frontal(model, scale=1.2)
-    shine = (
-        view.interpolate(surface.weights) @ directional_albedo(surface.tables, [1.0])[0]
-    )
+    shine = surface.model.normal_reflectance(view.interpolate(surface.parameters))
     pictures = [
         ((view.interpolate(surface.normals) + 1) / 2, "normal"),
         (encode_srgb(view.interpolate(surface.diffuse)), "diffuse albedo"),

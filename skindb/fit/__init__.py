@@ -3,23 +3,18 @@ translucency.
 """
 
 from skindb.fit.albedo import estimate_diffuse_reflectance, reflectance_interval
-from skindb.fit.basis import reduce_basis
-from skindb.fit.dictionary import dictionary_report
-from skindb.fit.held_out import held_out_error
-from skindb.fit.light_gains import estimate_light_gains
-from skindb.fit.lumitexels import lumitexels
+from skindb.fit.corrections import estimate_light_gains
+from skindb.fit.lumitexels import lumitexels, sample_variance
 from skindb.fit.model import first_pass, fit_model, second_pass
 from skindb.fit.normals import estimate_normals
-from skindb.fit.obstructed import find_obstructed
-from skindb.fit.outliers import find_outliers
 from skindb.fit.plan import FitPlan, plan_fit
-from skindb.fit.prediction import (
+from skindb.fit.quality import (
     describe_prediction,
+    find_obstructed,
     prediction_table,
     tabulate_prediction,
 )
-from skindb.fit.sample_noise import sample_variance
-from skindb.fit.surface import fit_surface, refit
+from skindb.fit.surface import find_outliers, fit_surface, held_out_error, refit
 from skindb.fit.translucency import (
     fit_probe,
     summarise_translucency,
@@ -27,7 +22,8 @@ from skindb.fit.translucency import (
     translucency_map,
 )
 from skindb.parameters import FitParameters
-from skindb.reflectance.dictionary import embedded_dictionary
+from skindb.reflectance.basis import reduce_basis
+from skindb.reflectance.dictionary import dictionary_report, embedded_dictionary
 from skindb.reflectance.table_file import read_dictionary
 
 __all__ = [

@@ -11,17 +11,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from skindb.fit._lumitexel_kernels import (
-    MODEL_ERROR,
-    UNSEEN,
-    choose,
-    lumitexel_memory,
-    sample_status,
-    write_cosines,
-    write_directions,
-    write_noise,
-    write_rows,
-)
 from skindb.jit import (
     LANES,
     dots,
@@ -34,6 +23,17 @@ from skindb.jit import (
     unpack,
 )
 from skindb.numerics._nnls_kernels import active_set_memory, factor, solve, solve_scaled
+from skindb.reflectance._lumitexel_kernels import (
+    MODEL_ERROR,
+    UNSEEN,
+    choose,
+    lumitexel_memory,
+    sample_status,
+    write_cosines,
+    write_directions,
+    write_noise,
+    write_rows,
+)
 from skindb.reflectance._shade_kernels import transmittance
 
 # to light or camera; below it F_t and the footprint of a pixel change too fast

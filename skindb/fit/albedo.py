@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import numpy as np
 import xarray as xr
 
 from skindb.elementwise import elementwise
-from skindb.fit._albedo_kernels import separate_block
-from skindb.fit._albedo_rules import lobe_table, rule_reflectance
-from skindb.fit._arrays import in_batches
-from skindb.fit.lumitexels import GEOMETRY
-from skindb.fit.sample_noise import NO_NOISE, NOISE_INPUTS, noise_inputs, noise_of
+from skindb.fit._albedo_kernels import (
+    MIN_COSINE_ALBEDO,
+    MIN_SAMPLES_ALBEDO,
+    separate_block,
+)
+from skindb.fit.lumitexels import (
+    GEOMETRY,
+    Arrays,
+    by_name,
+    cosines,
+    directions,
+    noise_inputs,
+    noise_of,
+)
 from skindb.jit import sample_bits
 from skindb.optics.diffuse import dipole_s
+from skindb.optics.fresnel import fresnel_transmittance
 from skindb.parameters import EVEN_REFLECTION
+from skindb.reflectance.dictionary import lobe_table
+from skindb.reflectance.model import typical_noise
 from skindb.schema import check, label
 from skindb.schema.status import LARGEST_R_D, SMALLEST_R_D
 from skindb.types import Array
@@ -28,6 +38,15 @@ LARGEST_TURN = 0.25
 # captures was 0.004 to 0.016 too low.
 MODEL_ERROR_ALBEDO = 0.01
 NORMAL_95 = 1.96
+NORMAL_ERRORS = ("normal_error", "normal_total_error")
+PLACES = ("surfel_position", "light_position", "camera_position", "shading_normal")
+# surfels processed at once by the other rules: 15 MB of samples of a full dome
+BATCH = 512
+# quantiles of the method "quantile", and their normal deviates
+LOW = 0.10
+LOWER = 0.02
+Z_LOW = -1.2816
+Z_LOWER = -2.0537
 
 
 def estimate_diffuse_reflectance(
@@ -99,17 +118,15 @@ def estimate_diffuse_reflectance(
     if method not in METHODS:
         raise ValueError(f"method must be one of {METHODS}, not {method!r}")
     check(lumitexels, (*GEOMETRY, "shading_normal"), where="lumitexels")
-    errors = (
-        ("normal_error", "normal_total_error")
-        if "normal_total_error" in lumitexels
-        else ("normal_error",)
+    known = [name for name in NORMAL_ERRORS if name in lumitexels]
+    names = tuple(
+        dict.fromkeys((*GEOMETRY, "shading_normal", *noise_inputs(lumitexels), *known))
     )
-    known = errors if "normal_error" in lumitexels else errors[:0]
-    found = elementwise(
-        _reflectances,
+    fitted = elementwise(
+        by_name(block_reflectance, names),
         lumitexels,
         over="surfel",
-        inputs=(*GEOMETRY, "shading_normal", *noise_inputs(lumitexels), *known),
+        inputs=names,
         outputs=(
             "diffuse_reflectance",
             "diffuse_reflectance_error",
@@ -121,7 +138,7 @@ def estimate_diffuse_reflectance(
         discard=discard,
         even_reflection=even_reflection,
     )
-    return found.assign(
+    return fitted.assign(
         even_reflection_limit=label("even_reflection_limit", even_reflection)
     )
 
@@ -150,63 +167,70 @@ def reflectance_interval(fitted: xr.Dataset) -> tuple[xr.DataArray, xr.DataArray
     return value - both**0.5, value + (both - limit**2).clip(min=0) ** 0.5
 
 
-def _reflectances(
-    sample: Array,
-    position: Array,
-    light: Array,
-    camera: Array,
-    normal: Array,
-    *others: Array,
+def block_reflectance(
+    arrays: Arrays,
+    *,
     method: str,
     eta: float,
-    discard: int,
-    even_reflection: float,
+    discard: int = 2,
+    even_reflection: float = EVEN_REFLECTION,
 ) -> tuple[Array, Array, Array, Array]:
     """(n, 3) R_d within SMALLEST_R_D and LARGEST_R_D, its standard error and total
     error, and dipole s.
-
-    `others` are the arrays of the noise of the samples, and the standard and total
-    error of the normal, if known.
     """
-    known = len(NOISE_INPUTS) if len(others) >= len(NOISE_INPUTS) else 0
-    errors = others[known:]
-    normal_error, normal_total_error = (
-        errors[i] if i < len(errors) else None for i in range(2)
-    )
     if method == "separated":
-        larger = normal_error if normal_total_error is None else normal_total_error
-        angle = np.stack(
-            [_turn(normal_error, len(sample)), _turn(larger, len(sample))], axis=1
-        )
-        estimate, error, shared = (np.empty((len(sample), 3)) for _ in range(3))
-        doubles = (
-            np.ascontiguousarray(a, np.float64)
-            for a in (position, light, camera, normal)
-        )
-        noise = noise_of(others[:known], NO_NOISE)
-        separate_block(
-            sample_bits(sample),
-            *doubles,
-            angle,
-            lobe_table(),
-            noise,
-            float(eta),
-            estimate,
-            error,
-            shared,
-        )
+        value, error, shared = _separated(arrays, eta=eta)
     else:
-        rule = partial(rule_reflectance, method=method, eta=eta, discard=discard)
-        estimate, error = in_batches(
-            lambda sample, position, normal: rule(
-                sample, position, light, camera, normal
-            ),
-            (sample, position, normal),
-        )
-        shared = np.full_like(error, np.nan)
-    clamped = np.clip(estimate, SMALLEST_R_D, LARGEST_R_D)
+        value, error, shared = _by_rule(arrays, eta=eta, method=method, discard=discard)
+    clamped = np.clip(value, SMALLEST_R_D, LARGEST_R_D)
     total = np.hypot(np.hypot(shared, MODEL_ERROR_ALBEDO), even_reflection / NORMAL_95)
     return clamped, error, total, dipole_s(clamped, eta=eta)[0]
+
+
+def _separated(arrays: Arrays, *, eta: float) -> tuple[Array, Array, Array]:
+    """R_d (n, 3) by the separation, its standard error, and that for errors by device."""
+    n = len(arrays["surfel_position"])
+    turns = [_turn(arrays.get(name), n) for name in NORMAL_ERRORS]
+    if "normal_total_error" not in arrays:
+        turns[1] = turns[0]
+    estimate, error, shared = (np.empty((n, 3)) for _ in range(3))
+    separate_block(
+        sample_bits(arrays["reflectance_sample"]),
+        *(np.ascontiguousarray(arrays[name], np.float64) for name in PLACES),
+        np.stack(turns, axis=1),
+        lobe_table(),
+        noise_of(arrays, typical_noise()),
+        float(eta),
+        estimate,
+        error,
+        shared,
+    )
+    return estimate, error, shared
+
+
+def _by_rule(
+    arrays: Arrays, *, eta: float, method: str, discard: int
+) -> tuple[Array, Array, Array]:
+    """R_d (n, 3) by the minimum or the quantile, its error, and NaN; in batches, which
+    bounds the memory.
+    """
+    light = arrays["light_position"]
+    camera = arrays["camera_position"]
+    n = len(arrays["surfel_position"])
+    parts = []
+    for begin in range(0, max(n, 1), BATCH):
+        sample, position, normal = (
+            arrays[name][begin : begin + BATCH]
+            for name in ("reflectance_sample", "surfel_position", "shading_normal")
+        )
+        ratio, weight = ratios(sample, position, light, camera, normal, eta)
+        parts.append(
+            stable_minimum(ratio, weight, discard)
+            if method == "minimum"
+            else low_quantile(ratio)
+        )
+    estimate, error = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return estimate, error, np.full_like(error, np.nan)
 
 
 def _turn(normal_error: Array | None, surfels: int) -> Array:
@@ -218,3 +242,85 @@ def _turn(normal_error: Array | None, surfels: int) -> Array:
     radians = np.nan_to_num(np.deg2rad(normal_error, dtype=float))
     # the RMS angle is that of two axes
     return np.asarray(np.clip(radians, 0, LARGEST_TURN) / np.sqrt(2))
+
+
+def ratios(
+    sample: Array,
+    position: Array,
+    light: Array,
+    camera: Array,
+    normal: Array,
+    eta: float,
+) -> tuple[Array, Array]:
+    """Ratios pi f_r / (F_t F_t) of all samples (n, l c, 3), NaN at grazing angles, and
+    weights that decrease there.
+    """
+    normal = normal.astype(np.float64)
+    samples = sample.astype(np.float32)
+    lit, seen = (
+        cosines(normal, directions(position, targets)) for targets in (light, camera)
+    )
+    lit, seen = (np.where(c > MIN_COSINE_ALBEDO, c, np.nan) for c in (lit, seen))
+    # F_t is evaluated at the limit instead of NaN; the cosine carries the NaN
+    per_light = np.pi / (
+        lit * fresnel_transmittance(np.fmax(lit, MIN_COSINE_ALBEDO), eta)
+    )
+    per_camera = seen / (
+        seen * fresnel_transmittance(np.fmax(seen, MIN_COSINE_ALBEDO), eta)
+    )
+    ratio = (
+        samples
+        * (per_light[:, :, None] * per_camera[:, None]).astype(np.float32)[..., None]
+    )
+    # -1 would be ambiguous without surfels
+    n = len(sample)
+    pairs = lit.shape[1] * seen.shape[1]
+    weight = (lit[:, :, None] * seen[:, None]).reshape(n, pairs)
+    return ratio.reshape(n, pairs, 3), weight
+
+
+def stable_minimum(ratio: Array, weight: Array, discard: int) -> tuple[Array, Array]:
+    """The paper's rule (eq. 6): ratios are raised by up to a fifth at grazing angles,
+    the `discard` smallest ignored.
+
+    The error is half the distance between the values that lie `discard` ranks above and below.
+    """
+    order = np.argsort(ratio * (1.2 - 0.2 * weight[..., None]), axis=1)
+    count = np.isfinite(ratio).sum(1, keepdims=True)
+    enough = count[:, 0] >= max(MIN_SAMPLES_ALBEDO, 2 * discard + 2)
+
+    def at(rank: int) -> Array:
+        place = np.take_along_axis(
+            order, np.full_like(count, min(rank, ratio.shape[1] - 1)), 1
+        )
+        return np.where(enough, np.take_along_axis(ratio, place, 1)[:, 0], np.nan)
+
+    return at(discard), np.abs(at(2 * discard + 1) - at(0)) / 2
+
+
+def low_quantile(ratio: Array) -> tuple[Array, Array]:
+    """Tenth percentile, raised by half of its bias under normal noise, whose spread is
+    estimated below it.
+    """
+    count = np.isfinite(ratio).sum(1)
+    low = quantile_finite(ratio, LOW, 1)
+    lower = quantile_finite(ratio, LOWER, 1)
+    noise = (low - lower) / (Z_LOW - Z_LOWER)
+    enough = count >= MIN_SAMPLES_ALBEDO
+    # the variance of a quantile: p (1 - p) / (n density^2), density of the normal at it
+    error = noise * np.sqrt(LOW * (1 - LOW) / np.maximum(count, 1)) / 0.1755
+    return np.where(enough, low - Z_LOW * noise / 2, np.nan), np.where(
+        enough, error, np.nan
+    )
+
+
+def quantile_finite(values: Array, level: float, axis: int) -> Array:
+    """Quantile at `level` of the finite values along an axis, without interpolation;
+    NaN where there is none.
+    """
+    ordered = np.sort(np.where(np.isfinite(values), values, np.nan), axis=axis)
+    count = np.isfinite(ordered).sum(axis, keepdims=True)
+    place = np.clip(
+        np.rint(level * (count - 1)).astype(np.int64), 0, values.shape[axis] - 1
+    )
+    return np.asarray(np.take_along_axis(ordered, place, axis).squeeze(axis))

@@ -1,33 +1,46 @@
-"""Input of the fits of one take: samples, surfels and dome in one Dataset."""
+"""Input of the fits of one take: samples, their noise, surfels and dome in one Dataset,
+and in blocks of surfels.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
-from skindb.fit.sample_noise import NOISE_LIGHTS, NOISE_SAMPLES
+from skindb.reflectance.model import Block, Noise, typical_noise
 from skindb.schema import check, label
+from skindb.types import Array
 
-SAMPLES = ("reflectance_sample", "noise_floor")
-SHOT = "shot_noise"  # 0 for captures that were ingested before it was stored
-SURFELS = ("surfel_position", "surfel_normal", "surfel_area")
-DOME = ("light_position", "light_disc_radius", "camera_position")
+Arrays = Mapping[str, NDArray[Any]]  # of a block of surfels, by variable
 GEOMETRY = (
     "reflectance_sample",
     "surfel_position",
     "light_position",
     "camera_position",
-)  # first inputs of every kernel
-
-
-def disc_angle(whole: xr.Dataset) -> float:
-    """Median angular radius [rad] of the lights as seen from the middle of the surfels;
-    0 for point lights.
-    """
-    middle = whole["surfel_position"].values.astype(np.float64).mean(axis=0)
-    distance = np.linalg.norm(whole["light_position"].values - middle, axis=1)
-    return float(np.median(np.arctan2(whole["light_disc_radius"].values, distance)))
+)
+SHOT = "shot_noise"
+RADIANCE = ("radiance_limit", "radiance_read_variance", "radiance_shot_variance")
+# captures of linear files or of unknown electrons have none of these
+NOISE_SAMPLES = ("effective_pixels", *RADIANCE)
+NOISE_LIGHTS = ("light_intensity", "light_axis", "light_falloff")
+NOISE_INPUTS = (
+    "surfel_position",
+    "light_position",
+    "effective_pixels",
+    *NOISE_LIGHTS,
+    *RADIANCE,
+)
+REQUIRED = {
+    "samples": ("reflectance_sample", "noise_floor"),
+    "surfels": ("surfel_position", "surfel_normal", "surfel_area"),
+    "dome": ("light_position", "light_disc_radius", "camera_position"),
+}
+OPTIONAL = {"samples": (SHOT, *NOISE_SAMPLES), "dome": NOISE_LIGHTS, "surfels": ()}
 
 
 def lumitexels(capture: xr.DataTree) -> xr.Dataset:
@@ -52,20 +65,14 @@ def lumitexels(capture: xr.DataTree) -> xr.Dataset:
     """
     parts: list[xr.Dataset] = []
     faults: list[Fault] = []
-    read: list[str] = []
-    optional = {"samples": (SHOT, *NOISE_SAMPLES), "dome": NOISE_LIGHTS}
-    for group, required in (("samples", SAMPLES), ("surfels", SURFELS), ("dome", DOME)):
-        dataset = (
-            capture[group].to_dataset() if group in capture.children else xr.Dataset()
-        )
-        names = [
-            *required,
-            *(name for name in optional.get(group, ()) if name in dataset),
-        ]
+    for group, required in REQUIRED.items():
+        dataset = xr.Dataset()
+        if group in capture.children:
+            dataset = capture[group].to_dataset()
+        names = [*required, *(name for name in OPTIONAL[group] if name in dataset)]
         try:
             check(dataset, names, where=group)
             parts.append(dataset[names])
-            read += names
         except InputError as error:  # collects the faults of all groups
             faults += error.faults
     if faults:
@@ -77,6 +84,155 @@ def lumitexels(capture: xr.DataTree) -> xr.Dataset:
         merged = merged.assign({SHOT: label(SHOT, 0.0)})
     # geometry and noise are read once: 60 bytes per surfel, compared with 14 kB of
     # samples for a full dome
-    return merged.assign(
-        {name: merged[name].load() for name in read if name != "reflectance_sample"}
+    small = [name for name in merged.data_vars if name != "reflectance_sample"]
+    return merged.assign({name: merged[name].load() for name in small})
+
+
+def disc_angle(lumitexels: xr.Dataset) -> float:
+    """Median angular radius [rad] of the lights as seen from the middle of the surfels;
+    0 for point lights.
+    """
+    middle = lumitexels["surfel_position"].values.astype(np.float64).mean(axis=0)
+    distance = np.linalg.norm(lumitexels["light_position"].values - middle, axis=1)
+    radius = lumitexels["light_disc_radius"].values
+    return float(np.median(np.arctan2(radius, distance)))
+
+
+def by_name(
+    kernel: Callable[..., tuple[Any, ...]], names: Sequence[str]
+) -> Callable[..., tuple[Any, ...]]:
+    """A kernel of arrays by the names of their variables, as `elementwise` calls it."""
+
+    def call(*arrays: Array, **params: Any) -> tuple[Any, ...]:
+        return kernel(dict(zip(names, arrays, strict=True)), **params)
+
+    return call
+
+
+def block_of(arrays: Arrays, typical: Noise) -> Block:
+    """The block of surfels in these variables, and in those of `noise_inputs`."""
+    return Block(
+        sample=arrays["reflectance_sample"],
+        position=arrays["surfel_position"],
+        light=arrays["light_position"],
+        camera=arrays["camera_position"],
+        normal=arrays["shading_normal"],
+        diffuse=arrays["diffuse_reflectance"],
+        noise=noise_of(arrays, typical),
     )
+
+
+def noise_inputs(lumitexels: xr.Dataset) -> tuple[str, ...]:
+    """Names of the variables that `noise_of` takes; empty if the noise of the samples
+    is unknown.
+    """
+    return NOISE_INPUTS if all(name in lumitexels for name in NOISE_INPUTS) else ()
+
+
+def take_noise(lumitexels: xr.Dataset) -> Noise:
+    """Noise of captures without the noise of each sample; zero if their photon noise is
+    unknown.
+    """
+    shot = float(lumitexels[SHOT]) if SHOT in lumitexels else 0.0
+    return typical_noise(float(lumitexels["noise_floor"]), shot)
+
+
+def noise_of(arrays: Arrays, typical: Noise) -> Noise:
+    """Noise of the samples of a block of surfels from the variables of `noise_inputs`,
+    or else the typical one.
+    """
+    if not all(name in arrays for name in NOISE_INPUTS):
+        return typical
+    scale = _reflectance_per_radiance(
+        arrays, arrays["light_intensity"].mean(axis=1, keepdims=True)
+    )
+    limit, read, slope = (
+        np.ascontiguousarray(arrays[name].mean(axis=1), np.float32) for name in RADIANCE
+    )
+    return typical._replace(
+        per_radiance=np.ascontiguousarray(scale[..., 0], np.float32),
+        pixels=np.ascontiguousarray(arrays["effective_pixels"], np.float32),
+        limit=limit,
+        read=read,
+        slope=slope,
+    )
+
+
+def sample_variance(
+    lumitexels: xr.Dataset, reflectance: NDArray[Any] | None = None
+) -> xr.DataArray:
+    """Variance (surfel, light, camera, channel) [sr^-2] of samples due to photons, read
+    noise and quantisation.
+
+    Parameters
+    ----------
+    lumitexels
+        From `lumitexels`.
+    reflectance
+        (surfel, light, camera, channel) [sr^-1] samples without noise; default the
+        samples themselves, whose noise makes the variance of low ones too small.
+
+    Returns
+    -------
+    DataArray
+        NaN where there is no sample. The result is held in memory: select some surfels
+        of a large capture.
+
+    Raises
+    ------
+    InputError
+        If the capture does not hold the noise of its cameras: linear files, unknown
+        electrons.
+
+    Examples
+    --------
+    >>> variance = sample_variance(lumitexels(capture).isel(surfel=slice(100)))  # doctest: +SKIP
+    """
+    check(lumitexels, ("reflectance_sample", *NOISE_INPUTS), where="lumitexels")
+    sample = lumitexels["reflectance_sample"]
+    arrays = {name: lumitexels[name].values.astype(np.float64) for name in NOISE_INPUTS}
+    limit, read, slope = (arrays[name] for name in RADIANCE)
+    value = sample.values.astype(np.float64)
+    expected = np.maximum(value if reflectance is None else reflectance, 0.0)
+    scale = _reflectance_per_radiance(arrays, arrays["light_intensity"])[:, :, None]
+    # the longest exposure whose limit is not exceeded
+    step = (value / scale)[..., None] > limit
+    exposure = np.minimum(step.sum(axis=-1), limit.shape[2] - 1)
+    camera, channel = np.ogrid[: limit.shape[0], : limit.shape[1]]
+    variance = (
+        scale**2 * read[camera, channel, exposure]
+        + scale * slope[camera, channel, exposure] * expected
+    )
+    pixels = arrays["effective_pixels"][:, None, :, None]
+    variance = np.where(np.isfinite(value), variance / pixels, np.nan)
+    return xr.DataArray(
+        variance,
+        dims=sample.dims,
+        attrs={"units": "sr-2", "long_name": "variance of a sample"},
+    )
+
+
+def _reflectance_per_radiance(arrays: Arrays, intensity: Array) -> Array:
+    """Distance squared over intensity and fall-off (n, light, channel)."""
+    position = arrays["surfel_position"].astype(np.float64)
+    falloff = arrays["light_falloff"]
+    way = position[:, None] - arrays["light_position"]
+    square = np.einsum("nlk,nlk->nl", way, way)
+    if falloff.any():
+        cosine = np.einsum("nlk,lk->nl", way, arrays["light_axis"]) / np.sqrt(square)
+        square = square / np.maximum(cosine, 1e-3) ** falloff
+    return np.asarray(square[..., None] / intensity)
+
+
+def directions(points: Array, targets: Array) -> Array:
+    """(n, t, 3) unit directions from points (n, 3) to targets (t, 3); NaN where both
+    coincide.
+    """
+    way = targets.astype(np.float64)[None] - points.astype(np.float64)[:, None]
+    length = np.linalg.norm(way, axis=-1, keepdims=True)
+    return np.asarray(way / np.where(length > 0, length, np.nan))
+
+
+def cosines(normal: Array, towards: Array) -> Array:
+    """(n, t) cosines between normals (n, 3) and directions (n, t, 3)."""
+    return np.asarray(np.einsum("nk,ntk->nt", normal, towards))

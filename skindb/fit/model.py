@@ -4,43 +4,45 @@ over the samples.
 
 from __future__ import annotations
 
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
 import numpy as np
 import xarray as xr
+from dask.callbacks import Callback
 from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
-from skindb.fit._clock import Clock
 from skindb.fit.albedo import estimate_diffuse_reflectance
-from skindb.fit.basis import reduce_basis
-from skindb.fit.held_out import fitted_part, hold_out
-from skindb.fit.inter_reflection import bounced_light, without_bounce
-from skindb.fit.light_gains import (
+from skindb.fit.corrections import (
+    bounced_light,
     divided_by_gains,
     estimate_light_gains,
     summarise_gains,
+    without_bounce,
 )
-from skindb.fit.lumitexels import disc_angle, lumitexels
+from skindb.fit.lumitexels import lumitexels
 from skindb.fit.normals import estimate_normals
-from skindb.fit.obstructed import find_obstructed
-from skindb.fit.outliers import suspects
-from skindb.fit.plan import plan_fit
-from skindb.fit.second import refit_and_evaluate
-from skindb.fit.surface import fit_surface
+from skindb.fit.plan import plan_fit, surface_of
+from skindb.fit.quality import find_obstructed, fitted_part, hold_out, suspects
+from skindb.fit.surface import fit_surface, refit_and_evaluate
 from skindb.fit.translucency import fit_probe, summarise_translucency, translucency_map
+from skindb.jit import reported_compilation
 from skindb.parameters import FitParameters
 from skindb.reflectance.dictionary import (
     Dictionary,
-    disc_dictionary,
-    embedded_dictionary,
 )
-from skindb.reflectance.rows import Mode
+from skindb.reflectance.kinds import surface_model
+from skindb.reflectance.model import ReflectanceModel
 from skindb.schema import FitStatus, Use, label, names_of
 from skindb.schema.consent import honour_consent
 from skindb.types import Progress
 
+COMPILING = "compiling, only after an installation"
 COPIED_GROUPS = ("mesh", "dome", "probe")
 KEPT_ATTRS = ("subject", "condition", "session", "traits", "consent_scope", "take")
 
@@ -119,13 +121,11 @@ def first_pass(
             )
         whole = divided_by_gains(whole, groups["light_gains"]["light_gain"])
     with clock.stage("dictionary"):
-        tables = disc_dictionary(dictionary, disc_angle(whole))
+        surface = surface_of(whole, parameters, dictionary)
         plan = plan_fit(capture, parameters, dictionary=dictionary)
-    _require_components(parameters.k, len(tables.names))
     held_out = hold_out(capture, plan, parameters)
     work = fitted_part(whole, held_out)
     eta = parameters.eta
-    rank = min(parameters.rank, len(tables.names))
     diffuse = partial(
         estimate_diffuse_reflectance,
         eta=eta,
@@ -136,14 +136,10 @@ def first_pass(
     def fit(samples: xr.Dataset) -> xr.Dataset:
         found = estimate_normals(samples, eta=eta)
         found = found.merge(diffuse(samples.merge(found)))
-        surface = fit_surface(
-            samples.merge(found),
-            dictionary=tables,
-            mode=parameters.mode,
-            rank=rank,
-            eta=eta,
+        shiny = fit_surface(
+            samples.merge(found), surface=surface, mode=parameters.mode, eta=eta
         )
-        return found.merge(surface).compute()
+        return found.merge(shiny).compute()
 
     with clock.stage("first pass"):
         fitted = fit(work)
@@ -157,12 +153,11 @@ def first_pass(
         [name for name in ("light", "camera") if name in fitted.coords]
     )
     first = xr.DataTree.from_dict({"fitted": fitted, "held_out": held_out, **groups})
-    first.attrs = {
-        "parameters": parameters.as_dict() | {"rank": rank},
-        "dictionary": tables.source,
+    first.attrs = surface.provenance | {
+        "parameters": parameters.as_dict() | surface.settings,
+        "seconds": clock.seconds,
+        "skipped": plan.explain() if plan.omissions else [],
     }
-    first.attrs |= {"dictionary_digest": _digest(dictionary), "seconds": clock.seconds}
-    first.attrs["skipped"] = plan.explain() if plan.omissions else []
     return first
 
 
@@ -195,23 +190,20 @@ def second_pass(
     whole = lumitexels(capture)
     if "light_gains" in first.children:
         whole = divided_by_gains(whole, first["light_gains"].to_dataset()["light_gain"])
-    tables = disc_dictionary(dictionary, disc_angle(whole))
-    _require_match(first, tables.source, _digest(dictionary), whole)
+    surface = surface_of(whole, parameters, dictionary)
+    _require_match(first, surface, whole)
     fitted = first["fitted"].to_dataset()
     held_out = first["held_out"].to_dataset()
     if parameters.inter_reflection:
         with clock.stage("inter-reflection"):
             whole = _direct_light(capture, whole, fitted, parameters.eta)
     with clock.stage("reduced basis"):
-        good = int((fitted["fit_status"] == FitStatus.FITTED).sum())
         rng = np.random.default_rng([parameters.seed, 1])
         weighted = fitted.merge(whole[["surfel_area"]])
-        basis = reduce_basis(
-            weighted, dictionary=tables, k=max(1, min(parameters.k, good)), rng=rng
-        )
+        basis = surface.reduced(weighted, k=parameters.k, rng=rng)
     with clock.stage("second pass"):
         # only mixtures of BRDFs can be rendered
-        mode: Mode = "perceptual" if parameters.mode == "paper" else parameters.mode
+        mode = "perceptual" if parameters.mode == "paper" else parameters.mode
         known = (
             "shading_normal",
             "normal_error",
@@ -247,11 +239,10 @@ def second_pass(
     model.attrs = {
         name: capture.attrs[name] for name in KEPT_ATTRS if name in capture.attrs
     }
-    # the value that was actually used
-    used = parameters.as_dict() | {"k": basis.sizes["component"]}
-    model.attrs |= {"parameters": used, "dictionary": tables.source}
-    model.attrs |= {"dictionary_digest": _digest(dictionary)}
-    model.attrs |= _report(groups["fitted"], held_out) | _dictionary_files(tables)
+    # the values that were actually used
+    used = parameters.as_dict() | surface_model(basis).settings
+    model.attrs |= {"parameters": used} | surface.provenance
+    model.attrs |= _report(groups["fitted"], held_out)
     if "translucency" in groups:
         model.attrs["translucency"] = summarise_translucency(groups["translucency"])
     if "light_gains" in groups:
@@ -264,30 +255,14 @@ def second_pass(
     return model
 
 
-def _require_components(k: int, most: int) -> None:
-    if k > most:  # checked before the fit
-        raise InputError(
-            Fault(
-                "k",
-                f"a reduced basis of this dictionary has 1 to {most} components",
-                str(k),
-                "choose a smaller k",
-            )
-        )
-
-
-def _digest(dictionary: Dictionary | None) -> str:
-    """Digest of the BRDFs for point lights, which is the same for lights of all sizes."""
-    return (dictionary or embedded_dictionary()).digest
-
-
 def _require_match(
-    first: xr.DataTree, source: str, digest: str, whole: xr.Dataset
+    first: xr.DataTree, surface: ReflectanceModel, whole: xr.Dataset
 ) -> None:
-    if first.attrs["dictionary_digest"] != digest:
+    about = surface.provenance
+    if any(first.attrs.get(name) != about[name] for name in about):
         rule = "both passes need the same dictionary"
         cure = "give that of the first pass, or repeat it"
-        raise InputError(Fault("dictionary", rule, source, cure))
+        raise InputError(Fault("dictionary", rule, about["dictionary"], cure))
     surfels = first["fitted"].sizes["surfel"]
     if surfels != whole.sizes["surfel"]:
         rule = "both passes need the same capture"
@@ -299,17 +274,6 @@ def _require_match(
                 "repeat the first pass",
             )
         )
-
-
-def _dictionary_files(tables: Dictionary) -> dict[str, Any]:
-    """Notes on the files the BRDFs were read from, and their digests."""
-    if not tables.origins:
-        return {}
-    sums = {
-        name: origin.sha256
-        for name, origin in zip(tables.names, tables.origins, strict=True)
-    }
-    return {"dictionary_notes": list(tables.notes), "dictionary_sha256": sums}
 
 
 def _groups(
@@ -391,3 +355,54 @@ def _report(fitted: xr.Dataset, held_out: xr.Dataset) -> dict[str, Any]:
             str(name) for name in names[held_out[f"{dim}_held_out"].values > 0]
         ]
     return report
+
+
+@dataclass
+class Clock:
+    """Times stages; `progress` is called with the stage, the steps done and the total
+    number of steps.
+    """
+
+    progress: Progress | None
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Time a stage; the tasks of local dask schedulers are its steps, an eager
+        stage is one step.
+        """
+        begin = time.perf_counter()
+        if self.progress is None:
+            yield
+        else:
+            tell = self.progress
+            ticker = _Ticker(name, self.progress)
+            tell(name, 0, 1)
+            with (
+                ticker,
+                reported_compilation(
+                    lambda: tell(f"{name} ({COMPILING})", ticker.done, ticker.total)
+                ),
+            ):
+                yield
+            tell(name, ticker.total, ticker.total)
+        self.seconds[name] = round(time.perf_counter() - begin, 3)
+
+
+class _Ticker(Callback):
+    """Counts the finished tasks of the graphs that run while it is active."""
+
+    def __init__(self, name: str, progress: Progress) -> None:
+        super().__init__(start=self._begin, posttask=self._finish)  # type: ignore[no-untyped-call]
+        self.name = name
+        self.tell = progress
+        self.total = 1
+        self.done = 0
+
+    def _begin(self, graph: Mapping[Any, Any]) -> None:
+        self.total = max(len(graph), 1)
+        self.done = 0
+
+    def _finish(self, *_: Any) -> None:
+        self.done = min(self.done + 1, self.total)
+        self.tell(self.name, self.done, self.total)

@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 import xarray as xr
 
-from skindb.cache import cached_arrays
 from skindb.errors import Fault, InputError
 from skindb.fit.lumitexels import disc_angle, lumitexels
 from skindb.parameters import FitParameters
-from skindb.reflectance.dictionary import SOURCES, Dictionary, disc_dictionary
-from skindb.reflectance.reduction import (
-    Truncation,
-    reduced_dictionary,
-    truncation_bound,
-)
+from skindb.reflectance.dictionary import Dictionary
+from skindb.reflectance.kinds import unfitted_model
+from skindb.reflectance.model import ReflectanceModel
 from skindb.schema.omission import Omission, explain
 from skindb.types import Mask
 
@@ -117,56 +112,24 @@ def plan_fit(
                 "translucency", 1, 1, "no probe measurement: the model has no sigma_tr"
             ),
         )
-    tables = disc_dictionary(dictionary, disc_angle(lumitexels(capture)))
-    return FitPlan(
-        surfels, reached, probe, omissions + rank_omissions(tables, parameters)
-    )
+    surface = surface_of(lumitexels(capture), parameters, dictionary)
+    return FitPlan(surfels, reached, probe, omissions + surface.omissions)
 
 
-def rank_omissions(
-    tables: Dictionary, parameters: FitParameters
-) -> tuple[Omission, ...]:
-    """Error by a reduction of the dictionary to `rank` dimensions (`truncation_bound`).
+def surface_of(
+    lumitexels: xr.Dataset, parameters: FitParameters, dictionary: Dictionary | None
+) -> ReflectanceModel:
+    """The surface model that a take is fitted with.
 
-    The bound applies to a mixture with given weights. On a take of 32 lights and 6
-    cameras, fitted mixtures differed by 0.8 % (median) and 3.6 % (maximum; bound 3.9 %)
-    at rank 16; the residual was the same as with all 59 in the median surfel, and 5 %
-    larger in one of twenty.
+    Raises
+    ------
+    InputError
+        If the model cannot have as many components as asked for.
     """
-    count = len(tables.names)
-    if parameters.rank >= count:
-        return ()
-    roots = parameters.mode == "paper"
-    bound = _truncation(tables, parameters.rank, roots)
-    reason = (
-        f"rank {parameters.rank}; at a single pair of directions up to "
-        f"{bound.worst:.3g} times the value"
+    return unfitted_model(
+        dictionary,
+        disc_angle(lumitexels),
+        rank=parameters.rank,
+        mode=parameters.mode,
+        k=parameters.k,
     )
-    what = f"{'cube roots of mixtures' if roots else 'mixtures'}, RMS over directions,"
-    return (
-        Omission(
-            "dimensions of the dictionary",
-            count - parameters.rank,
-            count,
-            reason,
-            bound.rms,
-            what,
-        ),
-    )
-
-
-@lru_cache(maxsize=4)
-def _truncation(tables: Dictionary, rank: int, cube_roots: bool) -> Truncation:
-    """Takes of one dome share it."""
-
-    def make() -> dict[str, np.ndarray]:
-        table = np.cbrt(tables.table) if cube_roots else tables.table
-        found = truncation_bound(
-            table, *reduced_dictionary(tables, rank, cube_roots=cube_roots)
-        )
-        return {"rms": np.array(found.rms), "worst": np.array(found.worst)}
-
-    kept = cached_arrays(
-        "truncation", (tables.digest, rank, cube_roots), sources=SOURCES, make=make
-    )
-    return Truncation(float(kept["rms"]), float(kept["worst"]))

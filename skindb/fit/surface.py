@@ -1,106 +1,92 @@
-"""Surface reflectance per surfel as a mixture of measured BRDFs (Weyrich et al. 2005,
-section 7, eq. 7 and 8).
+"""Surface reflectance per surfel (Weyrich et al. 2005, section 7): the fit of a surface
+model, and its judgement by the errors of its predictions.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
+from dask.base import compute
+from dask.delayed import delayed
+from numpy.typing import NDArray
 
 from skindb.elementwise import elementwise
-from skindb.fit._surface_arrays import Refit, Tables, refit_weights, surface_weights
-from skindb.fit.lumitexels import GEOMETRY
-from skindb.fit.sample_noise import noise_inputs, typical_noise
-from skindb.parameters import FullMode
-from skindb.reflectance.dictionary import Dictionary
-from skindb.reflectance.reduction import reduced_dictionary
-from skindb.reflectance.rows import Mode
-from skindb.reflectance.tables import TableGrid, directional_albedo, kernel_tables
-from skindb.schema import check, text_labels
+from skindb.fit.lumitexels import (
+    GEOMETRY,
+    Arrays,
+    block_of,
+    by_name,
+    noise_inputs,
+    take_noise,
+)
+from skindb.fit.quality import HELD_OUT_ERRORS, misfits
+from skindb.reflectance.kinds import surface_model
+from skindb.reflectance.model import Comparison, Judgement, ReflectanceModel
+from skindb.schema import check, dataset, text_labels
 from skindb.types import Array
 
 NEEDED = (*GEOMETRY, "shading_normal", "diffuse_reflectance")
 # sr^-1; noise of a sample of dark skin by photons and resampling; that of the sensor may be larger
 NOISE_FLOOR_SURFACE = 2e-3
 MIN_SAMPLES = 10
-FITTED = (  # in the order of `Weights`
-    "dictionary_weight",
-    "kkt_residual",
-    "dictionary_residual",
-    "dictionary_residual_perceptual",
-    "fit_condition",
-    "fit_samples",
-    "fit_iterations",
-    "fit_status",
-)
 ERROR_INPUTS = ("diffuse_reflectance_error", "normal_error")
-REFITTED = (
-    "basis_weight",
-    "fit_residual",
-    "fit_residual_perceptual",
-    "basis_weight_error",
-    "surface_reflectance",
-    "surface_reflectance_error",
-)
+SURFELS_PER_BLOCK = 4096  # surfels per task if the samples are not lazy
 
 
 def fit_surface(
     lumitexels: xr.Dataset,
     *,
-    dictionary: Dictionary,
-    mode: FullMode = "perceptual",
-    rank: int = 16,
+    surface: ReflectanceModel,
+    mode: str = "perceptual",
     eta: float = 1.3,
 ) -> xr.Dataset:
-    """Non-negative weights of every BRDF of the dictionary.
+    """Fit a surface model to every surfel, before the parts common to all surfels are known.
 
     Parameters
     ----------
     lumitexels
         Samples with geometry, `shading_normal` and `diffuse_reflectance`.
-    dictionary
-        m measured BRDFs, convolved with the discs of the lights.
+    surface
+        Surface model, such as `Mixture.of_dictionary`: mixtures of all BRDFs of a
+        dictionary.
     mode
         "perceptual" (in cube-root space), "linear" (see
         `skindb.reflectance.rows.fit_reflectance`), or "paper": cube roots of the elements
         are mixed, and the prediction is the cube of the mixture.
-    rank
-        Rank of the reduced dictionary; m is exact. `rank_omissions` bounds the error of
-        a smaller rank.
     eta
         Refractive index of the diffuse term that is subtracted.
 
     Returns
     -------
     Dataset
-        `dictionary_weight`, `kkt_residual`, `fit_iterations`, `fit_samples`,
-        `fit_condition`, `dictionary_residual` (RMS of the samples' error over RMS of
-        the samples), `dictionary_residual_perceptual` (in cube-root space) and
+        Parameters of the model, such as `dictionary_weight`; `kkt_residual`,
+        `fit_iterations`, `fit_samples`, `fit_condition`, the residual (RMS of the
+        samples' error over RMS of the samples) also in cube-root space, and
         `fit_status`; NaN where the status says that nothing was fitted.
     """
     check(lumitexels, NEEDED, where="lumitexels")
-    reduced, lift = reduced_dictionary(dictionary, rank, cube_roots=mode == "paper")
+    comparison = Comparison(mode, eta, noise_floor(lumitexels), MIN_SAMPLES)
+    noise = take_noise(lumitexels)
+    names = _unique(*NEEDED, *noise_inputs(lumitexels))
 
-    def kernel(*arrays: Array, **params: Any) -> tuple[Array, ...]:
-        return tuple(surface_weights(*arrays, **params))
+    def kernel(arrays: Arrays) -> tuple[Any, ...]:
+        columns = surface.fit_columns(surface.fit(block_of(arrays, noise), comparison))
+        return tuple(columns[name] for name in surface.fit_variables)
 
     fitted = elementwise(
-        kernel,
+        by_name(kernel, names),
         lumitexels,
         over="surfel",
-        inputs=NEEDED + noise_inputs(lumitexels),
-        outputs=FITTED,
-        sizes={"dictionary": len(dictionary.names)},
-        tables=Tables(reduced, dictionary.grid, lift),
-        eta=eta,
-        mode=mode,
-        noise_floor=noise_floor(lumitexels),
-        noise=typical_noise(lumitexels),
-        min_samples=MIN_SAMPLES,
+        inputs=names,
+        outputs=surface.fit_variables,
+        sizes={dim: len(labels) for dim, labels in surface.labels.items()},
     )
-    return fitted.assign_coords(dictionary=text_labels(dictionary.names))
+    coords = {dim: text_labels(labels) for dim, labels in surface.labels.items()}
+    return fitted.assign_coords(coords)
 
 
 def noise_floor(lumitexels: xr.Dataset) -> float:
@@ -113,10 +99,10 @@ def refit(
     lumitexels: xr.Dataset,
     *,
     basis: xr.Dataset,
-    mode: Mode = "perceptual",
+    mode: str = "perceptual",
     eta: float = 1.3,
 ) -> xr.Dataset:
-    """Non-negative weights of a reduced basis.
+    """Parameters of every surfel for the surface model of a take.
 
     Parameters
     ----------
@@ -124,7 +110,7 @@ def refit(
         Samples with geometry, `shading_normal` and `diffuse_reflectance`; the errors below count
         `diffuse_reflectance_error` and `normal_error` where they are given.
     basis
-        `basis_brdf` of k components, from `reduce_basis`.
+        Group "basis" of a model, such as `basis_brdf` of k components from `reduce_basis`.
     mode, eta
         As in `fit_surface`; not "paper", whose mixtures are not BRDFs that could be reduced.
 
@@ -133,81 +119,231 @@ def refit(
     Dataset
         `basis_weight`, `fit_residual`, `fit_residual_perceptual` (of all samples,
         diffuse light included); `basis_weight_error`, NaN for weights at their bound 0;
-        `surface_reflectance`, the fraction of light along the normal that the mixture
+        `surface_reflectance`, the fraction of light along the normal that the surface
         reflects, and `surface_reflectance_error`. The errors include the noise of the
         samples and the errors of R_d and of the normal, conditional on which weights
         are above 0: they are too small for lobes so sharp that only a few samples see
         them, and for weights that noise moves to their bound.
     """
-    check(lumitexels, NEEDED, where="lumitexels")
-    known = tuple(name for name in ERROR_INPUTS if name in lumitexels)
-    noise = noise_inputs(lumitexels)
-    tables = reduced_tables(basis)
-    strength = surface_strength(tables)
-
-    def kernel(*arrays: Array, **params: Any) -> tuple[Array, ...]:
-        given = len(arrays) - len(known)
-        samples = arrays[:given]
-        errors = dict(zip(known, arrays[given:], strict=True))
-        diffuse = errors.get(
-            "diffuse_reflectance_error", np.zeros((len(samples[0]), 3))
-        )
-        found = refit_weights(
-            *samples,
-            diffuse_error=diffuse,
-            normal_error=errors.get("normal_error"),
-            **params,
-        )
-        variables = refitted_variables(found, strength)
-        return tuple(variables[name] for name in REFITTED)
-
-    fitted = elementwise(
-        kernel,
-        lumitexels,
-        over="surfel",
-        inputs=NEEDED + noise + known,
-        outputs=REFITTED,
-        sizes={"component": basis.sizes["component"]},
-        tables=tables,
-        eta=eta,
-        mode=mode,
-        noise_floor=noise_floor(lumitexels),
-        noise=typical_noise(lumitexels),
-        min_samples=MIN_SAMPLES,
-    )
-    return (
-        fitted.assign_coords(component=basis["component"])
-        if "component" in basis.coords
-        else fitted
-    )
+    return _judged(lumitexels, basis, mode=mode, eta=eta).surfels
 
 
-def refitted_variables(found: Refit, strength: Array) -> dict[str, Array]:
-    """Variables of REFITTED from the results of `refit_weights` for a block of surfels.
+def held_out_error(
+    lumitexels: xr.Dataset, *, basis: xr.Dataset, eta: float = 1.3, of: str = "light"
+) -> xr.Dataset:
+    """Relative RMS error of predicted samples, per surfel.
 
-    `strength` (k,) is the fraction of light along the normal that each component reflects.
+    Parameters
+    ----------
+    lumitexels
+        Samples of the lights or cameras that were held out, with geometry,
+        `shading_normal`, `diffuse_reflectance` and the parameters of the fit.
+    basis
+        Group "basis" of the model.
+    eta
+        Refractive index of the diffuse term.
+    of
+        "light" or "camera": what was held out.
+
+    Returns
+    -------
+    Dataset
+        `held_out_error` and, in cube-root space, `held_out_error_perceptual`; of
+        cameras `held_out_camera_error` and `held_out_camera_error_perceptual`. NaN
+        where the surfel has no such sample or nothing was fitted.
     """
-    variance = np.einsum(
-        "j,njk,k->n", strength, np.nan_to_num(found.covariance), strength
+    judged = _judged(
+        lumitexels, basis, mode="linear", eta=eta, evaluate=True, min_samples=1
+    ).surfels
+    residuals = ("fit_residual", "fit_residual_perceptual")
+    return dataset(
+        {
+            name: judged[residual].values
+            for name, residual in zip(HELD_OUT_ERRORS[of], residuals, strict=True)
+        }
     )
-    return {
-        "basis_weight": found.weight,
-        "fit_residual": found.residual,
-        "fit_residual_perceptual": found.residual_perceptual,
-        "basis_weight_error": np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2)),
-        "surface_reflectance": found.weight @ strength,
-        # NaN if no weight is above 0, or if the weights cannot be distinguished
-        "surface_reflectance_error": np.sqrt(np.where(variance > 0, variance, np.nan)),
+
+
+def find_outliers(
+    lumitexels: xr.Dataset, *, basis: xr.Dataset, eta: float = 1.3
+) -> xr.Dataset:
+    """Fractions of outlying samples per surfel, light and camera, and misfits of
+    lights, cameras and photographs.
+
+    A sample is an outlier if it differs from the prediction in cube-root space by more
+    than five scales of the residuals of its surfel; the scale is the median of the
+    absolute residuals (times 1.4826), so that half of the samples may be wrong. The
+    misfit of a light is a median over surfels, as motion of the face affects most of
+    them.
+
+    Parameters
+    ----------
+    lumitexels
+        Samples the model was fitted to, with geometry, `shading_normal`,
+        `diffuse_reflectance` and the parameters of the fit.
+    basis
+        Group "basis" of the model.
+    eta
+        Refractive index of the diffuse term.
+
+    Returns
+    -------
+    Dataset
+        `outlier_fraction` (surfel); `light_outlier_fraction`, `light_misfit`,
+        `camera_outlier_fraction`, `camera_misfit` and `frame_misfit` (light, camera).
+        NaN where there are too few samples to decide.
+    """
+    judged = _judged(
+        lumitexels, basis, mode="perceptual", eta=eta, evaluate=True, outliers=True
+    )
+    coords = {
+        dim: lumitexels[dim].values
+        for dim in ("light", "camera")
+        if dim in lumitexels.coords
     }
+    columns = {"outlier_fraction": judged.surfels["outlier_fraction"].values}
+    return dataset(columns | misfits(judged.counts), coords=coords)
 
 
-def surface_strength(tables: Tables) -> Array:
-    """Fraction (k,) of light along the normal that each component reflects."""
-    return np.asarray(directional_albedo(tables.reduced, 1.0)[0])
+def refit_and_evaluate(
+    lumitexels: xr.Dataset,
+    *,
+    held_out: xr.Dataset,
+    basis: xr.Dataset,
+    mode: str,
+    eta: float,
+) -> tuple[xr.Dataset, xr.Dataset]:
+    """`refit`, `held_out_error` of lights and of cameras, and `find_outliers`, in one
+    pass over the samples.
+
+    Parameters
+    ----------
+    lumitexels
+        All samples with geometry, and `shading_normal`, `diffuse_reflectance` and their errors.
+    held_out
+        `light_held_out` and `camera_held_out`.
+    basis
+        Group "basis" of the model.
+    mode, eta
+        As in `refit`.
+
+    Returns
+    -------
+    fitted, outliers
+        Variables of the surfels; and variables of lights, cameras and photographs for
+        the fitted samples.
+    """
+    check(lumitexels, ERROR_INPUTS, where="lumitexels")
+    held = (
+        1 * held_out["light_held_out"].values[:, None]
+        + 2 * held_out["camera_held_out"].values[None, :]
+    )
+    judged = _judged(
+        lumitexels, basis, mode=mode, eta=eta, held=held.astype(np.int64), outliers=True
+    )
+    # histograms of the fitted photographs alone
+    fitted = {
+        dim: np.flatnonzero(held_out[f"{dim}_held_out"].values == 0)
+        for dim in ("light", "camera")
+    }
+    counts = judged.counts[np.ix_(fitted["light"], fitted["camera"])]
+    coords = {
+        dim: held_out[dim].values[index]
+        for dim, index in fitted.items()
+        if dim in held_out.coords
+    }
+    return judged.surfels, dataset(misfits(counts), coords=coords)
 
 
-def reduced_tables(basis: xr.Dataset) -> Tables:
-    """The tables of a reduced basis for the kernels."""
-    check(basis, ("basis_brdf",), where="basis")
-    table = kernel_tables(basis)
-    return Tables(table, TableGrid(*table.shape[:3]), np.eye(table.shape[3]))
+class _Judged(NamedTuple):
+    """Variables of the surfels, and histograms (lights, cameras, bins) of residuals."""
+
+    surfels: xr.Dataset
+    counts: NDArray[np.int64]
+
+
+def _judged(
+    lumitexels: xr.Dataset,
+    basis: xr.Dataset,
+    *,
+    mode: str,
+    eta: float,
+    min_samples: int = MIN_SAMPLES,
+    evaluate: bool = False,
+    held: NDArray[np.int64] | None = None,
+    outliers: bool = False,
+) -> _Judged:
+    """Fit or only evaluate the parameters of the surfels, block by block.
+
+    `elementwise` cannot sum over surfels: a task per block returns its surfels and
+    histograms, which are summed.
+    """
+    surface = surface_model(basis)
+    known = surface.parameter_variables if evaluate else ()
+    errors = () if evaluate else tuple(n for n in ERROR_INPUTS if n in lumitexels)
+    names = _unique(*NEEDED, *noise_inputs(lumitexels), *known, *errors)
+    check(lumitexels, (*NEEDED, *known), where="lumitexels")
+    comparison = Comparison(mode, eta, noise_floor(lumitexels), min_samples)
+    noise = take_noise(lumitexels)
+
+    def judge(part: xr.Dataset) -> tuple[dict[str, Array], NDArray[np.int64]]:
+        arrays = {name: part[name].values for name in names}
+        diffuse_error = arrays.get("diffuse_reflectance_error")
+        if diffuse_error is None and not evaluate:
+            diffuse_error = np.zeros((part.sizes["surfel"], 3))
+        judgement = Judgement(diffuse_error, arrays.get("normal_error"), held, outliers)
+        parameters = surface.parameters_of(part) if evaluate else None
+        judged = surface.judge(
+            block_of(arrays, noise), comparison, judgement, parameters
+        )
+        columns = {
+            "fit_residual": judged.residual,
+            "fit_residual_perceptual": judged.residual_perceptual,
+        }
+        if not evaluate:
+            columns |= surface.judged_columns(judged)
+        if outliers:
+            columns["outlier_fraction"] = judged.outlier
+        for i, dim in enumerate(HELD_OUT_ERRORS):
+            if held is not None and (held & (i + 1)).any():
+                error = judged.held_error[:, i].T
+                columns |= dict(zip(HELD_OUT_ERRORS[dim], error, strict=True))
+        return columns, judged.counts
+
+    used = lumitexels[list(names)]
+    blocks = [used.isel(surfel=slice(a, b)) for a, b in pairwise(_cuts(lumitexels))]
+    parts, counts = joined_blocks(judge, blocks)
+    columns = {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
+    coords = {} if evaluate else surface.labels
+    return _Judged(dataset(columns, coords=coords), counts)
+
+
+def joined_blocks(
+    judge: Callable[[xr.Dataset], tuple[Any, NDArray[Any]]],
+    blocks: Sequence[xr.Dataset],
+) -> tuple[list[Any], NDArray[Any]]:
+    """Results of `judge` for each block, and the sum of the histograms that it also returns.
+
+    Histograms are added in pairs as blocks finish: those of a full dome take 1.5 MB per
+    block, and all of them together would take more memory than the results of the
+    surfels.
+    """
+    judged = [delayed(judge, nout=2)(block) for block in blocks]
+    sums = [counts for _, counts in judged]
+    while len(sums) > 1:
+        pairs = (sums[i : i + 2] for i in range(0, len(sums), 2))
+        sums = [delayed(np.add)(*pair) if len(pair) > 1 else pair[0] for pair in pairs]
+    parts, total = compute([part for part, _ in judged], sums[0])  # type: ignore[no-untyped-call]
+    return parts, total
+
+
+def _cuts(lumitexels: xr.Dataset) -> NDArray[np.int64]:
+    """Boundaries of the blocks of surfels."""
+    count = lumitexels.sizes["surfel"]
+    if lumitexels["reflectance_sample"].chunks is None:
+        return np.append(np.arange(0, max(count, 1), SURFELS_PER_BLOCK), count)
+    return np.cumsum([0, *lumitexels.chunksizes["surfel"]])
+
+
+def _unique(*names: str) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(names))

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from skindb.fit._probe_profile import ProbeFit, fit_profile
+from skindb.fit.probe_profile import ProbeFit, fit_profile
 from skindb.schema import IDENTIFIED, ProbeStatus, check, dataset, label
 
 PROFILE_NAMES = ("transport", "dipole")

@@ -1,4 +1,4 @@
-"""Compiled shading of points under one light; see `skindb.reflectance.shade` for shapes,
+"""Compiled shading of points under one light; see `skindb.reflectance.model` for shapes,
 units and sources.
 """
 

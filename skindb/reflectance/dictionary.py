@@ -10,8 +10,11 @@ import hashlib
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, lru_cache
+from typing import Any
 
 import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
 
 from skindb.cache import cached_arrays
 from skindb.errors import Fault, InputError
@@ -26,6 +29,7 @@ from skindb.reflectance.tables import (
     lookup,
     tabulate,
 )
+from skindb.schema import dataset
 from skindb.types import Array
 
 Rule = tuple[int, int]  # rings and points per ring of a quadrature over a disc
@@ -43,6 +47,18 @@ SOURCES = (
     "skindb.optics.angles",
     "skindb.optics.fresnel",
     "skindb.jit",
+)
+# The six most different embedded materials, from narrow to nearly diffuse. The width of
+# the broadest one trades two errors: broad lobes take light from R_d, and without them
+# R_d includes the even reflection of the surface. These balance the two on captures
+# with and without such reflection (notes of `estimate_diffuse_reflectance`).
+LOBES = (
+    "black-fabric",
+    "green-plastic",
+    "beige-fabric",
+    "white-paint",
+    "pearl-paint",
+    "fruitwood-241",
 )
 INCIDENCE = np.radians(np.arange(0, 86, 5))
 # rings, spokes; twice as many points change the worst average of the 59 materials by
@@ -77,11 +93,30 @@ class Dictionary:
     source: str
     disc_angular_radius: float = 0.0  # rad; 0 where the tables are not convolved
     origins: tuple[Origin, ...] = ()  # one per material read from files
+    # `digest` of the tables for point lights that were averaged over the disc
+    point_digest: str = ""
 
     @cached_property
     def digest(self) -> str:
         """SHA-256 of the tables, part of the cache key of results computed from them."""
         return hashlib.sha256(np.ascontiguousarray(self.table).data).hexdigest()
+
+    @property
+    def provenance(self) -> dict[str, Any]:
+        """Source and digest, which is the same for lights of all sizes; for dictionaries
+        from files also notes, and the digests of the files.
+        """
+        about: dict[str, Any] = {
+            "dictionary": self.source,
+            "dictionary_digest": self.point_digest or self.digest,
+        }
+        if self.origins:
+            about["dictionary_notes"] = list(self.notes)
+            about["dictionary_sha256"] = {
+                name: origin.sha256
+                for name, origin in zip(self.names, self.origins, strict=True)
+            }
+        return about
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -267,7 +302,12 @@ def convolve_disc(
         sources=SOURCES,
         make=lambda: {"table": _convolve(dictionary, angular_radius, far, near)},
     )
-    return replace(dictionary, table=found["table"], disc_angular_radius=angular_radius)
+    return replace(
+        dictionary,
+        table=found["table"],
+        disc_angular_radius=angular_radius,
+        point_digest=dictionary.digest,
+    )
 
 
 def _convolve(
@@ -389,3 +429,54 @@ def _disc_errors(
         "disc_quadrature_error": weighted_error(used, mean, wi, wo),
         "disc_table_error": weighted_error(found, mean, wi, wo),
     }
+
+
+def dictionary_report(
+    dictionary: Dictionary, *, disc_angular_radius: float
+) -> xr.Dataset:
+    """Energy, reciprocity, errors and holes of every material, see `dictionary_quality`.
+
+    Parameters
+    ----------
+    dictionary
+        `embedded_dictionary()` or `read_dictionary(path)`.
+    disc_angular_radius
+        Angular radius of the lights as seen from the surface [rad]; ignored if the
+        tables are already averaged.
+
+    Returns
+    -------
+    Dataset
+        Group `dictionary_report` of the schema and `disc_angular_radius` [rad];
+        attributes `source` and `notes`.
+    """
+    radius = dictionary.disc_angular_radius or disc_angular_radius
+    attrs = {"source": dictionary.source, "notes": list(dictionary.notes)}
+    found = dictionary_quality(dictionary, radius) | {"disc_angular_radius": radius}
+    return dataset(found, coords={"dictionary": list(dictionary.names)}, attrs=attrs)
+
+
+@cache
+def surface_lobes() -> tuple[NDArray[np.float32], TableGrid]:
+    """Tables (nh, nd, np, 6) of `LOBES` without their diffuse part, and their grid."""
+    rows = np.array([PARAMETERS[name] for name in LOBES], np.float64)
+    rows[:, :3] = 0
+    return tabulate(
+        lambda wi, wo: evaluate_abc(rows, wi, wo), DEFAULT_GRID
+    ), DEFAULT_GRID
+
+
+@cache
+def lobe_table() -> NDArray[np.float32]:
+    """Tables (nh, nd, np, 16) for the kernel: six lobes, two zeros, their derivatives
+    by theta_h [rad], two zeros.
+    """
+    table, grid = surface_lobes()
+    steep = np.gradient(table.astype(np.float64), grid.theta_h, axis=0)
+    gap = np.zeros((*table.shape[:3], 2))
+    joined = np.ascontiguousarray(
+        np.concatenate([table, gap, steep, gap], axis=-1), np.float32
+    )
+    # as for all tables, so that kernels are compiled once
+    joined.flags.writeable = False
+    return joined

@@ -160,6 +160,23 @@ def truncation_bound(
     )
 
 
+@lru_cache(maxsize=4)
+def rank_truncation(dictionary: Dictionary, rank: int, cube_roots: bool) -> Truncation:
+    """`truncation_bound` of `reduced_dictionary`; cached for the takes of a dome."""
+
+    def make() -> dict[str, NDArray[Any]]:
+        table = np.cbrt(dictionary.table) if cube_roots else dictionary.table
+        bound = truncation_bound(
+            table, *reduced_dictionary(dictionary, rank, cube_roots=cube_roots)
+        )
+        return {"rms": np.array(bound.rms), "worst": np.array(bound.worst)}
+
+    cached = cached_arrays(
+        "truncation", (dictionary.digest, rank, cube_roots), sources=SOURCES, make=make
+    )
+    return Truncation(float(cached["rms"]), float(cached["worst"]))
+
+
 def nodes_above(grid: TableGrid, elevation: float) -> NDArray[np.bool_]:
     """(nh, nd, np) nodes of all cells that contain a pair of directions whose cosines
     both exceed `elevation`.

@@ -60,6 +60,8 @@ class LobeSampler:
         """Probabilities (n, 1 + k) of the cosine and of each basis at points with these
         weights (n, k).
         """
+        if weights.shape[1] == 0:  # without the surface term
+            weights = np.zeros((len(weights), len(self.albedo)))
         lobes = np.maximum(np.asarray(weights, np.float64), 0.0) * self.albedo
         total = lobes.sum(axis=1, keepdims=True)
         shared = np.where(

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from skindb.geometry.camera import pixel_rays
 from skindb.geometry.rays import RayScene
 from skindb.optics.fresnel import fresnel_transmittance
-from skindb.reflectance.shade import shade_points
+from skindb.reflectance.model import Lamp, Points
 from skindb.render.scene import Camera, Lights, Surface
 from skindb.render.subsurface import exitances
 
@@ -216,12 +216,7 @@ def shade_view(
     diffuse = view.interpolate(surface.diffuse) * float(
         "diffuse" in terms and not subsurface
     )
-    weights = (
-        view.interpolate(surface.weights)
-        if "surface" in terms
-        else np.zeros((len(view.pixel), 0))
-    )
-    tables = surface.tables if "surface" in terms else surface.tables[..., :0]
+    points = seen_points(view, surface, diffuse, with_surface="surface" in terms)
     escape = (
         escape_factor(view, surface.eta) if subsurface and "diffuse" in terms else None
     )
@@ -235,31 +230,28 @@ def shade_view(
     for i in range(len(lights)):
         # every ray of a pixel has its own points; together they cover the disc
         chosen = view.ray[:, None] * disc_samples + np.arange(disc_samples)
-        lamp = _lamp_points(lights, i, disc_samples * view.samples**2)[chosen]
-        lit = _lit(scene, view, lamp)
-        if surface.disc_included:
-            lamp = np.broadcast_to(lights.position[i], (len(lit), 1, 3))
+        place = _lamp_points(lights, i, disc_samples * view.samples**2)[chosen]
+        lit = _lit(scene, view, place)
+        if surface.model.disc_included:  # only the shadow of the disc is sampled
+            place = np.broadcast_to(lights.position[i], (len(lit), 1, 3))
             lit = lit.mean(axis=1, keepdims=True)
-        values = (
-            shade_points(
-                view.position,
-                view.normal,
-                view.towards,
-                diffuse,
-                weights,
-                tables,
-                lamp=lamp,
-                lit=lit,
-                axis=lights.axis[i],
-                falloff=float(lights.falloff[i]),
-                eta=surface.eta,
-            )
-            * lights.intensity[i]
-        )
+        lamp = Lamp(place, lit, lights.axis[i], float(lights.falloff[i]))
+        shaded = surface.model.shade(points, lamp, eta=surface.eta)
+        values = shaded * lights.intensity[i]
         if escape is not None and glow is not None:
             values = values + escape * view.interpolate(glow[i])
         images[i] = view.image(values)
     return images
+
+
+def seen_points(
+    view: View, surface: Surface, diffuse: Float, *, with_surface: bool
+) -> Points:
+    """The hits of a view, with R_d (n, 3) and the parameters of the surface model."""
+    parameters: Float = np.zeros((len(view.pixel), 0))
+    if with_surface:
+        parameters = view.interpolate(surface.parameters)
+    return Points(view.position, view.normal, view.towards, diffuse, parameters)
 
 
 def glow_image(view: View, surface: Surface, glow: Image) -> Image:

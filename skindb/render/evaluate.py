@@ -7,13 +7,13 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from skindb.errors import Fault, InputError
-from skindb.reflectance.shade import shade_points
-from skindb.reflectance.tables import kernel_tables
+from skindb.reflectance.kinds import surface_model
+from skindb.reflectance.model import Lamp, Points, ReflectanceModel
 from skindb.render.scene import usable_surfels
 from skindb.schema import FitStatus, check
 from skindb.types import Array
 
-NEEDED = ("shading_normal", "diffuse_reflectance", "basis_weight", "fit_status")
+NEEDED = ("shading_normal", "diffuse_reflectance", "fit_status")
 MAX_LENGTH_ERROR = 1e-3  # of a unit direction; directions in half precision have 5e-4
 
 
@@ -67,30 +67,22 @@ def evaluate(
     """
     fitted = model["fitted"].to_dataset()
     basis = model["basis"].to_dataset()
-    check(fitted, (*NEEDED, "refractive_index"), where="fitted")
-    check(basis, ("basis_brdf",), where="basis")
-    values = _values_of(fitted, surfel)
+    reflectance = surface_model(basis)
+    names = (*NEEDED, *reflectance.parameter_variables, "refractive_index")
+    check(fitted, names, where="fitted")
+    values = _values_of(fitted, surfel, reflectance)
     to_light, to_camera = np.broadcast_arrays(_unit("wi", wi), _unit("wo", wo))
     shape = to_light.shape
     to_light = to_light.reshape(-1, 3)
     to_camera = to_camera.reshape(-1, 3)
-    normal, diffuse, weight = (
+    normal, diffuse, parameters = (
         np.broadcast_to(values[name], (len(to_light), values[name].shape[1]))
-        for name in ("shading_normal", "diffuse_reflectance", "basis_weight")
+        for name in ("shading_normal", "diffuse_reflectance", "parameters")
     )
-    radiance = shade_points(
-        np.zeros_like(to_light),
-        normal,
-        to_camera,
-        diffuse,
-        weight,
-        kernel_tables(basis),
-        lamp=to_light[:, None],
-        lit=np.ones((len(to_light), 1), np.float32),
-        axis=np.zeros(3),
-        falloff=0.0,
-        eta=float(fitted["refractive_index"]),
-    )
+    points = Points(np.zeros_like(to_light), normal, to_camera, diffuse, parameters)
+    lit = np.ones((len(to_light), 1), np.float32)
+    lamp = Lamp(to_light[:, None], lit, np.zeros(3), 0.0)
+    radiance = reflectance.shade(points, lamp, eta=float(fitted["refractive_index"]))
     # for a lamp at a distance of 1 mm, radiance per radiant intensity is f_r cos(theta_i) per mm2
     cosine = np.einsum("nc,nc->n", normal, to_light)[:, None]
     above = (cosine > 0) & (np.einsum("nc,nc->n", normal, to_camera)[:, None] > 0)
@@ -98,16 +90,22 @@ def evaluate(
     return np.asarray(f_r.reshape(shape), np.float32)
 
 
-def _values_of(fitted: xr.Dataset, surfel: int) -> dict[str, Array]:
-    """Values of `NEEDED` for one surfel, each with a leading dimension of length one."""
+def _values_of(
+    fitted: xr.Dataset, surfel: int, reflectance: ReflectanceModel
+) -> dict[str, Array]:
+    """Values of `NEEDED` and the parameters of one surfel, each with a leading dimension of
+    length one.
+    """
     count = fitted.sizes["surfel"]
     if not 0 <= surfel < count:
         rule = f"surfel must be an index from 0 to {count - 1}"
         raise InputError(
             Fault("surfel", rule, str(surfel), "choose a surfel of this model")
         )
-    one = fitted[list(NEEDED)].isel(surfel=[surfel]).compute()
-    values = {name: np.asarray(one[name].values) for name in NEEDED}
+    names = [*NEEDED, *reflectance.parameter_variables]
+    row = fitted[names].isel(surfel=[surfel]).compute()
+    values = {name: np.asarray(row[name].values) for name in NEEDED}
+    values["parameters"] = reflectance.parameters_of(row)
     if not usable_surfels(values)[0]:
         status = FitStatus(int(values["fit_status"][0]))
         found = f"the status {status.name} ({status.explanation})"

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from skindb.geometry.rays import RayScene
 from skindb.optics.fresnel import fresnel_transmittance
-from skindb.reflectance.sampling import LobeSampler, tangents
-from skindb.reflectance.shade import shade_points
-from skindb.render.direct import View, escape_factor, trace_view
+from skindb.reflectance.model import DirectionSampler, Lamp, Points
+from skindb.reflectance.sampling import tangents
+from skindb.render.direct import View, escape_factor, seen_points, trace_view
 from skindb.render.environment import Environment
 from skindb.render.light_choice import LightChoice, points_on_discs, stratified
 from skindb.render.scene import Camera, Lights, Surface
@@ -151,7 +151,7 @@ def render_monte_carlo(
         else None
     )
     painter = _Painter(
-        surface, rays, lighting, quality, LobeSampler.of_tables(surface.tables), choice
+        surface, rays, lighting, quality, surface.model.sampler(), choice
     )
     many = (
         lighting.environment is not None
@@ -198,7 +198,7 @@ class _Painter:
     scene: RayScene
     lighting: Lighting
     quality: Quality
-    lobes: LobeSampler
+    lobes: DirectionSampler
     choice: LightChoice | None  # without lights
 
     def batch(self, view: View, rng: np.random.Generator) -> Image:
@@ -207,15 +207,11 @@ class _Painter:
         terms = self.quality.terms
         subsurface = self.quality.subsurface and "diffuse" in terms
         values = np.zeros((len(view.pixel), 3))
-        hits = _Hits(
-            view,
-            view.interpolate(surface.diffuse)
-            * float("diffuse" in terms and not subsurface),
-            view.interpolate(surface.weights)
-            if "surface" in terms
-            else np.zeros((len(view.pixel), 0)),
-            surface.tables if "surface" in terms else surface.tables[..., :0],
-        )
+        local = float("diffuse" in terms and not subsurface)
+        diffuse = view.interpolate(surface.diffuse) * local
+        with_surface = "surface" in terms
+        points = seen_points(view, surface, diffuse, with_surface=with_surface)
+        hits = _Hits(view, points, surface)
         if self.choice is not None:
             values += self._by_lights(hits, self.choice, rng)
         if self.lighting.environment is not None:
@@ -250,14 +246,14 @@ class _Painter:
             rows = rows[~hidden]
             # tables that are averaged over the disc are evaluated at its centre; the
             # shadow is that of the point
-            lamp = lights.position[chosen] if surface.disc_included else points
+            disc_included = surface.model.disc_included
+            lamp = lights.position[chosen] if disc_included else points
             for light in np.unique(chosen[rows]):
                 own = rows[chosen[rows] == light]
                 shaded = hits.shade(
                     own,
                     lamp[own],
                     weight[own],
-                    surface.eta,
                     lights.axis[light],
                     lights.falloff[light],
                 )
@@ -272,11 +268,7 @@ class _Painter:
         """
         view = hits.view
         values = np.zeros((len(view.pixel), 3))
-        mix = self.lobes.mix(
-            hits.weights
-            if hits.weights.shape[1]
-            else np.zeros((len(view.pixel), len(self.lobes.albedo)))
-        )
+        mix = self.lobes.mix(hits.points.parameters)
         draw = stratified(view, 7, rng)
         drawn = (
             environment.sample(draw[:, :3]),
@@ -299,9 +291,7 @@ class _Painter:
             weight = np.where(
                 own > 0, own / np.maximum(by_light**2 + by_lobe**2, 1e-300), 0.0
             )
-            shaded = hits.shade(
-                rows, view.position[rows] + towards[rows], weight, self.surface.eta
-            )
+            shaded = hits.shade(rows, view.position[rows] + towards[rows], weight)
             values[rows] += shaded * environment.along(towards[rows])
         return values
 
@@ -391,35 +381,22 @@ class _Hits:
     """Hits and their reflectance."""
 
     view: View
-    diffuse: Float  # (n, 3)
-    weights: Float  # (n, k)
-    tables: NDArray[np.float32]
+    points: Points
+    surface: Surface
 
     def shade(
         self,
         rows: NDArray[np.int64],
         lamp: Float,
         weight: Float,
-        eta: float,
         axis: Any = (0.0, 0.0, 1.0),
         falloff: Any = 0.0,
     ) -> Float:
         """Radiance (m, 3) of chosen hits, each under a point light (m, 3) of its own
         with intensity `weight` (m,).
         """
-        view = self.view
-        lit = np.asarray(weight, np.float64)
-        shaded = shade_points(
-            view.position[rows],
-            view.normal[rows],
-            view.towards[rows],
-            self.diffuse[rows],
-            self.weights[rows],
-            self.tables,
-            lamp=lamp[:, None],
-            lit=np.ones((len(rows), 1), np.float32),
-            axis=np.asarray(axis, np.float64),
-            falloff=float(falloff),
-            eta=eta,
-        )
-        return np.asarray(shaded * lit[:, None])
+        points = Points(*(values[rows] for values in self.points))
+        lit = np.ones((len(rows), 1), np.float32)
+        light = Lamp(lamp[:, None], lit, np.asarray(axis, np.float64), float(falloff))
+        shaded = self.surface.model.shade(points, light, eta=self.surface.eta)
+        return np.asarray(shaded * np.asarray(weight, np.float64)[:, None])

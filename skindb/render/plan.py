@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from skindb.geometry.camera import project
 from skindb.geometry.rays import RayScene
 from skindb.optics.fresnel import fresnel_transmittance
-from skindb.reflectance.shade import shade_points
+from skindb.reflectance.model import Lamp, Points
 from skindb.render.direct import View, trace_view
 from skindb.render.monte_carlo import Lighting
 from skindb.render.scene import Camera, Lights, Surface
@@ -113,7 +113,9 @@ def plan_scene(
             view.shown(len(surface.vertices)), subsurface=subsurface
         ).omissions,
     ]
-    surface, found = without_unused_bases(surface)
+    model, parameters, found = surface.model.simplified(surface.parameters)
+    if found:
+        surface = replace(surface, model=model, parameters=parameters)
     skipped += found
     lights = lighting.lights
     if lights is not None and not subsurface:
@@ -134,8 +136,8 @@ def plan_scene(
 def _with_terms(surface: Surface, terms: tuple[str, ...]) -> Surface:
     """The surface with some terms of its BRDF."""
     diffuse = surface.diffuse * ("diffuse" in terms)
-    weights = surface.weights * ("surface" in terms)
-    return replace(surface, diffuse=diffuse, weights=weights)
+    parameters = surface.parameters[:, : None if "surface" in terms else 0]
+    return replace(surface, diffuse=diffuse, parameters=parameters)
 
 
 def plan_octree(error: float | None) -> Omission:
@@ -149,26 +151,6 @@ def plan_octree(error: float | None) -> Omission:
         reason=reason,
         bound=bound,
         bounded="values of subsurface light",
-    )
-
-
-def without_unused_bases(surface: Surface) -> tuple[Surface, Omissions]:
-    """The surface without tables whose weight is zero everywhere."""
-    used = (surface.weights != 0).any(axis=0)
-    if used.all():
-        return surface, ()
-    kept = replace(
-        surface,
-        weights=surface.weights[:, used],
-        tables=np.ascontiguousarray(surface.tables[..., used]),
-    )
-    return kept, (
-        Omission(
-            "basis BRDFs",
-            int((~used).sum()),
-            used.size,
-            "their weight is zero everywhere",
-        ),
     )
 
 
@@ -300,26 +282,18 @@ def _unshadowed(
 ) -> Float:
     """Radiance (l, m, 3) of chosen hits under each light, from its centre and without shadows."""
     diffuse = view.interpolate(surface.diffuse)[rows]
-    weights = view.interpolate(surface.weights)[rows]
+    parameters = view.interpolate(surface.parameters)[rows]
+    points = Points(
+        view.position[rows], view.normal[rows], view.towards[rows], diffuse, parameters
+    )
     lit = np.ones((len(rows), 1), np.float32)
-    found = [
-        shade_points(
-            view.position[rows],
-            view.normal[rows],
-            view.towards[rows],
-            diffuse,
-            weights,
-            surface.tables,
-            lit=lit,
-            lamp=np.broadcast_to(lights.position[i], (len(rows), 1, 3)),
-            axis=lights.axis[i],
-            falloff=float(lights.falloff[i]),
-            eta=surface.eta,
-        )
-        * lights.intensity[i]
-        for i in range(len(lights))
-    ]
-    return np.stack(found)
+    radiance = []
+    for i in range(len(lights)):
+        place = np.broadcast_to(lights.position[i], (len(rows), 1, 3))
+        lamp = Lamp(place, lit, lights.axis[i], float(lights.falloff[i]))
+        shaded = surface.model.shade(points, lamp, eta=surface.eta)
+        radiance.append(shaded * lights.intensity[i])
+    return np.stack(radiance)
 
 
 def _irradiance(light: Lights, surface: Surface) -> Float:

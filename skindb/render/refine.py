@@ -42,7 +42,7 @@ def subdivide_surface(
     """
     names = [
         name
-        for name in ("normals", "diffuse", "weights", "s", "sigma_tr")
+        for name in ("normals", "diffuse", "parameters", "s", "sigma_tr")
         if getattr(surface, name) is not None
     ]
     values = {name: np.asarray(getattr(surface, name), np.float64) for name in names}

@@ -12,7 +12,8 @@ from scipy.spatial import cKDTree
 
 from skindb.errors import Fault, InputError
 from skindb.limits import MAX_PICTURE_PIXELS
-from skindb.reflectance.tables import kernel_tables
+from skindb.reflectance.kinds import surface_model
+from skindb.reflectance.model import ReflectanceModel
 from skindb.schema import FitStatus, check
 
 Float = NDArray[np.floating[Any]]
@@ -20,7 +21,6 @@ NEEDED = (
     "surfel_position",
     "shading_normal",
     "diffuse_reflectance",
-    "basis_weight",
     "dipole_s",
     "fit_status",
 )
@@ -34,17 +34,11 @@ class Surface:
     faces: NDArray[np.integer[Any]]  # (f, 3)
     normals: Float  # (v, 3) unit shading normals
     diffuse: Float  # (v, 3) diffuse reflectance R_d
-    weights: Float  # (v, k) weights of the tables
-    # (nh, nd, np, k) sr^-1, uniform in sqrt(theta_h), theta_d and phi_d (period pi)
-    tables: NDArray[np.float32]
+    parameters: Float  # (v, p) of the surface model
+    model: ReflectanceModel
     s: Float | None = None  # (v, 3) dipole s, for subsurface transport
     sigma_tr: Float | None = None  # (v, 3) mm^-1, for subsurface transport
     eta: float = 1.3
-    disc_included: bool = (
-        # whether tables are convolved with the light's disc, so that only its shadow is
-        # sampled
-        False
-    )
 
     @property
     def known(self) -> NDArray[np.bool_]:
@@ -53,7 +47,7 @@ class Surface:
         """
         finite = [
             np.isfinite(x).all(axis=1)
-            for x in (self.normals, self.diffuse, self.weights)
+            for x in (self.normals, self.diffuse, self.parameters)
         ]
         return np.asarray(np.logical_and.reduce(finite), np.bool_)
 
@@ -168,9 +162,11 @@ def from_model(model: xr.DataTree, *, fill: bool = False) -> Surface:
     """
     fitted = model["fitted"].to_dataset()
     basis = model["basis"].to_dataset()
-    check(fitted, (*NEEDED, "refractive_index"), where="fitted")
-    check(basis, ("basis_brdf", "disc_angular_radius"), where="basis")
+    reflectance = surface_model(basis)
+    names = (*NEEDED, *reflectance.parameter_variables, "refractive_index")
+    check(fitted, names, where="fitted")
     values = {name: np.asarray(fitted[name].values) for name in NEEDED}
+    values["parameters"] = reflectance.parameters_of(fitted)
     if "sigma_tr" in fitted:
         values["sigma_tr"] = np.asarray(fitted["sigma_tr"].values)
     position = values.pop("surfel_position")
@@ -195,14 +191,13 @@ def from_model(model: xr.DataTree, *, fill: bool = False) -> Surface:
         faces=model["mesh"].to_dataset()["triangle"].values,
         normals=values["shading_normal"],
         diffuse=values["diffuse_reflectance"],
-        weights=values["basis_weight"],
-        tables=kernel_tables(basis),
+        parameters=values["parameters"],
+        model=reflectance,
         s=values["dipole_s"],
         sigma_tr=sigma_tr
         if sigma_tr is not None and np.isfinite(sigma_tr).any()
         else None,
         eta=float(fitted["refractive_index"]),
-        disc_included=float(basis["disc_angular_radius"]) > 0,
     )
 
 
@@ -220,7 +215,7 @@ def usable_surfels(values: dict[str, NDArray[Any]]) -> NDArray[np.bool_]:
             FitStatus.OBSTRUCTED,
         ],
     )
-    for name in ("shading_normal", "diffuse_reflectance", "basis_weight"):
+    for name in ("shading_normal", "diffuse_reflectance", "parameters"):
         good &= np.isfinite(values[name]).all(axis=1)
     return good
 

@@ -17,6 +17,7 @@ from skindb.files import make_private, private_file
 from skindb.optics.diffuse import dipole_s
 from skindb.reflectance.abc_low2012 import PARAMETERS
 from skindb.reflectance.dictionary import Dictionary, convolve_disc, embedded_dictionary
+from skindb.reflectance.mixture import Mixture
 from skindb.reflectance.tables import directional_albedo
 from skindb.render.scene import Surface
 from skindb.types import Progress
@@ -180,11 +181,10 @@ def _surface(head: Head, skin: Skin, dictionary: Dictionary, eta: float) -> Surf
         head.normals,
         skin.diffuse,
         skin.weights,
-        dictionary.table,
+        Mixture(dictionary.table, disc_angular_radius=dictionary.disc_angular_radius),
         s=s,
         sigma_tr=skin.sigma_tr,
         eta=eta,
-        disc_included=True,
     )
 
 

@@ -149,7 +149,6 @@ def test_vignette_gain__corner_and_centre(pristine):
     assert gain.max() < 1
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("with_dark", [False, True])
 @pytest.mark.parametrize("curved", [False, True])
 def test_darkroom__develops_as_merge_exposures(pristine, with_dark, curved):

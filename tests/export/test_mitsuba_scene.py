@@ -22,6 +22,7 @@ import xarray as xr
 from scipy.ndimage import binary_erosion, map_coordinates
 
 from skindb.export.bundle import export_bundle
+from skindb.reflectance.mixture import Mixture
 from skindb.reflectance.table_file import read_dictionary
 from skindb.render.direct import render_view
 from skindb.render.image import read_exr, write_exr
@@ -89,7 +90,7 @@ def read_back(bundle: Path) -> Surface:
         mesh.vertex_normals,
         values("albedo"),
         weights,
-        tables,
+        Mixture(tables),
         eta=eta,
     )
 

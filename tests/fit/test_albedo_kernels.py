@@ -19,9 +19,9 @@ from skindb.fit._albedo_kernels import (
     robust_slope,
     separation_memory,
 )
-from skindb.fit._albedo_rules import surface_lobes
 from skindb.optics.angles import half_difference
 from skindb.optics.fresnel import fresnel_transmittance
+from skindb.reflectance.dictionary import surface_lobes
 from skindb.reflectance.tables import lookup
 from skindb.schema import label
 

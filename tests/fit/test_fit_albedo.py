@@ -12,9 +12,10 @@ from skindb.fit import (
     estimate_normals,
     reflectance_interval,
 )
-from skindb.fit._albedo_rules import low_quantile, stable_minimum, surface_lobes
+from skindb.fit.albedo import low_quantile, stable_minimum
 from skindb.optics.diffuse import diffuse_reflectance
 from skindb.optics.fresnel import fresnel_transmittance
+from skindb.reflectance.dictionary import surface_lobes
 from skindb.reflectance.rows import basis_rows
 from skindb.schema import dataset, label
 
@@ -54,7 +55,6 @@ def test_estimate_diffuse_reflectance__white_gloss_leaves_the_colour_alone(new_s
     assert np.median(np.abs(b / a - 1)) < 0.03
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("lights", "cameras", "noise"), [(60, 8, 0.01), (60, 8, 0.05), (150, 16, 0.03)]
 )

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
 
-from skindb.fit._arrays import BATCH, in_batches, quantile_finite, unit
-from skindb.fit._lumitexel_kernels import MODEL_ERROR, lumitexel_memory
-from skindb.fit._segments import Segments
-from skindb.fit._surface_arrays import MODES
-from skindb.fit._surface_kernels import Options, weigh
-from skindb.fit.sample_noise import NO_NOISE, TypicalNoise, noise_of
+from skindb.fit.albedo import BATCH, block_reflectance, quantile_finite
+from skindb.fit.lumitexels import directions
+from skindb.reflectance._lumitexel_kernels import (
+    MODEL_ERROR,
+    Options,
+    lumitexel_memory,
+    weigh,
+)
+from skindb.reflectance.mixture import MODES
+from skindb.reflectance.model import typical_noise
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
@@ -41,41 +43,29 @@ def test_quantile_finite__counts_ranks():
     ]
 
 
-def test_unit__no_direction_is_nan():
-    np.testing.assert_array_equal(
-        unit(np.array([[0.0, 3.0, 4.0], [0.0, 0.0, 0.0]])),
-        [[0, 0.6, 0.8], [np.nan] * 3],
-    )
+def test_directions__no_direction_is_nan():
+    found = directions(np.zeros((1, 3)), np.array([[0.0, 3.0, 4.0], [0.0, 0.0, 0.0]]))
+    np.testing.assert_array_equal(found, [[[0, 0.6, 0.8], [np.nan] * 3]])
 
 
-def test_in_batches__joins_slices_and_takes_none():
-    x = np.arange(2 * BATCH + 3.0)
-    (out,) = in_batches(lambda a: (a * 2,), (x,))
-    np.testing.assert_array_equal(out, 2 * x)
-    assert in_batches(lambda a: (a, a), (x[:0],))[1].shape == (0,)
-
-
-def test_segments__sums_spread_and_scatter_as_loops_do():
-    rng = np.random.default_rng(1)
-    sizes = np.array([0, 3, 0, 1, 5, 0])
-    offsets = np.concatenate([[0], np.cumsum(sizes)])
-    values = rng.normal(size=offsets[-1])
-    segments = Segments(offsets)
-    sums = [values[a:b].sum() for a, b in pairwise(offsets) if b > a]
-    np.testing.assert_allclose(segments.sum(values), sums, rtol=1e-14)
-    np.testing.assert_array_equal(segments.owner, np.repeat(np.arange(6), sizes))
-    np.testing.assert_array_equal(
-        segments.spread(np.array([1.0, 2.0, 3.0])), [1, 1, 1, 2, 3, 3, 3, 3, 3]
-    )
-    np.testing.assert_array_equal(
-        np.isnan(segments.scatter(np.ones((3, 2)))[:, 0]), sizes == 0
-    )
-
-
-def test_segments__without_any_sample():
-    segments = Segments(np.zeros(4, np.int64))
-    assert segments.sum(np.zeros(0)).shape == (0,)
-    assert np.isnan(segments.scatter(np.zeros(0))).sum() == 3
+def test_block_reflectance__rules_in_batches_and_without_surfels():
+    rng = np.random.default_rng(3)
+    n = BATCH + 5
+    arrays = {
+        "reflectance_sample": rng.uniform(0.1, 0.2, (n, 6, 4, 3)),
+        "surfel_position": rng.normal(size=(n, 3)),
+        "light_position": rng.normal((0, 0, 900), size=(6, 3)),
+        "camera_position": rng.normal((0, 0, 900), size=(4, 3)),
+        "shading_normal": np.tile([0.0, 0.0, 1.0], (n, 1)),
+    }
+    whole = block_reflectance(arrays, method="quantile", eta=1.3)
+    for part in (slice(BATCH, None), slice(0, 0)):
+        cut = {
+            k: v if "_pos" in k and "surfel" not in k else v[part]
+            for k, v in arrays.items()
+        }
+        found = block_reflectance(cut, method="quantile", eta=1.3)
+        np.testing.assert_array_equal(found[0], whole[0][part])
 
 
 @pytest.mark.parametrize("mode", ["linear", "perceptual"])
@@ -89,8 +79,7 @@ def test_weigh__noise_over_the_error_of_models_in_plain_numpy(mode):
     memory.scattered[:, :count] = rng.uniform(0, 0.3, (3, count))
     weight = np.zeros(60, np.float32)
     options = Options(1.3, MODES.index(mode), floor, 1, True)
-    typical = TypicalNoise(noise, shot)
-    weigh(0, count, noise_of((), typical), options, memory, weight)
+    weigh(0, count, typical_noise(noise, shot), options, memory, weight)
 
     level = memory.scattered[:, :count].mean(axis=0, dtype=np.float64)
     mean = level.mean()
@@ -108,5 +97,5 @@ def test_weigh__noise_over_the_error_of_models_in_plain_numpy(mode):
     np.testing.assert_allclose(weight[:count], 1 / (1 + (spread / own) ** 2), rtol=1e-4)
     assert weight[:count].max() > 1.1 * weight[:count].min()
 
-    weigh(0, count, noise_of((), NO_NOISE), options, memory, weight)
+    weigh(0, count, typical_noise(), options, memory, weight)
     assert (weight[:count] == 1).all()

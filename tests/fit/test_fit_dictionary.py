@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from skindb.fit import dictionary_report
-from skindb.fit.model import _dictionary_files as _files
 from skindb.reflectance.dictionary import Dictionary, embedded_dictionary
 from skindb.reflectance.merl import SHAPE, write_merl
 from skindb.reflectance.table_file import read_dictionary
@@ -21,7 +20,6 @@ def measured(tmp_path_factory) -> Dictionary:
     return read_dictionary(folder)
 
 
-@pytest.mark.slow
 def test_dictionary_report__is_labelled_and_carries_the_notes(measured):
     report = dictionary_report(measured, disc_angular_radius=0.01)
     check(report, [v.name for v in GROUPS["dictionary_report"]])
@@ -32,11 +30,14 @@ def test_dictionary_report__is_labelled_and_carries_the_notes(measured):
     assert report["disc_angular_radius"] == 0.01
 
 
-def test_files__sums_and_notes_of_what_was_read(measured):
-    found = _files(measured)
+def test_provenance__sums_and_notes_of_what_was_read(measured):
+    found = measured.provenance
     assert found["dictionary_notes"] == [
         "not in the published set: mine",
         "differs from the published file of that name: teflon",
     ]
     assert {len(value) for value in found["dictionary_sha256"].values()} == {64}
-    assert _files(embedded_dictionary()) == {}
+    assert set(embedded_dictionary().provenance) == {
+        "dictionary",
+        "dictionary_digest",
+    }

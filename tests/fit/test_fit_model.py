@@ -25,10 +25,11 @@ from skindb.fit import (
     summarise_translucency,
     tabulate_translucency,
 )
-from skindb.fit.held_out import ERRORS, fitted_part, hold_out
 from skindb.fit.lumitexels import lumitexels as lumitexels_of
 from skindb.fit.plan import plan_fit
+from skindb.fit.quality import HELD_OUT_ERRORS, fitted_part, hold_out
 from skindb.optics.dipole import sigma_tr
+from skindb.reflectance.mixture import Mixture
 from skindb.schema import GROUPS, FitStatus, check, dataset, label
 
 STAGES = {"dictionary", "first pass", "reduced basis", "second pass", "translucency"}
@@ -181,7 +182,8 @@ def test_fit_model__passes_are_their_separate_methods(
     alone = alone.merge(estimate_diffuse_reflectance(work.merge(alone)))
     alone = alone.merge(
         fit_surface(
-            work.merge(alone), dictionary=_averaged(small_dictionary, whole), rank=6
+            work.merge(alone),
+            surface=Mixture.of_dictionary(_averaged(small_dictionary, whole), rank=6),
         )
     )
     basis = model["basis"].to_dataset()
@@ -196,8 +198,8 @@ def test_fit_model__passes_are_their_separate_methods(
         alone = alone.merge(held_out_error(samples.merge(known), basis=basis, of=dim))
     names = [name for name in found.data_vars if name in alone]
     assert {
-        *ERRORS["light"],
-        *ERRORS["camera"],
+        *HELD_OUT_ERRORS["light"],
+        *HELD_OUT_ERRORS["camera"],
         "fit_residual",
         "outlier_fraction",
         "basis_weight",
@@ -256,7 +258,7 @@ def test_fit_model__never_sees_what_is_held_out(fitted, planted, small_dictionar
         samples["reflectance_sample"].loc[place] = values
     wild["samples"] = xr.DataTree(samples)
     again = fit_model(wild, HELD_OUT, dictionary=small_dictionary)
-    errors = [name for pair in ERRORS.values() for name in pair]
+    errors = [name for pair in HELD_OUT_ERRORS.values() for name in pair]
     for group in ("fitted", "basis", "translucency"):
         left, right = (
             tree[group].to_dataset().drop_vars(errors, errors="ignore")

@@ -12,8 +12,8 @@ import pytest
 import xarray as xr
 
 from skindb.fit import find_outliers, refit
-from skindb.fit.outliers import joined_blocks, suspects
-from skindb.fit.surface import noise_floor
+from skindb.fit.quality import suspects
+from skindb.fit.surface import joined_blocks, noise_floor
 from skindb.optics.angles import half_difference
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.reflectance.tables import kernel_tables, lookup, stored_brdf
@@ -217,7 +217,6 @@ def test_find_outliers__is_its_definition(taken):
     assert found["light_misfit"].isnull().all()
 
 
-@pytest.mark.slow
 def test_find_outliers__same_for_any_chunks(taken):
     lumitexels, basis = taken
     whole = find_outliers(lumitexels, basis=basis)

@@ -7,7 +7,7 @@ import pytest
 
 from skindb.errors import InputError
 from skindb.fit import prediction_table
-from skindb.fit.prediction import describe_prediction, tabulate_prediction
+from skindb.fit.quality import describe_prediction, tabulate_prediction
 from skindb.schema import FitStatus, dataset
 
 FITTED = FitStatus.FITTED

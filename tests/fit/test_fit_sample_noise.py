@@ -8,23 +8,25 @@ from planted_skin import make_skin
 
 from skindb.errors import InputError
 from skindb.fit import estimate_diffuse_reflectance
-from skindb.fit._lumitexel_kernels import (
-    choose,
-    lumitexel_memory,
-    write_cosines,
-    write_directions,
-    write_noise,
-    write_rows,
-)
-from skindb.fit._surface_arrays import MODES
-from skindb.fit._surface_kernels import MODEL_ERROR, Options, weigh
-from skindb.fit.sample_noise import (
-    NO_NOISE,
+from skindb.fit.lumitexels import (
     NOISE_INPUTS,
     noise_inputs,
     noise_of,
     sample_variance,
 )
+from skindb.reflectance._lumitexel_kernels import (
+    MODEL_ERROR,
+    Options,
+    choose,
+    lumitexel_memory,
+    weigh,
+    write_cosines,
+    write_directions,
+    write_noise,
+    write_rows,
+)
+from skindb.reflectance.mixture import MODES
+from skindb.reflectance.model import typical_noise
 from skindb.reflectance.tables import pad_to_lanes
 from skindb.schema import label
 
@@ -87,14 +89,13 @@ def by_hand(lumitexels, surfel, i, o, c, level, bright):
     )
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("whole", [100.0, 12.0])
 def test_write_noise__variance_of_each_sample_by_hand(skin, whole):
     """With a white level that some samples exceed in the long exposure, and without."""
     known = with_noise(skin.lumitexels, whole=whole)
-    arrays = tuple(known[name].values for name in NOISE_INPUTS)
+    arrays = {name: known[name].values for name in NOISE_INPUTS}
     sample = known["reflectance_sample"].values
-    noise = noise_of(arrays, NO_NOISE)
+    noise = noise_of(arrays, typical_noise())
     table = np.zeros((3, 3, 3, 4), np.float32)
     b = lumitexel_memory(20, 4, 8)
     rows = 0
@@ -152,9 +153,11 @@ def test_weigh__no_weight_exceeds_what_noise_permits(skin, mode):
     known = with_noise(skin.lumitexels, electrons=100.0)
     weights = []
     for pixels in (1.0, 0.5):
-        arrays = tuple(known[name].values for name in NOISE_INPUTS)
+        arrays = {name: known[name].values for name in NOISE_INPUTS}
         noise = noise_of(
-            (arrays[0], np.full_like(arrays[1], pixels), *arrays[2:]), NO_NOISE
+            arrays
+            | {"effective_pixels": np.full_like(arrays["effective_pixels"], pixels)},
+            typical_noise(),
         )
         b = lumitexel_memory(20, 4, 8)
         weight = np.zeros(80, np.float32)

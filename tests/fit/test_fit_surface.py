@@ -11,12 +11,12 @@ from scipy.optimize import nnls
 
 from skindb.errors import InputError
 from skindb.fit import fit_surface, held_out_error, reduce_basis, refit
-from skindb.fit._albedo_rules import surface_lobes
-from skindb.fit._surface_kernels import MIN_COSINE_SURFACE
 from skindb.fit.surface import NEEDED, NOISE_FLOOR_SURFACE
 from skindb.optics.angles import half_difference
 from skindb.optics.fresnel import fresnel_transmittance
-from skindb.reflectance.dictionary import Dictionary
+from skindb.reflectance._lumitexel_kernels import MIN_COSINE_SURFACE
+from skindb.reflectance.dictionary import Dictionary, surface_lobes
+from skindb.reflectance.mixture import Mixture
 from skindb.reflectance.reduction import (
     MIN_COSINE_SAMPLES,
     reduce_dictionary,
@@ -44,7 +44,11 @@ def test_fit_surface__reproduces_planted_reflectance(
     planted, small_dictionary, mode, rank
 ):
     lumitexels, weight = planted
-    found = fit_surface(lumitexels, dictionary=small_dictionary, mode=mode, rank=rank)
+    found = fit_surface(
+        lumitexels,
+        surface=Mixture.of_dictionary(small_dictionary, rank=rank, mode=mode),
+        mode=mode,
+    )
     assert (found["fit_status"] == FitStatus.FITTED).all()
     # five dimensions do not hold six materials
     assert found["dictionary_residual"].max() < (HALF if rank == 6 else 0.05)
@@ -77,7 +81,11 @@ def test_fit_surface__reduced_rank_agrees_within_the_bound(
     # the bound holds for every sample that is used
     assert MIN_COSINE_SAMPLES <= MIN_COSINE_SURFACE
     found = [
-        fit_surface(lumitexels, dictionary=small_dictionary, mode=mode, rank=r)
+        fit_surface(
+            lumitexels,
+            surface=Mixture.of_dictionary(small_dictionary, rank=r, mode=mode),
+            mode=mode,
+        )
         for r in (6, rank)
     ]
     place = lumitexels["surfel_position"].values.astype(float)
@@ -146,7 +154,7 @@ def test_fit_surface__statuses(planted, small_dictionary):
     sample[4, 0, 0] = np.inf
     position[5] = np.nan
     normal[6] = np.nan
-    found = fit_surface(lumitexels, dictionary=small_dictionary)
+    found = fit_surface(lumitexels, surface=Mixture.of_dictionary(small_dictionary))
     expected = [
         FitStatus.UNSEEN,
         FitStatus.TOO_FEW_SAMPLES,
@@ -165,9 +173,9 @@ def test_fit_surface__statuses(planted, small_dictionary):
 
 def test_fit_surface__any_chunking(planted, small_dictionary):
     lumitexels, _ = planted
-    eager = fit_surface(lumitexels, dictionary=small_dictionary)
+    eager = fit_surface(lumitexels, surface=Mixture.of_dictionary(small_dictionary))
     lazy = fit_surface(
-        lumitexels.chunk(surfel=9), dictionary=small_dictionary
+        lumitexels.chunk(surfel=9), surface=Mixture.of_dictionary(small_dictionary)
     ).compute()
     for name in ("dictionary_weight", "dictionary_residual"):
         np.testing.assert_allclose(
@@ -177,7 +185,7 @@ def test_fit_surface__any_chunking(planted, small_dictionary):
 
 def test_fit_surface__asks_for_normals_and_diffuse(skin, small_dictionary):
     with pytest.raises(InputError, match="shading_normal") as caught:
-        fit_surface(skin.lumitexels, dictionary=small_dictionary)
+        fit_surface(skin.lumitexels, surface=Mixture.of_dictionary(small_dictionary))
     assert len(caught.value.faults) == 2
 
 
@@ -190,7 +198,9 @@ def _identity_basis(dictionary):
 
 def test_refit__every_bases_as_components_is_the_full_fit(planted, small_dictionary):
     lumitexels, _ = planted
-    full = fit_surface(lumitexels, dictionary=small_dictionary, rank=6)
+    full = fit_surface(
+        lumitexels, surface=Mixture.of_dictionary(small_dictionary, rank=6)
+    )
     reduced = refit(lumitexels, basis=_identity_basis(small_dictionary))
     np.testing.assert_allclose(
         reduced["basis_weight"], full["dictionary_weight"], rtol=1e-6, atol=1e-9
@@ -438,9 +448,8 @@ def test_fit_surface__paper_rule_against_scipy(planted, small_dictionary):
     lumitexels, _ = planted
     found = fit_surface(
         lumitexels.isel(surfel=slice(0, 4)),
-        dictionary=small_dictionary,
+        surface=Mixture.of_dictionary(small_dictionary, rank=6, mode="paper"),
         mode="paper",
-        rank=6,
     )
     sample, position, light, camera, normal, diffuse = (
         lumitexels[name].values.astype(float) for name in NEEDED
@@ -482,7 +491,9 @@ def test_fit_surface__paper_rule_against_scipy(planted, small_dictionary):
 
 def test_fit_surface__counts_and_condition(planted, small_dictionary):
     lumitexels, _ = planted
-    found = fit_surface(lumitexels, dictionary=small_dictionary, rank=6)
+    found = fit_surface(
+        lumitexels, surface=Mixture.of_dictionary(small_dictionary, rank=6)
+    )
     usable = np.isfinite(lumitexels["reflectance_sample"].values).all(-1).sum((1, 2))
     assert (found["fit_samples"] <= usable).all()
     # the other samples are at grazing angles

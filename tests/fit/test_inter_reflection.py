@@ -10,7 +10,7 @@ from scipy.integrate import quad
 from scipy.spatial import ConvexHull
 
 from skindb.errors import InputError
-from skindb.fit.inter_reflection import bounced_light, without_bounce
+from skindb.fit.corrections import bounced_light, without_bounce
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.schema import dataset
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from skindb.fit import estimate_light_gains
-from skindb.fit.light_gains import divided_by_gains
+from skindb.fit.corrections import divided_by_gains
 from skindb.schema import dataset, label
 
 

@@ -25,8 +25,7 @@ from sphere import (
 import skindb
 from skindb import workflow
 from skindb.calibration.radiance import frame_merger, merge_exposures
-from skindb.fit.lumitexels import lumitexels
-from skindb.fit.sample_noise import noise_inputs, sample_variance
+from skindb.fit.lumitexels import lumitexels, noise_inputs, sample_variance
 from skindb.format.dome import CameraRecord
 from skindb.format.folder import read_capture
 from skindb.format.frames import FrameKind
@@ -103,7 +102,6 @@ def lumitexels_of(dome, surfels, folder, *, footprint):
     return lumitexels(xr.DataTree.from_dict(groups))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("footprint", [False, True])
 def test_sample_variance__z_scores_of_repeated_frames_have_unit_variance(
     capture_folder, tmp_path, footprint
@@ -361,7 +359,6 @@ def ingested(folder, root, **options):
     return record.provenance["summary"]["notes"]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", HOSTILE)
 def test_ingest_capture__intensities_and_samples_of_no_dome_are_refused(
     capture_folder, tmp_path, name
@@ -415,7 +412,6 @@ def test_ingest_capture__lights_that_are_wrong_are_noted_on_request(
     )
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", LEGAL)
 def test_ingest_capture__unusual_lights_pass_and_are_noted(
     capture_folder, tmp_path, name

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import nnls
 
-from skindb.reflectance.factor import Systems, factor_reflectance, residuals
+from skindb.reflectance.basis import Systems, factor_reflectance, residuals
 
 
 def _problem(rng, *, n=60, m=20, k=3, noise=0.0):

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.interpolate import RegularGridInterpolator
 
-from skindb.reflectance.shade import shade_points
+from skindb.reflectance.mixture import Mixture
+from skindb.reflectance.model import Lamp, Points
 
 ETA = 1.3
 FLOAT32 = 2e-6  # relative: tables and results are float32, eight corners are summed
@@ -69,10 +70,17 @@ def points() -> dict[str, np.ndarray]:
     }
 
 
-def test_shade_points__equals_slow_twin(points: dict[str, np.ndarray]) -> None:
+def shaded(
+    position, normal, view, diffuse, weight, table, *, lamp, lit, axis, falloff, eta
+):
+    points = Points(position, normal, view, diffuse, weight)
+    return Mixture(table).shade(points, Lamp(lamp, lit, axis, falloff), eta=eta)
+
+
+def test_shade__equals_slow_twin(points: dict[str, np.ndarray]) -> None:
     axis = unit(np.array([0.3, -0.2, -1.0]))
     falloff = 1.5
-    values = shade_points(**points, axis=axis, falloff=falloff, eta=ETA)
+    values = shaded(**points, axis=axis, falloff=falloff, eta=ETA)
     for i, (x, n, wo) in enumerate(
         zip(points["position"], points["normal"], points["view"], strict=True)
     ):
@@ -91,11 +99,11 @@ def test_shade_points__equals_slow_twin(points: dict[str, np.ndarray]) -> None:
         np.testing.assert_allclose(values[i], expected / 2, rtol=FLOAT32, atol=1e-12)
 
 
-def test_shade_points__mirror_at_normal_incidence_reads_the_first_node() -> None:
+def test_shade__mirror_at_normal_incidence_reads_the_first_node() -> None:
     table = np.zeros((5, 4, 3, 1), np.float32)
     table[0, 0] = 2.0
     up = np.array([[0.0, 0.0, 1.0]])
-    values = shade_points(
+    values = shaded(
         np.zeros((1, 3)),
         up,
         up,
@@ -111,7 +119,7 @@ def test_shade_points__mirror_at_normal_incidence_reads_the_first_node() -> None
     np.testing.assert_allclose(values, 2.0 / 100, rtol=FLOAT32)
 
 
-def test_shade_points__is_reciprocal(points: dict[str, np.ndarray]) -> None:
+def test_shade__is_reciprocal(points: dict[str, np.ndarray]) -> None:
     # swapping light and camera directions changes the radiance only by the ratio of the cosines
     one = points | {
         "lamp": points["position"][:, None]
@@ -129,9 +137,9 @@ def test_shade_points__is_reciprocal(points: dict[str, np.ndarray]) -> None:
     cos_o = np.einsum("nc,nc->n", points["view"], points["normal"])
     use = (cos_i > 0.01) & (cos_o > 0.01)
     forward = (
-        shade_points(**one, axis=axis, falloff=0, eta=ETA)
+        shaded(**one, axis=axis, falloff=0, eta=ETA)
         * np.sum(there**2, axis=1)[:, None]
         / cos_i[:, None]
     )
-    backward = shade_points(**back, axis=axis, falloff=0, eta=ETA) * 25 / cos_o[:, None]
+    backward = shaded(**back, axis=axis, falloff=0, eta=ETA) * 25 / cos_o[:, None]
     np.testing.assert_allclose(forward[use], backward[use], rtol=5e-6)

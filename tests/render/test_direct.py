@@ -12,6 +12,7 @@ import trimesh
 
 from skindb.geometry.rays import RayScene
 from skindb.optics.diffuse import dipole_s
+from skindb.reflectance.mixture import Mixture
 from skindb.render.direct import render_view, trace_view
 from skindb.render.scene import Camera, Lights, Surface
 from skindb.render.subsurface import exitances, transmitted_irradiance
@@ -30,7 +31,7 @@ def surface(
         normals,
         np.full((n, 3), [0.6, 0.4, 0.3]),
         np.full((n, 1), 0.0),
-        np.ones((4, 3, 2, 1), np.float32),
+        Mixture(np.ones((4, 3, 2, 1), np.float32)),
         eta=eta,
     )
 
@@ -189,12 +190,13 @@ def test_render_view__tables_that_include_the_disc_are_read_at_its_centre() -> N
     small = lights((0.0, 0.0, 100.0))
     wide = lights((0.0, 0.0, 100.0), radius=60.0)
     expected = render_view(plane(), view, small)
-    found = render_view(replace(plane(), disc_included=True), view, wide)
+    averaged = replace(plane().model, disc_angular_radius=0.1)
+    found = render_view(replace(plane(), model=averaged), view, wide)
     np.testing.assert_allclose(found, expected, rtol=FLOAT32)
 
 
 def test_render_view__terms_add_up() -> None:
-    glossy = replace(plane(), weights=np.full((4, 1), 0.7), eta=1.3)
+    glossy = replace(plane(), parameters=np.full((4, 1), 0.7), eta=1.3)
     view = camera()
     lamps = lights((200, 100, 400))
     parts = [
@@ -229,11 +231,13 @@ def test_trace_view__coverage_and_antialiasing() -> None:
 
 def test_trace_view__unknown_vertices_and_backs_do_not_shine() -> None:
     flat = plane(cells=2)
-    weights = flat.weights.copy()
+    weights = flat.parameters.copy()
     weights[0] = np.nan  # a corner of the first cell
-    found = trace_view(replace(flat, weights=weights), camera())
+    found = trace_view(replace(flat, parameters=weights), camera())
     assert 0 < (found.coverage == 0).sum() < found.coverage.size
-    image = render_view(replace(flat, weights=weights), camera(), lights((0, 0, 400)))
+    image = render_view(
+        replace(flat, parameters=weights), camera(), lights((0, 0, 400))
+    )
     assert np.isfinite(image).all()
     behind = replace(flat, faces=flat.faces[:, ::-1])
     assert trace_view(behind, camera()).coverage.max() == 0

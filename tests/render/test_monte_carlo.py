@@ -12,6 +12,7 @@ from scipy import stats
 from skindb.errors import InputError
 from skindb.optics.diffuse import dipole_s
 from skindb.optics.fresnel import fresnel_transmittance
+from skindb.reflectance.mixture import Mixture
 from skindb.reflectance.tables import TableGrid, directional_albedo, tabulate
 from skindb.render.direct import render_view, trace_view
 from skindb.render.environment import Environment
@@ -44,7 +45,7 @@ def ball(eta: float = 1.0, diffuse: float = 0.6, weight: float = 0.0) -> Surface
         mesh.vertices / 60.0,
         np.full((n, 3), diffuse),
         np.full((n, 1), weight),
-        tabulate(lobe, TableGrid(40, 30, 8)),
+        Mixture(tabulate(lobe, TableGrid(40, 30, 8))),
         eta=eta,
     )
 
@@ -112,7 +113,7 @@ def test_furnace__a_lobe_has_its_directional_albedo() -> None:
     view = trace_view(surface, camera(), samples=8)
     cosine = np.einsum("nc,nc->n", view.normal, view.towards)
     at = np.linspace(0.05, 1, 60)
-    albedo = np.interp(cosine, at, directional_albedo(surface.tables, at)[:, 0])
+    albedo = np.interp(cosine, at, directional_albedo(surface.model.table, at)[:, 0])
     expected = view.image(np.repeat(albedo[:, None], 3, axis=1))
     middle = (expected > 0) & (found.coverage == 1)[..., None]
     gap = (found.radiance - expected)[middle].mean() / expected[middle].mean()
@@ -144,12 +145,13 @@ def test_subsurface__even_light_gives_r_d() -> None:
     assert abs(found.radiance[seen].mean() / expected[seen].mean() - 1) < 0.005
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 3, 12])
 @pytest.mark.parametrize("disc_included", [False, True])
 def test_lights__as_the_renderer_of_the_fit(count, disc_included) -> None:
     """Against `render_view`, which goes through all lights and regular points of their discs."""
-    surface = replace(ball(eta=1.3, weight=0.5), disc_included=disc_included)
+    surface = ball(eta=1.3, weight=0.5)
+    radius = 0.01 if disc_included else 0.0
+    surface = replace(surface, model=replace(surface.model, disc_angular_radius=radius))
     expected = render_view(
         surface, camera(), lights(count), samples=6, disc_samples=4
     ).sum(axis=0)
@@ -161,7 +163,6 @@ def test_lights__as_the_renderer_of_the_fit(count, disc_included) -> None:
     assert 0.85 < spread < 1.3
 
 
-@pytest.mark.slow
 def test_environment__as_many_small_lights() -> None:
     """An environment against one distant point light for each of its texels."""
     surface = ball(eta=1.3, weight=0.5)

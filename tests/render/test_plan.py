@@ -75,7 +75,6 @@ POWERS = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", list(POWERS))
 @pytest.mark.parametrize("subsurface", [False, True])
 def test_notable_lights__pictures_agree_within_the_bound(
@@ -121,7 +120,7 @@ def test_plan_scene__bounds_are_relative_to_the_terms_of_the_picture() -> None:
     surface = skin()
     lights = around(POWERS["eight decades"])
     parts = {
-        ("diffuse",): replace(surface, weights=0 * surface.weights),
+        ("diffuse",): replace(surface, parameters=0 * surface.parameters),
         ("surface",): replace(surface, diffuse=0 * surface.diffuse),
         ("diffuse", "surface"): surface,
     }
@@ -165,7 +164,6 @@ CAMERAS = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", list(CAMERAS))
 @pytest.mark.parametrize("coarse", [False, True])
 def test_covered_pixels__contain_every_hit(name: str, coarse: bool) -> None:
@@ -174,7 +172,7 @@ def test_covered_pixels__contain_every_hit(name: str, coarse: bool) -> None:
         corner = np.array([[-60.0, -60, 0], [60, -60, 0], [60, 60, 0], [-60, 60, 0]])
         four = {
             key: getattr(surface, key)[:4]
-            for key in ("diffuse", "weights", "s", "sigma_tr")
+            for key in ("diffuse", "parameters", "s", "sigma_tr")
         }
         faces = np.array([[0, 1, 2], [0, 2, 3]])
         surface = replace(

@@ -12,6 +12,7 @@ import pytest
 from skindb.errors import InputError
 from skindb.geometry.rays import RayScene
 from skindb.optics.diffuse import dipole_s
+from skindb.reflectance.mixture import Mixture
 from skindb.render import refine
 from skindb.render.direct import render_view
 from skindb.render.refine import subdivide_surface
@@ -55,7 +56,15 @@ def skin(cells: int) -> Surface:
     weights = np.zeros((n + 4, 1))
     sigma = np.full((n + 4, 3), 0.7)
     return Surface(
-        all_vertices, all_faces, normals, colour, weights, tables, s, sigma, 1.3
+        all_vertices,
+        all_faces,
+        normals,
+        colour,
+        weights,
+        Mixture(tables),
+        s,
+        sigma,
+        1.3,
     )
 
 

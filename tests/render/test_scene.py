@@ -45,7 +45,7 @@ def test_from_model__carries_every_value() -> None:
     surface = from_model(tree)
     np.testing.assert_allclose(surface.diffuse, tree["fitted/diffuse_reflectance"])
     np.testing.assert_array_equal(
-        surface.tables[..., 1], tree["basis/basis_brdf"].values[1, ..., :-1]
+        surface.model.table[..., 1], tree["basis/basis_brdf"].values[1, ..., :-1]
     )
     assert surface.eta == 1.35
     assert surface.known.all()
@@ -87,11 +87,11 @@ def test_from_model__missing_variables_are_listed_together() -> None:
 
 def test_from_model__disc_of_the_tables_is_known() -> None:
     tree = model([0] * 5)
-    assert not from_model(tree).disc_included
+    assert not from_model(tree).model.disc_included
     basis = tree["basis"].to_dataset()
     basis["disc_angular_radius"] = label("disc_angular_radius", 0.014)
     tree["basis"] = basis
-    assert from_model(tree).disc_included
+    assert from_model(tree).model.disc_included
 
 
 def test_cameras_and_lights_from_dome__round_trip() -> None:

@@ -14,8 +14,6 @@ from skindb.schema import dataset
 from skindb.store import Database
 from skindb.workflow import translucency_grid, translucency_pictures
 
-pytestmark = pytest.mark.slow
-
 
 @pytest.fixture
 def db(tmp_path):

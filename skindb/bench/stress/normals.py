@@ -19,7 +19,7 @@ from skindb.bench.stress.surfels import (
     surfels,
     unit,
 )
-from skindb.fit.albedo import _reflectances as diffuse_reflectances
+from skindb.fit.albedo import block_reflectance
 from skindb.fit.normals import _normals as normals
 from skindb.schema.status import LARGEST_R_D, SMALLEST_R_D
 
@@ -120,9 +120,15 @@ METHODS = ("separated", "quantile", "minimum")
 
 
 def _albedo(skin: Surfels, method: str, eta: float = ETA) -> tuple[Array, Array]:
-    geometry = skin.position, skin.light, skin.camera, skin.normal
-    found, error, _, _ = diffuse_reflectances(
-        skin.sample, *geometry, method=method, eta=eta, discard=2, even_reflection=0.0
+    arrays = {
+        "reflectance_sample": skin.sample,
+        "surfel_position": skin.position,
+        "light_position": skin.light,
+        "camera_position": skin.camera,
+        "shading_normal": skin.normal,
+    }
+    found, error, _, _ = block_reflectance(
+        arrays, method=method, eta=eta, even_reflection=0.0
     )
     return found, error
 

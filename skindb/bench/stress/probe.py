@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skindb.bench.case import close, combinations, each, expect
-from skindb.fit._probe_profile import MODELS, ProbeFit, fit_profile
+from skindb.fit.probe_profile import MODELS, ProbeFit, fit_profile
 from skindb.optics.dipole import sigma_tr
 from skindb.schema import ProbeStatus
 

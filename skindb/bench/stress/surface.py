@@ -18,14 +18,12 @@ from skindb.bench.stress.surfels import (
     first,
     rows,
     six,
-    six_tables,
     spoiled,
     surfels,
     weights,
 )
-from skindb.fit._surface_arrays import Tables
+from skindb.reflectance.mixture import Mixture
 from skindb.reflectance.reduction import reduce_dictionary
-from skindb.reflectance.tables import TableGrid
 from skindb.schema import FitStatus
 from skindb.schema.status import LARGEST_R_D, SMALLEST_R_D
 
@@ -49,7 +47,9 @@ def _recovers(mode: str) -> None:
     expect(found.residual.max() < SINGLE, found.residual)
     for s in range(3):
         M, _ = rows(skin, s)
-        close(M @ found.weight[s], M @ WEIGHT, atol=SINGLE * np.abs(M @ WEIGHT).max())
+        close(
+            M @ found.parameters[s], M @ WEIGHT, atol=SINGLE * np.abs(M @ WEIGHT).max()
+        )
 
 
 def _few(lights: int, cameras: int) -> None:
@@ -61,14 +61,14 @@ def _few(lights: int, cameras: int) -> None:
     refused = weights(skin)
     expect(
         (refused.status == FitStatus.TOO_FEW_SAMPLES).all()
-        and np.isnan(refused.weight).all(),
+        and np.isnan(refused.parameters).all(),
         refused.status,
     )
     found = weights(skin, min_samples=1)
     for s in range(3):
         M, target = rows(skin, s)
         theirs = nnls(np.repeat(M, 3, 0), target.ravel())[1]
-        ours = np.linalg.norm((M @ found.weight[s])[:, None] - target)
+        ours = np.linalg.norm((M @ found.parameters[s])[:, None] - target)
         expect(ours <= theirs + SINGLE * np.linalg.norm(target), (ours, theirs))
 
 
@@ -78,10 +78,10 @@ def _unseen_surfel(mode: str) -> None:
     whole = weights(skin, mode)
     expect(
         found.status.tolist() == [FitStatus.UNSEEN, 0, 0]
-        and np.isnan(found.weight[0]).all(),
+        and np.isnan(found.parameters[0]).all(),
         found.status,
     )
-    np.testing.assert_array_equal(found.weight[1:], whole.weight[1:])
+    np.testing.assert_array_equal(found.parameters[1:], whole.parameters[1:])
 
 
 def _infinite(bad: float) -> None:
@@ -89,10 +89,10 @@ def _infinite(bad: float) -> None:
     whole = weights(surfels())
     expect(
         found.status.tolist() == [FitStatus.NOT_FINITE, 0, 0]
-        and np.isnan(found.weight[0]).all(),
+        and np.isnan(found.parameters[0]).all(),
         found.status,
     )
-    np.testing.assert_array_equal(found.weight[1:], whole.weight[1:])
+    np.testing.assert_array_equal(found.parameters[1:], whole.parameters[1:])
 
 
 def _one_nan() -> None:
@@ -109,17 +109,17 @@ def _geometry_nan(field: str, status: FitStatus) -> None:
     found = weights(replace(skin, **{field: spoiled}))
     whole = weights(skin)
     expect(
-        found.status.tolist() == [status, 0, 0] and np.isnan(found.weight[0]).all(),
+        found.status.tolist() == [status, 0, 0] and np.isnan(found.parameters[0]).all(),
         found.status,
     )
-    np.testing.assert_array_equal(found.weight[1:], whole.weight[1:])
+    np.testing.assert_array_equal(found.parameters[1:], whole.parameters[1:])
 
 
 def _black_surfel(mode: str) -> None:
     found = weights(spoiled(surfels(), filled(0.0)), mode)
     expect(
-        found.status[0] == FitStatus.FITTED and (found.weight[0] == 0).all(),
-        (found.status[0], found.weight[0]),
+        found.status[0] == FitStatus.FITTED and (found.parameters[0] == 0).all(),
+        (found.status[0], found.parameters[0]),
     )
 
 
@@ -127,8 +127,8 @@ def _matte(eta: float) -> None:
     skin = surfels(eta=eta, weight=0 * WEIGHT)
     found = weights(skin, eta=eta)
     expect(
-        found.residual.max() < TOTAL and np.abs(found.weight).max() < SINGLE,
-        (found.residual, found.weight),
+        found.residual.max() < TOTAL and np.abs(found.parameters).max() < SINGLE,
+        (found.residual, found.parameters),
     )
 
 
@@ -138,7 +138,10 @@ def _albedo_bound(value: float) -> None:
     diffuse[0] = value
     found = weights(replace(skin, diffuse=diffuse))
     expect(found.status.tolist() == [FitStatus.DIFFUSE_CLAMPED, 0, 0], found.status)
-    expect(np.isfinite(found.weight).all() and (found.weight >= 0).all(), found.weight)
+    expect(
+        np.isfinite(found.parameters).all() and (found.parameters >= 0).all(),
+        found.parameters,
+    )
 
 
 def _grazing_lights() -> None:
@@ -152,7 +155,7 @@ def _grazing_lights() -> None:
         light=np.concatenate([skin.light, low]),
         sample=np.concatenate([skin.sample, wild], axis=1),
     )
-    close(weights(more).weight, weights(flat).weight, rtol=1e-9, atol=1e-12)
+    close(weights(more).parameters, weights(flat).parameters, rtol=1e-9, atol=1e-12)
 
 
 def _behind() -> None:
@@ -163,7 +166,7 @@ def _behind() -> None:
     more = replace(
         skin, light=behind, sample=np.concatenate([skin.sample, wild], axis=1)
     )
-    close(weights(more).weight, weights(skin).weight, rtol=1e-9, atol=1e-12)
+    close(weights(more).parameters, weights(skin).parameters, rtol=1e-9, atol=1e-12)
 
 
 def _precision(dtype: str) -> None:
@@ -176,31 +179,30 @@ def _precision(dtype: str) -> None:
     for s in range(3):
         M, _ = rows(skin, s)
         close(
-            M @ found.weight[s],
-            M @ want.weight[s],
+            M @ found.parameters[s],
+            M @ want.parameters[s],
             atol=1e-5 * np.abs(M @ WEIGHT).max(),
         )
 
 
 def _extra_tables(change: str) -> None:
-    own = six_tables()
     extra = {"zero": 0 * six()[..., :1], "duplicate": six()[..., :1]}
     extra["collinear"] = six()[..., :1] + six()[..., 1:2]
     both = np.concatenate([extra[change], six(), extra[change]], axis=-1)
-    found = weights(surfels(), tables=Tables(both, own.grid, np.eye(8)))
+    found = weights(surfels(), model=Mixture(both))
     expect(
         (found.status == FitStatus.FITTED).all() and found.kkt.max() < 1e-9,
         (found.status, found.kkt),
     )
     expect(found.residual.max() < SINGLE, found.residual)
     if change == "zero":
-        expect((found.weight[:, [0, 7]] == 0).all(), found.weight)
+        expect((found.parameters[:, [0, 7]] == 0).all(), found.parameters)
 
 
 def _rank_above() -> None:
     reduced, lift = reduce_dictionary(six(), 99)
-    found = weights(surfels(), tables=Tables(reduced, six_tables().grid, lift))
-    close(found.weight, weights(surfels()).weight, rtol=1e-12)
+    found = weights(surfels(), model=Mixture(reduced, lift))
+    close(found.parameters, weights(surfels()).parameters, rtol=1e-12)
 
 
 def _rank_of_one_material() -> None:
@@ -210,7 +212,7 @@ def _rank_of_one_material() -> None:
     one = six()[..., :1] * np.geomspace(0.5, 4, 6, dtype=np.float32)
     reduced, lift = reduce_dictionary(np.ascontiguousarray(one), 4)
     skin = surfels(weight=np.array([0.4, 0, 0, 0, 0, 0]))
-    found = weights(skin, tables=Tables(reduced, six_tables().grid, lift))
+    found = weights(skin, model=Mixture(reduced, lift))
     expect(
         (found.status == FitStatus.FITTED).all() and found.residual.max() < SINGLE,
         (found.status, found.residual),
@@ -225,39 +227,39 @@ def _no_surfels() -> None:
             f: getattr(skin, f)[:0] for f in ("sample", "position", "normal", "diffuse")
         },
     )
-    expect(weights(empty).weight.shape == (0, 6), weights(empty).weight.shape)
+    expect(weights(empty).parameters.shape == (0, 6), weights(empty).parameters.shape)
 
 
 # refit
 
 
-def _basis(*columns: Array) -> Tables:
+def _basis(*columns: Array) -> Mixture:
     table = np.stack([six() @ c.astype(np.float32) for c in columns], axis=-1)
-    return Tables(table, TableGrid(*table.shape[:3]), np.eye(len(columns)))
+    return Mixture(table)
 
 
 def _true_mixture(mode: str) -> None:
     found = weights(surfels(), mode, _basis(WEIGHT))
-    close(found.weight, 1.0, rtol=SINGLE)
+    close(found.parameters, 1.0, rtol=SINGLE)
     expect(found.residual.max() < SINGLE, found.residual)
 
 
 def _twins(mode: str) -> None:
     found = weights(surfels(), mode, _basis(WEIGHT, WEIGHT, 0 * WEIGHT))
-    close(found.weight[:, :2].sum(axis=1), 1.0, rtol=SINGLE)
+    close(found.parameters[:, :2].sum(axis=1), 1.0, rtol=SINGLE)
     expect(
-        (found.weight[:, 2] == 0).all() and (found.status == 0).all(),
-        (found.weight, found.status),
+        (found.parameters[:, 2] == 0).all() and (found.status == 0).all(),
+        (found.parameters, found.status),
     )
 
 
 def _scaled_basis(scale: float) -> None:
-    found = weights(surfels(), tables=_basis(WEIGHT * scale))
-    close(found.weight * scale, 1.0, rtol=SINGLE)
+    found = weights(surfels(), model=_basis(WEIGHT * scale))
+    close(found.parameters * scale, 1.0, rtol=SINGLE)
 
 
 def _refit_nothing() -> None:
-    found = weights(spoiled(surfels(), filled(np.nan)), tables=_basis(WEIGHT))
+    found = weights(spoiled(surfels(), filled(np.nan)), model=_basis(WEIGHT))
     expect(
         found.status.tolist() == [FitStatus.UNSEEN, 0, 0]
         and np.isnan(found.residual[0]),

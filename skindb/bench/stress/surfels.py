@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb.fit._surface_arrays import Tables, Weights, surface_weights
 from skindb.fit.surface import MIN_SAMPLES, NOISE_FLOOR_SURFACE
 from skindb.optics.angles import half_difference
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.reflectance.dictionary import embedded_dictionary
+from skindb.reflectance.mixture import Mixture
+from skindb.reflectance.model import Block, Comparison, SurfaceFit
 from skindb.reflectance.tables import lookup
 
 Array = NDArray[Any]
@@ -39,14 +40,14 @@ def unit(v: Array) -> Array:
 
 def six() -> Array:
     """Tables (nh, nd, np, 6) without the padding that the kernels need."""
-    return six_tables().reduced[..., : len(CHOSEN)]
+    return six_tables().table[..., : len(CHOSEN)]
 
 
 @lru_cache(maxsize=1)
-def six_tables() -> Tables:
+def six_tables() -> Mixture:
     """Six of the embedded materials, not reduced."""
     whole = embedded_dictionary()
-    return Tables(whole.table[..., CHOSEN], whole.grid, np.eye(len(CHOSEN)))
+    return Mixture(whole.table[..., CHOSEN])
 
 
 @dataclass(frozen=True)
@@ -61,9 +62,9 @@ class Surfels:
     diffuse: Array
 
     @property
-    def arrays(self) -> tuple[Array, ...]:
-        """Arguments of `surface_weights`."""
-        return (
+    def block(self) -> Block:
+        """The surfels for the fit of a surface model."""
+        return Block(
             self.sample,
             self.position,
             self.light,
@@ -98,17 +99,12 @@ def surfels(
 
 
 def weights(
-    skin: Surfels, mode: str = "linear", tables: Tables | None = None, **options: Any
-) -> Weights:
-    """Fit of the six materials, or of `tables`, to the surfels."""
-    ask = {
-        "eta": ETA,
-        "noise_floor": NOISE_FLOOR_SURFACE,
-        "min_samples": MIN_SAMPLES,
-    } | options
-    return surface_weights(
-        *skin.arrays, tables=tables or six_tables(), mode=mode, **ask
-    )
+    skin: Surfels, mode: str = "linear", model: Mixture | None = None, **options: Any
+) -> SurfaceFit:
+    """Fit of the six materials, or of `model`, to the surfels."""
+    comparison = Comparison(mode, ETA, NOISE_FLOOR_SURFACE, MIN_SAMPLES)
+    comparison = comparison._replace(**options)
+    return (model or six_tables()).fit(skin.block, comparison)
 
 
 def spoiled(skin: Surfels, change: Callable[[Array], None]) -> Surfels:

@@ -1,17 +1,20 @@
-"""Compiled access to the samples of one surfel: directions, Fresnel factors, selection
-of samples, rows, targets.
+"""Compiled work on the samples of one surfel: directions, Fresnel factors, selection,
+weights, rows, targets, and the judgement of predictions.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from skindb.jit import fast_kernel, kernel
+from skindb.jit import fast_kernel, kernel, median_of
+from skindb.reflectance._mixture_kernels import to_roots
 from skindb.reflectance._row_kernels import form_rows, row_memory
 from skindb.reflectance._shade_kernels import transmittance
 from skindb.schema import FitStatus
+from skindb.schema.status import LARGEST_R_D, SMALLEST_R_D
 
 FITTED, UNSEEN, FEW, NO_DIFFUSE, CLAMPED, NOT_CONVERGED, NOT_FINITE, _ = (
     int(status) for status in FitStatus
@@ -21,23 +24,33 @@ FITTED, UNSEEN, FEW, NO_DIFFUSE, CLAMPED, NOT_CONVERGED, NOT_FINITE, _ = (
 # relative error of a model in held-out samples without noise, 2 to 6 %
 # (docs/validation.md), with which the noise of a sample is compared
 MODEL_ERROR = 0.05
+# to light or camera; below it lights are partly hidden, and pixels cover a large area
+MIN_COSINE_SURFACE = 0.1
+# below it an error of the normal has a larger effect than a motion of the face
+MIN_COSINE_OUTLIER = 0.2
+NO_FLOOR = 1e-9  # sr^-1; floor of the cube roots for residuals
+LINEAR, PERCEPTUAL, PAPER = range(3)
+# scales of the residuals of the surfel: exceeded by normal noise once in two million,
+# and by 1.1 to 2.6 % of samples of six clean captures of another renderer (partly
+# hidden lights, lobes outside the basis); with 4 scales twice as many would be
+# outliers; halved samples are at 25
+OUTLIER_SCALES = 5.0
+BINS_PER_SCALE = 16  # of the histograms of scaled residuals
+# smallest scale relative to the cube root of the surfel's mean: samples within 1.5 % of
+# it are not outliers
+MIN_ROOT_SCALE = 1e-3
+# of the histograms of residuals; the last one has no upper limit
+BINS = int(OUTLIER_SCALES * BINS_PER_SCALE) + 1
 
 
-class Noise(NamedTuple):
-    """Noise model of the samples of n surfels, mean over the channels.
+class Options(NamedTuple):
+    """Options of the fit of a surfel."""
 
-    For captures without the noise of each sample the arrays are (0, ...); the variance
-    is then floor^2 + shot sample, or unknown if shot is 0.
-    """
-
-    per_radiance: Any  # (n, lights) reflectance of radiance 1
-    pixels: Any  # (n, cameras) effective number of pixels
-    # (cameras, exposures) radiance up to which an exposure is usable, from the longest
-    limit: Any
-    read: Any  # (cameras, exposures) variance of radiance 0
-    slope: Any  # (cameras, exposures) variance over radiance
+    eta: float
+    mode: int
     floor: float  # sr^-1
-    shot: float  # sr^-1
+    least: int  # minimum number of samples
+    solve: bool  # otherwise the given weights are only evaluated
 
 
 class Lumitexel(NamedTuple):
@@ -204,3 +217,141 @@ def split_diffuse(d: Any, count: int, b: Any) -> None:
         for r in range(count):
             b.scattered[c, r] = b.scattered[2, r] * reflectance
             b.target[c, r] = b.given[c, r] - b.scattered[c, r]
+
+
+@kernel
+def prepare(position: Any, n: Any, d: Any, block: Any, options: Any, b: Any) -> int:
+    """Return the status of a surfel before its fit, and write its chosen samples to `b`."""
+    status = sample_status(b.values)
+    if status != FITTED:
+        return status
+    if not np.isfinite(position).all():
+        return NOT_FINITE
+    write_directions(position, block.light, block.camera, b)
+    write_cosines(n, options.eta, MIN_COSINE_SURFACE, b)
+    if not np.isfinite(n).all():
+        return FEW  # no normal: it needs light that is not grazing
+    if not np.isfinite(d).all():
+        return NO_DIFFUSE
+    choose(b)
+    return FITTED
+
+
+@kernel
+def clamped(d: Any) -> bool:
+    low = min(d[0], d[1], d[2])
+    high = max(d[0], d[1], d[2])
+    return bool(low <= np.float32(SMALLEST_R_D) or high >= np.float32(LARGEST_R_D))
+
+
+@kernel
+def weigh(
+    surfel: int, count: int, noise: Any, options: Any, b: Any, weight: Any
+) -> None:
+    """Weights of the rows: 1 where the error of the model dominates, less where the
+    noise of the sensor does.
+
+    The noise is that of the diffuse part, as weights by the noisy samples would favour
+    some of them.
+    """
+    if options.mode == PAPER or not write_noise(surfel, count, noise, b):
+        for r in range(count):
+            weight[r] = 1.0
+        return
+    mean = 0.0
+    least = options.floor * options.floor
+    for r in range(count):
+        mean += (b.scattered[0, r] + b.scattered[1, r] + b.scattered[2, r]) / (
+            3.0 * count
+        )
+    mean = max(mean, options.floor)
+    own = MODEL_ERROR * mean
+    if options.mode == PERCEPTUAL:
+        own = MODEL_ERROR / 3.0 * mean * (mean * mean + least) ** (-1.0 / 3.0)
+    for r in range(count):
+        level = max(
+            (b.scattered[0, r] + b.scattered[1, r] + b.scattered[2, r]) / 3.0, 0.0
+        )
+        # of the mean of three channels
+        variance = (b.noise[0, r] + b.noise[1, r] * level) / 3.0
+        if options.mode == PERCEPTUAL:
+            slope = (level * level / 3.0 + least) * (level * level + least) ** (
+                -4.0 / 3.0
+            )
+            variance *= slope * slope
+        weight[r] = 1.0 / (1.0 + variance / (own * own))
+
+
+@fast_kernel
+def _root_residuals(
+    count: int, begin: int, floor: Any, y: Any, b: Any, work: Any
+) -> float:
+    """Write residuals in cube-root space, averaged over channels, to `work.trial`;
+    returns the mean sample.
+    """
+    third = np.float32(1.0 / 3.0)
+    mean = np.float32(0)
+    for r in range(count):
+        work.total[r] = (
+            b.given[0, begin + r] + b.given[1, begin + r] + b.given[2, begin + r]
+        ) * third
+        body = (
+            b.scattered[0, begin + r]
+            + b.scattered[1, begin + r]
+            + b.scattered[2, begin + r]
+        )
+        work.mixed[r] = body * third + y[begin + r]
+        mean += work.total[r]
+    square = work.square[:count]
+    inverse = work.inverse[:count]
+    to_roots(
+        work.total[:count], floor, square, inverse, work.square_bits, work.inverse_bits
+    )
+    for r in range(count):
+        work.trial[r] = work.total[r] * inverse[r]
+    to_roots(
+        work.mixed[:count], floor, square, inverse, work.square_bits, work.inverse_bits
+    )
+    for r in range(count):
+        work.trial[r] -= work.mixed[r] * inverse[r]
+    return np.float64(mean) / max(count, 1)
+
+
+@kernel
+def outliers(count: int, options: Any, y: Any, b: Any, work: Any, counts: Any) -> float:
+    """Fraction of outlying samples, NaN for too few samples; adds to the histograms
+    (lights, cameras, bins).
+    """
+    mean = _root_residuals(count, 0, np.float32(options.floor), y, b, work)
+    steep = 0
+    last = counts.shape[2] - 1
+    for r in range(count):
+        above = (
+            b.lit[b.index[r, 0]] >= MIN_COSINE_OUTLIER
+            and b.seen[b.index[r, 1]] >= MIN_COSINE_OUTLIER
+        )
+        work.square[r] = abs(work.trial[r]) if above else np.float32(np.inf)
+        steep += 1 if above else 0
+    if steep < options.least:
+        return math.nan
+    level = max(mean, options.floor)
+    finest = (
+        MIN_ROOT_SCALE * level / np.cbrt(level * level + options.floor * options.floor)
+    )
+    scale = max(1.4826 * median_of(work.square, work.square_bits, count, steep), finest)
+    beyond = 0
+    per_scale = BINS_PER_SCALE / scale
+    for r in range(count):
+        if work.square[r] < np.inf:
+            place = min(int(work.square[r] * per_scale), last)
+            counts[b.index[r, 0], b.index[r, 1], place] += 1
+            beyond += place == last
+    return beyond / steep
+
+
+@kernel
+def mark(held: Any, kind: int, finite: Any, b: Any) -> None:
+    """Choose the finite samples of one kind."""
+    for i in range(held.shape[0]):
+        for o in range(held.shape[1]):
+            b.usable[i, o] = finite[i, o] and held[i, o] == kind

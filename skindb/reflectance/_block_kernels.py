@@ -1,8 +1,8 @@
-"""Compiled fits of BRDFs to the samples minus the diffuse term; `skindb.fit.surface`
-describes the methods.
+"""Compiled fits of mixtures of tables to the samples minus the diffuse term, for
+`skindb.reflectance.mixture`.
 
-They combine the rows of `optics` and the solver of `numerics`, so that the rows of a
-surfel, 60 kB at rank 16, stay in the cache until they are solved.
+Rows are formed and solved surfel by surfel, so that those of one surfel, 60 kB at rank
+16, stay in the cache until they are solved.
 """
 
 from __future__ import annotations
@@ -12,24 +12,26 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from skindb.fit._lumitexel_kernels import (
+from skindb.jit import kernel, unpack
+from skindb.reflectance._lumitexel_kernels import (
     CLAMPED,
     FEW,
     FITTED,
-    MODEL_ERROR,
-    NO_DIFFUSE,
+    MIN_COSINE_SURFACE,
+    NO_FLOOR,
     NOT_CONVERGED,
-    NOT_FINITE,
-    choose,
+    PAPER,
+    PERCEPTUAL,
+    clamped,
     lumitexel_memory,
-    sample_status,
+    mark,
+    outliers,
+    prepare,
     split_diffuse,
+    weigh,
     write_cosines,
-    write_directions,
-    write_noise,
     write_rows,
 )
-from skindb.jit import fast_kernel, kernel, median_of, unpack
 from skindb.reflectance._mixture_kernels import (
     coefficients,
     fit_memory,
@@ -37,51 +39,13 @@ from skindb.reflectance._mixture_kernels import (
     fit_weighted,
     predict,
     relative_errors,
-    to_roots,
     weight_covariance,
 )
 from skindb.reflectance._row_kernels import turn_rows
-from skindb.schema.status import LARGEST_R_D, SMALLEST_R_D
+from skindb.schema.status import SMALLEST_R_D
 
-# to light or camera; below it lights are partly hidden, and pixels cover a large area
-MIN_COSINE_SURFACE = 0.1
-# below it an error of the normal has a larger effect than a motion of the face
-MIN_COSINE_OUTLIER = 0.2
 KKT_TOLERANCE = 1e-10
-NO_FLOOR = 1e-9  # sr^-1; floor of the cube roots for residuals
-LINEAR, PERCEPTUAL, PAPER = range(3)
-# scales of the residuals of the surfel: exceeded by normal noise once in two million,
-# and by 1.1 to 2.6 % of samples of six clean captures of another renderer (partly
-# hidden lights, lobes outside the basis); with 4 scales twice as many would be
-# outliers; halved samples are at 25
-OUTLIER_SCALES = 5.0
-BINS_PER_SCALE = 16  # of the histograms of scaled residuals
-# smallest scale relative to the cube root of the surfel's mean: samples within 1.5 % of
-# it are not outliers
-MIN_ROOT_SCALE = 1e-3
 SQRT_3 = math.sqrt(3.0)
-
-
-class Options(NamedTuple):
-    """Options of the fit of a surfel."""
-
-    eta: float
-    mode: int
-    floor: float  # sr^-1
-    least: int  # minimum number of samples
-    solve: bool  # otherwise the given weights are only evaluated
-
-
-class Block(NamedTuple):
-    """Inputs of a block of surfels."""
-
-    sample: Any  # (n, lights, cameras, 3)
-    position: Any  # (n, 3) mm
-    light: Any  # (lights, 3)
-    camera: Any  # (cameras, 3)
-    normal: Any  # (n, 3)
-    diffuse: Any  # (n, 3)
-    noise: Any  # a `Noise`
 
 
 class Fitted(NamedTuple):
@@ -114,24 +78,6 @@ class Errors(NamedTuple):
 
 
 @kernel
-def prepare(position: Any, n: Any, d: Any, block: Any, options: Any, b: Any) -> int:
-    """Return the status of a surfel before its fit, and write its chosen samples to `b`."""
-    status = sample_status(b.values)
-    if status != FITTED:
-        return status
-    if not np.isfinite(position).all():
-        return NOT_FINITE
-    write_directions(position, block.light, block.camera, b)
-    write_cosines(n, options.eta, MIN_COSINE_SURFACE, b)
-    if not np.isfinite(n).all():
-        return FEW  # no normal: it needs light that is not grazing
-    if not np.isfinite(d).all():
-        return NO_DIFFUSE
-    choose(b)
-    return FITTED
-
-
-@kernel
 def _cube_roots(count: int, b: Any) -> None:
     """Convert rows and targets for mode "paper": the table holds cube roots, so that
     only the cosine is converted.
@@ -142,51 +88,6 @@ def _cube_roots(count: int, b: Any) -> None:
             b.rows[r, q] *= scale
         for c in range(3):
             b.target[c, r] = np.cbrt(b.target[c, r])
-
-
-@kernel
-def _clamped(d: Any) -> bool:
-    low = min(d[0], d[1], d[2])
-    high = max(d[0], d[1], d[2])
-    return bool(low <= np.float32(SMALLEST_R_D) or high >= np.float32(LARGEST_R_D))
-
-
-@kernel
-def weigh(
-    surfel: int, count: int, noise: Any, options: Any, b: Any, weight: Any
-) -> None:
-    """Weights of the rows: 1 where the error of the model dominates, less where the
-    noise of the sensor does.
-
-    The noise is that of the diffuse part, as weights by the noisy samples would favour
-    some of them.
-    """
-    if options.mode == PAPER or not write_noise(surfel, count, noise, b):
-        for r in range(count):
-            weight[r] = 1.0
-        return
-    mean = 0.0
-    least = options.floor * options.floor
-    for r in range(count):
-        mean += (b.scattered[0, r] + b.scattered[1, r] + b.scattered[2, r]) / (
-            3.0 * count
-        )
-    mean = max(mean, options.floor)
-    own = MODEL_ERROR * mean
-    if options.mode == PERCEPTUAL:
-        own = MODEL_ERROR / 3.0 * mean * (mean * mean + least) ** (-1.0 / 3.0)
-    for r in range(count):
-        level = max(
-            (b.scattered[0, r] + b.scattered[1, r] + b.scattered[2, r]) / 3.0, 0.0
-        )
-        # of the mean of three channels
-        variance = (b.noise[0, r] + b.noise[1, r] * level) / 3.0
-        if options.mode == PERCEPTUAL:
-            slope = (level * level / 3.0 + least) * (level * level + least) ** (
-                -4.0 / 3.0
-            )
-            variance *= slope * slope
-        weight[r] = 1.0 / (1.0 + variance / (own * own))
 
 
 @kernel
@@ -228,7 +129,7 @@ def fit_block(block: Any, table: Any, lift: Any, options: Any, out: Any) -> None
                 work,
             )
             out.status[s] = (
-                NOT_CONVERGED if not met else CLAMPED if _clamped(d) else FITTED
+                NOT_CONVERGED if not met else CLAMPED if clamped(d) else FITTED
             )
         predict(b.rows, count, coefficients(lift, x), y, work.single)
         for c in range(3):
@@ -313,83 +214,6 @@ def _add_turned(
     write_cosines(n, options.eta, MIN_COSINE_SURFACE, b)
 
 
-@fast_kernel
-def _root_residuals(
-    count: int, begin: int, floor: Any, y: Any, b: Any, work: Any
-) -> float:
-    """Write residuals in cube-root space, averaged over channels, to `work.trial`;
-    returns the mean sample.
-    """
-    third = np.float32(1.0 / 3.0)
-    mean = np.float32(0)
-    for r in range(count):
-        work.total[r] = (
-            b.given[0, begin + r] + b.given[1, begin + r] + b.given[2, begin + r]
-        ) * third
-        body = (
-            b.scattered[0, begin + r]
-            + b.scattered[1, begin + r]
-            + b.scattered[2, begin + r]
-        )
-        work.mixed[r] = body * third + y[begin + r]
-        mean += work.total[r]
-    square = work.square[:count]
-    inverse = work.inverse[:count]
-    to_roots(
-        work.total[:count], floor, square, inverse, work.square_bits, work.inverse_bits
-    )
-    for r in range(count):
-        work.trial[r] = work.total[r] * inverse[r]
-    to_roots(
-        work.mixed[:count], floor, square, inverse, work.square_bits, work.inverse_bits
-    )
-    for r in range(count):
-        work.trial[r] -= work.mixed[r] * inverse[r]
-    return np.float64(mean) / max(count, 1)
-
-
-@kernel
-def _outliers(
-    count: int, options: Any, y: Any, b: Any, work: Any, counts: Any
-) -> float:
-    """Fraction of outlying samples, NaN for too few samples; adds to the histograms
-    (lights, cameras, bins).
-    """
-    mean = _root_residuals(count, 0, np.float32(options.floor), y, b, work)
-    steep = 0
-    last = counts.shape[2] - 1
-    for r in range(count):
-        above = (
-            b.lit[b.index[r, 0]] >= MIN_COSINE_OUTLIER
-            and b.seen[b.index[r, 1]] >= MIN_COSINE_OUTLIER
-        )
-        work.square[r] = abs(work.trial[r]) if above else np.float32(np.inf)
-        steep += 1 if above else 0
-    if steep < options.least:
-        return math.nan
-    level = max(mean, options.floor)
-    finest = (
-        MIN_ROOT_SCALE * level / np.cbrt(level * level + options.floor * options.floor)
-    )
-    scale = max(1.4826 * median_of(work.square, work.square_bits, count, steep), finest)
-    beyond = 0
-    per_scale = BINS_PER_SCALE / scale
-    for r in range(count):
-        if work.square[r] < np.inf:
-            place = min(int(work.square[r] * per_scale), last)
-            counts[b.index[r, 0], b.index[r, 1], place] += 1
-            beyond += place == last
-    return beyond / steep
-
-
-@kernel
-def _mark(held: Any, kind: int, finite: Any, b: Any) -> None:
-    """Choose the finite samples of one kind."""
-    for i in range(held.shape[0]):
-        for o in range(held.shape[1]):
-            b.usable[i, o] = finite[i, o] and held[i, o] == kind
-
-
 @kernel
 def _held_out(
     kind: int,
@@ -405,7 +229,7 @@ def _held_out(
     out: Any,
 ) -> None:
     """Relative errors (2,) of the predictions of held-out samples of one kind."""
-    _mark(held, kind, finite, b)
+    mark(held, kind, finite, b)
     count = write_rows(n, table, b)
     split_diffuse(d, count, b)
     predict(b.rows, count, x, y, work.single)
@@ -418,8 +242,8 @@ def _held_out(
 
 
 @kernel
-def refit_block(
-    block: Any, table: Any, lift: Any, options: Any, out: Any, more: Any
+def judge_block(
+    block: Any, table: Any, lift: Any, options: Any, out: Any, errors: Any
 ) -> None:
     """Fit, or only evaluate, every surfel of a block by a reduced basis; its errors,
     held-out samples and outliers.
@@ -440,7 +264,7 @@ def refit_block(
     present = np.zeros(4, np.bool_)
     for i in range(lights):
         for o in range(cameras):
-            present[more.held[i, o]] = True
+            present[errors.held[i, o]] = True
     for s in range(block.position.shape[0]):
         n = block.normal[s]
         d = block.diffuse[s]
@@ -455,7 +279,7 @@ def refit_block(
             for i in range(lights):
                 for o in range(cameras):
                     finite[i, o] = b.usable[i, o]
-            _mark(more.held, np.int64(0), finite, b)
+            mark(errors.held, np.int64(0), finite, b)
         count = write_rows(n, table, b)
         if count < options.least:
             if options.solve:
@@ -477,15 +301,15 @@ def refit_block(
                 work,
             )
         predict(b.rows, count, x, y, work.single)
-        if more.counts.shape[2] > 0:
-            more.outlier[s] = _outliers(count, options, y, b, work, more.counts)
-        if more.covariance.shape[1] > 0:
+        if errors.counts.shape[2] > 0:
+            errors.outlier[s] = outliers(count, options, y, b, work, errors.counts)
+        if errors.covariance.shape[1] > 0:
             # colour differences do not affect the sum over channels: their common error
             # is at most the smallest one
             shared = min(
-                more.diffuse_error[s, 0],
-                more.diffuse_error[s, 1],
-                more.diffuse_error[s, 2],
+                errors.diffuse_error[s, 0],
+                errors.diffuse_error[s, 1],
+                errors.diffuse_error[s, 2],
             )
             for c in range(3):
                 drift[c] = shared / max(d[c], SMALLEST_R_D)
@@ -499,7 +323,7 @@ def refit_block(
                 b.scattered[:, :count],
                 drift,
                 x,
-                more.covariance[s],
+                errors.covariance[s],
                 work,
             )
         for c in range(3):
@@ -508,17 +332,17 @@ def refit_block(
         out.residual[s], out.residual_perceptual[s] = relative_errors(
             b.scattered[:, :count], b.given[:, :count], NO_FLOOR, work
         )
-        if more.covariance.shape[1] > 0 and more.turn[s] > 0.0:
+        if errors.covariance.shape[1] > 0 and errors.turn[s] > 0.0:
             _add_turned(
                 n,
                 d,
-                more.turn[s],
+                errors.turn[s],
                 count,
                 table,
                 lift,
                 options,
                 x,
-                more.covariance[s],
+                errors.covariance[s],
                 weight,
                 b,
                 work,
@@ -532,11 +356,11 @@ def refit_block(
                     x,
                     table,
                     finite,
-                    more.held,
+                    errors.held,
                     y,
                     b,
                     work,
-                    more.held_error[s, kind - 1],
+                    errors.held_error[s, kind - 1],
                 )
 
 

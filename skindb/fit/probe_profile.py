@@ -12,10 +12,10 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.special import chdtrc
 
-from skindb.fit._arrays import Array
 from skindb.optics.dipole import dipole_profile
 from skindb.optics.transport import RATIO_MAX, transport_profile
 from skindb.schema import ProbeStatus
+from skindb.types import Array
 
 MIN_FIBRE_SIGNAL = 3.0  # standard errors above zero for a fibre to be used
 MIN_FIBRES = 3

@@ -1,0 +1,227 @@
+"""What a surface model is: the Protocol that fits, renderers and exports know, and the
+records that it exchanges with them.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from skindb.reflectance.tables import Table
+from skindb.schema.omission import Omission
+from skindb.types import Array
+
+
+class Noise(NamedTuple):
+    """Noise model of the samples of n surfels, mean over the channels.
+
+    For captures without the noise of each sample the arrays are (0, ...); the variance
+    is then floor^2 + shot sample, or unknown if shot is 0.
+    """
+
+    per_radiance: Any  # (n, lights) reflectance of radiance 1
+    pixels: Any  # (n, cameras) effective number of pixels
+    # (cameras, exposures) radiance up to which an exposure is usable, from the longest
+    limit: Any
+    read: Any  # (cameras, exposures) variance of radiance 0
+    slope: Any  # (cameras, exposures) variance over radiance
+    floor: float  # sr^-1
+    shot: float  # sr^-1
+
+
+def typical_noise(floor: float = 0.0, shot: float = 0.0) -> Noise:
+    """Noise of all samples, variance = floor^2 + shot sample [sr^-2]; unknown if shot is 0."""
+    empty = np.zeros((0, 0), np.float32)
+    return Noise(empty, empty, empty, empty, empty, floor, shot)
+
+
+class Block(NamedTuple):
+    """Samples of n surfels, with all that a fit of their surface needs."""
+
+    sample: Any  # (n, lights, cameras, 3) sr^-1
+    position: Any  # (n, 3) mm
+    light: Any  # (lights, 3) mm
+    camera: Any  # (cameras, 3) mm
+    normal: Any  # (n, 3) unit shading normals
+    diffuse: Any  # (n, 3) R_d
+    noise: Noise = typical_noise()
+
+
+class Comparison(NamedTuple):
+    """How samples are compared with a prediction, and which are used."""
+
+    mode: str = "perceptual"  # or "linear", or "paper"
+    eta: float = 1.3  # refractive index of the diffuse term
+    noise_floor: float = 1.0  # sr^-1; samples below it are compared linearly
+    min_samples: int = 1  # per surfel
+
+
+class SurfaceFit(NamedTuple):
+    """Results of a fit of n surfels; NaN where the status says that nothing was fitted."""
+
+    parameters: Array  # (n, p)
+    kkt: Array  # (n,), as are the following arrays
+    residual: Array  # RMS error over RMS of the samples, diffuse light included
+    residual_perceptual: Array  # the same in cube-root space
+    condition: Array
+    samples: NDArray[Any]
+    iterations: NDArray[Any]
+    status: NDArray[Any]
+
+
+class Judgement(NamedTuple):
+    """What `ReflectanceModel.judge` finds in addition to fitting."""
+
+    # (n, 3) standard errors of R_d, and (n,) RMS angles to the true normals [degree];
+    # None to skip the errors of the parameters
+    diffuse_error: Array | None = None
+    normal_error: Array | None = None
+    # (lights, cameras) 0 for samples that are fitted, 1 under held-out lights, 2 in
+    # held-out cameras, 3 for both
+    held: NDArray[np.int64] | None = None
+    outliers: bool = False
+
+
+class JudgedFit(NamedTuple):
+    """Results of `ReflectanceModel.judge` for n surfels."""
+
+    parameters: Array  # (n, p)
+    residual: Array  # (n,)
+    residual_perceptual: Array  # (n,)
+    # (n, p, p) of the parameters that are not at a bound, NaN for the others; (n, 0, 0)
+    # without errors
+    covariance: Array
+    # (n, 2, 2) relative errors at held-out lights and in held-out cameras, linear and
+    # in cube roots
+    held_error: Array
+    outlier: Array  # (n,) fraction of outlying samples
+    # (lights, cameras, bins) histograms of scaled residuals, the sum over the surfels
+    counts: NDArray[np.int64]
+
+
+class Points(NamedTuple):
+    """Points of a surface that a camera sees."""
+
+    position: Array  # (n, 3) mm
+    normal: Array  # (n, 3) unit
+    view: Array  # (n, 3) unit directions towards the camera
+    diffuse: Array  # (n, 3) R_d; zeros omit the diffuse term
+    parameters: Array  # (n, p); (n, 0) omits the surface term
+
+
+class Lamp(NamedTuple):
+    """A disc light as seen from n points."""
+
+    # (n, q, 3) points [mm] that represent equal parts of the light's disc
+    place: Array
+    # (n, q) visible fraction, 0 to 1, of the part of the disc that each represents
+    lit: NDArray[np.float32]
+    axis: Array  # (3,) unit direction in which the light shines
+    falloff: float  # exponent n of its fall-off cos^n
+
+
+class DirectionSampler(Protocol):
+    """Random directions towards the light, with their probability density."""
+
+    def mix(self, parameters: Array) -> Array:
+        """What `sample` and `pdf` need to know of points with these parameters (n, p)."""
+
+    def sample(self, mix: Array, normal: Array, view: Array, draw: Array) -> Array:
+        """Directions (n, 3) from uniform numbers `draw` (n, 4); those below the surface
+        carry no light.
+        """
+
+    def pdf(self, mix: Array, normal: Array, view: Array, towards: Array) -> Array:
+        """Density (n,) per steradian of the directions `towards` (n, 3)."""
+
+
+class ReflectanceModel(Protocol):
+    """The reflection at the surface of a take: what all surfels share.
+
+    Each surfel has p parameters of its own. The diffuse term (eq. 4) is the same for all
+    models: light reaches the camera by F_t(i) F_t(o) R_d / pi plus the surface term.
+    """
+
+    @property
+    def disc_included(self) -> bool:
+        """Whether the surface term is that of the round lights of the dome."""
+
+    @property
+    def parameter_variables(self) -> tuple[str, ...]:
+        """Variables of the group "fitted" that hold the parameters."""
+
+    @property
+    def fit_variables(self) -> tuple[str, ...]:
+        """Variables of the group "fitted" that `fit_columns` returns."""
+
+    @property
+    def labels(self) -> dict[str, tuple[str, ...]]:
+        """Labels of the dims that only variables of this model have."""
+
+    @property
+    def provenance(self) -> dict[str, Any]:
+        """Attributes of a model that state where this one comes from."""
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Parameters of the fit as they were used: rank, or number of components."""
+
+    @property
+    def omissions(self) -> tuple[Omission, ...]:
+        """Parts of the model that are not computed, with a bound on the error."""
+
+    def parameters_of(self, fitted: xr.Dataset) -> Array:
+        """Parameters (n, p) in `parameter_variables`."""
+
+    def fit(self, block: Block, comparison: Comparison) -> SurfaceFit:
+        """Fit the surface term to the samples minus their diffuse part."""
+
+    def fit_columns(self, fit: SurfaceFit) -> dict[str, Array]:
+        """Variables of the surfels from `fit`."""
+
+    def reduced(
+        self, fitted: xr.Dataset, *, k: int, rng: np.random.Generator
+    ) -> xr.Dataset:
+        """The group "basis" for a take: the model that all of its surfels share, with at
+        most k components, from the results of `fit` and `surfel_area`.
+        """
+
+    def judge(
+        self,
+        block: Block,
+        comparison: Comparison,
+        judgement: Judgement,
+        parameters: Array | None = None,
+    ) -> JudgedFit:
+        """Fit, or only evaluate given parameters (n, p), and judge the prediction."""
+
+    def judged_columns(self, judged: JudgedFit) -> dict[str, Array]:
+        """Variables of the surfels from `judge`: parameters, their errors, and the
+        reflectance of the surface.
+        """
+
+    def shade(self, points: Points, lamp: Lamp, *, eta: float) -> NDArray[np.float32]:
+        """Radiance (n, 3) per radiant intensity [sr^-1 mm^-2] of the diffuse and the
+        surface term (eq. 1, 3, 8).
+        """
+
+    def normal_reflectance(self, parameters: Array) -> Array:
+        """Fraction (n,) of light along the normal that the surface reflects."""
+
+    def simplified(
+        self, parameters: Array
+    ) -> tuple[ReflectanceModel, Array, tuple[Omission, ...]]:
+        """The model and the parameters (n, p) without what reflects nothing at any of the
+        surfels.
+        """
+
+    def resample(self, parameters: Array) -> tuple[Table, Array]:
+        """Tables (nh, nd, np, k) and weights (n, k) whose mixtures are the surface term,
+        for programs that read tables.
+        """
+
+    def sampler(self) -> DirectionSampler:
+        """Sampler of directions in proportion to the surface term."""
