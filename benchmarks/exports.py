@@ -34,13 +34,13 @@ from scipy.optimize import minimize_scalar
 
 import skindb
 from skindb.export import export_bundle
-from skindb.export.mean_free_path import mean_free_path
+from skindb.export.translucency import mean_free_path
 from skindb.geometry.rays import RayScene
 from skindb.optics.diffuse import dipole_s, scattering_coefficients
 from skindb.optics.dipole import dipole_profile
 from skindb.render.direct import View, shade_view, trace_view
 from skindb.render.image import read_png, tone_map, write_png
-from skindb.render.picture import chosen_camera
+from skindb.render.rendering import chosen_camera
 from skindb.render.scene import Camera, Lights, Surface, from_model, lights_from_dome
 from skindb.render.texels import surfel_confidence
 

@@ -23,8 +23,8 @@ from skindb.reflectance.mixture import Mixture
 from skindb.render.direct import trace_view
 from skindb.render.environment import Environment
 from skindb.render.monte_carlo import Lighting, Quality, render_monte_carlo
-from skindb.render.picture import chosen_camera
 from skindb.render.plan import plan_scene
+from skindb.render.rendering import chosen_camera
 from skindb.render.scene import Camera, from_model, lights_from_dome
 
 # factor on one light, so that all others together are below the wanted error

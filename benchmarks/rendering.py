@@ -22,8 +22,8 @@ from skindb.geometry.rays import RayScene
 from skindb.render.environment import Environment
 from skindb.render.image import write_exr
 from skindb.render.monte_carlo import Lighting, Quality, render_monte_carlo
-from skindb.render.picture import chosen_camera
 from skindb.render.plan import plan_scene
+from skindb.render.rendering import chosen_camera
 from skindb.render.scene import Lights, from_model, lights_from_dome
 
 REFERENCE = 1024  # rays per pixel

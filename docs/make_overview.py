@@ -14,7 +14,7 @@ import numpy as np
 import skindb
 from skindb.demo.pictures import map_pictures
 from skindb.geometry.atlas import stretches
-from skindb.render.field import trace_front
+from skindb.render.figures import trace_front
 from skindb.render.image import write_png
 from skindb.render.photographs import compare_photographs, side_by_side
 

@@ -42,7 +42,7 @@ def test_kernel__is_compiled_again_when_a_kernel_of_another_file_changes(tmp_pat
 IMPORTED = (
     "fit",
     "ingest",
-    "render.picture",
+    "render.rendering",
     "export.gltf",
     "virtual.takes",
     "bench.run",

@@ -24,7 +24,7 @@ from skindb.geometry.scan import Crop
 from skindb.reflectance.dictionary import embedded_dictionary
 from skindb.reflectance.merl import write_merl
 from skindb.reflectance.table_file import write_tables
-from skindb.render.field import write_field
+from skindb.render.figures import write_field
 from skindb.render.image import write_exr, write_png
 from skindb.view.face import face_record
 from skindb.view.landmarks import landmark_task, save_landmarks

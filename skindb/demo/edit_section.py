@@ -8,7 +8,7 @@ from typing import Any
 from skindb.demo import page, tables
 from skindb.demo.pictures import Image, Portraits, portrait
 from skindb.demo.results import Results
-from skindb.render.compare import compare_images
+from skindb.render.photographs import compare_images
 
 # largest distance of an edit inside the data, in median distances between takes
 INSIDE = 1.0

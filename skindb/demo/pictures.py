@@ -14,7 +14,7 @@ from skindb.geometry.rays import RayScene
 from skindb.render.direct import View, shade_view, trace_view
 from skindb.render.image import auto_exposure, encode_srgb, tone_map
 from skindb.render.photographs import Comparison, side_by_side
-from skindb.render.picture import frontal_camera
+from skindb.render.rendering import frontal_camera
 from skindb.render.scene import (
     Lights,
     Surface,

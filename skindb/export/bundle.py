@@ -17,13 +17,19 @@ from numpy.typing import NDArray
 
 from skindb import __version__
 from skindb.errors import Fault, InputError
-from skindb.export.edited import describe_edit
 from skindb.export.gltf import export_gltf
+from skindb.export.inputs import describe_edit
 from skindb.export.maps import TextureMap, texture_maps
-from skindb.export.mitsuba_scene import MESH, PROGRAM, export_mitsuba
 from skindb.export.readme import readme
+from skindb.export.scenes import (
+    MATERIAL,
+    MESH,
+    PROGRAM,
+    STAGE,
+    export_mitsuba,
+    export_usd,
+)
 from skindb.export.textures import Skin, skin_of
-from skindb.export.usd import MATERIAL, STAGE, export_usd
 from skindb.files import make_private, private_file
 from skindb.reflectance.dictionary import Dictionary
 from skindb.reflectance.merl import write_merl

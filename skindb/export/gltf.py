@@ -14,7 +14,7 @@ import numpy as np
 import xarray as xr
 
 from skindb import __version__
-from skindb.export.edited import describe_edit
+from skindb.export.inputs import describe_edit
 from skindb.export.textures import Skin, skin_of
 from skindb.files import private_file
 from skindb.schema.consent import require_consent

@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from skindb.export.inputs import chosen_size, required
-from skindb.export.maps import atlas_images
+from skindb.export.maps import atlas_images, tangent_frames, to_tangent_space
 from skindb.export.pbr import Material, approximation_error, fit_material
-from skindb.export.tangents import tangent_frames, to_tangent_space
-from skindb.export.thin_parts import thickness, transmitted_fraction
+from skindb.export.translucency import thickness, transmitted_fraction
 from skindb.reflectance.tables import kernel_tables
 from skindb.render.image import encode_srgb
 from skindb.render.texels import surfel_confidence

@@ -1,10 +1,13 @@
 """Rendering of fitted models, comparison with photographs, and the BRDF of a surfel."""
 
-from skindb.render.compare import compare_images
 from skindb.render.environment import Environment
 from skindb.render.evaluate import evaluate
-from skindb.render.field import field_figure
-from skindb.render.photographs import compare_photographs, write_comparisons
+from skindb.render.figures import field_figure
+from skindb.render.photographs import (
+    compare_images,
+    compare_photographs,
+    write_comparisons,
+)
 from skindb.render.rendering import render, render_picture
 from skindb.render.scene import Camera, Lights
 from skindb.schema.omission import NOTHING

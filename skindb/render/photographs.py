@@ -1,5 +1,5 @@
-"""Comparison of each kept photograph with the model rendered from the same camera under
-the same light.
+"""Comparison of kept photographs with the model rendered from the same camera under the
+same light: measures of the error, and its likely causes.
 """
 
 from __future__ import annotations
@@ -7,27 +7,278 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
+from scipy.ndimage import binary_erosion
+from skimage.metrics import structural_similarity
 
 from skindb.errors import Fault, InputError
 from skindb.files import make_private
 from skindb.geometry.rays import RayScene
-from skindb.render.causes import Causes, find_causes
-from skindb.render.compare import compare_images
 from skindb.render.direct import View, shade_view, trace_view
-from skindb.render.image import tone_map, write_png
+from skindb.render.image import auto_exposure, encode_srgb, tone_map, write_png
 from skindb.render.scene import cameras_from_dome, from_model, lights_from_dome
 from skindb.render.subsurface import require_translucency
 from skindb.render.texels import surfel_confidence
 from skindb.schema import check
 from skindb.schema.consent import honour_consent
+from skindb.types import Mask
 
+# pixels, the default of Wang et al. 2004's uniform window in scikit-image
+SSIM_WINDOW = 7
+Float = NDArray[np.float64]
+Image = NDArray[np.floating[Any]]
+# of the median of lit pixels; darker pixels of the rendering are in shadow
+LIT_FRACTION = 0.05
+MIN_PIXELS = 50  # of a class, below which its measure is NaN
+SMOOTHING = 1.0  # px, standard deviation of the filter on rendering and residual
+MAX_SHIFT = 2.0  # px, above which the linear estimate is invalid
+# thresholds above which a cause is reported: chosen by judgement. On a virtual face
+# without imperfections only gloss was reported
+NOTABLE_SHIFT = 0.25  # px
+NOTABLE_GAIN = 0.03
+# fraction of the lit skin; ideal virtual captures reach 0.02 where light grazes the
+# face
+NOTABLE_SHADOW = 0.03
+NOTABLE_HIGHLIGHT = 0.1  # fraction of the highlights
+# fraction of the squared residual in surfels that are obstructed or doubtful
+NOTABLE_DOUBTFUL = 0.25
+# part of the rendering that the surface must reflect for a pixel to be in a highlight
+HIGHLIGHT_FRACTION = 0.3
 MIN_REGION_PIXELS = 30  # below which a region is not compared
 # fraction of a pixel's rays that must meet known surface, to exclude silhouettes
 MIN_COVERAGE = 0.999
+
+
+def compare_images(
+    rendered: ArrayLike,
+    photographed: ArrayLike,
+    *,
+    mask: Mask | None = None,
+    exposure: float | None = None,
+) -> dict[str, float]:
+    """Differences of two linear Rec. 709 images at one common exposure.
+
+    Parameters
+    ----------
+    rendered, photographed
+        (h, w, 3) radiance in the same unit; pixels with NaN in either are excluded.
+    mask
+        (h, w) pixels to compare; default all.
+    exposure
+        Factor from radiance to display values for PSNR, SSIM and colour. By default,
+        the 99.5 % quantile of the photograph is display white.
+
+    Returns
+    -------
+    dict
+        `rmse` (radiance), `relative_rmse` (over the RMS of the photograph), `psnr` [dB,
+        peak 1] and `ssim` of the sRGB images, `delta_e_mean`, `delta_e_median`,
+        `delta_e_95` (CIEDE2000, D65), `exposure`, `pixels`. SSIM is the mean over
+        windows that lie entirely inside the mask, or NaN if there are none. Values
+        above display white are clipped in both images, except for the two linear
+        errors.
+    """
+    ours, theirs, inside = _prepared(rendered, photographed, mask)
+    gain = auto_exposure(theirs, mask=inside) if exposure is None else exposure
+    error = np.sqrt(np.mean((ours - theirs)[inside] ** 2))
+    level = np.sqrt(np.mean(theirs[inside] ** 2))
+    shown = [encode_srgb(image * gain) for image in (ours, theirs)]
+    noise = np.mean((shown[0] - shown[1])[inside] ** 2)
+    delta = delta_e(ours[inside] * gain, theirs[inside] * gain)
+    return {
+        "rmse": float(error),
+        "relative_rmse": float(error / level) if level > 0 else float("nan"),
+        "psnr": float(-10 * np.log10(noise)) if noise > 0 else float("inf"),
+        "ssim": _ssim(shown[0], shown[1], inside),
+        "delta_e_mean": float(delta.mean()),
+        "delta_e_median": float(np.median(delta)),
+        "delta_e_95": float(np.quantile(delta, 0.95)),
+        "exposure": gain,
+        "pixels": float(inside.sum()),
+    }
+
+
+def delta_e(first: ArrayLike, second: ArrayLike) -> Float:
+    """CIEDE2000 differences of display-referred linear Rec. 709 colours (..., 3),
+    clipped to [0, 1] (CIE 142-2001).
+    """
+    import colour  # takes longer to import than most commands of the package to run
+
+    lab = []
+    for values in (first, second):
+        xyz = colour.RGB_to_XYZ(np.clip(np.asarray(values, np.float64), 0, 1), "sRGB")
+        lab.append(colour.XYZ_to_Lab(xyz))
+    return np.asarray(colour.delta_E(lab[0], lab[1], method="CIE 2000"), np.float64)
+
+
+def _prepared(
+    rendered: ArrayLike, photographed: ArrayLike, mask: Mask | None
+) -> tuple[Float, Float, Mask]:
+    ours = np.asarray(rendered, np.float64)
+    theirs = np.asarray(photographed, np.float64)
+    if ours.shape != theirs.shape or ours.ndim != 3 or ours.shape[2] != 3:
+        raise ValueError(
+            f"both images must have the shape (h, w, 3), found {ours.shape} and {theirs.shape}"
+        )
+    known = np.isfinite(ours).all(axis=-1) & np.isfinite(theirs).all(axis=-1)
+    inside = np.asarray(known if mask is None else known & mask, np.bool_)
+    if not inside.any():
+        raise ValueError(
+            "at least one pixel must be comparable: the mask is empty, or every pixel is NaN"
+        )
+    return (
+        np.where(inside[..., None], ours, 0),
+        np.where(inside[..., None], theirs, 0),
+        inside,
+    )
+
+
+def _ssim(first: Float, second: Float, inside: Mask) -> float:
+    if min(inside.shape) < SSIM_WINDOW:
+        return float("nan")
+    whole = binary_erosion(inside, np.ones((SSIM_WINDOW, SSIM_WINDOW), bool))
+    if not whole.any():
+        return float("nan")
+    _, local = structural_similarity(
+        first, second, win_size=SSIM_WINDOW, data_range=1.0, channel_axis=-1, full=True
+    )
+    return float(local[whole].mean())
+
+
+@dataclass(frozen=True)
+class Causes:
+    """Measures of a residual, each with its likely cause; NaN where there are too few pixels.
+
+    Attributes
+    ----------
+    shift
+        (2,) translation of the rendering [px, right and down] that explains most of the
+        residual. Cause: calibration of the camera, or motion.
+    gain
+        Photograph over rendering where skin is lit. Cause: intensity of the light.
+    shadow
+        Mean photograph in shadow over the mean of lit skin. Cause: light from other
+        parts of the face or the room.
+    highlight
+        Photograph over rendering in highlights, after this gain. Cause: gloss, or normals.
+    doubtful
+        Fraction of the squared residual in surfels whose fit is doubtful or obstructed.
+        Cause: hair, eyes.
+    """
+
+    shift: tuple[float, float]
+    gain: float
+    shadow: float
+    highlight: float
+    doubtful: float
+
+    @property
+    def notable(self) -> list[str]:
+        """Descriptions of the causes whose measures exceed their thresholds."""
+        words = []
+        if abs(self.gain - 1) > NOTABLE_GAIN:
+            words.append(f"intensity of the light ({100 * (self.gain - 1):+.0f} %)")
+        if np.hypot(*self.shift) > NOTABLE_SHIFT:
+            words.append(
+                f"calibration of the camera or motion ({np.hypot(*self.shift):.1f} px)"
+            )
+        if self.shadow > NOTABLE_SHADOW:
+            words.append(
+                "light between parts of the face or of the room "
+                f"({100 * self.shadow:.0f} % in shadow)"
+            )
+        if abs(self.highlight - 1) > NOTABLE_HIGHLIGHT:
+            words.append(
+                f"gloss or normals ({100 * (self.highlight - 1):+.0f} % in highlights)"
+            )
+        if self.doubtful > NOTABLE_DOUBTFUL:
+            words.append(
+                f"hair, eyes or doubtful fits ({100 * self.doubtful:.0f} % of the residual)"
+            )
+        return words
+
+
+def find_causes(
+    photographed: Image, rendered: Image, surface: Image, *, mask: Mask, doubtful: Image
+) -> Causes:
+    """Measures of the residual of one photograph.
+
+    Parameters
+    ----------
+    photographed, rendered, surface
+        (h, w, 3) radiance: photograph, rendering, and the part of the rendering that
+        the surface reflects.
+    mask
+        (h, w) pixels that are compared.
+    doubtful
+        (h, w) fraction, from 0 to 1, of the pixel that shows surfels whose fit is
+        doubtful or obstructed.
+    """
+    photo, ours, gloss = (
+        np.where(mask, image.mean(axis=-1), 0.0)
+        for image in (photographed, rendered, surface)
+    )
+    inside = ndimage.binary_erosion(mask, iterations=2)
+    lit = inside & (
+        ours
+        > LIT_FRACTION
+        * (np.median(ours[inside & (ours > 0)]) if (inside & (ours > 0)).any() else 0.0)
+    )
+    lit &= ours > 0
+    if lit.sum() < MIN_PIXELS:
+        return Causes((np.nan, np.nan), np.nan, np.nan, np.nan, np.nan)
+    shiny = gloss > HIGHLIGHT_FRACTION * ours
+    matte = lit & ~shiny
+    used = matte if matte.sum() >= MIN_PIXELS else lit
+    # the median is robust to hair and eyes
+    gain = float(np.median(photo[used] / ours[used]))
+    residual = photo - gain * ours
+    dark = inside & (ours <= LIT_FRACTION * np.median(ours[lit]))
+    shadow = (
+        float(photo[dark].mean() / photo[lit].mean())
+        if dark.sum() >= MIN_PIXELS
+        else np.nan
+    )
+    bright = lit & shiny
+    highlight = (
+        float(photo[bright].sum() / (gain * ours[bright].sum()))
+        if bright.sum() >= MIN_PIXELS
+        else np.nan
+    )
+    square = np.where(inside, residual**2, 0.0)
+    fraction = (
+        float((square * doubtful).sum() / square.sum()) if square.sum() > 0 else 0.0
+    )
+    return Causes(_shift(residual, gain * ours, lit), gain, shadow, highlight, fraction)
+
+
+def _shift(residual: Image, ours: Image, lit: Mask) -> tuple[float, float]:
+    """Translation (right, down) [px] of the rendering that fits the residual best
+    (Lucas and Kanade 1981).
+    """
+    smooth = ndimage.gaussian_filter(ours, SMOOTHING)
+    down, right = np.gradient(smooth)
+    rest = ndimage.gaussian_filter(residual, SMOOTHING)
+    weight = (
+        lit / np.maximum(smooth, 1e-3 * smooth.max()) ** 2
+    )  # relative errors, so that dark and bright skin weigh the same
+    design = np.stack([right[lit], down[lit]], axis=1)
+    normal = (design * weight[lit][:, None]).T @ design
+    if np.linalg.cond(normal) > 1e6:
+        return np.nan, np.nan
+    # a translation by (x, y) changes the picture by minus its gradient times (x, y)
+    x, y = np.linalg.solve(normal, -(design * weight[lit][:, None]).T @ rest[lit])
+    length = float(np.hypot(x, y))
+    return (
+        (float(x), float(y))
+        if length <= MAX_SHIFT
+        else (float(x) * MAX_SHIFT / length, float(y) * MAX_SHIFT / length)
+    )
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,7 @@ from skindb.optics.fresnel import boundary_factor
 from skindb.render.environment import Environment
 from skindb.render.image import tone_map
 from skindb.render.monte_carlo import Lighting
-from skindb.render.picture import chosen_camera, chosen_lights
-from skindb.render.rendering import fixed_exposure, render
+from skindb.render.rendering import chosen_camera, chosen_lights, fixed_exposure, render
 from skindb.render.scene import Surface, from_model
 from skindb.render.texels import surfel_confidence
 from skindb.schema.consent import honour_consent

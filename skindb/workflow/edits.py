@@ -16,8 +16,8 @@ from skindb.analysis.population_basis import population_basis
 from skindb.analysis.summary import SAMPLED
 from skindb.errors import Fault, InputError
 from skindb.reflectance.dictionary import embedded_dictionary
-from skindb.render.grid import write_grid
-from skindb.render.picture import frontal_camera, radiance_of
+from skindb.render.figures import write_grid
+from skindb.render.rendering import frontal_camera, radiance_of
 from skindb.schema.consent import require_consent
 from skindb.schema.plain import plain
 from skindb.store import STUDY, Database, require_fresh
@@ -137,7 +137,7 @@ def edit_grid(
     progress
         Called with the stage, the number of finished steps and the total number of steps.
     **options
-        Of `skindb.render.picture.radiance_of`: lights, camera, samples, subsurface, and
+        Of `skindb.render.rendering.radiance_of`: lights, camera, samples, subsurface, and
         scale, by default such that a picture's longer side has 320 pixels.
 
     Returns
@@ -199,7 +199,7 @@ def basis_grid(
     seed
         Random seed of the factorisations.
     **options
-        Of `skindb.render.picture.radiance_of`.
+        Of `skindb.render.rendering.radiance_of`.
 
     Returns
     -------

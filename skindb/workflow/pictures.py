@@ -12,7 +12,7 @@ from skindb.errors import Fault, InputError
 from skindb.export.bundle import export_bundle
 from skindb.export.gltf import export_gltf
 from skindb.files import make_private
-from skindb.render.field import write_field
+from skindb.render.figures import write_field
 from skindb.render.photographs import Comparison, compare_photographs
 from skindb.render.rendering import render_picture
 from skindb.schema.consent import require_consent

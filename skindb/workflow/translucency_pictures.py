@@ -12,9 +12,8 @@ import numpy as np
 import xarray as xr
 
 from skindb.errors import Fault, InputError
-from skindb.render.grid import write_grid
-from skindb.render.picture import chosen_camera
-from skindb.render.rendering import render
+from skindb.render.figures import write_grid
+from skindb.render.rendering import chosen_camera, render
 from skindb.render.scene import Camera, Lights
 from skindb.schema.consent import require_consent
 from skindb.store import Database

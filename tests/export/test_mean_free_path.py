@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from skindb.export.mean_free_path import mean_free_path
+from skindb.export.translucency import mean_free_path
 from skindb.optics.diffuse import dipole_s, scattering_coefficients
 from skindb.optics.dipole import dipole_profile
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from skindb.export.tangents import tangent_frames, to_tangent_space
+from skindb.export.maps import tangent_frames, to_tangent_space
 
 
 def patch(seed: int, *, mirrored: bool = False):

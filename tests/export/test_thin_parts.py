@@ -15,7 +15,7 @@ from scipy import integrate
 
 from skindb.export.gltf import export_gltf
 from skindb.export.textures import skin_of
-from skindb.export.thin_parts import thickness, transmitted_fraction
+from skindb.export.translucency import thickness, transmitted_fraction
 from skindb.geometry.mesh import vertex_areas
 from skindb.optics.diffuse import diffuse_reflectance, dipole_s
 from skindb.optics.dipole import dipole_power_beyond, dipole_profile

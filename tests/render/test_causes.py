@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from skindb.render.causes import find_causes
+from skindb.render.photographs import find_causes
 
 SIZE = 120
 

@@ -5,8 +5,8 @@ import pytest
 from skimage.color import deltaE_ciede2000, rgb2lab
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
-from skindb.render.compare import compare_images, delta_e
 from skindb.render.image import encode_srgb
+from skindb.render.photographs import compare_images, delta_e
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ import pytest
 import xarray as xr
 
 from skindb.errors import InputError
-from skindb.render.field import field_figure, trace_front
+from skindb.render.figures import field_figure, trace_front
 
 SIDE = 9
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from skindb.render.grid import write_grid
+from skindb.render.figures import write_grid
 from skindb.render.image import read_png
 
 

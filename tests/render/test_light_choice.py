@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from skindb.render.direct import trace_view
-from skindb.render.light_choice import LIGHTS_PER_RAY, LightChoice
-from skindb.render.monte_carlo import Lighting
+from skindb.render.monte_carlo import LIGHTS_PER_RAY, LightChoice, Lighting
 from skindb.render.scene import Lights
 from tests.render.test_monte_carlo import ball, camera, rendered
 

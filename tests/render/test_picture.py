@@ -15,8 +15,13 @@ from skindb.render.direct import render_view
 from skindb.render.image import decode_srgb, read_exr, read_png, write_exr
 from skindb.render.monte_carlo import Lighting
 from skindb.render.photographs import compare_photographs
-from skindb.render.picture import picture, trace_shot
-from skindb.render.rendering import fixed_exposure, render, render_picture
+from skindb.render.rendering import (
+    fixed_exposure,
+    picture,
+    render,
+    render_picture,
+    trace_shot,
+)
 from skindb.render.scene import cameras_from_dome, from_model, lights_from_dome
 from skindb.schema import dataset
 

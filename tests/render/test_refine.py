@@ -13,10 +13,9 @@ from skindb.errors import InputError
 from skindb.geometry.rays import RayScene
 from skindb.optics.diffuse import dipole_s
 from skindb.reflectance.mixture import Mixture
-from skindb.render import refine
+from skindb.render import scene as refine
 from skindb.render.direct import render_view
-from skindb.render.refine import subdivide_surface
-from skindb.render.scene import Camera, Lights, Surface
+from skindb.render.scene import Camera, Lights, Surface, subdivide_surface
 from skindb.render.subsurface import exitances
 
 HALF = 20.0

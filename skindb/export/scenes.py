@@ -1,10 +1,11 @@
-"""Export of a fitted model to a USD scene with an OpenPBR material, and of this
-material to MaterialX.
+"""Scenes of a fitted model: USD with an OpenPBR material, this material in MaterialX, and
+Mitsuba 3 with a program that evaluates the exact BRDFs.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from importlib import resources
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -14,13 +15,15 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from skindb import __version__
-from skindb.export.textures import Skin
+from skindb.export.textures import Skin, shading_normals
 from skindb.files import make_private, private_file
 
 STAGE = "face.usda"
 MATERIAL = "face.mtlx"
 MEAN_FREE_PATH = "../maps/mean_free_path.exr"
 RELATIVE = "subsurface_radius_scale"
+MESH = "face.ply"
+PROGRAM = "skin.py"
 
 
 def export_usd(
@@ -318,3 +321,49 @@ def _normals(fitted: xr.Dataset) -> NDArray[np.float64]:
     return np.asarray(
         normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
     )
+
+
+def export_mitsuba(model: xr.DataTree, folder: Path) -> None:
+    """Write `face.ply` and `skin.py` into a new folder beside the maps and bases of a bundle.
+
+    Parameters
+    ----------
+    model
+        Version of kind "model".
+    folder
+        New folder. `skin.py` reads `../manifest.json`, `../maps` and `../bases`.
+    """
+    make_private(folder)
+    program = resources.files("skindb.export") / "mitsuba" / f"{PROGRAM}.txt"
+    private_file(folder / PROGRAM).write_text(
+        program.read_text(encoding="utf-8"), encoding="utf-8"
+    )
+    fitted = model["fitted"].to_dataset()
+    triangles = model["mesh"].to_dataset()["triangle"].values
+    columns = [
+        fitted["surfel_position"].values,
+        shading_normals(fitted),
+        fitted["surfel_uv"].values,
+    ]
+    vertices = np.concatenate(columns, axis=1).astype("<f4")
+    names = ("x", "y", "z", "nx", "ny", "nz", "u", "v")
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        "comment skindb: mm; v = 0 is the top row of the maps",
+    ]
+    header += [
+        f"element vertex {len(vertices)}",
+        *(f"property float {name}" for name in names),
+    ]
+    header += [
+        f"element face {len(triangles)}",
+        "property list uchar int vertex_indices",
+        "end_header",
+    ]
+    faces = np.empty(
+        len(triangles), np.dtype([("count", "u1"), ("corner", "<i4", (3,))])
+    )
+    faces["count"], faces["corner"] = 3, triangles
+    head = "\n".join([*header, ""]).encode("ascii")
+    private_file(folder / MESH).write_bytes(head + vertices.tobytes() + faces.tobytes())
