@@ -36,8 +36,7 @@ import skindb
 from skindb.export import export_bundle
 from skindb.export.translucency import mean_free_path
 from skindb.geometry.rays import RayScene
-from skindb.optics.diffuse import dipole_s, scattering_coefficients
-from skindb.optics.dipole import dipole_profile
+from skindb.optics.diffusion import dipole_profile, dipole_s, scattering_coefficients
 from skindb.render.direct import View, shade_view, trace_view
 from skindb.render.image import read_png, tone_map, write_png
 from skindb.render.rendering import chosen_camera

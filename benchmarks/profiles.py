@@ -15,7 +15,7 @@ import numpy as np
 
 from skindb.bench.diffusion import across, ring_mean, rings
 from skindb.fit.probe_profile import MODELS
-from skindb.optics.random_walk import random_walk
+from skindb.optics.transport import random_walk
 
 ALBEDO = (0.1, 0.3, 0.5, 0.7, 0.8, 0.9, 0.95, 0.99, 0.999)  # reduced
 # transport mean free paths
@@ -44,7 +44,7 @@ def work_precision(
         walk = random_walk(
             int(packets * share),
             eta=eta,
-            longest=longest,
+            max_path=longest,
             rng=np.random.default_rng(seed),
         )
         for albedo in (a for a in ALBEDO if darker < a <= limit):

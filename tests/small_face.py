@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import xarray as xr
 
-from skindb.optics.diffuse import dipole_s
+from skindb.optics.diffusion import dipole_s
 from skindb.reflectance.tables import TableGrid, stored_brdf, tabulate
 from skindb.schema import dataset
 

@@ -16,7 +16,7 @@ from skindb.bench.curve import Curve, Point
 from skindb.bench.diffusion import transport_curves
 from skindb.bench.stress import CASES, failure_of
 from skindb.cli import cli
-from skindb.optics.dipole import dipole_profile
+from skindb.optics.diffusion import dipole_profile
 from skindb.optics.transport import transport_profile
 
 

@@ -15,7 +15,7 @@ from skindb.analysis.population_basis import project
 from skindb.analysis.texture_edit import at_surfels, edit_texture
 from skindb.errors import Fault, InputError
 from skindb.numerics.texture import valid_quantiles
-from skindb.optics.diffuse import dipole_s
+from skindb.optics.diffusion import dipole_s
 from skindb.reflectance.tables import TableGrid, brdf_coords, brdf_metric, stored_brdf
 from skindb.schema import GROUPS, Use, check, dataset, label, names_of
 from skindb.schema.consent import honour_consent

@@ -15,8 +15,12 @@ from skindb.calibration.radiance import merge_exposures
 from skindb.format.frames import FrameKind
 from skindb.format.sensor import SensorRecord
 from skindb.optics.angles import directions, half_difference
-from skindb.optics.diffuse import diffuse_reflectance, dipole_s, scattering_coefficients
-from skindb.optics.dipole import dipole_profile
+from skindb.optics.diffusion import (
+    diffuse_reflectance,
+    dipole_profile,
+    dipole_s,
+    scattering_coefficients,
+)
 from skindb.optics.dipole_tree import subsurface_exitance
 from skindb.reflectance.dictionary import (
     FAR_RULE,

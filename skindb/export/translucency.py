@@ -10,8 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skindb.geometry.rays import RAY_OFFSET_MM, RayScene
-from skindb.optics.diffuse import dipole_s, scattering_coefficients
-from skindb.optics.dipole import dipole_power_beyond
+from skindb.optics.diffusion import (
+    dipole_power_beyond,
+    dipole_s,
+    scattering_coefficients,
+)
 
 Float = NDArray[np.floating[Any]]
 # mean free path of the walk over that of the dipole, s / sigma_tr, is this constant

@@ -10,7 +10,12 @@ from typing import Any
 import numpy as np
 
 from skindb.jit import kernel
-from skindb.optics._photometric_kernels import buffers, estimate_one
+from skindb.optics._photometric_kernels import (
+    NormalEstimates,
+    buffers,
+    estimate_normals,
+    normal_estimates,
+)
 
 COMBINED, CHROMATIC, PHOTOMETRIC, PEAK = range(4)
 # Terms of the total error that cover 91 to 96 % of the normals of six independent
@@ -45,9 +50,7 @@ def _mean(first: float, normal: Any, out: Any) -> None:
 
 
 @kernel
-def _variance(
-    first: float, covariance: Any, cross: Any, pull: Any, scan_error: float
-) -> float:
+def _variance(first: float, estimates: NormalEstimates, scan_error: float) -> float:
     """Squared RMS angle [rad^2] of a mean: noise, which is partly common to both, and
     error of the scan per axis.
     """
@@ -55,15 +58,15 @@ def _variance(
     noise = 0.0
     scan = 0.0
     for k in range(3):
-        a = covariance[0, k, k]
-        b = covariance[1, k, k]
-        c = cross[k, k]
+        a = estimates.covariance[0, k, k]
+        b = estimates.covariance[1, k, k]
+        c = estimates.cross[k, k]
         noise += first * first * a if a == a else 0.0
         noise += second * second * b if b == b else 0.0
         noise += 2.0 * first * second * c if c == c else 0.0
         for j in range(3):
-            p = pull[0, j, k]
-            q = pull[1, j, k]
+            p = estimates.pull[0, j, k]
+            q = estimates.pull[1, j, k]
             turned = (first * p if p == p else 0.0) + (second * q if q == q else 0.0)
             scan += turned * turned
     return noise + scan * scan_error * scan_error / 2.0
@@ -91,18 +94,16 @@ def normals_block(
     """
     b = buffers(light.shape[0], camera.shape[0])
     first = np.empty(3)
-    peak = np.empty(3)
-    normal = np.empty((2, 3))
-    spread = np.empty(2)
-    covariance = np.empty((2, 3, 3))
-    pull = np.empty((2, 3, 3))
-    cross = np.empty((3, 3))
+    estimates = normal_estimates()
+    peak = estimates.peak
+    normal = estimates.normal
+    spread = estimates.spread
     combined = np.empty(3)
     for s in range(position.shape[0]):
         size = math.sqrt(scan[s, 0] ** 2 + scan[s, 1] ** 2 + scan[s, 2] ** 2)
         for k in range(3):
             first[k] = scan[s, k] / size if size > 0.0 else math.nan
-        estimate_one(
+        estimate_normals(
             sample[s],
             position[s],
             light,
@@ -111,12 +112,7 @@ def normals_block(
             eta,
             scan_error,
             b,
-            peak,
-            normal,
-            spread,
-            covariance,
-            cross,
-            pull,
+            estimates,
         )
         # inverse variance: each residual relative to the signal; for skin without
         # colour the first has all the weight
@@ -139,9 +135,7 @@ def normals_block(
         disagreement[s] = _angle(peak, combined)
         error[s], total[s] = math.nan, math.nan
         if method != PEAK and np.isfinite(chosen[s]).all():
-            error[s] = math.degrees(
-                math.sqrt(_variance(share, covariance, cross, pull, scan_error))
-            )
+            error[s] = math.degrees(math.sqrt(_variance(share, estimates, scan_error)))
             # skin without colour has only one of the two
             apart = _angle(normal[0], normal[1])
             apart = apart if apart == apart else 0.0

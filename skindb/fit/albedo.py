@@ -21,7 +21,7 @@ from skindb.fit.lumitexels import (
     noise_of,
 )
 from skindb.jit import sample_bits
-from skindb.optics.diffuse import dipole_s
+from skindb.optics.diffusion import dipole_s
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.parameters import EVEN_REFLECTION
 from skindb.reflectance.dictionary import lobe_table

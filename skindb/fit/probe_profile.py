@@ -12,7 +12,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.special import chdtrc
 
-from skindb.optics.dipole import dipole_profile
+from skindb.optics.diffusion import dipole_profile
 from skindb.optics.transport import RATIO_MAX, transport_profile
 from skindb.schema import ProbeStatus
 from skindb.types import Array

@@ -1,4 +1,5 @@
-"""Compiled estimates of normals from reflectance samples; see `skindb.optics.photometric`.
+"""Compiled estimates of the normal of a surfel from its reflectance samples (Weyrich et
+al. 2005, section 6).
 
 Arrays over lights are rows of single precision, so that loops over lights run in vector
 registers; 3 x 3 sums are in double precision. Order statistics come from sorting
@@ -21,6 +22,17 @@ from skindb.jit import (
     scale_to_one,
     sort_columns,
     unpack,
+)
+from skindb.types import (
+    Cube,
+    Cube32,
+    IntMatrix32,
+    IntVector,
+    IntVector32,
+    Matrix,
+    Matrix32,
+    Vector,
+    Vector32,
 )
 
 # below it, a pixel may include the background behind the silhouette
@@ -45,38 +57,76 @@ ONE = np.float32(1)
 HALF = np.float32(0.5)
 
 
+class NormalEstimates(NamedTuple):
+    """Estimates for a surfel; NaN where the samples do not determine them.
+
+    `peak` follows the paper: the normal is half way between each camera and its
+    direction of maximum reflectance. It uses the darkest channel, which has the least
+    diffuse light under the highlight. The four brightest lights are weighted by their
+    excess over the fifth, cameras by the contrast of their brightest light.
+
+    The others are from robust photometric stereo of two signals. The first signal is a
+    low quantile over cameras of the mean channel, below the highlights; the second is
+    the median of the colour difference that is zero for white light (Zickler et al.
+    2008). The spread is the residual over the signal. The covariance describes the noise
+    of the samples, estimated from the residuals. A small rotation t of the scan's normal
+    rotates an estimate by `pull` t.
+    """
+
+    peak: Vector  # (3,)
+    normal: Matrix  # (2, 3)
+    spread: Vector  # (2,)
+    covariance: Cube  # (2, 3, 3) [rad^2]
+    cross: Matrix  # (3, 3) covariance of the first normal with the second
+    pull: Cube  # (2, 3, 3)
+
+
 class Buffers(NamedTuple):
     """Memory for one surfel; each thread has its own."""
 
-    values: Any  # (lights cameras 3,) samples
-    light: Any  # (3, lights) unit directions, one row per axis
-    camera: Any  # (3, cameras)
-    through: Any  # (cameras,) F_t towards the camera, 0 for cameras that are not used
-    used: Any  # (cameras,) indices of cameras that are used
-    white: Any  # (cameras, lights) mean channel over F_t, inf where there is no sample
-    tinted: Any  # (cameras, lights) the part along the skin's colour
+    values: Vector32  # (lights cameras 3,) samples
+    light: Matrix32  # (3, lights) unit directions, one row per axis
+    camera: Matrix  # (3, cameras)
+    through: Vector32  # (cameras,) F_t towards the camera, 0 for unused cameras
+    cameras: IntVector  # (cameras,) indices of the cameras that are used
+    white: Matrix32  # (cameras, lights) mean channel over F_t, inf without a sample
+    tinted: Matrix32  # (cameras, lights) the part along the skin's colour
     # (cameras, lights) darkest channel, not below 0, inf where there is no sample
-    dark: Any
-    count: Any  # (lights,) samples
-    shade: Any  # (2, lights) signals that the normal explains
-    known: Any  # (lights,) 1 where there is a signal, else 0
-    weight: Any  # (lights,)
-    passed: Any  # (lights,) F_t of the light
-    residual: Any  # (lights,)
-    size: Any  # (lights,) absolute values of the residuals
-    size_bits: Any  # the same memory as int32
-    dark_bits: Any
-    score: Any  # (2, lights)
-    half: Any  # (cameras, 3) half vectors of the brightest lights
-    contrast: Any  # (cameras,) weights of these half vectors
-    kept: Any  # (cameras,)
-    angle: Any  # (cameras,)
-    ordered: Any  # (cameras,)
+    dark: Matrix32
+    samples: IntVector  # (lights,) number of samples
+    shade: Matrix32  # (2, lights) signals that the normal explains
+    present: Vector32  # (lights,) 1 where there is a signal, else 0
+    weight: Vector32  # (lights,)
+    passed: Vector32  # (lights,) F_t of the light
+    residual: Vector32  # (lights,)
+    size: Vector32  # (lights,) absolute values of the residuals
+    size_bits: IntVector32  # the same memory as int32
+    dark_bits: IntMatrix32
+    score: Matrix  # (2, lights)
+    turn: Cube  # (2, 3, 3) from a sum of score times direction to a rotation
+    half: Matrix  # (cameras, 3) half vectors of the brightest lights
+    contrast: Vector  # (cameras,) weights of these half vectors
+    trust: Vector  # (cameras,) the same without outliers
+    angle: Vector  # (cameras,)
+    ordered: Vector  # (cameras,)
 
 
 @kernel
-def buffers(lights: int, cameras: int) -> Any:
-    """Memory for `estimate_one`."""
+def normal_estimates() -> NormalEstimates:
+    """Memory for the result of `estimate_normals`."""
+    return NormalEstimates(
+        np.empty(3),
+        np.empty((2, 3)),
+        np.empty(2),
+        np.empty((2, 3, 3)),
+        np.empty((3, 3)),
+        np.empty((2, 3, 3)),
+    )
+
+
+@kernel
+def buffers(lights: int, cameras: int) -> Buffers:
+    """Memory for `estimate_normals`."""
     single = np.zeros((10 + 3 * cameras, lights), np.float32)
     dark = single[10 + 2 * cameras :]
     size = single[9]
@@ -99,6 +149,7 @@ def buffers(lights: int, cameras: int) -> Any:
         size.view(np.int32),
         dark.view(np.int32),
         np.zeros((2, lights)),
+        np.empty((2, 3, 3)),
         np.empty((cameras, 3)),
         np.empty(cameras),
         np.empty(cameras),
@@ -117,18 +168,20 @@ def _finite(value: float) -> bool:
 
 @inline_fast_kernel
 def _transmittance(cosine: Any, square: Any) -> Any:
-    """F_t of a cosine; `square` is eta^2 - 1, which must not be negative."""
+    """F_t of a cosine in single or double precision; `square` is eta^2 - 1, which must
+    not be negative.
+    """
     g = math.sqrt(square + cosine * cosine)
-    less = g - cosine
-    more = g + cosine
-    p = cosine * less + ONE
-    q = cosine * more - ONE
+    minus = g - cosine
+    plus = g + cosine
+    p = cosine * minus + ONE
+    q = cosine * plus - ONE
     # a single division, as divisions dominate the time
-    return ONE - HALF * less * less * (p * p + q * q) / (more * more * p * p)
+    return ONE - HALF * minus * minus * (p * p + q * q) / (plus * plus * p * p)
 
 
 @fast_kernel
-def _unit(v: Any) -> bool:
+def _unit(v: Vector) -> bool:
     """Scale v to length 1; a vector of length 0 becomes NaN and returns False."""
     size = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
     for k in range(3):
@@ -138,7 +191,12 @@ def _unit(v: Any) -> bool:
 
 @fast_kernel
 def _point(
-    position: Any, light: Any, camera: Any, scan: Any, square: Any, b: Any
+    position: Vector,
+    light: Matrix,
+    camera: Matrix,
+    scan: Vector,
+    square: np.float32,
+    b: Buffers,
 ) -> int:
     """Set directions from a surfel, and F_t towards cameras above MIN_COSINE_CAMERA;
     returns their number.
@@ -148,76 +206,81 @@ def _point(
         y = light[i, 1] - position[1]
         z = light[i, 2] - position[2]
         scale = 1.0 / math.sqrt(x * x + y * y + z * z)
-        b.light[0, i], b.light[1, i], b.light[2, i] = x * scale, y * scale, z * scale
+        b.light[0, i] = x * scale
+        b.light[1, i] = y * scale
+        b.light[2, i] = z * scale
     count = 0
     for o in range(camera.shape[0]):
         x = camera[o, 0] - position[0]
         y = camera[o, 1] - position[1]
         z = camera[o, 2] - position[2]
         scale = 1.0 / math.sqrt(x * x + y * y + z * z)
-        b.camera[0, o], b.camera[1, o], b.camera[2, o] = x * scale, y * scale, z * scale
+        b.camera[0, o] = x * scale
+        b.camera[1, o] = y * scale
+        b.camera[2, o] = z * scale
         cosine = np.float32((scan[0] * x + scan[1] * y + scan[2] * z) * scale)
         b.through[o] = ZERO
         if cosine > MIN_COSINE_CAMERA:
             b.through[o] = _transmittance(min(cosine, ONE), square)
-            b.used[count] = o
+            b.cameras[count] = o
             count += 1
     return count
 
 
 @fast_kernel
-def _shades(used: int, cameras: int, b: Any) -> None:
+def _shades(used: int, cameras: int, b: Buffers) -> None:
     """For each light, low quantile over cameras of the mean channel, and median of the
     part along the skin's colour.
     """
-    lights = b.known.shape[0]
+    lights = b.present.shape[0]
     red = 0.0
     green = 0.0
     blue = 0.0
     count = 0.0
     for i in range(lights):
-        b.count[i] = 0
+        b.samples[i] = 0
         for q in range(used):
-            at = 3 * (i * cameras + b.used[q])
-            r = b.values[at]
-            g = b.values[at + 1]
-            v = b.values[at + 2]
+            place = 3 * (i * cameras + b.cameras[q])
+            r = b.values[place]
+            g = b.values[place + 1]
+            v = b.values[place + 2]
             if _finite(r + g + v):
                 red = red + r
                 green = green + g
                 blue = blue + v
                 count = count + 1.0
-                b.count[i] += 1
+                b.samples[i] += 1
     grey = (red + green + blue) / 3.0
     red = red - grey
     green = green - grey
     blue = blue - grey
     size = math.sqrt(red * red + green * green + blue * blue)
     scale = 1.0 / size if size > 0.0 else 0.0
-    along = np.float32(red * scale), np.float32(green * scale), np.float32(blue * scale)
+    along_red = np.float32(red * scale)
+    along_green = np.float32(green * scale)
+    along_blue = np.float32(blue * scale)
+    missing = np.float32(np.inf)
     for q in range(used):
-        o = b.used[q]
+        o = b.cameras[q]
         inverse = ONE / b.through[o]
         third = inverse / np.float32(3)
         for i in range(lights):
-            at = 3 * (i * cameras + o)
-            r = b.values[at]
-            g = b.values[at + 1]
-            v = b.values[at + 2]
-            known = _finite(r + g + v)
-            b.white[q, i] = (r + g + v) * third if known else np.float32(np.inf)
-            b.tinted[q, i] = (
-                (r * along[0] + g * along[1] + v * along[2]) * inverse
-                if known
-                else np.float32(np.inf)
-            )
-            b.dark[q, i] = max(min(r, g, v), ZERO) if known else np.float32(np.inf)
+            place = 3 * (i * cameras + o)
+            r = b.values[place]
+            g = b.values[place + 1]
+            v = b.values[place + 2]
+            valid = _finite(r + g + v)
+            tint = (r * along_red + g * along_green + v * along_blue) * inverse
+            b.white[q, i] = (r + g + v) * third if valid else missing
+            b.tinted[q, i] = tint if valid else missing
+            b.dark[q, i] = max(min(r, g, v), ZERO) if valid else missing
     sort_columns(b.white, used, lights)
     sort_columns(b.tinted, used, lights)
     for i in range(lights):
-        n = b.count[i]
-        b.known[i] = ONE if n > 0 else ZERO
-        b.shade[0, i], b.shade[1, i] = ZERO, ZERO
+        n = b.samples[i]
+        b.present[i] = ONE if n > 0 else ZERO
+        b.shade[0, i] = ZERO
+        b.shade[1, i] = ZERO
         if n > 0:
             b.shade[0, i] = b.white[int(np.rint(SHADE_QUANTILE * (n - 1))), i]
             b.shade[1, i] = HALF * (b.tinted[(n - 1) // 2, i] + b.tinted[n // 2, i])
@@ -225,7 +288,12 @@ def _shades(used: int, cameras: int, b: Any) -> None:
 
 @fast_kernel
 def _normal_equations(
-    n: Any, shade: Any, square: Any, b: Any, data: Any, right: Any
+    n: Vector,
+    shade: Vector32,
+    square: np.float32,
+    b: Buffers,
+    data: Matrix,
+    right: Vector,
 ) -> int:
     """F_t of the lights at the normal n and weighted sums of their directions; returns
     the number of lights used.
@@ -249,7 +317,7 @@ def _normal_equations(
     count = ZERO
     for i in range(x.shape[0]):
         cosine = nx * x[i] + ny * y[i] + nz * z[i]
-        above = b.known[i] if cosine > MIN_COSINE_LIGHT else ZERO
+        above = b.present[i] if cosine > MIN_COSINE_LIGHT else ZERO
         passed = above * _transmittance(min(max(cosine, MIN_COSINE_LIGHT), ONE), square)
         b.passed[i] = passed
         a = weight[i] * passed
@@ -273,7 +341,7 @@ def _normal_equations(
 
 
 @fast_kernel
-def _residuals(g: Any, shade: Any, b: Any) -> None:
+def _residuals(g: Vector, shade: Vector32, b: Buffers) -> None:
     gx = np.float32(g[0])
     gy = np.float32(g[1])
     gz = np.float32(g[2])
@@ -288,7 +356,7 @@ def _residuals(g: Any, shade: Any, b: Any) -> None:
 
 
 @fast_kernel
-def _tukey(spread: float, b: Any) -> None:
+def _tukey(spread: float, b: Buffers) -> None:
     inverse = np.float32(1.0 / (TUKEY * spread) ** 2)
     for i in range(b.weight.shape[0]):
         u = ONE - b.residual[i] * b.residual[i] * inverse
@@ -296,7 +364,7 @@ def _tukey(spread: float, b: Any) -> None:
 
 
 @fast_kernel
-def _inverse(a: Any, out: Any) -> None:
+def _inverse(a: Matrix, out: Matrix) -> None:
     """Inverse of a 3 x 3 matrix by cofactors; with a ridge of 1e-6 of its trace, 9
     digits are accurate.
     """
@@ -314,7 +382,7 @@ def _inverse(a: Any, out: Any) -> None:
 
 
 @fast_kernel
-def _sandwich(left: Any, meat: Any, right: Any, out: Any) -> None:
+def _sandwich(left: Matrix, meat: Matrix, right: Matrix, out: Matrix) -> None:
     """Write left meat right^T of 3 x 3 matrices."""
     for j in range(3):
         for k in range(3):
@@ -327,24 +395,22 @@ def _sandwich(left: Any, meat: Any, right: Any, out: Any) -> None:
 
 @fast_kernel
 def _photometric(
-    shade: Any,
-    scan: Any,
-    square: Any,
+    signal: int,
+    scan: Vector,
+    square: np.float32,
     prior: float,
-    b: Any,
-    normal: Any,
-    covariance: Any,
-    pull: Any,
-    score: Any,
-    half: Any,
+    b: Buffers,
+    out: NormalEstimates,
 ) -> float:
-    """Robust photometric stereo: shade = F_t(n.l) g.l for one g; writes g/|g| and its
-    covariance, returns residual/|g|.
+    """Robust photometric stereo: shade = F_t(n.l) g.l for one g; writes g/|g| of a signal
+    and its covariance, returns residual/|g|.
 
     Tukey weights exclude shadows and remaining highlights. The scan's normal is a prior
     on the direction of g, which matters where few lights or mixed pixels do not
     determine the direction.
     """
+    shade = b.shade[signal]
+    normal = out.normal[signal]
     data = np.empty((3, 3))
     matrix = np.empty((3, 3))
     inverse = np.empty((3, 3))
@@ -355,23 +421,21 @@ def _photometric(
         normal[k] = scan[k]
     spread = 0.0
     size = 1.0
-    share = 0.0
+    hold = 0.0  # weight of the scan's normal
     for step in range(MAX_ITERATIONS):
         count = _normal_equations(normal, shade, square, b, data, right)
         if step > 0:
             # errors of neighbouring lights are correlated, so any number counts as at
             # most INDEPENDENT_LIGHTS
-            share = (
-                max(count / INDEPENDENT_LIGHTS, 1.0)
-                * (spread / (size * max(prior, 1e-9))) ** 2
-            )
+            repeats = max(count / INDEPENDENT_LIGHTS, 1.0)
+            hold = repeats * (spread / (size * max(prior, 1e-9))) ** 2
         # a ridge far below the data, so that surfels without light have the solution
         # zero and hence a NaN normal
-        ridge = 1e-6 * (data[0, 0] + data[1, 1] + data[2, 2] + 2.0 * share) + 1e-12
+        ridge = 1e-6 * (data[0, 0] + data[1, 1] + data[2, 2] + 2.0 * hold) + 1e-12
         for j in range(3):
             for k in range(3):
-                matrix[j, k] = data[j, k] - share * scan[j] * scan[k]
-            matrix[j, j] += share + ridge
+                matrix[j, k] = data[j, k] - hold * scan[j] * scan[k]
+            matrix[j, j] += hold + ridge
         _inverse(matrix, inverse)
         for k in range(3):
             g[k] = (
@@ -381,58 +445,43 @@ def _photometric(
             )
         size = math.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2])
         if not size > 0.0:
-            normal[:], covariance[:], pull[:], half[:] = np.nan, np.nan, np.nan, np.nan
+            normal[:] = np.nan
+            out.covariance[signal] = np.nan
+            out.pull[signal] = np.nan
+            b.turn[signal] = np.nan
             return np.nan
         moved = 0.0
         for k in range(3):
             moved += (g[k] / size - normal[k]) ** 2
             normal[k] = g[k] / size
         _residuals(g, shade, b)
-        spread = (
-            1.4826 * median_of(b.size, b.size_bits, b.size.shape[0], count)
-            + 0.01 * size
-        )
+        middle = median_of(b.size, b.size_bits, b.size.shape[0], count)
+        spread = 1.4826 * middle + 0.01 * size
         if moved < MIN_SQUARED_CHANGE or step == MAX_ITERATIONS - 1:
             break
         _tukey(spread, b)
-    _covariance(
-        square,
-        spread,
-        share,
-        size,
-        normal,
-        data,
-        matrix,
-        covariance,
-        pull,
-        score,
-        half,
-        b,
-    )
+    _covariance(signal, square, spread, hold, size, data, matrix, b, out)
     return spread / size
 
 
 @fast_kernel
 def _covariance(
-    square: Any,
+    signal: int,
+    square: np.float32,
     spread: float,
-    share: float,
+    hold: float,
     size: float,
-    normal: Any,
-    data: Any,
-    matrix: Any,
-    out: Any,
-    pull: Any,
-    score: Any,
-    half: Any,
-    b: Any,
+    data: Matrix,
+    matrix: Matrix,
+    b: Buffers,
+    out: NormalEstimates,
 ) -> None:
     """Covariance of the normal from the residuals (Huber's sandwich), and its
-    derivative by the scan's normal.
-
-    It also writes the scores of the lights, and the matrix `half` from a sum of score
-    times direction to a rotation.
+    derivative by the scan's normal; also the scores of the lights and `turn`.
     """
+    normal = out.normal[signal]
+    score = b.score[signal]
+    turn = b.turn[signal]
     slope = 0.0
     total = 0.0
     count = 0
@@ -453,27 +502,22 @@ def _covariance(
         count += 1
         # a rotation of the normal also changes F_t, which matters at grazing angles
         c = normal[0] * way[0] + normal[1] * way[1] + normal[2] * way[2]
-        steep = (
-            _transmittance(c + 1e-4, np.float64(square))
-            - _transmittance(c - 1e-4, np.float64(square))
-        ) / 2e-4
+        above = _transmittance(c + 1e-4, np.float64(square))
+        below = _transmittance(c - 1e-4, np.float64(square))
+        steep = (above - below) / 2e-4
         score[i] = b.weight[i] * passed * b.residual[i]
         for j in range(3):
             for k in range(3):
-                bent[j, k] += (
-                    bend
-                    * passed
-                    * way[j]
-                    * (passed * way[k] + c * steep * (way[k] - c * normal[k]))
-                )
+                change = passed * way[k] + c * steep * (way[k] - c * normal[k])
+                bent[j, k] += bend * passed * way[j] * change
                 meat[j, k] += score[i] * score[i] * way[j] * way[k]
     # correction for three fitted unknowns; the slope of the influence function is below its weights
-    more = count / max(count - 3.0, 1.0)
+    correction = count / max(count - 3.0, 1.0)
     for i in range(score.shape[0]):
-        score[i] *= math.sqrt(more)
+        score[i] *= math.sqrt(correction)
     for j in range(3):
         for k in range(3):
-            meat[j, k] *= more
+            meat[j, k] *= correction
             matrix[j, k] += (
                 bent[j, k] - data[j, k] if slope > 0.5 * total else -0.5 * data[j, k]
             )
@@ -485,41 +529,45 @@ def _covariance(
             + inverse[2, j] * normal[2]
         )
         for k in range(3):
-            half[k, j] = (inverse[k, j] - along * normal[k]) / size
-    _sandwich(half, meat, half, out)
+            turn[k, j] = (inverse[k, j] - along * normal[k]) / size
+    _sandwich(turn, meat, turn, out.covariance[signal])
     for k in range(3):  # a rotation of the scan's normal is perpendicular to it
-        along = half[k, 0] * normal[0] + half[k, 1] * normal[1] + half[k, 2] * normal[2]
+        along = turn[k, 0] * normal[0] + turn[k, 1] * normal[1] + turn[k, 2] * normal[2]
         for j in range(3):
-            pull[k, j] = (half[k, j] - along * normal[j]) * share * size
+            out.pull[signal, k, j] = (turn[k, j] - along * normal[j]) * hold * size
 
 
 @fast_kernel
-def _brightest(dark: Any, best: Any, place: Any) -> None:
+def _brightest(dark: Vector32, best: Vector, place: IntVector) -> None:
     """The BRIGHTEST largest values and their indices, in descending order."""
     for q in range(BRIGHTEST):
-        best[q], place[q] = -1.0, 0
-    last = np.float32(-1)
+        best[q] = -1.0
+        place[q] = 0
+    smallest = np.float32(-1)
     for i in range(dark.shape[0]):
         value = dark[i]
-        if value > last and value < np.inf:
+        if value > smallest and value < np.inf:
             q = BRIGHTEST - 1
             while q > 0 and value > best[q - 1]:
-                best[q], place[q] = best[q - 1], place[q - 1]
+                best[q] = best[q - 1]
+                place[q] = place[q - 1]
                 q -= 1
-            best[q], place[q] = value, i
-            last = np.float32(best[BRIGHTEST - 1])
+            best[q] = value
+            place[q] = i
+            smallest = np.float32(best[BRIGHTEST - 1])
 
 
 @fast_kernel
-def _peak(used: int, b: Any) -> None:
+def _peak(used: int, b: Buffers) -> None:
     """Half vectors of the brightest lights of each camera and their weights; see
-    `PhotometricNormals.peak`.
+    `NormalEstimates.peak`.
     """
     best = np.empty(BRIGHTEST)
     place = np.empty(BRIGHTEST, np.int64)
     maximum = np.empty(3)
     for q in range(used):
-        b.half[q], b.contrast[q] = 0.0, 0.0
+        b.half[q] = 0.0
+        b.contrast[q] = 0.0
         _brightest(b.dark[q], best, place)
         if best[BRIGHTEST - 1] < 0.0:
             continue
@@ -536,13 +584,13 @@ def _peak(used: int, b: Any) -> None:
             b.contrast[q] = max(best[0] / max(middle, 1e-6 * best[0]) - 1.0, 0.0)
         if _unit(maximum):
             for k in range(3):
-                b.half[q, k] = maximum[k] + b.camera[k, b.used[q]]
+                b.half[q, k] = maximum[k] + b.camera[k, b.cameras[q]]
             if not _unit(b.half[q]):
                 b.half[q] = 0.0
 
 
 @fast_kernel
-def _middle(values: Any, count: int) -> float:
+def _middle(values: Vector, count: int) -> float:
     """Median of the first `count` values, which are sorted in place; 0 if there are none."""
     for i in range(1, count):  # insertion sort, as there are few values
         value = values[i]
@@ -555,56 +603,63 @@ def _middle(values: Any, count: int) -> float:
 
 
 @fast_kernel
-def _robust_mean(used: int, mean: Any, b: Any) -> None:
+def _robust_mean(used: int, mean: Vector, b: Buffers) -> None:
     """Mean direction of the half vectors without outliers, each weighted by the inverse
     of its angle to the mean.
     """
     for q in range(used):
-        b.kept[q] = b.contrast[q]
+        b.trust[q] = b.contrast[q]
     for step in range(9):
         mean[:] = 0.0
         for q in range(used):
             for k in range(3):
-                mean[k] += b.kept[q] * b.half[q, k]
+                mean[k] += b.trust[q] * b.half[q, k]
         if not _unit(mean) or step == 8:
             return
-        at = 0
+        count = 0
         for q in range(used):
             cosine = (
                 b.half[q, 0] * mean[0] + b.half[q, 1] * mean[1] + b.half[q, 2] * mean[2]
             )
             b.angle[q] = math.degrees(math.acos(min(max(cosine, -1.0), 1.0)))
             if b.contrast[q] > 0.0:
-                b.ordered[at] = b.angle[q]
-                at += 1
-        limit = 2.5 * max(1.4826 * _middle(b.ordered, at), 2.0)
+                b.ordered[count] = b.angle[q]
+                count += 1
+        limit = 2.5 * max(1.4826 * _middle(b.ordered, count), 2.0)
         for q in range(used):
-            b.kept[q] = (
-                b.contrast[q] / max(b.angle[q], 1.0) if b.angle[q] < limit else 0.0
-            )
+            trust = b.contrast[q] / max(b.angle[q], 1.0)
+            b.trust[q] = trust if b.angle[q] < limit else 0.0
 
 
 @fast_kernel
-def estimate_one(
-    sample: Any,
-    position: Any,
-    light: Any,
-    camera: Any,
-    scan: Any,
+def estimate_normals(
+    sample: Cube32,
+    position: Vector,
+    light: Matrix,
+    camera: Matrix,
+    scan: Vector,
     eta: float,
     prior: float,
-    b: Any,
-    peak: Any,
-    normal: Any,
-    spread: Any,
-    covariance: Any,
-    cross: Any,
-    pull: Any,
+    b: Buffers,
+    out: NormalEstimates,
 ) -> None:
-    """Peak normal (3,) of a surfel; normals (2, 3), spreads (2,), covariances and pulls
-    (2, 3, 3) of both signals.
+    """Estimate the normal of a surfel by all methods.
 
-    `cross` (3, 3) is the covariance of the first normal with the second.
+    Parameters
+    ----------
+    sample
+        (lights, cameras, 3) f_r cos(theta_i) [sr^-1] or bits of half floats, see
+        `skindb.jit.sample_bits`; NaN where unusable.
+    position, light, camera
+        (3,), (lights, 3) and (cameras, 3) positions [mm].
+    scan
+        (3,) unit normal of the scan.
+    eta
+        Refractive index of the Fresnel factors.
+    prior
+        Standard deviation of the scan's normals [rad].
+    b, out
+        Buffers and result, which are overwritten.
     """
     square = np.float32(max(eta * eta - 1.0, 0.0))
     unpack(sample, b.values)
@@ -613,21 +668,9 @@ def estimate_one(
     scale_to_one(b.values)
     used = _point(position, light, camera, scan, square, b)
     _shades(used, camera.shape[0], b)
-    turn = np.empty((2, 3, 3))
     meat = np.zeros((3, 3))
-    for q in range(2):
-        spread[q] = _photometric(
-            b.shade[q],
-            scan,
-            square,
-            prior,
-            b,
-            normal[q],
-            covariance[q],
-            pull[q],
-            b.score[q],
-            turn[q],
-        )
+    for signal in range(2):
+        out.spread[signal] = _photometric(signal, scan, square, prior, b, out)
     # noise that grows with the signal differs between channels, so both signals have
     # part of it in common
     for i in range(b.score.shape[1]):
@@ -635,43 +678,6 @@ def estimate_one(
         for j in range(3):
             for k in range(3):
                 meat[j, k] += both * b.light[j, i] * b.light[k, i]
-    _sandwich(turn[0], meat, turn[1], cross)
+    _sandwich(b.turn[0], meat, b.turn[1], out.cross)
     _peak(used, b)
-    _robust_mean(used, peak, b)
-
-
-@kernel
-def estimate(
-    sample: Any,
-    position: Any,
-    light: Any,
-    camera: Any,
-    scan: Any,
-    eta: float,
-    prior: float,
-    peak: Any,
-    normal: Any,
-    spread: Any,
-    covariance: Any,
-    cross: Any,
-    pull: Any,
-) -> None:
-    """Apply `estimate_one` to every surfel."""
-    b = buffers(light.shape[0], camera.shape[0])
-    for s in range(position.shape[0]):
-        estimate_one(
-            sample[s],
-            position[s],
-            light,
-            camera,
-            scan[s],
-            eta,
-            prior,
-            b,
-            peak[s],
-            normal[s],
-            spread[s],
-            covariance[s],
-            cross[s],
-            pull[s],
-        )
+    _robust_mean(used, out.peak, b)

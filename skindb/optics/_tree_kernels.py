@@ -7,11 +7,12 @@ points is one list of rows.
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
 from skindb.jit import fast_kernel, inline_fast_kernel, kernel
+from skindb.types import Cube, Cube32, IntVector, Matrix, Vector
 
 MAX_DEPTH = 10  # levels of the octree, with three bits of the Morton code each
 # rows evaluated at a time, so that the list and its profiles stay in the first-level
@@ -20,71 +21,104 @@ ROWS_PER_SUM = 1024
 LIGHTS_IN_REGISTERS = 8  # lights whose sums stay in registers
 
 
-@kernel
-def build(code: Any, points: Any, area: Any, leaf: int) -> Any:
-    """Nodes over points sorted by Morton code, which makes every node a contiguous range of points.
+class Tree(NamedTuple):
+    """Nodes (v,) of an octree over sorted points; children come after their parents."""
 
-    Returns first, last, child, children, box, centre (area-weighted) and node area;
-    children come after their parents.
+    begin: IntVector  # points of a node, from begin to end
+    end: IntVector
+    child: IntVector  # its first child; -1 for a leaf
+    children: IntVector  # number of its children, which follow each other
+    box: Matrix  # (v, 6) lower and upper corner [mm]
+    centre: Matrix  # (v, 3) mean of the points weighted by area [mm]
+    area: Vector  # sum over the points [mm2]
+
+
+class Sources(NamedTuple):
+    """Rows of points and nodes."""
+
+    place: Matrix  # (rows, 3) mm
+    area: Vector  # (rows,) mm2
+    power: Cube32  # (groups, rows, LIGHTS_IN_REGISTERS) irradiance times area
+
+
+class SumMemory(NamedTuple):
+    """Memory for the sums at one receiver; each thread needs its own."""
+
+    rows: IntVector  # (ROWS_PER_SUM,)
+    square: Vector  # (ROWS_PER_SUM,) squared distances
+    profile: Matrix  # (3, ROWS_PER_SUM)
+
+
+@kernel
+def build(code: IntVector, points: Matrix, area: Vector, leaf: int) -> Tree:
+    """Nodes over points sorted by Morton code, so that every node is a contiguous range
+    of points.
     """
-    most = 2 * len(code) + 16
-    first = np.zeros(most, np.int64)
-    last = np.zeros(most, np.int64)
-    child = np.full(most, -1, np.int64)
-    children = np.zeros(most, np.int64)
-    level = np.zeros(most, np.int64)
-    centre = np.zeros((most, 3))
-    box = np.zeros((most, 6))
-    node_area = np.zeros(most)
-    count, last[0], i = 1, len(code), 0
+    size = 2 * len(code) + 16
+    begin = np.zeros(size, np.int64)
+    end = np.zeros(size, np.int64)
+    child = np.full(size, -1, np.int64)
+    children = np.zeros(size, np.int64)
+    level = np.zeros(size, np.int64)
+    centre = np.zeros((size, 3))
+    box = np.zeros((size, 6))
+    node_area = np.zeros(size)
+    end[0] = len(code)
+    count = 1
+    i = 0
     while i < count:
-        box[i, :3], box[i, 3:] = np.inf, -np.inf
+        box[i, :3] = np.inf
+        box[i, 3:] = -np.inf
         total = 0.0
-        for j in range(first[i], last[i]):
+        for j in range(begin[i], end[i]):
             w = area[j] + 1e-300
             total += w
             node_area[i] += area[j]
             for a in range(3):
                 centre[i, a] += w * points[j, a]
-                box[i, a], box[i, a + 3] = (
-                    min(box[i, a], points[j, a]),
-                    max(box[i, a + 3], points[j, a]),
-                )
+                box[i, a] = min(box[i, a], points[j, a])
+                box[i, a + 3] = max(box[i, a + 3], points[j, a])
         for a in range(3):
             centre[i, a] /= total
-        if last[i] - first[i] > leaf and level[i] < MAX_DEPTH:
+        if end[i] - begin[i] > leaf and level[i] < MAX_DEPTH:
             shift = 3 * (MAX_DEPTH - 1 - level[i])
-            start = first[i]
+            start = begin[i]
             child[i] = count
-            while start < last[i]:
+            while start < end[i]:
                 digit = (code[start] >> shift) & 7
                 stop = start
-                while stop < last[i] and ((code[stop] >> shift) & 7) == digit:
+                while stop < end[i] and ((code[stop] >> shift) & 7) == digit:
                     stop += 1
-                first[count], last[count], level[count] = start, stop, level[i] + 1
+                begin[count] = start
+                end[count] = stop
+                level[count] = level[i] + 1
                 count = count + 1
                 start = stop
             children[i] = count - child[i]
         i += 1
-    stretch = (first[:count], last[:count])
-    family = (child[:count], children[:count])
-    return *stretch, *family, box[:count], centre[:count], node_area[:count]
+    return Tree(
+        begin[:count],
+        end[:count],
+        child[:count],
+        children[:count],
+        box[:count],
+        centre[:count],
+        node_area[:count],
+    )
 
 
 @kernel
-def sum_nodes(
-    power: Any, points: int, first: Any, last: Any, child: Any, children: Any
-) -> None:
+def sum_nodes(power: Cube32, points: int, tree: Tree) -> None:
     """Fill the rows of the nodes of power (groups, rows, LIGHTS_IN_REGISTERS) from the
     rows of the points.
     """
     for g in range(power.shape[0]):
-        for v in range(len(first) - 1, -1, -1):  # children before their parents
-            low = first[v]
-            high = last[v]
-            if child[v] >= 0:
-                low = points + child[v]
-                high = points + child[v] + children[v]
+        for v in range(len(tree.begin) - 1, -1, -1):  # children before their parents
+            low = tree.begin[v]
+            high = tree.end[v]
+            if tree.child[v] >= 0:
+                low = points + tree.child[v]
+                high = low + tree.children[v]
             for c in range(LIGHTS_IN_REGISTERS):
                 total = 0.0
                 for j in range(low, high):
@@ -100,15 +134,9 @@ def _decay(x: float) -> float:
     Taylor polynomial of degree seven in x / 64, then six squarings; constant above 24 (4e-11).
     """
     t = -min(x, 24.0) * 0.015625
-    e = 1.0 + t * (
-        1.0
-        + t
-        * (
-            0.5
-            + t
-            * (1 / 6 + t * (1 / 24 + t * (1 / 120 + t * (1 / 720 + t * (1 / 5040)))))
-        )
-    )
+    e = 1 / 120 + t * (1 / 720 + t * (1 / 5040))
+    e = 0.5 + t * (1 / 6 + t * (1 / 24 + t * e))
+    e = 1.0 + t * (1.0 + t * e)
     e *= e
     e *= e
     e *= e
@@ -128,39 +156,37 @@ def _source(square: float, z: float, decay: float) -> float:
 # no check for division by zero, which would prevent vectorisation of the loops
 @fast_kernel
 def _add(
-    rows: Any,
     count: int,
-    at: Any,
-    p: Any,
-    place: Any,
-    area: Any,
-    power: Any,
-    square: Any,
-    profile: Any,
-    even: Any,
-    out: Any,
+    receiver: Vector,
+    parameters: Matrix,
+    sources: Sources,
+    memory: SumMemory,
+    even: Vector,
+    out: Cube,
 ) -> None:
     """Add the listed rows to the sums of one receiver: even (3,) for unit irradiance,
     out (groups, 3, lights).
-
-    `square` (ROWS_PER_SUM,) for squared distances and `profile` (3, ROWS_PER_SUM) are
-    working memory.
     """
+    rows = memory.rows
+    place = sources.place
+    area = sources.area
+    power = sources.power
+    square = memory.square
+    profile = memory.profile
     for e in range(count):
         j = rows[e]
-        dx = at[0] - place[j, 0]
-        dy = at[1] - place[j, 1]
-        dz = at[2] - place[j, 2]
+        dx = receiver[0] - place[j, 0]
+        dy = receiver[1] - place[j, 1]
+        dz = receiver[2] - place[j, 2]
         square[e] = dx * dx + dy * dy + dz * dz
     for c in range(3):
-        depth = p[c, 0]
-        above = p[c, 1]
-        decay = p[c, 2]
-        scale = p[c, 3] * 0.07957747154594767
+        depth = parameters[c, 0]
+        above = parameters[c, 1]
+        decay = parameters[c, 2]
+        scale = parameters[c, 3] * 0.07957747154594767
         for e in range(count):
-            profile[c, e] = scale * (
-                _source(square[e], depth, decay) + _source(square[e], above, decay)
-            )
+            real = _source(square[e], depth, decay)
+            profile[c, e] = scale * (real + _source(square[e], above, decay))
         total = 0.0
         for e in range(count):
             total += profile[c, e] * area[rows[e]]
@@ -195,39 +221,36 @@ def _add(
 def gather(
     start: int,
     stop: int,
-    receivers: Any,
-    parameters: Any,
-    place: Any,
-    area: Any,
-    power: Any,
-    first: Any,
-    last: Any,
-    child: Any,
-    children: Any,
-    box: Any,
+    receivers: IntVector,
+    parameters: Cube,
+    sources: Sources,
+    tree: Tree,
     tolerance: float,
     reach: float,
-    even: Any,
-    out: Any,
+    even: Matrix,
+    out: np.ndarray[tuple[int, int, int, int], np.dtype[np.float64]],
 ) -> None:
     """Dipole sums at the points receivers[start:stop], with receivers (m,).
 
-    parameters (n, 3, 4) are z_r, z_v, sigma_tr, alpha' of each point and channel; place
-    (rows, 3), area (rows,) and power (groups, rows, LIGHTS_IN_REGISTERS) of points and
-    nodes. The sums are even (m, 3), under unit irradiance, and out (m, groups, 3,
+    parameters (n, 3, 4) are z_r, z_v, sigma_tr, alpha' of each point and channel. The
+    sums are even (m, 3), under unit irradiance, and out (m, groups, 3,
     LIGHTS_IN_REGISTERS).
     """
     points = len(parameters)
+    place = sources.place
+    box = tree.box
     stack = np.empty(8 * (MAX_DEPTH + 2), np.int64)
     rows = np.empty(ROWS_PER_SUM, np.int64)
     square = np.empty(ROWS_PER_SUM)
-    profile = np.empty((3, ROWS_PER_SUM))
+    memory = SumMemory(rows, square, np.empty((3, ROWS_PER_SUM)))
     for k in range(start, stop):
         i = receivers[k]
         x = place[i, 0]
         y = place[i, 1]
         z = place[i, 2]
-        top, stack[0], count = 1, 0, 0
+        stack[0] = 0
+        top = 1
+        count = 0
         while top > 0:
             top -= 1
             v = stack[top]
@@ -242,42 +265,21 @@ def gather(
             dx = x - place[low, 0]
             dy = y - place[low, 1]
             dz = z - place[low, 2]
-            if gap == 0.0 or area[low] >= tolerance * (dx * dx + dy * dy + dz * dz):
-                low = first[v]
-                high = last[v]
-                if child[v] >= 0:
+            area_limit = tolerance * (dx * dx + dy * dy + dz * dz)
+            if gap == 0.0 or sources.area[low] >= area_limit:
+                low = tree.begin[v]
+                high = tree.end[v]
+                if tree.child[v] >= 0:
                     low = high
-                    for q in range(children[v]):
-                        stack[top] = child[v] + q
+                    for q in range(tree.children[v]):
+                        stack[top] = tree.child[v] + q
                         top += 1
             for j in range(low, high):
                 if count == ROWS_PER_SUM:
                     _add(
-                        rows,
-                        count,
-                        place[i],
-                        parameters[i],
-                        place,
-                        area,
-                        power,
-                        square,
-                        profile,
-                        even[k],
-                        out[k],
+                        count, place[i], parameters[i], sources, memory, even[k], out[k]
                     )
                     count = 0
                 rows[count] = j
                 count += 1
-        _add(
-            rows,
-            count,
-            place[i],
-            parameters[i],
-            place,
-            area,
-            power,
-            square,
-            profile,
-            even[k],
-            out[k],
-        )
+        _add(count, place[i], parameters[i], sources, memory, even[k], out[k])

@@ -1,12 +1,11 @@
-"""Compiled part of the random walk of photons; see `skindb.optics.random_walk`."""
+"""Compiled part of the random walk of photons; see `skindb.optics.transport`."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 
 from skindb.jit import fast_kernel
+from skindb.types import Matrix32
 
 
 @fast_kernel
@@ -23,12 +22,12 @@ def _escape(cosine: float, eta: float) -> float:
 
 @fast_kernel
 def walk(
-    rng: Any,
+    rng: np.random.Generator,
     packets: int,
     g: float,
     eta: float,
-    longest: float,
-    events: np.ndarray[Any, Any],
+    max_path: float,
+    events: Matrix32,
 ) -> int:
     """Fill `events` (m, 3) with radius, path and weight of every escape; returns their number.
 
@@ -46,7 +45,7 @@ def walk(
         dz = 1.0
         path = 0.0
         weight = 1.0
-        while path < longest:
+        while path < max_path:
             step = -np.log(1.0 - rng.random()) * (1.0 - g)
             while dz < 0.0 and z + dz * step < 0.0:  # the boundary comes first
                 reach = -z / dz
@@ -96,11 +95,11 @@ def walk(
                 dz = ct * np.sign(dz)
             else:
                 h = np.sqrt(1.0 - dz * dz)
-                dx, dy, dz = (
-                    c * dx * dz / h - s * dy / h + dx * ct,
-                    c * dy * dz / h + s * dx / h + dy * ct,
-                    -c * h + dz * ct,
-                )
+                x_turned = c * dx * dz / h - s * dy / h + dx * ct
+                y_turned = c * dy * dz / h + s * dx / h + dy * ct
+                dx = x_turned
+                dy = y_turned
+                dz = -c * h + dz * ct
             n = 1.0 / np.sqrt(dx * dx + dy * dy + dz * dz)
             dx = dx * n
             dy = dy * n

@@ -5,13 +5,19 @@ Weyrich et al. 2005, eq. 9).
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb.optics import _tree_kernels
-from skindb.optics.diffuse import S_FLOOR, diffuse_reflectance, reduced_albedo
+from skindb.optics._tree_kernels import (
+    LIGHTS_IN_REGISTERS,
+    Sources,
+    Tree,
+    build,
+    gather,
+    sum_nodes,
+)
+from skindb.optics.diffusion import S_FLOOR, diffuse_reflectance, reduced_albedo
 from skindb.optics.fresnel import boundary_factor
 from skindb.types import Array
 
@@ -83,75 +89,56 @@ def subsurface_exitance(
     depth = s / decay
     above = depth * (1.0 + 4.0 / 3.0 * boundary_factor(eta))
     parameters = np.stack([depth, above, decay, reduced_albedo(s)], axis=-1)
-    *tree, box, centre, node_area = _tree_kernels.build(
-        code, points, areas, MAX_LEAF_POINTS
-    )
-    place = np.concatenate([points, centre])
-    area = np.concatenate([areas, node_area])
+    tree = build(code, points, areas, MAX_LEAF_POINTS)
+    place = np.concatenate([points, tree.centre])
+    area = np.concatenate([areas, tree.area])
     reach = REACH_MEAN_PATHS / float(decay.min())
-    wanted = (
-        np.arange(len(points))
-        if receivers is None
-        else np.flatnonzero(receivers[order])
-    )
+    chosen = np.arange(len(points))
+    if receivers is not None:
+        chosen = np.flatnonzero(receivers[order])
+    starts = range(0, len(chosen), RECEIVERS_PER_BLOCK)
     for low in range(0, len(result), LIGHTS_PER_WALK):
-        power = _powers(
-            irradiance[order, low : low + LIGHTS_PER_WALK] * areas[:, None],
-            tree,
-            _tree_kernels,
-        )
-        even = np.zeros((len(wanted), 3))
-        sums = np.zeros((len(wanted), len(power), 3, _tree_kernels.LIGHTS_IN_REGISTERS))
+        lights = irradiance[order, low : low + LIGHTS_PER_WALK]
+        sources = Sources(place, area, _powers(lights * areas[:, None], tree))
+        even = np.zeros((len(chosen), 3))
+        sums = np.zeros((len(chosen), len(sources.power), 3, LIGHTS_IN_REGISTERS))
 
         def walk(
-            start: int, power: Array = power, even: Array = even, sums: Array = sums
+            start: int,
+            sources: Sources = sources,
+            even: Array = even,
+            sums: Array = sums,
         ) -> None:
-            stop = min(start + RECEIVERS_PER_BLOCK, len(wanted))
-            _tree_kernels.gather(
-                start,
-                stop,
-                wanted,
-                parameters,
-                place,
-                area,
-                power,
-                *tree,
-                box,
-                tolerance,
-                reach,
-                even,
-                sums,
-            )
+            stop = min(start + RECEIVERS_PER_BLOCK, len(chosen))
+            limits = (tolerance, reach)
+            gather(start, stop, chosen, parameters, sources, tree, *limits, even, sums)
 
         # plain threads, as the kernel releases the GIL, and numba's own threads abort
         # when two threads render at once
         with ThreadPoolExecutor() as pool:
-            list(pool.map(walk, range(0, len(wanted), RECEIVERS_PER_BLOCK)))
-        gain = (
-            diffuse_reflectance(s[wanted], eta=eta) / np.maximum(even, 1e-300)
-            if normalise
-            else np.ones(1)
-        )
-        for i in range(low, min(low + LIGHTS_PER_WALK, len(result))):
-            group, lane = divmod(i - low, _tree_kernels.LIGHTS_IN_REGISTERS)
-            result[i, order[wanted]] = sums[:, group, :, lane] * gain
+            list(pool.map(walk, starts))
+        gain = np.ones(1)
+        if normalise:
+            gain = diffuse_reflectance(s[chosen], eta=eta) / np.maximum(even, 1e-300)
+        for i in range(lights.shape[1]):
+            group, lane = divmod(i, LIGHTS_IN_REGISTERS)
+            result[low + i, order[chosen]] = sums[:, group, :, lane] * gain
     return result
 
 
-def _powers(power: Array, tree: list[Any], kernels: Any) -> NDArray[np.float32]:
+def _powers(power: Array, tree: Tree) -> NDArray[np.float32]:
     """Power (groups, points and nodes, LIGHTS_IN_REGISTERS) [irradiance mm2] from the
     power (n, l) of points.
 
     The last group is padded with zeros.
     """
     n, lights = power.shape
-    groups = -(-lights // kernels.LIGHTS_IN_REGISTERS)
-    out = np.zeros((groups, n + len(tree[0]), kernels.LIGHTS_IN_REGISTERS), np.float32)
+    groups = -(-lights // LIGHTS_IN_REGISTERS)
+    out = np.zeros((groups, n + len(tree.begin), LIGHTS_IN_REGISTERS), np.float32)
     for i in range(lights):
-        out[i // kernels.LIGHTS_IN_REGISTERS, :n, i % kernels.LIGHTS_IN_REGISTERS] = (
-            power[:, i]
-        )
-    kernels.sum_nodes(out, n, *tree)
+        group, lane = divmod(i, LIGHTS_IN_REGISTERS)
+        out[group, :n, lane] = power[:, i]
+    sum_nodes(out, n, tree)
     return out
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
 from skindb.geometry.mesh import vertex_areas
-from skindb.optics.diffuse import S_FLOOR
+from skindb.optics.diffusion import S_FLOOR
 from skindb.optics.fresnel import boundary_factor
 from skindb.render.environment import Environment
 from skindb.render.image import tone_map

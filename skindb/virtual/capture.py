@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
 from skindb.files import make_private, private_file
-from skindb.optics.diffuse import dipole_s
+from skindb.optics.diffusion import dipole_s
 from skindb.reflectance.abc_low2012 import PARAMETERS
 from skindb.reflectance.dictionary import Dictionary, convolve_disc, embedded_dictionary
 from skindb.reflectance.mixture import Mixture

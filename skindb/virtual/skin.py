@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from skindb.optics.diffuse import dipole_s, scattering_coefficients
+from skindb.optics.diffusion import dipole_s, scattering_coefficients
 from skindb.virtual.head import Head
 from skindb.virtual.noise import smooth_noise
 from skindb.virtual.person import Person

@@ -19,7 +19,7 @@ from skindb.analysis.albedo import levels, quantiles
 from skindb.analysis.edit import shift_quantiles, valid_quantiles, with_basis
 from skindb.errors import InputError
 from skindb.fit.translucency import translucency_map
-from skindb.optics.diffuse import diffuse_reflectance
+from skindb.optics.diffusion import diffuse_reflectance
 from skindb.reflectance.tables import brdf_metric, stored_brdf
 from skindb.schema import dataset
 

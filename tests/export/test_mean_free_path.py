@@ -7,8 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from skindb.export.translucency import mean_free_path
-from skindb.optics.diffuse import dipole_s, scattering_coefficients
-from skindb.optics.dipole import dipole_profile
+from skindb.optics.diffusion import dipole_profile, dipole_s, scattering_coefficients
 
 ETA = 1.3
 PHOTONS = 100_000

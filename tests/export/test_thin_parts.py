@@ -17,8 +17,12 @@ from skindb.export.gltf import export_gltf
 from skindb.export.textures import skin_of
 from skindb.export.translucency import thickness, transmitted_fraction
 from skindb.geometry.mesh import vertex_areas
-from skindb.optics.diffuse import diffuse_reflectance, dipole_s
-from skindb.optics.dipole import dipole_power_beyond, dipole_profile
+from skindb.optics.diffusion import (
+    diffuse_reflectance,
+    dipole_power_beyond,
+    dipole_profile,
+    dipole_s,
+)
 from skindb.optics.dipole_tree import subsurface_exitance
 from skindb.render.image import decode_srgb
 from tests.export.test_gltf import chunks, picture

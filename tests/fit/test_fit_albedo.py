@@ -13,7 +13,7 @@ from skindb.fit import (
     reflectance_interval,
 )
 from skindb.fit.albedo import low_quantile, stable_minimum
-from skindb.optics.diffuse import diffuse_reflectance
+from skindb.optics.diffusion import diffuse_reflectance
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.reflectance.dictionary import surface_lobes
 from skindb.reflectance.rows import basis_rows

@@ -28,7 +28,7 @@ from skindb.fit import (
 from skindb.fit.lumitexels import lumitexels as lumitexels_of
 from skindb.fit.plan import plan_fit
 from skindb.fit.quality import HELD_OUT_ERRORS, fitted_part, hold_out
-from skindb.optics.dipole import sigma_tr
+from skindb.optics.diffusion import sigma_tr
 from skindb.reflectance.mixture import Mixture
 from skindb.schema import GROUPS, FitStatus, check, dataset, label
 

@@ -14,7 +14,7 @@ from skindb.fit import (
     translucency_map,
 )
 from skindb.fit.probe_profile import _faces, fit_profile
-from skindb.optics.dipole import dipole_profile, sigma_tr
+from skindb.optics.diffusion import dipole_profile, sigma_tr
 from skindb.optics.transport import transport_profile
 from skindb.schema import ProbeStatus, dataset, label
 
@@ -193,7 +193,7 @@ def test_fit_probe__a_minimum_that_is_excluded_does_not_count():
 
 
 def test_fit_probe__photons_within_4_percent():
-    from skindb.optics.random_walk import radial_profile, random_walk
+    from skindb.optics.transport import radial_profile, random_walk
 
     walk = random_walk(40_000, eta=1.3, rng=np.random.default_rng(3))
     edges = np.concatenate([DISTANCE[:16] - 0.25, [DISTANCE[15] + 0.25]])
@@ -214,9 +214,9 @@ def test_fit_probe__dark_skin_by_photons(sigma_a, sigma_s):
     """Reduced albedo 0.6 and 0.26: the dipole is 20 % low, with a status; transport is
     within 1 % and noise.
     """
-    from skindb.optics.random_walk import radial_profile, random_walk
+    from skindb.optics.transport import radial_profile, random_walk
 
-    walk = random_walk(150_000, eta=1.3, longest=60.0, rng=np.random.default_rng(8))
+    walk = random_walk(150_000, eta=1.3, max_path=60.0, rng=np.random.default_rng(8))
     edges = np.concatenate([DISTANCE[:12] - 0.25, [DISTANCE[11] + 0.25]])
     profile, error = (
         v[None, :, None].repeat(3, 2)
@@ -291,10 +291,12 @@ JENSEN_DARK = {"ketchup": ((0.18, 0.07, 0.03), (0.061, 0.97, 1.45))}
 @pytest.fixture(scope="module")
 def walks():
     """Photons by index; stopped after 8000 / sigma_s', which whole milk needs."""
-    from skindb.optics.random_walk import random_walk
+    from skindb.optics.transport import random_walk
 
     return {
-        eta: random_walk(packets, eta=eta, longest=8000.0, rng=np.random.default_rng(1))
+        eta: random_walk(
+            packets, eta=eta, max_path=8000.0, rng=np.random.default_rng(1)
+        )
         for eta, packets in ((1.3, 15_000), (1.5, 10_000))
     }
 
@@ -311,7 +313,7 @@ def test_fit_probe__jensen_2001_by_photons(material, walks):
     table). Red of skimmed milk has 1 / sigma_tr = 18 mm, beyond the last fibre. Both
     say so.
     """
-    from skindb.optics.random_walk import radial_profile
+    from skindb.optics.transport import radial_profile
 
     eta = {"marble": 1.5}.get(material, 1.3)
     edges = np.append(DISTANCE - 0.25, DISTANCE[-1] + 0.25)

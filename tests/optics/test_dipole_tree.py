@@ -8,8 +8,12 @@ import numpy as np
 import pytest
 
 from skindb.optics import _tree_kernels
-from skindb.optics.diffuse import diffuse_reflectance, dipole_s, scattering_coefficients
-from skindb.optics.dipole import dipole_profile
+from skindb.optics.diffusion import (
+    diffuse_reflectance,
+    dipole_profile,
+    dipole_s,
+    scattering_coefficients,
+)
 from skindb.optics.dipole_tree import LIGHTS_PER_WALK, subsurface_exitance
 
 ETA = 1.3

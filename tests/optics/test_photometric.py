@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from skindb.optics._photometric_kernels import (
+    NormalEstimates,
+    buffers,
+    estimate_normals,
+    normal_estimates,
+)
 from skindb.optics.fresnel import fresnel_transmittance
-from skindb.optics.photometric import photometric_normals
 
 ETA = 1.3
 PRIOR = np.deg2rad(3.0)
@@ -44,6 +49,17 @@ def _scene(seed, surfels=12, lights=40, cameras=7):
     return sample.astype(np.float32), position, light, camera, scan
 
 
+def _estimates(sample, position, light, camera, scan):
+    """Estimates of all surfels, with the surfel as the first axis."""
+    memory = buffers(len(light), len(camera))
+    out = []
+    for s in range(len(sample)):
+        out.append(normal_estimates())
+        points = (position[s], light, camera, scan[s])
+        estimate_normals(sample[s], *points, ETA, PRIOR, memory, out[s])
+    return NormalEstimates(*(np.stack(arrays) for arrays in zip(*out, strict=True)))
+
+
 def _directions(s, position, light, camera):
     return _unit(light - position[s]), _unit(camera - position[s])
 
@@ -76,12 +92,10 @@ def _naive_photometric(shade, to_light, scan):
     return normal, spread / size
 
 
-def test_photometric_normals__are_those_of_the_plain_rule():
+def test_estimate_normals__are_those_of_the_plain_rule():
     for seed in [0, 1, 2]:
         sample, position, light, camera, scan = _scene(seed)
-        found = photometric_normals(
-            sample, position, light, camera, scan, eta=ETA, prior=PRIOR
-        )
+        found = _estimates(sample, position, light, camera, scan)
         for s in range(len(sample)):
             to_light, to_camera = _directions(s, position, light, camera)
             seen = to_camera @ scan[s] > 0.2
@@ -128,12 +142,10 @@ def _naive_peak(part, to_light, to_camera):
     return mean
 
 
-def test_photometric_normals__peak_is_that_of_the_plain_rule():
+def test_estimate_normals__peak_is_that_of_the_plain_rule():
     for seed in [3, 4]:
         sample, position, light, camera, scan = _scene(seed)
-        found = photometric_normals(
-            sample, position, light, camera, scan, eta=ETA, prior=PRIOR
-        )
+        found = _estimates(sample, position, light, camera, scan)
         for s in range(len(sample)):
             to_light, to_camera = _directions(s, position, light, camera)
             seen = to_camera @ scan[s] > 0.2
@@ -143,7 +155,7 @@ def test_photometric_normals__peak_is_that_of_the_plain_rule():
             np.testing.assert_allclose(found.peak[s], expected, atol=1e-6)
 
 
-def test_photometric_normals__covariance_is_the_scatter_of_repeated_draws():
+def test_estimate_normals__covariance_is_the_scatter_of_repeated_draws():
     rng = np.random.default_rng(5)
     _, position, light, camera, scan = _scene(6, surfels=1, lights=60, cameras=1)
     to_light, to_camera = _directions(0, position, light, camera)
@@ -159,9 +171,7 @@ def test_photometric_normals__covariance_is_the_scatter_of_repeated_draws():
     sample[:, cosine <= 0] = np.nan
     points = (np.repeat(a, draws, axis=0) for a in (position, scan))
     place, scans = points
-    found = photometric_normals(
-        sample.astype(np.float32), place, light, camera, scans, eta=ETA, prior=PRIOR
-    )
+    found = _estimates(sample.astype(np.float32), place, light, camera, scans)
     for q in range(2):
         scatter = np.trace(np.cov(found.normal[:, q].T))
         # 800 draws give a variance to 5 %; the linear model neglects that F_t decreases
@@ -170,14 +180,11 @@ def test_photometric_normals__covariance_is_the_scatter_of_repeated_draws():
         assert 0.8 < np.einsum("nkk->n", found.covariance[:, q]).mean() / scatter < 1.5
 
 
-def test_photometric_normals__pull_is_the_derivative_by_the_scan():
+def test_estimate_normals__pull_is_the_derivative_by_the_scan():
     sample, position, light, camera, scan = _scene(7, lights=4, surfels=30)
     turn = np.cross(scan, [0.0, 1.0, 0.0]) * 0.002
     found, moved = (
-        photometric_normals(
-            sample, position, light, camera, _unit(scan + d), eta=ETA, prior=PRIOR
-        )
-        for d in (0, turn)
+        _estimates(sample, position, light, camera, _unit(scan + d)) for d in (0, turn)
     )
     step = moved.normal[:, 0] - found.normal[:, 0]
     expected = np.einsum("njk,nk->nj", found.pull[:, 0], turn)

@@ -11,7 +11,7 @@ import pytest
 import trimesh
 
 from skindb.geometry.rays import RayScene
-from skindb.optics.diffuse import dipole_s
+from skindb.optics.diffusion import dipole_s
 from skindb.reflectance.mixture import Mixture
 from skindb.render.direct import render_view, trace_view
 from skindb.render.scene import Camera, Lights, Surface

@@ -10,7 +10,7 @@ import trimesh
 from scipy import stats
 
 from skindb.errors import InputError
-from skindb.optics.diffuse import dipole_s
+from skindb.optics.diffusion import dipole_s
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.reflectance.mixture import Mixture
 from skindb.reflectance.tables import TableGrid, directional_albedo, tabulate

@@ -8,7 +8,7 @@ import pytest
 import xarray as xr
 
 from skindb.errors import InputError
-from skindb.optics.diffuse import dipole_s
+from skindb.optics.diffusion import dipole_s
 from skindb.reflectance.tables import stored_brdf
 from skindb.render import subsurface as subsurface_module
 from skindb.render.direct import render_view

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from skindb.geometry.rays import RayScene
-from skindb.optics.diffuse import dipole_s
+from skindb.optics.diffusion import dipole_s
 from skindb.render.direct import render_view, trace_view
 from skindb.render.monte_carlo import Lighting, Quality, render_monte_carlo
 from skindb.render.plan import covered_pixels, notable_lights, plan_scene

@@ -11,7 +11,7 @@ import pytest
 
 from skindb.errors import InputError
 from skindb.geometry.rays import RayScene
-from skindb.optics.diffuse import dipole_s
+from skindb.optics.diffusion import dipole_s
 from skindb.reflectance.mixture import Mixture
 from skindb.render import scene as refine
 from skindb.render.direct import render_view

@@ -4,7 +4,7 @@ import imagecodecs
 import numpy as np
 import pytest
 
-from skindb.optics.random_walk import radial_profile
+from skindb.optics.transport import radial_profile
 from skindb.virtual.probe import (
     BIN,
     BRACKETS,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from skindb.bench.case import close, combinations, each, expect
 from skindb.fit.probe_profile import MODELS, ProbeFit, fit_profile
-from skindb.optics.dipole import sigma_tr
+from skindb.optics.diffusion import sigma_tr
 from skindb.schema import ProbeStatus
 
 Array = NDArray[Any]

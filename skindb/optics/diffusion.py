@@ -1,6 +1,8 @@
-"""Diffuse reflectance of a semi-infinite medium and its inverse (Weyrich et al. 2005, eq. 5).
+"""Diffusion in a semi-infinite medium: diffuse reflectance and its inverse (Weyrich et
+al. 2005, eq. 5), and the reflectance profile of the dipole (Jensen et al. 2001; Weyrich
+et al. 2005, section 8 and eq. 9).
 
-Both use s = sqrt(3 (1 - alpha')), which is also the stored variable, because alpha'
+The reflectance uses s = sqrt(3 (1 - alpha')), which is also the stored variable, because alpha'
 near 1 suffers from cancellation.
 """
 
@@ -23,9 +25,9 @@ S_FLOOR = 1e-4
 def diffuse_reflectance(s: ArrayLike, *, eta: float) -> Array:
     """R_d = alpha'/2 (1 + exp(-4/3 A s)) exp(-s) for s in [0, sqrt 3]."""
     s = np.asarray(s, np.float64)
-    return np.asarray(
-        (1.0 - s * s / 3.0) / 2.0 * (1.0 + np.exp(-_steepness(eta) * s)) * np.exp(-s)
-    )
+    albedo = 1.0 - s * s / 3.0
+    far = np.exp(-_steepness(eta) * s)
+    return np.asarray(albedo / 2.0 * (1.0 + far) * np.exp(-s))
 
 
 def dipole_s(diffuse: ArrayLike, *, eta: float) -> tuple[Array, NDArray[np.bool_]]:
@@ -71,9 +73,7 @@ def scattering_coefficients(s: ArrayLike, sigma_tr: ArrayLike) -> tuple[Array, A
     """
     s = np.maximum(np.asarray(s, np.float64), S_FLOOR)
     extinction = np.asarray(sigma_tr, np.float64) / s
-    return np.asarray(extinction * s * s / 3.0), np.asarray(
-        extinction * (1.0 - s * s / 3.0)
-    )
+    return extinction * s * s / 3.0, extinction * (1.0 - s * s / 3.0)
 
 
 def _steepness(eta: float) -> float:
@@ -93,6 +93,53 @@ def _slope(s: Array, eta: float) -> Array:
     b = 1.0 + _steepness(eta)
     near = np.exp(-s)
     far = np.exp(-b * s)
-    return np.asarray(
-        (1.0 - s * s / 3.0) / 2.0 * (near + b * far) + s / 3.0 * (near + far)
-    )
+    albedo = 1.0 - s * s / 3.0
+    return np.asarray(albedo / 2.0 * (near + b * far) + s / 3.0 * (near + far))
+
+
+def sigma_tr(sigma_a: ArrayLike, sigma_s_prime: ArrayLike) -> Array:
+    """sigma_tr = sqrt(3 sigma_a (sigma_a + sigma_s')) in mm^-1 (eq. 9)."""
+    a = np.asarray(sigma_a, np.float64)
+    s = np.asarray(sigma_s_prime, np.float64)
+    return np.asarray(np.sqrt(3.0 * a * (a + s)))
+
+
+def dipole_profile(
+    r: ArrayLike, sigma_a: ArrayLike, sigma_s_prime: ArrayLike, *, eta: float
+) -> Array:
+    """R(r) in mm^-2: radiant exitance at distance r [mm] per unit of power that enters.
+
+    Arguments broadcast. The integral of R over the plane is eq. 5.
+    """
+    r, a, s = (np.asarray(x, np.float64) for x in (r, sigma_a, sigma_s_prime))
+    decay, sources = _sources(a, s, eta)
+    total = np.zeros(())
+    for z in sources:
+        d = np.sqrt(r * r + z * z)
+        # in this order 0 at infinity, instead of infinity times 0
+        total = total + z * (1.0 / d + decay) / (d * d) * np.exp(-decay * d)
+    return np.asarray(s / (a + s) / (4.0 * np.pi) * total)
+
+
+def dipole_power_beyond(
+    distance: ArrayLike, sigma_a: ArrayLike, sigma_s_prime: ArrayLike, *, eta: float
+) -> Array:
+    """Fraction of the entered power that leaves farther than `distance` [mm] from where it entered.
+
+    The integral of 2 pi r R(r) from `distance` to infinity, in closed form; at 0 it is
+    R_d (eq. 5). Arguments broadcast. It is also the exitance of a plane at that
+    distance from an evenly lit one.
+    """
+    r, a, s = (np.asarray(x, np.float64) for x in (distance, sigma_a, sigma_s_prime))
+    decay, sources = _sources(a, s, eta)
+    total = np.zeros(())
+    for z in sources:
+        d = np.sqrt(r * r + z * z)
+        total = total + z / d * np.exp(-decay * d)
+    return np.asarray(s / (a + s) / 2.0 * total)
+
+
+def _sources(a: Array, s: Array, eta: float) -> tuple[Array, tuple[Array, Array]]:
+    """sigma_tr, and depth of the real and height of the virtual source of the dipole."""
+    depth = 1.0 / (a + s)
+    return sigma_tr(a, s), (depth, depth * (1.0 + 4.0 / 3.0 * boundary_factor(eta)))

@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from skindb.optics.diffuse import (
+from skindb.optics.diffusion import (
     diffuse_reflectance,
+    dipole_profile,
     dipole_s,
     reduced_albedo,
     scattering_coefficients,
+    sigma_tr,
 )
-from skindb.optics.dipole import dipole_profile, sigma_tr
 from skindb.optics.fresnel import (
     boundary_factor,
     fresnel_reflectance,
