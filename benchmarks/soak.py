@@ -279,7 +279,7 @@ def main(
         with alone("register", watch, studies):
             workflow.register_takes(db, **where)
         with alone("brdf", watch, studies):
-            workflow.basis_size(db)
+            workflow.study(db, "brdf")
         for group in (None, "gender", "condition"):
             with alone(f"albedo by {group}", watch, studies):
                 workflow.albedo(db, group_by=group)

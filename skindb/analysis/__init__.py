@@ -60,18 +60,19 @@ from skindb.analysis.registration import (
     register,
     tabulate_registration,
 )
+from skindb.analysis.studies import STUDIES, describe_study, plot_study, tabulate_study
 from skindb.analysis.summary import (
     cohort_of,
     region_tables,
     sample_surfels,
     summary_tables,
 )
-from skindb.analysis.tabulate import describe_study, plot_study, tabulate_study
 from skindb.analysis.traits import plot_traits, trait_vectors
 from skindb.analysis.translucency import plot_translucency, translucency_table
 
 __all__ = [
     "BASIS_SIZE_VARIABLES",
+    "STUDIES",
     "albedo_histograms",
     "albedo_table",
     "apply_traits",

@@ -11,9 +11,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
-from skindb.analysis import colours
+from skindb.analysis import colours, texture
 from skindb.analysis.each_take import each_take
 from skindb.analysis.members import groups_by, takes_to_compare
+from skindb.analysis.study import (
+    Population,
+    Results,
+    Study,
+    Table,
+    group_option,
+    table_of,
+)
+from skindb.analysis.summary import SAMPLED
 from skindb.errors import Fault, InputError
 from skindb.numerics.statistics import Moments
 from skindb.schema import dataset
@@ -404,3 +413,67 @@ def plot_albedo(
     ax.set_ylabel("fraction of the area")
     ax.set_ylim(bottom=0)
     return ax
+
+
+def tabulate_albedo(table: xr.Dataset, histograms: xr.Dataset) -> Table:
+    """Header and one row per region and channel of every group, or of every take if
+    they are not grouped.
+    """
+    if not table.attrs["group_by"]:
+        return table_of(histograms, ["albedo_mean"], ("take", "region", "channel"))
+    columns = ("count", "mean", "mean_low", "mean_high", "standard_deviation")
+    names = [f"group_albedo_{column}" for column in columns]
+    return table_of(table, names, ("group", "region", "channel"))
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Parameters of the study of albedo."""
+
+    group_by: str | None = group_option()
+
+
+def albedo_and_texture(population: Population) -> Results:
+    """Histograms of albedo, and distributions at every scale of the takes that are
+    registered, whose landmarks draw the regions that captures lack.
+    """
+    mixed = population.mixed_fits
+    if not population.registered:
+        return {"albedo": albedo_histograms(population.cohort, mixed_fits=mixed)}
+    drawn = population.open_cohort(
+        "surfels",
+        kind="registration",
+        surfels=SAMPLED,
+        variables=["region_mask", "surfel_index"],
+    )
+    maps = population.open_cohort("maps", size=texture.SIZE, variables=texture.MAPPED)
+    distributions = texture.texture_statistics(
+        maps, landmarks=population.landmarks, mixed_fits=mixed
+    )
+    histograms = albedo_histograms(
+        population.cohort, regions=texture.REGIONS, drawn=drawn, mixed_fits=mixed
+    )
+    return {"albedo": histograms, "texture": distributions}
+
+
+def compute(population: Population, parameters: Parameters) -> Results:
+    """The results of the study."""
+    results = albedo_and_texture(population)
+    table = albedo_table(
+        population.cohort, albedo=results["albedo"], group_by=parameters.group_by
+    )
+    return results | {"albedo_table": table}
+
+
+STUDY = Study(
+    name="albedo",
+    description="distribution of the diffuse albedo",
+    layout="surfels",
+    parameters=Parameters,
+    compute=compute,
+    shown=("albedo_table", "albedo"),
+    tabulate=tabulate_albedo,
+    plot=lambda table, histograms: plot_albedo(histograms, table=table),
+    cohort_options={"surfels": SAMPLED},
+    uses_registration=True,
+)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,8 +15,16 @@ from numpy.typing import NDArray
 
 from skindb.analysis.each_take import each_take, shared_once
 from skindb.analysis.population_basis import same_dictionary
+from skindb.analysis.study import (
+    DICTIONARY,
+    Population,
+    Results,
+    Study,
+    seed_option,
+)
 from skindb.numerics.statistics import bootstrap_interval
 from skindb.optics.fresnel import fresnel_transmittance
+from skindb.parameters import option
 from skindb.reflectance.basis import Systems, factor_reflectance, residuals
 from skindb.reflectance.rows import basis_rows
 from skindb.reflectance.tables import TableGrid
@@ -47,6 +57,7 @@ TABLE_HEADER = (
     "error / error of next k",
 )
 MAX_DECIMALS = 6  # of the percentages in the table
+STUDY_SURFELS = 200  # of each take, that the study draws
 # surfels of all takes together from which the bases are computed: 56 MB of normal
 # equations
 MAX_FACTORED = 2000
@@ -393,3 +404,40 @@ def plot_basis_size(curve: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     ax.set_ylabel("error of reflectance / error with whole dictionary")
     ax.legend(fontsize=8)
     return ax
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Parameters of the study of the number of bases."""
+
+    seed: int = seed_option("the bootstrap")
+    dictionary: Path | None = option(None, DICTIONARY)
+
+
+def compute(population: Population, parameters: Parameters) -> Results:
+    """The results of the study."""
+    curve = basis_size_curve(
+        population.cohort,
+        tables=population.brdf_tables(),
+        mixed_fits=population.mixed_fits,
+        rng=np.random.default_rng(parameters.seed),
+    )
+    return {"basis_size": curve}
+
+
+STUDY = Study(
+    name="brdf",
+    description="number of basis BRDFs that the population needs",
+    layout="surfels",
+    parameters=Parameters,
+    compute=compute,
+    shown=("basis_size",),
+    tabulate=tabulate_basis_size,
+    plot=plot_basis_size,
+    describe=lambda curve: [describe_basis_size(curve)],
+    # the labels of the weights name the BRDFs of the fits
+    cohort_options={
+        "surfels": STUDY_SURFELS,
+        "variables": (*BASIS_SIZE_VARIABLES, "dictionary_weight"),
+    },
+)

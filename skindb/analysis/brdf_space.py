@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ import xarray as xr
 from dask.delayed import Delayed
 from numpy.typing import NDArray
 
+from skindb.analysis.brdf_plots import plot_space
 from skindb.analysis.each_take import each_item
 from skindb.analysis.members import (
     NORMAL,
@@ -26,6 +28,17 @@ from skindb.analysis.members import (
     takes_to_compare,
     texts,
 )
+from skindb.analysis.population_basis import population_basis
+from skindb.analysis.study import (
+    DICTIONARY,
+    Population,
+    Results,
+    Study,
+    compared_option,
+    permutations_option,
+    seed_option,
+)
+from skindb.analysis.summary import SAMPLED
 from skindb.errors import Fault, InputError
 from skindb.numerics.inference import (
     between_groups_p,
@@ -33,6 +46,7 @@ from skindb.numerics.inference import (
     within_subjects_p,
 )
 from skindb.numerics.statistics import known_mean
+from skindb.parameters import option
 from skindb.reflectance.tables import TableGrid, brdf_coords, brdf_metric, stored_brdf
 from skindb.schema import dataset
 from skindb.schema.cohort import require_same_fit
@@ -452,3 +466,58 @@ def describe_brdf_space(space: xr.Dataset) -> list[str]:
         f"the RMS error of its distances is {float(space['map_error']):.1%}",
         *space.attrs["flags"],
     ]
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Parameters of the study of surfaces."""
+
+    group_by: str = compared_option()
+    k: int = option(6, "Number of components of the common basis.", minimum=1)
+    permutations: int = permutations_option()
+    seed: int = seed_option("the factorisation and the permutations")
+    dictionary: Path | None = option(None, DICTIONARY)
+
+
+def compute(population: Population, parameters: Parameters) -> Results:
+    """The results of the study."""
+    cohort = population.open_cohort("tables")
+    grouped_takes(cohort, parameters.group_by)  # before anything is computed
+    rng = np.random.default_rng(parameters.seed)
+    tables = population.brdf_tables()
+    mixed = population.mixed_fits
+    k = parameters.k
+    basis = population_basis(
+        population.cohort, tables=tables, k=k, mixed_fits=mixed, rng=rng
+    )
+    rank = basis.sizes["component"]
+    if rank < k:
+        rule = "must not be above the number of BRDFs of the dictionary or of surfels"
+        raise InputError(
+            Fault("k", rule, f"{k}, and {rank} of them", "choose a smaller k")
+        )
+    space = brdf_space(
+        cohort,
+        basis=basis,
+        tables=tables,
+        group_by=parameters.group_by,
+        permutations=parameters.permutations,
+        mixed_fits=mixed,
+        rng=rng,
+    )
+    return {"population_basis": basis, "brdf_space": space}
+
+
+STUDY = Study(
+    name="surface",
+    description="differences between the surface BRDFs of groups",
+    layout="surfels",
+    parameters=Parameters,
+    compute=compute,
+    shown=("brdf_space",),
+    tabulate=tabulate_brdf_space,
+    plot=plot_space,
+    describe=describe_brdf_space,
+    cohort_options={"surfels": SAMPLED},
+    compares_normal=True,
+)

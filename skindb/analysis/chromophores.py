@@ -24,12 +24,22 @@ from sklearn.exceptions import ConvergenceWarning
 from skindb.analysis import colours
 from skindb.analysis.each_take import each_take
 from skindb.analysis.masks import region_masks
+from skindb.analysis.mean_face import mean_face
 from skindb.analysis.members import groups_by, takes_to_compare
+from skindb.analysis.study import (
+    Population,
+    Results,
+    Study,
+    group_option,
+    seed_option,
+    table_of,
+)
 from skindb.analysis.texture import COVERED, DARKEST, LEAST_COVERED, MAPPED
 from skindb.errors import Fault, InputError
 from skindb.numerics.statistics import Moments, known_mean
 from skindb.schema import dataset
 from skindb.schema.cohort import require_same_fit
+from skindb.schema.notes import note
 from skindb.schema.regions import FACE
 from skindb.types import Array, Mask
 
@@ -38,6 +48,13 @@ if TYPE_CHECKING:
 
 CHROMOPHORES = ("melanin", "haemoglobin")
 CHANNELS = ("R", "G", "B")
+COLUMNS = (
+    "group_chromophore_count",
+    "group_chromophore_mean",
+    "group_chromophore_mean_low",
+    "group_chromophore_mean_high",
+    "group_chromophore_standard_deviation",
+)
 # absorption in Gaussian bands (standard deviation 30 nm) at 600, 540 and 450 nm
 # relative to that at 540 nm: eumelanin (Sarna and Swartz 1988), haemoglobin with 75 %
 # oxygenation (Prahl 1999); a test computes them from the tables
@@ -609,3 +626,50 @@ def plot_chromophores(
         frameon=False,
     )
     return ax
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Parameters of the study of chromophores."""
+
+    group_by: str | None = group_option()
+    seed: int = seed_option("the independent components and the bootstrap")
+
+
+def compute(population: Population, parameters: Parameters) -> Results:
+    """The results of the study. The mean face is omitted, with a note, where no texel
+    has enough subjects.
+    """
+    cohort = population.cohort
+    landmarks = population.landmarks
+    mixed = population.mixed_fits
+    rng = np.random.default_rng(parameters.seed)
+    axes = chromophore_axes(cohort, landmarks=landmarks, mixed_fits=mixed, rng=rng)
+    statistics = chromophore_statistics(cohort, axes=axes, landmarks=landmarks)
+    results = {
+        "chromophores": axes.merge(statistics, combine_attrs="override"),
+        "chromophore_table": chromophore_table(
+            cohort, statistics=statistics, group_by=parameters.group_by
+        ),
+    }
+    try:
+        results["mean_face"] = mean_face(cohort, mixed_fits=mixed)
+    except InputError as error:
+        population.notes.extend(note("", str(fault)) for fault in error.faults)
+    return results
+
+
+STUDY = Study(
+    name="chromophores",
+    description="melanin and haemoglobin in maps of albedo, and the mean face",
+    layout="maps",
+    parameters=Parameters,
+    compute=compute,
+    shown=("chromophores", "chromophore_table"),
+    tabulate=lambda _, table: table_of(
+        table, COLUMNS, ("group", "region", "chromophore")
+    ),
+    plot=lambda statistics, table: plot_chromophores(statistics, table=table),
+    describe=lambda axes, _: describe_chromophores(axes),
+    uses_registration=True,
+)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -9,8 +10,10 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from skindb.analysis.each_take import each_take, shared_once
+from skindb.analysis.study import Population, Results, Study
 from skindb.errors import Fault, InputError
 from skindb.numerics.factorise import principal_axes
+from skindb.parameters import option
 from skindb.render.image import tone_map
 from skindb.schema import dataset
 from skindb.schema.cohort import require_same_fit
@@ -248,3 +251,31 @@ def plot_components(table: xr.Dataset, *, most: int = 3) -> Figure:
     figure.suptitle(f"albedo of {table.sizes['take']} takes", fontsize=9)
     figure.tight_layout()
     return figure
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Parameters of the study of components."""
+
+    k: int = option(5, "Largest number of components.", minimum=1)
+
+
+def compute(population: Population, parameters: Parameters) -> Results:
+    """The results of the study."""
+    mixed = population.mixed_fits
+    components = face_components(population.cohort, most=parameters.k, mixed_fits=mixed)
+    return {"components": components}
+
+
+STUDY = Study(
+    name="components",
+    description="principal components of albedo, drawn as faces",
+    layout="maps",
+    parameters=Parameters,
+    compute=compute,
+    shown=("components",),
+    tabulate=tabulate_components,
+    plot=plot_components,
+    describe=describe_components,
+    uses_registration=True,
+)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +13,15 @@ from scipy import stats
 from skindb.analysis import colours
 from skindb.analysis.members import takes_to_compare
 from skindb.analysis.quantities import CHANNELS, SURFACE, Quantities, quantities_of
+from skindb.analysis.study import (
+    Population,
+    Results,
+    Study,
+    Table,
+    permutations_option,
+    seed_option,
+    table_of,
+)
 from skindb.errors import Fault, InputError
 from skindb.numerics.statistics import benjamini_hochberg, known_mean
 from skindb.schema import dataset
@@ -30,6 +40,15 @@ COMPONENTS = (
     *(f"R_d {channel}" for channel in CHANNELS),
     SURFACE,
     *(f"log sigma_tr {c}" for c in CHANNELS),
+)
+
+COLUMNS = (
+    "correlation_count",
+    "component_correlation",
+    "component_correlation_low",
+    "component_correlation_high",
+    "correlation_p",
+    "correlation_p_false_discovery",
 )
 
 
@@ -247,3 +266,41 @@ def plot_correlations(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
         "at a false discovery rate of 5 %"
     )
     return ax
+
+
+def tabulate_correlations(table: xr.Dataset) -> Table:
+    """Header and one row per pair."""
+    return table_of(table, COLUMNS, ["pair"])
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Parameters of the study of correlations."""
+
+    permutations: int = permutations_option()
+    seed: int = seed_option("the permutations and the bootstrap")
+
+
+def compute(population: Population, parameters: Parameters) -> Results:
+    """The results of the study."""
+    table = component_correlations(
+        population.cohort,
+        permutations=parameters.permutations,
+        mixed_fits=population.mixed_fits,
+        rng=np.random.default_rng(parameters.seed),
+    )
+    return {"correlations": table}
+
+
+STUDY = Study(
+    name="correlations",
+    description="correlations between albedo, surface BRDF and translucency",
+    layout="tables",
+    parameters=Parameters,
+    compute=compute,
+    shown=("correlations",),
+    tabulate=tabulate_correlations,
+    plot=plot_correlations,
+    describe=describe_correlations,
+    compares_normal=True,
+)

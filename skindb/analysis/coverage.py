@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,6 +20,7 @@ from skindb.analysis.quantities import (
     is_age,
     is_number,
 )
+from skindb.analysis.study import Population, Results, Study, table_of
 from skindb.errors import Fault, InputError
 from skindb.schema import IDENTIFIED, dataset
 from skindb.schema.cohort import require_takes
@@ -470,3 +472,26 @@ def _plot_table(
 def _cell_count(cells: Mapping[tuple[str, ...], int], wanted: tuple[str, ...]) -> int:
     """Number of subjects in a crossing, whatever the order of its factors."""
     return next((count for name, count in cells.items() if set(name) == set(wanted)), 0)
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """The study of coverage has no parameters."""
+
+
+def compute(population: Population, _: Parameters) -> Results:
+    """The results of the study."""
+    return {"coverage": coverage_report(population.cohort)}
+
+
+STUDY = Study(
+    name="coverage",
+    description="number of subjects by skin type, gender and age",
+    layout="tables",
+    parameters=Parameters,
+    compute=compute,
+    shown=("coverage",),
+    tabulate=lambda report: table_of(report, ["coverage_count"], ["cell"]),
+    plot=plot_coverage,
+    describe=describe_coverage,
+)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,6 +24,15 @@ from skindb.analysis.group_effects import (
 )
 from skindb.analysis.members import texts
 from skindb.analysis.quantities import CHANNELS, SURFACE, Quantities
+from skindb.analysis.study import (
+    Population,
+    Results,
+    Study,
+    adjust_option,
+    compared_option,
+    permutations_option,
+    seed_option,
+)
 from skindb.errors import Fault, InputError
 from skindb.numerics.inference import (
     effects,
@@ -49,6 +59,7 @@ MAPPED = {
     "texel_surface_reflectance": SURFACE,
     "texel_sigma_tr": "sigma_tr",
 }
+PERMUTATIONS = 1000  # of each of 65,536 texels
 LOGARITHMIC = "sigma_tr"
 SHOWN_FRACTION = 0.995  # fraction of the texels within the range of a colour scale
 SHOWN = ("R_d G", SURFACE, "sigma_tr G")
@@ -60,7 +71,7 @@ def effect_maps(
     group_by: str,
     adjust: Sequence[str] = (),
     size: int = SIZE,
-    permutations: int = 1000,
+    permutations: int = PERMUTATIONS,
     min_fraction: float = MIN_FRACTION,
     mixed_fits: bool = False,
     rng: np.random.Generator,
@@ -397,3 +408,41 @@ def _finite_extent(values: Array) -> tuple[slice, slice]:
         at = np.flatnonzero(known.any(axis=axis))
         found.append(slice(int(at[0]), int(at[-1]) + 1) if at.size else slice(None))
     return found[0], found[1]
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Parameters of the study of maps."""
+
+    group_by: str = compared_option()
+    adjust: tuple[str, ...] = adjust_option()
+    permutations: int = permutations_option(PERMUTATIONS)
+    seed: int = seed_option("the permutations")
+
+
+def compute(population: Population, parameters: Parameters) -> Results:
+    """The results of the study."""
+    maps = effect_maps(
+        population.cohort,
+        group_by=parameters.group_by,
+        adjust=parameters.adjust,
+        permutations=parameters.permutations,
+        mixed_fits=population.mixed_fits,
+        rng=np.random.default_rng(parameters.seed),
+    )
+    return {"effect_maps": maps}
+
+
+STUDY = Study(
+    name="maps",
+    description="differences between groups at every texel of the common (u, v)",
+    layout="maps",
+    parameters=Parameters,
+    compute=compute,
+    shown=("effect_maps",),
+    tabulate=tabulate_effect_maps,
+    plot=plot_effect_maps,
+    describe=describe_effect_maps,
+    uses_registration=True,
+    compares_normal=True,
+)

@@ -34,6 +34,17 @@ from skindb.analysis.quantities import (
     require_adjustable,
     require_one_kind,
 )
+from skindb.analysis.study import (
+    Population,
+    Results,
+    Study,
+    Table,
+    adjust_option,
+    compared_option,
+    permutations_option,
+    seed_option,
+    table_of,
+)
 from skindb.errors import Fault, InputError
 from skindb.numerics.inference import (
     Effects,
@@ -63,6 +74,18 @@ ASSOCIATED = 0.5
 MAX_CONDITION_NUMBER = 30.0
 SIGNIFICANT = 0.05  # of adjusted p values
 SIDES = ("with", "without")
+COLUMNS = (
+    "effect",
+    "effect_low",
+    "effect_high",
+    "effect_percent",
+    "effect_percent_low",
+    "effect_percent_high",
+    "effect_p",
+    "effect_p_adjusted",
+    "effect_p_false_discovery",
+    "effect_detectable",
+)
 CONTRAST_RULE = "the subjects must determine the effect"
 CONTRAST_CURE = "adjust for fewer attributes, compare other groups, or add subjects"
 
@@ -676,3 +699,56 @@ def _word(value: Any) -> str:
         if isinstance(value, float) and value.is_integer()
         else str(value)
     )
+
+
+def tabulate_group_effects(table: xr.Dataset) -> Table:
+    """Header and one row per comparison and quantity."""
+    counts = {
+        f"subjects_{side}": table["effect_count"].sel(side=side, drop=True)
+        for side in SIDES
+    }
+    names = [*counts, *COLUMNS]
+    return table_of(table.assign(counts), names, ("contrast", "quantity"))
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Parameters of the study of groups."""
+
+    group_by: str = compared_option()
+    adjust: tuple[str, ...] = adjust_option()
+    permutations: int = permutations_option()
+    seed: int = seed_option("the permutations")
+
+
+def compute(population: Population, parameters: Parameters) -> Results:
+    """The results of the study."""
+    effects = group_effects(
+        population.cohort,
+        group_by=parameters.group_by,
+        adjust=parameters.adjust,
+        permutations=parameters.permutations,
+        mixed_fits=population.mixed_fits,
+        rng=np.random.default_rng(parameters.seed),
+    )
+    return {"effects": effects}
+
+
+STUDY = Study(
+    name="groups",
+    description="differences between groups of subjects, with intervals and p values",
+    layout="tables",
+    parameters=Parameters,
+    compute=compute,
+    shown=("effects",),
+    tabulate=tabulate_group_effects,
+    plot=plot_group_effects,
+    describe=describe_group_effects,
+    columns_of_files=(
+        "effect_percent_low",
+        "effect_percent_high",
+        "effect_p_false_discovery",
+        "effect_detectable",
+    ),
+    compares_normal=True,
+)

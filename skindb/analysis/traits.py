@@ -6,12 +6,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import xarray as xr
 
-from skindb.analysis.albedo import quantiles
+from skindb.analysis.albedo import albedo_and_texture, quantiles
 from skindb.analysis.members import (
     is_normal,
     known_traits,
@@ -22,14 +23,27 @@ from skindb.analysis.members import (
     trait_name,
     trait_names,
 )
+from skindb.analysis.population_basis import population_basis
 from skindb.analysis.quantities import (
     attribute_of_subjects,
     columns_of,
     require_adjustable,
 )
+from skindb.analysis.study import (
+    DICTIONARY,
+    Population,
+    Results,
+    Study,
+    Table,
+    adjust_option,
+    seed_option,
+    table_of,
+)
+from skindb.analysis.summary import SAMPLED
 from skindb.errors import Fault, InputError
 from skindb.numerics.inference import missing_patterns
 from skindb.numerics.statistics import known_mean
+from skindb.parameters import option
 from skindb.schema import IDENTIFIED, dataset
 from skindb.schema.cohort import require_same_fit
 from skindb.schema.regions import FACE
@@ -451,3 +465,83 @@ def plot_traits(traits: xr.Dataset, *, ax: Axes | None = None) -> Axes:
         image, ax=ax, label="difference of the coefficient with and without the trait"
     )
     return ax
+
+
+def tabulate_traits(traits: xr.Dataset) -> Table:
+    """Header and one row per trait: numbers of takes, and RMS lengths of the parts of
+    its vector and of their errors.
+    """
+    face = (
+        traits.sel(region=FACE, drop=True)
+        if FACE in traits["region"].values
+        else traits.isel(region=0, drop=True)
+    )
+    parts = {
+        "brdf": (traits, "trait_brdf_shift", ["component"]),
+        "colour": (face, "trait_quantile_shift", ["axis", "level"]),
+        "log_sigma_tr": (traits, "trait_log_sigma_tr_shift", ["channel"]),
+    }
+    columns = {
+        f"takes_{side}": traits["trait_count"].sel(side=side, drop=True)
+        for side in SIDES
+    }
+    for name, (vectors, variable, dims) in parts.items():
+        for suffix, part in (("shift", variable), ("noise", f"{variable}_error")):
+            if part in vectors:
+                square = (vectors[part] ** 2).mean(dims, skipna=False)
+                columns[f"{name}_{suffix}"] = square**0.5
+    return table_of(traits.assign(columns), list(columns), ["trait"])
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Parameters of the study of traits."""
+
+    k: int = option(6, "Number of components of the common basis.", minimum=1)
+    in_metric: bool = option(
+        False,
+        "Find the common basis in the metric of BRDFs instead of that of coefficients.",
+    )
+    adjust: tuple[str, ...] = adjust_option()
+    seed: int = seed_option("the factorisation and the bootstrap")
+    dictionary: Path | None = option(None, DICTIONARY)
+
+
+def compute(population: Population, parameters: Parameters) -> Results:
+    """The results of the study."""
+    rng = np.random.default_rng(parameters.seed)
+    mixed = population.mixed_fits
+    basis = population_basis(
+        population.cohort,
+        tables=population.brdf_tables(),
+        k=parameters.k,
+        in_metric=parameters.in_metric,
+        mixed_fits=mixed,
+        rng=rng,
+    )
+    colours = albedo_and_texture(population)
+    vectors = trait_vectors(
+        population.open_cohort("tables"),
+        basis=basis,
+        albedo=colours["albedo"],
+        texture=colours.get("texture"),
+        adjust=parameters.adjust,
+        mixed_fits=mixed,
+        rng=rng,
+    )
+    return {"population_basis": basis, "traits": vectors, **colours}
+
+
+STUDY = Study(
+    name="traits",
+    description="vectors of BRDF, albedo and translucency for each attribute",
+    layout="surfels",
+    parameters=Parameters,
+    compute=compute,
+    shown=("traits",),
+    tabulate=tabulate_traits,
+    plot=plot_traits,
+    describe=describe_traits,
+    cohort_options={"surfels": SAMPLED},
+    uses_registration=True,
+)

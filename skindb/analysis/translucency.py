@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,6 +12,14 @@ from numpy.typing import NDArray
 from skindb.analysis import colours
 from skindb.analysis.group_effects import FEW
 from skindb.analysis.members import groups_by, takes_to_compare
+from skindb.analysis.study import (
+    Population,
+    Results,
+    Study,
+    Table,
+    group_option,
+    table_of,
+)
 from skindb.numerics.statistics import Moments, variance_components
 from skindb.schema import IDENTIFIED, ProbeStatus, dataset
 from skindb.schema.cohort import require_same_fit, require_takes
@@ -18,6 +27,18 @@ from skindb.types import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+COLUMNS = (
+    "sigma_tr_count",
+    "sigma_tr_mean",
+    "sigma_tr_mean_low",
+    "sigma_tr_mean_high",
+    "sigma_tr_standard_deviation",
+    "sigma_tr_measurement_error",
+    "sigma_tr_total_error",
+    "sigma_tr_people_fraction",
+    "sigma_tr_repeat_deviation",
+)
 
 
 def translucency_table(
@@ -253,3 +274,41 @@ def plot_translucency(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     ax.set_ylabel("mean sigma_tr with 95 % CI [mm-1]")
     ax.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
     return ax
+
+
+def tabulate_translucency(table: xr.Dataset) -> Table:
+    """Header and one row per group, site and channel."""
+    names = [name for name in COLUMNS if name in table]
+    return table_of(table, names, ("group", "site", "channel"))
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Parameters of the study of translucency."""
+
+    group_by: str | None = group_option()
+
+
+def compute(population: Population, parameters: Parameters) -> Results:
+    """The results of the study."""
+    table = translucency_table(
+        population.cohort,
+        group_by=parameters.group_by,
+        mixed_fits=population.mixed_fits,
+    )
+    return {"translucency_table": table}
+
+
+STUDY = Study(
+    name="translucency",
+    description="translucency by site of the face",
+    layout="tables",
+    parameters=Parameters,
+    compute=compute,
+    shown=("translucency_table",),
+    tabulate=tabulate_translucency,
+    plot=plot_translucency,
+    describe=describe_translucency,
+    columns_of_files=("sigma_tr_total_error", "sigma_tr_repeat_deviation"),
+    compares_normal=True,
+)

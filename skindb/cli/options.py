@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import Field, fields
+from dataclasses import MISSING, Field, fields
 from functools import wraps
 from pathlib import Path
 from types import UnionType
@@ -119,6 +119,8 @@ def _click_option(
         text += f"  [default: {shown}]"
     name = limits.name or spec.name.replace("_", "-")
     about: dict[str, Any] = {"default": None if unset else default, "help": text}
+    if default is MISSING:
+        about = {"required": True, "help": text}
     if limits.metavar:
         about["metavar"] = limits.metavar
     if not limits.show_default:

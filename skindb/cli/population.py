@@ -6,247 +6,212 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-from click.core import ParameterSource
 
 import skindb
 from skindb.cli.engine import SCHEDULER, client_of, shared_path
-from skindb.cli.options import DB, DICTIONARY, PATH, TAKE, WORKERS, Seed, common
+from skindb.cli.options import DB, DICTIONARY, PATH, TAKE, WORKERS, common, options_of
 from skindb.cli.shared import aligned, bar, emit, existing, trait_amounts, writable
-from skindb.errors import Fault, InputError
 from skindb.files import csv_text, private_file
-from skindb.limits import MAX_PERMUTATIONS
 
 if TYPE_CHECKING:
     import xarray as xr
+
+    from skindb.analysis.study import Study
+    from skindb.store import Database
 
 RELEASE = click.option(
     "--release",
     metavar="NAME",
     help="Release whose versions are used.  [default: the newest versions]",
 )
-# study: its options
-OPTIONS = {
-    "brdf": ("seed", "dictionary"),
-    "albedo": ("group_by",),
-    "translucency": ("group_by",),
-    "traits": ("k", "in_metric", "adjust", "seed", "dictionary"),
-    "groups": ("group_by", "adjust", "permutations", "seed"),
-    "components": ("k",),
-    "correlations": ("permutations", "seed"),
-    "maps": ("group_by", "adjust", "permutations", "seed"),
-    "chromophores": ("group_by", "seed"),
-    "coverage": (),
-    "surface": ("group_by", "k", "permutations", "seed", "dictionary"),
-}
 
-# columns that would make lines too long for a terminal; they are in the output of --json and --csv
-COLUMNS_OF_FILES_ONLY = (
-    "sigma_tr_total_error",
-    "sigma_tr_repeat_deviation",
-    "effect_percent_low",
-    "effect_percent_high",
-    "effect_p_false_discovery",
-    "effect_detectable",
+
+class Studies(click.Group):
+    """The studies as commands, each with the options of its own parameters."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
+        """Names of the studies."""
+        return list(skindb.analysis.STUDIES)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002
+        """The command of a study."""
+        study = skindb.analysis.STUDIES.get(cmd_name)
+        return None if study is None else _study_command(study)
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """The command of the study that the first argument names."""
+        if args[0] not in skindb.analysis.STUDIES:
+            names = ", ".join(self.list_commands(ctx))
+            raise click.UsageError(
+                f"Invalid value for 'STUDY': {args[0]!r} is not one of {names}.", ctx
+            )
+        return super().resolve_command(ctx, args)
+
+    def format_commands(
+        self,
+        ctx: click.Context,  # noqa: ARG002
+        formatter: click.HelpFormatter,
+    ) -> None:
+        """List the studies."""
+        studies = skindb.analysis.STUDIES.values()
+        with formatter.section("Studies"):
+            formatter.write_dl([(study.name, study.description) for study in studies])
+
+
+@click.group(
+    cls=Studies, subcommand_metavar="STUDY [OPTIONS]", invoke_without_command=True
 )
-
-
-@click.command()
 @DB
-@click.argument("what", metavar="STUDY", type=click.Choice(list(OPTIONS)))
-@click.option(
-    "--take",
-    "takes",
-    multiple=True,
-    help="Take to use (may be given several times).  [default: all]",
-)
-@click.option(
-    "--group-by", help="Attribute or trait by which takes are grouped: gender, age, ..."
-)
-@click.option(
-    "--adjust",
-    metavar="NAME,...",
-    default="",
-    show_default=False,
-    help="Attributes that the comparison adjusts for, separated by commas.",
-)
-@click.option(
-    "--permutations",
-    type=click.IntRange(100, MAX_PERMUTATIONS),
-    help="Largest number of permutations for p values.  [default: 10000, for maps 1000]",
-)
-@click.option(
-    "--k",
-    type=click.IntRange(1),
-    help="Number of components.  [default: 6 for the common basis, 5 for maps of albedo]",
-)
-@click.option(
-    "--in-metric",
-    is_flag=True,
-    help="Find the common basis in the metric of BRDFs instead of that of coefficients.",
-)
-@click.option(
-    "--seed",
-    type=Seed(),
-    default=0,
-    help="Random seed for factorisation, bootstrap and permutations.",
-)
-@DICTIONARY
-@RELEASE
-@click.option(
-    "--name", help="Name under which the study is stored.  [default: its parameters]"
-)
-@click.option("--plot", type=PATH, help="Plot to write (.png, .pdf, .svg).")
-@click.option(
-    "--faces",
-    type=PATH,
-    help="Picture of the least and the most translucent take, for translucency (.png, .pdf, .svg).",
-)
-@click.option("--site", help="Site of the probe for --faces.  [default: cheek]")
-@click.option(
-    "--csv", type=PATH, help="Table to write as comma-separated values (.csv)."
-)
-@SCHEDULER
-@common
-def analyze(
-    db: str,
-    what: str,
-    takes: tuple[str, ...],
-    release: str | None,
-    name: str | None,
-    plot: Path | None,
-    csv: Path | None,
-    faces: Path | None,
-    site: str | None,
-    scheduler: str | None,
-    **options: Any,
-) -> None:
+@click.pass_context
+def analyze(ctx: click.Context, db: str) -> None:
     """Study the population of the fitted takes.
 
-    \b
-    brdf           number of basis BRDFs that the population needs
-    albedo         distribution of the diffuse albedo
-    translucency   translucency by site of the face
-    traits         vectors of BRDF, albedo and translucency for each attribute
-    groups         differences between groups of subjects, with intervals and p values
-    components     principal components of albedo, drawn as faces
-    correlations   correlations between albedo, surface BRDF and translucency
-    maps           differences between groups at every texel of the common (u, v)
-    chromophores   melanin and haemoglobin in maps of albedo, and the mean face
-    coverage       number of subjects by skin type, gender and age
-    surface        differences between the surface BRDFs of groups
-
     A study with other parameters, of other takes or of a release is stored under its
-    own name, and does not replace the study with default parameters.
-    """  # noqa: D301  click needs the character
-    if plot:
-        writable(plot, ".png", ".pdf", ".svg")
-    if csv:
-        writable(csv, ".csv")
-    if faces:
-        writable(faces, ".png", ".pdf", ".svg")
-    if (faces or site) and what != "translucency":
-        raise InputError(
-            Fault(
-                "--faces" if faces else "--site",
-                "belongs to the study translucency",
-                f"the study {what}",
-                "omit it",
-            )
-        )
-    context = click.get_current_context()
-    for option in sorted({name for known in OPTIONS.values() for name in known}):
-        if (
-            option not in OPTIONS[what]
-            and context.get_parameter_source(option) is ParameterSource.COMMANDLINE
+    own name, and does not replace the study with default parameters. The options of a
+    study are listed by: skindb analyze DB STUDY --help
+    """
+    if ctx.invoked_subcommand is None:
+        names = ",\n\t".join(skindb.analysis.STUDIES)
+        raise click.UsageError(f"Missing argument 'STUDY'. Choose from:\n\t{names}")
+    ctx.obj = db
+
+
+def _study_command(study: Study) -> click.Command:
+    """The command of one study."""
+
+    @click.command(study.name, help=f"Study the {study.description}.")
+    @click.option(
+        "--take",
+        "takes",
+        multiple=True,
+        help="Take to use (may be given several times).  [default: all]",
+    )
+    @options_of(study.parameters)
+    @RELEASE
+    @click.option(
+        "--name",
+        help="Name under which the study is stored.  [default: its parameters]",
+    )
+    @click.option("--plot", type=PATH, help="Plot to write (.png, .pdf, .svg).")
+    @click.option(
+        "--csv", type=PATH, help="Table to write as comma-separated values (.csv)."
+    )
+    @SCHEDULER
+    @common
+    @click.pass_obj
+    def command(
+        db: str,
+        takes: tuple[str, ...],
+        parameters: Any,
+        release: str | None,
+        name: str | None,
+        plot: Path | None,
+        csv: Path | None,
+        scheduler: str | None,
+        faces: Path | None = None,
+        site: str | None = None,
+    ) -> None:
+        for picture in (plot, faces):
+            if picture:
+                writable(picture, ".png", ".pdf", ".svg")
+        if csv:
+            writable(csv, ".csv")
+        chosen = dict(vars(parameters))
+        if "adjust" in chosen:
+            names = ",".join(chosen["adjust"]).split(",")
+            chosen["adjust"] = tuple(name.strip() for name in names if name.strip())
+        if "dictionary" in chosen:
+            chosen["dictionary"] = shared_path(chosen["dictionary"], scheduler)
+        database = existing(db)
+        progress = bar()
+        progress(f"analyze {study.name}", 0, 1)
+        used = takes or database.takes("model", release=release)
+        with skindb.workflow.logged_action(
+            database,
+            "study",
+            used,
+            what=study.name,
+            arguments={"faces": faces is not None},
         ):
-            *most, last = (name for name, known in OPTIONS.items() if option in known)
-            belongs = (
-                f"belongs to the studies {', '.join(most)} and {last}"
-                if most
-                else f"belongs to the study {last}"
-            )
-            raise InputError(
-                Fault(
-                    f"--{option.replace('_', '-')}",
-                    belongs,
-                    f"the study {what}",
-                    "omit it",
+            with (
+                client_of(scheduler, progress) as client,
+                skindb.workflow.computing_on(client, database.folder),
+            ):
+                results = skindb.workflow.study(
+                    database,
+                    study.name,
+                    takes=takes,
+                    release=release,
+                    name=name,
+                    **chosen,
                 )
-            )
-    options["adjust"] = [
-        name.strip() for name in options["adjust"].split(",") if name.strip()
+            progress(f"analyze {study.name}", 1, 1)
+            if faces:
+                skindb.workflow.translucency_grid(
+                    database, faces, site=site or "cheek", progress=progress
+                )
+        if plot:
+            skindb.analysis.plot_study(results, plot)
+        _report(database, study, results, csv)
+
+    return _with_faces(command) if study.name == "translucency" else command
+
+
+def _with_faces(command: click.Command) -> click.Command:
+    """The command of translucency, which can also draw takes."""
+    command.params += [
+        click.Option(
+            ["--faces"],
+            type=PATH,
+            help="Picture of the least and the most translucent take (.png, .pdf, .svg).",
+        ),
+        click.Option(
+            ["--site"], help="Site of the probe for --faces.  [default: cheek]"
+        ),
     ]
-    if what in ("groups", "maps", "surface") and not options["group_by"]:
-        raise InputError(
-            Fault(
-                f"analyze {what}",
-                "needs an attribute to compare by",
-                "none",
-                "name it with --group-by",
-            )
-        )
-    database = existing(db)
-    progress = bar()
-    progress(f"analyze {what}", 0, 1)
-    given = {
-        option: options[option]
-        for option in OPTIONS[what]
-        if options[option] is not None
-    }
-    if "dictionary" in given:
-        given["dictionary"] = shared_path(given["dictionary"], scheduler)
-    used = takes or database.takes("model", release=release)
-    with skindb.workflow.logged_action(
-        database, "study", used, what=what, arguments={"faces": faces is not None}
-    ):
-        with (
-            client_of(scheduler, progress) as client,
-            skindb.workflow.computing_on(client, database.folder),
-        ):
-            study = skindb.workflow.STUDIES[what](
-                database, takes=takes, release=release, name=name, **given
-            )
-        progress(f"analyze {what}", 1, 1)
-        if faces:
-            skindb.workflow.translucency_grid(
-                database, faces, site=site or "cheek", progress=progress
-            )
-    if plot:
-        skindb.analysis.plot_study(study, plot)
-    header, rows = skindb.analysis.tabulate_study(study)
+    return command
+
+
+def _report(
+    database: Database, study: Study, results: xr.DataTree, csv: Path | None
+) -> None:
+    """Print the table and the notes of a study, and write its table."""
+    header, rows = skindb.analysis.tabulate_study(results)
     if csv:
         private_file(csv).write_text(csv_text(header, rows), encoding="utf-8")
-    record = database.record(
-        "population", study.attrs["study"], study.attrs["generation"]
-    )
-    notes = skindb.analysis.describe_study(study)
+    attrs = results.attrs
+    record = database.record("population", attrs["study"], attrs["generation"])
+    notes = skindb.analysis.describe_study(results)
     lines = [
-        f"skipped: {line}" for line in skindb.schema.note_lines(study.attrs["skipped"])
+        f"{label}: {line}"
+        for label, name in (
+            ("skipped", "skipped"),
+            ("out of date", "outdated"),
+            ("registration", "registration"),
+        )
+        for line in skindb.schema.note_lines(attrs.get(name, []))
     ]
-    lines += [
-        f"out of date: {line}"
-        for line in skindb.schema.note_lines(study.attrs["outdated"])
-    ]
-    lines += [
-        f"registration: {line}"
-        for line in skindb.schema.note_lines(study.attrs.get("registration", []))
-    ]
-    result = {
-        "study": record.take,
-        "generation": record.generation,
-        "path": record.path,
-    }
     units = {
         name: skindb.schema.VARIABLES[name].units
         for name in header
         if name in skindb.schema.VARIABLES
     }
-    result |= {"header": header, "units": units, "rows": rows, "notes": notes}
-    result |= {"skipped": study.attrs["skipped"]}
-    shown = [i for i, name in enumerate(header) if name not in COLUMNS_OF_FILES_ONLY]
-    table = aligned([[line[i] for i in shown] for line in [header, *rows]])
-    table += _unit_lines(units, [header[i] for i in shown])
-    emit(result, [*table, *notes, *lines])
+    report = {
+        "study": record.take,
+        "generation": record.generation,
+        "path": record.path,
+        "header": header,
+        "units": units,
+        "rows": rows,
+        "notes": notes,
+        "skipped": attrs["skipped"],
+    }
+    columns = [i for i, name in enumerate(header) if name not in study.columns_of_files]
+    table = aligned([[line[i] for i in columns] for line in [header, *rows]])
+    table += _unit_lines(units, [header[i] for i in columns])
+    emit(report, [*table, *notes, *lines])
 
 
 def _unit_lines(units: dict[str, str], shown: list[str]) -> list[str]:

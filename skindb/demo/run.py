@@ -93,11 +93,11 @@ def run_demo(
     with results.stage("analyze"):
         # once, for every study
         workflow.register_takes(db, workers=many, progress=tell)
-        results.studies["brdf"] = workflow.basis_size(db, seed=seed)
-        results.studies["albedo"] = workflow.albedo(db)
-        results.studies["translucency"] = workflow.translucency(db)
+        results.studies["brdf"] = workflow.study(db, "brdf", seed=seed)
+        results.studies["albedo"] = workflow.study(db, "albedo")
+        results.studies["translucency"] = workflow.study(db, "translucency")
         if takes > 1:
-            results.studies["traits"] = workflow.traits(db, seed=seed)
+            results.studies["traits"] = workflow.study(db, "traits", seed=seed)
     with results.stage("edit"):
         _edit(results, db)
     with results.stage("export"):

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from skindb.analysis.tabulate import tabulate_study
+from skindb.analysis.studies import tabulate_study
 from skindb.demo.page import Table
 from skindb.demo.results import Results
 from skindb.schema import FitStatus

@@ -4,7 +4,7 @@ what they return.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import lazy_loader
 
@@ -34,20 +34,7 @@ if TYPE_CHECKING:
     from skindb.workflow.registration import register_takes, registered_datasets
     from skindb.workflow.session import capture_session, plan_session
     from skindb.workflow.simulation import begin_cohort, simulate, simulate_one
-    from skindb.workflow.studies import (
-        STUDIES,
-        albedo,
-        basis_size,
-        chromophores,
-        components,
-        correlations,
-        coverage,
-        groups,
-        maps,
-        surface,
-        traits,
-        translucency,
-    )
+    from skindb.workflow.studies import STUDY_FUNCTIONS, study
     from skindb.workflow.summaries import summarise
     from skindb.workflow.superseded import superseded_calibrations, superseded_lines
     from skindb.workflow.takes import Outcome, faults_of, map_takes, results_of
@@ -73,29 +60,23 @@ if TYPE_CHECKING:
     )
 
 __all__ = [
-    "STUDIES",
+    "STUDY_FUNCTIONS",
     "NotLoggedWarning",
     "Outcome",
     "Refreshed",
     "Withdrawal",
     "acting_as",
-    "albedo",
     "backup",
     "backup_states",
     "basis_grid",
-    "basis_size",
     "begin_cohort",
     "calibrate",
     "capture_session",
     "captured_subjects",
-    "chromophores",
     "clean",
     "compare_take",
-    "components",
     "computing_on",
     "connected",
-    "correlations",
-    "coverage",
     "create_release",
     "dashboard_link",
     "describe_calibration",
@@ -108,12 +89,10 @@ __all__ = [
     "faults_of",
     "fit_take",
     "fit_with",
-    "groups",
     "ingest_take",
     "landmark_page",
     "logged_action",
     "map_takes",
-    "maps",
     "parameters_of",
     "plan_session",
     "plan_take",
@@ -130,14 +109,12 @@ __all__ = [
     "simulate",
     "simulate_one",
     "stale_results",
+    "study",
     "summarise",
     "superseded_calibrations",
     "superseded_lines",
-    "surface",
     "takes_to_fit",
     "takes_without_consent",
-    "traits",
-    "translucency",
     "translucency_grid",
     "view_server",
     "view_takes",
@@ -146,7 +123,7 @@ __all__ = [
 ]
 
 # each step needs other large packages: a command imports what it uses
-__getattr__, __dir__, _ = lazy_loader.attach(
+_attribute, _, _ = lazy_loader.attach(
     __name__,
     submod_attrs={
         "administration": ["clean", "create_release", "record_consent"],
@@ -173,20 +150,7 @@ __getattr__, __dir__, _ = lazy_loader.attach(
         "viewing": ["explain_view", "landmark_page", "view_server", "view_takes"],
         "upkeep": ["Refreshed", "refresh", "repeat_requests", "stale_results"],
         "registration": ["register_takes", "registered_datasets"],
-        "studies": [
-            "STUDIES",
-            "albedo",
-            "basis_size",
-            "chromophores",
-            "components",
-            "correlations",
-            "coverage",
-            "groups",
-            "maps",
-            "surface",
-            "traits",
-            "translucency",
-        ],
+        "studies": ["STUDY_FUNCTIONS", "study"],
         "summaries": ["summarise"],
         "takes": ["Outcome", "faults_of", "map_takes", "results_of"],
         "withdrawal": [
@@ -198,3 +162,18 @@ __getattr__, __dir__, _ = lazy_loader.attach(
         ],
     },
 )
+
+
+def __getattr__(name: str) -> Any:
+    """A step, or the function of one study: `translucency` is `study` with this name."""
+    try:
+        return _attribute(name)
+    except AttributeError:
+        if name.startswith("_") or name not in _attribute("STUDY_FUNCTIONS"):
+            raise
+        return _attribute("STUDY_FUNCTIONS")[name]
+
+
+def __dir__() -> list[str]:
+    """The steps, and the functions of the studies."""
+    return sorted([*__all__, *_attribute("STUDY_FUNCTIONS")])

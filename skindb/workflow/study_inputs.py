@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,8 @@ from dask.delayed import Delayed, delayed
 from numpy.typing import NDArray
 
 from skindb.analysis.registration import describe_registration
+from skindb.analysis.study import Population, Study
+from skindb.analysis.texture import common_landmarks
 from skindb.errors import Fault, InputError
 from skindb.reflectance.dictionary import convolve_disc, embedded_dictionary
 from skindb.reflectance.table_file import read_dictionary
@@ -26,15 +28,6 @@ from skindb.workflow.registration import (
     takes_with_landmarks,
 )
 from skindb.workflow.summaries import summarise
-
-
-@dataclass(frozen=True)
-class Frame:
-    """Registrations of takes, and notes on them."""
-
-    records: Mapping[str, Record]
-    datasets: Mapping[str, xr.Dataset]
-    notes: list[Note]
 
 
 def dictionary_tables(
@@ -61,87 +54,118 @@ def dictionary_tables(
     return convolve_disc(own, disc).table
 
 
-def study_cohort(
-    db: Database, layout: Any, takes: Sequence[str], release: str | None, **options: Any
-) -> xr.Dataset:
-    """A cohort of the takes of a study; models of earlier versions of skindb are
-    summarised for it.
+def open_population(
+    db: Database,
+    study: Study,
+    *,
+    takes: Sequence[str] = (),
+    release: str | None = None,
+    dictionary: Path | None = None,
+) -> tuple[Population, list[Record]]:
+    """What a study reads, and the records of the versions that it is made from.
+
+    Parameters
+    ----------
+    db
+        Database with models.
+    study
+        The study.
+    takes
+        Default all whose consent covers statistics.
+    release
+        Name of a release to study; default the newest versions.
+    dictionary
+        Path of the dictionary of the fits; default the embedded one.
     """
-    _summarise(db, takes, release)
-    return db.cohort(layout, takes=takes or None, release=release, **options)
+    if study.uses_registration:
+        require_covered(db, release)
+    _require_models(db, takes, release)
+    open_models = partial(db.cohort, takes=takes or None, release=release)
+    if study.layout != "maps":
+        cohort = open_models(study.layout, **study.cohort_options)
+    else:
+        cohort = open_models("tables")
+    registrations: Mapping[str, Record] = {}
+    notes: list[Note] = []
+    if study.uses_registration:
+        if not takes:  # before anything is registered
+            require_same_fit(cohort)
+        registrations, notes = _registrations(db, cohort, release)
+    registered = [*registrations]
+    open_registered = partial(db.cohort, takes=registered, release=release)
 
+    def open_cohort(layout: Any, **options: Any) -> xr.Dataset:
+        if layout != "maps" and "kind" not in options:
+            return open_models(layout, **options)
+        size = {"size": options["size"]} if "size" in options else {}
+        summarise(db, registered, release=release, **size)
+        return open_registered(layout, **options)
 
-def _summarise(db: Database, takes: Sequence[str], release: str | None) -> None:
-    """Models of earlier versions of skindb keep nothing for cohorts."""
-    known = set(db.takes("model", release=release))
-    if not known:
-        raise InputError(
-            Fault(
-                db.url, "a study needs fitted takes", "no model", "run skindb fit first"
-            )
-        )
-    summarise(
-        db,
-        [take for take in (takes or sorted(known)) if take in known],
-        release=release,
+    if study.layout == "maps":
+        cohort = _open_maps(db, cohort, registered, open_cohort)
+    population = Population(
+        cohort,
+        open_cohort,
+        partial(_brdf_tables, open_models, cohort, dictionary),
+        landmarks=common_landmarks(registered_datasets(db, registrations)),
+        registered=registered,
+        mixed_fits=bool(takes),
+        notes=notes,
     )
+    return population, [*_models(db, cohort), *registrations.values()]
 
 
-def brdf_tables(
-    db: Database, cohort: xr.Dataset, dictionary: Path | None, release: str | None
+def _require_models(db: Database, takes: Sequence[str], release: str | None) -> None:
+    """Refuse a database without models, and summarise those that cohorts cannot read."""
+    models = db.takes("model", release=release)
+    if not models:
+        rule = "a study needs fitted takes"
+        raise InputError(Fault(db.url, rule, "no model", "run skindb fit first"))
+    summarise(db, [take for take in takes or models if take in models], release=release)
+
+
+def _open_maps(
+    db: Database,
+    models: xr.Dataset,
+    registered: Sequence[str],
+    open_cohort: Callable[..., xr.Dataset],
+) -> xr.Dataset:
+    """Maps of the registered takes; without a probe there is no map of sigma_tr."""
+    if not registered:
+        rule = "maps need registered takes"
+        found = f"none of {models.sizes['take']} takes has landmarks"
+        cure = "add landmarks to the captures, then ingest and fit them"
+        raise InputError(Fault(db.url, rule, found, cure))
+    maps = open_cohort("maps")
+    skipped = [*models.attrs["skipped"], *maps.attrs["skipped"]]
+    return maps.assign_attrs(skipped=unique_notes(skipped))
+
+
+def _models(db: Database, cohort: xr.Dataset) -> list[Record]:
+    """Records of the models of a cohort."""
+    takes = cohort["take"].values
+    generations = cohort["model_generation"].values
+    markers = db.markers()
+    return [
+        db.record("model", str(take), int(generation), markers=markers)
+        for take, generation in zip(takes, generations, strict=True)
+    ]
+
+
+def _brdf_tables(
+    open_models: Callable[..., xr.Dataset], cohort: xr.Dataset, dictionary: Path | None
 ) -> Delayed:
     """The tables of the fits, computed once, where the study is: they travel to no
     other process by themselves.
     """
-    first = str(cohort["take"].values[0])
-    opened = db.cohort(
-        "tables", takes=[first], variables=["disc_angular_radius"], release=release
-    )
+    take = str(cohort["take"].values[0])
+    opened = open_models("tables", takes=[take], variables=["disc_angular_radius"])
     disc = float(opened["disc_angular_radius"][0])
     names = [str(name) for name in cohort["dictionary"].values]
     tables: Delayed = delayed(dictionary_tables, pure=False)(
         names, disc, dictionary
     ).persist()
     return tables
-
-
-def frame_of(db: Database, cohort: xr.Dataset, release: str | None) -> Frame:
-    """The registrations of the takes of a cohort that have landmarks."""
-    takes = [str(take) for take in cohort["take"].values]
-    records, origin = _registrations(db, takes, release)
-    datasets = registered_datasets(db, records)
-    notes = describe_registration(datasets, takes)
-    return Frame(records, datasets, [*notes, note("", origin)] if records else notes)
-
-
-def registered_maps(
-    db: Database, takes: Sequence[str], release: str | None
-) -> tuple[xr.Dataset, Frame]:
-    """Maps of takes on the common (u, v), and their registrations."""
-    require_covered(db, release)
-    models = study_cohort(db, "tables", takes, release)
-    if not takes:  # before anything is registered
-        require_same_fit(models)
-    frame = frame_of(db, models, release)
-    if not frame.records:
-        rule = "maps need registered takes"
-        cure = "add landmarks to the captures, then ingest and fit them"
-        raise InputError(
-            Fault(
-                db.url,
-                rule,
-                f"none of {models.sizes['take']} takes has landmarks",
-                cure,
-            )
-        )
-    names = list(frame.records)
-    summarise(db, names, release=release)
-    # without a probe there is no map of sigma_tr
-    cohort = db.cohort("maps", takes=names, release=release)
-    cohort.attrs["skipped"] = unique_notes(
-        [*models.attrs["skipped"], *cohort.attrs["skipped"]]
-    )
-    return cohort, frame
 
 
 def require_covered(db: Database, release: str | None) -> None:
@@ -168,22 +192,25 @@ def require_covered(db: Database, release: str | None) -> None:
 
 
 def _registrations(
-    db: Database, takes: Sequence[str], release: str | None
-) -> tuple[dict[str, Record], str]:
-    """Registrations of the takes that can have one, and their source: a release is
-    never registered again.
+    db: Database, cohort: xr.Dataset, release: str | None
+) -> tuple[dict[str, Record], list[Note]]:
+    """Registrations of the takes of a cohort that can have one, and notes on them; a
+    release is never registered again.
     """
+    takes = [str(take) for take in cohort["take"].values]
     if release is not None:
         known = Known(db, release)
-        return {
-            t: known.record("registration", t)
-            for t in takes
-            if known.has("registration", t)
-        }, "that of the release"
-    able = takes_with_landmarks(db, takes)
-    records = current_registrations(db, able)
-    if records or not able:
-        return records, "the stored one"
-    # all takes, so that the next study need not register others again
-    made = {take: record for take, record in register_takes(db).items() if take in able}
-    return made, "made for this study"
+        names = [take for take in takes if known.has("registration", take)]
+        records = {take: known.record("registration", take) for take in names}
+        origin = "that of the release"
+    else:
+        able = takes_with_landmarks(db, takes)
+        records = current_registrations(db, able)
+        origin = "the stored one"
+        if able and not records:
+            # all takes, so that the next study need not register others again
+            everyone = register_takes(db)
+            records = {take: everyone[take] for take in everyone if take in able}
+            origin = "made for this study"
+    notes = describe_registration(registered_datasets(db, records), takes)
+    return records, [*notes, note("", origin)] if records else notes

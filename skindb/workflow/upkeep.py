@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from skindb.analysis.studies import STUDIES
 from skindb.errors import Fault, InputError
 from skindb.store import (
     RELEASE,
@@ -25,7 +25,7 @@ from skindb.workflow.cluster import computing_on
 from skindb.workflow.edits import edit
 from skindb.workflow.fit import fit_with
 from skindb.workflow.registration import register_takes
-from skindb.workflow.studies import STUDIES
+from skindb.workflow.studies import study
 from skindb.workflow.takes import map_takes
 
 if TYPE_CHECKING:
@@ -190,12 +190,8 @@ def repeat_study(
     cure = "run skindb analyze"
     if what not in STUDIES:
         raise InputError(Fault(key, rule, f"the study {what!r}", cure))
-    accepted = inspect.signature(STUDIES[what]).parameters.keys() - {
-        "db",
-        "name",
-        "dictionary",
-    }
-    if unknown := sorted(options.keys() - accepted):
+    accepted = {spec.name for spec in fields(STUDIES[what].parameters)}
+    if unknown := sorted(options.keys() - {*accepted, "takes", "release"}):
         raise InputError(Fault(key, rule, f"the parameters {', '.join(unknown)}", cure))
     release = options.pop("release", "") or None
     takes = options.pop("takes", [])
@@ -211,10 +207,10 @@ def repeat_study(
     }
     if "group_by" in options:
         options["group_by"] = options["group_by"] or None
-    if "dictionary" in inspect.signature(STUDIES[what]).parameters:
+    if "dictionary" in accepted:
         options["dictionary"] = dictionary
-    study = STUDIES[what](db, **options)
-    return db.record(STUDY, key, study.attrs["generation"])
+    results = study(db, what, **options)
+    return db.record(STUDY, key, results.attrs["generation"])
 
 
 def repeat_edit(

@@ -93,9 +93,7 @@ def database(root: Path) -> None:
     )
     # a study of the same model by the same code would be the same version
     for code in "123":
-        with patch(
-            "skindb.workflow.study_versions.method_digest", lambda _, code=code: code
-        ):
+        with patch("skindb.workflow.derive.code_digest", lambda *_, code=code: code):
             workflow.translucency(db)
     Log(db._place, "population", "translucency").remove(2)
     if faults := db.verify():

@@ -6,7 +6,8 @@ import shutil
 
 import pytest
 
-from skindb.workflow import code_digest, studies
+from skindb.analysis import texture
+from skindb.workflow import code_digest
 
 TEXELS = 128  # along each side; the least for pyramids of 7 levels
 
@@ -14,7 +15,7 @@ TEXELS = 128  # along each side; the least for pyramids of 7 levels
 @pytest.fixture
 def small_textures(monkeypatch):
     """The study of albedo computes its textures from small maps."""
-    monkeypatch.setattr(studies, "TEXELS", TEXELS)
+    monkeypatch.setattr(texture, "SIZE", TEXELS)
 
 
 @pytest.fixture

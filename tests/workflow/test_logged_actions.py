@@ -27,6 +27,7 @@ LOG_THEMSELVES = {
     "create_release",
     "ingest_take",
     "record_consent",
+    "study",
     "withdraw",
 }
 # functions that compute or list what a command needs, and neither change nor disclose
@@ -75,9 +76,8 @@ def test_logged__every_function_of_a_database_is_decorated_or_named_here():
     functions = {
         name: getattr(workflow, name)
         for name in workflow.__all__
-        if name != "logged_action"
+        if name not in ("logged_action", "STUDY_FUNCTIONS")
     }
-    functions |= workflow.STUDIES
     plain = {
         name
         for name, one in functions.items()

@@ -103,7 +103,7 @@ def test_refresh__repeats_all(database):
         ("components", {}),
         ("correlations", {}),
     ):
-        study = workflow.STUDIES[what](database, **given)
+        study = workflow.study(database, what, **given)
         record = database.record("population", study.attrs["study"])
         parameters = record.provenance["parameters"]
         assert (

@@ -128,7 +128,7 @@ def test_analyze__writes_tables_and_plots(database, tmp_path):
 
 def test_refresh__repeats_both(database):
     for what in ("chromophores", "coverage"):
-        workflow.STUDIES[what](database)
+        workflow.study(database, what)
         record = database.record("population", what)
         again = repeat_study(database, record.take, record.provenance["parameters"])
         # the same parameters: nothing to do

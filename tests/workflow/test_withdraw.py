@@ -21,12 +21,13 @@ from planted_population import TABLES, population
 from planted_sheet import face_take
 
 from skindb import workflow
+from skindb.analysis import translucency
 from skindb.cli import cli
 from skindb.errors import InputError
 from skindb.store import Database, WithdrawnError, seal_of, stale_versions
 from skindb.store.bucket import Bucket
 from skindb.store.log import Log
-from skindb.workflow import studies, study_inputs
+from skindb.workflow import study_inputs
 
 MARKER = np.float32(0.12345679)  # planted in the data of the subject
 WORD = "marker-of-nobody"  # planted in its attributes
@@ -395,7 +396,7 @@ def test_withdraw__whatever_a_computation_raises_is_named_and_repeated(
         raise error
 
     with monkeypatch.context() as patch:
-        patch.setattr("skindb.workflow.studies.translucency_table", fail)
+        patch.setattr("skindb.analysis.translucency.translucency_table", fail)
         outcomes = _outcomes(workflow.withdraw(db, "A"))
     assert outcomes["population of translucency"].startswith(
         f"cannot be computed by this version: {type(error).__name__}"
@@ -413,15 +414,15 @@ def test_withdraw__while_a_study_is_computed(small, tmp_path, monkeypatch):
     withdrawal.
     """
     db = Database(shutil.copytree(small, tmp_path / "db"))
-    compute = studies.translucency_table
+    compute = translucency.translucency_table
 
     def suspended(*args, **options):
         table = compute(*args, **options)
-        monkeypatch.setattr(studies, "translucency_table", compute)
+        monkeypatch.setattr(translucency, "translucency_table", compute)
         Database(db.root).erase("A")
         return table
 
-    monkeypatch.setattr(studies, "translucency_table", suspended)
+    monkeypatch.setattr(translucency, "translucency_table", suspended)
     with pytest.raises(
         WithdrawnError, match="A: the subject must not be withdrawn while a version"
     ):

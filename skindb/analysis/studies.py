@@ -1,0 +1,73 @@
+"""The studies of a population, and what is shown of a stored one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import xarray as xr
+
+from skindb.analysis.albedo import STUDY as ALBEDO
+from skindb.analysis.basis_size import STUDY as BRDF
+from skindb.analysis.brdf_space import STUDY as SURFACE
+from skindb.analysis.chromophores import STUDY as CHROMOPHORES
+from skindb.analysis.components import STUDY as COMPONENTS
+from skindb.analysis.correlations import STUDY as CORRELATIONS
+from skindb.analysis.coverage import STUDY as COVERAGE
+from skindb.analysis.effect_maps import STUDY as MAPS
+from skindb.analysis.group_effects import STUDY as GROUPS
+from skindb.analysis.study import Study, Table
+from skindb.analysis.traits import STUDY as TRAITS
+from skindb.analysis.translucency import STUDY as TRANSLUCENCY
+from skindb.files import private_file
+from skindb.plots import plain_text
+
+STUDIES: dict[str, Study] = {
+    study.name: study
+    for study in (
+        BRDF,
+        ALBEDO,
+        TRANSLUCENCY,
+        TRAITS,
+        GROUPS,
+        COMPONENTS,
+        CORRELATIONS,
+        MAPS,
+        CHROMOPHORES,
+        COVERAGE,
+        SURFACE,
+    )
+}
+
+
+def study_of(results: xr.DataTree) -> Study:
+    """The study to which stored results belong."""
+    return next(
+        study for study in STUDIES.values() if study.shown[0] in results.children
+    )
+
+
+def tabulate_study(results: xr.DataTree) -> Table:
+    """Header and rows of the table of a study."""
+    return study_of(results).tabulate(*_shown(results))
+
+
+def describe_study(results: xr.DataTree) -> list[str]:
+    """Notes on a study that accompany its table, one line each."""
+    return study_of(results).describe(*_shown(results))
+
+
+@plain_text()
+def plot_study(results: xr.DataTree, path: Path) -> None:
+    """Plot a study and write the figure to a file."""
+    from matplotlib import pyplot
+
+    plot = study_of(results).plot(*_shown(results))
+    figure = plot.get_figure(root=True)
+    assert figure is not None
+    figure.savefig(private_file(path), dpi=150, bbox_inches="tight")
+    pyplot.close(figure)
+
+
+def _shown(results: xr.DataTree) -> list[xr.Dataset]:
+    names = study_of(results).shown
+    return [results[name].to_dataset().load() for name in names]
