@@ -16,7 +16,7 @@ import skindb
 from skindb.analysis import principal_components
 from skindb.workflow import (
     albedo,
-    basis_size,
+    brdf,
     computing_on,
     connected,
     fit_with,
@@ -73,7 +73,7 @@ def _filled(root, captures, **where):
     list(results_of(map_takes(partial(fit_with, db, given=GIVEN), takes, **where)))
     register_takes(db, **where)
     with computing_on(where.get("client"), db.root):
-        basis_size(db)
+        brdf(db)
         traits(db, k=3)
         albedo(db, group_by="gender")
     return db
