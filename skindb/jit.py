@@ -67,17 +67,20 @@ def _stamped(compiled: Any) -> Any:
     """Make the cache on disk valid only as long as no kernel changes.
 
     Numba only compares the date of the file of a function. Compiled code also contains
-    the functions of other files that it calls, which would not be updated.
+    the functions of other files that it calls, which would not be updated. The version
+    is compared before names of modules, which may be gone, are read from the cache.
     """
-    compiled._cache._cache_file._source_stamp = _sources()
+    cache_file = compiled._cache._cache_file
+    cache_file._source_stamp = _sources()
+    cache_file._version = _sources()
     return compiled
 
 
 @cache
 def _sources() -> str:
-    """Digest of the source of all modules with compiled code."""
+    """Digest of the version of Numba and of the source of all modules with compiled code."""
     root = Path(__file__).parent
-    digest = hashlib.sha256(str(INTRINSICS).encode())
+    digest = hashlib.sha256(f"{nb.__version__} {INTRINSICS}".encode())
     for path in [root / "jit.py", *sorted(root.rglob("_*_kernels.py"))]:
         digest.update(path.read_bytes())
     return digest.hexdigest()

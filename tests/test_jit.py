@@ -39,6 +39,34 @@ def test_kernel__is_compiled_again_when_a_kernel_of_another_file_changes(tmp_pat
     assert list(package.glob("__pycache__/*.nbc"))  # the cache is used
 
 
+PAIR = "from typing import NamedTuple\n\nclass Pair(NamedTuple):\n    a: float\n    b: float\n"
+SUM = "from package.jit import kernel\n\n@kernel\ndef outer(pair):\n    return pair.a + pair.b\n"
+CALL_PAIR = "from package._outer_kernels import outer; from package.{} import Pair; "
+CALL_PAIR += "print(outer(Pair(1.0, 2.0)))"
+
+
+@pytest.mark.slow
+def test_kernel__is_compiled_again_when_the_module_of_an_argument_is_renamed(tmp_path):
+    """The cache names the classes of arguments by their modules."""
+    package = tmp_path / "package"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    (package / "jit.py").write_bytes(Path(skindb.jit.__file__).read_bytes())
+    (package / "_outer_kernels.py").write_text(SUM)
+    (package / "_pair_kernels.py").write_text(PAIR)
+    for name in ("_pair_kernels", "_couple_kernels"):
+        if not (package / f"{name}.py").exists():
+            (package / "_pair_kernels.py").rename(package / f"{name}.py")
+        done = subprocess.run(
+            [sys.executable, "-c", CALL_PAIR.format(name)],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.stdout == "3.0\n", done.stderr
+
+
 IMPORTED = (
     "fit",
     "ingest",
