@@ -11,10 +11,10 @@ import pytest
 from click.testing import CliRunner
 
 from skindb.bench import KERNELS, run
-from skindb.bench.case import Case, expect
+from skindb.bench.case import Case, expect, failure_of
 from skindb.bench.curve import Curve, Point
 from skindb.bench.diffusion import transport_curves
-from skindb.bench.stress import CASES, failure_of
+from skindb.bench.run import CASES
 from skindb.cli import cli
 from skindb.optics.diffusion import dipole_profile
 from skindb.optics.transport import transport_profile

@@ -8,14 +8,29 @@ from typing import TYPE_CHECKING
 
 import lazy_loader
 
-from skindb.bench.names import KERNELS
-
 if TYPE_CHECKING:
     from skindb.bench.run import run_bench, table_of
 
 __all__ = ["KERNELS", "run_bench", "table_of"]
 
-# imported lazily, because the command line only needs the names for its options
+# of the curves and of the stress set; the command line needs only the names
+KERNELS = (
+    "surface",
+    "refit",
+    "normals",
+    "albedo",
+    "nmf",
+    "probe",
+    "transport",
+    "inverse",
+    "subsurface",
+    "disc",
+    "exposures",
+    "pyramid",
+    "textures",
+    "components",
+    "permutations",
+)
 __getattr__, __dir__, _ = lazy_loader.attach(
     __name__, submod_attrs={"run": ["run_bench", "table_of"]}
 )

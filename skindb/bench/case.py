@@ -1,8 +1,10 @@
-"""One case of the stress set."""
+"""One case of the stress set of DESIGN, section 7: a promised behaviour that is checked
+against a number or a law.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -24,22 +26,26 @@ class Case:
     check: Callable[[], None]
 
 
-def each(
-    kernel: str, name: str, promise: str, check: Callable[..., None], *values: Any
-) -> tuple[Case, ...]:
-    """One case per value (a tuple holds several arguments of `check`); `name` is
-    formatted with the value.
+def stress_cases(kernel: str, *rows: Sequence[Any]) -> tuple[Case, ...]:
+    """Cases of a kernel from rows (name, promise, check) or (name, promise, check, values).
+
+    A row with values gives one case for each of them (a tuple holds several arguments of
+    `check`), whose name is formatted with the value.
     """
-    arguments = [value if isinstance(value, tuple) else (value,) for value in values]
-    return tuple(
-        Case(kernel, name.format(*one), promise, partial(check, *one))
-        for one in arguments
-    )
+    cases = []
+    for name, promise, check, *values in rows:
+        if not values:
+            cases.append(Case(kernel, name, promise, check))
+        for value in values[0] if values else ():
+            arguments = value if isinstance(value, tuple) else (value,)
+            called = partial(check, *arguments)
+            cases.append(Case(kernel, name.format(*arguments), promise, called))
+    return tuple(cases)
 
 
 def combinations(first: tuple[Any, ...], *second: Any) -> list[tuple[Any, ...]]:
     """All combinations of `first` and `second` (a tuple holds several arguments), as
-    values for `each`.
+    values of `stress_cases`.
     """
     return [(a, *(b if isinstance(b, tuple) else (b,))) for a in first for b in second]
 
@@ -53,3 +59,15 @@ def expect(holds: Any, found: Any = "") -> None:
 def close(found: Any, want: Any, *, rtol: float = 0.0, atol: float = 0.0) -> None:
     """Raise AssertionError unless two arrays agree; NaN agrees with NaN."""
     np.testing.assert_allclose(found, want, rtol=rtol, atol=atol)
+
+
+def failure_of(case: Case) -> str:
+    """Description of a broken promise; empty if it holds."""
+    try:
+        case.check()
+    # any error is reported as a broken promise
+    except Exception as error:  # noqa: BLE001
+        lines = str(error).strip().splitlines() or ["no message"]
+        text = " ".join(line.strip() for line in lines if line.strip())
+        return f"{type(error).__name__}: {text[:300]}"
+    return ""

@@ -1,11 +1,22 @@
-"""Work-precision curves, and the measurement of CPU time."""
+"""Work-precision curves: their records, the measurement of CPU time, and plots."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import TypeVar
+from functools import partial
+from pathlib import Path
+from textwrap import fill
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+
+from skindb.files import private_file
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 
 T = TypeVar("T")
 # number of rounds, of which the best counts; no further round after this time [s]
@@ -59,3 +70,79 @@ def cpu_time(work: Callable[[], T], per: float = 1.0) -> tuple[float, T]:
         result = work()
         times.append(time.process_time() - start)
     return min(times) / per, result
+
+
+EXACT = 1e-17  # position of errors of zero
+
+
+def plot_curves(curves: Sequence[Curve], path: Path) -> None:
+    """Write one panel per curve, side by side, to a PNG file."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8.5 * len(curves), 6), layout="constrained")
+    FigureCanvasAgg(figure)
+    for ax, curve in zip(
+        figure.subplots(1, len(curves), squeeze=False)[0], curves, strict=True
+    ):
+        plot_curve(curve, ax=ax)
+    figure.savefig(private_file(path), dpi=100)
+
+
+def plot_curve(curve: Curve, *, ax: Axes) -> Axes:
+    """Plot error against CPU time; unsuitable methods are crosses, and those without a
+    time horizontal lines.
+    """
+    ax.set(xscale="log", yscale="log")
+    for i, method in enumerate(dict.fromkeys(p.method for p in curve.points)):
+        own = [p for p in curve.points if p.method == method and np.isfinite(p.error)]
+        colour = f"C{i % 10}"
+        for p in (p for p in own if not np.isfinite(p.seconds)):
+            ax.axhline(
+                max(p.error, EXACT),
+                color=colour,
+                ls=":",
+                lw=1,
+                label=_legend(method, p),
+            )
+        timed = [p for p in own if np.isfinite(p.seconds)]
+        if timed:
+            x = [p.seconds for p in timed]
+            y = [max(p.error, EXACT) for p in timed]
+            marker = "x" if all(p.failure for p in timed) else "os^Dv"[i // 10 % 5]
+            ax.plot(
+                x,
+                y,
+                marker=marker,
+                lw=0.4,
+                color=colour,
+                label=_legend(method, timed[0]),
+            )
+        for p in timed:
+            ax.annotate(
+                p.parameter,
+                (p.seconds, max(p.error, EXACT)),
+                fontsize=6,
+                xytext=(4, 3),
+                textcoords="offset points",
+            )
+    ax.set_xlabel(
+        f"CPU time for {curve.seconds_of} [s]; top axis relative to {curve.base}",
+        fontsize=8,
+    )
+    ax.set_ylabel(fill(curve.error_of, 60), fontsize=8)
+    ax.set_title(
+        fill(f"{curve.kernel}, compared with {curve.reference}", 80), fontsize=9
+    )
+    base = next(p.seconds for p in curve.points if p.name == curve.base)
+    ax.secondary_xaxis(
+        "top", functions=(partial(np.multiply, 1 / base), partial(np.multiply, base))
+    )
+    ax.grid(visible=True, which="both", alpha=0.2)
+    ax.margins(x=0.15)  # space for the names of the settings
+    ax.legend(fontsize=7)
+    return ax
+
+
+def _legend(method: str, point: Point) -> str:
+    return f"{method} (fails)" if point.failure else method

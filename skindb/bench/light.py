@@ -1,5 +1,5 @@
 """Subsurface light with the octree, tables averaged over a disc light, and radiance
-from exposures.
+from exposures: curves and stress cases.
 """
 
 from __future__ import annotations
@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from skindb.bench.case import SCALES, close, expect, stress_cases
 from skindb.bench.curve import Curve, Point, cpu_time
-from skindb.calibration.pixel_flags import OK
+from skindb.calibration.pixel_flags import DARK, OK, SATURATED
 from skindb.calibration.radiance import merge_exposures
 from skindb.format.frames import FrameKind
 from skindb.format.sensor import SensorRecord
@@ -29,7 +30,8 @@ from skindb.reflectance.dictionary import (
     convolve_disc,
     embedded_dictionary,
 )
-from skindb.reflectance.tables import lookup
+from skindb.reflectance.rows import basis_rows
+from skindb.reflectance.tables import TableGrid, lookup, tabulate
 from skindb.types import Array
 from skindb.virtual.sensor import Sensor
 
@@ -313,3 +315,301 @@ def _merged(
         why,
         more,
     )
+
+
+def _sensor(**changes: Any) -> SensorRecord:
+    levels: dict[str, Any] = {
+        "black": 256.0,
+        "white": 65535.0,
+        "read_noise": 6.0,
+        "electrons_per_dn": 0.3,
+    }
+    return SensorRecord(FrameKind(4, 3, 16), **(levels | changes))
+
+
+SECONDS = (0.04, 0.005)
+
+
+def _frames(value: int, shape: tuple[int, ...] = (3, 4, 3)) -> list[Array]:
+    return [np.full(shape, value, np.uint16) for _ in SECONDS]
+
+
+def _white() -> None:
+    radiance, _, flag = merge_exposures(_frames(65535), SECONDS, _sensor())
+    expect((flag == SATURATED).all() and np.isnan(radiance).all(), (flag, radiance))
+
+
+def _one_white() -> None:
+    frames = _frames(65535)
+    frames[1][:] = 30000
+    radiance, _, flag = merge_exposures(frames, SECONDS, _sensor())
+    expect((flag == OK).all(), flag)
+    close(radiance, (30000 - 256) / (65535 - 256) / 0.005, rtol=1e-6)
+
+
+def _no_exposure_black(value: int) -> None:
+    radiance, error, flag = merge_exposures(_frames(value), SECONDS, _sensor())
+    expect((flag == DARK).all(), flag)
+    expect(
+        (np.abs(radiance) <= 3 * error).all() and np.isfinite(error).all(),
+        (radiance, error),
+    )
+
+
+def _dead_noise() -> None:
+    """A sensor without noise gives the value over the time, without a division by zero."""
+    radiance, error, flag = merge_exposures(
+        _frames(256 + 6528)[:1], SECONDS[:1], _sensor(read_noise=0.0, step=0.0)
+    )
+    close(radiance, 6528 / (65535 - 256) / 0.04, rtol=1e-6)
+    expect(np.isfinite(error).all() and (flag == OK).all(), (error, flag))
+
+
+def _shot_noise_unknown() -> None:
+    frames = [
+        np.full((3, 4, 3), 256 + round(6528 * s / 0.04), np.uint16) for s in SECONDS
+    ]
+    radiance, error, flag = merge_exposures(
+        frames, SECONDS, _sensor(electrons_per_dn=np.inf, read_noise=0.0)
+    )
+    close(radiance, 6528 / (65535 - 256) / 0.04, rtol=1e-3)
+    expect(np.isfinite(error).all() and (flag == OK).all(), (error, flag))
+
+
+def _scaled_times(scale: float) -> None:
+    frames = [
+        np.full((3, 4, 3), 256 + round(6528 * s / 0.04), np.uint16) for s in SECONDS
+    ]
+    want, want_error, _ = merge_exposures(frames, SECONDS, _sensor())
+    times = tuple(s * scale for s in SECONDS)
+    radiance, error, flag = merge_exposures(frames, times, _sensor())
+    expect((flag == OK).all(), flag)
+    close(radiance.astype(np.float64) * scale, want, rtol=1e-5)
+    close(error.astype(np.float64) * scale, want_error, rtol=1e-5)
+
+
+def _odd_sizes(rows: int, columns: int) -> None:
+    radiance, error, flag = merge_exposures(
+        _frames(6784, (rows, columns, 3))[:1], SECONDS[:1], _sensor()
+    )
+    expect(
+        radiance.shape == error.shape == (rows, columns, 3)
+        and flag.shape == (rows, columns),
+        radiance.shape,
+    )
+    close(radiance, 6528 / (65535 - 256) / 0.04, rtol=1e-6)
+
+
+def _duplicates() -> None:
+    """The same exposure twice gives the same radiance, with an error smaller by sqrt 2."""
+    one, once, _ = merge_exposures(_frames(6784)[:1], SECONDS[:1], _sensor())
+    two, twice, _ = merge_exposures(_frames(6784), (SECONDS[0], SECONDS[0]), _sensor())
+    close(two, one, rtol=1e-6)
+    close(twice, once / np.sqrt(2), rtol=1e-6)
+
+
+def _linear(bad: float) -> None:
+    frame = np.full((2, 2, 3), 0.25, np.float32)
+    frame[0, 1, 2] = bad
+    radiance, _, flag = merge_exposures([frame], (1.0,), _linear_sensor())
+    expect(
+        flag.tolist() == [[OK, SATURATED], [OK, OK]] and np.isnan(radiance[0, 1]).all(),
+        (flag, radiance),
+    )
+    close(radiance[1], 0.25)
+
+
+def _linear_sensor() -> SensorRecord:
+    return SensorRecord(FrameKind(2, 2, 0), 0.0, 1.0, 0.0, np.inf)
+
+
+EXPOSURES = stress_cases(
+    "exposures",
+    ("all saturated", "The result is NaN and flagged.", _white),
+    ("one of two saturated", "The other exposure is used.", _one_white),
+    (
+        "all black, value {}",
+        "The result is flagged dark, and zero within its error.",
+        _no_exposure_black,
+        (
+            256,
+            250,
+        ),
+    ),
+    ("no noise", "The result is the value over the time.", _dead_noise),
+    (
+        "shot noise unknown",
+        "The result is the value over the time, with the error of quantisation.",
+        _shot_noise_unknown,
+    ),
+    (
+        "times multiplied by {:g}",
+        "Radiance and error are divided by it.",
+        _scaled_times,
+        SCALES,
+    ),
+    (
+        "{} x {} pixels",
+        "Shapes and values are right.",
+        _odd_sizes,
+        (
+            (0, 4),
+            (1, 1),
+            (3, 7),
+        ),
+    ),
+    (
+        "the same exposure twice",
+        "The radiance is the same, and the error smaller by sqrt 2.",
+        _duplicates,
+    ),
+    (
+        "a linear pixel is {}",
+        "Only that pixel is NaN and flagged.",
+        _linear,
+        (
+            np.nan,
+            np.inf,
+        ),
+    ),
+)
+
+
+GRID = TableGrid(24, 20, 8)
+
+
+def _dictionary(table: Array) -> Dictionary:
+    table = np.ascontiguousarray(table, np.float32)
+    return Dictionary(
+        tuple(str(i) for i in range(table.shape[-1])), table, GRID, "stress"
+    )
+
+
+def _lobe(sharp: float = 40.0) -> Array:
+    return tabulate(
+        lambda wi, wo: np.exp(-sharp * half_difference(wi, wo)[0][..., None] ** 2), GRID
+    )
+
+
+def _even_table(radius: float, value: float) -> None:
+    close(
+        convolve_disc(_dictionary(np.full((24, 20, 8, 2), value)), radius).table,
+        np.float32(value),
+        rtol=1e-5,
+    )
+
+
+def _no_disc() -> None:
+    lobe = _dictionary(_lobe())
+    expect(convolve_disc(lobe, 0.0) is lobe, "a copy")
+    close(convolve_disc(lobe, 1e-9).table, lobe.table, atol=1e-5)
+
+
+def _scaled_table(scale: float) -> None:
+    lobe = _lobe()
+    found = convolve_disc(_dictionary(lobe * np.float32(scale)), 0.05).table
+    close(
+        found / np.float32(scale),
+        convolve_disc(_dictionary(lobe), 0.05).table,
+        rtol=1e-5,
+        atol=1e-12,
+    )
+
+
+def _between_extremes(radius: float) -> None:
+    lobe = _dictionary(_lobe(400.0))
+    found = convolve_disc(lobe, radius).table
+    expect(
+        found.min() >= -1e-6 and found.max() <= lobe.table.max() * (1 + 1e-5),
+        (found.min(), found.max()),
+    )
+    expect(
+        found[0, 0, 0, 0] < lobe.table[0, 0, 0, 0], "a lobe not lowered by a wide lamp"
+    )
+
+
+# rows, for the fits
+
+
+def _row_of(wi: Any, wo: Any) -> Array:
+    table = np.concatenate([_lobe(), np.ones_like(_lobe())], axis=-1)
+    every = np.ones((1, 1, 1), np.bool_)
+    return basis_rows(
+        table, GRID, np.array([[0.0, 0, 1]]), np.array([[wi]]), np.array([[wo]]), every
+    )[0]
+
+
+def _grazing_rows(height: float) -> None:
+    """Towards the horizon a row decreases only with the cosine, times the value of the table."""
+    wi = np.array([np.sqrt(1 - height**2), 0, height])
+    wo = np.array([0.6, 0.0, 0.8])
+    want = (
+        lookup(
+            np.concatenate([_lobe(), np.ones_like(_lobe())], axis=-1),
+            *half_difference(wi, wo),
+        )
+        * height
+    )
+    close(_row_of(wi, wo)[0], want, rtol=1e-4, atol=1e-12)
+
+
+def _special_rows() -> None:
+    up = [0.0, 0.0, 1.0]
+    down = [0.0, 0.0, -1.0]
+    # light, camera and normal coincide, so phi_d is undefined
+    close(_row_of(up, up), [[1.0, 1.0]], rtol=1e-6)
+    expect(len(_row_of(down, up)) == len(_row_of(up, down)) == 0, "a row from below")
+    expect(
+        len(_row_of([np.nan, 0, 1], up)) == len(_row_of(up, [np.inf, 0, 1])) == 0,
+        "a row of no finite direction",
+    )
+    # the mirror direction
+    close(_row_of([0.6, 0, 0.8], [-0.6, 0, 0.8]), [[0.8, 0.8]], rtol=1e-5)
+
+
+TABLES = (
+    *stress_cases(
+        "disc",
+        (
+            "a table of {1:g}, disc of {0} rad",
+            "A constant is unchanged.",
+            _even_table,
+            (
+                (0.014, 0.0),
+                (0.014, 0.25),
+                (0.3, 0.25),
+                (0.014, 1e-30),
+                (0.014, 1e30),
+            ),
+        ),
+        ("no disc", "The tables are unchanged, also in the limit.", _no_disc),
+        ("tables times {:g}", "Averages are multiplied by it.", _scaled_table, SCALES),
+        (
+            "a disc of {} rad",
+            "Averages lie between the extremes; sharp lobes are lowered.",
+            _between_extremes,
+            (
+                0.05,
+                0.5,
+            ),
+        ),
+    ),
+    *stress_cases(
+        "surface",
+        (
+            "rows: light {:g} above the horizon",
+            "A row is the table's value times the cosine.",
+            _grazing_rows,
+            (
+                1e-08,
+                0.0001,
+                0.02,
+            ),
+        ),
+        (
+            "rows: overhead, mirror, below, not finite",
+            "Rows are one, the cosine, none and none.",
+            _special_rows,
+        ),
+    ),
+)

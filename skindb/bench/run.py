@@ -14,25 +14,34 @@ from typing import Any
 
 from threadpoolctl import threadpool_limits
 
-from skindb.bench.curve import Curve
+from skindb.bench.case import Case, failure_of
+from skindb.bench.curve import Curve, plot_curves
 from skindb.bench.diffusion import (
+    PROBE,
     inverse_curves,
     probe_curves,
     require_mpmath,
     transport_curves,
 )
-from skindb.bench.factors import nmf_curves
-from skindb.bench.light import disc_curves, exposures_curves, subsurface_curves
-from skindb.bench.photometry import albedo_curves, normals_curves
-from skindb.bench.plot import plot_curves
+from skindb.bench.light import (
+    EXPOSURES,
+    TABLES,
+    disc_curves,
+    exposures_curves,
+    subsurface_curves,
+)
+from skindb.bench.optics_cases import OPTICS
+from skindb.bench.photometry import ALBEDO, NORMAL, albedo_curves, normals_curves
 from skindb.bench.population import (
+    POPULATION,
     components_curves,
     permutations_curves,
     pyramid_curves,
     textures_curves,
 )
-from skindb.bench.stress import CASES, failure_of
+from skindb.bench.solvers import SOLVERS, nmf_curves
 from skindb.bench.surface import refit_curves, surface_curves
+from skindb.bench.surface_cases import SURFACE
 from skindb.files import make_private, private_file
 from skindb.schema.plain import plain
 from skindb.types import Progress
@@ -54,6 +63,17 @@ CURVES: dict[str, Callable[[bool], list[Curve]]] = {
     "components": components_curves,
     "permutations": permutations_curves,
 }
+CASES: tuple[Case, ...] = (
+    *SOLVERS,
+    *SURFACE,
+    *NORMAL,
+    *ALBEDO,
+    *PROBE,
+    *OPTICS,
+    *TABLES,
+    *EXPOSURES,
+    *POPULATION,
+)
 
 
 def run_bench(

@@ -14,18 +14,17 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from skindb.bench.curve import Curve, Point, cpu_time
+from skindb.fit._surface_arrays import Tables, Weights, surface_weights
 from skindb.fit.surface import MIN_SAMPLES, NOISE_FLOOR_SURFACE
 from skindb.numerics.factorise import nmf
 from skindb.optics.angles import half_difference
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.reflectance.dictionary import Dictionary, convolve_disc, embedded_dictionary
-from skindb.reflectance.mixture import Mixture
-from skindb.reflectance.model import Block, Comparison, SurfaceFit
 from skindb.reflectance.reduction import reduce_dictionary
 from skindb.reflectance.rows import basis_rows
 from skindb.reflectance.tables import lookup
+from skindb.types import Array
 
-Array = NDArray[Any]
 ETA = 1.3
 DISC = float(np.radians(0.8))
 MIN_COSINE_SAMPLES = 0.1  # to light and camera, as in `skindb.reflectance.reduction`
@@ -44,22 +43,28 @@ class Strip:
     loop over SciPy.
     """
 
-    block: Block
-    offsets: Array  # (n + 1,) index of the first row of each surfel, and the total
+    # sample, position, light, camera, normal, diffuse of `surface_weights`
+    arrays: tuple[Array, ...]
+    offsets: NDArray[
+        np.int64
+    ]  # (n + 1,) index of the first row of each surfel, and the total
     rows: Array  # (total, 59) float64
     target: Array  # (total, 3) samples minus the diffuse term
     true: Array  # (total,) surface term without noise
     directions: tuple[Array, Array, Array]  # wi, wo, normal of each row
     cosine: Array  # (total,)
 
-    def first(self, count: int) -> Block:
-        """The first `count` surfels."""
-        return self.block._replace(
-            sample=self.block.sample[:count],
-            position=self.block.position[:count],
-            normal=self.block.normal[:count],
-            diffuse=self.block.diffuse[:count],
-        )
+    def first(self, count: int) -> list[Array]:
+        """The arguments of `surface_weights` for the first `count` surfels."""
+        sample, position, light, camera, normal, diffuse = self.arrays
+        return [
+            sample[:count],
+            position[:count],
+            light,
+            camera,
+            normal[:count],
+            diffuse[:count],
+        ]
 
 
 def _spiral(count: int, radius: float, share: float) -> Array:
@@ -116,9 +121,9 @@ def strip(
     sample = np.full((surfels, 150, 16, 3), np.nan, np.float16)
     sample[owner, i, o] = value
     target = sample[owner, i, o].astype(float) - scattered
-    block = Block(sample, position, light, camera, normal, diffuse)
+    arrays = sample, position, light, camera, normal, diffuse
     away = wi[owner, i], wo[owner, o], normal[owner]
-    return Strip(block, offsets, rows.astype(np.float64), target, true, away, c)
+    return Strip(arrays, offsets, rows.astype(np.float64), target, true, away, c)
 
 
 @lru_cache(maxsize=1)
@@ -129,13 +134,13 @@ def _problem(quick: bool) -> tuple[Dictionary, Strip, int]:
 
 
 @lru_cache(maxsize=5)
-def _tables(quick: bool, roots: bool, rank: int) -> Mixture:
+def _tables(quick: bool, roots: bool, rank: int) -> Tables:
     """The dictionary, or its cube roots, reduced to `rank` dimensions."""
     dictionary = _problem(quick)[0]
     reduced, lift = reduce_dictionary(
         np.cbrt(dictionary.table) if roots else dictionary.table, rank
     )
-    return Mixture(reduced, lift)
+    return Tables(reduced, dictionary.grid, lift)
 
 
 def _parts(made: Strip, count: int) -> list[slice]:
@@ -192,12 +197,17 @@ def _errors(
     return float(np.median(linear)), float(np.median(roots)), float(np.median(residual))
 
 
-def _fit(made: Strip, model: Mixture, mode: str) -> tuple[float, SurfaceFit]:
+def _fit(made: Strip, tables: Tables, mode: str) -> tuple[float, Weights]:
     """CPU time per surfel [s], and weights of all surfels."""
-    comparison = Comparison(mode, ETA, NOISE_FLOOR_SURFACE, MIN_SAMPLES)
-    model.fit(made.first(2), comparison)  # compiles
+    options: dict[str, Any] = {
+        "eta": ETA,
+        "mode": mode,
+        "noise_floor": NOISE_FLOOR_SURFACE,
+        "min_samples": MIN_SAMPLES,
+    }
     n = len(made.offsets) - 1
-    return cpu_time(lambda: model.fit(made.block, comparison), n)
+    surface_weights(*made.first(2), tables=tables, **options)  # compiles
+    return cpu_time(lambda: surface_weights(*made.arrays, tables=tables, **options), n)
 
 
 def _mixed(made: Strip, weight: Array) -> Callable[[slice, int], Array]:
@@ -232,9 +242,9 @@ def surface_curves(quick: bool) -> list[Curve]:
                 "not_fitted": float((found.status != 0).sum()),
             }
             cubes = (
-                _cubes(made, table, found.parameters)
+                _cubes(made, table, found.weight)
                 if mode == "paper"
-                else _mixed(made, found.parameters)
+                else _mixed(made, found.weight)
             )
             measured.append(
                 (
@@ -248,7 +258,7 @@ def surface_curves(quick: bool) -> list[Curve]:
             )
             if mode == "paper" and rank == 59:
                 why = "cbrt(M x) is not cbrt(M) x, so weights of cube roots do not mix reflectance"
-                errors = _errors(made, few, _mixed(made, found.parameters))
+                errors = _errors(made, few, _mixed(made, found.weight))
                 measured.append(
                     (
                         "paper's weights used as linear weights",
@@ -290,17 +300,19 @@ def refit_curves(quick: bool) -> list[Curve]:
     dictionary, made, few = _problem(quick)
     _, full = _fit(
         made,
-        Mixture(dictionary.table),
+        Tables(dictionary.table, dictionary.grid, np.eye(len(dictionary.names))),
         "linear",
     )
-    H = nmf(full.parameters, 4, rng=np.random.default_rng(0)).H
+    H = nmf(full.weight, 4, rng=np.random.default_rng(0)).H
     measured = []
     took, weight = cpu_time(lambda: scipy_loop(made, few, channels=3, H=H), few)
     measured.append((SCIPY, took, weight))
-    four = Mixture((dictionary.table @ H.T).astype(np.float32))
+    four = Tables(
+        (dictionary.table @ H.T).astype(np.float32), dictionary.grid, np.eye(4)
+    )
     for mode in ("linear", "perceptual"):
         took, found = _fit(made, four, mode)
-        measured.append((f"skindb {mode}", took, found.parameters))
+        measured.append((f"skindb {mode}", took, found.weight))
     errors = [_errors(made, few, _mixed(made, weight @ H)) for _, _, weight in measured]
     return [
         Curve(

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import skindb
-from skindb.bench.names import KERNELS
+from skindb.bench import KERNELS
 from skindb.cli.options import DB, PATH, asked, common
 from skindb.cli.shared import aligned, bar, calibration_lines, emit, existing
 from skindb.cli.subjects import stale_as_json

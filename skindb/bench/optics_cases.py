@@ -1,30 +1,24 @@
-"""Stress cases of diffuse reflection: eq. 5, diffusion profiles and subsurface light at
-the extremes.
-"""
+"""Stress cases of diffusion and the octree."""
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 from scipy.integrate import quad
 
-from skindb.bench.case import SCALES, Case, close, combinations, each, expect
-from skindb.optics.diffusion import (
+from skindb.bench.case import SCALES, close, combinations, expect, stress_cases
+from skindb.optics.diffuse import (
     S_MAX,
     diffuse_reflectance,
-    dipole_profile,
     dipole_s,
     reduced_albedo,
     scattering_coefficients,
-    sigma_tr,
 )
+from skindb.optics.dipole import dipole_profile, sigma_tr
 from skindb.optics.dipole_tree import subsurface_exitance
 from skindb.optics.fresnel import fresnel_reflectance, internal_diffuse_reflectance
 from skindb.optics.transport import transport_profile
+from skindb.types import Array
 
-Array = NDArray[Any]
 ETA = 1.3
 PROFILES = {"dipole": dipole_profile, "transport": transport_profile}
 SINGLE = 2e-6  # results in single precision
@@ -331,206 +325,175 @@ def _broken_light() -> None:
 
 NAMES = tuple(PROFILES)
 OPTICS = (
-    *each(
-        "inverse", "eta {}", "s is recovered from R_d(s).", _round_trip, 1.0, 1.3, 1.5
-    ),
-    *each(
+    *stress_cases(
         "inverse",
-        "alpha' to 1, eta {}",
-        "s follows the first term of the series.",
-        _bright,
-        1.0,
-        1.3,
-    ),
-    *each(
-        "inverse",
-        "alpha' to 0, eta {}",
-        "s follows the first term of the series.",
-        _dark,
-        1.0,
-        1.3,
-    ),
-    Case(
-        "inverse",
-        "black, white, out of range, NaN and inf",
-        "Clamped and flagged, monotone; NaN stays NaN.",
-        _outside,
-    ),
-    Case(
-        "inverse",
-        "single precision",
-        "Computed in double precision: the same bits.",
-        _single_precision,
-    ),
-    Case(
-        "inverse",
-        "no values",
-        "Arrays are empty and have the right shapes.",
-        _no_values,
-    ),
-    *each(
-        "inverse",
-        "coefficients at sigma_tr {:g}",
-        "Limited where s approaches 0; sigma_tr is recovered.",
-        _coefficients,
-        1e-30,
-        1.0,
-        1e30,
-    ),
-    Case(
-        "inverse",
-        "Fresnel at eta 1",
-        "Nothing is reflected at any angle.",
-        _no_boundary,
-    ),
-    *each(
-        "inverse",
-        "Fresnel towards the horizon, eta {}",
-        "All light is reflected at the horizon, less above it.",
-        _grazing_light,
-        1.05,
-        1.3,
-        2.0,
-    ),
-    *each(
-        "transport",
-        "{}: r to 0",
-        "Positive, finite, and not steeper than single scattering.",
-        _near,
-        *NAMES,
-    ),
-    *each(
-        "transport",
-        "{}: r far",
-        "Decays to zero at the rate of its medium.",
-        _far,
-        *NAMES,
-    ),
-    *each(
-        "transport",
-        "{}: sigma_a = 0",
-        "Decays with the third power; it is the limit of little absorption.",
-        _no_absorption,
-        *NAMES,
-    ),
-    *each(
-        "transport",
-        "{}: sigma_s' to 0",
-        "No light is scattered back.",
-        _no_scattering,
-        *NAMES,
-    ),
-    *each(
-        "transport",
-        "{}: lengths times {:g}",
-        "The same in units of the mean free path.",
-        _similar,
-        *((name, s) for name in NAMES for s in SCALES),
-    ),
-    *each(
-        "transport",
-        "{}: single precision",
-        "Computed in double precision: the same bits.",
-        _profile_precision,
-        *NAMES,
-    ),
-    *each(
-        "transport",
-        "{}: NaN and inf",
-        "NaN gives NaN, and infinity no positive number.",
-        _profile_nan,
-        *NAMES,
-    ),
-    *each(
-        "transport",
-        "{}: sigma_a {:g}, sigma_s' {:g}",
-        "Finite, and decreasing with distance.",
-        _medium,
-        *combinations(
-            NAMES, (0.0, 1.0), (1e-12, 1.0), (0.1, 1e-4), (30.0, 1.0), (0.1, 100.0)
+        (
+            "eta {}",
+            "s is recovered from R_d(s).",
+            _round_trip,
+            (
+                1.0,
+                1.3,
+                1.5,
+            ),
+        ),
+        (
+            "alpha' to 1, eta {}",
+            "s follows the first term of the series.",
+            _bright,
+            (
+                1.0,
+                1.3,
+            ),
+        ),
+        (
+            "alpha' to 0, eta {}",
+            "s follows the first term of the series.",
+            _dark,
+            (
+                1.0,
+                1.3,
+            ),
+        ),
+        (
+            "black, white, out of range, NaN and inf",
+            "Clamped and flagged, monotone; NaN stays NaN.",
+            _outside,
+        ),
+        (
+            "single precision",
+            "Computed in double precision: the same bits.",
+            _single_precision,
+        ),
+        ("no values", "Arrays are empty and have the right shapes.", _no_values),
+        (
+            "coefficients at sigma_tr {:g}",
+            "Limited where s approaches 0; sigma_tr is recovered.",
+            _coefficients,
+            (
+                1e-30,
+                1.0,
+                1e30,
+            ),
+        ),
+        ("Fresnel at eta 1", "Nothing is reflected at any angle.", _no_boundary),
+        (
+            "Fresnel towards the horizon, eta {}",
+            "All light is reflected at the horizon, less above it.",
+            _grazing_light,
+            (
+                1.05,
+                1.3,
+                2.0,
+            ),
         ),
     ),
-    *each(
+    *stress_cases(
         "transport",
-        "{}: more absorption",
-        "There is less light at every distance.",
-        _more_absorption,
-        *NAMES,
+        (
+            "{}: r to 0",
+            "Positive, finite, and not steeper than single scattering.",
+            _near,
+            NAMES,
+        ),
+        ("{}: r far", "Decays to zero at the rate of its medium.", _far, NAMES),
+        (
+            "{}: sigma_a = 0",
+            "Decays with the third power; it is the limit of little absorption.",
+            _no_absorption,
+            NAMES,
+        ),
+        ("{}: sigma_s' to 0", "No light is scattered back.", _no_scattering, NAMES),
+        (
+            "{}: lengths times {:g}",
+            "The same in units of the mean free path.",
+            _similar,
+            ((name, s) for name in NAMES for s in SCALES),
+        ),
+        (
+            "{}: single precision",
+            "Computed in double precision: the same bits.",
+            _profile_precision,
+            NAMES,
+        ),
+        (
+            "{}: NaN and inf",
+            "NaN gives NaN, and infinity no positive number.",
+            _profile_nan,
+            NAMES,
+        ),
+        (
+            "{}: sigma_a {:g}, sigma_s' {:g}",
+            "Finite, and decreasing with distance.",
+            _medium,
+            combinations(
+                NAMES,
+                (0.0, 1.0),
+                (1e-12, 1.0),
+                (0.1, 0.0001),
+                (30.0, 1.0),
+                (0.1, 100.0),
+            ),
+        ),
+        (
+            "{}: more absorption",
+            "There is less light at every distance.",
+            _more_absorption,
+            NAMES,
+        ),
+        ("{}: no distances", "The array is empty.", _no_distances, NAMES),
+        (
+            "dipole: eta {}, albedo {:g}",
+            "Its integral over the plane is eq. 5.",
+            _integral,
+            (
+                (1.0, 0.5),
+                (1.3, 0.01),
+                (1.3, 0.5),
+                (1.3, 0.999),
+            ),
+        ),
     ),
-    *each(
-        "transport", "{}: no distances", "The array is empty.", _no_distances, *NAMES
-    ),
-    *each(
-        "transport",
-        "dipole: eta {}, albedo {:g}",
-        "Its integral over the plane is eq. 5.",
-        _integral,
-        (1.0, 0.5),
-        (1.3, 0.01),
-        (1.3, 0.5),
-        (1.3, 0.999),
-    ),
-    *each(
+    *stress_cases(
         "subsurface",
-        "uniform light, s {:g}, sigma_tr {:g}",
-        "Exitance is R_d.",
-        _uniform,
-        (0.0, 1.0),
-        (0.7, 0.01),
-        (0.7, 100.0),
-        (S_MAX - 1e-6, 1.0),
+        (
+            "uniform light, s {:g}, sigma_tr {:g}",
+            "Exitance is R_d.",
+            _uniform,
+            (
+                (0.0, 1.0),
+                (0.7, 0.01),
+                (0.7, 100.0),
+                (S_MAX - 1e-06, 1.0),
+            ),
+        ),
+        ("uniform light, eta {2}", "Exitance is R_d.", _uniform, ((0.7, 1.0, 1.0),)),
+        (
+            "{} point(s)",
+            "Exitance is R_d in uniform light; empty for no points.",
+            _few_points,
+            (
+                0,
+                1,
+                3,
+                2400,
+            ),
+        ),
+        ("no lights", "Arrays are empty and have the right shapes.", _no_lights),
+        ("50 points in one place", "All receive the mean of their light.", _same_place),
+        ("points in a line", "Exitance is R_d in uniform light.", _in_a_line),
+        ("a kilometre apart", "No light is exchanged.", _far_apart),
+        ("light times {:g}", "Exitance is multiplied by it.", _scaled_light, SCALES),
+        (
+            "lengths times {:g}",
+            "Exitance is unchanged.",
+            _scaled_lengths,
+            (
+                1e-06,
+                1000000.0,
+            ),
+        ),
+        ("no light", "Exitance is zero.", _no_light),
+        ("NaN in one light", "Only this light has NaN.", _broken_light),
     ),
-    *each(
-        "subsurface",
-        "uniform light, eta {2}",
-        "Exitance is R_d.",
-        _uniform,
-        (0.7, 1.0, 1.0),
-    ),
-    *each(
-        "subsurface",
-        "{} point(s)",
-        "Exitance is R_d in uniform light; empty for no points.",
-        _few_points,
-        0,
-        1,
-        3,
-        2400,
-    ),
-    Case(
-        "subsurface",
-        "no lights",
-        "Arrays are empty and have the right shapes.",
-        _no_lights,
-    ),
-    Case(
-        "subsurface",
-        "50 points in one place",
-        "All receive the mean of their light.",
-        _same_place,
-    ),
-    Case(
-        "subsurface",
-        "points in a line",
-        "Exitance is R_d in uniform light.",
-        _in_a_line,
-    ),
-    Case("subsurface", "a kilometre apart", "No light is exchanged.", _far_apart),
-    *each(
-        "subsurface",
-        "light times {:g}",
-        "Exitance is multiplied by it.",
-        _scaled_light,
-        *SCALES,
-    ),
-    *each(
-        "subsurface",
-        "lengths times {:g}",
-        "Exitance is unchanged.",
-        _scaled_lengths,
-        1e-6,
-        1e6,
-    ),
-    Case("subsurface", "no light", "Exitance is zero.", _no_light),
-    Case("subsurface", "NaN in one light", "Only this light has NaN.", _broken_light),
 )

@@ -1,19 +1,96 @@
-"""Stress cases of least squares and factorisations."""
+"""Factorisations and non-negative least squares: curves compared with scikit-learn, and
+stress cases.
+"""
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import nnls
+from sklearn.decomposition import NMF
+from sklearn.exceptions import ConvergenceWarning
 
-from skindb.bench.case import SCALES, Case, close, each, expect
-from skindb.numerics.factorise import nmf
+from skindb.bench.case import SCALES, close, expect, stress_cases
+from skindb.bench.curve import Curve, Point, cpu_time
+from skindb.numerics.factorise import nmf, relative_error
 from skindb.numerics.nnls import solve_nnls
+from skindb.reflectance.dictionary import embedded_dictionary
 from skindb.reflectance.rows import ReflectanceFit, fit_reflectance
+from skindb.reflectance.tables import brdf_metric
+from skindb.types import Array
 
-Array = NDArray[Any]
+K = 6
+
+
+def nmf_curves(quick: bool) -> list[Curve]:
+    """Skindb by number of starts, scikit-learn by iterations; each H is rated in both
+    metrics with the best W.
+    """
+    X, H = _weights(300 if quick else 2000)
+    gram = brdf_metric(embedded_dictionary().table)
+    gram /= np.trace(gram)
+    metrics = {"weights": np.eye(len(gram)), "BRDFs": gram}
+    found = [("planted", "", np.nan, H)]
+    nmf(X[:20], 2, metric=gram, seeds=0, rng=_rng())  # compiles
+    for name, metric in (("weights", None), ("BRDFs", gram)):
+        for seeds in (0,) if quick else (0, 3, 8):
+            took, factors = cpu_time(
+                lambda m=metric, s=seeds: nmf(X, K, metric=m, seeds=s, rng=_rng())  # type: ignore[misc]
+            )
+            found.append(
+                (f"skindb between {name}", f"{1 + seeds} starts", took, factors.H)
+            )
+    for solver in ("cd", "mu"):
+        for steps in (10, 200) if quick else (10, 50, 200, 1000):
+            took, rows = cpu_time(lambda s=solver, n=steps: _scikit(X, s, n))  # type: ignore[misc]
+            found.append((f"scikit-learn {solver}", f"{steps} iterations", took, rows))
+    reference = (
+        f"{len(X)} planted mixtures of {K} with 20 % scatter, so that the error cannot "
+        "be zero"
+    )
+    return [
+        Curve(
+            "nmf",
+            f"|X - W H| / |X| between {name}",
+            reference,
+            "a factorisation",
+            "scikit-learn cd, 200 iterations",
+            tuple(
+                Point(method, at, took, relative_error(X, rows, metric))
+                for method, at, took, rows in found
+            ),
+        )
+        for name, metric in metrics.items()
+    ]
+
+
+def _rng() -> np.random.Generator:
+    return np.random.default_rng(1)
+
+
+def _weights(n: int) -> tuple[Array, Array]:
+    """Weights (n, 59), mixtures of K sparse rows H with scatter like that of similar
+    BRDFs, and H.
+    """
+    rng = np.random.default_rng(0)
+    H = np.where(rng.random((K, 59)) < 0.2, rng.uniform(0.2, 1, (K, 59)), 0)
+    H[:, :K] += np.eye(K)
+    X = rng.gamma(0.7, 1.0, (n, K)) @ H
+    return X * rng.lognormal(0, 0.2, X.shape), H
+
+
+def _scikit(X: Array, solver: str, steps: int) -> Any:
+    model = NMF(
+        K, init="nndsvda", solver=solver, max_iter=steps, tol=1e-6, random_state=0
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        model.fit(X)
+    return model.components_
+
+
 # normal equations square the condition: residuals agree to the root of the rounding
 # error
 ROUNDING = 1e-7
@@ -275,152 +352,134 @@ MODES = ("linear", "perceptual")
 SPACES = ("weights", "metric")
 BOTH = [(mode, s) for mode in MODES for s in SCALES]
 SOLVERS = (
-    Case(
+    *stress_cases(
         "surface",
-        "solver: 0 samples",
-        "Nothing is fitted, and the status says so.",
-        _no_rows,
+        ("solver: 0 samples", "Nothing is fitted, and the status says so.", _no_rows),
+        (
+            "solver: fewer than required",
+            "Too few samples give a status, not a fit.",
+            _few_are_refused,
+        ),
+        (
+            "solver: {} samples",
+            "Certified, and no worse than SciPy.",
+            _samples,
+            (
+                1,
+                3,
+                2400,
+            ),
+        ),
+        (
+            "solver: {} bases",
+            "No worse than SciPy; redundant bases change nothing.",
+            _columns,
+            (
+                "zero",
+                "duplicate",
+                "collinear",
+            ),
+        ),
+        (
+            "solver: {}, bases times {:g}",
+            "Weights are divided by it.",
+            _scaled_rows,
+            BOTH,
+        ),
+        (
+            "solver: {}, samples times {:g}",
+            "Weights are multiplied by it.",
+            _scaled_samples,
+            BOTH,
+        ),
+        (
+            "solver: bases from 1 to {:g}",
+            "No worse than SciPy on equal scales.",
+            _scaled_columns,
+            SCALES,
+        ),
+        (
+            "solver: {}, a sample is {}",
+            "Its surfel is NaN with a status; its neighbour is unchanged.",
+            _not_finite,
+            ((mode, bad) for mode in MODES for bad in (np.nan, np.inf, -np.inf)),
+        ),
+        (
+            "solver: {}, all samples {:g}",
+            "Black and negative samples give weights of exactly zero.",
+            _black,
+            ((mode, level) for mode in MODES for level in (0.0, -1.0)),
+        ),
+        (
+            "solver: single precision",
+            "Weights are the same to rounding.",
+            _single_precision,
+        ),
+        (
+            "solver: 59 bases, 12 samples",
+            "Certified, and no worse than SciPy.",
+            _more_bases_than_samples,
+        ),
+        (
+            "solver: no surfels",
+            "Arrays are empty and have the right shapes.",
+            _empty_batch,
+        ),
     ),
-    Case(
-        "surface",
-        "solver: fewer than required",
-        "Too few samples give a status, not a fit.",
-        _few_are_refused,
-    ),
-    *each(
-        "surface",
-        "solver: {} samples",
-        "Certified, and no worse than SciPy.",
-        _samples,
-        1,
-        3,
-        2400,
-    ),
-    *each(
-        "surface",
-        "solver: {} bases",
-        "No worse than SciPy; redundant bases change nothing.",
-        _columns,
-        "zero",
-        "duplicate",
-        "collinear",
-    ),
-    *each(
-        "surface",
-        "solver: {}, bases times {:g}",
-        "Weights are divided by it.",
-        _scaled_rows,
-        *BOTH,
-    ),
-    *each(
-        "surface",
-        "solver: {}, samples times {:g}",
-        "Weights are multiplied by it.",
-        _scaled_samples,
-        *BOTH,
-    ),
-    *each(
-        "surface",
-        "solver: bases from 1 to {:g}",
-        "No worse than SciPy on equal scales.",
-        _scaled_columns,
-        *SCALES,
-    ),
-    *each(
-        "surface",
-        "solver: {}, a sample is {}",
-        "Its surfel is NaN with a status; its neighbour is unchanged.",
-        _not_finite,
-        *((mode, bad) for mode in MODES for bad in (np.nan, np.inf, -np.inf)),
-    ),
-    *each(
-        "surface",
-        "solver: {}, all samples {:g}",
-        "Black and negative samples give weights of exactly zero.",
-        _black,
-        *((mode, level) for mode in MODES for level in (0.0, -1.0)),
-    ),
-    Case(
-        "surface",
-        "solver: single precision",
-        "Weights are the same to rounding.",
-        _single_precision,
-    ),
-    Case(
-        "surface",
-        "solver: 59 bases, 12 samples",
-        "Certified, and no worse than SciPy.",
-        _more_bases_than_samples,
-    ),
-    Case(
-        "surface",
-        "solver: no surfels",
-        "Arrays are empty and have the right shapes.",
-        _empty_batch,
-    ),
-    *each(
+    *stress_cases(
         "nmf",
-        "k above the rank, {}",
-        "The error is small; spare components are valid.",
-        _above_the_rank,
-        *SPACES,
-    ),
-    Case("nmf", "k above a side", "Refused with the rule.", _above_the_size),
-    *each(
-        "nmf",
-        "weights times {:g}",
-        "Basis and relative error are unchanged.",
-        _scaled_weights,
-        *SCALES,
-    ),
-    *each(
-        "nmf",
-        "in the metric, times {:g}",
-        "The basis is unchanged.",
-        _scaled_in_metric,
-        *SCALES,
-    ),
-    *each(
-        "nmf",
-        "one surfel, {}",
-        "The basis is its own reflectance.",
-        _one_surfel,
-        *SPACES,
-    ),
-    *each(
-        "nmf",
-        "constant, {}",
-        "The component is the constant, without error.",
-        _constant,
-        *SPACES,
-    ),
-    Case("nmf", "weights of zero", "The basis is uniform, without error.", _nothing),
-    *each(
-        "nmf",
-        "unused rows, {}",
-        "Unused BRDFs have no weight in the basis.",
-        _idle_rows_and_columns,
-        *SPACES,
-    ),
-    Case(
-        "nmf",
-        "a BRDF of zero",
-        "A singular metric still gives a basis.",
-        _zero_basis_in_metric,
-    ),
-    *each(
-        "nmf",
-        "a weight is {}",
-        "Refused with the rule.",
-        _bad_weights,
-        np.nan,
-        np.inf,
-        -1.0,
-    ),
-    Case(
-        "nmf",
-        "duplicates",
-        "Components are the same, divided equally between duplicates.",
-        _duplicates,
+        (
+            "k above the rank, {}",
+            "The error is small; spare components are valid.",
+            _above_the_rank,
+            SPACES,
+        ),
+        ("k above a side", "Refused with the rule.", _above_the_size),
+        (
+            "weights times {:g}",
+            "Basis and relative error are unchanged.",
+            _scaled_weights,
+            SCALES,
+        ),
+        (
+            "in the metric, times {:g}",
+            "The basis is unchanged.",
+            _scaled_in_metric,
+            SCALES,
+        ),
+        ("one surfel, {}", "The basis is its own reflectance.", _one_surfel, SPACES),
+        (
+            "constant, {}",
+            "The component is the constant, without error.",
+            _constant,
+            SPACES,
+        ),
+        ("weights of zero", "The basis is uniform, without error.", _nothing),
+        (
+            "unused rows, {}",
+            "Unused BRDFs have no weight in the basis.",
+            _idle_rows_and_columns,
+            SPACES,
+        ),
+        (
+            "a BRDF of zero",
+            "A singular metric still gives a basis.",
+            _zero_basis_in_metric,
+        ),
+        (
+            "a weight is {}",
+            "Refused with the rule.",
+            _bad_weights,
+            (
+                np.nan,
+                np.inf,
+                -1.0,
+            ),
+        ),
+        (
+            "duplicates",
+            "Components are the same, divided equally between duplicates.",
+            _duplicates,
+        ),
     ),
 )
