@@ -14,7 +14,7 @@ import pytest
 import trimesh
 from page_session import Session
 
-from skindb.virtual.face_field import FaceShape
+from skindb.virtual.face import FaceShape
 from skindb.virtual.head import parametric_head
 
 

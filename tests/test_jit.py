@@ -72,7 +72,7 @@ IMPORTED = (
     "ingest",
     "render.rendering",
     "export.gltf",
-    "virtual.takes",
+    "virtual.capture",
     "bench.run",
 )
 

@@ -29,7 +29,7 @@ from skindb.render.image import write_exr, write_png
 from skindb.view.face import face_record
 from skindb.view.landmarks import landmark_task, save_landmarks
 from skindb.view.page import PagedFace, write_folder, write_page
-from skindb.virtual.face_field import FaceShape
+from skindb.virtual.face import FaceShape
 from skindb.virtual.head import parametric_head
 
 

@@ -22,6 +22,7 @@ T = TypeVar("T")
 # number of rounds, of which the best counts; no further round after this time [s]
 ROUNDS = 3
 LONG = 2.0
+EXACT = 1e-17  # position of errors of zero
 
 
 @dataclass(frozen=True)
@@ -70,9 +71,6 @@ def cpu_time(work: Callable[[], T], per: float = 1.0) -> tuple[float, T]:
         result = work()
         times.append(time.process_time() - start)
     return min(times) / per, result
-
-
-EXACT = 1e-17  # position of errors of zero
 
 
 def plot_curves(curves: Sequence[Curve], path: Path) -> None:

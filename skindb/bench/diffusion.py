@@ -39,6 +39,9 @@ SKIN = (
     (0.3, 1.0),
     (0.54, 0.79),
 )  # sigma_a, sigma_s' [mm-1]; albedo 0.98 to 0.59
+PROBES = tuple(MODELS)
+RECOVERED = "Coefficients are recovered."
+MEDIUM = (0.17, 2.3)
 
 
 @lru_cache(maxsize=1)
@@ -360,12 +363,6 @@ def _fitter(
         ]
 
     return fit
-
-
-PROBES = tuple(MODELS)
-RECOVERED = "Coefficients are recovered."
-
-MEDIUM = (0.17, 2.3)
 
 
 def _true_profile(

@@ -33,7 +33,7 @@ from skindb.reflectance.dictionary import (
 from skindb.reflectance.rows import basis_rows
 from skindb.reflectance.tables import TableGrid, lookup, tabulate
 from skindb.types import Array
-from skindb.virtual.sensor import Sensor
+from skindb.virtual.frames import Sensor
 
 # refractive index, radius of a ball [mm], points of comparison
 ETA = 1.3
@@ -43,6 +43,8 @@ SIGMA_TR = np.array([0.55, 0.98, 1.55])  # mm-1
 SKIN = (0.5, 0.3, 0.2)  # R_d
 PROFILE_REACH_MM = 25.0  # mm: beyond it the profile is below 1e-6 of its integral
 LIGHTS = 4
+SECONDS = (0.04, 0.005)
+GRID = TableGrid(24, 20, 8)
 
 
 def subsurface_curves(quick: bool) -> list[Curve]:
@@ -327,9 +329,6 @@ def _sensor(**changes: Any) -> SensorRecord:
     return SensorRecord(FrameKind(4, 3, 16), **(levels | changes))
 
 
-SECONDS = (0.04, 0.005)
-
-
 def _frames(value: int, shape: tuple[int, ...] = (3, 4, 3)) -> list[Array]:
     return [np.full(shape, value, np.uint16) for _ in SECONDS]
 
@@ -473,9 +472,6 @@ EXPOSURES = stress_cases(
         ),
     ),
 )
-
-
-GRID = TableGrid(24, 20, 8)
 
 
 def _dictionary(table: Array) -> Dictionary:

@@ -24,6 +24,7 @@ PROFILES = {"dipole": dipole_profile, "transport": transport_profile}
 SINGLE = 2e-6  # results in single precision
 
 # eq. 5, its inverse, Fresnel
+NAMES = tuple(PROFILES)
 
 
 def _round_trip(eta: float) -> None:
@@ -323,7 +324,6 @@ def _broken_light() -> None:
     close(out[1], diffuse_reflectance(0.7, eta=ETA), rtol=SINGLE)
 
 
-NAMES = tuple(PROFILES)
 OPTICS = (
     *stress_cases(
         "inverse",

@@ -40,6 +40,8 @@ SCAN_ERROR = 3.0
 DOMES = ((12, 2), (16, 4), (32, 6), (64, 8), (150, 16))  # lights, cameras
 NOISE = 0.03
 GLOSS = 0.1
+NORMALS = ("combined", "chromatic", "photometric", "peak")
+METHODS = ("separated", "quantile", "minimum")
 
 
 @dataclass(frozen=True)
@@ -259,8 +261,6 @@ def _albedo(skin: ModelSamples, name: str, samples: str, **ask: Any) -> Point:
     return Point(name, samples, took, float(np.nanmedian(np.abs(relative))), why, more)
 
 
-NORMALS = ("combined", "chromatic", "photometric", "peak")
-
 # normals
 
 
@@ -346,8 +346,6 @@ def _no_surfels_normals() -> None:
 
 
 # albedo
-
-METHODS = ("separated", "quantile", "minimum")
 
 
 def _estimated_albedo(

@@ -22,6 +22,16 @@ from skindb.reflectance.tables import brdf_metric
 from skindb.types import Array
 
 K = 6
+# normal equations square the condition: residuals agree to the root of the rounding
+# error
+ROUNDING = 1e-7
+# of weights up to 0.5: rows and sums of a surfel are in single precision, and scales no
+# powers of two
+SINGLE = 2e-5
+KKT = 1e-9  # largest KKT residual of a solution; the tolerance of the solver is 1e-10
+MODES = ("linear", "perceptual")
+SPACES = ("weights", "metric")
+BOTH = [(mode, s) for mode in MODES for s in SCALES]
 
 
 def nmf_curves(quick: bool) -> list[Curve]:
@@ -89,15 +99,6 @@ def _scikit(X: Array, solver: str, steps: int) -> Any:
         warnings.simplefilter("ignore", ConvergenceWarning)
         model.fit(X)
     return model.components_
-
-
-# normal equations square the condition: residuals agree to the root of the rounding
-# error
-ROUNDING = 1e-7
-# of weights up to 0.5: rows and sums of a surfel are in single precision, and scales no
-# powers of two
-SINGLE = 2e-5
-KKT = 1e-9  # largest KKT residual of a solution; the tolerance of the solver is 1e-10
 
 
 def _rows(n: int, m: int = 6, seed: int = 0) -> tuple[Array, Array]:
@@ -348,9 +349,6 @@ def _samples(n: int) -> None:
     _as_scipy(*_rows(n))
 
 
-MODES = ("linear", "perceptual")
-SPACES = ("weights", "metric")
-BOTH = [(mode, s) for mode in MODES for s in SCALES]
 SOLVERS = (
     *stress_cases(
         "surface",

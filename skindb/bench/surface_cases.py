@@ -26,6 +26,11 @@ ETA = 1.3
 CHOSEN = [3, 12, 20, 31, 44, 57]  # six of the embedded materials
 WEIGHT = np.array([0.2, 0.0, 0.1, 0.0, 0.3, 0.0])
 DIFFUSE = np.array([0.5, 0.33, 0.24])
+# error for samples in single precision: positions in a table to 1e-6, times the slope
+# of its lobes
+SINGLE = 1e-4
+TOTAL = 1e-6  # relative: rounding of samples in single precision
+MODES = ("linear", "perceptual")
 
 
 def spiral(n: int, top: float) -> Array:
@@ -164,12 +169,6 @@ def rows(skin: Surfels, s: int) -> tuple[Array, Array]:
     target = skin.sample[s].astype(np.float64) - shape[..., None] * skin.diffuse[s]
     return M.reshape(-1, M.shape[-1]), target.reshape(-1, 3)
 
-
-# error for samples in single precision: positions in a table to 1e-6, times the slope
-# of its lobes
-SINGLE = 1e-4
-TOTAL = 1e-6  # relative: rounding of samples in single precision
-MODES = ("linear", "perceptual")
 
 # surface
 

@@ -1,23 +1,259 @@
-"""The report of the demo: subjects, errors against the truth, population, an edit, run times."""
+"""The report of the demo: subjects, populations, an edit and its distance from the data."""
 
 from __future__ import annotations
 
+import html
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from skindb import __version__
-from skindb.demo import figures, page, tables
-from skindb.demo.edit_section import edit_section
-from skindb.demo.pictures import Portraits, draw_portraits
-from skindb.demo.results import Results
-from skindb.demo.subjects_section import subjects_section
+from skindb.demo import page, pictures, tables
+from skindb.demo.pictures import (
+    Image,
+    Portraits,
+    draw_portraits,
+    half_size,
+    map_pictures,
+    portrait,
+    predictions,
+)
+from skindb.demo.tables import Results
 from skindb.files import private_file
+from skindb.render.compare import compare_images
+from skindb.schema import FitStatus
 from skindb.types import Progress
 
+# largest distance of an edit inside the data, in median distances between takes
+INSIDE = 1.0
+MEASURED = "measured"
+SHOWN = ("trait", "takes_with", "takes_without", "brdf_shift", "colour_shift")
+VIEWER = "viewer.html"  # beside the report
+ERROR_NAMES = ("Normal [deg]", "R_d [%]", "Held-out lights [%]")
+LEAST_PERCENT = 0.1  # smallest percentage that is written as a number
+Record = Mapping[str, Any]
 Section = Callable[[Results, Portraits], list[str]]
+
+
+def edit_section(results: Results, portraits: Portraits) -> list[str]:
+    """Pictures of the edited models and their distance from the data; empty if no model
+    was edited.
+    """
+    if not results.edits:
+        return []
+    images = {f"{amount:g}": portrait(tree) for amount, tree in results.edits.items()}
+    captions = {
+        f"{amount:g}": _edit_caption(amount, tree.attrs)
+        for amount, tree in results.edits.items()
+    }
+    if results.target_take in portraits.images:
+        images[MEASURED] = portraits.images[results.target_take]
+        captions[MEASURED] = f"{results.target_take}: the measured take"
+    drawn = portraits.cut(images)
+    shown = [
+        page.picture(
+            drawn[key], f"{results.edited_take}: {captions[key]}", caption=captions[key]
+        )
+        for key in drawn
+    ]
+    trait = next(iter(next(iter(results.edits.values())).attrs["edit"]))
+    text = (
+        f"{results.edited_take} is moved along the trait vector of {trait}: the "
+        "mean of the takes with the trait minus "
+        "the mean of those without it. The takes span amounts from 0 to 1. The "
+        "distance of an edit is the distance to "
+        "its nearest take, divided by the median distance between takes. If it is "
+        "at most 1, the edit is inside the "
+        "data."
+    )
+    full = tables.study_table("traits", results.studies["traits"])
+    rows = [[_breakable(row[0]), *row[1:]] for row in full.columns(SHOWN).rows]
+    named = page.Table("traits", [_breakable(name) for name in SHOWN], rows)
+    note = (
+        "Shifts are root mean squares of the parts of a vector: coefficients of "
+        "the common basis, and quantiles of "
+        "colour. The file also contains standard errors from a bootstrap over "
+        "subjects. If there is only one take on a "
+        "side, a vector is a difference of two takes and has no standard error."
+    )
+    listed = page.details("Trait vectors", [page.paragraph(note), page.table(named)])
+    said = _edit_error(results, portraits, images)
+    return [
+        page.paragraph(text),
+        page.row(shown),
+        *said,
+        listed,
+        page.downloads([full]),
+    ]
+
+
+def _breakable(name: str) -> str:
+    """A name with spaces, so that it can be broken on a narrow page."""
+    return name.replace(":", ": ").replace("_", " ")
+
+
+def _edit_caption(amount: float, attrs: Mapping[Any, Any]) -> str:
+    distance = attrs["edit_distance"]
+    place = (
+        "inside the data"
+        if 0 <= amount <= 1 and round(distance, 2) <= INSIDE
+        else "outside the data"
+    )
+    return f"amount {amount:g}, distance {distance:.2f}: {place}"
+
+
+def _edit_error(
+    results: Results, portraits: Portraits, images: Mapping[str, Image]
+) -> list[str]:
+    """Colour differences of the unedited model and of the edit at amount 1 from the
+    measured take.
+    """
+    if MEASURED not in images or not {"0", "1"} <= set(images):
+        return []
+    target = images[MEASURED]
+    errors = {
+        amount: compare_images(images[amount], target, exposure=portraits.exposure)[
+            "delta_e_mean"
+        ]
+        for amount in ("0", "1")
+    }
+    return [
+        page.paragraph(
+            f"The mean colour difference to the picture of {results.target_take} "
+            f"is {errors['0']:.2g} for the unedited "
+            f"model and {errors['1']:.2g} at amount 1 (CIEDE2000)."
+        )
+    ]
+
+
+def subjects_section(results: Results, portraits: Portraits) -> list[str]:
+    """Table of all takes with small pictures; maps and a predicted photograph can be
+    opened below each row.
+    """
+    first = next(iter(results.models))
+    viewer = (
+        f'<p><a href="{VIEWER}">Turn {html.escape(first)} and move its lights</a> in '
+        "this browser (WebGL2).</p>"
+    )
+    text = (
+        "The portraits show the fitted models from the front under two lights of "
+        "the dome. Pictures of one kind have "
+        "the same exposure and the same scale for all subjects. Errors are medians "
+        "over the fitted surfels: the angle "
+        "between recovered and true normals, the relative error of the diffuse "
+        "reflectance R_d (mean of the channels), "
+        "and the relative error of samples under lights that the fit did not use."
+    )
+    drawn = portraits.cut(portraits.images)
+    maps = map_pictures(results.models)
+    strips = _strips(results)
+    bodies = []
+    for values in tables.subject_table(results).rows:
+        record = dict(zip(tables.SUBJECT_HEADER, values, strict=True))
+        take = str(record["take"])
+        shown = [(drawn[take], "portrait"), *maps[take]]
+        blocks = [
+            page.row(
+                page.picture(one, f"{take}: {name}", caption=name)
+                for one, name in shown
+            )
+        ]
+        blocks += [page.row([strips[take]], kind="strip")] if take in strips else []
+        bodies.append(
+            _subject(
+                record,
+                results,
+                page.picture(half_size(drawn[take]), _alt(take, record)),
+                blocks,
+            )
+        )
+    head = "".join(
+        f'<th scope="col">{name}</th>'
+        for name in ("Portrait", "Take", "Fitted", "Not fitted", *ERROR_NAMES)
+    )
+    listed = f'<table class="subjects"><thead><tr>{head}</tr></thead>{"".join(bodies)}</table>'
+    saved = page.downloads(
+        [tables.subject_table(results), tables.status_table(results)]
+    )
+    return [viewer, page.paragraph(text), listed, saved]
+
+
+def _alt(take: str, record: Record) -> str:
+    return f"Portrait of the fitted model of {take}: {_who(record)}"
+
+
+def _who(record: Record) -> str:
+    words = [
+        str(record[name])
+        for name in ("age", "gender", "ancestry", "condition")
+        if record[name] != ""
+    ]
+    return ", ".join(words).replace("_", " ")
+
+
+def _subject(record: Record, results: Results, small: str, maps: list[str]) -> str:
+    """Two rows of the table: the values of a take, and its maps, which can be opened."""
+    take = str(record["take"])
+    counts = tables.status_counts(results.models[take])
+    total = sum(counts.values())
+    others = [
+        f"{status.name.lower().replace('_', ' ')} {_percent(100 * count / total)} %"
+        for status, count in sorted(counts.items(), key=lambda one: -one[1])
+        if count and status != FitStatus.FITTED
+    ]
+    channels = [record[f"diffuse_{name}_percent"] for name in ("red", "green", "blue")]
+    cells = {
+        "Fitted": (
+            f"{record['fitted_surfels']:,} of {total:,} surfels "
+            f"({record['fitted_percent']:.1f} %)"
+        ),
+        "Not fitted": ", ".join(others) or "none",
+        ERROR_NAMES[0]: page.cell(record["normal_median_deg"]),
+        ERROR_NAMES[1]: page.cell(float(np.mean(channels))),
+        ERROR_NAMES[2]: page.cell(record["held_out_percent"]),
+    }
+    name = f"<b>{html.escape(take)}</b><br>{html.escape(_who(record))}"
+    values = "".join(
+        f'<td data-label="{key}">{html.escape(value)}</td>'
+        for key, value in cells.items()
+    )
+    shown = page.details(f"Pictures and maps of {take}", maps)
+    return (
+        f"<tbody><tr><td>{small}</td><td>{name}</td>{values}</tr><tr><td "
+        f'colspan="7">{shown}</td></tr></tbody>'
+    )
+
+
+def _percent(value: float) -> str:
+    return f"{value:.1f}" if value >= LEAST_PERCENT else f"below {LEAST_PERCENT}"
+
+
+def _strips(results: Results) -> dict[str, str]:
+    """For each take a photograph, its prediction and their difference, under a held-out
+    light if there is one.
+    """
+    shown = {
+        take: min(found, key=lambda one: not one.held_out)
+        for take, found in results.compared.items()
+        if found
+    }
+    if not shown:
+        return {}
+    exposure = min(one.error["exposure"] for one in shown.values())
+    strips = predictions(list(shown.values()), exposure)
+    made = {}
+    for (take, one), strip in zip(shown.items(), strips, strict=True):
+        held = "not used by the fit" if one.held_out else "used by the fit"
+        caption = (
+            "Photograph, prediction and ten times their difference (grey is "
+            f"none). Light {one.light}, {held}; "
+            f"relative RMSE {100 * one.error['relative_rmse']:.1f} %."
+        )
+        made[take] = page.picture(strip, f"{take}: {caption}", caption=caption)
+    return made
 
 
 def write_report(path: Path, results: Results, *, progress: Progress) -> Path:
@@ -91,7 +327,8 @@ def _recovered(results: Results, _: Portraits) -> list[str]:
         "photons of the probe and the effect of the finite size of its fibres."
     )
     normals = page.details(
-        "Distribution of the error of normals", [figures.normal_plot(results.recovered)]
+        "Distribution of the error of normals",
+        [pictures.normal_plot(results.recovered)],
     )
     full = tables.site_table(results)
     shown = full.renamed(["take", "site", "red [%]", "green [%]", "blue [%]"])
@@ -106,7 +343,7 @@ def _recovered(results: Results, _: Portraits) -> list[str]:
     )
     return [
         page.paragraph(text),
-        figures.reflectance_plot(results.recovered),
+        pictures.reflectance_plot(results.recovered),
         normals,
         *sites,
         page.downloads([full]),
@@ -121,8 +358,8 @@ def _population(results: Results, _: Portraits) -> list[str]:
     )
     study = results.studies["translucency"]
     plots = [
-        figures.translucency_plot(study["translucency_table"].to_dataset().load()),
-        figures.albedo_plot(results.studies["albedo"]["albedo"].to_dataset().load()),
+        pictures.translucency_plot(study["translucency_table"].to_dataset().load()),
+        pictures.albedo_plot(results.studies["albedo"]["albedo"].to_dataset().load()),
     ]
     saved = [
         tables.study_table(name, results.studies[name])
@@ -152,7 +389,7 @@ def _basis_size(results: Results) -> str:
         f"{curve.attrs['surfels']} surfels of all takes."
     )
     return page.details(
-        "Number of basis BRDFs", [page.paragraph(text), figures.basis_size_plot(curve)]
+        "Number of basis BRDFs", [page.paragraph(text), pictures.basis_size_plot(curve)]
     )
 
 

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 
 from skindb import workflow
-from skindb.demo.report import write_report
-from skindb.demo.results import Results
-from skindb.demo.subjects_section import VIEWER
+from skindb.demo.report import VIEWER, write_report
+from skindb.demo.tables import Results
 from skindb.elementwise import thread_count
 from skindb.errors import Fault, InputError
 from skindb.export.bundle import export_bundle
@@ -21,8 +20,8 @@ from skindb.fit import FitParameters
 from skindb.render.photographs import compare_photographs
 from skindb.store import Database
 from skindb.types import Progress, silent
+from skindb.virtual.capture import simulate_takes
 from skindb.virtual.person import default_people
-from skindb.virtual.takes import simulate_takes
 from skindb.virtual.truth import recovered_against_true
 
 # fraction of lights; mm

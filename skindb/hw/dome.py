@@ -15,7 +15,7 @@ from skindb.hw.link import (
     Link,
     stopped_at_end,
 )
-from skindb.hw.readings import (
+from skindb.hw.protocol import (
     CLOCK_ERROR,
     CURRENT,
     EARLY_SECONDS,

@@ -54,7 +54,7 @@ class RefusedError(DeviceError):
 
 
 class Accepted(Protocol[T_co]):
-    """Values that a device may send; see `skindb.hw.readings`."""
+    """Values that a device may send; see `skindb.hw.protocol`."""
 
     def parse(self, text: str) -> T_co:
         """The value; raises ValueError if the text is not one of these values."""

@@ -16,7 +16,7 @@ from skindb.hw.link import (
     Link,
     stopped_at_end,
 )
-from skindb.hw.readings import (
+from skindb.hw.protocol import (
     CLOCK_ERROR,
     EARLY_SECONDS,
     GAUGE_KPA,

@@ -1,9 +1,11 @@
-"""Simulation of one virtual take: a capture folder, and a file with the true parameters."""
+"""Simulation of virtual takes: a capture folder for each, and a file with the true parameters."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -21,16 +23,24 @@ from skindb.reflectance.mixture import Mixture
 from skindb.reflectance.tables import directional_albedo
 from skindb.render.scene import Surface
 from skindb.types import Progress
-from skindb.virtual.dome import DISC_RADIUS, LIGHT_RADIUS, Dome
-from skindb.virtual.frames import photograph
-from skindb.virtual.head import Head, parametric_head
-from skindb.virtual.head_file import head_of_file
-from skindb.virtual.noise import smooth_noise
-from skindb.virtual.person import Person, face_shape
+from skindb.virtual.dome import CENTRE, DISC_RADIUS, LIGHT_RADIUS, Dome, build_dome
+from skindb.virtual.frames import (
+    DARK,
+    EXPOSURES,
+    FRAMES,
+    SECONDS,
+    TARGET_HALF_SIZE,
+    TARGET_NORMAL,
+    TARGET_REFLECTANCE,
+    WHITE,
+    Sensor,
+    frontal_camera,
+    photograph,
+)
+from skindb.virtual.head import Head, head_of_file, parametric_head
+from skindb.virtual.person import CONDITIONS, Person, default_people, face_shape
 from skindb.virtual.probe import ProbeTruth, write_probe
-from skindb.virtual.records import capture_record, dome_record, session_time
-from skindb.virtual.sensor import Sensor
-from skindb.virtual.skin import MATERIALS, Skin, skin_of
+from skindb.virtual.skin import MATERIALS, Skin, skin_of, smooth_noise
 
 Array = NDArray[np.float64]
 # mm
@@ -39,6 +49,123 @@ SCAN_SPACING = 3.6
 SCAN_NOISE = 0.08  # mm each, smooth and white
 DEVICE_SEED = 2005
 SCAN_REGIONS = ("forehead", "nose", "cheek", "lips", "chin", "neck", "beard")
+
+
+def session_time(person: Person) -> datetime:
+    """A fixed time that depends only on the person and the condition."""
+    days = person.seed % 365
+    minutes = 40 * CONDITIONS.index(person.condition)
+    return datetime(2005, 1, 10, 9, 0, tzinfo=UTC) + timedelta(
+        days=days, minutes=minutes
+    )
+
+
+def capture_record(person: Person, *, contact: bool, landmarks: bool) -> dict[str, Any]:
+    """capture.json."""
+    traits = {
+        "age": person.age,
+        "gender": person.gender,
+        "ancestry": person.ancestry,
+        "beard_density": person.beard_density,
+        "freckles": person.freckles,
+    }
+    record: dict[str, Any] = {
+        "format": "skindb-capture",
+        "version": 1,
+        "subject": person.subject,
+        "session": session_time(person).isoformat(),
+        "condition": person.condition,
+        "traits": traits,
+        "consent": {
+            "scope": ["fit", "statistics", "export", "publish"],
+            "reference": "virtual-no-person",
+        },
+        "mesh": "scan.ply",
+        "regions": "regions.json",
+        "dome": "dome/dome.json",
+        "virtual": True,
+        "seed": person.seed,
+    }
+    if landmarks:
+        record["landmarks"] = "landmarks.json"
+    if contact:
+        record["contact"] = "contact/probe.json"
+    return record
+
+
+def dome_record(dome: Dome, sensor: Sensor, start: datetime) -> dict[str, Any]:
+    """Content of dome/dome.json, without the intensities of the lights, which the white
+    target determines.
+    """
+    cameras = [
+        {
+            "id": c.name,
+            "width": c.width,
+            "height": c.height,
+            "K": c.matrix.tolist(),
+            "R": c.rotation.tolist(),
+            "t": c.translation.tolist(),
+            "distortion": c.distortion.tolist(),
+            "bit_depth": 16,
+            "black_level": sensor.black,
+            "white_level": sensor.white,
+            "response": "linear",
+            "read_noise_e": sensor.read_noise if sensor.noisy else 0.0,
+            "electrons_per_dn": sensor.electrons_per_dn,
+            "colour_matrix": np.eye(3).tolist(),
+            "vignette": c.vignette.tolist(),
+        }
+        for c in dome.cameras
+    ]
+    lights = [
+        {
+            "id": light.name,
+            "position": light.position.tolist(),
+            "disc_radius": light.disc_radius,
+            "intensity": None,  # determined by the white target
+            "axis": light.axis.tolist(),
+            "falloff": 0.0,
+        }
+        for light in dome.lights
+    ]
+    return {
+        "cameras": cameras,
+        "lights": lights,
+        "exposures": [
+            {"id": e, "seconds": s} for e, s in zip(EXPOSURES, SECONDS, strict=True)
+        ],
+        "frames": FRAMES,
+        "dark": DARK,
+        "white": {
+            "frames": WHITE,
+            "reflectance": TARGET_REFLECTANCE,
+            "point": CENTRE.tolist(),
+            "normal": TARGET_NORMAL.tolist(),
+            "half_size": TARGET_HALF_SIZE,
+            "cameras": [frontal_camera(dome).name],
+        },
+        "sequence": _sequence(dome, start),
+    }
+
+
+def _sequence(dome: Dome, start: datetime) -> list[dict[str, Any]]:
+    """Lights one after the other at 12 Hz, once per exposure."""
+    out = []
+    for e, seconds in enumerate(SECONDS):
+        for i, light in enumerate(dome.lights):
+            on = start + timedelta(milliseconds=83 * (e * len(dome.lights) + i))
+            out.append(
+                {
+                    "light": light.name,
+                    "exposure": EXPOSURES[e],
+                    "t_on": on.isoformat(timespec="milliseconds"),
+                    "t_off": (on + timedelta(seconds=seconds)).isoformat(
+                        timespec="milliseconds"
+                    ),
+                    "trigger_count": e * len(dome.lights) + i + 1,
+                }
+            )
+    return out
 
 
 def simulate_take(
@@ -266,3 +393,59 @@ def _write_truth(
 
 def _dump(path: Path, record: Any) -> None:
     private_file(path).write_text(json.dumps(record, indent=1), encoding="utf-8")
+
+
+def simulate_takes(
+    out: Path,
+    *,
+    takes: int | Sequence[int] = 8,
+    people: Sequence[Person] | None = None,
+    cameras: int = 8,
+    lights: int = 48,
+    width: int = 160,
+    height: int = 200,
+    head: Path | None = None,
+    subsurface: bool = False,
+    seed: int = 2005,
+    progress: Progress | None = None,
+) -> list[Path]:
+    """Write `<out>/<take>` and `<out>/<take>.truth.npz` for virtual people; each take
+    is independent of the others.
+
+    Parameters
+    ----------
+    out
+        Folder of the captures; a take's own folder must be absent or empty.
+    takes
+        Number of people, or their indices.
+    people
+        The people to choose from; default `default_people`.
+    cameras, lights, width, height
+        The dome and its frames in pixels.
+    head
+        Head model file that replaces the parametric face.
+    subsurface
+        Transport diffuse light through the skin by the dipole instead of reflecting it
+        where it enters.
+    seed
+        Random seed of the noise; shapes and skins depend on the people alone.
+    progress
+        Called with the stage, the steps done and the total number of steps.
+    """
+    folders = []
+    dome = build_dome(
+        lights,
+        cameras,
+        width=width,
+        height=height,
+        rng=np.random.default_rng(DEVICE_SEED),
+    )
+    everybody = default_people() if people is None else people
+    for i in range(len(everybody))[:takes] if isinstance(takes, int) else takes:
+        person = replace(everybody[i], head_file=head)
+        rng = np.random.default_rng([seed, i])
+        folders.append(out / person.take)
+        simulate_take(
+            folders[-1], person, dome, subsurface=subsurface, rng=rng, progress=progress
+        )
+    return folders

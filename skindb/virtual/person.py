@@ -8,10 +8,20 @@ from pathlib import Path
 
 import numpy as np
 
-from skindb.virtual.face_field import FaceShape
+from skindb.virtual.face import FaceShape
 
 ANCESTRIES = ("european", "east_asian", "african", "south_asian")
 CONDITIONS = ("normal", "lotion", "powder", "sweat", "hot", "cold", "makeup", "tan")
+# subjects of the paper's table 1, dataset B: ancestries, gender, how many, least and
+# largest age, conditions
+TABLE_1 = (
+    (("european",), "male", 50, 13, 59, ("normal",)),
+    (("european",), "female", 5, 24, 55, ("normal",)),
+    (("european",), "female", 6, 23, 56, ("lotion", "makeup")),
+    (("east_asian", "south_asian"), "male", 20, 22, 74, ("normal",)),
+    (("east_asian", "south_asian"), "female", 4, 22, 65, ("normal",)),
+    (("east_asian", "south_asian"), "female", 2, 24, 30, ("lotion", "makeup")),
+)
 
 
 @dataclass(frozen=True)
@@ -111,18 +121,6 @@ def default_people() -> tuple[Person, ...]:
         ),
         Person("V006", 22, "female", "african", 66, melanin=-0.9, fullness=0.7),
     )
-
-
-# subjects of the paper's table 1, dataset B: ancestries, gender, how many, least and
-# largest age, conditions
-TABLE_1 = (
-    (("european",), "male", 50, 13, 59, ("normal",)),
-    (("european",), "female", 5, 24, 55, ("normal",)),
-    (("european",), "female", 6, 23, 56, ("lotion", "makeup")),
-    (("east_asian", "south_asian"), "male", 20, 22, 74, ("normal",)),
-    (("east_asian", "south_asian"), "female", 4, 22, 65, ("normal",)),
-    (("east_asian", "south_asian"), "female", 2, 24, 30, ("lotion", "makeup")),
-)
 
 
 def cohort_people(

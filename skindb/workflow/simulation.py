@@ -12,8 +12,8 @@ from typing import Any
 from skindb.errors import Fault, InputError
 from skindb.files import make_private, private_file, read_regular
 from skindb.types import Progress
+from skindb.virtual.capture import simulate_takes
 from skindb.virtual.person import Person, cohort_people
-from skindb.virtual.takes import simulate_takes
 from skindb.workflow.takes import map_takes, results_of
 
 COHORT = "cohort.json"  # what the captures of a folder were made with
@@ -50,7 +50,7 @@ def simulate(
         Called with the stage, the number of finished steps and the total number; only
         in this process.
     **options
-        Of `skindb.virtual.takes.simulate_takes`: cameras, lights, width, height, head,
+        Of `skindb.virtual.capture.simulate_takes`: cameras, lights, width, height, head,
         subsurface, seed.
 
     Returns

@@ -16,8 +16,7 @@ from skindb.schema.consent import require_consent
 from skindb.store import Database, UnavailableError, require_fresh
 from skindb.types import Progress, silent
 from skindb.view.face import Trait, face_record, page_omissions, still_picture
-from skindb.view.landmark_page import landmark_server
-from skindb.view.landmarks import landmark_task
+from skindb.view.landmarks import landmark_server, landmark_task
 from skindb.view.page import OVERCAST, PagedFace, index_text, write_folder, write_page
 from skindb.view.server import HTML, JSON, Content, PageServer
 from skindb.workflow.audit import logged

@@ -22,7 +22,7 @@ from skindb.analysis import (
 )
 from skindb.analysis.chromophores import INDEPENDENT, TABLE_AXES, chromophore_regions
 from skindb.errors import InputError
-from skindb.virtual.skin_colour import HAEMOGLOBIN, MELANIN
+from skindb.virtual.skin import HAEMOGLOBIN, MELANIN
 
 mpl.use("Agg")
 SIZE = 128

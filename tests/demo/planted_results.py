@@ -6,8 +6,9 @@ import numpy as np
 import xarray as xr
 from small_face import SIDE, small_face
 
-from skindb.demo.results import Results
-from skindb.render.photographs import Causes, Comparison
+from skindb.demo.tables import Results
+from skindb.render.causes import Causes
+from skindb.render.photographs import Comparison
 from skindb.schema import FitStatus, label
 from skindb.virtual.truth import Recovery
 

@@ -12,7 +12,7 @@ from skindb.clock import SimulatedClock
 from skindb.errors import InputError
 from skindb.hw.link import SILENCE_SECONDS, DeviceError
 from skindb.hw.probe import MAX_AGE_SECONDS, POLL_SECONDS, PlacementError, Probe
-from skindb.hw.readings import SLACK_SECONDS
+from skindb.hw.protocol import SLACK_SECONDS
 from skindb.virtual.devices import DeviceFaults, EmulatedProbe
 
 EXPOSURES = {"b00": 3.0, "b01": 1.0}

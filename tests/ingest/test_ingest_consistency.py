@@ -38,7 +38,7 @@ from skindb.ingest.photo_offsets import (
 )
 from skindb.ingest.surfels import build_surfels
 from skindb.ingest.visibility import camera_visibility, light_visibility
-from skindb.virtual.takes import simulate_takes
+from skindb.virtual.capture import simulate_takes
 
 CAMERAS = 4
 LIGHTS = 14

@@ -17,7 +17,7 @@ from skindb.geometry.rays import RayScene
 from skindb.geometry.subdivide import subdivide
 from skindb.ingest.surfels import SurfelSet, build_surfels, subdivision_levels
 from skindb.ingest.visibility import camera_visibility, disc_points, light_visibility
-from skindb.virtual.face_field import FaceShape
+from skindb.virtual.face import FaceShape
 from skindb.virtual.head import parametric_head
 
 

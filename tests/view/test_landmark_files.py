@@ -12,14 +12,15 @@ from skindb.errors import InputError
 from skindb.format.crop_file import crop_path
 from skindb.geometry.landmarks import MEAN_FACE
 from skindb.geometry.scan import Crop
-from skindb.view.landmark_page import PLACES, place_sentence
 from skindb.view.landmarks import (
+    PLACES,
     landmark_mistakes,
     landmark_task,
     open_questions,
+    place_sentence,
     save_landmarks,
 )
-from skindb.virtual.face_field import FaceShape
+from skindb.virtual.face import FaceShape
 from skindb.virtual.head import parametric_head
 
 BOX = Crop((-100.0, -150.0, -20.0), (100.0, 150.0, 200.0))

@@ -14,9 +14,8 @@ from page_session import Session, running
 
 from skindb.format.folder import read_capture
 from skindb.geometry.scan import Crop
-from skindb.view.landmark_page import landmark_server
-from skindb.view.landmarks import landmark_task
-from skindb.virtual.face_field import FaceShape
+from skindb.view.landmarks import landmark_server, landmark_task
+from skindb.virtual.face import FaceShape
 from skindb.virtual.head import parametric_head
 
 BROWSER = shutil.which("chromium") or shutil.which("google-chrome")

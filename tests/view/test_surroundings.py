@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from skindb.render.environment import Environment
-from skindb.view.surroundings import distant_lights, overcast_sky
+from skindb.view.face import distant_lights, overcast_sky
 
 
 def irradiance(environment, normal):

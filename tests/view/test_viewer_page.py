@@ -27,10 +27,16 @@ from skindb.render.scene import (
     lights_from_dome,
 )
 from skindb.schema import dataset
-from skindb.view.face import Trait, face_record, page_omissions, still_picture
+from skindb.view.face import (
+    Trait,
+    distant_lights,
+    face_record,
+    overcast_sky,
+    page_omissions,
+    still_picture,
+)
 from skindb.view.page import PagedFace, index_text, write_folder, write_page
 from skindb.view.server import HTML, JSON, Content, PageServer
-from skindb.view.surroundings import distant_lights, overcast_sky
 
 BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]

@@ -5,7 +5,7 @@ import pytest
 
 from skindb.errors import InputError
 from skindb.virtual.dome import CENTRE, HEAD, build_dome
-from skindb.virtual.sensor import Sensor
+from skindb.virtual.frames import Sensor
 
 
 def _dome(**sizes):

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from skindb.virtual.face_field import FaceShape, field, normals
+from skindb.virtual.face import FaceShape, field, normals
 from skindb.virtual.head import parametric_head
 from skindb.virtual.person import Person, default_people, face_shape
 

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from skindb.errors import InputError
-from skindb.virtual.head_file import head_of_file, load_head
+from skindb.virtual.head import head_of_file, load_head
 from skindb.virtual.person import Person
 from skindb.virtual.skin import skin_of
 

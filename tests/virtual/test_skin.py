@@ -3,13 +3,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from skindb.optics.diffusion import diffuse_reflectance, reduced_albedo
-from skindb.virtual.face_field import FaceShape
+from skindb.optics.diffuse import diffuse_reflectance, reduced_albedo
+from skindb.virtual.face import FaceShape
 from skindb.virtual.head import parametric_head
-from skindb.virtual.noise import smooth_noise
 from skindb.virtual.person import ANCESTRIES, CONDITIONS, Person
-from skindb.virtual.skin import MATERIALS, SIGMA_TR, skin_of
-from skindb.virtual.skin_colour import HAEMOGLOBIN, MEAN, MELANIN, SITES
+from skindb.virtual.skin import (
+    HAEMOGLOBIN,
+    MATERIALS,
+    MEAN,
+    MELANIN,
+    SIGMA_TR,
+    SITES,
+    skin_of,
+    smooth_noise,
+)
 
 # stand-in albedos of the materials at normal incidence
 ALBEDO = np.array([0.10, 0.05, 0.20, 0.30])

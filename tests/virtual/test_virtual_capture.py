@@ -14,10 +14,9 @@ from skindb.render.subsurface import exitances
 from skindb.virtual import frames
 from skindb.virtual.capture import simulate_take
 from skindb.virtual.dome import build_dome
-from skindb.virtual.face_field import field
-from skindb.virtual.frames import frontal_camera
+from skindb.virtual.face import field
+from skindb.virtual.frames import Sensor, frontal_camera
 from skindb.virtual.person import Person, face_shape
-from skindb.virtual.sensor import Sensor
 
 PERSON = Person("T001", 30, "female", "european", 5)
 DOME = build_dome(4, 3, width=64, height=80, rng=np.random.default_rng(1))

@@ -14,7 +14,7 @@ from skindb import workflow
 from skindb.analysis import describe_study, tabulate_study
 from skindb.cli import cli
 from skindb.store import Database
-from skindb.virtual.skin_colour import HAEMOGLOBIN, MELANIN
+from skindb.virtual.skin import HAEMOGLOBIN, MELANIN
 from skindb.workflow.upkeep import repeat_study
 
 AGES = [21, 35, 62]
