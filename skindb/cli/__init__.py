@@ -74,7 +74,7 @@ for _command in (
     cli.add_command(_command)
 
 
-def _give_up(code: int, faults: Sequence[Fault], done: Any = None) -> NoReturn:
+def _give_up(code: int, faults: Sequence[Fault], results: Any = None) -> NoReturn:
     """Exit with this code; with --json print the faults, and what was done in spite of them.
 
     The option is looked up in `sys.argv`, because a faulty call may not have been parsed.
@@ -84,7 +84,7 @@ def _give_up(code: int, faults: Sequence[Fault], done: Any = None) -> NoReturn:
             {"what": f.where, "rule": f.rule, "found": f.found, "cure": f.cure}
             for f in faults
         ]
-        echo_json({"error": errors} | ({"done": done} if done else {}))
+        echo_json({"error": errors} | ({"done": results} if results else {}))
     sys.exit(code)
 
 
@@ -160,9 +160,9 @@ def main() -> None:
         )
         _give_up(1, error.faults, getattr(error, "done", None))
     except click.ClickException as error:
-        shown = io.StringIO()
-        error.show(shown)
-        echo(*shown.getvalue().expandtabs(2).splitlines(), err=True)
+        stream = io.StringIO()
+        error.show(stream)
+        echo(*stream.getvalue().expandtabs(2).splitlines(), err=True)
         context = getattr(error, "ctx", None)
         command = context.command_path if context else "skindb"
         rule = "must be called as its --help says"
@@ -171,9 +171,11 @@ def main() -> None:
             [Fault(command, rule, error.format_message(), f"see {command} --help")],
         )
     except (click.Abort, KeyboardInterrupt):
-        said = "interrupted; no incomplete version was committed"
-        echo(f"skindb: {said}", err=True)
-        _give_up(INTERRUPTED, [Fault("skindb", "must run until it is finished", said)])
+        message = "interrupted; no incomplete version was committed"
+        echo(f"skindb: {message}", err=True)
+        _give_up(
+            INTERRUPTED, [Fault("skindb", "must run until it is finished", message)]
+        )
     except OSError as error:
         fault = system_fault(error, "file system")
         echo(f"skindb: {fault}", err=True)

@@ -88,12 +88,16 @@ def restore(
     if only_list:
         states = skindb.workflow.backup_states(source)
         rows = [
-            [f"state {one.number}", one.created, f"{one.versions} versions"]
-            for one in states
+            [f"state {state.number}", state.created, f"{state.versions} versions"]
+            for state in states
         ]
         listed = [
-            {"number": one.number, "created": one.created, "versions": one.versions}
-            for one in states
+            {
+                "number": state.number,
+                "created": state.created,
+                "versions": state.versions,
+            }
+            for state in states
         ]
         emit(listed, aligned(rows) if rows else ["no states"])
         return
@@ -101,17 +105,19 @@ def restore(
         raise click.UsageError("Missing argument 'DB'.")
     if markers is not None and without_markers:
         raise click.UsageError("--markers and --without-markers exclude each other")
-    done = skindb.workflow.restore(
+    restored = skindb.workflow.restore(
         source, db, number=number, markers=markers, without_markers=without_markers
     )
-    emit(_as_json(done), _restored_lines(done, without_markers), done.faults)
+    emit(
+        _as_json(restored), _restored_lines(restored, without_markers), restored.faults
+    )
 
 
-def _restored_lines(done: Restored, without_markers: bool) -> list[str]:
+def _restored_lines(restored: Restored, without_markers: bool) -> list[str]:
     lines = [
         (
-            f"state {done.number} of {done.created}: {done.versions} versions, "
-            f"{done.bytes / 1e6:.1f} MB"
+            f"state {restored.number} of {restored.created}: {restored.versions} versions, "
+            f"{restored.bytes / 1e6:.1f} MB"
         )
     ]
     if without_markers:
@@ -119,16 +125,20 @@ def _restored_lines(done: Restored, without_markers: bool) -> list[str]:
             "subjects who were withdrawn after this state are in the database "
             "again: withdraw them again"
         )
-    if done.skipped:
-        lines.append(f"not restored, because of withdrawals: {done.skipped} versions")
-    if done.requests:
-        lines.append(f"results to be computed again by skindb refresh: {done.requests}")
-    if done.consents:
-        lines.append(f"later records of consent, repeated: {done.consents}")
-    if done.unknown_consents:
+    if restored.skipped:
+        lines.append(
+            f"not restored, because of withdrawals: {restored.skipped} versions"
+        )
+    if restored.requests:
+        lines.append(
+            f"results to be computed again by skindb refresh: {restored.requests}"
+        )
+    if restored.consents:
+        lines.append(f"later records of consent, repeated: {restored.consents}")
+    if restored.unknown_consents:
         lines.append(
             "later records of consent of subjects who are not in this state: "
-            f"{done.unknown_consents}; "
+            f"{restored.unknown_consents}; "
             "record them again when their captures are ingested"
         )
     return lines

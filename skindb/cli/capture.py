@@ -48,19 +48,19 @@ def capture(
         plan, lines = skindb.workflow.plan_session(out, parameters, progress=bar())
         emit(plan, lines)
         return
-    found = skindb.workflow.capture_session(out, parameters, ask=ask, progress=bar())
-    count = found["flashes_per_second"]
+    report = skindb.workflow.capture_session(out, parameters, ask=ask, progress=bar())
+    count = report["flashes_per_second"]
     rate = f"at most {count} {'flash' if count == 1 else 'flashes'} in any second"
     before = (
         ""
-        if found["frames_of_this_session"]
+        if report["frames_of_this_session"]
         else " (all of them from earlier sessions)"
     )
     emit(
-        found,
+        report,
         [
-            f"{out}: {found['frames']} frames{before} in {found['seconds']:.1f} s, {rate}",
-            *found["notes"],
+            f"{out}: {report['frames']} frames{before} in {report['seconds']:.1f} s, {rate}",
+            *report["notes"],
         ],
     )
 
@@ -116,45 +116,45 @@ def calibrate(
         fit_falloff=fit_falloff,
         position_error=position_error,
     )
-    about = skindb.workflow.describe_calibration(database, record)
+    report = skindb.workflow.describe_calibration(database, record)
     lines = [
-        f"{name}: calibration {record.generation} of {about['lights']} lights, {record.path}"
+        f"{name}: calibration {record.generation} of {report['lights']} lights, {record.path}"
     ]
-    lines += [f"  {line}" for line in _camera_lines(about.get("cameras", {}))]
-    if "largest_position_error_mm" in about:
+    lines += [f"  {line}" for line in _camera_lines(report.get("cameras", {}))]
+    if "largest_position_error_mm" in report:
         lines.append(
             "  positions of the lights: standard error at most "
-            f"{about['largest_position_error_mm']:.2f} mm"
+            f"{report['largest_position_error_mm']:.2f} mm"
         )
     lines.append(
-        f"  intensities are known to {about['total_relative_error']:.2%} or better: noise at most "
-        f"{about['largest_relative_error']:.2%}, positions "
-        f"{about['position_error']:.2%} and light beside the target "
-        f"{about['glare']:.2%} (medians)"
+        f"  intensities are known to {report['total_relative_error']:.2%} or better: noise at most "
+        f"{report['largest_relative_error']:.2%}, positions "
+        f"{report['position_error']:.2%} and light beside the target "
+        f"{report['glare']:.2%} (medians)"
     )
-    if "probe" in about:
-        gains = about["probe"]["largest_relative_error"]
+    if "probe" in report:
+        gains = report["probe"]["largest_relative_error"]
         lines.append(
-            f"  gains of {about['probe']['fibres']} fibres: known to {gains:.2%} or better"
+            f"  gains of {report['probe']['fibres']} fibres: known to {gains:.2%} or better"
         )
-    if "largest_change" in about:
+    if "largest_change" in report:
         lines.append(
             f"  largest change since {record.generation - 1}: "
-            f"{about['largest_change']:.2%}, {about['most_changed']}"
+            f"{report['largest_change']:.2%}, {report['most_changed']}"
         )
-    if about["ingest_again"]:
-        earlier = ", ".join(about["ingest_again"])
+    if report["ingest_again"]:
+        earlier = ", ".join(report["ingest_again"])
         lines.append(
             f"  captures that used an earlier calibration and should be ingested again: {earlier}"
         )
     emit(
         {"calibration": name, "generation": record.generation, "path": record.path}
-        | about,
+        | report,
         lines,
     )
 
 
-def _camera_lines(found: dict[str, Any]) -> list[str]:
+def _camera_lines(calibrated: dict[str, Any]) -> list[str]:
     """Results of the calibration of the cameras, one line each."""
     words = {
         "dark frames": "at most {defect_pixels:.0f} hot or noisy pixels",
@@ -166,6 +166,6 @@ def _camera_lines(found: dict[str, Any]) -> list[str]:
         "known points": "rms distance from their projections at most {reprojection_rms:.2f} px",
     }
     return [
-        f"{name} of {one['cameras']} cameras: {words[name].format(**one)}"
-        for name, one in found.items()
+        f"{name} of {figures['cameras']} cameras: {words[name].format(**figures)}"
+        for name, figures in calibrated.items()
     ]

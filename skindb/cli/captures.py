@@ -146,14 +146,14 @@ def simulate(
         skindb.workflow.simulate_one, out, people=people, progress=progress, **options
     )
     numbers = range(takes if people is None else len(people))
-    done, faults = each_take(
+    results, faults = each_take(
         call, numbers, workers=workers, progress=progress, finish=_simulated
     )
-    emit([done[name] for name in sorted(done)], [], faults)
+    emit([results[name] for name in sorted(results)], [], faults)
 
 
-def _simulated(made: tuple[int, Path]) -> tuple[str, Any, list[str]]:
-    return f"{made[0]:04d}", str(made[1]), [str(made[1])]
+def _simulated(simulated: tuple[int, Path]) -> tuple[str, Any, list[str]]:
+    return f"{simulated[0]:04d}", str(simulated[1]), [str(simulated[1])]
 
 
 @click.command()
@@ -232,14 +232,14 @@ def ingest(
         "shared": database.folder,
     }
     finish = partial(_ingested, database, explain=explain)
-    folders = [shared_path(one, scheduler) for one in captures]
+    folders = [shared_path(folder, scheduler) for folder in captures]
     with _logged(database, folders):
-        done, faults = each_take(
+        results, faults = each_take(
             call, folders, **work, progress=progress, finish=finish
         )
     if faults and len(captures) > 1:
-        echo(f"{len(done)} of {len(captures)} captures were ingested", err=True)
-    emit(done, [], faults)
+        echo(f"{len(results)} of {len(captures)} captures were ingested", err=True)
+    emit(results, [], faults)
 
 
 def _logged(
@@ -269,17 +269,18 @@ def _ingested(
             err=True,
         )
     summary = summary_of(record)
-    made = summary.get("summary", {})
+    figures = summary.get("summary", {})
     lines = [f"{record.take}: capture {summary['generation']}, {summary['path']}"]
-    if "surfels" in made:
-        lines.append(
-            f"  {made['surfels']['count']:,} surfels, {made['surfels']['spacing_mm']:.2g} mm apart"
-        )
-    if "samples" in made:
-        lines += [f"  {line}" for line in skindb.ingest.sample_lines(made["samples"])]
+    if surfels := figures.get("surfels"):
+        spacing = f"{surfels['spacing_mm']:.2g} mm apart"
+        lines.append(f"  {surfels['count']:,} surfels, {spacing}")
+    if "samples" in figures:
+        lines += [
+            f"  {line}" for line in skindb.ingest.sample_lines(figures["samples"])
+        ]
     if asked("verbose"):
         lines += [f"  {line}" for line in calibration_lines(database, record.take)]
-    lines += [f"  note: {line}" for line in made.get("notes", [])]
+    lines += [f"  note: {line}" for line in figures.get("notes", [])]
     lines += [f"  skipped: {line}" for line in summary.get("skipped", [])]
     if explain:
         lines += [

@@ -77,7 +77,7 @@ def fit(
     dictionary = shared_path(dictionary, scheduler)
     # its faults are reported once, before the fits start
     workflow.dictionary_at(dictionary)
-    wanted = takes or workflow.takes_to_fit(
+    chosen = takes or workflow.takes_to_fit(
         database, refit=refit, given=given, dictionary=dictionary
     )
     for take in [] if takes else workflow.takes_without_consent(database, "fit"):
@@ -97,18 +97,18 @@ def fit(
         "shared": database.folder,
     }
     finish = partial(_finished, database)
-    done: dict[str, Any] = {}
+    results: dict[str, Any] = {}
     faults: list[Fault] = []
-    if wanted:
+    if chosen:
         with workflow.logged_action(
-            database, "fit", wanted, arguments={"refit": refit, "explain": explain}
+            database, "fit", chosen, arguments={"refit": refit, "explain": explain}
         ):
-            done, faults = each_take(
-                call, wanted, **work, progress=progress, finish=finish
+            results, faults = each_take(
+                call, chosen, **work, progress=progress, finish=finish
             )
     else:
         echo(_nothing_to_fit(database, refit=refit), err=True)
-    emit(done, [], faults)
+    emit(results, [], faults)
 
 
 def _nothing_to_fit(database: Database, *, refit: bool) -> str:
@@ -154,10 +154,10 @@ def _fit_lines(take: str, report: dict[str, Any]) -> list[str]:
             "draw fit_status with skindb show"
         )
     names = ("fit_residual", "held_out_error", "held_out_camera_error")
-    shown = {name: report[name] for name in names if name in report}
+    errors = {name: report[name] for name in names if name in report}
     lines += [
         f"  {n.replace('_', ' ')}: median {v['median']:.1%}, 95 % {v['p95']:.1%}"
-        for n, v in shown.items()
+        for n, v in errors.items()
     ]
     if report.get("fit_residual", {}).get("median", 0) > MAX_RESIDUAL:
         lines.append(
@@ -167,9 +167,10 @@ def _fit_lines(take: str, report: dict[str, Any]) -> list[str]:
         )
     lines += [f"  dictionary, {line}" for line in report.get("dictionary_notes", [])]
     lines += [
-        _site_line(site, one) for site, one in report.get("translucency", {}).items()
+        _site_line(site, entry)
+        for site, entry in report.get("translucency", {}).items()
     ]
-    lines += [_suspect_line(one) for one in report["suspects"]]
+    lines += [_suspect_line(entry) for entry in report["suspects"]]
     if gains := report.get("light_gains"):
         lines.append(
             f"  gains of the lights: standard deviation {gains['spread']:.1%}; "
@@ -188,28 +189,28 @@ def _fit_lines(take: str, report: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _site_line(site: str, one: dict[str, Any]) -> str:
+def _site_line(site: str, result: dict[str, Any]) -> str:
     """sigma_tr of one site with its total error, by channel, and the status of the fit."""
-    values = zip("RGB", one["sigma_tr"], one["total_error"], strict=True)
-    shown = ", ".join(
+    values = zip("RGB", result["sigma_tr"], result["total_error"], strict=True)
+    channels = ", ".join(
         f"{c} {v:.3g} +- {e:.1g}" if v is not None else f"{c} unknown"
         for c, v, e in values
     )
-    statuses = ", ".join(dict.fromkeys(one["status"]))
-    return f"  sigma_tr of {site}: {shown} mm-1 ({statuses})"
+    statuses = ", ".join(dict.fromkeys(result["status"]))
+    return f"  sigma_tr of {site}: {channels} mm-1 ({statuses})"
 
 
-def _suspect_line(one: dict[str, Any]) -> str:
-    what, why = (
+def _suspect_line(suspect: dict[str, Any]) -> str:
+    device, question = (
         ("light", "did the face move?")
-        if "light" in one
+        if "light" in suspect
         else ("camera", "was it moved?")
     )
-    fraction = one["outlier_fraction"]
-    misfit = one["misfit"]
+    fraction = suspect["outlier_fraction"]
+    misfit = suspect["misfit"]
     return (
-        f"  {what} {one[what]}: {fraction:.0%} of its samples are outliers, residuals "
-        f"{misfit:.1f} times noise ({why})"
+        f"  {device} {suspect[device]}: {fraction:.0%} of its samples are outliers, residuals "
+        f"{misfit:.1f} times noise ({question})"
     )
 
 
@@ -243,8 +244,10 @@ def dictionary_command(path: Path | None, disc: float) -> None:
         for name, v in columns.items()
     ]
     header = ["dictionary", *columns]
-    about = report.attrs | {"disc_angular_radius": float(report["disc_angular_radius"])}
+    figures = report.attrs | {
+        "disc_angular_radius": float(report["disc_angular_radius"])
+    }
     emit(
-        about | {"header": header, "rows": rows},
+        figures | {"header": header, "rows": rows},
         [*aligned([header, *rows]), *worst, *report.attrs["notes"]],
     )

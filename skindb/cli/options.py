@@ -115,24 +115,24 @@ def _click_option(
     text = limits.help
     default = spec.default
     if unset and default is not False:
-        shown = f"{default:g}" if isinstance(default, float) else default
-        text += f"  [default: {shown}]"
+        default_text = f"{default:g}" if isinstance(default, float) else default
+        text += f"  [default: {default_text}]"
     name = limits.name or spec.name.replace("_", "-")
-    about: dict[str, Any] = {"default": None if unset else default, "help": text}
+    settings: dict[str, Any] = {"default": None if unset else default, "help": text}
     if default is MISSING:
-        about = {"required": True, "help": text}
+        settings = {"required": True, "help": text}
     if limits.metavar:
-        about["metavar"] = limits.metavar
+        settings["metavar"] = limits.metavar
     if not limits.show_default:
-        about["show_default"] = False
+        settings["show_default"] = False
     kind = get_args(hint)[0] if isinstance(hint, UnionType) else hint
     if kind is bool:
-        about["is_flag"] = True
+        settings["is_flag"] = True
     elif get_origin(kind) is tuple:
-        about["multiple"] = True
+        settings["multiple"] = True
     else:
-        about["type"] = _type(kind, limits)
-    return click.option(f"--{name}", spec.name, **about)
+        settings["type"] = _type(kind, limits)
+    return click.option(f"--{name}", spec.name, **settings)
 
 
 def _type(kind: Any, limits: Option) -> Any:

@@ -126,10 +126,10 @@ def render(
     By default all models are rendered with all lights of the dome and its most frontal camera.
     """
     database = existing(db)
-    wanted = _wanted(db, takes, edited=edited)
+    chosen = _wanted(db, takes, edited=edited)
     if out.suffix:
         writable(out, ".exr", ".png")
-        _require_one(out, wanted)
+        _require_one(out, chosen)
     call = partial(
         skindb.workflow.render_take,
         database,
@@ -140,28 +140,30 @@ def render(
     finish = partial(_rendered, explain=options["explain"], error=options["error"])
     work: dict[str, Any] = {"workers": workers, "scheduler": scheduler}
     with skindb.workflow.logged_action(
-        database, "render", wanted, arguments={"edited": edited, **options}
+        database, "render", chosen, arguments={"edited": edited, **options}
     ):
-        done, faults = each_take(call, wanted, **work, progress=bar(), finish=finish)
-    emit(done, [], faults)
+        results, faults = each_take(call, chosen, **work, progress=bar(), finish=finish)
+    emit(results, [], faults)
 
 
 def _rendered(
-    about: dict[str, Any], *, explain: bool, error: float | None
+    report: dict[str, Any], *, explain: bool, error: float | None
 ) -> tuple[str, Any, list[str]]:
-    skipped = about["skipped"] or [skindb.render.NOTHING]
+    skipped = report["skipped"] or [skindb.render.NOTHING]
     if explain:
-        return about["take"], about, [*skipped, *about["kept"]]
-    found = about["relative_error"]
+        return report["take"], report, [*skipped, *report["kept"]]
+    relative_error = report["relative_error"]
     path = (
-        f"{about['path']}: {about['samples']} rays per pixel, relative standard error "
-        f"{found:.2%}"
+        f"{report['path']}: {report['samples']} rays per pixel, relative standard error "
+        f"{relative_error:.2%}"
     )
     missed = (
-        f", above the wanted {error:.2%}" if error is not None and found > error else ""
+        f", above the wanted {error:.2%}"
+        if error is not None and relative_error > error
+        else ""
     )
     plan = [f"plan: {line}" for line in skipped]
-    return about["take"], about, [*(plan if asked("verbose") else []), path + missed]
+    return report["take"], report, [*(plan if asked("verbose") else []), path + missed]
 
 
 @click.command()
@@ -194,11 +196,11 @@ def compare(
     a shift, light in shadows, a different gloss, hair. With --json, the figures of each
     region are printed too.
     """
-    found = skindb.workflow.compare_take(
+    comparisons = skindb.workflow.compare_take(
         existing(db), take, generation=generation, **options
     )
     if out:
-        skindb.render.write_comparisons(found, out)
+        skindb.render.write_comparisons(comparisons, out)
     result = [
         {
             "light": c.light,
@@ -209,7 +211,7 @@ def compare(
             "causes": asdict(c.causes),
             "likely_causes": c.causes.notable,
         }
-        for c in found
+        for c in comparisons
     ]
     header = [
         "light",
@@ -223,7 +225,7 @@ def compare(
     lines = aligned([header, *([row[name] for name in header] for row in result)])
     lines += [
         f"{c.light} {c.camera}: {'; '.join(c.causes.notable)}"
-        for c in found
+        for c in comparisons
         if c.causes.notable
     ]
     emit(result, lines)
@@ -247,10 +249,10 @@ def show(db: str, take: str, variable: str, out: Path, at: tuple[str, ...]) -> N
     A variable is, for example, sample_count or fit_status. OUT is a picture (.png, .pdf, .svg).
     """
     writable(out, ".png", ".pdf", ".svg")
-    about = skindb.workflow.show_take(
+    report = skindb.workflow.show_take(
         existing(db), take, variable, out, at=dict(map(_label, at))
     )
-    emit(about, [about["path"]])
+    emit(report, [report["path"]])
 
 
 @click.command()
@@ -299,10 +301,10 @@ def export(
     """
     database = existing(db)
     progress = bar()
-    wanted = _wanted(db, takes, edited=edited)
+    chosen = _wanted(db, takes, edited=edited)
     if options["gltf"] and out.suffix:
         writable(out, ".glb")
-        _require_one(out, wanted)
+        _require_one(out, chosen)
     elif out.suffix in (".glb", ".gltf"):
         rule = "without --gltf it must be a folder, which gets a bundle for each take"
         cure = "add --gltf, or rename it"
@@ -314,11 +316,11 @@ def export(
         skindb.workflow.export_take, database, shared_path(out, scheduler), **options
     )
     work: dict[str, Any] = {"workers": workers, "scheduler": scheduler}
-    with skindb.workflow.logged_action(database, "export", wanted, arguments=options):
-        done, faults = each_take(
-            call, wanted, **work, progress=progress, finish=_exported
+    with skindb.workflow.logged_action(database, "export", chosen, arguments=options):
+        results, faults = each_take(
+            call, chosen, **work, progress=progress, finish=_exported
         )
-    emit(done, [], faults)
+    emit(results, [], faults)
 
 
 def _exported(path: Path) -> tuple[str, Any, list[str]]:
@@ -328,11 +330,11 @@ def _exported(path: Path) -> tuple[str, Any, list[str]]:
 def _wanted(db: str, takes: tuple[str, ...], *, edited: bool) -> list[str]:
     """The named takes, or all that have a model."""
     kind = "edit" if edited else "model"
-    found = list(takes) or skindb.open(db).takes(kind)
-    if not found:
+    chosen = list(takes) or skindb.open(db).takes(kind)
+    if not chosen:
         cure = "run skindb edit first" if edited else "run skindb fit first"
         raise InputError(Fault(db, f"there must be a take with a {kind}", "none", cure))
-    return found
+    return chosen
 
 
 def _require_one(out: Path, takes: list[str]) -> None:

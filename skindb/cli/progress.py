@@ -81,10 +81,10 @@ class Progress:
         if self.style == "json":
             self._line("failed" if failed else "finished", 1, 1)
         elif self.bars and self.takes_total > 1:
-            rate, left = _pace(
+            rate, seconds_left = _pace(
                 self.takes_done, self.takes_total, time.monotonic() - self.begin
             )
-            pace = f"{rate:.3g} takes per minute, {left:.0f} s left"
+            pace = f"{rate:.3g} takes per minute, {seconds_left:.0f} s left"
             echo(f"take {self.takes_done} of {self.takes_total}: {pace}", err=True)
         self.take = following
         self.stage = ""
@@ -97,7 +97,7 @@ class Progress:
             echo(f"dashboard: {link}", err=True)
 
     def _bar(self, stage: str, done: int, total: int) -> None:
-        _, left = _pace(
+        _, seconds_left = _pace(
             done - self.first, total - self.first, time.monotonic() - self.since
         )
         bar = "#" * round(24 * done / max(total, 1))
@@ -107,7 +107,7 @@ class Progress:
             else ""
         )
         redraw(
-            f"{prefix + stage:<44.44} [{bar:<24}] {done}/{total} {left or 0:4.0f} s left",
+            f"{prefix + stage:<44.44} [{bar:<24}] {done}/{total} {seconds_left or 0:4.0f} s left",
             last=done >= total,
         )
 
@@ -117,27 +117,27 @@ class Progress:
         """
         now = time.monotonic()
         several = self.takes_total > 1
-        rate, left = (
+        rate, seconds_left = (
             _pace(self.takes_done, self.takes_total, now - self.begin)
             if several
             else _pace(done - self.first, total - self.first, now - self.since)
         )
-        said: dict[str, Any] = {
+        report: dict[str, Any] = {
             "take": self.take or None,
             "stage": stage,
             "done": done,
             "total": total,
         }
-        said |= {
+        report |= {
             "takes_done": self.takes_done,
             "takes_total": self.takes_total,
             "seconds": round(now - self.begin, 2),
         }
-        said |= {
+        report |= {
             "rate_per_minute": rate and round(rate, 3),
-            "seconds_left": None if left is None else round(left, 1),
+            "seconds_left": None if seconds_left is None else round(seconds_left, 1),
         }
-        echo(json.dumps(said), err=True)
+        echo(json.dumps(report), err=True)
 
 
 def _pace(done: int, total: int, seconds: float) -> tuple[float | None, float | None]:

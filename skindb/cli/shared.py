@@ -61,13 +61,14 @@ def emit(result: Any, lines: list[str], faults: Sequence[Fault] = ()) -> None:
         raise InputError(faults)
 
 
-def serve(server: PageServer, **about: Any) -> None:
+def serve(server: PageServer, **values: Any) -> None:
     """Print the address of a page, with --json beside the values `about` it, and serve
     it until Ctrl-C.
     """
     with server, suppress(KeyboardInterrupt):
         emit(
-            {"address": server.address} | about, [f"{server.address}  (Ctrl-C ends it)"]
+            {"address": server.address} | values,
+            [f"{server.address}  (Ctrl-C ends it)"],
         )
         server.serve_forever()
 
@@ -118,7 +119,7 @@ def each_take(
         Called in this process with each result; returns its name, what --json prints of
         it, and lines to print.
     """
-    done: dict[str, Any] = {}
+    results: dict[str, Any] = {}
     faults: list[Fault] = []
     # so that the running take is known
     in_turn = scheduler is None and (workers == 1 or len(takes) == 1)
@@ -133,13 +134,13 @@ def each_take(
                     err=True,
                 )
             if outcome.error is not None:
-                found = skindb.workflow.faults_of(outcome)
-                faults += [_placed(fault, name) for fault in dict.fromkeys(found)]
+                errors = skindb.workflow.faults_of(outcome)
+                faults += [_placed(fault, name) for fault in dict.fromkeys(errors)]
                 if outcome.traceback and asked("verbose"):
                     echo(*outcome.traceback.splitlines(), err=True)
             else:
                 name, result, lines = finish(outcome.result())
-                done[name] = result
+                results[name] = result
                 if lines and not asked("json"):
                     echo(*lines)
             progress.end_take(
@@ -147,7 +148,7 @@ def each_take(
             )
     except InputError as error:  # of the cluster: no other take can be processed
         faults += error.faults
-    return done, faults
+    return results, faults
 
 
 def _outcomes(
@@ -237,10 +238,10 @@ def writable(path: Path, *endings: str) -> None:
 def summary_of(record: Record) -> dict[str, Any]:
     """The parts of the record of a version that commands print."""
     names = ("skipped", "cleaning", "cleaning_places", "summary", "registration")
-    said = {
+    parts = {
         name: record.provenance[name] for name in names if name in record.provenance
     }
-    return {"generation": record.generation, "path": record.path, **said}
+    return {"generation": record.generation, "path": record.path, **parts}
 
 
 def calibration_lines(database: Database, take: str) -> list[str]:
@@ -251,10 +252,10 @@ def calibration_lines(database: Database, take: str) -> list[str]:
     # without a dome, or ingested before calibrations were checked
     if "calibration" not in capture.children:
         return []
-    found = capture["calibration"].to_dataset()
+    calibration = capture["calibration"].to_dataset()
     return [
-        *skindb.ingest.calibration_lines(found),
-        *aligned(skindb.ingest.calibration_table(found)),
+        *skindb.ingest.calibration_lines(calibration),
+        *aligned(skindb.ingest.calibration_table(calibration)),
     ]
 
 
@@ -270,7 +271,7 @@ def trait_amounts(
     click.UsageError
         If a text has another form, or an amount is not a finite number.
     """
-    found: dict[str, float] = {}
+    amounts: dict[str, float] = {}
     for text in texts:
         name, equals, number = text.partition("=")
         try:
@@ -282,7 +283,7 @@ def trait_amounts(
             raise click.UsageError(
                 f"--trait needs {form}, such as lotion=0.5; found {text!r}"
             )
-        if name in found:
+        if name in amounts:
             raise InputError(
                 Fault(
                     "--trait",
@@ -291,5 +292,5 @@ def trait_amounts(
                     "give one amount",
                 )
             )
-        found[name] = amount
-    return found
+        amounts[name] = amount
+    return amounts

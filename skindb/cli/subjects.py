@@ -44,18 +44,16 @@ def consent(db: str, subject: str, scope: str | None) -> None:
         names = [name for part in scope.split(",") if (name := part.strip())]
         if not names or ("none" in names and len(names) > 1):
             rule = "must name scopes, or be the single word none"
-            found = repr(scope)
-            raise InputError(
-                Fault("--scope", rule, found, "for example fit,statistics")
-            )
+            text = repr(scope)
+            raise InputError(Fault("--scope", rule, text, "for example fit,statistics"))
         names = [] if names == ["none"] else names
         skindb.workflow.record_consent(database, subject, names)
-    given = database.consent_history(subject)
+    history = database.consent_history(subject)
     emit(
-        given,
+        history,
         [
-            f"{one['created']}  {', '.join(one['scope']) or 'none'}  ({one['source']})"
-            for one in given
+            f"{entry['created']}  {', '.join(entry['scope']) or 'none'}  ({entry['source']})"
+            for entry in history
         ],
     )
 
@@ -91,12 +89,12 @@ def release(
             chosen = [take for take in chosen if take in fulfilling]
         skindb.workflow.create_release(database, name, chosen)
     listed = {
-        one: _released(database, one)
-        for one in ([name] if name else database.takes("release"))
+        listed_name: _released(database, listed_name)
+        for listed_name in ([name] if name else database.takes("release"))
     }
     lines = [
-        f"{one}  {about['created']}  {len(about['takes'])} takes"
-        for one, about in listed.items()
+        f"{listed_name}  {report['created']}  {len(report['takes'])} takes"
+        for listed_name, report in listed.items()
     ]
     emit(listed, lines or ["no releases"])
 
@@ -104,8 +102,8 @@ def release(
 def _released(database: Database, name: str) -> dict[str, Any]:
     record = database.record("release", name)
     takes: dict[str, dict[str, int]] = {}
-    for one in record.made_from:
-        takes.setdefault(one["take"], {})[one["kind"]] = one["generation"]
+    for source in record.made_from:
+        takes.setdefault(source["take"], {})[source["kind"]] = source["generation"]
     return {"created": record.created, "revision": record.generation, "takes": takes}
 
 
@@ -139,44 +137,48 @@ def refresh(
     workflow = skindb.workflow
     progress = bar()
     if dry_run:
-        found = workflow.stale_results(database)
+        results = workflow.stale_results(database)
     else:
         dictionary = shared_path(dictionary, scheduler)
         with client_of(scheduler, progress) as client:
-            where: dict[str, Any] = {"workers": workers, "client": client, "wait": wait}
-            found = workflow.refresh(
-                database, dictionary=dictionary, **where, progress=progress
+            engine: dict[str, Any] = {
+                "workers": workers,
+                "client": client,
+                "wait": wait,
+            }
+            results = workflow.refresh(
+                database, dictionary=dictionary, **engine, progress=progress
             )
-    lines = [_line(one) for one in found] or ["every result is up to date"]
+    lines = [_line(result) for result in results] or ["every result is up to date"]
     # refresh has no folders to ingest from
     emit(
-        [stale_as_json(one) for one in found],
+        [stale_as_json(result) for result in results],
         lines + workflow.superseded_lines(workflow.superseded_calibrations(database)),
     )
 
 
-def stale_as_json(one: Refreshed) -> dict[str, Any]:
+def stale_as_json(result: Refreshed) -> dict[str, Any]:
     """JSON record of a stale version and its replacement."""
-    about = {
-        "kind": one.kind,
-        "take": one.take,
-        "generation": one.generation,
-        "reasons": list(one.reasons),
+    report = {
+        "kind": result.kind,
+        "take": result.take,
+        "generation": result.generation,
+        "reasons": list(result.reasons),
     }
-    return about | {
-        "made": one.record.generation if one.record else None,
-        "fault": one.fault,
+    return report | {
+        "made": result.record.generation if result.record else None,
+        "fault": result.fault,
     }
 
 
-def _line(one: Refreshed) -> str:
-    what = one.name
-    reasons = "; ".join(one.reasons[:3])
-    reasons += f" and {len(one.reasons) - 3} more" if len(one.reasons) > 3 else ""
-    if one.record is not None:
-        return f"{what} -> {one.record.generation} ({reasons})"
-    return f"{what}: {reasons}" + (
-        f"; it cannot be computed again: {one.fault}" if one.fault else ""
+def _line(result: Refreshed) -> str:
+    name = result.name
+    reasons = "; ".join(result.reasons[:3])
+    reasons += f" and {len(result.reasons) - 3} more" if len(result.reasons) > 3 else ""
+    if result.record is not None:
+        return f"{name} -> {result.record.generation} ({reasons})"
+    return f"{name}: {reasons}" + (
+        f"; it cannot be computed again: {result.fault}" if result.fault else ""
     )
 
 
@@ -241,23 +243,25 @@ def withdraw(
         if not _is_confirmed(f"Remove {subject} permanently?"):
             emit(_withdrawal_as_json(plan), ["Nothing was removed."])
             return
-    done = workflow.withdraw(
+    withdrawal = workflow.withdraw(
         database, subject, dictionary=dictionary, wait=wait, backups=backups
     )
-    lines = [_line(one) for one in done.repeated]
-    lines += [f"revised without {subject}: release {name}" for name in done.revised]
-    lines += [f"removed: {reason}" for reason in done.lost]
+    lines = [_line(result) for result in withdrawal.repeated]
+    lines += [
+        f"revised without {subject}: release {name}" for name in withdrawal.revised
+    ]
+    lines += [f"removed: {reason}" for reason in withdrawal.lost]
     counts = ", ".join(
-        f"{count} of kind {kind}" for kind, count in done.removed.items()
+        f"{count} of kind {kind}" for kind, count in withdrawal.removed.items()
     )
     lines.append(f"removed versions: {counts or 'none'}")
     lines += [
         f"removed from {url}: {count} files"
-        for url, count in zip(backups, done.backups, strict=True)
+        for url, count in zip(backups, withdrawal.backups, strict=True)
     ]
     if report is not None:
-        lines += map(str, workflow.write_erasure_report(done, report))
-    emit(_withdrawal_as_json(done), lines)
+        lines += map(str, workflow.write_erasure_report(withdrawal, report))
+    emit(_withdrawal_as_json(withdrawal), lines)
 
 
 def _is_confirmed(question: str) -> bool:
@@ -289,13 +293,13 @@ def _plan_lines(plan: Withdrawal) -> list[str]:
     ]
 
 
-def _withdrawal_as_json(one: Withdrawal) -> dict[str, Any]:
+def _withdrawal_as_json(withdrawal: Withdrawal) -> dict[str, Any]:
     return {
-        "versions": list(one.versions),
-        "users": list(one.users),
-        "removed": one.removed,
-        "repeated": [stale_as_json(result) for result in one.repeated],
-        "revised": list(one.revised),
-        "lost": list(one.lost),
-        "removed_from_backups": list(one.backups),
+        "versions": list(withdrawal.versions),
+        "users": list(withdrawal.users),
+        "removed": withdrawal.removed,
+        "repeated": [stale_as_json(result) for result in withdrawal.repeated],
+        "revised": list(withdrawal.revised),
+        "lost": list(withdrawal.lost),
+        "removed_from_backups": list(withdrawal.backups),
     }

@@ -88,15 +88,21 @@ def _info_lines(
         for part in result.get(name, {}).items()
     ]
     for take, kinds in parts:
-        for kind, one in kinds.items():
-            text = one.get("fault") or (
-                f"{one['generation']:3d}  {one['bytes'] / 1e6:8.1f} MB  "
-                f"{one['created']}  {one['path']}"
+        for kind, version in kinds.items():
+            text = version.get("fault") or (
+                f"{version['generation']:3d}  {version['bytes'] / 1e6:8.1f} MB  "
+                f"{version['created']}  {version['path']}"
             )
-            text += f"  {', '.join(one['scope']) or 'none'}" if "scope" in one else ""
-            text += f"  out of date: {one['stale'][0]}" if one.get("stale") else ""
+            text += (
+                f"  {', '.join(version['scope']) or 'none'}"
+                if "scope" in version
+                else ""
+            )
+            text += (
+                f"  out of date: {version['stale'][0]}" if version.get("stale") else ""
+            )
             lines.append(f"{take:<16} {kind:<10} {text}")
-            if kind in DETAILS and "fault" not in one and details:
+            if kind in DETAILS and "fault" not in version and details:
                 lines += [f"  {line}" for line in _details(database, kind, take)]
     return lines
 
@@ -156,12 +162,12 @@ def _atlas_lines(database: Database, take: str) -> list[str]:
         "flips": "atlas_flips",
     }
     rows = zip(*(atlas[name].values.tolist() for name in columns.values()), strict=True)
-    made = (
+    heading = (
         [f"atlas by {ATLAS_WEIGHTS[atlas.attrs['weights']]}"]
         if "weights" in atlas.attrs
         else []
     )
-    return [*made, *aligned([[*columns], *map(list, rows)])]
+    return [*heading, *aligned([[*columns], *map(list, rows)])]
 
 
 def _capture_lines(database: Database, take: str) -> list[str]:
@@ -186,13 +192,13 @@ def verify(db: str) -> None:
     faults = database.verify()
     garbage = database.garbage()
     stale = skindb.workflow.stale_results(database)
-    lines = [f"out of date: {one.name}: {one.reasons[0]}" for one in stale]
-    lines += [f"garbage, see skindb clean: {_garbage_line(one)}" for one in garbage]
-    found = {
-        "stale": [stale_as_json(one) for one in stale],
-        "garbage": [asdict(one) for one in garbage],
+    lines = [f"out of date: {item.name}: {item.reasons[0]}" for item in stale]
+    lines += [f"garbage, see skindb clean: {_garbage_line(item)}" for item in garbage]
+    report = {
+        "stale": [stale_as_json(item) for item in stale],
+        "garbage": [asdict(item) for item in garbage],
     }
-    emit(found, [*([] if faults else ["Every version is intact."]), *lines], faults)
+    emit(report, [*([] if faults else ["Every version is intact."]), *lines], faults)
 
 
 @click.command()
@@ -216,18 +222,18 @@ def audit(db: str, subject: str | None, where: str | None) -> None:
     header = ["number", "when", "actor", "action", "subjects", "counts", "parameters"]
     rows = [
         [
-            one.number,
-            one.when,
-            one.actor,
-            one.action,
-            len(one.subjects),
-            _pairs(one.counts),
-            _pairs(one.parameters),
+            entry.number,
+            entry.when,
+            entry.actor,
+            entry.action,
+            len(entry.subjects),
+            _pairs(entry.counts),
+            _pairs(entry.parameters),
         ]
-        for one in entries
+        for entry in entries
     ]
     lines = aligned([header, *rows]) if rows else ["The audit log has no such entry."]
-    emit([asdict(one) for one in entries], lines, faults)
+    emit([asdict(entry) for entry in entries], lines, faults)
 
 
 def _pairs(values: Mapping[str, Any]) -> str:
@@ -259,13 +265,13 @@ def clean(db: str, generations: int | None, yes: bool) -> None:
     """
     database = existing(db)
     if yes:
-        found = skindb.workflow.clean(database, generations=generations)
+        garbage = skindb.workflow.clean(database, generations=generations)
     else:
-        found = database.garbage(generations=generations)
-    going = [one for one in found if not one.kept]
-    kept = [one for one in found if one.kept]
-    total = sum(one.bytes for one in going)
-    lines = [_garbage_line(one) for one in [*going, *kept]]
+        garbage = database.garbage(generations=generations)
+    going = [item for item in garbage if not item.kept]
+    remaining = [item for item in garbage if item.kept]
+    total = sum(item.bytes for item in going)
+    lines = [_garbage_line(item) for item in [*going, *remaining]]
     lines.append(
         f"{len(going)} removed, {total / 1e6:.1f} MB"
         if yes
@@ -273,13 +279,14 @@ def clean(db: str, generations: int | None, yes: bool) -> None:
         + ("; --yes removes them" if going else "")
     )
     emit(
-        {"removed": yes, "bytes": total, "items": [asdict(one) for one in found]}, lines
+        {"removed": yes, "bytes": total, "items": [asdict(item) for item in garbage]},
+        lines,
     )
 
 
-def _garbage_line(one: Garbage) -> str:
-    return f"{one.key}  {one.bytes / 1e6:.1f} MB  {one.what}" + (
-        f"  (kept: {one.kept})" if one.kept else ""
+def _garbage_line(item: Garbage) -> str:
+    return f"{item.key}  {item.bytes / 1e6:.1f} MB  {item.what}" + (
+        f"  (kept: {item.kept})" if item.kept else ""
     )
 
 
@@ -306,7 +313,7 @@ def bench(out: Path, only: tuple[str, ...], quick: bool) -> None:
     """
     result = skindb.bench.run_bench(out, only=only, quick=quick, progress=bar())
     failures = [f"fails: {line}" for line in result["failures"]]
-    kept = (
+    promises = (
         f"{len(result['stress']) - result['broken']} of {len(result['stress'])} "
         "promises of the stress set hold"
     )
@@ -321,7 +328,7 @@ def bench(out: Path, only: tuple[str, ...], quick: bool) -> None:
             *aligned(skindb.bench.table_of(result)),
             "",
             *failures,
-            kept,
+            promises,
             str(out / "bench.json"),
         ],
         faults,

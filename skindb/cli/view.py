@@ -79,28 +79,28 @@ def view(
             )
         )
     database = existing(db)
-    wanted = list(takes) or database.takes("model")
-    if not wanted:
+    chosen = list(takes) or database.takes("model")
+    if not chosen:
         raise InputError(
             Fault(
                 db, "there must be a take with a model", "none", "run skindb fit first"
             )
         )
     if explain:
-        with skindb.workflow.logged_action(database, "view", wanted, explain=True):
+        with skindb.workflow.logged_action(database, "view", chosen, explain=True):
             skipped = {
                 take: skindb.workflow.explain_view(database, take, traits=amounts)
-                for take in wanted
+                for take in chosen
             }
         emit(
             skipped,
             [f"{take}: {line}" for take, lines in skipped.items() for line in lines],
         )
         return
-    if out is not None and out.suffix == ".html" and len(wanted) > 1:
-        found = f"{len(wanted)} takes"
+    if out is not None and out.suffix == ".html" and len(chosen) > 1:
+        count = f"{len(chosen)} takes"
         cure = "name a folder, or one take"
-        raise InputError(Fault(str(out), "a file must hold one take", found, cure))
+        raise InputError(Fault(str(out), "a file must hold one take", count, cure))
     options: dict[str, Any] = {
         "traits": amounts,
         "study": study,
@@ -109,17 +109,17 @@ def view(
     }
     options["environment"] = environment
     if out is not None:
-        about = skindb.workflow.view_takes(database, wanted, out, **options)
+        report = skindb.workflow.view_takes(database, chosen, out, **options)
         emit(
-            about,
+            report,
             [
-                about["path"]
+                report["path"]
                 if out.suffix
                 else f"{out / 'index.html'}: serve the folder to open it"
             ],
         )
         return
     serve(
-        skindb.workflow.view_server(database, wanted, port=port, **options),
-        takes=wanted,
+        skindb.workflow.view_server(database, chosen, port=port, **options),
+        takes=chosen,
     )
