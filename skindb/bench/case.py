@@ -43,22 +43,22 @@ def stress_cases(kernel: str, *rows: Sequence[Any]) -> tuple[Case, ...]:
     return tuple(cases)
 
 
-def combinations(first: tuple[Any, ...], *second: Any) -> list[tuple[Any, ...]]:
+def combinations(values: tuple[Any, ...], *second: Any) -> list[tuple[Any, ...]]:
     """All combinations of `first` and `second` (a tuple holds several arguments), as
     values of `stress_cases`.
     """
-    return [(a, *(b if isinstance(b, tuple) else (b,))) for a in first for b in second]
+    return [(a, *(b if isinstance(b, tuple) else (b,))) for a in values for b in second]
 
 
-def expect(holds: Any, found: Any = "") -> None:
+def expect(holds: Any, value: Any = "") -> None:
     """Raise AssertionError unless `holds` is true, also under `python -O`."""
     if not np.all(holds):
-        raise AssertionError(f"found {found}")
+        raise AssertionError(f"found {value}")
 
 
-def close(found: Any, want: Any, *, rtol: float = 0.0, atol: float = 0.0) -> None:
+def close(value: Any, want: Any, *, rtol: float = 0.0, atol: float = 0.0) -> None:
     """Raise AssertionError unless two arrays agree; NaN agrees with NaN."""
-    np.testing.assert_allclose(found, want, rtol=rtol, atol=atol)
+    np.testing.assert_allclose(value, want, rtol=rtol, atol=atol)
 
 
 def failure_of(case: Case) -> str:

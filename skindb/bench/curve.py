@@ -93,9 +93,11 @@ def plot_curve(curve: Curve, *, ax: Axes) -> Axes:
     """
     ax.set(xscale="log", yscale="log")
     for i, method in enumerate(dict.fromkeys(p.method for p in curve.points)):
-        own = [p for p in curve.points if p.method == method and np.isfinite(p.error)]
+        points = [
+            p for p in curve.points if p.method == method and np.isfinite(p.error)
+        ]
         colour = f"C{i % 10}"
-        for p in (p for p in own if not np.isfinite(p.seconds)):
+        for p in (p for p in points if not np.isfinite(p.seconds)):
             ax.axhline(
                 max(p.error, EXACT),
                 color=colour,
@@ -103,7 +105,7 @@ def plot_curve(curve: Curve, *, ax: Axes) -> Axes:
                 lw=1,
                 label=_legend(method, p),
             )
-        timed = [p for p in own if np.isfinite(p.seconds)]
+        timed = [p for p in points if np.isfinite(p.seconds)]
         if timed:
             x = [p.seconds for p in timed]
             y = [max(p.error, EXACT) for p in timed]

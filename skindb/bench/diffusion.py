@@ -60,7 +60,7 @@ def inverse_curves(quick: bool) -> list[Curve]:
     )
     exact = np.array([_exact(float(value)) for value in diffuse])
     dipole_s(diffuse, eta=ETA)  # caches F_dr
-    own, s = cpu_time(lambda: dipole_s(diffuse, eta=ETA)[0], len(diffuse))
+    seconds, s = cpu_time(lambda: dipole_s(diffuse, eta=ETA)[0], len(diffuse))
     took, plain = cpu_time(
         lambda: np.array([_bracketed(value) for value in diffuse]), len(diffuse)
     )
@@ -76,22 +76,22 @@ def inverse_curves(quick: bool) -> list[Curve]:
         "it at 1 - 1e-9"
     )
     points = (
-        _inverse("skindb dipole_s", own, s, exact),
+        _inverse("skindb dipole_s", seconds, s, exact),
         _inverse(
             "skindb dipole_s, stored in single precision",
-            own,
+            seconds,
             s.astype(np.float32),
             exact,
         ),
         _inverse("SciPy brentq on eq. 5", took, plain, exact, cancels),
         _inverse(
             "alpha' in double precision",
-            own,
+            seconds,
             double,
             exact,
             "1 - alpha' is lost to cancellation near 1",
         ),
-        _inverse("alpha' in single precision", own, single, exact, stored),
+        _inverse("alpha' in single precision", seconds, single, exact, stored),
     )
     label = f"largest relative error of s over {len(diffuse)} R_d from 1e-6 to 1 - 1e-9"
     return [
@@ -176,13 +176,13 @@ def transport_curves(quick: bool) -> list[Curve]:
                 lambda m=model, a=ratio: m.profile(r, a, 1.0, eta=ETA),  # type: ignore[misc]
                 1000,
             )
-            found = model.profile(ring, ratio, 1.0, eta=ETA)
+            profile = model.profile(ring, ratio, 1.0, eta=ETA)
             points.append(
                 _profile(
                     f"skindb {name}",
                     albedo,
                     took,
-                    ring_mean(found, middle),
+                    ring_mean(profile, middle),
                     value,
                     noise,
                 )
@@ -197,13 +197,13 @@ def transport_curves(quick: bool) -> list[Curve]:
                 level, kappa = half_space_profile(
                     ring.ravel().astype(np.float64), ratio, basis
                 )
-            found = np.exp(level - kappa * ring.ravel()).reshape(ring.shape)
+            profile = np.exp(level - kappa * ring.ravel()).reshape(ring.shape)
             points.append(
                 _profile(
                     f"moments of degree {degree}",
                     albedo,
                     took,
-                    ring_mean(found, middle),
+                    ring_mean(profile, middle),
                     value,
                     noise,
                 )
@@ -234,10 +234,10 @@ def across(middle: Array, width: float = WIDTH) -> Array:
     return np.linspace(middle / width, middle * width, 21)
 
 
-def ring_mean(found: Array, middle: Array, width: float = WIDTH) -> Array:
+def ring_mean(values: Array, middle: Array, width: float = WIDTH) -> Array:
     """Mean (d,) over each ring of values at `across`, weighted by area."""
     r = across(middle, width)
-    return np.asarray((found * r).sum(axis=0) / r.sum(axis=0))
+    return np.asarray((values * r).sum(axis=0) / r.sum(axis=0))
 
 
 def rings(
@@ -246,12 +246,12 @@ def rings(
     """R in a ring around each distance, and its relative standard error; sigma_s' = 1,
     sigma_a = `ratio`.
     """
-    found = [
+    profiles = [
         radial_profile(walk, ratio, 1.0, np.array([r / width, r * width]))
         for r in middle
     ]
-    value = np.concatenate([v for v, _ in found])
-    error = np.concatenate([e for _, e in found])
+    value = np.concatenate([v for v, _ in profiles])
+    error = np.concatenate([e for _, e in profiles])
     with np.errstate(invalid="ignore", divide="ignore"):
         return value, np.asarray(np.where(value > 0, error / value, np.inf))
 
@@ -259,13 +259,13 @@ def rings(
 def _profile(
     name: str, albedo: float, took: float, mean: Array, value: Array, noise: Array
 ) -> Point:
-    known = (noise < NOISY) & np.isfinite(mean)
-    off = mean[known] / value[known] - 1
-    more = {
+    clear = (noise < NOISY) & np.isfinite(mean)
+    off = mean[clear] / value[clear] - 1
+    details = {
         f"at_{d:g}": float(e)
-        for d, e in zip(np.array(DISTANCE)[known], off, strict=True)
+        for d, e in zip(np.array(DISTANCE)[clear], off, strict=True)
     }
-    more["walk_noise"] = float(np.sqrt((noise[known] ** 2).mean()))
+    details["walk_noise"] = float(np.sqrt((noise[clear] ** 2).mean()))
     diffusion = (
         "the diffusion approximation is invalid within some mean free paths and for "
         "strong absorption"
@@ -288,7 +288,7 @@ def _profile(
         took,
         error,
         diffusion if name.endswith("dipole") else few,
-        more,
+        details,
     )
 
 
@@ -306,24 +306,24 @@ def probe_curves(quick: bool) -> list[Curve]:
         for free in (False, True):
             for fibres in (28,) if quick else (4, 6, 8, 12, 28):
                 fit = _fitter(model, free, fibres, photons)
-                took, found = cpu_time(fit, len(skin))
+                took, fits = cpu_time(fit, len(skin))
                 off = np.array(
                     [
                         f.sigma_tr / sigma_tr(*x) - 1
-                        for f, x in zip(found, skin, strict=True)
+                        for f, x in zip(fits, skin, strict=True)
                     ]
                 )
-                more = {
+                details = {
                     f"{a:g}, {s:g}": float(e)
                     for (a, s), e in zip(skin, off, strict=True)
                 }
-                why = (
+                failure = (
                     ""
                     if np.isfinite(off).all()
                     else "some profiles were not fitted, see `more`"
                 )
                 if np.nanmax(np.abs(off)) > FAR_OFF:
-                    why = f"{np.nanmax(np.abs(off)):.0%} off in one medium: " + (
+                    failure = f"{np.nanmax(np.abs(off)):.0%} off in one medium: " + (
                         FAILS_WITH_FREE_GAIN if free else FAILS_WHERE_NEAR
                     )
                 name = f"skindb {model}, gain {'fitted' if free else 'known'}"
@@ -333,8 +333,8 @@ def probe_curves(quick: bool) -> list[Curve]:
                         f"{fibres} fibres",
                         took,
                         float(np.sqrt(np.nanmean(off**2))),
-                        why,
-                        more,
+                        failure,
+                        details,
                     )
                 )
     label = f"RMS over {len(skin)} kinds of skin of the relative error of sigma_tr"

@@ -74,17 +74,17 @@ def subsurface_curves(quick: bool) -> list[Curve]:
                 lambda p=points, a=areas, t=tolerance: _exitance(p, a, t)  # type: ignore[misc]
             )
             name = f"skindb octree, {spacing} mm"
-            at = f"tolerance {tolerance}"
-            tree.append(Point(name, at, took, _rms(got[:, chosen], want)))
-            spaced.append(Point(name, at, took, _rms(got[:, chosen], best)))
+            setting = f"tolerance {tolerance}"
+            tree.append(Point(name, setting, took, _rms(got[:, chosen], want)))
+            spaced.append(Point(name, setting, took, _rms(got[:, chosen], best)))
     base = f"every pair by NumPy, {spacings[0]} mm"
-    of = f"{LIGHTS} lights on a ball of {RADIUS:g} mm"
+    scene = f"{LIGHTS} lights on a ball of {RADIUS:g} mm"
     error = "RMS error of the exitance over its RMS"
     brute_of = f"every pair of the same points ({RECEIVERS} receivers)"
     fine_of = f"every pair of points {fine} mm apart, so that the error of the spacing is included"
     return [
-        Curve("subsurface", error, brute_of, of, base, tuple(tree)),
-        Curve("subsurface", error, fine_of, of, base, tuple(spaced)),
+        Curve("subsurface", error, brute_of, scene, base, tuple(tree)),
+        Curve("subsurface", error, fine_of, scene, base, tuple(spaced)),
     ]
 
 
@@ -116,14 +116,14 @@ def _exitance(points: Array, areas: Array, tolerance: float) -> NDArray[np.float
     )
 
 
-def _plain(at: Array, points: Array, areas: Array, light: Array) -> Array:
+def _plain(receivers: Array, points: Array, areas: Array, light: Array) -> Array:
     """Exitance (lights, receivers, 3) with the kernel normalised by its sum, as in
     `subsurface_exitance`.
     """
     s = dipole_s(np.array(SKIN), eta=ETA)[0]
     absorbed, scattered = scattering_coefficients(s, SIGMA_TR)
-    out = np.empty((light.shape[1], len(at), 3))
-    for i, place in enumerate(at):
+    out = np.empty((light.shape[1], len(receivers), 3))
+    for i, place in enumerate(receivers):
         near = np.flatnonzero(((points - place) ** 2).sum(axis=1) < PROFILE_REACH_MM**2)
         r = np.linalg.norm(points[near] - place, axis=1)[:, None]
         kernel = dipole_profile(r, absorbed, scattered, eta=ETA) * areas[near, None]
@@ -141,25 +141,27 @@ def _rms(got: Array, want: Array) -> float:
 
 def disc_curves(quick: bool) -> list[Curve]:
     """Averages of tables over the disc of the light, by number of quadrature points."""
-    whole = embedded_dictionary()
+    dictionary = embedded_dictionary()
     angle = float(np.radians(0.8))
-    table = np.ascontiguousarray(whole.table[..., 18:50:8])
-    few = Dictionary(whole.names[18:50:8], table, whole.grid, whole.source)
-    nodes = _nodes(whole.table.shape[:3], 150 if quick else 600)
+    table = np.ascontiguousarray(dictionary.table[..., 18:50:8])
+    few = Dictionary(
+        dictionary.names[18:50:8], table, dictionary.grid, dictionary.source
+    )
+    nodes = _nodes(dictionary.table.shape[:3], 150 if quick else 600)
     want = _dense_disc(few, nodes, angle, 100 if quick else 400)
     convolve_disc(few, angle, far=(1, 1), near=(1, 1))  # compiles
     points = []
-    one = ((1, 4), (1, 4))
+    coarse = ((1, 4), (1, 4))
     four = ((4, 12), (4, 12))
-    more = (
+    rules_between = (
         () if quick else (((2, 6), (2, 6)), ((3, 8), (3, 8)), four, ((6, 18), (6, 18)))
     )
-    rules = (one, *more, (FAR_RULE, NEAR_RULE))
+    rules = (coarse, *rules_between, (FAR_RULE, NEAR_RULE))
     for far, near in rules:
-        took, found = cpu_time(
+        took, tables = cpu_time(
             lambda f=far, n=near: convolve_disc(few, angle, far=f, near=n).table  # type: ignore[misc]
         )
-        got = found[nodes]
+        got = tables[nodes]
         error = np.linalg.norm(got - want, axis=0) / np.linalg.norm(want, axis=0)
         per = {f"{name}": float(e) for name, e in zip(few.names, error, strict=True)}
         rule = " and ".join(
@@ -169,8 +171,8 @@ def disc_curves(quick: bool) -> list[Curve]:
             Point("skindb convolve_disc", rule, took, float(error.max()), "", per)
         )
     error = np.linalg.norm(table[nodes] - want, axis=0) / np.linalg.norm(want, axis=0)
-    why = "a lamp is not a point, so sharp lobes become too high and too narrow"
-    points.append(Point("no convolution", "", np.nan, float(error.max()), why))
+    failure = "a lamp is not a point, so sharp lobes become too high and too narrow"
+    points.append(Point("no convolution", "", np.nan, float(error.max()), failure))
     label = f"relative RMS error at {len(nodes[0])} nodes, worst of {len(few.names)} materials"
     reference = (
         "averages of interpolated values over a dense disc around either direction"
@@ -213,11 +215,11 @@ def _dense_disc(
     turn = q * np.pi * (3 - np.sqrt(5))
     total = np.zeros((len(i), len(dictionary.names)))
     for a, b in ((wi, wo), (wo, wi)):
-        first = np.cross(a, [0.3, 0.9, 0.1])
-        first /= np.linalg.norm(first, axis=1, keepdims=True)
-        second = np.cross(a, first)
+        across = np.cross(a, [0.3, 0.9, 0.1])
+        across /= np.linalg.norm(across, axis=1, keepdims=True)
+        second = np.cross(a, across)
         for u, v in zip(radius * np.cos(turn), radius * np.sin(turn), strict=True):
-            moved = a + u * first + v * second
+            moved = a + u * across + v * second
             moved /= np.linalg.norm(moved, axis=1, keepdims=True)
             total += lookup(dictionary.table, *half_difference(moved, b)) / (2 * count)
     return total
@@ -250,8 +252,8 @@ def exposures_curves(quick: bool) -> list[Curve]:
         points.append(
             _merged("skindb merge_exposures", count, took, got, truth, flag == OK)
         )
-        known = flag == OK
-        z = (got - truth)[known] / claimed[known]
+        usable = flag == OK
+        z = (got - truth)[usable] / claimed[usable]
         points[-1].more["scatter_over_claimed_error"] = float(np.sqrt((z**2).mean()))
         took, got = cpu_time(
             lambda f=frames, s=seconds: _longest(f, s, sensor),  # type: ignore[misc]
@@ -261,13 +263,13 @@ def exposures_curves(quick: bool) -> list[Curve]:
         points.append(_merged(name, count, took, got, truth, np.isfinite(got).all(-1)))
     longest = 0.09 * 4.0**2
     frame = sensor.expose(truth * np.float32(longest), still, rng=rng)
-    one, _, flag = merge_exposures([frame], (longest,), record)
-    why = (
+    merged, _, flag = merge_exposures([frame], (longest,), record)
+    failure = (
         f"{(flag != OK).mean():.0%} of the pixels are white or black: one exposure "
         "does not cover four decades"
     )
     points.append(
-        _merged("one medium exposure", 1, np.nan, one, truth, flag == OK, why)
+        _merged("one medium exposure", 1, np.nan, merged, truth, flag == OK, failure)
     )
     label = "median relative error of radiance from 1e-3 to 10 (white after 1 s at 1)"
     base = "skindb merge_exposures, 1 exposure"
@@ -284,15 +286,15 @@ def exposures_curves(quick: bool) -> list[Curve]:
 
 
 def _longest(frames: list[Any], seconds: tuple[float, ...], sensor: Sensor) -> Array:
-    found = np.full(frames[0].shape, np.nan)
+    radiance = np.full(frames[0].shape, np.nan)
     for frame, s in zip(frames, seconds, strict=True):  # from short to long
         level = (
             (frame.astype(np.float64) - sensor.black)
             / (sensor.white - sensor.black)
             / s
         )
-        found = np.where(frame < sensor.white, level, found)
-    return found
+        radiance = np.where(frame < sensor.white, level, radiance)
+    return radiance
 
 
 def _merged(
@@ -301,21 +303,21 @@ def _merged(
     took: float,
     got: Array,
     truth: Array,
-    known: Any,
-    why: str = "",
+    usable: Any,
+    failure: str = "",
 ) -> Point:
-    relative = np.abs(got[known] / truth[known] - 1)
-    more = {
+    relative = np.abs(got[usable] / truth[usable] - 1)
+    details = {
         "p95": float(np.quantile(relative, 0.95)),
-        "without_value": float(1 - known.mean()),
+        "without_value": float(1 - usable.mean()),
     }
     return Point(
         name,
         f"{count} exposure{'s' * (count > 1)}",
         took,
         float(np.median(relative)),
-        why,
-        more,
+        failure,
+        details,
     )
 
 
@@ -401,9 +403,9 @@ def _odd_sizes(rows: int, columns: int) -> None:
 
 def _duplicates() -> None:
     """The same exposure twice gives the same radiance, with an error smaller by sqrt 2."""
-    one, once, _ = merge_exposures(_frames(6784)[:1], SECONDS[:1], _sensor())
+    single, once, _ = merge_exposures(_frames(6784)[:1], SECONDS[:1], _sensor())
     two, twice, _ = merge_exposures(_frames(6784), (SECONDS[0], SECONDS[0]), _sensor())
-    close(two, one, rtol=1e-6)
+    close(two, single, rtol=1e-6)
     close(twice, once / np.sqrt(2), rtol=1e-6)
 
 
@@ -503,9 +505,9 @@ def _no_disc() -> None:
 
 def _scaled_table(scale: float) -> None:
     lobe = _lobe()
-    found = convolve_disc(_dictionary(lobe * np.float32(scale)), 0.05).table
+    averaged = convolve_disc(_dictionary(lobe * np.float32(scale)), 0.05).table
     close(
-        found / np.float32(scale),
+        averaged / np.float32(scale),
         convolve_disc(_dictionary(lobe), 0.05).table,
         rtol=1e-5,
         atol=1e-12,
@@ -514,13 +516,14 @@ def _scaled_table(scale: float) -> None:
 
 def _between_extremes(radius: float) -> None:
     lobe = _dictionary(_lobe(400.0))
-    found = convolve_disc(lobe, radius).table
+    averaged = convolve_disc(lobe, radius).table
     expect(
-        found.min() >= -1e-6 and found.max() <= lobe.table.max() * (1 + 1e-5),
-        (found.min(), found.max()),
+        averaged.min() >= -1e-6 and averaged.max() <= lobe.table.max() * (1 + 1e-5),
+        (averaged.min(), averaged.max()),
     )
     expect(
-        found[0, 0, 0, 0] < lobe.table[0, 0, 0, 0], "a lobe not lowered by a wide lamp"
+        averaged[0, 0, 0, 0] < lobe.table[0, 0, 0, 0],
+        "a lobe not lowered by a wide lamp",
     )
 
 
@@ -529,9 +532,9 @@ def _between_extremes(radius: float) -> None:
 
 def _row_of(wi: Any, wo: Any) -> Array:
     table = np.concatenate([_lobe(), np.ones_like(_lobe())], axis=-1)
-    every = np.ones((1, 1, 1), np.bool_)
+    mask = np.ones((1, 1, 1), np.bool_)
     return basis_rows(
-        table, GRID, np.array([[0.0, 0, 1]]), np.array([[wi]]), np.array([[wo]]), every
+        table, GRID, np.array([[0.0, 0, 1]]), np.array([[wi]]), np.array([[wo]]), mask
     )[0]
 
 

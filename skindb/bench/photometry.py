@@ -113,7 +113,7 @@ def model_samples(
     sample[s, i, o] = value + np.hypot(noise * value, floor) * rng.normal(
         size=value.shape
     )
-    found = dataset(
+    lumitexels = dataset(
         {
             "reflectance_sample": sample,
             "surfel_position": position,
@@ -128,13 +128,13 @@ def model_samples(
         },
         coords={"channel": ["R", "G", "B"]},
     )
-    return ModelSamples(found, normal, diffuse, weight)
+    return ModelSamples(lumitexels, normal, diffuse, weight)
 
 
 def _domes(quick: bool) -> list[tuple[str, ModelSamples]]:
     """Samples of every dome, named by their mean number per surfel."""
     rng = np.random.default_rng(11)
-    made = []
+    domes = []
     for lights, cameras in DOMES[1::2] if quick else DOMES:
         skin = model_samples(
             rng,
@@ -149,8 +149,8 @@ def _domes(quick: bool) -> list[tuple[str, ModelSamples]]:
             .sum((1, 2))
             .mean()
         )
-        made.append((f"{count:.0f} samples", skin))
-    return made
+        domes.append((f"{count:.0f} samples", skin))
+    return domes
 
 
 def normals_curves(quick: bool) -> list[Curve]:
@@ -168,20 +168,20 @@ def normals_curves(quick: bool) -> list[Curve]:
             }
             # compiles
             estimate_normals(skin.lumitexels.isel(surfel=slice(0, 2)), **ask)
-            took, found = cpu_time(
+            took, estimate = cpu_time(
                 lambda s=skin, a=ask: estimate_normals(s.lumitexels, **a),  # type: ignore[misc]
                 len(skin.normal),
             )
             cosine = np.einsum(
-                "nk,nk->n", found["shading_normal"].values, skin.normal
+                "nk,nk->n", estimate["shading_normal"].values, skin.normal
             ).clip(-1, 1)
             angle = np.degrees(np.arccos(cosine))
-            more = {
+            details = {
                 "p95": float(np.nanquantile(angle, 0.95)),
                 "estimated": float(np.isfinite(angle).mean()),
             }
             points.append(
-                Point(method, samples, took, float(np.nanmedian(angle)), "", more)
+                Point(method, samples, took, float(np.nanmedian(angle)), "", details)
             )
     scan = np.einsum(
         "nk,nk->n", domes[0][1].lumitexels["surfel_normal"].values, domes[0][1].normal
@@ -244,21 +244,24 @@ def albedo_curves(quick: bool) -> list[Curve]:
 
 
 def _albedo(skin: ModelSamples, name: str, samples: str, **ask: Any) -> Point:
-    known = skin.with_normals
+    lumitexels = skin.with_normals
     # compiles
-    estimate_diffuse_reflectance(known.isel(surfel=slice(0, 2)), eta=ETA, **ask)
-    took, found = cpu_time(
-        lambda: estimate_diffuse_reflectance(known, eta=ETA, **ask), len(skin.normal)
+    estimate_diffuse_reflectance(lumitexels.isel(surfel=slice(0, 2)), eta=ETA, **ask)
+    took, estimate = cpu_time(
+        lambda: estimate_diffuse_reflectance(lumitexels, eta=ETA, **ask),
+        len(skin.normal),
     )
-    relative = found["diffuse_reflectance"].values / skin.diffuse - 1
+    relative = estimate["diffuse_reflectance"].values / skin.diffuse - 1
     known_share = float(np.isfinite(relative).all(1).mean())
-    why = (
+    failure = (
         ""
         if known_share > 0.5
         else f"{1 - known_share:.0%} of the surfels have too few samples"
     )
-    more = {"bias": float(np.nanmedian(relative)), "estimated": known_share}
-    return Point(name, samples, took, float(np.nanmedian(np.abs(relative))), why, more)
+    details = {"bias": float(np.nanmedian(relative)), "estimated": known_share}
+    return Point(
+        name, samples, took, float(np.nanmedian(np.abs(relative))), failure, details
+    )
 
 
 # normals
@@ -282,9 +285,9 @@ def _scan(skin: Surfels) -> Array:
     return unit(skin.normal + np.deg2rad(3.0) * np.array([0.6, 0.8, 0.0]))
 
 
-def _angle(found: Array, true: Array) -> Array:
+def _angle(estimate: Array, true: Array) -> Array:
     return np.asarray(
-        np.degrees(np.arccos(np.clip(np.einsum("nk,nk->n", found, true), -1, 1)))
+        np.degrees(np.arccos(np.clip(np.einsum("nk,nk->n", estimate, true), -1, 1)))
     )
 
 
@@ -298,19 +301,19 @@ def _matte_normals(method: str, eta: float) -> None:
 
 def _no_normals(method: str, value: float) -> None:
     skin = surfels()
-    found = _normals(spoiled(skin, filled(value)), method)
-    whole = _normals(skin, method)
-    expect(np.isnan(found[0]).all(), found[0])
-    close(found[1:], whole[1:], atol=1e-7)
+    estimate = _normals(spoiled(skin, filled(value)), method)
+    unchanged = _normals(skin, method)
+    expect(np.isnan(estimate[0]).all(), estimate[0])
+    close(estimate[1:], unchanged[1:], atol=1e-7)
 
 
 def _few_normals(method: str, lights: int, cameras: int) -> None:
     """Too few samples give NaN, or a unit vector near the scan."""
     skin = surfels(lights, cameras)
-    found = _normals(skin, method)
-    known = np.isfinite(found).all(axis=1)
-    close(np.linalg.norm(found[known], axis=1), 1.0, atol=1e-6)
-    off = _angle(found[known], _scan(skin)[known])
+    estimate = _normals(skin, method)
+    finite = np.isfinite(estimate).all(axis=1)
+    close(np.linalg.norm(estimate[finite], axis=1), 1.0, atol=1e-6)
+    off = _angle(estimate[finite], _scan(skin)[finite])
     expect((off < (45 if method == "peak" else 10)).all(), off)
 
 
@@ -329,15 +332,15 @@ def _even_light() -> None:
     """Constant samples have no shading and give a unit vector or NaN, never an invalid vector."""
     skin = replace(surfels(), sample=np.full((3, 40, 6, 3), 0.2, np.float32))
     for method in ("combined", "chromatic", "photometric", "peak"):
-        found = _normals(skin, method)
-        length = np.linalg.norm(found, axis=1)
-        expect((np.isnan(length) | (np.abs(length - 1) < 1e-6)).all(), found)
+        estimate = _normals(skin, method)
+        length = np.linalg.norm(estimate, axis=1)
+        expect((np.isnan(length) | (np.abs(length - 1) < 1e-6)).all(), estimate)
 
 
 def _no_scan(method: str) -> None:
     skin = surfels(weight=0 * WEIGHT)
-    found = _normals(skin, method, scan=np.full((3, 3), np.nan))
-    expect(np.isnan(found).all(), found)
+    estimate = _normals(skin, method, scan=np.full((3, 3), np.nan))
+    expect(np.isnan(estimate).all(), estimate)
 
 
 def _no_surfels_normals() -> None:
@@ -352,10 +355,10 @@ def _estimated_albedo(
     skin: Surfels, method: str, eta: float = ETA
 ) -> tuple[Array, Array]:
     geometry = skin.position, skin.light, skin.camera, skin.normal
-    found, error, _, _ = diffuse_reflectances(
+    estimate, error, _, _ = diffuse_reflectances(
         skin.sample, *geometry, method=method, eta=eta, discard=2, even_reflection=0.0
     )
-    return found, error
+    return estimate, error
 
 
 def _matte_albedo(method: str, eta: float) -> None:
@@ -364,16 +367,16 @@ def _matte_albedo(method: str, eta: float) -> None:
 
 
 def _few_albedo(method: str, lights: int, cameras: int) -> None:
-    found, error = _estimated_albedo(surfels(lights, cameras), method)
-    expect(np.isnan(found).all() and np.isnan(error).all(), (found, error))
+    estimate, error = _estimated_albedo(surfels(lights, cameras), method)
+    expect(np.isnan(estimate).all() and np.isnan(error).all(), (estimate, error))
 
 
 def _no_albedo(method: str) -> None:
     skin = surfels()
-    found = _estimated_albedo(spoiled(skin, filled(np.nan)), method)[0]
-    whole = _estimated_albedo(skin, method)[0]
-    expect(np.isnan(found[0]).all(), found[0])
-    close(found[1:], whole[1:], rtol=1e-7)
+    estimate = _estimated_albedo(spoiled(skin, filled(np.nan)), method)[0]
+    unchanged = _estimated_albedo(skin, method)[0]
+    expect(np.isnan(estimate[0]).all(), estimate[0])
+    close(estimate[1:], unchanged[1:], rtol=1e-7)
 
 
 def _one_albedo_lost(method: str, value: float) -> None:
@@ -383,8 +386,8 @@ def _one_albedo_lost(method: str, value: float) -> None:
 
 def _clamped_albedo(method: str, factor: float) -> None:
     skin = surfels(weight=0 * WEIGHT)
-    found = _estimated_albedo(brightened(skin, factor), method)[0]
-    close(found, SMALLEST_R_D if factor < 1 else LARGEST_R_D, rtol=1e-6)
+    estimate = _estimated_albedo(brightened(skin, factor), method)[0]
+    close(estimate, SMALLEST_R_D if factor < 1 else LARGEST_R_D, rtol=1e-6)
 
 
 def _grazing_albedo(method: str) -> None:
@@ -395,13 +398,13 @@ def _grazing_albedo(method: str) -> None:
     )
     low = 900 * np.array([[np.cos(a), np.sin(a), 0.2] for a in (0.1, 2.0, 4.0)])
     wild = np.full((3, 3, *skin.sample.shape[2:]), 1e-3, np.float32)
-    more = replace(
+    extended = replace(
         skin,
         light=np.concatenate([skin.light, low]),
         sample=np.concatenate([skin.sample, wild], axis=1),
     )
     close(
-        _estimated_albedo(more, method)[0],
+        _estimated_albedo(extended, method)[0],
         _estimated_albedo(skin, method)[0],
         rtol=1e-6,
     )
@@ -410,11 +413,11 @@ def _grazing_albedo(method: str) -> None:
 def _precision_albedo(method: str) -> None:
     skin = surfels()
     half = skin.sample.astype(np.float16)
-    found = [
+    estimates = [
         _estimated_albedo(replace(skin, sample=half.astype(t)), method)[0]
         for t in ("float16", "float32", "float64")
     ]
-    close(found[1:], [found[0]] * 2, rtol=1e-6)
+    close(estimates[1:], [estimates[0]] * 2, rtol=1e-6)
 
 
 def _no_surfels_albedo(method: str) -> None:

@@ -48,8 +48,8 @@ def pyramid_curves(quick: bool) -> list[Curve]:
         )
         base = base or points[-1].name
         for dtype in (np.float64, np.float32):
-            given = image.astype(dtype)
-            took, again = cpu_time(lambda x=given: reconstruct(build(x)), size**2)  # type: ignore[misc]
+            typed = image.astype(dtype)
+            took, again = cpu_time(lambda x=typed: reconstruct(build(x)), size**2)  # type: ignore[misc]
             points.append(
                 Point(
                     "skindb",
@@ -76,9 +76,9 @@ def textures_curves(quick: bool) -> list[Curve]:
     """
     size, levels = (128, 4) if quick else (512, 7)
     rng = np.random.default_rng(0)
-    wanted = gaussian_filter(rng.standard_normal((size, size)), (1, 4), mode="wrap")
-    image = wanted.std() * rng.standard_normal((size, size))
-    goal = _quantiles(wanted, levels)
+    target = gaussian_filter(rng.standard_normal((size, size)), (1, 4), mode="wrap")
+    image = target.std() * rng.standard_normal((size, size))
+    goal = _quantiles(target, levels)
     shift = (goal - _quantiles(image, levels))[None]
 
     def made(iterations: int) -> Array:
@@ -90,10 +90,10 @@ def textures_curves(quick: bool) -> list[Curve]:
 
     points = []
     for iterations in (1, 5) if quick else (1, 2, 5, 10, 20):
-        took, found = cpu_time(lambda n=iterations: made(n), size**2)  # type: ignore[misc]
+        took, result = cpu_time(lambda n=iterations: made(n), size**2)  # type: ignore[misc]
         error = float(
             np.sqrt(
-                ((_quantiles(found, levels) - goal) ** 2).mean() / (shift**2).mean()
+                ((_quantiles(result, levels) - goal) ** 2).mean() / (shift**2).mean()
             )
         )
         points.append(Point("skindb", f"{iterations} iterations", took, error))
@@ -120,22 +120,24 @@ def components_curves(quick: bool) -> list[Curve]:
     exact = PCA(5, svd_solver="full").fit(vectors)
     points = []
     for name, solver in (("scikit-learn", "full"), ("scikit-learn", "randomized")):
-        took, found = cpu_time(
+        took, axes = cpu_time(
             lambda s=solver: PCA(5, svd_solver=s, random_state=0).fit(vectors)  # type: ignore[misc]
         )
         points.append(
-            Point(name, solver, took, _axes_off(found.components_, exact.components_))
+            Point(name, solver, took, _axes_off(axes.components_, exact.components_))
         )
-    took, own = cpu_time(lambda: principal_axes(vectors, 5))
-    points.append(Point("skindb", "", took, _axes_off(own.axes, exact.components_)))
+    took, axes_of_skindb = cpu_time(lambda: principal_axes(vectors, 5))
+    points.append(
+        Point("skindb", "", took, _axes_off(axes_of_skindb.axes, exact.components_))
+    )
     single = vectors.astype(np.float32)
-    took, own = cpu_time(lambda: principal_axes(single, 5))
+    took, axes_of_skindb = cpu_time(lambda: principal_axes(single, 5))
     points.append(
         Point(
             "skindb",
             "vectors in single precision",
             took,
-            _axes_off(own.axes, exact.components_),
+            _axes_off(axes_of_skindb.axes, exact.components_),
         )
     )
     label = f"largest difference of 5 axes of {TAKES} vectors of {length:,}"
@@ -167,25 +169,25 @@ def permutations_curves(quick: bool) -> list[Curve]:
         rng=np.random.default_rng(7),
     )
     points = []
-    for most in (100, 1000) if quick else (100, 1000, 10_000):
+    for draws in (100, 1000) if quick else (100, 1000, 10_000):
         took, (p, _, _) = cpu_time(
-            lambda n=most: permutation_p(  # type: ignore[misc]
+            lambda n=draws: permutation_p(  # type: ignore[misc]
                 values, group, max_draws=n, rng=np.random.default_rng(1)
             )
         )
         points.append(
-            Point("skindb", f"{most} permutations", took, _largest(p - exact))
+            Point("skindb", f"{draws} permutations", took, _largest(p - exact))
         )
-    most = 100 if quick else 1000
+    draws = 100 if quick else 1000
 
     def welch(x: Array, y: Array, axis: int = 0) -> Array:
         return np.asarray(stats.ttest_ind(x, y, equal_var=False, axis=axis).statistic)
 
-    took, found = cpu_time(
+    took, scipy_test = cpu_time(
         lambda: stats.permutation_test(
             (values[group == 1], values[group == 0]),
             welch,
-            n_resamples=most,
+            n_resamples=draws,
             vectorized=True,
             axis=0,
             rng=np.random.default_rng(1),
@@ -193,7 +195,7 @@ def permutations_curves(quick: bool) -> list[Curve]:
     )
     name = "SciPy permutation_test of Welch's statistic, which differs from HC3's"
     points.append(
-        Point(name, f"{most} permutations", took, _largest(found.pvalue - exact))
+        Point(name, f"{draws} permutations", took, _largest(scipy_test.pvalue - exact))
     )
     count = "20,000" if quick else "200,000"
     base = f"skindb, {1000} permutations"
@@ -216,9 +218,9 @@ def _quantiles(image: Array, levels: int) -> Array:
     )
 
 
-def _axes_off(found: Array, exact: Array) -> float:
-    sign = np.sign((found * exact).sum(axis=1, keepdims=True))
-    return _largest(found * sign - exact)
+def _axes_off(axes: Array, exact: Array) -> float:
+    sign = np.sign((axes * exact).sum(axis=1, keepdims=True))
+    return _largest(axes * sign - exact)
 
 
 def _largest(difference: Array) -> float:
@@ -248,17 +250,17 @@ def _constant(value: float) -> None:
 
 def _texture(scale: float) -> None:
     image = _noise(64, 64)
-    wanted = gaussian_filter(image.T, 2)
-    every = [
-        [np.ones(part.shape) for part in image_parts(x, 3)] for x in (image, wanted)
+    target = gaussian_filter(image.T, 2)
+    distributions = [
+        [np.ones(part.shape) for part in image_parts(x, 3)] for x in (image, target)
     ]
     before, after = (
-        part_quantiles(image_parts(x, 3), one)
-        for x, one in zip((image, wanted), every, strict=True)
+        part_quantiles(image_parts(x, 3), distribution)
+        for x, distribution in zip((image, target), distributions, strict=True)
     )
     image = scale * image
     shift = scale * (after - before)[None]
-    found = synthesise(
+    result = synthesise(
         image,
         [np.ones((64, 64))],
         shift,
@@ -267,7 +269,8 @@ def _texture(scale: float) -> None:
         rng=np.random.default_rng(0),
     )
     expect(
-        np.isfinite(found.image).all() and found.trace[-1] < found.trace[0], found.trace
+        np.isfinite(result.image).all() and result.trace[-1] < result.trace[0],
+        result.trace,
     )
 
 
@@ -275,62 +278,62 @@ def _flat_texture() -> None:
     shift = np.sort(_noise(1, 15, QUANTILES))
     blank = np.zeros((64, 64))
     rng = np.random.default_rng(0)
-    found = synthesise(
+    result = synthesise(
         blank, [np.ones((64, 64))], shift, levels=3, iterations=3, rng=rng
     )
     expect(
-        np.isfinite(found.image).all() and found.image.std() > 0.1, found.image.std()
+        np.isfinite(result.image).all() and result.image.std() > 0.1, result.image.std()
     )
 
 
 def _no_texture_asked() -> None:
     image = _noise(64, 64)
-    found = synthesise(
+    result = synthesise(
         image,
         [np.ones((64, 64))],
         np.zeros((1, 15, QUANTILES)),
         levels=3,
         rng=np.random.default_rng(0),
     )
-    close(found.image, image)
+    close(result.image, image)
 
 
 def _falling_quantiles(scale: float) -> None:
-    found = valid_quantiles(scale * _noise(3, QUANTILES))
-    expect((np.diff(found) >= 0).all(), "a decreasing quantile function")
+    quantiles = valid_quantiles(scale * _noise(3, QUANTILES))
+    expect((np.diff(quantiles) >= 0).all(), "a decreasing quantile function")
     close(
-        found.mean(axis=1),
+        quantiles.mean(axis=1),
         scale * _noise(3, QUANTILES).mean(axis=1),
         atol=1e-12 * scale,
     )
 
 
 def _alike(count: int) -> None:
-    found = principal_axes(np.ones((count, 50)), 3)
-    expect(len(found.axes) == 0 and found.total <= 1e-20, found.total)
+    axes = principal_axes(np.ones((count, 50)), 3)
+    expect(len(axes.axes) == 0 and axes.total <= 1e-20, axes.total)
 
 
 def _vectors(scale: float) -> None:
     x = scale * _noise(6, 500)
-    found = principal_axes(x, 5)
-    close(found.mean + found.score @ found.axes, x, atol=1e-10 * scale)
-    close(found.axes @ found.axes.T, np.eye(5), atol=1e-10)
+    axes = principal_axes(x, 5)
+    close(axes.mean + axes.score @ axes.axes, x, atol=1e-10 * scale)
+    close(axes.axes @ axes.axes.T, np.eye(5), atol=1e-10)
 
 
 def _scaled(scale: float) -> None:
     values = _noise(20, 4)
     group = (np.arange(20) % 2).astype(float)
-    one = effects(values, group)
-    other = effects(scale * values, group)
-    close(other.slope, scale * one.slope, rtol=1e-9)
-    close(other.statistic, one.statistic, rtol=1e-9)
+    plain = effects(values, group)
+    scaled = effects(scale * values, group)
+    close(scaled.slope, scale * plain.slope, rtol=1e-9)
+    close(scaled.statistic, plain.statistic, rtol=1e-9)
 
 
 def _equal_values() -> None:
     values = np.ones((10, 2))
     group = (np.arange(10) % 2).astype(float)
-    found = effects(values, group)
-    close(found.slope, [0.0, 0.0], atol=1e-15)
+    result = effects(values, group)
+    close(result.slope, [0.0, 0.0], atol=1e-15)
     p, adjusted, _ = permutation_p(
         values, group, max_draws=200, rng=np.random.default_rng(0)
     )

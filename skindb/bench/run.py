@@ -108,20 +108,20 @@ def run_bench(
     if "inverse" in kernels:
         require_mpmath()  # fails before the work begins
     make_private(out)
-    tell = progress or (lambda *_: None)
+    report = progress or (lambda *_: None)
     begin = time.perf_counter()
     points = []
     seconds = {}
     with threadpool_limits(1):  # waiting threads of BLAS would count as CPU time
         for i, kernel in enumerate(kernels):
-            tell(f"curves: {kernel}", i, len(kernels))
+            report(f"curves: {kernel}", i, len(kernels))
             since = time.perf_counter()
             curves = CURVES[kernel](quick)
             plot_curves(curves, out / f"{kernel}.png")
             points += [_flat(curve) for curve in curves]
             seconds[kernel] = round(time.perf_counter() - since, 1)
-        tell("curves", len(kernels), len(kernels))
-        stress = _stress(kernels, tell)
+        report("curves", len(kernels), len(kernels))
+        stress = _stress(kernels, report)
     flat = [point for curve in points for point in curve]
     result = {
         "quick": quick,
@@ -162,21 +162,21 @@ def _flat(curve: Curve) -> list[dict[str, Any]]:
     ]
 
 
-def _stress(kernels: Sequence[str], tell: Progress) -> list[dict[str, str]]:
+def _stress(kernels: Sequence[str], report: Progress) -> list[dict[str, str]]:
     chosen = [case for case in CASES if case.kernel in kernels]
-    found = []
+    results = []
     for i, case in enumerate(chosen):
-        tell("stress set", i, len(chosen))
-        said = {"kernel": case.kernel, "name": case.name, "promise": case.promise}
-        found.append(said | {"failure": failure_of(case)})
-    tell("stress set", len(chosen), len(chosen))
-    return found
+        report("stress set", i, len(chosen))
+        result = {"kernel": case.kernel, "name": case.name, "promise": case.promise}
+        results.append(result | {"failure": failure_of(case)})
+    report("stress set", len(chosen), len(chosen))
+    return results
 
 
 def _failures(
     points: Sequence[dict[str, Any]], stress: Sequence[dict[str, str]]
 ) -> list[str]:
-    said = {
+    lines = {
         f"{p['kernel']}: {p['method']}, {p['parameter']}: {p['failure']}": None
         for p in points
         if p["failure"]
@@ -186,7 +186,7 @@ def _failures(
         for c in stress
         if c["failure"]
     ]
-    return [*(line.replace(", : ", ": ") for line in said), *broken]
+    return [*(line.replace(", : ", ": ") for line in lines), *broken]
 
 
 def table_of(result: dict[str, Any]) -> list[list[Any]]:

@@ -42,20 +42,22 @@ def nmf_curves(quick: bool) -> list[Curve]:
     gram = brdf_metric(embedded_dictionary().table)
     gram /= np.trace(gram)
     metrics = {"weights": np.eye(len(gram)), "BRDFs": gram}
-    found = [("planted", "", np.nan, H)]
+    results = [("planted", "", np.nan, H)]
     nmf(X[:20], 2, metric=gram, seeds=0, rng=_rng())  # compiles
     for name, metric in (("weights", None), ("BRDFs", gram)):
         for seeds in (0,) if quick else (0, 3, 8):
             took, factors = cpu_time(
                 lambda m=metric, s=seeds: nmf(X, K, metric=m, seeds=s, rng=_rng())  # type: ignore[misc]
             )
-            found.append(
+            results.append(
                 (f"skindb between {name}", f"{1 + seeds} starts", took, factors.H)
             )
     for solver in ("cd", "mu"):
         for steps in (10, 200) if quick else (10, 50, 200, 1000):
             took, rows = cpu_time(lambda s=solver, n=steps: _scikit(X, s, n))  # type: ignore[misc]
-            found.append((f"scikit-learn {solver}", f"{steps} iterations", took, rows))
+            results.append(
+                (f"scikit-learn {solver}", f"{steps} iterations", took, rows)
+            )
     reference = (
         f"{len(X)} planted mixtures of {K} with 20 % scatter, so that the error cannot "
         "be zero"
@@ -68,8 +70,8 @@ def nmf_curves(quick: bool) -> list[Curve]:
             "a factorisation",
             "scikit-learn cd, 200 iterations",
             tuple(
-                Point(method, at, took, relative_error(X, rows, metric))
-                for method, at, took, rows in found
+                Point(method, setting, took, relative_error(X, rows, metric))
+                for method, setting, took, rows in results
             ),
         )
         for name, metric in metrics.items()
@@ -161,13 +163,13 @@ def _columns(change: str) -> None:
         "collinear": rows[:, :1] + rows[:, 1:2],
     }[change]
     _as_scipy(np.concatenate([rows, extra, extra], axis=1), target)
-    more = _fit(np.concatenate([extra, rows], axis=1), target)
+    extended = _fit(np.concatenate([extra, rows], axis=1), target)
     less = _fit(rows, target)
     # a redundant column does not change the residual (a collinear one may, as it is a new mixture)
     if change != "collinear":
-        close(more.residual, less.residual, rtol=1e-6)
+        close(extended.residual, less.residual, rtol=1e-6)
     if change == "zero":
-        expect(more.weight[0, 0] == 0, more.weight)
+        expect(extended.weight[0, 0] == 0, extended.weight)
 
 
 def _scaled_rows(mode: str, scale: float) -> None:
@@ -250,10 +252,10 @@ def _planted(n: int = 200, m: int = 12, k: int = 3) -> Array:
 
 
 def _factors(X: Array, k: int, metric: Array | None = None) -> Any:
-    found = nmf(X, k, metric=metric, seeds=1, rng=np.random.default_rng(0))
-    expect(np.isfinite(found.H).all() and (found.H >= 0).all(), found.H)
-    close(found.H.sum(axis=1), 1.0, rtol=1e-9)
-    return found
+    factors = nmf(X, k, metric=metric, seeds=1, rng=np.random.default_rng(0))
+    expect(np.isfinite(factors.H).all() and (factors.H >= 0).all(), factors.H)
+    close(factors.H.sum(axis=1), 1.0, rtol=1e-9)
+    return factors
 
 
 def _above_the_rank(space: str) -> None:
@@ -297,26 +299,26 @@ def _one_surfel(space: str) -> None:
 
 
 def _constant(space: str) -> None:
-    found = _factors(
+    factors = _factors(
         np.full((30, 12), 0.7), 1, np.eye(12) if space == "metric" else None
     )
-    close(found.H, 1 / 12, rtol=1e-5)
-    expect(found.error < 1e-5, found.error)
+    close(factors.H, 1 / 12, rtol=1e-5)
+    expect(factors.error < 1e-5, factors.error)
 
 
 def _nothing() -> None:
-    found = _factors(np.zeros((5, 4)), 2)
-    close(found.H, 0.25)
-    expect(found.error == 0, found.error)
+    factors = _factors(np.zeros((5, 4)), 2)
+    close(factors.H, 0.25)
+    expect(factors.error == 0, factors.error)
 
 
 def _idle_rows_and_columns(space: str) -> None:
     X = np.zeros((210, 14))
     X[:200, :12] = _planted()
     A = np.eye(14) if space == "metric" else None
-    found = _factors(X, 3, A)
-    expect(found.H[:, 12:].max() < 1e-9, found.H[:, 12:].max())
-    expect(found.error < 0.02, found.error)
+    factors = _factors(X, 3, A)
+    expect(factors.H[:, 12:].max() < 1e-9, factors.H[:, 12:].max())
+    expect(factors.error < 0.02, factors.error)
 
 
 def _zero_basis_in_metric() -> None:

@@ -143,12 +143,12 @@ def _tables(quick: bool, roots: bool, rank: int) -> Tables:
     return Tables(reduced, dictionary.grid, lift)
 
 
-def _parts(made: Strip, count: int) -> list[slice]:
-    return [slice(*made.offsets[s : s + 2]) for s in range(count)]
+def _parts(samples: Strip, count: int) -> list[slice]:
+    return [slice(*samples.offsets[s : s + 2]) for s in range(count)]
 
 
 def scipy_loop(
-    made: Strip,
+    samples: Strip,
     count: int,
     *,
     channels: int,
@@ -159,25 +159,25 @@ def scipy_loop(
 
     Rows are precomputed, or interpolated in `table` by NumPy.
     """
-    found = []
-    for part in _parts(made, count):
+    solutions = []
+    for part in _parts(samples, count):
         if table is None:
-            M = made.rows[part]
+            M = samples.rows[part]
         else:
-            angles = half_difference(*(d[part] for d in made.directions))
-            M = lookup(table, *angles) * made.cosine[part, None]
+            angles = half_difference(*(d[part] for d in samples.directions))
+            M = lookup(table, *angles) * samples.cosine[part, None]
         M = M if H is None else M @ H.T
-        target = made.target[part]
-        found.append(
+        target = samples.target[part]
+        solutions.append(
             nnls(np.repeat(M, 3, 0), target.ravel())[0]
             if channels == 3
             else nnls(M, target.mean(1))[0]
         )
-    return np.array(found)
+    return np.array(solutions)
 
 
 def _errors(
-    made: Strip, count: int, predict: Callable[[slice, int], Array]
+    samples: Strip, count: int, predict: Callable[[slice, int], Array]
 ) -> tuple[float, float, float]:
     """Medians over surfels of the true errors, linear and in cube-root space, and of |M
     x - R| / |R|.
@@ -185,19 +185,19 @@ def _errors(
     linear = []
     roots = []
     residual = []
-    for s, part in enumerate(_parts(made, count)):
+    for s, part in enumerate(_parts(samples, count)):
         y = predict(part, s)
-        true = made.true[part]
-        given = made.target[part]
+        true = samples.true[part]
+        target = samples.target[part]
         linear.append(np.linalg.norm(y - true) / np.linalg.norm(true))
         roots.append(
             np.linalg.norm(np.cbrt(y) - np.cbrt(true)) / np.linalg.norm(np.cbrt(true))
         )
-        residual.append(np.linalg.norm(y[:, None] - given) / np.linalg.norm(given))
+        residual.append(np.linalg.norm(y[:, None] - target) / np.linalg.norm(target))
     return float(np.median(linear)), float(np.median(roots)), float(np.median(residual))
 
 
-def _fit(made: Strip, tables: Tables, mode: str) -> tuple[float, Weights]:
+def _fit(samples: Strip, tables: Tables, mode: str) -> tuple[float, Weights]:
     """CPU time per surfel [s], and weights of all surfels."""
     options: dict[str, Any] = {
         "eta": ETA,
@@ -205,18 +205,20 @@ def _fit(made: Strip, tables: Tables, mode: str) -> tuple[float, Weights]:
         "noise_floor": NOISE_FLOOR_SURFACE,
         "min_samples": MIN_SAMPLES,
     }
-    n = len(made.offsets) - 1
-    surface_weights(*made.first(2), tables=tables, **options)  # compiles
-    return cpu_time(lambda: surface_weights(*made.arrays, tables=tables, **options), n)
+    n = len(samples.offsets) - 1
+    surface_weights(*samples.first(2), tables=tables, **options)  # compiles
+    return cpu_time(
+        lambda: surface_weights(*samples.arrays, tables=tables, **options), n
+    )
 
 
-def _mixed(made: Strip, weight: Array) -> Callable[[slice, int], Array]:
-    return lambda part, s: made.rows[part] @ weight[s]
+def _mixed(samples: Strip, weight: Array) -> Callable[[slice, int], Array]:
+    return lambda part, s: samples.rows[part] @ weight[s]
 
 
 def surface_curves(quick: bool) -> list[Curve]:
     """All 59 BRDFs by mode and rank."""
-    dictionary, made, few = _problem(quick)
+    dictionary, samples, few = _problem(quick)
     measured: list[
         tuple[str, str, float, tuple[float, float, float], str, dict[str, float]]
     ] = []
@@ -227,46 +229,49 @@ def surface_curves(quick: bool) -> list[Curve]:
         ("SciPy nnls, rows by NumPy, three channels", 3, dictionary.table),
     ):
         took, weight = cpu_time(
-            lambda c=channels, t=table: scipy_loop(made, few, channels=c, table=t),  # type: ignore[misc]
+            lambda c=channels, t=table: scipy_loop(samples, few, channels=c, table=t),  # type: ignore[misc]
             few,
         )
         measured.append(
-            (name, "", took, _errors(made, few, _mixed(made, weight)), "", {})
+            (name, "", took, _errors(samples, few, _mixed(samples, weight)), "", {})
         )
     for mode in ("linear", "perceptual", "paper"):
         table = np.cbrt(dictionary.table) if mode == "paper" else dictionary.table
         for rank in (16, 59) if quick else (8, 12, 16, 24, 59):
-            took, found = _fit(made, _tables(quick, mode == "paper", rank), mode)
-            more = {
-                "kkt": float(found.kkt.max()),
-                "not_fitted": float((found.status != 0).sum()),
+            took, fit = _fit(samples, _tables(quick, mode == "paper", rank), mode)
+            details = {
+                "kkt": float(fit.kkt.max()),
+                "not_fitted": float((fit.status != 0).sum()),
             }
             cubes = (
-                _cubes(made, table, found.weight)
+                _cubes(samples, table, fit.weight)
                 if mode == "paper"
-                else _mixed(made, found.weight)
+                else _mixed(samples, fit.weight)
             )
             measured.append(
                 (
                     f"skindb {mode}",
                     f"rank {rank}",
                     took,
-                    _errors(made, few, cubes),
+                    _errors(samples, few, cubes),
                     "",
-                    more,
+                    details,
                 )
             )
             if mode == "paper" and rank == 59:
-                why = "cbrt(M x) is not cbrt(M) x, so weights of cube roots do not mix reflectance"
-                errors = _errors(made, few, _mixed(made, found.weight))
+                failure = (
+                    "cbrt(M x) is not cbrt(M) x, so weights of cube roots do not mix "
+                    "reflectance"
+                )
+                errors = _errors(samples, few, _mixed(samples, fit.weight))
                 measured.append(
                     (
                         "paper's weights used as linear weights",
                         "rank 59",
                         took,
                         errors,
-                        why,
-                        more,
+                        failure,
+                        details,
                     )
                 )
     return [
@@ -277,43 +282,56 @@ def surface_curves(quick: bool) -> list[Curve]:
             "a surfel",
             SCIPY,
             tuple(
-                Point(name, at, took, errors[i], why, more | {"residual": errors[2]})
-                for name, at, took, errors, why, more in measured
+                Point(
+                    name,
+                    setting,
+                    took,
+                    errors[i],
+                    failure,
+                    details | {"residual": errors[2]},
+                )
+                for name, setting, took, errors, failure, details in measured
             ),
         )
         for i, label in enumerate((LINEAR, ROOTS))
     ]
 
 
-def _cubes(made: Strip, roots: Array, weight: Array) -> Callable[[slice, int], Array]:
+def _cubes(
+    samples: Strip, roots: Array, weight: Array
+) -> Callable[[slice, int], Array]:
     """Prediction of the paper's weights: cos(theta_i) times the cube of the mixed cube roots."""
 
     def predict(part: slice, s: int) -> Array:
-        angles = half_difference(*(d[part] for d in made.directions))
-        return np.asarray((lookup(roots, *angles) @ weight[s]) ** 3 * made.cosine[part])
+        angles = half_difference(*(d[part] for d in samples.directions))
+        return np.asarray(
+            (lookup(roots, *angles) @ weight[s]) ** 3 * samples.cosine[part]
+        )
 
     return predict
 
 
 def refit_curves(quick: bool) -> list[Curve]:
     """Four mixtures of the BRDFs, from the full linear weights."""
-    dictionary, made, few = _problem(quick)
+    dictionary, samples, few = _problem(quick)
     _, full = _fit(
-        made,
+        samples,
         Tables(dictionary.table, dictionary.grid, np.eye(len(dictionary.names))),
         "linear",
     )
     H = nmf(full.weight, 4, rng=np.random.default_rng(0)).H
     measured = []
-    took, weight = cpu_time(lambda: scipy_loop(made, few, channels=3, H=H), few)
+    took, weight = cpu_time(lambda: scipy_loop(samples, few, channels=3, H=H), few)
     measured.append((SCIPY, took, weight))
     four = Tables(
         (dictionary.table @ H.T).astype(np.float32), dictionary.grid, np.eye(4)
     )
     for mode in ("linear", "perceptual"):
-        took, found = _fit(made, four, mode)
-        measured.append((f"skindb {mode}", took, found.weight))
-    errors = [_errors(made, few, _mixed(made, weight @ H)) for _, _, weight in measured]
+        took, fit = _fit(samples, four, mode)
+        measured.append((f"skindb {mode}", took, fit.weight))
+    errors = [
+        _errors(samples, few, _mixed(samples, weight @ H)) for _, _, weight in measured
+    ]
     return [
         Curve(
             "refit",

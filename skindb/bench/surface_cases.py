@@ -54,8 +54,8 @@ def six() -> Array:
 @lru_cache(maxsize=1)
 def six_tables() -> Tables:
     """Six of the embedded materials, not reduced."""
-    whole = embedded_dictionary()
-    return Tables(whole.table[..., CHOSEN], whole.grid, np.eye(len(CHOSEN)))
+    dictionary = embedded_dictionary()
+    return Tables(dictionary.table[..., CHOSEN], dictionary.grid, np.eye(len(CHOSEN)))
 
 
 @dataclass(frozen=True)
@@ -175,15 +175,15 @@ def rows(skin: Surfels, s: int) -> tuple[Array, Array]:
 
 def _recovers(mode: str) -> None:
     skin = surfels(150, 16)
-    found = weights(skin, mode)
+    fit = weights(skin, mode)
     expect(
-        (found.status == FitStatus.FITTED).all() and (found.samples == 2400).all(),
-        (found.status, found.samples),
+        (fit.status == FitStatus.FITTED).all() and (fit.samples == 2400).all(),
+        (fit.status, fit.samples),
     )
-    expect(found.residual.max() < SINGLE, found.residual)
+    expect(fit.residual.max() < SINGLE, fit.residual)
     for s in range(3):
         M, _ = rows(skin, s)
-        close(M @ found.weight[s], M @ WEIGHT, atol=SINGLE * np.abs(M @ WEIGHT).max())
+        close(M @ fit.weight[s], M @ WEIGHT, atol=SINGLE * np.abs(M @ WEIGHT).max())
 
 
 def _few(lights: int, cameras: int) -> None:
@@ -198,71 +198,71 @@ def _few(lights: int, cameras: int) -> None:
         and np.isnan(refused.weight).all(),
         refused.status,
     )
-    found = weights(skin, min_samples=1)
+    fit = weights(skin, min_samples=1)
     for s in range(3):
         M, target = rows(skin, s)
         theirs = nnls(np.repeat(M, 3, 0), target.ravel())[1]
-        ours = np.linalg.norm((M @ found.weight[s])[:, None] - target)
+        ours = np.linalg.norm((M @ fit.weight[s])[:, None] - target)
         expect(ours <= theirs + SINGLE * np.linalg.norm(target), (ours, theirs))
 
 
 def _unseen_surfel(mode: str) -> None:
     skin = surfels()
-    found = weights(spoiled(skin, filled(np.nan)), mode)
-    whole = weights(skin, mode)
+    fit = weights(spoiled(skin, filled(np.nan)), mode)
+    unchanged = weights(skin, mode)
     expect(
-        found.status.tolist() == [FitStatus.UNSEEN, 0, 0]
-        and np.isnan(found.weight[0]).all(),
-        found.status,
+        fit.status.tolist() == [FitStatus.UNSEEN, 0, 0]
+        and np.isnan(fit.weight[0]).all(),
+        fit.status,
     )
-    np.testing.assert_array_equal(found.weight[1:], whole.weight[1:])
+    np.testing.assert_array_equal(fit.weight[1:], unchanged.weight[1:])
 
 
 def _infinite(bad: float) -> None:
-    found = weights(first(surfels(), bad))
-    whole = weights(surfels())
+    fit = weights(first(surfels(), bad))
+    unchanged = weights(surfels())
     expect(
-        found.status.tolist() == [FitStatus.NOT_FINITE, 0, 0]
-        and np.isnan(found.weight[0]).all(),
-        found.status,
+        fit.status.tolist() == [FitStatus.NOT_FINITE, 0, 0]
+        and np.isnan(fit.weight[0]).all(),
+        fit.status,
     )
-    np.testing.assert_array_equal(found.weight[1:], whole.weight[1:])
+    np.testing.assert_array_equal(fit.weight[1:], unchanged.weight[1:])
 
 
 def _one_nan() -> None:
     """A sample that lacks one channel is excluded, and the weights are still recovered."""
-    found = weights(first(surfels(), np.nan))
-    expect(found.samples.tolist() == [239, 240, 240], found.samples)
-    expect(found.residual.max() < SINGLE, found.residual)
+    fit = weights(first(surfels(), np.nan))
+    expect(fit.samples.tolist() == [239, 240, 240], fit.samples)
+    expect(fit.residual.max() < SINGLE, fit.residual)
 
 
 def _geometry_nan(field: str, status: FitStatus) -> None:
     skin = surfels()
     spoiled = getattr(skin, field).copy()
     spoiled[0] = np.nan
-    found = weights(replace(skin, **{field: spoiled}))
-    whole = weights(skin)
+    fit = weights(replace(skin, **{field: spoiled}))
+    unchanged = weights(skin)
     expect(
-        found.status.tolist() == [status, 0, 0] and np.isnan(found.weight[0]).all(),
-        found.status,
+        fit.status.tolist() == [status, 0, 0] and np.isnan(fit.weight[0]).all(),
+        fit.status,
     )
-    np.testing.assert_array_equal(found.weight[1:], whole.weight[1:])
+    np.testing.assert_array_equal(fit.weight[1:], unchanged.weight[1:])
 
 
 def _black_surfel(mode: str) -> None:
-    found = weights(spoiled(surfels(), filled(0.0)), mode)
+    fit = weights(spoiled(surfels(), filled(0.0)), mode)
     expect(
-        found.status[0] == FitStatus.FITTED and (found.weight[0] == 0).all(),
-        (found.status[0], found.weight[0]),
+        fit.status[0] == FitStatus.FITTED and (fit.weight[0] == 0).all(),
+        (fit.status[0], fit.weight[0]),
     )
 
 
 def _matte(eta: float) -> None:
     skin = surfels(eta=eta, weight=0 * WEIGHT)
-    found = weights(skin, eta=eta)
+    fit = weights(skin, eta=eta)
     expect(
-        found.residual.max() < TOTAL and np.abs(found.weight).max() < SINGLE,
-        (found.residual, found.weight),
+        fit.residual.max() < TOTAL and np.abs(fit.weight).max() < SINGLE,
+        (fit.residual, fit.weight),
     )
 
 
@@ -270,9 +270,9 @@ def _albedo_bound(value: float) -> None:
     skin = surfels()
     diffuse = skin.diffuse.astype(np.float32)  # as it is stored
     diffuse[0] = value
-    found = weights(replace(skin, diffuse=diffuse))
-    expect(found.status.tolist() == [FitStatus.DIFFUSE_CLAMPED, 0, 0], found.status)
-    expect(np.isfinite(found.weight).all() and (found.weight >= 0).all(), found.weight)
+    fit = weights(replace(skin, diffuse=diffuse))
+    expect(fit.status.tolist() == [FitStatus.DIFFUSE_CLAMPED, 0, 0], fit.status)
+    expect(np.isfinite(fit.weight).all() and (fit.weight >= 0).all(), fit.weight)
 
 
 def _grazing_lights() -> None:
@@ -281,12 +281,12 @@ def _grazing_lights() -> None:
     low = 900 * np.array([[np.cos(a), np.sin(a), 0.05] for a in (0.1, 2.0, 4.0)])
     wild = np.full((3, 3, *skin.sample.shape[2:]), 50.0, np.float32)
     flat = replace(skin, normal=np.tile([0.0, 0, 1], (3, 1)), position=np.zeros((3, 3)))
-    more = replace(
+    extended = replace(
         flat,
         light=np.concatenate([skin.light, low]),
         sample=np.concatenate([skin.sample, wild], axis=1),
     )
-    close(weights(more).weight, weights(flat).weight, rtol=1e-9, atol=1e-12)
+    close(weights(extended).weight, weights(flat).weight, rtol=1e-9, atol=1e-12)
 
 
 def _behind() -> None:
@@ -294,60 +294,60 @@ def _behind() -> None:
     skin = surfels()
     wild = np.full((3, 2, *skin.sample.shape[2:]), 50.0, np.float32)
     behind = np.concatenate([skin.light, [[0.0, 0, -900], [100, 0, -900]]])
-    more = replace(
+    extended = replace(
         skin, light=behind, sample=np.concatenate([skin.sample, wild], axis=1)
     )
-    close(weights(more).weight, weights(skin).weight, rtol=1e-9, atol=1e-12)
+    close(weights(extended).weight, weights(skin).weight, rtol=1e-9, atol=1e-12)
 
 
 def _precision(dtype: str) -> None:
     skin = surfels()
     half = skin.sample.astype(np.float16)  # values that are exact in every precision
-    found, want = (
+    fit, want = (
         weights(replace(skin, sample=half.astype(t))) for t in (dtype, np.float16)
     )
     # only the mixed reflectance is determined, not the weights of similar materials
     for s in range(3):
         M, _ = rows(skin, s)
         close(
-            M @ found.weight[s],
+            M @ fit.weight[s],
             M @ want.weight[s],
             atol=1e-5 * np.abs(M @ WEIGHT).max(),
         )
 
 
 def _extra_tables(change: str) -> None:
-    own = six_tables()
+    tables = six_tables()
     extra = {"zero": 0 * six()[..., :1], "duplicate": six()[..., :1]}
     extra["collinear"] = six()[..., :1] + six()[..., 1:2]
     both = np.concatenate([extra[change], six(), extra[change]], axis=-1)
-    found = weights(surfels(), tables=Tables(both, own.grid, np.eye(8)))
+    fit = weights(surfels(), tables=Tables(both, tables.grid, np.eye(8)))
     expect(
-        (found.status == FitStatus.FITTED).all() and found.kkt.max() < 1e-9,
-        (found.status, found.kkt),
+        (fit.status == FitStatus.FITTED).all() and fit.kkt.max() < 1e-9,
+        (fit.status, fit.kkt),
     )
-    expect(found.residual.max() < SINGLE, found.residual)
+    expect(fit.residual.max() < SINGLE, fit.residual)
     if change == "zero":
-        expect((found.weight[:, [0, 7]] == 0).all(), found.weight)
+        expect((fit.weight[:, [0, 7]] == 0).all(), fit.weight)
 
 
 def _rank_above() -> None:
     reduced, lift = reduce_dictionary(six(), 99)
-    found = weights(surfels(), tables=Tables(reduced, six_tables().grid, lift))
-    close(found.weight, weights(surfels()).weight, rtol=1e-12)
+    fit = weights(surfels(), tables=Tables(reduced, six_tables().grid, lift))
+    close(fit.weight, weights(surfels()).weight, rtol=1e-12)
 
 
 def _rank_of_one_material() -> None:
     """Six tables that are multiples of one lie in a space of four dimensions, and fits
     are finite and correct.
     """
-    one = six()[..., :1] * np.geomspace(0.5, 4, 6, dtype=np.float32)
-    reduced, lift = reduce_dictionary(np.ascontiguousarray(one), 4)
+    tables = six()[..., :1] * np.geomspace(0.5, 4, 6, dtype=np.float32)
+    reduced, lift = reduce_dictionary(np.ascontiguousarray(tables), 4)
     skin = surfels(weight=np.array([0.4, 0, 0, 0, 0, 0]))
-    found = weights(skin, tables=Tables(reduced, six_tables().grid, lift))
+    fit = weights(skin, tables=Tables(reduced, six_tables().grid, lift))
     expect(
-        (found.status == FitStatus.FITTED).all() and found.residual.max() < SINGLE,
-        (found.status, found.residual),
+        (fit.status == FitStatus.FITTED).all() and fit.residual.max() < SINGLE,
+        (fit.status, fit.residual),
     )
 
 
@@ -365,31 +365,30 @@ def _basis(*columns: Array) -> Tables:
 
 
 def _true_mixture(mode: str) -> None:
-    found = weights(surfels(), mode, _basis(WEIGHT))
-    close(found.weight, 1.0, rtol=SINGLE)
-    expect(found.residual.max() < SINGLE, found.residual)
+    fit = weights(surfels(), mode, _basis(WEIGHT))
+    close(fit.weight, 1.0, rtol=SINGLE)
+    expect(fit.residual.max() < SINGLE, fit.residual)
 
 
 def _twins(mode: str) -> None:
-    found = weights(surfels(), mode, _basis(WEIGHT, WEIGHT, 0 * WEIGHT))
-    close(found.weight[:, :2].sum(axis=1), 1.0, rtol=SINGLE)
+    fit = weights(surfels(), mode, _basis(WEIGHT, WEIGHT, 0 * WEIGHT))
+    close(fit.weight[:, :2].sum(axis=1), 1.0, rtol=SINGLE)
     expect(
-        (found.weight[:, 2] == 0).all() and (found.status == 0).all(),
-        (found.weight, found.status),
+        (fit.weight[:, 2] == 0).all() and (fit.status == 0).all(),
+        (fit.weight, fit.status),
     )
 
 
 def _scaled_basis(scale: float) -> None:
-    found = weights(surfels(), tables=_basis(WEIGHT * scale))
-    close(found.weight * scale, 1.0, rtol=SINGLE)
+    fit = weights(surfels(), tables=_basis(WEIGHT * scale))
+    close(fit.weight * scale, 1.0, rtol=SINGLE)
 
 
 def _refit_nothing() -> None:
-    found = weights(spoiled(surfels(), filled(np.nan)), tables=_basis(WEIGHT))
+    fit = weights(spoiled(surfels(), filled(np.nan)), tables=_basis(WEIGHT))
     expect(
-        found.status.tolist() == [FitStatus.UNSEEN, 0, 0]
-        and np.isnan(found.residual[0]),
-        found.status,
+        fit.status.tolist() == [FitStatus.UNSEEN, 0, 0] and np.isnan(fit.residual[0]),
+        fit.status,
     )
 
 

@@ -42,12 +42,12 @@ def picture(image: NDArray[np.uint8], alt: str, *, caption: str = "") -> str:
     """An sRGB picture (rows, cols, 3) with an alternative text and, if there is one, a
     visible caption.
     """
-    shown = (
+    image_tag = (
         f'<img alt="{html.escape(alt)}" '
         f'src="{_png(imagecodecs.png_encode(np.ascontiguousarray(image)))}">'
     )
     text = f"<figcaption>{html.escape(caption)}</figcaption>" if caption else ""
-    return f"<figure>{shown}{text}</figure>"
+    return f"<figure>{image_tag}{text}</figure>"
 
 
 def row(pictures: Iterable[str], *, kind: str = "row") -> str:
@@ -68,11 +68,13 @@ def _png(data: bytes | bytearray) -> str:
     return f"data:image/png;base64,{base64.b64encode(data).decode()}"
 
 
-def table(shown: Table) -> str:
+def table(content: Table) -> str:
     """A table; numbers are printed to three significant digits."""
-    head = "".join(f'<th scope="col">{html.escape(name)}</th>' for name in shown.header)
+    head = "".join(
+        f'<th scope="col">{html.escape(name)}</th>' for name in content.header
+    )
     body = "".join(
-        "<tr>" + "".join(map(_entry, values)) + "</tr>" for values in shown.rows
+        "<tr>" + "".join(map(_entry, values)) + "</tr>" for values in content.rows
     )
     return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
 
@@ -105,9 +107,11 @@ def downloads(tables: Iterable[Table]) -> str:
     contains the files.
     """
     links = []
-    for one in tables:
-        data = base64.b64encode(csv_text(one.header, one.rows).encode()).decode()
-        name = html.escape(f"{one.name}.csv")
+    for content in tables:
+        data = base64.b64encode(
+            csv_text(content.header, content.rows).encode()
+        ).decode()
+        name = html.escape(f"{content.name}.csv")
         links.append(
             f'<a download="{name}" href="data:text/csv;charset=utf-8;base64,{data}">{name}</a>'
         )

@@ -90,8 +90,10 @@ def _key(dome: xr.Dataset) -> Lights:
     """Two lights of the dome, one from each side."""
     place = dome["light_position"].values
     place = place / np.linalg.norm(place, axis=1, keepdims=True)
-    wanted = np.array(KEY_LIGHTS) / np.linalg.norm(KEY_LIGHTS, axis=1, keepdims=True)
-    return lights_from_dome(dome).select(np.argmax(wanted @ place.T, axis=1))
+    directions = np.array(KEY_LIGHTS) / np.linalg.norm(
+        KEY_LIGHTS, axis=1, keepdims=True
+    )
+    return lights_from_dome(dome).select(np.argmax(directions @ place.T, axis=1))
 
 
 def portrait(model: xr.DataTree) -> Image:
@@ -116,7 +118,7 @@ def map_pictures(
         with its caption.
     """
     drawn = {take: _maps(model) for take, model in models.items()}
-    flat = [one for maps in drawn.values() for one in maps]
+    flat = [image for maps in drawn.values() for image in maps]
     cut = iter(
         crop_alike([image for image, _, _ in flat], [mask for _, mask, _ in flat])
     )
@@ -139,8 +141,8 @@ def _maps(model: xr.DataTree) -> list[tuple[Picture, Mask, str]]:
     fitted = model["fitted"].to_dataset()
     for name, top, text in ERRORS:
         if name in fitted:
-            found = view.interpolate(np.nan_to_num(fitted[name].values)[:, None])[:, 0]
-            pictures.append((_scaled(found, top), f"{text}, 0 to {100 * top:g} %"))
+            values = view.interpolate(np.nan_to_num(fitted[name].values)[:, None])[:, 0]
+            pictures.append((_scaled(values, top), f"{text}, 0 to {100 * top:g} %"))
     return [
         (_byte(view.image(values)), view.coverage > 0.5, text)
         for values, text in pictures
@@ -211,17 +213,17 @@ def half_size(image: Picture) -> Picture:
     return np.asarray(np.round(mean), np.uint8)
 
 
-def predictions(shown: Sequence[Comparison], exposure: float) -> list[Picture]:
+def predictions(comparisons: Sequence[Comparison], exposure: float) -> list[Picture]:
     """Photograph, prediction and difference of each comparison side by side, all at one
     exposure and one scale.
     """
     drawn = list[Picture]()
     masks = list[Mask]()
-    for one in shown:
-        width = one.mask.shape[1]
-        strip = side_by_side(one, exposure=exposure)
+    for comparison in comparisons:
+        width = comparison.mask.shape[1]
+        strip = side_by_side(comparison, exposure=exposure)
         drawn += [strip[:, i * width : (i + 1) * width] for i in range(3)]
-        masks += [one.mask] * 3
+        masks += [comparison.mask] * 3
     cut = crop_alike(drawn, masks)
     return [np.concatenate(cut[i : i + 3], axis=1) for i in range(0, len(cut), 3)]
 
@@ -294,14 +296,16 @@ def reflectance_plot(recovered: Mapping[str, Recovery]) -> str:
     ax = _axes()
     for channel, (name, colour) in enumerate(zip("RGB", colours.CHANNELS, strict=True)):
         true = []
-        found = []
-        for one in recovered.values():
-            pick = np.flatnonzero(one.fitted)[::40]
-            true.append(one.true_diffuse[pick, channel])
-            found.append(true[-1] * (1 + one.diffuse_error[pick, channel]))
+        recovered_values = []
+        for recovery in recovered.values():
+            pick = np.flatnonzero(recovery.fitted)[::40]
+            true.append(recovery.true_diffuse[pick, channel])
+            recovered_values.append(
+                true[-1] * (1 + recovery.diffuse_error[pick, channel])
+            )
         ax.plot(
             np.concatenate(true),
-            np.concatenate(found),
+            np.concatenate(recovered_values),
             ".",
             ms=2,
             color=colour,
@@ -322,8 +326,8 @@ def normal_plot(recovered: Mapping[str, Recovery]) -> str:
     """Plot of the cumulative distribution of the error of normals, one line for each take."""
     ax = _axes()
     ax.set_prop_cycle(color=colours.CYCLE)
-    for i, (take, one) in enumerate(recovered.items()):
-        angle = one.normal_angle[one.fitted]
+    for i, (take, recovery) in enumerate(recovered.items()):
+        angle = recovery.normal_angle[recovery.fitted]
         angle = np.sort(angle[np.isfinite(angle)])
         dashes = "-" if i < len(colours.CYCLE) else "--"
         ax.plot(angle, np.linspace(0, 100, len(angle)), dashes, label=take)

@@ -53,7 +53,7 @@ def edit_section(results: Results, portraits: Portraits) -> list[str]:
         images[MEASURED] = portraits.images[results.target_take]
         captions[MEASURED] = f"{results.target_take}: the measured take"
     drawn = portraits.cut(images)
-    shown = [
+    figures = [
         page.picture(
             drawn[key], f"{results.edited_take}: {captions[key]}", caption=captions[key]
         )
@@ -80,11 +80,11 @@ def edit_section(results: Results, portraits: Portraits) -> list[str]:
         "side, a vector is a difference of two takes and has no standard error."
     )
     listed = page.details("Trait vectors", [page.paragraph(note), page.table(named)])
-    said = _edit_error(results, portraits, images)
+    comparison = _edit_error(results, portraits, images)
     return [
         page.paragraph(text),
-        page.row(shown),
-        *said,
+        page.row(figures),
+        *comparison,
         listed,
         page.downloads([full]),
     ]
@@ -133,9 +133,9 @@ def subjects_section(results: Results, portraits: Portraits) -> list[str]:
     """Table of all takes with small pictures; maps and a predicted photograph can be
     opened below each row.
     """
-    first = next(iter(results.models))
+    viewed = next(iter(results.models))
     viewer = (
-        f'<p><a href="{VIEWER}">Turn {html.escape(first)} and move its lights</a> in '
+        f'<p><a href="{VIEWER}">Turn {html.escape(viewed)} and move its lights</a> in '
         "this browser (WebGL2).</p>"
     )
     text = (
@@ -154,11 +154,11 @@ def subjects_section(results: Results, portraits: Portraits) -> list[str]:
     for values in tables.subject_table(results).rows:
         record = dict(zip(tables.SUBJECT_HEADER, values, strict=True))
         take = str(record["take"])
-        shown = [(drawn[take], "portrait"), *maps[take]]
+        pictures_of_take = [(drawn[take], "portrait"), *maps[take]]
         blocks = [
             page.row(
-                page.picture(one, f"{take}: {name}", caption=name)
-                for one, name in shown
+                page.picture(image, f"{take}: {name}", caption=name)
+                for image, name in pictures_of_take
             )
         ]
         blocks += [page.row([strips[take]], kind="strip")] if take in strips else []
@@ -199,9 +199,9 @@ def _subject(record: Record, results: Results, small: str, maps: list[str]) -> s
     take = str(record["take"])
     counts = tables.status_counts(results.models[take])
     total = sum(counts.values())
-    others = [
+    statuses = [
         f"{status.name.lower().replace('_', ' ')} {_percent(100 * count / total)} %"
-        for status, count in sorted(counts.items(), key=lambda one: -one[1])
+        for status, count in sorted(counts.items(), key=lambda item: -item[1])
         if count and status != FitStatus.FITTED
     ]
     channels = [record[f"diffuse_{name}_percent"] for name in ("red", "green", "blue")]
@@ -210,7 +210,7 @@ def _subject(record: Record, results: Results, small: str, maps: list[str]) -> s
             f"{record['fitted_surfels']:,} of {total:,} surfels "
             f"({record['fitted_percent']:.1f} %)"
         ),
-        "Not fitted": ", ".join(others) or "none",
+        "Not fitted": ", ".join(statuses) or "none",
         ERROR_NAMES[0]: page.cell(record["normal_median_deg"]),
         ERROR_NAMES[1]: page.cell(float(np.mean(channels))),
         ERROR_NAMES[2]: page.cell(record["held_out_percent"]),
@@ -220,10 +220,10 @@ def _subject(record: Record, results: Results, small: str, maps: list[str]) -> s
         f'<td data-label="{key}">{html.escape(value)}</td>'
         for key, value in cells.items()
     )
-    shown = page.details(f"Pictures and maps of {take}", maps)
+    opened = page.details(f"Pictures and maps of {take}", maps)
     return (
         f"<tbody><tr><td>{small}</td><td>{name}</td>{values}</tr><tr><td "
-        f'colspan="7">{shown}</td></tr></tbody>'
+        f'colspan="7">{opened}</td></tr></tbody>'
     )
 
 
@@ -235,25 +235,27 @@ def _strips(results: Results) -> dict[str, str]:
     """For each take a photograph, its prediction and their difference, under a held-out
     light if there is one.
     """
-    shown = {
-        take: min(found, key=lambda one: not one.held_out)
-        for take, found in results.compared.items()
-        if found
+    chosen = {
+        take: min(compared, key=lambda comparison: not comparison.held_out)
+        for take, compared in results.compared.items()
+        if compared
     }
-    if not shown:
+    if not chosen:
         return {}
-    exposure = min(one.error["exposure"] for one in shown.values())
-    strips = predictions(list(shown.values()), exposure)
-    made = {}
-    for (take, one), strip in zip(shown.items(), strips, strict=True):
-        held = "not used by the fit" if one.held_out else "used by the fit"
+    exposure = min(comparison.error["exposure"] for comparison in chosen.values())
+    strips = predictions(list(chosen.values()), exposure)
+    pictures_by_take = {}
+    for (take, comparison), strip in zip(chosen.items(), strips, strict=True):
+        held = "not used by the fit" if comparison.held_out else "used by the fit"
         caption = (
             "Photograph, prediction and ten times their difference (grey is "
-            f"none). Light {one.light}, {held}; "
-            f"relative RMSE {100 * one.error['relative_rmse']:.1f} %."
+            f"none). Light {comparison.light}, {held}; "
+            f"relative RMSE {100 * comparison.error['relative_rmse']:.1f} %."
         )
-        made[take] = page.picture(strip, f"{take}: {caption}", caption=caption)
-    return made
+        pictures_by_take[take] = page.picture(
+            strip, f"{take}: {caption}", caption=caption
+        )
+    return pictures_by_take
 
 
 def write_report(path: Path, results: Results, *, progress: Progress) -> Path:
@@ -293,15 +295,15 @@ def _statuses(results: Results, _: Portraits) -> list[str]:
 
 def _predicted(results: Results, _: Portraits) -> list[str]:
     full = tables.photograph_table(results)
-    shown = full.columns(
+    columns = full.columns(
         ["take", "light", "held_out", "relative_rmse", "delta_e_median"]
     )
-    held = [row for row in shown.rows if row[2] == "yes"]
-    found = "The fit used the lights of all photographs."
+    held = [row for row in columns.rows if row[2] == "yes"]
+    text = "The fit used the lights of all photographs."
     if held:
         error, colour = (float(np.median([row[i] for row in held])) for i in (3, 4))
-        found = (
-            f"The fit did not use the lights of {len(held)} of {len(shown.rows)} "
+        text = (
+            f"The fit did not use the lights of {len(held)} of {len(columns.rows)} "
             "photographs; for these the median "
             f"relative RMSE is {100 * error:.1f} % and the median colour "
             f"difference is {colour:.2g} (CIEDE2000)."
@@ -309,11 +311,11 @@ def _predicted(results: Results, _: Portraits) -> list[str]:
     text = (
         "The photographs that ingest kept are predicted by rendering the model and "
         "compared over all pixels of the "
-        f"face, including folds and shadow edges. {found}"
+        f"face, including folds and shadow edges. {text}"
     )
-    named = shown.renamed(["take", "light", "held out", "relative RMSE", "delta E"])
+    named = columns.renamed(["take", "light", "held out", "relative RMSE", "delta E"])
     listed = page.details(
-        f"Errors of {len(shown.rows)} photographs", [page.table(named)]
+        f"Errors of {len(columns.rows)} photographs", [page.table(named)]
     )
     return [page.paragraph(text), listed, page.downloads([full])]
 
@@ -331,11 +333,11 @@ def _recovered(results: Results, _: Portraits) -> list[str]:
         [pictures.normal_plot(results.recovered)],
     )
     full = tables.site_table(results)
-    shown = full.renamed(["take", "site", "red [%]", "green [%]", "blue [%]"])
+    table = full.renamed(["take", "site", "red [%]", "green [%]", "blue [%]"])
     sites = (
         [
             page.details(
-                "Errors of sigma_tr at the sites of the probe", [page.table(shown)]
+                "Errors of sigma_tr at the sites of the probe", [page.table(table)]
             )
         ]
         if full.rows
@@ -365,10 +367,10 @@ def _population(results: Results, _: Portraits) -> list[str]:
         tables.study_table(name, results.studies[name])
         for name in ("translucency", "brdf", "albedo")
     ]
-    shown = saved[0].columns(
+    columns = saved[0].columns(
         ["site", "channel", "sigma_tr_mean", "sigma_tr_mean_low", "sigma_tr_mean_high"]
     )
-    named = shown.renamed(["site", "channel", "mean", "95 % from", "to"])
+    named = columns.renamed(["site", "channel", "mean", "95 % from", "to"])
     listed = page.details("sigma_tr in 1/mm by site and channel", [page.table(named)])
     return [
         page.paragraph(text),

@@ -74,24 +74,24 @@ def run_demo(
         If the folder contains other files, or its database other subjects.
     """
     _remove_earlier_demo(out)
-    tell = progress or silent
+    report_progress = progress or silent
     results = Results()
     db = Database(out / "db")
     make = partial(_make_take, out=out, cameras=cameras, lights=lights, seed=seed)
     # first and alone, as it compiles the kernels that the others use
-    results.add(make(0, progress=tell))
+    results.add(make(0, progress=report_progress))
     if takes > 1:
-        tell("the other takes", 0, takes - 1)
+        report_progress("the other takes", 0, takes - 1)
     many = workers or min(thread_count(), MAX_WORKERS)
-    for i, made in enumerate(
+    for i, take_results in enumerate(
         workflow.results_of(workflow.map_takes(make, range(1, takes), workers=many)), 1
     ):
-        results.add(made)
-        tell("the other takes", i, takes - 1)
+        results.add(take_results)
+        report_progress("the other takes", i, takes - 1)
     results.sort_takes([person.take for person in default_people()])
     with results.stage("analyze"):
         # once, for every study
-        workflow.register_takes(db, workers=many, progress=tell)
+        workflow.register_takes(db, workers=many, progress=report_progress)
         results.studies["brdf"] = workflow.study(db, "brdf", seed=seed)
         results.studies["albedo"] = workflow.study(db, "albedo")
         results.studies["translucency"] = workflow.study(db, "translucency")
@@ -100,20 +100,24 @@ def run_demo(
     with results.stage("edit"):
         _edit(results, db)
     with results.stage("export"):
-        first = next(iter(results.models))
+        exported = next(iter(results.models))
         export_bundle(
-            results.models[first],
-            out / "export" / first,
+            results.models[exported],
+            out / "export" / exported,
             size=1024,
             merl=False,
-            progress=tell,
+            progress=report_progress,
         )
     with results.stage("view"):
-        traits = {EDIT_CONDITION: 1.0} if results.edited_take == first else {}
-        workflow.view_takes(db, [first], out / VIEWER, traits=traits, progress=tell)
+        traits = {EDIT_CONDITION: 1.0} if results.edited_take == exported else {}
+        workflow.view_takes(
+            db, [exported], out / VIEWER, traits=traits, progress=report_progress
+        )
     with results.stage("report"):
-        report = write_report(out / "report.html", results, progress=tell)
-    recovered = {take: one.summary() for take, one in results.recovered.items()}
+        report = write_report(out / "report.html", results, progress=report_progress)
+    recovered = {
+        take: recovery.summary() for take, recovery in results.recovered.items()
+    }
     return {
         "report": str(report),
         "viewer": str(out / VIEWER),

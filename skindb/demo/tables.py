@@ -90,17 +90,17 @@ def subject_table(results: Results) -> Table:
         counts = status_counts(model)
         traits = dict(model.attrs.get("traits", {}))
         total = sum(counts.values())
-        about = [traits.get(name, "") for name in ("age", "gender", "ancestry")]
+        attributes = [traits.get(name, "") for name in ("age", "gender", "ancestry")]
         fitted = [
             total,
             counts[FitStatus.FITTED],
             100 * counts[FitStatus.FITTED] / total,
         ]
-        found: Any = results.recovered[take].summary()
+        errors_of_take: Any = results.recovered[take].summary()
         errors = [
-            found["normal_median_deg"],
-            found["normal_95_deg"],
-            *found["diffuse_median_percent"],
+            errors_of_take["normal_median_deg"],
+            errors_of_take["normal_95_deg"],
+            *errors_of_take["diffuse_median_percent"],
         ]
         held = 100 * results.fits[take].get("held_out_error", {}).get(
             "median", float("nan")
@@ -108,7 +108,7 @@ def subject_table(results: Results) -> Table:
         rows.append(
             [
                 take,
-                *about,
+                *attributes,
                 model.attrs.get("condition", "normal"),
                 *fitted,
                 *errors,
@@ -160,13 +160,13 @@ def photograph_table(results: Results) -> Table:
     rows = [
         [
             take,
-            one.light,
-            one.camera,
-            "yes" if one.held_out else "no",
-            *(one.error[name] for name in ERROR_COLUMNS),
+            comparison.light,
+            comparison.camera,
+            "yes" if comparison.held_out else "no",
+            *(comparison.error[name] for name in ERROR_COLUMNS),
         ]
-        for take, found in results.compared.items()
-        for one in found
+        for take, comparisons in results.compared.items()
+        for comparison in comparisons
     ]
     return Table(
         "photographs", ["take", "light", "camera", "held_out", *ERROR_COLUMNS], rows
@@ -176,11 +176,11 @@ def photograph_table(results: Results) -> Table:
 def site_table(results: Results) -> Table:
     """Relative error of sigma_tr [%] at each probe site."""
     rows = []
-    for take, one in results.recovered.items():
-        found: Any = one.summary()
+    for take, recovery in results.recovered.items():
+        summary: Any = recovery.summary()
         rows += [
             [take, site, *map(float, values)]
-            for site, values in found["sigma_tr_percent"].items()
+            for site, values in summary["sigma_tr_percent"].items()
         ]
     header = ["take", "site", "red_percent", "green_percent", "blue_percent"]
     return Table("sigma_tr_errors", header, rows)

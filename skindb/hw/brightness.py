@@ -127,21 +127,23 @@ def failed_lights(
     lit = dict(zip(taken, levels.of(list(taken.values())), strict=True))
     failed = _darker_lights(lit, dome, least=0.0 if levels.linear else MIN_LEVEL)
     readable = [level for level in lit.values() if not np.isnan(level)]
-    last = len(schedule.steps) - 1
-    witness = Picture(str(dome["cameras"][0]["id"]), last)
+    last_step = len(schedule.steps) - 1
+    witness = Picture(str(dome["cameras"][0]["id"]), last_step)
     if (
         lamp
         or not readable
-        or schedule.steps[last].light != DARK
+        or schedule.steps[last_step].light != DARK
         or not levels.has(witness)
     ):
         return failed
     level = levels.of([witness])[0]
     usual = float(np.median(readable))
-    most = MAX_STUCK * usual * _ratio(dome, schedule.steps[last].exposure, exposure)
-    if not level <= most:
-        found = "no readable picture" if np.isnan(level) else f"{level:.1%} of white"
-        failed[DARK] = f"{found} in the last dark frame of camera {witness.camera}"
+    limit = (
+        MAX_STUCK * usual * _ratio(dome, schedule.steps[last_step].exposure, exposure)
+    )
+    if not level <= limit:
+        text = "no readable picture" if np.isnan(level) else f"{level:.1%} of white"
+        failed[DARK] = f"{text} in the last dark frame of camera {witness.camera}"
     return failed
 
 
@@ -162,10 +164,12 @@ def lamp_brightness(
     pictures = _light_pictures(schedule, dome, exposure, lamp=True)
     if not pictures:
         return float("nan")
-    last = len(schedule.steps) - 1
+    last_step = len(schedule.steps) - 1
     light = levels.of(list(pictures.values()))
-    lamp = levels.of([Picture(picture.camera, last) for picture in pictures.values()])
-    lamp = lamp * _ratio(dome, exposure, schedule.steps[last].exposure)
+    lamp = levels.of(
+        [Picture(picture.camera, last_step) for picture in pictures.values()]
+    )
+    lamp = lamp * _ratio(dome, exposure, schedule.steps[last_step].exposure)
     if not (light > 0).all():  # also if one is NaN
         return float("nan")
     return float((lamp / light).min())
@@ -224,13 +228,13 @@ def _darker_lights(
     places = {str(light["id"]): _unit(light["position"]) for light in dome["lights"]}
     for name, value in level.items():
         distance = {
-            other: -float(places[other] @ places[name])
-            for other in level
-            if other != name
+            neighbour: -float(places[neighbour] @ places[name])
+            for neighbour in level
+            if neighbour != name
         }
         near = [
-            level[other]
-            for other in sorted(distance, key=distance.__getitem__)[:NEIGHBOURS]
+            level[neighbour]
+            for neighbour in sorted(distance, key=distance.__getitem__)[:NEIGHBOURS]
         ]
         usual = float(np.median(near)) if len(near) >= MIN_NEIGHBOURS else 0.0
         if usual > 0 and not value >= MIN_BRIGHTNESS * usual:
@@ -271,13 +275,15 @@ def _longest_exposure(dome: Mapping[str, Any]) -> str:
 
 def _seconds(dome: Mapping[str, Any], exposure: str) -> float:
     return next(
-        float(one["seconds"]) for one in dome["exposures"] if str(one["id"]) == exposure
+        float(entry["seconds"])
+        for entry in dome["exposures"]
+        if str(entry["id"]) == exposure
     )
 
 
-def _ratio(dome: Mapping[str, Any], exposure: str, other: str) -> float:
+def _ratio(dome: Mapping[str, Any], exposure: str, reference: str) -> float:
     """Length of an exposure relative to another one."""
-    return _seconds(dome, exposure) / _seconds(dome, other)
+    return _seconds(dome, exposure) / _seconds(dome, reference)
 
 
 def _unit(vector: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:

@@ -156,15 +156,15 @@ class FolderCameras:
         """Image files of a camera that are not complete; one that is renamed or removed
         at this moment is skipped.
         """
-        found = list[tuple[Path, os.stat_result]]()
+        files = list[tuple[Path, os.stat_result]]()
         try:
             for path in (self.root / name).iterdir():
                 if path.suffix.lower() in FRAME_SUFFIXES and path not in complete:
                     with suppress(FileNotFoundError):
-                        found.append((path, path.stat()))
+                        files.append((path, path.stat()))
         except OSError as error:
             raise InputError(system_fault(error, f"camera {name}")) from None
-        return found
+        return files
 
 
 def _in_order(shots: Iterable[Shot]) -> list[Shot]:
@@ -234,10 +234,10 @@ def _assignment(
         error[k] = np.abs(times[index[matched]] - offset - due[matched]).sum()
     order = np.lexsort((error, -count))
     best: NDArray[np.int64] = fits[order[0]]
-    most = 2 * error[order[0]] + AMBIGUOUS * reach * len(times)
-    for other in order[1:]:
-        rivals = count[other] == count[order[0]] and error[other] <= most
-        if rivals and not np.array_equal(fits[other], best):
+    limit = 2 * error[order[0]] + AMBIGUOUS * reach * len(times)
+    for candidate in order[1:]:
+        rivals = count[candidate] == count[order[0]] and error[candidate] <= limit
+        if rivals and not np.array_equal(fits[candidate], best):
             return None
     return best
 
@@ -247,7 +247,7 @@ def _nearest(
 ) -> NDArray[np.int64]:
     """Index of the frame nearest to each due time within reach, -1 if there is none."""
     right = np.clip(np.searchsorted(at, due), 1, max(len(at) - 1, 1))
-    left = right - 1
+    before = right - 1
     right = np.minimum(right, len(at) - 1)
-    index = np.where(np.abs(at[left] - due) <= np.abs(at[right] - due), left, right)
+    index = np.where(np.abs(at[before] - due) <= np.abs(at[right] - due), before, right)
     return np.where(np.abs(at[index] - due) < reach, index, -1)

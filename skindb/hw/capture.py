@@ -88,15 +88,15 @@ def planned_schedule(setup: Setup, plan: CapturePlan) -> Schedule:
     InputError
         If the sequence cannot be completed in the wanted time.
     """
-    found = plan_schedule(setup.lights, setup.exposures, seconds=plan.seconds)
-    found = Schedule(found.steps, plan.base)
+    schedule = plan_schedule(setup.lights, setup.exposures, seconds=plan.seconds)
+    schedule = Schedule(schedule.steps, plan.base)
     if plan.slow:
-        found = slowed_schedule(found)
-        least = slowed_schedule(plan_schedule(setup.lights, setup.exposures)).seconds
-        if plan.seconds is not None and plan.seconds < least:
+        schedule = slowed_schedule(schedule)
+        shortest = slowed_schedule(plan_schedule(setup.lights, setup.exposures)).seconds
+        if plan.seconds is not None and plan.seconds < shortest:
             rule = (
                 f"with at most {MAX_FLASHES} flashes in a second the sequence lasts at "
-                f"least {least:.1f} s"
+                f"least {shortest:.1f} s"
             )
             raise InputError(
                 Fault(
@@ -106,7 +106,7 @@ def planned_schedule(setup: Setup, plan: CapturePlan) -> Schedule:
                     "allow more time, or omit --slower",
                 )
             )
-    return with_dark_frames(found)
+    return with_dark_frames(schedule)
 
 
 def run_capture(
@@ -157,24 +157,24 @@ def run_capture(
     _require_devices(setup, devices, plan)
     session = open_unfinished(out, identity(setup, subject, plan.base))
     schedule = planned_schedule(setup, plan)
-    kept = _keep_interrupted(session, setup, devices)
-    left = (
+    notes_of_recovery = _keep_interrupted(session, setup, devices)
+    remaining = (
         remaining_schedule(schedule, session.sequence) if session.sequence else schedule
     )
     run = None
-    notes = kept
-    if any(step.light != DARK for step in left.steps):
-        require_space(out, setup, len(left.steps))
+    notes = notes_of_recovery
+    if any(step.light != DARK for step in remaining.steps):
+        require_space(out, setup, len(remaining.steps))
         lamp = None
         # the flashes are counted with the measured lamp, not with the stated one
         if plan.base:
             lamp = measure_lamp(devices.dome, devices.cameras, setup, plan.base)
-            left = replace(left, base=min(plan.base, round(lamp)))
+            remaining = replace(remaining, base=min(plan.base, round(lamp)))
         if isinstance(override, Rehearsal):
-            notes += rehearsal_notes(left, override)
-        run = _run_lights(session, devices, left, override, progress)
+            notes += rehearsal_notes(remaining, override)
+        run = _run_lights(session, devices, remaining, override, progress)
         if lamp is not None:
-            _check_lamp(session, left, plan, lamp, run, setup)
+            _check_lamp(session, remaining, plan, lamp, run, setup)
         _keep_run(session, run, setup)
         require_complete(run, setup.cameras)
         notes += run.notes
@@ -193,17 +193,17 @@ def run_capture(
 def _run_lights(
     session: Unfinished,
     devices: Devices,
-    left: Schedule,
+    remaining: Schedule,
     override: Override | Rehearsal | None,
     progress: Progress | None,
 ) -> DomeRun:
     """Run the remaining steps; the flashes and their confirmation are recorded before."""
-    found = require_safe(left, override)
+    assessment = require_safe(remaining, override)
     confirmed = None
-    if isinstance(override, Override) and not found.safe:
-        confirmed = override.recorded(found)
+    if isinstance(override, Override) and not assessment.safe:
+        confirmed = override.recorded(assessment)
     before = replace(session)
-    session.count(found.flashes_per_second, confirmed)
+    session.count(assessment.flashes_per_second, confirmed)
     clock = devices.dome.link.clock
 
     def begin(part: Schedule) -> None:
@@ -215,14 +215,14 @@ def _run_lights(
         "progress": progress,
     }
     try:
-        run = capture_dome(devices.dome, devices.cameras, left, **options)
+        run = capture_dome(devices.dome, devices.cameras, remaining, **options)
     except InputError:  # nothing was lit
         before.save()
         raise
-    flashes = measured_flashes(left, run.measured)
-    if flashes > found.flashes_per_second:
+    flashes = measured_flashes(remaining, run.measured)
+    if flashes > assessment.flashes_per_second:
         session.count(flashes, confirmed)
-        planned = f"{found.flashes_per_second} were planned"
+        planned = f"{assessment.flashes_per_second} were planned"
         run.notes.append(
             f"the controller flashed {flashes} times in a second, and {planned}"
         )
@@ -264,7 +264,7 @@ def _keep_interrupted(session: Unfinished, setup: Setup, devices: Devices) -> li
 
 def _check_lamp(
     session: Unfinished,
-    left: Schedule,
+    remaining: Schedule,
     plan: CapturePlan,
     before: float,
     run: DomeRun,
@@ -280,16 +280,16 @@ def _check_lamp(
     session.lamp = lamp | {
         "measured_after": round(after, 2) if np.isfinite(after) else None
     }
-    beside = replace(left, base=round(after) if np.isfinite(after) else 0)
+    beside = replace(remaining, base=round(after) if np.isfinite(after) else 0)
     flashes = assess(beside).flashes_per_second
-    if flashes > assess(left).flashes_per_second:
-        found = (
+    if flashes > assess(remaining).flashes_per_second:
+        state = (
             f"{after:.1f} times as bright as a light"
             if np.isfinite(after)
             else "not visible"
         )
         seen = f"the subject may have seen {flashes} flashes in a second"
-        run.notes.append(f"the steady lamp was {found} after the lights, so {seen}")
+        run.notes.append(f"the steady lamp was {state} after the lights, so {seen}")
         session.count(flashes, None)
     session.save()
 
@@ -327,7 +327,7 @@ def _measure_sites(
     devices: Devices,
     plan: CapturePlan,
     place: Callable[[str, int], None],
-    tell: Progress,
+    report: Progress,
 ) -> list[str]:
     """Measure the placements of the probe that are missing.
 
@@ -335,20 +335,20 @@ def _measure_sites(
     ends. Returns notes on those that were repeated.
     """
     notes = list[str]()
-    complete = {(one["site"], one["number"]) for one in session.sites}
+    complete = {(entry["site"], entry["number"]) for entry in session.sites}
     for site, number in product(plan.sites, range(1, plan.placements + 1)):
         for attempt in range(ATTEMPTS if (site, number) not in complete else 0):
             readings = list[Reading]()
             try:
                 place(site, number)
-                run = _measure_site(setup, devices, plan, site, readings, tell)
+                run = _measure_site(setup, devices, plan, site, readings, report)
                 keep_site(session, run, number)
                 break
             except KeyboardInterrupt:
                 cure = "run the same command again; it resumes with this placement"
-                found = f"stopped by the operator at {site}, placement {number}"
+                text = f"stopped by the operator at {site}, placement {number}"
                 raise InputError(
-                    Fault("capture", "must run to its end", found, cure)
+                    Fault("capture", "must run to its end", text, cure)
                 ) from None
             except InputError as error:
                 keep_failed_placement(session, site, number, error, readings)
@@ -365,7 +365,7 @@ def _measure_site(
     plan: CapturePlan,
     site: str,
     readings: list[Reading],
-    tell: Progress,
+    report: Progress,
 ) -> SiteRun:
     # `_require_devices` asserts it
     if devices.probe is None or devices.probe_camera is None:
@@ -376,7 +376,7 @@ def _measure_site(
         )
 
     def advance(done: int, total: int) -> None:
-        tell(f"probe {site}", done, total)
+        report(f"probe {site}", done, total)
 
     options: dict[str, Any] = {
         "pressure": plan.pressure,
@@ -405,9 +405,9 @@ def _report(
     session: Unfinished, schedule: Schedule, run: DomeRun | None, notes: list[str]
 ) -> dict[str, Any]:
     drift = dict[str, float]()
-    for one in session.sites:
-        drift[one["site"]] = max(
-            drift.get(one["site"], one["drift_kpa"]), one["drift_kpa"]
+    for entry in session.sites:
+        drift[entry["site"]] = max(
+            drift.get(entry["site"], entry["drift_kpa"]), entry["drift_kpa"]
         )
     return {
         "path": str(session.folder),

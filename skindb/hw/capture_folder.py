@@ -96,8 +96,8 @@ def read_setup(folder: Path) -> Setup:
     """
     faults = list[Fault]()
     dome = read_json(folder / "dome/dome.json", faults)
-    there = (folder / "contact/probe.json").is_file()
-    probe = read_json(folder / "contact/probe.json", faults) if there else None
+    has_probe = (folder / "contact/probe.json").is_file()
+    probe = read_json(folder / "contact/probe.json", faults) if has_probe else None
     for name, record, keys in (
         ("dome/dome.json", dome, ("cameras", "lights", "exposures")),
         ("contact/probe.json", probe, ("exposures", "fibres")),
@@ -151,7 +151,7 @@ def require_space(folder: Path, setup: Setup, steps: int) -> None:
     not fit on the disk.
     """
     pixels = sum(
-        int(one["width"]) * int(one["height"]) for one in setup.dome["cameras"]
+        int(camera["width"]) * int(camera["height"]) for camera in setup.dome["cameras"]
     )
     needed = steps * pixels * 3 * 2  # bytes of three channels of 16 bits
     free = shutil.disk_usage(folder).free
@@ -171,13 +171,13 @@ def remaining_schedule(
     schedule: Schedule, entries: Sequence[Mapping[str, Any]]
 ) -> Schedule:
     """Steps of a schedule that are not among these entries, with the intervals of the schedule."""
-    done = {(entry["light"], entry["exposure"]) for entry in entries}
-    left = [
+    complete = {(entry["light"], entry["exposure"]) for entry in entries}
+    remaining = [
         i
         for i, step in enumerate(schedule.steps)
-        if (step.light, step.exposure) not in done
+        if (step.light, step.exposure) not in complete
     ]
-    return partial_schedule(schedule, left)
+    return partial_schedule(schedule, remaining)
 
 
 def keep_frames(session: Unfinished, run: DomeRun, setup: Setup) -> None:
@@ -187,7 +187,7 @@ def keep_frames(session: Unfinished, run: DomeRun, setup: Setup) -> None:
     missing = run.missing(cameras)
     offset = max((float(entry["t_off"]) for entry in entries), default=0.0)
     suffix = next((path.suffix for path in run.frames.values()), ".png")
-    kept = []
+    added = []
     for i, (step, measured) in enumerate(
         zip(run.schedule.steps, run.measured, strict=True)
     ):
@@ -199,12 +199,15 @@ def keep_frames(session: Unfinished, run: DomeRun, setup: Setup) -> None:
             )
             _copy(run.frames[camera, i], session.folder / f"{name}{suffix}")
         entry = sequence_entry(step, measured)
-        kept.append(entry | {key: entry[key] + offset for key in ("t_on", "t_off")})
+        added.append(entry | {key: entry[key] + offset for key in ("t_on", "t_off")})
     bits = {
-        str(one["id"]): int(one.get("bit_depth", 16)) for one in setup.dome["cameras"]
+        str(camera_record["id"]): int(camera_record.get("bit_depth", 16))
+        for camera_record in setup.dome["cameras"]
     }
     _keep_dark_frames(session.folder, run, cameras, suffix, bits)
-    session.sequence = sorted([*entries, *kept], key=lambda entry: float(entry["t_on"]))
+    session.sequence = sorted(
+        [*entries, *added], key=lambda entry: float(entry["t_on"])
+    )
     session.save()
 
 
@@ -264,14 +267,14 @@ def _keep_dark_frames(
 
     The last dark frame is excluded: it only shows whether a light stayed on.
     """
-    last = len(run.schedule.steps) - 1
+    last_step = len(run.schedule.steps) - 1
     for camera in cameras:
         by_exposure = dict[str, list[Path]]()
         for i, step in enumerate(run.schedule.steps):
             if (
                 step.light == DARK
                 and (camera, i) in run.frames
-                and (i < last or not by_exposure)
+                and (i < last_step or not by_exposure)
             ):
                 by_exposure.setdefault(step.exposure, []).append(run.frames[camera, i])
         for exposure, paths in by_exposure.items():
@@ -369,9 +372,10 @@ def capture_record(subject: Subject) -> dict[str, Any]:
 
 
 def _write_probe(session: Unfinished, probe: Mapping[str, Any]) -> None:
-    sites = dict.fromkeys(str(one["site"]) for one in session.sites)
-    own = {
-        site: [one for one in session.sites if one["site"] == site] for site in sites
+    sites = dict.fromkeys(str(entry["site"]) for entry in session.sites)
+    placements = {
+        site: [entry for entry in session.sites if entry["site"] == site]
+        for site in sites
     }
     record = {
         key: value
@@ -382,11 +386,12 @@ def _write_probe(session: Unfinished, probe: Mapping[str, Any]) -> None:
         "sites": list(sites),
         "frames": f"{SITE_FRAMES}{session.sites[0]['suffix']}",
         "placements": {
-            site: [str(one["number"]) for one in found] for site, found in own.items()
+            site: [str(entry["number"]) for entry in entries]
+            for site, entries in placements.items()
         },
         "pressure": {
-            site: {str(one["number"]): one["pressure"] for one in found}
-            for site, found in own.items()
+            site: {str(entry["number"]): entry["pressure"] for entry in entries}
+            for site, entries in placements.items()
         },
     }
     _dump(session.folder / "contact/probe.json", record)

@@ -107,9 +107,9 @@ class Dome:
             )
         if not self.holds(schedule):
             held = self.link.request("PLAN").values
-            found = f"{held.get('steps')} steps, digest {held.get('digest')}"
+            text = f"{held.get('steps')} steps, digest {held.get('digest')}"
             rule = f"must hold {len(schedule.steps)} steps, digest {schedule.digest}"
-            raise self.link.error(rule, found)
+            raise self.link.error(rule, text)
 
     def holds(self, schedule: Schedule) -> bool:
         """Whether the controller holds exactly these steps."""
@@ -200,15 +200,15 @@ class Dome:
         try:
             self.link.request("STOP")
             state = self.link.value(self.link.request("STATUS"), "state", STATES)
-            found = f"the state {state}"
+            text = f"the state {state}"
         except DeviceError as error:
             state = ""
-            found = error.faults[0].found
+            text = error.faults[0].found
         if state in ("", "running"):
             self.link.clock.sleep(SILENCE_SECONDS)
             rule = "must confirm that it stopped"
             raise self.link.error(
-                rule, f"{found}, so that lights may be on", LIGHTS_CURE
+                rule, f"{text}, so that lights may be on", LIGHTS_CURE
             )
 
     def report_step(self, schedule: Schedule, index: int) -> Measured:
@@ -271,8 +271,12 @@ class Dome:
         self, schedule: Schedule, state: DomeState, *, at_least: float, at_most: float
     ) -> None:
         """Refuse progress that is slower or faster than the plan; times are seconds since START."""
-        last = schedule.steps[-1]
-        step = schedule.steps[state.step] if state.step < len(schedule.steps) else last
+        last_step = schedule.steps[-1]
+        step = (
+            schedule.steps[state.step]
+            if state.step < len(schedule.steps)
+            else last_step
+        )
         latest = step.off_us / 1e6 * (1 + CLOCK_ERROR) + SLACK_SECONDS
         if state.state == "running" and at_least > latest:
             rule = f"must finish step {state.step} within {latest:.1f} s"

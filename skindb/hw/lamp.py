@@ -57,14 +57,14 @@ def measure_lamp(dome: Dome, cameras: Cameras, setup: Setup, stated: int) -> flo
     require_complete(run, setup.cameras)
     brightness = lamp_brightness(schedule, Levels(run.frames, setup.dome), setup.dome)
     if not brightness >= MIN_LAMP * stated:
-        found = f"{brightness:.1f} lights"
+        text = f"{brightness:.1f} lights"
         if np.isnan(brightness):
-            found = "lights that are not visible beside it"
+            text = "lights that are not visible beside it"
         rule = (
             f"must be as bright as {stated} lights, and at least {MIN_LAMP:.0%} of that"
         )
         cure = "make it brighter, or state its brightness with --base-light"
-        raise InputError(Fault("steady lamp", rule, found, cure))
+        raise InputError(Fault("steady lamp", rule, text, cure))
     return brightness
 
 
@@ -84,21 +84,21 @@ def _require_visible(dome: Dome, cameras: Cameras, setup: Setup, stated: int) ->
             f"{MAX_FILLED_LEVEL:.0%} of white"
         )
         cure = "shorten that exposure in dome.json, or make the lamp darker"
-        found = f"a dark frame of {level[filled[0]]:.0%} in exposure {filled[0]}"
-        raise InputError(Fault("steady lamp", rule, found, cure))
+        text = f"a dark frame of {level[filled[0]]:.0%} in exposure {filled[0]}"
+        raise InputError(Fault("steady lamp", rule, text, cure))
     exposure = usable_exposure(schedule, levels, setup.dome)
     if not exposure:
         rule = f"must be at most {MAX_LAMP_LEVEL:.0%} of white in the shortest exposure"
-        found = f"a dark frame of {min(level.values()):.0%}"
+        text = f"a dark frame of {min(level.values()):.0%}"
         raise InputError(
-            Fault("steady lamp", rule, found, "add a shorter exposure to dome.json")
+            Fault("steady lamp", rule, text, "add a shorter exposure to dome.json")
         )
     if not level[exposure] > (0.0 if levels.linear else MIN_LAMP_LEVEL):
         rule = f"must be as bright as {stated} lights"
-        found = (
+        text = (
             f"dark frames of {max(level[exposure], 0.0):.1%} of white, so no lamp is on"
         )
         raise InputError(
-            Fault("steady lamp", rule, found, "switch it on, or omit --base-light")
+            Fault("steady lamp", rule, text, "switch it on, or omit --base-light")
         )
     return exposure

@@ -163,9 +163,9 @@ class Link:
         try:
             return accepted.parse(text)
         except ValueError:
-            found = f"{text!r} in {message.kind}{message.number}"
+            received = f"{text!r} in {message.kind}{message.number}"
             raise self.error(
-                f"must send as {name} {accepted}", found, FIRMWARE_CURE
+                f"must send as {name} {accepted}", received, FIRMWARE_CURE
             ) from None
 
     def hello(self, kind: str) -> Message:
@@ -173,15 +173,15 @@ class Link:
         supported protocol.
         """
         found = self.request("HELLO")
-        said = (
+        greeting = (
             found.values.get("kind", "an unknown device"),
             found.values.get("protocol", "?"),
         )
-        if said != (kind, str(PROTOCOL)):
+        if greeting != (kind, str(PROTOCOL)):
             rule = f"must be a {kind} with protocol {PROTOCOL}"
             raise self.error(
                 rule,
-                f"{said[0]} with protocol {said[1]}",
+                f"{greeting[0]} with protocol {greeting[1]}",
                 "check which device has which address",
             )
         return found
@@ -251,8 +251,8 @@ class Link:
 
     def _require_ok(self, verb: str, reply: Message) -> Message:
         if reply.verb == ERROR:
-            found = reply.values.get("text", "a refusal without a reason")
-            raise RefusedError(Fault(self.name, f"must accept {verb}", found, ""))
+            text = reply.values.get("text", "a refusal without a reason")
+            raise RefusedError(Fault(self.name, f"must accept {verb}", text, ""))
         if reply.verb != OK:
             raise self.error(
                 f"must answer {verb} by OK or ERR", repr(reply.verb), FIRMWARE_CURE
@@ -304,7 +304,9 @@ def _new_file(path: Path) -> Path:
     """The path, with a number added if it exists, so that logs of earlier sessions are kept."""
     numbered = (path.with_stem(f"{path.stem}-{i}") for i in count(2))
     return (
-        path if not path.exists() else next(one for one in numbered if not one.exists())
+        path
+        if not path.exists()
+        else next(candidate for candidate in numbered if not candidate.exists())
     )
 
 

@@ -112,19 +112,22 @@ class Gauge:
         """
         events = [event for event in self._link.events() if event.verb == "PRESSURE"]
         seconds = self._link.clock.monotonic() - self._start
-        last = self.readings[-1][0] if self.readings else -1.0
+        previous = self.readings[-1][0] if self.readings else -1.0
         for event in events:
             t = self._link.value(event, "t", GAUGE_SECONDS)
             kpa = self._link.value(event, "kpa", GAUGE_KPA)
-            if not last < t <= seconds + MAX_AHEAD_SECONDS:
+            if not previous < t <= seconds + MAX_AHEAD_SECONDS:
                 rule = "must send readings of the gauge in order, with their times since PUMP"
-                found = f"{t:.2f} s, {seconds:.2f} s after PUMP and after a reading of {last:.2f} s"
-                raise self._link.error(rule, found, FIRMWARE_CURE)
-            self._require_recent(t - max(last, 0.0))
+                received = (
+                    f"{t:.2f} s, {seconds:.2f} s after PUMP and after a reading of "
+                    f"{previous:.2f} s"
+                )
+                raise self._link.error(rule, received, FIRMWARE_CURE)
+            self._require_recent(t - max(previous, 0.0))
             self.readings.append((t, kpa))
-            last = t
+            previous = t
             self._require_pressure(t, kpa)
-        self._require_recent(seconds - max(last, 0.0))
+        self._require_recent(seconds - max(previous, 0.0))
 
     def _require_recent(self, age: float) -> None:
         """Refuse a pressure that was unknown for too long, also if another reading followed."""
@@ -147,9 +150,9 @@ class Gauge:
             rule = (
                 f"must hold {self._target:g} kPa within {PRESSURE_TOLERANCE_KPA:g} kPa"
             )
-            found = f"{kpa:.2f} kPa after {t:.1f} s, so it leaks"
+            received = f"{kpa:.2f} kPa after {t:.1f} s, so it leaks"
             cure = "press it on, check its seal, and place it again"
-            raise PlacementError(Fault(self._link.name, rule, found, cure))
+            raise PlacementError(Fault(self._link.name, rule, received, cure))
 
 
 class Probe:
@@ -223,20 +226,20 @@ class Probe:
         DeviceError
             If the probe does not confirm it, or if the gauge sends readings as if the pump ran.
         """
-        found = ""
+        text = ""
         try:
             self.link.request("STOP")
             self.link.discard_events()
             self.link.clock.sleep(RELEASE_SECONDS)
             if any(event.verb == "PRESSURE" for event in self.link.events()):
-                found = "readings of the gauge, which it sends while the pump runs"
+                text = "readings of the gauge, which it sends while the pump runs"
         except DeviceError as error:
-            found = error.faults[0].found
-        if found:
+            text = error.faults[0].found
+        if text:
             self.link.clock.sleep(SILENCE_SECONDS)
             cure = "take the probe off, and switch off its power"
             raise self.link.error(
-                "must confirm that it released the suction", found, cure
+                "must confirm that it released the suction", text, cure
             )
 
     def _settle(self, gauge: Gauge, pressure: float) -> None:

@@ -76,10 +76,10 @@ def checksum(body: bytes) -> int:
 
 def decode(line: bytes) -> Message:
     """Decode a line without its newline; raises `ProtocolError` if it is not a message."""
-    found = LINE.fullmatch(line)
-    if found is None or len(line) >= MAX_LINE_BYTES:
+    match = LINE.fullmatch(line)
+    if match is None or len(line) >= MAX_LINE_BYTES:
         raise ProtocolError(f"{line[:80]!r} is not a message of the protocol")
-    kind, number, verb, values, crc = found.groups()
+    kind, number, verb, values, crc = match.groups()
     if checksum(line[:-5]) != int(crc, 16):
         raise ProtocolError(f"{line[:80]!r} has a wrong checksum")
     pairs = [text.partition("=") for text in values.decode("ascii").split()]

@@ -85,27 +85,27 @@ def assess(schedule: Schedule, *, window_us: int = WINDOW_US) -> Assessment:
     """Flashes and luminance steps of a schedule, in any second or window of another length."""
     step = (
         1 / (1 + schedule.base)
-        if any(one.light != DARK for one in schedule.steps)
+        if any(entry.light != DARK for entry in schedule.steps)
         else 0.0
     )
-    starts = sorted(one.on_us for one in schedule.steps if one.light != DARK)
+    starts = sorted(entry.on_us for entry in schedule.steps if entry.light != DARK)
     if step < MIN_LUMINANCE_STEP:
         starts = []
-    most = 0
-    first = 0
-    for last, start in enumerate(starts):
-        while starts[first] <= start - window_us:
-            first += 1
-        most = max(most, last - first + 1)
-    return Assessment(most, step, schedule.seconds)
+    flashes = 0
+    begin = 0
+    for end, start in enumerate(starts):
+        while starts[begin] <= start - window_us:
+            begin += 1
+        flashes = max(flashes, end - begin + 1)
+    return Assessment(flashes, step, schedule.seconds)
 
 
 def measured_flashes(schedule: Schedule, measured: Sequence[Measured | None]) -> int:
     """Largest number of flashes in any second by the measured times."""
     steps = list[Step]()
-    for step, done in zip(schedule.steps, measured, strict=True):
-        if done is not None:
-            steps.append(replace(step, on_us=done.on_us, off_us=done.off_us))
+    for step, times in zip(schedule.steps, measured, strict=True):
+        if times is not None:
+            steps.append(replace(step, on_us=times.on_us, off_us=times.off_us))
     lit = replace(schedule, steps=tuple(steps))
     return assess(lit, window_us=WINDOW_US - 2 * MAX_JITTER_US).flashes_per_second
 
@@ -170,36 +170,38 @@ def require_safe(
     InputError
         If the schedule exceeds the limit of flashes and no operator has confirmed it.
     """
-    found = assess(schedule)
-    if found.safe or isinstance(override, Rehearsal):
-        return found
+    assessment = assess(schedule)
+    if assessment.safe or isinstance(override, Rehearsal):
+        return assessment
     if override is not None and override.complete:
-        return found
-    raise InputError(_flash_fault(schedule, found))
+        return assessment
+    raise InputError(_flash_fault(schedule, assessment))
 
 
 def rehearsal_notes(schedule: Schedule, rehearsal: Rehearsal) -> list[str]:
     """How a real session would judge a schedule: its refusal, or whose confirmation allows it."""
-    found = assess(schedule)
-    if found.safe:
+    assessment = assess(schedule)
+    if assessment.safe:
         return []
     confirmation = rehearsal.confirmation
     if confirmation is None or not confirmation.complete:
-        return [f"a real session would be refused: {_flash_fault(schedule, found)}"]
+        return [
+            f"a real session would be refused: {_flash_fault(schedule, assessment)}"
+        ]
     return [
         f"a real session would run because {confirmation.operator} confirms screening, consent and "
-        f"closed eyes for {found.flashes_per_second} flashes in a second"
+        f"closed eyes for {assessment.flashes_per_second} flashes in a second"
     ]
 
 
-def _flash_fault(schedule: Schedule, found: Assessment) -> Fault:
+def _flash_fault(schedule: Schedule, assessment: Assessment) -> Fault:
     rule = (
         "an operator must confirm screening, consent and closed eyes for more than "
         f"{MAX_FLASHES} flashes in a second"
     )
-    longer = assess(slowed_schedule(schedule)).seconds - found.seconds
+    longer = assess(slowed_schedule(schedule)).seconds - assessment.seconds
     cure = (
         f"give --confirm-screening --operator ID, or --slower ({longer:.1f} s longer), "
         "or a steady lamp (see --plan)"
     )
-    return Fault("sequence", rule, str(found), cure)
+    return Fault("sequence", rule, str(assessment), cure)

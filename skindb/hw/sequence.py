@@ -58,18 +58,18 @@ class Schedule:
         interval as in this one.
         """
         start = 0
-        made = list[Step]()
+        chosen = list[Step]()
         for index in sorted(set(steps)):
             step = self.steps[index]
             length = step.off_us - step.on_us
-            made.append(replace(step, on_us=start, off_us=start + length))
+            chosen.append(replace(step, on_us=start, off_us=start + length))
             after = (
                 self.steps[index + 1].on_us
                 if index + 1 < len(self.steps)
                 else step.off_us
             )
             start += max(after - step.on_us, length + round(GAP_SECONDS * 1e6))
-        return replace(self, steps=tuple(made))
+        return replace(self, steps=tuple(chosen))
 
 
 @dataclass(frozen=True)
@@ -126,17 +126,20 @@ def plan_schedule(
         )
     if bad := [name for name, time in exposures.items() if not 1e-6 <= time <= 60]:
         rule = "an exposure must last 1e-6 to 60 s"
-        found = f"{exposures[bad[0]]} s for {bad[0]}"
-        raise InputError(Fault("sequence", rule, found, ""))
-    least = sum(max(exposures[name] + GAP_SECONDS, period) for _, name in pairs)
-    if seconds is not None and seconds < least - 1e-9:
+        text = f"{exposures[bad[0]]} s for {bad[0]}"
+        raise InputError(Fault("sequence", rule, text, ""))
+    shortest = sum(max(exposures[name] + GAP_SECONDS, period) for _, name in pairs)
+    if seconds is not None and seconds < shortest - 1e-9:
         cure = "allow more time, or shorten the exposures"
         raise InputError(
             Fault(
-                "sequence", f"must last at least {least:.3f} s", f"{seconds:g} s", cure
+                "sequence",
+                f"must last at least {shortest:.3f} s",
+                f"{seconds:g} s",
+                cure,
             )
         )
-    stretch = 0.0 if seconds is None else (seconds - least) / len(pairs)
+    stretch = 0.0 if seconds is None else (seconds - shortest) / len(pairs)
     steps = list[Step]()
     start = 0.0
     for light, name in pairs:
@@ -146,14 +149,14 @@ def plan_schedule(
     return Schedule(tuple(steps))
 
 
-def sequence_entry(step: Step, found: Measured) -> dict[str, Any]:
+def sequence_entry(step: Step, measured: Measured) -> dict[str, Any]:
     """Entry of the list `sequence` of dome.json, with measured and planned times [s]."""
     return {
         "light": step.light,
         "exposure": step.exposure,
-        "t_on": found.on_us / 1e6,
-        "t_off": found.off_us / 1e6,
-        "trigger_count": found.triggers,
+        "t_on": measured.on_us / 1e6,
+        "t_off": measured.off_us / 1e6,
+        "trigger_count": measured.triggers,
         "planned_on": step.on_us / 1e6,
         "planned_off": step.off_us / 1e6,
     }

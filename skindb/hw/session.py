@@ -131,15 +131,15 @@ def capture_dome(
         switched on. A refused repetition is not an error: `stopped` gives the reason,
         and the frames captured so far are kept.
     """
-    tell = progress or silent
+    report = progress or silent
     run = DomeRun(
         schedule, require_safe(schedule, override), [None] * len(schedule.steps)
     )
     clock = dome.link.clock
-    wanted = list(range(len(schedule.steps)))
-    first = 0.0  # when the first run began
+    remaining = list(range(len(schedule.steps)))
+    begin_time = 0.0  # when the first run began
     for attempt in range(1 + MAX_REPEATS):
-        part = partial_schedule(schedule, wanted) if attempt else schedule
+        part = partial_schedule(schedule, remaining) if attempt else schedule
         stage = "repeat" if attempt else "capture"
         cameras.start()
         try:
@@ -153,13 +153,13 @@ def capture_dome(
             break
         begin(part)
         now = clock.monotonic()
-        first = first or now
-        done = list[Measured]()
+        begin_time = begin_time or now
+        measured = list[Measured]()
         try:
             state = dome.run(
                 part,
-                lambda number, total, stage=stage: tell(stage, number, total),  # type: ignore[misc]
-                done,
+                lambda number, total, stage=stage: report(stage, number, total),  # type: ignore[misc]
+                measured,
             )
             if state.state == "stopped":
                 run.stopped = (
@@ -167,20 +167,26 @@ def capture_dome(
                 )
         except (DeviceError, KeyboardInterrupt) as error:
             run.stopped = _reason(error)
-        finished, lost_device = _read_reports(dome, part, done)
+        finished, lost_device = _read_reports(dome, part, measured)
         run.stopped = run.stopped or lost_device
-        since = round(1e6 * (now - first))
-        done = [
-            replace(one, on_us=one.on_us + since, off_us=one.off_us + since)
-            for one in done
+        since = round(1e6 * (now - begin_time))
+        measured = [
+            replace(entry, on_us=entry.on_us + since, off_us=entry.off_us + since)
+            for entry in measured
         ]
         _collect(
-            run, cameras, wanted, part, done, finished=finished, known=not lost_device
+            run,
+            cameras,
+            remaining,
+            part,
+            measured,
+            finished=finished,
+            known=not lost_device,
         )
         lost = run.missing(cameras.ids)
         if run.stopped or not lost:
             break
-        wanted = sorted(lost)
+        remaining = sorted(lost)
         run.notes.append(f"{_describe_missing(schedule, lost)}: repeated")
     run.notes += (
         [f"{dome.link.name}: {dome.link.damaged} damaged lines"]
@@ -216,11 +222,17 @@ def recover_run(
     dome.stop()
     cameras.start(started)
     run = DomeRun(schedule, assess(schedule), [None] * len(schedule.steps))
-    done = list[Measured]()
-    finished, lost_device = _read_reports(dome, schedule, done)
-    wanted = range(len(schedule.steps))
+    measured = list[Measured]()
+    finished, lost_device = _read_reports(dome, schedule, measured)
+    indices = range(len(schedule.steps))
     _collect(
-        run, cameras, wanted, schedule, done, finished=finished, known=not lost_device
+        run,
+        cameras,
+        indices,
+        schedule,
+        measured,
+        finished=finished,
+        known=not lost_device,
     )
     run.faulty_lights = _faulty_lights(run)
     return run
@@ -235,20 +247,22 @@ def _reason(error: BaseException) -> str:
     )
 
 
-def _read_reports(dome: Dome, part: Schedule, done: list[Measured]) -> tuple[int, str]:
+def _read_reports(
+    dome: Dome, part: Schedule, measured: list[Measured]
+) -> tuple[int, str]:
     """Append the missing reports to `done`, including that of an interrupted step.
 
     Returns the number of finished steps, and why the reports are incomplete.
     """
-    finished = len(done)
+    finished = len(measured)
     try:
         finished = dome.state(len(part.steps)).step
-        while len(done) < min(finished + 1, len(part.steps)):
-            done.append(dome.report_step(part, len(done)))
+        while len(measured) < min(finished + 1, len(part.steps)):
+            measured.append(dome.report_step(part, len(measured)))
     except DeviceError as error:
-        if isinstance(error, RefusedError) and len(done) == finished:
+        if isinstance(error, RefusedError) and len(measured) == finished:
             return finished, ""  # the step after the last one did not begin
-        return min(finished, len(done)), _reason(error)
+        return min(finished, len(measured)), _reason(error)
     return finished, ""
 
 
@@ -296,8 +310,10 @@ def forget_faulty_steps(run: DomeRun) -> None:
     """Discard the frames of lights that failed, and all frames after a light stayed on,
     so that they are repeated.
     """
-    measured = [(i, done) for i, done in enumerate(run.measured) if done is not None]
-    since = (i for i, done in measured if not done.rest <= MAX_REST)
+    measured = [
+        (i, report) for i, report in enumerate(run.measured) if report is not None
+    ]
+    since = (i for i, report in measured if not report.rest <= MAX_REST)
     stuck = next(since, 0 if DARK in run.faulty_lights else len(run.measured))
     for i, step in enumerate(run.schedule.steps):
         if i >= stuck or step.light in run.faulty_lights:
@@ -328,7 +344,7 @@ def require_complete(run: DomeRun, cameras: Sequence[str]) -> None:
                 cure,
             )
         )
-    for light, what in run.faulty_lights.items():
+    for light, failure in run.faulty_lights.items():
         rule = (
             "all lights must be off"
             if light == DARK
@@ -336,7 +352,9 @@ def require_complete(run: DomeRun, cameras: Sequence[str]) -> None:
         )
         cure = "repair the light, and run the capture again; it repeats the frames of that light"
         faults.append(
-            Fault("dark frame" if light == DARK else f"light {light}", rule, what, cure)
+            Fault(
+                "dark frame" if light == DARK else f"light {light}", rule, failure, cure
+            )
         )
     if faults:
         raise InputError(faults)
@@ -356,24 +374,24 @@ def _faulty_lights(run: DomeRun) -> dict[str, str]:
     """Lights with a wrong current or duration, with a description."""
     faulty = dict[str, str]()
     steady = 0.0  # current of a light that stayed on
-    for step, done in zip(run.schedule.steps, run.measured, strict=True):
-        if done is None:
+    for step, measured in zip(run.schedule.steps, run.measured, strict=True):
+        if measured is None:
             continue
-        error = abs((done.off_us - done.on_us) - (step.off_us - step.on_us))
-        level = done.level - steady
+        error = abs((measured.off_us - measured.on_us) - (step.off_us - step.on_us))
+        level = measured.level - steady
         # the steps after it show the same light
-        if not done.rest <= MAX_REST and not steady:
-            steady = done.rest
-            text = (
-                f"{done.rest:.0%} of the current of a light after it was switched off"
-            )
+        if not measured.rest <= MAX_REST and not steady:
+            steady = measured.rest
+            text = f"{measured.rest:.0%} of the current of a light after it was switched off"
             faulty.setdefault(step.light, text)
         elif step.light == DARK and not level <= MAX_REST:
             faulty.setdefault(
                 DARK, f"{level:.0%} of the current of a light in a dark frame"
             )
         elif step.light != DARK and not MIN_LEVEL <= level <= MAX_LEVEL:
-            faulty.setdefault(step.light, f"{done.level:.0%} of its nominal current")
+            faulty.setdefault(
+                step.light, f"{measured.level:.0%} of its nominal current"
+            )
         elif not error <= MAX_TIME_ERROR_US:
             faulty.setdefault(
                 step.light, f"a duration that differs by {error} us from the plan"
@@ -426,9 +444,9 @@ def capture_site(
     triggers = sum(placement.triggers.values())
     if not len(shots) == triggers == len(exposures):
         rule = "must take a frame of every exposure"
-        found = f"{len(shots)} frames for {triggers} triggers and {len(exposures)} exposures"
+        text = f"{len(shots)} frames for {triggers} triggers and {len(exposures)} exposures"
         raise PlacementError(
-            Fault(f"camera {name}", rule, found, f"measure {site} again")
+            Fault(f"camera {name}", rule, text, f"measure {site} again")
         )
     paths = (shot.path for shot in shots)
     return SiteRun(site, placement, dict(zip(exposures, paths, strict=True)))

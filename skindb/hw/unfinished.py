@@ -118,13 +118,13 @@ def open_unfinished(folder: Path, identity: Mapping[str, Any]) -> Unfinished:
     if faults:
         raise InputError(faults)
     if note is None:
-        found = (
+        text = (
             "a complete capture"
             if (folder / "capture.json").is_file()
             else "other files"
         )
         rule = "must be a new folder, or that of an unfinished capture"
-        raise InputError(Fault(str(folder), rule, found, "choose another folder"))
+        raise InputError(Fault(str(folder), rule, text, "choose another folder"))
     begun = _read(folder, path, note)
     if begun.started:
         _require_same(folder, begun.identity, identity)
@@ -143,7 +143,7 @@ def _read(folder: Path, path: Path, note: Any) -> Unfinished:
         record.get(name) for name in ("flashes_per_second", "lamp", "running")
     )
     sound = all(
-        isinstance(one, dict | None) for one in (override, lamp)
+        isinstance(part, dict | None) for part in (override, lamp)
     ) and isinstance(flashes, int)
     sound = sound and (running is None or _is_run(running))
     if not isinstance(identity, dict) or sequence is None or sites is None or not sound:
@@ -187,7 +187,7 @@ def _is_run(value: Any) -> bool:
 def _entries(value: Any, keys: set[str]) -> list[dict[str, Any]] | None:
     """The value if it is a list of objects with these keys, else None."""
     sound = isinstance(value, list) and all(
-        isinstance(one, dict) and keys <= one.keys() for one in value
+        isinstance(entry, dict) and keys <= entry.keys() for entry in value
     )
     return value if sound else None
 
@@ -198,7 +198,9 @@ def _require_same(
     """Refuse to mix subjects, or frames under different conditions."""
     faults = []
     for name in {**before, **now}:
-        old, new = (json.dumps(one.get(name), sort_keys=True) for one in (before, now))
+        old, new = (
+            json.dumps(record.get(name), sort_keys=True) for record in (before, now)
+        )
         if old != new:
             rule = f"an unfinished capture must be resumed with the same {name}"
             cure = "give the earlier value, or choose another folder"

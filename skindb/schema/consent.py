@@ -18,15 +18,15 @@ def consent_scope(attrs: Mapping[Any, Any]) -> tuple[str, ...]:
 
 def require_consent(attrs: Mapping[Any, Any], scope: str) -> None:
     """Raise `InputError` unless the consent in `attrs` names `scope`, one of `SCOPES`."""
-    given = consent_scope(attrs)
-    if scope in given:
+    scopes = consent_scope(attrs)
+    if scope in scopes:
         return
     who = str(attrs.get("take", attrs.get("subject", "the subject")))
-    found = f"only {', '.join(given)}" if given else "no scope at all"
+    text = f"only {', '.join(scopes)}" if scopes else "no scope at all"
     cure = "ask the subject, then record the answer with skindb consent"
     raise InputError(
         Fault(
-            f"{who}: consent_scope", f"this step needs the scope {scope!r}", found, cure
+            f"{who}: consent_scope", f"this step needs the scope {scope!r}", text, cure
         )
     )
 

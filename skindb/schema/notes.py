@@ -17,12 +17,12 @@ def note(take: str, reason: str) -> Note:
 
 def unique_notes(notes: Iterable[Note]) -> list[Note]:
     """The notes in order, each only once."""
-    return list({(one["take"], one["reason"]): one for one in notes}.values())
+    return list({(item["take"], item["reason"]): item for item in notes}.values())
 
 
 def note_lines(notes: Iterable[Note]) -> list[str]:
     """One line for each note."""
     return [
-        f"{one['take']}: {one['reason']}" if one["take"] else one["reason"]
-        for one in notes
+        f"{item['take']}: {item['reason']}" if item["take"] else item["reason"]
+        for item in notes
     ]

@@ -114,10 +114,10 @@ def distant_lights(environment: Environment, count: int = COUNT) -> DistantLight
             float(bright[a:b, c:d].sum()) if (b - a) * (d - c) > 1 else -1.0
             for a, b, c, d in regions
         ]
-        most = int(np.argmax(totals))
-        if totals[most] <= 0:
+        brightest = int(np.argmax(totals))
+        if totals[brightest] <= 0:
             break
-        regions += _halves(bright, regions.pop(most))
+        regions += _halves(bright, regions.pop(brightest))
     mean = (polar[:-1] + polar[1:]) / 2
     azimuth = 2 * np.pi * ((np.arange(width) + 0.5) / width - 0.5)
     towards = np.stack(
@@ -235,7 +235,7 @@ def face_record(
         "about": _about(model, surface, take, attributes, resampled.shape)
         | {"surroundings": _surroundings(model, environment)},
         "arrays": {name: _encode(value) for name, value in arrays.items()},
-        "traits": [_trait(one, values) for one in traits],
+        "traits": [_trait(trait, values) for trait in traits],
     }
 
 
@@ -395,8 +395,8 @@ def _about(
     shape: tuple[int, ...],
 ) -> dict[str, Any]:
     dome = model["dome"].to_dataset().load()
-    used = surface.vertices[np.unique(surface.faces)]
-    centre = (used.min(axis=0) + used.max(axis=0)) / 2
+    corners = surface.vertices[np.unique(surface.faces)]
+    centre = (corners.min(axis=0) + corners.max(axis=0)) / 2
     distance = float(
         np.median(np.linalg.norm(dome["light_position"].values - centre, axis=1))
     )
@@ -410,7 +410,7 @@ def _about(
     return {
         "eta": surface.eta,
         "centre": centre.tolist(),
-        "radius": float(np.linalg.norm(used - centre, axis=1).max()),
+        "radius": float(np.linalg.norm(corners - centre, axis=1).max()),
         "lightDistance": distance,
         "lightIntensity": intensity.tolist(),
         "exposure": float(np.pi * distance**2 / intensity.mean()),

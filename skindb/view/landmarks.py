@@ -109,20 +109,20 @@ def reread_task(task: LandmarkTask) -> LandmarkTask:
     InputError
         If one of the files cannot be read.
     """
-    found = _existing(task.out)
+    stored = _existing(task.out)
     box = _existing(crop_path(task.out))
     crop = None if not box else parsed_crop(box, str(crop_path(task.out)))
-    return replace(task, points=parsed_points(found, str(task.out)), crop=crop)
+    return replace(task, points=parsed_points(stored, str(task.out)), crop=crop)
 
 
 def _existing(path: Path) -> Any:
     if not path.exists():
         return {}
     faults = list[Fault]()
-    found = read_json(path, faults)
+    stored = read_json(path, faults)
     if faults:
         raise InputError(faults)
-    return found
+    return stored
 
 
 def parsed_points(value: Any, where: str) -> dict[str, NDArray[np.float64]]:
@@ -305,27 +305,29 @@ def landmark_server(task: LandmarkTask, *, port: int = 0) -> PageServer:
     )
 
 
-def _suggest(task: LandmarkTask, asked: dict[str, Any]) -> dict[str, Any]:
-    found = suggest_landmarks(
+def _suggest(task: LandmarkTask, request: dict[str, Any]) -> dict[str, Any]:
+    suggestions = suggest_landmarks(
         task.scan.vertices,
         task.scan.faces,
-        parsed_points(asked.get("points"), "points"),
+        parsed_points(request.get("points"), "points"),
     )
-    return {"points": {name: p.tolist() for name, p in found.items()}}
+    return {"points": {name: p.tolist() for name, p in suggestions.items()}}
 
 
-def _save(task: LandmarkTask, asked: dict[str, Any]) -> dict[str, Any]:
+def _save(task: LandmarkTask, request: dict[str, Any]) -> dict[str, Any]:
     """Save the landmarks, unless there are faults or questions that are not yet
     confirmed, and describe the result.
     """
-    points = parsed_points(asked.get("points"), "points")
+    points = parsed_points(request.get("points"), "points")
     crop: Crop | None = (
-        None if asked.get("crop") is None else parsed_crop(asked["crop"], "crop box")
+        None
+        if request.get("crop") is None
+        else parsed_crop(request["crop"], "crop box")
     )
     if faults := landmark_mistakes(task, points, crop):
         raise InputError(faults)
-    confirmed = asked.get("confirmed")
-    questions = open_questions(task, points, seen=str(asked.get("seen", "")))
+    confirmed = request.get("confirmed")
+    questions = open_questions(task, points, seen=str(request.get("seen", "")))
     if any(
         not isinstance(confirmed, list) or question not in confirmed
         for question in questions
@@ -357,7 +359,7 @@ def _mesh(task: LandmarkTask) -> bytes:
 
 def _page(task: LandmarkTask) -> str:
     box = task.crop
-    about = {
+    task_record = {
         "vertices": len(task.scan.vertices),
         "faces": len(task.scan.faces),
         "colours": task.colours is not None,
@@ -368,6 +370,6 @@ def _page(task: LandmarkTask) -> str:
     parts = {
         "scan": html.escape(task.scan_path.name),
         "out": html.escape(str(task.out)),
-        "about": embedded_json(about),
+        "about": embedded_json(task_record),
     }
     return page_text("page_landmarks", [f"{name}.js" for name in SCRIPTS], parts)

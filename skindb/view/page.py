@@ -110,15 +110,15 @@ class PagedFace:
     @classmethod
     def of(cls, record: Mapping[str, Any], still: str) -> PagedFace:
         """The face of a record of `face_record`."""
-        about = record["about"]["attributes"]
-        shown = [
-            f"{name} {about[name]}"
+        attributes = record["about"]["attributes"]
+        texts = [
+            f"{name} {attributes[name]}"
             for name in ("age", "gender", "condition")
-            if name in about
+            if name in attributes
         ]
         return cls(
-            about["take"],
-            ", ".join([about["take"], *shown]),
+            attributes["take"],
+            ", ".join([attributes["take"], *texts]),
             still,
             embedded_json(record).encode(),
         )

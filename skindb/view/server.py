@@ -107,9 +107,9 @@ class PageServer(ThreadingHTTPServer):
         )
 
 
-def _are_equal(one: str, other: str) -> bool:
+def _are_equal(secret: str, candidate: str) -> bool:
     """Comparison of secrets, whose time does not depend on them."""
-    return secrets.compare_digest(one.encode(), other.encode())
+    return secrets.compare_digest(secret.encode(), candidate.encode())
 
 
 class _Handler(BaseHTTPRequestHandler):

@@ -142,9 +142,9 @@ def photograph(
     glow = exitances(surface, lights, scene) if subsurface else None
 
     def shoot(
-        camera: DomeCamera, own: np.random.Generator, stream: np.random.Generator
+        camera: DomeCamera, camera_rng: np.random.Generator, stream: np.random.Generator
     ) -> None:
-        pattern = sensor.pattern((camera.height, camera.width, 3), rng=own)
+        pattern = sensor.pattern((camera.height, camera.width, 3), rng=camera_rng)
         images = render_view(
             surface,
             _render_camera(camera),

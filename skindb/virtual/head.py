@@ -223,9 +223,9 @@ def _grid_faces(rows: int, columns: int) -> NDArray[np.int64]:
     c = index[1:, 1:]
     d = index[1:, :-1]
     even = ((np.arange(rows - 1)[:, None] + np.arange(columns - 1)) % 2 == 0)[..., None]
-    first = np.where(even, np.stack([a, d, c], -1), np.stack([a, d, b], -1))
+    lower = np.where(even, np.stack([a, d, c], -1), np.stack([a, d, b], -1))
     second = np.where(even, np.stack([a, c, b], -1), np.stack([d, c, b], -1))
-    return np.stack([first, second], axis=2).reshape(-1, 3).astype(np.int64)
+    return np.stack([lower, second], axis=2).reshape(-1, 3).astype(np.int64)
 
 
 @dataclass(frozen=True)
@@ -279,12 +279,12 @@ def load_head(path: Path) -> HeadModel:
     if "v0" in arrays:
         return _checked(path, _population(arrays))
     if not {"vertices", "faces"} <= arrays.keys():
-        found = ", ".join(sorted(arrays)) or "nothing"
+        names = ", ".join(sorted(arrays)) or "nothing"
         raise InputError(
             Fault(
                 str(path),
                 "head model needs the arrays vertices and faces, or v0 and quads",
-                found,
+                names,
             )
         )
     return _checked(path, _plain(arrays))

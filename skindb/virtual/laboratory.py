@@ -137,10 +137,10 @@ class Laboratory:
         """Write a frame atomically, like tethering tools, which rename a file when it
         is complete.
         """
-        whole = target.with_suffix(".part")
-        self._expose(whole, camera, exposure, factors)
-        os.utime(whole, (stamp, stamp))
-        whole.rename(target)
+        partial = target.with_suffix(".part")
+        self._expose(partial, camera, exposure, factors)
+        os.utime(partial, (stamp, stamp))
+        partial.rename(target)
 
     def _expose(
         self, target: Path, camera: str, exposure: str, factors: dict[str, float]
@@ -267,23 +267,25 @@ def laboratory_faults(
     """
     kinds = {spec.name: str(spec.type) for spec in fields(DeviceFaults)}
     devices: dict[str, dict[str, Any]] = {"dome": {}, "probe": {}}
-    about: dict[str, Any] = {}
+    settings: dict[str, Any] = {}
     for text in texts:
         name, _, value = text.partition("=")
-        device, _, what = name.rpartition(".")
+        device, _, fault = name.rpartition(".")
         try:
-            if device in devices and what in kinds:
-                devices[device][what] = _fault_value(what, kinds[what], value, lights)
-            elif what == "dropped_frame":
+            if device in devices and fault in kinds:
+                devices[device][fault] = _fault_value(
+                    fault, kinds[fault], value, lights
+                )
+            elif fault == "dropped_frame":
                 camera, number = value.split(":")
                 if camera not in cameras:
                     raise ValueError(camera)
-                dropped = about.get("dropped_frames", ())
-                about["dropped_frames"] = (*dropped, (camera, _count(number)))
-            elif what == "hot_pixels":
-                about["hot_pixels"] = _count(value)
-            elif what == "lamp":
-                about["lamp"] = _fault_value(what, "float", value, lights)
+                dropped = settings.get("dropped_frames", ())
+                settings["dropped_frames"] = (*dropped, (camera, _count(number)))
+            elif fault == "hot_pixels":
+                settings["hot_pixels"] = _count(value)
+            elif fault == "lamp":
+                settings["lamp"] = _fault_value(fault, "float", value, lights)
             else:
                 raise ValueError(name)
         except ValueError:
@@ -300,21 +302,21 @@ def laboratory_faults(
     if not texts:
         return None
     dome = DeviceFaults(**devices["dome"])
-    return LaboratoryFaults(dome, DeviceFaults(**devices["probe"]), **about)
+    return LaboratoryFaults(dome, DeviceFaults(**devices["probe"]), **settings)
 
 
-def _fault_value(what: str, kind: str, value: str, lights: Collection[str]) -> Any:
+def _fault_value(fault: str, kind: str, value: str, lights: Collection[str]) -> Any:
     """The value of a fault of a device; ValueError if it can never happen."""
     if kind.startswith("tuple"):
         return tuple(_count(number) for number in value.split(":"))
     if kind == "str":
-        if value not in (GAUGE_FAULTS if what == "gauge" else lights):
+        if value not in (GAUGE_FAULTS if fault == "gauge" else lights):
             raise ValueError(value)
         return value
     if kind == "int":
         return _count(value)
     number = float(value)
-    if not 0.0 <= number <= (1.0 if what in PROBABILITIES else MAX_FAULT):
+    if not 0.0 <= number <= (1.0 if fault in PROBABILITIES else MAX_FAULT):
         raise ValueError(value)
     return number
 

@@ -72,7 +72,7 @@ class Person:
 
 def default_people() -> tuple[Person, ...]:
     """The demo's eight takes: six subjects, the first of them also under lotion and powder."""
-    first = Person(
+    base = Person(
         "V001",
         31,
         "female",
@@ -84,9 +84,9 @@ def default_people() -> tuple[Person, ...]:
         fullness=0.45,
     )
     return (
-        first,
-        replace(first, condition="lotion"),
-        replace(first, condition="powder"),
+        base,
+        replace(base, condition="lotion"),
+        replace(base, condition="powder"),
         Person(
             "V002",
             46,
@@ -171,9 +171,9 @@ def cohort_people(
         people += [
             person,
             *(
-                replace(person, condition=one)
-                for one in conditions
-                if one != person.condition
+                replace(person, condition=condition)
+                for condition in conditions
+                if condition != person.condition
             ),
         ]
     return people

@@ -71,12 +71,12 @@ def shared_walk(eta: float, packets: int = PACKETS) -> Walk:
     def make() -> dict[str, NDArray[Any]]:
         return vars(random_walk(packets, eta=eta, rng=np.random.default_rng(WALK_SEED)))
 
-    found = cached_arrays("probe-walk", (eta, packets), sources=SOURCES, make=make)
+    arrays = cached_arrays("probe-walk", (eta, packets), sources=SOURCES, make=make)
     radius, path, weight, batch = (
-        found[name] for name in ("radius", "path", "weight", "batch")
+        arrays[name] for name in ("radius", "path", "weight", "batch")
     )
     return Walk(
-        radius, path, weight, batch, int(found["packets"]), float(found["longest"])
+        radius, path, weight, batch, int(arrays["packets"]), float(arrays["longest"])
     )
 
 
@@ -124,9 +124,9 @@ def _smooth(distance: Array, value: Array, error: Array) -> Array:
     (where few photons arrive) follow the straight line, so that the images contain the
     noise of the sensor and not that of the walk.
     """
-    known = (value > 0) & (error < 0.7 * value)
-    target = np.where(known, np.log(np.where(known, value, 1) * distance**2), 0)
-    weight = np.where(known, (value / np.maximum(error, 1e-3 * value + 1e-300)) ** 2, 0)
+    clear = (value > 0) & (error < 0.7 * value)
+    target = np.where(clear, np.log(np.where(clear, value, 1) * distance**2), 0)
+    weight = np.where(clear, (value / np.maximum(error, 1e-3 * value + 1e-300)) ** 2, 0)
     bend = (
         np.diff(np.eye(len(distance)), 2, axis=0)
         * (distance[1:-1] / (SMOOTH * PITCH))[:, None]

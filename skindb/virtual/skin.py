@@ -313,13 +313,13 @@ def _weights(
     table = np.array([[GLOSS[name][0], *GLOSS[name][1]] for name in names])
     field = member @ table + np.outer(rest, [GLOSS_ELSEWHERE[0], *GLOSS_ELSEWHERE[1]])
     field /= (member.sum(axis=1) + rest)[:, None]
-    own = rng.lognormal(0, 0.12, 4)
+    personal = rng.lognormal(0, 0.12, 4)
     share = (
         field[:, 1:]
         * np.exp(
             np.stack([0.15 * smooth_noise(p, 30, rng=rng) for _ in range(4)], axis=1)
         )
-        * own
+        * personal
     )
     share *= [1.0, 1.0, effect.sharp, effect.sharp]
     share /= share.sum(axis=1, keepdims=True)
@@ -338,21 +338,25 @@ def _sites(
     R_d imply (paper, section 9).
     """
     rng = person.stream(5)
-    own = person.stream(6).lognormal(0, 0.12)
+    personal = person.stream(6).lognormal(0, 0.12)
     sites = []
     for name, mean in SIGMA_TR.items():
         local = rng.lognormal(0, 0.06) * rng.lognormal(0, 0.03, 3)
-        at = _site_vertex(head, name)
-        if at is None:
+        vertex = _site_vertex(head, name)
+        if vertex is None:
             continue
-        near = ((head.vertices - head.vertices[at]) ** 2).sum(axis=1) < PATCH**2
+        near = ((head.vertices - head.vertices[vertex]) ** 2).sum(axis=1) < PATCH**2
         colour = diffuse[near].mean(axis=0)
-        sigma_tr = np.clip(np.array(mean) * own * local * effect.translucency, 0.3, 3.0)
+        sigma_tr = np.clip(
+            np.array(mean) * personal * local * effect.translucency, 0.3, 3.0
+        )
         s, _ = dipole_s(colour, eta=eta)
         sigma_a, sigma_s = (
             np.asarray(x, np.float64) for x in scattering_coefficients(s, sigma_tr)
         )
-        sites.append(Site(name, head.vertices[at], colour, sigma_tr, sigma_a, sigma_s))
+        sites.append(
+            Site(name, head.vertices[vertex], colour, sigma_tr, sigma_a, sigma_s)
+        )
     return tuple(sites)
 
 

@@ -61,14 +61,16 @@ def recovered_against_true(model: xr.DataTree, truth: Mapping[str, Array]) -> Re
     """
     fitted = model["fitted"].to_dataset()
     face, corner = _foot_points(fitted, truth)
-    at = truth["faces"][np.maximum(face, 0)]
-    normal = _mix(truth["normals"][at], corner)
+    corners = truth["faces"][np.maximum(face, 0)]
+    normal = _mix(truth["normals"][corners], corner)
     length = np.linalg.norm(normal, axis=1, keepdims=True)
     normal = np.divide(
         normal, length, out=np.full_like(normal, np.nan), where=length > 0
     )
     diffuse = np.where(
-        (face >= 0)[:, None], _mix(truth["diffuse_reflectance"][at], corner), np.nan
+        (face >= 0)[:, None],
+        _mix(truth["diffuse_reflectance"][corners], corner),
+        np.nan,
     )
     cosine = np.clip((normal * fitted["shading_normal"].values).sum(1), -1, 1)
     return Recovery(
@@ -99,10 +101,10 @@ def _mix(values: Array, corner: Array) -> Array:
 def _sites(model: xr.DataTree, truth: Mapping[str, Array]) -> dict[str, Array]:
     if "translucency" not in model.children or "site_names" not in truth:
         return {}
-    found = model["translucency"].to_dataset()["site_sigma_tr"]
+    fitted = model["translucency"].to_dataset()["site_sigma_tr"]
     true = dict(zip(map(str, truth["site_names"]), truth["site_sigma_tr"], strict=True))
     return {
-        str(s): found.sel(site=s).values / true[str(s)] - 1
-        for s in found["site"].values
+        str(s): fitted.sel(site=s).values / true[str(s)] - 1
+        for s in fitted["site"].values
         if str(s) in true
     }
