@@ -30,7 +30,7 @@ from skindb.fit.albedo import _reflectances as diffuse_reflectances
 from skindb.fit.normals import _normals as fit_normals
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.reflectance.rows import basis_rows
-from skindb.schema import dataset, label
+from skindb.schema import dataset, label, variables
 from skindb.schema.status import LARGEST_R_D, SMALLEST_R_D
 from skindb.types import Array
 
@@ -57,7 +57,7 @@ class ModelSamples:
     def with_normals(self) -> xr.Dataset:
         """The lumitexels with the true normals."""
         return self.lumitexels.assign(
-            shading_normal=label("shading_normal", self.normal)
+            shading_normal=label(variables.SHADING_NORMAL, self.normal)
         )
 
 
@@ -115,16 +115,16 @@ def model_samples(
     )
     lumitexels = dataset(
         {
-            "reflectance_sample": sample,
-            "surfel_position": position,
-            "surfel_normal": unit(
+            variables.REFLECTANCE_SAMPLE: sample,
+            variables.SURFEL_POSITION: position,
+            variables.SURFEL_NORMAL: unit(
                 normal
                 + np.deg2rad(SCAN_ERROR / np.sqrt(2)) * rng.normal(size=normal.shape)
             ),
-            "surfel_area": np.ones(surfels),
-            "light_position": light,
-            "light_disc_radius": np.zeros(lights),
-            "camera_position": camera,
+            variables.SURFEL_AREA: np.ones(surfels),
+            variables.LIGHT_POSITION: light,
+            variables.LIGHT_DISC_RADIUS: np.zeros(lights),
+            variables.CAMERA_POSITION: camera,
         },
         coords={"channel": ["R", "G", "B"]},
     )
@@ -145,7 +145,7 @@ def _domes(quick: bool) -> list[tuple[str, ModelSamples]]:
             gloss=GLOSS,
         )
         count = (
-            np.isfinite(skin.lumitexels["reflectance_sample"].values[..., 0])
+            np.isfinite(skin.lumitexels[variables.REFLECTANCE_SAMPLE].values[..., 0])
             .sum((1, 2))
             .mean()
         )
@@ -173,7 +173,7 @@ def normals_curves(quick: bool) -> list[Curve]:
                 len(skin.normal),
             )
             cosine = np.einsum(
-                "nk,nk->n", estimate["shading_normal"].values, skin.normal
+                "nk,nk->n", estimate[variables.SHADING_NORMAL].values, skin.normal
             ).clip(-1, 1)
             angle = np.degrees(np.arccos(cosine))
             details = {
@@ -184,7 +184,9 @@ def normals_curves(quick: bool) -> list[Curve]:
                 Point(method, samples, took, float(np.nanmedian(angle)), "", details)
             )
     scan = np.einsum(
-        "nk,nk->n", domes[0][1].lumitexels["surfel_normal"].values, domes[0][1].normal
+        "nk,nk->n",
+        domes[0][1].lumitexels[variables.SURFEL_NORMAL].values,
+        domes[0][1].normal,
     ).clip(-1, 1)
     points.append(
         Point(
@@ -251,7 +253,7 @@ def _albedo(skin: ModelSamples, name: str, samples: str, **ask: Any) -> Point:
         lambda: estimate_diffuse_reflectance(lumitexels, eta=ETA, **ask),
         len(skin.normal),
     )
-    relative = estimate["diffuse_reflectance"].values / skin.diffuse - 1
+    relative = estimate[variables.DIFFUSE_REFLECTANCE].values / skin.diffuse - 1
     known_share = float(np.isfinite(relative).all(1).mean())
     failure = (
         ""

@@ -27,6 +27,7 @@ from skindb.render.scene import (
     from_model,
     lights_from_dome,
 )
+from skindb.schema import variables
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -40,8 +41,8 @@ Image = NDArray[np.floating[Any]]
 Picture = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 ERRORS = (  # maps of residuals, black where they are unknown
-    ("held_out_error", 0.2, "error under lights the fit did not see"),
-    ("outlier_fraction", 0.1, "samples the model does not explain"),
+    (variables.HELD_OUT_ERROR, 0.2, "error under lights the fit did not see"),
+    (variables.OUTLIER_FRACTION, 0.1, "samples the model does not explain"),
 )
 # directions of the two lights of a portrait
 KEY_LIGHTS = ((-0.5, 0.35, 0.8), (0.55, 0.25, 0.8))
@@ -88,7 +89,7 @@ def _frontal(
 
 def _key(dome: xr.Dataset) -> Lights:
     """Two lights of the dome, one from each side."""
-    place = dome["light_position"].values
+    place = dome[variables.LIGHT_POSITION].values
     place = place / np.linalg.norm(place, axis=1, keepdims=True)
     directions = np.array(KEY_LIGHTS) / np.linalg.norm(
         KEY_LIGHTS, axis=1, keepdims=True

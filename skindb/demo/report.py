@@ -24,7 +24,7 @@ from skindb.demo.pictures import (
 from skindb.demo.tables import Results
 from skindb.files import private_file
 from skindb.render.compare import compare_images
-from skindb.schema import FitStatus
+from skindb.schema import FitStatus, variables
 from skindb.types import Progress
 
 # largest distance of an edit inside the data, in median distances between takes
@@ -368,7 +368,13 @@ def _population(results: Results, _: Portraits) -> list[str]:
         for name in ("translucency", "brdf", "albedo")
     ]
     columns = saved[0].columns(
-        ["site", "channel", "sigma_tr_mean", "sigma_tr_mean_low", "sigma_tr_mean_high"]
+        [
+            "site",
+            "channel",
+            variables.SIGMA_TR_MEAN,
+            variables.SIGMA_TR_MEAN_LOW,
+            variables.SIGMA_TR_MEAN_HIGH,
+        ]
     )
     named = columns.renamed(["site", "channel", "mean", "95 % from", "to"])
     listed = page.details("sigma_tr in 1/mm by site and channel", [page.table(named)])
@@ -383,7 +389,7 @@ def _population(results: Results, _: Portraits) -> list[str]:
 
 def _basis_size(results: Results) -> str:
     curve = results.studies["brdf"]["basis_size"].to_dataset().load()
-    near = 100 * float(curve["plateau_tolerance"])
+    near = 100 * float(curve[variables.PLATEAU_TOLERANCE])
     text = (
         f"Sufficient number of basis BRDFs: {curve.attrs['size_status']}. Its "
         f"error must be within {near:g} % of that "

@@ -14,7 +14,7 @@ import xarray as xr
 from skindb.analysis.studies import tabulate_study
 from skindb.demo.page import Table
 from skindb.render.photographs import Comparison
-from skindb.schema import FitStatus
+from skindb.schema import FitStatus, variables
 from skindb.virtual.truth import Recovery
 
 PER_TAKE = ("models", "fits", "recovered", "compared")
@@ -76,7 +76,8 @@ class Results:
 def status_counts(model: xr.DataTree) -> dict[FitStatus, int]:
     """Number of surfels with each status, including zeros."""
     counts = np.bincount(
-        model["fitted"].to_dataset()["fit_status"].values, minlength=len(FitStatus)
+        model["fitted"].to_dataset()[variables.FIT_STATUS].values,
+        minlength=len(FitStatus),
     )
     return {status: int(counts[status]) for status in FitStatus}
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 import base64
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import imagecodecs
@@ -17,14 +17,17 @@ from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
 from skindb.geometry.mesh import vertex_areas
-from skindb.optics.diffusion import S_FLOOR
+from skindb.optics.diffuse import S_FLOOR
 from skindb.optics.fresnel import boundary_factor
 from skindb.render.environment import LUMINANCE, Environment
 from skindb.render.image import tone_map
 from skindb.render.monte_carlo import Lighting
-from skindb.render.rendering import chosen_camera, chosen_lights, fixed_exposure, render
+from skindb.render.picture import chosen_camera, chosen_lights
+from skindb.render.plan import without_unused_bases
+from skindb.render.rendering import fixed_exposure, render
 from skindb.render.scene import Surface, from_model
 from skindb.render.texels import surfel_confidence
+from skindb.schema import variables
 from skindb.schema.consent import honour_consent
 from skindb.schema.omission import Omission
 
@@ -212,14 +215,13 @@ def face_record(
     """
     honour_consent(model.attrs, "export")
     surface = _surface(model, edited=bool(traits))[0]
-    resampled, weights = surface.model.resample(surface.parameters)
-    if (count := weights.shape[1]) > MAX_BASES:
+    if (count := surface.tables.shape[-1]) > MAX_BASES:
         rule = f"the viewer needs at most {MAX_BASES} bases"
         cure = f"fit again with --k {MAX_BASES} or less"
         raise InputError(Fault(take, rule, str(count), cure))
-    values = _values(surface, weights)
-    uv = model["fitted"].to_dataset()["surfel_uv"].values.astype(np.float32)
-    tables = _tables(resampled)
+    values = _values(surface)
+    uv = model["fitted"].to_dataset()[variables.SURFEL_UV].values.astype(np.float32)
+    tables = _tables(surface.tables)
     arrays: dict[str, NDArray[Any]] = {
         "position": surface.vertices.astype(np.float32),
         "triangles": np.asarray(surface.faces, np.uint32),
@@ -232,7 +234,7 @@ def face_record(
         **({"tableB": tables[1]} if len(tables) > 1 else {}),
     }
     return {
-        "about": _about(model, surface, take, attributes, resampled.shape)
+        "about": _about(model, surface, take, attributes)
         | {"surroundings": _surroundings(model, environment)},
         "arrays": {name: _encode(value) for name, value in arrays.items()},
         "traits": [_trait(trait, values) for trait in traits],
@@ -260,10 +262,7 @@ def _surface(
 ) -> tuple[Surface, tuple[Omission, ...]]:
     """The surface of the page, without unused bases unless it is edited, and what was omitted."""
     surface = from_model(model, fill=True)
-    if edited:
-        return surface, ()
-    fewer, parameters, omissions = surface.model.simplified(surface.parameters)
-    return replace(surface, model=fewer, parameters=parameters), omissions
+    return (surface, ()) if edited else without_unused_bases(surface)
 
 
 def still_picture(model: xr.DataTree) -> str:
@@ -310,12 +309,12 @@ def uv_spacing(vertices: Float, faces: NDArray[np.integer[Any]], uv: Float) -> F
     return np.asarray(np.sqrt(np.clip(square, 1e-6, 1e12)))
 
 
-def _values(surface: Surface, mixed: Float) -> dict[str, Float]:
+def _values(surface: Surface) -> dict[str, Float]:
     """Values that traits change: albedo (n, 3), weights (n, 4) twice, diffusion length
     (n, 3) [mm].
     """
     weights = np.zeros((len(surface.vertices), MAX_BASES))
-    weights[:, : mixed.shape[1]] = mixed
+    weights[:, : surface.weights.shape[1]] = surface.weights
     diffusion = np.zeros((len(surface.vertices), 3))
     if surface.sigma_tr is not None:
         diffusion = np.nan_to_num(
@@ -333,10 +332,8 @@ def _trait(trait: Trait, plain: Mapping[str, Float]) -> dict[str, Any]:
     """Change of the arrays by a trait: differences of weights, log ratios of albedo and
     diffusion length.
     """
-    edited = (from_model(tree, fill=True) for tree in (trait.whole, trait.half))
     whole, half = (
-        _values(surface, surface.model.resample(surface.parameters)[1])
-        for surface in edited
+        _values(from_model(tree, fill=True)) for tree in (trait.whole, trait.half)
     )
     ratio = {
         name: np.log(
@@ -376,7 +373,10 @@ def _quality(model: xr.DataTree, surface: Surface) -> Float:
     """Confidence and relative standard error of the albedo (n, 2); an unknown error is 0."""
     fitted = model["fitted"].to_dataset()
     error = np.zeros(len(surface.vertices))
-    for name in ("diffuse_reflectance_total_error", "diffuse_reflectance_error"):
+    for name in (
+        variables.DIFFUSE_REFLECTANCE_TOTAL_ERROR,
+        variables.DIFFUSE_REFLECTANCE_ERROR,
+    ):
         if name in fitted:
             error = (
                 fitted[name].values / np.maximum(surface.diffuse, MIN_ALBEDO)
@@ -388,19 +388,17 @@ def _quality(model: xr.DataTree, surface: Surface) -> Float:
 
 
 def _about(
-    model: xr.DataTree,
-    surface: Surface,
-    take: str,
-    attributes: Mapping[str, Any],
-    shape: tuple[int, ...],
+    model: xr.DataTree, surface: Surface, take: str, attributes: Mapping[str, Any]
 ) -> dict[str, Any]:
     dome = model["dome"].to_dataset().load()
     corners = surface.vertices[np.unique(surface.faces)]
     centre = (corners.min(axis=0) + corners.max(axis=0)) / 2
     distance = float(
-        np.median(np.linalg.norm(dome["light_position"].values - centre, axis=1))
+        np.median(
+            np.linalg.norm(dome[variables.LIGHT_POSITION].values - centre, axis=1)
+        )
     )
-    intensity = np.median(dome["light_intensity"].values, axis=0)
+    intensity = np.median(dome[variables.LIGHT_INTENSITY].values, axis=0)
     translucent = (
         surface.s is not None
         and surface.sigma_tr is not None
@@ -418,7 +416,11 @@ def _about(
         "diffusionWidth": [
             float(np.median(diffusion_width(s[:, c], surface.eta))) for c in range(3)
         ],
-        "tableShape": [shape[2], shape[0], shape[1]],
+        "tableShape": [
+            surface.tables.shape[2],
+            surface.tables.shape[0],
+            surface.tables.shape[1],
+        ],
         "attributes": {"take": take}
         | {str(name): str(value) for name, value in attributes.items()},
     }
@@ -435,12 +437,14 @@ def _surroundings(
         (lights.irradiance * np.maximum(lights.direction[:, 2:], 0)).sum(axis=0).mean()
     )
     dome = model["dome"].to_dataset().load()
-    middle = model["fitted"].to_dataset()["surfel_position"].values.mean(axis=0)
+    middle = model["fitted"].to_dataset()[variables.SURFEL_POSITION].values.mean(axis=0)
     distance = float(
-        np.median(np.linalg.norm(dome["light_position"].values - middle, axis=1))
+        np.median(
+            np.linalg.norm(dome[variables.LIGHT_POSITION].values - middle, axis=1)
+        )
     )
     unit = (
-        float(np.median(dome["light_intensity"].values, axis=0).mean())
+        float(np.median(dome[variables.LIGHT_INTENSITY].values, axis=0).mean())
         / distance**2
         / max(float(front), 1e-30)
     )

@@ -10,7 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from skindb.geometry.rays import RayScene
-from skindb.schema import FitStatus
+from skindb.schema import FitStatus, variables
 
 Array = NDArray[np.floating]
 # mm along the normal of the scan within which the true surface is searched
@@ -72,12 +72,12 @@ def recovered_against_true(model: xr.DataTree, truth: Mapping[str, Array]) -> Re
         _mix(truth["diffuse_reflectance"][corners], corner),
         np.nan,
     )
-    cosine = np.clip((normal * fitted["shading_normal"].values).sum(1), -1, 1)
+    cosine = np.clip((normal * fitted[variables.SHADING_NORMAL].values).sum(1), -1, 1)
     return Recovery(
         np.where(face >= 0, np.degrees(np.arccos(cosine)), np.nan),
-        fitted["diffuse_reflectance"].values / diffuse - 1,
+        fitted[variables.DIFFUSE_REFLECTANCE].values / diffuse - 1,
         diffuse,
-        fitted["fit_status"].values == FitStatus.FITTED,
+        fitted[variables.FIT_STATUS].values == FitStatus.FITTED,
         _sites(model, truth),
     )
 
@@ -87,7 +87,7 @@ def _foot_points(
 ) -> tuple[NDArray[np.integer], Array]:
     position, normal = (
         fitted[name].values.astype(np.float64)
-        for name in ("surfel_position", "surfel_normal")
+        for name in (variables.SURFEL_POSITION, variables.SURFEL_NORMAL)
     )
     scene = RayScene(truth["vertices"], truth["faces"].astype(np.int64))
     face, corner, distance = scene.first_hit(position + SEARCH * normal, -normal)
@@ -101,7 +101,7 @@ def _mix(values: Array, corner: Array) -> Array:
 def _sites(model: xr.DataTree, truth: Mapping[str, Array]) -> dict[str, Array]:
     if "translucency" not in model.children or "site_names" not in truth:
         return {}
-    fitted = model["translucency"].to_dataset()["site_sigma_tr"]
+    fitted = model["translucency"].to_dataset()[variables.SITE_SIGMA_TR]
     true = dict(zip(map(str, truth["site_names"]), truth["site_sigma_tr"], strict=True))
     return {
         str(s): fitted.sel(site=s).values / true[str(s)] - 1
