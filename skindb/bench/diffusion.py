@@ -14,7 +14,7 @@ from scipy.optimize import brentq
 from skindb.bench.case import close, combinations, expect, stress_cases
 from skindb.bench.curve import Curve, Point, cpu_time
 from skindb.errors import Fault, InputError
-from skindb.fit._probe_profile import MODELS, ProbeFit, fit_profile
+from skindb.fit.probe_profile import MODELS, ProbeFit, fit_profile
 from skindb.optics import transport
 from skindb.optics._moments import half_space_profile, moments
 from skindb.optics.diffuse import S_MAX, diffuse_reflectance, dipole_s, reduced_albedo

@@ -25,10 +25,10 @@ from skindb.bench.surface_cases import (
     without_surfels,
 )
 from skindb.fit import albedo, estimate_diffuse_reflectance, estimate_normals, normals
-from skindb.fit._albedo_rules import surface_lobes
-from skindb.fit.albedo import _reflectances as diffuse_reflectances
+from skindb.fit.albedo import block_reflectance
 from skindb.fit.normals import _normals as fit_normals
 from skindb.optics.fresnel import fresnel_transmittance
+from skindb.reflectance.dictionary import surface_lobes
 from skindb.reflectance.rows import basis_rows
 from skindb.schema import dataset, label, variables
 from skindb.schema.status import LARGEST_R_D, SMALLEST_R_D
@@ -356,9 +356,15 @@ def _no_surfels_normals() -> None:
 def _estimated_albedo(
     skin: Surfels, method: str, eta: float = ETA
 ) -> tuple[Array, Array]:
-    geometry = skin.position, skin.light, skin.camera, skin.normal
-    estimate, error, _, _ = diffuse_reflectances(
-        skin.sample, *geometry, method=method, eta=eta, discard=2, even_reflection=0.0
+    arrays = {
+        "reflectance_sample": skin.sample,
+        "surfel_position": skin.position,
+        "light_position": skin.light,
+        "camera_position": skin.camera,
+        "shading_normal": skin.normal,
+    }
+    estimate, error, _, _ = block_reflectance(
+        arrays, method=method, eta=eta, even_reflection=0.0
     )
     return estimate, error
 

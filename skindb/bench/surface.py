@@ -7,19 +7,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from skindb.bench.curve import Curve, Point, cpu_time
-from skindb.fit._surface_arrays import Tables, Weights, surface_weights
 from skindb.fit.surface import MIN_SAMPLES, NOISE_FLOOR_SURFACE
 from skindb.numerics.factorise import nmf
 from skindb.optics.angles import half_difference
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.reflectance.dictionary import Dictionary, convolve_disc, embedded_dictionary
+from skindb.reflectance.mixture import Mixture
+from skindb.reflectance.model import Block, Comparison, SurfaceFit
 from skindb.reflectance.reduction import reduce_dictionary
 from skindb.reflectance.rows import basis_rows
 from skindb.reflectance.tables import lookup
@@ -43,8 +43,7 @@ class Strip:
     loop over SciPy.
     """
 
-    # sample, position, light, camera, normal, diffuse of `surface_weights`
-    arrays: tuple[Array, ...]
+    block: Block
     offsets: NDArray[
         np.int64
     ]  # (n + 1,) index of the first row of each surfel, and the total
@@ -54,17 +53,14 @@ class Strip:
     directions: tuple[Array, Array, Array]  # wi, wo, normal of each row
     cosine: Array  # (total,)
 
-    def first(self, count: int) -> list[Array]:
-        """The arguments of `surface_weights` for the first `count` surfels."""
-        sample, position, light, camera, normal, diffuse = self.arrays
-        return [
-            sample[:count],
-            position[:count],
-            light,
-            camera,
-            normal[:count],
-            diffuse[:count],
-        ]
+    def first(self, count: int) -> Block:
+        """The first `count` surfels."""
+        return self.block._replace(
+            sample=self.block.sample[:count],
+            position=self.block.position[:count],
+            normal=self.block.normal[:count],
+            diffuse=self.block.diffuse[:count],
+        )
 
 
 def _spiral(count: int, radius: float, share: float) -> Array:
@@ -121,9 +117,9 @@ def strip(
     sample = np.full((surfels, 150, 16, 3), np.nan, np.float16)
     sample[owner, i, o] = value
     target = sample[owner, i, o].astype(float) - scattered
-    arrays = sample, position, light, camera, normal, diffuse
+    block = Block(sample, position, light, camera, normal, diffuse)
     away = wi[owner, i], wo[owner, o], normal[owner]
-    return Strip(arrays, offsets, rows.astype(np.float64), target, true, away, c)
+    return Strip(block, offsets, rows.astype(np.float64), target, true, away, c)
 
 
 @lru_cache(maxsize=1)
@@ -134,13 +130,13 @@ def _problem(quick: bool) -> tuple[Dictionary, Strip, int]:
 
 
 @lru_cache(maxsize=5)
-def _tables(quick: bool, roots: bool, rank: int) -> Tables:
+def _tables(quick: bool, roots: bool, rank: int) -> Mixture:
     """The dictionary, or its cube roots, reduced to `rank` dimensions."""
     dictionary = _problem(quick)[0]
     reduced, lift = reduce_dictionary(
         np.cbrt(dictionary.table) if roots else dictionary.table, rank
     )
-    return Tables(reduced, dictionary.grid, lift)
+    return Mixture(reduced, lift)
 
 
 def _parts(samples: Strip, count: int) -> list[slice]:
@@ -197,19 +193,12 @@ def _errors(
     return float(np.median(linear)), float(np.median(roots)), float(np.median(residual))
 
 
-def _fit(samples: Strip, tables: Tables, mode: str) -> tuple[float, Weights]:
+def _fit(samples: Strip, model: Mixture, mode: str) -> tuple[float, SurfaceFit]:
     """CPU time per surfel [s], and weights of all surfels."""
-    options: dict[str, Any] = {
-        "eta": ETA,
-        "mode": mode,
-        "noise_floor": NOISE_FLOOR_SURFACE,
-        "min_samples": MIN_SAMPLES,
-    }
+    comparison = Comparison(mode, ETA, NOISE_FLOOR_SURFACE, MIN_SAMPLES)
+    model.fit(samples.first(2), comparison)  # compiles
     n = len(samples.offsets) - 1
-    surface_weights(*samples.first(2), tables=tables, **options)  # compiles
-    return cpu_time(
-        lambda: surface_weights(*samples.arrays, tables=tables, **options), n
-    )
+    return cpu_time(lambda: model.fit(samples.block, comparison), n)
 
 
 def _mixed(samples: Strip, weight: Array) -> Callable[[slice, int], Array]:
@@ -244,9 +233,9 @@ def surface_curves(quick: bool) -> list[Curve]:
                 "not_fitted": float((fit.status != 0).sum()),
             }
             cubes = (
-                _cubes(samples, table, fit.weight)
+                _cubes(samples, table, fit.parameters)
                 if mode == "paper"
-                else _mixed(samples, fit.weight)
+                else _mixed(samples, fit.parameters)
             )
             measured.append(
                 (
@@ -263,7 +252,7 @@ def surface_curves(quick: bool) -> list[Curve]:
                     "cbrt(M x) is not cbrt(M) x, so weights of cube roots do not mix "
                     "reflectance"
                 )
-                errors = _errors(samples, few, _mixed(samples, fit.weight))
+                errors = _errors(samples, few, _mixed(samples, fit.parameters))
                 measured.append(
                     (
                         "paper's weights used as linear weights",
@@ -316,19 +305,17 @@ def refit_curves(quick: bool) -> list[Curve]:
     dictionary, samples, few = _problem(quick)
     _, full = _fit(
         samples,
-        Tables(dictionary.table, dictionary.grid, np.eye(len(dictionary.names))),
+        Mixture(dictionary.table),
         "linear",
     )
-    H = nmf(full.weight, 4, rng=np.random.default_rng(0)).H
+    H = nmf(full.parameters, 4, rng=np.random.default_rng(0)).H
     measured = []
     took, weight = cpu_time(lambda: scipy_loop(samples, few, channels=3, H=H), few)
     measured.append((SCIPY, took, weight))
-    four = Tables(
-        (dictionary.table @ H.T).astype(np.float32), dictionary.grid, np.eye(4)
-    )
+    four = Mixture((dictionary.table @ H.T).astype(np.float32))
     for mode in ("linear", "perceptual"):
         took, fit = _fit(samples, four, mode)
-        measured.append((f"skindb {mode}", took, fit.weight))
+        measured.append((f"skindb {mode}", took, fit.parameters))
     errors = [
         _errors(samples, few, _mixed(samples, weight @ H)) for _, _, weight in measured
     ]

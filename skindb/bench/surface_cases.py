@@ -11,13 +11,14 @@ import numpy as np
 from scipy.optimize import nnls
 
 from skindb.bench.case import SCALES, close, expect, stress_cases
-from skindb.fit._surface_arrays import Tables, Weights, surface_weights
 from skindb.fit.surface import MIN_SAMPLES, NOISE_FLOOR_SURFACE
 from skindb.optics.angles import half_difference
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.reflectance.dictionary import embedded_dictionary
+from skindb.reflectance.mixture import Mixture
+from skindb.reflectance.model import Block, Comparison, SurfaceFit
 from skindb.reflectance.reduction import reduce_dictionary
-from skindb.reflectance.tables import TableGrid, lookup
+from skindb.reflectance.tables import lookup
 from skindb.schema import FitStatus
 from skindb.schema.status import LARGEST_R_D, SMALLEST_R_D
 from skindb.types import Array
@@ -48,14 +49,14 @@ def unit(v: Array) -> Array:
 
 def six() -> Array:
     """Tables (nh, nd, np, 6) without the padding that the kernels need."""
-    return six_tables().reduced[..., : len(CHOSEN)]
+    return six_tables().table[..., : len(CHOSEN)]
 
 
 @lru_cache(maxsize=1)
-def six_tables() -> Tables:
+def six_tables() -> Mixture:
     """Six of the embedded materials, not reduced."""
     dictionary = embedded_dictionary()
-    return Tables(dictionary.table[..., CHOSEN], dictionary.grid, np.eye(len(CHOSEN)))
+    return Mixture(dictionary.table[..., CHOSEN])
 
 
 @dataclass(frozen=True)
@@ -70,9 +71,9 @@ class Surfels:
     diffuse: Array
 
     @property
-    def arrays(self) -> tuple[Array, ...]:
-        """Arguments of `surface_weights`."""
-        return (
+    def block(self) -> Block:
+        """The surfels for the fit of a surface model."""
+        return Block(
             self.sample,
             self.position,
             self.light,
@@ -107,17 +108,12 @@ def surfels(
 
 
 def weights(
-    skin: Surfels, mode: str = "linear", tables: Tables | None = None, **options: Any
-) -> Weights:
-    """Fit of the six materials, or of `tables`, to the surfels."""
-    ask = {
-        "eta": ETA,
-        "noise_floor": NOISE_FLOOR_SURFACE,
-        "min_samples": MIN_SAMPLES,
-    } | options
-    return surface_weights(
-        *skin.arrays, tables=tables or six_tables(), mode=mode, **ask
-    )
+    skin: Surfels, mode: str = "linear", model: Mixture | None = None, **options: Any
+) -> SurfaceFit:
+    """Fit of the six materials, or of `model`, to the surfels."""
+    comparison = Comparison(mode, ETA, NOISE_FLOOR_SURFACE, MIN_SAMPLES)
+    comparison = comparison._replace(**options)
+    return (model or six_tables()).fit(skin.block, comparison)
 
 
 def spoiled(skin: Surfels, change: Callable[[Array], None]) -> Surfels:
@@ -183,7 +179,7 @@ def _recovers(mode: str) -> None:
     expect(fit.residual.max() < SINGLE, fit.residual)
     for s in range(3):
         M, _ = rows(skin, s)
-        close(M @ fit.weight[s], M @ WEIGHT, atol=SINGLE * np.abs(M @ WEIGHT).max())
+        close(M @ fit.parameters[s], M @ WEIGHT, atol=SINGLE * np.abs(M @ WEIGHT).max())
 
 
 def _few(lights: int, cameras: int) -> None:
@@ -195,14 +191,14 @@ def _few(lights: int, cameras: int) -> None:
     refused = weights(skin)
     expect(
         (refused.status == FitStatus.TOO_FEW_SAMPLES).all()
-        and np.isnan(refused.weight).all(),
+        and np.isnan(refused.parameters).all(),
         refused.status,
     )
     fit = weights(skin, min_samples=1)
     for s in range(3):
         M, target = rows(skin, s)
         theirs = nnls(np.repeat(M, 3, 0), target.ravel())[1]
-        ours = np.linalg.norm((M @ fit.weight[s])[:, None] - target)
+        ours = np.linalg.norm((M @ fit.parameters[s])[:, None] - target)
         expect(ours <= theirs + SINGLE * np.linalg.norm(target), (ours, theirs))
 
 
@@ -212,10 +208,10 @@ def _unseen_surfel(mode: str) -> None:
     unchanged = weights(skin, mode)
     expect(
         fit.status.tolist() == [FitStatus.UNSEEN, 0, 0]
-        and np.isnan(fit.weight[0]).all(),
+        and np.isnan(fit.parameters[0]).all(),
         fit.status,
     )
-    np.testing.assert_array_equal(fit.weight[1:], unchanged.weight[1:])
+    np.testing.assert_array_equal(fit.parameters[1:], unchanged.parameters[1:])
 
 
 def _infinite(bad: float) -> None:
@@ -223,10 +219,10 @@ def _infinite(bad: float) -> None:
     unchanged = weights(surfels())
     expect(
         fit.status.tolist() == [FitStatus.NOT_FINITE, 0, 0]
-        and np.isnan(fit.weight[0]).all(),
+        and np.isnan(fit.parameters[0]).all(),
         fit.status,
     )
-    np.testing.assert_array_equal(fit.weight[1:], unchanged.weight[1:])
+    np.testing.assert_array_equal(fit.parameters[1:], unchanged.parameters[1:])
 
 
 def _one_nan() -> None:
@@ -243,17 +239,17 @@ def _geometry_nan(field: str, status: FitStatus) -> None:
     fit = weights(replace(skin, **{field: spoiled}))
     unchanged = weights(skin)
     expect(
-        fit.status.tolist() == [status, 0, 0] and np.isnan(fit.weight[0]).all(),
+        fit.status.tolist() == [status, 0, 0] and np.isnan(fit.parameters[0]).all(),
         fit.status,
     )
-    np.testing.assert_array_equal(fit.weight[1:], unchanged.weight[1:])
+    np.testing.assert_array_equal(fit.parameters[1:], unchanged.parameters[1:])
 
 
 def _black_surfel(mode: str) -> None:
     fit = weights(spoiled(surfels(), filled(0.0)), mode)
     expect(
-        fit.status[0] == FitStatus.FITTED and (fit.weight[0] == 0).all(),
-        (fit.status[0], fit.weight[0]),
+        fit.status[0] == FitStatus.FITTED and (fit.parameters[0] == 0).all(),
+        (fit.status[0], fit.parameters[0]),
     )
 
 
@@ -261,8 +257,8 @@ def _matte(eta: float) -> None:
     skin = surfels(eta=eta, weight=0 * WEIGHT)
     fit = weights(skin, eta=eta)
     expect(
-        fit.residual.max() < TOTAL and np.abs(fit.weight).max() < SINGLE,
-        (fit.residual, fit.weight),
+        fit.residual.max() < TOTAL and np.abs(fit.parameters).max() < SINGLE,
+        (fit.residual, fit.parameters),
     )
 
 
@@ -272,7 +268,10 @@ def _albedo_bound(value: float) -> None:
     diffuse[0] = value
     fit = weights(replace(skin, diffuse=diffuse))
     expect(fit.status.tolist() == [FitStatus.DIFFUSE_CLAMPED, 0, 0], fit.status)
-    expect(np.isfinite(fit.weight).all() and (fit.weight >= 0).all(), fit.weight)
+    expect(
+        np.isfinite(fit.parameters).all() and (fit.parameters >= 0).all(),
+        fit.parameters,
+    )
 
 
 def _grazing_lights() -> None:
@@ -286,7 +285,7 @@ def _grazing_lights() -> None:
         light=np.concatenate([skin.light, low]),
         sample=np.concatenate([skin.sample, wild], axis=1),
     )
-    close(weights(extended).weight, weights(flat).weight, rtol=1e-9, atol=1e-12)
+    close(weights(extended).parameters, weights(flat).parameters, rtol=1e-9, atol=1e-12)
 
 
 def _behind() -> None:
@@ -297,7 +296,7 @@ def _behind() -> None:
     extended = replace(
         skin, light=behind, sample=np.concatenate([skin.sample, wild], axis=1)
     )
-    close(weights(extended).weight, weights(skin).weight, rtol=1e-9, atol=1e-12)
+    close(weights(extended).parameters, weights(skin).parameters, rtol=1e-9, atol=1e-12)
 
 
 def _precision(dtype: str) -> None:
@@ -310,31 +309,30 @@ def _precision(dtype: str) -> None:
     for s in range(3):
         M, _ = rows(skin, s)
         close(
-            M @ fit.weight[s],
-            M @ want.weight[s],
+            M @ fit.parameters[s],
+            M @ want.parameters[s],
             atol=1e-5 * np.abs(M @ WEIGHT).max(),
         )
 
 
 def _extra_tables(change: str) -> None:
-    tables = six_tables()
     extra = {"zero": 0 * six()[..., :1], "duplicate": six()[..., :1]}
     extra["collinear"] = six()[..., :1] + six()[..., 1:2]
     both = np.concatenate([extra[change], six(), extra[change]], axis=-1)
-    fit = weights(surfels(), tables=Tables(both, tables.grid, np.eye(8)))
+    fit = weights(surfels(), model=Mixture(both))
     expect(
         (fit.status == FitStatus.FITTED).all() and fit.kkt.max() < 1e-9,
         (fit.status, fit.kkt),
     )
     expect(fit.residual.max() < SINGLE, fit.residual)
     if change == "zero":
-        expect((fit.weight[:, [0, 7]] == 0).all(), fit.weight)
+        expect((fit.parameters[:, [0, 7]] == 0).all(), fit.parameters)
 
 
 def _rank_above() -> None:
     reduced, lift = reduce_dictionary(six(), 99)
-    fit = weights(surfels(), tables=Tables(reduced, six_tables().grid, lift))
-    close(fit.weight, weights(surfels()).weight, rtol=1e-12)
+    fit = weights(surfels(), model=Mixture(reduced, lift))
+    close(fit.parameters, weights(surfels()).parameters, rtol=1e-12)
 
 
 def _rank_of_one_material() -> None:
@@ -344,7 +342,7 @@ def _rank_of_one_material() -> None:
     tables = six()[..., :1] * np.geomspace(0.5, 4, 6, dtype=np.float32)
     reduced, lift = reduce_dictionary(np.ascontiguousarray(tables), 4)
     skin = surfels(weight=np.array([0.4, 0, 0, 0, 0, 0]))
-    fit = weights(skin, tables=Tables(reduced, six_tables().grid, lift))
+    fit = weights(skin, model=Mixture(reduced, lift))
     expect(
         (fit.status == FitStatus.FITTED).all() and fit.residual.max() < SINGLE,
         (fit.status, fit.residual),
@@ -353,39 +351,39 @@ def _rank_of_one_material() -> None:
 
 def _no_surfels() -> None:
     empty = without_surfels(surfels())
-    expect(weights(empty).weight.shape == (0, 6), weights(empty).weight.shape)
+    expect(weights(empty).parameters.shape == (0, 6), weights(empty).parameters.shape)
 
 
 # refit
 
 
-def _basis(*columns: Array) -> Tables:
+def _basis(*columns: Array) -> Mixture:
     table = np.stack([six() @ c.astype(np.float32) for c in columns], axis=-1)
-    return Tables(table, TableGrid(*table.shape[:3]), np.eye(len(columns)))
+    return Mixture(table)
 
 
 def _true_mixture(mode: str) -> None:
     fit = weights(surfels(), mode, _basis(WEIGHT))
-    close(fit.weight, 1.0, rtol=SINGLE)
+    close(fit.parameters, 1.0, rtol=SINGLE)
     expect(fit.residual.max() < SINGLE, fit.residual)
 
 
 def _twins(mode: str) -> None:
     fit = weights(surfels(), mode, _basis(WEIGHT, WEIGHT, 0 * WEIGHT))
-    close(fit.weight[:, :2].sum(axis=1), 1.0, rtol=SINGLE)
+    close(fit.parameters[:, :2].sum(axis=1), 1.0, rtol=SINGLE)
     expect(
-        (fit.weight[:, 2] == 0).all() and (fit.status == 0).all(),
-        (fit.weight, fit.status),
+        (fit.parameters[:, 2] == 0).all() and (fit.status == 0).all(),
+        (fit.parameters, fit.status),
     )
 
 
 def _scaled_basis(scale: float) -> None:
-    fit = weights(surfels(), tables=_basis(WEIGHT * scale))
-    close(fit.weight * scale, 1.0, rtol=SINGLE)
+    fit = weights(surfels(), model=_basis(WEIGHT * scale))
+    close(fit.parameters * scale, 1.0, rtol=SINGLE)
 
 
 def _refit_nothing() -> None:
-    fit = weights(spoiled(surfels(), filled(np.nan)), tables=_basis(WEIGHT))
+    fit = weights(spoiled(surfels(), filled(np.nan)), model=_basis(WEIGHT))
     expect(
         fit.status.tolist() == [FitStatus.UNSEEN, 0, 0] and np.isnan(fit.residual[0]),
         fit.status,

@@ -7,7 +7,7 @@ from __future__ import annotations
 import base64
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import imagecodecs
@@ -23,7 +23,6 @@ from skindb.render.environment import LUMINANCE, Environment
 from skindb.render.image import tone_map
 from skindb.render.monte_carlo import Lighting
 from skindb.render.picture import chosen_camera, chosen_lights
-from skindb.render.plan import without_unused_bases
 from skindb.render.rendering import fixed_exposure, render
 from skindb.render.scene import Surface, from_model
 from skindb.render.texels import surfel_confidence
@@ -215,13 +214,14 @@ def face_record(
     """
     honour_consent(model.attrs, "export")
     surface = _surface(model, edited=bool(traits))[0]
-    if (count := surface.tables.shape[-1]) > MAX_BASES:
+    resampled, weights = surface.model.resample(surface.parameters)
+    if (count := weights.shape[1]) > MAX_BASES:
         rule = f"the viewer needs at most {MAX_BASES} bases"
         cure = f"fit again with --k {MAX_BASES} or less"
         raise InputError(Fault(take, rule, str(count), cure))
-    values = _values(surface)
+    values = _values(surface, weights)
     uv = model["fitted"].to_dataset()[variables.SURFEL_UV].values.astype(np.float32)
-    tables = _tables(surface.tables)
+    tables = _tables(resampled)
     arrays: dict[str, NDArray[Any]] = {
         "position": surface.vertices.astype(np.float32),
         "triangles": np.asarray(surface.faces, np.uint32),
@@ -234,7 +234,7 @@ def face_record(
         **({"tableB": tables[1]} if len(tables) > 1 else {}),
     }
     return {
-        "about": _about(model, surface, take, attributes)
+        "about": _about(model, surface, take, attributes, resampled.shape)
         | {"surroundings": _surroundings(model, environment)},
         "arrays": {name: _encode(value) for name, value in arrays.items()},
         "traits": [_trait(trait, values) for trait in traits],
@@ -262,7 +262,10 @@ def _surface(
 ) -> tuple[Surface, tuple[Omission, ...]]:
     """The surface of the page, without unused bases unless it is edited, and what was omitted."""
     surface = from_model(model, fill=True)
-    return (surface, ()) if edited else without_unused_bases(surface)
+    if edited:
+        return surface, ()
+    fewer, parameters, omissions = surface.model.simplified(surface.parameters)
+    return replace(surface, model=fewer, parameters=parameters), omissions
 
 
 def still_picture(model: xr.DataTree) -> str:
@@ -309,12 +312,12 @@ def uv_spacing(vertices: Float, faces: NDArray[np.integer[Any]], uv: Float) -> F
     return np.asarray(np.sqrt(np.clip(square, 1e-6, 1e12)))
 
 
-def _values(surface: Surface) -> dict[str, Float]:
+def _values(surface: Surface, mixed: Float) -> dict[str, Float]:
     """Values that traits change: albedo (n, 3), weights (n, 4) twice, diffusion length
     (n, 3) [mm].
     """
     weights = np.zeros((len(surface.vertices), MAX_BASES))
-    weights[:, : surface.weights.shape[1]] = surface.weights
+    weights[:, : mixed.shape[1]] = mixed
     diffusion = np.zeros((len(surface.vertices), 3))
     if surface.sigma_tr is not None:
         diffusion = np.nan_to_num(
@@ -332,8 +335,10 @@ def _trait(trait: Trait, plain: Mapping[str, Float]) -> dict[str, Any]:
     """Change of the arrays by a trait: differences of weights, log ratios of albedo and
     diffusion length.
     """
+    edited = (from_model(tree, fill=True) for tree in (trait.whole, trait.half))
     whole, half = (
-        _values(from_model(tree, fill=True)) for tree in (trait.whole, trait.half)
+        _values(surface, surface.model.resample(surface.parameters)[1])
+        for surface in edited
     )
     ratio = {
         name: np.log(
@@ -388,7 +393,11 @@ def _quality(model: xr.DataTree, surface: Surface) -> Float:
 
 
 def _about(
-    model: xr.DataTree, surface: Surface, take: str, attributes: Mapping[str, Any]
+    model: xr.DataTree,
+    surface: Surface,
+    take: str,
+    attributes: Mapping[str, Any],
+    shape: tuple[int, ...],
 ) -> dict[str, Any]:
     dome = model["dome"].to_dataset().load()
     corners = surface.vertices[np.unique(surface.faces)]
@@ -416,11 +425,7 @@ def _about(
         "diffusionWidth": [
             float(np.median(diffusion_width(s[:, c], surface.eta))) for c in range(3)
         ],
-        "tableShape": [
-            surface.tables.shape[2],
-            surface.tables.shape[0],
-            surface.tables.shape[1],
-        ],
+        "tableShape": [shape[2], shape[0], shape[1]],
         "attributes": {"take": take}
         | {str(name): str(value) for name, value in attributes.items()},
     }
