@@ -16,11 +16,21 @@ from skindb.bench.curve import Curve, Point, cpu_time
 from skindb.errors import Fault, InputError
 from skindb.fit.probe_profile import MODELS, ProbeFit, fit_profile
 from skindb.optics import transport
-from skindb.optics._moments import half_space_profile, moments
-from skindb.optics.diffuse import S_MAX, diffuse_reflectance, dipole_s, reduced_albedo
-from skindb.optics.dipole import sigma_tr
+from skindb.optics.diffusion import (
+    S_MAX,
+    diffuse_reflectance,
+    dipole_s,
+    reduced_albedo,
+    sigma_tr,
+)
 from skindb.optics.fresnel import boundary_factor
-from skindb.optics.random_walk import Walk, radial_profile, random_walk
+from skindb.optics.transport import (
+    Walk,
+    half_space_profile,
+    moment_basis,
+    radial_profile,
+    random_walk,
+)
 from skindb.schema import ProbeStatus
 from skindb.types import Array
 
@@ -48,7 +58,10 @@ MEDIUM = (0.17, 2.3)
 def _walk(quick: bool) -> Walk:
     rng = np.random.default_rng(0)
     return random_walk(
-        40_000 if quick else 200_000, eta=ETA, longest=60.0 if quick else 240.0, rng=rng
+        40_000 if quick else 200_000,
+        eta=ETA,
+        max_path=60.0 if quick else 240.0,
+        rng=rng,
     )
 
 
@@ -188,7 +201,7 @@ def transport_curves(quick: bool) -> list[Curve]:
                 )
             )
         for degree in (3, 7, 11) if quick else (3, 5, 7, 9, 11, 13):
-            basis = moments(degree, eta=ETA, anisotropy=transport.ANISOTROPY)
+            basis = moment_basis(degree, eta=ETA, anisotropy=transport.ANISOTROPY)
             took, (level, kappa) = cpu_time(
                 lambda a=ratio, b=basis: half_space_profile(r, a, b),  # type: ignore[misc]
                 1000,

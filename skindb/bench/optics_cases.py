@@ -6,14 +6,15 @@ import numpy as np
 from scipy.integrate import quad
 
 from skindb.bench.case import SCALES, close, combinations, expect, stress_cases
-from skindb.optics.diffuse import (
+from skindb.optics.diffusion import (
     S_MAX,
     diffuse_reflectance,
+    dipole_profile,
     dipole_s,
     reduced_albedo,
     scattering_coefficients,
+    sigma_tr,
 )
-from skindb.optics.dipole import dipole_profile, sigma_tr
 from skindb.optics.dipole_tree import subsurface_exitance
 from skindb.optics.fresnel import fresnel_reflectance, internal_diffuse_reflectance
 from skindb.optics.transport import transport_profile

@@ -23,7 +23,7 @@ from skindb.demo.pictures import (
 )
 from skindb.demo.tables import Results
 from skindb.files import private_file
-from skindb.render.compare import compare_images
+from skindb.render.photographs import compare_images
 from skindb.schema import FitStatus, variables
 from skindb.types import Progress
 

@@ -17,13 +17,12 @@ from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
 from skindb.geometry.mesh import vertex_areas
-from skindb.optics.diffuse import S_FLOOR
+from skindb.optics.diffusion import S_FLOOR
 from skindb.optics.fresnel import boundary_factor
 from skindb.render.environment import LUMINANCE, Environment
 from skindb.render.image import tone_map
 from skindb.render.monte_carlo import Lighting
-from skindb.render.picture import chosen_camera, chosen_lights
-from skindb.render.rendering import fixed_exposure, render
+from skindb.render.rendering import chosen_camera, chosen_lights, fixed_exposure, render
 from skindb.render.scene import Surface, from_model
 from skindb.render.texels import surfel_confidence
 from skindb.schema import variables

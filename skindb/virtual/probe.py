@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from skindb.cache import cached_arrays
 from skindb.files import private_file
-from skindb.optics.random_walk import Walk, radial_profile, random_walk
+from skindb.optics.transport import Walk, radial_profile, random_walk
 from skindb.virtual.frames import Sensor, write_png
 from skindb.virtual.skin import Site
 
@@ -43,7 +43,7 @@ PACKETS = 160_000
 WALK_SEED = 20050701
 SOURCES = (
     "skindb.optics._walk_kernels",
-    "skindb.optics.random_walk",
+    "skindb.optics.transport",
     "skindb.virtual.probe",
 )
 # expected change of slope of log(r^2 R) from fibre to fibre, per mm of spacing over r
@@ -76,7 +76,7 @@ def shared_walk(eta: float, packets: int = PACKETS) -> Walk:
         arrays[name] for name in ("radius", "path", "weight", "batch")
     )
     return Walk(
-        radius, path, weight, batch, int(arrays["packets"]), float(arrays["longest"])
+        radius, path, weight, batch, int(arrays["packets"]), float(arrays["max_path"])
     )
 
 

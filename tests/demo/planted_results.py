@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import xarray as xr
-from skindb.render.causes import Causes
 from small_face import SIDE, small_face
 
 from skindb.demo.tables import Results
-from skindb.render.photographs import Comparison
+from skindb.render.photographs import Causes, Comparison
 from skindb.schema import FitStatus, label
 from skindb.virtual.truth import Recovery
 

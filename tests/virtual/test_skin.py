@@ -2,8 +2,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from skindb.optics.diffuse import diffuse_reflectance, reduced_albedo
 
+from skindb.optics.diffusion import diffuse_reflectance, reduced_albedo
 from skindb.virtual.face import FaceShape
 from skindb.virtual.head import parametric_head
 from skindb.virtual.person import ANCESTRIES, CONDITIONS, Person
