@@ -96,6 +96,8 @@ class FitParameters:
         Number of components of the reduced basis; fewer if fewer surfels are fitted.
     profile
         Model of the probe's profiles, see `fit_probe`.
+    surface
+        Surface model: a mixture of the BRDFs of a dictionary, or one GGX lobe.
     mode, rank
         Mode and rank of the fit by the dictionary, see `fit_surface`. After "paper" the
         refit uses "perceptual".
@@ -124,6 +126,9 @@ class FitParameters:
     k: int = option(4, "Number of basis BRDFs.", minimum=1)
     profile: Literal["transport", "dipole"] = option(
         "transport", "Model of the probe profiles; dipole is that of the paper."
+    )
+    surface: Literal["mixture", "ggx"] = option(
+        "mixture", "Surface model: mixture of measured BRDFs, or one GGX lobe."
     )
     mode: FullMode = option(
         "perceptual",

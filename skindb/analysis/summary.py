@@ -202,6 +202,10 @@ def _basis_tables(model: xr.DataTree, fitted: xr.Dataset) -> xr.Dataset:
     basis = model["basis"].to_dataset()
     names = ("basis_mixture", "mean_dictionary_weight", "disc_angular_radius")
     tables = basis[[name for name in names if name in basis]].load()
+    eta = fitted[["refractive_index"]] if "refractive_index" in fitted else xr.Dataset()
+    eta = eta.reset_coords(drop=True)
+    if "basis_weight" not in fitted:
+        return xr.merge([tables, eta])
     good = np.isfinite(fitted["basis_weight"].values).all(axis=1) & (
         fitted["fit_status"].values == FitStatus.FITTED
     )
@@ -219,9 +223,8 @@ def _basis_tables(model: xr.DataTree, fitted: xr.Dataset) -> xr.Dataset:
     )
     # a cohort needs the labels of the dictionary even if the model stores no mixtures
     own = dataset({"mean_basis_weight": mean}, coords=coords)
-    eta = fitted[["refractive_index"]] if "refractive_index" in fitted else xr.Dataset()
     return xr.merge(
-        [tables, own, eta.reset_coords(drop=True)],
+        [tables, own, eta],
         combine_attrs="override",
         join="outer",
     )

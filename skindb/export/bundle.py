@@ -32,6 +32,7 @@ from skindb.export.scenes import (
 from skindb.export.textures import Skin, skin_of
 from skindb.files import make_private, private_file
 from skindb.reflectance.dictionary import Dictionary
+from skindb.reflectance.kinds import as_mixture
 from skindb.reflectance.merl import write_merl
 from skindb.reflectance.table_file import write_tables
 from skindb.reflectance.tables import TableGrid, kernel_tables, lookup
@@ -129,6 +130,7 @@ def export_bundle(
         Path of the manifest.
     """
     require_consent(model.attrs, "export")
+    model = as_mixture(model)
     target = Path(out).absolute()  # absolute, as "." has no name
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         found = "files in it" if target.is_dir() else "a file"

@@ -13,6 +13,7 @@ from scipy import ndimage
 from skindb.export.inputs import chosen_size, required
 from skindb.export.translucency import mean_free_path
 from skindb.geometry.texture import atlas_values, push_pull, rasterise_atlas
+from skindb.reflectance.kinds import as_mixture
 from skindb.render.texels import surfel_confidence, surfel_texels, texel_codes
 from skindb.schema import VARIABLES, TexelStatus
 
@@ -104,6 +105,7 @@ def texture_maps(
         - if the model has them, `albedo_error`, `normal_error` [degree] (both include
           the error of the model), `surface_reflectance` and `surface_reflectance_error`
     """
+    model = as_mixture(model)
     fitted = required(model)
     trust = surfel_confidence(fitted)
     uv = fitted["surfel_uv"].values

@@ -17,6 +17,7 @@ from skindb.export.inputs import chosen_size, required
 from skindb.export.maps import atlas_images, tangent_frames, to_tangent_space
 from skindb.export.pbr import Material, approximation_error, fit_material
 from skindb.export.translucency import thickness, transmitted_fraction
+from skindb.reflectance.kinds import as_mixture
 from skindb.reflectance.tables import kernel_tables
 from skindb.render.image import encode_srgb
 from skindb.render.texels import surfel_confidence
@@ -79,6 +80,7 @@ def skin_of(model: xr.DataTree, *, size: int | None = None) -> Skin:
     InputError
         If no surfel was fitted.
     """
+    model = as_mixture(model)
     fitted = required(model)
     eta = float(fitted["refractive_index"])
     mesh = model["mesh"].to_dataset()

@@ -217,7 +217,7 @@ def second_pass(
             mode=mode,
             eta=parameters.eta,
         )
-    groups = _groups(capture, fitted.merge(judged), basis) | {
+    groups = _groups(capture, fitted.assign(judged), basis) | {
         "held_out": held_out,
         "outliers": outliers,
     }
@@ -262,7 +262,8 @@ def _require_match(
     if any(first.attrs.get(name) != about[name] for name in about):
         rule = "both passes need the same dictionary"
         cure = "give that of the first pass, or repeat it"
-        raise InputError(Fault("dictionary", rule, about["dictionary"], cure))
+        source = str(next(iter(about.values())))
+        raise InputError(Fault("dictionary", rule, source, cure))
     surfels = first["fitted"].sizes["surfel"]
     if surfels != whole.sizes["surfel"]:
         rule = "both passes need the same capture"

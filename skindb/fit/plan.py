@@ -127,9 +127,11 @@ def surface_of(
         If the model cannot have as many components as asked for.
     """
     return unfitted_model(
+        parameters.surface,
         dictionary,
         disc_angle(lumitexels),
         rank=parameters.rank,
         mode=parameters.mode,
         k=parameters.k,
+        eta=parameters.eta,
     )

@@ -437,7 +437,8 @@ def find_obstructed(fitted: xr.Dataset) -> NDArray[np.bool_]:
     good = fitted["fit_status"].values == FitStatus.FITTED
     if not good.any():
         return np.asarray(good)
-    residual = fitted["dictionary_residual"].values
+    name = "dictionary_residual" if "dictionary_residual" in fitted else "fit_residual"
+    residual = fitted[name].values
     brightness = fitted["diffuse_reflectance"].values.mean(axis=1)
     limit = max(TIMES_MEDIAN_RESIDUAL * float(np.median(residual[good])), MIN_RESIDUAL)
     dark = brightness < MAX_RELATIVE_R_D * float(np.median(brightness[good]))

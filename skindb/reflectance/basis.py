@@ -9,6 +9,7 @@ non-negative, by non-negative least squares on the normal equations of the surfe
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from itertools import pairwise
 from typing import Any
@@ -67,7 +68,7 @@ def reduce_basis(
         and spread of the factorisation over its seeds, surfels used, metric.
     """
     check(fitted, ("dictionary_weight", "fit_status", "surfel_area"), where="fitted")
-    good = _fitted_surfels(fitted)
+    good = fitted_surfels(fitted, ("dictionary_weight",))
     weight = fitted["dictionary_weight"].values
     area = np.maximum(fitted["surfel_area"].values.astype(np.float64), 0) + 1e-12
     most = min(len(good), weight.shape[1])
@@ -118,11 +119,18 @@ def reduce_basis(
     )
 
 
-def _fitted_surfels(fitted: xr.Dataset) -> NDArray[np.int64]:
-    """Indices of the surfels whose every stage was fitted."""
-    good = (fitted["fit_status"].values == FitStatus.FITTED) & np.isfinite(
-        fitted["dictionary_weight"].values
-    ).all(1)
+def fitted_surfels(fitted: xr.Dataset, names: Sequence[str]) -> NDArray[np.int64]:
+    """Indices of the surfels whose every stage was fitted, with finite variables `names`.
+
+    Raises
+    ------
+    InputError
+        If there are none.
+    """
+    good = fitted["fit_status"].values == FitStatus.FITTED
+    for name in names:
+        values = fitted[name].values.reshape(len(good), -1)
+        good = good & np.isfinite(values).all(axis=1)
     if not good.any():
         status, count = np.unique(fitted["fit_status"].values, return_counts=True)
         counts_by_status = ", ".join(

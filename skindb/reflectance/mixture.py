@@ -56,6 +56,7 @@ FIT_VARIABLES = (  # in the order of `SurfaceFit`
     "fit_iterations",
     "fit_status",
 )
+NO_TABLE = np.zeros((2, 2, 1, 0), np.float32)
 MAX_LOG_SCALE = np.log(1e9)  # tables within this factor of 1 are used without scaling
 
 
@@ -200,8 +201,8 @@ class Mixture:
         the error of models have less weight.
         """
         out = self._empty(len(block.sample), parameters)
-        options = _options(comparison, solve=parameters is None)
-        fit_block(_prepared(block), self.filled, self.matrix, options, out)
+        options = kernel_options(comparison, solve=parameters is None)
+        fit_block(kernel_block(block), self.filled, self.matrix, options, out)
         out.weight[...] /= self.scale
         return SurfaceFit(*out)
 
@@ -228,34 +229,12 @@ class Mixture:
         """Weights of n surfels with their errors, held-out samples and outliers; not in
         mode "paper", and only for tables that are not reduced.
         """
-        n, lights, cameras = block.sample.shape[:3]
-        m = self.matrix.shape[1]
-        out = self._empty(n, parameters)
-        with_errors = judgement.diffuse_error is not None
-        size = m if with_errors else 0
-        turn = np.zeros(n)
-        if judgement.normal_error is not None:
-            angle = np.nan_to_num(np.float64(judgement.normal_error))
-            turn = np.radians(angle / np.sqrt(2))
-        diffuse_error = np.zeros((n, 3))
-        if judgement.diffuse_error is not None:
-            diffuse_error = np.nan_to_num(judgement.diffuse_error.astype(np.float64))
-        held = judgement.held
-        errors = Errors(
-            diffuse_error=diffuse_error,
-            turn=turn,
-            covariance=np.full((n, size, size), np.nan),
-            held=np.zeros((lights, cameras), np.int64) if held is None else held,
-            held_error=np.full((n, 2, 2), np.nan),
-            outlier=np.full(n, np.nan),
-            counts=np.zeros(
-                (lights, cameras, BINS if judgement.outliers else 0), np.int64
-            ),
-        )
-        options = _options(comparison, solve=parameters is None)
-        judge_block(_prepared(block), self.filled, self.matrix, options, out, errors)
+        out = self._empty(len(block.sample), parameters)
+        errors = empty_errors(block, judgement, self.matrix.shape[1])
+        options = kernel_options(comparison, solve=parameters is None)
+        judge_block(kernel_block(block), self.filled, self.matrix, options, out, errors)
         out.weight[...] /= self.scale
-        if with_errors:
+        if judgement.diffuse_error is not None:
             errors.covariance[...] /= np.multiply.outer(self.scale, self.scale)
         return JudgedFit(
             out.weight,
@@ -295,24 +274,7 @@ class Mixture:
         (Weyrich et al. 2005).
         """
         with_surface = points.parameters.shape[1] > 0
-        table = self.table if with_surface else self.table[..., :0]
-        out = np.empty((len(points.position), 3), np.float32)
-        _shade_kernels.shade(
-            np.ascontiguousarray(points.position, np.float64),
-            np.ascontiguousarray(points.normal, np.float64),
-            np.ascontiguousarray(points.view, np.float64),
-            np.ascontiguousarray(points.diffuse, np.float32),
-            np.ascontiguousarray(points.parameters, np.float32),
-            np.ascontiguousarray(table, np.float32),
-            np.ascontiguousarray(lamp.place, np.float64),
-            np.ascontiguousarray(lamp.lit, np.float32),
-            np.ascontiguousarray(lamp.axis, np.float64),
-            float(lamp.falloff),
-            float(eta),
-            with_surface,
-            out,
-        )
-        return out
+        return _shade(points, self.table if with_surface else NO_TABLE, lamp, eta)
 
     def normal_reflectance(self, parameters: Array) -> Array:
         """Fraction (n,) of light along the normal that mixtures (n, m) reflect."""
@@ -358,7 +320,58 @@ class Mixture:
         )
 
 
-def _options(comparison: Comparison, *, solve: bool) -> Options:
+def diffuse_points(points: Points, lamp: Lamp, *, eta: float) -> NDArray[np.float32]:
+    """Radiance (n, 3) of the diffuse term alone, see `ReflectanceModel.shade`."""
+    none = np.zeros((len(points.position), 0))
+    return _shade(points._replace(parameters=none), NO_TABLE, lamp, eta)
+
+
+def _shade(points: Points, table: Table, lamp: Lamp, eta: float) -> NDArray[np.float32]:
+    out = np.empty((len(points.position), 3), np.float32)
+    _shade_kernels.shade(
+        np.ascontiguousarray(points.position, np.float64),
+        np.ascontiguousarray(points.normal, np.float64),
+        np.ascontiguousarray(points.view, np.float64),
+        np.ascontiguousarray(points.diffuse, np.float32),
+        np.ascontiguousarray(points.parameters, np.float32),
+        np.ascontiguousarray(table, np.float32),
+        np.ascontiguousarray(lamp.place, np.float64),
+        np.ascontiguousarray(lamp.lit, np.float32),
+        np.ascontiguousarray(lamp.axis, np.float64),
+        float(lamp.falloff),
+        float(eta),
+        points.parameters.shape[1] > 0,
+        out,
+    )
+    return out
+
+
+def empty_errors(block: Block, judgement: Judgement, parameters: int) -> Errors:
+    """Inputs of a judgement for the kernels, and space for its results."""
+    n, lights, cameras = block.sample.shape[:3]
+    diffuse_error = np.zeros((n, 3))
+    if judgement.diffuse_error is not None:
+        diffuse_error = np.nan_to_num(judgement.diffuse_error.astype(np.float64))
+    turn = np.zeros(n)
+    if judgement.normal_error is not None:  # the RMS angle is that of two axes
+        angle = np.nan_to_num(np.float64(judgement.normal_error))
+        turn = np.radians(angle / np.sqrt(2))
+    size = 0 if judgement.diffuse_error is None else parameters
+    bins = BINS if judgement.outliers else 0
+    held = judgement.held
+    return Errors(
+        diffuse_error=diffuse_error,
+        turn=turn,
+        covariance=np.full((n, size, size), np.nan),
+        held=np.zeros((lights, cameras), np.int64) if held is None else held,
+        held_error=np.full((n, 2, 2), np.nan),
+        outlier=np.full(n, np.nan),
+        counts=np.zeros((lights, cameras, bins), np.int64),
+    )
+
+
+def kernel_options(comparison: Comparison, *, solve: bool) -> Options:
+    """A comparison for the kernels; without `solve` given parameters are only evaluated."""
     return Options(
         float(comparison.eta),
         MODES.index(comparison.mode),
@@ -368,7 +381,7 @@ def _options(comparison: Comparison, *, solve: bool) -> Options:
     )
 
 
-def _prepared(block: Block) -> Block:
+def kernel_block(block: Block) -> Block:
     """The block in the types for which the kernels are compiled."""
     doubles: dict[str, Any] = {
         name: np.ascontiguousarray(getattr(block, name), np.float64)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from skindb.errors import Fault, InputError
+from skindb.reflectance.kinds import parameter_variables
 from skindb.schema import FitStatus, TexelStatus
 from skindb.schema.status import MAX_CONDITION_TRUSTED, MIN_SAMPLES_TRUSTED
 
@@ -42,8 +43,10 @@ def surfel_texels(fitted: xr.Dataset) -> Codes:
                 else values > MAX_CONDITION_TRUSTED
             )
             code[wrong & (code < TexelStatus.FILLED)] = doubt
-    for name in ("shading_normal", "diffuse_reflectance", "basis_weight"):
-        code[~np.isfinite(fitted[name].values).all(axis=1)] = TexelStatus.FILLED
+    needed = ("shading_normal", "diffuse_reflectance", *parameter_variables(fitted))
+    for name in needed:
+        finite = np.isfinite(fitted[name].values.reshape(len(code), -1)).all(axis=1)
+        code[~finite] = TexelStatus.FILLED
     return code
 
 

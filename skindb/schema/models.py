@@ -87,6 +87,28 @@ BASIS_WEIGHT_ERROR = declare(
     "NaN at the bound 0",
     uses=Use.SAMPLED,
 )
+LOBE_STRENGTH = declare(
+    "float32 fitted/lobe_strength(surfel) [1]",
+    "factor on the GGX lobe of a surfel, which reflects by the Fresnel equations at 1",
+    uses=Use.SAMPLED | Use.SURVIVES_EDIT,
+)
+LOBE_ROUGHNESS = declare(
+    "float32 fitted/lobe_roughness(surfel) [1]",
+    "width alpha of the GGX lobe, which includes that of the lights",
+    "Walter et al. 2007",
+    Use.SAMPLED | Use.SURVIVES_EDIT,
+)
+LOBE_STRENGTH_ERROR = declare(
+    "float32 fitted/lobe_strength_error(surfel) [1]",
+    "standard error of lobe_strength: noise of the samples, errors of R_d and normal; "
+    "NaN without a lobe",
+    uses=Use.SAMPLED,
+)
+LOBE_ROUGHNESS_ERROR = declare(
+    "float32 fitted/lobe_roughness_error(surfel) [1]",
+    "standard error of lobe_roughness, from the same sources",
+    uses=Use.SAMPLED,
+)
 SURFACE_REFLECTANCE = declare(
     "float32 fitted/surface_reflectance(surfel) [1]",
     "fraction of light along the normal that the surface reflects, by the reduced basis",
@@ -245,6 +267,11 @@ BASIS_BRDF = declare(
 MEAN_DICTIONARY_WEIGHT = declare(
     "float32 basis/mean_dictionary_weight(dictionary) [1]",
     "area-weighted mean of dictionary_weight over fitted surfels",
+)
+LOBE_INDEX = declare(
+    "float64 basis/lobe_index() [1]",
+    "refractive index of the Fresnel term of the GGX lobes, which models with it have "
+    "instead of tables",
 )
 DISC_ANGULAR_RADIUS = declare(
     "float64 basis/disc_angular_radius() [rad]",

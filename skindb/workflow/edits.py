@@ -16,6 +16,7 @@ from skindb.analysis.population_basis import population_basis
 from skindb.analysis.summary import SAMPLED
 from skindb.errors import Fault, InputError
 from skindb.reflectance.dictionary import embedded_dictionary
+from skindb.reflectance.kinds import require_mixture
 from skindb.render.figures import write_grid
 from skindb.render.rendering import frontal_camera, radiance_of
 from skindb.schema.consent import require_consent
@@ -208,6 +209,7 @@ def basis_grid(
     """
     model = db.read("model", take)
     require_consent({**model.attrs, "take": take}, "export")
+    require_mixture(model["fitted"].to_dataset(), f"model of {take}")
     names = [str(name) for name in model["fitted"].to_dataset()["dictionary"].values]
     tables = study_inputs.dictionary_tables(
         names, float(model["basis/disc_angular_radius"]), dictionary
@@ -271,6 +273,7 @@ def editable_model(
     vectors = db.read(STUDY, study)
     require_consent({**model.attrs, "take": take}, "statistics")
     require_fresh(db, STUDY, study)
+    require_mixture(model["fitted"].to_dataset(), f"model of {take}")
     brdfs = [str(name) for name in model["fitted"].to_dataset()["dictionary"].values]
     used = db.record(STUDY, study, vectors.attrs["generation"])
     inputs = [db.record("model", take, model.attrs["generation"]), used]

@@ -17,6 +17,7 @@ from skindb.analysis.study import Population, Study
 from skindb.analysis.texture import common_landmarks
 from skindb.errors import Fault, InputError
 from skindb.reflectance.dictionary import convolve_disc, embedded_dictionary
+from skindb.reflectance.kinds import require_mixture
 from skindb.reflectance.table_file import read_dictionary
 from skindb.schema.cohort import require_same_fit
 from skindb.schema.notes import Note, note, unique_notes
@@ -161,6 +162,7 @@ def _brdf_tables(
     take = str(cohort["take"].values[0])
     opened = open_models("tables", takes=[take], variables=["disc_angular_radius"])
     disc = float(opened["disc_angular_radius"][0])
+    require_mixture(cohort.coords, "cohort")
     names = [str(name) for name in cohort["dictionary"].values]
     tables: Delayed = delayed(dictionary_tables, pure=False)(
         names, disc, dictionary

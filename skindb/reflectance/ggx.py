@@ -1,0 +1,334 @@
+"""One analytic GGX lobe per surfel as a surface model (Walter et al. 2007, Heitz 2014).
+
+f_s = w F(theta_d) D(theta_h; alpha) G / (4 cos theta_i cos theta_o)
+
+F is the exact Fresnel reflectance at the refractive index of the fit, D the GGX
+distribution and G the height-correlated masking of Smith. The strength w and the
+roughness alpha are those of a surfel, as in fits of Torrance and Sparrow's model to faces
+(Weyrich et al. 2006). The width includes that of the dome's lights.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from skindb.optics.fresnel import fresnel_reflectance
+from skindb.reflectance import _ggx_kernels
+from skindb.reflectance._ggx_kernels import (
+    MAX_ROUGHNESS,
+    MIN_ROUGHNESS,
+    ROUGHNESS,
+    STRENGTH,
+)
+from skindb.reflectance.basis import fitted_surfels
+from skindb.reflectance.mixture import (
+    diffuse_points,
+    empty_errors,
+    kernel_block,
+    kernel_options,
+)
+from skindb.reflectance.model import (
+    Block,
+    Comparison,
+    JudgedFit,
+    Judgement,
+    Lamp,
+    Points,
+    SurfaceFit,
+)
+from skindb.reflectance.sampling import COSINE_FRACTION, MIN_COSINE_HALF, tangents
+from skindb.reflectance.tables import Table, tabulate
+from skindb.schema import check, dataset
+from skindb.schema.omission import Omission
+from skindb.types import Array
+
+PARAMETERS = ("lobe_strength", "lobe_roughness")
+FIT_VARIABLES = (
+    *PARAMETERS,
+    "kkt_residual",
+    "fit_residual",
+    "fit_residual_perceptual",
+    "fit_condition",
+    "fit_samples",
+    "fit_iterations",
+    "fit_status",
+)
+MIN_COSINE_LOBE = (
+    1e-3  # below it values continue, as tables have nodes below the horizon
+)
+ALBEDO_NODES = 24  # roughnesses at which the reflectance of a lobe is integrated
+# tables that stand for all lobes of a take, between which weights are interpolated; with a
+# ratio of 1.3 between neighbours, values differ by up to 2 % of the peak
+TABLES = 8
+# of the roughnesses of a take, between which tables are placed
+TABLE_QUANTILES = (0.01, 0.99)
+
+
+def evaluate_lobe(wi: Array, wo: Array, alpha: Array | float, index: float) -> Array:
+    """BRDF (...) [sr^-1] of lobes of strength 1, for unit directions (..., 3) in the local
+    frame; cosines are clamped to `MIN_COSINE_LOBE`.
+    """
+    light = np.maximum(wi[..., 2], MIN_COSINE_LOBE)
+    camera = np.maximum(wo[..., 2], MIN_COSINE_LOBE)
+    half = wi + wo
+    half = half / np.maximum(np.linalg.norm(half, axis=-1, keepdims=True), 1e-12)
+    square = np.asarray(alpha) ** 2
+    spread = square / (np.pi * (half[..., 2] ** 2 * (square - 1) + 1) ** 2)
+    shadow = camera * np.sqrt(square + (1 - square) * light**2)
+    shadow = shadow + light * np.sqrt(square + (1 - square) * camera**2)
+    cos_d = np.clip((half * wi).sum(axis=-1), 0.0, 1.0)
+    return np.asarray(fresnel_reflectance(cos_d, index) * spread / (2 * shadow))
+
+
+@lru_cache(maxsize=4)
+def _normal_albedo(index: float) -> tuple[Array, Array]:
+    """Roughnesses, and the fraction of light along the normal that their lobes reflect."""
+    alpha = np.geomspace(MIN_ROUGHNESS, MAX_ROUGHNESS, ALBEDO_NODES)
+    theta, weight = np.polynomial.legendre.leggauss(400)
+    theta = (theta + 1) * np.pi / 4
+    wi = np.stack([np.sin(theta), 0 * theta, np.cos(theta)], axis=-1)
+    wo = np.broadcast_to([0.0, 0.0, 1.0], wi.shape)
+    value = evaluate_lobe(wi, wo, alpha[:, None], index)
+    ring = weight * np.pi / 4 * 2 * np.pi * np.sin(theta) * np.cos(theta)
+    return alpha, value @ ring
+
+
+@dataclass(frozen=True)
+class GGX:
+    """GGX lobes with a common refractive index of their Fresnel term."""
+
+    index: float = 1.3
+    disc_angular_radius: float = 0.0  # rad, of the lights whose width the lobes include
+
+    @classmethod
+    def of_basis(cls, basis: xr.Dataset) -> GGX:
+        """The model in the group "basis"."""
+        check(basis, ("lobe_index", "disc_angular_radius"), where="basis")
+        return cls(float(basis["lobe_index"]), float(basis["disc_angular_radius"]))
+
+    @property
+    def disc_included(self) -> bool:
+        """Whether the lobes are those of the dome's lights: true, as they are fitted so."""
+        return True
+
+    @property
+    def parameter_variables(self) -> tuple[str, ...]:
+        """Variables of strength and roughness."""
+        return PARAMETERS
+
+    @property
+    def fit_variables(self) -> tuple[str, ...]:
+        """Variables from `fit`."""
+        return FIT_VARIABLES
+
+    @property
+    def labels(self) -> dict[str, tuple[str, ...]]:
+        """No variable has a dim of its own."""
+        return {}
+
+    @property
+    def provenance(self) -> dict[str, Any]:
+        """What the surface was fitted by."""
+        return {"surface": f"GGX lobe, refractive index {self.index:g}"}
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """No parameter of a fit is changed."""
+        return {}
+
+    @property
+    def omissions(self) -> tuple[Omission, ...]:
+        """Nothing is omitted."""
+        return ()
+
+    def parameters_of(self, fitted: xr.Dataset) -> Array:
+        """Strength and roughness (n, 2)."""
+        return np.column_stack([fitted[name].values for name in PARAMETERS])
+
+    def fit(self, block: Block, comparison: Comparison) -> SurfaceFit:
+        """Strength and roughness of n surfels."""
+        n = len(block.sample)
+        out = SurfaceFit(
+            parameters=np.full((n, 2), np.nan),
+            kkt=np.full(n, np.nan),
+            residual=np.full(n, np.nan),
+            residual_perceptual=np.full(n, np.nan),
+            condition=np.full(n, np.nan),
+            samples=np.zeros(n, np.int32),
+            iterations=np.zeros(n, np.int32),
+            status=np.zeros(n, np.uint8),
+        )
+        options = kernel_options(comparison, solve=True)
+        _ggx_kernels.fit_ggx(kernel_block(block), float(self.index), options, out)
+        return out
+
+    def fit_columns(self, fit: SurfaceFit) -> dict[str, Array]:
+        """Variables of a fit."""
+        return dict(zip(FIT_VARIABLES, [*fit.parameters.T, *fit[1:]], strict=True))
+
+    def reduced(
+        self,
+        fitted: xr.Dataset,
+        *,
+        k: int,  # noqa: ARG002
+        rng: np.random.Generator,  # noqa: ARG002
+    ) -> xr.Dataset:
+        """The refractive index; lobes have no components."""
+        fitted_surfels(fitted, PARAMETERS)
+        shared = {
+            "lobe_index": self.index,
+            "disc_angular_radius": self.disc_angular_radius,
+        }
+        return dataset(shared)
+
+    def judge(
+        self,
+        block: Block,
+        comparison: Comparison,
+        judgement: Judgement,
+        parameters: Array | None = None,
+    ) -> JudgedFit:
+        """Strength and roughness of n surfels with their errors, held-out samples and
+        outliers.
+        """
+        n = len(block.sample)
+        x = np.full((n, 2), np.nan)
+        if parameters is not None:
+            x = np.array(parameters, np.float64, order="C")
+        residual = np.full((n, 2), np.nan)
+        errors = empty_errors(block, judgement, 2)
+        options = kernel_options(comparison, solve=parameters is None)
+        block = kernel_block(block)
+        _ggx_kernels.judge_ggx(block, float(self.index), options, x, residual, errors)
+        return JudgedFit(
+            x,
+            residual[:, 0],
+            residual[:, 1],
+            errors.covariance,
+            errors.held_error,
+            errors.outlier,
+            errors.counts,
+        )
+
+    def judged_columns(self, judged: JudgedFit) -> dict[str, Array]:
+        """Strength, roughness and the reflectance along the normal with their errors; those
+        are NaN without a lobe.
+        """
+        error = np.sqrt(np.diagonal(judged.covariance, axis1=1, axis2=2))
+        strength, roughness = judged.parameters.T
+        nodes, albedo = _normal_albedo(self.index)
+        slope = np.interp(roughness, nodes, np.gradient(albedo, nodes))
+        gradient = np.stack([self._albedo(roughness), strength * slope], axis=1)
+        variance = np.einsum("nj,njk,nk->n", gradient, judged.covariance, gradient)
+        return {
+            "lobe_strength": strength,
+            "lobe_roughness": roughness,
+            "lobe_strength_error": error[:, STRENGTH],
+            "lobe_roughness_error": error[:, ROUGHNESS],
+            "surface_reflectance": self.normal_reflectance(judged.parameters),
+            "surface_reflectance_error": np.sqrt(variance),
+        }
+
+    def shade(self, points: Points, lamp: Lamp, *, eta: float) -> NDArray[np.float32]:
+        """Radiance (n, 3) per radiant intensity [sr^-1 mm^-2], see `ReflectanceModel`."""
+        out = diffuse_points(points, lamp, eta=eta)
+        if points.parameters.shape[1] > 0:
+            _ggx_kernels.shade_ggx(
+                np.ascontiguousarray(points.position, np.float64),
+                np.ascontiguousarray(points.normal, np.float64),
+                np.ascontiguousarray(points.view, np.float64),
+                np.ascontiguousarray(points.parameters, np.float64),
+                np.ascontiguousarray(lamp.place, np.float64),
+                np.ascontiguousarray(lamp.lit, np.float32),
+                np.ascontiguousarray(lamp.axis, np.float64),
+                float(lamp.falloff),
+                float(self.index),
+                out,
+            )
+        return out
+
+    def normal_reflectance(self, parameters: Array) -> Array:
+        """Fraction (n,) of light along the normal that the lobes reflect."""
+        return np.asarray(parameters[:, STRENGTH] * self._albedo(parameters[:, 1]))
+
+    def simplified(self, parameters: Array) -> tuple[GGX, Array, tuple[Omission, ...]]:
+        """The model as it is."""
+        return self, parameters, ()
+
+    def resample(self, parameters: Array) -> tuple[Table, Array]:
+        """Tables of lobes at `TABLES` roughnesses, and weights (n, TABLES) that interpolate
+        between them; a roughness beyond the outermost takes that one.
+        """
+        strength = np.asarray(parameters[:, STRENGTH], np.float64)
+        roughness = np.clip(parameters[:, ROUGHNESS], MIN_ROUGHNESS, MAX_ROUGHNESS)
+        shiny = np.isfinite(roughness) & (strength > 0)
+        ends = np.array([MIN_ROUGHNESS, MAX_ROUGHNESS])
+        if shiny.any():
+            ends = np.quantile(roughness[shiny], TABLE_QUANTILES)
+        nodes = np.geomspace(ends[0], ends[1], TABLES)
+        nodes = nodes if nodes[-1] > nodes[0] * 1.01 else nodes[:1]
+        tables = tabulate(
+            lambda wi, wo: evaluate_lobe(
+                wi[..., None, :], wo[..., None, :], nodes, self.index
+            )
+        )
+        place = np.interp(np.log(roughness), np.log(nodes), np.arange(len(nodes)))
+        distance = np.abs(place[:, None] - np.arange(len(nodes)))
+        return tables, strength[:, None] * np.maximum(1 - distance, 0.0)
+
+    def sampler(self) -> LobeSampler:
+        """Sampler of directions by the distribution of the half vectors."""
+        return LobeSampler()
+
+    def _albedo(self, roughness: Array) -> Array:
+        nodes, albedo = _normal_albedo(self.index)
+        return np.asarray(np.interp(roughness, nodes, albedo))
+
+
+@dataclass(frozen=True)
+class LobeSampler:
+    """Directions by GGX half vectors, and by the cosine alone for what they miss."""
+
+    def mix(self, parameters: Array) -> Array:
+        """(n, 2) probability of the lobe, and its roughness."""
+        if parameters.shape[1] == 0:  # without the surface term
+            return np.tile([0.0, MAX_ROUGHNESS], (len(parameters), 1))
+        shiny = parameters[:, STRENGTH] > 0
+        roughness = np.maximum(parameters[:, ROUGHNESS], MIN_ROUGHNESS)
+        return np.column_stack([(1 - COSINE_FRACTION) * shiny, roughness])
+
+    def sample(self, mix: Array, normal: Array, view: Array, draw: Array) -> Array:
+        """Directions (n, 3), see `DirectionSampler`."""
+        probability, roughness = mix.T
+        lobe = draw[:, 0] < probability
+        turn = 2 * np.pi * draw[:, 3]
+        square = roughness**2
+        # of the half vector (Walter et al. 2007, eq. 35), or of a direction by its cosine
+        half = 1 / (1 + square * draw[:, 1] / (1 - draw[:, 1]))
+        cosine = np.sqrt(np.where(lobe, half, 1 - draw[:, 1]))
+        sine = np.sqrt(np.maximum(1 - cosine**2, 0.0))
+        first, second = tangents(normal)
+        drawn = (sine * np.cos(turn))[:, None] * first + cosine[:, None] * normal
+        drawn = drawn + (sine * np.sin(turn))[:, None] * second
+        mirrored = 2 * np.einsum("nc,nc->n", view, drawn)[:, None] * drawn - view
+        return np.asarray(np.where(lobe[:, None], mirrored, drawn))
+
+    def pdf(self, mix: Array, normal: Array, view: Array, towards: Array) -> Array:
+        """Density (n,) per steradian of `sample`; 0 below the surface."""
+        probability, roughness = mix.T
+        cosine = np.einsum("nc,nc->n", normal, towards)
+        half = towards + view
+        half = half / np.maximum(np.linalg.norm(half, axis=1, keepdims=True), 1e-12)
+        cos_h = np.maximum(np.einsum("nc,nc->n", half, normal), 0.0)
+        cos_d = np.einsum("nc,nc->n", half, view)
+        square = roughness**2
+        spread = square / (np.pi * (cos_h**2 * (square - 1) + 1) ** 2)
+        lobe = spread * cos_h / (4 * np.maximum(cos_d, MIN_COSINE_HALF))
+        density = probability * lobe + (1 - probability) * cosine / np.pi
+        return np.asarray(np.where(cosine > 0, density, 0.0))
