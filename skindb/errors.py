@@ -5,10 +5,14 @@ together, one line each.
 from __future__ import annotations
 
 import errno
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
+T = TypeVar("T")
+Item = TypeVar("Item")
 CURE_FULL = "free some space there, then run the command again"
 CURE_READ_ONLY = "make its file system writable, or copy it to one that is"
 CURE_PERMISSIONS = "check its owner and permissions"
@@ -117,3 +121,43 @@ class InputError(ValueError):
     def __reduce__(self) -> tuple[type[InputError], tuple[tuple[Fault, ...]]]:
         """Pickle the faults instead of their text."""
         return InputError, (self.faults,)
+
+
+def require(
+    satisfied: object, where: str, rule: str, found: str, cure: str = ""
+) -> None:
+    """Raise an `InputError` with one fault unless a condition is satisfied."""
+    if not satisfied:
+        raise InputError(Fault(where, rule, found, cure))
+
+
+def attempt(
+    faults: list[Fault], call: Callable[[], T], *, where: str = "{}"
+) -> T | None:
+    """Result of a call; None if it raises an `InputError`, whose faults are then recorded.
+
+    In `where`, the place of each fault, {} stands for the place that the fault names.
+    """
+    try:
+        return call()
+    except InputError as error:
+        faults += [replace(f, where=where.replace("{}", f.where)) for f in error.faults]
+        return None
+
+
+def attempt_all(
+    faults: list[Fault],
+    call: Callable[[Item], T],
+    items: Iterable[Item],
+    *,
+    pool: Executor,
+    where: Callable[[Item], str] = lambda _: "{}",
+) -> list[T]:
+    """Results of a call for all items in threads; `InputError` with all faults, sorted."""
+    results = pool.map(
+        lambda item: attempt(faults, lambda: call(item), where=where(item)), items
+    )
+    completed = [result for result in results if result is not None]
+    if faults:
+        raise InputError(sorted(faults, key=str))
+    return completed

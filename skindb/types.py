@@ -29,6 +29,7 @@ IntMatrix32 = np.ndarray[tuple[int, int], np.dtype[np.int32]]
 BoolVector = np.ndarray[tuple[int], np.dtype[np.bool_]]
 BoolMatrix = np.ndarray[tuple[int, int], np.dtype[np.bool_]]
 ByteVector = np.ndarray[tuple[int], np.dtype[np.uint8]]
+ByteMatrix = np.ndarray[tuple[int, int], np.dtype[np.uint8]]
 
 # called with the stage, the steps done and the steps in all
 Progress = Callable[[str, int, int], None]

@@ -4,13 +4,14 @@ the GIL released.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
+from numpy.typing import NDArray
 
 from skindb.calibration.pixel_flags import DARK, DARK_SIGMA, OK, SATURATED
 from skindb.jit import kernel
+from skindb.types import ByteMatrix, ByteVector, Cube32, IntMatrix, Matrix32, Vector32
 
+Values = NDArray[np.unsignedinteger]  # uint8 or uint16, of the file
 # of relative exposure; the weight 1 / variance stays finite
 MIN_VARIANCE = np.float32(1e-30)
 ZERO = np.float32(0.0)
@@ -23,22 +24,22 @@ NO_USABLE_EXPOSURE = np.float32(100.0)
 
 @kernel
 def develop(
-    frames: Any,
-    dark: Any,
-    curve: Any,
+    frames: tuple[Values, ...],
+    dark: Values,
+    curve: Cube32,
     offset: int,
     zero: float,
     span: float,
     variance: float,
     white: float,
-    seconds: Any,
+    seconds: Vector32,
     photon: float,
-    gain: Any,
-    matrix: Any,
-    spans: Any,
-    radiance: Any,
-    flag: Any,
-    usable: Any,
+    gain: Matrix32,
+    matrix: Matrix32,
+    spans: IntMatrix,
+    radiance: Cube32,
+    flag: ByteMatrix,
+    usable: ByteMatrix,
 ) -> None:
     """Merge the exposures of one view to radiance with the formulas of
     `skindb.calibration.radiance.merge_exposures`.
@@ -76,7 +77,7 @@ def develop(
     flag
         (h, w) uint8 output; SATURATED outside the spans, where no sample uses the pixel.
     usable
-        (h, w) uint8 zeros, output: see `skindb.calibration.radiance.usable_exposures`; or (0, 0).
+        (h, w) uint8 zeros, output: see `skindb.calibration.radiance.FrameMerger.merge`; or (0, 0).
     """
     count, (height, width) = len(frames), flag.shape
     signal = np.empty((count, 3 * width), np.float32)
@@ -88,17 +89,17 @@ def develop(
     black = np.full(3 * width, np.float32(zero), np.float32)
     slope = ONE / np.float32(span)
     for y in range(height):
-        first = spans[y, 0]
-        last = max(spans[y, 0], spans[y, 1])
-        flag[y, :first], flag[y, last:] = SATURATED, SATURATED
-        begin = 3 * first
-        size = 3 * (last - first)
+        start = spans[y, 0]
+        end = max(spans[y, 0], spans[y, 1])
+        flag[y, :start], flag[y, end:] = SATURATED, SATURATED
+        begin = 3 * start
+        size = 3 * (end - start)
         if size == 0:
             continue
         total[:size], time[:size], above[:size] = ZERO, ZERO, ZERO
         for e in range(count):
             value = frames[e][y].reshape(3 * width)[begin : begin + size]
-            own = signal[e, :size]
+            exposure_signal = signal[e, :size]
             spread = noise[e, :size]
             if curve.shape[0]:
                 shade = (
@@ -106,18 +107,26 @@ def develop(
                     if dark.shape[0]
                     else dark[:0, 0, 0, 0]
                 )
-                _tabulated_response(value, shade, curve, offset, own, spread)
+                _tabulated_response(
+                    value, shade, curve, offset, exposure_signal, spread
+                )
             else:
                 if dark.shape[0]:
                     black[:size] = dark[e, y].reshape(3 * width)[begin : begin + size]
-                _linear_response(value, black, slope, own)
+                _linear_response(value, black, slope, exposure_signal)
                 spread[:] = np.float32(variance)
             if usable.shape[0]:
-                _count(value, np.float32(white), own, spread, usable[y, first:last])
+                _count(
+                    value,
+                    np.float32(white),
+                    exposure_signal,
+                    spread,
+                    usable[y, start:end],
+                )
             _collect(
                 value,
                 np.float32(white),
-                own,
+                exposure_signal,
                 spread,
                 seconds[e],
                 total[:size],
@@ -128,27 +137,36 @@ def develop(
             expected = total[k] / time[k]
             total[k] = np.float32(photon) * (expected if expected > ZERO else ZERO)
         _average(signal, noise, seconds, total[:size], weights[:size])
-        _finish(y, first, total[:size], time, above, gain, matrix, radiance, flag)
+        _finish(y, start, total[:size], time, above, gain, matrix, radiance, flag)
 
 
 @kernel
-def _linear_response(value: Any, black: Any, slope: float, signal: Any) -> None:
+def _linear_response(
+    value: Values, black: Vector32, slope: float, signal: Vector32
+) -> None:
     for k in range(value.shape[0]):
         signal[k] = (np.float32(value[k]) - black[k]) * slope
 
 
 @kernel
 def _tabulated_response(
-    value: Any, dark: Any, curve: Any, offset: int, signal: Any, noise: Any
+    value: Values,
+    dark: Values,
+    curve: Cube32,
+    offset: int,
+    signal: Vector32,
+    noise: Vector32,
 ) -> None:
     """Relative exposure by a table; `dark` is empty if the table includes it."""
     for k in range(value.shape[0]):
-        at = np.int64(value[k]) + offset - (np.int64(dark[k]) if dark.shape[0] else 0)
-        signal[k], noise[k] = curve[at, k % 3, 0], curve[at, k % 3, 1]
+        row = np.int64(value[k]) + offset - (np.int64(dark[k]) if dark.shape[0] else 0)
+        signal[k], noise[k] = curve[row, k % 3, 0], curve[row, k % 3, 1]
 
 
 @kernel
-def _count(value: Any, white: float, signal: Any, noise: Any, usable: Any) -> None:
+def _count(
+    value: Values, white: float, signal: Vector32, noise: Vector32, usable: ByteVector
+) -> None:
     """Count the exposure at pixels where a channel is above the noise and none is at
     the white level.
     """
@@ -163,14 +181,14 @@ def _count(value: Any, white: float, signal: Any, noise: Any, usable: Any) -> No
 
 @kernel
 def _collect(
-    value: Any,
+    value: Values,
     white: float,
-    signal: Any,
-    noise: Any,
+    signal: Vector32,
+    noise: Vector32,
     seconds: float,
-    total: Any,
-    time: Any,
-    above: Any,
+    total: Vector32,
+    time: Vector32,
+    above: Vector32,
 ) -> None:
     """Accumulate sums over the exposures below the white level; at the white level the
     noise is infinite.
@@ -187,7 +205,13 @@ def _collect(
 
 
 @kernel
-def _average(signal: Any, noise: Any, seconds: Any, photons: Any, weights: Any) -> None:
+def _average(
+    signal: Matrix32,
+    noise: Matrix32,
+    seconds: Vector32,
+    photons: Vector32,
+    weights: Vector32,
+) -> None:
     """Write the inverse-variance weighted mean of the exposures to `photons`; 0 / 0
     where none is usable.
     """
@@ -195,12 +219,12 @@ def _average(signal: Any, noise: Any, seconds: Any, photons: Any, weights: Any) 
     mean = np.zeros_like(weights)
     for e in range(signal.shape[0]):
         second = seconds[e]
-        own = signal[e]
+        exposure_signal = signal[e]
         spread = noise[e]
         for k in range(weights.shape[0]):
             variance = photons[k] * second + spread[k]
             weight = second / (variance if variance > MIN_VARIANCE else MIN_VARIANCE)
-            mean[k] += weight * own[k]
+            mean[k] += weight * exposure_signal[k]
             weights[k] += weight * second
     for k in range(weights.shape[0]):
         photons[k] = mean[k] / weights[k]
@@ -209,25 +233,25 @@ def _average(signal: Any, noise: Any, seconds: Any, photons: Any, weights: Any) 
 @kernel
 def _finish(
     y: int,
-    first: int,
-    value: Any,
-    time: Any,
-    above: Any,
-    gain: Any,
-    matrix: Any,
-    out: Any,
-    flag: Any,
+    start: int,
+    value: Vector32,
+    time: Vector32,
+    above: Vector32,
+    gain: Matrix32,
+    matrix: Matrix32,
+    out: Cube32,
+    flag: ByteMatrix,
 ) -> None:
     """Apply vignette and colour matrix to a row, and set its flags."""
     pixels = value.shape[0] // 3
-    row = out[y, first : first + pixels].reshape(value.shape[0])
+    row = out[y, start : start + pixels].reshape(value.shape[0])
     if gain.shape[0] == 1:
         scale = gain[0, 0]
         for k in range(value.shape[0]):
             row[k] = value[k] * scale
     else:
         for x in range(pixels):
-            factor = gain[y, first + x]
+            factor = gain[y, start + x]
             for k in range(3 * x, 3 * x + 3):
                 row[k] = value[k] * factor
     if matrix.shape[0]:
@@ -241,7 +265,7 @@ def _finish(
     for k in range(value.shape[0]):  # sums over channels distinguish the three cases
         above[k] = NO_USABLE_EXPOSURE if time[k] == ZERO else min(above[k], ONE)
     for x in range(pixels):
-        found = above[3 * x] + above[3 * x + 1] + above[3 * x + 2]
-        flag[y, first + x] = (
-            SATURATED if found >= NO_USABLE_EXPOSURE else DARK if found == ZERO else OK
+        state = above[3 * x] + above[3 * x + 1] + above[3 * x + 2]
+        flag[y, start + x] = (
+            SATURATED if state >= NO_USABLE_EXPOSURE else DARK if state == ZERO else OK
         )

@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from skindb.calibration.colour_chart import fit_colour_matrix
 from skindb.calibration.lens import fit_edge, fit_vignette, veiling_glare
-from skindb.calibration.mirror_ball import Pinhole, reprojection_error
+from skindb.calibration.mirror_ball import reprojection_error
 from skindb.calibration.pixel_flags import OK
 from skindb.calibration.radiance import (
     merge_exposures,
@@ -29,10 +30,10 @@ from skindb.calibration.setup import (
     CalibrationFrames,
     CameraFrames,
     KnownPoints,
-    regions,
+    of_devices,
 )
-from skindb.errors import Fault, InputError
-from skindb.format.dome import CameraRecord, DomeRecord, pixel_width
+from skindb.errors import Fault, attempt, attempt_all, require
+from skindb.format.dome import CameraRecord, DomeRecord
 from skindb.schema import dataset
 
 Array = NDArray[np.float64]
@@ -98,46 +99,39 @@ def calibrate_cameras(dome: DomeRecord, frames: CalibrationFrames) -> xr.Dataset
     """
     faults = list[Fault]()
 
-    def one(camera: CameraRecord) -> Values:
+    def calibrated(camera: CameraRecord) -> Values:
         values = dict(UNKNOWN)
-        known = camera
-        for name, step in STEPS.items():
-            kind: CameraFrames | None = getattr(frames, name)
-            if kind is None or (
-                kind.places is not None and camera.id not in kind.places
-            ):
+        improved = camera
+        for name, kind in frames.kinds.items():
+            if camera.id not in kind.places:
                 continue
-            try:
-                known, found = step(frames, kind, known)
-            except InputError as error:
-                where = f"{name} frames of camera {camera.id}"
-                faults.extend(
-                    Fault(f"{where}: {f.where}", f.rule, f.found, f.cure)
-                    for f in error.faults
-                )
+            step = attempt(
+                faults,
+                partial(STEPS[name], frames, kind, improved),
+                where=f"{name} frames of camera {camera.id}: {{}}",
+            )
+            if step is None:
                 break
-            values |= found
+            improved = step[0]
+            values |= step[1]
         if camera.id in frames.points:
-            try:
-                values |= _reprojection(frames.points[camera.id], camera)
-            except InputError as error:
-                where = f"{frames.folder / FILE}[points], camera {camera.id}"
-                faults.extend(replace(fault, where=where) for fault in error.faults)
+            place = f"{frames.folder / FILE}[points], camera {camera.id}"
+            points = frames.points[camera.id]
+            values |= (
+                attempt(faults, lambda: _reprojection(points, camera), where=place)
+                or {}
+            )
         return values
 
     with ThreadPoolExecutor(THREADS) as pool:
-        rows = list(pool.map(one, dome.cameras))
-    if faults:
-        raise InputError(sorted(faults, key=str))
-    levels = np.linspace(0.0, 1.0, TABLE_ROWS)
+        rows = attempt_all(faults, calibrated, dome.cameras, pool=pool)
     coords = {
-        "camera": [c.id for c in dome.cameras],
-        "response_level": levels,
+        "camera": [camera.id for camera in dome.cameras],
+        "response_level": np.linspace(0.0, 1.0, TABLE_ROWS),
         "channel": ["R", "G", "B"],
     }
-    return dataset(
-        {name: np.array([row[name] for row in rows]) for name in UNKNOWN}, coords=coords
-    )
+    variables = {name: np.array([row[name] for row in rows]) for name in UNKNOWN}
+    return dataset(variables, coords=coords)
 
 
 def calibrated_cameras(
@@ -151,48 +145,35 @@ def calibrated_cameras(
     InputError
         If the calibration lacks a camera, or the frames of the capture are not values of a sensor.
     """
-    known = calibration.load()
-    names = set(map(str, known["camera"].values))
-    if missing := [camera.id for camera in dome.cameras if camera.id not in names]:
-        found = f"none of {', '.join(missing[:5])}"
-        raise InputError(
-            Fault(
-                where,
-                "a calibration must have every camera of the capture",
-                found,
-                "calibrate again",
-            )
-        )
-    if dome.cameras and dome.cameras[0].sensor.kind.bits == 0:
-        rule = "a sensor calibration applies to sensor values only"
-        cure = "calibrate a set-up without its cameras"
-        raise InputError(Fault(where, rule, "a capture in OpenEXR", cure))
-    return replace(
-        dome,
-        cameras=tuple(
-            _calibrated(camera, known.sel(camera=camera.id)) for camera in dome.cameras
-        ),
+    ids = [camera.id for camera in dome.cameras]
+    calibrated = of_devices(calibration, "camera", ids, where=where)
+    require(
+        not dome.cameras or dome.cameras[0].sensor.kind.bits,
+        where,
+        "a sensor calibration applies to sensor values only",
+        "a capture in OpenEXR",
+        "calibrate a set-up without its cameras",
     )
+    cameras = (
+        _calibrated(camera, calibrated.isel(camera=c))
+        for c, camera in enumerate(dome.cameras)
+    )
+    return replace(dome, cameras=tuple(cameras))
 
 
-def _calibrated(camera: CameraRecord, known: xr.Dataset) -> CameraRecord:
+def _calibrated(camera: CameraRecord, calibration: xr.Dataset) -> CameraRecord:
     sensor = camera.sensor
-    response = known["calibrated_response"].values
+    response = calibration["calibrated_response"].values
     if np.isfinite(response).all():
-        values = sensor.black + known["response_level"].values * (
-            sensor.white - sensor.black
-        )
-        sensor = replace(
-            sensor, response=np.column_stack([values, response]), response_file=None
-        )
-    if np.isfinite(gain := float(known["calibrated_electrons_per_value"])):
-        sensor = replace(
-            sensor,
-            electrons_per_dn=gain,
-            read_noise=float(known["calibrated_read_noise"]),
-        )
-    vignette = known["calibrated_vignette"].values
-    colours = known["calibrated_colour_matrix"].values
+        levels = calibration["response_level"].values
+        values = sensor.black + levels * (sensor.white - sensor.black)
+        table = np.column_stack([values, response])
+        sensor = replace(sensor, response=table, response_file=None)
+    if np.isfinite(gain := float(calibration["calibrated_electrons_per_value"])):
+        noise = float(calibration["calibrated_read_noise"])
+        sensor = replace(sensor, electrons_per_dn=gain, read_noise=noise)
+    vignette = calibration["calibrated_vignette"].values
+    colours = calibration["calibrated_colour_matrix"].values
     return replace(
         camera,
         sensor=sensor,
@@ -204,39 +185,36 @@ def _calibrated(camera: CameraRecord, known: xr.Dataset) -> CameraRecord:
 def _dark(
     frames: CalibrationFrames, kind: CameraFrames, camera: CameraRecord
 ) -> tuple[CameraRecord, Values]:
-    found = average_dark(
-        np.stack(frames.read(kind.frames, camera, repeats=kind.repeats)[0])
-    )
-    good = ~found.defect
-    level = np.array([found.mean[..., c][good[..., c]].mean() for c in range(3)])
-    error = np.array(
-        [
-            np.sqrt((found.error[..., c][good[..., c]] ** 2).sum()) / good[..., c].sum()
-            for c in range(3)
-        ]
-    )
-    defects = float(found.defect.any(axis=-1).sum())
+    (repeats,) = frames.read(kind.frames, camera, repeats=kind.repeats)
+    dark = average_dark(np.stack(repeats))
+    good = ~dark.defect
+    level = [dark.mean[good[..., c], c].mean() for c in range(3)]
+    error = [
+        np.sqrt((dark.error[good[..., c], c] ** 2).sum()) / good[..., c].sum()
+        for c in range(3)
+    ]
     return camera, {
-        "dark_level": level,
-        "dark_level_error": error,
-        "defect_pixels": defects,
+        "dark_level": np.array(level),
+        "dark_level_error": np.array(error),
+        "defect_pixels": float(dark.defect.any(axis=-1).sum()),
     }
 
 
 def _response(
     frames: CalibrationFrames, kind: CameraFrames, camera: CameraRecord
 ) -> tuple[CameraRecord, Values]:
-    stack = np.stack(
-        [own[0] for own in frames.read(kind.frames, camera, [*frames.exposures])]
-    )
+    sets = frames.read(kind.frames, camera, frames.exposures)
     sensor = camera.sensor
-    found = recover_response(
-        stack, [*frames.exposures.values()], black=sensor.black, white=sensor.white
+    response = recover_response(
+        np.stack([repeats[0] for repeats in sets]),
+        [*frames.exposures.values()],
+        black=sensor.black,
+        white=sensor.white,
     )
-    known = replace(
-        camera, sensor=replace(sensor, response=found.table, response_file=None)
-    )
-    return known, {"calibrated_response": found.table[:, 1:]}
+    sensor = replace(sensor, response=response.table, response_file=None)
+    return replace(camera, sensor=sensor), {
+        "calibrated_response": response.table[:, 1:]
+    }
 
 
 def _flat(
@@ -244,25 +222,27 @@ def _flat(
 ) -> tuple[CameraRecord, Values]:
     """Noise from pairs of equal frames of the green channel, and the vignette from their mean."""
     sensor = camera.sensor
-    span = camera.sensor.white - camera.sensor.black
-    sets = frames.read(kind.frames, camera, [*frames.exposures], kind.repeats)
+    span = sensor.white - sensor.black
+    sets = frames.read(kind.frames, camera, frames.exposures, kind.repeats)
     # in linear values above black; saturated values stay at the white level, so that
     # the fit excludes them
     pairs = [
         [
             relative_exposure(frame, None, sensor)[0][..., GREEN] * span
-            for frame in own[:2]
+            for frame in repeats[:2]
         ]
-        for own in sets
+        for repeats in sets
     ]
     noise = fit_noise(np.array(pairs), black=0.0, white=float(span), step=sensor.step)
     sensor = replace(
         sensor, electrons_per_dn=noise.electrons_per_dn, read_noise=noise.read_noise
     )
-    means = [np.mean(own, axis=0).astype(np.float32) for own in sets]
-    for mean, own in zip(means, sets, strict=True):
+    means = []
+    for repeats in sets:
+        mean = np.mean(repeats, axis=0).astype(np.float32)
         # a mean hides that one of them was saturated
-        mean[np.max(own, axis=0) >= sensor.white] = sensor.white
+        mean[np.max(repeats, axis=0) >= sensor.white] = sensor.white
+        means.append(mean)
     merged, _, flag = merge_exposures(means, tuple(frames.exposures.values()), sensor)
     shade = fit_vignette(
         np.where(flag == OK, merged[..., GREEN], np.nan), camera.K[:2, 2]
@@ -282,22 +262,20 @@ def _flat(
 def _chart(
     frames: CalibrationFrames, kind: CameraFrames, camera: CameraRecord
 ) -> tuple[CameraRecord, Values]:
-    chart, white = (
-        _merged(frames, template, camera) for template in (kind.frames, kind.white)
-    )
+    chart = _merged(frames, kind.frames, camera)
+    white = _merged(frames, kind.white, camera)
     row, column = np.mgrid[: camera.height, : camera.width] + 0.5
-    places = {} if kind.places is None else kind.places
-    patches = np.full((len(places[camera.id]), 3), np.nan)
-    for patch, (x, y) in enumerate(places[camera.id]):
+    patches = np.full((len(kind.places[camera.id]), 3), np.nan)
+    for patch, (x, y) in zip(patches, kind.places[camera.id], strict=True):
         inside = np.hypot(column - x, row - y) <= kind.radius
         if inside.any():
             # a saturated pixel makes its patch NaN: the mean of the other pixels would be biased
-            patches[patch] = chart[inside].mean(axis=0) / white[inside].mean(axis=0)
-    found = fit_colour_matrix(patches)
-    return replace(camera, colour_matrix=found.matrix), {
-        "calibrated_colour_matrix": found.matrix,
-        "calibrated_colour_matrix_error": found.error,
-        "chart_difference": float(np.nanmedian(found.delta_e_after)),
+            patch[:] = chart[inside].mean(axis=0) / white[inside].mean(axis=0)
+    fit = fit_colour_matrix(patches)
+    return replace(camera, colour_matrix=fit.matrix), {
+        "calibrated_colour_matrix": fit.matrix,
+        "calibrated_colour_matrix_error": fit.error,
+        "chart_difference": float(np.nanmedian(fit.delta_e_after)),
     }
 
 
@@ -305,53 +283,43 @@ def _edge(
     frames: CalibrationFrames, kind: CameraFrames, camera: CameraRecord
 ) -> tuple[CameraRecord, Values]:
     picture = _merged(frames, kind.frames, camera)[..., GREEN].astype(np.float64)
-    place = {} if kind.places is None else kind.places
-    found = fit_edge(picture[regions(place[camera.id])])
-    glare = veiling_glare(
-        found, mean=float(np.nanmean(picture)), contrast=kind.contrast
-    )
+    (left, top), (right, bottom) = np.sort(kind.places[camera.id], axis=0).astype(int)
+    edge = fit_edge(picture[top:bottom, left:right])
+    mean = float(np.nanmean(picture))
     return camera, {
-        "edge_blur": found.blur,
-        "edge_blur_error": found.blur_error,
-        "veiling_glare": glare,
+        "edge_blur": edge.blur,
+        "edge_blur_error": edge.blur_error,
+        "veiling_glare": veiling_glare(edge, mean=mean, contrast=kind.contrast),
     }
 
 
 def _reprojection(points: KnownPoints, camera: CameraRecord) -> Values:
-    pinhole = Pinhole(camera.K, camera.R, camera.t, camera.distortion)
-    found = reprojection_error(points.position, points.pixel, pinhole)
-    width = pixel_width(camera, points.position.mean(axis=0))
+    error = reprojection_error(points.position, points.pixel, camera)
+    width = camera.pixel_width(points.position.mean(axis=0))
     limit = float(np.clip(MAX_REPROJECTION_MM / width, *MAX_REPROJECTIONS_PX))
-    if found.rms > limit:
-        rule = (
-            f"known points must be seen within {limit:.2g} px of their projections "
-            "(root mean square)"
-        )
-        cure = (
-            "calibrate K, R, t and distortion of the camera again, or correct "
-            "positions and pixels of the points"
-        )
-        said = (
-            f"{found.rms:.3g} px, {found.rms * width:.2g} mm at their distance; at "
-            f"most {found.largest:.3g} px"
-        )
-        raise InputError(Fault("known points", rule, said, cure))
-    return {"reprojection_rms": found.rms, "reprojection_max": found.largest}
+    require(
+        not error.rms > limit,
+        "known points",
+        f"known points must be seen within {limit:.2g} px of their projections "
+        "(root mean square)",
+        f"{error.rms:.3g} px, {error.rms * width:.2g} mm at their distance; at "
+        f"most {error.largest:.3g} px",
+        "calibrate K, R, t and distortion of the camera again, or correct "
+        "positions and pixels of the points",
+    )
+    return {"reprojection_rms": error.rms, "reprojection_max": error.largest}
 
 
 def _merged(
     frames: CalibrationFrames, template: str, camera: CameraRecord
 ) -> NDArray[np.float32]:
     """Radiance (h, w, 3) in the colours of the sensor, NaN where it is saturated."""
-    sets = frames.read(template, camera, [*frames.exposures])
+    exposures = [sets[0] for sets in frames.read(template, camera, frames.exposures)]
     gain = vignette_gain(camera) if camera.vignette.any() else None
-    own = [exposure[0] for exposure in sets]
-    return merge_exposures(
-        own, tuple(frames.exposures.values()), camera.sensor, vignette=gain
-    )[0]
+    seconds = tuple(frames.exposures.values())
+    return merge_exposures(exposures, seconds, camera.sensor, vignette=gain)[0]
 
 
-# ordered by dependence: a step uses the results of the steps before it
 STEPS: dict[str, Step] = {
     "dark": _dark,
     "response": _response,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from skindb.errors import Fault, InputError
+from skindb.errors import require
 
 Array = NDArray[np.float64]
 # the manufacturer's reference values, as in colour-science
@@ -72,33 +72,29 @@ def fit_colour_matrix(
     target = (
         chart_reference() if reference is None else np.asarray(reference, np.float64)
     )
-    if values.shape != target.shape or values.shape[1:] != (3,):
-        rule = "its values must have the shape (patch, 3) of the reference"
-        cure = "give the patches row by row"
-        raise InputError(
-            Fault("colour chart", rule, f"{values.shape} and {target.shape}", cure)
-        )
+    require(
+        values.shape == target.shape and values.shape[1:] == (3,),
+        "colour chart",
+        "its values must have the shape (patch, 3) of the reference",
+        f"{values.shape} and {target.shape}",
+        "give the patches row by row",
+    )
     good: NDArray[np.bool_] = np.asarray(np.isfinite(values).all(axis=1))
     white = int(target.sum(axis=1).argmax())
     usable = good.sum() >= MIN_PATCHES and good[white] and values[white, 1] > 0
-    if not usable or np.linalg.cond(values[good]) > 1e4:
-        rule = (
-            f"{MIN_PATCHES} patches of different colours must be usable, the white one "
-            "among them"
-        )
-        raise InputError(
-            Fault(
-                "colour chart",
-                rule,
-                f"{int(good.sum())} usable patches",
-                "expose the chart shorter",
-            )
-        )
+    require(
+        usable and np.linalg.cond(values[good]) <= 1e4,
+        "colour chart",
+        f"{MIN_PATCHES} patches of different colours must be usable, the white one "
+        "among them",
+        f"{int(good.sum())} usable patches",
+        "expose the chart shorter",
+    )
     scale = target[white, 1] / values[white, 1]
     camera = values[good] * scale
     solution, *_ = np.linalg.lstsq(camera, target[good], rcond=None)
-    apart = target[good] - camera @ solution
-    variance = (apart**2).sum(axis=0) / max(len(camera) - 3, 1)
+    residual = target[good] - camera @ solution
+    variance = (residual**2).sum(axis=0) / max(len(camera) - 3, 1)
     error = np.sqrt(variance[:, None] * np.diag(np.linalg.inv(camera.T @ camera)))
     level = float(camera[good[:white].sum()] @ solution[:, 1]) / target[white, 1]
     before = np.full(len(values), np.nan)
@@ -108,12 +104,12 @@ def fit_colour_matrix(
     return ColourFit(solution.T / level, error / level, before, after)
 
 
-def _difference(found: Array, expected: Array) -> Array:
+def _difference(measured: Array, expected: Array) -> Array:
     """CIEDE2000 (n,) between linear sRGB colours (n, 3)."""
     import colour
 
     lab = [
         colour.XYZ_to_Lab(colour.sRGB_to_XYZ(c, apply_cctf_decoding=False))
-        for c in (found, expected)
+        for c in (measured, expected)
     ]
     return np.asarray(colour.delta_E(*lab, method="CIE 2000"))

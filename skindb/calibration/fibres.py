@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import xarray as xr
@@ -12,7 +13,8 @@ from scipy import ndimage, optimize
 
 from skindb.calibration.frame_checks import disagreement
 from skindb.calibration.radiance import merge_exposures
-from skindb.errors import Fault, InputError
+from skindb.calibration.setup import MIN_FLAT_FRAMES, of_devices
+from skindb.errors import Fault, InputError, attempt, require
 from skindb.format.contact_probe import ProbeRecord
 from skindb.format.frames import Digests, Frame, read_frame, read_frames
 from skindb.limits import MAX_FIBRE_PIXELS
@@ -31,7 +33,6 @@ MIN_SPOT_PIXELS = 9
 # contrast of a spot over the robust standard deviation of the background
 MIN_CONTRAST = 8.0
 MARGIN = 2  # px around a spot over which its light is summed
-MIN_FRAMES = 3  # frames of the flat field, for a meaningful estimate of the scatter
 
 
 def placement_signal(
@@ -42,40 +43,44 @@ def placement_signal(
     """
     fibres = list[Index]()
     strips = list[Frame]()
-    faults = dict[Fault, None]()
-    for exposure in probe.exposures:
-        try:
-            frame = read_frame(probe.frame(site, exposure, placement), None, digests)
-            fibres = fibres or fibre_pixels(probe, frame.shape[:2])
-        except InputError as problem:
-            faults |= dict.fromkeys(problem.faults)
-            continue
+    faults = list[Fault]()
+
+    def read_strip(exposure: str) -> None:
+        frame = read_frame(probe.frame(site, exposure, placement), None, digests)
+        fibres[:] = fibres or fibre_pixels(probe, frame.shape[:2])
         # only the fibres' pixels are kept and merged: a few percent of the picture
         strips.append(frame.reshape(-1, 3)[np.unique(np.concatenate(fibres))][None])
+
+    for exposure in probe.exposures:
+        attempt(faults, partial(read_strip, exposure))
     if faults:
-        raise InputError(faults)
+        raise InputError(dict.fromkeys(faults))
     fault = disagreement(
         f"{probe.file}[exposures]", probe.exposures, strips, probe.sensor
     )
     if fault is not None:
-        at = f"site {site}, placement {placement}" if placement else f"site {site}"
-        raise InputError(replace(fault, found=f"{at}: bracket {fault.found}"))
-    radiance, error, _ = merge_exposures(
-        strips, tuple(probe.exposures.values()), probe.sensor
-    )
+        finding = f"{place_text(site, placement)}: bracket {fault.found}"
+        raise InputError(replace(fault, found=finding))
+    seconds = tuple(probe.exposures.values())
+    radiance, error, _ = merge_exposures(strips, seconds, probe.sensor)
     value = np.full((len(fibres), 3), np.nan)
     spread = np.full((len(fibres), 3), np.nan)
     union = np.unique(np.concatenate(fibres))
     for i, pixels in enumerate(fibres):
-        own = np.searchsorted(union, pixels)
-        signal = radiance[0, own].astype(np.float64)
-        noise = error[0, own].astype(np.float64)
+        columns = np.searchsorted(union, pixels)
+        signal = radiance[0, columns].astype(np.float64)
+        noise = error[0, columns].astype(np.float64)
         for c in range(3):
             usable = np.isfinite(signal[:, c])
             if 1 - usable.mean() <= MAX_LOST_FRACTION:
                 value[i, c] = signal[usable, c].mean()
                 spread[i, c] = np.sqrt((noise[usable, c] ** 2).sum()) / usable.sum()
     return value, spread
+
+
+def place_text(site: str, placement: str) -> str:
+    """A placement of the probe in a message."""
+    return f"site {site}" + (f", placement {placement}" if placement else "")
 
 
 def fibre_pixels(probe: ProbeRecord, shape: tuple[int, ...]) -> list[Index]:
@@ -99,24 +104,27 @@ def fibre_pixels(probe: ProbeRecord, shape: tuple[int, ...]) -> list[Index]:
             for c, side in zip(centre, shape[::-1], strict=True)
         )
         total += max(right - left, 0) * max(bottom - top, 0)
-        if total > MAX_FIBRE_PIXELS:
-            rule = f"the fibres must cover at most {MAX_FIBRE_PIXELS:,} pixels"
-            cure = "give centre and radius in pixels of the picture"
-            raise InputError(
-                Fault(f"{probe.file}[fibres]", rule, f"{total:,} or more", cure)
-            )
+        require(
+            total <= MAX_FIBRE_PIXELS,
+            f"{probe.file}[fibres]",
+            f"the fibres must cover at most {MAX_FIBRE_PIXELS:,} pixels",
+            f"{total:,} or more",
+            "give centre and radius in pixels of the picture",
+        )
         y = np.arange(top, bottom)[:, None] + 0.5
         x = np.arange(left, right) + 0.5
         row, column = np.nonzero(
             (x - centre[0]) ** 2 + (y - centre[1]) ** 2 <= radius * radius
         )
         fibres.append((row + top) * shape[1] + column + left)
+    finding = f"no pixel of {shape[1]} x {shape[0]}"
+    cure = "correct its centre and radius, in pixels"
     faults = [
         Fault(
             f"{probe.file}[fibres][{i}]",
             "a fibre must lie in the picture",
-            f"no pixel of {shape[1]} x {shape[0]}",
-            "correct its centre and radius, in pixels",
+            finding,
+            cure,
         )
         for i, pixels in enumerate(fibres)
         if not len(pixels)
@@ -151,20 +159,18 @@ def calibrate_probe(flat: ProbeRecord) -> xr.Dataset:
         saturated in all brackets.
     """
     picture = np.mean([_green(flat, site) for site in flat.sites], axis=0)
-    given = Spots(flat.centre, flat.radius)
     spots = find_fibres(picture, count=len(flat.fibres))
-    offsets = match_fibres(spots, given)
+    offsets = match_fibres(spots, Spots(flat.centre, flat.radius))
     moved = replace(flat, centre=flat.centre + offsets.offset)
-    found = fibre_gain(
-        np.stack([placement_signal(moved, site)[0] for site in flat.sites])
-    )
+    signals = [placement_signal(moved, site)[0] for site in flat.sites]
+    relative = fibre_gain(np.stack(signals))
     level = flat.gain.mean(axis=0)
     return dataset(
         {
             "calibrated_fibre_centre": moved.centre,
             "fibre_spot_radius": spots.radius[offsets.order],
-            "calibrated_fibre_gain": found.gain * level,
-            "calibrated_fibre_gain_error": found.error * level,
+            "calibrated_fibre_gain": relative.gain * level,
+            "calibrated_fibre_gain_error": relative.error * level,
         },
         coords={
             "fibre": list(flat.fibres),
@@ -174,21 +180,17 @@ def calibrate_probe(flat: ProbeRecord) -> xr.Dataset:
     )
 
 
-def _green(flat: ProbeRecord, site: str) -> NDArray[np.float64]:
+def _green(flat: ProbeRecord, site: str) -> Array:
     """Merged green channel (h, w) of one repeat; the brightest value where it is
     saturated in all brackets.
     """
-    frames = read_frames(
-        [flat.frame(site, exposure) for exposure in flat.exposures], None
-    )
+    frames = read_frames([flat.frame(site, exposure) for exposure in flat.exposures])
     seconds = tuple(flat.exposures.values())
-    parts = [
-        merge_exposures(
-            [frame[top : top + ROWS] for frame in frames], seconds, flat.sensor
-        )[0][..., GREEN]
-        for top in range(0, frames[0].shape[0], ROWS)
-    ]
-    green = np.concatenate(parts).astype(np.float64)
+    strips = []
+    for top in range(0, frames[0].shape[0], ROWS):
+        strip = [frame[top : top + ROWS] for frame in frames]
+        strips.append(merge_exposures(strip, seconds, flat.sensor)[0][..., GREEN])
+    green = np.concatenate(strips).astype(np.float64)
     return np.nan_to_num(green, nan=float(np.nanmax(green, initial=0.0)))
 
 
@@ -203,25 +205,14 @@ def calibrated_probe(
     InputError
         If the calibration lacks a fibre.
     """
-    known = calibration.load()
-    names = set(map(str, known["fibre"].values))
-    if missing := [fibre for fibre in probe.fibres if fibre not in names]:
-        found = f"none of {', '.join(missing[:5])}"
-        raise InputError(
-            Fault(
-                where,
-                "a calibration must have every fibre of the capture",
-                found,
-                "calibrate again",
-            )
-        )
-    own = known.sel(fibre=list(probe.fibres))
-    gain = own["calibrated_fibre_gain"].values
-    error = float(
-        np.sqrt(np.mean((own["calibrated_fibre_gain_error"].values / gain) ** 2))
-    )
+    fibres = of_devices(calibration, "fibre", probe.fibres, where=where)
+    gain = fibres["calibrated_fibre_gain"].values
+    relative = fibres["calibrated_fibre_gain_error"].values / gain
     return replace(
-        probe, centre=own["calibrated_fibre_centre"].values, gain=gain, gain_error=error
+        probe,
+        centre=fibres["calibrated_fibre_centre"].values,
+        gain=gain,
+        gain_error=float(np.sqrt(np.mean(relative**2))),
     )
 
 
@@ -276,38 +267,31 @@ def find_fibres(picture: ArrayLike, *, count: int) -> Spots:
         The picture is not finite, or another number of spots is found.
     """
     grey = np.asarray(picture, np.float64)
-    if grey.ndim != 2 or not np.isfinite(grey).all():
-        rule = "it must be finite and have the shape (height, width)"
-        cure = "give one channel of the merged brackets"
-        raise InputError(Fault("picture of the fibres", rule, str(grey.shape), cure))
+    require(
+        grey.ndim == 2 and np.isfinite(grey).all(),
+        "picture of the fibres",
+        "it must be finite and have the shape (height, width)",
+        str(grey.shape),
+        "give one channel of the merged brackets",
+    )
     dark = float(np.median(grey))
     noise = 1.4826 * float(np.median(np.abs(grey - dark)))
     level = dark + max(MIN_CONTRAST * noise, 0.05 * (float(grey.max()) - dark))
-    labels, _ = (
-        ndimage.label(grey > level)
-        if grey.max() > level
-        else (np.zeros(grey.shape, int), 0)
-    )
+    labels, _ = ndimage.label(grey > level)
     spots = [
         _measure(grey, labels == i + 1, box, dark)
         for i, box in enumerate(ndimage.find_objects(labels))
         if (labels[box] == i + 1).sum() >= MIN_SPOT_PIXELS
     ]
-    if len(spots) != count:
-        cure = (
-            "light all fibres evenly, keep them from touching in the picture, and "
-            "cover stray light"
-        )
-        raise InputError(
-            Fault(
-                "picture of the fibres",
-                f"it must show {count} separate spots",
-                f"{len(spots)}",
-                cure,
-            )
-        )
-    found = np.array(sorted(spots))
-    return Spots(found[:, :2], found[:, 2])
+    require(
+        len(spots) == count,
+        "picture of the fibres",
+        f"it must show {count} separate spots",
+        f"{len(spots)}",
+        "light all fibres evenly, keep them from touching in the picture, and cover stray light",
+    )
+    table = np.array(sorted(spots))
+    return Spots(table[:, :2], table[:, 2])
 
 
 def _measure(
@@ -315,25 +299,20 @@ def _measure(
 ) -> tuple[float, float, float]:
     """Column, row and radius of one spot, measured in its bounding box with a margin."""
     top, left = (max(side.start - MARGIN, 0) for side in box)
-    bottom = box[0].stop + MARGIN
-    right = box[1].stop + MARGIN
-    light = np.where(
-        ndimage.binary_dilation(spot[top:bottom, left:right], iterations=MARGIN),
-        1.0,
-        0.0,
-    )
-    light *= grey[top:bottom, left:right] - dark
-    middle = float(np.percentile(light[spot[top:bottom, left:right]], 75))
+    window = np.s_[top : box[0].stop + MARGIN, left : box[1].stop + MARGIN]
+    near = ndimage.binary_dilation(spot[window], iterations=MARGIN)
+    light = np.where(near, 1.0, 0.0) * (grey[window] - dark)
+    middle = float(np.percentile(light[spot[window]], 75))
     row, column = np.mgrid[: light.shape[0], : light.shape[1]] + 0.5
     total = float(light.sum())
-    centre = (
+    return (
         left + float((column * light).sum()) / total,
         top + float((row * light).sum()) / total,
+        float(np.sqrt(total / middle / np.pi)),
     )
-    return (*centre, float(np.sqrt(total / middle / np.pi)))
 
 
-def match_fibres(found: Spots, given: Spots) -> SpotOffsets:
+def match_fibres(spots: Spots, stated: Spots) -> SpotOffsets:
     """Pair found with given fibres so that the sum of squared distances is smallest.
 
     Raises
@@ -341,28 +320,27 @@ def match_fibres(found: Spots, given: Spots) -> SpotOffsets:
     InputError
         The numbers differ, or a fibre is farther from its given position than its radius.
     """
-    if len(found.radius) != len(given.radius):
-        rule = "as many fibres must be found as are given"
-        cure = "compare probe.json with the picture"
-        raise InputError(
-            Fault("fibres", rule, f"{len(found.radius)} and {len(given.radius)}", cure)
-        )
-    square = ((given.centre[:, None] - found.centre) ** 2).sum(axis=-1)
-    _, order = optimize.linear_sum_assignment(square)
-    offset = found.centre[order] - given.centre
-    far = np.flatnonzero(np.linalg.norm(offset, axis=1) > given.radius)
-    if len(far):
-        rule = "every fibre must be found within its radius of the given centre"
-        cure = "correct the centres"
-        worst = float(np.linalg.norm(offset, axis=1).max())
-        raise InputError(
-            Fault(
-                "fibres", rule, f"{len(far)} farther away, up to {worst:.1f} px", cure
-            )
-        )
-    return SpotOffsets(
-        offset, found.radius[order] / given.radius, np.asarray(order, np.int64)
+    require(
+        len(spots.radius) == len(stated.radius),
+        "fibres",
+        "as many fibres must be found as are given",
+        f"{len(spots.radius)} and {len(stated.radius)}",
+        "compare probe.json with the picture",
     )
+    square = ((stated.centre[:, None] - spots.centre) ** 2).sum(axis=-1)
+    _, order = optimize.linear_sum_assignment(square)
+    offset = spots.centre[order] - stated.centre
+    distance = np.linalg.norm(offset, axis=1)
+    count = int((distance > stated.radius).sum())
+    require(
+        not count,
+        "fibres",
+        "every fibre must be found within its radius of the given centre",
+        f"{count} farther away, up to {distance.max():.1f} px",
+        "correct the centres",
+    )
+    ratio = spots.radius[order] / stated.radius
+    return SpotOffsets(offset, ratio, np.asarray(order, np.int64))
 
 
 def fibre_gain(signal: ArrayLike) -> FibreGain:
@@ -383,23 +361,17 @@ def fibre_gain(signal: ArrayLike) -> FibreGain:
         Too few frames, or signals that are not positive and finite.
     """
     values = np.asarray(signal, np.float64)
-    shape = (
-        values.ndim == 3
-        and values.shape[-1:] == (3,)
-        and values.shape[0] >= MIN_FRAMES
-        and values.shape[1] > 1
+    shaped = values.ndim == 3 and values.shape[2] == 3 and values.shape[1] > 1
+    require(
+        shaped
+        and len(values) >= MIN_FLAT_FRAMES
+        and (np.isfinite(values) & (values > 0)).all(),
+        "flat field of the fibres",
+        "its signals must be positive, of the shape (frame, fibre, 3), and of "
+        f"{MIN_FLAT_FRAMES} frames or more",
+        f"an array of {values.shape}",
+        "use brackets in which no fibre is dark or saturated, and repeat the frames",
     )
-    if not shape or not np.isfinite(values).all() or not (values > 0).all():
-        rule = (
-            "its signals must be positive, of the shape (frame, fibre, 3), and of "
-            f"{MIN_FRAMES} frames or more"
-        )
-        cure = (
-            "use brackets in which no fibre is dark or saturated, and repeat the frames"
-        )
-        raise InputError(
-            Fault("flat field of the fibres", rule, f"an array of {values.shape}", cure)
-        )
     log = np.log(values)
     log -= log.mean(axis=1, keepdims=True)
     gain = np.exp(log.mean(axis=0))

@@ -5,14 +5,20 @@ their camera, wrong levels, blank pictures.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb.calibration.radiance import FrameMerger, read_sigma, relative_exposure
-from skindb.errors import Fault
+from skindb.calibration.radiance import (
+    FrameMerger,
+    read_sigma,
+    read_view,
+    relative_exposure,
+)
+from skindb.errors import Fault, InputError
 from skindb.format.dome import DomeRecord
 from skindb.format.frames import Digests, Frame, read_frame
 from skindb.format.json_file import MAX_MAGNITUDE
@@ -57,12 +63,12 @@ MIN_USED_RANGE = 0.02  # of the range of values, by the brightest photograph of 
 MIN_POSITIVE_FRACTION = 0.01
 # of a camera that are averaged; more reduce noise that is already below the pattern
 MAX_PHOTOGRAPHS = 12
-MAX_PIXELS = 250_000  # in whole rows, evenly spread over the picture
-MIN_PIXELS = 1_000
+MAX_PATTERN_PIXELS = 250_000  # in whole rows, evenly spread over the picture
+MIN_PATTERN_PIXELS = 1_000
 # of the pixels, by their mean value: the noise of light hides the pattern in the others
 DARK_QUANTILE = 0.25
-# robust standard deviations, beyond which hot pixels and edges are clipped
-MAX_DEVIATIONS = 3.0
+# robust standard deviations, beyond which hot pixels and edges of the pattern are clipped
+MAX_PATTERN_DEVIATIONS = 3.0
 # standard deviations of the correlations with shifted frames, which are unrelated
 MIN_CORRELATION = 6.0
 SHIFTS = 16
@@ -89,35 +95,48 @@ def view_faults(
     white
         Whether the frames show the white target.
     """
-    where = f"{dome.file}[white][frames]" if white else f"{dome.file}[frames]"
+    place = f"{dome.file}[white][frames]" if white else f"{dome.file}[frames]"
     sensor = merger.camera.sensor
-    names = [*dome.exposures]
-    step = _step(frames[0])
-    some = [frame[::step, ::step] for frame in frames]
-    said = f"camera {merger.camera.id}, light {light}: "
+    view = f"camera {merger.camera.id}, light {light}: "
     if sensor.kind.bits == 0:
-        fault = _linear_fault(where, frames[0])
+        fault = _linear_fault(place, frames[0])
     else:
-        dark = (
-            None
-            if merger.dark is None
-            else [frame[::step, ::step] for frame in merger.dark]
+        names = [*dome.exposures]
+        thinned = [_thinned(frame) for frame in frames]
+        dark = None if merger.dark is None else [_thinned(x) for x in merger.dark]
+        fault = _saturated_fault(place, thinned, sensor) or _below_fault(
+            place, names, thinned, dark, sensor
         )
-        fault = _saturated_fault(where, some, sensor) or _below_fault(
-            where, names, some, dark, sensor
-        )
-        said += "" if fault else "exposure "
-        seconds = dict(zip(names, merger.seconds, strict=True))
-        fault = fault or disagreement(where, seconds, some, sensor, dark=dark)
-    return (
-        []
-        if fault is None
-        else [Fault(fault.where, fault.rule, said + fault.found, fault.cure)]
-    )
+        if fault is None:
+            view += "exposure "
+            seconds = dict(zip(names, merger.seconds, strict=True))
+            fault = disagreement(place, seconds, thinned, sensor, dark=dark)
+    return [] if fault is None else [replace(fault, found=view + fault.found)]
+
+
+def checked_view(
+    dome: DomeRecord,
+    light: str,
+    merger: FrameMerger,
+    *,
+    white: bool = False,
+    digests: Digests | None = None,
+) -> list[Frame]:
+    """Decode the exposures of one light and camera.
+
+    Raises
+    ------
+    InputError
+        With every frame that cannot be decoded, or the fault of the view.
+    """
+    frames = read_view(dome, light, merger.camera, white=white, digests=digests)
+    if faults := view_faults(dome, light, merger, frames, white=white):
+        raise InputError(faults)
+    return frames
 
 
 def disagreement(
-    where: str,
+    place: str,
     seconds: Mapping[str, float],
     frames: Sequence[Frame],
     sensor: SensorRecord,
@@ -127,30 +146,33 @@ def disagreement(
     """Fault of two neighbouring exposures with different radiance; `frames` are in the
     order of `seconds`.
     """
-    signals = [
-        relative_exposure(f, None if dark is None else dark[i], sensor)[0]
-        for i, f in enumerate(frames)
-    ]
-    by_time = sorted(
-        zip(seconds.items(), signals, frames, strict=True), key=lambda one: one[0][1]
+    rule = (
+        "exposures of one view must have the same radiance: check seconds, "
+        "black_level and response"
     )
-    for ((short, a), low, dim), ((long, b), high, bright) in pairwise(by_time):
+    cure = "assign the correct seconds and frames to each exposure"
+    exposures = [
+        (
+            seconds[name],
+            name,
+            relative_exposure(frame, None if dark is None else dark[i], sensor)[0],
+            frame,
+        )
+        for i, (name, frame) in enumerate(zip(seconds, frames, strict=True))
+    ]
+    exposures.sort(key=lambda exposure: exposure[0])
+    for (a, short, low, dim), (b, long, high, bright) in pairwise(exposures):
         ratio, apart = _radiance_ratio(sensor, (dim, low, a), (bright, high, b))
-        if np.isnan(ratio) or (
-            1 / MAX_RADIANCE_RATIO < ratio < MAX_RADIANCE_RATIO
-            and apart <= MAX_APART_FRACTION
-        ):
+        similar = 1 / MAX_RADIANCE_RATIO < ratio < MAX_RADIANCE_RATIO
+        if np.isnan(ratio) or (similar and apart <= MAX_APART_FRACTION):
             continue
-        rule = (
-            "exposures of one view must have the same radiance: check seconds, "
-            "black_level and response"
-        )
-        found = f"{short} ({a:.3g} s) has {ratio:.3g} times the radiance of {long} ({b:.3g} s)"
-        if 1 / MAX_RADIANCE_RATIO < ratio < MAX_RADIANCE_RATIO:
-            found = f"{short} and {long} differ in {apart:.0%} of the values that both must contain"
-        return Fault(
-            where, rule, found, "assign the correct seconds and frames to each exposure"
-        )
+        finding = f"{short} ({a:.3g} s) has {ratio:.3g} times the radiance of {long} ({b:.3g} s)"
+        if similar:
+            finding = (
+                f"{short} and {long} differ in {apart:.0%} of the values that both must "
+                "contain"
+            )
+        return Fault(place, rule, finding, cure)
     return None
 
 
@@ -169,37 +191,36 @@ def _radiance_ratio(
     # for a linear response
     slope = np.asarray([1 / (sensor.white - sensor.black)], np.float32)
     read = float(read_sigma(slope, sensor)[0])
-    least = max(MIN_SIGNAL, MIN_SIGNAL_DEVIATIONS * read)
+    minimum = max(MIN_SIGNAL, MIN_SIGNAL_DEVIATIONS * read)
     # the short one is noisier: near the limit it would select pixels that noise has raised
-    by_short = (dim < sensor.white) & (low > 2 * least) & (low * (b / a) < MAX_SIGNAL)
-    by_long = (bright < sensor.white) & (high < MAX_SIGNAL) & (high * (a / b) > least)
+    by_short = (dim < sensor.white) & (low > 2 * minimum) & (low * (b / a) < MAX_SIGNAL)
+    by_long = (bright < sensor.white) & (high < MAX_SIGNAL) & (high * (a / b) > minimum)
     good = by_short | by_long
     if good.sum() < MIN_RATIO_VALUES:
         return float("nan"), float("nan")
-    one = np.maximum(low[good], 0)
-    other = np.maximum(high[good] * np.float32(a / b), 0)
-    larger = np.maximum(one, other)
-    noise = (
-        MAX_BELOW_DEVIATIONS * np.sqrt(read**2 + larger / sensor.full_electrons)
-        + MIN_SIGNAL
-    )
-    apart = np.abs(one - other) > (MAX_RADIANCE_RATIO - 1) * larger + noise
-    return float(np.median(one / np.maximum(other, 1e-9))), float(apart.mean())
+    by_short_values = np.maximum(low[good], 0)
+    by_long_values = np.maximum(high[good] * np.float32(a / b), 0)
+    larger = np.maximum(by_short_values, by_long_values)
+    noise = MAX_BELOW_DEVIATIONS * np.sqrt(read**2 + larger / sensor.full_electrons)
+    limit = (MAX_RADIANCE_RATIO - 1) * larger + (noise + MIN_SIGNAL)
+    apart = np.abs(by_short_values - by_long_values) > limit
+    ratio = np.median(by_short_values / np.maximum(by_long_values, 1e-9))
+    return float(ratio), float(apart.mean())
 
 
 def _saturated_fault(
-    where: str, frames: Sequence[Frame], sensor: SensorRecord
+    place: str, frames: Sequence[Frame], sensor: SensorRecord
 ) -> Fault | None:
     """Fault of a picture that is at the white level everywhere, in every exposure."""
     if all((frame >= sensor.white).all() for frame in frames):
         rule = "a photograph must not be saturated everywhere"
         cure = "take it with a shorter exposure"
-        return Fault(where, rule, "no value below white_level", cure)
+        return Fault(place, rule, "no value below white_level", cure)
     return None
 
 
 def _below_fault(
-    where: str,
+    place: str,
     names: Sequence[str],
     frames: Sequence[Frame],
     dark: Sequence[Frame] | None,
@@ -212,27 +233,23 @@ def _below_fault(
         signal, slope = relative_exposure(
             frame, None if dark is None else dark[i], sensor
         )
-        below = float(
-            (
-                signal < -MAX_BELOW - MAX_BELOW_DEVIATIONS * read_sigma(slope, sensor)
-            ).mean()
-        )
+        limit = -MAX_BELOW - MAX_BELOW_DEVIATIONS * read_sigma(slope, sensor)
+        below = float((signal < limit).mean())
         if below > MAX_BELOW_FRACTION:
-            key = "black_level" if dark is None else "the dark frame"
+            reference = "black_level"
+            cure = "correct black_level"
+            if dark is not None:
+                reference = "the dark frame"
+                cure = "take the dark frames again, with the exposures of the face"
             rule = (
                 f"at most {MAX_BELOW_FRACTION:.0%} of a frame may be darker than "
-                f"{key}, beyond noise"
+                f"{reference}, beyond noise"
             )
-            cure = (
-                "correct black_level"
-                if dark is None
-                else "take the dark frames again, with the exposures of the face"
-            )
-            return Fault(where, rule, f"{below:.0%} of exposure {names[i]}", cure)
+            return Fault(place, rule, f"{below:.0%} of exposure {names[i]}", cure)
     return None
 
 
-def _linear_fault(where: str, frame: Frame) -> Fault | None:
+def _linear_fault(place: str, frame: Frame) -> Fault | None:
     """Fault of merged radiance that is negative or constant; zero is allowed, for
     lights behind the face.
     """
@@ -240,38 +257,27 @@ def _linear_fault(where: str, frame: Frame) -> Fault | None:
     low = float(np.min(frame, where=finite, initial=np.inf))
     high = float(np.max(frame, where=finite, initial=-np.inf))
     rule = "an OpenEXR frame must hold the radiance of a photograph"
-    cure = "merge the exposures of this view again"
     if not low <= high:
-        return Fault(where, rule, "no finite value", cure)
-    if max(-low, high) > MAX_MAGNITUDE:
-        return Fault(
-            where,
-            f"radiance must be at most {MAX_MAGNITUDE:g}",
-            f"{low:.3g} to {high:.3g}",
-            cure,
-        )
-    if low == high != 0:
-        return Fault(where, rule, f"{low:.3g} everywhere", cure)
-    if low < 0 and float((frame > 0).mean()) < MIN_POSITIVE_FRACTION:
-        return Fault(
-            where,
-            rule,
-            f"values from {low:.3g} to {high:.3g}, nearly all negative",
-            cure,
-        )
-    return None
+        finding = "no finite value"
+    elif max(-low, high) > MAX_MAGNITUDE:
+        rule = f"radiance must be at most {MAX_MAGNITUDE:g}"
+        finding = f"{low:.3g} to {high:.3g}"
+    elif low == high != 0:
+        finding = f"{low:.3g} everywhere"
+    elif low < 0 and float((frame > 0).mean()) < MIN_POSITIVE_FRACTION:
+        finding = f"values from {low:.3g} to {high:.3g}, nearly all negative"
+    else:
+        return None
+    return Fault(place, rule, finding, "merge the exposures of this view again")
 
 
 def highest_value(merger: FrameMerger, frames: Sequence[Frame]) -> tuple[float, bool]:
     """Highest value of the longest exposure of a view, and whether the picture is cut off there."""
-    frame = frames[int(np.argmax(merger.seconds))]
-    values = frame[:: _step(frame), :: _step(frame)]
+    values = _thinned(frames[int(np.argmax(merger.seconds))])
     highest = float(values.max())
     near = values > highest - 0.1 * (highest - merger.camera.sensor.black)
-    count = int((values == highest).sum())
-    return highest, count >= max(
-        MIN_CLIPPED_VALUES, MIN_CLIPPED_FRACTION * int(near.sum())
-    )
+    minimum = max(MIN_CLIPPED_VALUES, MIN_CLIPPED_FRACTION * int(near.sum()))
+    return highest, int((values == highest).sum()) >= minimum
 
 
 def level_notes(
@@ -289,30 +295,33 @@ def level_notes(
     notes = list[str]()
     for c, camera in enumerate(dome.cameras):
         sensor = camera.sensor
-        known = highest[np.isfinite(highest[:, c]), c]
-        if sensor.kind.bits == 0 or not len(known):
+        values = highest[np.isfinite(highest[:, c]), c]
+        if sensor.kind.bits == 0 or not len(values):
             continue
-        top = float(known.max())
-        used = (top - sensor.black) / (sensor.white - sensor.black)
-        said = f"camera {camera.id}: its photographs have values up to {top:g}"
-        if used > MAX_ABOVE_WHITE:
-            notes.append(
-                f"{said}, above white_level {sensor.white:g}, from which pixels "
+        top = float(values.max())
+        fraction = (top - sensor.black) / (sensor.white - sensor.black)
+        note = f"camera {camera.id}: its photographs have values up to {top:g}"
+        if fraction > MAX_ABOVE_WHITE:
+            note += (
+                f", above white_level {sensor.white:g}, from which pixels "
                 "count as saturated; correct it"
             )
-        elif used < MIN_USED_RANGE:
-            notes.append(
-                f"{said}, {used:.1%} of the range to white_level {sensor.white:g}; "
+        elif fraction < MIN_USED_RANGE:
+            note += (
+                f", {fraction:.1%} of the range to white_level {sensor.white:g}; "
                 "correct it, or expose longer"
             )
         elif (
             top < sensor.white
             and (clipped[:, c] & (highest[:, c] == top)).sum() >= MIN_CLIPPED_VIEWS
         ):
-            notes.append(
-                f"{said} and are cut off there; set white_level to it, so that "
+            note += (
+                " and are cut off there; set white_level to it, so that "
                 "these pixels count as saturated"
             )
+        else:
+            continue
+        notes.append(note)
     return notes
 
 
@@ -321,46 +330,41 @@ def dark_faults(dome: DomeRecord, merger: FrameMerger) -> list[Fault]:
     their camera.
     """
     faults = []
-    key = f"{dome.file}[dark]"
-    for i, (name, offset) in enumerate(_dark_offsets(dome, merger).items()):
-        said = f"exposure {name} of camera {merger.camera.id}"
-        if (
-            merger.dark is not None
-            and not merger.dark[i].any()
-            and merger.camera.sensor.black > 0
-        ):
+    black = merger.camera.sensor.black
+    for name, (frame, offset) in _dark_offsets(dome, merger).items():
+        exposure = (
+            f"exposure {name} of camera {merger.camera.id}, black_level {black:g}"
+        )
+        if black > 0 and not frame.any():
             rule = "dark frames must hold the values of black"
+            finding = f"0 everywhere, {exposure}"
             cure = "take them again, with the lens covered"
-            faults.append(
-                Fault(
-                    key,
-                    rule,
-                    f"0 everywhere, {said}, black_level {merger.camera.sensor.black:g}",
-                    cure,
-                )
-            )
         elif abs(offset) > MAX_DARK_OFFSET:
             rule = (
                 "dark frames and black_level must differ by at most "
                 f"{MAX_DARK_OFFSET:.0%} of the range"
             )
-            found = f"{offset:+.1%}, {said}, black_level {merger.camera.sensor.black:g}"
+            finding = f"{offset:+.1%}, {exposure}"
             cure = (
                 "set black_level to the camera's value without light, and cover the "
                 "lens for dark frames"
             )
-            faults.append(Fault(key, rule, found, cure))
+        else:
+            continue
+        faults.append(Fault(f"{dome.file}[dark]", rule, finding, cure))
     return faults
 
 
 def dark_notes(dome: DomeRecord, merger: FrameMerger) -> list[str]:
     """Warnings about dark frames that differ noticeably from the black level."""
-    worst = max(_dark_offsets(dome, merger).values(), key=abs, default=0.0)
-    said = (
+    offsets = [offset for _, offset in _dark_offsets(dome, merger).values()]
+    worst = max(offsets, key=abs, default=0.0)
+    if abs(worst) <= NOTED_DARK_OFFSET:
+        return []
+    return [
         f"dark frames of camera {merger.camera.id} differ from its black_level by "
         f"{worst:+.1%} of the range"
-    )
-    return [said] if abs(worst) > NOTED_DARK_OFFSET else []
+    ]
 
 
 def repeated_frame_faults(
@@ -383,32 +387,34 @@ def repeated_frame_faults(
         alike.setdefault(digests[path], []).append(path)
     rule = "every frame must have been taken by itself"
     cure = "copy the right frames from the camera again"
-    return [
-        Fault(
-            str(folder),
-            rule,
-            f"{first.relative_to(folder)} is a copy of {second.relative_to(folder)}",
-            cure,
-        )
-        for first, second in (same[:2] for same in alike.values() if len(same) > 1)
-        if np.ptp(read_frame(first)) > 0
-    ]
+    faults = []
+    for paths in alike.values():
+        if len(paths) > 1 and np.ptp(read_frame(paths[0])) > 0:
+            copy, original = (path.relative_to(folder) for path in paths[:2])
+            faults.append(
+                Fault(str(folder), rule, f"{copy} is a copy of {original}", cure)
+            )
+    return faults
 
 
-def _dark_offsets(dome: DomeRecord, merger: FrameMerger) -> dict[str, float]:
-    """Median of each dark frame above the black level, relative to the range of values."""
+def _dark_offsets(
+    dome: DomeRecord, merger: FrameMerger
+) -> dict[str, tuple[Frame, float]]:
+    """Each dark frame, and its median above the black level, relative to the range of values."""
     if merger.dark is None:
         return {}
     sensor = merger.camera.sensor
+    span = sensor.white - sensor.black
     return {
-        name: float(np.median(frame[:: _step(frame), :: _step(frame)]) - sensor.black)
-        / (sensor.white - sensor.black)
+        name: (frame, float(np.median(_thinned(frame)) - sensor.black) / span)
         for name, frame in zip(dome.exposures, merger.dark, strict=True)
     }
 
 
-def _step(frame: Frame) -> int:
-    return int(np.ceil(np.sqrt(frame.shape[0] * frame.shape[1] / MAX_COMPARED_PIXELS)))
+def _thinned(frame: Frame) -> Frame:
+    """At most `MAX_COMPARED_PIXELS` pixels of a frame, evenly spread."""
+    step = int(np.ceil(np.sqrt(frame.shape[0] * frame.shape[1] / MAX_COMPARED_PIXELS)))
+    return frame[::step, ::step]
 
 
 def dark_pattern_fault(
@@ -417,7 +423,9 @@ def dark_pattern_fault(
     """Fault of the dark frames of a camera that match its photographs only turned, or
     those of another camera.
 
-    Compared is the shortest exposure, in which the least light hides the pattern.
+    The fixed pattern of a sensor differs from pixel to pixel, so that even a small part
+    of it shows this. Compared is the shortest exposure, in which the least light hides
+    the pattern.
 
     Raises
     ------
@@ -428,39 +436,46 @@ def dark_pattern_fault(
     shortest = int(np.argmin(merger.seconds))
     if merger.dark is None:
         return None
-    step = -(
-        -merger.dark[shortest].shape[0] * merger.dark[shortest].shape[1] // MAX_PIXELS
-    )
-    lights = dome.lights[:: -(-len(dome.lights) // MAX_PHOTOGRAPHS)]
+    dark = merger.dark[shortest]
+    step = -(-dark.shape[0] * dark.shape[1] // MAX_PATTERN_PIXELS)
     exposure = [*dome.exposures][shortest]
     kind = merger.camera.sensor.kind
-    photographs = (
-        read_frame(dome.frame(light.id, camera, exposure), kind)[::step]
-        for light in lights
-    )
-    mean = np.mean(
-        [photograph.astype(np.float32) for photograph in photographs], axis=0
-    )
+    photographs = [
+        read_frame(dome.frame(light.id, camera, exposure), kind)[::step].astype(
+            np.float32
+        )
+        for light in dome.lights[:: -(-len(dome.lights) // MAX_PHOTOGRAPHS)]
+    ]
+    mean = np.mean(photographs, axis=0)
     inner = mean[:, 1:-1]
-    dark = inner <= np.quantile(inner, DARK_QUANTILE)
-    if dark.sum() < MIN_PIXELS:
+    chosen = inner <= np.quantile(inner, DARK_QUANTILE)
+    if chosen.sum() < MIN_PATTERN_PIXELS:
         return None
-    pattern = _pattern(mean, dark)
-    own = merger.dark[shortest][::step]
-    given = _correlation(pattern, _pattern(own, dark))
+    pattern = _pattern(mean, chosen)
+
+    def correlation(frame: Frame) -> float:
+        return _correlation(pattern, _pattern(frame, chosen))
+
     # neighbouring pixels may share noise, for example by the interpolation of colours
-    shifted = (np.roll(own, (5 * i, 7 * i), axis=(0, 1)) for i in range(1, SHIFTS + 1))
-    unrelated = [_correlation(pattern, _pattern(frame, dark)) for frame in shifted]
+    thinned = dark[::step]
+    unrelated = [
+        correlation(np.roll(thinned, (5 * i, 7 * i), axis=(0, 1)))
+        for i in range(1, SHIFTS + 1)
+    ]
     spread = max(float(np.std(unrelated)), 1 / np.sqrt(len(pattern)))
-    least = max(MIN_CORRELATION * spread, MIN_CORRELATION_RATIO * given)
-    for said, frame in _alternatives(camera, mergers, shortest):
-        if _correlation(pattern, _pattern(frame[::step], dark)) > least:
+    minimum = max(
+        MIN_CORRELATION * spread, MIN_CORRELATION_RATIO * correlation(thinned)
+    )
+    for finding, frame in _alternatives(camera, mergers, shortest):
+        if correlation(frame[::step]) > minimum:
             rule = "dark frames must show the pattern of the sensor where the photographs show it"
             cure = (
                 "write them like the photographs: in the same orientation, under the "
                 "id of their camera"
             )
-            return Fault(f"{dome.file}[dark]", rule, f"camera {camera}: {said}", cure)
+            return Fault(
+                f"{dome.file}[dark]", rule, f"camera {camera}: {finding}", cure
+            )
     return None
 
 
@@ -470,14 +485,15 @@ def _alternatives(
     """What the dark frames of a camera may be instead, each with the frame that would
     then be the right one.
     """
-    own = mergers[camera].dark
-    assert own is not None
-    yield "they look upside down", own[exposure][::-1, ::-1]
-    yield "they look mirrored", own[exposure][:, ::-1]
-    yield "they look mirrored top to bottom", own[exposure][::-1]
-    for name, other in mergers.items():
-        if name != camera and other.dark is not None and other.dark.shape == own.shape:
-            yield f"those of camera {name} match its photographs", other.dark[exposure]
+    dark = mergers[camera].dark
+    assert dark is not None
+    yield "they look upside down", dark[exposure][::-1, ::-1]
+    yield "they look mirrored", dark[exposure][:, ::-1]
+    yield "they look mirrored top to bottom", dark[exposure][::-1]
+    for name, merger in mergers.items():
+        other_dark = merger.dark
+        if name != camera and other_dark is not None and other_dark.shape == dark.shape:
+            yield f"those of camera {name} match its photographs", other_dark[exposure]
 
 
 def _pattern(frame: Frame | Array, chosen: NDArray[np.bool_]) -> Array:
@@ -486,13 +502,12 @@ def _pattern(frame: Frame | Array, chosen: NDArray[np.bool_]) -> Array:
     """
     values = frame.astype(np.float32)
     difference = (values[:, 1:-1] - (values[:, :-2] + values[:, 2:]) / 2)[chosen]
-    limit = MAX_DEVIATIONS * 1.4826 * np.median(np.abs(difference))
-    return np.asarray(np.clip(difference, -limit, limit))
+    limit = MAX_PATTERN_DEVIATIONS * 1.4826 * np.median(np.abs(difference))
+    return np.clip(difference, -limit, limit)
 
 
 def _correlation(a: Array, b: Array) -> float:
     """Pearson's correlation; 0 if one of the two is constant."""
-    first = a.astype(np.float64) - a.mean(dtype=np.float64)
-    second = b.astype(np.float64) - b.mean(dtype=np.float64)
-    product = float(np.sqrt((first @ first) * (second @ second)))
-    return float(first @ second) / product if product > 0 else 0.0
+    x, y = (v.astype(np.float64) - v.mean(dtype=np.float64) for v in (a, b))
+    product = float(np.sqrt((x @ x) * (y @ y)))
+    return float(x @ y) / product if product > 0 else 0.0

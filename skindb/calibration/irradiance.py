@@ -11,13 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb.calibration.frame_checks import view_faults
+from skindb.calibration.frame_checks import checked_view
 from skindb.calibration.pixel_flags import OK
-from skindb.calibration.radiance import FrameMerger, read_view
-from skindb.errors import Fault, InputError
+from skindb.calibration.radiance import FrameMerger
+from skindb.errors import attempt_all, require
 from skindb.format.dome import CameraRecord, DomeRecord, LightRecord, WhiteRecord
 from skindb.format.frames import Digests
-from skindb.geometry.camera import camera_centre, pixel_rays
 
 Array = NDArray[np.float64]
 
@@ -70,42 +69,30 @@ def light_intensities(
         cannot be decoded.
     """
     white = dome.white
-    targets = (
-        []
-        if white is None
-        else [target_pixels(c, white) for c in dome.cameras if c.id in white.cameras]
-    )
-    faults: list[Fault] = []
+    targets = []
+    if white is not None:
+        targets = [
+            target_pixels(c, white) for c in dome.cameras if c.id in white.cameras
+        ]
 
-    def one(light: LightRecord) -> Array:
+    def intensity(light: LightRecord) -> Array:
         if light.intensity is not None:
             return light.intensity
-        parts = [np.zeros((0, 3))]
-        try:
-            parts += [
-                _intensities(dome, light, mergers[target.camera], target, digests)
-                for target in targets
-            ]
-        except InputError as error:
-            faults.extend(error.faults)
-            return np.ones(3)
-        found = robust_mean(np.concatenate(parts))
-        if not (found > 0).all():
-            rule = "every light must illuminate the white target"
-            faults.append(
-                Fault(
-                    f"{dome.file}[lights], light {light.id}",
-                    rule,
-                    "no usable pixel",
-                    "check its position, or give its intensity",
-                )
-            )
-        return found
+        values = [np.zeros((0, 3))]
+        for target in targets:
+            merger = mergers[target.camera]
+            values.append(_intensities(dome, light, merger, target, digests))
+        mean = robust_mean(np.concatenate(values))
+        require(
+            (mean > 0).all(),
+            f"{dome.file}[lights], light {light.id}",
+            "every light must illuminate the white target",
+            "no usable pixel",
+            "check its position, or give its intensity",
+        )
+        return mean
 
-    intensities = np.array(list(pool.map(one, dome.lights)))
-    if faults:
-        raise InputError(sorted(faults, key=str))
-    return intensities
+    return np.array(attempt_all([], intensity, dome.lights, pool=pool))
 
 
 @dataclass(frozen=True)
@@ -122,56 +109,48 @@ class Target:
 def target_pixels(camera: CameraRecord, white: WhiteRecord) -> Target:
     """Pixels at which a camera sees the interior of the white target."""
     step = max(PIXELS_PER_BLOCK // camera.width, 1)
-    blocks = [
-        (first, min(first + step, camera.height))
-        for first in range(0, camera.height, step)
-    ]
-    parts = [_target_rows(camera, white, *block) for block in blocks]
-    inside = np.concatenate([part[0] for part in parts])
-    first = inside.argmax(axis=1)
-    last = camera.width - inside[:, ::-1].argmax(axis=1)
-    spans = np.stack([first, np.where(inside.any(axis=1), last, first)], axis=1)
-    return Target(
-        camera.id,
-        np.flatnonzero(inside),
-        spans,
-        np.concatenate([part[1] for part in parts]),
+    masks, points = zip(
+        *(
+            _target_rows(camera, white, top, min(top + step, camera.height))
+            for top in range(0, camera.height, step)
+        ),
+        strict=True,
     )
+    inside = np.concatenate(masks)
+    left = inside.argmax(axis=1)
+    right = camera.width - inside[:, ::-1].argmax(axis=1)
+    spans = np.stack([left, np.where(inside.any(axis=1), right, left)], axis=1)
+    return Target(camera.id, np.flatnonzero(inside), spans, np.concatenate(points))
 
 
 def _target_rows(
-    camera: CameraRecord, white: WhiteRecord, first: int, last: int
+    camera: CameraRecord, white: WhiteRecord, top: int, bottom: int
 ) -> tuple[NDArray[np.bool_], Array]:
-    """Mask (rows, width) of the pixels on the target in rows first to last - 1, and
+    """Mask (rows, width) of the pixels on the target in rows top to bottom - 1, and
     their points (n, 3) in mm.
     """
-    row, column = np.mgrid[first:last, : camera.width]
-    ray = pixel_rays(
-        np.stack([column, row], axis=-1) + 0.5, camera.K, camera.R, camera.distortion
-    )
-    centre = camera_centre(camera.R, camera.t)
+    row, column = np.mgrid[top:bottom, : camera.width]
+    ray = camera.rays(np.stack([column, row], axis=-1) + 0.5)
+    centre = camera.centre
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = (white.point - centre) @ white.normal / (ray @ white.normal)
         points = centre + distance[..., None] * ray
-        inside = (distance > 0) & (
-            np.linalg.norm(points - white.point, axis=-1)
-            < TARGET_INTERIOR_FRACTION * white.half_size
-        )
+        radius = np.linalg.norm(points - white.point, axis=-1)
+        inside = (distance > 0) & (radius < TARGET_INTERIOR_FRACTION * white.half_size)
     return inside, points[inside]
 
 
 def robust_mean(values: Array) -> Array:
     """Mean (c,) of values (n, c) without outliers; NaN if there are too few values."""
-    known = values[np.isfinite(values).all(axis=1)]
-    if len(known) < MIN_TARGET_PIXELS:
+    usable = values[np.isfinite(values).all(axis=1)]
+    if len(usable) < MIN_TARGET_PIXELS:
         return np.full(values.shape[1], np.nan)
-    known = np.ascontiguousarray(known.T)  # medians are taken along rows
-    middle = np.median(known, axis=1, keepdims=True)
-    apart = np.abs(known - middle)
-    good = (
-        apart <= MAX_DEVIATIONS * 1.4826 * np.median(apart, axis=1, keepdims=True)
-    ).all(axis=0)
-    return np.asarray(known[:, good].mean(axis=1) if good.any() else middle[:, 0])
+    columns = np.ascontiguousarray(usable.T)  # medians are taken along rows
+    middle = np.median(columns, axis=1, keepdims=True)
+    apart = np.abs(columns - middle)
+    spread = 1.4826 * np.median(apart, axis=1, keepdims=True)
+    good = (apart <= MAX_DEVIATIONS * spread).all(axis=0)
+    return columns[:, good].mean(axis=1) if good.any() else middle[:, 0]
 
 
 def _intensities(
@@ -185,31 +164,25 @@ def _intensities(
     white = dome.white
     if white is None or not len(target.at):
         return np.zeros((0, 3))
-    frames = read_view(dome, light.id, merger.camera, white=True, digests=digests)
-    if faults := view_faults(dome, light.id, merger, frames, white=True):
-        raise InputError(faults)
+    frames = checked_view(dome, light.id, merger, white=True, digests=digests)
     radiance, flag = merger.merge(frames, target.spans)
     square, falloff = light_falloff(light, target.points)
-    cosine = (
-        falloff * ((light.position - target.points) @ white.normal) / np.sqrt(square)
-    )
+    towards = (light.position - target.points) @ white.normal
+    cosine = falloff * towards / np.sqrt(square)
     usable = (cosine > MIN_COSINE_TARGET) & (flag.ravel()[target.at] == OK)
     factor = np.pi / white.reflectance * square[usable] / cosine[usable]
-    found = np.asarray(
-        radiance.reshape(-1, 3)[target.at[usable]] * factor[:, None], np.float64
+    values = radiance.reshape(-1, 3)[target.at[usable]] * factor[:, None]
+    variation = unevenness(values)
+    require(
+        not variation > MAX_UNEVENNESS,
+        f"{dome.file}[white]",
+        "the white target must be evenly bright: radiance * d^2 / cos varies by "
+        f"at most {MAX_UNEVENNESS:.0%}",
+        f"camera {merger.camera.id}, light {light.id}: by {variation:.0%}",
+        "point, normal and half_size must be those of the target, and its frames "
+        "must show it and not the face",
     )
-    if (uneven := unevenness(found)) > MAX_UNEVENNESS:
-        rule = (
-            "the white target must be evenly bright: radiance * d^2 / cos varies by "
-            f"at most {MAX_UNEVENNESS:.0%}"
-        )
-        cure = (
-            "point, normal and half_size must be those of the target, and its frames "
-            "must show it and not the face"
-        )
-        said = f"camera {merger.camera.id}, light {light.id}: by {uneven:.0%}"
-        raise InputError(Fault(f"{dome.file}[white]", rule, said, cure))
-    return found
+    return np.asarray(values, np.float64)
 
 
 def unevenness(values: Array) -> float:
@@ -221,11 +194,8 @@ def unevenness(values: Array) -> float:
     count = len(values) // PIXELS_PER_GROUP
     if count < MIN_TARGET_PIXELS:
         return 0.0
-    means = (
-        values[: count * PIXELS_PER_GROUP]
-        .reshape(count, PIXELS_PER_GROUP, -1)
-        .mean(axis=1)
-    )
+    groups = values[: count * PIXELS_PER_GROUP].reshape(count, PIXELS_PER_GROUP, -1)
+    means = groups.mean(axis=1)
     middle = np.median(means, axis=0)
     spread = 1.4826 * np.median(np.abs(means - middle), axis=0)
     return float((spread / np.maximum(np.abs(middle), 1e-300)).max())
@@ -277,22 +247,27 @@ def position_sensitivity(target: TargetPixels, *, falloff: float) -> float:
     """
 
     def mean(position: Array) -> float:
-        way = target.points - position
-        distance = np.linalg.norm(way, axis=1)
-        lit = -(way @ target.normal) / distance
-        angle = (way @ target.axis) / distance
-        known = (lit > MIN_COSINE) & (angle > MIN_COSINE)
-        return float(np.mean(np.log(distance**2 / (lit * angle**falloff)), where=known))
-
-    steps = np.eye(3) / 2  # mm
-    return float(
-        np.linalg.norm(
-            [
-                mean(target.position + step) - mean(target.position - step)
-                for step in steps
-            ]
+        distance, lit, angle = _light_geometry(target, position)
+        usable = (lit > MIN_COSINE) & (angle > MIN_COSINE)
+        return float(
+            np.mean(np.log(distance**2 / (lit * angle**falloff)), where=usable)
         )
-    )
+
+    position = target.position
+    half_mm = np.eye(3) / 2
+    gradient = [mean(position + step) - mean(position - step) for step in half_mm]
+    return float(np.linalg.norm(gradient))
+
+
+def _light_geometry(
+    target: TargetPixels, position: Array
+) -> tuple[Array, Array, Array]:
+    """Distance of the pixels (n,) from a light, and their cosines of incidence and of
+    the angle to the axis of the light.
+    """
+    way = target.points - position
+    distance = np.linalg.norm(way, axis=1)
+    return distance, -(way @ target.normal) / distance, (way @ target.axis) / distance
 
 
 def fit_light(target: TargetPixels, *, falloff: float | None = None) -> LightFit:
@@ -318,81 +293,64 @@ def fit_light(target: TargetPixels, *, falloff: float | None = None) -> LightFit
         Wrong shapes, too few usable pixels, or more than half of them in shadow.
     """
     radiance = np.asarray(target.radiance, np.float64)
-    if (
-        radiance.ndim != 2
-        or radiance.shape != np.shape(target.points)
-        or radiance.shape[1] != 3
-    ):
-        rule = "radiance and points must have the shape (pixel, 3)"
-        cure = "give one row for each pixel of the target"
-        raise InputError(
-            Fault(
-                "white target",
-                rule,
-                f"{radiance.shape} and {np.shape(target.points)}",
-                cure,
-            )
-        )
-    way = target.points - target.position
-    distance = np.linalg.norm(way, axis=1)
-    lit = -(way @ target.normal) / distance
-    angle = (way @ target.axis) / distance
+    require(
+        radiance.shape == np.shape(target.points) == (len(radiance), 3),
+        "white target",
+        "radiance and points must have the shape (pixel, 3)",
+        f"{radiance.shape} and {np.shape(target.points)}",
+        "give one row for each pixel of the target",
+    )
+    distance, lit, angle = _light_geometry(target, target.position)
     with np.errstate(invalid="ignore", divide="ignore"):
-        value = np.log(
-            np.pi * radiance * (distance**2 / (target.reflectance * lit))[:, None]
-        )
+        factor = distance**2 / (target.reflectance * lit)
+        value = np.log(np.pi * radiance * factor[:, None])
         slope = np.log(angle)
     good = (lit > MIN_COSINE) & (angle > MIN_COSINE) & np.isfinite(value).all(axis=1)
-    if good.sum() < MIN_PIXELS:
-        rule = f"at least {MIN_PIXELS} of its pixels must be lit and neither dark nor saturated"
-        raise InputError(
-            Fault(
-                "white target",
-                rule,
-                f"{int(good.sum())} of {len(good)}",
-                "add a suitable exposure",
-            )
-        )
+    require(
+        good.sum() >= MIN_PIXELS,
+        "white target",
+        f"at least {MIN_PIXELS} of its pixels must be lit and neither dark nor saturated",
+        f"{int(good.sum())} of {len(good)}",
+        "add a suitable exposure",
+    )
     return _fit(value[good], slope[good], falloff)
 
 
 def _fit(value: Array, slope: Array, falloff: float | None) -> LightFit:
     """Robust fit of logarithms (n, 3) over ln cosine (n,)."""
-    kept = np.ones(len(value), bool)
+    inliers = np.ones(len(value), bool)
     exponent = falloff or 0.0
     level = np.median(value - exponent * slope[:, None], axis=0)
     for _ in range(ROUNDS):
         apart = (value - level - exponent * slope[:, None]).mean(axis=1)
         spread = 1.4826 * float(np.median(np.abs(apart - np.median(apart))))
-        chosen = np.abs(apart - np.median(apart[kept])) <= MAX_DEVIATIONS * max(
-            spread, 1e-9
-        )
+        limit = MAX_DEVIATIONS * max(spread, 1e-9)
+        chosen = np.abs(apart - np.median(apart[inliers])) <= limit
         centred = slope[chosen] - slope[chosen].mean()
+        square = max(float(centred @ centred), 1e-12)
         if falloff is None:
-            exponent = float(centred @ value[chosen].mean(axis=1)) / max(
-                float(centred @ centred), 1e-12
-            )
+            exponent = float(centred @ value[chosen].mean(axis=1)) / square
         level = value[chosen].mean(axis=0) - exponent * slope[chosen].mean()
-        if (chosen == kept).all():
+        if (chosen == inliers).all():
             break
-        kept = chosen
-    used = float(kept.mean())
-    if used < MIN_USED:
-        rule = "less than half of the white target may lie in shadow"
-        cure = "move the target, or remove the obstacle"
-        raise InputError(Fault("white target", rule, f"{used:.0%} agree", cure))
-    residual = value[kept] - level - exponent * slope[kept, None]
-    count = int(kept.sum())
-    common = float(residual.mean(axis=1).std(ddof=2))
-    centred = slope[kept] - slope[kept].mean()
-    exponent_error = (
-        0.0
-        if falloff is not None
-        else common / np.sqrt(max(float(centred @ centred), 1e-12))
+        inliers = chosen
+    inlier_fraction = float(inliers.mean())
+    require(
+        inlier_fraction >= MIN_USED,
+        "white target",
+        "less than half of the white target may lie in shadow",
+        f"{inlier_fraction:.0%} agree",
+        "move the target, or remove the obstacle",
     )
+    residual = value[inliers] - level - exponent * slope[inliers, None]
+    exponent_error = 0.0
+    if falloff is None:
+        centred = slope[inliers] - slope[inliers].mean()
+        common = float(residual.mean(axis=1).std(ddof=2))
+        exponent_error = common / np.sqrt(max(float(centred @ centred), 1e-12))
     error = np.hypot(
-        residual.std(axis=0, ddof=1) / np.sqrt(count),
-        exponent_error * slope[kept].mean(),
+        residual.std(axis=0, ddof=1) / np.sqrt(len(residual)),
+        exponent_error * slope[inliers].mean(),
     )
     intensity = np.exp(level)
     return LightFit(
@@ -400,6 +358,6 @@ def _fit(value: Array, slope: Array, falloff: float | None) -> LightFit:
         intensity * error,
         exponent,
         float(exponent_error),
-        used,
+        inlier_fraction,
         float(residual.std()),
     )

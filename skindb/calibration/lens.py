@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import optimize, special
 
-from skindb.errors import Fault, InputError
+from skindb.errors import require
 
 Array = NDArray[np.float64]
 
@@ -67,13 +67,13 @@ def fit_edge(picture: ArrayLike) -> EdgeFit:
         The picture is too small, not finite, has no edge, or the edge is not slanted.
     """
     grey = np.asarray(picture, np.float64)
-    if grey.ndim != 2 or min(grey.shape) < 16 or not np.isfinite(grey).all():
-        rule = "its picture must be finite and have 16 px or more on each side"
-        raise InputError(
-            Fault(
-                "slanted edge", rule, str(grey.shape), "select more, without saturation"
-            )
-        )
+    require(
+        grey.ndim == 2 and min(grey.shape) >= 16 and np.isfinite(grey).all(),
+        "slanted edge",
+        "its picture must be finite and have 16 px or more on each side",
+        str(grey.shape),
+        "select more, without saturation",
+    )
     start, slant = _locate(grey)
     row, column = np.mgrid[: grey.shape[0], : grey.shape[1]] + 0.5
     middle = grey.shape[0] / 2
@@ -97,21 +97,15 @@ def fit_edge(picture: ArrayLike) -> EdgeFit:
             [np.inf, 1, EDGE_REACH_PX, np.inf, np.inf],
         ),
     )
+    _, slant, blur, dark, contrast = map(float, fit.x)
     variance = 2 * fit.cost / max(len(value) - 5, 1)
-    error = float(np.sqrt(variance * np.linalg.pinv(fit.jac.T @ fit.jac)[2, 2]))
-    if not fit.x[4] > MIN_CONTRAST_TO_NOISE * np.sqrt(variance):
-        raise InputError(
-            _no_edge(
-                f"a contrast of {fit.x[4]:.3g} over noise of {np.sqrt(variance):.3g}"
-            )
-        )
-    return EdgeFit(
-        float(fit.x[2]),
-        error,
-        float(fit.x[3]),
-        float(fit.x[3] + fit.x[4]),
-        float(fit.x[1]),
+    noise = np.sqrt(variance)
+    _require_edge(
+        contrast > MIN_CONTRAST_TO_NOISE * noise,
+        f"a contrast of {contrast:.3g} over noise of {noise:.3g}",
     )
+    error = np.sqrt(variance * np.linalg.pinv(fit.jac.T @ fit.jac)[2, 2])
+    return EdgeFit(blur, float(error), dark, dark + contrast, slant)
 
 
 def veiling_glare(edge: EdgeFit, *, mean: float, contrast: float = 0.0) -> float:
@@ -136,17 +130,14 @@ def veiling_glare(edge: EdgeFit, *, mean: float, contrast: float = 0.0) -> float
     InputError
         `mean` is not positive, or `contrast` is not in [0, 1).
     """
-    if not (mean > 0 and 0 <= contrast < 1):
-        rule = "the mean must be positive, and the contrast at least 0 and below 1"
-        raise InputError(
-            Fault(
-                "veiling glare",
-                rule,
-                f"{mean:g} and {contrast:g}",
-                "measure both on linear frames",
-            )
-        )
-    return float((edge.dark - contrast * edge.bright) / (mean * (1 - contrast)))
+    require(
+        mean > 0 and 0 <= contrast < 1,
+        "veiling glare",
+        "the mean must be positive, and the contrast at least 0 and below 1",
+        f"{mean:g} and {contrast:g}",
+        "measure both on linear frames",
+    )
+    return (edge.dark - contrast * edge.bright) / (mean * (1 - contrast))
 
 
 def _locate(grey: Array) -> tuple[float, float]:
@@ -155,36 +146,26 @@ def _locate(grey: Array) -> tuple[float, float]:
     """
     smooth = np.apply_along_axis(np.convolve, 1, grey, np.ones(5) / 5, mode="valid")
     steep = np.abs(smooth[:, 4:] - smooth[:, :-4])
-    place = steep.argmax(axis=1) + 4.5
+    column = steep.argmax(axis=1) + 4.5
     row = np.arange(grey.shape[0]) + 0.5 - grey.shape[0] / 2
-    pairs = np.arange(len(row) // 2)
+    half = len(row) // 2
     # robust slope (Theil)
-    slant = float(
-        np.median((place[pairs + len(row) // 2] - place[pairs]) / (len(row) // 2))
+    slant = float(np.median((column[half : 2 * half] - column[:half]) / half))
+    start = float(np.median(column - slant * row))
+    scatter = float(np.median(np.abs(column - slant * row - start)))
+    degrees = np.degrees(np.arctan(slant))
+    _require_edge(steep.max() != 0, "a uniform picture")
+    _require_edge(not scatter > 2, "no straight edge")
+    _require_edge(
+        MIN_SLANT < abs(slant) < 1, f"an edge that is slanted by {degrees:.1f} degrees"
     )
-    start = float(np.median(place - slant * row))
-    scatter = float(np.median(np.abs(place - slant * row - start)))
-    if steep.max() == 0 or scatter > 2:
-        raise InputError(
-            _no_edge("a uniform picture" if steep.max() == 0 else "no straight edge")
-        )
-    if not MIN_SLANT < abs(slant) < 1:
-        raise InputError(
-            _no_edge(
-                f"an edge that is slanted by {np.degrees(np.arctan(slant)):.1f} degrees"
-            )
-        )
     return start, slant
 
 
-def _no_edge(found: str) -> Fault:
+def _require_edge(satisfied: object, finding: str) -> None:
     rule = "the picture must show one edge that is slanted by 2 to 45 degrees from the columns"
-    return Fault(
-        "slanted edge",
-        rule,
-        found,
-        "turn the edge by about 5 degrees, and select the edge alone",
-    )
+    cure = "turn the edge by about 5 degrees, and select the edge alone"
+    require(satisfied, "slanted edge", rule, finding, cure)
 
 
 @dataclass(frozen=True)
@@ -224,45 +205,43 @@ def fit_vignette(flat: ArrayLike, centre: ArrayLike) -> Vignette:
     """
     picture = np.asarray(flat, np.float64)
     middle = np.asarray(centre, np.float64)
-    if picture.ndim != 2:
-        rule = "it must have the shape (height, width)"
-        cure = "fit one channel, or the mean of the channels"
-        raise InputError(Fault("flat frame", rule, str(picture.shape), cure))
+    require(
+        picture.ndim == 2,
+        "flat frame",
+        "it must have the shape (height, width)",
+        str(picture.shape),
+        "fit one channel, or the mean of the channels",
+    )
     row, column = np.nonzero(np.isfinite(picture) & (picture > 0))
     half = np.hypot(*picture.shape) / 2
     x = (column + 0.5 - middle[0]) / half
     y = (row + 0.5 - middle[1]) / half
     r2 = x**2 + y**2
-    if len(r2) < MIN_PIXELS or r2.max() < MIN_REACH**2:
-        rule = (
-            f"at least {MIN_PIXELS} pixels must be usable, some of them {MIN_REACH} "
-            "half diagonals from the centre"
-        )
-        found = (
-            f"{len(r2)} pixels, up to {np.sqrt(r2.max(initial=0)):.2f} half diagonals"
-        )
-        raise InputError(
-            Fault(
-                "flat frame",
-                rule,
-                found,
-                "fill the picture with the surface, and avoid saturation",
-            )
-        )
+    reach2 = r2.max(initial=0)
+    require(
+        len(r2) >= MIN_PIXELS and reach2 >= MIN_REACH**2,
+        "flat frame",
+        f"at least {MIN_PIXELS} pixels must be usable, some of them {MIN_REACH} "
+        "half diagonals from the centre",
+        f"{len(r2)} pixels, up to {np.sqrt(reach2):.2f} half diagonals",
+        "fill the picture with the surface, and avoid saturation",
+    )
     value = picture[row, column]
     design = np.stack([np.ones_like(x), x, y, r2, r2**2, r2**3], axis=1)
-    kept = np.ones(len(value), bool)
+    inliers = np.ones(len(value), bool)
     for _ in range(ROUNDS):
-        solution = np.linalg.lstsq(design[kept], value[kept], rcond=None)[0]
-        apart = value - design @ solution
-        spread = 1.4826 * float(np.median(np.abs(apart[kept])))
-        kept = np.abs(apart) <= MAX_DEVIATIONS * max(spread, 1e-12 * abs(solution[0]))
-    misfit = float(np.sqrt(np.mean(apart[kept] ** 2)))
-    inverse = misfit**2 * np.linalg.inv(design[kept].T @ design[kept])
+        solution = np.linalg.lstsq(design[inliers], value[inliers], rcond=None)[0]
+        residual = value - design @ solution
+        spread = 1.4826 * float(np.median(np.abs(residual[inliers])))
+        limit = MAX_DEVIATIONS * max(spread, 1e-12 * abs(solution[0]))
+        inliers = np.abs(residual) <= limit
+    misfit = float(np.sqrt(np.mean(residual[inliers] ** 2)))
+    inverse = misfit**2 * np.linalg.inv(design[inliers].T @ design[inliers])
     level = solution[0]
-    found = solution[3:] / solution[0]
+    coefficients = solution[3:] / level
     # covariance of the ratio of the coefficients to the level at the centre
-    slope = np.hstack([-found[:, None] / level, np.zeros((3, 2)), np.eye(3) / level])
-    return Vignette(
-        found, slope @ inverse @ slope.T, misfit / abs(level), float(kept.mean())
-    )
+    by_level = -coefficients[:, None] / level
+    slope = np.hstack([by_level, np.zeros((3, 2)), np.eye(3) / level])
+    covariance = slope @ inverse @ slope.T
+    inlier_fraction = float(inliers.mean())
+    return Vignette(coefficients, covariance, misfit / abs(level), inlier_fraction)

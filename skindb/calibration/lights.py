@@ -7,12 +7,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from skindb.calibration.frame_checks import view_faults
+from skindb.calibration.frame_checks import checked_view
 from skindb.calibration.irradiance import (
     TARGET_INTERIOR_FRACTION,
     LightFit,
@@ -25,16 +26,15 @@ from skindb.calibration.irradiance import (
 from skindb.calibration.mirror_ball import (
     LightPosition,
     Outline,
-    Pinhole,
     ball_centre,
     highlight_centre,
     light_position,
     reflected_ray,
 )
 from skindb.calibration.pixel_flags import OK, SATURATED
-from skindb.calibration.radiance import FrameMerger, frame_mergers, read_view
-from skindb.calibration.setup import PLACE, BallFrames
-from skindb.errors import Fault, InputError
+from skindb.calibration.radiance import FrameMerger, frame_mergers
+from skindb.calibration.setup import PLACE, BallFrames, of_devices
+from skindb.errors import Fault, InputError, attempt, attempt_all, require
 from skindb.format.dome import (
     CameraRecord,
     DomeRecord,
@@ -55,17 +55,6 @@ POSITION_ERROR_MM = 1.0
 # corners
 BESIDE_TARGET = 1.05
 THREADS = 2
-
-
-@dataclass(frozen=True)
-class _Calibrated:
-    """Fit of a light, the relative error by positions, and the light beside the target
-    over that on the target.
-    """
-
-    fit: LightFit
-    position_error: float
-    beside: float
 
 
 def calibrate_lights(
@@ -104,49 +93,42 @@ def calibrate_lights(
         With every light that does not illuminate the target, and every frame that
         cannot be decoded.
     """
+    white = dome.white
+    if white is None:
+        rule = "a calibration needs one"
+        raise InputError(Fault("white target", rule, "none", "photograph it"))
     faults = list[Fault]()
     mergers = frame_mergers(dome, faults)
-    own = () if dome.white is None else dome.white.cameras
     views = [
-        _view(c, mergers[c.id], dome.white)
-        for c in dome.cameras
-        if dome.white is not None and c.id in own
+        _view(camera, mergers[camera.id], white)
+        for camera in dome.cameras
+        if camera.id in white.cameras
     ]
 
-    def one(light: LightRecord) -> _Calibrated | None:
-        try:
-            pixels, beside = _pixels(dome, light, views)
-            fit = fit_light(pixels, falloff=None if fit_falloff else light.falloff)
-            return _Calibrated(
-                fit,
-                position_error * position_sensitivity(pixels, falloff=fit.falloff),
-                beside,
-            )
-        except InputError as error:
-            where = f"{dome.file}[lights], light {light.id}"
-            faults.extend(
-                Fault(f"{where}: {fault.where}", fault.rule, fault.found, fault.cure)
-                for fault in error.faults
-            )
-            return None
+    def calibrated(light: LightRecord) -> tuple[LightFit, float, float]:
+        """Fit of a light, the relative error by positions, and the light beside the
+        target over that on the target.
+        """
+        pixels, beside = _pixels(dome, white, light, views)
+        fit = fit_light(pixels, falloff=None if fit_falloff else light.falloff)
+        sensitivity = position_sensitivity(pixels, falloff=fit.falloff)
+        return fit, position_error * sensitivity, beside
 
     with ThreadPoolExecutor(THREADS) as pool:
-        found = [
-            one_light
-            for one_light in pool.map(one, dome.lights)
-            if one_light is not None
-        ]
-    if faults:
-        raise InputError(sorted(faults, key=str))
-    fits = [one_light.fit for one_light in found]
+        results = attempt_all(
+            faults,
+            calibrated,
+            dome.lights,
+            pool=pool,
+            where=lambda light: f"{dome.file}[lights], light {light.id}: {{}}",
+        )
+    fits, position_errors, glare = zip(*results, strict=True)
     return dataset(
         {
             "calibrated_intensity": [fit.intensity for fit in fits],
             "calibrated_intensity_error": [fit.intensity_error for fit in fits],
-            "calibrated_intensity_position_error": [
-                one_light.position_error for one_light in found
-            ],
-            "glare_fraction": [one_light.beside for one_light in found],
+            "calibrated_intensity_position_error": list(position_errors),
+            "glare_fraction": list(glare),
             "calibrated_falloff": [fit.falloff for fit in fits],
             "calibrated_falloff_error": [fit.falloff_error for fit in fits],
             "target_used_fraction": [fit.used for fit in fits],
@@ -172,14 +154,9 @@ class _View:
 
 def _view(camera: CameraRecord, merger: FrameMerger, white: WhiteRecord) -> _View:
     target = target_pixels(camera, white)
+    corner = BESIDE_TARGET * np.sqrt(2) * white.half_size
+    near = replace(white, half_size=corner / TARGET_INTERIOR_FRACTION)
     beside = np.ones(camera.height * camera.width, bool)
-    near = replace(
-        white,
-        half_size=BESIDE_TARGET
-        * np.sqrt(2)
-        * white.half_size
-        / TARGET_INTERIOR_FRACTION,
-    )
     beside[target_pixels(camera, near).at] = False
     square_over_disc = 4 / (np.pi * TARGET_INTERIOR_FRACTION**2)
     return _View(
@@ -191,41 +168,29 @@ def _view(camera: CameraRecord, merger: FrameMerger, white: WhiteRecord) -> _Vie
 
 
 def _pixels(
-    dome: DomeRecord, light: LightRecord, views: list[_View]
+    dome: DomeRecord, white: WhiteRecord, light: LightRecord, views: list[_View]
 ) -> tuple[TargetPixels, float]:
     """Pixels of the target under one light, of all cameras together, and the fraction
     of light beside the target.
     """
-    white = dome.white
-    if white is None:
-        raise InputError(
-            Fault("white target", "a calibration needs one", "none", "photograph it")
-        )
-    radiance = list[NDArray[np.float64]]()
-    points = list[NDArray[np.float64]]()
+    radiance = [np.zeros((0, 3))]
+    points = [np.zeros((0, 3))]
     beside = [0.0]
     for view in views:
-        frames = read_view(dome, light.id, view.merger.camera, white=True)
-        if faults := view_faults(dome, light.id, view.merger, frames, white=True):
-            raise InputError(faults)
+        frames = checked_view(dome, light.id, view.merger, white=True)
         merged, flag = view.merger.merge(frames)
-        at = view.target.at
-        known = flag.ravel()[at] == OK
-        radiance.append(
-            np.where(known[:, None], merged.reshape(-1, 3)[at], np.nan).astype(
-                np.float64
-            )
-        )
+        usable = flag.ravel()[view.target.at] == OK
+        values = merged.reshape(-1, 3)[view.target.at].astype(np.float64)
+        values[~usable] = np.nan
+        radiance.append(values)
         points.append(view.target.points)
-        if known.any():
-            scattered = (
-                np.nansum(merged[view.beside & (flag != SATURATED)], dtype=np.float64)
-                / 3
-            )
-            beside.append(scattered / (float(np.nanmean(radiance[-1])) * view.area))
+        if usable.any():
+            scattered = merged[view.beside & (flag != SATURATED)]
+            total = np.nansum(scattered, dtype=np.float64) / 3
+            beside.append(total / (float(np.nanmean(values)) * view.area))
     pixels = TargetPixels(
-        np.concatenate(radiance) if radiance else np.zeros((0, 3)),
-        np.concatenate(points) if points else np.zeros((0, 3)),
+        np.concatenate(radiance),
+        np.concatenate(points),
         light.position,
         light.axis,
         white.normal,
@@ -244,29 +209,17 @@ def calibrated_dome(
     InputError
         If the calibration lacks a light.
     """
-    known = calibration.load()
-    names = set(map(str, known["light"].values))
-    if missing := [light.id for light in dome.lights if light.id not in names]:
-        found = f"none of {', '.join(missing[:5])}"
-        raise InputError(
-            Fault(
-                where,
-                "a calibration must have every light of the capture",
-                found,
-                "calibrate again",
-            )
+    ids = [light.id for light in dome.lights]
+    lights = of_devices(calibration, "light", ids, where=where)
+    intensities = lights["calibrated_intensity"].values
+    exponents = lights["calibrated_falloff"].values
+    calibrated = (
+        replace(light, intensity=intensity, falloff=float(exponent))
+        for light, intensity, exponent in zip(
+            dome.lights, intensities, exponents, strict=True
         )
-    intensity = known["calibrated_intensity"]
-    falloff = known["calibrated_falloff"]
-    lights = (
-        replace(
-            light,
-            intensity=intensity.sel(light=light.id).values,
-            falloff=float(falloff.sel(light=light.id)),
-        )
-        for light in dome.lights
     )
-    return replace(dome, lights=tuple(lights))
+    return replace(dome, lights=tuple(calibrated))
 
 
 def calibrate_positions(dome: DomeRecord, ball: BallFrames) -> xr.Dataset:
@@ -286,54 +239,48 @@ def calibrate_positions(dome: DomeRecord, ball: BallFrames) -> xr.Dataset:
     InputError
         With every frame that cannot be read, and every light that is seen in fewer than two frames.
     """
-    cameras = {
-        camera.id: Pinhole(camera.K, camera.R, camera.t, camera.distortion)
-        for camera in dome.cameras
-    }
+    cameras = {camera.id: camera for camera in dome.cameras}
     centres = dict[str, Array]()
-    for place, circles in ball.outlines.items():
-        try:
-            seen = [cameras[name] for name in circles]
-            centres[place] = ball_centre(
-                seen, list(circles.values()), ball.radius
-            ).centre
-        except InputError as error:
-            raise InputError(
-                [
-                    replace(fault, where=f"{fault.where}, place {place}")
-                    for fault in error.faults
-                ]
-            ) from None
     faults = list[Fault]()
+    for place, circles in ball.outlines.items():
+        views = [cameras[name] for name in circles]
+        centre = attempt(
+            faults,
+            partial(ball_centre, views, list(circles.values()), ball.radius),
+            where=f"{{}}, place {place}",
+        )
+        if centre is None:
+            raise InputError(faults)
+        centres[place] = centre.centre
 
-    def one(light: LightRecord) -> tuple[LightPosition | None, int]:
-        try:
-            rays = list(_rays(dome, ball, centres, light))
-            if len(rays) < 2:
-                rule = "its highlight must appear in two frames"
-                cure = "expose them longer, or add a place of the ball"
-                raise InputError(Fault("mirror ball", rule, f"{len(rays)}", cure))
-            return light_position(*zip(*rays, strict=True)), len(rays)
-        except InputError as error:
-            faults.extend(
-                replace(fault, where=f"light {light.id}, {fault.where}")
-                for fault in error.faults
-            )
-            return None, 0
+    def calibrated(light: LightRecord) -> tuple[LightPosition, int]:
+        rays = list(_rays(dome, ball, centres, light))
+        require(
+            len(rays) >= 2,
+            "mirror ball",
+            "its highlight must appear in two frames",
+            f"{len(rays)}",
+            "expose them longer, or add a place of the ball",
+        )
+        return light_position(*zip(*rays, strict=True)), len(rays)
 
     with ThreadPoolExecutor(THREADS) as pool:
-        pairs = list(pool.map(one, dome.lights))
-    if faults:
-        raise InputError(sorted(faults, key=str))
-    found = [position for position, _ in pairs if position is not None]
+        results = attempt_all(
+            faults,
+            calibrated,
+            dome.lights,
+            pool=pool,
+            where=lambda light: f"light {light.id}, {{}}",
+        )
+    positions, counts = zip(*results, strict=True)
     return dataset(
         {
-            "calibrated_position": [one.position for one in found],
+            "calibrated_position": [fit.position for fit in positions],
             "calibrated_position_error": [
-                np.sqrt(np.diag(one.covariance)) for one in found
+                np.sqrt(np.diag(fit.covariance)) for fit in positions
             ],
-            "position_ray_count": [count for _, count in pairs],
-            "position_miss": [np.sqrt(np.mean(one.miss**2)) for one in found],
+            "position_ray_count": list(counts),
+            "position_miss": [np.sqrt(np.mean(fit.miss**2)) for fit in positions],
         },
         coords={"light": [light.id for light in dome.lights], "xyz": ["x", "y", "z"]},
     )
@@ -350,18 +297,13 @@ def _rays(
             if camera.id not in circles:
                 continue
             names = {PLACE: place, LIGHT: light.id, CAMERA: camera.id}
-            frame = read_frame(
-                ball.folder / filled(ball.frames, **names), camera.sensor.kind
-            )
+            file = ball.folder / filled(ball.frames, **names)
+            frame = read_frame(file, camera.sensor.kind)
             column, row, radius = circles[camera.id]
-            try:
-                highlight = highlight_centre(
-                    frame, Outline(np.array([column, row]), radius)
-                )
-            except InputError:
-                continue
-            pinhole = Pinhole(camera.K, camera.R, camera.t, camera.distortion)
-            yield reflected_ray(pinhole, centres[place], ball.radius, highlight)
+            outline = Outline(np.array([column, row]), radius)
+            highlight = attempt([], partial(highlight_centre, frame, outline))
+            if highlight is not None:
+                yield reflected_ray(camera, centres[place], ball.radius, highlight)
 
 
 def positioned_dome(
@@ -374,20 +316,12 @@ def positioned_dome(
     InputError
         If the calibration lacks a light.
     """
-    known = calibration["calibrated_position"].load()
-    names = set(map(str, known["light"].values))
-    if missing := [light.id for light in dome.lights if light.id not in names]:
-        found = f"none of {', '.join(missing[:5])}"
-        raise InputError(
-            Fault(
-                where,
-                "a calibration must have every light of the capture",
-                found,
-                "calibrate again",
-            )
-        )
+    ids = [light.id for light in dome.lights]
+    positions = of_devices(calibration, "light", ids, where=where)[
+        "calibrated_position"
+    ]
     lights = (
-        replace(light, position=known.sel(light=light.id).values)
-        for light in dome.lights
+        replace(light, position=position)
+        for light, position in zip(dome.lights, positions.values, strict=True)
     )
     return replace(dome, lights=tuple(lights))

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from skindb.errors import Fault, InputError
-from skindb.geometry.camera import camera_centre, pixel_rays, project
+from skindb.errors import require
+from skindb.format.dome import Pinhole
 
 Array = NDArray[np.float64]
 # of the contrast over the ball; pixels above it belong to the highlight
@@ -36,16 +36,6 @@ class Outline:
 
     centre: Array
     radius: float
-
-
-@dataclass(frozen=True)
-class Pinhole:
-    """A camera `x_cam = R x + t`: K (3, 3) px, R (3, 3), t (3,) mm, distortion (5,)."""
-
-    K: Array
-    R: Array
-    t: Array
-    distortion: Array
 
 
 @dataclass(frozen=True)
@@ -89,25 +79,19 @@ def ball_outline(mask: ArrayLike) -> Outline:
     InputError
         The mask is empty, or not round.
     """
-    inside = np.asarray(mask, bool)
-    row, column = np.nonzero(inside)
+    row, column = np.nonzero(np.asarray(mask, bool))
     area = len(row)
-    if area:
-        radius = float(np.sqrt(area / np.pi))
-        centre = np.array([column.mean(), row.mean()]) + 0.5
-        far = float(np.hypot(column + 0.5 - centre[0], row + 0.5 - centre[1]).max())
-        if far < 1.1 * radius + 1:
-            return Outline(centre, radius)
-    rule = "the mask of the mirror ball must be one disc"
-    cure = "draw it again, without the stand of the ball"
-    raise InputError(
-        Fault(
-            "mirror ball",
-            rule,
-            f"{area} pixels that do not fill a disc" if area else "nothing",
-            cure,
-        )
+    radius = float(np.sqrt(area / np.pi))
+    centre = np.array([column.sum(), row.sum()]) / max(area, 1) + 0.5
+    away = np.hypot(column + 0.5 - centre[0], row + 0.5 - centre[1])
+    require(
+        area and away.max() < 1.1 * radius + 1,
+        "mirror ball",
+        "the mask of the mirror ball must be one disc",
+        f"{area} pixels that do not fill a disc" if area else "nothing",
+        "draw it again, without the stand of the ball",
     )
+    return Outline(centre, radius)
 
 
 def highlight_centre(picture: ArrayLike, outline: Outline) -> Array:
@@ -128,42 +112,34 @@ def highlight_centre(picture: ArrayLike, outline: Outline) -> Array:
     grey = np.asarray(picture, np.float64)
     grey = grey.mean(axis=-1) if grey.ndim == 3 else grey
     row, column = np.mgrid[: grey.shape[0], : grey.shape[1]] + 0.5
-    ball = (
-        np.hypot(column - outline.centre[0], row - outline.centre[1]) < outline.radius
+    x, y = outline.centre
+    ball = np.hypot(column - x, row - y) < outline.radius
+    values = grey[ball]
+    finite = len(values) > 0 and bool(np.isfinite(values).all())
+    low = float(np.median(values)) if finite else 0.0
+    high = float(values.max()) if finite else 0.0
+    require(
+        high > low,
+        "mirror ball",
+        "the mirror ball must show a highlight",
+        "a uniform picture" if finite else "no finite values",
+        "check its position in the picture, or expose it longer",
     )
-    known = bool(ball.any()) and bool(np.isfinite(grey[ball]).all())
-    low, high = (
-        (float(np.median(grey[ball])), float(grey[ball].max())) if known else (0.0, 0.0)
-    )
-    if not high > low:
-        rule = "the mirror ball must show a highlight"
-        cure = "check its position in the picture, or expose it longer"
-        raise InputError(
-            Fault(
-                "mirror ball",
-                rule,
-                "a uniform picture" if known else "no finite values",
-                cure,
-            )
-        )
     level = low + HIGHLIGHT_FRACTION * (high - low)
     labels, _ = ndimage.label(ball & (grey >= level))
     sizes = np.bincount(labels.ravel())[1:]
-    spot = labels == 1 + int(sizes.argmax())
-    if sizes.max() > MAX_HIGHLIGHT_FRACTION * ball.sum():
-        rule = (
-            f"the highlight must cover at most {MAX_HIGHLIGHT_FRACTION:.0%} of the ball"
-        )
-        found = f"{sizes.max() / ball.sum():.0%}"
-        cure = "expose the frame shorter, and darken the room"
-        raise InputError(Fault("mirror ball", rule, found, cure))
-    near = ball & ndimage.binary_dilation(spot, iterations=HIGHLIGHT_MARGIN)
-    row = row[near]
-    column = column[near]
-    weight = np.maximum(grey[near] - low, 0)
-    return np.array(
-        [np.average(column, weights=weight), np.average(row, weights=weight)]
+    fraction = sizes.max() / ball.sum()
+    require(
+        fraction <= MAX_HIGHLIGHT_FRACTION,
+        "mirror ball",
+        f"the highlight must cover at most {MAX_HIGHLIGHT_FRACTION:.0%} of the ball",
+        f"{fraction:.0%}",
+        "expose the frame shorter, and darken the room",
     )
+    spot = labels == 1 + int(sizes.argmax())
+    near = ball & ndimage.binary_dilation(spot, iterations=HIGHLIGHT_MARGIN)
+    weight = np.maximum(grey[near] - low, 0)
+    return np.array([np.average(axis[near], weights=weight) for axis in (column, row)])
 
 
 def distant_light(outline: Outline, highlight: ArrayLike) -> Array:
@@ -173,21 +149,16 @@ def distant_light(outline: Outline, highlight: ArrayLike) -> Array:
     The view along -z is reflected at the normal of the ball under the highlight (2,)
     px: l = 2 (n . v) n - v.
     """
-    offset = (
-        (np.asarray(highlight, np.float64) - outline.centre) / outline.radius * [1, -1]
-    )
+    away = np.asarray(highlight, np.float64) - outline.centre
+    offset = away / outline.radius * [1, -1]
     square = float(offset @ offset)
-    if not square < 1:
-        rule = "the highlight must lie on the ball"
-        cure = "check the centre and radius of the ball"
-        raise InputError(
-            Fault(
-                "mirror ball",
-                rule,
-                f"{np.sqrt(square):.2f} radii from its centre",
-                cure,
-            )
-        )
+    require(
+        square < 1,
+        "mirror ball",
+        "the highlight must lie on the ball",
+        f"{np.sqrt(square):.2f} radii from its centre",
+        "check the centre and radius of the ball",
+    )
     normal = np.array([*offset, np.sqrt(1 - square)])
     return np.asarray(2 * normal[2] * normal - [0, 0, 1])
 
@@ -213,28 +184,21 @@ def reflected_ray(
     InputError
         The line of sight misses the ball.
     """
-    origin = camera_centre(camera.R, camera.t)
-    view = pixel_rays(
-        np.asarray(highlight, np.float64), camera.K, camera.R, camera.distortion
-    )
-    way = np.asarray(np.asarray(ball, np.float64) - origin, np.float64)
+    view = camera.rays(np.asarray(highlight, np.float64))
+    centre = np.asarray(ball, np.float64)
+    way = centre - camera.centre
     along = float(way @ view)
-    under = radius**2 - float(way @ way) + along**2
-    if not (under > 0 and along > 0):
-        found = (
-            f"{np.sqrt(max(float(way @ way) - along**2, 0.0)):.1f} mm from its centre"
-        )
-        cure = "check the position of the ball"
-        raise InputError(
-            Fault(
-                "mirror ball",
-                f"the line of sight must meet the ball of {radius:g} mm",
-                found,
-                cure,
-            )
-        )
-    point = origin + (along - np.sqrt(under)) * view
-    normal = (point - np.asarray(ball, np.float64)) / radius
+    square = float(way @ way)
+    under = radius**2 - square + along**2
+    require(
+        under > 0 and along > 0,
+        "mirror ball",
+        f"the line of sight must meet the ball of {radius:g} mm",
+        f"{np.sqrt(max(square - along**2, 0.0)):.1f} mm from its centre",
+        "check the position of the ball",
+    )
+    point = camera.centre + (along - np.sqrt(under)) * view
+    normal = (point - centre) / radius
     return point, np.asarray(view - 2 * (view @ normal) * normal)
 
 
@@ -261,38 +225,31 @@ def ball_centre(
     InputError
         The distances differ from the place where the axes meet by more than 5 %.
     """
-    circles = np.asarray(outlines, np.float64)
     turn = np.linspace(0, 2 * np.pi, OUTLINE_POINTS, endpoint=False)
     around = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
-    origins = list[Array]()
-    axes = list[Array]()
+    directions = list[Array]()
     distances = list[float]()
-    for camera, circle in zip(cameras, circles, strict=True):
-        sight = pixel_rays(
-            circle[:2] + circle[2] * around, camera.K, camera.R, camera.distortion
-        )
+    for camera, circle in zip(cameras, np.asarray(outlines, np.float64), strict=True):
+        sight = camera.rays(circle[:2] + circle[2] * around)
         # all lines make the same angle with the axis: sight . axis = cos(angle)
         axis = np.linalg.lstsq(sight, np.ones(OUTLINE_POINTS))[0]
         length = float(np.linalg.norm(axis))
-        origins.append(np.asarray(camera_centre(camera.R, camera.t), np.float64))
-        axes.append(np.asarray(axis / length, np.float64))
+        directions.append(np.asarray(axis / length, np.float64))
         distances.append(radius / np.sqrt(1 - min(1 / length**2, 1 - 1e-12)))
-    start = np.array(origins)
-    way = np.array(axes)
-    distance = np.array(distances)
-    if len(start) == 1:
-        return BallCentre(start[0] + distance[0] * way[0], np.nan)
-    centre = light_position(start, way).position
-    mismatch = float(
-        np.abs(np.linalg.norm(centre - start, axis=1) / distance - 1).max()
+    start = np.array([camera.centre for camera in cameras])
+    if len(cameras) == 1:
+        return BallCentre(start[0] + distances[0] * directions[0], np.nan)
+    centre = light_position(start, directions).position
+    ratio = np.linalg.norm(centre - start, axis=1) / np.array(distances)
+    mismatch = float(np.abs(ratio - 1).max())
+    require(
+        not mismatch > MAX_SIZE_MISMATCH,
+        "mirror ball",
+        f"its outlines must be of the size of a ball of radius {radius:g} mm, "
+        f"within {MAX_SIZE_MISMATCH:.0%}",
+        f"{mismatch:.0%} off",
+        "give the radius of the ball in mm, and column, row and radius of its outlines in px",
     )
-    if mismatch > MAX_SIZE_MISMATCH:
-        rule = (
-            f"its outlines must be of the size of a ball of radius {radius:g} mm, "
-            f"within {MAX_SIZE_MISMATCH:.0%}"
-        )
-        cure = "give the radius of the ball in mm, and column, row and radius of its outlines in px"
-        raise InputError(Fault("mirror ball", rule, f"{mismatch:.0%} off", cure))
     return BallCentre(centre, mismatch)
 
 
@@ -318,28 +275,28 @@ def light_position(origins: ArrayLike, directions: ArrayLike) -> LightPosition:
     """
     start = np.asarray(origins, np.float64)
     way = np.asarray(directions, np.float64)
-    if (
-        start.ndim != 2
-        or start.shape != way.shape
-        or len(start) < 2
-        or not np.isfinite([start, way]).all()
-    ):
-        rule = "its position needs two or more rays of finite numbers"
-        cure = "photograph the ball at another position"
-        raise InputError(Fault("light", rule, f"{start.shape} and {way.shape}", cure))
+    shaped = start.ndim == 2 and start.shape == way.shape and len(start) >= 2
+    require(
+        shaped and np.isfinite([start, way]).all(),
+        "light",
+        "its position needs two or more rays of finite numbers",
+        f"{start.shape} and {way.shape}",
+        "photograph the ball at another position",
+    )
     across = np.eye(3) - way[:, :, None] * way[:, None, :]
     weight = np.ones(len(start))
     for _ in range(ROUNDS):
         normal = np.einsum("r,rij->ij", weight, across)
-        if np.linalg.eigvalsh(normal)[0] < MIN_BASELINE**2 * weight.sum() / 4:
-            rule = "its rays must not be parallel"
-            cure = "move the ball farther between the photographs"
-            raise InputError(
-                Fault("light", rule, f"{len(start)} rays within about a degree", cure)
-            )
-        position = np.linalg.solve(
-            normal, np.einsum("r,rij,rj->i", weight, across, start)
+        minimum = MIN_BASELINE**2 * weight.sum() / 4
+        require(
+            not np.linalg.eigvalsh(normal)[0] < minimum,
+            "light",
+            "its rays must not be parallel",
+            f"{len(start)} rays within about a degree",
+            "move the ball farther between the photographs",
         )
+        moment = np.einsum("r,rij,rj->i", weight, across, start)
+        position = np.linalg.solve(normal, moment)
         weight = 1 / ((position - start) ** 2).sum(axis=1)
     offset = np.einsum("rij,rj->ri", across, position - start)
     angle = np.linalg.norm(offset, axis=1) * np.sqrt(weight)
@@ -360,17 +317,15 @@ def reprojection_error(
     InputError
         No point remains.
     """
-    predicted, _ = project(points, camera.K, camera.R, camera.t, camera.distortion)
-    residual = np.asarray(pixels, np.float64) - predicted
+    residual = np.asarray(pixels, np.float64) - camera.project(points)
     length = np.linalg.norm(residual, axis=-1)
-    seen = np.isfinite(length)
-    if not seen.any():
-        rule = "at least one known point must be seen"
-        cure = "check the pose of the camera"
-        raise InputError(Fault("reprojection", rule, f"none of {len(length)}", cure))
-    return Reprojection(
-        residual,
-        float(np.sqrt(np.mean(length[seen] ** 2))),
-        float(length[seen].max()),
-        int(seen.sum()),
+    observed = length[np.isfinite(length)]
+    require(
+        len(observed),
+        "reprojection",
+        "at least one known point must be seen",
+        f"none of {len(length)}",
+        "check the pose of the camera",
     )
+    rms = float(np.sqrt(np.mean(observed**2)))
+    return Reprojection(residual, rms, float(observed.max()), len(observed))

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
-from skindb.errors import Fault, InputError
+from skindb.errors import require
 
 Array = NDArray[np.float64]
 
@@ -75,60 +75,58 @@ def compare_azimuths(
         Wrong shapes, too few azimuths, or too few distances at which all profiles are
         clear of noise.
     """
-    profile = np.asarray(value, np.float64)
-    sigma = np.asarray(error, np.float64)
-    r = np.asarray(distance, np.float64)
-    phi = np.asarray(azimuth, np.float64)
+    profile, sigma, r, phi = (
+        np.asarray(values, np.float64) for values in (value, error, distance, azimuth)
+    )
     shape = (len(phi), len(r), 3)
-    if profile.shape != shape or sigma.shape != shape or len(phi) < MIN_AZIMUTHS:
-        rule = (
-            "value and error must have the shape (azimuth, fibre, 3), with "
-            f"{MIN_AZIMUTHS} azimuths or more"
-        )
-        raise InputError(
-            Fault(
-                "test of isotropy",
-                rule,
-                f"{profile.shape}, {sigma.shape}, {shape}",
-                "measure more",
-            )
-        )
-    with np.errstate(invalid="ignore"):
-        clear = np.asarray((sigma > 0) & (profile > MIN_SIGNAL_TO_NOISE * sigma)).all(
-            axis=(0, 2)
-        ) & (r > 0)
-    if len(np.unique(r[clear])) < MIN_DISTANCES:
-        rule = (
-            f"all profiles must be {MIN_SIGNAL_TO_NOISE:g} times their error at "
-            f"{MIN_DISTANCES} distances or more"
-        )
-        cure = "add longer exposures, and remove profiles without contact"
-        raise InputError(
-            Fault("test of isotropy", rule, f"{int(clear.sum())} distances", cure)
-        )
+    require(
+        profile.shape == sigma.shape == shape and len(phi) >= MIN_AZIMUTHS,
+        "test of isotropy",
+        "value and error must have the shape (azimuth, fibre, 3), with "
+        f"{MIN_AZIMUTHS} azimuths or more",
+        f"{profile.shape}, {sigma.shape}, {shape}",
+        "measure more",
+    )
+    clear = _clear_fibres(profile, sigma) & (sigma > 0).all(axis=(0, 2)) & (r > 0)
+    require(
+        len(np.unique(r[clear])) >= MIN_DISTANCES,
+        "test of isotropy",
+        f"all profiles must be {MIN_SIGNAL_TO_NOISE:g} times their error at "
+        f"{MIN_DISTANCES} distances or more",
+        f"{int(clear.sum())} distances",
+        "add longer exposures, and remove profiles without contact",
+    )
     log = np.log(profile[:, clear] * r[clear, None] ** 2)
     slope, variance = _slopes(log, sigma[:, clear] / profile[:, clear], r[clear])
     decay = slope.mean(axis=0)
     level = (slope / variance).sum(axis=0) / (1 / variance).sum(axis=0)
     chi_square = ((slope - level) ** 2 / variance).sum(axis=0)
     parts = [_harmonics(slope[:, c] - level[c], variance[:, c], phi) for c in range(3)]
-    first, amplitude, direction, amplitude_error = (
-        np.array(part) for part in zip(*parts, strict=True)
-    )
-    ratio = _ratio(decay, amplitude)
-    steep = np.maximum(np.abs(decay) - amplitude, 1e-12)
+    shift, amplitude, direction, amplitude_error = np.array(parts).T
+    # of the smallest decay, which is not positive in noise
+    low = np.abs(decay) - amplitude
+    ratio = np.full(3, np.inf)
+    np.divide(np.abs(decay) + amplitude, low, out=ratio, where=low > 0)
+    steep = np.maximum(low, 1e-12)
     return Isotropy(
-        slope - level,
-        np.sqrt(variance),
-        decay,
-        stats.chi2.sf(chi_square, len(phi) - 1),
-        amplitude,
-        direction,
-        ratio,
-        2 * np.abs(decay) / steep**2 * amplitude_error,
-        first,
-        clear,
+        slope=slope - level,
+        slope_error=np.sqrt(variance),
+        decay=decay,
+        p_value=stats.chi2.sf(chi_square, len(phi) - 1),
+        amplitude=amplitude,
+        direction=direction,
+        anisotropy=ratio,
+        anisotropy_error=2 * np.abs(decay) / steep**2 * amplitude_error,
+        shift=shift,
+        distances=clear,
     )
+
+
+def _clear_fibres(profile: Array, sigma: Array) -> NDArray[np.bool_]:
+    """Fibres (fibre,) whose signal is clear of noise in all profiles and channels."""
+    with np.errstate(invalid="ignore"):
+        clear = (profile > 0) & (profile > MIN_SIGNAL_TO_NOISE * sigma) & (sigma >= 0)
+    return np.asarray(clear.all(axis=(0, 2)))
 
 
 def _slopes(log: Array, sigma: Array, r: Array) -> tuple[Array, Array]:
@@ -152,20 +150,19 @@ def _harmonics(
         axis=1,
     )
     covariance = np.linalg.pinv(design.T @ (design / variance[:, None]))
-    found = covariance @ (design.T @ (slope / variance))
-    amplitude = float(np.hypot(found[3], found[4]))
-    unit = found[3:] / amplitude if amplitude > 0 else np.array([1.0, 0.0])
+    coefficients = covariance @ (design.T @ (slope / variance))
+    amplitude = float(np.hypot(coefficients[3], coefficients[4]))
+    unit = coefficients[3:] / amplitude if amplitude > 0 else np.array([1.0, 0.0])
     error = float(np.sqrt(unit @ covariance[3:, 3:] @ unit))
     # light travels farthest where the decay is smallest, half a period from its maximum
-    direction = float(np.mod(np.arctan2(found[4], found[3]) / 2 + np.pi / 2, np.pi))
-    return float(np.hypot(found[1], found[2])), amplitude, direction, error
-
-
-def _ratio(decay: Array, amplitude: Array) -> Array:
-    """Largest over smallest decay; infinite where the smallest is not positive."""
-    low = np.abs(decay) - amplitude
-    return np.where(
-        low > 0, (np.abs(decay) + amplitude) / np.where(low > 0, low, 1.0), np.inf
+    direction = float(
+        np.mod(np.arctan2(coefficients[4], coefficients[3]) / 2 + np.pi / 2, np.pi)
+    )
+    return (
+        float(np.hypot(coefficients[1], coefficients[2])),
+        amplitude,
+        direction,
+        error,
     )
 
 
@@ -220,34 +217,23 @@ def placement_variance(value: ArrayLike, error: ArrayLike) -> Repeatability:
     """
     profile = np.asarray(value, np.float64)
     sigma = np.asarray(error, np.float64)
-    if (
-        profile.ndim != 3
-        or profile.shape != sigma.shape
-        or profile.shape[-1] != 3
-        or len(profile) < MIN_PLACEMENTS
-    ):
-        rule = (
-            "profiles and errors must have the shape (placement, fibre, 3), with "
-            f"{MIN_PLACEMENTS} or more placements"
-        )
-        raise InputError(
-            Fault(
-                "repeated placements",
-                rule,
-                f"{profile.shape} and {sigma.shape}",
-                "place it again",
-            )
-        )
-    with np.errstate(invalid="ignore"):
-        clear = np.asarray(
-            (sigma >= 0) & (profile > MIN_SIGNAL_TO_NOISE * sigma) & (profile > 0)
-        ).all(axis=(0, 2))
-    if clear.sum() < 2:
-        rule = "at least two fibres must have a clear signal in all placements"
-        cure = "add longer exposures"
-        raise InputError(
-            Fault("repeated placements", rule, f"{int(clear.sum())}", cure)
-        )
+    shaped = profile.ndim == 3 and profile.shape[2] == 3
+    require(
+        shaped and profile.shape == sigma.shape and len(profile) >= MIN_PLACEMENTS,
+        "repeated placements",
+        "profiles and errors must have the shape (placement, fibre, 3), with "
+        f"{MIN_PLACEMENTS} or more placements",
+        f"{profile.shape} and {sigma.shape}",
+        "place it again",
+    )
+    clear = _clear_fibres(profile, sigma)
+    require(
+        clear.sum() >= 2,
+        "repeated placements",
+        "at least two fibres must have a clear signal in all placements",
+        f"{int(clear.sum())}",
+        "add longer exposures",
+    )
     log = np.log(profile[:, clear])
     noise = (sigma[:, clear] / profile[:, clear]) ** 2
     placements, fibres, _ = log.shape
@@ -288,32 +274,22 @@ def level_trend(levels: ArrayLike, covariate: ArrayLike) -> Trend:
     """
     y = np.asarray(levels, np.float64)
     x = np.asarray(covariate, np.float64)
-    good = (
-        x.ndim == 1
-        and y.shape == (len(x), 3)
-        and len(x) >= MIN_PLACEMENTS
-        and np.isfinite(y).all()
+    shaped = x.ndim == 1 and y.shape == (len(x), 3) and len(x) >= MIN_PLACEMENTS
+    require(
+        shaped and np.isfinite(y).all() and np.isfinite(x).all() and np.ptp(x) > 0,
+        "trend of the probe",
+        f"levels (placement, 3) and a covariate that varies over {MIN_PLACEMENTS} "
+        "placements or more are needed",
+        f"{y.shape} and {x.shape}",
+        "log it for every placement",
     )
-    if not good or not np.isfinite(x).all() or np.ptp(x) == 0:
-        rule = (
-            f"levels (placement, 3) and a covariate that varies over {MIN_PLACEMENTS} "
-            "placements or more are needed"
-        )
-        raise InputError(
-            Fault(
-                "trend of the probe",
-                rule,
-                f"{y.shape} and {x.shape}",
-                "log it for every placement",
-            )
-        )
     centred = x - x.mean()
     square = float(centred @ centred)
     slope = centred @ y / square
     rest = y - y.mean(axis=0) - centred[:, None] * slope
     error = np.sqrt((rest**2).sum(axis=0) / (len(x) - 2) / square)
+    p_value = np.ones(3)
     with np.errstate(divide="ignore", invalid="ignore"):
-        p_value = np.where(
-            slope == 0, 1.0, 2 * stats.t.sf(np.abs(slope) / error, len(x) - 2)
-        )
+        tails = 2 * stats.t.sf(np.abs(slope) / error, len(x) - 2)
+    p_value[slope != 0] = tails[slope != 0]
     return Trend(slope, error, p_value, p_value < FLAG_P_VALUE)

@@ -6,8 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from pathlib import Path
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 
 from skindb.calibration._merge_kernels import develop
 from skindb.calibration.pixel_flags import DARK, DARK_SIGMA, OK, SATURATED
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, attempt
 from skindb.format.dome import CameraRecord, DomeRecord
 from skindb.format.frame_paths import filled
 from skindb.format.frames import Digests, Frame, read_frames
@@ -46,11 +45,13 @@ class FrameMerger:
 
         `spans` (h, 2) are the first wanted column of each row and the one after the
         last, by default all; pixels outside may be NaN and SATURATED. `usable` (h, w),
-        zeros, receives the number of `usable_exposures`, which is set to two for linear
-        files, whose exposures are unknown.
+        zeros, receives the number of exposures in which no channel is at the white
+        level and one is above the dark level; two for linear files, whose exposures are
+        unknown. A pixel with one such exposure has no second value that could confirm
+        its radiance; one with none is saturated, dark, or lies in a gap between the
+        exposures.
         """
-        sensor = self.camera.sensor
-        if sensor.kind.bits == 0:
+        if self.camera.sensor.kind.bits == 0:
             radiance, _, flag = _linear(frames)
             if usable is not None:
                 usable[:] = 2
@@ -69,42 +70,28 @@ class FrameMerger:
         """The other arguments of `develop`."""
         sensor = self.camera.sensor
         matrix = self.camera.colour_matrix
-        dtype = self.camera.sensor.kind.dtype
-        dark = (
-            np.zeros((0, 1, 1, 3), dtype)
-            if self.dark is None
-            else np.ascontiguousarray(self.dark)
-        )
+        dark = np.zeros((0, 1, 1, 3), sensor.kind.dtype)
+        if self.dark is not None:
+            dark = np.ascontiguousarray(self.dark)
         curve, offset = _curve(sensor, dark=self.dark is not None)
-        zero = np.float32(sensor.black)
         span = sensor.white - sensor.black
-        variance = (
-            float(read_sigma(np.asarray([1 / np.float32(span)], np.float32), sensor)[0])
-            ** 2
-        )
+        slope = np.asarray([1 / np.float32(span)], np.float32)
         longest = max(self.seconds)
-        gain = (
-            1
-            / (
-                np.ones((1, 1))
-                if self.vignette is None
-                else self.vignette[..., 0].astype(np.float64)
-            )
-            / longest
-        )
+        shade = np.ones((1, 1))
+        if self.vignette is not None:
+            shade = self.vignette[..., 0].astype(np.float64)
         colours = matrix if (matrix != np.eye(3)).any() else np.zeros((0, 3))
-        seconds = np.asarray(self.seconds, np.float32) / np.float32(longest)
         return (
             dark,
             curve,
             offset,
-            float(zero),
+            float(np.float32(sensor.black)),
             float(span),
-            variance,
+            float(read_sigma(slope, sensor)[0]) ** 2,
             float(sensor.white),
-            seconds,
+            np.asarray(self.seconds, np.float32) / np.float32(longest),
             1 / sensor.full_electrons,
-            gain.astype(np.float32),
+            (1 / shade / longest).astype(np.float32),
             np.ascontiguousarray(colours, np.float32),
         )
 
@@ -117,13 +104,12 @@ def _curve(sensor: SensorRecord, *, dark: bool) -> tuple[Image, int]:
         return np.zeros((0, 3, 2), np.float32), 0
     top = int(np.iinfo(sensor.kind.dtype).max)
     offset = top if dark else 0
-    level = np.arange(-offset, top + 1, dtype=np.float32)[None, :, None] + np.zeros(
-        3, np.float32
-    )
-    signal, slope = relative_exposure(level, np.float32(0) if dark else None, sensor)
-    return np.ascontiguousarray(
-        np.stack([signal[0], read_sigma(slope[0], sensor) ** 2], axis=-1)
-    ), offset
+    values = np.arange(-offset, top + 1, dtype=np.float32)
+    level = np.tile(values[None, :, None], 3)
+    black = np.float32(0) if dark else None
+    signal, slope = relative_exposure(level, black, sensor)
+    variance = read_sigma(slope, sensor) ** 2
+    return np.stack([signal[0], variance[0]], axis=-1), offset
 
 
 def frame_merger(
@@ -133,23 +119,13 @@ def frame_merger(
     kind = camera.sensor.kind
     dark = None
     if dome.dark and kind.bits:
-        dark = np.stack(read_frames(_dark_files(dome, camera), kind, digests))
+        files = [
+            dome.folder / filled(dome.dark, exposure=exposure, camera=camera.id)
+            for exposure in dome.exposures
+        ]
+        dark = np.stack(read_frames(files, kind, digests))
     gain = vignette_gain(camera) if kind.bits and camera.vignette.any() else None
     return FrameMerger(camera, tuple(dome.exposures.values()), dark, gain)
-
-
-def dark_frame_files(dome: DomeRecord) -> list[Path]:
-    """Files of all dark frames."""
-    return [path for camera in dome.cameras for path in _dark_files(dome, camera)]
-
-
-def _dark_files(dome: DomeRecord, camera: CameraRecord) -> list[Path]:
-    if not dome.dark:
-        return []
-    return [
-        dome.folder / filled(dome.dark, exposure=e, camera=camera.id)
-        for e in dome.exposures
-    ]
 
 
 def frame_mergers(
@@ -158,14 +134,12 @@ def frame_mergers(
     """A frame merger for every camera; damaged dark frames are recorded in `faults` and
     replaced by the black level.
     """
-    mergers = {}
-    for camera in dome.cameras:
-        try:
-            mergers[camera.id] = frame_merger(dome, camera, digests)
-        except InputError as error:
-            faults += error.faults
-            mergers[camera.id] = frame_merger(replace(dome, dark=None), camera)
-    return mergers
+    without_dark = replace(dome, dark=None)
+    return {
+        camera.id: attempt(faults, partial(frame_merger, dome, camera, digests))
+        or frame_merger(without_dark, camera)
+        for camera in dome.cameras
+    }
 
 
 def read_view(
@@ -177,7 +151,7 @@ def read_view(
     digests: Digests | None = None,
 ) -> list[Frame]:
     """Decode the exposures of one light and camera."""
-    paths: list[Path] = [
+    paths = [
         dome.frame(light, camera.id, exposure, white=white)
         for exposure in dome.exposures
     ]
@@ -190,9 +164,8 @@ def vignette_gain(camera: CameraRecord) -> Image:
     """
     column = np.arange(camera.width) + 0.5 - camera.K[0, 2]
     row = np.arange(camera.height) + 0.5 - camera.K[1, 2]
-    r2 = (column**2 + row[:, None] ** 2) / (
-        np.hypot(camera.width, camera.height) / 2
-    ) ** 2
+    half = np.hypot(camera.width, camera.height) / 2
+    r2 = (column**2 + row[:, None] ** 2) / half**2
     a2, a4, a6 = camera.vignette
     return np.asarray(1 + r2 * (a2 + r2 * (a4 + r2 * a6)), np.float32)[..., None]
 
@@ -239,44 +212,37 @@ def merge_exposures(
     shape = frames[0].shape
     total = np.zeros(shape, np.float32)
     time = np.zeros(shape, np.float32)
-    signals = []
+    exposures = []
     flag_dark = np.ones(shape[:2], bool)
     # times are relative to it: their squares stay within single precision
-    longest = max(seconds)
+    longest = np.float32(max(seconds))
     for i, frame in enumerate(frames):
-        black = dark[i] if dark is not None else None
+        relative_seconds = np.float32(seconds[i] / max(seconds))
+        black = None if dark is None else dark[i]
         signal, slope = relative_exposure(frame, black, sensor)
+        sigma = read_sigma(slope, sensor)
         usable = frame < sensor.white
-        flag_dark &= (signal <= DARK_SIGMA * read_sigma(slope, sensor)).all(axis=-1)
-        signals.append((signal, slope, usable, np.float32(seconds[i] / longest)))
-        total += np.where(usable, signal, 0)
-        time += usable * np.float32(seconds[i] / longest)
+        flag_dark &= (signal <= DARK_SIGMA * sigma).all(axis=-1)
+        signal = np.where(usable, signal, 0)
+        exposures.append((signal, sigma, usable, relative_seconds))
+        total += signal
+        time += usable * relative_seconds
+    weighted = np.zeros(shape, np.float32)
+    weights = np.zeros(shape, np.float32)
     with np.errstate(invalid="ignore", divide="ignore"):
-        expected = np.maximum(total / time, 0)
-        radiance, error = _weighted(signals, expected, sensor)
+        photons = np.maximum(total / time, 0)
+        for signal, sigma, usable, relative_seconds in exposures:
+            shot = photons * relative_seconds / np.float32(sensor.full_electrons)
+            variance = np.maximum(shot + sigma**2, np.float32(1e-30))
+            weight = np.where(usable, relative_seconds * relative_seconds / variance, 0)
+            weighted += weight * signal / relative_seconds
+            weights += weight
+        radiance = weighted / weights
+        error = np.asarray(1 / np.sqrt(weights), np.float32)
     saturated = np.any(time == 0, axis=-1)
-    flag = np.where(saturated, SATURATED, np.where(flag_dark, DARK, OK)).astype(
-        np.uint8
-    )
-    gain = np.float32(longest) if vignette is None else vignette * np.float32(longest)
-    return radiance / gain, error / gain, flag
-
-
-def usable_exposures(
-    frames: Sequence[Frame], sensor: SensorRecord
-) -> NDArray[np.uint8]:
-    """Number of exposures (h, w) in which no channel is at the white level and one is
-    above the dark level.
-
-    A pixel with one such exposure has no second value that could confirm its radiance;
-    one with none is saturated, dark, or lies in a gap between the exposures.
-    """
-    count = np.zeros(frames[0].shape[:2], np.uint8)
-    for frame in frames:
-        signal, slope = relative_exposure(frame, None, sensor)
-        lit = (signal > DARK_SIGMA * read_sigma(slope, sensor)).any(axis=-1)
-        count += lit & (frame < sensor.white).all(axis=-1)
-    return count
+    flag = np.where(saturated, SATURATED, np.where(flag_dark, DARK, OK))
+    gain = longest if vignette is None else vignette * longest
+    return radiance / gain, error / gain, flag.astype(np.uint8)
 
 
 def radiance_floor(sensor: SensorRecord, exposures: Mapping[str, float]) -> float:
@@ -285,23 +251,20 @@ def radiance_floor(sensor: SensorRecord, exposures: Mapping[str, float]) -> floa
     """
     if sensor.kind.bits == 0:
         return 0.0
-    _, slope = relative_exposure(
-        np.full((1, 1, 3), sensor.black, np.uint16), None, sensor
-    )
+    black = np.full((1, 1, 3), sensor.black, np.uint16)
+    _, slope = relative_exposure(black, None, sensor)
     time = np.sqrt(sum(t * t for t in exposures.values()))
     return float(read_sigma(slope, sensor).mean() / time)
 
 
 def _linear(frames: list[Frame]) -> tuple[Image, Image, NDArray[np.uint8]]:
     # a single one, as `read_dome` requires
-    (radiance,) = (frame.astype(np.float32, copy=False) for frame in frames)
-    lost: NDArray[np.bool_] = np.asarray(~np.isfinite(radiance).all(axis=-1))
+    (frame,) = frames
+    radiance = frame.astype(np.float32)
+    lost = ~np.isfinite(radiance).all(axis=-1)
+    radiance[lost] = np.nan
     flag = np.where(lost, SATURATED, OK).astype(np.uint8)
-    return (
-        np.where(lost[..., None], np.float32(np.nan), radiance),
-        np.zeros_like(radiance),
-        flag,
-    )
+    return radiance, np.zeros_like(radiance), flag
 
 
 def relative_exposure(
@@ -309,28 +272,25 @@ def relative_exposure(
 ) -> tuple[Image, Image]:
     """Relative exposure (1 at the white level) and its slope per value of the file."""
     span = np.float32(sensor.white - sensor.black)
+    black = np.float32(sensor.black)
     level = frame.astype(np.float32) - (
-        np.float32(sensor.black) if dark is None else dark.astype(np.float32)
+        black if dark is None else dark.astype(np.float32)
     )
     if sensor.response is None:
         return level / span, np.broadcast_to(1 / span, frame.shape)
-    table = sensor.response
-    value = level + np.float32(sensor.black)
+    values = sensor.response[:, 0]
+    value = level + black
     signal = np.empty(frame.shape, np.float32)
     slope = np.empty(frame.shape, np.float32)
     for c in range(3):
-        rise = np.diff(table[:, c + 1]) / np.diff(table[:, 0])
-        cell = np.clip(
-            np.searchsorted(table[:, 0], value[..., c], side="right") - 1,
-            0,
-            len(rise) - 1,
-        )
+        exposure = sensor.response[:, c + 1]
+        rise = np.diff(exposure) / np.diff(values)
+        cell = np.searchsorted(values, value[..., c], side="right") - 1
+        cell = np.clip(cell, 0, len(rise) - 1)
         slope[..., c] = rise[cell]
         # the first segment is extrapolated below black: clipping the noise would
         # brighten dark pixels
-        signal[..., c] = (
-            table[cell, c + 1] + (value[..., c] - table[cell, 0]) * rise[cell]
-        )
+        signal[..., c] = exposure[cell] + (value[..., c] - values[cell]) * rise[cell]
     return signal, slope
 
 
@@ -341,19 +301,3 @@ def read_sigma(slope: Image, sensor: SensorRecord) -> Image:
     steps = np.float32(sensor.step / np.sqrt(12)) * slope
     read = np.float32(sensor.read_noise / sensor.full_electrons)
     return np.asarray(np.sqrt(steps**2 + read**2), np.float32)
-
-
-def _weighted(
-    signals: list[Any], expected: Image, sensor: SensorRecord
-) -> tuple[Image, Image]:
-    weighted = np.zeros_like(expected)
-    weights = np.zeros_like(expected)
-    for signal, slope, usable, seconds in signals:
-        photons = expected * seconds / np.float32(sensor.full_electrons)
-        variance = photons + read_sigma(slope, sensor) ** 2
-        weight = np.where(
-            usable, seconds * seconds / np.maximum(variance, np.float32(1e-30)), 0
-        )
-        weighted += weight * np.where(usable, signal, 0) / seconds
-        weights += weight
-    return weighted / weights, np.asarray(1 / np.sqrt(weights), np.float32)

@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, require
 from skindb.files import private_file
 
 Array = NDArray[np.float64]
 
+STACK = "the exposure stack"
 # value at which the knots change from even steps to even ratios: below it sensors and
 # encodings are nearly linear
 TOE = 0.02
@@ -127,39 +128,44 @@ def recover_response(
         in two exposures.
     """
     options = options or ResponseOptions()
-    picked = [
+    frames = np.asarray(stack)
+    times = np.asarray(seconds, np.float64)
+    _require_stack(frames, times, (black, white), options.block)
+    channels = [
         response_samples(
-            stack,
-            seconds,
-            channel=c,
-            levels=(black, white),
-            count=options.samples,
-            block=options.block,
+            (frames[..., c].astype(np.float64) - black) / (white - black),
+            times,
+            options,
         )
         for c in range(3)
     ]
-    few = [i for i, sample in enumerate(picked) if len(sample.value) < MIN_SAMPLES]
-    if few:
-        found = ", ".join(
-            f"{('red', 'green', 'blue')[i]} {len(picked[i].value)}" for i in few
-        )
-        rule = (
-            f"at least {MIN_SAMPLES} blocks of pixels must be neither dark nor "
-            "saturated in two exposures"
-        )
-        raise InputError(
-            Fault(
-                "the exposure stack",
-                rule,
-                found,
-                "add exposures, or photograph a scene with more range",
-            )
-        )
-    return _response(
-        picked,
-        [_fit_channel(sample, options) for sample in picked],
-        (black, white),
-        options.knots,
+    few = [
+        f"{colour} {len(samples.value)}"
+        for colour, samples in zip(("red", "green", "blue"), channels, strict=True)
+        if len(samples.value) < MIN_SAMPLES
+    ]
+    require(
+        not few,
+        STACK,
+        f"at least {MIN_SAMPLES} blocks of pixels must be neither dark nor "
+        "saturated in two exposures",
+        ", ".join(few),
+        "add exposures, or photograph a scene with more range",
+    )
+    # forced to rise from 0 at black to 1 at white
+    value = np.linspace(0.0, 1.0, TABLE_ROWS)
+    fits = [_fit_channel(samples, options) for samples in channels]
+    curves = [_curve(value, log_ratio, options.knots) for log_ratio, _, _ in fits]
+    rising = [_rising(curve) for curve in curves]
+    usable = [samples.value[samples.usable] for samples in channels]
+    return Response(
+        table=np.column_stack(
+            [black + value * (white - black), *(curve / curve[-1] for curve in rising)]
+        ),
+        residual=np.array([residual for _, residual, _ in fits]),
+        covered=np.array([[values.min(), values.max()] for values in usable]),
+        samples=np.array([count for _, _, count in fits], np.int64),
+        was_rising=np.array([(np.diff(curve) > 0).all() for curve in curves]),
     )
 
 
@@ -182,35 +188,13 @@ def _place(value: Array) -> Array:
 
 def _curve(value: Array, log_ratio: Array, knots: int) -> Array:
     """Exposure (n,) of values (n,), up to a factor."""
-    return np.asarray(
-        value * np.exp(np.interp(_place(value), np.linspace(0, 1, knots), log_ratio))
-    )
+    ratio = np.interp(_place(value), np.linspace(0, 1, knots), log_ratio)
+    return value * np.exp(ratio)
 
 
-def _response(
-    picked: list[ResponseSamples],
-    parts: list[tuple[Array, float, int]],
-    levels: tuple[float, float],
-    knots: int,
-) -> Response:
-    """Table of the fitted curves, forced to rise from 0 at black to 1 at white."""
-    value = np.linspace(0.0, 1.0, TABLE_ROWS)
-    curves = [_curve(value, part[0], knots) for part in parts]
-    rising = [bool((np.diff(curve) > 0).all()) for curve in curves]
-    curves = [
-        np.maximum.accumulate(curve) + MIN_RISE * np.arange(TABLE_ROWS)
-        for curve in curves
-    ]
-    black, white = levels
-    table = np.column_stack(
-        [black + value * (white - black), *(curve / curve[-1] for curve in curves)]
-    )
-    covered = np.array(
-        [[s.value[s.usable].min(), s.value[s.usable].max()] for s in picked]
-    )
-    residual = np.array([p[1] for p in parts])
-    counts = np.array([p[2] for p in parts], np.int64)
-    return Response(table, residual, covered, counts, np.array(rising))
+def _rising(curve: Array) -> Array:
+    """The running maximum of a curve, which rises slightly where the curve falls."""
+    return np.asarray(np.maximum.accumulate(curve) + MIN_RISE * np.arange(len(curve)))
 
 
 def _fit_channel(
@@ -234,68 +218,63 @@ def _mean_exposure_value(pixels: Array, log_ratio: Array, knots: int) -> Array:
     exposures are clipped at black.
     """
     grid = np.linspace(0.0, 1.0, MEAN_ROWS)
-    curve = np.maximum.accumulate(
-        _curve(grid, log_ratio, knots)
-    ) + MIN_RISE * np.arange(MEAN_ROWS)
+    curve = _rising(_curve(grid, log_ratio, knots))
     exposure = np.interp(pixels, grid, curve)
     mean = exposure.mean(axis=-1)
-    noise = exposure.std(axis=-1)
-    usable = mean > MIN_SIGNAL_TO_NOISE * noise
-    return np.asarray(
-        np.where(usable, np.interp(mean, curve, grid), pixels.mean(axis=-1))
-    )
+    usable = mean > MIN_SIGNAL_TO_NOISE * exposure.std(axis=-1)
+    value = np.interp(mean, curve, grid)
+    return np.asarray(np.where(usable, value, pixels.mean(axis=-1)))
 
 
 def _fit_values(
     samples: ResponseSamples, value: Array, options: ResponseOptions
 ) -> tuple[Array, float, int]:
     """The fit to given values (sample, exposure) of the samples."""
-    kept = np.ones(len(value), bool)
+    chosen = np.ones(len(value), bool)
     for _ in range(ROUNDS):
-        solution, misfit = _solve(samples, value, kept, options)
-        limit = MAX_SAMPLE_RATIO * float(np.median(misfit[kept]))
+        solution, misfit = _solve(samples, value, chosen, options)
+        limit = MAX_SAMPLE_RATIO * float(np.median(misfit[chosen]))
         still = misfit <= limit
-        if (still == kept).all() or still.sum() < MIN_SAMPLES:
+        if (still == chosen).all() or still.sum() < MIN_SAMPLES:
             break
-        kept = still
-    return solution, float(np.sqrt(np.mean(misfit[kept] ** 2))), int(kept.sum())
+        chosen = still
+    residual = float(np.sqrt(np.mean(misfit[chosen] ** 2)))
+    return solution, residual, int(chosen.sum())
 
 
 def _solve(
     samples: ResponseSamples,
     value: Array,
-    kept: NDArray[np.bool_],
+    chosen: NDArray[np.bool_],
     options: ResponseOptions,
 ) -> tuple[Array, Array]:
-    """Log ratios (knot,) of the kept samples and weighted root mean square misfit
+    """Log ratios (knot,) of the chosen samples and weighted root mean square misfit
     (sample,) of all.
     """
+    knots = options.knots
     value = np.where(samples.usable, value, 0.5)
     hat = np.where(value < 0.5, value, np.maximum(1 - value, MIN_BRIGHT_WEIGHT))
     weight = np.where(samples.usable, hat, 0.0) ** 2
-    position = _place(value) * (options.knots - 1)
-    cell = np.minimum(position.astype(int), options.knots - 2)
-    design = np.zeros((*value.shape, options.knots))
-    np.put_along_axis(
-        design, cell[..., None], (cell + 1 - position)[..., None], axis=-1
-    )
-    np.put_along_axis(
-        design, cell[..., None] + 1, (position - cell)[..., None], axis=-1
-    )
+    position = _place(value) * (knots - 1)
+    cell = np.minimum(position.astype(int), knots - 2)[..., None]
+    part = position[..., None] - cell
+    design = np.zeros((*value.shape, knots))
+    np.put_along_axis(design, cell, cell + 1 - position[..., None], axis=-1)
+    np.put_along_axis(design, cell + 1, part, axis=-1)
     target = np.log(samples.seconds) - np.log(value)
     # subtracting the weighted mean eliminates the unknown radiance of a sample
     total = weight.sum(axis=1, keepdims=True)
     design -= (weight[..., None] * design).sum(axis=1, keepdims=True) / total[..., None]
     target = target - (weight * target).sum(axis=1, keepdims=True) / total
-    rows = design[kept].reshape(-1, options.knots)
-    known = target[kept].ravel()
-    heavy = weight[kept].ravel()[:, None]
-    bend = np.diff(np.eye(options.knots), 2, axis=0)
-    penalty = options.smoothness * (options.knots - 1) ** 3 * bend.T @ bend
+    rows = design[chosen].reshape(-1, knots)
+    column = target[chosen].ravel()
+    heavy = weight[chosen].ravel()[:, None]
+    bend = np.diff(np.eye(knots), 2, axis=0)
+    penalty = options.smoothness * (knots - 1) ** 3 * bend.T @ bend
     # fixes the free factor of the curve: 1 at white
-    anchor = np.eye(options.knots)[-1:]
+    anchor = np.eye(knots)[-1:]
     normal = rows.T @ (heavy * rows) / heavy.sum() + penalty + anchor.T @ anchor
-    solution = np.linalg.solve(normal, rows.T @ (heavy[:, 0] * known) / heavy.sum())
+    solution = np.linalg.solve(normal, rows.T @ (heavy[:, 0] * column) / heavy.sum())
     misfit = design @ solution - target
     return solution, np.sqrt((weight * misfit**2).sum(axis=1) / total[:, 0])
 
@@ -320,13 +299,7 @@ class ResponseSamples:
 
 
 def response_samples(
-    stack: ArrayLike,
-    seconds: ArrayLike,
-    *,
-    channel: int,
-    levels: tuple[float, float],
-    count: int,
-    block: int,
+    values: Array, times: Array, options: ResponseOptions
 ) -> ResponseSamples:
     """Choose flat blocks of pixels that are spread over all brightnesses.
 
@@ -335,59 +308,31 @@ def response_samples(
     if none of its pixels is at the white level, and if its mean lies between MIN_VALUE
     and MAX_VALUE; it is a sample if it counts in two.
 
-    Parameters
-    ----------
-    stack
-        (exposure, height, width, 3) values of the file.
-    seconds
-        (exposure,) s.
-    channel
-        0 red, 1 green, 2 blue.
-    levels
-        Black and white in values of the file.
-    count
-        Number of samples wanted.
-    block
-        Side of the blocks in px.
-
-    Raises
-    ------
-    InputError
-        Wrong shapes, non-finite values, levels that do not rise, or times that are all
-        equal or not positive.
+    `values` (exposure, height, width) are those of one channel, 0 black and 1 white;
+    `times` (exposure,) in s.
     """
-    frames = np.asarray(stack)
-    times = np.asarray(seconds, np.float64)
-    _require_stack(frames, times, levels, block)
-    values = (frames[..., channel].astype(np.float64) - levels[0]) / (
-        levels[1] - levels[0]
-    )
+    block = options.block
     height, width = (side // block * block for side in values.shape[1:])
     tiles = values[:, :height, :width].reshape(
         len(times), height // block, block, width // block, block
     )
     tiles = tiles.transpose(1, 3, 0, 2, 4).reshape(-1, len(times), block * block)
     mean = tiles.mean(axis=-1)
-    top = tiles.max(axis=-1)
-    spread = tiles.std(axis=-1)
-    usable = (mean >= MIN_VALUE) & (mean <= MAX_VALUE) & (top < 1)
+    usable = (mean >= MIN_VALUE) & (mean <= MAX_VALUE) & (tiles.max(axis=-1) < 1)
     enough = usable.sum(axis=1) >= 2
     tiles = tiles[enough]
     mean = mean[enough]
     usable = usable[enough]
-    spread = spread[enough]
-    rough = np.where(usable, spread / np.maximum(mean, MIN_VALUE), 0).max(
-        axis=1, initial=0
-    )
+    roughness = tiles.std(axis=-1) / np.maximum(mean, MIN_VALUE)
+    rough = np.where(usable, roughness, 0).max(axis=1, initial=0)
     bright = np.clip(mean, 0, 1).mean(axis=1)
     low, high = (bright.min(), bright.max()) if len(bright) else (0.0, 1.0)
-    stratum = np.minimum(
-        ((bright - low) / max(high - low, 1e-12) * STRATA).astype(int), STRATA - 1
-    )
+    relative = (bright - low) / max(high - low, 1e-12)
+    stratum = np.minimum((relative * STRATA).astype(int), STRATA - 1)
     order = np.lexsort((rough, stratum))
-    first = np.searchsorted(stratum[order], np.arange(STRATA))
-    rank = np.arange(len(order)) - first[stratum[order]]
-    chosen = order[np.argsort(rank, kind="stable")[:count]]
+    start = np.searchsorted(stratum[order], np.arange(STRATA))
+    rank = np.arange(len(order)) - start[stratum[order]]
+    chosen = order[np.argsort(rank, kind="stable")[: options.samples]]
     return ResponseSamples(tiles[chosen], usable[chosen], times)
 
 
@@ -395,53 +340,25 @@ def _require_stack(
     frames: NDArray[np.generic], times: Array, levels: tuple[float, float], block: int
 ) -> None:
     """Report every fault of the arguments at once."""
-    where = "the exposure stack"
     faults = list[Fault]()
     if frames.ndim != 4 or frames.shape[-1] != 3 or times.shape != frames.shape[:1]:
         rule = "it must have the shape (exposure, height, width, 3) and one time for each exposure"
-        faults.append(
-            Fault(
-                where,
-                rule,
-                f"{frames.shape} and {times.shape}",
-                "stack the frames along a new first axis",
-            )
-        )
+        finding = f"{frames.shape} and {times.shape}"
+        cure = "stack the frames along a new first axis"
+        faults.append(Fault(STACK, rule, finding, cure))
     elif min(frames.shape[1:3]) < block:
-        faults.append(
-            Fault(
-                where,
-                f"frames must be at least {block} px wide and high",
-                str(frames.shape),
-            )
-        )
+        rule = f"frames must be at least {block} px wide and high"
+        faults.append(Fault(STACK, rule, str(frames.shape)))
     elif not np.isfinite(frames.astype(np.float64)).all():
-        faults.append(
-            Fault(
-                where,
-                "its values must be finite",
-                "NaN or infinity",
-                "remove damaged frames",
-            )
-        )
-    good = np.isfinite(times).all() and (times > 0).all()
-    if not good or len(np.unique(times)) < 2:
+        rule = "its values must be finite"
+        faults.append(Fault(STACK, rule, "NaN or infinity", "remove damaged frames"))
+    if not (np.isfinite(times) & (times > 0)).all() or len(np.unique(times)) < 2:
         rule = "exposure times must be positive, and at least two of them different"
-        faults.append(
-            Fault(
-                where,
-                rule,
-                np.array2string(times, threshold=8),
-                "photograph the scene with several times",
-            )
-        )
+        finding = np.array2string(times, threshold=8)
+        cure = "photograph the scene with several times"
+        faults.append(Fault(STACK, rule, finding, cure))
     if not levels[0] < levels[1]:
-        faults.append(
-            Fault(
-                where,
-                "the white level must be above the black level",
-                f"{levels[0]:g}, {levels[1]:g}",
-            )
-        )
+        rule = "the white level must be above the black level"
+        faults.append(Fault(STACK, rule, f"{levels[0]:g}, {levels[1]:g}"))
     if faults:
         raise InputError(faults)

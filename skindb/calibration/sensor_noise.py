@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from skindb.errors import Fault, InputError
+from skindb.errors import require
 
 Array = NDArray[np.float64]
 
+PAIRS = "pairs of flat frames"
 MIN_PAIRS = 3  # pairs of different brightness
 # brightest over darkest mean; with less, slope and intercept cannot be separated
 MIN_RATIO = 4.0
@@ -74,50 +75,64 @@ def fit_noise(
         one brightness.
     """
     frames = np.asarray(pairs, np.float64)
-    if (
-        frames.ndim != 4
-        or frames.shape[1] != 2
-        or frames[0, 0].size < 100
-        or not np.isfinite(frames).all()
-    ):
-        rule = (
-            "they must be finite, of the shape (pair, 2, height, width), and have 100 "
-            "pixels or more"
-        )
-        raise InputError(
-            Fault(
-                "pairs of flat frames",
-                rule,
-                str(frames.shape),
-                "give one channel of each frame",
-            )
-        )
-    cut = (frames >= white).mean(axis=(1, 2, 3)) > SATURATION_FRACTION
-    count = frames[0, 0].size
-    mean = np.where(cut, np.nan, frames.mean(axis=(1, 2, 3)) - black)
-    variance = np.where(
-        cut, np.nan, np.var(frames[:, 0] - frames[:, 1], axis=(1, 2), ddof=1) / 2
+    shaped = frames.ndim == 4 and frames.shape[1] == 2 and frames[0, 0].size >= 100
+    require(
+        shaped and np.isfinite(frames).all(),
+        PAIRS,
+        "they must be finite, of the shape (pair, 2, height, width), and have 100 "
+        "pixels or more",
+        str(frames.shape),
+        "give one channel of each frame",
     )
-    x = mean[~cut]
-    y = variance[~cut]
-    if (
-        len(x) < MIN_PAIRS
-        or x.max() < MIN_RATIO * max(x.min(), 0.0)
-        or not (y > 0).all()
-    ):
-        rule = (
-            f"at least {MIN_PAIRS} pairs must be unsaturated, noisy, and differ "
-            f"{MIN_RATIO:g} times in brightness"
-        )
-        found = f"{len(x)} unsaturated pairs, {int((y > 0).sum())} of them noisy"
-        raise InputError(
-            Fault(
-                "pairs of flat frames",
-                rule,
-                found,
-                "photograph them with several exposure times",
-            )
-        )
+    clipped = (frames >= white).mean(axis=(1, 2, 3)) > SATURATION_FRACTION
+    count = frames[0, 0].size
+    difference = frames[:, 0] - frames[:, 1]
+    mean = np.where(clipped, np.nan, frames.mean(axis=(1, 2, 3)) - black)
+    variance = np.where(clipped, np.nan, difference.var(axis=(1, 2), ddof=1) / 2)
+    x = mean[~clipped]
+    y = variance[~clipped]
+    require(
+        len(x) >= MIN_PAIRS
+        and x.max() >= MIN_RATIO * max(x.min(), 0.0)
+        and (y > 0).all(),
+        PAIRS,
+        f"at least {MIN_PAIRS} pairs must be unsaturated, noisy, and differ "
+        f"{MIN_RATIO:g} times in brightness",
+        f"{len(x)} unsaturated pairs, {int((y > 0).sum())} of them noisy",
+        "photograph them with several exposure times",
+    )
+    (floor, slope), covariance, chi_square = _line(x, y, count)
+    require(
+        not slope <= 0,
+        PAIRS,
+        "the noise must grow with brightness",
+        f"a slope of {slope:.3g}",
+        "check that the frames are linear and not denoised",
+    )
+    # from values to electrons; a read noise that is negative by chance becomes 0
+    gain = 1 / float(slope)
+    read = floor - step**2 / 12
+    noise = gain * np.sqrt(max(read, 0.0))
+    # d noise = gain / (2 sqrt(read)) d read - noise gain d slope; near zero, the error
+    # of the square root
+    deviation = float(np.sqrt(covariance[0, 0]))
+    slopes = np.array([gain / (2 * np.sqrt(max(read, deviation))), -noise * gain])
+    return NoiseModel(
+        electrons_per_dn=gain,
+        electrons_per_dn_error=gain**2 * float(np.sqrt(covariance[1, 1])),
+        read_noise=float(noise),
+        read_noise_error=float(np.sqrt(slopes @ covariance @ slopes)),
+        covariance=covariance,
+        chi_square=chi_square,
+        mean=mean,
+        variance=variance,
+    )
+
+
+def _line(x: Array, y: Array, count: int) -> tuple[Array, Array, float]:
+    """Offset and slope of variances y of `count` values over means x, their covariance,
+    and chi-squared per degree of freedom.
+    """
     design = np.stack([np.ones_like(x), x], axis=1)
     expected = y
     for _ in range(ROUNDS):
@@ -125,47 +140,8 @@ def fit_noise(
         covariance = np.linalg.inv(design.T @ (design / sigma[:, None] ** 2))
         solution = covariance @ (design.T @ (y / sigma**2))
         expected = np.maximum(design @ solution, 1e-3 * y)
-    floor, slope = solution
-    if slope <= 0:
-        rule = "the noise must grow with brightness"
-        cure = "check that the frames are linear and not denoised"
-        raise InputError(
-            Fault("pairs of flat frames", rule, f"a slope of {slope:.3g}", cure)
-        )
-    chi_square = float(
-        (((y - design @ solution) / sigma) ** 2).sum() / max(len(x) - 2, 1)
-    )
-    return _electrons(
-        solution, covariance, floor - step**2 / 12, chi_square, (mean, variance)
-    )
-
-
-def _electrons(
-    line: Array,
-    covariance: Array,
-    read: float,
-    chi_square: float,
-    points: tuple[Array, Array],
-) -> NoiseModel:
-    """Convert variances in values to electrons; a read noise that is negative by chance
-    becomes 0.
-    """
-    gain = 1 / float(line[1])
-    noise = gain * np.sqrt(max(read, 0.0))
-    # d noise = gain / (2 sqrt(read)) d read - noise gain d slope; near zero, the error
-    # of the square root
-    deviation = float(np.sqrt(covariance[0, 0]))
-    slopes = np.array([gain / (2 * np.sqrt(max(read, deviation))), -noise * gain])
-    error = float(np.sqrt(slopes @ covariance @ slopes))
-    return NoiseModel(
-        gain,
-        gain**2 * float(np.sqrt(covariance[1, 1])),
-        float(noise),
-        error,
-        covariance,
-        chi_square,
-        *points,
-    )
+    square = (((y - design @ solution) / sigma) ** 2).sum()
+    return solution, covariance, float(square / max(len(x) - 2, 1))
 
 
 @dataclass(frozen=True)
@@ -198,32 +174,21 @@ def average_dark(frames: ArrayLike) -> DarkFrame:
     InputError
         Fewer than two frames, another shape, or values that are not finite.
     """
-    stack = np.asarray(frames)
-    if (
-        stack.ndim != 4
-        or stack.shape[-1] != 3
-        or len(stack) < 2
-        or not np.isfinite(stack.astype(np.float64)).all()
-    ):
-        rule = (
-            "at least two frames (frame, height, width, 3) of finite values are needed"
-        )
-        raise InputError(
-            Fault(
-                "dark frames",
-                rule,
-                f"an array of {stack.shape}",
-                "repeat the frame with the lens covered",
-            )
-        )
-    values = stack.astype(np.float64)
+    values = np.asarray(frames).astype(np.float64)
+    shaped = values.ndim == 4 and values.shape[-1] == 3 and len(values) >= 2
+    require(
+        shaped and np.isfinite(values).all(),
+        "dark frames",
+        "at least two frames (frame, height, width, 3) of finite values are needed",
+        f"an array of {values.shape}",
+        "repeat the frame with the lens covered",
+    )
     mean = values.mean(axis=0)
     spread = values.std(axis=0, ddof=1)
-    noisy = float(np.median(spread)) > 0
-    defect = (
-        _outliers(mean) | _outliers(spread) | ((spread == 0) & noisy & (len(stack) > 3))
-    )
-    return DarkFrame(mean, spread / np.sqrt(len(stack)), defect)
+    defect = _outliers(mean) | _outliers(spread)
+    if len(values) > 3 and np.median(spread) > 0:
+        defect |= spread == 0
+    return DarkFrame(mean, spread / np.sqrt(len(values)), defect)
 
 
 def _outliers(picture: Array) -> NDArray[np.bool_]:

@@ -89,52 +89,48 @@ class ProbeRecord:
 
 def read_probe(folder: Path, fields: Fields) -> ProbeRecord:
     """The probe of `probe.json`; faults are recorded in `fields`."""
-    noted = len(fields.faults)
-    fibres = fields.items("fibres", most=MAX_FIBRES)
+    earlier_faults = len(fields.faults)
+    fibres = fields.items("fibres", maximum=MAX_FIBRES)
     exposures = read_exposures(fields)
-    several = {EXPOSURE} if len(exposures) > 1 else set()
-    sites = fields.names("sites", most=MAX_SITES)
+    sites = fields.names("sites", maximum=MAX_SITES)
     placements = _placements(fields, sites)
-    several |= (
-        {PLACEMENT} if any(len(own) > 1 for own in placements.values()) else set()
-    )
-    frames = fields.template("frames", {SITE} | several, {EXPOSURE, PLACEMENT})
-    if is_linear(frames):
+    needed = {SITE}
+    if len(exposures) > 1:
+        needed.add(EXPOSURE)
+    if any(len(names) > 1 for names in placements.values()):
+        needed.add(PLACEMENT)
+    frames = fields.template("frames", needed, {EXPOSURE, PLACEMENT})
+    linear = is_linear(frames)
+    if linear:
         require_merged(fields, exposures)
-    scale = fields.get("scale", None)
+    centre = np.array([fibre.array("centre", (2,)) for fibre in fibres])
     probe = ProbeRecord(
         folder=folder,
         sites=sites,
         placements=placements,
         azimuth=np.array([_azimuth(fibre) for fibre in fibres]),
         distance=np.array([fibre.number("distance", above=0.0) for fibre in fibres]),
-        centre=np.array([fibre.array("centre", (2,)) for fibre in fibres]).reshape(
-            -1, 2
-        ),
+        centre=centre.reshape(-1, 2),
         radius=np.array([fibre.number("radius", above=0.0) for fibre in fibres]),
         exposures=exposures,
         frames=frames,
         gain=fields.gains("gain", len(fibres)),
         gain_error=fields.number(
-            "gain_error", default=GAIN_ERROR, least=0.0, most=MAX_GAIN_ERROR
+            "gain_error", default=GAIN_ERROR, minimum=0.0, maximum=MAX_GAIN_ERROR
         ),
         face=fields.number(
-            "fibre_radius", default=0.0, least=0.0, most=MAX_FIBRE_RADIUS_MM
+            "fibre_radius", default=0.0, minimum=0.0, maximum=MAX_FIBRE_RADIUS_MM
         ),
-        scale=None if scale is None else fields.number("scale", above=0.0),
-        sensor=read_sensor(
-            folder, fields, FrameKind(0, 0, 0), linear=is_linear(frames)
-        ),
+        scale=fields.number("scale", above=0.0) if fields.has("scale") else None,
+        sensor=read_sensor(folder, fields, FrameKind(0, 0, 0), linear=linear),
         fibres=tuple(fibre.text("id", rule=IDENTIFIER) for fibre in fibres),
-        pressure=read_pressure(fields, placements),
+        pressure=_pressure(fields, placements),
         file=Path(fields.where),
     )
-    if len(fields.faults) == noted:
-        fields.faults += fibre_faults(
-            fields.where, probe.distance, probe.centre, probe.radius, probe.face
-        )
-        fields.faults += gain_faults(fields.where, probe.gain)
-    _check_probe_frames(probe, fields)
+    if len(fields.faults) == earlier_faults:
+        _require_separate_fibres(fields, probe)
+        _require_even_gains(fields, probe.gain)
+    _check_frames(probe, fields)
     return probe
 
 
@@ -142,27 +138,26 @@ def _placements(fields: Fields, sites: Sequence[str]) -> dict[str, tuple[str, ..
     """Names of the placements of the probe at each site; a site without names has a
     single placement.
     """
-    given = Fields(
-        fields.get("placements", {}), f"{fields.where}[placements]", fields.faults
-    )
-    if unknown := sorted(set(given.data) - set(sites)):
-        given.fault(unknown[0], "must be one of the sites", shown(unknown[0]))
+    by_site = fields.object("placements", {})
+    if unknown := sorted(set(by_site.data) - set(sites)):
+        by_site.fault(unknown[0], "must be one of the sites", shown(unknown[0]))
     return {
-        site: given.names(site, most=MAX_PLACEMENTS) if site in given.data else ("",)
+        site: by_site.names(site, maximum=MAX_PLACEMENTS)
+        if site in by_site.data
+        else ("",)
         for site in sites
     }
 
 
 def _azimuth(fibre: Fields) -> float:
-    given = fibre.get("azimuth", None)
-    return (
-        np.nan if given is None else fibre.number("azimuth", least=-360.0, most=360.0)
-    )
+    if not fibre.has("azimuth"):
+        return np.nan
+    return fibre.number("azimuth", minimum=-360.0, maximum=360.0)
 
 
-def _check_probe_frames(probe: ProbeRecord, fields: Fields) -> None:
+def _check_frames(probe: ProbeRecord, fields: Fields) -> None:
     """Require that all frames have the size of the first one, and the declared depth."""
-    size: FrameKind | None = None
+    kind: FrameKind | None = None
     views = [
         {SITE: site, EXPOSURE: exposure, PLACEMENT: placement}
         for site in (probe.sites if probe.frames else ())
@@ -171,157 +166,114 @@ def _check_probe_frames(probe: ProbeRecord, fields: Fields) -> None:
     require_own_files(
         fields, (("frames", filled(probe.frames, **names), names) for names in views)
     )
+    place = f"{fields.where}[frames]"
     for names in views:
-        where = f"{fields.where}[frames]"
-        path = inside(probe.folder, filled(probe.frames, **names), where, fields.faults)
+        path = inside(probe.folder, filled(probe.frames, **names), place, fields.faults)
         if path is None:
             continue
-        size = size or _kind_of(path, probe.sensor.kind.bits)
-        fields.faults += header_faults(path, size or probe.sensor.kind, where)
+        size = None if kind else frame_size(path)
+        if size is not None:
+            kind = FrameKind(*size, probe.sensor.kind.bits)
+        fields.faults += header_faults(path, kind or probe.sensor.kind, place)
 
 
-def read_pressure(
+def _pressure(
     fields: Fields, placements: Mapping[str, tuple[str, ...]]
 ) -> dict[tuple[str, str], Log]:
     """(site, placement) -> log of its pressure; a single number is a log without times (NaN)."""
-    given = Fields(
-        fields.get("pressure", {}), f"{fields.where}[pressure]", fields.faults
-    )
-    found = {}
-    for site, value in given.data.items():
-        own = placements.get(site, ("",))
-        parts = value if isinstance(value, dict) else dict.fromkeys(own, value)
-        for placement, one in parts.items():
-            if site in placements and placement not in own:
-                given.fault(
-                    site,
-                    f"must name placements of the site: {', '.join(own)}",
-                    shown(placement),
-                )
-            log = _log(one)
+    low, high = GAUGE_PRESSURES_KPA
+    by_site = fields.object("pressure", {})
+    logs = {}
+    for site, value in by_site.data.items():
+        names = placements.get(site, ("",))
+        parts = value if isinstance(value, dict) else dict.fromkeys(names, value)
+        for placement, content in parts.items():
+            if site in placements and placement not in names:
+                rule = f"must name placements of the site: {', '.join(names)}"
+                by_site.fault(site, rule, shown(placement))
+            log = _log(content)
             if log is None:
-                given.fault(site, PRESSURE_RULE, shown(one))
-            elif not (
-                (log[:, 1] >= GAUGE_PRESSURES_KPA[0])
-                & (log[:, 1] <= GAUGE_PRESSURES_KPA[1])
-            ).all():
-                low, high = GAUGE_PRESSURES_KPA
+                by_site.fault(site, PRESSURE_RULE, shown(content))
+            elif not ((log[:, 1] >= low) & (log[:, 1] <= high)).all():
+                worst = log[np.abs(log[:, 1]).argmax(), 1]
                 rule = f"a gauge pressure must be {low:g} to {high:g} kPa"
-                given.fault(site, rule, f"{log[np.abs(log[:, 1]).argmax(), 1]:.4g} kPa")
+                by_site.fault(site, rule, f"{worst:.4g} kPa")
             else:
-                found[site, placement] = log
-    return found
+                logs[site, placement] = log
+    return logs
 
 
 def _log(value: Any) -> Log | None:
     if is_number(value):
         return np.array([[np.nan, value]]) if abs(value) <= MAX_MAGNITUDE else None
-    pairs = isinstance(value, list) and 0 < len(value) <= MAX_PRESSURE_SAMPLES
-    if not pairs or not all(
-        isinstance(one, list) and len(one) == 2 and all(map(is_number, one))
-        for one in value
-    ):
+    if not isinstance(value, list) or not 0 < len(value) <= MAX_PRESSURE_SAMPLES:
         return None
+    for pair in value:
+        if not isinstance(pair, list) or len(pair) != 2:
+            return None
+        if not all(is_number(x) and abs(x) <= MAX_MAGNITUDE for x in pair):
+            return None
     log = np.array(value, np.float64)
-    return (
-        log
-        if (np.abs(log) <= MAX_MAGNITUDE).all() and (np.diff(log[:, 0]) > 0).all()
-        else None
-    )
+    return log if (np.diff(log[:, 0]) > 0).all() else None
 
 
-def _kind_of(path: Path, bits: int) -> FrameKind | None:
-    size = frame_size(path)
-    return None if size is None else FrameKind(*size, bits)
-
-
-def fibre_faults(
-    where: str, distance: Array, centre: Array, radius: Array, face: float
-) -> list[Fault]:
-    """Faults of fibres that are at one distance, in another unit, or overlap.
-
-    Parameters
-    ----------
-    where
-        File of the probe.
-    distance, centre, radius
-        (n,) mm from the source, (n, 2) and (n,) px.
-    face
-        Radius of a fibre and of the source in mm; 0 if unknown.
-    """
+def _require_separate_fibres(fields: Fields, probe: ProbeRecord) -> None:
+    """Require fibres at different distances in mm that do not overlap."""
+    distance = probe.distance
     if not len(distance):
-        return []
-    faults, (least, most) = [], FIBRE_DISTANCES_MM
-    if not least <= distance.max() <= most:
+        return
+    nearest, farthest = FIBRE_DISTANCES_MM
+    if not nearest <= distance.max() <= farthest:
         rule = (
-            f"distances must be in mm, and the farthest fibre must be {least:g} to "
-            f"{most:g} mm from the source"
+            f"distances must be in mm, and the farthest fibre must be {nearest:g} to "
+            f"{farthest:g} mm from the source"
         )
-        faults.append(
-            Fault(
-                f"{where}[fibres]",
-                rule,
-                f"{distance.max():g} mm",
-                "give the distances in mm",
-            )
-        )
+        cure = "give the distances in mm"
+        fields.fault("fibres", rule, f"{distance.max():g} mm", cure)
     elif len(distance) > 1 and np.ptp(distance) == 0:
         rule = "a profile needs fibres at different distances"
-        cure = "give each fibre its own distance"
-        faults.append(
-            Fault(
-                f"{where}[fibres]",
-                rule,
-                f"all {len(distance)} at {distance[0]:g} mm",
-                cure,
-            )
-        )
-    if face > 0 and (distance < 2 * face).any():
+        finding = f"all {len(distance)} at {distance[0]:g} mm"
+        fields.fault("fibres", rule, finding, "give each fibre its own distance")
+    if probe.face > 0 and (distance < 2 * probe.face).any():
         i = int(distance.argmin())
         rule = (
             "fibres must not overlap the source: distance must be at least twice "
-            f"fibre_radius, {2 * face:g} mm"
+            f"fibre_radius, {2 * probe.face:g} mm"
         )
         cure = (
             "distance is measured between the centres; both are in mm, and "
             "fibre_radius is not the diameter"
         )
-        faults.append(
-            Fault(f"{where}[fibres][{i}][distance]", rule, f"{distance[i]:g} mm", cure)
-        )
-    faults += _overlap_faults(where, centre, radius)
-    return faults
+        place = f"{fields.where}[fibres][{i}][distance]"
+        fields.faults.append(Fault(place, rule, f"{distance[i]:g} mm", cure))
+    _require_separate_discs(fields, probe.centre, probe.radius)
 
 
-def _overlap_faults(where: str, centre: Array, radius: Array) -> list[Fault]:
-    """Fault of fibres that overlap in the picture; it names the pair that overlaps most."""
+def _require_separate_discs(fields: Fields, centre: Array, radius: Array) -> None:
+    """Require discs (n, 2) and (n,) px that do not overlap; the fault names the pair
+    that overlaps most.
+    """
     gap = np.linalg.norm(centre[:, None] - centre, axis=-1)
     closeness = gap / (MIN_CENTRE_DISTANCE_FRACTION * (radius[:, None] + radius))
     closeness[np.tril_indices(len(radius))] = np.inf
-    count = int((closeness < 1).sum())
-    if not count:
-        return []
-    i, j = np.unravel_index(closeness.argmin(), closeness.shape)
-    rule = "fibres must not overlap in the picture"
-    cure = "correct centre and radius, in pixels"
-    found = (
-        f"{count} pairs, such as {i} and {j}: {gap[i, j]:.3g} px apart, radii "
-        f"{radius[i]:g} and {radius[j]:g} px"
-    )
-    return [Fault(f"{where}[fibres]", rule, found, cure)]
+    if count := int((closeness < 1).sum()):
+        i, j = np.unravel_index(closeness.argmin(), closeness.shape)
+        finding = (
+            f"{count} pairs, such as {i} and {j}: {gap[i, j]:.3g} px apart, radii "
+            f"{radius[i]:g} and {radius[j]:g} px"
+        )
+        cure = "correct centre and radius, in pixels"
+        fields.fault("fibres", "fibres must not overlap in the picture", finding, cure)
 
 
-def gain_faults(where: str, gain: Array) -> list[Fault]:
-    """Faults of gains (n, 3) that are far from the median of their channel."""
+def _require_even_gains(fields: Fields, gain: Array) -> None:
+    """Require gains (n, 3) near the median of their channel."""
     ratio = gain / np.median(gain, axis=0)
-    off = np.maximum(ratio, 1 / ratio).max(axis=1)
     rule = (
         f"the gain of a fibre must be at most {MAX_GAIN_RATIO:g} times as large or "
         "small as the median gain"
     )
-    cure = "measure the flat field of the fibre again"
-    return [
-        Fault(f"{where}[gain]", rule, f"{x:.3g} times, of fibre {i}", cure)
-        for i, x in enumerate(off)
-        if x > MAX_GAIN_RATIO
-    ]
+    for i, factor in enumerate(np.maximum(ratio, 1 / ratio).max(axis=1)):
+        if factor > MAX_GAIN_RATIO:
+            cure = "measure the flat field of the fibre again"
+            fields.fault("gain", rule, f"{factor:.3g} times, of fibre {i}", cure)

@@ -11,8 +11,10 @@ import math
 import operator
 import os
 import struct
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -23,13 +25,14 @@ import OpenEXR
 import tifffile
 from numpy.typing import NDArray
 
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, attempt, require
 from skindb.files import open_regular, private_file, read_regular
 from skindb.limits import MAX_FRAME_BYTES, MAX_FRAME_PIXELS, MAX_PNG_RATIO
 from skindb.render.image import write_exr
 
 Frame = NDArray[Any]  # (h, w, 3) uint8, uint16 or float32
 Header = tuple[int, int, int, np.dtype[Any]]  # width, height, channels, type
+Codec = tuple[Callable[[Path, BinaryIO], Header], Callable[[Path, bytes], Frame]]
 Digests = dict[Path, str]  # sha256 of the bytes that were decoded
 PNG_HEAD = b"\x89PNG\r\n\x1a\n"
 PNG_TAIL = b"IEND\xaeB`\x82"
@@ -39,6 +42,8 @@ EXR_LINES = {0: 1, 1: 1, 2: 1, 3: 16, 4: 32, 5: 16, 6: 32, 7: 32, 8: 32, 9: 256}
 # of a file; a count far above R, G, B, alpha and depth indicates damage
 MAX_CHANNELS = 16
 CURE = "copy the file from the camera again"
+RGB_RULE = "a frame must have the channels R, G, B"
+RGB_CURE = "write RGB frames"
 # otherwise its messages on damage go to standard error
 logging.getLogger("tifffile").addHandler(logging.NullHandler())
 # errors of tifffile for damaged tags, found by changing bytes; MemoryError: an absurd
@@ -93,94 +98,65 @@ def header_faults(path: Path, kind: FrameKind, key: str) -> list[Fault]:
     key
         Key of the JSON file that lists the frame, for the message.
     """
-    where = f"{path} ({key})"
-    try:
-        width, height, channels, dtype = _header(path)
-    except InputError as error:
-        return [
-            Fault(where, fault.rule, fault.found, fault.cure) for fault in error.faults
-        ]
-    faults = []
+    place = f"{path} ({key})"
+    faults = list[Fault]()
+    header = attempt(faults, lambda: _header(path), where=place)
+    if header is None:
+        return faults
+    width, height, channels, dtype = header
     if (width, height) != (kind.width, kind.height):
         rule = f"a frame must be {kind.width} x {kind.height} pixels, as declared for its camera"
-        faults.append(
-            Fault(
-                where,
-                rule,
-                f"{width} x {height}",
-                "correct width and height, or the frames",
-            )
-        )
+        cure = "correct width and height, or the frames"
+        faults.append(Fault(place, rule, f"{width} x {height}", cure))
     if channels != 3:
-        faults.append(
-            Fault(
-                where,
-                "a frame must have the channels R, G, B",
-                f"{channels} channels",
-                "write RGB frames",
-            )
-        )
+        faults.append(Fault(place, RGB_RULE, f"{channels} channels", RGB_CURE))
     if dtype != kind.dtype:
-        promised = (
-            f"bit_depth {kind.bits} means {kind.dtype}"
-            if kind.bits
-            else "OpenEXR holds half or float"
-        )
-        faults.append(
-            Fault(
-                where,
-                promised,
-                str(dtype),
-                "correct bit_depth, or write frames of that depth",
-            )
-        )
+        rule = "OpenEXR holds half or float"
+        if kind.bits:
+            rule = f"bit_depth {kind.bits} means {kind.dtype}"
+        cure = "correct bit_depth, or write frames of that depth"
+        faults.append(Fault(place, rule, str(dtype), cure))
     return faults
 
 
 def frame_size(path: Path) -> tuple[int, int] | None:
     """Width and height according to the header; None if there is none."""
-    try:
-        return _header(path)[:2]
-    except InputError:
-        return None
+    header = attempt([], lambda: _header(path))
+    return None if header is None else header[:2]
 
 
 def _header(path: Path) -> Header:
     """Width, height, channels and type of a frame; the file must be regular and within
     the size limit.
     """
-    where = str(path)
+    place = str(path)
     try:
-        with open_regular(path, MAX_FRAME_BYTES) as stream:
-            width, height, channels, dtype = _reader(path, _HEADERS)(path, stream)
-    except UnreadableError as error:
-        raise InputError(
-            Fault(where, "a frame must be a whole image file", str(error), CURE)
-        ) from None
+        with _whole_image(path), open_regular(path, MAX_FRAME_BYTES) as stream:
+            width, height, channels, dtype = _codec(path)[0](path, stream)
     except OSError as error:
-        found = error.strerror or str(error)
-        raise InputError(
-            Fault(
-                where,
-                "a frame must be readable",
-                found,
-                "check its permissions and the disk",
-            )
-        ) from None
-    if channels > MAX_CHANNELS:
-        raise InputError(
-            Fault(
-                where,
-                "a frame must have the channels R, G, B",
-                f"{channels} channels",
-                "write RGB frames",
-            )
-        )
-    if min(width, height) < 1 or width * height > MAX_FRAME_PIXELS:
-        rule = f"a frame must have 1 to {MAX_FRAME_PIXELS:,} pixels"
-        found = f"{width} x {height} in its header"
-        raise InputError(Fault(where, rule, found, CURE))
+        finding = error.strerror or str(error)
+        cure = "check its permissions and the disk"
+        fault = Fault(place, "a frame must be readable", finding, cure)
+        raise InputError(fault) from None
+    require(channels <= MAX_CHANNELS, place, RGB_RULE, f"{channels} channels", RGB_CURE)
+    require(
+        min(width, height) > 0 and width * height <= MAX_FRAME_PIXELS,
+        place,
+        f"a frame must have 1 to {MAX_FRAME_PIXELS:,} pixels",
+        f"{width} x {height} in its header",
+        CURE,
+    )
     return width, height, channels, dtype
+
+
+@contextmanager
+def _whole_image(path: Path) -> Iterator[None]:
+    """Context that raises an `UnreadableError` as an `InputError`."""
+    try:
+        yield
+    except UnreadableError as error:
+        rule = "a frame must be a whole image file"
+        raise InputError(Fault(str(path), rule, str(error), CURE)) from None
 
 
 def read_frame(
@@ -207,28 +183,20 @@ def read_frame(
     InputError
         If the file is absent, incomplete, or not of this kind.
     """
-    try:
-        decode = _reader(path, _DECODERS)
+    with _whole_image(path):
+        decode = _codec(path)[1]
         _header(path)  # checks the size before memory for it is allocated
         content = read_regular(path, MAX_FRAME_BYTES)
         frame: Frame = decode(path, content)
-    except UnreadableError as error:
-        raise InputError(
-            Fault(str(path), "a frame must be a whole image file", str(error), CURE)
-        ) from None
     shape = frame.shape[:2] if kind is None else (kind.height, kind.width)
     dtype = frame.dtype if kind is None else kind.dtype
-    if frame.shape != (*shape, 3) or frame.dtype != dtype:
-        rule = f"a frame must be {shape[1]} x {shape[0]} with R, G, B of {dtype}"
-        found = f"an array of {' x '.join(map(str, frame.shape))} {frame.dtype}"
-        raise InputError(
-            Fault(
-                str(path),
-                rule,
-                found,
-                "correct the JSON file that describes it, or the frames",
-            )
-        )
+    require(
+        frame.shape == (*shape, 3) and frame.dtype == dtype,
+        str(path),
+        f"a frame must be {shape[1]} x {shape[0]} with R, G, B of {dtype}",
+        f"an array of {' x '.join(map(str, frame.shape))} {frame.dtype}",
+        "correct the JSON file that describes it, or the frames",
+    )
     if digests is not None:
         digests[path] = hashlib.sha256(content).hexdigest()
     return frame
@@ -238,16 +206,13 @@ def read_frames(
     paths: Iterable[Path], kind: FrameKind | None = None, digests: Digests | None = None
 ) -> list[Frame]:
     """Several frames; `InputError` with the faults of all of them."""
-    frames = list[Frame]()
     faults = list[Fault]()
-    for path in paths:
-        try:
-            frames.append(read_frame(path, kind, digests))
-        except InputError as error:
-            faults += error.faults
+    frames = [
+        attempt(faults, partial(read_frame, path, kind, digests)) for path in paths
+    ]
     if faults:
         raise InputError(faults)
-    return frames
+    return [frame for frame in frames if frame is not None]
 
 
 def write_frame(path: Path, frame: Frame) -> None:
@@ -260,13 +225,11 @@ def write_frame(path: Path, frame: Frame) -> None:
     if suffix == ".exr":
         write_exr(path, frame)
     elif suffix == ".png":
-        private_file(path).write_bytes(
-            imagecodecs.png_encode(np.ascontiguousarray(frame))
-        )
+        content = imagecodecs.png_encode(np.ascontiguousarray(frame))
+        private_file(path).write_bytes(content)
     elif suffix in (".tif", ".tiff"):
-        tifffile.imwrite(
-            private_file(path), frame, photometric="rgb", compression="zstd"
-        )
+        file = private_file(path)
+        tifffile.imwrite(file, frame, photometric="rgb", compression="zstd")
     else:
         raise ValueError(f"frames are .png, .tif or .exr, not {suffix!r}")
 
@@ -275,35 +238,31 @@ def _png_header(_: Path, stream: BinaryIO) -> Header:
     head = stream.read(33)
     size = stream.seek(0, io.SEEK_END)
     stream.seek(max(size - len(PNG_TAIL), 0))
-    whole = stream.read() == PNG_TAIL or _png_ends(stream, size)
+    complete = stream.read() == PNG_TAIL or _png_ends(stream, size)
     if len(head) < 33 or head[:8] != PNG_HEAD:
         raise UnreadableError("not a PNG file")
-    if not whole:
+    if not complete:
         raise UnreadableError(DAMAGED)
     width, height, bits, colour = struct.unpack(">IIBB", head[16:26])
     if width * height * PNG_CHANNELS.get(colour, 1) * bits > 8 * MAX_PNG_RATIO * size:
         raise UnreadableError(
             f"a PNG file of {size:,} bytes whose header states {width} x {height} pixels"
         )
-    return (
-        width,
-        height,
-        PNG_CHANNELS.get(colour, 0),
-        np.dtype("uint16" if bits == 16 else "uint8"),
-    )
+    dtype = np.dtype("uint16" if bits == 16 else "uint8")
+    return width, height, PNG_CHANNELS.get(colour, 0), dtype
 
 
 def _png_ends(stream: BinaryIO, size: int) -> bool:
     """Whether the chunks end within the file; data after the end, such as padding to
     blocks, is allowed.
     """
-    at = len(PNG_HEAD)
-    while at + 12 <= size:
-        stream.seek(at)
+    offset = len(PNG_HEAD)
+    while offset + 12 <= size:
+        stream.seek(offset)
         length, kind = struct.unpack(">I4s", stream.read(8))
-        at += 12 + length
+        offset += 12 + length
         if kind == b"IEND":
-            return bool(at <= size)
+            return bool(offset <= size)
     return False
 
 
@@ -313,19 +272,17 @@ def _tiff_header(_: Path, stream: BinaryIO) -> Header:
             page = file.pages[0]
             # damaged tags are tuples or text
             height, width, *channels = (operator.index(side) for side in page.shape)
-            dtype = np.dtype(page.dtype) if page.dtype is not None else None
+            if page.dtype is not None:
+                return width, height, math.prod(channels), np.dtype(page.dtype)
     except TIFF_DAMAGE:
-        raise UnreadableError(DAMAGED) from None
-    if dtype is None:
-        raise UnreadableError(DAMAGED)
-    return width, height, math.prod(channels), dtype
+        pass
+    raise UnreadableError(DAMAGED)
 
 
 def _exr_header(path: Path, stream: BinaryIO) -> Header:
     try:
-        part = OpenEXR.File(str(path), separate_channels=True, header_only=True).parts[
-            0
-        ]
+        file = OpenEXR.File(str(path), separate_channels=True, header_only=True)
+        part = file.parts[0]
     except (ValueError, RuntimeError, IndexError):
         raise UnreadableError(DAMAGED) from None
     low, high = (np.asarray(corner) for corner in part.header["dataWindow"])
@@ -333,17 +290,13 @@ def _exr_header(path: Path, stream: BinaryIO) -> Header:
     try:
         _require_chunks(stream, height)
         names = {channel.name for channel in part.header["channels"]}
-        if len(names) > MAX_CHANNELS:
-            raise UnreadableError(f"an OpenEXR file of {len(names)} channels")
     except (struct.error, IndexError, UnicodeDecodeError):
         # the library also opens incomplete headers
         raise UnreadableError(DAMAGED) from None
-    return (
-        width,
-        height,
-        3 if {"R", "G", "B"} <= names else len(names),
-        np.dtype("float32"),
-    )
+    if len(names) > MAX_CHANNELS:
+        raise UnreadableError(f"an OpenEXR file of {len(names)} channels")
+    channels = 3 if names.issuperset("RGB") else len(names)
+    return width, height, channels, np.dtype("float32")
 
 
 def _require_chunks(stream: BinaryIO, height: int) -> None:
@@ -352,42 +305,40 @@ def _require_chunks(stream: BinaryIO, height: int) -> None:
     """
     size = stream.seek(0, os.SEEK_END)
 
-    def content(at: int, count: int) -> bytes:
-        stream.seek(min(at, size))
+    def content(offset: int, count: int) -> bytes:
+        stream.seek(min(offset, size))
         # a damaged file may contain any number
         return stream.read(min(max(count, 0), size))
 
-    at = 8
+    offset = 8
     lines = 0
-    while (attribute := content(at, 600))[:1] != b"\0":
+    while (attribute := content(offset, 600))[:1] != b"\0":
         name, _, rest = attribute.partition(b"\0")
         kind = rest.partition(b"\0")[0]
-        value = at + len(name) + len(kind) + 6
-        lines = (
-            EXR_LINES.get(content(value, 1)[0], 0) if name == b"compression" else lines
-        )
+        value = offset + len(name) + len(kind) + 6
+        if name == b"compression":
+            lines = EXR_LINES.get(content(value, 1)[0], 0)
         # unsigned: no step back
-        at = value + int(struct.unpack("<I", content(value - 4, 4))[0])
+        offset = value + int(struct.unpack("<I", content(value - 4, 4))[0])
     flags = content(5, 1)[0]
     # tiled, deep and multi-part files are left to the decoder
     if not lines or flags & 0b11010:
         return
     count = -(-height // lines)
-    table = content(at + 1, 8 * count)
+    table = content(offset + 1, 8 * count)
     if not 0 < 8 * count == len(table):
         raise UnreadableError(DAMAGED)
     offsets = np.frombuffer(table, "<u8")
-    last = int(offsets.max())
-    length = (
-        int.from_bytes(content(last + 4, 4), "little") if last + 8 <= size else size
-    )
-    if last + 8 + length > size or int(offsets.min()) == 0:
+    end = int(offsets.max()) + 8
+    if end <= size:
+        end += int.from_bytes(content(end - 4, 4), "little")
+    if end > size or int(offsets.min()) == 0:
         raise UnreadableError(DAMAGED)
 
 
 def _decode_png(_: Path, content: bytes) -> Frame:
     try:
-        return np.asarray(imagecodecs.png_decode(content))
+        return imagecodecs.png_decode(content)
     except (ValueError, RuntimeError):  # the decoder raises RuntimeError
         raise UnreadableError(DAMAGED) from None
 
@@ -415,21 +366,17 @@ def _decode_exr(path: Path, _: bytes) -> Frame:
     )
 
 
-_HEADERS: dict[str, Callable[[Path, BinaryIO], Header]] = {
-    ".png": _png_header,
-    ".tif": _tiff_header,
-    ".tiff": _tiff_header,
-    ".exr": _exr_header,
-}
-_DECODERS: dict[str, Callable[[Path, bytes], Frame]] = {
-    ".png": _decode_png,
-    ".tif": _decode_tiff,
-    ".tiff": _decode_tiff,
-    ".exr": _decode_exr,
+TIFF: Codec = (_tiff_header, _decode_tiff)
+CODECS: dict[str, Codec] = {
+    ".png": (_png_header, _decode_png),
+    ".tif": TIFF,
+    ".tiff": TIFF,
+    ".exr": (_exr_header, _decode_exr),
 }
 
 
-def _reader(path: Path, readers: dict[str, Callable[..., Any]]) -> Callable[..., Any]:
-    if path.suffix.lower() not in readers:
+def _codec(path: Path) -> Codec:
+    """Functions that read the header and decode the content of a file."""
+    if path.suffix.lower() not in CODECS:
         raise UnreadableError(f"frames are .png, .tif or .exr, not {path.suffix!r}")
-    return readers[path.suffix.lower()]
+    return CODECS[path.suffix.lower()]

@@ -27,7 +27,9 @@ def read_json(path: Path, faults: list[Fault]) -> Any:
     beyond a limit.
     """
     where = str(path)
-    noted = len(faults)
+    earlier = len(faults)
+    finding = ""
+    content = None
     try:
         text = read_regular(path, MAX_JSON_BYTES).decode("utf-8")
         if (depth := json_depth(text)) > MAX_JSON_DEPTH:
@@ -41,11 +43,13 @@ def read_json(path: Path, faults: list[Fault]) -> Any:
         faults += error.faults
         return None
     except UnicodeDecodeError as error:
-        faults.append(_no_json(where, f"byte {error.start} is not UTF-8"))
-        return None
+        finding = f"byte {error.start} is not UTF-8"
     except (ValueError, RecursionError) as error:
         # ValueError: also of numbers with thousands of digits
-        faults.append(_no_json(where, str(error)))
+        finding = str(error)
+    if finding:
+        cure = "correct the file at that place, or write it again"
+        faults.append(Fault(where, "must be JSON in UTF-8", finding, cure))
         return None
     if content is None:
         faults.append(Fault(where, "must be a JSON object {...}", "null", CURE))
@@ -56,57 +60,44 @@ def read_json(path: Path, faults: list[Fault]) -> Any:
             Fault(f"{where}{place}", rule, "half a surrogate pair", cure)
             for place in _broken_texts(content)
         ]
-    return content if len(faults) == noted else None
-
-
-def _no_json(where: str, found: str) -> Fault:
-    return Fault(
-        where,
-        "must be JSON in UTF-8",
-        found,
-        "correct the file at that place, or write it again",
-    )
+    return content if len(faults) == earlier else None
 
 
 def _unique_pairs(
     pairs: list[tuple[str, Any]], where: str, faults: list[Fault]
 ) -> dict[str, Any]:
     """The object of these pairs; repeated keys, and more than `MAX_OBJECT_KEYS`, are faults."""
-    data = dict(pairs)
     if len(pairs) > MAX_OBJECT_KEYS:
         rule = f"a JSON object must have at most {MAX_OBJECT_KEYS} keys"
-        faults.append(
-            Fault(where, rule, f"{len(pairs)}", "remove those that are not needed")
+        cure = "remove those that are not needed"
+        faults.append(Fault(where, rule, f"{len(pairs)}", cure))
+        return dict(pairs)
+    count = Counter(key for key, _ in pairs)
+    rule = "an object must have each key once"
+    faults += [
+        Fault(
+            f"{where}[{short(key)}]",
+            rule,
+            "the key more than once",
+            "remove all but one",
         )
-    elif len(data) < len(pairs):
-        for key in sorted(
-            key for key, times in Counter(key for key, _ in pairs).items() if times > 1
-        ):
-            rule = "an object must have each key once"
-            cure = "remove all but one"
-            faults.append(
-                Fault(f"{where}[{short(key)}]", rule, "the key more than once", cure)
-            )
-    return data
+        for key in sorted(key for key, times in count.items() if times > 1)
+    ]
+    return dict(pairs)
 
 
 def _broken_texts(value: Any, place: str = "") -> Iterator[str]:
     """Places of the keys and texts with half a surrogate pair."""
     if isinstance(value, str):
-        if _broken(value):
+        if any("\ud800" <= c <= "\udfff" for c in value):
             yield place
     elif isinstance(value, list):
         for i, item in enumerate(value):
             yield from _broken_texts(item, f"{place}[{i}]")
     elif isinstance(value, dict):
         for key, item in value.items():
-            if _broken(key):
-                yield f"{place}[{short(key)}]"
+            yield from _broken_texts(key, f"{place}[{short(key)}]")
             yield from _broken_texts(item, f"{place}[{short(key)}]")
-
-
-def _broken(text: str) -> bool:
-    return any("\ud800" <= c <= "\udfff" for c in text)
 
 
 def is_number(value: Any) -> bool:

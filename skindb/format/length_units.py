@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import product
 from math import inf, log
 
@@ -25,7 +26,6 @@ from skindb.format.scan_checks import (
     likely_unit,
     rescaling,
 )
-from skindb.geometry.camera import camera_centre
 from skindb.geometry.clean import CleanMesh
 from skindb.geometry.mesh import closest_on_mesh, face_crosses, winding_number
 from skindb.geometry.scan import Scan
@@ -86,32 +86,25 @@ class Lengths:
     middles: Mapping[str, Array]
     dome: DomeRecord | None
 
-    @property
-    def diagonal(self) -> float:
-        """Diagonal of the scan."""
-        return float(np.linalg.norm(np.ptp(self.scan.vertices, axis=0)))
-
-    @property
+    @cached_property
     def sizes(self) -> dict[str, float]:
         """A length of each part: diagonal, height of the face, median distances from
         the centre of the scan.
         """
-        sizes = {SCAN: self.diagonal}
+        vertices = self.scan.vertices
+        sizes = {SCAN: float(np.linalg.norm(np.ptp(vertices, axis=0)))}
         if (height := face_height(self.landmarks)) is not None:
             sizes[LANDMARKS] = height
         if self.dome is not None and self.dome.cameras:
-            sizes[CAMERAS] = self._distance([*device_positions(self.dome).values()])
+            sizes[CAMERAS] = self.distance([c.centre for c in self.dome.cameras])
         if self.dome is not None and self.dome.lights:
-            sizes[LIGHTS] = self._distance(
-                [light.position for light in self.dome.lights]
-            )
+            sizes[LIGHTS] = self.distance([x.position for x in self.dome.lights])
         return sizes
 
-    def _distance(self, places: list[Array], factor: float = 1.0) -> float:
-        middle = self.scan.vertices.mean(axis=0)
-        return float(
-            np.median(np.linalg.norm(factor * np.array(places) - middle, axis=1))
-        )
+    def distance(self, positions: list[Array], factor: float = 1.0) -> float:
+        """Median distance from the centre of the scan of positions times a factor."""
+        away = factor * np.array(positions) - self.scan.vertices.mean(axis=0)
+        return float(np.median(np.linalg.norm(away, axis=1)))
 
 
 def likely_units(lengths: Lengths) -> dict[str, str]:
@@ -122,164 +115,136 @@ def likely_units(lengths: Lengths) -> dict[str, str]:
     heads in domes, and in which the fewest parts are in the fewest other units.
     """
     parts = [*lengths.sizes]
-    near = (
-        {ratio: _landmarks_near(lengths, ratio) for ratio in _ratios()}
-        if LANDMARKS in parts
-        else {}
-    )
-    views = {ratio: _device_cost(lengths, ratio) for ratio in _ratios()}
+    ratios = {a / b for a, b in product(MM.values(), repeat=2)}
+    near = {}
+    if LANDMARKS in parts:
+        near = {ratio: _landmark_distance(lengths, ratio) for ratio in ratios}
+    views = {ratio: _device_costs(lengths, ratio) for ratio in ratios}
     best = dict[str, str]()
-    least = inf
+    lowest = inf
     for names in product(MM, repeat=len(parts)):
         units = dict(zip(parts, names, strict=True))
-        other = {part: unit for part, unit in units.items() if MM[unit] != 1}
-        cost = PART_COST * len(other) + UNIT_COST * max(len({*names}) - 1, 0)
-        if cost < least:
-            cost += _cost(
-                lengths, {part: MM[unit] for part, unit in units.items()}, near, views
-            )
-        if cost < least:
-            best = other
-            least = cost
+        other_units = {part: unit for part, unit in units.items() if MM[unit] != 1}
+        cost = PART_COST * len(other_units) + UNIT_COST * max(len({*names}) - 1, 0)
+        if cost < lowest:
+            factors = {part: MM[unit] for part, unit in units.items()}
+            cost += _cost(lengths, factors, near, views)
+        if cost < lowest:
+            best = other_units
+            lowest = cost
     return best
-
-
-def _ratios() -> set[float]:
-    """Ratios of the units of two parts."""
-    return {a / b for a, b in product(MM.values(), repeat=2)}
 
 
 def _cost(
     lengths: Lengths,
     factor: Mapping[str, float],
     near: Mapping[float, float],
-    views: Mapping[float, tuple[float, float]],
+    views: Mapping[float, Mapping[str, float]],
 ) -> float:
     """Sum of the logarithms by which lengths differ from the usual ones; infinite for
     lengths that are impossible.
     """
     sizes = {part: factor[part] * size for part, size in lengths.sizes.items()}
+    diagonal = sizes[SCAN]
     height = sizes.get(LANDMARKS, (face_height(lengths.middles) or 0.0) * factor[SCAN])
-    if not SCAN_DIAGONAL[0] <= sizes[SCAN] <= SCAN_DIAGONAL[1] or (
-        height and not _within(height, FACE_HEIGHTS)
-    ):
+    if not SCAN_DIAGONAL[0] <= diagonal <= SCAN_DIAGONAL[1]:
         return inf
-    cost = (
-        abs(log(height / FACE_HEIGHT))
-        if height
-        else abs(log(sizes[SCAN] / HEAD_DIAGONAL))
-    )
-    if LANDMARKS in factor and min(near.values()) < LANDMARK_REACH / factor[SCAN]:
-        cost += (
-            0.0
-            if near[factor[LANDMARKS] / factor[SCAN]] <= LANDMARK_REACH / factor[SCAN]
-            else inf
-        )
-    if CAMERAS in factor:
-        cost += views[factor[CAMERAS] / factor[SCAN]][0]
-    if LIGHTS in factor:
-        cost += views[factor[LIGHTS] / factor[SCAN]][1]
+    cost = abs(log(diagonal / HEAD_DIAGONAL))
+    if height:
+        if not FACE_HEIGHTS[0] <= height <= FACE_HEIGHTS[1]:
+            return inf
+        cost = abs(log(height / FACE_HEIGHT))
+    if LANDMARKS in factor:
+        reach = LANDMARK_REACH / factor[SCAN]
+        if min(near.values()) < reach < near[factor[LANDMARKS] / factor[SCAN]]:
+            return inf
+    for part in (CAMERAS, LIGHTS):
+        if part in factor:
+            cost += views[factor[part] / factor[SCAN]][part]
     return cost
 
 
-def _within(value: float, limits: tuple[float, float]) -> bool:
-    return limits[0] <= value <= limits[1]
-
-
-def _landmarks_near(lengths: Lengths, ratio: float) -> float:
+def _landmark_distance(lengths: Lengths, ratio: float) -> float:
     """Median distance of the landmarks from the scan, in its unit, if they are this
     many times larger.
     """
     points = ratio * np.array([*lengths.landmarks.values()])
-    return float(
-        np.median(closest_on_mesh(lengths.scan.vertices, lengths.scan.faces, points)[2])
-    )
+    distances = closest_on_mesh(lengths.scan.vertices, lengths.scan.faces, points)[2]
+    return float(np.median(distances))
 
 
-def _device_cost(lengths: Lengths, ratio: float) -> tuple[float, float]:
+def _device_costs(lengths: Lengths, ratio: float) -> dict[str, float]:
     """Costs of cameras and lights that are this many times farther away, in the unit of
     the scan.
     """
-    if lengths.dome is None:
-        return 0.0, 0.0
+    dome = lengths.dome
+    if dome is None:
+        return {}
     vertices = lengths.scan.vertices[:: -(-len(lengths.scan.vertices) // MAX_VERTICES)]
-    spans = [
-        picture_span(camera, vertices, factor=ratio) for camera in lengths.dome.cameras
-    ]
-    known = [span for span in spans if span is not None and np.isfinite(span)]
-    camera = (
-        abs(log(float(np.median(known)) / USUAL_SPAN))
-        if 2 * len(known) >= len(spans)
-        else inf
-    )
-    places = [light.position for light in lengths.dome.lights]
-    far = lengths._distance(places, ratio) / lengths.diagonal
-    return camera, abs(log(far / DOME_RADIUS_RATIO)) if far >= MIN_LIGHT_RATIO else inf
+    spans = [picture_span(camera, vertices, factor=ratio) for camera in dome.cameras]
+    finite = [span for span in spans if span is not None and np.isfinite(span)]
+    camera_cost = inf
+    if 2 * len(finite) >= len(spans):
+        camera_cost = abs(log(float(np.median(finite)) / USUAL_SPAN))
+    positions = [light.position for light in dome.lights]
+    far = lengths.distance(positions, ratio) / lengths.sizes[SCAN]
+    light_cost = abs(log(far / DOME_RADIUS_RATIO)) if far >= MIN_LIGHT_RATIO else inf
+    return {CAMERAS: camera_cost, LIGHTS: light_cost}
 
 
 def unit_text(units: Mapping[str, str]) -> str:
     """The correction for parts in other units, for a message."""
-    said = list[str]()
+    cures = list[str]()
     for unit in dict.fromkeys(units.values()):
-        lengths = _listed([LENGTHS[part] for part, own in units.items() if own == unit])
-        how = (
-            f"multiply {lengths} by {UNITS[unit]:g}"
-            if UNITS[unit] > 1
-            else f"divide {lengths} by {1 / UNITS[unit]:g}"
-        )
-        said.append(f"these look like {unit}: {how}")
-    beside = (
-        ""
-        if {CAMERAS, LIGHTS}.isdisjoint(units)
-        else "; check disc_radius and the white target too"
-    )
-    return f"{'; '.join(said)}{beside}"
-
-
-def _listed(words: list[str]) -> str:
-    return (
-        " and ".join([", ".join(words[:-1]), words[-1]]) if len(words) > 1 else words[0]
-    )
+        *before, final = (LENGTHS[part] for part in units if units[part] == unit)
+        lengths = f"{', '.join(before)} and {final}" if before else final
+        cures.append(rescaling(unit, lengths))
+    if not {CAMERAS, LIGHTS}.isdisjoint(units):
+        cures.append("check disc_radius and the white target too")
+    return "; ".join(cures)
 
 
 def device_faults(where: str, dome: DomeRecord, surface: CleanMesh) -> list[Fault]:
     """Faults of cameras and lights that are inside the head, or too far away."""
     faults = []
-    for key, places in (
-        ("cameras", device_positions(dome)),
+    for key, positions in (
+        ("cameras", {camera.id: camera.centre for camera in dome.cameras}),
         ("lights", {light.id: light.position for light in dome.lights}),
     ):
         far = [
             name
-            for name, place in places.items()
-            if np.linalg.norm(place) > MAX_DEVICE_DISTANCE_MM
+            for name, position in positions.items()
+            if np.linalg.norm(position) > MAX_DEVICE_DISTANCE_MM
+        ]
+        inner = [
+            name for name, position in positions.items() if _inside(surface, position)
         ]
         if far:
             rule = (
                 f"{key} must be within {MAX_DEVICE_DISTANCE_MM / 1000:g} m of the "
                 "origin of the scan's frame"
             )
-            found = (
-                f"{len(far)} of {len(places)} farther: "
-                f"{', '.join(far[:3])}{', ..' * (len(far) > 3)}"
+            finding = f"{len(far)} of {len(positions)} farther: {_first_names(far)}"
+            faults.append(
+                Fault(f"{where}[{key}]", rule, finding, "give positions in mm")
             )
-            faults.append(Fault(f"{where}[{key}]", rule, found, "give positions in mm"))
-        inside = [name for name, place in places.items() if _inside(surface, place)]
-        if inside:
-            found = (
-                f"{len(inside)} of {len(places)} inside it: "
-                f"{', '.join(inside[:3])}{', ..' * (len(inside) > 3)}"
+        if inner:
+            rule = f"{key} must be outside the head"
+            finding = (
+                f"{len(inner)} of {len(positions)} inside it: {_first_names(inner)}"
             )
             cure = "calibrate in mm and in the frame of the scan; the centre of a camera is -R^T t"
-            faults.append(
-                Fault(f"{where}[{key}]", f"{key} must be outside the head", found, cure)
-            )
+            faults.append(Fault(f"{where}[{key}]", rule, finding, cure))
     return faults
 
 
-def unit_fault(
+def _first_names(names: list[str]) -> str:
+    return ", ".join(names[:3]) + ", .." * (len(names) > 3)
+
+
+def dome_unit_faults(
     where: str, dome: DomeRecord, mesh: str, surface: CleanMesh, *, sized: bool
-) -> Fault | None:
+) -> list[Fault]:
     """Fault of a dome and a scan that cannot both be in mm, or cannot be in the same frame.
 
     Only impossible captures are faults: a dome within the bounding box of the scan; a
@@ -301,64 +266,47 @@ def unit_fault(
     low = surface.vertices.min(axis=0)
     high = surface.vertices.max(axis=0)
     diagonal = float(np.linalg.norm(high - low))
-    places = np.array(
-        [*device_positions(dome).values(), *(light.position for light in dome.lights)]
+    positions = np.array(
+        [*(c.centre for c in dome.cameras), *(x.position for x in dome.lights)]
     )
-    if ((places > low) & (places < high)).all():
+    if ((positions > low) & (positions < high)).all():
         # the origin is near the centre of the dome
-        distance = float(np.median(np.linalg.norm(places, axis=1)))
-        cure = (
-            f"{rescaling(likely_unit(distance, DOME_RADIUS_RATIO * diagonal))}, or "
-            "calibrate in the frame of the scan"
-        )
+        distance = float(np.median(np.linalg.norm(positions, axis=1)))
+        unit = likely_unit(distance, DOME_RADIUS_RATIO * diagonal)
         rule = "lengths must be in mm, and a dome must surround the scan"
-        return Fault(where, rule, "all of it within the bounding box of the scan", cure)
-    spans = [
-        span
-        for camera in dome.cameras
-        if (span := picture_span(camera, surface.vertices)) is not None
-    ]
-    if not spans:
+        finding = "all of it within the bounding box of the scan"
+        cure = f"{rescaling(unit)}, or calibrate in the frame of the scan"
+        return [Fault(where, rule, finding, cure)]
+    spans = [picture_span(camera, surface.vertices) for camera in dome.cameras]
+    span = max((span for span in spans if span is not None), default=None)
+    if span is None:
+        rule = "the picture of a camera must show the scan"
+        finding = f"none of {len(dome.cameras)} does"
         cure = (
             "calibrate in mm and in the frame of the scan: x_cam = R x + t, z forwards"
         )
-        return Fault(
-            where,
-            "the picture of a camera must show the scan",
-            f"none of {len(dome.cameras)} does",
-            cure,
-        )
-    span = max(spans)
+        return [Fault(where, rule, finding, cure)]
     if not sized and span < LEAST_SPAN and _shrunken_head(surface, diagonal):
         rule = (
             "lengths must be in mm, and a head must span at least a tenth of a picture"
         )
-        found = f"{diagonal:.0f} mm across, {span:.1%} of a picture's side"
-        return Fault(mesh, rule, found, rescaling(likely_unit(diagonal, HEAD_DIAGONAL)))
+        finding = f"{diagonal:.0f} mm across, {span:.1%} of a picture's side"
+        cure = rescaling(likely_unit(diagonal, HEAD_DIAGONAL))
+        return [Fault(mesh, rule, finding, cure)]
     if span < (LEAST_SPAN if diagonal > FACE_DIAGONAL else PATCH_SPAN):
         rule = "lengths must be in mm, and the scan must be visible in the pictures"
-        found = f"{diagonal:,.0f} mm across, it spans {span:.2%} of a picture's side"
-        return Fault(where, rule, found, rescaling(likely_unit(USUAL_SPAN / span, 1.0)))
-    return None
+        finding = f"{diagonal:,.0f} mm across, it spans {span:.2%} of a picture's side"
+        cure = rescaling(likely_unit(USUAL_SPAN / span, 1.0))
+        return [Fault(where, rule, finding, cure)]
+    return []
 
 
-def device_positions(dome: DomeRecord) -> dict[str, Array]:
-    """Centres of the cameras."""
-    return {
-        camera.id: np.asarray(camera_centre(camera.R, camera.t), np.float64)
-        for camera in dome.cameras
-    }
-
-
-def _inside(surface: CleanMesh, place: Array) -> bool:
-    within = (place > surface.vertices.min(axis=0)) & (
-        place < surface.vertices.max(axis=0)
-    )
-    return bool(
-        within.all()
-        and winding_number(surface.vertices, surface.faces, place)[0]
-        > MIN_WINDING_NUMBER
-    )
+def _inside(surface: CleanMesh, point: Array) -> bool:
+    vertices = surface.vertices
+    if not ((point > vertices.min(axis=0)) & (point < vertices.max(axis=0))).all():
+        return False
+    number = winding_number(vertices, surface.faces, point)[0]
+    return bool(number > MIN_WINDING_NUMBER)
 
 
 def picture_span(
@@ -373,17 +321,18 @@ def picture_span(
     clearly outside count as invisible.
     """
     local = vertices @ camera.R.T + factor * camera.t
-    if (local[:, 2] <= 0).all():
+    behind = local[:, 2] <= 0
+    if behind.all():
         return None
-    if (local[:, 2] <= 0).any():
+    if behind.any():
         return np.inf  # the camera is inside the scan
     pixels = local @ camera.K.T
-    places = pixels[:, :2] / pixels[:, 2:] / [camera.width, camera.height]
-    low = places.min(axis=0)
-    high = places.max(axis=0)
-    return (
-        float((high - low).max()) if (low < 1.5).all() and (high > -0.5).all() else None
-    )
+    relative = pixels[:, :2] / pixels[:, 2:] / [camera.width, camera.height]
+    low = relative.min(axis=0)
+    high = relative.max(axis=0)
+    if (low < 1.5).all() and (high > -0.5).all():
+        return float((high - low).max())
+    return None
 
 
 def _shrunken_head(surface: CleanMesh, diagonal: float) -> bool:

@@ -55,35 +55,32 @@ MIN_LANDMARK_DISTANCE_MM = 0.5
 MIN_COSINE_SIDEWAYS = 0.5
 
 
-def scan_fault(where: str, surface: CleanMesh) -> Fault | None:
+def scan_faults(where: str, surface: CleanMesh) -> list[Fault]:
     """Fault of a scan that is too large or too small to be in mm."""
     diagonal = float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))
-    least, most = SCAN_DIAGONAL
-    if least <= diagonal <= most:
-        return None
-    rule = f"lengths must be in mm, and a scan must be {least:g} to {most:g} mm across"
-    return Fault(
-        where,
-        rule,
-        f"{diagonal:,.{0 if diagonal > most else 3}f} mm",
-        rescaling(likely_unit(diagonal, HEAD_DIAGONAL)),
-    )
+    smallest, largest = SCAN_DIAGONAL
+    if smallest <= diagonal <= largest:
+        return []
+    rule = f"lengths must be in mm, and a scan must be {smallest:g} to {largest:g} mm across"
+    finding = f"{diagonal:,.{0 if diagonal > largest else 3}f} mm"
+    cure = rescaling(likely_unit(diagonal, HEAD_DIAGONAL))
+    return [Fault(where, rule, finding, cure)]
 
 
-def face_fault(where: str, points: Mapping[str, Array]) -> Fault | None:
+def face_faults(where: str, points: Mapping[str, Array]) -> list[Fault]:
     """Fault of a face that is too large or too small to be in mm, by its landmarks or
     the centres of its regions.
     """
     height = face_height(points)
-    least, most = FACE_HEIGHTS
-    if height is None or least <= height <= most:
-        return None
+    smallest, largest = FACE_HEIGHTS
+    if height is None or smallest <= height <= largest:
+        return []
     rule = (
-        f"lengths must be in mm, and a face must be {least:g} to {most:g} mm from "
+        f"lengths must be in mm, and a face must be {smallest:g} to {largest:g} mm from "
         "brows and eyes to mouth and chin"
     )
     cure = f"{rescaling(likely_unit(height, FACE_HEIGHT))}, also for the scan"
-    return Fault(where, rule, f"{height:.3g} mm", cure)
+    return [Fault(where, rule, f"{height:.3g} mm", cure)]
 
 
 def face_height(points: Mapping[str, Array]) -> float | None:
@@ -96,15 +93,19 @@ def face_height(points: Mapping[str, Array]) -> float | None:
 
 def landmark_faults(where: str, points: Mapping[str, Array], scan: Scan) -> list[Fault]:
     """Faults of landmarks that are not on the scan."""
-    place = np.array([*points.values()]).reshape(-1, 3)
-    distance = closest_on_mesh(scan.vertices, scan.faces, place)[2]
-    off = distance > LANDMARK_REACH
     rule = f"a landmark must lie within {LANDMARK_REACH:g} mm of the scan"
     return [
         Fault(f"{where}[{name}]", rule, f"{d:.1f} mm away", "mark it again, in mm")
-        for name, d, wrong in zip(points, distance, off, strict=True)
-        if wrong
+        for name, d in _distances(points, scan).items()
+        if d > LANDMARK_REACH
     ]
+
+
+def _distances(points: Mapping[str, Array], mesh: Scan | CleanMesh) -> dict[str, float]:
+    """Distance [mm] of each point from a mesh."""
+    positions = np.array([*points.values()]).reshape(-1, 3)
+    distances = closest_on_mesh(mesh.vertices, mesh.faces, positions)[2]
+    return dict(zip(points, distances, strict=True))
 
 
 def discarded_piece_faults(
@@ -113,46 +114,38 @@ def discarded_piece_faults(
     """Fault of landmarks on a component of the scan that cleaning removed, because
     another one is larger.
     """
-    place = np.array([*points.values()]).reshape(-1, 3)
-    distance = closest_on_mesh(surface.vertices, surface.faces, place)[2]
-    off = [name for name, d in zip(points, distance, strict=True) if d > LANDMARK_REACH]
-    if not off:
+    distances = _distances(points, surface)
+    distant = [name for name, d in distances.items() if d > LANDMARK_REACH]
+    if not distant:
         return []
-    found = f"{len(off)} of {len(points)} up to {distance.max():.0f} mm from it, such as {off[0]}"
+    rule = "landmarks must lie on the largest component of the scan, which is kept"
+    finding = (
+        f"{len(distant)} of {len(points)} up to {max(distances.values()):.0f} mm from "
+        f"it, such as {distant[0]}"
+    )
     cure = "remove everything from the scan that does not belong to this face"
-    return [
-        Fault(
-            where,
-            "landmarks must lie on the largest component of the scan, which is kept",
-            found,
-            cure,
-        )
-    ]
+    return [Fault(where, rule, finding, cure)]
 
 
 def coincidence_faults(where: str, points: Mapping[str, Array]) -> list[Fault]:
     """Faults of landmarks at the same point."""
     names = [*points]
-    place = np.array([*points.values()]).reshape(-1, 3)
+    tree = cKDTree(np.array([*points.values()]).reshape(-1, 3))
     rule = f"landmarks must be at least {MIN_LANDMARK_DISTANCE_MM:g} mm apart"
+    cure = "mark one of them again, or remove it"
     return [
-        Fault(
-            f"{where}[{names[j]}]",
-            rule,
-            f"{names[i]} at the same point",
-            "mark one of them again, or remove it",
-        )
-        for i, j in sorted(cKDTree(place).query_pairs(MIN_LANDMARK_DISTANCE_MM))
+        Fault(f"{where}[{names[j]}]", rule, f"{names[i]} at the same point", cure)
+        for i, j in sorted(tree.query_pairs(MIN_LANDMARK_DISTANCE_MM))
     ]
 
 
-def order_fault(where: str, points: Mapping[str, Array]) -> Fault | None:
+def order_faults(where: str, points: Mapping[str, Array]) -> list[Fault]:
     """Fault of landmarks in the wrong vertical order: names the two that violate it
     most, probably exchanged ones.
     """
     up = _up_direction(points)
     if up is None:
-        return None
+        return []
     size = float(up @ up)
     level = {
         name: i
@@ -168,12 +161,11 @@ def order_fault(where: str, points: Mapping[str, Array]) -> Fault | None:
     ]
     worst, high, low = max(inversions, default=(0.0, "", ""))
     if worst <= MAX_LEVEL_INVERSION:
-        return None
+        return []
     rule = f"{high} must lie above {low} on a face"
-    found = f"it {worst * np.sqrt(size):.0f} mm below"
-    return Fault(
-        f"{where}[{high}]", rule, found, "exchange the two points, or mark them again"
-    )
+    finding = f"it {worst * np.sqrt(size):.0f} mm below"
+    cure = "exchange the two points, or mark them again"
+    return [Fault(f"{where}[{high}]", rule, finding, cure)]
 
 
 def swapped_faults(
@@ -186,16 +178,20 @@ def swapped_faults(
     from the surface normals at the landmarks; nothing is checked without such a pair or
     such landmarks.
     """
-    pairs = [
-        (name, mate)
-        for name in points
-        if (mate := name.replace("left", "right")) != name and mate in points
-    ]
-    axis = _left_direction(points, surface) if pairs else None
-    if axis is None:
+    mates = {name: name.replace("left", "right") for name in points if "left" in name}
+    pairs = [(left, right) for left, right in mates.items() if right in points]
+    up = _up_direction(points)
+    if not pairs or up is None:
+        return []
+    nearest = cKDTree(surface.vertices).query(np.array([*points.values()]))[1]
+    front = np.nansum(vertex_normals(surface.vertices, surface.faces)[nearest], axis=0)
+    axis = np.cross(up, front)
+    length = float(np.linalg.norm(axis))
+    if length == 0:
         return []
     across = np.array([points[left] - points[right] for left, right in pairs])
-    wrong = across @ axis < -MIN_COSINE_SIDEWAYS * np.linalg.norm(across, axis=1)
+    limit = -MIN_COSINE_SIDEWAYS * np.linalg.norm(across, axis=1)
+    wrong = across @ (axis / length) < limit
     rule = (
         "left must be the subject's left: +x of a face that looks along +z, with y up"
     )
@@ -207,24 +203,10 @@ def swapped_faults(
         return [Fault(where, rule, f"all {len(pairs)} pairs the other way round", cure)]
     cure = "exchange the two points"
     return [
-        Fault(f"{where}[{left}]", rule, f"{mate} on that side", cure)
-        for (left, mate), bad in zip(pairs, wrong, strict=True)
-        if bad
+        Fault(f"{where}[{left}]", rule, f"{right} on that side", cure)
+        for (left, right), exchanged in zip(pairs, wrong, strict=True)
+        if exchanged
     ]
-
-
-def _left_direction(points: Mapping[str, Array], surface: CleanMesh) -> Array | None:
-    """Unit vector to the subject's left, from up and front directions; None if the
-    landmarks do not determine up.
-    """
-    up = _up_direction(points)
-    if up is None:
-        return None
-    nearest = cKDTree(surface.vertices).query(np.array([*points.values()]))[1]
-    front = np.nansum(vertex_normals(surface.vertices, surface.faces)[nearest], axis=0)
-    axis = np.cross(up, front)
-    length = float(np.linalg.norm(axis))
-    return axis / length if length > 0 else None
 
 
 def _up_direction(points: Mapping[str, Array]) -> Array | None:
@@ -240,15 +222,18 @@ def _up_direction(points: Mapping[str, Array]) -> Array | None:
 
 def likely_unit(length: float, usual: float) -> str:
     """The unit in which a length is closest to the usual one, by their ratio."""
-    return min(
-        UNITS,
-        key=lambda name: float(abs(np.log(max(length, 1e-300) * UNITS[name] / usual))),
-    )
+
+    def distance(unit: str) -> float:
+        return float(abs(np.log(max(length, 1e-300) * UNITS[unit] / usual)))
+
+    return min(UNITS, key=distance)
 
 
-def rescaling(unit: str) -> str:
+def rescaling(unit: str, lengths: str = "") -> str:
     """The correction for lengths in a wrong unit, for a message."""
     factor = UNITS[unit]
-    return f"these look like {unit}: " + (
-        f"multiply by {factor:g}" if factor > 1 else f"divide by {1 / factor:g}"
-    )
+    words = f" {lengths}" if lengths else ""
+    cure = f"multiply{words} by {factor:g}"
+    if factor < 1:
+        cure = f"divide{words} by {1 / factor:g}"
+    return f"these look like {unit}: {cure}"

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb.errors import Fault, InputError
+from skindb.errors import attempt
 from skindb.files import read_regular
 from skindb.format.fields import Fields
 from skindb.format.frame_paths import inside
@@ -60,112 +60,88 @@ def read_sensor(
     """
     if linear:
         return SensorRecord(size, 0.0, np.inf, 0.0, np.inf)
-    noted = len(item.faults)
-    bits = item.integer("bit_depth", least=1, most=16, default=16)
-    black = item.number("black_level", least=0.0, default=0.0)
-    white = item.number("white_level", above=0.0, default=float(2**bits - 1))
+    earlier = len(item.faults)
+    bits = item.integer("bit_depth", minimum=1, maximum=16, default=16)
+    highest = 2**bits - 1
+    black = item.number("black_level", minimum=0.0, default=0.0)
+    white = item.number("white_level", above=0.0, default=float(highest))
     if white <= black:
         item.fault("white_level", f"must be above black_level {black:g}", shown(white))
         white = black + 1
-    elif len(item.faults) == noted and white > 2**bits - 1:
+    elif len(item.faults) == earlier and white > highest:
         rule = (
-            f"must be at most {2**bits - 1}, the highest value of {bits} bits: no "
+            f"must be at most {highest}, the highest value of {bits} bits: no "
             "pixel would be saturated"
         )
-        item.fault(
-            "white_level",
-            rule,
-            shown(white),
-            "bit_depth is that of the file, adc_bits that of the converter",
-        )
-    levels = (black, white) if len(item.faults) == noted else None
-    missing = [
-        key
-        for key in ("read_noise_e", "electrons_per_dn")
-        if item.get(key, None) is None
-    ]
+        cure = "bit_depth is that of the file, adc_bits that of the converter"
+        item.fault("white_level", rule, shown(white), cure)
+    levels = (black, white) if len(item.faults) == earlier else None
+    missing = [key for key in ("read_noise_e", "electrons_per_dn") if not item.has(key)]
     if len(missing) == 1:
         rule = (
             "read_noise_e and electrons_per_dn must be given together: noise is in "
             "electrons, pixels are in values"
         )
         item.fault(missing[0], rule, "nothing", "add it, or remove both")
-    response = _response(folder, item, levels)
+    response, response_file = _response(folder, item, levels)
+    converter_bits = item.integer("adc_bits", minimum=1, maximum=16, default=bits)
     sensor = SensorRecord(
         kind=FrameKind(size.width, size.height, bits),
         black=black,
         white=white,
-        read_noise=item.number("read_noise_e", least=0.0, default=0.0),
+        read_noise=item.number("read_noise_e", minimum=0.0, default=0.0),
         electrons_per_dn=item.number(
             "electrons_per_dn", above=0.0, default=UNKNOWN_ELECTRONS
         ),
-        step=2.0
-        ** max(bits - item.integer("adc_bits", least=1, most=16, default=bits), 0),
-        response=None if response is None else response[0],
-        response_file=None if response is None else response[1],
+        step=2.0 ** max(bits - converter_bits, 0),
+        response=response,
+        response_file=response_file,
     )
-    fault = (
-        noise_fault(item.where, sensor.read_noise, sensor.full_electrons)
-        if len(item.faults) == noted
-        else None
-    )
-    item.faults += [] if fault is None else [fault]
+    if len(item.faults) == earlier:
+        _require_electrons(item, sensor)
     return sensor
 
 
 def _response(
     folder: Path, item: Fields, levels: tuple[float, float] | None
-) -> tuple[Array, Path] | None:
+) -> tuple[Array, Path] | tuple[None, None]:
     """The table of a response, and its file; its ends are checked unless the levels are
     faulty (None).
     """
     name = item.text("response", default="linear")
-    path = (
-        None
-        if name in ("linear", "")
-        else inside(folder, name, f"{item.where}[response]", item.faults)
-    )
+    if name in ("linear", ""):
+        return None, None
+    path = inside(folder, name, item.place("response"), item.faults)
     if path is None:
-        return None
+        return None, None
+    place = f"{path} ({item.place('response')})"
+    content = attempt(
+        item.faults, lambda: read_regular(path, MAX_RESPONSE_BYTES), where=place
+    )
+    if content is None:
+        return None, None
     cure = (
         "measure the response again, or write it as described in docs/capture_format.md"
     )
+    table = np.zeros((0, 4))
     try:
-        lines = read_regular(path, MAX_RESPONSE_BYTES).decode("utf-8").splitlines()[1:]
-        table = (
-            np.loadtxt(lines, delimiter=",", ndmin=2)
-            if any(lines)
-            else np.zeros((0, 4))
-        )
-    except InputError as error:
-        item.faults += [
-            Fault(f"{path} ({item.place('response')})", f.rule, f.found, f.cure)
-            for f in error.faults
-        ]
-        return None
+        lines = content.decode("utf-8").splitlines()[1:]
+        if any(lines):
+            table = np.loadtxt(lines, delimiter=",", ndmin=2)
     except ValueError as error:  # includes errors of UTF-8
-        item.fault(
-            "response",
-            "must be a CSV file dn,r,g,b of numbers",
-            f"{name}: {error}",
-            cure,
-        )
-        return None
-    rising = (
-        table.ndim == 2
-        and table.shape[1] == 4
-        and len(table) > 1
-        and bool((np.diff(table, axis=0) > 0).all())
-    )
+        rule = "must be a CSV file dn,r,g,b of numbers"
+        item.fault("response", rule, f"{name}: {error}", cure)
+        return None, None
+    rows, columns = table.shape
+    rising = columns == 4 and rows > 1 and bool((np.diff(table, axis=0) > 0).all())
     if not rising or not (np.abs(table) <= MAX_MAGNITUDE).all():
-        found = f"{name} of {table.shape[0]} rows and {table.shape[1]} columns"
-        item.fault(
-            "response", "must be finite columns dn,r,g,b that all rise", found, cure
-        )
-        return None
+        finding = f"{name} of {rows} rows and {columns} columns"
+        rule = "must be finite columns dn,r,g,b that all rise"
+        item.fault("response", rule, finding, cure)
+        return None, None
     if levels is not None:
         _require_ends(item, name, table, *levels)
-    return np.asarray(table), path
+    return table, path
 
 
 def _require_ends(
@@ -175,48 +151,35 @@ def _require_ends(
     scale all radiance.
     """
     ends = np.array(
-        [
-            [np.interp(level, table[:, 0], column) for column in table.T[1:]]
-            for level in (black, white)
-        ]
+        [np.interp([black, white], table[:, 0], column) for column in table.T[1:]]
     )
     slack = RESPONSE_ERROR * (white - black)
     covers = table[0, 0] <= black + slack and table[-1, 0] >= white - slack
-    if not covers or (np.abs(ends - [[0.0], [1.0]]) > RESPONSE_ERROR).any():
+    if not covers or (np.abs(ends - [0.0, 1.0]) > RESPONSE_ERROR).any():
         rule = f"must run from 0 at black_level {black:g} to 1 at white_level {white:g}"
-        (low, *first), (high, *last) = table[0], table[-1]
-        found = f"{name}: {min(first):.3g} at {low:g} to {max(last):.3g} at {high:g}"
-        item.fault(
-            "response",
-            rule,
-            found,
-            "measure it over all values, and divide it by that at the white level",
+        (low, *dimmest), (high, *brightest) = table[0], table[-1]
+        finding = (
+            f"{name}: {min(dimmest):.3g} at {low:g} to {max(brightest):.3g} at {high:g}"
         )
+        cure = "measure it over all values, and divide it by that at the white level"
+        item.fault("response", rule, finding, cure)
 
 
-def noise_fault(where: str, read_noise: float, full_electrons: float) -> Fault | None:
-    """Fault of a sensor with too few electrons, or too much noise, for a picture."""
-    if full_electrons < MIN_FULL_ELECTRONS:
+def _require_electrons(item: Fields, sensor: SensorRecord) -> None:
+    """Require enough electrons, and little enough noise, for a picture."""
+    full = sensor.full_electrons
+    if full < MIN_FULL_ELECTRONS:
         rule = (
             "electrons_per_dn * (white_level - black_level) must be at least "
             f"{MIN_FULL_ELECTRONS:g} electrons"
         )
-        return Fault(
-            f"{where}[electrons_per_dn]",
-            rule,
-            f"{full_electrons:.3g}",
-            "measure it by a photon transfer curve",
-        )
-    if read_noise > MAX_READ_NOISE_FRACTION * full_electrons:
+        cure = "measure it by a photon transfer curve"
+        item.fault("electrons_per_dn", rule, f"{full:.3g}", cure)
+    elif sensor.read_noise > MAX_READ_NOISE_FRACTION * full:
         rule = (
             f"read noise must be at most {MAX_READ_NOISE_FRACTION:g} of the electrons "
             "at the white level"
         )
-        found = f"{read_noise:.3g} of {full_electrons:.3g} electrons"
-        return Fault(
-            f"{where}[read_noise_e]",
-            rule,
-            found,
-            "give it in electrons: values times electrons_per_dn",
-        )
-    return None
+        finding = f"{sensor.read_noise:.3g} of {full:.3g} electrons"
+        cure = "give it in electrons: values times electrons_per_dn"
+        item.fault("read_noise_e", rule, finding, cure)

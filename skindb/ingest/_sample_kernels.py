@@ -11,7 +11,21 @@ from numba.extending import intrinsic
 
 from skindb.calibration.pixel_flags import DARK, OK, SATURATED
 from skindb.jit import inline_kernel, kernel
+from skindb.types import (
+    BoolVector,
+    ByteMatrix,
+    ByteVector,
+    Cube,
+    Cube32,
+    IntMatrix,
+    IntMatrix32,
+    Matrix,
+    Matrix32,
+    Vector,
+    Vector32,
+)
 
+Halves = np.ndarray[tuple[int, int], np.dtype[np.uint16]]  # bits of half floats
 # outcomes of a sample besides those of a pixel: usable, but no pixel has two exposures;
 # no sample was requested
 SINGLE = 3
@@ -27,12 +41,14 @@ FOOTPRINT_REACH = 8.0
 
 
 @kernel
-def pixel_spans(wanted: Any, pixels: Any, spread: Any, height: int, width: int) -> Any:
-    """Spans (h, 2) of the pixels that `gather` reads for the wanted surfels (n,); see `develop`."""
+def pixel_spans(
+    surfels: BoolVector, pixels: Matrix32, spread: Matrix32, height: int, width: int
+) -> IntMatrix:
+    """Spans (h, 2) of the pixels that `gather` reads for surfels (n,) bool; see `develop`."""
     spans = np.empty((height, 2), np.int64)
     spans[:, 0], spans[:, 1] = width, 0
-    for i in range(wanted.shape[0]):
-        if wanted[i]:
+    for i in range(surfels.shape[0]):
+        if surfels[i]:
             if spread.shape[0] and not np.isnan(spread[i, 0]):
                 left, right, top, bottom = _footprint_bounds(
                     pixels[i, 0], pixels[i, 1], spread[i], height, width
@@ -50,7 +66,9 @@ def pixel_spans(wanted: Any, pixels: Any, spread: Any, height: int, width: int) 
 
 
 @kernel
-def _bilinear_bounds(column: float, row: float, height: int, width: int) -> Any:
+def _bilinear_bounds(
+    column: float, row: float, height: int, width: int
+) -> tuple[int, int, int, int]:
     """First and last column and row of the four pixels around a position; an empty
     range outside the picture.
     """
@@ -68,8 +86,8 @@ def _bilinear_bounds(column: float, row: float, height: int, width: int) -> Any:
 
 @kernel
 def _footprint_bounds(
-    column: float, row: float, spread: Any, height: int, width: int
-) -> Any:
+    column: float, row: float, spread: Vector32, height: int, width: int
+) -> tuple[int, int, int, int]:
     """First and last column and row of the pixels inside a footprint; an empty range if
     it leaves the picture.
 
@@ -92,21 +110,21 @@ def _footprint_bounds(
 
 @kernel
 def gather(
-    radiance: Any,
-    flag: Any,
-    usable: Any,
-    wanted: Any,
-    light_fraction: Any,
-    pixels: Any,
-    spread: Any,
-    position: Any,
-    normal: Any,
-    light: Any,
-    axis: Any,
+    radiance: Cube32,
+    flag: ByteMatrix,
+    usable: ByteMatrix,
+    surfels: BoolVector,
+    light_fraction: Vector32,
+    pixels: Matrix32,
+    spread: Matrix32,
+    position: Matrix,
+    normal: Matrix,
+    light: Vector,
+    axis: Vector,
     falloff: float,
-    intensity: Any,
-    out: Any,
-    outcome: Any,
+    intensity: Vector,
+    out: Halves,
+    outcome: ByteVector,
 ) -> None:
     """Reflectance rho = L d^2 / (I falloff fraction) of every surfel in one view
     (Weyrich et al. 2005, eq. 3).
@@ -115,8 +133,8 @@ def gather(
     ----------
     radiance, flag, usable
         (h, w, 3) float32 and twice (h, w) uint8, from `develop`.
-    wanted
-        (n,) bool; surfels to sample. Those that face away from the light get no sample.
+    surfels
+        (n,) bool; those to sample. Those that face away from the light get no sample.
     light_fraction
         (n,) float32 visible fraction of the light's disc, 0 for no sample; or (0,) if
         all of it is visible.
@@ -138,11 +156,11 @@ def gather(
         SATURATED (a contributing pixel was saturated), DARK (all contributing pixels
         were dark).
     """
-    found = np.empty(5)
+    pixel = np.empty(5)
     factor = 1.0 / intensity
     out[:], outcome[:] = NAN_BITS, NONE
-    for i in range(wanted.shape[0]):
-        if not wanted[i] or (light_fraction.shape[0] and light_fraction[i] <= 0):
+    for i in range(surfels.shape[0]):
+        if not surfels[i] or (light_fraction.shape[0] and light_fraction[i] <= 0):
             continue
         x = position[i, 0] - light[0]
         y = position[i, 1] - light[1]
@@ -160,15 +178,15 @@ def gather(
             scale /= light_fraction[i]
         if spread.shape[0] and not np.isnan(spread[i, 0]):
             state = _footprint(
-                radiance, flag, usable, pixels[i, 0], pixels[i, 1], spread[i], found
+                radiance, flag, usable, pixels[i, 0], pixels[i, 1], spread[i], pixel
             )
         else:
-            state = _bilinear(radiance, flag, usable, pixels[i, 0], pixels[i, 1], found)
-        outcome[i] = SINGLE if state == OK and found[4] < 2.0 else state
+            state = _bilinear(radiance, flag, usable, pixels[i, 0], pixels[i, 1], pixel)
+        outcome[i] = SINGLE if state == OK and pixel[4] < 2.0 else state
         if state == OK:
-            r = found[0] * scale * factor[0]
-            g = found[1] * scale * factor[1]
-            b = found[2] * scale * factor[2]
+            r = pixel[0] * scale * factor[0]
+            g = pixel[1] * scale * factor[1]
+            b = pixel[2] * scale * factor[2]
             out[0, i], out[1, i], out[2, i] = (
                 _half_or_nan(r),
                 _half_or_nan(g),
@@ -178,14 +196,19 @@ def gather(
 
 @kernel
 def pixel_counts(
-    wanted: Any, pixels: Any, spread: Any, height: int, width: int, out: Any
+    surfels: BoolVector,
+    pixels: Matrix32,
+    spread: Matrix32,
+    height: int,
+    width: int,
+    out: Vector32,
 ) -> None:
     """Effective number of pixels (n,) that `gather` averages for each surfel; NaN where
     it takes no sample.
     """
     out[:] = np.nan
-    for i in range(wanted.shape[0]):
-        if not wanted[i]:
+    for i in range(surfels.shape[0]):
+        if not surfels[i]:
             continue
         column = pixels[i, 0]
         row = pixels[i, 1]
@@ -205,7 +228,7 @@ def pixel_counts(
 
 @kernel
 def _footprint_weights(
-    column: float, row: float, spread: Any, height: int, width: int
+    column: float, row: float, spread: Vector32, height: int, width: int
 ) -> tuple[float, float]:
     """Sum of the weights of `_footprint`, and sum of their squares."""
     left, right, top, bottom = _footprint_bounds(column, row, spread, height, width)
@@ -227,7 +250,7 @@ def _footprint_weights(
 
 
 @kernel
-def tally(outcome: Any, counts: Any) -> int:
+def tally(outcome: ByteVector, counts: IntMatrix32) -> int:
     """Add the outcome of each surfel (n,) to its counts (state, n), SINGLE also to OK;
     return how many are usable.
     """
@@ -242,7 +265,12 @@ def tally(outcome: Any, counts: Any) -> int:
 
 @kernel
 def _bilinear(
-    radiance: Any, flag: Any, usable: Any, column: float, row: float, found: Any
+    radiance: Cube32,
+    flag: ByteMatrix,
+    usable: ByteMatrix,
+    column: float,
+    row: float,
+    pixel: Vector,
 ) -> int:
     """Interpolate bilinearly between the four pixels around a position; the outer half
     pixel repeats the edge.
@@ -254,7 +282,7 @@ def _bilinear(
     y = min(max(row - 0.5, 0.0), height - 1.0)
     left = int(x)
     top = int(y)
-    found[:] = 0.0
+    pixel[:] = 0.0
     for down in range(2):
         for right in range(2):
             weight = (x - left if right else 1.0 - (x - left)) * (
@@ -264,30 +292,30 @@ def _bilinear(
             if (
                 weight > 0
                 and _add(
-                    radiance, flag, usable, left + right, top + down, weight, found
+                    radiance, flag, usable, left + right, top + down, weight, pixel
                 )
                 == SATURATED
             ):
                 return SATURATED
-    return DARK if found[3] > MIN_DARK_FRACTION else OK
+    return DARK if pixel[3] > MIN_DARK_FRACTION else OK
 
 
 @kernel
 def _footprint(
-    radiance: Any,
-    flag: Any,
-    usable: Any,
+    radiance: Cube32,
+    flag: ByteMatrix,
+    usable: ByteMatrix,
     column: float,
     row: float,
-    spread: Any,
-    found: Any,
+    spread: Vector32,
+    pixel: Vector,
 ) -> int:
     """Weighted mean over an ellipse of pixels (Heckbert 1989, the elliptical weighted average)."""
     left, right, top, bottom = _footprint_bounds(column, row, spread, *flag.shape)
     xx = float(spread[0])
     xy = float(spread[1])
     yy = float(spread[2])
-    found[:] = 0.0
+    pixel[:] = 0.0
     total = 0.0
     scale = 1.0 / (FOOTPRINT_REACH * (xx * yy - xy * xy))
     for v in range(top, bottom + 1):
@@ -298,26 +326,32 @@ def _footprint(
             if rest > 0:
                 weight = rest * rest
                 total += weight
-                if _add(radiance, flag, usable, u, v, weight, found) == SATURATED:
+                if _add(radiance, flag, usable, u, v, weight, pixel) == SATURATED:
                     return SATURATED
     if total == 0:
         return NONE
     for k in range(4):
-        found[k] /= total
-    return DARK if found[3] > MIN_DARK_FRACTION else OK
+        pixel[k] /= total
+    return DARK if pixel[3] > MIN_DARK_FRACTION else OK
 
 
 @inline_kernel
 def _add(
-    radiance: Any, flag: Any, usable: Any, u: int, v: int, weight: float, found: Any
+    radiance: Cube32,
+    flag: ByteMatrix,
+    usable: ByteMatrix,
+    u: int,
+    v: int,
+    weight: float,
+    pixel: Vector,
 ) -> int:
     """Add one pixel to a sample, and return the flag of the pixel."""
     state = flag[v, u]
-    found[0] += weight * radiance[v, u, 0]
-    found[1] += weight * radiance[v, u, 1]
-    found[2] += weight * radiance[v, u, 2]
-    found[3] += weight if state == DARK else 0.0
-    found[4] = max(found[4], float(usable[v, u]))
+    pixel[0] += weight * radiance[v, u, 0]
+    pixel[1] += weight * radiance[v, u, 1]
+    pixel[2] += weight * radiance[v, u, 2]
+    pixel[3] += weight if state == DARK else 0.0
+    pixel[4] = max(pixel[4], float(usable[v, u]))
     return int(state)
 
 
@@ -335,12 +369,12 @@ def _half_bits(_typing: Any, number: Any) -> Any:
 
 
 @kernel
-def _half_or_nan(number: float) -> Any:
+def _half_or_nan(number: float) -> np.uint16:
     return _half_bits(np.float64(number)) if abs(number) < MAX_HALF_FLOAT else NAN_BITS
 
 
 @kernel
-def interpolate(images: Any, pixels: Any, out: Any) -> None:
+def interpolate(images: Cube, pixels: Matrix, out: Matrix) -> None:
     """Bilinear values (picture, n) of pictures (picture, h, w) at pixels (n, 2); 0
     outside, also where these are NaN.
 

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import dask
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
 from skindb.calibration.frame_checks import (
     dark_faults,
@@ -22,9 +23,9 @@ from skindb.calibration.frame_checks import (
     repeated_frame_faults,
 )
 from skindb.calibration.irradiance import light_intensities
-from skindb.calibration.radiance import dark_frame_files, frame_mergers
+from skindb.calibration.radiance import FrameMerger, frame_mergers
 from skindb.elementwise import thread_count
-from skindb.errors import Fault, InputError, grouped
+from skindb.errors import Fault, InputError, attempt, grouped
 from skindb.format.dome import DomeRecord
 from skindb.format.folder import Capture
 from skindb.format.frames import Digests
@@ -47,6 +48,7 @@ from skindb.ingest.groups import (
     surfel_group,
 )
 from skindb.ingest.lumitexels import (
+    Lumitexels,
     Views,
     checked_pictures,
     choose_photographs,
@@ -72,7 +74,7 @@ from skindb.ingest.visibility import (
 from skindb.parameters import IngestParameters
 from skindb.types import Progress, silent
 
-T = TypeVar("T")
+Array = NDArray[np.float64]
 # with two, one reads while the other computes
 MIN_THREADS = 2
 MAX_THREADS = 8
@@ -120,69 +122,86 @@ def ingest_capture(
     ...     model = skindb.fit.fit_model(tree)
     """
     report = progress or silent
-    asked = parameters or IngestParameters()
+    parameters = parameters or IngestParameters()
+    dome = capture.dome
     require_fit_consent(capture)
     report("check", 1, 1)
-    surfels = build_surfels(capture, spacing_mm=asked.spacing_mm)
+    surfels = build_surfels(capture, spacing_mm=parameters.spacing_mm)
     report("surfels", 1, 1)
     groups = {"mesh": mesh_group(capture, surfels), "atlas": atlas_group(surfels)}
     faults = list[Fault]()
     digests = Digests()
-    touched = list[str]()
+    notes = list[str]()
+    summary: dict[str, Any] = {}
+    probe_groups, notes_of_probe = _probe_groups(capture, surfels, faults, digests)
+    groups |= probe_groups
     with ExitStack() as stack:
-        if (probe := capture.probe) is not None:
-            profiles = _attempt(faults, lambda: fibre_profiles(probe, digests))
-            if profiles is not None:
-                isotropy = isotropy_p_values(probe, profiles)
-                places = site_positions(capture, surfels, probe.sites)
-                groups["probe"] = probe_group(probe, profiles, places, isotropy)
-                touched = probe_notes(probe, profiles, isotropy)
-        summary: dict[str, Any] = {}
-        if capture.dome is None:
+        if dome is None:
             groups["surfels"] = surfel_group(surfels)
         else:
-            folder = Path(scratch) / scratch_name(capture, asked)
+            key = samples_digest(capture, asdict(parameters))
+            shape = (len(dome.lights), len(dome.cameras), len(surfels.position))
+            folder = Path(scratch) / _scratch_name(capture, key)
             spool = stack.enter_context(
-                _spool(folder, capture, len(surfels.position), asked)
+                Spool(folder, shape, frame_marks(dome), key=key)
             )
             # ends before the spool does
-            pool = stack.enter_context(ThreadPoolExecutor(threads(capture.dome)))
-            made, summary = _dome_groups(
-                Plan(capture.dome, surfels, asked), faults, digests, spool, pool, report
-            )
-            groups |= made
-            if made and capture.dome.sequence is not None:
-                groups["sequence"] = sequence_group(capture.dome.sequence, capture.dome)
+            pool = stack.enter_context(ThreadPoolExecutor(threads(dome)))
+            run = _Run(dome, surfels, parameters, faults, digests, spool, pool, report)
+            if dome_groups := run.groups():
+                groups |= dome_groups
+                summary = run.summary
+                notes = run.notes
+                if dome.sequence is not None:
+                    groups["sequence"] = sequence_group(dome.sequence, dome)
             digests |= {Path(path): digest for path, digest in spool.digests.items()}
         faults += repeated_frame_faults(
             capture.folder, digests, besides=_copies(capture)
         )
         if faults:
             raise InputError(grouped(faults))
+        spacing = surfels.spacing()
+        if parameters.spacing_mm > 1.5 * spacing:
+            notes.append(
+                f"the points of the scan are {spacing:.2g} mm apart; a wider spacing leaves "
+                "the scan unchanged"
+            )
         summary |= {
-            "surfels": {"count": len(surfels.position), "spacing_mm": surfels.spacing()}
+            "surfels": {"count": len(surfels.position), "spacing_mm": spacing},
+            "notes": notes + notes_of_probe,
         }
-        summary["notes"] = [
-            *summary.get("notes", []),
-            *_spacing_notes(surfels, asked.spacing_mm),
-            *touched,
-        ]
         tree = xr.DataTree.from_dict(groups)
-        tree.attrs = capture_provenance(capture, asdict(asked), digests) | {
+        tree.attrs = capture_provenance(capture, asdict(parameters), digests) | {
             "summary": summary,
             "take": capture.take,
         }
         stack.enter_context(
-            dask.config.set(scheduler="threads", num_workers=threads(capture.dome))
+            dask.config.set(scheduler="threads", num_workers=threads(dome))
         )
         yield tree
+
+
+def _probe_groups(
+    capture: Capture, surfels: SurfelSet, faults: list[Fault], digests: Digests
+) -> tuple[dict[str, xr.Dataset], list[str]]:
+    """The group "probe" and its notes; neither without a probe or with faults."""
+    probe = capture.probe
+    if probe is None:
+        return {}, []
+    profiles = attempt(faults, lambda: fibre_profiles(probe, digests))
+    if profiles is None:
+        return {}, []
+    isotropy = isotropy_p_values(probe, profiles)
+    sites = site_positions(capture, surfels, probe.sites)
+    group = probe_group(probe, profiles, sites, isotropy)
+    return {"probe": group}, probe_notes(probe, profiles, isotropy)
 
 
 def _copies(capture: Capture) -> list[Path]:
     """Frames that may be copies of each other: dark frames, and those of the probe of a
     rehearsal.
     """
-    dark = [] if capture.dome is None else dark_frame_files(capture.dome)
+    dark = [] if capture.dome is None else capture.dome.frame_files("dark")
     if capture.probe is None or capture.attributes.get("virtual") is not True:
         return dark
     return [*dark, *capture.probe.frame_files()]
@@ -190,20 +209,12 @@ def _copies(capture: Capture) -> list[Path]:
 
 def scratch_name(capture: Capture, parameters: IngestParameters | None = None) -> str:
     """Name of the scratch folder, unique to the capture and the parameters of its ingest."""
-    digest = samples_digest(capture, asdict(parameters or IngestParameters()))
+    parameters = parameters or IngestParameters()
+    return _scratch_name(capture, samples_digest(capture, asdict(parameters)))
+
+
+def _scratch_name(capture: Capture, digest: str) -> str:
     return f"{capture.take}-{digest[:16]}"
-
-
-def _spacing_notes(surfels: SurfelSet, wanted: float) -> list[str]:
-    """Warning if the spacing of the scan does not allow the target spacing within a
-    factor of sqrt 2.
-    """
-    found = surfels.spacing()
-    said = (
-        f"the points of the scan are {found:.2g} mm apart; a wider spacing leaves the "
-        "scan unchanged"
-    )
-    return [said] if wanted > 1.5 * found else []
 
 
 def threads(dome: DomeRecord | None) -> int:
@@ -215,157 +226,178 @@ def threads(dome: DomeRecord | None) -> int:
     """
     if dome is None:
         return MIN_THREADS
-    one = max(camera.width * camera.height for camera in dome.cameras) * (
-        16 + 8 * len(dome.exposures)
-    )
-    return max(min(thread_count(), MAX_THREADS, MAX_BYTES // one), MIN_THREADS)
+    pixels = max(camera.width * camera.height for camera in dome.cameras)
+    thread_bytes = pixels * (16 + 8 * len(dome.exposures))
+    return max(min(thread_count(), MAX_THREADS, MAX_BYTES // thread_bytes), MIN_THREADS)
 
 
-@dataclass(frozen=True)
-class Plan:
-    """How the frames of the dome are to be processed."""
+@dataclass
+class _Run:
+    """The stages in which the frames of a dome are processed."""
 
     dome: DomeRecord
     surfels: SurfelSet
-    asked: IngestParameters
+    parameters: IngestParameters
+    faults: list[Fault]
+    digests: Digests
+    spool: Spool
+    pool: Executor
+    report: Progress
+    summary: dict[str, Any] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
 
+    def groups(self) -> dict[str, xr.Dataset]:
+        """Groups surfels, samples, dome and photographs; empty if faults were found."""
+        surfels = self.surfels
+        parameters = self.parameters
+        method = parameters.visibility
+        mergers = frame_mergers(self.dome, self.faults, self.digests)
+        self._check_dark_frames(mergers)
+        intensity, measured = self._intensity(mergers)
+        scene = RayScene(surfels.position, surfels.faces)
+        light_fraction = light_visibility(
+            surfels, self.dome.lights, scene, self.pool, method=method
+        )
+        sees = partial(
+            camera_visibility, surfels, scene=scene, pool=self.pool, method=method
+        )
+        visible, clear, pixels = sees(self.dome.cameras)
+        self.report("visibility", 1, 1)
+        check = CalibrationCheck(
+            self.dome, surfels, light_fraction, clear, pixels, intensity
+        )
+        rotations = np.zeros((len(self.dome.cameras), 3))
+        if parameters.refine and not self.faults:
+            pictures = attempt(
+                self.faults, lambda: checked_pictures(check, mergers, pool=self.pool)
+            )
+            if pictures is None:
+                return {}
+            refined = refine_cameras(check, pictures)
+            rotations = applied_rotations(self.dome, refined)
+            self.dome = refined
+            visible, clear, pixels = sees(refined.cameras)
+            check = replace(check, dome=refined, clear=clear, pixels=pixels)
+            self.report("refine", 1, 1)
+        soft = parameters.soft
+        views = Views(
+            surfels,
+            fully_lit(surfels, light_fraction, self.dome.cameras, soft=soft),
+            clear,
+            pixels,
+            light_fraction=light_fraction if soft == "keep" else None,
+            footprint=parameters.footprint,
+        )
+        lumitexels = self._lumitexels(views, mergers, check)
+        if lumitexels is None:
+            return {}
+        if measured and not self.faults:
+            levels = lumitexels.views
+            self.faults += sample_faults(self.dome, levels.median, levels.bright)
+        if not lumitexels.sample_count.any():
+            rule = "a surfel must be lit by a light and seen by a camera"
+            cure = "check the crop, poses and positions"
+            self.faults.append(Fault("samples", rule, "none is", cure))
+        if self.faults:
+            return {}
+        self._note(lumitexels, mergers, intensity)
+        return self._labelled(lumitexels, check, visible, rotations)
 
-def _spool(
-    folder: Path, capture: Capture, surfels: int, parameters: IngestParameters
-) -> Spool:
-    """The spool of this capture and these parameters, new or left by a run that was killed."""
-    assert capture.dome is not None
-    shape = (len(capture.dome.lights), len(capture.dome.cameras), surfels)
-    return Spool(
-        folder,
-        shape,
-        frame_marks(capture.dome),
-        key=samples_digest(capture, asdict(parameters)),
-    )
+    def _lumitexels(
+        self,
+        views: Views,
+        mergers: Mapping[str, FrameMerger],
+        check: CalibrationCheck,
+    ) -> Lumitexels | None:
+        """The samples; None, with its faults recorded, if there are any."""
+        middle = self.surfels.position.mean(axis=0)
+        count = self.parameters.photographs
+        earlier_faults = bool(self.faults)
+        return attempt(
+            self.faults,
+            lambda: sample_lumitexels(
+                self.dome,
+                check.intensity,
+                views,
+                mergers,
+                self.spool,
+                kept=choose_photographs(self.dome, middle, count),
+                check=None if earlier_faults else check,
+                refuse=self.parameters.calibration == "refuse",
+                pool=self.pool,
+                progress=self.report,
+            ),
+        )
 
+    def _labelled(
+        self,
+        lumitexels: Lumitexels,
+        check: CalibrationCheck,
+        visible: NDArray[np.float16],
+        rotations: Array,
+    ) -> dict[str, xr.Dataset]:
+        dome = self.dome
+        groups = {
+            "surfels": surfel_group(self.surfels, dome, check.light_visible, visible),
+            "samples": sample_group(dome, lumitexels),
+            "dome": dome_group(dome, check.intensity),
+        }
+        if lumitexels.photographs:
+            groups["photographs"] = photograph_group(lumitexels.photographs)
+        if lumitexels.calibration is not None:
+            groups["calibration"] = calibration_group(
+                dome, lumitexels.calibration, rotations
+            )
+        return groups
 
-def _dome_groups(
-    plan: Plan,
-    faults: list[Fault],
-    digests: Digests,
-    spool: Spool,
-    pool: Executor,
-    report: Progress,
-) -> tuple[dict[str, xr.Dataset], dict[str, Any]]:
-    """Groups surfels, samples, dome and photographs, and their summary; both empty if
-    faults were found.
-    """
-    dome = plan.dome
-    surfels = plan.surfels
-    mergers = frame_mergers(dome, faults, digests)
-    faults += [
-        fault for merger in mergers.values() for fault in dark_faults(dome, merger)
-    ]
-    if not faults:
-        patterns = _attempt(
-            faults,
+    def _note(
+        self,
+        lumitexels: Lumitexels,
+        mergers: Mapping[str, FrameMerger],
+        intensity: Array,
+    ) -> None:
+        dome = self.dome
+        levels = lumitexels.views
+        for merger in mergers.values():
+            self.notes += dark_notes(dome, merger)
+        self.notes += level_notes(dome, levels.highest, levels.clipped)
+        self.notes += light_notes(dome, intensity, levels.median)
+        if self.parameters.visibility == "splats":
+            self.notes += coarse_maps(self.surfels, dome.lights, dome.cameras)
+        calibration = lumitexels.calibration
+        if calibration is not None:
+            # empty if refused
+            faults = calibration_faults(dome, calibration)
+            self.notes += [str(fault) for fault in faults]
+            self.notes += calibration_notes(dome, calibration)
+        self.summary = {"samples": describe_samples(lumitexels, self.surfels, dome)}
+
+    def _check_dark_frames(self, mergers: Mapping[str, FrameMerger]) -> None:
+        for merger in mergers.values():
+            self.faults += dark_faults(self.dome, merger)
+        if self.faults:
+            return
+        patterns = attempt(
+            self.faults,
             lambda: [
-                *pool.map(lambda name: dark_pattern_fault(dome, name, mergers), mergers)
+                *self.pool.map(
+                    lambda name: dark_pattern_fault(self.dome, name, mergers), mergers
+                )
             ],
         )
-        faults += [fault for fault in patterns or [] if fault is not None]
-    intensity = _attempt(
-        faults, lambda: light_intensities(dome, mergers, pool, digests)
-    )
-    if judged := intensity is not None:
-        faults += intensity_faults(dome, intensity)
-    else:  # continue, to find damaged frames of the face in the same run
-        intensity = np.ones((len(dome.lights), 3))
-    report("lights", 1, 1)
-    scene = RayScene(surfels.position, surfels.faces)
-    light_fraction = light_visibility(
-        surfels, dome.lights, scene, pool, method=plan.asked.visibility
-    )
-    sees = partial(
-        camera_visibility, surfels, scene=scene, pool=pool, method=plan.asked.visibility
-    )
-    camera_share, clear, pixels = sees(dome.cameras)
-    report("visibility", 1, 1)
-    given = dome
-    if plan.asked.refine and not faults:
-        check = CalibrationCheck(
-            dome, surfels, light_fraction, clear, pixels, intensity
-        )
-        pictures = _attempt(faults, lambda: checked_pictures(check, mergers, pool=pool))
-        if pictures is None:
-            return {}, {}
-        dome = refine_cameras(check, pictures)
-        camera_share, clear, pixels = sees(dome.cameras)
-        report("refine", 1, 1)
-    kept = choose_photographs(
-        dome, surfels.position.mean(axis=0), plan.asked.photographs
-    )
-    lit = fully_lit(surfels, light_fraction, dome.cameras, soft=plan.asked.soft)
-    divisor = light_fraction if plan.asked.soft == "keep" else None
-    views = Views(
-        surfels,
-        lit,
-        clear,
-        pixels,
-        light_fraction=divisor,
-        footprint=plan.asked.footprint,
-    )
-    refuse = plan.asked.calibration == "refuse"
-    final = (
-        None
-        if faults
-        else CalibrationCheck(dome, surfels, light_fraction, clear, pixels, intensity)
-    )
-    found = _attempt(
-        faults,
-        lambda: sample_lumitexels(
-            dome,
-            intensity,
-            views,
-            mergers,
-            spool,
-            kept=kept,
-            check=final,
-            refuse=refuse,
-            pool=pool,
-            progress=report,
-        ),
-    )
-    if found is None:
-        return {}, {}
-    if judged and not faults:
-        faults += sample_faults(dome, found.views.median, found.views.bright)
-    if not found.sample_count.any():
-        rule = "a surfel must be lit by a light and seen by a camera"
-        cure = "check the crop, poses and positions"
-        faults.append(Fault("samples", rule, "none is", cure))
-    if faults:
-        return {}, {}
-    groups = {
-        "surfels": surfel_group(surfels, dome, light_fraction, camera_share),
-        "samples": sample_group(dome, found),
-        "dome": dome_group(dome, intensity),
-    }
-    groups |= {"photographs": photograph_group(found.photographs)} if kept else {}
-    notes = [note for merger in mergers.values() for note in dark_notes(dome, merger)]
-    notes += level_notes(dome, found.views.highest, found.views.clipped)
-    notes += light_notes(dome, intensity, found.views.median)
-    if plan.asked.visibility == "splats":
-        notes += coarse_maps(surfels, dome.lights, dome.cameras)
-    if found.calibration is not None:
-        groups["calibration"] = calibration_group(
-            dome, found.calibration, applied_rotations(given, dome)
-        )
-        # empty if refused
-        notes += [str(fault) for fault in calibration_faults(dome, found.calibration)]
-        notes += calibration_notes(dome, found.calibration)
-    return groups, {"samples": describe_samples(found, surfels, dome), "notes": notes}
+        self.faults += [fault for fault in patterns or [] if fault is not None]
 
+    def _intensity(self, mergers: Mapping[str, FrameMerger]) -> tuple[Array, bool]:
+        """Intensities of the lights (light, 3), and whether they could be determined.
 
-def _attempt(faults: list[Fault], step: Callable[[], T]) -> T | None:
-    """Result of a step, or None with its faults recorded, so that the next step can find more."""
-    try:
-        return step()
-    except InputError as error:
-        faults += error.faults
-        return None
+        Otherwise they are 1, to find damaged frames of the face in the same run.
+        """
+        intensity = attempt(
+            self.faults,
+            lambda: light_intensities(self.dome, mergers, self.pool, self.digests),
+        )
+        self.report("lights", 1, 1)
+        if intensity is None:
+            return np.ones((len(self.dome.lights), 3)), False
+        self.faults += intensity_faults(self.dome, intensity)
+        return intensity, True

@@ -4,7 +4,7 @@ the lights by the shading; rotations that align the cameras with the scan.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skindb.calibration.irradiance import light_falloff
-from skindb.format.dome import CameraRecord, DomeRecord, pixel_width
-from skindb.geometry.camera import camera_centre, project
+from skindb.format.dome import CameraRecord, DomeRecord
+from skindb.geometry.camera import project
 from skindb.ingest.photo_offsets import (
     Brightness,
     Offset,
@@ -109,21 +109,17 @@ class CalibrationCheck:
         """The views to compare; empty for a patch of skin."""
         if np.linalg.norm(np.ptp(self.surfels.position, axis=0)) < MIN_DIAGONAL_MM:
             return frozenset()
-        area = (
-            np.stack([self._seen_area(camera) for camera in self.dome.cameras], axis=1)
-            * self._clear
-        )
+        area = [self._seen_area(camera) for camera in self.dome.cameras]
         # (light, camera) mm2 that are lit and visible
-        seen = (self.irradiance > 0) @ area
+        seen = (self.irradiance > 0) @ (np.stack(area, axis=1) * self._clear)
         pairs = {
             (int(j), c)
             for c in range(seen.shape[1])
             for j in np.argsort(-seen[:, c])[:LIGHTS_PER_CAMERA]
         }
         pairs |= {(j, int(seen[j].argmax())) for j in range(seen.shape[0])}
-        return frozenset(
-            pair for pair in pairs if seen[pair] > MIN_SEEN_FRACTION * seen.max()
-        )
+        minimum = MIN_SEEN_FRACTION * seen.max()
+        return frozenset(pair for pair in pairs if seen[pair] > minimum)
 
     @cached_property
     def irradiance(self) -> Array:
@@ -133,9 +129,8 @@ class CalibrationCheck:
             square, falloff = light_falloff(light, self._position)
             way = light.position - self._position
             cosine = np.einsum("ni,ni->n", way, self._normal) / np.sqrt(square)
-            lit = np.maximum(cosine, 0) * self.light_visible[self.compared, j].astype(
-                np.float64
-            )
+            visible = self.light_visible[self.compared, j].astype(np.float64)
+            lit = np.maximum(cosine, 0) * visible
             rows.append(lit * falloff / square * self.intensity[j].mean())
         return np.array(rows)
 
@@ -147,40 +142,34 @@ class CalibrationCheck:
         """Compare the downsampled pictures of `pairs` with the predictions."""
         views = self._views(pictures)
         offsets, albedo = self._offsets(views)
-        agreement, offset, scale = np.full((3, len(self.dome.cameras)), np.nan)
-        for c, one in offsets.items():
-            agreement[c], offset[c], scale[c] = (
-                one.agreement,
-                one.length * self._mm(c),
-                one.scale,
-            )
+        agreement, length, scale = np.full((3, len(self.dome.cameras)), np.nan)
+        for c, offset in offsets.items():
+            agreement[c] = offset.agreement
+            length[c] = offset.length * self._mm(c)
+            scale[c] = offset.scale
         wrong = self._wrong(offsets)
-        good = {c: one for c, one in offsets.items() if c not in wrong} or offsets
-        table = self._light_table(
-            [view for view in views if view.camera in good], offsets, albedo
-        )
-        own = np.diagonal(table).copy()
+        good = {c: x for c, x in offsets.items() if c not in wrong} or offsets
+        good_views = [view for view in views if view.camera in good]
+        table = self._light_table(good_views, offsets, albedo)
+        light_agreement = np.diagonal(table).copy()
         np.fill_diagonal(table, -1.0)
-        alike = np.where(
-            np.isfinite(own), np.nan_to_num(table, nan=-1.0).argmax(axis=1), -1
-        )
+        similar = np.nan_to_num(table, nan=-1.0).argmax(axis=1)
         explanations = {
             c: self._explanation(c, views, offsets[c], albedo) for c in wrong
         }
-        pose = self._scan_pose(good)
-        brightness = self._brightness(
-            [view for view in views if view.camera in good], pictures, offsets, albedo
-        )
+        translation, rotation, residual = self._scan_pose(good)
         return Calibration(
-            agreement,
-            offset,
-            scale,
-            own,
-            alike,
-            np.nanmax(table, axis=1, initial=-1.0),
-            *pose,
-            brightness,
-            {c: said for c, said in explanations.items() if said},
+            camera_agreement=agreement,
+            camera_offset=length,
+            camera_scale=scale,
+            light_agreement=light_agreement,
+            light_similar=np.where(np.isfinite(light_agreement), similar, -1),
+            light_similar_agreement=np.nanmax(table, axis=1, initial=-1.0),
+            scan_translation=translation,
+            scan_rotation=rotation,
+            camera_residual=residual,
+            brightness=self._brightness(good_views, pictures, offsets, albedo),
+            explanations={c: text for c, text in explanations.items() if text},
         )
 
     def good_offsets(
@@ -189,7 +178,7 @@ class CalibrationCheck:
         """Offset of each camera whose photographs show the face near the scan."""
         offsets, _ = self._offsets(self._views(pictures))
         wrong = self._wrong(offsets)
-        return {c: one for c, one in offsets.items() if c not in wrong}
+        return {c: offset for c, offset in offsets.items() if c not in wrong}
 
     def _brightness(
         self,
@@ -204,11 +193,8 @@ class CalibrationCheck:
             pixels = moved_pixels(view, offsets[view.camera])
             colour = self.intensity[view.light] / self.intensity[view.light].mean()
             irradiance = self.irradiance[view.light][:, None] * colour
-            factors.append(
-                view_factors(
-                    view, pictures[view.light, view.camera], pixels, irradiance, albedo
-                )
-            )
+            picture = pictures[view.light, view.camera]
+            factors.append(view_factors(view, picture, pixels, irradiance, albedo))
         lights = [view.light for view in views]
         cameras = [view.camera for view in views]
         shape = (len(self.dome.lights), len(self.dome.cameras))
@@ -231,59 +217,54 @@ class CalibrationCheck:
     def _clear(self) -> NDArray[np.bool_]:
         return self.clear[self.compared]
 
+    @cached_property
+    def _middle(self) -> Array:
+        return np.asarray(self.surfels.position.mean(axis=0))
+
     def _seen_area(self, camera: CameraRecord) -> Array:
         """Area (n,) [mm2] of the surfels, projected towards the camera."""
-        way = camera_centre(camera.R, camera.t) - self._position
+        way = camera.centre - self._position
         cosine = np.einsum("ni,ni->n", way, self._normal) / np.linalg.norm(way, axis=1)
         return np.asarray(np.maximum(cosine, 0) * self.surfels.area[self.compared])
 
     def factor(self, camera: int) -> int:
         """Downsampling factor of a camera."""
-        return reduction(
-            pixel_width(self.dome.cameras[camera], self.surfels.position.mean(axis=0))
-        )
+        return reduction(self.dome.cameras[camera].pixel_width(self._middle))
 
     def _mm(self, camera: int) -> float:
         """Width [mm] of a downsampled pixel on the face."""
-        width = pixel_width(
-            self.dome.cameras[camera], self.surfels.position.mean(axis=0)
-        )
+        width = self.dome.cameras[camera].pixel_width(self._middle)
         return self.factor(camera) * width
 
-    def _seen(self, light: int, camera: int, image: NDArray[np.float32]) -> ReducedView:
-        pixels = self.pixels[self.compared, camera].astype(np.float64) / self.factor(
-            camera
-        )
-        return ReducedView(
-            light,
-            camera,
-            square_root_image(image.mean(axis=2)),
-            pixels,
-            self._clear[:, camera],
-        )
+    def _reduced_pixels(self, camera: int) -> Array:
+        """Pixels (n, 2) of the compared surfels in the downsampled pictures of a camera."""
+        pixels = self.pixels[self.compared, camera].astype(np.float64)
+        return pixels / self.factor(camera)
 
     def _views(self, pictures: Mapping[Pair, NDArray[np.float32]]) -> list[ReducedView]:
-        return self._usable(
-            [self._seen(j, c, image) for (j, c), image in sorted(pictures.items())]
-        )
-
-    def _usable(self, views: Iterable[ReducedView]) -> list[ReducedView]:
         """Views with enough surfels of varying irradiance that are not black, as they
         are when a lamp fails.
         """
-        kept = list[ReducedView]()
-        bright = list[float]()
-        for view in views:
-            light = self.irradiance[view.light, view.clear]
-            if view.clear.sum() < MIN_SURFELS or np.std(
-                np.sqrt(light)
-            ) < MIN_VARIATION * np.mean(np.sqrt(light)):
+        views = list[ReducedView]()
+        brightness = list[float]()
+        for (j, c), picture in sorted(pictures.items()):
+            clear = self._clear[:, c]
+            light = self.irradiance[j, clear]
+            root = np.sqrt(light)
+            if clear.sum() < MIN_SURFELS or np.std(root) < MIN_VARIATION * np.mean(
+                root
+            ):
                 continue
-            seen = bilinear(view.image, view.pixels[view.clear])
-            kept.append(view)
-            bright.append(float(np.mean(seen**2)) / max(float(np.mean(light)), 1e-300))
-        least = BLACK_FRACTION * float(np.median(bright)) if bright else 0.0
-        return [view for view, value in zip(kept, bright, strict=True) if value > least]
+            image = square_root_image(picture.mean(axis=2))
+            view = ReducedView(j, c, image, self._reduced_pixels(c), clear)
+            seen = bilinear(view.image, view.pixels[clear])
+            views.append(view)
+            ratio = float(np.mean(seen**2)) / max(float(np.mean(light)), 1e-300)
+            brightness.append(ratio)
+        minimum = BLACK_FRACTION * float(np.median(brightness)) if brightness else 0.0
+        return [
+            v for v, ratio in zip(views, brightness, strict=True) if ratio > minimum
+        ]
 
     def _offsets(self, views: Sequence[ReducedView]) -> tuple[dict[int, Offset], Array]:
         """Offset of every camera, and albedo of the surfels."""
@@ -291,12 +272,14 @@ class CalibrationCheck:
         offsets = dict[int, Offset]()
         if not views:
             return offsets, albedo
-        cameras = sorted({view.camera for view in views})
+        by_camera = dict[int, list[ReducedView]]()
+        for view in sorted(views, key=lambda view: view.camera):
+            by_camera.setdefault(view.camera, []).append(view)
         for turn in range(ALBEDO_ROUNDS + 1):
-            for c in cameras:
-                mine = [view for view in views if view.camera == c]
+            search = turn in (0, ALBEDO_ROUNDS)
+            for c, camera_views in by_camera.items():
                 offsets[c] = camera_offset(
-                    mine, self.irradiance, albedo, search=turn in (0, ALBEDO_ROUNDS)
+                    camera_views, self.irradiance, albedo, search=search
                 )
             # wrong photographs would produce an albedo that agrees with them
             if turn < ALBEDO_ROUNDS:
@@ -321,39 +304,35 @@ class CalibrationCheck:
         """
         table = np.full((len(self.dome.lights),) * 2, np.nan)
         for view in views:
-            at = view.clear
-            seen = bilinear(view.image, moved_pixels(view, offsets[view.camera])[at])
-            row = np.array(
-                [
-                    correlation(seen, one)
-                    for one in np.sqrt(self.irradiance[:, at] * albedo[at])
-                ]
-            )
+            clear = view.clear
+            seen = bilinear(view.image, moved_pixels(view, offsets[view.camera])[clear])
+            predictions = np.sqrt(self.irradiance[:, clear] * albedo[clear])
+            row = np.array([correlation(seen, shade) for shade in predictions])
             if not row[view.light] <= table[view.light, view.light]:
                 table[view.light] = row
         return table
 
     def _explanation(
-        self, camera: int, views: Sequence[ReducedView], found: Offset, albedo: Array
+        self, camera: int, views: Sequence[ReducedView], offset: Offset, albedo: Array
     ) -> str:
         """Exchange of pictures or parameters that explains the photographs of a camera;
         empty if none does.
         """
-        mine = [view for view in views if view.camera == camera]
-        best = max(found.agreement + BETTER_AGREEMENT, GOOD_AGREEMENT)
-        said = ""
+        camera_views = [view for view in views if view.camera == camera]
+        best = max(offset.agreement + BETTER_AGREEMENT, GOOD_AGREEMENT)
+        explanation = ""
         for text, pixels, clear in self._alternatives(camera):
-            others = [replace(view, pixels=pixels, clear=clear) for view in mine]
             if clear.sum() < MIN_SURFELS:
                 continue
-            offset = camera_offset(others, self.irradiance, albedo)
-            if (
-                offset.agreement > best
-                and offset.length * self._mm(camera) < MAX_OFFSET_MM
-            ):
-                best = offset.agreement
-                said = text
-        return said
+            exchanged = [
+                replace(view, pixels=pixels, clear=clear) for view in camera_views
+            ]
+            exchanged_offset = camera_offset(exchanged, self.irradiance, albedo)
+            near = exchanged_offset.length * self._mm(camera) < MAX_OFFSET_MM
+            if exchanged_offset.agreement > best and near:
+                best = exchanged_offset.agreement
+                explanation = text
+        return explanation
 
     def _alternatives(self, c: int) -> Iterator[tuple[str, Array, NDArray[np.bool_]]]:
         """Possible exchanges, each with the pixels (n, 2) and the visibility (n,) of
@@ -361,47 +340,39 @@ class CalibrationCheck:
         """
         camera = self.dome.cameras[c]
         factor = self.factor(c)
-        pixels = self.pixels[self.compared, c].astype(np.float64) / factor
+        pixels = self._reduced_pixels(c)
         clear = self._clear[:, c]
         size = np.array([camera.width, camera.height]) / factor
-        yield "they look upside down", size - pixels, clear
-        yield (
-            "they look mirrored",
-            np.stack([size[0] - pixels[:, 0], pixels[:, 1]], axis=1),
-            clear,
-        )
-        yield (
-            "they look mirrored top to bottom",
-            np.stack([pixels[:, 0], size[1] - pixels[:, 1]], axis=1),
-            clear,
-        )
-        for k, other in enumerate(self.dome.cameras):
-            if k != c and (other.width, other.height) == (camera.width, camera.height):
+        upside_down = size - pixels
+        mirrored = np.stack([upside_down[:, 0], pixels[:, 1]], axis=1)
+        flipped = np.stack([pixels[:, 0], upside_down[:, 1]], axis=1)
+        yield "they look upside down", upside_down, clear
+        yield "they look mirrored", mirrored, clear
+        yield "they look mirrored top to bottom", flipped, clear
+        for k, other_camera in enumerate(self.dome.cameras):
+            if k != c and (other_camera.width, other_camera.height) == (
+                camera.width,
+                camera.height,
+            ):
                 theirs = self.pixels[self.compared, k].astype(np.float64) / factor
-                yield (
-                    f"they look as if camera {other.id} had taken them",
-                    theirs,
-                    self._clear[:, k],
-                )
+                text = f"they look as if camera {other_camera.id} had taken them"
+                yield text, theirs, self._clear[:, k]
         middle = camera.K[:2, 2] / factor
-        yield (
-            "the focal length looks twice too long",
-            middle + (pixels - middle) / 2,
-            clear,
-        )
-        yield (
-            "the focal length looks half of what it should be",
-            middle + (pixels - middle) * 2,
-            clear,
-        )
+        away = pixels - middle
+        yield "the focal length looks twice too long", middle + away / 2, clear
+        text = "the focal length looks half of what it should be"
+        yield text, middle + away * 2, clear
         turned = replace(camera, R=camera.R.T)
-        there, depth = project(
+        turned_pixels, depth = project(
             self._position, turned.K, turned.R, turned.t, turned.distortion
         )
-        faces = (
-            (self._seen_area(turned) > 0) & (depth > 0) & np.isfinite(there).all(axis=1)
+        visible = (self._seen_area(turned) > 0) & (depth > 0)
+        visible &= np.isfinite(turned_pixels).all(axis=1)
+        yield (
+            "R looks transposed",
+            np.nan_to_num(turned_pixels / factor, nan=-1.0),
+            visible,
         )
-        yield "R looks transposed", np.nan_to_num(there / factor, nan=-1.0), faces
 
     def _scan_pose(self, offsets: Mapping[int, Offset]) -> tuple[Array, Array, Array]:
         """Translation [mm] and rotation [degrees] of the scan about its centre that fit
@@ -409,47 +380,39 @@ class CalibrationCheck:
 
         They are a least-squares fit to the displacements of 200 surfels in each picture.
         """
-        left = np.full(len(self.dome.cameras), np.nan)
+        residuals = np.full(len(self.dome.cameras), np.nan)
         if not offsets:
-            return np.full(3, np.nan), np.full(3, np.nan), left
-        rows = {c: self._pose_rows(c, one) for c, one in offsets.items()}
-        matrix, right = (
-            np.concatenate([pair[i] for pair in rows.values()]) for i in (0, 1)
-        )
+            return np.full(3, np.nan), np.full(3, np.nan), residuals
+        rows = {c: self._pose_rows(c, offset) for c, offset in offsets.items()}
+        matrix = np.concatenate([slopes for slopes, _ in rows.values()])
+        right = np.concatenate([moves for _, moves in rows.values()])
         x = np.linalg.lstsq(matrix, right, rcond=None)[0]
         for c, (slopes, moves) in rows.items():
             residual = (moves - slopes @ x).reshape(-1, 2)
-            left[c] = float(np.sqrt((residual**2).sum(axis=1).mean())) * self._mm(c)
-        return x[:3], np.degrees(x[3:]), left
+            length = float(np.sqrt((residual**2).sum(axis=1).mean()))
+            residuals[c] = length * self._mm(c)
+        return x[:3], np.degrees(x[3:]), residuals
 
     def _pose_rows(self, c: int, offset: Offset) -> tuple[Array, Array]:
         """Derivatives (2 m, 6) of m pixels by translation [mm] and rotation [rad], and
         displacements (2 m,).
         """
         camera = self.dome.cameras[c]
-        middle = self.surfels.position.mean(axis=0)
-        at = np.flatnonzero(self._clear[:, c])
-        at = at[:: max(len(at) // 200, 1)]
-        points = self._position[at]
-        steps = [np.broadcast_to(axis, points.shape) for axis in np.eye(3)]
-        steps += [np.cross(axis, points - middle) for axis in np.eye(3)]
-
-        def pixels(places: Array) -> Array:
-            return project(places, camera.K, camera.R, camera.t, camera.distortion)[
-                0
-            ] / self.factor(c)
-
+        factor = self.factor(c)
+        surfels = np.flatnonzero(self._clear[:, c])
+        surfels = surfels[:: max(len(surfels) // 200, 1)]
+        points = self._position[surfels]
+        axes = np.eye(3)
+        steps = [np.broadcast_to(axis, points.shape) for axis in axes]
+        steps += [np.cross(axis, points - self._middle) for axis in axes]
         small = 1e-3
-        slopes = np.stack(
-            [
-                (pixels(points + small * step) - pixels(points)) / small
-                for step in steps
-            ],
-            axis=-1,
-        )
-        return slopes.reshape(-1, 6), offset.moves(
-            self.pixels[self.compared, c][at] / self.factor(c)
-        ).ravel()
+        pixels = camera.project(points) / factor
+        slopes = [
+            (camera.project(points + small * step) / factor - pixels) / small
+            for step in steps
+        ]
+        moves = offset.moves(self.pixels[self.compared, c][surfels] / factor)
+        return np.stack(slopes, axis=-1).reshape(-1, 6), moves.ravel()
 
 
 def refine_cameras(
@@ -482,9 +445,7 @@ def refine_cameras(
         pixels = check.pixels.copy()
         for c in turns:
             camera = cameras[c]
-            pixels[:, c] = project(
-                check.surfels.position, camera.K, camera.R, camera.t, camera.distortion
-            )[0]
+            pixels[:, c] = camera.project(check.surfels.position)
         check = replace(check, dome=replace(check.dome, cameras=cameras), pixels=pixels)
     return check.dome
 
@@ -504,15 +465,11 @@ def applied_rotations(before: DomeRecord, after: DomeRecord) -> Array:
 
 def _turn(check: CalibrationCheck, c: int, offset: Offset) -> Array:
     """Rotation vector (3,) [rad] in the frame of camera c that compensates for its offset."""
-    at = np.flatnonzero(check.clear[check.compared, c])
-    points = check.surfels.position[check.compared][at]
+    points = check.surfels.position[check.compared][check.clear[check.compared, c]]
     camera = check.dome.cameras[c]
 
     def pixels(turn: Array) -> Array:
-        turned = _turned(camera, turn)
-        return project(points, turned.K, turned.R, turned.t, turned.distortion)[
-            0
-        ] / check.factor(c)
+        return _turned(camera, turn).project(points) / check.factor(c)
 
     moves = offset.moves(pixels(np.zeros(3)))
     slopes = [
@@ -520,9 +477,8 @@ def _turn(check: CalibrationCheck, c: int, offset: Offset) -> Array:
         / (2 * SMALL_TURN)
         for axis in np.eye(3)
     ]
-    return np.asarray(
-        np.linalg.lstsq(np.stack(slopes, axis=1), moves.ravel(), rcond=None)[0]
-    )
+    matrix = np.stack(slopes, axis=1)
+    return np.asarray(np.linalg.lstsq(matrix, moves.ravel(), rcond=None)[0])
 
 
 def _turned(camera: CameraRecord, turn: Array) -> CameraRecord:

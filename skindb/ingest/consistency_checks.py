@@ -41,58 +41,54 @@ RED_REFLECTANCES = (0.1, 0.9)  # of a face; skin of all tones has 0.2 to 0.75
 CHANNELS = ("red", "green", "blue")
 
 
-def calibration_faults(dome: DomeRecord, found: Calibration) -> list[Fault]:
+def calibration_faults(dome: DomeRecord, calibration: Calibration) -> list[Fault]:
     """Faults of cameras, lights and channels; a wrong pose of the scan is one fault,
     not one for each camera.
     """
-    cameras = [*_camera_faults(dome, found)]
-    checked = int(np.isfinite(found.camera_agreement).sum())
-    if len(cameras) == checked > 1 and not found.explanations:
+    faults = [*_camera_faults(dome, calibration)]
+    checked = int(np.isfinite(calibration.camera_agreement).sum())
+    if len(faults) == checked > 1 and not calibration.explanations:
         rule = f"the photographs must show the face within {MAX_OFFSET_MM:g} mm of the scan"
-        cameras = [
-            Fault(
-                str(dome.file),
-                rule,
-                f"none of {checked} cameras does",
-                f"align the scan: {_pose(found)}",
-            )
-        ]
-    faults = cameras or [*_light_faults(dome, found)]
-    return faults + _channel_faults(dome, found) + _brightness_faults(dome, found)
-
-
-def _channel_faults(dome: DomeRecord, found: Calibration) -> list[Fault]:
-    """Faults of channels in another order than R, G, B: one if that of all cameras is
-    wrong, else one for each.
-    """
-    ratio = _red_to_blue(found)
-    rule = "skin must reflect more red than blue"
-    cure = "write the channels in the order R, G, B"
-    if not np.isfinite(ratio).any():
-        return []
-    if (middle := np.nanmedian(ratio)) < MIN_RED_TO_BLUE:
-        return [Fault(f"{dome.file}[frames]", rule, f"a ratio of {middle:.2g}", cure)]
+        finding = f"none of {checked} cameras does"
+        cure = f"align the scan: {_pose(calibration)}"
+        faults = [Fault(str(dome.file), rule, finding, cure)]
+    faults = faults or [*_light_faults(dome, calibration)]
     return [
-        Fault(
-            f"{dome.file}[frames]",
-            rule,
-            f"a ratio of {ratio[c]:.2g} in the frames of camera {camera.id}",
-            cure,
-        )
-        for c, camera in enumerate(dome.cameras)
-        if ratio[c] < MIN_RED_TO_BLUE
+        *faults,
+        *_channel_faults(dome, calibration),
+        *_brightness_faults(dome, calibration),
     ]
 
 
-def _red_to_blue(found: Calibration) -> NDArray[np.float64]:
+def _channel_faults(dome: DomeRecord, calibration: Calibration) -> list[Fault]:
+    """Faults of channels in another order than R, G, B: one if that of all cameras is
+    wrong, else one for each.
+    """
+    ratio = _red_to_blue(calibration)
+    if not np.isfinite(ratio).any():
+        return []
+    middle = np.nanmedian(ratio)
+    findings = [
+        f"a ratio of {ratio[c]:.2g} in the frames of camera {camera.id}"
+        for c, camera in enumerate(dome.cameras)
+        if ratio[c] < MIN_RED_TO_BLUE
+    ]
+    if middle < MIN_RED_TO_BLUE:
+        findings = [f"a ratio of {middle:.2g}"]
+    rule = "skin must reflect more red than blue"
+    cure = "write the channels in the order R, G, B"
+    return [Fault(f"{dome.file}[frames]", rule, text, cure) for text in findings]
+
+
+def _red_to_blue(calibration: Calibration) -> NDArray[np.float64]:
     """Red over blue reflectance of the face in the photographs of each camera
     (camera,); NaN if unknown.
     """
-    seen = found.brightness.reflectance * found.brightness.camera
-    return np.asarray(seen[:, 0] / seen[:, 2])
+    seen = calibration.brightness.reflectance * calibration.brightness.camera
+    return seen[:, 0] / seen[:, 2]
 
 
-def _brightness_faults(dome: DomeRecord, found: Calibration) -> list[Fault]:
+def _brightness_faults(dome: DomeRecord, calibration: Calibration) -> Iterator[Fault]:
     """Faults of cameras and lights whose photographs are much brighter or darker than
     those of the others.
     """
@@ -100,98 +96,105 @@ def _brightness_faults(dome: DomeRecord, found: Calibration) -> list[Fault]:
         "its photographs must be as bright as those of the others, within a factor of "
         f"{MAX_BRIGHTNESS:g}"
     )
-    sensor = "correct colour_matrix, response, white_level or vignette of the camera"
-    lamp = "correct its intensity or position, or its frames of the white target"
-    cameras = [
-        Fault(f"{dome.file}[cameras], camera {dome.cameras[c].id}", rule, said, sensor)
-        for c, said in _brightness_beyond(found, MAX_BRIGHTNESS)
-    ]
-    lights = [
-        Fault(
-            f"{dome.file}[lights], light {light.id}",
-            rule,
-            f"{factor:.2g} times as bright",
-            lamp,
-        )
-        for light, factor in zip(dome.lights, found.brightness.light, strict=True)
-        if abs(np.log(factor)) > np.log(MAX_BRIGHTNESS)
-    ]
-    return cameras + lights
+    for c, finding in _cameras_beyond(calibration, MAX_BRIGHTNESS):
+        place = f"{dome.file}[cameras], camera {dome.cameras[c].id}"
+        cure = "correct colour_matrix, response, white_level or vignette of the camera"
+        yield Fault(place, rule, finding, cure)
+    for light, factor in _lights_beyond(dome, calibration, MAX_BRIGHTNESS):
+        place = f"{dome.file}[lights], light {light}"
+        cure = "correct its intensity or position, or its frames of the white target"
+        yield Fault(place, rule, f"{factor:.2g} times as bright", cure)
 
 
-def _brightness_beyond(found: Calibration, limit: float) -> Iterator[tuple[int, str]]:
+def _cameras_beyond(
+    calibration: Calibration, limit: float
+) -> Iterator[tuple[int, str]]:
     """Cameras whose brightness differs from that of the others by more than a factor,
     with the channel that does most.
 
     Cameras with exchanged channels are excluded, because these explain the difference.
     """
-    ratio = _red_to_blue(found)
-    for c, factors in enumerate(found.brightness.camera):
+    ratio = _red_to_blue(calibration)
+    for c, factors in enumerate(calibration.brightness.camera):
         away = np.abs(np.log(factors))
         if away.max() > np.log(limit) and not ratio[c] < MIN_RED_TO_BLUE:
             worst = int(away.argmax())
             yield c, f"{factors[worst]:.2g} times as bright in {CHANNELS[worst]}"
 
 
-def calibration_notes(dome: DomeRecord, found: Calibration) -> list[str]:
+def _lights_beyond(
+    dome: DomeRecord, calibration: Calibration, limit: float
+) -> Iterator[tuple[str, float]]:
+    """Lights whose brightness differs from that of the others by more than a factor."""
+    factors = calibration.brightness.light
+    for light, factor in zip(dome.lights, factors, strict=True):
+        if abs(np.log(factor)) > np.log(limit):
+            yield light.id, factor
+
+
+def calibration_notes(dome: DomeRecord, calibration: Calibration) -> list[str]:
     """Warnings about parameters of the calibration that are probably inaccurate."""
     return [
-        *_camera_notes(dome, found),
-        *_light_notes(dome, found),
-        *_brightness_notes(dome, found),
+        *_camera_notes(dome, calibration),
+        *_light_notes(dome, calibration),
+        *_brightness_notes(dome, calibration),
     ]
 
 
-def _brightness_notes(dome: DomeRecord, found: Calibration) -> Iterator[str]:
-    for c, said in _brightness_beyond(found, DOUBTFUL_CAMERA_BRIGHTNESS):
-        yield f"camera {dome.cameras[c].id}: its photographs are {said} as those of the others"
-    for light, factor in zip(dome.lights, found.brightness.light, strict=True):
-        if abs(np.log(factor)) > np.log(DOUBTFUL_LIGHT_BRIGHTNESS):
-            said = (
-                f"the face is {factor:.2g} times as bright under it as under the others"
-            )
-            yield f"light {light.id}: {said}; check its intensity, or use fit --light-gains"
+def _brightness_notes(dome: DomeRecord, calibration: Calibration) -> Iterator[str]:
+    for c, finding in _cameras_beyond(calibration, DOUBTFUL_CAMERA_BRIGHTNESS):
+        yield f"camera {dome.cameras[c].id}: its photographs are {finding} as those of the others"
+    for light, factor in _lights_beyond(dome, calibration, DOUBTFUL_LIGHT_BRIGHTNESS):
+        yield (
+            f"light {light}: the face is {factor:.2g} times as bright under it as under the "
+            "others; check its intensity, or use fit --light-gains"
+        )
     low, high = RED_REFLECTANCES
-    red = found.brightness.reflectance[0]
+    red = calibration.brightness.reflectance[0]
     if not low <= red <= high and np.isfinite(red):
-        cure = "check the white target and the intensities of the lights"
-        yield f"the face reflects {red:.0%} of red light, and skin {low:.0%} to {high:.0%}; {cure}"
-    ratio = _red_to_blue(found)
+        yield (
+            f"the face reflects {red:.0%} of red light, and skin {low:.0%} to {high:.0%}; "
+            "check the white target and the intensities of the lights"
+        )
+    ratio = _red_to_blue(calibration)
     for c, camera in enumerate(dome.cameras):
         if MIN_RED_TO_BLUE <= ratio[c] < DOUBTFUL_RED_TO_BLUE:
-            said = f"camera {camera.id}: the face reflects {ratio[c]:.2g} times as much red as blue"
-            yield f"{said}; check the order of the channels"
-
-
-def _camera_notes(dome: DomeRecord, found: Calibration) -> Iterator[str]:
-    move, turn = (
-        float(np.linalg.norm(part))
-        for part in (found.scan_translation, found.scan_rotation)
-    )
-    offset = found.camera_offset
-    if move > DOUBTFUL_SCAN_MM or turn > DOUBTFUL_SCAN_DEGREES:
-        yield (
-            f"the scan is not where the photographs show the face; {_pose(found)}; use "
-            "--refine to compensate"
-        )
-        offset = found.camera_residual
-    for c, camera in enumerate(dome.cameras):
-        if (
-            offset[c] > DOUBTFUL_OFFSET_MM
-            or abs(found.camera_scale[c]) > DOUBTFUL_SCALE
-        ):
-            said = _beside(offset[c], found.camera_scale[c])
-            cure = "calibrate it again, or ingest with --refine"
-            yield f"camera {camera.id}: its photographs show the face {said}; {cure}"
-        elif found.camera_agreement[c] < DOUBTFUL_AGREEMENT:
-            said = f"(correlation {found.camera_agreement[c]:.2f})"
             yield (
-                f"camera {camera.id}: its photographs differ from those of a matte "
-                f"face {said}; inspect them"
+                f"camera {camera.id}: the face reflects {ratio[c]:.2g} times as much red as "
+                "blue; check the order of the channels"
             )
 
 
-def _light_notes(dome: DomeRecord, found: Calibration) -> Iterator[str]:
+def _camera_notes(dome: DomeRecord, calibration: Calibration) -> Iterator[str]:
+    shift = float(np.linalg.norm(calibration.scan_translation))
+    turn = float(np.linalg.norm(calibration.scan_rotation))
+    offsets = calibration.camera_offset
+    if shift > DOUBTFUL_SCAN_MM or turn > DOUBTFUL_SCAN_DEGREES:
+        yield (
+            f"the scan is not where the photographs show the face; {_pose(calibration)}; "
+            "use --refine to compensate"
+        )
+        offsets = calibration.camera_residual
+    for camera, offset, scale, agreement in zip(
+        dome.cameras,
+        offsets,
+        calibration.camera_scale,
+        calibration.camera_agreement,
+        strict=True,
+    ):
+        if offset > DOUBTFUL_OFFSET_MM or abs(scale) > DOUBTFUL_SCALE:
+            yield (
+                f"camera {camera.id}: its photographs show the face {_beside(offset, scale)}; "
+                "calibrate it again, or ingest with --refine"
+            )
+        elif agreement < DOUBTFUL_AGREEMENT:
+            yield (
+                f"camera {camera.id}: its photographs differ from those of a matte "
+                f"face (correlation {agreement:.2f}); inspect them"
+            )
+
+
+def _light_notes(dome: DomeRecord, calibration: Calibration) -> Iterator[str]:
     # the head is at the origin of a dome
     distance = np.linalg.norm([light.position for light in dome.lights], axis=1)
     for light, ratio in zip(dome.lights, distance / np.median(distance), strict=True):
@@ -201,82 +204,68 @@ def _light_notes(dome: DomeRecord, found: Calibration) -> Iterator[str]:
                 f"light {light.id}: {ratio:.2g} times as far away as the median light; "
                 "check its position"
             )
-    better = found.light_similar_agreement - found.light_agreement
+    shading = calibration.light_agreement
+    better = calibration.light_similar_agreement - shading
     for j, light in enumerate(dome.lights):
-        if (
-            better[j] > DOUBTFUL_BETTER_LIGHT
-            or found.light_agreement[j] < DOUBTFUL_LIGHT_AGREEMENT
-        ):
+        if better[j] > DOUBTFUL_BETTER_LIGHT or shading[j] < DOUBTFUL_LIGHT_AGREEMENT:
             yield (
                 f"light {light.id}: the shading of the face does not match its "
-                f"position; {_shading(dome, found, j)}"
+                f"position; {_shading(dome, calibration, j)}"
             )
-        elif not np.isfinite(found.light_agreement[j]):
+        elif not np.isfinite(shading[j]):
             yield (
                 f"light {light.id}: its photographs are too dark or show too little of "
                 "the face to check its position"
             )
 
 
-def _camera_faults(dome: DomeRecord, found: Calibration) -> Iterator[Fault]:
+def _camera_faults(dome: DomeRecord, calibration: Calibration) -> Iterator[Fault]:
+    rule = f"its photographs must show the face within {MAX_OFFSET_MM:g} mm of the scan"
+    cure = "correct K, R and t, the order of the frames, or the pose of the scan"
     for c, camera in enumerate(dome.cameras):
-        offset = found.camera_offset[c]
-        agreement = found.camera_agreement[c]
-        scale = found.camera_scale[c]
-        if (
-            offset > MAX_OFFSET_MM
-            or agreement < MIN_AGREEMENT
-            or abs(scale) > MAX_SCALE
-        ):
-            rule = f"its photographs must show the face within {MAX_OFFSET_MM:g} mm of the scan"
-            said = f"the face {_beside(offset, scale)}, correlation {agreement:.2f}"
-            said = found.explanations.get(c, said)
-            cure = (
-                "correct K, R and t, the order of the frames, or the pose of the scan"
-            )
-            yield Fault(f"{dome.file}[cameras], camera {camera.id}", rule, said, cure)
-
-
-def _light_faults(dome: DomeRecord, found: Calibration) -> Iterator[Fault]:
-    better = found.light_similar_agreement - found.light_agreement
-    for j, light in enumerate(dome.lights):
-        if (
-            better[j] > MAX_BETTER_LIGHT
-            or found.light_agreement[j] < MIN_LIGHT_AGREEMENT
-        ):
-            rule = "the shading of the face must match its position"
-            cure = "correct its position, or the order of the frames"
+        offset = calibration.camera_offset[c]
+        agreement = calibration.camera_agreement[c]
+        scale = calibration.camera_scale[c]
+        displaced = offset > MAX_OFFSET_MM or abs(scale) > MAX_SCALE
+        if displaced or agreement < MIN_AGREEMENT:
+            finding = f"the face {_beside(offset, scale)}, correlation {agreement:.2f}"
+            finding = calibration.explanations.get(c, finding)
             yield Fault(
-                f"{dome.file}[lights], light {light.id}",
-                rule,
-                _shading(dome, found, j),
-                cure,
+                f"{dome.file}[cameras], camera {camera.id}", rule, finding, cure
             )
 
 
-def _shading(dome: DomeRecord, found: Calibration, j: int) -> str:
-    own = found.light_agreement[j]
-    other = found.light_similar_agreement[j]
-    said = f"correlation {own:.2f}"
-    return said + (
-        f", {other:.2f} with light {dome.lights[int(found.light_similar[j])].id}"
-        if other > own
-        else ""
-    )
+def _light_faults(dome: DomeRecord, calibration: Calibration) -> Iterator[Fault]:
+    rule = "the shading of the face must match its position"
+    cure = "correct its position, or the order of the frames"
+    shading = calibration.light_agreement
+    better = calibration.light_similar_agreement - shading
+    for j, light in enumerate(dome.lights):
+        if better[j] > MAX_BETTER_LIGHT or shading[j] < MIN_LIGHT_AGREEMENT:
+            place = f"{dome.file}[lights], light {light.id}"
+            yield Fault(place, rule, _shading(dome, calibration, j), cure)
+
+
+def _shading(dome: DomeRecord, calibration: Calibration, j: int) -> str:
+    agreement = calibration.light_agreement[j]
+    better = calibration.light_similar_agreement[j]
+    text = f"correlation {agreement:.2f}"
+    if better > agreement:
+        similar = dome.lights[int(calibration.light_similar[j])].id
+        text += f", {better:.2f} with light {similar}"
+    return text
 
 
 def _beside(offset: float, scale: float) -> str:
-    size = (
-        f" and {abs(scale):.1%} {'larger' if scale > 0 else 'smaller'}"
-        if abs(scale) > REPORTED_SCALE
-        else ""
-    )
-    return f"{offset:.1f} mm away from the scan{size}"
+    text = f"{offset:.1f} mm away from the scan"
+    if abs(scale) > REPORTED_SCALE:
+        text += f" and {abs(scale):.1%} {'larger' if scale > 0 else 'smaller'}"
+    return text
 
 
-def _pose(found: Calibration) -> str:
-    move, turn = (
+def _pose(calibration: Calibration) -> str:
+    shift, turn = (
         ", ".join(f"{value:.1f}" for value in part)
-        for part in (found.scan_translation, found.scan_rotation)
+        for part in (calibration.scan_translation, calibration.scan_rotation)
     )
-    return f"a shift by ({move}) mm and a rotation by ({turn}) degrees would align it"
+    return f"a shift by ({shift}) mm and a rotation by ({turn}) degrees would align it"

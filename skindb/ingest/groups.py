@@ -14,7 +14,6 @@ from skindb.format.contact_probe import ProbeRecord
 from skindb.format.dome import DomeRecord, SequenceRecord
 from skindb.format.folder import Capture
 from skindb.geometry.atlas import distortion
-from skindb.geometry.camera import camera_centre
 from skindb.ingest.consistency import Calibration
 from skindb.ingest.lumitexels import FULL_SHADOW, MIN_LIT_FRACTION, Lumitexels
 from skindb.ingest.probe_profiles import Profiles
@@ -22,14 +21,14 @@ from skindb.ingest.surfels import SurfelSet, transferred_landmarks
 from skindb.schema import dataset
 
 Array = NDArray[np.float64]
-CHANNELS = ("R", "G", "B")
+CHANNELS = {"channel": ["R", "G", "B"]}  # coordinate
 
 
 def surfel_group(
     surfels: SurfelSet,
     dome: DomeRecord | None = None,
     light_fraction: NDArray[np.float16] | None = None,
-    camera_share: NDArray[np.float16] | None = None,
+    camera_fraction: NDArray[np.float16] | None = None,
 ) -> xr.Dataset:
     """Group "surfels"; without a dome it has no visibility."""
     variables: dict[str, Any] = {
@@ -38,38 +37,37 @@ def surfel_group(
         "surfel_area": surfels.area,
         "surfel_radius": surfels.radius,
         "surfel_uv": surfels.uv,
-        "region_mask": surfels.region.astype(np.int8),
     }
-    coords: dict[str, list[str]] = {"region": list(surfels.region_names)}
-    if dome is not None:
+    coords = dict[str, list[str]]()
+    if surfels.region_names:
+        variables["region_mask"] = surfels.region.astype(np.int8)
+        coords["region"] = list(surfels.region_names)
+    if dome is not None and light_fraction is not None:
+        soft = np.zeros(len(surfels.position), np.int32)
+        # not all at once: memory
+        for fraction in light_fraction.T:
+            soft += (fraction >= FULL_SHADOW) & (fraction < MIN_LIT_FRACTION)
         variables |= {
             "light_visible_fraction": light_fraction,
-            "camera_visible_fraction": camera_share,
+            "camera_visible_fraction": camera_fraction,
+            "soft_light_count": soft,
         }
-        variables["soft_light_count"] = np.zeros(len(surfels.position), np.int32)
-        # not all at once: memory
-        for share in () if light_fraction is None else light_fraction.T:
-            variables["soft_light_count"] += (share >= FULL_SHADOW) & (
-                share < MIN_LIT_FRACTION
-            )
         coords |= _dome_names(dome)
-    if not surfels.region_names:
-        variables.pop("region_mask")
-        coords.pop("region")
     return dataset(variables, coords=coords)
 
 
 def mesh_group(capture: Capture, surfels: SurfelSet) -> xr.Dataset:
     """Group "mesh"."""
-    if not capture.landmarks:
-        return dataset({"triangle": surfels.faces})
-    position, distance = transferred_landmarks(capture, surfels)
-    variables = {
-        "triangle": surfels.faces,
-        "landmark_position": position,
-        "landmark_surface_distance": distance,
-    }
-    return dataset(variables, coords={"landmark": [*capture.landmarks]})
+    variables: dict[str, Any] = {"triangle": surfels.faces}
+    coords = dict[str, list[str]]()
+    if capture.landmarks:
+        position, distance = transferred_landmarks(capture, surfels)
+        variables |= {
+            "landmark_position": position,
+            "landmark_surface_distance": distance,
+        }
+        coords["landmark"] = [*capture.landmarks]
+    return dataset(variables, coords=coords)
 
 
 def atlas_group(surfels: SurfelSet) -> xr.Dataset:
@@ -79,10 +77,9 @@ def atlas_group(surfels: SurfelSet) -> xr.Dataset:
     Its attribute `weights` names the method: "intrinsic" (Desbrun et al. 2002) or
     "mean_value" (Floater 2003).
     """
-    found = distortion(surfels.position, surfels.faces, surfels.uv, surfels.region)
-    variables = {f"atlas_{name}": values for name, values in found.items()}
+    measures = distortion(surfels.position, surfels.faces, surfels.uv, surfels.region)
     return dataset(
-        variables,
+        {f"atlas_{name}": values for name, values in measures.items()},
         coords={"region": ["all", *surfels.region_names]},
         attrs={"weights": surfels.uv_weights},
     )
@@ -98,51 +95,51 @@ def dome_group(dome: DomeRecord, intensity: Array) -> xr.Dataset:
         "light_disc_radius": [light.disc_radius for light in lights],
         "light_falloff": [light.falloff for light in lights],
         "light_intensity": intensity,
-        "camera_position": [camera_centre(camera.R, camera.t) for camera in cameras],
+        "camera_position": [camera.centre for camera in cameras],
         "camera_matrix": [camera.K for camera in cameras],
         "camera_rotation": [camera.R for camera in cameras],
         "camera_translation": [camera.t for camera in cameras],
         "camera_distortion": [camera.distortion for camera in cameras],
         "camera_size": [(camera.width, camera.height) for camera in cameras],
     }
-    return dataset(variables, coords=_dome_names(dome) | {"channel": list(CHANNELS)})
+    return dataset(variables, coords=_dome_names(dome) | CHANNELS)
 
 
 def calibration_group(
-    dome: DomeRecord, found: Calibration, applied: NDArray[np.float64]
+    dome: DomeRecord, calibration: Calibration, rotations: Array
 ) -> xr.Dataset:
     """Group "calibration": how well the photographs fit the poses of cameras and scan
     and the positions of the lights.
 
-    `applied` are the rotation vectors (camera, 3) [degrees] of the refinement.
+    `rotations` are the rotation vectors (camera, 3) [degrees] of the refinement.
     """
     variables = {
-        "camera_agreement": found.camera_agreement,
-        "camera_offset": found.camera_offset,
-        "camera_scale_error": found.camera_scale,
-        "light_agreement": found.light_agreement,
-        "camera_brightness": found.brightness.camera,
-        "light_brightness": found.brightness.light,
-        "scan_translation_error": found.scan_translation,
-        "scan_rotation_error": found.scan_rotation,
-        "camera_rotation_applied": applied,
+        "camera_agreement": calibration.camera_agreement,
+        "camera_offset": calibration.camera_offset,
+        "camera_scale_error": calibration.camera_scale,
+        "light_agreement": calibration.light_agreement,
+        "camera_brightness": calibration.brightness.camera,
+        "light_brightness": calibration.brightness.light,
+        "scan_translation_error": calibration.scan_translation,
+        "scan_rotation_error": calibration.scan_rotation,
+        "camera_rotation_applied": rotations,
     }
-    return dataset(variables, coords=_dome_names(dome) | {"channel": list(CHANNELS)})
+    return dataset(variables, coords=_dome_names(dome) | CHANNELS)
 
 
-def sample_group(dome: DomeRecord, found: Lumitexels) -> xr.Dataset:
+def sample_group(dome: DomeRecord, lumitexels: Lumitexels) -> xr.Dataset:
     """Group "samples"; the store reads the spool shard by shard."""
     variables = {
-        "reflectance_sample": found.sample,
-        "sample_count": found.sample_count,
-        "saturated_count": found.saturated_count,
-        "dark_count": found.dark_count,
-        "single_exposure_count": found.single_count,
-        "noise_floor": found.noise_floor,
-        "shot_noise": found.shot_noise,
+        "reflectance_sample": lumitexels.sample,
+        "sample_count": lumitexels.sample_count,
+        "saturated_count": lumitexels.saturated_count,
+        "dark_count": lumitexels.dark_count,
+        "single_exposure_count": lumitexels.single_count,
+        "noise_floor": lumitexels.noise_floor,
+        "shot_noise": lumitexels.shot_noise,
     }
-    coords = _dome_names(dome) | {"channel": list(CHANNELS)}
-    if (noise := found.noise) is not None:
+    coords = _dome_names(dome) | CHANNELS
+    if (noise := lumitexels.noise) is not None:
         variables |= {
             "effective_pixels": noise.effective_pixels,
             "radiance_limit": noise.limit,
@@ -162,6 +159,10 @@ def probe_group(
     isotropy: Array | None = None,
 ) -> xr.Dataset:
     """Group "probe"; `position` (site, 3) [mm] and p values of isotropy (site, 3)."""
+    logs = [
+        [probe.pressure.get((site, name)) for name in probe.placements[site]]
+        for site in probe.sites
+    ]
     variables = {
         "fibre_distance": probe.distance,
         "fibre_profile": profiles.value,
@@ -169,20 +170,16 @@ def probe_group(
         "site_position": position,
         "gain_known": int(profiles.scale_known),
         "fibre_radius": probe.face,
-        "site_pressure": _mean_pressures(probe),
-        "site_placements": [len(probe.placements[site]) for site in probe.sites],
+        "site_pressure": [_mean_pressure(site) for site in logs],
+        "site_placements": [len(site) for site in logs],
         "site_repeatability": profiles.repeatability,
     }
     if np.isfinite(probe.azimuth).any():
         variables["fibre_azimuth"] = probe.azimuth
     if isotropy is not None:
         variables["site_isotropy_p_value"] = isotropy
-    if any(len(own) > 1 for own in probe.placements.values()):
+    if any(len(site) > 1 for site in logs):
         variables["placement_profile"] = _padded(profiles.placements)
-    logs = [
-        [probe.pressure.get((site, name)) for name in probe.placements[site]]
-        for site in probe.sites
-    ]
     if any(log is not None and len(log) > 1 for site in logs for log in site):
         # (site, placement, sample, time and pressure); a value without a time is a log
         # with one entry
@@ -191,14 +188,8 @@ def probe_group(
             [_padded([empty if log is None else log for log in site]) for site in logs]
         )
         variables |= {"pressure_time": padded[..., 0], "pressure": padded[..., 1]}
-    return dataset(
-        variables,
-        coords={
-            "site": list(probe.sites),
-            "fibre": list(probe.fibres),
-            "channel": list(CHANNELS),
-        },
-    )
+    coords = {"site": list(probe.sites), "fibre": list(probe.fibres)} | CHANNELS
+    return dataset(variables, coords=coords)
 
 
 def sequence_group(sequence: SequenceRecord, dome: DomeRecord) -> xr.Dataset:
@@ -215,41 +206,35 @@ def sequence_group(sequence: SequenceRecord, dome: DomeRecord) -> xr.Dataset:
     return dataset(variables)
 
 
-def _mean_pressures(probe: ProbeRecord) -> list[float]:
-    """Mean pressure (site,) over time and placements; NaN for a site without a gauge."""
-    logs = [
-        [probe.pressure.get((site, name)) for name in probe.placements[site]]
-        for site in probe.sites
-    ]
-    means = [[log[:, 1].mean() for log in site if log is not None] for site in logs]
-    return [float(np.mean(site)) if site else np.nan for site in means]
+def _mean_pressure(logs: Sequence[Array | None]) -> float:
+    """Mean pressure over time and placements; NaN for a site without a gauge."""
+    means = [log[:, 1].mean() for log in logs if log is not None]
+    return float(np.mean(means)) if means else np.nan
 
 
 def _padded(arrays: Sequence[Array]) -> Array:
     """Arrays stacked along a new first axis, NaN where one is shorter."""
-    shape = np.max([one.shape for one in arrays], axis=0)
+    shape = np.max([array.shape for array in arrays], axis=0)
     out = np.full((len(arrays), *shape), np.nan)
-    for i, one in enumerate(arrays):
-        out[i][tuple(slice(size) for size in one.shape)] = one
+    for target, array in zip(out, arrays, strict=True):
+        target[tuple(slice(size) for size in array.shape)] = array
     return out
 
 
 def photograph_group(photographs: Mapping[tuple[int, int], Image]) -> xr.Dataset:
     """Group "photographs"; smaller ones are padded with NaN on the right and at the bottom."""
     pairs = sorted(photographs)
-    height, width = (
-        max(photographs[pair].shape[axis] for pair in pairs) for axis in (0, 1)
-    )
-    radiance = np.full((len(pairs), height, width, 3), np.nan, np.float32)
-    for i, pair in enumerate(pairs):
+    shapes = [photographs[pair].shape for pair in pairs]
+    radiance = np.full((len(pairs), *np.max(shapes, axis=0)), np.nan, np.float32)
+    for target, pair in zip(radiance, pairs, strict=True):
         image = photographs[pair]
-        radiance[i, : image.shape[0], : image.shape[1]] = image
+        target[: image.shape[0], : image.shape[1]] = image
     variables = {
         "photograph_radiance": radiance,
         "photograph_light": [light for light, _ in pairs],
         "photograph_camera": [camera for _, camera in pairs],
     }
-    return dataset(variables, coords={"channel": list(CHANNELS)})
+    return dataset(variables, coords=CHANNELS)
 
 
 def _dome_names(dome: DomeRecord) -> dict[str, list[str]]:

@@ -6,36 +6,38 @@ from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, wait
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb.calibration.frame_checks import highest_value, view_faults
+from skindb.calibration.frame_checks import checked_view, highest_value
 from skindb.calibration.irradiance import light_falloff
 from skindb.calibration.pixel_flags import OK, SATURATED
-from skindb.calibration.radiance import FrameMerger, Image, radiance_floor, read_view
-from skindb.errors import Fault, InputError
-from skindb.format.dome import CameraRecord, DomeRecord, LightRecord, pixel_width
+from skindb.calibration.radiance import FrameMerger, Image, radiance_floor
+from skindb.errors import Fault, InputError, attempt
+from skindb.format.dome import CameraRecord, DomeRecord, LightRecord
 from skindb.format.frames import Digests, Frame
 from skindb.geometry._mesh_kernels import grown
-from skindb.geometry.camera import camera_centre, project
 from skindb.ingest._sample_kernels import SINGLE, gather, pixel_counts, pixel_spans
-from skindb.ingest.consistency import Calibration, CalibrationCheck
+from skindb.ingest.consistency import Calibration, CalibrationCheck, Pair
 from skindb.ingest.consistency_checks import calibration_faults
 from skindb.ingest.sample_quality import (
     SampleNoise,
     bright_fraction,
+    require_lit,
     sample_noise,
-    unlit_fault,
     view_median,
 )
 from skindb.ingest.spool import Spool
 from skindb.ingest.surfels import SurfelSet
-from skindb.types import Progress
+from skindb.types import Progress, silent
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
+# radiance (h, w, 3), flags (h, w) and usable exposures (h, w)
+Picture = tuple[Image, NDArray[np.uint8], NDArray[np.uint8]]
 T = TypeVar("T")
 R = TypeVar("R")
 # views that are requested ahead of the one that is waited for: keeps eight threads busy
@@ -76,7 +78,7 @@ class Views:
 class CameraSampling:
     """Where and how one camera samples the surfels, the same under every light."""
 
-    wanted: NDArray[np.bool_]  # (n,)
+    surfels: Bools  # (n,) those that it samples
     pixels: NDArray[np.float32]  # (n, 2)
     spread: NDArray[np.float32]  # (n, 3) px^2, or (0, 3)
 
@@ -91,6 +93,16 @@ class ViewLevels:
     bright: Array  # fraction of its samples that are too large for a surface
     highest: Array  # value of the longest exposure
     clipped: Bools  # whether the picture is cut off at its highest value
+
+    @classmethod
+    def empty(cls, shape: tuple[int, ...]) -> ViewLevels:
+        """Levels before any view was read."""
+        return cls(
+            np.full(shape, np.nan),
+            np.zeros(shape),
+            np.full(shape, np.nan),
+            np.zeros(shape, bool),
+        )
 
 
 @dataclass(frozen=True)
@@ -117,7 +129,7 @@ def fully_lit(
     cameras: Sequence[CameraRecord],
     *,
     soft: PenumbraRule = "exclude",
-) -> NDArray[np.bool_]:
+) -> Bools:
     """Where (n, light) the entire disc is visible from a surfel and from all neighbours
     that a pixel may cover.
 
@@ -125,15 +137,14 @@ def fully_lit(
     the first ring of neighbours. With `soft` "keep", any visible part of the disc is
     enough, for a surfel and for its neighbours.
     """
-    least = MIN_LIT_FRACTION if soft == "exclude" else FULL_SHADOW
-    pixel = max(
-        pixel_width(camera, surfels.position.mean(axis=0)) for camera in cameras
-    )
+    minimum = MIN_LIT_FRACTION if soft == "exclude" else FULL_SHADOW
+    middle = surfels.position.mean(axis=0)
+    pixel = max(camera.pixel_width(middle) for camera in cameras)
     rings = max(int(np.ceil(pixel / surfels.spacing())), 1)
     # the columns of lights are used one by one
     lit = np.empty_like(light_fraction, bool, order="F")
     for j in range(lit.shape[1]):
-        shadow = light_fraction[:, j] < least
+        shadow = light_fraction[:, j] < minimum
         for _ in range(rings):
             shadow = grown(surfels.faces, shadow)
         lit[:, j] = ~shadow
@@ -147,11 +158,11 @@ def sample_lumitexels(
     mergers: Mapping[str, FrameMerger],
     spool: Spool,
     *,
-    kept: Collection[tuple[int, int]] = (),
+    kept: Collection[Pair] = (),
     check: CalibrationCheck | None = None,
     refuse: bool = True,
     pool: Executor,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> Lumitexels:
     """Decode, merge and sample every view that the spool does not hold yet.
 
@@ -183,124 +194,108 @@ def sample_lumitexels(
         With every frame that cannot be decoded, or for a calibration that the
         photographs contradict.
     """
-    checked = frozenset[tuple[int, int]]() if check is None else check.pairs
+    checked = frozenset[Pair]() if check is None else check.pairs
+    cameras = range(len(dome.cameras))
     shots = list(
-        pool.map(
-            lambda c: _camera_sampling(views, dome.cameras[c], c),
-            range(len(dome.cameras)),
-        )
+        pool.map(lambda c: _camera_sampling(views, dome.cameras[c], c), cameras)
     )
-
-    def one(pair: tuple[int, int]) -> list[Fault]:
-        j, c = pair
-        digests: Digests = {}
-        try:
-            frames = read_view(
-                dome, dome.lights[j].id, dome.cameras[c], digests=digests
-            )
-        except InputError as error:
-            return list(error.faults)
-        merger = mergers[dome.cameras[c].id]
-        if found := view_faults(dome, dome.lights[j].id, merger, frames):
-            return found
-        wanted = shots[c].wanted & views.lit[:, j]
-        radiance, flag, exposures = _developed(
-            merger, frames, shots[c], wanted, whole=pair in kept or pair in checked
-        )
-        if pair in kept:
-            spool.keep(f"photograph-{j}-{c}", _without_saturated(radiance, flag))
-        if check is not None and pair in checked:
-            spool.keep(
-                f"calibration-{j}-{c}",
-                check.reduce(c, _without_saturated(radiance, flag)),
-            )
-        samples, outcome = _sampled(
-            (radiance, flag, exposures),
-            shots[c],
-            wanted,
-            dome.lights[j],
-            intensity[j],
-            views,
-            j,
-        )
-        usable = samples[:, (outcome == OK) | (outcome == SINGLE)].view(np.float16)
-        where = (
-            f"{dome.file}[frames], camera {merger.camera.id}, light {dome.lights[j].id}"
-        )
-        if fault := unlit_fault(where, radiance[flag == OK], usable.shape[1]):
-            return [fault]
-        levels.median[j, c] = view_median(usable)
-        levels.bright[j, c] = bright_fraction(usable)
-        levels.highest[j, c], levels.clipped[j, c] = highest_value(merger, frames)
-        spool.put(
-            j,
-            c,
-            samples,
-            outcome,
-            {str(path): digest for path, digest in digests.items()},
-        )
-        return []
-
+    levels = ViewLevels.empty(spool.done.shape)
+    sampler = _Sampler(
+        dome, intensity, views, mergers, spool, frozenset(kept), check, shots, levels
+    )
     faults = list[Fault]()
-    shape = spool.done.shape
-    levels = ViewLevels(
-        np.full(shape, np.nan),
-        np.zeros(shape),
-        np.full(shape, np.nan),
-        np.zeros(shape, bool),
-    )
     missing = [(int(j), int(c)) for j, c in np.argwhere(~spool.done)]
     count = spool.done.size - len(missing)
 
-    def sample(pairs: Iterable[tuple[int, int]]) -> None:
+    def sample(pairs: Iterable[Pair]) -> None:
         nonlocal count
-        for found in _in_turn(pool, one, pairs):
-            faults.extend(found)
+        for view_faults in _in_turn(pool, sampler.faults, pairs):
+            faults.extend(view_faults)
             count += 1
-            if progress is not None:
-                progress("sample", count, spool.done.size)
+            progress("sample", count, spool.done.size)
 
     sample(pair for pair in missing if pair in checked)
     calibration = None if check is None or faults else _evaluated(check, spool)
-    wrong = (
-        []
-        if calibration is None or not refuse
-        else calibration_faults(dome, calibration)
-    )
-    if not wrong:  # otherwise hours of sampling would end with the same faults
+    contradictions = []
+    if calibration is not None and refuse:
+        contradictions = calibration_faults(dome, calibration)
+    if not contradictions:  # otherwise hours of sampling would end with the same faults
         sample(pair for pair in missing if pair not in checked)
-    faults += wrong
-    if faults:
-        raise InputError(faults)
+    if faults or contradictions:
+        raise InputError(faults + contradictions)
     usable, saturated, dark, single = spool.counts
-    photographs = {
-        (j, c): image
-        for j, c in kept
-        if (image := spool.kept(f"photograph-{j}-{c}")) is not None
-    }
-    noise = (
-        noise_floor(dome, intensity, views.surfels),
-        shot_noise(dome, intensity, views.surfels),
-    )
-    each = sample_noise(dome, views.pixels, _effective_pixels(dome, shots))
+    photographs = {pair: spool.kept(f"photograph-{pair[0]}-{pair[1]}") for pair in kept}
     return Lumitexels(
-        spool.samples(),
-        usable,
-        saturated,
-        dark,
-        single,
-        spool.views,
-        levels,
-        *noise,
-        photographs,
-        calibration,
-        each,
+        sample=spool.samples(),
+        sample_count=usable,
+        saturated_count=saturated,
+        dark_count=dark,
+        single_count=single,
+        view_count=spool.views,
+        views=levels,
+        noise_floor=noise_floor(dome, intensity, views.surfels),
+        shot_noise=shot_noise(dome, intensity, views.surfels),
+        photographs={k: image for k, image in photographs.items() if image is not None},
+        calibration=calibration,
+        noise=sample_noise(dome, views.pixels, _effective_pixels(dome, shots)),
     )
+
+
+@dataclass(frozen=True)
+class _Sampler:
+    """Samples single views into the spool; the arguments of `sample_lumitexels`."""
+
+    dome: DomeRecord
+    intensity: Array
+    views: Views
+    mergers: Mapping[str, FrameMerger]
+    spool: Spool
+    kept: frozenset[Pair]
+    check: CalibrationCheck | None
+    shots: list[CameraSampling]  # by camera
+    levels: ViewLevels
+
+    def faults(self, pair: Pair) -> list[Fault]:
+        """Sample a view; its faults, if it has any."""
+        faults = list[Fault]()
+        attempt(faults, lambda: self._sample(*pair))
+        return faults
+
+    def _sample(self, j: int, c: int) -> None:
+        light = self.dome.lights[j]
+        merger = self.mergers[self.dome.cameras[c].id]
+        shot = self.shots[c]
+        check = self.check if self.check and (j, c) in self.check.pairs else None
+        digests: Digests = {}
+        frames = checked_view(self.dome, light.id, merger, digests=digests)
+        surfels = shot.surfels & self.views.lit[:, j]
+        is_kept = (j, c) in self.kept
+        picture = _developed(
+            merger, frames, shot, surfels, whole=is_kept or check is not None
+        )
+        radiance, flag, _ = picture
+        if is_kept:
+            self.spool.keep(f"photograph-{j}-{c}", _without_saturated(radiance, flag))
+        if check is not None:
+            reduced = check.reduce(c, _without_saturated(radiance, flag))
+            self.spool.keep(f"calibration-{j}-{c}", reduced)
+        samples, outcome = _sampled(
+            picture, shot, surfels, light, self.intensity[j], self.views, j
+        )
+        usable = samples[:, (outcome == OK) | (outcome == SINGLE)].view(np.float16)
+        place = f"{self.dome.file}[frames], camera {merger.camera.id}, light {light.id}"
+        require_lit(place, radiance[flag == OK], usable.shape[1])
+        levels = self.levels
+        levels.median[j, c] = view_median(usable)
+        levels.bright[j, c] = bright_fraction(usable)
+        levels.highest[j, c], levels.clipped[j, c] = highest_value(merger, frames)
+        names = {str(path): digest for path, digest in digests.items()}
+        self.spool.put(j, c, samples, outcome, names)
 
 
 def checked_pictures(
     check: CalibrationCheck, mergers: Mapping[str, FrameMerger], *, pool: Executor
-) -> dict[tuple[int, int], NDArray[np.float32]]:
+) -> dict[Pair, NDArray[np.float32]]:
     """The downsampled photographs of the pairs of a check, before anything is sampled.
 
     Raises
@@ -308,28 +303,25 @@ def checked_pictures(
     InputError
         With every frame that cannot be decoded or that cannot be a photograph.
     """
-    faults = list[Fault]()
     dome = check.dome
+    faults = list[Fault]()
 
-    def one(pair: tuple[int, int]) -> NDArray[np.float32] | None:
-        light = dome.lights[pair[0]].id
-        camera = dome.cameras[pair[1]]
-        try:
-            frames = read_view(dome, light, camera, digests={})
-        except InputError as error:
-            faults.extend(error.faults)
-            return None
-        if found := view_faults(dome, light, mergers[camera.id], frames):
-            faults.extend(found)
-            return None
-        radiance, flag = mergers[camera.id].merge(frames)
-        return check.reduce(pair[1], _without_saturated(radiance, flag))
+    def picture(pair: Pair) -> NDArray[np.float32]:
+        j, c = pair
+        merger = mergers[dome.cameras[c].id]
+        frames = checked_view(dome, dome.lights[j].id, merger)
+        return check.reduce(c, _without_saturated(*merger.merge(frames)))
 
     pairs = sorted(check.pairs)
-    found = dict(zip(pairs, _in_turn(pool, one, pairs), strict=True))
+    call = partial(attempt, faults)
+    pictures = list(_in_turn(pool, lambda pair: call(partial(picture, pair)), pairs))
     if faults:
         raise InputError(faults)
-    return {pair: image for pair, image in found.items() if image is not None}
+    return {
+        pair: image
+        for pair, image in zip(pairs, pictures, strict=True)
+        if image is not None
+    }
 
 
 def _without_saturated(radiance: Image, flag: NDArray[np.uint8]) -> Image:
@@ -356,34 +348,28 @@ def footprints(surfels: SurfelSet, camera: CameraRecord) -> NDArray[np.float32]:
     larger than the footprint of bilinear interpolation.
     """
     helper = np.eye(3)[np.abs(surfels.normal).argmin(axis=1)]
-    first = np.cross(surfels.normal, helper)
-    first *= (surfels.radius / 2 / np.maximum(np.linalg.norm(first, axis=1), 1e-30))[
-        :, None
-    ]
-    spread = np.zeros((len(first), 3))
-    for arm in (first, np.cross(surfels.normal, first)):
-        ahead, _ = project(
-            surfels.position + arm, camera.K, camera.R, camera.t, camera.distortion
-        )
-        behind, _ = project(
-            surfels.position - arm, camera.K, camera.R, camera.t, camera.distortion
-        )
+    arm = np.cross(surfels.normal, helper)
+    length = np.maximum(np.linalg.norm(arm, axis=1), 1e-30)
+    arm *= (surfels.radius / 2 / length)[:, None]
+    spread = np.zeros((len(arm), 3))
+    for half in (arm, np.cross(surfels.normal, arm)):
+        ahead = camera.project(surfels.position + half)
+        behind = camera.project(surfels.position - half)
         x, y = ((ahead - behind) / 2).T
         spread += np.stack([x * x, x * y, y * y], axis=1)
     spread[spread[:, [0, 2]].max(axis=1) < MIN_SPLAT_VARIANCE_PX2] = np.nan
-    return np.asarray(
-        spread + np.array([PIXEL_VARIANCE_PX2, 0, PIXEL_VARIANCE_PX2]), np.float32
-    )
+    pixel = np.array([PIXEL_VARIANCE_PX2, 0, PIXEL_VARIANCE_PX2])
+    return np.asarray(spread + pixel, np.float32)
 
 
 def _camera_sampling(views: Views, camera: CameraRecord, c: int) -> CameraSampling:
-    wanted = views.clear[:, c] & _frontal(camera, views.surfels)
+    surfels = views.clear[:, c] & _frontal(camera, views.surfels)
     spread = np.zeros((0, 3), np.float32)
     if views.footprint:
         spread = footprints(views.surfels, camera)
         wide = spread[:, [0, 2]].max(axis=1) > MAX_CLEAR_FOOTPRINT_PX**2
-        wanted &= ~(wide & grown(views.surfels.faces, ~views.clear[:, c]))
-    return CameraSampling(wanted, np.ascontiguousarray(views.pixels[:, c]), spread)
+        surfels &= ~(wide & grown(views.surfels.faces, ~views.clear[:, c]))
+    return CameraSampling(surfels, np.ascontiguousarray(views.pixels[:, c]), spread)
 
 
 def _effective_pixels(
@@ -392,10 +378,10 @@ def _effective_pixels(
     """Effective number of pixels (n, camera) that a sample averages; NaN where a camera
     takes no sample.
     """
-    out = np.empty((len(shots), len(shots[0].wanted)), np.float32)
+    out = np.empty((len(shots), len(shots[0].surfels)), np.float32)
     for camera, shot, row in zip(dome.cameras, shots, out, strict=True):
         pixel_counts(
-            shot.wanted, shot.pixels, shot.spread, camera.height, camera.width, row
+            shot.surfels, shot.pixels, shot.spread, camera.height, camera.width, row
         )
     return np.ascontiguousarray(out.T)
 
@@ -404,43 +390,38 @@ def _developed(
     merger: FrameMerger,
     frames: list[Frame],
     shot: CameraSampling,
-    wanted: Bools,
+    surfels: Bools,
     *,
     whole: bool,
-) -> tuple[Image, NDArray[np.uint8], NDArray[np.uint8]]:
-    """Radiance (h, w, 3), flags and usable exposures (h, w) of a view, or of the pixels
-    that wanted surfels need.
-    """
-    spans = (
-        None
-        if whole
-        else pixel_spans(wanted, shot.pixels, shot.spread, *frames[0].shape[:2])
-    )
-    usable = np.zeros(frames[0].shape[:2], np.uint8)
+) -> Picture:
+    """Radiance, flags and usable exposures of a view, or of the pixels that surfels need."""
+    shape = frames[0].shape[:2]
+    spans = None
+    if not whole:
+        spans = pixel_spans(surfels, shot.pixels, shot.spread, *shape)
+    usable = np.zeros(shape, np.uint8)
     return *merger.merge(frames, spans, usable=usable), usable
 
 
 def _sampled(
-    picture: tuple[Image, NDArray[np.uint8], NDArray[np.uint8]],
+    picture: Picture,
     shot: CameraSampling,
-    wanted: Bools,
+    surfels: Bools,
     light: LightRecord,
     intensity: Array,
     views: Views,
     j: int,
 ) -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
     """Bits of the samples (3, n) of a view, and outcome (n,) for each surfel."""
-    n = len(wanted)
+    n = len(surfels)
     out = np.empty((3, n), np.uint16)
     outcome = np.empty(n, np.uint8)
-    light_fraction = (
-        np.zeros(0, np.float32)
-        if views.light_fraction is None
-        else views.light_fraction[:, j].astype(np.float32)
-    )
+    light_fraction = np.zeros(0, np.float32)
+    if views.light_fraction is not None:
+        light_fraction = views.light_fraction[:, j].astype(np.float32)
     gather(
         *picture,
-        wanted,
+        surfels,
         light_fraction,
         shot.pixels,
         shot.spread,
@@ -478,13 +459,9 @@ def noise_floor(dome: DomeRecord, intensity: Array, surfels: SurfelSet) -> float
     """Reflectance [sr^-1] of one sigma of read noise and quantisation, at the median
     light and distance.
     """
-    radiance = float(
-        np.median(
-            [radiance_floor(camera.sensor, dome.exposures) for camera in dome.cameras]
-        )
-    )
-    floor = radiance * _reflectance_per_radiance(dome, intensity, surfels)
-    return floor if floor > 0 else LINEAR_NOISE_FLOOR
+    floors = [radiance_floor(camera.sensor, dome.exposures) for camera in dome.cameras]
+    per_radiance = _reflectance_per_radiance(dome, intensity, surfels)
+    return float(np.median(floors)) * per_radiance or LINEAR_NOISE_FLOOR
 
 
 def shot_noise(dome: DomeRecord, intensity: Array, surfels: SurfelSet) -> float:
@@ -495,58 +472,51 @@ def shot_noise(dome: DomeRecord, intensity: Array, surfels: SurfelSet) -> float:
     electrons of full exposure: the variance of merged radiance is L over this number
     per unit of radiance.
     """
-    if not all(camera.sensor.noise_known for camera in dome.cameras):
+    sensors = [camera.sensor for camera in dome.cameras]
+    if not all(sensor.noise_known for sensor in sensors):
         return 0.0
-    electrons = float(
-        np.median([camera.sensor.full_electrons for camera in dome.cameras])
-    )
+    electrons = float(np.median([sensor.full_electrons for sensor in sensors]))
     per_second = 1 / (electrons * sum(dome.exposures.values()))
-    return (
-        BILINEAR_NOISE
-        * per_second
-        * _reflectance_per_radiance(dome, intensity, surfels)
-    )
+    per_radiance = _reflectance_per_radiance(dome, intensity, surfels)
+    return BILINEAR_NOISE * per_second * per_radiance
 
 
 def _reflectance_per_radiance(
     dome: DomeRecord, intensity: Array, surfels: SurfelSet
 ) -> float:
     """Reflectance per radiance at the median light and distance."""
-    middle = surfels.position.mean(axis=0)
-    square = np.array(
-        [light_falloff(light, middle[None])[0][0] for light in dome.lights]
-    )
+    middle = surfels.position.mean(axis=0)[None]
+    square = np.array([light_falloff(light, middle)[0][0] for light in dome.lights])
     return float(np.median(square[:, None] / intensity))
 
 
-def choose_photographs(
-    dome: DomeRecord, middle: Array, count: int
-) -> list[tuple[int, int]]:
+def choose_photographs(dome: DomeRecord, middle: Array, count: int) -> list[Pair]:
     """(light, camera) pairs of lights that are spread evenly in front of the face, with
     the most frontal camera.
     """
     if count < 1:
         return []
-    centres = (
-        np.array([camera_centre(camera.R, camera.t) for camera in dome.cameras])
-        - middle
-    )
-    camera = int((centres[:, 2] / np.linalg.norm(centres, axis=1)).argmax())
-    towards = np.array([light.position for light in dome.lights]) - middle
-    direction = towards / np.linalg.norm(towards, axis=1, keepdims=True)
+
+    def directions(positions: list[Array]) -> Array:
+        way = np.array(positions) - middle
+        return np.asarray(way / np.linalg.norm(way, axis=1, keepdims=True))
+
+    camera = directions([camera.centre for camera in dome.cameras])[:, 2].argmax()
+    direction = directions([light.position for light in dome.lights])
     front = np.flatnonzero(direction[:, 2] > 0.5)
-    front = front if len(front) >= count else np.argsort(-direction[:, 2])[:count]
+    if len(front) < count:
+        front = np.argsort(-direction[:, 2])[:count]
     # farthest-point sampling: each next light is the one farthest from all chosen lights
     chosen = [int(front[direction[front, 2].argmax()])]
     while len(chosen) < min(count, len(front)):
         nearest = (direction[front] @ direction[chosen].T).max(axis=1)
         chosen.append(int(front[nearest.argmin()]))
-    return [(light, camera) for light in sorted(chosen)]
+    return [(light, int(camera)) for light in sorted(chosen)]
 
 
-def _frontal(camera: CameraRecord, surfels: SurfelSet) -> NDArray[np.bool_]:
+def _frontal(camera: CameraRecord, surfels: SurfelSet) -> Bools:
     """Where (n,) a view is steep enough for a pixel to cover little of the surface."""
-    way = camera_centre(camera.R, camera.t) - surfels.position
+    way = camera.centre - surfels.position
     cosine = np.einsum("ni,ni->n", way, surfels.normal) / np.linalg.norm(way, axis=1)
-    width = pixel_width(camera, surfels.position.mean(axis=0))
+    width = camera.pixel_width(surfels.position.mean(axis=0))
     return np.asarray(cosine >= max(MIN_COSINE_CAMERA, width / MAX_SMEAR_MM))

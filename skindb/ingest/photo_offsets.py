@@ -16,6 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from skindb.ingest._sample_kernels import interpolate
+
 Array = NDArray[np.float64]
 
 PIXEL_MM = 2.0  # mm; about the width of an eyelid, well below the offsets to be found
@@ -76,9 +78,7 @@ class Offset:
     def moves(self, pixels: Array) -> Array:
         """Displacements (n, 2) of pixels (n, 2) by shift and roll, without the scale."""
         away = pixels - self.middle
-        return np.asarray(
-            self.shift + self.roll * np.stack([-away[:, 1], away[:, 0]], axis=1)
-        )
+        return self.shift + self.roll * np.stack([-away[:, 1], away[:, 0]], axis=1)
 
 
 def reduction(width_mm: float) -> int:
@@ -91,9 +91,9 @@ def reduced(image: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
     whose NaN count as its maximum.
     """
     h, w = (size // factor * factor for size in image.shape[:2])
-    whole = image[:h, :w]
-    top = float(np.nanmax(whole, initial=0.0)) if np.isfinite(whole).any() else 0.0
-    filled = np.nan_to_num(whole, nan=top, posinf=top, neginf=0.0)
+    cropped = image[:h, :w]
+    top = float(np.nanmax(cropped, initial=0.0)) if np.isfinite(cropped).any() else 0.0
+    filled = np.nan_to_num(cropped, nan=top, posinf=top, neginf=0.0)
     blocks = filled.reshape(h // factor, factor, w // factor, factor, -1)
     return np.asarray(blocks.mean(axis=(1, 3)), np.float32)
 
@@ -107,8 +107,6 @@ def interpolated(images: Array, pixels: Array) -> Array:
     """Interpolated values (picture, n) of pictures (picture, h, w) at pixels (n, 2); 0
     outside the pictures.
     """
-    from skindb.ingest._sample_kernels import interpolate
-
     out = np.empty((len(images), len(pixels)))
     interpolate(
         np.ascontiguousarray(images, np.float64),
@@ -147,60 +145,63 @@ def camera_offset(
     search
         Also search for large offsets, which Gauss-Newton steps would not reach.
     """
-    at = np.flatnonzero(views[0].clear)
-    pixels = views[0].pixels[at]
+    surfels = np.flatnonzero(views[0].clear)
+    pixels = views[0].pixels[surfels]
     middle = pixels.mean(axis=0)
     radius = float(np.sqrt(((pixels - middle) ** 2).sum(axis=1).mean()))
     images = np.stack([view.image for view in views])
     predicted = [
-        np.sqrt(np.maximum(irradiance[view.light][at] * albedo[at], 0))
+        np.sqrt(np.maximum(irradiance[view.light][surfels] * albedo[surfels], 0))
         for view in views
     ]
 
     def agreement(places: Array) -> float:
-        seen = interpolated(images, places)
-        each = [
-            correlation(one, shade) for one, shade in zip(seen, predicted, strict=True)
-        ]
+        correlations = map(correlation, interpolated(images, places), predicted)
         # the median ignores a light with a wrong position
-        return float(np.median(each))
+        return float(np.median([*correlations]))
 
     away = (pixels - middle) / radius
     # px: shift, and displacements at the radius by scale and roll
-    moves = np.zeros((len(at), 2, 4))
-    moves[:, 0, 0] = moves[:, 1, 1] = 1
-    moves[:, :, 2], moves[:, 0, 3], moves[:, 1, 3] = away, -away[:, 1], away[:, 0]
+    moves = np.zeros((len(surfels), 2, 4))
+    moves[:, 0, 0] = 1
+    moves[:, 1, 1] = 1
+    moves[:, :, 2] = away
+    moves[:, 0, 3] = -away[:, 1]
+    moves[:, 1, 3] = away[:, 0]
     start = np.zeros(4)
     if search:
-        few = slice(None, None, max(len(at) // 2000, 1))
-        steps = radius * SEARCH_RADII * np.linspace(-1, 1, 2 * SEARCH_STEPS + 1)
-        thin = np.concatenate([values[few] for values in predicted])
-
-        def coarse(shift: Array) -> float:
-            return correlation(interpolated(images, pixels[few] + shift).ravel(), thin)
-
-        shifts = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
-        best = shifts[int(np.argmax([coarse(shift) for shift in shifts]))]
-        start[:2] = best if coarse(best) > coarse(np.zeros(2)) + 0.02 else 0
+        start[:2] = _large_shift(images, predicted, pixels, radius)
     move = _gauss_newton(images, predicted, pixels, moves, start)
-    if not np.isfinite(move).all() or agreement(pixels + moves @ move) < agreement(
-        pixels + moves @ start
-    ):
+    aligned = agreement(pixels + moves @ move) if np.isfinite(move).all() else -np.inf
+    if aligned < (coarse := agreement(pixels + moves @ start)):
         move = start
-    found = agreement(pixels + moves @ move)
-    return Offset(
-        found,
-        move[:2].copy(),
-        float(move[2] / radius),
-        float(move[3] / radius),
-        middle,
-        radius,
-    )
+        aligned = coarse
+    shift = move[:2].copy()
+    scale, roll = (move[2:] / radius).tolist()
+    return Offset(aligned, shift, scale, roll, middle, radius)
+
+
+def _large_shift(
+    images: Array, predicted: Sequence[Array], pixels: Array, radius: float
+) -> Array:
+    """Shift (2,) px on a coarse grid that agrees best; 0 unless it is clearly better."""
+    few = slice(None, None, max(len(pixels) // 2000, 1))
+    thin = np.concatenate([values[few] for values in predicted])
+
+    def agreement(shift: Array) -> float:
+        return correlation(interpolated(images, pixels[few] + shift).ravel(), thin)
+
+    steps = radius * SEARCH_RADII * np.linspace(-1, 1, 2 * SEARCH_STEPS + 1)
+    shifts = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    agreements = [agreement(shift) for shift in shifts]
+    best = int(np.argmax(agreements))
+    none = np.zeros(2)
+    return shifts[best] if agreements[best] > agreement(none) + 0.02 else none
 
 
 def moved_pixels(view: ReducedView, offset: Offset) -> Array:
     """Pixels (n, 2) of the surfels after the alignment."""
-    return np.asarray(
+    return (
         view.pixels
         + offset.moves(view.pixels)
         + offset.scale * (view.pixels - offset.middle)
@@ -216,19 +217,17 @@ def surfel_albedo(
     ratios = np.full((len(views), len(views[0].clear)), np.nan)
     for ratio, view in zip(ratios, views, strict=True):
         light = irradiance[view.light]
-        at = view.clear & (light > 0.3 * light.max())
-        ratio[at] = (
-            bilinear(view.image, moved_pixels(view, offsets[view.camera])[at]) ** 2
-            / light[at]
-        )
-        # removes errors of the intensity
-        ratio /= max(float(np.nanmedian(ratio)), FLOOR) if at.any() else 1.0
-    known = np.isfinite(ratios).any(axis=0)
+        lit = view.clear & (light > 0.3 * light.max())
+        if lit.any():
+            pixels = moved_pixels(view, offsets[view.camera])[lit]
+            ratio[lit] = bilinear(view.image, pixels) ** 2 / light[lit]
+            # removes errors of the intensity
+            ratio /= max(float(np.nanmedian(ratio)), FLOOR)
+    measured = np.isfinite(ratios).any(axis=0)
     albedo = np.ones(ratios.shape[1])
-    albedo[known] = nan_quantile(ratios[:, known], ALBEDO_QUANTILE)
-    return np.asarray(
-        np.clip(albedo / max(float(np.median(albedo[known])), FLOOR), *ALBEDO_RANGE)
-    )
+    albedo[measured] = nan_quantile(ratios[:, measured], ALBEDO_QUANTILE)
+    middle = max(float(np.median(albedo[measured])), FLOOR)
+    return np.clip(albedo / middle, *ALBEDO_RANGE)
 
 
 def nan_quantile(values: Array, level: float) -> Array:
@@ -236,10 +235,9 @@ def nan_quantile(values: Array, level: float) -> Array:
     ordered = np.sort(values, axis=0)
     place = level * ((~np.isnan(ordered)).sum(axis=0) - 1)
     below = np.maximum(place.astype(int), 0)
-    low, high = (
-        np.take_along_axis(ordered, at[None], 0)[0]
-        for at in (below, np.ceil(np.maximum(place, 0)).astype(int))
-    )
+    above = np.ceil(np.maximum(place, 0)).astype(int)
+    low = np.take_along_axis(ordered, below[None], 0)[0]
+    high = np.take_along_axis(ordered, above[None], 0)[0]
     part = place - below
     step = high - low
     return np.asarray(np.where(part < 0.5, low + step * part, high - step * (1 - part)))
@@ -247,11 +245,8 @@ def nan_quantile(values: Array, level: float) -> Array:
 
 def square_root_image(image: NDArray[np.floating[Any]]) -> Array:
     """Square roots of a picture, slightly smoothed so that its derivatives are smooth."""
-    return np.asarray(
-        np.sqrt(
-            np.maximum(gaussian_filter(np.asarray(image, np.float64), SMOOTHING_PX), 0)
-        )
-    )
+    smooth = gaussian_filter(np.asarray(image, np.float64), SMOOTHING_PX)
+    return np.asarray(np.sqrt(np.maximum(smooth, 0)))
 
 
 def _gauss_newton(
@@ -284,10 +279,8 @@ def _gauss_newton(
         residual = np.concatenate(rest)
         scale = ROBUST_SCALE * 1.4826 * float(np.median(np.abs(residual))) + FLOOR
         weight = 1 / (1 + (residual / scale) ** 2)
-        normal = (matrix * weight[:, None]).T @ matrix
-        step = np.linalg.lstsq(
-            normal, (matrix * weight[:, None]).T @ residual, rcond=None
-        )[0]
+        weighted = (matrix * weight[:, None]).T
+        step = np.linalg.lstsq(weighted @ matrix, weighted @ residual, rcond=None)[0]
         move += step
         if np.abs(step).max() < SMALL_STEP:
             break
@@ -328,11 +321,12 @@ def view_factors(
         (n,) of the surfels, relative to the median.
     """
     grey = irradiance.mean(axis=1)
-    at = view.clear & (grey > LIT_FRACTION * grey.max())
+    surfels = view.clear & (grey > LIT_FRACTION * grey.max())
     planes = np.moveaxis(np.asarray(picture, np.float64), -1, 0)
-    radiance = np.stack([bilinear(plane, pixels[at]) for plane in planes], axis=1)
+    radiance = np.stack([bilinear(plane, pixels[surfels]) for plane in planes], axis=1)
     return np.asarray(
-        np.pi * np.median(radiance / (irradiance[at] * albedo[at, None]), axis=0)
+        np.pi
+        * np.median(radiance / (irradiance[surfels] * albedo[surfels, None]), axis=0)
     )
 
 
@@ -364,14 +358,13 @@ def relative_brightness(
         return Brightness(np.full(3, np.nan), by_camera, by_light[:, 0])
     by_light[light_of] = 0.0
     for _ in range(POLISH_ROUNDS):
+        rest = log - by_light[light_of]
         for c in np.unique(camera_of):
-            mine = camera_of == c
-            by_camera[c] = np.median(log[mine] - by_light[light_of[mine]], axis=0)
+            by_camera[c] = np.median(rest[camera_of == c], axis=0)
         by_camera -= np.nanmedian(by_camera, axis=0)
+        rest = log - by_camera[camera_of]
         for j in np.unique(light_of):
-            mine = light_of == j
-            by_light[j] = np.median(log[mine] - by_camera[camera_of[mine]], axis=0)
+            by_light[j] = np.median(rest[light_of == j], axis=0)
     level = np.nanmedian(by_light, axis=0)
-    return Brightness(
-        np.exp(level), np.exp(by_camera), np.exp((by_light - level).mean(axis=1))
-    )
+    light = np.exp((by_light - level).mean(axis=1))
+    return Brightness(np.exp(level), np.exp(by_camera), light)

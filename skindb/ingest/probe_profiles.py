@@ -4,19 +4,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb.calibration.fibres import placement_signal
+from skindb.calibration.fibres import place_text, placement_signal
 from skindb.calibration.profile_statistics import (
     MIN_AZIMUTHS,
     MIN_SIGNAL_TO_NOISE,
     compare_azimuths,
 )
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, attempt, require
 from skindb.format.contact_probe import ProbeRecord
 from skindb.format.frames import Digests
 from skindb.format.json_file import MAX_MAGNITUDE
@@ -68,94 +69,86 @@ def fibre_profiles(probe: ProbeRecord, digests: Digests | None = None) -> Profil
     InputError
         With every frame that cannot be decoded, and fibres that lie outside the picture.
     """
-    found = list[list[tuple[Array, Array]]]()
     faults = list[Fault]()
+    by_site = list[list[tuple[Array, Array]]]()
     for site in probe.sites:
-        try:
-            found.append(
-                [
-                    placement_signal(probe, site, placement, digests)
-                    for placement in probe.placements[site]
-                ]
-            )
-        except InputError as problem:
-            faults += problem.faults
+        parts = [
+            attempt(faults, partial(placement_signal, probe, site, name, digests))
+            for name in probe.placements[site]
+        ]
+        by_site.append([signal for signal in parts if signal is not None])
     if faults:
         # the faults of the fibres repeat at every site
         raise InputError(dict.fromkeys(faults))
-    if faults := _light_faults(probe, found):
+    # values and errors (placement, fibre, 3) of each site
+    signals = [
+        (np.stack([x for x, _ in site]), np.stack([x for _, x in site]))
+        for site in by_site
+    ]
+    if faults := _light_faults(probe, signals):
         raise InputError(faults)
     factor = (probe.scale or 1.0) / probe.gain
-    each = [
-        (np.stack([v for v, _ in one]), np.stack([e for _, e in one])) for one in found
-    ]
-    together = [combine_placements(value, error) for value, error in each]
-    value, error, spread = (np.array(column) for column in zip(*together, strict=True))
-    value, error = value * factor, np.hypot(error, probe.gain_error * value) * factor
-    if (np.fmax(np.abs(value), error) > MAX_MAGNITUDE).any():
-        rule = f"scale * signal / gain must be at most {MAX_MAGNITUDE:g}"
-        cure = "correct scale, gain and seconds"
-        raise InputError(
-            Fault(f"{probe.file}[gain]", rule, f"{np.nanmax(np.abs(value)):.3g}", cure)
-        )
-    known = probe.scale is not None
-    fault = (
-        energy_fault(str(probe.file), probe.sites, probe.distance, value, error)
-        if known
-        else None
+    combined = [combine_placements(value, error) for value, error in signals]
+    mean, noise, spread = (np.array(part) for part in zip(*combined, strict=True))
+    value = mean * factor
+    error = np.hypot(noise, probe.gain_error * mean) * factor
+    require(
+        not (np.fmax(np.abs(value), error) > MAX_MAGNITUDE).any(),
+        f"{probe.file}[gain]",
+        f"scale * signal / gain must be at most {MAX_MAGNITUDE:g}",
+        f"{np.nanmax(np.abs(value)):.3g}",
+        "correct scale, gain and seconds",
     )
-    if fault is not None:
-        raise InputError(fault)
-    return Profiles(value, error, known, tuple(one * factor for one, _ in each), spread)
+    if probe.scale is not None:
+        _require_energy(probe, value, error)
+    single = tuple(placements * factor for placements, _ in signals)
+    return Profiles(value, error, probe.scale is not None, single, spread)
 
 
 def _light_faults(
-    probe: ProbeRecord, signals: list[list[tuple[Array, Array]]]
+    probe: ProbeRecord, signals: list[tuple[Array, Array]]
 ) -> list[Fault]:
     """Faults of placements whose frames are black or white: nearly no fibre shows light
     that is clear of noise.
     """
     faults = list[Fault]()
-    least = min(MIN_LIT_FIBRES, len(probe.fibres))
-    rule = f"at least {least} fibres must show light, and not be saturated in every bracket"
+    minimum = min(MIN_LIT_FIBRES, len(probe.fibres))
+    rule = f"at least {minimum} fibres must show light, and not be saturated in every bracket"
     cure = "place the probe and take its frames again, or remove the site"
-    for site, placements in zip(probe.sites, signals, strict=True):
-        for placement, (value, error) in zip(
-            probe.placements[site], placements, strict=True
-        ):
+    for site, (values, errors) in zip(probe.sites, signals, strict=True):
+        names = probe.placements[site]
+        for placement, value, error in zip(names, values, errors, strict=True):
             lit = int((value > MIN_SIGNAL_TO_NOISE * error).any(axis=1).sum())
-            if lit < least:
-                at = (
-                    f"site {site}, placement {placement}"
-                    if placement
-                    else f"site {site}"
-                )
+            if lit < minimum:
                 saturated = int(np.isnan(value).all(axis=1).sum())
-                found = f"{at}: {lit} of {len(value)}, {saturated} saturated"
-                faults.append(Fault(f"{probe.file}[frames]", rule, found, cure))
+                finding = (
+                    f"{place_text(site, placement)}: {lit} of {len(value)}, "
+                    f"{saturated} saturated"
+                )
+                faults.append(Fault(f"{probe.file}[frames]", rule, finding, cure))
     return faults
 
 
-def energy_fault(
-    where: str, sites: Sequence[str], distance: Array, value: Array, error: Array
-) -> Fault | None:
-    """Fault of profiles (site, fibre, 3) in mm^-2 that return more light than is incident.
+def _require_energy(probe: ProbeRecord, value: Array, error: Array) -> None:
+    """Require profiles (site, fibre, 3) in mm^-2 that return no more light than is incident.
 
     A profile that falls with the distance returns at least pi r^2 R(r) of the light within r.
     """
-    returned = np.pi * distance[:, None] ** 2 * (value - 3 * error)
+    returned = np.pi * probe.distance[:, None] ** 2 * (value - 3 * error)
     if not (returned > MAX_RETURNED_FRACTION).any():
-        return None
-    site, fibre = divmod(int(np.nanargmax(returned)) // value.shape[2], value.shape[1])
+        return
+    site, fibre, _ = np.unravel_index(int(np.nanargmax(returned)), returned.shape)
     rule = (
         f"R at r mm must be at most {MAX_RETURNED_FRACTION:g} / (pi r^2): skin cannot "
         "return more light"
     )
-    found = f"{np.nanmax(returned):.3g} / (pi r^2) at fibre {fibre} of {sites[site]}"
+    finding = (
+        f"{np.nanmax(returned):.3g} / (pi r^2) at fibre {fibre} of {probe.sites[site]}"
+    )
     cure = (
         "correct scale, gain, seconds or distance; use a scale of null if it is unknown"
     )
-    return Fault(f"{where}[scale]", rule, found, cure)
+    raise InputError(Fault(f"{probe.file}[scale]", rule, finding, cure))
 
 
 def combine_placements(value: Array, error: Array) -> tuple[Array, Array, Array]:
@@ -188,9 +181,8 @@ def combine_placements(value: Array, error: Array) -> tuple[Array, Array, Array]
         relative = (value.var(axis=0, ddof=1) - (error**2).mean(axis=0)) / mean**2
         # far fibres carry little information
         weight = np.where(np.isfinite(relative), (mean / noise) ** 2, 0.0)
-        spread = np.sqrt(
-            np.maximum(np.nansum(weight * relative, axis=0) / weight.sum(axis=0), 0.0)
-        )
+        variance = np.nansum(weight * relative, axis=0) / weight.sum(axis=0)
+    spread = np.sqrt(np.maximum(variance, 0.0))
     return mean, np.hypot(noise, spread * np.abs(mean) / np.sqrt(count)), spread
 
 
@@ -204,19 +196,24 @@ def isotropy_p_values(probe: ProbeRecord, profiles: Profiles) -> Array | None:
     if rows is None:
         return None
     azimuth, index = rows
-    out = np.full((len(probe.sites), 3), np.nan)
-    for s in range(len(probe.sites)):
-        try:
-            found = compare_azimuths(
-                profiles.value[s][index],
-                profiles.error[s][index],
-                probe.distance[index[0]],
+    p_values = np.full((len(probe.sites), 3), np.nan)
+    for site, value, error in zip(
+        p_values, profiles.value, profiles.error, strict=True
+    ):
+        distance = probe.distance[index[0]]
+        test = attempt(
+            [],
+            partial(
+                compare_azimuths,
+                value[index],
+                error[index],
+                distance,
                 np.radians(azimuth),
-            )
-        except InputError:  # no contact, or too little light
-            continue
-        out[s] = found.p_value
-    return out
+            ),
+        )
+        if test is not None:  # otherwise no contact, or too little light
+            site[:] = test.p_value
+    return p_values
 
 
 def probe_notes(
@@ -227,12 +224,12 @@ def probe_notes(
     for site, spread in zip(probe.sites, profiles.repeatability, strict=True):
         if (worst := float(np.nanmax(spread, initial=0.0))) > MAX_REPEATABILITY:
             notes.append(f"probe at {site}: placements differ by {worst:.0%}")
-    for site, own in zip(
-        probe.sites, () if p_values is None else p_values, strict=p_values is not None
-    ):
-        if (least := float(np.nanmin(own, initial=1.0))) < MAX_P_VALUE:
+    if p_values is None:
+        return notes
+    for site, p_value in zip(probe.sites, p_values, strict=True):
+        if (smallest := float(np.nanmin(p_value, initial=1.0))) < MAX_P_VALUE:
             notes.append(
-                f"probe at {site}: light decays differently along the azimuths (p = {least:.2g})"
+                f"probe at {site}: light decays differently along the azimuths (p = {smallest:.2g})"
             )
     return notes
 
@@ -240,16 +237,15 @@ def probe_notes(
 def _pressure_notes(probe: ProbeRecord) -> Iterator[str]:
     low, high = USUAL_PRESSURES_KPA
     for (site, placement), log in probe.pressure.items():
-        at = f"{site}, placement {placement}" if placement else site
+        note = f"probe at {site}" + (f", placement {placement}" if placement else "")
         drift = float(np.ptp(log[:, 1]))
         if drift > MAX_PRESSURE_DRIFT_KPA:
-            yield f"probe at {at}: the pressure drifted by {drift:.1f} kPa"
+            yield f"{note}: the pressure drifted by {drift:.1f} kPa"
         mean = float(log[:, 1].mean())
         if not low <= mean <= high:
-            cure = "give that of a gauge in kPa; suction is negative"
             yield (
-                f"probe at {at}: a pressure of {mean:.4g} kPa is outside {low:g} to "
-                f"{high:g} kPa; {cure}"
+                f"{note}: a pressure of {mean:.4g} kPa is outside {low:g} to "
+                f"{high:g} kPa; give that of a gauge in kPa; suction is negative"
             )
 
 
@@ -264,31 +260,28 @@ def _decay_notes(probe: ProbeRecord, profiles: Profiles) -> Iterator[str]:
     clear = np.isfinite(value) & (value > MIN_SIGNAL_TO_NOISE * error)
     log = np.full(value.shape, np.nan)
     np.log(value * distance[:, None] ** 2, out=log, where=clear)
-    decay = np.array(
-        [[_decay(distance, log[s, :, c]) for c in (0, 2)] for s in range(len(log))]
-    )
-    known = decay[np.isfinite(decay).all(axis=1)]
-    if len(known):
-        red, blue = np.median(known, axis=0)
+    decay = np.array([[_decay(distance, site[:, c]) for c in (0, 2)] for site in log])
+    decay = decay[np.isfinite(decay).all(axis=1)]
+    if len(decay):
+        red, blue = np.median(decay, axis=0)
+        low, high = RED_DECAYS
         if red > MAX_DECAY_RATIO * blue:
-            said = f"red light decays by {red:.2g} and blue light by {blue:.2g} per mm"
             yield (
-                f"probe: {said}, but light of longer waves reaches farther in skin; "
-                "check the order of the channels"
+                f"probe: red light decays by {red:.2g} and blue light by {blue:.2g} per "
+                "mm, but light of longer waves reaches farther in skin; check the order "
+                "of the channels"
             )
-        if not RED_DECAYS[0] <= red <= RED_DECAYS[1]:
-            usual = f"{RED_DECAYS[0]:g} to {RED_DECAYS[1]:g}"
+        if not low <= red <= high:
             yield (
-                f"probe: red light decays by {red:.2g} per mm, and by {usual} in skin; "
-                "check the distances"
+                f"probe: red light decays by {red:.2g} per mm, and by {low:g} to "
+                f"{high:g} in skin; check the distances"
             )
     steps = _steps(distance, log)
-    if len(steps) and np.abs(steps).max() > np.log(MAX_GAIN_RATIO):
-        worst = int(np.abs(steps).argmax())
-        fibre = probe.fibres[order[worst + 1]]
+    worst = int(np.abs(steps).argmax()) if len(steps) else 0
+    if len(steps) and np.abs(steps[worst]) > np.log(MAX_GAIN_RATIO):
         yield (
-            f"probe: fibre {fibre} is {np.exp(steps[worst]):.2f} times as bright as "
-            "its neighbours; check its gain"
+            f"probe: fibre {probe.fibres[order[worst + 1]]} is {np.exp(steps[worst]):.2f} "
+            "times as bright as its neighbours; check its gain"
         )
 
 
@@ -300,8 +293,8 @@ def _steps(distance: Array, log: Array) -> Array:
     part = ((distance[1:-1] - distance[:-2]) / gap)[:, None]
     step = log[:, 1:-1] - (1 - part) * log[:, :-2] - part * log[:, 2:]
     step[:, distance[2:] > MAX_NEIGHBOUR_RATIO * distance[:-2]] = np.nan
-    known = [values[np.isfinite(values)] for values in np.moveaxis(step, 1, 0)]
-    return np.array([np.median(values) if len(values) > 1 else 0.0 for values in known])
+    finite = [values[np.isfinite(values)] for values in np.moveaxis(step, 1, 0)]
+    return np.array([np.median(x) if len(x) > 1 else 0.0 for x in finite])
 
 
 def _decay(distance: Array, log: Array) -> float:
@@ -317,12 +310,12 @@ def _rows(probe: ProbeRecord) -> tuple[Array, NDArray[np.int64]] | None:
     if not np.isfinite(probe.azimuth).all():
         return None
     azimuth = np.unique(np.round(probe.azimuth % 360, 3))
-    fibres = [
+    rows = [
         np.flatnonzero(np.isclose(probe.azimuth % 360, phi, atol=2e-3))
         for phi in azimuth
     ]
-    if len(azimuth) < MIN_AZIMUTHS or len({len(own) for own in fibres}) > 1:
+    if len(azimuth) < MIN_AZIMUTHS or len({len(row) for row in rows}) > 1:
         return None
-    index = np.array([own[np.argsort(probe.distance[own])] for own in fibres])
-    same = np.ptp(probe.distance[index], axis=0) <= DISTANCE_TOLERANCE_MM
-    return (azimuth, index) if same.all() else None
+    index = np.array([row[np.argsort(probe.distance[row])] for row in rows])
+    differences = np.ptp(probe.distance[index], axis=0)
+    return (azimuth, index) if (differences <= DISTANCE_TOLERANCE_MM).all() else None

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
 from skindb.format.dome import DomeRecord
 from skindb.format.folder import WHOLE_SURFACE
@@ -23,73 +24,69 @@ def cleaning_lines(provenance: Mapping[str, Any], *, places: bool) -> list[str]:
     """A line for every kind of repair, optionally with the `places` of the first ones,
     x y z in mm.
     """
-    kept = provenance.get("cleaning_places", {}) if places else {}
+    points = provenance.get("cleaning_places", {}) if places else {}
     lines = []
     for kind, count in provenance.get("cleaning", {}).items():
         lines.append(f"{kind}: {count}")
-        lines += [f"  at {x:.2f} {y:.2f} {z:.2f}" for x, y, z in kept.get(kind, [])]
-        if kind in kept and count > len(kept[kind]):
-            lines.append(f"  and {count - len(kept[kind]):,} more")
+        listed = points.get(kind, [])
+        lines += [f"  at {x:.2f} {y:.2f} {z:.2f}" for x, y, z in listed]
+        if kind in points and count > len(listed):
+            lines.append(f"  and {count - len(listed):,} more")
     return lines
 
 
 def describe_samples(
-    found: Lumitexels, surfels: SurfelSet, dome: DomeRecord
+    lumitexels: Lumitexels, surfels: SurfelSet, dome: DomeRecord
 ) -> dict[str, Any]:
     """Samples per sampled surfel and fraction of sampled surfels, also by region;
     devices without samples.
 
     Also the fraction of the samples that come from a single exposure.
     """
-    count = found.sample_count
-    parts = {WHOLE_SURFACE: np.ones(len(count), bool)}
-    parts |= {name: surfels.region[:, k] for k, name in enumerate(surfels.region_names)}
+    count = lumitexels.sample_count
+    views = lumitexels.view_count
+    parts = {WHOLE_SURFACE: _quantiles(count)}
+    for name, region in zip(surfels.region_names, surfels.region.T, strict=True):
+        parts[name] = _quantiles(count[region])
+    single = float(lumitexels.single_count.sum() / max(count.sum(), 1))
+    cameras = [camera.id for camera in dome.cameras]
+    lights = zip(dome.lights, views.sum(axis=1), strict=True)
     return {
-        "of": int(found.view_count.size),
+        "of": int(views.size),
         "surfels": len(count),
-        "parts": {name: _quantiles(count[part]) for name, part in parts.items()},
-        "single_exposure_fraction": round(
-            float(found.single_count.sum() / max(count.sum(), 1)), 4
-        ),
-        "cameras": {
-            c.id: int(n)
-            for c, n in zip(dome.cameras, found.view_count.sum(axis=0), strict=True)
-        },
-        "lights_without": [
-            x.id
-            for x, n in zip(dome.lights, found.view_count.sum(axis=1), strict=True)
-            if n == 0
-        ],
+        "parts": parts,
+        "single_exposure_fraction": round(single, 4),
+        "cameras": dict(zip(cameras, views.sum(axis=0).tolist(), strict=True)),
+        "lights_without": [light.id for light, number in lights if number == 0],
     }
 
 
 def sample_lines(samples: Mapping[str, Any]) -> list[str]:
     """Summary of the samples, and a line for every camera and light without a sample."""
-    whole = samples["parts"][WHOLE_SURFACE]
-    said = ", ".join(f"{name} {whole[name]:,}" for name in QUANTILES)
-    lines = [
-        f"samples per surfel: mean {whole['mean']:,} ({said}) of {samples['of']:,}; "
-        f"{whole['seen']:.0%} of {samples['surfels']:,} surfels have any"
+    face = samples["parts"][WHOLE_SURFACE]
+    quantiles = ", ".join(f"{name} {face[name]:,}" for name in QUANTILES)
+    summary = (
+        f"samples per surfel: mean {face['mean']:,} ({quantiles}) of {samples['of']:,}; "
+        f"{face['seen']:.0%} of {samples['surfels']:,} surfels have any"
+    )
+    if fraction := samples["single_exposure_fraction"]:
+        summary += f"; {fraction:.1%} of the samples come from a single exposure"
+    cameras = [name for name, number in samples["cameras"].items() if number == 0]
+    return [
+        summary,
+        *[f"camera {name}: no sample" for name in cameras],
+        *[f"light {name}: no sample" for name in samples["lights_without"]],
     ]
-    # unknown for captures of an earlier version
-    if fraction := samples.get("single_exposure_fraction"):
-        lines[0] += f"; {fraction:.1%} of the samples come from a single exposure"
-    lines += [
-        f"camera {name}: no sample" for name, n in samples["cameras"].items() if n == 0
-    ]
-    return lines + [f"light {name}: no sample" for name in samples["lights_without"]]
 
 
 def calibration_lines(calibration: xr.Dataset) -> list[str]:
     """Agreement of photographs, scan and calibration, in one line."""
     if not np.isfinite(calibration["camera_agreement"]).any():
         return ["calibration: not checked, as the photographs show too little"]
-    move, turn = (
-        float(np.linalg.norm(calibration[f"scan_{name}_error"]))
-        for name in ("translation", "rotation")
-    )
+    shift = float(np.linalg.norm(calibration["scan_translation_error"]))
+    turn = float(np.linalg.norm(calibration["scan_rotation_error"]))
     return [
-        f"calibration: scan {move:.1f} mm and {turn:.1f} degrees from where the "
+        f"calibration: scan {shift:.1f} mm and {turn:.1f} degrees from where the "
         "photographs show the face; "
         f"cameras up to {float(calibration['camera_offset'].max()):.1f} mm off; "
         f"lights agree by {float(calibration['light_agreement'].min()):.2f} or more"
@@ -103,51 +100,44 @@ def calibration_table(calibration: xr.Dataset) -> list[list[Any]]:
     rows: list[list[Any]] = [
         ["device", "offset [mm]", "larger by [%]", "agreement", "brightness"]
     ]
-    cameras = [
-        calibration[f"camera_{name}"].values
-        for name in ("offset", "scale_error", "agreement", "brightness")
-    ]
-    for name, offset, scale, agreement, factors in zip(
-        calibration["camera"].values, *cameras, strict=True
-    ):
-        brightness = " ".join(f"{factor:.2f}" for factor in factors)
+    for name in calibration["camera"].values:
+        camera = calibration.sel(camera=name)
+        brightness = camera["camera_brightness"].values
         rows.append(
             [
                 f"camera {name}",
-                f"{offset:.2f}",
-                f"{100 * scale:.1f}",
-                f"{agreement:.3f}",
-                brightness,
+                f"{float(camera['camera_offset']):.2f}",
+                f"{100 * float(camera['camera_scale_error']):.1f}",
+                f"{float(camera['camera_agreement']):.3f}",
+                " ".join(f"{factor:.2f}" for factor in brightness),
             ]
         )
-    lights = [
-        calibration[f"light_{name}"].values for name in ("agreement", "brightness")
-    ]
-    for name, agreement, factor in zip(
-        calibration["light"].values, *lights, strict=True
-    ):
-        rows.append([f"light {name}", "-", "-", f"{agreement:.3f}", f"{factor:.2f}"])
+    for name in calibration["light"].values:
+        light = calibration.sel(light=name)
+        agreement = f"{float(light['light_agreement']):.3f}"
+        factor = f"{float(light['light_brightness']):.2f}"
+        rows.append([f"light {name}", "-", "-", agreement, factor])
     return rows
 
 
 def sample_table(samples: Mapping[str, Any]) -> list[list[Any]]:
     """Header and rows: samples per surfel, by region."""
-    return [
-        ["samples of", *COLUMNS],
-        *[
-            [name, *(part[column] for column in COLUMNS)]
-            for name, part in samples["parts"].items()
-        ],
+    rows = [
+        [name, *(part[column] for column in COLUMNS)]
+        for name, part in samples["parts"].items()
     ]
+    return [["samples of", *COLUMNS], *rows]
 
 
-def _quantiles(count: Any) -> dict[str, float]:
-    seen = count[count > 0]
-    if not len(seen):
+def _quantiles(count: NDArray[np.int32]) -> dict[str, float]:
+    sampled = count[count > 0]
+    if not len(sampled):
         return dict.fromkeys(COLUMNS, 0)
-    values = {name: round(float(np.quantile(seen, q))) for name, q in QUANTILES.items()}
+    values = {
+        name: round(float(np.quantile(sampled, q))) for name, q in QUANTILES.items()
+    }
     return {
-        "mean": round(float(seen.mean())),
+        "mean": round(float(sampled.mean())),
         **values,
-        "seen": round(len(seen) / len(count), 4),
+        "seen": round(len(sampled) / len(count), 4),
     }

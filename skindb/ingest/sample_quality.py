@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skindb.calibration.radiance import read_sigma, vignette_gain
-from skindb.errors import Fault
+from skindb.errors import Fault, require
 from skindb.format.dome import CameraRecord, DomeRecord
 
 Array = NDArray[np.float64]
@@ -111,8 +111,8 @@ def radiance_noise(
     read = float(read_sigma(per_value, sensor)[0]) ** 2
     # an exposure is the longest usable one where all longer ones are saturated
     lines = [
-        _line(time[first:] * gain, read, 1 / sensor.full_electrons)
-        for first in range(len(time))
+        _line(time[longest:] * gain, read, 1 / sensor.full_electrons)
+        for longest in range(len(time))
     ]
     mixed = np.square(camera.colour_matrix).sum(axis=1)[:, None]
     offset, slope = np.array(lines).T
@@ -146,6 +146,7 @@ def intensity_faults(dome: DomeRecord, intensity: Array) -> list[Fault]:
         f"the intensity of a light must be at most {MAX_INTENSITY_RATIO:,g} times as "
         "large or small as the median"
     )
+    cure = "correct it; remove a light that was not switched on, and its frames"
     return [
         Fault(
             f"{dome.file}[lights][{j}][intensity]",
@@ -154,9 +155,6 @@ def intensity_faults(dome: DomeRecord, intensity: Array) -> list[Fault]:
             cure,
         )
         for j, ratio in _beyond(_relative(intensity), MAX_INTENSITY_RATIO)
-        for cure in [
-            "correct it; remove a light that was not switched on, and its frames"
-        ]
     ]
 
 
@@ -164,20 +162,15 @@ def sample_faults(dome: DomeRecord, view_median: Array, bright: Array) -> list[F
     """Faults of samples that are too large or small for skin, by their medians and
     bright fractions (light, camera).
     """
-    median, (least, most) = _light_medians(view_median), MEDIAN_SAMPLES
-    middle = (
-        float(np.median(known))
-        if len(known := median[~np.isnan(median)])
-        else float("nan")
-    )
-    if not np.isnan(middle) and not least <= middle <= most:
-        rule = f"the median reflectance sample of a face must be {least:g} to {most:g} sr^-1"
-        found = (
-            f"{middle:.3g}"
-            if np.isfinite(middle)
-            else "samples beyond 65504, the largest half float"
-        )
-        return [Fault(f"{dome.file}[lights]", rule, found, SAMPLE_CURE)]
+    median = _light_medians(view_median)
+    middle = _nan_median(median)
+    smallest, largest = MEDIAN_SAMPLES
+    if not np.isnan(middle) and not smallest <= middle <= largest:
+        rule = f"the median reflectance sample of a face must be {smallest:g} to {largest:g} sr^-1"
+        finding = f"{middle:.3g}"
+        if np.isinf(middle):
+            finding = "samples beyond 65504, the largest half float"
+        return [Fault(f"{dome.file}[lights]", rule, finding, SAMPLE_CURE)]
     rule = (
         f"the median sample of a light must be at most {MAX_SAMPLE_RATIO:g} times the "
         "overall median, or its inverse"
@@ -217,14 +210,11 @@ def _bright_faults(dome: DomeRecord, bright: Array) -> list[Fault]:
 def light_notes(dome: DomeRecord, intensity: Array, view_median: Array) -> list[str]:
     """Warnings about lights whose intensities or samples are unusual, but not impossible."""
     median = _light_medians(view_median)
-    middle = (
-        np.median(median[~np.isnan(median)]) if np.isfinite(median).any() else np.nan
-    )
     return [
-        f"light {dome.lights[j].id}: its {what} {ratio:.3g} times the median of all lights"
-        for what, ratios, limit in (
+        f"light {dome.lights[j].id}: its {quantity} {ratio:.3g} times the median of all lights"
+        for quantity, ratios, limit in (
             ("intensity is", _relative(intensity), NOTED_INTENSITY_RATIO),
-            ("samples are", median[:, None] / middle, NOTED_SAMPLE_RATIO),
+            ("samples are", median[:, None] / _nan_median(median), NOTED_SAMPLE_RATIO),
         )
         for j, ratio in _beyond(ratios, limit)
     ]
@@ -236,9 +226,8 @@ def view_median(samples: NDArray[np.float16]) -> float:
     """
     if samples.shape[1] < MIN_MEDIAN_SAMPLES:
         return float("nan")
-    return float(
-        np.median(np.where(np.isnan(samples), np.inf, samples.astype(np.float64)))
-    )
+    values = samples.astype(np.float64)
+    return float(np.median(np.where(np.isnan(values), np.inf, values)))
 
 
 def bright_fraction(samples: NDArray[np.float16]) -> float:
@@ -250,27 +239,32 @@ def bright_fraction(samples: NDArray[np.float16]) -> float:
     return float((~(samples <= MAX_SAMPLE)).any(axis=0).mean())
 
 
-def unlit_fault(where: str, radiance: NDArray[np.float32], count: int) -> Fault | None:
-    """Fault of a view whose usable pixels (n, 3), at `count` surfels, are all zero or negative."""
-    if count < MIN_MEDIAN_SAMPLES or (radiance > 0).any():
-        return None
-    rule = "a frame must be bright where its light reaches the face"
-    cure = "copy the frame from the camera again"
-    return Fault(where, rule, f"none at {count} surfels", cure)
+def require_lit(where: str, radiance: NDArray[np.float32], count: int) -> None:
+    """Require a view whose usable pixels (n, 3), at `count` surfels, are not all zero
+    or negative.
+    """
+    require(
+        count < MIN_MEDIAN_SAMPLES or (radiance > 0).any(),
+        where,
+        "a frame must be bright where its light reaches the face",
+        f"none at {count} surfels",
+        "copy the frame from the camera again",
+    )
 
 
 def _relative(intensity: Array) -> Array:
-    return np.asarray(intensity / np.median(intensity, axis=0))
+    return intensity / np.median(intensity, axis=0)
 
 
 def _light_medians(view_median: Array) -> Array:
     """Median over the cameras (light,) of medians (light, camera); NaN where there is none."""
-    return np.array(
-        [
-            np.median(row[~np.isnan(row)]) if (~np.isnan(row)).any() else np.nan
-            for row in view_median
-        ]
-    )
+    return np.array([_nan_median(row) for row in view_median])
+
+
+def _nan_median(values: Array) -> float:
+    """Median of the values that are not NaN; NaN if there is none."""
+    numbers = values[~np.isnan(values)]
+    return float(np.median(numbers)) if len(numbers) else float("nan")
 
 
 def _beyond(ratios: Array, limit: float) -> list[tuple[int, float]]:

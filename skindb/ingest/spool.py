@@ -94,9 +94,9 @@ class Spool:
             )
             size = 6 * int(np.prod(self.shape))
             # otherwise it is new, and its journal is invalid
-            whole = os.fstat(self._file).st_size == size
+            complete = os.fstat(self._file).st_size == size
             os.ftruncate(self._file, size)
-            self._resume(whole=whole)
+            self._resume(whole=complete)
         except BaseException:
             self._close()
             raise
@@ -188,11 +188,11 @@ class Spool:
 
     def _write(self, light: int, camera: int, samples: NDArray[np.uint16]) -> None:
         content = np.ascontiguousarray(samples).data.cast("B")
-        at = (light * self.shape[1] + camera) * len(content)
+        offset = (light * self.shape[1] + camera) * len(content)
         while content:  # a large write may be partial
-            count = os.pwrite(self._file, content, at)
+            count = os.pwrite(self._file, content, offset)
             content = content[count:]
-            at = at + count
+            offset = offset + count
 
     def _read(self, begin: int, end: int) -> NDArray[np.float16]:
         """Samples (surfel, light, camera, 3) in column-major order, as the store keeps them."""

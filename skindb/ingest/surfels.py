@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb.errors import Fault, InputError
+from skindb.errors import require
 from skindb.format.folder import Capture
 from skindb.format.scan_checks import LANDMARK_REACH, SITE_LANDMARK
 from skindb.geometry.atlas import disc_atlas
@@ -92,23 +92,26 @@ def subdivision_levels(mesh: CleanMesh, spacing_mm: float) -> int:
     """
     if not spacing_mm > 0:
         raise ValueError(f"spacing_mm must be positive, not {spacing_mm}")
+    count = len(mesh.vertices)
     area = float(vertex_areas(mesh.vertices, mesh.faces).sum())
-    spacing = lattice_spacing(area / len(mesh.vertices))
+    spacing = lattice_spacing(area / count)
     levels = max(int(np.rint(np.log2(spacing / spacing_mm))), 0)
     rule = f"a capture must have at most {MAX_SURFELS:,} surfels"
-    if len(mesh.vertices) > MAX_SURFELS:
-        found = f"{len(mesh.vertices):,} vertices of the scan, each of which becomes a surfel"
-        raise InputError(Fault("scan", rule, found, "decimate the scan, or crop it"))
-    finest = int(np.log2(MAX_SURFELS / len(mesh.vertices)) / 2)
-    if levels > finest:
-        found = (
-            f"{spacing_mm:g} mm, which requires {len(mesh.vertices) * 4.0**levels:,.0f}"
-        )
-        raise InputError(
-            Fault(
-                "spacing", rule, found, f"choose {spacing / 2**finest:.2g} mm or more"
-            )
-        )
+    require(
+        count <= MAX_SURFELS,
+        "scan",
+        rule,
+        f"{count:,} vertices of the scan, each of which becomes a surfel",
+        "decimate the scan, or crop it",
+    )
+    finest = int(np.log2(MAX_SURFELS / count) / 2)
+    require(
+        levels <= finest,
+        "spacing",
+        rule,
+        f"{spacing_mm:g} mm, which requires {count * 4.0**levels:,.0f}",
+        f"choose {spacing / 2**finest:.2g} mm or more",
+    )
     return levels
 
 
@@ -120,21 +123,21 @@ def transferred_landmarks(capture: Capture, surfels: SurfelSet) -> tuple[Array, 
     NaN if the landmark was cropped away, so that the complete scan is nearer to it than
     the surface.
     """
-    given = np.array([*capture.landmarks.values()]).reshape(-1, 3)
+    landmarks = np.array([*capture.landmarks.values()]).reshape(-1, 3)
     base = capture.surface
     scan = capture.scan
-    face, weight, distance = closest_on_mesh(base.vertices, base.faces, given)
-    there = distance <= LANDMARK_REACH
+    face, weight, distance = closest_on_mesh(base.vertices, base.faces, landmarks)
+    near = distance <= LANDMARK_REACH
     if capture.crop is not None:
-        there &= (
+        near &= (
             distance
-            <= closest_on_mesh(scan.vertices, scan.faces, given)[2]
+            <= closest_on_mesh(scan.vertices, scan.faces, landmarks)[2]
             + CROPPED_LANDMARK_MM
         )
     levels = round(np.log2(len(surfels.faces) / len(base.faces)) / 2)
     face, weight = carry_points(face, weight, len(base.faces), levels)
     position = np.einsum("kc,kci->ki", weight, surfels.position[surfels.faces[face]])
-    return np.where(there[:, None], position, np.nan), distance
+    return np.where(near[:, None], position, np.nan), distance
 
 
 def site_positions(
@@ -149,8 +152,10 @@ def site_positions(
     """
     carried, _ = transferred_landmarks(capture, surfels)
     landmarks = {
-        name: place if np.isfinite(place).all() else given
-        for (name, given), place in zip(capture.landmarks.items(), carried, strict=True)
+        name: place if np.isfinite(place).all() else stated
+        for (name, stated), place in zip(
+            capture.landmarks.items(), carried, strict=True
+        )
     }
     return np.array(
         [_site_position(surfels, site, landmarks) for site in sites]
@@ -167,11 +172,12 @@ def _site_position(
         return np.full(3, np.nan)
     member = surfels.region[:, surfels.region_names.index(site)]
     x = surfels.position[:, 0]
-    for wanted in (
-        (np.abs(x) < NECK_STRIP_HALF_WIDTH_MM, x > 0) if site == "neck" else (x > 0,)
-    ):
-        if (member & wanted).any():
-            member = member & wanted
+    preferred = [x > 0]
+    if site == "neck":
+        preferred.insert(0, np.abs(x) < NECK_STRIP_HALF_WIDTH_MM)
+    for part in preferred:
+        if (member & part).any():
+            member = member & part
             break
     if not member.any():
         return np.full(3, np.nan)
@@ -187,6 +193,6 @@ def _regions(
     """Membership (v', region) of the cleaned vertices in the regions of the scan."""
     member = np.zeros((len(mesh.vertices), len(regions)))
     for i, ids in enumerate(regions.values()):
-        kept = mesh.clean_vertex[ids]
-        member[kept[kept >= 0], i] = 1.0
+        vertices = mesh.clean_vertex[ids]
+        member[vertices[vertices >= 0], i] = 1.0
     return tuple(regions), member

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from skindb.format.dome import CameraRecord, LightRecord
 from skindb.geometry._mesh_kernels import grown, mixed
 from skindb.geometry._ray_kernels import matches_tangent_plane
-from skindb.geometry.camera import camera_centre, pixel_rays, project
 from skindb.geometry.rays import RayScene
 from skindb.geometry.splats import THRESHOLD, SplatScene
 from skindb.ingest.surfels import SurfelSet
@@ -56,29 +55,23 @@ def light_visibility(
     """
     look = _visibility_test(surfels, scene, method)
 
-    def one(light: LightRecord) -> Half:
+    def visible_fraction(light: LightRecord) -> Half:
         fraction = np.zeros(len(surfels.position), np.float16)
-        facing = (
-            np.einsum("ni,ni->n", light.position - surfels.position, surfels.normal) > 0
-        )
-        at = np.flatnonzero(facing)
+        way = light.position - surfels.position
+        facing = np.einsum("ni,ni->n", way, surfels.normal) > 0
+        indices = np.flatnonzero(facing)
         centre, *ring = disc_points(light)
-        fraction[at] = look(centre)(at)
+        fraction[indices] = look(centre)(indices)
         if ring:
             start = mixed(surfels.faces, fraction > 0)
             start[::SURFELS_PER_PROBE] = True
-            _add_penumbrae(
-                fraction,
-                start & facing,
-                surfels.faces,
-                facing,
-                [look(point) for point in ring],
-            )
+            tests = [look(point) for point in ring]
+            _add_penumbrae(fraction, start & facing, surfels.faces, facing, tests)
         return fraction
 
     # used column by column
     out = np.empty((len(surfels.position), len(lights)), np.float16, order="F")
-    for j, fraction in enumerate(pool.map(one, lights)):
+    for j, fraction in enumerate(pool.map(visible_fraction, lights)):
         out[:, j] = fraction
     return out
 
@@ -96,16 +89,16 @@ def _add_penumbrae(
     The neighbours of every surfel in a penumbra are also tested, until no further
     surfel is in a penumbra.
     """
-    left = facing & ~start
+    untested = facing & ~start
     front = np.flatnonzero(start)
     while len(front):
         total = fraction[front] + np.sum([sees(front) for sees in ring], axis=0)
         fraction[front] = total / (RING_POINTS + 1)
         soft = np.zeros(len(fraction), bool)
         soft[front[(total > 0) & (total < RING_POINTS + 1)]] = True
-        asked = grown(faces, soft) & left
-        left &= ~asked
-        front = np.flatnonzero(asked)
+        ring_surfels = grown(faces, soft) & untested
+        untested &= ~ring_surfels
+        front = np.flatnonzero(ring_surfels)
 
 
 def _visibility_test(
@@ -136,18 +129,13 @@ def coarse_maps(
     allows for a light or camera.
     """
     splats = SplatScene(surfels.position, surfels.normal, surfels.radius)
-    eyes = [
-        *(light.position for light in lights),
-        *(camera_centre(camera.R, camera.t) for camera in cameras),
-    ]
-    times = max(splats.coarsening(eye) for eye in eyes)
-    if times < MAX_PIXEL_WIDTH_RATIO:
+    eyes = [*(light.position for light in lights), *(c.centre for c in cameras)]
+    ratio = max(splats.coarsening(eye) for eye in eyes)
+    if ratio < MAX_PIXEL_WIDTH_RATIO:
         return []
     return [
-        (
-            f"depth maps of splats: pixels are up to {times:.1f} times too wide; use "
-            "rays, which are exact"
-        )
+        f"depth maps of splats: pixels are up to {ratio:.1f} times too wide; use "
+        "rays, which are exact"
     ]
 
 
@@ -175,7 +163,7 @@ def camera_visibility(
     pool: Executor,
     *,
     method: Method = "rays",
-) -> tuple[Half, NDArray[np.bool_], NDArray[np.float32]]:
+) -> tuple[Half, Bools, NDArray[np.float32]]:
     """Visibility of the surfels in each camera.
 
     Returns
@@ -194,15 +182,16 @@ def camera_visibility(
     clear = np.zeros((len(cameras), count), bool).T
     pixels = np.empty((len(cameras), count, 2), np.float32).transpose(1, 0, 2)
 
-    def one(c: int) -> None:
+    def see(c: int) -> None:
         camera = cameras[c]
-        places, candidate = _in_picture(surfels, camera)
-        at = np.flatnonzero(candidate)
-        at = at[look(np.asarray(camera_centre(camera.R, camera.t), np.float64))(at)]
-        visible[at, c], pixels[:, c] = 1, places
-        clear[at, c] = _clear(camera, scene, surfels, places, at)
+        projected, candidate = _in_picture(surfels, camera)
+        indices = np.flatnonzero(candidate)
+        indices = indices[look(camera.centre)(indices)]
+        visible[indices, c] = 1
+        pixels[:, c] = projected
+        clear[indices, c] = _clear(camera, scene, surfels, projected, indices)
 
-    list(pool.map(one, range(len(cameras))))
+    list(pool.map(see, range(len(cameras))))
     return visible, clear, pixels
 
 
@@ -210,20 +199,17 @@ def _in_picture(surfels: SurfelSet, camera: CameraRecord) -> tuple[Array, Bools]
     """Projections (n, 2) of the surfels, and which of them face the camera and fall
     inside its picture (n,).
     """
-    centre = camera_centre(camera.R, camera.t)
-    last = np.array([camera.width, camera.height]) - 0.5
+    centre = camera.centre
+    limit = np.array([camera.width, camera.height]) - 0.5
     pixels = np.empty((len(surfels.position), 2))
     inside = np.empty(len(surfels.position), bool)
     for i in range(0, len(pixels), SURFELS_PER_BLOCK):
         part = slice(i, i + SURFELS_PER_BLOCK)
         position = surfels.position[part]
-        pixels[part], _ = project(
-            position, camera.K, camera.R, camera.t, camera.distortion
-        )
-        inside[part] = ((pixels[part] >= 0.5) & (pixels[part] <= last)).all(axis=1)
-        inside[part] &= (
-            np.einsum("ni,ni->n", centre - position, surfels.normal[part]) > 0
-        )
+        projected = camera.project(position)
+        facing = np.einsum("ni,ni->n", centre - position, surfels.normal[part]) > 0
+        pixels[part] = projected
+        inside[part] = facing & ((projected >= 0.5) & (projected <= limit)).all(axis=1)
     return pixels, inside
 
 
@@ -235,7 +221,7 @@ def depth_map(
     """
     rays = np.empty((camera.height, camera.width, 3), np.float32)
     distance = np.empty((camera.height, camera.width), np.float32)
-    centre = camera_centre(camera.R, camera.t)
+    centre = camera.centre
     column = np.arange(camera.width) + 0.5
     # in strips, whose arrays stay in the cache: allocating large arrays takes longer
     # than filling them
@@ -244,7 +230,7 @@ def depth_map(
         pixels = np.stack(
             np.meshgrid(column, np.arange(camera.height)[strip] + 0.5), axis=-1
         )
-        rays[strip] = pixel_rays(pixels, camera.K, camera.R, camera.distortion)
+        rays[strip] = camera.rays(pixels)
         distance[strip] = scene.distances(centre, rays[strip].reshape(-1, 3)).reshape(
             distance[strip].shape
         )
@@ -252,15 +238,26 @@ def depth_map(
 
 
 def _clear(
-    camera: CameraRecord, scene: RayScene, surfels: SurfelSet, pixels: Array, at: Places
+    camera: CameraRecord,
+    scene: RayScene,
+    surfels: SurfelSet,
+    pixels: Array,
+    indices: Places,
 ) -> Bools:
-    """Whether the pixels around surfels `at` show the surface that their tangent planes predict."""
+    """Whether the pixels around surfels show the surface that their tangent planes predict."""
     distance, rays = depth_map(camera, scene)
-    centre = np.asarray(camera_centre(camera.R, camera.t), np.float64)
-    steepest = (
-        EDGE_PX * MAX_DEPTH_SLOPE / float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
-    )
-    where = (surfels.position, surfels.normal, pixels, at, centre)
+    focal_px = float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
     return np.asarray(
-        matches_tangent_plane(*where, rays, distance, EDGE_PX, DEPTH_SLACK, steepest)
+        matches_tangent_plane(
+            surfels.position,
+            surfels.normal,
+            pixels,
+            indices,
+            camera.centre,
+            rays,
+            distance,
+            EDGE_PX,
+            DEPTH_SLACK,
+            EDGE_PX * MAX_DEPTH_SLOPE / focal_px,
+        )
     )

@@ -23,8 +23,8 @@ from skindb.format.json_file import read_json
 from skindb.format.scan_checks import (
     coincidence_faults,
     discarded_piece_faults,
-    face_fault,
-    order_fault,
+    face_faults,
+    order_faults,
     swapped_faults,
 )
 from skindb.geometry.clean import CleanMesh, clean_mesh
@@ -190,11 +190,9 @@ def landmark_mistakes(
         or discarded_piece_faults(where, points, task.surface)
         or coincidence_faults(where, points)
     )
-    size = None if faults else face_fault(where, points)
-    order = None if faults else order_fault(where, points)
     return (
         faults
-        or [f for f in (size, order) if f]
+        or [*face_faults(where, points), *order_faults(where, points)]
         or swapped_faults(where, points, task.surface)
     )
 

@@ -28,6 +28,7 @@ from skindb.calibration.setup import (
 )
 from skindb.errors import Fault, InputError
 from skindb.format.dome import DomeRecord
+from skindb.format.fields import NAME
 from skindb.format.folder import Capture
 from skindb.store import CALIBRATION, Database, Record, require_text
 from skindb.workflow.audit import logged_action
@@ -40,7 +41,6 @@ APPLIED: dict[str, Callable[..., DomeRecord]] = {
     "light_calibration": calibrated_dome,
     "camera_calibration": calibrated_cameras,
 }
-NAME = r"[A-Za-z0-9_-]{1,64}"
 
 
 def calibrate(
@@ -85,7 +85,7 @@ def calibrate(
     InputError
         With every fault of the folder.
     """
-    key = require_text(name, NAME, "name of a calibration")
+    key = require_text(name, NAME.pattern, "name of a calibration")
     dome = read_setup_dome(Path(setup))
     groups = dict[str, xr.Dataset]()
     if frames := read_calibration_frames(dome):
@@ -116,28 +116,26 @@ def calibrate(
 
 def calibrated_capture(db: Database, capture: Capture) -> Capture:
     """The capture with the newest version of the calibration that it names, if it names one."""
-    if not capture.calibration or (capture.dome is None and capture.probe is None):
-        return capture
-    if not db.has(CALIBRATION, capture.calibration):
-        there = ", ".join(db.takes(CALIBRATION)) or "none"
-        rule = "the database must hold the calibration that it names"
-        cure = "run skindb calibrate first"
-        where = f"{capture.folder / 'capture.json'}[calibration]"
-        raise InputError(
-            Fault(where, rule, f"{capture.calibration}; calibrations: {there}", cure)
-        )
-    record = db.record(CALIBRATION, capture.calibration)
-    stored = db.read(CALIBRATION, capture.calibration, generation=record.generation)
+    name = capture.calibration
     dome = capture.dome
     probe = capture.probe
-    where = f"calibration {capture.calibration}"
+    if not name or (dome is None and probe is None):
+        return capture
+    if not db.has(CALIBRATION, name):
+        names = ", ".join(db.takes(CALIBRATION)) or "none"
+        where = f"{capture.folder / 'capture.json'}[calibration]"
+        rule = "the database must hold the calibration that it names"
+        found = f"{name}; calibrations: {names}"
+        raise InputError(Fault(where, rule, found, "run skindb calibrate first"))
+    record = db.record(CALIBRATION, name)
+    stored = db.read(CALIBRATION, name, generation=record.generation)
+    groups = {group: child.to_dataset() for group, child in stored.children.items()}
+    where = f"calibration {name}"
     for group, apply in APPLIED.items():
-        if dome is not None and group in stored.children:
-            dome = apply(dome, stored[group].to_dataset(), where=where)
-    if probe is not None and "probe_calibration" in stored.children:
-        probe = calibrated_probe(
-            probe, stored["probe_calibration"].to_dataset(), where=where
-        )
+        if dome is not None and group in groups:
+            dome = apply(dome, groups[group], where=where)
+    if probe is not None and "probe_calibration" in groups:
+        probe = calibrated_probe(probe, groups["probe_calibration"], where=where)
     return replace(capture, dome=dome, probe=probe, calibrated_by=record.as_input())
 
 
@@ -145,55 +143,51 @@ def describe_calibration(db: Database, record: Record) -> dict[str, Any]:
     """Largest relative errors of intensities, change since the version before, cameras,
     takes of earlier versions.
     """
-    stored = db.read(CALIBRATION, record.take, generation=record.generation)
-    now = stored["light_calibration"].to_dataset().load()
-    relative = (now["calibrated_intensity_error"] / now["calibrated_intensity"]).max(
-        "channel"
-    )
-    about: dict[str, Any] = {
-        "lights": now.sizes["light"],
-        "largest_relative_error": float(relative.max()),
-    }
-    position = now["calibrated_intensity_position_error"]
-    glare = now["glare_fraction"]
+    groups = _groups(db, record, record.generation)
+    lights = groups["light_calibration"]
+    intensity = lights["calibrated_intensity"]
+    relative = (lights["calibrated_intensity_error"] / intensity).max("channel")
+    position = lights["calibrated_intensity_position_error"]
+    glare = lights["glare_fraction"]
     total = np.sqrt(relative**2 + position**2 + glare**2)
-    about |= {
+    about: dict[str, Any] = {
+        "lights": lights.sizes["light"],
+        "largest_relative_error": float(relative.max()),
         "position_error": float(position.median()),
         "glare": float(glare.median()),
         "total_relative_error": float(total.max()),
     }
     if record.generation > 1:
-        before = db.read(CALIBRATION, record.take, generation=record.generation - 1)[
-            "light_calibration"
-        ].to_dataset()
+        before = _groups(db, record, record.generation - 1)["light_calibration"]
         # lights that both have
-        both = now["calibrated_intensity"] / before["calibrated_intensity"].load()
-        change = abs(both - 1).max(dim="channel")
+        ratio = intensity / before["calibrated_intensity"]
+        change = abs(ratio - 1).max(dim="channel")
         if change.size:
             about |= {
                 "largest_change": float(change.max()),
                 "most_changed": str(change["light"].values[change.values.argmax()]),
             }
-    if "position_calibration" in stored.children:
-        positions = stored["position_calibration"].to_dataset().load()
-        about["largest_position_error_mm"] = float(
-            positions["calibrated_position_error"].max()
-        )
-    if "probe_calibration" in stored.children:
-        probe = stored["probe_calibration"].to_dataset().load()
-        error = probe["calibrated_fibre_gain_error"] / probe["calibrated_fibre_gain"]
+    if (positions := groups.get("position_calibration")) is not None:
+        errors = positions["calibrated_position_error"]
+        about["largest_position_error_mm"] = float(errors.max())
+    if (fibres := groups.get("probe_calibration")) is not None:
+        errors = fibres["calibrated_fibre_gain_error"] / fibres["calibrated_fibre_gain"]
         about["probe"] = {
-            "fibres": probe.sizes["fibre"],
-            "largest_relative_error": float(error.max()),
+            "fibres": fibres.sizes["fibre"],
+            "largest_relative_error": float(errors.max()),
         }
-    if "camera_calibration" in stored.children:
-        about["cameras"] = _describe_cameras(
-            stored["camera_calibration"].to_dataset().load()
-        )
+    if (cameras := groups.get("camera_calibration")) is not None:
+        about["cameras"] = _describe_cameras(cameras)
     return about | {"ingest_again": takes_of_earlier(db, record)}
 
 
-def _describe_cameras(found: xr.Dataset) -> dict[str, Any]:
+def _groups(db: Database, record: Record, generation: int) -> dict[str, xr.Dataset]:
+    """The groups of a version of a calibration, in memory."""
+    stored = db.read(CALIBRATION, record.take, generation=generation)
+    return {name: group.to_dataset().load() for name, group in stored.children.items()}
+
+
+def _describe_cameras(calibration: xr.Dataset) -> dict[str, Any]:
     """How many cameras each calibration has, and the worst of each measure of it."""
     measures = {
         "dark frames": "defect_pixels",
@@ -206,9 +200,8 @@ def _describe_cameras(found: xr.Dataset) -> dict[str, Any]:
     }
     about = dict[str, Any]()
     for name, variable in measures.items():
-        values = found[variable].max(
-            dim=[dim for dim in found[variable].dims if dim != "camera"]
-        )
+        values = calibration[variable]
+        values = values.max(dim=[dim for dim in values.dims if dim != "camera"])
         if count := int(np.isfinite(values).sum()):
             about[name] = {"cameras": count, variable: float(values.max())}
     return about

@@ -9,7 +9,7 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
-from skindb.errors import Fault, InputError, add_filename
+from skindb.errors import Fault, InputError, add_filename, require
 from skindb.files import private_file
 from skindb.format.json_file import read_json
 from skindb.ingest import (
@@ -76,16 +76,17 @@ def ingest_take(
         consent to fit, if another run ingests or fits the take, or if the subject was
         withdrawn and no new consent is given.
     """
-    if db.folder is not None and Path(folder).resolve() in (
-        db.folder.resolve(),
-        *db.folder.resolve().parents,
-    ):
-        rule = "a database lies outside the captures it holds"
-        cure = "choose another folder for the database"
-        raise InputError(Fault(db.url, rule, f"the capture {folder} around it", cure))
+    database = None if db.folder is None else db.folder.resolve()
+    require(
+        database is None or Path(folder).resolve() not in (database, *database.parents),
+        db.url,
+        "a database lies outside the captures it holds",
+        f"the capture {folder} around it",
+        "choose another folder for the database",
+    )
     capture = calibrated_capture(db, read_capture(folder, crop=crop))
-    asked = IngestParameters(**parameters)
-    scratch = db.scratch() / scratch_name(capture, asked)
+    record = IngestParameters(**parameters)
+    scratch = db.scratch() / scratch_name(capture, record)
     with logged_action(
         db, "ingest", [capture.take], arguments={"new_consent": new_consent is not None}
     ):
@@ -96,7 +97,7 @@ def ingest_take(
             db.readmit(subject_of(capture.take), new_consent)
         remove_stale(scratch)
         try:
-            return _ingest(db, capture, asked, scratch, wait, progress)
+            return _ingest(db, capture, record, scratch, wait, progress)
         except (OSError, InputError):
             _require_admitted(db, capture.take, scratch)
             raise
@@ -118,7 +119,7 @@ def captured_subjects(folders: Iterable[str | Path]) -> list[str]:
 def _ingest(
     db: Database,
     capture: Capture,
-    asked: IngestParameters,
+    parameters: IngestParameters,
     scratch: Path,
     wait: float,
     progress: Progress | None,
@@ -136,7 +137,7 @@ def _ingest(
         with (
             one_blas_thread(),
             ingest_capture(
-                capture, asked, scratch=scratch.parent, progress=progress
+                capture, parameters, scratch=scratch.parent, progress=progress
             ) as tree,
         ):
             _discard_left(db, capture.take, scratch / NOTE)

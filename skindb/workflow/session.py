@@ -162,7 +162,7 @@ def _require_parameters(parameters: SessionParameters, needed: Iterable[str]) ->
     )
     for site in _names(parameters.sites):
         if not re.fullmatch(IDENTIFIER.pattern, site):
-            rule = f"a name {IDENTIFIER.said}"
+            rule = f"a name {IDENTIFIER.text}"
             faults.append(Fault("--sites", rule, repr(site), "correct it"))
             break
     for key, path in _given_files(parameters).items():
@@ -245,7 +245,7 @@ def _operator_faults(parameters: SessionParameters) -> list[Fault]:
     confirmed = parameters.confirm_screening
     real_lamp = parameters.base and not parameters.virtual
     if operator is not None and not re.fullmatch(IDENTIFIER.pattern, operator):
-        return [Fault("--operator", IDENTIFIER.said, repr(operator), "correct it")]
+        return [Fault("--operator", IDENTIFIER.text, repr(operator), "correct it")]
     if operator is None and (confirmed or real_lamp):
         option = "--confirm-screening" if confirmed else "--base-light"
         rule = "an operator must be responsible for it"

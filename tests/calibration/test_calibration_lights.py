@@ -10,9 +10,10 @@ import pytest
 from mirror import ball_outline_of, ball_picture
 
 from skindb.calibration.lights import calibrate_positions, positioned_dome
-from skindb.calibration.mirror_ball import Pinhole, ball_centre
+from skindb.calibration.mirror_ball import ball_centre
 from skindb.calibration.setup import read_calibration_frames, read_setup_dome
 from skindb.errors import InputError
+from skindb.format.dome import Pinhole
 
 RADIUS = 30.0
 LIGHTS = {

@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from skindb.calibration.mirror_ball import (
     Outline,
-    Pinhole,
     ball_outline,
     distant_light,
     highlight_centre,
@@ -19,6 +18,7 @@ from skindb.calibration.mirror_ball import (
     reprojection_error,
 )
 from skindb.errors import InputError
+from skindb.format.dome import Pinhole
 from skindb.geometry.camera import camera_centre, project
 
 PUBLISHED = Path("/work/shared/data/photometric/uw")

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from skindb.calibration.pixel_flags import DARK, OK, SATURATED
+from skindb.calibration.pixel_flags import DARK, DARK_SIGMA, OK, SATURATED
 from skindb.calibration.radiance import (
     FrameMerger,
     frame_merger,
     merge_exposures,
     radiance_floor,
-    usable_exposures,
+    read_sigma,
+    relative_exposure,
     vignette_gain,
 )
 from skindb.format.folder import read_capture
@@ -28,6 +30,18 @@ SENSOR = SensorRecord(
     electrons_per_dn=0.3,
 )
 SECONDS = (0.04, 0.005)
+
+
+def usable_exposures(frames, sensor):
+    """Number of exposures (h, w) in which no channel is at the white level and one is
+    above the dark level.
+    """
+    count = np.zeros(frames[0].shape[:2], np.uint8)
+    for frame in frames:
+        signal, slope = relative_exposure(frame, None, sensor)
+        lit = (signal > DARK_SIGMA * read_sigma(slope, sensor)).any(axis=-1)
+        count += lit & (frame < sensor.white).all(axis=-1)
+    return count
 
 
 def expose(radiance, seconds, rng, sensor=SENSOR):
@@ -355,7 +369,7 @@ def test_merge_exposures__has_no_halo_at_bright_edges():
     assert np.abs(z).max() < 5 / np.sqrt(600)
 
 
-def test_usable_exposures__counts_neither_dark_nor_saturated_ones():
+def test_frame_merger__counts_exposures_that_are_neither_dark_nor_saturated():
     levels = np.array([0.0, 0.5, 1.5, 3.0, 6.0, 12.0]) / BRACKETS[0]
     truth = np.broadcast_to(levels[None, :, None], (1, 6, 3))
     quiet = SensorRecord(
@@ -365,4 +379,8 @@ def test_usable_exposures__counts_neither_dark_nor_saturated_ones():
         np.rint(BLACK + np.minimum(truth * t, 1) * (WHITE - BLACK)).astype(np.uint16)
         for t in BRACKETS
     ]
-    assert usable_exposures(frames, quiet).tolist() == [[0, 4, 3, 2, 1, 0]]
+    camera = SimpleNamespace(sensor=quiet, colour_matrix=np.eye(3))
+    usable = np.zeros((1, 6), np.uint8)
+    FrameMerger(camera, BRACKETS).merge(frames, usable=usable)
+    assert usable.tolist() == [[0, 4, 3, 2, 1, 0]]
+    np.testing.assert_array_equal(usable, usable_exposures(frames, quiet))

@@ -194,9 +194,8 @@ def test_recover_response__refuses_what_tells_nothing(stack, seconds, match):
 def test_response_samples__are_flat_spread_and_unsaturated():
     rng = np.random.default_rng(7)
     stack = photographed(scene(rng), EIGHT, rng)
-    samples = response_samples(
-        stack, EIGHT, channel=1, levels=(BLACK, WHITE), count=400, block=4
-    )
+    green = (stack[..., 1] - float(BLACK)) / (WHITE - BLACK)
+    samples = response_samples(green, np.array(EIGHT), ResponseOptions(samples=400))
     assert samples.value[samples.usable].max() < 1
     assert (samples.usable.sum(axis=1) >= 2).all()
     mean = np.clip(samples.value, 0, 1).mean(axis=1)

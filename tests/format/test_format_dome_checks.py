@@ -13,7 +13,7 @@ import trimesh
 from sphere import RADIUS, half_sphere
 
 from skindb.errors import InputError
-from skindb.format.length_units import unit_fault
+from skindb.format.length_units import dome_unit_faults
 from skindb.geometry.clean import CleanMesh, clean_mesh
 from skindb.ingest import read_capture
 
@@ -146,12 +146,14 @@ def dome(pristine):
 
 
 def judged(dome, surface, *, sized=False):
-    return unit_fault("dome.json", dome, "scan", surface, sized=sized)
+    """The fault, or None."""
+    faults = dome_unit_faults("dome.json", dome, "scan", surface, sized=sized)
+    return next(iter(faults), None)
 
 
 @pytest.mark.parametrize("reach", [12.0, 20.0, 40.0])
 @pytest.mark.parametrize("centred", [False, True])
-def test_unit_fault__a_patch_of_skin_passes(dome, reach, centred):
+def test_dome_unit_faults__a_patch_of_skin_passes(dome, reach, centred):
     """Cut from the face where it lies, or a sample held into the middle of the dome."""
     surface = patch(reach)
     if centred:
@@ -172,7 +174,7 @@ def further(dome, factor):
     )
 
 
-def test_unit_fault__a_face_that_spans_a_ninth_of_the_pictures_passes_a_patch_far_less(
+def test_dome_unit_faults__a_face_that_spans_a_ninth_of_the_pictures_passes_a_patch_far_less(
     dome,
 ):
     vertices, faces = half_sphere()
@@ -186,12 +188,12 @@ def test_unit_fault__a_face_that_spans_a_ninth_of_the_pictures_passes_a_patch_fa
     )
 
 
-def test_unit_fault__a_person_in_a_large_dome_passes(dome):
+def test_dome_unit_faults__a_person_in_a_large_dome_passes(dome):
     vertices, faces = half_sphere()
     assert judged(further(dome, 5), clean_mesh(vertices * [3, 10, 2], faces)) is None
 
 
-def test_unit_fault__a_nose_whose_landmarks_tell_its_size_passes(dome):
+def test_dome_unit_faults__a_nose_whose_landmarks_tell_its_size_passes(dome):
     """Round, in the middle of its frame and small in the pictures as it is: a head in
     centimetres else.
     """
@@ -204,7 +206,7 @@ def test_unit_fault__a_nose_whose_landmarks_tell_its_size_passes(dome):
     assert judged(afar, replace(nose, vertices=nose.vertices + ahead)) is None
 
 
-def test_unit_fault__a_scan_round_a_camera_is_large_not_unseen(dome):
+def test_dome_unit_faults__a_scan_round_a_camera_is_large_not_unseen(dome):
     """A camera between the ears of an open scan: some of it lies behind, and no
     picture's side measures that.
     """
@@ -215,7 +217,7 @@ def test_unit_fault__a_scan_round_a_camera_is_large_not_unseen(dome):
 
 
 @pytest.mark.parametrize("how", ["turned away", "aside", "other side"])
-def test_unit_fault__no_camera_shows_the_scan(dome, how):
+def test_dome_unit_faults__no_camera_shows_the_scan(dome, how):
     vertices, faces = half_sphere()
     turn = np.diag([-1.0, 1, -1])
     aside = np.array([500.0 if how == "aside" else -500.0, 0, 0])

@@ -619,7 +619,7 @@ def test_capture_format__lists_every_key_that_is_read():
     )
     keys = set(
         re.findall(
-            r'\.(?:get|text|number|integer|array|gains|names|items|template)\(\s*"(\w+)"',
+            r'\.(?:get|has|object|text|number|integer|array|gains|names|items|template)\(\s*"(\w+)"',
             source,
         )
     )

@@ -15,8 +15,8 @@ from skindb.errors import InputError
 from skindb.format.scan_checks import (
     coincidence_faults,
     landmark_faults,
-    order_fault,
-    scan_fault,
+    order_faults,
+    scan_faults,
     swapped_faults,
 )
 from skindb.geometry.clean import CleanMesh, clean_mesh
@@ -246,12 +246,11 @@ def test_swapped_faults__a_slanting_pair_is_not_judged():
         ("brow_left", "nose_tip"),
     ],
 )
-def test_order_fault__names_exchanged_along_the_middle(one, other):
+def test_order_faults__names_exchanged_along_the_middle(one, other):
     for turn in rotations():
         points = {name: turn @ p for name, p in FACE.items()}
-        assert order_fault("f", points) is None
-        fault = order_fault("f", points | {one: points[other], other: points[one]})
-        assert fault is not None
+        assert order_faults("f", points) == []
+        (fault,) = order_faults("f", points | {one: points[other], other: points[one]})
         assert fault.rule == f"{one} must lie above {other} on a face"
 
 
@@ -266,19 +265,14 @@ def test_read_capture__names_exchanged_along_the_middle_are_one_fault(capture_fo
     ) in fault
 
 
-def test_order_fault__a_hanging_nose_passes_and_without_heights_nothing_is_judged():
+def test_order_faults__a_hanging_nose_passes_and_without_heights_nothing_is_judged():
     # above the tip of the nose
     hanging = FACE | {"subnasale": FACE["nose_tip"] + [0, 5, 0]}
-    assert order_fault("f", hanging) is None
-    assert (
-        order_fault("f", FACE | {"subnasale": FACE["nose_tip"] + [0, 12, 0]})
-        is not None
-    )
-    assert (
-        order_fault("f", {name: FACE[name] for name in ("brow_left", "nose_tip")})
-        is None
-    )
-    assert order_fault("f", {}) is None
+    assert order_faults("f", hanging) == []
+    assert order_faults("f", FACE | {"subnasale": FACE["nose_tip"] + [0, 12, 0]})
+    few = {name: FACE[name] for name in ("brow_left", "nose_tip")}
+    assert order_faults("f", few) == []
+    assert order_faults("f", {}) == []
 
 
 def test_doubled_faults__two_names_at_one_point(capture_folder):
@@ -296,13 +290,11 @@ def test_doubled_faults__two_names_at_one_point(capture_folder):
 
 
 @pytest.mark.parametrize("size", [15.0, 400.0, 1100.0])
-def test_scan_fault__a_patch_a_head_and_a_person_pass(size):
+def test_scan_faults__a_patch_a_head_and_a_person_pass(size):
     """Boxes of 22, 590 and 1620 mm across: only what is a unit away from any scan is refused."""
     ball = trimesh.creation.icosphere(1, radius=size / 2)
-    assert (
-        scan_fault("m", clean_mesh(np.asarray(ball.vertices), np.asarray(ball.faces)))
-        is None
-    )
+    surface = clean_mesh(np.asarray(ball.vertices), np.asarray(ball.faces))
+    assert scan_faults("m", surface) == []
 
 
 def move_camera(folder, index, eye):
