@@ -36,7 +36,6 @@ from skindb.errors import Fault, attempt, attempt_all, require
 from skindb.format.dome import CameraRecord, DomeRecord
 from skindb.schema import dataset
 
-Array = NDArray[np.float64]
 Values = dict[str, Any]
 Step = Callable[
     [CalibrationFrames, CameraFrames, CameraRecord], tuple[CameraRecord, Values]

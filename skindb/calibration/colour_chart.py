@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from skindb.errors import require
+from skindb.types import Float64, Mask
 
-Array = NDArray[np.float64]
 # the manufacturer's reference values, as in colour-science
 CHART = "ColorChecker24 - After November 2014"
 # usable patches for nine unknowns; three channels leave residuals for the standard
@@ -25,13 +25,13 @@ class ColourFit:
     patch that is not used has a NaN in the differences.
     """
 
-    matrix: Array
-    error: Array
-    delta_e_before: Array
-    delta_e_after: Array
+    matrix: Float64
+    error: Float64
+    delta_e_before: Float64
+    delta_e_after: Float64
 
 
-def chart_reference() -> Array:
+def chart_reference() -> Float64:
     """Linear sRGB (24, 3) of the ColorChecker under D65, row by row, by chromatic
     adaptation from D50.
     """
@@ -79,7 +79,7 @@ def fit_colour_matrix(
         f"{values.shape} and {target.shape}",
         "give the patches row by row",
     )
-    good: NDArray[np.bool_] = np.asarray(np.isfinite(values).all(axis=1))
+    good: Mask = np.asarray(np.isfinite(values).all(axis=1))
     white = int(target.sum(axis=1).argmax())
     usable = good.sum() >= MIN_PATCHES and good[white] and values[white, 1] > 0
     require(
@@ -104,7 +104,7 @@ def fit_colour_matrix(
     return ColourFit(solution.T / level, error / level, before, after)
 
 
-def _difference(measured: Array, expected: Array) -> Array:
+def _difference(measured: Float64, expected: Float64) -> Float64:
     """CIEDE2000 (n,) between linear sRGB colours (n, 3)."""
     import colour
 

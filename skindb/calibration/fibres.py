@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import ndimage, optimize
 
 from skindb.calibration.frame_checks import disagreement
@@ -19,10 +19,8 @@ from skindb.format.contact_probe import ProbeRecord
 from skindb.format.frames import Digests, Frame, read_frame, read_frames
 from skindb.limits import MAX_FIBRE_PIXELS
 from skindb.schema import dataset
+from skindb.types import Float64, Index, Mask
 
-Array = NDArray[np.float64]
-
-Index = NDArray[np.int64]
 # fraction of a fibre's pixels that may be missing in a channel (stuck ones): for a
 # fibre whose centre is 50 % above its mean brightness, the signal is then 0.5 % too
 # low, which is the default error of a gain
@@ -37,7 +35,7 @@ MARGIN = 2  # px around a spot over which its light is summed
 
 def placement_signal(
     probe: ProbeRecord, site: str, placement: str = "", digests: Digests | None = None
-) -> tuple[Array, Array]:
+) -> tuple[Float64, Float64]:
     """Signal per second (fibre, 3) and its standard error; NaN where pixels are
     saturated in every bracket.
     """
@@ -180,7 +178,7 @@ def calibrate_probe(flat: ProbeRecord) -> xr.Dataset:
     )
 
 
-def _green(flat: ProbeRecord, site: str) -> Array:
+def _green(flat: ProbeRecord, site: str) -> Float64:
     """Merged green channel (h, w) of one repeat; the brightest value where it is
     saturated in all brackets.
     """
@@ -222,8 +220,8 @@ class Spots:
     px; sorted by column, then row.
     """
 
-    centre: Array
-    radius: Array
+    centre: Float64
+    radius: Float64
 
 
 @dataclass(frozen=True)
@@ -232,9 +230,9 @@ class SpotOffsets:
     of the found spot (fibre,).
     """
 
-    offset: Array
-    radius_ratio: Array
-    order: NDArray[np.int64]
+    offset: Float64
+    radius_ratio: Float64
+    order: Index
 
 
 @dataclass(frozen=True)
@@ -243,8 +241,8 @@ class FibreGain:
     standard error (fibre, 3).
     """
 
-    gain: Array
-    error: Array
+    gain: Float64
+    error: Float64
 
 
 def find_fibres(picture: ArrayLike, *, count: int) -> Spots:
@@ -295,7 +293,7 @@ def find_fibres(picture: ArrayLike, *, count: int) -> Spots:
 
 
 def _measure(
-    grey: Array, spot: NDArray[np.bool_], box: tuple[slice, slice], dark: float
+    grey: Float64, spot: Mask, box: tuple[slice, slice], dark: float
 ) -> tuple[float, float, float]:
     """Column, row and radius of one spot, measured in its bounding box with a margin."""
     top, left = (max(side.start - MARGIN, 0) for side in box)

@@ -23,10 +23,10 @@ from skindb.format.dome import DomeRecord
 from skindb.format.frames import Digests, Frame, read_frame
 from skindb.format.json_file import MAX_MAGNITUDE
 from skindb.format.sensor import SensorRecord
+from skindb.types import Float64, Mask
 
 Array = NDArray[np.float32]
 
-Values = NDArray[np.float64]
 # of a frame, evenly spread: takes 1 % of the time to decode 10 megapixels
 MAX_COMPARED_PIXELS = 40_000
 # standard deviations of read noise above black, and relative exposure: the effect of
@@ -280,9 +280,7 @@ def highest_value(merger: FrameMerger, frames: Sequence[Frame]) -> tuple[float, 
     return highest, int((values == highest).sum()) >= minimum
 
 
-def level_notes(
-    dome: DomeRecord, highest: Values, clipped: NDArray[np.bool_]
-) -> list[str]:
+def level_notes(dome: DomeRecord, highest: Float64, clipped: Mask) -> list[str]:
     """Warnings about white levels that the photographs contradict.
 
     Parameters
@@ -496,7 +494,7 @@ def _alternatives(
             yield f"those of camera {name} match its photographs", other_dark[exposure]
 
 
-def _pattern(frame: Frame | Array, chosen: NDArray[np.bool_]) -> Array:
+def _pattern(frame: Frame | Array, chosen: Mask) -> Array:
     """Differences (n,) of chosen values (h, w - 2, 3) from both neighbours in their
     row, without outliers.
     """

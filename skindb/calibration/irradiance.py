@@ -9,7 +9,6 @@ from concurrent.futures import Executor
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skindb.calibration.frame_checks import checked_view
 from skindb.calibration.pixel_flags import OK
@@ -17,8 +16,7 @@ from skindb.calibration.radiance import FrameMerger
 from skindb.errors import attempt_all, require
 from skindb.format.dome import CameraRecord, DomeRecord, LightRecord, WhiteRecord
 from skindb.format.frames import Digests
-
-Array = NDArray[np.float64]
+from skindb.types import Float64, Index, Mask
 
 # of the half size: a disc inside the square, however the square is rotated
 TARGET_INTERIOR_FRACTION = 0.8
@@ -41,7 +39,7 @@ ROUNDS = 20
 MIN_USED = 0.5  # of the pixels; if more are in shadow, the median belongs to the shadow
 
 
-def light_falloff(light: LightRecord, points: Array) -> tuple[Array, Array]:
+def light_falloff(light: LightRecord, points: Float64) -> tuple[Float64, Float64]:
     """Squared distance (n,) mm2 of points (n, 3) from a light and its angular fall-off
     (n,) towards them.
     """
@@ -58,7 +56,7 @@ def light_intensities(
     mergers: Mapping[str, FrameMerger],
     pool: Executor,
     digests: Digests | None = None,
-) -> Array:
+) -> Float64:
     """Radiant intensity (light, 3) in radiance mm2: given, or I = pi L d^2 /
     (reflectance cos falloff) by the target.
 
@@ -75,7 +73,7 @@ def light_intensities(
             target_pixels(c, white) for c in dome.cameras if c.id in white.cameras
         ]
 
-    def intensity(light: LightRecord) -> Array:
+    def intensity(light: LightRecord) -> Float64:
         if light.intensity is not None:
             return light.intensity
         values = [np.zeros((0, 3))]
@@ -100,10 +98,10 @@ class Target:
     """Pixels of a camera that lie well inside the white target."""
 
     camera: str
-    at: NDArray[np.int64]  # (n,) index into the flattened picture
+    at: Index  # (n,) index into the flattened picture
     # (h, 2) first column in each row, and the one after the last
-    spans: NDArray[np.int64]
-    points: Array  # (n, 3) mm on the target
+    spans: Index
+    points: Float64  # (n, 3) mm on the target
 
 
 def target_pixels(camera: CameraRecord, white: WhiteRecord) -> Target:
@@ -125,7 +123,7 @@ def target_pixels(camera: CameraRecord, white: WhiteRecord) -> Target:
 
 def _target_rows(
     camera: CameraRecord, white: WhiteRecord, top: int, bottom: int
-) -> tuple[NDArray[np.bool_], Array]:
+) -> tuple[Mask, Float64]:
     """Mask (rows, width) of the pixels on the target in rows top to bottom - 1, and
     their points (n, 3) in mm.
     """
@@ -140,7 +138,7 @@ def _target_rows(
     return inside, points[inside]
 
 
-def robust_mean(values: Array) -> Array:
+def robust_mean(values: Float64) -> Float64:
     """Mean (c,) of values (n, c) without outliers; NaN if there are too few values."""
     usable = values[np.isfinite(values).all(axis=1)]
     if len(usable) < MIN_TARGET_PIXELS:
@@ -159,7 +157,7 @@ def _intensities(
     merger: FrameMerger,
     target: Target,
     digests: Digests | None,
-) -> Array:
+) -> Float64:
     """Intensity (m, 3) computed from each usable pixel of the target."""
     white = dome.white
     if white is None or not len(target.at):
@@ -185,7 +183,7 @@ def _intensities(
     return np.asarray(values, np.float64)
 
 
-def unevenness(values: Array) -> float:
+def unevenness(values: Float64) -> float:
     """Relative robust standard deviation of values (n, c) in the order of the pixels; 0
     if there are too few.
 
@@ -211,11 +209,11 @@ class TargetPixels:
     target.
     """
 
-    radiance: Array
-    points: Array
-    position: Array
-    axis: Array
-    normal: Array
+    radiance: Float64
+    points: Float64
+    position: Float64
+    axis: Float64
+    normal: Float64
     reflectance: float
 
 
@@ -229,8 +227,8 @@ class LightFit:
     dirty, `scatter` the relative standard deviation of these.
     """
 
-    intensity: Array
-    intensity_error: Array
+    intensity: Float64
+    intensity_error: Float64
     falloff: float
     falloff_error: float
     used: float
@@ -246,7 +244,7 @@ def position_sensitivity(target: TargetPixels, *, falloff: float) -> float:
     light. A target or a camera that lies elsewhere has the same effect.
     """
 
-    def mean(position: Array) -> float:
+    def mean(position: Float64) -> float:
         distance, lit, angle = _light_geometry(target, position)
         usable = (lit > MIN_COSINE) & (angle > MIN_COSINE)
         return float(
@@ -260,8 +258,8 @@ def position_sensitivity(target: TargetPixels, *, falloff: float) -> float:
 
 
 def _light_geometry(
-    target: TargetPixels, position: Array
-) -> tuple[Array, Array, Array]:
+    target: TargetPixels, position: Float64
+) -> tuple[Float64, Float64, Float64]:
     """Distance of the pixels (n,) from a light, and their cosines of incidence and of
     the angle to the axis of the light.
     """
@@ -316,7 +314,7 @@ def fit_light(target: TargetPixels, *, falloff: float | None = None) -> LightFit
     return _fit(value[good], slope[good], falloff)
 
 
-def _fit(value: Array, slope: Array, falloff: float | None) -> LightFit:
+def _fit(value: Float64, slope: Float64, falloff: float | None) -> LightFit:
     """Robust fit of logarithms (n, 3) over ln cosine (n,)."""
     inliers = np.ones(len(value), bool)
     exponent = falloff or 0.0

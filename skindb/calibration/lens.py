@@ -7,12 +7,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import optimize, special
 
 from skindb.errors import require
-
-Array = NDArray[np.float64]
+from skindb.types import Float64
 
 # px from the edge that are fitted; farther away the glare is no longer even
 EDGE_REACH_PX = 12.0
@@ -84,7 +83,7 @@ def fit_edge(picture: ArrayLike) -> EdgeFit:
     low, high = np.percentile(value, [5, 95])
     sign = 1.0 if np.corrcoef(column, value)[0, 1] > 0 else -1.0
 
-    def residual(p: Array) -> Array:
+    def residual(p: Float64) -> Float64:
         way = (column - p[0] - p[1] * row) / np.hypot(1, p[1])
         return np.asarray(p[3] + p[4] * special.ndtr(sign * way / p[2]) - value)
 
@@ -140,7 +139,7 @@ def veiling_glare(edge: EdgeFit, *, mean: float, contrast: float = 0.0) -> float
     return (edge.dark - contrast * edge.bright) / (mean * (1 - contrast))
 
 
-def _locate(grey: Array) -> tuple[float, float]:
+def _locate(grey: Float64) -> tuple[float, float]:
     """Column of the edge in the middle row, and its columns per row, from the steepest
     position in each row.
     """
@@ -177,8 +176,8 @@ class Vignette:
     `used` is the fraction of the finite pixels that are not outliers.
     """
 
-    coefficients: Array
-    covariance: Array
+    coefficients: Float64
+    covariance: Float64
     residual: float
     used: float
 

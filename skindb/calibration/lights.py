@@ -11,7 +11,6 @@ from functools import partial
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from skindb.calibration.frame_checks import checked_view
 from skindb.calibration.irradiance import (
@@ -44,8 +43,7 @@ from skindb.format.dome import (
 from skindb.format.frame_paths import CAMERA, LIGHT, filled
 from skindb.format.frames import read_frame
 from skindb.schema import dataset
-
-Array = NDArray[np.float64]
+from skindb.types import Float64, Mask
 
 # Standard error of a light relative to the target along each axis, chosen in advance
 # for a careful calibration. In generated captures with errors of 0.6 mm of lights and
@@ -148,7 +146,7 @@ class _View:
 
     merger: FrameMerger
     target: Target
-    beside: NDArray[np.bool_]
+    beside: Mask
     area: float
 
 
@@ -240,7 +238,7 @@ def calibrate_positions(dome: DomeRecord, ball: BallFrames) -> xr.Dataset:
         With every frame that cannot be read, and every light that is seen in fewer than two frames.
     """
     cameras = {camera.id: camera for camera in dome.cameras}
-    centres = dict[str, Array]()
+    centres = dict[str, Float64]()
     faults = list[Fault]()
     for place, circles in ball.outlines.items():
         views = [cameras[name] for name in circles]
@@ -287,8 +285,11 @@ def calibrate_positions(dome: DomeRecord, ball: BallFrames) -> xr.Dataset:
 
 
 def _rays(
-    dome: DomeRecord, ball: BallFrames, centres: Mapping[str, Array], light: LightRecord
-) -> Iterator[tuple[Array, Array]]:
+    dome: DomeRecord,
+    ball: BallFrames,
+    centres: Mapping[str, Float64],
+    light: LightRecord,
+) -> Iterator[tuple[Float64, Float64]]:
     """Points of the ball, and directions from them to the light, of all frames that
     show its highlight.
     """

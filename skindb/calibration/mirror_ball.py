@@ -8,13 +8,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from skindb.errors import require
 from skindb.format.dome import Pinhole
+from skindb.types import Float64
 
-Array = NDArray[np.float64]
 # of the contrast over the ball; pixels above it belong to the highlight
 HIGHLIGHT_FRACTION = 0.5
 # of the ball's area; a larger spot is a window or an overexposed frame
@@ -34,7 +34,7 @@ ROUNDS = 20
 class Outline:
     """Circle of a ball in a picture: centre (2,) column and row, and radius, in px."""
 
-    centre: Array
+    centre: Float64
     radius: float
 
 
@@ -44,7 +44,7 @@ class BallCentre:
     pictures; NaN for one camera.
     """
 
-    centre: Array
+    centre: Float64
     mismatch: float
 
 
@@ -54,9 +54,9 @@ class LightPosition:
     which each ray misses it.
     """
 
-    position: Array
-    covariance: Array
-    miss: Array
+    position: Float64
+    covariance: Float64
+    miss: Float64
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Reprojection:
     maximum in px; number of points.
     """
 
-    residual: Array
+    residual: Float64
     rms: float
     largest: float
     count: int
@@ -94,7 +94,7 @@ def ball_outline(mask: ArrayLike) -> Outline:
     return Outline(centre, radius)
 
 
-def highlight_centre(picture: ArrayLike, outline: Outline) -> Array:
+def highlight_centre(picture: ArrayLike, outline: Outline) -> Float64:
     """Column and row (2,) in px of the highlight on a ball: centroid of the largest bright spot.
 
     Parameters
@@ -142,7 +142,7 @@ def highlight_centre(picture: ArrayLike, outline: Outline) -> Array:
     return np.array([np.average(axis[near], weights=weight) for axis in (column, row)])
 
 
-def distant_light(outline: Outline, highlight: ArrayLike) -> Array:
+def distant_light(outline: Outline, highlight: ArrayLike) -> Float64:
     """Unit direction (3,) to a distant light seen by a distant camera: x right, y up, z
     to the viewer.
 
@@ -165,7 +165,7 @@ def distant_light(outline: Outline, highlight: ArrayLike) -> Array:
 
 def reflected_ray(
     camera: Pinhole, ball: ArrayLike, radius: float, highlight: ArrayLike
-) -> tuple[Array, Array]:
+) -> tuple[Float64, Float64]:
     """Point (3,) mm of the ball at a highlight, and the unit direction (3,) from it to the light.
 
     Parameters
@@ -227,7 +227,7 @@ def ball_centre(
     """
     turn = np.linspace(0, 2 * np.pi, OUTLINE_POINTS, endpoint=False)
     around = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
-    directions = list[Array]()
+    directions = list[Float64]()
     distances = list[float]()
     for camera, circle in zip(cameras, np.asarray(outlines, np.float64), strict=True):
         sight = camera.rays(circle[:2] + circle[2] * around)

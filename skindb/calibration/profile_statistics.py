@@ -7,12 +7,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import stats
 
 from skindb.errors import require
-
-Array = NDArray[np.float64]
+from skindb.types import Float64, Mask
 
 # the mean and two harmonics have five unknowns; one degree of freedom remains
 MIN_AZIMUTHS = 6
@@ -38,16 +37,16 @@ class Isotropy:
     pressure of the probe. `distances` (fibre,) marks the distances that were used.
     """
 
-    slope: Array
-    slope_error: Array
-    decay: Array
-    p_value: Array
-    amplitude: Array
-    direction: Array
-    anisotropy: Array
-    anisotropy_error: Array
-    shift: Array
-    distances: NDArray[np.bool_]
+    slope: Float64
+    slope_error: Float64
+    decay: Float64
+    p_value: Float64
+    amplitude: Float64
+    direction: Float64
+    anisotropy: Float64
+    anisotropy_error: Float64
+    shift: Float64
+    distances: Mask
 
 
 def compare_azimuths(
@@ -122,14 +121,14 @@ def compare_azimuths(
     )
 
 
-def _clear_fibres(profile: Array, sigma: Array) -> NDArray[np.bool_]:
+def _clear_fibres(profile: Float64, sigma: Float64) -> Mask:
     """Fibres (fibre,) whose signal is clear of noise in all profiles and channels."""
     with np.errstate(invalid="ignore"):
         clear = (profile > 0) & (profile > MIN_SIGNAL_TO_NOISE * sigma) & (sigma >= 0)
     return np.asarray(clear.all(axis=(0, 2)))
 
 
-def _slopes(log: Array, sigma: Array, r: Array) -> tuple[Array, Array]:
+def _slopes(log: Float64, sigma: Float64, r: Float64) -> tuple[Float64, Float64]:
     """Decay -d ln (r^2 R) / dr (azimuth, 3) by weighted lines over r, and its variance.
 
     All azimuths have the same weights, so that the mean profile, which is not a
@@ -142,7 +141,7 @@ def _slopes(log: Array, sigma: Array, r: Array) -> tuple[Array, Array]:
 
 
 def _harmonics(
-    slope: Array, variance: Array, phi: Array
+    slope: Float64, variance: Float64, phi: Float64
 ) -> tuple[float, float, float, float]:
     """Amplitude of the first harmonic; amplitude, direction and error of the second one."""
     design = np.stack(
@@ -177,11 +176,11 @@ class Repeatability:
     scatter of the placements. Fibres without a clear signal are NaN.
     """
 
-    level: Array
-    shape: Array
-    levels: Array
-    mean: Array
-    error: Array
+    level: Float64
+    shape: Float64
+    levels: Float64
+    mean: Float64
+    error: Float64
 
 
 @dataclass(frozen=True)
@@ -190,10 +189,10 @@ class Trend:
     value and flag.
     """
 
-    slope: Array
-    error: Array
-    p_value: Array
-    flag: NDArray[np.bool_]
+    slope: Float64
+    error: Float64
+    p_value: Float64
+    flag: Mask
 
 
 def placement_variance(value: ArrayLike, error: ArrayLike) -> Repeatability:

@@ -19,9 +19,9 @@ from skindb.format.dome import CameraRecord, DomeRecord
 from skindb.format.frame_paths import filled
 from skindb.format.frames import Digests, Frame, read_frames
 from skindb.format.sensor import SensorRecord
+from skindb.types import Index
 
 Image = NDArray[np.float32]
-Spans = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class FrameMerger:
     def merge(
         self,
         frames: list[Frame],
-        spans: Spans | None = None,
+        spans: Index | None = None,
         *,
         usable: NDArray[np.uint8] | None = None,
     ) -> tuple[Image, NDArray[np.uint8]]:

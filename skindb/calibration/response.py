@@ -10,8 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from skindb.errors import Fault, InputError, require
 from skindb.files import private_file
-
-Array = NDArray[np.float64]
+from skindb.types import Float64, Index, Mask
 
 STACK = "the exposure stack"
 # value at which the knots change from even steps to even ratios: below it sensors and
@@ -75,11 +74,11 @@ class Response:
     (3,) is False where the fit fell somewhere, and the table is its running maximum.
     """
 
-    table: Array
-    residual: Array
-    covered: Array
-    samples: NDArray[np.int64]
-    was_rising: NDArray[np.bool_]
+    table: Float64
+    residual: Float64
+    covered: Float64
+    samples: Index
+    was_rising: Mask
 
     @property
     def nonlinearity(self) -> float:
@@ -181,25 +180,25 @@ def write_response(path: Path, response: Response) -> None:
     )
 
 
-def _place(value: Array) -> Array:
+def _place(value: Float64) -> Float64:
     """Coordinate in which the knots are evenly spaced, 0 at black and 1 at white."""
     return np.asarray(np.arcsinh(value / TOE) / np.arcsinh(1 / TOE))
 
 
-def _curve(value: Array, log_ratio: Array, knots: int) -> Array:
+def _curve(value: Float64, log_ratio: Float64, knots: int) -> Float64:
     """Exposure (n,) of values (n,), up to a factor."""
     ratio = np.interp(_place(value), np.linspace(0, 1, knots), log_ratio)
     return value * np.exp(ratio)
 
 
-def _rising(curve: Array) -> Array:
+def _rising(curve: Float64) -> Float64:
     """The running maximum of a curve, which rises slightly where the curve falls."""
     return np.asarray(np.maximum.accumulate(curve) + MIN_RISE * np.arange(len(curve)))
 
 
 def _fit_channel(
     samples: ResponseSamples, options: ResponseOptions
-) -> tuple[Array, float, int]:
+) -> tuple[Float64, float, int]:
     """Log ratio of exposure to value at the knots, weighted residual, and number of
     samples that did not move.
     """
@@ -210,7 +209,7 @@ def _fit_channel(
     return _fit_values(samples, value, options)
 
 
-def _mean_exposure_value(pixels: Array, log_ratio: Array, knots: int) -> Array:
+def _mean_exposure_value(pixels: Float64, log_ratio: Float64, knots: int) -> Float64:
     """Value (sample, exposure) of the mean exposure of the pixels of each block, by a
     preliminary response.
 
@@ -227,8 +226,8 @@ def _mean_exposure_value(pixels: Array, log_ratio: Array, knots: int) -> Array:
 
 
 def _fit_values(
-    samples: ResponseSamples, value: Array, options: ResponseOptions
-) -> tuple[Array, float, int]:
+    samples: ResponseSamples, value: Float64, options: ResponseOptions
+) -> tuple[Float64, float, int]:
     """The fit to given values (sample, exposure) of the samples."""
     chosen = np.ones(len(value), bool)
     for _ in range(ROUNDS):
@@ -244,10 +243,10 @@ def _fit_values(
 
 def _solve(
     samples: ResponseSamples,
-    value: Array,
-    chosen: NDArray[np.bool_],
+    value: Float64,
+    chosen: Mask,
     options: ResponseOptions,
-) -> tuple[Array, Array]:
+) -> tuple[Float64, Float64]:
     """Log ratios (knot,) of the chosen samples and weighted root mean square misfit
     (sample,) of all.
     """
@@ -288,18 +287,18 @@ class ResponseSamples:
     (exposure,).
     """
 
-    pixels: Array
-    usable: NDArray[np.bool_]
-    seconds: Array
+    pixels: Float64
+    usable: Mask
+    seconds: Float64
 
     @property
-    def value(self) -> Array:
+    def value(self) -> Float64:
         """Mean value (sample, exposure) of each block."""
         return np.asarray(self.pixels.mean(axis=-1))
 
 
 def response_samples(
-    values: Array, times: Array, options: ResponseOptions
+    values: Float64, times: Float64, options: ResponseOptions
 ) -> ResponseSamples:
     """Choose flat blocks of pixels that are spread over all brightnesses.
 
@@ -337,7 +336,7 @@ def response_samples(
 
 
 def _require_stack(
-    frames: NDArray[np.generic], times: Array, levels: tuple[float, float], block: int
+    frames: NDArray[np.generic], times: Float64, levels: tuple[float, float], block: int
 ) -> None:
     """Report every fault of the arguments at once."""
     faults = list[Fault]()

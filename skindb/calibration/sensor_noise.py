@@ -7,12 +7,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from skindb.errors import require
-
-Array = NDArray[np.float64]
+from skindb.types import Float64, Mask
 
 PAIRS = "pairs of flat frames"
 MIN_PAIRS = 3  # pairs of different brightness
@@ -41,10 +40,10 @@ class NoiseModel:
     electrons_per_dn_error: float
     read_noise: float
     read_noise_error: float
-    covariance: Array
+    covariance: Float64
     chi_square: float
-    mean: Array
-    variance: Array
+    mean: Float64
+    variance: Float64
 
 
 def fit_noise(
@@ -129,7 +128,7 @@ def fit_noise(
     )
 
 
-def _line(x: Array, y: Array, count: int) -> tuple[Array, Array, float]:
+def _line(x: Float64, y: Float64, count: int) -> tuple[Float64, Float64, float]:
     """Offset and slope of variances y of `count` values over means x, their covariance,
     and chi-squared per degree of freedom.
     """
@@ -150,9 +149,9 @@ class DarkFrame:
     values of the file.
     """
 
-    mean: Array
-    error: Array
-    defect: NDArray[np.bool_]
+    mean: Float64
+    error: Float64
+    defect: Mask
 
 
 def average_dark(frames: ArrayLike) -> DarkFrame:
@@ -191,7 +190,7 @@ def average_dark(frames: ArrayLike) -> DarkFrame:
     return DarkFrame(mean, spread / np.sqrt(len(values)), defect)
 
 
-def _outliers(picture: Array) -> NDArray[np.bool_]:
+def _outliers(picture: Float64) -> Mask:
     """Mask (h, w, 3) of the pixels that deviate from their neighbourhood."""
     apart = picture - ndimage.median_filter(
         picture, size=(NEIGHBOURHOOD, NEIGHBOURHOOD, 1), mode="nearest"

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError, attempt, require
 from skindb.format.contact_probe import ProbeRecord, read_probe
@@ -30,8 +29,8 @@ from skindb.format.frame_paths import (
 from skindb.format.frames import Frame, read_frames
 from skindb.format.json_file import read_json, shown
 from skindb.limits import MAX_BALL_PLACES, MAX_KNOWN_POINTS
+from skindb.types import Float64
 
-Array = NDArray[np.float64]
 FILE = "dome/calibration.json"
 MAX_BALL_RADIUS_MM = 1_000.0  # mm; mirror balls have 5 to 200
 PLACE = "place"
@@ -133,15 +132,15 @@ class CameraFrames:
     white: str  # chart only
     radius: float  # chart only
     contrast: float  # edge only
-    places: Mapping[str, Array]
+    places: Mapping[str, Float64]
 
 
 @dataclass(frozen=True)
 class KnownPoints:
     """Points (point, 3) mm of known position, and pixels (point, 2) at which a camera sees them."""
 
-    position: Array
-    pixel: Array
+    position: Float64
+    pixel: Float64
 
 
 @dataclass(frozen=True)
@@ -155,7 +154,7 @@ class BallFrames:
     folder: Path
     frames: str
     radius: float
-    outlines: Mapping[str, Mapping[str, Array]]
+    outlines: Mapping[str, Mapping[str, Float64]]
 
 
 @dataclass(frozen=True)
@@ -266,7 +265,7 @@ def _template(dome: DomeRecord, item: Fields, key: str, needed: set[str]) -> str
 
 def _places(
     dome: DomeRecord, item: Fields, key: str, shape: tuple[int, int]
-) -> dict[str, Array]:
+) -> dict[str, Float64]:
     """Position of the target in the picture of every camera that sees it."""
     by_camera = item.object(key, {})
     cameras = _named_cameras(dome, by_camera)
@@ -313,7 +312,7 @@ def _ball_frames(dome: DomeRecord, item: Fields) -> BallFrames:
     """The key "ball"."""
     template = _template(dome, item, "frames", {PLACE, LIGHT, CAMERA})
     places = item.object("outlines")
-    outlines = dict[str, dict[str, Array]]()
+    outlines = dict[str, dict[str, Float64]]()
     if places.at_most(MAX_BALL_PLACES, "places of the ball"):
         for place in places.data:
             outlines[place] = _outlines(dome, places.object(place))
@@ -322,9 +321,9 @@ def _ball_frames(dome: DomeRecord, item: Fields) -> BallFrames:
     return BallFrames(dome.folder, template, radius, outlines)
 
 
-def _outlines(dome: DomeRecord, circles: Fields) -> dict[str, Array]:
+def _outlines(dome: DomeRecord, circles: Fields) -> dict[str, Float64]:
     """Outline of the ball in each camera that sees it."""
-    outlines = dict[str, Array]()
+    outlines = dict[str, Float64]()
     for name, camera in _named_cameras(dome, circles).items():
         circle = circles.array(name, (3,))
         column, row, radius = circle

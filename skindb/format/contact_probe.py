@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skindb.errors import Fault
 from skindb.format.fields import IDENTIFIER, Fields
@@ -32,8 +31,8 @@ from skindb.format.frames import FrameKind, frame_size, header_faults, is_linear
 from skindb.format.json_file import MAX_MAGNITUDE, is_number, shown
 from skindb.format.sensor import SensorRecord, read_sensor
 from skindb.limits import MAX_FIBRES, MAX_PLACEMENTS, MAX_PRESSURE_SAMPLES, MAX_SITES
+from skindb.types import Float64
 
-Array = NDArray[np.float64]
 # mm, of the farthest fibre: light does not scatter within a tenth of a millimetre
 FIBRE_DISTANCES_MM = (0.1, 300.0)
 MAX_FIBRE_RADIUS_MM = 10.0  # mm; fibres of probes have 0.02 to 1
@@ -48,7 +47,7 @@ GAIN_ERROR = 0.005  # relative error of a fibre's gain, where the file does not 
 PRESSURE_RULE = (
     "must be a pressure in kPa, or a list of [seconds, kPa] with rising seconds"
 )
-Log = NDArray[np.float64]  # (n, 2) seconds since the start of the placement, kPa
+Log = Float64  # (n, 2) seconds since the start of the placement, kPa
 
 
 @dataclass(frozen=True)
@@ -59,19 +58,19 @@ class ProbeRecord:
     sites: tuple[str, ...]
     # names of the placements at each site; ("",) for a single one
     placements: Mapping[str, tuple[str, ...]]
-    distance: Array  # (fibre,) mm
-    azimuth: Array  # (fibre,) degrees about the source fibre; NaN if unknown
-    centre: Array  # (fibre, 2) px
-    radius: Array  # (fibre,) px
+    distance: Float64  # (fibre,) mm
+    azimuth: Float64  # (fibre,) degrees about the source fibre; NaN if unknown
+    centre: Float64  # (fibre, 2) px
+    radius: Float64  # (fibre,) px
     exposures: Mapping[str, float]
     frames: str
-    gain: Array  # (fibre, 3)
+    gain: Float64  # (fibre, 3)
     gain_error: float  # relative, of each
     face: float  # radius of a fibre in mm; 0 if unknown
     scale: float | None
     sensor: SensorRecord
     fibres: tuple[str, ...]
-    pressure: Mapping[tuple[str, str], Array]  # (site, placement) -> (n, 2) s, kPa
+    pressure: Mapping[tuple[str, str], Float64]  # (site, placement) -> (n, 2) s, kPa
     file: Path  # probe.json
 
     def frame(self, site: str, exposure: str, placement: str = "") -> Path:
@@ -249,7 +248,7 @@ def _require_separate_fibres(fields: Fields, probe: ProbeRecord) -> None:
     _require_separate_discs(fields, probe.centre, probe.radius)
 
 
-def _require_separate_discs(fields: Fields, centre: Array, radius: Array) -> None:
+def _require_separate_discs(fields: Fields, centre: Float64, radius: Float64) -> None:
     """Require discs (n, 2) and (n,) px that do not overlap; the fault names the pair
     that overlaps most.
     """
@@ -266,7 +265,7 @@ def _require_separate_discs(fields: Fields, centre: Array, radius: Array) -> Non
         fields.fault("fibres", "fibres must not overlap in the picture", finding, cure)
 
 
-def _require_even_gains(fields: Fields, gain: Array) -> None:
+def _require_even_gains(fields: Fields, gain: Float64) -> None:
     """Require gains (n, 3) near the median of their channel."""
     ratio = gain / np.median(gain, axis=0)
     rule = (

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from skindb.format.fields import IDENTIFIER, REQUIRED, Fields, zoned_time
 from skindb.format.frame_paths import (
@@ -35,8 +35,8 @@ from skindb.limits import (
     MAX_LIGHTS,
     MAX_SEQUENCE_STEPS,
 )
+from skindb.types import Float64, Index
 
-Array = NDArray[np.float64]
 ROTATION_TOLERANCE = 1e-4  # of R R^T - 1: five digits in the file
 MAX_DISC_RADIUS_MM = 2_000.0  # mm: the largest soft boxes have a radius of 1 m
 # exponent of the cosine: a narrow spot, half as bright at 1.5 degrees from the axis
@@ -58,25 +58,25 @@ VIGNETTE_STEPS = 1000
 class Pinhole:
     """Projection of a camera: `x_cam = R x + t`, distortion k1 k2 p1 p2 k3."""
 
-    K: Array  # (3, 3) px
-    R: Array  # (3, 3)
-    t: Array  # (3,) mm
-    distortion: Array  # (5,)
+    K: Float64  # (3, 3) px
+    R: Float64  # (3, 3)
+    t: Float64  # (3,) mm
+    distortion: Float64  # (5,)
 
     @property
-    def centre(self) -> Array:
+    def centre(self) -> Float64:
         """Centre of projection (3,) in mm."""
         return np.asarray(camera_centre(self.R, self.t), np.float64)
 
-    def project(self, points: ArrayLike) -> Array:
+    def project(self, points: ArrayLike) -> Float64:
         """Pixels (..., 2) of points (..., 3) in mm; NaN behind the camera."""
         return project(points, self.K, self.R, self.t, self.distortion)[0]
 
-    def rays(self, pixels: ArrayLike) -> Array:
+    def rays(self, pixels: ArrayLike) -> Float64:
         """Unit directions (..., 3) through pixels (..., 2)."""
         return pixel_rays(pixels, self.K, self.R, self.distortion)
 
-    def pixel_width(self, point: Array) -> float:
+    def pixel_width(self, point: Float64) -> float:
         """Width [mm] of a pixel at the distance of a point."""
         distance = float(np.linalg.norm(self.centre - point))
         return distance / float(np.sqrt(self.K[0, 0] * self.K[1, 1]))
@@ -90,8 +90,8 @@ class CameraRecord(Pinhole):
     width: int
     height: int
     sensor: SensorRecord
-    colour_matrix: Array
-    vignette: Array  # a2 a4 a6
+    colour_matrix: Float64
+    vignette: Float64  # a2 a4 a6
 
 
 @dataclass(frozen=True)
@@ -99,10 +99,10 @@ class LightRecord:
     """One light; if its intensity is None, the white target determines it."""
 
     id: str
-    position: Array
+    position: Float64
     disc_radius: float
-    intensity: Array | None
-    axis: Array
+    intensity: Float64 | None
+    axis: Float64
     falloff: float
 
 
@@ -112,8 +112,8 @@ class WhiteRecord:
 
     frames: str
     reflectance: float
-    point: Array
-    normal: Array
+    point: Float64
+    normal: Float64
     half_size: float
     cameras: tuple[str, ...]
 
@@ -124,9 +124,9 @@ class SequenceRecord:
 
     light: tuple[str, ...]  # id of the light of each step
     exposure: tuple[str, ...]
-    on: Array  # (step,) s since the first light went on
-    off: Array  # (step,) s
-    triggers: NDArray[np.int64]  # (step,) number of trigger pulses
+    on: Float64  # (step,) s since the first light went on
+    off: Float64  # (step,) s
+    triggers: Index  # (step,) number of trigger pulses
 
 
 @dataclass(frozen=True)
@@ -272,7 +272,9 @@ def _size(item: Fields) -> tuple[int, int]:
     return 1, 1
 
 
-def _require_light(item: Fields, vignette: Array, centre: Array, size: Array) -> None:
+def _require_light(
+    item: Fields, vignette: Float64, centre: Float64, size: Float64
+) -> None:
     """Require a vignette within limits: a polynomial fitted to the centre alone may be
     negative at the corners.
     """
@@ -309,7 +311,7 @@ def _light(item: Fields) -> LightRecord:
     )
 
 
-def _direction(item: Fields, key: str, default: Any = REQUIRED) -> Array:
+def _direction(item: Fields, key: str, default: Any = REQUIRED) -> Float64:
     """A unit vector (3,)."""
     vector = item.array(key, (3,), default=default)
     length = np.linalg.norm(vector)
@@ -438,7 +440,7 @@ def _seconds(step: Fields, key: str) -> float:
     return 0.0
 
 
-def _require_distortion(item: Fields, lens: Array, K: Array, size: Array) -> None:
+def _require_distortion(item: Fields, lens: Float64, K: Float64, size: Float64) -> None:
     """Require a distortion k1 k2 p1 p2 k3 that is small enough at the corners of the
     picture.
     """

@@ -13,7 +13,6 @@ from string import Formatter
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skindb.errors import Fault
 from skindb.format.json_file import CURE, MAX_MAGNITUDE, is_number, short, shown
@@ -23,6 +22,7 @@ from skindb.limits import (
     MAX_NAMED_UNKNOWN_KEYS,
     MAX_TEXT_CHARACTERS,
 )
+from skindb.types import Float64
 
 REQUIRED: Any = object()
 FEWER = "remove those that are not needed"
@@ -198,15 +198,13 @@ class Fields:
         *,
         default: Any = REQUIRED,
         fallback: Any = 1.0,
-    ) -> NDArray[np.float64]:
+    ) -> Float64:
         """Finite numbers of exactly this shape; `fallback` if they are faulty."""
         value = self.get(key, default)
         array = None if value is None else self._array(key, value, shape)
         return np.full(shape, fallback, np.float64) if array is None else array
 
-    def _array(
-        self, key: str, value: Any, *shapes: tuple[int, ...]
-    ) -> NDArray[np.float64] | None:
+    def _array(self, key: str, value: Any, *shapes: tuple[int, ...]) -> Float64 | None:
         if not any(_has_shape(value, shape) for shape in shapes):
             sizes = " or ".join(" x ".join(map(str, shape)) for shape in shapes)
             self.fault(key, f"must be {sizes} numbers", shown(value))
@@ -221,7 +219,7 @@ class Fields:
         self.fault(key, rule, shown(value))
         return None
 
-    def gains(self, key: str, count: int) -> NDArray[np.float64]:
+    def gains(self, key: str, count: int) -> Float64:
         """Positive factors, one per element or one per element and channel, as (count,
         3); default 1.
         """

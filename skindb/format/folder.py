@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError, attempt
 from skindb.format.contact_probe import ProbeRecord, read_probe
@@ -56,8 +55,9 @@ from skindb.geometry.clean import CleanMesh, clean_mesh
 from skindb.geometry.scan import Crop, Scan, crop_faces, read_scan
 from skindb.limits import MAX_FRAMES, MAX_OBJECT_KEYS, MAX_REGIONS
 from skindb.schema.cohort import imitates_column
+from skindb.types import Float64, Index
 
-Point = NDArray[np.float64]  # (3,) mm
+Point = Float64  # (3,) mm
 FORMAT = "skindb-capture"
 VERSIONS = (1, 2)
 OVERRIDE = ("screened", "consented", "eyes_closed")  # what the operator confirms
@@ -86,7 +86,7 @@ class Capture:
     scan: Scan
     surface: CleanMesh
     landmarks: Mapping[str, Point]
-    regions: Mapping[str, NDArray[np.int64]]  # vertices of the scan
+    regions: Mapping[str, Index]  # vertices of the scan
     dome: DomeRecord | None
     probe: ProbeRecord | None
     json_files: tuple[Path, ...]
@@ -456,7 +456,7 @@ class _Reader:
 
     def _regions(
         self, scan: Scan | None, surface: CleanMesh | None
-    ) -> dict[str, NDArray[np.int64]]:
+    ) -> dict[str, Index]:
         name = self.fields.get("regions", None)
         if name is not None and not str(name).lower().endswith(".json"):
             path = self._path("regions")
@@ -478,7 +478,7 @@ class _Reader:
                 f"`{WHOLE_SURFACE}` is the name of the entire surface in every report"
             )
             fields.fault(WHOLE_SURFACE, rule, "a region of that name", "rename it")
-        regions = dict[str, NDArray[np.int64]]()
+        regions = dict[str, Index]()
         for name in fields.data:
             vertices = _vertices(fields, name, len(scan.vertices))
             if vertices is not None:
@@ -517,7 +517,7 @@ class _Reader:
         return dome
 
     def _require_sites(
-        self, landmarks: Mapping[str, Any], regions: Mapping[str, NDArray[np.int64]]
+        self, landmarks: Mapping[str, Any], regions: Mapping[str, Index]
     ) -> None:
         """Check that every site of the probe has a position: a landmark, or a non-empty
         region of its name.
@@ -540,7 +540,7 @@ class _Reader:
                 self.faults.append(Fault(place, rule, "none", cure))
 
 
-def _middles(scan: Scan, regions: Mapping[str, NDArray[np.int64]]) -> dict[str, Point]:
+def _middles(scan: Scan, regions: Mapping[str, Index]) -> dict[str, Point]:
     """Centres of the regions."""
     return {
         name: scan.vertices[ids].mean(axis=0)
@@ -549,7 +549,7 @@ def _middles(scan: Scan, regions: Mapping[str, NDArray[np.int64]]) -> dict[str, 
     }
 
 
-def _vertices(fields: Fields, name: str, count: int) -> NDArray[np.int64] | None:
+def _vertices(fields: Fields, name: str, count: int) -> Index | None:
     """The distinct vertex numbers of one region; None and a fault if they are not
     vertices of the scan.
     """

@@ -11,7 +11,6 @@ from itertools import product
 from math import inf, log
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skindb.errors import Fault
 from skindb.format.dome import CameraRecord, DomeRecord
@@ -29,8 +28,7 @@ from skindb.format.scan_checks import (
 from skindb.geometry.clean import CleanMesh
 from skindb.geometry.mesh import closest_on_mesh, face_crosses, winding_number
 from skindb.geometry.scan import Scan
-
-Array = NDArray[np.float64]
+from skindb.types import Float64
 
 SCAN = "scan"
 LANDMARKS = "landmarks"
@@ -82,8 +80,8 @@ class Lengths:
     """
 
     scan: Scan
-    landmarks: Mapping[str, Array]
-    middles: Mapping[str, Array]
+    landmarks: Mapping[str, Float64]
+    middles: Mapping[str, Float64]
     dome: DomeRecord | None
 
     @cached_property
@@ -101,7 +99,7 @@ class Lengths:
             sizes[LIGHTS] = self.distance([x.position for x in self.dome.lights])
         return sizes
 
-    def distance(self, positions: list[Array], factor: float = 1.0) -> float:
+    def distance(self, positions: list[Float64], factor: float = 1.0) -> float:
         """Median distance from the centre of the scan of positions times a factor."""
         away = factor * np.array(positions) - self.scan.vertices.mean(axis=0)
         return float(np.median(np.linalg.norm(away, axis=1)))
@@ -301,7 +299,7 @@ def dome_unit_faults(
     return []
 
 
-def _inside(surface: CleanMesh, point: Array) -> bool:
+def _inside(surface: CleanMesh, point: Float64) -> bool:
     vertices = surface.vertices
     if not ((point > vertices.min(axis=0)) & (point < vertices.max(axis=0))).all():
         return False
@@ -310,7 +308,7 @@ def _inside(surface: CleanMesh, point: Array) -> bool:
 
 
 def picture_span(
-    camera: CameraRecord, vertices: Array, *, factor: float = 1.0
+    camera: CameraRecord, vertices: Float64, *, factor: float = 1.0
 ) -> float | None:
     """Fraction of the picture's side that the scan spans; None if it is outside the
     picture or behind the camera.

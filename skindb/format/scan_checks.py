@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from skindb.errors import Fault
 from skindb.geometry.clean import CleanMesh
 from skindb.geometry.mesh import closest_on_mesh, vertex_normals
 from skindb.geometry.scan import Scan
+from skindb.types import Float64
 
-Array = NDArray[np.float64]
 UNITS = {
     "metres": 1000.0,
     "inches": 25.4,
@@ -67,7 +66,7 @@ def scan_faults(where: str, surface: CleanMesh) -> list[Fault]:
     return [Fault(where, rule, finding, cure)]
 
 
-def face_faults(where: str, points: Mapping[str, Array]) -> list[Fault]:
+def face_faults(where: str, points: Mapping[str, Float64]) -> list[Fault]:
     """Fault of a face that is too large or too small to be in mm, by its landmarks or
     the centres of its regions.
     """
@@ -83,7 +82,7 @@ def face_faults(where: str, points: Mapping[str, Array]) -> list[Fault]:
     return [Fault(where, rule, f"{height:.3g} mm", cure)]
 
 
-def face_height(points: Mapping[str, Array]) -> float | None:
+def face_height(points: Mapping[str, Float64]) -> float | None:
     """Distance [mm] between the centres of the lower and the upper landmarks; None
     without landmarks of both.
     """
@@ -91,7 +90,9 @@ def face_height(points: Mapping[str, Array]) -> float | None:
     return None if up is None else float(np.linalg.norm(up))
 
 
-def landmark_faults(where: str, points: Mapping[str, Array], scan: Scan) -> list[Fault]:
+def landmark_faults(
+    where: str, points: Mapping[str, Float64], scan: Scan
+) -> list[Fault]:
     """Faults of landmarks that are not on the scan."""
     rule = f"a landmark must lie within {LANDMARK_REACH:g} mm of the scan"
     return [
@@ -101,7 +102,9 @@ def landmark_faults(where: str, points: Mapping[str, Array], scan: Scan) -> list
     ]
 
 
-def _distances(points: Mapping[str, Array], mesh: Scan | CleanMesh) -> dict[str, float]:
+def _distances(
+    points: Mapping[str, Float64], mesh: Scan | CleanMesh
+) -> dict[str, float]:
     """Distance [mm] of each point from a mesh."""
     positions = np.array([*points.values()]).reshape(-1, 3)
     distances = closest_on_mesh(mesh.vertices, mesh.faces, positions)[2]
@@ -109,7 +112,7 @@ def _distances(points: Mapping[str, Array], mesh: Scan | CleanMesh) -> dict[str,
 
 
 def discarded_piece_faults(
-    where: str, points: Mapping[str, Array], surface: CleanMesh
+    where: str, points: Mapping[str, Float64], surface: CleanMesh
 ) -> list[Fault]:
     """Fault of landmarks on a component of the scan that cleaning removed, because
     another one is larger.
@@ -127,7 +130,7 @@ def discarded_piece_faults(
     return [Fault(where, rule, finding, cure)]
 
 
-def coincidence_faults(where: str, points: Mapping[str, Array]) -> list[Fault]:
+def coincidence_faults(where: str, points: Mapping[str, Float64]) -> list[Fault]:
     """Faults of landmarks at the same point."""
     names = [*points]
     tree = cKDTree(np.array([*points.values()]).reshape(-1, 3))
@@ -139,7 +142,7 @@ def coincidence_faults(where: str, points: Mapping[str, Array]) -> list[Fault]:
     ]
 
 
-def order_faults(where: str, points: Mapping[str, Array]) -> list[Fault]:
+def order_faults(where: str, points: Mapping[str, Float64]) -> list[Fault]:
     """Fault of landmarks in the wrong vertical order: names the two that violate it
     most, probably exchanged ones.
     """
@@ -169,7 +172,7 @@ def order_faults(where: str, points: Mapping[str, Array]) -> list[Fault]:
 
 
 def swapped_faults(
-    where: str, points: Mapping[str, Array], surface: CleanMesh
+    where: str, points: Mapping[str, Float64], surface: CleanMesh
 ) -> list[Fault]:
     """Faults of left and right landmarks with exchanged names, for any pose of the
     head: left is up x front.
@@ -209,7 +212,7 @@ def swapped_faults(
     ]
 
 
-def _up_direction(points: Mapping[str, Array]) -> Array | None:
+def _up_direction(points: Mapping[str, Float64]) -> Float64 | None:
     """Vector [mm] from the centre of the lower to that of the upper landmarks; None
     without landmarks of both.
     """

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skindb.errors import attempt
 from skindb.files import read_regular
@@ -15,8 +14,8 @@ from skindb.format.frame_paths import inside
 from skindb.format.frames import FrameKind
 from skindb.format.json_file import MAX_MAGNITUDE, shown
 from skindb.limits import MAX_RESPONSE_BYTES
+from skindb.types import Float64
 
-Array = NDArray[np.float64]
 UNKNOWN_ELECTRONS = 1e30  # per value, where the file does not state them: no shot noise
 RESPONSE_ERROR = 0.01  # tolerance at the ends of a response, in values and in exposure
 
@@ -38,7 +37,7 @@ class SensorRecord:
     electrons_per_dn: float  # infinity: shot noise unknown
     # between neighbouring values that occur: 16 for a 12-bit converter in 16-bit files
     step: float = 1.0
-    response: Array | None = None  # (n, 4) dn, r, g, b; None for linear
+    response: Float64 | None = None  # (n, 4) dn, r, g, b; None for linear
     response_file: Path | None = None
 
     @property
@@ -104,7 +103,7 @@ def read_sensor(
 
 def _response(
     folder: Path, item: Fields, levels: tuple[float, float] | None
-) -> tuple[Array, Path] | tuple[None, None]:
+) -> tuple[Float64, Path] | tuple[None, None]:
     """The table of a response, and its file; its ends are checked unless the levels are
     faulty (None).
     """
@@ -145,7 +144,7 @@ def _response(
 
 
 def _require_ends(
-    item: Fields, name: str, table: Array, black: float, white: float
+    item: Fields, name: str, table: Float64, black: float, white: float
 ) -> None:
     """Require that a response runs from 0 at black to 1 at white: other units would
     scale all radiance.

@@ -72,9 +72,8 @@ from skindb.ingest.visibility import (
     light_visibility,
 )
 from skindb.parameters import IngestParameters
-from skindb.types import Progress, silent
+from skindb.types import Float64, Progress, silent
 
-Array = NDArray[np.float64]
 # with two, one reads while the other computes
 MIN_THREADS = 2
 MAX_THREADS = 8
@@ -334,7 +333,7 @@ class _Run:
         lumitexels: Lumitexels,
         check: CalibrationCheck,
         visible: NDArray[np.float16],
-        rotations: Array,
+        rotations: Float64,
     ) -> dict[str, xr.Dataset]:
         dome = self.dome
         groups = {
@@ -354,7 +353,7 @@ class _Run:
         self,
         lumitexels: Lumitexels,
         mergers: Mapping[str, FrameMerger],
-        intensity: Array,
+        intensity: Float64,
     ) -> None:
         dome = self.dome
         levels = lumitexels.views
@@ -387,7 +386,7 @@ class _Run:
         )
         self.faults += [fault for fault in patterns or [] if fault is not None]
 
-    def _intensity(self, mergers: Mapping[str, FrameMerger]) -> tuple[Array, bool]:
+    def _intensity(self, mergers: Mapping[str, FrameMerger]) -> tuple[Float64, bool]:
         """Intensities of the lights (light, 3), and whether they could be determined.
 
         Otherwise they are 1, to find damaged frames of the face in the same run.

@@ -31,8 +31,7 @@ from skindb.ingest.photo_offsets import (
     view_factors,
 )
 from skindb.ingest.surfels import SurfelSet
-
-Array = NDArray[np.float64]
+from skindb.types import Float64, Index, Mask
 
 Pair = tuple[int, int]  # light, camera
 LIGHTS_PER_CAMERA = 3  # those that illuminate the largest part of what the camera sees
@@ -66,17 +65,19 @@ class Calibration:
     """How well the photographs fit the calibration; NaN where too little is visible to decide."""
 
     # (camera,) correlation of the square roots of photograph and prediction
-    camera_agreement: Array
-    camera_offset: Array  # (camera,) mm on the face
-    camera_scale: Array  # (camera,) relative excess size of the face in the photographs
-    light_agreement: Array  # (light,) correlation under this light
+    camera_agreement: Float64
+    camera_offset: Float64  # (camera,) mm on the face
+    camera_scale: (
+        Float64  # (camera,) relative excess size of the face in the photographs
+    )
+    light_agreement: Float64  # (light,) correlation under this light
     # (light,) the light with the most similar shading; -1: unknown
-    light_similar: NDArray[np.int64]
-    light_similar_agreement: Array  # (light,) its correlation
-    scan_translation: Array  # (3,) mm that would bring the scan to the photographs
-    scan_rotation: Array  # (3,) degrees about x, y, z through the centre of the scan
+    light_similar: Index
+    light_similar_agreement: Float64  # (light,) its correlation
+    scan_translation: Float64  # (3,) mm that would bring the scan to the photographs
+    scan_rotation: Float64  # (3,) degrees about x, y, z through the centre of the scan
     # (camera,) mm of the offset that the pose of the scan does not explain
-    camera_residual: Array
+    camera_residual: Float64
     brightness: Brightness  # of the photographs, relative to a matte face
     explanations: Mapping[int, str]  # by camera, a likely cause of its mismatch
 
@@ -100,9 +101,9 @@ class CalibrationCheck:
     dome: DomeRecord
     surfels: SurfelSet
     light_visible: NDArray[np.float16]
-    clear: NDArray[np.bool_]
+    clear: Mask
     pixels: NDArray[np.float32]
-    intensity: Array
+    intensity: Float64
 
     @cached_property
     def pairs(self) -> frozenset[Pair]:
@@ -122,7 +123,7 @@ class CalibrationCheck:
         return frozenset(pair for pair in pairs if seen[pair] > minimum)
 
     @cached_property
-    def irradiance(self) -> Array:
+    def irradiance(self) -> Float64:
         """Irradiance (light, n) by each light at the compared surfels, 0 in shadow."""
         rows = []
         for j, light in enumerate(self.dome.lights):
@@ -185,10 +186,10 @@ class CalibrationCheck:
         views: Sequence[ReducedView],
         pictures: Mapping[Pair, NDArray[np.float32]],
         offsets: Mapping[int, Offset],
-        albedo: Array,
+        albedo: Float64,
     ) -> Brightness:
         """Relative brightness of the photographs by camera and light."""
-        factors = list[Array]()
+        factors = list[Float64]()
         for view in views:
             pixels = moved_pixels(view, offsets[view.camera])
             colour = self.intensity[view.light] / self.intensity[view.light].mean()
@@ -206,22 +207,22 @@ class CalibrationCheck:
         return slice(None, None, -(-len(self.surfels.position) // MAX_SURFELS))
 
     @cached_property
-    def _position(self) -> Array:
+    def _position(self) -> Float64:
         return self.surfels.position[self.compared]
 
     @cached_property
-    def _normal(self) -> Array:
+    def _normal(self) -> Float64:
         return self.surfels.normal[self.compared]
 
     @cached_property
-    def _clear(self) -> NDArray[np.bool_]:
+    def _clear(self) -> Mask:
         return self.clear[self.compared]
 
     @cached_property
-    def _middle(self) -> Array:
+    def _middle(self) -> Float64:
         return np.asarray(self.surfels.position.mean(axis=0))
 
-    def _seen_area(self, camera: CameraRecord) -> Array:
+    def _seen_area(self, camera: CameraRecord) -> Float64:
         """Area (n,) [mm2] of the surfels, projected towards the camera."""
         way = camera.centre - self._position
         cosine = np.einsum("ni,ni->n", way, self._normal) / np.linalg.norm(way, axis=1)
@@ -236,7 +237,7 @@ class CalibrationCheck:
         width = self.dome.cameras[camera].pixel_width(self._middle)
         return self.factor(camera) * width
 
-    def _reduced_pixels(self, camera: int) -> Array:
+    def _reduced_pixels(self, camera: int) -> Float64:
         """Pixels (n, 2) of the compared surfels in the downsampled pictures of a camera."""
         pixels = self.pixels[self.compared, camera].astype(np.float64)
         return pixels / self.factor(camera)
@@ -266,7 +267,9 @@ class CalibrationCheck:
             v for v, ratio in zip(views, brightness, strict=True) if ratio > minimum
         ]
 
-    def _offsets(self, views: Sequence[ReducedView]) -> tuple[dict[int, Offset], Array]:
+    def _offsets(
+        self, views: Sequence[ReducedView]
+    ) -> tuple[dict[int, Offset], Float64]:
         """Offset of every camera, and albedo of the surfels."""
         albedo = np.ones(len(self._position))
         offsets = dict[int, Offset]()
@@ -297,8 +300,11 @@ class CalibrationCheck:
         ]
 
     def _light_table(
-        self, views: Sequence[ReducedView], offsets: Mapping[int, Offset], albedo: Array
-    ) -> Array:
+        self,
+        views: Sequence[ReducedView],
+        offsets: Mapping[int, Offset],
+        albedo: Float64,
+    ) -> Float64:
         """Correlation (light, light) of the best view under each light with the
         prediction for every light.
         """
@@ -313,7 +319,7 @@ class CalibrationCheck:
         return table
 
     def _explanation(
-        self, camera: int, views: Sequence[ReducedView], offset: Offset, albedo: Array
+        self, camera: int, views: Sequence[ReducedView], offset: Offset, albedo: Float64
     ) -> str:
         """Exchange of pictures or parameters that explains the photographs of a camera;
         empty if none does.
@@ -334,7 +340,7 @@ class CalibrationCheck:
                 explanation = text
         return explanation
 
-    def _alternatives(self, c: int) -> Iterator[tuple[str, Array, NDArray[np.bool_]]]:
+    def _alternatives(self, c: int) -> Iterator[tuple[str, Float64, Mask]]:
         """Possible exchanges, each with the pixels (n, 2) and the visibility (n,) of
         the surfels that it implies.
         """
@@ -374,7 +380,9 @@ class CalibrationCheck:
             visible,
         )
 
-    def _scan_pose(self, offsets: Mapping[int, Offset]) -> tuple[Array, Array, Array]:
+    def _scan_pose(
+        self, offsets: Mapping[int, Offset]
+    ) -> tuple[Float64, Float64, Float64]:
         """Translation [mm] and rotation [degrees] of the scan about its centre that fit
         best, and the residuals.
 
@@ -393,7 +401,7 @@ class CalibrationCheck:
             residuals[c] = length * self._mm(c)
         return x[:3], np.degrees(x[3:]), residuals
 
-    def _pose_rows(self, c: int, offset: Offset) -> tuple[Array, Array]:
+    def _pose_rows(self, c: int, offset: Offset) -> tuple[Float64, Float64]:
         """Derivatives (2 m, 6) of m pixels by translation [mm] and rotation [rad], and
         displacements (2 m,).
         """
@@ -450,7 +458,7 @@ def refine_cameras(
     return check.dome
 
 
-def applied_rotations(before: DomeRecord, after: DomeRecord) -> Array:
+def applied_rotations(before: DomeRecord, after: DomeRecord) -> Float64:
     """Rotation vectors (camera, 3) [degrees] about the axes of each camera, from
     `before` to `after`.
     """
@@ -463,12 +471,12 @@ def applied_rotations(before: DomeRecord, after: DomeRecord) -> Array:
     )
 
 
-def _turn(check: CalibrationCheck, c: int, offset: Offset) -> Array:
+def _turn(check: CalibrationCheck, c: int, offset: Offset) -> Float64:
     """Rotation vector (3,) [rad] in the frame of camera c that compensates for its offset."""
     points = check.surfels.position[check.compared][check.clear[check.compared, c]]
     camera = check.dome.cameras[c]
 
-    def pixels(turn: Array) -> Array:
+    def pixels(turn: Float64) -> Float64:
         return _turned(camera, turn).project(points) / check.factor(c)
 
     moves = offset.moves(pixels(np.zeros(3)))
@@ -481,7 +489,7 @@ def _turn(check: CalibrationCheck, c: int, offset: Offset) -> Array:
     return np.asarray(np.linalg.lstsq(matrix, moves.ravel(), rcond=None)[0])
 
 
-def _turned(camera: CameraRecord, turn: Array) -> CameraRecord:
+def _turned(camera: CameraRecord, turn: Float64) -> CameraRecord:
     """The camera rotated about its centre by a rotation vector [rad] in its own frame."""
     rotation = Rotation.from_rotvec(turn).as_matrix()
     return replace(camera, R=rotation @ camera.R, t=rotation @ camera.t)

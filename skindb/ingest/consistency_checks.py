@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skindb.errors import Fault
 from skindb.format.dome import DomeRecord
 from skindb.ingest.consistency import MAX_OFFSET_MM, MIN_AGREEMENT, Calibration
+from skindb.types import Float64
 
 # Heads in domes with common errors (lights 1 mm, cameras 0.03 degrees, hair, motion)
 # have offsets of up to 1.4 mm, scales of 1.5 %, agreements of 0.93 and more, a scan
@@ -80,7 +80,7 @@ def _channel_faults(dome: DomeRecord, calibration: Calibration) -> list[Fault]:
     return [Fault(f"{dome.file}[frames]", rule, text, cure) for text in findings]
 
 
-def _red_to_blue(calibration: Calibration) -> NDArray[np.float64]:
+def _red_to_blue(calibration: Calibration) -> Float64:
     """Red over blue reflectance of the face in the photographs of each camera
     (camera,); NaN if unknown.
     """

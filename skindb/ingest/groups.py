@@ -19,8 +19,8 @@ from skindb.ingest.lumitexels import FULL_SHADOW, MIN_LIT_FRACTION, Lumitexels
 from skindb.ingest.probe_profiles import Profiles
 from skindb.ingest.surfels import SurfelSet, transferred_landmarks
 from skindb.schema import dataset
+from skindb.types import Float64
 
-Array = NDArray[np.float64]
 CHANNELS = {"channel": ["R", "G", "B"]}  # coordinate
 
 
@@ -85,7 +85,7 @@ def atlas_group(surfels: SurfelSet) -> xr.Dataset:
     )
 
 
-def dome_group(dome: DomeRecord, intensity: Array) -> xr.Dataset:
+def dome_group(dome: DomeRecord, intensity: Float64) -> xr.Dataset:
     """Group "dome"."""
     cameras = dome.cameras
     lights = dome.lights
@@ -106,7 +106,7 @@ def dome_group(dome: DomeRecord, intensity: Array) -> xr.Dataset:
 
 
 def calibration_group(
-    dome: DomeRecord, calibration: Calibration, rotations: Array
+    dome: DomeRecord, calibration: Calibration, rotations: Float64
 ) -> xr.Dataset:
     """Group "calibration": how well the photographs fit the poses of cameras and scan
     and the positions of the lights.
@@ -155,8 +155,8 @@ def sample_group(dome: DomeRecord, lumitexels: Lumitexels) -> xr.Dataset:
 def probe_group(
     probe: ProbeRecord,
     profiles: Profiles,
-    position: Array,
-    isotropy: Array | None = None,
+    position: Float64,
+    isotropy: Float64 | None = None,
 ) -> xr.Dataset:
     """Group "probe"; `position` (site, 3) [mm] and p values of isotropy (site, 3)."""
     logs = [
@@ -206,13 +206,13 @@ def sequence_group(sequence: SequenceRecord, dome: DomeRecord) -> xr.Dataset:
     return dataset(variables)
 
 
-def _mean_pressure(logs: Sequence[Array | None]) -> float:
+def _mean_pressure(logs: Sequence[Float64 | None]) -> float:
     """Mean pressure over time and placements; NaN for a site without a gauge."""
     means = [log[:, 1].mean() for log in logs if log is not None]
     return float(np.mean(means)) if means else np.nan
 
 
-def _padded(arrays: Sequence[Array]) -> Array:
+def _padded(arrays: Sequence[Float64]) -> Float64:
     """Arrays stacked along a new first axis, NaN where one is shorter."""
     shape = np.max([array.shape for array in arrays], axis=0)
     out = np.full((len(arrays), *shape), np.nan)

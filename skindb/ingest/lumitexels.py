@@ -32,10 +32,8 @@ from skindb.ingest.sample_quality import (
 )
 from skindb.ingest.spool import Spool
 from skindb.ingest.surfels import SurfelSet
-from skindb.types import Progress, silent
+from skindb.types import Float64, Index, Mask, Progress, silent
 
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 # radiance (h, w, 3), flags (h, w) and usable exposures (h, w)
 Picture = tuple[Image, NDArray[np.uint8], NDArray[np.uint8]]
 T = TypeVar("T")
@@ -65,8 +63,8 @@ class Views:
     """Which surfels each light reaches and each camera sees, and where they project to."""
 
     surfels: SurfelSet
-    lit: NDArray[np.bool_]  # (n, light) surfels that get samples, see `fully_lit`
-    clear: NDArray[np.bool_]  # (n, camera)
+    lit: Mask  # (n, light) surfels that get samples, see `fully_lit`
+    clear: Mask  # (n, camera)
     pixels: NDArray[np.float32]  # (n, camera, 2)
     # (n, light) visible fraction of the disc; divides samples
     light_fraction: NDArray[np.float16] | None = None
@@ -78,7 +76,7 @@ class Views:
 class CameraSampling:
     """Where and how one camera samples the surfels, the same under every light."""
 
-    surfels: Bools  # (n,) those that it samples
+    surfels: Mask  # (n,) those that it samples
     pixels: NDArray[np.float32]  # (n, 2)
     spread: NDArray[np.float32]  # (n, 3) px^2, or (0, 3)
 
@@ -89,10 +87,10 @@ class ViewLevels:
     earlier run.
     """
 
-    median: Array  # sr^-1 of its samples; NaN for few samples
-    bright: Array  # fraction of its samples that are too large for a surface
-    highest: Array  # value of the longest exposure
-    clipped: Bools  # whether the picture is cut off at its highest value
+    median: Float64  # sr^-1 of its samples; NaN for few samples
+    bright: Float64  # fraction of its samples that are too large for a surface
+    highest: Float64  # value of the longest exposure
+    clipped: Mask  # whether the picture is cut off at its highest value
 
     @classmethod
     def empty(cls, shape: tuple[int, ...]) -> ViewLevels:
@@ -114,7 +112,7 @@ class Lumitexels:
     saturated_count: NDArray[np.int32]
     dark_count: NDArray[np.int32]
     single_count: NDArray[np.int32]  # samples from a single exposure
-    view_count: NDArray[np.int64]  # (light, camera) samples of each view
+    view_count: Index  # (light, camera) samples of each view
     views: ViewLevels
     noise_floor: float  # sr^-1
     shot_noise: float  # sr^-1
@@ -129,7 +127,7 @@ def fully_lit(
     cameras: Sequence[CameraRecord],
     *,
     soft: PenumbraRule = "exclude",
-) -> Bools:
+) -> Mask:
     """Where (n, light) the entire disc is visible from a surfel and from all neighbours
     that a pixel may cover.
 
@@ -153,7 +151,7 @@ def fully_lit(
 
 def sample_lumitexels(
     dome: DomeRecord,
-    intensity: Array,
+    intensity: Float64,
     views: Views,
     mergers: Mapping[str, FrameMerger],
     spool: Spool,
@@ -246,7 +244,7 @@ class _Sampler:
     """Samples single views into the spool; the arguments of `sample_lumitexels`."""
 
     dome: DomeRecord
-    intensity: Array
+    intensity: Float64
     views: Views
     mergers: Mapping[str, FrameMerger]
     spool: Spool
@@ -390,7 +388,7 @@ def _developed(
     merger: FrameMerger,
     frames: list[Frame],
     shot: CameraSampling,
-    surfels: Bools,
+    surfels: Mask,
     *,
     whole: bool,
 ) -> Picture:
@@ -406,9 +404,9 @@ def _developed(
 def _sampled(
     picture: Picture,
     shot: CameraSampling,
-    surfels: Bools,
+    surfels: Mask,
     light: LightRecord,
-    intensity: Array,
+    intensity: Float64,
     views: Views,
     j: int,
 ) -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
@@ -455,7 +453,7 @@ def _in_turn(pool: Executor, call: Callable[[T], R], items: Iterable[T]) -> Iter
         wait(waiting)
 
 
-def noise_floor(dome: DomeRecord, intensity: Array, surfels: SurfelSet) -> float:
+def noise_floor(dome: DomeRecord, intensity: Float64, surfels: SurfelSet) -> float:
     """Reflectance [sr^-1] of one sigma of read noise and quantisation, at the median
     light and distance.
     """
@@ -464,7 +462,7 @@ def noise_floor(dome: DomeRecord, intensity: Array, surfels: SurfelSet) -> float
     return float(np.median(floors)) * per_radiance or LINEAR_NOISE_FLOOR
 
 
-def shot_noise(dome: DomeRecord, intensity: Array, surfels: SurfelSet) -> float:
+def shot_noise(dome: DomeRecord, intensity: Float64, surfels: SurfelSet) -> float:
     """Variance by photons over reflectance [sr^-1], at the median light and distance; 0
     if electrons are not known.
 
@@ -482,7 +480,7 @@ def shot_noise(dome: DomeRecord, intensity: Array, surfels: SurfelSet) -> float:
 
 
 def _reflectance_per_radiance(
-    dome: DomeRecord, intensity: Array, surfels: SurfelSet
+    dome: DomeRecord, intensity: Float64, surfels: SurfelSet
 ) -> float:
     """Reflectance per radiance at the median light and distance."""
     middle = surfels.position.mean(axis=0)[None]
@@ -490,14 +488,14 @@ def _reflectance_per_radiance(
     return float(np.median(square[:, None] / intensity))
 
 
-def choose_photographs(dome: DomeRecord, middle: Array, count: int) -> list[Pair]:
+def choose_photographs(dome: DomeRecord, middle: Float64, count: int) -> list[Pair]:
     """(light, camera) pairs of lights that are spread evenly in front of the face, with
     the most frontal camera.
     """
     if count < 1:
         return []
 
-    def directions(positions: list[Array]) -> Array:
+    def directions(positions: list[Float64]) -> Float64:
         way = np.array(positions) - middle
         return np.asarray(way / np.linalg.norm(way, axis=1, keepdims=True))
 
@@ -514,7 +512,7 @@ def choose_photographs(dome: DomeRecord, middle: Array, count: int) -> list[Pair
     return [(light, int(camera)) for light in sorted(chosen)]
 
 
-def _frontal(camera: CameraRecord, surfels: SurfelSet) -> Bools:
+def _frontal(camera: CameraRecord, surfels: SurfelSet) -> Mask:
     """Where (n,) a view is steep enough for a pixel to cover little of the surface."""
     way = camera.centre - surfels.position
     cosine = np.einsum("ni,ni->n", way, surfels.normal) / np.linalg.norm(way, axis=1)

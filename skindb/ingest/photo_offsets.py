@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from skindb.ingest._sample_kernels import interpolate
-
-Array = NDArray[np.float64]
+from skindb.types import Float64, Mask
 
 PIXEL_MM = 2.0  # mm; about the width of an eyelid, well below the offsets to be found
 SMOOTHING_PX = 0.7  # px of the downsampled picture; makes its derivatives smooth
@@ -49,9 +48,9 @@ class ReducedView:
 
     light: int
     camera: int
-    image: Array  # (h, w) square roots of the downsampled grey radiance
-    pixels: Array  # (n, 2) px of the downsampled picture
-    clear: NDArray[np.bool_]  # (n,) the camera sees the surfel
+    image: Float64  # (h, w) square roots of the downsampled grey radiance
+    pixels: Float64  # (n, 2) px of the downsampled picture
+    clear: Mask  # (n,) the camera sees the surfel
 
 
 @dataclass(frozen=True)
@@ -63,11 +62,11 @@ class Offset:
     # correlation of measured and predicted square roots after alignment, median over
     # photographs
     agreement: float
-    shift: Array  # (2,) px of the downsampled picture, columns and rows
+    shift: Float64  # (2,) px of the downsampled picture, columns and rows
     scale: float  # relative; 0.01: the face is 1 % larger in the photographs
     roll: float  # radians, clockwise in the picture
     # (2,) px, centroid of the visible surfels, the centre of roll and scale
-    middle: Array
+    middle: Float64
     radius: float  # px, root mean square distance of the surfels from their centroid
 
     @property
@@ -75,7 +74,7 @@ class Offset:
         """Root mean square displacement [px] over the face by shift and roll."""
         return float(np.sqrt(self.shift @ self.shift + (self.roll * self.radius) ** 2))
 
-    def moves(self, pixels: Array) -> Array:
+    def moves(self, pixels: Float64) -> Float64:
         """Displacements (n, 2) of pixels (n, 2) by shift and roll, without the scale."""
         away = pixels - self.middle
         return self.shift + self.roll * np.stack([-away[:, 1], away[:, 0]], axis=1)
@@ -98,12 +97,12 @@ def reduced(image: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
     return np.asarray(blocks.mean(axis=(1, 3)), np.float32)
 
 
-def bilinear(image: Array, pixels: Array) -> Array:
+def bilinear(image: Float64, pixels: Float64) -> Float64:
     """Interpolated values (n,) at pixels (n, 2); 0 outside the picture."""
     return np.asarray(interpolated(image[None], pixels)[0])
 
 
-def interpolated(images: Array, pixels: Array) -> Array:
+def interpolated(images: Float64, pixels: Float64) -> Float64:
     """Interpolated values (picture, n) of pictures (picture, h, w) at pixels (n, 2); 0
     outside the pictures.
     """
@@ -116,7 +115,7 @@ def interpolated(images: Array, pixels: Array) -> Array:
     return out
 
 
-def correlation(a: Array, b: Array) -> float:
+def correlation(a: Float64, b: Float64) -> float:
     """Pearson's correlation; 0 if one of the two is constant."""
     a = a - a.mean()
     b = b - b.mean()
@@ -126,8 +125,8 @@ def correlation(a: Array, b: Array) -> float:
 
 def camera_offset(
     views: Sequence[ReducedView],
-    irradiance: Array,
-    albedo: Array,
+    irradiance: Float64,
+    albedo: Float64,
     *,
     search: bool = True,
 ) -> Offset:
@@ -155,7 +154,7 @@ def camera_offset(
         for view in views
     ]
 
-    def agreement(places: Array) -> float:
+    def agreement(places: Float64) -> float:
         correlations = map(correlation, interpolated(images, places), predicted)
         # the median ignores a light with a wrong position
         return float(np.median([*correlations]))
@@ -182,13 +181,13 @@ def camera_offset(
 
 
 def _large_shift(
-    images: Array, predicted: Sequence[Array], pixels: Array, radius: float
-) -> Array:
+    images: Float64, predicted: Sequence[Float64], pixels: Float64, radius: float
+) -> Float64:
     """Shift (2,) px on a coarse grid that agrees best; 0 unless it is clearly better."""
     few = slice(None, None, max(len(pixels) // 2000, 1))
     thin = np.concatenate([values[few] for values in predicted])
 
-    def agreement(shift: Array) -> float:
+    def agreement(shift: Float64) -> float:
         return correlation(interpolated(images, pixels[few] + shift).ravel(), thin)
 
     steps = radius * SEARCH_RADII * np.linspace(-1, 1, 2 * SEARCH_STEPS + 1)
@@ -199,7 +198,7 @@ def _large_shift(
     return shifts[best] if agreements[best] > agreement(none) + 0.02 else none
 
 
-def moved_pixels(view: ReducedView, offset: Offset) -> Array:
+def moved_pixels(view: ReducedView, offset: Offset) -> Float64:
     """Pixels (n, 2) of the surfels after the alignment."""
     return (
         view.pixels
@@ -209,8 +208,8 @@ def moved_pixels(view: ReducedView, offset: Offset) -> Array:
 
 
 def surfel_albedo(
-    views: Sequence[ReducedView], irradiance: Array, offsets: Mapping[int, Offset]
-) -> Array:
+    views: Sequence[ReducedView], irradiance: Float64, offsets: Mapping[int, Offset]
+) -> Float64:
     """Albedo (n,) relative to the median: a low quantile of measured / predicted over
     the views that light a surfel.
     """
@@ -230,7 +229,7 @@ def surfel_albedo(
     return np.clip(albedo / middle, *ALBEDO_RANGE)
 
 
-def nan_quantile(values: Array, level: float) -> Array:
+def nan_quantile(values: Float64, level: float) -> Float64:
     """`np.nanquantile` along the first axis, which makes a call for each column."""
     ordered = np.sort(values, axis=0)
     place = level * ((~np.isnan(ordered)).sum(axis=0) - 1)
@@ -243,15 +242,19 @@ def nan_quantile(values: Array, level: float) -> Array:
     return np.asarray(np.where(part < 0.5, low + step * part, high - step * (1 - part)))
 
 
-def square_root_image(image: NDArray[np.floating[Any]]) -> Array:
+def square_root_image(image: NDArray[np.floating[Any]]) -> Float64:
     """Square roots of a picture, slightly smoothed so that its derivatives are smooth."""
     smooth = gaussian_filter(np.asarray(image, np.float64), SMOOTHING_PX)
     return np.asarray(np.sqrt(np.maximum(smooth, 0)))
 
 
 def _gauss_newton(
-    images: Array, predicted: Sequence[Array], pixels: Array, moves: Array, start: Array
-) -> Array:
+    images: Float64,
+    predicted: Sequence[Float64],
+    pixels: Float64,
+    moves: Float64,
+    start: Float64,
+) -> Float64:
     """Alignment (4,) that minimises the robust sum of (gain predicted - measured)^2
     with one gain per picture.
     """
@@ -293,18 +296,18 @@ class Brightness:
     little is visible.
     """
 
-    reflectance: Array  # (3,) of the face, the factor of the median camera and light
-    camera: Array  # (camera, 3) relative to the median camera
-    light: Array  # (light,) relative to the median light
+    reflectance: Float64  # (3,) of the face, the factor of the median camera and light
+    camera: Float64  # (camera, 3) relative to the median camera
+    light: Float64  # (light,) relative to the median light
 
 
 def view_factors(
     view: ReducedView,
     picture: NDArray[np.float32],
-    pixels: Array,
-    irradiance: Array,
-    albedo: Array,
-) -> Array:
+    pixels: Float64,
+    irradiance: Float64,
+    albedo: Float64,
+) -> Float64:
     """Median factor (3,) of the radiance of a view over that of a matte face.
 
     Parameters
@@ -331,7 +334,7 @@ def view_factors(
 
 
 def relative_brightness(
-    factors: Array,
+    factors: Float64,
     lights: Sequence[int],
     cameras: Sequence[int],
     *,

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skindb.calibration.fibres import place_text, placement_signal
 from skindb.calibration.profile_statistics import (
@@ -21,8 +20,7 @@ from skindb.errors import Fault, InputError, attempt, require
 from skindb.format.contact_probe import ProbeRecord
 from skindb.format.frames import Digests
 from skindb.format.json_file import MAX_MAGNITUDE
-
-Array = NDArray[np.float64]
+from skindb.types import Float64, Index
 
 # of the incident light; 1 by energy conservation, doubled for errors of scale and gain
 MAX_RETURNED_FRACTION = 2.0
@@ -50,12 +48,12 @@ DISTANCE_TOLERANCE_MM = 1e-3  # fibres of several rows are at the same distances
 class Profiles:
     """R(r) of every site, in mm^-2 if `scale_known`, otherwise up to a factor."""
 
-    value: Array  # (site, fibre, 3) mean over placements
-    error: Array  # (site, fibre, 3) standard error
+    value: Float64  # (site, fibre, 3) mean over placements
+    error: Float64  # (site, fibre, 3) standard error
     scale_known: bool
-    placements: tuple[Array, ...]  # for each site (placement, fibre, 3)
+    placements: tuple[Float64, ...]  # for each site (placement, fibre, 3)
     # (site, 3) relative standard deviation between placements; NaN of a single one
-    repeatability: Array
+    repeatability: Float64
 
 
 def fibre_profiles(probe: ProbeRecord, digests: Digests | None = None) -> Profiles:
@@ -70,7 +68,7 @@ def fibre_profiles(probe: ProbeRecord, digests: Digests | None = None) -> Profil
         With every frame that cannot be decoded, and fibres that lie outside the picture.
     """
     faults = list[Fault]()
-    by_site = list[list[tuple[Array, Array]]]()
+    by_site = list[list[tuple[Float64, Float64]]]()
     for site in probe.sites:
         parts = [
             attempt(faults, partial(placement_signal, probe, site, name, digests))
@@ -106,7 +104,7 @@ def fibre_profiles(probe: ProbeRecord, digests: Digests | None = None) -> Profil
 
 
 def _light_faults(
-    probe: ProbeRecord, signals: list[tuple[Array, Array]]
+    probe: ProbeRecord, signals: list[tuple[Float64, Float64]]
 ) -> list[Fault]:
     """Faults of placements whose frames are black or white: nearly no fibre shows light
     that is clear of noise.
@@ -129,7 +127,7 @@ def _light_faults(
     return faults
 
 
-def _require_energy(probe: ProbeRecord, value: Array, error: Array) -> None:
+def _require_energy(probe: ProbeRecord, value: Float64, error: Float64) -> None:
     """Require profiles (site, fibre, 3) in mm^-2 that return no more light than is incident.
 
     A profile that falls with the distance returns at least pi r^2 R(r) of the light within r.
@@ -151,7 +149,9 @@ def _require_energy(probe: ProbeRecord, value: Array, error: Array) -> None:
     raise InputError(Fault(f"{probe.file}[scale]", rule, finding, cure))
 
 
-def combine_placements(value: Array, error: Array) -> tuple[Array, Array, Array]:
+def combine_placements(
+    value: Float64, error: Float64
+) -> tuple[Float64, Float64, Float64]:
     """Mean of repeated placements of the probe at one site, its standard error, and
     their repeatability.
 
@@ -186,7 +186,7 @@ def combine_placements(value: Array, error: Array) -> tuple[Array, Array, Array]
     return mean, np.hypot(noise, spread * np.abs(mean) / np.sqrt(count)), spread
 
 
-def isotropy_p_values(probe: ProbeRecord, profiles: Profiles) -> Array | None:
+def isotropy_p_values(probe: ProbeRecord, profiles: Profiles) -> Float64 | None:
     """P value (site, 3) of equal decay along all azimuths; NaN where profiles are too noisy.
 
     None for a probe without six rows of fibres at the same distances (Weyrich et al.
@@ -217,7 +217,7 @@ def isotropy_p_values(probe: ProbeRecord, profiles: Profiles) -> Array | None:
 
 
 def probe_notes(
-    probe: ProbeRecord, profiles: Profiles, p_values: Array | None
+    probe: ProbeRecord, profiles: Profiles, p_values: Float64 | None
 ) -> list[str]:
     """Warnings, one line for each placement or site that fails a check."""
     notes = [*_pressure_notes(probe), *_decay_notes(probe, profiles)]
@@ -285,7 +285,7 @@ def _decay_notes(probe: ProbeRecord, profiles: Profiles) -> Iterator[str]:
         )
 
 
-def _steps(distance: Array, log: Array) -> Array:
+def _steps(distance: Float64, log: Float64) -> Float64:
     """Median step (fibre - 2,) from the line between both neighbours to each fibre, of
     logarithms (site, fibre, 3).
     """
@@ -297,7 +297,7 @@ def _steps(distance: Array, log: Array) -> Array:
     return np.array([np.median(x) if len(x) > 1 else 0.0 for x in finite])
 
 
-def _decay(distance: Array, log: Array) -> float:
+def _decay(distance: Float64, log: Float64) -> float:
     """Decay [mm^-1] of a profile, -d ln (r^2 R) / dr; NaN of too few distances."""
     clear = np.isfinite(log)
     if len(np.unique(distance[clear])) < MIN_DECAY_FIBRES:
@@ -305,7 +305,7 @@ def _decay(distance: Array, log: Array) -> float:
     return float(-np.polyfit(distance[clear], log[clear], 1)[0])
 
 
-def _rows(probe: ProbeRecord) -> tuple[Array, NDArray[np.int64]] | None:
+def _rows(probe: ProbeRecord) -> tuple[Float64, Index] | None:
     """Azimuths (row,) [degrees] and the fibres (row, fibre) of each, in order of their distance."""
     if not np.isfinite(probe.azimuth).all():
         return None

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from skindb.calibration.radiance import read_sigma, vignette_gain
 from skindb.errors import Fault, require
 from skindb.format.dome import CameraRecord, DomeRecord
-
-Array = NDArray[np.float64]
+from skindb.types import Float64
 
 # number of radiances up to the white level at which the linear model is fitted to the
 # variance
@@ -50,9 +49,9 @@ class SampleNoise:
     effective pixels.
     """
 
-    limit: Array  # (camera, 3, exposure) radiance
-    read_variance: Array  # (camera, 3, exposure) radiance^2
-    shot_variance: Array  # (camera, 3, exposure) radiance
+    limit: Float64  # (camera, 3, exposure) radiance
+    read_variance: Float64  # (camera, 3, exposure) radiance^2
+    shot_variance: Float64  # (camera, 3, exposure) radiance
     # (n, camera); NaN where the camera takes no sample
     effective_pixels: NDArray[np.float32]
 
@@ -85,8 +84,8 @@ def sample_noise(
 
 
 def radiance_noise(
-    camera: CameraRecord, seconds: Sequence[float] | Array, gain: float
-) -> tuple[Array, Array, Array]:
+    camera: CameraRecord, seconds: Sequence[float] | Float64, gain: float
+) -> tuple[Float64, Float64, Float64]:
     """Limit, read variance and shot variance (3, exposure) of merged radiance for a
     given gain of the lens.
 
@@ -119,7 +118,7 @@ def radiance_noise(
     return np.tile(1 / (time * gain), (3, 1)), mixed * offset, mixed * slope
 
 
-def _line(seconds: Array, read: float, photon: float) -> tuple[float, float]:
+def _line(seconds: Float64, read: float, photon: float) -> tuple[float, float]:
     """Offset and slope of the variance over radiance, from noise of relative exposures."""
     # begins where read noise dominates
     radiance = np.geomspace(read / photon / 10, 1.0, RADIANCES) / seconds[0]
@@ -140,7 +139,7 @@ def _mean_gain(camera: CameraRecord, pixels: NDArray[np.float32]) -> float:
     return float(vignette_gain(camera)[row, column, 0].mean())
 
 
-def intensity_faults(dome: DomeRecord, intensity: Array) -> list[Fault]:
+def intensity_faults(dome: DomeRecord, intensity: Float64) -> list[Fault]:
     """Faults of lights whose intensities (light, 3) are far above or below those of the others."""
     rule = (
         f"the intensity of a light must be at most {MAX_INTENSITY_RATIO:,g} times as "
@@ -158,7 +157,9 @@ def intensity_faults(dome: DomeRecord, intensity: Array) -> list[Fault]:
     ]
 
 
-def sample_faults(dome: DomeRecord, view_median: Array, bright: Array) -> list[Fault]:
+def sample_faults(
+    dome: DomeRecord, view_median: Float64, bright: Float64
+) -> list[Fault]:
     """Faults of samples that are too large or small for skin, by their medians and
     bright fractions (light, camera).
     """
@@ -187,7 +188,7 @@ def sample_faults(dome: DomeRecord, view_median: Array, bright: Array) -> list[F
     return lights or _bright_faults(dome, bright)
 
 
-def _bright_faults(dome: DomeRecord, bright: Array) -> list[Fault]:
+def _bright_faults(dome: DomeRecord, bright: Float64) -> list[Fault]:
     """Faults of views (light, camera) in which more than a few samples are too large
     for a surface.
     """
@@ -207,7 +208,9 @@ def _bright_faults(dome: DomeRecord, bright: Array) -> list[Fault]:
     ]
 
 
-def light_notes(dome: DomeRecord, intensity: Array, view_median: Array) -> list[str]:
+def light_notes(
+    dome: DomeRecord, intensity: Float64, view_median: Float64
+) -> list[str]:
     """Warnings about lights whose intensities or samples are unusual, but not impossible."""
     median = _light_medians(view_median)
     return [
@@ -252,22 +255,22 @@ def require_lit(where: str, radiance: NDArray[np.float32], count: int) -> None:
     )
 
 
-def _relative(intensity: Array) -> Array:
+def _relative(intensity: Float64) -> Float64:
     return intensity / np.median(intensity, axis=0)
 
 
-def _light_medians(view_median: Array) -> Array:
+def _light_medians(view_median: Float64) -> Float64:
     """Median over the cameras (light,) of medians (light, camera); NaN where there is none."""
     return np.array([_nan_median(row) for row in view_median])
 
 
-def _nan_median(values: Array) -> float:
+def _nan_median(values: Float64) -> float:
     """Median of the values that are not NaN; NaN if there is none."""
     numbers = values[~np.isnan(values)]
     return float(np.median(numbers)) if len(numbers) else float("nan")
 
 
-def _beyond(ratios: Array, limit: float) -> list[tuple[int, float]]:
+def _beyond(ratios: Float64, limit: float) -> list[tuple[int, float]]:
     """Rows of ratios (n, k) that differ from 1 by more than the limit, each with its
     most extreme ratio.
     """

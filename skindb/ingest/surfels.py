@@ -23,8 +23,8 @@ from skindb.geometry.mesh import (
     vertex_normals,
 )
 from skindb.geometry.subdivide import carry_points, subdivide
+from skindb.types import Float64, Index, Mask
 
-Array = NDArray[np.float64]
 MAX_SURFELS = 2_500_000  # the samples of this many surfels in a full dome take 36 GB
 # mm; a landmark that is farther from the cropped than from the complete scan by this
 # distance was cropped away
@@ -36,14 +36,14 @@ NECK_STRIP_HALF_WIDTH_MM = 15.0  # mm; half width of the strip at the front of t
 class SurfelSet:
     """Surfels of one take, and the mesh whose vertices they are."""
 
-    position: Array  # (n, 3) mm
-    normal: Array  # (n, 3)
-    area: Array  # (n,) mm2
-    radius: Array  # (n,) mm, of the splat
+    position: Float64  # (n, 3) mm
+    normal: Float64  # (n, 3)
+    area: Float64  # (n,) mm2
+    radius: Float64  # (n,) mm, of the splat
     uv: NDArray[np.float32]  # (n, 2)
-    faces: NDArray[np.int64]  # (f, 3)
+    faces: Index  # (f, 3)
     region_names: tuple[str, ...]
-    region: NDArray[np.bool_]  # (n, region)
+    region: Mask  # (n, region)
     uv_weights: str  # weights that uv were computed with: "intrinsic" or "mean_value"
 
     def spacing(self) -> float:
@@ -115,7 +115,9 @@ def subdivision_levels(mesh: CleanMesh, spacing_mm: float) -> int:
     return levels
 
 
-def transferred_landmarks(capture: Capture, surfels: SurfelSet) -> tuple[Array, Array]:
+def transferred_landmarks(
+    capture: Capture, surfels: SurfelSet
+) -> tuple[Float64, Float64]:
     """Landmarks (k, 3) on the surface of the surfels, transferred by subdivision, and
     their distance (k,) in mm.
 
@@ -142,7 +144,7 @@ def transferred_landmarks(capture: Capture, surfels: SurfelSet) -> tuple[Array, 
 
 def site_positions(
     capture: Capture, surfels: SurfelSet, sites: tuple[str, ...]
-) -> Array:
+) -> Float64:
     """Positions of the probe (site, 3) mm: a landmark, or the surfel nearest to the
     centre of the region of that name.
 
@@ -163,8 +165,8 @@ def site_positions(
 
 
 def _site_position(
-    surfels: SurfelSet, site: str, landmarks: Mapping[str, Array]
-) -> Array:
+    surfels: SurfelSet, site: str, landmarks: Mapping[str, Float64]
+) -> Float64:
     for name in (SITE_LANDMARK.get(site, site), site):
         if name in landmarks:
             return np.asarray(landmarks[name], np.float64)
@@ -188,8 +190,8 @@ def _site_position(
 
 
 def _regions(
-    mesh: CleanMesh, regions: Mapping[str, NDArray[np.int64]]
-) -> tuple[tuple[str, ...], Array]:
+    mesh: CleanMesh, regions: Mapping[str, Index]
+) -> tuple[tuple[str, ...], Float64]:
     """Membership (v', region) of the cleaned vertices in the regions of the scan."""
     member = np.zeros((len(mesh.vertices), len(regions)))
     for i, ids in enumerate(regions.values()):

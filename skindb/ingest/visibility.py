@@ -15,13 +15,11 @@ from skindb.geometry._ray_kernels import matches_tangent_plane
 from skindb.geometry.rays import RayScene
 from skindb.geometry.splats import THRESHOLD, SplatScene
 from skindb.ingest.surfels import SurfelSet
+from skindb.types import Float64, Index, Mask
 
-Array = NDArray[np.float64]
 Half = NDArray[np.float16]
-Bools = NDArray[np.bool_]
-Places = NDArray[np.int64]
 Method = Literal["rays", "splats"]
-VisibilityTest = Callable[[Places], Bools]  # surfels (m,) that face an eye -> (m,)
+VisibilityTest = Callable[[Index], Mask]  # surfels (m,) that face an eye -> (m,)
 # points of a light's disc besides its centre; each stands for a fifth of its area
 RING_POINTS = 4
 # one surfel in this many is tested for all points of a disc, to find isolated penumbrae
@@ -78,9 +76,9 @@ def light_visibility(
 
 def _add_penumbrae(
     fraction: Half,
-    start: Bools,
-    faces: Places,
-    facing: Bools,
+    start: Mask,
+    faces: Index,
+    facing: Mask,
     ring: Sequence[VisibilityTest],
 ) -> None:
     """Refine `fraction` (n,), the visibility of a disc's centre, to that of the disc,
@@ -103,7 +101,7 @@ def _add_penumbrae(
 
 def _visibility_test(
     surfels: SurfelSet, scene: RayScene, method: Method
-) -> Callable[[Array], VisibilityTest]:
+) -> Callable[[Float64], VisibilityTest]:
     """Function from an eye (3,) in mm to the visibility of surfels from it, by the method."""
     if method == "rays":
         position = surfels.position
@@ -114,7 +112,7 @@ def _visibility_test(
     if method == "splats":
         splats = SplatScene(surfels.position, surfels.normal, surfels.radius)
 
-        def look(eye: Array) -> VisibilityTest:
+        def look(eye: Float64) -> VisibilityTest:
             maps = splats.draw(eye)
             return lambda at: splats.visible_fraction(eye, at, maps=maps) >= THRESHOLD
 
@@ -139,7 +137,7 @@ def coarse_maps(
     ]
 
 
-def disc_points(light: LightRecord) -> Array:
+def disc_points(light: LightRecord) -> Float64:
     """Five points (5, 3) that represent equal parts of a light's disc; one for a point light."""
     if light.disc_radius == 0:
         return light.position[None]
@@ -163,7 +161,7 @@ def camera_visibility(
     pool: Executor,
     *,
     method: Method = "rays",
-) -> tuple[Half, Bools, NDArray[np.float32]]:
+) -> tuple[Half, Mask, NDArray[np.float32]]:
     """Visibility of the surfels in each camera.
 
     Returns
@@ -195,7 +193,7 @@ def camera_visibility(
     return visible, clear, pixels
 
 
-def _in_picture(surfels: SurfelSet, camera: CameraRecord) -> tuple[Array, Bools]:
+def _in_picture(surfels: SurfelSet, camera: CameraRecord) -> tuple[Float64, Mask]:
     """Projections (n, 2) of the surfels, and which of them face the camera and fall
     inside its picture (n,).
     """
@@ -241,9 +239,9 @@ def _clear(
     camera: CameraRecord,
     scene: RayScene,
     surfels: SurfelSet,
-    pixels: Array,
-    indices: Places,
-) -> Bools:
+    pixels: Float64,
+    indices: Index,
+) -> Mask:
     """Whether the pixels around surfels show the surface that their tangent planes predict."""
     distance, rays = depth_map(camera, scene)
     focal_px = float(np.sqrt(camera.K[0, 0] * camera.K[1, 1]))
