@@ -96,7 +96,7 @@ class Spool:
             # otherwise it is new, and its journal is invalid
             complete = os.fstat(self._file).st_size == size
             os.ftruncate(self._file, size)
-            self._resume(whole=complete)
+            self._resume(complete=complete)
         except BaseException:
             self._close()
             raise
@@ -154,16 +154,14 @@ class Spool:
         with self._turn:  # otherwise an older entry could replace a newer one
             with self._guard:
                 self._written = time.monotonic()
-                state = np.array(
-                    json.dumps({"frames": self._frames, "digests": self.digests})
-                )
+                state = {"frames": self._frames, "digests": self.digests}
                 content = io.BytesIO()
                 np.savez(
                     content,
                     done=self.done,
                     views=self.views,
                     counts=self.counts,
-                    state=state,
+                    state=np.array(json.dumps(state)),
                 )
             # the samples first: the journal must not list views that are not on disk
             os.fsync(self._file)
@@ -200,31 +198,22 @@ class Spool:
         rows = np.empty((3, cameras, lights, end - begin), np.float16)
         for i, (light, camera, channel) in enumerate(np.ndindex(lights, cameras, 3)):
             row = rows[channel, camera, light]
-            if (
-                os.preadv(self._file, [row.data.cast("B")], 2 * (i * n + begin))
-                != row.nbytes
-            ):
-                raise OSError(
-                    errno.EIO, "samples are truncated", str(self.folder / "samples")
-                )
+            buffer = row.data.cast("B")
+            if os.preadv(self._file, [buffer], 2 * (i * n + begin)) != row.nbytes:
+                file = str(self.folder / "samples")
+                raise OSError(errno.EIO, "samples are truncated", file)
         return rows.transpose()
 
-    def _resume(self, *, whole: bool) -> None:
+    def _resume(self, *, complete: bool) -> None:
         """Resume from the journal if it is complete and belongs to these samples and frames."""
         content = self._sealed(JOURNAL)
-        if content is not None:
+        if content is not None and complete:
             with np.load(content) as journal:
                 state = json.loads(str(journal["state"]))
-                # otherwise an earlier version of skindb wrote it
-                same = journal["counts"].shape == self.counts.shape
-                if (
-                    whole
-                    and same
-                    and state["frames"] == json.loads(json.dumps(self._frames))
-                ):
-                    self.done, self.views, self.counts = (
-                        journal[name] for name in ("done", "views", "counts")
-                    )
+                if state["frames"] == json.loads(json.dumps(self._frames)):
+                    self.done = journal["done"]
+                    self.views = journal["views"]
+                    self.counts = journal["counts"]
                     self.digests |= state["digests"]
                     return
         # before the first sample is overwritten, as a later run with the old frames
@@ -238,13 +227,10 @@ class Spool:
         path = self.folder / name
         if path.is_symlink() or not path.is_file():
             return None
-        seal = path.read_bytes()[:SEAL_BYTES]
-        content = path.read_bytes()[SEAL_BYTES:]
-        return (
-            io.BytesIO(content)
-            if hmac.compare_digest(seal, self._seal(name, content))
-            else None
-        )
+        sealed = path.read_bytes()
+        content = sealed[SEAL_BYTES:]
+        valid = hmac.compare_digest(sealed[:SEAL_BYTES], self._seal(name, content))
+        return io.BytesIO(content) if valid else None
 
     def _seal(self, name: str, content: bytes) -> bytes:
         return hmac.digest(self._key, name.encode() + b"\0" + content, "sha256")
@@ -298,14 +284,12 @@ def _remove(folder: Path) -> None:
     """Remove a spool, renaming it first: after a kill, no run finds a journal without
     its samples.
     """
-    gone = (
-        folder
-        if folder.name.endswith(REMOVED_SUFFIX)
-        else folder.with_name(f"{uuid.uuid4().hex}{REMOVED_SUFFIX}")
-    )
-    with suppress(OSError):  # the next call tries again
-        folder.rename(gone)
-    shutil.rmtree(gone, ignore_errors=True)
+    target = folder
+    if not folder.name.endswith(REMOVED_SUFFIX):
+        target = folder.with_name(f"{uuid.uuid4().hex}{REMOVED_SUFFIX}")
+        with suppress(OSError):  # the next call tries again
+            folder.rename(target)
+    shutil.rmtree(target, ignore_errors=True)
 
 
 def _locked(folder: Path, *, new: bool = True) -> int:
@@ -317,28 +301,23 @@ def _locked(folder: Path, *, new: bool = True) -> int:
     InputError
         If another process holds it.
     """
+    file = folder / "lock"
     while True:
         if new:
             make_private(folder)
-        lock = os.open(
-            folder / "lock", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, PRIVATE_FILE
-        )
+        lock = os.open(file, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, PRIVATE_FILE)
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if os.path.samestat(os.fstat(lock), (folder / "lock").stat()):
+            if os.path.samestat(os.fstat(lock), file.stat()):
                 return lock
         except FileNotFoundError:  # removed between opening and locking: try again
             pass
         except BlockingIOError:
             os.close(lock)
+            rule = "one process ingests a capture"
             cure = "wait until the other one has ended"
             raise InputError(
-                Fault(
-                    str(folder),
-                    "one process ingests a capture",
-                    "another one does",
-                    cure,
-                )
+                Fault(str(folder), rule, "another one does", cure)
             ) from None
         except OSError:
             os.close(lock)

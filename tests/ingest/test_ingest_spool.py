@@ -170,19 +170,6 @@ def test_spool__goes_on_from_its_journal_unless_frames_changed(tmp_path):
         assert not target.counts.any()
 
 
-def test_spool__begins_again_after_a_version_that_counted_less(tmp_path):
-    with (
-        suppress(KeyboardInterrupt),
-        Spool(tmp_path / "a", (2, 2, 5), FRAMES, key="run") as target,
-    ):
-        target.put(1, 0, np.zeros((3, 5), np.uint16), np.zeros(5, np.uint8), {"f": "x"})
-        target.counts = target.counts[:3]
-        raise KeyboardInterrupt
-    with Spool(tmp_path / "a", (2, 2, 5), FRAMES, key="run") as target:
-        assert not target.done.any()
-        assert target.counts.shape == (4, 5)
-
-
 def test_spool__an_older_note_never_replaces_a_newer_one(tmp_path, monkeypatch):
     """Two threads note their views; the note of the first is held up until the other's
     is written, or in vain.
