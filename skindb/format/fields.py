@@ -166,7 +166,7 @@ class Fields:
         elif value <= above:
             rule = f"must be greater than {above:g}"
         elif value < minimum:
-            rule = f"must be at minimum {minimum:g}"
+            rule = f"must be at least {minimum:g}"
         elif value > maximum:
             rule = f"must be at most {maximum:,g}"
         else:
@@ -249,8 +249,8 @@ class Fields:
                 self.fault(key, rule, shown(name))
                 return ()
         if len(value) < minimum:
-            cure = "give at minimum one name, or remove the enclosing part"
-            self.fault(key, "must be a list of at minimum one name", shown(value), cure)
+            cure = "give at least one name, or remove the enclosing part"
+            self.fault(key, "must be a list of at least one name", shown(value), cure)
         self._require_unique(key, value)
         return tuple(value)
 
@@ -260,7 +260,7 @@ class Fields:
         if value is None:
             return []
         if not isinstance(value, list) or not value:
-            self.fault(key, "must be a list of at minimum one object", shown(value))
+            self.fault(key, "must be a list of at least one object", shown(value))
             return []
         if not self._within(key, value, maximum):
             return []
