@@ -182,7 +182,7 @@ def test_calibrate_positions__skips_frames_without_a_highlight(setup, pictures):
         ({"radios": 3}, "radios"),
     ],
 )
-def test_read_ball__faults_are_named(setup, change, said):
+def test_read_calibration_frames__faults_are_named(setup, change, said):
     edited(setup, **change)
     with pytest.raises(InputError, match=said):
         calibrated(setup)

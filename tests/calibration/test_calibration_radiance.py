@@ -136,7 +136,7 @@ def test_radiance_floor__is_the_noise_of_darkness():
     assert radiance.std() == pytest.approx(floor, rel=0.02)
 
 
-def test_darkroom__applies_vignette_and_colour_matrix(pristine):
+def test_frame_merger__applies_vignette_and_colour_matrix(pristine):
     dome = read_capture(pristine).dome
     swap = np.array([[0, 1, 0], [1, 0, 0], [0, 0, 2.0]])
     camera = replace(
@@ -165,7 +165,7 @@ def test_vignette_gain__corner_and_centre(pristine):
 
 @pytest.mark.parametrize("with_dark", [False, True])
 @pytest.mark.parametrize("curved", [False, True])
-def test_darkroom__develops_as_merge_exposures(pristine, with_dark, curved):
+def test_frame_merger__develops_as_merge_exposures(pristine, with_dark, curved):
     """Twin: the NumPy formulas. Values everywhere between 0 and white, below black and
     above white among them.
     """
@@ -234,7 +234,7 @@ def test_darkroom__develops_as_merge_exposures(pristine, with_dark, curved):
 
 
 @pytest.mark.parametrize("lens", [0.0, -0.4])
-def test_darkroom__develops_spans_as_it_does_the_whole(pristine, lens):
+def test_frame_merger__develops_spans_as_it_does_the_whole(pristine, lens):
     """The same bits inside, and nothing usable beside them; rows of none and of all are
     among them.
     """
@@ -262,7 +262,7 @@ def test_darkroom__develops_spans_as_it_does_the_whole(pristine, lens):
     np.testing.assert_array_equal(flag, np.where(inside, whole_flag, SATURATED))
 
 
-def test_darkroom__a_sensor_without_noise(pristine):
+def test_frame_merger__a_sensor_without_noise(pristine):
     """Variance 0: the weights stay finite, and the photons of an unknown gain count nothing."""
     sensor = replace(SENSOR, read_noise=0.0, step=0.0, electrons_per_dn=np.inf)
     camera = replace(read_capture(pristine).dome.cameras[0], sensor=sensor)

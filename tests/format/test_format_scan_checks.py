@@ -275,7 +275,7 @@ def test_order_faults__a_hanging_nose_passes_and_without_heights_nothing_is_judg
     assert order_faults("f", {}) == []
 
 
-def test_doubled_faults__two_names_at_one_point(capture_folder):
+def test_coincidence_faults__two_names_at_one_point(capture_folder):
     points = FACE | {"subnasale": FACE["nose_tip"] + [0.1, 0, 0]}
     (fault,) = coincidence_faults("f", points)
     assert str(fault).startswith(
@@ -458,7 +458,7 @@ def test_ingest_capture__crop_is_in_the_provenance(capture_folder, tmp_path):
 
 
 @pytest.mark.parametrize("spacing", [6.0, 2.5])
-def test_carried_landmarks__lie_on_the_surface_of_the_surfels(capture_folder, spacing):
+def test_transferred_landmarks__lie_on_the_surface_of_the_surfels(capture_folder, spacing):
     """Clicked 0, 1, 2 .. mm beside the sphere: that is the distance, and what is stored
     lies on the surface.
     """
@@ -483,7 +483,7 @@ def test_carried_landmarks__lie_on_the_surface_of_the_surfels(capture_folder, sp
 
 
 @pytest.mark.parametrize("below", [1.0, 4.0, 8.0, 30.0])
-def test_carried_landmarks__cropped_away_are_nan(capture_folder, below):
+def test_transferred_landmarks__cropped_away_are_nan(capture_folder, below):
     """Cut that far above the nose: never carried to the cut edge, though that is within
     the reach of landmarks.
     """
@@ -506,7 +506,7 @@ def test_carried_landmarks__cropped_away_are_nan(capture_folder, below):
     assert np.isfinite(away).any()
 
 
-def test_carried_landmarks__clicked_beside_the_scan_stay_where_they_are_not_cropped(
+def test_transferred_landmarks__clicked_beside_the_scan_stay_where_they_are_not_cropped(
     capture_folder,
 ):
     put_landmarks(

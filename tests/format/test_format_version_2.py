@@ -251,7 +251,7 @@ def test_read_capture__mistakes_of_version_2(second, file, change, said):
     assert said in str(error.value)
 
 
-def test_read_sequence__iso_times_are_seconds(second):
+def test_read_dome__iso_times_are_seconds(second):
     steps = [
         step
         | {
