@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from skindb import analysis, bench, demo, export, fit, ingest, render, workflow
 
     # the first word of a notebook, as in xarray and zarr
-    from skindb.store.opening import open  # noqa: A004
+    from skindb.store.database import open  # noqa: A004
     from skindb.workflow.simulation import simulate
 
 __all__ = [
@@ -47,5 +47,5 @@ __getattr__, __dir__, _ = lazy_loader.attach(
         "render",
         "workflow",
     ],
-    submod_attrs={"store.opening": ["open"], "workflow.simulation": ["simulate"]},
+    submod_attrs={"store.database": ["open"], "workflow.simulation": ["simulate"]},
 )

@@ -14,7 +14,7 @@ from stored import commit, groups
 
 from skindb.store import Database
 from skindb.store import lease as lease_module
-from skindb.store.process import this_process
+from skindb.store.lease import this_process
 
 
 @pytest.fixture

@@ -10,13 +10,19 @@ from skindb.store.cohort import CohortRequest, frame_of, lacking
 from skindb.store.database import Database
 from skindb.store.erasure import Holdings
 from skindb.store.garbage import Garbage
-from skindb.store.kinds import CALIBRATION, RELEASE, STUDY, SUMMARY
 from skindb.store.known import Known
 from skindb.store.lease import LEASE_SECONDS, Lease, LeaseLost
 from skindb.store.log import Conflict
 from skindb.store.marker_file import MarkerFileWarning
 from skindb.store.markers import WithdrawnError
-from skindb.store.paths import require_text, subject_of
+from skindb.store.paths import (
+    CALIBRATION,
+    RELEASE,
+    STUDY,
+    SUMMARY,
+    require_text,
+    subject_of,
+)
 from skindb.store.place import UnavailableError
 from skindb.store.record import Record, seal_of
 from skindb.store.requests import Request

@@ -35,7 +35,6 @@ from skindb.store.archive import (
     seal_of_withdrawals,
     surviving,
 )
-from skindb.store.kinds import KINDS_OF_ONE_SUBJECT, RELEASE
 from skindb.store.lease import Lease
 from skindb.store.log import RESTORE, UPDATE
 from skindb.store.marker_file import note_consents, note_withdrawals
@@ -47,7 +46,7 @@ from skindb.store.markers import (
     marker_faults,
     read_markers,
 )
-from skindb.store.paths import TRANSIENT
+from skindb.store.paths import KINDS_OF_ONE_SUBJECT, RELEASE, TRANSIENT
 from skindb.store.place import Place, UnavailableError
 from skindb.store.record import LaterError, Record, record_from_json
 from skindb.store.requests import REQUESTS, read_requests

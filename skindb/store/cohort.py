@@ -14,9 +14,9 @@ import xarray as xr
 from skindb.errors import Fault, InputError
 from skindb.schema.cohort import Part, combine, few_names, one_take_each, take_coords
 from skindb.schema.notes import Note, note, note_lines
-from skindb.store.kinds import SUMMARY
 from skindb.store.known import Known
 from skindb.store.log import RESTORE
+from skindb.store.paths import SUMMARY
 from skindb.store.record import AS_RECORDED, Record
 from skindb.store.stage import describe
 

@@ -29,7 +29,6 @@ from skindb.store.erasure import (
     subject_holdings,
 )
 from skindb.store.garbage import Garbage, find_garbage, remove_garbage
-from skindb.store.kinds import CALIBRATION, KINDS_WITHOUT_SUBJECT, RELEASE, STUDY
 from skindb.store.known import Known, Snapshot, consent_of
 from skindb.store.lease import LEASE_SECONDS, Lease
 from skindb.store.location import place_at
@@ -43,7 +42,17 @@ from skindb.store.markers import (
     read_markers,
     readmit,
 )
-from skindb.store.paths import KIND, TAKE, TRANSIENT, require_text, subject_of
+from skindb.store.paths import (
+    CALIBRATION,
+    KIND,
+    KINDS_WITHOUT_SUBJECT,
+    RELEASE,
+    STUDY,
+    TAKE,
+    TRANSIENT,
+    require_text,
+    subject_of,
+)
 from skindb.store.place import UnavailableError
 from skindb.store.record import Record, json_object
 from skindb.store.record_cache import CACHED_KINDS, RecordCache, takes_in_log
@@ -920,3 +929,20 @@ def _table(known: Known) -> pd.DataFrame:
 
 def _chunked(ds: xr.Dataset) -> xr.Dataset:
     return ds.chunk(surfel=SHARD) if "surfel" in ds.dims else ds
+
+
+def open(url: str) -> Database:  # noqa: A001  as in xarray and zarr
+    """Open a database.
+
+    Parameters
+    ----------
+    url
+        Folder of the database, created by the first commit if it is absent, or
+        ``s3://bucket/prefix``.
+
+    Returns
+    -------
+    Database
+        Handle with `takes()`, `table()`, `read(kind, take)`, `cohort(layout)` and `info()`.
+    """
+    return Database(url)

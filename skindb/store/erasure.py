@@ -20,18 +20,22 @@ from typing import TypeVar
 from skindb.errors import Fault, InputError
 from skindb.schema.consent import CONSENT
 from skindb.store.folder import remove_tree
-from skindb.store.kinds import (
+from skindb.store.lease import Lease
+from skindb.store.log import Log, committed_logs, names_below
+from skindb.store.marker_file import note_withdrawals
+from skindb.store.markers import Markers, mark_withdrawn, read_markers
+from skindb.store.paths import (
+    KIND,
     KINDS_OF_ONE_SUBJECT,
     KINDS_WITHOUT_SUBJECT,
     RELEASE,
     STUDY,
     SUMMARY,
+    TAKE,
+    TIME_HEX,
+    TRANSIENT,
+    subject_of,
 )
-from skindb.store.lease import Lease
-from skindb.store.log import Log, committed_logs, names_below
-from skindb.store.marker_file import note_withdrawals
-from skindb.store.markers import Markers, mark_withdrawn, read_markers
-from skindb.store.paths import KIND, TAKE, TIME_HEX, TRANSIENT, subject_of
 from skindb.store.place import Place, UnavailableError
 from skindb.store.record import Record, subjects_of
 from skindb.store.record_cache import CATALOGUE, cache_names

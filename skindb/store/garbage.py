@@ -16,11 +16,19 @@ from skindb.errors import Fault, InputError
 from skindb.limits import RESUMABLE_SECONDS
 from skindb.schema.consent import CONSENT
 from skindb.store.erasure import SCRATCH_NAME, erase_withdrawn, holdings_of
-from skindb.store.kinds import CALIBRATION, RELEASE
 from skindb.store.lease import NUMBER, Lease, abandoned_holder, holder_of, storage_time
 from skindb.store.log import Log, committed_logs, names_below
 from skindb.store.markers import Markers, read_markers
-from skindb.store.paths import KIND, LEASE_KINDS, STAGING, TAKE, TIME_HEX, TRANSIENT
+from skindb.store.paths import (
+    CALIBRATION,
+    KIND,
+    LEASE_KINDS,
+    RELEASE,
+    STAGING,
+    TAKE,
+    TIME_HEX,
+    TRANSIENT,
+)
 from skindb.store.place import Place
 from skindb.store.record import Record
 from skindb.store.stage import remove_version

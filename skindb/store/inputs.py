@@ -11,14 +11,14 @@ from typing import Any
 
 from skindb.errors import Fault, InputError
 from skindb.schema.consent import CONSENT, consent_scope
-from skindb.store.kinds import (
+from skindb.store.log import Log
+from skindb.store.paths import (
     KINDS_OF_ONE_SUBJECT,
     KINDS_WITHOUT_SUBJECT,
     RELEASE,
     STUDY,
+    subject_of,
 )
-from skindb.store.log import Log
-from skindb.store.paths import subject_of
 from skindb.store.place import Place, UnavailableError
 from skindb.store.record import Record, own_takes
 

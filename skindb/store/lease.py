@@ -13,23 +13,31 @@ differ. Leases only prevent wasted work: the log alone decides what is committed
 from __future__ import annotations
 
 import json
+import os
 import re
+import socket
 import threading
 import time
 import uuid
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 from skindb.clock import SYSTEM_CLOCK, Clock
 from skindb.errors import Fault, InputError
-from skindb.store.kinds import KINDS_WITHOUT_SUBJECT
 from skindb.store.markers import AdmissionGuard, WithdrawnError
-from skindb.store.paths import KIND, TAKE, require_text, subject_of
+from skindb.store.paths import (
+    KIND,
+    KINDS_WITHOUT_SUBJECT,
+    TAKE,
+    require_text,
+    subject_of,
+)
 from skindb.store.place import Place
-from skindb.store.process import has_ended, this_process
 from skindb.store.record import json_object
 
 # without a renewal; a compilation can delay the renewing thread for some of them
@@ -37,6 +45,9 @@ LEASE_SECONDS = 60.0
 RENEWALS = 4  # within the duration of a lease
 MAX_LEASE_SECONDS = 3600.0  # limit for the durations in files, which may be damaged
 POLL_SECONDS = 0.5  # between two attempts to acquire a lease
+PROC = Path("/proc")
+# equal for processes that can find each other by their ids
+MACHINE_KEYS = ("boot", "namespace")
 NUMBER = re.compile(r"([0-9]{8})\.json")
 ONE_RUN = "only one run at a time may work on it"
 
@@ -379,3 +390,58 @@ def _lost_fault(key: str, newest: Claim | None) -> Fault:
 def _uptime() -> float:
     """Seconds since the boot, including those while the machine was suspended."""
     return time.clock_gettime(getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC))
+
+
+def this_process() -> dict[str, Any]:
+    """Host name, process id and, on Linux, the boot id, the namespace of process ids
+    and the start time.
+    """
+    number = os.getpid()
+    return {
+        "host": socket.gethostname(),
+        "process": number,
+        "started": _start(number),
+        **_machine(),
+    }
+
+
+def has_ended(holder: Mapping[str, Any]) -> bool:
+    """Whether a process described by `this_process` has certainly ended; False for a
+    process of another machine.
+    """
+    here = _machine()
+    number = holder.get("process")
+    started = holder.get("started")
+    if not all(here[name] and here[name] == holder.get(name) for name in MACHINE_KEYS):
+        return False
+    if not isinstance(number, int) or not 0 < number < 1 << 31 or not started:
+        return False
+    try:
+        os.kill(number, 0)
+    except ProcessLookupError:
+        return True
+    except OSError:  # a process of another user
+        pass
+    now = _start(number)
+    return now not in (started, None)
+
+
+def _machine() -> dict[str, str]:
+    try:
+        boot = (PROC / "sys/kernel/random/boot_id").read_text().strip()
+        return {"boot": boot, "namespace": str((PROC / "self/ns/pid").readlink())}
+    except OSError:
+        return dict.fromkeys(MACHINE_KEYS, "")
+
+
+def _start(number: int) -> str | None:
+    """Start of a process in clock ticks since the boot; "ended" for a zombie process;
+    None if unknown.
+    """
+    try:
+        state, *rest = (
+            (PROC / str(number) / "stat").read_text().rpartition(")")[2].split()
+        )
+    except (OSError, ValueError):
+        return None
+    return "ended" if state in "ZX" else rest[18]

@@ -1,5 +1,5 @@
-"""Patterns of names, and the conversion of keys to paths, which never leads outside the
-database.
+"""Names of kinds, takes and files, and the conversion of keys to paths, which never leads
+outside the database.
 """
 
 from __future__ import annotations
@@ -10,6 +10,16 @@ from pathlib import Path
 
 from skindb.errors import Fault, InputError
 
+STUDY = "population"  # results of a study of many takes
+RELEASE = "release"  # one version of every take under a name
+CALIBRATION = "calibration"  # of the lights of a dome
+# tables, samples or maps of a take with other parameters than those of its model
+SUMMARY = "summary"
+# whose takes are names of studies, releases and calibrations
+KINDS_WITHOUT_SUBJECT = (STUDY, RELEASE, CALIBRATION)
+# kinds that hold data of their own subject only; an input of them is of that subject,
+# or a product that many share
+KINDS_OF_ONE_SUBJECT = ("capture", "first", "model", "consent")
 TAKE = r"[A-Za-z0-9_-]{1,64}(\.[A-Za-z0-9_-]{1,64})?"
 KIND = r"[a-z]{1,32}"
 GROUP = r"[a-z_]{1,32}"

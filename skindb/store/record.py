@@ -14,8 +14,14 @@ from typing import Any, TypeGuard
 from skindb.files import json_depth
 from skindb.limits import MAX_JSON_DEPTH
 from skindb.schema import SCHEMA_VERSION, VARIABLES
-from skindb.store.kinds import KINDS_WITHOUT_SUBJECT
-from skindb.store.paths import GROUP, KIND, TAKE, VERSION, subject_of
+from skindb.store.paths import (
+    GROUP,
+    KIND,
+    KINDS_WITHOUT_SUBJECT,
+    TAKE,
+    VERSION,
+    subject_of,
+)
 
 FORMAT = 3
 FIELDS = {

@@ -6,8 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from skindb.errors import Fault, InputError
-from skindb.store.kinds import RELEASE
-from skindb.store.paths import TAKE, require_text
+from skindb.store.paths import RELEASE, TAKE, require_text
 from skindb.store.place import Place
 from skindb.store.record import Record
 from skindb.store.stage import Stage

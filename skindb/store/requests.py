@@ -15,8 +15,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from skindb.errors import Fault
-from skindb.store.kinds import KINDS_WITHOUT_SUBJECT
-from skindb.store.paths import KIND, TAKE, subject_of
+from skindb.store.paths import KIND, KINDS_WITHOUT_SUBJECT, TAKE, subject_of
 from skindb.store.place import Place, UnavailableError
 from skindb.store.record import json_object, seal_of
 

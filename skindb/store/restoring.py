@@ -24,7 +24,6 @@ from skindb.store.archive import (
     require_apart,
     surviving,
 )
-from skindb.store.kinds import RELEASE
 from skindb.store.lease import Lease
 from skindb.store.location import place_at
 from skindb.store.log import Log
@@ -44,7 +43,7 @@ from skindb.store.markers import (
     keyed_hash,
     require_secret,
 )
-from skindb.store.paths import STAGING
+from skindb.store.paths import RELEASE, STAGING
 from skindb.store.place import Place
 from skindb.store.record import Record, subjects_of
 from skindb.store.requests import REQUESTS

@@ -29,11 +29,17 @@ from skindb.store.inputs import (
     require_inputs,
     require_own_subject,
 )
-from skindb.store.kinds import KINDS_OF_ONE_SUBJECT
 from skindb.store.lease import Lease
 from skindb.store.log import Log
 from skindb.store.markers import AdmissionGuard, read_markers, require_secret
-from skindb.store.paths import GROUP, TAKE, TRANSIENT, VERSION, require_text
+from skindb.store.paths import (
+    GROUP,
+    KINDS_OF_ONE_SUBJECT,
+    TAKE,
+    TRANSIENT,
+    VERSION,
+    require_text,
+)
 from skindb.store.place import Place, UnavailableError
 from skindb.store.record import Record, json_object, own_takes, subjects_of
 

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from skindb.errors import Fault, InputError, SkindbWarning
 from skindb.schema.consent import CONSENT
-from skindb.store.kinds import STUDY
 from skindb.store.known import Snapshot, consent_of
 from skindb.store.markers import WithdrawnError
+from skindb.store.paths import STUDY
 from skindb.store.place import UnavailableError
 from skindb.store.record import Record
 from skindb.store.record_cache import CACHED_KINDS

@@ -13,13 +13,13 @@ import xarray as xr
 from skindb.errors import Fault, InputError
 from skindb.store.audit import BLOCK_NAME, ENTRY_NAME, read_audit
 from skindb.store.erasure import holdings_of
-from skindb.store.kinds import KINDS_OF_ONE_SUBJECT
 from skindb.store.lease import NUMBER, abandoned_holder
 from skindb.store.log import GENERATION, RESTORE, Log, committed_logs, tombstone_of
 from skindb.store.markers import SECRET, WITHDRAWN, marker_faults, read_markers
 from skindb.store.paths import (
     AUDIT,
     KIND,
+    KINDS_OF_ONE_SUBJECT,
     LEASE_KINDS,
     STAGING,
     TAKE,

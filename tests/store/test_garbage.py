@@ -15,7 +15,7 @@ from skindb.errors import InputError
 from skindb.store import Database
 from skindb.store import lease as lease_module
 from skindb.store.garbage import RELEASE, STILL_WRITING_SECONDS
-from skindb.store.process import this_process
+from skindb.store.lease import this_process
 
 HEX = "0" * 32
 OLD = STILL_WRITING_SECONDS + 60

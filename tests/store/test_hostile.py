@@ -10,7 +10,7 @@ from stored import commit, groups
 
 from skindb.errors import InputError
 from skindb.store import Database
-from skindb.store.metadata import metadata_faults
+from skindb.store.verified import metadata_faults
 
 AREA = "surfels/surfel_area/zarr.json"
 

@@ -17,7 +17,7 @@ from stored import commit, groups
 import skindb
 from skindb.errors import InputError
 from skindb.store import lease as lease_module
-from skindb.store.process import this_process
+from skindb.store.lease import this_process
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from test_cli import _run

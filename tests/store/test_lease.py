@@ -22,8 +22,7 @@ from skindb.clock import SimulatedClock
 from skindb.errors import InputError
 from skindb.store import Database, LeaseLost
 from skindb.store import lease as lease_module
-from skindb.store.lease import LEASE_SECONDS, POLL_SECONDS, Lease
-from skindb.store.process import this_process
+from skindb.store.lease import LEASE_SECONDS, POLL_SECONDS, Lease, this_process
 
 
 @pytest.fixture
