@@ -24,9 +24,10 @@ from skindb.store.paths import (
     subject_of,
 )
 from skindb.store.place import UnavailableError
-from skindb.store.record import Record, seal_of
+from skindb.store.record import Record
 from skindb.store.requests import Request
 from skindb.store.restoring import Restored, restore
+from skindb.store.sealed import seal_of
 from skindb.store.stale import Staleness, StaleWarning, require_fresh, stale_versions
 
 __all__ = [

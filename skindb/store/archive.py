@@ -17,6 +17,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from typing import TypeVar
 
 from skindb.errors import Fault, InputError
@@ -36,13 +37,20 @@ from skindb.store.markers import (
 )
 from skindb.store.paths import KIND, TAKE, TIME_HEX
 from skindb.store.place import Place, UnavailableError
-from skindb.store.record import DIGEST, Record, json_object, record_from_json, seal_of
+from skindb.store.record import DIGEST, Record, record_from_json
 from skindb.store.requests import (
     REQUEST_NAME,
     REQUESTS,
     Request,
     request_content,
     request_from_json,
+)
+from skindb.store.sealed import (
+    collect_faults,
+    damage_as_fault,
+    reason_of,
+    seal_of,
+    sealed_object,
 )
 from skindb.store.verified import Manifest, manifest_from_json
 
@@ -162,60 +170,36 @@ class Archive:
     def state(self, number: int) -> State:
         """A state; `InputError` if it does not exist or is damaged."""
         key = f"{STATES}/{number:06d}.json"
-        cure = CURE_STATE
-        if number not in self.numbers():
-            found = f"states {', '.join(map(str, self.numbers())) or 'none'}"
-            raise InputError(
-                Fault(
-                    self.place.name,
-                    f"state {number} must exist",
-                    found,
-                    "see skindb restore --list",
-                )
-            )
-        try:
-            body = json_object(self.place.read_small(key))
-            if body.pop("seal", None) != seal_of(body):
-                raise ValueError("content that does not match its seal")
+        numbers = self.numbers()
+        if number not in numbers:
+            rule = f"state {number} must exist"
+            found = f"states {', '.join(map(str, numbers)) or 'none'}"
+            cure = "see skindb restore --list"
+            raise InputError(Fault(self.place.name, rule, found, cure))
+        with damage_as_fault(self.place.where(key), AS_WRITTEN, CURE_STATE):
+            body = sealed_object(self.place.read_small(key))
             format_ = body.pop("format")
             if format_ != FORMAT:
-                cure = UPDATE
-                raise ValueError(f"a state of format {format_!r}")
+                raise ValueError(
+                    f"a state of format {format_!r}; if it is later, {UPDATE}"
+                )
             if body["number"] != number:
                 raise ValueError("another state")
             if not all(
-                STATE_KEY.fullmatch(name) and re.fullmatch(DIGEST, one)
-                for name, one in body["files"].items()
+                STATE_KEY.fullmatch(name) and re.fullmatch(DIGEST, digest)
+                for name, digest in body["files"].items()
             ):
                 raise ValueError("names that are not those of a database")
             return State(**body)
-        except UnavailableError:
-            raise
-        except (
-            OSError,
-            ValueError,
-            TypeError,
-            KeyError,
-            AttributeError,
-            RecursionError,
-        ) as error:
-            found = getattr(error, "strerror", None) or str(error)
-            raise InputError(
-                Fault(self.place.where(key), AS_WRITTEN, found, cure)
-            ) from None
 
     def states(self) -> tuple[list[State], list[Fault]]:
         """All readable states, and the faults of the others."""
-        states: list[State] = []
         faults: list[Fault] = []
-        for number in self.numbers():
-            try:
-                states.append(self.state(number))
-            except UnavailableError:
-                raise
-            except InputError as error:
-                faults += error.faults
-        return states, faults
+        states = [
+            collect_faults(partial(self.state, number), faults)
+            for number in self.numbers()
+        ]
+        return [state for state in states if state is not None], faults
 
     def contents(self) -> set[str]:
         """Digests of all contents."""
@@ -229,34 +213,20 @@ class Archive:
         """The content of a file of the database, compared with its digest."""
         name, digest, size = item
         key = content_key(digest)
+        place = self.place
         try:
             content = (
-                self.place.read_small(key)
-                if size is None
-                else self.place.read(key, 0, size)
+                place.read_small(key) if size is None else place.read(key, 0, size)
             )
-            found = (
-                ""
-                if hashlib.sha256(content).hexdigest() == digest
-                else "different content"
-            )
+            if hashlib.sha256(content).hexdigest() == digest:
+                return content
+            found = "different content"
         except UnavailableError:
             raise
         except (OSError, InputError) as error:
-            found = (
-                getattr(error, "strerror", None)
-                or "something that is not a regular file"
-            )
-        if found:
-            raise InputError(
-                Fault(
-                    self.place.where(key),
-                    AS_WRITTEN,
-                    f"{found} for {name}",
-                    CURE_CONTENT,
-                )
-            )
-        return content
+            found = reason_of(error)
+        where = place.where(key)
+        raise InputError(Fault(where, AS_WRITTEN, f"{found} for {name}", CURE_CONTENT))
 
     def put(self, content: bytes, digest: str, guard: Callable[[], None]) -> None:
         """Write a content under its digest, unless the guard raises."""
@@ -355,19 +325,9 @@ class Archive:
 
     def _parsed(self, item: Item, parse: Callable[[bytes], R]) -> R:
         content = self.read(item)
-        try:
+        where = f"{self.place.where(content_key(item[1]))}, {item[0]}"
+        with damage_as_fault(where, AS_WRITTEN, CURE_CONTENT):
             return parse(content)
-        except (
-            ValueError,
-            TypeError,
-            KeyError,
-            AttributeError,
-            RecursionError,
-        ) as error:
-            where = self.place.where(content_key(item[1]))
-            raise InputError(
-                Fault(where, AS_WRITTEN, f"{error}, for {item[0]}", CURE_CONTENT)
-            ) from None
 
 
 def backup_states(url: str) -> list[State]:
@@ -474,21 +434,17 @@ def intact(
     faults are added to `faults`.
     """
 
-    def attempt(value: T) -> R | InputError:
-        try:
-            return function(value)
-        except UnavailableError:
-            raise
-        except InputError as error:
-            return error
+    def attempt(value: T) -> tuple[R | None, list[Fault]]:
+        found: list[Fault] = []
+        return collect_faults(partial(function, value), found), found
 
     values = list(values)
     pool = ThreadPoolExecutor(THREADS)
     try:
         for value, outcome in zip(values, pool.map(attempt, values), strict=True):
-            if isinstance(outcome, InputError):
-                faults.extend(outcome.faults)
-            else:
-                yield value, outcome
+            result, found = outcome
+            faults.extend(found)
+            if result is not None:
+                yield value, result
     finally:
         pool.shutdown(cancel_futures=True)

@@ -26,7 +26,7 @@ from skindb.store.condition import evaluate
 from skindb.store.markers import is_sealed, keyed_hash, keyed_seal, require_secret
 from skindb.store.paths import AUDIT, subject_of
 from skindb.store.place import Place, UnavailableError
-from skindb.store.record import json_object
+from skindb.store.sealed import collect_faults, damage_as_fault, json_object
 
 FORMAT = 1
 BLOCK = 1_000  # numbers in a folder
@@ -156,12 +156,9 @@ def read_audit(
             Fault(place.where(AUDIT), "must be a folder", f"a {file_type}", RESTORE)
         ]
     numbers, faults = _listed(place)
-    try:
-        secret = require_secret(place)
-    except UnavailableError:
-        raise
-    except InputError as error:
-        return [], [*faults, *error.faults]
+    secret = collect_faults(partial(require_secret, place), faults)
+    if secret is None:
+        return [], faults
     entries: dict[int, AuditEntry] = {}
     with ThreadPoolExecutor(THREADS) as threads:
         outcomes = threads.map(partial(_outcome, place, secret), numbers)
@@ -245,16 +242,12 @@ def _outcome(place: Place, secret: bytes, number: int) -> AuditEntry | Fault:
     """An entry, or what is wrong with it."""
     key = entry_key(number)
     try:
-        return _entry_from_json(secret, key, number, place.read_small(key))
+        with damage_as_fault(place.where(key), RULE, RESTORE):
+            return _entry_from_json(secret, key, number, place.read_small(key))
     except UnavailableError:
         raise
-    except InputError as error:  # a symbolic link
-        found = error.faults[0].found
-    except OSError as error:
-        found = error.strerror or "an unreadable file"
-    except (ValueError, RecursionError) as error:
-        found = str(error)
-    return Fault(place.where(key), RULE, found, RESTORE)
+    except InputError as error:
+        return error.faults[0]
 
 
 def _entry_from_json(

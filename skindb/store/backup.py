@@ -36,7 +36,7 @@ from skindb.store.archive import (
     surviving,
 )
 from skindb.store.lease import Lease
-from skindb.store.log import RESTORE, UPDATE
+from skindb.store.log import read_record
 from skindb.store.marker_file import note_consents, note_withdrawals
 from skindb.store.markers import (
     BACKUP,
@@ -47,9 +47,10 @@ from skindb.store.markers import (
     read_markers,
 )
 from skindb.store.paths import KINDS_OF_ONE_SUBJECT, RELEASE, TRANSIENT
-from skindb.store.place import Place, UnavailableError
-from skindb.store.record import LaterError, Record, record_from_json
+from skindb.store.place import Place
+from skindb.store.record import Record
 from skindb.store.requests import REQUESTS, read_requests
+from skindb.store.sealed import damage_as_fault
 from skindb.store.verified import AS_COMMITTED, CHANGED, CURE, read_manifest
 
 T = TypeVar("T")
@@ -307,7 +308,7 @@ def _draft(place: Place, markers: Markers, states: list[State]) -> Draft:
         if (match := RECORD_KEY.fullmatch(key)) and match[1] not in TRANSIENT
     ]
     faults: list[Fault] = []
-    every = dict(intact(partial(_read_record, place), keys, faults))
+    every = dict(intact(partial(read_record, place), keys, faults))
     tombstones = [key for key in listing if key.startswith("tombstones/")]
     records, texts = surviving(
         {key: record for key, (record, _) in every.items()},
@@ -387,24 +388,6 @@ def _require_unchanged(
         raise Changed
 
 
-def _read_record(place: Place, key: str) -> tuple[Record, str]:
-    """A record, and the digest of its file."""
-    cure = RESTORE
-    try:
-        content = place.read_small(key)
-        return record_from_json(content, key), hashlib.sha256(content).hexdigest()
-    except UnavailableError:
-        raise
-    except LaterError as error:
-        found = f"{error}, written by a later version of skindb"
-        cure = UPDATE
-    except (OSError, ValueError, RecursionError) as error:
-        found = _reason(error)
-    raise InputError(
-        Fault(place.where(key), "a record of the log must be as committed", found, cure)
-    )
-
-
 def _version_items(place: Place, record: Record) -> list[Item]:
     """All files of a version except for its record."""
     return [
@@ -430,17 +413,5 @@ def _copy(place: Place, archive: Archive, guard: Callable[[], None], item: Item)
 
 def _read(place: Place, item: Item) -> bytes:
     name, _, size = item
-    try:
+    with damage_as_fault(place.where(name), AS_COMMITTED, CURE):
         return place.read_small(name) if size is None else place.read(name, 0, size)
-    except UnavailableError:
-        raise
-    except (OSError, InputError) as error:
-        raise InputError(
-            Fault(place.where(name), AS_COMMITTED, _reason(error), CURE)
-        ) from None
-
-
-def _reason(error: Exception) -> str:
-    if isinstance(error, InputError):
-        return error.faults[0].found
-    return getattr(error, "strerror", None) or str(error)

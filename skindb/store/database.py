@@ -54,10 +54,11 @@ from skindb.store.paths import (
     subject_of,
 )
 from skindb.store.place import UnavailableError
-from skindb.store.record import Record, json_object
+from skindb.store.record import Record
 from skindb.store.record_cache import CACHED_KINDS, RecordCache, takes_in_log
 from skindb.store.release import commit_release, create_release, pinned_record, pins_of
 from skindb.store.requests import Request, read_requests, remove_request
+from skindb.store.sealed import json_object
 from skindb.store.stage import TABLES, Stage, remove_version, tables_from_json
 from skindb.store.stale import DERIVED, Staleness
 from skindb.store.verified import VerifiedStore, read_beside

@@ -38,7 +38,7 @@ from skindb.store.paths import (
     subject_of,
 )
 from skindb.store.place import Place
-from skindb.store.record import json_object
+from skindb.store.sealed import json_object
 
 # without a renewal; a compilation can delay the renewing thread for some of them
 LEASE_SECONDS = 60.0

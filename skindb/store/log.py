@@ -16,6 +16,7 @@ import re
 from collections.abc import Callable, Iterable
 from dataclasses import asdict
 from datetime import UTC, datetime
+from functools import partial
 from typing import Any
 
 from skindb.errors import Fault, InputError
@@ -26,9 +27,15 @@ from skindb.store.record import (
     FORMAT,
     LaterError,
     Record,
-    json_object,
     record_from_json,
     record_to_json,
+)
+from skindb.store.sealed import (
+    DAMAGE,
+    collect_faults,
+    intact_or_none,
+    json_object,
+    reason_of,
     seal_of,
 )
 
@@ -195,79 +202,47 @@ class Log:
         last = 0
         seal = ""
         for generation in known:
-            try:
-                record = self._read(generation)
-            except InputError as error:
-                faults += error.faults
-                last = generation
+            record = collect_faults(partial(self._read, generation), faults)
+            if record is None:
                 seal = "?"
-                continue
-            faults += self._link_faults(record, last, seal)
-            faults += [fault] if (fault := self._mismatch_fault(head, record)) else []
-            records.append(record)
+            else:
+                faults += self._link_faults(record, last, seal)
+                faults += filter(None, [self._mismatch_fault(head, record)])
+                records.append(record)
+                seal = record.seal
             last = generation
-            seal = record.seal
-        return records, faults + (
-            [lost] if (lost := self._lost_fault(head, known)) else []
-        )
+        faults += filter(None, [self._lost_fault(head, known)])
+        return records, faults
 
     def readable(self) -> list[Record]:
         """All readable records, oldest first; damaged ones are skipped."""
-        records = []
-        for generation in self.generations():
-            try:
-                records.append(self._read(generation))
-            except UnavailableError:
-                raise
-            except InputError:
-                continue
-        return records
+        read = [
+            intact_or_none(partial(self._read, generation))
+            for generation in self.generations()
+        ]
+        return [record for record in read if record is not None]
 
     def head(self) -> dict[str, Any]:
         """Generation and seal of the newest record from the cache; empty if the cache
         is missing or damaged.
         """
-        try:
-            head = json_object(self.place.read_small(self.head_key))
-        except UnavailableError:
-            raise
-        except (OSError, ValueError, RecursionError):
+        head = intact_or_none(lambda: json_object(self.place.read_small(self.head_key)))
+        if head is None:
             return {}
         digest = head.pop("digest", None)
-        if not isinstance(head.get("generation"), int) or not isinstance(
-            head.get("seal"), str
-        ):
-            return {}
-        return head if digest == self._head_digest(head) else {}
+        is_whole = (
+            isinstance(head.get("generation"), int)
+            and isinstance(head.get("seal"), str)
+            and digest == self._head_digest(head)
+        )
+        return head if is_whole else {}
 
     def is_removed(self, seal: str) -> bool:
         """Whether a record with this seal was removed deliberately."""
         return self._tombstone(seal) is not None
 
     def _read(self, generation: int) -> Record:
-        key = self.record_key(generation)
-        cure = RESTORE
-        try:
-            return record_from_json(self.place.read_small(key), key)
-        except UnavailableError:
-            raise
-        except LaterError as error:
-            found = f"{error}, written by a later version of skindb"
-            cure = UPDATE
-        except InputError as error:  # a symbolic link
-            found = error.faults[0].found
-        except (ValueError, RecursionError) as error:
-            found = str(error)
-        except OSError as error:
-            found = error.strerror or "an unreadable file"
-        raise InputError(
-            Fault(
-                self.place.where(key),
-                "a record of the log must be as committed",
-                found,
-                cure,
-            )
-        )
+        return read_record(self.place, self.record_key(generation))[0]
 
     def _link_faults(self, record: Record, last: int, seal: str) -> list[Fault]:
         """Faults of the link to the previous record, which must exist unless it was
@@ -370,22 +345,36 @@ class Log:
         """The tombstone of the record with this seal; None if there is none."""
         if not seal:
             return None
-        try:
-            tombstone = json_object(self.place.read_small(tombstone_of(seal)))
-        except UnavailableError:
-            raise
-        except (OSError, ValueError, RecursionError):
-            return None
-        return (
-            tombstone
-            if tombstone.get("seal") == seal
-            and isinstance(tombstone.get("previous"), str)
-            else None
+        tombstone = intact_or_none(
+            lambda: json_object(self.place.read_small(tombstone_of(seal)))
         )
+        is_whole = (
+            tombstone is not None
+            and tombstone.get("seal") == seal
+            and isinstance(tombstone.get("previous"), str)
+        )
+        return tombstone if is_whole else None
 
     def record_key(self, generation: int) -> str:
         """Key of a record."""
         return f"{self.key}/{generation:08d}.json"
+
+
+def read_record(place: Place, key: str) -> tuple[Record, str]:
+    """The record in a file of the log, and the digest of the file."""
+    try:
+        content = place.read_small(key)
+        return record_from_json(content, key), hashlib.sha256(content).hexdigest()
+    except UnavailableError:
+        raise
+    except DAMAGE as error:
+        found = reason_of(error)
+        cure = RESTORE
+        if isinstance(error, LaterError):
+            found += ", written by a later version of skindb"
+            cure = UPDATE
+    rule = "a record of the log must be as committed"
+    raise InputError(Fault(place.where(key), rule, found, cure))
 
 
 def tombstone_of(seal: str) -> str:

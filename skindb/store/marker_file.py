@@ -36,7 +36,8 @@ from skindb.store.markers import (
     require_secret,
 )
 from skindb.store.place import Place, UnavailableError
-from skindb.store.record import DIGEST, Record, json_object
+from skindb.store.record import DIGEST, Record
+from skindb.store.sealed import json_object
 
 FORMAT = 1
 LINE = "line"  # the key in the seals of lines

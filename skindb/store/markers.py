@@ -32,12 +32,21 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, date, datetime
+from functools import partial
 from typing import Any
 
 from skindb.errors import Fault, InputError
 from skindb.store.paths import AUDIT
-from skindb.store.place import Place, UnavailableError
-from skindb.store.record import Record, json_object, seal_of, subjects_of
+from skindb.store.place import Place
+from skindb.store.record import Record, subjects_of
+from skindb.store.sealed import (
+    collect_faults,
+    damage_as_fault,
+    json_object,
+    seal_of,
+    sealed,
+    sealed_object,
+)
 
 SECRET = "secret"
 SECRET_BYTES = 32
@@ -190,21 +199,10 @@ def require_secret(place: Place) -> bytes:
         and not _numbers(place)
         and not place.file_type(AUDIT)
     ):
-        body = {"secret": os.urandom(SECRET_BYTES).hex()}
-        place.create(SECRET, json.dumps(body | {"seal": seal_of(body)}).encode())
-    try:
-        body = json_object(place.read_small(SECRET))
-        if body.pop("seal", None) != seal_of(body):
-            raise ValueError("content that does not match its seal")
-        return bytes.fromhex(body["secret"])
-    except UnavailableError:
-        raise
-    except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
-        rule = "must be as it was created, because withdrawn subjects and the audit log need it"
-        found = getattr(error, "strerror", None) or str(error)
-        raise InputError(
-            Fault(place.where(SECRET), rule, found, RESTORE_SECRET)
-        ) from None
+        place.create(SECRET, sealed({"secret": os.urandom(SECRET_BYTES).hex()}))
+    rule = "must be as it was created, because withdrawn subjects and the audit log need it"
+    with damage_as_fault(place.where(SECRET), rule, RESTORE_SECRET):
+        return bytes.fromhex(sealed_object(place.read_small(SECRET))["secret"])
 
 
 def read_markers(place: Place) -> Markers:
@@ -220,15 +218,7 @@ def last_entry(place: Place, subject: str) -> Entry | None:
     if not number:
         return None
     key = _entry_key(markers.secret, subject, number)
-    try:
-        body = json_object(place.read_small(key))
-        if not is_sealed(markers.secret, key, body):
-            raise ValueError("content that does not match its seal")
-        return Entry(number, body)
-    except UnavailableError:
-        raise
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(_entry_fault(place, key, error)) from None
+    return Entry(number, _read_entry(place, markers.secret, key))
 
 
 def mark_withdrawn(place: Place, subject: str, removed: Mapping[str, int]) -> None:
@@ -287,22 +277,14 @@ def marker_faults(place: Place) -> list[Fault]:
     numbers = _numbers(place)
     if not numbers and not place.file_type(SECRET):
         return []
-    try:
-        secret = require_secret(place)
-    except InputError as error:
-        return list(error.faults)
-    faults = []
+    faults: list[Fault] = []
+    secret = collect_faults(partial(require_secret, place), faults)
+    if secret is None:
+        return faults
     for name, last in sorted(numbers.items()):
         for number in range(1, last + 1):
             key = f"{WITHDRAWN}/{name}/{number:04d}.json"
-            try:
-                body = json_object(place.read_small(key))
-                if not is_sealed(secret, key, body):
-                    raise ValueError("content that does not match its seal")
-            except UnavailableError:
-                raise
-            except (OSError, ValueError, RecursionError) as error:
-                faults.append(_entry_fault(place, key, error))
+            collect_faults(partial(_read_entry, place, secret, key), faults)
     return faults
 
 
@@ -362,11 +344,10 @@ def keyed_hash(secret: bytes, text: str) -> str:
     ).hex()
 
 
-def _entry_fault(place: Place, key: str, error: Exception) -> Fault:
-    found = getattr(error, "strerror", None) or str(error)
-    return Fault(
-        place.where(key),
-        "an entry of a withdrawal must be as it was created",
-        found,
-        RESTORE_SECRET,
-    )
+def _read_entry(place: Place, secret: bytes, key: str) -> dict[str, Any]:
+    rule = "an entry of a withdrawal must be as it was created"
+    with damage_as_fault(place.where(key), rule, RESTORE_SECRET):
+        body = json_object(place.read_small(key))
+        if not is_sealed(secret, key, body):
+            raise ValueError("content that does not match its seal")
+        return body

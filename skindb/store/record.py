@@ -4,15 +4,12 @@ are used.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field
 from typing import Any, TypeGuard
 
-from skindb.files import json_depth
-from skindb.limits import MAX_JSON_DEPTH
 from skindb.schema import SCHEMA_VERSION, VARIABLES
 from skindb.store.paths import (
     GROUP,
@@ -22,6 +19,7 @@ from skindb.store.paths import (
     VERSION,
     subject_of,
 )
+from skindb.store.sealed import json_object, seal_of
 
 FORMAT = 3
 FIELDS = {
@@ -106,22 +104,6 @@ def own_takes(kind: str, take: str) -> set[str]:
 def subjects_of(kind: str, take: str, names: Iterable[str]) -> set[str]:
     """Subjects of the takes that a version is of or names."""
     return {subject_of(name) for name in own_takes(kind, take).union(names)}
-
-
-def seal_of(body: Mapping[str, Any]) -> str:
-    """SHA-256 digest of a JSON object with sorted keys."""
-    return hashlib.sha256(json.dumps(body, sort_keys=True).encode()).hexdigest()
-
-
-def json_object(content: bytes) -> dict[str, Any]:
-    """The JSON object in a small file of the database; `ValueError` for any other content."""
-    text = content.decode()
-    if json_depth(text) > MAX_JSON_DEPTH:
-        raise ValueError(f"more than {MAX_JSON_DEPTH} levels of nested brackets")
-    body = json.loads(text)
-    if not isinstance(body, dict):
-        raise ValueError("content that is not a JSON object")
-    return body
 
 
 def record_to_json(record: Record) -> tuple[bytes, str]:

@@ -8,7 +8,6 @@ head. All other listed records are read and checked again.
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable, Hashable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -22,7 +21,12 @@ from skindb.store.log import GENERATION, Log
 from skindb.store.markers import WithdrawnError, read_markers
 from skindb.store.paths import KIND, TAKE, TRANSIENT
 from skindb.store.place import Place, UnavailableError
-from skindb.store.record import Record, json_object, seal_of
+from skindb.store.record import Record
+from skindb.store.sealed import (
+    intact_or_none,
+    sealed,
+    sealed_object,
+)
 
 if TYPE_CHECKING:
     from skindb.store.database import Database
@@ -190,8 +194,8 @@ class RecordCache:
         body["records"] = [_row(entry, names) for entry in rows]
         # for example a read-only folder: the next query reads the log again
         with suppress(OSError, InputError):
-            content = json.dumps(body | {"seal": seal_of(body)}).encode()
-            self.place.replace(CATALOGUE, content, guard=self._require_same_markers)
+            guard = self._require_same_markers
+            self.place.replace(CATALOGUE, sealed(body), guard=guard)
 
     def _require_same_markers(self) -> None:
         """Raise a `WithdrawnError` if a subject was withdrawn since this query began."""
@@ -314,27 +318,20 @@ def _unchanged_entries(
 
 def _load_entries(place: Place) -> dict[Key, Entry] | None:
     """Entries of the cache; None if it is missing, damaged or of another format."""
-    try:
-        body = json_object(place.read_small(CATALOGUE))
-        if body.pop("seal", None) != seal_of(body) or body.get("format") != FORMAT:
+
+    def read() -> dict[Key, Entry] | None:
+        body = sealed_object(place.read_small(CATALOGUE))
+        if body["format"] != FORMAT:
             return None
-        names = {number: tuple(those) for number, those in body["names"].items()}
-        entries = [
-            Entry(
-                Record(**row["record"], names=names[str(row["names"])]),
-                str(row["file"]),
-                row["head"],
-            )
-            for row in body["records"]
-        ]
-    except UnavailableError:
-        raise
-    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
-        return None
-    return {
-        (one.record.kind, one.record.take, one.record.generation): one
-        for one in entries
-    }
+        names = {number: tuple(takes) for number, takes in body["names"].items()}
+        entries = {}
+        for row in body["records"]:
+            record = Record(**row["record"], names=names[str(row["names"])])
+            key = (record.kind, record.take, record.generation)
+            entries[key] = Entry(record, str(row["file"]), row["head"])
+        return entries
+
+    return intact_or_none(read)
 
 
 def _trimmed_record(record: Record) -> Record:

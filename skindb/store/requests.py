@@ -8,16 +8,21 @@ is killed, or if a result cannot be computed at once.
 from __future__ import annotations
 
 import hashlib
-import json
 import re
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from typing import Any
 
 from skindb.errors import Fault
 from skindb.store.paths import KIND, KINDS_WITHOUT_SUBJECT, TAKE, subject_of
-from skindb.store.place import Place, UnavailableError
-from skindb.store.record import json_object, seal_of
+from skindb.store.place import Place
+from skindb.store.sealed import (
+    collect_faults,
+    damage_as_fault,
+    sealed,
+    sealed_object,
+)
 
 REQUESTS = "requests"
 REQUEST_NAME = r"[0-9a-f]{64}\.json"
@@ -83,8 +88,7 @@ def write_request(place: Place, request: Request) -> None:
 
 def request_content(request: Request) -> bytes:
     """Content of the file of a request."""
-    body = asdict(request)
-    return json.dumps(body | {"seal": seal_of(body)}).encode()
+    return sealed(asdict(request))
 
 
 def remove_request(place: Place, request: Request) -> None:
@@ -94,39 +98,34 @@ def remove_request(place: Place, request: Request) -> None:
 
 def read_requests(place: Place) -> tuple[list[Request], list[Fault]]:
     """The readable requests, and the faults of the others."""
-    requests = []
-    faults = []
+    requests: list[Request] = []
+    faults: list[Fault] = []
     for name in place.children(REQUESTS):
         if not re.fullmatch(REQUEST_NAME, name):
             continue
         key = f"{REQUESTS}/{name}"
-        try:
-            requests.append(request_from_json(place.read_small(key)))
-        except FileNotFoundError:  # fulfilled meanwhile
-            continue
-        except UnavailableError:
-            raise
-        except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
-            cure = "remove it, and run the analysis that is missing again"
-            faults.append(
-                Fault(
-                    place.where(key),
-                    "a request must be as it was written",
-                    str(error),
-                    cure,
-                )
-            )
+        request = collect_faults(partial(_read_request, place, key), faults)
+        requests += [] if request is None else [request]
     return requests, faults
+
+
+def _read_request(place: Place, key: str) -> Request | None:
+    """A request; None if it was fulfilled meanwhile."""
+    rule = "a request must be as it was written"
+    cure = "remove it, and run the analysis that is missing again"
+    with damage_as_fault(place.where(key), rule, cure):
+        try:
+            content = place.read_small(key)
+        except FileNotFoundError:
+            return None
+        return request_from_json(content)
 
 
 def request_from_json(content: bytes) -> Request:
     """The request in a file; `ValueError`, `TypeError` or `KeyError` if it is not as it
     was written.
     """
-    body = json_object(content)
-    if body.pop("seal", None) != seal_of(body):
-        raise ValueError("content that does not match its seal")
-    request = Request(**body)
+    request = Request(**sealed_object(content))
     names = [
         request.take,
         *request.parameters.get(TAKES, []),

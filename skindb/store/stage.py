@@ -41,7 +41,8 @@ from skindb.store.paths import (
     require_text,
 )
 from skindb.store.place import Place, UnavailableError
-from skindb.store.record import Record, json_object, own_takes, subjects_of
+from skindb.store.record import Record, own_takes, subjects_of
+from skindb.store.sealed import intact_or_none, json_object
 
 MIN_CHUNK_SURFELS = 256  # in a chunk, the smallest unit of reading
 MIN_CHUNK_BYTES = 1 << 19  # a smaller chunk gets more surfels
@@ -360,19 +361,15 @@ def read_names(place: Place, path: str) -> tuple[list[str], dict[str, int]] | No
     """Takes that a version refers to and admissions of their subjects, from beside it;
     None if they are unknown.
     """
-    try:
-        content = json_object(
-            place.read_small(f"{path.removesuffix('.zarr')}.{NAMES}.json")
-        )
+
+    def read() -> tuple[list[str], dict[str, int]]:
+        key = f"{path.removesuffix('.zarr')}.{NAMES}.json"
+        content = json_object(place.read_small(key))
         names = [require_text(name, TAKE, "take") for name in content["names"]]
-        return names, {
-            str(subject): int(number)
-            for subject, number in content["admissions"].items()
-        }
-    except UnavailableError:
-        raise
-    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
-        return None
+        admissions = content["admissions"].items()
+        return names, {str(subject): int(number) for subject, number in admissions}
+
+    return intact_or_none(read)
 
 
 def remove_version(place: Place, path: str) -> None:

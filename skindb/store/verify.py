@@ -27,8 +27,9 @@ from skindb.store.paths import (
     TRANSIENT,
 )
 from skindb.store.place import Place, UnavailableError
-from skindb.store.record import AS_RECORDED, Record, json_object
+from skindb.store.record import AS_RECORDED, Record
 from skindb.store.requests import REQUEST_NAME, REQUESTS, read_requests
+from skindb.store.sealed import json_object
 from skindb.store.stage import TABLES, describe, read_names, tables_from_json
 from skindb.store.verified import (
     AS_COMMITTED,
