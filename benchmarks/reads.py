@@ -92,7 +92,7 @@ def main(*, surfels: int = 5 * stage_module.SHARD, repeat: int = 5) -> None:
         stores = {
             "no check": lambda: LocalStore(plain, read_only=True),
             "crc32c of every chunk": lambda: LocalStore(summed, read_only=True),
-            "digests of the record": lambda: VerifiedStore(db._place, record),
+            "digests of the record": lambda: VerifiedStore(db.place, record),
         }
         seconds: dict[tuple[str, str], list[float]] = {}
         for _ in range(repeat):

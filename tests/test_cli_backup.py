@@ -105,9 +105,9 @@ def test_restore__prints_what_the_marker_file_changed(db, dest, tmp_path):
 def test_restore__of_a_lost_database_uses_the_file_beside_it(db, dest):
     _done("backup", db.root, dest)
     _done("withdraw", db.root, SUBJECT, "--yes")
-    db._place.remove("log")
+    db.place.remove("log")
     for name in db.names():
-        db._place.remove(name)
+        db.place.remove(name)
     _done("restore", dest, db.root)
     assert db.takes("model") == ["B"]
     assert db.verify() == []
@@ -147,7 +147,7 @@ def test_backup__is_refused_in_one_line(db, dest, tmp_path):
 
 def test_backup__names_damage_and_exits_with_1(db, dest, tmp_path):
     _done("backup", db.root, dest)
-    digest = db._place.digest(f"{db.record('model', 'B').path}/surfels/surfel_area/c/0")
+    digest = db.place.digest(f"{db.record('model', 'B').path}/surfels/surfel_area/c/0")
     file = Path(dest) / "files" / digest[:2] / digest
     file.write_bytes(b"x")
     for command in (

@@ -10,7 +10,6 @@ from skindb.store.cohort import CohortRequest, frame_of, lacking
 from skindb.store.database import Database
 from skindb.store.erasure import Holdings
 from skindb.store.garbage import Garbage
-from skindb.store.known import Known
 from skindb.store.lease import LEASE_SECONDS, Lease, LeaseLost
 from skindb.store.log import Conflict
 from skindb.store.marker_file import MarkerFileWarning
@@ -28,6 +27,7 @@ from skindb.store.record import Record
 from skindb.store.requests import Request
 from skindb.store.restoring import Restored, restore
 from skindb.store.sealed import seal_of
+from skindb.store.snapshot import Known
 from skindb.store.stale import Staleness, StaleWarning, require_fresh, stale_versions
 
 __all__ = [

@@ -117,6 +117,10 @@ class Bucket:
         name = self.name.removeprefix("s3://").replace("/", "-")
         return folder / "skindb" / f"{name}-{digest[:8]}.markers"
 
+    def address(self) -> str:
+        """URL by which another process finds the place."""
+        return self.name
+
     def url(self, key: str) -> str:
         """Address of a key as shown to users."""
         return self.where(self._path(key))

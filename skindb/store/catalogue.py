@@ -3,18 +3,31 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterable
 from typing import Any
 
 import pandas as pd
 
-from skindb.errors import SkindbWarning
+from skindb.errors import InputError, SkindbWarning
 from skindb.schema.cohort import column, few_names, imitates_column, take_coords
+from skindb.schema.consent import CONSENT, consent_scope
 from skindb.store.condition import evaluate, is_missing
-from skindb.store.known import Known
+from skindb.store.paths import CALIBRATION, RELEASE, STUDY
+from skindb.store.place import Located
 from skindb.store.record import Record
+from skindb.store.record_cache import CACHED_KINDS, RecordCache
+from skindb.store.snapshot import Known
+from skindb.store.stale import DERIVED, Staleness
 
 # kinds whose generation and date the catalogue shows
 CATALOGUE_KINDS = ("capture", "model", "registration")
+# kinds without takes -> section of `Database.info` that lists them
+INFO_SECTIONS = {
+    STUDY: "studies",
+    RELEASE: "releases",
+    CALIBRATION: "calibrations",
+    CONSENT: "consents",
+}
 
 
 class MissingWarning(SkindbWarning):
@@ -115,3 +128,67 @@ def _is_outdated(model: Record, capture: Record | None) -> bool:
     return (
         capture is not None and bool(made_from) and capture.generation not in made_from
     )
+
+
+def cached_table(known: Known) -> pd.DataFrame:
+    """The catalogue, for which records are read in parallel and kept in the cache."""
+    known.read_ahead((*CATALOGUE_KINDS, CONSENT))
+    rows = table(known)
+    known.save()
+    return rows
+
+
+def describe_versions(
+    db: Located,
+    *,
+    takes: Iterable[str] | None,
+    where: str | None,
+    release: str | None,
+) -> dict[str, Any]:
+    """See `Database.info`."""
+    sections: dict[str, dict[str, Any]] = {
+        name: {} for name in ("takes", *INFO_SECTIONS.values())
+    }
+    cache = RecordCache(db.place)
+    cached = Known(db, release, cache)
+    known = Known(db, release)
+    stale = Staleness(db, cache)
+    chosen = None if takes is None else {*takes}
+    if where is not None:
+        fulfilling = {*matching(cached_table(cached), where)}
+        chosen = fulfilling if chosen is None else chosen & fulfilling
+    else:
+        cached.read_ahead(CACHED_KINDS)
+    for kind in cache.kinds():
+        if chosen is not None and kind in INFO_SECTIONS:
+            continue
+        section = sections[INFO_SECTIONS.get(kind, "takes")]
+        source = cached if kind in CACHED_KINDS else known
+        names = cached.takes(kind)
+        for take in sorted(names if chosen is None else names & chosen):
+            section.setdefault(take, {})[kind] = _describe(source, stale, kind, take)
+    cache.save()
+    return {
+        name: dict(sorted(section.items()))
+        for name, section in sections.items()
+        if section or name == "takes"
+    }
+
+
+def _describe(known: Known, stale: Staleness, kind: str, take: str) -> dict[str, Any]:
+    try:
+        record = known.record(kind, take)
+        reasons = stale.reasons(record) if kind in DERIVED else ()
+    except InputError as error:
+        return {"fault": str(error)}
+    about: dict[str, Any] = {
+        "generation": record.generation,
+        "path": known.place.url(record.path),
+        "created": record.created,
+        "bytes": record.bytes,
+    }
+    if kind == CONSENT:
+        return about | {"scope": list(consent_scope(record.provenance))}
+    if reasons:
+        about["stale"] = list(map(str, reasons))
+    return about | {"status": record.provenance.get("status", {})}

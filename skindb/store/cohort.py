@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 import xarray as xr
@@ -14,14 +14,14 @@ import xarray as xr
 from skindb.errors import Fault, InputError
 from skindb.schema.cohort import Part, combine, few_names, one_take_each, take_coords
 from skindb.schema.notes import Note, note, note_lines
-from skindb.store.known import Known
+from skindb.store.location import place_at
 from skindb.store.log import RESTORE
 from skindb.store.paths import SUMMARY
+from skindb.store.place import Located, Place
 from skindb.store.record import AS_RECORDED, Record
-from skindb.store.stage import describe
-
-if TYPE_CHECKING:
-    from skindb.store.database import Database
+from skindb.store.snapshot import Known, Snapshot
+from skindb.store.stage import describe, read_tables
+from skindb.store.verified import open_group
 
 Layout = Literal["tables", "surfels", "maps"]
 GROUP: dict[str, str] = {"tables": "tables", "surfels": "sample", "maps": "maps"}
@@ -47,20 +47,27 @@ class CohortRequest:
 class Address:
     """Address of a version, with which another process finds it and detects changes."""
 
-    db: Database
+    url: str  # of the database
     kind: str
     take: str
     generation: int
     seal: str
 
     @classmethod
-    def of(cls, db: Database, record: Record) -> Address:
+    def of(cls, place: Place, record: Record) -> Address:
         """The address of the version of a record."""
-        return cls(db, record.kind, record.take, record.generation, record.seal)
+        url = place.address()
+        return cls(url, record.kind, record.take, record.generation, record.seal)
+
+    @property
+    def place(self) -> Place:
+        """Location of the database."""
+        return _place(self.url)
 
     def record(self) -> Record:
         """The record at this address; `InputError` if its seal differs."""
-        record = self.db.record(self.kind, self.take, self.generation)
+        snapshot = Snapshot(self.place)
+        record = snapshot.record(self.kind, self.take, self.generation)
         if record.seal != self.seal:
             where = f"{self.kind} of {self.take}"
             rule = "a version must not change while a cohort refers to it"
@@ -130,19 +137,16 @@ class StoredSamples:
 
 
 def cohort(
-    db: Database,
-    layout: Layout,
+    known: Known,
+    request: CohortRequest,
     *,
     kind: str,
     variables: Iterable[str] | None,
     takes: Sequence[str] | None,
     dim: str,
-    surfels: int,
-    size: int,
-    seed: int,
-    release: str | None,
 ) -> xr.Dataset:
     """See `Database.cohort`."""
+    layout = request.layout
     if layout not in GROUP:
         rule = f"must be one of {', '.join(GROUP)}"
         raise InputError(Fault("layout", rule, repr(layout), "choose one"))
@@ -152,9 +156,7 @@ def cohort(
         )
     wanted = None if variables is None else list(variables)
     base = "registration" if layout == "maps" else kind
-    known = Known(db, release)
     names, skipped = _members(known, base, takes)
-    request = CohortRequest(layout, surfels, size, seed)
     records = {take: known.record(base, take) for take in names}
     stored = {
         take: _stored_record(known, record, request) for take, record in records.items()
@@ -162,11 +164,11 @@ def cohort(
     if missing := [take for take, found in stored.items() if found is None]:
         what = {
             "tables": "tables",
-            "surfels": f"a sample of {surfels} surfels with seed {seed}",
+            "surfels": f"a sample of {request.surfels} surfels with seed {request.seed}",
         }
         rule = (
             f"a version of kind {base} must store "
-            f"{what.get(layout, f'maps of {size} texels')} for cohorts"
+            f"{what.get(layout, f'maps of {request.size} texels')} for cohorts"
         )
         cure = "call skindb.workflow.summarise for them"
         raise InputError(
@@ -186,7 +188,7 @@ def cohort(
         skipped += [note(take, "none of its surfels was fitted") for take in empty]
     if layout == "surfels" and wanted is None and not _have_same_dome(parts):
         parts = [_without_variables(part, (SAMPLES, *DOME)) for part in parts]
-    sizes = {"surfel": surfels} if layout == "surfels" else {}
+    sizes = {"surfel": request.surfels} if layout == "surfels" else {}
     attrs = {
         "layout": layout,
         "kind": base,
@@ -215,7 +217,7 @@ def _outdated(known: Known, records: Mapping[str, Record]) -> list[Note]:
 
 
 def lacking(
-    db: Database,
+    db: Located,
     kind: str,
     requests: Iterable[CohortRequest],
     takes: Iterable[str],
@@ -254,7 +256,7 @@ def _members(
             else "run skindb fit first"
         )
         raise InputError(
-            Fault(known.db.url, "a study needs fitted takes", f"no {kind}", cure)
+            Fault(known.place.name, "a study needs fitted takes", f"no {kind}", cure)
         )
     allowed = []
     skipped = []
@@ -337,11 +339,7 @@ def _stored_record(
     """The record of the version with the data for a cohort: the given one, or a summary
     of it; None if neither.
     """
-    for one in reversed(
-        known.db.history(SUMMARY, record.take)
-        if known.has(SUMMARY, record.take)
-        else []
-    ):
+    for one in reversed(known.history(SUMMARY, record.take)):
         of = [(i["kind"], i["generation"], i.get("seal")) for i in one.made_from]
         if (record.kind, record.generation, record.seal) in of and _has_data_for(
             one, request
@@ -379,9 +377,8 @@ def _part(
     request: CohortRequest,
     wanted: Sequence[str] | None,
 ) -> Part:
-    db = known.db
     layout = request.layout
-    address = Address.of(db, stored)
+    address = Address.of(known.place, stored)
     contents = stored.contents.get(
         GROUP[layout], {"variables": [], "sizes": {}, "labels": {}}
     )
@@ -402,7 +399,7 @@ def _part(
             labels,
             StoredGroup(address, GROUP[layout]),
         )
-    capture = _capture_of(db, known.record("model", record.take))
+    capture = _capture_of(known, known.record("model", record.take))
     if capture is None or (wanted is not None and not {SAMPLES, *DOME} & set(wanted)):
         return Part(
             record.take,
@@ -419,16 +416,16 @@ def _part(
         [*variables, SAMPLES, *DOME],
         sizes | dome_sizes,
         labels | dome_labels,
-        StoredSamples(address, Address.of(db, capture), request.surfels),
+        StoredSamples(address, Address.of(known.place, capture), request.surfels),
     )
 
 
-def _capture_of(db: Database, model: Record) -> Record | None:
+def _capture_of(known: Known, model: Record) -> Record | None:
     """The capture with samples from which a model was made; None if there is none."""
     for one in model.made_from:
         if one["kind"] == "capture":
             try:
-                capture = db.record("capture", one["take"], one["generation"])
+                capture = known.generation("capture", one["take"], one["generation"])
             except InputError:
                 return None
             return capture if {"dome", "samples"} <= capture.contents.keys() else None
@@ -462,13 +459,18 @@ def _without_variables(part: Part, names: Iterable[str]) -> Part:
 @lru_cache(MAX_OPEN_TABLES)
 def _tables(address: Address) -> xr.Dataset:
     record = address.record()
-    return _require_recorded(record, "tables", address.db.tables(record))
+    return _require_recorded(record, "tables", read_tables(address.place, record))
 
 
 @lru_cache(MAX_OPEN_GROUPS)
 def _group(address: Address, name: str) -> xr.Dataset:
     record = address.record()
-    return _require_recorded(record, name, address.db.read_group(record, name))
+    return _require_recorded(record, name, open_group(address.place, record, name))
+
+
+@lru_cache
+def _place(url: str) -> Place:
+    return place_at(url)
 
 
 def _require_recorded(record: Record, name: str, ds: xr.Dataset) -> xr.Dataset:
@@ -476,7 +478,7 @@ def _require_recorded(record: Record, name: str, ds: xr.Dataset) -> xr.Dataset:
     layout of the cohort.
     """
     if name in record.contents and describe(ds) != record.contents[name]:
-        where = f"{record.kind} {record.generation} of {record.take}"
+        where = record.title
         raise InputError(
             Fault(where, AS_RECORDED, f"a different group {name}", RESTORE)
         )

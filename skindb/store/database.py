@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import date
 from pathlib import Path
@@ -13,13 +12,17 @@ import pandas as pd
 import xarray as xr
 
 from skindb.errors import Fault, InputError
-from skindb.schema.blocks import SHARD
 from skindb.schema.consent import CONSENT, SCOPES, consent_scope
 from skindb.store.archive import Archive
 from skindb.store.audit import AuditEntry, append_entry, read_audit
 from skindb.store.backup import BackupReport, create_backup, erase_from_archive
-from skindb.store.catalogue import CATALOGUE_KINDS, matching, table
-from skindb.store.cohort import Layout, cohort
+from skindb.store.catalogue import (
+    INFO_SECTIONS,
+    cached_table,
+    describe_versions,
+    matching,
+)
+from skindb.store.cohort import CohortRequest, Layout, cohort
 from skindb.store.erasure import (
     Erasure,
     Holdings,
@@ -29,7 +32,6 @@ from skindb.store.erasure import (
     subject_holdings,
 )
 from skindb.store.garbage import Garbage, find_garbage, remove_garbage
-from skindb.store.known import Known, Snapshot, consent_of
 from skindb.store.lease import LEASE_SECONDS, Lease
 from skindb.store.location import place_at
 from skindb.store.log import Log
@@ -37,40 +39,30 @@ from skindb.store.marker_file import note_consents, note_withdrawals
 from skindb.store.markers import (
     Entry,
     Markers,
-    WithdrawnError,
     last_entry,
     read_markers,
     readmit,
 )
 from skindb.store.paths import (
-    CALIBRATION,
-    KIND,
-    KINDS_WITHOUT_SUBJECT,
     RELEASE,
-    STUDY,
     TAKE,
-    TRANSIENT,
     require_text,
     subject_of,
 )
-from skindb.store.place import UnavailableError
 from skindb.store.record import Record
-from skindb.store.record_cache import CACHED_KINDS, RecordCache, takes_in_log
-from skindb.store.release import commit_release, create_release, pinned_record, pins_of
+from skindb.store.record_cache import RecordCache
 from skindb.store.requests import Request, read_requests, remove_request
-from skindb.store.sealed import json_object
-from skindb.store.stage import TABLES, Stage, remove_version, tables_from_json
-from skindb.store.stale import DERIVED, Staleness
-from skindb.store.verified import VerifiedStore, read_beside
+from skindb.store.snapshot import (
+    PINNED,
+    Known,
+    Snapshot,
+    consent_of,
+    pinned_record,
+    pins_of,
+)
+from skindb.store.stage import Stage, commit_release, read_tables, remove_version
+from skindb.store.verified import open_group, open_version
 from skindb.store.verify import database_faults
-
-# kinds without takes -> section of `Database.info` that lists them
-INFO_SECTIONS = {
-    STUDY: "studies",
-    RELEASE: "releases",
-    CALIBRATION: "calibrations",
-    CONSENT: "consents",
-}
 
 
 class Database:
@@ -86,7 +78,7 @@ class Database:
     def __init__(self, url: str | os.PathLike[str]) -> None:
         text = os.fspath(url)
         self.folder = None if "://" in text else Path(text)  # None for a bucket
-        self._place = place_at(text)
+        self.place = place_at(text)
 
     def __repr__(self) -> str:
         return f"<skindb.Database {self.url!r}: {len(self.takes())} takes>"
@@ -94,66 +86,47 @@ class Database:
     def __eq__(self, other: object) -> bool:
         return (
             isinstance(other, Database)
-            and self._absolute_url() == other._absolute_url()
+            and self.place.address() == other.place.address()
         )
 
     def __hash__(self) -> int:
-        return hash(self._absolute_url())
+        return hash(self.place.address())
 
     def __reduce__(self) -> tuple[type[Database], tuple[str]]:
-        # another process may have another working directory
-        return Database, (self._absolute_url(),)
+        return Database, (self.place.address(),)
 
     @property
     def url(self) -> str:
         """Address of the folder or bucket."""
-        return self._place.name
+        return self.place.name
 
     @property
     def root(self) -> Path:
         """The folder of the database; `InputError` if it is in a bucket."""
         if self.folder is None:
-            raise InputError(
-                Fault(
-                    self.url,
-                    "the database must be in a local folder",
-                    "a bucket",
-                    "use db.url",
-                )
-            )
+            rule = "the database must be in a local folder"
+            raise InputError(Fault(self.url, rule, "a bucket", "use db.url"))
         return self.folder
 
     def scratch(self) -> Path:
         """Path of a local folder for temporary files of this database, which may not exist yet."""
-        return self._place.scratch()
+        return self.place.scratch()
 
     def names(self) -> list[str] | None:
         """Names at the top level of the folder or bucket; None if the database does not
         exist yet.
         """
-        return self._place.names()
+        return self.place.names()
 
     def has(self, kind: str, take: str, *, markers: Markers | None = None) -> bool:
         """Whether a take has a version of this kind; for `markers` see `record`."""
-        markers = self.markers() if markers is None else markers
-        return not Log(self._place, kind, take).is_empty() and not markers.hides(
-            kind, take
-        )
+        return Snapshot(self.place, markers).has(kind, take)
 
     def kinds(self, take: str | None = None) -> list[str]:
         """Kinds of the versions of one take or of all takes, without the transient kinds."""
-        names = sorted(
-            {*self._place.children("log"), *self._head_names("")} - {*TRANSIENT}
-        )
-        markers = self.markers()
-        takes = {
-            kind: self._takes(kind, markers)
-            for kind in names
-            if re.fullmatch(KIND, kind)
-        }
-        return [
-            kind for kind, there in takes.items() if (take in there if take else there)
-        ]
+        snapshot = Snapshot(self.place)
+        kinds = snapshot.kinds()
+        return [kind for kind in kinds if not take or take in snapshot.takes(kind)]
 
     def takes(
         self,
@@ -191,25 +164,10 @@ class Database:
         >>> db.takes(where="condition == 'lotion' and age > 40 and fit_k == 4")  # doctest: +SKIP
         """
         if where is None:
-            return (
-                self._takes(kind, self.markers())
-                if release is None
-                else sorted(Known(self, release).takes(kind))
-            )
-        known = Known(self, release, RecordCache(self, self._place))
-        rows = _table(known)
+            return sorted(Known(self, release).takes(kind))
+        known = Known(self, release, RecordCache(self.place))
+        rows = cached_table(known)
         return sorted(matching(rows[rows.index.isin(known.takes(kind))], where))
-
-    def _takes(self, kind: str, markers: Markers) -> list[str]:
-        require_text(kind, KIND, "kind")
-        known = takes_in_log(self._place, kind)
-        cached = {name.removesuffix(".json") for name in self._head_names(kind)} - known
-        lost = {
-            take
-            for take in cached
-            if re.fullmatch(TAKE, take) and not Log(self._place, kind, take).is_empty()
-        }
-        return sorted(take for take in known | lost if not markers.hides(kind, take))
 
     def subjects(self) -> list[str]:
         """Subjects with at least one capture."""
@@ -238,34 +196,11 @@ class Database:
             If the version does not exist, if its record is damaged, or if it refers to
             a withdrawn subject.
         """
-        markers = self.markers() if markers is None else markers
-        try:
-            record = Log(self._place, kind, take).read(generation)
-        except InputError:
-            self._require_version(kind, take)
-            raise
-        if not markers.admits(record):
-            if markers.hides(kind, take):
-                raise self._missing_error(kind, take)
-            what = f"{kind} {record.generation} of {take}"
-            rule = "a version must not refer to a withdrawn subject"
-            raise WithdrawnError(
-                Fault(
-                    what,
-                    rule,
-                    "a withdrawal that is not complete",
-                    "run skindb refresh",
-                )
-            )
-        return record
+        return Snapshot(self.place, markers).record(kind, take, generation)
 
     def markers(self) -> Markers:
         """The withdrawals of subjects at this moment."""
-        return read_markers(self._place)
-
-    def lists(self, kind: str, take: str, generation: int) -> bool:
-        """Whether the log has a record of this generation, even if the record is damaged."""
-        return generation in Log(self._place, kind, take).generations()
+        return read_markers(self.place)
 
     def history(self, kind: str, take: str) -> list[Record]:
         """All records, oldest first.
@@ -275,23 +210,11 @@ class Database:
         InputError
             If a record is damaged, or is missing without a tombstone.
         """
-        current = self.record(kind, take)
-        log = Log(self._place, kind, take)
-        before = [one for one in log.generations() if one < current.generation]
-        if len(before) < current.generation - 1 and (faults := log.faults()[1]):
-            raise InputError(faults)
-        markers = self.markers()
-        earlier = [log.read(generation) for generation in before]
-        return [*(record for record in earlier if markers.admits(record)), current]
+        return Snapshot(self.place).history(kind, take)
 
     def readable_history(self, kind: str, take: str) -> list[Record]:
         """All readable records, oldest first; damaged ones are skipped."""
-        markers = self.markers()
-        return [
-            record
-            for record in Log(self._place, kind, take).readable()
-            if markers.admits(record)
-        ]
+        return Snapshot(self.place).readable_history(kind, take)
 
     def read(
         self,
@@ -329,21 +252,15 @@ class Database:
             different size. A file with changed content raises an `InputError` when
             values that need it are computed.
         """
-        pinned = (
-            None
-            if release is None
-            else pinned_record(self, pins_of(self, release), kind, take)
-        )
-        record = pinned or self.record(kind, take, generation)
-        store = VerifiedStore(self._place, record)
-        # chunks={} would use the inner chunks, which gives sixteen times as many tasks
-        tree = xr.open_datatree(store, engine="zarr", consolidated=False, chunks=None)  # type: ignore[arg-type]
-        blocked = tree.map_over_datasets(_chunked)
-        blocked.attrs = tree.attrs
-        blocked.attrs = blocked.attrs | {"generation": record.generation}
+        if release is None:
+            record = self.record(kind, take, generation)
+        else:
+            snapshot = Snapshot(self.place)
+            record = pinned_record(snapshot, pins_of(snapshot, release), kind, take)
+        version = open_version(self.place, record)
         if kind not in INFO_SECTIONS:
-            blocked.attrs |= self._consent_of(take)
-        return blocked
+            version.attrs |= self._consent_of(take)
+        return version
 
     def _consent_of(self, take: str) -> dict[Any, Any]:
         """Consent attributes of a version that is read; the scope is empty if the
@@ -365,7 +282,7 @@ class Database:
         Without such a record they are those of the newest capture of the take, or of
         its newest model if there is no capture.
         """
-        return list(consent_of(Snapshot(self), take))
+        return list(consent_of(Snapshot(self.place), take))
 
     def record_consent(self, subject: str, scope: Iterable[str]) -> Record:
         """Record the consent of a subject, which takes effect immediately for all
@@ -392,7 +309,7 @@ class Database:
         self._require_subject(subject)
         with self.stage(CONSENT, subject) as stage:
             record = stage.commit({"subject": subject, "consent_scope": asked})
-        note_consents(self._place, [record])
+        note_consents(self.place, [record])
         return record
 
     def consent_history(self, subject: str) -> list[dict[str, Any]]:
@@ -425,23 +342,11 @@ class Database:
         """One group of a version, lazy and verified as in `read`, without opening the
         other groups.
         """
-        store = VerifiedStore(self._place, record)
-        ds = xr.open_dataset(
-            store,  # type: ignore[arg-type]
-            engine="zarr",
-            group=group,
-            consolidated=False,
-            chunks=None,
-        )
-        return _chunked(ds)
+        return open_group(self.place, record, group)
 
     def tables(self, record: Record) -> xr.Dataset:
         """The tables kept beside a version; empty if it has none."""
-        if not record.tables:
-            return xr.Dataset()
-        return tables_from_json(
-            json_object(read_beside(self._place, record, TABLES, record.tables))
-        )
+        return read_tables(self.place, record)
 
     def cohort(
         self,
@@ -507,20 +412,13 @@ class Database:
         >>> cohort = db.cohort("tables")  # doctest: +SKIP
         >>> cohort.region_diffuse_reflectance.groupby("gender").mean()  # doctest: +SKIP
         """
-        options: dict[str, Any] = {
-            "kind": kind,
-            "variables": variables,
-            "takes": takes,
-            "dim": dim,
-        }
         return cohort(
-            self,
-            layout,
-            **options,
-            surfels=surfels,
-            size=size,
-            seed=seed,
-            release=release,
+            Known(self, release),
+            CohortRequest(layout, surfels, size, seed),
+            kind=kind,
+            variables=variables,
+            takes=takes,
+            dim=dim,
         )
 
     def table(self, *, release: str | None = None) -> pd.DataFrame:
@@ -540,7 +438,7 @@ class Database:
             status of the fit, and whether there is a newer capture than that of the
             model (``outdated``). Values that a take does not have are NaN.
         """
-        return _table(Known(self, release, RecordCache(self, self._place)))
+        return cached_table(Known(self, release, RecordCache(self.place)))
 
     def create_release(self, name: str, takes: Sequence[str] | None = None) -> Record:
         """Record the present versions of takes (capture, model and registration of
@@ -562,13 +460,33 @@ class Database:
         InputError
             If a release of this name exists already, or if a take has no model.
         """
-        return create_release(self, name, takes)
+        require_text(name, TAKE, "name of a release")
+        if self.has(RELEASE, name):
+            found = f"a release of {self.record(RELEASE, name).created}"
+            rule = "a release must have a new name"
+            raise InputError(Fault(name, rule, found, "choose another name"))
+        fitted = self.takes("model")
+        names = fitted if takes is None else list(dict.fromkeys(takes))
+        if unknown := [take for take in names if take not in fitted]:
+            rule = "a release must consist of takes with a model"
+            cure = f"takes with a model: {', '.join(fitted) or 'none'}"
+            raise InputError(Fault(take, rule, "no model", cure) for take in unknown)
+        if not names:
+            rule = "a release needs fitted takes"
+            raise InputError(Fault(name, rule, "no model", "run skindb fit first"))
+        pins = [
+            self.record(kind, take).as_input()
+            for take in names
+            for kind in PINNED
+            if self.has(kind, take)
+        ]
+        return self.commit_release(name, pins)
 
     def commit_release(self, name: str, pins: Iterable[Mapping[str, Any]]) -> Record:
         """Commit the next revision of a release, which names these versions; prefer
         `create_release`.
         """
-        return commit_release(self._place, name, pins)
+        return commit_release(self.place, name, pins)
 
     def source(
         self, version: xr.DataTree, kind: str = "capture", take: str | None = None
@@ -609,7 +527,7 @@ class Database:
         """A new version to be written, under a lease if one is given, that refers to
         the takes `names`; see `Stage`.
         """
-        return Stage(self._place, kind, take, lease, names)
+        return Stage(self.place, kind, take, lease, names)
 
     def lease(
         self,
@@ -630,38 +548,38 @@ class Database:
         ...         stage.commit({"command": "notebook"})
         """
         return Lease(
-            self._place, take, kinds, wait=wait, seconds=seconds, command=command
+            self.place, take, kinds, wait=wait, seconds=seconds, command=command
         )
 
     def remove(self, record: Record) -> None:
         """Remove a version permanently; a tombstone with the seal of its record remains."""
-        Log(self._place, record.kind, record.take).remove(record.generation)
+        Log(self.place, record.kind, record.take).remove(record.generation)
 
     def holdings(self, subject: str) -> Holdings:
         """What `erase` would remove; `InputError` if there is nothing."""
-        return subject_holdings(self._place, subject)
+        return subject_holdings(self.place, subject)
 
     def erase(self, subject: str, *, wait: float = 0.0) -> Erasure:
         """Withdraw a subject and remove everything that refers to it; prefer
         `skindb.workflow.withdraw`.
         """
-        return erase(self._place, subject, wait=wait)
+        return erase(self.place, subject, wait=wait)
 
     def complete_erasures(self) -> Erasure:
         """Remove what interrupted withdrawals and writers that were suspended left of
         withdrawn subjects.
         """
-        return erase_withdrawn(self._place)
+        return erase_withdrawn(self.place)
 
     def has_remains(self) -> bool:
         """Whether data of a withdrawn subject are left, which `complete_erasures` removes."""
-        return bool(holdings_of(self._place, self.markers()))
+        return bool(holdings_of(self.place, self.markers()))
 
     def withdrawal(self, subject: str) -> Entry | None:
         """The last withdrawal or readmission of a subject; None if the subject was
         never withdrawn.
         """
-        return last_entry(self._place, subject)
+        return last_entry(self.place, subject)
 
     def readmit(self, subject: str, consent: date) -> None:
         """Admit a withdrawn subject again, by the date of a new consent.
@@ -682,16 +600,16 @@ class Database:
                     "run skindb clean --yes",
                 )
             )
-        readmit(self._place, subject, consent)
-        note_withdrawals(self._place)
+        readmit(self.place, subject, consent)
+        note_withdrawals(self.place)
 
     def requests(self) -> list[Request]:
         """Results that withdrawals removed and that are to be computed again."""
-        return read_requests(self._place)[0]
+        return read_requests(self.place)[0]
 
     def fulfil(self, request: Request) -> None:
         """Remove a request, because its result was computed."""
-        remove_request(self._place, request)
+        remove_request(self.place, request)
 
     def discard(self, kind: str, take: str, path: str) -> None:
         """Remove the data of a version that a killed writer left; a version that a
@@ -713,15 +631,15 @@ class Database:
                     "remove the folder tmp of the database",
                 )
             )
-        log = Log(self._place, kind, take)
+        log = Log(self.place, kind, take)
         if path not in {log.read(generation).path for generation in log.generations()}:
-            remove_version(self._place, path)
+            remove_version(self.place, path)
 
     def forget(self, kind: str, take: str) -> None:
         """Remove all versions of a transient kind, such as the first pass of a fit,
         without a tombstone.
         """
-        Log(self._place, kind, take).forget()
+        Log(self.place, kind, take).forget()
 
     def info(
         self,
@@ -749,42 +667,13 @@ class Database:
         release
             Name of a release, to list the versions that it names.
         """
-        found: dict[str, dict[str, Any]] = {
-            name: {} for name in ("takes", *INFO_SECTIONS.values())
-        }
-        records = RecordCache(self, self._place)
-        known = Known(self, release, records)
-        stale = Staleness(self, records)
-        whole = Known(self, release)
-        chosen = None if takes is None else {*takes}
-        if where is not None:
-            fulfilling = {*matching(_table(known), where)}
-            chosen = fulfilling if chosen is None else chosen & fulfilling
-        else:
-            known.read_ahead(CACHED_KINDS)
-        for kind in records.kinds():
-            if chosen is not None and kind in INFO_SECTIONS:
-                continue
-            part = found[INFO_SECTIONS.get(kind, "takes")]
-            for take in sorted(
-                known.takes(kind) if chosen is None else known.takes(kind) & chosen
-            ):
-                source = known if kind in CACHED_KINDS else whole
-                part.setdefault(take, {})[kind] = self._summary(
-                    source, stale, kind, take
-                )
-        records.save()
-        return {
-            name: dict(sorted(part.items()))
-            for name, part in found.items()
-            if part or name == "takes"
-        }
+        return describe_versions(self, takes=takes, where=where, release=release)
 
     def log_action(self, action: str, **about: Any) -> None:
         """Create an entry of the audit log, see `append_entry`; prefer
         `skindb.workflow.logged_action`.
         """
-        append_entry(self._place, action, **about)
+        append_entry(self.place, action, **about)
 
     def audit(
         self, *, subject: str | None = None, where: str | None = None
@@ -799,32 +688,29 @@ class Database:
             Condition, as in `takes`, on number, when, actor, action and subjects, which
             is their number.
         """
-        return read_audit(self._place, subject=subject, where=where)
+        return read_audit(self.place, subject=subject, where=where)
 
     def verify(self) -> list[Fault]:
         """Check every record and every file of every version, and return all faults."""
-        return database_faults(self._place)
-
-    def _absolute_url(self) -> str:
-        return self.url if self.folder is None else str(self.folder.absolute())
+        return database_faults(self.place)
 
     def backup(self, url: str, *, verify: bool = False) -> BackupReport:
         """Write a new state to the backup at a folder or bucket; prefer
         `skindb.workflow.backup`.
         """
-        return create_backup(self._place, Archive(place_at(url)), verify=verify)
+        return create_backup(self.place, Archive(place_at(url)), verify=verify)
 
     def require_backup(self, url: str) -> None:
         """Raise an `InputError` unless there is a backup of this database at a folder or bucket."""
         archive = Archive(place_at(url))
         archive.require()
-        archive.require_of(self._place)
+        archive.require_of(self.place)
 
     def erase_from_backup(self, url: str, *, wait: float = 0.0) -> int:
         """Remove subjects who were withdrawn from all states of a backup; returns the
         number of removed files.
         """
-        return erase_from_archive(self._place, Archive(place_at(url)), wait=wait)
+        return erase_from_archive(self.place, Archive(place_at(url)), wait=wait)
 
     def garbage(self, *, generations: int | None = None) -> list[Garbage]:
         """Files to which no record refers, such as those of killed runs, with their
@@ -838,98 +724,24 @@ class Database:
             them. Consents, releases and calibrations are always kept. By default all
             generations are kept.
         """
-        return find_garbage(self._place, generations)
+        return find_garbage(self.place, generations)
 
     def clean(self, *, generations: int | None = None) -> list[Garbage]:
         """Remove and return what `garbage` lists without a reason for keeping it; old
         generations leave tombstones.
         """
-        return remove_garbage(self._place, generations)
-
-    def _head_names(self, kind: str) -> list[str]:
-        """Names of the heads of a kind, or of the kinds with heads; empty if this cache
-        is damaged.
-        """
-        try:
-            return self._place.children(f"heads/{kind}".rstrip("/"))
-        except UnavailableError:
-            raise
-        except InputError:
-            return []
+        return remove_garbage(self.place, generations)
 
     def _require_subject(self, subject: str) -> None:
-        known = sorted(
-            {
-                subject_of(t)
-                for kind in self.kinds()
-                if kind not in KINDS_WITHOUT_SUBJECT
-                for t in self.takes(kind)
-            }
-        )
-        if subject not in known:
-            there = f"subjects: {', '.join(known[:8]) or 'none'}" + (
-                ", ..." if len(known) > 8 else ""
-            )
-            own = subject_of(subject)
-            cure = (
-                f"the subject of that take is {own}"
-                if own in known
-                else "see skindb info"
-            )
-            raise InputError(
-                Fault(subject, "the database must hold the subject", there, cure)
-            )
-
-    def _require_version(self, kind: str, take: str) -> None:
-        """Raise an `InputError` that lists the existing takes or kinds, unless the take
-        has a version of this kind.
-        """
-        if not self.has(kind, take):
-            raise self._missing_error(kind, take)
-
-    def _missing_error(self, kind: str, take: str) -> InputError:
-        takes = self.takes(kind)
-        kinds = self.kinds()
-        there = (
-            f"takes: {', '.join(takes)}"
-            if takes
-            else f"no {kind}; kinds: {', '.join(kinds) or 'none'}"
-        )
-        where = f"{self.url}: {kind} of {take}"
-        rule = "the database must hold it"
-        return InputError(Fault(where, rule, there, "see skindb info"))
-
-    def _summary(
-        self, known: Known, stale: Staleness, kind: str, take: str
-    ) -> dict[str, Any]:
-        try:
-            record = known.record(kind, take)
-            reasons = stale.reasons(record) if kind in DERIVED else ()
-        except InputError as error:
-            return {"fault": str(error)}
-        path = self._place.url(record.path)
-        created = record.created
-        summary = {
-            "generation": record.generation,
-            "path": path,
-            "created": created,
-            "bytes": record.bytes,
-        }
-        if kind == CONSENT:
-            return summary | {"scope": list(consent_scope(record.provenance))}
-        summary |= {"stale": list(map(str, reasons))} if reasons else {}
-        return summary | {"status": record.provenance.get("status", {})}
-
-
-def _table(known: Known) -> pd.DataFrame:
-    known.read_ahead((*CATALOGUE_KINDS, CONSENT))
-    rows = table(known)
-    known.save()
-    return rows
-
-
-def _chunked(ds: xr.Dataset) -> xr.Dataset:
-    return ds.chunk(surfel=SHARD) if "surfel" in ds.dims else ds
+        subjects = Snapshot(self.place).subjects()
+        if subject not in subjects:
+            found = f"subjects: {', '.join(subjects[:8]) or 'none'}"
+            found += ", ..." if len(subjects) > 8 else ""
+            cure = "see skindb info"
+            if subject_of(subject) in subjects:
+                cure = f"the subject of that take is {subject_of(subject)}"
+            rule = "the database must hold the subject"
+            raise InputError(Fault(subject, rule, found, cure))
 
 
 def open(url: str) -> Database:  # noqa: A001  as in xarray and zarr

@@ -39,7 +39,6 @@ from skindb.store.paths import (
 from skindb.store.place import Place, UnavailableError
 from skindb.store.record import Record, subjects_of
 from skindb.store.record_cache import CATALOGUE, cache_names
-from skindb.store.release import commit_release
 from skindb.store.requests import (
     PINS,
     TAKES,
@@ -48,7 +47,7 @@ from skindb.store.requests import (
     remove_request,
     write_request,
 )
-from skindb.store.stage import read_names, remove_version
+from skindb.store.stage import commit_release, read_names, remove_version
 
 T = TypeVar("T")
 # folders with one entry per kind, and below it one per take

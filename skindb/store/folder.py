@@ -63,6 +63,11 @@ class Folder:
         root = self.root.resolve()
         return root.with_name(f"{root.name}.markers")
 
+    def address(self) -> str:
+        """URL by which another process finds the place."""
+        # another process may have another working directory
+        return str(self.root.absolute())
+
     def url(self, key: str) -> str:
         """Path of a key as shown to users."""
         return str(inside(self.root.resolve(), key))

@@ -19,6 +19,14 @@ class UnavailableError(InputError):
     """
 
 
+class Located(Protocol):
+    """Something with a location, such as a database."""
+
+    @property
+    def place(self) -> Place:
+        """Its location."""
+
+
 class Place(Protocol):
     """A place that stores bytes under keys, which are relative paths with "/" as the separator.
 
@@ -46,6 +54,9 @@ class Place(Protocol):
         """Path of the local file outside the place that notes withdrawals and consents;
         see `marker_file`.
         """
+
+    def address(self) -> str:
+        """URL by which another process finds the place."""
 
     def url(self, key: str) -> str:
         """Address of a key as shown to users."""

@@ -80,6 +80,11 @@ class Record:
         inputs = self.provenance.get("inputs", [])
         return inputs if isinstance(inputs, list) else []
 
+    @property
+    def title(self) -> str:
+        """Kind, generation and take, as shown in messages."""
+        return f"{self.kind} {self.generation} of {self.take}"
+
     def beside(self, what: str) -> str:
         """Key of the file `what` (manifest or tables) beside the version."""
         return f"{self.path.removesuffix('.zarr')}.{what}.json"

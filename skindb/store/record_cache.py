@@ -13,11 +13,11 @@ from collections.abc import Callable, Hashable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from skindb.errors import Fault, InputError
 from skindb.schema.consent import CONSENT
-from skindb.store.log import GENERATION, Log
+from skindb.store.log import Log
 from skindb.store.markers import WithdrawnError, read_markers
 from skindb.store.paths import KIND, TAKE, TRANSIENT
 from skindb.store.place import Place, UnavailableError
@@ -27,9 +27,7 @@ from skindb.store.sealed import (
     sealed,
     sealed_object,
 )
-
-if TYPE_CHECKING:
-    from skindb.store.database import Database
+from skindb.store.snapshot import Snapshot, identity_text, list_records
 
 CATALOGUE = "catalogue.json"
 FORMAT = 3
@@ -83,21 +81,21 @@ class RecordCache:
 
     Parameters
     ----------
-    db, place
-        Database and its location.
+    place
+        Location of the database.
     """
 
-    def __init__(self, db: Database, place: Place) -> None:
-        self.db = db
+    def __init__(self, place: Place) -> None:
         self.place = place
         with ThreadPoolExecutor(4) as pool:
-            listed = pool.submit(_list_records, place)
+            listed = pool.submit(list_records, place)
             heads = pool.submit(_list_heads, place)
             stored = pool.submit(_load_entries, place)
             markers = pool.submit(read_markers, place)
         self._files = listed.result()
         self._heads = heads.result()
         self._markers = markers.result()
+        self._log = Snapshot(place, self._markers)
         entries = stored.result() or {}
         self._entries = _unchanged_entries(entries, self._files)
         self._changed = len(self._entries) != len(entries)
@@ -127,7 +125,7 @@ class RecordCache:
         return (
             (kind, take) in self._heads
             and re.fullmatch(TAKE, take) is not None
-            and self.db.has(kind, take)
+            and self._log.has(kind, take)
         )
 
     def record(self, kind: str, take: str, generation: int | None = None) -> Record:
@@ -178,7 +176,7 @@ class RecordCache:
         """
         if not self._changed:
             return
-        entries = _unchanged_entries(self._entries, _list_records(self.place))
+        entries = _unchanged_entries(self._entries, list_records(self.place))
         rows = [
             entry
             for _, entry in sorted(entries.items())
@@ -217,7 +215,7 @@ class RecordCache:
         entry = None if number is None else self._entries.get((kind, take, number))
         is_checked = generation is not None or (
             entry is not None
-            and entry.head == _identity_text(self._heads.get((kind, take), ()))
+            and entry.head == identity_text(self._heads.get((kind, take), ()))
         )
         return entry if is_checked else None
 
@@ -237,24 +235,19 @@ class RecordCache:
             raise
         except InputError:
             # damaged, or committed or removed since the listing, which the log decides
-            record = self.db.record(kind, take, generation, markers=self._markers)
+            record = self._log.record(kind, take, generation)
         if not self._markers.admits(record):
             # raises the reason
-            return self.db.record(kind, take, generation, markers=self._markers)
+            return self._log.record(kind, take, generation)
         record, key = _trimmed_record(record), (kind, take, record.generation)
         if key in self._files:
             self._entries[key] = Entry(
                 record,
                 self._files[key],
-                _identity_text(head) if generation is None else None,
+                identity_text(head) if generation is None else None,
             )
             self._changed = True
         return record
-
-
-def takes_in_log(place: Place, kind: str) -> set[str]:
-    """Takes with a record of this kind, from a single listing."""
-    return {take for _, take, _ in _list_records(place, kind)}
 
 
 def cache_names(place: Place, is_named: Callable[[str], bool]) -> bool:
@@ -277,17 +270,6 @@ def _generations(files: Iterable[Key]) -> dict[tuple[str, str], list[int]]:
     return found
 
 
-def _list_records(place: Place, kind: str = "") -> dict[Key, str]:
-    """Identity of the file of every record in the log, of one kind or of all kinds."""
-    found: dict[Key, str] = {}
-    for name, identity in place.identities(f"log/{kind}".rstrip("/")).items():
-        of, take, file, *_ = [*([kind] if kind else []), *name.split("/"), "", ""]
-        match = GENERATION.fullmatch(file)
-        if match and re.fullmatch(KIND, of) and re.fullmatch(TAKE, take):
-            found[of, take, int(match[1])] = _identity_text(identity)
-    return found
-
-
 def _list_heads(place: Place) -> dict[tuple[str, str], tuple[Hashable, ...]]:
     """Identity of every head, by kind and take; empty if the folder of heads is damaged."""
     try:
@@ -302,10 +284,6 @@ def _list_heads(place: Place) -> dict[tuple[str, str], tuple[Hashable, ...]]:
         if name.endswith(".json")
     }
     return {(kind, take): every[name] for name, (kind, _, take) in parts.items()}
-
-
-def _identity_text(identity: tuple[Hashable, ...]) -> str:
-    return " ".join(map(str, identity))
 
 
 def _unchanged_entries(

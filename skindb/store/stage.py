@@ -35,6 +35,7 @@ from skindb.store.markers import AdmissionGuard, read_markers, require_secret
 from skindb.store.paths import (
     GROUP,
     KINDS_OF_ONE_SUBJECT,
+    RELEASE,
     TAKE,
     TRANSIENT,
     VERSION,
@@ -43,6 +44,7 @@ from skindb.store.paths import (
 from skindb.store.place import Place, UnavailableError
 from skindb.store.record import Record, own_takes, subjects_of
 from skindb.store.sealed import intact_or_none, json_object
+from skindb.store.verified import read_beside
 
 MIN_CHUNK_SURFELS = 256  # in a chunk, the smallest unit of reading
 MIN_CHUNK_BYTES = 1 << 19  # a smaller chunk gets more surfels
@@ -357,6 +359,15 @@ class Stage:
             return True
 
 
+def commit_release(
+    place: Place, name: str, pins: Iterable[Mapping[str, Any]]
+) -> Record:
+    """Commit a release, or a new revision of it."""
+    inputs = [dict(pin) for pin in pins]
+    with Stage(place, RELEASE, name, names={pin["take"] for pin in inputs}) as stage:
+        return stage.commit({"command": "release", "release": name, "inputs": inputs})
+
+
 def read_names(place: Place, path: str) -> tuple[list[str], dict[str, int]] | None:
     """Takes that a version refers to and admissions of their subjects, from beside it;
     None if they are unknown.
@@ -414,6 +425,15 @@ def tables_from_json(content: Mapping[str, Any]) -> xr.Dataset:
         for name, value in content["values"].items()
     }
     return dataset(values, coords=content["labels"])
+
+
+def read_tables(place: Place, record: Record) -> xr.Dataset:
+    """The tables beside a version; empty if it has none."""
+    if not record.tables:
+        return xr.Dataset()
+    return tables_from_json(
+        json_object(read_beside(place, record, TABLES, record.tables))
+    )
 
 
 def _faults(name: str, ds: xr.Dataset) -> list[Fault]:

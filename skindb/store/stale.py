@@ -7,20 +7,19 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from functools import partial
+from typing import Any, Literal
 
 from skindb.errors import Fault, InputError, SkindbWarning
 from skindb.schema.consent import CONSENT
-from skindb.store.known import Snapshot, consent_of
+from skindb.store.log import Log
 from skindb.store.markers import WithdrawnError
 from skindb.store.paths import STUDY
-from skindb.store.place import UnavailableError
+from skindb.store.place import Located, UnavailableError
 from skindb.store.record import Record
 from skindb.store.record_cache import CACHED_KINDS
-
-if TYPE_CHECKING:
-    from skindb.store.database import Database
-    from skindb.store.record_cache import RecordCache
+from skindb.store.sealed import intact_or_none
+from skindb.store.snapshot import Records, Snapshot, consent_of
 
 Why = Literal["withdrawn", "unreadable", "not covered", "superseded"]
 REASONS: dict[Why, str] = {
@@ -68,10 +67,9 @@ class Staleness:
         Source of records of the kinds `CACHED_KINDS`, by default the database itself.
     """
 
-    def __init__(self, db: Database, cache: RecordCache | None = None) -> None:
-        self.db = db
+    def __init__(self, db: Located, cache: Records | None = None) -> None:
         self._cache = cache
-        self._snapshot = Snapshot(db)
+        self._snapshot = Snapshot(db.place)
         self._known: dict[tuple[str, str, int], tuple[Reason, ...]] = {}
         self._newest: dict[tuple[str, str], int] = {}
         self._covered: dict[str, bool] = {}
@@ -106,7 +104,7 @@ class Staleness:
         except WithdrawnError:
             made_from = None
         except InputError:
-            if self.db.lists(kind, take, generation):
+            if generation in Log(self._snapshot.place, kind, take).generations():
                 yield Reason("unreadable", kind, take, generation)
                 return
             made_from = None
@@ -146,16 +144,13 @@ class Staleness:
             self._newest[kind, take] = self._records(kind).record(kind, take).generation
         return self._newest[kind, take]
 
-    def _records(self, kind: str) -> Snapshot | RecordCache:
-        return (
-            self._cache
-            if self._cache is not None and kind in CACHED_KINDS
-            else self._snapshot
-        )
+    def _records(self, kind: str) -> Records:
+        is_cached = self._cache is not None and kind in CACHED_KINDS
+        return self._cache if self._cache and is_cached else self._snapshot
 
 
 def require_fresh(
-    db: Database, kind: str, take: str, generation: int | None = None
+    db: Located, kind: str, take: str, generation: int | None = None
 ) -> None:
     """Raise an error or warn if a version is stale.
 
@@ -170,8 +165,8 @@ def require_fresh(
         If an input was withdrawn or cannot be read, or if the consent of its subject no
         longer covers statistics.
     """
-    record = db.record(kind, take, generation)
-    what = f"{kind} {record.generation} of {take}"
+    record = Snapshot(db.place).record(kind, take, generation)
+    what = record.title
     reasons = Staleness(db).reasons(record)
     if refused := [reason for reason in reasons if reason.why != "superseded"]:
         rule = "its inputs must exist and be covered by consent"
@@ -192,26 +187,29 @@ def require_fresh(
         )
 
 
-def stale_versions(db: Database) -> list[tuple[Record, tuple[Reason, ...]]]:
+def stale_versions(db: Located) -> list[tuple[Record, tuple[Reason, ...]]]:
     """The newest versions that are stale, with the reasons, in order of dependence.
 
     Damaged versions and results that were made from them are omitted, because results
     that are computed again would lack the damaged data.
     """
     staleness = Staleness(db)
-    found = []
-    for kind in DERIVED:
-        for take in db.takes(kind):
-            try:
-                record = db.record(kind, take)
-                reasons = staleness.reasons(record)
-            except UnavailableError:
-                raise
-            except InputError:
-                continue
-            sound = all(reason.why != "unreadable" for reason in reasons)
-            found += [(record, reasons)] if reasons and sound else []
-    return found
+    snapshot = Snapshot(db.place)
+
+    def judged(kind: str, take: str) -> tuple[Record, tuple[Reason, ...]]:
+        record = snapshot.record(kind, take)
+        return record, staleness.reasons(record)
+
+    newest = [
+        intact_or_none(partial(judged, kind, take))
+        for kind in DERIVED
+        for take in snapshot.takes(kind)
+    ]
+    return [
+        (record, reasons)
+        for record, reasons in filter(None, newest)
+        if reasons and all(reason.why != "unreadable" for reason in reasons)
+    ]
 
 
 def _is_of_release(record: Record) -> bool:

@@ -111,10 +111,7 @@ def _withdrawn_faults(place: Place) -> list[Fault]:
     except InputError as error:  # of the secret, which `marker_faults` reports
         return [fault for fault in error.faults if fault.where != place.where(SECRET)]
     left = [f"{kind} of {take}" for kind, take in holdings.takes]
-    left += [
-        f"{record.kind} {record.generation} of {record.take}"
-        for record in holdings.versions
-    ]
+    left += [record.title for record in holdings.versions]
     left += [place.where(key) for key in (*holdings.unrecorded, *holdings.caches)]
     left += [*map(str, holdings.requests), *map(str, holdings.scratch)]
     rule = "nothing of a withdrawn subject must remain"
@@ -185,7 +182,7 @@ def _input_faults(
             ):
                 continue
             if seals.get((log.kind, log.take, generation)) != one["seal"]:
-                by = f"{record.kind} {record.generation} of {record.take}"
+                by = record.title
                 rule = f"generation {generation}, from which {by} was made, must exist"
                 faults.append(
                     Fault(log.what, rule, "no record, or a different one", RESTORE)
@@ -265,7 +262,7 @@ def partly_removed_records(
 
 
 def _partly_removed_fault(record: Record) -> Fault:
-    what = f"{record.kind} {record.generation} of {record.take}"
+    what = record.title
     return Fault(
         what,
         "its removal must be completed",
@@ -331,7 +328,7 @@ def _record_faults(place: Place, record: Record, tables: bytes) -> list[Fault]:
     )
     wrong += [] if contents == record.contents else ["contents"]
     wrong += [] if sum(place.sizes(record.path).values()) == record.bytes else ["bytes"]
-    where = f"{record.kind} {record.generation} of {record.take}"
+    where = record.title
     return (
         [Fault(where, AS_RECORDED, f"different {', '.join(wrong)}", RESTORE)]
         if wrong

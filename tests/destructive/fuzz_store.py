@@ -95,7 +95,7 @@ def database(root: Path) -> None:
     for code in "123":
         with patch("skindb.workflow.derive.code_digest", lambda *_, code=code: code):
             workflow.translucency(db)
-    Log(db._place, "population", "translucency").remove(2)
+    Log(db.place, "population", "translucency").remove(2)
     if faults := db.verify():
         raise AssertionError(faults)
 

@@ -208,7 +208,7 @@ def files_of(
 ) -> dict[str, list[object]]:
     """Digest of every file of a version except for its provenance, and of its tables."""
     record = db.record(kind, take, generation)
-    manifest = json.loads(db._place.read(record.beside("manifest")))
+    manifest = json.loads(db.place.read(record.beside("manifest")))
     manifest.pop("zarr.json")
     return manifest | {"tables": [record.tables]}
 
@@ -288,7 +288,7 @@ def generations(db: Database, kind: str, take: str) -> list[int]:
 
 def unlisted(db: Database) -> set[str]:
     """Versions that have no record and are not listed as garbage."""
-    below = db._place.children
+    below = db.place.children
     keys = {
         f"data/{kind}/{take}"
         for kind in below("data")

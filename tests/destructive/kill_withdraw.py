@@ -101,11 +101,11 @@ def fill(db: Database) -> None:
 
 
 def copy_objects(old: Database, new: Database) -> None:
-    for top in old._place.names() or []:
-        if old._place.file_type(top) == "file":
-            new._place.replace(top, old._place.read(top))
-        for name in [name for name, size in old._place.sizes(top).items() if size >= 0]:
-            new._place.replace(f"{top}/{name}", old._place.read(f"{top}/{name}"))
+    for top in old.place.names() or []:
+        if old.place.file_type(top) == "file":
+            new.place.replace(top, old.place.read(top))
+        for name in [name for name, size in old.place.sizes(top).items() if size >= 0]:
+            new.place.replace(f"{top}/{name}", old.place.read(f"{top}/{name}"))
 
 
 def _withdraw_again(db: Database) -> None:

@@ -124,7 +124,7 @@ def _state(root) -> dict[str, bytes]:
 
 
 def _restored(db, dest, target, **options) -> Database:
-    restore(str(dest), str(target), markers=db._place.marker_file(), **options)
+    restore(str(dest), str(target), markers=db.place.marker_file(), **options)
     return Database(target)
 
 
@@ -196,7 +196,7 @@ def test_restore__brings_back_nobody_who_was_withdrawn_later(db, dest, tmp_path)
     copy = _restored(db, dest, tmp_path / "copy")
     assert traces(copy.root, SUBJECT) == []
     assert traces(tmp_path / "copy.markers", SUBJECT) == []
-    assert SUBJECT.encode() not in db._place.marker_file().read_bytes()
+    assert SUBJECT.encode() not in db.place.marker_file().read_bytes()
     assert (
         copy.takes("model"),
         copy.subjects(),
@@ -331,13 +331,13 @@ def test_restore__needs_a_marker_file(db, dest, tmp_path):
 def test_restore__refuses_a_damaged_marker_file(db, dest, tmp_path, damage):
     db.backup(str(dest))
     db.erase(SUBJECT)
-    file = db._place.marker_file()
+    file = db.place.marker_file()
     lines = file.read_bytes().splitlines(keepends=True)
     if damage == "other database":
         other = Database(tmp_path / "other")
         _commit(other.url, "capture", "A")
         other.backup(str(tmp_path / "other backup"))
-        lines = other._place.marker_file().read_bytes().splitlines(keepends=True)
+        lines = other.place.marker_file().read_bytes().splitlines(keepends=True)
     elif damage == "line changed":
         lines[1] = lines[1].replace(b'"removed"', b'"Removed"')
     elif damage == "line removed":
@@ -403,7 +403,7 @@ def test_backup__of_another_database_or_elsewhere_is_refused(db, dest, tmp_path)
 
 def _file_of(dest: Path, db: Database, key: str) -> Path:
     """The file of a backup that holds a file of the database."""
-    digest = backup_states(str(dest))[-1].files.get(key) or db._place.digest(key)
+    digest = backup_states(str(dest))[-1].files.get(key) or db.place.digest(key)
     return dest / "files" / digest[:2] / digest
 
 
@@ -422,7 +422,7 @@ def test_backup__names_each_damaged_file(db, dest, tmp_path):
         fault.rule == "a file of a backup must be as it was written" for fault in faults
     )
     copy = tmp_path / "copy"
-    restored = restore(str(dest), str(copy), markers=db._place.marker_file())
+    restored = restore(str(dest), str(copy), markers=db.place.marker_file())
     assert {fault.where for fault in restored.faults} == {str(chunk), str(log)}
     again = Database(copy)
     # damaged here too, never silently absent
@@ -452,7 +452,7 @@ def test_backup__of_a_damaged_database_names_the_file_and_saves_the_rest(
     )
     copy = tmp_path / "copy"
     assert (
-        len(restore(str(dest), str(copy), markers=db._place.marker_file()).faults) == 1
+        len(restore(str(dest), str(copy), markers=db.place.marker_file()).faults) == 1
     )
     assert float(Database(copy).read("capture", "B")["surfels/surfel_area"][0]) == 2.0
     with pytest.raises(InputError, match="no file"):
@@ -500,7 +500,7 @@ def test_backup__of_hostile_names(tmp_path, dest):
 
 def test_backup__copies_the_audit_log(db, dest, tmp_path):
     for number in (1, 2):
-        db._place.create(f"audit/000000/{number:09d}.json", b'{"entry": %d}' % number)
+        db.place.create(f"audit/000000/{number:09d}.json", b'{"entry": %d}' % number)
     db.backup(str(dest))
     db.erase(SUBJECT)
     db.erase_from_backup(str(dest))
@@ -794,7 +794,7 @@ def test_backup__from_a_folder_to_a_bucket_and_back(
     first = db.backup(archive, verify=True)
     assert first.faults == ()
     assert db.backup(archive).copied == 0
-    restore(archive, copy, markers=db._place.marker_file())
+    restore(archive, copy, markers=db.place.marker_file())
     assert Database(copy).verify() == []
     back = tmp_path / "back"
     report = Database(copy).backup(str(back), verify=True)

@@ -237,13 +237,13 @@ def test_database__is_pickled_without_secrets(bucket):
     commit(bucket)
     db = Database(bucket)
     tree = db.read("capture", "A1")
-    for thing in (db, db._place, tree):
+    for thing in (db, db.place, tree):
         content = pickle.dumps(thing)
         assert KEY.encode() not in content
         assert SECRET.encode() not in content
     assert pickle.loads(pickle.dumps(db)) == db
     assert float(pickle.loads(pickle.dumps(tree))["surfels/surfel_area"][3]) == 1.0
-    text = repr((db, db._place, vars(db._place)))
+    text = repr((db, db.place, vars(db.place)))
     assert KEY not in text
     assert SECRET not in text
 

@@ -170,9 +170,9 @@ def test_table__the_first_of_a_bucket_reads_one_object_for_each_record(
 def test_table__a_head_in_a_bucket_that_names_another_record_is_read(bucket):
     commit(bucket, take="A1", **SCOPE)
     db = skindb.open(bucket)
-    log = Log(db._place, "capture", "A1")
+    log = Log(db.place, "capture", "A1")
     for seal in ("0" * 64, "1" * 63 + "0"):
-        db._place.replace(log.head_key, log.head_content(1, seal))
+        db.place.replace(log.head_key, log.head_content(1, seal))
         with pytest.raises(
             InputError, match="generation 1 must be the record that was committed"
         ):

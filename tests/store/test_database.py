@@ -268,7 +268,7 @@ def test_commit__interrupt_around_the_link(tmp_path, monkeypatch, when):
         db.history("capture", "A1")
     )
     assert not [
-        name for name in db._place.children("log/capture/A1") if name.endswith(".tmp")
+        name for name in db.place.children("log/capture/A1") if name.endswith(".tmp")
     ]
 
 

@@ -365,7 +365,7 @@ def test_erase__a_release_that_names_a_damaged_version_waits(db):
 
 def test_verify__names_a_damaged_request(db):
     _fitted(db, "B")
-    write_request(db._place, Request("edit", "B", {"amounts": {"age": 1}}))
+    write_request(db.place, Request("edit", "B", {"amounts": {"age": 1}}))
     [file] = (db.root / "requests").iterdir()
     assert db.verify() == []
     file.write_text(file.read_text().replace("age", "sex"))

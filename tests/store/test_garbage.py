@@ -327,7 +327,7 @@ def test_garbage__of_a_database_that_cannot_be_written_is_listed(db, monkeypatch
     def full(_):
         raise OSError(30, "Read-only file system")
 
-    monkeypatch.setattr(type(db._place), "now", full)
+    monkeypatch.setattr(type(db.place), "now", full)
     assert _kept(db) == {path: ""}
 
 

@@ -268,7 +268,7 @@ def test_lease__of_a_machine_whose_clock_is_an_hour_off(
         os.utime(file, (time.time() - age,) * 2)
         for machine in (-3600.0, 0.0, 3600.0):
             clock(machine)
-            assert bool(lease_module.holder_of(db._place, "capture", "A1")) == is_held
+            assert bool(lease_module.holder_of(db.place, "capture", "A1")) == is_held
         clock(0.0)
     file.unlink()  # without its lease, the age of the version decides
     for minutes, is_kept in ((50, True), (70, False)):

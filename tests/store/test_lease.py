@@ -98,7 +98,7 @@ def test_lease__of_several_kinds_is_all_or_nothing(db):
 
 
 def _waiting(db, wait, clock):
-    return Lease(db._place, "A1", ("model",), wait=wait, clock=clock)
+    return Lease(db.place, "A1", ("model",), wait=wait, clock=clock)
 
 
 def test_lease__waits_for_the_other_run(db):
@@ -149,7 +149,7 @@ def test_lease__that_a_full_disk_cannot_mark_as_free_is_free(db, monkeypatch):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with _hold(db):
-        monkeypatch.setattr(type(db._place), "replace", refuse)
+        monkeypatch.setattr(type(db.place), "replace", refuse)
     monkeypatch.undo()
     assert _files(db) == []
     with _hold(db) as lease:
@@ -251,7 +251,7 @@ def test_lease__that_is_damaged_ends_like_any_other(db):
     ):
         file.write_text(json.dumps(body))
         _age(file, LEASE_SECONDS + 1)
-        assert lease_module.holder_of(db._place, "model", "A1") == ""
+        assert lease_module.holder_of(db.place, "model", "A1") == ""
     with _hold(db):
         pass
 

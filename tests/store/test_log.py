@@ -31,7 +31,7 @@ def db(made, tmp_path):
 
 
 def _log(db):
-    return Log(db._place, "capture", "A1")
+    return Log(db.place, "capture", "A1")
 
 
 def _record(db, generation, take="A1"):

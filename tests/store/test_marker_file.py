@@ -28,7 +28,7 @@ def db(tmp_path):
 
 
 def _notes(db):
-    return read_marker_file(db._place.marker_file(), require_secret(db._place))
+    return read_marker_file(db.place.marker_file(), require_secret(db.place))
 
 
 def test_marker_file__notes_withdrawals_readmissions_and_consents(db):
@@ -43,11 +43,11 @@ def test_marker_file__notes_withdrawals_readmissions_and_consents(db):
     notes = _notes(db)
     assert [one["consent"] for one in notes.consents.values()] == [["fit", "export"]]
     assert [*notes.entries] == [
-        f"withdrawn/{name}" for name in db._place.sizes("withdrawn")
+        f"withdrawn/{name}" for name in db.place.sizes("withdrawn")
     ]
     db.readmit(SUBJECT, db.withdrawal(SUBJECT).date)
     assert len(_notes(db).entries) == 2
-    file = db._place.marker_file()
+    file = db.place.marker_file()
     assert SUBJECT.encode() not in file.read_bytes()
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
     size = file.stat().st_size
@@ -58,7 +58,7 @@ def test_marker_file__notes_withdrawals_readmissions_and_consents(db):
 def test_marker_file__can_be_a_link_to_another_disk(db, tmp_path):
     other = tmp_path / "other"
     other.mkdir()
-    db._place.marker_file().symlink_to(other / "faces.markers")
+    db.place.marker_file().symlink_to(other / "faces.markers")
     db.erase(SUBJECT)
     assert len(_notes(db).entries) == 1
     assert (other / "faces.markers").is_file()
@@ -67,18 +67,18 @@ def test_marker_file__can_be_a_link_to_another_disk(db, tmp_path):
 def test_marker_file__that_was_lost_is_written_again(db):
     db.erase(SUBJECT)
     before = _notes(db)
-    db._place.marker_file().unlink()
+    db.place.marker_file().unlink()
     db.complete_erasures()
     assert _notes(db) == before
 
 
 def test_marker_file__continues_after_a_line_that_was_cut_off(db):
     db.erase(SUBJECT)
-    before = db._place.marker_file().read_bytes()
+    before = db.place.marker_file().read_bytes()
     for size in range(1, len(before), 7):
-        db._place.marker_file().write_bytes(before[:size])
-        note_withdrawals(db._place)
-        assert db._place.marker_file().read_bytes() == before
+        db.place.marker_file().write_bytes(before[:size])
+        note_withdrawals(db.place)
+        assert db.place.marker_file().read_bytes() == before
 
 
 def test_marker_file__that_cannot_be_written_is_a_warning(db, tmp_path, monkeypatch):
@@ -86,18 +86,18 @@ def test_marker_file__that_cannot_be_written_is_a_warning(db, tmp_path, monkeypa
         "withdrawals and consents must be noted outside the database, so that a "
         "restore repeats them"
     )
-    db._place.marker_file().mkdir()
+    db.place.marker_file().mkdir()
     with pytest.warns(MarkerFileWarning, match=rule):
         db.record_consent("B", ["fit"])
     assert db.consent("B") == ["fit"]
-    db._place.marker_file().rmdir()
-    os.mkfifo(db._place.marker_file())
+    db.place.marker_file().rmdir()
+    os.mkfifo(db.place.marker_file())
     with pytest.warns(
         MarkerFileWarning, match="found something that is not a regular file"
     ):
         db.erase(SUBJECT)
     assert db.takes() == ["B"]
-    db._place.marker_file().unlink()
+    db.place.marker_file().unlink()
     monkeypatch.setattr(os, "pwrite", lambda *_: 0)
     with pytest.warns(
         MarkerFileWarning, match="found No space left on device; free some space there"
@@ -115,7 +115,7 @@ def test_marker_file__is_unlocked_although_a_copy_of_its_descriptor_is_open(
     copies = []
     monkeypatch.setattr(os, "fsync", lambda number: copies.append(os.dup(number)))
     db.erase(SUBJECT)
-    with db._place.marker_file().open("rb") as file:
+    with db.place.marker_file().open("rb") as file:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     for number in copies:
         os.close(number)
@@ -125,14 +125,14 @@ def test_marker_file__of_another_database_is_kept(db, tmp_path):
     other = Database(tmp_path / "other")
     commit(other.root, n=2)
     other.erase("A1")
-    content = other._place.marker_file().read_bytes()
-    shutil.copy(other._place.marker_file(), db._place.marker_file())
+    content = other.place.marker_file().read_bytes()
+    shutil.copy(other.place.marker_file(), db.place.marker_file())
     with pytest.warns(
         MarkerFileWarning,
         match=r"found a line that is damaged, or of another database; give the right",
     ):
         db.erase(SUBJECT)
-    assert db._place.marker_file().read_bytes() == content
+    assert db.place.marker_file().read_bytes() == content
 
 
 def test_marker_file__of_many_writers_has_each_line_once(db):
@@ -142,7 +142,7 @@ def test_marker_file__of_many_writers_has_each_line_once(db):
     with ThreadPoolExecutor(8) as threads:
         list(threads.map(partial(_consent, db.url), subjects))
     assert len(_notes(db).consents) == 8
-    assert len(db._place.marker_file().read_bytes().splitlines()) == 9
+    assert len(db.place.marker_file().read_bytes().splitlines()) == 9
 
 
 def _consent(url, subject):

@@ -229,7 +229,7 @@ def test_writer__suspended_at_any_step_of_a_bucket_leaves_nothing(
 
 
 def _keys_with(db: Database, subject: str) -> list[str]:
-    place = db._place
+    place = db.place
     files = [top for top in place.names() or [] if place.file_type(top) == "file"]
     files += [
         f"{top}/{name}"
@@ -283,7 +283,7 @@ def test_late_commit__is_not_visible(late):
     assert list(late.table().index) == ["B"]
     assert late.subjects() == ["B"]
     assert SUBJECT not in late.info()["takes"]
-    assert SUBJECT.encode() not in late._place.read("catalogue.json")
+    assert SUBJECT.encode() not in late.place.read("catalogue.json")
     assert not late.has("capture", f"{SUBJECT}.lotion")
     assert [
         record.generation for record in late.readable_history("population", "traits")

@@ -115,7 +115,7 @@ def test_read__parts_of_a_shard_are_compared_too(db):
     tree = db.read("capture", "A1")
     samples = tree["samples/reflectance_sample"]
     few = zarr.open_array(
-        VerifiedStore(db._place, db.record("capture", "A1")),
+        VerifiedStore(db.place, db.record("capture", "A1")),
         path="samples/reflectance_sample",
         mode="r",
     )
@@ -171,7 +171,7 @@ def test_read__reports_a_damaged_manifest(db, change):
 
 
 def test_verified_store__is_small_in_another_process(db):
-    store = VerifiedStore(db._place, db.record("capture", "A1"))
+    store = VerifiedStore(db.place, db.record("capture", "A1"))
     # dask copies stores for names
     with mock.patch("skindb.store.verified.read_manifest", side_effect=AssertionError):
         again = pickle.loads(pickle.dumps(store))

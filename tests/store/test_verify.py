@@ -404,7 +404,7 @@ def test_verify__endless_folders_and_files(db):
 
 def test_remove__leaves_nothing_of_the_version(db):
     record = db.record("capture", "B1")
-    Log(db._place, "capture", "B1").remove(1)
+    Log(db.place, "capture", "B1").remove(1)
     assert db.verify() == []
     assert not [
         path

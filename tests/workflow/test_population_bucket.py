@@ -75,10 +75,10 @@ def test_population__of_a_bucket(db):
         "release": 1,
         "summary": 2,
     }
-    keys = [meta["path"] for page in obstore.list(db._place._store) for meta in page]
+    keys = [meta["path"] for page in obstore.list(db.place._store) for meta in page]
     assert len(keys) > 20
     for key in keys:
-        content = bytes(obstore.get(db._place._store, key).bytes())
+        content = bytes(obstore.get(db.place._store, key).bytes())
         assert WORD.encode() not in content
         assert b'"A"' not in content
         assert not {"A", "A.lotion", "A.json", "A.lotion.json"} & set(key.split("/"))

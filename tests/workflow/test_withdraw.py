@@ -275,7 +275,7 @@ def test_withdraw__killed_at_any_step_the_same_call_completes_it(
 
     for name in ("remove", "create", "replace", "sweep"):
         monkeypatch.setattr(
-            type(db._place), name, counted(getattr(type(db._place), name))
+            type(db.place), name, counted(getattr(type(db.place), name))
         )
     with contextlib.suppress(KeyboardInterrupt):
         workflow.withdraw(db, "A")
@@ -340,7 +340,7 @@ def test_withdraw__of_an_unknown_subject(db):
     for name in ("nobody", "A.lotion", "..", ""):
         with pytest.raises(InputError, match="the database must hold the subject"):
             workflow.withdraw(db, name)
-    assert Log(db._place, "model", "A").generations() == [1, 2]
+    assert Log(db.place, "model", "A").generations() == [1, 2]
 
 
 def test_withdraw__a_study_of_another_version_of_skindb_waits(small, tmp_path):
