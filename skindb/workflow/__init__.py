@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from skindb.workflow.calibration import calibrate, describe_calibration
     from skindb.workflow.cluster import computing_on, connected, dashboard_link
     from skindb.workflow.edits import basis_grid, edit, edit_grid
+    from skindb.workflow.executor import Outcome
     from skindb.workflow.fit import (
         dictionary_at,
         fit_take,
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
     from skindb.workflow.studies import STUDY_FUNCTIONS, study
     from skindb.workflow.summaries import summarise
     from skindb.workflow.superseded import superseded_calibrations, superseded_lines
-    from skindb.workflow.takes import Outcome, faults_of, map_takes, results_of
+    from skindb.workflow.takes import faults_of, map_takes, results_of
     from skindb.workflow.translucency_pictures import translucency_grid
     from skindb.workflow.upkeep import (
         Refreshed,
@@ -152,7 +153,8 @@ _attribute, _, _ = lazy_loader.attach(
         "registration": ["register_takes", "registered_datasets"],
         "studies": ["STUDY_FUNCTIONS", "study"],
         "summaries": ["summarise"],
-        "takes": ["Outcome", "faults_of", "map_takes", "results_of"],
+        "executor": ["Outcome"],
+        "takes": ["faults_of", "map_takes", "results_of"],
         "withdrawal": [
             "Withdrawal",
             "erasure_report",

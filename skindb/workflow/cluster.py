@@ -9,10 +9,11 @@ import asyncio
 import json
 import threading
 import uuid
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +26,14 @@ from skindb.errors import Fault, InputError
 from skindb.files import make_private, private_file
 from skindb.threads import one_blas_thread
 from skindb.workflow.code_digest import package_digest
+from skindb.workflow.executor import (
+    KilledError,
+    Outcome,
+    Result,
+    Take,
+    defective,
+    pickled_outcome,
+)
 
 if TYPE_CHECKING:
     from distributed import Client, Future, Worker
@@ -228,72 +237,62 @@ def shared_token(folder: Path | None) -> Iterator[str]:
         token.unlink(missing_ok=True)
 
 
-def calls_on_cluster(
-    call: bytes, takes: Sequence[Any], client: Client, *, shared: Path | None = None
-) -> Iterator[tuple[Any, bytes | Exception, int]]:
-    """Send a small task for each take, and a large call only once; yield each answer as it comes.
+@dataclass(frozen=True)
+class Cluster:
+    """Calls on the workers of a Dask cluster, each with a small task, one at a time on a
+    worker.
 
     Parameters
     ----------
-    call
-        Takes a take and a number of threads, and returns bytes.
-    takes, client, shared
+    client, shared
         See `map_takes`.
-
-    Yields
-    ------
-    take, answer, attempts
-        The answer is bytes or an exception; `attempts` is 2 where a take was tried again alone.
-
-    Raises
-    ------
-    InputError
-        If a worker has another skindb or another file system, or if the scheduler is
-        lost: then no take can end well.
     """
+
+    client: Client
+    shared: Path | None = None
+
+    def outcomes(
+        self, function: Callable[[Take], Result], takes: Sequence[Take]
+    ) -> Generator[Outcome[Take, Result], None, None]:
+        """See `Executor`.
+
+        Raises
+        ------
+        InputError
+            If a worker has another skindb or another file system, or if the scheduler
+            is lost: then no take can end well.
+        """
+        from distributed import as_completed
+
+        client = self.client
+        call = cloudpickle.dumps(partial(pickled_outcome, function))
+        with shared_token(self.shared) as token:
+            expected = Expected(__version__, package_digest(), token)
+            message: Any = bytes(cloudpickle.dumps((expected, call)))
+            # its own task: the graph holds it once
+            if len(message) > MAX_REPEATED_BYTES:
+                message = client.submit(bytes, message, pure=False)
+                # takes go where it is: if one worker had it, all to that one
+                client.replicate(message)
+            futures = {
+                client.submit(_on_worker, message, take, pure=False): take
+                for take in takes
+            }
+            try:
+                for future in as_completed(list(futures), loop=client.loop):
+                    yield _received(future, futures[future], client)
+                    future.release()
+            finally:
+                # without a scheduler there is nothing to cancel
+                with suppress(Exception):
+                    client.cancel([future for future in futures if not future.done()])
+
+
+def _received(future: Future, take: Take, client: Client) -> Outcome[Take, Any]:
     from distributed import KilledWorker
 
-    with shared_token(shared) as token:
-        expected = Expected(__version__, package_digest(), token)
-        message = bytes(cloudpickle.dumps((expected, call)))
-        # their workers were killed, perhaps by a take beside them: each is tried again
-        # alone
-        suspects = []
-        for take, answer in _answers(message, takes, client):
-            if isinstance(answer, KilledWorker):
-                suspects.append(take)
-            else:
-                yield take, answer, 1
-        for one in suspects:
-            for take, answer in _answers(message, [one], client):
-                yield take, answer, 2
-
-
-def _answers(
-    message: bytes, takes: Sequence[Any], client: Client
-) -> Iterator[tuple[Any, bytes | Exception]]:
-    from distributed import as_completed
-
-    once: Any = message
-    if len(message) > MAX_REPEATED_BYTES:  # its own task: the graph holds it once
-        once = client.submit(bytes, message, pure=False)
-        # takes go where it is: if one worker had it, all to that one
-        client.replicate(once)
-    futures = {
-        client.submit(_on_worker, once, take, pure=False): take for take in takes
-    }
     try:
-        for future in as_completed(list(futures), loop=client.loop):
-            yield futures[future], _answer(future, client)
-            future.release()
-    finally:
-        with suppress(Exception):  # without a scheduler there is nothing to cancel
-            client.cancel([future for future in futures if not future.done()])
-
-
-def _answer(future: Future, client: Client) -> bytes | Exception:
-    try:
-        return bytes(future.result())
+        outcome: Outcome[Take, Any] = cloudpickle.loads(future.result())
     except InputError:
         raise
     except CancelledError:
@@ -305,9 +304,12 @@ def _answer(future: Future, client: Client) -> bytes | Exception:
         rule = "every worker must have skindb"
         cure = "install it in the environment of the workers"
         raise InputError(Fault("cluster", rule, str(error), cure)) from None
-    # the call could not be sent, or its worker was lost
+    except KilledWorker:
+        return Outcome(take, error=KilledError(take))
+    # the call could not be sent
     except Exception as error:  # noqa: BLE001
-        return error
+        return defective(take, error)
+    return outcome
 
 
 def _on_worker(message: bytes, take: Any) -> bytes:
