@@ -40,7 +40,7 @@ from skindb.store.s3 import (
     endpoint,
     readable_errors,
 )
-from skindb.store.verified import limits
+from skindb.store.verified import ListedStore, limits
 
 T = TypeVar("T")
 # before a request is repeated whose answer was lost and that obstore does not repeat
@@ -487,7 +487,7 @@ def _identity(meta: Mapping[str, Any]) -> tuple[Hashable, ...]:
     return meta["size"], meta["e_tag"], meta["last_modified"]
 
 
-class BucketStore(Store):
+class BucketStore(ListedStore):
     """A version that is being written, as a zarr store.
 
     In the process that created it, existing objects are known without requests. A copy
@@ -498,10 +498,6 @@ class BucketStore(Store):
     bucket, key
         Location of the version.
     """
-
-    supports_writes = True
-    supports_deletes = True
-    supports_listing = True
 
     def __init__(self, bucket: Bucket, key: str) -> None:
         super().__init__(read_only=False)
@@ -537,18 +533,6 @@ class BucketStore(Store):
         except FileNotFoundError:
             return None
 
-    async def get_partial_values(
-        self,
-        prototype: BufferPrototype,
-        key_ranges: Iterable[tuple[str, ByteRequest | None]],
-    ) -> list[Buffer | None]:
-        """Contents of several objects."""
-        return list(
-            await asyncio.gather(
-                *(self.get(key, prototype, part) for key, part in key_ranges)
-            )
-        )
-
     async def exists(self, key: str) -> bool:
         """Whether an object exists."""
         if not self.is_copy:
@@ -571,21 +555,6 @@ class BucketStore(Store):
         for name in await asyncio.to_thread(self.bucket.sizes, self.key):
             yield name
         for name in self.bucket.pending(self.key):
-            yield name
-
-    async def list_prefix(self, prefix: str) -> AsyncIterator[str]:
-        """Objects whose path begins with `prefix`."""
-        async for name in self.list():
-            if name.startswith(prefix):
-                yield name
-
-    async def list_dir(self, prefix: str) -> AsyncIterator[str]:
-        """Names directly below `prefix`."""
-        start = f"{prefix.rstrip('/')}/" if prefix else ""
-        for name in {
-            name[len(start) :].split("/", 1)[0]
-            async for name in self.list_prefix(start)
-        }:
             yield name
 
     def _of(self, key: str) -> str:

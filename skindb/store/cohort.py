@@ -12,7 +12,14 @@ import numpy as np
 import xarray as xr
 
 from skindb.errors import Fault, InputError
-from skindb.schema.cohort import Part, combine, few_names, one_take_each, take_coords
+from skindb.schema.cohort import (
+    Part,
+    Source,
+    combine,
+    few_names,
+    one_take_each,
+    take_coords,
+)
 from skindb.schema.notes import Note, note, note_lines
 from skindb.store.location import place_at
 from skindb.store.log import RESTORE
@@ -317,8 +324,7 @@ def frame_of(registration: Record) -> str:
     """
     about = registration.provenance
     inputs = sorted(
-        (str(one["take"]), str(one.get("seal", one["generation"])))
-        for one in registration.made_from
+        (str(one["take"]), str(one["seal"])) for one in registration.made_from
     )
     code = about.get("code_digest", "")
     return json.dumps([inputs, about["parameters"], code], sort_keys=True)
@@ -340,7 +346,7 @@ def _stored_record(
     of it; None if neither.
     """
     for one in reversed(known.history(SUMMARY, record.take)):
-        of = [(i["kind"], i["generation"], i.get("seal")) for i in one.made_from]
+        of = [(i["kind"], i["generation"], i["seal"]) for i in one.made_from]
         if (record.kind, record.generation, record.seal) in of and _has_data_for(
             one, request
         ):
@@ -386,38 +392,20 @@ def _part(
     sizes = dict(contents["sizes"])
     labels = dict(contents["labels"])
     coords = _coords(known, record.take)
-    if layout == "tables":
-        return Part(
-            record.take, coords, variables, sizes, labels, StoredTables(address)
-        )
-    if layout == "maps" or "surfel_index" not in variables:
-        return Part(
-            record.take,
-            coords,
-            variables,
-            sizes,
-            labels,
-            StoredGroup(address, GROUP[layout]),
-        )
-    capture = _capture_of(known, known.record("model", record.take))
-    if capture is None or (wanted is not None and not {SAMPLES, *DOME} & set(wanted)):
-        return Part(
-            record.take,
-            coords,
-            variables,
-            sizes,
-            labels,
-            StoredGroup(address, GROUP[layout]),
-        )
-    dome_sizes, dome_labels = _dome(capture)
-    return Part(
-        record.take,
-        coords,
-        [*variables, SAMPLES, *DOME],
-        sizes | dome_sizes,
-        labels | dome_labels,
-        StoredSamples(address, Address.of(known.place, capture), request.surfels),
-    )
+    source: Source = StoredTables(address)
+    if layout != "tables":
+        source = StoredGroup(address, GROUP[layout])
+    needs_samples = wanted is None or bool({SAMPLES, *DOME} & set(wanted))
+    if layout == "surfels" and "surfel_index" in variables and needs_samples:
+        capture = _capture_of(known, known.record("model", record.take))
+        if capture is not None:
+            dome_sizes, dome_labels = _dome(capture)
+            variables += [SAMPLES, *DOME]
+            sizes |= dome_sizes
+            labels |= dome_labels
+            whole = Address.of(known.place, capture)
+            source = StoredSamples(address, whole, request.surfels)
+    return Part(record.take, coords, variables, sizes, labels, source)
 
 
 def _capture_of(known: Known, model: Record) -> Record | None:

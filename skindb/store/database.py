@@ -498,7 +498,7 @@ class Database:
         for made_from in version.attrs.get("inputs", []):
             if made_from["kind"] == kind and take in (None, made_from["take"]):
                 record = self.record(kind, made_from["take"], made_from["generation"])
-                if made_from.get("seal", record.seal) != record.seal:
+                if made_from["seal"] != record.seal:
                     rule = f"the {kind} it was made from must exist"
                     found = "a different version of that generation"
                     raise InputError(

@@ -21,11 +21,10 @@ from skindb.errors import Fault, InputError
 from skindb.schema.consent import CONSENT
 from skindb.store.folder import remove_tree
 from skindb.store.lease import Lease
-from skindb.store.log import Log, committed_logs, names_below
+from skindb.store.log import Log, committed_logs, takes_below
 from skindb.store.marker_file import note_withdrawals
 from skindb.store.markers import Markers, mark_withdrawn, read_markers
 from skindb.store.paths import (
-    KIND,
     KINDS_OF_ONE_SUBJECT,
     KINDS_WITHOUT_SUBJECT,
     RELEASE,
@@ -316,7 +315,7 @@ def subject_holdings(place: Place, subject: str) -> Holdings:
     if holdings == holdings_of(place, markers):
         takes = {
             take
-            for kind, take in names_below(place, "log")
+            for kind, take in takes_below(place, "log")
             if kind not in KINDS_WITHOUT_SUBJECT
         }
         known = sorted(
@@ -418,9 +417,7 @@ def _doomed(records: Iterable[Record], markers: Markers) -> list[Record]:
 
 def _is_removed(record: Record, refused: set[Key], markers: Markers) -> bool:
     """Whether an affected version is removed by itself, not with its take."""
-    if record.kind not in KINDS_WITHOUT_SUBJECT and markers.is_withdrawn(
-        subject_of(record.take)
-    ):
+    if markers.hides(record.kind, record.take):
         return False
     return _key(record) in refused or record.kind not in (
         *KINDS_OF_ONE_SUBJECT,
@@ -432,19 +429,13 @@ def _own_takes(place: Place, markers: Markers) -> list[tuple[str, str]]:
     """Kind and take of everything of withdrawn subjects, including unfinished versions
     and leases.
     """
-    own = set()
-    for top in FOLDERS_WITH_TAKES:
-        for kind, name in names_below(place, top):
-            take = name.removesuffix(".json") if top == "heads" else name
-            if (
-                re.fullmatch(KIND, kind)
-                and re.fullmatch(TAKE, take)
-                and kind not in KINDS_WITHOUT_SUBJECT
-            ):
-                own |= (
-                    {(kind, take)} if markers.is_withdrawn(subject_of(take)) else set()
-                )
-    return sorted(own, key=lambda one: (_rank(one[0]), one))
+    takes = {
+        (kind, take)
+        for top in FOLDERS_WITH_TAKES
+        for kind, take in takes_below(place, top)
+        if markers.hides(kind, take)
+    }
+    return sorted(takes, key=lambda key: (_rank(key[0]), key))
 
 
 def _unrecorded(
@@ -459,14 +450,8 @@ def _unrecorded(
     """
     paths: list[str] = []
     damaged: list[str] = []
-    for kind, take in names_below(place, "data"):
-        if (
-            not re.fullmatch(KIND, kind)
-            or not re.fullmatch(TAKE, take)
-            or kind in KINDS_OF_ONE_SUBJECT
-        ):
-            continue
-        if kind not in KINDS_WITHOUT_SUBJECT and markers.is_withdrawn(subject_of(take)):
+    for kind, take in takes_below(place, "data"):
+        if kind in KINDS_OF_ONE_SUBJECT or markers.hides(kind, take):
             continue
         stems = {
             match[1]
@@ -612,7 +597,7 @@ def _key(record: Record) -> Key:
 
 
 def _input_key(one: dict[str, str]) -> Key:
-    return one["kind"], one["take"], one.get("seal", "")
+    return one["kind"], one["take"], one["seal"]
 
 
 def _rank(kind: str) -> int:

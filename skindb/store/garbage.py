@@ -17,15 +17,13 @@ from skindb.limits import RESUMABLE_SECONDS
 from skindb.schema.consent import CONSENT
 from skindb.store.erasure import SCRATCH_NAME, erase_withdrawn, holdings_of
 from skindb.store.lease import NUMBER, Lease, abandoned_holder, holder_of, storage_time
-from skindb.store.log import Log, committed_logs, names_below
+from skindb.store.log import Log, committed_logs, takes_below
 from skindb.store.markers import Markers, read_markers
 from skindb.store.paths import (
     CALIBRATION,
-    KIND,
     LEASE_KINDS,
     RELEASE,
     STAGING,
-    TAKE,
     TIME_HEX,
     TRANSIENT,
 )
@@ -87,12 +85,8 @@ def find_garbage(place: Place, generations: int | None = None) -> list[Garbage]:
     ]
     unrecorded = partial(_unrecorded, tombstone_names=tombstones(place))
     for key, of_take in (("data", unrecorded), ("leases", _abandoned_leases)):
-        for kind, take in names_below(place, key):
-            if (
-                re.fullmatch(KIND, kind)
-                and re.fullmatch(TAKE, take)
-                and not markers.hides(kind, take)
-            ):
+        for kind, take in takes_below(place, key):
+            if not markers.hides(kind, take):
                 with suppress(InputError):
                     found += of_take(place, kind, take, now)
     return (

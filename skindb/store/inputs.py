@@ -46,8 +46,6 @@ def require_inputs(place: Place, provenance: Mapping[str, Any]) -> list[Record]:
     faults = []
     rule = "the inputs of a version must exist when it is committed"
     for one in _inputs_of(provenance):
-        if "seal" not in one:
-            continue
         record = _record_of(place, one)
         if record is None:
             faults.append(
@@ -60,11 +58,7 @@ def require_inputs(place: Place, provenance: Mapping[str, Any]) -> list[Record]:
             )
             continue
         records.append(record)
-        shared = [
-            of
-            for of in record.made_from
-            if of["kind"] in KINDS_WITHOUT_SUBJECT and "seal" in of
-        ]
+        shared = [of for of in record.made_from if of["kind"] in KINDS_WITHOUT_SUBJECT]
         for of in shared:
             if _record_of(place, of) is None:
                 rule = "the inputs of an input must exist"

@@ -13,7 +13,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from datetime import UTC, datetime
 from functools import partial
@@ -40,6 +40,7 @@ from skindb.store.sealed import (
 )
 
 GENERATION = re.compile(r"([0-9]{8})\.json")
+HEADS = "heads"
 RESTORE = "restore it from a backup"
 UPDATE = "update skindb"
 
@@ -56,7 +57,7 @@ class Log:
         self.kind = require_text(kind, KIND, "kind")
         self.take = require_text(take, TAKE, "take")
         self.key = f"log/{kind}/{take}"
-        self.head_key = f"heads/{kind}/{take}.json"
+        self.head_key = f"{HEADS}/{kind}/{take}.json"
         self.what = f"{kind} of {take}"
 
     def generations(self) -> list[int]:
@@ -393,23 +394,18 @@ def tombstone_content(record: Record) -> bytes:
     return json.dumps(tombstone).encode()
 
 
-def committed_logs(place: Place) -> Iterable[Log]:
+def committed_logs(place: Place) -> Iterator[Log]:
     """The logs of all kinds and takes, including those for which only a head exists."""
-    heads = {
-        (kind, name.removesuffix(".json")) for kind, name in names_below(place, "heads")
-    }
-    for kind, take in sorted({*names_below(place, "log"), *heads}):
-        if (
-            re.fullmatch(KIND, kind)
-            and re.fullmatch(TAKE, take)
-            and kind not in TRANSIENT
-        ):
+    for kind, take in sorted({*takes_below(place, "log"), *takes_below(place, HEADS)}):
+        if kind not in TRANSIENT:
             yield Log(place, kind, take)
 
 
-def names_below(place: Place, key: str) -> Iterable[tuple[str, str]]:
-    """Names on the first two levels below a key, without links."""
-    if place.file_type(key) == "folder":
-        for kind in place.children(key):
-            for name in place.children(f"{key}/{kind}"):
-                yield kind, name
+def takes_below(place: Place, key: str) -> Iterator[tuple[str, str]]:
+    """Kinds and takes on the first two levels below a key, without other names and links."""
+    kinds = place.children(key) if place.file_type(key) == "folder" else []
+    for kind in filter(re.compile(KIND).fullmatch, kinds):
+        for name in place.children(f"{key}/{kind}"):
+            take = name.removesuffix(".json") if key == HEADS else name
+            if re.fullmatch(TAKE, take):
+                yield kind, take

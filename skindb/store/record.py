@@ -8,6 +8,7 @@ import json
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from typing import Any, TypeGuard
 
 from skindb.schema import SCHEMA_VERSION, VARIABLES
@@ -40,6 +41,7 @@ FIELDS = {
 }
 DIGEST = re.compile("[0-9a-f]{64}")
 AS_RECORDED = "the record must agree with the attributes of its version"
+Test = Callable[[object], bool]
 MAX_COUNT = 1 << 53  # number of bytes, or of elements along a dim
 
 
@@ -179,95 +181,80 @@ def _is_digest_or_empty(value: object) -> bool:
     return value == "" or _is_text(value, DIGEST)
 
 
+def _is_object(value: object) -> TypeGuard[dict[str, Any]]:
+    return isinstance(value, dict)
+
+
+def _is_list_of(test: Test, value: object) -> bool:
+    return isinstance(value, list) and all(map(test, value))
+
+
+def _is_object_of(test: Test, value: object) -> bool:
+    return _is_object(value) and all(map(test, value.values()))
+
+
 def _is_provenance(value: object) -> bool:
     """Whether the parts of a provenance that skindb uses have the right types."""
-    return isinstance(value, dict) and all(
+    return _is_object(value) and all(
         holds(value[name]) for name, holds in PROVENANCE.items() if name in value
     )
 
 
-def _are_inputs(value: object) -> bool:
-    return isinstance(value, dict) or (
-        isinstance(value, list) and all(_is_input(one) for one in value)
-    )
-
-
-def _is_input(one: object) -> bool:
+def _is_input(value: object) -> bool:
     return (
-        isinstance(one, dict)
-        and _is_text(one.get("kind"), KIND)
-        and _is_text(one.get("take"), TAKE)
-        and _is_count(one.get("generation"))
-        and _is_text(one.get("seal", ""))
+        _is_object(value)
+        and _is_text(value.get("kind"), KIND)
+        and _is_text(value.get("take"), TAKE)
+        and _is_count(value.get("generation"))
+        and _is_text(value.get("seal"))
     )
 
 
 def _are_summary_parameters(value: object) -> bool:
     return (
-        isinstance(value, dict)
+        _is_object(value)
         and _is_text(value.get("digest", ""))
         and all(_is_count(value.get(name, 0)) for name in ("surfels", "seed"))
     )
 
 
-def _is_object(value: object) -> bool:
-    return isinstance(value, dict)
-
-
-def _are_texts(value: object) -> bool:
-    return isinstance(value, list) and all(isinstance(item, str) for item in value)
-
-
 def _are_contents(value: object) -> bool:
-    return isinstance(value, dict) and all(
-        _is_text(name, GROUP) and _is_group(one) for name, one in value.items()
+    return (
+        _is_object(value)
+        and all(_is_text(name, GROUP) for name in value)
+        and all(map(_is_group, value.values()))
     )
 
 
-def _is_group(one: object) -> bool:
+def _is_group(value: object) -> bool:
     """Whether the description of a group has sizes for the dims of all variables, and
     labels of matching lengths.
     """
-    if not isinstance(one, dict) or one.keys() != {"sizes", "variables", "labels"}:
+    if not _is_object(value) or value.keys() != {"sizes", "variables", "labels"}:
         return False
-    sizes = one["sizes"]
-    variables = one["variables"]
-    labels = one["labels"]
-    if not (_is_object(sizes) and _are_texts(variables) and _is_object(labels)):
-        return False
+    sizes = value["sizes"]
+    names = value["variables"]
+    labels = value["labels"]
     return (
-        all(map(_is_count, sizes.values()))
-        and all(
-            name in VARIABLES and sizes.keys() >= set(VARIABLES[name].dims)
-            for name in variables
-        )
-        and all(
-            _are_labels(those) and len(those) == sizes.get(dim)
-            for dim, those in labels.items()
-        )
+        _is_object_of(_is_count, sizes)
+        and _is_list_of(lambda name: name in VARIABLES, names)
+        and all(sizes.keys() >= set(VARIABLES[name].dims) for name in names)
+        and _is_object_of(_are_labels, labels)
+        and all(len(names) == sizes.get(dim) for dim, names in labels.items())
     )
-
-
-def _are_takes(value: object) -> bool:
-    return isinstance(value, list) and all(_is_text(name, TAKE) for name in value)
-
-
-def _are_admissions(value: object) -> bool:
-    return isinstance(value, dict) and all(map(_is_count, value.values()))
 
 
 def _are_labels(value: object) -> bool:
-    return isinstance(value, list) and all(
-        isinstance(item, str | int | float) for item in value
-    )
+    return _is_list_of(lambda item: isinstance(item, str | int | float), value)
 
 
 # parts of a provenance that skindb reads without opening the version -> test of their values
-PROVENANCE: dict[str, Callable[[object], bool]] = {
+PROVENANCE: dict[str, Test] = {
     "schema_version": _is_count,
     "software_version": _is_text,
-    "inputs": _are_inputs,
-    "consent_scope": lambda value: value is None or _are_texts(value),
+    # a capture names files
+    "inputs": lambda value: _is_object(value) or _is_list_of(_is_input, value),
+    "consent_scope": lambda value: value is None or _is_list_of(_is_text, value),
     "traits": _is_object,
     "parameters": _is_object,
     "status": _is_object,
@@ -275,15 +262,15 @@ PROVENANCE: dict[str, Callable[[object], bool]] = {
     "summary_parameters": _are_summary_parameters,
 }
 # fields of a record -> test of their values
-CHECKS: dict[str, Callable[[object], bool]] = {
+CHECKS: dict[str, Test] = {
     "kind": lambda value: _is_text(value, KIND),
     "take": lambda value: _is_text(value, TAKE),
     "generation": _is_count,
     "path": lambda value: _is_text(value, VERSION),
     "created": _is_text,
     "bytes": _is_count,
-    "names": _are_takes,
-    "admissions": _are_admissions,
+    "names": partial(_is_list_of, lambda name: _is_text(name, TAKE)),
+    "admissions": partial(_is_object_of, _is_count),
     "provenance": _is_provenance,
     "manifest": lambda value: _is_text(value, DIGEST),
     "tables": _is_digest_or_empty,

@@ -108,7 +108,7 @@ class Staleness:
                 yield Reason("unreadable", kind, take, generation)
                 return
             made_from = None
-        if made_from is None or one.get("seal", made_from.seal) != made_from.seal:
+        if made_from is None or one["seal"] != made_from.seal:
             yield Reason("withdrawn", kind, take, generation)
             return
         if (

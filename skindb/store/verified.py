@@ -85,7 +85,40 @@ def read_beside(place: Place, record: Record, what: str, digest: str) -> bytes:
     return text
 
 
-class VerifiedStore(Store):
+class ListedStore(Store):
+    """A zarr store that finds names by listing all of its files."""
+
+    supports_writes = True
+    supports_deletes = True
+    supports_listing = True
+
+    async def get_partial_values(
+        self,
+        prototype: BufferPrototype,
+        key_ranges: Iterable[tuple[str, ByteRequest | None]],
+    ) -> list[Buffer | None]:
+        """Contents of several files."""
+        return list(
+            await asyncio.gather(
+                *(self.get(key, prototype, part) for key, part in key_ranges)
+            )
+        )
+
+    async def list_prefix(self, prefix: str) -> AsyncIterator[str]:
+        """Files whose path begins with `prefix`."""
+        async for key in self.list():
+            if key.startswith(prefix):
+                yield key
+
+    async def list_dir(self, prefix: str) -> AsyncIterator[str]:
+        """Names directly below `prefix`."""
+        start = f"{prefix.rstrip('/')}/" if prefix else ""
+        keys = [key async for key in self.list_prefix(start)]
+        for name in {key.removeprefix(start).partition("/")[0] for key in keys}:
+            yield name
+
+
+class VerifiedStore(ListedStore):
     """A version as a read-only zarr store; a missing or changed file raises an
     `InputError`, and is never a fill value.
 
@@ -106,7 +139,6 @@ class VerifiedStore(Store):
 
     supports_writes = False
     supports_deletes = False
-    supports_listing = True
 
     def __init__(self, place: Place, record: Record) -> None:
         self.__setstate__((place, record))
@@ -156,18 +188,6 @@ class VerifiedStore(Store):
             await asyncio.to_thread(self._bytes, key, byte_range)
         )
 
-    async def get_partial_values(
-        self,
-        prototype: BufferPrototype,
-        key_ranges: Iterable[tuple[str, ByteRequest | None]],
-    ) -> list[Buffer | None]:
-        """Contents of several files."""
-        return list(
-            await asyncio.gather(
-                *(self.get(key, prototype, part) for key, part in key_ranges)
-            )
-        )
-
     async def exists(self, key: str) -> bool:
         """Whether the version has this file."""
         return key in self.files
@@ -184,22 +204,6 @@ class VerifiedStore(Store):
         """All files."""
         for key in self.files:
             yield key
-
-    async def list_prefix(self, prefix: str) -> AsyncIterator[str]:
-        """Files whose path begins with `prefix`."""
-        for key in self.files:
-            if key.startswith(prefix):
-                yield key
-
-    async def list_dir(self, prefix: str) -> AsyncIterator[str]:
-        """Names directly below `prefix`."""
-        start = f"{prefix.rstrip('/')}/" if prefix else ""
-        for name in {
-            key[len(start) :].split("/", 1)[0]
-            for key in self.files
-            if key.startswith(start)
-        }:
-            yield name
 
     def _bytes(self, key: str, byte_range: ByteRequest | None) -> bytes:
         name = f"{self.record.path}/{key}"

@@ -175,11 +175,7 @@ def _input_faults(
         for one in record.made_from:
             log = Log(place, one["kind"], one["take"])
             generation = one["generation"]
-            if (
-                log.what in damaged
-                or not one.get("seal")
-                or log.is_removed(one["seal"])
-            ):
+            if log.what in damaged or log.is_removed(one["seal"]):
                 continue
             if seals.get((log.kind, log.take, generation)) != one["seal"]:
                 by = record.title
