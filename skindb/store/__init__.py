@@ -27,7 +27,7 @@ from skindb.store.record import Record
 from skindb.store.requests import Request
 from skindb.store.restoring import Restored, restore
 from skindb.store.sealed import seal_of
-from skindb.store.snapshot import Known
+from skindb.store.snapshot import Lookup
 from skindb.store.stale import Staleness, StaleWarning, require_fresh, stale_versions
 
 __all__ = [
@@ -43,9 +43,9 @@ __all__ = [
     "Database",
     "Garbage",
     "Holdings",
-    "Known",
     "Lease",
     "LeaseLost",
+    "Lookup",
     "MarkerFileWarning",
     "MissingWarning",
     "Record",

@@ -123,12 +123,12 @@ class Archive:
         were written.
         """
         if self.place.file_type(f"{WITHDRAWN}/{BACKUP}") != "file":
-            found = "another folder" if self.place.names() else "nothing"
+            finding = "another folder" if self.place.names() else "nothing"
             raise InputError(
                 Fault(
                     self.place.name,
                     "must be a backup",
-                    found,
+                    finding,
                     "give the folder of skindb backup",
                 )
             )
@@ -173,9 +173,9 @@ class Archive:
         numbers = self.numbers()
         if number not in numbers:
             rule = f"state {number} must exist"
-            found = f"states {', '.join(map(str, numbers)) or 'none'}"
+            finding = f"states {', '.join(map(str, numbers)) or 'none'}"
             cure = "see skindb restore --list"
-            raise InputError(Fault(self.place.name, rule, found, cure))
+            raise InputError(Fault(self.place.name, rule, finding, cure))
         with damage_as_fault(self.place.where(key), AS_WRITTEN, CURE_STATE):
             body = sealed_object(self.place.read_small(key))
             format_ = body.pop("format")
@@ -220,13 +220,15 @@ class Archive:
             )
             if hashlib.sha256(content).hexdigest() == digest:
                 return content
-            found = "different content"
+            finding = "different content"
         except UnavailableError:
             raise
         except (OSError, InputError) as error:
-            found = reason_of(error)
-        where = place.where(key)
-        raise InputError(Fault(where, AS_WRITTEN, f"{found} for {name}", CURE_CONTENT))
+            finding = reason_of(error)
+        location = place.where(key)
+        raise InputError(
+            Fault(location, AS_WRITTEN, f"{finding} for {name}", CURE_CONTENT)
+        )
 
     def put(self, content: bytes, digest: str, guard: Callable[[], None]) -> None:
         """Write a content under its digest, unless the guard raises."""
@@ -254,8 +256,8 @@ class Archive:
         to `faults`.
         """
         items: list[Item] = [
-            (key, one, None)
-            for key, one in sorted(state.files.items())
+            (key, digest, None)
+            for key, digest in sorted(state.files.items())
             if key.startswith("log/")
         ]
         return {
@@ -265,8 +267,8 @@ class Archive:
     def requests(self, state: State, faults: list[Fault]) -> list[Request]:
         """The requests of a state; faults of others are added to `faults`."""
         items: list[Item] = [
-            (key, one, None)
-            for key, one in state.files.items()
+            (key, digest, None)
+            for key, digest in state.files.items()
             if key.startswith(f"{REQUESTS}/")
         ]
         return [request for _, request in intact(self._request, items, faults)]
@@ -276,23 +278,23 @@ class Archive:
         beside: Item = (record.beside("manifest"), record.manifest, None)
         return [beside, *items_of(record, self._parsed(beside, manifest_from_json))]
 
-    def uses(self, state: State, known: set[str], faults: list[Fault]) -> list[Item]:
+    def uses(self, state: State, seen: set[str], faults: list[Fault]) -> list[Item]:
         """Every content that a state needs.
 
         Parameters
         ----------
         state
             State.
-        known
+        seen
             Digests of records whose versions are skipped; those of this state are added.
         faults
             List to which faults of records and manifests are added.
         """
         records = self.records(state, faults)
         fresh = [
-            record for key, record in records.items() if state.files[key] not in known
+            record for key, record in records.items() if state.files[key] not in seen
         ]
-        known |= {state.files[key] for key in records}
+        seen |= {state.files[key] for key in records}
         items: list[Item] = [(key, digest, None) for key, digest in state.files.items()]
         for _, those in intact(self.version_items, fresh, faults):
             items += those
@@ -325,8 +327,8 @@ class Archive:
 
     def _parsed(self, item: Item, parse: Callable[[bytes], R]) -> R:
         content = self.read(item)
-        where = f"{self.place.where(content_key(item[1]))}, {item[0]}"
-        with damage_as_fault(where, AS_WRITTEN, CURE_CONTENT):
+        location = f"{self.place.where(content_key(item[1]))}, {item[0]}"
+        with damage_as_fault(location, AS_WRITTEN, CURE_CONTENT):
             return parse(content)
 
 
@@ -435,15 +437,15 @@ def intact(
     """
 
     def attempt(value: T) -> tuple[R | None, list[Fault]]:
-        found: list[Fault] = []
-        return collect_faults(partial(function, value), found), found
+        damage: list[Fault] = []
+        return collect_faults(partial(function, value), damage), damage
 
     values = list(values)
     pool = ThreadPoolExecutor(THREADS)
     try:
         for value, outcome in zip(values, pool.map(attempt, values), strict=True):
-            result, found = outcome
-            faults.extend(found)
+            result, damage = outcome
+            faults.extend(damage)
             if result is not None:
                 yield value, result
     finally:

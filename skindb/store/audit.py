@@ -108,7 +108,7 @@ def append_entry(
     distinct = {*takes}
     names = {*subjects, *map(subject_of, distinct)}
     numbers = {"takes": len(distinct)} if distinct else {}
-    about = {
+    fields = {
         "format": FORMAT,
         "id": uuid.uuid4().hex,
         "when": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -120,12 +120,12 @@ def append_entry(
         "software_version": __version__,
     }
     for _ in range(MAX_ATTEMPTS):
-        last = _last_number(place)
-        body = about | {
-            "number": last + 1,
-            "previous": _seal_of_entry(place, secret, last),
+        newest = _last_number(place)
+        body = fields | {
+            "number": newest + 1,
+            "previous": _seal_of_entry(place, secret, newest),
         }
-        key = entry_key(last + 1)
+        key = entry_key(newest + 1)
         content = json.dumps(body | {"seal": keyed_seal(secret, key, body)}).encode()
         if place.create(key, content):
             return

@@ -136,11 +136,11 @@ def verify_archive(archive: Archive) -> list[Fault]:
     archive.require()
     states, faults = archive.states()
     checked: set[str] = set()
-    known: set[str] = set()
+    seen: set[str] = set()
     for state in states:
         fresh = {
             item[1]: item
-            for item in archive.uses(state, known, faults)
+            for item in archive.uses(state, seen, faults)
             if item[1] not in checked
         }
         checked |= fresh.keys()
@@ -170,10 +170,13 @@ def _repeated(step: Callable[[], T], place: Place) -> T:
 def _begin(place: Place, archive: Archive) -> None:
     """Create a backup, or require that there is one of this database."""
     if not place.file_type(SECRET):
-        found = "nothing" if place.names() is None else "a folder without its secret"
+        finding = "nothing" if place.names() is None else "a folder without its secret"
         raise InputError(
             Fault(
-                place.name, "must be a database", found, "give the folder of a database"
+                place.name,
+                "must be a database",
+                finding,
+                "give the folder of a database",
             )
         )
     faults = marker_faults(place)
@@ -182,16 +185,16 @@ def _begin(place: Place, archive: Archive) -> None:
     dest = archive.place
     require_apart(dest, place)
     if not dest.file_type(f"{WITHDRAWN}/{BACKUP}"):
-        others = [
+        foreign = [
             name
             for name in dest.names() or []
             if name not in ("staging", SECRET, WITHDRAWN)
         ]
-        if others:
+        if foreign:
             rule = "a backup needs an empty folder, or one with a backup"
             cure = "give another folder"
             raise InputError(
-                Fault(dest.name, rule, f"other files, such as {others[0]}", cure)
+                Fault(dest.name, rule, f"other files, such as {foreign[0]}", cure)
             )
         dest.create(SECRET, place.read_small(SECRET))
         dest.create(f"{WITHDRAWN}/{BACKUP}", b"{}")
@@ -222,8 +225,8 @@ def _write_state(place: Place, archive: Archive, lease: Lease) -> BackupReport:
     removed = 0
     if not faults:  # otherwise it is unknown what the damaged state needs
         removed = archive.prune(contents, _needed(archive, states) | digests, lease)
-    there = archive.contents()
-    missing = {item[1]: item for item in draft.items if item[1] not in there}
+    stored = archive.contents()
+    missing = {item[1]: item for item in draft.items if item[1] not in stored}
     faults += draft.faults
     sizes = [
         size
@@ -233,7 +236,7 @@ def _write_state(place: Place, archive: Archive, lease: Lease) -> BackupReport:
     ]
     for digest, content in draft.additions.items():
         archive.put(content, digest, guard)
-    archive.place.flush_names(content_key(digest) for digest in digests - there)
+    archive.place.flush_names(content_key(digest) for digest in digests - stored)
     state = State(
         number=max(archive.numbers(), default=0) + 1,
         created=datetime.now(UTC).isoformat(timespec="seconds"),
@@ -246,7 +249,7 @@ def _write_state(place: Place, archive: Archive, lease: Lease) -> BackupReport:
     lease.require()
     if not archive.place.create(state.key, state.content(), guard=guard):
         raise Changed
-    present = len(digests & there)
+    present = len(digests & stored)
     return BackupReport(
         state.number,
         state.versions,
@@ -260,9 +263,9 @@ def _write_state(place: Place, archive: Archive, lease: Lease) -> BackupReport:
 
 def _needed(archive: Archive, states: Iterable[State]) -> set[str]:
     """Digests of all contents of states."""
-    known: set[str] = set()
+    seen: set[str] = set()
     return {
-        digest for state in states for _, digest, _ in archive.uses(state, known, [])
+        digest for state in states for _, digest, _ in archive.uses(state, seen, [])
     }
 
 
@@ -280,10 +283,12 @@ def _erased_states(
         if state.withdrawals == seal_of_withdrawals(markers):
             continue
         tombstones = [key for key in state.files if key.startswith("tombstones/")]
-        left, additions = surviving(
+        remaining, additions = surviving(
             archive.records(state, []), archive.requests(state, []), tombstones, markers
         )
-        files = {key: state.files[key] for key in left} | other_files(state.files, left)
+        files = {key: state.files[key] for key in remaining} | other_files(
+            state.files, remaining
+        )
         for key, content in additions.items():
             files[key] = hashlib.sha256(content).hexdigest()
             archive.put(content, files[key], guard)
@@ -291,7 +296,7 @@ def _erased_states(
         changed = replace(
             state,
             files=files,
-            versions=len(left),
+            versions=len(remaining),
             withdrawals=seal_of_withdrawals(markers),
         )
         archive.place.replace(state.key, changed.content(), guard=guard)
@@ -308,31 +313,31 @@ def _draft(place: Place, markers: Markers, states: list[State]) -> Draft:
         if (match := RECORD_KEY.fullmatch(key)) and match[1] not in TRANSIENT
     ]
     faults: list[Fault] = []
-    every = dict(intact(partial(read_record, place), keys, faults))
+    readable = dict(intact(partial(read_record, place), keys, faults))
     tombstones = [key for key in listing if key.startswith("tombstones/")]
     records, texts = surviving(
-        {key: record for key, (record, _) in every.items()},
+        {key: record for key, (record, _) in readable.items()},
         read_requests(place)[0],
         tombstones,
         markers,
     )
-    files = {key: every[key][1] for key in records}
-    known = states[-1].files if states else {}
+    files = {key: readable[key][1] for key in records}
+    previous = states[-1].files if states else {}
     names = [
-        one.beside("names")
-        for one in records.values()
-        if one.kind not in KINDS_OF_ONE_SUBJECT
+        record.beside("names")
+        for record in records.values()
+        if record.kind not in KINDS_OF_ONE_SUBJECT
     ]
-    others = [
+    small_files = [
         key
         for key in listing
         if key.startswith(NEVER_CHANGE) and STATE_KEY.fullmatch(key)
     ]
-    files |= {key: known[key] for key in others if key in known}
+    files |= {key: previous[key] for key in small_files if key in previous}
     items: list[Item] = []
     files |= intact(
         partial(_digest, place),
-        [*names, *(key for key in others if key not in known)],
+        [*names, *(key for key in small_files if key not in previous)],
         faults,
     )
     for _, those in intact(partial(_version_items, place), records.values(), faults):
@@ -368,9 +373,9 @@ def _list_twice(place: Place) -> Listing:
 
 def _list(place: Place) -> Listing:
     return {
-        f"{top}/{name}": one
+        f"{top}/{name}": identity
         for top in LISTED
-        for name, one in place.identities(top).items()
+        for name, identity in place.identities(top).items()
     }
 
 

@@ -90,13 +90,13 @@ class Bucket:
         there is no cache.
         """
         base = cache_folder() or Path(tempfile.gettempdir()) / f"skindb-{os.getuid()}"
-        own = (
+        folder = (
             base
             / "buckets"
             / hashlib.sha256(f"{endpoint()} {self.name}".encode()).hexdigest()[:24]
         )
-        make_private(own)
-        status = own.lstat()
+        make_private(folder)
+        status = folder.lstat()
         if (
             not stat.S_ISDIR(status.st_mode)
             or status.st_uid != os.getuid()
@@ -104,9 +104,9 @@ class Bucket:
         ):
             rule = "must be a folder of this user with permissions 0700"
             cure = "remove it, or set SKINDB_CACHE"
-            found = f"a different owner, or permissions {status.st_mode & 0o777:04o}"
-            raise InputError(Fault(str(own), rule, found, cure))
-        return own
+            finding = f"a different owner, or permissions {status.st_mode & 0o777:04o}"
+            raise InputError(Fault(str(folder), rule, finding, cure))
+        return folder
 
     def marker_file(self) -> Path:
         """A file in the data folder of this user (XDG_DATA_HOME), named after the bucket."""
@@ -182,12 +182,14 @@ class Bucket:
         path = self._path(key)
 
         def fetch() -> bytes:
-            found = self._store.get(path)
-            if found.meta["size"] > MAX_STORE_JSON_BYTES:
+            finding = self._store.get(path)
+            if finding.meta["size"] > MAX_STORE_JSON_BYTES:
                 raise OSError(
-                    errno.EFBIG, f"{found.meta['size'] / 1e6:,.1f} MB", self.where(key)
+                    errno.EFBIG,
+                    f"{finding.meta['size'] / 1e6:,.1f} MB",
+                    self.where(key),
                 )
-            return bytes(found.bytes())
+            return bytes(finding.bytes())
 
         return self._ask(key, fetch)
 
@@ -267,17 +269,17 @@ class Bucket:
             )
         for name in names:
             del self._pending[name]
-        there = self._objects(key)
+        stored = self._objects(key)
         for path, (_, tag) in list(self._written.items()):
             if path.startswith(f"{key}/"):
-                meta = there.get(path.removeprefix(f"{key}/"))
+                meta = stored.get(path.removeprefix(f"{key}/"))
                 if meta is None or meta["e_tag"] != tag:
-                    found = (
+                    finding = (
                         "a different object than was written"
                         if meta
                         else "no object where one was written"
                     )
-                    raise OSError(errno.EIO, found, self.where(path))
+                    raise OSError(errno.EIO, finding, self.where(path))
 
     def create(
         self,
@@ -363,13 +365,13 @@ class Bucket:
                 [path, *(f"{path}/{name}" for name in self._objects(key))]
             ),
         )
-        for known in (self._pending, self._kept, self._written):
+        for cache in (self._pending, self._kept, self._written):
             for name in [
                 name
-                for name in list(known)
+                for name in list(cache)
                 if name == path or name.startswith(f"{path}/")
             ]:
-                known.pop(name)
+                cache.pop(name)
 
     def has_written(self, key: str) -> bool:
         """Whether this process wrote an object at this key that is not committed yet."""
@@ -395,9 +397,9 @@ class Bucket:
 
     def _metadata(self, path: str) -> bytes:
         """Contents of a zarr.json object, which is requested only once."""
-        known = self._pending.get(path) or self._kept.get(path)
-        if known is not None:
-            return known
+        cached = self._pending.get(path) or self._kept.get(path)
+        if cached is not None:
+            return cached
         data = self._ask(path, lambda: bytes(self._store.get(path).bytes()))
         if len(self._kept) >= MAX_CACHED_METADATA:
             self._kept.clear()
@@ -425,9 +427,9 @@ class Bucket:
         with suppress(UnavailableError):  # checked with the next object
             if not self._is_conditional and self._put_new(path, data):
                 rule = "the server must support conditional put (If-None-Match)"
-                found = "a server that overwrites objects"
+                finding = "a server that overwrites objects"
                 cure = "use another server, or a newer version of it"
-                raise InputError(Fault(self.name, rule, found, cure))
+                raise InputError(Fault(self.name, rule, finding, cure))
             self._is_conditional = True
 
     def _put(self, path: str, data: bytes) -> str:
@@ -440,22 +442,22 @@ class Bucket:
     def _objects(self, key: str) -> dict[str, Any]:
         """Metadata of every object below a key, by its path relative to the key."""
         path = self._path(key)
-        found = self._ask(
+        listing = self._ask(
             key, lambda: [meta for page in self._store.list(path) for meta in page]
         )
         return {
             meta["path"].removeprefix(f"{path}/"): meta
-            for meta in found
+            for meta in listing
             if meta["path"] != path
         }
 
     def _names_below(self, path: str) -> list[str]:
-        found = self._ask(path, lambda: self._store.list_with_delimiter(path or None))
-        every = {
-            *found["common_prefixes"],
-            *(meta["path"] for meta in found["objects"]),
+        listing = self._ask(path, lambda: self._store.list_with_delimiter(path or None))
+        paths = {
+            *listing["common_prefixes"],
+            *(meta["path"] for meta in listing["objects"]),
         } - {path, ""}
-        return sorted(one.rsplit("/", 1)[-1] for one in every)
+        return sorted(entry.rsplit("/", 1)[-1] for entry in paths)
 
     def _ask(self, key: str, request: Callable[[], T]) -> T:
         """Answer to a request, which is repeated if its answer was incomplete and

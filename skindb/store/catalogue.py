@@ -16,7 +16,7 @@ from skindb.store.paths import CALIBRATION, RELEASE, STUDY
 from skindb.store.place import Located
 from skindb.store.record import Record
 from skindb.store.record_cache import CACHED_KINDS, RecordCache
-from skindb.store.snapshot import Known
+from skindb.store.snapshot import Lookup
 from skindb.store.stale import DERIVED, Staleness
 
 # kinds whose generation and date the catalogue shows
@@ -34,10 +34,10 @@ class MissingWarning(SkindbWarning):
     """Takes are not selected because they lack an attribute that a condition compares."""
 
 
-def table(known: Known) -> pd.DataFrame:
+def table(lookup: Lookup) -> pd.DataFrame:
     """See `Database.table`."""
-    takes = sorted(known.takes("capture") | known.takes("model"))
-    rows = {take: _row(known, take) for take in takes}
+    takes = sorted(lookup.takes("capture") | lookup.takes("model"))
+    rows = {take: _row(lookup, take) for take in takes}
     names = list(dict.fromkeys(name for row in rows.values() for name in row))
     columns = {name: column([row.get(name) for row in rows.values()]) for name in names}
     frame = pd.DataFrame(columns, index=pd.Index(list(rows), name="take"))
@@ -76,7 +76,7 @@ def matching(frame: pd.DataFrame, where: str) -> list[str]:
     }
     truth, operands = evaluate(where, columns)
     takes = columns["take"]
-    undecided = [row for row, one in enumerate(truth) if one is None]
+    undecided = [row for row, is_true in enumerate(truth) if is_true is None]
     attributes = [name for name in operands if not imitates_column(name)]
     lacking = [
         name
@@ -84,33 +84,33 @@ def matching(frame: pd.DataFrame, where: str) -> list[str]:
         if any(is_missing(columns[name][row]) for row in undecided)
     ]
     if lacking:
-        found = (
+        finding = (
             f"{len(undecided)} of {len(takes)} takes "
             f"({few_names([takes[row] for row in undecided])})"
         )
         name = lacking[0] if lacking[0].isidentifier() else f"`{lacking[0]}`"
         cure = f"add 'or {name} is missing' to select them"
-        text = f"{found} lack {' or '.join(lacking)} and are not selected by {where!r}; {cure}"
+        text = f"{finding} lack {' or '.join(lacking)} and are not selected by {where!r}; {cure}"
         warnings.warn(text, MissingWarning, stacklevel=3)
-    return [take for take, one in zip(takes, truth, strict=True) if one]
+    return [take for take, is_true in zip(takes, truth, strict=True) if is_true]
 
 
-def _row(known: Known, take: str) -> dict[str, Any]:
+def _row(lookup: Lookup, take: str) -> dict[str, Any]:
     records = {
-        kind: known.record(kind, take)
+        kind: lookup.record(kind, take)
         for kind in CATALOGUE_KINDS
-        if known.has(kind, take)
+        if lookup.has(kind, take)
     }
     model = records.get("model")
     row = take_coords(
-        take, known.about(take), None if model is None else model.provenance
+        take, lookup.about(take), None if model is None else model.provenance
     )
     row |= {
         f"{kind}_generation": records[kind].generation if kind in records else None
         for kind in CATALOGUE_KINDS
     }
     row |= {f"{kind}_created": record.created for kind, record in records.items()}
-    row["consent"] = ", ".join(known.scope(take))
+    row["consent"] = ", ".join(lookup.scope(take))
     if model is not None:
         row |= {
             f"status_{name}": part
@@ -123,18 +123,20 @@ def _row(known: Known, take: str) -> dict[str, Any]:
 def _is_outdated(model: Record, capture: Record | None) -> bool:
     """Whether there is a newer capture than that from which a model was made."""
     made_from = [
-        one["generation"] for one in model.made_from if one["kind"] == "capture"
+        reference["generation"]
+        for reference in model.made_from
+        if reference["kind"] == "capture"
     ]
     return (
         capture is not None and bool(made_from) and capture.generation not in made_from
     )
 
 
-def cached_table(known: Known) -> pd.DataFrame:
+def cached_table(lookup: Lookup) -> pd.DataFrame:
     """The catalogue, for which records are read in parallel and kept in the cache."""
-    known.read_ahead((*CATALOGUE_KINDS, CONSENT))
-    rows = table(known)
-    known.save()
+    lookup.read_ahead((*CATALOGUE_KINDS, CONSENT))
+    rows = table(lookup)
+    lookup.save()
     return rows
 
 
@@ -150,8 +152,8 @@ def describe_versions(
         name: {} for name in ("takes", *INFO_SECTIONS.values())
     }
     cache = RecordCache(db.place)
-    cached = Known(db, release, cache)
-    known = Known(db, release)
+    cached = Lookup(db, release, cache)
+    lookup = Lookup(db, release)
     stale = Staleness(db, cache)
     chosen = None if takes is None else {*takes}
     if where is not None:
@@ -163,7 +165,7 @@ def describe_versions(
         if chosen is not None and kind in INFO_SECTIONS:
             continue
         section = sections[INFO_SECTIONS.get(kind, "takes")]
-        source = cached if kind in CACHED_KINDS else known
+        source = cached if kind in CACHED_KINDS else lookup
         names = cached.takes(kind)
         for take in sorted(names if chosen is None else names & chosen):
             section.setdefault(take, {})[kind] = _describe(source, stale, kind, take)
@@ -175,20 +177,20 @@ def describe_versions(
     }
 
 
-def _describe(known: Known, stale: Staleness, kind: str, take: str) -> dict[str, Any]:
+def _describe(lookup: Lookup, stale: Staleness, kind: str, take: str) -> dict[str, Any]:
     try:
-        record = known.record(kind, take)
+        record = lookup.record(kind, take)
         reasons = stale.reasons(record) if kind in DERIVED else ()
     except InputError as error:
         return {"fault": str(error)}
-    about: dict[str, Any] = {
+    summary: dict[str, Any] = {
         "generation": record.generation,
-        "path": known.place.url(record.path),
+        "path": lookup.place.url(record.path),
         "created": record.created,
         "bytes": record.bytes,
     }
     if kind == CONSENT:
-        return about | {"scope": list(consent_scope(record.provenance))}
+        return summary | {"scope": list(consent_scope(record.provenance))}
     if reasons:
-        about["stale"] = list(map(str, reasons))
-    return about | {"status": record.provenance.get("status", {})}
+        summary["stale"] = list(map(str, reasons))
+    return summary | {"status": record.provenance.get("status", {})}

@@ -26,7 +26,7 @@ from skindb.store.log import RESTORE
 from skindb.store.paths import SUMMARY
 from skindb.store.place import Located, Place
 from skindb.store.record import AS_RECORDED, Record
-from skindb.store.snapshot import Known, Snapshot
+from skindb.store.snapshot import Lookup, Snapshot
 from skindb.store.stage import describe, read_tables
 from skindb.store.verified import open_group
 
@@ -76,11 +76,11 @@ class Address:
         snapshot = Snapshot(self.place)
         record = snapshot.record(self.kind, self.take, self.generation)
         if record.seal != self.seal:
-            where = f"{self.kind} of {self.take}"
+            title = f"{self.kind} of {self.take}"
             rule = "a version must not change while a cohort refers to it"
             raise InputError(
                 Fault(
-                    where,
+                    title,
                     rule,
                     "a different version of that generation",
                     "open the cohort again",
@@ -126,12 +126,12 @@ class StoredSamples:
         """Values of a variable of the sample or of the dome, or the reflectance samples."""
         if name in DOME:
             return _group(self.capture, "dome")[name].compute(scheduler="synchronous")
-        own = _group(self.address, "sample")
+        sample = _group(self.address, "sample")
         if name != SAMPLES:
-            return own[name].compute(scheduler="synchronous")
-        index = own["surfel_index"].values[: self.surfels]
+            return sample[name].compute(scheduler="synchronous")
+        index = sample["surfel_index"].values[: self.surfels]
         order = np.argsort(index)
-        found = (
+        values = (
             _group(self.capture, "samples")[SAMPLES]
             .isel(surfel=index[order])
             .compute(scheduler="synchronous")
@@ -140,11 +140,11 @@ class StoredSamples:
         labels = {
             dim: dome[dim].values for dim in ("light", "camera") if dim in dome.coords
         }
-        return found.isel(surfel=np.argsort(order)).assign_coords(labels)
+        return values.isel(surfel=np.argsort(order)).assign_coords(labels)
 
 
 def cohort(
-    known: Known,
+    lookup: Lookup,
     request: CohortRequest,
     *,
     kind: str,
@@ -161,30 +161,31 @@ def cohort(
         raise InputError(
             Fault("dim", "must be take or subject", repr(dim), "choose one")
         )
-    wanted = None if variables is None else list(variables)
+    chosen = None if variables is None else list(variables)
     base = "registration" if layout == "maps" else kind
-    names, skipped = _members(known, base, takes)
-    records = {take: known.record(base, take) for take in names}
+    names, skipped = _members(lookup, base, takes)
+    records = {take: lookup.record(base, take) for take in names}
     stored = {
-        take: _stored_record(known, record, request) for take, record in records.items()
+        take: _stored_record(lookup, record, request)
+        for take, record in records.items()
     }
-    if missing := [take for take, found in stored.items() if found is None]:
-        what = {
+    if missing := [take for take, version in stored.items() if version is None]:
+        contents = {
             "tables": "tables",
             "surfels": f"a sample of {request.surfels} surfels with seed {request.seed}",
         }
         rule = (
             f"a version of kind {base} must store "
-            f"{what.get(layout, f'maps of {request.size} texels')} for cohorts"
+            f"{contents.get(layout, f'maps of {request.size} texels')} for cohorts"
         )
         cure = "call skindb.workflow.summarise for them"
         raise InputError(
             Fault(few_names(missing), rule, "none, or different ones", cure)
         )
     parts = [
-        _part(known, records[take], found, request, wanted)
-        for take, found in stored.items()
-        if found is not None
+        _part(lookup, records[take], version, request, chosen)
+        for take, version in stored.items()
+        if version is not None
     ]
     if empty := [
         part.take
@@ -193,33 +194,34 @@ def cohort(
     ]:
         parts = [part for part in parts if part.take not in empty]
         skipped += [note(take, "none of its surfels was fitted") for take in empty]
-    if layout == "surfels" and wanted is None and not _have_same_dome(parts):
+    if layout == "surfels" and chosen is None and not _have_same_dome(parts):
         parts = [_without_variables(part, (SAMPLES, *DOME)) for part in parts]
     sizes = {"surfel": request.surfels} if layout == "surfels" else {}
     attrs = {
         "layout": layout,
         "kind": base,
         "skipped": skipped,
-        "outdated": _outdated(known, records),
+        "outdated": _outdated(lookup, records),
     }
-    whole = combine(parts, variables=wanted, sizes=sizes, attrs=attrs)
-    return one_take_each(whole) if dim == "subject" else whole
+    combined = combine(parts, variables=chosen, sizes=sizes, attrs=attrs)
+    return one_take_each(combined) if dim == "subject" else combined
 
 
-def _outdated(known: Known, records: Mapping[str, Record]) -> list[Note]:
+def _outdated(lookup: Lookup, records: Mapping[str, Record]) -> list[Note]:
     """One note for each take whose model was not made from the newest capture."""
     notes = []
     for take in records:
-        if known.has("capture", take) and known.has("model", take):
-            newest = known.record("capture", take).generation
-            of = [
-                one["generation"]
-                for one in known.record("model", take).made_from
-                if one["kind"] == "capture"
+        if lookup.has("capture", take) and lookup.has("model", take):
+            newest = lookup.record("capture", take).generation
+            generations = [
+                reference["generation"]
+                for reference in lookup.record("model", take).made_from
+                if reference["kind"] == "capture"
             ]
-            if of and newest not in of:
-                found = f"its model was made from capture {max(of)}, but the newest is {newest}"
-                notes.append(note(take, f"{found}; run skindb fit"))
+            if generations and newest not in generations:
+                text = f"its model was made from capture {max(generations)}"
+                text += f", but the newest is {newest}; run skindb fit"
+                notes.append(note(take, text))
     return notes
 
 
@@ -234,27 +236,27 @@ def lacking(
     """Takes whose versions of a kind, and the summaries of these versions, lack data
     that the cohorts need.
     """
-    known = Known(db, release)
-    every = list(requests)
+    lookup = Lookup(db, release)
+    requested = list(requests)
     return [
         take
         for take in takes
         if any(
-            _stored_record(known, known.record(kind, take), one) is None
-            for one in every
+            _stored_record(lookup, lookup.record(kind, take), request) is None
+            for request in requested
         )
     ]
 
 
 def _members(
-    known: Known, kind: str, takes: Sequence[str] | None
+    lookup: Lookup, kind: str, takes: Sequence[str] | None
 ) -> tuple[list[str], list[Note]]:
     """Takes that the cohort may use, and one note for each skipped take."""
-    there = sorted(known.takes(kind))
-    names = there if takes is None else list(dict.fromkeys(takes))
-    if unknown := [take for take in names if take not in there]:
+    available = sorted(lookup.takes(kind))
+    names = available if takes is None else list(dict.fromkeys(takes))
+    if unknown := [take for take in names if take not in available]:
         rule = f"every take of a cohort must have a {kind}"
-        cure = f"takes with one: {', '.join(there) or 'none'}"
+        cure = f"takes with one: {', '.join(available) or 'none'}"
         raise InputError(Fault(take, rule, "none", cure) for take in unknown)
     if not names:
         cure = (
@@ -263,15 +265,15 @@ def _members(
             else "run skindb fit first"
         )
         raise InputError(
-            Fault(known.place.name, "a study needs fitted takes", f"no {kind}", cure)
+            Fault(lookup.place.name, "a study needs fitted takes", f"no {kind}", cure)
         )
     allowed = []
     skipped = []
     lacks_registration = False
     for take in names:
-        if "statistics" not in known.scope(take):
+        if "statistics" not in lookup.scope(take):
             skipped.append(note(take, "its consent does not cover statistics"))
-        elif kind == "registration" and not _is_of_current_model(known, take):
+        elif kind == "registration" and not _is_of_current_model(lookup, take):
             skipped.append(
                 note(
                     take,
@@ -282,75 +284,80 @@ def _members(
         else:
             allowed.append(take)
     if kind == "registration":
-        allowed, others = _largest_frame(known, allowed)
+        allowed, rest = _largest_frame(lookup, allowed)
         reason = "it was not registered together with the others; run skindb register"
-        skipped += [note(take, reason) for take in others]
+        skipped += [note(take, reason) for take in rest]
     if not allowed:
-        found = "; ".join(note_lines(skipped[:3]))
+        finding = "; ".join(note_lines(skipped[:3]))
         cure = "see skindb consent"
         rule = "statistics need takes that consent to them"
         if lacks_registration:
             rule = "at least one take must have an up-to-date registration"
             cure = ""
-        raise InputError(Fault("population", rule, found, cure))
+        raise InputError(Fault("population", rule, finding, cure))
     return allowed, skipped
 
 
-def _is_of_current_model(known: Known, take: str) -> bool:
-    if not known.has("model", take):
+def _is_of_current_model(lookup: Lookup, take: str) -> bool:
+    if not lookup.has("model", take):
         return False
-    current = known.record("model", take)
-    of = [
-        (one["kind"], one["take"], one["generation"])
-        for one in known.record("registration", take).made_from
+    current = lookup.record("model", take)
+    models = [
+        (reference["kind"], reference["take"], reference["generation"])
+        for reference in lookup.record("registration", take).made_from
     ]
-    return ("model", take, current.generation) in of
+    return ("model", take, current.generation) in models
 
 
-def _largest_frame(known: Known, takes: Sequence[str]) -> tuple[list[str], list[str]]:
+def _largest_frame(lookup: Lookup, takes: Sequence[str]) -> tuple[list[str], list[str]]:
     """The largest group of takes that were registered together, and the others, whose
     (u, v) differ.
     """
     frames: dict[str, list[str]] = {}
     for take in takes:
-        frames.setdefault(frame_of(known.record("registration", take)), []).append(take)
-    most = max(frames.values(), key=len, default=[])
-    return most, [take for take in takes if take not in set(most)]
+        frames.setdefault(frame_of(lookup.record("registration", take)), []).append(
+            take
+        )
+    largest = max(frames.values(), key=len, default=[])
+    return largest, [take for take in takes if take not in set(largest)]
 
 
 def frame_of(registration: Record) -> str:
     """Key of the common (u, v) of a registration, which is equal for takes that were
     registered together.
     """
-    about = registration.provenance
+    provenance = registration.provenance
     inputs = sorted(
-        (str(one["take"]), str(one["seal"])) for one in registration.made_from
+        (str(reference["take"]), str(reference["seal"]))
+        for reference in registration.made_from
     )
-    code = about.get("code_digest", "")
-    return json.dumps([inputs, about["parameters"], code], sort_keys=True)
+    code = provenance.get("code_digest", "")
+    return json.dumps([inputs, provenance["parameters"], code], sort_keys=True)
 
 
-def _coords(known: Known, take: str) -> dict[str, Any]:
+def _coords(lookup: Lookup, take: str) -> dict[str, Any]:
     """Coordinates of a take: attributes of its capture and parameters of its model."""
-    model = known.record("model", take) if known.has("model", take) else None
+    model = lookup.record("model", take) if lookup.has("model", take) else None
     coords = take_coords(
-        take, known.about(take), None if model is None else model.provenance
+        take, lookup.about(take), None if model is None else model.provenance
     )
     return coords | ({} if model is None else {"model_generation": model.generation})
 
 
 def _stored_record(
-    known: Known, record: Record, request: CohortRequest
+    lookup: Lookup, record: Record, request: CohortRequest
 ) -> Record | None:
     """The record of the version with the data for a cohort: the given one, or a summary
     of it; None if neither.
     """
-    for one in reversed(known.history(SUMMARY, record.take)):
-        of = [(i["kind"], i["generation"], i["seal"]) for i in one.made_from]
-        if (record.kind, record.generation, record.seal) in of and _has_data_for(
-            one, request
+    for summary in reversed(lookup.history(SUMMARY, record.take)):
+        sources = [(i["kind"], i["generation"], i["seal"]) for i in summary.made_from]
+        if (record.kind, record.generation, record.seal) in sources and _has_data_for(
+            summary, request
         ):
-            return one  # preferred, because it is newer than the data of the version
+            return (
+                summary  # preferred, because it is newer than the data of the version
+            )
     return record if _has_data_for(record, request) else None
 
 
@@ -366,54 +373,56 @@ def _has_data_for(record: Record, request: CohortRequest) -> bool:
             and "tables" in record.contents
         )
     if request.layout == "surfels":
-        kept = contents["sizes"]["surfel"]
-        of = record.provenance.get("summary_parameters", {})
+        count = contents["sizes"]["surfel"]
+        parameters = record.provenance.get("summary_parameters", {})
         # fewer than requested: the sample contains all fitted surfels
-        whole = kept < int(of.get("surfels", 0))
-        return int(of.get("seed", 0)) == request.seed and (
-            kept >= request.surfels or whole
+        is_complete = count < int(parameters.get("surfels", 0))
+        return int(parameters.get("seed", 0)) == request.seed and (
+            count >= request.surfels or is_complete
         )
     return request.layout == "tables" or contents["sizes"]["u"] == request.size
 
 
 def _part(
-    known: Known,
+    lookup: Lookup,
     record: Record,
     stored: Record,
     request: CohortRequest,
-    wanted: Sequence[str] | None,
+    chosen: Sequence[str] | None,
 ) -> Part:
     layout = request.layout
-    address = Address.of(known.place, stored)
+    address = Address.of(lookup.place, stored)
     contents = stored.contents.get(
         GROUP[layout], {"variables": [], "sizes": {}, "labels": {}}
     )
     variables = list(contents["variables"])
     sizes = dict(contents["sizes"])
     labels = dict(contents["labels"])
-    coords = _coords(known, record.take)
+    coords = _coords(lookup, record.take)
     source: Source = StoredTables(address)
     if layout != "tables":
         source = StoredGroup(address, GROUP[layout])
-    needs_samples = wanted is None or bool({SAMPLES, *DOME} & set(wanted))
+    needs_samples = chosen is None or bool({SAMPLES, *DOME} & set(chosen))
     if layout == "surfels" and "surfel_index" in variables and needs_samples:
-        capture = _capture_of(known, known.record("model", record.take))
+        capture = _capture_of(lookup, lookup.record("model", record.take))
         if capture is not None:
             dome_sizes, dome_labels = _dome(capture)
             variables += [SAMPLES, *DOME]
             sizes |= dome_sizes
             labels |= dome_labels
-            whole = Address.of(known.place, capture)
-            source = StoredSamples(address, whole, request.surfels)
+            capture_address = Address.of(lookup.place, capture)
+            source = StoredSamples(address, capture_address, request.surfels)
     return Part(record.take, coords, variables, sizes, labels, source)
 
 
-def _capture_of(known: Known, model: Record) -> Record | None:
+def _capture_of(lookup: Lookup, model: Record) -> Record | None:
     """The capture with samples from which a model was made; None if there is none."""
-    for one in model.made_from:
-        if one["kind"] == "capture":
+    for reference in model.made_from:
+        if reference["kind"] == "capture":
             try:
-                capture = known.generation("capture", one["take"], one["generation"])
+                capture = lookup.generation(
+                    "capture", reference["take"], reference["generation"]
+                )
             except InputError:
                 return None
             return capture if {"dome", "samples"} <= capture.contents.keys() else None
@@ -440,8 +449,8 @@ def _have_same_dome(parts: Sequence[Part]) -> bool:
 
 
 def _without_variables(part: Part, names: Iterable[str]) -> Part:
-    kept = [name for name in part.variables if name not in set(names)]
-    return Part(part.take, part.coords, kept, part.sizes, part.labels, part.source)
+    remaining = [name for name in part.variables if name not in set(names)]
+    return Part(part.take, part.coords, remaining, part.sizes, part.labels, part.source)
 
 
 @lru_cache(MAX_OPEN_TABLES)
@@ -466,8 +475,8 @@ def _require_recorded(record: Record, name: str, ds: xr.Dataset) -> xr.Dataset:
     layout of the cohort.
     """
     if name in record.contents and describe(ds) != record.contents[name]:
-        where = record.title
+        title = record.title
         raise InputError(
-            Fault(where, AS_RECORDED, f"a different group {name}", RESTORE)
+            Fault(title, AS_RECORDED, f"a different group {name}", RESTORE)
         )
     return ds

@@ -126,8 +126,8 @@ class _Evaluation:
                 )
             case ast.UnaryOp(op=ast.Not(), operand=operand):
                 return [
-                    None if one is None else not one
-                    for one in self.truth(operand, depth + 1)
+                    None if value is None else not value
+                    for value in self.truth(operand, depth + 1)
                 ]
             case ast.Compare(
                 left=left,
@@ -142,8 +142,8 @@ class _Evaluation:
                 left=left, ops=[ast.In() | ast.NotIn() as op], comparators=[right]
             ):
                 return [
-                    one if one is None else one == isinstance(op, ast.In)
-                    for one in self.contained(left, right)
+                    value if value is None else value == isinstance(op, ast.In)
+                    for value in self.contained(left, right)
                 ]
             case ast.Compare(left=left, ops=ops, comparators=comparators):
                 if not {*map(type, ops)} <= {*COMPARISONS}:
@@ -161,9 +161,9 @@ class _Evaluation:
             case ast.Name():
                 values = self.values(node)
                 if _kinds(values) - {TRUTH}:
-                    found = f"{self.column(node.id)} alone"
+                    finding = f"{self.column(node.id)} alone"
                     raise self.fault(
-                        "must compare a column of text or numbers", found, EXAMPLE
+                        "must compare a column of text or numbers", finding, EXAMPLE
                     )
                 return [None if is_missing(value) else bool(value) for value in values]
         raise self.refused(node)
@@ -180,7 +180,7 @@ class _Evaluation:
         name = self.names.get(name, name)
         if name in self.columns:
             return name
-        shown = (
+        text = (
             name
             if name.isascii()
             else f"{name} ({name.encode('ascii', 'backslashreplace').decode()})"
@@ -190,9 +190,7 @@ class _Evaluation:
         )
         hint = f"did you mean {near[0]}? " if near else ""
         cure = f"{hint}Text needs quotes; columns: {', '.join(self.columns)}"
-        raise self.fault(
-            "must name columns of the catalogue", f"the name {shown}", cure
-        )
+        raise self.fault("must name columns of the catalogue", f"the name {text}", cure)
 
     def literal(self, node: ast.expr) -> Any:
         """The text, number or truth value of a literal."""
@@ -256,10 +254,12 @@ class _Evaluation:
     ) -> None:
         """Refuse a comparison of two kinds of values; a column of several kinds has no order."""
         if (order and len(left | right) > 1) or (left and right and not left & right):
-            found = f"{' and '.join(sorted(left))} beside {' and '.join(sorted(right))}"
+            finding = (
+                f"{' and '.join(sorted(left))} beside {' and '.join(sorted(right))}"
+            )
             cure = "put text in quotes, and write numbers without them"
             raise self.fault(
-                "must compare text with text and numbers with numbers", found, cure
+                "must compare text with text and numbers with numbers", finding, cure
             )
 
     def dates(self, values: Column) -> Column:
@@ -286,15 +286,15 @@ class _Evaluation:
 
     def refused(self, node: ast.AST) -> InputError:
         """Error for a part that is not of the language."""
-        found = REFUSED.get(type(node), "another expression")
+        finding = REFUSED.get(type(node), "another expression")
         return self.fault(
-            "must compare columns of the catalogue with values", found, EXAMPLE
+            "must compare columns of the catalogue with values", finding, EXAMPLE
         )
 
-    def fault(self, rule: str, found: str, cure: str) -> InputError:
+    def fault(self, rule: str, finding: str, cure: str) -> InputError:
         """Error of this condition."""
         return InputError(
-            Fault("where", f"a condition {rule}", f"{found} in {self.text!r}", cure)
+            Fault("where", f"a condition {rule}", f"{finding} in {self.text!r}", cure)
         )
 
 
@@ -328,9 +328,9 @@ def _parsed(text: str) -> tuple[ast.expr, dict[str, str]]:
             warnings.simplefilter("error")
             return ast.parse(plain, mode="eval").body, quoted
     except (SyntaxError, ValueError, MemoryError, RecursionError) as error:
-        found = f"{text!r} ({error.msg if isinstance(error, SyntaxError) else error})"
+        finding = f"{text!r} ({error.msg if isinstance(error, SyntaxError) else error})"
         raise InputError(
-            Fault("where", "a condition must follow the grammar", found, EXAMPLE)
+            Fault("where", "a condition must follow the grammar", finding, EXAMPLE)
         ) from None
 
 

@@ -54,7 +54,7 @@ from skindb.store.record_cache import RecordCache
 from skindb.store.requests import Request, read_requests, remove_request
 from skindb.store.snapshot import (
     PINNED,
-    Known,
+    Lookup,
     Snapshot,
     consent_of,
     pinned_record,
@@ -164,10 +164,10 @@ class Database:
         >>> db.takes(where="condition == 'lotion' and age > 40 and fit_k == 4")  # doctest: +SKIP
         """
         if where is None:
-            return sorted(Known(self, release).takes(kind))
-        known = Known(self, release, RecordCache(self.place))
-        rows = cached_table(known)
-        return sorted(matching(rows[rows.index.isin(known.takes(kind))], where))
+            return sorted(Lookup(self, release).takes(kind))
+        lookup = Lookup(self, release, RecordCache(self.place))
+        rows = cached_table(lookup)
+        return sorted(matching(rows[rows.index.isin(lookup.takes(kind))], where))
 
     def subjects(self) -> list[str]:
         """Subjects with at least one capture."""
@@ -301,14 +301,14 @@ class Database:
         InputError
             For an unknown subject or scope.
         """
-        asked = list(dict.fromkeys(scope))
-        if unknown := [name for name in asked if name not in SCOPES]:
+        scopes = list(dict.fromkeys(scope))
+        if unknown := [name for name in scopes if name not in SCOPES]:
             rule = f"a scope must be one of {', '.join(SCOPES)}"
             cure = "choose from these"
             raise InputError(Fault("scope", rule, ", ".join(map(repr, unknown)), cure))
         self._require_subject(subject)
         with self.stage(CONSENT, subject) as stage:
-            record = stage.commit({"subject": subject, "consent_scope": asked})
+            record = stage.commit({"subject": subject, "consent_scope": scopes})
         note_consents(self.place, [record])
         return record
 
@@ -316,18 +316,18 @@ class Database:
         """History of the consent of a subject, oldest first: created, scope and source
         (a capture or a record).
         """
-        given = [
+        sources = [
             (record, f"capture of {take}")
             for take in self.takes("capture")
             if subject_of(take) == subject
             for record in [self.record("capture", take)]
         ]
-        given += (
+        sources += (
             [(record, "record") for record in self.history(CONSENT, subject)]
             if self.has(CONSENT, subject)
             else []
         )
-        if not given:
+        if not sources:
             self._require_subject(subject)
         return [
             {
@@ -335,7 +335,7 @@ class Database:
                 "scope": list(consent_scope(record.provenance)),
                 "source": source,
             }
-            for record, source in given
+            for record, source in sources
         ]
 
     def read_group(self, record: Record, group: str) -> xr.Dataset:
@@ -413,7 +413,7 @@ class Database:
         >>> cohort.region_diffuse_reflectance.groupby("gender").mean()  # doctest: +SKIP
         """
         return cohort(
-            Known(self, release),
+            Lookup(self, release),
             CohortRequest(layout, surfels, size, seed),
             kind=kind,
             variables=variables,
@@ -438,7 +438,7 @@ class Database:
             status of the fit, and whether there is a newer capture than that of the
             model (``outdated``). Values that a take does not have are NaN.
         """
-        return cached_table(Known(self, release, RecordCache(self.place)))
+        return cached_table(Lookup(self, release, RecordCache(self.place)))
 
     def create_release(self, name: str, takes: Sequence[str] | None = None) -> Record:
         """Record the present versions of takes (capture, model and registration of
@@ -462,9 +462,9 @@ class Database:
         """
         require_text(name, TAKE, "name of a release")
         if self.has(RELEASE, name):
-            found = f"a release of {self.record(RELEASE, name).created}"
+            finding = f"a release of {self.record(RELEASE, name).created}"
             rule = "a release must have a new name"
-            raise InputError(Fault(name, rule, found, "choose another name"))
+            raise InputError(Fault(name, rule, finding, "choose another name"))
         fitted = self.takes("model")
         names = fitted if takes is None else list(dict.fromkeys(takes))
         if unknown := [take for take in names if take not in fitted]:
@@ -494,22 +494,22 @@ class Database:
         """The input of this kind, and of this take if one is given, from which a
         version was made.
         """
-        where = str(version.attrs.get("take", "version"))
+        title = str(version.attrs.get("take", "version"))
         for made_from in version.attrs.get("inputs", []):
             if made_from["kind"] == kind and take in (None, made_from["take"]):
                 record = self.record(kind, made_from["take"], made_from["generation"])
                 if made_from["seal"] != record.seal:
                     rule = f"the {kind} it was made from must exist"
-                    found = "a different version of that generation"
+                    finding = "a different version of that generation"
                     raise InputError(
-                        Fault(where, rule, found, "compute the version again")
+                        Fault(title, rule, finding, "compute the version again")
                     )
                 return self.read(
                     kind, made_from["take"], generation=made_from["generation"]
                 )
         raise InputError(
             Fault(
-                where,
+                title,
                 f"its provenance must name a {kind}",
                 "none",
                 "compute the version again",
@@ -621,11 +621,11 @@ class Database:
             If `path` is not the path of a version of this take, or if the log cannot be read.
         """
         if not path.startswith(f"data/{kind}/{take}/"):
-            where = f"{self.url}: {path[:200]!r}"
+            location = f"{self.url}: {path[:200]!r}"
             rule = f"must be the path of a {kind} of {take}"
             raise InputError(
                 Fault(
-                    where,
+                    location,
                     rule,
                     "a different path",
                     "remove the folder tmp of the database",
@@ -735,13 +735,13 @@ class Database:
     def _require_subject(self, subject: str) -> None:
         subjects = Snapshot(self.place).subjects()
         if subject not in subjects:
-            found = f"subjects: {', '.join(subjects[:8]) or 'none'}"
-            found += ", ..." if len(subjects) > 8 else ""
+            finding = f"subjects: {', '.join(subjects[:8]) or 'none'}"
+            finding += ", ..." if len(subjects) > 8 else ""
             cure = "see skindb info"
             if subject_of(subject) in subjects:
                 cure = f"the subject of that take is {subject_of(subject)}"
             rule = "the database must hold the subject"
-            raise InputError(Fault(subject, rule, found, cure))
+            raise InputError(Fault(subject, rule, finding, cure))
 
 
 def open(url: str) -> Database:  # noqa: A001  as in xarray and zarr

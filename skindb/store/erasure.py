@@ -133,9 +133,9 @@ def holdings_of(place: Place, markers: Markers) -> Holdings:
         unrecorded=tuple(unrecorded),
         damaged=tuple(damaged),
         requests=tuple(
-            one
-            for one in read_requests(place)[0]
-            if one.without(markers.is_withdrawn) != one
+            request
+            for request in read_requests(place)[0]
+            if request.without(markers.is_withdrawn) != request
         ),
         scratch=tuple(_scratch(place, markers)),
         caches=(CATALOGUE,) if cache_names(place, markers.is_withdrawn) else (),
@@ -163,10 +163,10 @@ def remainder_of(
     requests, markers
         Requests and withdrawals of the database.
     """
-    every = list(records)
-    removed = _doomed(every, markers)
+    listed = list(records)
+    removed = _doomed(listed, markers)
     gone = set(map(_key, removed))
-    newest = {(record.kind, record.take): _key(record) for record in every}
+    newest = {(record.kind, record.take): _key(record) for record in listed}
     current = [
         record for record in removed if newest[record.kind, record.take] == _key(record)
     ]
@@ -178,7 +178,7 @@ def remainder_of(
     return Remainder(
         [
             record
-            for record in every
+            for record in listed
             if _key(record) not in gone and not markers.hides(record.kind, record.take)
         ],
         removed,
@@ -236,11 +236,11 @@ def erase_withdrawn(place: Place) -> Erasure:
     """Remove everything that is of a withdrawn subject or refers to one; the same call
     completes an interrupted one.
     """
-    done = Erasure()
+    erasure = Erasure()
     markers = read_markers(place)
     while markers.numbers:
         place.sweep()  # before anything is listed, see `markers`
-        _erase_holdings(place, holdings_of(place, markers), markers, done)
+        _erase_holdings(place, holdings_of(place, markers), markers, erasure)
         later = read_markers(place)
         # otherwise a release or a request may name a subject who was withdrawn
         # meanwhile
@@ -249,18 +249,18 @@ def erase_withdrawn(place: Place) -> Erasure:
         markers = later
     if markers.numbers:
         note_withdrawals(place)  # again, because there may be more space
-    return done
+    return erasure
 
 
 def _erase_holdings(
-    place: Place, holdings: Holdings, markers: Markers, done: Erasure
+    place: Place, holdings: Holdings, markers: Markers, erasure: Erasure
 ) -> None:
     """Remove everything that was found, results after the requests to compute them again."""
     for folder in [*holdings.scratch, *_abandoned_scratch(place)]:
         remove_tree(folder)
     for (kind, take), number in holdings.takes.items():
         _erase_take(place, kind, take)
-        done.removed += Counter({kind: number})
+        erasure.removed += Counter({kind: number})
     for request in holdings.requests:
         _replace_request(place, holdings, request, markers)
     for record in holdings.versions:
@@ -268,11 +268,11 @@ def _erase_holdings(
             _with_space(
                 place,
                 holdings,
-                partial(_before_removal, place, record, holdings, markers, done),
+                partial(_before_removal, place, record, holdings, markers, erasure),
             )
     for record in holdings.versions:
         _with_space(place, holdings, partial(_remove_record, place, record))
-        done.removed[record.kind] += 1
+        erasure.removed[record.kind] += 1
     for key in (*holdings.damaged, *holdings.caches):
         place.remove(key)
     for path in holdings.unrecorded:
@@ -318,17 +318,17 @@ def subject_holdings(place: Place, subject: str) -> Holdings:
             for kind, take in takes_below(place, "log")
             if kind not in KINDS_WITHOUT_SUBJECT
         }
-        known = sorted(
+        subjects = sorted(
             {
                 subject_of(take)
                 for take in takes
                 if not markers.is_withdrawn(subject_of(take))
             }
         )
-        found = f"subjects: {', '.join(known[:8]) or 'none'}" + (
-            ", ..." if len(known) > 8 else ""
+        finding = f"subjects: {', '.join(subjects[:8]) or 'none'}" + (
+            ", ..." if len(subjects) > 8 else ""
         )
-        raise InputError(Fault(subject, rule, found, "see skindb info"))
+        raise InputError(Fault(subject, rule, finding, "see skindb info"))
     return holdings
 
 
@@ -381,34 +381,34 @@ def _doomed(records: Iterable[Record], markers: Markers) -> list[Record]:
     Captures and models of other subjects remain. If one was made from a product of many
     subjects that is removed, it is stale.
     """
-    every = list(records)
-    refused = {_key(record) for record in every if not markers.admits(record)}
+    listed = list(records)
+    refused = {_key(record) for record in listed if not markers.admits(record)}
     affected = set(refused)
     while (
-        more := {
-            _key(one)
-            for one in every
-            if any(_input_key(of) in affected for of in one.made_from)
+        added := {
+            _key(version)
+            for version in listed
+            if any(_input_key(reference) in affected for reference in version.made_from)
         }
         - affected
     ):
-        affected |= more
+        affected |= added
     doomed = [
         record
-        for record in every
+        for record in listed
         if _key(record) in affected and _is_removed(record, refused, markers)
     ]
     gone = {_key(record) for record in doomed}
     # a release holds no data: it only names versions, and those that remain do it no harm
     releases = [
         record
-        for record in every
+        for record in listed
         if record.kind == RELEASE and _key(record) not in refused
     ]
     doomed += [
         record
         for record in releases
-        if any(_input_key(of) in gone for of in record.made_from)
+        if any(_input_key(reference) in gone for reference in record.made_from)
     ]
     return sorted(
         doomed, key=lambda record: (_rank(record.kind), record.take, record.generation)
@@ -463,12 +463,12 @@ def _unrecorded(
             for stem in sorted(stems)
             if (path := f"data/{kind}/{take}/{stem}.zarr") not in named
         ]
-        found = [
+        refused = [
             path
             for path in unnamed
             if not _is_admitted(place, markers, path, subjects_of(kind, take, ()))
         ]
-        if found:
+        if refused:
             log = Log(place, kind, take)
             readable = {record.generation for record in log.readable()}
             damaged += [
@@ -476,17 +476,17 @@ def _unrecorded(
                 for number in log.generations()
                 if number not in readable
             ]
-        paths += found
+        paths += refused
     return paths, damaged
 
 
-def _is_admitted(place: Place, markers: Markers, path: str, own: set[str]) -> bool:
+def _is_admitted(place: Place, markers: Markers, path: str, subjects: set[str]) -> bool:
     """Whether an unfinished version is known to refer to no withdrawn subject beside its own."""
     names = read_names(place, path)
     if names is None:
         return False
     takes, admissions = names
-    return markers.admits_all(own.union(map(subject_of, takes)), admissions)
+    return markers.admits_all(subjects.union(map(subject_of, takes)), admissions)
 
 
 def _scratch(place: Place, markers: Markers) -> Iterator[Path]:
@@ -522,16 +522,16 @@ def _replace_request(
 
 
 def _before_removal(
-    place: Place, record: Record, holdings: Holdings, markers: Markers, done: Erasure
+    place: Place, record: Record, holdings: Holdings, markers: Markers, erasure: Erasure
 ) -> None:
     """Prepare the replacement of the newest version of a kind and take that is to be removed."""
     gone = {_key(version) for version in holdings.versions}
     request = _replacement(record, gone)
     changed = None if request is None else request.without(markers.is_withdrawn)
     if request is not None and changed is None:
-        done.lost.append(f"{request}: no other take was used")
+        erasure.lost.append(f"{request}: no other take was used")
     elif changed is not None and record.kind == RELEASE:
-        _revise(place, changed, done)
+        _revise(place, changed, erasure)
     elif changed is not None:
         write_request(place, changed)
 
@@ -540,12 +540,12 @@ def _replacement(record: Record, gone: set[Key]) -> Request | None:
     """The request to compute a result again; None for kinds that are not computed by themselves."""
     parameters = dict(record.provenance.get("parameters", {}))
     if record.kind == RELEASE:
-        pins = [one for one in record.made_from if _input_key(one) not in gone]
-        takes = {one["take"] for one in pins}
+        pins = [pin for pin in record.made_from if _input_key(pin) not in gone]
+        takes = {pin["take"] for pin in pins}
         lacking = [
-            one["take"]
-            for one in record.made_from
-            if _input_key(one) in gone and one["take"] in takes
+            pin["take"]
+            for pin in record.made_from
+            if _input_key(pin) in gone and pin["take"] in takes
         ]
         return Request(RELEASE, record.take, {TAKES: lacking, PINS: pins})
     if record.kind == REGISTRATION:
@@ -557,7 +557,7 @@ def _replacement(record: Record, gone: set[Key]) -> Request | None:
     )
 
 
-def _revise(place: Place, request: Request, done: Erasure) -> None:
+def _revise(place: Place, request: Request, erasure: Erasure) -> None:
     """Commit the next revision of a release, and request the registrations that it
     lacks until they are made again.
     """
@@ -568,7 +568,7 @@ def _revise(place: Place, request: Request, done: Erasure) -> None:
                 place, Request(RELEASE, request.take, {TAKES: parameters[TAKES]})
             )
         commit_release(place, request.take, parameters[PINS])
-        done.revised.append(request.take)
+        erasure.revised.append(request.take)
     except UnavailableError:
         raise
     except InputError:
@@ -596,8 +596,8 @@ def _key(record: Record) -> Key:
     return record.kind, record.take, record.seal
 
 
-def _input_key(one: dict[str, str]) -> Key:
-    return one["kind"], one["take"], one["seal"]
+def _input_key(reference: dict[str, str]) -> Key:
+    return reference["kind"], reference["take"], reference["seal"]
 
 
 def _rank(kind: str) -> int:

@@ -108,7 +108,7 @@ class Folder:
         """
         place = inside(self.root, key)
         return (
-            {name: one[0] for name, one in _walk(place, "", MAX_FOLDER_DEPTH)}
+            {name: identity[0] for name, identity in _walk(place, "", MAX_FOLDER_DEPTH)}
             if place.is_dir()
             else {}
         )
@@ -198,7 +198,7 @@ class Folder:
         """Flush the folders of these files, and the folders above them."""
         folders = {inside(self.root, key).parent for key in keys}
         for folder in sorted(
-            folders | {above for one in folders for above in one.parents}
+            folders | {parent for path in folders for parent in path.parents}
         ):
             if folder == self.root.parent or folder.is_relative_to(self.root):
                 with suppress(FileNotFoundError):  # a file that was not written
@@ -370,11 +370,11 @@ def _entries(place: str | Path) -> list[os.DirEntry[str]] | None:
 
 def remove_tree(place: Path) -> None:
     """Remove a folder, even if another process still writes or removes files below it."""
-    for left in reversed(range(MAX_ATTEMPTS)):
+    for attempt in reversed(range(MAX_ATTEMPTS)):
         try:
             shutil.rmtree(place)
         except OSError:
-            if place.exists() and not left:
+            if place.exists() and not attempt:
                 raise
         if not place.exists():
             return

@@ -78,7 +78,7 @@ def find_garbage(place: Place, generations: int | None = None) -> list[Garbage]:
     # needs a file to be written, so it is only called if there is garbage
     now = cache(partial(storage_time, place))
     markers = read_markers(place)
-    found = [
+    garbage = [
         *_of_withdrawn_subjects(place, markers),
         *_temporary_files(place, now),
         *_scratch_folders(place, now),
@@ -88,11 +88,11 @@ def find_garbage(place: Place, generations: int | None = None) -> list[Garbage]:
         for kind, take in takes_below(place, key):
             if not markers.hides(kind, take):
                 with suppress(InputError):
-                    found += of_take(place, kind, take, now)
+                    garbage += of_take(place, kind, take, now)
     return (
-        found
+        garbage
         if generations is None
-        else [*found, *_old_generations(place, generations, now)]
+        else [*garbage, *_old_generations(place, generations, now)]
     )
 
 
@@ -105,12 +105,12 @@ def remove_garbage(place: Place, generations: int | None = None) -> list[Garbage
     removed = list(_of_withdrawn_subjects(place, read_markers(place)))
     erase_withdrawn(place)
     groups = defaultdict[tuple[tuple[str, ...], str], list[Garbage]](list)
-    for one in find_garbage(place, generations):
-        if not one.kept:
-            groups[_required_leases(*one.of)].append(one)
+    for item in find_garbage(place, generations):
+        if not item.kept:
+            groups[_required_leases(*item.of)].append(item)
     for (kinds, take), those in groups.items():
         if not kinds:
-            removed += [one for one in those if _remove_one(place, one)]
+            removed += [item for item in those if _remove_one(place, item)]
             continue
         lease = Lease(place, take, kinds, command="skindb clean")
         try:
@@ -118,7 +118,7 @@ def remove_garbage(place: Place, generations: int | None = None) -> list[Garbage
         except InputError:  # a run has started to work on this take
             continue
         try:
-            removed += [one for one in those if _remove_one(place, one)]
+            removed += [item for item in those if _remove_one(place, item)]
         finally:
             lease.__exit__(None, None, None)
     return removed
@@ -131,23 +131,25 @@ def _required_leases(kind: str, take: str) -> tuple[tuple[str, ...], str]:
     return ((kind,) if kind else ()), take
 
 
-def _remove_one(place: Place, one: Garbage) -> bool:
-    kind, take = one.of
+def _remove_one(place: Place, item: Garbage) -> bool:
+    kind, take = item.of
     # it was replaced by the lease of this process
-    if one.key.startswith("leases/") and NUMBER.search(one.key):
+    if item.key.startswith("leases/") and NUMBER.search(item.key):
         return True
-    if one.generation:
-        Log(place, kind, take).remove(one.generation)
-    elif kind in TRANSIENT and one.key.startswith("log/") and one.key.endswith(".json"):
+    if item.generation:
+        Log(place, kind, take).remove(item.generation)
+    elif (
+        kind in TRANSIENT and item.key.startswith("log/") and item.key.endswith(".json")
+    ):
         Log(place, kind, take).forget()
-    elif one.key.endswith(".zarr"):
+    elif item.key.endswith(".zarr"):
         records, faults = Log(place, kind, take).faults()
         # committed meanwhile
-        if faults or one.key in {record.path for record in records}:
+        if faults or item.key in {record.path for record in records}:
             return False
-        remove_version(place, one.key)
+        remove_version(place, item.key)
     else:
-        place.remove(one.key)
+        place.remove(item.key)
     return True
 
 
@@ -166,13 +168,13 @@ def _unrecorded(
         yield _first_pass(place, log, records, now)
         return
     for record in partly_removed_records(log, records, tombstone_names):
-        what = f"generation {record.generation}, whose removal was interrupted"
-        kept = _in_use_reason(place, kind, take)
+        description = f"generation {record.generation}, whose removal was interrupted"
+        reason = _in_use_reason(place, kind, take)
         yield Garbage(
             f"{log.key}/{record.generation:08d}.json",
-            what,
+            description,
             record.bytes,
-            kept,
+            reason,
             record.generation,
         )
     named = {record.path for record in records}
@@ -184,46 +186,46 @@ def _unrecorded(
             max(count, 0) for name, count in sizes.items() if name.startswith(stem)
         )
         if faults:
-            kept = "its log is damaged, see skindb verify"
+            reason = "its log is damaged, see skindb verify"
         elif f"{stem}.manifest.json" in names and may_have_had_record(log):
-            kept = (
+            reason = (
                 "its record may have been lost; remove it by hand if its run was killed"
             )
         elif abandoned_holder(place, kind, take):
-            kept = ""  # its writer can no longer commit
+            reason = ""  # its writer can no longer commit
         else:
             files = [f"{key}/{name}" for name in names if stem in name]
-            kept = _in_use_reason(place, kind, take) or _recent_reason(
+            reason = _in_use_reason(place, kind, take) or _recent_reason(
                 place, files, now
             )
         yield Garbage(
             f"{key}/{stem}.zarr",
             "a version without a record, left by a killed run",
             size,
-            kept,
+            reason,
         )
 
 
 def _first_pass(place: Place, log: Log, records: list[Record], now: Clock) -> Garbage:
     """The first pass of a fit that was committed, or of a killed fit that can be resumed."""
     data = f"data/{log.kind}/{log.take}"
-    what = "the first pass of a killed fit"
-    kept = _in_use_reason(place, log.kind, log.take)
+    description = "the first pass of a killed fit"
+    reason = _in_use_reason(place, log.kind, log.take)
     if records and _has_model(place, records[-1]):
-        what = "the first pass of a fit that was committed"
+        description = "the first pass of a fit that was committed"
     elif records:
-        kept = kept or _recent_reason(place, [data], now, RESUMABLE_SECONDS)
+        reason = reason or _recent_reason(place, [data], now, RESUMABLE_SECONDS)
     elif not abandoned_holder(place, LEASE_KINDS[log.kind], log.take):
-        kept = kept or _recent_reason(place, [data], now)
+        reason = reason or _recent_reason(place, [data], now)
     size = _bytes_below(place, data)
-    return Garbage(f"{log.key}/00000001.json", what, size, kept)
+    return Garbage(f"{log.key}/00000001.json", description, size, reason)
 
 
-def _has_model(place: Place, first: Record) -> bool:
-    fit = Log(place, LEASE_KINDS[first.kind], first.take)
+def _has_model(place: Place, first_pass: Record) -> bool:
+    fit = Log(place, LEASE_KINDS[first_pass.kind], first_pass.take)
     model = {} if fit.is_empty() else fit.read().provenance
     return all(
-        name in model and model[name] == first.provenance.get(name)
+        name in model and model[name] == first_pass.provenance.get(name)
         for name in FIT_IDENTITY
     )
 
@@ -246,8 +248,8 @@ def _recent_reason(
         age = 0.0
     if age >= seconds:
         return ""
-    why = " so that the same run can resume" if seconds == RESUMABLE_SECONDS else ""
-    return f"written {max(age, 0.0) / 60:.0f} minutes ago, kept for {seconds / 3600:.0f} h{why}"
+    purpose = " so that the same run can resume" if seconds == RESUMABLE_SECONDS else ""
+    return f"written {max(age, 0.0) / 60:.0f} minutes ago, kept for {seconds / 3600:.0f} h{purpose}"
 
 
 def _of_withdrawn_subjects(place: Place, markers: Markers) -> Iterator[Garbage]:
@@ -303,12 +305,12 @@ def _scratch_folders(place: Place, now: Clock) -> Iterator[Garbage]:
         key = f"tmp/{name}"
         size = _bytes_below(place, key)
         if match := SCRATCH_NAME.fullmatch(name):
-            kept = _in_use_reason(place, "capture", match[1]) or _recent_reason(
+            reason = _in_use_reason(place, "capture", match[1]) or _recent_reason(
                 place, [key], now, RESUMABLE_SECONDS
             )
         else:
-            kept = _recent_reason(place, [key], now)
-        yield Garbage(key, "scratch files of a killed ingest", size, kept)
+            reason = _recent_reason(place, [key], now)
+        yield Garbage(key, "scratch files of a killed ingest", size, reason)
 
 
 def _abandoned_leases(
@@ -329,35 +331,39 @@ def _old_generations(place: Place, generations: int, now: Clock) -> Iterator[Gar
         raise InputError(
             Fault("generations", rule, str(generations), "choose a larger number")
         )
-    every: dict[tuple[str, str, int], Record] = {}
+    listed: dict[tuple[str, str, int], Record] = {}
     waiting: list[Record] = []
     for log in committed_logs(place):
         records, faults = log.faults()
         if faults:  # the inputs that a damaged record names are unknown
             raise InputError(faults)
-        every |= {(log.kind, log.take, record.generation): record for record in records}
+        listed |= {
+            (log.kind, log.take, record.generation): record for record in records
+        }
         waiting += records if log.kind in KEPT_KINDS else records[-generations:]
     stays: set[tuple[str, str, int]] = set()
     while waiting:
         record = waiting.pop()
-        own = (record.kind, record.take, record.generation)
-        if own not in stays:
-            stays.add(own)
+        key = (record.kind, record.take, record.generation)
+        if key not in stays:
+            stays.add(key)
             named = [
-                (one["kind"], one["take"], one["generation"])
-                for one in record.made_from
+                (reference["kind"], reference["take"], reference["generation"])
+                for reference in record.made_from
             ]
-            waiting += [every[one] for one in named if one in every]
-    for (kind, take, generation), record in every.items():
+            waiting += [listed[reference] for reference in named if reference in listed]
+    for (kind, take, generation), record in listed.items():
         if (kind, take, generation) not in stays:
-            what = f"generation {generation}, which is not an input of a kept version"
-            kept = _in_use_reason(place, kind, take) or _recent_reason(
+            description = (
+                f"generation {generation}, which is not an input of a kept version"
+            )
+            reason = _in_use_reason(place, kind, take) or _recent_reason(
                 place, [record.path], now
             )
             yield Garbage(
                 f"log/{kind}/{take}/{generation:08d}.json",
-                what,
+                description,
                 record.bytes,
-                kept,
+                reason,
                 generation,
             )

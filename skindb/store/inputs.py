@@ -45,12 +45,12 @@ def require_inputs(place: Place, provenance: Mapping[str, Any]) -> list[Record]:
     records = []
     faults = []
     rule = "the inputs of a version must exist when it is committed"
-    for one in _inputs_of(provenance):
-        record = _record_of(place, one)
+    for reference in _inputs_of(provenance):
+        record = _record_of(place, reference)
         if record is None:
             faults.append(
                 Fault(
-                    _name(one),
+                    _name(reference),
                     rule,
                     "it was removed during the run",
                     "run the command again",
@@ -58,15 +58,19 @@ def require_inputs(place: Place, provenance: Mapping[str, Any]) -> list[Record]:
             )
             continue
         records.append(record)
-        shared = [of for of in record.made_from if of["kind"] in KINDS_WITHOUT_SUBJECT]
-        for of in shared:
-            if _record_of(place, of) is None:
+        shared = [
+            product
+            for product in record.made_from
+            if product["kind"] in KINDS_WITHOUT_SUBJECT
+        ]
+        for product in shared:
+            if _record_of(place, product) is None:
                 rule = "the inputs of an input must exist"
                 faults.append(
                     Fault(
-                        _name(one),
+                        _name(reference),
                         rule,
-                        f"{_name(of)} was removed",
+                        f"{_name(product)} was removed",
                         "run skindb refresh",
                     )
                 )
@@ -84,9 +88,9 @@ def names_of(
     calibration, and outlives it; it does not refer to these subjects.
     """
     names = {
-        str(one["take"])
-        for one in _inputs_of(provenance)
-        if one["kind"] not in KINDS_WITHOUT_SUBJECT
+        str(reference["take"])
+        for reference in _inputs_of(provenance)
+        if reference["kind"] not in KINDS_WITHOUT_SUBJECT
     }
     # a release names versions, but has none of their data
     if kind not in (*KINDS_OF_ONE_SUBJECT, RELEASE):
@@ -99,8 +103,8 @@ def require_own_subject(kind: str, take: str, names: Iterable[str]) -> None:
     """Raise an `InputError` if a version of a kind of one subject refers to a take of
     another subject.
     """
-    others = sorted(name for name in names if subject_of(name) != subject_of(take))
-    if kind in KINDS_OF_ONE_SUBJECT and others:
+    foreign = sorted(name for name in names if subject_of(name) != subject_of(take))
+    if kind in KINDS_OF_ONE_SUBJECT and foreign:
         rule = f"a {kind} must refer to takes of its own subject only"
         cure = (
             "commit what many subjects share as a kind of its own, and name that "
@@ -108,7 +112,7 @@ def require_own_subject(kind: str, take: str, names: Iterable[str]) -> None:
         )
         raise InputError(
             Fault(
-                f"{kind} of {take}", rule, f"a reference to {', '.join(others)}", cure
+                f"{kind} of {take}", rule, f"a reference to {', '.join(foreign)}", cure
             )
         )
 
@@ -121,11 +125,11 @@ def require_consents(
     if scope is None:
         return
     of_takes = [
-        one
-        for one in _inputs_of(provenance)
-        if one["kind"] not in KINDS_WITHOUT_SUBJECT
+        reference
+        for reference in _inputs_of(provenance)
+        if reference["kind"] not in KINDS_WITHOUT_SUBJECT
     ]
-    subjects = {subject_of(one["take"]) for one in of_takes}
+    subjects = {subject_of(reference["take"]) for reference in of_takes}
     subjects |= set() if kind == STUDY else {subject_of(take)}
     faults = []
     for subject in sorted(subjects):
@@ -134,10 +138,10 @@ def require_consents(
             (record := log.read()).provenance
         ):
             rule = f"its subject must consent to {scope} when it is committed"
-            found = f"no such consent since {record.created}"
-            where = f"{kind} of {take}" if kind != STUDY else f"study {take}, {subject}"
+            finding = f"no such consent since {record.created}"
+            title = f"{kind} of {take}" if kind != STUDY else f"study {take}, {subject}"
             faults.append(
-                Fault(where, rule, found, "nothing was committed; see skindb consent")
+                Fault(title, rule, finding, "nothing was committed; see skindb consent")
             )
     if faults:
         raise InputError(faults)
@@ -149,16 +153,18 @@ def _inputs_of(provenance: Mapping[str, Any]) -> list[Mapping[str, Any]]:
     return inputs if isinstance(inputs, list) else []
 
 
-def _record_of(place: Place, one: Mapping[str, Any]) -> Record | None:
+def _record_of(place: Place, reference: Mapping[str, Any]) -> Record | None:
     """The record of an input; None if it was removed or replaced."""
     try:
-        record = Log(place, one["kind"], one["take"]).read(one["generation"])
+        record = Log(place, reference["kind"], reference["take"]).read(
+            reference["generation"]
+        )
     except UnavailableError:
         raise
     except InputError:
         return None
-    return record if record.seal == one["seal"] else None
+    return record if record.seal == reference["seal"] else None
 
 
-def _name(one: Mapping[str, Any]) -> str:
-    return f"{one['kind']} {one['generation']} of {one['take']}"
+def _name(reference: Mapping[str, Any]) -> str:
+    return f"{reference['kind']} {reference['generation']} of {reference['take']}"

@@ -85,8 +85,11 @@ class Claim:
         holder = self.body.get("holder")
         if not isinstance(holder, dict):
             return "a lease that cannot be read"
-        by, where = (str(holder.get(name, "unknown")) for name in ("command", "host"))
-        return f"{by} on {where} (process {holder.get('process')}) since {self.body.get('since')}"
+        command, host = (
+            str(holder.get(name, "unknown")) for name in ("command", "host")
+        )
+        process = holder.get("process")
+        return f"{command} on {host} (process {process}) since {self.body.get('since')}"
 
 
 class Lease:
@@ -154,9 +157,9 @@ class Lease:
         self._guard = AdmissionGuard.begin(self.place, self._subjects)
         try:
             while (holder := self._claim_all()) is not None:
-                if (left := end - self._clock.monotonic()) <= 0:
+                if (remaining := end - self._clock.monotonic()) <= 0:
                     raise InputError(_held_fault(holder))
-                self._clock.sleep(min(POLL_SECONDS, left))
+                self._clock.sleep(min(POLL_SECONDS, remaining))
         except BaseException:  # for example an interrupt or a full disk
             self._release()
             raise
@@ -259,7 +262,9 @@ class Lease:
                 self.place.remove(_file_key(key, number))
             return now or Claim(key, number, {})
         self._held[key] = number
-        for older in (one for one in _numbers(self.place, key) if one < number):
+        for older in (
+            earlier for earlier in _numbers(self.place, key) if earlier < number
+        ):
             self.place.remove(_file_key(key, older))
         return None
 
@@ -313,8 +318,10 @@ def abandoned_holder(place: Place, kind: str, take: str) -> str:
     lease or still holds it.
     """
     newest = _newest(place, f"leases/{kind}/{take}")
-    left = newest is not None and not newest.is_released and _has_ended(place, newest)
-    return str(newest) if left else ""
+    is_abandoned = (
+        newest is not None and not newest.is_released and _has_ended(place, newest)
+    )
+    return str(newest) if is_abandoned else ""
 
 
 def _has_ended(place: Place, claim: Claim) -> bool:
@@ -377,13 +384,16 @@ def _held_fault(claim: Claim) -> Fault:
 
 
 def _lost_fault(key: str, newest: Claim | None) -> Fault:
-    found = "another run took over, because this one did not renew its lease"
+    finding = "another run took over, because this one did not renew its lease"
     if newest is None:
-        found = "the lease was removed"
+        finding = "the lease was removed"
     elif not newest.is_released:
-        found += f": {newest}"
+        finding += f": {newest}"
     return Fault(
-        _lease_name(key), ONE_RUN, found, "nothing was committed; run the command again"
+        _lease_name(key),
+        ONE_RUN,
+        finding,
+        "nothing was committed; run the command again",
     )
 
 

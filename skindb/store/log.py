@@ -66,12 +66,14 @@ class Log:
         names = self.place.children(self.key, links=True)
         return [int(m[1]) for name in names if (m := GENERATION.fullmatch(name))]
 
-    def read_listed(self, known: list[int], is_head: Callable[[bytes], bool]) -> Record:
+    def read_listed(
+        self, listed: list[int], is_head: Callable[[bytes], bool]
+    ) -> Record:
         """The current record, given the generations that were listed already.
 
         Parameters
         ----------
-        known
+        listed
             Generations, ascending.
         is_head
             Whether the head is known to have this content; if not, the head is read.
@@ -82,11 +84,13 @@ class Log:
             If the head names another record. A list that is older than a commit of
             another run looks like a lost record; the caller should then use `read`.
         """
-        record = self._read(known[-1])
+        record = self._read(listed[-1])
         if is_head(self.head_content(record.generation, record.seal)):
             return record
         head = self.head()
-        if fault := self._lost_fault(head, known) or self._mismatch_fault(head, record):
+        if fault := self._lost_fault(head, listed) or self._mismatch_fault(
+            head, record
+        ):
             raise InputError(fault)
         return record
 
@@ -96,22 +100,24 @@ class Log:
         """
         # read before the log, which only grows
         head = self.head() if generation is None else {}
-        known = self.generations()
-        if generation is None and (lost := self._lost_fault(head, known)):
+        listed = self.generations()
+        if generation is None and (lost := self._lost_fault(head, listed)):
             raise InputError(lost)
-        if not known or (generation is not None and generation not in known):
+        if not listed or (generation is not None and generation not in listed):
             rule = (
                 "the database must hold it"
                 if generation is None
                 else f"generation {generation} must exist"
             )
-            found = f"generations {known}" if known else "nothing"
+            finding = f"generations {listed}" if listed else "nothing"
             raise InputError(
-                Fault(f"{self.place.name}: {self.what}", rule, found, "see skindb info")
+                Fault(
+                    f"{self.place.name}: {self.what}", rule, finding, "see skindb info"
+                )
             )
-        record = self._read(known[-1] if generation is None else generation)
-        if other := self._mismatch_fault(head, record):
-            raise InputError(other)
+        record = self._read(listed[-1] if generation is None else generation)
+        if fault := self._mismatch_fault(head, record):
+            raise InputError(fault)
         return record
 
     def is_empty(self) -> bool:
@@ -149,12 +155,12 @@ class Log:
                 self.remove(record.generation)
             raise
         if not created:
-            found = f"generation {record.generation} was committed by another writer"
+            finding = f"generation {record.generation} was committed by another writer"
             raise Conflict(
                 Fault(
                     self.what,
                     "a generation must be committed only once",
-                    found,
+                    finding,
                     "run the command again",
                 )
             )
@@ -199,20 +205,20 @@ class Log:
         records: list[Record] = []
         faults: list[Fault] = []
         head = self.head()
-        known = self.generations()
-        last = 0
+        listed = self.generations()
+        preceding = 0
         seal = ""
-        for generation in known:
+        for generation in listed:
             record = collect_faults(partial(self._read, generation), faults)
             if record is None:
                 seal = "?"
             else:
-                faults += self._link_faults(record, last, seal)
+                faults += self._link_faults(record, preceding, seal)
                 faults += filter(None, [self._mismatch_fault(head, record)])
                 records.append(record)
                 seal = record.seal
-            last = generation
-        faults += filter(None, [self._lost_fault(head, known)])
+            preceding = generation
+        faults += filter(None, [self._lost_fault(head, listed)])
         return records, faults
 
     def readable(self) -> list[Record]:
@@ -245,12 +251,12 @@ class Log:
     def _read(self, generation: int) -> Record:
         return read_record(self.place, self.record_key(generation))[0]
 
-    def _link_faults(self, record: Record, last: int, seal: str) -> list[Fault]:
+    def _link_faults(self, record: Record, preceding: int, seal: str) -> list[Fault]:
         """Faults of the link to the previous record, which must exist unless it was
         removed deliberately.
         """
         before = record.previous
-        missing = record.generation - last - 1
+        missing = record.generation - preceding - 1
         tombstone = self._tombstone(before)
         if not missing and tombstone is not None:
             return []
@@ -260,9 +266,9 @@ class Log:
             tombstone = self._tombstone(before)
         if missing:
             lost = (
-                f"generation {last + 1}"
+                f"generation {preceding + 1}"
                 if missing == 1
-                else f"generations {last + 1} to {last + missing}"
+                else f"generations {preceding + 1} to {preceding + missing}"
             )
             return [
                 Fault(
@@ -284,21 +290,21 @@ class Log:
             ]
         return []
 
-    def _lost_fault(self, head: dict[str, Any], known: list[int]) -> Fault | None:
+    def _lost_fault(self, head: dict[str, Any], listed: list[int]) -> Fault | None:
         """Fault if the head, a cache that may be outdated, is ahead of the log: then
         records were lost.
         """
         if (
             not head
-            or (known and head["generation"] <= known[-1])
+            or (listed and head["generation"] <= listed[-1])
             or self.is_removed(head["seal"])
         ):
             return None
-        found = f"generations {known}" if known else "nothing"
+        finding = f"generations {listed}" if listed else "nothing"
         return Fault(
             self.what,
             f"generation {head['generation']} must exist",
-            found,
+            finding,
             self._head_cure(),
         )
 
@@ -369,13 +375,13 @@ def read_record(place: Place, key: str) -> tuple[Record, str]:
     except UnavailableError:
         raise
     except DAMAGE as error:
-        found = reason_of(error)
+        finding = reason_of(error)
         cure = RESTORE
         if isinstance(error, LaterError):
-            found += ", written by a later version of skindb"
+            finding += ", written by a later version of skindb"
             cure = UPDATE
     rule = "a record of the log must be as committed"
-    raise InputError(Fault(place.where(key), rule, found, cure))
+    raise InputError(Fault(place.where(key), rule, finding, cure))
 
 
 def tombstone_of(seal: str) -> str:

@@ -71,7 +71,7 @@ def read_marker_file(path: Path, secret: bytes) -> Notes:
     return _notes_from(content, str(path), secret)
 
 
-def _notes_from(content: bytes, where: str, secret: bytes) -> Notes:
+def _notes_from(content: bytes, location: str, secret: bytes) -> Notes:
     notes = Notes()
     for number, line in enumerate(content.removesuffix(b"\n").split(b"\n"), 1):
         try:
@@ -83,7 +83,7 @@ def _notes_from(content: bytes, where: str, secret: bytes) -> Notes:
             _add_line(notes, body)
         except (ValueError, TypeError, KeyError, RecursionError) as error:
             fault = Fault(
-                f"{where}, line {number}",
+                f"{location}, line {number}",
                 "a marker file must be as it was written",
                 str(error),
                 CURE,
@@ -175,14 +175,16 @@ def _add_lines(
         with _locked(path) as number:
             content = os.pread(number, MAX_STORE_JSON_BYTES, 0)
             # without a line whose writer was killed
-            whole = content[: content.rfind(b"\n") + 1]
-            notes = _notes_from(whole, str(path), secret) if whole else Notes()
-            bodies = ([] if whole else [{"format": FORMAT}]) + missing(notes, secret)
+            complete = content[: content.rfind(b"\n") + 1]
+            notes = _notes_from(complete, str(path), secret) if complete else Notes()
+            bodies = ([] if complete else [{"format": FORMAT}]) + missing(notes, secret)
             lines = [
                 json.dumps({**body, "seal": keyed_seal(secret, LINE, body)})
                 for body in bodies
             ]
-            _append(number, len(whole), "".join(f"{line}\n" for line in lines).encode())
+            _append(
+                number, len(complete), "".join(f"{line}\n" for line in lines).encode()
+            )
     except UnavailableError:
         raise
     except (OSError, InputError) as error:

@@ -253,18 +253,18 @@ def readmit(place: Place, subject: str, consent: date) -> None:
     if not entry.is_withdrawal:
         if entry.date == consent:  # the run that admitted the subject was interrupted
             return
-        found = f"the new consent of {entry.date}"
+        finding = f"the new consent of {entry.date}"
         raise InputError(
             Fault(
                 subject,
                 "a subject is admitted again once",
-                found,
+                finding,
                 "run the command without it",
             )
         )
     if not entry.date <= consent <= date.today():
-        found = f"{consent}, and a withdrawal on {entry.date}"
-        raise InputError(Fault(subject, rule, found, cure))
+        finding = f"{consent}, and a withdrawal on {entry.date}"
+        raise InputError(Fault(subject, rule, finding, cure))
     if not _create_entry(
         place, subject, entry.number + 1, {"readmitted": consent.isoformat()}
     ):
@@ -281,8 +281,8 @@ def marker_faults(place: Place) -> list[Fault]:
     secret = collect_faults(partial(require_secret, place), faults)
     if secret is None:
         return faults
-    for name, last in sorted(numbers.items()):
-        for number in range(1, last + 1):
+    for name, newest in sorted(numbers.items()):
+        for number in range(1, newest + 1):
             key = f"{WITHDRAWN}/{name}/{number:04d}.json"
             collect_faults(partial(_read_entry, place, secret, key), faults)
     return faults
@@ -291,10 +291,10 @@ def marker_faults(place: Place) -> list[Fault]:
 def _numbers(place: Place) -> dict[str, int]:
     """Keyed hash of every subject that was ever withdrawn -> number of the last entry."""
     names = place.sizes(WITHDRAWN)
-    for name, (found, cure) in LOCKS.items():
+    for name, (finding, cure) in LOCKS.items():
         if name in names and not place.is_unlocked:
             raise InputError(
-                Fault(place.name, "must be a complete database", found, cure)
+                Fault(place.name, "must be a complete database", finding, cure)
             )
     return entry_numbers(names)
 

@@ -39,12 +39,12 @@ def subject_of(take: str) -> str:
     return take.partition(".")[0]
 
 
-def require_text(value: str, pattern: str, what: str) -> str:
+def require_text(value: str, pattern: str, label: str) -> str:
     """Return `value` if it matches the whole pattern; otherwise raise an `InputError`."""
     if not isinstance(value, str) or not re.fullmatch(pattern, value):
         raise InputError(
             Fault(
-                what, f"must match {pattern}", repr(value)[:200], "choose another name"
+                label, f"must match {pattern}", repr(value)[:200], "choose another name"
             )
         )
     return value
@@ -82,12 +82,12 @@ def inside(root: Path, key: str) -> Path:
     return Path(place)
 
 
-def outside_fault(root: Path | str, key: str, found: str) -> Fault:
+def outside_fault(root: Path | str, key: str, finding: str) -> Fault:
     """Fault for a key that leads outside the database."""
     cure = "restore the file that names this path from a backup"
     return Fault(
         f"{root}: {key[:200]!r}",
         "every path must stay inside the database",
-        found,
+        finding,
         cure,
     )

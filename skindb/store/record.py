@@ -87,9 +87,9 @@ class Record:
         """Kind, generation and take, as shown in messages."""
         return f"{self.kind} {self.generation} of {self.take}"
 
-    def beside(self, what: str) -> str:
+    def beside(self, suffix: str) -> str:
         """Key of the file `what` (manifest or tables) beside the version."""
-        return f"{self.path.removesuffix('.zarr')}.{what}.json"
+        return f"{self.path.removesuffix('.zarr')}.{suffix}.json"
 
     def as_input(self) -> dict[str, Any]:
         """Reference to this version in the provenance of another one."""

@@ -76,7 +76,7 @@ class Entry:
 
 
 class RecordCache:
-    """The records of a database as `Known` needs them; only records that are not in the
+    """The records of a database as `Lookup` needs them; only records that are not in the
     cache are read.
 
     Parameters
@@ -112,8 +112,8 @@ class RecordCache:
         """Takes with a version of this kind, including those whose records were lost."""
         return sorted(
             take
-            for of, take in {*self._generations, *self._heads}
-            if of == kind and self.has(kind, take)
+            for listed_kind, take in {*self._generations, *self._heads}
+            if listed_kind == kind and self.has(kind, take)
         )
 
     def has(self, kind: str, take: str) -> bool:
@@ -156,11 +156,14 @@ class RecordCache:
             except InputError:
                 return
 
-        wanted = {*kinds}
-        asked = [(*key, None) for key in self._generations if key[0] in wanted]
+        chosen = {*kinds}
+        newest = [(*key, None) for key in self._generations if key[0] in chosen]
         missing = [
             key
-            for key in [*asked, *((*key, one) for key, one in pins.items())]
+            for key in [
+                *newest,
+                *((*key, generation) for key, generation in pins.items()),
+            ]
             if self._entry(*key) is None
         ]
         pool = ThreadPoolExecutor(READER_THREADS)
@@ -210,8 +213,8 @@ class RecordCache:
 
     def _entry(self, kind: str, take: str, generation: int | None) -> Entry | None:
         """Cached entry of a version; None if its files have changed."""
-        known = self._generations.get((kind, take), [])
-        number = generation if generation is not None or not known else known[-1]
+        listed = self._generations.get((kind, take), [])
+        number = generation if generation is not None or not listed else listed[-1]
         entry = None if number is None else self._entries.get((kind, take, number))
         is_checked = generation is not None or (
             entry is not None
@@ -222,12 +225,12 @@ class RecordCache:
     def _read(self, kind: str, take: str, generation: int | None) -> Record:
         """A record from the log, with the checks of `Log.read`."""
         log = Log(self.place, kind, take)
-        known = self._generations.get((kind, take), [])
+        listed = self._generations.get((kind, take), [])
         head = self._heads.get((kind, take), ())
         try:
-            if generation is None and known:
+            if generation is None and listed:
                 record = log.read_listed(
-                    known, lambda content: self.place.proves(head, content)
+                    listed, lambda content: self.place.proves(head, content)
                 )
             else:
                 record = log.read(generation)
@@ -264,26 +267,26 @@ def cache_names(place: Place, is_named: Callable[[str], bool]) -> bool:
 
 def _generations(files: Iterable[Key]) -> dict[tuple[str, str], list[int]]:
     """Generations in ascending order, by kind and take."""
-    found: dict[tuple[str, str], list[int]] = {}
+    generations: dict[tuple[str, str], list[int]] = {}
     for kind, take, generation in sorted(files):
-        found.setdefault((kind, take), []).append(generation)
-    return found
+        generations.setdefault((kind, take), []).append(generation)
+    return generations
 
 
 def _list_heads(place: Place) -> dict[tuple[str, str], tuple[Hashable, ...]]:
     """Identity of every head, by kind and take; empty if the folder of heads is damaged."""
     try:
-        every = place.identities("heads")
+        identities = place.identities("heads")
     except UnavailableError:
         raise
     except InputError:  # a link
         return {}
     parts = {
         name: name.removesuffix(".json").partition("/")
-        for name in every
+        for name in identities
         if name.endswith(".json")
     }
-    return {(kind, take): every[name] for name, (kind, _, take) in parts.items()}
+    return {(kind, take): identities[name] for name, (kind, _, take) in parts.items()}
 
 
 def _unchanged_entries(

@@ -69,11 +69,11 @@ class Request:
                 return None
         if PINS in parameters:
             parameters[PINS] = [
-                one
-                for one in parameters[PINS]
-                if not is_withdrawn(subject_of(one["take"]))
+                pin
+                for pin in parameters[PINS]
+                if not is_withdrawn(subject_of(pin["take"]))
             ]
-            if not any(one["kind"] == "model" for one in parameters[PINS]):
+            if not any(pin["kind"] == "model" for pin in parameters[PINS]):
                 return None
         reference = parameters.get(REFERENCE)
         if reference and is_withdrawn(subject_of(reference)):

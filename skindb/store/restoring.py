@@ -186,7 +186,10 @@ def restore_backup(
     note_withdrawals(place)
     note_consents(
         place,
-        [*consents, *(one for one in plan.records.values() if one.kind == CONSENT)],
+        [
+            *consents,
+            *(record for record in plan.records.values() if record.kind == CONSENT),
+        ],
     )
     return Restored(
         number=state.number,
@@ -216,16 +219,16 @@ def _plan(archive: Archive, state: State, notes: Notes) -> Plan:
     numbers = entry_numbers(key.removeprefix(f"{WITHDRAWN}/") for key in entries)
     markers = Markers(numbers, require_secret(archive.place))
     faults: list[Fault] = []
-    every = archive.records(state, faults)
+    stored = archive.records(state, faults)
     tombstones = [key for key in state.files if key.startswith("tombstones/")]
     records, texts = surviving(
-        every, archive.requests(state, faults), tombstones, markers
+        stored, archive.requests(state, faults), tombstones, markers
     )
     texts |= entries | {SECRET: archive.place.read_small(SECRET)}
     for record in records.values():  # in ascending order
         log = Log(archive.place, record.kind, record.take)
         texts[log.head_key] = log.head_content(record.generation, record.seal)
-    for key in state.files.keys() - every.keys():
+    for key in state.files.keys() - stored.keys():
         _, kind, take, *_ = [*key.split("/"), "", ""]
         if key.startswith("log/") and not markers.hides(kind, take):
             # an unreadable record, so that none before it takes its place
@@ -237,7 +240,7 @@ def _plan(archive: Archive, state: State, notes: Notes) -> Plan:
     for _, those in intact(archive.version_items, records.values(), faults):
         items += those
     return Plan(
-        items, texts, records, markers, notes, len(every) - len(records), faults
+        items, texts, records, markers, notes, len(stored) - len(records), faults
     )
 
 
@@ -248,16 +251,16 @@ def _require_empty(place: Place) -> None:
     if place.file_type(LOCK):
         return
     names = place.names() or []
-    others = [name for name in names if name not in (STAGING, WITHDRAWN)]
-    if others or place.sizes(WITHDRAWN):
+    foreign = [name for name in names if name not in (STAGING, WITHDRAWN)]
+    if foreign or place.sizes(WITHDRAWN):
         rule = "a restore needs an empty or missing folder"
         cure = "give another folder; nothing was changed"
-        found = (
+        finding = (
             "a database or a backup"
             if {"log", WITHDRAWN} & {*names}
-            else f"other files, such as {others[0]}"
+            else f"other files, such as {foreign[0]}"
         )
-        raise InputError(Fault(place.name, rule, found, cure))
+        raise InputError(Fault(place.name, rule, finding, cure))
 
 
 def _copy_all(archive: Archive, place: Place, plan: Plan) -> int:
@@ -298,13 +301,13 @@ def _remove_others(place: Place, keys: set[str]) -> set[str]:
         for key in keys
         for depth in range(1, key.count("/") + 1)
     }
-    others = present - keys
-    if not others - folders:
+    foreign = present - keys
+    if not foreign - folders:
         return present
     for top in tops:
         if top != WITHDRAWN:
             place.remove(top)
-    for key in others:
+    for key in foreign:
         place.remove(key)
     return set()
 
@@ -324,9 +327,9 @@ def _copy(archive: Archive, place: Place, present: set[str], item: Item) -> int:
 def _subjects(plan: Plan) -> dict[str, str]:
     """Keyed hash of every subject of the restored versions -> pseudonym."""
     subjects = {
-        one
+        subject
         for record in plan.records.values()
-        for one in subjects_of(record.kind, record.take, ())
+        for subject in subjects_of(record.kind, record.take, ())
     }
     return {keyed_hash(plan.markers.secret, subject): subject for subject in subjects}
 

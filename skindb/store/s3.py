@@ -152,15 +152,15 @@ def endpoint() -> str:
     InputError
         If it is not a valid URL, or if data of subjects would be sent unencrypted over a network.
     """
-    found = next(
+    address = next(
         (os.environ[name] for name in ENDPOINTS if os.environ.get(name)),
         _profile().get("endpoint_url", ""),
     )
-    if not found:
+    if not address:
         return ""
-    parts = urlsplit(found)
+    parts = urlsplit(address)
     host = parts.hostname or ""
-    if not re.fullmatch(r"https?://[^@/?#]+/?", found) or not host:
+    if not re.fullmatch(r"https?://[^@/?#]+/?", address) or not host:
         rule = "must be http(s)://HOST:PORT without credentials"
         cure = "correct it"
         raise InputError(Fault("AWS_ENDPOINT_URL", rule, "a different URL", cure))
@@ -173,7 +173,7 @@ def endpoint() -> str:
         rule = "data of subjects must be encrypted when they are sent over a network"
         cure = "use https, or set AWS_ALLOW_HTTP=true in a private network"
         raise InputError(Fault("AWS_ENDPOINT_URL", rule, f"http to {host}", cure))
-    return found.rstrip("/")
+    return address.rstrip("/")
 
 
 class BrokenAnswerError(UnavailableError):
@@ -185,7 +185,7 @@ class DeniedError(UnavailableError):
 
 
 @contextmanager
-def readable_errors(where: str) -> Iterator[None]:
+def readable_errors(location: str) -> Iterator[None]:
     """Convert errors of obstore to those that `Place` documents, without details of the
     request except its key.
 
@@ -193,22 +193,22 @@ def readable_errors(where: str) -> Iterator[None]:
     """
     from obstore.exceptions import AlreadyExistsError, BaseError
 
-    _require_own_process(where)
+    _require_own_process(location)
     try:
         yield
     except AlreadyExistsError:
         raise
     except FileNotFoundError as error:
         if "NoSuchBucket" in str(error):
-            raise _unavailable(where, str(error)) from None
-        raise FileNotFoundError(2, "no such object", where) from None
+            raise _unavailable(location, str(error)) from None
+        raise FileNotFoundError(2, "no such object", location) from None
     except BaseError as error:
         if "416 Range" in str(error):
-            raise OSError(22, "fewer bytes than were requested", where) from None
-        raise _unavailable(where, str(error)) from None
+            raise OSError(22, "fewer bytes than were requested", location) from None
+        raise _unavailable(location, str(error)) from None
 
 
-def _require_own_process(where: str) -> None:
+def _require_own_process(location: str) -> None:
     """Raise an `InputError` in a forked process, which has no threads of obstore and
     would wait forever.
     """
@@ -219,10 +219,10 @@ def _require_own_process(where: str) -> None:
             "a process that uses a bucket must not be forked from another one that does"
         )
         cure = "use the workers of skindb, loky or Dask, or the start method spawn"
-        raise InputError(Fault(where, rule, "a forked process", cure))
+        raise InputError(Fault(location, rule, "a forked process", cure))
 
 
-def _unavailable(where: str, text: str) -> UnavailableError:
+def _unavailable(location: str, text: str) -> UnavailableError:
     """Error with the reason from the text of an obstore error, without the request that
     the text repeats.
     """
@@ -232,37 +232,37 @@ def _unavailable(where: str, text: str) -> UnavailableError:
     )
     if "NoSuchBucket" in text:
         return _fault(
-            where,
+            location,
             "the bucket must exist",
             "no bucket of this name",
             "create it, or correct its name",
         )
     if "/latest/" in text and not code:  # the metadata service of a virtual machine
-        return _fault(where, "credentials must be set", "none", CURE_NO_KEYS)
+        return _fault(location, "credentials must be set", "none", CURE_NO_KEYS)
     if code in (401, 403) or "AccessDenied" in text:
         rule = "the credentials must permit this request"
         return DeniedError(
-            Fault(where, rule, phrase or "access denied", CURE_PERMISSION)
+            Fault(location, rule, phrase or "access denied", CURE_PERMISSION)
         )
     if 300 <= code < 400:
         return _fault(
-            where,
+            location,
             "the request must be sent to the region of the bucket",
             phrase,
             "set AWS_REGION",
         )
     reason = phrase or ("a time-out" if "kind: Timeout" in text else "no connection")
     retries = re.search(r"after (\d+) retries", text)
-    found = f"{reason} from {endpoint() or 'AWS'}" + (
+    finding = f"{reason} from {endpoint() or 'AWS'}" + (
         f", after {retries[1]} retries" if retries else ""
     )
     given_up = code or (retries and int(retries[1]) >= MAX_RETRIES)
     kind = UnavailableError if given_up else BrokenAnswerError
-    return kind(Fault(where, "the server must answer", found, CURE_NETWORK))
+    return kind(Fault(location, "the server must answer", finding, CURE_NETWORK))
 
 
-def _fault(where: str, rule: str, found: str, cure: str) -> UnavailableError:
-    return UnavailableError(Fault(where, rule, found, cure))
+def _fault(location: str, rule: str, finding: str, cure: str) -> UnavailableError:
+    return UnavailableError(Fault(location, rule, finding, cure))
 
 
 def _profile() -> dict[str, str]:
@@ -278,7 +278,7 @@ def _profile() -> dict[str, str]:
             os.environ.get("AWS_SHARED_CREDENTIALS_FILE") or home / "credentials"
         ): name or "default",
     }
-    found: dict[str, str] = {}
+    settings: dict[str, str] = {}
     for path, title in files.items():
         parser = configparser.ConfigParser(
             interpolation=None, default_section="no defaults"
@@ -292,12 +292,12 @@ def _profile() -> dict[str, str]:
             raise InputError(
                 Fault(str(path), rule, "lines that cannot be parsed", cure)
             ) from None
-        found |= dict(parser[title]) if title in parser else {}
-    if name and not found:
+        settings |= dict(parser[title]) if title in parser else {}
+    if name and not settings:
         rule = "must name a profile of the AWS configuration"
         cure = "correct it, or unset it"
         raise InputError(Fault("AWS_PROFILE", rule, repr(name), cure))
-    return found
+    return settings
 
 
 def _is_on_aws() -> bool:

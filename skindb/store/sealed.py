@@ -55,14 +55,14 @@ def reason_of(error: Exception) -> str:
 
 
 @contextmanager
-def damage_as_fault(where: str, rule: str, cure: str) -> Iterator[None]:
+def damage_as_fault(location: str, rule: str, cure: str) -> Iterator[None]:
     """Context that raises an `InputError` in place of everything that a damaged file raises."""
     try:
         yield
     except UnavailableError:
         raise
     except DAMAGE as error:
-        raise InputError(Fault(where, rule, reason_of(error), cure)) from None
+        raise InputError(Fault(location, rule, reason_of(error), cure)) from None
 
 
 def intact_or_none(read: Callable[[], T]) -> T | None:

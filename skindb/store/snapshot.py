@@ -107,8 +107,8 @@ class Snapshot:
         if self.markers.hides(kind, take):
             raise self._missing_error(kind, take)
         rule = "a version must not refer to a withdrawn subject"
-        found = "a withdrawal that is not complete"
-        raise WithdrawnError(Fault(record.title, rule, found, "run skindb refresh"))
+        finding = "a withdrawal that is not complete"
+        raise WithdrawnError(Fault(record.title, rule, finding, "run skindb refresh"))
 
     def history(self, kind: str, take: str) -> list[Record]:
         """All records, oldest first; see `Database.history`."""
@@ -139,16 +139,16 @@ class Snapshot:
 
     def _missing_error(self, kind: str, take: str) -> InputError:
         takes = self.takes(kind)
-        found = f"takes: {', '.join(takes)}"
+        finding = f"takes: {', '.join(takes)}"
         if not takes:
-            found = f"no {kind}; kinds: {', '.join(self.kinds()) or 'none'}"
-        where = f"{self.place.name}: {kind} of {take}"
+            finding = f"no {kind}; kinds: {', '.join(self.kinds()) or 'none'}"
+        title = f"{self.place.name}: {kind} of {take}"
         return InputError(
-            Fault(where, "the database must hold it", found, "see skindb info")
+            Fault(title, "the database must hold it", finding, "see skindb info")
         )
 
 
-class Known:
+class Lookup:
     """Cached lookups of takes and records, for example while a cohort or a table is created.
 
     Parameters
@@ -179,7 +179,11 @@ class Known:
         """Takes with a version of this kind."""
         if kind not in self._takes:
             if self._is_pinned(kind):
-                names = [take for of, take in self._pins or () if of == kind]
+                names = [
+                    take
+                    for pinned_kind, take in self._pins or ()
+                    if pinned_kind == kind
+                ]
             else:
                 names = self._source.takes(kind)
             self._takes[kind] = frozenset(names)
@@ -244,10 +248,10 @@ def list_records(place: Place, kind: str = "") -> dict[tuple[str, str, int], str
     identities: dict[tuple[str, str, int], str] = {}
     for name, identity in place.identities(f"log/{kind}".rstrip("/")).items():
         path = f"{kind}/{name}" if kind else name
-        of, take, file, *_ = [*path.split("/"), "", ""]
+        listed_kind, take, file, *_ = [*path.split("/"), "", ""]
         match = GENERATION.fullmatch(file)
-        if match and re.fullmatch(KIND, of) and re.fullmatch(TAKE, take):
-            identities[of, take, int(match[1])] = identity_text(identity)
+        if match and re.fullmatch(KIND, listed_kind) and re.fullmatch(TAKE, take):
+            identities[listed_kind, take, int(match[1])] = identity_text(identity)
     return identities
 
 
@@ -269,9 +273,9 @@ def consent_of(records: Records, take: str) -> tuple[str, ...]:
 def pins_of(records: Records, release: str) -> Pins:
     """The versions that a release names; `InputError` if the release does not exist."""
     if not records.has(RELEASE, release):
-        found = f"releases: {', '.join(records.takes(RELEASE)) or 'none'}"
+        finding = f"releases: {', '.join(records.takes(RELEASE)) or 'none'}"
         rule = "the release must exist"
-        raise InputError(Fault(release, rule, found, "see skindb release"))
+        raise InputError(Fault(release, rule, finding, "see skindb release"))
     named = records.record(RELEASE, release).made_from
     return {(pin["kind"], pin["take"]): pin for pin in named}
 
@@ -279,10 +283,10 @@ def pins_of(records: Records, release: str) -> Pins:
 def pinned_record(records: Records, pins: Pins, kind: str, take: str) -> Record:
     """The record of the version that a release names for a take."""
     if (kind, take) not in pins:
-        takes = sorted(name for of, name in pins if of == kind)
+        takes = sorted(name for pinned_kind, name in pins if pinned_kind == kind)
         rule = f"the release must name a {kind} of this take"
-        found = f"takes: {', '.join(takes) or 'none'}"
-        raise InputError(Fault(take, rule, found, "choose one of these"))
+        finding = f"takes: {', '.join(takes) or 'none'}"
+        raise InputError(Fault(take, rule, finding, "choose one of these"))
     pin = pins[kind, take]
     record = records.record(kind, take, pin["generation"])
     if record.seal != pin["seal"]:

@@ -153,20 +153,20 @@ class Stage:
             With all faults of all groups, before anything is written.
         """
         self._require_open()
-        every = dict(groups) | ({} if tables is None else {TABLES: tables})
-        faults = [fault for name, ds in every.items() for fault in _faults(name, ds)]
+        datasets = dict(groups) | ({} if tables is None else {TABLES: tables})
+        faults = [fault for name, ds in datasets.items() for fault in _faults(name, ds)]
         if faults:
             raise InputError(faults)
         labels = {
             str(take)
-            for ds in every.values()
+            for ds in datasets.values()
             if "take" in ds.coords
             for take in np.atleast_1d(ds["take"].values)
         }
         self._require_named(labels)
         self._declare()
         self.tables = self.tables if tables is None else tables
-        self.contents |= {name: describe(ds) for name, ds in every.items()}
+        self.contents |= {name: describe(ds) for name, ds in datasets.items()}
         self.groups |= groups.keys()
         for name, ds in groups.items():
             ready = _whole_shards(ds).assign_attrs(plain(ds.attrs))
@@ -249,9 +249,9 @@ class Stage:
             name for name in sorted(self.groups) if f"{name}/zarr.json" not in sizes
         ]:
             rule = "all groups of a version must exist when it is committed"
-            found = f"that another process removed {', '.join(gone)}"
+            finding = f"that another process removed {', '.join(gone)}"
             cure = "run the command again"
-            raise InputError(Fault(self.log.what, rule, found, cure))
+            raise InputError(Fault(self.log.what, rule, finding, cure))
         files = {
             name: (self.place.digest(f"{self.path}/{name}"), size)
             for name, size in sorted(sizes.items())
@@ -336,10 +336,10 @@ class Stage:
         if any(markers.is_withdrawn(subject) for subject in subjects):
             self.place.remove(f"data/{kind}/{take}")
 
-    def _create_beside(self, record: Record, what: str, value: Any) -> str:
+    def _create_beside(self, record: Record, suffix: str, value: Any) -> str:
         """Write a JSON file durably beside the version; returns its digest."""
         content = json.dumps(value, separators=(",", ":"), allow_nan=False).encode()
-        self.place.create(record.beside(what), content)
+        self.place.create(record.beside(suffix), content)
         return hashlib.sha256(content).hexdigest()
 
     def _require_open(self) -> None:
@@ -386,8 +386,8 @@ def read_names(place: Place, path: str) -> tuple[list[str], dict[str, int]] | No
 def remove_version(place: Place, path: str) -> None:
     """Remove the data of a version that no record names."""
     require_text(path, VERSION, "path of a version")
-    for what in (".zarr", f".{TABLES}.json", ".manifest.json", f".{NAMES}.json"):
-        place.remove(path.removesuffix(".zarr") + what)
+    for ending in (".zarr", f".{TABLES}.json", ".manifest.json", f".{NAMES}.json"):
+        place.remove(path.removesuffix(".zarr") + ending)
 
 
 def describe(ds: xr.Dataset) -> dict[str, Any]:

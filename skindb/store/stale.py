@@ -83,12 +83,12 @@ class Staleness:
         if key not in self._known:
             # inputs are earlier versions; this ends the recursion in a forged cycle
             self._known[key] = ()
-            found = dict.fromkeys(
+            finding = dict.fromkeys(
                 reason
-                for one in record.made_from
-                for reason in self._input_reasons(record, one)
+                for reference in record.made_from
+                for reason in self._input_reasons(record, reference)
             )
-            self._known[key] = tuple(found)
+            self._known[key] = tuple(finding)
         return self._known[key]
 
     def _input_reasons(
@@ -166,7 +166,7 @@ def require_fresh(
         longer covers statistics.
     """
     record = Snapshot(db.place).record(kind, take, generation)
-    what = record.title
+    title = record.title
     reasons = Staleness(db).reasons(record)
     if refused := [reason for reason in reasons if reason.why != "superseded"]:
         rule = "its inputs must exist and be covered by consent"
@@ -176,12 +176,13 @@ def require_fresh(
             else CURE
         )
         raise InputError(
-            Fault(what, rule, found, cure) for found in dict.fromkeys(map(str, refused))
+            Fault(title, rule, finding, cure)
+            for finding in dict.fromkeys(map(str, refused))
         )
     if reasons:
-        more = f" and {len(reasons) - 1} more" if len(reasons) > 1 else ""
+        rest = f" and {len(reasons) - 1} more" if len(reasons) > 1 else ""
         warnings.warn(
-            f"{what} is out of date: {reasons[0]}{more}; {CURE}",
+            f"{title} is out of date: {reasons[0]}{rest}; {CURE}",
             StaleWarning,
             stacklevel=3,
         )

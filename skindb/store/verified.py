@@ -70,9 +70,9 @@ def manifest_from_json(content: bytes) -> Manifest:
     }
 
 
-def read_beside(place: Place, record: Record, what: str, digest: str) -> bytes:
+def read_beside(place: Place, record: Record, suffix: str, digest: str) -> bytes:
     """Contents of a file beside a version, compared with its digest in the record."""
-    key = record.beside(what)
+    key = record.beside(suffix)
     try:
         text = place.read_small(key)
     except OSError as error:
@@ -230,33 +230,38 @@ class VerifiedStore(ListedStore):
 
     def _require_plausible(self, key: str, content: bytes) -> None:
         """Raise an `InputError` for metadata that do not match the chunk files."""
-        if found := metadata_faults(content, self._chunks[key.rpartition("/")[0]]):
-            where = self.place.where(f"{self.record.path}/{key}")
+        if finding := metadata_faults(content, self._chunks[key.rpartition("/")[0]]):
+            location = self.place.where(f"{self.record.path}/{key}")
             rule = "the metadata of an array must match its files"
-            raise InputError(Fault(where, rule, found, "compute the version again"))
+            raise InputError(
+                Fault(location, rule, finding, "compute the version again")
+            )
 
     def _require_files(self) -> None:
         """Raise an `InputError` with all missing and truncated files, before values are read."""
-        there = self.place.sizes(self.record.path)
+        sizes = self.place.sizes(self.record.path)
         faults: list[Fault] = []
         for key, (_, size) in self.files.items():
-            if key not in there:
+            if key not in sizes:
                 faults += self._fault(key, "no file").faults
-            elif there[key] < 0:
+            elif sizes[key] < 0:
                 faults += self._fault(
                     key, "something that is not a regular file"
                 ).faults
-            elif there[key] != size:
+            elif sizes[key] != size:
                 faults += self._fault(
-                    key, f"{there[key]} bytes instead of {size}"
+                    key, f"{sizes[key]} bytes instead of {size}"
                 ).faults
         if faults:
             raise InputError(faults)
 
-    def _fault(self, key: str, found: str) -> InputError:
+    def _fault(self, key: str, finding: str) -> InputError:
         return InputError(
             Fault(
-                self.place.where(f"{self.record.path}/{key}"), AS_COMMITTED, found, CURE
+                self.place.where(f"{self.record.path}/{key}"),
+                AS_COMMITTED,
+                finding,
+                CURE,
             )
         )
 
@@ -334,7 +339,9 @@ def _codec_faults(codecs: list[dict[str, Any]], depth: int) -> str:
     if len(codecs) > MAX_CODECS or depth > 1:
         return "more codecs than skindb writes"
     inner = [
-        one["configuration"]["codecs"] for one in codecs if one["name"] == SHARDING
+        codec["configuration"]["codecs"]
+        for codec in codecs
+        if codec["name"] == SHARDING
     ]
     return next(
         (fault for those in inner if (fault := _codec_faults(those, depth + 1))), ""
@@ -343,7 +350,7 @@ def _codec_faults(codecs: list[dict[str, Any]], depth: int) -> str:
 
 def _lengths(value: object) -> tuple[int, ...]:
     if not isinstance(value, list) or not all(
-        isinstance(one, int) and one >= 0 for one in value
+        isinstance(length, int) and length >= 0 for length in value
     ):
         raise ValueError("a shape must be a list of non-negative integers")
     return tuple(value)

@@ -110,20 +110,20 @@ def _withdrawn_faults(place: Place) -> list[Fault]:
         raise
     except InputError as error:  # of the secret, which `marker_faults` reports
         return [fault for fault in error.faults if fault.where != place.where(SECRET)]
-    left = [f"{kind} of {take}" for kind, take in holdings.takes]
-    left += [record.title for record in holdings.versions]
-    left += [place.where(key) for key in (*holdings.unrecorded, *holdings.caches)]
-    left += [*map(str, holdings.requests), *map(str, holdings.scratch)]
+    remains = [f"{kind} of {take}" for kind, take in holdings.takes]
+    remains += [record.title for record in holdings.versions]
+    remains += [place.where(key) for key in (*holdings.unrecorded, *holdings.caches)]
+    remains += [*map(str, holdings.requests), *map(str, holdings.scratch)]
     rule = "nothing of a withdrawn subject must remain"
     cure = "run skindb clean --yes"
     return [
         Fault(
-            where,
+            location,
             rule,
             "data that the withdrawal did not remove, or that came later",
             cure,
         )
-        for where in left
+        for location in remains
     ]
 
 
@@ -133,9 +133,9 @@ def _layout_faults(
     """Faults of unknown names in the folders of the database, and of links or pipes in
     place of files.
     """
-    found = place.file_type(key)
-    if found != "folder":
-        return [_type_fault(place, key, "folder", found)] if found else []
+    finding = place.file_type(key)
+    if finding != "folder":
+        return [_type_fault(place, key, "folder", finding)] if finding else []
     faults: list[Fault] = []
     for name in place.children(key, links=True):
         child = f"{key}/{name}"
@@ -148,18 +148,18 @@ def _layout_faults(
             faults += _layout_faults(place, child, levels[1:], beside)
         else:
             expected = "folder" if name.endswith(".zarr") else "file"
-            if (found := place.file_type(child)) != expected:
-                faults.append(_type_fault(place, child, expected, found))
+            if (finding := place.file_type(child)) != expected:
+                faults.append(_type_fault(place, child, expected, finding))
             elif key.startswith("data/") and FILE_BESIDE.search(name):
                 beside.append(child)
     return faults
 
 
-def _type_fault(place: Place, key: str, expected: str, found: str) -> Fault:
+def _type_fault(place: Place, key: str, expected: str, finding: str) -> Fault:
     names = {"link": "a symbolic link", "file": "a file", "folder": "a folder"}
     rule = "must be a folder" if expected == "folder" else "must be a regular file"
     return Fault(
-        place.where(key), rule, names.get(found, "a pipe, socket or device"), RESTORE
+        place.where(key), rule, names.get(finding, "a pipe, socket or device"), RESTORE
     )
 
 
@@ -172,12 +172,12 @@ def _input_faults(
     }
     faults = []
     for record in records:
-        for one in record.made_from:
-            log = Log(place, one["kind"], one["take"])
-            generation = one["generation"]
-            if log.what in damaged or log.is_removed(one["seal"]):
+        for reference in record.made_from:
+            log = Log(place, reference["kind"], reference["take"])
+            generation = reference["generation"]
+            if log.what in damaged or log.is_removed(reference["seal"]):
                 continue
-            if seals.get((log.kind, log.take, generation)) != one["seal"]:
+            if seals.get((log.kind, log.take, generation)) != reference["seal"]:
                 by = record.title
                 rule = f"generation {generation}, from which {by} was made, must exist"
                 faults.append(
@@ -190,7 +190,9 @@ def _unrecorded_faults(
     place: Place, beside: list[str], records: list[Record], damaged: set[str]
 ) -> list[Fault]:
     """Faults of versions that were written completely, but whose records were lost."""
-    named = {record.beside(what) for record in records for what in ("manifest", TABLES)}
+    named = {
+        record.beside(suffix) for record in records for suffix in ("manifest", TABLES)
+    }
     rule = "a record of the log must name every version that was written completely"
     cure = (
         "restore its record from a backup; if its run was killed, remove this file and "
@@ -199,8 +201,8 @@ def _unrecorded_faults(
     faults = []
     for key in beside:
         _, kind, take, _ = key.split("/")
-        known = key in named or kind in TRANSIENT or f"{kind} of {take}" in damaged
-        if not known and _has_lost_record(place, kind, take):
+        is_known = key in named or kind in TRANSIENT or f"{kind} of {take}" in damaged
+        if not is_known and _has_lost_record(place, kind, take):
             faults.append(Fault(place.where(key), rule, "no such record", cure))
     return faults
 
@@ -249,18 +251,18 @@ def partly_removed_records(
     log: Log, records: Iterable[Record], tombstone_names: set[str]
 ) -> list[Record]:
     """Records that already have a tombstone, because their removal was interrupted."""
-    there = [
+    tombstoned = [
         record
         for record in records
         if tombstone_of(record.seal).rpartition("/")[2] in tombstone_names
     ]
-    return [record for record in there if log.is_removed(record.seal)]
+    return [record for record in tombstoned if log.is_removed(record.seal)]
 
 
 def _partly_removed_fault(record: Record) -> Fault:
-    what = record.title
+    title = record.title
     return Fault(
-        what,
+        title,
         "its removal must be completed",
         "both a record and a tombstone",
         "run skindb clean",
@@ -268,30 +270,32 @@ def _partly_removed_fault(record: Record) -> Fault:
 
 
 def _file_faults(place: Place, record: Record, manifest: Manifest) -> list[Fault]:
-    there = place.sizes(record.path)
-    names = sorted(there.keys() | manifest.keys())
+    sizes = place.sizes(record.path)
+    names = sorted(sizes.keys() | manifest.keys())
     with ThreadPoolExecutor(THREADS) as threads:
-        found = list(
+        finding = list(
             threads.map(
-                lambda name: _file_fault(place, record, manifest, there, name), names
+                lambda name: _file_fault(place, record, manifest, sizes, name), names
             )
         )
-    return [fault for fault in found if fault is not None]
+    return [fault for fault in finding if fault is not None]
 
 
 def _file_fault(
-    place: Place, record: Record, manifest: Manifest, there: dict[str, int], name: str
+    place: Place, record: Record, manifest: Manifest, sizes: dict[str, int], name: str
 ) -> Fault | None:
     key = f"{record.path}/{name}"
-    where = place.where(key)
-    if name not in there:
-        return Fault(where, AS_COMMITTED, "no file", CURE)
+    location = place.where(key)
+    if name not in sizes:
+        return Fault(location, AS_COMMITTED, "no file", CURE)
     if name not in manifest:
-        return Fault(where, AS_COMMITTED, "an unknown file or folder", "remove it")
-    if there[name] < 0:
-        return Fault(where, AS_COMMITTED, "something that is not a regular file", CURE)
-    found = _difference(place, key, there[name], manifest[name])
-    return Fault(where, AS_COMMITTED, found, CURE) if found else None
+        return Fault(location, AS_COMMITTED, "an unknown file or folder", "remove it")
+    if sizes[name] < 0:
+        return Fault(
+            location, AS_COMMITTED, "something that is not a regular file", CURE
+        )
+    finding = _difference(place, key, sizes[name], manifest[name])
+    return Fault(location, AS_COMMITTED, finding, CURE) if finding else None
 
 
 def _difference(place: Place, key: str, size: int, committed: tuple[str, int]) -> str:
@@ -324,9 +328,9 @@ def _record_faults(place: Place, record: Record, tables: bytes) -> list[Fault]:
     )
     wrong += [] if contents == record.contents else ["contents"]
     wrong += [] if sum(place.sizes(record.path).values()) == record.bytes else ["bytes"]
-    where = record.title
+    title = record.title
     return (
-        [Fault(where, AS_RECORDED, f"different {', '.join(wrong)}", RESTORE)]
+        [Fault(title, AS_RECORDED, f"different {', '.join(wrong)}", RESTORE)]
         if wrong
         else []
     )

@@ -21,7 +21,7 @@ from skindb.reflectance.kinds import require_mixture
 from skindb.reflectance.table_file import read_dictionary
 from skindb.schema.cohort import require_same_fit
 from skindb.schema.notes import Note, note, unique_notes
-from skindb.store import Database, Known, Record, Staleness
+from skindb.store import Database, Lookup, Record, Staleness
 from skindb.workflow.registration import (
     current_registrations,
     register_takes,
@@ -176,7 +176,7 @@ def require_covered(db: Database, release: str | None) -> None:
     """
     if release is None:
         return
-    known = Known(db, release)
+    known = Lookup(db, release)
     staleness = Staleness(db)
     records = [
         known.record("registration", take) for take in known.takes("registration")
@@ -201,7 +201,7 @@ def _registrations(
     """
     takes = [str(take) for take in cohort["take"].values]
     if release is not None:
-        known = Known(db, release)
+        known = Lookup(db, release)
         names = [take for take in takes if known.has("registration", take)]
         records = {take: known.record("registration", take) for take in names}
         origin = "that of the release"

@@ -22,7 +22,7 @@ from skindb.analysis.summary import (
 from skindb.fit import prediction_table
 from skindb.schema import FitStatus, dataset
 from skindb.schema.regions import FACE
-from skindb.store import SUMMARY, CohortRequest, Database, Known, Record, lacking
+from skindb.store import SUMMARY, CohortRequest, Database, Lookup, Record, lacking
 from skindb.workflow.audit import logged
 from skindb.workflow.code_digest import code_digest
 from skindb.workflow.derive import TABLES, Derivation, groups_of
@@ -75,15 +75,15 @@ def summarise(
     code = summary_digest()
     tables = CohortRequest("tables", digest=code)
     sample = CohortRequest("surfels", surfels=surfels, seed=seed, digest=code)
-    known = Known(db, release)
+    lookup = Lookup(db, release)
     maps = CohortRequest("maps", size=size, digest=code)
     models = [
-        known.record("model", take)
+        lookup.record("model", take)
         for take in lacking(db, "model", [tables, sample], names, release=release)
     ]
-    registered = [take for take in names if known.has("registration", take)]
+    registered = [take for take in names if lookup.has("registration", take)]
     lack = lacking(db, "registration", [maps, sample], registered, release=release)
-    frames = [known.record("registration", take) for take in lack]
+    frames = [lookup.record("registration", take) for take in lack]
     done = list(
         results_of(
             map_takes(partial(_summarise_model, db, sample), models, workers=workers)

@@ -98,15 +98,7 @@ def test_info__studies_are_no_takes(tmp_path):
 
 def test_source__is_the_version_that_was_used(tmp_path):
     first = commit(tmp_path, 1.0)
-    inputs = [
-        {
-            "kind": "capture",
-            "take": "A1",
-            "generation": first.generation,
-            "path": first.path,
-        }
-    ]
-    _with(tmp_path, "model", inputs=inputs)
+    _with(tmp_path, "model", inputs=[first.as_input()])
     commit(tmp_path, 2.0)
     db = Database(tmp_path)
     model = db.read("model", "A1")
