@@ -9,9 +9,17 @@ from typing import TYPE_CHECKING, Any
 import lazy_loader
 
 if TYPE_CHECKING:
-    from skindb.workflow.administration import clean, create_release, record_consent
+    from skindb.workflow.administration import (
+        backup,
+        backup_states,
+        clean,
+        create_release,
+        record_consent,
+        restore,
+        superseded_calibrations,
+        superseded_lines,
+    )
     from skindb.workflow.audit import NotLoggedWarning, acting_as, logged_action
-    from skindb.workflow.backups import backup, backup_states, restore
     from skindb.workflow.calibration import calibrate, describe_calibration
     from skindb.workflow.cluster import computing_on, connected, dashboard_link
     from skindb.workflow.edits import basis_grid, edit, edit_grid
@@ -31,15 +39,14 @@ if TYPE_CHECKING:
         export_take,
         render_take,
         show_take,
+        translucency_grid,
     )
     from skindb.workflow.registration import register_takes, registered_datasets
     from skindb.workflow.session import capture_session, plan_session
     from skindb.workflow.simulation import begin_cohort, simulate, simulate_one
     from skindb.workflow.studies import STUDY_FUNCTIONS, study
     from skindb.workflow.summaries import summarise
-    from skindb.workflow.superseded import superseded_calibrations, superseded_lines
     from skindb.workflow.takes import faults_of, map_takes, results_of
-    from skindb.workflow.translucency_pictures import translucency_grid
     from skindb.workflow.upkeep import (
         Refreshed,
         refresh,
@@ -127,11 +134,18 @@ __all__ = [
 _attribute, _, _ = lazy_loader.attach(
     __name__,
     submod_attrs={
-        "administration": ["clean", "create_release", "record_consent"],
+        "administration": [
+            "backup",
+            "backup_states",
+            "clean",
+            "create_release",
+            "record_consent",
+            "restore",
+            "superseded_calibrations",
+            "superseded_lines",
+        ],
         "audit": ["NotLoggedWarning", "acting_as", "logged_action"],
-        "backups": ["backup", "backup_states", "restore"],
         "calibration": ["calibrate", "describe_calibration"],
-        "superseded": ["superseded_calibrations", "superseded_lines"],
         "cluster": ["computing_on", "connected", "dashboard_link"],
         "edits": ["basis_grid", "edit", "edit_grid"],
         "fit": [
@@ -146,8 +160,13 @@ _attribute, _, _ = lazy_loader.attach(
         "ingest": ["captured_subjects", "ingest_take"],
         "session": ["capture_session", "plan_session"],
         "simulation": ["begin_cohort", "simulate", "simulate_one"],
-        "pictures": ["compare_take", "export_take", "render_take", "show_take"],
-        "translucency_pictures": ["translucency_grid"],
+        "pictures": [
+            "compare_take",
+            "export_take",
+            "render_take",
+            "show_take",
+            "translucency_grid",
+        ],
         "viewing": ["explain_view", "landmark_page", "view_server", "view_takes"],
         "upkeep": ["Refreshed", "refresh", "repeat_requests", "stale_results"],
         "registration": ["register_takes", "registered_datasets"],

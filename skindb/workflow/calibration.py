@@ -31,9 +31,9 @@ from skindb.format.dome import DomeRecord
 from skindb.format.fields import NAME
 from skindb.format.folder import Capture
 from skindb.store import CALIBRATION, Database, Record, require_text
+from skindb.workflow.administration import superseded_calibrations
 from skindb.workflow.audit import logged_action
 from skindb.workflow.provenance import provenance
-from skindb.workflow.superseded import superseded_calibrations
 
 # group of a calibration -> function that applies it to a dome
 APPLIED: dict[str, Callable[..., DomeRecord]] = {

@@ -60,13 +60,13 @@ class Expected:
         """Raise an `InputError` if this process, which is the named worker, has something else."""
         if (self.version, self.code) != (__version__, package_digest()):
             rule = f"must run the same skindb as this process ({self.version})"
-            found = f"version {__version__}"
-            found += "" if __version__ != self.version else " with other source code"
+            finding = f"version {__version__}"
+            finding += "" if __version__ != self.version else " with other source code"
             raise InputError(
                 Fault(
                     f"worker {worker}",
                     rule,
-                    found,
+                    finding,
                     "install the same version, restart the worker",
                 )
             )
@@ -101,14 +101,14 @@ def connected(address: str) -> Iterator[Client]:
         cure = "run: pip install 'skindb[cluster]'"
         raise InputError(Fault("--scheduler", rule, str(error), cure)) from None
     try:
-        where = (
+        url = (
             json.loads(Path(address).read_text())["address"]
             if address.endswith(".json")
             else address
         )
         with ThreadPoolExecutor(1) as apart:  # a notebook has its own event loop
-            apart.submit(asyncio.run, _greet(where)).result()
-        client = Client(where, timeout=CONNECT_SECONDS, set_as_default=False)
+            apart.submit(asyncio.run, _greet(url)).result()
+        client = Client(url, timeout=CONNECT_SECONDS, set_as_default=False)
     # of any kind: the file and the server are not ours
     except Exception as error:  # noqa: BLE001
         rule = "a Dask scheduler must answer there"
@@ -296,10 +296,10 @@ def _received(future: Future, take: Take, client: Client) -> Outcome[Take, Any]:
     except InputError:
         raise
     except CancelledError:
-        where = str(client.scheduler.address if client.scheduler else "the scheduler")
+        url = str(client.scheduler.address if client.scheduler else "the scheduler")
         rule = "the scheduler must answer until the work is done"
         cure = "start it, and run the command again"
-        raise InputError(Fault(where, rule, "the connection was lost", cure)) from None
+        raise InputError(Fault(url, rule, "the connection was lost", cure)) from None
     except ImportError as error:
         rule = "every worker must have skindb"
         cure = "install it in the environment of the workers"

@@ -148,28 +148,28 @@ def edit_grid(
         and `trait_notes`.
     """
     source = editable_model(db, take, study, dictionary)
-    tell = progress or silent
+    report = progress or silent
     require_consent({**source.model.attrs, "take": take}, "export")
     options.setdefault("scale", _grid_scale(source.model))
     plain = radiance_of(source.model, **options).radiance
     pictures = {}
-    last = {}
-    done = 0
+    strongest = {}
+    number = 0
     steps = len(rows) * len(strengths)
-    tell("edits", 0, steps)
+    report("edits", 0, steps)
     for label, amounts in rows.items():
         pictures[label] = [plain]
         for strength in strengths:
-            last[label] = source.move(
+            strongest[label] = source.move(
                 {name: strength * amount for name, amount in amounts.items()}
             )
-            pictures[label].append(radiance_of(last[label], **options).radiance)
-            done += 1
-            tell("edits", done, steps)
+            pictures[label].append(radiance_of(strongest[label], **options).radiance)
+            number += 1
+            report("edits", number, steps)
     titles = [take, *(f"{strength:g} times the trait" for strength in strengths)]
-    labels = {label: f"{label}\n{_sides(last[label])}" for label in rows}
+    labels = {label: f"{label}\n{_sides(strongest[label])}" for label in rows}
     write_grid(out, {labels[label]: row for label, row in pictures.items()}, titles)
-    return last
+    return strongest
 
 
 @logged("render")
@@ -218,8 +218,8 @@ def basis_grid(
     columns = {}
     for k in ks:
         rng = np.random.default_rng(seed)
-        found = population_basis(cohort, tables=tables, k=k, in_metric=True, rng=rng)
-        columns[f"k = {k}"] = found["population_mixture"].values
+        reduced = population_basis(cohort, tables=tables, k=k, in_metric=True, rng=rng)
+        columns[f"k = {k}"] = reduced["population_mixture"].values
     columns[f"all {len(names)}"] = np.eye(len(names))
     options.setdefault("scale", _grid_scale(model))
     lamps = lights or [_frontal_light(model)]
@@ -232,10 +232,10 @@ def basis_grid(
         for mix in columns.values()
     ]
     write_grid(out, {take: pictures}, list(columns))
-    whole = float(np.sqrt((pictures[-1] ** 2).mean()))
+    full = float(np.sqrt((pictures[-1] ** 2).mean()))
     return {
-        name: float(np.sqrt(((one - pictures[-1]) ** 2).mean())) / whole
-        for name, one in zip(columns, pictures, strict=True)
+        name: float(np.sqrt(((picture - pictures[-1]) ** 2).mean())) / full
+        for name, picture in zip(columns, pictures, strict=True)
     }
 
 
@@ -275,8 +275,8 @@ def editable_model(
     require_fresh(db, STUDY, study)
     require_mixture(model["fitted"].to_dataset(), f"model of {take}")
     brdfs = [str(name) for name in model["fitted"].to_dataset()["dictionary"].values]
-    used = db.record(STUDY, study, vectors.attrs["generation"])
-    inputs = [db.record("model", take, model.attrs["generation"]), used]
+    study_record = db.record(STUDY, study, vectors.attrs["generation"])
+    inputs = [db.record("model", take, model.attrs["generation"]), study_record]
     placed: dict[str, Any] = {}
     if "texture" in vectors.children and (records := current_registrations(db, [take])):
         registered = registered_datasets(db, records)[take]
@@ -323,9 +323,9 @@ def _trait_study(db: Database, name: str | None) -> str:
     study = name or (stored[0] if is_only else "traits")
     if study not in stored:
         rule = "must be a study of traits in the database"
-        found = f"studies of traits: {', '.join(stored) or 'none'}"
+        finding = f"studies of traits: {', '.join(stored) or 'none'}"
         cure = "run: skindb analyze DB traits"
         if stored:
             cure = "name one of them with --study"
-        raise InputError(Fault(f"study {study}", rule, found, cure))
+        raise InputError(Fault(f"study {study}", rule, finding, cure))
     return study

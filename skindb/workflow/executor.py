@@ -184,9 +184,9 @@ def _attempt(function: Callable[[Take], Result], take: Take) -> Outcome[Take, Re
 def defective(take: Take, error: BaseException, text: str = "") -> Outcome[Take, Any]:
     """Outcome of a take that shows a defect of the program, with its traceback."""
     rule = "a take must not end in an internal error"
-    found = f"{type(error).__name__}: {error}"
+    finding = f"{type(error).__name__}: {error}"
     cure = "this is a defect of skindb: report it with the traceback that -v shows"
-    fault = Fault(str(take), rule, found, cure)
+    fault = Fault(str(take), rule, finding, cure)
     return Outcome(take, error=InputError(fault), traceback=text)
 
 

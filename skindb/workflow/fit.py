@@ -132,9 +132,9 @@ def _stored_first_pass(derivation: Derivation) -> xr.DataTree | None:
         groups = {name: ds.compute() for name, ds in groups_of(stored).items()}
     except InputError:  # damaged: it is repeated
         return None
-    first = xr.DataTree.from_dict(groups)
-    first.attrs = stored.attrs
-    return first
+    first_pass_tree = xr.DataTree.from_dict(groups)
+    first_pass_tree.attrs = stored.attrs
+    return first_pass_tree
 
 
 def _store_first_pass(derivation: Derivation, first: xr.DataTree, lease: Lease) -> None:
@@ -233,11 +233,11 @@ def takes_without_consent(db: Database, scope: str) -> list[str]:
     """Takes with a capture whose subject does not agree to a scope; damaged ones are
     not looked at.
     """
-    found = []
+    takes = []
     for take in db.takes("capture"):
         with suppress(InputError):
-            found += [take] if scope not in db.consent(take) else []
-    return found
+            takes += [take] if scope not in db.consent(take) else []
+    return takes
 
 
 def parameters_of(
@@ -271,9 +271,9 @@ def parameters_of(
     model = db.record("model", take).provenance
     if dictionary is None and model.get("dictionary", EMBEDDED) != EMBEDDED:
         rule = "a refit uses the dictionary of the model"
-        found = f"no dictionary for a model made with {model['dictionary']!r}"
+        finding = f"no dictionary for a model made with {model['dictionary']!r}"
         cure = "name it with --dictionary, or fit without --refit"
-        raise InputError(Fault(take, rule, found, cure))
+        raise InputError(Fault(take, rule, finding, cure))
     return replace(FitParameters.of({"parameters": model["requested"]}), **given)
 
 

@@ -81,9 +81,9 @@ def register_takes(
         require_consent({"consent_scope": db.consent(take), "take": take}, "statistics")
     names = sorted(takes_with_landmarks(db, takes))
     if not names:
-        found = "no take has any"
+        finding = "no take has any"
         cure = "name the 20 points in the capture's landmarks.json"
-        raise InputError(Fault(db.url, "a registration needs landmarks", found, cure))
+        raise InputError(Fault(db.url, "a registration needs landmarks", finding, cure))
     models = {take: db.record("model", take) for take in names}
     derivation = _derivation(db, models.values(), reference or "")
     stored = {take: replace(derivation, key=take).current() for take in names}
@@ -92,17 +92,17 @@ def register_takes(
         return current
     # small: every task gets all of them
     generations = {take: record.generation for take, record in models.items()}
-    tell = progress or silent
-    where: dict[str, Any] = {"workers": workers, "client": client}
+    report = progress or silent
+    resources: dict[str, Any] = {"workers": workers, "client": client}
     outlines: dict[str, Outline] = {}
     landmarks: dict[str, tuple[str, ...]] = {}
-    tell("outlines", 0, len(names))
+    report("outlines", 0, len(names))
     for take, points, shape in results_of(
-        map_takes(partial(_outline, db, generations), names, **where)
+        map_takes(partial(_outline, db, generations), names, **resources)
     ):
         landmarks[take] = points
         outlines[take] = shape
-        tell("outlines", len(outlines), len(names))
+        report("outlines", len(outlines), len(names))
     every_point = tuple(
         dict.fromkeys(name for take in names for name in landmarks[take])
     )
@@ -112,18 +112,18 @@ def register_takes(
     frame = common_frame(aligned, every_point, reference=reference)
     assert frame is not None
     call = partial(_register, derivation, generations, frame)
-    tell("register", len(current), len(names))
+    report("register", len(current), len(names))
     pending = [take for take in names if take not in current]
-    for record in results_of(map_takes(call, pending, **where)):
+    for record in results_of(map_takes(call, pending, **resources)):
         current[record.take] = record
-        tell("register", len(current), len(names))
+        report("register", len(current), len(names))
     return {take: current[take] for take in names}
 
 
 def takes_with_landmarks(db: Database, takes: Sequence[str] | None = None) -> list[str]:
     """Takes with a model and landmarks whose newest capture consents to statistics."""
-    known = db.takes("model")
-    names = known if not takes else list(dict.fromkeys(takes))
+    fitted = db.takes("model")
+    names = fitted if not takes else list(dict.fromkeys(takes))
     if not names:
         rule = "a study needs fitted takes"
         cure = "run skindb fit first"

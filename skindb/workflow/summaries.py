@@ -84,17 +84,17 @@ def summarise(
     registered = [take for take in names if lookup.has("registration", take)]
     lack = lacking(db, "registration", [maps, sample], registered, release=release)
     frames = [lookup.record("registration", take) for take in lack]
-    done = list(
+    records = list(
         results_of(
             map_takes(partial(_summarise_model, db, sample), models, workers=workers)
         )
     )
-    done += results_of(
+    records += results_of(
         map_takes(
             partial(_summarise_registration, db, sample, size), frames, workers=workers
         )
     )
-    return sorted({record.take for record in done})
+    return sorted({record.take for record in records})
 
 
 def summary_digest() -> str:
@@ -115,9 +115,9 @@ def summary_parameters(
 def model_with_summary(model: xr.DataTree) -> xr.DataTree:
     """A model with what cohorts need of it: a sample of its surfels, and tables."""
     groups = groups_of(model) | sample_groups(model) | {TABLES: tables_of(model)}
-    whole = xr.DataTree.from_dict(groups)
-    whole.attrs = model.attrs
-    return whole
+    version = xr.DataTree.from_dict(groups)
+    version.attrs = model.attrs
+    return version
 
 
 def tables_of(model: xr.DataTree) -> xr.Dataset:
@@ -165,8 +165,8 @@ def registered_parts(
             {"surfel_index": index, "region_mask": mask.T},
             coords={"region": list(masks)},
         )
-    whole = {FACE: np.ones(fitted.sizes["surfel"], np.bool_)}
-    groups[TABLES] = region_tables(fitted, whole | masks)
+    face = {FACE: np.ones(fitted.sizes["surfel"], np.bool_)}
+    groups[TABLES] = region_tables(fitted, face | masks)
     return groups
 
 

@@ -61,7 +61,7 @@ def stale_results(db: Database) -> list[Refreshed]:
     for record, reasons in stale_versions(db):
         texts = tuple(dict.fromkeys(map(str, reasons)))
         stale.append(Refreshed(record.kind, record.take, record.generation, texts))
-    return sorted(stale, key=lambda one: KINDS.index(one.kind))
+    return sorted(stale, key=lambda result: KINDS.index(result.kind))
 
 
 @logged("refresh")
@@ -100,28 +100,30 @@ def refresh(
         does not cover statistics any more, stays as it is and is refused by every step
         that would read it.
     """
-    where = {"workers": workers, "client": client}
+    resources = {"workers": workers, "client": client}
     makers: dict[str, Callable[[list[Refreshed]], list[Refreshed]]] = {
-        "model": partial(_fit_again, db, dictionary, wait, where),
-        "registration": partial(_register_again, db, where),
-        STUDY: partial(_study_again, db, dictionary),
-        "edit": partial(_edit_again, db, dictionary),
+        "model": partial(_fit_again, db, dictionary, wait, resources),
+        "registration": partial(_register_again, db, resources),
+        STUDY: partial(_repeat_again, db, dictionary),
+        "edit": partial(_repeat_again, db, dictionary),
     }
     db.complete_erasures()
-    done = list[Refreshed]()
-    tell = progress or silent
+    results = list[Refreshed]()
+    report = progress or silent
     for number, kind in enumerate(KINDS):
-        tell("refresh", number, len(KINDS))
+        report("refresh", number, len(KINDS))
         with computing_on(client if kind == STUDY else None, db.folder):
-            done += repeat_requests(db, dictionary=dictionary, kinds=(kind,))
+            results += repeat_requests(db, dictionary=dictionary, kinds=(kind,))
             # what was made before made others stale
             stale = [
-                one for one in stale_results(db) if one.kind == kind and one.generation
+                result
+                for result in stale_results(db)
+                if result.kind == kind and result.generation
             ]
             if stale:
-                done += makers[kind](stale)
-    tell("refresh", len(KINDS), len(KINDS))
-    return done
+                results += makers[kind](stale)
+    report("refresh", len(KINDS), len(KINDS))
+    return results
 
 
 @logged("refresh")
@@ -156,7 +158,7 @@ def repeat_requests(
     requests = sorted(
         db.requests(), key=lambda request: (KINDS.index(request.kind), request.take)
     )
-    done = []
+    results = []
     for request in requests:
         if request.kind in kinds:
             outcome = _again(
@@ -164,8 +166,8 @@ def repeat_requests(
             )
             if outcome.record is not None:
                 db.fulfil(request)
-            done.append(outcome)
-    return done
+            results.append(outcome)
+    return results
 
 
 def repeat_study(
@@ -239,8 +241,8 @@ def _repeat_release(db: Database, request: Request) -> Record:
     the models that it names.
     """
     pins = request.parameters.get("pins") or db.record(RELEASE, request.take).made_from
-    models = {one["take"]: one["seal"] for one in pins if one["kind"] == "model"}
-    if any(other.kind == "registration" for other in db.requests()):
+    models = {pin["take"]: pin["seal"] for pin in pins if pin["kind"] == "model"}
+    if any(waiting.kind == "registration" for waiting in db.requests()):
         rule = (
             "the registrations of a release must be computed before its next revision"
         )
@@ -258,7 +260,7 @@ def _repeat_release(db: Database, request: Request) -> Record:
             db.record("registration", take) if db.has("registration", take) else None
         )
         if record is not None and models.get(take) in {
-            one.get("seal") for one in record.made_from
+            pin.get("seal") for pin in record.made_from
         }:
             registrations.append(record.as_input())
     if not registrations and "pins" not in request.parameters:
@@ -274,75 +276,65 @@ def _fit_again(
     db: Database,
     dictionary: Path | None,
     wait: float,
-    where: Mapping[str, Any],
+    resources: Mapping[str, Any],
     stale: Sequence[Refreshed],
 ) -> list[Refreshed]:
-    known = {one.take: one for one in stale}
+    stale_models = {result.take: result for result in stale}
     call = partial(fit_with, db, given={}, refit=True, dictionary=dictionary, wait=wait)
-    done = []
-    for outcome in map_takes(call, list(known), **where, shared=db.folder):
+    results = []
+    for outcome in map_takes(call, list(stale_models), **resources, shared=db.folder):
         record = outcome.value if isinstance(outcome.value, Record) else None
-        done.append(
-            replace(known[outcome.take], record=record, fault=str(outcome.error or ""))
+        results.append(
+            replace(
+                stale_models[outcome.take],
+                record=record,
+                fault=str(outcome.error or ""),
+            )
         )
-    return done
+    return results
 
 
 def _register_again(
-    db: Database, where: Mapping[str, Any], stale: Sequence[Refreshed]
+    db: Database, resources: Mapping[str, Any], stale: Sequence[Refreshed]
 ) -> list[Refreshed]:
     """All takes together: the common (u, v) depends on each of them."""
-    first = db.record("registration", stale[0].take)
-    reference = first.provenance.get("parameters", {}).get("reference") or None
+    registration = db.record("registration", stale[0].take)
+    reference = registration.provenance.get("parameters", {}).get("reference") or None
     try:
-        records = register_takes(db, reference=reference, **where)
+        records = register_takes(db, reference=reference, **resources)
     except UnavailableError:
         raise
     except InputError as error:
-        return [replace(one, fault=str(error)) for one in stale]
+        return [replace(result, fault=str(error)) for result in stale]
     rule = "its consent does not cover statistics, or its model has no landmarks"
     return [
-        replace(one, record=records[one.take])
-        if one.take in records
-        else replace(one, fault=rule)
-        for one in stale
+        replace(result, record=records[result.take])
+        if result.take in records
+        else replace(result, fault=rule)
+        for result in stale
     ]
 
 
-def _study_again(
+def _repeat_again(
     db: Database, dictionary: Path | None, stale: Sequence[Refreshed]
 ) -> list[Refreshed]:
-    return [
-        _again(one, partial(_repeat_stored, repeat_study, db, one, dictionary))
-        for one in stale
-    ]
+    def repeat(result: Refreshed) -> Record:
+        parameters = db.record(result.kind, result.take).provenance["parameters"]
+        repeat_one = repeat_study if result.kind == STUDY else repeat_edit
+        return repeat_one(db, result.take, parameters, dictionary=dictionary)
+
+    return [_again(result, partial(repeat, result)) for result in stale]
 
 
-def _edit_again(
-    db: Database, dictionary: Path | None, stale: Sequence[Refreshed]
-) -> list[Refreshed]:
-    return [
-        _again(one, partial(_repeat_stored, repeat_edit, db, one, dictionary))
-        for one in stale
-    ]
-
-
-def _repeat_stored(
-    repeat: Callable[..., Record], db: Database, one: Refreshed, dictionary: Path | None
-) -> Record:
-    parameters = db.record(one.kind, one.take).provenance.get("parameters", {})
-    return repeat(db, one.take, parameters, dictionary=dictionary)
-
-
-def _again(one: Refreshed, make: Callable[[], Record]) -> Refreshed:
+def _again(result: Refreshed, make: Callable[[], Record]) -> Refreshed:
     """The outcome of a computation; whatever it raises does not stop the others."""
     try:
-        return replace(one, record=make())
+        return replace(result, record=make())
     except InputError as error:
-        return replace(one, fault=str(error))
+        return replace(result, fault=str(error))
     # for example parameters of another version of skindb, or too little memory
     except Exception as error:  # noqa: BLE001
         return replace(
-            one,
+            result,
             fault=f"cannot be computed by this version: {type(error).__name__}: {error}",
         )

@@ -169,10 +169,10 @@ def _faces(
     progress: Progress | None = None,
 ) -> Iterator[tuple[dict[str, Any], str]]:
     """Record and still picture of each face, see `view_takes`."""
-    tell = progress or silent
+    report = progress or silent
     around = None if environment is None else Environment.read(environment)
     for done, take in enumerate(takes):
-        tell("view", done, len(takes))
+        report("view", done, len(takes))
         model = db.read("model", take)
         require_consent({**model.attrs, "take": take}, "export")
         require_fresh(db, "model", take)
@@ -184,7 +184,7 @@ def _faces(
             ),
             still_picture(model),
         )
-    tell("view", len(takes), len(takes))
+    report("view", len(takes), len(takes))
 
 
 def landmark_page(scan: Path, out: Path, *, port: int = 0) -> PageServer:

@@ -71,7 +71,7 @@ def plan_withdrawal(
     # which was interrupted, and may have removed some of them
     if entry is not None and entry.is_withdrawal:
         removed |= Counter(entry.body.get("removed", {}))
-    own = tuple(
+    versions = tuple(
         f"{kind} of {take}: {_count(number)}"
         for (kind, take), number in holdings.takes.items()
     )
@@ -79,7 +79,7 @@ def plan_withdrawal(
         f"{record.kind} {record.generation} of {record.take}"
         for record in holdings.versions
     )
-    return Withdrawal(subject, own, users, dict(sorted(removed.items())))
+    return Withdrawal(subject, versions, users, dict(sorted(removed.items())))
 
 
 def withdraw(
@@ -159,9 +159,9 @@ def _erase_from_backups(
         try:
             erased.append(db.erase_from_backup(url, wait=wait))
         except InputError as error:  # the others are erased nevertheless
-            where = f"backup {url}, from which the subject is not removed yet"
+            title = f"backup {url}, from which the subject is not removed yet"
             faults += [
-                replace(fault, where=f"{where}: {fault.where}")
+                replace(fault, where=f"{title}: {fault.where}")
                 for fault in error.faults
             ]
     return tuple(erased), faults
@@ -171,8 +171,12 @@ def erasure_report(withdrawal: Withdrawal) -> dict[str, Any]:
     """A report of a withdrawal that can be handed out: it contains no pseudonym,
     attribute, name or path.
     """
-    again = Counter(one.kind for one in withdrawal.repeated if one.record is not None)
-    waiting = Counter(one.kind for one in withdrawal.repeated if one.record is None)
+    again = Counter(
+        result.kind for result in withdrawal.repeated if result.record is not None
+    )
+    waiting = Counter(
+        result.kind for result in withdrawal.repeated if result.record is None
+    )
     body = {
         "completed": withdrawal.date,
         "software_version": __version__,

@@ -12,7 +12,7 @@ from skindb.errors import InputError
 from skindb.render.image import read_png
 from skindb.schema import dataset
 from skindb.store import Database
-from skindb.workflow import translucency_grid, translucency_pictures
+from skindb.workflow import pictures, translucency_grid
 
 
 @pytest.fixture
@@ -62,14 +62,14 @@ def _commit(db, take, length, scope):
 
 def test_translucency_grid__shows_the_extremes(db, tmp_path, monkeypatch):
     drawn = {}
-    write = translucency_pictures.write_grid
+    write = pictures.write_grid
 
     def keep(out, rows, names):
         drawn.update(rows)
         write(out, rows, names)
 
-    monkeypatch.setattr(translucency_pictures, "write_grid", keep)
-    monkeypatch.setattr(translucency_pictures, "SIDE_PX", 160)
+    monkeypatch.setattr(pictures, "write_grid", keep)
+    monkeypatch.setattr(pictures, "SIDE_PX", 160)
     found = translucency_grid(db, tmp_path / "grid.png", samples=16)
     assert [*found] == ["A", "B"]
     np.testing.assert_allclose([*found.values()], [0.7, 2.0])
