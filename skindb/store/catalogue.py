@@ -141,11 +141,7 @@ def cached_table(lookup: Lookup) -> pd.DataFrame:
 
 
 def describe_versions(
-    db: Located,
-    *,
-    takes: Iterable[str] | None,
-    where: str | None,
-    release: str | None,
+    db: Located, *, takes: Iterable[str] | None, where: str | None, release: str | None
 ) -> dict[str, Any]:
     """See `Database.info`."""
     sections: dict[str, dict[str, Any]] = {

@@ -12,7 +12,7 @@ import pandas as pd
 import xarray as xr
 
 from skindb.errors import Fault, InputError
-from skindb.schema.consent import CONSENT, SCOPES, consent_scope
+from skindb.schema.consent import CONSENT
 from skindb.store.archive import Archive
 from skindb.store.audit import AuditEntry, append_entry, read_audit
 from skindb.store.backup import BackupReport, create_backup, erase_from_archive
@@ -23,6 +23,12 @@ from skindb.store.catalogue import (
     matching,
 )
 from skindb.store.cohort import CohortRequest, Layout, cohort
+from skindb.store.decisions import (
+    commit_release,
+    consent_history,
+    create_release,
+    record_consent,
+)
 from skindb.store.erasure import (
     Erasure,
     Holdings,
@@ -35,32 +41,14 @@ from skindb.store.garbage import Garbage, find_garbage, remove_garbage
 from skindb.store.lease import LEASE_SECONDS, Lease
 from skindb.store.location import place_at
 from skindb.store.log import Log
-from skindb.store.marker_file import note_consents, note_withdrawals
-from skindb.store.markers import (
-    Entry,
-    Markers,
-    last_entry,
-    read_markers,
-    readmit,
-)
-from skindb.store.paths import (
-    RELEASE,
-    TAKE,
-    require_text,
-    subject_of,
-)
+from skindb.store.marker_file import note_withdrawals
+from skindb.store.markers import Entry, Markers, last_entry, read_markers, readmit
+from skindb.store.paths import subject_of
 from skindb.store.record import Record
 from skindb.store.record_cache import RecordCache
 from skindb.store.requests import Request, read_requests, remove_request
-from skindb.store.snapshot import (
-    PINNED,
-    Lookup,
-    Snapshot,
-    consent_of,
-    pinned_record,
-    pins_of,
-)
-from skindb.store.stage import Stage, commit_release, read_tables, remove_version
+from skindb.store.snapshot import Lookup, Snapshot, consent_of, pinned_record, pins_of
+from skindb.store.stage import Stage, read_tables, remove_version
 from skindb.store.verified import open_group, open_version
 from skindb.store.verify import database_faults
 
@@ -118,9 +106,9 @@ class Database:
         """
         return self.place.names()
 
-    def has(self, kind: str, take: str, *, markers: Markers | None = None) -> bool:
-        """Whether a take has a version of this kind; for `markers` see `record`."""
-        return Snapshot(self.place, markers).has(kind, take)
+    def has(self, kind: str, take: str) -> bool:
+        """Whether a take has a version of this kind."""
+        return Snapshot(self.place).has(kind, take)
 
     def kinds(self, take: str | None = None) -> list[str]:
         """Kinds of the versions of one take or of all takes, without the transient kinds."""
@@ -301,42 +289,13 @@ class Database:
         InputError
             For an unknown subject or scope.
         """
-        scopes = list(dict.fromkeys(scope))
-        if unknown := [name for name in scopes if name not in SCOPES]:
-            rule = f"a scope must be one of {', '.join(SCOPES)}"
-            cure = "choose from these"
-            raise InputError(Fault("scope", rule, ", ".join(map(repr, unknown)), cure))
-        self._require_subject(subject)
-        with self.stage(CONSENT, subject) as stage:
-            record = stage.commit({"subject": subject, "consent_scope": scopes})
-        note_consents(self.place, [record])
-        return record
+        return record_consent(self.place, subject, scope)
 
     def consent_history(self, subject: str) -> list[dict[str, Any]]:
         """History of the consent of a subject, oldest first: created, scope and source
         (a capture or a record).
         """
-        sources = [
-            (record, f"capture of {take}")
-            for take in self.takes("capture")
-            if subject_of(take) == subject
-            for record in [self.record("capture", take)]
-        ]
-        sources += (
-            [(record, "record") for record in self.history(CONSENT, subject)]
-            if self.has(CONSENT, subject)
-            else []
-        )
-        if not sources:
-            self._require_subject(subject)
-        return [
-            {
-                "created": record.created,
-                "scope": list(consent_scope(record.provenance)),
-                "source": source,
-            }
-            for record, source in sources
-        ]
+        return consent_history(self.place, subject)
 
     def read_group(self, record: Record, group: str) -> xr.Dataset:
         """One group of a version, lazy and verified as in `read`, without opening the
@@ -460,27 +419,7 @@ class Database:
         InputError
             If a release of this name exists already, or if a take has no model.
         """
-        require_text(name, TAKE, "name of a release")
-        if self.has(RELEASE, name):
-            finding = f"a release of {self.record(RELEASE, name).created}"
-            rule = "a release must have a new name"
-            raise InputError(Fault(name, rule, finding, "choose another name"))
-        fitted = self.takes("model")
-        names = fitted if takes is None else list(dict.fromkeys(takes))
-        if unknown := [take for take in names if take not in fitted]:
-            rule = "a release must consist of takes with a model"
-            cure = f"takes with a model: {', '.join(fitted) or 'none'}"
-            raise InputError(Fault(take, rule, "no model", cure) for take in unknown)
-        if not names:
-            rule = "a release needs fitted takes"
-            raise InputError(Fault(name, rule, "no model", "run skindb fit first"))
-        pins = [
-            self.record(kind, take).as_input()
-            for take in names
-            for kind in PINNED
-            if self.has(kind, take)
-        ]
-        return self.commit_release(name, pins)
+        return create_release(self.place, name, takes)
 
     def commit_release(self, name: str, pins: Iterable[Mapping[str, Any]]) -> Record:
         """Commit the next revision of a release, which names these versions; prefer
@@ -732,17 +671,6 @@ class Database:
         """
         return remove_garbage(self.place, generations)
 
-    def _require_subject(self, subject: str) -> None:
-        subjects = Snapshot(self.place).subjects()
-        if subject not in subjects:
-            finding = f"subjects: {', '.join(subjects[:8]) or 'none'}"
-            finding += ", ..." if len(subjects) > 8 else ""
-            cure = "see skindb info"
-            if subject_of(subject) in subjects:
-                cure = f"the subject of that take is {subject_of(subject)}"
-            rule = "the database must hold the subject"
-            raise InputError(Fault(subject, rule, finding, cure))
-
 
 def open(url: str) -> Database:  # noqa: A001  as in xarray and zarr
     """Open a database.
@@ -750,12 +678,11 @@ def open(url: str) -> Database:  # noqa: A001  as in xarray and zarr
     Parameters
     ----------
     url
-        Folder of the database, created by the first commit if it is absent, or
-        ``s3://bucket/prefix``.
+        See `Database`.
 
     Returns
     -------
     Database
-        Handle with `takes()`, `table()`, `read(kind, take)`, `cohort(layout)` and `info()`.
+        With `takes()`, `table()`, `read(kind, take)`, `cohort(layout)` and `info()`.
     """
     return Database(url)

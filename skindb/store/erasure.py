@@ -19,6 +19,7 @@ from typing import TypeVar
 
 from skindb.errors import Fault, InputError
 from skindb.schema.consent import CONSENT
+from skindb.store.decisions import commit_release
 from skindb.store.folder import remove_tree
 from skindb.store.lease import Lease
 from skindb.store.log import Log, committed_logs, takes_below
@@ -46,7 +47,7 @@ from skindb.store.requests import (
     remove_request,
     write_request,
 )
-from skindb.store.stage import commit_release, read_names, remove_version
+from skindb.store.stage import read_names, remove_version
 
 T = TypeVar("T")
 # folders with one entry per kind, and below it one per take

@@ -30,11 +30,7 @@ from skindb.store.paths import (
 from skindb.store.place import Place
 from skindb.store.record import Record
 from skindb.store.stage import remove_version
-from skindb.store.verify import (
-    may_have_had_record,
-    partly_removed_records,
-    tombstones,
-)
+from skindb.store.verify import may_have_had_record, partly_removed_records, tombstones
 
 STILL_WRITING_SECONDS = 3600.0  # newer files may belong to a run without a lease
 KEPT_KINDS = (CONSENT, RELEASE, CALIBRATION)  # kinds of which all generations are kept

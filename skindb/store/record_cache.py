@@ -22,11 +22,7 @@ from skindb.store.markers import WithdrawnError, read_markers
 from skindb.store.paths import KIND, TAKE, TRANSIENT
 from skindb.store.place import Place, UnavailableError
 from skindb.store.record import Record
-from skindb.store.sealed import (
-    intact_or_none,
-    sealed,
-    sealed_object,
-)
+from skindb.store.sealed import intact_or_none, sealed, sealed_object
 from skindb.store.snapshot import Snapshot, identity_text, list_records
 
 CATALOGUE = "catalogue.json"

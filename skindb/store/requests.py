@@ -17,12 +17,7 @@ from typing import Any
 from skindb.errors import Fault
 from skindb.store.paths import KIND, KINDS_WITHOUT_SUBJECT, TAKE, subject_of
 from skindb.store.place import Place
-from skindb.store.sealed import (
-    collect_faults,
-    damage_as_fault,
-    sealed,
-    sealed_object,
-)
+from skindb.store.sealed import collect_faults, damage_as_fault, sealed, sealed_object
 
 REQUESTS = "requests"
 REQUEST_NAME = r"[0-9a-f]{64}\.json"

@@ -35,7 +35,6 @@ from skindb.store.markers import AdmissionGuard, read_markers, require_secret
 from skindb.store.paths import (
     GROUP,
     KINDS_OF_ONE_SUBJECT,
-    RELEASE,
     TAKE,
     TRANSIENT,
     VERSION,
@@ -357,15 +356,6 @@ class Stage:
         except InputError:
             # the unreadable record may be that of this stage, so the data are kept
             return True
-
-
-def commit_release(
-    place: Place, name: str, pins: Iterable[Mapping[str, Any]]
-) -> Record:
-    """Commit a release, or a new revision of it."""
-    inputs = [dict(pin) for pin in pins]
-    with Stage(place, RELEASE, name, names={pin["take"] for pin in inputs}) as stage:
-        return stage.commit({"command": "release", "release": name, "inputs": inputs})
 
 
 def read_names(place: Place, path: str) -> tuple[list[str], dict[str, int]] | None:

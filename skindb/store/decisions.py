@@ -1,0 +1,101 @@
+"""Consents and releases: versions that record a decision and hold no data."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from skindb.errors import Fault, InputError
+from skindb.schema.consent import CONSENT, SCOPES, consent_scope
+from skindb.store.marker_file import note_consents
+from skindb.store.paths import RELEASE, TAKE, require_text, subject_of
+from skindb.store.place import Place
+from skindb.store.record import Record
+from skindb.store.snapshot import PINNED, Snapshot
+from skindb.store.stage import Stage
+
+MAX_NAMED = 8  # subjects in a message
+
+
+def record_consent(place: Place, subject: str, scope: Iterable[str]) -> Record:
+    """See `Database.record_consent`."""
+    scopes = list(dict.fromkeys(scope))
+    if unknown := [name for name in scopes if name not in SCOPES]:
+        rule = f"a scope must be one of {', '.join(SCOPES)}"
+        finding = ", ".join(map(repr, unknown))
+        raise InputError(Fault("scope", rule, finding, "choose from these"))
+    _require_subject(place, subject)
+    with Stage(place, CONSENT, subject) as stage:
+        record = stage.commit({"subject": subject, "consent_scope": scopes})
+    note_consents(place, [record])
+    return record
+
+
+def consent_history(place: Place, subject: str) -> list[dict[str, Any]]:
+    """See `Database.consent_history`."""
+    snapshot = Snapshot(place)
+    takes = [take for take in snapshot.takes("capture") if subject_of(take) == subject]
+    sources = [
+        (snapshot.record("capture", take), f"capture of {take}") for take in takes
+    ]
+    if snapshot.has(CONSENT, subject):
+        records = snapshot.history(CONSENT, subject)
+        sources += [(record, "record") for record in records]
+    if not sources:
+        _require_subject(place, subject)
+    return [
+        {
+            "created": record.created,
+            "scope": list(consent_scope(record.provenance)),
+            "source": source,
+        }
+        for record, source in sources
+    ]
+
+
+def create_release(place: Place, name: str, takes: Sequence[str] | None) -> Record:
+    """See `Database.create_release`."""
+    require_text(name, TAKE, "name of a release")
+    snapshot = Snapshot(place)
+    if snapshot.has(RELEASE, name):
+        finding = f"a release of {snapshot.record(RELEASE, name).created}"
+        rule = "a release must have a new name"
+        raise InputError(Fault(name, rule, finding, "choose another name"))
+    fitted = snapshot.takes("model")
+    names = fitted if takes is None else list(dict.fromkeys(takes))
+    if unknown := [take for take in names if take not in fitted]:
+        rule = "a release must consist of takes with a model"
+        cure = f"takes with a model: {', '.join(fitted) or 'none'}"
+        raise InputError(Fault(take, rule, "no model", cure) for take in unknown)
+    if not names:
+        rule = "a release needs fitted takes"
+        raise InputError(Fault(name, rule, "no model", "run skindb fit first"))
+    pins = [
+        snapshot.record(kind, take).as_input()
+        for take in names
+        for kind in PINNED
+        if snapshot.has(kind, take)
+    ]
+    return commit_release(place, name, pins)
+
+
+def commit_release(
+    place: Place, name: str, pins: Iterable[Mapping[str, Any]]
+) -> Record:
+    """Commit a release, or a new revision of it."""
+    inputs = [dict(pin) for pin in pins]
+    with Stage(place, RELEASE, name, names={pin["take"] for pin in inputs}) as stage:
+        return stage.commit({"command": "release", "release": name, "inputs": inputs})
+
+
+def _require_subject(place: Place, subject: str) -> None:
+    subjects = Snapshot(place).subjects()
+    if subject in subjects:
+        return
+    finding = f"subjects: {', '.join(subjects[:MAX_NAMED]) or 'none'}"
+    finding += ", ..." if len(subjects) > MAX_NAMED else ""
+    cure = "see skindb info"
+    if subject_of(subject) in subjects:
+        cure = f"the subject of that take is {subject_of(subject)}"
+    rule = "the database must hold the subject"
+    raise InputError(Fault(subject, rule, finding, cure))
