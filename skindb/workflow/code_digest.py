@@ -12,7 +12,7 @@ import ast
 import hashlib
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -21,13 +21,13 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = "skindb"
 # The store returns what was committed, and the version of the schema, which every
 # version records, stands for the table of variables
-NOT_FOLLOWED = ("skindb.store", "skindb.schema.variables")
-WHOLE = "*"  # in place of a name: everything in a module
+NOT_FOLLOWED = ("skindb.store.", "skindb.schema.variables.")
 DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 # fields of syntax trees that follow from others or do not change what is computed
 DERIVED_FIELDS = ("ctx", "kind", "type_comment", "type_params")
 
 Symbol = tuple[str, str]  # module and name
+Reference = tuple[str, tuple[str, ...]]  # module and dotted names
 
 
 def code_digest(*functions: Callable[..., Any]) -> str:
@@ -79,156 +79,109 @@ def _symbol(function: Callable[..., Any]) -> Symbol:
 def _digest_of(root: Path, starts: tuple[Symbol, ...]) -> str:
     digest = hashlib.sha256()
     for module, name in sorted(_reached(root, starts)):
-        source = _source(root, module)
         digest.update(f"{module}:{name}\n".encode())
-        for statement in source.statements(name):
+        for statement in _source(root, module).statements(name):
             digest.update(repr(_written(statement)).encode())
     return digest.hexdigest()
 
 
 def _reached(root: Path, starts: Iterable[Symbol]) -> set[Symbol]:
     """The definitions that some definitions use, and these themselves."""
-    symbols = set(starts)
-    pending = list(symbols)
+    symbols: set[Symbol] = set()
+    references: set[Reference] = set()
+    pending: list[Reference] = [(module, (name,)) for module, name in starts]
     while pending:
-        module, name = pending.pop()
-        uses = set(_uses(root, module, name)) - symbols
-        symbols |= uses
-        pending += uses
-    return {
-        (module, name)
-        for module, name in symbols
-        if _source(root, module).defines(name)
-    }
+        reference = pending.pop()
+        if reference not in references:
+            references.add(reference)
+            pending += _followed(root, *reference, symbols)
+    return symbols
 
 
-@cache
-def _uses(root: Path, module: str, name: str) -> tuple[Symbol, ...]:
+def _followed(
+    root: Path, module: str, names: tuple[str, ...], symbols: set[Symbol]
+) -> list[Reference]:
+    """What dotted names in a module lead to; a definition is added to `symbols`."""
+    if f"{module}.".startswith(NOT_FOLLOWED):
+        return []
     source = _source(root, module)
-    if name != WHOLE and name not in source.definitions:
-        targets = [
-            _resolved(root, target, ()) for target in source.imports.get(name, ())
-        ]
-    else:
-        targets = [
-            target
-            for statement in source.statements(name)
-            for chain in _chains(statement)
-            for target in _bound(root, module, chain)
-        ]
-        if name == WHOLE:
-            imported = [target for found in source.imports.values() for target in found]
-            targets += [_resolved(root, target, ()) for target in imported]
-    return tuple(target for target in targets if not _is_left_out(target[0]))
-
-
-def _is_left_out(module: str) -> bool:
-    return any(f"{module}.".startswith(f"{package}.") for package in NOT_FOLLOWED)
-
-
-def _bound(root: Path, module: str, chain: tuple[str, ...]) -> Iterator[Symbol]:
-    """What a dotted name in a module refers to; nothing if it is local or not of skindb."""
-    source = _source(root, module)
-    if chain[0] in source.definitions:
-        yield module, chain[0]
-    for target in source.imports.get(chain[0], ()):
-        yield _resolved(root, target, chain[1:])
-
-
-def _resolved(root: Path, target: Symbol, attributes: tuple[str, ...]) -> Symbol:
-    """Follow the attributes of a module that was imported to a definition."""
-    module, name = target
-    if name == WHOLE:
-        if not attributes:
-            return target
-        return _resolved(root, (module, attributes[0]), attributes[1:])
-    if _is_module(root, f"{module}.{name}"):
-        source = _source(root, module)
-        if name not in source.definitions and set(source.imports.get(name, ())) <= {
-            target
-        }:
-            return _resolved(root, (f"{module}.{name}", WHOLE), attributes)
-    return target
+    if not names:  # the module itself
+        return [(module, (name,)) for name in (*source.definitions, *source.imports)]
+    name, *attributes = names
+    followed: list[Reference] = []
+    if name in source.definitions and (module, name) not in symbols:
+        symbols.add((module, name))
+        statements = source.statements(name)
+        followed += [(module, chain) for node in statements for chain in _chains(node)]
+    for target, path in source.imports.get(name, ()):
+        followed.append((target, (*path, *attributes)))
+    if name not in source.imports and _path(root, f"{module}.{name}") is not None:
+        followed.append((f"{module}.{name}", tuple(attributes)))
+    return followed
 
 
 @dataclass
 class _Source:
     """What the names in a module stand for."""
 
-    definitions: dict[str, list[ast.stmt]] = field(
-        default_factory=lambda: defaultdict(list)
-    )
-    imports: dict[str, list[Symbol]] = field(default_factory=lambda: defaultdict(list))
+    definitions: dict[str, list[ast.stmt]]
+    imports: dict[str, list[Reference]]
     # statements that bind no name: they may change what the others are
-    effects: list[ast.stmt] = field(default_factory=list)
-
-    def defines(self, name: str) -> bool:
-        return name == WHOLE or name in self.definitions
+    effects: list[ast.stmt]
 
     def statements(self, name: str) -> list[ast.stmt]:
-        if name == WHOLE:
-            unique = {
-                id(statement): statement
-                for statements in self.definitions.values()
-                for statement in statements
-            }
-            return [*unique.values(), *self.effects]
-        return [*self.definitions[name], *self.effects] if self.defines(name) else []
+        """The statements that define a name."""
+        return [*self.definitions[name], *self.effects]
 
 
 @cache
 def _source(root: Path, module: str) -> _Source:
+    source = _Source(defaultdict(list), defaultdict(list), [])
     path = _path(root, module)
     if path is None:
-        return _Source()
+        return source
     tree = ast.parse(path.read_bytes(), path.name)
-    source = _Source()
     for node in ast.walk(tree):
         if isinstance(node, ast.Import | ast.ImportFrom):
-            _add_imports(source, node)
+            for name, target in _imported(node):
+                is_own = target == (module, (name,))
+                if target[0].partition(".")[0] == PACKAGE and not is_own:
+                    source.imports[name].append(target)
         if isinstance(node, DOCUMENTED) and ast.get_docstring(node, clean=False):
             del node.body[0]
     for statement in tree.body:
-        _add_definitions(source, statement)
+        names = _defined(statement)
+        for name in names:
+            source.definitions[name].append(statement)
+        is_import = isinstance(statement, ast.Import | ast.ImportFrom)
+        if not names and not is_import and not _is_for_types(statement):
+            source.effects.append(statement)
     return source
 
 
-def _add_imports(source: _Source, node: ast.Import | ast.ImportFrom) -> None:
+def _imported(node: ast.Import | ast.ImportFrom) -> Iterator[tuple[str, Reference]]:
+    """Names that an import binds, and what they stand for."""
     for alias in node.names:
         if isinstance(node, ast.ImportFrom):
-            target = (str(node.module), alias.name)
-            name = alias.asname or alias.name
+            yield alias.asname or alias.name, (str(node.module), (alias.name,))
         elif alias.asname:
-            target = (alias.name, WHOLE)
-            name = alias.asname
+            yield alias.asname, (alias.name, ())
         else:
             name = alias.name.partition(".")[0]
-            target = (name, WHOLE)
-        if target[0].partition(".")[0] == PACKAGE:
-            source.imports[name].append(target)
+            yield name, (name, ())
 
 
-def _add_definitions(source: _Source, statement: ast.stmt) -> None:
-    if isinstance(statement, ast.Import | ast.ImportFrom) or _is_for_types(statement):
-        return
-    names = {
-        node.id
-        for node in ast.walk(statement)
-        if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)
-    }
-    if isinstance(statement, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
-        # `@overload(function)` changes what `function` is
-        names = {statement.name} | {
-            argument.id
-            for decorator in statement.decorator_list
-            if isinstance(decorator, ast.Call)
-            for argument in decorator.args
-            if isinstance(argument, ast.Name)
-        }
-    for name in names:
-        source.definitions[name].append(statement)
-    if not names:
-        source.effects.append(statement)
+def _defined(statement: ast.stmt) -> set[str]:
+    """Names that a statement of a module binds or changes."""
+    if not isinstance(statement, DOCUMENTED):
+        nodes = [node for node in ast.walk(statement) if isinstance(node, ast.Name)]
+        return {node.id for node in nodes if isinstance(node.ctx, ast.Store)}
+    assert not isinstance(statement, ast.Module)
+    # `@overload(function)` changes what `function` is
+    calls = [call for call in statement.decorator_list if isinstance(call, ast.Call)]
+    arguments = [argument for call in calls for argument in call.args]
+    changed = {node.id for node in arguments if isinstance(node, ast.Name)}
+    return {statement.name} | changed
 
 
 def _is_for_types(statement: ast.stmt) -> bool:
@@ -273,10 +226,6 @@ def _annotations(node: ast.AST) -> tuple[str, ...]:
     if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
         return ("returns",)
     return ("annotation",) if isinstance(node, ast.arg) else ()
-
-
-def _is_module(root: Path, module: str) -> bool:
-    return _path(root, module) is not None
 
 
 @cache
