@@ -135,7 +135,7 @@ def measure(
         for state in ("cold", "later", "refitted") if name != "takes" else ("later",):
             times = []
             for number in range(repeat):
-                place = skindb.open(url)._place
+                place = skindb.open(url).place
                 if state == "cold":
                     place.remove(CATALOGUE)
                 elif state == "refitted":

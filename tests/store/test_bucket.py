@@ -94,7 +94,7 @@ def test_stage__whole_shards_are_put_and_read_in_parts(home):
 
 
 def test_stage__left_without_commit_leaves_nothing(home):
-    place = Database(home)._place
+    place = Database(home).place
 
     def interrupted():
         with Database(home).stage("capture", "A1") as stage:
@@ -109,7 +109,7 @@ def test_stage__left_without_commit_leaves_nothing(home):
 
 def test_remove__leaves_a_tombstone(home):
     records = [commit(home, value) for value in (1.0, 2.0, 3.0)]
-    place = Database(home)._place
+    place = Database(home).place
     Log(place, "capture", "A1").remove(2)
     assert not place.sizes(records[1].path)
     assert place.file_type(records[1].beside("manifest")) == ""
@@ -126,7 +126,7 @@ def _flip(place, key):
 
 def test_verify__finds_changed_missing_and_foreign_objects(home):
     records = {take: commit(home, take=take) for take in ("A1", "A2", "A3", "A4", "A5")}
-    place = Database(home)._place
+    place = Database(home).place
     _flip(place, f"{records['A1'].path}/surfels/surfel_area/c/0")
     place.remove(f"{records['A2'].path}/samples/light/zarr.json")
     place.replace(f"{records['A3'].path}/stray", b"x")
@@ -188,7 +188,7 @@ def test_commit__racing_writers_on_eight_keys(home):
 
 
 def test_create__one_of_many_wins(atomic_home):
-    place = Database(atomic_home)._place
+    place = Database(atomic_home).place
     for number in range(20):
         with ThreadPoolExecutor(WRITERS) as pool:
             won = list(
@@ -305,7 +305,7 @@ def test_read__parts_are_those_of_a_folder(bucket, tmp_path, limits):
 def test_place__answers_are_those_of_a_folder(home, tmp_path):
     """The calls that `verify`, the log and the lists of takes make."""
     answers = []
-    for place in (Database(home)._place, Folder(tmp_path / "other")):
+    for place in (Database(home).place, Folder(tmp_path / "other")):
         assert place.names() is None
         place.replace("log/a/x.json", b"1")
         place.replace("log/a/y/z.json", b"12")
@@ -425,7 +425,7 @@ def test_bucket__one_request_in_ten_fails(
         monkeypatch.setenv("AWS_ENDPOINT_URL", proxy.address)
         for value in range(5):
             assert commit(url, value).generation == value + 1
-        Log(Database(url)._place, "capture", "A1").remove(2)
+        Log(Database(url).place, "capture", "A1").remove(2)
         db = Database(url)
         assert db.verify() == []
         assert [
