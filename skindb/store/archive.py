@@ -167,6 +167,15 @@ class Archive:
             if (match := STATE.fullmatch(name))
         ]
 
+    def newest(self) -> int:
+        """Number of the newest state; `InputError` if there is none."""
+        numbers = self.numbers()
+        if not numbers:
+            rule = "a backup must hold a state"
+            cure = "run skindb backup again"
+            raise InputError(Fault(self.place.name, rule, "none", cure))
+        return numbers[-1]
+
     def state(self, number: int) -> State:
         """A state; `InputError` if it does not exist or is damaged."""
         key = f"{STATES}/{number:06d}.json"

@@ -165,27 +165,10 @@ def cohort(
     base = "registration" if layout == "maps" else kind
     names, skipped = _members(lookup, base, takes)
     records = {take: lookup.record(base, take) for take in names}
-    stored = {
-        take: _stored_record(lookup, record, request)
-        for take, record in records.items()
-    }
-    if missing := [take for take, version in stored.items() if version is None]:
-        contents = {
-            "tables": "tables",
-            "surfels": f"a sample of {request.surfels} surfels with seed {request.seed}",
-        }
-        rule = (
-            f"a version of kind {base} must store "
-            f"{contents.get(layout, f'maps of {request.size} texels')} for cohorts"
-        )
-        cure = "call skindb.workflow.summarise for them"
-        raise InputError(
-            Fault(few_names(missing), rule, "none, or different ones", cure)
-        )
+    stored = _stored_records(lookup, records, request)
     parts = [
         _part(lookup, records[take], version, request, chosen)
         for take, version in stored.items()
-        if version is not None
     ]
     if empty := [
         part.take
@@ -205,6 +188,32 @@ def cohort(
     }
     combined = combine(parts, variables=chosen, sizes=sizes, attrs=attrs)
     return one_take_each(combined) if dim == "subject" else combined
+
+
+def _stored_records(
+    lookup: Lookup, records: Mapping[str, Record], request: CohortRequest
+) -> dict[str, Record]:
+    """The versions with the data of each take; an `InputError` names takes without them."""
+    stored = {}
+    missing = []
+    for take, record in records.items():
+        version = _stored_record(lookup, record, request)
+        if version is None:
+            missing.append(take)
+        else:
+            stored[take] = version
+    if missing:
+        contents = {
+            "tables": "tables",
+            "surfels": f"a sample of {request.surfels} surfels with seed {request.seed}",
+            "maps": f"maps of {request.size} texels",
+        }
+        kind = records[missing[0]].kind
+        rule = f"a version of kind {kind} must store {contents[request.layout]} for cohorts"
+        cure = "call skindb.workflow.summarise for them"
+        finding = "none, or different ones"
+        raise InputError(Fault(few_names(missing), rule, finding, cure))
+    return stored
 
 
 def _outdated(lookup: Lookup, records: Mapping[str, Record]) -> list[Note]:

@@ -44,36 +44,21 @@ def require_inputs(place: Place, provenance: Mapping[str, Any]) -> list[Record]:
     """
     records = []
     faults = []
-    rule = "the inputs of a version must exist when it is committed"
     for reference in _inputs_of(provenance):
+        title = _name(reference)
         record = _record_of(place, reference)
         if record is None:
-            faults.append(
-                Fault(
-                    _name(reference),
-                    rule,
-                    "it was removed during the run",
-                    "run the command again",
-                )
-            )
+            rule = "the inputs of a version must exist when it is committed"
+            finding = "it was removed during the run"
+            faults.append(Fault(title, rule, finding, "run the command again"))
             continue
         records.append(record)
-        shared = [
-            product
-            for product in record.made_from
-            if product["kind"] in KINDS_WITHOUT_SUBJECT
-        ]
-        for product in shared:
-            if _record_of(place, product) is None:
-                rule = "the inputs of an input must exist"
-                faults.append(
-                    Fault(
-                        _name(reference),
-                        rule,
-                        f"{_name(product)} was removed",
-                        "run skindb refresh",
-                    )
-                )
+        rule = "the inputs of an input must exist"
+        for product in record.made_from:
+            is_shared = product["kind"] in KINDS_WITHOUT_SUBJECT
+            if is_shared and _record_of(place, product) is None:
+                finding = f"{_name(product)} was removed"
+                faults.append(Fault(title, rule, finding, "run skindb refresh"))
     if faults:
         raise InputError(faults)
     return records

@@ -159,22 +159,10 @@ def restore_backup(
     place.is_unlocked = True
     require_apart(archive.place, place)
     _require_empty(place)
-    numbers = archive.numbers()
-    if not numbers:
-        raise InputError(
-            Fault(
-                archive.place.name,
-                "a backup must hold a state",
-                "none",
-                "run skindb backup again",
-            )
-        )
-    state = archive.state(numbers[-1] if number is None else number)
-    notes = (
-        Notes()
-        if marker_file is None
-        else read_marker_file(marker_file, require_secret(archive.place))
-    )
+    state = archive.state(archive.newest() if number is None else number)
+    notes = Notes()
+    if marker_file is not None:
+        notes = read_marker_file(marker_file, require_secret(archive.place))
     plan = _plan(archive, state, notes)
     place.create(LOCK, b"{}")
     with Lease(place, "restore", (RELEASE,), command="skindb restore"):

@@ -43,7 +43,7 @@ from skindb.store.paths import (
 from skindb.store.place import Place, UnavailableError
 from skindb.store.record import Record, own_takes, subjects_of
 from skindb.store.sealed import intact_or_none, json_object
-from skindb.store.verified import read_beside
+from skindb.store.verified import Manifest, read_beside
 
 MIN_CHUNK_SURFELS = 256  # in a chunk, the smallest unit of reading
 MIN_CHUNK_BYTES = 1 << 19  # a smaller chunk gets more surfels
@@ -239,29 +239,14 @@ class Stage:
             )
             # the data first, then the record; transient results need not survive a power loss
             self.place.make_durable(self.path, flush=self.log.kind not in TRANSIENT)
-        sizes = {
-            name: size
-            for name, size in self.place.sizes(self.path).items()
-            if size >= 0
-        }
-        if gone := [
-            name for name in sorted(self.groups) if f"{name}/zarr.json" not in sizes
-        ]:
-            rule = "all groups of a version must exist when it is committed"
-            finding = f"that another process removed {', '.join(gone)}"
-            cure = "run the command again"
-            raise InputError(Fault(self.log.what, rule, finding, cure))
-        files = {
-            name: (self.place.digest(f"{self.path}/{name}"), size)
-            for name, size in sorted(sizes.items())
-        }
+        files = self._written_files()
         record = Record(
             kind=self.log.kind,
             take=self.log.take,
             generation=self.base + 1,
             path=self.path,
             created=self.created,
-            bytes=sum(sizes.values()),
+            bytes=sum(size for _, size in files.values()),
             provenance=attrs,
             names=tuple(names),
             admissions=self._admissions(),
@@ -269,11 +254,9 @@ class Stage:
             previous=self.previous,
         )
         manifest = self._create_beside(record, "manifest", files)
-        tables = (
-            ""
-            if self.tables is None
-            else self._create_beside(record, TABLES, tables_to_json(self.tables))
-        )
+        tables = ""
+        if self.tables is not None:
+            tables = self._create_beside(record, TABLES, tables_to_json(self.tables))
         require_consents(self.place, self.log.kind, self.log.take, attrs)
         if self.lease is not None:
             # as late as possible, because a process can be suspended at any time
@@ -283,6 +266,23 @@ class Stage:
         )
         self.committed = True
         return record
+
+    def _written_files(self) -> Manifest:
+        """Digest and size of every file, with those of all groups that were written."""
+        sizes = self.place.sizes(self.path)
+        gone = [
+            name for name in sorted(self.groups) if f"{name}/zarr.json" not in sizes
+        ]
+        if gone:
+            rule = "all groups of a version must exist when it is committed"
+            finding = f"that another process removed {', '.join(gone)}"
+            cure = "run the command again"
+            raise InputError(Fault(self.log.what, rule, finding, cure))
+        return {
+            name: (self.place.digest(f"{self.path}/{name}"), size)
+            for name, size in sorted(sizes.items())
+            if size >= 0
+        }
 
     def _require_names(self, provenance: Mapping[str, Any]) -> list[str]:
         """The other takes that the version refers to, which must have been named when
