@@ -112,9 +112,7 @@ class Database:
 
     def kinds(self, take: str | None = None) -> list[str]:
         """Kinds of the versions of one take or of all takes, without the transient kinds."""
-        snapshot = Snapshot(self.place)
-        kinds = snapshot.kinds()
-        return [kind for kind in kinds if not take or take in snapshot.takes(kind)]
+        return Snapshot(self.place).kinds(take)
 
     def takes(
         self,

@@ -70,11 +70,14 @@ class Snapshot:
         self.place = place
         self.markers = read_markers(place) if markers is None else markers
 
-    def kinds(self) -> list[str]:
-        """Kinds of the versions of all takes, without the transient kinds."""
+    def kinds(self, take: str | None = None) -> list[str]:
+        """Kinds of the versions of one take or of all takes, without the transient kinds."""
         names = {*self.place.children("log"), *self._head_names("")} - {*TRANSIENT}
         kinds = [name for name in sorted(names) if re.fullmatch(KIND, name)]
-        return [kind for kind in kinds if self.takes(kind)]
+        takes = {kind: self.takes(kind) for kind in kinds}
+        return [
+            kind for kind in kinds if (take in takes[kind] if take else takes[kind])
+        ]
 
     def takes(self, kind: str) -> list[str]:
         """Takes with a version of this kind, including those whose records were lost."""

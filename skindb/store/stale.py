@@ -145,8 +145,9 @@ class Staleness:
         return self._newest[kind, take]
 
     def _records(self, kind: str) -> Records:
-        is_cached = self._cache is not None and kind in CACHED_KINDS
-        return self._cache if self._cache and is_cached else self._snapshot
+        if self._cache is not None and kind in CACHED_KINDS:
+            return self._cache
+        return self._snapshot
 
 
 def require_fresh(
