@@ -7,6 +7,7 @@ A subject may be withdrawn, or change the consent, while the version is computed
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from functools import partial
 from typing import Any
 
 from skindb.errors import Fault, InputError
@@ -19,8 +20,9 @@ from skindb.store.paths import (
     STUDY,
     subject_of,
 )
-from skindb.store.place import Place, UnavailableError
+from skindb.store.place import Place
 from skindb.store.record import Record, own_takes
+from skindb.store.sealed import intact_or_none
 
 # kind -> scope that its subjects must consent to when it is committed; a record of
 # consent needs none
@@ -140,15 +142,10 @@ def _inputs_of(provenance: Mapping[str, Any]) -> list[Mapping[str, Any]]:
 
 def _record_of(place: Place, reference: Mapping[str, Any]) -> Record | None:
     """The record of an input; None if it was removed or replaced."""
-    try:
-        record = Log(place, reference["kind"], reference["take"]).read(
-            reference["generation"]
-        )
-    except UnavailableError:
-        raise
-    except InputError:
-        return None
-    return record if record.seal == reference["seal"] else None
+    log = Log(place, reference["kind"], reference["take"])
+    record = intact_or_none(partial(log.read, reference["generation"]))
+    is_same = record is not None and record.seal == reference["seal"]
+    return record if is_same else None
 
 
 def _name(reference: Mapping[str, Any]) -> str:

@@ -13,6 +13,7 @@ from collections.abc import Callable, Hashable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from skindb.errors import Fault, InputError
@@ -143,15 +144,6 @@ class RecordCache:
 
         Errors of single records are ignored here; they are raised when the record is requested.
         """
-
-        def read(key: tuple[str, str, int | None]) -> None:
-            try:
-                self._read(*key)
-            except UnavailableError:
-                raise
-            except InputError:
-                return
-
         chosen = {*kinds}
         newest = [(*key, None) for key in self._generations if key[0] in chosen]
         missing = [
@@ -164,7 +156,9 @@ class RecordCache:
         ]
         pool = ThreadPoolExecutor(READER_THREADS)
         try:
-            list(pool.map(read, missing))
+            list(
+                pool.map(intact_or_none, [partial(self._read, *key) for key in missing])
+            )
         finally:
             # if a bucket does not answer one request, it does not answer the others
             pool.shutdown(cancel_futures=True)
@@ -271,12 +265,8 @@ def _generations(files: Iterable[Key]) -> dict[tuple[str, str], list[int]]:
 
 def _list_heads(place: Place) -> dict[tuple[str, str], tuple[Hashable, ...]]:
     """Identity of every head, by kind and take; empty if the folder of heads is damaged."""
-    try:
-        identities = place.identities("heads")
-    except UnavailableError:
-        raise
-    except InputError:  # a link
-        return {}
+    # a link in place of the folder is damage
+    identities = intact_or_none(partial(place.identities, "heads")) or {}
     parts = {
         name: name.removesuffix(".json").partition("/")
         for name in identities

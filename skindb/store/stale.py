@@ -129,14 +129,9 @@ class Staleness:
 
     def _is_covered(self, take: str) -> bool:
         if take not in self._covered:
-            try:
-                self._covered[take] = "statistics" in consent_of(
-                    self._records(CONSENT), take
-                )
-            except UnavailableError:
-                raise
-            except InputError:  # the consent of the subject is unknown
-                self._covered[take] = False
+            # None: the consent of the subject is unknown
+            scope = intact_or_none(partial(consent_of, self._records(CONSENT), take))
+            self._covered[take] = scope is not None and "statistics" in scope
         return self._covered[take]
 
     def _newest_of(self, kind: str, take: str) -> int:
