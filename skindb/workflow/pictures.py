@@ -16,8 +16,7 @@ from skindb.export.gltf import export_gltf
 from skindb.files import make_private
 from skindb.render.figures import write_field, write_grid
 from skindb.render.photographs import Comparison, compare_photographs
-from skindb.render.picture import chosen_camera
-from skindb.render.rendering import render, render_picture
+from skindb.render.rendering import chosen_camera, render, render_picture
 from skindb.render.scene import Camera, Lights
 from skindb.schema.consent import require_consent
 from skindb.store import Database, require_fresh
