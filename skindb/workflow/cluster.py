@@ -9,7 +9,7 @@ import asyncio
 import json
 import threading
 import uuid
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -29,6 +29,7 @@ from skindb.workflow.code_digest import package_digest
 from skindb.workflow.executor import (
     KilledError,
     Outcome,
+    Outcomes,
     Result,
     Take,
     defective,
@@ -253,7 +254,7 @@ class Cluster:
 
     def outcomes(
         self, function: Callable[[Take], Result], takes: Sequence[Take]
-    ) -> Generator[Outcome[Take, Result], None, None]:
+    ) -> Outcomes[Take, Result]:
         """See `Executor`.
 
         Raises

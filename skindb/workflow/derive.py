@@ -109,39 +109,16 @@ class Derivation:
             return stage.commit({**defaults, **attrs, **self.provenance})
 
 
-def derive(
-    db: Database,
-    kind: str,
-    key: str,
-    *,
-    inputs: Iterable[Record],
-    parameters: Mapping[str, Any],
-    compute: Callable[[], xr.DataTree],
-    names: Iterable[str] = (),
-    **decisive: Any,
-) -> Record:
+def derive(derivation: Derivation, compute: Callable[[], xr.DataTree]) -> Record:
     """The stored version if it is current, or a new one, which is computed and committed.
 
     Parameters
     ----------
-    db, kind, key, inputs, names, **decisive
-        See `Derivation.of`.
-    parameters
-        Parameters of the computation.
+    derivation
+        What decides the content of the version.
     compute
-        Function of skindb, or a partial of one, that returns the groups of the version,
-        with further attributes; see `Derivation.commit`.
+        Returns its groups and further attributes; see `Derivation.commit`.
     """
-    derivation = Derivation.of(
-        db,
-        kind,
-        key,
-        inputs=inputs,
-        code=[compute],
-        names=names,
-        parameters=parameters,
-        **decisive,
-    )
     return derivation.current() or derivation.commit(compute())
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from skindb.store import STUDY, Database, require_fresh
 from skindb.types import Progress, silent
 from skindb.workflow import study_inputs
 from skindb.workflow.audit import logged
-from skindb.workflow.derive import Derivation
+from skindb.workflow.derive import Derivation, derive
 from skindb.workflow.fit import dictionary_at
 from skindb.workflow.registration import current_registrations, registered_datasets
 
@@ -89,8 +90,7 @@ def edit(
         data the study used withdrew it.
     """
     source = editable_model(db, take, study, dictionary)
-    derivation = source.derivation_by(amounts)
-    record = derivation.current() or derivation.commit(source.move(amounts))
+    record = derive(source.derivation_by(amounts), partial(source.move, amounts))
     return db.read("edit", take, generation=record.generation)
 
 

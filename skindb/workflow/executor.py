@@ -65,12 +65,15 @@ class Outcome(Generic[Take, Result]):
         return self.value  # type: ignore[return-value]
 
 
+Outcomes = Generator[Outcome[Take, Result], None, None]
+
+
 class Executor(Protocol):
     """Where the calls for takes run."""
 
     def outcomes(
         self, function: Callable[[Take], Result], takes: Sequence[Take]
-    ) -> Generator[Outcome[Take, Result], None, None]:
+    ) -> Outcomes[Take, Result]:
         """Call a function for every take; yield each outcome as soon as it is available.
 
         Where a process was killed, the takes that it and its neighbours were working on
@@ -83,7 +86,7 @@ class ThisProcess:
 
     def outcomes(
         self, function: Callable[[Take], Result], takes: Sequence[Take]
-    ) -> Generator[Outcome[Take, Result], None, None]:
+    ) -> Outcomes[Take, Result]:
         """See `Executor`."""
         for take in takes:
             yield _attempt(function, take)
@@ -97,7 +100,7 @@ class LocalProcesses:
 
     def outcomes(
         self, function: Callable[[Take], Result], takes: Sequence[Take]
-    ) -> Generator[Outcome[Take, Result], None, None]:
+    ) -> Outcomes[Take, Result]:
         """See `Executor`."""
         call = partial(
             pickled_outcome, function, max(1, thread_count() // self.workers)

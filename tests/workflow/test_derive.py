@@ -40,19 +40,12 @@ def db(tmp_path):
 def _derived(db, calls, **changed):
     options = {
         "inputs": [db.record("model", take) for take in ("A", "B")],
+        "code": registration.METHOD,
         "parameters": {"reference": ""},
         "names": ["A", "B"],
-        "compute": partial(_computed, calls),
     }
-    return derive(db, "registration", "A", **options | changed)
-
-
-def _computed(calls):
-    return _version(calls, take="A")
-
-
-_computed.__module__ = "skindb.analysis.registration"
-_computed.__qualname__ = "register_one"
+    derivation = Derivation.of(db, "registration", "A", **options | changed)
+    return derive(derivation, partial(_version, calls, take="A"))
 
 
 def test_derive__computes_once(db):
@@ -106,8 +99,7 @@ def test_method__depends_on_the_kernels_that_it_uses(method, change, change_code
 
 def test_derivation__describes_only_what_was_derived_alike(db):
     models = [db.record("model", "A")]
-    method = [_computed]
-    options = {"inputs": models, "code": method, "names": ["A"]}
+    options = {"inputs": models, "code": registration.METHOD, "names": ["A"]}
     derivation = Derivation.of(db, "registration", "A", **options, parameters={"k": 1})
     assert derivation.current() is None
     record = derivation.commit(_version([]))
