@@ -33,7 +33,6 @@ from skindb.format.folder import Capture
 from skindb.store import CALIBRATION, Database, Record, require_text
 from skindb.workflow.administration import superseded_calibrations
 from skindb.workflow.audit import logged_action
-from skindb.workflow.provenance import provenance
 
 # group of a calibration -> function that applies it to a dome
 APPLIED: dict[str, Callable[..., DomeRecord]] = {
@@ -108,7 +107,12 @@ def calibrate(
         "fit_falloff": fit_falloff,
         "position_error": position_error,
     }
-    about = provenance("calibrate", [], parameters=parameters)
+    about = {
+        "command": "calibrate",
+        "parameters": parameters,
+        "seeds": {},
+        "inputs": [],
+    }
     with logged_action(db, "calibrate"), db.stage(CALIBRATION, key) as stage:
         stage.write(groups)
         return stage.commit(about)
