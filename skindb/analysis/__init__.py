@@ -51,7 +51,6 @@ from skindb.analysis.group_effects import (
 )
 from skindb.analysis.masks import mask_agreement, region_masks, take_masks
 from skindb.analysis.mean_face import mean_face, plot_mean_face
-from skindb.analysis.members import groups_by, sides, trait_names
 from skindb.analysis.population_basis import population_basis
 from skindb.analysis.registration import (
     correspondence_error,
@@ -61,6 +60,7 @@ from skindb.analysis.registration import (
     tabulate_registration,
 )
 from skindb.analysis.studies import STUDIES, describe_study, plot_study, tabulate_study
+from skindb.analysis.subjects import groups_by, sides, subjects_of, trait_names
 from skindb.analysis.summary import (
     cohort_of,
     region_tables,
@@ -125,6 +125,7 @@ __all__ = [
     "register",
     "sample_surfels",
     "sides",
+    "subjects_of",
     "summary_tables",
     "tabulate_basis_size",
     "tabulate_brdf_space",

@@ -13,7 +13,6 @@ import xarray as xr
 
 from skindb.analysis import colours, texture
 from skindb.analysis.each_take import each_take
-from skindb.analysis.members import groups_by, takes_to_compare
 from skindb.analysis.study import (
     Population,
     Results,
@@ -22,6 +21,7 @@ from skindb.analysis.study import (
     group_option,
     table_of,
 )
+from skindb.analysis.subjects import groups_by, takes_to_compare
 from skindb.analysis.summary import SAMPLED
 from skindb.errors import Fault, InputError
 from skindb.numerics.statistics import Moments
@@ -246,8 +246,8 @@ def albedo_table(
         that it cancels in differences of groups but not in ratios, and it matters most
         for dark skin.
     """
-    takes = takes_to_compare(cohort, group_by)
-    groups = groups_by(takes, group_by)
+    takes, people = takes_to_compare(cohort, group_by)
+    groups = groups_by(people, group_by)
     names = sorted(set(groups))
     even = _even_reflection(takes)
     labels = [str(take) for take in takes["take"].values]

@@ -19,15 +19,6 @@ from numpy.typing import NDArray
 
 from skindb.analysis.brdf_plots import plot_space
 from skindb.analysis.each_take import each_item
-from skindb.analysis.members import (
-    NORMAL,
-    OTHER,
-    UNKNOWN,
-    groups_by,
-    numeric_attributes,
-    takes_to_compare,
-    texts,
-)
 from skindb.analysis.population_basis import population_basis
 from skindb.analysis.study import (
     DICTIONARY,
@@ -37,6 +28,16 @@ from skindb.analysis.study import (
     compared_option,
     permutations_option,
     seed_option,
+)
+from skindb.analysis.subjects import (
+    NORMAL,
+    OTHER,
+    UNKNOWN,
+    Subjects,
+    groups_by,
+    numeric_attributes,
+    subjects_of,
+    takes_to_compare,
 )
 from skindb.analysis.summary import SAMPLED
 from skindb.errors import Fault, InputError
@@ -151,7 +152,7 @@ def brdf_space(
     if not mixed_fits:
         require_same_fit(cohort)
     takes, named, flags = grouped_takes(cohort, group_by)
-    coefficient = _coefficients(takes, basis)
+    coefficient = _coefficients(takes.take, basis)
     [(metric, brdf)] = each_item(
         _metric_and_basis(basis["population_mixture"].values.astype(np.float64)),
         [tables],
@@ -190,7 +191,7 @@ def brdf_space(
         **compared,
     }
     pairs = [f"{a} to {b}" for a, b in combinations(subjects.groups, 2)]
-    labels = [str(take) for take in takes["take"].values]
+    labels = list(takes.take)
     coords: dict[str, Any] = {
         "group": list(subjects.groups),
         "pair": pairs,
@@ -216,7 +217,7 @@ def brdf_space(
 
 def grouped_takes(
     cohort: xr.Dataset, group_by: str
-) -> tuple[xr.Dataset, list[str], list[str]]:
+) -> tuple[Subjects, list[str], list[str]]:
     """Takes that belong to a group, the names of their groups, and a flag about excluded takes.
 
     Raises
@@ -224,7 +225,7 @@ def grouped_takes(
     InputError
         If there are fewer than two groups or subjects, or if the attribute is numeric.
     """
-    if group_by in numeric_attributes(cohort):
+    if group_by in numeric_attributes(subjects_of(cohort)):
         cure = (
             "group by a trait, such as age:older"
             if group_by == "age"
@@ -238,7 +239,7 @@ def grouped_takes(
                 cure,
             )
         )
-    counted = takes_to_compare(cohort, group_by)
+    _, counted = takes_to_compare(cohort, group_by)
     named = groups_by(counted, group_by)
     kept = [i for i, name in enumerate(named) if name not in (UNKNOWN, OTHER)]
     groups = sorted({named[i] for i in kept})
@@ -248,7 +249,8 @@ def grouped_takes(
         raise InputError(
             Fault(f"group by {group_by}", rule, found, "group by another attribute")
         )
-    if len(set(texts(counted["subject"].isel(take=kept)))) < 2:
+    subjects = counted.select(kept)
+    if len(subjects.names) < 2:
         cure = "add the takes of other subjects"
         raise InputError(
             Fault(
@@ -266,10 +268,10 @@ def grouped_takes(
         if left
         else []
     )
-    return counted.isel(take=kept), [named[i] for i in kept], flags
+    return subjects, [named[i] for i in kept], flags
 
 
-def _coefficients(takes: xr.Dataset, basis: xr.Dataset) -> Array:
+def _coefficients(names: Sequence[str], basis: xr.Dataset) -> Array:
     """Coefficients (take, component) of the takes; raises `InputError` for missing ones
     and for a dependent basis.
     """
@@ -289,7 +291,6 @@ def _coefficients(takes: xr.Dataset, basis: xr.Dataset) -> Array:
                 "choose a smaller k",
             )
         )
-    names = [str(take) for take in takes["take"].values]
     known = {str(take): i for i, take in enumerate(basis["take"].values)}
     stored = basis["take_coefficient"].values.astype(np.float64)
     bad = [
@@ -327,10 +328,10 @@ def _metric_root(metric: Array) -> Array:
 
 
 def _by_subject(
-    takes: xr.Dataset, named: Sequence[str], coefficient: Array, place: Array
+    takes: Subjects, named: Sequence[str], coefficient: Array, place: Array
 ) -> _Subjects:
     """Average the takes of every subject within each group; the group "normal" is the first."""
-    who = np.array([str(one) for one in texts(takes["subject"])])
+    who = np.array(takes.subject)
     group = np.array(named)
     groups = sorted(set(named), key=lambda name: (name != NORMAL, name))
     members = [

@@ -25,7 +25,6 @@ from skindb.analysis import colours
 from skindb.analysis.each_take import each_take
 from skindb.analysis.masks import region_masks
 from skindb.analysis.mean_face import mean_face
-from skindb.analysis.members import groups_by, takes_to_compare
 from skindb.analysis.study import (
     Population,
     Results,
@@ -34,6 +33,7 @@ from skindb.analysis.study import (
     seed_option,
     table_of,
 )
+from skindb.analysis.subjects import groups_by, takes_to_compare
 from skindb.analysis.texture import COVERED, DARKEST, LEAST_COVERED, MAPPED
 from skindb.errors import Fault, InputError
 from skindb.numerics.statistics import Moments, known_mean
@@ -311,9 +311,8 @@ def chromophore_table(
     Dataset
         (group, region, chromophore), see the variables of the group "chromophore_table".
     """
-    takes = takes_to_compare(cohort, group_by)
-    groups = groups_by(takes, group_by)
-    subjects = [str(one) for one in takes["subject"].values.tolist()]
+    takes, people = takes_to_compare(cohort, group_by)
+    groups = groups_by(people, group_by)
     names = sorted(set(groups))
     values = (
         statistics["take_chromophore"]
@@ -323,7 +322,7 @@ def chromophore_table(
     parts = []
     for name in names:
         own: dict[str, list[int]] = {}
-        for i, (group, subject) in enumerate(zip(groups, subjects, strict=True)):
+        for i, (group, subject) in enumerate(zip(groups, people.subject, strict=True)):
             if group == name:
                 own.setdefault(subject, []).append(i)
         parts.append(

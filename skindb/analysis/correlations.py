@@ -11,8 +11,7 @@ import xarray as xr
 from scipy import stats
 
 from skindb.analysis import colours
-from skindb.analysis.members import takes_to_compare
-from skindb.analysis.quantities import CHANNELS, SURFACE, Quantities, quantities_of
+from skindb.analysis.contrasts import CHANNELS, SURFACE, Quantities, quantities_of
 from skindb.analysis.study import (
     Population,
     Results,
@@ -22,6 +21,7 @@ from skindb.analysis.study import (
     seed_option,
     table_of,
 )
+from skindb.analysis.subjects import takes_to_compare
 from skindb.errors import Fault, InputError
 from skindb.numerics.statistics import benjamini_hochberg, known_mean
 from skindb.schema import dataset
@@ -97,7 +97,7 @@ def component_correlations(
     require_takes(cohort, "tables")
     if not mixed_fits:
         require_same_fit(cohort)
-    takes = takes_to_compare(cohort, None)
+    takes, _ = takes_to_compare(cohort, None)
     if "region" in takes.coords and region not in takes["region"].values:
         cure = f"choose one of {', '.join(map(str, takes['region'].values))}"
         raise InputError(

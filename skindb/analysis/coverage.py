@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -11,16 +12,18 @@ import numpy as np
 import xarray as xr
 from scipy.stats.contingency import association
 
-from skindb.analysis.group_effects import ASSOCIATED, FEW
-from skindb.analysis.members import AGE, CONDITION, NORMAL, attributes, is_normal, texts
-from skindb.analysis.quantities import (
-    attribute_notes,
-    attribute_of_subjects,
-    columns_of,
-    is_age,
-    is_number,
-)
+from skindb.analysis.contrasts import ASSOCIATED, FEW
 from skindb.analysis.study import Population, Results, Study, table_of
+from skindb.analysis.subjects import (
+    AGE,
+    CONDITION,
+    NORMAL,
+    Attribute,
+    Subjects,
+    is_age,
+    multiple_correlation,
+    subjects_of,
+)
 from skindb.errors import Fault, InputError
 from skindb.schema import IDENTIFIED, dataset
 from skindb.schema.cohort import require_takes
@@ -78,21 +81,20 @@ def coverage_report(cohort: xr.Dataset) -> xr.Dataset:
         raise InputError(
             Fault("coverage", "the cohort must have a take", "none", "fit a take first")
         )
-    subjects = tuple(dict.fromkeys(str(one) for one in texts(cohort["subject"])))
+    takes = subjects_of(cohort)
+    subjects = takes.names
     stated = {
-        name: attribute_of_subjects(cohort, name, subjects)
-        for name in sorted(attributes(cohort))
-        if name != CONDITION
+        name: takes.by_subject(name, subjects) for name in sorted(takes.described)
     }
-    factors = _factors(cohort, subjects, stated)
+    factors = _factors(cohort, takes, stated)
     levels = {name: _values(name, factor) for name, factor in factors.items()}
     if SITE in factors:  # including sites without measurements
         levels[SITE] = [str(site) for site in cohort["site"].values]
     counts = dict(_cells(factors, levels))
     names = [
         name
-        for name in stated
-        if is_number(stated[name]) or 1 < len(_words(stated[name])) <= MAX_VALUES
+        for name, attribute in stated.items()
+        if attribute.is_numeric or 1 < len(attribute.words) <= MAX_VALUES
     ]
     between = np.array(
         [[_association(stated[a], stated[b]) for b in names] for a in names]
@@ -107,7 +109,7 @@ def coverage_report(cohort: xr.Dataset) -> xr.Dataset:
             "coverage_count": np.array(list(counts.values()), np.int32),
             "coverage_association": between,
             "coverage_unknown": np.array(
-                [_unknown(stated[name]) for name in names], np.int32
+                [stated[name].values.count(None) for name in names], np.int32
             ),
         },
         coords={
@@ -119,58 +121,42 @@ def coverage_report(cohort: xr.Dataset) -> xr.Dataset:
             "subjects": len(subjects),
             "takes": sorted(map(str, cohort["take"].values)),
             "flags": _flags(counts, unknown, names, stated, between, len(subjects))
-            + [
-                line
-                for name, values in stated.items()
-                for line in attribute_notes(name, values)
-            ],
+            + [line for attribute in stated.values() for line in attribute.notes()],
             "skipped": list(cohort.attrs.get("skipped", [])),
         },
     )
 
 
 def _factors(
-    cohort: xr.Dataset, subjects: Sequence[str], stated: Mapping[str, list[object]]
+    cohort: xr.Dataset, takes: Subjects, stated: Mapping[str, Attribute]
 ) -> dict[str, Factor]:
     """Factors by which subjects are counted: categorical attributes, age in decades,
     conditions and sites.
     """
     factors: dict[str, Factor] = {}
-    for name, values in stated.items():
+    for name, attribute in stated.items():
         if name == AGE:
-            factors[AGE_BAND] = [
-                frozenset([_band(one)]) if is_age(one) else frozenset()
-                for one in values
-            ]
-        elif not is_number(values) and 1 <= len(_words(values)) <= MAX_VALUES:
-            factors[name] = [
-                frozenset() if one is None else frozenset([str(one)]) for one in values
-            ]
-    owner = [str(one) for one in texts(cohort["subject"])]
-    known = (
-        texts(cohort[CONDITION])
-        if CONDITION in cohort.coords
-        else [NORMAL] * len(owner)
-    )
+            bands = [_band(age) if is_age(age) else None for age in attribute.values]
+            factors[AGE_BAND] = _single(bands)
+        elif not attribute.is_numeric and 1 <= len(attribute.words) <= MAX_VALUES:
+            factors[name] = _single(attribute.values)
+    conditions: Sequence[object] = [NORMAL] * len(takes.take)
+    if CONDITION in takes.attributes:
+        conditions = takes.attributes[CONDITION].values
+    rows = [takes.rows_of(name) for name in takes.names]
     factors[CONDITION] = [
-        frozenset(
-            str(one)
-            for one, own in zip(known, owner, strict=True)
-            if own == subject and one is not None
-        )
-        for subject in subjects
+        frozenset(str(v) for v in itertools.compress(conditions, own) if v is not None)
+        for own in rows
     ]
     if "site_status" in cohort:
         good = (
             cohort["site_status"].isin(IDENTIFIED).transpose("take", "site", ...).values
         )
-        good = (
-            good.reshape(*good.shape[:2], -1).any(axis=-1) & is_normal(cohort)[:, None]
-        )
-        rows = [np.array([one == subject for one in owner]) for subject in subjects]
+        measured = np.any(good.reshape(*good.shape[:2], -1), axis=-1)
+        measured = np.asarray(measured & takes.is_normal[:, None])
         sites = [str(site) for site in cohort["site"].values]
         factors[SITE] = [
-            frozenset(itertools.compress(sites, good[own].any(axis=0).tolist()))
+            frozenset(itertools.compress(sites, np.any(measured[own], axis=0).tolist()))
             for own in rows
         ]
     order = [*CROSSED, CONDITION, SITE]
@@ -179,6 +165,11 @@ def _factors(
         for name in [*order, *sorted(set(factors) - set(order))]
         if name in factors
     }
+
+
+def _single(values: Iterable[object]) -> Factor:
+    """A factor of which each subject has at most one value."""
+    return [frozenset() if v is None else frozenset([str(v)]) for v in values]
 
 
 def _cells(
@@ -225,7 +216,7 @@ def _flags(
     counts: Mapping[tuple[str, ...], int],
     unknown: Mapping[str, int],
     names: Sequence[str],
-    stated: Mapping[str, list[object]],
+    stated: Mapping[str, Attribute],
     between: Array,
     subjects: int,
 ) -> list[str]:
@@ -281,7 +272,7 @@ def _flags(
     flags += [
         f"{name}: no subject has this attribute"
         for name in (GENDER, ANCESTRY, AGE)
-        if not any(_words(stated.get(name, [])))
+        if name not in stated or not stated[name].words
     ]
     for i, j in itertools.combinations(range(len(names)), 2):
         if between[i, j] >= ASSOCIATED:
@@ -294,27 +285,30 @@ def _flags(
     return flags
 
 
-def _association(a: list[object], b: list[object]) -> float:
+def _association(a: Attribute, b: Attribute) -> float:
     """Strength of association of two attributes, from 0 to 1; NaN if too few subjects have both."""
-    both = [
-        (x, y) for x, y in zip(a, b, strict=True) if x is not None and y is not None
-    ]
+    pairs = zip(a.values, b.values, strict=True)
+    both = [(x, y) for x, y in pairs if x is not None and y is not None]
     if len(both) < 3:
         return float("nan")
-    first, second = ([pair[i] for pair in both] for i in (0, 1))
-    if len(_words(first)) < 2 or len(_words(second)) < 2:
-        return float("nan")
-    if is_number(a) and is_number(b):
-        return float(np.abs(np.corrcoef(_numbers(first), _numbers(second))[0, 1]))
-    if is_number(a) or is_number(b):
-        return _multiple(first, second) if is_number(a) else _multiple(second, first)
-    table = np.array(
-        [
-            [sum(pair == (x, y) for pair in _as_words(both)) for y in _words(second)]
-            for x in _words(first)
-        ]
+    first, second = (
+        Attribute(attribute.name, values)
+        for attribute, values in zip((a, b), zip(*both, strict=True), strict=True)
     )
-    return _cramer(table)
+    if len(first.words) < 2 or len(second.words) < 2:
+        return float("nan")
+    if a.is_numeric and b.is_numeric:
+        return float(np.abs(np.corrcoef(first.numbers, second.numbers)[0, 1]))
+    if b.is_numeric:
+        first, second = second, first
+    if a.is_numeric or b.is_numeric:
+        words = tuple(map(str, second.values))
+        return multiple_correlation(
+            first.numbers, Attribute(second.name, words).columns
+        )
+    counts = Counter((str(x), str(y)) for x, y in both)
+    table = [[counts[x, y] for y in second.words] for x in first.words]
+    return _cramer(np.array(table))
 
 
 def _cramer(table: Array) -> float:
@@ -331,37 +325,10 @@ def _cramer(table: Array) -> float:
     return float(min(1.0, np.sqrt(corrected / most))) if most > 0 else float("nan")
 
 
-def _multiple(numbers: list[object], words: list[object]) -> float:
-    """Multiple correlation of a numeric attribute with groups, adjusted for their number."""
-    y = _numbers(numbers)
-    x = np.column_stack([np.ones(len(y)), columns_of([str(one) for one in words])])
-    free = len(y) - np.linalg.matrix_rank(x)
-    if free < 1 or np.ptp(y) == 0:
-        return float("nan")
-    left = y - x @ np.linalg.lstsq(x, y, rcond=None)[0]
-    return float(np.sqrt(max(0.0, 1.0 - (left @ left / free) / np.var(y, ddof=1))))
-
-
-def _measure_name(a: list[object], b: list[object]) -> str:
+def _measure_name(a: Attribute, b: Attribute) -> str:
     """Name of the measure of association of two attributes."""
-    numbers = is_number(a) + is_number(b)
-    return ("Cramer's V", "multiple correlation", "correlation")[numbers]
-
-
-def _numbers(values: list[object]) -> Array:
-    return np.array([float(str(one)) for one in values])
-
-
-def _as_words(pairs: list[tuple[object, object]]) -> list[tuple[str, str]]:
-    return [(str(x), str(y)) for x, y in pairs]
-
-
-def _words(values: Sequence[object]) -> list[str]:
-    return sorted({str(one) for one in values if one is not None})
-
-
-def _unknown(values: Sequence[object]) -> int:
-    return sum(one is None for one in values)
+    numeric = a.is_numeric + b.is_numeric
+    return ("Cramer's V", "multiple correlation", "correlation")[numeric]
 
 
 def _band(age: object) -> str:

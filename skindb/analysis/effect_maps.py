@@ -9,21 +9,21 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
-from skindb.analysis.each_take import each_take
-from skindb.analysis.group_effects import (
+from skindb.analysis.contrasts import (
+    CHANNELS,
     CONTRAST_CURE,
     CONTRAST_RULE,
-    SIGNIFICANT,
+    SURFACE,
     Contrast,
+    Quantities,
     associations,
     contrast_counts,
     contrast_flags,
     contrasts,
-    notes_on_attributes,
     other_attributes,
 )
-from skindb.analysis.members import texts
-from skindb.analysis.quantities import CHANNELS, SURFACE, Quantities
+from skindb.analysis.each_take import each_take
+from skindb.analysis.group_effects import SIGNIFICANT
 from skindb.analysis.study import (
     Population,
     Results,
@@ -33,6 +33,7 @@ from skindb.analysis.study import (
     permutations_option,
     seed_option,
 )
+from skindb.analysis.subjects import notes_on_attributes, subjects_of
 from skindb.errors import Fault, InputError
 from skindb.numerics.inference import (
     effects,
@@ -125,7 +126,8 @@ def effect_maps(
     counts: list[int] = []
     faults: list[Fault] = []
     flags = list[str]()
-    others = other_attributes(cohort, group_by)
+    subjects = subjects_of(cohort)
+    others = other_attributes(subjects, group_by)
     for variable, called in MAPPED.items():
         if variable not in cohort:
             continue
@@ -144,9 +146,9 @@ def effect_maps(
                         *_contrast_statistics(one, permutations, min_fraction, rng),
                     )
                 )
-                associated = associations(one, cohort, others)
+                associated = associations(one, subjects, others)
                 flags += contrast_flags(
-                    one, cohort, associated, adjust, contrast_counts(one)
+                    one, subjects, associated, adjust, contrast_counts(one)
                 )
             except ValueError as error:
                 faults.append(
@@ -199,7 +201,7 @@ def effect_maps(
                 name for name in quantities if name.startswith(LOGARITHMIC)
             ],
             "flags": [
-                *dict.fromkeys([*flags, *notes_on_attributes(cohort)]),
+                *dict.fromkeys([*flags, *notes_on_attributes(subjects)]),
                 *(f"{fault.where}: excluded, {fault.found}" for fault in faults),
             ],
             "skipped": list(cohort.attrs.get("skipped", [])),
@@ -213,7 +215,7 @@ def _texel_quantities(takes: xr.Dataset, variable: str, size: int) -> Quantities
         each_take(_block_means, takes, [variable, "texel_coverage"], variable, size)
     )
     count = values.shape[1]
-    subject = tuple(str(one) for one in texts(takes["subject"]))
+    subject = tuple(map(str, takes["subject"].values))
     nothing = np.full(values.shape, np.nan, np.float32)  # errors of texels are not used
     return Quantities(
         tuple(map(str, range(count))),

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import xarray as xr
 
-from skindb.analysis.members import takes_to_compare, texts
+from skindb.analysis.subjects import takes_to_compare
 from skindb.analysis.texture import COVERED
 from skindb.errors import Fault, InputError
 from skindb.numerics.statistics import Moments, known_mean
@@ -67,12 +67,11 @@ def mean_face(
     """
     if not mixed_fits:
         require_same_fit(cohort)
-    takes = takes_to_compare(cohort, None)
+    takes, subjects = takes_to_compare(cohort, None)
     names = [name for name in AVERAGED if name in takes]
-    subjects = [str(one) for one in texts(takes["subject"])]
     sums: dict[str, Moments] = {}
-    for subject in dict.fromkeys(subjects):
-        rows = [i for i, one in enumerate(subjects) if one == subject]
+    for subject in subjects.names:
+        rows = np.flatnonzero(subjects.rows_of(subject))
         for name, values in _subject_maps(takes.isel(take=rows), names).items():
             sums[name] = (
                 sums[name] + Moments.of(values[None])
@@ -95,13 +94,13 @@ def mean_face(
         rule = f"at least one texel must be measured in {least} subjects"
         cure = "fit or register more subjects"
         raise InputError(
-            Fault("mean face", rule, f"none among {len(set(subjects))} subjects", cure)
+            Fault("mean face", rule, f"none among {len(subjects.names)} subjects", cure)
         )
     return dataset(
         found,
         coords={"channel": ["R", "G", "B"]},
         attrs={
-            "subjects": len(set(subjects)),
+            "subjects": len(subjects.names),
             "least_subjects": least,
             "takes": sorted(map(str, takes["take"].values)),
             "skipped": list(cohort.attrs.get("skipped", [])),

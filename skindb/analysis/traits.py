@@ -13,22 +13,7 @@ import numpy as np
 import xarray as xr
 
 from skindb.analysis.albedo import albedo_and_texture, quantiles
-from skindb.analysis.members import (
-    is_normal,
-    known_traits,
-    number_of_takes,
-    numeric_attributes,
-    sides,
-    texts,
-    trait_name,
-    trait_names,
-)
 from skindb.analysis.population_basis import population_basis
-from skindb.analysis.quantities import (
-    attribute_of_subjects,
-    columns_of,
-    require_adjustable,
-)
 from skindb.analysis.study import (
     DICTIONARY,
     Population,
@@ -38,6 +23,17 @@ from skindb.analysis.study import (
     adjust_option,
     seed_option,
     table_of,
+)
+from skindb.analysis.subjects import (
+    Subjects,
+    known_traits,
+    number_of_takes,
+    numeric_attributes,
+    require_adjustable,
+    sides,
+    subjects_of,
+    trait_name,
+    trait_names,
 )
 from skindb.analysis.summary import SAMPLED
 from skindb.errors import Fault, InputError
@@ -133,15 +129,16 @@ def trait_vectors(
     """
     if not mixed_fits:
         require_same_fit(cohort)
-    known = trait_names(cohort)
-    numbers = numeric_attributes(cohort)
-    named = sorted({*_requestable_traits(cohort, known), *numbers})
+    subjects = subjects_of(cohort)
+    known = trait_names(subjects)
+    numbers = numeric_attributes(subjects)
+    named = sorted({*known_traits(subjects), *numbers})
     names = (
         [*known, *numbers]
         if traits is None
         else [trait_name(name, named) for name in traits]
     )
-    split = [_sides(cohort, name, numbers) for name in names]
+    split = [_sides(subjects, name, numbers) for name in names]
     both = list(zip(names, split, strict=True))
     bad = [
         (n, w, o)
@@ -156,12 +153,12 @@ def trait_vectors(
             Fault(f"trait {n}", rule, f"{w.sum()} with, {o.sum()} without", cure)
             for n, w, o in bad
         )
-    require_adjustable(cohort, adjust)
+    require_adjustable(subjects, adjust)
     units = dict[str, Units]()
     flags = list[str]()
     for name, side in both:
         try:
-            units[name] = _units(cohort, name, side, adjust, numbers)
+            units[name] = _units(subjects, name, side, adjust, numbers)
         except InputError as error:
             if traits is not None:
                 raise
@@ -238,18 +235,18 @@ def trait_vectors(
     )
 
 
-def _sides(cohort: xr.Dataset, trait: str, numbers: Sequence[str]) -> tuple[Mask, Mask]:
+def _sides(subjects: Subjects, trait: str, numbers: Sequence[str]) -> tuple[Mask, Mask]:
     """Masks of takes with and without a trait; for a numeric attribute, those in the
     condition normal that have it.
     """
     if trait not in numbers:
-        return sides(cohort, trait)
-    known = np.isfinite(number_of_takes(cohort, trait)) & is_normal(cohort)
+        return sides(subjects, trait)
+    known = np.isfinite(number_of_takes(subjects, trait)) & subjects.is_normal
     return known, np.zeros(len(known), np.bool_)
 
 
 def _units(
-    cohort: xr.Dataset,
+    subjects: Subjects,
     trait: str,
     side: tuple[Mask, Mask],
     adjust: Sequence[str],
@@ -262,7 +259,7 @@ def _units(
     between people must not appear as the trait.
     """
     carries, lacks = side
-    who = np.array([str(subject) for subject in texts(cohort["subject"])])
+    who = np.array(subjects.subject)
     pairs = sorted(set(who[carries]))
     if trait not in numbers and set(pairs) <= set(who[lacks]):
         own, other = (
@@ -270,7 +267,7 @@ def _units(
         )
         return Units(own, other, np.ones((len(pairs), 1)))
     if trait in numbers:
-        values = number_of_takes(cohort, trait)
+        values = number_of_takes(subjects, trait)
         whose = [
             (s, float(values[carries & (who == s)][0]), carries & (who == s))
             for s in pairs
@@ -280,10 +277,8 @@ def _units(
         whose += [
             (s, 0.0, lacks & (who == s)) for s in sorted(set(who[lacks]) - set(pairs))
         ]
-    subjects = tuple(s for s, _, _ in whose)
-    held = [
-        columns_of(attribute_of_subjects(cohort, name, subjects)) for name in adjust
-    ]
+    names = [s for s, _, _ in whose]
+    held = [subjects.by_subject(name, names).columns for name in adjust]
     design = np.column_stack([[x for _, x, _ in whose], np.ones(len(whose)), *held])
     complete = np.isfinite(design).all(axis=1)
     design = design[complete]
@@ -389,13 +384,6 @@ def _log_sigma_tr(cohort: xr.Dataset) -> Array:
     node = cohort[["site_sigma_tr", "site_status"]].load()
     good = node["site_status"].isin(IDENTIFIED)
     return np.log(np.asarray(node["site_sigma_tr"].where(good).values, np.float64))
-
-
-def _requestable_traits(cohort: xr.Dataset, known: Sequence[str]) -> list[str]:
-    """Traits that can be requested, including those that every take has, for which a
-    specific error is raised.
-    """
-    return sorted({*known, *known_traits(cohort)})
 
 
 def describe_traits(traits: xr.Dataset) -> list[str]:

@@ -10,8 +10,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from skindb.analysis import colours
-from skindb.analysis.group_effects import FEW
-from skindb.analysis.members import groups_by, takes_to_compare
+from skindb.analysis.contrasts import FEW
 from skindb.analysis.study import (
     Population,
     Results,
@@ -20,6 +19,7 @@ from skindb.analysis.study import (
     group_option,
     table_of,
 )
+from skindb.analysis.subjects import groups_by, takes_to_compare
 from skindb.numerics.statistics import Moments, variance_components
 from skindb.schema import IDENTIFIED, ProbeStatus, dataset
 from skindb.schema.cohort import require_same_fit, require_takes
@@ -85,8 +85,8 @@ def translucency_table(
     require_takes(cohort, "tables")
     if not mixed_fits:
         require_same_fit(cohort)
-    takes = takes_to_compare(cohort, group_by)
-    groups = groups_by(takes, group_by)
+    takes, people = takes_to_compare(cohort, group_by)
+    groups = groups_by(people, group_by)
     names = sorted(set(groups))
     members = [np.flatnonzero([group == name for group in groups]) for name in names]
     if "site_sigma_tr" not in takes:  # the probe was not used
@@ -107,7 +107,7 @@ def translucency_table(
         )
 
     stacked = moments("site_sigma_tr")
-    subjects = np.array([str(one) for one in takes["subject"].values.tolist()])
+    subjects = np.array(people.subject)
     low, high = stacked.mean_interval()
     deviation_low, deviation_high = stacked.deviation_interval()
     known = stacked.count > 0

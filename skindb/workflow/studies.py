@@ -15,9 +15,9 @@ from typing import Any
 
 import xarray as xr
 
-from skindb.analysis.members import CONDITION, subjects_without_normal
 from skindb.analysis.studies import STUDIES
 from skindb.analysis.study import Population, Study
+from skindb.analysis.subjects import CONDITION, subjects_of, subjects_without_normal
 from skindb.errors import Fault, InputError
 from skindb.parameters import option_of, require_limits
 from skindb.store import STUDY, Database, Record, require_text
@@ -213,7 +213,7 @@ def _derivation(
     skipped = list(cohort.attrs["skipped"])
     compares_conditions = str(requested.get("group_by", "")).startswith(CONDITION)
     if record.compares_normal and not compares_conditions:
-        skipped += subjects_without_normal(cohort)
+        skipped += subjects_without_normal(subjects_of(cohort))
     outdated = list(cohort.attrs["outdated"])
     notes = [*skipped, *outdated, *population.notes]
     names = {note["take"] for note in notes if note["take"]}

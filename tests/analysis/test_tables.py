@@ -15,12 +15,13 @@ from skindb.analysis import (
     plot_translucency,
     translucency_table,
 )
-from skindb.analysis.members import (
+from skindb.analysis.subjects import (
     comparable_takes,
     groups_by,
     has_trait,
     known_traits,
     sides,
+    subjects_of,
     trait_names,
 )
 from skindb.errors import InputError
@@ -122,23 +123,27 @@ def test_members__consent_is_respected():
 
 def test_members__traits_and_what_they_are_compared_with():
     models = population()
-    assert trait_names(tables(models)) == [
+    assert trait_names(subjects_of(tables(models))) == [
         "age:older",
         "condition:lotion",
         "gender:female",
         "gender:male",
     ]
     np.testing.assert_array_equal(
-        has_trait(tables(models), "condition:lotion"), [False, True, False, False]
+        has_trait(subjects_of(tables(models)), "condition:lotion"),
+        [False, True, False, False],
     )
     np.testing.assert_array_equal(
-        comparable_takes(tables(models), "condition:lotion"), [True, True, False, False]
+        comparable_takes(subjects_of(tables(models)), "condition:lotion"),
+        [True, True, False, False],
     )  # within the subject
     np.testing.assert_array_equal(
-        comparable_takes(tables(models), "gender:male"), [True, False, True, True]
+        comparable_takes(subjects_of(tables(models)), "gender:male"),
+        [True, False, True, True],
     )  # the take with lotion would be included
     np.testing.assert_array_equal(
-        comparable_takes(tables(models), "gender:female"), [True, False, True, True]
+        comparable_takes(subjects_of(tables(models)), "gender:female"),
+        [True, False, True, True],
     )  # A counts once
 
 
@@ -147,11 +152,11 @@ def test_members__silent_takes_are_on_neither_side():
     del models["C"].attrs["traits"]["gender"]
     models["C"].attrs["traits"]["age"] = "fifty"
     models["B"].attrs["traits"]["tan"] = True
-    with_male, without = sides(tables(models), "gender:male")
+    with_male, without = sides(subjects_of(tables(models)), "gender:male")
     np.testing.assert_array_equal(with_male, [False, False, True, False])
     np.testing.assert_array_equal(without, [True, False, False, False])
     np.testing.assert_array_equal(
-        sides(tables(models), "age:older"),
+        sides(subjects_of(tables(models)), "age:older"),
         [[False, False, True, False], [True, False, False, False]],
     )
     expected = [
@@ -162,8 +167,8 @@ def test_members__silent_takes_are_on_neither_side():
         "gender:male",
     ]
     # no capture states the absence of a tan
-    assert trait_names(tables(models)) == expected
-    assert not any(sides(tables({"A": models["A"]}), "age:older")[0])
+    assert trait_names(subjects_of(tables(models))) == expected
+    assert not any(sides(subjects_of(tables({"A": models["A"]})), "age:older")[0])
 
 
 def test_members__a_subject_counts_once_for_the_median_age():
@@ -174,7 +179,9 @@ def test_members__a_subject_counts_once_for_the_median_age():
     }
     assert [
         t
-        for t, old in zip(models, has_trait(tables(models), "age:older"), strict=True)
+        for t, old in zip(
+            models, has_trait(subjects_of(tables(models)), "age:older"), strict=True
+        )
         if old
     ] == ["B"]
 
@@ -183,7 +190,7 @@ def test_members__a_take_without_an_age_has_no_age_of_another_take():
     models = population()
     models["A"].attrs["traits"]["age"] = 70
     models["A.lotion"].attrs["traits"] = {"gender": "female"}
-    assert has_trait(tables(models), "age:older").tolist() == [
+    assert has_trait(subjects_of(tables(models)), "age:older").tolist() == [
         True,
         False,
         False,
@@ -195,7 +202,10 @@ def test_groups_by__a_subject_without_a_condition_counts_once():
     models = population() | {
         f"B.{c}": model_of(2, subject="B", condition=c) for c in ("cold", "hot")
     }
-    assert groups_by(tables(models), "lotion")[-2:] == ["other conditions"] * 2
+    assert (
+        groups_by(subjects_of(tables(models)), "lotion")[-2:]
+        == ["other conditions"] * 2
+    )
     table = translucency_table(tables(models), group_by="lotion").sel(
         site="cheek", channel="R"
     )
@@ -210,12 +220,14 @@ def test_members__a_cohort_that_was_written_and_read_again(tmp_path):
     cohort.to_zarr(tmp_path / "cohort.zarr", consolidated=False, zarr_format=3)
     again = xr.open_zarr(tmp_path / "cohort.zarr", consolidated=False)
     assert (
-        groups_by(again, "hair")
-        == groups_by(cohort, "hair")
+        groups_by(subjects_of(again), "hair")
+        == groups_by(subjects_of(cohort), "hair")
         == ["red", "unknown", "unknown", "unknown"]
     )
     for trait in ("hair:red", "gender:male", "condition:lotion", "age:older"):
-        np.testing.assert_array_equal(sides(again, trait), sides(cohort, trait))
+        np.testing.assert_array_equal(
+            sides(subjects_of(again), trait), sides(subjects_of(cohort), trait)
+        )
     xr.testing.assert_allclose(translucency_table(again), translucency_table(cohort))
 
 
@@ -230,21 +242,21 @@ def test_cohort_of__an_attribute_never_replaces_what_a_cohort_names_itself():
         "normal",
     ]
     assert cohort["attribute_condition"].sel(take="B") == "eczema"
-    assert "attribute_condition:eczema" in known_traits(cohort)
+    assert "attribute_condition:eczema" in known_traits(subjects_of(cohort))
 
 
 def test_groups_by__attributes_traits_and_typing_errors():
     models = population()
-    assert groups_by(tables(models), None) == ["all"] * 4
-    assert groups_by(tables(models), "condition")[1] == "lotion"
+    assert groups_by(subjects_of(tables(models)), None) == ["all"] * 4
+    assert groups_by(subjects_of(tables(models)), "condition")[1] == "lotion"
     assert (
-        groups_by(tables(models), "male")
+        groups_by(subjects_of(tables(models)), "male")
         == ["not gender:male"] * 2 + ["gender:male"] * 2
     )
     del models["C"].attrs["traits"]["gender"]
     assert (
-        groups_by(tables(models), "gender")[3]
-        == groups_by(tables(models), "male")[3]
+        groups_by(subjects_of(tables(models)), "gender")[3]
+        == groups_by(subjects_of(tables(models)), "male")[3]
         == "unknown"
     )
     with pytest.raises(
@@ -264,19 +276,19 @@ def test_trait_name__an_alias_must_be_unambiguous():
         models[take].attrs["traits"] |= {"hair": hair, "skin": skin}
     cohort = tables(models)
     np.testing.assert_array_equal(
-        has_trait(cohort, "hair:dark"), [True, False, False, False]
+        has_trait(subjects_of(cohort), "hair:dark"), [True, False, False, False]
     )
     np.testing.assert_array_equal(
-        has_trait(cohort, "skin:dark"), [False, False, True, True]
+        has_trait(subjects_of(cohort), "skin:dark"), [False, False, True, True]
     )
-    assert groups_by(cohort, "red") == [
+    assert groups_by(subjects_of(cohort), "red") == [
         "not hair:red",
         "unknown",
         "not hair:red",
         "hair:red",
     ]
     with pytest.raises(InputError, match="found 2 matches: hair:dark, skin:dark"):
-        groups_by(cohort, "dark")
+        groups_by(subjects_of(cohort), "dark")
 
 
 def test_studies__takes_that_were_fitted_differently_are_not_mixed_silently():

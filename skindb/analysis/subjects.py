@@ -1,0 +1,457 @@
+"""What is known of the subjects of a cohort: attributes, parsed once, and the traits and
+groups that they give.
+
+A trait is an attribute with a value, such as ``condition:lotion`` or ``gender:male``; a
+boolean attribute is a trait by itself, and ``age:older`` is an age above the median of
+the subjects. The value alone can name a trait if no other attribute has this value.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+
+from skindb.errors import Fault, InputError
+from skindb.schema.notes import Note, note
+from skindb.types import Array, Mask
+
+Value = bool | int | float | str | None  # None where it is unknown
+CONDITION = "condition"
+NORMAL = "normal"
+AGE = "age"
+OLDER = "age:older"
+MAX_AGE = 130  # years
+ALL_TAKES = "all"
+UNKNOWN = "unknown"
+OTHER = "other conditions"
+# coordinates along "take" that describe no subject
+NO_ATTRIBUTES = ("take", "subject", "session", "model_generation")
+FIT = "fit_"  # prefix of coordinates that are parameters of the fit
+
+
+@dataclass(frozen=True)
+class Attribute:
+    """Values of an attribute, of takes or of subjects.
+
+    Ages are in years; other numbers have the unit that the captures give them.
+    """
+
+    name: str
+    values: tuple[Value, ...]
+
+    @property
+    def known(self) -> list[Value]:
+        """The values that are known."""
+        return [value for value in self.values if value is not None]
+
+    @property
+    def words(self) -> list[str]:
+        """Different values as text, sorted."""
+        return sorted({str(value) for value in self.known})
+
+    @property
+    def numbers(self) -> Array:
+        """Values that are numbers; NaN for the others."""
+        return np.array(
+            [float(value) if _is_number(value) else np.nan for value in self.values]  # type: ignore[arg-type]
+        )
+
+    @property
+    def is_numeric(self) -> bool:
+        """Whether all values are numbers, of which more than two differ."""
+        return all(map(_is_number, self.known)) and len(set(self.known)) > 2
+
+    @property
+    def odd_words(self) -> list[str]:
+        """Sorted values that cannot be read as numbers, if others can."""
+        words = [word for word in self.words if not _reads_as_number(word)]
+        return words if words != self.words else []
+
+    @property
+    def columns(self) -> Array:
+        """Regression columns (n, c): a centred number, or indicators of all values
+        except the first. NaN where the attribute is unknown.
+        """
+        if self.is_numeric:
+            return np.asarray(self.numbers - np.nanmean(self.numbers))[:, None]
+        columns = np.array(
+            [[float(str(v) == word) for word in self.words[1:]] for v in self.values]
+        ).reshape(len(self.values), -1)
+        known = np.array([value is not None for value in self.values])
+        return np.where(known[:, None], columns, np.nan)
+
+    def require_one_kind(self) -> None:
+        """Raise `InputError` if some values are numbers and others are words."""
+        if words := self.odd_words:
+            rule = "must be a number for all subjects or a word for all"
+            found = f"numbers and {', '.join(map(repr, words[:3]))}"
+            cure = "correct the traits in capture.json and ingest again"
+            raise InputError(Fault(f"attribute {self.name}", rule, found, cure))
+
+    def notes(self) -> list[str]:
+        """Lines about values that are likely to be mistakes."""
+        notes = []
+        if words := self.odd_words:
+            some = ", ".join(map(repr, words[:3]))
+            notes.append(f"{self.name}: numbers and {some}; it is not compared")
+        spellings: dict[str, set[str]] = {}
+        for value in self.values:
+            if isinstance(value, str):
+                spellings.setdefault(value.strip().casefold(), set()).add(value)
+        for same in spellings.values():
+            if len(same) > 1:
+                alike = " and ".join(map(repr, sorted(same)))
+                notes.append(f"{self.name}: {alike} count as different values")
+        ages = [] if self.name != AGE else self.known
+        odd = {str(age) for age in ages if _is_finite(age) and not is_age(age)}
+        if odd:
+            some = ", ".join(sorted(odd)[:3])
+            rule = f"must be in years, from 0 to {MAX_AGE}"
+            notes.append(f"{AGE}: {rule}; found {some}")
+        return notes
+
+
+@dataclass(frozen=True)
+class Subjects:
+    """The takes of a cohort, with the subject and the attributes of each."""
+
+    take: tuple[str, ...]
+    subject: tuple[str, ...]
+    attributes: Mapping[str, Attribute]  # by the names that the captures give them
+
+    @property
+    def is_normal(self) -> Mask:
+        """Mask (take,) of the takes in the condition normal."""
+        if CONDITION not in self.attributes:
+            return np.ones(len(self.take), np.bool_)
+        conditions = self.attributes[CONDITION].values
+        return np.array([value == NORMAL for value in conditions], np.bool_)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The subjects, in the order of their first takes."""
+        return tuple(dict.fromkeys(self.subject))
+
+    @property
+    def described(self) -> list[str]:
+        """Attributes of the subjects, which are the same in all conditions."""
+        return [name for name in self.attributes if name != CONDITION]
+
+    def select(self, rows: Iterable[int]) -> Subjects:
+        """The takes with these indices."""
+        rows = list(rows)
+        return Subjects(
+            tuple(self.take[i] for i in rows),
+            tuple(self.subject[i] for i in rows),
+            {
+                name: Attribute(name, tuple(attribute.values[i] for i in rows))
+                for name, attribute in self.attributes.items()
+            },
+        )
+
+    def by_subject(self, name: str, subjects: Sequence[str]) -> Attribute:
+        """An attribute of the named subjects, each from its first take that has it."""
+        first: dict[str, Value] = {}
+        values = self.attributes[name].values
+        for subject, value in zip(self.subject, values, strict=True):
+            if value is not None:
+                first.setdefault(subject, value)
+        return Attribute(name, tuple(first.get(subject) for subject in subjects))
+
+    def rows_of(self, subject: str) -> Mask:
+        """Mask (take,) of the takes of a subject."""
+        return np.array([name == subject for name in self.subject], np.bool_)
+
+
+def subjects_of(cohort: xr.Dataset) -> Subjects:
+    """Parse the attributes of the takes of a cohort."""
+    attributes = {}
+    for name, coordinate in cohort.coords.items():
+        name = str(name)
+        if coordinate.dims == ("take",):
+            attributes[name] = Attribute(name, tuple(map(_parsed, coordinate.values)))
+    takes, subjects = (attributes[name].values for name in ("take", "subject"))
+    return Subjects(
+        tuple(map(str, takes)),
+        tuple(map(str, subjects)),
+        {
+            name: attribute
+            for name, attribute in attributes.items()
+            if name not in NO_ATTRIBUTES and not name.startswith(FIT)
+        },
+    )
+
+
+def takes_to_compare(
+    cohort: xr.Dataset, group_by: str | None
+) -> tuple[xr.Dataset, Subjects]:
+    """Takes that are used in a comparison, with their subjects: those in the condition
+    normal, or all takes if conditions are compared.
+
+    Raises
+    ------
+    InputError
+        If no take remains.
+    """
+    subjects = subjects_of(cohort)
+    compared = group_by is not None and attribute_of(subjects, group_by) == CONDITION
+    rows = np.flatnonzero(subjects.is_normal | compared)
+    if not rows.size:
+        rule = "groups must have a take in the condition normal"
+        found = f"only {', '.join(subjects.take)}"
+        cure = "group by condition, or add takes in the condition normal"
+        raise InputError(Fault("population", rule, found, cure))
+    return cohort.isel(take=rows), subjects.select(rows)
+
+
+def groups_by(subjects: Subjects, name: str | None) -> list[str]:
+    """Name of the group of every take, by an attribute or a trait; None puts all takes
+    into one group.
+
+    Raises
+    ------
+    InputError
+        If no take has the attribute or trait.
+    """
+    if name is None:
+        return [ALL_TAKES] * len(subjects.take)
+    if name in subjects.attributes:
+        values = subjects.attributes[name].values
+        return [UNKNOWN if value is None else word_of(value) for value in values]
+    trait = trait_of(subjects, name)
+    carries = has_trait(subjects, trait)
+    if trait.startswith(f"{CONDITION}:"):
+        # only takes in the condition normal count as without it
+        lacks = subjects.is_normal
+        rest = OTHER
+    else:
+        lacks = has_attribute(subjects, trait)
+        rest = UNKNOWN
+    names = np.select([carries, lacks], [trait, f"not {trait}"], rest)
+    return [str(name) for name in names]
+
+
+def attribute_of(subjects: Subjects, name: str) -> str:
+    """The attribute to which a trait belongs; the name itself if it is an attribute."""
+    if name in subjects.attributes:
+        return name
+    return trait_of(subjects, name).partition(":")[0]
+
+
+def trait_of(subjects: Subjects, name: str) -> str:
+    """Full name of the trait that a name refers to; the error lists the attributes and
+    traits that can be used.
+    """
+    known = known_traits(subjects)
+    try:
+        return trait_name(name, known)
+    except InputError as error:
+        cure = (
+            f"choose from the attributes: {', '.join(sorted(subjects.attributes))}; "
+            f"traits: {', '.join(known) or 'none'}"
+        )
+        found = error.faults[0].found
+        rule = "must be an attribute or a trait"
+        raise InputError(Fault(f"group by {name}", rule, found, cure)) from None
+
+
+def trait_name(name: str, known: Iterable[str]) -> str:
+    """Full name of the trait that a name refers to: a full name, or a value that only
+    one trait has.
+
+    Raises
+    ------
+    InputError
+        If the name refers to no trait, or to more than one.
+    """
+    traits = list(known)
+    if name in traits:
+        return name
+    meant = [trait for trait in traits if trait.partition(":")[2] == name]
+    if len(meant) == 1:
+        return meant[0]
+    rule = "must name exactly one trait of the population"
+    found = f"{len(meant)} matches: {', '.join(meant)}" if meant else "an unknown name"
+    cure = f"choose from: {', '.join(traits) or 'none'}"
+    raise InputError(Fault(f"trait {name}", rule, found, cure))
+
+
+def known_traits(subjects: Subjects) -> list[str]:
+    """All traits that any take has, in alphabetical order."""
+    traits = set()
+    for name, attribute in subjects.attributes.items():
+        for value in attribute.values:
+            if isinstance(value, str):
+                traits.add(f"{name}:{value}")
+            elif value is True:
+                traits.add(name)
+    if np.isfinite(number_of_takes(subjects, AGE)).any():
+        traits.add(OLDER)
+    return sorted(traits - {f"{CONDITION}:{NORMAL}"})
+
+
+def trait_names(subjects: Subjects) -> list[str]:
+    """All traits that some takes have and others lack, in alphabetical order."""
+    return [
+        name
+        for name in known_traits(subjects)
+        if all(side.any() for side in sides(subjects, name))
+    ]
+
+
+def sides(subjects: Subjects, trait: str) -> tuple[Mask, Mask]:
+    """Masks (take,) of the comparable takes with and without a trait."""
+    carries = has_trait(subjects, trait)
+    usable = comparable_takes(subjects, trait)
+    return carries & usable, ~carries & usable
+
+
+def has_trait(subjects: Subjects, trait: str) -> Mask:
+    """Mask (take,) of the takes that have a trait, given by its full name."""
+    name, _, value = trait.partition(":")
+    if trait == OLDER:
+        ages = number_of_takes(subjects, AGE)
+        first: dict[str, float] = {}
+        for subject, age in zip(subjects.subject, ages.tolist(), strict=True):
+            if np.isfinite(age):  # the first take of a subject that states an age
+                first.setdefault(subject, age)
+        return np.asarray(ages > (np.median([*first.values()]) if first else np.inf))
+    if name not in subjects.attributes:
+        return np.zeros(len(subjects.take), np.bool_)
+    values = subjects.attributes[name].values
+    return np.array([v == value if value else v is True for v in values], np.bool_)
+
+
+def has_attribute(subjects: Subjects, trait: str) -> Mask:
+    """Mask (take,) of the takes that have the attribute of a trait."""
+    if trait == OLDER:
+        return np.isfinite(number_of_takes(subjects, AGE))
+    name = trait.partition(":")[0]
+    if name not in subjects.attributes:
+        return np.zeros(len(subjects.take), np.bool_)
+    values = subjects.attributes[name].values
+    return np.array([value is not None for value in values], np.bool_)
+
+
+def comparable_takes(subjects: Subjects, trait: str) -> Mask:
+    """Mask (take,) of the takes that are compared for a trait; takes without its
+    attribute are excluded.
+
+    A condition is compared within the subjects that were measured with and without it,
+    if there are any: between subjects it would be confounded with everything else that
+    differs.
+    """
+    carries = has_trait(subjects, trait)
+    plain = subjects.is_normal
+    if not trait.startswith(f"{CONDITION}:"):
+        # takes in other conditions are used only if no take with the trait is in the
+        # condition normal
+        used = plain if (carries & plain).any() else plain | carries
+        return has_attribute(subjects, trait) & used
+    names = np.array(subjects.subject)
+    paired = set(names[carries]) & set(names[plain])
+    if not paired:
+        return np.asarray(carries | plain)
+    return np.asarray(np.isin(names, list(paired)) & (carries | plain))
+
+
+def subjects_without_normal(subjects: Subjects) -> list[Note]:
+    """One note for each subject without a take in the condition normal; such subjects
+    are not compared with others.
+    """
+    plain = {subjects.subject[i] for i in np.flatnonzero(subjects.is_normal)}
+    others = [name for name in subjects.names if name not in plain]
+    return [note(subject, "no take in the condition normal") for subject in others]
+
+
+def numeric_attributes(subjects: Subjects) -> list[str]:
+    """Attributes with more than two different numbers, sorted."""
+    names = []
+    for name in sorted(subjects.attributes):
+        numbers = subjects.attributes[name].numbers
+        if len(set(numbers[np.isfinite(numbers)].tolist())) > 2:
+            names.append(name)
+    return names
+
+
+def number_of_takes(subjects: Subjects, name: str) -> Array:
+    """Values (take,) of an attribute that are numbers; NaN for the others."""
+    if name not in subjects.attributes:
+        return np.full(len(subjects.take), np.nan)
+    return subjects.attributes[name].numbers
+
+
+def notes_on_attributes(subjects: Subjects) -> list[str]:
+    """Lines about values of attributes that are likely to be mistakes."""
+    return [
+        line
+        for name in subjects.described
+        for line in subjects.by_subject(name, subjects.names).notes()
+    ]
+
+
+def require_adjustable(
+    subjects: Subjects, adjust: Sequence[str], compared: str = ""
+) -> None:
+    """Raise `InputError` if a name in `adjust` is not an attribute, or is the compared
+    attribute.
+    """
+    able = sorted(set(subjects.described) - {compared})
+    if unknown := [name for name in adjust if name not in able]:
+        rule = "must be an attribute other than the compared one"
+        cure = f"choose from: {', '.join(able) or 'none'}"
+        raise InputError(
+            Fault(f"adjust {name}", rule, "an unknown name", cure) for name in unknown
+        )
+
+
+def multiple_correlation(y: Array, columns: Array) -> float:
+    """Multiple correlation of values (n,) with columns (n, c), adjusted for their
+    number; NaN where it is not determined.
+    """
+    x = np.column_stack([np.ones(len(y)), columns])
+    free = len(y) - np.linalg.matrix_rank(x) if len(y) else 0
+    if free < 1 or np.ptp(y) == 0:
+        return float("nan")
+    left = y - x @ np.linalg.lstsq(x, y, rcond=None)[0]
+    return float(np.sqrt(max(0.0, 1.0 - (left @ left / free) / np.var(y, ddof=1))))
+
+
+def word_of(value: Value) -> str:
+    """A value as the name of a group: 20.0 is "20"."""
+    if isinstance(value, float) and value.is_integer():
+        return str(int(value))
+    return str(value)
+
+
+def is_age(value: Value) -> bool:
+    """Whether a value is an age in years."""
+    return _is_finite(value) and 0 <= float(str(value)) <= MAX_AGE
+
+
+def _parsed(value: object) -> Value:
+    """A value of a coordinate; None where it is missing (None, NaN or empty text)."""
+    if isinstance(value, np.generic):
+        value = value.item()
+    if value is None or value != value or value == "":
+        return None
+    return value if isinstance(value, bool | int | float | str) else str(value)
+
+
+def _is_number(value: Value) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _is_finite(value: Value) -> bool:
+    return _is_number(value) and math.isfinite(float(str(value)))
+
+
+def _reads_as_number(text: str) -> bool:
+    try:
+        return math.isfinite(float(text))
+    except ValueError:
+        return False
