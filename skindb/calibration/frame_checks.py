@@ -20,8 +20,8 @@ from skindb.calibration.radiance import (
 )
 from skindb.errors import Fault, InputError
 from skindb.format.dome import DomeRecord
+from skindb.format.fields import MAX_MAGNITUDE
 from skindb.format.frames import Digests, Frame, read_frame
-from skindb.format.json_file import MAX_MAGNITUDE
 from skindb.format.sensor import SensorRecord
 from skindb.types import Float64, Mask
 

@@ -16,7 +16,7 @@ import xarray as xr
 from skindb.errors import Fault, InputError, attempt, require
 from skindb.format.contact_probe import ProbeRecord, read_probe
 from skindb.format.dome import CameraRecord, DomeRecord, read_dome
-from skindb.format.fields import Fields
+from skindb.format.fields import Fields, read_json, shown
 from skindb.format.frame_paths import (
     CAMERA,
     EXPOSURE,
@@ -27,7 +27,6 @@ from skindb.format.frame_paths import (
     read_exposures,
 )
 from skindb.format.frames import Frame, read_frames
-from skindb.format.json_file import read_json, shown
 from skindb.limits import MAX_BALL_PLACES, MAX_KNOWN_POINTS
 from skindb.types import Float64
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from skindb.errors import Fault
-from skindb.format.fields import IDENTIFIER, Fields
+from skindb.format.fields import IDENTIFIER, MAX_MAGNITUDE, Fields, is_number, shown
 from skindb.format.frame_paths import (
     EXPOSURE,
     PLACEMENT,
@@ -28,7 +28,6 @@ from skindb.format.frame_paths import (
     require_own_files,
 )
 from skindb.format.frames import FrameKind, frame_size, header_faults, is_linear
-from skindb.format.json_file import MAX_MAGNITUDE, is_number, shown
 from skindb.format.sensor import SensorRecord, read_sensor
 from skindb.limits import MAX_FIBRES, MAX_PLACEMENTS, MAX_PRESSURE_SAMPLES, MAX_SITES
 from skindb.types import Float64

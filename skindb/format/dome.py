@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from skindb.format.fields import IDENTIFIER, REQUIRED, Fields, zoned_time
+from skindb.format.fields import IDENTIFIER, REQUIRED, Fields, shown, zoned_time
 from skindb.format.frame_paths import (
     CAMERA,
     EXPOSURE,
@@ -25,7 +25,6 @@ from skindb.format.frame_paths import (
     require_own_files,
 )
 from skindb.format.frames import FrameKind, header_faults, is_linear
-from skindb.format.json_file import shown
 from skindb.format.sensor import SensorRecord, read_sensor
 from skindb.geometry.camera import camera_centre, pixel_rays, project
 from skindb.limits import (

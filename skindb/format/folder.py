@@ -16,18 +16,20 @@ import numpy as np
 
 from skindb.errors import Fault, InputError, attempt
 from skindb.format.contact_probe import ProbeRecord, read_probe
-from skindb.format.crop_file import crop_path, parsed_crop
 from skindb.format.dome import DomeRecord, read_dome
-from skindb.format.fields import IDENTIFIER, NAME, Fields, zoned_time
-from skindb.format.frame_paths import decoding_faults, inside
-from skindb.format.json_file import (
+from skindb.format.fields import (
     CURE,
+    IDENTIFIER,
     MAX_MAGNITUDE,
+    NAME,
+    Fields,
     is_number,
     read_json,
     short,
     shown,
+    zoned_time,
 )
+from skindb.format.frame_paths import decoding_faults, inside
 from skindb.format.length_units import (
     CAMERAS,
     LANDMARKS,
@@ -43,11 +45,13 @@ from skindb.format.length_units import (
 from skindb.format.scan_checks import (
     SITE_LANDMARK,
     coincidence_faults,
+    crop_path,
     discarded_piece_faults,
     face_faults,
     face_height,
     landmark_faults,
     order_faults,
+    parsed_crop,
     scan_faults,
     swapped_faults,
 )

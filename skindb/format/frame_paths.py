@@ -12,9 +12,8 @@ from pathlib import Path
 
 from skindb.elementwise import thread_count
 from skindb.errors import Fault, attempt
-from skindb.format.fields import IDENTIFIER, Fields
+from skindb.format.fields import IDENTIFIER, Fields, short
 from skindb.format.frames import read_frame
-from skindb.format.json_file import short
 from skindb.limits import MAX_EXPOSURES, MAX_RECHECKED_BYTES
 
 EXPOSURE = "exposure"

@@ -9,10 +9,9 @@ import numpy as np
 
 from skindb.errors import attempt
 from skindb.files import read_regular
-from skindb.format.fields import Fields
+from skindb.format.fields import MAX_MAGNITUDE, Fields, shown
 from skindb.format.frame_paths import inside
 from skindb.format.frames import FrameKind
-from skindb.format.json_file import MAX_MAGNITUDE, shown
 from skindb.limits import MAX_RESPONSE_BYTES
 from skindb.types import Float64
 

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from skindb.errors import Fault, InputError, system_fault
+from skindb.format.fields import read_json
 from skindb.format.frames import (
     Frame,
     FrameKind,
@@ -24,7 +25,6 @@ from skindb.format.frames import (
     read_frame,
     write_frame,
 )
-from skindb.format.json_file import read_json
 from skindb.hw.probe import Reading
 from skindb.hw.safety import partial_schedule
 from skindb.hw.sequence import DARK, Schedule, sequence_entry

@@ -16,7 +16,7 @@ from typing import Any
 
 from skindb.errors import Fault, InputError
 from skindb.files import make_private, private_file
-from skindb.format.json_file import read_json
+from skindb.format.fields import read_json
 from skindb.hw.sequence import Schedule, Step
 
 UNFINISHED = "unfinished.json"  # removed when the capture is complete

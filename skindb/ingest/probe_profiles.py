@@ -18,8 +18,8 @@ from skindb.calibration.profile_statistics import (
 )
 from skindb.errors import Fault, InputError, attempt, require
 from skindb.format.contact_probe import ProbeRecord
+from skindb.format.fields import MAX_MAGNITUDE
 from skindb.format.frames import Digests
-from skindb.format.json_file import MAX_MAGNITUDE
 from skindb.types import Float64, Index
 
 # of the incident light; 1 by energy conservation, doubled for errors of scale and gain

@@ -18,13 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
-from skindb.format.crop_file import crop_path, is_point, parsed_crop
-from skindb.format.json_file import read_json
+from skindb.format.fields import read_json
 from skindb.format.scan_checks import (
     coincidence_faults,
+    crop_path,
     discarded_piece_faults,
     face_faults,
+    is_point,
     order_faults,
+    parsed_crop,
     swapped_faults,
 )
 from skindb.geometry.clean import CleanMesh, clean_mesh

@@ -11,7 +11,7 @@ from typing import Any
 
 from skindb.errors import Fault, InputError, add_filename, require
 from skindb.files import private_file
-from skindb.format.json_file import read_json
+from skindb.format.fields import read_json
 from skindb.ingest import (
     Capture,
     Crop,

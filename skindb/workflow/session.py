@@ -16,9 +16,8 @@ from skindb.calibration.setup import read_setup_dome
 from skindb.clock import SYSTEM_CLOCK, Clock, SimulatedClock
 from skindb.errors import Fault, InputError
 from skindb.files import make_private, private_umask
-from skindb.format.fields import IDENTIFIER
+from skindb.format.fields import IDENTIFIER, read_json
 from skindb.format.folder import read_capture, record_faults
-from skindb.format.json_file import read_json
 from skindb.geometry.scan import read_scan
 from skindb.hw.cameras import FolderCameras
 from skindb.hw.capture import CapturePlan, Devices, planned_schedule, run_capture

@@ -458,7 +458,9 @@ def test_ingest_capture__crop_is_in_the_provenance(capture_folder, tmp_path):
 
 
 @pytest.mark.parametrize("spacing", [6.0, 2.5])
-def test_transferred_landmarks__lie_on_the_surface_of_the_surfels(capture_folder, spacing):
+def test_transferred_landmarks__lie_on_the_surface_of_the_surfels(
+    capture_folder, spacing
+):
     """Clicked 0, 1, 2 .. mm beside the sphere: that is the distance, and what is stored
     lies on the surface.
     """

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 from skindb.errors import InputError
-from skindb.format.crop_file import crop_path
+from skindb.format.scan_checks import crop_path
 from skindb.geometry.landmarks import MEAN_FACE
 from skindb.geometry.scan import Crop
 from skindb.view.landmarks import (
