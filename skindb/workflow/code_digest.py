@@ -2,8 +2,8 @@
 
 The digest covers the functions that are named and everything in skindb that they use:
 functions, classes and constants, followed through the imports of their modules. The
-source is parsed and never imported. Docstrings, comments, annotations and formatting do
-not count, nor does what stands in the same file and is not used.
+source is parsed and never imported. Docstrings, comments, annotations, help texts of parameters and
+formatting do not count, nor does what stands in the same file and is not used.
 """
 
 from __future__ import annotations
@@ -213,6 +213,9 @@ def _written(node: Any) -> Any:
         return tuple(_written(part) for part in node)
     if not isinstance(node, ast.AST):
         return node
+    if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "option":
+        # a parameter of `skindb.parameters`, whose help does not count
+        return _written([*node.args[:1], *node.keywords])
     skipped = {*DERIVED_FIELDS, *_annotations(node)}
     fields = tuple(
         (name, _written(value))

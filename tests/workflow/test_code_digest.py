@@ -44,7 +44,12 @@ def fit(values: np.ndarray, parameters: Parameters) -> np.ndarray:
 def plot(values):
     return values
 ''',
-    "science/parameters.py": "class Parameters:\n    k = 4\n",
+    "science/parameters.py": """
+from skindb.jit import option
+
+class Parameters:
+    k = option(4, "Number.", minimum=1)
+""",
     "science/plain.py": "def shift():\n    return 1\n\ndef other():\n    return 2\n",
     "science/late.py": "def late():\n    return 3\n",
     "science/_kernels.py": """
@@ -97,7 +102,8 @@ def _digest_after(package, monkeypatch, name, old, new):
         ("science/_kernels.py", "total += value", "total -= value"),
         ("science/_kernels.py", "sum(values)", "max(values)"),
         ("science/_kernels.py", "@kernel\n", ""),
-        ("science/parameters.py", "k = 4", "k = 5"),
+        ("science/parameters.py", "option(4", "option(5"),
+        ("science/parameters.py", "minimum=1", "minimum=2"),
         ("science/late.py", "return 3", "return 4"),
         ("science/plain.py", "return 1", "return 0"),
         ("jit.py", "return function", "return None"),
@@ -114,6 +120,7 @@ def test_code_digest__changes_with_everything_that_is_used(
     ("name", "old", "new"),
     [
         ("science/model.py", "Fit values.", "Fit many values."),
+        ("science/parameters.py", "Number.", "Number of bases."),
         ("science/model.py", "    # a comment\n", "\n\n"),
         ("science/model.py", "values: np.ndarray", "values: list[float]"),
         ("science/model.py", "UNUSED = 1", "UNUSED = 2"),
