@@ -133,27 +133,27 @@ def export_bundle(
     model = as_mixture(model)
     target = Path(out).absolute()  # absolute, as "." has no name
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
-        found = "files in it" if target.is_dir() else "a file"
+        content = "files in it" if target.is_dir() else "a file"
         raise InputError(
             Fault(
                 str(target),
                 "must be a new or empty folder",
-                found,
+                content,
                 "choose another folder",
             )
         )
-    tell = progress or silent
+    report = progress or silent
     staged = target.with_name(f".{target.name}.{uuid.uuid4().hex[:8]}.partial")
     try:
         make_private(staged)
     except OSError as error:
         rule = "must be a folder that can be created"
-        found = error.strerror or str(error)
+        content = error.strerror or str(error)
         raise InputError(
-            Fault(str(target), rule, found, "choose another folder")
+            Fault(str(target), rule, content, "choose another folder")
         ) from None
     try:
-        described = _write_parts(model, staged, size, merl, tell)
+        described = _write_parts(model, staged, size, merl, report)
         manifest = _manifest(model, staged, described)
         text = json.dumps(plain(manifest), indent=1, allow_nan=False)
         private_file(staged / "manifest.json").write_text(text + "\n", encoding="utf-8")
@@ -198,25 +198,25 @@ def _write_parts(
     tell("glTF", 2, 3)
     skin = skin_of(model, size=size)
     error = export_gltf(model, folder / "model.glb", skin=skin)
-    about = (
+    text = (
         "glTF 2.0: mesh, uv, shading normals as a texture, and a metallic-roughness "
         "approximation of the material"
     )
     described["model.glb"] = {
-        "holds": about,
+        "holds": text,
         "units": "m",
         "approximation_error": error,
     }
     export_usd(model, folder / "usd", skin, longest_path=longest)
     described |= _usd_files(skin)
     export_mitsuba(model, folder / "mitsuba")
-    about = "mesh for Mitsuba: positions [mm], shading normals, uv"
-    described[f"mitsuba/{MESH}"] = {"holds": about, "units": "mm"}
-    about = (
+    text = "mesh for Mitsuba: positions [mm], shading normals, uv"
+    described[f"mitsuba/{MESH}"] = {"holds": text, "units": "mm"}
+    text = (
         "Mitsuba 3: the exact BRDFs as a BSDF, and a scene, which python skin.py "
         "picture.exr renders"
     )
-    described[f"mitsuba/{PROGRAM}"] = {"holds": about, "units": "mm"}
+    described[f"mitsuba/{PROGRAM}"] = {"holds": text, "units": "mm"}
     tell("done", 3, 3)
     return described
 
@@ -240,15 +240,15 @@ def _usd_files(skin: Skin) -> dict[str, dict[str, Any]]:
             "1",
         ),
     }
-    found: dict[str, dict[str, Any]] = {
+    files: dict[str, dict[str, Any]] = {
         f"usd/{name}": {"holds": text, "units": units}
         for name, (text, units) in holds.items()
     }
-    found[f"usd/{STAGE}"] |= {
+    files[f"usd/{STAGE}"] |= {
         "approximation_error": skin.error_of_one_index,
         "approximation_error_of_preview": skin.error_of_preview,
     }
-    return found
+    return files
 
 
 def _write_maps(maps: dict[str, TextureMap], folder: Path) -> dict[str, dict[str, Any]]:
@@ -258,9 +258,9 @@ def _write_maps(maps: dict[str, TextureMap], folder: Path) -> dict[str, dict[str
         planes = dict(
             zip(texture.channels, np.moveaxis(texture.values, -1, 0), strict=True)
         )
-        about = {"units": texture.units, "comments": texture.doc}
-        about |= {key: CONVENTIONS[key] for key in ("frame", "colour", "texture")}
-        write_exr(folder / f"{name}.exr", planes, attributes=about)
+        attributes = {"units": texture.units, "comments": texture.doc}
+        attributes |= {key: CONVENTIONS[key] for key in ("frame", "colour", "texture")}
+        write_exr(folder / f"{name}.exr", planes, attributes=attributes)
         shape = {"width": texture.values.shape[1], "height": texture.values.shape[0]}
         holds = {
             "holds": texture.doc,
@@ -286,21 +286,23 @@ def _write_bases(
     dictionary = Dictionary(
         tuple(map(str, names)), tables, TableGrid(*tables.shape[:3]), "basis", disc
     )
-    more = (
+    arrays = (
         {"basis_mixture": basis["basis_mixture"].values}
         if "basis_mixture" in basis
         else {}
     )
     if "dictionary" in basis.coords:
-        more["dictionary_names"] = np.array(list(map(str, basis["dictionary"].values)))
-    write_tables(folder / "bases.npz", dictionary, **more)
-    about = (
+        arrays["dictionary_names"] = np.array(
+            list(map(str, basis["dictionary"].values))
+        )
+    write_tables(folder / "bases.npz", dictionary, **arrays)
+    text = (
         "basis_brdf (component, theta_h, theta_d, phi_d), its nodes [rad], "
         "mixtures of the measured BRDFs; "
         "skindb fit --dictionary reads it"
     )
     described: dict[str, dict[str, Any]] = {
-        "bases/bases.npz": {"holds": about, "units": "sr-1"}
+        "bases/bases.npz": {"holds": text, "units": "sr-1"}
     }
     for k in range(count if merl else 0):
         write_merl(folder / f"component_{k}.binary", merl_table(tables[..., k]))
@@ -342,8 +344,8 @@ def _missing(model: xr.DataTree, described: dict[str, dict[str, Any]]) -> list[s
         "error, maps of errors, errors of translucency_sites: they describe the fit, "
         "which did not see the edited face"
     )
-    there = described.get("maps/translucency.exr", {}).get("channels", [])
-    lost = [channel for channel in "RGB" if channel not in there]
+    channels = described.get("maps/translucency.exr", {}).get("channels", [])
+    lost = [channel for channel in "RGB" if channel not in channels]
     unprobed = (
         [
             f"maps/translucency.exr: {', '.join(lost)}: sigma_tr is unknown at all probe sites"
@@ -376,11 +378,11 @@ def _errors(fitted: xr.Dataset) -> dict[str, Any]:
         quantiles = (
             np.quantile(finite, [0.5, 0.95]) if finite.size else [np.nan, np.nan]
         )
-        about = {"units": VARIABLES[name].units, "meaning": VARIABLES[name].doc}
+        meaning = {"units": VARIABLES[name].units, "meaning": VARIABLES[name].doc}
         report[name] = {
             "median": float(quantiles[0]),
             "quantile_95": float(quantiles[1]),
-        } | about
+        } | meaning
     return report
 
 

@@ -43,8 +43,8 @@ def texture_size(model: xr.DataTree) -> int:
     triangles = model["mesh"].to_dataset()["triangle"].values
     corners = uv.astype(np.float64)[triangles]
     edge = np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1))
-    wanted = TEXELS_PER_SPACING / max(float(edge), 1e-6)
-    return int(np.clip(2 ** np.ceil(np.log2(wanted)), MIN_SIZE, MAX_SIZE))
+    texels = TEXELS_PER_SPACING / max(float(edge), 1e-6)
+    return int(np.clip(2 ** np.ceil(np.log2(texels)), MIN_SIZE, MAX_SIZE))
 
 
 def chosen_size(model: xr.DataTree, size: int | None) -> int:
@@ -80,12 +80,12 @@ def _free_memory() -> float:
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
     except OSError:
         return np.inf
-    found = [
+    available = [
         float(line.split()[1]) * 1024
         for line in lines
         if line.startswith("MemAvailable:")
     ]
-    return found[0] if found else np.inf
+    return available[0] if available else np.inf
 
 
 def required(model: xr.DataTree) -> xr.Dataset:
@@ -106,12 +106,12 @@ def required(model: xr.DataTree) -> xr.Dataset:
     if not np.isfinite(corner).all() or not np.ptp(corner, axis=1).any():
         rule = "texture coordinates must be finite and cover an area"
         cure = "ingest and fit the capture again"
-        found = (
+        fault = (
             "values that are not finite"
             if not np.isfinite(corner).all()
             else "no triangle with an area"
         )
-        raise InputError(Fault("fitted[surfel_uv]", rule, found, cure))
+        raise InputError(Fault("fitted[surfel_uv]", rule, fault, cure))
     return fitted
 
 
@@ -122,10 +122,11 @@ def describe_edit(attrs: Mapping[Any, Any]) -> dict[str, Any] | None:
     if "edit" not in attrs:
         return None
     made_from = {
-        str(one["kind"]): one.get("generation") for one in attrs.get("inputs", [])
+        str(record["kind"]): record.get("generation")
+        for record in attrs.get("inputs", [])
     }
     whose = str(attrs.get("take", attrs.get("subject", "a subject")))
-    about = {
+    description = {
         "from": whose,
         "model_generation": made_from.get("model"),
         "by": dict(attrs["edit"]),
@@ -136,4 +137,4 @@ def describe_edit(attrs: Mapping[Any, Any]) -> dict[str, Any] | None:
         f"subjects added. The consent of {whose} covers it. Whoever shows it must "
         "state that it was edited.",
     }
-    return dict(plain(about))
+    return dict(plain(description))

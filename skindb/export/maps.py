@@ -193,15 +193,15 @@ def _translucency(
         for c, channel in enumerate("RGB")
     }
     planes = _spread_known(parts, trust, atlas)
-    found = {}
+    maps = {}
     for name, doc in TRANSLUCENCY.items():
         channels = tuple(channel for channel in "RGB" if name + channel in planes)
         if channels:
             image = np.concatenate(
                 [planes[name + channel] for channel in channels], axis=-1
             )
-            found[name] = TextureMap(image, channels, "mm", doc)
-    return found
+            maps[name] = TextureMap(image, channels, "mm", doc)
+    return maps
 
 
 def _measured(
@@ -222,12 +222,12 @@ def _measured(
         trust,
         atlas,
     )
-    found = {}
+    maps = {}
     for name, image in images.items():
         spec = VARIABLES[MEASURED[name]]
         channels = ("R", "G", "B") if image.shape[-1] == 3 else ("Y",)
-        found[name] = TextureMap(image, channels, spec.units, spec.doc)
-    return found
+        maps[name] = TextureMap(image, channels, spec.units, spec.doc)
+    return maps
 
 
 def _spread_known(
@@ -241,9 +241,9 @@ def _spread_known(
     """
     together: dict[bytes, list[str]] = {}
     for name, values in parts.items():
-        known = np.isfinite(values).all(axis=1) & (trust > 0)
-        if known.any():
-            together.setdefault(known.tobytes(), []).append(name)
+        finite = np.isfinite(values).all(axis=1) & (trust > 0)
+        if finite.any():
+            together.setdefault(finite.tobytes(), []).append(name)
     images: dict[str, Image] = {}
     for mask, names in together.items():
         columns = np.concatenate([parts[name] for name in names], axis=1)
@@ -359,5 +359,5 @@ def to_tangent_space(
 
 def _any_perpendicular(normal: Float) -> NDArray[np.float64]:
     axis = np.where(np.abs(normal[:, :1]) < 0.9, [[1.0, 0, 0]], [[0.0, 1, 0]])
-    found = np.cross(normal, axis)
-    return np.asarray(found / np.linalg.norm(found, axis=1, keepdims=True))
+    tangent = np.cross(normal, axis)
+    return np.asarray(tangent / np.linalg.norm(tangent, axis=1, keepdims=True))

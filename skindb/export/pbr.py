@@ -104,7 +104,7 @@ def _fit_lobe(
     rise = (1 - pairs.cos_d) ** 5
     matt = np.stack([np.ones_like(rise), rise], axis=1) / np.pi
     of_matt = parts.T @ (use[:, None] * matt)
-    found = np.zeros((len(base), 3))
+    parameters = np.zeros((len(base), 3))
     best = np.full(len(base), -np.inf)
     for roughness in ROUGHNESS:
         lobe = _ggx(
@@ -112,8 +112,8 @@ def _fit_lobe(
         )[0]
         gloss = lobe[:, None] * matt * np.pi
         squares = [
-            one.T @ (use[:, None] * other)
-            for one, other in ((gloss, gloss), (gloss, matt), (matt, matt))
+            left.T @ (use[:, None] * right)
+            for left, right in ((gloss, gloss), (gloss, matt), (matt, matt))
         ]
         of_gloss = parts.T @ (use[:, None] * gloss)
         flat_gloss = (matt[:, 0] * use) @ gloss
@@ -121,21 +121,23 @@ def _fit_lobe(
         gram = np.zeros((len(base), 2, 2))
         rhs = np.zeros((len(base), 2))
         for c in range(3):  # the three channels share the lobe
-            own = base[:, c, None]
+            colour = base[:, c, None]
             cross = squares[1] + squares[1].T
             gram += (
-                squares[0] - own[..., None] * cross + (own**2)[..., None] * squares[2]
+                squares[0]
+                - colour[..., None] * cross
+                + (colour**2)[..., None] * squares[2]
             )
             rhs += (
                 amounts[c] @ of_gloss
-                - own * flat_gloss
-                - own * (amounts[c] @ of_matt - own * flat_matt)
+                - colour * flat_gloss
+                - colour * (amounts[c] @ of_matt - colour * flat_matt)
             )
         x, gain = _best_pair(gram, rhs)
         better = gain > best
         best[better] = gain[better]
-        found[better] = np.column_stack([x, np.full(len(x), roughness)])[better]
-    return found[:, 0], found[:, 1], found[:, 2]
+        parameters[better] = np.column_stack([x, np.full(len(x), roughness)])[better]
+    return parameters[:, 0], parameters[:, 1], parameters[:, 2]
 
 
 def _best_pair(gram: Float, rhs: Float) -> tuple[Float, Float]:
@@ -198,7 +200,7 @@ def _fit_base(
         + slope**2 * moment[2]
     )
     of_flat, of_rise = (
-        parts.T @ (use * one) / np.pi for one in (np.ones_like(rise), rise)
+        parts.T @ (use * factor) / np.pi for factor in (np.ones_like(rise), rise)
     )
     gloss = np.zeros((len(low), 3))
     for value in np.unique(roughness):

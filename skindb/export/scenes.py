@@ -70,7 +70,7 @@ def _inputs(ior: float, radius: float) -> dict[str, tuple[str, str | float]]:
 
     Light leaves where it enters if `radius`, the longest mean free path [mm], is zero.
     """
-    found: dict[str, tuple[str, str | float]] = {
+    inputs: dict[str, tuple[str, str | float]] = {
         "base_color": ("color3", "baseColor.png"),
         "specular_color": ("color3", "specularFactor.png"),
         "specular_roughness": ("float", "roughness.png"),
@@ -78,13 +78,13 @@ def _inputs(ior: float, radius: float) -> dict[str, tuple[str, str | float]]:
         "geometry_normal": ("vector3", "normal.png"),
     }
     if radius > 0:
-        found |= {
+        inputs |= {
             "subsurface_weight": ("float", 1.0),
             "subsurface_color": ("color3", "baseColor.png"),
             "subsurface_radius": ("float", radius),
             RELATIVE: ("color3", MEAN_FREE_PATH),
         }
-    return found
+    return inputs
 
 
 def _per_length(inputs: Mapping[str, tuple[str, str | float]]) -> float:
@@ -106,9 +106,9 @@ def _materialx(inputs: Mapping[str, tuple[str, str | float]]) -> str:
         "open_pbr_surface", name="skin_surface", type="surfaceshader"
     )
     for name, (kind, value) in inputs.items():
-        given = ElementTree.SubElement(surface, "input", name=name, type=kind)
+        node = ElementTree.SubElement(surface, "input", name=name, type=kind)
         if isinstance(value, float):
-            given.set("value", f"{value:.6g}")
+            node.set("value", f"{value:.6g}")
             continue
         image = ElementTree.SubElement(root, "image", name=f"{name}_image", type=kind)
         file = ElementTree.SubElement(
@@ -147,7 +147,7 @@ def _materialx(inputs: Mapping[str, tuple[str, str | float]]) -> str:
                 value=f"{_per_length(inputs):.6g}",
             )
             source = "relative_length"
-        given.set("nodename", source)
+        node.set("nodename", source)
     root.append(surface)
     material = ElementTree.SubElement(
         root, "surfacematerial", name="skin", type="material"
@@ -225,7 +225,7 @@ def Xform "Face" (
 def _openpbr(inputs: Mapping[str, tuple[str, str | float]]) -> list[str]:
     """MaterialX shaders: coordinates, images and the surface."""
     path = "/Face/Materials/Skin"
-    found = [_shader("Coordinates", "ND_texcoord_vector2", ["float2 outputs:out"])]
+    shaders = [_shader("Coordinates", "ND_texcoord_vector2", ["float2 outputs:out"])]
     lines = []
     for name, (kind, value) in inputs.items():
         declared = {"color3": "color3f", "vector3": "float3"}.get(kind, kind)
@@ -244,13 +244,13 @@ def _openpbr(inputs: Mapping[str, tuple[str, str | float]]) -> list[str]:
             *(f'string inputs:{axis}addressmode = "clamp"' for axis in "uv"),
             f"{declared} outputs:out",
         ]
-        found.append(_shader(node, f"ND_image_{kind}", image))
+        shaders.append(_shader(node, f"ND_image_{kind}", image))
         if name == "geometry_normal":
             bent = [
                 f"float3 inputs:in.connect = <{path}/{node}.outputs:out>",
                 "float3 outputs:out",
             ]
-            found.append(_shader("BentNormal", "ND_normalmap_float", bent))
+            shaders.append(_shader("BentNormal", "ND_normalmap_float", bent))
             node = "BentNormal"
         elif name == RELATIVE:
             ratio = [f"color3f inputs:in1.connect = <{path}/{node}.outputs:out>"]
@@ -258,11 +258,11 @@ def _openpbr(inputs: Mapping[str, tuple[str, str | float]]) -> list[str]:
                 f"float inputs:in2 = {_per_length(inputs):.6g}",
                 "color3f outputs:out",
             ]
-            found.append(_shader("RelativeLength", "ND_multiply_color3FA", ratio))
+            shaders.append(_shader("RelativeLength", "ND_multiply_color3FA", ratio))
             node = "RelativeLength"
         lines.append(f"{declared} inputs:{name}.connect = <{path}/{node}.outputs:out>")
     return [
-        *found,
+        *shaders,
         _shader(
             "OpenPbr",
             "ND_open_pbr_surface_surfaceshader",
@@ -275,7 +275,7 @@ def _preview(ior: float) -> list[str]:
     """Shaders for renderers without MaterialX."""
     path = "/Face/Materials/Skin"
     reader = ['string inputs:varname = "st"', "float2 outputs:result"]
-    found = [_shader("PreviewCoordinates", "UsdPrimvarReader_float2", reader)]
+    shaders = [_shader("PreviewCoordinates", "UsdPrimvarReader_float2", reader)]
     for name, file, space, output in (
         ("PreviewColor", "baseColor.png", "sRGB", "float3 outputs:rgb"),
         ("PreviewRoughness", "roughness.png", "raw", "float outputs:r"),
@@ -292,7 +292,7 @@ def _preview(ior: float) -> list[str]:
                 "float4 inputs:scale = (2, 2, 2, 1)",
                 "float4 inputs:bias = (-1, -1, -1, 0)",
             ]
-        found.append(_shader(name, "UsdUVTexture", [*lines, output]))
+        shaders.append(_shader(name, "UsdUVTexture", [*lines, output]))
     surface = [
         f"color3f inputs:diffuseColor.connect = <{path}/PreviewColor.outputs:rgb>",
         f"float inputs:ior = {ior:.6g}",
@@ -300,7 +300,7 @@ def _preview(ior: float) -> list[str]:
         f"float inputs:roughness.connect = <{path}/PreviewRoughness.outputs:r>",
         "token outputs:surface",
     ]
-    return [*found, _shader("Preview", "UsdPreviewSurface", surface)]
+    return [*shaders, _shader("Preview", "UsdPreviewSurface", surface)]
 
 
 def _shader(name: str, kind: str, lines: list[str]) -> str:
@@ -313,7 +313,7 @@ def _shader(name: str, kind: str, lines: list[str]) -> str:
 
 def _vectors(values: NDArray[np.floating[Any]]) -> str:
     tuples = (", ".join(f"{x:.7g}" for x in row) for row in values.tolist())
-    return f"[{', '.join(f'({one})' for one in tuples)}]"
+    return f"[{', '.join(f'({numbers})' for numbers in tuples)}]"
 
 
 def _normals(fitted: xr.Dataset) -> NDArray[np.float64]:

@@ -86,9 +86,9 @@ def skin_of(model: xr.DataTree, *, size: int | None = None) -> Skin:
     mesh = model["mesh"].to_dataset()
     trust = surfel_confidence(fitted)
     tables = kernel_tables(model["basis"].to_dataset())
-    known = np.flatnonzero(trust > 0)
+    trusted = np.flatnonzero(trust > 0)
     diffuse, weights = (
-        fitted[name].values[known] for name in ("diffuse_reflectance", "basis_weight")
+        fitted[name].values[trusted] for name in ("diffuse_reflectance", "basis_weight")
     )
     skin = fit_material(tables, diffuse, weights, eta=eta)
     mean_f0 = (
@@ -106,12 +106,12 @@ def skin_of(model: xr.DataTree, *, size: int | None = None) -> Skin:
     )
     shape = _shape(fitted, mesh["triangle"].values)
     top = float(max(skin.f0.max(), MIN_F0))
-    through = _through(fitted, shape, known, eta)
-    columns = _columns(skin, known, shape, top, through)
+    through = _through(fitted, shape, trusted, eta)
+    columns = _columns(skin, trusted, shape, top, through)
     images, layout = atlas_images(model, columns, trust, size=chosen_size(model, size))
     values = np.split(images, np.cumsum([*layout.values()])[:-1], axis=-1)
     pictures = _textures(dict(zip(layout, values, strict=True)))
-    error["normal_error_degrees"] = _normal_error(pictures["normal"], shape, known)
+    error["normal_error_degrees"] = _normal_error(pictures["normal"], shape, trusted)
     f0 = (top, max(mean_f0, MIN_F0), reflection)
     return Skin(
         pictures, shape, *f0, error, of_one_index, of_preview, float(through.max())
@@ -130,13 +130,13 @@ def _errors(
     chosen = np.linspace(0, len(diffuse) - 1, min(ERROR_POINTS, len(diffuse))).astype(
         int
     )
-    some = [
-        Material(*(getattr(one, part.name)[chosen] for part in fields(one)))
-        for one in materials
+    samples = [
+        Material(*(getattr(material, part.name)[chosen] for part in fields(material)))
+        for material in materials
     ]
     return [
-        approximation_error(tables, diffuse[chosen], weights[chosen], one, eta=eta)
-        for one in some
+        approximation_error(tables, diffuse[chosen], weights[chosen], material, eta=eta)
+        for material in samples
     ]
 
 
@@ -246,11 +246,11 @@ def _normal_error(
 ) -> float:
     """Median angle [degree] between the shading normals and those of the texture at the surfels."""
     size = len(picture)
-    at = (shape.uv[known].astype(np.float64) * size - 0.5)[:, ::-1].T
+    places = (shape.uv[known].astype(np.float64) * size - 0.5)[:, ::-1].T
     bent = np.stack(
         [
             ndimage.map_coordinates(
-                picture[..., c] / 127.5 - 1, at, order=1, mode="nearest"
+                picture[..., c] / 127.5 - 1, places, order=1, mode="nearest"
             )
             for c in range(3)
         ],
@@ -259,11 +259,11 @@ def _normal_error(
     normal = shape.normal[known]
     tangent = shape.tangent[known]
     bitangent = np.cross(normal, tangent[:, :3]) * tangent[:, 3:]
-    found = (
+    normals = (
         bent[:, :1] * tangent[:, :3] + bent[:, 1:2] * bitangent + bent[:, 2:] * normal
     )
-    found /= np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-9)
-    cosine = np.clip((found * shape.shading[known]).sum(axis=1), -1, 1)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
+    cosine = np.clip((normals * shape.shading[known]).sum(axis=1), -1, 1)
     return float(np.degrees(np.median(np.arccos(cosine))))
 
 

@@ -88,11 +88,13 @@ def transmitted_fraction(
     eta
         Refractive index of the skin.
     """
-    known = np.isfinite(sigma_tr) & np.isfinite(distance)[:, None]
+    finite = np.isfinite(sigma_tr) & np.isfinite(distance)[:, None]
     s, _ = dipole_s(diffuse, eta=eta)
-    absorption, scattering = scattering_coefficients(s, np.where(known, sigma_tr, 1.0))
-    there, here = (
-        dipole_power_beyond(where, absorption, scattering, eta=eta)
-        for where in (np.where(known, distance[:, None], 0.0), 0.0)
+    absorption, scattering = scattering_coefficients(s, np.where(finite, sigma_tr, 1.0))
+    beyond, here = (
+        dipole_power_beyond(depth, absorption, scattering, eta=eta)
+        for depth in (np.where(finite, distance[:, None], 0.0), 0.0)
     )
-    return np.where(known & (here > 0), there / np.maximum(there + here, 1e-300), 0.0)
+    return np.where(
+        finite & (here > 0), beyond / np.maximum(beyond + here, 1e-300), 0.0
+    )

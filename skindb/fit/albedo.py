@@ -118,9 +118,11 @@ def estimate_diffuse_reflectance(
     if method not in METHODS:
         raise ValueError(f"method must be one of {METHODS}, not {method!r}")
     check(lumitexels, (*GEOMETRY, "shading_normal"), where="lumitexels")
-    known = [name for name in NORMAL_ERRORS if name in lumitexels]
+    normal_errors = [name for name in NORMAL_ERRORS if name in lumitexels]
     names = tuple(
-        dict.fromkeys((*GEOMETRY, "shading_normal", *noise_inputs(lumitexels), *known))
+        dict.fromkeys(
+            (*GEOMETRY, "shading_normal", *noise_inputs(lumitexels), *normal_errors)
+        )
     )
     fitted = elementwise(
         by_name(block_reflectance, names),

@@ -161,30 +161,32 @@ def _add_view(
     if ratio.min() < LOWEST or ratio.max() > HIGHEST:
         return
     q, _ = np.linalg.qr(columns / fitted[:, None])
-    left = np.diag(ratio) - q @ (q.T * ratio)
-    matrix[np.ix_(at, at)] += left.T @ left
+    projected = np.diag(ratio) - q @ (q.T * ratio)
+    matrix[np.ix_(at, at)] += projected.T @ projected
 
 
 def _gains(matrix: Array) -> Array:
     """Gains (light,) from the quadratic form (light, light) of the residual in the
     inverse gains.
     """
-    own = np.diagonal(matrix)
-    if not (own > 0).any():
+    information = np.diagonal(matrix)
+    if not (information > 0).any():
         return np.ones(len(matrix))
-    prior = PRIOR * float(np.median(own[own > 0]))
+    prior = PRIOR * float(np.median(information[information > 0]))
     inverse = np.linalg.solve(
         matrix + prior * np.eye(len(matrix)), np.full(len(matrix), prior)
     )
-    gain = np.where(own > 0, 1 / inverse, 1.0)
-    return np.asarray(np.where(own > 0, gain / np.median(gain[own > 0]), 1.0))
+    gain = np.where(information > 0, 1 / inverse, 1.0)
+    return np.asarray(
+        np.where(information > 0, gain / np.median(gain[information > 0]), 1.0)
+    )
 
 
 def _frame(normal: Array) -> Array:
     """Two tangents and the normal, in rows."""
-    first = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
-    first /= np.linalg.norm(first)
-    return np.stack([first, np.cross(normal, first), normal])
+    tangent = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
+    tangent /= np.linalg.norm(tangent)
+    return np.stack([tangent, np.cross(normal, tangent), normal])
 
 
 def _shading(direction: Array, eta: float) -> Array:
@@ -235,12 +237,12 @@ def bounced_light(
         lumitexels[name].values.astype(np.float64) for name in NEEDED[:3]
     )
     if len(position) != len(visible) or len(position) != len(diffuse):
-        found = f"{len(position)}, {len(visible)} and {len(diffuse)} surfels"
+        counts = f"{len(position)}, {len(visible)} and {len(diffuse)} surfels"
         rule = "samples, visibility and R_d must be of the same surfels"
         raise InputError(
-            Fault("inter-reflection", rule, found, "ingest the capture again")
+            Fault("inter-reflection", rule, counts, "ingest the capture again")
         )
-    known = np.where(
+    reflectance = np.where(
         np.isfinite(diffuse), diffuse, np.nanmedian(diffuse, axis=0)
     ).astype(np.float32)
     scene = RayScene(position, triangles)
@@ -254,16 +256,16 @@ def bounced_light(
     )
     # transmitted light of each lamp over its intensity
     sent = (enters / square).astype(np.float32)
-    out = np.zeros((len(position), len(light), known.shape[1]), np.float32)
-    for first in range(0, len(position), SURFELS_PER_BLOCK):
-        part = slice(first, first + SURFELS_PER_BLOCK)
-        at, met, weight = _meetings(
+    out = np.zeros((len(position), len(light), reflectance.shape[1]), np.float32)
+    for begin in range(0, len(position), SURFELS_PER_BLOCK):
+        part = slice(begin, begin + SURFELS_PER_BLOCK)
+        receiver, met, weight = _meetings(
             scene, position[part], normal[part], rays, triangles, normal, eta
         )
-        for c in range(known.shape[1]):
+        for c in range(reflectance.shape[1]):
             shape = (len(position[part]), len(position))
             out[part, :, c] = (
-                csr_array((weight * known[met, c], (at, met)), shape=shape)
+                csr_array((weight * reflectance[met, c], (receiver, met)), shape=shape)
                 @ sent
                 * square[part]
             )
@@ -295,8 +297,8 @@ def without_bounce(
     # otherwise the contribution to all samples would be computed at once
     if sample.chunks is not None:
         arrives, towards = (
-            one.chunk({"surfel": sample.chunksizes["surfel"]})
-            for one in (arrives, towards)
+            variable.chunk({"surfel": sample.chunksizes["surfel"]})
+            for variable in (arrives, towards)
         )
     direct = (
         (sample.astype(np.float32) - arrives * towards)
@@ -319,9 +321,9 @@ def _meetings(
     """Pairs of surfels (m,) of a block and the surfels (m,) that their rays hit, with
     weights (m,).
     """
-    first = np.cross(normal, np.eye(3)[np.abs(normal).argmin(axis=1)])
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    frame = np.stack([first, np.cross(normal, first), normal], axis=1)
+    tangent = np.cross(normal, np.eye(3)[np.abs(normal).argmin(axis=1)])
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    frame = np.stack([tangent, np.cross(normal, tangent), normal], axis=1)
     way = np.einsum("rk,nkj->nrj", rays, frame).reshape(-1, 3)
     start = np.repeat(position + RAY_OFFSET_MM * normal, len(rays), axis=0)
     face, corner, distance = scene.first_hit(start, way)

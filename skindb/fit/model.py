@@ -111,20 +111,22 @@ def first_pass(
     honour_consent(capture.attrs, "fit")
     parameters = parameters or FitParameters()
     clock = Clock(progress)
-    whole = lumitexels(capture)
+    samples_of_take = lumitexels(capture)
     groups: dict[str, xr.Dataset] = {}
     if parameters.light_gains:
         chosen = np.random.default_rng([parameters.seed, 2])
         with clock.stage("light gains"):
             groups["light_gains"] = estimate_light_gains(
-                whole, rng=chosen, eta=parameters.eta
+                samples_of_take, rng=chosen, eta=parameters.eta
             )
-        whole = divided_by_gains(whole, groups["light_gains"]["light_gain"])
+        samples_of_take = divided_by_gains(
+            samples_of_take, groups["light_gains"]["light_gain"]
+        )
     with clock.stage("dictionary"):
-        surface = surface_of(whole, parameters, dictionary)
+        surface = surface_of(samples_of_take, parameters, dictionary)
         plan = plan_fit(capture, parameters, dictionary=dictionary)
     held_out = hold_out(capture, plan, parameters)
-    work = fitted_part(whole, held_out)
+    work = fitted_part(samples_of_take, held_out)
     eta = parameters.eta
     diffuse = partial(
         estimate_diffuse_reflectance,
@@ -134,18 +136,18 @@ def first_pass(
 
     # one graph: every block of samples is read once
     def fit(samples: xr.Dataset) -> xr.Dataset:
-        found = estimate_normals(samples, eta=eta)
-        found = found.merge(diffuse(samples.merge(found)))
+        estimates = estimate_normals(samples, eta=eta)
+        estimates = estimates.merge(diffuse(samples.merge(estimates)))
         shiny = fit_surface(
-            samples.merge(found), surface=surface, mode=parameters.mode, eta=eta
+            samples.merge(estimates), surface=surface, mode=parameters.mode, eta=eta
         )
-        return found.merge(shiny).compute()
+        return estimates.merge(shiny).compute()
 
     with clock.stage("first pass"):
         fitted = fit(work)
     if parameters.inter_reflection:
         with clock.stage("inter-reflection"):
-            direct = _direct_light(capture, whole, fitted, eta)
+            direct = _direct_light(capture, samples_of_take, fitted, eta)
         with clock.stage("first pass again"):
             fitted = fit(fitted_part(direct, held_out))
     fitted["fit_status"][find_obstructed(fitted)] = FitStatus.OBSTRUCTED
@@ -187,31 +189,35 @@ def second_pass(
     honour_consent(capture.attrs, "fit")
     parameters = FitParameters.of(first.attrs)
     clock = Clock(progress)
-    whole = lumitexels(capture)
+    samples_of_take = lumitexels(capture)
     if "light_gains" in first.children:
-        whole = divided_by_gains(whole, first["light_gains"].to_dataset()["light_gain"])
-    surface = surface_of(whole, parameters, dictionary)
-    _require_match(first, surface, whole)
+        samples_of_take = divided_by_gains(
+            samples_of_take, first["light_gains"].to_dataset()["light_gain"]
+        )
+    surface = surface_of(samples_of_take, parameters, dictionary)
+    _require_match(first, surface, samples_of_take)
     fitted = first["fitted"].to_dataset()
     held_out = first["held_out"].to_dataset()
     if parameters.inter_reflection:
         with clock.stage("inter-reflection"):
-            whole = _direct_light(capture, whole, fitted, parameters.eta)
+            samples_of_take = _direct_light(
+                capture, samples_of_take, fitted, parameters.eta
+            )
     with clock.stage("reduced basis"):
         rng = np.random.default_rng([parameters.seed, 1])
-        weighted = fitted.merge(whole[["surfel_area"]])
+        weighted = fitted.merge(samples_of_take[["surfel_area"]])
         basis = surface.reduced(weighted, k=parameters.k, rng=rng)
     with clock.stage("second pass"):
         # only mixtures of BRDFs can be rendered
         mode = "perceptual" if parameters.mode == "paper" else parameters.mode
-        known = (
+        estimates = (
             "shading_normal",
             "normal_error",
             "diffuse_reflectance",
             "diffuse_reflectance_error",
         )
         judged, outliers = refit_and_evaluate(
-            whole.merge(fitted[list(known)]),
+            samples_of_take.merge(fitted[list(estimates)]),
             held_out=held_out,
             basis=basis,
             mode=mode,
@@ -240,15 +246,15 @@ def second_pass(
         name: capture.attrs[name] for name in KEPT_ATTRS if name in capture.attrs
     }
     # the values that were actually used
-    used = parameters.as_dict() | surface_model(basis).settings
-    model.attrs |= {"parameters": used} | surface.provenance
+    settings = parameters.as_dict() | surface_model(basis).settings
+    model.attrs |= {"parameters": settings} | surface.provenance
     model.attrs |= _report(groups["fitted"], held_out)
     if "translucency" in groups:
         model.attrs["translucency"] = summarise_translucency(groups["translucency"])
     if "light_gains" in groups:
         model.attrs["light_gains"] = summarise_gains(groups["light_gains"])
     model.attrs |= {
-        "suspects": suspects(outliers, fitted_part(whole, held_out)),
+        "suspects": suspects(outliers, fitted_part(samples_of_take, held_out)),
         "skipped": first.attrs["skipped"],
     }
     model.attrs["seconds"] = {**first.attrs["seconds"], **clock.seconds}
@@ -258,11 +264,11 @@ def second_pass(
 def _require_match(
     first: xr.DataTree, surface: ReflectanceModel, whole: xr.Dataset
 ) -> None:
-    about = surface.provenance
-    if any(first.attrs.get(name) != about[name] for name in about):
+    origin = surface.provenance
+    if any(first.attrs.get(name) != origin[name] for name in origin):
         rule = "both passes need the same dictionary"
         cure = "give that of the first pass, or repeat it"
-        source = str(next(iter(about.values())))
+        source = str(next(iter(origin.values())))
         raise InputError(Fault("dictionary", rule, source, cure))
     surfels = first["fitted"].sizes["surfel"]
     if surfels != whole.sizes["surfel"]:
@@ -376,17 +382,17 @@ class Clock:
         if self.progress is None:
             yield
         else:
-            tell = self.progress
+            report = self.progress
             ticker = _Ticker(name, self.progress)
-            tell(name, 0, 1)
+            report(name, 0, 1)
             with (
                 ticker,
                 reported_compilation(
-                    lambda: tell(f"{name} ({COMPILING})", ticker.done, ticker.total)
+                    lambda: report(f"{name} ({COMPILING})", ticker.done, ticker.total)
                 ),
             ):
                 yield
-            tell(name, ticker.total, ticker.total)
+            report(name, ticker.total, ticker.total)
         self.seconds[name] = round(time.perf_counter() - begin, 3)
 
 

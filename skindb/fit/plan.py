@@ -70,7 +70,7 @@ def plan_fit(
     are not detected, as all three use the same system of equations.
     """
     parameters = parameters or FitParameters()
-    where = str(capture.attrs.get("take", capture.attrs.get("subject", "capture")))
+    name = str(capture.attrs.get("take", capture.attrs.get("subject", "capture")))
     if "samples" not in capture.children:
         measured = (
             "only the probe was measured"
@@ -79,7 +79,7 @@ def plan_fit(
         )
         cure = "photograph the subject in the dome, or exclude this take"
         raise InputError(
-            Fault(where, "a fit needs photographs of a dome", measured, cure)
+            Fault(name, "a fit needs photographs of a dome", measured, cure)
         )
     surfels = capture["samples"].to_dataset()["sample_count"].values > 0
     probe = "probe" in capture.children
@@ -90,8 +90,8 @@ def plan_fit(
     if not surfels.any() or not reached.any():
         rule = "a fit needs surfels that a camera sees lit"
         cure = "check calibration, mesh and frames, then ingest again"
-        raise InputError(Fault(f"{where}: samples", rule, "no usable sample", cure))
-    found = [
+        raise InputError(Fault(f"{name}: samples", rule, "no usable sample", cure))
+    candidates = [
         Omission(
             "surfels",
             int((~surfels).sum()),
@@ -105,7 +105,7 @@ def plan_fit(
             "they reach no surfel that has a sample",
         ),
     ]
-    omissions = tuple(omission for omission in found if omission.skipped)
+    omissions = tuple(omission for omission in candidates if omission.skipped)
     if not probe:
         omissions += (
             Omission(

@@ -181,9 +181,9 @@ def fit_profile(
             & (profile > 0)
             & (distance > 0)
         )
-    used = int(good.sum())
-    if used < MIN_FIBRES + int(free_gain):
-        return _nothing(used)
+    fibres = int(good.sum())
+    if fibres < MIN_FIBRES + int(free_gain):
+        return _nothing(fibres)
     problem = Problem(
         *_faces(distance[good], radius),
         np.log(profile[good]),
@@ -192,15 +192,15 @@ def fit_profile(
         MODELS[model],
         free_gain,
     )
-    found, rival = _best(problem)
+    minimum, rival = _best(problem)
     near = 0.0
-    if free_gain and used > MIN_FIBRES + 1:
+    if free_gain and fibres > MIN_FIBRES + 1:
         # the nearest fibres determine the gain, and the error of the model is largest there
         without = replace(
             problem, **{name: getattr(problem, name)[1:] for name in PER_FIBRE}
         )
-        near = abs(float(_descend(without, found.x).x[0] - found.x[0]))
-    return _report(found, problem, rival=rival, near=near)
+        near = abs(float(_descend(without, minimum.x).x[0] - minimum.x[0]))
+    return _report(minimum, problem, rival=rival, near=near)
 
 
 def _best(problem: Problem) -> tuple[Any, float]:
@@ -209,14 +209,14 @@ def _best(problem: Problem) -> tuple[Any, float]:
     """
     tries = [_descend(problem, p) for p in _valleys(problem)]
     cost = np.array([problem.deviance(end.x) for end in tries])
-    found = tries[int(np.argmin(cost))]
-    excess = max(1.0, 2 * found.cost / max(len(problem.distance) - len(found.x), 1))
+    minimum = tries[int(np.argmin(cost))]
+    excess = max(1.0, 2 * minimum.cost / max(len(problem.distance) - len(minimum.x), 1))
     rivals = [
-        end.x[0] - found.x[0]
+        end.x[0] - minimum.x[0]
         for end, c in zip(tries, cost, strict=True)
         if c < cost.min() + RIVAL * excess
     ]
-    return found, float(np.abs(rivals).max())
+    return minimum, float(np.abs(rivals).max())
 
 
 def _valleys(problem: Problem) -> Array:
@@ -280,15 +280,15 @@ def _descend(problem: Problem, start: Array) -> Any:
     for _ in range(2):
         p = np.clip(p, LOWER[:size] + 1e-6, UPPER[:size] - 1e-6)
         bounds = (LOWER[:size], UPPER[:size])
-        found = least_squares(
+        minimum = least_squares(
             problem.objective,
             p,
             args=(problem.weight(p),),
             bounds=bounds,
             max_nfev=EVALUATIONS,
         )
-        p = found.x
-    return found
+        p = minimum.x
+    return minimum
 
 
 def _coefficients(p: Array) -> tuple[Array, Array]:
@@ -310,26 +310,26 @@ def _report(found: Any, problem: Problem, *, rival: float, near: float) -> Probe
     """
     p = found.x
     size = len(p)
-    used = len(problem.log_profile)
+    fibres = len(problem.log_profile)
     # a ridge keeps undetermined directions finite; their error exceeds any bound
     normal = np.linalg.inv(found.jac.T @ found.jac + 1e-12 * np.eye(size))
     effect = normal @ found.jac.T  # of each weighted residual on each parameter
-    gain = effect[:, :used] * problem.weight(p)
+    gain = effect[:, :fibres] * problem.weight(p)
     # residuals larger than both errors increase the error
-    excess = 2 * float(found.cost) / max(used - size, 1)
+    excess = 2 * float(found.cost) / max(fibres - size, 1)
     residual = float(np.sqrt(np.mean(problem.misfit(p) ** 2)))
     covariance = (gain * problem.relative_error(p) ** 2) @ gain.T * max(
         1.0, excess
     ) + 1e-18 * np.eye(size)
-    covariance += effect[:, used:] @ effect[:, used:].T
+    covariance += effect[:, fibres:] @ effect[:, fibres:].T
     sd = np.sqrt(np.diag(covariance))
     error = float(max(sd[0], rival, near))
     _, vectors = np.linalg.eigh(covariance[:2, :2])
     sharp = vectors[:, 0] / np.abs(vectors[:, 0]).max()
     sharp = sharp * np.sign(sharp[0]) if sharp[0] else sharp
     a, s = map(float, _coefficients(p))
-    own = problem.model.bright + problem.model.dark * a / (a + s)
-    off = float(np.hypot(gain[0] @ problem.discrepancy(p), own))
+    model_error = problem.model.bright + problem.model.dark * a / (a + s)
+    off = float(np.hypot(gain[0] @ problem.discrepancy(p), model_error))
     tr = float(np.exp(p[0]))
     unexplained, chance = _unexplained(problem, p)
     bound = bool((p - LOWER[:size] < 1e-3).any() or (UPPER[:size] - p < 1e-3).any())
@@ -353,7 +353,7 @@ def _report(found: Any, problem: Problem, *, rival: float, near: float) -> Probe
         residual=residual,
         misfit=unexplained,
         chi_squared=excess,
-        used=used,
+        used=fibres,
         correlation=float(covariance[0, 1] / (sd[0] * sd[1])),
         combination=(float(sharp[0]), float(sharp[1])),
         status=next(

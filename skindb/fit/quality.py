@@ -73,9 +73,9 @@ def fitted_part(lumitexels: xr.Dataset, held_out: xr.Dataset) -> xr.Dataset:
     """Lumitexels without the lights and cameras that are held out."""
     part = lumitexels
     for dim in ("light", "camera"):
-        kept = np.flatnonzero(held_out[f"{dim}_held_out"].values == 0)
+        fitted = np.flatnonzero(held_out[f"{dim}_held_out"].values == 0)
         # indexing everything would copy the samples
-        part = part if len(kept) == part.sizes[dim] else part.isel({dim: kept})
+        part = part if len(fitted) == part.sizes[dim] else part.isel({dim: fitted})
     return part
 
 
@@ -90,10 +90,10 @@ def _drawn(
         raise InputError(Fault(f"hold_out_{dim}s", rule, str(count), cure))
     order = np.random.default_rng(seed).permutation(np.flatnonzero(useful))
     if "photographs" in capture.children:
-        shown = np.isin(
+        photographed = np.isin(
             order, capture["photographs"].to_dataset()[f"photograph_{dim}"].values
         )
-        order = order[np.argsort(~shown, kind="stable")]
+        order = order[np.argsort(~photographed, kind="stable")]
     return np.sort(
         order[: min(max(round(fraction * count), int(fraction > 0)), count - 1)]
     )
@@ -183,7 +183,7 @@ def describe_prediction(table: xr.Dataset) -> dict[str, Any]:
 
 def tabulate_prediction(described: dict[str, Any]) -> list[list[str]]:
     """Header and rows of `describe_prediction` for a terminal: median / 95 %, in per cent."""
-    kinds = [(what, space) for what in SAMPLES for space in SPACES]
+    kinds = [(samples, space) for samples in SAMPLES for space in SPACES]
     rows = [
         (name, row)
         for part in described.values()
@@ -191,16 +191,18 @@ def tabulate_prediction(described: dict[str, Any]) -> list[list[str]]:
         if row["surfels"]
     ]
     kinds = [
-        (what, space) for what, space in kinds if any(what in row for _, row in rows)
+        (samples, space)
+        for samples, space in kinds
+        if any(samples in row for _, row in rows)
     ]
     titles = [
-        "roots" if space == "perceptual" else what.replace("held_out_", "unseen ")
-        for what, space in kinds
+        "roots" if space == "perceptual" else samples.replace("held_out_", "unseen ")
+        for samples, space in kinds
     ]
     lines = [["median / 95 % [%]", "surfels", "outliers", *titles]]
     for name, row in rows:
-        cells = [row.get(what, {}).get(space) for what, space in kinds]
-        shown = [
+        cells = [row.get(samples, {}).get(space) for samples, space in kinds]
+        quantiles = [
             f"{100 * c['median']:.1f} / {100 * c['p95']:.1f}" if c else "-"
             for c in cells
         ]
@@ -211,7 +213,7 @@ def tabulate_prediction(described: dict[str, Any]) -> list[list[str]]:
                 f"{100 * row['outlier_fraction']:.1f}"
                 if "outlier_fraction" in row
                 else "-",
-                *shown,
+                *quantiles,
             ]
         )
     return lines
@@ -219,24 +221,24 @@ def tabulate_prediction(described: dict[str, Any]) -> list[list[str]]:
 
 def _row(one: xr.Dataset) -> dict[str, Any]:
     """Values of one region or status."""
-    found: dict[str, Any] = {"surfels": int(one["prediction_surfels"])}
-    if found["surfels"]:
-        found["fraction"] = float(one["prediction_fraction"])
+    row: dict[str, Any] = {"surfels": int(one["prediction_surfels"])}
+    if row["surfels"]:
+        row["fraction"] = float(one["prediction_fraction"])
     if np.isfinite(one["prediction_outlier_fraction"]):
-        found["outlier_fraction"] = float(one["prediction_outlier_fraction"])
-    for what in SAMPLES:
+        row["outlier_fraction"] = float(one["prediction_outlier_fraction"])
+    for samples in SAMPLES:
         error = (
             one["prediction_error"]
-            .sel(samples=what)
+            .sel(samples=samples)
             .transpose("space", "statistic")
             .values
         )
         if np.isfinite(error).all():
-            found[what] = {
+            row[samples] = {
                 k: dict(zip(QUANTILES, map(float, v), strict=True))
                 for k, v in zip(SPACES, error, strict=True)
             }
-    return found
+    return row
 
 
 def _values(fitted: xr.Dataset, name: str) -> NDArray[Any]:
@@ -249,33 +251,35 @@ def _values(fitted: xr.Dataset, name: str) -> NDArray[Any]:
 
 def _regions(fitted: xr.Dataset) -> dict[str, NDArray[Any]]:
     """Indices of the surfels of the face and of each non-empty region."""
-    found = {FACE: np.arange(fitted.sizes["surfel"])}
+    regions = {FACE: np.arange(fitted.sizes["surfel"])}
     if "region_mask" in fitted:
         mask = fitted["region_mask"].transpose("region", "surfel").astype(bool)
         names = mask["region"].values if "region" in mask.coords else range(len(mask))
-        found |= {
-            str(name): np.flatnonzero(one)
-            for name, one in zip(names, mask.values, strict=True)
-            if one.any()
+        regions |= {
+            str(name): np.flatnonzero(inside)
+            for name, inside in zip(names, mask.values, strict=True)
+            if inside.any()
         }
-    return found
+    return regions
 
 
 def _quantiles(values: NDArray[Any], area: NDArray[Any]) -> NDArray[Any]:
     """Area-weighted quantiles; NaN without values."""
-    known = np.isfinite(values)
-    if not known.any():
+    finite = np.isfinite(values)
+    if not finite.any():
         return np.full(len(QUANTILES), np.nan)
-    order = np.argsort(values[known], kind="stable")
-    below = np.cumsum(area[known][order])
+    order = np.argsort(values[finite], kind="stable")
+    below = np.cumsum(area[finite][order])
     place = np.searchsorted(below, np.array([*QUANTILES.values()]) * below[-1])
-    return np.asarray(values[known][order][np.minimum(place, len(below) - 1)])
+    return np.asarray(values[finite][order][np.minimum(place, len(below) - 1)])
 
 
 def _mean(values: NDArray[Any], area: NDArray[Any]) -> float:
-    known = np.isfinite(values)
+    finite = np.isfinite(values)
     return (
-        float(np.average(values[known], weights=area[known])) if known.any() else np.nan
+        float(np.average(values[finite], weights=area[finite]))
+        if finite.any()
+        else np.nan
     )
 
 
@@ -324,14 +328,14 @@ def suspects(outliers: xr.Dataset, lumitexels: xr.Dataset) -> list[dict[str, Any
         > MOVED_LIGHT_RATIO * _around(outliers, lumitexels["light_position"].values),
         "camera": _moved_cameras(outliers),
     }
-    found: list[dict[str, Any]] = []
+    devices: list[dict[str, Any]] = []
     for dim, named in moved.items():
         misfit = outliers[f"{dim}_misfit"].values
         share = outliers[f"{dim}_outlier_fraction"].values
         names = (
             outliers[dim].values if dim in outliers.coords else np.arange(misfit.size)
         )
-        found += [
+        devices += [
             {
                 dim: str(names[i]),
                 "outlier_fraction": float(share[i]),
@@ -339,7 +343,7 @@ def suspects(outliers: xr.Dataset, lumitexels: xr.Dataset) -> list[dict[str, Any
             }
             for i in np.flatnonzero(named)
         ]
-    return sorted(found, key=lambda one: -one["misfit"])
+    return sorted(devices, key=lambda one: -one["misfit"])
 
 
 def _moved_cameras(outliers: xr.Dataset) -> NDArray[np.bool_]:
@@ -348,15 +352,15 @@ def _moved_cameras(outliers: xr.Dataset) -> NDArray[np.bool_]:
     """
     misfit = outliers["camera_misfit"].values
     frames = outliers["frame_misfit"].values
-    whole = misfit > MOVED_CAMERA_WHOLE_RATIO * _usual(outliers["camera_misfit"])
+    moved = misfit > MOVED_CAMERA_WHOLE_RATIO * _usual(outliers["camera_misfit"])
     # lights with results for at least three cameras
     usable = frames[np.isfinite(frames).sum(axis=1) > 2]
     judged = np.isfinite(usable).sum(axis=0) >= MIN_LIGHTS_PER_CAMERA
     if not judged.any():
-        return whole
+        return moved
     ratio = usable[:, judged] / np.nanmedian(usable, axis=1, keepdims=True)
-    whole[judged] = np.nanquantile(ratio, 0.25, axis=0) > MOVED_CAMERA_RATIO
-    return whole
+    moved[judged] = np.nanquantile(ratio, 0.25, axis=0) > MOVED_CAMERA_RATIO
+    return moved
 
 
 def _usual(misfit: xr.DataArray) -> NDArray[Any]:

@@ -279,10 +279,10 @@ def _judged(
     histograms, which are summed.
     """
     surface = surface_model(basis)
-    known = surface.parameter_variables if evaluate else ()
+    parameter_names = surface.parameter_variables if evaluate else ()
     errors = () if evaluate else tuple(n for n in ERROR_INPUTS if n in lumitexels)
-    names = _unique(*NEEDED, *noise_inputs(lumitexels), *known, *errors)
-    check(lumitexels, (*NEEDED, *known), where="lumitexels")
+    names = _unique(*NEEDED, *noise_inputs(lumitexels), *parameter_names, *errors)
+    check(lumitexels, (*NEEDED, *parameter_names), where="lumitexels")
     comparison = Comparison(mode, eta, noise_floor(lumitexels), min_samples)
     noise = take_noise(lumitexels)
 
@@ -310,8 +310,8 @@ def _judged(
                 columns |= dict(zip(HELD_OUT_ERRORS[dim], error, strict=True))
         return columns, judged.counts
 
-    used = lumitexels[list(names)]
-    blocks = [used.isel(surfel=slice(a, b)) for a, b in pairwise(_cuts(lumitexels))]
+    inputs = lumitexels[list(names)]
+    blocks = [inputs.isel(surfel=slice(a, b)) for a, b in pairwise(_cuts(lumitexels))]
     parts, counts = joined_blocks(judge, blocks)
     columns = {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
     coords = {} if evaluate else surface.labels

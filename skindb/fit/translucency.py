@@ -148,15 +148,15 @@ def summarise_translucency(sites: xr.Dataset) -> dict[str, dict[str, list[Any]]]
         "error": "site_sigma_tr_error",
     }
     status = sites["site_status"].values
-    found = {}
+    summary = {}
     for i, name in enumerate(names):
-        one: dict[str, list[Any]] = {
+        values: dict[str, list[Any]] = {
             key: [_number(x) for x in sites[var].values[i]] for key, var in keys.items()
         }
-        found[str(name)] = one | {
+        summary[str(name)] = values | {
             "status": [ProbeStatus(int(code)).name.lower() for code in status[i]]
         }
-    return found
+    return summary
 
 
 def tabulate_translucency(
@@ -185,10 +185,10 @@ def tabulate_translucency(
         [
             site,
             channel,
-            *(_or_nan(one[key][c]) for key in ("sigma_tr", "total_error", "error")),
-            one["status"][c],
+            *(_or_nan(values[key][c]) for key in ("sigma_tr", "total_error", "error")),
+            values["status"][c],
         ]
-        for site, one in sites.items()
+        for site, values in sites.items()
         for c, channel in enumerate("RGB")
     ]
     return list(TABLE_HEADER), rows
@@ -238,13 +238,15 @@ def translucency_map(surfels: xr.Dataset, sites: xr.Dataset) -> xr.Dataset:
     place = np.concatenate([place, place[mirrored] * [-1, 1, 1]])
     path = np.concatenate([path, path[mirrored]])
     good = np.concatenate([good, good[mirrored]])
-    known = np.isfinite(place).all(1)
+    placed = np.isfinite(place).all(1)
     position = surfels["surfel_position"].values.astype(np.float64)
     weight = np.empty((len(position), len(place)))
-    for j in np.flatnonzero(known):
+    for j in np.flatnonzero(placed):
         weight[:, j] = 1 / (np.square(position - place[j]).sum(1) + SMOOTH**2)
     # without a position: the mean weight of the known sites
-    weight[:, ~known] = weight[:, known].mean(1, keepdims=True) if known.any() else 1.0
+    weight[:, ~placed] = (
+        weight[:, placed].mean(1, keepdims=True) if placed.any() else 1.0
+    )
     share = weight @ good
     with np.errstate(invalid="ignore", divide="ignore"):
         mean_path = weight @ np.where(good, path, 0) / share

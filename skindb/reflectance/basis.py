@@ -71,12 +71,12 @@ def reduce_basis(
     good = fitted_surfels(fitted, ("dictionary_weight",))
     weight = fitted["dictionary_weight"].values
     area = np.maximum(fitted["surfel_area"].values.astype(np.float64), 0) + 1e-12
-    most = min(len(good), weight.shape[1])
-    if not 1 <= k <= most:
+    limit = min(len(good), weight.shape[1])
+    if not 1 <= k <= limit:
         raise InputError(
             Fault(
                 "k",
-                f"a reduced basis has 1 to {most} components here",
+                f"a reduced basis has 1 to {limit} components here",
                 str(k),
                 "choose another k",
             )
@@ -181,9 +181,9 @@ class Systems:
         gram = np.zeros((n, m, m))
         rhs = np.zeros((n, m))
         for s, (start, stop) in enumerate(pairwise(offsets)):
-            own = rows[start:stop].astype(np.float64)
-            gram[s] = target.shape[1] * (own.T @ own)
-            rhs[s] = own.T @ target[start:stop].sum(axis=1)
+            block = rows[start:stop].astype(np.float64)
+            gram[s] = target.shape[1] * (block.T @ block)
+            rhs[s] = block.T @ target[start:stop].sum(axis=1)
         surfel = np.repeat(np.arange(n), np.diff(offsets))
         square = np.asarray(np.bincount(surfel, (target**2).sum(axis=1), n), np.float64)
         return cls(
@@ -214,10 +214,10 @@ def residuals(systems: Systems, H: Array | None = None) -> tuple[Array, Array]:
     """Non-negative weights (n, k) of the mixtures H (k, m), or of all m BRDFs, and
     squared residuals (n,).
     """
-    own = systems if H is None else systems.within(H)
-    x, _, _, _ = solve_nnls(own.gram, own.rhs)
-    fitted = np.einsum("nk,nkl,nl->n", x, own.gram, x) - 2 * np.einsum(
-        "nk,nk->n", own.rhs, x
+    reduced = systems if H is None else systems.within(H)
+    x, _, _, _ = solve_nnls(reduced.gram, reduced.rhs)
+    fitted = np.einsum("nk,nkl,nl->n", x, reduced.gram, x) - 2 * np.einsum(
+        "nk,nk->n", reduced.rhs, x
     )
     return x, np.maximum(systems.square + fitted, 0.0)
 
@@ -231,12 +231,12 @@ def factor_reflectance(systems: Systems, largest: int) -> list[Array]:
     better one is kept; shrinking ends in far better minima than random starts. In a
     last upward pass every size is also started from the size below.
     """
-    weights, least = residuals(systems)
+    weights, squares = residuals(systems)
     small, lift = _compress(systems)
     H = _descend(small, lift, weights.mean(axis=0, keepdims=True))
     up = [H]
     while len(H) < largest:
-        H = _descend(small, lift, _grown(small, lift, H, weights, least))
+        H = _descend(small, lift, _grown(small, lift, H, weights, squares))
         up.append(H)
     best = {largest: H}
     for k in range(largest - 1, 0, -1):
@@ -252,12 +252,12 @@ def factor_reflectance(systems: Systems, largest: int) -> list[Array]:
     # one more mixture cannot increase the error, and the size below may be a better
     # start
     for k in range(1, largest):
-        grown = _descend(small, lift, _grown(small, lift, best[k], weights, least))
+        grown = _descend(small, lift, _grown(small, lift, best[k], weights, squares))
         best[k + 1] = _best(small, lift, [best[k + 1], grown])
     # the error of the compressed space is a third of the noise, if the noise is 1 %
-    whole = np.eye(len(lift))
+    identity = np.eye(len(lift))
     return [
-        _unit_sum(_descend(systems, whole, best[k], steps=POLISH))
+        _unit_sum(_descend(systems, identity, best[k], steps=POLISH))
         for k in range(1, largest + 1)
     ]
 
@@ -312,10 +312,10 @@ def _descend(systems: Systems, lift: Array, H: Array, *, steps: int = STEPS) -> 
 
     def objective(flat: Array) -> tuple[float, Array]:
         nonlocal x
-        own = flat.reshape(H.shape) / norm @ lift
-        reduced = systems.within(own)
+        mixtures = flat.reshape(H.shape) / norm @ lift
+        reduced = systems.within(mixtures)
         x, _, _, _ = solve_nnls(reduced.gram, reduced.rhs, warm=x)
-        fitted = x @ own
+        fitted = x @ mixtures
         slope = (systems.gram @ fitted[..., None])[..., 0] - systems.rhs
         square = systems.square.sum() + float((fitted * (slope - systems.rhs)).sum())
         return float(square) / total, (
@@ -330,7 +330,7 @@ def _descend(systems: Systems, lift: Array, H: Array, *, steps: int = STEPS) -> 
         "ftol": 1e-7,
         "gtol": 0.0,
     }
-    found = minimize(
+    minimum = minimize(
         objective,
         start.ravel(),
         jac=True,
@@ -338,7 +338,7 @@ def _descend(systems: Systems, lift: Array, H: Array, *, steps: int = STEPS) -> 
         bounds=[(0, None)] * H.size,
         options=options,
     )
-    return np.asarray(found.x.reshape(H.shape) / norm)
+    return np.asarray(minimum.x.reshape(H.shape) / norm)
 
 
 def _cheapest_merges(systems: Systems, lift: Array, H: Array) -> list[Array]:

@@ -133,9 +133,9 @@ class Dictionary:
         )
         if worst > 0:
             count = sum(origin.hole_fraction > 0 for origin in self.origins)
-            most = f"most in {name} ({worst:.2%} of its nodes)"
+            largest = f"most in {name} ({worst:.2%} of its nodes)"
             lines.append(
-                f"materials with unmeasured nodes above the horizon: {count}, {most}"
+                f"materials with unmeasured nodes above the horizon: {count}, {largest}"
             )
         return tuple(lines)
 
@@ -218,14 +218,14 @@ def average_disc(
     reach = angular_radius / (2 * np.cos(theta_d))
     close = theta_h < reach + np.radians(0.5)
     out = np.zeros((len(wi), len(dictionary.names)), np.float32)
-    for rule, some in ((far, ~close), (near, close)):
+    for rule, pairs in ((far, ~close), (near, close)):
         points, weights = _disc_rule(*rule)
-        values = np.zeros((int(some.sum()), out.shape[1]), np.float32)
+        values = np.zeros((int(pairs.sum()), out.shape[1]), np.float32)
         disc = points * np.tan(angular_radius)
         _row_kernels.average_disc(
-            dictionary.table, wi[some], wo[some], disc, weights, values
+            dictionary.table, wi[pairs], wo[pairs], disc, weights, values
         )
-        out[some] = values
+        out[pairs] = values
     return out
 
 
@@ -296,7 +296,7 @@ def convolve_disc(
     if before or angular_radius <= 0:
         return dictionary
     arguments = (dictionary.digest, angular_radius, far, near)
-    found = cached_arrays(
+    cached = cached_arrays(
         "disc-dictionary",
         arguments,
         sources=SOURCES,
@@ -304,7 +304,7 @@ def convolve_disc(
     )
     return replace(
         dictionary,
-        table=found["table"],
+        table=cached["table"],
         disc_angular_radius=angular_radius,
         point_digest=dictionary.digest,
     )
@@ -370,7 +370,7 @@ def dictionary_quality(
     """
     fitted = convolve_disc(dictionary, dictionary.disc_angular_radius or angular_radius)
     wi, wo = sample_pairs(pairs)
-    there, back = (
+    forward, back = (
         lookup(fitted.table, *half_difference(a, b)) for a, b in ((wi, wo), (wo, wi))
     )
     albedo = directional_albedo(dictionary.table, np.cos(INCIDENCE))
@@ -383,14 +383,14 @@ def dictionary_quality(
         "normal_albedo": albedo[0],
         "largest_albedo": albedo.max(axis=0),
         "energy_excess": np.maximum(np.maximum(albedo, after).max(axis=0) - 1, 0),
-        "reciprocity_error": weighted_error(back, there, wi, wo),
+        "reciprocity_error": weighted_error(back, forward, wi, wo),
     }
     unknown = np.full(len(dictionary.names), np.nan)
     disc = dict.fromkeys(
         ("one_sided_error", "disc_quadrature_error", "disc_table_error"), unknown
     )
     if fitted is not dictionary:
-        disc = _disc_errors(dictionary, angular_radius, there, wi, wo)
+        disc = _disc_errors(dictionary, angular_radius, forward, wi, wo)
     figures |= disc | {"interpolation_error": unknown, "hole_fraction": unknown}
     if dictionary.origins:
         figures["interpolation_error"] = np.array(
@@ -401,9 +401,9 @@ def dictionary_quality(
         )
     elif dictionary.names == tuple(PARAMETERS) and not dictionary.disc_angular_radius:
         exact = evaluate_abc(np.array(list(PARAMETERS.values())), wi, wo)
-        found = lookup(dictionary.table, *half_difference(wi, wo))
+        values = lookup(dictionary.table, *half_difference(wi, wo))
         figures |= {
-            "interpolation_error": weighted_error(found, exact, wi, wo),
+            "interpolation_error": weighted_error(values, exact, wi, wo),
             "hole_fraction": np.zeros(len(unknown)),
         }
     return figures
@@ -416,17 +416,17 @@ def _disc_errors(
     from `convolve_disc`.
     """
     pairs = (wi, wo), (wo, wi)
-    used = np.mean(
+    averages = np.mean(
         [average_disc(dictionary, *pair, angular_radius) for pair in pairs], axis=0
     )
-    one, other = (
+    forward, backward = (
         average_disc(dictionary, *pair, angular_radius, far=FINE, near=FINE)
         for pair in pairs
     )
-    mean = (one + other) / 2
+    mean = (forward + backward) / 2
     return {
-        "one_sided_error": weighted_error(mean + one - other, mean, wi, wo),
-        "disc_quadrature_error": weighted_error(used, mean, wi, wo),
+        "one_sided_error": weighted_error(mean + forward - backward, mean, wi, wo),
+        "disc_quadrature_error": weighted_error(averages, mean, wi, wo),
         "disc_table_error": weighted_error(found, mean, wi, wo),
     }
 
@@ -452,8 +452,8 @@ def dictionary_report(
     """
     radius = dictionary.disc_angular_radius or disc_angular_radius
     attrs = {"source": dictionary.source, "notes": list(dictionary.notes)}
-    found = dictionary_quality(dictionary, radius) | {"disc_angular_radius": radius}
-    return dataset(found, coords={"dictionary": list(dictionary.names)}, attrs=attrs)
+    figures = dictionary_quality(dictionary, radius) | {"disc_angular_radius": radius}
+    return dataset(figures, coords={"dictionary": list(dictionary.names)}, attrs=attrs)
 
 
 @cache

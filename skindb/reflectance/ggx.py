@@ -313,8 +313,8 @@ class LobeSampler:
         half = 1 / (1 + square * draw[:, 1] / (1 - draw[:, 1]))
         cosine = np.sqrt(np.where(lobe, half, 1 - draw[:, 1]))
         sine = np.sqrt(np.maximum(1 - cosine**2, 0.0))
-        first, second = tangents(normal)
-        drawn = (sine * np.cos(turn))[:, None] * first + cosine[:, None] * normal
+        tangent, second = tangents(normal)
+        drawn = (sine * np.cos(turn))[:, None] * tangent + cosine[:, None] * normal
         drawn = drawn + (sine * np.sin(turn))[:, None] * second
         mirrored = 2 * np.einsum("nc,nc->n", view, drawn)[:, None] * drawn - view
         return np.asarray(np.where(lobe[:, None], mirrored, drawn))

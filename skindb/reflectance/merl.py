@@ -49,9 +49,9 @@ def read_merl(path: str | Path) -> tuple[Array, int]:
     dims = tuple(np.frombuffer(data[: min(len(data), 12) // 4 * 4], "<i4").tolist())
     want = 12 + 8 * 3 * int(np.prod(SHAPE))
     if dims != SHAPE or len(data) != want:
-        found = f"the header {dims} and {len(data)} bytes"
+        content = f"the header {dims} and {len(data)} bytes"
         rule = f"a MERL binary must have the header {SHAPE} and {want} bytes"
-        raise InputError(Fault(str(path), rule, found, "download it again"))
+        raise InputError(Fault(str(path), rule, content, "download it again"))
     values = np.frombuffer(data[12:], "<f8").reshape(3, *SHAPE)
     wrong = int((~np.isfinite(values)).sum())
     if wrong:
@@ -67,8 +67,8 @@ def read_merl(path: str | Path) -> tuple[Array, int]:
     hole = np.asarray((table < 0).any(axis=-1))
     if hole.all():
         rule = "some cells must be measured"
-        found = "only negative values"
-        raise InputError(Fault(str(path), rule, found, "download it again"))
+        content = "only negative values"
+        raise InputError(Fault(str(path), rule, content, "download it again"))
     return np.where(hole[..., None], np.nan, table), int(hole.sum())
 
 
@@ -77,10 +77,10 @@ def write_merl(path: str | Path, table: Array) -> None:
     table = np.asarray(table, np.float64)
     wrong = int((~(np.isfinite(table) & (table >= 0))).sum())
     if table.shape != (*SHAPE, 3) or wrong:
-        found = f"the shape {table.shape} and {wrong} other values"
+        content = f"the shape {table.shape} and {wrong} other values"
         raise ValueError(
             f"a MERL table must have the shape {(*SHAPE, 3)}, finite and "
-            f"non-negative; found {found}"
+            f"non-negative; found {content}"
         )
     values = np.ascontiguousarray(np.moveaxis(table / SCALE, -1, 0))
     private_file(path).write_bytes(
@@ -135,14 +135,14 @@ def read_merl_folder(path: str | Path) -> Dictionary:
 def _publication_check(file: Path) -> tuple[str, str]:
     """Whether a file is the published one, in words, and its SHA-256."""
     with file.open("rb") as data:
-        found = hashlib.file_digest(data, "sha256").hexdigest()
-    if found in SHA256.values():
-        name = next(name for name, value in SHA256.items() if value == found)
+        digest = hashlib.file_digest(data, "sha256").hexdigest()
+    if digest in SHA256.values():
+        name = next(name for name, value in SHA256.items() if value == digest)
         return (
             GENUINE if name == file.stem else f"published under the name {name}",
-            found,
+            digest,
         )
-    return DIFFERS if file.stem in SHA256 else UNKNOWN, found
+    return DIFFERS if file.stem in SHA256 else UNKNOWN, digest
 
 
 # SHA-256 of the hundred files of the database, version 2 of February 2006. MERL

@@ -284,15 +284,17 @@ class Mixture:
         self, parameters: Array
     ) -> tuple[Mixture, Array, tuple[Omission, ...]]:
         """The mixture without the tables whose weight is zero at all surfels."""
-        used = (parameters != 0).any(axis=0)
-        if used.all():
+        positive = (parameters != 0).any(axis=0)
+        if positive.all():
             return self, parameters, ()
-        names = tuple(np.array(self.names)[used])
-        tables = np.ascontiguousarray(self.table[..., used])
+        names = tuple(np.array(self.names)[positive])
+        tables = np.ascontiguousarray(self.table[..., positive])
         reason = "their weight is zero everywhere"
-        omission = Omission("basis BRDFs", int((~used).sum()), used.size, reason)
+        omission = Omission(
+            "basis BRDFs", int((~positive).sum()), positive.size, reason
+        )
         fewer = replace(self, table=tables, names=names)
-        return fewer, parameters[:, used], (omission,)
+        return fewer, parameters[:, positive], (omission,)
 
     def resample(self, parameters: Array) -> tuple[Table, Array]:
         """The tables and the weights as they are."""

@@ -99,11 +99,11 @@ def reduced_dictionary(
 
     # without a reduction, the result is not worth the space in the cache
     if rank >= len(dictionary.names):
-        made = make()
-        return made["reduced"], made["lift"]
+        arrays = make()
+        return arrays["reduced"], arrays["lift"]
     arguments = (dictionary.digest, rank, cube_roots)
-    found = cached_arrays("reduced-dictionary", arguments, sources=SOURCES, make=make)
-    return found["reduced"], found["lift"]
+    cached = cached_arrays("reduced-dictionary", arguments, sources=SOURCES, make=make)
+    return cached["reduced"], cached["lift"]
 
 
 @dataclass(frozen=True)
@@ -145,9 +145,9 @@ def truncation_bound(
     error = (table - reduced @ lift).astype(np.float32)
     if not error.any():
         return Truncation(0.0, 0.0)
-    used = nodes_above(TableGrid(*table.shape[:3]), elevation)
-    value = table[used]
-    off = np.abs(error[used])
+    above = nodes_above(TableGrid(*table.shape[:3]), elevation)
+    value = table[above]
+    off = np.abs(error[above])
     ratio = np.divide(
         off,
         value,

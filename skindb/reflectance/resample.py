@@ -67,7 +67,9 @@ def _periodic_nodes(phi_d: Array) -> tuple[Array, NDArray[np.int64]]:
 
 def _linear_matrix(nodes: Array, at: Array) -> Array:
     """Matrix (len(at), len(nodes)) of linear interpolation; constant beyond the ends."""
-    return np.stack([np.interp(at, nodes, one) for one in np.eye(len(nodes))], axis=1)
+    return np.stack(
+        [np.interp(at, nodes, column) for column in np.eye(len(nodes))], axis=1
+    )
 
 
 def _resampling_error(brdf: Array, nodes: Nodes, table: Table) -> float:
@@ -81,11 +83,13 @@ def _resampling_error(brdf: Array, nodes: Nodes, table: Table) -> float:
     values = RegularGridInterpolator(axes, brdf[:, :, column], bounds_error=False)(
         np.stack([np.sqrt(th), td, pd], -1)
     )
-    known = np.isfinite(values)
-    if not known.any():
+    finite = np.isfinite(values)
+    if not finite.any():
         return float("nan")
-    found = lookup(table[..., None], th[known], td[known], pd[known])
-    return float(weighted_error(found, values[known, None], wi[known], wo[known])[0])
+    values_of_table = lookup(table[..., None], th[finite], td[finite], pd[finite])
+    return float(
+        weighted_error(values_of_table, values[finite, None], wi[finite], wo[finite])[0]
+    )
 
 
 def fill_holes(brdf: Array) -> Array:
@@ -107,7 +111,9 @@ def fill_holes(brdf: Array) -> Array:
         place = np.arange(turned.shape[axis]).reshape(
             [-1 if a == axis else 1 for a in range(3)]
         )
-        last = np.maximum.accumulate(np.where(np.isfinite(turned), place, 0), axis=axis)
-        turned = np.take_along_axis(turned, last, axis=axis)
+        nearest = np.maximum.accumulate(
+            np.where(np.isfinite(turned), place, 0), axis=axis
+        )
+        turned = np.take_along_axis(turned, nearest, axis=axis)
         brdf = np.flip(turned, axis) if backwards else turned
     return np.asarray(brdf)

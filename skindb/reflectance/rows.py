@@ -57,11 +57,11 @@ def basis_rows(
     seen = _above_horizon(normal, to_camera)
     use = np.ascontiguousarray(usable & lit[:, :, None] & seen[:, None, :])
     offsets = np.concatenate([[0], np.cumsum(use.sum((1, 2)))]).astype(np.int64)
-    whole = pad_to_lanes(table)
-    rows = np.empty((offsets[-1], whole.shape[3]), np.float32)
+    padded = pad_to_lanes(table)
+    rows = np.empty((offsets[-1], padded.shape[3]), np.float32)
     index = np.empty((offsets[-1], 2), np.int32)
     _row_kernels.fill_rows(
-        whole, normal, to_light, to_camera, use, offsets, rows, index
+        padded, normal, to_light, to_camera, use, offsets, rows, index
     )
     return rows[:, : table.shape[3]], offsets, index
 

@@ -95,9 +95,9 @@ class LobeSampler:
             cell = np.minimum((draw[lobe, 1:2] > rising[which]).sum(axis=1), cells - 1)
             cosine[lobe] = np.cos(((cell + draw[lobe, 2]) / cells) ** 2 * np.pi / 2)
         sine = np.sqrt(np.maximum(1 - cosine**2, 0.0))
-        first, second = tangents(normal)
+        tangent, second = tangents(normal)
         drawn = (
-            (sine * np.cos(turn))[:, None] * first
+            (sine * np.cos(turn))[:, None] * tangent
             + (sine * np.sin(turn))[:, None] * second
             + cosine[:, None] * normal
         )
@@ -142,5 +142,5 @@ def tangents(normal: Array) -> tuple[Array, Array]:
     sign = np.where(z >= 0, 1.0, -1.0)
     a = -1.0 / (sign + z)
     b = x * y * a
-    first = np.stack([1 + sign * x * x * a, sign * b, -sign * x], axis=1)
-    return first, np.stack([b, sign + y * y * a, -y], axis=1)
+    tangent = np.stack([1 + sign * x * x * a, sign * b, -sign * x], axis=1)
+    return tangent, np.stack([b, sign + y * y * a, -y], axis=1)

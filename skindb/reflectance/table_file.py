@@ -68,12 +68,14 @@ def read_tables(path: str | Path) -> Dictionary:
         raise InputError(faults)
     brdf = arrays[TABLE]
     nodes = (arrays["theta_h"], arrays["theta_d"], arrays["phi_d"])
-    found = hashlib.sha256(path.read_bytes()).hexdigest()
-    made = [
-        to_default_grid(_channel_mean(one), nodes, "a file of tables", found)
-        for one in brdf
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    resampled = [
+        to_default_grid(
+            _channel_mean(brdf_of_material), nodes, "a file of tables", digest
+        )
+        for brdf_of_material in brdf
     ]
-    table = np.stack([table for table, _ in made], axis=-1)
+    table = np.stack([table for table, _ in resampled], axis=-1)
     albedo = directional_albedo(table, 1.0)[0]
     if albedo.max() > 2:  # more than an error of measurement explains
         rule = "a surface must not reflect more light than it receives"
@@ -93,7 +95,12 @@ def read_tables(path: str | Path) -> Dictionary:
     )
     disc = float(arrays.get("disc_angular_radius", 0.0))
     return Dictionary(
-        names, table, DEFAULT_GRID, path.name, disc, tuple(origin for _, origin in made)
+        names,
+        table,
+        DEFAULT_GRID,
+        path.name,
+        disc,
+        tuple(origin for _, origin in resampled),
     )
 
 
@@ -136,8 +143,8 @@ def _load(path: Path) -> dict[str, NDArray[Any]]:
     missing = [name for name in (TABLE, *NODES) if name not in arrays]
     if missing:
         rule = f"must contain {TABLE} and its nodes {', '.join(NODES)}"
-        found = f"no {', '.join(missing)}"
-        raise InputError(Fault(str(path), rule, found, "add them, in sr^-1 and rad"))
+        fault = f"no {', '.join(missing)}"
+        raise InputError(Fault(str(path), rule, fault, "add them, in sr^-1 and rad"))
     wrong = [name for name in (TABLE, *NODES) if arrays[name].dtype.kind not in "fiu"]
     if wrong:
         raise InputError(
@@ -162,26 +169,26 @@ def _channel_mean(one: NDArray[Any]) -> Array:
 
 def _node_faults(path: Path, arrays: Mapping[str, NDArray[Any]]) -> list[Fault]:
     faults = []
-    for name, least in zip(NODES, (2, 2, 1), strict=True):
+    for name, minimum in zip(NODES, (2, 2, 1), strict=True):
         nodes = arrays[name]
-        where = f"{path}[{name}]"
-        if nodes.ndim != 1 or len(nodes) < least:
-            rule = f"must be a one-dimensional array of at least {least} nodes"
+        place = f"{path}[{name}]"
+        if nodes.ndim != 1 or len(nodes) < minimum:
+            rule = f"must be a one-dimensional array of at least {minimum} nodes"
             faults.append(
-                Fault(where, rule, f"the shape {nodes.shape}", "add the nodes")
+                Fault(place, rule, f"the shape {nodes.shape}", "add the nodes")
             )
         elif not (np.diff(nodes) > 0).all():
             cure = "sort nodes and table, and remove repeated nodes"
             faults.append(
                 Fault(
-                    where,
+                    place,
                     "nodes must be in strictly ascending order",
                     "another order",
                     cure,
                 )
             )
         else:
-            faults += _range_faults(name, nodes, where)
+            faults += _range_faults(name, nodes, place)
     return faults
 
 
@@ -206,12 +213,12 @@ def _shape_faults(path: Path, arrays: Mapping[str, NDArray[Any]]) -> list[Fault]
         else []
     )
     if "names" in arrays and (len(names) != len(brdf) or len(set(names)) != len(brdf)):
-        found = f"{len(names)} names, {len(set(names))} of them different"
+        counts = f"{len(names)} names, {len(set(names))} of them different"
         return [
             Fault(
                 f"{path}[names]",
                 f"{len(brdf)} materials must have as many different names",
-                found,
+                counts,
             )
         ]
     return []
@@ -264,12 +271,12 @@ def _range_faults(name: str, nodes: Array, where: str) -> list[Fault]:
 def _unit_faults(path: Path, arrays: Mapping[str, NDArray[Any]]) -> list[Fault]:
     faults = []
     if "units" in arrays and str(arrays["units"]) not in UNITS:
-        found = str(arrays["units"])
+        unit = str(arrays["units"])
         faults.append(
             Fault(
                 f"{path}[units]",
                 "the unit of a BRDF must be sr-1",
-                found,
+                unit,
                 "convert the table",
             )
         )
@@ -283,30 +290,37 @@ def _unit_faults(path: Path, arrays: Mapping[str, NDArray[Any]]) -> list[Fault]:
 
 def _value_faults(path: Path, arrays: Mapping[str, NDArray[Any]]) -> list[Fault]:
     brdf = arrays[TABLE]
-    where = f"{path}[{TABLE}]"
+    place = f"{path}[{TABLE}]"
     faults = []
     if np.isinf(brdf).any():
-        found = f"{np.isinf(brdf).sum()} infinite ones"
+        counts = f"{np.isinf(brdf).sum()} infinite ones"
         cure = "replace them by NaN"
-        faults.append(Fault(where, "values must be finite or NaN", found, cure))
+        faults.append(Fault(place, "values must be finite or NaN", counts, cure))
     if (brdf < 0).any():
         cure = "use NaN where nothing was measured, and 0 where no light is reflected"
         faults.append(
             Fault(
-                where,
+                place,
                 "a BRDF must not be negative",
                 f"{(brdf < 0).sum()} values below 0",
                 cure,
             )
         )
     nodes = arrays["theta_h"], arrays["theta_d"], arrays["phi_d"]
-    holes = np.array([hole_fraction(_channel_mean(one), nodes) for one in brdf])
+    holes = np.array(
+        [
+            hole_fraction(_channel_mean(brdf_of_material), nodes)
+            for brdf_of_material in brdf
+        ]
+    )
     if (holes > MAX_HOLE_FRACTION).any():
         rule = (
             f"at most {MAX_HOLE_FRACTION:.0%} of the nodes above the horizon may be NaN"
         )
-        found = f"{holes.max():.0%} in material {int(holes.argmax())}"
+        counts = f"{holes.max():.0%} in material {int(holes.argmax())}"
         faults.append(
-            Fault(where, rule, found, "measure more directions, or remove the material")
+            Fault(
+                place, rule, counts, "measure more directions, or remove the material"
+            )
         )
     return faults

@@ -155,19 +155,19 @@ def trace_view(
     """
     rays = RayScene(surface.vertices, surface.faces) if scene is None else scene
     offset = (np.arange(samples) + 0.5) / samples
-    at = (
+    traced = (
         np.arange(camera.height * camera.width)
         if pixels is None
         else np.flatnonzero(pixels)
     )
-    y, x = np.divmod(at[:, None], camera.width)
+    y, x = np.divmod(traced[:, None], camera.width)
     # rays of a pixel are adjacent, which keeps the ray tracer and memory access coherent
     sy = np.repeat(offset, samples)
     sx = np.tile(offset, samples)
     place = np.stack([x + sx, y + sy], axis=-1)
     if rng is not None:
         drawn = rng.random((camera.height * camera.width, samples**2, 2))
-        place += ((drawn if pixels is None else drawn[at]) - 0.5) / samples
+        place += ((drawn if pixels is None else drawn[traced]) - 0.5) / samples
     direction = pixel_rays(place.reshape(-1, 2), camera.K, camera.R, camera.distortion)
     face, barycentric, _ = rays.first_hit(
         np.broadcast_to(camera.centre, direction.shape), direction
@@ -189,7 +189,7 @@ def trace_view(
     return View(
         camera,
         samples,
-        at[pixel],
+        traced[pixel],
         ray,
         corners[keep],
         weight[keep],
@@ -273,11 +273,11 @@ def _lamp_points(lights: Lights, i: int, total: int) -> Float:
     q = np.arange(total)
     radius = lights.disc_radius[i] * np.sqrt((q + 0.5) / total) * float(total > 1)
     axis = lights.axis[i]
-    first = np.cross(axis, [0.0, 1.0, 0.0] if abs(axis[1]) < 0.9 else [1.0, 0.0, 0.0])
-    first = first / np.linalg.norm(first)
-    second = np.cross(axis, first)
+    tangent = np.cross(axis, [0.0, 1.0, 0.0] if abs(axis[1]) < 0.9 else [1.0, 0.0, 0.0])
+    tangent = tangent / np.linalg.norm(tangent)
+    second = np.cross(axis, tangent)
     across = (
-        np.cos(q * GOLDEN_ANGLE)[:, None] * first
+        np.cos(q * GOLDEN_ANGLE)[:, None] * tangent
         + np.sin(q * GOLDEN_ANGLE)[:, None] * second
     )
     return np.asarray(lights.position[i] + radius[:, None] * across)

@@ -45,7 +45,7 @@ class Environment:
             cure = "write it as an RGB image"
             raise InputError(Fault(str(path), rule, ", ".join(names), cure))
         values = pixels[..., :3].astype(np.float64)
-        known = np.isfinite(values)
+        finite = np.isfinite(values)
         height, width = values.shape[:2]
         if width != 2 * height:
             rule = (
@@ -57,15 +57,15 @@ class Environment:
                     str(path), rule, f"{width} x {height} pixels", "convert the image"
                 )
             )
-        if not known.all() or values.min() < 0 or values.max() == 0:
+        if not finite.all() or values.min() < 0 or values.max() == 0:
             rule = "radiance must be finite, not negative, and not zero everywhere"
             cure = "correct the image"
-            found = (
-                f"{int((~known).sum())} values that are not finite, "
+            fault = (
+                f"{int((~finite).sum())} values that are not finite, "
                 f"{int((values < 0).sum())} negative ones"
             )
-            found = "zero everywhere" if known.all() and not values.any() else found
-            raise InputError(Fault(str(path), rule, found, cure))
+            fault = "zero everywhere" if finite.all() and not values.any() else fault
+            raise InputError(Fault(str(path), rule, fault, cure))
         return cls(values)
 
     def along(self, direction: Float) -> Float:
@@ -104,8 +104,8 @@ class Environment:
         column = (
             np.arctan2(direction[:, 0], direction[:, 2]) / (2 * np.pi) + 0.5
         ) * width
-        at = np.minimum(row.astype(np.int64), height - 1) * width
-        return np.asarray(at + np.minimum(column.astype(np.int64), width - 1))
+        row_start = np.minimum(row.astype(np.int64), height - 1) * width
+        return np.asarray(row_start + np.minimum(column.astype(np.int64), width - 1))
 
     @cached_property
     def _solid_angle(self) -> Float:

@@ -108,13 +108,13 @@ def _values_of(
     values["parameters"] = reflectance.parameters_of(row)
     if not usable_surfels(values)[0]:
         status = FitStatus(int(values["fit_status"][0]))
-        found = f"the status {status.name} ({status.explanation})"
+        reason = f"the status {status.name} ({status.explanation})"
         cure = "choose a surfel whose fit_status is FITTED"
         raise InputError(
             Fault(
                 f"fitted[fit_status] of surfel {surfel}",
                 "the surfel must be fitted",
-                found,
+                reason,
                 cure,
             )
         )
@@ -125,12 +125,12 @@ def _unit(name: str, direction: ArrayLike) -> Array:
     """Directions (..., 3) in double precision, checked to be unit vectors and then normalised."""
     vectors = np.asarray(direction, np.float64)
     if vectors.ndim == 0 or vectors.shape[-1] != 3:
-        found = f"the shape {vectors.shape}"
+        shape = f"the shape {vectors.shape}"
         raise InputError(
             Fault(
                 name,
                 "directions must have the shape (..., 3)",
-                found,
+                shape,
                 "put x, y, z last",
             )
         )

@@ -69,10 +69,10 @@ def field_figure(
         If there is no such variable, or `at` does not have a valid label for each of
         its other dimensions.
     """
-    group, found = _find(take, variable)
+    group, values = _find(take, variable)
     at = dict(at or {})
-    colour = _colour_dim(found, at)
-    chosen = _chosen(found, dict(at), keep=colour)
+    colour = _colour_dim(values, at)
+    chosen = _chosen(values, dict(at), keep=colour)
     position = group["surfel_position"].values
     triangle = take["mesh"].to_dataset()["triangle"].values
     views = [trace_front(position, triangle, turn) for turn in turns]
@@ -87,7 +87,7 @@ def field_figure(
     if colour:
         images, scale = _colour_images(chosen, views)
         return _figure(images, f"{title} ({scale})")
-    return _scalar_figure(chosen, views, title + _units(found))
+    return _scalar_figure(chosen, views, title + _units(values))
 
 
 def _figure(images: Sequence[NDArray[np.float64]], title: str) -> Figure:
@@ -115,8 +115,8 @@ def _scalar_figure(chosen: xr.DataArray, views: Sequence[View], title: str) -> F
 
     values, names = _shades(chosen)
     pictures = [_field(view, values, nearest=bool(names)) for view in views]
-    shown = np.concatenate([picture[np.isfinite(picture)] for picture in pictures])
-    low, high = (-0.5, len(names) - 0.5) if names else _span(shown)
+    finite = np.concatenate([picture[np.isfinite(picture)] for picture in pictures])
+    low, high = (-0.5, len(names) - 0.5) if names else _span(finite)
     colours = pyplot.get_cmap("tab10" if names else "viridis", len(names) or None)
     images = []
     for (_, _, shade), picture in zip(views, pictures, strict=True):
@@ -174,11 +174,11 @@ def _colour_dim(found: xr.DataArray, at: Mapping[str, str]) -> str | None:
     """The dimension that is drawn as a colour: the only one besides "surfel" that is
     not in `at`, if it fits.
     """
-    left = [str(dim) for dim in found.dims if dim != "surfel" and dim not in at]
-    if len(left) != 1 or found.sizes[left[0]] != 3 or "flag_values" in found.attrs:
+    free = [str(dim) for dim in found.dims if dim != "surfel" and dim not in at]
+    if len(free) != 1 or found.sizes[free[0]] != 3 or "flag_values" in found.attrs:
         return None
-    unit_vectors = left[0] == "xyz" and str(found.attrs.get("units", "1")) in ("1", "")
-    return left[0] if left[0] == "channel" or unit_vectors else None
+    unit_vectors = free[0] == "xyz" and str(found.attrs.get("units", "1")) in ("1", "")
+    return free[0] if free[0] == "channel" or unit_vectors else None
 
 
 def write_field(
@@ -210,13 +210,13 @@ def write_field(
         honour_consent(version.attrs, "export")
     having = [kind for kind, tree in trees.items() if variable in _drawable(tree)]
     if not having:
-        known = ", ".join(sorted(set().union(*map(_drawable, trees.values()))))
+        variables = ", ".join(sorted(set().union(*map(_drawable, trees.values()))))
         raise InputError(
             Fault(
                 "variable",
                 "must be a variable of the surfels",
                 variable,
-                f"choose {known}",
+                f"choose {variables}",
             )
         )
     tree = trees[having[0]]
@@ -259,8 +259,8 @@ def trace_front(
     # rightwards in the picture; towards the viewer
     right = np.array([c, 0, -s])
     back = np.array([s, 0, c])
-    used = position[np.unique(triangle)].astype(np.float64)
-    place = np.column_stack([used @ right, used[:, 1], used @ back])
+    vertices = position[np.unique(triangle)].astype(np.float64)
+    place = np.column_stack([vertices @ right, vertices[:, 1], vertices @ back])
     (left, bottom, _), (end, top, front) = place.min(axis=0), place.max(axis=0)
     width, height = (
         max(extent, MIN_ASPECT * max(end - left, top - bottom))
@@ -333,8 +333,8 @@ def _drawable(take: xr.DataTree) -> set[str]:
     return {
         str(name)
         for group in _groups(take)
-        for name, one in group.items()
-        if "surfel" in one.dims
+        for name, values in group.items()
+        if "surfel" in values.dims
     }
 
 
@@ -349,14 +349,14 @@ def _chosen(
             else [str(i) for i in range(found.sizes[dim])]
         )
         if at.get(dim) not in labels:
-            given = f"{dim}={at[dim]}" if dim in at else f"no {dim}"
+            choice = f"{dim}={at[dim]}" if dim in at else f"no {dim}"
             cure = (
                 f"choose {dim}="
                 + ", ".join(labels[:12])
                 + (", ..." if len(labels) > 12 else "")
             )
             raise InputError(
-                Fault("at", f"must select one {dim} of {found.name}", given, cure)
+                Fault("at", f"must select one {dim} of {found.name}", choice, cure)
             )
         found = found.isel({dim: labels.index(at.pop(dim))})
     if at:
@@ -422,10 +422,10 @@ def write_grid(
     """
     from matplotlib import pyplot
 
-    every = [image for row in rows.values() for image in row]
-    gain = auto_exposure(every[0]) if exposure is None else exposure
-    shown = _lit(every)
-    height, width = every[0][shown].shape[:2]
+    pictures = [image for row in rows.values() for image in row]
+    gain = auto_exposure(pictures[0]) if exposure is None else exposure
+    crop = _lit(pictures)
+    height, width = pictures[0][crop].shape[:2]
     size = (CELL * width / max(height, width), CELL * height / max(height, width))
     figure, axes = pyplot.subplots(
         len(rows),
@@ -435,7 +435,7 @@ def write_grid(
     )
     for line, (label, row) in zip(axes, rows.items(), strict=True):
         for ax, image in zip(line, row, strict=True):
-            ax.imshow(tone_map(image[shown], exposure=gain), interpolation="none")
+            ax.imshow(tone_map(image[crop], exposure=gain), interpolation="none")
             ax.set(xticks=[], yticks=[])
             ax.set_frame_on(False)
         line[0].set_ylabel(label, rotation=0, ha="right", va="center", fontsize=8)
@@ -455,8 +455,10 @@ def _lit(images: Sequence[NDArray[np.floating]]) -> tuple[slice, slice]:
     lit = np.any([np.nan_to_num(image).max(axis=2) > 0 for image in images], axis=0)
     if not lit.any():
         return slice(None), slice(None)
-    found = []
+    ranges = []
     for axis in (1, 0):
-        at = np.flatnonzero(lit.any(axis=axis))
-        found.append(slice(max(int(at[0]) - MARGIN, 0), int(at[-1]) + 1 + MARGIN))
-    return found[0], found[1]
+        places = np.flatnonzero(lit.any(axis=axis))
+        ranges.append(
+            slice(max(int(places[0]) - MARGIN, 0), int(places[-1]) + 1 + MARGIN)
+        )
+    return ranges[0], ranges[1]

@@ -165,18 +165,18 @@ def render_monte_carlo(
     per_batch = axis**2
     sums = _Sums()
     # at least two batches, for the variance
-    most = (
+    limit = (
         MAX_SAMPLES
         if quality.error is not None
         else max(quality.samples, 2 * per_batch)
     )
-    while sums.count * per_batch < most:
+    while sums.count * per_batch < limit:
         view = trace_view(
             surface, camera, samples=axis, scene=rays, rng=rng, pixels=pixels
         )
         sums.add(painter.batch(view, rng), view.coverage)
         if progress is not None:
-            progress("render", min(sums.count * per_batch, most), most)
+            progress("render", min(sums.count * per_batch, limit), limit)
         if (
             quality.error is not None
             and sums.count >= MIN_BATCHES
@@ -253,15 +253,15 @@ class _Painter:
             disc_included = surface.model.disc_included
             lamp = lights.position[chosen] if disc_included else points
             for light in np.unique(chosen[rows]):
-                own = rows[chosen[rows] == light]
+                lit = rows[chosen[rows] == light]
                 shaded = hits.shade(
-                    own,
-                    lamp[own],
-                    weight[own],
+                    lit,
+                    lamp[lit],
+                    weight[lit],
                     lights.axis[light],
                     lights.falloff[light],
                 )
-                values[own] += shaded * lights.intensity[light]
+                values[lit] += shaded * lights.intensity[light]
         return values
 
     def _by_environment(
@@ -278,7 +278,7 @@ class _Painter:
             environment.sample(draw[:, :3]),
             self.lobes.sample(mix, view.normal, view.towards, draw[:, 3:]),
         )
-        for first, towards in enumerate(drawn):
+        for sampler, towards in enumerate(drawn):
             above = np.flatnonzero(np.einsum("nc,nc->n", towards, view.normal) > 0)
             target = view.position[above] + FAR * towards[above]
             rows = above[
@@ -290,10 +290,10 @@ class _Painter:
             by_lobe = self.lobes.pdf(
                 mix[rows], view.normal[rows], view.towards[rows], towards[rows]
             )
-            own = (by_light, by_lobe)[first]
+            density = (by_light, by_lobe)[sampler]
             # power heuristic, divided by the density with which the direction was drawn
             weight = np.where(
-                own > 0, own / np.maximum(by_light**2 + by_lobe**2, 1e-300), 0.0
+                density > 0, density / np.maximum(by_light**2 + by_lobe**2, 1e-300), 0.0
             )
             shaded = hits.shade(rows, view.position[rows] + towards[rows], weight)
             values[rows] += shaded * environment.along(towards[rows])
@@ -304,10 +304,10 @@ class _Painter:
         independent estimate in each batch.
         """
         surface = self.surface
-        known = np.flatnonzero(surface.known)
-        points = surface.vertices[known]
-        normals = surface.normals[known]
-        received = np.zeros((len(known), 3))
+        vertices = np.flatnonzero(surface.known)
+        points = surface.vertices[vertices]
+        normals = surface.normals[vertices]
+        received = np.zeros((len(vertices), 3))
         if self.lighting.lights is not None and len(self.lighting.lights):
             received += self._received_from_lights(
                 points, normals, self.lighting.lights, rng
@@ -317,7 +317,7 @@ class _Painter:
                 points, normals, self.lighting.environment, rng
             )
         out = np.zeros((len(surface.vertices), 3))
-        out[known] = received
+        out[vertices] = received
         return out
 
     def _received_from_lights(
@@ -354,7 +354,7 @@ class _Painter:
         heuristic, Veach 1997).
         """
         received = np.zeros((len(points), 3))
-        first, second = tangents(normals)
+        tangent, second = tangents(normals)
         for i in range(VERTEX_SAMPLES):
             if i % 2:
                 towards = environment.sample(rng.random((len(points), 3)))
@@ -362,7 +362,7 @@ class _Painter:
                 height = np.sqrt(rng.random(len(points)))
                 turn = 2 * np.pi * rng.random(len(points))
                 sine = np.sqrt(1 - height**2)
-                towards = (sine * np.cos(turn))[:, None] * first + (
+                towards = (sine * np.cos(turn))[:, None] * tangent + (
                     sine * np.sin(turn)
                 )[:, None] * second
                 towards += height[:, None] * normals
@@ -468,12 +468,12 @@ class LightChoice:
         drawn = []
         for i in range(LIGHTS_PER_RAY):
             place = cell + (start + i) / LIGHTS_PER_RAY
-            at = np.clip(
+            light = np.clip(
                 np.searchsorted(self.rising, place, side="right") - cell * count,
                 0,
                 count - 1,
             )
-            drawn.append((at, 1 / (LIGHTS_PER_RAY * self.probability[cell, at])))
+            drawn.append((light, 1 / (LIGHTS_PER_RAY * self.probability[cell, light])))
         return drawn
 
 
@@ -494,10 +494,10 @@ def points_on_discs(
     lights: Lights, chosen: NDArray[np.int64], rng: np.random.Generator
 ) -> Float:
     """Points (n, 3) drawn uniformly on the discs of the chosen lights (n,)."""
-    first, second = tangents(np.asarray(lights.axis, np.float64))
+    tangent, second = tangents(np.asarray(lights.axis, np.float64))
     radius = lights.disc_radius[chosen] * np.sqrt(rng.random(len(chosen)))
     turn = 2 * np.pi * rng.random(len(chosen))
     across = (
-        np.cos(turn)[:, None] * first[chosen] + np.sin(turn)[:, None] * second[chosen]
+        np.cos(turn)[:, None] * tangent[chosen] + np.sin(turn)[:, None] * second[chosen]
     )
     return np.asarray(lights.position[chosen] + radius[:, None] * across)

@@ -87,14 +87,14 @@ def compare_images(
     gain = auto_exposure(theirs, mask=inside) if exposure is None else exposure
     error = np.sqrt(np.mean((ours - theirs)[inside] ** 2))
     level = np.sqrt(np.mean(theirs[inside] ** 2))
-    shown = [encode_srgb(image * gain) for image in (ours, theirs)]
-    noise = np.mean((shown[0] - shown[1])[inside] ** 2)
+    encoded = [encode_srgb(image * gain) for image in (ours, theirs)]
+    noise = np.mean((encoded[0] - encoded[1])[inside] ** 2)
     delta = delta_e(ours[inside] * gain, theirs[inside] * gain)
     return {
         "rmse": float(error),
         "relative_rmse": float(error / level) if level > 0 else float("nan"),
         "psnr": float(-10 * np.log10(noise)) if noise > 0 else float("inf"),
-        "ssim": _ssim(shown[0], shown[1], inside),
+        "ssim": _ssim(encoded[0], encoded[1], inside),
         "delta_e_mean": float(delta.mean()),
         "delta_e_median": float(np.median(delta)),
         "delta_e_95": float(np.quantile(delta, 0.95)),
@@ -125,8 +125,8 @@ def _prepared(
         raise ValueError(
             f"both images must have the shape (h, w, 3), found {ours.shape} and {theirs.shape}"
         )
-    known = np.isfinite(ours).all(axis=-1) & np.isfinite(theirs).all(axis=-1)
-    inside = np.asarray(known if mask is None else known & mask, np.bool_)
+    finite = np.isfinite(ours).all(axis=-1) & np.isfinite(theirs).all(axis=-1)
+    inside = np.asarray(finite if mask is None else finite & mask, np.bool_)
     if not inside.any():
         raise ValueError(
             "at least one pixel must be comparable: the mask is empty, or every pixel is NaN"
@@ -141,13 +141,13 @@ def _prepared(
 def _ssim(first: Float, second: Float, inside: Mask) -> float:
     if min(inside.shape) < SSIM_WINDOW:
         return float("nan")
-    whole = binary_erosion(inside, np.ones((SSIM_WINDOW, SSIM_WINDOW), bool))
-    if not whole.any():
+    centres = binary_erosion(inside, np.ones((SSIM_WINDOW, SSIM_WINDOW), bool))
+    if not centres.any():
         return float("nan")
     _, local = structural_similarity(
         first, second, win_size=SSIM_WINDOW, data_range=1.0, channel_axis=-1, full=True
     )
-    return float(local[whole].mean())
+    return float(local[centres].mean())
 
 
 @dataclass(frozen=True)
@@ -234,9 +234,9 @@ def find_causes(
         return Causes((np.nan, np.nan), np.nan, np.nan, np.nan, np.nan)
     shiny = gloss > HIGHLIGHT_FRACTION * ours
     matte = lit & ~shiny
-    used = matte if matte.sum() >= MIN_PIXELS else lit
+    matte_or_lit = matte if matte.sum() >= MIN_PIXELS else lit
     # the median is robust to hair and eyes
-    gain = float(np.median(photo[used] / ours[used]))
+    gain = float(np.median(photo[matte_or_lit] / ours[matte_or_lit]))
     residual = photo - gain * ours
     dark = inside & (ours <= LIT_FRACTION * np.median(ours[lit]))
     shadow = (
@@ -321,10 +321,10 @@ def compare_photographs(
         raise InputError(
             Fault("capture", "must contain kept photographs", "none", cure)
         )
-    kept = capture["photographs"].to_dataset()
+    photographs = capture["photographs"].to_dataset()
     dome = capture["dome"].to_dataset()
     check(
-        kept,
+        photographs,
         ("photograph_radiance", "photograph_light", "photograph_camera"),
         where="photographs",
     )
@@ -334,13 +334,13 @@ def compare_photographs(
     scene = RayScene(surface.vertices, surface.faces)
     cameras = cameras_from_dome(dome)
     lights = lights_from_dome(dome)
-    dark, away = (_held_out(model, what) for what in ("light", "camera"))
+    dark, away = (_held_out(model, dim) for dim in ("light", "camera"))
     regions = _regions(capture)
     doubtful = 1 - surfel_confidence(model["fitted"].to_dataset()).astype(np.float64)
     results = []
-    for i in range(kept.sizes["photograph"]):
-        at_light = int(kept["photograph_light"][i])
-        at_camera = int(kept["photograph_camera"][i])
+    for i in range(photographs.sizes["photograph"]):
+        at_light = int(photographs["photograph_light"][i])
+        at_camera = int(photographs["photograph_camera"][i])
         camera = cameras[at_camera]
         view = trace_view(surface, camera, samples=samples, scene=scene)
         lamp = lights.select(at_light)
@@ -350,7 +350,7 @@ def compare_photographs(
         gloss = shade_view(view, surface, lamp, scene, terms=("surface",))[0]
         rendered = diffuse + gloss
         photo = (
-            kept["photograph_radiance"][i]
+            photographs["photograph_radiance"][i]
             .values[: camera.height, : camera.width]
             .astype(np.float32)
         )
@@ -361,9 +361,9 @@ def compare_photographs(
         name = str(dome["camera"].values[at_camera])
         error = compare_images(rendered, photo, mask=mask)
         parts = _by_region(view, regions, rendered, photo, mask, error["exposure"])
-        shown = view.image(view.interpolate(doubtful[:, None]))[..., 0]
+        doubt = view.image(view.interpolate(doubtful[:, None]))[..., 0]
         causes = find_causes(
-            np.nan_to_num(photo), rendered, gloss, mask=mask, doubtful=shown
+            np.nan_to_num(photo), rendered, gloss, mask=mask, doubtful=doubt
         )
         unseen = light in dark or name in away
         results.append(
@@ -395,15 +395,17 @@ def compare_photographs(
 
 def _regions(capture: xr.DataTree) -> dict[str, NDArray[np.float64]]:
     """Membership (surfel,) of the regions that the capture names."""
-    found = (
+    surfels = (
         capture["surfels"].to_dataset()
         if "surfels" in capture.children
         else xr.Dataset()
     )
-    if "region_mask" not in found:
+    if "region_mask" not in surfels:
         return {}
-    mask = found["region_mask"].transpose("surfel", "region").values.astype(np.float64)
-    return {str(name): mask[:, i] for i, name in enumerate(found["region"].values)}
+    mask = (
+        surfels["region_mask"].transpose("surfel", "region").values.astype(np.float64)
+    )
+    return {str(name): mask[:, i] for i, name in enumerate(surfels["region"].values)}
 
 
 def _by_region(
@@ -417,15 +419,15 @@ def _by_region(
     """Differences in the pixels of each region, at the exposure of the whole picture."""
     if not regions:
         return {}
-    shown = view.image(view.interpolate(np.stack(list(regions.values()), axis=1)))
-    found = {}
+    membership = view.image(view.interpolate(np.stack(list(regions.values()), axis=1)))
+    errors = {}
     for i, name in enumerate(regions):
-        inside = mask & (shown[..., i] > 0.5)
+        inside = mask & (membership[..., i] > 0.5)
         if inside.sum() >= MIN_REGION_PIXELS:
-            found[name] = compare_images(
+            errors[name] = compare_images(
                 rendered, photo, mask=inside, exposure=exposure
             )
-    return found
+    return errors
 
 
 def _held_out(model: xr.DataTree, dim: str) -> set[str]:
@@ -444,9 +446,9 @@ def write_comparisons(comparisons: Sequence[Comparison], folder: Path) -> list[P
     """
     make_private(folder)
     paths = []
-    for one in comparisons:
-        paths.append(folder / f"{one.light}_{one.camera}.png")
-        write_png(paths[-1], side_by_side(one, components=True))
+    for comparison in comparisons:
+        paths.append(folder / f"{comparison.light}_{comparison.camera}.png")
+        write_png(paths[-1], side_by_side(comparison, components=True))
     return paths
 
 
@@ -465,11 +467,11 @@ def side_by_side(
         one.rendered,
         *((one.diffuse, one.rendered - one.diffuse) if components else ()),
     ]
-    shown = [tone_map(np.nan_to_num(image), exposure=exposure) for image in images]
+    panels = [tone_map(np.nan_to_num(image), exposure=exposure) for image in images]
     gap = np.where(
         one.mask[..., None],
         (one.rendered - np.nan_to_num(one.photographed)) * exposure,
         0.0,
     )
     difference = np.clip(127.5 + 10 * 127.5 * gap, 0, 255).astype(np.uint8)
-    return np.concatenate([*shown, difference], axis=1)
+    return np.concatenate([*panels, difference], axis=1)

@@ -113,20 +113,20 @@ def plan_scene(
             view.shown(len(surface.vertices)), subsurface=subsurface
         ).omissions,
     ]
-    model, parameters, found = surface.model.simplified(surface.parameters)
-    if found:
+    model, parameters, omissions = surface.model.simplified(surface.parameters)
+    if omissions:
         surface = replace(surface, model=model, parameters=parameters)
-    skipped += found
+    skipped += omissions
     lights = lighting.lights
     if lights is not None and not subsurface:
-        lights, found = lights_above_horizon(lights, view)
-        skipped += found
+        lights, omissions = lights_above_horizon(lights, view)
+        skipped += omissions
     if lights is not None and error is not None:
         seen = _with_terms(surface, terms)
-        lights, found = notable_lights(
+        lights, omissions = notable_lights(
             lights, seen, view, scene, error=error, subsurface=subsurface
         )
-        skipped += found
+        skipped += omissions
     skipped += (plan_octree(error),) if subsurface else ()
     return ScenePlan(
         surface, Lighting(lights, lighting.environment), pixels, tuple(skipped)
@@ -205,10 +205,10 @@ def lights_above_horizon(lights: Lights, view: View) -> tuple[Lights, Omissions]
         lit[i] = bool((height > -slack).any())
     if lit.all():
         return lights, ()
-    left = int((~lit).sum())
+    dark = int((~lit).sum())
     return lights.select(lit), (
         Omission(
-            "lights", left, lit.size, "they are below the horizon of all visible points"
+            "lights", dark, lit.size, "they are below the horizon of all visible points"
         ),
     )
 
@@ -235,7 +235,7 @@ def notable_lights(
         np.int64
     )
     light = _unshadowed(lights, surface, view, rows)
-    shown = np.stack(
+    visible = np.stack(
         [
             ~scene.occluded(
                 view.position[rows],
@@ -245,7 +245,7 @@ def notable_lights(
             for i in range(len(lights))
         ]
     )
-    level = float(np.sqrt(np.mean((light * shown[..., None]).sum(axis=0) ** 2)))
+    level = float(np.sqrt(np.mean((light * visible[..., None]).sum(axis=0) ** 2)))
     dropped: list[int] = []
     total = np.zeros(light.shape[1:])
     entered = np.zeros((len(surface.vertices), 3))
@@ -262,15 +262,15 @@ def notable_lights(
         bound = cost
     if not dropped:
         return lights, ()
-    kept = np.ones(len(lights), bool)
-    kept[dropped] = False
-    why = f"together they contribute less than {ERROR_PART:g} of the wanted error"
-    return lights.select(kept), (
+    bright = np.ones(len(lights), bool)
+    bright[dropped] = False
+    reason = f"together they contribute less than {ERROR_PART:g} of the wanted error"
+    return lights.select(bright), (
         Omission(
             "lights",
             len(dropped),
             len(lights),
-            why,
+            reason,
             bound,
             "pictures (root mean square)",
         ),

@@ -122,8 +122,8 @@ def chosen_lights(dome: xr.Dataset, lights: Sequence[str]) -> tuple[Lights, list
 def chosen_camera(dome: xr.Dataset, camera: str | None) -> tuple[Camera, str]:
     """Camera of a dome by its name, or the most frontal one for None, and its name."""
     names = [str(name) for name in dome["camera"].values]
-    at = frontal_camera(dome) if camera is None else _index(names, camera, "camera")
-    return cameras_from_dome(dome)[at], names[at]
+    index = frontal_camera(dome) if camera is None else _index(names, camera, "camera")
+    return cameras_from_dome(dome)[index], names[index]
 
 
 def trace_shot(
@@ -253,7 +253,7 @@ def render(
         subject does not consent to exports, or subsurface transport is requested and
         the model has no translucency.
     """
-    where: dict[str, Any] = {
+    view: dict[str, Any] = {
         "lights": lights,
         "environment": environment,
         "camera": camera,
@@ -264,9 +264,9 @@ def render(
         "error": error,
         "terms": tuple(terms),
     }
-    inputs = render_inputs(model, **where, **options, subsurface=subsurface)
+    inputs = render_inputs(model, **view, **options, subsurface=subsurface)
     quality = Quality(samples, error, subsurface, tuple(terms), tree_opening(error)[0])
-    found = render_monte_carlo(
+    rendering = render_monte_carlo(
         inputs.surface,
         inputs.camera,
         inputs.lighting,
@@ -280,21 +280,21 @@ def render(
     attrs = {"units": UNITS, "long_name": "radiance, linear Rec. 709"}
     return xr.Dataset(
         {
-            "radiance": ((*space, "channel"), found.radiance, attrs),
+            "radiance": ((*space, "channel"), rendering.radiance, attrs),
             "radiance_variance": (
                 (*space, "channel"),
-                found.variance,
+                rendering.variance,
                 {"units": f"{UNITS}2"},
             ),
-            "coverage": (space, found.coverage, {"units": "1"}),
+            "coverage": (space, rendering.coverage, {"units": "1"}),
         },
         coords={"channel": ["R", "G", "B"]},
         attrs=inputs.names
         | {
-            "samples": found.samples,
-            "relative_error": found.relative_error,
-            "seconds": found.seconds,
-            "skipped": [str(one) for one in inputs.omissions],
+            "samples": rendering.samples,
+            "relative_error": rendering.relative_error,
+            "seconds": rendering.seconds,
+            "skipped": [str(omission) for omission in inputs.omissions],
         },
     )
 
@@ -343,12 +343,12 @@ def render_inputs(
     sized = seen_by if scale == 1 else seen_by.scaled(scale)
     scene = RayScene(surface.vertices, surface.faces)
     if subsurface and spacing is not None:
-        shown = trace_view(surface, sized, scene=scene).shown(len(surface.vertices))
-        surface = subdivide_surface(surface, spacing, shown)
+        visible = trace_view(surface, sized, scene=scene).shown(len(surface.vertices))
+        surface = subdivide_surface(surface, spacing, visible)
         scene = RayScene(surface.vertices, surface.faces)
-    given = Lighting(lamps if len(lamps) else None, surroundings)
+    lighting = Lighting(lamps if len(lamps) else None, surroundings)
     plan = plan_scene(
-        surface, sized, given, scene, subsurface=subsurface, error=error, terms=terms
+        surface, sized, lighting, scene, subsurface=subsurface, error=error, terms=terms
     )
     return RenderInputs(
         plan.surface,
@@ -357,7 +357,7 @@ def render_inputs(
         scene,
         names,
         plan.pixels,
-        given,
+        lighting,
         plan.omissions,
     )
 
@@ -403,7 +403,7 @@ def render_picture(
             Fault(str(out), rule, out.suffix or "no suffix", "change the name")
         )
     keys = ("lights", "environment", "camera")
-    where = {"lights": (), "environment": None, "camera": None} | {
+    view = {"lights": (), "environment": None, "camera": None} | {
         k: options[k] for k in keys if k in options
     }
     subsurface = bool(options.get("subsurface", False))
@@ -412,13 +412,14 @@ def render_picture(
         how = {
             key: options[key] for key in ("spacing", "error", "terms") if key in options
         }
-        inputs = render_inputs(
-            model, **where, subsurface=subsurface, scale=scale, **how
-        )
+        inputs = render_inputs(model, **view, subsurface=subsurface, scale=scale, **how)
         return (
             {"path": str(out)}
             | inputs.names
-            | {"skipped": [str(one) for one in inputs.omissions], "kept": KEPT}
+            | {
+                "skipped": [str(omission) for omission in inputs.omissions],
+                "kept": KEPT,
+            }
         )
     seen = render(model, **options)
     summary = {"path": str(out)} | {
@@ -432,7 +433,7 @@ def render_picture(
         _write_exr(out, seen)
         return summary
     if exposure == "fixed":
-        inputs = render_inputs(model, **where, subsurface=False, scale=scale)
+        inputs = render_inputs(model, **view, subsurface=False, scale=scale)
         gain = fixed_exposure(inputs.given, inputs.camera)
     else:
         gain = auto_exposure(radiance) if exposure == "auto" else float(exposure)
@@ -486,8 +487,8 @@ def _write_exr(path: Path, seen: xr.Dataset) -> None:
         planes[f"variance.{name}"] = seen["radiance_variance"].values[..., i]
     planes["A"] = seen["coverage"].values
     keys = ("camera", "samples", "relative_error")
-    about = {f"skindb.{key}": str(seen.attrs[key]) for key in keys}
-    about |= {
+    attributes = {f"skindb.{key}": str(seen.attrs[key]) for key in keys}
+    attributes |= {
         "skindb.units": "R, G, B: radiance, linear Rec. 709; variance: of their means; A: coverage"
     }
-    write_exr(path, planes, attributes=about)
+    write_exr(path, planes, attributes=attributes)

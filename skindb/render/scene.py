@@ -175,19 +175,19 @@ def from_model(model: xr.DataTree, *, fill: bool = False) -> Surface:
     if "sigma_tr" in fitted:
         values["sigma_tr"] = np.asarray(fitted["sigma_tr"].values)
     position = values.pop("surfel_position")
-    known = usable_surfels(values)
-    if not known.any():
+    usable = usable_surfels(values)
+    if not usable.any():
         rule = "at least one surfel must be fitted for a picture"
         raise InputError(
             Fault("fitted[fit_status]", rule, "none", "see the report of the fit")
         )
     del values["fit_status"]
     if fill:
-        nearest = _nearest(position, known)
+        nearest = _nearest(position, usable)
         values = {name: value[nearest] for name, value in values.items()}
     else:
         values = {
-            name: np.where(known[:, None], value, np.nan)
+            name: np.where(usable[:, None], value, np.nan)
             for name, value in values.items()
         }
     sigma_tr = values.get("sigma_tr")
@@ -278,7 +278,7 @@ def subdivide_surface(
                 "the part of the face in the picture must have at most "
                 f"{MAX_VERTICES:,} vertices"
             )
-            found = (
+            size = (
                 f"{len(vertices):,} and {len(chosen):,} triangles that are still "
                 f"coarser than {spacing:g} mm"
             )
@@ -286,7 +286,7 @@ def subdivide_surface(
                 Fault(
                     "spacing",
                     rule,
-                    found,
+                    size,
                     "choose a larger spacing, or a closer picture",
                 )
             )
@@ -297,5 +297,5 @@ def subdivide_surface(
     values["normals"] = values["normals"] / np.maximum(
         np.linalg.norm(values["normals"], axis=1, keepdims=True), 1e-12
     )
-    made: dict[str, Any] = values
-    return replace(surface, vertices=vertices, faces=faces, **made)
+    arrays: dict[str, Any] = values
+    return replace(surface, vertices=vertices, faces=faces, **arrays)

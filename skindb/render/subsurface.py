@@ -26,17 +26,19 @@ Float = NDArray[np.floating[Any]]
 
 def require_translucency(surface: Surface) -> None:
     """Raise `InputError` if there are channels in which no vertex has sigma_tr."""
-    known = np.isfinite(
+    finite = np.isfinite(
         np.zeros((0, 3)) if surface.sigma_tr is None else surface.sigma_tr
     )
-    if missing := [channel for c, channel in enumerate("RGB") if not known[:, c].any()]:
+    if missing := [
+        channel for c, channel in enumerate("RGB") if not finite[:, c].any()
+    ]:
         rule = "must have sigma_tr in R, G and B for subsurface transport"
-        found = f"no probe site with a valid fit in {', '.join(missing)}"
+        missing_text = f"no probe site with a valid fit in {', '.join(missing)}"
         raise InputError(
             Fault(
                 "model",
                 rule,
-                found,
+                missing_text,
                 "omit --subsurface, or repeat the probe measurement",
             )
         )
@@ -51,9 +53,9 @@ def transmitted_irradiance(
     It is computed from the centre of each light, with its fall-off. It is zero if the
     vertex faces away from the light, is in its shadow, or has no known normal.
     """
-    known = np.flatnonzero(surface.known)
-    points = surface.vertices[known]
-    normals = surface.normals[known]
+    vertices = np.flatnonzero(surface.known)
+    points = surface.vertices[vertices]
+    normals = surface.normals[vertices]
     out = np.zeros((len(surface.vertices), len(lights)), np.float32)
     for i in range(len(lights)):
         towards = lights.position[i] - points
@@ -69,7 +71,7 @@ def transmitted_irradiance(
             -(towards[lit] @ lights.axis[i]) / np.sqrt(square[lit]), 0
         ) ** float(lights.falloff[i])
         passed = fresnel_transmittance(np.minimum(cosine[lit], 1), surface.eta)
-        out[known[lit], i] = cosine[lit] / square[lit] * along * passed
+        out[vertices[lit], i] = cosine[lit] / square[lit] * along * passed
     return out
 
 
@@ -169,20 +171,20 @@ def _exitances_from_irradiance(
         raise ValueError(
             "the surface must have s and sigma_tr for subsurface transport, found None"
         )
-    known = (
+    finite = (
         surface.known
         & np.isfinite(surface.s).all(axis=1)
         & np.isfinite(surface.sigma_tr).all(axis=1)
     )
     out = np.zeros((irradiance.shape[1], len(surface.vertices), 3), np.float32)
-    out[:, known] = subsurface_exitance(
-        surface.vertices[known],
-        vertex_areas(surface.vertices, surface.faces)[known],
-        irradiance[known],
-        surface.s[known],
-        surface.sigma_tr[known],
+    out[:, finite] = subsurface_exitance(
+        surface.vertices[finite],
+        vertex_areas(surface.vertices, surface.faces)[finite],
+        irradiance[finite],
+        surface.s[finite],
+        surface.sigma_tr[finite],
         eta=surface.eta,
         tolerance=tolerance,
-        receivers=None if wanted is None else wanted[known],
+        receivers=None if wanted is None else wanted[finite],
     )
     return out

@@ -75,9 +75,9 @@ def texel_codes(
     open_to_border = np.zeros(n + 1, bool)
     for border in (piece[0], piece[-1], piece[:, 0], piece[:, -1]):
         open_to_border[border] = True
-    found = np.where(
+    codes = np.where(
         open_to_border[piece], TexelStatus.OUTSIDE, TexelStatus.OPENING
     ).astype(np.uint8)
     on = ~empty
-    found[on] = code[triangles[face[on], weight[on].argmax(axis=1)]]
-    return found
+    codes[on] = code[triangles[face[on], weight[on].argmax(axis=1)]]
+    return codes
