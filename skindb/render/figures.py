@@ -34,7 +34,7 @@ MIN_ASPECT = 0.05
 DPI = 90
 RAY_START_MM = 10.0  # in front of the head
 CELL = 2.0  # inches, the longer side of a picture
-MARGIN = 4  # pixels around the lit part
+GRID_MARGIN_PX = 4  # pixels around the lit part
 
 
 def field_figure(
@@ -458,7 +458,6 @@ def _lit(images: Sequence[NDArray[np.floating]]) -> tuple[slice, slice]:
     ranges = []
     for axis in (1, 0):
         places = np.flatnonzero(lit.any(axis=axis))
-        ranges.append(
-            slice(max(int(places[0]) - MARGIN, 0), int(places[-1]) + 1 + MARGIN)
-        )
+        begin = max(int(places[0]) - GRID_MARGIN_PX, 0)
+        ranges.append(slice(begin, int(places[-1]) + 1 + GRID_MARGIN_PX))
     return ranges[0], ranges[1]
