@@ -20,6 +20,7 @@ from skindb.optics.diffusion import dipole_profile
 from skindb.optics.transport import transport_profile
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_stress__every_promise_of_a_kernel_holds(kernel):
     failures = {case.name: failure_of(case) for case in CASES if case.kernel == kernel}

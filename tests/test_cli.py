@@ -335,6 +335,7 @@ def small_database(tmp_path_factory):
     return out, db
 
 
+@pytest.mark.slow
 def test_cli__captures_and_databases_belong_to_their_owner_alone(small_database):
     out, _ = small_database
     assert open_to_others(out, itself=False) == {}
@@ -362,6 +363,7 @@ def test_cli__fit_processes_takes_without_a_model_of_their_newest_capture(
     assert "V001" in json.loads(_run("fit", db, "--json").stdout)
 
 
+@pytest.mark.slow
 def test_cli__ingest_and_fit_refuse_what_a_subject_withdrew(small_database, tmp_path):
     out, db = small_database
     copy = str(tmp_path / "db")
@@ -382,6 +384,7 @@ def test_cli__ingest_and_fit_refuse_what_a_subject_withdrew(small_database, tmp_
     )
 
 
+@pytest.mark.slow
 def test_cli__fit_refuses_too_many_components_before_it_starts(small_database):
     _, db = small_database
     done = _run("fit", db, "V001", "--k", "100")
@@ -389,6 +392,7 @@ def test_cli__fit_refuses_too_many_components_before_it_starts(small_database):
     assert "1 to 59 components" in done.stderr
 
 
+@pytest.mark.slow
 def test_cli__explain_plans_and_does_not_work(small_database, tmp_path):
     _, db = small_database
     versions = _run("info", db).stdout
@@ -423,6 +427,7 @@ def test_cli__explain_plans_and_does_not_work(small_database, tmp_path):
     assert _run(*call, "-v").stdout.startswith(f"plan: {planned.splitlines()[0]}")
 
 
+@pytest.mark.slow
 def test_cli__a_variable_is_drawn_from_the_model_or_else_the_capture(
     small_database, tmp_path
 ):
@@ -533,6 +538,7 @@ def test_cli__many_takes_at_a_time(tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_cli__json_is_strict(small_database):
     """Unknown intervals in a table of one take are null, because JSON has no NaN."""
     _, db = small_database
@@ -546,6 +552,7 @@ def test_cli__json_is_strict(small_database):
     assert any(None in row for row in rows)
 
 
+@pytest.mark.slow
 def test_cli__demo_keeps_files_that_it_did_not_create(small_database, tmp_path):
     out, _ = small_database
     folder = tmp_path / "demo"
@@ -578,6 +585,7 @@ def test_import__is_fast_and_does_nothing(module):
     assert done.stdout.strip() == "[]"
 
 
+@pytest.mark.slow
 def test_import__of_methods_needs_no_plots_and_no_colour_science():
     """Every process of a run imports the methods, and these packages would double the
     time for that.
@@ -637,6 +645,7 @@ def test_fault_lines__many_of_one_rule_are_folded():
     assert len(fault_lines(faults, every=True)) == 31
 
 
+@pytest.mark.slow
 def test_fit__faults_say_which_take_they_are_of(small_database):
     _, db = small_database
     done = _run("fit", db, "V001", "--rank", "0")
@@ -674,6 +683,7 @@ def test_cli__a_failure_is_one_json_object(tmp_path, args, code, what):
     assert told["error"][0]["found"].splitlines()[0].split(": ")[-1] in done.stderr
 
 
+@pytest.mark.slow
 def test_cli__successes_are_reported_beside_failures(small_database):
     _, db = small_database
     done = _run("fit", db, "V001", "nobody", "--explain", "--json")
@@ -684,6 +694,7 @@ def test_cli__successes_are_reported_beside_failures(small_database):
     assert "nobody" in told["error"][0]["what"]
 
 
+@pytest.mark.slow
 def test_cli__unknown_keys_of_a_capture_are_named(small_database, tmp_path):
     out, _ = small_database
     shutil.copytree(out / "c/V001", tmp_path / "c")

@@ -14,6 +14,8 @@ from skindb.store.folder import Folder
 from skindb.store.markers import subject_hash
 from skindb.workflow import audit, viewing
 
+pytestmark = pytest.mark.slow
+
 ALL = ("S01", "S02")
 # arguments; action, subjects and parameters of the entry
 LOGGED = [

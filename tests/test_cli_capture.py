@@ -19,6 +19,8 @@ from skindb.ingest import read_capture
 from skindb.virtual.devices import RefusedError
 from skindb.workflow.session import VIRTUAL_SIZE
 
+pytestmark = pytest.mark.slow
+
 SMALL = {"width": 80, "height": 100}  # px of the frames of the virtual subject
 
 

@@ -17,6 +17,8 @@ from page_session import Session
 from skindb.virtual.face import FaceShape
 from skindb.virtual.head import parametric_head
 
+pytestmark = pytest.mark.slow
+
 
 def call(*args):
     return [

@@ -16,6 +16,7 @@ OUTER = "from package.jit import kernel\nfrom package._inner_kernels import inne
 OUTER += "@kernel\ndef outer(x):\n    return 10 * inner(x)\n"
 
 
+@pytest.mark.slow
 def test_kernel__is_compiled_again_when_a_kernel_of_another_file_changes(tmp_path):
     package = tmp_path / "package"
     package.mkdir()

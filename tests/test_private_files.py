@@ -127,6 +127,7 @@ WRITERS = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("write", WRITERS, ids=lambda one: one.__name__)
 def test_writers__their_files_are_private(tmp_path, model, write, monkeypatch):
     monkeypatch.setenv("SKINDB_CACHE", str(tmp_path / "cache"))
@@ -174,6 +175,7 @@ EXCEPTIONS = {
 }
 
 
+@pytest.mark.slow
 def test_package__every_writer_makes_its_files_private():
     root = Path(skindb.__file__).parent
     found = []

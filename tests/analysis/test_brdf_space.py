@@ -317,6 +317,7 @@ def _people():
     }
 
 
+@pytest.mark.slow
 def test_surface__is_stored_and_repeated(tmp_path, monkeypatch):
     """The study is stored; the same seed gives the same numbers, and other parameters
     give another study.

@@ -159,6 +159,7 @@ def test_effect_maps__too_few_subjects_make_no_texel():
         maps_of(ds)
 
 
+@pytest.mark.slow
 def test_effect_maps__conditions_within_subjects_and_numbers():
     ds = cohort(12)
     other = ds.assign(texel_diffuse_reflectance=ds["texel_diffuse_reflectance"] + 0.1)

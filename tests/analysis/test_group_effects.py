@@ -63,6 +63,7 @@ def test_group_effects__are_student_s_test_where_nothing_is_adjusted():
     assert abs(float(one["effect_p"]) - stats.ttest_ind(men, women).pvalue) < 0.02
 
 
+@pytest.mark.slow
 def test_group_effects__a_confounder_misleads_the_plain_comparison_and_not_the_adjusted_one():
     """Ancestry is correlated with age, and albedo depends on age only; means over 100 cohorts."""
     plain = []

@@ -78,6 +78,7 @@ def test_register__brings_back_a_planted_warp():
     assert np.isnan(after).mean() < 0.06  # only the rim may leave the other surface
 
 
+@pytest.mark.slow
 def test_register__anchors_help_where_no_landmark_is():
     """Landmarks are in the middle of the sheet only; beyond them, points are matched by
     the surface.
@@ -97,6 +98,7 @@ def test_register__anchors_help_where_no_landmark_is():
     assert np.nanmedian(by_few) < 0.7 * np.nanmedian(own)
 
 
+@pytest.mark.slow
 def test_registrations__come_one_after_the_other():
     models = sheet_pair()
     first = next(iter(registrations(models)))
@@ -104,6 +106,7 @@ def test_registrations__come_one_after_the_other():
     xr.testing.assert_identical(first[1], register(models)["A"])
 
 
+@pytest.mark.slow
 def test_register__the_mean_of_all_is_between_them():
     models = sheet_pair()
     found = register(models, smoothing=0.0)
@@ -161,6 +164,7 @@ def test_register__skips_takes_without_landmarks():
             register(models, reference=reference)
 
 
+@pytest.mark.slow
 def test_register__a_wrong_click_stands_out():
     models = sheet_pair()
     points = on_sheet(nodes())
@@ -174,6 +178,7 @@ def test_register__a_wrong_click_stands_out():
     assert error[4] > 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wrong", ["click", "swap", None])
 def test_doubtful_landmarks__names_the_wrong_ones(wrong):
     models = sheet_pair()
@@ -278,6 +283,7 @@ def test_register__one_take_alone_stays_as_it_is():
     assert float(found["landmark_prediction_error"].max()) < STORED
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("swapped", [False, True])
 def test_register__turns_no_triangle_over(swapped):
     """The clicks are so wrong that every map through them folds."""
@@ -370,6 +376,7 @@ def test_inside_outline__is_odd_winding():
         np.testing.assert_array_equal(inside, winding % 2 == 1)
 
 
+@pytest.mark.slow
 def test_take_masks__the_capture_wins():
     models = {"A": face_take(own=True), "B": face_take(seed=2)}
     registered = register(models)
@@ -394,6 +401,7 @@ def test_mask_agreement__counts_area():
     assert mask_agreement(a, b, np.array([1.0, 3.0, 2.0, 50.0])) == 0.5
 
 
+@pytest.mark.slow
 def test_albedo_histograms__regions_by_landmarks_where_the_capture_has_none():
     models = {"A": face_take(own=True), "B": face_take(seed=2)}
     registered = register(models)

@@ -66,6 +66,7 @@ def test_region_tables__means_by_hand():
     assert float(empty["region_area"]) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("common", [0.0, 0.01])
 def test_region_tables__stated_errors_are_the_scatter_of_means(common):
     """300 measurements of one face give the scatter of means to 4 %; three times that

@@ -360,6 +360,7 @@ def ingested(folder, root):
     ).provenance["summary"]["notes"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", HOSTILE)
 def test_ingest_capture__frames_that_contradict_are_refused(
     capture_folder, tmp_path, name
@@ -452,6 +453,7 @@ LEGAL = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LEGAL)
 def test_ingest_capture__what_cameras_do_passes(capture_folder, tmp_path, name):
     spoil, notes = LEGAL[name]

@@ -77,6 +77,7 @@ def flat_frame(rng, noise=0.005):
     return 5 * gain * (1 + noise * rng.standard_normal(gain.shape)), gain
 
 
+@pytest.mark.slow
 def test_fit_vignette__knows_its_error():
     z = []
     for seed in range(60):

@@ -115,6 +115,7 @@ def calibrated(folder):
     return dome, calibrate_positions(dome, read_calibration_frames(dome).ball)
 
 
+@pytest.mark.slow
 def test_calibrate_positions__finds_the_lights_and_its_error(setup):
     dome, found = calibrated(setup)
     off = found["calibrated_position"].values - np.array([*LIGHTS.values()])

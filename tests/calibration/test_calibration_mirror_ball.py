@@ -100,6 +100,7 @@ def test_light_position__is_that_of_the_shortest_ways():
     assert found.miss.max() < 1e-3
 
 
+@pytest.mark.slow
 def test_light_position__knows_its_error():
     z = []
     for seed in range(60):

@@ -163,6 +163,7 @@ def test_vignette_gain__corner_and_centre(pristine):
     assert gain.max() < 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("with_dark", [False, True])
 @pytest.mark.parametrize("curved", [False, True])
 def test_frame_merger__develops_as_merge_exposures(pristine, with_dark, curved):

@@ -64,6 +64,7 @@ def saved(text, name):
     return list(csv.DictReader(io.StringIO(base64.b64decode(data).decode())))
 
 
+@pytest.mark.slow
 def test_write_report__one_row_for_each_take(report):
     text = report.read_text()
     found = saved(text, "subjects")
@@ -92,6 +93,7 @@ def test_write_report__states_why_surfels_have_no_fit(report):
     assert f"unseen {100 * PLANTED[FitStatus.UNSEEN] / SURFELS:.1f} %" in text
 
 
+@pytest.mark.slow
 def test_write_report__states_the_distance_of_the_edit(report, results):
     text = report.read_text()
     assert "amount 1, distance 0.40: inside the data" in text
@@ -109,6 +111,7 @@ def test_write_report__states_the_distance_of_the_edit(report, results):
     assert "amount 1, distance 1.20: outside the data" in other
 
 
+@pytest.mark.slow
 def test_write_report__without_edits_and_traits(report):
     plain = planted_results((TAKES[0], TAKES[3]))
     plain.edits = {}

@@ -25,6 +25,7 @@ from skindb.render.image import read_exr
 SIZE = 64
 
 
+@pytest.mark.slow
 def test_export_bundle__every_file_is_listed_with_its_hash(bundle: Path) -> None:
     manifest = json.loads((bundle / "manifest.json").read_text(encoding="utf-8"))
     there = {str(p.relative_to(bundle)) for p in bundle.rglob("*") if p.is_file()} - {
@@ -41,6 +42,7 @@ def test_export_bundle__every_file_is_listed_with_its_hash(bundle: Path) -> None
     assert not list(bundle.parent.glob(".*"))
 
 
+@pytest.mark.slow
 def test_export_bundle__belongs_to_its_owner_alone(
     model: xr.DataTree, tmp_path: Path
 ) -> None:
@@ -56,6 +58,7 @@ def test_export_bundle__belongs_to_its_owner_alone(
     assert open_to_others(tmp_path, itself=False) == {}
 
 
+@pytest.mark.slow
 def test_export_bundle__its_read_me_names_every_file_and_error(
     merl_bundle: Path,
 ) -> None:
@@ -110,6 +113,7 @@ def test_export_bundle__maps_and_tables_come_back(
         assert stored["theta_h"][-1] == pytest.approx(np.pi / 2)
 
 
+@pytest.mark.slow
 def test_export_bundle__its_bases_can_be_fitted_with(
     model: xr.DataTree, tables: np.ndarray, tmp_path: Path
 ) -> None:
@@ -192,6 +196,7 @@ def test_export_bundle__states_the_light_disc_of_its_bases(
     assert "disc_angular_radius [rad]" in manifest["conventions"]["light_disc"]
 
 
+@pytest.mark.slow
 def test_export_bundle__names_what_is_missing(
     model: xr.DataTree, tmp_path: Path
 ) -> None:

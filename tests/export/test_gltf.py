@@ -47,6 +47,7 @@ def picture(document: dict, body: bytes, index: int) -> np.ndarray:
     )
 
 
+@pytest.mark.slow
 def test_export_gltf__another_reader_gets_the_mesh_in_metres(
     model: xr.DataTree, tmp_path: Path
 ) -> None:
@@ -181,6 +182,7 @@ def test_export_gltf__names_contain_the_take(
     assert len({one["name"] for one in document["images"]}) == len(document["images"])
 
 
+@pytest.mark.slow
 def test_export_gltf__states_its_error(model: xr.DataTree, tmp_path: Path) -> None:
     error = export_gltf(model, tmp_path / "a.glb", size=SIZE)
     extras = chunks(tmp_path / "a.glb")[0]["materials"][0]["extras"]

@@ -149,6 +149,7 @@ def test_index_of__fresnel_at_normal_incidence(f0: float, index: float) -> None:
     assert index_of(f0) == pytest.approx(index, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_export_usd__without_translucency_light_stays(
     model: xr.DataTree, tmp_path: Path
 ) -> None:

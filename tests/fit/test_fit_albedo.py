@@ -55,6 +55,7 @@ def test_estimate_diffuse_reflectance__white_gloss_leaves_the_colour_alone(new_s
     assert np.median(np.abs(b / a - 1)) < 0.03
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("lights", "cameras", "noise"), [(60, 8, 0.01), (60, 8, 0.05), (150, 16, 0.03)]
 )

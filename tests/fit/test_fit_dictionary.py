@@ -20,6 +20,7 @@ def measured(tmp_path_factory) -> Dictionary:
     return read_dictionary(folder)
 
 
+@pytest.mark.slow
 def test_dictionary_report__is_labelled_and_carries_the_notes(measured):
     report = dictionary_report(measured, disc_angular_radius=0.01)
     check(report, [v.name for v in GROUPS["dictionary_report"]])

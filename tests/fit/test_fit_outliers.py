@@ -217,6 +217,7 @@ def test_find_outliers__is_its_definition(taken):
     assert found["light_misfit"].isnull().all()
 
 
+@pytest.mark.slow
 def test_find_outliers__same_for_any_chunks(taken):
     lumitexels, basis = taken
     whole = find_outliers(lumitexels, basis=basis)

@@ -31,6 +31,7 @@ def partly_dark(skin):
     return capture
 
 
+@pytest.mark.slow
 def test_plan_fit__skips_what_has_no_sample(partly_dark, small_dictionary):
     plan = plan_fit(partly_dark, EXACT, dictionary=small_dictionary)
     assert np.flatnonzero(~plan.surfels).tolist() == [0, 5]

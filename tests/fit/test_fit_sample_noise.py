@@ -89,6 +89,7 @@ def by_hand(lumitexels, surfel, i, o, c, level, bright):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("whole", [100.0, 12.0])
 def test_write_noise__variance_of_each_sample_by_hand(skin, whole):
     """With a white level that some samples exceed in the long exposure, and without."""

@@ -168,6 +168,7 @@ def _noisy(sigma_a, sigma_s, floor, seed):
         yield fit, abs(fit.sigma_tr / true - 1)
 
 
+@pytest.mark.slow
 def test_fit_probe__a_second_minimum_is_never_silent():
     """Dark skin with no signal beyond 7 mm: noise selects one of two minima whose
     deviances differ by 1 to 3.
@@ -341,6 +342,7 @@ def test_fit_probe__jensen_2001_by_photons(material, walks):
     assert (found["site_chi_squared"].values[known] < 3).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("sigma_s", "sigma_a", "scatters"), [(1.01, 0.48, False), (0.70, 0.0014, True)]
 )

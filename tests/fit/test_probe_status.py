@@ -103,11 +103,13 @@ def test_poor_fit__noise_and_small_smooth_errors_are_none(relative, floor, misfi
     assert np.median(fitted) < 0.005 + misfit / 2
 
 
+@pytest.mark.slow
 def test_poor_fit__noise_with_a_free_gain_is_none():
     fits = _fits(_smooth(0.0), *NOISE[0], seed=6, free_gain=True)
     assert not [fit for fit, _ in fits if fit.status == ProbeStatus.POOR_FIT]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("relative", "floor"), NOISE[:2])
 def test_poor_fit__fibres_above_the_floor_by_chance_are_none(relative, floor):
     """A fibre four errors above zero and decades above the profile has a large
@@ -137,6 +139,7 @@ def _layers(value: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return value + 0.1 * value[0] * np.exp(-0.4 * (DISTANCE - 1)) / DISTANCE**2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("distort", [_veil, _layers], ids=["stray light", "two media"])
 @pytest.mark.parametrize(("relative", "floor"), NOISE[::2])
 def test_poor_fit__other_media_never_pass_for_one(relative, floor, distort):

@@ -145,6 +145,7 @@ HOSTILE = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", HOSTILE)
 def test_read_capture__numbers_that_no_device_has(capture_folder, name):
     spoil, message = HOSTILE[name]

@@ -496,6 +496,7 @@ FAULTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FAULTS)
 def test_read_capture__names_the_fault_with_file_and_key(capture_folder, name):
     spoil, message = FAULTS[name]

@@ -75,6 +75,7 @@ def only_fault(folder):
     return str(fault)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("landmarks", ["none", "in mm", "in the unit of the scan"])
 @pytest.mark.parametrize(
     ("scale", "unit"),
@@ -376,6 +377,7 @@ def reduced(folder, cameras, lights):
     write(folder, "dome/dome.json", record)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "kind",
     ["one camera", "one light", "open mesh", "two components", "three triangles"],

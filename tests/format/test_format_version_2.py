@@ -150,6 +150,7 @@ def test_read_capture__version_1_keeps_these_keys_as_they_are(second):
     assert capture.attributes["override"] == "nobody"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("file", "change", "said"),
     [
@@ -266,6 +267,7 @@ def test_read_dome__iso_times_are_seconds(second):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spread", [0.0, 0.03])
 @pytest.mark.parametrize("count", [2, 3, 8])
 def test_combine_placements__error_is_that_of_the_mean(spread, count):

@@ -127,6 +127,7 @@ def test_capture_dome__takes_any_cameras(subject, tmp_path):
     _require_right_frames(run)
 
 
+@pytest.mark.slow
 def test_capture_dome__any_frames_may_be_lost(subject, tmp_path):
     """Up to a tenth of the frames, anywhere: those that are kept are always the right ones."""
     for seed in range(12):

@@ -328,6 +328,7 @@ def test_ingest_capture__without_dome_and_probe_keeps_the_surface(
     assert take["surfels"].sizes["surfel"] > 100
 
 
+@pytest.mark.slow
 def test_ingest_capture__by_splats_and_footprints_sees_the_same_face(
     take, capture_folder, tmp_path
 ):
@@ -369,6 +370,7 @@ def test_atlas_group__names_the_weights_that_made_the_map(capture_folder, monkey
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("largest", [4096, 64])
 def test_ingest_capture__depth_maps_too_coarse_for_the_splats_are_told(
     capture_folder, tmp_path, monkeypatch, largest

@@ -127,6 +127,7 @@ def _found(shoot):
     )
 
 
+@pytest.mark.slow
 def test_calibration__of_a_true_capture_is_good(shoot):
     found, faults, notes = _found(shoot)
     assert (faults, notes) == ([], [])
@@ -293,6 +294,7 @@ DOUBTFUL = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", DOUBTFUL)
 def test_calibration_notes__warn_of_smaller_errors(shoot, name):
     spoil, message = DOUBTFUL[name]
@@ -301,6 +303,7 @@ def test_calibration_notes__warn_of_smaller_errors(shoot, name):
     assert any(re.search(message, line) for line in notes), notes
 
 
+@pytest.mark.slow
 def test_ingest_capture__refuses_or_notes_exchanged_frames(shoot, tmp_path):
     folder = Path(shutil.copytree(shoot.folder, tmp_path / "V001"))
     frames = (
@@ -337,6 +340,7 @@ def test_ingest_capture__refuses_or_notes_exchanged_frames(shoot, tmp_path):
         assert found["camera_offset"].max() < 3.0
 
 
+@pytest.mark.slow
 def test_scan_pose__is_the_planted_one(shoot):
     true, _, _ = _found(shoot)
     found, _, _ = _found(_scan(shoot, move=(1.0, -2.0, 3.0)))
@@ -360,6 +364,7 @@ def _check(shoot):
     }
 
 
+@pytest.mark.slow
 def test_refine_cameras__turns_back_what_was_turned(shoot):
     """Rationale: shifts are found to 1.5 mm where pixels are 4 mm. Planted: 0.6
     degrees, 9 mm, and a roll.
@@ -389,6 +394,7 @@ def test_refine_cameras__leaves_cameras_that_show_something_else(shoot):
     np.testing.assert_array_equal(refined.cameras[1].R, shoot.dome.cameras[1].R)
 
 
+@pytest.mark.slow
 def test_ingest_capture__refine_stores_the_rotations(shoot, tmp_path):
     parameters = IngestParameters(spacing_mm=4.0, refine=True)
     with ingest_capture(

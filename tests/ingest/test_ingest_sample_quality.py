@@ -102,6 +102,7 @@ def lumitexels_of(dome, surfels, folder, *, footprint):
     return lumitexels(xr.DataTree.from_dict(groups))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("footprint", [False, True])
 def test_sample_variance__z_scores_of_repeated_frames_have_unit_variance(
     capture_folder, tmp_path, footprint
@@ -359,6 +360,7 @@ def ingested(folder, root, **options):
     return record.provenance["summary"]["notes"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", HOSTILE)
 def test_ingest_capture__intensities_and_samples_of_no_dome_are_refused(
     capture_folder, tmp_path, name
@@ -412,6 +414,7 @@ def test_ingest_capture__lights_that_are_wrong_are_noted_on_request(
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LEGAL)
 def test_ingest_capture__unusual_lights_pass_and_are_noted(
     capture_folder, tmp_path, name

@@ -261,6 +261,7 @@ def test_spool__a_journal_without_its_samples_is_not_believed(tmp_path, length):
             assert not (tmp_path / "a/journal").exists()
 
 
+@pytest.mark.slow
 def test_spool__old_frames_come_back_after_samples_of_others_were_written(tmp_path):
     """A, then B is killed before its first note, then A again: the view B wrote over
     must not count as one of A.
@@ -378,6 +379,7 @@ def whole(pristine, tmp_path_factory):
     return db.read("capture", "T001").load()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "point", [("visibility", 1), ("sample", 3), ("sample", 8), ("write", 1)]
 )
@@ -467,6 +469,7 @@ def test_ingest_capture__survives_a_kill_without_goodbye(
     assert db.verify() == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "planted",
     [
@@ -501,6 +504,7 @@ def test_ingest_take__a_planted_note_removes_nothing(pristine, tmp_path, planted
     assert db.takes() == ["T001"]
 
 
+@pytest.mark.slow
 def test_ingest_capture__a_frame_that_changed_is_read_again(
     capture_folder, tmp_path, whole
 ):

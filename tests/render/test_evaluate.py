@@ -109,6 +109,7 @@ def test_evaluate__is_zero_below_the_horizon(model):
     assert (evaluate(model, 0, -wi, -wo) == 0).all()
 
 
+@pytest.mark.slow
 def test_evaluate__broadcasts_and_takes_one_pair(model):
     wi, wo = _pairs(model, 1, 12)
     every = evaluate(model, 1, wi[:, None], wo[:5])

@@ -145,6 +145,7 @@ def test_subsurface__even_light_gives_r_d() -> None:
     assert abs(found.radiance[seen].mean() / expected[seen].mean() - 1) < 0.005
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 3, 12])
 @pytest.mark.parametrize("disc_included", [False, True])
 def test_lights__as_the_renderer_of_the_fit(count, disc_included) -> None:
@@ -163,6 +164,7 @@ def test_lights__as_the_renderer_of_the_fit(count, disc_included) -> None:
     assert 0.85 < spread < 1.3
 
 
+@pytest.mark.slow
 def test_environment__as_many_small_lights() -> None:
     """An environment against one distant point light for each of its texels."""
     surface = ball(eta=1.3, weight=0.5)

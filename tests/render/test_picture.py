@@ -213,6 +213,7 @@ def test_compare_photographs__reads_the_half_floats_of_older_stores(
     assert found[0] == found[1]
 
 
+@pytest.mark.slow
 def test_render__is_a_labelled_picture(model: xr.DataTree) -> None:
     seen = render(model, lights=["l0", "l2"], samples=256, scale=2.0)
     dome = model["dome"].to_dataset()

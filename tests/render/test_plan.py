@@ -75,6 +75,7 @@ POWERS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(POWERS))
 @pytest.mark.parametrize("subsurface", [False, True])
 def test_notable_lights__pictures_agree_within_the_bound(
@@ -164,6 +165,7 @@ CAMERAS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(CAMERAS))
 @pytest.mark.parametrize("coarse", [False, True])
 def test_covered_pixels__contain_every_hit(name: str, coarse: bool) -> None:

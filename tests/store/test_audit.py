@@ -88,6 +88,7 @@ def test_append_entry__accepts_any_text_as_take(tmp_path):
     assert len(db.audit()[0][0].subjects) == 5
 
 
+@pytest.mark.slow
 def test_append_entry__processes_that_race_lose_nothing(tmp_path):
     db = Database(tmp_path / "db")
     command = [sys.executable, "-c", WRITER, str(db.root)]
@@ -170,6 +171,7 @@ def test_append_entry__costs_the_same_after_many_entries(tmp_path):
     assert place.count <= 21 + 1 + 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "step", ["before the temporary file", "before the link", "after the link"]
 )

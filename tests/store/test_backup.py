@@ -480,6 +480,7 @@ def test_restore__refuses_names_that_lead_elsewhere(db, dest, tmp_path):
     assert not (tmp_path / "copy").exists()
 
 
+@pytest.mark.slow
 def test_backup__of_hostile_names(tmp_path, dest):
     db = Database(tmp_path / "db")
     _fill(db.url, NAMES)
@@ -572,6 +573,7 @@ def one_thread(monkeypatch):
     monkeypatch.setattr(lease_module, "_has_ended", lambda *_: True)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("one_thread")
 def test_backup__while_a_subject_is_withdrawn_at_any_step(made, tmp_path):
     others = 0
@@ -613,6 +615,7 @@ def _withdraw_apart(url, *backups) -> None:
     assert os.waitpid(process, 0)[1] == 0
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("one_thread")
 def test_backup__suspended_while_a_subject_is_erased_from_it_leaves_nothing(
     made, tmp_path
@@ -639,6 +642,7 @@ def test_backup__suspended_while_a_subject_is_erased_from_it_leaves_nothing(
     assert refused > 3
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("one_thread")
 def test_backup__while_others_commit_and_remove_is_one_moment(made, tmp_path):
     """Every version of a restored state has its inputs, and `verify` finds nothing."""
@@ -695,6 +699,7 @@ def test_list__is_repeated_until_nothing_changes(db, dest, monkeypatch):
     assert len(lists) == 4
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("one_thread")
 def test_backup__interrupted_at_any_step_continues(made, tmp_path):
     for number in range(0, 10_000, 17):
@@ -724,6 +729,7 @@ def test_backup__interrupted_at_any_step_continues(made, tmp_path):
     assert number > 50
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("one_thread")
 def test_restore__interrupted_at_any_step_is_refused_and_continues(db, dest, tmp_path):
     db.backup(str(dest))

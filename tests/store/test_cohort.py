@@ -24,6 +24,7 @@ def db(tmp_path_factory) -> Database:
     return database(tmp_path_factory.mktemp("cohort"), PEOPLE)
 
 
+@pytest.mark.slow
 def test_cohort__tables_are_those_of_every_take(db):
     cohort = db.cohort("tables")
     assert cohort.sizes["take"] == len(PEOPLE) - 1

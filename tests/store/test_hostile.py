@@ -83,6 +83,7 @@ def _commit_hostile(root, change: dict, take: str = "A1") -> None:
         stage.commit({"consent_scope": ["fit", "statistics"], "subject": take})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", HOSTILE)
 def test_read__metadata_that_promise_too_much_are_refused_before_allocation(
     tmp_path, name

@@ -278,6 +278,7 @@ db = Database({str(db.root)!r})
     return child
 
 
+@pytest.mark.slow
 def test_lease__of_a_killed_process_of_this_machine_is_free_at_once(db):
     child = _child(
         db,

@@ -17,6 +17,7 @@ def db(fitted_database):
     return fitted_database
 
 
+@pytest.mark.slow
 def test_create_release__cohort_and_reads_stay_the_same(db):
     db.create_release("first", ["S01", "S02"])
     before = db.cohort("tables", release="first").load()

@@ -188,6 +188,7 @@ def test_readable_errors__refused_access(new_database, monkeypatch):
     assert KEY not in str(caught.value)
 
 
+@pytest.mark.slow
 def test_connect__without_obstore_names_what_to_install():
     code = (
         "import sys; sys.modules['obstore'] = sys.modules['obstore.exceptions'] = "

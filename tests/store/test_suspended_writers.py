@@ -270,6 +270,7 @@ def _capture_late(db: Database) -> None:
         _capture(db)
 
 
+@pytest.mark.slow
 def test_late_commit__is_not_visible(late):
     for kind, take in (("capture", f"{SUBJECT}.lotion"), ("population", "traits")):
         with pytest.raises(InputError, match=HIDDEN):

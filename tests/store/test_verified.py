@@ -73,6 +73,7 @@ def test_read__reports_a_cut_or_longer_file_before_any_work(db):
         file.write_bytes(content)
 
 
+@pytest.mark.slow
 def test_read__any_changed_byte_is_an_error_of_what_needs_it(db):
     rng = np.random.default_rng(5)
     for file in _files(db):

@@ -294,6 +294,7 @@ def test_cohort__a_record_that_describes_other_tables_is_refused(db):
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "place",
     [
@@ -336,6 +337,7 @@ SUBSTITUTES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", SUBSTITUTES)
 @pytest.mark.parametrize(
     "name", ["record", "manifest", "head", "chunk", "log", "heads", "take"]

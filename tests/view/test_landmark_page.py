@@ -286,6 +286,7 @@ def test_page__fits_a_width_of_400_px(browser, address):
     page.close()
 
 
+@pytest.mark.slow
 def test_landmark_server__saves_nothing_for_others(server, tmp_path):
     """A page that knows the address, but not the token, can neither read the scan nor
     write landmarks.

@@ -103,6 +103,7 @@ def test_server__only_a_get_of_the_page_uses_the_token(server):
     assert Session.opened(server.address).page.status == 200
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_server__no_method_is_answered_without_the_session(server, session, method):
     for cookie in (
@@ -122,6 +123,7 @@ def test_server__no_method_is_answered_without_the_session(server, session, meth
             assert b"face" not in answer.body.replace(path.encode() or b" ", b"")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", METHODS)
 def test_server__no_method_is_answered_to_other_hosts_and_origins(session, method):
     own = session.host

@@ -62,6 +62,7 @@ def test_parametric_head__is_a_disc_with_one_boundary_loop(head):
     assert len(seen) == len(boundary)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "person",
     [p for p in default_people() if p.condition == "normal"],
@@ -80,6 +81,7 @@ def test_parametric_head__every_default_person_has_sound_triangles(person):
     assert np.abs(field(head.vertices, face_shape(person))).max() < ON_SKIN
 
 
+@pytest.mark.slow
 def test_normals__agree_with_a_finer_sampling_of_the_surface(head):
     fine = parametric_head(FaceShape(), spacing_mm=1.5)
     a, b, c = (fine.vertices[fine.faces[:, i]] for i in range(3))

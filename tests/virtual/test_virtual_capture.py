@@ -50,6 +50,7 @@ def _digest(folder):
     ]
 
 
+@pytest.mark.slow
 def test_simulate_take__writes_every_file_the_format_promises(capture):
     record = json.loads((capture / "capture.json").read_text())
     assert (record["format"], record["version"], record["subject"]) == (
@@ -201,6 +202,7 @@ def test_simulate_take__truth_lies_beside_the_folder_and_is_consistent(capture):
     assert not list(capture.rglob("*truth*"))
 
 
+@pytest.mark.slow
 def test_simulate_take__same_seed_same_bytes_other_seed_other_noise(tmp_path):
     first, again, other = (
         _simulate(tmp_path / f"t{i}", seed=s) for i, s in enumerate((1, 1, 2))

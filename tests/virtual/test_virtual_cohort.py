@@ -43,6 +43,7 @@ def test_cohort_people__the_first_are_the_same_whatever_the_number():
     assert [one for one in twice if one.condition == "normal"] == cohort_people(6)
 
 
+@pytest.mark.slow
 def test_simulate__continues_a_cohort(tmp_path):
     out = tmp_path / "c"
     first = simulate(out, cohort=2, **SIZE)

@@ -216,6 +216,7 @@ def test_calibrate_cameras__finds_what_was_put_in(pristine, tmp_path, gamma):
             assert np.abs(got / exposure - 1).max() < 0.02
 
 
+@pytest.mark.slow
 def test_ingest__uses_the_calibrated_cameras(linear_setup, pristine, tmp_path):
     folder = Path(shutil.copytree(pristine, tmp_path / "T001"))
     meta = json.loads((folder / "capture.json").read_text()) | {

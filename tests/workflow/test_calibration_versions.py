@@ -96,6 +96,7 @@ def test_calibrate_lights__light_beside_the_target_is_part_of_the_error(setup):
     )
 
 
+@pytest.mark.slow
 def test_ingest__takes_the_lights_of_the_named_calibration(
     setup, capture, pristine, tmp_path
 ):

@@ -129,6 +129,7 @@ def test_fit_take__uses_no_first_pass_that_would_be_another(
     assert "first pass" in stages
 
 
+@pytest.mark.slow
 def test_fit_take__repeats_a_first_pass_that_is_damaged(killed):
     for file in (killed.root / "data/first").rglob("c/*"):
         if file.is_file():

@@ -15,6 +15,8 @@ from skindb.cli import cli
 from skindb.store import Database
 from skindb.workflow.upkeep import repeat_study
 
+pytestmark = pytest.mark.slow
+
 STEP = 0.1  # of R_d between the two groups
 
 
@@ -78,7 +80,6 @@ def test_correlations__channels_go_together(database):
     assert one["correlation_count"] == 8
 
 
-@pytest.mark.slow
 def test_analyze__writes_tables_and_plots(database, tmp_path):
     url = str(database.folder)
     for what, options in (
@@ -96,7 +97,6 @@ def test_analyze__writes_tables_and_plots(database, tmp_path):
         assert path.stat().st_size > 1000
 
 
-@pytest.mark.slow
 def test_refresh__repeats_all(database):
     for what, given in (
         ("maps", {"group_by": "gender", "permutations": 100}),

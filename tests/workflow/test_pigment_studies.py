@@ -17,6 +17,8 @@ from skindb.store import Database
 from skindb.virtual.skin import HAEMOGLOBIN, MELANIN
 from skindb.workflow.upkeep import repeat_study
 
+pytestmark = pytest.mark.slow
+
 AGES = [21, 35, 62]
 
 
@@ -107,7 +109,6 @@ def test_chromophores__two_people_have_no_mean_face(tmp_path):
     )
 
 
-@pytest.mark.slow
 def test_analyze__writes_tables_and_plots(database, tmp_path):
     url = str(database.folder)
     done = CliRunner().invoke(

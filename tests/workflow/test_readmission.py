@@ -70,6 +70,7 @@ def test_ingest__of_a_withdrawn_subject_is_refused_in_one_line(db, folder):
     assert after == before
 
 
+@pytest.mark.slow
 def test_ingest__with_a_new_consent_is_admitted_from_then_on(db, folder):
     record = workflow.ingest_take(db, folder, new_consent=date.today(), **OPTIONS)
     assert record.admissions == {SUBJECT: 2}

@@ -109,6 +109,7 @@ def test_groups__are_stored_by_what_is_compared_and_made_again(db):
     )
 
 
+@pytest.mark.slow
 def test_edit__names_the_studies_there_are(db):
     with pytest.raises(
         InputError,
@@ -153,6 +154,7 @@ def test_stale_versions__a_new_model_supersedes_what_was_made_from_the_old_one(d
         require_fresh(db, "edit", "B")
 
 
+@pytest.mark.slow
 def test_refresh__makes_results_again_in_order_of_dependence(db):
     _commit(db, "C")
     done = workflow.refresh(db)
@@ -184,6 +186,7 @@ def test_refresh__makes_results_again_in_order_of_dependence(db):
     assert workflow.refresh(db) == []
 
 
+@pytest.mark.slow
 def test_refresh__leaves_out_whose_consent_was_narrowed(db):
     db.record_consent("C", ["fit"])
     assert list(_stale(db).values()) == [["not covered"]] * 4

@@ -53,6 +53,7 @@ def _studies(db):
     return [tree.attrs["generation"] for tree in made]
 
 
+@pytest.mark.slow
 def test_made__nothing_changed(db, monkeypatch):
     monkeypatch.setattr(
         study_inputs, "dictionary_tables", lambda *_: pytest.fail("computed again")

@@ -70,6 +70,7 @@ def _strange(take: int):
     return take
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", [None, 2])
 def test_map_takes__results_and_errors_that_cannot_be_pickled_are_outcomes(workers):
     outcomes = {one.take: one for one in map_takes(_strange, range(6), workers=workers)}

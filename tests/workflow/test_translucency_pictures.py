@@ -14,6 +14,8 @@ from skindb.schema import dataset
 from skindb.store import Database
 from skindb.workflow import pictures, translucency_grid
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def db(tmp_path):

@@ -19,6 +19,8 @@ from skindb.workflow.derive import groups_of
 sys.path.insert(0, str(Path(__file__).parents[1] / "store"))
 from stored import commit
 
+pytestmark = pytest.mark.slow
+
 PROGRAM = "from skindb.cli import main; main()"
 
 
