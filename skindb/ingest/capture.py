@@ -122,78 +122,91 @@ def ingest_capture(
     """
     report = progress or silent
     parameters = parameters or IngestParameters()
-    dome = capture.dome
     require_fit_consent(capture)
     report("check", 1, 1)
     surfels = build_surfels(capture, spacing_mm=parameters.spacing_mm)
     report("surfels", 1, 1)
-    groups = {"mesh": mesh_group(capture, surfels), "atlas": atlas_group(surfels)}
-    faults = list[Fault]()
-    digests = Digests()
-    notes = list[str]()
-    summary: dict[str, Any] = {}
-    probe_groups, notes_of_probe = _probe_groups(capture, surfels, faults, digests)
-    groups |= probe_groups
+    run = _Run(capture, surfels, parameters, report)
+    run.groups |= {"mesh": mesh_group(capture, surfels), "atlas": atlas_group(surfels)}
+    run.measure_probe()
     with ExitStack() as stack:
-        if dome is None:
-            groups["surfels"] = surfel_group(surfels)
+        if capture.dome is None:
+            run.groups["surfels"] = surfel_group(surfels)
         else:
-            key = samples_digest(capture, asdict(parameters))
-            shape = (len(dome.lights), len(dome.cameras), len(surfels.position))
-            folder = Path(scratch) / _scratch_name(capture, key)
-            spool = stack.enter_context(
-                Spool(folder, shape, frame_marks(dome), key=key)
-            )
+            spool = stack.enter_context(run.spool(capture.dome, Path(scratch)))
             # ends before the spool does
-            pool = stack.enter_context(ThreadPoolExecutor(threads(dome)))
-            run = _Run(dome, surfels, parameters, faults, digests, spool, pool, report)
-            if dome_groups := run.groups():
-                groups |= dome_groups
-                summary = run.summary
-                notes = run.notes
-                if dome.sequence is not None:
-                    groups["sequence"] = sequence_group(dome.sequence, dome)
-            digests |= {Path(path): digest for path, digest in spool.digests.items()}
-        faults += repeated_frame_faults(
-            capture.folder, digests, besides=_copies(capture)
-        )
-        if faults:
-            raise InputError(grouped(faults))
-        spacing = surfels.spacing()
-        if parameters.spacing_mm > 1.5 * spacing:
-            notes.append(
-                f"the points of the scan are {spacing:.2g} mm apart; a wider spacing leaves "
-                "the scan unchanged"
-            )
-        summary |= {
-            "surfels": {"count": len(surfels.position), "spacing_mm": spacing},
-            "notes": notes + notes_of_probe,
-        }
-        tree = xr.DataTree.from_dict(groups)
-        tree.attrs = capture_provenance(capture, asdict(parameters), digests) | {
-            "summary": summary,
-            "take": capture.take,
-        }
+            pool = stack.enter_context(ThreadPoolExecutor(threads(capture.dome)))
+            _DomeStages(run, capture.dome, spool, pool).sample()
+        run.require_no_faults()
+        tree = xr.DataTree.from_dict(run.groups)
+        tree.attrs = run.attributes()
         stack.enter_context(
-            dask.config.set(scheduler="threads", num_workers=threads(dome))
+            dask.config.set(scheduler="threads", num_workers=threads(capture.dome))
         )
         yield tree
 
 
-def _probe_groups(
-    capture: Capture, surfels: SurfelSet, faults: list[Fault], digests: Digests
-) -> tuple[dict[str, xr.Dataset], list[str]]:
-    """The group "probe" and its notes; neither without a probe or with faults."""
-    probe = capture.probe
-    if probe is None:
-        return {}, []
-    profiles = attempt(faults, lambda: fibre_profiles(probe, digests))
-    if profiles is None:
-        return {}, []
-    isotropy = isotropy_p_values(probe, profiles)
-    sites = site_positions(capture, surfels, probe.sites)
-    group = probe_group(probe, profiles, sites, isotropy)
-    return {"probe": group}, probe_notes(probe, profiles, isotropy)
+@dataclass
+class _Run:
+    """An ingest, and what its stages have produced so far."""
+
+    capture: Capture
+    surfels: SurfelSet
+    parameters: IngestParameters
+    report: Progress
+    groups: dict[str, xr.Dataset] = field(default_factory=dict)
+    faults: list[Fault] = field(default_factory=list)
+    digests: Digests = field(default_factory=Digests)
+    summary: dict[str, Any] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    probe_notes: list[str] = field(default_factory=list)
+
+    def measure_probe(self) -> None:
+        """Add the group "probe" and its notes."""
+        probe = self.capture.probe
+        if probe is None:
+            return
+        profiles = attempt(self.faults, lambda: fibre_profiles(probe, self.digests))
+        if profiles is not None:
+            isotropy = isotropy_p_values(probe, profiles)
+            sites = site_positions(self.capture, self.surfels, probe.sites)
+            self.groups["probe"] = probe_group(probe, profiles, sites, isotropy)
+            self.probe_notes = probe_notes(probe, profiles, isotropy)
+
+    def spool(self, dome: DomeRecord, scratch: Path) -> Spool:
+        """The spool of this capture and these parameters, new or left by a run that was
+        killed.
+        """
+        key = samples_digest(self.capture, asdict(self.parameters))
+        shape = (len(dome.lights), len(dome.cameras), len(self.surfels.position))
+        folder = scratch / _scratch_name(self.capture, key)
+        return Spool(folder, shape, frame_marks(dome), key=key)
+
+    def require_no_faults(self) -> None:
+        """Raise the faults of all stages, and of frames that are copies of others."""
+        folder = self.capture.folder
+        copies = _copies(self.capture)
+        self.faults += repeated_frame_faults(folder, self.digests, besides=copies)
+        if self.faults:
+            raise InputError(grouped(self.faults))
+
+    def attributes(self) -> dict[str, Any]:
+        """Provenance and summary of the version."""
+        spacing = self.surfels.spacing()
+        notes = [*self.notes]
+        if self.parameters.spacing_mm > 1.5 * spacing:
+            notes.append(
+                f"the points of the scan are {spacing:.2g} mm apart; a wider spacing leaves "
+                "the scan unchanged"
+            )
+        count = len(self.surfels.position)
+        summary = self.summary | {
+            "surfels": {"count": count, "spacing_mm": spacing},
+            "notes": notes + self.probe_notes,
+        }
+        parameters = asdict(self.parameters)
+        provenance = capture_provenance(self.capture, parameters, self.digests)
+        return provenance | {"summary": summary, "take": self.capture.take}
 
 
 def _copies(capture: Capture) -> list[Path]:
@@ -231,26 +244,31 @@ def threads(dome: DomeRecord | None) -> int:
 
 
 @dataclass
-class _Run:
+class _DomeStages:
     """The stages in which the frames of a dome are processed."""
 
+    run: _Run
     dome: DomeRecord
-    surfels: SurfelSet
-    parameters: IngestParameters
-    faults: list[Fault]
-    digests: Digests
     spool: Spool
     pool: Executor
-    report: Progress
-    summary: dict[str, Any] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
 
-    def groups(self) -> dict[str, xr.Dataset]:
-        """Groups surfels, samples, dome and photographs; empty if faults were found."""
-        surfels = self.surfels
-        parameters = self.parameters
+    def sample(self) -> None:
+        """Add the groups surfels, samples, dome, photographs, calibration and sequence,
+        unless faults are found.
+        """
+        groups = self._groups()
+        if groups and self.dome.sequence is not None:
+            groups["sequence"] = sequence_group(self.dome.sequence, self.dome)
+        self.run.groups |= groups
+        self.run.digests |= {
+            Path(x): digest for x, digest in self.spool.digests.items()
+        }
+
+    def _groups(self) -> dict[str, xr.Dataset]:
+        surfels = self.run.surfels
+        parameters = self.run.parameters
         method = parameters.visibility
-        mergers = frame_mergers(self.dome, self.faults, self.digests)
+        mergers = frame_mergers(self.dome, self.run.faults, self.run.digests)
         self._check_dark_frames(mergers)
         intensity, measured = self._intensity(mergers)
         scene = RayScene(surfels.position, surfels.faces)
@@ -261,14 +279,15 @@ class _Run:
             camera_visibility, surfels, scene=scene, pool=self.pool, method=method
         )
         visible, clear, pixels = sees(self.dome.cameras)
-        self.report("visibility", 1, 1)
+        self.run.report("visibility", 1, 1)
         check = CalibrationCheck(
             self.dome, surfels, light_fraction, clear, pixels, intensity
         )
         rotations = np.zeros((len(self.dome.cameras), 3))
-        if parameters.refine and not self.faults:
+        if parameters.refine and not self.run.faults:
             pictures = attempt(
-                self.faults, lambda: checked_pictures(check, mergers, pool=self.pool)
+                self.run.faults,
+                lambda: checked_pictures(check, mergers, pool=self.pool),
             )
             if pictures is None:
                 return {}
@@ -277,43 +296,42 @@ class _Run:
             self.dome = refined
             visible, clear, pixels = sees(refined.cameras)
             check = replace(check, dome=refined, clear=clear, pixels=pixels)
-            self.report("refine", 1, 1)
-        soft = parameters.soft
-        views = Views(
-            surfels,
-            fully_lit(surfels, light_fraction, self.dome.cameras, soft=soft),
-            clear,
-            pixels,
-            light_fraction=light_fraction if soft == "keep" else None,
-            footprint=parameters.footprint,
-        )
-        lumitexels = self._lumitexels(views, mergers, check)
+            self.run.report("refine", 1, 1)
+        lumitexels = self._lumitexels(mergers, check)
         if lumitexels is None:
             return {}
-        if measured and not self.faults:
+        if measured and not self.run.faults:
             levels = lumitexels.views
-            self.faults += sample_faults(self.dome, levels.median, levels.bright)
+            self.run.faults += sample_faults(self.dome, levels.median, levels.bright)
         if not lumitexels.sample_count.any():
             rule = "a surfel must be lit by a light and seen by a camera"
             cure = "check the crop, poses and positions"
-            self.faults.append(Fault("samples", rule, "none is", cure))
-        if self.faults:
+            self.run.faults.append(Fault("samples", rule, "none is", cure))
+        if self.run.faults:
             return {}
         self._note(lumitexels, mergers, intensity)
         return self._labelled(lumitexels, check, visible, rotations)
 
     def _lumitexels(
-        self,
-        views: Views,
-        mergers: Mapping[str, FrameMerger],
-        check: CalibrationCheck,
+        self, mergers: Mapping[str, FrameMerger], check: CalibrationCheck
     ) -> Lumitexels | None:
         """The samples; None, with its faults recorded, if there are any."""
-        middle = self.surfels.position.mean(axis=0)
-        count = self.parameters.photographs
-        earlier_faults = bool(self.faults)
+        surfels = self.run.surfels
+        light_fraction = check.light_visible
+        soft = self.run.parameters.soft
+        views = Views(
+            surfels,
+            fully_lit(surfels, light_fraction, self.dome.cameras, soft=soft),
+            check.clear,
+            check.pixels,
+            light_fraction=light_fraction if soft == "keep" else None,
+            footprint=self.run.parameters.footprint,
+        )
+        middle = surfels.position.mean(axis=0)
+        count = self.run.parameters.photographs
+        earlier_faults = bool(self.run.faults)
         return attempt(
-            self.faults,
+            self.run.faults,
             lambda: sample_lumitexels(
                 self.dome,
                 check.intensity,
@@ -322,9 +340,9 @@ class _Run:
                 self.spool,
                 kept=choose_photographs(self.dome, middle, count),
                 check=None if earlier_faults else check,
-                refuse=self.parameters.calibration == "refuse",
+                refuse=self.run.parameters.calibration == "refuse",
                 pool=self.pool,
-                progress=self.report,
+                progress=self.run.report,
             ),
         )
 
@@ -337,7 +355,9 @@ class _Run:
     ) -> dict[str, xr.Dataset]:
         dome = self.dome
         groups = {
-            "surfels": surfel_group(self.surfels, dome, check.light_visible, visible),
+            "surfels": surfel_group(
+                self.run.surfels, dome, check.light_visible, visible
+            ),
             "samples": sample_group(dome, lumitexels),
             "dome": dome_group(dome, check.intensity),
         }
@@ -358,33 +378,35 @@ class _Run:
         dome = self.dome
         levels = lumitexels.views
         for merger in mergers.values():
-            self.notes += dark_notes(dome, merger)
-        self.notes += level_notes(dome, levels.highest, levels.clipped)
-        self.notes += light_notes(dome, intensity, levels.median)
-        if self.parameters.visibility == "splats":
-            self.notes += coarse_maps(self.surfels, dome.lights, dome.cameras)
+            self.run.notes += dark_notes(dome, merger)
+        self.run.notes += level_notes(dome, levels.highest, levels.clipped)
+        self.run.notes += light_notes(dome, intensity, levels.median)
+        if self.run.parameters.visibility == "splats":
+            self.run.notes += coarse_maps(self.run.surfels, dome.lights, dome.cameras)
         calibration = lumitexels.calibration
         if calibration is not None:
             # empty if refused
             faults = calibration_faults(dome, calibration)
-            self.notes += [str(fault) for fault in faults]
-            self.notes += calibration_notes(dome, calibration)
-        self.summary = {"samples": describe_samples(lumitexels, self.surfels, dome)}
+            self.run.notes += [str(fault) for fault in faults]
+            self.run.notes += calibration_notes(dome, calibration)
+        self.run.summary = {
+            "samples": describe_samples(lumitexels, self.run.surfels, dome)
+        }
 
     def _check_dark_frames(self, mergers: Mapping[str, FrameMerger]) -> None:
         for merger in mergers.values():
-            self.faults += dark_faults(self.dome, merger)
-        if self.faults:
+            self.run.faults += dark_faults(self.dome, merger)
+        if self.run.faults:
             return
         patterns = attempt(
-            self.faults,
+            self.run.faults,
             lambda: [
                 *self.pool.map(
                     lambda name: dark_pattern_fault(self.dome, name, mergers), mergers
                 )
             ],
         )
-        self.faults += [fault for fault in patterns or [] if fault is not None]
+        self.run.faults += [fault for fault in patterns or [] if fault is not None]
 
     def _intensity(self, mergers: Mapping[str, FrameMerger]) -> tuple[Float64, bool]:
         """Intensities of the lights (light, 3), and whether they could be determined.
@@ -392,11 +414,11 @@ class _Run:
         Otherwise they are 1, to find damaged frames of the face in the same run.
         """
         intensity = attempt(
-            self.faults,
-            lambda: light_intensities(self.dome, mergers, self.pool, self.digests),
+            self.run.faults,
+            lambda: light_intensities(self.dome, mergers, self.pool, self.run.digests),
         )
-        self.report("lights", 1, 1)
+        self.run.report("lights", 1, 1)
         if intensity is None:
             return np.ones((len(self.dome.lights), 3)), False
-        self.faults += intensity_faults(self.dome, intensity)
+        self.run.faults += intensity_faults(self.dome, intensity)
         return intensity, True
