@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from skindb.analysis import correspondence_error, mask_agreement, register
-from skindb.analysis.masks import own_masks, region_masks
+from skindb.analysis.regions import own_masks, region_masks
 from skindb.analysis.registration import unregistered
 from skindb.format.folder import read_capture
 from skindb.geometry.atlas import disc_atlas

@@ -28,7 +28,6 @@ from skindb.analysis.chromophores import (
     describe_chromophores,
     plot_chromophores,
 )
-from skindb.analysis.common_maps import common_maps
 from skindb.analysis.components import face_components, principal_components
 from skindb.analysis.correlations import (
     component_correlations,
@@ -49,9 +48,9 @@ from skindb.analysis.group_effects import (
     group_effects,
     plot_group_effects,
 )
-from skindb.analysis.masks import mask_agreement, region_masks, take_masks
 from skindb.analysis.mean_face import mean_face, plot_mean_face
 from skindb.analysis.population_basis import population_basis
+from skindb.analysis.regions import mask_agreement, region_masks, take_masks
 from skindb.analysis.registration import (
     correspondence_error,
     corresponding_points,
@@ -63,6 +62,7 @@ from skindb.analysis.studies import STUDIES, describe_study, plot_study, tabulat
 from skindb.analysis.subjects import groups_by, sides, subjects_of, trait_names
 from skindb.analysis.summary import (
     cohort_of,
+    common_maps,
     region_tables,
     sample_surfels,
     summary_tables,

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
-from skindb.analysis import colours, texture
+from skindb import plots
+from skindb.analysis import texture
 from skindb.analysis.each_take import each_take
 from skindb.analysis.study import (
     Population,
@@ -390,7 +391,7 @@ def plot_albedo(
     else:
         names = [str(take) for take in histograms["take"].values]
         lines = histograms["albedo_histogram"].sel(region=region).isel(axis=axis).values
-    ax.set_prop_cycle(color=colours.CYCLE)
+    ax.set_prop_cycle(color=plots.CYCLE)
     for i, (name, fractions) in enumerate(zip(names, lines, strict=True)):
         own: dict[str, Any] = (
             {"label": name}
@@ -400,7 +401,7 @@ def plot_albedo(
         ax.plot(
             centres,
             fractions.reshape(-1, width).sum(axis=1),
-            linestyle=LINES[i // len(colours.CYCLE) % len(LINES)],
+            linestyle=LINES[i // len(plots.CYCLE) % len(LINES)],
             **own,
         )
     if len(names) > MAX_LEGEND_ENTRIES:

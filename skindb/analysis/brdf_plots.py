@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from skindb.analysis import colours
+from skindb import plots
 from skindb.optics.angles import half_difference
 from skindb.reflectance.tables import lookup
 from skindb.types import Array
@@ -260,4 +260,4 @@ def _tables(space: xr.Dataset) -> NDArray[np.float32]:
 
 
 def _colour(i: int) -> str:
-    return colours.CYCLE[i % len(colours.CYCLE)]
+    return plots.CYCLE[i % len(plots.CYCLE)]

@@ -21,10 +21,10 @@ import xarray as xr
 from sklearn.decomposition import FastICA
 from sklearn.exceptions import ConvergenceWarning
 
-from skindb.analysis import colours
+from skindb import plots
 from skindb.analysis.each_take import each_take
-from skindb.analysis.masks import region_masks
 from skindb.analysis.mean_face import mean_face
+from skindb.analysis.regions import region_masks
 from skindb.analysis.study import (
     Population,
     Results,
@@ -586,7 +586,7 @@ def plot_chromophores(
     lines = len(groups) * len(CHROMOPHORES)
     for g, group in enumerate(groups):
         for c, (name, colour) in enumerate(
-            zip(CHROMOPHORES, (colours.BLUE, colours.RED), strict=True)
+            zip(CHROMOPHORES, (plots.BLUE, plots.RED), strict=True)
         ):
             one = table.sel(group=group, chromophore=name, region=shown)
             y = np.arange(len(shown)) + 0.7 * (

@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 from scipy import stats
 
-from skindb.analysis import colours
+from skindb import plots
 from skindb.analysis.contrasts import CHANNELS, SURFACE, Quantities, quantities_of
 from skindb.analysis.study import (
     Population,
@@ -241,13 +241,13 @@ def plot_correlations(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     )
     bars = np.maximum(np.nan_to_num(bars), 0.0)
     significant = table["correlation_p_false_discovery"].values < 0.05
-    for kept, fill in ((significant, colours.CYCLE[0]), (~significant, "white")):
+    for kept, fill in ((significant, plots.CYCLE[0]), (~significant, "white")):
         ax.errorbar(
             found[kept],
             place[kept],
             xerr=bars[:, kept],
             fmt="o",
-            color=colours.CYCLE[0],
+            color=plots.CYCLE[0],
             mfc=fill,
             markersize=4,
             capsize=2,

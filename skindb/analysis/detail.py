@@ -10,11 +10,10 @@ import numpy as np
 import xarray as xr
 from scipy.ndimage import gaussian_filter
 
-from skindb.analysis.common_maps import common_maps
 from skindb.analysis.edit import KEPT_ATTRS, surviving, with_albedo
-from skindb.analysis.masks import region_masks
-from skindb.analysis.texture import SIZE, common_landmarks, log_albedo
-from skindb.analysis.texture_edit import at_surfels
+from skindb.analysis.regions import region_masks
+from skindb.analysis.summary import common_maps
+from skindb.analysis.texture import SIZE, at_surfels, common_landmarks, log_albedo
 from skindb.errors import Fault, InputError
 from skindb.numerics.texture import Image, build, level_fractions, reconstruct
 from skindb.schema.consent import honour_consent

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from skindb.analysis.albedo import cumulative, decorrelate, histogram, levels, quantiles
 from skindb.analysis.population_basis import project
 from skindb.analysis.subjects import trait_name
-from skindb.analysis.texture_edit import at_surfels, edit_texture
+from skindb.analysis.texture import at_surfels, edit_texture
 from skindb.errors import Fault, InputError
 from skindb.numerics.texture import valid_quantiles
 from skindb.optics.diffusion import dipole_s

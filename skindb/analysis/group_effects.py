@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 from scipy.special import gammaln
 
-from skindb.analysis import colours
+from skindb import plots
 from skindb.analysis.contrasts import (
     CONTRAST_CURE,
     CONTRAST_RULE,
@@ -374,7 +374,7 @@ def plot_group_effects(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
         )
         found = one["effect_p_adjusted"].values < SIGNIFICANT
         y = places + 0.6 * ((i + 0.5) / len(contrasts) - 0.5)
-        colour = colours.CYCLE[i % len(colours.CYCLE)]
+        colour = plots.CYCLE[i % len(plots.CYCLE)]
         count = int(one["effect_count"].sum("side").max())
         label = f"{contrast} (n = {count})"
         ax.plot([], [], "osD^v"[i % 5], color=colour, markersize=4, label=label)

@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from skindb.analysis import colours
+from skindb import plots
 from skindb.analysis.contrasts import FEW
 from skindb.analysis.study import (
     Population,
@@ -248,7 +248,7 @@ def plot_translucency(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
         _, ax = pyplot.subplots(figsize=(6, 3.6))
     sites = [str(s) for s in table["site"].values]
     for g, group in enumerate(map(str, table["group"].values)):
-        for c, colour in enumerate(colours.CHANNELS):
+        for c, colour in enumerate(plots.CHANNELS):
             one = table.isel(group=g, channel=c)
             x = np.arange(len(sites)) + 0.12 * (c - 1) + 0.03 * g
             mean = one["sigma_tr_mean"].values

@@ -13,7 +13,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from skindb.analysis import colours, plot_albedo, plot_basis_size, plot_translucency
+from skindb import plots
+from skindb.analysis import plot_albedo, plot_basis_size, plot_translucency
 from skindb.demo.page import themed
 from skindb.geometry.rays import RayScene
 from skindb.render.direct import View, shade_view, trace_view
@@ -295,7 +296,7 @@ def reflectance_plot(recovered: Mapping[str, Recovery]) -> str:
     surfel of all takes.
     """
     ax = _axes()
-    for channel, (name, colour) in enumerate(zip("RGB", colours.CHANNELS, strict=True)):
+    for channel, (name, colour) in enumerate(zip("RGB", plots.CHANNELS, strict=True)):
         true = []
         recovered_values = []
         for recovery in recovered.values():
@@ -326,11 +327,11 @@ def reflectance_plot(recovered: Mapping[str, Recovery]) -> str:
 def normal_plot(recovered: Mapping[str, Recovery]) -> str:
     """Plot of the cumulative distribution of the error of normals, one line for each take."""
     ax = _axes()
-    ax.set_prop_cycle(color=colours.CYCLE)
+    ax.set_prop_cycle(color=plots.CYCLE)
     for i, (take, recovery) in enumerate(recovered.items()):
         angle = recovery.normal_angle[recovery.fitted]
         angle = np.sort(angle[np.isfinite(angle)])
-        dashes = "-" if i < len(colours.CYCLE) else "--"
+        dashes = "-" if i < len(plots.CYCLE) else "--"
         ax.plot(angle, np.linspace(0, 100, len(angle)), dashes, label=take)
     ax.set_xlim(0, MAX_NORMAL_ANGLE)
     ax.set_xlabel("angle between recovered and true normal [deg]")

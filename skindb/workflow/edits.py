@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from skindb.analysis.common_maps import common_maps
 from skindb.analysis.edit import apply_traits, with_basis
 from skindb.analysis.population_basis import population_basis
-from skindb.analysis.summary import SAMPLED
+from skindb.analysis.summary import SAMPLED, common_maps
 from skindb.errors import Fault, InputError
 from skindb.reflectance.dictionary import embedded_dictionary
 from skindb.reflectance.kinds import require_mixture

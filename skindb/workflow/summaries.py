@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from skindb.analysis.common_maps import SIZE, common_maps
-from skindb.analysis.masks import take_masks
+from skindb.analysis.regions import take_masks
 from skindb.analysis.summary import (
     SAMPLED,
+    SIZE,
+    common_maps,
     region_tables,
     sample_surfels,
     summary_tables,

@@ -10,11 +10,12 @@ from sklearn.decomposition import PCA
 
 from skindb.analysis.texture import (
     BINS,
+    at_surfels,
     common_landmarks,
+    edit_texture,
     texel_regions,
     texture_statistics,
 )
-from skindb.analysis.texture_edit import at_surfels, edit_texture
 from skindb.errors import InputError
 from skindb.numerics.texture import quantile_function
 from skindb.schema import dataset

@@ -24,7 +24,7 @@ from planted_sheet import (
 )
 
 from skindb.analysis.albedo import albedo_histograms
-from skindb.analysis.masks import (
+from skindb.analysis.regions import (
     FINE,
     inside_outline,
     mask_agreement,
