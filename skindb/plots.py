@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 # colours that colour-blind readers can distinguish (Okabe and Ito 2008)
 BLUE, ORANGE, GREEN, RED, PURPLE, SKY, YELLOW = (
@@ -28,3 +32,12 @@ def plain_text() -> Iterator[None]:
 
     with rc_context({"text.parse_math": False}):
         yield
+
+
+def new_axes(width: float, height: float) -> Axes:
+    """Axes of a new figure of this size [inch]."""
+    from matplotlib import pyplot
+
+    ax: Axes
+    _, ax = pyplot.subplots(figsize=(width, height))
+    return ax

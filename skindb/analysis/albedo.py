@@ -190,22 +190,15 @@ def _masks(take: xr.Dataset, good: Mask) -> dict[str, Mask]:
 
 
 def _colour_axes(samples: Sequence[Colours]) -> tuple[Array, Array]:
-    """Common mean (3,) and axes (3, 3) in rows; every take has the same weight."""
+    """Common mean (3,) and axes (3, 3) in rows."""
     means = []
-    spreads = []
-    for one in samples:
-        means.append(np.average(one.colour, axis=0, weights=one.area))
-        from_mean = one.colour - means[-1]
-        spreads.append(from_mean.T @ (from_mean * (one.area / one.area.sum())[:, None]))
-    mean = np.mean(means, axis=0)
-    # the variance includes differences between takes
-    between = np.stack(means) - mean
-    values, vectors = np.linalg.eigh(
-        np.mean(spreads, axis=0) + between.T @ between / len(means)
-    )
-    axes = (vectors / np.sqrt(np.maximum(values, 1e-12))).T[::-1]
-    # brighter is larger on every axis
-    return mean, axes * np.where(axes.sum(axis=1, keepdims=True) < 0, -1.0, 1.0)
+    scatters = []
+    for sample in samples:
+        means.append(np.average(sample.colour, axis=0, weights=sample.area))
+        from_mean = sample.colour - means[-1]
+        weight = (sample.area / sample.area.sum())[:, None]
+        scatters.append(from_mean.T @ (from_mean * weight))
+    return texture.colour_axes(means, scatters)
 
 
 def _shared_edges(decorrelated: Sequence[Array]) -> Array:
@@ -256,12 +249,8 @@ def albedo_table(
         [take for take, group in zip(labels, groups, strict=True) if group == name]
         for name in names
     ]
-    parts = [Moments.of(albedo["albedo_mean"].sel(take=own).values) for own in members]
-    stacked = Moments(
-        *(
-            np.stack([getattr(part, f) for part in parts])
-            for f in ("count", "mean", "second")
-        )
+    stacked = Moments.stacked(
+        Moments.of(albedo["albedo_mean"].sel(take=group).values) for group in members
     )
     low, high = stacked.mean_interval()
     known = stacked.count > 0
@@ -368,10 +357,7 @@ def plot_albedo(
     """Plot histograms of one decorrelated axis, one line per take, or per group of
     `table` (from `albedo_table`).
     """
-    from matplotlib import pyplot
-
-    if ax is None:
-        _, ax = pyplot.subplots(figsize=(6, 3.6))
+    ax = ax or plots.new_axes(6, 3.6)
     edges = histograms["histogram_edge"].isel(axis=axis).values
     # bins that are joined for the plot; the full number is needed only for matching
     width = 8

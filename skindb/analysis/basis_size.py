@@ -13,6 +13,7 @@ import xarray as xr
 from dask.delayed import Delayed
 from numpy.typing import NDArray
 
+from skindb import plots
 from skindb.analysis.each_take import each_take, shared_once
 from skindb.analysis.population_basis import same_dictionary
 from skindb.analysis.study import (
@@ -375,10 +376,7 @@ def _directions(points: Array, position: Array) -> Array:
 
 def plot_basis_size(curve: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     """Plot the error against k with its interval; the chosen size is marked."""
-    from matplotlib import pyplot
-
-    if ax is None:
-        _, ax = pyplot.subplots(figsize=(6, 3.6))
+    ax = ax or plots.new_axes(6, 3.6)
     k = curve["k"].values
     ax.fill_between(
         k,

@@ -42,10 +42,7 @@ def plot_brdf_space(space: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     ax
         Axes to draw on; by default new ones.
     """
-    from matplotlib import pyplot
-
-    if ax is None:
-        _, ax = pyplot.subplots(figsize=(5, 4.4))
+    ax = ax or plots.new_axes(5, 4.4)
     named = np.array(space.attrs["groups_of_takes"])
     place = space["take_place"].values
     for i, (group, count) in enumerate(
@@ -93,13 +90,10 @@ def plot_group_spheres(space: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     ax
         Axes to draw on; by default new ones.
     """
-    from matplotlib import pyplot
-
     names = [str(name) for name in space["group"].values]
     columns = min(len(names), SPHERES_PER_ROW)
     rows = -(-len(names) // columns)
-    if ax is None:
-        _, ax = pyplot.subplots(figsize=(1.6 * columns + 0.4, 1.9 * rows + 0.4))
+    ax = ax or plots.new_axes(1.6 * columns + 0.4, 1.9 * rows + 0.4)
     radiance, inside = sphere_radiance(_tables(space))
     white = float(np.percentile(radiance[inside], WHITE_PERCENTILE)) or 1.0
     step_x = 1.1

@@ -24,7 +24,7 @@ from sklearn.exceptions import ConvergenceWarning
 from skindb import plots
 from skindb.analysis.each_take import each_take
 from skindb.analysis.mean_face import mean_face
-from skindb.analysis.regions import region_masks
+from skindb.analysis.regions import map_regions
 from skindb.analysis.study import (
     Population,
     Results,
@@ -155,7 +155,7 @@ def chromophore_axes(
     if not mixed_fits:
         require_same_fit(cohort)
     size = cohort.sizes["v"]
-    drawn = chromophore_regions(landmarks or {}, size)
+    drawn = map_regions(landmarks or {}, size)
     flags = []
     inside = drawn.get("no_beard", drawn[FACE])
     if "no_beard" not in drawn:
@@ -266,7 +266,7 @@ def chromophore_statistics(
         `take_chromophore_residual` (take, region) and `take_chromophore_coverage`. NaN
         for regions of which less than half was measured.
     """
-    drawn = chromophore_regions(landmarks or {}, cohort.sizes["v"])
+    drawn = map_regions(landmarks or {}, cohort.sizes["v"])
     masks = np.stack(list(drawn.values()))
     vectors = axes["chromophore_axis"].values
     offset = axes["chromophore_offset"].values
@@ -328,12 +328,7 @@ def chromophore_table(
         parts.append(
             Moments.of(np.stack([known_mean(values[rows]) for rows in own.values()]))
         )
-    stacked = Moments(
-        *(
-            np.stack([getattr(part, f) for part in parts])
-            for f in ("count", "mean", "second")
-        )
-    )
+    stacked = Moments.stacked(parts)
     low, high = (
         np.where(stacked.count > 1, end, np.nan) for end in stacked.mean_interval()
     )
@@ -356,19 +351,6 @@ def chromophore_table(
             "skipped": list(cohort.attrs.get("skipped", [])),
         },
     )
-
-
-def chromophore_regions(landmarks: Mapping[str, Array], size: int) -> dict[str, Mask]:
-    """Masks (v, u) of the regions in the common (u, v); without landmarks only the whole face."""
-    whole = {FACE: np.ones((size, size), np.bool_)}
-    if not landmarks:
-        return whole
-    centre = (np.arange(size) + 0.5) / size
-    at = np.stack(np.meshgrid(centre, centre), axis=-1).reshape(-1, 2)
-    return whole | {
-        name: mask.reshape(size, size)
-        for name, mask in region_masks(at, landmarks).items()
-    }
 
 
 def _density(maps: xr.Dataset) -> tuple[Array, Mask]:
@@ -572,13 +554,10 @@ def plot_chromophores(
     statistics: xr.Dataset, *, table: xr.Dataset | None = None, ax: Axes | None = None
 ) -> Axes:
     """Plot mean melanin and haemoglobin of the groups in every region, with 95 % intervals."""
-    from matplotlib import pyplot
-
     shown = [
         name for name in statistics["region"].values.tolist() if str(name) != "neck"
     ]
-    if ax is None:
-        _, ax = pyplot.subplots(figsize=(6.5, 1.4 + 0.55 * len(shown)))
+    ax = ax or plots.new_axes(6.5, 1.4 + 0.55 * len(shown))
     ax.axvline(0, color="0.6", linewidth=1)
     if table is None:
         raise ValueError("table must be given; pass the result of chromophore_table")

@@ -225,11 +225,8 @@ def describe_correlations(table: xr.Dataset) -> list[str]:
 
 def plot_correlations(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     """Plot the correlations with their 95 % intervals, one row per pair."""
-    from matplotlib import pyplot
-
     names: list[Any] = table["pair"].values.tolist()
-    if ax is None:
-        _, ax = pyplot.subplots(figsize=(6.5, 1.0 + 0.24 * len(names)))
+    ax = ax or plots.new_axes(6.5, 1.0 + 0.24 * len(names))
     ax.axvline(0, color="0.6", linewidth=1)
     found = table["component_correlation"].values
     place = np.arange(len(names))[::-1]

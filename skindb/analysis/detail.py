@@ -11,9 +11,9 @@ import xarray as xr
 from scipy.ndimage import gaussian_filter
 
 from skindb.analysis.edit import KEPT_ATTRS, surviving, with_albedo
-from skindb.analysis.regions import region_masks
+from skindb.analysis.regions import common_landmarks, map_regions
 from skindb.analysis.summary import common_maps
-from skindb.analysis.texture import SIZE, at_surfels, common_landmarks, log_albedo
+from skindb.analysis.texture import SIZE, at_surfels, log_albedo
 from skindb.errors import Fault, InputError
 from skindb.numerics.texture import Image, build, level_fractions, reconstruct
 from skindb.schema.consent import honour_consent
@@ -154,13 +154,10 @@ def _region(
             cure = "pass a mask of that shape, or another size"
             raise InputError(Fault("region", rule, str(mask.shape), cure))
         return mask
-    if region == FACE:
-        return np.ones((size, size), np.bool_)
-    centre = (np.arange(size) + 0.5) / size
-    at = np.stack(np.meshgrid(centre, centre), axis=-1).reshape(-1, 2)
-    drawn = region_masks(at, common_landmarks({"own": registered, "other": other}))
+    landmarks = common_landmarks({"own": registered, "other": other})
+    drawn = map_regions(landmarks, size)
     if region not in drawn:
-        cure = f"choose one of {', '.join([FACE, *drawn])}"
+        cure = f"choose one of {', '.join(drawn)}"
         raise InputError(
             Fault(
                 f"region {region}",
@@ -169,4 +166,4 @@ def _region(
                 cure,
             )
         )
-    return drawn[region].reshape(size, size)
+    return drawn[region]

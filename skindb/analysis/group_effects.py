@@ -354,11 +354,8 @@ def plot_group_effects(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     """Plot effects with their 95 % intervals in standard deviations between subjects,
     one row per quantity.
     """
-    from matplotlib import pyplot
-
     names = [str(name) for name in table["quantity"].values]
-    if ax is None:
-        _, ax = pyplot.subplots(figsize=(6.5, 1.2 + 0.22 * len(names)))
+    ax = ax or plots.new_axes(6.5, 1.2 + 0.22 * len(names))
     ax.axvline(0, color="0.6", linewidth=1)
     places = np.arange(len(names))[::-1]
     contrasts = [str(name) for name in table["contrast"].values]

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import xarray as xr
 
+from skindb import plots
 from skindb.analysis.subjects import takes_to_compare
 from skindb.analysis.texture import COVERED
 from skindb.errors import Fault, InputError
@@ -130,10 +131,7 @@ def _subject_maps(takes: xr.Dataset, names: list[str]) -> dict[str, Array]:
 
 def plot_mean_face(face: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     """Plot the mean albedo in sRGB; texels with too few subjects are white."""
-    from matplotlib import pyplot
-
-    if ax is None:
-        _, ax = pyplot.subplots(figsize=(4, 4))
+    ax = ax or plots.new_axes(4, 4)
     linear = face["face_diffuse_reflectance"].values
     clipped = np.clip(np.nan_to_num(linear, nan=1.0), 0.0, 1.0)
     shown = np.where(

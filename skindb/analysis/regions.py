@@ -8,14 +8,13 @@ regions are an addition.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
-Array = NDArray[np.floating[Any]]
-Mask = NDArray[np.bool_]
+from skindb.schema.regions import FACE
+from skindb.types import Array, Mask
+
 Corner = tuple[str, float, float]
 
 # Outlines from the middle of the top along the subject's right side to the middle of
@@ -152,6 +151,29 @@ def region_masks(common_uv: Array, landmarks: Mapping[str, Array]) -> dict[str, 
                 np.any([masks[name] for name in SMOOTH_SKIN], axis=0) & ~masks["beard"]
             )
     return masks
+
+
+def map_regions(landmarks: Mapping[str, Array], size: int) -> dict[str, Mask]:
+    """Masks (v, u) of the regions in the common (u, v), size texels along each side;
+    without landmarks only the whole face.
+    """
+    centre = (np.arange(size) + 0.5) / size
+    at = np.stack(np.meshgrid(centre, centre), axis=-1).reshape(-1, 2)
+    masks = {FACE: np.ones(len(at), np.bool_)} | region_masks(at, landmarks)
+    return {name: mask.reshape(size, size) for name, mask in masks.items()}
+
+
+def common_landmarks(registered: Mapping[str, xr.Dataset]) -> dict[str, Array]:
+    """Mean positions (2,) of the landmarks in the common (u, v), each over the takes
+    that have it.
+    """
+    places: dict[str, list[Array]] = {}
+    for take in registered.values():
+        names = map(str, take["landmark"].values)
+        for name, place in zip(names, take["common_landmark"].values, strict=True):
+            if np.isfinite(place).all():
+                places.setdefault(name, []).append(place)
+    return {name: np.mean(found, axis=0) for name, found in places.items()}
 
 
 def own_masks(fitted: xr.Dataset) -> dict[str, Mask]:

@@ -4,7 +4,7 @@ et al. 2005, section 10.2).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ import xarray as xr
 from scipy.ndimage import gaussian_filter
 
 from skindb.analysis.each_take import each_take
-from skindb.analysis.regions import region_masks
+from skindb.analysis.regions import map_regions
 from skindb.elementwise import thread_count
 from skindb.errors import Fault, InputError
 from skindb.geometry.texture import bilinear, push_pull
@@ -55,35 +55,9 @@ class Moments:
 def texel_regions(landmarks: Mapping[str, Array], size: int = SIZE) -> dict[str, Mask]:
     """Masks (v, u) of the regions in the common (u, v): the whole face, the beard, and
     the skin without a beard.
-
-    Parameters
-    ----------
-    landmarks
-        Name -> (2,) position in the common (u, v).
-    size
-        Texels along each side.
     """
-    centre = (np.arange(size) + 0.5) / size
-    at = np.stack(np.meshgrid(centre, centre), axis=-1).reshape(-1, 2)
-    drawn = region_masks(at, landmarks)
-    whole = {FACE: np.ones((size, size), np.bool_)}
-    return whole | {
-        name: drawn[name].reshape(size, size) for name in REGIONS if name in drawn
-    }
-
-
-def common_landmarks(registered: Mapping[str, xr.Dataset]) -> dict[str, Array]:
-    """Mean positions (2,) of the landmarks in the common (u, v), each over the takes
-    that have it.
-    """
-    found: dict[str, list[Array]] = {}
-    for one in registered.values():
-        for name, at in zip(
-            one["landmark"].values.tolist(), one["common_landmark"].values, strict=True
-        ):
-            if np.isfinite(at).all():
-                found.setdefault(str(name), []).append(at)
-    return {name: np.mean(places, axis=0) for name, places in found.items()}
+    masks = map_regions(landmarks, size)
+    return {name: masks[name] for name in REGIONS if name in masks}
 
 
 def texture_statistics(
@@ -198,13 +172,21 @@ def _axes(found: list[Moments | None]) -> tuple[Array, Array]:
                 "fit or register more takes",
             )
         )
-    means = np.stack([one.mean for one in known])
-    mean = means.mean(axis=0)
-    between = means - mean
-    spread = np.mean(
-        [one.scatter for one in known], axis=0
-    ) + between.T @ between / len(known)
-    values, vectors = np.linalg.eigh(spread)
+    return colour_axes([one.mean for one in known], [one.scatter for one in known])
+
+
+def colour_axes(
+    means: Sequence[Array], scatters: Sequence[Array]
+) -> tuple[Array, Array]:
+    """Common mean (3,) and decorrelated axes (3, 3), in rows, of takes of the same
+    weight, from their means (3,) and covariances (3, 3).
+    """
+    mean = np.mean(means, axis=0)
+    # the variance includes differences between takes
+    between = np.stack(means) - mean
+    values, vectors = np.linalg.eigh(
+        np.mean(scatters, axis=0) + between.T @ between / len(means)
+    )
     axes = (vectors / np.sqrt(np.maximum(values, 1e-12))).T[::-1]
     # brighter is larger on every axis
     return mean, axes * np.where(axes.sum(axis=1, keepdims=True) < 0, -1.0, 1.0)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import xarray as xr
 
+from skindb import plots
 from skindb.analysis.albedo import albedo_and_texture, quantiles
 from skindb.analysis.population_basis import population_basis
 from skindb.analysis.study import (
@@ -434,10 +435,7 @@ def plot_traits(traits: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     """Plot the shift of the coefficients of the surface BRDF: rows are traits, columns
     are components of the basis.
     """
-    from matplotlib import pyplot
-
-    if ax is None:
-        _, ax = pyplot.subplots(figsize=(6, 3.6))
+    ax = ax or plots.new_axes(6, 3.6)
     shift = traits["trait_brdf_shift"].values
     largest = max(float(np.abs(shift).max(initial=0.0)), 1e-12)
     image = ax.imshow(shift, cmap="RdBu_r", vmin=-largest, vmax=largest, aspect="auto")

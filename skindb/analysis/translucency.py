@@ -98,13 +98,8 @@ def translucency_table(
     empty = np.full((takes.sizes["take"], len(sites), 3), np.nan)
 
     def moments(name: str) -> Moments:
-        parts = [Moments.of(measured.get(name, empty)[own]) for own in members]
-        return Moments(
-            *(
-                np.stack([getattr(part, field) for part in parts])
-                for field in ("count", "mean", "second")
-            )
-        )
+        values = measured.get(name, empty)
+        return Moments.stacked(Moments.of(values[rows]) for rows in members)
 
     stacked = moments("site_sigma_tr")
     subjects = np.array(people.subject)
@@ -242,10 +237,7 @@ def plot_translucency(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     """Plot mean sigma_tr with its 95 % interval per site; colours are channels, markers
     are groups.
     """
-    from matplotlib import pyplot
-
-    if ax is None:
-        _, ax = pyplot.subplots(figsize=(6, 3.6))
+    ax = ax or plots.new_axes(6, 3.6)
     sites = [str(s) for s in table["site"].values]
     for g, group in enumerate(map(str, table["group"].values)):
         for c, colour in enumerate(plots.CHANNELS):

@@ -4,7 +4,7 @@ variance components; the unit of observation is a subject.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -41,6 +41,12 @@ class Moments:
         mean = np.where(finite, values, 0.0).sum(axis=0) / np.maximum(count, 1.0)
         second = (np.where(finite, values - mean, 0.0) ** 2).sum(axis=0)
         return cls(count, mean, second)
+
+    @classmethod
+    def stacked(cls, parts: Iterable[Moments]) -> Moments:
+        """Moments of several sets, along a new first axis."""
+        columns = ((part.count, part.mean, part.second) for part in parts)
+        return cls(*map(np.stack, zip(*columns, strict=True)))
 
     def __add__(self, other: Moments) -> Moments:
         count = self.count + other.count

@@ -12,9 +12,9 @@ import xarray as xr
 from dask.delayed import Delayed, delayed
 from numpy.typing import NDArray
 
+from skindb.analysis.regions import common_landmarks
 from skindb.analysis.registration import describe_registration
 from skindb.analysis.study import Population, Study
-from skindb.analysis.texture import common_landmarks
 from skindb.errors import Fault, InputError
 from skindb.reflectance.dictionary import convolve_disc, embedded_dictionary
 from skindb.reflectance.kinds import require_mixture

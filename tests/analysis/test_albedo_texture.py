@@ -8,10 +8,10 @@ import xarray as xr
 from scipy.ndimage import gaussian_filter
 from sklearn.decomposition import PCA
 
+from skindb.analysis.regions import common_landmarks
 from skindb.analysis.texture import (
     BINS,
     at_surfels,
-    common_landmarks,
     edit_texture,
     texel_regions,
     texture_statistics,

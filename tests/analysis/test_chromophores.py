@@ -20,7 +20,8 @@ from skindb.analysis import (
     describe_chromophores,
     plot_chromophores,
 )
-from skindb.analysis.chromophores import INDEPENDENT, TABLE_AXES, chromophore_regions
+from skindb.analysis.chromophores import INDEPENDENT, TABLE_AXES
+from skindb.analysis.regions import map_regions
 from skindb.errors import InputError
 from skindb.virtual.skin import HAEMOGLOBIN, MELANIN
 
@@ -266,7 +267,7 @@ def test_chromophore_axes__beards_do_not_turn_them():
     """A grey beard is not a pigment; if there are landmarks, it is excluded."""
     amounts = pigments()
     maps = maps_of(amounts)
-    beard = chromophore_regions(POINTS, SIZE)["beard"]
+    beard = map_regions(POINTS, SIZE)["beard"]
     strands = np.random.default_rng(3).random((SIZE, SIZE)) * beard
     maps["texel_diffuse_reflectance"] = maps["texel_diffuse_reflectance"] * (
         1 - 0.7 * strands[None, ..., None]
@@ -283,7 +284,7 @@ def test_chromophore_statistics__as_numpy(planted):
     covered[1, : SIZE // 2] = 0.0  # the forehead is not measured
     maps = maps.assign(texel_coverage=(("take", "v", "u"), covered))
     found = chromophore_statistics(maps, axes=axes, landmarks=POINTS)
-    masks = chromophore_regions(POINTS, SIZE)
+    masks = map_regions(POINTS, SIZE)
     one = chromophore_maps(maps.isel(take=2), axes)
     inside = one["texel_chromophore"].values[masks["cheek"]].astype(np.float64)
     cheek = found.sel(take="T2", region="cheek")
