@@ -282,11 +282,11 @@ def main(
             workflow.study(db, "brdf")
         for group in (None, "gender", "condition"):
             with alone(f"albedo by {group}", watch, studies):
-                workflow.albedo(db, group_by=group)
+                workflow.study(db, "albedo", group_by=group)
             with alone(f"translucency by {group}", watch, studies):
-                workflow.translucency(db, group_by=group)
+                workflow.study(db, "translucency", group_by=group)
         with alone("traits", watch, studies):
-            workflow.traits(db)
+            workflow.study(db, "traits")
         with alone("table", watch, studies):
             db.table()
         with alone("verify", watch, studies):

@@ -26,8 +26,9 @@ import numpy as np
 import xarray as xr
 
 import skindb
+from skindb.analysis import STUDIES
 from skindb.store import Database
-from skindb.workflow import STUDIES, register_takes
+from skindb.workflow import register_takes, study
 from skindb.workflow.derive import groups_of
 
 # brdf needs captures, of which there are none
@@ -115,7 +116,7 @@ def measure(url: str, step: str, takes: int) -> None:
         register_takes(db, takes=names)
     else:
         given = {"group_by": "gender"} if step in GROUPED else {}
-        STUDIES[step](db, takes=names, name=f"cost-{time.time_ns()}", **given)
+        study(db, step, takes=names, name=f"cost-{time.time_ns()}", **given)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     print(json.dumps({"seconds": time.perf_counter() - start, "peak": peak}))
 
