@@ -136,14 +136,13 @@ def simulate(
     require_sizes(
         parameters.lights, parameters.cameras, parameters.width, parameters.height
     )
-    options = asdict(parameters)
     people = (
         None
         if cohort is None
-        else skindb.workflow.begin_cohort(out, cohort, conditions, options)
+        else skindb.workflow.begin_cohort(out, cohort, conditions, parameters)
     )
     call = partial(
-        skindb.workflow.simulate_one, out, people=people, progress=progress, **options
+        skindb.workflow.simulate_one, out, parameters, people=people, progress=progress
     )
     numbers = range(takes if people is None else len(people))
     results, faults = each_take(

@@ -16,7 +16,7 @@ from skindb.elementwise import thread_count
 from skindb.errors import Fault, InputError
 from skindb.export.bundle import export_bundle
 from skindb.files import make_private, private_file
-from skindb.fit import FitParameters
+from skindb.parameters import FitParameters, SimulationParameters
 from skindb.render.photographs import compare_photographs
 from skindb.store import Database
 from skindb.types import Progress, silent
@@ -172,10 +172,8 @@ def _make_take(
     with results.stage("simulate"):
         (folder,) = simulate_takes(
             out / "captures",
+            SimulationParameters(cameras=cameras, lights=lights, seed=seed),
             takes=[i],
-            cameras=cameras,
-            lights=lights,
-            seed=seed,
             progress=progress,
         )
     with results.stage("ingest"):

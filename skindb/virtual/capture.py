@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from skindb.errors import Fault, InputError
 from skindb.files import make_private, private_file
 from skindb.optics.diffusion import dipole_s
+from skindb.parameters import SimulationParameters
 from skindb.reflectance.abc_low2012 import PARAMETERS
 from skindb.reflectance.dictionary import Dictionary, convolve_disc, embedded_dictionary
 from skindb.reflectance.mixture import Mixture
@@ -397,55 +398,47 @@ def _dump(path: Path, record: Any) -> None:
 
 def simulate_takes(
     out: Path,
+    parameters: SimulationParameters | None = None,
     *,
     takes: int | Sequence[int] = 8,
     people: Sequence[Person] | None = None,
-    cameras: int = 8,
-    lights: int = 48,
-    width: int = 160,
-    height: int = 200,
-    head: Path | None = None,
-    subsurface: bool = False,
-    seed: int = 2005,
     progress: Progress | None = None,
 ) -> list[Path]:
-    """Write `<out>/<take>` and `<out>/<take>.truth.npz` for virtual people; each take
-    is independent of the others.
+    """Write `<out>/<take>` and `<out>/<take>.truth.npz` for virtual people, all
+    photographed by one dome; each take is independent of the others.
 
     Parameters
     ----------
     out
         Folder of the captures; a take's own folder must be absent or empty.
+    parameters
+        The dome, its frames and the noise; default `SimulationParameters()`.
     takes
         Number of people, or their indices.
     people
         The people to choose from; default `default_people`.
-    cameras, lights, width, height
-        The dome and its frames in pixels.
-    head
-        Head model file that replaces the parametric face.
-    subsurface
-        Transport diffuse light through the skin by the dipole instead of reflecting it
-        where it enters.
-    seed
-        Random seed of the noise; shapes and skins depend on the people alone.
     progress
         Called with the stage, the steps done and the total number of steps.
     """
-    folders = []
+    settings = parameters or SimulationParameters()
     dome = build_dome(
-        lights,
-        cameras,
-        width=width,
-        height=height,
+        settings.lights,
+        settings.cameras,
+        width=settings.width,
+        height=settings.height,
         rng=np.random.default_rng(DEVICE_SEED),
     )
+    folders = []
     everybody = default_people() if people is None else people
     for i in range(len(everybody))[:takes] if isinstance(takes, int) else takes:
-        person = replace(everybody[i], head_file=head)
-        rng = np.random.default_rng([seed, i])
+        person = replace(everybody[i], head_file=settings.head)
         folders.append(out / person.take)
         simulate_take(
-            folders[-1], person, dome, subsurface=subsurface, rng=rng, progress=progress
+            folders[-1],
+            person,
+            dome,
+            subsurface=settings.subsurface,
+            rng=np.random.default_rng([settings.seed, i]),
+            progress=progress,
         )
     return folders

@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Sequence
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from skindb.errors import Fault, InputError
 from skindb.files import make_private, private_file, read_regular
+from skindb.parameters import SimulationParameters
 from skindb.types import Progress
 from skindb.virtual.capture import simulate_takes
 from skindb.virtual.person import Person, cohort_people
@@ -50,7 +52,7 @@ def simulate(
         Called with the stage, the number of finished steps and the total number; only
         in this process.
     **options
-        Of `skindb.virtual.capture.simulate_takes`: cameras, lights, width, height, head,
+        Of `skindb.parameters.SimulationParameters`: cameras, lights, width, height, head,
         subsurface, seed.
 
     Returns
@@ -63,10 +65,15 @@ def simulate(
     InputError
         If the folder holds a cohort that was made with other options.
     """
+    parameters = SimulationParameters(**options)
     people = (
-        None if cohort is None else begin_cohort(Path(out), cohort, conditions, options)
+        None
+        if cohort is None
+        else begin_cohort(Path(out), cohort, conditions, parameters)
     )
-    call = partial(simulate_one, Path(out), people=people, progress=progress, **options)
+    call = partial(
+        simulate_one, Path(out), parameters, people=people, progress=progress
+    )
     folders = dict(
         results_of(
             map_takes(
@@ -78,39 +85,27 @@ def simulate(
 
 
 def begin_cohort(
-    out: Path, subjects: int, conditions: Sequence[str], options: dict[str, Any]
+    out: Path,
+    subjects: int,
+    conditions: Sequence[str],
+    parameters: SimulationParameters,
 ) -> list[Person]:
-    """The people of a cohort, whose options are noted in its folder, or compared with
-    those that are noted there.
+    """The people of a cohort, whose parameters are noted in its folder, or compared
+    with those that are noted there.
     """
-    seed = options.get("seed", 2005)
-    asked = {
-        name: str(value) if isinstance(value, Path) else value
-        for name, value in sorted(options.items())
-    }
-    # which takes have which noise depends on them
-    asked["conditions"] = list(conditions)
+    # which takes have which noise depends on the conditions
+    options = asdict(parameters) | {"conditions": list(conditions)}
+    if parameters.head is not None:
+        options["head"] = str(parameters.head)
     note = out / COHORT
     if note.is_file():
-        try:
-            found = json.loads(read_regular(note, MOST_BYTES))
-        except (ValueError, RecursionError) as error:
-            raise InputError(
-                Fault(
-                    str(note),
-                    "must be a JSON object",
-                    str(error),
-                    "choose another folder",
-                )
-            ) from None
-        if not isinstance(found, dict):
-            found = {}
-        if found != asked:
-            differ = [
-                f"{name} {found.get(name)}"
-                for name in sorted({*found, *asked})
-                if found.get(name) != asked.get(name)
-            ]
+        stored = _stored_options(note)
+        differ = [
+            f"{name} {stored.get(name)}"
+            for name in sorted({*stored, *options})
+            if stored.get(name) != options.get(name)
+        ]
+        if differ:
             rule = "a cohort is continued with the same options"
             cure = "give them, or choose another folder"
             raise InputError(Fault(str(note), rule, ", ".join(differ), cure))
@@ -119,12 +114,28 @@ def begin_cohort(
         raise InputError(Fault(str(out), rule, "something there", "choose another"))
     else:
         make_private(out)
-        private_file(note).write_text(json.dumps(asked, indent=1), encoding="utf-8")
-    return cohort_people(subjects, conditions=conditions, seed=seed)
+        private_file(note).write_text(json.dumps(options, indent=1), encoding="utf-8")
+    return cohort_people(subjects, conditions=conditions, seed=parameters.seed)
+
+
+def _stored_options(note: Path) -> dict[str, Any]:
+    """The options that were noted when a cohort was begun."""
+    try:
+        stored = json.loads(read_regular(note, MOST_BYTES))
+    except (ValueError, RecursionError) as error:
+        cure = "choose another folder"
+        fault = Fault(str(note), "must be a JSON object", str(error), cure)
+        raise InputError(fault) from None
+    return stored if isinstance(stored, dict) else {}
 
 
 def simulate_one(
-    out: Path, number: int, *, people: Sequence[Person] | None = None, **options: Any
+    out: Path,
+    parameters: SimulationParameters,
+    number: int,
+    *,
+    people: Sequence[Person] | None = None,
+    progress: Progress | None = None,
 ) -> tuple[int, Path]:
     """One of the virtual takes, by its number; see `simulate`."""
     if people is not None:
@@ -133,5 +144,7 @@ def simulate_one(
             return number, folder
         if folder.exists():
             shutil.rmtree(folder)  # what a run that was killed had written
-    (folder,) = simulate_takes(out, takes=[number], people=people, **options)
+    (folder,) = simulate_takes(
+        out, parameters, takes=[number], people=people, progress=progress
+    )
     return number, folder

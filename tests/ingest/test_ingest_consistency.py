@@ -38,6 +38,7 @@ from skindb.ingest.photo_offsets import (
 )
 from skindb.ingest.surfels import build_surfels
 from skindb.ingest.visibility import camera_visibility, light_visibility
+from skindb.parameters import SimulationParameters
 from skindb.virtual.capture import simulate_takes
 
 CAMERAS = 4
@@ -59,7 +60,7 @@ class Shoot:
 def shoot(tmp_path_factory):
     out = tmp_path_factory.mktemp("virtual")
     [folder] = simulate_takes(
-        out, takes=1, cameras=CAMERAS, lights=LIGHTS, width=120, height=150
+        out, SimulationParameters(CAMERAS, LIGHTS, width=120, height=150), takes=1
     )
     capture = read_capture(folder)
     dome = capture.dome
