@@ -7,7 +7,7 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from functools import cache, partial
 from typing import cast
@@ -56,11 +56,8 @@ class Garbage:
         """Kind and take; empty if it does not belong to a take."""
         parts = self.key.split("/")
         if parts[0] == "tmp":
-            return (
-                ("capture", match[1])
-                if (match := SCRATCH_NAME.fullmatch(parts[1]))
-                else ("", "")
-            )
+            match = SCRATCH_NAME.fullmatch(parts[1])
+            return ("capture", match[1]) if match else ("", "")
         return (parts[1], parts[2]) if len(parts) > 3 else ("", "")
 
 
@@ -85,11 +82,9 @@ def find_garbage(place: Place, generations: int | None = None) -> list[Garbage]:
             if not markers.hides(kind, take):
                 with suppress(InputError):
                     garbage += of_take(place, kind, take, now)
-    return (
-        garbage
-        if generations is None
-        else [*garbage, *_old_generations(place, generations, now)]
-    )
+    if generations is not None:
+        garbage += _old_generations(place, generations, now)
+    return garbage
 
 
 def remove_garbage(place: Place, generations: int | None = None) -> list[Garbage]:
@@ -105,18 +100,14 @@ def remove_garbage(place: Place, generations: int | None = None) -> list[Garbage
         if not item.kept:
             groups[_required_leases(*item.of)].append(item)
     for (kinds, take), those in groups.items():
-        if not kinds:
+        with ExitStack() as leases:
+            if kinds:
+                lease = Lease(place, take, kinds, command="skindb clean")
+                try:
+                    leases.enter_context(lease)
+                except InputError:  # a run has started to work on this take
+                    continue
             removed += [item for item in those if _remove_one(place, item)]
-            continue
-        lease = Lease(place, take, kinds, command="skindb clean")
-        try:
-            lease.__enter__()
-        except InputError:  # a run has started to work on this take
-            continue
-        try:
-            removed += [item for item in those if _remove_one(place, item)]
-        finally:
-            lease.__exit__(None, None, None)
     return removed
 
 

@@ -111,7 +111,9 @@ def restore(
     Raises
     ------
     InputError
-        If there is no such backup, state or marker file, or if there is something at `url`.
+        If there is no such backup, state or marker file, if one of them is damaged, or
+        if there is something at `url`. Damaged versions do not stop the restore: they
+        are reported, and refused when they are read.
     """
     place = place_at(url)
     file = markers or place.marker_file()
@@ -122,63 +124,17 @@ def restore(
         )
         cure = "give --markers FILE, or --without-markers to accept this risk"
         raise InputError(Fault(str(file), rule, "no such file", cure))
-    return restore_backup(
-        Archive(place_at(source)),
-        place,
-        number=number,
-        marker_file=None if without_markers else file,
-    )
-
-
-def restore_backup(
-    archive: Archive,
-    place: Place,
-    *,
-    number: int | None = None,
-    marker_file: Path | None,
-) -> Restored:
-    """Restore a state of a backup into an empty place.
-
-    Parameters
-    ----------
-    archive, place
-        Backup, and location of the database, which must be empty or an interrupted restore.
-    number
-        Number of the state; default the newest.
-    marker_file
-        File that notes withdrawals and consents after the backup; None to restore without them.
-
-    Raises
-    ------
-    InputError
-        If there is something at the location, or if the state, its withdrawals or the
-        marker file are damaged. Damaged versions do not stop the restore: they are
-        reported, and refused when they are read.
-    """
+    archive = Archive(place_at(source))
     archive.require()
     place.is_unlocked = True
     require_apart(archive.place, place)
     _require_empty(place)
     state = archive.state(archive.newest() if number is None else number)
     notes = Notes()
-    if marker_file is not None:
-        notes = read_marker_file(marker_file, require_secret(archive.place))
+    if not without_markers:
+        notes = read_marker_file(file, require_secret(archive.place))
     plan = _plan(archive, state, notes)
-    place.create(LOCK, b"{}")
-    with Lease(place, "restore", (RELEASE,), command="skindb restore"):
-        written = _copy_all(archive, place, plan)
-        consents = _repeat_consents(place, plan)
-        place.flush_names([LOCK])
-        place.remove(LOCK)
-    place.is_unlocked = False
-    note_withdrawals(place)
-    note_consents(
-        place,
-        [
-            *consents,
-            *(record for record in plan.records.values() if record.kind == CONSENT),
-        ],
-    )
+    written, consents = _write(archive, place, plan)
     return Restored(
         number=state.number,
         created=state.created,
@@ -190,6 +146,23 @@ def restore_backup(
         unknown_consents=len(notes.consents.keys() - _subjects(plan).keys()),
         faults=tuple(plan.faults),
     )
+
+
+def _write(archive: Archive, place: Place, plan: Plan) -> tuple[int, list[Record]]:
+    """Write the files of a database, which is locked meanwhile, and the later consents;
+    returns the number of bytes, and the records of these consents.
+    """
+    place.create(LOCK, b"{}")
+    with Lease(place, "restore", (RELEASE,), command="skindb restore"):
+        written = _copy_all(archive, place, plan)
+        consents = _repeat_consents(place, plan)
+        place.flush_names([LOCK])
+        place.remove(LOCK)
+    place.is_unlocked = False
+    note_withdrawals(place)
+    restored = [record for record in plan.records.values() if record.kind == CONSENT]
+    note_consents(place, [*consents, *restored])
+    return written, consents
 
 
 def _plan(archive: Archive, state: State, notes: Notes) -> Plan:

@@ -82,11 +82,10 @@ def database_faults(place: Place) -> list[Fault]:
         faults += broken
         damaged |= {log.what} if broken else set()
         for record in readable:
-            faults += (
-                [_partly_removed_fault(record)]
-                if record in partly_removed
-                else version_faults(place, record)
-            )
+            if record in partly_removed:
+                faults.append(_partly_removed_fault(record))
+            else:
+                faults += version_faults(place, record)
     faults += _input_faults(place, records, damaged)
     faults += _unrecorded_faults(place, beside, records, damaged)
     faults += [
@@ -116,15 +115,8 @@ def _withdrawn_faults(place: Place) -> list[Fault]:
     remains += [*map(str, holdings.requests), *map(str, holdings.scratch)]
     rule = "nothing of a withdrawn subject must remain"
     cure = "run skindb clean --yes"
-    return [
-        Fault(
-            location,
-            rule,
-            "data that the withdrawal did not remove, or that came later",
-            cure,
-        )
-        for location in remains
-    ]
+    finding = "data that the withdrawal did not remove, or that came later"
+    return [Fault(location, rule, finding, cure) for location in remains]
 
 
 def _layout_faults(
