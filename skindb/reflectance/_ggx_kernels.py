@@ -39,9 +39,11 @@ MIN_ROUGHNESS = 0.05  # narrower lobes fall between the lights of a dome
 MAX_ROUGHNESS = 1.0
 NO_ROUGHNESS = 0.5  # of surfels whose lobe has no strength
 GRID = 10  # values of alpha, evenly spaced in its logarithm, from which steps start
-STEPS = 8  # Gauss-Newton steps at most
+STEPS = 20  # Gauss-Newton steps at most
 MAX_STEP = 0.3  # of log alpha
 TOLERANCE = 1e-5  # step of log alpha at which the search ends
+# relative decrease below which it ends too: weak lobes have a flat minimum
+MIN_GAIN_LOBE = 1e-9
 REWEIGHTINGS = 3  # in cube-root space
 STRENGTH, ROUGHNESS = range(2)  # columns of the parameters
 SQRT_3 = math.sqrt(3.0)
@@ -204,7 +206,7 @@ def _descend(count: int, x: Any, lobe: Any) -> tuple[int, bool]:
         for _ in range(6):
             gain, strength = _decrease(count, math.exp(start + move), lobe)
             if gain >= best:
-                moved = gain > best
+                moved = gain > best * (1.0 + MIN_GAIN_LOBE)
                 best = gain
                 x[STRENGTH] = strength
                 x[ROUGHNESS] = math.exp(start + move)
