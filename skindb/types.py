@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.floating[Any]]
 Float64 = NDArray[np.float64]
@@ -33,6 +33,11 @@ ByteMatrix = np.ndarray[tuple[int, int], np.dtype[np.uint8]]
 
 # called with the stage, the steps done and the steps in all
 Progress = Callable[[str, int, int], None]
+
+
+def float64(values: ArrayLike) -> Float64:
+    """An array in double precision; a copy only if it has another type."""
+    return np.asarray(values, np.float64)
 
 
 def silent(stage: str, done: int, total: int) -> None:

@@ -13,7 +13,7 @@ from skindb.jit import kernel
 from skindb.optics._photometric_kernels import (
     NormalEstimates,
     buffers,
-    estimate_normals,
+    estimate_normal,
     normal_estimates,
 )
 
@@ -103,7 +103,7 @@ def normals_block(
         size = math.sqrt(scan[s, 0] ** 2 + scan[s, 1] ** 2 + scan[s, 2] ** 2)
         for k in range(3):
             first[k] = scan[s, k] / size if size > 0.0 else math.nan
-        estimate_normals(
+        estimate_normal(
             sample[s],
             position[s],
             light,

@@ -10,6 +10,7 @@ from skindb.types import (
     Cube32,
     IntMatrix32,
     IntVector,
+    IntVector32,
     Matrix,
     Matrix32,
     Vector,
@@ -21,6 +22,22 @@ EDGE = 1e-9  # texels; a texel centre on an edge belongs to both triangles
 CORNERS = 9
 
 
+@inline_kernel
+def _corners(
+    uv: Matrix, face: IntVector32, size: int, offset: float
+) -> tuple[float, float, float, float, float, float]:
+    """Corners of a triangle in texels, minus an offset."""
+    a, b, c = face
+    return (
+        uv[a, 0] * size - offset,
+        uv[a, 1] * size - offset,
+        uv[b, 0] * size - offset,
+        uv[b, 1] * size - offset,
+        uv[c, 0] * size - offset,
+        uv[c, 1] * size - offset,
+    )
+
+
 @kernel
 def rasterise(
     uv: Matrix, faces: IntMatrix32, face: IntMatrix32, weight: Cube32
@@ -30,16 +47,8 @@ def rasterise(
     """
     size = face.shape[0]
     for f in range(len(faces)):
-        a = faces[f, 0]
-        b = faces[f, 1]
-        c = faces[f, 2]
         # texel centres become integers
-        ax = np.float64(uv[a, 0]) * size - 0.5
-        ay = np.float64(uv[a, 1]) * size - 0.5
-        bx = np.float64(uv[b, 0]) * size - 0.5
-        by = np.float64(uv[b, 1]) * size - 0.5
-        cx = np.float64(uv[c, 0]) * size - 0.5
-        cy = np.float64(uv[c, 1]) * size - 0.5
+        ax, ay, bx, by, cx, cy = _corners(uv, faces[f], size, 0.5)
         double_area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
         if not (abs(double_area) > 0):
             continue
@@ -123,15 +132,7 @@ def average(
                 for channel in range(values.shape[1]):
                     image[i, j, channel] = 0
     for f in range(len(faces)):
-        a = faces[f, 0]
-        b = faces[f, 1]
-        c = faces[f, 2]
-        ax = np.float64(uv[a, 0]) * size
-        ay = np.float64(uv[a, 1]) * size
-        bx = np.float64(uv[b, 0]) * size
-        by = np.float64(uv[b, 1]) * size
-        cx = np.float64(uv[c, 0]) * size
-        cy = np.float64(uv[c, 1]) * size
+        ax, ay, bx, by, cx, cy = _corners(uv, faces[f], size, 0.0)
         double_area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
         if not (abs(double_area) > 0):
             continue

@@ -22,7 +22,7 @@ from skindb.geometry.topology import (
     outline_first,
     side_lengths,
 )
-from skindb.types import Array, Faces, Float64, Index, Mask
+from skindb.types import Array, Faces, Float64, Index, Mask, float64
 
 EQUALISATION_ROUNDS = 9  # of area equalisation
 # exponent of the squared stretch: the published 0.5 needs 13 rounds for the result of 8
@@ -81,7 +81,7 @@ def disc_atlas(
         If the surface is closed, has a handle, is in pieces, or has triangles too small
         for any map.
     """
-    points = np.asarray(vertices, np.float64)
+    points = float64(vertices)
     corner = np.asarray(faces, np.int64)
     loops = outline_first(points, boundary_loops(corner))
     _check(len(points), corner, loops)
@@ -124,13 +124,13 @@ def signed_areas(uv: Array, faces: Faces) -> Float64:
     """Areas (f,) of triangles in the map; positive if they face outwards (u to the
     right, v down).
     """
-    plus, minus = _area_products(*(np.asarray(uv)[faces[:, i]] for i in range(3)))
+    plus, minus = _area_products(uv[faces])
     return (plus - minus) / 2
 
 
-def _area_products(a: Array, b: Array, c: Array) -> tuple[Float64, Float64]:
-    """Terms (f,) whose difference is twice the area of triangles in the map."""
-    a, b, c = (corner.astype(np.float64) for corner in (a, b, c))
+def _area_products(corners: Array) -> tuple[Float64, Float64]:
+    """Terms (f,) whose difference is twice the area of triangles (f, 3, 2) in the map."""
+    a, b, c = float64(corners).swapaxes(0, 1)
     ab = b - a
     ac = c - a
     return ab[:, 1] * ac[:, 0], ab[:, 0] * ac[:, 1]
@@ -169,7 +169,7 @@ def _circle(path: Array) -> Float64:
     """
     step = side_lengths(path)
     angle = 2 * np.pi * (np.cumsum(step) - step) / step.sum()
-    return np.asarray(DISC_RADIUS * np.stack([np.cos(angle), -np.sin(angle)], axis=1))
+    return DISC_RADIUS * np.stack([np.cos(angle), -np.sin(angle)], axis=1)
 
 
 def _intrinsic_weights(points: Array, faces: Index) -> sp.csr_matrix:
@@ -312,8 +312,8 @@ def flipped(uv: Array, faces: Faces) -> Mask:
     wrong = np.empty(len(faces), bool)
     for start in range(0, len(faces), TRIANGLES_PER_BLOCK):
         part = faces[start : start + TRIANGLES_PER_BLOCK]
-        corners = np.asarray(uv)[part]
-        plus, minus = _area_products(*np.moveaxis(corners, 1, 0))
+        corners = uv[part]
+        plus, minus = _area_products(corners)
         wrong[start : start + TRIANGLES_PER_BLOCK] = plus <= minus
         error = CERTAIN * (np.abs(plus) + np.abs(minus))
         for i in np.flatnonzero(np.abs(plus - minus) <= error):
@@ -354,8 +354,8 @@ def stretches(
 def _stretches(
     vertices: Array, faces: Faces, uv: Array
 ) -> tuple[Float64, Float64, Float64]:
-    p, q, r = (np.asarray(vertices)[faces[:, k]].astype(np.float64) for k in range(3))
-    s, t = (np.asarray(uv)[:, axis].astype(np.float64)[faces].T for axis in (0, 1))
+    p, q, r = float64(vertices[faces.T])
+    s, t = float64(uv[faces.T].transpose(2, 0, 1))
     pq = q - p
     pr = r - p
     area = np.linalg.norm(np.cross(pq, pr), axis=1) / 2

@@ -8,14 +8,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from skindb.geometry._camera_kernels import undistorted
-from skindb.types import Array, Float64
+from skindb.types import Array, Float64, float64
 
 UNDISTORT_TOLERANCE = 1e-10  # in units of the focal length: 1e-7 px
 
 
 def camera_centre(R: ArrayLike, t: ArrayLike) -> Float64:
     """Centre of projection (3,) in mm of the camera `x_cam = R x + t`."""
-    return np.asarray(-np.asarray(R, np.float64).T @ np.asarray(t, np.float64))
+    return -float64(R).T @ float64(t)
 
 
 def project(
@@ -41,17 +41,17 @@ def project(
     depth : ndarray
         (...) mm along the optical axis.
     """
-    rotated = np.asarray(points, np.float64) @ np.asarray(R, np.float64).T
-    local = rotated + np.asarray(t, np.float64)
+    rotated = float64(points) @ float64(R).T
+    local = rotated + float64(t)
     depth = local[..., 2]
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = local[..., :2] / depth[..., None]
     plane = np.where((depth > 0)[..., None], ratio, np.nan)
-    coefficients = np.asarray(distortion, np.float64)
+    coefficients = float64(distortion)
     square = np.einsum("...i,...i->...", plane, plane)
     plane[square >= _fold(coefficients)] = np.nan
     bent = _distort(plane, coefficients)
-    matrix = np.asarray(K, np.float64)
+    matrix = float64(K)
     return np.asarray(bent @ matrix[:2, :2].T + matrix[:2, 2]), depth
 
 
@@ -60,12 +60,12 @@ def undistort(pixels: ArrayLike, K: ArrayLike, distortion: ArrayLike) -> Float64
 
     NaN where no point in front of the camera appears at that pixel.
     """
-    matrix = np.asarray(K, np.float64)
-    coefficients = np.asarray(distortion, np.float64)
-    offset = np.asarray(pixels, np.float64) - matrix[:2, 2]
+    matrix = float64(K)
+    coefficients = float64(distortion)
+    offset = float64(pixels) - matrix[:2, 2]
     bent = np.asarray(offset @ np.linalg.inv(matrix[:2, :2]).T).reshape(-1, 2)
     if not coefficients.any():
-        return np.asarray(bent.reshape(offset.shape), np.float64)
+        return float64(bent.reshape(offset.shape))
     plane = np.empty_like(bent)
     limit = float(np.sqrt(_fold(coefficients)))
     bent = np.ascontiguousarray(bent)
@@ -83,7 +83,7 @@ def pixel_rays(
     local = np.ones((*plane.shape[:-1], 3))
     local[..., :2] = plane
     local /= np.sqrt(1 + np.einsum("...i,...i->...", plane, plane))[..., None]
-    return np.asarray(local @ np.asarray(R, np.float64))
+    return local @ float64(R)
 
 
 def _distort(plane: Array, coefficients: Array) -> Float64:

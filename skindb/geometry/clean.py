@@ -6,9 +6,8 @@ filled with the triangulation of least area.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import islice
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -25,7 +24,7 @@ from skindb.geometry.topology import (
     simple_loops,
     winding_flips,
 )
-from skindb.types import Faces, Float64, Index, Mask
+from skindb.types import Faces, Float64, Index, Mask, float64
 
 # of the diagonal of the mesh: 0.3 um on a face, far below any scanner's spacing
 WELD_DISTANCE_RATIO = 1e-6
@@ -88,21 +87,16 @@ class _Report:
     count: dict[str, int] = field(default_factory=lambda: dict.fromkeys(KINDS, 0))
     places: dict[str, list[Float64]] = field(default_factory=dict)
 
-    def add(
-        self, kind: str, points: Float64, parts: Iterable[Index], count: int
-    ) -> None:
-        """Add `count` of a kind, each a set of vertices."""
-        self.count[kind] += count
+    def add(self, kind: str, points: Float64, parts: Sequence[Index] | Index) -> None:
+        """Add parts, each of which is a set of vertices: faces (n, 3), edges (n, 2),
+        vertices (n, 1), or loops.
+        """
+        self.count[kind] += len(parts)
         places = self.places.get(kind, [])
-        parts = islice(parts, PLACES - len(places))
-        if centres := [points[part].mean(axis=0) for part in parts]:
+        if centres := [
+            points[part].mean(axis=0) for part in parts[: PLACES - len(places)]
+        ]:
             self.places[kind] = places + centres
-
-    def add_all(
-        self, kind: str, points: Float64, parts: Sequence[Index] | Index
-    ) -> None:
-        """Add every one of `parts`: faces (n, 3), edges (n, 2), vertices (n, 1), loops."""
-        self.add(kind, points, parts, len(parts))
 
 
 def clean_mesh(
@@ -140,7 +134,7 @@ def clean_mesh(
     InputError
         If nothing is left.
     """
-    points = np.asarray(vertices, np.float64)
+    points = float64(vertices)
     current = np.asarray(faces, np.int64)
     report = _Report()
     if keep is not None:
@@ -151,8 +145,8 @@ def clean_mesh(
     current = _drop_overfull(points, current, report)
     current = _orient(points, current, report)
     current, repaired, remaining = repair_slivers(points, current)
-    report.add_all("slivers", points, repaired)
-    report.add_all("slivers_left", points, remaining)
+    report.add("slivers", points, repaired)
+    report.add("slivers_left", points, remaining)
     current = _largest_component(points, current, report)
     if not len(current):
         rule = "a scan must have a surface"
@@ -160,7 +154,7 @@ def clean_mesh(
         raise InputError(Fault("mesh", rule, found, "export it again"))
     current = _fill_small_holes(points, current, hole_edges, report)
     current, source = _split_bow_ties(current, len(points))
-    report.add_all("bow_ties", points, source[len(points) :, None])
+    report.add("bow_ties", points, source[len(points) :, None])
     points = points[source]
     current = _outwards(points, current, report)
     return _compact(points, current, source, weld, report)
@@ -168,7 +162,7 @@ def clean_mesh(
 
 def _drop_repeated(points: Float64, faces: Index, report: _Report) -> Index:
     degenerate = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
-    report.add_all("degenerate_faces", points, faces[degenerate])
+    report.add("degenerate_faces", points, faces[degenerate])
     faces = faces[~degenerate]
     _, index, inverse = np.unique(
         np.sort(faces, axis=1), axis=0, return_index=True, return_inverse=True
@@ -178,8 +172,8 @@ def _drop_repeated(points: Float64, faces: Index, report: _Report) -> Index:
     # an odd permutation of ascending corners
     odd = np.prod(np.sign(np.roll(faces, -1, axis=1) - faces), axis=1) > 0
     flipped = repeated & (odd != odd[original])
-    report.add_all("duplicate_faces", points, faces[repeated & ~flipped])
-    report.add_all("flipped_duplicates", points, faces[flipped])
+    report.add("duplicate_faces", points, faces[repeated & ~flipped])
+    report.add("flipped_duplicates", points, faces[flipped])
     return np.asarray(faces[~repeated])
 
 
@@ -196,7 +190,7 @@ def _weld(points: Float64, faces: Index, report: _Report) -> tuple[Index, Index]
         _, index = np.unique(label, return_index=True)
         weld[rim] = rim[index[label]]
     welded = np.flatnonzero(weld != np.arange(len(points)))
-    report.add_all("welded_vertices", points, welded[:, None])
+    report.add("welded_vertices", points, welded[:, None])
     if len(welded):
         faces = _drop_repeated(points, weld[faces], report)
     return faces, weld
@@ -207,7 +201,7 @@ def _drop_overfull(points: Float64, faces: Index, report: _Report) -> Index:
     which they are attached.
     """
     table = edge_table(faces)
-    report.add_all("non_manifold_edges", points, table.edges[table.count > 2])
+    report.add("non_manifold_edges", points, table.edges[table.count > 2])
     while len(faces):
         table = edge_table(faces)
         face, side = np.nonzero(table.count[table.of_face] > 2)
@@ -221,7 +215,7 @@ def _drop_overfull(points: Float64, faces: Index, report: _Report) -> Index:
         order = np.lexsort((area[face], -free[face], size[face], edge))
         _, index = np.unique(edge[order], return_index=True)
         extra = np.unique(face[order[index]])
-        report.add_all("non_manifold_faces", points, faces[extra])
+        report.add("non_manifold_faces", points, faces[extra])
         faces = np.delete(faces, extra, axis=0)
     return faces
 
@@ -229,14 +223,14 @@ def _drop_overfull(points: Float64, faces: Index, report: _Report) -> Index:
 def _orient(points: Float64, faces: Index, report: _Report) -> Index:
     flip = winding_flips(faces) if len(faces) else np.zeros(0, bool)
     turned = np.where(flip[:, None], faces[:, ::-1], faces)
-    report.add_all("turned_faces", points, faces[flip])
+    report.add("turned_faces", points, faces[flip])
     # a one-sided strip has no consistent winding: cut it where two faces still traverse
     # an edge in the same direction
     key = turned * (len(points) + 1) + np.roll(turned, -1, axis=1)
     _, inverse, count = np.unique(key, return_inverse=True, return_counts=True)
     drop = np.asarray((count[inverse].reshape(-1, 3) > 1).any(axis=1))
-    report.add_all("one_sided_faces", points, faces[drop])
-    return np.asarray(turned[~drop])
+    report.add("one_sided_faces", points, faces[drop])
+    return turned[~drop]
 
 
 def _largest_component(points: Float64, faces: Index, report: _Report) -> Index:
@@ -246,11 +240,12 @@ def _largest_component(points: Float64, faces: Index, report: _Report) -> Index:
     touching = np.isin(faces, faces[keep]).any(axis=1)
     hanging = ~keep & np.isin(label, label[touching])
     island = ~keep & ~hanging
-    report.add_all("hanging_faces", points, faces[hanging])
+    report.add("hanging_faces", points, faces[hanging])
     report.count["island_faces"] = int(island.sum())
-    islands = np.unique(label[island])
-    corners = (faces[label == name].ravel() for name in islands)
-    report.add("islands", points, corners, len(islands))
+    order = np.argsort(label[island], kind="stable")
+    _, start = np.unique(label[island][order], return_index=True)
+    islands = [part.ravel() for part in np.split(faces[island][order], start)[1:]]
+    report.add("islands", points, islands)
     return np.asarray(faces[keep])
 
 
@@ -287,7 +282,7 @@ def _fill_small_holes(
             holes.append(loop)
             edges |= set(map(tuple, edge_table(patch).edges.tolist()))
     filled = np.concatenate(patches)
-    report.add_all("pin_holes", points, holes)
+    report.add("pin_holes", points, holes)
     report.count["filled_faces"] = len(filled) - len(faces)
     return filled
 
@@ -297,7 +292,7 @@ def _outwards(points: Float64, faces: Index, report: _Report) -> Index:
     closed by a fan.
     """
     loops = outline_first(points, boundary_loops(faces))
-    report.add_all("open_loops", points, loops)
+    report.add("open_loops", points, loops)
     # seen from the middle of the boundary, the fan that closes it adds no volume
     origin = points[loops[0]].mean(axis=0) if loops else points[faces[0, 0]]
     cross = face_crosses(points, faces)
@@ -305,7 +300,7 @@ def _outwards(points: Float64, faces: Index, report: _Report) -> Index:
     scale = (float(np.linalg.norm(cross, axis=1).sum()) / 2) ** 1.5
     inside_out = volume < -MIN_VOLUME_RATIO * scale
     report.count["turned_mesh"] = int(inside_out)
-    return np.asarray(faces[:, ::-1] if inside_out else faces)
+    return faces[:, ::-1] if inside_out else faces
 
 
 def _compact(
@@ -335,7 +330,7 @@ def sliver_mask(
     """Mask (f,) of triangles with a height below `min_ratio` of their longest side, or
     with coinciding corners.
     """
-    p = np.asarray(vertices, np.float64)[faces]
+    p = float64(vertices)[faces]
     sides = p - np.roll(p, -1, axis=1)
     longest = np.einsum("fki,fki->fk", sides, sides).max(axis=1, initial=0.0)
     double_area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
@@ -365,7 +360,7 @@ def fill_hole(
     # the mesh follows the loop, so that the patch follows its reverse
     ring = loop[::-1]
     n = len(ring)
-    p = np.asarray(vertices, np.float64)[ring]
+    p = float64(vertices)[ring]
     cost = np.full((n, n), np.inf)
     split = np.zeros((n, n), np.int64)
     cost[np.arange(n - 1), np.arange(1, n)] = 0.0

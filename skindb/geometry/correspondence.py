@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from skindb.geometry.landmarks import similarity, width
 from skindb.geometry.mesh import closest_on_mesh, vertex_areas, vertex_normals
 from skindb.geometry.topology import boundary_loops, outline_first
-from skindb.types import Array, Float64, Index, Mask
+from skindb.types import Array, Float64, Index, Mask, float64
 
 ALIGNED = 3  # number of shared landmarks that an alignment requires
 # width of the landmarks over their length, below which the rotation is undetermined
@@ -59,7 +59,7 @@ class Sheet:
     @classmethod
     def of(cls, position: Array, uv: Array, faces: Index, landmark: Array) -> Sheet:
         """Normals and boundaries of a mesh."""
-        loops = outline_first(np.asarray(position, np.float64), boundary_loops(faces))
+        loops = outline_first(float64(position), boundary_loops(faces))
         rim = np.zeros(len(position), np.bool_)
         rim[np.concatenate(loops)] = True
         normal = vertex_normals(position, faces)
@@ -181,7 +181,7 @@ def _weights(kernel: Array, pull: Array, error: Array) -> Float64:
     system = np.kron(kernel, np.eye(3)).reshape(m, 3, m, 3)
     system[np.arange(m), :, np.arange(m)] += error
     weights = np.linalg.solve(system.reshape(3 * m, 3 * m), pull.ravel())
-    return np.asarray(weights.reshape(m, 3))
+    return weights.reshape(m, 3)
 
 
 def _matern(distance: Array) -> Float64:

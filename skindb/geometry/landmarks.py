@@ -9,7 +9,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from skindb.geometry.mesh import closest_on_mesh
-from skindb.types import Array, Faces, Float64
+from skindb.types import Array, Faces, Float64, float64
 
 MAX_SHAPE_ROUNDS = 100  # of the mean shape; a face needs about 5
 SETTLED = 1e-12  # relative change of the mean shape at which it has converged
@@ -65,8 +65,8 @@ def similarity(source: Array, target: Array) -> tuple[Float64, Float64]:
     matrix, shift : ndarray
         `source @ matrix + shift` approximates target.
     """
-    x = np.asarray(source, np.float64)
-    y = np.asarray(target, np.float64)
+    x = float64(source)
+    y = float64(target)
     a = x - x.mean(axis=0)
     b = y - y.mean(axis=0)
     left, value, right = np.linalg.svd(a.T @ b)
@@ -100,7 +100,7 @@ def mean_shape(shapes: Array) -> Float64:
     ndarray
         (k, 2); NaN for a point no shape has.
     """
-    shapes = np.asarray(shapes, np.float64)
+    shapes = float64(shapes)
     pose = _mean_of_complete(shapes)
     mean = pose
     size = float(np.nanmax(np.abs(pose - np.nanmean(pose, axis=0)), initial=0.0))
@@ -117,9 +117,9 @@ def _onto(shape: Array, target: Array) -> Float64:
     """A shape (k, 2) after the similarity that best maps it to another."""
     shared = np.isfinite(shape).all(axis=1) & np.isfinite(target).all(axis=1)
     if not shared.any():
-        return np.asarray(shape, np.float64)
+        return float64(shape)
     matrix, shift = similarity(shape[shared], target[shared])
-    return np.asarray(shape @ matrix + shift)
+    return shape @ matrix + shift
 
 
 def _mean_of_complete(shapes: Array) -> Float64:
@@ -127,7 +127,7 @@ def _mean_of_complete(shapes: Array) -> Float64:
     complete = np.isfinite(shapes).all(axis=2, keepdims=True)
     total = np.where(complete, shapes, 0.0).sum(axis=0)
     count = complete.sum(axis=0)
-    return np.asarray(np.where(count > 0, total / np.maximum(count, 1), np.nan))
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
 def mate(name: str) -> str:
@@ -145,7 +145,7 @@ def nose_tip(vertices: Array) -> Float64:
     The middle is a strip around the median of x; hair and clothes that stand out
     farther than the nose mislead it.
     """
-    points = np.asarray(vertices, np.float64)
+    points = float64(vertices)
     across = points[:, 0] - np.median(points[:, 0])
     strip = points[np.abs(across) <= MIDDLE_FRACTION * np.ptp(points[:, 0])]
     return np.asarray(strip[np.argmax(strip[:, 2])])
@@ -174,11 +174,7 @@ def suggest_landmarks(
     dict
         Name to position (3,) mm.
     """
-    fixed = {
-        name: np.asarray(points[name], np.float64)
-        for name in points
-        if name in MEAN_FACE
-    }
+    fixed = {name: float64(points[name]) for name in points if name in MEAN_FACE}
     names = [name for name in MEAN_FACE if name not in fixed]
     if not names:
         return {}
@@ -190,7 +186,7 @@ def suggest_landmarks(
         guess[NOSE] = start[NOSE]
     places = np.array([guess[name] for name in names])
     triangle, weight, _ = closest_on_mesh(vertices, faces, places)
-    corners = np.asarray(vertices, np.float64)[faces[triangle]]
+    corners = float64(vertices)[faces[triangle]]
     nearest = (weight[..., None] * corners).sum(axis=1)
     return dict(zip(names, nearest, strict=True))
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from skindb.types import Array, Faces, Float64, Index
+from skindb.types import Array, Faces, Float64, Index, float64
 
 MORTON_BITS = 21  # per axis: 63 bits in all
 POINTS_PER_BLOCK = 1 << 10  # each point may have a hundred candidate triangles
@@ -23,7 +23,7 @@ def morton_order(points: Array) -> Index:
     in the cache. The cells are cubes, 2^21 along the longest side of the box of the
     points.
     """
-    p = np.asarray(points, np.float64)
+    p = float64(points)
     if len(p) == 0:
         return np.zeros(0, np.int64)
     low = p.min(axis=0)
@@ -36,8 +36,8 @@ def morton_order(points: Array) -> Index:
 
 def face_crosses(vertices: Array, faces: Faces) -> Float64:
     """Normals (f, 3) of triangles by the right-hand rule, of length twice the area in mm2."""
-    a, b, c = (np.asarray(vertices, np.float64)[faces[:, i]] for i in range(3))
-    return np.asarray(np.cross(b - a, c - a))
+    a, b, c = float64(vertices)[faces.T]
+    return np.cross(b - a, c - a)
 
 
 def vertex_normals(vertices: Array, faces: Faces) -> Float64:
@@ -48,7 +48,7 @@ def vertex_normals(vertices: Array, faces: Faces) -> Float64:
     total = _sum_at_vertices(face_crosses(vertices, faces), faces, len(vertices))
     length = np.linalg.norm(total, axis=1, keepdims=True)
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray(np.where(length > 0, total / length, np.nan))
+        return np.where(length > 0, total / length, np.nan)
 
 
 def vertex_areas(vertices: Array, faces: Faces) -> Float64:
@@ -91,7 +91,7 @@ def splat_radius(vertices: Array, faces: Faces) -> Float64:
     for k in range(3):
         a = faces[:, k]
         b = faces[:, (k + 1) % 3]
-        side = np.asarray(vertices[a] - vertices[b], np.float64)
+        side = float64(vertices[a] - vertices[b])
         length = np.linalg.norm(side, axis=1)
         np.maximum.at(out, a, length)
         np.maximum.at(out, b, length)
@@ -119,11 +119,11 @@ def closest_on_mesh(
     distance : ndarray
         (n,) mm.
     """
-    p = np.asarray(points, np.float64).reshape(-1, 3)
-    triangles = np.asarray(vertices, np.float64)[faces]
+    p = float64(points).reshape(-1, 3)
+    triangles = float64(vertices)[faces]
     used = np.zeros(len(vertices), np.bool_)
     used[faces] = True
-    near = cKDTree(np.asarray(vertices, np.float64)[used]).query(p)[0]
+    near = cKDTree(float64(vertices)[used]).query(p)[0]
     classes = _by_reach(triangles)
     face = np.empty(len(p), np.int64)
     barycentric = np.empty((len(p), 3))
@@ -233,9 +233,9 @@ def winding_number(vertices: Array, faces: Faces, points: Array) -> Float64:
     directions in which its inner side is visible minus that of its outer side, at most
     one half outside the convex hull.
     """
-    triangles = np.asarray(vertices, np.float64)[faces]
+    triangles = float64(vertices)[faces]
     numbers = []
-    for point in np.asarray(points, np.float64).reshape(-1, 3):
+    for point in float64(points).reshape(-1, 3):
         a, b, c = (triangles[:, i] - point for i in range(3))
         la, lb, lc = (np.linalg.norm(side, axis=1) for side in (a, b, c))
         # van Oosterom and Strackee 1983

@@ -8,7 +8,7 @@ from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
 from skindb.geometry._ray_kernels import aim
-from skindb.types import Array, Faces, Float64, Mask
+from skindb.types import Array, Faces, Float64, Mask, float64
 
 RAYS_PER_BLOCK = 1 << 15  # so that the arrays of the rays stay in the cache
 NUDGE = 1e-3 * np.array([0.62, 0.55, -0.56])  # mm
@@ -27,7 +27,7 @@ class RayScene:
 
     def __init__(self, vertices: Array, faces: Faces) -> None:
         """Build the tree over vertices (v, 3) in mm and faces (f, 3)."""
-        corners = np.asarray(vertices, np.float64)
+        corners = float64(vertices)
         index = np.asarray(faces, np.int64)
         mask = np.zeros(len(corners), bool)
         mask[index] = True
@@ -114,9 +114,7 @@ class RayScene:
         distance : ndarray
             (n,) mm; infinity for a miss.
         """
-        begin, towards = np.broadcast_arrays(
-            np.asarray(origin, np.float64), np.asarray(direction, np.float64)
-        )
+        begin, towards = np.broadcast_arrays(float64(origin), float64(direction))
         face = np.full(len(begin), -1, np.int32)
         barycentric = np.zeros((len(begin), 3))
         distance = np.full(len(begin), np.inf)
@@ -124,7 +122,8 @@ class RayScene:
             part = slice(i, i + RAYS_PER_BLOCK)
             start = begin[part] - self._centre
             with np.errstate(invalid="ignore", divide="ignore"):
-                way = towards[part] / _length(towards[part])[:, None]
+                length = np.sqrt(np.einsum("ni,ni->n", towards[part], towards[part]))
+                way = towards[part] / length[:, None]
             faces = self._first(start, way)
             face[part] = faces
             hit = np.flatnonzero(faces >= 0)
@@ -141,7 +140,7 @@ class RayScene:
         and one in a hundred rays that aim exactly at a vertex misses the mesh: use this
         for depth maps; `first_hit` is exact.
         """
-        start = (np.asarray(origin, np.float64) - self._centre).astype(np.float32)
+        start = (float64(origin) - self._centre).astype(np.float32)
         distance = np.empty(len(direction), np.float32)
         for i in range(0, len(direction), RAYS_PER_BLOCK):
             block = slice(i, i + RAYS_PER_BLOCK)
@@ -171,10 +170,6 @@ class RayScene:
         length = np.full(len(start), 1e37, np.float32) if reach is None else reach
         single = (rays.astype(np.float32, copy=False) for rays in (start, way))
         return np.asarray(self._scene.run(*single, length, query=query))
-
-
-def _length(vectors: Array) -> Float64:
-    return np.asarray(np.sqrt(np.einsum("ni,ni->n", vectors, vectors)))
 
 
 def _refine(

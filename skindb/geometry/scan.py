@@ -24,7 +24,7 @@ from skindb.limits import (
     MAX_SCAN_HEADER_BYTES,
     MAX_SCAN_VERTICES,
 )
-from skindb.types import Array, Faces, Float64, Index, Mask
+from skindb.types import Array, Faces, Float64, Index, Mask, float64
 
 MAX_COLOUR = 255  # of the eight bits of a colour of a vertex
 CURE = "export the scan again as a triangle mesh in mm (PLY or OBJ)"
@@ -296,7 +296,7 @@ def crop_faces(
     landmarks
         (k, 3) mm, needed where the crop has a reach.
     """
-    points = np.asarray(vertices, np.float64)
+    points = float64(vertices)
     kept = np.ones(len(points), bool)
     if crop.low is not None:
         kept &= (points >= crop.low).all(axis=1)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from skindb.geometry._splat_kernels import splat
-from skindb.types import Array, Faces, Float64, Index
+from skindb.types import Array, Faces, Float64, Index, float64
 
 # of blended over rasterised pixels; 0.5 was measured to hide 0.2 to 0.9 % more than
 # rays
@@ -150,14 +150,14 @@ class SplatScene:
         counting: bool,
     ) -> None:
         discs = (self._position, self._normal, self._radius, chosen)
-        local = (np.asarray(eye, np.float64) - self._centre).astype(np.float32)
+        local = (float64(eye) - self._centre).astype(np.float32)
         projection = (view.frame, local, np.float32(view.focal), view.corner)
         tolerance = (np.float32(SLOPE_PX), np.float32(BIAS_MM))
         splat(*discs, *projection, *tolerance, view.depth, fraction, counting)
 
     def _layout(self, eye: ArrayLike) -> tuple[float, list[_View]]:
         """The intended focal length, and the views within the limit of pixels."""
-        place = np.asarray(eye, np.float64)
+        place = float64(eye)
         if not np.isfinite(place).all() or not len(self._drawn):
             return 1.0, []
         ends = np.stack([self._low, self._high], axis=1)

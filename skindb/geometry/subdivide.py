@@ -6,7 +6,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from skindb.geometry.topology import EdgeTable, edge_table
-from skindb.types import Array, Faces, Float64, Index
+from skindb.types import Array, Faces, Float64, Index, float64
 
 
 def loop_matrix(faces: Faces, n_vertices: int) -> tuple[sp.csr_matrix, Index]:
@@ -67,7 +67,7 @@ def subdivide(
     for _ in range(levels):
         level, current = loop_matrix(current, matrix.shape[0])
         matrix = level @ matrix
-    return np.asarray(matrix @ np.asarray(vertices, np.float64)), current, matrix
+    return np.asarray(matrix @ float64(vertices)), current, matrix
 
 
 def carry_points(

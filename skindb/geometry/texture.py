@@ -13,7 +13,7 @@ from skindb.geometry._texture_kernels import (
     push,
     rasterise,
 )
-from skindb.types import Array, Faces, Float64, Index
+from skindb.types import Array, Faces, Float64, Index, float64
 
 Image = NDArray[np.float32]
 
@@ -100,7 +100,7 @@ def _indices(faces: Faces) -> NDArray[np.int32]:
 
 
 def _areas(uv: Array, faces: Faces) -> Image:
-    a, b, c = (np.asarray(uv, np.float32)[faces[:, k]] for k in range(3))
+    a, b, c = np.asarray(uv, np.float32)[faces.T]
     ab = b - a
     ac = c - a
     return np.asarray(np.abs(ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]) / 2)
@@ -162,7 +162,7 @@ def bilinear(image: Array, pixels: Array) -> Float64:
     """
     values = np.asarray(image)
     height, width = values.shape[:2]
-    place = np.asarray(pixels, np.float64)
+    place = float64(pixels)
     inside = np.asarray(((place >= 0) & (place <= (width, height))).all(axis=-1))
     column, x = _cell(np.where(inside, place[..., 0], 0.5), width)
     row, y = _cell(np.where(inside, place[..., 1], 0.5), height)
@@ -173,7 +173,7 @@ def bilinear(image: Array, pixels: Array) -> Float64:
     y = y[..., None]
     top = values[row, column] * (1 - x) + values[row, right] * x
     bottom = values[below, column] * (1 - x) + values[below, right] * x
-    return np.asarray(np.where(inside[..., None], top * (1 - y) + bottom * y, np.nan))
+    return np.where(inside[..., None], top * (1 - y) + bottom * y, np.nan)
 
 
 def _cell(place: Array, size: int) -> tuple[Index, Float64]:

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from skindb.geometry.landmarks import similarity, width
-from skindb.types import Array, Float64, Mask
+from skindb.types import Array, Float64, Mask, float64
 
 # of the spread of the points: half a millimetre on a face, less than the error of a
 # click
@@ -78,9 +78,7 @@ def fit_warp(
         Source and target (m, 2) of less accurate points, which are used if the others
         determine an affine map.
     """
-    x, y = (
-        np.asarray(points, np.float64).reshape(-1, 2) for points in (source, target)
-    )
+    x, y = (float64(points).reshape(-1, 2) for points in (source, target))
     a, b, used = _merged(x, y)
     if not len(a):
         return _plain("identity", used, np.zeros(2), 1.0, np.eye(2), np.zeros(2))
@@ -141,17 +139,17 @@ def _attempts(smoothing: float | None, has_weak: bool) -> list[tuple[float, floa
 
 def apply_warp(warp: Warp, uv: Array) -> Float64:
     """Apply the map to points (n, 2)."""
-    points = (np.asarray(uv, np.float64) - warp.origin) / warp.scale
+    points = (float64(uv) - warp.origin) / warp.scale
     out = _linear(points) @ warp.affine
     if len(warp.centre):
         for block in _blocks(points, warp):
             out[block] += _bending(points[block], warp.centre) @ warp.weight
-    return np.asarray(out)
+    return out
 
 
 def area_factor(warp: Warp, uv: Array) -> Float64:
     """Determinant of the Jacobian (n,) at points (n, 2): negative where the map is folded."""
-    points = (np.asarray(uv, np.float64) - warp.origin) / warp.scale
+    points = (float64(uv) - warp.origin) / warp.scale
     out = np.empty(len(points))
     for block in _blocks(points, warp):
         slope = _slope(points[block], warp.centre, warp.weight)
@@ -283,7 +281,7 @@ def _bending(points: Array, centre: Array) -> Float64:
     """r^2 log r (n, c)."""
     squared = (points[:, :1] - centre[:, 0]) ** 2 + (points[:, 1:] - centre[:, 1]) ** 2
     logarithm = np.log(np.maximum(squared, np.finfo(np.float64).tiny))
-    return np.asarray(0.5 * squared * logarithm)
+    return 0.5 * squared * logarithm
 
 
 def _slope(points: Array, centre: Array, weight: Array) -> Float64:

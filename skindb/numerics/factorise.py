@@ -16,7 +16,7 @@ from sklearn.exceptions import ConvergenceWarning
 
 from skindb.numerics.nnls import solve_nnls
 from skindb.threads import c_contiguous
-from skindb.types import Array
+from skindb.types import Array, float64
 
 MAX_SWEEPS = 200  # alternating over W and H; TOLERANCE ends most runs earlier
 TOLERANCE = 1e-8  # decrease of the squared error per sweep, relative to |X|^2
@@ -68,7 +68,7 @@ def nmf(
     mapper
         Function with the interface of `map` that runs the starts, possibly in parallel.
     """
-    X = np.asarray(weights, np.float64)
+    X = float64(weights)
     fits = X.ndim == 2 and 1 <= k <= min(X.shape)
     if not fits or not np.isfinite(X).all() or (X < 0).any():
         raise ValueError(
@@ -263,7 +263,7 @@ def _canonical(H: Array, mean: Array) -> Array:
     total = H.sum(axis=1, keepdims=True)
     H = np.where(total > 0, H / np.where(total > 0, total, 1.0), 1.0 / H.shape[1])
     contribution = mean @ H.T
-    return np.asarray(H[np.argsort(-contribution, kind="stable")])
+    return H[np.argsort(-contribution, kind="stable")]
 
 
 @dataclass(frozen=True)

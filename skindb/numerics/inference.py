@@ -12,7 +12,7 @@ each over its number of subjects; in one dimension it is the square of Welch's t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, islice, permutations, product
 from math import factorial, prod
@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from skindb.numerics.statistics import ROUNDING
-from skindb.types import Array, Mask
+from skindb.numerics.statistics import CONFIDENCE, ROUNDING
+from skindb.types import Array, Mask, float64
 
 Index = NDArray[np.intp]
 Draw = NDArray[Any]  # an order, signs or labels of the subjects, or many of them
@@ -63,14 +63,14 @@ class _Regression:
     @property
     def leverage(self) -> Array:
         square = float(self.regressor @ self.regressor)
-        return np.asarray((self.basis**2).sum(axis=1) + self.regressor**2 / square)
+        return (self.basis**2).sum(axis=1) + self.regressor**2 / square
 
     @property
     def error_weight(self) -> Array:
         """Weights (rows,) of the squared residuals in the squared HC3 error of the slope."""
         square = float(self.regressor @ self.regressor)
         scale = np.maximum(1 - self.leverage, 1e-12)
-        return np.asarray((self.regressor / square / scale) ** 2)
+        return (self.regressor / square / scale) ** 2
 
     def residual(self) -> Array:
         """Values after projection on the basis; 0 where only rounding remains."""
@@ -128,8 +128,6 @@ def effects(
     values: Array,
     regressor: Array,
     covariates: Array | None = None,
-    *,
-    level: float = 0.95,
 ) -> Effects:
     """Least squares of every quantity on [1, regressor, covariates].
 
@@ -142,8 +140,6 @@ def effects(
         (n,) 0 and 1 for two groups, or a number such as an age.
     covariates
         (n, c) variables to adjust for; none by default.
-    level
-        Confidence level of the intervals.
 
     Returns
     -------
@@ -166,10 +162,10 @@ def effects(
         error[columns] = np.sqrt(fit.error_weight @ residual**2)
         freedom[columns] = len(y) - fit.basis.shape[1] - 1
         spread[columns] = np.sqrt((residual**2).sum(axis=0) / freedom[columns])
-    return _effects(slope, error, spread, freedom, level)
+    return _effects(slope, error, spread, freedom)
 
 
-def paired_effects(differences: Array, *, level: float = 0.95) -> Effects:
+def paired_effects(differences: Array) -> Effects:
     """Mean of differences (n, q) within subjects, NaN where a subject lacks one; see `effects`.
 
     The error is the standard error of the mean, and `spread` the standard deviation of
@@ -184,13 +180,11 @@ def paired_effects(differences: Array, *, level: float = 0.95) -> Effects:
     spread[count < 2] = np.nan
     error = spread / np.sqrt(np.maximum(count, 1))
     freedom = np.where(count >= 2, count - 1.0, np.nan)
-    return _effects(mean, error, spread, freedom, level)
+    return _effects(mean, error, spread, freedom)
 
 
-def _effects(
-    slope: Array, error: Array, spread: Array, freedom: Array, level: float
-) -> Effects:
-    half = stats.t.ppf((1 + level) / 2, freedom) * error
+def _effects(slope: Array, error: Array, spread: Array, freedom: Array) -> Effects:
+    half = stats.t.ppf((1 + CONFIDENCE) / 2, freedom) * error
     statistic = np.where(np.isnan(slope), np.nan, _ratio(slope, error))
     return Effects(slope, error, slope - half, slope + half, statistic, spread, freedom)
 
@@ -226,13 +220,9 @@ def permutation_p(
         positive); the number of permutations. The smallest p is 1 / (count + 1).
     """
     n = len(regressor)
-    orders: Iterator[Draw]
-    if factorial(min(n, 12)) <= max_draws:
-        orders = (np.array(order) for order in islice(permutations(range(n)), 1, None))
-        count = factorial(n) - 1
-    else:
-        orders = (rng.permutation(n) for _ in range(max_draws))
-        count = max_draws
+    orders, count = _draws(
+        factorial(n), permutations(range(n)), lambda: rng.permutation(n), max_draws
+    )
 
     def redraw(fit: _Regression, order: Draw) -> tuple[Index, Array]:
         # subjects who lack a quantity are excluded, and all orders remain equally likely
@@ -262,13 +252,10 @@ def sign_flip_p(
             )
     if not fits:
         raise ValueError("paired differences need at least two subjects")
-    signs: Iterator[Draw]
-    if 2.0**n <= max_draws:
-        signs = map(np.array, islice(product((1.0, -1.0), repeat=n), 1, None))
-        count = 2**n - 1
-    else:
-        signs = (rng.choice((1.0, -1.0), n) for _ in range(max_draws))
-        count = max_draws
+    every_sign = product((1.0, -1.0), repeat=n)
+    signs, count = _draws(
+        2**n, every_sign, lambda: rng.choice((1.0, -1.0), n), max_draws
+    )
 
     def redraw(fit: _Regression, sign: Draw) -> tuple[Index, Array]:
         sign = sign[:, fit.rows]
@@ -299,10 +286,10 @@ def _regressions(
     """Quantities grouped by the subjects who have them, if their effect can be estimated."""
     fits = []
     fault = ValueError("no subject has any of the quantities")
-    x = np.asarray(regressor, np.float64)
+    x = float64(regressor)
     design = np.ones((len(x), 1))
     if covariates is not None:
-        design = np.column_stack([design, np.asarray(covariates, np.float64)])
+        design = np.column_stack([design, float64(covariates)])
     for rows, columns in missing_patterns(values):
         try:
             adjusted, basis = _adjusted(x[rows], design[rows])
@@ -349,6 +336,20 @@ def _require_several(fit: _Regression) -> None:
         raise ValueError(
             "each group must have two subjects: the effect depends on one subject and has no error"
         )
+
+
+def _draws(
+    total: int,
+    enumeration: Iterable[Any],
+    draw: Callable[[], Draw],
+    max_draws: int,
+) -> tuple[Iterator[Draw], int]:
+    """Draws and their number: all of `total` but the first, which is the identity, or
+    random ones if there are more than `max_draws`.
+    """
+    if total - 1 <= max_draws:
+        return map(np.array, islice(enumeration, 1, None)), total - 1
+    return (draw() for _ in range(max_draws)), max_draws
 
 
 def _batches(draws: Iterator[Draw], entries: int) -> Iterator[Draw]:
@@ -411,15 +412,14 @@ def between_groups_p(
         permutations. The smallest p is 1 / (count + 1).
     """
     sizes = np.bincount(group)
-    count = factorial(len(group)) // prod(map(factorial, sizes.tolist())) - 1
     # all draws label the values in this order, in which the groups follow each other
     observed = np.repeat(np.arange(len(sizes)), sizes)
-    draws: Iterator[Draw]
-    if count <= max_draws:
-        draws = islice(_arrangements(sizes.tolist()), 1, None)
-    else:
-        draws = (rng.permutation(observed) for _ in range(max_draws))
-        count = max_draws
+    draws, count = _draws(
+        factorial(len(group)) // prod(map(factorial, sizes.tolist())),
+        _arrangements(sizes.tolist()),
+        lambda: rng.permutation(observed),
+        max_draws,
+    )
     # sorted by group, so that the order of the subjects does not change the bits of the result
     y = values[np.argsort(group, kind="stable")]
     y = y - y.mean(axis=0)
@@ -452,13 +452,10 @@ def within_subjects_p(
     """
     orders = [_orders(row) for row in np.asarray(np.isfinite(values).all(axis=2))]
     lengths = [len(order) for order in orders]
-    count = prod(lengths) - 1
-    choices: Iterator[Draw]
-    if count <= max_draws:
-        choices = map(np.array, islice(product(*map(range, lengths)), 1, None))
-    else:
-        choices = (rng.integers(lengths) for _ in range(max_draws))
-        count = max_draws
+    every_choice = product(*map(range, lengths))
+    choices, count = _draws(
+        prod(lengths), every_choice, lambda: rng.integers(lengths), max_draws
+    )
     rows = np.arange(len(values))[:, None]
 
     def permuted(choice: Index) -> Array:

@@ -12,8 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize, stats
 
-from skindb.types import Array
+from skindb.types import Array, float64
 
+CONFIDENCE = 0.95  # of intervals
+POWER = 0.8  # of tests, for the smallest effect that they detect
 ROUNDING = 1e-13  # relative to the largest value
 
 
@@ -35,7 +37,7 @@ class Moments:
     @classmethod
     def of(cls, values: Array) -> Moments:
         """Moments over the first axis; NaN counts as missing."""
-        values = np.asarray(values, np.float64)
+        values = float64(values)
         finite = np.isfinite(values)
         count = finite.sum(axis=0).astype(np.float64)
         mean = np.where(finite, values, 0.0).sum(axis=0) / np.maximum(count, 1.0)
@@ -67,20 +69,20 @@ class Moments:
         """Square root of the unbiased variance."""
         return np.sqrt(self.variance)
 
-    def mean_interval(self, *, level: float = 0.95) -> tuple[Array, Array]:
+    def mean_interval(self) -> tuple[Array, Array]:
         """Student's interval of the mean; NaN for fewer than two values."""
-        half = stats.t.ppf((1 + level) / 2, np.maximum(self.count - 1.0, 1.0))
+        half = stats.t.ppf((1 + CONFIDENCE) / 2, np.maximum(self.count - 1.0, 1.0))
         half = half * self.standard_deviation / np.sqrt(np.maximum(self.count, 1.0))
         return self.mean - half, self.mean + half
 
-    def deviation_interval(self, *, level: float = 0.95) -> tuple[Array, Array]:
+    def deviation_interval(self) -> tuple[Array, Array]:
         """Chi-square interval of the standard deviation of normal values; NaN for fewer
         than two values.
         """
         freedom = np.maximum(self.count - 1.0, 1.0)
         second = np.where(self.count > 1, self.second, np.nan)
-        low = np.sqrt(second / stats.chi2.ppf((1 + level) / 2, freedom))
-        high = np.sqrt(second / stats.chi2.ppf((1 - level) / 2, freedom))
+        low = np.sqrt(second / stats.chi2.ppf((1 + CONFIDENCE) / 2, freedom))
+        high = np.sqrt(second / stats.chi2.ppf((1 - CONFIDENCE) / 2, freedom))
         return low, high
 
 
@@ -90,7 +92,6 @@ def bootstrap_interval(
     *,
     rng: np.random.Generator,
     draws: int = 1000,
-    level: float = 0.95,
 ) -> tuple[Array, Array]:
     """Percentile interval of `statistic(values[drawn rows])`, rows drawn with
     replacement (Efron 1979).
@@ -99,7 +100,8 @@ def bootstrap_interval(
     if n == 0:
         raise ValueError("values must have at least one row for a bootstrap")
     results = [statistic(values[rng.integers(n, size=n)]) for _ in range(draws)]
-    low, high = np.quantile(results, [(1 - level) / 2, (1 + level) / 2], axis=0)
+    tail = (1 - CONFIDENCE) / 2
+    low, high = np.quantile(results, [tail, (1 + CONFIDENCE) / 2], axis=0)
     return low, high
 
 
@@ -113,7 +115,7 @@ def known_mean(values: Array) -> Array:
 
 def benjamini_hochberg(p: Array) -> Array:
     """P values adjusted to control the false discovery rate (Benjamini and Hochberg 1995)."""
-    p = np.asarray(p, np.float64)
+    p = float64(p)
     order = np.argsort(p)
     raised = p[order] * len(p) / np.arange(1, len(p) + 1)
     adjusted = np.empty_like(p)
@@ -121,14 +123,12 @@ def benjamini_hochberg(p: Array) -> Array:
     return adjusted
 
 
-def detectable_difference(
-    error: Array, free: Array | float, *, level: float = 0.05, power: float = 0.8
-) -> Array:
-    """Smallest effect that a test at this level detects with this power, from the
-    standard error of its estimate and its degrees of freedom.
+def detectable_difference(error: Array, free: Array | float) -> Array:
+    """Smallest effect that a test at the level of 5 % detects with a power of 80 %, from
+    the standard error of its estimate and its degrees of freedom.
     """
-    quantiles = stats.t.ppf(1 - level / 2, free) + stats.t.ppf(power, free)
-    return np.asarray(error * quantiles)
+    quantiles = stats.t.ppf((1 + CONFIDENCE) / 2, free) + stats.t.ppf(POWER, free)
+    return error * quantiles
 
 
 def variance_components(

@@ -26,6 +26,8 @@ from scipy.fft import fftfreq, irfft2, rfft2, rfftfreq
 from scipy.ndimage import uniform_filter
 from scipy.optimize import isotonic_regression
 
+from skindb.types import float64
+
 Image = NDArray[np.floating[Any]]
 Spectrum = NDArray[np.complexfloating[Any, Any]]
 LEVELS = 7
@@ -217,11 +219,11 @@ def _widened(spectrum: Spectrum, size: tuple[int, ...]) -> Spectrum:
 
 
 def _transform(image: Image) -> Spectrum:
-    return np.asarray(rfft2(image, norm="forward"))
+    return rfft2(image, norm="forward")
 
 
 def _image(spectrum: Spectrum, size: tuple[int, ...]) -> Image:
-    return np.asarray(irfft2(spectrum, s=size, norm="forward"))
+    return irfft2(spectrum, s=size, norm="forward")
 
 
 @dataclass(frozen=True)
@@ -381,7 +383,7 @@ def synthesise(
         Random generator of the noise that is added first, so that parts without detail
         can gain some.
     """
-    image = np.asarray(image, np.float64)
+    image = float64(image)
     if not np.nan_to_num(shifts).any():
         return Synthesis(image, (0.0,))
     parts = image_parts(image, levels, orientations)

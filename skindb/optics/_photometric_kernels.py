@@ -113,7 +113,7 @@ class Buffers(NamedTuple):
 
 @kernel
 def normal_estimates() -> NormalEstimates:
-    """Memory for the result of `estimate_normals`."""
+    """Memory for the result of `estimate_normal`."""
     return NormalEstimates(
         np.empty(3),
         np.empty((2, 3)),
@@ -126,7 +126,7 @@ def normal_estimates() -> NormalEstimates:
 
 @kernel
 def buffers(lights: int, cameras: int) -> Buffers:
-    """Memory for `estimate_normals`."""
+    """Memory for `estimate_normal`."""
     single = np.zeros((10 + 3 * cameras, lights), np.float32)
     dark = single[10 + 2 * cameras :]
     size = single[9]
@@ -632,7 +632,7 @@ def _robust_mean(used: int, mean: Vector, b: Buffers) -> None:
 
 
 @fast_kernel
-def estimate_normals(
+def estimate_normal(
     sample: Cube32,
     position: Vector,
     light: Matrix,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from skindb.types import Array
+from skindb.types import Array, float64
 
 
 def half_difference(
@@ -26,10 +26,10 @@ def half_difference(
         theta_h, theta_d in [0, pi/2] and phi_d in [0, pi), as isotropic reciprocal
         BRDFs have period pi. phi_d is 0 where the half vector is the normal.
     """
-    wi = np.asarray(wi, np.float64)
-    wo = np.asarray(wo, np.float64)
+    wi = float64(wi)
+    wo = float64(wo)
     n = np.broadcast_to(
-        np.array([0.0, 0.0, 1.0]) if normal is None else np.asarray(normal, np.float64),
+        np.array([0.0, 0.0, 1.0]) if normal is None else float64(normal),
         wi.shape,
     )
     h = wi + wo
@@ -52,9 +52,7 @@ def directions(
     """Unit directions (wi, wo), each (..., 3), in the local frame (normal +z, half
     vector in the xz plane).
     """
-    th, td, pd = np.broadcast_arrays(
-        *(np.asarray(x, np.float64) for x in (theta_h, theta_d, phi_d))
-    )
+    th, td, pd = np.broadcast_arrays(*(float64(x) for x in (theta_h, theta_d, phi_d)))
     dx = np.sin(td) * np.cos(pd)
     dy = np.sin(td) * np.sin(pd)
     dz = np.cos(td)

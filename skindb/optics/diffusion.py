@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from skindb.optics.fresnel import boundary_factor
-from skindb.types import Array
+from skindb.types import Array, float64
 
 S_MAX = float(np.sqrt(3.0))
 # range of R_d that is inverted; values outside are clamped
@@ -24,7 +24,7 @@ S_FLOOR = 1e-4
 
 def diffuse_reflectance(s: ArrayLike, *, eta: float) -> Array:
     """R_d = alpha'/2 (1 + exp(-4/3 A s)) exp(-s) for s in [0, sqrt 3]."""
-    s = np.asarray(s, np.float64)
+    s = float64(s)
     albedo = 1.0 - s * s / 3.0
     far = np.exp(-_steepness(eta) * s)
     return np.asarray(albedo / 2.0 * (1.0 + far) * np.exp(-s))
@@ -46,7 +46,7 @@ def dipole_s(diffuse: ArrayLike, *, eta: float) -> tuple[Array, NDArray[np.bool_
         s with a relative error below 1e-12 for R_d in [1e-6, 1 - 1e-9], and a mask of
         values that were outside this range and clamped.
     """
-    value = np.asarray(diffuse, np.float64)
+    value = float64(diffuse)
     clamped = (value < MIN_R_D) | (value > MAX_R_D)
     absorbed = 1.0 - np.clip(value, MIN_R_D, MAX_R_D)
     low = np.zeros(value.shape)
@@ -64,15 +64,15 @@ def dipole_s(diffuse: ArrayLike, *, eta: float) -> tuple[Array, NDArray[np.bool_
 
 def reduced_albedo(s: ArrayLike) -> Array:
     """Alpha' = 1 - s^2 / 3."""
-    return np.asarray(1.0 - np.square(np.asarray(s, np.float64)) / 3.0)
+    return np.asarray(1.0 - np.square(float64(s)) / 3.0)
 
 
 def scattering_coefficients(s: ArrayLike, sigma_tr: ArrayLike) -> tuple[Array, Array]:
     """(sigma_a, sigma_s') in mm^-1 from s and sigma_tr (Weyrich et al. 2005, section
     9); s is floored at 1e-4.
     """
-    s = np.maximum(np.asarray(s, np.float64), S_FLOOR)
-    extinction = np.asarray(sigma_tr, np.float64) / s
+    s = np.maximum(float64(s), S_FLOOR)
+    extinction = float64(sigma_tr) / s
     return extinction * s * s / 3.0, extinction * (1.0 - s * s / 3.0)
 
 
@@ -99,8 +99,8 @@ def _slope(s: Array, eta: float) -> Array:
 
 def sigma_tr(sigma_a: ArrayLike, sigma_s_prime: ArrayLike) -> Array:
     """sigma_tr = sqrt(3 sigma_a (sigma_a + sigma_s')) in mm^-1 (eq. 9)."""
-    a = np.asarray(sigma_a, np.float64)
-    s = np.asarray(sigma_s_prime, np.float64)
+    a = float64(sigma_a)
+    s = float64(sigma_s_prime)
     return np.asarray(np.sqrt(3.0 * a * (a + s)))
 
 
@@ -111,7 +111,7 @@ def dipole_profile(
 
     Arguments broadcast. The integral of R over the plane is eq. 5.
     """
-    r, a, s = (np.asarray(x, np.float64) for x in (r, sigma_a, sigma_s_prime))
+    r, a, s = (float64(x) for x in (r, sigma_a, sigma_s_prime))
     decay, sources = _sources(a, s, eta)
     total = np.zeros(())
     for z in sources:
@@ -130,7 +130,7 @@ def dipole_power_beyond(
     R_d (eq. 5). Arguments broadcast. It is also the exitance of a plane at that
     distance from an evenly lit one.
     """
-    r, a, s = (np.asarray(x, np.float64) for x in (distance, sigma_a, sigma_s_prime))
+    r, a, s = (float64(x) for x in (distance, sigma_a, sigma_s_prime))
     decay, sources = _sources(a, s, eta)
     total = np.zeros(())
     for z in sources:

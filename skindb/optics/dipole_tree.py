@@ -19,7 +19,7 @@ from skindb.optics._tree_kernels import (
 )
 from skindb.optics.diffusion import S_FLOOR, diffuse_reflectance, reduced_albedo
 from skindb.optics.fresnel import boundary_factor
-from skindb.types import Array
+from skindb.types import Array, float64
 
 MAX_LEAF_POINTS = 8  # nodes with more points are divided
 # mean paths 1 / sigma_tr after which the profile is below 1e-7 of its integral
@@ -73,9 +73,7 @@ def subsurface_exitance(
     ndarray
         (l, n, 3) exitance of each light; 0 at points that are not receivers.
     """
-    points, areas, irradiance = (
-        np.asarray(x, np.float64) for x in (points, areas, irradiance)
-    )
+    points, areas, irradiance = (float64(x) for x in (points, areas, irradiance))
     result = np.zeros((irradiance.shape[1], len(points), 3), np.float32)
     if result.size == 0:
         return result
@@ -84,8 +82,8 @@ def subsurface_exitance(
     code = code[order]
     points = points[order]
     areas = areas[order]
-    s = np.maximum(np.asarray(s, np.float64)[order], S_FLOOR)
-    decay = np.asarray(sigma_tr, np.float64)[order]
+    s = np.maximum(float64(s)[order], S_FLOOR)
+    decay = float64(sigma_tr)[order]
     depth = s / decay
     above = depth * (1.0 + 4.0 / 3.0 * boundary_factor(eta))
     parameters = np.stack([depth, above, decay, reduced_albedo(s)], axis=-1)

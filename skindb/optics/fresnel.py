@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike
 
-from skindb.types import Array
+from skindb.types import Array, float64
 
 
 def fresnel_reflectance(cos_i: ArrayLike, eta: float) -> Array:
@@ -21,7 +21,7 @@ def fresnel_reflectance(cos_i: ArrayLike, eta: float) -> Array:
         Index of refraction behind the boundary over that in front of it. Total internal
         reflection gives F_r = 1.
     """
-    c = np.clip(np.abs(np.asarray(cos_i, np.float64)), 0.0, 1.0)
+    c = np.clip(np.abs(float64(cos_i)), 0.0, 1.0)
     square = eta * eta - 1.0 + c * c
     g = np.sqrt(np.maximum(square, 0.0))
     with np.errstate(divide="ignore", invalid="ignore"):

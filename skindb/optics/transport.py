@@ -45,7 +45,7 @@ from scipy.special import gammaln, k0e, lpmv
 from skindb.cache import cached_arrays
 from skindb.optics._walk_kernels import walk
 from skindb.optics.fresnel import fresnel_reflectance
-from skindb.types import Array, Mask
+from skindb.types import Array, Mask, float64
 
 ANISOTROPY = 0.8  # of skin; for a given sigma_s' the profile hardly depends on it
 DEGREE = 11
@@ -96,7 +96,7 @@ def transport_profile(
     sigma_s', R is proportional to 1/r (single scattering); above 300 / sigma_s' to
     exp(-kappa r) / r^2.
     """
-    r, a, s = (np.asarray(x, np.float64) for x in (r, sigma_a, sigma_s_prime))
+    r, a, s = (float64(x) for x in (r, sigma_a, sigma_s_prime))
     ratio = a / s
     log_clipped = np.log(np.clip(ratio, RATIO_MIN, RATIO_MAX))
     table = _table(float(eta))
@@ -202,7 +202,7 @@ def moment_basis(degree: int, *, eta: float, anisotropy: float) -> MomentBasis:
     adjacent = np.abs(m[:, None] - m) == 1
     near = np.where((m[:, None] == 0) | (m == 0), np.sqrt(0.5), 0.5) * adjacent
     inside, weight = _half_range(eta)
-    back = np.asarray(fresnel_reflectance(inside, 1 / eta), np.float64)
+    back = float64(fresnel_reflectance(inside, 1 / eta))
     h = _harmonics(degrees, m, inside)
     plus = (h.T * (weight * (1 + back))) @ h * same
     minus = (h.T * (weight * (1 - back))) @ h * same

@@ -7,7 +7,7 @@ import numpy as np
 from skindb.optics._photometric_kernels import (
     NormalEstimates,
     buffers,
-    estimate_normals,
+    estimate_normal,
     normal_estimates,
 )
 from skindb.optics.fresnel import fresnel_transmittance
@@ -56,7 +56,7 @@ def _estimates(sample, position, light, camera, scan):
     for s in range(len(sample)):
         out.append(normal_estimates())
         points = (position[s], light, camera, scan[s])
-        estimate_normals(sample[s], *points, ETA, PRIOR, memory, out[s])
+        estimate_normal(sample[s], *points, ETA, PRIOR, memory, out[s])
     return NormalEstimates(*(np.stack(arrays) for arrays in zip(*out, strict=True)))
 
 
