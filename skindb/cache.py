@@ -64,9 +64,9 @@ def cached_arrays(
     if folder is None:
         return dict(make())
     place = folder / f"{name}-{_key(arguments, sources)}"
-    found = _read(place)
-    if found is not None:
-        return found
+    stored = _read(place)
+    if stored is not None:
+        return stored
     with one_blas_thread():
         arrays = {key: np.asarray(array, order="C") for key, array in make().items()}
     try:

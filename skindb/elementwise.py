@@ -57,11 +57,11 @@ def elementwise(
         # convert the results of the kernel to the dtype of the schema, which the lazy
         # array declares
         results = kernel(*blocks, **params)
-        kept = tuple(
+        arrays = tuple(
             np.asarray(r, spec.dtype) for r, spec in zip(results, specs, strict=True)
         )
         # apply_ufunc expects a single output without a tuple
-        return kept if len(kept) > 1 else kept[0]
+        return arrays if len(arrays) > 1 else arrays[0]
 
     # one call of the kernel per block gives all outputs; inputs without `over` are
     # shared by every block

@@ -43,13 +43,13 @@ class Fault:
         return f"{line}; {printable(self.cure)}" if self.cure else line
 
 
-def printable(text: str, most: int = MAX_PART_CHARACTERS) -> str:
+def printable(text: str, length: int = MAX_PART_CHARACTERS) -> str:
     """Text on one line for a terminal: white space is folded, control characters are
     escaped, the middle is cut.
     """
-    if len(text) > most:
-        head = most * 2 // 3
-        text = f"{text[:head]}...{text[len(text) - (most - head - 3) :]}"
+    if len(text) > length:
+        head = length * 2 // 3
+        text = f"{text[:head]}...{text[len(text) - (length - head - 3) :]}"
     return " ".join(escaped(text.replace("\n", " ").replace("\t", " ")).split())
 
 
@@ -57,26 +57,22 @@ def escaped(text: str) -> str:
     """Text with escapes in place of all characters that cannot be printed, such as
     control characters.
     """
-    return (
-        text
-        if text.isprintable()
-        else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
-    )
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
 
 
 def grouped(faults: Iterable[Fault]) -> list[Fault]:
     """The faults, with many of the same place and rule replaced by one that gives the
     first finding and the number.
     """
-    alike = dict[tuple[str, str], list[Fault]]()
+    groups = dict[tuple[str, str], list[Fault]]()
     for fault in dict.fromkeys(faults):
-        alike.setdefault((fault.where, fault.rule), []).append(fault)
+        groups.setdefault((fault.where, fault.rule), []).append(fault)
     out = list[Fault]()
-    for same in alike.values():
-        found = f"{same[0].found}, and {len(same) - 1} more"
-        out += (
-            same if len(same) <= MAX_SIMILAR_FAULTS else [replace(same[0], found=found)]
-        )
+    for similar in groups.values():
+        if len(similar) > MAX_SIMILAR_FAULTS:
+            found = f"{similar[0].found}, and {len(similar) - 1} more"
+            similar = [replace(similar[0], found=found)]
+        out += similar
     return out
 
 

@@ -35,8 +35,8 @@ KINDS = (
 )
 
 
-def open_regular(path: Path, most_bytes: int) -> BufferedReader:
-    """Open a regular file of at most `most_bytes` for reading.
+def open_regular(path: Path, max_bytes: int) -> BufferedReader:
+    """Open a regular file of at most `max_bytes` for reading.
 
     Pipes and devices are opened without blocking and closed again without reading.
 
@@ -51,24 +51,16 @@ def open_regular(path: Path, most_bytes: int) -> BufferedReader:
     except OSError as error:
         raise _not_opened(path, error) from None
     except ValueError as error:  # a zero byte or an unpaired surrogate in the name
-        raise InputError(
-            Fault(where, "the file must exist", str(error), "correct its name")
-        ) from None
+        rule = "the file must exist"
+        raise InputError(Fault(where, rule, str(error), "correct its name")) from None
     try:
         status = os.fstat(number)
         if not stat.S_ISREG(status.st_mode):
             raise _of_kind(where, status.st_mode)
-        if status.st_size > most_bytes:
-            rule = f"the file must be at most {_size(most_bytes)}"
-            found = _size(status.st_size)
-            raise InputError(
-                Fault(
-                    where,
-                    rule,
-                    found,
-                    "check that it is the right file, or make it smaller",
-                )
-            )
+        if status.st_size > max_bytes:
+            rule = f"the file must be at most {_size(max_bytes)}"
+            cure = "check that it is the right file, or make it smaller"
+            raise InputError(Fault(where, rule, _size(status.st_size), cure))
         # keeps the name, which readers of TIFF use
         return open(path, "rb", opener=lambda *_: number)
     except BaseException:
@@ -76,9 +68,9 @@ def open_regular(path: Path, most_bytes: int) -> BufferedReader:
         raise
 
 
-def read_regular(path: Path, most_bytes: int) -> bytes:
+def read_regular(path: Path, max_bytes: int) -> bytes:
     """Content of a file that `open_regular` opens."""
-    with open_regular(path, most_bytes) as stream:
+    with open_regular(path, max_bytes) as stream:
         try:
             # the exact size, so that no more is allocated
             return stream.read(os.fstat(stream.fileno()).st_size)
@@ -101,26 +93,17 @@ def json_depth(text: str) -> int:
 
 def _not_opened(path: Path, error: OSError) -> InputError:
     where = str(path)
+    found = error.strerror or str(error)
     try:
         mode = path.stat().st_mode
     except (OSError, ValueError):
-        found = (
-            "no such file"
-            if isinstance(error, FileNotFoundError)
-            else error.strerror or str(error)
-        )
+        if isinstance(error, FileNotFoundError):
+            found = "no such file"
         return InputError(Fault(where, "the file must exist", found, CURE_MISSING))
     if not stat.S_ISREG(mode):
         return _of_kind(where, mode)
-    found = error.strerror or str(error)
-    return InputError(
-        Fault(
-            where,
-            "the file must be readable",
-            found,
-            "check its permissions and the disk",
-        )
-    )
+    cure = "check its permissions and the disk"
+    return InputError(Fault(where, "the file must be readable", found, cure))
 
 
 def _of_kind(where: str, mode: int) -> InputError:
@@ -129,9 +112,8 @@ def _of_kind(where: str, mode: int) -> InputError:
 
 
 def _size(count: int) -> str:
-    return (
-        f"{count / 1e6:,.1f} MB" if count % 1_000_000 else f"{count // 1_000_000:,} MB"
-    )
+    digits = 1 if count % 1_000_000 else 0
+    return f"{count / 1e6:,.{digits}f} MB"
 
 
 def private_file(path: str | os.PathLike[str]) -> Path:
@@ -169,10 +151,10 @@ def make_private(folder: Path, mode: int = PRIVATE) -> None:
     while not folder.exists():
         missing.append(folder)
         folder = folder.parent
-    for one in reversed(missing):
+    for parent in reversed(missing):
         with suppress(FileExistsError):  # another process created it
-            one.mkdir(mode)
-            one.chmod(mode)
+            parent.mkdir(mode)
+            parent.chmod(mode)
 
 
 def write_private(path: Path, content: bytes) -> None:
@@ -180,7 +162,9 @@ def write_private(path: Path, content: bytes) -> None:
     is replaced.
     """
     path.unlink(missing_ok=True)
-    number = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+    number = os.open(
+        path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, PRIVATE_FILE
+    )
     with os.fdopen(number, "wb") as file:
         file.write(content)
 
@@ -196,9 +180,9 @@ def csv_text(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     Text that a spreadsheet would evaluate begins with an apostrophe (OWASP, "CSV Injection").
     """
     buffer = io.StringIO()
-    csv.writer(buffer).writerows(
-        [_cell(value) for value in row] for row in (header, *rows)
-    )
+    writer = csv.writer(buffer)
+    for row in (header, *rows):
+        writer.writerow([_cell(value) for value in row])
     return buffer.getvalue()
 
 
@@ -209,5 +193,5 @@ def _cell(value: Any) -> Any:
         return ""
     if not isinstance(value, str) or NUMBER.fullmatch(value):
         return value
-    first = {value[:1], value.lstrip()[:1]}
-    return f"'{value}" if first & FORMULA else value
+    beginnings = {value[:1], value.lstrip()[:1]}
+    return f"'{value}" if beginnings & FORMULA else value

@@ -288,8 +288,8 @@ def _equalised(surface: Surface, weights: sp.csr_matrix) -> list[tuple[Float64, 
     limit = EQUAL * min((energy for energy, _, _ in maps), default=0.0)
     # the most even of the best, then the others by their energy
     best = sorted((m for m in maps if m[0] <= limit), key=lambda m: m[1])
-    others = sorted((m for m in maps if m[0] > limit), key=lambda m: m[0])
-    return [(uv, spread) for _, spread, uv in best + others]
+    remaining = sorted((m for m in maps if m[0] > limit), key=lambda m: m[0])
+    return [(uv, spread) for _, spread, uv in best + remaining]
 
 
 def _upright(uv: Array, points: Array, faces: Index) -> Float64:
@@ -376,9 +376,9 @@ def _stretches(
 
 def area_log2_sd(largest: Array, smallest: Array, area: Array) -> float:
     """Standard deviation over the surface of log2 of area in the map over area on the surface."""
-    used = (area > 0) & (smallest > 0)
-    weight = area[used] / area[used].sum()
-    ratio = np.log2(largest[used] * smallest[used])
+    valid = (area > 0) & (smallest > 0)
+    weight = area[valid] / area[valid].sum()
+    ratio = np.log2(largest[valid] * smallest[valid])
     return float(np.sqrt(weight @ (ratio - weight @ ratio) ** 2))
 
 
@@ -388,14 +388,14 @@ def symmetric_dirichlet(largest: Array, smallest: Array, area: Array) -> float:
 
     The energy of Smith and Schaefer (2015): it weighs uneven areas and stretch against each other.
     """
-    used = (area > 0) & (smallest > 0)
-    if not used.any():
+    valid = (area > 0) & (smallest > 0)
+    if not valid.any():
         return float("inf")
-    high = largest[used] ** 2
-    low = smallest[used] ** 2
-    weight = area[used] / area[used].sum()
+    high = largest[valid] ** 2
+    low = smallest[valid] ** 2
+    weight = area[valid] / area[valid].sum()
     # mm2 of a unit of the map
-    scale = area[used].sum() / (area[used] / (largest[used] * smallest[used])).sum()
+    scale = area[valid].sum() / (area[valid] / (largest[valid] * smallest[valid])).sum()
     return float(weight @ (high / scale + low / scale + scale / high + scale / low) / 4)
 
 
@@ -431,12 +431,12 @@ def distortion(
 def _summary(
     largest: Array, smallest: Array, area: Array
 ) -> tuple[float, float, float]:
-    used = (area > 0) & (smallest > 0)
-    if not used.any():
+    valid = (area > 0) & (smallest > 0)
+    if not valid.any():
         return (np.nan,) * 3
-    ratio = largest[used] / smallest[used]
+    ratio = largest[valid] / smallest[valid]
     order = np.argsort(ratio)
-    fraction = np.cumsum(area[used][order]) / area[used].sum()
+    fraction = np.cumsum(area[valid][order]) / area[valid].sum()
     places = np.minimum(np.searchsorted(fraction, (0.5, 0.99)), len(order) - 1)
     median, high = ratio[order[places]]
     return area_log2_sd(largest, smallest, area), float(median), float(high)

@@ -310,14 +310,14 @@ def _compact(
     weld: Index,
     report: _Report,
 ) -> CleanMesh:
-    used, inverse = np.unique(faces, return_inverse=True)
+    corners, inverse = np.unique(faces, return_inverse=True)
     number = np.full(len(points), -1, np.int64)
-    number[used] = np.arange(len(used))
-    report.count["dropped_vertices"] = len(weld) - len(np.unique(source[used]))
+    number[corners] = np.arange(len(corners))
+    report.count["dropped_vertices"] = len(weld) - len(np.unique(source[corners]))
     return CleanMesh(
-        vertices=points[used],
+        vertices=points[corners],
         faces=inverse.reshape(-1, 3).astype(np.int64),
-        source_vertex=source[used],
+        source_vertex=source[corners],
         clean_vertex=number[weld],
         report=report.count,
         places=report.places,

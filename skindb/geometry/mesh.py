@@ -121,9 +121,9 @@ def closest_on_mesh(
     """
     p = float64(points).reshape(-1, 3)
     triangles = float64(vertices)[faces]
-    used = np.zeros(len(vertices), np.bool_)
-    used[faces] = True
-    near = cKDTree(float64(vertices)[used]).query(p)[0]
+    is_corner = np.zeros(len(vertices), np.bool_)
+    is_corner[faces] = True
+    near = cKDTree(float64(vertices)[is_corner]).query(p)[0]
     classes = _by_reach(triangles)
     face = np.empty(len(p), np.int64)
     barycentric = np.empty((len(p), 3))

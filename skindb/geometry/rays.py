@@ -8,7 +8,7 @@ from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
 from skindb.geometry._ray_kernels import aim
-from skindb.types import Array, Faces, Float64, Mask, float64
+from skindb.types import Array, Faces, Float64, Index, Mask, float64
 
 RAYS_PER_BLOCK = 1 << 15  # so that the arrays of the rays stay in the cache
 NUDGE = 1e-3 * np.array([0.62, 0.55, -0.56])  # mm
@@ -27,19 +27,17 @@ class RayScene:
 
     def __init__(self, vertices: Array, faces: Faces) -> None:
         """Build the tree over vertices (v, 3) in mm and faces (f, 3)."""
-        corners = float64(vertices)
-        index = np.asarray(faces, np.int64)
-        mask = np.zeros(len(corners), bool)
-        mask[index] = True
-        used = corners[mask]
-        if not len(used) or not np.isfinite(used).all():
+        self._faces = np.asarray(faces, np.int64)
+        is_corner = np.zeros(len(vertices), bool)
+        is_corner[self._faces] = True
+        corners = float64(vertices)[is_corner]
+        if not len(corners) or not np.isfinite(corners).all():
             raise ValueError("rays need at least one triangle, and finite vertices")
-        self._centre = (used.min(axis=0) + used.max(axis=0)) / 2
-        self._corners = corners - self._centre
-        self._faces = index
+        self._centre = (corners.min(axis=0) + corners.max(axis=0)) / 2
+        self._corners = float64(vertices) - self._centre
         self._scene = EmbreeScene()
         # triangles by value: vertices of no triangle may be invalid
-        TriangleMesh(self._scene, self._corners.astype(np.float32)[index])
+        TriangleMesh(self._scene, self._corners.astype(np.float32)[self._faces])
 
     def occluded(
         self,
@@ -47,7 +45,7 @@ class RayScene:
         target: Array,
         *,
         normal: Array | None = None,
-        at: Faces | None = None,
+        chosen: Index | None = None,
     ) -> Mask:
         """Whether the mesh stands between points of its surface and targets.
 
@@ -60,7 +58,7 @@ class RayScene:
             above the surface, and a smooth surface casts no shadow on itself where
             light grazes it; without them it starts that far along the ray. Every ray
             ends RAY_OFFSET_MM before its target.
-        at
+        chosen
             (m,) indices of the origins and normals to use; targets are then (m, 3) or a
             single one. Default all.
 
@@ -76,9 +74,8 @@ class RayScene:
         if normal is not None:
             lift = np.ascontiguousarray(normal, np.float64)
             ahead = 0.0
-        if at is None:
-            at = np.arange(np.broadcast_shapes(begin.shape, end.shape)[0])
-        chosen = np.asarray(at, np.int64)
+        if chosen is None:
+            chosen = np.arange(np.broadcast_shapes(begin.shape, end.shape)[0])
         hidden = np.empty(len(chosen), bool)
         size = min(RAYS_PER_BLOCK, len(chosen))
         memory = np.empty((2, size, 3), np.float32)

@@ -297,13 +297,13 @@ def crop_faces(
         (k, 3) mm, needed where the crop has a reach.
     """
     points = float64(vertices)
-    kept = np.ones(len(points), bool)
+    inside = np.ones(len(points), bool)
     if crop.low is not None:
-        kept &= (points >= crop.low).all(axis=1)
+        inside &= (points >= crop.low).all(axis=1)
     if crop.high is not None:
-        kept &= (points <= crop.high).all(axis=1)
+        inside &= (points <= crop.high).all(axis=1)
     if crop.reach_mm is not None:
         if landmarks is None or not len(landmarks):
             raise ValueError("a crop around the landmarks needs landmarks")
-        kept &= cKDTree(landmarks).query(points)[0] <= crop.reach_mm
-    return np.asarray(kept[faces].all(axis=1))
+        inside &= cKDTree(landmarks).query(points)[0] <= crop.reach_mm
+    return np.asarray(inside[faces].all(axis=1))

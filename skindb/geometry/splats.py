@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from skindb.geometry._splat_kernels import splat
-from skindb.types import Array, Faces, Float64, Index, float64
+from skindb.types import Array, Float64, Index, float64
 
 # of blended over rasterised pixels; 0.5 was measured to hide 0.2 to 0.9 % more than
 # rays
@@ -100,7 +100,7 @@ class SplatScene:
     def visible_fraction(
         self,
         eye: ArrayLike,
-        at: Faces | None = None,
+        chosen: Index | None = None,
         *,
         maps: list[DepthMap] | None = None,
     ) -> NDArray[np.float32]:
@@ -110,7 +110,7 @@ class SplatScene:
         ----------
         eye
             (3,) mm, of a light or a camera.
-        at
+        chosen
             (m,) indices of the discs to test; default all. All discs occlude in any case.
         maps
             Result of `draw` for the eye; drawn here by default.
@@ -121,9 +121,8 @@ class SplatScene:
             (m,) in [0, 1]; the paper calls a disc visible above a threshold. 0 for
             discs that face away.
         """
-        if at is None:
-            at = np.arange(len(self._radius))
-        chosen = np.asarray(at, np.int64)
+        if chosen is None:
+            chosen = np.arange(len(self._radius))
         valid = self._valid[chosen]
         discs = chosen[valid]
         visible = np.zeros(len(discs), np.float32)

@@ -107,7 +107,7 @@ def _visibility_test(
         position = surfels.position
         normal = surfels.normal
         return lambda eye: (
-            lambda at: ~scene.occluded(position, eye[None], normal=normal, at=at)
+            lambda at: ~scene.occluded(position, eye[None], normal=normal, chosen=at)
         )
     if method == "splats":
         splats = SplatScene(surfels.position, surfels.normal, surfels.radius)

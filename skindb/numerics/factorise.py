@@ -197,7 +197,7 @@ _SUMS = [field.name for field in fields(Sums)]
 
 def refine(
     H: Array, groups: Callable[[Array], Sequence[Sums]], A: Array
-) -> tuple[Array, Sequence[Sums], NDArray[np.float64]]:
+) -> tuple[Array, Sequence[Sums], Array]:
     """Refine H (k, m) by passes over data that do not fit into memory, until the error
     stops decreasing.
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from skindb.numerics import _nnls_kernels
-from skindb.types import Array
+from skindb.types import Array, Mask
 
 
 def solve_nnls(
@@ -15,7 +15,7 @@ def solve_nnls(
     *,
     tolerance: float = 1e-10,
     warm: ArrayLike | None = None,
-) -> tuple[Array, Array, NDArray[np.int32], NDArray[np.bool_]]:
+) -> tuple[Array, Array, NDArray[np.int32], Mask]:
     """Minimise |M x - r| over x >= 0 given M'M and M'r.
 
     Parameters

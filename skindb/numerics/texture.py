@@ -26,7 +26,7 @@ from scipy.fft import fftfreq, irfft2, rfft2, rfftfreq
 from scipy.ndimage import uniform_filter
 from scipy.optimize import isotonic_regression
 
-from skindb.types import float64
+from skindb.types import Float64, Mask, float64
 
 Image = NDArray[np.floating[Any]]
 Spectrum = NDArray[np.complexfloating[Any, Any]]
@@ -103,17 +103,17 @@ def build(
             f"bands, not {levels} of {orientations}"
         )
     spectrum = _transform(image)
-    whole = image.shape
+    shape = image.shape
     kind = image.dtype.type
-    low, high = _low(whole, whole, 0, kind)
-    residual = _image(spectrum * high, whole)
+    low, high = _low(shape, shape, 0, kind)
+    residual = _image(spectrum * high, shape)
     bands = []
     spectrum *= low
-    size = whole
+    size = shape
     for level in range(levels):
-        low, high = _low(size, whole, level + 1, kind)
+        low, high = _low(size, shape, level + 1, kind)
         ring = spectrum * high * _phase(orientations, kind)
-        masks = _angular(size, whole, orientations, kind)
+        masks = _angular(size, shape, orientations, kind)
         bands.append(np.stack([_image(ring * mask, size) for mask in masks]))
         size = tuple((side + 1) // 2 for side in size)
         spectrum = _cropped(spectrum * low, size)
@@ -124,43 +124,43 @@ def reconstruct(pyramid: Pyramid) -> Image:
     """Rebuild the image of a pyramid as the sum of its parts, filtered with the masks
     of the decomposition.
     """
-    whole = pyramid.high.shape
+    shape = pyramid.high.shape
     kind = pyramid.high.dtype.type
     spectrum = _transform(pyramid.low)
     for level in reversed(range(len(pyramid.bands))):
         bands = pyramid.bands[level]
         size = bands.shape[1:]
-        low, high = _low(size, whole, level + 1, kind)
+        low, high = _low(size, shape, level + 1, kind)
         ring = np.zeros(low.shape, spectrum.dtype)
-        masks = _angular(size, whole, len(bands), kind)
+        masks = _angular(size, shape, len(bands), kind)
         for band, mask in zip(bands, masks, strict=True):
             ring += _transform(band) * mask
         ring *= high * np.conj(_phase(len(bands), kind))
         spectrum = ring + _widened(spectrum, size) * low
-    low, high = _low(whole, whole, 0, kind)
-    return _image(spectrum * low + _transform(pyramid.high) * high, whole)
+    low, high = _low(shape, shape, 0, kind)
+    return _image(spectrum * low + _transform(pyramid.high) * high, shape)
 
 
 def _frequencies(
-    size: tuple[int, ...], whole: tuple[int, ...], kind: Any
+    size: tuple[int, ...], shape: tuple[int, ...], kind: Any
 ) -> tuple[Image, Image]:
     """Frequencies of the spectrum of a level, in cycles per entry of the whole image,
     at most 0.5.
     """
-    rows = fftfreq(size[0], 1 / size[0]) / whole[0]
-    columns = rfftfreq(size[1], 1 / size[1]) / whole[1]
+    rows = fftfreq(size[0], 1 / size[0]) / shape[0]
+    columns = rfftfreq(size[1], 1 / size[1]) / shape[1]
     return rows[:, None].astype(kind), columns[None].astype(kind)
 
 
 def _low(
-    size: tuple[int, ...], whole: tuple[int, ...], level: int, kind: Any
+    size: tuple[int, ...], shape: tuple[int, ...], level: int, kind: Any
 ) -> tuple[Image, Image]:
     """Low-pass and high-pass mask, whose squares add up to 1.
 
     The first is 1 up to half of the highest frequency of a level, 0 above the highest
     frequency, and a cosine of the logarithm of the frequency in between.
     """
-    rows, columns = _frequencies(size, whole, kind)
+    rows, columns = _frequencies(size, shape, kind)
     square = rows * rows + columns * columns
     square *= 4.0 ** (level + 1)
     between = np.flatnonzero((square > 0.25) & (square < 1))
@@ -173,12 +173,12 @@ def _low(
 
 
 def _angular(
-    size: tuple[int, ...], whole: tuple[int, ...], orientations: int, kind: Any
+    size: tuple[int, ...], shape: tuple[int, ...], orientations: int, kind: Any
 ) -> Iterator[Image]:
     """Oriented masks, powers of the cosine of the angle to each direction, whose
     squares add up to 1.
     """
-    rows, columns = _frequencies(size, whole, kind)
+    rows, columns = _frequencies(size, shape, kind)
     order = orientations - 1
     scale = 2**order * factorial(order) / sqrt(orientations * factorial(2 * order))
     inverse = rows * rows + columns * columns
@@ -282,19 +282,19 @@ def level_fractions(mask: Image, shapes: Sequence[tuple[int, ...]]) -> list[Imag
     return [fractions[shape] for shape in shapes]
 
 
-def members(fraction: Image) -> NDArray[np.bool_]:
+def members(fraction: Image) -> Mask:
     """Mask of entries whose fraction of a region exceeds half of the largest, since
     coarse ones may only overlap it.
     """
     return fraction > 0.5 * float(fraction.max(initial=0.0))
 
 
-def quantile_levels() -> NDArray[np.float64]:
+def quantile_levels() -> Float64:
     """Fractions (QUANTILES,) at which quantile functions are sampled."""
     return (np.arange(QUANTILES) + 0.5) / QUANTILES
 
 
-def quantile_function(values: Image) -> NDArray[np.float64]:
+def quantile_function(values: Image) -> Float64:
     """Quantiles (QUANTILES,) of values of any shape, subsampled if there are many; NaN
     if there are none.
     """
@@ -305,9 +305,7 @@ def quantile_function(values: Image) -> NDArray[np.float64]:
     return np.interp(quantile_levels() * len(flat) - 0.5, np.arange(len(flat)), flat)
 
 
-def part_quantiles(
-    parts: Sequence[Image], fractions: Sequence[Image]
-) -> NDArray[np.float64]:
+def part_quantiles(parts: Sequence[Image], fractions: Sequence[Image]) -> Float64:
     """Quantiles (part, QUANTILES) of the entries of each part that belong to a region;
     see `members`.
     """
@@ -315,9 +313,7 @@ def part_quantiles(
     return np.stack([quantile_function(part[members(mask)]) for part, mask in pairs])
 
 
-def part_histogram(
-    part: Image, fraction: Image, edges: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def part_histogram(part: Image, fraction: Image, edges: Float64) -> Float64:
     """Fractions (bins,) of the entries of a region in bins of equal width; the
     outermost bins include all beyond.
     """
@@ -329,7 +325,7 @@ def part_histogram(
     return np.bincount(np.clip(place, 0, bins - 1), minlength=bins) / inside.size
 
 
-def valid_quantiles(values: NDArray[np.float64]) -> NDArray[np.float64]:
+def valid_quantiles(values: Float64) -> Float64:
     """Monotone quantile functions nearest to `values` (..., levels), in the mean square
     over levels.
 
@@ -347,7 +343,7 @@ def valid_quantiles(values: NDArray[np.float64]) -> NDArray[np.float64]:
 def synthesise(
     image: Image,
     regions: Sequence[Image],
-    shifts: NDArray[np.float64],
+    shifts: Float64,
     *,
     measured: Sequence[Image] | None = None,
     iterations: int = 5,
@@ -415,15 +411,15 @@ class _Matching:
     blend: list[list[Image]]  # fraction of each region at the size of each part
     total: list[Image]  # sum of the fractions over the regions, for each part
     measured: list[list[Image]]  # fractions of the entries that are measured
-    targets: NDArray[np.float64]  # (region, part, QUANTILES)
-    size: NDArray[np.float64]  # (part,) number of entries
+    targets: Float64  # (region, part, QUANTILES)
+    size: Float64  # (part,) number of entries
 
     @classmethod
     def of(
         cls,
         parts: list[Image],
         regions: Sequence[Image],
-        shifts: NDArray[np.float64],
+        shifts: Float64,
         measured: Sequence[Image] | None,
     ) -> _Matching:
         shapes = [part.shape for part in parts]
@@ -437,24 +433,24 @@ class _Matching:
         size = np.array([part.size for part in parts], np.float64)
         return cls(blend, total, counted, valid_quantiles(sums), size)
 
-    def quantiles(self, part: Image, k: int) -> NDArray[np.float64]:
+    def quantiles(self, part: Image, k: int) -> Float64:
         """Quantile functions (region, QUANTILES) of part k."""
         return np.stack(
             [quantile_function(part[members(masks[k])]) for masks in self.measured]
         )
 
-    def all_quantiles(self, parts: list[Image]) -> NDArray[np.float64]:
+    def all_quantiles(self, parts: list[Image]) -> Float64:
         """Quantile functions (region, part, QUANTILES)."""
         rows = [self.quantiles(part, k) for k, part in enumerate(parts)]
         return np.stack(rows, axis=1)
 
-    def distance(self, quantiles: NDArray[np.float64]) -> float:
+    def distance(self, quantiles: Float64) -> float:
         """RMS difference from the targets."""
         squares = np.nan_to_num(((quantiles - self.targets) ** 2).mean(axis=-1))
         count = self.size.sum() * len(self.blend)
         return float(np.sqrt((squares * self.size).sum() / count))
 
-    def matched(self, part: Image, k: int, quantiles: NDArray[np.float64]) -> Image:
+    def matched(self, part: Image, k: int, quantiles: Float64) -> Image:
         """Part k, whose values are mapped to the targets by their rank in each region."""
         moved = np.zeros_like(part)
         for masks, source, target in zip(
@@ -468,7 +464,7 @@ class _Matching:
         return part + moved / self.total[k]
 
 
-def _strictly_increasing(values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _strictly_increasing(values: Float64) -> Float64:
     """Quantiles made strictly increasing by a negligible slope, so that each value has
     a unique rank.
     """

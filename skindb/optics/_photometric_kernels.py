@@ -228,7 +228,7 @@ def _point(
 
 
 @fast_kernel
-def _shades(used: int, cameras: int, b: Buffers) -> None:
+def _shades(n_cameras: int, cameras: int, b: Buffers) -> None:
     """For each light, low quantile over cameras of the mean channel, and median of the
     part along the skin's colour.
     """
@@ -239,7 +239,7 @@ def _shades(used: int, cameras: int, b: Buffers) -> None:
     count = 0.0
     for i in range(lights):
         b.samples[i] = 0
-        for q in range(used):
+        for q in range(n_cameras):
             place = 3 * (i * cameras + b.cameras[q])
             r = b.values[place]
             g = b.values[place + 1]
@@ -260,7 +260,7 @@ def _shades(used: int, cameras: int, b: Buffers) -> None:
     along_green = np.float32(green * scale)
     along_blue = np.float32(blue * scale)
     missing = np.float32(np.inf)
-    for q in range(used):
+    for q in range(n_cameras):
         o = b.cameras[q]
         inverse = ONE / b.through[o]
         third = inverse / np.float32(3)
@@ -274,8 +274,8 @@ def _shades(used: int, cameras: int, b: Buffers) -> None:
             b.white[q, i] = (r + g + v) * third if valid else missing
             b.tinted[q, i] = tint if valid else missing
             b.dark[q, i] = max(min(r, g, v), ZERO) if valid else missing
-    sort_columns(b.white, used, lights)
-    sort_columns(b.tinted, used, lights)
+    sort_columns(b.white, n_cameras, lights)
+    sort_columns(b.tinted, n_cameras, lights)
     for i in range(lights):
         n = b.samples[i]
         b.present[i] = ONE if n > 0 else ZERO
@@ -558,14 +558,14 @@ def _brightest(dark: Vector32, best: Vector, place: IntVector) -> None:
 
 
 @fast_kernel
-def _peak(used: int, b: Buffers) -> None:
+def _peak(n_cameras: int, b: Buffers) -> None:
     """Half vectors of the brightest lights of each camera and their weights; see
     `NormalEstimates.peak`.
     """
     best = np.empty(BRIGHTEST)
     place = np.empty(BRIGHTEST, np.int64)
     maximum = np.empty(3)
-    for q in range(used):
+    for q in range(n_cameras):
         b.half[q] = 0.0
         b.contrast[q] = 0.0
         _brightest(b.dark[q], best, place)
@@ -603,21 +603,21 @@ def _middle(values: Vector, count: int) -> float:
 
 
 @fast_kernel
-def _robust_mean(used: int, mean: Vector, b: Buffers) -> None:
+def _robust_mean(n_cameras: int, mean: Vector, b: Buffers) -> None:
     """Mean direction of the half vectors without outliers, each weighted by the inverse
     of its angle to the mean.
     """
-    for q in range(used):
+    for q in range(n_cameras):
         b.trust[q] = b.contrast[q]
     for step in range(9):
         mean[:] = 0.0
-        for q in range(used):
+        for q in range(n_cameras):
             for k in range(3):
                 mean[k] += b.trust[q] * b.half[q, k]
         if not _unit(mean) or step == 8:
             return
         count = 0
-        for q in range(used):
+        for q in range(n_cameras):
             cosine = (
                 b.half[q, 0] * mean[0] + b.half[q, 1] * mean[1] + b.half[q, 2] * mean[2]
             )
@@ -626,7 +626,7 @@ def _robust_mean(used: int, mean: Vector, b: Buffers) -> None:
                 b.ordered[count] = b.angle[q]
                 count += 1
         limit = 2.5 * max(1.4826 * _middle(b.ordered, count), 2.0)
-        for q in range(used):
+        for q in range(n_cameras):
             trust = b.contrast[q] / max(b.angle[q], 1.0)
             b.trust[q] = trust if b.angle[q] < limit else 0.0
 
@@ -666,8 +666,8 @@ def estimate_normal(
     # normals do not depend on brightness, and squares must neither underflow nor
     # overflow
     scale_to_one(b.values)
-    used = _point(position, light, camera, scan, square, b)
-    _shades(used, camera.shape[0], b)
+    n_cameras = _point(position, light, camera, scan, square, b)
+    _shades(n_cameras, camera.shape[0], b)
     meat = np.zeros((3, 3))
     for signal in range(2):
         out.spread[signal] = _photometric(signal, scan, square, prior, b, out)
@@ -679,5 +679,5 @@ def estimate_normal(
             for k in range(3):
                 meat[j, k] += both * b.light[j, i] * b.light[k, i]
     _sandwich(b.turn[0], meat, b.turn[1], out.cross)
-    _peak(used, b)
-    _robust_mean(used, out.peak, b)
+    _peak(n_cameras, b)
+    _robust_mean(n_cameras, out.peak, b)

@@ -9,10 +9,10 @@ near 1 suffers from cancellation.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from skindb.optics.fresnel import boundary_factor
-from skindb.types import Array, float64
+from skindb.types import Array, Mask, float64
 
 S_MAX = float(np.sqrt(3.0))
 # range of R_d that is inverted; values outside are clamped
@@ -30,7 +30,7 @@ def diffuse_reflectance(s: ArrayLike, *, eta: float) -> Array:
     return np.asarray(albedo / 2.0 * (1.0 + far) * np.exp(-s))
 
 
-def dipole_s(diffuse: ArrayLike, *, eta: float) -> tuple[Array, NDArray[np.bool_]]:
+def dipole_s(diffuse: ArrayLike, *, eta: float) -> tuple[Array, Mask]:
     """Inverse of `diffuse_reflectance`.
 
     Parameters

@@ -19,7 +19,7 @@ from skindb.optics._tree_kernels import (
 )
 from skindb.optics.diffusion import S_FLOOR, diffuse_reflectance, reduced_albedo
 from skindb.optics.fresnel import boundary_factor
-from skindb.types import Array, float64
+from skindb.types import Array, Index, Mask, float64
 
 MAX_LEAF_POINTS = 8  # nodes with more points are divided
 # mean paths 1 / sigma_tr after which the profile is below 1e-7 of its integral
@@ -39,7 +39,7 @@ def subsurface_exitance(
     eta: float,
     tolerance: float = 0.1,
     normalise: bool = True,
-    receivers: NDArray[np.bool_] | None = None,
+    receivers: Mask | None = None,
 ) -> NDArray[np.float32]:
     """Radiant exitance under the boundary at every point, for many lights in one
     traversal of the tree.
@@ -140,7 +140,7 @@ def _powers(power: Array, tree: Tree) -> NDArray[np.float32]:
     return out
 
 
-def _morton(points: Array) -> NDArray[np.int64]:
+def _morton(points: Array) -> Index:
     """Morton codes of ten bits per axis."""
     low = points.min(axis=0)
     span = max(float(np.ptp(points, axis=0).max()), 1e-12)

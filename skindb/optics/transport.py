@@ -45,7 +45,7 @@ from scipy.special import gammaln, k0e, lpmv
 from skindb.cache import cached_arrays
 from skindb.optics._walk_kernels import walk
 from skindb.optics.fresnel import fresnel_reflectance
-from skindb.types import Array, Mask, float64
+from skindb.types import Array, Index, Mask, float64
 
 ANISOTROPY = 0.8  # of skin; for a given sigma_s' the profile hardly depends on it
 DEGREE = 11
@@ -219,7 +219,7 @@ def moment_basis(degree: int, *, eta: float, anisotropy: float) -> MomentBasis:
     )
 
 
-def _harmonics(n: NDArray[np.int64], m: NDArray[np.int64], x: Array) -> Array:
+def _harmonics(n: Index, m: Index, x: Array) -> Array:
     """(x, lm) normalised associated Legendre functions, orthonormal over [-1, 1] at equal m."""
     logarithm = np.log(n + 0.5) + gammaln(n - m + 1) - gammaln(n + m + 1)
     scale = np.exp(logarithm / 2) * (-1.0) ** m

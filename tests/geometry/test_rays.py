@@ -237,7 +237,7 @@ def test_occluded__chosen_origins_are_those_origins(monkeypatch):
     monkeypatch.setattr("skindb.geometry.rays.RAYS_PER_BLOCK", 64)
     scene = RayScene(v, f)
     for aims in (eye, target):
-        found = scene.occluded(v, aims, normal=normal, at=at)
+        found = scene.occluded(v, aims, normal=normal, chosen=at)
         np.testing.assert_array_equal(
             found, scene.occluded(v[at], aims, normal=normal[at])
         )
