@@ -147,30 +147,7 @@ def average(
                 polygon[0, 0], polygon[0, 1] = ax, ay
                 polygon[1, 0], polygon[1, 1] = bx, by
                 polygon[2, 0], polygon[2, 1] = cx, cy
-                n = 3
-                for side in range(4):  # left, right, top, bottom
-                    line = (i if side // 2 else j) + side % 2
-                    sign = 1.0 - 2.0 * (side % 2)
-                    n = _clip(polygon, clipped, n, side // 2, line, sign)
-                    polygon, clipped = clipped, polygon
-                for k in range(3):
-                    part[k] = 0.0
-                # a fan of triangles: area of each times the weights of the corners at its centroid
-                for k in range(1, n - 1):
-                    px = polygon[k, 0] - polygon[0, 0]
-                    py = polygon[k, 1] - polygon[0, 1]
-                    qx = polygon[k + 1, 0] - polygon[0, 0]
-                    qy = polygon[k + 1, 1] - polygon[0, 1]
-                    area = abs(px * qy - py * qx) / 2
-                    x = polygon[0, 0] + (px + qx) / 3 - ax
-                    y = polygon[0, 1] + (py + qy) / 3 - ay
-                    u = min(max((x * (cy - ay) - y * (cx - ax)) / double_area, 0), 1)
-                    v = min(
-                        max(((bx - ax) * y - (by - ay) * x) / double_area, 0), 1 - u
-                    )
-                    part[0] += area * (1 - u - v)
-                    part[1] += area * u
-                    part[2] += area * v
+                _corner_areas(polygon, clipped, i, j, double_area, part)
                 covered[i, j] += part[0] + part[1] + part[2]
                 for k in range(3):
                     corner = faces[f, k]
@@ -185,6 +162,46 @@ def average(
                 for channel in range(values.shape[1]):
                     image[i, j, channel] /= confidence[i, j]
                 confidence[i, j] = min(confidence[i, j] / covered[i, j], 1)
+
+
+@kernel
+def _corner_areas(
+    polygon: Matrix,
+    clipped: Matrix,
+    i: int,
+    j: int,
+    double_area: float,
+    part: Vector,
+) -> None:
+    """Write area times mean weight of each corner over the part of a triangle in texel (i, j).
+
+    `polygon` holds the corners; it and `clipped` are overwritten.
+    """
+    ax, ay = polygon[0, 0], polygon[0, 1]
+    bx, by = polygon[1, 0], polygon[1, 1]
+    cx, cy = polygon[2, 0], polygon[2, 1]
+    n = 3
+    for side in range(4):  # left, right, top, bottom
+        line = (i if side // 2 else j) + side % 2
+        sign = 1.0 - 2.0 * (side % 2)
+        n = _clip(polygon, clipped, n, side // 2, line, sign)
+        polygon, clipped = clipped, polygon
+    for k in range(3):
+        part[k] = 0.0
+    # a fan of triangles: area of each times the weights of the corners at its centroid
+    for k in range(1, n - 1):
+        px = polygon[k, 0] - polygon[0, 0]
+        py = polygon[k, 1] - polygon[0, 1]
+        qx = polygon[k + 1, 0] - polygon[0, 0]
+        qy = polygon[k + 1, 1] - polygon[0, 1]
+        area = abs(px * qy - py * qx) / 2
+        x = polygon[0, 0] + (px + qx) / 3 - ax
+        y = polygon[0, 1] + (py + qy) / 3 - ay
+        u = min(max((x * (cy - ay) - y * (cx - ax)) / double_area, 0), 1)
+        v = min(max(((bx - ax) * y - (by - ay) * x) / double_area, 0), 1 - u)
+        part[0] += area * (1 - u - v)
+        part[1] += area * u
+        part[2] += area * v
 
 
 @kernel

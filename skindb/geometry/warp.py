@@ -99,30 +99,46 @@ def fit_warp(
         centre = np.concatenate([a, (weak_source - origin) / scale])
         goal = np.concatenate([b, weak_target])
     is_weak = np.arange(len(centre)) >= len(a)
-    checked = _check_points(centre) * scale + origin
-    attempts = _attempts(smoothing, len(centre) > len(a)) if len(centre) > 3 else []
-    for smooth, loosening in attempts:
-        loose = np.where(is_weak, loosening * WEAK_SMOOTHING_FACTOR, 1.0)
-        system = _System.of(centre, loose)
-        weight, affine = system.solve(goal, smooth)
-        warp = replace(
-            fallback,
-            kind="thin plate",
-            centre=centre,
-            weight=weight,
-            affine=affine,
-            condition=system.condition(smooth),
-            smoothing=smooth,
-            loose=loose,
-        )
-        if np.linalg.det(affine[1:]) <= min_area:
-            continue
-        if area_factor(warp, checked).min() * scale**2 > min_area:
+    if len(centre) > 3:
+        attempts = _attempts(smoothing, len(centre) > len(a))
+        warp = _without_folds(fallback, centre, goal, is_weak, attempts, min_area)
+        if warp is not None:
             return warp
     affine = np.linalg.lstsq(_linear(a), b, rcond=None)[0]
     if np.linalg.det(affine[1:]) <= min_area:
         return fallback
     return replace(fallback, kind="affine", affine=affine)
+
+
+def _without_folds(
+    base: Warp,
+    centre: Array,
+    goal: Array,
+    is_weak: Mask,
+    attempts: list[tuple[float, float]],
+    min_area: float,
+) -> Warp | None:
+    """The thin-plate map of the first attempt that is nowhere folded; None if all are."""
+    checked = _check_points(centre) * base.scale + base.origin
+    for smoothing, loosening in attempts:
+        loose = np.where(is_weak, loosening * WEAK_SMOOTHING_FACTOR, 1.0)
+        system = _System.of(centre, loose)
+        weight, affine = system.solve(goal, smoothing)
+        warp = replace(
+            base,
+            kind="thin plate",
+            centre=centre,
+            weight=weight,
+            affine=affine,
+            condition=system.condition(smoothing),
+            smoothing=smoothing,
+            loose=loose,
+        )
+        if np.linalg.det(affine[1:]) <= min_area:
+            continue
+        if area_factor(warp, checked).min() * base.scale**2 > min_area:
+            return warp
+    return None
 
 
 def _attempts(smoothing: float | None, has_weak: bool) -> list[tuple[float, float]]:

@@ -199,14 +199,8 @@ def active_set(
                 continue
             valid = k
             solve(L, b, active, k, z)
-            step = 1.0
-            leaving = False
-            for a in range(k):
-                if z[a] <= 0.0:
-                    leaving = True
-                    xa = x[active[a]]
-                    step = min(step, xa / (xa - z[a]) if xa > z[a] else 0.0)
-            if not leaving:
+            step = _feasible_step(active, k, x, z)
+            if step == math.inf:
                 for a in range(k):
                     if x[active[a]] != z[a]:
                         # after progress, barred columns may enter again
@@ -228,18 +222,41 @@ def active_set(
                 break
         entering = -1
     _gradient(G, b, x, w)
+    worst = _worst_gradient(G, x, w)
+    converged = worst <= 10.0 * max(tolerance, 1e-12) * scale and count < limit
+    return worst / scale, count, converged, _pivot_ratio(L, min(valid, k))
+
+
+@kernel
+def _feasible_step(active: IntVector, k: int, x: Vector, z: Vector) -> float:
+    """Largest fraction of the way from x to z that keeps x >= 0; inf if z is positive."""
+    step = math.inf
+    for a in range(k):
+        if z[a] <= 0.0:
+            xa = x[active[a]]
+            step = min(step, 1.0, xa / (xa - z[a]) if xa > z[a] else 0.0)
+    return step
+
+
+@kernel
+def _worst_gradient(G: Matrix, x: Vector, w: Vector) -> float:
+    """Largest violation of the KKT conditions by the gradient w."""
     worst = 0.0
-    for j in range(m):
+    for j in range(x.shape[0]):
         if G[j, j] > 0.0:
             worst = max(worst, abs(w[j]) if x[j] > 0.0 else w[j])
+    return worst
+
+
+@kernel
+def _pivot_ratio(L: Matrix, k: int) -> float:
+    """Squared ratio of the extreme pivots of a factor of k columns."""
     low = math.inf
     high = 0.0
-    for a in range(min(valid, k)):
+    for a in range(k):
         low = min(low, L[a, a])
         high = max(high, L[a, a])
-    condition = (high / low) ** 2 if high > 0.0 else 1.0
-    converged = worst <= 10.0 * max(tolerance, 1e-12) * scale and count < limit
-    return worst / scale, count, converged, condition
+    return (high / low) ** 2 if high > 0.0 else 1.0
 
 
 @kernel

@@ -94,27 +94,11 @@ def subsurface_exitance(
     chosen = np.arange(len(points))
     if receivers is not None:
         chosen = np.flatnonzero(receivers[order])
-    starts = range(0, len(chosen), RECEIVERS_PER_BLOCK)
     for low in range(0, len(result), LIGHTS_PER_WALK):
         lights = irradiance[order, low : low + LIGHTS_PER_WALK]
         sources = Sources(place, area, _powers(lights * areas[:, None], tree))
-        even = np.zeros((len(chosen), 3))
-        sums = np.zeros((len(chosen), len(sources.power), 3, LIGHTS_IN_REGISTERS))
-
-        def walk(
-            start: int,
-            sources: Sources = sources,
-            even: Array = even,
-            sums: Array = sums,
-        ) -> None:
-            stop = min(start + RECEIVERS_PER_BLOCK, len(chosen))
-            limits = (tolerance, reach)
-            gather(start, stop, chosen, parameters, sources, tree, *limits, even, sums)
-
-        # plain threads, as the kernel releases the GIL, and numba's own threads abort
-        # when two threads render at once
-        with ThreadPoolExecutor() as pool:
-            list(pool.map(walk, starts))
+        limits = (tolerance, reach)
+        even, sums = _gather_parallel(chosen, parameters, sources, tree, limits)
         gain = np.ones(1)
         if normalise:
             gain = diffuse_reflectance(s[chosen], eta=eta) / np.maximum(even, 1e-300)
@@ -122,6 +106,30 @@ def subsurface_exitance(
             group, lane = divmod(i, LIGHTS_IN_REGISTERS)
             result[low + i, order[chosen]] = sums[:, group, :, lane] * gain
     return result
+
+
+def _gather_parallel(
+    chosen: Index,
+    parameters: Array,
+    sources: Sources,
+    tree: Tree,
+    limits: tuple[float, float],
+) -> tuple[Array, Array]:
+    """Dipole sums at chosen points, see `_tree_kernels.gather`; the limits are the
+    tolerance and the reach.
+    """
+    even = np.zeros((len(chosen), 3))
+    sums = np.zeros((len(chosen), len(sources.power), 3, LIGHTS_IN_REGISTERS))
+
+    def walk(start: int) -> None:
+        stop = min(start + RECEIVERS_PER_BLOCK, len(chosen))
+        gather(start, stop, chosen, parameters, sources, tree, *limits, even, sums)
+
+    # plain threads, as the kernel releases the GIL, and numba's own threads abort when
+    # two threads render at once
+    with ThreadPoolExecutor() as pool:
+        list(pool.map(walk, range(0, len(chosen), RECEIVERS_PER_BLOCK)))
+    return even, sums
 
 
 def _powers(power: Array, tree: Tree) -> NDArray[np.float32]:
