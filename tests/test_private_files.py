@@ -170,7 +170,7 @@ EXCEPTIONS = {
     "hw": "a session runs with a private umask",
     "virtual/laboratory.py": "a session runs with a private umask",
     "store": "a database has the permissions of its root",
-    "demo/figures.py": "into the memory",
+    "demo/pictures.py": "into the memory",
     "ingest/spool.py": "into the memory",
 }
 

@@ -228,8 +228,9 @@ def write_frame(path: Path, frame: Frame) -> None:
         content = imagecodecs.png_encode(np.ascontiguousarray(frame))
         private_file(path).write_bytes(content)
     elif suffix in (".tif", ".tiff"):
-        file = private_file(path)
-        tifffile.imwrite(file, frame, photometric="rgb", compression="zstd")
+        tifffile.imwrite(
+            private_file(path), frame, photometric="rgb", compression="zstd"
+        )
     else:
         raise ValueError(f"frames are .png, .tif or .exr, not {suffix!r}")
 
