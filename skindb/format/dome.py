@@ -182,10 +182,8 @@ def read_dome(
     if face:
         frames = fields.template("frames", {LIGHT, CAMERA} | several, {EXPOSURE})
     target = fields.get("white", None)
-    if not frames and isinstance(target, dict):
-        linear = is_linear(str(target.get("frames", "")))
-    else:
-        linear = is_linear(frames)
+    of_target = target.get("frames", "") if isinstance(target, dict) else ""
+    linear = is_linear(frames or str(of_target))
     if linear:
         require_merged(fields, exposures)
     cameras = tuple(
