@@ -82,7 +82,7 @@ def fit(db: Database, tell: Tell, _: Path | None = None) -> int:
     """Fit the take, report each stage, and return the generation of its model."""
     for name, stage in (
         ("first_pass", FIT[1]),
-        ("keep_first_pass", FIT[2]),
+        ("_store_first_pass", FIT[2]),
         ("second_pass", FIT[3]),
     ):
         setattr(fit_module, name, _telling(getattr(fit_module, name), stage, tell))
