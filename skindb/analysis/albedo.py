@@ -100,25 +100,27 @@ def albedo_histograms(
     takes = [str(take) for take in cohort["take"].values]
     loaded = each_take(xr.Dataset.load, cohort, COLOUR_VARIABLES)
     drawn = None if drawn is None else drawn.load()
-    samples = [_colours(one, drawn) for one in loaded]
+    samples = [_colours(sample, drawn) for sample in loaded]
     mean, axes = _colour_axes(samples)
-    decorrelated = [decorrelate(one.colour, mean, axes) for one in samples]
+    decorrelated = [decorrelate(sample.colour, mean, axes) for sample in samples]
     edges = _shared_edges(decorrelated)
     counted = np.full((len(takes), len(regions), 3, BINS), np.nan)
     means = np.full((len(takes), len(regions), 3), np.nan)
     by_landmarks: dict[str, list[str]] = {}
-    for t, (one, x) in enumerate(zip(samples, decorrelated, strict=True)):
+    for t, (sample, x) in enumerate(zip(samples, decorrelated, strict=True)):
         for r, region in enumerate(regions):
             inside = (
-                np.ones(len(x), np.bool_) if region == FACE else one.regions.get(region)
+                np.ones(len(x), np.bool_)
+                if region == FACE
+                else sample.regions.get(region)
             )
             if inside is None or not inside.any():
                 continue
-            counted[t, r] = histogram(x[inside], one.area[inside], edges)
+            counted[t, r] = histogram(x[inside], sample.area[inside], edges)
             means[t, r] = np.average(
-                one.colour[inside], axis=0, weights=one.area[inside]
+                sample.colour[inside], axis=0, weights=sample.area[inside]
             )
-            if region in one.drawn:
+            if region in sample.drawn:
                 by_landmarks.setdefault(region, []).append(takes[t])
     return dataset(
         {
@@ -136,41 +138,44 @@ def albedo_histograms(
     )
 
 
-def _colours(one: xr.Dataset, drawn: xr.Dataset | None) -> Colours:
+def _colours(take: xr.Dataset, drawn: xr.Dataset | None) -> Colours:
     """Sampled surfels of one take of a cohort, with the regions of its capture or those
     defined by landmarks.
     """
-    good = np.isfinite(one["diffuse_reflectance"].values).all(axis=-1) & (
-        one["surfel_area"].values > 0
+    good = np.isfinite(take["diffuse_reflectance"].values).all(axis=-1) & (
+        take["surfel_area"].values > 0
     )
     if not good.any():
-        where = str(one["take"].values)
+        name_of_take = str(take["take"].values)
         cure = "skip the take or fit it again"
         raise InputError(
             Fault(
-                where, "a take of a population must have fitted surfels", "none", cure
+                name_of_take,
+                "a take of a population must have fitted surfels",
+                "none",
+                cure,
             )
         )
-    own = _masks(one, good)
-    name = one["take"].values.item()
-    more: dict[str, Mask] = {}
+    stored = _masks(take, good)
+    name = take["take"].values.item()
+    by_landmark: dict[str, Mask] = {}
     if drawn is not None and name in drawn["take"].values:
-        other = drawn.sel(take=name)
+        registered = drawn.sel(take=name)
         same = np.array_equal(
-            other["surfel_index"].values[: len(good)][good],
-            one["surfel_index"].values[good],
+            registered["surfel_index"].values[: len(good)][good],
+            take["surfel_index"].values[good],
         )
         if not same:
             rule = "regions by landmarks must belong to the sampled surfels"
             cure = "open both cohorts with the same seed"
             raise InputError(Fault(str(name), rule, "a different sample", cure))
-        more = _masks(other, good)
-    by_landmarks = frozenset(region for region in more if region not in own)
-    colour = one["diffuse_reflectance"].values[good].astype(np.float64)
+        by_landmark = _masks(registered, good)
+    by_landmarks = frozenset(region for region in by_landmark if region not in stored)
+    colour = take["diffuse_reflectance"].values[good].astype(np.float64)
     return Colours(
         colour,
-        one["surfel_area"].values[good].astype(np.float64),
-        more | own,
+        take["surfel_area"].values[good].astype(np.float64),
+        by_landmark | stored,
         by_landmarks,
     )
 
@@ -253,10 +258,11 @@ def albedo_table(
         Moments.of(albedo["albedo_mean"].sel(take=group).values) for group in members
     )
     low, high = stacked.mean_interval()
-    known = stacked.count > 0
-    limits = np.array([max(even[take] for take in own) for own in members])
+    is_known = stacked.count > 0
+    limits = np.array([max(even[take] for take in group) for group in members])
     histograms = [
-        Moments.of(albedo["albedo_histogram"].sel(take=own).values) for own in members
+        Moments.of(albedo["albedo_histogram"].sel(take=group).values)
+        for group in members
     ]
     mean_histograms = np.stack(
         [np.where(h.count > 0, h.mean, np.nan) for h in histograms]
@@ -264,7 +270,7 @@ def albedo_table(
     return dataset(
         {
             "group_albedo_count": stacked.count,
-            "group_albedo_mean": np.where(known, stacked.mean, np.nan),
+            "group_albedo_mean": np.where(is_known, stacked.mean, np.nan),
             "group_albedo_mean_low": low,
             "group_albedo_mean_high": high,
             "group_albedo_level_low": _level_low(stacked.mean, low, limits),
@@ -379,7 +385,7 @@ def plot_albedo(
         lines = histograms["albedo_histogram"].sel(region=region).isel(axis=axis).values
     ax.set_prop_cycle(color=plots.CYCLE)
     for i, (name, fractions) in enumerate(zip(names, lines, strict=True)):
-        own: dict[str, Any] = (
+        style: dict[str, Any] = (
             {"label": name}
             if len(names) <= MAX_LEGEND_ENTRIES
             else {"color": "0.4", "linewidth": 0.5}
@@ -388,7 +394,7 @@ def plot_albedo(
             centres,
             fractions.reshape(-1, width).sum(axis=1),
             linestyle=LINES[i // len(plots.CYCLE) % len(LINES)],
-            **own,
+            **style,
         )
     if len(names) > MAX_LEGEND_ENTRIES:
         ax.set_title(f"{len(names)} takes", fontsize=8)

@@ -124,7 +124,7 @@ def basis_size_curve(
     else:  # take by take: 2,000 surfels of 87 takes at once would need 5 GB
         del factored
         errors = np.concatenate(each_take(_take_errors, cohort, NEEDED, once, tried))
-    error, low, high, (fewest, most) = choose_size(
+    error, low, high, (fewest, upper) = choose_size(
         errors, ks, tolerance=tolerance, rng=rng
     )
     variables = {
@@ -132,13 +132,13 @@ def basis_size_curve(
         "relative_error_low": low,
         "relative_error_high": high,
         "smallest_size": fewest,
-        "sufficient_size": most,
+        "sufficient_size": upper,
         "plateau_tolerance": tolerance,
         "dictionary_error": float(
             np.sqrt(errors[:, 0, -1].sum() / errors[:, 2, -1].sum())
         ),
     }
-    attrs = {"size_status": size_status(fewest, most), "surfels": len(errors)}
+    attrs = {"size_status": size_status(fewest, upper), "surfels": len(errors)}
     attrs["skipped"] = list(cohort.attrs.get("skipped", []))
     return dataset(variables, coords={"k": ks}, attrs=attrs)
 
@@ -240,7 +240,7 @@ def tabulate_basis_size(curve: xr.Dataset) -> tuple[list[str], list[list[Any]]]:
     )
     ratio = error[:-1] / error[1:]
     digits = _digits_to_differ(error)
-    ratio_digits = _digits_to_differ(ratio, least=4)
+    ratio_digits = _digits_to_differ(ratio, min_digits=4)
     steps = [*(f"{one:.{ratio_digits}f}" for one in ratio), "-"]
     rows = [
         [
@@ -253,14 +253,14 @@ def tabulate_basis_size(curve: xr.Dataset) -> tuple[list[str], list[list[Any]]]:
     return list(TABLE_HEADER), rows
 
 
-def _digits_to_differ(values: Array, *, least: int = 2) -> int:
+def _digits_to_differ(values: Array, *, min_digits: int = 2) -> int:
     """Number of decimals, up to MAX_DECIMALS, with which different neighbours are
     printed differently.
     """
     pairs = [(a, b) for a, b in pairwise(values.tolist()) if a != b]
     enough = (
         d
-        for d in range(least, MAX_DECIMALS)
+        for d in range(min_digits, MAX_DECIMALS)
         if all(f"{a:.{d}f}" != f"{b:.{d}f}" for a, b in pairs)
     )
     return next(enough, MAX_DECIMALS)
@@ -273,11 +273,12 @@ def describe_basis_size(curve: xr.Dataset) -> str:
     fewest = int(curve["smallest_size"])
     most = int(curve["sufficient_size"])
     largest = int(ks[-1])
-    last = float(curve["relative_error"][-1])
-    if not most and last > 1 + float(curve["plateau_tolerance"]):
+    final_error = float(curve["relative_error"][-1])
+    if not most and final_error > 1 + float(curve["plateau_tolerance"]):
         return (
             f"At least {fewest} bases: with {largest}, the largest size tried, the error is still "
-            f"{100 * (last - 1):.3g} % above that with the whole dictionary. Try larger sizes."
+            f"{100 * (final_error - 1):.3g} % above that with the whole dictionary. "
+            "Try larger sizes."
         )
     if not most:
         return (
@@ -301,8 +302,8 @@ def describe_basis_size(curve: xr.Dataset) -> str:
     )
 
 
-def _sizes(first: int, last: int) -> str:
-    return str(first) if first == last else f"{first} to {last}"
+def _sizes(low: int, high: int) -> str:
+    return str(low) if low == high else f"{low} to {high}"
 
 
 def _take_errors(take: xr.Dataset, tables: Array, bases: Sequence[Array]) -> Array:
@@ -312,16 +313,16 @@ def _take_errors(take: xr.Dataset, tables: Array, bases: Sequence[Array]) -> Arr
 
 def _systems(take: xr.Dataset, tables: Array, part: slice) -> Systems:
     """Normal equations of the selected surfels of one take."""
-    known = np.isfinite(take["diffuse_reflectance"].values).all(axis=1)
-    there = take.isel(surfel=np.flatnonzero(known)[part])
+    is_fitted = np.isfinite(take["diffuse_reflectance"].values).all(axis=1)
+    surfels = take.isel(surfel=np.flatnonzero(is_fitted)[part])
     eta = float(take["fit_eta"]) if "fit_eta" in take else np.nan
     # for models that do not state the parameters of their fit
     eta = eta if np.isfinite(eta) else DEFAULT_ETA
     parts = []
-    for start in range(0, max(there.sizes["surfel"], 1), BLOCK):
-        one = there.isel(surfel=slice(start, start + BLOCK))
+    for start in range(0, max(surfels.sizes["surfel"], 1), BLOCK):
+        block = surfels.isel(surfel=slice(start, start + BLOCK))
         (rows, offsets), target = _surface_rows(
-            one["reflectance_sample"].values, one, one, tables, eta
+            block["reflectance_sample"].values, block, block, tables, eta
         )
         parts.append(Systems.of(rows, offsets, target))
     return Systems.joined(parts)

@@ -48,19 +48,21 @@ def plot_brdf_space(space: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     for i, (group, count) in enumerate(
         zip(space["group"].values, space["group_subject_count"].values, strict=True)
     ):
-        own = place[named == str(group)]
+        points = place[named == str(group)]
         takes = int((named == str(group)).sum())
         subjects = f"n = {count}" if takes == count else f"n = {count}, {takes} takes"
         ax.plot(
-            *own.T,
+            *points.T,
             MARKERS[i % 6],
             color=_colour(i),
             markersize=4,
             alpha=0.75,
             label=f"{group} ({subjects})",
         )
-    first, second = (f"{one:.1%}" for one in space["explained_fraction"].values)
-    ax.set_xlabel(f"axis 1, {first} of the scatter [length of the mean BRDF]")
+    horizontal, second = (
+        f"{fraction:.1%}" for fraction in space["explained_fraction"].values
+    )
+    ax.set_xlabel(f"axis 1, {horizontal} of the scatter [length of the mean BRDF]")
     ax.set_ylabel(
         f"axis 2, {second}; relative error of the map {float(space['map_error']):.1%}"
     )
@@ -177,11 +179,11 @@ def plot_space(space: xr.Dataset) -> Axes:
     groups = space.sizes["group"]
     height = 5.6 + 0.2 * groups
     figure = pyplot.figure(figsize=(11, height), layout="constrained")
-    left, right = figure.subfigures(1, 2, width_ratios=(1, 1.1))
+    map_part, right = figure.subfigures(1, 2, width_ratios=(1, 1.1))
     upper, lower = right.subfigures(2, 1, height_ratios=(1, 1.2 + 0.1 * groups))
     plot_group_spheres(space, ax=upper.subplots())
     plot_group_lobes(space, ax=lower.subplots(subplot_kw={"projection": "polar"}))
-    return plot_brdf_space(space, ax=left.subplots())
+    return plot_brdf_space(space, ax=map_part.subplots())
 
 
 def sphere_radiance(tables: NDArray[Any]) -> tuple[Array, NDArray[np.bool_]]:
@@ -193,8 +195,8 @@ def sphere_radiance(tables: NDArray[Any]) -> tuple[Array, NDArray[np.bool_]]:
     tables
         (nh, nd, np, groups) [sr^-1].
     """
-    at = (np.arange(SPHERE) + 0.5) / SPHERE * 2 - 1
-    x, y = np.meshgrid(at, -at)
+    pixel = (np.arange(SPHERE) + 0.5) / SPHERE * 2 - 1
+    x, y = np.meshgrid(pixel, -pixel)
     inside = x**2 + y**2 < 1
     normal = np.stack([x, y, np.sqrt(np.clip(1 - x**2 - y**2, 0, None))], axis=-1)[
         inside
@@ -233,12 +235,14 @@ def _shaded(tables: NDArray[Any], normal: Array, light: Array) -> Array:
     wi_z = cos_i[lit]
     wo_z = cos_o[lit]
     # local frame of the normal with the viewer in its x, z plane
-    first = view - wo_z[:, None] * n
-    length = np.linalg.norm(first, axis=1, keepdims=True)
-    first = np.where(length > 1e-9, first / np.maximum(length, 1e-9), [1.0, 0.0, 0.0])
-    second = np.cross(n, first)
-    wi = np.stack([first @ light, second @ light, wi_z], axis=-1)
-    wo = np.stack([first @ view, second @ view, wo_z], axis=-1)
+    tangent = view - wo_z[:, None] * n
+    length = np.linalg.norm(tangent, axis=1, keepdims=True)
+    tangent = np.where(
+        length > 1e-9, tangent / np.maximum(length, 1e-9), [1.0, 0.0, 0.0]
+    )
+    second = np.cross(n, tangent)
+    wi = np.stack([tangent @ light, second @ light, wi_z], axis=-1)
+    wo = np.stack([tangent @ view, second @ view, wo_z], axis=-1)
     out[lit] = lookup(tables, *half_difference(wi, wo)) * wi_z[:, None]
     return out
 

@@ -175,7 +175,7 @@ def brdf_space(
             )
         )
     mapped, explained, error = classical_scaling(distance)
-    compared, adjusted_by, more = _pairs(subjects, permutations, rng)
+    compared, adjusted_by, pair_flags = _pairs(subjects, permutations, rng)
     compared["group_distance"] /= length
     compared["group_distance_noise"] /= length
     means = known_mean(subjects.coefficient)
@@ -206,7 +206,7 @@ def brdf_space(
         "group_by": group_by,
         "groups_of_takes": named,
         "adjusted_by": adjusted_by,
-        "flags": flags + more,
+        "flags": flags + pair_flags,
     }
     return dataset(
         variables,
@@ -241,15 +241,15 @@ def grouped_takes(
         )
     _, counted = takes_to_compare(cohort, group_by)
     named = groups_by(counted, group_by)
-    kept = [i for i, name in enumerate(named) if name not in (UNKNOWN, OTHER)]
-    groups = sorted({named[i] for i in kept})
+    rows = [i for i, name in enumerate(named) if name not in (UNKNOWN, OTHER)]
+    groups = sorted({named[i] for i in rows})
     if len(groups) < 2:
-        found = f"only {groups[0]}" if groups else "no take with this attribute"
+        finding = f"only {groups[0]}" if groups else "no take with this attribute"
         rule = "there must be subjects of two groups"
         raise InputError(
-            Fault(f"group by {group_by}", rule, found, "group by another attribute")
+            Fault(f"group by {group_by}", rule, finding, "group by another attribute")
         )
-    subjects = counted.select(kept)
+    subjects = counted.select(rows)
     if len(subjects.names) < 2:
         cure = "add the takes of other subjects"
         raise InputError(
@@ -260,15 +260,16 @@ def grouped_takes(
                 cure,
             )
         )
-    left = len(named) - len(kept)
+    excluded = len(named) - len(rows)
     flags = (
         [
-            f"{left} of {len(named)} takes are excluded because they belong to none of the groups"
+            f"{excluded} of {len(named)} takes are excluded because they belong to none "
+            "of the groups"
         ]
-        if left
+        if excluded
         else []
     )
-    return subjects, [named[i] for i in kept], flags
+    return subjects, [named[i] for i in rows], flags
 
 
 def _coefficients(names: Sequence[str], basis: xr.Dataset) -> Array:
@@ -282,21 +283,21 @@ def _coefficients(names: Sequence[str], basis: xr.Dataset) -> Array:
     )
     rank = int((values > INDEPENDENT * values[0]).sum())
     if rank < len(mixture):
-        found = f"{len(mixture)} components of rank {rank}"
+        finding = f"{len(mixture)} components of rank {rank}"
         raise InputError(
             Fault(
                 "basis",
                 "the components must be linearly independent",
-                found,
+                finding,
                 "choose a smaller k",
             )
         )
-    known = {str(take): i for i, take in enumerate(basis["take"].values)}
+    row_of = {str(take): i for i, take in enumerate(basis["take"].values)}
     stored = basis["take_coefficient"].values.astype(np.float64)
     bad = [
         name
         for name in names
-        if name not in known or not np.isfinite(stored[known[name]]).all()
+        if name not in row_of or not np.isfinite(stored[row_of[name]]).all()
     ]
     if bad:
         rule = "a take must have fitted surfels"
@@ -304,7 +305,7 @@ def _coefficients(names: Sequence[str], basis: xr.Dataset) -> Array:
         raise InputError(
             Fault(f"take {name}", rule, "none in the basis", cure) for name in bad
         )
-    return stored[[known[name] for name in names]]
+    return stored[[row_of[name] for name in names]]
 
 
 def _metric_and_basis(mixture: Array) -> Any:
@@ -313,8 +314,8 @@ def _metric_and_basis(mixture: Array) -> Any:
     """
 
     def of(tables: NDArray[Any]) -> tuple[Array, Array]:
-        own = c_contiguous(mixture)
-        return own @ brdf_metric(tables) @ own.T, tables @ own.T
+        weights = c_contiguous(mixture)
+        return weights @ brdf_metric(tables) @ weights.T, tables @ weights.T
 
     return of
 
@@ -339,7 +340,7 @@ def _by_subject(
     ]
     means = [
         np.stack(
-            [np.stack([known_mean(values[own]) for own in row]) for row in members]
+            [np.stack([known_mean(values[rows]) for rows in row]) for row in members]
         )
         for values in (coefficient, place)
     ]
@@ -352,13 +353,13 @@ def _pairs(
     """Distances [length of a BRDF] and p values of every pair, the method of
     adjustment, and flags.
     """
-    there = subjects.there
+    measured = subjects.there
     groups = subjects.groups
     rows = []
     within = []
     flags = list[str]()
     for a, b in combinations(range(len(groups)), 2):
-        both = there[:, a] & there[:, b]
+        both = measured[:, a] & measured[:, b]
         within.append(bool(both.any()))
         values = subjects.place[:, [a, b]]
         if within[-1]:
@@ -367,7 +368,7 @@ def _pairs(
             count = (len(values), len(values))
         else:
             step = known_mean(values[:, 0]) - known_mean(values[:, 1])
-            count = (int(there[:, a].sum()), int(there[:, b].sum()))
+            count = (int(measured[:, a].sum()), int(measured[:, b].sum()))
         name = f"{groups[a]} to {groups[b]}"
         statistic = np.nan
         p = np.nan
@@ -382,11 +383,11 @@ def _pairs(
                 values, max_draws=most, rng=rng
             )
         else:
-            one = np.concatenate(
-                [values[there[:, side], i] for i, side in enumerate((a, b))]
+            places = np.concatenate(
+                [values[measured[:, side], i] for i, side in enumerate((a, b))]
             )
             (statistic,), (p,), drawn = between_groups_p(
-                one, np.repeat([0, 1], count), max_draws=most, rng=rng
+                places, np.repeat([0, 1], count), max_draws=most, rng=rng
             )
         if 2 <= min(count) < FEW:
             flags.append(
@@ -434,8 +435,8 @@ def _adjusted(
         _, largest, _ = within_subjects_p(subjects.place, max_draws=most, rng=rng)
     else:
         group = np.argmax(subjects.there, axis=1)
-        own = subjects.place[np.arange(len(group)), group]
-        _, largest, _ = between_groups_p(own, group, max_draws=most, rng=rng)
+        places = subjects.place[np.arange(len(group)), group]
+        _, largest, _ = between_groups_p(places, group, max_draws=most, rng=rng)
     return np.maximum(largest, p), "largest statistic"
 
 
@@ -457,7 +458,9 @@ def describe_brdf_space(space: xr.Dataset) -> list[str]:
     differ = int((p < SIGNIFICANT).sum())
     how = space.attrs["adjusted_by"]
     how = how if how == ONE_PAIR else f"adjusted for all pairs: {how}"
-    fractions = ", ".join(f"{one:.0%}" for one in space["explained_fraction"].values)
+    fractions = ", ".join(
+        f"{fraction:.0%}" for fraction in space["explained_fraction"].values
+    )
     return [
         f"{differ} of {compared} pairs of groups differ (p < {SIGNIFICANT:g}; {how})",
         "distances are relative to the length of the mean BRDF; "

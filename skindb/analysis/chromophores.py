@@ -163,22 +163,22 @@ def chromophore_axes(
             "no landmarks: beards, brows and lips are used as skin and may rotate the axes"
         )
     count = max(SAMPLES // max(cohort.sizes["take"], 1), 64)
-    found = [
-        one
-        for one in each_take(_sampled, cohort, MAPPED, inside, count)
-        if one is not None
+    samples = [
+        sample
+        for sample in each_take(_sampled, cohort, MAPPED, inside, count)
+        if sample is not None
     ]
-    if not found:
+    if not samples:
         rule = "some texels of skin must be measured"
         cure = "fit or register more takes"
         raise InputError(Fault("chromophores", rule, "none", cure))
-    density = np.concatenate([one.density for one in found])
+    density = np.concatenate([sample.density for sample in samples])
     if density.var(axis=0).sum() <= CONSTANT:
         rule = "albedo must vary over the skin of a take"
         cure = "use maps of measured faces"
         raise InputError(Fault("chromophores", rule, "constant maps", cure))
     plane = _principal_plane(density)
-    mixing, spread = _components(found, plane, rng)
+    mixing, spread = _components(samples, plane, rng)
     reasons = _rejection_reasons(mixing, spread, plane)
     axes, origin = (
         (np.maximum(mixing, 0.0), INDEPENDENT)
@@ -193,7 +193,7 @@ def chromophore_axes(
     return dataset(
         {
             "chromophore_axis": axes,
-            "chromophore_offset": np.mean([one.mean for one in found], axis=0),
+            "chromophore_offset": np.mean([sample.mean for sample in samples], axis=0),
             "chromophore_table_axis": TABLE_AXES,
             "chromophore_table_angle": _angle(axes, TABLE_AXES),
             "chromophore_axis_spread": spread,
@@ -321,12 +321,16 @@ def chromophore_table(
     )
     parts = []
     for name in names:
-        own: dict[str, list[int]] = {}
+        rows_of_subject: dict[str, list[int]] = {}
         for i, (group, subject) in enumerate(zip(groups, people.subject, strict=True)):
             if group == name:
-                own.setdefault(subject, []).append(i)
+                rows_of_subject.setdefault(subject, []).append(i)
         parts.append(
-            Moments.of(np.stack([known_mean(values[rows]) for rows in own.values()]))
+            Moments.of(
+                np.stack(
+                    [known_mean(values[rows]) for rows in rows_of_subject.values()]
+                )
+            )
         )
     stacked = Moments.stacked(parts)
     low, high = (
@@ -391,7 +395,7 @@ def _principal_plane(density: Array) -> _Plane:
 
 
 def _components(
-    found: list[_Sampled], plane: _Plane, rng: np.random.Generator
+    samples: list[_Sampled], plane: _Plane, rng: np.random.Generator
 ) -> tuple[Array, Array]:
     """Independent components (2, 3), melanin first, and their RMS rotation [deg] in
     bootstrap samples.
@@ -402,7 +406,9 @@ def _components(
     if plane.variance[1] <= 1e-9 * plane.variance[0]:
         return nothing
     blocks = [
-        one.density[one.tile == tile] for one in found for tile in np.unique(one.tile)
+        sample.density[sample.tile == tile]
+        for sample in samples
+        for tile in np.unique(sample.tile)
     ]
     best = _independent(np.concatenate(blocks), rng)
     draws = [
@@ -446,32 +452,32 @@ def _rejection_reasons(mixing: Array, spread: Array, plane: _Plane) -> list[str]
     """Reasons why components cannot be the absorption of two pigments; empty if there are none."""
     if not np.isfinite(mixing).all():
         return ["albedo varies in one direction only, as with one pigment"]
-    why = []
+    reasons = []
     ratio = plane.variance[1] / max(plane.variance[2], 1e-300)
     if ratio < MIN_PLANE_RATIO:
-        why.append(
+        reasons.append(
             f"the second principal variance is {ratio:.2f} times the third, as "
             "with one pigment and noise"
         )
     if spread.max() > MAX_AXIS_SPREAD:
-        why.append(
+        reasons.append(
             f"they rotate by {spread.max():.0f} degrees between samples, as with "
             "normally distributed pigments"
         )
     if mixing.min() < -MAX_NEGATIVE:
         channel = CHANNELS[int(np.argmin(mixing.min(axis=0)))]
-        why.append(f"one of them would brighten {channel}, which no pigment does")
+        reasons.append(f"one of them would brighten {channel}, which no pigment does")
     angle = _angle(mixing, TABLE_AXES)
     for name, is_far, value in zip(
         CHROMOPHORES, angle > MAX_TABLE_ANGLE, angle, strict=True
     ):
         if is_far:
-            why.append(
+            reasons.append(
                 f"the axis of {name} is {value:.0f} degrees from published absorption"
             )
     if (apart := float(_angle(mixing[:1], mixing[1:])[0])) < MIN_SEPARATION:
-        why.append(f"they are {apart:.1f} degrees apart")
-    return why
+        reasons.append(f"they are {apart:.1f} degrees apart")
+    return reasons
 
 
 def _published_axes(plane: _Plane) -> tuple[Array, str]:
@@ -508,18 +514,18 @@ def _statistics(
     density, measured = _density(maps)
     covered = np.array([(measured & mask).sum() / max(mask.sum(), 1) for mask in masks])
     mean, deviation = np.full((2, len(masks), len(CHROMOPHORES)), np.nan)
-    left = np.full(len(masks), np.nan)
+    residuals = np.full(len(masks), np.nan)
     for r, mask in enumerate(masks):
         # the first region is the face, which needs no minimum coverage
         if not (covered[r] >= LEAST_COVERED if r else measured.any()):
             continue
         amounts, residual = _unmixed(density[measured & mask], axes, offset)
-        mean[r], deviation[r], left[r] = (
+        mean[r], deviation[r], residuals[r] = (
             amounts.mean(axis=0),
             amounts.std(axis=0),
             np.sqrt(np.mean(residual**2)),
         )
-    return mean, deviation, left, covered
+    return mean, deviation, residuals, covered
 
 
 def _angle(a: Array, b: Array) -> Array:
@@ -534,13 +540,13 @@ def describe_chromophores(axes: xr.Dataset) -> list[str]:
     """Origin of the axes and their angles to published absorption, one line each."""
     lines = [f"axes: {axes.attrs['axes_origin']}"]
     for name in CHROMOPHORES:
-        one = axes.sel(chromophore=name)
-        vector = ", ".join(f"{value:.2f}" for value in one["chromophore_axis"].values)
+        axis = axes.sel(chromophore=name)
+        vector = ", ".join(f"{value:.2f}" for value in axis["chromophore_axis"].values)
         lines.append(
             f"{name}: absorbs R, G, B as {vector}; "
-            f"{float(one['chromophore_table_angle']):.0f} degrees from "
+            f"{float(axis['chromophore_table_angle']):.0f} degrees from "
             f"published absorption; independent components rotate by "
-            f"{float(one['chromophore_axis_spread']):.1f} degrees "
+            f"{float(axis['chromophore_axis_spread']):.1f} degrees "
             "between samples"
         )
     lines.append(
@@ -554,10 +560,10 @@ def plot_chromophores(
     statistics: xr.Dataset, *, table: xr.Dataset | None = None, ax: Axes | None = None
 ) -> Axes:
     """Plot mean melanin and haemoglobin of the groups in every region, with 95 % intervals."""
-    shown = [
+    regions = [
         name for name in statistics["region"].values.tolist() if str(name) != "neck"
     ]
-    ax = ax or plots.new_axes(6.5, 1.4 + 0.55 * len(shown))
+    ax = ax or plots.new_axes(6.5, 1.4 + 0.55 * len(regions))
     ax.axvline(0, color="0.6", linewidth=1)
     if table is None:
         raise ValueError("table must be given; pass the result of chromophore_table")
@@ -567,18 +573,18 @@ def plot_chromophores(
         for c, (name, colour) in enumerate(
             zip(CHROMOPHORES, (plots.BLUE, plots.RED), strict=True)
         ):
-            one = table.sel(group=group, chromophore=name, region=shown)
-            y = np.arange(len(shown)) + 0.7 * (
+            part = table.sel(group=group, chromophore=name, region=regions)
+            y = np.arange(len(regions)) + 0.7 * (
                 (g * len(CHROMOPHORES) + c + 0.5) / lines - 0.5
             )
-            mean = one["group_chromophore_mean"].values
+            mean = part["group_chromophore_mean"].values
             bars = np.nan_to_num(
                 [
-                    mean - one["group_chromophore_mean_low"].values,
-                    one["group_chromophore_mean_high"].values - mean,
+                    mean - part["group_chromophore_mean_low"].values,
+                    part["group_chromophore_mean_high"].values - mean,
                 ]
             )
-            count = int(one["group_chromophore_count"].max())
+            count = int(part["group_chromophore_count"].max())
             ax.errorbar(
                 mean,
                 y,
@@ -591,7 +597,7 @@ def plot_chromophores(
                 linewidth=1,
                 label=f"{name}, {group} (n = {count})",
             )
-    ax.set_yticks(range(len(shown)), shown)
+    ax.set_yticks(range(len(regions)), regions)
     ax.invert_yaxis()
     ax.set_xlabel(
         "amount relative to the mean of all takes, with 95 % CI [-ln R_d at green]"

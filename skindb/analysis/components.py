@@ -68,89 +68,89 @@ def principal_components(
     >>> faces = db.cohort("maps").texel_diffuse_reflectance  # doctest: +SKIP
     >>> principal_components(faces, most=5).axis.sel(component=0).plot.imshow()  # doctest: +SKIP
     """
-    others = [str(dim) for dim in values.dims if dim != "take"]
-    cohort = values.transpose("take", *others).rename("values").to_dataset()
+    dims = [str(dim) for dim in values.dims if dim != "take"]
+    cohort = values.transpose("take", *dims).rename("values").to_dataset()
     takes = [str(take) for take in cohort["take"].values]
-    known = each_take(_finite_entries, cohort, ["values"])
-    fraction = np.array([one.mean() for one in known])
-    kept = np.flatnonzero((fraction >= least_known) & (fraction > 0))
+    finite = each_take(_finite_entries, cohort, ["values"])
+    fraction = np.array([entries.mean() for entries in finite])
+    rows = np.flatnonzero((fraction >= least_known) & (fraction > 0))
     skipped = [
         note(takes[i], f"only {fraction[i]:.0%} of its entries are known")
         for i in range(len(takes))
-        if i not in kept
+        if i not in rows
     ]
-    if len(kept) < 2:
+    if len(rows) < 2:
         rule = "at least two takes must have enough values"
-        there = f"{len(kept)} of {len(takes)}"
+        finding = f"{len(rows)} of {len(takes)}"
         raise InputError(
-            Fault("principal components", rule, there, "fit or register more takes")
+            Fault("principal components", rule, finding, "fit or register more takes")
         )
-    used: Mask = np.logical_and.reduce([known[i] for i in kept])
-    if not used.any():
-        there = f"none of {used.size}"
+    is_used: Mask = np.logical_and.reduce([finite[i] for i in rows])
+    if not is_used.any():
+        finding = f"none of {is_used.size}"
         cure = "set a larger least_known to exclude takes that cover other parts"
         raise InputError(
             Fault(
                 "principal components",
                 "some entries must be known in every take",
-                there,
+                finding,
                 cure,
             )
         )
-    once = shared_once(used)
+    once = shared_once(is_used)
     # the mean uses up one dimension: one more axis would be rounding error
-    most = min(most, max(len(kept) - 1, 1))
-    found = principal_axes(
-        np.stack(each_take(_used_entries, cohort.isel(take=kept), ["values"], once)),
+    most = min(most, max(len(rows) - 1, 1))
+    axes = principal_axes(
+        np.stack(each_take(_used_entries, cohort.isel(take=rows), ["values"], once)),
         most,
     )
-    ratio = found.variance / (found.total or 1.0)
-    shape = tuple(cohort.sizes[dim] for dim in others)
+    ratio = axes.variance / (axes.total or 1.0)
+    shape = tuple(cohort.sizes[dim] for dim in dims)
     units = values.attrs.get("units", "1")
     ds = xr.Dataset(
         {
-            "mean": (others, _expand(found.mean, used, shape), {"units": units}),
+            "mean": (dims, _expand(axes.mean, is_used, shape), {"units": units}),
             "axis": (
-                ["component", *others],
-                _expand(found.axes, used, shape),
+                ["component", *dims],
+                _expand(axes.axes, is_used, shape),
                 UNIT,
             ),
-            "score": (["take", "component"], found.score, {"units": units}),
+            "score": (["take", "component"], axes.score, {"units": units}),
             "explained_variance": (
                 ["component"],
-                found.variance,
+                axes.variance,
                 {"long_name": "variance of the score"},
             ),
             "explained_variance_ratio": (["component"], ratio),
             "residual": (
                 ["take"],
-                found.residual,
+                axes.residual,
                 {"units": units, "long_name": "root mean square residual"},
             ),
         },
         coords={
-            "component": np.arange(len(found.variance)),
-            "take": cohort["take"].values[kept],
+            "component": np.arange(len(axes.variance)),
+            "take": cohort["take"].values[rows],
         },
-        attrs={"skipped": skipped, "used_fraction": float(used.mean())},
+        attrs={"skipped": skipped, "used_fraction": float(is_used.mean())},
     )
-    return ds.assign_coords(
-        {dim: cohort[dim] for dim in others if dim in cohort.coords}
-    )
+    return ds.assign_coords({dim: cohort[dim] for dim in dims if dim in cohort.coords})
 
 
 def _finite_entries(take: xr.Dataset) -> Mask:
     return np.asarray(np.isfinite(take["values"].values).ravel())
 
 
-def _used_entries(take: xr.Dataset, used: Mask) -> Array:
-    return np.asarray(take["values"].values.ravel()[used])
+def _used_entries(take: xr.Dataset, is_used: Mask) -> Array:
+    return np.asarray(take["values"].values.ravel()[is_used])
 
 
-def _expand(values: Array, used: Mask, shape: tuple[int, ...]) -> NDArray[np.float64]:
+def _expand(
+    values: Array, is_used: Mask, shape: tuple[int, ...]
+) -> NDArray[np.float64]:
     """Arrange entries (..., used) as arrays (..., *shape); NaN where an entry was not used."""
-    out = np.full((*values.shape[:-1], used.size), np.nan)
-    out[..., used] = values
+    out = np.full((*values.shape[:-1], is_used.size), np.nan)
+    out[..., is_used] = values
     return out.reshape(*values.shape[:-1], *shape)
 
 
@@ -178,22 +178,22 @@ def face_components(
     if not mixed_fits:
         require_same_fit(cohort)
     albedo = cohort["texel_diffuse_reflectance"]
-    found = principal_components(albedo, most=most)
+    components = principal_components(albedo, most=most)
     return dataset(
         {
-            "principal_mean": found["mean"].values,
-            "principal_axis": found["axis"].values,
-            "principal_score": found["score"].values,
-            "principal_variance_ratio": found["explained_variance_ratio"].values,
-            "principal_residual": found["residual"].values,
+            "principal_mean": components["mean"].values,
+            "principal_axis": components["axis"].values,
+            "principal_score": components["score"].values,
+            "principal_variance_ratio": components["explained_variance_ratio"].values,
+            "principal_residual": components["residual"].values,
         },
         coords={
-            "take": [str(take) for take in found["take"].values],
+            "take": [str(take) for take in components["take"].values],
             "channel": ["R", "G", "B"],
         },
         attrs={
-            "skipped": [*cohort.attrs.get("skipped", []), *found.attrs["skipped"]],
-            "used_fraction": found.attrs["used_fraction"],
+            "skipped": [*cohort.attrs.get("skipped", []), *components.attrs["skipped"]],
+            "used_fraction": components.attrs["used_fraction"],
         },
     )
 
@@ -202,11 +202,13 @@ def tabulate_components(table: xr.Dataset) -> tuple[list[str], list[list[Any]]]:
     """Header and one row per take with its scores and its residual."""
     names = [f"score_{i + 1}" for i in range(table.sizes["component"])]
     scores = table["principal_score"].values
-    left = table["principal_residual"].values
+    residuals = table["principal_residual"].values
     takes = table["take"].values.tolist()
     rows = [
-        [take, *own, rest]
-        for take, own, rest in zip(takes, scores.tolist(), left.tolist(), strict=True)
+        [take, *row, rest]
+        for take, row, rest in zip(
+            takes, scores.tolist(), residuals.tolist(), strict=True
+        )
     ]
     return ["take", *names, "principal_residual"], rows
 
@@ -216,9 +218,10 @@ def describe_components(table: xr.Dataset) -> list[str]:
     ratios = ", ".join(
         f"{ratio:.0%}" for ratio in table["principal_variance_ratio"].values
     )
-    used = f"{table.attrs['used_fraction']:.0%} of the texels, which all takes have"
+    fraction = f"{table.attrs['used_fraction']:.0%} of the texels, which all takes have"
     lines = [
-        f"components explain {ratios} of the variance between {table.sizes['take']} takes ({used})"
+        f"components explain {ratios} of the variance between "
+        f"{table.sizes['take']} takes ({fraction})"
     ]
     return [
         *lines,

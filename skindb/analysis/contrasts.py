@@ -63,7 +63,9 @@ class Quantities:
     def of_subjects(self) -> Quantities:
         """Means over the takes of every subject."""
         names = list(dict.fromkeys(self.subject))
-        takes = [np.array([name == own for own in self.subject]) for name in names]
+        takes = [
+            np.array([name == subject for subject in self.subject]) for name in names
+        ]
         values = np.stack([known_mean(self.values[rows]) for rows in takes])
         squares = np.stack(
             [known_mean(self.errors[rows] ** 2) / rows.sum() for rows in takes]
@@ -124,10 +126,10 @@ def quantities_of(cohort: xr.Dataset) -> Quantities:
         values = np.asarray(
             cohort[variable].transpose("take", *dims).values, np.float64
         )
-        known = f"{variable}_error" in cohort
+        has_errors = f"{variable}_error" in cohort
         errors = (
             np.asarray(cohort[f"{variable}_error"].transpose("take", *dims).values)
-            if known
+            if has_errors
             else values * np.nan
         )
         if is_log:
@@ -137,14 +139,17 @@ def quantities_of(cohort: xr.Dataset) -> Quantities:
             errors = np.where(good, errors / np.where(good, values, 1.0), np.nan)
             values = np.where(good, np.log(np.where(good, values, 1.0)), np.nan)
         for index in np.ndindex(values.shape[1:]):
-            there = [
+            labels = [
                 CHANNELS if dim == "channel" else cohort[dim].values for dim in dims
             ]
             names.append(
                 " ".join(
                     [
                         prefix,
-                        *(str(one[i]) for one, i in zip(there, index, strict=True)),
+                        *(
+                            str(names_of_dim[i])
+                            for names_of_dim, i in zip(labels, index, strict=True)
+                        ),
                     ]
                 )
             )
@@ -156,17 +161,17 @@ def quantities_of(cohort: xr.Dataset) -> Quantities:
     add("R_d", "region_diffuse_reflectance", ("region", "channel"), common=limit)
     add(SURFACE, "region_surface_reflectance", ("region",))
     add("sigma_tr", "site_sigma_tr", ("site", "channel"), is_log=True)
-    kept = [i for i, column in enumerate(columns) if np.isfinite(column[0]).any()]
-    if not kept:
+    measured = [i for i, column in enumerate(columns) if np.isfinite(column[0]).any()]
+    if not measured:
         rule = "some take must have albedo, surface reflectance or sigma_tr"
         raise InputError(
             Fault("population", rule, "none of them", "fit the takes again")
         )
-    values, errors, is_log, common = zip(*(columns[i] for i in kept), strict=True)
+    values, errors, is_log, common = zip(*(columns[i] for i in measured), strict=True)
     subject = tuple(map(str, cohort["subject"].values))
     stacked = np.stack(values, axis=1), np.stack(errors, axis=1)
     return Quantities(
-        tuple(names[i] for i in kept),
+        tuple(names[i] for i in measured),
         *stacked,
         np.array(is_log),
         np.array(common),
@@ -222,12 +227,12 @@ def contrasts(
     covariates = np.concatenate([nothing, *(one.columns for one in held)], axis=1)
 
     def contrast(name: str, regressor: Array, *, is_number: bool = False) -> Contrast:
-        known = np.isfinite(regressor) & np.isfinite(covariates).all(axis=1)
+        is_complete = np.isfinite(regressor) & np.isfinite(covariates).all(axis=1)
         return Contrast(
             name,
-            quantities.of_takes(known),
-            regressor[known],
-            covariates[known],
+            quantities.of_takes(is_complete),
+            regressor[is_complete],
+            covariates[is_complete],
             is_number,
         )
 
@@ -238,10 +243,10 @@ def contrasts(
         return [contrast(f"{trait} less others", regressor)]
     words = sorted({word_of(value) for value in stated.known})
     if len(words) < 2:
-        found = f"only {words[0]}" if words else "no subject with this attribute"
+        finding = f"only {words[0]}" if words else "no subject with this attribute"
         rule = "there must be subjects of two groups"
         raise InputError(
-            Fault(f"group by {group_by}", rule, found, "group by another attribute")
+            Fault(f"group by {group_by}", rule, finding, "group by another attribute")
         )
     if stated.is_numeric:
         return [contrast(f"{group_by}, per unit", stated.numbers, is_number=True)]
@@ -260,10 +265,10 @@ def _carriers(everyone: Subjects, subjects: Subjects, trait: str) -> dict[str, f
     """Subject -> 1 with and 0 without a trait, from its first take that is compared."""
     usable = comparable_takes(subjects, trait) & has_attribute(subjects, trait)
     # of all takes, because the median age is that of all subjects
-    whole = dict(zip(everyone.take, has_trait(everyone, trait).tolist(), strict=True))
+    of_take = dict(zip(everyone.take, has_trait(everyone, trait).tolist(), strict=True))
     carries: dict[str, float] = {}
     for i in np.flatnonzero(usable):
-        carries.setdefault(subjects.subject[i], float(whole[subjects.take[i]]))
+        carries.setdefault(subjects.subject[i], float(of_take[subjects.take[i]]))
     return carries
 
 
@@ -281,7 +286,11 @@ def _paired(
     pairs = []
     for name in names:
         changed = quantities.of_takes(conditions == name)
-        both = [own for own in dict.fromkeys(changed.subject) if own in plain.subject]
+        both = [
+            subject
+            for subject in dict.fromkeys(changed.subject)
+            if subject in plain.subject
+        ]
         if not both:
             continue
         after = changed.of_subjects().of_named(both)
@@ -311,13 +320,15 @@ def contrast_counts(contrast: Contrast) -> Array:
     """Numbers (quantity, side) of subjects with and without; for numeric attributes and
     pairs, all count as "with".
     """
-    known = np.isfinite(contrast.quantities.values)
+    is_known = np.isfinite(contrast.quantities.values)
     is_with = (
-        np.ones(len(known), np.bool_)
+        np.ones(len(is_known), np.bool_)
         if contrast.is_number or contrast.is_paired
         else contrast.regressor > 0
     )
-    return np.stack([known[is_with].sum(axis=0), known[~is_with].sum(axis=0)], axis=1)
+    return np.stack(
+        [is_known[is_with].sum(axis=0), is_known[~is_with].sum(axis=0)], axis=1
+    )
 
 
 def other_attributes(subjects: Subjects, group_by: str) -> list[str]:
@@ -342,10 +353,10 @@ def _association(contrast: Contrast, subjects: Subjects, name: str) -> float:
     if other.odd_words:
         return float("nan")
     columns = other.columns
-    known = np.isfinite(columns).all(axis=1)
-    if not known.any():
+    is_known = np.isfinite(columns).all(axis=1)
+    if not is_known.any():
         return float("nan")
-    return multiple_correlation(contrast.regressor[known], columns[known])
+    return multiple_correlation(contrast.regressor[is_known], columns[is_known])
 
 
 def contrast_flags(
@@ -388,13 +399,13 @@ def _collinearity(contrast: Contrast, adjust: Sequence[str]) -> list[str]:
 
 def _few_subjects(contrast: Contrast, count: Array) -> list[str]:
     """A warning if few subjects are compared."""
-    most = [int(side) for side in count.max(axis=0)]
-    text = f"{most[0]} subjects"
+    counts = [int(side) for side in count.max(axis=0)]
+    text = f"{counts[0]} subjects"
     if not (contrast.is_number or contrast.is_paired):
-        text += f" with and {most[1]} without"
+        text += f" with and {counts[1]} without"
     else:
-        most = most[:1]
-    if min(most) >= FEW:
+        counts = counts[:1]
+    if min(counts) >= FEW:
         return []
     return [f"{text}; with fewer than {FEW} the intervals assume normal values"]
 

@@ -109,11 +109,11 @@ def component_correlations(
             )
         )
     values = _components(quantities_of(takes), region)
-    known = np.isfinite(values)
+    is_known = np.isfinite(values)
     pairs = [
         (i, j)
         for i, j in combinations(range(len(COMPONENTS)), 2)
-        if (known[:, i] & known[:, j]).sum() >= MIN_SUBJECTS
+        if (is_known[:, i] & is_known[:, j]).sum() >= MIN_SUBJECTS
     ]
     pairs = [(i, j) for i, j in pairs if _varies(values[:, [i, j]])]
     if not pairs:
@@ -121,7 +121,7 @@ def component_correlations(
         cure = "fit more subjects"
         raise InputError(Fault("correlations", rule, f"{len(values)} subjects", cure))
     rows = [_pair(values[:, [i, j]], permutations, rng) for i, j in pairs]
-    found, low, high, p, count = (
+    values_of_pairs, low, high, p, count = (
         np.array(column) for column in zip(*rows, strict=True)
     )
     flags = (
@@ -131,7 +131,7 @@ def component_correlations(
     )
     return dataset(
         {
-            "component_correlation": found,
+            "component_correlation": values_of_pairs,
             "component_correlation_low": low,
             "component_correlation_high": high,
             "correlation_p": p,
@@ -147,11 +147,11 @@ def component_correlations(
     )
 
 
-def _components(every: Quantities, region: str) -> Array:
+def _components(quantities: Quantities, region: str) -> Array:
     """Values (subject, component); NaN where a subject lacks a component."""
-    own = every.of_subjects()
-    columns = dict(zip(own.names, own.values.T, strict=True))
-    nothing = np.full(len(own.subject), np.nan)
+    of_subjects = quantities.of_subjects()
+    columns = dict(zip(of_subjects.names, of_subjects.values.T, strict=True))
+    nothing = np.full(len(of_subjects.subject), np.nan)
     out = [columns.get(f"R_d {region} {channel}", nothing) for channel in CHANNELS]
     out.append(columns.get(f"{SURFACE} {region}", nothing))
     for channel in CHANNELS:
@@ -172,8 +172,8 @@ def _components(every: Quantities, region: str) -> Array:
 
 def _varies(two: Array) -> bool:
     """Whether both columns vary between the subjects that have both."""
-    known = two[np.isfinite(two).all(axis=1)]
-    return bool((np.ptp(known, axis=0) > 0).all())
+    complete = two[np.isfinite(two).all(axis=1)]
+    return bool((np.ptp(complete, axis=0) > 0).all())
 
 
 def _pair(
@@ -184,7 +184,7 @@ def _pair(
     # pairs of subjects are drawn anew; all of them are used if there are at most `permutations`
     p = stats.permutation_test(
         (x,),
-        lambda own, axis: np.abs(_pearson(own, y, axis)),
+        lambda permuted, axis: np.abs(_pearson(permuted, y, axis)),
         permutation_type="pairings",
         vectorized=True,
         n_resamples=permutations,
@@ -193,7 +193,7 @@ def _pair(
     ).pvalue
     low = high = float("nan")
     if len(x) >= FEW:
-        made = stats.bootstrap(
+        interval = stats.bootstrap(
             (x, y),
             _pearson,
             paired=True,
@@ -202,14 +202,14 @@ def _pair(
             method="BCa",
             rng=rng,
         ).confidence_interval
-        low = float(made.low)
-        high = float(made.high)
+        low = float(interval.low)
+        high = float(interval.high)
     return float(_pearson(x, y)), low, high, float(p), len(x)
 
 
 def _pearson(x: Array, y: Array, axis: int = -1) -> Array:
     """Correlation along an axis; 0 where a resample does not vary."""
-    x, y = (one - one.mean(axis=axis, keepdims=True) for one in (x, y))
+    x, y = (variable - variable.mean(axis=axis, keepdims=True) for variable in (x, y))
     size = np.sqrt((x**2).sum(axis=axis) * (y**2).sum(axis=axis))
     return np.asarray(
         np.divide((x * y).sum(axis=axis), size, out=np.zeros_like(size), where=size > 0)
@@ -228,21 +228,21 @@ def plot_correlations(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     names: list[Any] = table["pair"].values.tolist()
     ax = ax or plots.new_axes(6.5, 1.0 + 0.24 * len(names))
     ax.axvline(0, color="0.6", linewidth=1)
-    found = table["component_correlation"].values
+    correlations = table["component_correlation"].values
     place = np.arange(len(names))[::-1]
     bars = np.stack(
         [
-            found - table["component_correlation_low"].values,
-            table["component_correlation_high"].values - found,
+            correlations - table["component_correlation_low"].values,
+            table["component_correlation_high"].values - correlations,
         ]
     )
     bars = np.maximum(np.nan_to_num(bars), 0.0)
     significant = table["correlation_p_false_discovery"].values < 0.05
-    for kept, fill in ((significant, plots.CYCLE[0]), (~significant, "white")):
+    for rows, fill in ((significant, plots.CYCLE[0]), (~significant, "white")):
         ax.errorbar(
-            found[kept],
-            place[kept],
-            xerr=bars[:, kept],
+            correlations[rows],
+            place[rows],
+            xerr=bars[:, rows],
             fmt="o",
             color=plots.CYCLE[0],
             mfc=fill,

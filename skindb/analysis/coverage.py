@@ -100,7 +100,7 @@ def coverage_report(cohort: xr.Dataset) -> xr.Dataset:
         [[_association(stated[a], stated[b]) for b in names] for a in names]
     ).reshape(len(names), len(names))
     unknown = {
-        name: sum(not one for one in factor)
+        name: sum(not value for value in factor)
         for name, factor in factors.items()
         if name not in (CONDITION, SITE)
     }
@@ -145,8 +145,12 @@ def _factors(
         conditions = takes.attributes[CONDITION].values
     rows = [takes.rows_of(name) for name in takes.names]
     factors[CONDITION] = [
-        frozenset(str(v) for v in itertools.compress(conditions, own) if v is not None)
-        for own in rows
+        frozenset(
+            str(v)
+            for v in itertools.compress(conditions, rows_of_subject)
+            if v is not None
+        )
+        for rows_of_subject in rows
     ]
     if "site_status" in cohort:
         good = (
@@ -156,8 +160,12 @@ def _factors(
         measured = np.asarray(measured & takes.is_normal[:, None])
         sites = [str(site) for site in cohort["site"].values]
         factors[SITE] = [
-            frozenset(itertools.compress(sites, np.any(measured[own], axis=0).tolist()))
-            for own in rows
+            frozenset(
+                itertools.compress(
+                    sites, np.any(measured[rows_of_subject], axis=0).tolist()
+                )
+            )
+            for rows_of_subject in rows
         ]
     order = [*CROSSED, CONDITION, SITE]
     return {
@@ -182,18 +190,18 @@ def _cells(
     combined: list[tuple[str, ...]] = [(name,) for name in factors]
     combined += list(itertools.combinations(crossed, 2))
     combined += [
-        (name, other)
+        (name, factor)
         for name in crossed
-        for other in (CONDITION, SITE)
-        if other in factors
+        for factor in (CONDITION, SITE)
+        if factor in factors
     ]
     combined += [tuple(crossed)] if len(crossed) == 3 else []
     for chosen in combined:
         for cell in itertools.product(*(levels[name] for name in chosen)):
             subjects = zip(*(factors[name] for name in chosen), strict=True)
             count = sum(
-                all(value in has for value, has in zip(cell, one, strict=True))
-                for one in subjects
+                all(value in has for value, has in zip(cell, values, strict=True))
+                for values in subjects
             )
             yield (
                 tuple(
@@ -205,11 +213,11 @@ def _cells(
 
 def _values(name: str, factor: Factor) -> list[str]:
     """Sorted values of a factor; for age, all decades from the youngest to the oldest subject."""
-    found = sorted(set().union(*factor))
-    if name != AGE_BAND or not found:
-        return found
-    first = [int(one.partition("-")[0]) for one in found]
-    return [_band(decade) for decade in range(min(first), max(first) + 1, DECADE)]
+    values = sorted(set().union(*factor))
+    if name != AGE_BAND or not values:
+        return values
+    decades = [int(value.partition("-")[0]) for value in values]
+    return [_band(decade) for decade in range(min(decades), max(decades) + 1, DECADE)]
 
 
 def _flags(
@@ -226,7 +234,7 @@ def _flags(
     flags = []
     kinds: dict[tuple[str, ...], dict[tuple[str, ...], int]] = {}
     for cell, count in counts.items():
-        kinds.setdefault(tuple(one.partition(": ")[0] for one in cell), {})[cell] = (
+        kinds.setdefault(tuple(part.partition(": ")[0] for part in cell), {})[cell] = (
             count
         )
     for kind, cells in kinds.items():
@@ -242,7 +250,7 @@ def _flags(
         reported = {
             cell: count
             for cell, count in cells.items()
-            if all(counts[one,] for one in cell)
+            if all(counts[part,] for part in cell)
         }
         empty_ones = [
             _cell_values(cell)
@@ -291,23 +299,23 @@ def _association(a: Attribute, b: Attribute) -> float:
     both = [(x, y) for x, y in pairs if x is not None and y is not None]
     if len(both) < 3:
         return float("nan")
-    first, second = (
+    a_values, second = (
         Attribute(attribute.name, values)
         for attribute, values in zip((a, b), zip(*both, strict=True), strict=True)
     )
-    if len(first.words) < 2 or len(second.words) < 2:
+    if len(a_values.words) < 2 or len(second.words) < 2:
         return float("nan")
     if a.is_numeric and b.is_numeric:
-        return float(np.abs(np.corrcoef(first.numbers, second.numbers)[0, 1]))
+        return float(np.abs(np.corrcoef(a_values.numbers, second.numbers)[0, 1]))
     if b.is_numeric:
-        first, second = second, first
+        a_values, second = second, a_values
     if a.is_numeric or b.is_numeric:
         words = tuple(map(str, second.values))
         return multiple_correlation(
-            first.numbers, Attribute(second.name, words).columns
+            a_values.numbers, Attribute(second.name, words).columns
         )
     counts = Counter((str(x), str(y)) for x, y in both)
-    table = [[counts[x, y] for y in second.words] for x in first.words]
+    table = [[counts[x, y] for y in second.words] for x in a_values.words]
     return _cramer(np.array(table))
 
 
@@ -318,11 +326,13 @@ def _cramer(table: Array) -> float:
     n, (rows, columns) = table.sum(), table.shape
     square = float(association(table, method="cramer")) ** 2 * (min(rows, columns) - 1)
     corrected = max(0.0, square - (rows - 1) * (columns - 1) / (n - 1))
-    most = (
+    largest = (
         min(rows - (rows - 1) ** 2 / (n - 1), columns - (columns - 1) ** 2 / (n - 1))
         - 1
     )
-    return float(min(1.0, np.sqrt(corrected / most))) if most > 0 else float("nan")
+    return (
+        float(min(1.0, np.sqrt(corrected / largest))) if largest > 0 else float("nan")
+    )
 
 
 def _measure_name(a: Attribute, b: Attribute) -> str:
@@ -332,12 +342,12 @@ def _measure_name(a: Attribute, b: Attribute) -> str:
 
 
 def _band(age: object) -> str:
-    first = int(float(str(age)) // DECADE * DECADE)
-    return f"{first}-{first + DECADE - 1}"
+    start = int(float(str(age)) // DECADE * DECADE)
+    return f"{start}-{start + DECADE - 1}"
 
 
 def _cell_values(cell: tuple[str, ...]) -> str:
-    return AND.join(one.partition(": ")[2] for one in cell)
+    return AND.join(part.partition(": ")[2] for part in cell)
 
 
 def _join_names(names: Sequence[str]) -> str:
@@ -371,8 +381,8 @@ def plot_coverage(report: xr.Dataset, *, ax: Axes | None = None) -> Axes:
         _, ax = pyplot.subplots(
             figsize=(2.6 + 0.75 * len(columns), 1.1 + 0.4 * len(rows))
         )
-    most = max(int(counts.max()), FEW)
-    norm = LogNorm(0.5, 2 * most)
+    largest = max(int(counts.max()), FEW)
+    norm = LogNorm(0.5, 2 * largest)
     ax.imshow(np.ma.masked_equal(counts, 0), cmap="Blues", norm=norm, aspect="auto")
     for i, j in np.ndindex(counts.shape):
         dark = norm(max(int(counts[i, j]), 1)) > DARK
@@ -404,22 +414,22 @@ def _plot_table(
         for name in cells
         if len(name) == 1 and name[0].startswith(f"{AGE_BAND}: ")
     ]
-    others = [
+    without_age = [
         name
         for name in cells
-        if len(name) < 3 and not any(one.startswith(AGE_BAND) for one in name)
+        if len(name) < 3 and not any(part.startswith(AGE_BAND) for part in name)
     ]
     kinds = (GENDER, ANCESTRY, CONDITION, SITE)
     single = [
         name[0]
-        for name in others
+        for name in without_age
         if len(name) == 1 and (not bands or name[0].partition(":")[0] in kinds)
     ]
     pairs = [
         name
-        for name in others
+        for name in without_age
         if len(name) == 2
-        and {one.partition(":")[0] for one in name} == {GENDER, ANCESTRY}
+        and {part.partition(":")[0] for part in name} == {GENDER, ANCESTRY}
     ]
     if not bands:
         keys: list[tuple[str, ...]] = [*((name,) for name in single), *pairs]
@@ -436,9 +446,9 @@ def _plot_table(
     return labels, [band.partition(": ")[2] for band in bands], table
 
 
-def _cell_count(cells: Mapping[tuple[str, ...], int], wanted: tuple[str, ...]) -> int:
+def _cell_count(cells: Mapping[tuple[str, ...], int], parts: tuple[str, ...]) -> int:
     """Number of subjects in a crossing, whatever the order of its factors."""
-    return next((count for name, count in cells.items() if set(name) == set(wanted)), 0)
+    return next((count for name, count in cells.items() if set(name) == set(parts)), 0)
 
 
 @dataclass(frozen=True)

@@ -69,8 +69,8 @@ def transfer_detail(
         unknown, if the takes were not registered together, or if the wavelength is
         below four texels.
     """
-    for one in (model, source):
-        honour_consent(one.attrs, "statistics")
+    for take in (model, source):
+        honour_consent(take.attrs, "statistics")
     if not np.array_equal(
         registered["landmark"].values, source_registered["landmark"].values
     ):
@@ -92,13 +92,13 @@ def transfer_detail(
                 "choose a larger wavelength or more texels",
             )
         )
-    own, other = (
-        common_maps(one, placed, size=size)
-        for one, placed in ((model, registered), (source, source_registered))
+    maps, source_maps = (
+        common_maps(take, placed, size=size)
+        for take, placed in ((model, registered), (source, source_registered))
     )
-    (log, _), (log_source, there) = log_albedo(own), log_albedo(other)
+    (log, _), (log_source, is_measured) = log_albedo(maps), log_albedo(source_maps)
     fraction = np.asarray(
-        _region(region, registered, source_registered, size) & there, np.float32
+        _region(region, registered, source_registered, size) & is_measured, np.float32
     )
     # 0 where the source was not measured
     fraction = gaussian_filter(fraction, EDGE / per_texel) * fraction
@@ -128,24 +128,25 @@ def transfer_detail(
     return tree
 
 
-def _detail_change(image: Array, other: Array, fraction: Array, levels: int) -> Array:
+def _detail_change(image: Array, source: Array, fraction: Array, levels: int) -> Array:
     """Change (v, u) of an image that replaces its finest levels by those of another
     image where `fraction` is 1.
     """
     mine = build(image, levels)
-    theirs = build(other, levels)
+    theirs = build(source, levels)
     parts = mine.parts()
-    others = theirs.parts()
+    source_parts = theirs.parts()
     weights = level_fractions(fraction, [part.shape for part in parts])
     steps: list[Image] = [
-        weight * (b - a) for a, b, weight in zip(parts, others, weights, strict=True)
+        weight * (b - a)
+        for a, b, weight in zip(parts, source_parts, weights, strict=True)
     ]
     steps[-1] = np.zeros_like(parts[-1])  # the low-pass residual of the face is kept
     return reconstruct(mine.with_parts(steps))
 
 
 def _region(
-    region: str | Mask, registered: xr.Dataset, other: xr.Dataset, size: int
+    region: str | Mask, registered: xr.Dataset, source_registered: xr.Dataset, size: int
 ) -> Mask:
     if not isinstance(region, str):
         mask = np.asarray(region, np.bool_)
@@ -154,7 +155,7 @@ def _region(
             cure = "pass a mask of that shape, or another size"
             raise InputError(Fault("region", rule, str(mask.shape), cure))
         return mask
-    landmarks = common_landmarks({"own": registered, "other": other})
+    landmarks = common_landmarks({"own": registered, "other": source_registered})
     drawn = map_regions(landmarks, size)
     if region not in drawn:
         cure = f"choose one of {', '.join(drawn)}"

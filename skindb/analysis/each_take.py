@@ -38,20 +38,20 @@ def each_take(
         Arrays, or Dask collections, that every call receives; the graph holds one copy of each.
     """
     names = [name for name in variables if name in cohort.variables]
-    asked = cohort[names]
-    asked = asked.drop_vars(
-        [name for name in asked.coords if name not in names]
+    chosen = cohort[names]
+    chosen = chosen.drop_vars(
+        [name for name in chosen.coords if name not in names]
     )  # otherwise every task would hold them
-    takes = [asked.isel(take=i) for i in range(cohort.sizes["take"])]
+    takes = [chosen.isel(take=i) for i in range(cohort.sizes["take"])]
     call = delayed(_InOrder(function), pure=False, traverse=False)
-    once = [shared_once(one) for one in shared]
-    return list(compute(*(call(one, *once) for one in takes)))  # type: ignore[no-untyped-call]
+    once = [shared_once(value) for value in shared]
+    return list(compute(*(call(value, *once) for value in takes)))  # type: ignore[no-untyped-call]
 
 
 def each_item(function: Callable[[Any], Result], items: Iterable[Any]) -> list[Result]:
     """Apply a function to every item; the graph holds one copy of `function`."""
     call = delayed(_InOrder(function), pure=False, traverse=False)
-    return list(compute(*(call(one) for one in items)))  # type: ignore[no-untyped-call]
+    return list(compute(*(call(item) for item in items)))  # type: ignore[no-untyped-call]
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class _InOrder:
 def _in_order(value: Any) -> Any:
     if isinstance(value, xr.Dataset):
         return value.map(
-            lambda one: one.copy(data=c_contiguous(one.values)), keep_attrs=True
+            lambda array: array.copy(data=c_contiguous(array.values)), keep_attrs=True
         )
     return c_contiguous(value) if isinstance(value, np.ndarray) else value
 

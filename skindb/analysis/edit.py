@@ -160,19 +160,19 @@ def apply_traits(
                 _moved_sites(tree["translucency"].to_dataset().load(), amount, traits)
             )
     tree["fitted"] = xr.DataTree(surviving(fitted))
-    kept = {name: model.attrs[name] for name in KEPT_ATTRS if name in model.attrs}
+    attrs = {name: model.attrs[name] for name in KEPT_ATTRS if name in model.attrs}
     far = max(moves, default=0.0)
-    used = [str(traits["trait"].values[i]) for i in np.flatnonzero(amount)]
-    tree.attrs = kept | {
+    names = [str(traits["trait"].values[i]) for i in np.flatnonzero(amount)]
+    tree.attrs = attrs | {
         "edit": dict(amounts),
         "edit_distance": far,
         "edit_report": reports,
     }
-    tree.attrs["trait_notes"] = _notes(traits, used)
+    tree.attrs["trait_notes"] = _notes(traits, names)
     return tree
 
 
-def _notes(traits: xr.Dataset, used: list[str]) -> list[str]:
+def _notes(traits: xr.Dataset, names: list[str]) -> list[str]:
     """A line for each trait: its number of takes, or the warning of the study about it."""
     flagged = {flag.partition(": ")[0]: flag for flag in traits.attrs.get("flags", [])}
     counts = {
@@ -184,24 +184,24 @@ def _notes(traits: xr.Dataset, used: list[str]) -> list[str]:
         t: f"{n} takes with, {without} without" if without else f"{n} takes"
         for t, (n, without) in counts.items()
     }
-    return [flagged.get(name, f"{name}: {sides[name]}") for name in used]
+    return [flagged.get(name, f"{name}: {sides[name]}") for name in names]
 
 
 def _trait_amounts(amounts: Mapping[str, float], traits: xr.Dataset) -> Array:
     """Amounts (trait,); raises `InputError` for unknown traits and for amounts that are
     not finite or too large.
     """
-    known = [str(t) for t in traits["trait"].values]
-    found = np.zeros(len(known))
+    names = [str(t) for t in traits["trait"].values]
+    total = np.zeros(len(names))
     faults = list[Fault]()
     for name, amount in amounts.items():
         try:
-            found[known.index(trait_name(name, known))] += amount
+            total[names.index(trait_name(name, names))] += amount
         except InputError as error:
             faults += error.faults
     if faults:
         raise InputError(faults)
-    if not np.isfinite(found).all():
+    if not np.isfinite(total).all():
         raise InputError(
             Fault(
                 "amount",
@@ -210,12 +210,12 @@ def _trait_amounts(amounts: Mapping[str, float], traits: xr.Dataset) -> Array:
                 "give a number such as 0.5",
             )
         )
-    if np.abs(found).max(initial=0.0) > MAX_AMOUNT:
+    if np.abs(total).max(initial=0.0) > MAX_AMOUNT:
         rule = f"must be between -{MAX_AMOUNT:g} and {MAX_AMOUNT:g}; 1 is the whole difference"
         raise InputError(
             Fault("amount", rule, str(dict(amounts)), "give a number such as 0.5")
         )
-    return found
+    return total
 
 
 def _moved_surface(
@@ -230,15 +230,17 @@ def _moved_surface(
     H = basis["population_mixture"].values.astype(np.float64)
     here = project(weights[good], H, metric)
     moved = np.full((len(weights), len(H)), np.nan)
-    own = np.average(here, axis=0, weights=area)
-    [wanted] = project(((own + shift) @ H)[None], H, metric) if shift.any() else [own]
-    step = wanted - own
-    weaker = np.where((step < 0) & (own > 0), wanted / np.where(own > 0, own, 1.0), 1.0)
+    mean = np.average(here, axis=0, weights=area)
+    [target] = project(((mean + shift) @ H)[None], H, metric) if shift.any() else [mean]
+    step = target - mean
+    weaker = np.where(
+        (step < 0) & (mean > 0), target / np.where(mean > 0, mean, 1.0), 1.0
+    )
     moved[good] = here * weaker + np.maximum(step, 0.0)
     takes = [str(t) for t in basis["take"].values]
     gram = H @ metric @ H.T
     distance, move = _distances(
-        wanted, own, basis["take_coefficient"].values, takes, gram
+        target, mean, basis["take_coefficient"].values, takes, gram
     )
     report = _report(shift, step, np.zeros(len(area), np.bool_), area, distance)
     report["clipped"] = float(_length(step - shift, gram)) / max(
@@ -270,12 +272,12 @@ def with_basis(
     tree = model.copy()
     weights = fitted["dictionary_weight"].values.astype(np.float64)
     good = np.isfinite(weights).all(axis=1)
-    found = np.full((len(weights), len(mixture)), np.nan)
-    found[good] = project(
+    coefficients = np.full((len(weights), len(mixture)), np.nan)
+    coefficients[good] = project(
         weights[good], np.asarray(mixture, np.float64), brdf_metric(tables)
     )
     rest = fitted.drop_dims("component")  # the components of another basis differ
-    fitted = rest.assign(basis_weight=label("basis_weight", found))
+    fitted = rest.assign(basis_weight=label("basis_weight", coefficients))
     basis = xr.Dataset(
         {"population_mixture": (("component", "dictionary"), mixture)},
         {"dictionary": list(names)},
@@ -320,25 +322,25 @@ def _moved_texture(
     report["distance"] = ONE_SUBJECT if edit.distance is None else edit.distance
     report |= {
         "how": "texture",
-        "trace": [list(one) for one in edit.trace],
+        "trace": [list(row) for row in edit.trace],
         "distance_before": edit.distance_before,
     }
     # requested change of the mean of the whole face, like the other values of the report
-    at = [str(name) for name in texture["region"].values].index(FACE)
+    region = [str(name) for name in texture["region"].values].index(FACE)
     step = (
-        np.nan_to_num(shift[at, :, 0]).mean(axis=-1)
+        np.nan_to_num(shift[region, :, 0]).mean(axis=-1)
         @ np.linalg.inv(texture["texture_colour_axis"].values).T
     )
     good = np.isfinite(colour).all(axis=1)
-    own = np.average(colour[good], axis=0, weights=fitted["surfel_area"].values[good])
-    report["requested"] = [float(v) for v in own * np.expm1(step)]
+    mean = np.average(colour[good], axis=0, weights=fitted["surfel_area"].values[good])
+    report["requested"] = [float(v) for v in mean * np.expm1(step)]
     return fitted, report, move
 
 
-def with_albedo(fitted: xr.Dataset, wanted: Array) -> xr.Dataset:
+def with_albedo(fitted: xr.Dataset, albedo: Array) -> xr.Dataset:
     """A fitted surface with new albedos (n, 3), limited to physical values."""
     colour = fitted["diffuse_reflectance"].values.astype(np.float64)
-    out = np.where(wanted == colour, colour, np.clip(wanted, DARKEST, BRIGHTEST))
+    out = np.where(albedo == colour, colour, np.clip(albedo, DARKEST, BRIGHTEST))
     s, _ = dipole_s(out, eta=float(fitted["refractive_index"]))
     return fitted.assign(
         diffuse_reflectance=label("diffuse_reflectance", out),
@@ -352,22 +354,23 @@ def _with_albedo(
     """The fitted surface with new albedos (n, 3), the report of the change, and its distance."""
     moved = with_albedo(fitted, wanted)
     colour, out = (
-        one["diffuse_reflectance"].values.astype(np.float64) for one in (fitted, moved)
+        version["diffuse_reflectance"].values.astype(np.float64)
+        for version in (fitted, moved)
     )
     good = np.isfinite(colour).all(axis=1)
     area = fitted["surfel_area"].values[good].astype(np.float64)
-    own, now = (np.average(x[good], axis=0, weights=area) for x in (colour, out))
-    whole = [str(r) for r in albedo["region"].values].index(FACE)
-    takes = albedo["albedo_mean"].values[:, whole]
+    before, now = (np.average(x[good], axis=0, weights=area) for x in (colour, out))
+    face = [str(r) for r in albedo["region"].values].index(FACE)
+    takes = albedo["albedo_mean"].values[:, face]
     axes = albedo["colour_axis"].values
     # on the decorrelated axes, the unit is the standard deviation of skin in that direction
     distance, move = _distances(
-        now, own, takes, [str(t) for t in albedo["take"].values], axes.T @ axes
+        now, before, takes, [str(t) for t in albedo["take"].values], axes.T @ axes
     )
     cut = (np.clip(wanted, DARKEST, BRIGHTEST) != wanted)[good] & (wanted != colour)[
         good
     ]
-    report = _report(now - own, now - own, cut.any(axis=1), area, distance)
+    report = _report(now - before, now - before, cut.any(axis=1), area, distance)
     return moved, report, move
 
 
@@ -383,9 +386,9 @@ def _moved_albedo(
     area = fitted["surfel_area"].values[good].astype(np.float64)
     values = decorrelate(colour[good], mean, axes)
     here = histogram(np.clip(values, edges[:, 0], edges[:, -1]), area, edges)
-    whole = [str(r) for r in albedo["region"].values].index(FACE)
+    face = [str(r) for r in albedo["region"].values].index(FACE)
     source = quantiles(here, edges)
-    wanted = source + shift[whole]
+    wanted = source + shift[face]
     target = valid_quantiles(wanted)
     matched = np.stack(
         [
@@ -398,7 +401,7 @@ def _moved_albedo(
     edited = colour.copy()
     edited[good] = matched @ back + mean
     fitted, report, move = _with_albedo(fitted, edited, albedo)
-    report["requested"] = [float(v) for v in shift[whole].mean(axis=1) @ back]
+    report["requested"] = [float(v) for v in shift[face].mean(axis=1) @ back]
     report |= {"how": "colours", "projected": float(np.abs(target - wanted).mean())}
     return fitted, report, move
 
@@ -409,24 +412,28 @@ def _moved_translucency(
     """Scale sigma_tr; traits without a measured shift are not applied, and the report
     names them.
     """
-    log, known = _log_shift(amount, traits)
+    log, is_measured = _log_shift(amount, traits)
     before = np.log(fitted["sigma_tr"].values.astype(np.float64))
     after = np.clip(before + log, *np.log(SIGMA_TR_RANGE))
     good = np.isfinite(before).all(axis=1)
     area = fitted["surfel_area"].values[good].astype(np.float64)
-    own, now = (np.average(x[good], axis=0, weights=area) for x in (before, after))
+    mean, now = (np.average(x[good], axis=0, weights=area) for x in (before, after))
     population = traits["take_log_sigma_tr"]
     measured = np.isfinite(population.values).all(axis=1)
     names = [str(t) for t in population["take"].values[measured]]
-    distance, move = _distances(now, own, population.values[measured], names, np.eye(3))
+    distance, move = _distances(
+        now, mean, population.values[measured], names, np.eye(3)
+    )
     report = _report(
         np.exp(log),
-        np.exp(now - own),
+        np.exp(now - mean),
         (after != before + log)[good].any(axis=1),
         area,
         distance,
     )
-    report["unknown"] = [str(t) for t in traits["trait"].values[~known & (amount != 0)]]
+    report["unknown"] = [
+        str(t) for t in traits["trait"].values[~is_measured & (amount != 0)]
+    ]
     return fitted.assign(sigma_tr=label("sigma_tr", np.exp(after))), report, move
 
 
@@ -445,8 +452,8 @@ def _moved_sites(sites: xr.Dataset, amount: Array, traits: xr.Dataset) -> xr.Dat
     moved = np.clip(
         sites["site_sigma_tr"].values.astype(np.float64) * np.exp(log), *SIGMA_TR_RANGE
     )
-    kept = surviving(sites).drop_attrs(deep=False)
-    return kept.assign(site_sigma_tr=label("site_sigma_tr", moved))
+    moved_sites = surviving(sites).drop_attrs(deep=False)
+    return moved_sites.assign(site_sigma_tr=label("site_sigma_tr", moved))
 
 
 def _log_shift(amount: Array, traits: xr.Dataset) -> tuple[Array, NDArray[np.bool_]]:
@@ -454,8 +461,8 @@ def _log_shift(amount: Array, traits: xr.Dataset) -> tuple[Array, NDArray[np.boo
     measured shift.
     """
     shifts = traits["trait_log_sigma_tr_shift"].values
-    known = np.isfinite(shifts).all(axis=1)
-    return np.asarray(amount[known] @ shifts[known]), known
+    is_measured = np.isfinite(shifts).all(axis=1)
+    return np.asarray(amount[is_measured] @ shifts[is_measured]), is_measured
 
 
 def _report(

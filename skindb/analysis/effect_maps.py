@@ -115,10 +115,10 @@ def effect_maps(
     adjust = (adjust,) if isinstance(adjust, str) else tuple(adjust)
     if not mixed_fits:
         require_same_fit(cohort)
-    whole = cohort.sizes["v"]
-    if size < 1 or whole % size:
-        rule = f"must divide the {whole} texels of the maps"
-        cure = f"choose {whole}, {whole // 2} or {whole // 4}"
+    texels = cohort.sizes["v"]
+    if size < 1 or texels % size:
+        rule = f"must divide the {texels} texels of the maps"
+        cure = f"choose {texels}, {texels // 2} or {texels // 4}"
         raise InputError(Fault("size", rule, str(size), cure))
     columns: dict[str, list[Array]] = {}
     names: list[str] = []
@@ -136,33 +136,37 @@ def effect_maps(
             return _texel_quantities(takes, variable, size)
 
         channels = cohort[variable].ndim == 4
-        own = [f"{called} {channel}" for channel in CHANNELS] if channels else [called]
-        found = []
-        for one in contrasts(cohort, group_by, adjust, measure):
+        channel_names = (
+            [f"{called} {channel}" for channel in CHANNELS] if channels else [called]
+        )
+        statistics = []
+        for contrast in contrasts(cohort, group_by, adjust, measure):
             try:
-                found.append(
+                statistics.append(
                     (
-                        one.name,
-                        *_contrast_statistics(one, permutations, min_fraction, rng),
+                        contrast.name,
+                        *_contrast_statistics(
+                            contrast, permutations, min_fraction, rng
+                        ),
                     )
                 )
-                associated = associations(one, subjects, others)
+                associated = associations(contrast, subjects, others)
                 flags += contrast_flags(
-                    one, subjects, associated, adjust, contrast_counts(one)
+                    contrast, subjects, associated, adjust, contrast_counts(contrast)
                 )
             except ValueError as error:
                 faults.append(
                     Fault(
-                        f"{one.name}, {called}",
+                        f"{contrast.name}, {called}",
                         CONTRAST_RULE,
                         str(error),
                         CONTRAST_CURE,
                     )
                 )
-        if not found:
+        if not statistics:
             continue
         # a contrast is missing for this variable only
-        if names and [name for name, _, _ in found] != names:
+        if names and [name for name, _, _ in statistics] != names:
             faults.append(
                 Fault(
                     called,
@@ -172,13 +176,13 @@ def effect_maps(
                 )
             )
             continue
-        names = [name for name, _, _ in found]
-        counts = [count for _, _, count in found]
-        quantities += own
-        for name in found[0][1]:
+        names = [name for name, _, _ in statistics]
+        counts = [count for _, _, count in statistics]
+        quantities += channel_names
+        for name in statistics[0][1]:
             # one row a contrast, of texels and channels
-            stacked = np.stack([values[name] for _, values, _ in found])
-            placed = stacked.reshape(len(found), size, size, len(own))
+            stacked = np.stack([values[name] for _, values, _ in statistics])
+            placed = stacked.reshape(len(statistics), size, size, len(channel_names))
             columns.setdefault(name, []).append(np.moveaxis(placed, -1, 1))
     if not names:
         raise InputError(
@@ -235,8 +239,8 @@ def _block_means(take: xr.Dataset, variable: str, size: int) -> Array:
     values = values.reshape(*values.shape[:2], -1)
     if variable.endswith(LOGARITHMIC):
         values = np.log(np.where(values > 0, values, np.nan))
-    known = np.isfinite(values).all(axis=-1)
-    weight = np.where(known, take["texel_coverage"].values, 0.0)[..., None]
+    is_known = np.isfinite(values).all(axis=-1)
+    weight = np.where(is_known, take["texel_coverage"].values, 0.0)[..., None]
     block = len(values) // size
     shape = (size, block, size, block, -1)
     total = weight.reshape(shape).sum(axis=(1, 3))
@@ -249,12 +253,12 @@ def _block_means(take: xr.Dataset, variable: str, size: int) -> Array:
 
 
 def _contrast_statistics(
-    one: Contrast, most: int, min_fraction: float, rng: np.random.Generator
+    contrast: Contrast, max_draws: int, min_fraction: float, rng: np.random.Generator
 ) -> tuple[dict[str, Array], int]:
     """Statistics of a contrast at all texels (NaN for too few subjects), and the number
     of permutations.
     """
-    values = one.quantities.values
+    values = contrast.quantities.values
     count = np.isfinite(values).sum(axis=0)
     able = np.flatnonzero(count >= max(min_fraction * len(values), 1))
     if not able.size:
@@ -262,22 +266,26 @@ def _contrast_statistics(
             f"no texel with values of {min_fraction:.0%} of the {len(values)} subjects"
         )
     chosen = values[:, able].astype(np.float64)
-    if one.is_paired:
+    if contrast.is_paired:
         fit = paired_effects(chosen)
-        p, adjusted, drawn = sign_flip_p(chosen, max_draws=most, rng=rng)
+        p, adjusted, drawn = sign_flip_p(chosen, max_draws=max_draws, rng=rng)
     else:
-        fit = effects(chosen, one.regressor, one.covariates)
+        fit = effects(chosen, contrast.regressor, contrast.covariates)
         p, adjusted, drawn = permutation_p(
-            chosen, one.regressor, one.covariates, max_draws=most, rng=rng
+            chosen,
+            contrast.regressor,
+            contrast.covariates,
+            max_draws=max_draws,
+            rng=rng,
         )
-    found = {
+    variables = {
         "map_effect": fit.slope,
         "map_effect_half_width": (fit.high - fit.low) / 2,
         "map_effect_p": p,
         "map_effect_p_adjusted": adjusted,
     }
-    placed = {name: np.full(len(count), np.nan, np.float32) for name in found}
-    for name, part in found.items():
+    placed = {name: np.full(len(count), np.nan, np.float32) for name in variables}
+    for name, part in variables.items():
         placed[name][able] = part
     return placed | {"map_effect_count": count}, drawn
 
@@ -298,18 +306,24 @@ def tabulate_effect_maps(maps: xr.Dataset) -> tuple[list[str], list[list[Any]]]:
     rows: list[list[Any]] = []
     for contrast in maps["contrast"].values.tolist():
         for quantity in maps["quantity"].values.tolist():
-            one = maps.sel(contrast=contrast, quantity=quantity)
-            effect = one["map_effect"].values
-            known = np.isfinite(one["map_effect_p"].values)
-            if not known.any():
+            part = maps.sel(contrast=contrast, quantity=quantity)
+            effect = part["map_effect"].values
+            is_known = np.isfinite(part["map_effect_p"].values)
+            if not is_known.any():
                 rows.append([contrast, quantity, 0, 0, *[float("nan")] * 3])
                 continue
-            differ = one["map_effect_p_adjusted"].values[known] < SIGNIFICANT
-            largest = effect[known][np.abs(effect[known]).argmax()]
-            numbers = (differ.mean(), effect[known].mean(), largest)
-            subjects = int(one["map_effect_count"].values[known].max())
+            differ = part["map_effect_p_adjusted"].values[is_known] < SIGNIFICANT
+            largest = effect[is_known][np.abs(effect[is_known]).argmax()]
+            numbers = (differ.mean(), effect[is_known].mean(), largest)
+            subjects = int(part["map_effect_count"].values[is_known].max())
             rows.append(
-                [contrast, quantity, subjects, int(known.sum()), *map(float, numbers)]
+                [
+                    contrast,
+                    quantity,
+                    subjects,
+                    int(is_known.sum()),
+                    *map(float, numbers),
+                ]
             )
     return header, rows
 
@@ -342,31 +356,35 @@ def plot_effect_maps(maps: xr.Dataset, *, contrast: str | None = None) -> Figure
     from matplotlib import pyplot
 
     name = contrast or str(maps["contrast"].values[0])
-    one = maps.sel(contrast=name)
-    names = one["quantity"].values.tolist()
-    shown = [quantity for quantity in SHOWN if quantity in names] or names[:1]
+    part = maps.sel(contrast=name)
+    names = part["quantity"].values.tolist()
+    quantities = [quantity for quantity in SHOWN if quantity in names] or names[:1]
     figure: Figure
     figure, axes = pyplot.subplots(
-        len(shown), 3, figsize=(9, 2.9 * len(shown)), squeeze=False
+        len(quantities), 3, figsize=(9, 2.9 * len(quantities)), squeeze=False
     )
-    rows, columns = _finite_extent(one["map_effect_p"].sel(quantity=shown).values)
-    for line, quantity in zip(axes, shown, strict=True):
-        own = one.sel(quantity=quantity).isel(v=rows, u=columns)
-        known = np.isfinite(own["map_effect_p"].values)
+    rows, columns = _finite_extent(part["map_effect_p"].sel(quantity=quantities).values)
+    for line, quantity in zip(axes, quantities, strict=True):
+        quantity_map = part.sel(quantity=quantity).isel(v=rows, u=columns)
+        is_known = np.isfinite(quantity_map["map_effect_p"].values)
         unit = (
             "change of the logarithm"
             if quantity in maps.attrs["logarithmic"]
             else "difference"
         )
         largest = max(
-            float(np.quantile(np.abs(own["map_effect"].values[known]), SHOWN_FRACTION)),
+            float(
+                np.quantile(
+                    np.abs(quantity_map["map_effect"].values[is_known]), SHOWN_FRACTION
+                )
+            ),
             1e-12,
         )
-        wide = own["map_effect_half_width"].values
-        widest = float(np.quantile(wide[known], SHOWN_FRACTION))
+        wide = quantity_map["map_effect_half_width"].values
+        widest = float(np.quantile(wide[is_known], SHOWN_FRACTION))
         parts: list[tuple[Array, dict[str, Any], str]] = [
             (
-                own["map_effect"].values,
+                quantity_map["map_effect"].values,
                 {"cmap": "RdBu_r", "vmin": -largest, "vmax": largest},
                 f"effect on {quantity}",
             ),
@@ -376,7 +394,7 @@ def plot_effect_maps(maps: xr.Dataset, *, contrast: str | None = None) -> Figure
                 "half-width of the 95 % CI",
             ),
             (
-                np.where(known, own["map_effect_count"].values, np.nan),
+                np.where(is_known, quantity_map["map_effect_count"].values, np.nan),
                 {"cmap": "cividis"},
                 "subjects",
             ),
@@ -388,7 +406,8 @@ def plot_effect_maps(maps: xr.Dataset, *, contrast: str | None = None) -> Figure
             ax.set(title=title, xticks=[], yticks=[])
             ax.title.set_fontsize(8)
         differ = (
-            np.nan_to_num(own["map_effect_p_adjusted"].values, nan=1.0) < SIGNIFICANT
+            np.nan_to_num(quantity_map["map_effect_p_adjusted"].values, nan=1.0)
+            < SIGNIFICANT
         )
         if differ.any() and not differ.all():
             line[0].contour(differ, levels=[0.5], colors="black", linewidths=0.6)
@@ -404,12 +423,16 @@ def plot_effect_maps(maps: xr.Dataset, *, contrast: str | None = None) -> Figure
 
 def _finite_extent(values: Array) -> tuple[slice, slice]:
     """Slices of the rows and columns that contain the finite values of an array (..., v, u)."""
-    known = np.asarray(np.isfinite(values).any(axis=0))
-    found = []
+    is_finite = np.asarray(np.isfinite(values).any(axis=0))
+    extents = []
     for axis in (1, 0):
-        at = np.flatnonzero(known.any(axis=axis))
-        found.append(slice(int(at[0]), int(at[-1]) + 1) if at.size else slice(None))
-    return found[0], found[1]
+        indices = np.flatnonzero(is_finite.any(axis=axis))
+        extents.append(
+            slice(int(indices[0]), int(indices[-1]) + 1)
+            if indices.size
+            else slice(None)
+        )
+    return extents[0], extents[1]
 
 
 @dataclass(frozen=True)

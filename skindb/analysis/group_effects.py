@@ -139,7 +139,7 @@ def group_effects(
     faults = []
     for contrast in contrasts(cohort, group_by, adjust, quantities_of):
         try:
-            found, count = _contrast_statistics(contrast, permutations, rng)
+            variables, count = _contrast_statistics(contrast, permutations, rng)
         except ValueError as error:
             faults.append(
                 Fault(contrast.name, CONTRAST_RULE, str(error), CONTRAST_CURE)
@@ -148,15 +148,15 @@ def group_effects(
         measured = contrast.quantities
         associated = associations(contrast, subjects, others)
         for name, values in {
-            **found,
+            **variables,
             "attribute_association": np.array(list(associated.values())),
         }.items():
             columns.setdefault(name, []).append(values)
         names.append(contrast.name)
         counts.append(count)
         flags += contrast_flags(
-            contrast, subjects, associated, adjust, found["effect_count"]
-        ) + _surface_flag(contrast, found)
+            contrast, subjects, associated, adjust, variables["effect_count"]
+        ) + _surface_flag(contrast, variables)
         smallest.append(least := _least_p(contrast, count))
         if least >= SIGNIFICANT:
             few = f"with {len(contrast.regressor)} subjects no p value can be below {least:.2g}"
@@ -192,21 +192,25 @@ def group_effects(
 
 
 def _contrast_statistics(
-    contrast: Contrast, most: int, rng: np.random.Generator
+    contrast: Contrast, max_draws: int, rng: np.random.Generator
 ) -> tuple[dict[str, Array], int]:
     """Variables of a contrast for every quantity, and the number of permutations."""
     values = contrast.quantities.values
     if contrast.before is not None:
         fit = paired_effects(values)
-        p, adjusted, count = sign_flip_p(values, max_draws=most, rng=rng)
+        p, adjusted, count = sign_flip_p(values, max_draws=max_draws, rng=rng)
         reference = known_mean(np.where(np.isfinite(values), contrast.before, np.nan))
     else:
         fit = effects(values, contrast.regressor, contrast.covariates)
         p, adjusted, count = permutation_p(
-            values, contrast.regressor, contrast.covariates, max_draws=most, rng=rng
+            values,
+            contrast.regressor,
+            contrast.covariates,
+            max_draws=max_draws,
+            rng=rng,
         )
-        known = np.isfinite(values)
-        centre = known_mean(np.where(known, contrast.regressor[:, None], np.nan))
+        is_known = np.isfinite(values)
+        centre = known_mean(np.where(is_known, contrast.regressor[:, None], np.nan))
         reference = known_mean(values) - (
             0.0 if contrast.is_number else fit.slope * centre
         )
@@ -236,13 +240,13 @@ def _contrast_statistics(
 
 def _least_p(contrast: Contrast, count: int) -> float:
     """The smallest p value that is possible with this number of permutations and subjects."""
-    least = 1 / (count + 1)
+    smallest = 1 / (count + 1)
     if (
         contrast.is_paired
     ):  # with all signs changed, the statistic has the same magnitude
-        return max(least, 2.0 ** (1 - len(contrast.regressor)))
+        return max(smallest, 2.0 ** (1 - len(contrast.regressor)))
     if contrast.covariates.shape[1]:
-        return least
+        return smallest
     # permutations within a group change nothing
     sizes = np.unique(contrast.regressor, return_counts=True)[1]
     # exchanging both groups only changes the sign
@@ -253,7 +257,7 @@ def _least_p(contrast: Contrast, count: int) -> float:
             - sum(gammaln(size + 1) for size in sizes)
         )
     )
-    return max(least, mirrored / allocations)
+    return max(smallest, mirrored / allocations)
 
 
 def _percent(
@@ -264,11 +268,11 @@ def _percent(
 
     A decrease is at most 100 %; the upper end is NaN where the true level may be 0.
     """
-    least = np.maximum(reference - quantities.common, 0.0)
+    lowest = np.maximum(reference - quantities.common, 0.0)
     with np.errstate(divide="ignore", invalid="ignore"):
         slope = fit.slope / reference
-        low = np.maximum(fit.low / np.where(fit.low < 0, least, reference), -1.0)
-        high = fit.high / np.where(fit.high > 0, least, reference)
+        low = np.maximum(fit.low / np.where(fit.low < 0, lowest, reference), -1.0)
+        high = fit.high / np.where(fit.high > 0, lowest, reference)
     ratios = zip((slope, low, high), (fit.slope, fit.low, fit.high), strict=True)
     percent = [
         100 * np.where(quantities.is_log, np.expm1(logs), ratio)
@@ -279,11 +283,11 @@ def _percent(
     )
 
 
-def _surface_flag(contrast: Contrast, found: dict[str, Array]) -> list[str]:
+def _surface_flag(contrast: Contrast, variables: dict[str, Array]) -> list[str]:
     """Warning if surface reflectance differs, because its diffuse part is counted as albedo."""
     names = np.array(contrast.quantities.names)
-    differ = found["effect_p_adjusted"] < SIGNIFICANT
-    small = differ & (np.abs(found["effect"]) < contrast.quantities.common)
+    differ = variables["effect_p_adjusted"] < SIGNIFICANT
+    small = differ & (np.abs(variables["effect"]) < contrast.quantities.common)
     if not (differ & np.char.startswith(names, SURFACE)).any() or not small.any():
         return []
     limit = float(contrast.quantities.common.max())
@@ -302,10 +306,10 @@ def describe_group_effects(table: xr.Dataset) -> list[str]:
     for name, count, least_p in zip(
         table["contrast"].values, counts, smallest_p, strict=True
     ):
-        one = table.sel(contrast=name)
-        compared = np.isfinite(one["effect_p"].values)
-        differ = one["effect_p_adjusted"].values < SIGNIFICANT
-        subjects = int(one["effect_count"].sum("side").max())
+        part = table.sel(contrast=name)
+        compared = np.isfinite(part["effect_p"].values)
+        differ = part["effect_p_adjusted"].values < SIGNIFICANT
+        subjects = int(part["effect_count"].sum("side").max())
         limit = ""
         if least_p > 1.5 / (count + 1):
             limit = f", the smallest possible p is {least_p:.2g}"
@@ -316,22 +320,22 @@ def describe_group_effects(table: xr.Dataset) -> list[str]:
             f"{limit})"
         )
         if not differ.any() and compared.any():
-            least = [
+            detectable = [
                 f"{quantity} {_amount(value, quantity in table.attrs['logarithmic'])}"
                 for quantity, value in zip(
                     table["quantity"].values,
-                    one["effect_detectable"].values,
+                    part["effect_detectable"].values,
                     strict=True,
                 )
                 if np.isfinite(value)
             ]
-            shown = ", ".join(least[:6]) + (
-                f" and {len(least) - 6} more" if len(least) > 6 else ""
+            listed = ", ".join(detectable[:6]) + (
+                f" and {len(detectable) - 6} more" if len(detectable) > 6 else ""
             )
             lines += (
                 []
-                if not least
-                else [f"{name}: detectable differences (power 80 %): {shown}"]
+                if not detectable
+                else [f"{name}: detectable differences (power 80 %): {listed}"]
             )
     logarithmic = (
         ", effects of sigma_tr are differences of its natural logarithm"
@@ -360,26 +364,29 @@ def plot_group_effects(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     places = np.arange(len(names))[::-1]
     contrasts = [str(name) for name in table["contrast"].values]
     for i, contrast in enumerate(contrasts):
-        one = table.sel(contrast=contrast)
-        effect = one["effect"].values
-        scale = one["effect"].values / one["effect_standardised"].values
+        part = table.sel(contrast=contrast)
+        effect = part["effect"].values
+        scale = part["effect"].values / part["effect_standardised"].values
         bars = np.abs(
             np.stack(
-                [effect - one["effect_low"].values, one["effect_high"].values - effect]
+                [
+                    effect - part["effect_low"].values,
+                    part["effect_high"].values - effect,
+                ]
             )
             / scale
         )
-        found = one["effect_p_adjusted"].values < SIGNIFICANT
+        is_significant = part["effect_p_adjusted"].values < SIGNIFICANT
         y = places + 0.6 * ((i + 0.5) / len(contrasts) - 0.5)
         colour = plots.CYCLE[i % len(plots.CYCLE)]
-        count = int(one["effect_count"].sum("side").max())
+        count = int(part["effect_count"].sum("side").max())
         label = f"{contrast} (n = {count})"
         ax.plot([], [], "osD^v"[i % 5], color=colour, markersize=4, label=label)
-        for kept, fill in ((found, colour), (~found, "white")):
+        for rows, fill in ((is_significant, colour), (~is_significant, "white")):
             ax.errorbar(
-                (effect / scale)[kept],
-                y[kept],
-                xerr=bars[:, kept],
+                (effect / scale)[rows],
+                y[rows],
+                xerr=bars[:, rows],
                 fmt="osD^v"[i % 5],
                 color=colour,
                 mfc=fill,

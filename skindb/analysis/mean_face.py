@@ -79,26 +79,26 @@ def mean_face(
                 if name in sums
                 else Moments.of(values[None])
             )
-    found: dict[str, Array] = {}
+    variables: dict[str, Array] = {}
     for name, moments in sums.items():
         short, is_log = AVERAGED[name]
         enough = moments.count >= max(least, 1)
         mean = np.exp(moments.mean) if is_log else moments.mean
         deviation = f"{short}_log_deviation" if is_log else f"{short}_deviation"
-        found[short] = np.where(enough, mean, np.nan).astype(np.float32)
-        found[deviation] = np.where(enough, moments.standard_deviation, np.nan).astype(
-            np.float32
-        )
+        variables[short] = np.where(enough, mean, np.nan).astype(np.float32)
+        variables[deviation] = np.where(
+            enough, moments.standard_deviation, np.nan
+        ).astype(np.float32)
         count = moments.count.min(axis=-1) if moments.count.ndim == 3 else moments.count
-        found[f"{short}_count"] = count.astype(np.int32)
-    if not any(np.isfinite(found[AVERAGED[name][0]]).any() for name in names):
+        variables[f"{short}_count"] = count.astype(np.int32)
+    if not any(np.isfinite(variables[AVERAGED[name][0]]).any() for name in names):
         rule = f"at least one texel must be measured in {least} subjects"
         cure = "fit or register more subjects"
         raise InputError(
             Fault("mean face", rule, f"none among {len(subjects.names)} subjects", cure)
         )
     return dataset(
-        found,
+        variables,
         coords={"channel": ["R", "G", "B"]},
         attrs={
             "subjects": len(subjects.names),
@@ -113,20 +113,20 @@ def _subject_maps(takes: xr.Dataset, names: list[str]) -> dict[str, Array]:
     """Means of the maps over the takes of a subject, on the scale of averaging; NaN
     where nothing was measured.
     """
-    kept: dict[str, list[Array]] = {name: [] for name in names}
+    of_takes: dict[str, list[Array]] = {name: [] for name in names}
     for i in range(takes.sizes["take"]):
-        one = takes[[*names, COVERAGE]].isel(take=i).load()
-        measured = one[COVERAGE].values > COVERED
+        take = takes[[*names, COVERAGE]].isel(take=i).load()
+        measured = take[COVERAGE].values > COVERED
         for name in names:
-            values = one[name].values.astype(np.float64)
-            known = (
+            values = take[name].values.astype(np.float64)
+            is_known = (
                 measured if values.ndim == 2 else measured[..., None]
             ) & np.isfinite(values)
             if AVERAGED[name][1]:
-                known &= values > 0
-                values = np.log(np.where(known, values, 1.0))
-            kept[name].append(np.where(known, values, np.nan))
-    return {name: known_mean(np.stack(values)) for name, values in kept.items()}
+                is_known &= values > 0
+                values = np.log(np.where(is_known, values, 1.0))
+            of_takes[name].append(np.where(is_known, values, np.nan))
+    return {name: known_mean(np.stack(values)) for name, values in of_takes.items()}
 
 
 def plot_mean_face(face: xr.Dataset, *, ax: Axes | None = None) -> Axes:
@@ -134,10 +134,10 @@ def plot_mean_face(face: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     ax = ax or plots.new_axes(4, 4)
     linear = face["face_diffuse_reflectance"].values
     clipped = np.clip(np.nan_to_num(linear, nan=1.0), 0.0, 1.0)
-    shown = np.where(
+    encoded = np.where(
         clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055
     )
-    ax.imshow(shown, extent=(0, 1, 1, 0), interpolation="nearest")
+    ax.imshow(encoded, extent=(0, 1, 1, 0), interpolation="nearest")
     ax.set_xlabel("common u")
     ax.set_ylabel("common v")
     ax.set_title(f"geometric mean of R_d (n = {face.attrs['subjects']})", fontsize=9)

@@ -73,16 +73,16 @@ def population_basis(
     names = same_dictionary(cohort)
     takes = [str(take) for take in cohort["take"].values]
     part = max(1, MAX_START_SURFELS // len(takes))
-    first = each_take(
+    starts = each_take(
         _fitted_weights, cohort.isel(surfel=slice(2 * part)), ["dictionary_weight"]
     )
     if lost := [
-        take for take, known in zip(takes, first, strict=True) if not len(known)
+        take for take, weights in zip(takes, starts, strict=True) if not len(weights)
     ]:
         rule = "a take must have fitted surfels"
         cure = "fit it again, or exclude it"
         raise InputError(Fault(f"take {take}", rule, "none", cure) for take in lost)
-    X = np.concatenate([rng.permutation(one)[:part] for one in first])
+    X = np.concatenate([rng.permutation(weights)[:part] for weights in starts])
     [metric] = each_item(brdf_metric, [tables])
     start = nmf(
         X,

@@ -129,21 +129,21 @@ def region_masks(common_uv: Array, landmarks: Mapping[str, Array]) -> dict[str, 
         overlap; "beard" is where a beard may grow, without the lips; "no_beard" is the
         skin of forehead, nose and cheeks outside the beard.
     """
-    known = {
+    places = {
         name: np.asarray(p, np.float64)
         for name, p in landmarks.items()
         if np.isfinite(p).all()
     }
-    if {"lip_upper", "mouth_corner_right", "mouth_corner_left"} <= known.keys():
-        corners = (known["mouth_corner_right"] + known["mouth_corner_left"]) / 2
-        known["lip_lower"] = corners + LOWER_LIP * (corners - known["lip_upper"])
-    drawn = {name: _region_mask(name, common_uv, known) for name in (*FINE, "beard")}
+    if {"lip_upper", "mouth_corner_right", "mouth_corner_left"} <= places.keys():
+        corners = (places["mouth_corner_right"] + places["mouth_corner_left"]) / 2
+        places["lip_lower"] = corners + LOWER_LIP * (corners - places["lip_upper"])
+    drawn = {name: _region_mask(name, common_uv, places) for name in (*FINE, "beard")}
     taken = np.zeros(len(common_uv), np.bool_)
     masks: dict[str, Mask] = {}
     for name in FINE:
-        if (own := drawn[name]) is not None:
-            masks[name] = own & ~taken
-            taken |= own
+        if (mask := drawn[name]) is not None:
+            masks[name] = mask & ~taken
+            taken |= mask
     if drawn["beard"] is not None and "lips" in masks:
         masks["beard"] = drawn["beard"] & ~masks["lips"]
         if all(name in masks for name in SMOOTH_SKIN):
@@ -158,8 +158,8 @@ def map_regions(landmarks: Mapping[str, Array], size: int) -> dict[str, Mask]:
     without landmarks only the whole face.
     """
     centre = (np.arange(size) + 0.5) / size
-    at = np.stack(np.meshgrid(centre, centre), axis=-1).reshape(-1, 2)
-    masks = {FACE: np.ones(len(at), np.bool_)} | region_masks(at, landmarks)
+    points = np.stack(np.meshgrid(centre, centre), axis=-1).reshape(-1, 2)
+    masks = {FACE: np.ones(len(points), np.bool_)} | region_masks(points, landmarks)
     return {name: mask.reshape(size, size) for name, mask in masks.items()}
 
 
@@ -173,7 +173,7 @@ def common_landmarks(registered: Mapping[str, xr.Dataset]) -> dict[str, Array]:
         for name, place in zip(names, take["common_landmark"].values, strict=True):
             if np.isfinite(place).all():
                 places.setdefault(name, []).append(place)
-    return {name: np.mean(found, axis=0) for name, found in places.items()}
+    return {name: np.mean(points, axis=0) for name, points in places.items()}
 
 
 def own_masks(fitted: xr.Dataset) -> dict[str, Mask]:
@@ -222,12 +222,14 @@ def _region_mask(name: str, uv: Array, landmarks: Mapping[str, Array]) -> Mask |
         right = _corners(
             _MIDDLE.get(name, _SIDE.get(name, ())), landmarks, mirror=False
         )
-        left = _corners(_MIDDLE.get(name, _SIDE.get(name, ())), landmarks, mirror=True)
+        left_corners = _corners(
+            _MIDDLE.get(name, _SIDE.get(name, ())), landmarks, mirror=True
+        )
     except KeyError:
         return None
     if name in _MIDDLE:
-        return inside_outline(uv, np.concatenate([right, left[::-1]]))
-    return inside_outline(uv, right) | inside_outline(uv, left)
+        return inside_outline(uv, np.concatenate([right, left_corners[::-1]]))
+    return inside_outline(uv, right) | inside_outline(uv, left_corners)
 
 
 def _corners(

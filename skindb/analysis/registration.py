@@ -145,8 +145,8 @@ def with_names(one: Outline, own: Sequence[str], names: Sequence[str]) -> Outlin
     """
     landmark = np.full((len(names), 3), np.nan)
     uv = np.full((len(names), 2), np.nan)
-    at = [list(names).index(name) for name in own]
-    landmark[at], uv[at] = one.landmark, one.landmark_uv
+    rows = [list(names).index(name) for name in own]
+    landmark[rows], uv[rows] = one.landmark, one.landmark_uv
     return Outline(landmark, uv, one.area, one.alignable)
 
 
@@ -219,22 +219,28 @@ def _template_take(outlines: Mapping[str, Outline], target: Array) -> str:
 
     Among several, it is the one that shows most of its head, of those with many landmarks.
     """
-    known = {
-        take: np.isfinite(one.landmark).all(axis=1) for take, one in outlines.items()
+    has_landmark = {
+        take: np.isfinite(row.landmark).all(axis=1) for take, row in outlines.items()
     }
     sound = [take for take in outlines if outlines[take].alignable] or [*outlines]
     served = {
-        take: sum((known[take] & one).sum() >= ALIGNED for one in known.values())
+        take: sum(
+            (has_landmark[take] & row).sum() >= ALIGNED for row in has_landmark.values()
+        )
         for take in sound
     }
     best = [take for take in sound if served[take] == max(served.values())]
-    most = max(known[take].sum() for take in best)
-    many = [take for take in best if known[take].sum() >= TEMPLATE_FRACTION * most]
-    shown = {
+    largest_count = max(has_landmark[take].sum() for take in best)
+    many = [
+        take
+        for take in best
+        if has_landmark[take].sum() >= TEMPLATE_FRACTION * largest_count
+    ]
+    visible_area = {
         take: outlines[take].area / _mm_per_uv(outlines[take].landmark, target) ** 2
         for take in many
     }
-    return max(shown, key=lambda take: np.nan_to_num(shown[take]))
+    return max(visible_area, key=lambda take: np.nan_to_num(visible_area[take]))
 
 
 def with_landmarks(models: Takes) -> dict[str, xr.DataTree]:
@@ -256,12 +262,12 @@ def _landmark_uv(sheet: Sheet) -> NDArray[np.float64]:
     """Texture coordinates (k, 2) of the surface points nearest to the landmarks; NaN
     for landmarks that are missing.
     """
-    known = sheet.known()
+    is_known = sheet.known()
     face, corner, _ = closest_on_mesh(
-        sheet.position, sheet.faces, sheet.landmark[known]
+        sheet.position, sheet.faces, sheet.landmark[is_known]
     )
-    out = np.full((len(known), 2), np.nan)
-    out[known] = _interpolate(sheet.uv, sheet.faces[face], corner)
+    out = np.full((len(is_known), 2), np.nan)
+    out[is_known] = _interpolate(sheet.uv, sheet.faces[face], corner)
     return out
 
 
@@ -275,11 +281,12 @@ def _mm_per_uv(landmark: Array, target: Array) -> float:
     """Ratio of the spread of landmarks (k, 3) in mm to their spread (k, 2) in common
     (u, v); NaN for fewer than 2.
     """
-    known = np.isfinite(landmark).all(axis=1) & np.isfinite(target).all(axis=1)
-    if known.sum() < 2:
+    is_known = np.isfinite(landmark).all(axis=1) & np.isfinite(target).all(axis=1)
+    if is_known.sum() < 2:
         return float("nan")
     face, flat = (
-        float(np.sqrt(points[known].var(axis=0).sum())) for points in (landmark, target)
+        float(np.sqrt(points[is_known].var(axis=0).sum()))
+        for points in (landmark, target)
     )
     return face / flat if flat > 0 else float("nan")
 
@@ -373,9 +380,9 @@ def correspondence_error(
     """
     true = {}
     common = {}
-    for take, wanted in points.items():
+    for take, positions in points.items():
         position, _, faces = _surface(models[take])
-        face, corner, _ = closest_on_mesh(position, faces, wanted)
+        face, corner, _ = closest_on_mesh(position, faces, positions)
         true[take] = _interpolate(position, faces[face], corner)
         common[take] = _interpolate(
             registered[take]["common_uv"].values, faces[face], corner
@@ -383,11 +390,11 @@ def correspondence_error(
     error = []
     # all others at once, because every call builds a ray tracing scene
     for b in points:
-        there = np.concatenate([common[a] for a in points if a != b])
-        found = corresponding_points(models[b], registered[b], there).reshape(
+        places = np.concatenate([common[a] for a in points if a != b])
+        matches = corresponding_points(models[b], registered[b], places).reshape(
             len(points) - 1, -1, 3
         )
-        error.append(np.linalg.norm(found - true[b], axis=2))
+        error.append(np.linalg.norm(matches - true[b], axis=2))
     return np.concatenate(error)
 
 
@@ -410,14 +417,21 @@ def tabulate_registration(registered: Registered) -> tuple[list[str], list[list[
         "worst_mm worst anchors"
     ).split()
     rows: list[list[Any]] = []
-    for take, one in registered.items():
-        scale = float(one["mm_per_uv"])
+    for take, registration in registered.items():
+        scale = float(registration["mm_per_uv"])
         misfit, error = (
-            scale * one[f"landmark_{name}"].values
+            scale * registration[f"landmark_{name}"].values
             for name in ("residual", "prediction_error")
         )
-        row = [take, one.attrs["warp_kind"], int(one["landmark_used"].sum())]
-        row += [float(one.attrs["warp_condition"]), float(one.attrs["warp_smoothing"])]
+        row = [
+            take,
+            registration.attrs["warp_kind"],
+            int(registration["landmark_used"].sum()),
+        ]
+        row += [
+            float(registration.attrs["warp_condition"]),
+            float(registration.attrs["warp_smoothing"]),
+        ]
         row += (
             [float(np.nanmax(misfit))]
             if np.isfinite(misfit).any() and len(registered) > 1
@@ -425,17 +439,20 @@ def tabulate_registration(registered: Registered) -> tuple[list[str], list[list[
         )
         # a single take has no other to compare with
         if np.isfinite(error).any() and len(registered) > 1:
-            at = int(np.nanargmax(error))
+            worst = int(np.nanargmax(error))
             row += [
                 float(np.nanmedian(error)),
-                float(error[at]),
-                str(one["landmark"].values[at]),
+                float(error[worst]),
+                str(registration["landmark"].values[worst]),
             ]
         else:
             row += [float("nan"), float("nan"), "-"]
-        anchors = int(one.attrs.get("warp_anchors", 0))
+        anchors = int(registration.attrs.get("warp_anchors", 0))
         rows.append(
-            [*row, "template" if one.attrs.get("template") == take else anchors]
+            [
+                *row,
+                "template" if registration.attrs.get("template") == take else anchors,
+            ]
         )
     return header, rows
 
@@ -450,26 +467,30 @@ def doubtful_landmarks(registered: Registered) -> list[Note]:
     neighbours that a misplaced landmark causes are not reported.
     """
     errors = {
-        take: float(one["mm_per_uv"]) * one["landmark_prediction_error"].values
-        for take, one in registered.items()
+        take: float(registration["mm_per_uv"])
+        * registration["landmark_prediction_error"].values
+        for take, registration in registered.items()
     }
     notes = []
     for take, error in errors.items():
         count = int(registered[take]["landmark_used"].sum())
         if count > 3 and registered[take].attrs["warp_kind"] != "thin plate":
-            why = "left and right may be swapped, or they may lie on a line"
+            reason_of_map = "left and right may be swapped, or they may lie on a line"
             notes.append(
-                note(take, f"no map without folds fits its {count} landmarks; {why}")
+                note(
+                    take,
+                    f"no map without folds fits its {count} landmarks; {reason_of_map}",
+                )
             )
         others = [e for other, e in errors.items() if other != take]
         if not others or not np.isfinite(error).any():
             continue
-        known = [column[np.isfinite(column)] for column in np.transpose(others)]
+        usual_errors = [column[np.isfinite(column)] for column in np.transpose(others)]
         # a landmark that no other take has is compared with the other landmarks of its take
         usual = np.array(
             [
                 np.median(column if len(column) else error[np.isfinite(error)])
-                for column in known
+                for column in usual_errors
             ]
         )
         # a gross error bends the mean and appears in all takes: only the take with the
@@ -484,14 +505,14 @@ def doubtful_landmarks(registered: Registered) -> list[Note]:
             & (error > DOUBTFUL_FRACTION * np.nanmax(error))
         )
         names = registered[take]["landmark"].values
-        found = [
+        doubts = [
             f"{names[i]} by {error[i]:.1f} mm (other takes {usual[i]:.1f})"
             for i in np.flatnonzero(odd)
         ]
-        if found:
+        if doubts:
             reason = (
                 "check landmarks that differ from the prediction of the others: "
-                f"{', '.join(found)}"
+                f"{', '.join(doubts)}"
             )
             notes.append(note(take, reason))
     return notes
@@ -513,11 +534,11 @@ def describe_registration(registered: Registered, takes: Iterable[str]) -> list[
         f"{len(rows)} takes with up to {max(row[2] for row in rows)} landmarks "
         f"({', '.join(kinds)})"
     )
-    known = [row for row in rows if np.isfinite(row[7])]
+    measured_rows = [row for row in rows if np.isfinite(row[7])]
     largest = []
-    if known:
-        worst = max(known, key=lambda row: row[7])
-        middle = float(np.median([row[6] for row in known]))
+    if measured_rows:
+        worst = max(measured_rows, key=lambda row: row[7])
+        middle = float(np.median([row[6] for row in measured_rows]))
         line += (
             f"; error of a landmark predicted by the others: median {middle:.1f} mm, "
             f"largest {worst[7]:.1f} mm"

@@ -81,23 +81,23 @@ class Attribute:
         columns = np.array(
             [[float(str(v) == word) for word in self.words[1:]] for v in self.values]
         ).reshape(len(self.values), -1)
-        known = np.array([value is not None for value in self.values])
-        return np.where(known[:, None], columns, np.nan)
+        is_known = np.array([value is not None for value in self.values])
+        return np.where(is_known[:, None], columns, np.nan)
 
     def require_one_kind(self) -> None:
         """Raise `InputError` if some values are numbers and others are words."""
         if words := self.odd_words:
             rule = "must be a number for all subjects or a word for all"
-            found = f"numbers and {', '.join(map(repr, words[:3]))}"
+            finding = f"numbers and {', '.join(map(repr, words[:3]))}"
             cure = "correct the traits in capture.json and ingest again"
-            raise InputError(Fault(f"attribute {self.name}", rule, found, cure))
+            raise InputError(Fault(f"attribute {self.name}", rule, finding, cure))
 
     def notes(self) -> list[str]:
         """Lines about values that are likely to be mistakes."""
         notes = []
         if words := self.odd_words:
-            some = ", ".join(map(repr, words[:3]))
-            notes.append(f"{self.name}: numbers and {some}; it is not compared")
+            examples = ", ".join(map(repr, words[:3]))
+            notes.append(f"{self.name}: numbers and {examples}; it is not compared")
         spellings: dict[str, set[str]] = {}
         for value in self.values:
             if isinstance(value, str):
@@ -109,9 +109,9 @@ class Attribute:
         ages = [] if self.name != AGE else self.known
         odd = {str(age) for age in ages if _is_finite(age) and not is_age(age)}
         if odd:
-            some = ", ".join(sorted(odd)[:3])
+            examples = ", ".join(sorted(odd)[:3])
             rule = f"must be in years, from 0 to {MAX_AGE}"
-            notes.append(f"{AGE}: {rule}; found {some}")
+            notes.append(f"{AGE}: {rule}; found {examples}")
         return notes
 
 
@@ -155,12 +155,12 @@ class Subjects:
 
     def by_subject(self, name: str, subjects: Sequence[str]) -> Attribute:
         """An attribute of the named subjects, each from its first take that has it."""
-        first: dict[str, Value] = {}
+        value_of: dict[str, Value] = {}
         values = self.attributes[name].values
         for subject, value in zip(self.subject, values, strict=True):
             if value is not None:
-                first.setdefault(subject, value)
-        return Attribute(name, tuple(first.get(subject) for subject in subjects))
+                value_of.setdefault(subject, value)
+        return Attribute(name, tuple(value_of.get(subject) for subject in subjects))
 
     def rows_of(self, subject: str) -> Mask:
         """Mask (take,) of the takes of a subject."""
@@ -202,9 +202,9 @@ def takes_to_compare(
     rows = np.flatnonzero(subjects.is_normal | compared)
     if not rows.size:
         rule = "groups must have a take in the condition normal"
-        found = f"only {', '.join(subjects.take)}"
+        finding = f"only {', '.join(subjects.take)}"
         cure = "group by condition, or add takes in the condition normal"
-        raise InputError(Fault("population", rule, found, cure))
+        raise InputError(Fault("population", rule, finding, cure))
     return cohort.isel(take=rows), subjects.select(rows)
 
 
@@ -246,17 +246,17 @@ def trait_of(subjects: Subjects, name: str) -> str:
     """Full name of the trait that a name refers to; the error lists the attributes and
     traits that can be used.
     """
-    known = known_traits(subjects)
+    traits = known_traits(subjects)
     try:
-        return trait_name(name, known)
+        return trait_name(name, traits)
     except InputError as error:
         cure = (
             f"choose from the attributes: {', '.join(sorted(subjects.attributes))}; "
-            f"traits: {', '.join(known) or 'none'}"
+            f"traits: {', '.join(traits) or 'none'}"
         )
-        found = error.faults[0].found
+        finding = error.faults[0].found
         rule = "must be an attribute or a trait"
-        raise InputError(Fault(f"group by {name}", rule, found, cure)) from None
+        raise InputError(Fault(f"group by {name}", rule, finding, cure)) from None
 
 
 def trait_name(name: str, known: Iterable[str]) -> str:
@@ -275,9 +275,11 @@ def trait_name(name: str, known: Iterable[str]) -> str:
     if len(meant) == 1:
         return meant[0]
     rule = "must name exactly one trait of the population"
-    found = f"{len(meant)} matches: {', '.join(meant)}" if meant else "an unknown name"
+    finding = (
+        f"{len(meant)} matches: {', '.join(meant)}" if meant else "an unknown name"
+    )
     cure = f"choose from: {', '.join(traits) or 'none'}"
-    raise InputError(Fault(f"trait {name}", rule, found, cure))
+    raise InputError(Fault(f"trait {name}", rule, finding, cure))
 
 
 def known_traits(subjects: Subjects) -> list[str]:
@@ -315,11 +317,11 @@ def has_trait(subjects: Subjects, trait: str) -> Mask:
     name, _, value = trait.partition(":")
     if trait == OLDER:
         ages = number_of_takes(subjects, AGE)
-        first: dict[str, float] = {}
+        age_of: dict[str, float] = {}
         for subject, age in zip(subjects.subject, ages.tolist(), strict=True):
             if np.isfinite(age):  # the first take of a subject that states an age
-                first.setdefault(subject, age)
-        return np.asarray(ages > (np.median([*first.values()]) if first else np.inf))
+                age_of.setdefault(subject, age)
+        return np.asarray(ages > (np.median([*age_of.values()]) if age_of else np.inf))
     if name not in subjects.attributes:
         return np.zeros(len(subjects.take), np.bool_)
     values = subjects.attributes[name].values
@@ -350,8 +352,8 @@ def comparable_takes(subjects: Subjects, trait: str) -> Mask:
     if not trait.startswith(f"{CONDITION}:"):
         # takes in other conditions are used only if no take with the trait is in the
         # condition normal
-        used = plain if (carries & plain).any() else plain | carries
-        return has_attribute(subjects, trait) & used
+        is_used = plain if (carries & plain).any() else plain | carries
+        return has_attribute(subjects, trait) & is_used
     names = np.array(subjects.subject)
     paired = set(names[carries]) & set(names[plain])
     if not paired:
@@ -364,8 +366,8 @@ def subjects_without_normal(subjects: Subjects) -> list[Note]:
     are not compared with others.
     """
     plain = {subjects.subject[i] for i in np.flatnonzero(subjects.is_normal)}
-    others = [name for name in subjects.names if name not in plain]
-    return [note(subject, "no take in the condition normal") for subject in others]
+    names = [name for name in subjects.names if name not in plain]
+    return [note(subject, "no take in the condition normal") for subject in names]
 
 
 def numeric_attributes(subjects: Subjects) -> list[str]:
@@ -417,8 +419,10 @@ def multiple_correlation(y: Array, columns: Array) -> float:
     free = len(y) - np.linalg.matrix_rank(x) if len(y) else 0
     if free < 1 or np.ptp(y) == 0:
         return float("nan")
-    left = y - x @ np.linalg.lstsq(x, y, rcond=None)[0]
-    return float(np.sqrt(max(0.0, 1.0 - (left @ left / free) / np.var(y, ddof=1))))
+    residual = y - x @ np.linalg.lstsq(x, y, rcond=None)[0]
+    return float(
+        np.sqrt(max(0.0, 1.0 - (residual @ residual / free) / np.var(y, ddof=1)))
+    )
 
 
 def word_of(value: Value) -> str:

@@ -188,10 +188,10 @@ def trusted_surfels(fitted: xr.Dataset) -> Mask:
 
 def no_surfels_error(model: xr.DataTree) -> InputError:
     """Error for a take without fitted surfels, which a population cannot use."""
-    where = str(model.attrs.get("take", model.attrs.get("subject", "take")))
+    take = str(model.attrs.get("take", model.attrs.get("subject", "take")))
     return InputError(
         Fault(
-            where,
+            take,
             "a take of a population must have fitted surfels",
             "none",
             "skip the take or fit it again",
@@ -224,9 +224,9 @@ def _basis_tables(model: xr.DataTree, fitted: xr.Dataset) -> xr.Dataset:
         else {}
     )
     # a cohort needs the labels of the dictionary even if the model stores no mixtures
-    own = dataset({"mean_basis_weight": mean}, coords=coords)
+    weights_table = dataset({"mean_basis_weight": mean}, coords=coords)
     return xr.merge(
-        [tables, own, eta],
+        [tables, weights_table, eta],
         combine_attrs="override",
         join="outer",
     )
@@ -234,38 +234,40 @@ def _basis_tables(model: xr.DataTree, fitted: xr.Dataset) -> xr.Dataset:
 
 def _median_errors(fitted: xr.Dataset) -> xr.Dataset:
     """Medians over the surfels of the residuals and of the errors at held-out samples."""
-    found = {}
+    medians = {}
     for name in names_of(Use.MEDIAN):
         values = fitted[name].values if name in fitted else np.zeros(0)
-        known = values[np.isfinite(values)]
-        found[name] = float(np.median(known)) if known.size else np.nan
+        finite = values[np.isfinite(values)]
+        medians[name] = float(np.median(finite)) if finite.size else np.nan
     return dataset(
-        {"median_error": list(found.values())}, coords={"measure": list(found)}
+        {"median_error": list(medians.values())}, coords={"measure": list(medians)}
     )
 
 
 def _values(fitted: xr.Dataset, name: str, shape: tuple[int, ...]) -> Array:
     """Values (surfel, *shape) of a variable; NaN if the model does not have it."""
-    whole = (fitted.sizes["surfel"], *shape)
+    shape_of_all = (fitted.sizes["surfel"], *shape)
     return np.asarray(
         fitted[name].values.astype(np.float64)
         if name in fitted
-        else np.full(whole, np.nan)
+        else np.full(shape_of_all, np.nan)
     )
 
 
 def _weighted_mean(values: Array, errors: Array, weight: Array) -> tuple[Array, Array]:
     """Weighted mean over surfels, and its error from independent errors; NaN without surfels."""
     weight = weight.reshape(-1, *(1,) * (values.ndim - 1))
-    known = np.isfinite(values)
+    is_known = np.isfinite(values)
     stated = np.isfinite(errors)
     # weights at the bound 0 have no error: the RMS error of the others is used
     if stated.any():
         errors = np.where(stated, errors, np.sqrt(np.mean(errors[stated] ** 2)))
-    total = np.where(known, weight, 0).sum(axis=0)
+    total = np.where(is_known, weight, 0).sum(axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
-        mean = (np.where(known, values, 0) * weight).sum(axis=0) / total
-        error = np.sqrt((np.where(known, errors * weight, 0) ** 2).sum(axis=0)) / total
+        mean = (np.where(is_known, values, 0) * weight).sum(axis=0) / total
+        error = (
+            np.sqrt((np.where(is_known, errors * weight, 0) ** 2).sum(axis=0)) / total
+        )
     return mean, error
 
 
@@ -316,11 +318,14 @@ def cohort_of(
         if "statistics" in consent_scope(model.attrs)
     }
     if not allowed:
-        found = f"none of {len(models)} takes"
+        finding = f"none of {len(models)} takes"
         cure = "see consent.scope in capture.json"
         raise InputError(
             Fault(
-                "population", "the consent of a take must cover statistics", found, cure
+                "population",
+                "the consent of a take must cover statistics",
+                finding,
+                cure,
             )
         )
     skipped = [
@@ -401,14 +406,16 @@ def common_maps(
         trust = (
             (codes == TexelStatus.MEASURED) & np.isfinite(values).all(axis=1)
         ).astype(np.float32)
-        image, found = atlas_values(np.nan_to_num(values), trust, uv, triangles, raster)
+        image, weight = atlas_values(
+            np.nan_to_num(values), trust, uv, triangles, raster
+        )
         filled = (
-            push_pull(image, found)[0] if trust.any() else np.full_like(image, np.nan)
+            push_pull(image, weight)[0] if trust.any() else np.full_like(image, np.nan)
         )
         filled = np.where(outside[..., None], np.float32(np.nan), filled)
         maps[f"texel_{name}"] = filled if fitted[name].ndim == 2 else filled[..., 0]
         if name == "diffuse_reflectance":
-            coverage = np.where(outside, np.float32(0), found)
+            coverage = np.where(outside, np.float32(0), weight)
     if "even_reflection_limit" in fitted:
         maps["even_reflection_limit"] = fitted["even_reflection_limit"].values
     return dataset(

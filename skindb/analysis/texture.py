@@ -102,13 +102,15 @@ def texture_statistics(
     names = list(masks)
     drawn = np.stack([masks[name] for name in names])
     mean, axes = _axes(each_take(_moments, cohort, MAPPED))
-    found = each_take(_distributions, cohort, MAPPED, drawn, mean, axes)
-    if not np.isfinite(np.stack([one[0] for one in found])).any():
+    distributions = each_take(_distributions, cohort, MAPPED, drawn, mean, axes)
+    if not np.isfinite(np.stack([row[0] for row in distributions])).any():
         rule = "at least one take must have measured half of a region"
         cure = "fit or register more takes"
-        raise InputError(Fault("texture", rule, f"none of {len(found)} takes", cure))
+        raise InputError(
+            Fault("texture", rule, f"none of {len(distributions)} takes", cure)
+        )
     quantiles, low, high, covered = (
-        np.stack(column) for column in zip(*found, strict=True)
+        np.stack(column) for column in zip(*distributions, strict=True)
     )
     edges = _edges(np.nanmin(low, axis=(0, 1)), np.nanmax(high, axis=(0, 1)))
     histograms = each_take(_histograms, cohort, MAPPED, drawn, mean, axes, edges)
@@ -160,10 +162,10 @@ def _moments(maps: xr.Dataset) -> Moments | None:
     return Moments(inside.mean(axis=0), np.cov(inside.T, bias=True))
 
 
-def _axes(found: list[Moments | None]) -> tuple[Array, Array]:
+def _axes(moments: list[Moments | None]) -> tuple[Array, Array]:
     """Common mean (3,) and axes (3, 3) in rows; the variance includes differences between takes."""
-    known = [one for one in found if one is not None]
-    if not known:
+    measured = [take for take in moments if take is not None]
+    if not measured:
         raise InputError(
             Fault(
                 "texture",
@@ -172,7 +174,9 @@ def _axes(found: list[Moments | None]) -> tuple[Array, Array]:
                 "fit or register more takes",
             )
         )
-    return colour_axes([one.mean for one in known], [one.scatter for one in known])
+    return colour_axes(
+        [take.mean for take in measured], [take.scatter for take in measured]
+    )
 
 
 def colour_axes(
@@ -196,7 +200,9 @@ def _covered(measured: Mask, drawn: Array) -> Array:
     """Fraction (region,) of the texels of each region that are measured; for the face,
     of the whole map.
     """
-    return np.array([(measured & one).sum() / max(one.sum(), 1) for one in drawn])
+    return np.array(
+        [(measured & region).sum() / max(region.sum(), 1) for region in drawn]
+    )
 
 
 def _distributions(
@@ -214,9 +220,11 @@ def _distributions(
     for a, image in enumerate(decorrelated(log, mean, axes)):
         parts = image_parts(image)
         weights = weights or _part_weights(drawn, measured, covered, parts)
-        for r, own in weights.items():
-            quantiles[r, a] = part_quantiles(parts, own)
-            for p, (part, weight) in enumerate(zip(parts, own, strict=True)):
+        for r, weights_of_parts in weights.items():
+            quantiles[r, a] = part_quantiles(parts, weights_of_parts)
+            for p, (part, weight) in enumerate(
+                zip(parts, weights_of_parts, strict=True)
+            ):
                 inside = part[members(weight)]
                 if inside.size:
                     low[r, a, p], high[r, a, p] = inside.min(), inside.max()
@@ -231,14 +239,14 @@ def _part_weights(
     """
     shapes = [part.shape for part in parts]
     # the first region is the face, which needs no minimum coverage
-    there = [
+    regions = [
         r
         for r in range(len(drawn))
         if (covered[r] >= LEAST_COVERED if r else measured.any())
     ]
     return {
         r: level_fractions((drawn[r] & measured).astype(np.float32), shapes)
-        for r in there
+        for r in regions
     }
 
 
@@ -261,8 +269,10 @@ def _histograms(
     for a, image in enumerate(decorrelated(log, mean, axes)):
         parts = image_parts(image)
         weights = weights or _part_weights(drawn, measured, covered, parts)
-        for r, own in weights.items():
-            for p, (part, weight) in enumerate(zip(parts, own, strict=True)):
+        for r, weights_of_parts in weights.items():
+            for p, (part, weight) in enumerate(
+                zip(parts, weights_of_parts, strict=True)
+            ):
                 out[r, a, p] = part_histogram(part, weight, edges[a, p])
     return out
 
@@ -377,8 +387,8 @@ def _quantiles(images: Array | list[Array], counted: list[Array]) -> Array:
         shapes = [part.shape for part in parts]
         out.append(
             [
-                part_quantiles(parts, level_fractions(own.astype(np.float32), shapes))
-                for own in counted
+                part_quantiles(parts, level_fractions(mask.astype(np.float32), shapes))
+                for mask in counted
             ]
         )
     return np.moveaxis(np.array(out), 0, 1)
@@ -393,21 +403,23 @@ def _distances(
     distributions; the distance is the root mean square over the axes, which is about 1
     for takes of the population. None if there are too few takes.
     """
-    known = texture["texture_quantile"].values[:, at].astype(np.float64)
-    known = known.reshape(len(known), -1)
-    rows = known[np.isfinite(known).all(axis=1)]  # takes with all of these regions
-    after, before = (one.reshape(-1) for one in quantiles[::-1])
+    quantiles_of_takes = texture["texture_quantile"].values[:, at].astype(np.float64)
+    quantiles_of_takes = quantiles_of_takes.reshape(len(quantiles_of_takes), -1)
+    rows = quantiles_of_takes[
+        np.isfinite(quantiles_of_takes).all(axis=1)
+    ]  # takes with all of these regions
+    after, before = (values.reshape(-1) for values in quantiles[::-1])
     usable = np.isfinite(before) & np.isfinite(after)
     if len(rows) < MIN_TAKES_DISTANCE or not usable.any():
         return None, None
-    found = principal_axes(rows[:, usable], len(rows) - 1)
-    fraction = np.cumsum(found.variance) / max(found.total, 1e-300)
+    principal = principal_axes(rows[:, usable], len(rows) - 1)
+    fraction = np.cumsum(principal.variance) / max(principal.total, 1e-300)
     count = int(np.searchsorted(fraction, KEPT_VARIANCE)) + 1
-    axes = found.axes[:count]
-    spread = np.sqrt(found.variance[:count])
+    axes = principal.axes[:count]
+    spread = np.sqrt(principal.variance[:count])
 
-    def distance(one: Array) -> float:
-        score = axes @ (one[usable] - found.mean) / spread
+    def distance(values: Array) -> float:
+        score = axes @ (values[usable] - principal.mean) / spread
         return float(np.sqrt((score**2).mean()))
 
     return distance(after), distance(before)

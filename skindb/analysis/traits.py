@@ -69,9 +69,9 @@ class Units:
 
     def values(self, of_takes: Array) -> Array:
         """Mean values (n, ...) of the units."""
-        means = np.stack([known_mean(of_takes[own]) for own in self.takes])
+        means = np.stack([known_mean(of_takes[rows]) for rows in self.takes])
         return (
-            means - np.stack([known_mean(of_takes[own]) for own in self.against])
+            means - np.stack([known_mean(of_takes[rows]) for rows in self.against])
             if self.against
             else means
         )
@@ -147,9 +147,9 @@ def trait_vectors(
         if not w.any() or (n not in numbers and not o.any())
     ]
     if bad:
-        there = ", ".join(known) or "none"
+        names_of_traits = ", ".join(known) or "none"
         rule = "there must be takes with and without it"
-        cure = f"choose from: {there}"
+        cure = f"choose from: {names_of_traits}"
         raise InputError(
             Fault(f"trait {n}", rule, f"{w.sum()} with, {o.sum()} without", cure)
             for n, w, o in bad
@@ -181,17 +181,19 @@ def trait_vectors(
     rng = np.random.default_rng(0) if rng is None else rng
     shifts: dict[str, list[Array]] = {name: [] for name in columns}
     errors: dict[str, list[Array]] = {name: [] for name in columns}
-    for own in units.values():
+    for unit in units.values():
         drawn = rng.multinomial(
-            len(own.design), np.full(len(own.design), 1 / len(own.design)), RESAMPLES
+            len(unit.design), np.full(len(unit.design), 1 / len(unit.design)), RESAMPLES
         )
         for name, values in columns.items():
             resamples = (
                 drawn.astype(np.float64)
                 if name not in WITHOUT_ERRORS
-                else np.empty((0, len(own.design)))
+                else np.empty((0, len(unit.design)))
             )
-            shift, resampled = _coefficients(own.values(values), own.design, resamples)
+            shift, resampled = _coefficients(
+                unit.values(values), unit.design, resamples
+            )
             # averaged over sites last: differences between sites must not appear as a
             # trait
             if values is log_tr:
@@ -242,8 +244,8 @@ def _sides(subjects: Subjects, trait: str, numbers: Sequence[str]) -> tuple[Mask
     """
     if trait not in numbers:
         return sides(subjects, trait)
-    known = np.isfinite(number_of_takes(subjects, trait)) & subjects.is_normal
-    return known, np.zeros(len(known), np.bool_)
+    is_known = np.isfinite(number_of_takes(subjects, trait)) & subjects.is_normal
+    return is_known, np.zeros(len(is_known), np.bool_)
 
 
 def _units(
@@ -263,10 +265,10 @@ def _units(
     who = np.array(subjects.subject)
     pairs = sorted(set(who[carries]))
     if trait not in numbers and set(pairs) <= set(who[lacks]):
-        own, other = (
+        rows, rows_without = (
             tuple(mask & (who == s) for s in pairs) for mask in (carries, lacks)
         )
-        return Units(own, other, np.ones((len(pairs), 1)))
+        return Units(rows, rows_without, np.ones((len(pairs), 1)))
     if trait in numbers:
         values = number_of_takes(subjects, trait)
         whose = [
@@ -285,11 +287,15 @@ def _units(
     design = design[complete]
     if np.linalg.matrix_rank(design) < np.linalg.matrix_rank(design[:, 1:]) + 1:
         rule = "must vary independently of the attributes that are adjusted for"
-        found = ", ".join(adjust) or "one value"
+        finding = ", ".join(adjust) or "one value"
         cure = "adjust for fewer attributes, or exclude the trait"
-        raise InputError(Fault(f"trait {trait}", rule, found, cure))
+        raise InputError(Fault(f"trait {trait}", rule, finding, cure))
     return Units(
-        tuple(own for (_, _, own), kept in zip(whose, complete, strict=True) if kept),
+        tuple(
+            rows
+            for (_, _, rows), is_complete in zip(whose, complete, strict=True)
+            if is_complete
+        ),
         (),
         design,
     )
@@ -305,20 +311,22 @@ def _coefficients(values: Array, design: Array, drawn: Array) -> tuple[Array, Ar
     out = np.full(flat.shape[1], np.nan)
     resampled = np.full((len(drawn), flat.shape[1]), np.nan)
     for rows, columns in missing_patterns(flat):
-        own = design[rows]
-        others = np.linalg.matrix_rank(own[:, 1:]) if own.shape[1] > 1 else 0
-        if np.linalg.matrix_rank(own) == others:
+        rows_design = design[rows]
+        rank_of_others = (
+            np.linalg.matrix_rank(rows_design[:, 1:]) if rows_design.shape[1] > 1 else 0
+        )
+        if np.linalg.matrix_rank(rows_design) == rank_of_others:
             continue
-        out[columns] = np.linalg.pinv(own)[0] @ flat[np.ix_(rows, columns)]
+        out[columns] = np.linalg.pinv(rows_design)[0] @ flat[np.ix_(rows, columns)]
         counts = drawn[:, rows]
-        square = np.einsum("bi,ip,iq->bpq", counts, own, own)
+        square = np.einsum("bi,ip,iq->bpq", counts, rows_design, rows_design)
         able = np.linalg.matrix_rank(square, hermitian=True) == np.linalg.matrix_rank(
-            own
+            rows_design
         )
         weights = np.einsum(
             "bq,iq,bi->bi",
             np.linalg.pinv(square[able], hermitian=True)[:, 0],
-            own,
+            rows_design,
             counts[able],
         )
         resampled[np.ix_(able, columns)] = weights @ flat[np.ix_(rows, columns)]
@@ -331,24 +339,24 @@ def _deviation(resampled: Array) -> Array:
     """Standard deviation over resamples; NaN where over 10 % are undefined, or all are
     the same (a single subject).
     """
-    known = np.isfinite(resampled).sum(axis=0)
+    count = np.isfinite(resampled).sum(axis=0)
     squares = known_mean((resampled - known_mean(resampled)) ** 2)
     rounding = (1e-9 * np.abs(np.nan_to_num(known_mean(resampled)))) ** 2
     return np.where(
-        (known > 0.9 * len(resampled)) & (squares > rounding), np.sqrt(squares), np.nan
+        (count > 0.9 * len(resampled)) & (squares > rounding), np.sqrt(squares), np.nan
     )
 
 
 def _flags(names: Sequence[str], counts: Array, numbers: Sequence[str]) -> list[str]:
     flags = []
     for name, count in zip(names, counts.tolist(), strict=True):
-        least = count[0] if name in numbers else min(count)
-        if least == 1:
+        smallest = count[0] if name in numbers else min(count)
+        if smallest == 1:
             flags.append(
                 f"{name}: only one take {SIDES[count.index(1)]} it, so that the "
                 "vector contains an individual"
             )
-        elif least < FEW:
+        elif smallest < FEW:
             among = (
                 f"{count[0]} takes"
                 if name in numbers
@@ -364,7 +372,7 @@ def _texture_quantiles(texture: xr.Dataset, takes: Array, regions: Array) -> Arr
     """
     values = texture["texture_quantile"].values
     rows, columns = (
-        [str(one) for one in texture[dim].values] for dim in ("take", "region")
+        [str(label) for label in texture[dim].values] for dim in ("take", "region")
     )
     out = np.full((len(takes), len(regions), *values.shape[2:]), np.nan, np.float32)
     for t, take in enumerate(map(str, takes)):
@@ -403,10 +411,10 @@ def describe_traits(traits: xr.Dataset) -> list[str]:
         return lines
     face = traits.sel(region=FACE)
     for name in traits["trait"].values.tolist():
-        one = face.sel(trait=name)
-        error = float((one["trait_quantile_shift_error"] ** 2).sum(skipna=False))
-        true = float((one["trait_quantile_shift"] ** 2).sum(skipna=False)) - error
-        takes = int(one["trait_count"].sum())
+        part = face.sel(trait=name)
+        error = float((part["trait_quantile_shift_error"] ** 2).sum(skipna=False))
+        true = float((part["trait_quantile_shift"] ** 2).sum(skipna=False)) - error
+        takes = int(part["trait_count"].sum())
         if not np.isfinite(error):
             continue
         if true <= error / takes:

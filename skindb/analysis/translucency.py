@@ -105,7 +105,7 @@ def translucency_table(
     subjects = np.array(people.subject)
     low, high = stacked.mean_interval()
     deviation_low, deviation_high = stacked.deviation_interval()
-    known = stacked.count > 0
+    is_known = stacked.count > 0
     attrs = {
         "takes": sorted(map(str, takes["take"].values)),
         "group_by": group_by or "",
@@ -113,7 +113,7 @@ def translucency_table(
     return dataset(
         {
             "sigma_tr_count": stacked.count,
-            "sigma_tr_mean": np.where(known, stacked.mean, np.nan),
+            "sigma_tr_mean": np.where(is_known, stacked.mean, np.nan),
             "sigma_tr_mean_low": low,
             "sigma_tr_mean_high": high,
             "sigma_tr_standard_deviation": stacked.standard_deviation,
@@ -157,10 +157,10 @@ def describe_translucency(table: xr.Dataset) -> list[str]:
     )
     for group in map(str, table["group"].values):
         count = table["sigma_tr_count"].sel(group=group).values
-        if count.size and 0 < (most := int(count.max())) < FEW:
+        if count.size and 0 < (largest := int(count.max())) < FEW:
             low = (table["sigma_tr_mean_low"].sel(group=group) < 0).any()
             ends = "; some reach below 0, where sigma_tr cannot be" if low else ""
-            takes = f"{most} take{'s' if most > 1 else ''}"
+            takes = f"{largest} take{'s' if largest > 1 else ''}"
             lines.append(
                 f"{group}: {takes}; with fewer than {FEW} the intervals assume normal values{ends}"
             )
@@ -190,9 +190,9 @@ def _statuses(takes: xr.Dataset) -> dict[str, int]:
     """Number of profiles of each status."""
     if "site_status" not in takes:
         return {}
-    found = takes["site_status"].values
+    statuses = takes["site_status"].values
     counts = {
-        member.name.lower(): int((found == member).sum()) for member in ProbeStatus
+        member.name.lower(): int((statuses == member).sum()) for member in ProbeStatus
     }
     return {
         name: count
@@ -219,11 +219,11 @@ def _repeat_deviation(values: Array, subjects: NDArray[np.str_]) -> Array:
     """
     out = np.full(values.shape[1:], np.nan)
     for index in np.ndindex(out.shape):
-        known = np.isfinite(values[:, *index])
-        people = len(set(subjects[known].tolist()))
-        if people >= 2 and known.sum() > people:
+        is_known = np.isfinite(values[:, *index])
+        people = len(set(subjects[is_known].tolist()))
+        if people >= 2 and is_known.sum() > people:
             out[index] = np.sqrt(
-                variance_components(values[known, *index], subjects[known])[2]
+                variance_components(values[is_known, *index], subjects[is_known])[2]
             )
     return out
 
@@ -241,13 +241,13 @@ def plot_translucency(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     sites = [str(s) for s in table["site"].values]
     for g, group in enumerate(map(str, table["group"].values)):
         for c, colour in enumerate(plots.CHANNELS):
-            one = table.isel(group=g, channel=c)
+            part = table.isel(group=g, channel=c)
             x = np.arange(len(sites)) + 0.12 * (c - 1) + 0.03 * g
-            mean = one["sigma_tr_mean"].values
+            mean = part["sigma_tr_mean"].values
             # sigma_tr is never negative
-            low = np.maximum(one["sigma_tr_mean_low"].values, 0.0)
-            bars = np.nan_to_num([mean - low, one["sigma_tr_mean_high"].values - mean])
-            count = int(one["sigma_tr_count"].max())
+            low = np.maximum(part["sigma_tr_mean_low"].values, 0.0)
+            bars = np.nan_to_num([mean - low, part["sigma_tr_mean_high"].values - mean])
+            count = int(part["sigma_tr_count"].max())
             name = f"{table['channel'].values[c]}" + (
                 f", {group}" if table.sizes["group"] > 1 else ""
             )
