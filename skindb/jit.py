@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numba as nb
 import numpy as np
@@ -26,8 +26,10 @@ from numba.core import cgutils, event
 from numba.extending import intrinsic, overload
 from numpy.typing import NDArray
 
-from skindb.types import IntVector32, Matrix32, Vector32
+from skindb.types import Integer, IntVector32, Matrix32, Real, Vector32
 
+# a kernel keeps its signature for mypy, which checks its callers
+Function = TypeVar("Function", bound=Callable[..., Any])
 # sums may be reordered and products fused; NaN and inf keep their meaning
 # (`fastmath=True` would drop tests for them)
 FAST = {"reassoc", "contract", "arcp", "nsz", "afn"}
@@ -38,12 +40,12 @@ OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
 INTRINSICS = os.environ.get("SKINDB_INTRINSICS", "1") != "0"
 
 
-def kernel(function: Any) -> Any:
+def kernel(function: Function) -> Function:
     """Compile a kernel whose sums keep their order."""
     return _stamped(nb.njit(**OPTIONS)(function))
 
 
-def fast_kernel(function: Any) -> Any:
+def fast_kernel(function: Function) -> Function:
     """Compile a kernel whose loops may run in vector registers, see FAST.
 
     The kernel is always inlined into its callers. Otherwise a process that has just
@@ -53,12 +55,12 @@ def fast_kernel(function: Any) -> Any:
     return _stamped(nb.njit(fastmath=FAST, forceinline=True, **OPTIONS)(function))
 
 
-def inline_kernel(function: Any) -> Any:
+def inline_kernel(function: Function) -> Function:
     """Like `kernel`, but inlined by Numba into each of its callers."""
     return _stamped(nb.njit(inline="always", **OPTIONS)(function))
 
 
-def inline_fast_kernel(function: Any) -> Any:
+def inline_fast_kernel(function: Function) -> Function:
     """Like `fast_kernel`, but inlined by Numba into each of its callers."""
     return _stamped(nb.njit(fastmath=FAST, inline="always", **OPTIONS)(function))
 
@@ -276,8 +278,8 @@ def vector_half(_typing: Any, bits: Any) -> Any:
 @inline_fast_kernel
 def plain_blend(
     table: Matrix32,
-    places: tuple[int, ...],
-    weights: tuple[float, ...],
+    places: tuple[Integer, ...],
+    weights: tuple[Real, ...],
     rows: Matrix32,
     row: int,
 ) -> None:

@@ -31,6 +31,9 @@ BoolMatrix = np.ndarray[tuple[int, int], np.dtype[np.bool_]]
 ByteVector = np.ndarray[tuple[int], np.dtype[np.uint8]]
 ByteMatrix = np.ndarray[tuple[int, int], np.dtype[np.uint8]]
 
+Real = float | np.floating[Any]
+Integer = int | np.integer[Any]
+
 # called with the stage, the steps done and the steps in all
 Progress = Callable[[str, int, int], None]
 

@@ -9,7 +9,15 @@ from numpy.typing import NDArray
 
 from skindb.calibration.pixel_flags import DARK, DARK_SIGMA, OK, SATURATED
 from skindb.jit import kernel
-from skindb.types import ByteMatrix, ByteVector, Cube32, IntMatrix, Matrix32, Vector32
+from skindb.types import (
+    ByteMatrix,
+    ByteVector,
+    Cube32,
+    IntMatrix,
+    Matrix32,
+    Real,
+    Vector32,
+)
 
 Values = NDArray[np.unsignedinteger]  # uint8 or uint16, of the file
 # of relative exposure; the weight 1 / variance stays finite
@@ -142,7 +150,7 @@ def develop(
 
 @kernel
 def _linear_response(
-    value: Values, black: Vector32, slope: float, signal: Vector32
+    value: Values, black: Vector32, slope: Real, signal: Vector32
 ) -> None:
     for k in range(value.shape[0]):
         signal[k] = (np.float32(value[k]) - black[k]) * slope
@@ -165,7 +173,7 @@ def _tabulated_response(
 
 @kernel
 def _count(
-    value: Values, white: float, signal: Vector32, noise: Vector32, usable: ByteVector
+    value: Values, white: Real, signal: Vector32, noise: Vector32, usable: ByteVector
 ) -> None:
     """Count the exposure at pixels where a channel is above the noise and none is at
     the white level.
@@ -182,10 +190,10 @@ def _count(
 @kernel
 def _collect(
     value: Values,
-    white: float,
+    white: Real,
     signal: Vector32,
     noise: Vector32,
-    seconds: float,
+    seconds: Real,
     total: Vector32,
     time: Vector32,
     above: Vector32,

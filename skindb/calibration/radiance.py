@@ -62,7 +62,9 @@ class FrameMerger:
         if spans is None:
             spans = np.tile(np.array([0, width]), (height, 1))
         count = np.empty((0, 0), np.uint8) if usable is None else usable
-        develop(tuple(frames), *self._kernel_arguments, spans, radiance, flag, count)
+        shared = self._kernel_arguments
+        arguments = (tuple(frames), *shared, spans, radiance, flag, count)
+        develop(*arguments)
         return radiance, flag
 
     @cached_property

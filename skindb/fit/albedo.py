@@ -196,9 +196,15 @@ def _separated(arrays: Arrays, *, eta: float) -> tuple[Array, Array, Array]:
     if "normal_total_error" not in arrays:
         turns[1] = turns[0]
     estimate, error, shared = (np.empty((n, 3)) for _ in range(3))
+    position, light, camera, normal = (
+        np.ascontiguousarray(arrays[name], np.float64) for name in PLACES
+    )
     separate_block(
         sample_bits(arrays["reflectance_sample"]),
-        *(np.ascontiguousarray(arrays[name], np.float64) for name in PLACES),
+        position,
+        light,
+        camera,
+        normal,
         np.stack(turns, axis=1),
         lobe_table(),
         noise_of(arrays, typical_noise()),

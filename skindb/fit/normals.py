@@ -95,11 +95,9 @@ def _normals(
     """
     n = len(position)
     out = np.empty((n, 3)), np.empty(n), np.empty(n), np.empty(n)
-    doubles = (
+    position, light, camera, scan = (
         np.ascontiguousarray(a, np.float64) for a in (position, light, camera, scan)
     )
-    prior = float(np.deg2rad(scan_error))
-    normals_block(
-        sample_bits(sample), *doubles, METHODS.index(method), float(eta), prior, *out
-    )
+    options = METHODS.index(method), float(eta), float(np.deg2rad(scan_error))
+    normals_block(sample_bits(sample), position, light, camera, scan, *options, *out)
     return out

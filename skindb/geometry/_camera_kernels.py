@@ -54,7 +54,7 @@ def undistorted(
             xx = radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
             xy = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
             yy = radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
-            determinant = xx * yy - xy * xy
+            determinant = float(xx * yy - xy * xy)
             if abs(determinant) < 1e-12:
                 determinant = 1e-12
             x, y = _within(

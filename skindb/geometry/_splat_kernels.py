@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from skindb.jit import fast_kernel, inline_fast_kernel
-from skindb.types import IntVector, Matrix32, Vector32
+from skindb.types import IntVector, Matrix32, Real, Vector32
 
 ZERO = np.float32(0.0)
 HALF = np.float32(0.5)
@@ -22,7 +22,7 @@ MAX_DISC_SLOPE = np.float32(50.0)  # depth of a disc per width at most
 @inline_fast_kernel
 def _project(
     p: Vector32, n: Vector32, frame: Matrix32, eye: Vector32
-) -> tuple[float, float, float, float, float, float, float]:
+) -> tuple[Any, ...]:
     """Point and normal in the frame of the eye, and the height of the eye over the
     disc: negative from behind.
     """
@@ -41,14 +41,14 @@ def _project(
 
 @inline_fast_kernel
 def _ellipse(
-    x: float,
-    y: float,
-    z: float,
-    a: float,
-    b: float,
-    c: float,
-    radius: float,
-    focal: float,
+    x: Real,
+    y: Real,
+    z: Real,
+    a: Real,
+    b: Real,
+    c: Real,
+    radius: Real,
+    focal: Real,
 ) -> tuple[Any, ...]:
     """Conic (3,) in px^-2 and half widths (2,) in px of a disc's picture, wider by a
     pixel (Zwicker et al. 2001).

@@ -80,7 +80,7 @@ def atlas_values(
     place = _doubles(uv)
     mixed, trusted = (np.ascontiguousarray(x, np.float32) for x in (values, trust))
     image = np.zeros((*face.shape, values.shape[1]), np.float32)
-    confidence = np.zeros(face.shape, np.float32)
+    confidence: Image = np.zeros(face.shape, np.float32)
     interpolate(face, weight, corner, trusted, mixed, image, confidence)
     tiny = _areas(place, corner) * face.size < 1
     if tiny.any():

@@ -44,7 +44,8 @@ def solve_nnls(
     kkt = np.full(len(b), np.nan)
     count = np.zeros(len(b), np.int32)
     met = np.zeros(len(b), np.bool_)
-    finite = np.isfinite(G).all(axis=(1, 2)) & np.isfinite(b + x).all(axis=1)
+    valid = np.isfinite(G).all(axis=(1, 2)) & np.isfinite(b + x).all(axis=1)
+    finite = np.asarray(valid)
     _nnls_kernels.solve_many(G, b, x, finite, tolerance, kkt, count, met)
     x[~finite] = np.nan
     return x, kkt, count, met

@@ -19,7 +19,7 @@ from skindb.optics._tree_kernels import (
 )
 from skindb.optics.diffusion import S_FLOOR, diffuse_reflectance, reduced_albedo
 from skindb.optics.fresnel import boundary_factor
-from skindb.types import Array, Index, Mask, float64
+from skindb.types import Array, Float64, Index, Mask, float64
 
 MAX_LEAF_POINTS = 8  # nodes with more points are divided
 # mean paths 1 / sigma_tr after which the profile is below 1e-7 of its integral
@@ -110,7 +110,7 @@ def subsurface_exitance(
 
 def _gather_parallel(
     chosen: Index,
-    parameters: Array,
+    parameters: Float64,
     sources: Sources,
     tree: Tree,
     limits: tuple[float, float],

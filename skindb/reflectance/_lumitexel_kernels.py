@@ -15,6 +15,7 @@ from skindb.reflectance._row_kernels import form_rows, row_memory
 from skindb.reflectance._shade_kernels import transmittance
 from skindb.schema import FitStatus
 from skindb.schema.status import LARGEST_R_D, SMALLEST_R_D
+from skindb.types import Integer
 
 FITTED, UNSEEN, FEW, NO_DIFFUSE, CLAMPED, NOT_CONVERGED, NOT_FINITE, _ = (
     int(status) for status in FitStatus
@@ -350,7 +351,7 @@ def outliers(count: int, options: Any, y: Any, b: Any, work: Any, counts: Any) -
 
 
 @kernel
-def mark(held: Any, kind: int, finite: Any, b: Any) -> None:
+def mark(held: Any, kind: Integer, finite: Any, b: Any) -> None:
     """Choose the finite samples of one kind."""
     for i in range(held.shape[0]):
         for o in range(held.shape[1]):
