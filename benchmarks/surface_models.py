@@ -59,7 +59,8 @@ def main(db: str, takes: Sequence[str] = (), *, surfels: int = 4000) -> None:
         fitted(part(database.read("capture", names[0]), FEW), model)
     print(f"{'take':24} {'model':8} ms/surfel  " + "  ".join(ERRORS))
     for take in names:
-        capture = part(database.read("capture", take), surfels)
+        # read once, so that reading does not count
+        capture = part(database.read("capture", take), surfels).load()
         for model in MODELS:
             spent, medians = fitted(capture, model)
             row = "  ".join(f"{medians[name]:{len(name)}.4f}" for name in ERRORS)
