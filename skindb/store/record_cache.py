@@ -92,7 +92,7 @@ class RecordCache:
         self._files = listed.result()
         self._heads = heads.result()
         self._markers = markers.result()
-        self._log = Snapshot(place, self._markers)
+        self.snapshot = Snapshot(place, self._markers)
         entries = stored.result() or {}
         self._entries = _unchanged_entries(entries, self._files)
         self._changed = len(self._entries) != len(entries)
@@ -122,7 +122,7 @@ class RecordCache:
         return (
             (kind, take) in self._heads
             and re.fullmatch(TAKE, take) is not None
-            and self._log.has(kind, take)
+            and self.snapshot.has(kind, take)
         )
 
     def record(self, kind: str, take: str, generation: int | None = None) -> Record:
@@ -228,10 +228,10 @@ class RecordCache:
             raise
         except InputError:
             # damaged, or committed or removed since the listing, which the log decides
-            record = self._log.record(kind, take, generation)
+            record = self.snapshot.record(kind, take, generation)
         if not self._markers.admits(record):
             # raises the reason
-            return self._log.record(kind, take, generation)
+            return self.snapshot.record(kind, take, generation)
         record, key = _trimmed_record(record), (kind, take, record.generation)
         if key in self._files:
             self._entries[key] = Entry(

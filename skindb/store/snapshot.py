@@ -46,6 +46,8 @@ class Records(Protocol):
 class CachedRecords(Records, Protocol):
     """A source that keeps the records that it has read."""
 
+    snapshot: Snapshot  # with the withdrawals when the source was made
+
     def read_ahead(
         self, kinds: Iterable[str], pins: Mapping[tuple[str, str], int]
     ) -> None:
@@ -172,7 +174,7 @@ class Lookup:
     ) -> None:
         self.place = db.place
         self._cache = cache
-        self._snapshot = Snapshot(db.place)
+        self._snapshot = Snapshot(db.place) if cache is None else cache.snapshot
         self._source: Records = cache or self._snapshot
         self._pins = None if release is None else pins_of(self._snapshot, release)
         self._takes: dict[str, frozenset[str]] = {}
