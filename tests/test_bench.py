@@ -47,6 +47,7 @@ def _strict(text):
     return json.loads(text, parse_constant=refuse)
 
 
+@pytest.mark.slow
 def test_bench__writes_the_json_that_it_prints(tmp_path):
     done = _run(
         tmp_path / "new/bench", "--only", "inverse", "--only", "exposures", "--json"
@@ -115,6 +116,7 @@ def test_curve__ratio_is_to_the_stated_method():
     assert math.isnan(curve.ratio(Point("c", "", math.nan, 0.1)))
 
 
+@pytest.mark.slow
 def test_transport_curves__distances_are_mean_free_paths():
     """With sigma_t' = 1, the dipole at one mean free path is twice the random walk."""
     (curve,) = transport_curves(quick=True)

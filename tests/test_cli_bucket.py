@@ -77,6 +77,7 @@ def _one_line(*args):
     return line
 
 
+@pytest.mark.slow
 def test_cli__a_database_that_does_not_exist(bucket, monkeypatch):
     assert _one_line("info", bucket).endswith(
         "the database must exist; found nothing; ingest a capture into it first"

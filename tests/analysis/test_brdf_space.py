@@ -364,6 +364,7 @@ def test_surface__is_stored_and_repeated(tmp_path, monkeypatch):
         workflow.surface(db, group_by="gendre", k=3)
 
 
+@pytest.mark.slow
 def test_surface__refuses_a_take_without_fitted_surfels(tmp_path, monkeypatch):
     monkeypatch.setattr(study_inputs, "dictionary_tables", lambda *_: TABLES)
     models = dict(list(_people().items())[:4])

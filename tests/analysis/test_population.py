@@ -501,6 +501,7 @@ def test_traits__the_basis_of_one_person_in_two_conditions_by_its_brdfs(
     assert tree.attrs["parameters"]["in_metric"] is True
 
 
+@pytest.mark.slow
 def test_edit__is_stored_with_its_report(tmp_path, monkeypatch):
     # 8 of the 59
     monkeypatch.setattr(study_inputs, "dictionary_tables", lambda *_: TABLES)
@@ -526,6 +527,7 @@ def test_edit__is_stored_with_its_report(tmp_path, monkeypatch):
     assert np.isfinite(tree["fitted/basis_weight"].values[1:]).all()
 
 
+@pytest.mark.slow
 def test_edit__warns_of_a_study_that_is_out_of_date(tmp_path, monkeypatch):
     # 8 of the 59
     monkeypatch.setattr(study_inputs, "dictionary_tables", lambda *_: TABLES)

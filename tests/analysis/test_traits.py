@@ -285,6 +285,7 @@ def test_apply_traits__mean_albedo_moves_by_the_mean_difference():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("amount", [30.0, -30.0, 100.0])
 def test_apply_traits__an_extreme_edit_is_physical_and_reported(amount):
     models = population()

@@ -83,6 +83,7 @@ def test_fit_model__recovers_planted_lobes_and_predicts_held_out_samples(
     assert "dictionary_weight" not in fitted
 
 
+@pytest.mark.slow
 def test_evaluate__is_the_planted_brdf_and_that_of_the_tables(planted, model):
     fitted = model["fitted"].to_dataset()
     n = fitted["shading_normal"].values[5].astype(float)

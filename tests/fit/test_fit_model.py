@@ -56,6 +56,7 @@ def fitted(planted, small_dictionary):
     return model, steps
 
 
+@pytest.mark.slow
 def test_fit_model__returns_what_the_schema_declares(fitted, skin):
     model, _ = fitted
     groups = {
@@ -229,6 +230,7 @@ def _averaged(dictionary, whole):
     return disc_dictionary(dictionary, disc_angle(whole))
 
 
+@pytest.mark.slow
 def test_second_pass__refuses_another_first_pass(planted, small_dictionary, skin):
     first = first_pass(planted, HELD_OUT, dictionary=small_dictionary)
     with pytest.raises(

@@ -235,6 +235,7 @@ def test_threads__are_as_many_as_cores_and_memory_allow(
     assert threads(None) == 2
 
 
+@pytest.mark.slow
 def test_ingest_capture__numbers_do_not_depend_on_the_threads(
     pristine, take, tmp_path, monkeypatch
 ):

@@ -63,6 +63,7 @@ def _area(db, generation=None, take="A1"):
     )
 
 
+@pytest.mark.slow
 def test_commit__is_read_back_as_it_was(home):
     commit(home, 0.5)
     commit(home, 2.0)
@@ -124,6 +125,7 @@ def _flip(place, key):
     place.replace(key, bytes(data))
 
 
+@pytest.mark.slow
 def test_verify__finds_changed_missing_and_foreign_objects(home):
     records = {take: commit(home, take=take) for take in ("A1", "A2", "A3", "A4", "A5")}
     place = Database(home).place
@@ -151,6 +153,7 @@ def test_verify__finds_changed_missing_and_foreign_objects(home):
             Database(home).read("capture", take)["surfels/surfel_area"].compute()
 
 
+@pytest.mark.slow
 def test_commit__racing_writers_on_one_key(atomic_home):
     def attempt(i):
         try:
@@ -169,6 +172,7 @@ def test_commit__racing_writers_on_one_key(atomic_home):
     assert db.verify() == []
 
 
+@pytest.mark.slow
 def test_commit__racing_writers_on_eight_keys(home):
     db = Database(home)  # shared by all of them
     takes = [f"A{i}" for i in range(8)]
@@ -211,6 +215,7 @@ while True:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay", [0.15, 0.4])
 def test_commit__killed_at_any_time(bucket, delay):
     code = ENDLESS.format(tests=str(Path(__file__).parent), url=bucket)
@@ -414,6 +419,7 @@ SURVIVED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", SURVIVED)
 def test_bucket__one_request_in_ten_fails(
     new_database, s3_address, monkeypatch, impatient, kind
@@ -552,6 +558,7 @@ with db.lease("A1", "model") as lease, db.stage("model", "A1", lease) as stage:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("end", ["killed", "asleep"])
 def test_lease__ends_with_a_killed_holder_and_a_sleeping_one_commits_nothing(
     bucket, end, monkeypatch

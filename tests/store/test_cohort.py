@@ -132,6 +132,7 @@ def test_cohort__a_sample_represents_the_face(db):
     assert np.std(means) == pytest.approx(error, rel=0.25)
 
 
+@pytest.mark.slow
 def test_cohort__other_samples_are_made_by_summarise(db):
     with pytest.raises(
         InputError,

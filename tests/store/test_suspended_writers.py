@@ -207,6 +207,7 @@ def test_writer__of_another_subject_is_never_disturbed(made, tmp_path):
     assert number > 20
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("writer", ["capture", "study", "release", "cache"])
 def test_writer__suspended_at_any_step_of_a_bucket_leaves_nothing(
     bucket, new_database, writer

@@ -49,6 +49,7 @@ def test_withdraw__of_the_only_subject_of_a_bucket(bucket):
     assert db.names() == ["audit", "secret", "withdrawn"]
 
 
+@pytest.mark.slow
 def test_population__of_a_bucket(db):
     workflow.translucency(db)
     workflow.traits(db, k=3)
