@@ -33,7 +33,7 @@ MARKER = np.float32(0.12345679)  # planted in the data of the subject
 WORD = "marker-of-nobody"  # planted in its attributes
 
 
-pytestmark = pytest.mark.usefixtures("small_textures")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("small_textures")]
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -187,7 +187,6 @@ def _copy(url: str, folder: Path) -> Path:
     return folder
 
 
-@pytest.mark.slow
 def test_withdraw__leaves_nothing_of_a_subject_in_a_bucket(bucket, tmp_path):
     db = _planted(bucket)
     assert len(_found(_copy(bucket, tmp_path / "before"), "A")) > 10
@@ -253,7 +252,6 @@ def test_withdraw__a_study_that_only_named_the_subject_as_skipped(tmp_path):
     assert db.read("population", "translucency").attrs["skipped"] == []
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("step", range(0, 60, 4))
 def test_withdraw__killed_at_any_step_the_same_call_completes_it(
     small, tmp_path, monkeypatch, step

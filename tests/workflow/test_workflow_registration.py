@@ -28,7 +28,7 @@ from skindb.workflow.registration import (
     takes_with_landmarks,
 )
 
-pytestmark = pytest.mark.usefixtures("small_textures")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("small_textures")]
 
 
 def _stored(tmp_path, models: dict[str, xr.DataTree]) -> Database:
