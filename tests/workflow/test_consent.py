@@ -13,6 +13,8 @@ from skindb.cli import cli
 from skindb.errors import InputError
 from skindb.store import Database
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def db(fitted_database):
@@ -30,7 +32,6 @@ def _refused(call, pattern):
         call()
 
 
-@pytest.mark.slow
 def test_record_consent__counts_at_once_for_everything(db, tmp_path):
     assert db.consent("S01") == ["fit", "statistics", "export"]
     db.record_consent("S01", ["fit", "statistics"])
@@ -70,7 +71,6 @@ def test_record_consent__counts_at_once_for_everything(db, tmp_path):
     assert db.verify() == []
 
 
-@pytest.mark.slow
 def test_commit__of_what_a_subject_refused_during_the_work(db, monkeypatch):
     """The consent is recorded while a fit or a study is computed."""
     begin = Database.stage
@@ -164,7 +164,6 @@ def test_consent_command__a_scope_that_says_nothing_is_no_refusal_of_everything(
     assert "the subject of that take is S01" in str(result.exception)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("answer", "says"), [("n\n", "Nothing was removed."), ("", "must be confirmed")]
 )

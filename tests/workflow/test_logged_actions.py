@@ -19,6 +19,8 @@ from skindb.store import Database
 from skindb.store.folder import Folder
 from skindb.workflow.audit import NotLoggedWarning, as_part, logged, logged_action
 
+pytestmark = pytest.mark.slow
+
 # functions that use `logged_action` themselves
 LOG_THEMSELVES = {
     "backup",
@@ -86,7 +88,6 @@ def test_logged__every_function_of_a_database_is_decorated_or_named_here():
     assert plain == LOG_THEMSELVES | NOT_LOGGED
 
 
-@pytest.mark.slow
 def test_logged__a_call_in_a_notebook_is_one_entry(db, tmp_path):
     workflow.show_take(db, "S01", "fit_status", tmp_path / "a.png")
     workflow.fit_take(db, "S02", PARAMETERS, dictionary=few_materials())
@@ -144,7 +145,6 @@ def test_as_part__is_a_part_of_the_action_also_in_another_process(db, tmp_path):
     assert _actions(db) == [("show", 1)] * 2
 
 
-@pytest.mark.slow
 def test_map_takes__in_processes_does_not_log_again(db, tmp_path):
     draw = partial(workflow.explain_view, db)
     with logged_action(db, "view", ["S01", "S02"]):
@@ -234,7 +234,6 @@ def test_logged__a_change_that_cannot_be_logged_is_refused(db, monkeypatch):
         workflow.record_consent(db, "S01", [])
 
 
-@pytest.mark.slow
 def test_withdraw__that_frees_the_disk_is_logged_at_its_end(db, monkeypatch):
     disc = _Disc(monkeypatch, errno.ENOSPC)
     erase = Database.erase

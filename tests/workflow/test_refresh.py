@@ -16,6 +16,8 @@ from skindb.errors import InputError
 from skindb.store import Database, StaleWarning, require_fresh, stale_versions
 from skindb.workflow import edits, study_inputs
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module", autouse=True)
 def _tables():
@@ -60,7 +62,6 @@ def _stale(db):
     }
 
 
-@pytest.mark.slow
 def test_studies__one_asked_for_differently_replaces_no_other(db):
     assert db.takes("population") == [
         "traits.three",
@@ -81,7 +82,6 @@ def test_studies__one_asked_for_differently_replaces_no_other(db):
         workflow.translucency(db, name="../x")
 
 
-@pytest.mark.slow
 def test_groups__are_stored_by_what_is_compared_and_made_again(db):
     for who in ("D", "E"):
         with db.stage("model", who) as stage:
@@ -109,7 +109,6 @@ def test_groups__are_stored_by_what_is_compared_and_made_again(db):
     )
 
 
-@pytest.mark.slow
 def test_edit__names_the_studies_there_are(db):
     with pytest.raises(
         InputError,
@@ -121,7 +120,6 @@ def test_edit__names_the_studies_there_are(db):
         workflow.edit(db, "B", {"lotion": 0.5}, study="traits.k-9")
 
 
-@pytest.mark.slow
 def test_stored_or_moved__reads_an_edit_only_if_it_was_made_from_the_same_versions(db):
     def moved(**amounts):
         source = edits.editable_model(db, "B", "traits.three", None)
@@ -154,7 +152,6 @@ def test_stale_versions__a_new_model_supersedes_what_was_made_from_the_old_one(d
         require_fresh(db, "edit", "B")
 
 
-@pytest.mark.slow
 def test_refresh__makes_results_again_in_order_of_dependence(db):
     _commit(db, "C")
     done = workflow.refresh(db)
@@ -186,7 +183,6 @@ def test_refresh__makes_results_again_in_order_of_dependence(db):
     assert workflow.refresh(db) == []
 
 
-@pytest.mark.slow
 def test_refresh__leaves_out_whose_consent_was_narrowed(db):
     db.record_consent("C", ["fit"])
     assert list(_stale(db).values()) == [["not covered"]] * 4

@@ -16,6 +16,8 @@ from skindb.reflectance.table_file import write_tables
 from skindb.workflow.derive import groups_of
 from skindb.workflow.fit import fit_take, parameters_of, plan_take, takes_to_fit
 
+pytestmark = pytest.mark.slow
+
 SMALL = FitParameters(k=2, rank=6)
 
 
@@ -52,7 +54,6 @@ def test_fit_take__fits_the_version_that_is_asked_for(tmp_path, skin, small_dict
     assert record.provenance["inputs"][0]["generation"] == 2
 
 
-@pytest.mark.slow
 def test_plan_take__reports_what_the_fit_skips(tmp_path, skin, small_dictionary):
     db = _commit(tmp_path / "db", capture_of(skin, probe=False))
     plan = plan_take(db, "S1", SMALL, dictionary=small_dictionary)
@@ -116,7 +117,6 @@ def three(made, tmp_path):
     return skindb.open(str(shutil.copytree(made, tmp_path / "db")))
 
 
-@pytest.mark.slow
 def test_takes_to_fit__a_refit_continues_with_what_is_not_done(three):
     assert takes_to_fit(three) == ["S3"]
     # takes whose model would not change are not fitted again
@@ -175,7 +175,6 @@ def test_takes_to_fit__a_model_that_cannot_be_refitted_stops_no_other(
     assert takes_to_fit(three, refit=True, given={"eta": 1.4}) == ["S1", "S2", "S3"]
 
 
-@pytest.mark.slow
 def test_takes_to_fit__dictionaries_are_compared_by_their_values(
     tmp_path, skin, small_dictionary
 ):
