@@ -21,7 +21,7 @@ from skindb.errors import InputError
 from skindb.format.dome import Pinhole
 from skindb.geometry.camera import camera_centre, project
 
-PUBLISHED = Path("/work/shared/data/photometric/uw")
+PUBLISHED = Path(__file__).resolve().parents[3] / "shared/data/photometric/uw"
 RADIUS = 25.0  # mm
 LIGHT = np.array([400.0, 500.0, 300.0])  # mm
 

@@ -25,7 +25,7 @@ WHITE = 65520.0
 FULL = 20000.0
 READ = 6.0
 EIGHT = tuple(0.08 / 2.0**i for i in range(8))
-PUBLISHED = Path("/work/shared/data/exposures")
+PUBLISHED = Path(__file__).resolve().parents[3] / "shared/data/exposures"
 
 
 def encoded(exposure, gamma):
