@@ -10,13 +10,14 @@ import numpy as np
 import xarray as xr
 from scipy.ndimage import gaussian_filter
 
-from skindb.analysis.edit import KEPT_ATTRS, surviving, with_albedo
+from skindb.analysis.edit import surviving, with_albedo
 from skindb.analysis.regions import common_landmarks, map_regions
 from skindb.analysis.summary import common_maps
 from skindb.analysis.texture import SIZE, at_surfels, log_albedo
 from skindb.errors import Fault, InputError
 from skindb.numerics.texture import Image, build, level_fractions, reconstruct
 from skindb.schema.consent import honour_consent
+from skindb.schema.label import take_attrs
 from skindb.schema.regions import FACE
 from skindb.types import Array, Mask
 
@@ -122,9 +123,7 @@ def transfer_detail(
         "region": named,
         "coarsest_mm": float(coarsest),
     }
-    tree.attrs = {
-        name: model.attrs[name] for name in KEPT_ATTRS if name in model.attrs
-    } | {"edit": edited}
+    tree.attrs = take_attrs(model.attrs) | {"edit": edited}
     return tree
 
 

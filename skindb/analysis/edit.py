@@ -19,6 +19,7 @@ from skindb.optics.diffusion import dipole_s
 from skindb.reflectance.tables import TableGrid, brdf_coords, brdf_metric, stored_brdf
 from skindb.schema import GROUPS, Use, check, dataset, label, names_of
 from skindb.schema.consent import honour_consent
+from skindb.schema.label import take_attrs
 from skindb.schema.regions import FACE
 
 Array = NDArray[np.floating[Any]]
@@ -30,7 +31,6 @@ BRIGHTEST = 0.999
 SIGMA_TR_RANGE = (1e-2, 1e2)
 # of a trait vector; the exponential of a larger shift of log sigma_tr may overflow
 MAX_AMOUNT = 100.0
-KEPT_ATTRS = ("subject", "condition", "session", "traits", "consent_scope", "take")
 PROBED = "probe"  # measurements of the unedited skin
 MIN_REPORTED = 1e-3  # fraction of a change above which an omission is reported
 TEXTURE_SHIFT = "trait_texture_shift"  # only where takes are registered
@@ -160,7 +160,7 @@ def apply_traits(
                 _moved_sites(tree["translucency"].to_dataset().load(), amount, traits)
             )
     tree["fitted"] = xr.DataTree(surviving(fitted))
-    attrs = {name: model.attrs[name] for name in KEPT_ATTRS if name in model.attrs}
+    attrs = take_attrs(model.attrs)
     far = max(moves, default=0.0)
     names = [str(traits["trait"].values[i]) for i in np.flatnonzero(amount)]
     tree.attrs = attrs | {
@@ -284,7 +284,7 @@ def with_basis(
     )
     tree["basis"] = xr.DataTree(_common_basis(model, basis, tables))
     tree["fitted"] = xr.DataTree(surviving(fitted))
-    tree.attrs = {name: model.attrs[name] for name in KEPT_ATTRS if name in model.attrs}
+    tree.attrs = take_attrs(model.attrs)
     return tree
 
 

@@ -40,11 +40,11 @@ from skindb.reflectance.kinds import surface_model
 from skindb.reflectance.model import ReflectanceModel
 from skindb.schema import FitStatus, Use, label, names_of
 from skindb.schema.consent import honour_consent
+from skindb.schema.label import take_attrs
 from skindb.types import Progress
 
 COMPILING = "compiling, only after an installation"
 COPIED_GROUPS = ("mesh", "dome", "probe")
-KEPT_ATTRS = ("subject", "condition", "session", "traits", "consent_scope", "take")
 
 
 def fit_model(
@@ -242,9 +242,7 @@ def second_pass(
                 translucency_map(groups["fitted"], groups["translucency"])
             )
     model = xr.DataTree.from_dict(groups)
-    model.attrs = {
-        name: capture.attrs[name] for name in KEPT_ATTRS if name in capture.attrs
-    }
+    model.attrs = take_attrs(capture.attrs)
     # the values that were actually used
     settings = parameters.as_dict() | surface_model(basis).settings
     model.attrs |= {"parameters": settings} | surface.provenance

@@ -11,6 +11,14 @@ import xarray as xr
 from skindb.schema.status import flag_attrs
 from skindb.schema.variables import VARIABLES
 
+# attributes of a capture that its models and their edits have too
+TAKE_ATTRS = ("subject", "condition", "session", "traits", "consent_scope", "take")
+
+
+def take_attrs(attrs: Mapping[Any, Any]) -> dict[Any, Any]:
+    """The attributes of a version that describe its take."""
+    return {name: attrs[name] for name in TAKE_ATTRS if name in attrs}
+
 
 def label(name: str, data: Any) -> xr.Variable:
     """The variable `name` around `data` (numpy or dask); dims, dtype, units and
