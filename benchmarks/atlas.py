@@ -16,13 +16,10 @@ from pathlib import Path
 import numpy as np
 
 from skindb.geometry import atlas
-from skindb.geometry.atlas import distortion
+from skindb.geometry.atlas import atlas_values, distortion, push_pull, rasterise_atlas
 from skindb.geometry.clean import clean_mesh
-from skindb.geometry.mesh import morton_order
+from skindb.geometry.mesh import boundary_loops, morton_order, outline_first, subdivide
 from skindb.geometry.scan import read_scan
-from skindb.geometry.subdivide import subdivide
-from skindb.geometry.texture import atlas_values, push_pull, rasterise_atlas
-from skindb.geometry.topology import boundary_loops, outline_first
 
 
 def main(

@@ -34,14 +34,14 @@ from scipy.optimize import minimize_scalar
 
 import skindb
 from skindb.export import export_bundle
-from skindb.export.translucency import mean_free_path
+from skindb.export.inputs import mean_free_path
 from skindb.geometry.rays import RayScene
 from skindb.optics.diffusion import dipole_profile, dipole_s, scattering_coefficients
-from skindb.render.direct import View, shade_view, trace_view
 from skindb.render.image import read_png, tone_map, write_png
 from skindb.render.rendering import chosen_camera
 from skindb.render.scene import Camera, Lights, Surface, from_model, lights_from_dome
-from skindb.render.texels import surfel_confidence
+from skindb.render.shading import View, shade_view, trace_view
+from skindb.render.surfels import surfel_confidence
 
 HERE = Path(__file__).parent
 SAMPLES = 128  # rays per pixel in the other programs

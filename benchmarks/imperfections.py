@@ -4,7 +4,7 @@ their stated errors.
     python -m benchmarks imperfections DB CAPTURE [CAPTURE...]
 
 Each capture folder has its truth beside it as <folder>.truth.npz (keys of
-skindb.virtual.truth). The captures are ingested into DB, which must be new, and fitted
+skindb.virtual.capture). The captures are ingested into DB, which must be new, and fitted
 with a tenth of the lights held out; with --corrected, ingest uses --refine and fit uses
 --inter-reflection. The Markdown table has one row per capture: errors of normals and
 R_d, fraction of R_d within its 95 % interval, the median half-width of the interval,
@@ -26,7 +26,7 @@ from benchmarks.validate import header
 from skindb.errors import InputError
 from skindb.fit import FitParameters, reflectance_interval
 from skindb.store import Database
-from skindb.virtual.truth import recovered_against_true
+from skindb.virtual.capture import recovered_against_true
 from skindb.workflow import ingest_take
 from skindb.workflow.fit import fit_take
 

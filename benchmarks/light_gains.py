@@ -4,7 +4,7 @@ gains, and effect on the errors.
     python -m benchmarks light_gains DB CAPTURE [CAPTURE...]
 
 Each capture folder has its truth beside it as <folder>.truth.npz (keys of
-skindb.virtual.truth). The captures are ingested into DB; their samples are multiplied
+skindb.virtual.capture). The captures are ingested into DB; their samples are multiplied
 by random gains and fitted without and with `light_gains`, a tenth of the lights held
 out. The Markdown table has one row for each capture and size of the gains.
 """
@@ -21,7 +21,7 @@ import xarray as xr
 import skindb
 from benchmarks.validate import header
 from skindb.fit import FitParameters, fit_model
-from skindb.virtual.truth import recovered_against_true
+from skindb.virtual.capture import recovered_against_true
 from skindb.workflow import ingest_take
 
 COLUMNS = (

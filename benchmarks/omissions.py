@@ -20,12 +20,11 @@ from benchmarks.rendering import sky
 from skindb.geometry.rays import RayScene
 from skindb.optics.angles import directions
 from skindb.reflectance.mixture import Mixture
-from skindb.render.direct import trace_view
-from skindb.render.environment import Environment
 from skindb.render.monte_carlo import Lighting, Quality, render_monte_carlo
 from skindb.render.plan import plan_scene
 from skindb.render.rendering import chosen_camera
-from skindb.render.scene import Camera, from_model, lights_from_dome
+from skindb.render.scene import Camera, Environment, from_model, lights_from_dome
+from skindb.render.shading import trace_view
 
 # factor on one light, so that all others together are below the wanted error
 DOMINANT = 1e5

@@ -19,12 +19,11 @@ import numpy as np
 
 import skindb
 from skindb.geometry.rays import RayScene
-from skindb.render.environment import Environment
 from skindb.render.image import write_exr
 from skindb.render.monte_carlo import Lighting, Quality, render_monte_carlo
 from skindb.render.plan import plan_scene
 from skindb.render.rendering import chosen_camera
-from skindb.render.scene import Lights, from_model, lights_from_dome
+from skindb.render.scene import Environment, Lights, from_model, lights_from_dome
 
 REFERENCE = 1024  # rays per pixel
 SAMPLES = (16, 64, 256)
@@ -85,7 +84,7 @@ def by_samples(surface, camera, lighting, **options):
 
 def by_opening(surface, lighting):
     """Rows of opening, time [s] of a tree walk, and RMS difference from the sum over all pairs."""
-    from skindb.render.subsurface import (
+    from skindb.render.shading import (
         exitance_from_irradiance,
         transmitted_irradiance,
     )

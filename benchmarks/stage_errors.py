@@ -23,11 +23,11 @@ from skindb.calibration.irradiance import light_falloff
 from skindb.calibration.radiance import frame_mergers, read_view
 from skindb.format.dome import DomeRecord
 from skindb.format.folder import read_capture
+from skindb.geometry.atlas import bilinear
 from skindb.geometry.camera import project
 from skindb.geometry.mesh import closest_on_mesh
-from skindb.geometry.texture import bilinear
 from skindb.render.image import read_exr
-from skindb.virtual.truth import recovered_against_true
+from skindb.virtual.capture import recovered_against_true
 
 # fraction of the 99.9 % quantile of a frame's radiance, below which relative errors are
 # not computed

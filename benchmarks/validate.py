@@ -4,7 +4,7 @@
     python -m benchmarks validate DB CAPTURE [CAPTURE...]
 
 The truth of each capture folder is in <folder>.truth.npz (keys of
-skindb.virtual.truth). The captures are ingested into DB and fitted. Two Markdown tables
+skindb.virtual.capture). The captures are ingested into DB and fitted. Two Markdown tables
 are printed: errors, and surfels by status with times and memory.
 """
 
@@ -22,7 +22,7 @@ import skindb
 from benchmarks.stages import Stages, stage_lines
 from skindb.fit import FitParameters
 from skindb.store import Database
-from skindb.virtual.truth import recovered_against_true
+from skindb.virtual.capture import recovered_against_true
 from skindb.workflow import ingest_take
 from skindb.workflow.fit import fit_take
 

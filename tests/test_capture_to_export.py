@@ -9,7 +9,7 @@ import trimesh
 from test_cli import _run
 
 import skindb
-from skindb.virtual.truth import recovered_against_true
+from skindb.virtual.capture import recovered_against_true
 
 SIMULATE = "--takes 1 --cameras 3 --lights 12 --width 48 --height 60".split()
 # median errors; a surfel of 6 mm is two pixels wide here

@@ -28,7 +28,12 @@ from skindb.analysis.chromophores import (
     describe_chromophores,
     plot_chromophores,
 )
-from skindb.analysis.components import face_components, principal_components
+from skindb.analysis.components import (
+    face_components,
+    mean_face,
+    plot_mean_face,
+    principal_components,
+)
 from skindb.analysis.correlations import (
     component_correlations,
     describe_correlations,
@@ -48,7 +53,6 @@ from skindb.analysis.group_effects import (
     group_effects,
     plot_group_effects,
 )
-from skindb.analysis.mean_face import mean_face, plot_mean_face
 from skindb.analysis.population_basis import population_basis
 from skindb.analysis.regions import mask_agreement, region_masks, take_masks
 from skindb.analysis.registration import (

@@ -13,12 +13,12 @@ import xarray as xr
 
 from skindb import plots
 from skindb.analysis import texture
-from skindb.analysis.each_take import each_take
 from skindb.analysis.study import (
     Population,
     Results,
     Study,
     Table,
+    each_take,
     group_option,
     table_of,
 )

@@ -14,14 +14,15 @@ from dask.delayed import Delayed
 from numpy.typing import NDArray
 
 from skindb import plots
-from skindb.analysis.each_take import each_take, shared_once
 from skindb.analysis.population_basis import same_dictionary
 from skindb.analysis.study import (
     DICTIONARY,
     Population,
     Results,
     Study,
+    each_take,
     seed_option,
+    shared_once,
 )
 from skindb.numerics.statistics import bootstrap_interval
 from skindb.optics.fresnel import fresnel_transmittance

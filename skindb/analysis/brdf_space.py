@@ -18,7 +18,6 @@ from dask.delayed import Delayed
 from numpy.typing import NDArray
 
 from skindb.analysis.brdf_plots import plot_space
-from skindb.analysis.each_take import each_item
 from skindb.analysis.population_basis import population_basis
 from skindb.analysis.study import (
     DICTIONARY,
@@ -26,6 +25,7 @@ from skindb.analysis.study import (
     Results,
     Study,
     compared_option,
+    each_item,
     permutations_option,
     seed_option,
 )

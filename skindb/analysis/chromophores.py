@@ -22,13 +22,13 @@ from sklearn.decomposition import FastICA
 from sklearn.exceptions import ConvergenceWarning
 
 from skindb import plots
-from skindb.analysis.each_take import each_take
-from skindb.analysis.mean_face import mean_face
+from skindb.analysis.components import mean_face
 from skindb.analysis.regions import map_regions
 from skindb.analysis.study import (
     Population,
     Results,
     Study,
+    each_take,
     group_option,
     seed_option,
     table_of,

@@ -22,7 +22,6 @@ from skindb.analysis.contrasts import (
     contrasts,
     other_attributes,
 )
-from skindb.analysis.each_take import each_take
 from skindb.analysis.group_effects import SIGNIFICANT
 from skindb.analysis.study import (
     Population,
@@ -30,6 +29,7 @@ from skindb.analysis.study import (
     Study,
     adjust_option,
     compared_option,
+    each_take,
     permutations_option,
     seed_option,
 )

@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 from dask.delayed import Delayed
 
-from skindb.analysis.each_take import each_item, each_take
+from skindb.analysis.study import each_item, each_take
 from skindb.errors import Fault, InputError
 from skindb.numerics.factorise import Sums, nmf, refine
 from skindb.numerics.nnls import solve_nnls

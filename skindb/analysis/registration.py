@@ -14,16 +14,19 @@ from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
 from skindb.geometry.atlas import signed_areas
-from skindb.geometry.correspondence import (
-    ALIGNED,
-    Sheet,
-    anchor_vertices,
-    corresponding_uv,
-)
 from skindb.geometry.landmarks import mean_shape
 from skindb.geometry.mesh import closest_on_mesh
 from skindb.geometry.rays import RayScene
-from skindb.geometry.warp import Warp, apply_warp, fit_warp, left_out_error
+from skindb.geometry.warp import (
+    ALIGNED,
+    Sheet,
+    Warp,
+    anchor_vertices,
+    apply_warp,
+    corresponding_uv,
+    fit_warp,
+    left_out_error,
+)
 from skindb.schema import dataset
 from skindb.schema.consent import honour_consent
 from skindb.schema.notes import Note, note
@@ -51,7 +54,7 @@ def register(
 
     The landmarks of a face do not constrain ears, neck and scalp. There, corresponding
     points on the surface of a template are used in addition (see
-    `correspondence.corresponding_uv`). The template is the reference, or the take that shows
+    `warp.corresponding_uv`). The template is the reference, or the take that shows
     most of its head.
 
     Parameters

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from skindb.analysis.regions import own_masks
 from skindb.errors import Fault, InputError
-from skindb.geometry.texture import atlas_values, push_pull, rasterise_atlas
-from skindb.render.texels import surfel_texels, texel_codes
+from skindb.geometry.atlas import atlas_values, push_pull, rasterise_atlas
+from skindb.render.surfels import surfel_texels, texel_codes
 from skindb.schema import FitStatus, TexelStatus, Use, dataset, names_of
 from skindb.schema.cohort import Held, combine, take_coords
 from skindb.schema.consent import consent_scope
@@ -27,6 +27,7 @@ from skindb.types import Array, Mask
 # of one subject
 SAMPLED = 5000
 STREAM = 7  # random stream of the sample
+SIZE = 512  # texels along each side of the stored maps of a registration
 
 
 def sample_surfels(
@@ -362,9 +363,6 @@ def _samples_of(capture: xr.DataTree, index: NDArray[np.int64]) -> xr.Dataset:
         .load()
     )
     return xr.merge([samples, dome], combine_attrs="override")
-
-
-SIZE = 512  # texels along each side of the stored maps of a registration
 
 
 def common_maps(

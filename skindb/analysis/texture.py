@@ -12,11 +12,11 @@ import numpy as np
 import xarray as xr
 from scipy.ndimage import gaussian_filter
 
-from skindb.analysis.each_take import each_take
 from skindb.analysis.regions import map_regions
+from skindb.analysis.study import each_take
 from skindb.elementwise import thread_count
 from skindb.errors import Fault, InputError
-from skindb.geometry.texture import bilinear, push_pull
+from skindb.geometry.atlas import bilinear, push_pull
 from skindb.numerics.factorise import principal_axes
 from skindb.numerics.texture import (
     QUANTILES,
@@ -42,6 +42,15 @@ LEAST_COVERED = 0.5  # fraction of the texels of a region that a take must have 
 COVERED = 0.5  # coverage above which a texel counts as measured
 DARKEST = 1e-3  # lower limit of R_d; the logarithm of smaller values is mostly noise
 AXES = 3
+ITERATIONS = 5
+# standard deviation of the Gaussian that blends a region's edge, in units of (u, v):
+# about 5 mm on a face
+BLEND = 0.02
+BEARD, REST = REGIONS[1:]
+# fraction of the variance in the components along which the distance from the data is
+# measured
+KEPT_VARIANCE = 0.99
+MIN_TAKES_DISTANCE = 4  # takes needed for that distance
 
 
 @dataclass(frozen=True)
@@ -275,17 +284,6 @@ def _histograms(
             ):
                 out[r, a, p] = part_histogram(part, weight, edges[a, p])
     return out
-
-
-ITERATIONS = 5
-# standard deviation of the Gaussian that blends a region's edge, in units of (u, v):
-# about 5 mm on a face
-BLEND = 0.02
-BEARD, REST = REGIONS[1:]
-# fraction of the variance in the components along which the distance from the data is
-# measured
-KEPT_VARIANCE = 0.99
-MIN_TAKES_DISTANCE = 4  # takes needed for that distance
 
 
 @dataclass(frozen=True)

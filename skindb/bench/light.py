@@ -33,7 +33,7 @@ from skindb.reflectance.dictionary import (
 from skindb.reflectance.rows import basis_rows
 from skindb.reflectance.tables import TableGrid, lookup, tabulate
 from skindb.types import Array
-from skindb.virtual.frames import Sensor
+from skindb.virtual.dome import Sensor
 
 # refractive index, radius of a ball [mm], points of comparison
 ETA = 1.3

@@ -27,7 +27,7 @@ from skindb.errors import Fault, InputError
 
 if TYPE_CHECKING:
     from skindb.store import Database, Record
-    from skindb.view.server import PageServer
+    from skindb.view.page import PageServer
     from skindb.workflow import Outcome
 
 T = TypeVar("T")

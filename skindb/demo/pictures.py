@@ -17,7 +17,6 @@ from skindb import plots
 from skindb.analysis import plot_albedo, plot_basis_size, plot_translucency
 from skindb.demo.page import themed
 from skindb.geometry.rays import RayScene
-from skindb.render.direct import View, shade_view, trace_view
 from skindb.render.image import auto_exposure, encode_srgb, tone_map
 from skindb.render.photographs import Comparison, side_by_side
 from skindb.render.rendering import frontal_camera
@@ -28,6 +27,7 @@ from skindb.render.scene import (
     from_model,
     lights_from_dome,
 )
+from skindb.render.shading import View, shade_view, trace_view
 from skindb.schema import variables
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from skindb.virtual.truth import Recovery
+    from skindb.virtual.capture import Recovery
 
 
 Image = NDArray[np.floating[Any]]

@@ -20,9 +20,8 @@ from skindb.parameters import FitParameters, SimulationParameters
 from skindb.render.photographs import compare_photographs
 from skindb.store import Database
 from skindb.types import Progress, silent
-from skindb.virtual.capture import simulate_takes
+from skindb.virtual.capture import recovered_against_true, simulate_takes
 from skindb.virtual.person import default_people
-from skindb.virtual.truth import recovered_against_true
 
 # fraction of lights; mm
 HELD_OUT = 0.1

@@ -15,7 +15,7 @@ from skindb.analysis.studies import tabulate_study
 from skindb.demo.page import Table
 from skindb.render.photographs import Comparison
 from skindb.schema import FitStatus, variables
-from skindb.virtual.truth import Recovery
+from skindb.virtual.capture import Recovery
 
 PER_TAKE = ("models", "fits", "recovered", "compared")
 ERROR_COLUMNS = ("relative_rmse", "psnr", "ssim", "delta_e_median")

@@ -10,11 +10,10 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from skindb.export.inputs import chosen_size, required
-from skindb.export.translucency import mean_free_path
-from skindb.geometry.texture import atlas_values, push_pull, rasterise_atlas
+from skindb.export.inputs import chosen_size, mean_free_path, required
+from skindb.geometry.atlas import atlas_values, push_pull, rasterise_atlas
 from skindb.reflectance.kinds import as_mixture
-from skindb.render.texels import surfel_confidence, surfel_texels, texel_codes
+from skindb.render.surfels import surfel_confidence, surfel_texels, texel_codes
 from skindb.schema import VARIABLES, TexelStatus
 
 Image = NDArray[np.float32]

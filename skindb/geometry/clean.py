@@ -13,11 +13,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from skindb.errors import Fault, InputError
-from skindb.geometry.mesh import face_crosses
-from skindb.geometry.topology import (
+from skindb.geometry.mesh import (
     boundary_loops,
     edge_table,
     face_components,
+    face_crosses,
     fans,
     outline_first,
     pair_components,

@@ -1,5 +1,5 @@
-"""Meshes as numbers: order, normals and areas of vertices, nearest points, and whether
-points lie inside.
+"""Triangle meshes: connectivity, order, normals and areas of vertices, nearest points, and
+Loop subdivision.
 """
 
 from __future__ import annotations
@@ -7,13 +7,166 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.sparse as sp
 from numpy.typing import NDArray
+from scipy.sparse.csgraph import breadth_first_order, connected_components
 from scipy.spatial import cKDTree
 
-from skindb.types import Array, Faces, Float64, Index, float64
+from skindb.types import Array, Faces, Float64, Index, Mask, float64
 
 MORTON_BITS = 21  # per axis: 63 bits in all
 POINTS_PER_BLOCK = 1 << 10  # each point may have a hundred candidate triangles
+
+
+@dataclass(frozen=True)
+class EdgeTable:
+    """The edges of a mesh; side i of a face runs from its corner i to corner i + 1."""
+
+    edges: Index  # (e, 2) lower vertex first, sorted
+    of_face: Index  # (f, 3) edge of each side
+    count: Index  # (e,) faces at the edge
+
+
+def edge_table(faces: Faces) -> EdgeTable:
+    """Edges of faces (f, 3)."""
+    corner = np.asarray(faces, np.int64).reshape(-1, 3)
+    sides = np.sort(np.stack([corner, np.roll(corner, -1, axis=1)], axis=-1), axis=-1)
+    n = int(corner.max(initial=0)) + 1
+    key, inverse, count = np.unique(
+        sides[..., 0] * n + sides[..., 1], return_inverse=True, return_counts=True
+    )
+    return EdgeTable(
+        np.stack([key // n, key % n], axis=1), inverse.reshape(corner.shape), count
+    )
+
+
+def boundary_loops(faces: Faces) -> list[Index]:
+    """Boundary loops of an oriented mesh without bow-ties, that of the most vertices first.
+
+    Each runs along its faces: the mesh lies to its left, seen from outside.
+    """
+    corner = np.asarray(faces, np.int64)
+    table = edge_table(corner)
+    face, side = np.nonzero(table.count[table.of_face] == 1)
+    ends = corner[face, (side + 1) % 3]
+    after = dict(zip(corner[face, side].tolist(), ends.tolist(), strict=True))
+    if len(after) != len(face):
+        raise ValueError(
+            "two boundaries meet at a vertex, or the winding is inconsistent; clean the mesh first"
+        )
+    loops = []
+    while after:
+        start, step = after.popitem()
+        loop = [start]
+        while step != start:
+            loop.append(step)
+            step = after.pop(step)
+        loops.append(np.array(loop, np.int64))
+    # longest first; ties are resolved by the lowest vertex, so that results are reproducible
+    loops = [np.roll(loop, -int(loop.argmin())) for loop in loops]
+    return sorted(loops, key=lambda loop: (-len(loop), int(loop[0])))
+
+
+def simple_loops(loop: Index) -> list[Index]:
+    """Split a closed path (n,) at repeated vertices into parts that pass no vertex twice."""
+    parts = list[Index]()
+    path = list[int]()
+    place = dict[int, int]()
+    for vertex in loop.tolist():
+        if vertex in place:
+            start = place[vertex]
+            parts.append(np.array(path[start:], np.int64))
+            for passed in path[start:]:
+                del place[passed]
+            del path[start:]
+        place[vertex] = len(path)
+        path.append(vertex)
+    return [*parts, np.array(path, np.int64)]
+
+
+def side_lengths(path: Array) -> Float64:
+    """Length of each side of a closed path (n, d)."""
+    return np.asarray(np.linalg.norm(np.roll(path, -1, axis=0) - path, axis=1))
+
+
+def outline_first(points: Array, loops: list[Index]) -> list[Index]:
+    """Loops by their length in mm: the outline of the surface, then its holes."""
+    return sorted(loops, key=lambda loop: -float(side_lengths(points[loop]).sum()))
+
+
+def face_components(faces: Faces) -> Index:
+    """Label (f,) of the component each face belongs to; faces touch where exactly two
+    share an edge.
+    """
+    face, neighbour, _ = _pairs(faces)
+    return pair_components(face, neighbour, len(faces))
+
+
+def pair_components(a: Index, b: Index, n: int) -> Index:
+    """Label (n,) of the component of each of n items, of which the pairs (a, b) belong together."""
+    graph = sp.coo_matrix((np.ones(len(a)), (a, b)), shape=(n, n))
+    return np.asarray(connected_components(graph, directed=False)[1], np.int64)
+
+
+def winding_flips(faces: Faces) -> Mask:
+    """Mask (f,) of faces to turn over for a consistent winding; in each component the
+    minority is turned.
+    """
+    face, neighbour, alike = _pairs(faces)
+    n = len(faces)
+    parity = sp.csr_matrix((np.where(alike, 1, 2), (face, neighbour)), shape=(n, n))
+    parity = parity.maximum(parity.T).tocsr()
+    flip = np.zeros(n, bool)
+    for members in _groups(face_components(faces)):
+        if len(members) == 1:
+            continue
+        order, parent = breadth_first_order(parity, int(members[0]), directed=False)
+        step = np.asarray(parity[order[1:], parent[order[1:]]]).ravel() == 2
+        for node, turned in zip(order[1:].tolist(), step.tolist(), strict=True):
+            flip[node] = flip[parent[node]] ^ turned
+        if 2 * flip[members].sum() > len(members):
+            flip[members] ^= True
+    return flip
+
+
+def fans(faces: Faces) -> Index:
+    """Label (f, 3) of the fan each corner belongs to: corners of one vertex joined
+    across edges of two faces.
+
+    A vertex with more than one fan is a bow-tie.
+    """
+    vertex = np.asarray(faces, np.int64).ravel()
+    start, other = _shared_sides(faces)
+    end, other_end = (side // 3 * 3 + (side + 1) % 3 for side in (start, other))
+    opposite = vertex[start] != vertex[other]
+    at_start = np.where(opposite, other_end, other)
+    at_end = np.where(opposite, other, other_end)
+    rows = np.concatenate([start, end])
+    columns = np.concatenate([at_start, at_end])
+    return pair_components(rows, columns, len(vertex)).reshape(-1, 3)
+
+
+def _shared_sides(faces: Faces) -> tuple[Index, Index]:
+    """The two sides, as 3 face + side, at every edge of exactly two faces."""
+    table = edge_table(faces)
+    order = np.argsort(table.of_face.ravel(), kind="stable")
+    start = (np.cumsum(table.count) - table.count)[table.count == 2]
+    return order[start], order[start + 1]
+
+
+def _pairs(faces: Faces) -> tuple[Index, Index, Mask]:
+    """Pairs of faces that share an edge, and whether they traverse it in opposite
+    directions, as they should.
+    """
+    side, other = _shared_sides(faces)
+    start = np.asarray(faces, np.int64).ravel()
+    return side // 3, other // 3, start[side] != start[other]
+
+
+def _groups(labels: Index) -> list[Index]:
+    order = np.argsort(labels, kind="stable")
+    cuts = np.flatnonzero(np.diff(labels[order])) + 1
+    return np.split(order, cuts)
 
 
 def morton_order(points: Array) -> Index:
@@ -243,3 +396,136 @@ def winding_number(vertices: Array, faces: Faces, points: Array) -> Float64:
         scale = la * lb * lc + _dot(a, b) * lc + _dot(b, c) * la + _dot(c, a) * lb
         numbers.append(2 * np.arctan2(volume, scale).sum() / (4 * np.pi))
     return np.array(numbers, np.float64)
+
+
+def loop_matrix(faces: Faces, n_vertices: int) -> tuple[sp.csr_matrix, Index]:
+    """One level of Loop subdivision (Loop 1987; boundaries as cubic B-splines, Hoppe et al. 1994).
+
+    Parameters
+    ----------
+    faces
+        (f, 3), manifold.
+    n_vertices
+        Number of vertices v.
+
+    Returns
+    -------
+    matrix : csr_matrix
+        (v + e, v) of non-negative rows that sum to 1: the old vertices, then one per
+        edge in the order of (low, high).
+    faces : ndarray
+        (4 f, 3): the children of face i are i, f + i, 2 f + i (at its corners) and 3 f
+        + i (its middle).
+    """
+    corner = np.asarray(faces, np.int64)
+    table = edge_table(corner)
+    if (table.count > 2).any():
+        raise ValueError("an edge belongs to more than two faces; clean the mesh first")
+    even = _even_rows(table, n_vertices)
+    odd = _odd_rows(table, np.roll(corner, 1, axis=1), n_vertices)
+    middle = table.of_face + n_vertices
+    children = [
+        np.column_stack([corner[:, i], middle[:, i], middle[:, i - 1]])
+        for i in range(3)
+    ]
+    return sp.vstack([even, odd]).tocsr(), np.concatenate([*children, middle])
+
+
+def subdivide(
+    vertices: Array, faces: Faces, levels: int
+) -> tuple[Float64, Index, sp.csr_matrix]:
+    """`levels` levels of Loop subdivision.
+
+    Parameters
+    ----------
+    vertices, faces
+        (v, 3) mm and (f, 3), manifold.
+    levels
+        Number of levels, each of which splits a triangle into four.
+
+    Returns
+    -------
+    vertices, faces : ndarray
+        (v', 3) mm and (4^levels f, 3).
+    matrix : csr_matrix
+        (v', v): apply it to any value of the old vertices (texture coordinates, masks)
+        for that of the new.
+    """
+    matrix = sp.identity(len(vertices), format="csr")
+    current = np.asarray(faces, np.int64)
+    for _ in range(levels):
+        level, current = loop_matrix(current, matrix.shape[0])
+        matrix = level @ matrix
+    return np.asarray(matrix @ float64(vertices)), current, matrix
+
+
+def carry_points(
+    face: Index, barycentric: Array, n_faces: int, levels: int
+) -> tuple[Index, Float64]:
+    """Positions of points of a mesh after `levels` levels of subdivision, at the same parameters.
+
+    Parameters
+    ----------
+    face, barycentric
+        (k,) triangles of the old mesh and (k, 3) weights of their corners.
+    n_faces
+        Triangles of the old mesh.
+    levels
+        As in `subdivide`.
+
+    Returns
+    -------
+    face, barycentric
+        (k,) triangles of the new mesh and (k, 3) weights of their corners.
+    """
+    triangle = np.array(face, np.int64)
+    weight = np.array(barycentric, np.float64).reshape(-1, 3)
+    for level in range(levels):
+        corner = weight.argmax(axis=1)
+        middle = weight.max(axis=1) < 1 / 2
+        # child i has corner i, the middle of the side from it and the middle of the
+        # side to it; child 3 the middles
+        around = np.take_along_axis(weight, (corner[:, None] + [0, 1, 2]) % 3, axis=1)
+        outer = 2 * around - [1, 0, 0]
+        weight = np.where(middle[:, None], 1 - 2 * np.roll(weight, 1, axis=1), outer)
+        triangle += np.where(middle, 3, corner) * n_faces * 4**level
+    return triangle, weight
+
+
+def _odd_rows(table: EdgeTable, opposite: Faces, n: int) -> sp.csr_matrix:
+    """New vertices: 3/8 of both ends and 1/8 of both vertices across; the middle of a
+    boundary edge.
+    """
+    on_boundary = table.count == 1
+    ends = np.where(on_boundary, 1 / 2, 3 / 8)
+    row = np.arange(len(ends))
+    side = table.of_face.ravel()
+    inner = ~on_boundary[side]
+    rows = np.concatenate([row, row, side[inner]])
+    columns = np.concatenate(
+        [table.edges[:, 0], table.edges[:, 1], opposite.ravel()[inner]]
+    )
+    values = np.concatenate([ends, ends, np.full(int(inner.sum()), 1 / 8)])
+    return sp.csr_matrix((values, (rows, columns)), shape=(len(ends), n))
+
+
+def _even_rows(table: EdgeTable, n: int) -> sp.csr_matrix:
+    """Old vertices: beta of each neighbour inside; 3/4, 1/8, 1/8 along a boundary;
+    corners and isolated ones stay.
+    """
+    neighbours = _adjacency(table.edges, n)
+    rim = _adjacency(table.edges[table.count == 1], n)
+    valence, rim_valence = (np.diff(a.indptr) for a in (neighbours, rim))
+    safe = np.maximum(valence, 1)
+    beta = (5 / 8 - (3 / 8 + np.cos(2 * np.pi / safe) / 4) ** 2) / safe
+    beta = np.where((rim_valence == 0) & (valence > 0), beta, 0.0)
+    # the vertex of a single face is a corner of the outline and stays, as does a bow-tie
+    smooth = (rim_valence == 2) & (valence > 2)
+    diagonal = sp.diags(np.where(smooth, 3 / 4, 1 - beta * valence))
+    along_rim = sp.diags(np.where(smooth, 1 / 8, 0.0)) @ rim
+    return sp.csr_matrix(diagonal + sp.diags(beta) @ neighbours + along_rim)
+
+
+def _adjacency(edges: Faces, n: int) -> sp.csr_matrix:
+    both = np.concatenate([edges, edges[:, ::-1]])
+    return sp.csr_matrix((np.ones(len(both)), (both[:, 0], both[:, 1])), shape=(n, n))

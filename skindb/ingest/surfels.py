@@ -16,13 +16,14 @@ from skindb.format.scan_checks import LANDMARK_REACH, SITE_LANDMARK
 from skindb.geometry.atlas import disc_atlas
 from skindb.geometry.clean import CleanMesh
 from skindb.geometry.mesh import (
+    carry_points,
     closest_on_mesh,
     morton_order,
     splat_radius,
+    subdivide,
     vertex_areas,
     vertex_normals,
 )
-from skindb.geometry.subdivide import carry_points, subdivide
 from skindb.types import Float64, Index, Mask
 
 MAX_SURFELS = 2_500_000  # the samples of this many surfels in a full dome take 36 GB

@@ -1,7 +1,5 @@
 """Rendering of fitted models, comparison with photographs, and the BRDF of a surfel."""
 
-from skindb.render.environment import Environment
-from skindb.render.evaluate import evaluate
 from skindb.render.figures import field_figure
 from skindb.render.photographs import (
     compare_images,
@@ -9,7 +7,8 @@ from skindb.render.photographs import (
     write_comparisons,
 )
 from skindb.render.rendering import render, render_picture
-from skindb.render.scene import Camera, Lights
+from skindb.render.scene import Camera, Environment, Lights
+from skindb.render.surfels import evaluate
 from skindb.schema.omission import NOTHING
 
 __all__ = [

@@ -15,10 +15,14 @@ from skindb.geometry.rays import RayScene
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.reflectance.model import DirectionSampler, Lamp, Points
 from skindb.reflectance.sampling import tangents
-from skindb.render.direct import View, escape_factor, seen_points, trace_view
-from skindb.render.environment import Environment
-from skindb.render.scene import Camera, Lights, Surface
-from skindb.render.subsurface import exitance_from_irradiance
+from skindb.render.scene import Camera, Environment, Lights, Surface
+from skindb.render.shading import (
+    View,
+    escape_factor,
+    exitance_from_irradiance,
+    seen_points,
+    trace_view,
+)
 from skindb.types import Mask, Progress
 
 Float = NDArray[np.floating[Any]]

@@ -19,11 +19,10 @@ from skimage.metrics import structural_similarity
 from skindb.errors import Fault, InputError
 from skindb.files import make_private
 from skindb.geometry.rays import RayScene
-from skindb.render.direct import View, shade_view, trace_view
 from skindb.render.image import auto_exposure, encode_srgb, tone_map, write_png
 from skindb.render.scene import cameras_from_dome, from_model, lights_from_dome
-from skindb.render.subsurface import require_translucency
-from skindb.render.texels import surfel_confidence
+from skindb.render.shading import View, require_translucency, shade_view, trace_view
+from skindb.render.surfels import surfel_confidence
 from skindb.schema import check
 from skindb.schema.consent import honour_consent
 from skindb.types import Mask

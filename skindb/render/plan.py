@@ -14,10 +14,9 @@ from skindb.geometry.camera import project
 from skindb.geometry.rays import RayScene
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.reflectance.model import Lamp, Points
-from skindb.render.direct import View, trace_view
 from skindb.render.monte_carlo import Lighting
 from skindb.render.scene import Camera, Lights, Surface
-from skindb.render.subsurface import tree_opening
+from skindb.render.shading import View, trace_view, tree_opening
 from skindb.schema.omission import Omission
 from skindb.types import Mask
 

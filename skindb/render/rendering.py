@@ -15,13 +15,12 @@ from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
 from skindb.geometry.rays import RayScene
-from skindb.render.direct import TERMS, View, glow_image, shade_view, trace_view
-from skindb.render.environment import Environment
 from skindb.render.image import auto_exposure, tone_map, write_exr, write_png
 from skindb.render.monte_carlo import Lighting, Quality, render_monte_carlo
 from skindb.render.plan import KEPT, RenderPlan, plan_render, plan_scene
 from skindb.render.scene import (
     Camera,
+    Environment,
     Lights,
     Surface,
     cameras_from_dome,
@@ -29,7 +28,16 @@ from skindb.render.scene import (
     lights_from_dome,
     subdivide_surface,
 )
-from skindb.render.subsurface import require_translucency, total_exitance, tree_opening
+from skindb.render.shading import (
+    TERMS,
+    View,
+    glow_image,
+    require_translucency,
+    shade_view,
+    total_exitance,
+    trace_view,
+    tree_opening,
+)
 from skindb.schema.consent import honour_consent
 from skindb.schema.omission import Omission
 from skindb.types import Mask, Progress

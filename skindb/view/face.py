@@ -19,12 +19,11 @@ from skindb.errors import Fault, InputError
 from skindb.geometry.mesh import vertex_areas
 from skindb.optics.diffusion import S_FLOOR
 from skindb.optics.fresnel import boundary_factor
-from skindb.render.environment import LUMINANCE, Environment
 from skindb.render.image import tone_map
 from skindb.render.monte_carlo import Lighting
 from skindb.render.rendering import chosen_camera, chosen_lights, fixed_exposure, render
-from skindb.render.scene import Surface, from_model
-from skindb.render.texels import surfel_confidence
+from skindb.render.scene import LUMINANCE, Environment, Surface, from_model
+from skindb.render.surfels import surfel_confidence
 from skindb.schema import variables
 from skindb.schema.consent import honour_consent
 from skindb.schema.omission import Omission

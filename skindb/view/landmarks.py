@@ -34,8 +34,7 @@ from skindb.geometry.landmarks import MEAN_FACE, suggest_landmarks
 from skindb.geometry.mesh import closest_on_mesh, vertex_normals
 from skindb.geometry.scan import Crop, Scan, read_colours, read_scan
 from skindb.limits import MAX_JSON_BYTES
-from skindb.view.page import embedded_json, page_text
-from skindb.view.server import HTML, Content, PageServer
+from skindb.view.page import HTML, Content, PageServer, embedded_json, page_text
 
 Points = Mapping[str, NDArray[np.float64]]
 # clicks are on the surface; single precision and rounding cause errors of 0.001

@@ -1,19 +1,25 @@
-"""Pages from templates, whose markers are replaced in one pass: nothing is replaced inside
-of data; and the page of the viewer.
+"""Pages for the person at this machine: made from templates, and served from memory in one
+session that a token opens.
 """
 
 from __future__ import annotations
 
 import html
 import json
-from collections.abc import Iterable, Mapping
+import re
+import secrets
+import threading
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
 from pathlib import Path
 from string import Template
 from typing import Any
 
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, system_fault
 from skindb.files import make_private, private_file
 
 SCRIPTS = (
@@ -38,6 +44,25 @@ APPROXIMATIONS = (
     "reflected more than once is not included. skindb render omits it too, but has "
     "none of the other approximations."
 )
+LOCAL = "127.0.0.1"
+# another port is that of a tunnel
+HOST = re.compile(r"(127\.0\.0\.1|localhost)(:[0-9]{1,5})?")
+HTML = "text/html; charset=utf-8"
+JSON = "application/json"
+MAX_REQUEST_BYTES = 1_000_000  # a hundred landmarks take about 20,000
+REQUEST_SECONDS = 60.0  # for which a connection may be silent
+HEADERS = {
+    "Cache-Control": "no-store",
+    "Content-Security-Policy": "default-src 'none'; script-src 'unsafe-inline'; "
+    "style-src 'unsafe-inline'; "
+    "img-src data: blob:; connect-src 'self'; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors 'none'",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+}
+Action = Callable[[dict[str, Any]], dict[str, Any]]
 
 
 def page_text(folder: str, scripts: Iterable[str], parts: Mapping[str, str]) -> str:
@@ -158,3 +183,205 @@ def _page(
         "faces": faces,
     }
     return page_text("page", [f"{name}.js" for name in SCRIPTS], parts)
+
+
+@dataclass(frozen=True)
+class Content:
+    """What is served under a name: its media type, and a function that returns its bytes."""
+
+    kind: str
+    read: Callable[[], bytes]
+
+
+class PageServer(ThreadingHTTPServer):
+    """Server at 127.0.0.1 of one page and what the page requests, which is not yet running.
+
+    The address contains a token that is valid for one request, whose answer sets a
+    cookie for all others. The path of the cookie is random, because browsers send
+    cookies to every port of a host, also to servers of other users.
+
+    Parameters
+    ----------
+    contents
+        Name -> content; the page has the empty name.
+    actions
+        Name -> function of a JSON object that the page posts; returns the answer.
+    port
+        Port; 0 chooses a free one.
+
+    Raises
+    ------
+    InputError
+        If the port is taken.
+    """
+
+    daemon_threads = True
+
+    def __init__(
+        self,
+        contents: Mapping[str, Content],
+        actions: Mapping[str, Action],
+        *,
+        port: int = 0,
+    ) -> None:
+        self.contents = contents
+        self.actions = actions
+        self.root = f"/{secrets.token_urlsafe(12)}/"
+        self.cookie = f"skindb={secrets.token_urlsafe()}"
+        self._token = secrets.token_urlsafe()
+        self._unused = threading.Lock()
+        try:
+            super().__init__((LOCAL, port), _Handler)
+        except OSError as error:
+            cure = "choose another port, or omit --port"
+            raise InputError(
+                Fault(
+                    f"port {port}", "must be free", error.strerror or str(error), cure
+                )
+            ) from None
+
+    @property
+    def address(self) -> str:
+        """Address that opens the session, in one browser."""
+        return f"http://{LOCAL}:{self.server_address[1]}{self.root}?token={self._token}"
+
+    def accepts(self, query: str) -> bool:
+        """Whether the query of an address contains the token, which is accepted only
+        the first time.
+        """
+        return _are_equal(query, f"token={self._token}") and self._unused.acquire(
+            blocking=False
+        )
+
+
+def _are_equal(secret: str, candidate: str) -> bool:
+    """Comparison of secrets, whose time does not depend on them."""
+    return secrets.compare_digest(secret.encode(), candidate.encode())
+
+
+class _Handler(BaseHTTPRequestHandler):
+    """Answers requests of its own page; every other request is refused, whatever its method."""
+
+    server: PageServer
+    server_version = "skindb"
+    sys_version = ""
+    timeout = REQUEST_SECONDS
+    begins = False  # whether this request opens the session
+    name: str | None = None  # of the requested content or action
+
+    def handle_one_request(self) -> None:
+        """Answer a request; it is no fault if the page was closed meanwhile."""
+        with suppress(ConnectionError):
+            super().handle_one_request()
+
+    def parse_request(self) -> bool:
+        """Read the head of a request of any method, and whether it is permitted."""
+        if not super().parse_request():
+            return False
+        path, _, query = self.path.partition("?")
+        refusal = self._foreign()
+        if not refusal and not self._has_cookie():
+            self.begins = (
+                self.command == "GET"
+                and path == self.server.root
+                and self.server.accepts(query)
+            )
+            refusal = (
+                ""
+                if self.begins
+                else "open the address that skindb printed; it can be opened once"
+            )
+        if refusal:
+            self.send_error(HTTPStatus.FORBIDDEN, refusal)
+        elif path.startswith(self.server.root):
+            self.name = path.removeprefix(self.server.root)
+        return not refusal
+
+    def _foreign(self) -> str:
+        """Reason why a request is not from the page itself; empty if it is."""
+        hosts = self.headers.get_all("Host", [])
+        origins = self.headers.get_all("Origin", [])
+        if len(hosts) != 1 or not HOST.fullmatch(hosts[0]):
+            return "only requests to this machine are allowed"
+        if origins not in ([], [f"http://{hosts[0]}"]) or (
+            self.command == "POST" and not origins
+        ):
+            return "only requests of the page itself are allowed"
+        return ""
+
+    def _has_cookie(self) -> bool:
+        """Whether a cookie is that of the session; those of other servers at this host
+        may be malformed.
+        """
+        cookies = ";".join(self.headers.get_all("Cookie", [])).split(";")
+        return any(_are_equal(cookie.strip(), self.server.cookie) for cookie in cookies)
+
+    def do_GET(self) -> None:
+        """Answer with a content."""
+        content = None if self.name is None else self.server.contents.get(self.name)
+        if content is None:
+            self.send_error(HTTPStatus.NOT_FOUND)
+            return
+        try:
+            self._answer(HTTPStatus.OK, content.kind, content.read())
+        except InputError as error:
+            self._answer(
+                HTTPStatus.NOT_FOUND, "text/plain; charset=utf-8", str(error).encode()
+            )
+        except OSError as error:
+            fault = system_fault(error, "file system")
+            self._answer(
+                HTTPStatus.INTERNAL_SERVER_ERROR,
+                "text/plain; charset=utf-8",
+                str(fault).encode(),
+            )
+
+    def do_HEAD(self) -> None:
+        """Answer as to GET, without the content."""
+        self.do_GET()
+
+    def do_POST(self) -> None:
+        """Answer with the result of an action."""
+        action = None if self.name is None else self.server.actions.get(self.name)
+        length = self.headers.get("Content-Length", "")
+        if action is None:
+            self.send_error(HTTPStatus.NOT_FOUND)
+        elif self.headers.get("Content-Type") != JSON:
+            self.send_error(HTTPStatus.UNSUPPORTED_MEDIA_TYPE)
+        elif not re.fullmatch("[0-9]{1,9}", length) or int(length) > MAX_REQUEST_BYTES:
+            self.send_error(HTTPStatus.REQUEST_ENTITY_TOO_LARGE)
+        else:
+            self._act(action, self.rfile.read(int(length)))
+
+    def _act(self, action: Action, body: bytes) -> None:
+        try:
+            request = json.loads(body)
+            reply = action(request if isinstance(request, dict) else {})
+        except InputError as error:
+            reply = {"faults": [str(fault) for fault in error.faults]}
+        except OSError as error:
+            reply = {"faults": [str(system_fault(error, "file system"))]}
+        except (ValueError, RecursionError):
+            self.send_error(HTTPStatus.BAD_REQUEST, "the request must be JSON")
+            return
+        self._answer(HTTPStatus.OK, JSON, json.dumps(reply).encode())
+
+    def _answer(self, status: HTTPStatus, kind: str, body: bytes) -> None:
+        self.send_response(status)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(body)))
+        if self.begins:
+            settings = f"Path={self.server.root}; HttpOnly; SameSite=Strict"
+            self.send_header("Set-Cookie", f"{self.server.cookie}; {settings}")
+        self.end_headers()
+        if self.command != "HEAD":
+            self.wfile.write(body)
+
+    def end_headers(self) -> None:
+        """Add the headers of every answer."""
+        for name, value in HEADERS.items():
+            self.send_header(name, value)
+        super().end_headers()
+
+    def log_message(self, *_: Any) -> None:
+        """Do not log requests."""

@@ -19,8 +19,7 @@ from scipy import sparse
 from scipy.interpolate import RectBivariateSpline
 
 from skindb.errors import Fault, InputError
-from skindb.geometry.mesh import vertex_normals
-from skindb.geometry.subdivide import subdivide
+from skindb.geometry.mesh import subdivide, vertex_normals
 from skindb.virtual.face import (
     REGIONS,
     STEP,

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from skindb.cache import cached_arrays
 from skindb.files import private_file
 from skindb.optics.transport import Walk, radial_profile, random_walk
-from skindb.virtual.frames import Sensor, write_png
+from skindb.virtual.dome import Sensor, write_png
 from skindb.virtual.skin import Site
 
 Array = NDArray[np.float64]

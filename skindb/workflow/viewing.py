@@ -11,14 +11,23 @@ from typing import Any
 import xarray as xr
 
 from skindb.errors import Fault, InputError
-from skindb.render.environment import Environment
+from skindb.render.scene import Environment
 from skindb.schema.consent import require_consent
 from skindb.store import Database, UnavailableError, require_fresh
 from skindb.types import Progress, silent
 from skindb.view.face import Trait, face_record, page_omissions, still_picture
 from skindb.view.landmarks import landmark_server, landmark_task
-from skindb.view.page import OVERCAST, PagedFace, index_text, write_folder, write_page
-from skindb.view.server import HTML, JSON, Content, PageServer
+from skindb.view.page import (
+    HTML,
+    JSON,
+    OVERCAST,
+    Content,
+    PagedFace,
+    PageServer,
+    index_text,
+    write_folder,
+    write_page,
+)
 from skindb.workflow.audit import logged
 from skindb.workflow.edits import editable_model, stored_or_moved
 

@@ -9,7 +9,7 @@ from small_face import SIDE, small_face
 from skindb.demo.tables import Results
 from skindb.render.photographs import Causes, Comparison
 from skindb.schema import FitStatus, label
-from skindb.virtual.truth import Recovery
+from skindb.virtual.capture import Recovery
 
 TAKES = ("V001", "V001.lotion", "V001.powder", "V002", "V003", "V004", "V005", "V006")
 PLANTED = {

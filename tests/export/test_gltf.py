@@ -13,7 +13,7 @@ from PIL import Image
 
 from skindb.errors import InputError
 from skindb.export.gltf import export_gltf
-from skindb.export.pbr import fit_material
+from skindb.export.textures import fit_material
 from skindb.reflectance.tables import kernel_tables
 from skindb.render.image import decode_srgb, encode_srgb
 from skindb.schema import FitStatus

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from skindb.export.translucency import mean_free_path
+from skindb.export.inputs import mean_free_path
 from skindb.optics.diffusion import dipole_profile, dipole_s, scattering_coefficients
 
 ETA = 1.3

@@ -24,9 +24,9 @@ from scipy.ndimage import binary_erosion, map_coordinates
 from skindb.export.bundle import export_bundle
 from skindb.reflectance.mixture import Mixture
 from skindb.reflectance.table_file import read_dictionary
-from skindb.render.direct import render_view
 from skindb.render.image import read_exr, write_exr
 from skindb.render.scene import Camera, Lights, Surface, from_model
+from skindb.render.shading import render_view
 
 pytestmark = pytest.mark.slow
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from skindb.export.pbr import (
+from skindb.export.textures import (
     MAX_F0,
     ROUGHNESS,
     Material,

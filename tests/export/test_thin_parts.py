@@ -14,8 +14,8 @@ from PIL import Image
 from scipy import integrate
 
 from skindb.export.gltf import export_gltf
+from skindb.export.inputs import thickness, transmitted_fraction
 from skindb.export.textures import skin_of
-from skindb.export.translucency import thickness, transmitted_fraction
 from skindb.geometry.mesh import vertex_areas
 from skindb.optics.diffusion import (
     diffuse_reflectance,

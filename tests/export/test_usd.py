@@ -12,9 +12,9 @@ import pytest
 import xarray as xr
 
 from skindb.export.bundle import export_bundle
-from skindb.export.pbr import fit_material
+from skindb.export.inputs import mean_free_path
 from skindb.export.scenes import index_of
-from skindb.export.translucency import mean_free_path
+from skindb.export.textures import fit_material
 from skindb.reflectance.tables import kernel_tables
 from skindb.render.image import read_exr
 

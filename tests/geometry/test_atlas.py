@@ -25,8 +25,7 @@ from skindb.geometry.atlas import (
     symmetric_dirichlet,
 )
 from skindb.geometry.clean import clean_mesh
-from skindb.geometry.mesh import face_crosses
-from skindb.geometry.subdivide import subdivide
+from skindb.geometry.mesh import face_crosses, subdivide
 
 FLOAT32 = 2e-7
 EVEN = 0.2  # sd of log2 area; measured 0.06 to 0.18, 0.67 to 1.3 before equalisation

@@ -20,7 +20,7 @@ from skindb.geometry.clean import (
     repair_slivers,
     sliver_mask,
 )
-from skindb.geometry.topology import edge_table, fans
+from skindb.geometry.mesh import edge_table, fans
 
 
 def cap(level: int = 3) -> tuple[np.ndarray, np.ndarray]:

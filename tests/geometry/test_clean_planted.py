@@ -13,7 +13,7 @@ import trimesh
 from test_clean import assert_sound, cap, face_set, in_scan
 
 from skindb.geometry.clean import PLACES, clean_mesh
-from skindb.geometry.topology import boundary_loops, simple_loops
+from skindb.geometry.mesh import boundary_loops, simple_loops
 
 N = 20
 

@@ -10,7 +10,7 @@ from scipy.spatial import Delaunay, cKDTree
 from scipy.spatial.transform import Rotation
 
 from skindb.geometry.atlas import DISC_RADIUS, signed_areas
-from skindb.geometry.correspondence import (
+from skindb.geometry.warp import (
     INNER_POINTS,
     MIN_LANDMARK_DISTANCE_MM,
     OUTLINE_POINTS,

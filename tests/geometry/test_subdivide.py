@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from skindb.geometry.subdivide import carry_points, loop_matrix, subdivide
+from skindb.geometry.mesh import carry_points, loop_matrix, subdivide
 
 ROUNDING = 1e-12
 

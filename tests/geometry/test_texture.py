@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.ndimage import map_coordinates
 from scipy.spatial import Delaunay
 
-from skindb.geometry.texture import atlas_values, bilinear, push_pull, rasterise_atlas
+from skindb.geometry.atlas import atlas_values, bilinear, push_pull, rasterise_atlas
 
 FLOAT32 = 1e-6
 

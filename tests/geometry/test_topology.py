@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from skindb.geometry.topology import (
+from skindb.geometry.mesh import (
     boundary_loops,
     edge_table,
     face_components,

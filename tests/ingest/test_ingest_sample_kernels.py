@@ -5,7 +5,7 @@ import pytest
 from scipy.special import jv
 
 from skindb.calibration.pixel_flags import DARK, OK, SATURATED
-from skindb.geometry.texture import bilinear
+from skindb.geometry.atlas import bilinear
 from skindb.ingest._sample_kernels import (
     NONE,
     SINGLE,

@@ -12,9 +12,8 @@ from skindb.errors import InputError
 from skindb.format.folder import read_capture
 from skindb.geometry._mesh_kernels import grown
 from skindb.geometry.camera import camera_centre, pixel_rays, project
-from skindb.geometry.mesh import morton_order, splat_radius, vertex_normals
+from skindb.geometry.mesh import morton_order, splat_radius, subdivide, vertex_normals
 from skindb.geometry.rays import RayScene
-from skindb.geometry.subdivide import subdivide
 from skindb.ingest.surfels import SurfelSet, build_surfels, subdivision_levels
 from skindb.ingest.visibility import camera_visibility, disc_points, light_visibility
 from skindb.virtual.face import FaceShape

@@ -13,9 +13,13 @@ import trimesh
 from skindb.geometry.rays import RayScene
 from skindb.optics.diffusion import dipole_s
 from skindb.reflectance.mixture import Mixture
-from skindb.render.direct import render_view, trace_view
 from skindb.render.scene import Camera, Lights, Surface
-from skindb.render.subsurface import exitances, transmitted_irradiance
+from skindb.render.shading import (
+    exitances,
+    render_view,
+    trace_view,
+    transmitted_irradiance,
+)
 
 FLOAT32 = 2e-6
 LAMBERT = 1.0  # index at which Fresnel lets everything pass

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from skindb.render.direct import trace_view
 from skindb.render.monte_carlo import LIGHTS_PER_RAY, LightChoice, Lighting
 from skindb.render.scene import Lights
+from skindb.render.shading import trace_view
 from tests.render.test_monte_carlo import ball, camera, rendered
 
 COUNT = 32

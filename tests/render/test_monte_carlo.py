@@ -14,12 +14,15 @@ from skindb.optics.diffusion import dipole_s
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.reflectance.mixture import Mixture
 from skindb.reflectance.tables import TableGrid, directional_albedo, tabulate
-from skindb.render.direct import render_view, trace_view
-from skindb.render.environment import Environment
 from skindb.render.image import write_exr
 from skindb.render.monte_carlo import MIN_BATCHES, Lighting, Quality, render_monte_carlo
-from skindb.render.scene import Camera, Lights, Surface
-from skindb.render.subsurface import exitance_from_irradiance, tree_opening
+from skindb.render.scene import Camera, Environment, Lights, Surface
+from skindb.render.shading import (
+    exitance_from_irradiance,
+    render_view,
+    trace_view,
+    tree_opening,
+)
 
 LEVEL = 1e-5  # probability with which a right renderer fails a z-test of a picture
 

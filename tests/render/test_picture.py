@@ -10,8 +10,7 @@ import xarray as xr
 from skindb.errors import InputError
 from skindb.optics.diffusion import dipole_s
 from skindb.reflectance.tables import stored_brdf
-from skindb.render import subsurface as subsurface_module
-from skindb.render.direct import render_view
+from skindb.render import shading
 from skindb.render.image import decode_srgb, read_exr, read_png, write_exr
 from skindb.render.monte_carlo import Lighting
 from skindb.render.photographs import compare_photographs
@@ -23,6 +22,7 @@ from skindb.render.rendering import (
     trace_shot,
 )
 from skindb.render.scene import cameras_from_dome, from_model, lights_from_dome
+from skindb.render.shading import render_view
 from skindb.schema import dataset
 
 
@@ -170,8 +170,8 @@ def test_picture__all_lights_are_carried_as_three_columns(
         columns.append(irradiance.shape[1])
         return carry(points, areas, irradiance, *rest, **options)
 
-    carry = subsurface_module.subsurface_exitance
-    monkeypatch.setattr(subsurface_module, "subsurface_exitance", counted)
+    carry = shading.subsurface_exitance
+    monkeypatch.setattr(shading, "subsurface_exitance", counted)
     model["dome"] = model["dome"].to_dataset().isel(light=[0, 1, 2, 0, 1])
     surface = from_model(model)
     dome = model["dome"].to_dataset()

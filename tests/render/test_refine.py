@@ -14,9 +14,8 @@ from skindb.geometry.rays import RayScene
 from skindb.optics.diffusion import dipole_s
 from skindb.reflectance.mixture import Mixture
 from skindb.render import scene as refine
-from skindb.render.direct import render_view
 from skindb.render.scene import Camera, Lights, Surface, subdivide_surface
-from skindb.render.subsurface import exitances
+from skindb.render.shading import exitances, render_view
 
 HALF = 20.0
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from skindb.render.environment import Environment
+from skindb.render.scene import Environment
 from skindb.view.face import distant_lights, overcast_sky
 
 

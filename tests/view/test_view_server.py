@@ -10,7 +10,7 @@ import pytest
 from page_session import Session, running
 
 from skindb.errors import Fault, InputError
-from skindb.view.server import HTML, JSON, Content, PageServer
+from skindb.view.page import HTML, JSON, Content, PageServer
 
 METHODS = (
     "GET",

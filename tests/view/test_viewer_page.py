@@ -15,17 +15,17 @@ from scipy.ndimage import binary_erosion
 from small_face import LIGHTS, small_face
 
 from skindb.reflectance.tables import kernel_tables, stored_brdf
-from skindb.render.direct import render_view, trace_view
-from skindb.render.environment import Environment
 from skindb.render.image import decode_srgb
 from skindb.render.rendering import render
 from skindb.render.scene import (
     Camera,
+    Environment,
     Lights,
     cameras_from_dome,
     from_model,
     lights_from_dome,
 )
+from skindb.render.shading import render_view, trace_view
 from skindb.schema import dataset
 from skindb.view.face import (
     Trait,
@@ -35,8 +35,16 @@ from skindb.view.face import (
     page_omissions,
     still_picture,
 )
-from skindb.view.page import PagedFace, index_text, write_folder, write_page
-from skindb.view.server import HTML, JSON, Content, PageServer
+from skindb.view.page import (
+    HTML,
+    JSON,
+    Content,
+    PagedFace,
+    PageServer,
+    index_text,
+    write_folder,
+    write_page,
+)
 
 BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]

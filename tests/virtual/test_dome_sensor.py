@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from skindb.errors import InputError
-from skindb.virtual.dome import CENTRE, HEAD, build_dome
-from skindb.virtual.frames import Sensor
+from skindb.virtual.dome import CENTRE, HEAD, Sensor, build_dome
 
 
 def _dome(**sizes):

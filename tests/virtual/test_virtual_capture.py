@@ -9,13 +9,12 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from skindb.errors import InputError
-from skindb.render import direct
-from skindb.render.subsurface import exitances
-from skindb.virtual import frames
+from skindb.render import shading
+from skindb.render.shading import exitances
+from skindb.virtual import dome as virtual_dome
 from skindb.virtual.capture import simulate_take
-from skindb.virtual.dome import build_dome
+from skindb.virtual.dome import Sensor, build_dome, frontal_camera
 from skindb.virtual.face import field
-from skindb.virtual.frames import Sensor, frontal_camera
 from skindb.virtual.person import Person, face_shape
 
 PERSON = Person("T001", 30, "female", "european", 5)
@@ -259,7 +258,7 @@ def test_simulate_take__computes_subsurface_light_once_for_all_cameras(
         walks.append(len(lights))
         return exitances(surface, lights, scene)
 
-    for module in (direct, frames):
+    for module in (shading, virtual_dome):
         monkeypatch.setattr(module, "exitances", counted)
     soft = _simulate(tmp_path / "soft", subsurface=True, sensor=Sensor(noisy=False))
     assert walks == [4]

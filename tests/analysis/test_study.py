@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from skindb.analysis.each_take import each_item, each_take
+from skindb.analysis.study import each_item, each_take
 
 
 def _misaligned(values):
