@@ -1,20 +1,24 @@
-"""Parameters of fits, ingests, simulations and capture sessions, as frozen records.
+"""Parameters of commands and of the functions that they call, as frozen records.
 
 The options of the command line are generated from the fields: each has its default, its
-help and its limits here, and nowhere else. This module imports nothing heavy, because
-``--help`` reads it.
+help and its limits here, and nowhere else. The limits hold for every caller. This module
+imports nothing heavy, because ``--help`` reads it.
 """
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import MISSING, asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any, Literal, Self, get_args, get_origin, get_type_hints
+from types import UnionType
+from typing import Any, Literal, Self, Union, get_args, get_origin, get_type_hints
 
 from skindb.errors import Fault, InputError
 from skindb.limits import (
     MAX_CAMERAS,
+    MAX_DEMO_TAKES,
     MAX_FRAME_SIDE_PX,
     MAX_LIGHTS,
     MAX_PHOTOGRAPHS,
@@ -28,6 +32,15 @@ from skindb.limits import (
 # distribution, and at its 95 % limit all of the mean of both is even.
 EVEN_REFLECTION = 0.055
 VIRTUAL_SEED = 2005
+# Standard error of a light relative to the target along each axis, chosen in advance
+# for a careful calibration. In generated captures with errors of 0.6 mm of lights and
+# of cameras, intensities have z-scores of 0.9 to 1.2 with it.
+POSITION_ERROR_MM = 1.0
+# its file may change, so that a study with a dictionary is always computed
+DICTIONARY_HELP = (
+    "Dictionary to use instead of the embedded one: a folder of MERL files, or an .npz "
+    "file of tables."
+)
 FullMode = Literal["perceptual", "linear", "paper"]
 
 
@@ -51,8 +64,17 @@ def option(default: Any, help: str, **limits: Any) -> Any:  # noqa: A002
 
 def option_of(record: type, name: str) -> Option:
     """Help and limits of a field of a record."""
-    found: Option = record.__dataclass_fields__[name].metadata["option"]  # type: ignore[attr-defined]
-    return found
+    limits: Option = record.__dataclass_fields__[name].metadata["option"]  # type: ignore[attr-defined]
+    return limits
+
+
+def words_of(hint: Any) -> tuple[str, ...]:
+    """The words that a parameter of this type accepts."""
+    if get_origin(hint) is Literal:
+        return get_args(hint)
+    if get_origin(hint) in (Union, UnionType):
+        return tuple(word for part in get_args(hint) for word in words_of(part))
+    return ()
 
 
 def require_limits(parameters: Any) -> None:
@@ -62,32 +84,50 @@ def require_limits(parameters: Any) -> None:
     faults = []
     for spec in fields(record):
         value = getattr(parameters, spec.name)
-        rule = _rule(option_of(record, spec.name), hints[spec.name], value)
+        rule = broken_rule(option_of(record, spec.name), hints[spec.name], value)
         if rule:
             faults.append(Fault(spec.name, rule, repr(value), "give another value"))
     if faults:
         raise InputError(faults)
 
 
-def _rule(limits: Option, hint: Any, value: Any) -> str:
-    """The rule that a value breaks; empty if there is none."""
-    if get_origin(hint) is Literal:
-        choices = get_args(hint)
-        return "" if value in choices else f"must be one of {', '.join(choices)}"
+def broken_rule(limits: Option, hint: Any, value: Any) -> str:
+    """The rule that a value of this type breaks; empty if there is none."""
+    words = words_of(hint)
     low = limits.minimum
     high = limits.maximum
+    if value in words:
+        return ""
+    if words and low is None:
+        return f"must be one of {', '.join(words)}"
     if low is None or value is None:
         return ""
-    inside = value > low if limits.above_minimum else value >= low
-    if inside and (high is None or value <= high):
+    number = math.nan if words and isinstance(value, str) else value
+    inside = number > low if limits.above_minimum else number >= low
+    if inside and (high is None or number <= high):
         return ""
+    if words:
+        return f"must be {', '.join(words)}, or a number from {_short(low)} to {_short(high)}"
     if high is None or high == MAX_SEED:
         return f"must be at least {low:g}"
     return f"must lie in {'(' if limits.above_minimum else '['}{low:g}, {high:g}]"
 
 
+def _short(number: float | None) -> str:
+    """A number as a person writes it, such as 1e-9."""
+    return re.sub(r"e([+-])0*", lambda sign: "e" + sign[1].strip("+"), f"{number:g}")
+
+
+class Limited:
+    """A record whose fields are within their limits; others raise `InputError`."""
+
+    def __post_init__(self) -> None:
+        """Check the limits."""
+        require_limits(self)
+
+
 @dataclass(frozen=True)
-class FitParameters:
+class FitParameters(Limited):
     """Parameters of a fit.
 
     Parameters
@@ -165,10 +205,6 @@ class FitParameters:
         maximum=MAX_SEED,
     )
 
-    def __post_init__(self) -> None:
-        """Check the limits."""
-        require_limits(self)
-
     @classmethod
     def of(cls, attrs: Mapping[Any, Any]) -> Self:
         """The parameters in the attributes of a model or of a first pass."""
@@ -182,7 +218,7 @@ class FitParameters:
 
 
 @dataclass(frozen=True)
-class IngestParameters:
+class IngestParameters(Limited):
     """Parameters of an ingest.
 
     Parameters
@@ -247,7 +283,7 @@ class IngestParameters:
 
 
 @dataclass(frozen=True)
-class SimulationParameters:
+class SimulationParameters(Limited):
     """Parameters of virtual captures: the dome, its frames in pixels, and the skin.
 
     Parameters
@@ -283,7 +319,7 @@ class SimulationParameters:
 
 
 @dataclass(frozen=True)
-class SessionParameters:
+class SessionParameters(Limited):
     """Parameters of a capture session in a real or a virtual laboratory.
 
     A real session needs `setup`, `dome`, `cameras`, `subject`, `consent`, `reference` and
@@ -369,4 +405,151 @@ class SessionParameters:
     )
     faults: tuple[str, ...] = option(
         (), "Fault of an emulated device.", name="fault", metavar="NAME=VALUE"
+    )
+
+
+@dataclass(frozen=True)
+class CalibrationParameters(Limited):
+    """Parameters of a calibration of the lights, cameras and probe of a laboratory."""
+
+    name: str = option(MISSING, "Name by which captures refer to the calibration.")
+    fit_falloff: bool = option(False, "Also fit the angular fall-off of every light.")
+    position_error: float = option(
+        POSITION_ERROR_MM,
+        "Standard error of the positions of the lights relative to the white target "
+        "along each axis, in mm.",
+        minimum=0,
+        maximum=100,
+    )
+
+
+@dataclass(frozen=True)
+class RenderParameters(Limited):
+    """Parameters of a picture of a model, see `skindb.render.render_picture`."""
+
+    lights: tuple[str, ...] = option(
+        (),
+        "Name of a light of the dome; several are added.  [default: all, or none with "
+        "an environment]",
+        name="light",
+    )
+    environment: Path | None = option(
+        None, "Latitude-longitude image of light from all directions (.exr)."
+    )
+    camera: str | None = option(
+        None, "Name of a camera of the dome.  [default: the most frontal one]"
+    )
+    samples: int = option(
+        32, "Number of rays per pixel.", name="spp", minimum=8, maximum=4096
+    )
+    error: float | None = option(
+        None,
+        "Relative standard error of the picture at which sampling stops.",
+        minimum=1e-4,
+        maximum=1,
+    )
+    seed: int = option(0, "Random seed.", minimum=0, maximum=MAX_SEED)
+    scale: float = option(
+        1.0,
+        "Size of the picture relative to that of the camera.",
+        minimum=0.1,
+        maximum=20,
+    )
+    exposure: float | Literal["fixed", "auto"] = option(
+        "fixed",
+        "Exposure of a PNG: fixed (a white matt surface appears white), auto (for each "
+        "picture), or a factor.",
+        minimum=1e-9,
+        maximum=1e9,
+    )
+    subsurface: bool = option(False, "Simulate subsurface transport by the dipole.")
+
+
+@dataclass(frozen=True)
+class ComparisonParameters(Limited):
+    """Parameters of a comparison of photographs with renderings of the model."""
+
+    samples: int = option(2, "Number of rays per pixel and axis.", minimum=1, maximum=8)
+    subsurface: bool = option(False, "Simulate subsurface transport by the dipole.")
+
+
+@dataclass(frozen=True)
+class ExportParameters(Limited):
+    """Parameters of an export of a model."""
+
+    size: int | None = option(
+        None,
+        "Number of texels along each side of a map.  [default: 1.5 per surfel spacing, "
+        "rounded up to a power of two]",
+        minimum=16,
+        maximum=8192,
+    )
+    gltf: bool = option(
+        False, "Write only glTF; for one take, --out may then be a .glb file."
+    )
+    merl: bool = option(True, "Skip the MERL binaries (35 MB each).", name="no-merl")
+
+
+@dataclass(frozen=True)
+class EditParameters(Limited):
+    """Parameters of an edit of a model along traits."""
+
+    traits: tuple[str, ...] = option(
+        MISSING,
+        "Trait and its amount, for example lotion=0.5 (may be given several times).",
+        name="trait",
+        metavar="NAME=AMOUNT",
+    )
+    study: str | None = option(
+        None, "Study of traits.  [default: traits, or the only one]"
+    )
+    dictionary: Path | None = option(None, DICTIONARY_HELP)
+
+
+@dataclass(frozen=True)
+class ViewParameters(Limited):
+    """Parameters of the page that shows models."""
+
+    traits: tuple[str, ...] = option(
+        (),
+        "Trait that gets a slider, and the amount at its end, for example age=20; 1 if "
+        "no amount is given (may be given several times).",
+        name="trait",
+        metavar="NAME[=AMOUNT]",
+    )
+    study: str | None = option(
+        None, "Study of traits.  [default: traits, or the only one there is]"
+    )
+    environment: Path | None = option(
+        None,
+        "Latitude-longitude image of light from all directions (.exr).  [default: "
+        "overcast sky]",
+    )
+    dictionary: Path | None = option(None, DICTIONARY_HELP)
+
+
+@dataclass(frozen=True)
+class DemoParameters(Limited):
+    """Parameters of the demo: its virtual dome and the number of its takes."""
+
+    takes: int = option(
+        MAX_DEMO_TAKES, "Number of virtual takes.", minimum=1, maximum=MAX_DEMO_TAKES
+    )
+    cameras: int = option(
+        8, "Number of cameras of the virtual dome.", minimum=2, maximum=MAX_CAMERAS
+    )
+    lights: int = option(
+        48, "Number of lights of the virtual dome.", minimum=12, maximum=MAX_LIGHTS
+    )
+    seed: int = option(
+        VIRTUAL_SEED,
+        "Random seed for noise and sampling.",
+        minimum=0,
+        maximum=MAX_SEED,
+    )
+    workers: int | None = option(
+        None,
+        "Number of takes at a time.  [default: one for each core, at most 4]",
+        minimum=1,
+        maximum=MAX_DEMO_TAKES,
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import MISSING, fields
 
 import click
 import pytest
@@ -12,18 +12,32 @@ from skindb.cli import cli
 from skindb.cli.options import options_of
 from skindb.errors import InputError
 from skindb.parameters import (
+    CalibrationParameters,
+    ComparisonParameters,
+    DemoParameters,
+    EditParameters,
+    ExportParameters,
     FitParameters,
     IngestParameters,
+    RenderParameters,
     SessionParameters,
     SimulationParameters,
+    ViewParameters,
     option_of,
 )
 
 RECORDS = {
+    "calibrate": CalibrationParameters,
+    "capture": SessionParameters,
+    "compare": ComparisonParameters,
+    "demo": DemoParameters,
+    "edit": EditParameters,
+    "export": ExportParameters,
     "fit": FitParameters,
     "ingest": IngestParameters,
+    "render": RenderParameters,
     "simulate": SimulationParameters,
-    "capture": SessionParameters,
+    "view": ViewParameters,
 }
 
 
@@ -46,7 +60,11 @@ def test_options_of__every_field_is_an_option_with_its_default(name):
         assert options[spec.name].help.startswith(
             option_of(RECORDS[name], spec.name).help
         )
-        assert options[spec.name].default == (None if name == "fit" else spec.default)
+        if spec.default is MISSING:
+            assert options[spec.name].required
+        else:
+            default = None if name == "fit" else spec.default
+            assert options[spec.name].default == default
 
 
 def test_options_of__calls_with_the_record_or_with_what_was_given():
@@ -69,3 +87,35 @@ def test_options_of__calls_with_the_record_or_with_what_was_given():
         SimulationParameters(lights=20, subsurface=True),
         {"eta": 1.4, "light_gains": True},
     ]
+
+
+@pytest.mark.parametrize(
+    ("record", "options", "rule"),
+    [
+        (RenderParameters, {"samples": 4}, r"samples: must lie in \[8, 4096\]"),
+        (
+            RenderParameters,
+            {"exposure": 0.0},
+            "exposure: must be fixed, auto, or a number from 1e-9 to 1e9",
+        ),
+        (RenderParameters, {"exposure": "bright"}, "must be fixed, auto, or a number"),
+        (ComparisonParameters, {"samples": 9}, r"samples: must lie in \[1, 8\]"),
+        (ExportParameters, {"size": 8}, r"size: must lie in \[16, 8192\]"),
+        (
+            CalibrationParameters,
+            {"name": "a", "position_error": -1.0},
+            r"position_error: must lie in \[0, 100\]",
+        ),
+        (DemoParameters, {"takes": 9}, r"takes: must lie in \[1, 8\]"),
+        (IngestParameters, {"visibility": "guess"}, "must be one of rays, splats"),
+        (SimulationParameters, {"width": 8}, r"width: must lie in \[16, 32768\]"),
+    ],
+)
+def test_parameters__limits_hold_for_callers_in_python(record, options, rule):
+    with pytest.raises(InputError, match=rule):
+        record(**options)
+
+
+def test_parameters__an_exposure_is_a_word_or_a_number():
+    for exposure in ("fixed", "auto", 1e-9, 2.5, 1e9):
+        assert RenderParameters(exposure=exposure).exposure == exposure

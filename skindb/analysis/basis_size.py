@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from skindb import plots
 from skindb.analysis.population_basis import same_dictionary
 from skindb.analysis.study import (
-    DICTIONARY,
     Population,
     Results,
     Study,
@@ -26,7 +25,7 @@ from skindb.analysis.study import (
 )
 from skindb.numerics.statistics import bootstrap_interval
 from skindb.optics.fresnel import fresnel_transmittance
-from skindb.parameters import option
+from skindb.parameters import DICTIONARY_HELP, option
 from skindb.reflectance.basis import Systems, factor_reflectance, residuals
 from skindb.reflectance.rows import basis_rows
 from skindb.reflectance.tables import TableGrid
@@ -411,7 +410,7 @@ class Parameters:
     """Parameters of the study of the number of bases."""
 
     seed: int = seed_option("the bootstrap")
-    dictionary: Path | None = option(None, DICTIONARY)
+    dictionary: Path | None = option(None, DICTIONARY_HELP)
 
 
 def compute(population: Population, parameters: Parameters) -> Results:

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from skindb.analysis.brdf_plots import plot_space
 from skindb.analysis.population_basis import population_basis
 from skindb.analysis.study import (
-    DICTIONARY,
     Population,
     Results,
     Study,
@@ -47,7 +46,7 @@ from skindb.numerics.inference import (
     within_subjects_p,
 )
 from skindb.numerics.statistics import known_mean
-from skindb.parameters import option
+from skindb.parameters import DICTIONARY_HELP, option
 from skindb.reflectance.tables import TableGrid, brdf_coords, brdf_metric, stored_brdf
 from skindb.schema import dataset
 from skindb.schema.cohort import require_same_fit
@@ -480,7 +479,7 @@ class Parameters:
     k: int = option(6, "Number of components of the common basis.", minimum=1)
     permutations: int = permutations_option()
     seed: int = seed_option("the factorisation and the permutations")
-    dictionary: Path | None = option(None, DICTIONARY)
+    dictionary: Path | None = option(None, DICTIONARY_HELP)
 
 
 def compute(population: Population, parameters: Parameters) -> Results:

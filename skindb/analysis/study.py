@@ -29,12 +29,6 @@ if TYPE_CHECKING:
 
 
 Result = TypeVar("Result")
-# help of the parameter `dictionary`; its file may change, so that a study with one is
-# always computed
-DICTIONARY = (
-    "Dictionary to use instead of the embedded one: a folder of MERL files, or an .npz "
-    "file of tables."
-)
 Results = dict[str, xr.Dataset]  # group of the stored version -> its variables
 Table = tuple[list[str], list[list[Any]]]  # header and rows
 

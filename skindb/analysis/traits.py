@@ -16,7 +16,6 @@ from skindb import plots
 from skindb.analysis.albedo import albedo_and_texture, quantiles
 from skindb.analysis.population_basis import population_basis
 from skindb.analysis.study import (
-    DICTIONARY,
     Population,
     Results,
     Study,
@@ -40,7 +39,7 @@ from skindb.analysis.summary import SAMPLED
 from skindb.errors import Fault, InputError
 from skindb.numerics.inference import missing_patterns
 from skindb.numerics.statistics import known_mean
-from skindb.parameters import option
+from skindb.parameters import DICTIONARY_HELP, option
 from skindb.schema import IDENTIFIED, dataset
 from skindb.schema.cohort import require_same_fit
 from skindb.schema.regions import FACE
@@ -498,7 +497,7 @@ class Parameters:
     )
     adjust: tuple[str, ...] = adjust_option()
     seed: int = seed_option("the factorisation and the bootstrap")
-    dictionary: Path | None = option(None, DICTIONARY)
+    dictionary: Path | None = option(None, DICTIONARY_HELP)
 
 
 def compute(population: Population, parameters: Parameters) -> Results:

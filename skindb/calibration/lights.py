@@ -42,13 +42,10 @@ from skindb.format.dome import (
 )
 from skindb.format.frame_paths import CAMERA, LIGHT, filled
 from skindb.format.frames import read_frame
+from skindb.parameters import POSITION_ERROR_MM
 from skindb.schema import dataset
 from skindb.types import Float64, Mask
 
-# Standard error of a light relative to the target along each axis, chosen in advance
-# for a careful calibration. In generated captures with errors of 0.6 mm of lights and
-# of cameras, intensities have z-scores of 0.9 to 1.2 with it.
-POSITION_ERROR_MM = 1.0
 # half diagonals of the target: light farther from its centre is not that of its blurred
 # corners
 BESIDE_TARGET = 1.05

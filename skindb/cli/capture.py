@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -11,7 +11,10 @@ import skindb
 from skindb.cli.options import DB, PATH, common, options_of
 from skindb.cli.shared import bar, emit
 from skindb.cli.terminal import wait_for_enter
-from skindb.parameters import SessionParameters
+from skindb.parameters import CalibrationParameters, SessionParameters
+
+if TYPE_CHECKING:
+    from skindb.store import Record
 
 
 @click.command()
@@ -76,26 +79,9 @@ def _ask(site: str, number: int) -> None:
 @click.command()
 @DB
 @click.argument("setup", type=PATH)
-@click.option(
-    "--name", required=True, help="Name by which captures refer to the calibration."
-)
-@click.option(
-    "--fit-falloff", is_flag=True, help="Also fit the angular fall-off of every light."
-)
-@click.option(
-    "--position-error",
-    type=click.FloatRange(0, 100),
-    default=1.0,
-    show_default=True,
-    help=(
-        "Standard error of the positions of the lights relative to the white target "
-        "along each axis, in mm."
-    ),
-)
+@options_of(CalibrationParameters)
 @common
-def calibrate(
-    db: str, setup: Path, name: str, fit_falloff: bool, position_error: float
-) -> None:
+def calibrate(db: str, setup: Path, parameters: CalibrationParameters) -> None:
     """Calibrate the lights, cameras and probe of a laboratory.
 
     Lights are calibrated from the frames of the white target in SETUP. If SETUP holds
@@ -109,16 +95,21 @@ def calibrate(
     versions are kept.
     """
     database = skindb.open(db)
-    record = skindb.workflow.calibrate(
-        database,
-        setup,
-        name=name,
-        fit_falloff=fit_falloff,
-        position_error=position_error,
-    )
+    record = skindb.workflow.calibrate(database, setup, **vars(parameters))
     report = skindb.workflow.describe_calibration(database, record)
+    about = {
+        "calibration": record.take,
+        "generation": record.generation,
+        "path": record.path,
+    }
+    emit(about | report, _calibration_lines(record, report))
+
+
+def _calibration_lines(record: Record, report: dict[str, Any]) -> list[str]:
+    """What a calibration found, one line each."""
     lines = [
-        f"{name}: calibration {record.generation} of {report['lights']} lights, {record.path}"
+        f"{record.take}: calibration {record.generation} of {report['lights']} lights, "
+        f"{record.path}"
     ]
     lines += [f"  {line}" for line in _camera_lines(report.get("cameras", {}))]
     if "largest_position_error_mm" in report:
@@ -147,11 +138,7 @@ def calibrate(
         lines.append(
             f"  captures that used an earlier calibration and should be ingested again: {earlier}"
         )
-    emit(
-        {"calibration": name, "generation": record.generation, "path": record.path}
-        | report,
-        lines,
-    )
+    return lines
 
 
 def _camera_lines(calibrated: dict[str, Any]) -> list[str]:

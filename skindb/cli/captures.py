@@ -20,7 +20,6 @@ from skindb.cli.options import (
     WAIT,
     WORKERS,
     Finite,
-    Seed,
     asked,
     common,
     options_of,
@@ -28,8 +27,8 @@ from skindb.cli.options import (
 from skindb.cli.shared import bar, calibration_lines, each_take, emit, summary_of
 from skindb.cli.terminal import echo
 from skindb.errors import Fault, InputError
-from skindb.limits import MAX_CAMERAS, MAX_COHORT, MAX_LIGHTS
-from skindb.parameters import VIRTUAL_SEED, IngestParameters, SimulationParameters
+from skindb.limits import MAX_COHORT, MAX_DEMO_TAKES
+from skindb.parameters import DemoParameters, IngestParameters, SimulationParameters
 from skindb.virtual.dome import require_sizes
 from skindb.virtual.person import CONDITIONS
 
@@ -39,40 +38,15 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.option("--out", type=PATH, default=Path("demo"), help="Folder to write.")
-@click.option(
-    "--takes", type=click.IntRange(1, 8), default=8, help="Number of virtual takes."
-)
-@click.option(
-    "--cameras",
-    type=click.IntRange(2, MAX_CAMERAS),
-    default=8,
-    help="Number of cameras of the virtual dome.",
-)
-@click.option(
-    "--lights",
-    type=click.IntRange(12, MAX_LIGHTS),
-    default=48,
-    help="Number of lights of the virtual dome.",
-)
-@click.option(
-    "--seed",
-    type=Seed(),
-    default=VIRTUAL_SEED,
-    help="Random seed for noise and sampling.",
-)
-@click.option(
-    "--workers",
-    type=click.IntRange(1, 8),
-    help="Number of takes at a time.  [default: one for each core, at most 4]",
-)
+@options_of(DemoParameters)
 @common
-def demo(out: Path, **options: Any) -> None:
+def demo(out: Path, parameters: DemoParameters) -> None:
     """Run every step on simulated subjects, and write a report.
 
     The subjects are ingested, fitted, analysed, edited, rendered and exported;
     report.html and viewer.html show them.
     """
-    result = skindb.demo.run_demo(out, progress=bar(plain=True), **options)
+    result = skindb.demo.run_demo(out, progress=bar(plain=True), **vars(parameters))
     stages = [
         f"{stage:<10} {seconds:7.1f} s" for stage, seconds in result["seconds"].items()
     ]
@@ -89,7 +63,10 @@ def demo(out: Path, **options: Any) -> None:
 @click.command()
 @click.argument("out", type=PATH)
 @click.option(
-    "--takes", type=click.IntRange(1, 8), default=8, help="Number of virtual takes."
+    "--takes",
+    type=click.IntRange(1, MAX_DEMO_TAKES),
+    default=MAX_DEMO_TAKES,
+    help="Number of virtual takes.",
 )
 @click.option(
     "--cohort",

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 import skindb
-from skindb.cli.options import PATH, common
+from skindb.cli.options import PATH, PORT, common
 from skindb.cli.shared import serve, writable
 
 
@@ -19,12 +19,7 @@ from skindb.cli.shared import serve, writable
     default=Path("landmarks.json"),
     help="File for the landmarks (.json).",
 )
-@click.option(
-    "--port",
-    type=click.IntRange(0, 65535),
-    default=0,
-    help="Port of the local server; 0 chooses a free one.",
-)
+@PORT
 @common
 def landmarks(scan: Path, out: Path, port: int) -> None:
     """Set the 20 landmarks and a crop box on a scan in a browser.

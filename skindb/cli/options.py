@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import MISSING, Field, fields
 from functools import wraps
 from pathlib import Path
@@ -15,18 +16,23 @@ import click
 
 import skindb
 from skindb.limits import MAX_SEED, MAX_WAIT_S, MAX_WORKERS
-from skindb.parameters import Option, option_of
+from skindb.parameters import (
+    DICTIONARY_HELP,
+    Option,
+    broken_rule,
+    option_of,
+    words_of,
+)
 
 DB = click.argument("db", metavar="DB")
 PATH = click.Path(path_type=Path)
 TAKE = click.argument("take")
-DICTIONARY = click.option(
-    "--dictionary",
-    type=PATH,
-    help=(
-        "Dictionary to use instead of the embedded one: a folder of MERL files, or an "
-        ".npz file of tables."
-    ),
+DICTIONARY = click.option("--dictionary", type=PATH, help=DICTIONARY_HELP)
+PORT = click.option(
+    "--port",
+    type=click.IntRange(0, 65535),
+    default=0,
+    help="Port of the local server; 0 chooses a free one.",
 )
 WORKERS = click.option(
     "--workers",
@@ -73,6 +79,28 @@ class Seed(click.IntRange):
         return "x>=0"
 
 
+class WordOrNumber(click.ParamType):  # type: ignore[type-arg]
+    """One of a few words, or a number within limits."""
+
+    name = "text"
+
+    def __init__(self, hint: Any, limits: Option) -> None:
+        self.hint = hint
+        self.limits = limits
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> Any:
+        """Convert to a number, unless it is a word."""
+        converted = value
+        if value not in words_of(self.hint):
+            with suppress(ValueError):
+                converted = float(value)
+        if rule := broken_rule(self.limits, self.hint, converted):
+            self.fail(f"{rule}; found {value!r}", param, ctx)
+        return converted
+
+
 Command = Callable[..., Any]
 
 
@@ -117,7 +145,6 @@ def _click_option(
     if unset and default is not False:
         default_text = f"{default:g}" if isinstance(default, float) else default
         text += f"  [default: {default_text}]"
-    name = limits.name or spec.name.replace("_", "-")
     settings: dict[str, Any] = {"default": None if unset else default, "help": text}
     if default is MISSING:
         settings = {"required": True, "help": text}
@@ -125,14 +152,24 @@ def _click_option(
         settings["metavar"] = limits.metavar
     if not limits.show_default:
         settings["show_default"] = False
+    name = limits.name or spec.name.replace("_", "-")
+    return click.option(
+        f"--{name}", spec.name, **settings, **_kind(hint, limits, default)
+    )
+
+
+def _kind(hint: Any, limits: Option, default: Any) -> dict[str, Any]:
+    """Settings of an option that follow from the type of its field."""
+    if words_of(hint) and limits.minimum is not None:
+        return {"type": WordOrNumber(hint, limits)}
     kind = get_args(hint)[0] if isinstance(hint, UnionType) else hint
+    if kind is bool and default is True:  # the option switches it off
+        return {"is_flag": True, "flag_value": False, "show_default": False}
     if kind is bool:
-        settings["is_flag"] = True
-    elif get_origin(kind) is tuple:
-        settings["multiple"] = True
-    else:
-        settings["type"] = _type(kind, limits)
-    return click.option(f"--{name}", spec.name, **settings)
+        return {"is_flag": True}
+    if get_origin(kind) is tuple:
+        return {"multiple": True}
+    return {"type": _type(kind, limits)}
 
 
 def _type(kind: Any, limits: Option) -> Any:

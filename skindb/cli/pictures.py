@@ -17,29 +17,22 @@ from skindb.cli.options import (
     PATH,
     TAKE,
     WORKERS,
-    Finite,
-    Seed,
     asked,
     common,
+    options_of,
 )
-from skindb.cli.shared import aligned, bar, each_take, emit, existing, writable
+from skindb.cli.shared import (
+    aligned,
+    bar,
+    chosen_takes,
+    each_take,
+    emit,
+    existing,
+    require_one_take,
+    writable,
+)
 from skindb.errors import Fault, InputError
-
-
-def exposure_option(_: click.Context, __: click.Parameter, value: str) -> float | str:
-    """Parse an exposure: fixed, auto, or a positive number."""
-    if value in ("fixed", "auto"):
-        return value
-    try:
-        factor = float(value)
-    except ValueError:
-        factor = 0.0
-    if not 1e-9 <= factor <= 1e9:
-        raise click.BadParameter(
-            f"must be fixed, auto, or a number from 1e-9 to 1e9; found {value!r}"
-        )
-    return factor
-
+from skindb.parameters import ComparisonParameters, ExportParameters, RenderParameters
 
 TAKES = click.argument("takes", metavar="[TAKE...]", nargs=-1)
 
@@ -56,54 +49,7 @@ TAKES = click.argument("takes", metavar="[TAKE...]", nargs=-1)
         "of every take."
     ),
 )
-@click.option(
-    "--light",
-    "lights",
-    multiple=True,
-    help=(
-        "Name of a light of the dome; several are added.  [default: all, or none with "
-        "an environment]"
-    ),
-)
-@click.option(
-    "--environment",
-    type=PATH,
-    help="Latitude-longitude image of light from all directions (.exr).",
-)
-@click.option(
-    "--camera", help="Name of a camera of the dome.  [default: the most frontal one]"
-)
-@click.option(
-    "--spp",
-    "samples",
-    type=click.IntRange(8, 4096),
-    default=32,
-    help="Number of rays per pixel.",
-)
-@click.option(
-    "--error",
-    type=Finite(1e-4, 1),
-    help="Relative standard error of the picture at which sampling stops.",
-)
-@click.option("--seed", type=Seed(), default=0, help="Random seed.")
-@click.option(
-    "--scale",
-    type=Finite(0.1, 20),
-    default=1.0,
-    help="Size of the picture relative to that of the camera.",
-)
-@click.option(
-    "--exposure",
-    default="fixed",
-    callback=exposure_option,
-    help=(
-        "Exposure of a PNG: fixed (a white matt surface appears white), auto (for each "
-        "picture), or a factor."
-    ),
-)
-@click.option(
-    "--subsurface", is_flag=True, help="Simulate subsurface transport by the dipole."
-)
+@options_of(RenderParameters)
 @click.option("--edited", is_flag=True, help="Render the edited models.")
 @GENERATION
 @click.option(
@@ -119,29 +65,29 @@ def render(
     edited: bool,
     workers: int,
     scheduler: str | None,
-    **options: Any,
+    parameters: RenderParameters,
+    **request: Any,
 ) -> None:
     """Render models with lights of their dome or an environment.
 
     By default all models are rendered with all lights of the dome and its most frontal camera.
     """
     database = existing(db)
-    chosen = _wanted(db, takes, edited=edited)
+    chosen = chosen_takes(database, takes, "edit" if edited else "model")
     if out.suffix:
         writable(out, ".exr", ".png")
-        _require_one(out, chosen)
+        require_one_take(out, chosen)
+    request["edited"] = edited
     call = partial(
         skindb.workflow.render_take,
         database,
         shared_path(out, scheduler),
-        edited=edited,
-        **options,
+        **request,
+        **vars(parameters),
     )
-    finish = partial(_rendered, explain=options["explain"], error=options["error"])
+    finish = partial(_rendered, explain=request["explain"], error=parameters.error)
     work: dict[str, Any] = {"workers": workers, "scheduler": scheduler}
-    with skindb.workflow.logged_action(
-        database, "render", chosen, arguments={"edited": edited, **options}
-    ):
+    with skindb.workflow.logged_action(database, "render", chosen, arguments=request):
         results, faults = each_take(call, chosen, **work, progress=bar(), finish=finish)
     emit(results, [], faults)
 
@@ -174,19 +120,15 @@ def _rendered(
     type=PATH,
     help="Folder for pictures: photograph, rendering, diffuse and surface components, difference.",
 )
-@click.option(
-    "--samples",
-    type=click.IntRange(1, 8),
-    default=2,
-    help="Number of rays per pixel and axis.",
-)
-@click.option(
-    "--subsurface", is_flag=True, help="Simulate subsurface transport by the dipole."
-)
+@options_of(ComparisonParameters)
 @GENERATION
 @common
 def compare(
-    db: str, take: str, out: Path | None, generation: int | None, **options: Any
+    db: str,
+    take: str,
+    out: Path | None,
+    generation: int | None,
+    parameters: ComparisonParameters,
 ) -> None:
     """Compare the kept photographs with renderings of the model.
 
@@ -197,7 +139,7 @@ def compare(
     region are printed too.
     """
     comparisons = skindb.workflow.compare_take(
-        existing(db), take, generation=generation, **options
+        existing(db), take, generation=generation, **vars(parameters)
     )
     if out:
         skindb.render.write_comparisons(comparisons, out)
@@ -264,20 +206,7 @@ def show(db: str, take: str, variable: str, out: Path, at: tuple[str, ...]) -> N
     required=True,
     help="Folder that gets a folder for each take, or with --gltf a .glb file for each.",
 )
-@click.option(
-    "--size",
-    type=click.IntRange(16, 8192),
-    help=(
-        "Number of texels along each side of a map.  [default: 1.5 per surfel spacing, "
-        "rounded up to a power of two]"
-    ),
-)
-@click.option(
-    "--gltf",
-    is_flag=True,
-    help="Write only glTF; for one take, --out may then be a .glb file.",
-)
-@click.option("--no-merl", is_flag=True, help="Skip the MERL binaries (35 MB each).")
+@options_of(ExportParameters)
 @click.option("--edited", is_flag=True, help="Export the edited models.")
 @GENERATION
 @WORKERS
@@ -287,11 +216,11 @@ def export(
     db: str,
     takes: tuple[str, ...],
     out: Path,
-    no_merl: bool,
     edited: bool,
+    generation: int | None,
     workers: int,
     scheduler: str | None,
-    **options: Any,
+    parameters: ExportParameters,
 ) -> None:
     """Export models, by default all, for other programs.
 
@@ -301,19 +230,23 @@ def export(
     """
     database = existing(db)
     progress = bar()
-    chosen = _wanted(db, takes, edited=edited)
-    if options["gltf"] and out.suffix:
+    chosen = chosen_takes(database, takes, "edit" if edited else "model")
+    if parameters.gltf and out.suffix:
         writable(out, ".glb")
-        _require_one(out, chosen)
+        require_one_take(out, chosen)
     elif out.suffix in (".glb", ".gltf"):
         rule = "without --gltf it must be a folder, which gets a bundle for each take"
         cure = "add --gltf, or rename it"
         raise InputError(
             Fault(str(out), rule, f"a name that ends in {out.suffix}", cure)
         )
-    options |= {"merl": not no_merl, "edited": edited, "progress": progress}
+    options = {"edited": edited, "generation": generation, **vars(parameters)}
     call = partial(
-        skindb.workflow.export_take, database, shared_path(out, scheduler), **options
+        skindb.workflow.export_take,
+        database,
+        shared_path(out, scheduler),
+        progress=progress,
+        **options,
     )
     work: dict[str, Any] = {"workers": workers, "scheduler": scheduler}
     with skindb.workflow.logged_action(database, "export", chosen, arguments=options):
@@ -325,28 +258,6 @@ def export(
 
 def _exported(path: Path) -> tuple[str, Any, list[str]]:
     return path.name, str(path), [str(path)]
-
-
-def _wanted(db: str, takes: tuple[str, ...], *, edited: bool) -> list[str]:
-    """The named takes, or all that have a model."""
-    kind = "edit" if edited else "model"
-    chosen = list(takes) or skindb.open(db).takes(kind)
-    if not chosen:
-        cure = "run skindb edit first" if edited else "run skindb fit first"
-        raise InputError(Fault(db, f"there must be a take with a {kind}", "none", cure))
-    return chosen
-
-
-def _require_one(out: Path, takes: list[str]) -> None:
-    if len(takes) > 1:
-        raise InputError(
-            Fault(
-                str(out),
-                "a file must hold one take",
-                f"{len(takes)} takes",
-                "name a folder, or one take",
-            )
-        )
 
 
 def _label(text: str) -> tuple[str, str]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -9,20 +11,50 @@ import click
 
 import skindb
 from skindb.cli.engine import SCHEDULER, client_of, shared_path
-from skindb.cli.options import DB, DICTIONARY, PATH, TAKE, WORKERS, common, options_of
+from skindb.cli.options import DB, PATH, TAKE, WORKERS, common, options_of
 from skindb.cli.shared import aligned, bar, emit, existing, trait_amounts, writable
 from skindb.files import csv_text, private_file
+from skindb.parameters import EditParameters
 
 if TYPE_CHECKING:
     import xarray as xr
 
     from skindb.analysis.study import Study
-    from skindb.store import Database
+    from skindb.store import Database, Record
+    from skindb.types import Progress
 
-RELEASE = click.option(
-    "--release",
-    metavar="NAME",
-    help="Release whose versions are used.  [default: the newest versions]",
+MAX_EDIT_DISTANCE = 1.0  # to the nearest take, in median distances between takes
+EXTRAPOLATED = "the edit is outside the data, and its result is not reliable"
+TAKES = click.option(
+    "--take",
+    "takes",
+    multiple=True,
+    help="Take to use (may be given several times).  [default: all]",
+)
+# of every study, after its own parameters
+STORED = (
+    click.option(
+        "--release",
+        metavar="NAME",
+        help="Release whose versions are used.  [default: the newest versions]",
+    ),
+    click.option(
+        "--name",
+        help="Name under which the study is stored.  [default: its parameters]",
+    ),
+    click.option("--plot", type=PATH, help="Plot to write (.png, .pdf, .svg)."),
+    click.option(
+        "--csv", type=PATH, help="Table to write as comma-separated values (.csv)."
+    ),
+)
+# of translucency, which can also draw takes
+FACES = (
+    click.Option(
+        ["--faces"],
+        type=PATH,
+        help="Picture of the least and the most translucent take (.png, .pdf, .svg).",
+    ),
+    click.Option(["--site"], help="Site of the probe for --faces.  [default: cheek]"),
 )
 
 
@@ -79,99 +111,85 @@ def analyze(ctx: click.Context, db: str) -> None:
 
 
 def _study_command(study: Study) -> click.Command:
-    """The command of one study."""
+    """The command of one study, with the options of its parameters."""
+    run = partial(_run_study, study)
+    for add in reversed(
+        (TAKES, options_of(study.parameters), *STORED, SCHEDULER, common)
+    ):
+        run = add(run)
+    command = click.command(study.name, help=f"Study the {study.description}.")(run)
+    if study.name == "translucency":
+        command.params += FACES
+    return command
 
-    @click.command(study.name, help=f"Study the {study.description}.")
-    @click.option(
-        "--take",
-        "takes",
-        multiple=True,
-        help="Take to use (may be given several times).  [default: all]",
-    )
-    @options_of(study.parameters)
-    @RELEASE
-    @click.option(
-        "--name",
-        help="Name under which the study is stored.  [default: its parameters]",
-    )
-    @click.option("--plot", type=PATH, help="Plot to write (.png, .pdf, .svg).")
-    @click.option(
-        "--csv", type=PATH, help="Table to write as comma-separated values (.csv)."
-    )
-    @SCHEDULER
-    @common
-    @click.pass_obj
-    def command(
-        db: str,
-        takes: tuple[str, ...],
-        parameters: Any,
-        release: str | None,
-        name: str | None,
-        plot: Path | None,
-        csv: Path | None,
-        scheduler: str | None,
-        faces: Path | None = None,
-        site: str | None = None,
-    ) -> None:
-        for picture in (plot, faces):
+
+def _run_study(
+    study: Study,
+    *,
+    takes: tuple[str, ...],
+    parameters: Any,
+    release: str | None,
+    name: str | None,
+    scheduler: str | None,
+    csv: Path | None,
+    **drawn: Any,
+) -> None:
+    """Compute or read a study, and print, write and draw it."""
+    pictures = StudyPictures(**drawn)
+    pictures.require_writable()
+    if csv:
+        writable(csv, ".csv")
+    chosen = dict(vars(parameters))
+    if "adjust" in chosen:
+        names = ",".join(chosen["adjust"]).split(",")
+        chosen["adjust"] = tuple(name.strip() for name in names if name.strip())
+    if "dictionary" in chosen:
+        chosen["dictionary"] = shared_path(chosen["dictionary"], scheduler)
+    database = existing(click.get_current_context().obj)
+    progress = bar()
+    progress(f"analyze {study.name}", 0, 1)
+    used = takes or database.takes("model", release=release)
+    arguments = {"faces": pictures.faces is not None}
+    with skindb.workflow.logged_action(
+        database, "study", used, what=study.name, arguments=arguments
+    ):
+        with (
+            client_of(scheduler, progress) as client,
+            skindb.workflow.computing_on(client, database.folder),
+        ):
+            results = skindb.workflow.study(
+                database, study.name, takes=takes, release=release, name=name, **chosen
+            )
+        progress(f"analyze {study.name}", 1, 1)
+        pictures.draw(database, results, progress)
+    _report(database, study, results, csv)
+
+
+@dataclass(frozen=True)
+class StudyPictures:
+    """Pictures that a command draws of a study, if they are named."""
+
+    plot: Path | None
+    faces: Path | None = None  # of the most and the least translucent take
+    site: str | None = None  # of the faces
+
+    def require_writable(self) -> None:
+        """Check the names of the pictures before anything is computed."""
+        for picture in (self.plot, self.faces):
             if picture:
                 writable(picture, ".png", ".pdf", ".svg")
-        if csv:
-            writable(csv, ".csv")
-        chosen = dict(vars(parameters))
-        if "adjust" in chosen:
-            names = ",".join(chosen["adjust"]).split(",")
-            chosen["adjust"] = tuple(name.strip() for name in names if name.strip())
-        if "dictionary" in chosen:
-            chosen["dictionary"] = shared_path(chosen["dictionary"], scheduler)
-        database = existing(db)
-        progress = bar()
-        progress(f"analyze {study.name}", 0, 1)
-        used = takes or database.takes("model", release=release)
-        with skindb.workflow.logged_action(
-            database,
-            "study",
-            used,
-            what=study.name,
-            arguments={"faces": faces is not None},
-        ):
-            with (
-                client_of(scheduler, progress) as client,
-                skindb.workflow.computing_on(client, database.folder),
-            ):
-                results = skindb.workflow.study(
-                    database,
-                    study.name,
-                    takes=takes,
-                    release=release,
-                    name=name,
-                    **chosen,
-                )
-            progress(f"analyze {study.name}", 1, 1)
-            if faces:
-                skindb.workflow.translucency_grid(
-                    database, faces, site=site or "cheek", progress=progress
-                )
-        if plot:
-            skindb.analysis.plot_study(results, plot)
-        _report(database, study, results, csv)
 
-    return _with_faces(command) if study.name == "translucency" else command
-
-
-def _with_faces(command: click.Command) -> click.Command:
-    """The command of translucency, which can also draw takes."""
-    command.params += [
-        click.Option(
-            ["--faces"],
-            type=PATH,
-            help="Picture of the least and the most translucent take (.png, .pdf, .svg).",
-        ),
-        click.Option(
-            ["--site"], help="Site of the probe for --faces.  [default: cheek]"
-        ),
-    ]
-    return command
+    def draw(
+        self, database: Database, results: xr.DataTree, progress: Progress
+    ) -> None:
+        """Draw the pictures."""
+        if self.faces:
+            site = self.site or "cheek"
+            skindb.workflow.translucency_grid(
+                database, self.faces, site=site, progress=progress
+            )
+        if self.plot:
+            skindb.analysis.plot_study(results, self.plot)
 
 
 def _report(
@@ -283,32 +301,9 @@ def register(
     emit(report, [*aligned([header, *rows]), *skindb.schema.note_lines(doubts), *lines])
 
 
-MAX_EDIT_DISTANCE = 1.0  # to the nearest take, in median distances between takes
-EXTRAPOLATED = "the edit is outside the data, and its result is not reliable"
-
-
-def _far(tree: Any) -> list[str]:
-    """A warning if an edit is far from the data."""
-    distance = float(tree.attrs["edit_distance"])
-    far = (
-        f"the distance to the nearest take is {distance:.2f} times the median distance "
-        "between takes"
-    )
-    return [f"{far}; {EXTRAPOLATED}"] if distance > MAX_EDIT_DISTANCE else []
-
-
 @click.command()
 @DB
 @TAKE
-@click.option(
-    "--trait",
-    "amounts",
-    multiple=True,
-    required=True,
-    metavar="NAME=AMOUNT",
-    help="Trait and its amount, for example lotion=0.5 (may be given several times).",
-)
-@click.option("--study", help="Study of traits.  [default: traits, or the only one]")
 @click.option(
     "--grid",
     type=PATH,
@@ -317,75 +312,79 @@ def _far(tree: Any) -> list[str]:
         "edit (.png, .pdf, .svg)."
     ),
 )
-@DICTIONARY
+@options_of(EditParameters)
 @common
-def edit(
-    db: str,
-    take: str,
-    amounts: tuple[str, ...],
-    study: str | None,
-    grid: Path | None,
-    dictionary: Path | None,
-) -> None:
+def edit(db: str, take: str, grid: Path | None, parameters: EditParameters) -> None:
     """Move a model along traits and store the result.
 
     `render` and `export` use it with --edited.
     """
-    parsed = trait_amounts(amounts)
+    amounts = trait_amounts(parameters.traits)
     database = existing(db)
+    options: dict[str, Any] = {
+        "study": parameters.study,
+        "dictionary": parameters.dictionary,
+    }
     if grid:
         writable(grid, ".png", ".pdf", ".svg")
         rows = {
             text: {name: amount}
-            for text, (name, amount) in zip(amounts, parsed.items(), strict=True)
+            for text, (name, amount) in zip(
+                parameters.traits, amounts.items(), strict=True
+            )
         }
         drawn = skindb.workflow.edit_grid(
-            database,
-            take,
-            rows,
-            grid,
-            study=study,
-            dictionary=dictionary,
-            progress=bar(),
+            database, take, rows, grid, progress=bar(), **options
         )
-        reports = {
-            label: {"edit_report": tree.attrs["edit_report"]}
-            for label, tree in drawn.items()
-        }
-        notes = [
-            f"{label}: {line}"
-            for label, tree in drawn.items()
-            for line in [*_edit_notes(tree), *_far(tree)]
-        ]
-        emit({"path": str(grid), "edits": reports}, [str(grid), *notes])
-        return
-    tree = skindb.workflow.edit(
-        database, take, parsed, study=study, dictionary=dictionary
-    )
-    record = database.record("edit", take, tree.attrs["generation"])
-    distance = float(tree.attrs["edit_distance"])
-    far = f"; {EXTRAPOLATED}" if distance > MAX_EDIT_DISTANCE else ""
-    report: dict[str, Any] = dict(tree.attrs["edit_report"])
-    takes = tree.attrs["study_takes"]
-    near = "the distance to the nearest take is"
-    lines = [
-        (
-            f"{take}: edit {record.generation}; {near} {distance:.2f} times the median "
-            f"distance between takes{far}"
-        )
+        _report_grid(grid, drawn)
+    else:
+        tree = skindb.workflow.edit(database, take, amounts, **options)
+        _report_edit(database.record("edit", take, tree.attrs["generation"]), tree)
+
+
+def _report_grid(grid: Path, drawn: dict[str, xr.DataTree]) -> None:
+    """Print the reports of the edits of a picture."""
+    reports = {
+        label: {"edit_report": tree.attrs["edit_report"]}
+        for label, tree in drawn.items()
+    }
+    notes = [
+        f"{label}: {line}"
+        for label, tree in drawn.items()
+        for line in [*_edit_notes(tree), *_extrapolation(tree)]
     ]
-    lines.append(
+    emit({"path": str(grid), "edits": reports}, [str(grid), *notes])
+
+
+def _extrapolation(tree: xr.DataTree) -> list[str]:
+    """A warning if an edit is far from the data."""
+    distance = float(tree.attrs["edit_distance"])
+    if distance <= MAX_EDIT_DISTANCE:
+        return []
+    return [
+        f"the distance to the nearest take is {distance:.2f} times the median distance "
+        f"between takes; {EXTRAPOLATED}"
+    ]
+
+
+def _report_edit(record: Record, tree: xr.DataTree) -> None:
+    """Print the report of an edit that was stored."""
+    distance = float(tree.attrs["edit_distance"])
+    warning = f"; {EXTRAPOLATED}" if distance > MAX_EDIT_DISTANCE else ""
+    takes = tree.attrs["study_takes"]
+    lines = [
+        f"{record.take}: edit {record.generation}; the distance to the nearest take is "
+        f"{distance:.2f} times the median distance between takes{warning}",
         f"  traits from the study of {len(takes)} takes: "
-        f"{', '.join(takes[:8])}{', ...' if len(takes) > 8 else ''}"
-    )
-    lines += [f"  {line}" for line in _edit_notes(tree)]
+        f"{', '.join(takes[:8])}{', ...' if len(takes) > 8 else ''}",
+    ]
     about = {
         "generation": record.generation,
         "path": record.path,
         "edit_distance": distance,
-        "edit_report": report,
+        "edit_report": dict(tree.attrs["edit_report"]),
     }
-    emit(about, lines)
+    emit(about, [*lines, *(f"  {line}" for line in _edit_notes(tree))])
 
 
 def _edit_notes(tree: xr.DataTree) -> list[str]:

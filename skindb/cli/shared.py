@@ -13,7 +13,7 @@ from contextlib import suppress
 from dataclasses import replace
 from itertools import repeat
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import click
 
@@ -216,6 +216,26 @@ def existing(db: str) -> Database:
             )
         )
     return database
+
+
+def chosen_takes(
+    database: Database, takes: Sequence[str], kind: Literal["model", "edit"]
+) -> list[str]:
+    """The named takes, or all that have a model or an edit."""
+    chosen = list(takes) or database.takes(kind)
+    if not chosen:
+        cure = "run skindb edit first" if kind == "edit" else "run skindb fit first"
+        rule = f"there must be a take with a {kind}"
+        raise InputError(Fault(database.url, rule, "none", cure))
+    return chosen
+
+
+def require_one_take(out: Path, takes: Sequence[str]) -> None:
+    """Check that a file gets one take."""
+    if len(takes) > 1:
+        rule = "a file must hold one take"
+        cure = "name a folder, or one take"
+        raise InputError(Fault(str(out), rule, f"{len(takes)} takes", cure))
 
 
 def writable(path: Path, *endings: str) -> None:

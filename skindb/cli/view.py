@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import click
 
 import skindb
-from skindb.cli.options import DB, DICTIONARY, PATH, common
-from skindb.cli.shared import bar, emit, existing, serve, trait_amounts
+from skindb.cli.options import DB, PATH, PORT, common, options_of
+from skindb.cli.shared import (
+    bar,
+    chosen_takes,
+    emit,
+    existing,
+    require_one_take,
+    serve,
+    trait_amounts,
+)
 from skindb.errors import Fault, InputError
+from skindb.parameters import ViewParameters
 
 
 @click.command()
@@ -21,30 +29,8 @@ from skindb.errors import Fault, InputError
     type=PATH,
     help="Self-contained page of one take (.html), or folder for the page of several.",
 )
-@click.option(
-    "--trait",
-    "traits",
-    multiple=True,
-    metavar="NAME[=AMOUNT]",
-    help="Trait that gets a slider, and the amount at its end, for example age=20; 1 if "
-    "no amount is given (may be "
-    "given several times).",
-)
-@click.option(
-    "--study", help="Study of traits.  [default: traits, or the only one there is]"
-)
-@click.option(
-    "--environment",
-    type=PATH,
-    help="Latitude-longitude image of light from all directions (.exr).  [default: overcast sky]",
-)
-@DICTIONARY
-@click.option(
-    "--port",
-    type=click.IntRange(0, 65535),
-    default=0,
-    help="Port of the local server; 0 chooses a free one.",
-)
+@options_of(ViewParameters)
+@PORT
 @click.option(
     "--explain",
     is_flag=True,
@@ -55,12 +41,9 @@ def view(
     db: str,
     takes: tuple[str, ...],
     out: Path | None,
-    traits: tuple[str, ...],
-    study: str | None,
-    environment: Path | None,
-    dictionary: Path | None,
     port: int,
     explain: bool,
+    parameters: ViewParameters,
 ) -> None:
     """Show models in a browser, to turn, light and edit them.
 
@@ -68,58 +51,32 @@ def view(
     printed address opens it, once, in one browser of this machine, until Ctrl-C ends
     the server.
     """
-    amounts = trait_amounts(traits, default=1.0)
+    amounts = trait_amounts(parameters.traits, default=1.0)
     if 0.0 in amounts.values():
-        raise InputError(
-            Fault(
-                "--trait",
-                "the amount at the end of a slider must not be 0",
-                "0",
-                "give, for example, age=20",
-            )
-        )
+        rule = "the amount at the end of a slider must not be 0"
+        raise InputError(Fault("--trait", rule, "0", "give, for example, age=20"))
     database = existing(db)
-    chosen = list(takes) or database.takes("model")
-    if not chosen:
-        raise InputError(
-            Fault(
-                db, "there must be a take with a model", "none", "run skindb fit first"
-            )
-        )
+    chosen = chosen_takes(database, takes, "model")
     if explain:
         with skindb.workflow.logged_action(database, "view", chosen, explain=True):
             skipped = {
                 take: skindb.workflow.explain_view(database, take, traits=amounts)
                 for take in chosen
             }
-        emit(
-            skipped,
-            [f"{take}: {line}" for take, lines in skipped.items() for line in lines],
-        )
+        lines = [f"{take}: {line}" for take, lines in skipped.items() for line in lines]
+        emit(skipped, lines)
         return
-    if out is not None and out.suffix == ".html" and len(chosen) > 1:
-        count = f"{len(chosen)} takes"
-        cure = "name a folder, or one take"
-        raise InputError(Fault(str(out), "a file must hold one take", count, cure))
-    options: dict[str, Any] = {
-        "traits": amounts,
-        "study": study,
-        "dictionary": dictionary,
-        "progress": bar(),
-    }
-    options["environment"] = environment
-    if out is not None:
-        report = skindb.workflow.view_takes(database, chosen, out, **options)
-        emit(
-            report,
-            [
-                report["path"]
-                if out.suffix
-                else f"{out / 'index.html'}: serve the folder to open it"
-            ],
-        )
+    options = {**vars(parameters), "traits": amounts, "progress": bar()}
+    if out is None:
+        server = skindb.workflow.view_server(database, chosen, port=port, **options)
+        serve(server, takes=chosen)
         return
-    serve(
-        skindb.workflow.view_server(database, chosen, port=port, **options),
-        takes=chosen,
+    if out.suffix == ".html":
+        require_one_take(out, chosen)
+    report = skindb.workflow.view_takes(database, chosen, out, **options)
+    page = (
+        report["path"]
+        if out.suffix
+        else f"{out / 'index.html'}: serve the folder to open it"
     )
+    emit(report, [page])

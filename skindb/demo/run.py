@@ -16,16 +16,16 @@ from skindb.elementwise import thread_count
 from skindb.errors import Fault, InputError
 from skindb.export.bundle import export_bundle
 from skindb.files import make_private, private_file
-from skindb.parameters import FitParameters, SimulationParameters
+from skindb.parameters import DemoParameters, FitParameters, SimulationParameters
 from skindb.render.photographs import compare_photographs
 from skindb.store import Database
 from skindb.types import Progress, silent
 from skindb.virtual.capture import recovered_against_true, simulate_takes
 from skindb.virtual.person import default_people
 
-# fraction of lights; mm
-HELD_OUT = 0.1
-SPACING = 1.5
+HELD_OUT = 0.1  # fraction of the lights
+SPACING = 1.5  # mm
+MAP_TEXELS = 1024  # along each side of an exported map
 MAX_WORKERS = 4  # each take of the demo needs 1.5 GB
 # 0 and 1 correspond to measured takes of one subject
 EDIT_CONDITION = "lotion"
@@ -33,14 +33,7 @@ EDIT_AMOUNTS = (0.0, 0.25, 1.0)
 
 
 def run_demo(
-    out: Path,
-    *,
-    takes: int = 8,
-    cameras: int = 8,
-    lights: int = 48,
-    seed: int = 2005,
-    workers: int | None = None,
-    progress: Progress | None = None,
+    out: Path, *, progress: Progress | None = None, **options: Any
 ) -> dict[str, Any]:
     """Capture virtual subjects, ingest, fit, analyse, edit, render and export them, and
     write report.html.
@@ -50,16 +43,10 @@ def run_demo(
     out
         Folder for captures/, db/, export/, the viewer and report.html. It must be
         absent, empty or from an earlier demo, which is replaced.
-    takes
-        Number of virtual takes, at most eight.
-    cameras, lights
-        Number of cameras and lights of the virtual dome.
-    seed
-        Random seed for noise and sampling.
-    workers
-        Number of takes at a time, each in its own process; default one for each core, at most 4.
     progress
         Called with the stage, the number of finished steps and the total number of steps.
+    **options
+        Of `skindb.parameters.DemoParameters`: takes, cameras, lights, seed, workers.
 
     Returns
     -------
@@ -70,40 +57,29 @@ def run_demo(
     Raises
     ------
     InputError
-        If the folder contains other files, or its database other subjects.
+        If the folder contains other files, its database other subjects, or an option is
+        out of its limits.
     """
+    parameters = DemoParameters(**options)
     _remove_earlier_demo(out)
     report_progress = progress or silent
-    results = Results()
     db = Database(out / "db")
-    make = partial(_make_take, out=out, cameras=cameras, lights=lights, seed=seed)
-    # first and alone, as it compiles the kernels that the others use
-    results.add(make(0, progress=report_progress))
-    if takes > 1:
-        report_progress("the other takes", 0, takes - 1)
-    many = workers or min(thread_count(), MAX_WORKERS)
-    for i, take_results in enumerate(
-        workflow.results_of(workflow.map_takes(make, range(1, takes), workers=many)), 1
-    ):
-        results.add(take_results)
-        report_progress("the other takes", i, takes - 1)
-    results.sort_takes([person.take for person in default_people()])
+    workers = parameters.workers or min(thread_count(), MAX_WORKERS)
+    results = _make_takes(out, parameters, workers, report_progress)
     with results.stage("analyze"):
         # once, for every study
-        workflow.register_takes(db, workers=many, progress=report_progress)
-        results.studies["brdf"] = workflow.study(db, "brdf", seed=seed)
-        results.studies["albedo"] = workflow.study(db, "albedo")
-        results.studies["translucency"] = workflow.study(db, "translucency")
-        if takes > 1:
-            results.studies["traits"] = workflow.study(db, "traits", seed=seed)
+        workflow.register_takes(db, workers=workers, progress=report_progress)
+        for name, study_options in _studies(parameters).items():
+            results.studies[name] = workflow.study(db, name, **study_options)
     with results.stage("edit"):
         _edit(results, db)
+    exported = next(iter(results.models))
+    model = results.models[exported]
     with results.stage("export"):
-        exported = next(iter(results.models))
         export_bundle(
-            results.models[exported],
+            model,
             out / "export" / exported,
-            size=1024,
+            size=MAP_TEXELS,
             merl=False,
             progress=report_progress,
         )
@@ -124,6 +100,38 @@ def run_demo(
         "seconds": results.seconds,
         "recovered": recovered,
     }
+
+
+def _make_takes(
+    out: Path, parameters: DemoParameters, workers: int, progress: Progress
+) -> Results:
+    """The results of all takes. The first one is made alone, as it compiles the kernels
+    that the others use.
+    """
+    results = Results()
+    make = partial(_make_take, out=out, parameters=parameters)
+    results.add(make(0, progress=progress))
+    others = range(1, parameters.takes)
+    outcomes = workflow.map_takes(make, others, workers=workers)
+    if others:
+        progress("the other takes", 0, len(others))
+    for i, take_results in enumerate(workflow.results_of(outcomes), 1):
+        results.add(take_results)
+        progress("the other takes", i, len(others))
+    results.sort_takes([person.take for person in default_people()])
+    return results
+
+
+def _studies(parameters: DemoParameters) -> dict[str, dict[str, Any]]:
+    """Names and parameters of the studies; traits need two takes."""
+    studies: dict[str, dict[str, Any]] = {
+        "brdf": {"seed": parameters.seed},
+        "albedo": {},
+        "translucency": {},
+    }
+    if parameters.takes > 1:
+        studies["traits"] = {"seed": parameters.seed}
+    return studies
 
 
 def _remove_earlier_demo(out: Path) -> None:
@@ -158,9 +166,7 @@ def _make_take(
     i: int,
     *,
     out: Path,
-    cameras: int,
-    lights: int,
-    seed: int,
+    parameters: DemoParameters,
     progress: Progress | None = None,
 ) -> Results:
     """Simulate, ingest and fit a virtual take, and compare the model with its
@@ -168,22 +174,20 @@ def _make_take(
     """
     results = Results()
     db = Database(out / "db")
+    seed = parameters.seed
+    virtual = SimulationParameters(parameters.cameras, parameters.lights, seed=seed)
     with results.stage("simulate"):
         (folder,) = simulate_takes(
-            out / "captures",
-            SimulationParameters(cameras=cameras, lights=lights, seed=seed),
-            takes=[i],
-            progress=progress,
+            out / "captures", virtual, takes=[i], progress=progress
         )
     with results.stage("ingest"):
         take = workflow.ingest_take(
             db, folder, spacing_mm=SPACING, progress=progress
         ).take
     with results.stage("fit"):
-        parameters = FitParameters(hold_out_lights=HELD_OUT, seed=seed)
-        results.fits[take] = workflow.fit_take(
-            db, take, parameters, progress=progress
-        ).provenance
+        fitted = FitParameters(hold_out_lights=HELD_OUT, seed=seed)
+        record = workflow.fit_take(db, take, fitted, progress=progress)
+        results.fits[take] = record.provenance
     with results.stage("compare"):
         model = db.read("model", take)
         results.models[take] = model.map_over_datasets(lambda ds: ds.load())

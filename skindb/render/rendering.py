@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
 from skindb.geometry.rays import RayScene
+from skindb.parameters import RenderParameters
 from skindb.render.image import auto_exposure, tone_map, write_exr, write_png
 from skindb.render.monte_carlo import Lighting, Quality, render_monte_carlo
 from skindb.render.plan import KEPT, RenderPlan, plan_render, plan_scene
@@ -371,12 +372,7 @@ def render_inputs(
 
 
 def render_picture(
-    model: xr.DataTree,
-    out: Path,
-    *,
-    exposure: float | str = "fixed",
-    explain: bool = False,
-    **options: Any,
+    model: xr.DataTree, out: Path, *, explain: bool = False, **options: Any
 ) -> dict[str, Any]:
     """Render a model and write it as linear EXR or tone-mapped PNG, depending on the
     suffix of `out`.
@@ -388,15 +384,15 @@ def render_picture(
     out
         Picture to write. An EXR has the channels R, G, B, A (coverage) and variance.R,
         variance.G, variance.B.
-    exposure
-        Factor on the radiance of a PNG. "fixed" shows a white matte surface, which
-        stands in the place of the face and faces the camera, as display white, so that
-        pictures under the same light are comparable. "auto" shows the brightest skin as
-        display white.
     explain
         Only plan the picture and write nothing.
     **options
-        Options of `render`.
+        Of `skindb.parameters.RenderParameters`: lights, environment, camera, samples,
+        error, seed, scale and subsurface as in `render`, and exposure, a factor on the
+        radiance of a PNG. The exposure "fixed" shows a white matte surface, which
+        stands in the place of the face and faces the camera, as display white, so that
+        pictures under the same light are comparable. "auto" shows the brightest skin as
+        display white.
 
     Returns
     -------
@@ -404,32 +400,27 @@ def render_picture(
         path, camera, lights, environment and skipped; with `explain` kept, which lists
         what is computed because skipping it does not pay, and otherwise samples,
         relative_error, seconds, and for a PNG exposure.
+
+    Raises
+    ------
+    InputError
+        If an option is out of its limits, and as `render`.
     """
     if out.suffix not in (".exr", ".png"):
         rule = "the name of a picture must end in .exr or .png"
         raise InputError(
             Fault(str(out), rule, out.suffix or "no suffix", "change the name")
         )
-    keys = ("lights", "environment", "camera")
-    view = {"lights": (), "environment": None, "camera": None} | {
-        k: options[k] for k in keys if k in options
-    }
-    subsurface = bool(options.get("subsurface", False))
-    scale = float(options.get("scale", 1.0))
+    settings = dict(vars(RenderParameters(**options)))
+    exposure = settings.pop("exposure")
+    view = {key: settings[key] for key in ("lights", "environment", "camera", "scale")}
     if explain:
-        how = {
-            key: options[key] for key in ("spacing", "error", "terms") if key in options
-        }
-        inputs = render_inputs(model, **view, subsurface=subsurface, scale=scale, **how)
-        return (
-            {"path": str(out)}
-            | inputs.names
-            | {
-                "skipped": [str(omission) for omission in inputs.omissions],
-                "kept": KEPT,
-            }
+        inputs = render_inputs(
+            model, **view, subsurface=settings["subsurface"], error=settings["error"]
         )
-    seen = render(model, **options)
+        skipped = [str(omission) for omission in inputs.omissions]
+        return {"path": str(out), **inputs.names, "skipped": skipped, "kept": KEPT}
+    seen = render(model, **settings)
     summary = {"path": str(out)} | {
         key: seen.attrs[key] for key in ("camera", "lights", "environment", "skipped")
     }
@@ -441,7 +432,7 @@ def render_picture(
         _write_exr(out, seen)
         return summary
     if exposure == "fixed":
-        inputs = render_inputs(model, **view, subsurface=False, scale=scale)
+        inputs = render_inputs(model, **view, subsurface=False)
         gain = fixed_exposure(inputs.given, inputs.camera)
     else:
         gain = auto_exposure(radiance) if exposure == "auto" else float(exposure)

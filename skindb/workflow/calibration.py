@@ -15,7 +15,6 @@ import xarray as xr
 from skindb.calibration.cameras import calibrate_cameras, calibrated_cameras
 from skindb.calibration.fibres import calibrate_probe, calibrated_probe
 from skindb.calibration.lights import (
-    POSITION_ERROR_MM,
     calibrate_lights,
     calibrate_positions,
     calibrated_dome,
@@ -30,6 +29,7 @@ from skindb.errors import Fault, InputError
 from skindb.format.dome import DomeRecord
 from skindb.format.fields import NAME
 from skindb.format.folder import Capture
+from skindb.parameters import CalibrationParameters
 from skindb.store import CALIBRATION, Database, Record, require_text
 from skindb.workflow.administration import superseded_calibrations
 from skindb.workflow.audit import logged_action
@@ -47,8 +47,7 @@ def calibrate(
     setup: str | Path,
     *,
     name: str,
-    fit_falloff: bool = False,
-    position_error: float = POSITION_ERROR_MM,
+    **options: Any,
 ) -> Record:
     """Calibrate lights, cameras and probe of a set-up, and commit the result as the
     next version of that name.
@@ -68,11 +67,10 @@ def calibrate(
         name, see docs/howto/calibrate.md.
     name
         Name by which captures refer to it.
-    fit_falloff
-        Also fit the angular fall-off of every light.
-    position_error
-        Standard error of the position of a light relative to the white target along
-        each axis, in mm.
+    **options
+        Of `skindb.parameters.CalibrationParameters`: `fit_falloff`, whether the angular
+        fall-off of every light is fitted too, and `position_error`, the standard error
+        of the position of a light relative to the white target along each axis, in mm.
 
     Returns
     -------
@@ -82,8 +80,9 @@ def calibrate(
     Raises
     ------
     InputError
-        With every fault of the folder.
+        With every fault of the folder, or of the options.
     """
+    chosen = CalibrationParameters(name, **options)
     key = require_text(name, NAME.pattern, "name of a calibration")
     dome = read_setup_dome(Path(setup))
     groups = dict[str, xr.Dataset]()
@@ -98,14 +97,16 @@ def calibrate(
             dome, groups["camera_calibration"], where="the calibrated cameras"
         )
     groups["light_calibration"] = calibrate_lights(
-        dome, fit_falloff=fit_falloff, position_error=position_error
+        dome,
+        fit_falloff=chosen.fit_falloff,
+        position_error=chosen.position_error,
     )
     if (flat := read_flat_frames(Path(setup))) is not None:
         groups["probe_calibration"] = calibrate_probe(flat)
     parameters = {
         "setup": Path(setup).name,
-        "fit_falloff": fit_falloff,
-        "position_error": position_error,
+        "fit_falloff": chosen.fit_falloff,
+        "position_error": chosen.position_error,
     }
     about = {
         "command": "calibrate",

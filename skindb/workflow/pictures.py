@@ -14,6 +14,7 @@ from skindb.errors import Fault, InputError
 from skindb.export.bundle import export_bundle
 from skindb.export.gltf import export_gltf
 from skindb.files import make_private
+from skindb.parameters import ComparisonParameters, ExportParameters
 from skindb.render.figures import write_field, write_grid
 from skindb.render.photographs import Comparison, compare_photographs
 from skindb.render.rendering import chosen_camera, render, render_picture
@@ -41,6 +42,7 @@ def render_take(
     *,
     edited: bool = False,
     generation: int | None = None,
+    explain: bool = False,
     **options: Any,
 ) -> dict[str, Any]:
     """Render the model of a take to a picture.
@@ -57,15 +59,17 @@ def render_take(
         Render the edited model.
     generation
         Version of the model; default the newest.
+    explain
+        Only plan the picture.
     **options
-        Of `skindb.render.render_picture`.
+        Of `skindb.parameters.RenderParameters`, see `skindb.render.render_picture`.
     """
     _require_outside(db, out)
     model = _model(db, take, generation, edited=edited)
     path = out if out.suffix else out / f"{take}.png"
-    if not options.get("explain"):
+    if not explain:
         make_private(path.parent)
-    return {"take": take} | render_picture(model, path, **options)
+    return {"take": take} | render_picture(model, path, explain=explain, **options)
 
 
 @logged("compare")
@@ -74,9 +78,12 @@ def compare_take(
 ) -> list[Comparison]:
     """Compare the photographs of a take with the model's prediction; see
     `skindb.render.compare_photographs`.
+
+    The `options` are those of `skindb.parameters.ComparisonParameters`.
     """
+    parameters = ComparisonParameters(**options)
     model = _model(db, take, generation)
-    return compare_photographs(model, db.source(model), **options)
+    return compare_photographs(model, db.source(model), **vars(parameters))
 
 
 @logged("show")
@@ -111,12 +118,10 @@ def export_take(
     out: Path,
     take: str,
     *,
-    size: int | None = None,
-    gltf: bool = False,
-    merl: bool = True,
     edited: bool = False,
     generation: int | None = None,
     progress: Progress | None = None,
+    **options: Any,
 ) -> Path:
     """Write the bundle of a model to `<out>/<take>`, or its glTF alone to `<out>/<take>.glb`.
 
@@ -126,19 +131,22 @@ def export_take(
         Database with a model of the take, and its name.
     out
         Folder; with `gltf` also a file that ends in .glb.
-    size
-        Texels along a map's side; default 1.5 in the spacing of the surfels, as a power of two.
-    gltf, merl
-        Write only the glTF; write MERL binaries, 35 MB each.
     edited, generation
         The edited model; the version of the model.
     progress
         Called with the stage, the number of finished steps and the total number of steps.
+    **options
+        Of `skindb.parameters.ExportParameters`: the number of texels along the side of a
+        map, whether only glTF is written, and whether MERL binaries are.
     """
+    parameters = ExportParameters(**options)
+    size = parameters.size
     _require_outside(db, out)
     model = _model(db, take, generation, edited=edited)
-    if not gltf:
-        export_bundle(model, out / take, size=size, merl=merl, progress=progress)
+    if not parameters.gltf:
+        export_bundle(
+            model, out / take, size=size, merl=parameters.merl, progress=progress
+        )
         return out / take
     path = out if out.suffix == ".glb" else out / f"{take}.glb"
     make_private(path.parent)
