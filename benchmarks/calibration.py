@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from skindb.calibration._merge_kernels import SATURATED
 from skindb.calibration.irradiance import light_intensities
-from skindb.calibration.pixel_flags import SATURATED
 from skindb.calibration.radiance import frame_mergers, read_view
 from skindb.format.dome import DomeRecord
 from skindb.format.folder import read_capture

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from skindb.bench.case import SCALES, close, expect, stress_cases
 from skindb.bench.curve import Curve, Point, cpu_time
-from skindb.calibration.pixel_flags import DARK, OK, SATURATED
+from skindb.calibration._merge_kernels import DARK, OK, SATURATED
 from skindb.calibration.radiance import merge_exposures
 from skindb.format.frames import FrameKind
 from skindb.format.sensor import SensorRecord

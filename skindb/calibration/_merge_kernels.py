@@ -4,10 +4,11 @@ the GIL released.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb.calibration.pixel_flags import DARK, DARK_SIGMA, OK, SATURATED
 from skindb.jit import kernel
 from skindb.types import (
     ByteMatrix,
@@ -20,6 +21,12 @@ from skindb.types import (
 )
 
 Values = NDArray[np.unsignedinteger]  # uint8 or uint16, of the file
+# flags of a merged pixel; samples use the same ones
+OK = 0
+SATURATED = 1
+DARK = 2
+# standard deviations of read noise above black; a pixel at or below it is dark
+DARK_SIGMA = np.float32(2.0)
 # of relative exposure; the weight 1 / variance stays finite
 MIN_VARIANCE = np.float32(1e-30)
 ZERO = np.float32(0.0)
@@ -30,20 +37,29 @@ ENDLESS = np.float32(np.inf)
 NO_USABLE_EXPOSURE = np.float32(100.0)
 
 
+class ExposureModel(NamedTuple):
+    """From the values of the exposures of one camera to radiance."""
+
+    dark: Values  # (e, h, w, 3) dark frames, which are subtracted; or without rows
+    # (m, 3, 2) relative exposure and its read variance at value + offset; or (0, 3, 2)
+    # for a linear response, (value - zero) / span with `variance`
+    curve: Cube32
+    offset: int
+    zero: float
+    span: float
+    variance: float
+    white: float  # values at or above this level are saturated
+    seconds: Vector32  # (e,) exposure times as fractions of the longest one
+    # variance of photon noise per relative exposure: 1 / electrons at the white level
+    photon: float
+    gain: Matrix32  # (h, w) factor of the relative radiance, or (1, 1)
+    matrix: Matrix32  # (3, 3) colour matrix, or (0, 3) for none
+
+
 @kernel
 def develop(
     frames: tuple[Values, ...],
-    dark: Values,
-    curve: Cube32,
-    offset: int,
-    zero: float,
-    span: float,
-    variance: float,
-    white: float,
-    seconds: Vector32,
-    photon: float,
-    gain: Matrix32,
-    matrix: Matrix32,
+    model: ExposureModel,
     spans: IntMatrix,
     radiance: Cube32,
     flag: ByteMatrix,
@@ -60,23 +76,8 @@ def develop(
     ----------
     frames
         One array (h, w, 3) of uint8 or uint16 per exposure.
-    dark
-        (e, h, w, 3) dark frames, which are subtracted; or an array without rows.
-    curve
-        (m, 3, 2) float32 relative exposure and its read variance at value + offset; or
-        (0, 3, 2) for a linear response, (value - zero) / span with `variance`.
-    offset, zero, span, variance
-        See `curve`.
-    white
-        Values at or above this level are saturated.
-    seconds
-        (e,) float32 exposure times as fractions of the longest one.
-    photon
-        Variance of photon noise per relative exposure: 1 / electrons at the white level.
-    gain
-        (h, w) float32 factor of the relative radiance, or (1, 1).
-    matrix
-        (3, 3) float32 colour matrix, or (0, 3) for none.
+    model
+        Levels, response and noise.
     spans
         (h, 2) first column of each row to process, and the one after the last.
     radiance
@@ -87,65 +88,77 @@ def develop(
     usable
         (h, w) uint8 zeros, output: see `skindb.calibration.radiance.FrameMerger.merge`; or (0, 0).
     """
-    count, (height, width) = len(frames), flag.shape
+    count = len(frames)
+    height, width = flag.shape
+    white = np.float32(model.white)
     signal = np.empty((count, 3 * width), np.float32)
     noise = np.empty((count, 3 * width), np.float32)
     total = np.empty(3 * width, np.float32)
     time = np.empty(3 * width, np.float32)
     above = np.empty(3 * width, np.float32)
     weights = np.empty(3 * width, np.float32)
-    black = np.full(3 * width, np.float32(zero), np.float32)
-    slope = ONE / np.float32(span)
+    black = np.full(3 * width, np.float32(model.zero), np.float32)
     for y in range(height):
         start = spans[y, 0]
         end = max(spans[y, 0], spans[y, 1])
-        flag[y, :start], flag[y, end:] = SATURATED, SATURATED
+        flag[y, :start] = SATURATED
+        flag[y, end:] = SATURATED
         begin = 3 * start
         size = 3 * (end - start)
         if size == 0:
             continue
-        total[:size], time[:size], above[:size] = ZERO, ZERO, ZERO
+        total[:size] = ZERO
+        time[:size] = ZERO
+        above[:size] = ZERO
         for e in range(count):
             value = frames[e][y].reshape(3 * width)[begin : begin + size]
-            exposure_signal = signal[e, :size]
+            dark = (
+                model.dark[e, y].reshape(3 * width)[begin : begin + size]
+                if model.dark.shape[0]
+                else model.dark[:0, 0, 0, 0]
+            )
+            exposure = signal[e, :size]
             spread = noise[e, :size]
-            if curve.shape[0]:
-                shade = (
-                    dark[e, y].reshape(3 * width)[begin : begin + size]
-                    if dark.shape[0]
-                    else dark[:0, 0, 0, 0]
-                )
-                _tabulated_response(
-                    value, shade, curve, offset, exposure_signal, spread
-                )
-            else:
-                if dark.shape[0]:
-                    black[:size] = dark[e, y].reshape(3 * width)[begin : begin + size]
-                _linear_response(value, black, slope, exposure_signal)
-                spread[:] = np.float32(variance)
+            _relative_exposure(value, dark, black, model, exposure, spread)
             if usable.shape[0]:
-                _count(
-                    value,
-                    np.float32(white),
-                    exposure_signal,
-                    spread,
-                    usable[y, start:end],
-                )
+                _count(value, white, exposure, spread, usable[y, start:end])
             _collect(
                 value,
-                np.float32(white),
-                exposure_signal,
+                white,
+                exposure,
                 spread,
-                seconds[e],
+                model.seconds[e],
                 total[:size],
                 time[:size],
                 above[:size],
             )
         for k in range(size):
             expected = total[k] / time[k]
-            total[k] = np.float32(photon) * (expected if expected > ZERO else ZERO)
-        _average(signal, noise, seconds, total[:size], weights[:size])
-        _finish(y, start, total[:size], time, above, gain, matrix, radiance, flag)
+            positive = expected if expected > ZERO else ZERO
+            total[k] = np.float32(model.photon) * positive
+        _average(signal, noise, model.seconds, total[:size], weights[:size])
+        _finish(y, start, total[:size], time, above, model, radiance, flag)
+
+
+@kernel
+def _relative_exposure(
+    value: Values,
+    dark: Values,
+    black: Vector32,
+    model: ExposureModel,
+    signal: Vector32,
+    noise: Vector32,
+) -> None:
+    """Relative exposure of a part of a row, and its read variance; `dark` is empty
+    without dark frames, and otherwise replaces `black`.
+    """
+    if model.curve.shape[0]:
+        _tabulated_response(value, dark, model.curve, model.offset, signal, noise)
+        return
+    if dark.shape[0]:
+        black[: dark.shape[0]] = dark
+    _linear_response(value, black, ONE / np.float32(model.span), signal)
+    noise[:] = np.float32(model.variance)
 
 
 @kernel
@@ -168,7 +181,8 @@ def _tabulated_response(
     """Relative exposure by a table; `dark` is empty if the table includes it."""
     for k in range(value.shape[0]):
         row = np.int64(value[k]) + offset - (np.int64(dark[k]) if dark.shape[0] else 0)
-        signal[k], noise[k] = curve[row, k % 3, 0], curve[row, k % 3, 1]
+        signal[k] = curve[row, k % 3, 0]
+        noise[k] = curve[row, k % 3, 1]
 
 
 @kernel
@@ -245,12 +259,13 @@ def _finish(
     value: Vector32,
     time: Vector32,
     above: Vector32,
-    gain: Matrix32,
-    matrix: Matrix32,
+    model: ExposureModel,
     out: Cube32,
     flag: ByteMatrix,
 ) -> None:
     """Apply vignette and colour matrix to a row, and set its flags."""
+    gain = model.gain
+    matrix = model.matrix
     pixels = value.shape[0] // 3
     row = out[y, start : start + pixels].reshape(value.shape[0])
     if gain.shape[0] == 1:
@@ -274,6 +289,7 @@ def _finish(
         above[k] = NO_USABLE_EXPOSURE if time[k] == ZERO else min(above[k], ONE)
     for x in range(pixels):
         state = above[3 * x] + above[3 * x + 1] + above[3 * x + 2]
-        flag[y, start + x] = (
-            SATURATED if state >= NO_USABLE_EXPOSURE else DARK if state == ZERO else OK
-        )
+        if state >= NO_USABLE_EXPOSURE:
+            flag[y, start + x] = SATURATED
+        else:
+            flag[y, start + x] = DARK if state == ZERO else OK

@@ -14,10 +14,10 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from skindb.calibration._merge_kernels import OK
 from skindb.calibration.colour_chart import fit_colour_matrix
 from skindb.calibration.lens import fit_edge, fit_vignette, veiling_glare
 from skindb.calibration.mirror_ball import reprojection_error
-from skindb.calibration.pixel_flags import OK
 from skindb.calibration.radiance import (
     merge_exposures,
     relative_exposure,

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from skindb.calibration._merge_kernels import OK
 from skindb.calibration.frame_checks import checked_view
-from skindb.calibration.pixel_flags import OK
 from skindb.calibration.radiance import FrameMerger
 from skindb.errors import attempt_all, require
 from skindb.format.dome import CameraRecord, DomeRecord, LightRecord, WhiteRecord

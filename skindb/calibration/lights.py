@@ -12,6 +12,7 @@ from functools import partial
 import numpy as np
 import xarray as xr
 
+from skindb.calibration._merge_kernels import OK, SATURATED
 from skindb.calibration.frame_checks import checked_view
 from skindb.calibration.irradiance import (
     TARGET_INTERIOR_FRACTION,
@@ -30,7 +31,6 @@ from skindb.calibration.mirror_ball import (
     light_position,
     reflected_ray,
 )
-from skindb.calibration.pixel_flags import OK, SATURATED
 from skindb.calibration.radiance import FrameMerger, frame_mergers
 from skindb.calibration.setup import PLACE, BallFrames, of_devices
 from skindb.errors import Fault, InputError, attempt, attempt_all, require

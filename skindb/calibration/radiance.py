@@ -7,13 +7,18 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb.calibration._merge_kernels import develop
-from skindb.calibration.pixel_flags import DARK, DARK_SIGMA, OK, SATURATED
+from skindb.calibration._merge_kernels import (
+    DARK,
+    DARK_SIGMA,
+    OK,
+    SATURATED,
+    ExposureModel,
+    develop,
+)
 from skindb.errors import Fault, attempt
 from skindb.format.dome import CameraRecord, DomeRecord
 from skindb.format.frame_paths import filled
@@ -62,14 +67,11 @@ class FrameMerger:
         if spans is None:
             spans = np.tile(np.array([0, width]), (height, 1))
         count = np.empty((0, 0), np.uint8) if usable is None else usable
-        shared = self._kernel_arguments
-        arguments = (tuple(frames), *shared, spans, radiance, flag, count)
-        develop(*arguments)
+        develop(tuple(frames), self._exposure_model, spans, radiance, flag, count)
         return radiance, flag
 
     @cached_property
-    def _kernel_arguments(self) -> tuple[Any, ...]:
-        """The other arguments of `develop`."""
+    def _exposure_model(self) -> ExposureModel:
         sensor = self.camera.sensor
         matrix = self.camera.colour_matrix
         dark = np.zeros((0, 1, 1, 3), sensor.kind.dtype)
@@ -83,18 +85,18 @@ class FrameMerger:
         if self.vignette is not None:
             shade = self.vignette[..., 0].astype(np.float64)
         colours = matrix if (matrix != np.eye(3)).any() else np.zeros((0, 3))
-        return (
-            dark,
-            curve,
-            offset,
-            float(np.float32(sensor.black)),
-            float(span),
-            float(read_sigma(slope, sensor)[0]) ** 2,
-            float(sensor.white),
-            np.asarray(self.seconds, np.float32) / np.float32(longest),
-            1 / sensor.full_electrons,
-            (1 / shade / longest).astype(np.float32),
-            np.ascontiguousarray(colours, np.float32),
+        return ExposureModel(
+            dark=dark,
+            curve=curve,
+            offset=offset,
+            zero=float(np.float32(sensor.black)),
+            span=float(span),
+            variance=float(read_sigma(slope, sensor)[0]) ** 2,
+            white=float(sensor.white),
+            seconds=np.asarray(self.seconds, np.float32) / np.float32(longest),
+            photon=1 / sensor.full_electrons,
+            gain=(1 / shade / longest).astype(np.float32),
+            matrix=np.ascontiguousarray(colours, np.float32),
         )
 
 

@@ -7,9 +7,10 @@ Sums over samples run in single precision and in vector registers; systems of eq
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from skindb.jit import (
     LANES,
@@ -22,10 +23,17 @@ from skindb.jit import (
     scale_to_one,
     unpack,
 )
-from skindb.numerics._nnls_kernels import active_set_memory, factor, solve, solve_scaled
+from skindb.numerics._nnls_kernels import (
+    ActiveSetMemory,
+    active_set_memory,
+    factor,
+    solve,
+    solve_scaled,
+)
 from skindb.reflectance._lumitexel_kernels import (
     MODEL_ERROR,
     UNSEEN,
+    Lumitexel,
     choose,
     lumitexel_memory,
     sample_status,
@@ -35,6 +43,18 @@ from skindb.reflectance._lumitexel_kernels import (
     write_rows,
 )
 from skindb.reflectance._shade_kernels import transmittance
+from skindb.types import (
+    IntMatrix32,
+    IntVector,
+    Matrix,
+    Matrix32,
+    Vector,
+    Vector32,
+)
+
+if TYPE_CHECKING:
+    from skindb.reflectance.model import Noise
+    from skindb.reflectance.tables import Table
 
 # to light or camera; below it F_t and the footprint of a pixel change too fast
 MIN_COSINE_ALBEDO = 0.25
@@ -66,28 +86,28 @@ ONE = np.float32(1)
 class Separation(NamedTuple):
     """Buffers for `separate`; one set per thread."""
 
-    shape: Any  # (rows,) cos(theta_i) F_t F_t / pi
-    mean: Any  # (rows,) mean of the channels
-    tint: Any  # (rows,) a channel minus the mean
-    keep: Any  # (rows,) Tukey weights
-    weight: Any  # (rows,) weights of the linear problem
-    aim: Any  # (rows,) weighted target
-    residual: Any  # (rows,)
-    predicted: Any  # (rows,)
-    level: Any  # (rows,) scale of the residuals
-    pull: Any  # (rows,) derivative of R_d with respect to each sample
-    mixture: Any  # (2 COLUMNS,) weights of the columns in single precision
-    gram: Any  # (COLUMNS, COLUMNS)
-    right: Any  # (COLUMNS,)
-    x: Any  # (COLUMNS,)
-    active_set: Any  # of COLUMNS columns, for `solve_scaled`
-    block: Any  # (LANES + 1, LANES)
+    shape: Vector32  # (rows,) cos(theta_i) F_t F_t / pi
+    mean: Vector32  # (rows,) mean of the channels
+    tint: Vector32  # (rows,) a channel minus the mean
+    keep: Vector32  # (rows,) Tukey weights
+    weight: Vector32  # (rows,) weights of the linear problem
+    aim: Vector32  # (rows,) weighted target
+    residual: Vector32  # (rows,)
+    predicted: Vector32  # (rows,)
+    level: Vector32  # (rows,) scale of the residuals
+    pull: Vector32  # (rows,) derivative of R_d with respect to each sample
+    mixture: Vector32  # (2 COLUMNS,) weights of the columns in single precision
+    gram: Matrix  # (COLUMNS, COLUMNS)
+    right: Vector  # (COLUMNS,)
+    x: Vector  # (COLUMNS,)
+    active_set: ActiveSetMemory  # of COLUMNS columns, for `solve_scaled`
+    block: Matrix32  # (LANES + 1, LANES)
 
 
 @kernel
-def separation_memory(most: int) -> Any:
-    """Buffers for up to `most` samples of a surfel."""
-    v = np.empty((10, most), np.float32)
+def separation_memory(samples: int) -> Separation:
+    """Buffers for up to this many samples of a surfel."""
+    v = np.empty((10, samples), np.float32)
     return Separation(
         v[0],
         v[1],
@@ -110,7 +130,7 @@ def separation_memory(most: int) -> Any:
 
 @fast_kernel
 def robust_slope(
-    x: Any, y: Any, weight: Any, residual: Any, n: int
+    x: Vector32, y: Vector32, weight: Vector32, residual: Vector32, n: int
 ) -> tuple[float, float]:
     """Slope of y on x through the origin by Tukey weights, and its standard error
     (Huber's sandwich).
@@ -119,7 +139,7 @@ def robust_slope(
     """
     for i in range(n):
         weight[i] = ONE
-    found = 0.0
+    slope = 0.0
     norm = 1.0
     inverse = ZERO
     for step in range(SLOPE_STEPS):
@@ -130,12 +150,12 @@ def robust_slope(
             xx += wx * x[i]
             xy += wx * y[i]
         norm = max(np.float64(xx), 1e-12)
-        found = np.float64(xy) / norm
-        slope = np.float32(found)
+        slope = np.float64(xy) / norm
+        single_slope = np.float32(slope)
         absolute = ZERO
         total = ZERO
         for i in range(n):
-            residual[i] = y[i] - slope * x[i]
+            residual[i] = y[i] - single_slope * x[i]
             absolute += weight[i] * abs(residual[i])
             total += weight[i]
         scale = MEAN_TO_SIGMA * np.float64(absolute) / max(np.float64(total), 1e-12)
@@ -159,13 +179,14 @@ def robust_slope(
     steep = max(np.float64(bend) / norm, MIN_BEND) * norm
     for i in range(n):
         weight[i] *= np.float32(1.0 / steep)
-    return found, math.sqrt(np.float64(meat) * n / max(n - 1.0, 1.0)) / steep
+    return slope, math.sqrt(np.float64(meat) * n / max(n - 1.0, 1.0)) / steep
 
 
 @kernel
-def _normal_equations(rows: Any, n: int, s: Any) -> None:
+def _normal_equations(rows: Matrix32, n: int, s: Separation) -> None:
     """Write M' w M and M' (w y) of the first COLUMNS columns to `s.gram` and `s.right`."""
-    s.gram[:], s.right[:] = 0.0, 0.0
+    s.gram[:] = 0.0
+    s.right[:] = 0.0
     for begin in range(0, n, ROWS_PER_SUM):
         products(
             rows, s.weight, s.aim, 0, 0, begin, min(begin + ROWS_PER_SUM, n), s.block
@@ -177,7 +198,7 @@ def _normal_equations(rows: Any, n: int, s: Any) -> None:
 
 
 @fast_kernel
-def _weigh(n: int, noise: Any, s: Any) -> tuple[float, float]:
+def _weigh(n: int, noise: Matrix32, s: Separation) -> tuple[float, float]:
     """Tukey weights of the relative residuals; returns the sums of the weights and of
     the influence function's slope.
 
@@ -202,22 +223,22 @@ def _weigh(n: int, noise: Any, s: Any) -> tuple[float, float]:
         + MIN_RELATIVE_SCALE
     )
     inverse = np.float32(1.0 / (TUKEY * scale) ** 2)
-    kept = ZERO
+    weights = ZERO
     slope = ZERO
     for i in range(n):
         u = s.residual[i] * s.residual[i] * inverse
         inside = u < ONE
         keep = (ONE - u) * (ONE - u) if inside else ZERO
         slope += (ONE - u) * (ONE - np.float32(5) * u) if inside else ZERO
-        kept += keep
+        weights += keep
         s.keep[i] = keep
         s.weight[i] = keep * s.level[i] * s.level[i]
         s.aim[i] = s.weight[i] * s.mean[i]
-    return np.float64(kept), np.float64(slope)
+    return np.float64(weights), np.float64(slope)
 
 
 @fast_kernel
-def _pull(n: int, s: Any) -> float:
+def _pull(n: int, s: Separation) -> float:
     """Convert projections of the rows in `s.predicted` to pulls; returns the sum of
     squared pulls times residuals.
     """
@@ -230,16 +251,20 @@ def _pull(n: int, s: Any) -> float:
 
 
 @kernel
-def _predict(rows: Any, n: int, x: Any, at: int, s: Any, out: Any) -> None:
-    """Write the mixture of COLUMNS columns that begin at `at`."""
+def _predict(
+    rows: Matrix32, n: int, x: Vector, begin: int, s: Separation, out: Vector32
+) -> None:
+    """Write the mixture of the COLUMNS columns from `begin` on."""
     s.mixture[:] = ZERO
     for j in range(COLUMNS):
-        s.mixture[at + j] = x[j]
+        s.mixture[begin + j] = x[j]
     dots(rows, s.mixture, n, out)
 
 
 @kernel
-def fit_shape(rows: Any, n: int, noise: Any, s: Any) -> tuple[float, float]:
+def fit_shape(
+    rows: Matrix32, n: int, noise: Matrix32, s: Separation
+) -> tuple[float, float]:
     """Weight of the diffuse shape in the mean channel by robust non-negative least
     squares, and its standard error.
 
@@ -251,16 +276,17 @@ def fit_shape(rows: Any, n: int, noise: Any, s: Any) -> tuple[float, float]:
     floor = np.float32(NOISE_FLOOR_ALBEDO)
     for i in range(n):
         level = max(s.mean[i], floor)
-        s.keep[i], s.weight[i] = ONE, ONE / (level * level)
+        s.keep[i] = ONE
+        s.weight[i] = ONE / (level * level)
         s.aim[i] = s.weight[i] * s.mean[i]
     s.x[:] = 0.0
-    kept = 1.0
+    total = 1.0
     slope = 1.0
     for _ in range(LOBE_STEPS):
         _normal_equations(rows, n, s)
         solve_scaled(s.gram, s.right, s.x, 1e-10, 6 * COLUMNS, s.active_set)
         _predict(rows, n, s.x, 0, s, s.predicted)
-        kept, slope = _weigh(n, noise, s)
+        total, slope = _weigh(n, noise, s)
     active = np.empty(COLUMNS, np.int64)
     k = 0
     place = -1
@@ -270,26 +296,26 @@ def fit_shape(rows: Any, n: int, noise: Any, s: Any) -> tuple[float, float]:
             active[k] = j
             k += 1
     if place < 0:
-        for i in range(n):
-            s.pull[i], s.aim[i] = ZERO, ZERO
+        s.pull[:n] = ZERO
+        s.aim[:n] = ZERO
         return 0.0, 0.0
     _normal_equations(rows, n, s)
-    if not _first_row(active, k, s):
-        for i in range(n):
-            s.pull[i], s.aim[i] = ZERO, ZERO
+    if not _shape_row(active, k, s):
+        s.pull[:n] = ZERO
+        s.aim[:n] = ZERO
         return s.x[SHAPE], math.nan
     weights = s.x.copy()
     _predict(rows, n, s.right, 0, s, s.predicted)
     meat = _pull(n, s)
     s.x[:] = weights
-    bend = max(slope / max(kept, 1e-12), MIN_BEND)
+    bend = max(slope / max(total, 1e-12), MIN_BEND)
     for i in range(n):
         s.aim[i] = s.pull[i] * s.residual[i] / (s.level[i] * np.float32(bend))
     return s.x[SHAPE], math.sqrt(meat * n / max(n - k, 1)) / bend
 
 
 @kernel
-def _first_row(active: Any, k: int, s: Any) -> bool:
+def _shape_row(active: IntVector, k: int, s: Separation) -> bool:
     """Write the row of the diffuse shape of the inverse Gram matrix of the active
     columns to `s.right`.
     """
@@ -313,7 +339,7 @@ def _first_row(active: Any, k: int, s: Any) -> bool:
 
 
 @kernel
-def _tangents(n: Any, first: Any, second: Any) -> None:
+def _tangents(n: Vector, first: Vector, second: Vector) -> None:
     """Two unit vectors perpendicular to n and to each other."""
     small = 0
     for k in range(3):
@@ -334,7 +360,9 @@ def _tangents(n: Any, first: Any, second: Any) -> None:
 
 
 @kernel
-def _slide(axes: Any, eta: float, b: Any, light: Any, camera: Any) -> None:
+def _slide(
+    axes: Matrix, eta: float, b: Lumitexel, light: Matrix, camera: Matrix
+) -> None:
     """Effect of a rotation of the normal by one radian towards two axes (2, 3): light
     (lights, 6), camera (cameras, 4).
 
@@ -351,11 +379,9 @@ def _slide(axes: Any, eta: float, b: Any, light: Any, camera: Any) -> None:
                     + axes[q, 1] * b.to_light[i, 1]
                     + axes[q, 2] * b.to_light[i, 2]
                 )
-                light[i, 3 * q], light[i, 3 * q + 1], light[i, 3 * q + 2] = (
-                    t,
-                    t / c + t * steep,
-                    t / c,
-                )
+                light[i, 3 * q] = t
+                light[i, 3 * q + 1] = t / c + t * steep
+                light[i, 3 * q + 2] = t / c
     for o in range(b.seen.shape[0]):
         c = b.seen[o]
         if c > 0.0:
@@ -366,7 +392,8 @@ def _slide(axes: Any, eta: float, b: Any, light: Any, camera: Any) -> None:
                     + axes[q, 1] * b.to_camera[o, 1]
                     + axes[q, 2] * b.to_camera[o, 2]
                 )
-                camera[o, 2 * q], camera[o, 2 * q + 1] = t, t * steep
+                camera[o, 2 * q] = t
+                camera[o, 2 * q + 1] = t * steep
 
 
 @inline_kernel
@@ -381,15 +408,17 @@ def _relative_slope(c: float, eta: float) -> float:
 
 @fast_kernel
 def _turn_effect(
-    light: Any, camera: Any, n: int, b: Any, s: Any, mixed: Any, bent: Any, out: Any
+    light: Matrix, camera: Matrix, n: int, b: Lumitexel, s: Separation, out: Matrix
 ) -> None:
     """Effect of rotations of the normal by one radian on the common part, and relative
     effect on the channels' slopes.
 
     First order: the pulls of the samples times the change of their prediction; out is
-    (2 axes, 2). `mixed` and `bent` are the mixture of lobes and its derivative with
-    respect to theta_h; phi_d hardly affects lobes of isotropic materials.
+    (2 axes, 2). `s.predicted` and `s.level` are the mixture of lobes and its derivative
+    with respect to theta_h; phi_d hardly affects lobes of isotropic materials.
     """
+    mixed = s.predicted
+    bent = s.level
     weight = s.x[SHAPE]
     square = 0.0
     out[:] = 0.0
@@ -403,8 +432,10 @@ def _turn_effect(
         )
         # cosine and sine of theta_h times the length of wi + wo
         along = b.lit[i] + b.seen[o]
-        whole = 2.0 + 2.0 * wi_wo
-        across = math.sqrt(max(whole - along * along, MIN_SINE * MIN_SINE * whole))
+        square_length = 2.0 + 2.0 * wi_wo
+        across = math.sqrt(
+            max(square_length - along * along, MIN_SINE * MIN_SINE * square_length)
+        )
         tilt = bent[r] / across
         shape = s.shape[r]
         pull = s.pull[r]
@@ -422,7 +453,7 @@ def _turn_effect(
 
 @kernel
 def _add_by_device(
-    index: Any, moved: Any, n: int, by_light: Any, by_camera: Any
+    index: IntMatrix32, moved: Vector32, n: int, by_light: Vector, by_camera: Vector
 ) -> None:
     """Add the change of the result by each residual to the sums of its light and of its camera."""
     for r in range(n):
@@ -431,7 +462,7 @@ def _add_by_device(
 
 
 @kernel
-def _variance_of_sums(sums: Any) -> float:
+def _variance_of_sums(sums: Vector) -> float:
     """Variance of a result from the summed changes per device; devices without samples have 0."""
     count = 0
     square = 0.0
@@ -443,37 +474,31 @@ def _variance_of_sums(sums: Any) -> float:
 
 
 @kernel
-def separate(
-    n: Any,
-    turn: Any,
-    eta: float,
-    table: Any,
-    noise: Any,
-    surfel: int,
-    b: Any,
-    s: Any,
-    estimate: Any,
-    error: Any,
-    total: Any,
-) -> None:
-    """R_d (3,), its standard error for independent samples, and that for errors by
-    device; NaN for too few samples.
+def _normal_effect(
+    n: Vector, eta: float, count: int, b: Lumitexel, s: Separation
+) -> Matrix:
+    """`_turn_effect` (2 axes, 2) of the mixture of lobes in `s.x`."""
+    axes = np.empty((2, 3))
+    moved = np.empty((2, 2))
+    _tangents(n, axes[0], axes[1])
+    light = np.empty((b.lit.shape[0], 6))
+    camera = np.empty((b.seen.shape[0], 4))
+    lobes = s.x.copy()
+    lobes[SHAPE] = 0.0
+    _predict(b.rows, count, lobes, 0, s, s.predicted)
+    _predict(b.rows, count, lobes, COLUMNS, s, s.level)
+    _slide(axes, eta, b, light, camera)
+    _turn_effect(light, camera, count, b, s, moved)
+    return moved
 
-    `turn` (2,) is the error of the normal [rad] for either standard error. An error of
-    a light or camera affects all of its samples, so that the variance follows from sums
-    of their residuals: variance by lights + variance by cameras - variance by samples,
-    and not less than the last (Cameron, Gelbach and Miller 2011).
+
+@kernel
+def _separate_channels(
+    count: int, b: Lumitexel, s: Separation, estimate: Vector
+) -> tuple[Vector, Vector, Vector]:
+    """Write R_d (3,); returns the slopes of the channels minus their mean (3,), and the
+    variances for independent samples and for errors by device (3,).
     """
-    estimate[:], error[:], total[:] = np.nan, np.nan, np.nan
-    write_cosines(n, eta, MIN_COSINE_ALBEDO, b)
-    if choose(b) < MIN_SAMPLES_ALBEDO:
-        return
-    count = write_rows(n, table, b)
-    write_noise(surfel, count, noise, b)
-    for r in range(count):
-        s.shape[r] = b.enters[b.index[r, 0]] * b.leaves[b.index[r, 1]]
-        s.mean[r] = (b.given[0, r] + b.given[1, r] + b.given[2, r]) / np.float32(3)
-        b.rows[r, SHAPE] = s.shape[r]
     tint = np.empty(3)
     variance = np.empty(3)
     shared = np.empty(3)
@@ -496,41 +521,70 @@ def separate(
             - variance[c]
         )
         shared[c] = max(by_device, variance[c])
+    return tint, variance, shared
+
+
+@kernel
+def separate(
+    n: Vector,
+    turn: Vector,
+    eta: float,
+    table: Table,
+    noise: Noise,
+    surfel: int,
+    b: Lumitexel,
+    s: Separation,
+    estimate: Vector,
+    error: Vector,
+    total: Vector,
+) -> None:
+    """R_d (3,), its standard error for independent samples, and that for errors by
+    device; NaN for too few samples.
+
+    `turn` (2,) is the error of the normal [rad] for either standard error. An error of
+    a light or camera affects all of its samples, so that the variance follows from sums
+    of their residuals: variance by lights + variance by cameras - variance by samples,
+    and not less than the last (Cameron, Gelbach and Miller 2011).
+    """
+    estimate[:] = np.nan
+    error[:] = np.nan
+    total[:] = np.nan
+    write_cosines(n, eta, MIN_COSINE_ALBEDO, b)
+    if choose(b) < MIN_SAMPLES_ALBEDO:
+        return
+    count = write_rows(n, table, b)
+    write_noise(surfel, count, noise, b)
+    for r in range(count):
+        s.shape[r] = b.enters[b.index[r, 0]] * b.leaves[b.index[r, 1]]
+        s.mean[r] = (b.given[0, r] + b.given[1, r] + b.given[2, r]) / np.float32(3)
+        b.rows[r, SHAPE] = s.shape[r]
+    tint, variance, shared = _separate_channels(count, b, s, estimate)
     if turn[1] > 0.0:
-        axes = np.empty((2, 3))
-        moved = np.empty((2, 2))
-        _tangents(n, axes[0], axes[1])
-        light = np.empty((b.lit.shape[0], 6))
-        camera = np.empty((b.seen.shape[0], 4))
-        lobes = s.x.copy()
-        lobes[SHAPE] = 0.0
-        _predict(b.rows, count, lobes, 0, s, s.predicted)
-        _predict(b.rows, count, lobes, COLUMNS, s, s.level)
-        _slide(axes, eta, b, light, camera)
-        _turn_effect(light, camera, count, b, s, s.predicted, s.level, moved)
+        moved = _normal_effect(n, eta, count, b, s)
         for q in range(2):
             for c in range(3):
                 by_turn = (moved[q, 0] + tint[c] * moved[q, 1]) ** 2
                 variance[c] += turn[0] ** 2 * by_turn
                 shared[c] += turn[1] ** 2 * by_turn
     for c in range(3):
-        error[c], total[c] = math.sqrt(variance[c]), math.sqrt(shared[c])
+        error[c] = math.sqrt(variance[c])
+        total[c] = math.sqrt(shared[c])
 
 
 @kernel
 def separate_block(
-    sample: Any,
-    position: Any,
-    light: Any,
-    camera: Any,
-    normal: Any,
-    turn: Any,
-    table: Any,
-    noise: Any,
+    sample: NDArray[Any],
+    position: Matrix,
+    light: Matrix,
+    camera: Matrix,
+    normal: Matrix,
+    turn: Matrix,
+    table: Table,
+    noise: Noise,
     eta: float,
-    estimate: Any,
-    error: Any,
-    total: Any,
+    estimate: Matrix,
+    error: Matrix,
+    total: Matrix,
 ) -> None:
     """`separate` of every surfel of a block."""
     b = lumitexel_memory(light.shape[0], camera.shape[0], 2 * COLUMNS)
@@ -538,7 +592,9 @@ def separate_block(
     for i in range(position.shape[0]):
         unpack(sample[i], b.values)
         if sample_status(b.values) == UNSEEN or not np.isfinite(normal[i]).all():
-            estimate[i], error[i], total[i] = np.nan, np.nan, np.nan
+            estimate[i] = np.nan
+            error[i] = np.nan
+            total[i] = np.nan
             continue
         # squares of values far outside the range of reflectance would overflow
         power = scale_to_one(b.values) if largest_finite(b.values) > MAX_SAMPLE else 1.0

@@ -8,6 +8,7 @@ import math
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from skindb.jit import kernel
 from skindb.optics._photometric_kernels import (
@@ -16,6 +17,7 @@ from skindb.optics._photometric_kernels import (
     estimate_normal,
     normal_estimates,
 )
+from skindb.types import Matrix, Vector
 
 COMBINED, CHROMATIC, PHOTOMETRIC, PEAK = range(4)
 # Terms of the total error that cover 91 to 96 % of the normals of six independent
@@ -27,7 +29,7 @@ MODEL_ERROR_DEGREES = 1.0
 
 
 @kernel
-def _angle(a: Any, b: Any) -> float:
+def _angle(a: Vector, b: Vector) -> float:
     """Angle in degrees between unit vectors; NaN for NaN."""
     cosine = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
     if math.isnan(cosine):
@@ -36,56 +38,112 @@ def _angle(a: Any, b: Any) -> float:
 
 
 @kernel
-def _mean(first: float, normal: Any, out: Any) -> None:
-    """Unit mean of two normals, the first weighted by `first`; a normal that is NaN is ignored."""
-    second = 1.0 - first
+def _mean(white: float, normal: Matrix, out: Vector) -> None:
+    """Unit mean of the two estimates, the photometric one weighted by `white`; one that
+    is NaN is ignored.
+    """
+    tinted = 1.0 - white
     size = 0.0
     for k in range(3):
         a = normal[0, k]
         b = normal[1, k]
-        out[k] = (first * a if a == a else 0.0) + (second * b if b == b else 0.0)
+        out[k] = (white * a if a == a else 0.0) + (tinted * b if b == b else 0.0)
         size += out[k] * out[k]
     for k in range(3):
         out[k] = out[k] / math.sqrt(size) if size > 0.0 else math.nan
 
 
 @kernel
-def _variance(first: float, estimates: NormalEstimates, scan_error: float) -> float:
+def _variance(white: float, estimates: NormalEstimates, scan_error: float) -> float:
     """Squared RMS angle [rad^2] of a mean: noise, which is partly common to both, and
     error of the scan per axis.
     """
-    second = 1.0 - first
+    tinted = 1.0 - white
     noise = 0.0
     scan = 0.0
     for k in range(3):
         a = estimates.covariance[0, k, k]
         b = estimates.covariance[1, k, k]
         c = estimates.cross[k, k]
-        noise += first * first * a if a == a else 0.0
-        noise += second * second * b if b == b else 0.0
-        noise += 2.0 * first * second * c if c == c else 0.0
+        noise += white * white * a if a == a else 0.0
+        noise += tinted * tinted * b if b == b else 0.0
+        noise += 2.0 * white * tinted * c if c == c else 0.0
         for j in range(3):
             p = estimates.pull[0, j, k]
             q = estimates.pull[1, j, k]
-            turned = (first * p if p == p else 0.0) + (second * q if q == q else 0.0)
+            turned = (white * p if p == p else 0.0) + (tinted * q if q == q else 0.0)
             scan += turned * turned
     return noise + scan * scan_error * scan_error / 2.0
 
 
 @kernel
+def _unit_normal(scan: Vector, out: Vector) -> None:
+    """Write the normal of the scan with length 1; NaN for length 0."""
+    size = math.sqrt(scan[0] ** 2 + scan[1] ** 2 + scan[2] ** 2)
+    for k in range(3):
+        out[k] = scan[k] / size if size > 0.0 else math.nan
+
+
+@kernel
+def _combine(estimates: NormalEstimates, out: Vector) -> float:
+    """Write the mean of both estimates by inverse variance; returns the weight of the
+    photometric one.
+
+    The variance is that of the residuals relative to the signal; for skin without
+    colour the photometric estimate has all the weight.
+    """
+    spread = estimates.spread
+    white = 1.0 / spread[0] ** 2 if spread[0] == spread[0] else 0.0
+    tinted = 1.0 / spread[1] ** 2 if spread[1] == spread[1] else 0.0
+    share = white / max(white + tinted, 1e-300)
+    if white + tinted > 0.0:
+        _mean(share, estimates.normal, out)
+    else:
+        out[:] = math.nan
+    return share
+
+
+@kernel
+def _choose(
+    method: int, estimates: NormalEstimates, combined: Vector, out: Vector
+) -> None:
+    """Write the normal of a method."""
+    for k in range(3):
+        if method == PEAK:
+            out[k] = estimates.peak[k]
+        elif method == COMBINED:
+            out[k] = combined[k]
+        else:
+            out[k] = estimates.normal[0 if method == PHOTOMETRIC else 1, k]
+
+
+@kernel
+def _total_error(error: float, estimates: NormalEstimates) -> float:
+    """Total error [degree] of the combined normal, whose standard error is given."""
+    # skin without colour has only one of the two estimates
+    apart = _angle(estimates.normal[0], estimates.normal[1])
+    apart = apart if apart == apart else 0.0
+    return math.sqrt(
+        (NOISE_FACTOR_NORMAL * error) ** 2
+        + apart * apart
+        + MODEL_ERROR_DEGREES * MODEL_ERROR_DEGREES
+    )
+
+
+@kernel
 def normals_block(
-    sample: Any,
-    position: Any,
-    light: Any,
-    camera: Any,
-    scan: Any,
+    sample: NDArray[Any],
+    position: Matrix,
+    light: Matrix,
+    camera: Matrix,
+    scan: Matrix,
     method: int,
     eta: float,
     scan_error: float,
-    chosen: Any,
-    disagreement: Any,
-    error: Any,
-    total: Any,
+    chosen: Matrix,
+    disagreement: Vector,
+    error: Vector,
+    total: Vector,
 ) -> None:
     """Normals (n, 3) by the method, angle (n,) of peak and combined, standard and total
     error (n,) [degree].
@@ -93,55 +151,32 @@ def normals_block(
     `scan_error` is an angle [rad].
     """
     b = buffers(light.shape[0], camera.shape[0])
-    first = np.empty(3)
+    start = np.empty(3)
     estimates = normal_estimates()
-    peak = estimates.peak
-    normal = estimates.normal
-    spread = estimates.spread
     combined = np.empty(3)
     for s in range(position.shape[0]):
-        size = math.sqrt(scan[s, 0] ** 2 + scan[s, 1] ** 2 + scan[s, 2] ** 2)
-        for k in range(3):
-            first[k] = scan[s, k] / size if size > 0.0 else math.nan
+        _unit_normal(scan[s], start)
         estimate_normal(
             sample[s],
             position[s],
             light,
             camera,
-            first,
+            start,
             eta,
             scan_error,
             b,
             estimates,
         )
-        # inverse variance: each residual relative to the signal; for skin without
-        # colour the first has all the weight
-        white = 1.0 / spread[0] ** 2 if spread[0] == spread[0] else 0.0
-        tinted = 1.0 / spread[1] ** 2 if spread[1] == spread[1] else 0.0
-        share = white / max(white + tinted, 1e-300)
-        if white + tinted > 0.0:
-            _mean(share, normal, combined)
-        else:
-            combined[:] = math.nan
-        share = 1.0 if method == PHOTOMETRIC else 0.0 if method == CHROMATIC else share
-        for k in range(3):
-            chosen[s, k] = (
-                peak[k]
-                if method == PEAK
-                else combined[k]
-                if method == COMBINED
-                else normal[0 if method == PHOTOMETRIC else 1, k]
-            )
-        disagreement[s] = _angle(peak, combined)
-        error[s], total[s] = math.nan, math.nan
+        share = _combine(estimates, combined)
+        if method == PHOTOMETRIC:
+            share = 1.0
+        elif method == CHROMATIC:
+            share = 0.0
+        _choose(method, estimates, combined, chosen[s])
+        disagreement[s] = _angle(estimates.peak, combined)
+        error[s] = math.nan
+        total[s] = math.nan
         if method != PEAK and np.isfinite(chosen[s]).all():
             error[s] = math.degrees(math.sqrt(_variance(share, estimates, scan_error)))
-            # skin without colour has only one of the two
-            apart = _angle(normal[0], normal[1])
-            apart = apart if apart == apart else 0.0
             if method == COMBINED:
-                total[s] = math.sqrt(
-                    (NOISE_FACTOR_NORMAL * error[s]) ** 2
-                    + apart * apart
-                    + MODEL_ERROR_DEGREES * MODEL_ERROR_DEGREES
-                )
+                total[s] = _total_error(error[s], estimates)

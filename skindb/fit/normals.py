@@ -94,10 +94,25 @@ def _normals(
     error (n,) [degree].
     """
     n = len(position)
-    out = np.empty((n, 3)), np.empty(n), np.empty(n), np.empty(n)
+    chosen = np.empty((n, 3))
+    disagreement = np.empty(n)
+    error = np.empty(n)
+    total = np.empty(n)
     position, light, camera, scan = (
         np.ascontiguousarray(a, np.float64) for a in (position, light, camera, scan)
     )
-    options = METHODS.index(method), float(eta), float(np.deg2rad(scan_error))
-    normals_block(sample_bits(sample), position, light, camera, scan, *options, *out)
-    return out
+    normals_block(
+        sample_bits(sample),
+        position,
+        light,
+        camera,
+        scan,
+        METHODS.index(method),
+        float(eta),
+        float(np.deg2rad(scan_error)),
+        chosen,
+        disagreement,
+        error,
+        total,
+    )
+    return chosen, disagreement, error, total

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from skindb.calibration.pixel_flags import DARK, OK, SATURATED
+from skindb.calibration._merge_kernels import DARK, OK, SATURATED
 from skindb.jit import inline_kernel, kernel
 from skindb.types import (
     BoolVector,
@@ -40,13 +40,31 @@ MIN_DARK_FRACTION = 0.999
 FOOTPRINT_REACH = 8.0
 
 
+class MergedView(NamedTuple):
+    """The merged exposures of a view, from `develop`."""
+
+    radiance: Cube32  # (h, w, 3)
+    flag: ByteMatrix  # (h, w)
+    usable: ByteMatrix  # (h, w) number of usable exposures
+
+
+class PointLight(NamedTuple):
+    """A light as it reaches a point."""
+
+    position: Vector  # (3,) mm
+    axis: Vector  # (3,) unit direction in which it shines
+    falloff: float  # exponent of the cosine to the axis
+    intensity: Vector  # (3,) radiance mm^2
+
+
 @kernel
 def pixel_spans(
     surfels: BoolVector, pixels: Matrix32, spread: Matrix32, height: int, width: int
 ) -> IntMatrix:
     """Spans (h, 2) of the pixels that `gather` reads for surfels (n,) bool; see `develop`."""
     spans = np.empty((height, 2), np.int64)
-    spans[:, 0], spans[:, 1] = width, 0
+    spans[:, 0] = width
+    spans[:, 1] = 0
     for i in range(surfels.shape[0]):
         if surfels[i]:
             if spread.shape[0] and not np.isnan(spread[i, 0]):
@@ -58,10 +76,8 @@ def pixel_spans(
                     pixels[i, 0], pixels[i, 1], height, width
                 )
             for row in range(top, bottom + 1):
-                spans[row, 0], spans[row, 1] = (
-                    min(spans[row, 0], left),
-                    max(spans[row, 1], right + 1),
-                )
+                spans[row, 0] = min(spans[row, 0], left)
+                spans[row, 1] = max(spans[row, 1], right + 1)
     return spans
 
 
@@ -110,19 +126,14 @@ def _footprint_bounds(
 
 @kernel
 def gather(
-    radiance: Cube32,
-    flag: ByteMatrix,
-    usable: ByteMatrix,
+    view: MergedView,
     surfels: BoolVector,
     light_fraction: Vector32,
     pixels: Matrix32,
     spread: Matrix32,
     position: Matrix,
     normal: Matrix,
-    light: Vector,
-    axis: Vector,
-    falloff: float,
-    intensity: Vector,
+    light: PointLight,
     out: Halves,
     outcome: ByteVector,
 ) -> None:
@@ -131,8 +142,8 @@ def gather(
 
     Parameters
     ----------
-    radiance, flag, usable
-        (h, w, 3) float32 and twice (h, w) uint8, from `develop`.
+    view
+        Radiance, flags and usable exposures.
     surfels
         (n,) bool; those to sample. Those that face away from the light get no sample.
     light_fraction
@@ -146,9 +157,8 @@ def gather(
         3), for bilinear interpolation.
     position, normal
         (n, 3) float64 in mm, and unit vectors.
-    light, axis, falloff, intensity
-        Position (3,) mm, axis (3,), exponent of the cosine to the axis, and intensity
-        (3,) in radiance mm^2.
+    light
+        The light of the view.
     out
         (3, n) uint16 output: half floats, NaN where there is no sample.
     outcome
@@ -157,41 +167,44 @@ def gather(
         were dark).
     """
     pixel = np.empty(5)
-    factor = 1.0 / intensity
-    out[:], outcome[:] = NAN_BITS, NONE
+    factor = 1.0 / light.intensity
+    out[:] = NAN_BITS
+    outcome[:] = NONE
     for i in range(surfels.shape[0]):
         if not surfels[i] or (light_fraction.shape[0] and light_fraction[i] <= 0):
             continue
-        x = position[i, 0] - light[0]
-        y = position[i, 1] - light[1]
-        z = position[i, 2] - light[2]
-        # also rejects NaN
-        if not x * normal[i, 0] + y * normal[i, 1] + z * normal[i, 2] < 0:
+        scale = _square_over_falloff(light, position[i], normal[i])
+        if scale == 0.0:
             continue
-        scale = x * x + y * y + z * z
-        if falloff:
-            cosine = (x * axis[0] + y * axis[1] + z * axis[2]) / np.sqrt(scale)
-            if cosine <= 0:
-                continue
-            scale /= cosine**falloff
         if light_fraction.shape[0]:
             scale /= light_fraction[i]
         if spread.shape[0] and not np.isnan(spread[i, 0]):
-            state = _footprint(
-                radiance, flag, usable, pixels[i, 0], pixels[i, 1], spread[i], pixel
-            )
+            state = _footprint(view, pixels[i, 0], pixels[i, 1], spread[i], pixel)
         else:
-            state = _bilinear(radiance, flag, usable, pixels[i, 0], pixels[i, 1], pixel)
+            state = _bilinear(view, pixels[i, 0], pixels[i, 1], pixel)
         outcome[i] = SINGLE if state == OK and pixel[4] < 2.0 else state
         if state == OK:
-            r = pixel[0] * scale * factor[0]
-            g = pixel[1] * scale * factor[1]
-            b = pixel[2] * scale * factor[2]
-            out[0, i], out[1, i], out[2, i] = (
-                _half_or_nan(r),
-                _half_or_nan(g),
-                _half_or_nan(b),
-            )
+            for c in range(3):
+                out[c, i] = _half_or_nan(pixel[c] * scale * factor[c])
+
+
+@kernel
+def _square_over_falloff(light: PointLight, position: Vector, normal: Vector) -> float:
+    """Squared distance of a light over its fall-off; 0 where it does not reach the
+    front of a surfel.
+    """
+    x = position[0] - light.position[0]
+    y = position[1] - light.position[1]
+    z = position[2] - light.position[2]
+    # also rejects NaN
+    if not x * normal[0] + y * normal[1] + z * normal[2] < 0:
+        return 0.0
+    square = x * x + y * y + z * z
+    if not light.falloff:
+        return square
+    axis = light.axis
+    cosine = (x * axis[0] + y * axis[1] + z * axis[2]) / np.sqrt(square)
+    return square / cosine**light.falloff if cosine > 0 else 0.0
 
 
 @kernel
@@ -264,18 +277,11 @@ def tally(outcome: ByteVector, counts: IntMatrix32) -> int:
 
 
 @kernel
-def _bilinear(
-    radiance: Cube32,
-    flag: ByteMatrix,
-    usable: ByteMatrix,
-    column: float,
-    row: float,
-    pixel: Vector,
-) -> int:
+def _bilinear(view: MergedView, column: float, row: float, pixel: Vector) -> int:
     """Interpolate bilinearly between the four pixels around a position; the outer half
     pixel repeats the edge.
     """
-    height, width = flag.shape
+    height, width = view.flag.shape
     if not (column >= 0 and column <= width and row >= 0 and row <= height):
         return NONE
     x = min(max(column - 0.5, 0.0), width - 1.0)
@@ -289,29 +295,19 @@ def _bilinear(
                 y - top if down else 1.0 - (y - top)
             )
             # a neighbour of weight 0 may lie outside
-            if (
-                weight > 0
-                and _add(
-                    radiance, flag, usable, left + right, top + down, weight, pixel
-                )
-                == SATURATED
-            ):
-                return SATURATED
+            if weight > 0:
+                state = _add(view, left + right, top + down, weight, pixel)
+                if state == SATURATED:
+                    return SATURATED
     return DARK if pixel[3] > MIN_DARK_FRACTION else OK
 
 
 @kernel
 def _footprint(
-    radiance: Cube32,
-    flag: ByteMatrix,
-    usable: ByteMatrix,
-    column: float,
-    row: float,
-    spread: Vector32,
-    pixel: Vector,
+    view: MergedView, column: float, row: float, spread: Vector32, pixel: Vector
 ) -> int:
     """Weighted mean over an ellipse of pixels (Heckbert 1989, the elliptical weighted average)."""
-    left, right, top, bottom = _footprint_bounds(column, row, spread, *flag.shape)
+    left, right, top, bottom = _footprint_bounds(column, row, spread, *view.flag.shape)
     xx = float(spread[0])
     xy = float(spread[1])
     yy = float(spread[2])
@@ -326,7 +322,7 @@ def _footprint(
             if rest > 0:
                 weight = rest * rest
                 total += weight
-                if _add(radiance, flag, usable, u, v, weight, pixel) == SATURATED:
+                if _add(view, u, v, weight, pixel) == SATURATED:
                     return SATURATED
     if total == 0:
         return NONE
@@ -336,22 +332,14 @@ def _footprint(
 
 
 @inline_kernel
-def _add(
-    radiance: Cube32,
-    flag: ByteMatrix,
-    usable: ByteMatrix,
-    u: int,
-    v: int,
-    weight: float,
-    pixel: Vector,
-) -> int:
+def _add(view: MergedView, u: int, v: int, weight: float, pixel: Vector) -> int:
     """Add one pixel to a sample, and return the flag of the pixel."""
-    state = flag[v, u]
-    pixel[0] += weight * radiance[v, u, 0]
-    pixel[1] += weight * radiance[v, u, 1]
-    pixel[2] += weight * radiance[v, u, 2]
+    state = view.flag[v, u]
+    pixel[0] += weight * view.radiance[v, u, 0]
+    pixel[1] += weight * view.radiance[v, u, 1]
+    pixel[2] += weight * view.radiance[v, u, 2]
     pixel[3] += weight if state == DARK else 0.0
-    pixel[4] = max(pixel[4], float(usable[v, u]))
+    pixel[4] = max(pixel[4], float(view.usable[v, u]))
     return int(state)
 
 

@@ -12,15 +12,22 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from skindb.calibration._merge_kernels import OK, SATURATED
 from skindb.calibration.frame_checks import checked_view, highest_value
 from skindb.calibration.irradiance import light_falloff
-from skindb.calibration.pixel_flags import OK, SATURATED
 from skindb.calibration.radiance import FrameMerger, Image, radiance_floor
 from skindb.errors import Fault, InputError, attempt
 from skindb.format.dome import CameraRecord, DomeRecord, LightRecord
 from skindb.format.frames import Digests, Frame
 from skindb.geometry._mesh_kernels import grown
-from skindb.ingest._sample_kernels import SINGLE, gather, pixel_counts, pixel_spans
+from skindb.ingest._sample_kernels import (
+    SINGLE,
+    MergedView,
+    PointLight,
+    gather,
+    pixel_counts,
+    pixel_spans,
+)
 from skindb.ingest.consistency import Calibration, CalibrationCheck, Pair
 from skindb.ingest.consistency_checks import calibration_faults
 from skindb.ingest.sample_quality import (
@@ -34,8 +41,6 @@ from skindb.ingest.spool import Spool
 from skindb.ingest.surfels import SurfelSet
 from skindb.types import Float64, Index, Mask, Progress, silent
 
-# radiance (h, w, 3), flags (h, w) and usable exposures (h, w)
-Picture = tuple[Image, NDArray[np.uint8], NDArray[np.uint8]]
 T = TypeVar("T")
 R = TypeVar("R")
 # views that are requested ahead of the one that is waited for: keeps eight threads busy
@@ -268,17 +273,17 @@ class _Sampler:
         frames = checked_view(self.dome, light.id, merger, digests=digests)
         surfels = shot.surfels & self.views.lit[:, j]
         is_kept = (j, c) in self.kept
-        picture = _developed(
+        merged = _merged(
             merger, frames, shot, surfels, whole=is_kept or check is not None
         )
-        radiance, flag, _ = picture
+        radiance, flag, _ = merged
         if is_kept:
             self.spool.keep(f"photograph-{j}-{c}", _without_saturated(radiance, flag))
         if check is not None:
             reduced = check.reduce(c, _without_saturated(radiance, flag))
             self.spool.keep(f"calibration-{j}-{c}", reduced)
         samples, outcome = _sampled(
-            picture, shot, surfels, light, self.intensity[j], self.views, j
+            merged, shot, surfels, light, self.intensity[j], self.views, j
         )
         usable = samples[:, (outcome == OK) | (outcome == SINGLE)].view(np.float16)
         place = f"{self.dome.file}[frames], camera {merger.camera.id}, light {light.id}"
@@ -384,25 +389,26 @@ def _effective_pixels(
     return np.ascontiguousarray(out.T)
 
 
-def _developed(
+def _merged(
     merger: FrameMerger,
     frames: list[Frame],
     shot: CameraSampling,
     surfels: Mask,
     *,
     whole: bool,
-) -> Picture:
+) -> MergedView:
     """Radiance, flags and usable exposures of a view, or of the pixels that surfels need."""
-    shape = frames[0].shape[:2]
+    height, width, _ = frames[0].shape
     spans = None
     if not whole:
-        spans = pixel_spans(surfels, shot.pixels, shot.spread, *shape)
-    usable = np.zeros(shape, np.uint8)
-    return *merger.merge(frames, spans, usable=usable), usable
+        spans = pixel_spans(surfels, shot.pixels, shot.spread, height, width)
+    usable = np.zeros((height, width), np.uint8)
+    radiance, flag = merger.merge(frames, spans, usable=usable)
+    return MergedView(radiance, flag, usable)
 
 
 def _sampled(
-    picture: Picture,
+    merged: MergedView,
     shot: CameraSampling,
     surfels: Mask,
     light: LightRecord,
@@ -418,17 +424,14 @@ def _sampled(
     if views.light_fraction is not None:
         light_fraction = views.light_fraction[:, j].astype(np.float32)
     gather(
-        *picture,
+        merged,
         surfels,
         light_fraction,
         shot.pixels,
         shot.spread,
         views.surfels.position,
         views.surfels.normal,
-        light.position,
-        light.axis,
-        float(light.falloff),
-        intensity,
+        PointLight(light.position, light.axis, float(light.falloff), intensity),
         out,
         outcome,
     )

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from skindb.calibration.pixel_flags import DARK, DARK_SIGMA, OK, SATURATED
+from skindb.calibration._merge_kernels import DARK, DARK_SIGMA, OK, SATURATED
 from skindb.calibration.radiance import (
     FrameMerger,
     frame_merger,

@@ -13,8 +13,8 @@ import pytest
 from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
+from skindb.calibration._merge_kernels import SATURATED
 from skindb.calibration.irradiance import light_intensities
-from skindb.calibration.pixel_flags import SATURATED
 from skindb.calibration.radiance import frame_mergers, read_view
 from skindb.errors import InputError
 from skindb.format.folder import read_capture

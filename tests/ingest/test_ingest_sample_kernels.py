@@ -4,11 +4,13 @@ import numpy as np
 import pytest
 from scipy.special import jv
 
-from skindb.calibration.pixel_flags import DARK, OK, SATURATED
+from skindb.calibration._merge_kernels import DARK, OK, SATURATED
 from skindb.geometry.atlas import bilinear
 from skindb.ingest._sample_kernels import (
     NONE,
     SINGLE,
+    MergedView,
+    PointLight,
     gather,
     pixel_counts,
     pixel_spans,
@@ -38,9 +40,11 @@ def sampled(
     out = np.zeros((3, n), np.uint16)
     outcome = np.zeros(n, np.uint8)
     gather(
-        np.asarray(radiance, np.float32),
-        flag,
-        np.full_like(flag, 2) if usable is None else usable,
+        MergedView(
+            np.asarray(radiance, np.float32),
+            flag,
+            np.full_like(flag, 2) if usable is None else usable,
+        ),
         np.ones(n, bool) if wanted is None else wanted,
         np.zeros(0, np.float32) if share is None else share,
         np.asarray(pixels, np.float32),
@@ -49,10 +53,7 @@ def sampled(
         else np.asarray(spread, np.float32),
         position,
         np.tile([0.0, 0, 1], (n, 1)),
-        LIGHT,
-        AXIS,
-        falloff,
-        np.array(INTENSITY),
+        PointLight(LIGHT, AXIS, falloff, np.array(INTENSITY)),
         out,
         outcome,
     )

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from skindb.calibration.pixel_flags import DARK, OK, SATURATED
+from skindb.calibration._merge_kernels import DARK, OK, SATURATED
 from skindb.errors import InputError
 from skindb.ingest import IngestParameters, ingest_capture, lumitexels, read_capture
 from skindb.ingest._sample_kernels import NONE
