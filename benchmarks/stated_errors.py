@@ -19,7 +19,7 @@ import xarray as xr
 
 from skindb.bench.photometry import ETA, SCAN_ERROR, Array, ModelSamples, model_samples
 from skindb.fit import estimate_diffuse_reflectance, estimate_normals, refit
-from skindb.reflectance.dictionary import surface_lobes
+from skindb.reflectance.separation import surface_lobes
 from skindb.reflectance.tables import directional_albedo, stored_brdf
 from skindb.schema import dataset, label
 

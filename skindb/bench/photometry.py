@@ -28,8 +28,8 @@ from skindb.fit import albedo, estimate_diffuse_reflectance, estimate_normals, n
 from skindb.fit.albedo import block_reflectance
 from skindb.fit.normals import _normals as fit_normals
 from skindb.optics.fresnel import fresnel_transmittance
-from skindb.reflectance.dictionary import surface_lobes
 from skindb.reflectance.rows import basis_rows
+from skindb.reflectance.separation import surface_lobes
 from skindb.schema import dataset, label, variables
 from skindb.schema.status import LARGEST_R_D, SMALLEST_R_D
 from skindb.types import Array

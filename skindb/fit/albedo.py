@@ -6,29 +6,27 @@ import numpy as np
 import xarray as xr
 
 from skindb.elementwise import elementwise
-from skindb.fit._albedo_kernels import (
-    MIN_COSINE_ALBEDO,
-    MIN_SAMPLES_ALBEDO,
-    separate_block,
-)
 from skindb.fit.lumitexels import (
     GEOMETRY,
     Arrays,
+    block_of,
     by_name,
     cosines,
     directions,
     noise_inputs,
-    noise_of,
 )
-from skindb.jit import sample_bits
 from skindb.optics.diffusion import dipole_s
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.parameters import EVEN_REFLECTION
-from skindb.reflectance.dictionary import lobe_table
+from skindb.reflectance._separation_kernels import (
+    MIN_COSINE_ALBEDO,
+    MIN_SAMPLES_ALBEDO,
+)
 from skindb.reflectance.model import typical_noise
+from skindb.reflectance.separation import separate_diffuse
 from skindb.schema import check, label
 from skindb.schema.status import LARGEST_R_D, SMALLEST_R_D
-from skindb.types import Array
+from skindb.types import Array, Float64
 
 METHODS = ("separated", "quantile", "minimum")
 # rad; largest error of a normal: no sample above the grazing limit falls below the
@@ -39,7 +37,6 @@ LARGEST_TURN = 0.25
 MODEL_ERROR_ALBEDO = 0.01
 NORMAL_95 = 1.96
 NORMAL_ERRORS = ("normal_error", "normal_total_error")
-PLACES = ("surfel_position", "light_position", "camera_position", "shading_normal")
 # surfels processed at once by the other rules: 15 MB of samples of a full dome
 BATCH = 512
 # quantiles of the method "quantile", and their normal deviates
@@ -70,11 +67,8 @@ def estimate_diffuse_reflectance(
     method
         "minimum": the paper's eq. 6, biased down by noise and up by whatever the
         surface reflects into every direction. "quantile": tenth percentile of the same
-        ratios with half its noise bias taken out. "separated": light from the surface
-        is white, so differences between channels give the differences of R_d by a
-        robust slope; what is common to the channels is split by non-negative least
-        squares between the diffuse shape cos(theta_i) F_t F_t and six microfacet lobes
-        without diffuse part.
+        ratios with half its noise bias taken out. "separated": by the colours and by
+        non-negative least squares, see `skindb.reflectance.separation`.
     discard
         Number of smallest ratios that "minimum" ignores.
     even_reflection
@@ -195,25 +189,8 @@ def _separated(arrays: Arrays, *, eta: float) -> tuple[Array, Array, Array]:
     turns = [_turn(arrays.get(name), n) for name in NORMAL_ERRORS]
     if "normal_total_error" not in arrays:
         turns[1] = turns[0]
-    estimate, error, shared = (np.empty((n, 3)) for _ in range(3))
-    position, light, camera, normal = (
-        np.ascontiguousarray(arrays[name], np.float64) for name in PLACES
-    )
-    separate_block(
-        sample_bits(arrays["reflectance_sample"]),
-        position,
-        light,
-        camera,
-        normal,
-        np.stack(turns, axis=1),
-        lobe_table(),
-        noise_of(arrays, typical_noise()),
-        float(eta),
-        estimate,
-        error,
-        shared,
-    )
-    return estimate, error, shared
+    block = block_of(arrays, typical_noise())
+    return separate_diffuse(block, np.stack(turns, axis=1), eta=eta)
 
 
 def _by_rule(
@@ -241,7 +218,7 @@ def _by_rule(
     return estimate, error, np.full_like(error, np.nan)
 
 
-def _turn(normal_error: Array | None, surfels: int) -> Array:
+def _turn(normal_error: Array | None, surfels: int) -> Float64:
     """Standard error (surfels,) of the normal about each of two axes [rad]; 0 where it
     is not known.
     """

@@ -110,14 +110,17 @@ def by_name(
 
 
 def block_of(arrays: Arrays, typical: Noise) -> Block:
-    """The block of surfels in these variables, and in those of `noise_inputs`."""
+    """The block of surfels in these variables, and in those of `noise_inputs`; R_d is NaN
+    where it is not among them.
+    """
+    normal = arrays["shading_normal"]
     return Block(
         sample=arrays["reflectance_sample"],
         position=arrays["surfel_position"],
         light=arrays["light_position"],
         camera=arrays["camera_position"],
-        normal=arrays["shading_normal"],
-        diffuse=arrays["diffuse_reflectance"],
+        normal=normal,
+        diffuse=arrays.get("diffuse_reflectance", np.full_like(normal, np.nan)),
         noise=noise_of(arrays, typical),
     )
 

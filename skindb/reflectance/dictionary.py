@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from skindb.cache import cached_arrays
 from skindb.errors import Fault, InputError
@@ -47,18 +46,6 @@ SOURCES = (
     "skindb.optics.angles",
     "skindb.optics.fresnel",
     "skindb.jit",
-)
-# The six most different embedded materials, from narrow to nearly diffuse. The width of
-# the broadest one trades two errors: broad lobes take light from R_d, and without them
-# R_d includes the even reflection of the surface. These balance the two on captures
-# with and without such reflection (notes of `estimate_diffuse_reflectance`).
-LOBES = (
-    "black-fabric",
-    "green-plastic",
-    "beige-fabric",
-    "white-paint",
-    "pearl-paint",
-    "fruitwood-241",
 )
 INCIDENCE = np.radians(np.arange(0, 86, 5))
 # rings, spokes; twice as many points change the worst average of the 59 materials by
@@ -454,29 +441,3 @@ def dictionary_report(
     attrs = {"source": dictionary.source, "notes": list(dictionary.notes)}
     figures = dictionary_quality(dictionary, radius) | {"disc_angular_radius": radius}
     return dataset(figures, coords={"dictionary": list(dictionary.names)}, attrs=attrs)
-
-
-@cache
-def surface_lobes() -> tuple[NDArray[np.float32], TableGrid]:
-    """Tables (nh, nd, np, 6) of `LOBES` without their diffuse part, and their grid."""
-    rows = np.array([PARAMETERS[name] for name in LOBES], np.float64)
-    rows[:, :3] = 0
-    return tabulate(
-        lambda wi, wo: evaluate_abc(rows, wi, wo), DEFAULT_GRID
-    ), DEFAULT_GRID
-
-
-@cache
-def lobe_table() -> NDArray[np.float32]:
-    """Tables (nh, nd, np, 16) for the kernel: six lobes, two zeros, their derivatives
-    by theta_h [rad], two zeros.
-    """
-    table, grid = surface_lobes()
-    steep = np.gradient(table.astype(np.float64), grid.theta_h, axis=0)
-    gap = np.zeros((*table.shape[:3], 2))
-    joined = np.ascontiguousarray(
-        np.concatenate([table, gap, steep, gap], axis=-1), np.float32
-    )
-    # as for all tables, so that kernels are compiled once
-    joined.flags.writeable = False
-    return joined

@@ -15,8 +15,8 @@ from skindb.fit import (
 from skindb.fit.albedo import low_quantile, stable_minimum
 from skindb.optics.diffusion import diffuse_reflectance
 from skindb.optics.fresnel import fresnel_transmittance
-from skindb.reflectance.dictionary import surface_lobes
 from skindb.reflectance.rows import basis_rows
+from skindb.reflectance.separation import surface_lobes
 from skindb.schema import dataset, label
 
 

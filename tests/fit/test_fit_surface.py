@@ -15,13 +15,14 @@ from skindb.fit.surface import NEEDED, NOISE_FLOOR_SURFACE
 from skindb.optics.angles import half_difference
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.reflectance._lumitexel_kernels import MIN_COSINE_SURFACE
-from skindb.reflectance.dictionary import Dictionary, surface_lobes
+from skindb.reflectance.dictionary import Dictionary
 from skindb.reflectance.mixture import Mixture
 from skindb.reflectance.reduction import (
     MIN_COSINE_SAMPLES,
     reduce_dictionary,
     truncation_bound,
 )
+from skindb.reflectance.separation import surface_lobes
 from skindb.reflectance.tables import (
     brdf_metric,
     directional_albedo,

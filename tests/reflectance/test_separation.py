@@ -9,7 +9,9 @@ import pytest
 from scipy.optimize import nnls
 
 from skindb.fit import estimate_diffuse_reflectance
-from skindb.fit._albedo_kernels import (
+from skindb.optics.angles import half_difference
+from skindb.optics.fresnel import fresnel_transmittance
+from skindb.reflectance._separation_kernels import (
     COLUMNS,
     LOBES,
     MIN_COSINE_ALBEDO,
@@ -19,9 +21,7 @@ from skindb.fit._albedo_kernels import (
     robust_slope,
     separation_memory,
 )
-from skindb.optics.angles import half_difference
-from skindb.optics.fresnel import fresnel_transmittance
-from skindb.reflectance.dictionary import surface_lobes
+from skindb.reflectance.separation import surface_lobes
 from skindb.reflectance.tables import lookup
 from skindb.schema import label
 

@@ -1,5 +1,5 @@
 """Compiled separation of diffuse from surface reflection, surfel by surfel; the method
-is in `skindb.fit.albedo`.
+is in `skindb.reflectance.separation`.
 
 Sums over samples run in single precision and in vector registers; systems of equations are double.
 """
