@@ -385,3 +385,78 @@ def test_frame_merger__counts_exposures_that_are_neither_dark_nor_saturated():
     FrameMerger(camera, BRACKETS).merge(frames, usable=usable)
     assert usable.tolist() == [[0, 4, 3, 2, 1, 0]]
     np.testing.assert_array_equal(usable, usable_exposures(frames, quiet))
+
+
+# extreme inputs
+
+LEVEL = 6528 / (65535 - 256) / 0.04  # radiance of a value of 256 + 6528 after 0.04 s
+
+
+def _uniform_frames(count=2):
+    """Frames of the same radiance, exposed for `SECONDS`."""
+    values = [256 + round(6528 * s / SECONDS[0]) for s in SECONDS[:count]]
+    return [np.full((3, 4, 3), value, np.uint16) for value in values]
+
+
+def test_merge_exposures__black_is_zero_within_its_error():
+    for value in (256, 250):
+        frames = [np.full((3, 4, 3), value, np.uint16)] * 2
+        radiance, error, flag = merge_exposures(frames, SECONDS, SENSOR)
+        assert (flag == DARK).all()
+        assert np.isfinite(error).all()
+        assert (np.abs(radiance) <= 3 * error).all()
+
+
+def test_merge_exposures__a_sensor_without_noise():
+    for count, changes in (
+        (1, {"read_noise": 0.0, "step": 0.0}),
+        (2, {"read_noise": 0.0, "electrons_per_dn": np.inf}),
+    ):
+        sensor = replace(SENSOR, **changes)
+        radiance, error, flag = merge_exposures(
+            _uniform_frames(count), SECONDS[:count], sensor
+        )
+        np.testing.assert_allclose(radiance, LEVEL, rtol=1e-3)
+        assert np.isfinite(error).all()
+        assert (flag == OK).all()
+
+
+def test_merge_exposures__scales_with_the_exposure_times():
+    frames = _uniform_frames()
+    expected, expected_error, _ = merge_exposures(frames, SECONDS, SENSOR)
+    for scale in (1e-30, 1e-12, 1e12, 1e30):
+        times = tuple(s * scale for s in SECONDS)
+        radiance, error, flag = merge_exposures(frames, times, SENSOR)
+        assert (flag == OK).all()
+        scaled = radiance.astype(np.float64) * scale
+        np.testing.assert_allclose(scaled, expected, rtol=1e-5)
+        scaled_error = error.astype(np.float64) * scale
+        np.testing.assert_allclose(scaled_error, expected_error, rtol=1e-5)
+
+
+def test_merge_exposures__any_number_of_pixels():
+    for rows, columns in ((0, 4), (1, 1), (3, 7)):
+        frame = np.full((rows, columns, 3), 256 + 6528, np.uint16)
+        radiance, error, flag = merge_exposures([frame], SECONDS[:1], SENSOR)
+        assert radiance.shape == error.shape == (rows, columns, 3)
+        assert flag.shape == (rows, columns)
+        np.testing.assert_allclose(radiance, LEVEL, rtol=1e-6)
+
+
+def test_merge_exposures__the_same_exposure_twice_has_a_smaller_error():
+    frames = _uniform_frames(1)
+    radiance, error, _ = merge_exposures(frames, SECONDS[:1], SENSOR)
+    twice, error_of_twice, _ = merge_exposures(frames * 2, SECONDS[:1] * 2, SENSOR)
+    np.testing.assert_allclose(twice, radiance, rtol=1e-6)
+    np.testing.assert_allclose(error_of_twice, error / np.sqrt(2), rtol=1e-6)
+
+
+def test_merge_exposures__a_linear_pixel_that_is_not_finite_is_flagged():
+    sensor = SensorRecord(FrameKind(2, 2, 0), 0.0, 1.0, 0.0, np.inf)
+    for value in (np.nan, np.inf):
+        frame = np.full((2, 2, 3), 0.25, np.float32)
+        frame[0, 1, 2] = value
+        radiance, _, flag = merge_exposures([frame], (1.0,), sensor)
+        assert flag.tolist() == [[OK, SATURATED], [OK, OK]]
+        assert np.isnan(radiance[0, 1]).all()
+        np.testing.assert_array_equal(radiance[1], 0.25)

@@ -201,3 +201,82 @@ def test_principal_axes__of_equal_vectors_has_no_component():
     assert found.score.shape == (4, 0)
     assert found.total == 0
     assert (found.residual == 0).all()
+
+
+# extreme inputs
+
+SCALES = (1e-30, 1e-12, 1e12, 1e30)
+
+
+def _factors(X, k, metric=None):
+    factors = nmf(X, k, metric=metric, seeds=1, rng=np.random.default_rng(0))
+    assert np.isfinite(factors.H).all()
+    assert (factors.H >= 0).all()
+    np.testing.assert_allclose(factors.H.sum(axis=1), 1.0, rtol=1e-9)
+    return factors
+
+
+@pytest.mark.parametrize("metric", [None, np.eye(12)], ids=["weights", "metric"])
+def test_nmf__rank_one_and_fewer_than_k(metric):
+    X, _ = _planted(4, n=200)
+    of_rank_two, _ = _planted(4, n=200, k=2)
+    assert _factors(of_rank_two, 4, metric).error < 0.02
+    np.testing.assert_allclose(
+        _factors(X[:1], 1, metric).H, X[:1] / X[:1].sum(), atol=1e-6
+    )
+    constant = _factors(np.full((30, 12), 0.7), 1, metric)
+    np.testing.assert_allclose(constant.H, 1 / 12, rtol=1e-5)
+    assert constant.error < 1e-5
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_nmf__any_scale(scale):
+    X, _ = _planted(4, n=200)
+    plain = _factors(X, 3)
+    scaled = _factors(X * scale, 3)
+    # starts are in single precision
+    np.testing.assert_allclose(scaled.H, plain.H, atol=1e-3)
+    np.testing.assert_allclose(scaled.error, plain.error, rtol=0.05, atol=1e-4)
+    A = np.eye(12) + 0.5
+    in_metric = _factors(X, 3, A).H
+    np.testing.assert_allclose(_factors(X * scale, 3, A).H, in_metric, atol=1e-3)
+    np.testing.assert_allclose(_factors(X, 3, A * scale).H, in_metric, atol=1e-3)
+
+
+@pytest.mark.parametrize("metric", [None, np.eye(14)], ids=["weights", "metric"])
+def test_nmf__unused_rows_and_columns(metric):
+    X = np.zeros((210, 14))
+    X[:200, :12], _ = _planted(4, n=200)
+    factors = _factors(X, 3, metric)
+    assert factors.H[:, 12:].max() < 1e-9
+    assert factors.error < 0.02
+
+
+def test_nmf__a_brdf_of_zero_makes_the_metric_singular():
+    X, _ = _planted(4, n=200)
+    assert _factors(X, 3, np.diag([1.0] * 11 + [0.0])).error < 0.02
+
+
+def test_nmf__weights_that_are_not_finite_are_refused():
+    for value in (np.nan, np.inf):
+        X, _ = _planted(4, n=200)
+        X[3, 3] = value
+        with pytest.raises(ValueError, match="finite and non-negative"):
+            nmf(X, 2, rng=np.random.default_rng(0))
+
+
+def test_nmf__duplicates_divide_the_components():
+    X, _ = _planted(4, n=200)
+    twice = _factors(np.concatenate([X, X]), 3)
+    np.testing.assert_allclose(twice.error, _factors(X, 3).error, atol=5e-3)
+    both = _factors(np.concatenate([X, X], axis=1) / 2, 3).H
+    np.testing.assert_allclose(both[:, :12], both[:, 12:], atol=5e-3)
+
+
+def test_principal_axes__rebuild_vectors_of_any_scale():
+    for scale in SCALES:
+        x = scale * np.random.default_rng(0).standard_normal((6, 500))
+        axes = principal_axes(x, 5)
+        rebuilt = axes.mean + axes.score @ axes.axes
+        np.testing.assert_allclose(rebuilt, x, atol=1e-10 * scale)
+        np.testing.assert_allclose(axes.axes @ axes.axes.T, np.eye(5), atol=1e-10)

@@ -449,3 +449,22 @@ def test_classical_scaling__is_the_principal_component_analysis():
     assert flat[2] < 1e-12
     one = classical_scaling(np.array([[0.0, 2.0], [2.0, 0.0]]))
     np.testing.assert_allclose(np.abs(one[0]), [[1, 0], [1, 0]], atol=1e-12)
+
+
+def test_effects__scale_with_the_values_and_statistics_do_not():
+    values = np.random.default_rng(0).standard_normal((20, 4))
+    group = np.arange(20) % 2.0
+    plain = effects(values, group)
+    for scale in (1e-30, 1e-12, 1e12, 1e30):
+        scaled = effects(scale * values, group)
+        np.testing.assert_allclose(scaled.slope, scale * plain.slope, rtol=1e-9)
+        np.testing.assert_allclose(scaled.statistic, plain.statistic, rtol=1e-9)
+
+
+def test_permutation_p__of_groups_a_million_apart_is_at_least_one_draw():
+    group = np.arange(12) % 2.0
+    values = group[:, None] * 1e6 + np.random.default_rng(0).standard_normal((12, 1))
+    p, _, count = permutation_p(
+        values, group, max_draws=999, rng=np.random.default_rng(0)
+    )
+    assert 1 / (count + 1) <= p[0] < 0.02

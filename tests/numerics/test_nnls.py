@@ -38,7 +38,7 @@ def _problem(seed: int, n: int = 60, m: int = 9):
     ) + 0.02 * rng.normal(size=(n, 3))
 
 
-def _fit(rows, target, *, mode="linear", floor=1e-2, weight=None, lift=None):
+def _fit(rows, target, *, mode="linear", floor=1e-2, weight=None, lift=None, **options):
     lift = np.eye(rows.shape[1]) if lift is None else lift
     return fit_reflectance(
         rows,
@@ -48,6 +48,7 @@ def _fit(rows, target, *, mode="linear", floor=1e-2, weight=None, lift=None):
         lift,
         mode=mode,
         noise_floor=floor,
+        **options,
     )
 
 
@@ -316,3 +317,83 @@ def test_solve_nnls__a_shared_system_compiles_nothing_more():
     compiled = _nnls_kernels.solve_many.signatures
     # gram, rhs, x
     assert {kind.layout for one in compiled for kind in one[:3]} == {"C"}
+
+
+# extreme inputs
+
+
+def _check_against_scipy(rows, target):
+    """The fit is certified, and its residual is not above SciPy's on the same rows."""
+    fit = _fit(rows, target, floor=1e-3, min_samples=1)
+    M = np.repeat(rows.astype(np.float64), 3, axis=0)
+    residual = np.linalg.norm(M @ fit.weight[0] - target.ravel())
+    assert fit.status[0] == 0
+    assert fit.kkt[0] < 1e-9  # the tolerance of the solver is 1e-10
+    assert residual <= nnls(M, target.ravel())[1] * (
+        1 + ROUNDING
+    ) + 1e-14 * np.linalg.norm(target)
+
+
+def test_fit_reflectance__few_and_many_samples():
+    for n, m in ((1, 6), (3, 6), (12, 59), (2400, 6)):
+        _check_against_scipy(*_problem(0, n, m))
+
+
+@pytest.mark.parametrize("kind", ["zero", "duplicate", "collinear"])
+def test_fit_reflectance__redundant_bases(kind):
+    rows, target = _problem(0)
+    extra = {
+        "zero": 0 * rows[:, :1],
+        "duplicate": rows[:, :1],
+        "collinear": rows[:, :1] + rows[:, 1:2],
+    }[kind]
+    _check_against_scipy(np.concatenate([rows, extra, extra], axis=1), target)
+    extended = _fit(np.concatenate([extra, rows], axis=1), target)
+    if kind != "collinear":  # a sum of two bases is a new mixture
+        np.testing.assert_allclose(
+            extended.residual, _fit(rows, target).residual, rtol=1e-6
+        )
+    if kind == "zero":
+        assert extended.weight[0, 0] == 0
+
+
+@pytest.mark.parametrize("mode", ["linear", "perceptual"])
+def test_fit_reflectance__a_broken_sample_leaves_the_neighbour_alone(mode):
+    rows, target = _problem(0, 40)
+    expected = _fit(rows, target, mode=mode).weight[0]
+    for value in (np.nan, np.inf, -np.inf):
+        targets = np.concatenate([target, target])
+        targets[3, 1] = value
+        fit = fit_reflectance(
+            np.concatenate([rows, rows]),
+            np.array([0, 40, 80]),
+            targets,
+            None,
+            np.eye(9),
+            mode=mode,
+            noise_floor=1e-2,
+        )
+        assert fit.status.tolist() == [6, 0]
+        assert np.isnan(fit.weight[0]).all()
+        np.testing.assert_allclose(fit.weight[1], expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("mode", ["linear", "perceptual"])
+def test_fit_reflectance__black_and_negative_samples_have_no_weight(mode):
+    rows, _ = _problem(0, 40)
+    for level in (0.0, -1.0):
+        fit = _fit(rows, np.full((40, 3), level), mode=mode)
+        assert fit.status[0] == 0
+        assert (fit.weight == 0).all()
+
+
+def test_fit_reflectance__samples_in_single_precision():
+    rows, target = _problem(0)
+    single = _fit(rows, target.astype(np.float32)).weight
+    np.testing.assert_allclose(single, _fit(rows, target).weight, rtol=1e-5, atol=1e-6)
+
+
+def test_solve_nnls__no_systems():
+    x, kkt, count, met = solve_nnls(np.zeros((0, 4, 4)), np.zeros((0, 4)))
+    assert x.shape == (0, 4)
+    assert kkt.shape == count.shape == met.shape == (0,)

@@ -325,3 +325,55 @@ def test_with_parts__puts_images_back():
         np.array_equal(a, b)
         for a, b in zip(again.parts(), pyramid.parts(), strict=True)
     )
+
+
+# extreme inputs
+
+SCALES = (1e-30, 1e-12, 1e12, 1e30)
+
+
+def test_build__round_trip_of_any_scale():
+    for scale in SCALES:
+        image = scale * noise((64, 64))
+        np.testing.assert_allclose(
+            reconstruct(build(image, levels=4)), image, atol=1e-12 * scale
+        )
+
+
+def test_valid_quantiles__decreasing_ones_keep_their_mean_at_any_scale():
+    for scale in SCALES:
+        quantiles = scale * noise((3, QUANTILES))
+        valid = valid_quantiles(quantiles)
+        assert (np.diff(valid) >= 0).all()
+        np.testing.assert_allclose(
+            valid.mean(axis=1), quantiles.mean(axis=1), atol=1e-12 * scale
+        )
+
+
+@pytest.mark.parametrize("scale", [1e-12, 1e12])
+def test_synthesise__distributions_converge_at_any_scale(scale):
+    image = noise((64, 64))
+    shift = quantiles_of(gaussian_filter(image.T, 2)) - quantiles_of(image)
+    synthesis = synthesise(
+        scale * image,
+        [np.ones((64, 64))],
+        scale * shift[None],
+        iterations=2,
+        rng=np.random.default_rng(0),
+        **SMALL,
+    )
+    assert np.isfinite(synthesis.image).all()
+    assert synthesis.trace[-1] < synthesis.trace[0]
+
+
+def test_synthesise__noise_makes_a_texture_where_there_is_none():
+    synthesis = synthesise(
+        np.zeros((64, 64)),
+        [np.ones((64, 64))],
+        np.sort(noise((1, 15, QUANTILES))),
+        iterations=3,
+        rng=np.random.default_rng(0),
+        **SMALL,
+    )
+    assert np.isfinite(synthesis.image).all()
+    assert synthesis.image.std() > 0.1

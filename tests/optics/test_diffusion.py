@@ -8,6 +8,7 @@ import pytest
 from scipy.integrate import quad
 
 from skindb.optics.diffusion import (
+    S_MAX,
     diffuse_reflectance,
     dipole_profile,
     dipole_s,
@@ -55,24 +56,22 @@ def test_scattering_coefficients__give_back_sigma_tr_and_albedo():
     assert np.isfinite(scattering_coefficients(0.0, 1.0)).all()
 
 
-@pytest.mark.parametrize("sigma_a", [1e-3, 0.05, 1.0])
-def test_dipole_profile__plane_integral_is_equation_5(sigma_a):
-    total, _ = quad(
-        lambda r: 2 * np.pi * r * dipole_profile(r, sigma_a, 1.2, eta=1.3),
-        0,
-        1,
-        epsrel=1e-12,
+@pytest.mark.parametrize(
+    ("eta", "albedo"), [(1.0, 0.5), (1.3, 0.01), (1.3, 0.5), (1.3, 0.96), (1.3, 0.999)]
+)
+def test_dipole_profile__plane_integral_is_equation_5(eta, albedo):
+    sigma_a = 1 - albedo
+    far = max(60 / float(sigma_tr(sigma_a, albedo)), 31)
+
+    def ring(r):
+        return 2 * np.pi * r * float(dipole_profile(r, sigma_a, albedo, eta=eta))
+
+    total = sum(
+        quad(ring, low, high, epsrel=1e-10, limit=400)[0]
+        for low, high in ((0, 1), (1, 30), (30, far))
     )
-    tail, _ = quad(
-        lambda r: 2 * np.pi * r * dipole_profile(r, sigma_a, 1.2, eta=1.3),
-        1,
-        np.inf,
-        epsrel=1e-11,
-    )
-    s = np.sqrt(3 * sigma_a / (sigma_a + 1.2))
-    assert total + tail == pytest.approx(
-        float(diffuse_reflectance(s, eta=1.3)), rel=1e-9
-    )
+    expected = float(diffuse_reflectance(np.sqrt(3 * sigma_a), eta=eta))
+    assert total == pytest.approx(expected, rel=1e-6)
 
 
 def test_fresnel__known_values():
@@ -103,3 +102,45 @@ def test_internal_diffuse_reflectance__against_quadrature_and_polynomial(eta):
     assert internal_diffuse_reflectance_polynomial(1.3) == pytest.approx(
         0.4448, abs=5e-5
     )
+
+
+# extreme inputs
+
+
+def test_dipole_s__black_white_and_beyond_are_clamped_and_flagged():
+    outside = [-np.inf, -1.0, 0.0, 1e-30]
+    s, clamped = dipole_s([*outside, 0.5, 1.0, 2.0, 1e30, np.inf, np.nan], eta=1.3)
+    assert clamped.tolist() == [True] * 4 + [False] + [True] * 4 + [False]
+    assert np.isnan(s[-1])
+    assert ((s[:-1] > 0) & (s[:-1] < S_MAX)).all()
+    assert (np.diff(s[:-1]) <= 0).all()
+
+
+def test_dipole_s__any_precision_and_no_values():
+    value = np.linspace(0.01, 0.99, 25).astype(np.float32)
+    np.testing.assert_array_equal(
+        dipole_s(value, eta=1.3)[0], dipole_s(value.astype(np.float64), eta=1.3)[0]
+    )
+    assert dipole_s(np.zeros((0, 3)), eta=1.3)[0].shape == (0, 3)
+
+
+def test_scattering_coefficients__extremes_give_back_sigma_tr():
+    s = np.array([0.0, 1e-30, 1e-4, 0.5, S_MAX])
+    for transport in (1e-30, 1.0, 1e30):
+        coefficients = np.array(scattering_coefficients(s, transport))
+        assert np.isfinite(coefficients).all()
+        assert (coefficients >= 0).all()
+        np.testing.assert_allclose(sigma_tr(*coefficients), transport, rtol=1e-12)
+
+
+@pytest.mark.parametrize("eta", [1.05, 1.3, 2.0])
+def test_fresnel__everything_is_reflected_at_the_horizon(eta):
+    np.testing.assert_allclose(
+        fresnel_reflectance([0.0, 1e-30, 1e-12], eta), 1.0, atol=1e-10
+    )
+    assert (np.diff(fresnel_reflectance(np.linspace(0, 0.2, 50), eta)) < 0).all()
+    np.testing.assert_allclose(fresnel_reflectance([0.0, 0.1], 1 / eta), 1.0)
+
+
+def test_internal_diffuse_reflectance__is_zero_without_a_boundary():
+    assert internal_diffuse_reflectance(1.0) == pytest.approx(0.0, abs=1e-15)

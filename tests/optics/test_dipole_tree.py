@@ -9,6 +9,7 @@ import pytest
 
 from skindb.optics import _tree_kernels
 from skindb.optics.diffusion import (
+    S_MAX,
     diffuse_reflectance,
     dipole_profile,
     dipole_s,
@@ -135,3 +136,82 @@ def test_decay__against_exp():
     got = np.array([_tree_kernels._decay(float(v)) for v in x])
     np.testing.assert_allclose(got, np.exp(-x), rtol=1e-6)
     assert _tree_kernels._decay(700.0) < 4e-11
+
+
+# extreme inputs, on points 0.2 mm apart
+
+
+def _exitance(points, light, s=0.7, tr=1.0, *, eta=ETA, area=0.04):
+    n = len(points)
+    medium = np.full((n, 3), s), np.full((n, 3), tr)
+    return subsurface_exitance(points, np.full(n, area), light, *medium, eta=eta)
+
+
+def _patch(n=900):
+    side = round(n**0.5)
+    x, y = np.meshgrid(np.arange(side) * 0.2, np.arange(side) * 0.2)
+    return np.stack([x.ravel(), y.ravel(), 0.01 * x.ravel() * y.ravel()], axis=1)
+
+
+@pytest.mark.parametrize(
+    ("s", "tr", "eta"),
+    [
+        (0.0, 1.0, ETA),
+        (0.7, 0.01, ETA),
+        (0.7, 100.0, ETA),
+        (S_MAX - 1e-6, 1.0, ETA),
+        (0.7, 1.0, 1.0),
+    ],
+)
+def test_subsurface_exitance__uniform_light_on_any_medium_gives_rd(s, tr, eta):
+    exitance = _exitance(_patch(), np.ones((900, 2)), s, tr, eta=eta)
+    # s has a lower bound in the code
+    expected = diffuse_reflectance(np.maximum(s, 1e-4), eta=eta)
+    np.testing.assert_allclose(exitance, expected, rtol=FLOAT32)
+
+
+def test_subsurface_exitance__uniform_light_on_any_points_gives_rd():
+    expected = diffuse_reflectance(0.7, eta=ETA)
+    line = np.stack([0.2 * np.arange(300), np.zeros(300), np.zeros(300)], axis=1)
+    for points in (*(_patch(2500)[:n] for n in (0, 1, 3, 2400)), line):
+        exitance = _exitance(points, np.ones((len(points), 1)))
+        assert exitance.shape == (1, len(points), 3)
+        np.testing.assert_allclose(exitance, expected, rtol=FLOAT32)
+    assert _exitance(np.zeros((1, 3)), np.ones((1, 0))).shape == (0, 1, 3)
+
+
+def test_subsurface_exitance__points_in_one_place_receive_the_mean_of_the_light():
+    exitance = _exitance(np.zeros((50, 3)), np.linspace(0, 2, 50)[:, None])
+    expected = diffuse_reflectance(0.7, eta=ETA)
+    np.testing.assert_allclose(exitance, expected, rtol=FLOAT32)
+
+
+def test_subsurface_exitance__patches_a_kilometre_apart_exchange_no_light():
+    both = np.concatenate([_patch(), _patch() + np.array([1e6, 0, 0])])
+    exitance = _exitance(both, np.repeat([1.0, 0.0], 900)[:, None])[0]
+    expected = diffuse_reflectance(0.7, eta=ETA)
+    np.testing.assert_allclose(exitance[:900], expected, rtol=FLOAT32)
+    np.testing.assert_array_equal(exitance[900:], 0.0)
+
+
+def test_subsurface_exitance__any_scale_of_light_and_lengths():
+    light = np.linspace(0, 1, 900)[:, None]
+    expected = _exitance(_patch(), light)
+    for scale in (1e-30, 1e-12, 1e12, 1e30):
+        brighter = _exitance(_patch(), light * scale)
+        np.testing.assert_allclose(brighter / scale, expected, rtol=FLOAT32, atol=1e-12)
+    for scale in (1e-6, 1e6):
+        points = _patch() * scale
+        larger = _exitance(points, light, tr=1.0 / scale, area=0.04 * scale * scale)
+        np.testing.assert_allclose(larger, expected, rtol=1e-5)
+    np.testing.assert_array_equal(_exitance(_patch(), 0 * light), 0.0)
+
+
+def test_subsurface_exitance__a_nan_stays_in_its_light():
+    light = np.ones((900, 2))
+    light[450, 0] = np.nan
+    exitance = _exitance(_patch(), light)
+    assert np.isnan(exitance[0, 450]).all()
+    np.testing.assert_allclose(
+        exitance[1], diffuse_reflectance(0.7, eta=ETA), rtol=FLOAT32
+    )

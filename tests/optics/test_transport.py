@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
+from skindb.optics.diffusion import dipole_profile, sigma_tr
 from skindb.optics.transport import (
     Walk,
     leaving_transform,
@@ -232,3 +233,97 @@ def test_random_walk__same_seed_same_events_whatever_the_threads():
     assert isinstance(first, Walk)
     np.testing.assert_array_equal(first.path, second.path)
     np.testing.assert_array_equal(first.radius, second.radius)
+
+
+# extreme inputs of both profiles
+
+PROFILES = [dipole_profile, transport_profile]
+both_profiles = pytest.mark.parametrize("profile", PROFILES)
+
+
+@both_profiles
+def test_profile__near_the_source_is_no_steeper_than_single_scattering(profile):
+    """R decreases with distance and grows towards 0 at most like exp(-sigma_t' r) / r."""
+    r = np.geomspace(1e-12, 0.015, 60)  # mean free paths are 0.6
+    value = profile(r, 0.1, 1.5, eta=1.3)
+    assert np.isfinite(value).all()
+    assert (value > 0).all()
+    assert (np.diff(value) <= 0).all()
+    ratio = value * r * np.exp(1.6 * r)
+    assert (np.diff(ratio) >= -1e-12 * ratio[1:]).all()
+
+
+@both_profiles
+def test_profile__far_away_decays_at_the_rate_of_the_medium(profile):
+    """The dipole decays with sigma_tr; absorption makes the exact rate lower."""
+    r = np.array([40.0, 50.0, 60.0])
+    rate = -np.diff(np.log(profile(r, 0.3, 1.0, eta=1.3) * r**2)) / np.diff(r)
+    transport = sigma_tr(0.3, 1.0)
+    assert (rate < transport * 1.02).all()
+    assert (rate > 0.75 * transport).all()
+    assert np.isfinite(profile(np.array([1e6, 1e30]), 0.3, 1.0, eta=1.3)).all()
+
+
+@both_profiles
+def test_profile__without_absorption_falls_with_the_third_power(profile):
+    """The mean free path is the only length, and it is the limit of little absorption."""
+    r = np.array([30.0, 100.0])
+    value = profile(r, 0.0, 1.0, eta=1.3)
+    power = np.log(value[0] / value[1]) / np.log(r[1] / r[0])
+    assert power == pytest.approx(3, abs=0.1)
+    np.testing.assert_allclose(profile(r, 1e-12, 1.0, eta=1.3)[0], value[0], rtol=1e-3)
+
+
+@both_profiles
+def test_profile__vanishes_with_the_scattering(profile):
+    r = np.array([0.5, 1.0, 3.0])
+    small = profile(r, 0.5, 1e-4, eta=1.3)
+    smaller = profile(r, 0.5, 1e-6, eta=1.3)
+    assert np.isfinite([small, smaller]).all()
+    assert ((smaller >= 0) & (smaller < small)).all()
+    if profile is dipole_profile:  # in proportion
+        np.testing.assert_allclose(smaller / small, 0.01, rtol=1e-3)
+        np.testing.assert_array_equal(profile(r, 0.5, 0.0, eta=1.3), 0.0)
+
+
+@both_profiles
+def test_profile__scales_with_lengths(profile):
+    """If lengths are multiplied by f, coefficients are divided by f and R by f squared."""
+    r = np.geomspace(0.1, 10, 9)
+    expected = profile(r, 0.1, 1.5, eta=1.3)
+    for f in (1e-30, 1e-12, 1e12, 1e30):
+        value = profile(r * f, 0.1 / f, 1.5 / f, eta=1.3)
+        np.testing.assert_allclose(value * f * f, expected, rtol=1e-9)
+
+
+@both_profiles
+def test_profile__any_precision_and_values_that_are_not_finite(profile):
+    r = np.array([0.5, 2.0, 8.0], np.float32)
+    np.testing.assert_array_equal(
+        profile(r, np.float32(0.25), np.float32(1.5), eta=1.3),
+        profile(r.astype(float), 0.25, 1.5, eta=1.3),
+    )
+    value = profile(np.array([np.nan, 1.0, np.inf]), 0.1, 1.5, eta=1.3)
+    assert np.isnan(value[0])
+    assert value[1] > 0
+    assert not value[2] > 0  # zero or NaN
+    assert np.isnan(profile(1.0, np.nan, 1.5, eta=1.3))
+    assert profile(np.zeros(0), 0.1, 1.5, eta=1.3).shape == (0,)
+
+
+@both_profiles
+def test_profile__of_any_medium_is_finite_and_decreases(profile):
+    r = np.geomspace(1e-6, 2000, 200)
+    media = [(0.0, 1.0), (1e-12, 1.0), (0.1, 0.0001), (30.0, 1.0), (0.1, 100.0)]
+    for sigma_a, sigma_s in media:
+        value = profile(r, sigma_a, sigma_s, eta=1.3)
+        assert np.isfinite(value).all()
+        assert (np.diff(value) <= 0).all()
+        # it may vanish only where absorption is far above scattering
+        assert (value[:100] > 0).all() or sigma_a / sigma_s > 10
+
+
+@both_profiles
+def test_profile__more_absorption_is_less_light_at_every_distance(profile):
+    r = np.geomspace(1e-6, 350, 120)
+    assert (profile(r, 0.01, 1.0, eta=1.3) > profile(r, 0.02, 1.0, eta=1.3)).all()

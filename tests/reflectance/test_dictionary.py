@@ -222,3 +222,46 @@ def test_convolve_disc__is_done_once_for_fits_and_studies():
         ("flat",), np.full((4, 4, 4, 1), 0.2, np.float32), TableGrid(4, 4, 4), "test"
     )
     assert convolve_disc(flat, 0.01) is convolve_disc(flat, 0.01)
+
+
+# extreme inputs
+
+GRID = TableGrid(24, 20, 8)
+
+
+def _tables(table):
+    table = np.ascontiguousarray(table, np.float32)
+    names = tuple(str(i) for i in range(table.shape[-1]))
+    return Dictionary(names, table, GRID, "extreme")
+
+
+def _lobe(sharpness=40.0):
+    def brdf(wi, wo):
+        return np.exp(-sharpness * half_difference(wi, wo)[0][..., None] ** 2)
+
+    return tabulate(brdf, GRID)
+
+
+def test_convolve_disc__keeps_constants_of_any_scale():
+    for radius, value in ((0.014, 0.0), (0.014, 1e-30), (0.014, 1e30), (0.3, 0.25)):
+        constant = convolve_disc(_tables(np.full((24, 20, 8, 2), value)), radius)
+        np.testing.assert_allclose(constant.table, np.float32(value), rtol=1e-5)
+
+
+def test_convolve_disc__any_scale_and_a_disc_of_nearly_zero():
+    lobe = _lobe()
+    expected = convolve_disc(_tables(lobe), 0.05).table
+    for scale in np.float32([1e-30, 1e-12, 1e12, 1e30]):
+        averaged = convolve_disc(_tables(lobe * scale), 0.05).table
+        np.testing.assert_allclose(averaged / scale, expected, rtol=1e-5, atol=1e-12)
+    nearly_zero = convolve_disc(_tables(lobe), 1e-9)
+    np.testing.assert_allclose(nearly_zero.table, lobe, atol=1e-5)
+
+
+def test_convolve_disc__lies_between_the_extremes_and_lowers_a_sharp_lobe():
+    lobe = _lobe(400.0)
+    for radius in (0.05, 0.5):
+        averaged = convolve_disc(_tables(lobe), radius).table
+        assert averaged.min() >= -1e-6
+        assert averaged.max() <= lobe.max() * (1 + 1e-5)
+        assert averaged[0, 0, 0, 0] < lobe[0, 0, 0, 0]

@@ -83,6 +83,29 @@ def test_basis_rows__reciprocal():
     np.testing.assert_allclose(there / cos_i, back / cos_o, rtol=1e-5)
 
 
+def _row(table, wi, wo):
+    up = np.array([[0.0, 0, 1]])
+    usable = np.ones((1, 1, 1), bool)
+    grid = TableGrid(*table.shape[:3])
+    return basis_rows(table, grid, up, wi[None, None], wo[None, None], usable)[0]
+
+
+def test_basis_rows__overhead_mirrored_and_grazing_directions():
+    rng = np.random.default_rng(8)
+    table = rng.uniform(0.1, 1, (24, 20, 8, 2)).astype(np.float32)
+    table[0] = 1.0  # where the half vector is the normal
+    up = np.array([0.0, 0, 1])
+    # light, camera and normal coincide, so phi_d is undefined
+    np.testing.assert_allclose(_row(table, up, up), [[1.0, 1.0]], rtol=1e-6)
+    mirrored = _row(table, np.array([0.6, 0, 0.8]), np.array([-0.6, 0, 0.8]))
+    np.testing.assert_allclose(mirrored, [[0.8, 0.8]], rtol=SINGLE)
+    for height in (1e-8, 1e-4, 0.02):
+        wi = np.array([np.sqrt(1 - height**2), 0, height])
+        wo = np.array([0.6, 0.0, 0.8])
+        expected = lookup(table, *half_difference(wi, wo)) * height
+        np.testing.assert_allclose(_row(table, wi, wo)[0], expected, rtol=1e-4)
+
+
 @pytest.mark.parametrize("n", [0, 3])
 def test_basis_rows__nothing_usable(n):
     table = embedded_dictionary().table[..., :4]
