@@ -4,20 +4,29 @@ compared with a plain loop.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from three_surfels import MATTE, surfels
 
 from skindb.fit import (
     estimate_diffuse_reflectance,
     estimate_normals,
     reflectance_interval,
 )
-from skindb.fit.albedo import low_quantile, stable_minimum
+from skindb.fit.albedo import (
+    METHODS,
+    block_reflectance,
+    low_quantile,
+    stable_minimum,
+)
 from skindb.optics.diffusion import diffuse_reflectance
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.reflectance.rows import basis_rows
 from skindb.reflectance.separation import surface_lobes
 from skindb.schema import dataset, label
+from skindb.schema.status import LARGEST_R_D, SMALLEST_R_D
 
 
 def _with_normals(skin):
@@ -286,3 +295,77 @@ def test_estimate_diffuse_reflectance__any_chunking(skin):
 def test_estimate_diffuse_reflectance__unknown_method_is_refused(skin):
     with pytest.raises(ValueError, match="method must be one of"):
         estimate_diffuse_reflectance(_with_normals(skin), method="guess")
+
+
+# extreme inputs
+
+each_method = pytest.mark.parametrize("method", METHODS)
+
+
+def _of_surfels(skin, method, *, eta=1.3):
+    """R_d (3, 3) of three surfels, and its error."""
+    arrays = {
+        "reflectance_sample": skin.sample,
+        "surfel_position": skin.position,
+        "light_position": skin.light,
+        "camera_position": skin.camera,
+        "shading_normal": skin.normal,
+    }
+    options = {"method": method, "eta": eta, "even_reflection": 0.0}
+    return block_reflectance(arrays, **options)[:2]
+
+
+@each_method
+@pytest.mark.parametrize("eta", [1.0, 1.3])
+@pytest.mark.parametrize(
+    ("dtype", "tolerance"),
+    [("float16", 1e-3), pytest.param("float32", 1e-5, marks=pytest.mark.slow)],
+)
+def test_block_reflectance__2400_samples_of_matte_skin(method, eta, dtype, tolerance):
+    skin = surfels(150, 16, eta=eta, weight=MATTE, dtype=dtype)
+    estimate, _ = _of_surfels(skin, method, eta=eta)
+    np.testing.assert_allclose(estimate, skin.diffuse, rtol=tolerance)
+
+
+@each_method
+def test_block_reflectance__one_or_three_samples_are_too_few(method):
+    for lights in (1, 3):
+        assert np.isnan(_of_surfels(surfels(lights, 1), method)).all()
+
+
+@each_method
+def test_block_reflectance__broken_samples(method):
+    skin = surfels()
+    estimate, _ = _of_surfels(skin.filled(np.nan), method)
+    assert np.isnan(estimate[0]).all()
+    expected, _ = _of_surfels(skin, method)
+    np.testing.assert_allclose(estimate[1:], expected[1:], rtol=1e-7)
+    matte = surfels(weight=MATTE)
+    for value in (np.nan, np.inf):
+        estimate, _ = _of_surfels(matte.spoiled(value), method)
+        np.testing.assert_allclose(estimate, matte.diffuse, rtol=2e-3)
+
+
+@pytest.mark.slow
+@each_method
+def test_block_reflectance__any_scale_is_clamped_to_the_range_of_eq_5(method):
+    skin = surfels(weight=MATTE, dtype=np.float32)
+    for factor in (0.0, 1e-30, 1e3, 1e30):
+        estimate, _ = _of_surfels(skin.scaled(factor), method)
+        limit = SMALLEST_R_D if factor < 1 else LARGEST_R_D
+        np.testing.assert_allclose(estimate, limit, rtol=1e-6)
+
+
+@pytest.mark.slow
+@each_method
+def test_block_reflectance__half_floats_have_the_same_result_in_any_precision(method):
+    skin = surfels()
+    expected, _ = _of_surfels(skin, method)
+    for dtype in (np.float32, np.float64):
+        typed = replace(skin, sample=skin.sample.astype(dtype))
+        np.testing.assert_allclose(_of_surfels(typed, method)[0], expected, rtol=1e-6)
+
+
+@each_method
+def test_block_reflectance__no_surfels(method):
+    assert _of_surfels(surfels().empty, method)[0].shape == (0, 3)

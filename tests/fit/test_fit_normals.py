@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from three_surfels import MATTE, SCALES, surfels, unit
 
 from skindb.errors import InputError
 from skindb.fit import estimate_normals, lumitexels
 from skindb.fit.normals import METHODS
+from skindb.fit.normals import _normals as block_normals
 
 
 def _angles(found, true):
@@ -171,3 +173,81 @@ def test_lumitexels__names_every_missing_variable():
     with pytest.raises(InputError, match="reflectance_sample") as caught:
         lumitexels(xr.DataTree.from_dict({"/surfels": xr.Dataset()}))
     assert len(caught.value.faults) == 8
+
+
+# extreme inputs
+
+
+def _normals(skin, method="combined", *, eta=1.3, scan=None):
+    """Normals (3, 3) from a scan that is off by three degrees."""
+    scan = _scan(skin) if scan is None else scan
+    geometry = skin.position, skin.light, skin.camera, scan
+    return block_normals(
+        skin.sample, *geometry, method=method, eta=eta, scan_error=3.0
+    )[0]
+
+
+def _scan(skin):
+    return unit(skin.normal + np.deg2rad(3.0) * np.array([0.6, 0.8, 0.0]))
+
+
+@pytest.mark.parametrize("eta", [1.0, 1.3])
+@pytest.mark.parametrize("method", ["combined", "chromatic", "photometric"])
+def test_estimate_normals__2400_samples_of_matte_skin(method, eta):
+    skin = surfels(150, 16, eta=eta, weight=MATTE)
+    assert _angles(_normals(skin, method, eta=eta), skin.normal).max() < 0.5
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_estimate_normals__black_and_saturated_surfels_leave_the_others_alone(method):
+    expected = _normals(surfels(), method)
+    for value in (0.0, np.nan):
+        estimate = _normals(surfels().filled(value), method)
+        assert np.isnan(estimate[0]).all()
+        np.testing.assert_allclose(estimate[1:], expected[1:], atol=1e-7)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_estimate_normals__one_or_three_samples_give_nan_or_lie_near_the_scan(method):
+    for lights in (1, 3):
+        skin = surfels(lights, 1)
+        estimate = _normals(skin, method)
+        finite = np.isfinite(estimate).all(axis=1)
+        length = np.linalg.norm(estimate[finite], axis=1)
+        np.testing.assert_allclose(length, 1.0, atol=1e-6)
+        angle = _angles(estimate[finite], _scan(skin)[finite])
+        assert (angle < (45 if method == "peak" else 10)).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", METHODS)
+def test_estimate_normals__any_scale_of_the_samples(method):
+    skin = surfels(weight=MATTE, dtype=np.float32)
+    expected = _normals(skin, method)
+    for scale in SCALES:
+        estimate = _normals(skin.scaled(scale), method)
+        np.testing.assert_allclose(estimate, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("method", ["combined", "chromatic", "photometric"])
+def test_estimate_normals__one_broken_sample_changes_little(method):
+    skin = surfels(weight=MATTE)
+    for value in (np.nan, np.inf):
+        assert _angles(_normals(skin.spoiled(value), method), skin.normal)[0] < 0.5
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_estimate_normals__constant_samples_give_unit_vectors_or_nan(method):
+    skin = surfels().with_sample(np.s_[:], 0.2)
+    length = np.linalg.norm(_normals(skin, method), axis=1)
+    assert (np.isnan(length) | (np.abs(length - 1) < 1e-6)).all()
+
+
+@pytest.mark.parametrize("method", ["combined", "chromatic", "photometric"])
+def test_estimate_normals__without_a_normal_of_the_scan_is_nan(method):
+    scan = np.full((3, 3), np.nan)
+    assert np.isnan(_normals(surfels(weight=MATTE), method, scan=scan)).all()
+
+
+def test_estimate_normals__no_surfels():
+    assert _normals(surfels().empty).shape == (0, 3)
