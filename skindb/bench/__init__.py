@@ -1,6 +1,4 @@
-"""Curves of error against CPU time for every kernel of the fit, and the stress set;
-`skindb bench` runs both.
-"""
+"""Curves of error against CPU time for every kernel; `skindb bench` measures them."""
 
 from __future__ import annotations
 
@@ -13,7 +11,7 @@ if TYPE_CHECKING:
 
 __all__ = ["KERNELS", "run_bench", "table_of"]
 
-# of the curves and of the stress set; the command line needs only the names
+# the command line needs only the names
 KERNELS = (
     "surface",
     "refit",

@@ -42,6 +42,11 @@ class Point:
         """Method and setting."""
         return f"{self.method}, {self.parameter}" if self.parameter else self.method
 
+    @property
+    def label(self) -> str:
+        """Method, and whether it fails."""
+        return f"{self.method} (fails)" if self.failure else self.method
+
 
 @dataclass(frozen=True)
 class Curve:
@@ -52,13 +57,16 @@ class Curve:
     reference: str
     seconds_of: str
     base: str  # name of the point to whose CPU time the others are compared
-    points: tuple[Point, ...]
+    points: Sequence[Point]
+
+    @property
+    def base_seconds(self) -> float:
+        """CPU time of the base [s]."""
+        return next(p.seconds for p in self.points if p.name == self.base)
 
     def ratio(self, point: Point) -> float:
         """CPU time of a point over that of the base; below 1 is faster."""
-        return point.seconds / next(
-            p.seconds for p in self.points if p.name == self.base
-        )
+        return point.seconds / self.base_seconds
 
 
 def cpu_time(work: Callable[[], T], per: float = 1.0) -> tuple[float, T]:
@@ -80,9 +88,8 @@ def plot_curves(curves: Sequence[Curve], path: Path) -> None:
 
     figure = Figure(figsize=(8.5 * len(curves), 6), layout="constrained")
     FigureCanvasAgg(figure)
-    for ax, curve in zip(
-        figure.subplots(1, len(curves), squeeze=False)[0], curves, strict=True
-    ):
+    axes = figure.subplots(1, len(curves), squeeze=False)[0]
+    for ax, curve in zip(axes, curves, strict=True):
         plot_curve(curve, ax=ax)
     figure.savefig(private_file(path), dpi=100)
 
@@ -93,48 +100,14 @@ def plot_curve(curve: Curve, *, ax: Axes) -> Axes:
     """
     ax.set(xscale="log", yscale="log")
     for i, method in enumerate(dict.fromkeys(p.method for p in curve.points)):
-        points = [
-            p for p in curve.points if p.method == method and np.isfinite(p.error)
-        ]
-        colour = f"C{i % 10}"
-        for p in (p for p in points if not np.isfinite(p.seconds)):
-            ax.axhline(
-                max(p.error, EXACT),
-                color=colour,
-                ls=":",
-                lw=1,
-                label=_legend(method, p),
-            )
-        timed = [p for p in points if np.isfinite(p.seconds)]
-        if timed:
-            x = [p.seconds for p in timed]
-            y = [max(p.error, EXACT) for p in timed]
-            marker = "x" if all(p.failure for p in timed) else "os^Dv"[i // 10 % 5]
-            ax.plot(
-                x,
-                y,
-                marker=marker,
-                lw=0.4,
-                color=colour,
-                label=_legend(method, timed[0]),
-            )
-        for p in timed:
-            ax.annotate(
-                p.parameter,
-                (p.seconds, max(p.error, EXACT)),
-                fontsize=6,
-                xytext=(4, 3),
-                textcoords="offset points",
-            )
-    ax.set_xlabel(
-        f"CPU time for {curve.seconds_of} [s]; top axis relative to {curve.base}",
-        fontsize=8,
-    )
+        points = [p for p in curve.points if p.method == method]
+        _plot_method(ax, [p for p in points if np.isfinite(p.error)], i)
+    top = f"top axis relative to {curve.base}"
+    ax.set_xlabel(f"CPU time for {curve.seconds_of} [s]; {top}", fontsize=8)
     ax.set_ylabel(fill(curve.error_of, 60), fontsize=8)
-    ax.set_title(
-        fill(f"{curve.kernel}, compared with {curve.reference}", 80), fontsize=9
-    )
-    base = next(p.seconds for p in curve.points if p.name == curve.base)
+    title = f"{curve.kernel}, compared with {curve.reference}"
+    ax.set_title(fill(title, 80), fontsize=9)
+    base = curve.base_seconds
     ax.secondary_xaxis(
         "top", functions=(partial(np.multiply, 1 / base), partial(np.multiply, base))
     )
@@ -144,5 +117,24 @@ def plot_curve(curve: Curve, *, ax: Axes) -> Axes:
     return ax
 
 
-def _legend(method: str, point: Point) -> str:
-    return f"{method} (fails)" if point.failure else method
+def _plot_method(ax: Axes, points: Sequence[Point], number: int) -> None:
+    colour = f"C{number % 10}"
+    for p in points:
+        if not np.isfinite(p.seconds):
+            y = max(p.error, EXACT)
+            ax.axhline(y, color=colour, ls=":", lw=1, label=p.label)
+    timed = [p for p in points if np.isfinite(p.seconds)]
+    if not timed:
+        return
+    x = [p.seconds for p in timed]
+    errors = [max(p.error, EXACT) for p in timed]
+    marker = "x" if all(p.failure for p in timed) else "os^Dv"[number // 10 % 5]
+    ax.plot(x, errors, marker=marker, lw=0.4, color=colour, label=timed[0].label)
+    for p, place in zip(timed, zip(x, errors, strict=True), strict=True):
+        ax.annotate(
+            p.parameter,
+            place,
+            fontsize=6,
+            xytext=(4, 3),
+            textcoords="offset points",
+        )

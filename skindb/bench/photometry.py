@@ -1,47 +1,37 @@
-"""Normals and diffuse reflectance: curves on samples of the model, and stress cases, which
-must be the planted values or NaN.
+"""Curves of normals and diffuse reflectance on samples of the model, and of radiance
+merged from exposures.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
-from skindb.bench.case import SCALES, close, combinations, expect, stress_cases
 from skindb.bench.curve import Curve, Point, cpu_time
-from skindb.bench.surface_cases import (
-    WEIGHT,
-    Surfels,
-    brightened,
-    filled,
-    first,
-    spiral,
-    spoiled,
-    surfels,
-    unit,
-    without_surfels,
-)
+from skindb.calibration._merge_kernels import OK
+from skindb.calibration.radiance import merge_exposures
 from skindb.fit import albedo, estimate_diffuse_reflectance, estimate_normals, normals
-from skindb.fit.albedo import block_reflectance
-from skindb.fit.normals import _normals as fit_normals
+from skindb.format.frames import FrameKind
+from skindb.format.sensor import SensorRecord
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.reflectance.rows import basis_rows
 from skindb.reflectance.separation import surface_lobes
 from skindb.schema import dataset, label, variables
-from skindb.schema.status import LARGEST_R_D, SMALLEST_R_D
 from skindb.types import Array
+from skindb.virtual.dome import Sensor
 
-# degree
 ETA = 1.3
-SCAN_ERROR = 3.0
+SCAN_ERROR = 3.0  # degree
 DOMES = ((12, 2), (16, 4), (32, 6), (64, 8), (150, 16))  # lights, cameras
 NOISE = 0.03
 GLOSS = 0.1
-NORMALS = ("combined", "chromatic", "photometric", "peak")
-METHODS = ("separated", "quantile", "minimum")
+SHORTEST = 0.09  # exposure [s]
+STEP = 4.0  # factor between exposures
 
 
 @dataclass(frozen=True)
@@ -79,76 +69,90 @@ def model_samples(
     each with at least a fifth of `gloss`. Noise is relative, with `floor` [sr^-1] added
     in quadrature.
     """
-    normal = unit(spiral(surfels, 0.6) + 0.05 * rng.normal(size=(surfels, 3)))
-    position = 80 * spiral(surfels, 0.6)
-    light = 880 * spiral(lights, 0.1)
-    camera = 830 * spiral(cameras, 0.5)
-    wi = unit(light - position[:, None])
-    wo = unit(camera - position[:, None])
+    normal = _unit(_spiral(surfels, 0.6) + 0.05 * rng.normal(size=(surfels, 3)))
+    position = 80 * _spiral(surfels, 0.6)
+    light = 880 * _spiral(lights, 0.1)
+    camera = 830 * _spiral(cameras, 0.5)
+    wi = _unit(light - position[:, None])
+    wo = _unit(camera - position[:, None])
     lit = np.einsum("nk,ntk->nt", normal, wi)
     seen = np.einsum("nk,ntk->nt", normal, wo)
-    diffuse = (
-        np.array([0.5, 0.33, 0.24])
-        * rng.uniform(0.7, 1.2, (surfels, 1))
-        * rng.uniform(0.95, 1.05, (surfels, 3))
-    )
+    brightness = rng.uniform(0.7, 1.2, (surfels, 1))
+    tint = rng.uniform(0.95, 1.05, (surfels, 3))
+    diffuse = np.array([0.5, 0.33, 0.24]) * brightness * tint
     table, grid = surface_lobes()
-    rows, offsets, index = basis_rows(
-        table, grid, normal, wi, wo, (lit > 0)[:, :, None] & (seen > 0)[:, None]
-    )
-    s, (i, o) = np.repeat(np.arange(surfels), np.diff(offsets)), index.T
-    chosen = rng.permuted(np.tile(np.arange(table.shape[-1]), (surfels, 1)), axis=1) < 2
-    weight = rng.uniform(0, gloss, chosen.shape) * chosen
+    usable = (lit > 0)[:, :, None] & (seen > 0)[:, None]
+    rows, offsets, index = basis_rows(table, grid, normal, wi, wo, usable)
+    s = np.repeat(np.arange(surfels), np.diff(offsets))
+    i, o = index.T
+    weight = _lobe_weights(rng, (surfels, table.shape[-1]), gloss, lobes)
+    ci = lit.clip(0, 1)
+    transmitted = fresnel_transmittance(seen.clip(0, 1), ETA)
+    body = (lit * fresnel_transmittance(ci, ETA))[s, i] * transmitted[s, o]
+    surface = np.einsum("tm,tm->t", rows, weight[s])
+    value = body[:, None] / np.pi * diffuse[s] + surface[:, None]
+    scatter = np.hypot(noise * value, floor) * rng.normal(size=value.shape)
+    sample = np.full((surfels, lights, cameras, 3), np.nan)
+    sample[s, i, o] = value + scatter
+    off = np.deg2rad(SCAN_ERROR / np.sqrt(2)) * rng.normal(size=normal.shape)
+    values = {
+        variables.REFLECTANCE_SAMPLE: sample,
+        variables.SURFEL_POSITION: position,
+        variables.SURFEL_NORMAL: _unit(normal + off),
+        variables.SURFEL_AREA: np.ones(surfels),
+        variables.LIGHT_POSITION: light,
+        variables.LIGHT_DISC_RADIUS: np.zeros(lights),
+        variables.CAMERA_POSITION: camera,
+    }
+    lumitexels = dataset(values, coords={"channel": ["R", "G", "B"]})
+    return ModelSamples(lumitexels, normal, diffuse, weight)
+
+
+def _lobe_weights(
+    rng: np.random.Generator,
+    shape: tuple[int, int],
+    gloss: float,
+    lobes: tuple[int, ...],
+) -> Array:
+    """Weights (surfel, lobe) of two random lobes, or of the given ones."""
+    surfels, count = shape
+    chosen = rng.permuted(np.tile(np.arange(count), (surfels, 1)), axis=1) < 2
+    weight = rng.uniform(0, gloss, shape) * chosen
     if lobes:
         weight[:] = 0
         weight[:, list(lobes)] = rng.uniform(gloss / 5, gloss, (surfels, len(lobes)))
-    body = (lit * fresnel_transmittance(lit.clip(0, 1), ETA))[
-        s, i
-    ] * fresnel_transmittance(seen.clip(0, 1), ETA)[s, o]
-    value = (
-        body[:, None] / np.pi * diffuse[s]
-        + np.einsum("tm,tm->t", rows, weight[s])[:, None]
-    )
-    sample = np.full((surfels, lights, cameras, 3), np.nan)
-    sample[s, i, o] = value + np.hypot(noise * value, floor) * rng.normal(
-        size=value.shape
-    )
-    lumitexels = dataset(
-        {
-            variables.REFLECTANCE_SAMPLE: sample,
-            variables.SURFEL_POSITION: position,
-            variables.SURFEL_NORMAL: unit(
-                normal
-                + np.deg2rad(SCAN_ERROR / np.sqrt(2)) * rng.normal(size=normal.shape)
-            ),
-            variables.SURFEL_AREA: np.ones(surfels),
-            variables.LIGHT_POSITION: light,
-            variables.LIGHT_DISC_RADIUS: np.zeros(lights),
-            variables.CAMERA_POSITION: camera,
-        },
-        coords={"channel": ["R", "G", "B"]},
-    )
-    return ModelSamples(lumitexels, normal, diffuse, weight)
+    return weight
+
+
+def _spiral(n: int, lowest: float) -> Array:
+    """(n, 3) directions, evenly spread around +z down to the cosine `lowest`."""
+    z = 1 - (np.arange(n) + 0.5) / n * (1 - lowest)
+    phi = np.pi * (3 - np.sqrt(5)) * np.arange(n)
+    r = np.sqrt(1 - z * z)
+    return np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=1)
+
+
+def _unit(v: Array) -> Array:
+    """Vectors (..., 3) of length one."""
+    return np.asarray(v / np.linalg.norm(v, axis=-1, keepdims=True))
 
 
 def _domes(quick: bool) -> list[tuple[str, ModelSamples]]:
     """Samples of every dome, named by their mean number per surfel."""
     rng = np.random.default_rng(11)
+    surfels = 60 if quick else 300
     domes = []
     for lights, cameras in DOMES[1::2] if quick else DOMES:
         skin = model_samples(
             rng,
-            surfels=60 if quick else 300,
+            surfels=surfels,
             lights=lights,
             cameras=cameras,
             noise=NOISE,
             gloss=GLOSS,
         )
-        count = (
-            np.isfinite(skin.lumitexels[variables.REFLECTANCE_SAMPLE].values[..., 0])
-            .sum((1, 2))
-            .mean()
-        )
+        sample = skin.lumitexels[variables.REFLECTANCE_SAMPLE].values[..., 0]
+        count = np.isfinite(sample).sum((1, 2)).mean()
         domes.append((f"{count:.0f} samples", skin))
     return domes
 
@@ -160,54 +164,34 @@ def normals_curves(quick: bool) -> list[Curve]:
     points = []
     domes = _domes(quick)
     for samples, skin in domes:
-        for method in normals.METHODS:
-            ask: dict[str, Any] = {
-                "eta": ETA,
-                "scan_error": SCAN_ERROR,
-                "method": method,
-            }
-            # compiles
-            estimate_normals(skin.lumitexels.isel(surfel=slice(0, 2)), **ask)
-            took, estimate = cpu_time(
-                lambda s=skin, a=ask: estimate_normals(s.lumitexels, **a),  # type: ignore[misc]
-                len(skin.normal),
-            )
-            cosine = np.einsum(
-                "nk,nk->n", estimate[variables.SHADING_NORMAL].values, skin.normal
-            ).clip(-1, 1)
-            angle = np.degrees(np.arccos(cosine))
-            details = {
-                "p95": float(np.nanquantile(angle, 0.95)),
-                "estimated": float(np.isfinite(angle).mean()),
-            }
-            points.append(
-                Point(method, samples, took, float(np.nanmedian(angle)), "", details)
-            )
-    scan = np.einsum(
-        "nk,nk->n",
-        domes[0][1].lumitexels[variables.SURFEL_NORMAL].values,
-        domes[0][1].normal,
-    ).clip(-1, 1)
-    points.append(
-        Point(
-            "normals of the scan",
-            "",
-            np.nan,
-            float(np.degrees(np.median(np.arccos(scan)))),
-        )
-    )
+        points += [_normals(skin, method, samples) for method in normals.METHODS]
+    skin = domes[0][1]
+    scan = skin.lumitexels[variables.SURFEL_NORMAL].values
+    angle = float(np.median(_angles(scan, skin.normal)))
+    points.append(Point("normals of the scan", "", np.nan, angle))
     reference = f"true normals of samples of the model, {NOISE:.0%} noise"
+    error = "median angle [degree]"
     base = f"peak, {domes[-1][0]}"
-    return [
-        Curve(
-            "normals",
-            "median angle [degree]",
-            reference,
-            "a surfel",
-            base,
-            tuple(points),
-        )
-    ]
+    return [Curve("normals", error, reference, "a surfel", base, points)]
+
+
+def _normals(skin: ModelSamples, method: str, samples: str) -> Point:
+    options: dict[str, Any] = {"eta": ETA, "scan_error": SCAN_ERROR, "method": method}
+    estimate_normals(skin.lumitexels.isel(surfel=slice(0, 2)), **options)  # compiles
+    work = partial(estimate_normals, skin.lumitexels, **options)
+    seconds, estimate = cpu_time(work, len(skin.normal))
+    angle = _angles(estimate[variables.SHADING_NORMAL].values, skin.normal)
+    details = {
+        "p95": float(np.nanquantile(angle, 0.95)),
+        "estimated": float(np.isfinite(angle).mean()),
+    }
+    return Point(method, samples, seconds, float(np.nanmedian(angle)), "", details)
+
+
+def _angles(normal: Array, true: Array) -> Array:
+    """Angles (n,) between normals [degree]."""
+    cosine = np.einsum("nk,nk->n", normal, true).clip(-1, 1)
+    return np.asarray(np.degrees(np.arccos(cosine)))
 
 
 def albedo_curves(quick: bool) -> list[Curve]:
@@ -222,289 +206,107 @@ def albedo_curves(quick: bool) -> list[Curve]:
         ]
     samples, skin = domes[-1]
     for k in (0, 8, 32) if quick else (0, 1, 4, 8, 16, 32, 64):
-        points.append(
-            _albedo(
-                skin,
-                "minimum by discard",
-                f"{k} discarded",
-                method="minimum",
-                discard=k,
-            )
-        )
+        rule = {"method": "minimum", "discard": k}
+        points.append(_albedo(skin, "minimum by discard", f"{k} discarded", **rule))
     reference = f"true R_d of samples of the model, {NOISE:.0%} noise, true normals"
     error = "median relative error of R_d"
-    return [
-        Curve(
-            "albedo",
-            error,
-            reference,
-            "a surfel",
-            f"minimum, {domes[-1][0]}",
-            tuple(points),
-        )
-    ]
+    base = f"minimum, {samples}"
+    return [Curve("albedo", error, reference, "a surfel", base, points)]
 
 
-def _albedo(skin: ModelSamples, name: str, samples: str, **ask: Any) -> Point:
+def _albedo(skin: ModelSamples, name: str, samples: str, **options: Any) -> Point:
     lumitexels = skin.with_normals
+    options["eta"] = ETA
     # compiles
-    estimate_diffuse_reflectance(lumitexels.isel(surfel=slice(0, 2)), eta=ETA, **ask)
-    took, estimate = cpu_time(
-        lambda: estimate_diffuse_reflectance(lumitexels, eta=ETA, **ask),
-        len(skin.normal),
-    )
+    estimate_diffuse_reflectance(lumitexels.isel(surfel=slice(0, 2)), **options)
+    work = partial(estimate_diffuse_reflectance, lumitexels, **options)
+    seconds, estimate = cpu_time(work, len(skin.normal))
     relative = estimate[variables.DIFFUSE_REFLECTANCE].values / skin.diffuse - 1
-    known_share = float(np.isfinite(relative).all(1).mean())
+    estimated = float(np.isfinite(relative).all(1).mean())
+    failure = ""
+    if estimated <= 0.5:
+        failure = f"{1 - estimated:.0%} of the surfels have too few samples"
+    details = {"bias": float(np.nanmedian(relative)), "estimated": estimated}
+    error = float(np.nanmedian(np.abs(relative)))
+    return Point(name, samples, seconds, error, failure, details)
+
+
+def exposures_curves(quick: bool) -> list[Curve]:
+    """Radiance over four decades from one to five exposures in steps of a factor of four."""
+    side = 100 if quick else 300
+    rng = np.random.default_rng(6)
+    sensor = Sensor()
+    record = SensorRecord(
+        FrameKind(side, side, 16),
+        sensor.black,
+        sensor.white,
+        sensor.read_noise,
+        sensor.electrons_per_dn,
+        sensor.step,
+    )
+    # 1 is white after a second
+    truth = np.asarray(10 ** rng.uniform(-3, 1, (side, side, 3)), np.float32)
+    still = np.zeros_like(truth)
+    points = []
+    for count in (1, 2, 3) if quick else (1, 2, 3, 4, 5):
+        times = tuple(float(s) for s in SHORTEST * STEP ** np.arange(count))
+        frames = [sensor.expose(truth * np.float32(s), still, rng=rng) for s in times]
+        work = partial(merge_exposures, frames, times, record)
+        seconds, (merged, error, flag) = cpu_time(work, side**2)
+        usable = np.asarray(flag == OK)
+        point = _radiance(
+            "skindb merge_exposures", count, seconds, merged, truth, usable
+        )
+        z = (merged - truth)[usable] / error[usable]
+        point.more["scatter_over_claimed_error"] = float(np.sqrt((z**2).mean()))
+        points.append(point)
+        work_of_longest = partial(_longest_exposure, frames, times, sensor)
+        seconds, longest = cpu_time(work_of_longest, side**2)
+        name = "longest exposure that is not saturated"
+        usable = np.asarray(np.isfinite(longest).all(-1))
+        points.append(_radiance(name, count, seconds, longest, truth, usable))
+    medium = SHORTEST * STEP**2
+    frame = sensor.expose(truth * np.float32(medium), still, rng=rng)
+    single, _, flag = merge_exposures([frame], (medium,), record)
     failure = (
-        ""
-        if known_share > 0.5
-        else f"{1 - known_share:.0%} of the surfels have too few samples"
+        f"{(flag != OK).mean():.0%} of the pixels are white or black: one exposure "
+        "does not cover four decades"
     )
-    details = {"bias": float(np.nanmedian(relative)), "estimated": known_share}
-    return Point(
-        name, samples, took, float(np.nanmedian(np.abs(relative))), failure, details
+    name = "one medium exposure"
+    points.append(_radiance(name, 1, np.nan, single, truth, flag == OK, failure))
+    error_of = (
+        "median relative error of radiance from 1e-3 to 10 (white after 1 s at 1)"
     )
+    reference = "radiance given to a virtual sensor"
+    base = "skindb merge_exposures, 1 exposure"
+    return [Curve("exposures", error_of, reference, "a pixel", base, points)]
 
 
-# normals
-
-
-def _normals(
-    skin: Surfels,
-    method: str = "combined",
-    eta: float = ETA,
-    scan: Array | None = None,
+def _longest_exposure(
+    frames: list[NDArray[np.uint16]], times: tuple[float, ...], sensor: Sensor
 ) -> Array:
-    """Normals (3, 3); those of the scan have an error of three degrees."""
-    scan = _scan(skin) if scan is None else scan
-    geometry = skin.position, skin.light, skin.camera, scan
-    return fit_normals(skin.sample, *geometry, method=method, eta=eta, scan_error=3.0)[
-        0
-    ]
+    radiance = np.full(frames[0].shape, np.nan)
+    for frame, seconds in zip(frames, times, strict=True):  # from short to long
+        level = frame.astype(np.float64) - sensor.black
+        level = level / (sensor.white - sensor.black) / seconds
+        radiance = np.where(frame < sensor.white, level, radiance)
+    return radiance
 
 
-def _scan(skin: Surfels) -> Array:
-    return unit(skin.normal + np.deg2rad(3.0) * np.array([0.6, 0.8, 0.0]))
-
-
-def _angle(estimate: Array, true: Array) -> Array:
-    return np.asarray(
-        np.degrees(np.arccos(np.clip(np.einsum("nk,nk->n", estimate, true), -1, 1)))
-    )
-
-
-def _matte_normals(method: str, eta: float) -> None:
-    skin = surfels(150, 16, eta=eta, weight=0 * WEIGHT)
-    off = _angle(_normals(skin, method, eta), skin.normal)
-    # half a degree, because the prior of the scan has an error of three degrees that
-    # noise-free samples outweigh
-    expect(off.max() < 0.5, off)
-
-
-def _no_normals(method: str, value: float) -> None:
-    skin = surfels()
-    estimate = _normals(spoiled(skin, filled(value)), method)
-    unchanged = _normals(skin, method)
-    expect(np.isnan(estimate[0]).all(), estimate[0])
-    close(estimate[1:], unchanged[1:], atol=1e-7)
-
-
-def _few_normals(method: str, lights: int, cameras: int) -> None:
-    """Too few samples give NaN, or a unit vector near the scan."""
-    skin = surfels(lights, cameras)
-    estimate = _normals(skin, method)
-    finite = np.isfinite(estimate).all(axis=1)
-    close(np.linalg.norm(estimate[finite], axis=1), 1.0, atol=1e-6)
-    off = _angle(estimate[finite], _scan(skin)[finite])
-    expect((off < (45 if method == "peak" else 10)).all(), off)
-
-
-def _scaled_normals(method: str, scale: float) -> None:
-    skin = surfels(weight=0 * WEIGHT)
-    close(_normals(brightened(skin, scale), method), _normals(skin, method), atol=1e-5)
-
-
-def _one_sample_lost(method: str, value: float) -> None:
-    skin = surfels(weight=0 * WEIGHT)
-    off = _angle(_normals(first(skin, value), method), skin.normal)
-    expect(off[0] < 0.5, off)
-
-
-def _even_light() -> None:
-    """Constant samples have no shading and give a unit vector or NaN, never an invalid vector."""
-    skin = replace(surfels(), sample=np.full((3, 40, 6, 3), 0.2, np.float32))
-    for method in ("combined", "chromatic", "photometric", "peak"):
-        estimate = _normals(skin, method)
-        length = np.linalg.norm(estimate, axis=1)
-        expect((np.isnan(length) | (np.abs(length - 1) < 1e-6)).all(), estimate)
-
-
-def _no_scan(method: str) -> None:
-    skin = surfels(weight=0 * WEIGHT)
-    estimate = _normals(skin, method, scan=np.full((3, 3), np.nan))
-    expect(np.isnan(estimate).all(), estimate)
-
-
-def _no_surfels_normals() -> None:
-    empty = without_surfels(surfels())
-    expect(_normals(empty).shape == (0, 3), _normals(empty).shape)
-
-
-# albedo
-
-
-def _estimated_albedo(
-    skin: Surfels, method: str, eta: float = ETA
-) -> tuple[Array, Array]:
-    arrays = {
-        "reflectance_sample": skin.sample,
-        "surfel_position": skin.position,
-        "light_position": skin.light,
-        "camera_position": skin.camera,
-        "shading_normal": skin.normal,
+def _radiance(
+    name: str,
+    count: int,
+    seconds: float,
+    radiance: Array,
+    truth: Array,
+    usable: NDArray[np.bool],
+    failure: str = "",
+) -> Point:
+    relative = np.abs(radiance[usable] / truth[usable] - 1)
+    details = {
+        "p95": float(np.quantile(relative, 0.95)),
+        "without_value": float(1 - usable.mean()),
     }
-    estimate, error, _, _ = block_reflectance(
-        arrays, method=method, eta=eta, even_reflection=0.0
-    )
-    return estimate, error
-
-
-def _matte_albedo(method: str, eta: float) -> None:
-    skin = surfels(150, 16, eta=eta, weight=0 * WEIGHT)
-    close(_estimated_albedo(skin, method, eta)[0], skin.diffuse, rtol=1e-5)
-
-
-def _few_albedo(method: str, lights: int, cameras: int) -> None:
-    estimate, error = _estimated_albedo(surfels(lights, cameras), method)
-    expect(np.isnan(estimate).all() and np.isnan(error).all(), (estimate, error))
-
-
-def _no_albedo(method: str) -> None:
-    skin = surfels()
-    estimate = _estimated_albedo(spoiled(skin, filled(np.nan)), method)[0]
-    unchanged = _estimated_albedo(skin, method)[0]
-    expect(np.isnan(estimate[0]).all(), estimate[0])
-    close(estimate[1:], unchanged[1:], rtol=1e-7)
-
-
-def _one_albedo_lost(method: str, value: float) -> None:
-    skin = surfels(weight=0 * WEIGHT)
-    close(_estimated_albedo(first(skin, value), method)[0], skin.diffuse, rtol=1e-3)
-
-
-def _clamped_albedo(method: str, factor: float) -> None:
-    skin = surfels(weight=0 * WEIGHT)
-    estimate = _estimated_albedo(brightened(skin, factor), method)[0]
-    close(estimate, SMALLEST_R_D if factor < 1 else LARGEST_R_D, rtol=1e-6)
-
-
-def _grazing_albedo(method: str) -> None:
-    skin = replace(
-        surfels(weight=0 * WEIGHT),
-        normal=np.tile([0.0, 0, 1], (3, 1)),
-        position=np.zeros((3, 3)),
-    )
-    low = 900 * np.array([[np.cos(a), np.sin(a), 0.2] for a in (0.1, 2.0, 4.0)])
-    wild = np.full((3, 3, *skin.sample.shape[2:]), 1e-3, np.float32)
-    extended = replace(
-        skin,
-        light=np.concatenate([skin.light, low]),
-        sample=np.concatenate([skin.sample, wild], axis=1),
-    )
-    close(
-        _estimated_albedo(extended, method)[0],
-        _estimated_albedo(skin, method)[0],
-        rtol=1e-6,
-    )
-
-
-def _precision_albedo(method: str) -> None:
-    skin = surfels()
-    half = skin.sample.astype(np.float16)
-    estimates = [
-        _estimated_albedo(replace(skin, sample=half.astype(t)), method)[0]
-        for t in ("float16", "float32", "float64")
-    ]
-    close(estimates[1:], [estimates[0]] * 2, rtol=1e-6)
-
-
-def _no_surfels_albedo(method: str) -> None:
-    empty = without_surfels(surfels())
-    expect(
-        _estimated_albedo(empty, method)[0].shape == (0, 3),
-        _estimated_albedo(empty, method)[0].shape,
-    )
-
-
-NORMAL = stress_cases(
-    "normals",
-    (
-        "{}: 2400 samples of matte skin, eta {}",
-        "Normals are accurate to half a degree.",
-        _matte_normals,
-        combinations(NORMALS[:3], 1.0, 1.3),
-    ),
-    (
-        "{}: all {}",
-        "The normal is NaN; neighbours are unchanged.",
-        _no_normals,
-        combinations(NORMALS, np.nan, 0.0),
-    ),
-    (
-        "{}: {} light(s), {} camera",
-        "The normal is NaN, or a unit vector near the scan.",
-        _few_normals,
-        combinations(NORMALS, (1, 1), (3, 1)),
-    ),
-    (
-        "{}: samples times {:g}",
-        "Normals are unchanged.",
-        _scaled_normals,
-        combinations(NORMALS, *SCALES),
-    ),
-    (
-        "{}: a sample is {}",
-        "One sample changes the normal by less than half a degree.",
-        _one_sample_lost,
-        combinations(NORMALS[:3], np.nan, np.inf),
-    ),
-    ("constant", "Normals are unit vectors or NaN.", _even_light),
-    ("{}: no normal of the scan", "The normal is NaN.", _no_scan, NORMALS[:3]),
-    ("no surfels", "Arrays are empty and have the right shapes.", _no_surfels_normals),
-)
-ALBEDO = stress_cases(
-    "albedo",
-    (
-        "{}: 2400 samples of matte skin, eta {}",
-        "R_d is accurate to rounding.",
-        _matte_albedo,
-        combinations(METHODS, 1.0, 1.3),
-    ),
-    (
-        "{}: {} light(s), {} camera",
-        "R_d and its error are NaN.",
-        _few_albedo,
-        combinations(METHODS, (1, 1), (3, 1)),
-    ),
-    ("{}: all saturated", "R_d is NaN; neighbours are unchanged.", _no_albedo, METHODS),
-    (
-        "{}: a sample is {}",
-        "One sample of 240 changes R_d by less than 1e-3.",
-        _one_albedo_lost,
-        combinations(METHODS, np.nan, np.inf),
-    ),
-    (
-        "{}: samples times {:g}",
-        "R_d is clamped to the range of eq. 5.",
-        _clamped_albedo,
-        combinations(METHODS, 0.0, 1e-30, 1000.0, 1e30),
-    ),
-    ("{}: grazing lights", "Their samples are ignored.", _grazing_albedo, METHODS),
-    ("{}: any precision", "Results agree to rounding.", _precision_albedo, METHODS),
-    (
-        "{}: no surfels",
-        "Arrays are empty and have the right shapes.",
-        _no_surfels_albedo,
-        METHODS,
-    ),
-)
+    setting = f"{count} exposure{'s' * (count > 1)}"
+    error = float(np.median(relative))
+    return Point(name, setting, seconds, error, failure, details)

@@ -1,5 +1,5 @@
-"""One run of `skindb bench`: measures the curves, runs the stress set, writes
-bench.json and one plot per kernel.
+"""One run of `skindb bench`: measures the curves, writes bench.json and one plot per
+kernel.
 """
 
 from __future__ import annotations
@@ -14,34 +14,22 @@ from typing import Any
 
 from threadpoolctl import threadpool_limits
 
-from skindb.bench.case import Case, failure_of
 from skindb.bench.curve import Curve, plot_curves
-from skindb.bench.diffusion import (
-    PROBE,
-    inverse_curves,
-    probe_curves,
-    require_mpmath,
-    transport_curves,
-)
-from skindb.bench.light import (
-    EXPOSURES,
-    TABLES,
-    disc_curves,
-    exposures_curves,
-    subsurface_curves,
-)
-from skindb.bench.optics_cases import OPTICS
-from skindb.bench.photometry import ALBEDO, NORMAL, albedo_curves, normals_curves
+from skindb.bench.photometry import albedo_curves, exposures_curves, normals_curves
 from skindb.bench.population import (
-    POPULATION,
     components_curves,
     permutations_curves,
     pyramid_curves,
     textures_curves,
 )
-from skindb.bench.solvers import SOLVERS, nmf_curves
-from skindb.bench.surface import refit_curves, surface_curves
-from skindb.bench.surface_cases import SURFACE
+from skindb.bench.subsurface import (
+    inverse_curves,
+    probe_curves,
+    require_mpmath,
+    subsurface_curves,
+    transport_curves,
+)
+from skindb.bench.surface import disc_curves, nmf_curves, refit_curves, surface_curves
 from skindb.files import make_private, private_file
 from skindb.schema.plain import plain
 from skindb.types import Progress
@@ -63,17 +51,7 @@ CURVES: dict[str, Callable[[bool], list[Curve]]] = {
     "components": components_curves,
     "permutations": permutations_curves,
 }
-CASES: tuple[Case, ...] = (
-    *SOLVERS,
-    *SURFACE,
-    *NORMAL,
-    *ALBEDO,
-    *PROBE,
-    *OPTICS,
-    *TABLES,
-    *EXPOSURES,
-    *POPULATION,
-)
+MAX_REASON = 300  # characters
 
 
 def run_bench(
@@ -83,7 +61,7 @@ def run_bench(
     quick: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Measure every kernel, or those of `only`, and run the stress set on them.
+    """Measure every kernel, or those of `only`.
 
     Parameters
     ----------
@@ -101,8 +79,8 @@ def run_bench(
     dict
         Content of bench.json: `points` (kernel, method, parameter, CPU time and its
         unit of work, its ratio to `ratio_to`, error and its definition, reference,
-        failure), `stress` (kernel, name, promise, failure) and `failures` (one line for
-        each unsuitable method and each broken promise).
+        failure), `errors` (the reason for every kernel that stopped with an error) and
+        `failures` (one line for each unsuitable method and each error).
     """
     kernels = [kernel for kernel in CURVES if kernel in only or not only]
     if "inverse" in kernels:
@@ -110,31 +88,31 @@ def run_bench(
     make_private(out)
     report = progress or (lambda *_: None)
     begin = time.perf_counter()
-    points = []
+    points: list[dict[str, Any]] = []
     seconds = {}
+    errors = {}
     with threadpool_limits(1):  # waiting threads of BLAS would count as CPU time
         for i, kernel in enumerate(kernels):
             report(f"curves: {kernel}", i, len(kernels))
             since = time.perf_counter()
-            curves = CURVES[kernel](quick)
-            plot_curves(curves, out / f"{kernel}.png")
-            points += [_flat(curve) for curve in curves]
+            try:
+                curves = CURVES[kernel](quick)
+                plot_curves(curves, out / f"{kernel}.png")
+                points += [row for curve in curves for row in _rows(curve)]
+            # the other kernels are measured, and the error is reported
+            except Exception as error:  # noqa: BLE001
+                errors[kernel] = _reason(error)
             seconds[kernel] = round(time.perf_counter() - since, 1)
         report("curves", len(kernels), len(kernels))
-        stress = _stress(kernels, report)
-    flat = [point for curve in points for point in curve]
+    packages = ("skindb", "numpy", "numba", "scipy", "scikit-learn")
     result = {
         "quick": quick,
-        "software": {
-            name: version(name)
-            for name in ("skindb", "numpy", "numba", "scipy", "scikit-learn")
-        },
+        "software": {name: version(name) for name in packages},
         "machine": f"{platform.machine()}, Python {platform.python_version()}",
         "seconds": seconds | {"all": round(time.perf_counter() - begin, 1)},
-        "points": flat,
-        "stress": stress,
-        "failures": _failures(flat, stress),
-        "broken": sum(bool(case["failure"]) for case in stress),
+        "points": points,
+        "errors": errors,
+        "failures": _failures(points, errors),
     }
     private_file(out / "bench.json").write_text(
         json.dumps(plain(result), indent=1, allow_nan=False), encoding="utf-8"
@@ -142,79 +120,42 @@ def run_bench(
     return result
 
 
-def _flat(curve: Curve) -> list[dict[str, Any]]:
+def _rows(curve: Curve) -> list[dict[str, Any]]:
+    """The points of a curve as they stand in bench.json."""
     shared = {
         "kernel": curve.kernel,
         "error_of": curve.error_of,
         "reference": curve.reference,
+        "seconds_of": curve.seconds_of,
+        "ratio_to": curve.base,
     }
-    shared |= {"seconds_of": curve.seconds_of, "ratio_to": curve.base}
-    return [
-        shared
-        | {
-            "method": p.method,
-            "parameter": p.parameter,
-            "seconds": p.seconds,
-            "ratio": curve.ratio(p),
-        }
-        | {"error": p.error, "failure": p.failure, "more": p.more}
-        for p in curve.points
-    ]
+    return [shared | vars(p) | {"ratio": curve.ratio(p)} for p in curve.points]
 
 
-def _stress(kernels: Sequence[str], report: Progress) -> list[dict[str, str]]:
-    chosen = [case for case in CASES if case.kernel in kernels]
-    results = []
-    for i, case in enumerate(chosen):
-        report("stress set", i, len(chosen))
-        result = {"kernel": case.kernel, "name": case.name, "promise": case.promise}
-        results.append(result | {"failure": failure_of(case)})
-    report("stress set", len(chosen), len(chosen))
-    return results
+def _reason(error: Exception) -> str:
+    """Type and message of an error in one line."""
+    message = " ".join(str(error).split()) or "no message"
+    return f"{type(error).__name__}: {message[:MAX_REASON]}"
 
 
-def _failures(
-    points: Sequence[dict[str, Any]], stress: Sequence[dict[str, str]]
-) -> list[str]:
-    lines = {
-        f"{p['kernel']}: {p['method']}, {p['parameter']}: {p['failure']}": None
-        for p in points
-        if p["failure"]
-    }
-    broken = [
-        f"{c['kernel']}: {c['name']}: broken: {c['promise']} {c['failure']}"
-        for c in stress
-        if c["failure"]
-    ]
-    return [*(line.replace(", : ", ": ") for line in lines), *broken]
+def _failures(points: Sequence[dict[str, Any]], errors: dict[str, str]) -> list[str]:
+    lines = []
+    for p in points:
+        if p["failure"]:
+            name = ", ".join(filter(None, (p["method"], p["parameter"])))
+            lines.append(f"{p['kernel']}: {name}: {p['failure']}")
+    lines += [f"{kernel}: {reason}" for kernel, reason in errors.items()]
+    return list(dict.fromkeys(lines))
 
 
 def table_of(result: dict[str, Any]) -> list[list[Any]]:
     """Header and rows: kernel, method, setting, relative CPU time, CPU time, error, and
     its definition.
     """
-    rows: list[list[Any]] = [
-        [
-            "kernel",
-            "method",
-            "setting",
-            "relative time",
-            "CPU time [s]",
-            "error",
-            "error of",
-        ]
-    ]
+    header = "kernel,method,setting,relative time,CPU time [s],error,error of"
+    rows: list[list[Any]] = [header.split(",")]
     for p in result["points"]:
         ratio = "1 (base)" if p["ratio"] == 1 else float(p["ratio"])
-        rows.append(
-            [
-                p["kernel"],
-                p["method"],
-                p["parameter"] or "-",
-                ratio,
-                p["seconds"],
-                p["error"],
-                p["error_of"],
-            ]
-        )
+        method = [p["kernel"], p["method"], p["parameter"] or "-"]
+        rows.append([*method, ratio, p["seconds"], p["error"], p["error_of"]])
     return rows

@@ -1,28 +1,37 @@
-"""Fits of all measured BRDFs, and of four mixtures of them, compared with loops over
-SciPy's solver.
+"""Curves of the surface: fits of all measured BRDFs and of four mixtures compared with
+SciPy's solver, factorisations with scikit-learn, and tables averaged over a disc light.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
+from sklearn.decomposition import NMF
+from sklearn.exceptions import ConvergenceWarning
 
 from skindb.bench.curve import Curve, Point, cpu_time
 from skindb.fit.surface import MIN_SAMPLES, NOISE_FLOOR_SURFACE
-from skindb.numerics.factorise import nmf
-from skindb.optics.angles import half_difference
+from skindb.numerics.factorise import nmf, relative_error
+from skindb.optics.angles import directions, half_difference
 from skindb.optics.fresnel import fresnel_transmittance
-from skindb.reflectance.dictionary import Dictionary, convolve_disc, embedded_dictionary
+from skindb.reflectance.dictionary import (
+    FAR_RULE,
+    NEAR_RULE,
+    Dictionary,
+    convolve_disc,
+    embedded_dictionary,
+)
 from skindb.reflectance.mixture import Mixture
 from skindb.reflectance.model import Block, Comparison, SurfaceFit
 from skindb.reflectance.reduction import reduce_dictionary
 from skindb.reflectance.rows import basis_rows
-from skindb.reflectance.tables import lookup
+from skindb.reflectance.tables import brdf_metric, lookup
 from skindb.types import Array
 
 ETA = 1.3
@@ -35,6 +44,10 @@ TRUTH = (
     "half floats with 5 % noise"
 )
 SCIPY = "SciPy nnls, precomputed rows, three channels"
+COMPONENTS = 6  # of the planted factorisation
+
+Nodes = tuple[NDArray[np.int64], ...]  # indices of nodes of tables
+Predict = Callable[[slice, int], Array]  # surface reflectance of rows of a surfel
 
 
 @dataclass(frozen=True)
@@ -53,7 +66,7 @@ class Strip:
     directions: tuple[Array, Array, Array]  # wi, wo, normal of each row
     cosine: Array  # (total,)
 
-    def first(self, count: int) -> Block:
+    def start(self, count: int) -> Block:
         """The first `count` surfels."""
         return self.block._replace(
             sample=self.block.sample[:count],
@@ -62,13 +75,30 @@ class Strip:
             diffuse=self.block.diffuse[:count],
         )
 
+    def parts(self, count: int) -> list[slice]:
+        """The rows of each of the first `count` surfels."""
+        return [slice(*self.offsets[s : s + 2]) for s in range(count)]
 
-def _spiral(count: int, radius: float, share: float) -> Array:
-    """Points (count, 3) spread evenly over the front `share` of a sphere."""
-    z = 1 - (np.arange(count) + 0.5) / count * share
+    def looked_up(self, table: Array, part: slice) -> Array:
+        """Values (rows, materials) of a table at the directions of rows."""
+        return lookup(table, *half_difference(*(d[part] for d in self.directions)))
+
+
+def _spiral(count: int, radius: float, fraction: float) -> Array:
+    """Points (count, 3) spread evenly over the front `fraction` of a sphere."""
+    z = 1 - (np.arange(count) + 0.5) / count * fraction
     phi = np.pi * (1 + 5**0.5) * np.arange(count)
     s = np.sqrt(1 - z * z)
     return np.asarray(radius * np.stack([s * np.cos(phi), s * np.sin(phi), z], axis=-1))
+
+
+def _single(values: Array) -> Array:
+    """Values rounded to single precision, as they are stored."""
+    return values.astype(np.float32).astype(float)
+
+
+def _unit(v: Array) -> Array:
+    return np.asarray(v / np.linalg.norm(v, axis=-1, keepdims=True))
 
 
 def strip(
@@ -85,15 +115,10 @@ def strip(
     b = 0.9 * (np.arange(surfels) % side) / side - 0.45
     normal = np.stack([np.sin(b), np.sin(a) * np.cos(b), np.cos(a) * np.cos(b)], -1)
     normal += 0.01 * rng.normal(size=normal.shape)
-    normal = (
-        (normal / np.linalg.norm(normal, axis=1, keepdims=True))
-        .astype(np.float32)
-        .astype(float)
-    )
-    position = (90 * normal).astype(np.float32).astype(float)
-    wi, wo = ((t[None] - position[:, None]) for t in (light, camera))
-    wi = wi / np.linalg.norm(wi, axis=-1, keepdims=True)
-    wo = wo / np.linalg.norm(wo, axis=-1, keepdims=True)
+    normal = _single(_unit(normal))
+    position = _single(90 * normal)
+    wi = _unit(light[None] - position[:, None])
+    wo = _unit(camera[None] - position[:, None])
     ci = np.einsum("nk,ntk->nt", normal, wi)
     co = np.einsum("nk,ntk->nt", normal, wo)
     seen = (rng.random((surfels, 150, 1)) < 0.85) & (rng.random((surfels, 1, 16)) < 0.8)
@@ -101,24 +126,24 @@ def strip(
     rows, offsets, index = basis_rows(
         dictionary.table, dictionary.grid, normal, wi, wo, seen
     )
-    owner, (i, o) = np.repeat(np.arange(surfels), np.diff(offsets)), index.T
+    surfel = np.repeat(np.arange(surfels), np.diff(offsets))
+    i, o = index.T
     diffuse = rng.uniform(0.2, 0.6, (surfels, 3))
     weight = np.zeros((surfels, rows.shape[1]))
     for w in weight:
         w[rng.choice(len(w), 4, replace=False)] = rng.uniform(0, 0.4, 4)
-    c = ci[owner, i]
-    d = co[owner, o]
-    scattered = (
-        c * fresnel_transmittance(c, ETA) * fresnel_transmittance(d, ETA) / np.pi
-    )[:, None] * diffuse[owner]
-    true = np.einsum("tm,tm->t", rows, weight[owner])
+    c = ci[surfel, i]
+    transmitted = fresnel_transmittance(c, ETA)
+    transmitted = c * transmitted * fresnel_transmittance(co[surfel, o], ETA)
+    scattered = (transmitted / np.pi)[:, None] * diffuse[surfel]
+    true = np.einsum("tm,tm->t", rows, weight[surfel])
     value = true[:, None] + scattered
     value *= 1 + noise * rng.normal(size=value.shape)
     sample = np.full((surfels, 150, 16, 3), np.nan, np.float16)
-    sample[owner, i, o] = value
-    target = sample[owner, i, o].astype(float) - scattered
+    sample[surfel, i, o] = value
+    target = sample[surfel, i, o].astype(float) - scattered
     block = Block(sample, position, light, camera, normal, diffuse)
-    away = wi[owner, i], wo[owner, o], normal[owner]
+    away = wi[surfel, i], wo[surfel, o], normal[surfel]
     return Strip(block, offsets, rows.astype(np.float64), target, true, away, c)
 
 
@@ -127,20 +152,6 @@ def _problem(quick: bool) -> tuple[Dictionary, Strip, int]:
     """Dictionary, samples, and the number of surfels used for SciPy and for the errors."""
     dictionary = convolve_disc(embedded_dictionary(), DISC)
     return dictionary, strip(64 if quick else 400, dictionary), 16 if quick else 60
-
-
-@lru_cache(maxsize=5)
-def _tables(quick: bool, roots: bool, rank: int) -> Mixture:
-    """The dictionary, or its cube roots, reduced to `rank` dimensions."""
-    dictionary = _problem(quick)[0]
-    reduced, lift = reduce_dictionary(
-        np.cbrt(dictionary.table) if roots else dictionary.table, rank
-    )
-    return Mixture(reduced, lift)
-
-
-def _parts(samples: Strip, count: int) -> list[slice]:
-    return [slice(*samples.offsets[s : s + 2]) for s in range(count)]
 
 
 def scipy_loop(
@@ -156,180 +167,273 @@ def scipy_loop(
     Rows are precomputed, or interpolated in `table` by NumPy.
     """
     solutions = []
-    for part in _parts(samples, count):
-        if table is None:
-            M = samples.rows[part]
-        else:
-            angles = half_difference(*(d[part] for d in samples.directions))
-            M = lookup(table, *angles) * samples.cosine[part, None]
+    for part in samples.parts(count):
+        M = samples.rows[part]
+        if table is not None:
+            M = samples.looked_up(table, part) * samples.cosine[part, None]
         M = M if H is None else M @ H.T
         target = samples.target[part]
-        solutions.append(
-            nnls(np.repeat(M, 3, 0), target.ravel())[0]
-            if channels == 3
-            else nnls(M, target.mean(1))[0]
-        )
+        if channels == 3:
+            solution, _ = nnls(np.repeat(M, 3, 0), target.ravel())
+        else:
+            solution, _ = nnls(M, target.mean(1))
+        solutions.append(solution)
     return np.array(solutions)
 
 
-def _errors(
-    samples: Strip, count: int, predict: Callable[[slice, int], Array]
-) -> tuple[float, float, float]:
+def _errors(samples: Strip, count: int, predict: Predict) -> tuple[float, ...]:
     """Medians over surfels of the true errors, linear and in cube-root space, and of |M
     x - R| / |R|.
     """
-    linear = []
-    roots = []
-    residual = []
-    for s, part in enumerate(_parts(samples, count)):
+    errors = []
+    for s, part in enumerate(samples.parts(count)):
         y = predict(part, s)
         true = samples.true[part]
         target = samples.target[part]
-        linear.append(np.linalg.norm(y - true) / np.linalg.norm(true))
-        roots.append(
-            np.linalg.norm(np.cbrt(y) - np.cbrt(true)) / np.linalg.norm(np.cbrt(true))
+        roots = np.cbrt(true)
+        errors.append(
+            [
+                np.linalg.norm(y - true) / np.linalg.norm(true),
+                np.linalg.norm(np.cbrt(y) - roots) / np.linalg.norm(roots),
+                np.linalg.norm(y[:, None] - target) / np.linalg.norm(target),
+            ]
         )
-        residual.append(np.linalg.norm(y[:, None] - target) / np.linalg.norm(target))
-    return float(np.median(linear)), float(np.median(roots)), float(np.median(residual))
+    return tuple(np.median(errors, axis=0).tolist())
 
 
 def _fit(samples: Strip, model: Mixture, mode: str) -> tuple[float, SurfaceFit]:
     """CPU time per surfel [s], and weights of all surfels."""
     comparison = Comparison(mode, ETA, NOISE_FLOOR_SURFACE, MIN_SAMPLES)
-    model.fit(samples.first(2), comparison)  # compiles
-    n = len(samples.offsets) - 1
-    return cpu_time(lambda: model.fit(samples.block, comparison), n)
+    model.fit(samples.start(2), comparison)  # compiles
+    surfels = len(samples.offsets) - 1
+    return cpu_time(partial(model.fit, samples.block, comparison), surfels)
 
 
-def _mixed(samples: Strip, weight: Array) -> Callable[[slice, int], Array]:
-    return lambda part, s: samples.rows[part] @ weight[s]
+def _mixed(samples: Strip, weight: Array) -> Predict:
+    return lambda part, s: np.asarray(samples.rows[part] @ weight[s])
+
+
+def _cubed(samples: Strip, roots: Array, weight: Array) -> Predict:
+    """Prediction of the paper's weights: cos(theta_i) times the cube of the mixed cube roots."""
+
+    def predict(part: slice, s: int) -> Array:
+        mixed = samples.looked_up(roots, part) @ weight[s]
+        return np.asarray(mixed**3 * samples.cosine[part])
+
+    return predict
+
+
+def _both_spaces(
+    kernel: str,
+    reference: str,
+    base: str,
+    results: Sequence[tuple[Point, tuple[float, ...]]],
+) -> list[Curve]:
+    """Curves of the errors in linear and in cube-root space."""
+    curves = []
+    for i, label in enumerate((LINEAR, ROOTS)):
+        points = []
+        for p, errors in results:
+            details = p.more | {"residual": errors[2]}
+            point = Point(
+                p.method, p.parameter, p.seconds, errors[i], p.failure, details
+            )
+            points.append(point)
+        curves.append(Curve(kernel, label, reference, "a surfel", base, points))
+    return curves
 
 
 def surface_curves(quick: bool) -> list[Curve]:
     """All 59 BRDFs by mode and rank."""
     dictionary, samples, few = _problem(quick)
-    measured: list[
-        tuple[str, str, float, tuple[float, float, float], str, dict[str, float]]
-    ] = []
-    for name, channels, table in (
-        ("SciPy nnls, precomputed rows, mean of channels", 1, None),
-        (SCIPY, 3, None),
-        ("SciPy nnls, rows by NumPy, mean of channels", 1, dictionary.table),
-        ("SciPy nnls, rows by NumPy, three channels", 3, dictionary.table),
+    results = []
+    for rows, table in (
+        ("precomputed rows", None),
+        ("rows by NumPy", dictionary.table),
     ):
-        took, weight = cpu_time(
-            lambda c=channels, t=table: scipy_loop(samples, few, channels=c, table=t),  # type: ignore[misc]
-            few,
-        )
-        measured.append(
-            (name, "", took, _errors(samples, few, _mixed(samples, weight)), "", {})
-        )
+        for name, channels in (("mean of channels", 1), ("three channels", 3)):
+            work = partial(scipy_loop, samples, few, channels=channels, table=table)
+            seconds, weight = cpu_time(work, few)
+            point = Point(f"SciPy nnls, {rows}, {name}", "", seconds, np.nan)
+            results.append((point, _errors(samples, few, _mixed(samples, weight))))
     for mode in ("linear", "perceptual", "paper"):
         table = np.cbrt(dictionary.table) if mode == "paper" else dictionary.table
         for rank in (16, 59) if quick else (8, 12, 16, 24, 59):
-            took, fit = _fit(samples, _tables(quick, mode == "paper", rank), mode)
+            model = Mixture(*reduce_dictionary(table, rank))
+            seconds, fit = _fit(samples, model, mode)
             details = {
                 "kkt": float(fit.kkt.max()),
                 "not_fitted": float((fit.status != 0).sum()),
             }
-            cubes = (
-                _cubes(samples, table, fit.parameters)
-                if mode == "paper"
-                else _mixed(samples, fit.parameters)
-            )
-            measured.append(
-                (
-                    f"skindb {mode}",
-                    f"rank {rank}",
-                    took,
-                    _errors(samples, few, cubes),
-                    "",
-                    details,
-                )
-            )
+            setting = f"rank {rank}"
+            mixed = _mixed(samples, fit.parameters)
+            predict = mixed
+            if mode == "paper":
+                predict = _cubed(samples, table, fit.parameters)
+            point = Point(f"skindb {mode}", setting, seconds, np.nan, "", details)
+            results.append((point, _errors(samples, few, predict)))
             if mode == "paper" and rank == 59:
                 failure = (
                     "cbrt(M x) is not cbrt(M) x, so weights of cube roots do not mix "
                     "reflectance"
                 )
-                errors = _errors(samples, few, _mixed(samples, fit.parameters))
-                measured.append(
-                    (
-                        "paper's weights used as linear weights",
-                        "rank 59",
-                        took,
-                        errors,
-                        failure,
-                        details,
-                    )
-                )
-    return [
-        Curve(
-            "surface",
-            label,
-            TRUTH,
-            "a surfel",
-            SCIPY,
-            tuple(
-                Point(
-                    name,
-                    setting,
-                    took,
-                    errors[i],
-                    failure,
-                    details | {"residual": errors[2]},
-                )
-                for name, setting, took, errors, failure, details in measured
-            ),
-        )
-        for i, label in enumerate((LINEAR, ROOTS))
-    ]
-
-
-def _cubes(
-    samples: Strip, roots: Array, weight: Array
-) -> Callable[[slice, int], Array]:
-    """Prediction of the paper's weights: cos(theta_i) times the cube of the mixed cube roots."""
-
-    def predict(part: slice, s: int) -> Array:
-        angles = half_difference(*(d[part] for d in samples.directions))
-        return np.asarray(
-            (lookup(roots, *angles) @ weight[s]) ** 3 * samples.cosine[part]
-        )
-
-    return predict
+                name = "paper's weights used as linear weights"
+                point = Point(name, setting, seconds, np.nan, failure, details)
+                results.append((point, _errors(samples, few, mixed)))
+    return _both_spaces("surface", TRUTH, SCIPY, results)
 
 
 def refit_curves(quick: bool) -> list[Curve]:
     """Four mixtures of the BRDFs, from the full linear weights."""
     dictionary, samples, few = _problem(quick)
-    _, full = _fit(
-        samples,
-        Mixture(dictionary.table),
-        "linear",
-    )
+    _, full = _fit(samples, Mixture(dictionary.table), "linear")
     H = nmf(full.parameters, 4, rng=np.random.default_rng(0)).H
-    measured = []
-    took, weight = cpu_time(lambda: scipy_loop(samples, few, channels=3, H=H), few)
-    measured.append((SCIPY, took, weight))
     four = Mixture((dictionary.table @ H.T).astype(np.float32))
+    work = partial(scipy_loop, samples, few, channels=3, H=H)
+    measured = [(SCIPY, *cpu_time(work, few))]
     for mode in ("linear", "perceptual"):
-        took, fit = _fit(samples, four, mode)
-        measured.append((f"skindb {mode}", took, fit.parameters))
-    errors = [
-        _errors(samples, few, _mixed(samples, weight @ H)) for _, _, weight in measured
-    ]
-    return [
-        Curve(
-            "refit",
-            label,
-            TRUTH + ", which four mixtures cannot represent",
-            "a surfel",
-            f"{SCIPY}, 4 bases",
-            tuple(
-                Point(name, "4 bases", took, error[i], "", {"residual": error[2]})
-                for (name, took, _), error in zip(measured, errors, strict=True)
-            ),
+        seconds, fit = _fit(samples, four, mode)
+        measured.append((f"skindb {mode}", seconds, fit.parameters))
+    results = []
+    for name, seconds, weight in measured:
+        point = Point(name, "4 bases", seconds, np.nan)
+        results.append((point, _errors(samples, few, _mixed(samples, weight @ H))))
+    reference = f"{TRUTH}, which four mixtures cannot represent"
+    return _both_spaces("refit", reference, f"{SCIPY}, 4 bases", results)
+
+
+def nmf_curves(quick: bool) -> list[Curve]:
+    """Skindb by number of starts, scikit-learn by iterations; each H is rated in both
+    metrics with the best W.
+    """
+    X, H = _planted_weights(300 if quick else 2000)
+    gram = brdf_metric(embedded_dictionary().table)
+    gram /= np.trace(gram)
+    results = [("planted", "", np.nan, H)]
+    nmf(X[:20], 2, metric=gram, seeds=0, rng=np.random.default_rng(1))  # compiles
+    for name, metric in (("weights", None), ("BRDFs", gram)):
+        for seeds in (0,) if quick else (0, 3, 8):
+            seconds, factors = cpu_time(partial(_by_skindb, X, metric, seeds))
+            method = f"skindb between {name}"
+            results.append((method, f"{1 + seeds} starts", seconds, factors))
+    for solver in ("cd", "mu"):
+        for steps in (10, 200) if quick else (10, 50, 200, 1000):
+            seconds, factors = cpu_time(partial(_by_scikit, X, solver, steps))
+            method = f"scikit-learn {solver}"
+            results.append((method, f"{steps} iterations", seconds, factors))
+    reference = (
+        f"{len(X)} planted mixtures of {COMPONENTS} with 20 % scatter, so that the "
+        "error cannot be zero"
+    )
+    base = "scikit-learn cd, 200 iterations"
+    curves = []
+    for name, metric in (("weights", np.eye(len(gram))), ("BRDFs", gram)):
+        points = [
+            Point(method, setting, seconds, relative_error(X, factors, metric))
+            for method, setting, seconds, factors in results
+        ]
+        error = f"|X - W H| / |X| between {name}"
+        curves.append(Curve("nmf", error, reference, "a factorisation", base, points))
+    return curves
+
+
+def _planted_weights(n: int) -> tuple[Array, Array]:
+    """Weights (n, 59), mixtures of sparse rows H with scatter like that of similar
+    BRDFs, and H.
+    """
+    rng = np.random.default_rng(0)
+    shape = (COMPONENTS, 59)
+    H = np.where(rng.random(shape) < 0.2, rng.uniform(0.2, 1, shape), 0)
+    H[:, :COMPONENTS] += np.eye(COMPONENTS)
+    X = rng.gamma(0.7, 1.0, (n, COMPONENTS)) @ H
+    return X * rng.lognormal(0, 0.2, X.shape), H
+
+
+def _by_skindb(X: Array, metric: Array | None, seeds: int) -> Array:
+    rng = np.random.default_rng(1)
+    return nmf(X, COMPONENTS, metric=metric, seeds=seeds, rng=rng).H
+
+
+def _by_scikit(X: Array, solver: str, steps: int) -> Array:
+    options = {"init": "nndsvda", "tol": 1e-6, "random_state": 0}
+    model = NMF(COMPONENTS, solver=solver, max_iter=steps, **options)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        model.fit(X)
+    return np.asarray(model.components_)
+
+
+def disc_curves(quick: bool) -> list[Curve]:
+    """Averages of tables over the disc of the light, by number of quadrature points."""
+    dictionary = embedded_dictionary()
+    chosen = slice(18, 50, 8)
+    table = np.ascontiguousarray(dictionary.table[..., chosen])
+    names = dictionary.names[chosen]
+    few = Dictionary(names, table, dictionary.grid, dictionary.source)
+    nodes = _random_nodes(150 if quick else 600)
+    exact = _dense_disc(few, nodes, DISC, 100 if quick else 400)
+    convolve_disc(few, DISC, far=(1, 1), near=(1, 1))  # compiles
+    rules = [((1, 4), (1, 4))]
+    if not quick:
+        rules += [(rule, rule) for rule in ((2, 6), (3, 8), (4, 12), (6, 18))]
+    rules.append((FAR_RULE, NEAR_RULE))
+    points = []
+    for far, near in rules:
+        work = partial(convolve_disc, few, DISC, far=far, near=near)
+        seconds, averaged = cpu_time(work)
+        errors = _relative_errors(averaged.table[nodes], exact)
+        details = dict(zip(names, errors.tolist(), strict=True))
+        setting = " and ".join(f"{n} x {m}" for n, m in dict.fromkeys((far, near)))
+        error = float(errors.max())
+        points.append(
+            Point("skindb convolve_disc", setting, seconds, error, "", details)
         )
-        for i, label in enumerate((LINEAR, ROOTS))
-    ]
+    base = points[-1].name
+    error = float(_relative_errors(table[nodes], exact).max())
+    failure = "a lamp is not a point, so sharp lobes become too high and too narrow"
+    points.append(Point("no convolution", "", np.nan, error, failure))
+    count = len(nodes[0])
+    label = f"relative RMS error at {count} nodes, worst of {len(names)} materials"
+    reference = (
+        "averages of interpolated values over a dense disc around either direction"
+    )
+    return [Curve("disc", label, reference, f"{len(names)} tables", base, points)]
+
+
+def _relative_errors(values: Array, exact: Array) -> Array:
+    """RMS errors (materials,) over nodes, over the RMS."""
+    off = np.linalg.norm(values - exact, axis=0)
+    return np.asarray(off / np.linalg.norm(exact, axis=0))
+
+
+def _random_nodes(count: int) -> Nodes:
+    """Indices of random nodes in the lobes, both directions 12 degrees above the horizon."""
+    grid = embedded_dictionary().grid
+    theta_h, theta_d, phi_d = embedded_dictionary().table.shape[:3]
+    rng = np.random.default_rng(5)
+    sizes = (theta_h // 2, theta_d * 2 // 3, phi_d)
+    i, j, k = (rng.integers(0, size, 20 * count) for size in sizes)
+    wi, wo = directions(grid.theta_h[i], grid.theta_d[j], grid.phi_d[k])
+    up = np.flatnonzero(np.minimum(wi[:, 2], wo[:, 2]) > 0.2)[:count]
+    return i[up], j[up], k[up]
+
+
+def _dense_disc(
+    dictionary: Dictionary, nodes: Nodes, angle: float, count: int
+) -> Array:
+    """Means (nodes, materials) over `count` spiral points on the disc around either direction."""
+    grid = dictionary.grid
+    i, j, k = nodes
+    wi, wo = directions(grid.theta_h[i], grid.theta_d[j], grid.phi_d[k])
+    spiral = np.arange(count)
+    radius = np.sqrt((spiral + 0.5) / count) * np.tan(angle)
+    turn = spiral * np.pi * (3 - np.sqrt(5))
+    total = np.zeros((len(i), len(dictionary.names)))
+    for centre, other in ((wi, wo), (wo, wi)):
+        x = _unit(np.cross(centre, [0.3, 0.9, 0.1]))
+        y = np.cross(centre, x)
+        for u, v in zip(radius * np.cos(turn), radius * np.sin(turn), strict=True):
+            moved = _unit(centre + u * x + v * y)
+            angles = half_difference(moved, other)
+            total += lookup(dictionary.table, *angles) / (2 * count)
+    return total

@@ -1,0 +1,384 @@
+"""Curves of subsurface light: the inverse of eq. 5, profiles R(r) and their fits against
+mpmath and Monte Carlo, and the octree against the sum over every pair.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache, partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+
+from skindb.bench.curve import Curve, Point, cpu_time
+from skindb.errors import Fault, InputError
+from skindb.fit.probe_profile import MODELS, ProbeFit, fit_profile
+from skindb.optics.diffusion import (
+    S_MAX,
+    diffuse_reflectance,
+    dipole_profile,
+    dipole_s,
+    reduced_albedo,
+    scattering_coefficients,
+    sigma_tr,
+)
+from skindb.optics.dipole_tree import subsurface_exitance
+from skindb.optics.fresnel import boundary_factor
+from skindb.optics.transport import (
+    ANISOTROPY,
+    Walk,
+    half_space_profile,
+    moment_basis,
+    radial_profile,
+    random_walk,
+)
+from skindb.types import Array
+
+ETA = 1.3
+DISTANCE = (0.5, 1.0, 2.0, 5.0, 10.0)  # transport mean free paths
+WIDTH = 1.05  # rings extend from r / WIDTH to r WIDTH
+NOISY = 0.1  # relative standard error of the random walk above which a ring is ignored
+FAR_OFF = 0.25  # relative error above which a fit counts as failed
+FAILS_WITH_FREE_GAIN = "a free gain has two minima; measure the gain"
+FAILS_WHERE_NEAR = "the profile is wrong where the albedo is low or the fibres are near"
+CANCELLATION = "1 - alpha' is lost to cancellation"
+DIFFUSION = (
+    "the diffusion approximation is invalid within some mean free paths and for "
+    "strong absorption"
+)
+FIBRES = 1 + 0.5 * np.arange(28)  # mm, of the probe
+# sigma_a, sigma_s' [mm-1] of kinds of skin; albedo 0.98 to 0.59
+SKIN = ((0.05, 2.4), (0.17, 2.3), (0.36, 2.9), (0.3, 1.0), (0.54, 0.79))
+RADIUS = 30.0  # of a ball [mm]
+RECEIVERS = 150  # points of comparison on the ball
+LIGHTS = 4
+BALL_SIGMA_TR = np.array([0.55, 0.98, 1.55])  # mm-1
+BALL_R_D = np.array([0.5, 0.3, 0.2])
+PROFILE_REACH_MM = 25.0  # beyond it the profile is below 1e-6 of its integral
+
+
+@lru_cache(maxsize=1)
+def _walk(quick: bool) -> Walk:
+    packets = 40_000 if quick else 200_000
+    max_path = 60.0 if quick else 240.0
+    rng = np.random.default_rng(0)
+    return random_walk(packets, eta=ETA, max_path=max_path, rng=rng)
+
+
+def inverse_curves(quick: bool) -> list[Curve]:
+    """The dipole's s from R_d, from nearly black to nearly white."""
+    n = 20 if quick else 60
+    dark = np.geomspace(1e-6, 0.5, n)
+    bright = 1 - np.geomspace(0.5, 1e-9, n)[1:]
+    diffuse = np.concatenate([dark, bright])
+    exact = np.array([_exact(float(value)) for value in diffuse])
+    count = len(diffuse)
+    dipole_s(diffuse, eta=ETA)  # caches F_dr
+    seconds, (s, _) = cpu_time(partial(dipole_s, diffuse, eta=ETA), count)
+    seconds_of_brentq, of_brentq = cpu_time(partial(_by_brentq, diffuse), count)
+    albedo = reduced_albedo(exact)
+    from_double = np.sqrt(3 * (1 - albedo))
+    from_single = np.sqrt(3 * (1 - albedo.astype(np.float32).astype(np.float64)))
+    s_bright = _exact(0.999)
+    lost = (1 - np.float32(reduced_albedo(s_bright))) / (s_bright**2 / 3) - 1
+    brentq_fails = "1 - R_d(s) is lost to cancellation where R_d is near 1"
+    double_fails = f"{CANCELLATION} near 1"
+    single_fails = (
+        f"{CANCELLATION}: {abs(lost):.0%} off at R_d = 0.999, all of it at 1 - 1e-9"
+    )
+    stored = s.astype(np.float32)
+    brentq_name = "SciPy brentq on eq. 5"
+    points = [
+        _inverse("skindb dipole_s", seconds, s / exact),
+        _inverse(
+            "skindb dipole_s, stored in single precision", seconds, stored / exact
+        ),
+        _inverse(brentq_name, seconds_of_brentq, of_brentq / exact, brentq_fails),
+        _inverse(
+            "alpha' in double precision", seconds, from_double / exact, double_fails
+        ),
+        _inverse(
+            "alpha' in single precision", seconds, from_single / exact, single_fails
+        ),
+    ]
+    label = f"largest relative error of s over {count} R_d from 1e-6 to 1 - 1e-9"
+    reference = "mpmath, 40 digits"
+    return [Curve("inverse", label, reference, "a value", brentq_name, points)]
+
+
+def _inverse(name: str, seconds: float, ratio: Array, failure: str = "") -> Point:
+    """The point of estimates of s with a `ratio` to the exact s."""
+    off = np.abs(ratio - 1)
+    median = {"median": float(np.median(off))}
+    return Point(name, "", seconds, float(off.max()), failure, median)
+
+
+def _by_brentq(diffuse: Array) -> Array:
+    def off(s: float, value: float) -> float:
+        return float(diffuse_reflectance(s, eta=ETA)) - value
+
+    tolerance = {"xtol": 1e-300, "rtol": 1e-15}
+    roots = [brentq(off, 0, S_MAX, args=(value,), **tolerance) for value in diffuse]
+    return np.array(roots)
+
+
+def require_mpmath() -> Any:
+    """Import mpmath; raises `InputError` with the install command if it is missing."""
+    try:
+        import mpmath
+    except ImportError:
+        cure = "pip install 'skindb[bench]', or choose other kernels with --only"
+        raise InputError(
+            Fault("bench inverse", "mpmath must be installed", "no module mpmath", cure)
+        ) from None
+    return mpmath
+
+
+def _exact(value: float) -> float:
+    mpmath = require_mpmath()
+    with mpmath.workdps(40):
+        b = mpmath.mpf(4) / 3 * mpmath.mpf(boundary_factor(ETA))
+        bracket = (mpmath.mpf("1e-12"), mpmath.sqrt(3))
+        target = mpmath.mpf(value)
+
+        def off(s: Any) -> Any:
+            boundary = 1 + mpmath.exp(-b * s)
+            return (1 - s * s / 3) / 2 * boundary * mpmath.exp(-s) - target
+
+        return float(mpmath.findroot(off, bracket, solver="anderson", tol=1e-60))
+
+
+def transport_curves(quick: bool) -> list[Curve]:
+    """R(r) of a medium by model, and by moments of several degrees, from which the
+    table is made.
+    """
+    walk = _walk(quick)
+    points = []
+    r = np.linspace(0.5, 20, 1000)
+    for albedo in (0.7, 0.9) if quick else (0.3, 0.7, 0.9, 0.99):
+        ratio = (1 - albedo) / albedo
+        # in units of 1 / sigma_s', of which a mean free path is `albedo`
+        middle = np.array(DISTANCE) * albedo
+        walked = rings(walk, ratio, middle)
+        ring = across(middle)
+        setting = f"albedo {albedo:g}"
+        for name, model in MODELS.items():
+            model.profile(1.0, ratio, 1.0, eta=ETA)  # makes the table
+            work = partial(model.profile, r, ratio, 1.0, eta=ETA)
+            seconds, _ = cpu_time(work, len(r))
+            profile = model.profile(ring, ratio, 1.0, eta=ETA)
+            mean = ring_mean(profile, middle)
+            points.append(_profile(f"skindb {name}", setting, seconds, mean, walked))
+        for degree in (3, 7, 11) if quick else (3, 5, 7, 9, 11, 13):
+            basis = moment_basis(degree, eta=ETA, anisotropy=ANISOTROPY)
+            seconds, _ = cpu_time(partial(half_space_profile, r, ratio, basis), len(r))
+            with np.errstate(invalid="ignore"):
+                level, kappa = half_space_profile(ring.ravel(), ratio, basis)
+            profile = np.exp(level - kappa * ring.ravel()).reshape(ring.shape)
+            mean = ring_mean(profile, middle)
+            name = f"moments of degree {degree}"
+            points.append(_profile(name, setting, seconds, mean, walked))
+    distances = ", ".join(f"{d:g}" for d in DISTANCE)
+    label = f"RMS over {distances} mean free paths of the relative error of R(r)"
+    noise = f"random walk of {walk.packets:,} photons, with the noise `walk_noise`"
+    base = "skindb dipole, albedo 0.9"
+    return [Curve("transport", label, noise, "a distance", base, points)]
+
+
+def across(middle: Array, width: float = WIDTH) -> Array:
+    """Distances (21, d) from r / width to r width of a ring around each distance r (d,)."""
+    return np.linspace(middle / width, middle * width, 21)
+
+
+def ring_mean(values: Array, middle: Array, width: float = WIDTH) -> Array:
+    """Mean (d,) over each ring of values at `across`, weighted by area."""
+    r = across(middle, width)
+    return np.asarray((values * r).sum(axis=0) / r.sum(axis=0))
+
+
+def rings(
+    walk: Walk, ratio: float, middle: Array, width: float = WIDTH
+) -> tuple[Array, Array]:
+    """R in a ring around each distance, and its relative standard error; sigma_s' = 1,
+    sigma_a = `ratio`.
+    """
+    edges = [np.array([r / width, r * width]) for r in middle]
+    profiles = [radial_profile(walk, ratio, 1.0, edge) for edge in edges]
+    value = np.concatenate([v for v, _ in profiles])
+    error = np.concatenate([e for _, e in profiles])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return value, np.asarray(np.where(value > 0, error / value, np.inf))
+
+
+def _profile(
+    name: str, setting: str, seconds: float, mean: Array, walked: tuple[Array, Array]
+) -> Point:
+    """The point of ring means, compared with values and noise of the random walk."""
+    value, noise = walked
+    clear = (noise < NOISY) & np.isfinite(mean)
+    off = mean[clear] / value[clear] - 1
+    error = float(np.sqrt((off**2).mean()))
+    distances = np.array(DISTANCE)
+    details = {
+        f"at_{d:g}": float(e) for d, e in zip(distances[clear], off, strict=True)
+    }
+    details["walk_noise"] = float(np.sqrt((noise[clear] ** 2).mean()))
+    negative = ", ".join(f"{d:g}" for d in distances[np.isnan(mean)])
+    failure = ""
+    if name.endswith("dipole"):
+        failure = DIFFUSION
+    elif negative:
+        failure = f"negative at {negative} mean free paths (not in the error): too few moments"
+    elif name.startswith("moments") and error > 0.1:
+        failure = f"{error:.0%} off: too few moments"
+    return Point(name, setting, seconds, error, failure, details)
+
+
+def probe_curves(quick: bool) -> list[Curve]:
+    """sigma_tr from the fibres of the probe, by profile model, number of fibres, and
+    known or fitted gain.
+    """
+    walk = _walk(quick)
+    skin = SKIN[1:4:2] if quick else SKIN
+    edges = np.append(FIBRES - 0.25, FIBRES[-1] + 0.25)
+    photons = [radial_profile(walk, a, s, edges) for a, s in skin]
+    true = np.array([sigma_tr(a, s) for a, s in skin])
+    points = []
+    for model in MODELS:
+        MODELS[model].profile(1.0, *SKIN[0], eta=ETA)  # makes the table
+        for free in (False, True):
+            for fibres in (28,) if quick else (4, 6, 8, 12, 28):
+                work = partial(_fits, model, free, fibres, photons)
+                seconds, fits = cpu_time(work, len(skin))
+                off = np.array([fit.sigma_tr for fit in fits]) / true - 1
+                failure = _failure_of_fits(off, free)
+                details = {
+                    f"{a:g}, {s:g}": float(e)
+                    for (a, s), e in zip(skin, off, strict=True)
+                }
+                name = f"skindb {model}, gain {'fitted' if free else 'known'}"
+                setting = f"{fibres} fibres"
+                error = float(np.sqrt(np.nanmean(off**2)))
+                points.append(Point(name, setting, seconds, error, failure, details))
+    label = f"RMS over {len(skin)} kinds of skin of the relative error of sigma_tr"
+    reference = (
+        f"random walk of {walk.packets:,} photons through media of known coefficients"
+    )
+    base = f"skindb dipole, gain known, {len(FIBRES)} fibres"
+    return [Curve("probe", label, reference, "a profile", base, points)]
+
+
+def _fits(
+    model: str, free: bool, fibres: int, photons: Sequence[tuple[Array, Array]]
+) -> list[ProbeFit]:
+    return [
+        fit_profile(
+            FIBRES[:fibres],
+            value[:fibres],
+            error[:fibres],
+            radius=0.0,
+            eta=ETA,
+            model=model,
+            free_gain=free,
+        )
+        for value, error in photons
+    ]
+
+
+def _failure_of_fits(off: Array, free: bool) -> str:
+    largest = np.nanmax(np.abs(off))
+    if largest > FAR_OFF:
+        reason = FAILS_WITH_FREE_GAIN if free else FAILS_WHERE_NEAR
+        return f"{largest:.0%} off in one medium: {reason}"
+    if not np.isfinite(off).all():
+        return "some profiles were not fitted, see `more`"
+    return ""
+
+
+def subsurface_curves(quick: bool) -> list[Curve]:
+    """The octree by opening tolerance and point spacing, for hard shadows 4 mm wide."""
+    spacings = (1.6,) if quick else (0.5, 0.8, 1.6)
+    fine = 0.4 if quick else 0.15
+    fine_ball = _ball(fine)
+    tree = []
+    spaced = []
+    _octree(*_ball(20.0), 0.1)  # compiles
+    for spacing in spacings:
+        ball = _ball(spacing)
+        points = ball[0]
+        chosen = np.random.default_rng(4).integers(0, len(points), RECEIVERS)
+        receivers = points[chosen]
+        seconds, every_pair = cpu_time(partial(_every_pair, receivers, *ball))
+        seconds *= len(points) / RECEIVERS
+        exact = _every_pair(receivers, *fine_ball)
+        name = "every pair by NumPy"
+        setting = f"{spacing} mm"
+        tree.append(Point(name, setting, seconds, np.nan))
+        spaced.append(Point(name, setting, seconds, _rms(every_pair, exact)))
+        for tolerance in (0.05, 0.2) if quick else (0.02, 0.05, 0.1, 0.2, 0.4):
+            seconds, exitance = cpu_time(partial(_octree, *ball, tolerance))
+            at_receivers = exitance[:, chosen]
+            name = f"skindb octree, {spacing} mm"
+            setting = f"tolerance {tolerance}"
+            tree.append(Point(name, setting, seconds, _rms(at_receivers, every_pair)))
+            spaced.append(Point(name, setting, seconds, _rms(at_receivers, exact)))
+    base = f"every pair by NumPy, {spacings[0]} mm"
+    scene = f"{LIGHTS} lights on a ball of {RADIUS:g} mm"
+    error = "RMS error of the exitance over its RMS"
+    same = f"every pair of the same points ({RECEIVERS} receivers)"
+    finer = (
+        f"every pair of points {fine} mm apart, so that the error of the spacing is "
+        "included"
+    )
+    return [
+        Curve("subsurface", error, same, scene, base, tree),
+        Curve("subsurface", error, finer, scene, base, spaced),
+    ]
+
+
+def _ball(spacing: float) -> tuple[Array, Array, Array]:
+    """Points (n, 3) of a spiral on the ball, their areas and their irradiance (n, lights)."""
+    n = round(4 * np.pi * RADIUS**2 / spacing**2)
+    z = 1 - (2 * np.arange(n) + 1) / n
+    phi = np.pi * (1 + 5**0.5) * (np.arange(n) + 0.5)
+    r = np.sqrt(1 - z * z)
+    points = RADIUS * np.stack([r * np.cos(phi), r * np.sin(phi), z], axis=1)
+    light = np.random.default_rng(3).normal(size=(3, LIGHTS))
+    light /= np.linalg.norm(light, axis=0)
+    stripes = np.sin(points[:, 1:2] * np.pi / 4 + np.arange(LIGHTS)) > 0
+    irradiance = np.maximum(points @ light / RADIUS, 0) * stripes
+    return points, np.full(n, spacing**2), irradiance
+
+
+def _octree(
+    points: Array, areas: Array, irradiance: Array, tolerance: float
+) -> NDArray[np.float32]:
+    s = np.tile(dipole_s(BALL_R_D, eta=ETA)[0], (len(points), 1))
+    transport = np.tile(BALL_SIGMA_TR, (len(points), 1))
+    return subsurface_exitance(
+        points, areas, irradiance, s, transport, eta=ETA, tolerance=tolerance
+    )
+
+
+def _every_pair(
+    receivers: Array, points: Array, areas: Array, irradiance: Array
+) -> Array:
+    """Exitance (lights, receivers, 3) with the kernel normalised by its sum, as in
+    `subsurface_exitance`.
+    """
+    s = dipole_s(BALL_R_D, eta=ETA)[0]
+    absorbed, scattered = scattering_coefficients(s, BALL_SIGMA_TR)
+    diffuse = diffuse_reflectance(s, eta=ETA)
+    exitance = np.empty((LIGHTS, len(receivers), 3))
+    for i, place in enumerate(receivers):
+        near = np.flatnonzero(((points - place) ** 2).sum(axis=1) < PROFILE_REACH_MM**2)
+        r = np.linalg.norm(points[near] - place, axis=1)[:, None]
+        kernel = dipole_profile(r, absorbed, scattered, eta=ETA) * areas[near, None]
+        exitance[:, i] = irradiance[near].T @ kernel / kernel.sum(axis=0) * diffuse
+    return exitance
+
+
+def _rms(values: Array, exact: Array) -> float:
+    return float(np.sqrt(((values - exact) ** 2).mean() / (exact**2).mean()))
