@@ -4,6 +4,7 @@ HYPOTHESIS_PROFILE=search draws new ones.
 
 from __future__ import annotations
 
+import gc
 import os
 import shutil
 import sys
@@ -19,9 +20,20 @@ from hypothesis import settings
 import skindb
 from skindb.threads import one_blas_thread
 
-settings.register_profile("same", derandomize=True)
-settings.register_profile("search", derandomize=False)
+settings.register_profile("same", derandomize=True, deadline=None)
+settings.register_profile("search", derandomize=False, deadline=None)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "same"))
+
+
+def pytest_configure():
+    """Modules and items live until the end: the collector of garbage need not look at them."""
+    gc.disable()
+
+
+def pytest_collection_finish():
+    """See `pytest_configure`."""
+    gc.freeze()
+    gc.enable()
 
 
 def pytest_collection_modifyitems(items):

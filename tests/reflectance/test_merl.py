@@ -67,12 +67,12 @@ def test_read_merl__damage_is_one_line(tmp_path, damage, message):
 
 
 @pytest.mark.parametrize(
-    "wrong",
-    [np.full((*SHAPE, 3), -1.0), np.full((*SHAPE, 3), np.nan), np.ones((90, 90, 180))],
+    ("shape", "value"),
+    [((*SHAPE, 3), -1.0), ((*SHAPE, 3), np.nan), ((90, 90, 180), 1.0)],
 )
-def test_write_merl__refuses_what_is_not_a_table(tmp_path, wrong):
+def test_write_merl__refuses_what_is_not_a_table(tmp_path, shape, value):
     with pytest.raises(ValueError, match="a MERL table must have the shape"):
-        write_merl(tmp_path / "a.binary", wrong)
+        write_merl(tmp_path / "a.binary", np.full(shape, value))
 
 
 def test_read_merl__no_such_file(tmp_path):

@@ -31,7 +31,6 @@ from skindb.workflow.derive import groups_of
 
 pytestmark = pytest.mark.slow
 
-distributed = pytest.importorskip("distributed")
 SMALL = {"takes": 2, "cameras": 3, "lights": 12, "width": 48, "height": 60}
 GIVEN = {"k": 2, "hold_out_lights": 0.1}
 # seals of the inputs hold their time of creation
@@ -57,6 +56,7 @@ def address():
         "threads_per_worker": 1,
         "dashboard_address": "127.0.0.1:0",
     }
+    distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(**options) as cluster:
         yield cluster.scheduler_address
 
