@@ -7,10 +7,12 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from http.client import HTTPConnection, HTTPException
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from urllib.parse import urlsplit
+
+from waiting import PATIENCE_SECONDS
 
 REFUSED = {"403": b"AccessDenied", "500": b"InternalError", "503": b"SlowDown"}
 FAULTS = (
@@ -29,8 +31,6 @@ class FaultyProxy(ThreadingHTTPServer):
 
     Parameters
     ----------
-    late_s
-        Time until a late answer fails.
     without
         Headers that are not forwarded.
     delay_s
@@ -46,7 +46,6 @@ class FaultyProxy(ThreadingHTTPServer):
         fraction=0.0,
         faults=FAULTS,
         seed=0,
-        late_s=1.0,
         delay_s=0.0,
         without=(),
     ) -> None:
@@ -55,7 +54,6 @@ class FaultyProxy(ThreadingHTTPServer):
         self.fraction = fraction
         self.faults = faults
         self.without = without
-        self.late_s = late_s
         self.delay_s = delay_s
         self.address = f"http://127.0.0.1:{self.server_port}"
         self.requests: list[tuple[str, str]] = []  # method and path
@@ -110,13 +108,19 @@ class _Handler(BaseHTTPRequestHandler):
             return self._end()
         status, headers, answer = self._forward(body)
         if fault == "late answer":
-            time.sleep(self.server.late_s)
+            self._wait_until_the_client_gives_up()
         if fault in ("lost answer", "late answer"):
             return self._end()
         if fault == "half an answer":
             self._answer(status, headers, answer[: len(answer) // 2])
             return self._end()
         return self._answer(status, headers, answer)
+
+    def _wait_until_the_client_gives_up(self) -> None:
+        """The client closes the connection, of which it expects nothing any more."""
+        self.connection.settimeout(PATIENCE_SECONDS)
+        with suppress(ConnectionError):
+            self.connection.recv(1)
 
     def _read_request(self) -> bool:
         self.raw_requestline = self.rfile.readline(65537)

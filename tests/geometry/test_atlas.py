@@ -182,7 +182,7 @@ def test_disc_atlas__which_weights(height, seed, share, intrinsic):
     assert disc_atlas(v, f)[1]["intrinsic"] == intrinsic
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(st.floats(0, 60), st.integers(0, 1000))
 def test_disc_atlas__never_folds_however_obtuse(height, seed):
     v, f = creased(height, seed)

@@ -90,7 +90,7 @@ def test_pixel_rays__pass_through_the_projected_points(lens):
     np.testing.assert_allclose(pixel_rays(pixels, K, R, lens), towards, atol=ROUND_TRIP)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @example(0.0, 5e-324, 0.0, 0.0, 0.0)
 @given(
     st.floats(-0.4, 0.4),

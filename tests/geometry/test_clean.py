@@ -307,7 +307,7 @@ LATTICE = np.array([[x, y, 0.0] for x in range(4) for y in range(3)])
     "points",
     [np.random.default_rng(3).normal(size=(12, 3)) * 10, LATTICE, LATTICE // 2],
 )
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.lists(st.tuples(*[st.integers(0, 11)] * 3), min_size=1, max_size=40))
 def test_clean_mesh__any_rubbish_becomes_sound_or_is_refused(points, faces):
     try:

@@ -173,7 +173,7 @@ def test_push_pull__keeps_what_is_known_and_fills_the_rest(shape):
     assert (confidence <= 1).all()
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(1, 20), st.integers(1, 20), st.integers(0, 1000))
 def test_push_pull__constant_stays_constant(height, width, seed):
     rng = np.random.default_rng(seed)

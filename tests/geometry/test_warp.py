@@ -323,7 +323,7 @@ def test_fit_warp__of_swapped_points_does_not_fold(swapped):
     assert _factor(warp, EVERYWHERE).min() > 0
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     seed=st.integers(0, 2**32 - 1),
     count=st.integers(0, 20),

@@ -7,7 +7,6 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
-import time
 from contextlib import contextmanager
 
 import imagecodecs
@@ -15,6 +14,7 @@ import pytest
 import trimesh
 from devices_pair import CAMERAS, EXPOSURES, LIGHTS, OVERRIDE, subject_folder, value_of
 from served_devices import Server
+from waiting import wait_until
 
 from skindb.clock import SystemClock
 from skindb.hw.cameras import FolderCameras
@@ -29,7 +29,6 @@ from skindb.virtual.laboratory import Laboratory
 pytestmark = pytest.mark.slow
 
 SECONDS = 1.2  # of the sequence
-PATIENCE_SECONDS = 120.0  # of a test for another process
 PERSON = Subject(
     "S1", "2026-01-01T10:00:00+00:00", {"scope": ["fit"], "reference": "none"}
 )
@@ -76,13 +75,6 @@ def _served_laboratory(setup, watched):
         yield laboratory, server.url
 
 
-def _until(condition):
-    end = time.monotonic() + PATIENCE_SECONDS
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.01)
-
-
 def _kill(laboratory, url, setup, out, frames):
     """Start a session in another process, and kill it when a camera has so many frames,
     during that step.
@@ -99,13 +91,13 @@ def _kill(laboratory, url, setup, out, frames):
     ]
     process = subprocess.Popen(command, env={"PYTHONPATH": ":".join(sys.path)})
     taken = laboratory.watched / "c1"
-    _until(
+    wait_until(
         lambda: len(list(taken.glob("*.png"))) >= frames or process.poll() is not None
     )
     assert process.poll() is None
     process.send_signal(signal.SIGKILL)
     process.wait()
-    _until(lambda: laboratory.dome.state != "running")  # by the watchdog
+    wait_until(lambda: laboratory.dome.state != "running")  # by the watchdog
     assert laboratory.dome.on is None
     laboratory.dome.faults = DeviceFaults()
 

@@ -25,7 +25,7 @@ def statsmodels():
     return pytest.importorskip("statsmodels.api")
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(st.lists(st.floats(-1e6, 1e6), min_size=2, max_size=40), st.integers(0, 40))
 def test_moments__parts_add_up_to_the_whole(values, cut):
     x = np.array(values)

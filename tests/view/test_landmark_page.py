@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import shutil
-import time
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import numpy as np
 import pytest
 import trimesh
 from page_session import Session, running
+from waiting import PATIENCE_SECONDS, wait_until
 
 from skindb.format.folder import read_capture
 from skindb.geometry.scan import Crop
@@ -70,6 +70,7 @@ def served(folder):
 
 def opened(browser, address, *, width=860, height=500):
     page = browser.new_page(viewport={"width": width, "height": height})
+    page.set_default_timeout(1000 * PATIENCE_SECONDS)
     page.problems = []
     page.on(
         "console",
@@ -169,10 +170,8 @@ def test_page__saves_what_ingest_reads(browser, address, head, tmp_path):
     page.get_by_label("y from").fill("-105")
     # its own file is replaced without a question
     page.get_by_role("button", name="Save", exact=True).click()
-    deadline = time.monotonic() + 30
-    while json.loads((tmp_path / "landmarks.crop.json").read_text())["low"][1] != -105:
-        assert time.monotonic() < deadline
-        page.wait_for_timeout(50)
+    crop_file = tmp_path / "landmarks.crop.json"
+    wait_until(lambda: json.loads(crop_file.read_text())["low"][1] == -105)
     status(page, "20 points were saved")
     page.get_by_role("button", name="Remove chin").click()
     status(page, "The changes since the last save are not saved yet.")

@@ -13,6 +13,7 @@ import pytest
 from page_session import running
 from scipy.ndimage import binary_erosion
 from small_face import LIGHTS, small_face
+from waiting import PATIENCE_SECONDS
 
 from skindb.reflectance.tables import kernel_tables, stored_brdf
 from skindb.render.image import decode_srgb
@@ -85,6 +86,7 @@ def page_file(model, tmp_path_factory):
 # small: every pixel is computed on the CPU
 def opened(browser, address, *, width=620, height=320):
     page = browser.new_page(viewport={"width": width, "height": height})
+    page.set_default_timeout(1000 * PATIENCE_SECONDS)
     page.problems = []
     page.on(
         "console",

@@ -10,7 +10,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from functools import partial
 from pathlib import Path
 
@@ -19,13 +18,13 @@ import dask
 import numpy as np
 import pytest
 from threadpoolctl import threadpool_info
+from waiting import wait_until
 
 import skindb
 from skindb.errors import Fault, InputError
 from skindb.workflow import map_takes, results_of
 from skindb.workflow.takes import faults_of
 
-PATIENCE_SECONDS = 120.0  # of a test for other processes
 FAULT = Fault("a.exr", "must be readable", "nothing", "write it again")
 
 
@@ -44,11 +43,17 @@ def _mixed(take: int) -> int:
     return take
 
 
-def _killed(take: int) -> int:
-    """The third take kills its process while another take is in progress."""
-    time.sleep(0.2)
+def _killed(folder: Path, take: int) -> int:
+    """The third take kills its process while the fourth is in progress, which ends
+    with it and is tried again.
+    """
+    begun = folder / "fourth"
     if take == 2:
+        wait_until(begun.exists)
         os.kill(os.getpid(), signal.SIGKILL)
+    if take == 3 and not begun.exists():
+        begun.touch()
+        threading.Event().wait()
     return take
 
 
@@ -92,7 +97,7 @@ def test_map_takes__a_process_that_dies_while_the_caller_is_busy():
         seen.append(take)
         if len(seen) == 2:
             os.kill(process, signal.SIGKILL)
-            _wait_until(lambda process=process: not _is_running(process))
+            wait_until(lambda process=process: not _is_running(process))
     assert sorted(seen) == list(range(8))
 
 
@@ -141,8 +146,9 @@ def test_map_takes__functions_of_a_notebook():
 
 
 @pytest.mark.slow
-def test_map_takes__a_killed_process_fails_its_take_alone():
-    outcomes = {one.take: one for one in map_takes(_killed, range(6), workers=2)}
+def test_map_takes__a_killed_process_fails_its_take_alone(tmp_path):
+    call = partial(_killed, tmp_path)
+    outcomes = {one.take: one for one in map_takes(call, range(6), workers=2)}
     assert {take for take, one in outcomes.items() if one.error is None} == {
         0,
         1,
@@ -159,27 +165,27 @@ def test_map_takes__a_killed_process_fails_its_take_alone():
 def test_map_takes__who_stops_asking_stops_the_work(tmp_path):
     def mark(take: int) -> int:
         (tmp_path / str(take)).touch()
-        while take and not (tmp_path / "closed").exists():
-            time.sleep(0.01)
+        if take:
+            wait_until((tmp_path / "closed").exists)
         return os.getpid()
 
     outcomes = map_takes(mark, range(20), workers=2)
     workers = {next(outcomes).result()}
     outcomes.close()
-    _wait_until(lambda: not any(map(_is_running, workers)))
+    wait_until(lambda: not any(map(_is_running, workers)))
     (tmp_path / "closed").touch()
     # those that were being processed, and the file of this test
     assert len(list(tmp_path.iterdir())) <= 1 + 3
 
 
 DRIVER = """
-import os, sys, time
+import os, sys, threading
 from pathlib import Path
 from skindb.workflow import map_takes
 
 def note_and_wait(take):
     Path(sys.argv[1], str(take)).write_text(str(os.getpid()))
-    time.sleep(600)
+    threading.Event().wait()
 
 list(map_takes(note_and_wait, range(4), workers=2))
 """
@@ -191,23 +197,17 @@ def test_map_takes__worker_processes_end_with_a_caller_that_is_killed(tmp_path):
     memory for ten minutes.
     """
     with subprocess.Popen([sys.executable, "-c", DRIVER, str(tmp_path)]) as driver:
-        _wait_until(
+        wait_until(
             lambda: sum(bool(path.read_text()) for path in tmp_path.iterdir()) >= 2
         )
         driver.kill()
     workers = [int(path.read_text()) for path in tmp_path.iterdir()]
-    _wait_until(lambda: not any(map(_is_running, workers)))
-    alive = [worker for worker in workers if _is_running(worker)]
-    for worker in alive:
-        os.kill(worker, signal.SIGKILL)
-    assert (len(workers), alive) == (2, [])
-
-
-def _wait_until(condition):
-    """Wait for other processes, at most two minutes."""
-    end = time.monotonic() + PATIENCE_SECONDS
-    while not condition() and time.monotonic() < end:
-        time.sleep(0.01)
+    assert len(workers) == 2
+    try:
+        wait_until(lambda: not any(map(_is_running, workers)))
+    finally:
+        for worker in filter(_is_running, workers):
+            os.kill(worker, signal.SIGKILL)
 
 
 def _is_running(process):
