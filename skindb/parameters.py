@@ -20,11 +20,14 @@ from skindb.limits import (
     MAX_CAMERAS,
     MAX_DEMO_TAKES,
     MAX_FRAME_SIDE_PX,
+    MAX_FRAMES,
     MAX_LIGHTS,
+    MAX_PERMUTATIONS,
     MAX_PHOTOGRAPHS,
     MAX_PLACEMENTS,
     MAX_SEED,
     MAX_SPACING_MM,
+    MAX_VIRTUAL_PIXELS,
 )
 
 # The surface of skin reflects 4 to 7 % of the light (Anderson and Parrish 1981, J.
@@ -32,6 +35,8 @@ from skindb.limits import (
 # distribution, and at its 95 % limit all of the mean of both is even.
 EVEN_REFLECTION = 0.055
 VIRTUAL_SEED = 2005
+VIRTUAL_EXPOSURES = 2  # of every view of the virtual dome
+CONDITIONS = ("normal", "lotion", "powder", "sweat", "hot", "cold", "makeup", "tan")
 # Standard error of a light relative to the target along each axis, chosen in advance
 # for a careful calibration. In generated captures with errors of 0.6 mm of lights and
 # of cameras, intensities have z-scores of 0.9 to 1.2 with it.
@@ -60,6 +65,35 @@ class Option:
 def option(default: Any, help: str, **limits: Any) -> Any:  # noqa: A002
     """A field of a record with this default; `limits` are those of `Option`."""
     return field(default=default, metadata={"option": Option(help, **limits)})
+
+
+def group_option() -> Any:
+    """Field of a record for the attribute or trait of the groups."""
+    text = "Attribute or trait by which takes are grouped: gender, age, ..."
+    return option(None, text)
+
+
+def compared_option() -> Any:
+    """Field of a record for the attribute or trait that is compared, which has no default."""
+    text = "Attribute or trait that is compared: gender, age, ..."
+    return option(MISSING, text)
+
+
+def adjust_option() -> Any:
+    """Field of a record for attributes that a comparison is adjusted for."""
+    text = "Attributes that the comparison adjusts for, separated by commas."
+    return option((), text, metavar="NAME,...", show_default=False)
+
+
+def permutations_option(default: int = 10_000) -> Any:
+    """Field of a record for the number of permutations."""
+    text = "Largest number of permutations for p values."
+    return option(default, text, minimum=100, maximum=MAX_PERMUTATIONS)
+
+
+def seed_option(purpose: str) -> Any:
+    """Field of a record for the random seed."""
+    return option(0, f"Random seed for {purpose}.", minimum=0, maximum=MAX_SEED)
 
 
 def option_of(record: type, name: str) -> Option:
@@ -282,6 +316,32 @@ class IngestParameters(Limited):
     )
 
 
+def require_sizes(lights: int, cameras: int, width: int, height: int) -> None:
+    """Require sizes within the limits of captures, before memory is allocated for them.
+
+    Raises
+    ------
+    InputError
+        With the first size beyond its limit.
+    """
+    views = MAX_FRAMES // VIRTUAL_EXPOSURES
+    for what, size, most in (
+        ("lights", lights, MAX_LIGHTS),
+        ("cameras", cameras, MAX_CAMERAS),
+        ("lights x cameras", lights * cameras, views),
+        ("width x height", width * height, MAX_VIRTUAL_PIXELS),
+    ):
+        if not 1 <= size <= most:
+            raise InputError(
+                Fault(
+                    "virtual dome",
+                    f"{what} must be 1 to {most:,}",
+                    f"{size:,}",
+                    "choose another number",
+                )
+            )
+
+
 @dataclass(frozen=True)
 class SimulationParameters(Limited):
     """Parameters of virtual captures: the dome, its frames in pixels, and the skin.
@@ -316,6 +376,11 @@ class SimulationParameters(Limited):
     )
     subsurface: bool = option(False, "Simulate subsurface transport by the dipole.")
     seed: int = option(VIRTUAL_SEED, "Noise seed.", minimum=0, maximum=MAX_SEED)
+
+    def __post_init__(self) -> None:
+        """Check the limits of each size and of their products."""
+        super().__post_init__()
+        require_sizes(self.lights, self.cameras, self.width, self.height)
 
 
 @dataclass(frozen=True)

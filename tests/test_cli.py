@@ -9,6 +9,8 @@ import shutil
 import subprocess
 import sys
 from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import fields
+from typing import get_type_hints
 from unittest import mock
 
 import click
@@ -17,9 +19,11 @@ import pytest
 from permissions import open_to_others
 
 import skindb
+from skindb.analysis import STUDIES
 from skindb.cli import cli, main
 from skindb.cli.fitting import _fit_lines
 from skindb.cli.shared import fault_lines
+from skindb.cli.studies import declarations
 from skindb.errors import Fault
 from skindb.render.image import read_exr, read_png
 
@@ -585,6 +589,41 @@ def test_import__is_fast_and_does_nothing(module):
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )
     assert done.stdout.strip() == "[]"
+
+
+HELP_OF_ALL = """
+import sys
+from click.testing import CliRunner
+from skindb.cli import cli
+from skindb.cli.studies import declarations
+run = CliRunner().invoke
+calls = [[], *([name] for name in cli.commands)]
+calls += [["analyze", "db", study] for study in declarations()]
+assert not any(run(cli, [*call, "--help"]).exit_code for call in calls)
+heavy = {"numba", "scipy", "sklearn", "dask", "zarr", "xarray", "matplotlib"}
+science = {"analysis", "fit", "render", "reflectance", "optics", "geometry", "numerics"}
+print(sorted((heavy | {f"skindb.{name}" for name in science}) & set(sys.modules)))
+"""
+
+
+def test_help__of_every_command_and_study_imports_no_science():
+    done = subprocess.run(
+        [sys.executable, "-c", HELP_OF_ALL], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == "[]"
+
+
+def test_declarations__are_those_of_the_studies():
+    assert [*declarations()] == [*STUDIES]
+    for name, study in STUDIES.items():
+        declared = declarations()[name]
+        assert declared.description == study.description
+        assert get_type_hints(declared.parameters) == get_type_hints(study.parameters)
+        defaults = [
+            [(spec.name, spec.default, spec.metadata) for spec in fields(record)]
+            for record in (declared.parameters, study.parameters)
+        ]
+        assert defaults[0] == defaults[1]
 
 
 @pytest.mark.slow

@@ -13,19 +13,12 @@ import xarray as xr
 
 from skindb import plots
 from skindb.analysis import texture
-from skindb.analysis.study import (
-    Population,
-    Results,
-    Study,
-    Table,
-    each_take,
-    group_option,
-    table_of,
-)
+from skindb.analysis.study import Population, Results, Study, Table, each_take, table_of
 from skindb.analysis.subjects import groups_by, takes_to_compare
 from skindb.analysis.summary import SAMPLED
 from skindb.errors import Fault, InputError
 from skindb.numerics.statistics import Moments
+from skindb.parameters import group_option
 from skindb.schema import dataset
 from skindb.schema.cohort import require_same_fit
 from skindb.schema.regions import FACE

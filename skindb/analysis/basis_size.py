@@ -15,17 +15,10 @@ from numpy.typing import NDArray
 
 from skindb import plots
 from skindb.analysis.population_basis import same_dictionary
-from skindb.analysis.study import (
-    Population,
-    Results,
-    Study,
-    each_take,
-    seed_option,
-    shared_once,
-)
+from skindb.analysis.study import Population, Results, Study, each_take, shared_once
 from skindb.numerics.statistics import bootstrap_interval
 from skindb.optics.fresnel import fresnel_transmittance
-from skindb.parameters import DICTIONARY_HELP, option
+from skindb.parameters import DICTIONARY_HELP, option, seed_option
 from skindb.reflectance.basis import Systems, factor_reflectance, residuals
 from skindb.reflectance.rows import basis_rows
 from skindb.reflectance.tables import TableGrid

@@ -19,15 +19,7 @@ from numpy.typing import NDArray
 
 from skindb.analysis.brdf_plots import plot_space
 from skindb.analysis.population_basis import population_basis
-from skindb.analysis.study import (
-    Population,
-    Results,
-    Study,
-    compared_option,
-    each_item,
-    permutations_option,
-    seed_option,
-)
+from skindb.analysis.study import Population, Results, Study, each_item
 from skindb.analysis.subjects import (
     NORMAL,
     OTHER,
@@ -46,7 +38,13 @@ from skindb.numerics.inference import (
     within_subjects_p,
 )
 from skindb.numerics.statistics import known_mean
-from skindb.parameters import DICTIONARY_HELP, option
+from skindb.parameters import (
+    DICTIONARY_HELP,
+    compared_option,
+    option,
+    permutations_option,
+    seed_option,
+)
 from skindb.reflectance.tables import TableGrid, brdf_coords, brdf_metric, stored_brdf
 from skindb.schema import dataset
 from skindb.schema.cohort import require_same_fit

@@ -24,19 +24,12 @@ from sklearn.exceptions import ConvergenceWarning
 from skindb import plots
 from skindb.analysis.components import mean_face
 from skindb.analysis.regions import map_regions
-from skindb.analysis.study import (
-    Population,
-    Results,
-    Study,
-    each_take,
-    group_option,
-    seed_option,
-    table_of,
-)
+from skindb.analysis.study import Population, Results, Study, each_take, table_of
 from skindb.analysis.subjects import groups_by, takes_to_compare
 from skindb.analysis.texture import COVERED, DARKEST, LEAST_COVERED, MAPPED
 from skindb.errors import Fault, InputError
 from skindb.numerics.statistics import Moments, known_mean
+from skindb.parameters import group_option, seed_option
 from skindb.schema import dataset
 from skindb.schema.cohort import require_same_fit
 from skindb.schema.notes import note

@@ -12,18 +12,11 @@ from scipy import stats
 
 from skindb import plots
 from skindb.analysis.contrasts import CHANNELS, SURFACE, Quantities, quantities_of
-from skindb.analysis.study import (
-    Population,
-    Results,
-    Study,
-    Table,
-    permutations_option,
-    seed_option,
-    table_of,
-)
+from skindb.analysis.study import Population, Results, Study, Table, table_of
 from skindb.analysis.subjects import takes_to_compare
 from skindb.errors import Fault, InputError
 from skindb.numerics.statistics import benjamini_hochberg, known_mean
+from skindb.parameters import permutations_option, seed_option
 from skindb.schema import dataset
 from skindb.schema.cohort import require_same_fit, require_takes
 from skindb.schema.regions import FACE

@@ -23,16 +23,7 @@ from skindb.analysis.contrasts import (
     other_attributes,
 )
 from skindb.analysis.group_effects import SIGNIFICANT
-from skindb.analysis.study import (
-    Population,
-    Results,
-    Study,
-    adjust_option,
-    compared_option,
-    each_take,
-    permutations_option,
-    seed_option,
-)
+from skindb.analysis.study import Population, Results, Study, each_take
 from skindb.analysis.subjects import notes_on_attributes, subjects_of
 from skindb.errors import Fault, InputError
 from skindb.numerics.inference import (
@@ -40,6 +31,12 @@ from skindb.numerics.inference import (
     paired_effects,
     permutation_p,
     sign_flip_p,
+)
+from skindb.parameters import (
+    adjust_option,
+    compared_option,
+    permutations_option,
+    seed_option,
 )
 from skindb.schema import dataset
 from skindb.schema.cohort import require_same_fit, require_takes

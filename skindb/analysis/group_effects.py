@@ -24,17 +24,7 @@ from skindb.analysis.contrasts import (
     other_attributes,
     quantities_of,
 )
-from skindb.analysis.study import (
-    Population,
-    Results,
-    Study,
-    Table,
-    adjust_option,
-    compared_option,
-    permutations_option,
-    seed_option,
-    table_of,
-)
+from skindb.analysis.study import Population, Results, Study, Table, table_of
 from skindb.analysis.subjects import notes_on_attributes, subjects_of
 from skindb.errors import Fault, InputError
 from skindb.numerics.inference import (
@@ -48,6 +38,12 @@ from skindb.numerics.statistics import (
     benjamini_hochberg,
     detectable_difference,
     known_mean,
+)
+from skindb.parameters import (
+    adjust_option,
+    compared_option,
+    permutations_option,
+    seed_option,
 )
 from skindb.schema import dataset
 from skindb.schema.cohort import require_same_fit, require_takes

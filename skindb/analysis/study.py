@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import MISSING, dataclass, field
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
@@ -17,8 +17,6 @@ import xarray as xr
 from dask.base import compute
 from dask.delayed import Delayed, delayed
 
-from skindb.limits import MAX_PERMUTATIONS, MAX_SEED
-from skindb.parameters import option
 from skindb.schema.notes import Note
 from skindb.threads import c_contiguous
 from skindb.types import Array
@@ -194,32 +192,3 @@ def table_of(table: xr.Dataset, names: Sequence[str], dims: Sequence[str]) -> Ta
     values = zip(*columns, strict=True)
     rows = [[*key, *row] for key, row in zip(keys, values, strict=True)]
     return [*dims, *names], rows
-
-
-def group_option() -> Any:
-    """Field of a record for the attribute or trait of the groups."""
-    text = "Attribute or trait by which takes are grouped: gender, age, ..."
-    return option(None, text)
-
-
-def compared_option() -> Any:
-    """Field of a record for the attribute or trait that is compared, which has no default."""
-    text = "Attribute or trait that is compared: gender, age, ..."
-    return option(MISSING, text)
-
-
-def adjust_option() -> Any:
-    """Field of a record for attributes that a comparison is adjusted for."""
-    text = "Attributes that the comparison adjusts for, separated by commas."
-    return option((), text, metavar="NAME,...", show_default=False)
-
-
-def permutations_option(default: int = 10_000) -> Any:
-    """Field of a record for the number of permutations."""
-    text = "Largest number of permutations for p values."
-    return option(default, text, minimum=100, maximum=MAX_PERMUTATIONS)
-
-
-def seed_option(purpose: str) -> Any:
-    """Field of a record for the random seed."""
-    return option(0, f"Random seed for {purpose}.", minimum=0, maximum=MAX_SEED)

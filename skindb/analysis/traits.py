@@ -15,15 +15,7 @@ import xarray as xr
 from skindb import plots
 from skindb.analysis.albedo import albedo_and_texture, quantiles
 from skindb.analysis.population_basis import population_basis
-from skindb.analysis.study import (
-    Population,
-    Results,
-    Study,
-    Table,
-    adjust_option,
-    seed_option,
-    table_of,
-)
+from skindb.analysis.study import Population, Results, Study, Table, table_of
 from skindb.analysis.subjects import (
     Subjects,
     known_traits,
@@ -39,7 +31,7 @@ from skindb.analysis.summary import SAMPLED
 from skindb.errors import Fault, InputError
 from skindb.numerics.inference import missing_patterns
 from skindb.numerics.statistics import known_mean
-from skindb.parameters import DICTIONARY_HELP, option
+from skindb.parameters import DICTIONARY_HELP, adjust_option, option, seed_option
 from skindb.schema import IDENTIFIED, dataset
 from skindb.schema.cohort import require_same_fit
 from skindb.schema.regions import FACE

@@ -11,16 +11,10 @@ from numpy.typing import NDArray
 
 from skindb import plots
 from skindb.analysis.contrasts import FEW
-from skindb.analysis.study import (
-    Population,
-    Results,
-    Study,
-    Table,
-    group_option,
-    table_of,
-)
+from skindb.analysis.study import Population, Results, Study, Table, table_of
 from skindb.analysis.subjects import groups_by, takes_to_compare
 from skindb.numerics.statistics import Moments, variance_components
+from skindb.parameters import group_option
 from skindb.schema import IDENTIFIED, ProbeStatus, dataset
 from skindb.schema.cohort import require_same_fit, require_takes
 from skindb.types import Array

@@ -20,8 +20,9 @@ from skindb.cli.captures import demo, ingest, simulate
 from skindb.cli.fitting import dictionary_command, fit
 from skindb.cli.landmarks import landmarks
 from skindb.cli.pictures import compare, export, render, show
-from skindb.cli.population import analyze, edit, register
+from skindb.cli.population import edit, register
 from skindb.cli.shared import echo_json, fault_lines
+from skindb.cli.studies import analyze
 from skindb.cli.subjects import consent, refresh, release, withdraw
 from skindb.cli.terminal import echo
 from skindb.cli.upkeep import audit, bench, clean, info, verify

@@ -28,9 +28,12 @@ from skindb.cli.shared import bar, calibration_lines, each_take, emit, summary_o
 from skindb.cli.terminal import echo
 from skindb.errors import Fault, InputError
 from skindb.limits import MAX_COHORT, MAX_DEMO_TAKES
-from skindb.parameters import DemoParameters, IngestParameters, SimulationParameters
-from skindb.virtual.dome import require_sizes
-from skindb.virtual.person import CONDITIONS
+from skindb.parameters import (
+    CONDITIONS,
+    DemoParameters,
+    IngestParameters,
+    SimulationParameters,
+)
 
 if TYPE_CHECKING:
     from skindb.store import Database, Record
@@ -110,9 +113,6 @@ def simulate(
                 "give the number of subjects",
             )
         )
-    require_sizes(
-        parameters.lights, parameters.cameras, parameters.width, parameters.height
-    )
     people = (
         None
         if cohort is None

@@ -21,7 +21,7 @@ from skindb.errors import Fault, InputError
 from skindb.files import make_private, private_file
 from skindb.geometry.rays import RayScene
 from skindb.optics.diffusion import dipole_s
-from skindb.parameters import SimulationParameters
+from skindb.parameters import CONDITIONS, SimulationParameters
 from skindb.reflectance.abc_low2012 import PARAMETERS
 from skindb.reflectance.dictionary import Dictionary, convolve_disc, embedded_dictionary
 from skindb.reflectance.mixture import Mixture
@@ -48,7 +48,7 @@ from skindb.virtual.dome import (
     photograph,
 )
 from skindb.virtual.head import Head, head_of_file, parametric_head
-from skindb.virtual.person import CONDITIONS, Person, default_people, face_shape
+from skindb.virtual.person import Person, default_people, face_shape
 from skindb.virtual.probe import ProbeTruth, write_probe
 from skindb.virtual.skin import MATERIALS, Skin, skin_of, smooth_noise
 

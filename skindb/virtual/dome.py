@@ -14,11 +14,10 @@ import imagecodecs
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb.errors import Fault, InputError
 from skindb.files import make_private, private_file
 from skindb.geometry.camera import pixel_rays
 from skindb.geometry.rays import RayScene
-from skindb.limits import MAX_CAMERAS, MAX_FRAMES, MAX_LIGHTS, MAX_VIRTUAL_PIXELS
+from skindb.parameters import require_sizes
 from skindb.render.scene import Camera, Lights, Surface
 from skindb.render.shading import exitances, render_view
 
@@ -118,32 +117,6 @@ def build_dome(
         ),
         tuple(_light(i, d, rng) for i, d in enumerate(lamps)),
     )
-
-
-def require_sizes(lights: int, cameras: int, width: int, height: int) -> None:
-    """Require sizes within the limits of captures, before memory is allocated for them.
-
-    Raises
-    ------
-    InputError
-        With the first size beyond its limit.
-    """
-    views = MAX_FRAMES // len(EXPOSURES)
-    for what, size, most in (
-        ("lights", lights, MAX_LIGHTS),
-        ("cameras", cameras, MAX_CAMERAS),
-        ("lights x cameras", lights * cameras, views),
-        ("width x height", width * height, MAX_VIRTUAL_PIXELS),
-    ):
-        if not 1 <= size <= most:
-            raise InputError(
-                Fault(
-                    "virtual dome",
-                    f"{what} must be 1 to {most:,}",
-                    f"{size:,}",
-                    "choose another number",
-                )
-            )
 
 
 def _spiral(count: int, reach: float, *, turn: float) -> Array:

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from skindb.parameters import CONDITIONS
 from skindb.virtual.face import FaceShape
 
 ANCESTRIES = ("european", "east_asian", "african", "south_asian")
-CONDITIONS = ("normal", "lotion", "powder", "sweat", "hot", "cold", "makeup", "tan")
 # subjects of the paper's table 1, dataset B: ancestries, gender, how many, least and
 # largest age, conditions
 TABLE_1 = (

@@ -1,27 +1,35 @@
 """Consent, releases, cleaning and backups: actions that compute nothing, and are logged; and
-takes that only ingest can update.
+the results that are out of date.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from skindb import store
 from skindb.errors import InputError
 from skindb.store import (
     CALIBRATION,
+    RELEASE,
+    STUDY,
     BackupReport,
     Database,
     Garbage,
     Record,
+    Request,
     Restored,
     State,
     UnavailableError,
+    stale_versions,
 )
 from skindb.workflow.audit import logged_action
 
 MAX_NAMED = 8  # takes in one line
+# of results that become stale, in order of dependence
+KINDS = ("model", "registration", STUDY, "edit", RELEASE)
+REQUESTED = "a subject was withdrawn"
 
 
 def record_consent(db: Database, subject: str, scope: Iterable[str]) -> Record:
@@ -99,6 +107,40 @@ def restore(
     db = Database(url)
     with logged_action(db, "restore", db.takes(), counts={"state": restored.number}):
         return restored
+
+
+@dataclass(frozen=True)
+class Refreshed:
+    """A stale or removed version and what became of it."""
+
+    kind: str
+    take: str
+    generation: int  # 0 if it was removed
+    reasons: tuple[str, ...]
+    record: Record | None = None  # what took its place
+    fault: str = ""  # why nothing did
+
+    @property
+    def name(self) -> str:
+        """Kind, generation and take, as shown in messages."""
+        words = [self.kind, *([str(self.generation)] if self.generation else [])]
+        return " ".join([*words, *(["of", self.take] if self.take else [])])
+
+
+def requested_result(request: Request) -> Refreshed:
+    """A result that a withdrawal removed."""
+    return Refreshed(request.kind, request.take, 0, (REQUESTED,))
+
+
+def stale_results(db: Database) -> list[Refreshed]:
+    """The results that withdrawals removed and the newest versions that are stale, in
+    order of dependence, and why.
+    """
+    stale = [requested_result(request) for request in db.requests()]
+    for record, reasons in stale_versions(db):
+        texts = tuple(dict.fromkeys(map(str, reasons)))
+        stale.append(Refreshed(record.kind, record.take, record.generation, texts))
+    return sorted(stale, key=lambda result: KINDS.index(result.kind))
 
 
 def superseded_calibrations(db: Database) -> dict[str, list[str]]:

@@ -141,9 +141,12 @@ def _source(root: Path, module: str) -> _Source:
     if path is None:
         return source
     tree = ast.parse(path.read_bytes(), path.name)
-    for node in ast.walk(tree):
+    # names that a package imports at their first use are listed in its stub
+    stub = path.with_suffix(".pyi")
+    lazy = ast.parse(stub.read_bytes()) if stub.is_file() else ast.Module([], [])
+    for node in (*ast.walk(tree), *ast.walk(lazy)):
         if isinstance(node, ast.Import | ast.ImportFrom):
-            for name, target in _imported(node):
+            for name, target in _imported(node, module):
                 is_own = target == (module, (name,))
                 if target[0].partition(".")[0] == PACKAGE and not is_own:
                     source.imports[name].append(target)
@@ -159,11 +162,14 @@ def _source(root: Path, module: str) -> _Source:
     return source
 
 
-def _imported(node: ast.Import | ast.ImportFrom) -> Iterator[tuple[str, Reference]]:
-    """Names that an import binds, and what they stand for."""
+def _imported(
+    node: ast.Import | ast.ImportFrom, package: str
+) -> Iterator[tuple[str, Reference]]:
+    """Names that an import in a module or package binds, and what they stand for."""
     for alias in node.names:
         if isinstance(node, ast.ImportFrom):
-            yield alias.asname or alias.name, (str(node.module), (alias.name,))
+            source = f"{package}.{node.module}" if node.level else str(node.module)
+            yield alias.asname or alias.name, (source, (alias.name,))
         elif alias.asname:
             yield alias.asname, (alias.name, ())
         else:

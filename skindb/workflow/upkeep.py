@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,9 +17,14 @@ from skindb.store import (
     Record,
     Request,
     UnavailableError,
-    stale_versions,
 )
 from skindb.types import Progress, silent
+from skindb.workflow.administration import (
+    KINDS,
+    Refreshed,
+    requested_result,
+    stale_results,
+)
 from skindb.workflow.audit import logged
 from skindb.workflow.cluster import computing_on
 from skindb.workflow.edits import edit
@@ -30,38 +35,6 @@ from skindb.workflow.takes import map_takes
 
 if TYPE_CHECKING:
     from distributed import Client
-
-KINDS = ("model", "registration", STUDY, "edit", RELEASE)
-REQUESTED = "a subject was withdrawn"
-
-
-@dataclass(frozen=True)
-class Refreshed:
-    """A stale or removed version and what became of it."""
-
-    kind: str
-    take: str
-    generation: int  # 0 if it was removed
-    reasons: tuple[str, ...]
-    record: Record | None = None  # what took its place
-    fault: str = ""  # why nothing did
-
-    @property
-    def name(self) -> str:
-        """Kind, generation and take, as shown in messages."""
-        words = [self.kind, *([str(self.generation)] if self.generation else [])]
-        return " ".join([*words, *(["of", self.take] if self.take else [])])
-
-
-def stale_results(db: Database) -> list[Refreshed]:
-    """The results that withdrawals removed and the newest versions that are stale, in
-    order of dependence, and why.
-    """
-    stale = [_requested(request) for request in db.requests()]
-    for record, reasons in stale_versions(db):
-        texts = tuple(dict.fromkeys(map(str, reasons)))
-        stale.append(Refreshed(record.kind, record.take, record.generation, texts))
-    return sorted(stale, key=lambda result: KINDS.index(result.kind))
 
 
 @logged("refresh")
@@ -162,7 +135,7 @@ def repeat_requests(
     for request in requests:
         if request.kind in kinds:
             outcome = _again(
-                _requested(request), partial(makers[request.kind], request)
+                requested_result(request), partial(makers[request.kind], request)
             )
             if outcome.record is not None:
                 db.fulfil(request)
@@ -266,10 +239,6 @@ def _repeat_release(db: Database, request: Request) -> Record:
     if not registrations and "pins" not in request.parameters:
         return db.record(RELEASE, request.take)
     return db.commit_release(request.take, [*pins, *registrations])
-
-
-def _requested(request: Request) -> Refreshed:
-    return Refreshed(request.kind, request.take, 0, (REQUESTED,))
 
 
 def _fit_again(

@@ -22,7 +22,7 @@ from skindb.store import Database, Holdings, seal_of
 from skindb.workflow.audit import logged_action
 
 if TYPE_CHECKING:
-    from skindb.workflow.upkeep import Refreshed
+    from skindb.workflow.administration import Refreshed
 
 NOT_REACHED = (
     "capture folders",

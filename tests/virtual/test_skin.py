@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from skindb.optics.diffusion import diffuse_reflectance, reduced_albedo
+from skindb.parameters import CONDITIONS
 from skindb.virtual.face import FaceShape
 from skindb.virtual.head import parametric_head
-from skindb.virtual.person import ANCESTRIES, CONDITIONS, Person
+from skindb.virtual.person import ANCESTRIES, Person
 from skindb.virtual.skin import (
     HAEMOGLOBIN,
     MATERIALS,

@@ -1,0 +1,320 @@
+"""The command analyze, with one command for each study.
+
+The names, descriptions and parameters of the studies are read from their source: the help
+is shown, and wrong options are refused, without importing the science that the studies
+use.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cache, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+import skindb
+from skindb import parameters as parameter_module
+from skindb.cli.engine import SCHEDULER, client_of, shared_path
+from skindb.cli.options import DB, PATH, common, options_of
+from skindb.cli.shared import aligned, bar, emit, existing, writable
+from skindb.files import csv_text, private_file
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from skindb.store import Database
+    from skindb.types import Progress
+
+ANALYSIS = Path(skindb.__file__).parent / "analysis"
+TAKES = click.option(
+    "--take",
+    "takes",
+    multiple=True,
+    help="Take to use (may be given several times).  [default: all]",
+)
+# of every study, after its own parameters
+STORED = (
+    click.option(
+        "--release",
+        metavar="NAME",
+        help="Release whose versions are used.  [default: the newest versions]",
+    ),
+    click.option(
+        "--name",
+        help="Name under which the study is stored.  [default: its parameters]",
+    ),
+    click.option("--plot", type=PATH, help="Plot to write (.png, .pdf, .svg)."),
+    click.option(
+        "--csv", type=PATH, help="Table to write as comma-separated values (.csv)."
+    ),
+)
+# of translucency, which can also draw takes
+FACES = (
+    click.Option(
+        ["--faces"],
+        type=PATH,
+        help="Picture of the least and the most translucent take (.png, .pdf, .svg).",
+    ),
+    click.Option(["--site"], help="Site of the probe for --faces.  [default: cheek]"),
+)
+
+
+@dataclass(frozen=True)
+class Declaration:
+    """What the help shows of a study: its name, description and record of parameters."""
+
+    name: str
+    description: str
+    parameters: type[Any]
+
+
+@cache
+def declarations() -> Mapping[str, Declaration]:
+    """The studies by their names, in the order of the list in skindb/analysis/studies.py."""
+    tree = ast.parse((ANALYSIS / "studies.py").read_bytes())
+    modules = {
+        alias.asname: str(node.module)
+        for node in tree.body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+        if alias.name == "STUDY"
+    }
+    listed = next(
+        node
+        for node in tree.body
+        if isinstance(node, ast.AnnAssign) and ast.unparse(node.target) == "STUDIES"
+    )
+    names = [node.id for node in ast.walk(listed) if isinstance(node, ast.Name)]
+    studies = [_declaration(modules[name]) for name in names if name in modules]
+    return {study.name: study for study in studies}
+
+
+def _declaration(module: str) -> Declaration:
+    """The declaration of the study in a module.
+
+    The assignment STUDY is read, and the constants and the record of parameters of the
+    module are evaluated. If they need something else, the module is imported.
+    """
+    tree = ast.parse((ANALYSIS / f"{module.rpartition('.')[2]}.py").read_bytes())
+    values = {
+        ast.unparse(node.targets[0]): node.value
+        for node in tree.body
+        if isinstance(node, ast.Assign)
+    }
+    classes = [node for node in tree.body if isinstance(node, ast.ClassDef)]
+    try:
+        study = values["STUDY"]
+        assert isinstance(study, ast.Call)
+        settings = {str(keyword.arg): keyword.value for keyword in study.keywords}
+        record = ast.unparse(settings["parameters"])
+        scope = {"Path": Path, "dataclass": dataclass, **vars(parameter_module)}
+        scope |= _constants(values)
+        body: list[ast.stmt] = [node for node in classes if node.name == record]
+        code = compile(ast.Module(body, []), module, "exec", dont_inherit=True)
+        exec(code, scope)
+        name = ast.literal_eval(settings["name"])
+        return Declaration(
+            name, ast.literal_eval(settings["description"]), scope[record]
+        )
+    except (AssertionError, KeyError, NameError, ValueError):
+        imported = importlib.import_module(module).STUDY
+        return Declaration(imported.name, imported.description, imported.parameters)
+
+
+def _constants(values: Mapping[str, ast.expr]) -> dict[str, Any]:
+    """The values of names that are literals."""
+    constants = {}
+    for name, value in values.items():
+        with suppress(ValueError):
+            constants[name] = ast.literal_eval(value)
+    return constants
+
+
+class Studies(click.Group):
+    """The studies as commands, each with the options of its own parameters."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
+        """Names of the studies."""
+        return list(declarations())
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002
+        """The command of a study."""
+        study = declarations().get(cmd_name)
+        return None if study is None else _study_command(study)
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """The command of the study that the first argument names."""
+        if args[0] not in declarations():
+            names = ", ".join(self.list_commands(ctx))
+            raise click.UsageError(
+                f"Invalid value for 'STUDY': {args[0]!r} is not one of {names}.", ctx
+            )
+        return super().resolve_command(ctx, args)
+
+    def format_commands(
+        self,
+        ctx: click.Context,  # noqa: ARG002
+        formatter: click.HelpFormatter,
+    ) -> None:
+        """List the studies."""
+        studies = declarations().values()
+        with formatter.section("Studies"):
+            formatter.write_dl([(study.name, study.description) for study in studies])
+
+
+@click.group(
+    cls=Studies, subcommand_metavar="STUDY [OPTIONS]", invoke_without_command=True
+)
+@DB
+@click.pass_context
+def analyze(ctx: click.Context, db: str) -> None:
+    """Study the population of the fitted takes.
+
+    A study with other parameters, of other takes or of a release is stored under its
+    own name, and does not replace the study with default parameters. The options of a
+    study are listed by: skindb analyze DB STUDY --help
+    """
+    if ctx.invoked_subcommand is None:
+        names = ",\n\t".join(declarations())
+        raise click.UsageError(f"Missing argument 'STUDY'. Choose from:\n\t{names}")
+    ctx.obj = db
+
+
+def _study_command(study: Declaration) -> click.Command:
+    """The command of one study, with the options of its parameters."""
+    run = partial(_run_study, study)
+    for add in reversed(
+        (TAKES, options_of(study.parameters), *STORED, SCHEDULER, common)
+    ):
+        run = add(run)
+    command = click.command(study.name, help=f"Study the {study.description}.")(run)
+    if study.name == "translucency":
+        command.params += FACES
+    return command
+
+
+def _run_study(
+    study: Declaration,
+    *,
+    takes: tuple[str, ...],
+    parameters: Any,
+    release: str | None,
+    name: str | None,
+    scheduler: str | None,
+    csv: Path | None,
+    **drawn: Any,
+) -> None:
+    """Compute or read a study, and print, write and draw it."""
+    pictures = StudyPictures(**drawn)
+    pictures.require_writable()
+    if csv:
+        writable(csv, ".csv")
+    chosen = dict(vars(parameters))
+    if "adjust" in chosen:
+        names = ",".join(chosen["adjust"]).split(",")
+        chosen["adjust"] = tuple(name.strip() for name in names if name.strip())
+    if "dictionary" in chosen:
+        chosen["dictionary"] = shared_path(chosen["dictionary"], scheduler)
+    database = existing(click.get_current_context().obj)
+    progress = bar()
+    progress(f"analyze {study.name}", 0, 1)
+    used = takes or database.takes("model", release=release)
+    arguments = {"faces": pictures.faces is not None}
+    with skindb.workflow.logged_action(
+        database, "study", used, what=study.name, arguments=arguments
+    ):
+        with (
+            client_of(scheduler, progress) as client,
+            skindb.workflow.computing_on(client, database.folder),
+        ):
+            results = skindb.workflow.study(
+                database, study.name, takes=takes, release=release, name=name, **chosen
+            )
+        progress(f"analyze {study.name}", 1, 1)
+        pictures.draw(database, results, progress)
+    _report(database, study, results, csv)
+
+
+@dataclass(frozen=True)
+class StudyPictures:
+    """Pictures that a command draws of a study, if they are named."""
+
+    plot: Path | None
+    faces: Path | None = None  # of the most and the least translucent take
+    site: str | None = None  # of the faces
+
+    def require_writable(self) -> None:
+        """Check the names of the pictures before anything is computed."""
+        for picture in (self.plot, self.faces):
+            if picture:
+                writable(picture, ".png", ".pdf", ".svg")
+
+    def draw(
+        self, database: Database, results: xr.DataTree, progress: Progress
+    ) -> None:
+        """Draw the pictures."""
+        if self.faces:
+            site = self.site or "cheek"
+            skindb.workflow.translucency_grid(
+                database, self.faces, site=site, progress=progress
+            )
+        if self.plot:
+            skindb.analysis.plot_study(results, self.plot)
+
+
+def _report(
+    database: Database, study: Declaration, results: xr.DataTree, csv: Path | None
+) -> None:
+    """Print the table and the notes of a study, and write its table."""
+    header, rows = skindb.analysis.tabulate_study(results)
+    if csv:
+        private_file(csv).write_text(csv_text(header, rows), encoding="utf-8")
+    attrs = results.attrs
+    record = database.record("population", attrs["study"], attrs["generation"])
+    notes = skindb.analysis.describe_study(results)
+    lines = [
+        f"{label}: {line}"
+        for label, name in (
+            ("skipped", "skipped"),
+            ("out of date", "outdated"),
+            ("registration", "registration"),
+        )
+        for line in skindb.schema.note_lines(attrs.get(name, []))
+    ]
+    units = {
+        name: skindb.schema.VARIABLES[name].units
+        for name in header
+        if name in skindb.schema.VARIABLES
+    }
+    report = {
+        "study": record.take,
+        "generation": record.generation,
+        "path": record.path,
+        "header": header,
+        "units": units,
+        "rows": rows,
+        "notes": notes,
+        "skipped": attrs["skipped"],
+    }
+    hidden = skindb.analysis.STUDIES[study.name].columns_of_files
+    columns = [i for i, name in enumerate(header) if name not in hidden]
+    table = aligned([[line[i] for i in columns] for line in [header, *rows]])
+    table += _unit_lines(units, [header[i] for i in columns])
+    emit(report, [*table, *notes, *lines])
+
+
+def _unit_lines(units: dict[str, str], shown: list[str]) -> list[str]:
+    """One line for each unit of the columns other than 1."""
+    of = dict[str, list[str]]()
+    for name in shown:
+        if units.get(name, "1") not in ("", "1"):
+            of.setdefault(units[name], []).append(name)
+    return [f"unit {unit}: {', '.join(names)}" for unit, names in of.items()]
