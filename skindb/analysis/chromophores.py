@@ -648,5 +648,4 @@ STUDY = Study(
     ),
     plot=lambda statistics, table: plot_chromophores(statistics, table=table),
     describe=lambda axes, _: describe_chromophores(axes),
-    uses_registration=True,
 )

@@ -408,5 +408,4 @@ STUDY = Study(
     tabulate=tabulate_components,
     plot=plot_components,
     describe=describe_components,
-    uses_registration=True,
 )

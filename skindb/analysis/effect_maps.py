@@ -465,6 +465,5 @@ STUDY = Study(
     tabulate=tabulate_effect_maps,
     plot=plot_effect_maps,
     describe=describe_effect_maps,
-    uses_registration=True,
     compares_normal=True,
 )

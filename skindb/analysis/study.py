@@ -144,7 +144,7 @@ class Study:
     name
         Word by which it is requested and stored.
     description
-        What it finds, in a few words.
+        What it finds, in a few words: the help of its command is "Study the ...".
     layout
         Layout of the cohort that it reads, see `Database.cohort`. Cohorts of maps have
         registered takes only, which need landmarks.
@@ -163,7 +163,7 @@ class Study:
     cohort_options
         Further options of `Database.cohort`.
     uses_registration
-        Whether takes with landmarks are registered first.
+        Whether takes with landmarks are registered first, as for maps always.
     compares_normal
         Whether it compares subjects in the condition normal, so that those without such
         a take are reported as skipped.
@@ -182,6 +182,11 @@ class Study:
     cohort_options: Mapping[str, Any] = field(default_factory=dict)
     uses_registration: bool = False
     compares_normal: bool = False
+
+    @property
+    def registers(self) -> bool:
+        """Whether it reads registrations: maps exist of registered takes only."""
+        return self.uses_registration or self.layout == "maps"
 
 
 def table_of(table: xr.Dataset, names: Sequence[str], dims: Sequence[str]) -> Table:

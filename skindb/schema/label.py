@@ -23,7 +23,14 @@ def take_attrs(attrs: Mapping[Any, Any]) -> dict[Any, Any]:
 def label(name: str, data: Any) -> xr.Variable:
     """The variable `name` around `data` (numpy or dask); dims, dtype, units and
     description are the schema's.
+
+    Raises
+    ------
+    ValueError
+        If the schema does not declare it.
     """
+    if name not in VARIABLES:
+        raise ValueError(f"variable {name!r} is not declared in skindb/schema")
     spec = VARIABLES[name]
     attrs: dict[str, object] = {
         "units": spec.units,

@@ -78,7 +78,7 @@ def open_population(
     dictionary
         Path of the dictionary of the fits; default the embedded one.
     """
-    if study.uses_registration:
+    if study.registers:
         require_covered(db, release)
     _require_models(db, takes, release)
     open_models = partial(db.cohort, takes=takes or None, release=release)
@@ -88,7 +88,7 @@ def open_population(
         cohort = open_models("tables")
     registrations: Mapping[str, Record] = {}
     notes: list[Note] = []
-    if study.uses_registration:
+    if study.registers:
         if not takes:  # before anything is registered
             require_same_fit(cohort)
         registrations, notes = _registrations(db, cohort, release)
@@ -103,7 +103,8 @@ def open_population(
         return open_registered(layout, **options)
 
     if study.layout == "maps":
-        cohort = _open_maps(db, cohort, registered, open_cohort)
+        open_maps = partial(open_cohort, "maps", **study.cohort_options)
+        cohort = _open_maps(db, cohort, registered, open_maps)
     population = Population(
         cohort,
         open_cohort,
@@ -129,7 +130,7 @@ def _open_maps(
     db: Database,
     models: xr.Dataset,
     registered: Sequence[str],
-    open_cohort: Callable[..., xr.Dataset],
+    open_maps: Callable[[], xr.Dataset],
 ) -> xr.Dataset:
     """Maps of the registered takes; without a probe there is no map of sigma_tr."""
     if not registered:
@@ -137,7 +138,7 @@ def _open_maps(
         found = f"none of {models.sizes['take']} takes has landmarks"
         cure = "add landmarks to the captures, then ingest and fit them"
         raise InputError(Fault(db.url, rule, found, cure))
-    maps = open_cohort("maps")
+    maps = open_maps()
     skipped = [*models.attrs["skipped"], *maps.attrs["skipped"]]
     return maps.assign_attrs(skipped=unique_notes(skipped))
 

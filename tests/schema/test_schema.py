@@ -81,6 +81,11 @@ def test_check__every_fault_at_once():
     assert "take X[surfel_normal]" in str(caught.value)
 
 
+def test_dataset__names_a_variable_that_is_not_declared():
+    with pytest.raises(ValueError, match="'pore_density' is not declared"):
+        dataset({"pore_density": np.zeros(3)})
+
+
 def test_dataset__text_labels_and_flags():
     ds = dataset({"fit_status": [0, 1]}, coords={"surfel": [0, 1]})
     assert ds["fit_status"].attrs["flag_meanings"].split()[1] == "unseen"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,8 +12,10 @@ from planted_sheet import face_take
 
 from skindb import workflow
 from skindb.analysis import describe_study, tabulate_study
+from skindb.analysis.studies import STUDIES
 from skindb.cli import cli
 from skindb.store import Database
+from skindb.workflow.study_inputs import open_population
 from skindb.workflow.upkeep import repeat_study
 
 pytestmark = pytest.mark.slow
@@ -44,6 +47,13 @@ def database(tmp_path_factory):
             )
             stage.commit(model.attrs)
     return db
+
+
+def test_open_population__maps_have_the_options_of_the_study(database):
+    study = replace(STUDIES["maps"], cohort_options={"size": 256})
+    population, _ = open_population(database, study)
+    assert population.cohort.sizes["v"] == population.cohort.sizes["u"] == 256
+    assert population.cohort.sizes["take"] == len(population.registered) == 8
 
 
 def test_maps__find_the_step(database):
