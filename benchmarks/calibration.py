@@ -25,8 +25,12 @@ from skindb.format.folder import read_capture
 from skindb.geometry.rays import RayScene
 from skindb.ingest.consistency import CalibrationCheck
 from skindb.ingest.consistency_checks import calibration_faults, calibration_notes
-from skindb.ingest.surfels import SurfelSet, build_surfels
-from skindb.ingest.visibility import camera_visibility, light_visibility
+from skindb.ingest.surfels import (
+    SurfelSet,
+    build_surfels,
+    camera_visibility,
+    light_visibility,
+)
 
 Pictures = Callable[[int, int], Any]
 Case = tuple[str, DomeRecord, SurfelSet, Pictures]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from skindb.fit.probe_profile import fit_profile
+from skindb.fit.translucency import fit_profile
 from skindb.optics.transport import transport_profile
 from skindb.schema import ProbeStatus
 

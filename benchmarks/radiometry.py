@@ -22,8 +22,12 @@ from skindb.calibration.irradiance import (
     light_intensities,
     target_pixels,
 )
-from skindb.calibration.lights import calibrate_lights
-from skindb.calibration.mirror_ball import ball_outline, distant_light, highlight_centre
+from skindb.calibration.lights import (
+    ball_outline,
+    calibrate_lights,
+    distant_light,
+    highlight_centre,
+)
 from skindb.calibration.radiance import frame_mergers, merge_exposures, read_view
 from skindb.calibration.response import ResponseOptions, recover_response
 from skindb.format.folder import read_capture

@@ -30,8 +30,13 @@ from skindb.format.folder import read_capture
 from skindb.geometry._mesh_kernels import grown, mixed
 from skindb.geometry.rays import RayScene
 from skindb.geometry.splats import PIXEL, THRESHOLD, SplatScene
-from skindb.ingest.surfels import SurfelSet, build_surfels
-from skindb.ingest.visibility import camera_visibility, disc_points, light_visibility
+from skindb.ingest.surfels import (
+    SurfelSet,
+    build_surfels,
+    camera_visibility,
+    disc_points,
+    light_visibility,
+)
 
 # cosine, and neighbours from the edge of a shadow, beyond which the methods should agree
 STEEP = 0.1

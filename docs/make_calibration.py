@@ -13,9 +13,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from skindb.calibration.lens import fit_vignette
-from skindb.calibration.profile_statistics import compare_azimuths
-from skindb.calibration.response import recover_response
-from skindb.calibration.sensor_noise import fit_noise
+from skindb.calibration.response import fit_noise, recover_response
+from skindb.ingest.probe_profiles import compare_azimuths
 
 PICTURES = Path(__file__).parent / "pictures"
 BLACK = 1024.0

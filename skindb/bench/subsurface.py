@@ -14,7 +14,7 @@ from scipy.optimize import brentq
 
 from skindb.bench.curve import Curve, Point, cpu_time
 from skindb.errors import Fault, InputError
-from skindb.fit.probe_profile import MODELS, ProbeFit, fit_profile
+from skindb.fit.translucency import MODELS, ProbeFit, fit_profile
 from skindb.optics.diffusion import (
     S_MAX,
     diffuse_reflectance,

@@ -21,8 +21,7 @@ from skindb.calibration._merge_kernels import (
 )
 from skindb.errors import Fault, attempt
 from skindb.format.dome import CameraRecord, DomeRecord
-from skindb.format.frame_paths import filled
-from skindb.format.frames import Digests, Frame, read_frames
+from skindb.format.frames import Digests, Frame, filled, read_frames
 from skindb.format.sensor import SensorRecord
 from skindb.types import Index
 

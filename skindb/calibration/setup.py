@@ -17,16 +17,17 @@ from skindb.errors import Fault, InputError, attempt, require
 from skindb.format.contact_probe import ProbeRecord, read_probe
 from skindb.format.dome import CameraRecord, DomeRecord, read_dome
 from skindb.format.fields import Fields, read_json, shown
-from skindb.format.frame_paths import (
+from skindb.format.frames import (
     CAMERA,
     EXPOSURE,
     LIGHT,
     SITE,
+    Frame,
     filled,
     inside,
     read_exposures,
+    read_frames,
 )
-from skindb.format.frames import Frame, read_frames
 from skindb.limits import MAX_BALL_PLACES, MAX_KNOWN_POINTS
 from skindb.types import Float64
 

@@ -17,17 +17,20 @@ import numpy as np
 
 from skindb.errors import Fault
 from skindb.format.fields import IDENTIFIER, MAX_MAGNITUDE, Fields, is_number, shown
-from skindb.format.frame_paths import (
+from skindb.format.frames import (
     EXPOSURE,
     PLACEMENT,
     SITE,
+    FrameKind,
     filled,
+    frame_size,
+    header_faults,
     inside,
+    is_linear,
     read_exposures,
     require_merged,
     require_own_files,
 )
-from skindb.format.frames import FrameKind, frame_size, header_faults, is_linear
 from skindb.format.sensor import SensorRecord, read_sensor
 from skindb.limits import MAX_FIBRES, MAX_PLACEMENTS, MAX_PRESSURE_SAMPLES, MAX_SITES
 from skindb.types import Float64

@@ -14,17 +14,19 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from skindb.format.fields import IDENTIFIER, REQUIRED, Fields, shown, zoned_time
-from skindb.format.frame_paths import (
+from skindb.format.frames import (
     CAMERA,
     EXPOSURE,
     LIGHT,
+    FrameKind,
     filled,
+    header_faults,
     inside,
+    is_linear,
     read_exposures,
     require_merged,
     require_own_files,
 )
-from skindb.format.frames import FrameKind, header_faults, is_linear
 from skindb.format.sensor import SensorRecord, read_sensor
 from skindb.geometry.camera import camera_centre, pixel_rays, project
 from skindb.limits import (

@@ -29,31 +29,29 @@ from skindb.format.fields import (
     shown,
     zoned_time,
 )
-from skindb.format.frame_paths import decoding_faults, inside
-from skindb.format.length_units import (
+from skindb.format.frames import decoding_faults, inside
+from skindb.format.scan_checks import (
     CAMERAS,
     LANDMARKS,
     LIGHTS,
     SCAN,
+    SITE_LANDMARK,
     SIZES,
     Lengths,
-    device_faults,
-    dome_unit_faults,
-    likely_units,
-    unit_text,
-)
-from skindb.format.scan_checks import (
-    SITE_LANDMARK,
     coincidence_faults,
     crop_path,
+    device_faults,
     discarded_piece_faults,
+    dome_unit_faults,
     face_faults,
     face_height,
     landmark_faults,
+    likely_units,
     order_faults,
     parsed_crop,
     scan_faults,
     swapped_faults,
+    unit_text,
 )
 from skindb.geometry.clean import CleanMesh, clean_mesh
 from skindb.geometry.scan import Crop, Scan, crop_faces, read_scan

@@ -10,8 +10,7 @@ import numpy as np
 from skindb.errors import attempt
 from skindb.files import read_regular
 from skindb.format.fields import MAX_MAGNITUDE, Fields, shown
-from skindb.format.frame_paths import inside
-from skindb.format.frames import FrameKind
+from skindb.format.frames import FrameKind, inside
 from skindb.limits import MAX_RESPONSE_BYTES
 from skindb.types import Float64
 

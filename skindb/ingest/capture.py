@@ -65,11 +65,13 @@ from skindb.ingest.provenance import (
 from skindb.ingest.report import describe_samples
 from skindb.ingest.sample_quality import intensity_faults, light_notes, sample_faults
 from skindb.ingest.spool import Spool
-from skindb.ingest.surfels import SurfelSet, build_surfels, site_positions
-from skindb.ingest.visibility import (
+from skindb.ingest.surfels import (
+    SurfelSet,
+    build_surfels,
     camera_visibility,
     coarse_maps,
     light_visibility,
+    site_positions,
 )
 from skindb.parameters import IngestParameters
 from skindb.types import Float64, Progress, silent

@@ -13,7 +13,7 @@ from skindb.fit import (
     tabulate_translucency,
     translucency_map,
 )
-from skindb.fit.probe_profile import _faces, fit_profile
+from skindb.fit.translucency import _faces, fit_profile
 from skindb.optics.diffusion import dipole_profile, sigma_tr
 from skindb.optics.transport import transport_profile
 from skindb.schema import ProbeStatus, dataset, label

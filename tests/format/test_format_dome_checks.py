@@ -13,7 +13,7 @@ import trimesh
 from sphere import RADIUS, half_sphere
 
 from skindb.errors import InputError
-from skindb.format.length_units import dome_unit_faults
+from skindb.format.scan_checks import dome_unit_faults
 from skindb.geometry.clean import CleanMesh, clean_mesh
 from skindb.ingest import read_capture
 

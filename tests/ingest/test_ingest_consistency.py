@@ -36,8 +36,7 @@ from skindb.ingest.photo_offsets import (
     relative_brightness,
     square_root_image,
 )
-from skindb.ingest.surfels import build_surfels
-from skindb.ingest.visibility import camera_visibility, light_visibility
+from skindb.ingest.surfels import build_surfels, camera_visibility, light_visibility
 from skindb.parameters import SimulationParameters
 from skindb.virtual.capture import simulate_takes
 

@@ -31,8 +31,7 @@ from skindb.ingest.report import (
     sample_table,
 )
 from skindb.ingest.spool import Spool
-from skindb.ingest.surfels import SurfelSet, build_surfels
-from skindb.ingest.visibility import camera_visibility
+from skindb.ingest.surfels import SurfelSet, build_surfels, camera_visibility
 
 
 @pytest.fixture(scope="module")

@@ -35,8 +35,7 @@ from skindb.ingest.groups import dome_group, sample_group, surfel_group
 from skindb.ingest.lumitexels import Views, sample_lumitexels
 from skindb.ingest.sample_quality import radiance_noise
 from skindb.ingest.spool import Spool
-from skindb.ingest.surfels import build_surfels
-from skindb.ingest.visibility import camera_visibility
+from skindb.ingest.surfels import build_surfels, camera_visibility
 
 sys.path.append(str(Path(__file__).parent))
 from sphere import expose, write_capture

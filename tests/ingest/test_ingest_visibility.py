@@ -14,8 +14,14 @@ from skindb.geometry._mesh_kernels import grown
 from skindb.geometry.camera import camera_centre, pixel_rays, project
 from skindb.geometry.mesh import morton_order, splat_radius, subdivide, vertex_normals
 from skindb.geometry.rays import RayScene
-from skindb.ingest.surfels import SurfelSet, build_surfels, subdivision_levels
-from skindb.ingest.visibility import camera_visibility, disc_points, light_visibility
+from skindb.ingest.surfels import (
+    SurfelSet,
+    build_surfels,
+    camera_visibility,
+    disc_points,
+    light_visibility,
+    subdivision_levels,
+)
 from skindb.virtual.face import FaceShape
 from skindb.virtual.head import parametric_head
 

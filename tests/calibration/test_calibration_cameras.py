@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from skindb.calibration.colour_chart import chart_reference, fit_colour_matrix
+from skindb.calibration.cameras import chart_reference, fit_colour_matrix
 from skindb.errors import InputError
 
 MIX = np.array([[0.7, 0.2, 0.1], [0.15, 0.75, 0.1], [0.05, 0.2, 0.75]])
