@@ -16,7 +16,7 @@ import trimesh
 from spoil import C, D, P, drop, edit, edited, put
 
 from skindb.errors import InputError
-from skindb.format import contact_probe, dome, folder, frame_paths, sensor
+from skindb.format import contact_probe, dome, folder, frames, sensor
 from skindb.ingest import read_capture
 
 
@@ -616,7 +616,7 @@ def test_capture_format__lists_every_key_that_is_read():
     )
     source = "".join(
         Path(module.__file__).read_text(encoding="utf-8")
-        for module in (contact_probe, dome, folder, frame_paths, sensor)
+        for module in (contact_probe, dome, folder, frames, sensor)
     )
     keys = set(
         re.findall(
