@@ -96,6 +96,16 @@ def seed_option(purpose: str) -> Any:
     return option(0, f"Random seed for {purpose}.", minimum=0, maximum=MAX_SEED)
 
 
+@dataclass(frozen=True)
+class ContrastParameters:
+    """Parameters of a study that compares groups of subjects."""
+
+    group_by: str = compared_option()
+    adjust: tuple[str, ...] = adjust_option()
+    permutations: int = permutations_option()
+    seed: int = seed_option("the permutations")
+
+
 def option_of(record: type, name: str) -> Option:
     """Help and limits of a field of a record."""
     limits: Option = record.__dataclass_fields__[name].metadata["option"]  # type: ignore[attr-defined]

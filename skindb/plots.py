@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+from skindb.types import Array, Mask
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
@@ -41,3 +43,46 @@ def new_axes(width: float, height: float) -> Axes:
     ax: Axes
     _, ax = pyplot.subplots(figsize=(width, height))
     return ax
+
+
+def legend_above(ax: Axes, *, fontsize: float = 7) -> None:
+    """Legend above the axes, in two columns."""
+    ax.legend(
+        fontsize=fontsize,
+        loc="lower center",
+        bbox_to_anchor=(0.5, 1.0),
+        ncols=2,
+        frameon=False,
+    )
+
+
+def legend_beside(ax: Axes) -> None:
+    """Legend at the right of the axes."""
+    ax.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+
+
+def significance_bars(
+    ax: Axes,
+    values: Array,
+    places: Array,
+    bars: Array,
+    is_significant: Mask,
+    *,
+    colour: str,
+    marker: str = "o",
+) -> None:
+    """Values (n,) at heights (n,) with bars (2, n) to both sides; filled markers are
+    significant.
+    """
+    for rows, fill in ((is_significant, colour), (~is_significant, "white")):
+        ax.errorbar(
+            values[rows],
+            places[rows],
+            xerr=bars[:, rows],
+            fmt=marker,
+            color=colour,
+            mfc=fill,
+            markersize=4,
+            capsize=2,
+            linewidth=1,
+        )

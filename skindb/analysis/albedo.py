@@ -13,7 +13,15 @@ import xarray as xr
 
 from skindb import plots
 from skindb.analysis import texture
-from skindb.analysis.study import Population, Results, Study, Table, each_take, table_of
+from skindb.analysis.study import (
+    Population,
+    Results,
+    Study,
+    Table,
+    each_take,
+    skipped_takes,
+    table_of,
+)
 from skindb.analysis.subjects import groups_by, takes_to_compare
 from skindb.analysis.summary import SAMPLED
 from skindb.errors import Fault, InputError
@@ -125,7 +133,7 @@ def albedo_histograms(
         },
         coords={"take": takes, "region": list(regions), "channel": ["R", "G", "B"]},
         attrs={
-            "skipped": list(cohort.attrs.get("skipped", [])),
+            "skipped": skipped_takes(cohort),
             "regions_by_landmarks": by_landmarks,
         },
     )
@@ -279,7 +287,7 @@ def albedo_table(
         attrs={
             "takes": sorted(map(str, takes["take"].values)),
             "group_by": group_by or "",
-            "skipped": list(cohort.attrs.get("skipped", [])),
+            "skipped": skipped_takes(cohort),
         },
     )
 
@@ -392,9 +400,7 @@ def plot_albedo(
     if len(names) > MAX_LEGEND_ENTRIES:
         ax.set_title(f"{len(names)} takes", fontsize=8)
     else:
-        ax.legend(
-            fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False
-        )
+        plots.legend_beside(ax)
     ax.set_xlabel(f"decorrelated colour, axis {axis} [standard deviations]")
     ax.set_ylabel("fraction of the area")
     ax.set_ylim(bottom=0)

@@ -15,7 +15,14 @@ from numpy.typing import NDArray
 
 from skindb import plots
 from skindb.analysis.population_basis import same_dictionary
-from skindb.analysis.study import Population, Results, Study, each_take, shared_once
+from skindb.analysis.study import (
+    Population,
+    Results,
+    Study,
+    each_take,
+    shared_once,
+    skipped_takes,
+)
 from skindb.numerics.statistics import bootstrap_interval
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.parameters import DICTIONARY_HELP, option, seed_option
@@ -132,7 +139,7 @@ def basis_size_curve(
         ),
     }
     attrs = {"size_status": size_status(fewest, upper), "surfels": len(errors)}
-    attrs["skipped"] = list(cohort.attrs.get("skipped", []))
+    attrs["skipped"] = skipped_takes(cohort)
     return dataset(variables, coords={"k": ks}, attrs=attrs)
 
 

@@ -68,13 +68,7 @@ def plot_brdf_space(space: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     )
     ax.set_aspect("equal", adjustable="datalim")
     ax.set_box_aspect(1)
-    ax.legend(
-        fontsize=8,
-        loc="lower center",
-        bbox_to_anchor=(0.5, 1.0),
-        ncols=2,
-        frameon=False,
-    )
+    plots.legend_above(ax, fontsize=8)
     return ax
 
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from skindb.analysis.brdf_plots import plot_space
 from skindb.analysis.population_basis import population_basis
-from skindb.analysis.study import Population, Results, Study, each_item
+from skindb.analysis.study import Population, Results, Study, each_item, skipped_takes
 from skindb.analysis.subjects import (
     NORMAL,
     OTHER,
@@ -82,7 +82,7 @@ class _Subjects:
     place: Array
 
     @property
-    def there(self) -> NDArray[np.bool_]:
+    def measured(self) -> NDArray[np.bool_]:
         """Mask (subject, group) of the groups in which a subject was measured."""
         return np.asarray(np.isfinite(self.place).all(axis=2))
 
@@ -156,60 +156,55 @@ def brdf_space(
     )
     place = coefficient @ _metric_root(metric)
     subjects = _by_subject(takes, named, coefficient, place)
-    length = (
-        float(np.linalg.norm(known_mean(known_mean(np.moveaxis(subjects.place, 1, 0)))))
-        or 1.0
-    )
+    centre = known_mean(known_mean(np.moveaxis(subjects.place, 1, 0)))
+    length = float(np.linalg.norm(centre)) or 1.0
     distance = np.linalg.norm(place[:, None] - place[None], axis=-1) / length
-    if not distance.max() > IDENTICAL:  # also true if the mean BRDF is 0
-        rule = "the BRDFs of takes must differ"
-        raise InputError(
-            Fault(
-                f"group by {group_by}",
-                rule,
-                "the same BRDF in all takes",
-                "check the fits",
-            )
-        )
+    _require_different(distance, group_by)
     mapped, explained, error = classical_scaling(distance)
-    compared, adjusted_by, pair_flags = _pairs(subjects, permutations, rng)
-    compared["group_distance"] /= length
-    compared["group_distance_noise"] /= length
+    pairs = [
+        _compared_pair(subjects, pair, permutations, rng)
+        for pair in combinations(range(len(subjects.groups)), 2)
+    ]
+    adjusted, method = _adjusted(subjects, pairs, permutations, rng)
     means = known_mean(subjects.coefficient)
     averaged = brdf @ means.T
-    variables = {
-        "group_subject_count": subjects.there.sum(axis=0),
-        "group_coefficient": means,
-        "group_brdf": stored_brdf(averaged),
-        "take_distance": distance,
-        "take_place": mapped,
-        "explained_fraction": explained,
-        "map_error": error,
-        **compared,
-    }
-    pairs = [f"{a} to {b}" for a, b in combinations(subjects.groups, 2)]
     labels = list(takes.take)
-    coords: dict[str, Any] = {
-        "group": list(subjects.groups),
-        "pair": pairs,
-        "side": list(SIDES),
-    }
-    coords |= {
-        "take": labels,
-        "take_2": labels,
-        **brdf_coords(TableGrid(*averaged.shape[:3])),
-    }
-    attrs = {
-        "group_by": group_by,
-        "groups_of_takes": named,
-        "adjusted_by": adjusted_by,
-        "flags": flags + pair_flags,
-    }
     return dataset(
-        variables,
-        coords=coords,
-        attrs=attrs | {"skipped": list(cohort.attrs.get("skipped", []))},
+        {
+            "group_subject_count": subjects.measured.sum(axis=0),
+            "group_coefficient": means,
+            "group_brdf": stored_brdf(averaged),
+            "take_distance": distance,
+            "take_place": mapped,
+            "explained_fraction": explained,
+            "map_error": error,
+            **_distances(pairs, length),
+            "group_distance_p_adjusted": adjusted,
+        },
+        coords={
+            "group": list(subjects.groups),
+            "pair": [pair.name for pair in pairs],
+            "side": list(SIDES),
+            "take": labels,
+            "take_2": labels,
+            **brdf_coords(TableGrid(*averaged.shape[:3])),
+        },
+        attrs={
+            "group_by": group_by,
+            "groups_of_takes": named,
+            "adjusted_by": method,
+            "flags": flags + [flag for pair in pairs for flag in pair.flags],
+            "skipped": skipped_takes(cohort),
+        },
     )
+
+
+def _require_different(distance: Array, group_by: str) -> None:
+    """Raise `InputError` if all distances (take, take) are 0 or, without a mean, NaN."""
+    if not distance.max() > IDENTICAL:
+        rule = "the BRDFs of takes must differ"
+        finding = "the same BRDF in all takes"
+        raise InputError(Fault(f"group by {group_by}", rule, finding, "check the fits"))
 
 
 def grouped_takes(
@@ -344,96 +339,100 @@ def _by_subject(
     return _Subjects(tuple(groups), *means)
 
 
-def _pairs(
-    subjects: _Subjects, most: int, rng: np.random.Generator
-) -> tuple[dict[str, Array], str, list[str]]:
-    """Distances [length of a BRDF] and p values of every pair, the method of
-    adjustment, and flags.
-    """
-    measured = subjects.there
-    groups = subjects.groups
-    rows = []
-    within = []
-    flags = list[str]()
-    for a, b in combinations(range(len(groups)), 2):
-        both = measured[:, a] & measured[:, b]
-        within.append(bool(both.any()))
-        values = subjects.place[:, [a, b]]
-        if within[-1]:
-            values = values[both]
-            step = (values[:, 0] - values[:, 1]).mean(axis=0)
-            count = (len(values), len(values))
-        else:
-            step = known_mean(values[:, 0]) - known_mean(values[:, 1])
-            count = (int(measured[:, a].sum()), int(measured[:, b].sum()))
-        name = f"{groups[a]} to {groups[b]}"
-        statistic = np.nan
-        p = np.nan
-        drawn = 0
-        if min(count) < 2:
-            flags.append(
-                f"{name}: no p value with fewer than two subjects "
-                f"{'in both groups' if within[-1] else 'per group'}"
-            )
-        elif within[-1]:
-            (statistic,), (p,), drawn = within_subjects_p(
-                values, max_draws=most, rng=rng
-            )
-        else:
-            places = np.concatenate(
-                [values[measured[:, side], i] for i, side in enumerate((a, b))]
-            )
-            (statistic,), (p,), drawn = between_groups_p(
-                places, np.repeat([0, 1], count), max_draws=most, rng=rng
-            )
-        if 2 <= min(count) < FEW:
-            flags.append(
-                f"{name}: {count[0]} and {count[1]} subjects; p values are "
-                f"approximate with fewer than {FEW}"
-            )
-        length = float(np.linalg.norm(step))
-        noise = length / np.sqrt(statistic) if statistic > 0 else np.nan
-        rows.append((length, noise, p, np.array(count), drawn))
-    distances, noises, ps, counts, permuted = (
-        np.array(column) for column in zip(*rows, strict=True)
-    )
-    adjusted, how = _adjusted(subjects, ps, within, most, rng)
-    return (
-        {
-            "group_distance": distances,
-            "group_distance_noise": noises,
-            "group_distance_p": ps,
-            "group_distance_p_adjusted": adjusted,
-            "pair_subject_count": counts,
-            "pair_permutations": permuted,
-        },
-        how,
-        flags,
-    )
+@dataclass(frozen=True)
+class _Pair:
+    """Comparison of two groups; distances are lengths of BRDFs."""
+
+    name: str
+    within: bool  # whether subjects were measured in both groups
+    count: tuple[int, int]  # subjects of each group
+    distance: float
+    noise: float  # distance that the scatter of subjects alone would give
+    p: float
+    permutations: int
+
+    @property
+    def flags(self) -> list[str]:
+        """Warnings about few subjects."""
+        if min(self.count) < 2:
+            where = "in both groups" if self.within else "per group"
+            return [f"{self.name}: no p value with fewer than two subjects {where}"]
+        if min(self.count) < FEW:
+            subjects = f"{self.count[0]} and {self.count[1]} subjects"
+            warning = f"p values are approximate with fewer than {FEW}"
+            return [f"{self.name}: {subjects}; {warning}"]
+        return []
+
+
+def _compared_pair(
+    subjects: _Subjects, pair: tuple[int, int], max_draws: int, rng: np.random.Generator
+) -> _Pair:
+    """Compare two groups: within the subjects measured in both, if there are any."""
+    a, b = pair
+    measured = subjects.measured
+    values = subjects.place[:, [a, b]]
+    both = measured[:, a] & measured[:, b]
+    within = bool(both.any())
+    if within:
+        values = values[both]
+        step = (values[:, 0] - values[:, 1]).mean(axis=0)
+        count = (len(values), len(values))
+    else:
+        step = known_mean(values[:, 0]) - known_mean(values[:, 1])
+        count = (int(measured[:, a].sum()), int(measured[:, b].sum()))
+    statistic = np.nan
+    p = np.nan
+    drawn = 0
+    if min(count) >= 2 and within:
+        (statistic,), (p,), drawn = within_subjects_p(
+            values, max_draws=max_draws, rng=rng
+        )
+    elif min(count) >= 2:
+        places = np.concatenate(
+            [values[measured[:, side], i] for i, side in enumerate(pair)]
+        )
+        (statistic,), (p,), drawn = between_groups_p(
+            places, np.repeat([0, 1], count), max_draws=max_draws, rng=rng
+        )
+    length = float(np.linalg.norm(step))
+    noise = length / np.sqrt(statistic) if statistic > 0 else np.nan
+    name = f"{subjects.groups[a]} to {subjects.groups[b]}"
+    return _Pair(name, within, count, length, noise, p, drawn)
+
+
+def _distances(pairs: Sequence[_Pair], length: float) -> dict[str, Array]:
+    """Variables of the pairs; distances in units of `length`."""
+    return {
+        "group_distance": np.array([pair.distance for pair in pairs]) / length,
+        "group_distance_noise": np.array([pair.noise for pair in pairs]) / length,
+        "group_distance_p": np.array([pair.p for pair in pairs]),
+        "pair_subject_count": np.array([pair.count for pair in pairs]),
+        "pair_permutations": np.array([pair.permutations for pair in pairs]),
+    }
 
 
 def _adjusted(
     subjects: _Subjects,
-    p: Array,
-    within: Sequence[bool],
-    most: int,
+    pairs: Sequence[_Pair],
+    max_draws: int,
     rng: np.random.Generator,
 ) -> tuple[Array, str]:
     """P values adjusted for all pairs, and the method: joint permutations of all groups
     if these are valid.
     """
+    p = np.array([pair.p for pair in pairs])
     finite = np.isfinite(p)
     if finite.sum() < 2:
         return p, ONE_PAIR
     # no single permutation scheme is valid for all pairs
-    if not finite.all() or len(set(within)) > 1:
+    if not finite.all() or len({pair.within for pair in pairs}) > 1:
         return np.minimum(p * finite.sum(), 1.0), "Bonferroni"
-    if within[0]:
-        _, largest, _ = within_subjects_p(subjects.place, max_draws=most, rng=rng)
+    if pairs[0].within:
+        _, largest, _ = within_subjects_p(subjects.place, max_draws=max_draws, rng=rng)
     else:
-        group = np.argmax(subjects.there, axis=1)
+        group = np.argmax(subjects.measured, axis=1)
         places = subjects.place[np.arange(len(group)), group]
-        _, largest, _ = between_groups_p(places, group, max_draws=most, rng=rng)
+        _, largest, _ = between_groups_p(places, group, max_draws=max_draws, rng=rng)
     return np.maximum(largest, p), "largest statistic"
 
 

@@ -11,6 +11,7 @@ photographs of the paper, R_d contains no shading.
 
 from __future__ import annotations
 
+import itertools
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -24,7 +25,14 @@ from sklearn.exceptions import ConvergenceWarning
 from skindb import plots
 from skindb.analysis.components import mean_face
 from skindb.analysis.regions import map_regions
-from skindb.analysis.study import Population, Results, Study, each_take, table_of
+from skindb.analysis.study import (
+    Population,
+    Results,
+    Study,
+    each_take,
+    skipped_takes,
+    table_of,
+)
 from skindb.analysis.subjects import groups_by, takes_to_compare
 from skindb.analysis.texture import COVERED, DARKEST, LEAST_COVERED, MAPPED
 from skindb.errors import Fault, InputError
@@ -156,29 +164,15 @@ def chromophore_axes(
             "no landmarks: beards, brows and lips are used as skin and may rotate the axes"
         )
     count = max(SAMPLES // max(cohort.sizes["take"], 1), 64)
-    samples = [
-        sample
-        for sample in each_take(_sampled, cohort, MAPPED, inside, count)
-        if sample is not None
-    ]
-    if not samples:
-        rule = "some texels of skin must be measured"
-        cure = "fit or register more takes"
-        raise InputError(Fault("chromophores", rule, "none", cure))
+    samples = _skin_samples(cohort, inside, count)
     density = np.concatenate([sample.density for sample in samples])
-    if density.var(axis=0).sum() <= CONSTANT:
-        rule = "albedo must vary over the skin of a take"
-        cure = "use maps of measured faces"
-        raise InputError(Fault("chromophores", rule, "constant maps", cure))
     plane = _principal_plane(density)
     mixing, spread = _components(samples, plane, rng)
     reasons = _rejection_reasons(mixing, spread, plane)
-    axes, origin = (
-        (np.maximum(mixing, 0.0), INDEPENDENT)
-        if not reasons
-        else _published_axes(plane)
-    )
+    axes = np.maximum(mixing, 0.0)
+    origin = INDEPENDENT
     if reasons:
+        axes, origin = _published_axes(plane)
         flags.append(
             f"independent components are not used ({'; '.join(reasons)}): "
             f"the axes are {origin}, and amounts are approximate"
@@ -196,9 +190,34 @@ def chromophore_axes(
         attrs={
             "axes_origin": origin,
             "flags": flags,
-            "skipped": list(cohort.attrs.get("skipped", [])),
+            "skipped": skipped_takes(cohort),
         },
     )
+
+
+def _skin_samples(cohort: xr.Dataset, inside: Mask, count: int) -> list[_Sampled]:
+    """Samples of the skin of all takes that have any.
+
+    Raises
+    ------
+    InputError
+        If no texel was measured, or if albedo does not vary within any take.
+    """
+    samples = [
+        sample
+        for sample in each_take(_sampled, cohort, MAPPED, inside, count)
+        if sample is not None
+    ]
+    if not samples:
+        rule = "some texels of skin must be measured"
+        cure = "fit or register more takes"
+        raise InputError(Fault("chromophores", rule, "none", cure))
+    density = np.concatenate([sample.density for sample in samples])
+    if density.var(axis=0).sum() <= CONSTANT:
+        rule = "albedo must vary over the skin of a take"
+        cure = "use maps of measured faces"
+        raise InputError(Fault("chromophores", rule, "constant maps", cure))
+    return samples
 
 
 def chromophore_maps(maps: xr.Dataset, axes: xr.Dataset) -> xr.Dataset:
@@ -279,7 +298,7 @@ def chromophore_statistics(
             "region": list(drawn),
             "chromophore": list(CHROMOPHORES),
         },
-        attrs={"skipped": list(cohort.attrs.get("skipped", []))},
+        attrs={"skipped": skipped_takes(cohort)},
     )
 
 
@@ -345,7 +364,7 @@ def chromophore_table(
         attrs={
             "takes": sorted(map(str, takes["take"].values)),
             "group_by": group_by or "",
-            "skipped": list(cohort.attrs.get("skipped", [])),
+            "skipped": skipped_takes(cohort),
         },
     )
 
@@ -561,47 +580,32 @@ def plot_chromophores(
     if table is None:
         raise ValueError("table must be given; pass the result of chromophore_table")
     groups = [str(name) for name in table["group"].values]
-    lines = len(groups) * len(CHROMOPHORES)
-    for g, group in enumerate(groups):
-        for c, (name, colour) in enumerate(
-            zip(CHROMOPHORES, (plots.BLUE, plots.RED), strict=True)
-        ):
-            part = table.sel(group=group, chromophore=name, region=regions)
-            y = np.arange(len(regions)) + 0.7 * (
-                (g * len(CHROMOPHORES) + c + 0.5) / lines - 0.5
-            )
-            mean = part["group_chromophore_mean"].values
-            bars = np.nan_to_num(
-                [
-                    mean - part["group_chromophore_mean_low"].values,
-                    part["group_chromophore_mean_high"].values - mean,
-                ]
-            )
-            count = int(part["group_chromophore_count"].max())
-            ax.errorbar(
-                mean,
-                y,
-                xerr=bars,
-                fmt="osD^v"[g % 5],
-                color=colour,
-                mfc=colour if c else "white",
-                markersize=5,
-                capsize=2,
-                linewidth=1,
-                label=f"{name}, {group} (n = {count})",
-            )
+    colours = dict(zip(CHROMOPHORES, (plots.BLUE, plots.RED), strict=True))
+    lines = list(itertools.product(enumerate(groups), colours))
+    for i, ((g, group), name) in enumerate(lines):
+        part = table.sel(group=group, chromophore=name, region=regions)
+        mean, low, high = (
+            part[f"group_chromophore_mean{end}"].values for end in ("", "_low", "_high")
+        )
+        count = int(part["group_chromophore_count"].max())
+        ax.errorbar(
+            mean,
+            np.arange(len(regions)) + 0.7 * ((i + 0.5) / len(lines) - 0.5),
+            xerr=np.nan_to_num([mean - low, high - mean]),
+            fmt="osD^v"[g % 5],
+            color=colours[name],
+            mfc="white" if name == CHROMOPHORES[0] else colours[name],
+            markersize=5,
+            capsize=2,
+            linewidth=1,
+            label=f"{name}, {group} (n = {count})",
+        )
     ax.set_yticks(range(len(regions)), regions)
     ax.invert_yaxis()
     ax.set_xlabel(
         "amount relative to the mean of all takes, with 95 % CI [-ln R_d at green]"
     )
-    ax.legend(
-        fontsize=7,
-        loc="lower center",
-        bbox_to_anchor=(0.5, 1.0),
-        ncols=2,
-        frameon=False,
-    )
+    plots.legend_above(ax)
     return ax
 
 

@@ -12,7 +12,14 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from skindb import plots
-from skindb.analysis.study import Population, Results, Study, each_take, shared_once
+from skindb.analysis.study import (
+    Population,
+    Results,
+    Study,
+    each_take,
+    shared_once,
+    skipped_takes,
+)
 from skindb.analysis.subjects import takes_to_compare
 from skindb.analysis.texture import COVERED
 from skindb.errors import Fault, InputError
@@ -22,7 +29,7 @@ from skindb.parameters import option
 from skindb.render.image import tone_map
 from skindb.schema import dataset
 from skindb.schema.cohort import require_same_fit
-from skindb.schema.notes import note
+from skindb.schema.notes import Note, note
 from skindb.types import Array, Mask
 
 if TYPE_CHECKING:
@@ -117,7 +124,7 @@ def mean_face(
             "subjects": len(subjects.names),
             "least_subjects": least,
             "takes": sorted(map(str, takes["take"].values)),
-            "skipped": list(cohort.attrs.get("skipped", [])),
+            "skipped": skipped_takes(cohort),
         },
     )
 
@@ -198,33 +205,7 @@ def principal_components(
     """
     dims = [str(dim) for dim in values.dims if dim != "take"]
     cohort = values.transpose("take", *dims).rename("values").to_dataset()
-    takes = [str(take) for take in cohort["take"].values]
-    finite = each_take(_finite_entries, cohort, ["values"])
-    fraction = np.array([entries.mean() for entries in finite])
-    rows = np.flatnonzero((fraction >= least_known) & (fraction > 0))
-    skipped = [
-        note(takes[i], f"only {fraction[i]:.0%} of its entries are known")
-        for i in range(len(takes))
-        if i not in rows
-    ]
-    if len(rows) < 2:
-        rule = "at least two takes must have enough values"
-        finding = f"{len(rows)} of {len(takes)}"
-        raise InputError(
-            Fault("principal components", rule, finding, "fit or register more takes")
-        )
-    is_used: Mask = np.logical_and.reduce([finite[i] for i in rows])
-    if not is_used.any():
-        finding = f"none of {is_used.size}"
-        cure = "set a larger least_known to exclude takes that cover other parts"
-        raise InputError(
-            Fault(
-                "principal components",
-                "some entries must be known in every take",
-                finding,
-                cure,
-            )
-        )
+    rows, is_used, skipped = _usable_entries(cohort, least_known)
     once = shared_once(is_used)
     # the mean uses up one dimension: one more axis would be rounding error
     most = min(most, max(len(rows) - 1, 1))
@@ -263,6 +244,40 @@ def principal_components(
         attrs={"skipped": skipped, "used_fraction": float(is_used.mean())},
     )
     return ds.assign_coords({dim: cohort[dim] for dim in dims if dim in cohort.coords})
+
+
+def _usable_entries(
+    cohort: xr.Dataset, least_known: float
+) -> tuple[NDArray[np.intp], Mask, list[Note]]:
+    """Rows of the takes with enough known entries, the entries that all of them know,
+    and notes on the other takes.
+
+    Raises
+    ------
+    InputError
+        If there are fewer than two takes, or if no entry is known in all of them.
+    """
+    finite = each_take(_finite_entries, cohort, ["values"])
+    fraction = np.array([entries.mean() for entries in finite])
+    rows = np.flatnonzero((fraction >= least_known) & (fraction > 0))
+    skipped = [
+        note(str(take), f"only {fraction[i]:.0%} of its entries are known")
+        for i, take in enumerate(cohort["take"].values)
+        if i not in rows
+    ]
+    if len(rows) < 2:
+        rule = "at least two takes must have enough values"
+        finding = f"{len(rows)} of {len(finite)}"
+        raise InputError(
+            Fault("principal components", rule, finding, "fit or register more takes")
+        )
+    is_used: Mask = np.logical_and.reduce([finite[i] for i in rows])
+    if not is_used.any():
+        rule = "some entries must be known in every take"
+        finding = f"none of {is_used.size}"
+        cure = "set a larger least_known to exclude takes that cover other parts"
+        raise InputError(Fault("principal components", rule, finding, cure))
+    return rows, is_used, skipped
 
 
 def _finite_entries(take: xr.Dataset) -> Mask:

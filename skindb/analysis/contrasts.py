@@ -4,16 +4,20 @@ and of maps have in common. The unit of inference is the subject.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from skindb.analysis.study import Population
 from skindb.analysis.subjects import (
     CONDITION,
     NORMAL,
+    Attribute,
     Subjects,
     attribute_of,
     comparable_takes,
@@ -27,10 +31,19 @@ from skindb.analysis.subjects import (
     word_of,
 )
 from skindb.errors import Fault, InputError
+from skindb.numerics.inference import (
+    Effects,
+    effects,
+    paired_effects,
+    permutation_p,
+    sign_flip_p,
+)
 from skindb.numerics.statistics import known_mean
-from skindb.schema import IDENTIFIED
+from skindb.parameters import ContrastParameters
+from skindb.schema import IDENTIFIED, variables
 from skindb.types import Array, Mask
 
+Result = TypeVar("Result")
 CHANNELS = ("R", "G", "B")
 SURFACE = "surface reflectance"
 # subjects of a group, below which intervals depend on the assumption of normal values
@@ -40,8 +53,27 @@ FEW = 10
 ASSOCIATED = 0.5
 # of the standardised regressors, above which coefficients can hardly be separated
 MAX_CONDITION_NUMBER = 30.0
-CONTRAST_RULE = "the subjects must determine the effect"
-CONTRAST_CURE = "adjust for fewer attributes, compare other groups, or add subjects"
+
+
+# variable of the tables -> name, dims, and whether logarithms are compared
+TABULATED = {
+    variables.REGION_DIFFUSE_REFLECTANCE: ("R_d", ("region", "channel"), False),
+    variables.REGION_SURFACE_REFLECTANCE: (SURFACE, ("region",), False),
+    variables.SITE_SIGMA_TR: ("sigma_tr", ("site", "channel"), True),
+}
+
+
+def contrast_arguments(
+    population: Population, parameters: ContrastParameters
+) -> dict[str, Any]:
+    """Keyword arguments of the function that compares the groups of a population."""
+    return {
+        "group_by": parameters.group_by,
+        "adjust": parameters.adjust,
+        "permutations": parameters.permutations,
+        "mixed_fits": population.mixed_fits,
+        "rng": np.random.default_rng(parameters.seed),
+    }
 
 
 @dataclass(frozen=True)
@@ -50,9 +82,6 @@ class Quantities:
 
     names: tuple[str, ...]  # for example "R_d face G"
     values: Array  # (n, q) NaN where there is no value; logarithms where `is_log`
-    # (n, q) standard errors that are independent between takes; NaN where none is
-    # stated
-    errors: Array
     # (q,) whether logarithms are compared, so that intervals stay positive
     is_log: Mask
     # (q,) limit of a bias to higher values that all takes have in common; 0 where there
@@ -60,19 +89,19 @@ class Quantities:
     common: Array
     subject: tuple[str, ...]  # (n,) names of the subjects
 
+    @property
+    def logarithmic(self) -> list[str]:
+        """Names of the quantities whose logarithms are compared."""
+        return list(itertools.compress(self.names, self.is_log.tolist()))
+
     def of_subjects(self) -> Quantities:
         """Means over the takes of every subject."""
-        names = list(dict.fromkeys(self.subject))
+        names = tuple(dict.fromkeys(self.subject))
         takes = [
             np.array([name == subject for subject in self.subject]) for name in names
         ]
         values = np.stack([known_mean(self.values[rows]) for rows in takes])
-        squares = np.stack(
-            [known_mean(self.errors[rows] ** 2) / rows.sum() for rows in takes]
-        )
-        return replace(
-            self, values=values, errors=np.sqrt(squares), subject=tuple(names)
-        )
+        return replace(self, values=values, subject=names)
 
     def of_takes(self, rows: Mask) -> Quantities:
         """The quantities of the selected takes."""
@@ -83,12 +112,8 @@ class Quantities:
         return self._select([self.subject.index(name) for name in subjects])
 
     def _select(self, rows: Sequence[int] | NDArray[np.intp]) -> Quantities:
-        return replace(
-            self,
-            values=self.values[rows],
-            errors=self.errors[rows],
-            subject=tuple(self.subject[i] for i in rows),
-        )
+        subject = tuple(self.subject[i] for i in rows)
+        return replace(self, values=self.values[rows], subject=subject)
 
 
 def quantities_of(cohort: xr.Dataset) -> Quantities:
@@ -104,79 +129,55 @@ def quantities_of(cohort: xr.Dataset) -> Quantities:
     InputError
         If no take has any of these quantities.
     """
-    limit = 0.0
-    if (
-        "fit_even_reflection" in cohort.coords
-        and np.isfinite(cohort["fit_even_reflection"].values.astype(float)).any()
-    ):
-        limit = float(np.nanmax(cohort["fit_even_reflection"].values.astype(float)))
+    prefixes = ("region_", "site_")
+    tables = cohort[[name for name in cohort if str(name).startswith(prefixes)]].load()
+    limit = _even_reflection_limit(cohort)
     names: list[str] = []
-    columns: list[tuple[Array, Array, bool, float]] = []
-
-    def add(
-        prefix: str,
-        variable: str,
-        dims: tuple[str, ...],
-        *,
-        is_log: bool = False,
-        common: float = 0.0,
-    ) -> None:
-        if variable not in cohort:
-            return
-        values = np.asarray(
-            cohort[variable].transpose("take", *dims).values, np.float64
-        )
-        has_errors = f"{variable}_error" in cohort
-        errors = (
-            np.asarray(cohort[f"{variable}_error"].transpose("take", *dims).values)
-            if has_errors
-            else values * np.nan
-        )
-        if is_log:
-            good = cohort["site_status"].isin(IDENTIFIED).transpose(
-                "take", *dims[:-1], "channel"
-            ).values & (values > 0)
-            errors = np.where(good, errors / np.where(good, values, 1.0), np.nan)
-            values = np.where(good, np.log(np.where(good, values, 1.0)), np.nan)
-        for index in np.ndindex(values.shape[1:]):
-            labels = [
-                CHANNELS if dim == "channel" else cohort[dim].values for dim in dims
-            ]
-            names.append(
-                " ".join(
-                    [
-                        prefix,
-                        *(
-                            str(names_of_dim[i])
-                            for names_of_dim, i in zip(labels, index, strict=True)
-                        ),
-                    ]
-                )
-            )
-            columns.append((values[:, *index], errors[:, *index], is_log, common))
-
-    cohort = cohort[
-        [name for name in cohort if str(name).startswith(("region_", "site_"))]
-    ].load()
-    add("R_d", "region_diffuse_reflectance", ("region", "channel"), common=limit)
-    add(SURFACE, "region_surface_reflectance", ("region",))
-    add("sigma_tr", "site_sigma_tr", ("site", "channel"), is_log=True)
-    measured = [i for i, column in enumerate(columns) if np.isfinite(column[0]).any()]
-    if not measured:
+    columns: list[Array] = []
+    is_log: list[bool] = []
+    common: list[float] = []
+    for variable, (prefix, dims, logarithmic) in TABULATED.items():
+        if variable not in tables:
+            continue
+        values = _table_values(tables, variable, dims, logarithmic=logarithmic)
+        bias = limit if variable == variables.REGION_DIFFUSE_REFLECTANCE else 0.0
+        labels = [CHANNELS if dim == "channel" else tables[dim].values for dim in dims]
+        for words, column in zip(itertools.product(*labels), values.T, strict=True):
+            if np.isfinite(column).any():
+                names.append(" ".join([prefix, *map(str, words)]))
+                columns.append(column)
+                is_log.append(logarithmic)
+                common.append(bias)
+    if not names:
         rule = "some take must have albedo, surface reflectance or sigma_tr"
         raise InputError(
             Fault("population", rule, "none of them", "fit the takes again")
         )
-    values, errors, is_log, common = zip(*(columns[i] for i in measured), strict=True)
     subject = tuple(map(str, cohort["subject"].values))
-    stacked = np.stack(values, axis=1), np.stack(errors, axis=1)
+    stacked = np.stack(columns, axis=1)
     return Quantities(
-        tuple(names[i] for i in measured),
-        *stacked,
-        np.array(is_log),
-        np.array(common),
-        subject,
+        tuple(names), stacked, np.array(is_log), np.array(common), subject
     )
+
+
+def _even_reflection_limit(cohort: xr.Dataset) -> float:
+    """Largest limit of the excess of R_d by even reflection; 0 if no take states one."""
+    if "fit_even_reflection" not in cohort.coords:
+        return 0.0
+    limits = cohort["fit_even_reflection"].values.astype(float)
+    return float(np.nanmax(limits)) if np.isfinite(limits).any() else 0.0
+
+
+def _table_values(
+    tables: xr.Dataset, variable: str, dims: tuple[str, ...], *, logarithmic: bool
+) -> Array:
+    """Values (take, q) of a variable, or the logarithms of identified ones."""
+    values = np.asarray(tables[variable].transpose("take", *dims).values, np.float64)
+    if logarithmic:
+        identified = tables[variables.SITE_STATUS].isin(IDENTIFIED)
+        good = identified.transpose("take", *dims).values & (values > 0)
+        values = np.where(good, np.log(np.where(good, values, 1.0)), np.nan)
+    return values.reshape(len(values), -1)
 
 
 @dataclass(frozen=True)
@@ -195,6 +196,16 @@ class Contrast:
     def is_paired(self) -> bool:
         """Whether the contrast is of differences within subjects."""
         return self.before is not None
+
+    def complete(self) -> Contrast:
+        """The contrast of the subjects with known regressor and covariates."""
+        rows = np.isfinite(self.regressor) & np.isfinite(self.covariates).all(axis=1)
+        return replace(
+            self,
+            quantities=self.quantities.of_takes(rows),
+            regressor=self.regressor[rows],
+            covariates=self.covariates[rows],
+        )
 
 
 def contrasts(
@@ -219,46 +230,59 @@ def contrasts(
     takes, subjects = takes_to_compare(cohort, group_by)
     quantities = measure(takes).of_subjects()
     names = quantities.subject
-    stated = subjects.by_subject(compared, names)
-    held = [subjects.by_subject(name, names) for name in adjust]
-    for attribute in (stated, *held):
-        attribute.require_one_kind()
-    nothing = np.empty((len(names), 0))
-    covariates = np.concatenate([nothing, *(one.columns for one in held)], axis=1)
-
-    def contrast(name: str, regressor: Array, *, is_number: bool = False) -> Contrast:
-        is_complete = np.isfinite(regressor) & np.isfinite(covariates).all(axis=1)
-        return Contrast(
-            name,
-            quantities.of_takes(is_complete),
-            regressor[is_complete],
-            covariates[is_complete],
-            is_number,
-        )
-
+    attribute = subjects.by_subject(compared, names)
+    covariates = _covariates(subjects, names, adjust, attribute)
     if group_by not in everyone.attributes:
         trait = trait_of(everyone, group_by)
         carries = _carriers(everyone, subjects, trait)
-        regressor = np.array([carries.get(name, np.nan) for name in names])
-        return [contrast(f"{trait} less others", regressor)]
-    words = sorted({word_of(value) for value in stated.known})
+        regressors = {
+            f"{trait} less others": np.array([carries.get(s, np.nan) for s in names])
+        }
+    else:
+        regressors = _regressors(attribute, group_by)
+    is_number = group_by in everyone.attributes and attribute.is_numeric
+    return [
+        Contrast(name, quantities, regressor, covariates, is_number).complete()
+        for name, regressor in regressors.items()
+    ]
+
+
+def _covariates(
+    subjects: Subjects, names: Sequence[str], adjust: Sequence[str], compared: Attribute
+) -> Array:
+    """Regression columns (n, c) of the adjusted attributes of the named subjects.
+
+    Raises
+    ------
+    InputError
+        If one of them or the compared attribute mixes numbers and words.
+    """
+    attributes = [subjects.by_subject(name, names) for name in adjust]
+    for attribute in (compared, *attributes):
+        attribute.require_one_kind()
+    nothing = np.empty((len(names), 0))
+    return np.concatenate([nothing, *(a.columns for a in attributes)], axis=1)
+
+
+def _regressors(attribute: Attribute, group_by: str) -> dict[str, Array]:
+    """Name of each comparison by an attribute -> regressor (n,), NaN where unknown."""
+    words = sorted({word_of(value) for value in attribute.known})
     if len(words) < 2:
         finding = f"only {words[0]}" if words else "no subject with this attribute"
         rule = "there must be subjects of two groups"
         raise InputError(
             Fault(f"group by {group_by}", rule, finding, "group by another attribute")
         )
-    if stated.is_numeric:
-        return [contrast(f"{group_by}, per unit", stated.numbers, is_number=True)]
-
-    def is_of(word: str) -> Array:
-        is_known = np.array([value is not None for value in stated.values])
-        is_word = np.array([word_of(value) == word for value in stated.values])
-        return np.where(is_known, is_word.astype(np.float64), np.nan)
-
+    if attribute.is_numeric:
+        return {f"{group_by}, per unit": attribute.numbers}
+    is_known = np.array([value is not None for value in attribute.values])
+    indicators = {}
+    for word in words:
+        is_word = np.array([word_of(value) == word for value in attribute.values])
+        indicators[word] = np.where(is_known, is_word.astype(np.float64), np.nan)
     if len(words) == 2:
-        return [contrast(f"{words[1]} less {words[0]}", is_of(words[1]))]
-    return [contrast(f"{word} less others", is_of(word)) for word in words]
+        return {f"{words[1]} less {words[0]}": indicators[words[1]]}
+    return {f"{word} less others": indicators[word] for word in words}
 
 
 def _carriers(everyone: Subjects, subjects: Subjects, trait: str) -> dict[str, float]:
@@ -270,6 +294,44 @@ def _carriers(everyone: Subjects, subjects: Subjects, trait: str) -> dict[str, f
     for i in np.flatnonzero(usable):
         carries.setdefault(subjects.subject[i], float(of_take[subjects.take[i]]))
     return carries
+
+
+@dataclass(frozen=True)
+class Comparison(Generic[Result]):
+    """A contrast with its result, associated attributes and warnings."""
+
+    contrast: Contrast
+    result: Result
+    associated: dict[str, float]  # attribute -> multiple correlation
+    flags: list[str]
+
+
+def compare_groups(
+    cohort: xr.Dataset,
+    group_by: str,
+    adjust: Sequence[str],
+    measure: Callable[[xr.Dataset], Quantities],
+    statistics: Callable[[Contrast], Result],
+) -> tuple[list[Comparison[Result]], list[Fault]]:
+    """Comparisons with the results of `statistics`, and a fault for each contrast for
+    which it raises `ValueError`; arguments as of `contrasts`.
+    """
+    subjects = subjects_of(cohort)
+    others = other_attributes(subjects, group_by)
+    compared = []
+    faults = []
+    for contrast in contrasts(cohort, group_by, adjust, measure):
+        try:
+            result = statistics(contrast)
+            associated = associations(contrast, subjects, others)
+            flags = contrast_flags(contrast, subjects, associated, adjust)
+        except ValueError as error:
+            rule = "the subjects must determine the effect"
+            cure = "adjust for fewer attributes, compare other groups, or add subjects"
+            faults.append(Fault(contrast.name, rule, str(error), cure))
+        else:
+            compared.append(Comparison(contrast, result, associated, flags))
+    return compared, faults
 
 
 def _paired(
@@ -286,34 +348,47 @@ def _paired(
     pairs = []
     for name in names:
         changed = quantities.of_takes(conditions == name)
-        both = [
-            subject
-            for subject in dict.fromkeys(changed.subject)
-            if subject in plain.subject
-        ]
+        both = [s for s in dict.fromkeys(changed.subject) if s in plain.subject]
         if not both:
             continue
         after = changed.of_subjects().of_named(both)
-        before = plain.of_subjects().of_named(both)
-        difference = replace(
-            after,
-            values=after.values - before.values,
-            errors=np.hypot(after.errors, before.errors),
-        )
-        pairs.append(
-            Contrast(
-                f"{name} less {NORMAL}",
-                difference,
-                np.ones(len(both)),
-                np.empty((len(both), 0)),
-                before=before.values,
-            )
-        )
+        before = plain.of_subjects().of_named(both).values
+        difference = replace(after, values=after.values - before)
+        ones = np.ones(len(both))
+        nothing = np.empty((len(both), 0))
+        title = f"{name} less {NORMAL}"
+        pairs.append(Contrast(title, difference, ones, nothing, before=before))
     if not pairs:
         rule = "some subjects must be measured in both conditions"
         cure = "measure subjects in two conditions"
         raise InputError(Fault(f"group by {group_by}", rule, "none", cure))
     return pairs
+
+
+@dataclass(frozen=True)
+class ContrastTest:
+    """Effects on quantities (q,) with their p values by permutation."""
+
+    effects: Effects
+    p: Array
+    p_adjusted: Array  # for all quantities, by the largest statistic
+    permutations: int
+
+
+def contrast_test(
+    contrast: Contrast, values: Array, max_draws: int, rng: np.random.Generator
+) -> ContrastTest:
+    """Effects on values (n, q) of the subjects of a contrast; raises `ValueError` where
+    the subjects do not determine them.
+    """
+    if contrast.is_paired:
+        fit = paired_effects(values)
+        return ContrastTest(fit, *sign_flip_p(values, max_draws=max_draws, rng=rng))
+    design = (contrast.regressor, contrast.covariates)
+    fit = effects(values, *design)
+    return ContrastTest(
+        fit, *permutation_p(values, *design, max_draws=max_draws, rng=rng)
+    )
 
 
 def contrast_counts(contrast: Contrast) -> Array:
@@ -364,10 +439,9 @@ def contrast_flags(
     subjects: Subjects,
     associated: dict[str, float],
     adjust: Sequence[str],
-    count: Array,
 ) -> list[str]:
     """Warnings about a comparison: few subjects, correlated attributes and extrapolation."""
-    flags = _few_subjects(contrast, count)
+    flags = _few_subjects(contrast)
     if not contrast.is_paired:
         flags += _confounders(associated, adjust)
         for name in adjust:
@@ -397,9 +471,9 @@ def _collinearity(contrast: Contrast, adjust: Sequence[str]) -> list[str]:
     return [f"can hardly be separated from {names} (condition number {number:.0f})"]
 
 
-def _few_subjects(contrast: Contrast, count: Array) -> list[str]:
+def _few_subjects(contrast: Contrast) -> list[str]:
     """A warning if few subjects are compared."""
-    counts = [int(side) for side in count.max(axis=0)]
+    counts = [int(side) for side in contrast_counts(contrast).max(axis=0)]
     text = f"{counts[0]} subjects"
     if not (contrast.is_number or contrast.is_paired):
         text += f" with and {counts[1]} without"

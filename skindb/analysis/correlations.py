@@ -12,7 +12,14 @@ from scipy import stats
 
 from skindb import plots
 from skindb.analysis.contrasts import CHANNELS, SURFACE, Quantities, quantities_of
-from skindb.analysis.study import Population, Results, Study, Table, table_of
+from skindb.analysis.study import (
+    Population,
+    Results,
+    Study,
+    Table,
+    skipped_takes,
+    table_of,
+)
 from skindb.analysis.subjects import takes_to_compare
 from skindb.errors import Fault, InputError
 from skindb.numerics.statistics import benjamini_hochberg, known_mean
@@ -91,24 +98,13 @@ def component_correlations(
     if not mixed_fits:
         require_same_fit(cohort)
     takes, _ = takes_to_compare(cohort, None)
-    if "region" in takes.coords and region not in takes["region"].values:
-        cure = f"choose one of {', '.join(map(str, takes['region'].values))}"
-        raise InputError(
-            Fault(
-                f"region {region}",
-                "must be a region of the takes",
-                "an unknown name",
-                cure,
-            )
-        )
+    _require_region(takes, region)
     values = _components(quantities_of(takes), region)
-    is_known = np.isfinite(values)
     pairs = [
-        (i, j)
-        for i, j in combinations(range(len(COMPONENTS)), 2)
-        if (is_known[:, i] & is_known[:, j]).sum() >= MIN_SUBJECTS
+        pair
+        for pair in combinations(range(len(COMPONENTS)), 2)
+        if _can_correlate(values[:, pair])
     ]
-    pairs = [(i, j) for i, j in pairs if _varies(values[:, [i, j]])]
     if not pairs:
         rule = f"at least {MIN_SUBJECTS} subjects must have two components that vary"
         cure = "fit more subjects"
@@ -135,7 +131,7 @@ def component_correlations(
         attrs={
             "region": region,
             "flags": flags,
-            "skipped": list(cohort.attrs.get("skipped", [])),
+            "skipped": skipped_takes(cohort),
         },
     )
 
@@ -163,10 +159,18 @@ def _components(quantities: Quantities, region: str) -> Array:
     return np.stack(out, axis=1)
 
 
-def _varies(two: Array) -> bool:
-    """Whether both columns vary between the subjects that have both."""
-    complete = two[np.isfinite(two).all(axis=1)]
-    return bool((np.ptp(complete, axis=0) > 0).all())
+def _require_region(takes: xr.Dataset, region: str) -> None:
+    """Raise `InputError` if no take has a region of this name."""
+    if "region" in takes.coords and region not in takes["region"].values:
+        rule = "must be a region of the takes"
+        cure = f"choose one of {', '.join(map(str, takes['region'].values))}"
+        raise InputError(Fault(f"region {region}", rule, "an unknown name", cure))
+
+
+def _can_correlate(columns: Array) -> bool:
+    """Whether enough subjects have both columns (n, 2), and both vary between them."""
+    complete = columns[np.isfinite(columns).all(axis=1)]
+    return len(complete) >= MIN_SUBJECTS and bool((np.ptp(complete, axis=0) > 0).all())
 
 
 def _pair(
@@ -222,7 +226,7 @@ def plot_correlations(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     ax = ax or plots.new_axes(6.5, 1.0 + 0.24 * len(names))
     ax.axvline(0, color="0.6", linewidth=1)
     correlations = table["component_correlation"].values
-    place = np.arange(len(names))[::-1]
+    place = np.arange(float(len(names)))[::-1]
     bars = np.stack(
         [
             correlations - table["component_correlation_low"].values,
@@ -231,18 +235,9 @@ def plot_correlations(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     )
     bars = np.maximum(np.nan_to_num(bars), 0.0)
     significant = table["correlation_p_false_discovery"].values < 0.05
-    for rows, fill in ((significant, plots.CYCLE[0]), (~significant, "white")):
-        ax.errorbar(
-            correlations[rows],
-            place[rows],
-            xerr=bars[:, rows],
-            fmt="o",
-            color=plots.CYCLE[0],
-            mfc=fill,
-            markersize=4,
-            capsize=2,
-            linewidth=1,
-        )
+    plots.significance_bars(
+        ax, correlations, place, bars, significant, colour=plots.CYCLE[0]
+    )
     ax.set_yticks(place, names, fontsize=7)
     ax.set_xlim(-1, 1)
     count = int(table["correlation_count"].max())

@@ -13,7 +13,7 @@ import xarray as xr
 from scipy.stats.contingency import association
 
 from skindb.analysis.contrasts import ASSOCIATED, FEW
-from skindb.analysis.study import Population, Results, Study, table_of
+from skindb.analysis.study import Population, Results, Study, skipped_takes, table_of
 from skindb.analysis.subjects import (
     AGE,
     CONDITION,
@@ -122,7 +122,7 @@ def coverage_report(cohort: xr.Dataset) -> xr.Dataset:
             "takes": sorted(map(str, cohort["take"].values)),
             "flags": _flags(counts, unknown, names, stated, between, len(subjects))
             + [line for attribute in stated.values() for line in attribute.notes()],
-            "skipped": list(cohort.attrs.get("skipped", [])),
+            "skipped": skipped_takes(cohort),
         },
     )
 
@@ -231,47 +231,13 @@ def _flags(
     """Lines about empty and small cells of every crossing, unknown attributes, and
     associated attributes.
     """
+    crossings: dict[tuple[str, ...], list[tuple[str, ...]]] = {}
+    for cell in counts:
+        factors = tuple(part.partition(": ")[0] for part in cell)
+        crossings.setdefault(factors, []).append(cell)
     flags = []
-    kinds: dict[tuple[str, ...], dict[tuple[str, ...], int]] = {}
-    for cell, count in counts.items():
-        kinds.setdefault(tuple(part.partition(": ")[0] for part in cell), {})[cell] = (
-            count
-        )
-    for kind, cells in kinds.items():
-        if len(kind) == 3:  # too many cells to list; they are in the table
-            few = sum(count < FEW for count in cells.values())
-            empty = sum(count == 0 for count in cells.values())
-            flags.append(
-                f"{AND.join(kind)}: {empty} of {len(cells)} cells are empty, {few} "
-                f"have fewer than {FEW}"
-            )
-            continue
-        # crossings of a value without subjects are not listed again
-        reported = {
-            cell: count
-            for cell, count in cells.items()
-            if all(counts[part,] for part in cell)
-        }
-        empty_ones = [
-            _cell_values(cell)
-            for cell, count in (reported if len(kind) > 1 else cells).items()
-            if count == 0
-        ]
-        small = [
-            f"{_cell_values(cell)} ({count})"
-            for cell, count in cells.items()
-            if 0 < count < FEW
-        ]
-        if empty_ones:
-            flags.append(f"{AND.join(kind)}: no subjects in {_join_names(empty_ones)}")
-        if small and len(small) == sum(map(bool, cells.values())) and len(kind) > 1:
-            flags.append(
-                f"{AND.join(kind)}: all {len(small)} cells with subjects have fewer than {FEW}"
-            )
-        elif small:
-            flags.append(
-                f"{AND.join(kind)}: fewer than {FEW} subjects: {_join_names(small)}"
-            )
+    for factors, cells in crossings.items():
+        flags += _crossing_flags(AND.join(factors), cells, counts)
     flags += [
         f"{name}: unknown for {n} of {subjects} subjects"
         for name, n in unknown.items()
@@ -290,6 +256,40 @@ def _flags(
                 f"{between[i, j]:.2f}): their effects can "
                 "hardly be separated"
             )
+    return flags
+
+
+def _crossing_flags(
+    name: str,
+    cells: Sequence[tuple[str, ...]],
+    counts: Mapping[tuple[str, ...], int],
+) -> list[str]:
+    """Lines about empty and small cells of one crossing."""
+    factors = len(cells[0])
+    small = [cell for cell in cells if 0 < counts[cell] < FEW]
+    empty = [cell for cell in cells if counts[cell] == 0]
+    if factors == 3:  # too many cells to list; they are in the table
+        few = len(empty) + len(small)
+        return [
+            f"{name}: {len(empty)} of {len(cells)} cells are empty, {few} "
+            f"have fewer than {FEW}"
+        ]
+    flags = []
+    if factors > 1:
+        # crossings of a value without subjects are not listed again
+        empty = [cell for cell in empty if all(counts[part,] for part in cell)]
+    if empty:
+        listed = _join_names([_cell_values(cell) for cell in empty])
+        flags.append(f"{name}: no subjects in {listed}")
+    if factors > 1 and small and len(small) == sum(counts[cell] > 0 for cell in cells):
+        flags.append(
+            f"{name}: all {len(small)} cells with subjects have fewer than {FEW}"
+        )
+    elif small:
+        listed = _join_names(
+            [f"{_cell_values(cell)} ({counts[cell]})" for cell in small]
+        )
+        flags.append(f"{name}: fewer than {FEW} subjects: {listed}")
     return flags
 
 

@@ -72,35 +72,17 @@ def transfer_detail(
     """
     for take in (model, source):
         honour_consent(take.attrs, "statistics")
-    if not np.array_equal(
-        registered["landmark"].values, source_registered["landmark"].values
-    ):
-        rule = "both takes must be registered together"
-        cure = "run skindb register"
-        raise InputError(
-            Fault("transfer of detail", rule, "different sets of landmarks", cure)
-        )
+    _require_same_landmarks(registered, source_registered)
     per_texel = float(registered["mm_per_uv"]) / size
-    levels = math.floor(math.log2(coarsest / per_texel)) - 1 if coarsest > 0 else 0
-    levels = min(levels, size.bit_length() - 2)
-    if levels < 1:
-        rule = f"must be at least four texels of {per_texel:.2g} mm"
-        raise InputError(
-            Fault(
-                "coarsest",
-                rule,
-                f"{coarsest:g} mm",
-                "choose a larger wavelength or more texels",
-            )
-        )
+    levels = _transferred_levels(coarsest, per_texel, size)
     maps, source_maps = (
         common_maps(take, placed, size=size)
         for take, placed in ((model, registered), (source, source_registered))
     )
-    (log, _), (log_source, is_measured) = log_albedo(maps), log_albedo(source_maps)
-    fraction = np.asarray(
-        _region(region, registered, source_registered, size) & is_measured, np.float32
-    )
+    log, _ = log_albedo(maps)
+    log_source, is_measured = log_albedo(source_maps)
+    mask = _region(region, registered, source_registered, size)
+    fraction = np.asarray(mask & is_measured, np.float32)
     # 0 where the source was not measured
     fraction = gaussian_filter(fraction, EDGE / per_texel) * fraction
     change = np.stack(
@@ -117,14 +99,40 @@ def transfer_detail(
     )
     tree = model.copy()
     tree["fitted"] = xr.DataTree(surviving(moved))
-    named = region if isinstance(region, str) else "mask"
     edited = {
         "detail": str(source.attrs.get("take", "")),
-        "region": named,
+        "region": region if isinstance(region, str) else "mask",
         "coarsest_mm": float(coarsest),
     }
     tree.attrs = take_attrs(model.attrs) | {"edit": edited}
     return tree
+
+
+def _require_same_landmarks(registered: xr.Dataset, source: xr.Dataset) -> None:
+    """Raise `InputError` if two takes were not registered together."""
+    if not np.array_equal(registered["landmark"].values, source["landmark"].values):
+        rule = "both takes must be registered together"
+        finding = "different sets of landmarks"
+        raise InputError(
+            Fault("transfer of detail", rule, finding, "run skindb register")
+        )
+
+
+def _transferred_levels(coarsest: float, per_texel: float, size: int) -> int:
+    """Number of the finest levels of the pyramid with wavelengths up to `coarsest` [mm].
+
+    Raises
+    ------
+    InputError
+        If the wavelength is below four texels.
+    """
+    levels = math.floor(math.log2(coarsest / per_texel)) - 1 if coarsest > 0 else 0
+    levels = min(levels, size.bit_length() - 2)
+    if levels < 1:
+        rule = f"must be at least four texels of {per_texel:.2g} mm"
+        cure = "choose a larger wavelength or more texels"
+        raise InputError(Fault("coarsest", rule, f"{coarsest:g} mm", cure))
+    return levels
 
 
 def _detail_change(image: Array, source: Array, fraction: Array, levels: int) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -111,11 +112,8 @@ def apply_traits(
           not applied).
     """
     honour_consent(model.attrs, "statistics")
-    check(
-        traits,
-        [v.name for v in GROUPS["traits"] if v.name != TEXTURE_SHIFT],
-        where="traits (run skindb analyze DB traits again)",
-    )
+    needed = [v.name for v in GROUPS["traits"] if v.name != TEXTURE_SHIFT]
+    check(traits, needed, where="traits (run skindb analyze DB traits again)")
     amount = _trait_amounts(amounts, traits)
     fitted = model["fitted"].to_dataset().load()
     tree = model.copy()
@@ -128,47 +126,25 @@ def apply_traits(
         tree["basis"] = xr.DataTree(_common_basis(model, basis, tables))
         moves.append(move)
     if "albedo" in parts:
-        shifts = (
-            traits[TEXTURE_SHIFT].values[amount != 0]
-            if TEXTURE_SHIFT in traits
-            else None
+        mapped = None
+        if texture is not None and maps is not None and registered is not None:
+            mapped = _MappedSkin(texture, maps, registered["common_uv"].values)
+        fitted, reports["albedo"], move = _moved_skin(
+            fitted, amount, traits, albedo, mapped, rng
         )
-        if (
-            texture is not None
-            and maps is not None
-            and registered is not None
-            and shifts is not None
-        ):
-            moved = np.tensordot(amount[amount != 0], shifts.astype(np.float64), 1)
-            uv = registered["common_uv"].values
-            rng = np.random.default_rng(0) if rng is None else rng
-            fitted, reports["albedo"], move = _moved_texture(
-                fitted, moved, texture, maps, uv, albedo, rng
-            )
-        else:
-            moved = np.tensordot(amount, traits["trait_quantile_shift"].values, 1)
-            fitted, reports["albedo"], move = _moved_albedo(fitted, moved, albedo)
         moves.append(move)
     if "translucency" in parts and "sigma_tr" in fitted:
-        fitted, reports["translucency"], move = _moved_translucency(
-            fitted, amount, traits
-        )
+        fitted, reports["translucency"], move = _moved_sigma_tr(fitted, amount, traits)
         moves.append(move)
-        tree = tree.drop_nodes([name for name in (PROBED,) if name in tree.children])
-        if "translucency" in tree.children:
-            tree["translucency"] = xr.DataTree(
-                _moved_sites(tree["translucency"].to_dataset().load(), amount, traits)
-            )
+        tree = _with_moved_sites(tree, amount, traits)
     tree["fitted"] = xr.DataTree(surviving(fitted))
-    attrs = take_attrs(model.attrs)
-    far = max(moves, default=0.0)
     names = [str(traits["trait"].values[i]) for i in np.flatnonzero(amount)]
-    tree.attrs = attrs | {
+    tree.attrs = take_attrs(model.attrs) | {
         "edit": dict(amounts),
-        "edit_distance": far,
+        "edit_distance": max(moves, default=0.0),
         "edit_report": reports,
+        "trait_notes": _notes(traits, names),
     }
-    tree.attrs["trait_notes"] = _notes(traits, names)
     return tree
 
 
@@ -303,21 +279,48 @@ def _common_basis(model: xr.DataTree, basis: xr.Dataset, tables: Array) -> xr.Da
     )
 
 
+@dataclass(frozen=True)
+class _MappedSkin:
+    """Albedo map of a registered take, and the distributions of its population."""
+
+    texture: xr.Dataset  # from `texture_statistics`
+    maps: xr.Dataset
+    uv: Array  # (surfel, 2) common texture coordinates
+
+
+def _moved_skin(
+    fitted: xr.Dataset,
+    amount: Array,
+    traits: xr.Dataset,
+    albedo: xr.Dataset,
+    mapped: _MappedSkin | None,
+    rng: np.random.Generator | None,
+) -> tuple[xr.Dataset, Report, float]:
+    """Move the albedo: with a map at every scale, otherwise only its colours."""
+    if mapped is None or TEXTURE_SHIFT not in traits:
+        shift = np.tensordot(amount, traits["trait_quantile_shift"].values, 1)
+        return _moved_albedo(fitted, shift, albedo)
+    used = amount != 0
+    shifts = traits[TEXTURE_SHIFT].values[used].astype(np.float64)
+    shift = np.tensordot(amount[used], shifts, 1)
+    rng = np.random.default_rng(0) if rng is None else rng
+    return _moved_texture(fitted, shift, mapped, albedo, rng)
+
+
 def _moved_texture(
     fitted: xr.Dataset,
     shift: Array,
-    texture: xr.Dataset,
-    maps: xr.Dataset,
-    uv: Array,
+    mapped: _MappedSkin,
     albedo: xr.Dataset,
     rng: np.random.Generator,
 ) -> tuple[xr.Dataset, Report, float]:
     """Shift the distributions of log albedo and of its bands in the map, and apply the
     change to the surfels.
     """
-    edit = edit_texture(maps, shift, texture, rng=rng)
+    texture = mapped.texture
+    edit = edit_texture(mapped.maps, shift, texture, rng=rng)
     colour = fitted["diffuse_reflectance"].values.astype(np.float64)
-    wanted = colour * np.exp(at_surfels(edit.change, uv))
+    wanted = colour * np.exp(at_surfels(edit.change, mapped.uv))
     fitted, report, move = _with_albedo(fitted, wanted, albedo)
     report["distance"] = ONE_SUBJECT if edit.distance is None else edit.distance
     report |= {
@@ -406,7 +409,7 @@ def _moved_albedo(
     return fitted, report, move
 
 
-def _moved_translucency(
+def _moved_sigma_tr(
     fitted: xr.Dataset, amount: Array, traits: xr.Dataset
 ) -> tuple[xr.Dataset, Report, float]:
     """Scale sigma_tr; traits without a measured shift are not applied, and the report
@@ -442,6 +445,17 @@ def surviving(ds: xr.Dataset) -> xr.Dataset:
     weights belong to the unedited model.
     """
     return ds[[name for name in names_of(Use.SURVIVES_EDIT) if name in ds]]
+
+
+def _with_moved_sites(
+    tree: xr.DataTree, amount: Array, traits: xr.Dataset
+) -> xr.DataTree:
+    """The model without the measurements of the probe, and with moved sites."""
+    tree = tree.drop_nodes([name for name in (PROBED,) if name in tree.children])
+    if "translucency" in tree.children:
+        sites = tree["translucency"].to_dataset().load()
+        tree["translucency"] = xr.DataTree(_moved_sites(sites, amount, traits))
+    return tree
 
 
 def _moved_sites(sites: xr.Dataset, amount: Array, traits: xr.Dataset) -> xr.Dataset:

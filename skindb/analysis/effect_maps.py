@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,40 +12,35 @@ import xarray as xr
 
 from skindb.analysis.contrasts import (
     CHANNELS,
-    CONTRAST_CURE,
-    CONTRAST_RULE,
     SURFACE,
+    Comparison,
     Contrast,
     Quantities,
-    associations,
-    contrast_counts,
-    contrast_flags,
-    contrasts,
-    other_attributes,
+    compare_groups,
+    contrast_arguments,
+    contrast_test,
 )
 from skindb.analysis.group_effects import SIGNIFICANT
-from skindb.analysis.study import Population, Results, Study, each_take
+from skindb.analysis.study import (
+    Population,
+    Results,
+    Study,
+    Table,
+    each_take,
+    skipped_takes,
+)
 from skindb.analysis.subjects import notes_on_attributes, subjects_of
 from skindb.errors import Fault, InputError
-from skindb.numerics.inference import (
-    effects,
-    paired_effects,
-    permutation_p,
-    sign_flip_p,
-)
-from skindb.parameters import (
-    adjust_option,
-    compared_option,
-    permutations_option,
-    seed_option,
-)
+from skindb.parameters import ContrastParameters, permutations_option
 from skindb.schema import dataset
 from skindb.schema.cohort import require_same_fit, require_takes
 from skindb.types import Array
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+TexelResult = tuple[dict[str, Array], int]  # statistics, and number of permutations
 # texels along each side: about 1 mm each, which is also the accuracy of landmarks
 SIZE = 256
 # minimum fraction of the compared subjects that must have a value at a texel
@@ -112,119 +108,114 @@ def effect_maps(
     adjust = (adjust,) if isinstance(adjust, str) else tuple(adjust)
     if not mixed_fits:
         require_same_fit(cohort)
-    texels = cohort.sizes["v"]
-    if size < 1 or texels % size:
-        rule = f"must divide the {texels} texels of the maps"
-        cure = f"choose {texels}, {texels // 2} or {texels // 4}"
-        raise InputError(Fault("size", rule, str(size), cure))
-    columns: dict[str, list[Array]] = {}
-    names: list[str] = []
-    quantities: list[str] = []
-    counts: list[int] = []
-    faults: list[Fault] = []
-    flags = list[str]()
-    subjects = subjects_of(cohort)
-    others = other_attributes(subjects, group_by)
-    for variable, called in MAPPED.items():
-        if variable not in cohort:
-            continue
-
-        def measure(takes: xr.Dataset, variable: str = variable) -> Quantities:
-            return _texel_quantities(takes, variable, size)
-
-        channels = cohort[variable].ndim == 4
-        channel_names = (
-            [f"{called} {channel}" for channel in CHANNELS] if channels else [called]
-        )
-        statistics = []
-        for contrast in contrasts(cohort, group_by, adjust, measure):
-            try:
-                statistics.append(
-                    (
-                        contrast.name,
-                        *_contrast_statistics(
-                            contrast, permutations, min_fraction, rng
-                        ),
-                    )
-                )
-                associated = associations(contrast, subjects, others)
-                flags += contrast_flags(
-                    contrast, subjects, associated, adjust, contrast_counts(contrast)
-                )
-            except ValueError as error:
-                faults.append(
-                    Fault(
-                        f"{contrast.name}, {called}",
-                        CONTRAST_RULE,
-                        str(error),
-                        CONTRAST_CURE,
-                    )
-                )
-        if not statistics:
-            continue
-        # a contrast is missing for this variable only
-        if names and [name for name, _, _ in statistics] != names:
-            faults.append(
-                Fault(
-                    called,
-                    "every comparison must have texels",
-                    "none for some",
-                    "exclude takes",
-                )
-            )
-            continue
-        names = [name for name, _, _ in statistics]
-        counts = [count for _, _, count in statistics]
-        quantities += channel_names
-        for name in statistics[0][1]:
-            # one row a contrast, of texels and channels
-            stacked = np.stack([values[name] for _, values, _ in statistics])
-            placed = stacked.reshape(len(statistics), size, size, len(channel_names))
-            columns.setdefault(name, []).append(np.moveaxis(placed, -1, 1))
-    if not names:
-        raise InputError(
-            faults
-            or Fault(
-                "maps",
-                "some texels must be measured",
-                "none",
-                "fit or register more takes",
-            )
-        )
+    _require_divisor(size, cohort.sizes["v"])
+    test = partial(
+        _texel_statistics, max_draws=permutations, min_fraction=min_fraction, rng=rng
+    )
+    compare = partial(compare_groups, cohort, group_by, adjust, statistics=test)
+    parts, flags, faults = _variable_maps(cohort, size, compare)
+    if not parts:
+        rule = "some texels must be measured"
+        cure = "fit or register more takes"
+        raise InputError(faults or Fault("maps", rule, "none", cure))
+    quantities = [name for part in parts for name in part.quantities]
+    logarithmic = [name for name in quantities if name.startswith(LOGARITHMIC)]
+    flags += notes_on_attributes(subjects_of(cohort))
+    excluded = [f"{fault.where}: excluded, {fault.found}" for fault in faults]
     return dataset(
-        {name: np.concatenate(values, axis=1) for name, values in columns.items()},
-        coords={"contrast": names, "quantity": quantities},
+        {
+            name: np.concatenate([part.values[name] for part in parts], axis=1)
+            for name in parts[0].values
+        },
+        coords={"contrast": parts[0].contrasts, "quantity": quantities},
         attrs={
             "group_by": group_by,
             "adjust": list(adjust),
-            "permutations": counts,
-            "logarithmic": [
-                name for name in quantities if name.startswith(LOGARITHMIC)
-            ],
-            "flags": [
-                *dict.fromkeys([*flags, *notes_on_attributes(subjects)]),
-                *(f"{fault.where}: excluded, {fault.found}" for fault in faults),
-            ],
-            "skipped": list(cohort.attrs.get("skipped", [])),
+            "permutations": parts[-1].permutations,
+            "logarithmic": logarithmic,
+            "flags": [*dict.fromkeys(flags), *excluded],
+            "skipped": skipped_takes(cohort),
         },
     )
 
 
-def _texel_quantities(takes: xr.Dataset, variable: str, size: int) -> Quantities:
+@dataclass(frozen=True)
+class _VariableMaps:
+    """Statistics of the contrasts at the texels of one variable."""
+
+    contrasts: list[str]
+    quantities: list[str]  # one for each channel
+    permutations: list[int]  # of each contrast
+    values: dict[str, Array]  # (contrast, quantity, v, u)
+
+    @classmethod
+    def of(
+        cls,
+        values: xr.DataArray,
+        compared: Sequence[Comparison[TexelResult]],
+        size: int,
+    ) -> _VariableMaps:
+        """Arrange the statistics (texel * channel,) of comparisons of these maps."""
+        title = MAPPED[str(values.name)]
+        quantities = [f"{title} {c}" for c in CHANNELS] if values.ndim == 4 else [title]
+        contrasts = [comparison.contrast.name for comparison in compared]
+        statistics = [comparison.result[0] for comparison in compared]
+        permutations = [comparison.result[1] for comparison in compared]
+        shape = (len(statistics), size, size, len(quantities))
+        arranged = {}
+        for name in statistics[0]:
+            stacked = np.stack([texels[name] for texels in statistics])
+            arranged[name] = np.moveaxis(stacked.reshape(shape), -1, 1)
+        return cls(contrasts, quantities, permutations, arranged)
+
+
+def _variable_maps(
+    cohort: xr.Dataset,
+    size: int,
+    compare: Callable[..., tuple[list[Comparison[TexelResult]], list[Fault]]],
+) -> tuple[list[_VariableMaps], list[str], list[Fault]]:
+    """Statistics of the variables with the same comparisons, and flags and faults of all."""
+    parts: list[_VariableMaps] = []
+    flags: list[str] = []
+    faults: list[Fault] = []
+    for variable in [name for name in MAPPED if name in cohort]:
+        measure = partial(_texel_quantities, variable=variable, size=size)
+        compared, undetermined = compare(measure=measure)
+        title = MAPPED[variable]
+        flags += [flag for comparison in compared for flag in comparison.flags]
+        faults += [replace(f, where=f"{f.where}, {title}") for f in undetermined]
+        if not compared:
+            continue
+        maps = _VariableMaps.of(cohort[variable], compared, size)
+        # a contrast is missing for this variable only
+        if parts and maps.contrasts != parts[0].contrasts:
+            rule = "every comparison must have texels"
+            faults.append(Fault(title, rule, "none for some", "exclude takes"))
+        else:
+            parts.append(maps)
+    return parts, flags, faults
+
+
+def _require_divisor(size: int, texels: int) -> None:
+    """Raise `InputError` if maps of `texels` cannot be averaged to `size` texels."""
+    if size < 1 or texels % size:
+        rule = f"must divide the {texels} texels of the maps"
+        cure = f"choose {texels}, {texels // 2} or {texels // 4}"
+        raise InputError(Fault("size", rule, str(size), cure))
+
+
+def _texel_quantities(takes: xr.Dataset, *, variable: str, size: int) -> Quantities:
     """Values of a variable at every texel (and channel) of every take, as quantities."""
     values = np.stack(
         each_take(_block_means, takes, [variable, "texel_coverage"], variable, size)
     )
     count = values.shape[1]
-    subject = tuple(map(str, takes["subject"].values))
-    nothing = np.full(values.shape, np.nan, np.float32)  # errors of texels are not used
     return Quantities(
         tuple(map(str, range(count))),
         values,
-        nothing,
         np.full(count, variable.endswith(LOGARITHMIC)),
         np.zeros(count),
-        subject,
+        tuple(map(str, takes["subject"].values)),
     )
 
 
@@ -241,17 +232,19 @@ def _block_means(take: xr.Dataset, variable: str, size: int) -> Array:
     block = len(values) // size
     shape = (size, block, size, block, -1)
     total = weight.reshape(shape).sum(axis=(1, 3))
-    mean = (np.nan_to_num(values) * weight).reshape(shape).sum(
-        axis=(1, 3)
-    ) / np.maximum(total, 1e-12)
-    return (
-        np.where(total >= COVERED * block**2, mean, np.nan).astype(np.float32).ravel()
-    )
+    weighted = (np.nan_to_num(values) * weight).reshape(shape).sum(axis=(1, 3))
+    mean = weighted / np.maximum(total, 1e-12)
+    covered = total >= COVERED * block**2
+    return np.where(covered, mean, np.nan).astype(np.float32).ravel()
 
 
-def _contrast_statistics(
-    contrast: Contrast, max_draws: int, min_fraction: float, rng: np.random.Generator
-) -> tuple[dict[str, Array], int]:
+def _texel_statistics(
+    contrast: Contrast,
+    *,
+    max_draws: int,
+    min_fraction: float,
+    rng: np.random.Generator,
+) -> TexelResult:
     """Statistics of a contrast at all texels (NaN for too few subjects), and the number
     of permutations.
     """
@@ -262,32 +255,20 @@ def _contrast_statistics(
         raise ValueError(
             f"no texel with values of {min_fraction:.0%} of the {len(values)} subjects"
         )
-    chosen = values[:, able].astype(np.float64)
-    if contrast.is_paired:
-        fit = paired_effects(chosen)
-        p, adjusted, drawn = sign_flip_p(chosen, max_draws=max_draws, rng=rng)
-    else:
-        fit = effects(chosen, contrast.regressor, contrast.covariates)
-        p, adjusted, drawn = permutation_p(
-            chosen,
-            contrast.regressor,
-            contrast.covariates,
-            max_draws=max_draws,
-            rng=rng,
-        )
-    variables = {
-        "map_effect": fit.slope,
-        "map_effect_half_width": (fit.high - fit.low) / 2,
-        "map_effect_p": p,
-        "map_effect_p_adjusted": adjusted,
+    test = contrast_test(contrast, values[:, able].astype(np.float64), max_draws, rng)
+    statistics = {
+        "map_effect": test.effects.slope,
+        "map_effect_half_width": (test.effects.high - test.effects.low) / 2,
+        "map_effect_p": test.p,
+        "map_effect_p_adjusted": test.p_adjusted,
     }
-    placed = {name: np.full(len(count), np.nan, np.float32) for name in variables}
-    for name, part in variables.items():
+    placed = {name: np.full(len(count), np.nan, np.float32) for name in statistics}
+    for name, part in statistics.items():
         placed[name][able] = part
-    return placed | {"map_effect_count": count}, drawn
+    return placed | {"map_effect_count": count}, test.permutations
 
 
-def tabulate_effect_maps(maps: xr.Dataset) -> tuple[list[str], list[list[Any]]]:
+def tabulate_effect_maps(maps: xr.Dataset) -> Table:
     """Header and one row per comparison and quantity: texels, fraction that differs,
     mean and largest effect.
     """
@@ -313,15 +294,8 @@ def tabulate_effect_maps(maps: xr.Dataset) -> tuple[list[str], list[list[Any]]]:
             largest = effect[is_known][np.abs(effect[is_known]).argmax()]
             numbers = (differ.mean(), effect[is_known].mean(), largest)
             subjects = int(part["map_effect_count"].values[is_known].max())
-            rows.append(
-                [
-                    contrast,
-                    quantity,
-                    subjects,
-                    int(is_known.sum()),
-                    *map(float, numbers),
-                ]
-            )
+            texels = int(is_known.sum())
+            rows.append([contrast, quantity, subjects, texels, *map(float, numbers)])
     return header, rows
 
 
@@ -362,60 +336,44 @@ def plot_effect_maps(maps: xr.Dataset, *, contrast: str | None = None) -> Figure
     )
     rows, columns = _finite_extent(part["map_effect_p"].sel(quantity=quantities).values)
     for line, quantity in zip(axes, quantities, strict=True):
-        quantity_map = part.sel(quantity=quantity).isel(v=rows, u=columns)
-        is_known = np.isfinite(quantity_map["map_effect_p"].values)
-        unit = (
-            "change of the logarithm"
-            if quantity in maps.attrs["logarithmic"]
-            else "difference"
-        )
-        largest = max(
-            float(
-                np.quantile(
-                    np.abs(quantity_map["map_effect"].values[is_known]), SHOWN_FRACTION
-                )
-            ),
-            1e-12,
-        )
-        wide = quantity_map["map_effect_half_width"].values
-        widest = float(np.quantile(wide[is_known], SHOWN_FRACTION))
-        parts: list[tuple[Array, dict[str, Any], str]] = [
-            (
-                quantity_map["map_effect"].values,
-                {"cmap": "RdBu_r", "vmin": -largest, "vmax": largest},
-                f"effect on {quantity}",
-            ),
-            (
-                wide,
-                {"cmap": "cividis", "vmin": 0.0, "vmax": widest},
-                "half-width of the 95 % CI",
-            ),
-            (
-                np.where(is_known, quantity_map["map_effect_count"].values, np.nan),
-                {"cmap": "cividis"},
-                "subjects",
-            ),
-        ]
-        for ax, (values, options, title) in zip(line, parts, strict=True):
-            image = ax.imshow(values, interpolation="none", **options)
-            label = "n" if title == "subjects" else unit
-            figure.colorbar(image, ax=ax, shrink=0.8, label=label)
-            ax.set(title=title, xticks=[], yticks=[])
-            ax.title.set_fontsize(8)
-        differ = (
-            np.nan_to_num(quantity_map["map_effect_p_adjusted"].values, nan=1.0)
-            < SIGNIFICANT
-        )
-        if differ.any() and not differ.all():
-            line[0].contour(differ, levels=[0.5], colors="black", linewidths=0.6)
-    adjusted = (
-        f", adjusted for {', '.join(maps.attrs['adjust'])}"
-        if maps.attrs["adjust"]
-        else ""
-    )
-    figure.suptitle(f"{name}{adjusted}; lines surround adjusted p < 0.05", fontsize=9)
+        _plot_quantity(line, part.sel(quantity=quantity).isel(v=rows, u=columns))
+    adjusted = ", ".join(maps.attrs["adjust"])
+    note = f", adjusted for {adjusted}" if adjusted else ""
+    figure.suptitle(f"{name}{note}; lines surround adjusted p < 0.05", fontsize=9)
     figure.tight_layout()
     return figure
+
+
+def _plot_quantity(line: Sequence[Axes], maps: xr.Dataset) -> None:
+    """Plot effect, half-width and number of subjects of one quantity on three axes."""
+    quantity = str(maps["quantity"].values)
+    is_logarithm = quantity in maps.attrs["logarithmic"]
+    unit = "change of the logarithm" if is_logarithm else "difference"
+    effect = maps["map_effect"].values
+    half_width = maps["map_effect_half_width"].values
+    is_known = np.isfinite(maps["map_effect_p"].values)
+    largest, widest = (
+        float(np.quantile(values[is_known], SHOWN_FRACTION))
+        for values in (np.abs(effect), half_width)
+    )
+    largest = max(largest, 1e-12)
+    count = np.where(is_known, maps["map_effect_count"].values, np.nan)
+    diverging = {"cmap": "RdBu_r", "vmin": -largest, "vmax": largest}
+    from_zero = {"cmap": "cividis", "vmin": 0.0, "vmax": widest}
+    images: list[tuple[Array, dict[str, Any], str, str]] = [
+        (effect, diverging, f"effect on {quantity}", unit),
+        (half_width, from_zero, "half-width of the 95 % CI", unit),
+        (count, {"cmap": "cividis"}, "subjects", "n"),
+    ]
+    for ax, (values, options, title, label) in zip(line, images, strict=True):
+        image = ax.imshow(values, interpolation="none", **options)
+        ax.figure.colorbar(image, ax=ax, shrink=0.8, label=label)
+        ax.set(title=title, xticks=[], yticks=[])
+        ax.title.set_fontsize(8)
+    p = np.nan_to_num(maps["map_effect_p_adjusted"].values, nan=1.0)
+    differ = p < SIGNIFICANT
+    if differ.any() and not differ.all():
+        line[0].contour(differ, levels=[0.5], colors="black", linewidths=0.6)
 
 
 def _finite_extent(values: Array) -> tuple[slice, slice]:
@@ -433,25 +391,15 @@ def _finite_extent(values: Array) -> tuple[slice, slice]:
 
 
 @dataclass(frozen=True)
-class Parameters:
+class Parameters(ContrastParameters):
     """Parameters of the study of maps."""
 
-    group_by: str = compared_option()
-    adjust: tuple[str, ...] = adjust_option()
     permutations: int = permutations_option(PERMUTATIONS)
-    seed: int = seed_option("the permutations")
 
 
 def compute(population: Population, parameters: Parameters) -> Results:
     """The results of the study."""
-    maps = effect_maps(
-        population.cohort,
-        group_by=parameters.group_by,
-        adjust=parameters.adjust,
-        permutations=parameters.permutations,
-        mixed_fits=population.mixed_fits,
-        rng=np.random.default_rng(parameters.seed),
-    )
+    maps = effect_maps(population.cohort, **contrast_arguments(population, parameters))
     return {"effect_maps": maps}
 
 

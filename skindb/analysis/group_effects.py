@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,27 +11,29 @@ from scipy.special import gammaln
 
 from skindb import plots
 from skindb.analysis.contrasts import (
-    CONTRAST_CURE,
-    CONTRAST_RULE,
     SURFACE,
+    Comparison,
     Contrast,
+    ContrastTest,
     Quantities,
-    associations,
+    compare_groups,
+    contrast_arguments,
     contrast_counts,
-    contrast_flags,
-    contrasts,
-    other_attributes,
+    contrast_test,
     quantities_of,
 )
-from skindb.analysis.study import Population, Results, Study, Table, table_of
+from skindb.analysis.study import (
+    Population,
+    Results,
+    Study,
+    Table,
+    skipped_takes,
+    table_of,
+)
 from skindb.analysis.subjects import notes_on_attributes, subjects_of
-from skindb.errors import Fault, InputError
+from skindb.errors import InputError
 from skindb.numerics.inference import (
     Effects,
-    effects,
-    paired_effects,
-    permutation_p,
-    sign_flip_p,
 )
 from skindb.numerics.statistics import (
     benjamini_hochberg,
@@ -40,10 +41,7 @@ from skindb.numerics.statistics import (
     known_mean,
 )
 from skindb.parameters import (
-    adjust_option,
-    compared_option,
-    permutations_option,
-    seed_option,
+    ContrastParameters,
 )
 from skindb.schema import dataset
 from skindb.schema.cohort import require_same_fit, require_takes
@@ -53,6 +51,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 SIGNIFICANT = 0.05  # of adjusted p values
+MAX_LISTED = 6  # detectable differences that are named in a line
 SIDES = ("with", "without")
 COLUMNS = (
     "effect",
@@ -125,97 +124,59 @@ def group_effects(
     adjust = (adjust,) if isinstance(adjust, str) else tuple(adjust)
     if not mixed_fits:
         require_same_fit(cohort)
-    subjects = subjects_of(cohort)
-    others = other_attributes(subjects, group_by)
-    columns: dict[str, list[Array]] = {}
-    names = []
-    counts = []
-    smallest = []
-    flags = []
-    faults = []
-    for contrast in contrasts(cohort, group_by, adjust, quantities_of):
-        try:
-            variables, count = _contrast_statistics(contrast, permutations, rng)
-        except ValueError as error:
-            faults.append(
-                Fault(contrast.name, CONTRAST_RULE, str(error), CONTRAST_CURE)
-            )
-            continue
-        measured = contrast.quantities
-        associated = associations(contrast, subjects, others)
-        for name, values in {
-            **variables,
-            "attribute_association": np.array(list(associated.values())),
-        }.items():
-            columns.setdefault(name, []).append(values)
-        names.append(contrast.name)
-        counts.append(count)
-        flags += contrast_flags(
-            contrast, subjects, associated, adjust, variables["effect_count"]
-        ) + _surface_flag(contrast, variables)
-        smallest.append(least := _least_p(contrast, count))
-        if least >= SIGNIFICANT:
-            few = f"with {len(contrast.regressor)} subjects no p value can be below {least:.2g}"
-            flags.append(
-                f"{contrast.name}: {few}, so that no difference can be significant at 5 %"
-            )
-    if not names:
+
+    def test(contrast: Contrast) -> ContrastTest:
+        return contrast_test(contrast, contrast.quantities.values, permutations, rng)
+
+    compared, faults = compare_groups(cohort, group_by, adjust, quantities_of, test)
+    if not compared:
         raise InputError(faults)
+    variables = [_statistics(comparison) for comparison in compared]
+    quantities = compared[0].contrast.quantities
+    flags = [
+        flag
+        for comparison, values in zip(compared, variables, strict=True)
+        for flag in _flags(comparison, values)
+    ]
     flags += [f"{fault.where}: excluded, {fault.found}" for fault in faults]
-    flags += notes_on_attributes(subjects)
     return dataset(
-        {name: np.stack(values) for name, values in columns.items()},
+        {
+            name: np.stack([values[name] for values in variables])
+            for name in variables[0]
+        },
         coords={
-            "contrast": names,
-            "quantity": list(measured.names),
+            "contrast": [comparison.contrast.name for comparison in compared],
+            "quantity": list(quantities.names),
             "side": list(SIDES),
-            "attribute": others,
+            "attribute": list(compared[0].associated),
         },
         attrs={
             "group_by": group_by,
             "adjust": list(adjust),
-            "permutations": counts,
-            "smallest_p": smallest,
-            "logarithmic": [
-                name
-                for name, is_log in zip(measured.names, measured.is_log, strict=True)
-                if is_log
-            ],
-            "flags": flags,
-            "skipped": list(cohort.attrs.get("skipped", [])),
+            "permutations": [comparison.result.permutations for comparison in compared],
+            "smallest_p": [_smallest_p(comparison) for comparison in compared],
+            "logarithmic": quantities.logarithmic,
+            "flags": flags + notes_on_attributes(subjects_of(cohort)),
+            "skipped": skipped_takes(cohort),
         },
     )
 
 
-def _contrast_statistics(
-    contrast: Contrast, max_draws: int, rng: np.random.Generator
-) -> tuple[dict[str, Array], int]:
-    """Variables of a contrast for every quantity, and the number of permutations."""
-    values = contrast.quantities.values
-    if contrast.before is not None:
-        fit = paired_effects(values)
-        p, adjusted, count = sign_flip_p(values, max_draws=max_draws, rng=rng)
-        reference = known_mean(np.where(np.isfinite(values), contrast.before, np.nan))
-    else:
-        fit = effects(values, contrast.regressor, contrast.covariates)
-        p, adjusted, count = permutation_p(
-            values,
-            contrast.regressor,
-            contrast.covariates,
-            max_draws=max_draws,
-            rng=rng,
-        )
-        is_known = np.isfinite(values)
-        centre = known_mean(np.where(is_known, contrast.regressor[:, None], np.nan))
-        reference = known_mean(values) - (
-            0.0 if contrast.is_number else fit.slope * centre
-        )
-    percent, low, high = _percent(fit, reference, contrast.quantities)
+def _statistics(comparison: Comparison[ContrastTest]) -> dict[str, Array]:
+    """Variables of a comparison for every quantity, and its associated attributes."""
+    contrast = comparison.contrast
+    test = comparison.result
+    fit = test.effects
+    p = test.p
+    percent, low, high = _percent(fit, _reference(contrast, fit), contrast.quantities)
     discovered = np.full(len(p), np.nan)
     discovered[np.isfinite(p)] = benjamini_hochberg(p[np.isfinite(p)])
     standardised = np.divide(
         fit.slope, fit.spread, out=np.full_like(fit.slope, np.nan), where=fit.spread > 0
     )
+    detectable = np.full_like(fit.error, np.nan)
+    if _smallest_p(comparison) < SIGNIFICANT:
+        detectable = detectable_difference(fit.error, fit.free)
     return {
         "effect_count": contrast_counts(contrast),
         "effect": fit.slope,
@@ -226,20 +187,33 @@ def _contrast_statistics(
         "effect_percent_high": high,
         "effect_standardised": standardised,
         "effect_p": p,
-        "effect_p_adjusted": adjusted,
+        "effect_p_adjusted": test.p_adjusted,
         "effect_p_false_discovery": discovered,
-        "effect_detectable": detectable_difference(fit.error, fit.free)
-        if _least_p(contrast, count) < SIGNIFICANT
-        else np.full_like(fit.error, np.nan),
-    }, count
+        "effect_detectable": detectable,
+        "attribute_association": np.array(list(comparison.associated.values())),
+    }
 
 
-def _least_p(contrast: Contrast, count: int) -> float:
-    """The smallest p value that is possible with this number of permutations and subjects."""
-    smallest = 1 / (count + 1)
-    if (
-        contrast.is_paired
-    ):  # with all signs changed, the statistic has the same magnitude
+def _reference(contrast: Contrast, fit: Effects) -> Array:
+    """Level (q,) of the subjects without the compared value, to which effects in per
+    cent refer.
+    """
+    values = contrast.quantities.values
+    is_known = np.isfinite(values)
+    if contrast.before is not None:
+        return known_mean(np.where(is_known, contrast.before, np.nan))
+    if contrast.is_number:
+        return known_mean(values)
+    centre = known_mean(np.where(is_known, contrast.regressor[:, None], np.nan))
+    return np.asarray(known_mean(values) - fit.slope * centre)
+
+
+def _smallest_p(comparison: Comparison[ContrastTest]) -> float:
+    """The smallest p value that is possible with its number of permutations and subjects."""
+    contrast = comparison.contrast
+    smallest = 1 / (comparison.result.permutations + 1)
+    if contrast.is_paired:
+        # with all signs changed, the statistic has the same magnitude
         return max(smallest, 2.0 ** (1 - len(contrast.regressor)))
     if contrast.covariates.shape[1]:
         return smallest
@@ -247,13 +221,9 @@ def _least_p(contrast: Contrast, count: int) -> float:
     sizes = np.unique(contrast.regressor, return_counts=True)[1]
     # exchanging both groups only changes the sign
     mirrored = 2.0 if len(sizes) == 2 and sizes[0] == sizes[1] else 1.0
-    allocations = float(
-        np.exp(
-            gammaln(len(contrast.regressor) + 1)
-            - sum(gammaln(size + 1) for size in sizes)
-        )
-    )
-    return max(smallest, mirrored / allocations)
+    logarithm = gammaln(len(contrast.regressor) + 1)
+    logarithm -= sum(gammaln(size + 1) for size in sizes)
+    return max(smallest, mirrored / float(np.exp(logarithm)))
 
 
 def _percent(
@@ -279,6 +249,21 @@ def _percent(
     )
 
 
+def _flags(
+    comparison: Comparison[ContrastTest], variables: dict[str, Array]
+) -> list[str]:
+    """Warnings about a comparison and the significance that it can reach."""
+    contrast = comparison.contrast
+    flags = comparison.flags + _surface_flag(contrast, variables)
+    smallest = _smallest_p(comparison)
+    if smallest >= SIGNIFICANT:
+        flags.append(
+            f"{contrast.name}: with {len(contrast.regressor)} subjects no p value can be "
+            f"below {smallest:.2g}, so that no difference can be significant at 5 %"
+        )
+    return flags
+
+
 def _surface_flag(contrast: Contrast, variables: dict[str, Array]) -> list[str]:
     """Warning if surface reflectance differs, because its diffuse part is counted as albedo."""
     names = np.array(contrast.quantities.names)
@@ -296,54 +281,56 @@ def describe_group_effects(table: xr.Dataset) -> list[str]:
     one line each.
     """
     lines = []
-    held = ", ".join(table.attrs["adjust"])
-    counts = table.attrs["permutations"]
-    smallest_p = table.attrs["smallest_p"]
-    for name, count, least_p in zip(
-        table["contrast"].values, counts, smallest_p, strict=True
-    ):
+    permutations = (table.attrs["permutations"], table.attrs["smallest_p"])
+    contrasts = zip(table["contrast"].values, *permutations, strict=True)
+    for name, count, smallest_p in contrasts:
         part = table.sel(contrast=name)
         compared = np.isfinite(part["effect_p"].values)
         differ = part["effect_p_adjusted"].values < SIGNIFICANT
-        subjects = int(part["effect_count"].sum("side").max())
-        limit = ""
-        if least_p > 1.5 / (count + 1):
-            limit = f", the smallest possible p is {least_p:.2g}"
         lines.append(
             f"{name}: {differ.sum()} of {compared.sum()} quantities differ "
-            f"{f'with {held} held fixed ' if held else ''}"
-            f"(adjusted p < 0.05; {count} permutations of {subjects} subjects"
-            f"{limit})"
+            + _test_summary(part, count, smallest_p)
         )
         if not differ.any() and compared.any():
-            detectable = [
-                f"{quantity} {_amount(value, quantity in table.attrs['logarithmic'])}"
-                for quantity, value in zip(
-                    table["quantity"].values,
-                    part["effect_detectable"].values,
-                    strict=True,
-                )
-                if np.isfinite(value)
-            ]
-            listed = ", ".join(detectable[:6]) + (
-                f" and {len(detectable) - 6} more" if len(detectable) > 6 else ""
-            )
-            lines += (
-                []
-                if not detectable
-                else [f"{name}: detectable differences (power 80 %): {listed}"]
-            )
-    logarithmic = (
-        ", effects of sigma_tr are differences of its natural logarithm"
-        if table.attrs["logarithmic"]
-        else ""
-    )
-    lines.append(f"low and high are the ends of 95 % intervals{logarithmic}")
-    lines.append(
+            lines += _detectable_line(str(name), part)
+    interval = "low and high are the ends of 95 % intervals"
+    if table.attrs["logarithmic"]:
+        interval += ", effects of sigma_tr are differences of its natural logarithm"
+    adjusted = (
         "adjusted p values account for the number of quantities (largest "
         "statistic, Westfall and Young)"
     )
-    return [*lines, *table.attrs["flags"]]
+    return [*lines, interval, adjusted, *table.attrs["flags"]]
+
+
+def _test_summary(part: xr.Dataset, count: int, smallest_p: float) -> str:
+    """Adjustment, permutations and subjects of a comparison."""
+    held = ", ".join(part.attrs["adjust"])
+    subjects = int(part["effect_count"].sum("side").max())
+    limit = ""
+    if smallest_p > 1.5 / (count + 1):
+        limit = f", the smallest possible p is {smallest_p:.2g}"
+    return (
+        f"{f'with {held} held fixed ' if held else ''}"
+        f"(adjusted p < 0.05; {count} permutations of {subjects} subjects{limit})"
+    )
+
+
+def _detectable_line(name: str, part: xr.Dataset) -> list[str]:
+    """A line with the smallest detectable differences, if any is known."""
+    detectable = [
+        f"{quantity} {_amount(value, quantity in part.attrs['logarithmic'])}"
+        for quantity, value in zip(
+            part["quantity"].values, part["effect_detectable"].values, strict=True
+        )
+        if np.isfinite(value)
+    ]
+    if not detectable:
+        return []
+    listed = ", ".join(detectable[:MAX_LISTED])
+    if len(detectable) > MAX_LISTED:
+        listed += f" and {len(detectable) - MAX_LISTED} more"
+    return [f"{name}: detectable differences (power 80 %): {listed}"]
 
 
 def _amount(value: float, is_log: bool) -> str:
@@ -361,52 +348,33 @@ def plot_group_effects(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     contrasts = [str(name) for name in table["contrast"].values]
     for i, contrast in enumerate(contrasts):
         part = table.sel(contrast=contrast)
-        effect = part["effect"].values
-        scale = part["effect"].values / part["effect_standardised"].values
-        bars = np.abs(
-            np.stack(
-                [
-                    effect - part["effect_low"].values,
-                    part["effect_high"].values - effect,
-                ]
-            )
-            / scale
+        effect, low, high, standardised = (
+            part[name].values
+            for name in ("effect", "effect_low", "effect_high", "effect_standardised")
         )
-        is_significant = part["effect_p_adjusted"].values < SIGNIFICANT
-        y = places + 0.6 * ((i + 0.5) / len(contrasts) - 0.5)
+        scale = effect / standardised
         colour = plots.CYCLE[i % len(plots.CYCLE)]
+        marker = "osD^v"[i % 5]
         count = int(part["effect_count"].sum("side").max())
         label = f"{contrast} (n = {count})"
-        ax.plot([], [], "osD^v"[i % 5], color=colour, markersize=4, label=label)
-        for rows, fill in ((is_significant, colour), (~is_significant, "white")):
-            ax.errorbar(
-                (effect / scale)[rows],
-                y[rows],
-                xerr=bars[:, rows],
-                fmt="osD^v"[i % 5],
-                color=colour,
-                mfc=fill,
-                markersize=4,
-                capsize=2,
-                linewidth=1,
-            )
+        ax.plot([], [], marker, color=colour, markersize=4, label=label)
+        plots.significance_bars(
+            ax,
+            effect / scale,
+            places + 0.6 * ((i + 0.5) / len(contrasts) - 0.5),
+            np.abs(np.stack([effect - low, high - effect]) / scale),
+            part["effect_p_adjusted"].values < SIGNIFICANT,
+            colour=colour,
+            marker=marker,
+        )
     ax.set_yticks(places, names, fontsize=7)
     ax.set_ylim(-0.6, len(names) - 0.4)
-    held = (
-        f", {', '.join(table.attrs['adjust'])} held fixed"
-        if table.attrs["adjust"]
-        else ""
-    )
+    adjusted = ", ".join(table.attrs["adjust"])
+    held = f", {adjusted} held fixed" if adjusted else ""
     ax.set_xlabel(
         f"effect, 95 % CI [standard deviations between subjects]{held}\nfilled: adjusted p < 0.05"
     )
-    ax.legend(
-        fontsize=7,
-        loc="lower center",
-        bbox_to_anchor=(0.5, 1.0),
-        ncols=2,
-        frameon=False,
-    )
+    plots.legend_above(ax)
     return ax
 
 
@@ -420,34 +388,20 @@ def tabulate_group_effects(table: xr.Dataset) -> Table:
     return table_of(table.assign(counts), names, ("contrast", "quantity"))
 
 
-@dataclass(frozen=True)
-class Parameters:
-    """Parameters of the study of groups."""
-
-    group_by: str = compared_option()
-    adjust: tuple[str, ...] = adjust_option()
-    permutations: int = permutations_option()
-    seed: int = seed_option("the permutations")
-
-
-def compute(population: Population, parameters: Parameters) -> Results:
+def compute(population: Population, parameters: ContrastParameters) -> Results:
     """The results of the study."""
-    effects = group_effects(
-        population.cohort,
-        group_by=parameters.group_by,
-        adjust=parameters.adjust,
-        permutations=parameters.permutations,
-        mixed_fits=population.mixed_fits,
-        rng=np.random.default_rng(parameters.seed),
-    )
-    return {"effects": effects}
+    return {
+        "effects": group_effects(
+            population.cohort, **contrast_arguments(population, parameters)
+        )
+    }
 
 
 STUDY = Study(
     name="groups",
     description="differences between groups of subjects, with intervals and p values",
     layout="tables",
-    parameters=Parameters,
+    parameters=ContrastParameters,
     compute=compute,
     shown=("effects",),
     tabulate=tabulate_group_effects,

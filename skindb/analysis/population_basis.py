@@ -8,7 +8,7 @@ import numpy as np
 import xarray as xr
 from dask.delayed import Delayed
 
-from skindb.analysis.study import each_item, each_take
+from skindb.analysis.study import each_item, each_take, skipped_takes
 from skindb.errors import Fault, InputError
 from skindb.numerics.factorise import Sums, nmf, refine
 from skindb.numerics.nnls import solve_nnls
@@ -108,7 +108,7 @@ def population_basis(
             "nmf_passes": len(errors),
             "nmf_surfels": int(sum(own.count for own in sums)),
             "nmf_metric": "brdf" if in_metric else "coefficient",
-            "skipped": list(cohort.attrs.get("skipped", [])),
+            "skipped": skipped_takes(cohort),
         },
     )
 

@@ -197,3 +197,8 @@ def table_of(table: xr.Dataset, names: Sequence[str], dims: Sequence[str]) -> Ta
     values = zip(*columns, strict=True)
     rows = [[*key, *row] for key, row in zip(keys, values, strict=True)]
     return [*dims, *names], rows
+
+
+def skipped_takes(cohort: xr.Dataset) -> list[Note]:
+    """Notes on the takes that a cohort lacks, which its results repeat."""
+    return list(cohort.attrs.get("skipped", []))

@@ -13,7 +13,7 @@ import xarray as xr
 from scipy.ndimage import gaussian_filter
 
 from skindb.analysis.regions import map_regions
-from skindb.analysis.study import each_take
+from skindb.analysis.study import each_take, skipped_takes
 from skindb.elementwise import thread_count
 from skindb.errors import Fault, InputError
 from skindb.geometry.atlas import bilinear, push_pull
@@ -139,7 +139,7 @@ def texture_statistics(
             "part": part_names(),
             "channel": ["R", "G", "B"],
         },
-        attrs={"skipped": list(cohort.attrs.get("skipped", []))},
+        attrs={"skipped": skipped_takes(cohort)},
     )
 
 

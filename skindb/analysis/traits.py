@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,7 +15,14 @@ import xarray as xr
 from skindb import plots
 from skindb.analysis.albedo import albedo_and_texture, quantiles
 from skindb.analysis.population_basis import population_basis
-from skindb.analysis.study import Population, Results, Study, Table, table_of
+from skindb.analysis.study import (
+    Population,
+    Results,
+    Study,
+    Table,
+    skipped_takes,
+    table_of,
+)
 from skindb.analysis.subjects import (
     Subjects,
     known_traits,
@@ -44,6 +51,7 @@ SIDES = ("with", "without")
 # subjects with or without a trait, below which individual differences dominate its
 # vector
 FEW = 10
+LOG_SIGMA_TR = "trait_log_sigma_tr_shift"
 WITHOUT_ERRORS = {"trait_histogram_shift", "trait_texture_shift"}
 MIN_VECTOR_TO_ERROR = 3.0  # recommended ratio of the length of a vector to its error
 RESAMPLES = 200  # of subjects in the bootstrap, which gives standard errors to 5 %
@@ -122,111 +130,144 @@ def trait_vectors(
     if not mixed_fits:
         require_same_fit(cohort)
     subjects = subjects_of(cohort)
-    known = trait_names(subjects)
     numbers = numeric_attributes(subjects)
-    named = sorted({*known_traits(subjects), *numbers})
-    names = (
-        [*known, *numbers]
-        if traits is None
-        else [trait_name(name, named) for name in traits]
-    )
-    split = [_sides(subjects, name, numbers) for name in names]
-    both = list(zip(names, split, strict=True))
-    bad = [
-        (n, w, o)
-        for n, (w, o) in both
-        if not w.any() or (n not in numbers and not o.any())
-    ]
-    if bad:
-        names_of_traits = ", ".join(known) or "none"
-        rule = "there must be takes with and without it"
-        cure = f"choose from: {names_of_traits}"
-        raise InputError(
-            Fault(f"trait {n}", rule, f"{w.sum()} with, {o.sum()} without", cure)
-            for n, w, o in bad
-        )
+    split = _split_takes(subjects, traits, numbers)
     require_adjustable(subjects, adjust)
-    units = dict[str, Units]()
-    flags = list[str]()
-    for name, side in both:
-        try:
-            units[name] = _units(subjects, name, side, adjust, numbers)
-        except InputError as error:
-            if traits is not None:
-                raise
-            flags.append(f"excluded: {error}")
-    names = list(units)
-    takes = cohort["take"].values
-    histograms = albedo["albedo_histogram"].sel(take=takes).values
-    log_tr = _log_sigma_tr(cohort)
-    columns = {
-        "trait_brdf_shift": basis["take_coefficient"].sel(take=takes).values,
-        "trait_histogram_shift": histograms,
-        "trait_quantile_shift": quantiles(histograms, albedo["histogram_edge"].values),
-        "trait_log_sigma_tr_shift": log_tr,
-    }
-    if texture is not None:
-        columns["trait_texture_shift"] = _texture_quantiles(
-            texture, takes, albedo["region"].values
-        )
-    rng = np.random.default_rng(0) if rng is None else rng
-    shifts: dict[str, list[Array]] = {name: [] for name in columns}
-    errors: dict[str, list[Array]] = {name: [] for name in columns}
-    for unit in units.values():
-        drawn = rng.multinomial(
-            len(unit.design), np.full(len(unit.design), 1 / len(unit.design)), RESAMPLES
-        )
-        for name, values in columns.items():
-            resamples = (
-                drawn.astype(np.float64)
-                if name not in WITHOUT_ERRORS
-                else np.empty((0, len(unit.design)))
-            )
-            shift, resampled = _coefficients(
-                unit.values(values), unit.design, resamples
-            )
-            # averaged over sites last: differences between sites must not appear as a
-            # trait
-            if values is log_tr:
-                shift = known_mean(shift)
-                resampled = known_mean(np.moveaxis(resampled, 1, 0))
-            shifts[name].append(shift)
-            if name not in WITHOUT_ERRORS:
-                errors[name].append(_deviation(resampled))
-    counts = np.array([[w.sum(), o.sum()] for n, (w, o) in both if n in units]).reshape(
-        len(names), 2
+    units, flags = _determined_units(
+        subjects, split, adjust, numbers, skip=traits is None
     )
-    shapes = {
-        name: (0, *x.shape[1:]) if x is not log_tr else (0, 3)
-        for name, x in columns.items()
-    }
-    stacked = {
-        name: np.stack(x) if x else np.empty(shapes[name]) for name, x in shifts.items()
-    }
-    for name in columns.keys() - WITHOUT_ERRORS:
-        stacked[f"{name}_error"] = (
-            np.stack(errors[name]) if names else np.empty(shapes[name])
-        )
+    log_tr = _log_sigma_tr(cohort)
+    values = _compared_values(cohort, basis, albedo, log_tr, texture)
+    rng = np.random.default_rng(0) if rng is None else rng
+    counts = np.array([[mask.sum() for mask in split[name]] for name in units])
+    counts = counts.reshape(len(units), len(SIDES))
+    part = {} if texture is None else {"part": texture["part"].values}
     return dataset(
         {
             "trait_count": counts,
             "take_log_sigma_tr": _mean_over_sites(log_tr),
-            **stacked,
+            **_shifts(list(units.values()), values, rng),
         },
         coords={
-            "take": [str(take) for take in takes],
-            "trait": names,
+            "take": [str(take) for take in cohort["take"].values],
+            "trait": list(units),
             "side": list(SIDES),
             "region": albedo["region"].values,
             "channel": ["R", "G", "B"],
-        }
-        | ({} if texture is None else {"part": texture["part"].values}),
+            **part,
+        },
         attrs={
-            "flags": flags + _flags(names, counts, numbers),
+            "flags": flags + _flags(list(units), counts, numbers),
             "adjust": list(adjust),
-            "skipped": list(cohort.attrs.get("skipped", [])),
+            "skipped": skipped_takes(cohort),
         },
     )
+
+
+def _split_takes(
+    subjects: Subjects, traits: Sequence[str] | None, numbers: Sequence[str]
+) -> dict[str, tuple[Mask, Mask]]:
+    """Trait -> masks of the takes with and without it, of the named or of all traits.
+
+    Raises
+    ------
+    InputError
+        If a trait is unknown, or no take is on one of its sides.
+    """
+    known = trait_names(subjects)
+    names = [*known, *numbers]
+    if traits is not None:
+        valid = sorted({*known_traits(subjects), *numbers})
+        names = [trait_name(name, valid) for name in traits]
+    split = {name: _sides(subjects, name, numbers) for name in names}
+    rule = "there must be takes with and without it"
+    cure = f"choose from: {', '.join(known) or 'none'}"
+    faults = [
+        Fault(f"trait {n}", rule, f"{w.sum()} with, {o.sum()} without", cure)
+        for n, (w, o) in split.items()
+        if not w.any() or (n not in numbers and not o.any())
+    ]
+    if faults:
+        raise InputError(faults)
+    return split
+
+
+def _determined_units(
+    subjects: Subjects,
+    split: Mapping[str, tuple[Mask, Mask]],
+    adjust: Sequence[str],
+    numbers: Sequence[str],
+    *,
+    skip: bool,
+) -> tuple[dict[str, Units], list[str]]:
+    """Trait -> its units; traits that the subjects do not determine are skipped with a
+    flag, or raise `InputError`.
+    """
+    units: dict[str, Units] = {}
+    flags = []
+    for name, side in split.items():
+        try:
+            units[name] = _units(subjects, name, side, adjust, numbers)
+        except InputError as error:
+            if not skip:
+                raise
+            flags.append(f"excluded: {error}")
+    return units, flags
+
+
+def _compared_values(
+    cohort: xr.Dataset,
+    basis: xr.Dataset,
+    albedo: xr.Dataset,
+    log_tr: Array,
+    texture: xr.Dataset | None,
+) -> dict[str, Array]:
+    """Variable of the vectors -> values (take, ...) of which it is the difference."""
+    takes = cohort["take"].values
+    histograms = albedo["albedo_histogram"].sel(take=takes).values
+    values = {
+        "trait_brdf_shift": basis["take_coefficient"].sel(take=takes).values,
+        "trait_histogram_shift": histograms,
+        "trait_quantile_shift": quantiles(histograms, albedo["histogram_edge"].values),
+        LOG_SIGMA_TR: log_tr,
+    }
+    if texture is not None:
+        regions = albedo["region"].values
+        values["trait_texture_shift"] = _texture_quantiles(texture, takes, regions)
+    return values
+
+
+def _shifts(
+    units: Sequence[Units], values: Mapping[str, Array], rng: np.random.Generator
+) -> dict[str, Array]:
+    """Vectors (trait, ...) of all values (take, ...), with their errors by bootstrap."""
+    shifts: dict[str, list[Array]] = {name: [] for name in values}
+    errors: dict[str, list[Array]] = {
+        f"{name}_error": [] for name in values if name not in WITHOUT_ERRORS
+    }
+    for unit in units:
+        count = len(unit.design)
+        drawn = rng.multinomial(count, np.full(count, 1 / count), RESAMPLES)
+        for name, of_takes in values.items():
+            with_errors = name not in WITHOUT_ERRORS
+            resamples = drawn[: None if with_errors else 0].astype(np.float64)
+            shift, resampled = _coefficients(
+                unit.values(of_takes), unit.design, resamples
+            )
+            # averaged over sites last: differences between sites must not appear as a
+            # trait
+            if name == LOG_SIGMA_TR:
+                shift = known_mean(shift)
+                resampled = known_mean(np.moveaxis(resampled, 1, 0))
+            shifts[name].append(shift)
+            if with_errors:
+                errors[f"{name}_error"].append(_deviation(resampled))
+    stacked = {}
+    for name, rows in (shifts | errors).items():
+        variable = name.removesuffix("_error")
+        shape = (3,) if variable == LOG_SIGMA_TR else values[variable].shape[1:]
+        stacked[name] = np.stack(rows) if rows else np.empty((0, *shape))
+    return stacked
 
 
 def _sides(subjects: Subjects, trait: str, numbers: Sequence[str]) -> tuple[Mask, Mask]:

@@ -11,7 +11,14 @@ from numpy.typing import NDArray
 
 from skindb import plots
 from skindb.analysis.contrasts import FEW
-from skindb.analysis.study import Population, Results, Study, Table, table_of
+from skindb.analysis.study import (
+    Population,
+    Results,
+    Study,
+    Table,
+    skipped_takes,
+    table_of,
+)
 from skindb.analysis.subjects import groups_by, takes_to_compare
 from skindb.numerics.statistics import Moments, variance_components
 from skindb.parameters import group_option
@@ -22,6 +29,7 @@ from skindb.types import Array
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+PROBED = "site_sigma_tr"
 COLUMNS = (
     "sigma_tr_count",
     "sigma_tr_mean",
@@ -83,58 +91,50 @@ def translucency_table(
     groups = groups_by(people, group_by)
     names = sorted(set(groups))
     members = [np.flatnonzero([group == name for group in groups]) for name in names]
-    if "site_sigma_tr" not in takes:  # the probe was not used
-        sites = list[str]()
-        measured = dict[str, Array]()
-    else:
-        sites = [str(site) for site in takes["site"].values]
-        measured = _trusted(takes)
+    sites = [str(site) for site in takes["site"].values] if PROBED in takes else []
+    measured = _trusted(takes)
     empty = np.full((takes.sizes["take"], len(sites), 3), np.nan)
 
     def moments(name: str) -> Moments:
         values = measured.get(name, empty)
         return Moments.stacked(Moments.of(values[rows]) for rows in members)
 
-    stacked = moments("site_sigma_tr")
     subjects = np.array(people.subject)
-    low, high = stacked.mean_interval()
-    deviation_low, deviation_high = stacked.deviation_interval()
-    is_known = stacked.count > 0
-    attrs = {
-        "takes": sorted(map(str, takes["take"].values)),
-        "group_by": group_by or "",
-    }
+    sigma_tr = measured.get(PROBED, empty)
+    repeats = [_repeat_deviation(sigma_tr[rows], subjects[rows]) for rows in members]
+    noise = moments("site_sigma_tr_error")
     return dataset(
         {
-            "sigma_tr_count": stacked.count,
-            "sigma_tr_mean": np.where(is_known, stacked.mean, np.nan),
-            "sigma_tr_mean_low": low,
-            "sigma_tr_mean_high": high,
-            "sigma_tr_standard_deviation": stacked.standard_deviation,
-            "sigma_tr_deviation_low": deviation_low,
-            "sigma_tr_deviation_high": deviation_high,
-            "sigma_tr_variance": stacked.variance,
-            "sigma_tr_measurement_error": _rms(moments("site_sigma_tr_error")),
+            **_distribution(moments(PROBED), noise),
+            "sigma_tr_measurement_error": _rms(noise),
             "sigma_tr_total_error": _rms(moments("site_sigma_tr_total_error")),
-            "sigma_tr_people_fraction": _people_fraction(
-                stacked.variance, moments("site_sigma_tr_error")
-            ),
-            "sigma_tr_repeat_deviation": np.stack(
-                [
-                    _repeat_deviation(
-                        measured.get("site_sigma_tr", empty)[own], subjects[own]
-                    )
-                    for own in members
-                ]
-            ),
+            "sigma_tr_repeat_deviation": np.stack(repeats),
         },
         coords={"group": names, "site": sites, "channel": ["R", "G", "B"]},
-        attrs=attrs
-        | {
+        attrs={
+            "takes": sorted(map(str, takes["take"].values)),
+            "group_by": group_by or "",
             "statuses": _statuses(takes),
-            "skipped": list(cohort.attrs.get("skipped", [])),
+            "skipped": skipped_takes(cohort),
         },
     )
+
+
+def _distribution(values: Moments, noise: Moments) -> dict[str, Array]:
+    """Count, mean and spread of sigma_tr, and the fraction that noise does not explain."""
+    low, high = values.mean_interval()
+    deviation_low, deviation_high = values.deviation_interval()
+    return {
+        "sigma_tr_count": values.count,
+        "sigma_tr_mean": np.where(values.count > 0, values.mean, np.nan),
+        "sigma_tr_mean_low": low,
+        "sigma_tr_mean_high": high,
+        "sigma_tr_standard_deviation": values.standard_deviation,
+        "sigma_tr_deviation_low": deviation_low,
+        "sigma_tr_deviation_high": deviation_high,
+        "sigma_tr_variance": values.variance,
+        "sigma_tr_people_fraction": _people_fraction(values.variance, noise),
+    }
 
 
 def describe_translucency(table: xr.Dataset) -> list[str]:
@@ -165,8 +165,10 @@ def _trusted(takes: xr.Dataset) -> dict[str, Array]:
     """Variables (take, site, channel) of trusted fits; NaN where a take lacks a site or
     its fit is not trusted.
     """
+    if PROBED not in takes:  # the probe was not used
+        return {}
     names = (
-        "site_sigma_tr",
+        PROBED,
         "site_sigma_tr_error",
         "site_sigma_tr_total_error",
         "site_status",
@@ -258,7 +260,7 @@ def plot_translucency(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     ax.set_xticks(range(len(sites)), sites)
     ax.set_ylim(bottom=0)
     ax.set_ylabel("mean sigma_tr with 95 % CI [mm-1]")
-    ax.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+    plots.legend_beside(ax)
     return ax
 
 
