@@ -14,7 +14,7 @@ from permissions import open_to_others
 
 from skindb.cli import cli
 from skindb.errors import InputError
-from skindb.hw.unfinished import one_session
+from skindb.hw.capture_folder import one_session
 from skindb.ingest import read_capture
 from skindb.virtual.devices import RefusedError
 from skindb.workflow.session import VIRTUAL_SIZE

@@ -11,34 +11,37 @@ from typing import Any
 import numpy as np
 
 from skindb.errors import Fault, InputError
-from skindb.hw.brightness import Levels, failed_lights, lamp_brightness
+from skindb.hw.brightness import Levels, failed_lights, lamp_brightness, measure_lamp
 from skindb.hw.cameras import Cameras
 from skindb.hw.capture_folder import (
     Setup,
     Subject,
+    Unfinished,
     count_hot_pixels,
     identity,
     keep_failed_placement,
     keep_frames,
     keep_site,
+    open_unfinished,
     remaining_schedule,
     require_space,
     write_capture,
 )
 from skindb.hw.dome import Dome
-from skindb.hw.lamp import measure_lamp
 from skindb.hw.probe import PRESSURE_KPA, PlacementError, Probe, Reading
-from skindb.hw.safety import (
+from skindb.hw.sequence import (
+    DARK,
     MAX_FLASHES,
     Override,
     Rehearsal,
+    Schedule,
     assess,
     measured_flashes,
+    plan_schedule,
     rehearsal_notes,
     require_safe,
     slowed_schedule,
 )
-from skindb.hw.sequence import DARK, Schedule, plan_schedule
 from skindb.hw.session import (
     DomeRun,
     SiteRun,
@@ -49,7 +52,6 @@ from skindb.hw.session import (
     require_complete,
     with_dark_frames,
 )
-from skindb.hw.unfinished import Unfinished, open_unfinished
 from skindb.types import Progress, silent
 
 ATTEMPTS = 3  # to measure a site; if all fail, a device is broken

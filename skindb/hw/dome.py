@@ -8,27 +8,24 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from skindb.hw.link import (
-    FIRMWARE_CURE,
-    REPLY_SECONDS,
-    SILENCE_SECONDS,
-    DeviceError,
-    Link,
-    stopped_at_end,
-)
-from skindb.hw.protocol import (
     CLOCK_ERROR,
     CURRENT,
     EARLY_SECONDS,
+    FIRMWARE_CURE,
     INTERLOCKS,
+    REPLY_SECONDS,
     REST_CURRENT,
+    SILENCE_SECONDS,
     SLACK_SECONDS,
     STATES,
     TRIGGERS,
     Count,
+    DeviceError,
+    Link,
     Range,
+    stopped_at_end,
 )
-from skindb.hw.safety import Override, Rehearsal, require_safe
-from skindb.hw.sequence import Measured, Schedule
+from skindb.hw.sequence import Measured, Override, Rehearsal, Schedule, require_safe
 
 POLL_SECONDS = 0.1  # interval of status requests during a run
 REPORTS_AT_A_TIME = 10  # read between two status requests

@@ -10,20 +10,18 @@ from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
 from skindb.hw.link import (
-    FIRMWARE_CURE,
-    SILENCE_SECONDS,
-    DeviceError,
-    Link,
-    stopped_at_end,
-)
-from skindb.hw.protocol import (
     CLOCK_ERROR,
     EARLY_SECONDS,
+    FIRMWARE_CURE,
     GAUGE_KPA,
     GAUGE_SECONDS,
     PROBE_STATES,
+    SILENCE_SECONDS,
     SLACK_SECONDS,
     TRIGGERS,
+    DeviceError,
+    Link,
+    stopped_at_end,
 )
 
 KIND = "probe"

@@ -1,12 +1,18 @@
-"""The sequence of lights and exposures of a dome: its plan, and the measurements that
-are stored with the capture.
+"""The sequence of lights and exposures of a dome: its plan, its flashes and whether they are
+safe, and the measurements that are stored with the capture.
+
+Flashes at 3 to 30 per second provoke seizures in photosensitive people; guidelines
+allow at most three in any second (WCAG 2.2, success criterion 2.3.1; Harding and
+Jeavons 1994; ITU-R BT.1702). A flash is a pair of opposing changes of luminance of at
+least 10 % of the brighter one. Every light that is switched on counts, even if another
+one is switched off at the same time, because it shines from another direction.
 """
 
 from __future__ import annotations
 
 import binascii
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from skindb.errors import Fault, InputError
@@ -16,6 +22,11 @@ DARK = "-"  # id in place of a light when all lights are off
 GAP_SECONDS = 0.002
 # for 150 lights and two exposures (Weyrich et al. 2005, section 5)
 PAPER_SECONDS = 25.0
+MAX_FLASHES = 3  # in any second
+# smallest relative change of luminance that counts as one half of a flash
+MIN_LUMINANCE_STEP = 0.1
+WINDOW_US = 1_000_000
+MAX_JITTER_US = 1_000  # of a measured time
 
 
 @dataclass(frozen=True)
@@ -160,3 +171,187 @@ def sequence_entry(step: Step, measured: Measured) -> dict[str, Any]:
         "planned_on": step.on_us / 1e6,
         "planned_off": step.off_us / 1e6,
     }
+
+
+@dataclass(frozen=True)
+class Assessment:
+    """Flashes and luminance steps of a sequence."""
+
+    flashes_per_second: int  # largest number in any second
+    # when a light is switched on, relative to the luminance with that light
+    luminance_step: float
+    seconds: float  # duration of the sequence
+
+    @property
+    def safe(self) -> bool:
+        """Whether the sequence may run without screening the subject."""
+        return self.flashes_per_second <= MAX_FLASHES
+
+    def __str__(self) -> str:
+        """Describe the assessment in words."""
+        rate = (
+            f"at most {self.flashes_per_second} "
+            f"{'flash' if self.flashes_per_second == 1 else 'flashes'} in any second"
+        )
+        return f"{rate}, luminance steps of {self.luminance_step:.0%}, {self.seconds:.1f} s"
+
+
+@dataclass(frozen=True)
+class Override:
+    """Confirmation of an operator that the subject was screened, gave consent, and
+    keeps the eyes closed.
+    """
+
+    operator: str
+    time: str  # ISO 8601
+    screened: bool = True
+    consented: bool = True
+    eyes_closed: bool = True
+
+    @property
+    def complete(self) -> bool:
+        """Whether a named operator confirmed all of it."""
+        return (
+            bool(self.operator)
+            and self.screened
+            and self.consented
+            and self.eyes_closed
+        )
+
+    def recorded(self, found: Assessment) -> dict[str, Any]:
+        """Record that is stored with the capture."""
+        return asdict(self) | {"flashes_per_second": found.flashes_per_second}
+
+
+@dataclass(frozen=True)
+class Rehearsal:
+    """Nobody is present and the devices are emulated, so that nobody needs to be screened."""
+
+    confirmation: Override | None = None  # that of the operator who rehearses
+    operator: str = "rehearsal"  # for the emulated controller
+
+
+def assess(schedule: Schedule, *, window_us: int = WINDOW_US) -> Assessment:
+    """Flashes and luminance steps of a schedule, in any second or window of another length."""
+    step = (
+        1 / (1 + schedule.base)
+        if any(entry.light != DARK for entry in schedule.steps)
+        else 0.0
+    )
+    starts = sorted(entry.on_us for entry in schedule.steps if entry.light != DARK)
+    if step < MIN_LUMINANCE_STEP:
+        starts = []
+    flashes = 0
+    begin = 0
+    for end, start in enumerate(starts):
+        while starts[begin] <= start - window_us:
+            begin += 1
+        flashes = max(flashes, end - begin + 1)
+    return Assessment(flashes, step, schedule.seconds)
+
+
+def measured_flashes(schedule: Schedule, measured: Sequence[Measured | None]) -> int:
+    """Largest number of flashes in any second by the measured times."""
+    steps = list[Step]()
+    for step, times in zip(schedule.steps, measured, strict=True):
+        if times is not None:
+            steps.append(replace(step, on_us=times.on_us, off_us=times.off_us))
+    lit = replace(schedule, steps=tuple(steps))
+    return assess(lit, window_us=WINDOW_US - 2 * MAX_JITTER_US).flashes_per_second
+
+
+def slowed_schedule(schedule: Schedule, flashes: int = MAX_FLASHES) -> Schedule:
+    """The schedule with longer intervals, so that at most `flashes` lights are switched
+    on in any second.
+    """
+    period = WINDOW_US // max(flashes, 1) + 1
+    after = [step.on_us for step in schedule.steps[1:]] + [0]
+    steps = list[Step]()
+    start = 0
+    for step, following in zip(schedule.steps, after, strict=False):
+        steps.append(
+            replace(step, on_us=start, off_us=start + step.off_us - step.on_us)
+        )
+        start += max(period if step.light != DARK else 0, following - step.on_us)
+    return replace(schedule, steps=tuple(steps))
+
+
+def partial_schedule(schedule: Schedule, steps: Iterable[int]) -> Schedule:
+    """Schedule of some of the steps, with at most as many flashes in any second as the
+    whole schedule.
+    """
+    part = schedule.subset(steps)
+    allowed = assess(schedule).flashes_per_second
+    return (
+        part
+        if assess(part).flashes_per_second <= allowed
+        else slowed_schedule(part, allowed)
+    )
+
+
+def with_base_light(schedule: Schedule) -> Schedule:
+    """The schedule with a steady lamp so bright that switching on one more light is not a flash."""
+    return replace(schedule, base=int(1 / MIN_LUMINANCE_STEP))
+
+
+def alternatives(schedule: Schedule) -> list[str]:
+    """Descriptions of alternative schedules that need no override, one line each, with
+    their cost.
+    """
+    late = slowed_schedule(schedule)
+    lit = with_base_light(schedule)
+    noise = (1 + lit.base) ** 0.5
+    return [
+        f"slower (--slower): {assess(late)}, {late.seconds - schedule.seconds:.1f} s longer",
+        f"a steady lamp as bright as {lit.base} lights (--base-light {lit.base}): "
+        f"{assess(lit)}; photon "
+        f"noise {noise:.1f} times as high, and dark frames must be taken with the lamp on; its "
+        "brightness is measured before the lights flash",
+    ]
+
+
+def require_safe(
+    schedule: Schedule, override: Override | Rehearsal | None
+) -> Assessment:
+    """Assess a schedule, and refuse one that needs an override and has none.
+
+    Raises
+    ------
+    InputError
+        If the schedule exceeds the limit of flashes and no operator has confirmed it.
+    """
+    assessment = assess(schedule)
+    if assessment.safe or isinstance(override, Rehearsal):
+        return assessment
+    if override is not None and override.complete:
+        return assessment
+    raise InputError(_flash_fault(schedule, assessment))
+
+
+def rehearsal_notes(schedule: Schedule, rehearsal: Rehearsal) -> list[str]:
+    """How a real session would judge a schedule: its refusal, or whose confirmation allows it."""
+    assessment = assess(schedule)
+    if assessment.safe:
+        return []
+    confirmation = rehearsal.confirmation
+    if confirmation is None or not confirmation.complete:
+        return [
+            f"a real session would be refused: {_flash_fault(schedule, assessment)}"
+        ]
+    return [
+        f"a real session would run because {confirmation.operator} confirms screening, consent and "
+        f"closed eyes for {assessment.flashes_per_second} flashes in a second"
+    ]
+
+
+def _flash_fault(schedule: Schedule, assessment: Assessment) -> Fault:
+    rule = (
+        "an operator must confirm screening, consent and closed eyes for more than "
+        f"{MAX_FLASHES} flashes in a second"
+    )
+    longer = assess(slowed_schedule(schedule)).seconds - assessment.seconds
+    cure = (
+        f"give --confirm-screening --operator ID, or --slower ({longer:.1f} s longer), "
+        "or a steady lamp (see --plan)"
+    )
+    return Fault("sequence", rule, str(assessment), cure)

@@ -13,15 +13,18 @@ from skindb.hw.cameras import Cameras, match_frames
 from skindb.hw.dome import STOPPED, Dome
 from skindb.hw.link import DeviceError, RefusedError
 from skindb.hw.probe import PRESSURE_KPA, Placement, PlacementError, Probe, Reading
-from skindb.hw.safety import (
+from skindb.hw.sequence import (
+    DARK,
     Assessment,
+    Measured,
     Override,
     Rehearsal,
+    Schedule,
+    Step,
     assess,
     partial_schedule,
     require_safe,
 )
-from skindb.hw.sequence import DARK, Measured, Schedule, Step
 from skindb.types import Progress, silent
 
 # runs after the first one; frames that are still missing then indicate a broken device

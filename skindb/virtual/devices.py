@@ -13,13 +13,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from skindb.clock import SYSTEM_CLOCK, Clock, SimulatedClock
-from skindb.hw.link import READ_SECONDS
-from skindb.hw.protocol import (
+from skindb.hw.link import (
     ERROR,
     EVENT,
     MAX_NUMBER,
     OK,
     PROTOCOL,
+    READ_SECONDS,
     REPLY,
     REQUEST,
     Lines,

@@ -21,12 +21,17 @@ from skindb.format.folder import read_capture, record_faults
 from skindb.geometry.scan import read_scan
 from skindb.hw.cameras import FolderCameras
 from skindb.hw.capture import CapturePlan, Devices, planned_schedule, run_capture
-from skindb.hw.capture_folder import Setup, Subject, capture_record, read_setup
+from skindb.hw.capture_folder import (
+    Setup,
+    Subject,
+    capture_record,
+    one_session,
+    read_setup,
+)
 from skindb.hw.dome import Dome
 from skindb.hw.link import Link, open_port
 from skindb.hw.probe import Probe
-from skindb.hw.safety import Override, Rehearsal, alternatives, assess
-from skindb.hw.unfinished import one_session
+from skindb.hw.sequence import Override, Rehearsal, alternatives, assess
 from skindb.parameters import VIRTUAL_SEED, SessionParameters
 from skindb.schema.consent import SCOPES
 from skindb.types import Progress

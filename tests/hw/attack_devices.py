@@ -41,9 +41,8 @@ from skindb.hw.cameras import FolderCameras
 from skindb.hw.capture import CapturePlan, Devices, run_capture
 from skindb.hw.capture_folder import Subject, read_setup
 from skindb.hw.dome import Dome
-from skindb.hw.link import Link
+from skindb.hw.link import EVENT, OK, REPLY, Lines, Link, Message
 from skindb.hw.probe import Probe
-from skindb.hw.protocol import EVENT, OK, REPLY, Lines, Message
 from skindb.virtual.devices import DirectPort
 from skindb.virtual.laboratory import Laboratory
 

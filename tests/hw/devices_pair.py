@@ -13,7 +13,7 @@ from skindb.hw.cameras import FolderCameras
 from skindb.hw.dome import Dome
 from skindb.hw.link import Link
 from skindb.hw.probe import Probe
-from skindb.hw.safety import Override
+from skindb.hw.sequence import Override
 from skindb.virtual.devices import DeviceFaults, DirectPort, Emulated, EmulatedDome
 from skindb.virtual.laboratory import Laboratory, LaboratoryFaults
 

@@ -22,8 +22,7 @@ from skindb.hw.brightness import (
 )
 from skindb.hw.capture import CapturePlan, Devices, run_capture
 from skindb.hw.capture_folder import Subject, read_setup
-from skindb.hw.safety import MAX_FLASHES
-from skindb.hw.sequence import DARK, plan_schedule
+from skindb.hw.sequence import DARK, MAX_FLASHES, plan_schedule
 from skindb.hw.session import with_dark_frames
 from skindb.virtual.laboratory import LaboratoryFaults
 

@@ -20,10 +20,15 @@ from devices_pair import (
 
 from skindb.clock import SimulatedClock
 from skindb.hw.dome import Dome
-from skindb.hw.link import SILENCE_SECONDS, WATCHDOG_SECONDS, DeviceError
-from skindb.hw.protocol import SLACK_SECONDS
-from skindb.hw.safety import Rehearsal, measured_flashes, slowed_schedule
-from skindb.hw.sequence import DARK, Measured, plan_schedule
+from skindb.hw.link import SILENCE_SECONDS, SLACK_SECONDS, WATCHDOG_SECONDS, DeviceError
+from skindb.hw.sequence import (
+    DARK,
+    Measured,
+    Rehearsal,
+    measured_flashes,
+    plan_schedule,
+    slowed_schedule,
+)
 from skindb.hw.session import capture_dome, with_dark_frames
 from skindb.virtual.devices import DeviceFaults, EmulatedDome, RefusedError
 

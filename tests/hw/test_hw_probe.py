@@ -10,9 +10,8 @@ from devices_pair import linked
 
 from skindb.clock import SimulatedClock
 from skindb.errors import InputError
-from skindb.hw.link import SILENCE_SECONDS, DeviceError
+from skindb.hw.link import SILENCE_SECONDS, SLACK_SECONDS, DeviceError
 from skindb.hw.probe import MAX_AGE_SECONDS, POLL_SECONDS, PlacementError, Probe
-from skindb.hw.protocol import SLACK_SECONDS
 from skindb.virtual.devices import DeviceFaults, EmulatedProbe
 
 EXPOSURES = {"b00": 3.0, "b01": 1.0}

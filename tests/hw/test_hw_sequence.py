@@ -12,23 +12,21 @@ from skindb.clock import SimulatedClock
 from skindb.errors import InputError
 from skindb.hw.cameras import FolderCameras, Shot, match_frames
 from skindb.hw.probe import brackets
-from skindb.hw.safety import (
+from skindb.hw.sequence import (
+    DARK,
     MAX_FLASHES,
+    Measured,
     Override,
+    Schedule,
+    Step,
     alternatives,
     assess,
     partial_schedule,
+    plan_schedule,
     require_safe,
+    sequence_entry,
     slowed_schedule,
     with_base_light,
-)
-from skindb.hw.sequence import (
-    DARK,
-    Measured,
-    Schedule,
-    Step,
-    plan_schedule,
-    sequence_entry,
 )
 from skindb.hw.session import with_dark_frames
 

@@ -21,8 +21,7 @@ from devices_pair import (
 from skindb.errors import Fault, InputError
 from skindb.hw.cameras import Shot
 from skindb.hw.probe import PlacementError
-from skindb.hw.safety import assess, slowed_schedule
-from skindb.hw.sequence import DARK, plan_schedule
+from skindb.hw.sequence import DARK, assess, plan_schedule, slowed_schedule
 from skindb.hw.session import (
     capture_dome,
     capture_site,
