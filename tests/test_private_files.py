@@ -16,9 +16,8 @@ from permissions import open_to_others, open_umask
 from small_face import small_face
 
 import skindb
-from skindb.cache import cached_arrays
 from skindb.cli import main
-from skindb.files import private_file, private_umask
+from skindb.files import cached_arrays, private_file, private_umask
 from skindb.format.frames import write_frame
 from skindb.geometry.scan import Crop
 from skindb.reflectance.dictionary import embedded_dictionary

@@ -29,7 +29,7 @@ from skindb.numerics.statistics import Moments
 from skindb.parameters import group_option
 from skindb.schema import dataset
 from skindb.schema.cohort import require_same_fit
-from skindb.schema.regions import FACE
+from skindb.schema.label import FACE
 from skindb.types import Array, Mask
 
 if TYPE_CHECKING:

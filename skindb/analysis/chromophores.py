@@ -40,8 +40,8 @@ from skindb.numerics.statistics import Moments, known_mean
 from skindb.parameters import group_option, seed_option
 from skindb.schema import dataset
 from skindb.schema.cohort import require_same_fit
+from skindb.schema.label import FACE
 from skindb.schema.notes import note
-from skindb.schema.regions import FACE
 from skindb.types import Array, Mask
 
 if TYPE_CHECKING:

@@ -26,7 +26,7 @@ from skindb.numerics.statistics import benjamini_hochberg, known_mean
 from skindb.parameters import permutations_option, seed_option
 from skindb.schema import dataset
 from skindb.schema.cohort import require_same_fit, require_takes
-from skindb.schema.regions import FACE
+from skindb.schema.label import FACE
 from skindb.types import Array
 
 if TYPE_CHECKING:

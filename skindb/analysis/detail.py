@@ -17,8 +17,7 @@ from skindb.analysis.texture import SIZE, at_surfels, log_albedo
 from skindb.errors import Fault, InputError
 from skindb.numerics.texture import Image, build, level_fractions, reconstruct
 from skindb.schema.consent import honour_consent
-from skindb.schema.label import take_attrs
-from skindb.schema.regions import FACE
+from skindb.schema.label import FACE, take_attrs
 from skindb.types import Array, Mask
 
 # mm, default wavelength of the coarsest detail transferred: freckles, small moles,

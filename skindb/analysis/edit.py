@@ -20,8 +20,7 @@ from skindb.optics.diffusion import dipole_s
 from skindb.reflectance.tables import TableGrid, brdf_coords, brdf_metric, stored_brdf
 from skindb.schema import GROUPS, Use, check, dataset, label, names_of
 from skindb.schema.consent import honour_consent
-from skindb.schema.label import take_attrs
-from skindb.schema.regions import FACE
+from skindb.schema.label import FACE, take_attrs
 
 Array = NDArray[np.floating[Any]]
 Report = dict[str, Any]

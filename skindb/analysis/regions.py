@@ -12,7 +12,7 @@ from collections.abc import Mapping
 import numpy as np
 import xarray as xr
 
-from skindb.schema.regions import FACE
+from skindb.schema.label import FACE
 from skindb.types import Array, Mask
 
 Corner = tuple[str, float, float]

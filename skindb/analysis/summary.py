@@ -18,9 +18,9 @@ from skindb.render.surfels import surfel_texels, texel_codes
 from skindb.schema import FitStatus, TexelStatus, Use, dataset, names_of
 from skindb.schema.cohort import Held, combine, take_coords
 from skindb.schema.consent import consent_scope
+from skindb.schema.declaration import MAX_CONDITION_TRUSTED, MIN_SAMPLES_TRUSTED
+from skindb.schema.label import FACE
 from skindb.schema.notes import note
-from skindb.schema.regions import FACE
-from skindb.schema.status import MAX_CONDITION_TRUSTED, MIN_SAMPLES_TRUSTED
 from skindb.types import Array, Mask
 
 # surfels per take; the paper drew 2,000 of each subject, and 5,000 for the conditions

@@ -31,7 +31,7 @@ from skindb.numerics.texture import (
 )
 from skindb.schema import dataset
 from skindb.schema.cohort import require_same_fit
-from skindb.schema.regions import FACE
+from skindb.schema.label import FACE
 from skindb.types import Array, Mask
 
 SIZE = 1024  # texels along each side

@@ -41,7 +41,7 @@ from skindb.numerics.statistics import known_mean
 from skindb.parameters import DICTIONARY_HELP, adjust_option, option, seed_option
 from skindb.schema import IDENTIFIED, dataset
 from skindb.schema.cohort import require_same_fit
-from skindb.schema.regions import FACE
+from skindb.schema.label import FACE
 from skindb.types import Array, Mask
 
 if TYPE_CHECKING:

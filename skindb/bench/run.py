@@ -30,8 +30,7 @@ from skindb.bench.subsurface import (
     transport_curves,
 )
 from skindb.bench.surface import disc_curves, nmf_curves, refit_curves, surface_curves
-from skindb.files import make_private, private_file
-from skindb.schema.plain import plain
+from skindb.files import make_private, plain, private_file
 from skindb.types import Progress
 
 CURVES: dict[str, Callable[[bool], list[Curve]]] = {

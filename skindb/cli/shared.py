@@ -24,6 +24,7 @@ from skindb.cli.progress import Progress as Progress
 from skindb.cli.progress import bar as bar
 from skindb.cli.terminal import echo
 from skindb.errors import Fault, InputError
+from skindb.files import plain
 
 if TYPE_CHECKING:
     from skindb.store import Database, Record
@@ -75,8 +76,6 @@ def serve(server: PageServer, **values: Any) -> None:
 
 def echo_json(value: Any) -> None:
     """Print standard JSON, in which NaN and infinity are null."""
-    from skindb.schema.plain import plain  # imports xarray, which --help does not need
-
     echo(*json.dumps(plain(value), indent=1, allow_nan=False).splitlines())
 
 

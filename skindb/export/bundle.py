@@ -31,7 +31,7 @@ from skindb.export.scenes import (
     export_usd,
 )
 from skindb.export.textures import Skin, skin_of
-from skindb.files import make_private, private_file
+from skindb.files import make_private, plain, private_file
 from skindb.reflectance.dictionary import Dictionary
 from skindb.reflectance.kinds import as_mixture
 from skindb.reflectance.merl import write_merl
@@ -40,7 +40,6 @@ from skindb.reflectance.tables import TableGrid, kernel_tables, lookup
 from skindb.render.image import write_exr
 from skindb.schema import VARIABLES, FitStatus, ProbeStatus, Use, names_of
 from skindb.schema.consent import require_consent
-from skindb.schema.plain import plain
 from skindb.types import Progress, silent
 
 WIDTH = 100

@@ -13,6 +13,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
+from skindb.files import plain
 from skindb.geometry.rays import RAY_OFFSET_MM, RayScene
 from skindb.optics.diffusion import (
     dipole_power_beyond,
@@ -20,7 +21,6 @@ from skindb.optics.diffusion import (
     scattering_coefficients,
 )
 from skindb.schema import check
-from skindb.schema.plain import plain
 
 REQUIRED = (
     "surfel_position",

@@ -25,7 +25,7 @@ from skindb.reflectance._separation_kernels import (
 from skindb.reflectance.model import typical_noise
 from skindb.reflectance.separation import separate_diffuse
 from skindb.schema import check, label
-from skindb.schema.status import LARGEST_R_D, SMALLEST_R_D
+from skindb.schema.declaration import LARGEST_R_D, SMALLEST_R_D
 from skindb.types import Array, Float64
 
 METHODS = ("separated", "quantile", "minimum")

@@ -13,7 +13,7 @@ from skindb.parameters import FitParameters
 from skindb.reflectance.dictionary import Dictionary
 from skindb.reflectance.kinds import unfitted_model
 from skindb.reflectance.model import ReflectanceModel
-from skindb.schema.omission import Omission, explain
+from skindb.schema.notes import Omission, explain
 from skindb.types import Mask
 
 

@@ -15,7 +15,7 @@ from skindb.fit.plan import FitPlan
 from skindb.parameters import FitParameters
 from skindb.reflectance._lumitexel_kernels import BINS_PER_SCALE
 from skindb.schema import FitStatus, check, dataset
-from skindb.schema.regions import FACE
+from skindb.schema.label import FACE
 from skindb.types import Mask
 
 HELD_OUT_ERRORS = {

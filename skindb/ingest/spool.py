@@ -28,7 +28,7 @@ from skindb.errors import Fault, InputError
 from skindb.files import PRIVATE_FILE, make_private, private_file
 from skindb.ingest._sample_kernels import tally
 from skindb.limits import RESUMABLE_SECONDS
-from skindb.schema.blocks import SHARD
+from skindb.schema.label import SHARD
 
 # between two entries of the journal: the most that a killed run loses
 JOURNAL_INTERVAL_SECONDS = 5.0

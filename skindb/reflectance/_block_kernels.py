@@ -42,7 +42,7 @@ from skindb.reflectance._mixture_kernels import (
     weight_covariance,
 )
 from skindb.reflectance._row_kernels import turn_rows
-from skindb.schema.status import SMALLEST_R_D
+from skindb.schema.declaration import SMALLEST_R_D
 
 KKT_TOLERANCE = 1e-10
 SQRT_3 = math.sqrt(3.0)

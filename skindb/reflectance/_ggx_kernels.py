@@ -33,7 +33,7 @@ from skindb.reflectance._lumitexel_kernels import (
 )
 from skindb.reflectance._mixture_kernels import fit_memory, relative_errors
 from skindb.reflectance._shade_kernels import transmittance
-from skindb.schema.status import SMALLEST_R_D
+from skindb.schema.declaration import SMALLEST_R_D
 
 MIN_ROUGHNESS = 0.05  # narrower lobes fall between the lights of a dome
 MAX_ROUGHNESS = 1.0

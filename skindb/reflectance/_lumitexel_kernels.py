@@ -14,7 +14,7 @@ from skindb.reflectance._mixture_kernels import to_roots
 from skindb.reflectance._row_kernels import form_rows, row_memory
 from skindb.reflectance._shade_kernels import transmittance
 from skindb.schema import FitStatus
-from skindb.schema.status import LARGEST_R_D, SMALLEST_R_D
+from skindb.schema.declaration import LARGEST_R_D, SMALLEST_R_D
 from skindb.types import Integer
 
 FITTED, UNSEEN, FEW, NO_DIFFUSE, CLAMPED, NOT_CONVERGED, NOT_FINITE, _ = (

@@ -45,7 +45,7 @@ from skindb.reflectance.model import (
 from skindb.reflectance.sampling import COSINE_FRACTION, MIN_COSINE_HALF, tangents
 from skindb.reflectance.tables import Table, tabulate
 from skindb.schema import check, dataset
-from skindb.schema.omission import Omission
+from skindb.schema.notes import Omission
 from skindb.types import Array
 
 PARAMETERS = ("lobe_strength", "lobe_roughness")

@@ -41,7 +41,7 @@ from skindb.reflectance.tables import (
     pad_to_lanes,
 )
 from skindb.schema import FitStatus, check
-from skindb.schema.omission import Omission
+from skindb.schema.notes import Omission
 from skindb.types import Array
 
 # in the order of the codes in `_block_kernels`

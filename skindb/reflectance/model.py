@@ -11,7 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from skindb.reflectance.tables import Table
-from skindb.schema.omission import Omission
+from skindb.schema.notes import Omission
 from skindb.types import Array
 
 

@@ -9,7 +9,7 @@ from skindb.render.photographs import (
 from skindb.render.rendering import render, render_picture
 from skindb.render.scene import Camera, Environment, Lights
 from skindb.render.surfels import evaluate
-from skindb.schema.omission import NOTHING
+from skindb.schema.notes import NOTHING
 
 __all__ = [
     "NOTHING",

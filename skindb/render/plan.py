@@ -17,7 +17,7 @@ from skindb.reflectance.model import Lamp, Points
 from skindb.render.monte_carlo import Lighting
 from skindb.render.scene import Camera, Lights, Surface
 from skindb.render.shading import View, trace_view, tree_opening
-from skindb.schema.omission import Omission
+from skindb.schema.notes import Omission
 from skindb.types import Mask
 
 Float = NDArray[np.floating[Any]]

@@ -40,7 +40,7 @@ from skindb.render.shading import (
     tree_opening,
 )
 from skindb.schema.consent import honour_consent
-from skindb.schema.omission import Omission
+from skindb.schema.notes import Omission
 from skindb.types import Mask, Progress
 
 UNITS = "radiance"  # in the unit of the photographs, or of the environment

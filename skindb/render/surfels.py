@@ -12,7 +12,7 @@ from skindb.reflectance.kinds import parameter_variables, surface_model
 from skindb.reflectance.model import Lamp, Points, ReflectanceModel
 from skindb.render.scene import usable_surfels
 from skindb.schema import FitStatus, TexelStatus, check
-from skindb.schema.status import MAX_CONDITION_TRUSTED, MIN_SAMPLES_TRUSTED
+from skindb.schema.declaration import MAX_CONDITION_TRUSTED, MIN_SAMPLES_TRUSTED
 from skindb.types import Array
 
 Codes = NDArray[np.uint8]

@@ -1,17 +1,18 @@
 """Every stored variable, declared once: name, dims, dtype, units, one sentence, source."""
 
-from skindb.schema.check import check
-from skindb.schema.declaration import Use, Variable, names_of
-from skindb.schema.label import dataset, label, text_labels
-from skindb.schema.notes import note_lines
-from skindb.schema.status import (
+from skindb.schema.declaration import (
     IDENTIFIED,
     Explained,
     FitStatus,
     ProbeStatus,
     TexelStatus,
+    Use,
+    Variable,
     flag_attrs,
+    names_of,
 )
+from skindb.schema.label import check, dataset, label, text_labels
+from skindb.schema.notes import note_lines
 from skindb.schema.variables import GROUPS, SCHEMA_VERSION, VARIABLES
 
 __all__ = [

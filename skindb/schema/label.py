@@ -1,16 +1,21 @@
-"""From arrays to labelled variables with the dims, dtype and attributes of the schema."""
+"""Labelled variables with the dims, dtype and attributes of the schema: made from arrays, and
+checked where they are passed between packages; all faults are reported together.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from skindb.schema.status import flag_attrs
+from skindb.errors import Fault, InputError
+from skindb.schema.declaration import flag_attrs
 from skindb.schema.variables import VARIABLES
 
+SHARD = 4096  # surfels of a block: one task writes one file
+FACE = "face"  # every surfel of a take
 # attributes of a capture that its models and their edits have too
 TAKE_ATTRS = ("subject", "condition", "session", "traits", "consent_scope", "take")
 
@@ -64,3 +69,65 @@ def text_labels(values: Any) -> np.ndarray[Any, Any]:
     """Labels as an array; strings as variable-length text, which zarr v3 can store."""
     array = np.asarray(values)
     return array.astype(np.dtypes.StringDType()) if array.dtype.kind in "UO" else array
+
+
+def check(ds: xr.Dataset, names: Iterable[str], *, where: str = "dataset") -> None:
+    """Raise `InputError` with every fault of the variables `names` in `ds` (absent,
+    dims, dtype, units).
+
+    Parameters
+    ----------
+    ds
+        Dataset to look at; variables that are not named are ignored.
+    names
+        Variables that must be there, each declared in the schema.
+    where
+        What the user knows this Dataset by.
+    """
+    faults = [fault for name in names for fault in _faults(ds, name, where)]
+    if faults:
+        raise InputError(faults)
+
+
+def _faults(ds: xr.Dataset, name: str, where: str) -> list[Fault]:
+    spec = VARIABLES[name]
+    place = f"{where}[{name}]"
+    if name not in ds.variables:
+        return [
+            Fault(
+                place,
+                "variable is required",
+                f"only {sorted(map(str, ds.variables)) or 'nothing'}",
+                f"it is {spec.doc}",
+            )
+        ]
+    var = ds[name]
+    faults = []
+    if var.dims != spec.dims:
+        faults.append(
+            Fault(
+                place,
+                f"dims must be {spec.dims}",
+                str(var.dims),
+                "transpose or rename them",
+            )
+        )
+    if not np.can_cast(var.dtype, spec.dtype, "same_kind"):
+        faults.append(
+            Fault(
+                place,
+                f"dtype must be {spec.dtype}",
+                str(var.dtype),
+                "convert it before the call",
+            )
+        )
+    if var.attrs.get("units") != spec.units:
+        faults.append(
+            Fault(
+                place,
+                f"units must be {spec.units!r}",
+                repr(var.attrs.get("units")),
+                "convert the values, then set attrs['units']",
+            )
+        )
+    return faults

@@ -4,8 +4,7 @@ translucency, and data for cohorts.
 
 from __future__ import annotations
 
-from skindb.schema.declaration import PAPER, Use, declare
-from skindb.schema.status import FitStatus, ProbeStatus
+from skindb.schema.declaration import PAPER, FitStatus, ProbeStatus, Use, declare
 
 MISFIT = "median absolute residual in units of the noise scale of each surfel"
 

@@ -1,13 +1,16 @@
-"""Notes on takes, such as the reason why a take was skipped; they become text only
+"""Notes on takes, such as the reason why a take was skipped, and things that a computation
+skips, with the bound on the error this costs (MODEL.md, section 11). They become text only
 where they are printed.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Any
 
 Note = dict[str, Any]  # "take", which may be empty or a subject, and "reason"
+NOTHING = "nothing is skipped"
 
 
 def note(take: str, reason: str) -> Note:
@@ -26,3 +29,31 @@ def note_lines(notes: Iterable[Note]) -> list[str]:
         f"{item['take']}: {item['reason']}" if item["take"] else item["reason"]
         for item in notes
     ]
+
+
+@dataclass(frozen=True)
+class Omission:
+    """One thing that is skipped: what, how many of how many, why, and what the results
+    can differ by.
+    """
+
+    what: str
+    skipped: int = 0
+    of: int = 0  # 0 where they are not counted
+    reason: str = ""
+    bound: float = 0.0
+    bounded: str = "results"  # what the bound is a fraction of
+
+    def __str__(self) -> str:
+        cost = (
+            f"{self.bounded} differ by at most {100 * self.bound:.3g} %"
+            if self.bound
+            else "results stay the same"
+        )
+        count = f"{self.skipped} of {self.of}" if self.of else "some"
+        return f"{self.what}: {count} are skipped ({self.reason}); {cost}"
+
+
+def explain(omissions: tuple[Omission, ...]) -> list[str]:
+    """One line per thing that is skipped, for `--explain`."""
+    return [str(omission) for omission in omissions] or [NOTHING]

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from skindb.schema.declaration import PAPER, declare
-from skindb.schema.status import TexelStatus
+from skindb.schema.declaration import PAPER, TexelStatus, declare
 
 TABLE_2 = f"{PAPER}, table 2"
 

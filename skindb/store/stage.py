@@ -20,9 +20,9 @@ from zarr.codecs import BloscCodec, TransposeCodec
 
 from skindb import __version__
 from skindb.errors import Fault, InputError, add_filename
+from skindb.files import plain
 from skindb.schema import SCHEMA_VERSION, VARIABLES, check, dataset
-from skindb.schema.blocks import SHARD
-from skindb.schema.plain import plain
+from skindb.schema.label import SHARD
 from skindb.store.inputs import (
     names_of,
     require_consents,

@@ -25,7 +25,7 @@ from zarr.abc.store import (
 from zarr.core.buffer import Buffer, BufferPrototype
 
 from skindb.errors import Fault, InputError
-from skindb.schema.blocks import SHARD
+from skindb.schema.label import SHARD
 from skindb.store.place import Place
 from skindb.store.record import Record
 from skindb.store.sealed import json_object

@@ -26,7 +26,7 @@ from skindb.render.scene import LUMINANCE, Environment, Surface, from_model
 from skindb.render.surfels import surfel_confidence
 from skindb.schema import variables
 from skindb.schema.consent import honour_consent
-from skindb.schema.omission import Omission
+from skindb.schema.notes import Omission
 
 Float = NDArray[np.floating[Any]]
 COUNT = 256  # lights, in 64 passes of four

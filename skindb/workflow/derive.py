@@ -13,7 +13,7 @@ from typing import Any
 
 import xarray as xr
 
-from skindb.schema.plain import plain
+from skindb.files import plain
 from skindb.store import STUDY, SUMMARY, Database, Lease, Record
 from skindb.workflow.code_digest import code_digest
 

@@ -15,12 +15,12 @@ from skindb.analysis.edit import apply_traits, with_basis
 from skindb.analysis.population_basis import population_basis
 from skindb.analysis.summary import SAMPLED, common_maps
 from skindb.errors import Fault, InputError
+from skindb.files import plain
 from skindb.reflectance.dictionary import embedded_dictionary
 from skindb.reflectance.kinds import require_mixture
 from skindb.render.figures import write_grid
 from skindb.render.rendering import frontal_camera, radiance_of
 from skindb.schema.consent import require_consent
-from skindb.schema.plain import plain
 from skindb.store import STUDY, Database, require_fresh
 from skindb.types import Progress, silent
 from skindb.workflow import study_inputs

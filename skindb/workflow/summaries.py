@@ -22,7 +22,7 @@ from skindb.analysis.summary import (
 )
 from skindb.fit import prediction_table
 from skindb.schema import FitStatus, dataset
-from skindb.schema.regions import FACE
+from skindb.schema.label import FACE
 from skindb.store import SUMMARY, CohortRequest, Database, Lookup, Record, lacking
 from skindb.workflow.audit import logged
 from skindb.workflow.code_digest import code_digest

@@ -10,7 +10,7 @@ from skindb.analysis import cohort_of, region_tables, sample_surfels, summary_ta
 from skindb.analysis.summary import trusted_surfels
 from skindb.errors import InputError
 from skindb.schema import dataset
-from skindb.schema.status import MAX_CONDITION_TRUSTED, MIN_SAMPLES_TRUSTED
+from skindb.schema.declaration import MAX_CONDITION_TRUSTED, MIN_SAMPLES_TRUSTED
 
 N = 400
 

@@ -39,8 +39,8 @@ import skindb.ingest
 from skindb import workflow
 from skindb.cli import main
 from skindb.errors import Fault, InputError
+from skindb.files import plain
 from skindb.fit import FitParameters
-from skindb.schema.plain import plain
 from skindb.store.log import Log
 
 HARMLESS = {

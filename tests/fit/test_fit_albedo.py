@@ -26,7 +26,7 @@ from skindb.optics.fresnel import fresnel_transmittance
 from skindb.reflectance.rows import basis_rows
 from skindb.reflectance.separation import surface_lobes
 from skindb.schema import dataset, label
-from skindb.schema.status import LARGEST_R_D, SMALLEST_R_D
+from skindb.schema.declaration import LARGEST_R_D, SMALLEST_R_D
 
 
 def _with_normals(skin):

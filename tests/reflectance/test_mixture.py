@@ -23,7 +23,7 @@ from skindb.reflectance.mixture import Mixture
 from skindb.reflectance.model import Comparison
 from skindb.reflectance.reduction import reduce_dictionary
 from skindb.schema import FitStatus
-from skindb.schema.status import LARGEST_R_D, SMALLEST_R_D
+from skindb.schema.declaration import LARGEST_R_D, SMALLEST_R_D
 
 HALF = 1e-3  # samples are rounded to 5e-4
 # positions in a table to 1e-6, times the slope of its lobes
