@@ -109,7 +109,7 @@ rows = rng.gamma(0.5, 1.0, (count * each, 16)).astype(np.float32)
 target, lift = rng.gamma(1.0, 1.0, (count * each, 3)), np.abs(rng.normal(size=(16, 59)))
 offsets = np.arange(0, count * each + 1, each)
 found = fit_reflectance(rows, offsets, target, None, lift, mode="perceptual", noise_floor=0.05)
-print(hashlib.sha256(found.weight.tobytes()).hexdigest())
+print(hashlib.sha256(found.parameters.tobytes()).hexdigest())
 """
 
 

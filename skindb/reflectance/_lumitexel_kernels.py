@@ -5,17 +5,29 @@ weights, rows, targets, and the judgement of predictions.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from skindb.jit import fast_kernel, kernel, median_of
-from skindb.reflectance._mixture_kernels import to_roots
-from skindb.reflectance._row_kernels import form_rows, row_memory
+from skindb.jit import fast_kernel, kernel, median_of, unpack
+from skindb.reflectance._row_kernels import RowMemory, form_rows, row_memory
 from skindb.reflectance._shade_kernels import transmittance
+from skindb.reflectance.model import Block, Noise
 from skindb.schema import FitStatus
 from skindb.schema.declaration import LARGEST_R_D, SMALLEST_R_D
-from skindb.types import Integer
+from skindb.types import (
+    BoolMatrix,
+    BoolVector,
+    IntCube,
+    IntMatrix,
+    IntMatrix32,
+    IntVector32,
+    Matrix,
+    Matrix32,
+    Tensor32,
+    Vector,
+    Vector32,
+)
 
 FITTED, UNSEEN, FEW, NO_DIFFUSE, CLAMPED, NOT_CONVERGED, NOT_FINITE, _ = (
     int(status) for status in FitStatus
@@ -42,6 +54,10 @@ BINS_PER_SCALE = 16  # of the histograms of scaled residuals
 MIN_ROOT_SCALE = 1e-3
 # of the histograms of residuals; the last one has no upper limit
 BINS = int(OUTLIER_SCALES * BINS_PER_SCALE) + 1
+SQRT_3 = math.sqrt(3.0)
+# bits of s^(-1/3) plus a third of the bits of s; accurate to 4 %
+MAGIC = np.float32(1419967116.0)
+ZERO, THIRD, ONE, TWO_NINTHS = (np.float32(c) for c in (0, 1 / 3, 1, 2 / 9))
 
 
 class Options(NamedTuple):
@@ -50,37 +66,70 @@ class Options(NamedTuple):
     eta: float
     mode: int
     floor: float  # sr^-1
-    least: int  # minimum number of samples
-    solve: bool  # otherwise the given weights are only evaluated
+    min_samples: int
+    solve: bool  # otherwise the given parameters are only evaluated
+
+
+class JudgedErrors(NamedTuple):
+    """Errors of the input of a judgement, and the samples that are not fitted."""
+
+    diffuse: Matrix  # (n, 3) of R_d
+    turn: Vector  # (n,) of the normal about each axis [rad]
+    # (lights, cameras) 0 fitted, 1 a held-out light, 2 a held-out camera, 3 both
+    held: IntMatrix
+
+
+class RootMemory(NamedTuple):
+    """Memory for cube roots and residuals; one number per sample in single precision."""
+
+    total: Vector32  # sum of the targets over channels
+    trial: Vector32  # residuals, or the prediction of a step
+    mixed: Vector32  # values in cube-root space, or the prediction of a shorter step
+    square: Vector32  # squared values plus the squared noise floor
+    inverse: Vector32  # `square` to the power -1/3
+    square_bits: IntVector32  # the same memory as int32
+    inverse_bits: IntVector32
 
 
 class Lumitexel(NamedTuple):
     """Buffers for one surfel; one set per thread."""
 
-    values: Any  # (lights cameras 3,) samples as single floats
-    to_light: Any  # (lights, 3) unit directions
-    to_camera: Any  # (cameras, 3)
-    lit: Any  # (lights,) cosines, 0 below the limit
-    seen: Any  # (cameras,)
-    enters: Any  # (lights,) F_t cos / pi, 0 below the limit
-    leaves: Any  # (cameras,) F_t, 0 below the limit
-    usable: Any  # (lights, cameras) which samples are used
-    index: Any  # (rows, 2) light and camera of each row
-    row_memory: Any
-    rows: Any  # (rows, width) cos(theta_i) b_j
-    given: Any  # (3, rows) samples
-    scattered: Any  # (3, rows) their diffuse part
-    target: Any  # (3, rows) samples minus their diffuse part
-    noise: Any  # (2, rows) variance of one channel at reflectance 0, and its slope
+    values: Vector32  # (lights cameras 3,) samples as single floats
+    to_light: Matrix  # (lights, 3) unit directions
+    to_camera: Matrix  # (cameras, 3)
+    lit: Vector  # (lights,) cosines, 0 below the limit
+    seen: Vector  # (cameras,)
+    enters: Vector  # (lights,) F_t cos / pi, 0 below the limit
+    leaves: Vector  # (cameras,) F_t, 0 below the limit
+    finite: BoolMatrix  # (lights, cameras) which samples could be used
+    usable: BoolMatrix  # (lights, cameras) which samples are used
+    pairs: IntMatrix32  # (rows, 2) light and camera of each row
+    row_memory: RowMemory
+    rows: Matrix32  # (rows, width) cos(theta_i) b_j
+    sample: Matrix32  # (3, rows)
+    scattered: Matrix32  # (3, rows) their diffuse part, or a prediction
+    target: Matrix32  # (3, rows) samples minus their diffuse part
+    noise: Matrix32  # (2, rows) variance of one channel at reflectance 0, and its slope
+    weight: Vector32  # (rows,) weights of the samples
+    surface: Vector32  # (rows,) predicted surface part
 
 
 @kernel
-def lumitexel_memory(lights: int, cameras: int, width: int) -> Any:
-    """Buffers for `write_rows`."""
-    most = lights * cameras
-    channels = np.zeros((9, most), np.float32)
+def root_memory(size: int) -> RootMemory:
+    """Memory for up to `size` samples."""
+    v = np.empty((5, size), np.float32)
+    return RootMemory(
+        v[0], v[1], v[2], v[3], v[4], v[3].view(np.int32), v[4].view(np.int32)
+    )
+
+
+@kernel
+def lumitexel_memory(lights: int, cameras: int, width: int) -> Lumitexel:
+    """Buffers for up to `width` columns of rows."""
+    size = lights * cameras
+    channels = np.zeros((9, size), np.float32)
     return Lumitexel(
-        np.empty(most * 3, np.float32),
+        np.empty(size * 3, np.float32),
         np.empty((lights, 3)),
         np.empty((cameras, 3)),
         np.empty(lights),
@@ -88,38 +137,80 @@ def lumitexel_memory(lights: int, cameras: int, width: int) -> Any:
         np.empty(lights),
         np.empty(cameras),
         np.zeros((lights, cameras), np.bool_),
-        np.empty((most, 2), np.int32),
+        np.zeros((lights, cameras), np.bool_),
+        np.empty((size, 2), np.int32),
         row_memory(cameras),
-        np.zeros((most, width), np.float32),
+        np.zeros((size, width), np.float32),
         channels[:3],
         channels[3:6],
         channels[6:],
-        np.zeros((2, most), np.float32),
+        np.zeros((2, size), np.float32),
+        np.ones(size, np.float32),
+        np.empty(size, np.float32),
     )
 
 
 @fast_kernel
-def sample_status(values: Any) -> int:
+def inverse_roots(n: int, root: RootMemory) -> None:
+    """Write s^(-1/3) to `root.inverse` for n positive numbers s in `root.square`.
+
+    A start from a third of the exponent bits, then two iterations of third order:
+    accurate to rounding, and unlike `pow` it runs in vector registers.
+    """
+    for i in range(n):
+        root.inverse_bits[i] = np.int32(MAGIC - np.float32(root.square_bits[i]) * THIRD)
+    for i in range(n):
+        x = root.inverse[i]
+        for _ in range(2):
+            d = ONE - root.square[i] * x * x * x
+            x += x * d * (THIRD + d * TWO_NINTHS)
+        root.inverse[i] = x
+
+
+@fast_kernel
+def to_roots(y: Vector32, floor: np.float32, root: RootMemory) -> None:
+    """Write s = y^2 + floor^2 and q = s^(-1/3); y q is the value of y in cube-root space."""
+    for i in range(y.shape[0]):
+        root.square[i] = y[i] * y[i] + floor * floor
+    inverse_roots(y.shape[0], root)
+
+
+@fast_kernel
+def slopes(y: Vector32, floor: np.float32, root: RootMemory, out: Vector32) -> None:
+    """Write the squared slope of the cube root at y: the weight of a squared difference
+    at y in cube-root space.
+    """
+    to_roots(y, floor, root)
+    for i in range(y.shape[0]):
+        square = root.inverse[i] * root.inverse[i]
+        slope = (y[i] * y[i] * THIRD + floor * floor) * square * square
+        out[i] = slope * slope
+
+
+@fast_kernel
+def sample_status(values: Vector32) -> int:
     """Status of the samples of a surfel: UNSEEN, NOT_FINITE, or FITTED if there are
     finite samples.
     """
-    known = np.int32(0)
+    finite = np.int32(0)
     infinite = np.int32(0)
     for i in range(values.shape[0]):
-        known += np.int32(abs(values[i]) < np.inf)
+        finite += np.int32(abs(values[i]) < np.inf)
         infinite += np.int32(abs(values[i]) == np.inf)
-    return NOT_FINITE if infinite > 0 else FITTED if known > 0 else UNSEEN
+    return NOT_FINITE if infinite > 0 else FITTED if finite > 0 else UNSEEN
 
 
 @kernel
-def write_directions(position: Any, light: Any, camera: Any, b: Any) -> None:
+def write_directions(
+    position: Vector, light: Matrix, camera: Matrix, b: Lumitexel
+) -> None:
     """Write the directions from a surfel to every light and camera."""
     _towards(light, position, b.to_light)
     _towards(camera, position, b.to_camera)
 
 
 @kernel
-def _towards(target: Any, p: Any, out: Any) -> None:
+def _towards(target: Matrix, p: Vector, out: Matrix) -> None:
     for i in range(target.shape[0]):
         x = target[i, 0] - p[0]
         y = target[i, 1] - p[1]
@@ -129,7 +220,7 @@ def _towards(target: Any, p: Any, out: Any) -> None:
 
 
 @kernel
-def write_cosines(n: Any, eta: float, min_cosine: float, b: Any) -> None:
+def write_cosines(n: Vector, eta: float, min_cosine: float, b: Lumitexel) -> None:
     """Write cosines and transmission factors for all directions; 0 below the limit."""
     _transmission(n, b.to_light, eta, min_cosine, b.lit, b.enters)
     _transmission(n, b.to_camera, eta, min_cosine, b.seen, b.leaves)
@@ -139,7 +230,12 @@ def write_cosines(n: Any, eta: float, min_cosine: float, b: Any) -> None:
 
 @kernel
 def _transmission(
-    n: Any, towards: Any, eta: float, min_cosine: float, cosine: Any, passed: Any
+    n: Vector,
+    towards: Matrix,
+    eta: float,
+    min_cosine: float,
+    cosine: Vector,
+    passed: Vector,
 ) -> None:
     for i in range(towards.shape[0]):
         c = n[0] * towards[i, 0] + n[1] * towards[i, 1] + n[2] * towards[i, 2]
@@ -149,7 +245,7 @@ def _transmission(
 
 
 @kernel
-def choose(b: Any) -> int:
+def choose(b: Lumitexel) -> int:
     """Mark the samples that are finite in all channels and not grazing; returns their number."""
     cameras = b.seen.shape[0]
     count = 0
@@ -159,30 +255,66 @@ def choose(b: Any) -> int:
             at = 3 * (i * cameras + o)
             # abs of inf and NaN is not below inf; a sum of three half floats is finite
             # if all three are
-            known = abs(b.values[at] + b.values[at + 1] + b.values[at + 2]) < np.inf
-            b.usable[i, o] = known & above & (b.seen[o] > 0.0)
+            finite = abs(b.values[at] + b.values[at + 1] + b.values[at + 2]) < np.inf
+            b.finite[i, o] = finite & above & (b.seen[o] > 0.0)
+            b.usable[i, o] = b.finite[i, o]
             count += int(b.usable[i, o])
     return count
 
 
 @kernel
-def write_rows(n: Any, table: Any, b: Any) -> int:
+def held_kinds(held: IntMatrix) -> BoolVector:
+    """(4,) which of the codes 0 to 3 occur in `held`."""
+    present = np.zeros(4, np.bool_)
+    for i in range(held.shape[0]):
+        for o in range(held.shape[1]):
+            present[held[i, o]] = True
+    return present
+
+
+@kernel
+def choose_kind(kind: int, held: IntMatrix, b: Lumitexel) -> None:
+    """Mark the samples of one code of `held` among those that `choose` marked."""
+    for i in range(held.shape[0]):
+        for o in range(held.shape[1]):
+            b.usable[i, o] = b.finite[i, o] and held[i, o] == kind
+
+
+@kernel
+def write_rows(n: Vector, table: Tensor32, b: Lumitexel) -> int:
     """Write the rows of the chosen samples for this normal, and the samples; returns
     their number.
     """
     count = form_rows(
-        table, n, b.to_light, b.to_camera, b.usable, b.row_memory, b.rows, b.index
+        table, n, b.to_light, b.to_camera, b.usable, b.row_memory, b.rows, b.pairs
     )
     cameras = b.seen.shape[0]
     for r in range(count):
-        at = 3 * (b.index[r, 0] * cameras + b.index[r, 1])
+        at = 3 * (b.pairs[r, 0] * cameras + b.pairs[r, 1])
         for c in range(3):
-            b.given[c, r] = b.values[at + c]
+            b.sample[c, r] = b.values[at + c]
     return int(count)
 
 
 @kernel
-def write_noise(surfel: int, count: int, noise: Any, b: Any) -> bool:
+def write_samples(b: Lumitexel) -> int:
+    """Write the chosen samples without rows, for models that need none; returns their
+    number.
+    """
+    cameras = b.seen.shape[0]
+    count = 0
+    for i in range(b.lit.shape[0]):
+        for o in range(cameras):
+            if b.usable[i, o]:
+                b.pairs[count, 0], b.pairs[count, 1] = i, o
+                for c in range(3):
+                    b.sample[c, count] = b.values[3 * (i * cameras + o) + c]
+                count += 1
+    return count
+
+
+@kernel
+def write_noise(surfel: int, count: int, noise: Noise, b: Lumitexel) -> bool:
     """Write the variance of one channel of the chosen samples, linear in reflectance;
     returns whether it is known.
 
@@ -195,10 +327,10 @@ def write_noise(surfel: int, count: int, noise: Any, b: Any) -> bool:
         return bool(noise.shot > 0.0)
     last = noise.limit.shape[1] - 1
     for r in range(count):
-        i = b.index[r, 0]
-        o = b.index[r, 1]
+        i = b.pairs[r, 0]
+        o = b.pairs[r, 1]
         scale = noise.per_radiance[surfel, i]
-        brightest = max(b.given[0, r], b.given[1, r], b.given[2, r])
+        brightest = max(b.sample[0, r], b.sample[1, r], b.sample[2, r])
         e = 0
         while e < last and brightest > noise.limit[o, e] * scale:
             e += 1
@@ -209,20 +341,23 @@ def write_noise(surfel: int, count: int, noise: Any, b: Any) -> bool:
 
 
 @kernel
-def split_diffuse(d: Any, count: int, b: Any) -> None:
+def split_diffuse(d: Vector, count: int, b: Lumitexel) -> None:
     """Write the diffuse part of the samples for R_d (3,), and the remainder."""
     for r in range(count):
-        b.scattered[2, r] = b.enters[b.index[r, 0]] * b.leaves[b.index[r, 1]]
+        b.scattered[2, r] = b.enters[b.pairs[r, 0]] * b.leaves[b.pairs[r, 1]]
     for c in range(3):
         reflectance = np.float32(d[c])
         for r in range(count):
             b.scattered[c, r] = b.scattered[2, r] * reflectance
-            b.target[c, r] = b.given[c, r] - b.scattered[c, r]
+            b.target[c, r] = b.sample[c, r] - b.scattered[c, r]
 
 
 @kernel
-def prepare(position: Any, n: Any, d: Any, block: Any, options: Any, b: Any) -> int:
+def prepare(surfel: int, block: Block, options: Options, b: Lumitexel) -> int:
     """Return the status of a surfel before its fit, and write its chosen samples to `b`."""
+    position = block.position[surfel]
+    n = block.normal[surfel]
+    unpack(block.sample[surfel], b.values)
     status = sample_status(b.values)
     if status != FITTED:
         return status
@@ -232,24 +367,28 @@ def prepare(position: Any, n: Any, d: Any, block: Any, options: Any, b: Any) -> 
     write_cosines(n, options.eta, MIN_COSINE_SURFACE, b)
     if not np.isfinite(n).all():
         return FEW  # no normal: it needs light that is not grazing
-    if not np.isfinite(d).all():
+    if not np.isfinite(block.diffuse[surfel]).all():
         return NO_DIFFUSE
     choose(b)
     return FITTED
 
 
 @kernel
-def clamped(d: Any) -> bool:
+def fitted_status(converged: bool, d: Vector) -> int:
+    """Status of a fitted surfel with R_d (3,)."""
+    if not converged:
+        return NOT_CONVERGED
     low = min(d[0], d[1], d[2])
     high = max(d[0], d[1], d[2])
-    return bool(low <= np.float32(SMALLEST_R_D) or high >= np.float32(LARGEST_R_D))
+    clamped = low <= np.float32(SMALLEST_R_D) or high >= np.float32(LARGEST_R_D)
+    return CLAMPED if clamped else FITTED
 
 
 @kernel
 def weigh(
-    surfel: int, count: int, noise: Any, options: Any, b: Any, weight: Any
+    surfel: int, count: int, noise: Noise, options: Options, b: Lumitexel
 ) -> None:
-    """Weights of the rows: 1 where the error of the model dominates, less where the
+    """Weights of the samples: 1 where the error of the model dominates, less where the
     noise of the sensor does.
 
     The noise is that of the diffuse part, as weights by the noisy samples would favour
@@ -257,18 +396,19 @@ def weigh(
     """
     if options.mode == PAPER or not write_noise(surfel, count, noise, b):
         for r in range(count):
-            weight[r] = 1.0
+            b.weight[r] = 1.0
         return
     mean = 0.0
-    least = options.floor * options.floor
+    floor_square = options.floor * options.floor
     for r in range(count):
         mean += (b.scattered[0, r] + b.scattered[1, r] + b.scattered[2, r]) / (
             3.0 * count
         )
     mean = max(mean, options.floor)
-    own = MODEL_ERROR * mean
+    model_error = MODEL_ERROR * mean
     if options.mode == PERCEPTUAL:
-        own = MODEL_ERROR / 3.0 * mean * (mean * mean + least) ** (-1.0 / 3.0)
+        cubed = (mean * mean + floor_square) ** (-1.0 / 3.0)
+        model_error = MODEL_ERROR / 3.0 * mean * cubed
     for r in range(count):
         level = max(
             (b.scattered[0, r] + b.scattered[1, r] + b.scattered[2, r]) / 3.0, 0.0
@@ -276,83 +416,177 @@ def weigh(
         # of the mean of three channels
         variance = (b.noise[0, r] + b.noise[1, r] * level) / 3.0
         if options.mode == PERCEPTUAL:
-            slope = (level * level / 3.0 + least) * (level * level + least) ** (
-                -4.0 / 3.0
-            )
+            slope = (level * level / 3.0 + floor_square) * (
+                level * level + floor_square
+            ) ** (-4.0 / 3.0)
             variance *= slope * slope
-        weight[r] = 1.0 / (1.0 + variance / (own * own))
+        b.weight[r] = 1.0 / (1.0 + variance / (model_error * model_error))
 
 
 @fast_kernel
 def _root_residuals(
-    count: int, begin: int, floor: Any, y: Any, b: Any, work: Any
+    count: int, floor: np.float32, b: Lumitexel, root: RootMemory
 ) -> float:
-    """Write residuals in cube-root space, averaged over channels, to `work.trial`;
+    """Write residuals in cube-root space, averaged over channels, to `root.trial`;
     returns the mean sample.
     """
-    third = np.float32(1.0 / 3.0)
     mean = np.float32(0)
     for r in range(count):
-        work.total[r] = (
-            b.given[0, begin + r] + b.given[1, begin + r] + b.given[2, begin + r]
-        ) * third
-        body = (
-            b.scattered[0, begin + r]
-            + b.scattered[1, begin + r]
-            + b.scattered[2, begin + r]
-        )
-        work.mixed[r] = body * third + y[begin + r]
-        mean += work.total[r]
-    square = work.square[:count]
-    inverse = work.inverse[:count]
-    to_roots(
-        work.total[:count], floor, square, inverse, work.square_bits, work.inverse_bits
-    )
+        root.total[r] = (b.sample[0, r] + b.sample[1, r] + b.sample[2, r]) * THIRD
+        body = b.scattered[0, r] + b.scattered[1, r] + b.scattered[2, r]
+        root.mixed[r] = body * THIRD + b.surface[r]
+        mean += root.total[r]
+    to_roots(root.total[:count], floor, root)
     for r in range(count):
-        work.trial[r] = work.total[r] * inverse[r]
-    to_roots(
-        work.mixed[:count], floor, square, inverse, work.square_bits, work.inverse_bits
-    )
+        root.trial[r] = root.total[r] * root.inverse[r]
+    to_roots(root.mixed[:count], floor, root)
     for r in range(count):
-        work.trial[r] -= work.mixed[r] * inverse[r]
+        root.trial[r] -= root.mixed[r] * root.inverse[r]
     return np.float64(mean) / max(count, 1)
 
 
 @kernel
-def outliers(count: int, options: Any, y: Any, b: Any, work: Any, counts: Any) -> float:
-    """Fraction of outlying samples, NaN for too few samples; adds to the histograms
-    (lights, cameras, bins).
+def outliers(
+    count: int, options: Options, b: Lumitexel, root: RootMemory, counts: IntCube
+) -> float:
+    """Fraction of samples that the surface in `b.surface` does not explain, NaN for too
+    few samples; adds to the histograms (lights, cameras, bins).
     """
-    mean = _root_residuals(count, 0, np.float32(options.floor), y, b, work)
+    mean = _root_residuals(count, np.float32(options.floor), b, root)
     steep = 0
     last = counts.shape[2] - 1
     for r in range(count):
         above = (
-            b.lit[b.index[r, 0]] >= MIN_COSINE_OUTLIER
-            and b.seen[b.index[r, 1]] >= MIN_COSINE_OUTLIER
+            b.lit[b.pairs[r, 0]] >= MIN_COSINE_OUTLIER
+            and b.seen[b.pairs[r, 1]] >= MIN_COSINE_OUTLIER
         )
-        work.square[r] = abs(work.trial[r]) if above else np.float32(np.inf)
+        root.square[r] = abs(root.trial[r]) if above else np.float32(np.inf)
         steep += 1 if above else 0
-    if steep < options.least:
+    if steep < options.min_samples:
         return math.nan
     level = max(mean, options.floor)
     finest = (
         MIN_ROOT_SCALE * level / np.cbrt(level * level + options.floor * options.floor)
     )
-    scale = max(1.4826 * median_of(work.square, work.square_bits, count, steep), finest)
+    scale = max(1.4826 * median_of(root.square, root.square_bits, count, steep), finest)
     beyond = 0
     per_scale = BINS_PER_SCALE / scale
     for r in range(count):
-        if work.square[r] < np.inf:
-            place = min(int(work.square[r] * per_scale), last)
-            counts[b.index[r, 0], b.index[r, 1], place] += 1
+        if root.square[r] < np.inf:
+            place = min(int(root.square[r] * per_scale), last)
+            counts[b.pairs[r, 0], b.pairs[r, 1], place] += 1
             beyond += place == last
     return beyond / steep
 
 
+@fast_kernel
+def _squares(
+    predicted: Vector32, measured: Vector32, q: Vector32, roots: Vector32
+) -> tuple[float, float, float, float]:
+    """Sums of squared differences and of squared values, linear and in cube-root space.
+
+    In cube-root space the prediction is `predicted` q and the measured value is `roots`.
+    """
+    wrong = 0.0
+    total = 0.0
+    wrong_root = 0.0
+    total_root = 0.0
+    for i in range(measured.shape[0]):
+        d = predicted[i] - measured[i]
+        e = predicted[i] * q[i] - roots[i]
+        wrong += d * d
+        total += measured[i] * measured[i]
+        wrong_root += e * e
+        total_root += roots[i] * roots[i]
+    return wrong, total, wrong_root, total_root
+
+
 @kernel
-def mark(held: Any, kind: Integer, finite: Any, b: Any) -> None:
-    """Choose the finite samples of one kind."""
-    for i in range(held.shape[0]):
-        for o in range(held.shape[1]):
-            b.usable[i, o] = finite[i, o] and held[i, o] == kind
+def relative_errors(
+    predicted: Matrix32, measured: Matrix32, floor: float, root: RootMemory
+) -> tuple[float, float]:
+    """RMS error over RMS of `measured`, both (channels, n), linear and in cube-root
+    space; NaN if `measured` is zero.
+    """
+    n = measured.shape[1]
+    single_floor = np.float32(floor)
+    q = root.inverse[:n]
+    roots = root.mixed[:n]
+    sums = np.zeros(4)
+    for c in range(measured.shape[0]):
+        to_roots(measured[c], single_floor, root)
+        for i in range(n):
+            roots[i] = measured[c, i] * q[i]
+        to_roots(predicted[c], single_floor, root)
+        part = _squares(predicted[c], measured[c], q, roots)
+        for k in range(4):
+            sums[k] += part[k]
+    if sums[1] > 0.0:
+        return math.sqrt(sums[0] / sums[1]), math.sqrt(sums[2] / sums[3])
+    return math.nan, math.nan
+
+
+@kernel
+def add_surface(count: int, b: Lumitexel, root: RootMemory) -> tuple[float, float]:
+    """Add the surface in `b.surface` to the diffuse part of the samples; returns the
+    relative errors of this prediction, linear and in cube-root space.
+    """
+    for c in range(3):
+        for r in range(count):
+            b.scattered[c, r] += b.surface[r]
+    return relative_errors(b.scattered[:, :count], b.sample[:, :count], NO_FLOOR, root)
+
+
+@kernel
+def relative_drift(d: Vector, error: Vector, drift: Vector) -> None:
+    """Write the fraction (3,) of the diffuse part by which R_d (3,) may be wrong in all
+    channels.
+
+    Colour differences do not affect the sum over channels: the common error is at most
+    the smallest one.
+    """
+    shared = min(error[0], error[1], error[2])
+    for c in range(3):
+        drift[c] = shared / max(d[c], SMALLEST_R_D)
+
+
+@kernel
+def turned_normals(n: Vector, turn: float, out: Matrix) -> None:
+    """Write the normals (4, 3) that represent an error `turn` [rad] about either axis.
+
+    These are the points of the Gauss-Hermite rule with three points per axis, which is
+    correct to second order: a lobe that is sampled at its peak loses weight for a
+    rotation in any direction. Each of them has the weight 1/6.
+    """
+    small = 0
+    for k in range(3):
+        small = k if abs(n[k]) < abs(n[small]) else small
+    away = np.zeros(3)
+    away[small] = 1.0
+    axes = np.empty((2, 3))
+    _across(n, away, axes[0])
+    _across(n, axes[0], axes[1])
+    for q in range(4):
+        angle = SQRT_3 * turn * (1.0 if q % 2 == 0 else -1.0)
+        for k in range(3):
+            out[q, k] = math.cos(angle) * n[k] + math.sin(angle) * axes[q // 2, k]
+
+
+@kernel
+def _across(a: Vector, b: Vector, out: Vector) -> None:
+    """Unit vector perpendicular to two others; loops, since each array operation takes
+    seconds to compile.
+    """
+    for k in range(3):
+        out[k] = a[(k + 1) % 3] * b[(k + 2) % 3] - a[(k + 2) % 3] * b[(k + 1) % 3]
+    size = math.sqrt(out[0] * out[0] + out[1] * out[1] + out[2] * out[2])
+    for k in range(3):
+        out[k] /= size
+
+
+@kernel
+def add_scatter(moved: Vector, x: Vector, covariance: Matrix) -> None:
+    """Add the effect of one of the `turned_normals` on the parameters."""
+    for j in range(x.shape[0]):
+        for k in range(x.shape[0]):
+            covariance[j, k] += (moved[j] - x[j]) * (moved[k] - x[k]) / 6.0

@@ -3,12 +3,29 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numba as nb
 import numpy as np
 
 from skindb.jit import LANES, blend, fast_kernel, inline_fast_kernel, kernel
+from skindb.types import (
+    BoolCube,
+    BoolMatrix,
+    Cube,
+    IntMatrix32,
+    IntVector,
+    IntVector32,
+    Matrix,
+    Matrix32,
+    Real,
+    Tensor32,
+    Vector,
+    Vector32,
+)
+
+Triple = tuple[float, float, float]
+SingleTriple = tuple[np.float32, np.float32, np.float32]
 
 # arctan(t) = t sum c_k t^2k on [0, 1], minimax fit with error 5.3e-11; unlike atan2 it
 # runs in vector registers
@@ -63,7 +80,7 @@ def _arctangent(y: float, x: float) -> float:
 
 
 @inline_fast_kernel
-def _angles(n: Any, wi: Any, wo: Any) -> tuple[float, float, float]:
+def _angles(n: Triple, wi: Triple, wo: Triple) -> Triple:
     """theta_h, theta_d, phi_d of unit 3-tuples; sines from cross products are accurate
     for narrow lobes.
     """
@@ -97,7 +114,9 @@ def _angles(n: Any, wi: Any, wo: Any) -> tuple[float, float, float]:
 
 
 @fast_kernel
-def _coordinates(n: Any, wi: Any, wo: Any, count: int, shape: Any, out: Any) -> None:
+def _coordinates(
+    n: Triple, wi: Triple, wo: Matrix, count: int, shape: tuple[int, ...], out: Matrix
+) -> None:
     """Coordinates [cells] in a table of `shape`, out (3, count), of wi with the columns
     of wo (3, count).
     """
@@ -113,7 +132,7 @@ def _coordinates(n: Any, wi: Any, wo: Any, count: int, shape: Any, out: Any) -> 
 
 @inline_fast_kernel
 def _interpolate(
-    table: Any, x: float, y: float, z: float, factor: float, out: Any
+    table: Tensor32, x: float, y: float, z: float, factor: float, out: Vector32
 ) -> None:
     """out[:] = factor * trilinear table value at x, y, z in cells; NaN reads cell 0 and
     gives NaN.
@@ -149,7 +168,7 @@ def _interpolate(
 
 
 @inline_fast_kernel
-def _arctangent_single(y: Any, x: Any) -> Any:
+def _arctangent_single(y: Real, x: Real) -> Real:
     """atan2 for x, y >= 0 in single precision."""
     large = max(max(x, y), MIN_SQUARE)
     t = min(x, y) / large
@@ -161,7 +180,9 @@ def _arctangent_single(y: Any, x: Any) -> Any:
 
 
 @kernel
-def _face_cameras(n: Any, to_camera: Any, faces: Any, cameras: Any) -> int:
+def _face_cameras(
+    n: Vector, to_camera: Matrix, faces: Matrix32, cameras: IntVector32
+) -> int:
     """Write the input of `_cells`, faces (7, padded), and the indices of cameras above
     the horizon; returns the number.
 
@@ -188,8 +209,41 @@ def _face_cameras(n: Any, to_camera: Any, faces: Any, cameras: Any) -> int:
 
 
 @inline_fast_kernel
+def _cells_per_angle(table: Tensor32) -> SingleTriple:
+    """Number of cells per unit of sqrt(theta_h), theta_d and phi_d."""
+    nh, nd, n_phi, _ = table.shape
+    return (
+        np.float32(math.sqrt(2.0 / math.pi) * (nh - 1)),
+        np.float32(2.0 / math.pi * (nd - 1)),
+        np.float32(n_phi / math.pi),
+    )
+
+
+@inline_fast_kernel
+def _nodes(table: Tensor32) -> tuple[np.int32, np.int32, np.int32]:
+    nh, nd, n_phi, _ = table.shape
+    return np.int32(nh), np.int32(nd), np.int32(n_phi)
+
+
+@inline_fast_kernel
+def _cross(n: Vector, x: float, y: float, z: float) -> SingleTriple:
+    """N x (x, y, z)."""
+    return (
+        np.float32(n[1] * z - n[2] * y),
+        np.float32(n[2] * x - n[0] * z),
+        np.float32(n[0] * y - n[1] * x),
+    )
+
+
+@inline_fast_kernel
 def _cells(
-    wi: Any, across: Any, cosine: Any, faces: Any, count: int, size: Any, place: Any
+    wi: SingleTriple,
+    across: SingleTriple,
+    cosine: np.float32,
+    faces: Matrix32,
+    count: int,
+    size: SingleTriple,
+    place: Matrix32,
 ) -> None:
     """Coordinates in the table [cells], `place` (3, count), of one light with `count`
     cameras; `across` is n x wi.
@@ -229,7 +283,13 @@ def _cells(
 
 @inline_fast_kernel
 def _row(
-    flat: Any, shape: Any, place: Any, q: int, cosine: Any, rows: Any, row: int
+    flat: Matrix32,
+    shape: tuple[np.int32, np.int32, np.int32],
+    place: Matrix32,
+    q: int,
+    cosine: np.float32,
+    rows: Matrix32,
+    row: int,
 ) -> None:
     """One row: cosine times the trilinear sum of the eight corners of the cell around
     place[:, q].
@@ -291,15 +351,15 @@ class RowMemory(NamedTuple):
 
     # (7, cameras) direction X, Y, Z, normal x direction ACROSS_X, ACROSS_Y, ACROSS_Z,
     # and COSINE
-    faces: Any
-    place: Any  # (3, cameras) coordinates THETA_H, THETA_D, PHI_D in the table [cells]
-    above: Any  # (cameras,) indices of cameras above the horizon
+    faces: Matrix32
+    place: Matrix32  # (3, cameras) coordinates THETA_H, THETA_D, PHI_D in the table [cells]
+    above: IntVector32  # (cameras,) indices of cameras above the horizon
     # (cameras + 1,) indices into `above` of cameras with a usable sample of a light
-    chosen: Any
+    chosen: IntVector32
 
 
 @kernel
-def row_memory(cameras: int) -> Any:
+def row_memory(cameras: int) -> RowMemory:
     """Memory for up to `cameras` cameras."""
     padded = (cameras + LANES - 1) // LANES * LANES
     # one block, for which LLVM checks fewer addresses for aliasing
@@ -314,14 +374,14 @@ def row_memory(cameras: int) -> Any:
 
 @fast_kernel
 def form_rows(
-    table: Any,
-    n: Any,
-    to_light: Any,
-    to_camera: Any,
-    usable: Any,
-    memory: Any,
-    rows: Any,
-    index: Any,
+    table: Tensor32,
+    n: Vector,
+    to_light: Matrix,
+    to_camera: Matrix,
+    usable: BoolMatrix,
+    memory: RowMemory,
+    rows: Matrix32,
+    index: IntMatrix32,
 ) -> int:
     """Write the rows of one surfel, by light and then by camera; returns their number.
 
@@ -337,14 +397,9 @@ def form_rows(
     seen = _face_cameras(n, to_camera, faces, cameras)
     if seen == 0:
         return 0
-    nh, nd, n_phi, m = table.shape
-    size = (
-        np.float32(math.sqrt(2.0 / math.pi) * (nh - 1)),
-        np.float32(2.0 / math.pi * (nd - 1)),
-        np.float32(n_phi / math.pi),
-    )
-    shape = (np.int32(nh), np.int32(nd), np.int32(n_phi))
-    flat = table.reshape(-1, m)
+    size = _cells_per_angle(table)
+    shape = _nodes(table)
+    flat = table.reshape(-1, table.shape[3])
     padded = (seen + LANES - 1) // LANES * LANES
     count = 0
     for i in range(to_light.shape[0]):
@@ -355,17 +410,13 @@ def form_rows(
         if not (cosine > 0.0 and cosine < 2.0):  # also NaN and inf
             continue
         wi = (np.float32(x), np.float32(y), np.float32(z))
-        across = (
-            np.float32(n[1] * z - n[2] * y),
-            np.float32(n[2] * x - n[0] * z),
-            np.float32(n[0] * y - n[1] * x),
-        )
+        across = _cross(n, x, y, z)
         _cells(wi, across, np.float32(cosine), faces, padded, size, place)
-        found: Any = 0
+        used = np.int64(0)
         for q in range(seen):  # without branches, as usable samples are unpredictable
-            chosen[found] = q
-            found += np.int64(usable[i, cameras[q]])
-        for c in range(found):
+            chosen[used] = q
+            used += np.int64(usable[i, cameras[q]])
+        for c in range(used):
             q = chosen[c]
             index[count, 0], index[count, 1] = i, cameras[q]
             _row(flat, shape, place, q, np.float32(cosine), rows, count)
@@ -375,14 +426,14 @@ def form_rows(
 
 @fast_kernel
 def turn_rows(
-    table: Any,
-    n: Any,
-    to_light: Any,
-    to_camera: Any,
-    index: Any,
+    table: Tensor32,
+    n: Vector,
+    to_light: Matrix,
+    to_camera: Matrix,
+    index: IntMatrix32,
     count: int,
-    memory: Any,
-    rows: Any,
+    memory: RowMemory,
+    rows: Matrix32,
 ) -> None:
     """Rows of the samples `index` (count, 2) as from `form_rows`, with another normal.
 
@@ -390,14 +441,9 @@ def turn_rows(
     """
     faces = memory.faces
     place = memory.place
-    nh, nd, n_phi, m = table.shape
-    size = (
-        np.float32(math.sqrt(2.0 / math.pi) * (nh - 1)),
-        np.float32(2.0 / math.pi * (nd - 1)),
-        np.float32(n_phi / math.pi),
-    )
-    shape = (np.int32(nh), np.int32(nd), np.int32(n_phi))
-    flat = table.reshape(-1, m)
+    size = _cells_per_angle(table)
+    shape = _nodes(table)
+    flat = table.reshape(-1, table.shape[3])
     begin = 0
     while begin < count:
         i = index[begin, 0]
@@ -409,11 +455,7 @@ def turn_rows(
         z = to_light[i, 2]
         cosine = max(n[0] * x + n[1] * y + n[2] * z, 0.0)
         _face_samples(n, to_camera, index, begin, end, faces)
-        across = (
-            np.float32(n[1] * z - n[2] * y),
-            np.float32(n[2] * x - n[0] * z),
-            np.float32(n[0] * y - n[1] * x),
-        )
+        across = _cross(n, x, y, z)
         padded = (end - begin + LANES - 1) // LANES * LANES
         _cells(
             (np.float32(x), np.float32(y), np.float32(z)),
@@ -440,7 +482,12 @@ def turn_rows(
 
 @kernel
 def _face_samples(
-    n: Any, to_camera: Any, index: Any, begin: int, end: int, faces: Any
+    n: Vector,
+    to_camera: Matrix,
+    index: IntMatrix32,
+    begin: int,
+    end: int,
+    faces: Matrix32,
 ) -> None:
     """Write the input of `_cells` for the cameras of samples begin to end; the cosine
     is 0 below the horizon.
@@ -464,14 +511,14 @@ def _face_samples(
 
 @kernel
 def fill_rows(
-    table: Any,
-    normal: Any,
-    to_light: Any,
-    to_camera: Any,
-    usable: Any,
-    offsets: Any,
-    rows: Any,
-    index: Any,
+    table: Tensor32,
+    normal: Matrix,
+    to_light: Cube,
+    to_camera: Cube,
+    usable: BoolCube,
+    offsets: IntVector,
+    rows: Matrix32,
+    index: IntMatrix32,
 ) -> None:
     """Write the rows of every surfel, starting at its offset."""
     memory = row_memory(to_camera.shape[1])
@@ -492,7 +539,12 @@ def fill_rows(
 
 @fast_kernel
 def average_disc(
-    table: Any, wi: Any, wo: Any, points: Any, weights: Any, out: Any
+    table: Tensor32,
+    wi: Matrix,
+    wo: Matrix,
+    points: Matrix,
+    weights: Vector,
+    out: Matrix32,
 ) -> None:
     """Add to `out` (n, m) the weighted mean of the table over directions around wi."""
     count = points.shape[0]

@@ -7,7 +7,7 @@ Sums over samples run in single precision and in vector registers; systems of eq
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,18 +43,16 @@ from skindb.reflectance._lumitexel_kernels import (
     write_rows,
 )
 from skindb.reflectance._shade_kernels import transmittance
+from skindb.reflectance.model import Noise
 from skindb.types import (
     IntMatrix32,
     IntVector,
     Matrix,
     Matrix32,
+    Tensor32,
     Vector,
     Vector32,
 )
-
-if TYPE_CHECKING:
-    from skindb.reflectance.model import Noise
-    from skindb.reflectance.tables import Table
 
 # to light or camera; below it F_t and the footprint of a pixel change too fast
 MIN_COSINE_ALBEDO = 0.25
@@ -423,8 +421,8 @@ def _turn_effect(
     square = 0.0
     out[:] = 0.0
     for r in range(n):
-        i = b.index[r, 0]
-        o = b.index[r, 1]
+        i = b.pairs[r, 0]
+        o = b.pairs[r, 1]
         wi_wo = (
             b.to_light[i, 0] * b.to_camera[o, 0]
             + b.to_light[i, 1] * b.to_camera[o, 1]
@@ -506,15 +504,15 @@ def _separate_channels(
     by_camera = np.zeros((3, b.seen.shape[0]))
     for c in range(3):
         for r in range(count):
-            s.tint[r] = b.given[c, r] - s.mean[r]
+            s.tint[r] = b.sample[c, r] - s.mean[r]
         tint[c], spread = robust_slope(s.shape, s.tint, s.weight, s.residual, count)
         variance[c] = spread * spread
-        _add_by_device(b.index, s.weight, count, by_light[c], by_camera[c])
+        _add_by_device(b.pairs, s.weight, count, by_light[c], by_camera[c])
     common, spread = fit_shape(b.rows, count, b.noise, s)
     for c in range(3):
         estimate[c] = tint[c] + common
         variance[c] += spread * spread
-        _add_by_device(b.index, s.aim, count, by_light[c], by_camera[c])
+        _add_by_device(b.pairs, s.aim, count, by_light[c], by_camera[c])
         by_device = (
             _variance_of_sums(by_light[c])
             + _variance_of_sums(by_camera[c])
@@ -529,7 +527,7 @@ def separate(
     n: Vector,
     turn: Vector,
     eta: float,
-    table: Table,
+    table: Tensor32,
     noise: Noise,
     surfel: int,
     b: Lumitexel,
@@ -555,8 +553,8 @@ def separate(
     count = write_rows(n, table, b)
     write_noise(surfel, count, noise, b)
     for r in range(count):
-        s.shape[r] = b.enters[b.index[r, 0]] * b.leaves[b.index[r, 1]]
-        s.mean[r] = (b.given[0, r] + b.given[1, r] + b.given[2, r]) / np.float32(3)
+        s.shape[r] = b.enters[b.pairs[r, 0]] * b.leaves[b.pairs[r, 1]]
+        s.mean[r] = (b.sample[0, r] + b.sample[1, r] + b.sample[2, r]) / np.float32(3)
         b.rows[r, SHAPE] = s.shape[r]
     tint, variance, shared = _separate_channels(count, b, s, estimate)
     if turn[1] > 0.0:
@@ -579,7 +577,7 @@ def separate_block(
     camera: Matrix,
     normal: Matrix,
     turn: Matrix,
-    table: Table,
+    table: Tensor32,
     noise: Noise,
     eta: float,
     estimate: Matrix,

@@ -5,14 +5,15 @@ units and sources.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 from skindb.jit import fast_kernel, inline_fast_kernel
-from skindb.reflectance._row_kernels import _angles
+from skindb.reflectance._row_kernels import Triple, _angles
+from skindb.types import Cube, Matrix, Matrix32, Tensor32, Vector, Vector32
 
 
 @inline_fast_kernel
 def transmittance(cosine: float, eta: float) -> float:
+    """Fresnel transmittance F_t for light from outside, at the cosine to the normal."""
     g = math.sqrt(eta * eta - 1.0 + cosine * cosine)
     a = (g - cosine) / (g + cosine)
     b = (cosine * (g + cosine) - 1.0) / (cosine * (g - cosine) + 1.0)
@@ -20,7 +21,9 @@ def transmittance(cosine: float, eta: float) -> float:
 
 
 @inline_fast_kernel
-def _surface(table: Any, weight: Any, n: Any, wi: Any, wo: Any) -> float:
+def _surface(
+    table: Tensor32, weight: Vector32, n: Triple, wi: Triple, wo: Triple
+) -> float:
     """Sum over components of weight times the trilinear table value; n, wi, wo are unit
     3-tuples.
     """
@@ -55,19 +58,19 @@ def _surface(table: Any, weight: Any, n: Any, wi: Any, wo: Any) -> float:
 
 @fast_kernel
 def shade(
-    position: Any,
-    normal: Any,
-    view: Any,
-    diffuse: Any,
-    weight: Any,
-    table: Any,
-    lamp: Any,
-    lit: Any,
-    axis: Any,
+    position: Matrix,
+    normal: Matrix,
+    view: Matrix,
+    diffuse: Matrix32,
+    weight: Matrix32,
+    table: Tensor32,
+    lamp: Cube,
+    lit: Matrix32,
+    axis: Vector,
     falloff: float,
     eta: float,
     with_surface: bool,
-    out: Any,
+    out: Matrix32,
 ) -> None:
     """Fill `out` (n, 3) with the radiance per unit of the light's radiant intensity."""
     n, points = lit.shape

@@ -29,7 +29,7 @@ from skindb.reflectance.tables import (
     tabulate,
 )
 from skindb.schema import dataset
-from skindb.types import Array
+from skindb.types import Array, Float64
 
 Rule = tuple[int, int]  # rings and points per ring of a quadrature over a disc
 # away from the mirror direction and near it; see `convolve_disc`
@@ -169,7 +169,7 @@ def weighted_error(found: Array, exact: Array, wi: Array, wo: Array) -> Array:
 
 
 @cache
-def _disc_rule(rings: int, spokes: int) -> tuple[Array, Array]:
+def _disc_rule(rings: int, spokes: int) -> tuple[Float64, Float64]:
     """Quadrature points (q, 2) of the unit disc and weights (q,), Gauss in the squared
     radius, uniform in angle.
     """

@@ -27,11 +27,12 @@ from skindb.reflectance._ggx_kernels import (
     STRENGTH,
 )
 from skindb.reflectance.basis import fitted_surfels
-from skindb.reflectance.mixture import (
-    diffuse_points,
-    empty_errors,
+from skindb.reflectance.block import (
+    empty_fit,
+    empty_judgement,
     kernel_block,
     kernel_options,
+    shade_diffuse,
 )
 from skindb.reflectance.model import (
     Block,
@@ -153,17 +154,7 @@ class GGX:
 
     def fit(self, block: Block, comparison: Comparison) -> SurfaceFit:
         """Strength and roughness of n surfels."""
-        n = len(block.sample)
-        out = SurfaceFit(
-            parameters=np.full((n, 2), np.nan),
-            kkt=np.full(n, np.nan),
-            residual=np.full(n, np.nan),
-            residual_perceptual=np.full(n, np.nan),
-            condition=np.full(n, np.nan),
-            samples=np.zeros(n, np.int32),
-            iterations=np.zeros(n, np.int32),
-            status=np.zeros(n, np.uint8),
-        )
+        out = empty_fit(len(block.sample), 2)
         options = kernel_options(comparison, solve=True)
         _ggx_kernels.fit_ggx(kernel_block(block), float(self.index), options, out)
         return out
@@ -197,24 +188,12 @@ class GGX:
         """Strength and roughness of n surfels with their errors, held-out samples and
         outliers.
         """
-        n = len(block.sample)
-        x = np.full((n, 2), np.nan)
-        if parameters is not None:
-            x = np.array(parameters, np.float64, order="C")
-        residual = np.full((n, 2), np.nan)
-        errors = empty_errors(block, judgement, 2)
+        errors, out = empty_judgement(block, judgement, 2, parameters)
         options = kernel_options(comparison, solve=parameters is None)
-        block = kernel_block(block)
-        _ggx_kernels.judge_ggx(block, float(self.index), options, x, residual, errors)
-        return JudgedFit(
-            x,
-            residual[:, 0],
-            residual[:, 1],
-            errors.covariance,
-            errors.held_error,
-            errors.outlier,
-            errors.counts,
+        _ggx_kernels.judge_ggx(
+            kernel_block(block), float(self.index), options, errors, out
         )
+        return out
 
     def judged_columns(self, judged: JudgedFit) -> dict[str, Array]:
         """Strength, roughness and the reflectance along the normal with their errors; those
@@ -237,7 +216,7 @@ class GGX:
 
     def shade(self, points: Points, lamp: Lamp, *, eta: float) -> NDArray[np.float32]:
         """Radiance (n, 3) per radiant intensity [sr^-1 mm^-2], see `ReflectanceModel`."""
-        out = diffuse_points(points, lamp, eta=eta)
+        out = shade_diffuse(points, lamp, eta=eta)
         if points.parameters.shape[1] > 0:
             _ggx_kernels.shade_ggx(
                 np.ascontiguousarray(points.position, np.float64),

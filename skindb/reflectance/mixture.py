@@ -12,16 +12,16 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from skindb.jit import sample_bits
-from skindb.reflectance import _shade_kernels
-from skindb.reflectance._block_kernels import (
-    Errors,
-    Fitted,
-    fit_block,
-    judge_block,
-)
-from skindb.reflectance._lumitexel_kernels import BINS, Options
+from skindb.reflectance._block_kernels import Tables, fit_block, judge_block
 from skindb.reflectance.basis import reduce_basis
+from skindb.reflectance.block import (
+    NO_TABLE,
+    empty_fit,
+    empty_judgement,
+    kernel_block,
+    kernel_options,
+    shade_tables,
+)
 from skindb.reflectance.dictionary import Dictionary
 from skindb.reflectance.model import (
     Block,
@@ -42,10 +42,8 @@ from skindb.reflectance.tables import (
 )
 from skindb.schema import FitStatus, check
 from skindb.schema.notes import Omission
-from skindb.types import Array
+from skindb.types import Array, Float64
 
-# in the order of the codes in `_block_kernels`
-MODES = ("linear", "perceptual", "paper")
 FIT_VARIABLES = (  # in the order of `SurfaceFit`
     "dictionary_weight",
     "kkt_residual",
@@ -56,7 +54,6 @@ FIT_VARIABLES = (  # in the order of `SurfaceFit`
     "fit_iterations",
     "fit_status",
 )
-NO_TABLE = np.zeros((2, 2, 1, 0), np.float32)
 MAX_LOG_SCALE = np.log(1e9)  # tables within this factor of 1 are used without scaling
 
 
@@ -77,7 +74,7 @@ class Mixture:
     roots: bool = False  # whether the tables are cube roots
     # `table` over `scale`, padded to full vectors
     filled: Table = field(init=False, repr=False)
-    matrix: Array = field(init=False, repr=False)  # `lift` for the kernels
+    matrix: Float64 = field(init=False, repr=False)  # `lift` for the kernels
     # (m,) powers of two; 1 except for tables whose squares exceed single precision
     scale: Array = field(init=False, repr=False)
 
@@ -200,11 +197,12 @@ class Mixture:
         Samples below the noise floor are compared linearly; samples whose noise exceeds
         the error of models have less weight.
         """
-        out = self._empty(len(block.sample), parameters)
+        count = self.matrix.shape[1]
+        out = empty_fit(len(block.sample), count, self._scaled(parameters))
         options = kernel_options(comparison, solve=parameters is None)
-        fit_block(kernel_block(block), self.filled, self.matrix, options, out)
-        out.weight[...] /= self.scale
-        return SurfaceFit(*out)
+        fit_block(kernel_block(block), self._tables, options, out)
+        out.parameters[...] /= self.scale
+        return out
 
     def fit_columns(self, fit: SurfaceFit) -> dict[str, Array]:
         """Variables of a fit by the dictionary."""
@@ -229,22 +227,14 @@ class Mixture:
         """Weights of n surfels with their errors, held-out samples and outliers; not in
         mode "paper", and only for tables that are not reduced.
         """
-        out = self._empty(len(block.sample), parameters)
-        errors = empty_errors(block, judgement, self.matrix.shape[1])
+        count = self.matrix.shape[1]
+        errors, out = empty_judgement(block, judgement, count, self._scaled(parameters))
         options = kernel_options(comparison, solve=parameters is None)
-        judge_block(kernel_block(block), self.filled, self.matrix, options, out, errors)
-        out.weight[...] /= self.scale
+        judge_block(kernel_block(block), self._tables, options, errors, out)
+        out.parameters[...] /= self.scale
         if judgement.diffuse_error is not None:
-            errors.covariance[...] /= np.multiply.outer(self.scale, self.scale)
-        return JudgedFit(
-            out.weight,
-            out.residual,
-            out.residual_perceptual,
-            errors.covariance,
-            errors.held_error,
-            errors.outlier,
-            errors.counts,
-        )
+            out.covariance[...] /= np.multiply.outer(self.scale, self.scale)
+        return out
 
     def judged_columns(self, judged: JudgedFit) -> dict[str, Array]:
         """Weights, their standard errors, and the reflectance along the normal with its
@@ -274,7 +264,8 @@ class Mixture:
         (Weyrich et al. 2005).
         """
         with_surface = points.parameters.shape[1] > 0
-        return _shade(points, self.table if with_surface else NO_TABLE, lamp, eta)
+        table = self.table if with_surface else NO_TABLE
+        return shade_tables(points, table, lamp, eta=eta)
 
     def normal_reflectance(self, parameters: Array) -> Array:
         """Fraction (n,) of light along the normal that mixtures (n, m) reflect."""
@@ -304,92 +295,13 @@ class Mixture:
         """Sampler of directions by the half vectors of the tables."""
         return LobeSampler.of_tables(self.table)
 
-    def _empty(self, n: int, parameters: Array | None) -> Fitted:
-        """Results before a fit, or with given weights."""
-        if parameters is None:
-            weight = np.full((n, self.matrix.shape[1]), np.nan)
-        else:
-            weight = np.ascontiguousarray(parameters * self.scale, np.float64)
-        return Fitted(
-            weight,
-            kkt=np.full(n, np.nan),
-            residual=np.full(n, np.nan),
-            residual_perceptual=np.full(n, np.nan),
-            condition=np.full(n, np.nan),
-            samples=np.zeros(n, np.int32),
-            iterations=np.zeros(n, np.int32),
-            status=np.zeros(n, np.uint8),
-        )
+    @property
+    def _tables(self) -> Tables:
+        return Tables(self.filled, self.matrix)
 
-
-def diffuse_points(points: Points, lamp: Lamp, *, eta: float) -> NDArray[np.float32]:
-    """Radiance (n, 3) of the diffuse term alone, see `ReflectanceModel.shade`."""
-    none = np.zeros((len(points.position), 0))
-    return _shade(points._replace(parameters=none), NO_TABLE, lamp, eta)
-
-
-def _shade(points: Points, table: Table, lamp: Lamp, eta: float) -> NDArray[np.float32]:
-    out = np.empty((len(points.position), 3), np.float32)
-    _shade_kernels.shade(
-        np.ascontiguousarray(points.position, np.float64),
-        np.ascontiguousarray(points.normal, np.float64),
-        np.ascontiguousarray(points.view, np.float64),
-        np.ascontiguousarray(points.diffuse, np.float32),
-        np.ascontiguousarray(points.parameters, np.float32),
-        np.ascontiguousarray(table, np.float32),
-        np.ascontiguousarray(lamp.place, np.float64),
-        np.ascontiguousarray(lamp.lit, np.float32),
-        np.ascontiguousarray(lamp.axis, np.float64),
-        float(lamp.falloff),
-        float(eta),
-        points.parameters.shape[1] > 0,
-        out,
-    )
-    return out
-
-
-def empty_errors(block: Block, judgement: Judgement, parameters: int) -> Errors:
-    """Inputs of a judgement for the kernels, and space for its results."""
-    n, lights, cameras = block.sample.shape[:3]
-    diffuse_error = np.zeros((n, 3))
-    if judgement.diffuse_error is not None:
-        diffuse_error = np.nan_to_num(judgement.diffuse_error.astype(np.float64))
-    turn = np.zeros(n)
-    if judgement.normal_error is not None:  # the RMS angle is that of two axes
-        angle = np.nan_to_num(np.float64(judgement.normal_error))
-        turn = np.radians(angle / np.sqrt(2))
-    size = 0 if judgement.diffuse_error is None else parameters
-    bins = BINS if judgement.outliers else 0
-    held = judgement.held
-    return Errors(
-        diffuse_error=diffuse_error,
-        turn=turn,
-        covariance=np.full((n, size, size), np.nan),
-        held=np.zeros((lights, cameras), np.int64) if held is None else held,
-        held_error=np.full((n, 2, 2), np.nan),
-        outlier=np.full(n, np.nan),
-        counts=np.zeros((lights, cameras, bins), np.int64),
-    )
-
-
-def kernel_options(comparison: Comparison, *, solve: bool) -> Options:
-    """A comparison for the kernels; without `solve` given parameters are only evaluated."""
-    return Options(
-        float(comparison.eta),
-        MODES.index(comparison.mode),
-        float(comparison.noise_floor),
-        max(comparison.min_samples, 1),
-        solve,
-    )
-
-
-def kernel_block(block: Block) -> Block:
-    """The block in the types for which the kernels are compiled."""
-    doubles: dict[str, Any] = {
-        name: np.ascontiguousarray(getattr(block, name), np.float64)
-        for name in ("position", "light", "camera", "normal", "diffuse")
-    }
-    return block._replace(sample=sample_bits(block.sample), **doubles)
+    def _scaled(self, parameters: Array | None) -> Array | None:
+        """Weights of the scaled tables."""
+        return None if parameters is None else parameters * self.scale
 
 
 def _read_only(array: NDArray[Any]) -> NDArray[Any]:

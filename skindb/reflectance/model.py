@@ -22,12 +22,12 @@ class Noise(NamedTuple):
     is then floor^2 + shot sample, or unknown if shot is 0.
     """
 
-    per_radiance: Any  # (n, lights) reflectance of radiance 1
-    pixels: Any  # (n, cameras) effective number of pixels
+    per_radiance: NDArray[np.float32]  # (n, lights) reflectance of radiance 1
+    pixels: NDArray[np.float32]  # (n, cameras) effective number of pixels
     # (cameras, exposures) radiance up to which an exposure is usable, from the longest
-    limit: Any
-    read: Any  # (cameras, exposures) variance of radiance 0
-    slope: Any  # (cameras, exposures) variance over radiance
+    limit: NDArray[np.float32]
+    read: NDArray[np.float32]  # (cameras, exposures) variance of radiance 0
+    slope: NDArray[np.float32]  # (cameras, exposures) variance over radiance
     floor: float  # sr^-1
     shot: float  # sr^-1
 
@@ -41,12 +41,12 @@ def typical_noise(floor: float = 0.0, shot: float = 0.0) -> Noise:
 class Block(NamedTuple):
     """Samples of n surfels, with all that a fit of their surface needs."""
 
-    sample: Any  # (n, lights, cameras, 3) sr^-1
-    position: Any  # (n, 3) mm
-    light: Any  # (lights, 3) mm
-    camera: Any  # (cameras, 3) mm
-    normal: Any  # (n, 3) unit shading normals
-    diffuse: Any  # (n, 3) R_d
+    sample: NDArray[Any]  # (n, lights, cameras, 3) sr^-1; half floats, or their bits
+    position: NDArray[Any]  # (n, 3) mm
+    light: NDArray[Any]  # (lights, 3) mm
+    camera: NDArray[Any]  # (cameras, 3) mm
+    normal: NDArray[Any]  # (n, 3) unit shading normals
+    diffuse: NDArray[Any]  # (n, 3) R_d
     noise: Noise = typical_noise()
 
 

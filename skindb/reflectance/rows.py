@@ -6,14 +6,16 @@ Fits of captures do both in one kernel, see `skindb.reflectance.mixture`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from skindb.reflectance import _mixture_kernels, _row_kernels
+from skindb.reflectance.block import empty_fit
+from skindb.reflectance.model import SurfaceFit
 from skindb.reflectance.tables import Table, TableGrid, pad_to_lanes
+from skindb.schema import FitStatus
 from skindb.types import Array
 
 Mode = Literal["linear", "perceptual"]
@@ -72,20 +74,6 @@ def _above_horizon(normal: Array, away: Array) -> NDArray[np.bool_]:
     return np.asarray(np.isfinite(cosine) & (cosine > 0))
 
 
-@dataclass(frozen=True)
-class ReflectanceFit:
-    """Weights and certificates of n surfels; NaN for surfels that were not fitted, see `status`."""
-
-    weight: Array  # (n, m)
-    # (n,) relative KKT residual: dual feasibility and complementarity over max |M' R|
-    kkt: Array
-    iterations: NDArray[np.int32]  # (n,)
-    residual: Array  # (n,) |M x - R| / |R|
-    residual_perceptual: Array  # (n,) the same in cube-root space
-    # (n,) 0 fitted, 2 too few samples, 5 not converged, 6 not finite
-    status: NDArray[np.uint8]
-
-
 def fit_reflectance(
     rows: NDArray[np.float32],
     offsets: NDArray[np.int64],
@@ -97,7 +85,7 @@ def fit_reflectance(
     noise_floor: float,
     min_samples: int = 10,
     tolerance: float = 1e-10,
-) -> ReflectanceFit:
+) -> SurfaceFit:
     """Fit weights x >= 0 of every surfel to all channels at once.
 
     Parameters
@@ -130,30 +118,26 @@ def fit_reflectance(
         raise ValueError(f"mode must be 'linear' or 'perceptual', not {mode!r}")
     if not noise_floor > 0:
         raise ValueError(f"noise_floor must be positive, not {noise_floor}")
-    n = len(offsets) - 1
-    m = lift.shape[1]
-    x = np.zeros((n, m))
-    iterations = np.zeros(n, np.int32)
-    status = np.zeros(n, np.uint8)
-    kkt, residual, residual_root = (np.full(n, np.nan) for _ in range(3))
-    _mixture_kernels.fit_many(
+    out = empty_fit(len(offsets) - 1, lift.shape[1])
+    out.parameters[...] = 0.0
+    weights = np.ones(len(rows)) if weight is None else weight
+    samples = _mixture_kernels.Samples(
         np.ascontiguousarray(rows),
         np.asarray(offsets, np.int64),
         np.ascontiguousarray(target, np.float64),
-        np.ones(len(rows))
-        if weight is None
-        else np.ascontiguousarray(weight, np.float64),
+        np.ascontiguousarray(weights, np.float64),
+    )
+    _mixture_kernels.fit_many(
+        samples,
         np.ascontiguousarray(lift, np.float64),
         mode == "perceptual",
         float(noise_floor),
         tolerance,
         max(min_samples, 1),
-        x,
-        kkt,
-        iterations,
-        residual,
-        residual_root,
-        status,
+        out,
     )
-    x[(status == 2) | (status == 6)] = np.nan
-    return ReflectanceFit(x, kkt, iterations, residual, residual_root, status)
+    unfitted = (out.status == FitStatus.TOO_FEW_SAMPLES) | (
+        out.status == FitStatus.NOT_FINITE
+    )
+    out.parameters[unfitted] = np.nan
+    return out

@@ -13,7 +13,7 @@ from skindb.reflectance._lumitexel_kernels import (
     lumitexel_memory,
     weigh,
 )
-from skindb.reflectance.mixture import MODES
+from skindb.reflectance.block import MODES
 from skindb.reflectance.model import typical_noise
 
 
@@ -77,9 +77,9 @@ def test_weigh__noise_over_the_error_of_models_in_plain_numpy(mode):
     shot = 4e-4
     memory = lumitexel_memory(10, 6, 4)
     memory.scattered[:, :count] = rng.uniform(0, 0.3, (3, count))
-    weight = np.zeros(60, np.float32)
+    weight = memory.weight
     options = Options(1.3, MODES.index(mode), floor, 1, True)
-    weigh(0, count, typical_noise(noise, shot), options, memory, weight)
+    weigh(0, count, typical_noise(noise, shot), options, memory)
 
     level = memory.scattered[:, :count].mean(axis=0, dtype=np.float64)
     mean = level.mean()
@@ -97,5 +97,5 @@ def test_weigh__noise_over_the_error_of_models_in_plain_numpy(mode):
     np.testing.assert_allclose(weight[:count], 1 / (1 + (spread / own) ** 2), rtol=1e-4)
     assert weight[:count].max() > 1.1 * weight[:count].min()
 
-    weigh(0, count, typical_noise(), options, memory, weight)
+    weigh(0, count, typical_noise(), options, memory)
     assert (weight[:count] == 1).all()

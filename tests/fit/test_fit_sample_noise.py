@@ -25,7 +25,7 @@ from skindb.reflectance._lumitexel_kernels import (
     write_noise,
     write_rows,
 )
-from skindb.reflectance.mixture import MODES
+from skindb.reflectance.block import MODES
 from skindb.reflectance.model import typical_noise
 from skindb.reflectance.tables import pad_to_lanes
 from skindb.schema import label
@@ -113,7 +113,7 @@ def test_write_noise__variance_of_each_sample_by_hand(skin, whole):
         count = write_rows(skin.normal[s], pad_to_lanes(table), b)
         assert write_noise(s, count, noise, b)
         for r in range(count):
-            i, o = b.index[r]
+            i, o = b.pairs[r]
             brightest = float(sample[s, i, o].max())
             want = [
                 by_hand(known, s, i, o, 0, level, brightest) for level in (0.0, 1.0)
@@ -161,10 +161,10 @@ def test_weigh__no_weight_exceeds_what_noise_permits(skin, mode):
             typical_noise(),
         )
         b = lumitexel_memory(20, 4, 8)
-        weight = np.zeros(80, np.float32)
-        b.index[:] = [(i, o) for i in range(20) for o in range(4)]
-        b.given[:], b.scattered[:] = 0.05, np.linspace(0.001, 0.2, 80)
-        weigh(0, 80, noise, Options(ETA, MODES.index(mode), 2e-3, 1, True), b, weight)
+        weight = b.weight
+        b.pairs[:] = [(i, o) for i in range(20) for o in range(4)]
+        b.sample[:], b.scattered[:] = 0.05, np.linspace(0.001, 0.2, 80)
+        weigh(0, 80, noise, Options(ETA, MODES.index(mode), 2e-3, 1, True), b)
         weights.append(weight.copy())
         variance = (b.noise[0] + b.noise[1] * b.scattered[0]) / 3
         if mode == "linear":

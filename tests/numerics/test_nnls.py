@@ -10,8 +10,7 @@ from scipy.optimize import minimize, nnls
 
 from skindb.numerics import _nnls_kernels
 from skindb.numerics.nnls import solve_nnls
-from skindb.reflectance import _mixture_kernels as _reflectance_kernels
-from skindb.reflectance import _mixture_kernels as _weight_error_kernels
+from skindb.reflectance import _mixture_kernels
 from skindb.reflectance.rows import fit_reflectance
 
 # normal equations square the condition number: residuals agree to the root of the
@@ -60,7 +59,7 @@ def test_fit_reflectance__linear_agrees_with_scipy():
         _, reference = nnls(M, target.ravel())
         assert fit.status[0] == 0
         assert fit.kkt[0] < 1e-9
-        assert np.linalg.norm(M @ fit.weight[0] - target.ravel()) <= reference * (
+        assert np.linalg.norm(M @ fit.parameters[0] - target.ravel()) <= reference * (
             1 + ROUNDING
         )
 
@@ -117,16 +116,17 @@ def _check_minimum(seed):
     x = np.zeros(m)
     filled = np.pad(rows, ((0, 0), (0, 7)))
     given = _as_fits_give(target.T)
-    work = _reflectance_kernels.fit_memory(n, 16, m)
-    _reflectance_kernels._fit_roots(
-        filled, given, np.ones(n, np.float32), np.eye(m), floor, 1e-10, x, work
+    work = _mixture_kernels.fit_memory(n, 16, m)
+    problem = _mixture_kernels.Problem(
+        filled, given, np.ones(n, np.float32), np.eye(m), True, floor, 1e-10
     )
+    _mixture_kernels._fit_roots(problem, x, work)
     assert objective(x) <= best * (1 + 1e-4)  # Gauss-Newton stops at a gain of 1e-6
     # and a last linear step, which may not cost much
     fit = _fit(rows, target, mode="perceptual", floor=floor)
-    assert objective(fit.weight[0]) <= best * 1.01
+    assert objective(fit.parameters[0]) <= best * 1.01
     assert fit.residual_perceptual[0] == pytest.approx(
-        np.sqrt(objective(fit.weight[0]) / (root(target) ** 2).sum())
+        np.sqrt(objective(fit.parameters[0]) / (root(target) ** 2).sum())
     )
 
 
@@ -149,7 +149,7 @@ def test_fit_reflectance__noise_does_not_bias_the_perceptual_fit():
     noise = 0.5 * clean.mean()
     for k in range(draws):
         target = clean[:, None] + noise * rng.normal(size=(300, 3))
-        found[k] = _fit(rows, target, mode="perceptual", floor=floor).weight[
+        found[k] = _fit(rows, target, mode="perceptual", floor=floor).parameters[
             0
         ] @ rows.mean(axis=0)
     off = found.mean() / clean.mean() - 1
@@ -169,18 +169,18 @@ def test_fit_reflectance__extremes_are_statuses(mode):
         rows, offsets, target, None, np.eye(4), mode=mode, noise_floor=1e-3
     )
     np.testing.assert_array_equal(fit.status, [2, 2, 0, 6, 0])
-    assert np.isnan(fit.weight[[0, 1, 3]]).all()
-    assert np.isfinite(fit.weight[[2, 4]]).all()
-    assert (fit.weight[4] == 0).all()
+    assert np.isnan(fit.parameters[[0, 1, 3]]).all()
+    assert np.isfinite(fit.parameters[[2, 4]]).all()
+    assert (fit.parameters[4] == 0).all()
 
 
 def test_fit_reflectance__weights_of_zero_leave_rows_out():
     rows, target = _problem(1)
     weight = np.ones(len(rows))
     weight[:20] = 0
-    kept = _fit(rows[20:], target[20:]).weight
+    kept = _fit(rows[20:], target[20:]).parameters
     np.testing.assert_allclose(
-        _fit(rows, target, weight=weight).weight, kept, rtol=1e-9, atol=1e-12
+        _fit(rows, target, weight=weight).parameters, kept, rtol=1e-9, atol=1e-12
     )
 
 
@@ -203,7 +203,7 @@ def test_fit_reflectance__any_scale(mode, of_rows, of_target):
     )
     assert scaled.status[0] == 0
     np.testing.assert_allclose(
-        scaled.weight[0], plain.weight[0] * (of_target / of_rows), rtol=1e-9
+        scaled.parameters[0], plain.parameters[0] * (of_target / of_rows), rtol=1e-9
     )
     assert scaled.residual[0] == pytest.approx(plain.residual[0])
 
@@ -213,7 +213,9 @@ def test_fit_reflectance__columns_of_different_scales():
     lengths = 2.0 ** np.array([0, 80, -80, 3, -3, 40, -40, 1, 0])
     plain = _fit(rows, target)
     scaled = _fit((rows * lengths).astype(np.float32), target)
-    np.testing.assert_allclose(scaled.weight[0] * lengths, plain.weight[0], rtol=1e-9)
+    np.testing.assert_allclose(
+        scaled.parameters[0] * lengths, plain.parameters[0], rtol=1e-9
+    )
 
 
 def test_fit_reflectance__lift_is_the_same_as_the_product():
@@ -244,18 +246,19 @@ def test_weight_covariance__is_the_sandwich_in_plain_numpy(perceptual):
         1 + 0.1 * rng.normal(size=(n, 3))
     )
     scattered = rng.uniform(0, 0.1, (3, n))
-    work = _reflectance_kernels.fit_memory(n + 7, 8, 4)
+    work = _mixture_kernels.fit_memory(n + 7, 8, 4)
     x = np.zeros(4)
     covariance = np.empty((4, 4))
     filled = np.pad(rows, ((0, 7), (0, 4)))
     given = _as_fits_give(target.T)
     weight = rng.uniform(0.2, 1, n).astype(np.float32)
-    _reflectance_kernels.fit_one(
-        filled, given, weight, np.eye(4), perceptual, floor, 1e-10, x, work
+    problem = _mixture_kernels.Problem(
+        filled, given, weight, np.eye(4), perceptual, floor, 1e-10
     )
+    _mixture_kernels.fit_one(problem, x, work)
     y = rows.astype(np.float64) @ x
     scattered = _as_fits_give(scattered)
-    _weight_error_kernels.weight_covariance(
+    _mixture_kernels.weight_covariance(
         filled,
         y.astype(np.float32),
         weight,
@@ -291,16 +294,17 @@ def test_weight_covariance__is_the_sandwich_in_plain_numpy(perceptual):
 def test_weight_covariance__collinear_columns_have_none():
     rng = np.random.default_rng(13)
     rows = np.repeat(rng.uniform(0, 1, (50, 1)), 2, axis=1).astype(np.float32)
-    work = _reflectance_kernels.fit_memory(50, 8, 2)
+    work = _mixture_kernels.fit_memory(50, 8, 2)
     covariance = np.empty((2, 2))
     filled = np.pad(rows, ((0, 0), (0, 6)))
     ones = np.ones(50, np.float32)
     given = _as_fits_give(np.repeat(rows[:, :1].T, 3, axis=0))
-    _reflectance_kernels.fit_one(
-        filled, given, ones, np.eye(2), False, 1.0, 1e-10, np.zeros(2), work
+    problem = _mixture_kernels.Problem(
+        filled, given, ones, np.eye(2), False, 1.0, 1e-10
     )
+    _mixture_kernels.fit_one(problem, np.zeros(2), work)
     nothing = _as_fits_give(np.zeros((3, 50))), np.zeros(3)
-    _weight_error_kernels.weight_covariance(
+    _mixture_kernels.weight_covariance(
         filled, 0 * ones, ones, False, 1.0, *nothing, np.full(2, 0.5), covariance, work
     )
     assert np.isnan(covariance).all()
@@ -326,7 +330,7 @@ def _check_against_scipy(rows, target):
     """The fit is certified, and its residual is not above SciPy's on the same rows."""
     fit = _fit(rows, target, floor=1e-3, min_samples=1)
     M = np.repeat(rows.astype(np.float64), 3, axis=0)
-    residual = np.linalg.norm(M @ fit.weight[0] - target.ravel())
+    residual = np.linalg.norm(M @ fit.parameters[0] - target.ravel())
     assert fit.status[0] == 0
     assert fit.kkt[0] < 1e-9  # the tolerance of the solver is 1e-10
     assert residual <= nnls(M, target.ravel())[1] * (
@@ -354,13 +358,13 @@ def test_fit_reflectance__redundant_bases(kind):
             extended.residual, _fit(rows, target).residual, rtol=1e-6
         )
     if kind == "zero":
-        assert extended.weight[0, 0] == 0
+        assert extended.parameters[0, 0] == 0
 
 
 @pytest.mark.parametrize("mode", ["linear", "perceptual"])
 def test_fit_reflectance__a_broken_sample_leaves_the_neighbour_alone(mode):
     rows, target = _problem(0, 40)
-    expected = _fit(rows, target, mode=mode).weight[0]
+    expected = _fit(rows, target, mode=mode).parameters[0]
     for value in (np.nan, np.inf, -np.inf):
         targets = np.concatenate([target, target])
         targets[3, 1] = value
@@ -374,8 +378,8 @@ def test_fit_reflectance__a_broken_sample_leaves_the_neighbour_alone(mode):
             noise_floor=1e-2,
         )
         assert fit.status.tolist() == [6, 0]
-        assert np.isnan(fit.weight[0]).all()
-        np.testing.assert_allclose(fit.weight[1], expected, rtol=1e-12)
+        assert np.isnan(fit.parameters[0]).all()
+        np.testing.assert_allclose(fit.parameters[1], expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("mode", ["linear", "perceptual"])
@@ -384,13 +388,15 @@ def test_fit_reflectance__black_and_negative_samples_have_no_weight(mode):
     for level in (0.0, -1.0):
         fit = _fit(rows, np.full((40, 3), level), mode=mode)
         assert fit.status[0] == 0
-        assert (fit.weight == 0).all()
+        assert (fit.parameters == 0).all()
 
 
 def test_fit_reflectance__samples_in_single_precision():
     rows, target = _problem(0)
-    single = _fit(rows, target.astype(np.float32)).weight
-    np.testing.assert_allclose(single, _fit(rows, target).weight, rtol=1e-5, atol=1e-6)
+    single = _fit(rows, target.astype(np.float32)).parameters
+    np.testing.assert_allclose(
+        single, _fit(rows, target).parameters, rtol=1e-5, atol=1e-6
+    )
 
 
 def test_solve_nnls__no_systems():

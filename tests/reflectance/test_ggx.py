@@ -157,6 +157,14 @@ def test_judge__fits_like_fit_and_predicts_what_is_held_out():
     np.testing.assert_array_equal(again.counts, judged.counts)
 
 
+def test_judge__evaluated_parameters_have_the_errors_of_their_fit():
+    block = planted(STRENGTH, ROUGHNESS, noise=0.05, seed=3)
+    errors = Judgement(np.full((4, 3), 1e-3), np.full(4, 0.2))
+    judged = GGX(INDEX).judge(block, EXACT, errors)
+    again = GGX(INDEX).judge(block, EXACT, errors, judged.parameters)
+    np.testing.assert_allclose(again.covariance, judged.covariance, rtol=1e-9)
+
+
 def test_judge__errors_are_the_scatter_of_repeated_fits():
     repeats = 60
     model = GGX(INDEX)

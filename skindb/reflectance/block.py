@@ -1,0 +1,125 @@
+"""What implementations of `ReflectanceModel` share: blocks of surfels and empty results in
+the form of the kernels, and the diffuse term.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skindb.jit import sample_bits
+from skindb.reflectance import _shade_kernels
+from skindb.reflectance._lumitexel_kernels import BINS, JudgedErrors, Options
+from skindb.reflectance.model import (
+    Block,
+    Comparison,
+    JudgedFit,
+    Judgement,
+    Lamp,
+    Points,
+    SurfaceFit,
+)
+from skindb.reflectance.tables import Table
+from skindb.types import Array
+
+MODES = ("linear", "perceptual", "paper")  # in the order of `_lumitexel_kernels`
+NO_TABLE = np.zeros((2, 2, 1, 0), np.float32)
+
+
+def kernel_block(block: Block) -> Block:
+    """The block in the types for which the kernels are compiled."""
+    doubles: dict[str, Any] = {
+        name: np.ascontiguousarray(getattr(block, name), np.float64)
+        for name in ("position", "light", "camera", "normal", "diffuse")
+    }
+    return block._replace(sample=sample_bits(block.sample), **doubles)
+
+
+def kernel_options(comparison: Comparison, *, solve: bool) -> Options:
+    """A comparison for the kernels; without `solve` given parameters are only evaluated."""
+    return Options(
+        float(comparison.eta),
+        MODES.index(comparison.mode),
+        float(comparison.noise_floor),
+        max(comparison.min_samples, 1),
+        solve,
+    )
+
+
+def empty_fit(n: int, size: int, parameters: Array | None = None) -> SurfaceFit:
+    """Results before a fit of n surfels with `size` parameters, or with given ones."""
+    if parameters is None:
+        parameters = np.full((n, size), np.nan)
+    return SurfaceFit(
+        parameters=np.array(parameters, np.float64, order="C"),
+        kkt=np.full(n, np.nan),
+        residual=np.full(n, np.nan),
+        residual_perceptual=np.full(n, np.nan),
+        condition=np.full(n, np.nan),
+        samples=np.zeros(n, np.int32),
+        iterations=np.zeros(n, np.int32),
+        status=np.zeros(n, np.uint8),
+    )
+
+
+def empty_judgement(
+    block: Block, judgement: Judgement, size: int, parameters: Array | None = None
+) -> tuple[JudgedErrors, JudgedFit]:
+    """Input of a judgement for the kernels, and its results before they are computed, for
+    `size` parameters, or for given ones.
+    """
+    n, lights, cameras = block.sample.shape[:3]
+    diffuse = np.zeros((n, 3))
+    if judgement.diffuse_error is not None:
+        diffuse = np.nan_to_num(judgement.diffuse_error.astype(np.float64))
+    turn = np.zeros(n)
+    if judgement.normal_error is not None:  # the RMS angle is that of two axes
+        angle = np.nan_to_num(np.float64(judgement.normal_error))
+        turn = np.radians(angle / np.sqrt(2))
+    held = judgement.held
+    if held is None:
+        held = np.zeros((lights, cameras), np.int64)
+    if parameters is None:
+        parameters = np.full((n, size), np.nan)
+    columns = 0 if judgement.diffuse_error is None else size
+    bins = BINS if judgement.outliers else 0
+    return JudgedErrors(diffuse, turn, held), JudgedFit(
+        parameters=np.array(parameters, np.float64, order="C"),
+        residual=np.full(n, np.nan),
+        residual_perceptual=np.full(n, np.nan),
+        covariance=np.full((n, columns, columns), np.nan),
+        held_error=np.full((n, 2, 2), np.nan),
+        outlier=np.full(n, np.nan),
+        counts=np.zeros((lights, cameras, bins), np.int64),
+    )
+
+
+def shade_diffuse(points: Points, lamp: Lamp, *, eta: float) -> NDArray[np.float32]:
+    """Radiance (n, 3) of the diffuse term alone, see `ReflectanceModel.shade`."""
+    none = np.zeros((len(points.position), 0))
+    return shade_tables(points._replace(parameters=none), NO_TABLE, lamp, eta=eta)
+
+
+def shade_tables(
+    points: Points, table: Table, lamp: Lamp, *, eta: float
+) -> NDArray[np.float32]:
+    """Radiance (n, 3) of the diffuse term and of mixtures of tables (nh, nd, np, k)."""
+    out = np.empty((len(points.position), 3), np.float32)
+    _shade_kernels.shade(
+        np.ascontiguousarray(points.position, np.float64),
+        np.ascontiguousarray(points.normal, np.float64),
+        np.ascontiguousarray(points.view, np.float64),
+        np.ascontiguousarray(points.diffuse, np.float32),
+        np.ascontiguousarray(points.parameters, np.float32),
+        np.ascontiguousarray(table, np.float32),
+        np.ascontiguousarray(lamp.place, np.float64),
+        np.ascontiguousarray(lamp.lit, np.float32),
+        np.ascontiguousarray(lamp.axis, np.float64),
+        float(lamp.falloff),
+        float(eta),
+        points.parameters.shape[1] > 0,
+        out,
+    )
+    return out
