@@ -3,9 +3,9 @@ measured BRDFs, with noise.
 
     python -m benchmarks basis_size [--seeds N] [--first S] [--lights L] [--cameras C] [--surfels S]
 
-A planted component can only be found if removing it increases the error. The least
-important component is therefore redrawn until removing any of them increases the error
-by 20 %, at most a hundred times; problems that stay below 5 % are counted separately.
+At least 60 surfels are needed. A planted component can only be found if removing it
+increases the error. The least important component is therefore redrawn until removing
+any of them increases the error by 20 %, at most a hundred times; problems that stay below 5 % are counted separately.
 The number in brackets is the error with the planted basis over that with all BRDFs. The
 threshold of the rule was chosen on seeds 0 to 2.
 """
@@ -28,6 +28,7 @@ LARGEST = 12
 NEEDED = 1.2
 MATTERS = 1.05
 TRIES = 100
+FEW = 60  # surfels on which the least important component is judged
 # diffuse term; its noise remains in the samples after it is subtracted
 MATTE = np.array([0.5, 0.3, 0.2]) / np.pi
 
@@ -56,7 +57,7 @@ def planted(size, noise, seed, *, surfels=300, lights=40, cameras=4):
         * MATTE
     )
     level = np.sqrt((rows.astype(np.float64) ** 2).mean(axis=0))
-    few = offsets[60]
+    few = offsets[FEW]
     best = (0.0, np.empty(0), np.empty(0))
     H = np.stack([_mixture(rng, level) for _ in range(size)])
     for _ in range(TRIES):
@@ -65,7 +66,7 @@ def planted(size, noise, seed, *, surfels=300, lights=40, cameras=4):
             np.einsum("nm,nm->n", rows, x[surfel].astype(np.float32))[:, None] + matte
         )
         target = value * (1 + noise * rng.normal(size=value.shape)) - matte
-        part = Systems.of(rows[:few], offsets[:61], target[:few])
+        part = Systems.of(rows[:few], offsets[: FEW + 1], target[:few])
         without = [residuals(part, np.delete(H, i, 0))[1].sum() for i in range(size)]
         needed = float(np.sqrt(min(without) / residuals(part, H)[1].sum()))
         best = max(best, (needed, target, H), key=lambda found: found[0])

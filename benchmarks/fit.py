@@ -1,10 +1,12 @@
-"""Time and results of the fit of one take, by an earlier revision and by the current code.
+"""Time of the fit of one take, and its time and results compared with another revision.
 
-    python -m benchmarks fit CAPTURE [--before df1cf9e] [--repeats 3] [--json OUT] [--folder FOLDER]
+    python -m benchmarks fit CAPTURE [--before REVISION] [--repeats 3] [--json OUT]
+    [--folder FOLDER]
 
-The earlier revision is extracted from git and ingests CAPTURE into a temporary
-database, of which each side fits a copy. Every fit runs in its own process; the two
-sides alternate, and medians are printed. Compilation is not timed.
+CAPTURE is ingested into a temporary database. With --before, a revision that has the
+functions of benchmarks/programs/fit_driver.py is extracted from git, ingests CAPTURE,
+and each side fits a copy. Every fit runs in its own process; the two sides alternate,
+and medians are printed. Compilation is not timed.
 """
 
 from __future__ import annotations
@@ -17,7 +19,8 @@ import subprocess
 import sys
 import tarfile
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Annotated, Any
@@ -30,16 +33,6 @@ from skindb.schema import FitStatus
 
 ROOT = Path(__file__).resolve().parent.parent
 DRIVER = Path(__file__).parent / "programs/fit_driver.py"
-SIDES = ("before", "after")
-STAGES = {  # stage of the current code -> stages of the earlier revision
-    "dictionary": ("dictionary",),
-    "first pass": ("normals", "diffuse reflectance", "surface"),
-    "reduced basis": ("reduced basis",),
-    "second pass": ("refit", "held out", "outliers"),
-    "translucency": ("translucency",),
-    "commit": ("write", "commit"),
-    "all": ("all",),
-}
 ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"
 )
@@ -73,25 +66,21 @@ def drive(
     return dict(json.loads(done.stdout.splitlines()[-1]))
 
 
-def medians(runs: Sequence[dict[str, Any]], stage: str, what: str) -> float:
-    """Median of a stage of the current code, or of its counterparts in the earlier revision."""
-    names = {stage, *STAGES[stage]}
-    return median(
-        sum(table[what] for name, table in run["stages"].items() if name in names)
-        for run in runs
-    )
-
-
 def turns(
-    repeats: int, side: Callable[[str], dict[str, Any]]
+    repeats: int, codes: Mapping[str, Path], measure: Callable[[str], dict[str, Any]]
 ) -> dict[str, list[dict[str, Any]]]:
     """`repeats` results of each side, measured alternately."""
-    runs: dict[str, list[dict[str, Any]]] = {name: [] for name in SIDES}
+    runs: dict[str, list[dict[str, Any]]] = {side: [] for side in codes}
     for _ in range(repeats):
-        for name in SIDES:
-            runs[name].append(side(name))
-            print(f"{name}: {json.dumps(runs[name][-1])}", file=sys.stderr, flush=True)
+        for side in codes:
+            runs[side].append(measure(side))
+            print(f"{side}: {json.dumps(runs[side][-1])}", file=sys.stderr, flush=True)
     return runs
+
+
+def stage_median(runs: Sequence[dict[str, Any]], stage: str, what: str) -> float:
+    """Median of the time of a stage [s]."""
+    return median(run["stages"].get(stage, {}).get(what, 0.0) for run in runs)
 
 
 def differences(before: xr.DataTree, after: xr.DataTree) -> dict[str, float]:
@@ -103,148 +92,127 @@ def differences(before: xr.DataTree, after: xr.DataTree) -> dict[str, float]:
     good = (old["fit_status"].values == FitStatus.FITTED) & (
         new["fit_status"].values == FitStatus.FITTED
     )
-    cosine = (
-        old["shading_normal"].values.astype(float) * new["shading_normal"].values
-    ).sum(1)
-    lengths = [
-        np.linalg.norm(one["shading_normal"].values.astype(float), axis=1)
-        for one in (old, new)
-    ]
-    angle = np.degrees(np.arccos(np.clip(cosine / (lengths[0] * lengths[1]), -1, 1)))
-    found = {"normal": float(np.nanmedian((angle / old["normal_error"].values)[good]))}
+    normals = [side["shading_normal"].values.astype(float) for side in (old, new)]
+    lengths = np.linalg.norm(normals, axis=2)
+    cosine = (normals[0] * normals[1]).sum(axis=1) / lengths.prod(axis=0)
+    angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+    ratio = (angle / old["normal_error"].values)[good]
+    medians = {"normal": float(np.nanmedian(ratio))}
     for name in ("diffuse_reflectance", "surface_reflectance"):
-        change = (
-            np.abs(new[name].values.astype(float) - old[name].values)
-            / old[f"{name}_error"].values
-        )
-        found[name] = float(np.nanmedian(change[good]))
+        ratio = _change(old, new, name, f"{name}_error")
+        medians[name] = float(np.nanmedian(ratio[good]))
     if "translucency" in before.children:
-        sites, now = (model["translucency"].to_dataset() for model in (before, after))
-        change = (
-            np.abs(now["site_sigma_tr"].values - sites["site_sigma_tr"].values)
-            / sites["site_sigma_tr_error"].values
-        )
-        found["sigma_tr"] = float(np.nanmedian(change))
-    found["surfels with another status"] = float(
-        (old["fit_status"].values != new["fit_status"].values).mean()
-    )
-    return found
+        sites = [model["translucency"].to_dataset() for model in (before, after)]
+        ratio = _change(*sites, "site_sigma_tr", "site_sigma_tr_error")
+        medians["sigma_tr"] = float(np.nanmedian(ratio))
+    changed = old["fit_status"].values != new["fit_status"].values
+    medians["surfels with another status"] = float(changed.mean())
+    return medians
+
+
+def _change(old: xr.Dataset, new: xr.Dataset, name: str, error: str) -> np.ndarray:
+    """Absolute change of a variable over its stated error."""
+    change = new[name].values.astype(float) - old[name].values
+    return np.asarray(np.abs(change) / old[error].values)
+
+
+def stage_table(fits: dict[str, list[dict[str, Any]]]) -> list[str]:
+    """CPU and wall time of every stage of each side, and the peak of memory."""
+    sides = ", ".join(fits)
+    lines = [f"| stage | CPU {sides} [s] | wall {sides} [s] |", "|---|---|---|"]
+    for stage in fits["after"][0]["stages"]:
+        cells = [
+            ", ".join(
+                f"{stage_median(runs, stage, what):.1f}" for runs in fits.values()
+            )
+            for what in ("cpu", "wall")
+        ]
+        lines.append(f"| {stage} | {' | '.join(cells)} |")
+    peaks = [f"{max(run['peak'] for run in runs):.2f}" for runs in fits.values()]
+    return [*lines, "", f"Peak resident memory {', '.join(peaks)} GiB."]
+
+
+def part_table(parts: dict[str, dict[str, float]]) -> list[str]:
+    """CPU time of every part of a fit of each side."""
+    lines = [f"| part, one thread | {', '.join(parts)} [us per surfel] |", "|---|---|"]
+    for name in parts["after"]:
+        times = ", ".join(f"{part[name]:.1f}" for part in parts.values())
+        lines += [f"| {name} | {times} |"]
+    spent = parts["after"]
+    together = (spent["normals"] + spent["albedo"]) / spent["dictionary fit"]
+    refits = 1e6 / spent["linear refit of 4 components"]
+    return [
+        *lines,
+        "",
+        f"Normals and albedo take {together:.2f} of the time of the dictionary fit.",
+        f"Linear refit: {refits:,.0f} surfels per second and core.",
+    ]
 
 
 def report(results: dict[str, Any]) -> str:
     """Markdown tables of all results."""
-    runs = results["fits"]
-    old = results["parts"]["before"]
-    new = results["parts"]["after"]
-    lines = [
-        "| stage | CPU before, after [s] | wall before, after [s] |",
-        "|---|---|---|",
-    ]
-    for stage in STAGES:
-        cells = [
-            ", ".join(f"{medians(runs[s], stage, what):.1f}" for s in SIDES)
-            for what in ("cpu", "wall")
-        ]
-        lines.append(f"| {stage} | {' | '.join(cells)} |")
-    ratios = {what: ratio(runs, what) for what in ("cpu", "wall")}
-    peaks = [max(run["peak"] for run in runs[s]) for s in SIDES]
-    lines += [
-        "",
-        (
-            f"CPU time {ratios['cpu']:.2f} times shorter, wall time "
-            f"{ratios['wall']:.2f} times shorter."
-        ),
-    ]
-    lines += [
-        f"Peak resident memory {peaks[0]:.2f} GiB before, {peaks[1]:.2f} GiB after."
-    ]
-    lines += [
-        "",
-        "| part, one thread | before [us per surfel] | after |",
-        "|---|---|---|",
-    ]
-    lines += [f"| {name} | {old[name]:.0f} | {new[name]:.1f} |" for name in old]
-    together = (new["normals"] + new["albedo"]) / new["dictionary fit"]
-    lines += [
-        "",
-        f"Normals and albedo take {together:.2f} of the time of the dictionary fit.",
-    ]
-    lines += [
-        (
-            f"Linear refit: {1e6 / new['linear refit of 4 components']:,.0f} surfels "
-            "per second and core."
-        )
-    ]
+    fits = results["fits"]
+    lines = [*stage_table(fits), "", *part_table(results["parts"])]
     reading = {
-        what: 2 * results["read"][what] / medians(runs["after"], "all", what)
+        what: 2 * results["read"][what] / stage_median(fits["after"], "all", what)
         for what in ("cpu", "wall")
     }
-    lines += [
-        (
-            f"Reading all samples twice: {reading['cpu']:.1%} of the CPU time, "
-            f"{reading['wall']:.1%} of the wall time."
-        )
-    ]
-    lines += ["", "| median change, in stated errors | |", "|---|---|"]
-    return "\n".join(
-        [
-            *lines,
-            *(
-                f"| {name} | {value:.2g} |"
-                for name, value in results["differences"].items()
-            ),
-        ]
+    lines.append(
+        f"Reading all samples twice: {reading['cpu']:.1%} of the CPU time, "
+        f"{reading['wall']:.1%} of the wall time."
     )
+    if "differences" in results:
+        lines += ["", "| median change, in stated errors | |", "|---|---|"]
+        for name, value in results["differences"].items():
+            lines.append(f"| {name} | {value:.2g} |")
+    return "\n".join(lines)
 
 
-def ratio(runs: dict[str, list[dict[str, Any]]], what: str) -> float:
-    """Time before over time after."""
-    return medians(runs["before"], "all", what) / medians(runs["after"], "all", what)
-
-
-def measure(capture: Path, revision: str, repeats: int, folder: Path) -> dict[str, Any]:
+def measure(
+    capture: Path, revision: str | None, repeats: int, folder: Path
+) -> dict[str, Any]:
     """Run all measurements; code and databases that exist in the folder are reused."""
-    code = {"before": folder / "code", "after": ROOT}
-    if not code["before"].exists():
-        extract(revision, code["before"])
-    bases = {side: folder / side for side in SIDES}
-    if not bases["before"].exists():
-        drive(code["before"], "ingest", bases["before"], capture)
-    (take,) = skindb.open(bases["before"]).takes("capture")
-    if not bases["after"].exists():
-        shutil.copytree(bases["before"], bases["after"])
-    parts = turns(
-        repeats, lambda side: drive(code[side], "parts", bases[side], take, threads=1)
-    )
-    # compiles the remaining functions
-    turns(1, lambda side: drive(code[side], "fit", bases[side], take))
-    fits = turns(repeats, lambda side: drive(code[side], "fit", bases[side], take))
-    reads = [drive(ROOT, "read", bases["after"], take) for _ in range(repeats)]
-    models = [skindb.open(bases[side]).read("model", take) for side in SIDES]
-    return {
-        "parts": {
-            side: {
-                name: min(run[name] for run in parts[side]) for name in parts[side][0]
-            }
-            for side in SIDES
-        },
-        "fits": fits,
-        "read": {what: median(run[what] for run in reads) for what in ("cpu", "wall")},
-        "differences": differences(*models),
+    codes = {"after": ROOT}
+    if revision:
+        codes = {"before": folder / "code", "after": ROOT}
+        if not codes["before"].exists():
+            extract(revision, codes["before"])
+    databases = {side: folder / side for side in codes}
+    source, *copies = databases.items()
+    if not source[1].exists():
+        drive(codes[source[0]], "ingest", source[1], capture)
+    for _, copy in copies:
+        if not copy.exists():
+            shutil.copytree(source[1], copy)
+    (take,) = skindb.open(source[1]).takes("capture")
+
+    def run(action: str, side: str, threads: int | None = None) -> dict[str, Any]:
+        return drive(codes[side], action, databases[side], take, threads=threads)
+
+    parts = turns(repeats, codes, lambda side: run("parts", side, 1))
+    turns(1, codes, partial(run, "fit"))  # compiles the remaining functions
+    results: dict[str, Any] = {"fits": turns(repeats, codes, partial(run, "fit"))}
+    reads = [run("read", "after") for _ in range(repeats)]
+    results["read"] = {what: median(r[what] for r in reads) for what in ("cpu", "wall")}
+    results["parts"] = {
+        side: {name: min(r[name] for r in runs) for name in runs[0]}
+        for side, runs in parts.items()
     }
+    if revision:
+        models = [skindb.open(db).read("model", take) for db in databases.values()]
+        results["differences"] = differences(*models)
+    return results
 
 
 def main(
     capture: Path,
     *,
-    before: Annotated[
-        str, "Revision to compare with, from before schema version 2."
-    ] = "df1cf9e",
+    before: Annotated[str | None, "Revision to compare with."] = None,
     repeats: Annotated[int, "Number of timed runs per side."] = 3,
     json_: Annotated[Path | None, "File for all results."] = None,
     folder: Annotated[
         Path | None,
-        "Folder that keeps the earlier code and the databases (default: temporary).",
+        "Folder that keeps the other code and the databases (default: temporary).",
     ] = None,
 ) -> None:
     """Measure and print."""

@@ -22,6 +22,7 @@ from typing import Annotated, Any
 import numpy as np
 
 import skindb
+from benchmarks.truth import read_truth
 from benchmarks.validate import header
 from skindb.errors import InputError
 from skindb.fit import FitParameters, reflectance_interval
@@ -49,8 +50,7 @@ def measure(db: Database, folder: Path, *, corrected: bool) -> dict[str, Any]:
         db, done.take, FitParameters(hold_out_lights=0.1, inter_reflection=corrected)
     ).provenance
     model = db.read("model", done.take)
-    with np.load(folder.with_name(folder.name + ".truth.npz")) as truth:
-        recovered = recovered_against_true(model, dict(truth))
+    recovered = recovered_against_true(model, read_truth(folder))
     fitted = recovered.fitted
     found = model["fitted/diffuse_reflectance"].values[fitted]
     error = model["fitted/diffuse_reflectance_total_error"].values[fitted].astype(float)

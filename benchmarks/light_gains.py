@@ -19,6 +19,7 @@ import numpy as np
 import xarray as xr
 
 import skindb
+from benchmarks.truth import read_truth
 from benchmarks.validate import header
 from skindb.fit import FitParameters, fit_model
 from skindb.virtual.capture import recovered_against_true
@@ -49,11 +50,12 @@ def planted(capture: xr.DataTree, gain: np.ndarray[Any, Any]) -> xr.DataTree:
 
 def main(db: str, captures: Sequence[Path]) -> None:
     """Measure and print."""
-    db = skindb.open(db)
+    database = skindb.open(db)
     print(header(*COLUMNS))
     for folder in captures:
-        capture = db.read("capture", ingest_take(db, folder, calibration="note").take)
-        truth = dict(np.load(folder.with_name(folder.name + ".truth.npz")))
+        take = ingest_take(database, folder, calibration="note").take
+        capture = database.read("capture", take)
+        truth = read_truth(folder)
         normal = (
             np.random.default_rng(5)
             .standard_normal(capture["samples"].sizes["light"])

@@ -16,6 +16,7 @@ from pathlib import Path
 import imagecodecs
 import numpy as np
 
+from benchmarks.truth import read_truth
 from skindb.calibration.irradiance import (
     TargetPixels,
     fit_light,
@@ -104,7 +105,8 @@ def light_errors(capture, truth):
         target_pixels(c, dome.white) for c in dome.cameras if c.id in dome.white.cameras
     ]
     fits = []
-    for light, axis in zip(dome.lights, truth["light_axis"], strict=True):
+    axes = truth.get("light_axis", [light.axis for light in dome.lights])
+    for light, axis in zip(dome.lights, axes, strict=True):
         radiance = [
             _target_radiance(dome, light, mergers[t.camera], t) for t in targets
         ]
@@ -223,7 +225,7 @@ def main(
     curved = {}
     for folder in captures:
         capture = read_capture(folder)
-        truth = np.load(folder.with_name(folder.name + ".truth.npz"))
+        truth = read_truth(folder)
         used, own, falloff = light_errors(capture, truth)
         if capture.dome.cameras[0].sensor.response is not None:
             curved[folder.name] = radiance_biases(

@@ -3,9 +3,9 @@ points, and regions.
 
     python -m benchmarks registration CAPTURE ... [--shared N] [--every N] [--brief]
 
-Only the scan, landmarks and regions of the folder CAPTURE are read, not its frames.
-CAPTURE.truth.npz beside it has `vertices` (v, 3) in mm, `region` (v,) and
-`region_names`; its first N vertices are the same points of every head. Prints Markdown
+Only the scan, landmarks and regions of the folder CAPTURE are read, not its frames. The
+vertices of the truth must be the same points of every head, as in captures of
+`skindb simulate --head FILE`, or the first N of them. Prints Markdown
 tables: errors in mm by region without and with the warp, for the unchanged scans and
 for scans that end at different places; errors in mm by number of landmarks, errors of
 clicks and smoothing; agreement of regions from landmarks with those of the captures.
@@ -23,6 +23,8 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from benchmarks.truth import read_truth
+from benchmarks.truth import regions as true_regions
 from skindb.analysis import correspondence_error, mask_agreement, register
 from skindb.analysis.regions import own_masks, region_masks
 from skindb.analysis.registration import unregistered
@@ -223,7 +225,9 @@ def main(
     capture: Sequence[Path],
     *,
     spacing: Annotated[float, "Spacing of surfels [mm]."] = 4.0,
-    shared: Annotated[int, "Number of leading vertices that all heads share."] = 9409,
+    shared: Annotated[
+        int | None, "Number of leading vertices that all heads share (default: all)."
+    ] = None,
     every: Annotated[int, "Use every N-th of them."] = 3,
     outside: Annotated[
         str, "Regions that are not part of the face."
@@ -233,11 +237,10 @@ def main(
     """Print the tables."""
     models = {folder.name: scanned(folder, spacing) for folder in capture}
     points = {}
-    region = np.zeros(0, str)
-    for folder in capture:
-        with np.load(f"{folder}.truth.npz") as truth:
-            points[folder.name] = truth["vertices"][:shared:every].astype(np.float64)
-            region = truth["region_names"][truth["region"][:shared:every]]
+    truths = [read_truth(folder) for folder in capture]
+    for folder, truth in zip(capture, truths, strict=True):
+        points[folder.name] = truth["vertices"][:shared:every].astype(np.float64)
+    region = true_regions(truths[-1])[:shared:every]
     face = ~np.isin(region, outside.split(","))
     first = sorted(models)[0]
     cut = cut_differently(models)

@@ -4,13 +4,14 @@ capture, one Markdown row per stage.
     python -m benchmarks stage_errors DB CAPTURE
 
 CAPTURE.truth.npz contains the truth, and CAPTURE.truth/<light>_<camera>.exr the
-noise-free radiance of some frames. The take must have been ingested into DB and fitted,
-for example by benchmarks/validate.py.
+noise-free radiance of some frames, if the generator writes them. The take must have been
+ingested into DB and fitted, for example by benchmarks/validate.py.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +20,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 import skindb
+from benchmarks.truth import TrueVisibility, Truth, read_truth
 from skindb.calibration.irradiance import light_falloff
 from skindb.calibration.radiance import frame_mergers, read_view
+from skindb.errors import Fault
 from skindb.format.dome import DomeRecord
 from skindb.format.folder import read_capture
 from skindb.geometry.atlas import bilinear
@@ -36,105 +39,95 @@ LIT = 0.02
 NEAR = 0.5
 TURNED = 0.9
 STEEP = 0.1  # smallest cosine to a light or camera
-SOME = 20_000  # number of surfels whose distance is measured
+SURFELS = 20_000  # number of surfels whose distance is measured
 Row = tuple[str, str, str]
 
 
 def main(db: str, capture: Path) -> None:
-    folder = capture
-    with np.load(folder.with_name(folder.name + ".truth.npz")) as file:
-        truth = dict(file)
-    record = read_capture(folder)
+    truth = read_truth(capture)
+    record = read_capture(capture)
     assert record.dome is not None
-    db = skindb.open(db)
-    capture = db.read("capture", record.take)
-    model = db.read("model", record.take)
+    database = skindb.open(db)
+    ingested = database.read("capture", record.take)
+    model = database.read("model", record.take)
+    frames = capture.with_name(f"{capture.name}.truth")
+    parts = (
+        of_scan(ingested, truth),
+        of_lights(ingested, truth),
+        of_frames(record.dome, ingested, truth, frames),
+        of_visibility(ingested["surfels"].to_dataset(), truth, record.dome),
+        of_model(model, truth),
+    )
     print("| stage | error | of what |\n|---|---|---|")
-    for row in rows(
-        record.dome, capture, model, truth, folder.with_name(folder.name + ".truth")
-    ):
+    for row in chain(*parts):
         print("| " + " | ".join(row) + " |", flush=True)
 
 
-def rows(
-    dome: DomeRecord,
-    capture: xr.DataTree,
-    model: xr.DataTree,
-    truth: dict[str, NDArray],
-    frames: Path,
-) -> Iterator[Row]:
-    surfels = capture["surfels"].to_dataset()
-    position = surfels["surfel_position"].values.astype(float)
-    some = np.random.default_rng(0).choice(
-        len(position), min(SOME, len(position)), replace=False
-    )
+def of_scan(ingested: xr.DataTree, truth: Truth) -> Iterator[Row]:
+    """Distances of surfels from the true surface."""
+    position = ingested["surfels/surfel_position"].values.astype(float)
+    count = min(SURFELS, len(position))
+    chosen = np.random.default_rng(0).choice(len(position), count, replace=False)
     _, _, distance = closest_on_mesh(
-        truth["vertices"].astype(float), truth["faces"].astype(int), position[some]
+        truth["vertices"].astype(float), truth["faces"].astype(int), position[chosen]
     )
-    yield (
-        "scan, subdivision",
-        f"{quantiles(distance)} mm",
-        f"distance of {len(some):,} surfels from the true surface",
-    )
-    found = capture["dome/light_intensity"].values
-    true = truth["light_intensity"]
-    off = found / true - 1
-    yield (
-        "white target",
-        f"{100 * np.sqrt(np.mean(off**2)):.3f} % rms",
-        f"intensity of {len(off)} lights",
-    )
+    what = f"distance of {count:,} surfels from the true surface"
+    yield "scan, subdivision", f"{quantiles(distance)} mm", what
+
+
+def of_lights(ingested: xr.DataTree, truth: Truth) -> Iterator[Row]:
+    """Errors of the intensities of lights."""
+    intensity = ingested["dome/light_intensity"].values
+    off = intensity / truth["light_intensity"] - 1
+    error = f"{100 * np.sqrt(np.mean(off**2)):.3f} % rms"
+    yield "white target", error, f"intensity of {len(off)} lights"
+
+
+def of_frames(
+    dome: DomeRecord, ingested: xr.DataTree, truth: Truth, frames: Path
+) -> Iterator[Row]:
+    """Errors of merged exposures and of samples, where there are noise-free frames."""
     merged = []
     sampled = []
-    mergers = frame_mergers(dome, faults := [])
+    faults: list[Fault] = []
+    mergers = frame_mergers(dome, faults)
     assert not faults
     lights = {light.id: j for j, light in enumerate(dome.lights)}
     cameras = {camera.id: c for c, camera in enumerate(dome.cameras)}
     for path in sorted(frames.glob("*.exr")):
         light, camera = path.stem.split("_")
         image, _ = read_exr(path)
-        radiance, flag = mergers[camera].merge(
-            read_view(dome, light, dome.cameras[cameras[camera]])
-        )
+        view = read_view(dome, light, dome.cameras[cameras[camera]])
+        radiance, flag = mergers[camera].merge(view)
         lit = (flag == 0) & (image.min(axis=-1) > LIT * np.quantile(image, 0.999))
         merged.append((radiance[lit] / image[lit] - 1).ravel())
-        sampled.append(
-            of_samples(dome, capture, true, image, lights[light], cameras[camera])
-        )
+        intensity = truth["light_intensity"]
+        place = lights[light], cameras[camera]
+        sampled.append(of_samples(dome, ingested, intensity, image, *place))
     if merged:
-        yield (
-            "merged exposures",
-            relative(np.concatenate(merged)),
-            f"lit pixels of {len(merged)} frames, noise-free",
-        )
-        yield (
-            "samples",
-            relative(np.concatenate(sampled)),
-            "the same frames at the same pixels, noise-free",
-        )
-    yield from of_visibility(surfels, truth, dome)
+        what = f"lit pixels of {len(merged)} frames, noise-free"
+        yield "merged exposures", relative(np.concatenate(merged)), what
+        what = "the same frames at the same pixels, noise-free"
+        yield "samples", relative(np.concatenate(sampled)), what
+
+
+def of_model(model: xr.DataTree, truth: Truth) -> Iterator[Row]:
+    """Errors of the fitted parameters."""
     summary = recovered_against_true(model, truth).summary()
     median = summary["normal_median_deg"]
-    worst = summary["normal_95_deg"]
-    yield "normals", f"{median} deg median, {worst} at 95 %", "fitted surfels"
-    diffuse = summary["diffuse_median_percent"]
-    bias = summary["diffuse_bias_percent"]
-    yield (
-        "diffuse albedo",
-        f"{diffuse} % median, bias {bias} %",
-        "fitted surfels, R G B",
-    )
+    error = f"{median} deg median, {summary['normal_95_deg']} at 95 %"
+    yield "normals", error, "fitted surfels"
+    median = summary["diffuse_median_percent"]
+    error = f"{median} % median, bias {summary['diffuse_bias_percent']} %"
+    yield "diffuse albedo", error, "fitted surfels, R G B"
     if "held_out_error" in model["fitted"]:
-        held = model["fitted/held_out_error"].values
-        yield (
-            "surface BRDF",
-            f"{quantiles(100 * held[np.isfinite(held)])} %",
-            "samples of held-out lights",
-        )
+        held_out = model["fitted/held_out_error"].values
+        error = f"{quantiles(100 * held_out[np.isfinite(held_out)])} %"
+        yield "surface BRDF", error, "samples of held-out lights"
     if summary["sigma_tr_percent"]:
         sites = "; ".join(
-            f"{site} {' '.join(f'{v:+.1f}' for v in by)}"
-            for site, by in summary["sigma_tr_percent"].items()
+            f"{site} {' '.join(f'{v:+.1f}' for v in channels)}"
+            for site, channels in summary["sigma_tr_percent"].items()
         )
         yield "translucency", f"{sites} %", "sigma_tr, R G B"
 
@@ -164,39 +157,29 @@ def of_samples(
     return (stored[at][lit] / true[lit] - 1).ravel()
 
 
-def of_visibility(
-    surfels: xr.Dataset, truth: dict[str, NDArray], dome: DomeRecord
-) -> Iterator[Row]:
+def of_visibility(surfels: xr.Dataset, truth: Truth, dome: DomeRecord) -> Iterator[Row]:
     """Errors of the visibility of light centres and cameras, at the surfels nearest to
     true vertices.
     """
-    vertices = truth["vertices"].astype(float)
-    normals = truth["normals"].astype(float)
-    distance, nearest = cKDTree(surfels["surfel_position"].values).query(
-        vertices, workers=1
-    )
-    same = (distance < NEAR) & (
-        np.einsum("ni,ni->n", surfels["surfel_normal"].values[nearest], normals)
-        > TURNED
-    )
+    true = TrueVisibility(truth)
+    tree = cKDTree(surfels["surfel_position"].values)
+    distance, nearest = tree.query(true.vertices, workers=1)
+    normal = surfels["surfel_normal"].values[nearest]
+    same = distance < NEAR
+    same &= np.einsum("ni,ni->n", normal, true.normals) > TURNED
     for kind, devices in (("light", dome.lights), ("camera", dome.cameras)):
-        share = surfels[f"{kind}_visible_fraction"].values
-        seen = np.unpackbits(truth[f"visible_{kind}"], axis=1).astype(bool)
-        right = pairs = 0
+        fraction = surfels[f"{kind}_visible_fraction"].values
+        right = 0
+        pairs = 0
         for j, device in enumerate(devices):
-            eye = device.position if kind == "light" else -device.R.T @ device.t
-            way = eye - vertices
-            steep = np.einsum("ni,ni->n", way, normals) > STEEP * np.linalg.norm(
-                way, axis=1
-            )
-            at = np.flatnonzero(same & steep)
-            right += int(((share[nearest[at], j] > 0.5) == seen[at, j]).sum())
+            place = device.position if kind == "light" else -device.R.T @ device.t
+            at = np.flatnonzero(same & (true.cosine(place) > STEEP))
+            seen = fraction[nearest[at], j] > 0.5
+            right += int((seen == true.of(kind, j, place)[at]).sum())
             pairs += len(at)
-        yield (
-            f"visibility, {kind}s",
-            f"{100 * (1 - right / pairs):.2f} % wrong",
-            f"{pairs:,} pairs, cosine above {STEEP}",
-        )
+        error = f"{100 * (1 - right / pairs):.2f} % wrong"
+        what = f"{pairs:,} pairs, cosine above {STEEP}"
+        yield f"visibility, {kind}s", error, what
 
 
 def quantiles(x: NDArray) -> str:

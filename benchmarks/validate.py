@@ -20,6 +20,7 @@ import numpy as np
 
 import skindb
 from benchmarks.stages import Stages, stage_lines
+from benchmarks.truth import read_truth
 from skindb.fit import FitParameters
 from skindb.store import Database
 from skindb.virtual.capture import recovered_against_true
@@ -54,10 +55,8 @@ def measure(
     with Stages() as fit:
         report = fit_take(db, take, parameters, progress=fit).provenance
         fit.end("commit")
-    with np.load(folder.with_name(folder.name + ".truth.npz")) as truth:
-        recovered = recovered_against_true(
-            db.read("model", take), dict(truth)
-        ).summary()
+    model = db.read("model", take)
+    recovered = recovered_against_true(model, read_truth(folder)).summary()
     stages = {"ingest": ingest.table(), "fit": fit.table()}
     return {"capture": folder.name, **report, **recovered, "stages": stages}
 

@@ -1,13 +1,12 @@
 """Visibility by rays and by splats: time for all lights and cameras, agreement, and
 error relative to the truth.
 
-    python -m benchmarks visibility CAPTURE [--truth TRUTH.npz] [--spacing 0.4] [--every
-    10] [--picture FILE.png]
+    python -m benchmarks visibility CAPTURE [--truth] [--spacing 0.4] [--every 10]
+    [--picture FILE.png]
 
-CAPTURE is a capture folder; TRUTH has `vertices`, `normals`, `region`, `region_names`
-and `visible_light` (bits for the centres of the lights) of the surface from which it
-was made. Cameras are enlarged to 1300 x 1030 pixels. Every result is one line of JSON,
-with wall time and CPU time, since other programs may be running.
+With `--truth`, what the lights see of the true surface in CAPTURE.truth.npz is compared
+with what they see of the scan. Cameras are enlarged to 1300 x 1030 pixels. Every result
+is one line of JSON, with wall time and CPU time, since other programs may be running.
 """
 
 from __future__ import annotations
@@ -25,6 +24,7 @@ from typing import Annotated, Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from benchmarks.truth import TrueVisibility, Truth, read_truth, regions
 from skindb.format.dome import CameraRecord, LightRecord
 from skindb.format.folder import read_capture
 from skindb.geometry._mesh_kernels import grown, mixed
@@ -53,22 +53,21 @@ HEIGHT = 1030
 def main(
     capture: Path,
     *,
-    truth: Path | None = None,
+    truth: Annotated[bool, "Compare with the true surface."] = False,
     spacing: float = 0.4,
     every: Annotated[int, "Compare every N-th light."] = 10,
     picture: Path | None = None,
 ) -> None:
-    capture = read_capture(capture)
-    dome = capture.dome
-    surfels = build_surfels(capture, spacing_mm=spacing)
+    record = read_capture(capture)
+    dome = record.dome
+    surfels = build_surfels(record, spacing_mm=spacing)
     scene = RayScene(surfels.position, surfels.faces)
     scene.occluded(surfels.position[:1], np.zeros((1, 3)))  # builds the tree
     cameras = [enlarged(camera) for camera in dome.cameras]
-    some = dome.lights[::every]
     timings(surfels, scene, dome.lights, cameras)
-    compare(surfels, scene, some)
+    compare(surfels, scene, dome.lights[::every])
     if truth:
-        against_truth(surfels, scene, dome.lights, every, truth)
+        against_truth(surfels, scene, dome.lights, every, read_truth(capture))
     if picture:
         draw(surfels, scene, dome.lights, picture)
 
@@ -236,80 +235,71 @@ def dense_share(
     )
 
 
+def region_masks(true: TrueVisibility) -> dict[str, Any]:
+    """Masks (v,) of true vertices by region, and of places that are often in shadow."""
+    region = regions(true.truth)
+    down = true.normals[:, 1] < UNDERSIDE
+    masks = {"all": np.ones(len(region), bool)}
+    masks |= {str(name): region == name for name in np.unique(region)}
+    masks["nose, underside"] = (region == "nose") & down
+    below = np.isin(region, ("chin", "jaw", "neck_beard", "neck"))
+    masks["under the chin"] = below & down
+    return masks
+
+
 def against_truth(
     surfels: SurfelSet,
     scene: RayScene,
     lights: tuple[LightRecord, ...],
     every: int,
-    path: Path,
+    truth: Truth,
 ) -> None:
     """Compare both methods with the truth by region, at the surfels nearest to true
     vertices that face the light.
     """
-    truth = np.load(path)
-    vertices = truth["vertices"].astype(float)
-    normals = truth["normals"].astype(float)
-    distance, nearest = cKDTree(surfels.position).query(vertices, workers=1)
-    good = (distance < NEAREST) & (
-        np.einsum("ni,ni->n", surfels.normal[nearest], normals) > TURNED
-    )
+    true = TrueVisibility(truth)
+    distance, nearest = cKDTree(surfels.position).query(true.vertices, workers=1)
+    cosine = np.einsum("ni,ni->n", surfels.normal[nearest], true.normals)
+    good = (distance < NEAREST) & (cosine > TURNED)
     taken = np.unique(nearest[good])
     place = np.searchsorted(taken, nearest)
-    names = [str(n) for n in truth["region_names"]]
-    region = truth["region"]
-    down = normals[:, 1] < UNDERSIDE
-    groups = {name: region == i for i, name in enumerate(names)}
-    groups["nose, underside"] = groups["nose"] & down
-    below = [groups[n] for n in ("chin", "jaw", "neck_beard", "neck") if n in groups]
-    groups["under the chin"] = np.any(below, axis=0) & down
-    groups = {"all": np.ones(len(region), bool)} | groups
+    masks = region_masks(true)
     splats = SplatScene(surfels.position, surfels.normal, surfels.radius)
     # errors of rays, errors of splats, differences between both, pairs
-    wrong = {name: np.zeros(4) for name in groups}
+    wrong = {name: np.zeros(4) for name in masks}
     false = np.zeros((2, 2))  # method, false visible and false hidden
-    bits = truth["visible_light"]
     for j in range(0, len(lights), every):
-        seen = ((bits[:, j // 8] >> (7 - j % 8)) & 1).astype(bool)
         eye = lights[j].position
-        way = eye - vertices
-        at = good & (
-            np.einsum("ni,ni->n", way, normals) > STEEP * np.linalg.norm(way, axis=1)
-        )
+        at = good & (true.cosine(eye) > STEEP)
         front = facing(surfels, eye)[taken] > 0
         rays = front & ~scene.occluded(
             surfels.position[taken], eye[None], normal=surfels.normal[taken]
         )
         drawn = front & (splats.visible_fraction(eye, taken) >= THRESHOLD)
-        of = place[at]
-        both = np.stack([rays[of], drawn[of]])
-        off = both != seen[at]
-        false += np.stack(
-            [(both & ~seen[at]).sum(axis=1), (~both & seen[at]).sum(axis=1)], axis=1
-        )
-        for name, member in groups.items():
-            here = member[at]
-            wrong[name] += [
-                *off[:, here].sum(axis=1),
-                (off[0] != off[1])[here].sum(),
-                here.sum(),
-            ]
+        both = np.stack([rays, drawn])[:, place[at]]
+        seen = true.of("light", j, eye)[at]
+        off = both != seen
+        false += np.stack([(both & ~seen).sum(axis=1), (~both & seen).sum(axis=1)], 1)
+        differ = both[0] != both[1]
+        for name, mask in masks.items():
+            inside = mask[at]
+            counts = [differ[inside].sum(), inside.sum()]
+            wrong[name] += [*off[:, inside].sum(axis=1), *counts]
     total = wrong["all"][3]
-    for i, method in enumerate(("rays", "splats")):
-        say(
-            what="truth",
-            method=method,
-            false_visible=float(false[i, 0] / total),
-            false_hidden=float(false[i, 1] / total),
-        )
-    for name, (r, s, d, n) in wrong.items():
-        if n:
+    for method, (visible, hidden) in zip(
+        ("rays", "splats"), false / total, strict=True
+    ):
+        figures = {"false_visible": float(visible), "false_hidden": float(hidden)}
+        say(what="truth", method=method, **figures)
+    for name, (of_rays, of_splats, differing, pairs) in wrong.items():
+        if pairs:
             say(
                 what="truth",
                 region=name,
-                pairs=int(n),
-                rays=1 - r / n,
-                splats=1 - s / n,
-                each_other=1 - d / n,
+                pairs=int(pairs),
+                rays=1 - of_rays / pairs,
+                splats=1 - of_splats / pairs,
+                each_other=1 - differing / pairs,
             )
 
 

@@ -1,14 +1,13 @@
-"""One measurement of the fit in its own process, by the current code or by an earlier revision.
+"""One measurement of the fit in its own process, by the code on PYTHONPATH.
 
-    PYTHONPATH=REVISION python benchmarks/programs/fit_driver.py ingest DB CAPTURE
-    PYTHONPATH=REVISION python benchmarks/programs/fit_driver.py fit DB TAKE
-    PYTHONPATH=REVISION python benchmarks/programs/fit_driver.py fit-one-thread DB TAKE
-    PYTHONPATH=REVISION python benchmarks/programs/fit_driver.py parts DB TAKE
-    PYTHONPATH=REVISION python benchmarks/programs/fit_driver.py read DB TAKE
+    PYTHONPATH=CODE python benchmarks/programs/fit_driver.py ingest DB CAPTURE
+    PYTHONPATH=CODE python benchmarks/programs/fit_driver.py fit DB TAKE
+    PYTHONPATH=CODE python benchmarks/programs/fit_driver.py fit-one-thread DB TAKE
+    PYTHONPATH=CODE python benchmarks/programs/fit_driver.py parts DB TAKE
+    PYTHONPATH=CODE python benchmarks/programs/fit_driver.py read DB TAKE
 
 `benchmarks/fit.py` and `benchmarks/workers.py` call it. The last printed line is the
-result as JSON. It works with revisions from before and after the fit in two passes
-(df1cf9e).
+result as JSON.
 """
 
 from __future__ import annotations
@@ -27,27 +26,33 @@ from dask.delayed import delayed
 from threadpoolctl import threadpool_limits
 
 import skindb
+from skindb.fit import (
+    FitParameters,
+    estimate_diffuse_reflectance,
+    estimate_normals,
+    fit_surface,
+    reduce_basis,
+)
+from skindb.fit.lumitexels import block_of, disc_angle, lumitexels, take_noise
+from skindb.fit.surface import MIN_SAMPLES, NEEDED, noise_floor, refit_and_evaluate
+from skindb.reflectance.dictionary import disc_dictionary
+from skindb.reflectance.kinds import surface_model
+from skindb.reflectance.mixture import Mixture
+from skindb.reflectance.model import Comparison, Judgement
+from skindb.schema import dataset
+from skindb.workflow import ingest_take
+from skindb.workflow.fit import fit_take
 
-# by its path: `benchmarks` may be that of the earlier revision
+# by its path: `benchmarks` may be that of another revision
 sys.path.append(str(Path(__file__).parents[1]))
 from stages import Stages, peak
-
-try:
-    from skindb.fit import FitParameters
-    from skindb.workflow.fit import fit_take
-
-    TWO_PASSES = True
-except ImportError:  # an earlier revision
-    from skindb.fit import fit_take
-
-    TWO_PASSES = False
 
 SPACING = 1.5  # mm between surfels
 HOLD_OUT = 0.1  # fraction of the lights
 SURFELS = 2048  # for the measurement of parts of the fit
 ROUNDS = 3
 COMPONENTS = 4
-KNOWN = (
+FITTED = (
     "shading_normal",
     "normal_error",
     "diffuse_reflectance",
@@ -57,9 +62,7 @@ KNOWN = (
 
 def ingest(db: Any, capture: str) -> dict[str, Any]:
     """Ingest a capture folder, and return the name of its take."""
-    from skindb.ingest import ingest_capture
-
-    return {"take": ingest_capture(db, Path(capture), spacing_mm=SPACING).take}
+    return {"take": ingest_take(db, Path(capture), spacing_mm=SPACING).take}
 
 
 def fit(db: Any, take: str) -> dict[str, Any]:
@@ -67,10 +70,7 @@ def fit(db: Any, take: str) -> dict[str, Any]:
     peak resident memory.
     """
     with Stages() as stages:
-        if TWO_PASSES:
-            fit_take(db, take, FitParameters(hold_out_lights=HOLD_OUT), progress=stages)
-        else:
-            fit_take(db, take, hold_out_lights=HOLD_OUT, progress=stages)
+        fit_take(db, take, FitParameters(hold_out_lights=HOLD_OUT), progress=stages)
         stages.end("commit")
     return {"stages": stages.table(), "peak": peak()}
 
@@ -98,103 +98,54 @@ def read(db: Any, take: str) -> dict[str, Any]:
 
 def parts(db: Any, take: str) -> dict[str, float]:
     """CPU time per surfel [us] of the parts of a fit, on one thread and on samples in memory."""
-    from skindb.fit import (
-        estimate_diffuse_reflectance,
-        estimate_normals,
-        fit_surface,
-        reduce_basis,
-    )
-    from skindb.fit.lumitexels import lumitexels
-    from skindb.reflectance.mixture import Mixture
-
     dask.config.set(scheduler="synchronous")
     capture = db.read("capture", take)
     whole = lumitexels(capture)
     seen = np.flatnonzero(capture["samples"]["sample_count"].values > 0)
     chosen = seen[np.linspace(0, len(seen) - 1, min(SURFELS, len(seen))).astype(int)]
     work = whole.isel(surfel=chosen).load()
-    spent = {}
-    tables = _tables(whole)
+    spent: dict[str, float] = {}
+    tables = disc_dictionary(None, disc_angle(whole))
 
     def timed(name: str, part: Callable[[], Any]) -> Any:
         part()  # compiles
         times = []
         for _ in range(ROUNDS):
             begin = time.process_time()
-            found = part()
+            result = part()
             times.append(time.process_time() - begin)
         spent[name] = 1e6 * min(times) / len(chosen)
-        return found
+        return result
 
-    fitted = timed("normals", lambda: estimate_normals(work))
-    lit = work.merge(fitted)
-    fitted = fitted.merge(timed("albedo", lambda: estimate_diffuse_reflectance(lit)))
-    known = work.merge(fitted[list(KNOWN)])
-    surface = timed(
-        "dictionary fit",
-        lambda: fit_surface(known, surface=Mixture.of_dictionary(tables)),
-    )
+    normals = timed("normals", lambda: estimate_normals(work))
+    lit = work.merge(normals)
+    albedo = timed("albedo", lambda: estimate_diffuse_reflectance(lit))
+    fitted = work.merge(normals.merge(albedo)[list(FITTED)])
+    mixture = Mixture.of_dictionary(tables)
+    surface = timed("dictionary fit", lambda: fit_surface(fitted, surface=mixture))
     weighted = surface.merge(work[["surfel_area"]])
-    basis = reduce_basis(
-        weighted, dictionary=tables, k=COMPONENTS, rng=np.random.default_rng(0)
-    )
-    held = np.arange(work.sizes["light"]) % round(1 / HOLD_OUT) == 0
-    timed("second pass", _second_pass(known, held, basis))
-    timed("linear refit of 4 components", _linear_refit(known, basis))
+    rng = np.random.default_rng(0)
+    basis = reduce_basis(weighted, dictionary=tables, k=COMPONENTS, rng=rng)
+    timed("second pass", _second_pass(fitted, basis))
+    timed("linear refit of 4 components", _linear_refit(fitted, basis))
     return spent
 
 
-def _tables(whole: xr.Dataset) -> Any:
-    """The dictionary averaged over the disc of the lights."""
-    if TWO_PASSES:
-        from skindb.fit.lumitexels import disc_angle
-        from skindb.reflectance.dictionary import disc_dictionary
-
-        return disc_dictionary(None, disc_angle(whole))
-    from skindb.fit.run import _convolved, _disc_angle
-
-    return _convolved(None, _disc_angle(whole))
-
-
-def _second_pass(
-    known: xr.Dataset, held: np.ndarray, basis: xr.Dataset
-) -> Callable[[], Any]:
+def _second_pass(fitted: xr.Dataset, basis: xr.Dataset) -> Callable[[], Any]:
     """Refit with its errors, held-out errors, and outliers."""
-    if TWO_PASSES:
-        from skindb.fit.surface import refit_and_evaluate
-        from skindb.schema import dataset
-
-        flags = {
-            "light_held_out": held,
-            "camera_held_out": np.zeros(known.sizes["camera"], np.bool_),
-        }
-        held_out = dataset(flags)
-        return lambda: refit_and_evaluate(
-            known, held_out=held_out, basis=basis, mode="perceptual", eta=1.3
-        )
-    from skindb.fit import find_outliers, held_out_error, refit
-
-    work = known.isel(light=~held)
-    away = known.isel(light=held)
-
-    def after() -> None:
-        found = refit(work, basis=basis)
-        held_out_error(away.merge(found[["reduced_weight"]]), basis=basis)
-        find_outliers(work.merge(found[["reduced_weight"]]), basis=basis)
-
-    return after
+    lights = np.arange(fitted.sizes["light"]) % round(1 / HOLD_OUT) == 0
+    cameras = np.zeros(fitted.sizes["camera"], np.bool_)
+    held_out = dataset({"light_held_out": lights, "camera_held_out": cameras})
+    return lambda: refit_and_evaluate(
+        fitted, held_out=held_out, basis=basis, mode="perceptual", eta=1.3
+    )
 
 
-def _linear_refit(known: xr.Dataset, basis: xr.Dataset) -> Callable[[], Any]:
+def _linear_refit(fitted: xr.Dataset, basis: xr.Dataset) -> Callable[[], Any]:
     """Weights and residuals without their errors."""
-    from skindb.fit.lumitexels import block_of, take_noise
-    from skindb.fit.surface import MIN_SAMPLES, NEEDED, noise_floor
-    from skindb.reflectance.kinds import surface_model
-    from skindb.reflectance.model import Comparison, Judgement
-
-    arrays = {name: known[name].values for name in NEEDED}
-    block = block_of(arrays, take_noise(known))
-    comparison = Comparison("linear", 1.3, noise_floor(known), MIN_SAMPLES)
+    arrays = {name: fitted[name].values for name in NEEDED}
+    block = block_of(arrays, take_noise(fitted))
+    comparison = Comparison("linear", 1.3, noise_floor(fitted), MIN_SAMPLES)
     surface = surface_model(basis)
     return lambda: surface.judge(block, comparison, Judgement())
 
