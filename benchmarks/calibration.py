@@ -23,7 +23,7 @@ from skindb.calibration.radiance import frame_mergers, read_view
 from skindb.format.dome import DomeRecord
 from skindb.format.folder import read_capture
 from skindb.geometry.rays import RayScene
-from skindb.ingest.consistency import CalibrationCheck
+from skindb.ingest.consistency import Calibration, CalibrationCheck
 from skindb.ingest.consistency_checks import calibration_faults, calibration_notes
 from skindb.ingest.surfels import (
     SurfelSet,
@@ -61,38 +61,34 @@ def _rows(folder: Path) -> Iterator[list[str]]:
         )
         return np.where((flag == SATURATED)[..., None], np.float32(np.nan), radiance)
 
+    surfels = build_surfels(capture, spacing_mm=SPACING_MM)
     with ThreadPoolExecutor() as pool:
-        for name, planted, surfels, pictures in _cases(
-            dome, build_surfels(capture, spacing_mm=SPACING_MM), picture
-        ):
+        for name, planted, moved, pictures in _cases(dome, surfels, picture):
             intensity = light_intensities(planted, mergers, pool)
-            scene = RayScene(surfels.position, surfels.faces)
-            lit = light_visibility(surfels, planted.lights, scene, pool)
-            _, clear, pixels = camera_visibility(surfels, planted.cameras, scene, pool)
-            check = CalibrationCheck(planted, surfels, lit, clear, pixels, intensity)
-            found = check.evaluate(
+            scene = RayScene(moved.position, moved.faces)
+            lit = light_visibility(moved, planted.lights, scene, pool)
+            _, clear, pixels = camera_visibility(moved, planted.cameras, scene, pool)
+            check = CalibrationCheck(planted, moved, lit, clear, pixels, intensity)
+            result = check.evaluate(
                 {pair: check.reduce(pair[1], pictures(*pair)) for pair in check.pairs}
             )
-            faults = calibration_faults(planted, found)
-            notes = calibration_notes(planted, found)
-            said = (
-                f"refused: {faults[0].found}"
-                if faults
-                else f"warned: {notes[0]}"
-                if notes
-                else "nothing"
-            )
-            agreement = (
-                f"{np.nanmin(found.camera_agreement):.2f}, "
-                f"{np.nanmin(found.light_agreement):.2f}"
-            )
+            agreements = (result.camera_agreement, result.light_agreement)
             yield [
                 folder.name,
                 name,
-                f"{np.nanmax(found.camera_offset):.1f}",
-                agreement,
-                said,
+                f"{np.nanmax(result.camera_offset):.1f}",
+                ", ".join(f"{np.nanmin(values):.2f}" for values in agreements),
+                _message(planted, result),
             ]
+
+
+def _message(dome: DomeRecord, result: Calibration) -> str:
+    """What ingest would say about the calibration."""
+    if faults := calibration_faults(dome, result):
+        return f"refused: {faults[0].found}"
+    if notes := calibration_notes(dome, result):
+        return f"warned: {notes[0]}"
+    return "nothing"
 
 
 def _cases(dome: DomeRecord, surfels: SurfelSet, picture: Pictures) -> Iterator[Case]:
@@ -100,46 +96,54 @@ def _cases(dome: DomeRecord, surfels: SurfelSet, picture: Pictures) -> Iterator[
     the lights.
     """
     yield "-", dome, surfels, picture
-    first, second = dome.cameras[1:3]
+    for name, planted in _planted_cameras(dome):
+        yield name, planted, surfels, picture
+    for name, changed in _planted_pictures(picture):
+        yield name, dome, surfels, changed
+    for name, moved in _planted_scans(surfels):
+        yield name, dome, moved, picture
+    for name, planted in _planted_lights(dome):
+        yield name, planted, surfels, picture
+
+    def exchanged(j: int, c: int) -> Any:
+        return picture({3: 9, 9: 3}.get(j, j), c)
+
+    yield "frames of two lights exchanged", dome, surfels, exchanged
+
+
+def _planted_cameras(dome: DomeRecord) -> Iterator[tuple[str, DomeRecord]]:
+    one, two = dome.cameras[1:3]
+    off_centre = two.K + np.eye(3, k=2) * two.width / 13
     for name, changed in (
-        ("R transposed", replace(second, R=second.R.T)),
-        ("focal length doubled", replace(second, K=_scaled(second.K, 2))),
-        ("focal length 5 % too long", replace(second, K=_scaled(second.K, 1.05))),
-        (
-            "centre off by a 13th of the width",
-            replace(second, K=second.K + np.eye(3, k=2) * second.width / 13),
-        ),
-        ("translation 10 % off", replace(second, t=second.t * 1.1)),
+        ("R transposed", replace(two, R=two.R.T)),
+        ("focal length doubled", replace(two, K=_scaled(two.K, 2))),
+        ("focal length 5 % too long", replace(two, K=_scaled(two.K, 1.05))),
+        ("centre off by a 13th of the width", replace(two, K=off_centre)),
+        ("translation 10 % off", replace(two, t=two.t * 1.1)),
     ):
-        yield name, _with_cameras(dome, {2: changed}), surfels, picture
-    exchanged = {
-        1: replace(first, R=second.R, t=second.t),
-        2: replace(second, R=first.R, t=first.t),
-    }
-    yield "poses exchanged", _with_cameras(dome, exchanged), surfels, picture
+        yield name, _with_cameras(dome, {2: changed})
+    exchanged = {1: replace(one, R=two.R, t=two.t), 2: replace(two, R=one.R, t=one.t)}
+    yield "poses exchanged", _with_cameras(dome, exchanged)
+
+
+def _planted_pictures(picture: Pictures) -> Iterator[tuple[str, Pictures]]:
+    def of_camera_2(change: Callable[[Any], Any]) -> Pictures:
+        return lambda j, c: change(picture(j, c)) if c == 2 else picture(j, c)
+
+    def shift(image: Any) -> Any:
+        return np.roll(image, image.shape[1] // 20, axis=1)
+
     yield (
         "frames of two cameras exchanged",
-        dome,
-        surfels,
         lambda j, c: picture(j, {1: 2, 2: 1}.get(c, c)),
     )
-    for name, turned in (
-        ("pictures upside down", lambda image: image[::-1, ::-1]),
-        ("pictures mirrored", lambda image: image[:, ::-1]),
-        (
-            "pictures shifted by 5 %",
-            lambda image: np.roll(image, image.shape[1] // 20, axis=1),
-        ),
-    ):
-        yield (
-            name,
-            dome,
-            surfels,
-            lambda j, c, turned=turned: (
-                turned(picture(j, c)) if c == 2 else picture(j, c)
-            ),
-        )
-    yield "blue, green, red", dome, surfels, lambda j, c: picture(j, c)[..., ::-1]
+    yield "pictures upside down", of_camera_2(lambda image: image[::-1, ::-1])
+    yield "pictures mirrored", of_camera_2(lambda image: image[:, ::-1])
+    yield "pictures shifted by 5 %", of_camera_2(shift)
+    yield "blue, green, red", lambda j, c: picture(j, c)[..., ::-1]
+
+
+def _planted_scans(surfels: SurfelSet) -> Iterator[tuple[str, SurfelSet]]:
     turn = Rotation.from_euler("y", 5, degrees=True).as_matrix()
     for name, rotation, move in (
         ("scan turned by 5 degrees", turn, [0, 0, 0]),
@@ -148,38 +152,34 @@ def _cases(dome: DomeRecord, surfels: SurfelSet, picture: Pictures) -> Iterator[
         ("scan moved up by 30 mm", np.eye(3), [0, 30, 0]),
         ("scan mirrored", np.diag([-1, 1, 1]), [0, 0, 0]),
     ):
-        faces = (
-            surfels.faces
-            if np.linalg.det(rotation) > 0
-            else surfels.faces[:, ::-1].copy()
-        )
-        position = surfels.position @ rotation.T + move
-        normal = surfels.normal @ rotation.T
+        faces = surfels.faces
+        if np.linalg.det(rotation) < 0:
+            faces = faces[:, ::-1].copy()
         yield (
             name,
-            dome,
-            replace(surfels, position=position, normal=normal, faces=faces),
-            picture,
+            replace(
+                surfels,
+                position=surfels.position @ rotation.T + move,
+                normal=surfels.normal @ rotation.T,
+                faces=faces,
+            ),
         )
+
+
+def _planted_lights(dome: DomeRecord) -> Iterator[tuple[str, DomeRecord]]:
     places = np.array([light.position for light in dome.lights])
-    far = np.linalg.norm(places - places[3], axis=1)
-    near = int(np.argsort(far)[1])
+    distance = np.linalg.norm(places - places[3], axis=1)
+    near = int(np.argsort(distance)[1])
     for name, moved in (
         ("two lights exchanged", {3: places[9], 9: places[3]}),
         ("neighbouring lights exchanged", {3: places[near], near: places[3]}),
         ("a light mirrored", {3: places[3] * [-1, 1, 1]}),
     ):
         lights = tuple(
-            replace(x, position=moved.get(j, x.position))
-            for j, x in enumerate(dome.lights)
+            replace(light, position=moved.get(j, light.position))
+            for j, light in enumerate(dome.lights)
         )
-        yield name, replace(dome, lights=lights), surfels, picture
-    yield (
-        "frames of two lights exchanged",
-        dome,
-        surfels,
-        lambda j, c: picture({3: 9, 9: 3}.get(j, j), c),
-    )
+        yield name, replace(dome, lights=lights)
 
 
 def _scaled(K: Any, factor: float) -> Any:

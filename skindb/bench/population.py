@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from importlib.util import find_spec
 
 import numpy as np
 from scipy import stats
@@ -13,6 +14,7 @@ from skindb.bench.curve import Curve, Point, cpu_time
 from skindb.numerics.factorise import principal_axes
 from skindb.numerics.inference import permutation_p
 from skindb.numerics.texture import (
+    LEVELS,
     build,
     image_parts,
     level_fractions,
@@ -28,7 +30,7 @@ AXES = 5
 
 def pyramid_curves(quick: bool) -> list[Curve]:
     """Round trip of images of several sizes in both precisions, relative to a Fourier
-    transform and its inverse.
+    transform and its inverse, and of pyrtools if it is installed.
     """
     points = []
     for size in (256, 512) if quick else (512, 1024, 2048):
@@ -42,6 +44,9 @@ def pyramid_curves(quick: bool) -> list[Curve]:
             seconds, back = cpu_time(work, size**2)
             typed = f"{setting}, {dtype.__name__}"
             points.append(Point("skindb", typed, seconds, _largest(back - image)))
+        if find_spec("pyrtools"):
+            seconds, back = cpu_time(partial(_round_trip_of_pyrtools, image), size**2)
+            points.append(Point("pyrtools", setting, seconds, _largest(back - image)))
     error = "largest error of a round trip"
     return [Curve("pyramid", error, "the image", "an entry", points[0].name, points)]
 
@@ -52,6 +57,16 @@ def _fourier_round_trip(image: Array) -> Array:
 
 def _pyramid_round_trip(image: Array) -> Array:
     return reconstruct(build(image))
+
+
+def _round_trip_of_pyrtools(image: Array) -> Array:
+    from pyrtools.pyramids import (  # type: ignore[import-untyped]
+        SteerablePyramidFreq,
+    )
+
+    height = min(LEVELS, int(np.log2(len(image))) - 2)  # it takes no more
+    pyramid = SteerablePyramidFreq(image, height=height, order=3)
+    return np.asarray(pyramid.recon_pyr())
 
 
 def textures_curves(quick: bool) -> list[Curve]:
