@@ -8,8 +8,7 @@ from pathlib import Path
 
 import skindb
 from skindb.cli import _one_line
-from skindb.cli.progress import Progress
-from skindb.cli.terminal import echo
+from skindb.cli.terminal import Progress, echo
 from skindb.errors import SkindbWarning
 
 sys.path.insert(0, str(Path(__file__).parent / "store"))

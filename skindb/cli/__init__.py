@@ -14,19 +14,16 @@ from typing import Any, NoReturn, TextIO
 import click
 
 import skindb
-from skindb.cli.backups import backup, restore
-from skindb.cli.capture import calibrate, capture
 from skindb.cli.captures import demo, ingest, simulate
 from skindb.cli.fitting import dictionary_command, fit
-from skindb.cli.landmarks import landmarks
-from skindb.cli.pictures import compare, export, render, show
+from skindb.cli.laboratory import calibrate, capture, landmarks
+from skindb.cli.pictures import compare, export, render, show, view
 from skindb.cli.population import edit, register
 from skindb.cli.shared import echo_json, fault_lines
 from skindb.cli.studies import analyze
 from skindb.cli.subjects import consent, refresh, release, withdraw
 from skindb.cli.terminal import echo
-from skindb.cli.upkeep import audit, bench, clean, info, verify
-from skindb.cli.view import view
+from skindb.cli.upkeep import audit, backup, bench, clean, info, restore, verify
 from skindb.errors import Fault, InputError, SkindbWarning, escaped, system_fault
 from skindb.files import private_umask
 

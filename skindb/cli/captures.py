@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import skindb
-from skindb.cli.engine import SCHEDULER, shared_path
 from skindb.cli.options import (
     DB,
     PATH,
@@ -24,8 +23,15 @@ from skindb.cli.options import (
     common,
     options_of,
 )
-from skindb.cli.shared import bar, calibration_lines, each_take, emit, summary_of
-from skindb.cli.terminal import echo
+from skindb.cli.shared import (
+    SCHEDULER,
+    calibration_lines,
+    each_take,
+    emit,
+    shared_path,
+    summary_of,
+)
+from skindb.cli.terminal import bar, echo
 from skindb.errors import Fault, InputError
 from skindb.limits import MAX_COHORT, MAX_DEMO_TAKES
 from skindb.parameters import (

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import skindb
-from skindb.cli.engine import SCHEDULER, shared_path
 from skindb.cli.options import (
     DB,
     DICTIONARY,
@@ -22,8 +21,16 @@ from skindb.cli.options import (
     common,
     options_of,
 )
-from skindb.cli.shared import aligned, bar, each_take, emit, existing, summary_of
-from skindb.cli.terminal import echo
+from skindb.cli.shared import (
+    SCHEDULER,
+    aligned,
+    each_take,
+    emit,
+    existing,
+    shared_path,
+    summary_of,
+)
+from skindb.cli.terminal import bar, echo
 from skindb.errors import Fault
 from skindb.parameters import FitParameters
 

@@ -1,4 +1,4 @@
-"""Commands that draw or export models: render, compare, show, export."""
+"""Commands that draw, show or export models: render, compare, show, export, view."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from typing import Any
 import click
 
 import skindb
-from skindb.cli.engine import SCHEDULER, shared_path
 from skindb.cli.options import (
     DB,
     GENERATION,
     PATH,
+    PORT,
     TAKE,
     WORKERS,
     asked,
@@ -22,17 +22,26 @@ from skindb.cli.options import (
     options_of,
 )
 from skindb.cli.shared import (
+    SCHEDULER,
     aligned,
-    bar,
     chosen_takes,
     each_take,
     emit,
     existing,
     require_one_take,
+    serve,
+    shared_path,
+    trait_amounts,
     writable,
 )
+from skindb.cli.terminal import bar
 from skindb.errors import Fault, InputError
-from skindb.parameters import ComparisonParameters, ExportParameters, RenderParameters
+from skindb.parameters import (
+    ComparisonParameters,
+    ExportParameters,
+    RenderParameters,
+    ViewParameters,
+)
 
 TAKES = click.argument("takes", metavar="[TAKE...]", nargs=-1)
 
@@ -267,3 +276,64 @@ def _label(text: str) -> tuple[str, str]:
             f"--at needs DIMENSION=LABEL, such as channel=G; found {text!r}"
         )
     return name, label
+
+
+@click.command()
+@DB
+@click.argument("takes", metavar="[TAKE...]", nargs=-1)
+@click.option(
+    "--out",
+    type=PATH,
+    help="Self-contained page of one take (.html), or folder for the page of several.",
+)
+@options_of(ViewParameters)
+@PORT
+@click.option(
+    "--explain",
+    is_flag=True,
+    help="Only report what the pages skip and approximate, with error bounds.",
+)
+@common
+def view(
+    db: str,
+    takes: tuple[str, ...],
+    out: Path | None,
+    port: int,
+    explain: bool,
+    parameters: ViewParameters,
+) -> None:
+    """Show models in a browser, to turn, light and edit them.
+
+    By default all models are shown. With --out, the page is written. Otherwise the
+    printed address opens it, once, in one browser of this machine, until Ctrl-C ends
+    the server.
+    """
+    amounts = trait_amounts(parameters.traits, default=1.0)
+    if 0.0 in amounts.values():
+        rule = "the amount at the end of a slider must not be 0"
+        raise InputError(Fault("--trait", rule, "0", "give, for example, age=20"))
+    database = existing(db)
+    chosen = chosen_takes(database, takes, "model")
+    if explain:
+        with skindb.workflow.logged_action(database, "view", chosen, explain=True):
+            skipped = {
+                take: skindb.workflow.explain_view(database, take, traits=amounts)
+                for take in chosen
+            }
+        lines = [f"{take}: {line}" for take, lines in skipped.items() for line in lines]
+        emit(skipped, lines)
+        return
+    options = {**vars(parameters), "traits": amounts, "progress": bar()}
+    if out is None:
+        server = skindb.workflow.view_server(database, chosen, port=port, **options)
+        serve(server, takes=chosen)
+        return
+    if out.suffix == ".html":
+        require_one_take(out, chosen)
+    report = skindb.workflow.view_takes(database, chosen, out, **options)
+    page = (
+        report["path"]
+        if out.suffix
+        else f"{out / 'index.html'}: serve the folder to open it"
+    )
+    emit(report, [page])

@@ -8,9 +8,17 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import skindb
-from skindb.cli.engine import SCHEDULER, client_of
 from skindb.cli.options import DB, PATH, TAKE, WORKERS, common, options_of
-from skindb.cli.shared import aligned, bar, emit, existing, trait_amounts, writable
+from skindb.cli.shared import (
+    SCHEDULER,
+    aligned,
+    client_of,
+    emit,
+    existing,
+    trait_amounts,
+    writable,
+)
+from skindb.cli.terminal import bar
 from skindb.parameters import EditParameters
 
 if TYPE_CHECKING:

@@ -20,9 +20,17 @@ import click
 
 import skindb
 from skindb import parameters as parameter_module
-from skindb.cli.engine import SCHEDULER, client_of, shared_path
 from skindb.cli.options import DB, PATH, common, options_of
-from skindb.cli.shared import aligned, bar, emit, existing, writable
+from skindb.cli.shared import (
+    SCHEDULER,
+    aligned,
+    client_of,
+    emit,
+    existing,
+    shared_path,
+    writable,
+)
+from skindb.cli.terminal import bar
 from skindb.files import csv_text, private_file
 
 if TYPE_CHECKING:

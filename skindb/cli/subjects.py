@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import skindb
-from skindb.cli.engine import SCHEDULER, client_of, shared_path
 from skindb.cli.options import DB, DICTIONARY, PATH, WAIT, WORKERS, common
-from skindb.cli.shared import bar, emit, existing
-from skindb.cli.terminal import confirm, echo
+from skindb.cli.shared import SCHEDULER, client_of, emit, existing, shared_path
+from skindb.cli.terminal import bar, confirm, echo
 from skindb.errors import Fault, InputError
 
 if TYPE_CHECKING:

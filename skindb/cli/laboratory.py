@@ -1,4 +1,4 @@
-"""Commands for the laboratory: capture, calibrate."""
+"""Commands for the laboratory: capture, calibrate, landmarks."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 import skindb
-from skindb.cli.options import DB, PATH, common, options_of
-from skindb.cli.shared import bar, emit
-from skindb.cli.terminal import wait_for_enter
+from skindb.cli.options import DB, PATH, PORT, common, options_of
+from skindb.cli.shared import emit, serve, writable
+from skindb.cli.terminal import bar, wait_for_enter
 from skindb.parameters import CalibrationParameters, SessionParameters
 
 if TYPE_CHECKING:
@@ -156,3 +156,25 @@ def _camera_lines(calibrated: dict[str, Any]) -> list[str]:
         f"{name} of {figures['cameras']} cameras: {words[name].format(**figures)}"
         for name, figures in calibrated.items()
     ]
+
+
+@click.command()
+@click.argument("scan", type=PATH)
+@click.option(
+    "--out",
+    type=PATH,
+    default=Path("landmarks.json"),
+    help="File for the landmarks (.json).",
+)
+@PORT
+@common
+def landmarks(scan: Path, out: Path, port: int) -> None:
+    """Set the 20 landmarks and a crop box on a scan in a browser.
+
+    The scan is a .ply or .obj file. The printed address opens the page, once, in one
+    browser of this machine; Ctrl-C ends it. If the file exists, its landmarks are
+    loaded. The crop box is written beside it, to a file that ends in .crop.json, by
+    which skindb ingest crops the scan.
+    """
+    writable(out, ".json")
+    serve(skindb.workflow.landmark_page(scan, out, port=port), out=str(out))
