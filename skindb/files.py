@@ -1,32 +1,24 @@
 """Files: opens only regular files of limited size, creates private folders, writes tables as
-comma-separated values, and caches tables on disk that take seconds to compute and do not
-depend on measured data.
+comma-separated values, and converts values to JSON.
 """
 
 from __future__ import annotations
 
 import csv
-import hashlib
 import io
-import json
 import math
 import os
 import re
-import shutil
 import stat
-import uuid
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from importlib.util import find_spec
 from io import BufferedReader
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
-from skindb.threads import one_blas_thread
 
 PRIVATE = 0o700  # permissions of folders with personal data
 PRIVATE_FILE = 0o600  # and of files
@@ -42,9 +34,6 @@ KINDS = (
     (stat.S_ISCHR, "a device"),
     (stat.S_ISBLK, "a device"),
 )
-Arrays = dict[str, NDArray[Any]]
-MAX_ENTRIES = 8  # per name; the oldest are removed
-SUMS = "sums.json"  # digests of the files of an entry
 
 
 def open_regular(path: Path, max_bytes: int) -> BufferedReader:
@@ -224,107 +213,3 @@ def plain(value: Any) -> Any:
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return value if value is None or isinstance(value, bool | int | str) else str(value)
-
-
-def cache_folder() -> Path | None:
-    """Folder SKINDB_CACHE, or `skindb` in the user's cache folder; None if SKINDB_CACHE
-    is empty.
-    """
-    named = os.environ.get("SKINDB_CACHE")
-    if named is not None:
-        return Path(named) if named else None
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "skindb"
-
-
-def cached_arrays(
-    name: str,
-    arguments: tuple[Any, ...],
-    *,
-    sources: tuple[str, ...],
-    make: Callable[[], Mapping[str, NDArray[Any]]],
-) -> Arrays:
-    """Result of `make`, from the cache if available.
-
-    Parameters
-    ----------
-    name
-        Name of the tables.
-    arguments
-        Arguments on which the tables depend; their `repr` must distinguish all values.
-    sources
-        Names of the modules that compute the tables; if their source changes, the
-        tables are computed again.
-    make
-        Function without arguments that returns arrays by name.
-
-    Returns
-    -------
-    dict
-        Read-only arrays, memory-mapped if there is a cache. Files whose digests do not
-        match are computed again; a cache that cannot be written is ignored.
-    """
-    folder = cache_folder()
-    if folder is None:
-        return dict(make())
-    place = folder / f"{name}-{_key(arguments, sources)}"
-    stored = _read(place)
-    if stored is not None:
-        return stored
-    with one_blas_thread():
-        arrays = {key: np.asarray(array, order="C") for key, array in make().items()}
-    try:
-        _write(place, arrays)
-        _remove_oldest(folder, name)
-    except OSError:
-        return arrays
-    return _read(place) or arrays
-
-
-def _key(arguments: tuple[Any, ...], sources: tuple[str, ...]) -> str:
-    digest = hashlib.sha256(repr((arguments, np.__version__)).encode())
-    for source in sources:
-        spec = find_spec(source)
-        assert spec is not None
-        assert spec.origin is not None
-        digest.update(Path(spec.origin).read_bytes())
-    return digest.hexdigest()[:24]
-
-
-def _read(place: Path) -> Arrays | None:
-    """The arrays of an entry; None if it is missing or damaged."""
-    try:
-        sums = json.loads((place / SUMS).read_text(encoding="utf-8"))
-        if any(_digest(place / f"{key}.npy") != digest for key, digest in sums.items()):
-            return None
-        return {
-            key: np.asarray(np.load(place / f"{key}.npy", mmap_mode="r"))
-            for key in sums
-        }
-    except (OSError, ValueError, AttributeError, EOFError):
-        return None
-
-
-def _write(place: Path, arrays: Arrays) -> None:
-    """Write an entry to a temporary folder and rename it, so that it is complete or absent."""
-    staged = place.with_name(f".{uuid.uuid4().hex}")
-    try:
-        make_private(staged)
-        for key, array in arrays.items():
-            np.save(private_file(staged / f"{key}.npy"), array)
-        sums = {key: _digest(staged / f"{key}.npy") for key in arrays}
-        private_file(staged / SUMS).write_text(json.dumps(sums), encoding="utf-8")
-        shutil.rmtree(place, ignore_errors=True)  # a damaged entry
-        staged.rename(place)
-    finally:
-        shutil.rmtree(staged, ignore_errors=True)
-
-
-def _remove_oldest(folder: Path, name: str) -> None:
-    entries = sorted(folder.glob(f"{name}-*"), key=lambda place: place.stat().st_mtime)
-    for place in entries[:-MAX_ENTRIES]:
-        shutil.rmtree(place, ignore_errors=True)
-
-
-def _digest(path: Path) -> str:
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()

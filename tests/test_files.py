@@ -13,7 +13,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skindb.files import MAX_ENTRIES, cache_folder, cached_arrays, csv_text
+from skindb.cache import MAX_ENTRIES, cache_folder, cached_arrays
+from skindb.files import csv_text
 
 FORMULAS = [
     "=1+1",
@@ -37,7 +38,7 @@ FORMULAS = [
     "+1 555 0100",
     "-0,5",
 ]
-SOURCES = ("skindb.files",)
+SOURCES = ("skindb.cache",)
 
 
 def read(text):

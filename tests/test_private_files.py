@@ -16,8 +16,9 @@ from permissions import open_to_others, open_umask
 from small_face import small_face
 
 import skindb
+from skindb.cache import cached_arrays
 from skindb.cli import main
-from skindb.files import cached_arrays, private_file, private_umask
+from skindb.files import private_file, private_umask
 from skindb.format.frames import write_frame
 from skindb.geometry.scan import Crop
 from skindb.reflectance.dictionary import embedded_dictionary
@@ -113,7 +114,7 @@ def write_captures(out, model):
 
 def write_cache(out, model):
     os.environ["SKINDB_CACHE"] = str(out / "cache/skindb")
-    cached_arrays("x", (1,), sources=("skindb.files",), make=lambda: {"a": np.zeros(3)})
+    cached_arrays("x", (1,), sources=("skindb.cache",), make=lambda: {"a": np.zeros(3)})
 
 
 WRITERS = (

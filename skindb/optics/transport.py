@@ -42,7 +42,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import RectBivariateSpline, make_interp_spline
 from scipy.special import gammaln, k0e, lpmv
 
-from skindb.files import cached_arrays
+from skindb.cache import cached_arrays
 from skindb.optics._walk_kernels import walk
 from skindb.optics.fresnel import fresnel_reflectance
 from skindb.types import Array, Index, Mask, float64

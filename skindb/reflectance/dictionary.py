@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from skindb.cache import cached_arrays
 from skindb.errors import Fault, InputError
-from skindb.files import cached_arrays
 from skindb.optics.angles import directions, half_difference
 from skindb.reflectance import _row_kernels
 from skindb.reflectance.abc_low2012 import PARAMETERS, evaluate_abc

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb.files import cached_arrays
+from skindb.cache import cached_arrays
 from skindb.optics.angles import directions
 from skindb.reflectance.dictionary import SOURCES, Dictionary
 from skindb.reflectance.tables import Table, TableGrid, brdf_metric

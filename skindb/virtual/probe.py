@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb.files import cached_arrays, private_file
+from skindb.cache import cached_arrays
+from skindb.files import private_file
 from skindb.optics.transport import Walk, radial_profile, random_walk
 from skindb.virtual.dome import Sensor, write_png
 from skindb.virtual.skin import Site
