@@ -6,12 +6,14 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 import math
 import os
 import re
 import stat
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from importlib import resources
 from io import BufferedReader
 from pathlib import Path
 from typing import Any
@@ -213,3 +215,8 @@ def plain(value: Any) -> Any:
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return value if value is None or isinstance(value, bool | int | str) else str(value)
+
+
+def package_json(package: str, name: str) -> Any:
+    """Content of a JSON file that stands beside the modules of a package."""
+    return json.loads((resources.files(package) / name).read_text(encoding="utf-8"))

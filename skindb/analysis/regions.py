@@ -8,95 +8,17 @@ regions are an addition.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 
 import numpy as np
 import xarray as xr
 
+from skindb.files import package_json
 from skindb.schema.label import FACE
 from skindb.types import Array, Mask
 
 Corner = tuple[str, float, float]
 
-# Outlines from the middle of the top along the subject's right side to the middle of
-# the bottom; the left side is mirrored. A corner is a landmark with an offset to the
-# subject's left, as a fraction of the width between the outer corners of the eyes, and
-# an offset down, as a fraction of the height from nasion to chin.
-_MIDDLE: dict[str, tuple[Corner, ...]] = {
-    "lips": (
-        ("lip_upper", 0, -0.03),
-        ("lip_upper", -0.17, 0),
-        ("mouth_corner_right", -0.02, -0.01),
-        ("mouth_corner_right", 0, 0.03),
-        ("lip_lower", -0.2, -0.02),
-        ("lip_lower", 0, 0),
-    ),
-    "nose": (
-        ("nasion", 0, -0.05),
-        ("nasion", -0.11, -0.02),
-        ("nose_tip", -0.23, 0),
-        ("ala_right", -0.06, -0.09),
-        ("ala_right", -0.04, 0.02),
-        ("subnasale", -0.13, 0.03),
-        ("subnasale", 0, 0.02),
-    ),
-    "chin": (
-        ("lip_lower", 0, 0),
-        ("mouth_corner_right", -0.1, 0.03),
-        ("mouth_corner_right", -0.07, 0.25),
-        ("chin", -0.40, 0.13),
-        ("chin", 0, 0.16),
-    ),
-    "forehead": (
-        ("forehead_centre", 0, -0.19),
-        ("forehead_right", 0, -0.22),
-        ("forehead_right", -0.24, -0.1),
-        ("brow_right", -0.39, 0.04),
-        ("brow_right", 0, -0.07),
-        ("nasion", 0, -0.25),
-    ),
-    "neck": (
-        ("chin", 0, 0.17),
-        ("chin", -0.4, 0.16),
-        ("jaw_right", -0.16, 0.26),
-        ("jaw_right", -0.8, 0.26),
-        ("jaw_right", -0.8, 1.2),
-        ("chin", 0, 1.2),
-    ),
-    "beard": (
-        ("subnasale", 0, 0.02),
-        ("subnasale", -0.2, 0.04),
-        ("mouth_corner_right", -0.1, -0.07),
-        ("jaw_right", -0.05, -0.4),
-        ("jaw_right", -0.2, -0.57),
-        ("jaw_right", -0.46, -0.3),
-        ("jaw_right", -0.24, 0.14),
-        ("chin", -0.4, 0.38),
-        ("chin", 0, 0.4),
-    ),
-}
-# closed outlines on the subject's right side; the left side is mirrored
-_SIDE: dict[str, tuple[Corner, ...]] = {
-    "eyelid": (
-        ("eye_inner_right", 0.07, 0.03),
-        ("eye_inner_right", 0.09, -0.11),
-        ("eye_inner_right", -0.12, -0.14),
-        ("eye_outer_right", -0.06, -0.11),
-        ("eye_outer_right", -0.14, -0.01),
-        ("eye_outer_right", -0.07, 0.11),
-        ("eye_inner_right", -0.17, 0.17),
-        ("eye_inner_right", -0.04, 0.13),
-    ),
-    "cheek": (
-        ("nose_tip", -0.28, -0.05),
-        ("eye_outer_right", 0.05, 0.13),
-        ("eye_outer_right", -0.14, 0.05),
-        ("eye_outer_right", -0.26, 0.03),
-        ("eye_outer_right", -0.39, 0.23),
-        ("ala_right", -0.38, 0.03),
-        ("ala_right", -0.1, 0.08),
-        ("ala_right", -0.07, -0.09),
-    ),
-}
 FINE = (
     "lips",
     "eyelid",
@@ -216,38 +138,51 @@ def mask_agreement(mask: Mask, other: Mask, area: Array) -> float:
     return float(area[mask & other].sum()) / either if either else float("nan")
 
 
+@cache
+def _outlines() -> dict[str, dict[str, list[Corner]]]:
+    """Outlines "middle" and "side" by the names of the regions.
+
+    Those of the middle run from the middle of the top along the subject's right side to
+    the middle of the bottom; those of the side are closed. Both are mirrored to the
+    left. A corner is a landmark with an offset to the subject's left, as a fraction of
+    the width between the outer corners of the eyes, and an offset down, as a fraction
+    of the height from nasion to chin.
+    """
+    outlines: dict[str, dict[str, list[Corner]]]
+    outlines = package_json("skindb.analysis", "regions.json")
+    return outlines
+
+
 def _region_mask(name: str, uv: Array, landmarks: Mapping[str, Array]) -> Mask | None:
     """Mask (n,) of one region on both sides of the face; None if a landmark is missing."""
+    middle = _outlines()["middle"].get(name)
+    outline = middle or _outlines()["side"][name]
     try:
-        right = _corners(
-            _MIDDLE.get(name, _SIDE.get(name, ())), landmarks, mirror=False
-        )
-        left_corners = _corners(
-            _MIDDLE.get(name, _SIDE.get(name, ())), landmarks, mirror=True
-        )
+        right = _corners(outline, landmarks, mirror=False)
+        left = _corners(outline, landmarks, mirror=True)
     except KeyError:
         return None
-    if name in _MIDDLE:
-        return inside_outline(uv, np.concatenate([right, left_corners[::-1]]))
-    return inside_outline(uv, right) | inside_outline(uv, left_corners)
+    if middle:
+        return inside_outline(uv, np.concatenate([right, left[::-1]]))
+    return inside_outline(uv, right) | inside_outline(uv, left)
 
 
 def _corners(
-    outline: tuple[Corner, ...], landmarks: Mapping[str, Array], *, mirror: bool
+    outline: list[Corner], landmarks: Mapping[str, Array], *, mirror: bool
 ) -> Array:
     """Corners (m, 2) of an outline on the subject's right side, or mirrored to the left."""
     across = landmarks["eye_outer_left"] - landmarks["eye_outer_right"]
     down = landmarks["chin"] - landmarks["nasion"]
     if mirror:
         across = -across
-        outline = tuple(
-            (name.replace("_right", "_left"), right, below)
-            for name, right, below in outline
-        )
+        outline = [
+            (name.replace("_right", "_left"), left, below)
+            for name, left, below in outline
+        ]
     return np.array(
         [
-            landmarks[name] + right * across + below * down
-            for name, right, below in outline
+            landmarks[name] + left * across + below * down
+            for name, left, below in outline
         ]
     )
 

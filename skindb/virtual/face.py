@@ -333,58 +333,50 @@ def region_membership(points: Array, shape: FaceShape) -> dict[str, Array]:
     x = np.abs(points[:, 0]) / s.width
     y = points[:, 1] / s.height
     z = points[:, 2]
-    tip = s.nose_tip
-    mouth = s.mouth_height
-    front = _soft(z - 20, 12)
-    down = np.clip((44 - y) / (44 - tip[1] + 14), 0, 1)
-    nose_half = 7.0 + (s.nose_width - 0.5) * down**1.6
-    nose = (
-        _soft(nose_half - x, 3)
-        * _soft(46 - y, 5)
-        * _soft(y - tip[1] + 17.0, 2)
-        * _soft(z - 90, 6)
-    )
+    nose = _nose_region(x, y, z, s)
     lips = _lips(x, y, z, s)
-    neck = _soft(-88 + 0.62 * (95 - z) * 0.5 - y, 6) * front**0
-    chin = (
-        _soft(22 - np.hypot(x * 0.85, (y + 72) * 1.0), 5)
-        * _soft(z - 70, 8)
-        * (1 - neck)
-        * (1 - lips)
-    )
-    forehead = _soft(y - 66, 6) * _soft(66 - x, 10) * front
+    neck = _soft(-88 + 0.62 * (95 - z) * 0.5 - y, 6)
+    chin = _soft(22 - np.hypot(x * 0.85, (y + 72) * 1.0), 5) * _soft(z - 70, 8)
+    eyelid = _soft(1 - np.hypot((x - s.eye_distance) / 17, (y - 32) / 9), 0.25)
+    eyelid = eyelid * _soft(z - 60, 8)
     oval = 1 - np.hypot((y + 14) / 38, (z - 72) / 52)
     cheek = _soft(oval, 0.2) * _soft(x - 19 - 0.22 * np.maximum(-8 - y, 0), 5)
-    brow = (
-        _soft(3.6 - np.abs(y - _brow_height(x, s)), 2.2)
-        * _soft(19.5 - np.abs(x - 32), 5)
-        * _soft(z - 50, 8)
+    brow = _soft(3.6 - np.abs(y - _brow_height(x, s)), 2.2)
+    lower = _soft(-12 - y + 0.35 * np.maximum(x - 40, 0), 7) * _soft(y + 100, 10)
+    hairless = _hairless_cheek(x, y, s.mouth_height)
+    fields = {
+        "forehead": _soft(y - 66, 6) * _soft(66 - x, 10) * _soft(z - 20, 12),
+        "nose": nose,
+        "cheek": cheek * (1 - nose) * (1 - eyelid),
+        "lips": lips,
+        "chin": chin * (1 - neck) * (1 - lips),
+        "neck": neck,
+        "beard": lower * (1 - lips) * (1 - nose) * _soft(z - 25, 10) * (1 - hairless),
+        "brow": brow * _soft(19.5 - np.abs(x - 32), 5) * _soft(z - 50, 8),
+        "eyelid": eyelid,
+        "lash": _lashes(points, s),
+    }
+    return {name: fields[name] for name in REGIONS}
+
+
+def _nose_region(x: Array, y: Array, z: Array, s: FaceShape) -> Array:
+    """The nose, which widens from its root to the wings."""
+    tip = s.nose_tip[1]
+    down = np.clip((44 - y) / (44 - tip + 14), 0, 1)
+    half_width = 7.0 + (s.nose_width - 0.5) * down**1.6
+    return (
+        _soft(half_width - x, 3)
+        * _soft(46 - y, 5)
+        * _soft(y - tip + 17.0, 2)
+        * _soft(z - 90, 6)
     )
-    eyelid = _soft(1 - np.hypot((x - s.eye_distance) / 17, (y - 32) / 9), 0.25) * _soft(
-        z - 60, 8
-    )
-    lower = (
-        _soft(-12 - y + 0.35 * np.maximum(x - 40, 0), 7)
-        * _soft(-26 - mouth + 0 * x + 90, 1)
-        * _soft(y + 100, 10)
-    )
-    beard = (
-        lower * (1 - lips) * (1 - nose) * _soft(z - 25, 10) * _moustache(x, y, mouth)
-    )
-    cheek = cheek * (1 - nose) * (1 - eyelid)
-    fields = (
-        forehead,
-        nose,
-        cheek,
-        lips,
-        chin,
-        neck,
-        beard,
-        brow,
-        eyelid,
-        _lashes(points, s),
-    )
-    return dict(zip(REGIONS, fields, strict=True))
+
+
+def _hairless_cheek(x: Array, y: Array, mouth: float) -> Array:
+    """1 in the centre of the cheeks and below the outer sides of the nose, where no
+    beard grows.
+    """
+    return _soft(16 - np.hypot((x - 36) * 0.8, (y - mouth - 16) * 1.0), 6)
 
 
 def _lips(x: Array, y: Array, z: Array, s: FaceShape) -> Array:
@@ -408,14 +400,6 @@ def _lips(x: Array, y: Array, z: Array, s: FaceShape) -> Array:
 
 def _brow_height(x: Array, s: FaceShape) -> Array:
     return np.asarray(58.0 + 2.0 * s.brow - 0.012 * (x - 34) ** 2)
-
-
-def _moustache(x: Array, y: Array, mouth: float) -> Array:
-    """1 where hair grows, which excludes the centre of the cheeks and the area below
-    the outer sides of the nose.
-    """
-    free = _soft(16 - np.hypot((x - 36) * 0.8, (y - mouth - 16) * 1.0), 6)
-    return np.asarray(1 - free)
 
 
 def _lashes(points: Array, shape: FaceShape) -> Array:

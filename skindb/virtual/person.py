@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from skindb.files import package_json
 from skindb.parameters import CONDITIONS
 from skindb.virtual.face import FaceShape
 
@@ -72,55 +75,7 @@ class Person:
 
 def default_people() -> tuple[Person, ...]:
     """The demo's eight takes: six subjects, the first of them also under lotion and powder."""
-    base = Person(
-        "V001",
-        31,
-        "female",
-        "european",
-        11,
-        freckles=0.5,
-        melanin=-0.3,
-        blood=0.3,
-        fullness=0.45,
-    )
-    return (
-        base,
-        replace(base, condition="lotion"),
-        replace(base, condition="powder"),
-        Person(
-            "V002",
-            46,
-            "male",
-            "european",
-            22,
-            beard_density=0.75,
-            melanin=0.5,
-            blood=0.6,
-            fullness=0.55,
-        ),
-        Person(
-            "V003",
-            27,
-            "male",
-            "african",
-            33,
-            beard_density=0.35,
-            melanin=0.3,
-            fullness=0.4,
-        ),
-        Person("V004", 38, "female", "east_asian", 44, melanin=-0.2, fullness=0.6),
-        Person(
-            "V005",
-            67,
-            "male",
-            "south_asian",
-            55,
-            beard_density=0.55,
-            melanin=0.2,
-            fullness=0.3,
-        ),
-        Person("V006", 22, "female", "african", 66, melanin=-0.9, fullness=0.7),
-    )
+    return tuple(Person(**row) for row in _tables()["demo"])
 
 
 def cohort_people(
@@ -186,59 +141,29 @@ def face_shape(person: Person) -> FaceShape:
     reports (Farkas 1994); they give the virtual population variety and are no claim
     about anyone.
     """
-    z = person.stream(1).standard_normal(18)
-    male = 1.0 if person.gender == "male" else 0.0
-    african = float(person.ancestry == "african")
-    asian = float(person.ancestry == "east_asian")
-    south = float(person.ancestry == "south_asian")
-    age = np.clip((person.age - 30) / 45, 0, 1)
-    child = np.clip((18 - person.age) / 10, 0, 1)
-    return FaceShape(
-        width=0.965 + 0.03 * male + 0.025 * asian - 0.05 * child + 0.016 * z[0],
-        height=0.955 + 0.045 * male - 0.08 * child + 0.018 * z[1],
-        jaw_width=50.5 + 4.5 * male + 1.5 * z[2],
-        chin_forward=-1.5 + 3.0 * male - 1.0 * african + 1.2 * z[3],
-        chin_width=13.0 + 4.0 * male + 1.2 * z[4],
-        nose_length=-1.2
-        + 2.2 * male
-        - 1.0 * african
-        - 1.0 * asian
-        + 2.5 * age
-        - 2.5 * child
-        + 1.0 * z[5],
-        nose_height=0.4
-        + 1.2 * male
-        - 2.6 * african
-        - 2.2 * asian
-        + 0.8 * south
-        - 2.0 * child
-        + 0.9 * z[6],
-        nose_width=9.6
-        + 1.1 * male
-        + 2.6 * african
-        + 0.9 * asian
-        + 0.6 * age
-        + 0.4 * z[7],
-        bridge_depth=0.3 + 1.8 * african + 2.4 * asian - 1.2 * male + 0.7 * z[8],
-        brow=float(np.clip(0.1 + 0.7 * male + 0.15 * z[9], 0, 1.2)),
-        eye_distance=30.6 + 0.6 * male + 0.8 * african + 0.7 * z[10],
-        eye_size=12.6 + 0.2 * z[11],
-        cheekbone=float(np.clip(0.5 + 0.35 * asian + 0.15 * z[12], 0, 1.2)),
-        fullness=float(np.clip(person.fullness + 0.1 * z[13] - 0.3 * age, 0, 1.1)),
-        lip_fullness=float(
-            np.clip(
-                0.55
-                + 0.4 * african
-                + 0.1 * asian
-                - 0.15 * male
-                - 0.35 * age
-                + 0.1 * z[14],
-                0.05,
-                1.1,
-            )
-        ),
-        mouth_width=25.2 + 1.2 * male + 1.6 * african + 0.9 * z[15],
-        sagging=float(age),
-        neck_width=44.0 + 7.0 * male + 1.2 * z[16],
-        asymmetry=0.5 * float(z[17]),
-    )
+    value_of = {
+        "constant": 1.0,
+        "male": float(person.gender == "male"),
+        "african": float(person.ancestry == "african"),
+        "asian": float(person.ancestry == "east_asian"),
+        "south": float(person.ancestry == "south_asian"),
+        "age": float(np.clip((person.age - 30) / 45, 0, 1)),
+        "child": float(np.clip((18 - person.age) / 10, 0, 1)),
+        "fullness": person.fullness,
+    }
+    terms = _tables()["shape"]
+    variation = person.stream(1).standard_normal(len(terms)).tolist()
+    lengths = {}
+    for (name, factors), individual in zip(terms.items(), variation, strict=True):
+        values = value_of | {"individual": individual}
+        lengths[name] = sum(factor * values[term] for term, factor in factors.items())
+    for name, (low, high) in _tables()["limits"].items():
+        lengths[name] = min(max(lengths[name], low), high)
+    return FaceShape(**lengths, sagging=value_of["age"])
+
+
+@cache
+def _tables() -> dict[str, Any]:
+    """Subjects of the demo, and the terms of a linear model of the shape of faces."""
+    tables: dict[str, Any] = package_json("skindb.virtual", "person.json")
+    return tables

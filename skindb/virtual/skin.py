@@ -8,108 +8,22 @@ converted to scene-linear Rec. 709 under D65, means over people by group and sit
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from skindb.files import package_json
 from skindb.optics.diffusion import dipole_s, scattering_coefficients
 from skindb.virtual.head import Head
 from skindb.virtual.person import Person
 
 Array = NDArray[np.float64]
-SITES = ("forehead", "cheek", "nose", "chin", "neck")
-MEAN: dict[tuple[str, str], tuple[tuple[float, float, float], ...]] = {
-    ("european", "female"): (
-        (0.4567, 0.2712, 0.2042),
-        (0.4668, 0.2730, 0.2124),
-        (0.4187, 0.2380, 0.1730),
-        (0.4607, 0.2508, 0.1960),
-        (0.4718, 0.3185, 0.2268),
-    ),
-    ("european", "male"): (
-        (0.4189, 0.2306, 0.1721),
-        (0.4308, 0.2352, 0.1817),
-        (0.4033, 0.2163, 0.1637),
-        (0.3590, 0.1991, 0.1507),
-        (0.4781, 0.2874, 0.2094),
-    ),
-    ("east_asian", "female"): (
-        (0.4240, 0.2521, 0.1737),
-        (0.4644, 0.2883, 0.2155),
-        (0.4205, 0.2583, 0.1719),
-        (0.4537, 0.2617, 0.1846),
-        (0.4345, 0.2841, 0.1788),
-    ),
-    ("east_asian", "male"): (
-        (0.3803, 0.2092, 0.1417),
-        (0.4083, 0.2316, 0.1691),
-        (0.3906, 0.2219, 0.1518),
-        (0.3738, 0.2079, 0.1444),
-        (0.4376, 0.2515, 0.1602),
-    ),
-    ("african", "female"): (
-        (0.2186, 0.1149, 0.0718),
-        (0.2176, 0.1153, 0.0697),
-        (0.2517, 0.1259, 0.0781),
-        (0.1935, 0.0992, 0.0659),
-        (0.1721, 0.0920, 0.0554),
-    ),
-    ("african", "male"): (
-        (0.1361, 0.0732, 0.0526),
-        (0.1516, 0.0809, 0.0556),
-        (0.1864, 0.0899, 0.0600),
-        (0.1474, 0.0795, 0.0581),
-        (0.1373, 0.0726, 0.0483),
-    ),
-    ("south_asian", "female"): (
-        (0.3552, 0.2046, 0.1327),
-        (0.3898, 0.2364, 0.1554),
-        (0.3849, 0.2200, 0.1455),
-        (0.3828, 0.2092, 0.1413),
-        (0.3301, 0.2001, 0.1144),
-    ),
-    ("south_asian", "male"): (
-        (0.3053, 0.1630, 0.1037),
-        (0.2764, 0.1619, 0.1023),
-        (0.3598, 0.1866, 0.1246),
-        (0.2639, 0.1536, 0.1032),
-        (0.2790, 0.1511, 0.0875),
-    ),
-}
-# relative standard deviation between people, green, cheek
-SPREAD: dict[tuple[str, str], float] = {
-    ("european", "female"): 0.155,
-    ("european", "male"): 0.189,
-    ("east_asian", "female"): 0.142,
-    ("east_asian", "male"): 0.132,
-    ("african", "female"): 0.310,
-    ("african", "male"): 0.279,
-    ("south_asian", "female"): 0.169,
-    ("south_asian", "male"): 0.301,
-}
 BLOOD_SPREAD = 0.06  # log green, between people of equal melanin
-_CHEEK, _CHIN, _NECK = (SITES.index(site) for site in ("cheek", "chin", "neck"))
 # The measured materials with the smallest Lambertian fraction (which a fit cannot
 # distinguish from R_d); two broad lobes, two sharp ones
 MATERIALS = ("special-walnut-224", "black-soft-plastic", "cherry-235", "black-phenolic")
-GLOSS = {  # albedo at normal incidence; fractions of MATERIALS in it
-    "forehead": (0.050, (0.28, 0.58, 0.110, 0.030)),
-    "nose": (0.057, (0.22, 0.56, 0.160, 0.060)),
-    "cheek": (0.037, (0.36, 0.58, 0.050, 0.010)),
-    "lips": (0.052, (0.22, 0.58, 0.150, 0.050)),
-    "chin": (0.045, (0.30, 0.59, 0.090, 0.020)),
-    "neck": (0.033, (0.42, 0.54, 0.040, 0.000)),
-    "brow": (0.040, (0.40, 0.55, 0.050, 0.000)),
-    "eyelid": (0.042, (0.32, 0.58, 0.080, 0.020)),
-}
-GLOSS_ELSEWHERE = (0.035, (0.40, 0.55, 0.045, 0.005))
-# paper, table 2: mean sigma_tr in mm^-1
-SIGMA_TR = {
-    "cheek": (0.5572, 0.9751, 1.5494),
-    "forehead": (0.5443, 0.9831, 1.5499),
-    "neck": (0.6911, 1.2488, 1.9159),
-}
 PATCH = 6.0  # mm about a probe site over which its colour is averaged
 
 
@@ -133,24 +47,6 @@ def smooth_noise(
     return np.asarray(wave.sum(axis=1, dtype=np.float64) * np.sqrt(2 / waves))
 
 
-def _axis(light: Array, dark: Array) -> Array:
-    """Direction from a lighter to a darker colour in log reflectance, 1 in green."""
-    step = np.log(light) - np.log(dark)
-    return np.asarray(step / step[1])
-
-
-# melanin: difference between the cheeks of two groups; haemoglobin: difference between
-# the ruddy chin and pale neck
-MELANIN = _axis(
-    np.array(MEAN["european", "female"][_CHEEK]),
-    np.array(MEAN["african", "female"][_CHEEK]),
-)
-HAEMOGLOBIN = _axis(
-    np.array(MEAN["european", "female"][_NECK]),
-    np.array(MEAN["european", "female"][_CHIN]),
-)
-
-
 @dataclass(frozen=True)
 class ConditionEffect:
     """Effect of a condition on the skin."""
@@ -163,16 +59,65 @@ class ConditionEffect:
     translucency: float = 1.0  # factor on sigma_tr
 
 
-EFFECT = {
-    "normal": ConditionEffect(),
-    "lotion": ConditionEffect(gloss=1.7, sharp=3.0),
-    "powder": ConditionEffect(gloss=0.55, sharp=0.15, even=0.15),
-    "sweat": ConditionEffect(gloss=1.4, sharp=2.8, blood=0.04),
-    "hot": ConditionEffect(gloss=1.15, sharp=1.3, blood=0.12),
-    "cold": ConditionEffect(gloss=0.92, sharp=0.9, blood=-0.08),
-    "makeup": ConditionEffect(gloss=0.85, sharp=0.6, even=0.6),
-    "tan": ConditionEffect(melanin=0.22),
-}
+@dataclass(frozen=True)
+class Gloss:
+    """Surface reflection of a region."""
+
+    albedo: float  # at normal incidence
+    fractions: tuple[float, ...]  # of MATERIALS in it
+
+
+@dataclass(frozen=True)
+class SkinTables:
+    """The constants of skin.json."""
+
+    sites: tuple[str, ...]
+    mean: dict[tuple[str, str], Array]  # ancestry and gender -> R_d (site, channel)
+    # ancestry and gender -> relative standard deviation between people, green, cheek
+    spread: dict[tuple[str, str], float]
+    gloss: dict[str, Gloss]  # by region; "elsewhere" for the others
+    sigma_tr: dict[str, Array]  # paper, table 2: site -> mean (channel,) in mm^-1
+    effects: dict[str, ConditionEffect]  # by condition
+
+    @property
+    def melanin(self) -> Array:
+        """Axis of melanin in log R_d, 1 in green: from one cheek to a darker one."""
+        light, dark = (
+            self.mean[group, "female"][self.sites.index("cheek")]
+            for group in ("european", "african")
+        )
+        return _axis(light, dark)
+
+    @property
+    def haemoglobin(self) -> Array:
+        """Axis of haemoglobin in log R_d, 1 in green: from pale neck to ruddy chin."""
+        mean = self.mean["european", "female"]
+        neck, chin = (mean[self.sites.index(site)] for site in ("neck", "chin"))
+        return _axis(neck, chin)
+
+
+def _axis(light: Array, dark: Array) -> Array:
+    """Direction from a lighter to a darker colour in log reflectance, 1 in green."""
+    step = np.log(light) - np.log(dark)
+    return np.asarray(step / step[1])
+
+
+@cache
+def skin_tables() -> SkinTables:
+    """The constants, read at their first use."""
+    tables = package_json("skindb.virtual", "skin.json")
+    people = {(row["ancestry"], row["gender"]): row for row in tables["people"]}
+    return SkinTables(
+        tuple(tables["sites"]),
+        {group: np.array(row["mean"]) for group, row in people.items()},
+        {group: row["spread"] for group, row in people.items()},
+        {
+            region: Gloss(row["albedo"], tuple(row["fractions"]))
+            for region, row in tables["gloss"].items()
+        },
+        {site: np.array(mean) for site, mean in tables["sigma_tr"].items()},
+        {name: ConditionEffect(**row) for name, row in tables["effects"].items()},
+    )
 
 
 @dataclass(frozen=True)
@@ -212,7 +157,7 @@ def skin_of(head: Head, person: Person, *, material_albedo: Array, eta: float) -
         Index of refraction for the conversion of (R_d, sigma_tr) of the sites to
         sigma_a and sigma_s'.
     """
-    effect = EFFECT[person.condition]
+    effect = skin_tables().effects[person.condition]
     diffuse = _diffuse_reflectance(head, person, effect)
     sites = _sites(head, person, diffuse, effect, eta)
     return Skin(
@@ -225,18 +170,20 @@ def skin_of(head: Head, person: Person, *, material_albedo: Array, eta: float) -
 
 def _diffuse_reflectance(head: Head, person: Person, effect: ConditionEffect) -> Array:
     """Group and site mean, moved along the melanin and haemoglobin axes; then hair."""
+    tables = skin_tables()
+    sites = tables.sites
     group = (person.ancestry, person.gender)
     m = head.membership
-    weight = np.stack([m[site] for site in SITES], axis=1) + 1e-6
+    weight = np.stack([m[site] for site in sites], axis=1) + 1e-6
     # everywhere else
-    weight[:, SITES.index("cheek")] += np.clip(1 - weight.sum(axis=1), 0, 1)
-    weight[:, SITES.index("cheek")] += m["lips"]
-    log = (weight / weight.sum(axis=1, keepdims=True)) @ np.log(np.array(MEAN[group]))
+    weight[:, sites.index("cheek")] += np.clip(1 - weight.sum(axis=1), 0, 1)
+    weight[:, sites.index("cheek")] += m["lips"]
+    log = (weight / weight.sum(axis=1, keepdims=True)) @ np.log(tables.mean[group])
     melanin, blood = _pigment(head, person)
     melanin = (1 - effect.even) * melanin
     blood = (1 - effect.even) * blood
     old = np.clip((person.age - 30) / 50, 0, 1)
-    melanin += SPREAD[group] * person.melanin + 0.08 * old + effect.melanin
+    melanin += tables.spread[group] * person.melanin + 0.08 * old + effect.melanin
     blood += BLOOD_SPREAD * person.blood + effect.blood
     # blood shows less through melanin
     pale = float(np.clip(np.exp(log.mean(axis=0))[1] / 0.27, 0.25, 1))
@@ -244,7 +191,9 @@ def _diffuse_reflectance(head: Head, person: Person, effect: ConditionEffect) ->
     melanin = (
         melanin + (0.30 - 0.18 * pale) * m["lips"] + (0.06 + 0.08 * old) * m["eyelid"]
     )
-    colour = np.exp(log - np.outer(melanin, MELANIN) - np.outer(blood, HAEMOGLOBIN))
+    colour = np.exp(
+        log - np.outer(melanin, tables.melanin) - np.outer(blood, tables.haemoglobin)
+    )
     return np.asarray(np.clip(colour * (1 - _hair(head, person)), 0.008, 0.95))
 
 
@@ -307,11 +256,13 @@ def _weights(
     """Smooth non-negative weights with the wanted specular albedo at normal incidence."""
     rng = person.stream(4)
     p = head.vertices
-    names = [name for name in GLOSS if name in head.membership]
+    gloss = skin_tables().gloss
+    rows = {name: [row.albedo, *row.fractions] for name, row in gloss.items()}
+    names = [name for name in rows if name in head.membership]
     member = np.stack([head.membership[name] for name in names], axis=1)
     rest = np.clip(1 - member.sum(axis=1), 0, 1)
-    table = np.array([[GLOSS[name][0], *GLOSS[name][1]] for name in names])
-    field = member @ table + np.outer(rest, [GLOSS_ELSEWHERE[0], *GLOSS_ELSEWHERE[1]])
+    table = np.array([rows[name] for name in names])
+    field = member @ table + np.outer(rest, rows["elsewhere"])
     field /= (member.sum(axis=1) + rest)[:, None]
     personal = rng.lognormal(0, 0.12, 4)
     share = (
@@ -340,16 +291,14 @@ def _sites(
     rng = person.stream(5)
     personal = person.stream(6).lognormal(0, 0.12)
     sites = []
-    for name, mean in SIGMA_TR.items():
+    for name, mean in skin_tables().sigma_tr.items():
         local = rng.lognormal(0, 0.06) * rng.lognormal(0, 0.03, 3)
         vertex = _site_vertex(head, name)
         if vertex is None:
             continue
         near = ((head.vertices - head.vertices[vertex]) ** 2).sum(axis=1) < PATCH**2
         colour = diffuse[near].mean(axis=0)
-        sigma_tr = np.clip(
-            np.array(mean) * personal * local * effect.translucency, 0.3, 3.0
-        )
+        sigma_tr = np.clip(mean * personal * local * effect.translucency, 0.3, 3.0)
         s, _ = dipole_s(colour, eta=eta)
         sigma_a, sigma_s = (
             np.asarray(x, np.float64) for x in scattering_coefficients(s, sigma_tr)
@@ -381,7 +330,7 @@ def _site_vertex(head: Head, name: str) -> int | None:
 def _sigma_tr(points: Array, sites: tuple[Site, ...]) -> Array:
     """1/sigma_tr interpolated between the sites (Shepard); the cheek counts on both sides."""
     if not sites:
-        return np.broadcast_to(np.array(SIGMA_TR["cheek"]), (len(points), 3)).copy()
+        return np.broadcast_to(skin_tables().sigma_tr["cheek"], (len(points), 3)).copy()
     anchors = [(s.position, s.sigma_tr) for s in sites]
     anchors += [
         (s.position * (-1, 1, 1), s.sigma_tr) for s in sites if s.name == "cheek"

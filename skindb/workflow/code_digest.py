@@ -3,7 +3,8 @@
 The digest covers the functions that are named and everything in skindb that they use:
 functions, classes and constants, followed through the imports of their modules. The
 source is parsed and never imported. Docstrings, comments, annotations, help texts of parameters and
-formatting do not count, nor does what stands in the same file and is not used.
+formatting do not count, nor does what stands in the same file and is not used. A table (a
+JSON file) beside a module counts where it is named.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ def package_digest() -> str:
     same program.
     """
     digest = hashlib.sha256()
-    for file in sorted(ROOT.rglob("*.py")):
+    for file in sorted([*ROOT.rglob("*.py"), *ROOT.rglob("*.json")]):
         name = file.relative_to(ROOT).as_posix()
         digest.update(name.encode() + b"\0" + file.read_bytes() + b"\0")
     return digest.hexdigest()
@@ -82,7 +83,23 @@ def _digest_of(root: Path, starts: tuple[Symbol, ...]) -> str:
         digest.update(f"{module}:{name}\n".encode())
         for statement in _source(root, module).statements(name):
             digest.update(repr(_written(statement)).encode())
+            for table in _tables(root, module, statement):
+                digest.update(table.read_bytes())
     return digest.hexdigest()
+
+
+def _tables(root: Path, module: str, statement: ast.stmt) -> Iterator[Path]:
+    """Tables beside a module that a statement names."""
+    path = _path(root, module)
+    for node in ast.walk(statement):
+        if (
+            isinstance(node, ast.Constant)
+            and str(node.value).endswith(".json")
+            and path
+        ):
+            table = path.with_name(str(node.value))
+            if table.is_file():
+                yield table
 
 
 def _reached(root: Path, starts: Iterable[Symbol]) -> set[Symbol]:

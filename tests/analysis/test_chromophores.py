@@ -23,11 +23,11 @@ from skindb.analysis import (
 from skindb.analysis.chromophores import INDEPENDENT, TABLE_AXES
 from skindb.analysis.regions import map_regions
 from skindb.errors import InputError
-from skindb.virtual.skin import HAEMOGLOBIN, MELANIN
+from skindb.virtual.skin import skin_tables
 
 mpl.use("Agg")
 SIZE = 128
-PLANTED = np.stack([MELANIN, HAEMOGLOBIN])
+PLANTED = np.stack([skin_tables().melanin, skin_tables().haemoglobin])
 BASE = -np.log([0.45, 0.27, 0.2])
 TABLES = Path(__file__).resolve().parents[3] / "shared/data/optics"
 # of a plain face in the common (u, v)
@@ -243,7 +243,9 @@ def test_chromophore_axes__projected_fallback_lies_in_the_plane():
 
 def test_chromophore_axes__refuses_components_that_brighten_skin():
     """For example, a change of exposure or of a filter is not a pigment."""
-    axes = found_axes(maps_of(pigments(), axes=np.array([MELANIN, [-0.8, 1.0, 0.6]])))
+    axes = found_axes(
+        maps_of(pigments(), axes=np.array([skin_tables().melanin, [-0.8, 1.0, 0.6]]))
+    )
     assert "would brighten R, which no pigment does" in axes.attrs["flags"][-1]
 
 

@@ -9,17 +9,14 @@ from skindb.virtual.face import FaceShape
 from skindb.virtual.head import parametric_head
 from skindb.virtual.person import ANCESTRIES, Person
 from skindb.virtual.skin import (
-    HAEMOGLOBIN,
     MATERIALS,
-    MEAN,
-    MELANIN,
-    SIGMA_TR,
-    SITES,
     skin_of,
+    skin_tables,
     smooth_noise,
 )
 
 # stand-in albedos of the materials at normal incidence
+TABLES = skin_tables()
 ALBEDO = np.array([0.10, 0.05, 0.20, 0.30])
 PERSON = Person("A", 35, "female", "european", 7)
 
@@ -49,7 +46,7 @@ def test_skin_of__cheek_colour_is_near_the_measured_mean(head, ancestry, gender)
     # 25 %: the flush of the cheeks, ageing and low-frequency mottling are real shifts of one person
     np.testing.assert_allclose(
         np.mean(colours, axis=0),
-        MEAN[ancestry, gender][SITES.index("cheek")],
+        TABLES.mean[ancestry, gender][TABLES.sites.index("cheek")],
         rtol=0.25,
     )
 
@@ -95,10 +92,10 @@ def test_skin_of__tan_is_darker_and_hot_is_redder(head):
         for c in ("normal", "tan", "hot")
     )
     np.testing.assert_allclose(
-        np.log(normal / tan).mean(axis=0), 0.22 * MELANIN, rtol=1e-6
+        np.log(normal / tan).mean(axis=0), 0.22 * TABLES.melanin, rtol=1e-6
     )
     np.testing.assert_allclose(
-        np.log(normal / hot).mean(axis=0), 0.12 * HAEMOGLOBIN, rtol=1e-6
+        np.log(normal / hot).mean(axis=0), 0.12 * TABLES.haemoglobin, rtol=1e-6
     )
 
 
@@ -117,7 +114,7 @@ def test_skin_of__beard_darkens_the_beard_region_only(head):
 
 def test_skin_of__sites_lie_on_the_face_and_their_optics_are_consistent(head):
     skin = _skin(head, PERSON)
-    assert [site.name for site in skin.sites] == list(SIGMA_TR)
+    assert [site.name for site in skin.sites] == list(TABLES.sigma_tr)
     for site in skin.sites:
         sigma_t = site.sigma_a + site.sigma_s_prime
         np.testing.assert_allclose(

@@ -33,17 +33,19 @@ from skindb import late, science
 from skindb.science.parameters import Parameters
 
 SCALE = 2.0
+TABLE = "table.json"
 UNUSED = 1
 
 def fit(values: np.ndarray, parameters: Parameters) -> np.ndarray:
     """Fit values."""
     from skindb.science._kernels import summed
     # a comment
-    return SCALE * summed(values) + late() + science.plain.shift()
+    return SCALE * summed(values) + late() + science.plain.shift() + len(TABLE)
 
 def plot(values):
     return values
 ''',
+    "science/table.json": '{"step": 1}',
     "science/parameters.py": """
 from skindb.jit import option
 
@@ -106,6 +108,7 @@ def _digest_after(package, monkeypatch, name, old, new):
         ("science/parameters.py", "minimum=1", "minimum=2"),
         ("science/late.py", "return 3", "return 4"),
         ("science/plain.py", "return 1", "return 0"),
+        ("science/table.json", "1", "2"),
         ("jit.py", "return function", "return None"),
     ],
 )

@@ -14,7 +14,7 @@ from skindb import workflow
 from skindb.analysis import describe_study, tabulate_study
 from skindb.cli import cli
 from skindb.store import Database
-from skindb.virtual.skin import HAEMOGLOBIN, MELANIN
+from skindb.virtual.skin import skin_tables
 from skindb.workflow.upkeep import repeat_study
 
 pytestmark = pytest.mark.slow
@@ -36,8 +36,10 @@ def pigmented(seed, **about):
         -1, 2
     )
     amounts = np.resize(amounts, (fitted.sizes["surfel"], 2))
+    tables = skin_tables()
     colour = np.exp(
-        np.log([0.45, 0.27, 0.2]) - amounts @ np.stack([MELANIN, HAEMOGLOBIN])
+        np.log([0.45, 0.27, 0.2])
+        - amounts @ np.stack([tables.melanin, tables.haemoglobin])
     )
     dims = fitted["diffuse_reflectance"].dims
     model["fitted"] = fitted.assign(
