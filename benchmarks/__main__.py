@@ -22,13 +22,13 @@ FOLDER = Path(__file__).parent
 
 def summaries() -> dict[str, str]:
     """Name of each benchmark -> the first sentence of its description; nothing is imported."""
-    found = {}
+    texts = {}
     for path in sorted(FOLDER.glob("[!_]*.py")):
         tree = ast.parse(path.read_text(encoding="utf-8"))
         if any(isinstance(x, ast.FunctionDef) and x.name == "main" for x in tree.body):
             text = ast.get_docstring(tree) or ""
-            found[path.stem] = " ".join(text.split("\n\n")[0].split())
-    return found
+            texts[path.stem] = " ".join(text.split("\n\n")[0].split())
+    return texts
 
 
 def add_options(parser: argparse.ArgumentParser, function: Any) -> None:
@@ -40,29 +40,29 @@ def add_options(parser: argparse.ArgumentParser, function: Any) -> None:
             hint, *notes = get_args(hint)
         if get_origin(hint) in (Union, types.UnionType):
             hint = get_args(hint)[0]
-        about: dict[str, Any] = {}
+        settings: dict[str, Any] = {}
         for note in notes:
-            about["help" if isinstance(note, str) else "choices"] = note
+            settings["help" if isinstance(note, str) else "choices"] = note
         several = get_origin(hint) in (Sequence, list)
         if several:
             hint = get_args(hint)[0]
         required = spec.default is spec.empty
         if hint is bool:
-            about["action"] = "store_true"
+            settings["action"] = "store_true"
         else:
-            about["type"] = hint
+            settings["type"] = hint
         if not required:
-            about["default"] = spec.default
+            settings["default"] = spec.default
         if spec.kind is spec.KEYWORD_ONLY:
             option = f"--{name.strip('_').replace('_', '-')}"
             if several:
-                about["nargs"] = "+" if required or spec.default else "*"
-            parser.add_argument(option, dest=name, required=required, **about)
+                settings["nargs"] = "+" if required or spec.default else "*"
+            parser.add_argument(option, dest=name, required=required, **settings)
         else:
-            about["nargs"] = ("+" if required else "*") if several else None
+            settings["nargs"] = ("+" if required else "*") if several else None
             if not required and not several:
-                about["nargs"] = "?"
-            parser.add_argument(name, **about)
+                settings["nargs"] = "?"
+            parser.add_argument(name, **settings)
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -59,10 +59,10 @@ def rounds(vertices: np.ndarray, faces: np.ndarray) -> None:
 def print_distortion(
     name: str, vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray
 ) -> None:
-    found = distortion(vertices, faces, uv, np.zeros((len(vertices), 0), bool))
+    measures = distortion(vertices, faces, uv, np.zeros((len(vertices), 0), bool))
     print(
         f"{name:22}",
-        {key: round(float(value[0]), 3) for key, value in found.items()},
+        {key: round(float(value[0]), 3) for key, value in measures.items()},
         f"{len(faces)} triangles",
     )
 

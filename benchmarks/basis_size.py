@@ -1,7 +1,8 @@
 """How often the basis-size rule recovers the number k of planted mixtures of the
 measured BRDFs, with noise.
 
-    python -m benchmarks basis_size [--seeds N] [--first S] [--lights L] [--cameras C] [--surfels S]
+    python -m benchmarks basis_size [--seeds N] [--first-seed S] [--lights L]
+    [--cameras C] [--surfels S]
 
 At least 60 surfels are needed. A planted component can only be found if removing it
 increases the error. The least important component is therefore redrawn until removing
@@ -69,7 +70,7 @@ def planted(size, noise, seed, *, surfels=300, lights=40, cameras=4):
         part = Systems.of(rows[:few], offsets[: FEW + 1], target[:few])
         without = [residuals(part, np.delete(H, i, 0))[1].sum() for i in range(size)]
         needed = float(np.sqrt(min(without) / residuals(part, H)[1].sum()))
-        best = max(best, (needed, target, H), key=lambda found: found[0])
+        best = max(best, (needed, target, H), key=lambda problem: problem[0])
         if needed > NEEDED:
             break
         H = H.copy()
@@ -105,7 +106,7 @@ def _unit(v):
 def main(
     *,
     seeds: int = 4,
-    first: int = 10,
+    first_seed: int = 10,
     lights: int = 40,
     cameras: int = 4,
     surfels: int = 300,
@@ -113,21 +114,21 @@ def main(
     """Print one line per problem, and the counts."""
     shape = {"surfels": surfels, "lights": lights, "cameras": cameras}
     counts = {True: Counter(), False: Counter()}
-    seeds = range(first, first + seeds)
+    seeds = range(first_seed, first_seed + seeds)
     for size, noise, seed in ((k, e, s) for k in SIZES for e in NOISES for s in seeds):
         systems, needed, H = planted(size, noise, seed, **shape)
-        (fewest, most), error = found_sizes(systems)
+        (lower, upper), error = found_sizes(systems)
         squares, free, _ = surfel_errors(systems, [H]).sum(axis=0)
         truth = np.sqrt(squares[0] / free[0] / (squares[1] / free[1]))
-        counts[needed > MATTERS][judged(size, fewest, most)] += 1
+        counts[needed > MATTERS][judged(size, lower, upper)] += 1
         print(
             f"planted {size} ({truth:.4f}), noise {noise:.0%}, least important "
             f"component {needed - 1:6.1%}: "
-            f"{size_status(fewest, most).split(':')[0]}; curve",
+            f"{size_status(lower, upper).split(':')[0]}; curve",
             *(f"{e:.4f}" for e in error),
             flush=True,
         )
-    for seen, found in counts.items():
+    for seen, ratings in counts.items():
         kind = (
             "every component lowers the error by 5 % or more"
             if seen
@@ -135,14 +136,14 @@ def main(
         )
         print(
             f"{kind}: "
-            f"{', '.join(f'{n} {what}' for what, n in sorted(found.items()))}, of "
-            f"{found.total()}"
+            f"{', '.join(f'{n} {rating}' for rating, n in sorted(ratings.items()))}, of "
+            f"{ratings.total()}"
         )
 
 
-def judged(size, fewest, most):
+def judged(size, lower, upper):
     """Rating of an answer."""
-    if fewest == most:
-        return "right" if size == most else "wrong"
-    holds = fewest <= size and (size <= most or not most)
+    if lower == upper:
+        return "right" if size == upper else "wrong"
+    holds = lower <= size and (size <= upper or not upper)
     return "range that contains the truth" if holds else "range without the truth"

@@ -75,9 +75,9 @@ def main(*, picture: Path | None = None) -> None:
     )
     print("|---" * 6 + "|")
     for count, (shot, spent, relative, z, lost) in rows.items():
-        shown = ", ".join("-" if np.isnan(r) else f"{100 * r:.2f} %" for r in relative)
+        cells = ", ".join("-" if np.isnan(r) else f"{100 * r:.2f} %" for r in relative)
         print(
-            f"| {count} | {shot:.3f} | {spent:.2f} | {shown} | {z:.3f} | {100 * lost:.1f} % |"
+            f"| {count} | {shot:.3f} | {spent:.2f} | {cells} | {z:.3f} | {100 * lost:.1f} % |"
         )
     if picture:
         draw(rows, picture)

@@ -51,8 +51,8 @@ def steps(url: str, values: np.ndarray):
     Database(url).read("capture", "A1")[NAME].count().compute()
     yield "read all", clock() - begin
     begin = clock()
-    some = Database(url).read("capture", "A1")[NAME]
-    some[:: SHARD // 2, :3].compute()
+    samples = Database(url).read("capture", "A1")[NAME]
+    samples[:: SHARD // 2, :3].compute()
     yield "read two chunks of every shard", clock() - begin
     begin = clock()
     assert Database(url).verify() == []
@@ -62,7 +62,7 @@ def steps(url: str, values: np.ndarray):
 def main(*, surfels: int = 5 * SHARD, repeat: int = 3, delay_ms: float = 20.0) -> None:
     """Measure and print."""
     values = samples(surfels)
-    found: dict[tuple[str, str], list[float]] = {}
+    times: dict[tuple[str, str], list[float]] = {}
     requests: dict[str, int] = {}
     with (
         s3_server("localbucket") as address,
@@ -77,14 +77,14 @@ def main(*, surfels: int = 5 * SHARD, repeat: int = 3, delay_ms: float = 20.0) -
                 ):
                     proxy.requests.clear()
                     for step, seconds in steps(url, values):
-                        found.setdefault((step, name), []).append(seconds)
+                        times.setdefault((step, name), []).append(seconds)
                         if name == "bucket":
                             requests[step] = len(proxy.requests)
                             proxy.requests.clear()
     print(f"{values.nbytes / 1e6:.0f} MB of samples, {delay_ms:g} ms delay per request")
     for step, count in requests.items():
-        folder = median(found[step, "folder"])
-        bucket = median(found[step, "bucket"])
+        folder = median(times[step, "folder"])
+        bucket = median(times[step, "bucket"])
         print(
             f"{step:32} folder {folder:6.2f} s  bucket {bucket:6.2f} s  ratio "
             f"{bucket / folder:5.1f}  {count} requests"

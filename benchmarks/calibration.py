@@ -112,17 +112,20 @@ def _cases(dome: DomeRecord, surfels: SurfelSet, picture: Pictures) -> Iterator[
 
 
 def _planted_cameras(dome: DomeRecord) -> Iterator[tuple[str, DomeRecord]]:
-    one, two = dome.cameras[1:3]
-    off_centre = two.K + np.eye(3, k=2) * two.width / 13
+    camera_1, camera_2 = dome.cameras[1:3]
+    off_centre = camera_2.K + np.eye(3, k=2) * camera_2.width / 13
     for name, changed in (
-        ("R transposed", replace(two, R=two.R.T)),
-        ("focal length doubled", replace(two, K=_scaled(two.K, 2))),
-        ("focal length 5 % too long", replace(two, K=_scaled(two.K, 1.05))),
-        ("centre off by a 13th of the width", replace(two, K=off_centre)),
-        ("translation 10 % off", replace(two, t=two.t * 1.1)),
+        ("R transposed", replace(camera_2, R=camera_2.R.T)),
+        ("focal length doubled", replace(camera_2, K=_scaled(camera_2.K, 2))),
+        ("focal length 5 % too long", replace(camera_2, K=_scaled(camera_2.K, 1.05))),
+        ("centre off by a 13th of the width", replace(camera_2, K=off_centre)),
+        ("translation 10 % off", replace(camera_2, t=camera_2.t * 1.1)),
     ):
         yield name, _with_cameras(dome, {2: changed})
-    exchanged = {1: replace(one, R=two.R, t=two.t), 2: replace(two, R=one.R, t=one.t)}
+    exchanged = {
+        1: replace(camera_1, R=camera_2.R, t=camera_2.t),
+        2: replace(camera_2, R=camera_1.R, t=camera_1.t),
+    }
     yield "poses exchanged", _with_cameras(dome, exchanged)
 
 

@@ -69,23 +69,25 @@ def about(number: int) -> dict[str, Any]:
 
 def refit(db: Database, number: int) -> None:
     """Commit a model of a take."""
-    one = about(number)
+    attributes = about(number)
     fit = {
         "parameters": {"k": 4 + number % 5, "rank": 16},
         "status": {"fitted": 0.93, "obstructed": 0.07},
     }
-    with db.stage("model", one["take"]) as stage:
+    with db.stage("model", attributes["take"]) as stage:
         stage.commit(
-            one | fit | {"inputs": [db.record("capture", one["take"]).as_input()]}
+            attributes
+            | fit
+            | {"inputs": [db.record("capture", attributes["take"]).as_input()]}
         )
 
 
 def fill(db: Database, takes: int) -> None:
     """Commit captures and models."""
     for number in range(takes):
-        one = about(number)
-        with db.stage("capture", one["take"]) as stage:
-            stage.commit(one)
+        attributes = about(number)
+        with db.stage("capture", attributes["take"]) as stage:
+            stage.commit(attributes)
         refit(db, number)
 
 
@@ -144,7 +146,7 @@ def measure(
                 times.append(in_new_process(url, name) | {"requests": len(requests)})
             yield (
                 f"{name}, {state}",
-                {key: median(one[key] for one in times) for key in times[0]},
+                {key: median(figures[key] for figures in times) for key in times[0]},
             )
 
 
@@ -177,19 +179,18 @@ def main(
     if query:
         time_query(*query)
         return
-    found: dict[str, dict[str, dict[str, float]]] = {}
+    results: dict[str, dict[str, dict[str, float]]] = {}
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary) / "db"
         fill(skindb.open(str(folder)), takes)
-        found["folder"] = dict(measure(str(folder), repeat, []))
+        results["folder"] = dict(measure(str(folder), repeat, []))
         for delay in delay_ms:
             with bucket_of(folder, delay / 1000) as (url, requests):
-                found[f"bucket, {delay:g} ms"] = dict(measure(url, repeat, requests))
-    for place, queries in found.items():
-        for name, one in queries.items():
-            requests = f", {one['requests']:.0f} requests" if one["requests"] else ""
-            print(
-                f"{place:14} {name:24} {one['wall']:6.2f} s, CPU {one['cpu']:5.2f} s{requests}"
-            )
+                results[f"bucket, {delay:g} ms"] = dict(measure(url, repeat, requests))
+    for place, queries in results.items():
+        for name, figures in queries.items():
+            wall, cpu, requests = (figures[key] for key in ("wall", "cpu", "requests"))
+            counted = f", {requests:.0f} requests" if requests else ""
+            print(f"{place:14} {name:24} {wall:6.2f} s, CPU {cpu:5.2f} s{counted}")
     if out:
-        out.write_text(json.dumps({"takes": takes, "found": found}, indent=1))
+        out.write_text(json.dumps({"takes": takes, "results": results}, indent=1))

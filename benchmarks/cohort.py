@@ -66,31 +66,33 @@ def main(
         if name in cohort
     ]
     # restrict the truth to where estimates exist
-    kept = {name: planted[name].where(np.isfinite(cohort[name])) for name in measured}
+    compared = {
+        name: planted[name].where(np.isfinite(cohort[name])) for name in measured
+    }
     planted = cohort.drop_vars(
         [name for name in cohort if str(name).endswith("_error")]
-    ).assign(kept)
+    ).assign(compared)
     options = {"group_by": group_by, "adjust": adjust, "permutations": 1000}
-    found, want = (
-        group_effects(one, rng=np.random.default_rng(0), **options)
-        for one in (cohort, planted)
+    estimated, want = (
+        group_effects(cohort_part, rng=np.random.default_rng(0), **options)
+        for cohort_part in (cohort, planted)
     )
-    for contrast in found["contrast"].values.tolist():
+    for contrast in estimated["contrast"].values.tolist():
         inside = []
         print(
             f"| {contrast} | true mean | mean | true difference | difference | 95 "
             "% interval | contains the truth |"
         )
-        for quantity in found["quantity"].values.tolist():
+        for quantity in estimated["quantity"].values.tolist():
             if quantity.startswith("surface"):
                 continue
-            est = found.sel(contrast=contrast, quantity=quantity)
+            est = estimated.sel(contrast=contrast, quantity=quantity)
             true_effect = want.sel(contrast=contrast)
             truth = float(true_effect["effect"].sel(quantity=quantity))
             low = float(est["effect_low"])
             high = float(est["effect_high"])
             inside.append(low <= truth <= high)
-            means = [_mean(one, quantity) for one in (planted, cohort)]
+            means = [_mean(cohort_part, quantity) for cohort_part in (planted, cohort)]
             numbers = f"{means[0]:.3f} | {means[1]:.3f} | {truth:.4f} | {float(est['effect']):.4f}"
             print(
                 f"| {quantity} | {numbers} | {low:.4f} to {high:.4f} | "

@@ -107,7 +107,7 @@ def set_stage(model) -> Stage:
         view.interpolate(surfel_confidence(fitted)[:, None].astype(float))
     )[..., 0]
     mask = fitted["region_mask"].transpose("surfel", "region")
-    shown = view.image(view.interpolate(mask.values.astype(float)))
+    image_mask = view.image(view.interpolate(mask.values.astype(float)))
     good = binary_erosion(view.coverage > 0.999, iterations=2) & (trust > 0.99)
     names = map(str, mask["region"].values)
     return Stage(
@@ -115,7 +115,7 @@ def set_stage(model) -> Stage:
         scene,
         view,
         good,
-        {name: shown[..., i] > 0.5 for i, name in enumerate(names)},
+        {name: image_mask[..., i] > 0.5 for i, name in enumerate(names)},
     )
 
 
@@ -130,13 +130,13 @@ def pictures(stage: Stage, light: Lights) -> dict[str, np.ndarray]:
             stage.view, surface, light, stage.scene, disc_samples=1, **options
         )[0]
 
-    whole = shade(stage.surface)
+    shaded = shade(stage.surface)
     return {
-        "whole": whole,
+        "whole": shaded,
         "matt": shade(matt, terms=("diffuse",)),
         "subsurface": shade(stage.surface, subsurface=True)
         if stage.surface.sigma_tr is not None
-        else whole,
+        else shaded,
     }
 
 
@@ -169,14 +169,14 @@ def read(path: Path, name: str, channels: str = "RGB") -> np.ndarray:
 
 
 def difference(
-    found: np.ndarray, true: np.ndarray, mask: np.ndarray
+    picture: np.ndarray, true: np.ndarray, mask: np.ndarray
 ) -> dict[str, float]:
     """Median ratio, and RMS difference over RMS, also in cube-root space."""
 
     def rms(a: np.ndarray, b: np.ndarray) -> float:
         return float(np.sqrt(np.mean((a - b) ** 2) / np.mean(b**2)))
 
-    a = found[mask]
+    a = picture[mask]
     b = true[mask]
     ratio = [round(float(x), 4) for x in np.median(a / np.maximum(b, 1e-12), axis=0)]
     return {
@@ -186,19 +186,21 @@ def difference(
     }
 
 
-def compare(stage: Stage, job, true: np.ndarray, found: np.ndarray, out: Path):
+def compare(stage: Stage, job, true: np.ndarray, picture: np.ndarray, out: Path):
     """Figures of one picture, of each region too, and the pictures side by side."""
     lit = stage.good & (true.max(axis=-1) > 0.02 * true.max())
-    figures = difference(found, true, lit)
+    figures = difference(picture, true, lit)
     figures["regions"] = {
-        name: difference(found, true, lit & inside)
+        name: difference(picture, true, lit & inside)
         for name, inside in stage.regions.items()
         if (lit & inside).sum() > 50
     }
     gain = 0.9 / np.quantile(true[lit].max(axis=-1), 0.99)
     write_png(
         out,
-        np.concatenate([tone_map(one, exposure=gain) for one in (found, true)], axis=1),
+        np.concatenate(
+            [tone_map(linear, exposure=gain) for linear in (picture, true)], axis=1
+        ),
     )
     print(
         f"{job['name']}: ratio {figures['median_ratio']}, RMS "
@@ -326,7 +328,7 @@ def described(camera: Camera, light: Lights) -> dict:
     K = camera.K.tolist()
     R = camera.R.tolist()
     centre = camera.centre.tolist()
-    about = {
+    description = {
         "K": K,
         "R": R,
         "centre": centre,
@@ -338,7 +340,7 @@ def described(camera: Camera, light: Lights) -> dict:
         "intensity": light.intensity[0].tolist(),
     }
     return {
-        "camera": about,
+        "camera": description,
         "light": lamp,
         "size": [camera.width, camera.height],
         "samples": SAMPLES,
@@ -393,9 +395,9 @@ def main(
             *([exact] if mitsuba else []),
         ]:
             path = Path(job["out"])
-            found = read(path, "" if job is exact else "ViewLayer.Combined.")
+            rendered = read(path, "" if job is exact else "ViewLayer.Combined.")
             figures[f"{angle}: {job['name']}"] = compare(
-                stage, job, true[job["true"]], found, path.with_suffix(".png")
+                stage, job, true[job["true"]], rendered, path.with_suffix(".png")
             )
         if blender:
             controls(stage, Path(jobs[0]["out"]))

@@ -47,11 +47,11 @@ def main(*, surfels: int = 16384, repeat: int = 3) -> None:
             record = fit_module.fit_take(db, TAKE)
             seconds["fit"].append(time.perf_counter() - begin)
             seconds["first pass"].append(record.provenance["seconds"]["first pass"])
-    whole, kept, first = (
+    of_fit, of_storing, of_first_pass = (
         median(seconds[name][1:]) for name in ("fit", "keep", "first pass")
     )
     print(
-        f"{surfels} surfels: fit {whole:.1f} s, of which first pass "
-        f"{first:.1f} s and storing it {kept:.2f} s"
+        f"{surfels} surfels: fit {of_fit:.1f} s, of which first pass "
+        f"{of_first_pass:.1f} s and storing it {of_storing:.2f} s"
     )
-    print(f"storing it: {kept / whole:.1%} of the fit, {size[-1] / 1e6:.1f} MB")
+    print(f"storing it: {of_storing / of_fit:.1%} of the fit, {size[-1] / 1e6:.1f} MB")

@@ -56,14 +56,14 @@ def drive(
         os.environ | {"PYTHONPATH": str(code)} | (ONE_THREAD if threads == 1 else {})
     )
     command = [sys.executable, str(DRIVER), *map(str, arguments)]
-    done = subprocess.run(
+    process = subprocess.run(
         command, check=False, capture_output=True, text=True, env=surroundings
     )
-    if done.returncode:
+    if process.returncode:
         sys.exit(
-            f"{' '.join(map(str, arguments))} with the code of {code} failed:\n{done.stderr}"
+            f"{' '.join(map(str, arguments))} with the code of {code} failed:\n{process.stderr}"
         )
-    return dict(json.loads(done.stdout.splitlines()[-1]))
+    return dict(json.loads(process.stdout.splitlines()[-1]))
 
 
 def turns(
@@ -78,9 +78,9 @@ def turns(
     return runs
 
 
-def stage_median(runs: Sequence[dict[str, Any]], stage: str, what: str) -> float:
+def stage_median(runs: Sequence[dict[str, Any]], stage: str, clock: str) -> float:
     """Median of the time of a stage [s]."""
-    return median(run["stages"].get(stage, {}).get(what, 0.0) for run in runs)
+    return median(run["stages"].get(stage, {}).get(clock, 0.0) for run in runs)
 
 
 def differences(before: xr.DataTree, after: xr.DataTree) -> dict[str, float]:
@@ -123,9 +123,9 @@ def stage_table(fits: dict[str, list[dict[str, Any]]]) -> list[str]:
     for stage in fits["after"][0]["stages"]:
         cells = [
             ", ".join(
-                f"{stage_median(runs, stage, what):.1f}" for runs in fits.values()
+                f"{stage_median(runs, stage, clock):.1f}" for runs in fits.values()
             )
-            for what in ("cpu", "wall")
+            for clock in ("cpu", "wall")
         ]
         lines.append(f"| {stage} | {' | '.join(cells)} |")
     peaks = [f"{max(run['peak'] for run in runs):.2f}" for runs in fits.values()]
@@ -154,8 +154,8 @@ def report(results: dict[str, Any]) -> str:
     fits = results["fits"]
     lines = [*stage_table(fits), "", *part_table(results["parts"])]
     reading = {
-        what: 2 * results["read"][what] / stage_median(fits["after"], "all", what)
-        for what in ("cpu", "wall")
+        clock: 2 * results["read"][clock] / stage_median(fits["after"], "all", clock)
+        for clock in ("cpu", "wall")
     }
     lines.append(
         f"Reading all samples twice: {reading['cpu']:.1%} of the CPU time, "
@@ -193,7 +193,9 @@ def measure(
     turns(1, codes, partial(run, "fit"))  # compiles the remaining functions
     results: dict[str, Any] = {"fits": turns(repeats, codes, partial(run, "fit"))}
     reads = [run("read", "after") for _ in range(repeats)]
-    results["read"] = {what: median(r[what] for r in reads) for what in ("cpu", "wall")}
+    results["read"] = {
+        clock: median(r[clock] for r in reads) for clock in ("cpu", "wall")
+    }
     results["parts"] = {
         side: {name: min(r[name] for r in runs) for name in runs[0]}
         for side, runs in parts.items()

@@ -88,7 +88,7 @@ def main(
         cohort: Callable[[int], xr.Dataset], group_by: str, **options: tuple[str, ...]
     ) -> xr.Dataset:
         """First contrast of every cohort."""
-        every = []
+        results = []
         for i in range(cohorts):
             number = seed * 100_000 + i
             rng = np.random.default_rng([4, number])
@@ -99,12 +99,12 @@ def main(
                 rng=rng,
                 **options,
             )
-            every.append(table.isel(contrast=0, drop=True))
-        return xr.concat(every, "cohort", combine_attrs="override")
+            results.append(table.isel(contrast=0, drop=True))
+        return xr.concat(results, "cohort", combine_attrs="override")
 
-    def covered(found: xr.Dataset, quantity: str, truth: float) -> str:
-        one = found.sel(quantity=quantity)
-        inside = (one["effect_low"] < truth) & (one["effect_high"] > truth)
+    def covered(effects: xr.Dataset, quantity: str, truth: float) -> str:
+        effect = effects.sel(quantity=quantity)
+        inside = (effect["effect_low"] < truth) & (effect["effect_high"] > truth)
         return f"{100 * float(inside.mean()):.1f} %"
 
     for name, spread in (("equal spreads", 1.0), ("twice the spread", 2.0)):
@@ -130,25 +130,26 @@ def main(
         print(
             f"| planted, {name} | {SIGMA_TR} | covered: {covered(real, SIGMA_TR, 0.05)} |"
         )
-        least = float(null["effect_detectable"].sel(quantity=R_D).median())
-        found = over(
-            lambda seed, least=least, spread=spread: cohort_of_two(
-                n, seed, least, 0.0, spread
+        detectable = float(null["effect_detectable"].sel(quantity=R_D).median())
+        effects = over(
+            lambda seed, detectable=detectable, spread=spread: cohort_of_two(
+                n, seed, detectable, 0.0, spread
             ),
             "gender",
         )
-        power = float((found["effect_p"].sel(quantity=R_D) < 0.05).mean())
+        power = float((effects["effect_p"].sel(quantity=R_D) < 0.05).mean())
         print(
-            f"| detectable difference ({least:.3f}), {name} | {R_D} | found: {100 * power:.0f} % |"
+            f"| detectable difference ({detectable:.3f}), {name} | {R_D} "
+            f"| found: {100 * power:.0f} % |"
         )
     for name, adjust in (("not adjusted", ()), ("adjusted for age", ("age",))):
-        found = over(lambda seed: confounded(n, seed), "ancestry", adjust=adjust)[
+        effects = over(lambda seed: confounded(n, seed), "ancestry", adjust=adjust)[
             "effect"
         ].sel(quantity=R_D)
-        error = float(found.std()) / np.sqrt(cohorts)
+        error = float(effects.std()) / np.sqrt(cohorts)
         print(
             f"| confounded by age, {name} | {R_D} | mean effect "
-            f"{float(found.mean()):.4f}, standard error {error:.4f} |"
+            f"{float(effects.mean()):.4f}, standard error {error:.4f} |"
         )
     both = over(lambda seed: paired(n, seed), "condition")
     print(

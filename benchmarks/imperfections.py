@@ -45,17 +45,19 @@ COLUMNS = (
 
 def measure(db: Database, folder: Path, *, corrected: bool) -> dict[str, Any]:
     """Ingest, fit and compare one capture."""
-    done = ingest_take(db, folder, calibration="note", refine=corrected)
+    ingested = ingest_take(db, folder, calibration="note", refine=corrected)
     report = fit_take(
-        db, done.take, FitParameters(hold_out_lights=0.1, inter_reflection=corrected)
+        db,
+        ingested.take,
+        FitParameters(hold_out_lights=0.1, inter_reflection=corrected),
     ).provenance
-    model = db.read("model", done.take)
+    model = db.read("model", ingested.take)
     recovered = recovered_against_true(model, read_truth(folder))
     fitted = recovered.fitted
-    found = model["fitted/diffuse_reflectance"].values[fitted]
+    diffuse = model["fitted/diffuse_reflectance"].values[fitted]
     error = model["fitted/diffuse_reflectance_total_error"].values[fitted].astype(float)
-    off = found - recovered.true_diffuse[fitted]
-    known = np.isfinite(off).all(axis=1)
+    off = diffuse - recovered.true_diffuse[fitted]
+    finite = np.isfinite(off).all(axis=1)
     low, high = (
         end.values[fitted] for end in reflectance_interval(model["fitted"].to_dataset())
     )
@@ -63,15 +65,17 @@ def measure(db: Database, folder: Path, *, corrected: bool) -> dict[str, Any]:
     return {
         "capture": folder.name,
         **recovered.summary(),
-        "coverage": (np.abs(off[known]) < 1.96 * error[known]).mean(axis=0).tolist(),
-        "one_sided_coverage": ((true > low) & (true < high))[known]
+        "coverage": (np.abs(off[finite]) < 1.96 * error[finite]).mean(axis=0).tolist(),
+        "one_sided_coverage": ((true > low) & (true < high))[finite]
         .mean(axis=0)
         .tolist(),
-        "half_width": np.median(1.96 * error[known] / found[known], axis=0).tolist(),
-        "offset": np.median(off[known], axis=0).tolist(),
+        "half_width": np.median(
+            1.96 * error[finite] / diffuse[finite], axis=0
+        ).tolist(),
+        "offset": np.median(off[finite], axis=0).tolist(),
         "held_out": report.get("held_out_error"),
         "status": report["status"],
-        "notes": list(done.provenance["summary"]["notes"]),
+        "notes": list(ingested.provenance["summary"]["notes"]),
         "suspects": report.get("suspects"),
     }
 
@@ -127,11 +131,11 @@ def main(
         print(row(results[-1]), flush=True)
     share = np.array([r["coverage"] for r in results if "coverage" in r])
     if len(share):
-        each = share.mean(axis=1)
+        means = share.mean(axis=1)
         width = np.median([r["half_width"] for r in results if "coverage" in r], axis=0)
         print(
             f"\nIn the 95 % interval of R_d: {100 * share.mean():.1f} % of all; "
-            f"lowest {100 * each.min():.0f} %"
+            f"lowest {100 * means.min():.0f} %"
         )
         print(
             f"Median half-width of the interval, R G B: {numbers(100 * width, '.0f')} %"

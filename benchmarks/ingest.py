@@ -1,9 +1,9 @@
 """Ingest compared with decoding alone: CPU time, wall time and peak anonymous memory of
 every stage.
 
-    python -m benchmarks ingest CAPTURE [--spacing MM] [--every N] [--json FILE]
+    python -m benchmarks ingest CAPTURE [--spacing MM] [--stride N] [--json FILE]
 
-The CPU times are compared. Every N-th frame of each kind (face, white target, dark) is
+The CPU times are compared. Each N-th frame of each kind (face, white target, dark) is
 decoded with the same number of threads before and after the ingest, and the mean of
 both is used, because a shared processor varies in speed. The first run after a change
 of the code also compiles, so run it twice.
@@ -28,7 +28,7 @@ from skindb.ingest.report import sample_lines
 from skindb.workflow import ingest_take
 
 
-def decoding(folder: Path, every: int) -> dict[str, dict[str, float]]:
+def decoding(folder: Path, stride: int) -> dict[str, dict[str, float]]:
     """CPU and wall time of decoding the frames of each kind ("frames" of the face,
     "white", "dark"), and number.
     """
@@ -38,32 +38,32 @@ def decoding(folder: Path, every: int) -> dict[str, dict[str, float]]:
     kinds: dict[str, list[tuple[Path, FrameKind]]] = {}
     for kind, name, camera in promised_frames(dome):
         kinds.setdefault(kind, []).append((dome.folder / name, camera.sensor.kind))
-    found = {}
+    times = {}
     for kind, frames in kinds.items():
-        some = frames[::every] if len(frames) > 10 * every else frames
+        decoded = frames[::stride] if len(frames) > 10 * stride else frames
         start = time.monotonic(), time.process_time()
         with ThreadPoolExecutor(threads(dome)) as pool:
-            for _ in pool.map(lambda frame: len(read_frame(*frame)), some):
+            for _ in pool.map(lambda frame: len(read_frame(*frame)), decoded):
                 pass
-        scale = len(frames) / len(some)
+        scale = len(frames) / len(decoded)
         spent = {
             "wall": scale * (time.monotonic() - start[0]),
             "cpu": scale * (time.process_time() - start[1]),
         }
-        found[kind] = spent | {"frames": len(frames)}
-    return found
+        times[kind] = spent | {"frames": len(frames)}
+    return times
 
 
 def main(
     capture: Path,
     *,
     spacing: float = 1.5,
-    every: int = 10,
+    stride: int = 10,
     footprint: bool = False,
     json_: Path | None = None,
 ) -> None:
     """Print a table, and write the results."""
-    before = decoding(capture, every)
+    before = decoding(capture, stride)
     with (
         tempfile.TemporaryDirectory(dir=capture.parent) as folder,
         Stages() as stages,
@@ -76,7 +76,7 @@ def main(
             progress=stages,
         )
         stages.end("commit")
-    after = decoding(capture, every)
+    after = decoding(capture, stride)
     alone = {
         kind: {key: (before[kind][key] + after[kind][key]) / 2 for key in before[kind]}
         for kind in before

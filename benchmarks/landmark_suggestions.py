@@ -45,10 +45,10 @@ def main(folders: Sequence[Path]) -> None:
         "largest | farthest point |"
     )
     print("|---" * 5 + "|")
-    for label, (given, turn) in CASES.items():
-        found = [errors(scan, given, turn) for scan in scans]
-        names = sorted(found[0])
-        table = np.array([[one[name] for name in names] for one in found])
+    for label, (landmarks, turn) in CASES.items():
+        distances = [errors(scan, landmarks, turn) for scan in scans]
+        names = sorted(distances[0])
+        table = np.array([[distance[name] for name in names] for distance in distances])
         worst = names[int(np.median(table, axis=0).argmax())]
         quantiles = " | ".join(
             f"{value:.1f}" for value in np.quantile(table, (0.5, 0.95, 1.0))
@@ -66,14 +66,18 @@ def read(folder: Path) -> Scan:
     )
 
 
-def errors(scan: Scan, given: tuple[str, ...], turn: float) -> dict[str, float]:
+def errors(scan: Scan, landmarks: tuple[str, ...], turn: float) -> dict[str, float]:
     """Distances in mm by name; where one side is set, of the mirrored points alone."""
     vertices, faces, points = scan
     matrix = Rotation.from_euler("y", turn, degrees=True).as_matrix()
     turned = {name: matrix @ place for name, place in points.items()}
-    found = suggest_landmarks(
-        vertices @ matrix.T, faces, {name: turned[name] for name in given}
+    suggested = suggest_landmarks(
+        vertices @ matrix.T, faces, {name: turned[name] for name in landmarks}
     )
-    mirrored = {name for name in found if mate(name) in given and mate(name) != name}
-    kept = mirrored if set(RIGHT) <= set(given) else set(found)
-    return {name: float(np.linalg.norm(found[name] - turned[name])) for name in kept}
+    mirrored = {
+        name for name in suggested if mate(name) in landmarks and mate(name) != name
+    }
+    compared = mirrored if set(RIGHT) <= set(landmarks) else set(suggested)
+    return {
+        name: float(np.linalg.norm(suggested[name] - turned[name])) for name in compared
+    }

@@ -75,10 +75,12 @@ def main(db: str, captures: Sequence[Path]) -> None:
                 for model in models
             ]
             errors = [100 * model.attrs["held_out_error"]["median"] for model in models]
-            left = 100 * np.log(models[1]["light_gains/light_gain"].values / gain).std()
+            residual = (
+                100 * np.log(models[1]["light_gains/light_gain"].values / gain).std()
+            )
             cells = (
                 f"{spread:.0%}",
-                f"{left:.1f}",
+                f"{residual:.1f}",
                 "{:.1f}, {:.1f}".format(*angles),
                 "{:.1f}, {:.1f}".format(*errors),
             )

@@ -68,9 +68,9 @@ def embedded() -> None:
         start = process_time()
         convolve_disc(embedded_dictionary(), DISC, far=far, near=near)
         spent = process_time() - start
-        found = _disc(pairs, far, near)
+        averaged = _disc(pairs, far, near)
         cells = [
-            _above(found, exact, *pairs, lowest) for lowest in (0.1, 0.2, 0.3, 0.5)
+            _above(averaged, exact, *pairs, lowest) for lowest in (0.1, 0.2, 0.3, 0.5)
         ]
         worst = " | ".join(f"{100 * error.max():.2f} %" for error in cells)
         print(
@@ -91,9 +91,9 @@ def _disc(pairs, far, near):
     )
 
 
-def _above(found, exact, wi, wo, lowest):
+def _above(values, exact, wi, wo, lowest):
     up = np.minimum(wi[:, 2], wo[:, 2]) > lowest
-    return weighted_error(found[up], exact[up], wi[up], wo[up])
+    return weighted_error(values[up], exact[up], wi[up], wo[up])
 
 
 def _summary(report) -> None:
@@ -131,11 +131,11 @@ def grid() -> None:
                 lambda a, b: evaluate_abc(ROWS, a, b),
                 SimpleNamespace(**axes, n_theta_h=shape[0]),
             )
-            found = lookup(
+            values = lookup(
                 table, th, warp(np.minimum(td / (np.pi / 2), 1)) * np.pi / 2, pd
             )
             six, twelve = (
-                _above(found, exact, wi, wo, lowest) for lowest in (0.1, 0.2)
+                _above(values, exact, wi, wo, lowest) for lowest in (0.1, 0.2)
             )
             cells = [
                 f"{100 * np.median(e):.2f} %, {100 * e.max():.2f} %"
@@ -188,11 +188,11 @@ def compare(files: Path, slices) -> None:
         "\n| against the measured slices, above 12 degrees | median of the medians "
         "| worst median |\n|---|---|---|"
     )
-    for name, found in (
+    for name, weights in (
         ("tables read from MERL binaries", lookup(dictionary.table, *angles)),
         ("ABC formula", abc),
     ):
-        off = np.median(np.abs(found / np.maximum(want, 1e-5) - 1), axis=0)
+        off = np.median(np.abs(weights / np.maximum(want, 1e-5) - 1), axis=0)
         print(f"| {name} | {100 * np.median(off):.1f} % | {100 * off.max():.1f} % |")
     _mixtures(dictionary)
 
@@ -212,15 +212,15 @@ def _mixtures(dictionary) -> None:
         angles = half_difference(*pairs)
         want = lookup(dictionary.table, *angles)
         bases = lookup(embedded_dictionary().table, *angles)
-        others = [np.delete(bases, m, axis=1) for m in range(want.shape[1])]
-        own = weighted_error(bases, want, *pairs)
+        without = [np.delete(bases, m, axis=1) for m in range(want.shape[1])]
+        weights = weighted_error(bases, want, *pairs)
         rows = {
-            "all 59": [_mixed(bases, one, pairs) for one in want.T],
+            "all 59": [_mixed(bases, values, pairs) for values in want.T],
             "the other 58": [
-                _mixed(some, one, pairs)
-                for some, one in zip(others, want.T, strict=True)
+                _mixed(remaining, values, pairs)
+                for remaining, values in zip(without, want.T, strict=True)
             ],
-            "the material's own ABC parameters, unmixed": own,
+            "the material's own ABC parameters, unmixed": weights,
         }
         for name, errors in rows.items():
             worst = f"{100 * np.max(errors):.0f} %"
@@ -232,8 +232,8 @@ def _mixtures(dictionary) -> None:
 def _mixed(bases, want, pairs) -> float:
     root = np.sqrt(pairs[0][:, 2] * pairs[1][:, 2])  # of the error's weight
     rows = bases * root[:, None]
-    _, left = nnls(rows / np.linalg.norm(rows, axis=0), want * root, maxiter=3000)
-    return left / np.linalg.norm(want * root)
+    _, residual = nnls(rows / np.linalg.norm(rows, axis=0), want * root, maxiter=3000)
+    return residual / np.linalg.norm(want * root)
 
 
 def reconstruction(weights) -> np.ndarray:
@@ -244,8 +244,8 @@ def reconstruction(weights) -> np.ndarray:
     out = np.empty((*SHAPE, 3))
     for i, theta_h in enumerate(h**2 * np.pi / 2):
         td, pd = np.meshgrid(d * np.pi / 2, p * np.pi, indexing="ij")
-        one = np.ones_like(td)
-        x = [np.sin(theta_h) * one, 0 * one, np.cos(theta_h) * one]
+        ones = np.ones_like(td)
+        x = [np.sin(theta_h) * ones, 0 * ones, np.cos(theta_h) * ones]
         x = np.stack(
             [*x, np.sin(td) * np.cos(pd), np.sin(td) * np.sin(pd), np.cos(td)], axis=-1
         )

@@ -25,12 +25,12 @@ def repeated(capture: xr.DataTree, surfels: int) -> xr.DataTree:
     """A capture that repeats the surfels of `capture`, lazily."""
     groups = groups_of(capture)
     for name in ("samples", "surfels"):
-        one = groups[name]
-        along = one[[str(v) for v in one.data_vars if "surfel" in one[v].dims]]
+        group = groups[name]
+        along = group[[str(v) for v in group.data_vars if "surfel" in group[v].dims]]
         # clones, because a block that many tasks share would be read once and kept in memory
-        copies = [clone(along) for _ in range(-(-surfels // one.sizes["surfel"]))]
+        copies = [clone(along) for _ in range(-(-surfels // group.sizes["surfel"]))]
         many = xr.concat(copies, dim="surfel").isel(surfel=slice(surfels))
-        groups[name] = many.merge(one.drop_dims("surfel"))
+        groups[name] = many.merge(group.drop_dims("surfel"))
     tree = xr.DataTree.from_dict(groups)
     tree.attrs = capture.attrs
     return tree

@@ -60,15 +60,15 @@ def pictures(surface, camera, lights, scene) -> None:
     strong = lights.intensity.copy()
     strong[0] *= DOMINANT
     dominated = replace(lights, intensity=strong)
-    whole = Lighting(lights)
+    complete = Lighting(lights)
     room = Lighting(None, sky())
     cases = {
         "one light": (Lighting(lights.select([0])), Quality(64)),
-        "dome": (whole, Quality(64)),
-        "dome, error 2 %": (whole, Quality(error=0.02)),
+        "dome": (complete, Quality(64)),
+        "dome, error 2 %": (complete, Quality(error=0.02)),
         "one light dominates, error 2 %": (Lighting(dominated), Quality(error=0.02)),
         "sky": (room, Quality(64)),
-        "dome, subsurface": (whole, Quality(32, subsurface=True)),
+        "dome, subsurface": (complete, Quality(32, subsurface=True)),
         "one light dominates, subsurface, error 2 %": (
             Lighting(dominated),
             Quality(error=0.02, subsurface=True),
@@ -82,23 +82,23 @@ def pictures(surface, camera, lights, scene) -> None:
             ]
             for _ in range(3)
         ]
-        first, second = (min(run[i][0] for run in runs) for i in (0, 1))
-        (_, without, _), (_, found, omissions) = runs[0]
+        seconds_before, seconds_after = (min(run[i][0] for run in runs) for i in (0, 1))
+        (_, without, _), (_, picture, omissions) = runs[0]
         gap = np.sqrt(
-            np.mean((found.radiance - without.radiance) ** 2)
+            np.mean((picture.radiance - without.radiance) ** 2)
             / np.mean(without.radiance**2)
         )
         print(
-            f"{name}: {first:.1f} s, with its plan {second:.1f} s; pictures differ "
+            f"{name}: {seconds_before:.1f} s, with its plan {seconds_after:.1f} s; pictures differ "
             f"by {gap:.2%}, noise "
-            f"{found.relative_error:.2%}"
+            f"{picture.relative_error:.2%}"
         )
-        print("".join(f"    {one}\n" for one in omissions), end="")
+        print("".join(f"    {line}\n" for line in omissions), end="")
 
 
 def bases(surface, camera, lights, scene) -> None:
     """Time with all bases, and with the first one alone."""
-    one = replace(
+    changed = replace(
         surface,
         parameters=surface.parameters[:, :1],
         model=Mixture(np.ascontiguousarray(surface.model.table[..., :1])),
@@ -110,7 +110,7 @@ def bases(surface, camera, lights, scene) -> None:
         times = [
             [
                 made(face, camera, lighting, scene, Quality(64), planned=True)[0]
-                for face in (surface, one)
+                for face in (surface, changed)
             ]
             for _ in range(3)
         ]
@@ -131,21 +131,21 @@ def behind(surface, scene) -> None:
     dark = room.copy()
     dark[32, :2] = 0
     lowest = trace_view(surface, camera, scene=scene).normal[:, 2].min()
-    found = [
+    images = [
         render_monte_carlo(
             surface,
             camera,
-            Lighting(None, Environment(one)),
+            Lighting(None, Environment(surrounding)),
             Quality(64),
             rng=np.random.default_rng(1),
             scene=scene,
         ).relative_error
-        for one in (room, dark)
+        for surrounding in (room, dark)
     ]
     print(
         f"close-up, sun behind (normals face it by at most {-lowest:.2f}): noise "
-        f"{found[0]:.2%}, without it "
-        f"{found[1]:.2%}"
+        f"{images[0]:.2%}, without it "
+        f"{images[1]:.2%}"
     )
 
 
@@ -159,9 +159,9 @@ def hidden(surface, scene) -> None:
         axis=1,
     )
     seen = np.zeros(len(surface.vertices), bool)
-    for one in way:
-        front = np.flatnonzero(surface.normals @ one > 0)
-        target = surface.vertices[front] + 2000 * one
+    for direction in way:
+        front = np.flatnonzero(surface.normals @ direction > 0)
+        target = surface.vertices[front] + 2000 * direction
         seen[
             front[
                 ~scene.occluded(
@@ -195,11 +195,11 @@ def nodes(tables) -> None:
     )
     weight = (weight * np.sin(angles[1]) * np.cos(angles[1])).reshape(*shape, 1)
     for axis, name in enumerate(("theta_h", "theta_d", "phi_d")):
-        whole = np.moveaxis(tables, axis, 0)
+        moved = np.moveaxis(tables, axis, 0)
         if name == "phi_d":
-            whole = np.concatenate([whole, whole[:1]])
-        count = len(whole)
-        half = resampled(whole, np.linspace(0, count - 1, (count + 1) // 2))
+            moved = np.concatenate([moved, moved[:1]])
+        count = len(moved)
+        half = resampled(moved, np.linspace(0, count - 1, (count + 1) // 2))
         back = resampled(half, np.linspace(0, len(half) - 1, count))[: shape[axis]]
         error = np.moveaxis(back, 0, axis) - tables
         rms = np.sqrt(

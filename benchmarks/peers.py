@@ -137,20 +137,20 @@ def fit(peer: Peer, observed: Array, usable: Mask, light: Array, training: Mask)
     normal, albedo = _least_squares(
         observed[:, training], usable[:, training], light[training]
     )
-    first, second = _tangents(normal)
+    tangent, bitangent = _tangents(normal)
     start = np.tile(np.array([*peer.start, 0.0, 0.0]), (len(observed), 1))
     start[:, 0] += np.log(albedo)
 
     def shade(parameters: Array, lights: Array) -> Array:
         return peer.shading(
-            parameters[:, :-2], _turned(parameters, normal, first, second), lights
+            parameters[:, :-2], _turned(parameters, normal, tangent, bitangent), lights
         )
 
     seen = usable[:, training]
-    found = _refine(
+    solution = _refine(
         lambda p: shade(p, light[training]), start, observed[:, training], seen
     )
-    return Fit(_turned(found, normal, first, second), shade(found, light))
+    return Fit(_turned(solution, normal, tangent, bitangent), shade(solution, light))
 
 
 def mixture(observed: Array, usable: Mask, light: Array, training: Mask) -> Fit:
@@ -216,42 +216,44 @@ def _refine(
     shade: Callable[[Array], Array], start: Array, observed: Array, usable: Mask
 ) -> Array:
     """Damped Gauss-Newton steps for every row of parameters (n, p) by itself."""
-    found = start.copy()
-    predicted = shade(found)
+    solution = start.copy()
+    predicted = shade(solution)
     damping = np.full(len(start), 1e-2)
     for _ in range(ROUNDS):
         weight = _robust_weights(observed, predicted, usable)
         strength = weight.sum(axis=1) * observed.max(axis=1) ** 2 + 1e-12
         prior = PRIOR**2 * strength
-        slope = _derivatives(shade, found, predicted)
+        slope = _derivatives(shade, solution, predicted)
         gram = np.einsum("nl,nlp,nlq->npq", weight, slope, slope)
         right = np.einsum("nl,nlp,nl->np", weight, slope, observed - predicted)
-        right -= prior[:, None] * (found - start)
+        right -= prior[:, None] * (solution - start)
         diagonal = np.einsum("npp->np", gram)
         diagonal += prior[:, None] + damping[:, None] * (
             diagonal + 1e-9 * strength[:, None]
         )
         step = np.clip(np.linalg.solve(gram, right[:, :, None])[:, :, 0], -0.5, 0.5)
-        trial = shade(found + step)
+        trial = shade(solution + step)
         before = (weight * (observed - predicted) ** 2).sum(axis=1) + prior * (
-            (found - start) ** 2
+            (solution - start) ** 2
         ).sum(axis=1)
         after = (weight * (observed - trial) ** 2).sum(axis=1) + prior * (
-            (found + step - start) ** 2
+            (solution + step - start) ** 2
         ).sum(axis=1)
         better = after < before
-        found[better] += step[better]
+        solution[better] += step[better]
         predicted[better] = trial[better]
         damping = np.where(
             better, np.maximum(damping / 3, 1e-6), np.minimum(damping * 4, 1e4)
         )
-    return found
+    return solution
 
 
-def _derivatives(shade: Callable[[Array], Array], at: Array, value: Array) -> Array:
+def _derivatives(
+    shade: Callable[[Array], Array], parameters: Array, value: Array
+) -> Array:
     columns = []
-    for p in range(at.shape[1]):
-        moved = at.copy()
+    for p in range(parameters.shape[1]):
+        moved = parameters.copy()
         moved[:, p] += DIFFERENCE
         columns.append((shade(moved) - value) / DIFFERENCE)
     return np.stack(columns, axis=2)
@@ -259,13 +261,15 @@ def _derivatives(shade: Callable[[Array], Array], at: Array, value: Array) -> Ar
 
 def _tangents(normal: Array) -> tuple[Array, Array]:
     away = np.where(np.abs(normal[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
-    first = np.cross(normal, away)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    return first, np.cross(normal, first)
+    tangent = np.cross(normal, away)
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    return tangent, np.cross(normal, tangent)
 
 
-def _turned(parameters: Array, normal: Array, first: Array, second: Array) -> Array:
-    moved = normal + parameters[:, -2:-1] * first + parameters[:, -1:] * second
+def _turned(
+    parameters: Array, normal: Array, tangent: Array, bitangent: Array
+) -> Array:
+    moved = normal + parameters[:, -2:-1] * tangent + parameters[:, -1:] * bitangent
     return np.asarray(moved / np.linalg.norm(moved, axis=1, keepdims=True))
 
 

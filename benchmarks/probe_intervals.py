@@ -56,14 +56,14 @@ def main(*, profiles: int = 200) -> None:
     for free in (False, True):
         for relative in RELATIVE:
             for floor in FLOOR:
-                found = list(draws(count, relative=relative, floor=floor, free=free))
-                off = np.array([fit.sigma_tr / true - 1 for fit, true in found])
+                results = list(draws(count, relative=relative, floor=floor, free=free))
+                off = np.array([fit.sigma_tr / true - 1 for fit, true in results])
                 inside = [
                     abs(fit.sigma_tr - true) < 1.96 * fit.sigma_tr_error
-                    for fit, true in found
+                    for fit, true in results
                 ]
                 fitted = np.array(
-                    [fit.status == ProbeStatus.FITTED for fit, _ in found]
+                    [fit.status == ProbeStatus.FITTED for fit, _ in results]
                 )
                 gain = "free" if free else "known"
                 print(

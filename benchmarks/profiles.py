@@ -157,10 +157,10 @@ def main(
             for r in part
             if r["distance"] in PRINTED
         ]
-        first = part[0]
+        row = part[0]
         print(
-            f"| {first['albedo']} | {first['model']} | {' | '.join(cells)} | "
-            f"{1e3 * first['seconds']:.2f} |"
+            f"| {row['albedo']} | {row['model']} | {' | '.join(cells)} | "
+            f"{1e3 * row['seconds']:.2f} |"
         )
     if png:
         plot(rows, png)

@@ -60,19 +60,19 @@ def radiance_biases(capture, folder):
         np.concatenate(views, axis=1), seconds, black=sensor.black, white=sensor.white
     )
     biases = []
-    for own in (sensor, replace(sensor, response=response.table)):
+    for variant in (sensor, replace(sensor, response=response.table)):
         merged = []
         truth = []
         for path in sorted(folder.glob("*.exr")):
             light, name = path.stem.split("_")
             camera = next(c for c in dome.cameras if c.id == name)
             frames = read_view(dome, light, camera)
-            found, _, flag = merge_exposures(
-                frames, seconds, own, dark=mergers[name].dark
+            radiance, _, flag = merge_exposures(
+                frames, seconds, variant, dark=mergers[name].dark
             )
             expected = read_frame(path, None)
             usable = (flag == 0) & (expected > 0).all(axis=-1)
-            merged.append(found[usable].astype(float))
+            merged.append(radiance[usable].astype(float))
             truth.append(expected[usable].astype(float))
         biases.append(
             _octave_biases(np.concatenate(merged), np.concatenate(truth), seconds[0])
@@ -100,7 +100,9 @@ def light_errors(capture, truth):
     faults = []
     mergers = frame_mergers(dome, faults)
     with ThreadPoolExecutor(2) as pool:
-        used = light_intensities(dome, mergers, pool) / truth["light_intensity"] - 1
+        target_errors = (
+            light_intensities(dome, mergers, pool) / truth["light_intensity"] - 1
+        )
     targets = [
         target_pixels(c, dome.white) for c in dome.cameras if c.id in dome.white.cameras
     ]
@@ -121,8 +123,12 @@ def light_errors(capture, truth):
             white.reflectance,
         )
         fits.append(fit_light(pixels))
-    own = np.array([f.intensity for f in fits]) / truth["light_intensity"] - 1
-    return used, own, np.median([[f.falloff, f.falloff_error] for f in fits], axis=0)
+    fit_errors = np.array([f.intensity for f in fits]) / truth["light_intensity"] - 1
+    return (
+        target_errors,
+        fit_errors,
+        np.median([[f.falloff, f.falloff_error] for f in fits], axis=0),
+    )
 
 
 def _target_radiance(dome, light, merger, target):
@@ -138,16 +144,18 @@ def stated_errors(capture, truth):
     """Mean and largest relative error of `calibrate_lights` with the stated fall-off,
     glare, and rms z-score.
     """
-    found = calibrate_lights(
+    calibrated = calibrate_lights(
         replace(
             capture.dome,
             lights=[replace(light, intensity=None) for light in capture.dome.lights],
         )
     )
-    error = found["calibrated_intensity"].values / truth["light_intensity"] - 1
-    noise = (found["calibrated_intensity_error"] / found["calibrated_intensity"]).values
+    error = calibrated["calibrated_intensity"].values / truth["light_intensity"] - 1
+    noise = (
+        calibrated["calibrated_intensity_error"] / calibrated["calibrated_intensity"]
+    ).values
     position, glare = (
-        found[name].values[:, None]
+        calibrated[name].values[:, None]
         for name in ("calibrated_intensity_position_error", "glare_fraction")
     )
     z = error / np.sqrt(noise**2 + position**2 + glare**2)
@@ -178,14 +186,14 @@ def published_response(folder):
         stack, (0.125, 1.0, 8.0), black=0, white=255, options=options
     )
     values = np.arange(20, 251)
-    found = np.stack(
+    recovered = np.stack(
         [
             np.interp(values, response.table[:, 0], response.table[:, c])
             for c in (1, 2, 3)
         ],
         axis=-1,
     )
-    return response, reference, np.log(found / reference[values]).std(axis=0)
+    return response, reference, np.log(recovered / reference[values]).std(axis=0)
 
 
 def chrome_directions(folder):
@@ -226,12 +234,14 @@ def main(
     for folder in captures:
         capture = read_capture(folder)
         truth = read_truth(folder)
-        used, own, falloff = light_errors(capture, truth)
+        target_errors, fit_errors, falloff = light_errors(capture, truth)
         if capture.dome.cameras[0].sensor.response is not None:
             curved[folder.name] = radiance_biases(
                 capture, folder.with_name(folder.name + ".truth")
             )
-        largest = [f"{100 * np.abs(e).max():.2f} %" for e in (used, own)]
+        largest = [
+            f"{100 * np.abs(e).max():.2f} %" for e in (target_errors, fit_errors)
+        ]
         stated = "{:.2f} %, {:.2f} %, {:.2f} %, {:.2f}".format(
             *stated_errors(capture, truth)
         )
@@ -244,10 +254,10 @@ def main(
         )
     for name, biases in curved.items():
         for response, bias in zip(("given", "recovered"), biases, strict=True):
-            shown = ", ".join(
+            cells = ", ".join(
                 f"2^{o} {100 * b:+.2f} %" for o, b in zip(OCTAVES, bias, strict=True)
             )
-            print(f"{name}, bias of radiance with the {response} response: {shown}")
+            print(f"{name}, bias of radiance with the {response} response: {cells}")
     if exposures:
         print(
             "frobisher, RMS difference of ln exposure, R G B:",

@@ -97,10 +97,10 @@ def main(*, surfels: int = 5 * stage_module.SHARD, repeat: int = 5) -> None:
         seconds: dict[tuple[str, str], list[float]] = {}
         for _ in range(repeat):
             for name, store in stores.items():
-                for what, read in (("whole", whole), ("part", part)):
+                for part_name, read in (("whole", whole), ("part", part)):
                     begin = time.perf_counter()
                     read(zarr.open_array(store(), path=NAME, mode="r"))
-                    seconds.setdefault((name, what), []).append(
+                    seconds.setdefault((name, part_name), []).append(
                         time.perf_counter() - begin
                     )
         stored = record.bytes / surfels
@@ -109,10 +109,13 @@ def main(*, surfels: int = 5 * stage_module.SHARD, repeat: int = 5) -> None:
             "bytes stored per surfel"
         )
         for name in stores:
-            row = [median(seconds[name, what]) for what in ("whole", "part")]
-            base = [median(seconds["no check", what]) for what in ("whole", "part")]
+            row = [median(seconds[name, part_name]) for part_name in ("whole", "part")]
+            base = [
+                median(seconds["no check", part_name])
+                for part_name in ("whole", "part")
+            ]
             columns = zip(("whole", "part"), row, base, strict=True)
             ratios = " ".join(
-                f"{what} {a:.3f} s ({a / b:.2f} x)" for what, a, b in columns
+                f"{part_name} {a:.3f} s ({a / b:.2f} x)" for part_name, a, b in columns
             )
             print(f"{name:<24} {ratios}")

@@ -178,10 +178,10 @@ def prediction_error(
     observed = photographs.grey
     if scaled:
         predicted = predicted * light_factors(photographs, predicted)
-    used = photographs.usable & chosen & np.isfinite(predicted)
-    wrong = np.where(used, predicted - observed, 0.0)
-    whole = np.where(used, observed, 0.0)
-    square = (whole**2).sum(axis=1)
+    compared = photographs.usable & chosen & np.isfinite(predicted)
+    wrong = np.where(compared, predicted - observed, 0.0)
+    known_values = np.where(compared, observed, 0.0)
+    square = (known_values**2).sum(axis=1)
     error = np.sqrt((wrong**2).sum(axis=1)[square > 0] / square[square > 0])
     return 100 * float(np.median(error)) if error.size else np.nan
 
@@ -230,18 +230,18 @@ def face_rows(people: list[Photographs]) -> list[list[str]]:
         cells = []
         for k, person in enumerate(people):
             training = ~person.held_out
-            own = person.divided_by(
+            equalised = person.divided_by(
                 own_gains(person, training, None if name == "skindb" else method)
             )
             shared = person.divided_by(common_gains(people, rig, k))
             raw, balanced, common = (
-                method(part, training).predicted for part in (person, own, shared)
+                method(part, training).predicted for part in (person, equalised, shared)
             )
             cells.append(
                 [
                     prediction_error(person, raw, person.held_out),
                     prediction_error(person, raw, person.held_out, scaled=True),
-                    prediction_error(own, balanced, person.held_out, scaled=True),
+                    prediction_error(equalised, balanced, person.held_out, scaled=True),
                     prediction_error(shared, common, person.held_out),
                 ]
             )
@@ -347,8 +347,8 @@ def coverage(fitted: Fitted, angle: Array) -> str:
     )
 
 
-def _two(first: float, second: float, places: int = 1) -> str:
-    return f"{first:.{places}f}, {second:.{places}f}"
+def _two(left_value: float, right_value: float, places: int = 1) -> str:
+    return f"{left_value:.{places}f}, {right_value:.{places}f}"
 
 
 def measure(data: Path, part: str) -> list[list[str]] | str:

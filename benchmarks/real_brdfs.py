@@ -81,8 +81,8 @@ def _others(wi: Array, wo: Array):
     order = list(PARAMETERS)
 
     def estimate(material: str, value: Array) -> Array:
-        others = np.delete(lobes, order.index(material), axis=1)
-        return _perceptual_nnls(np.column_stack([others, np.ones(len(value))]), value)
+        without = np.delete(lobes, order.index(material), axis=1)
+        return _perceptual_nnls(np.column_stack([without, np.ones(len(value))]), value)
 
     return estimate
 

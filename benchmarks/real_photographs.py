@@ -165,13 +165,13 @@ def common_gains(
     """
     result = np.ones(len(people[without].light))
     for i, name in enumerate(people[without].light_name):
-        others = [
+        gains_of_others = [
             gain[person.light_name.index(name)]
             for k, (person, gain) in enumerate(zip(people, gains, strict=True))
             if k != without and name in person.light_name
         ]
-        if others:
-            result[i] = np.median(others)
+        if gains_of_others:
+            result[i] = np.median(gains_of_others)
     return result
 
 

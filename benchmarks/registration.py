@@ -1,7 +1,7 @@
 """Errors of a common (u, v): correspondences of virtual heads with known corresponding
 points, and regions.
 
-    python -m benchmarks registration CAPTURE ... [--shared N] [--every N] [--brief]
+    python -m benchmarks registration CAPTURE ... [--shared N] [--stride N] [--brief]
 
 Only the scan, landmarks and regions of the folder CAPTURE are read, not its frames. The
 vertices of the truth must be the same points of every head, as in captures of
@@ -92,10 +92,10 @@ def cut_differently(models: Models) -> Models:
         mesh = model["mesh"].to_dataset()
         corners = position[mesh["triangle"].values]
         low = float(mesh["landmark_position"].sel(landmark="chin")[1]) - below
-        kept = (corners[..., 1].min(axis=1) > low) & (
+        inside = (corners[..., 1].min(axis=1) > low) & (
             corners[..., 2].min(axis=1) > position[:, 2].min() + BACK
         )
-        piece = clean_mesh(position, mesh["triangle"].values[kept].astype(np.int64))
+        piece = clean_mesh(position, mesh["triangle"].values[inside].astype(np.int64))
         uv, _ = disc_atlas(piece.vertices, piece.faces)
         out[take] = xr.DataTree.from_dict(
             {
@@ -123,9 +123,9 @@ def on_both(models: Models, points: Mapping[str, Array]) -> NDArray[np.bool_]:
         take: cKDTree(model["fitted"].to_dataset()["surfel_position"].values)
         for take, model in models.items()
     }
-    there = {take: tree[take].query(p)[0] < PRESENT for take, p in points.items()}
+    present = {take: tree[take].query(p)[0] < PRESENT for take, p in points.items()}
     return np.concatenate(
-        [[there[a] & there[b] for a in points if a != b] for b in points]
+        [[present[a] & present[b] for a in points if a != b] for b in points]
     )
 
 
@@ -175,19 +175,23 @@ def against(
         click = case.get("click", 0.0)
         smoothing = case.get("smoothing")
         takes = with_landmarks(models, np.sort(order[:count]), click=click)
-        found = register(takes, smoothing=smoothing)
-        error = correspondence_error(takes, found, points)
-        kinds = ", ".join(sorted({one.attrs["warp_kind"] for one in found.values()}))
-        used = [one.attrs["warp_smoothing"] for one in found.values()]
-        condition = max(one.attrs["warp_condition"] for one in found.values())
-        said = (
-            f"{max(used):.3g}"
-            if max(used) == min(used)
-            else f"{min(used):.3g} to {max(used):.3g}"
+        registered = register(takes, smoothing=smoothing)
+        error = correspondence_error(takes, registered, points)
+        kinds = ", ".join(
+            sorted({result.attrs["warp_kind"] for result in registered.values()})
         )
-        row = f"| {count} | {click:g} | {said} | {kinds} | {condition:.0f} |"
+        smoothings = [result.attrs["warp_smoothing"] for result in registered.values()]
+        condition = max(
+            result.attrs["warp_condition"] for result in registered.values()
+        )
+        range_text = (
+            f"{max(smoothings):.3g}"
+            if max(smoothings) == min(smoothings)
+            else f"{min(smoothings):.3g} to {max(smoothings):.3g}"
+        )
+        row = f"| {count} | {click:g} | {range_text} | {kinds} | {condition:.0f} |"
         anchors, flips = (
-            sum(one.attrs[f"warp_{name}"] for one in found.values())
+            sum(result.attrs[f"warp_{name}"] for result in registered.values())
             for name in ("anchors", "flips")
         )
         print(
@@ -204,15 +208,15 @@ def regions(models: Models, registered: Mapping[str, xr.Dataset]) -> None:
     rows: dict[str, list[float]] = {}
     for take, model in models.items():
         fitted = model["fitted"].to_dataset()
-        one = registered[take]
-        own = own_masks(fitted)
+        result = registered[take]
+        masks = own_masks(fitted)
         area = fitted["surfel_area"].values
         named = {
-            str(n): one["common_landmark"].sel(landmark=n).values
-            for n in one["landmark"].values
+            str(n): result["common_landmark"].sel(landmark=n).values
+            for n in result["landmark"].values
         }
-        for name, mask in region_masks(one["common_uv"].values, named).items():
-            parts = [own[part] for part in BESIDE.get(name, (name,)) if part in own]
+        for name, mask in region_masks(result["common_uv"].values, named).items():
+            parts = [masks[part] for part in BESIDE.get(name, (name,)) if part in masks]
             if parts:
                 rows.setdefault(name, []).append(
                     mask_agreement(mask, np.any(parts, axis=0), area)
@@ -228,7 +232,7 @@ def main(
     shared: Annotated[
         int | None, "Number of leading vertices that all heads share (default: all)."
     ] = None,
-    every: Annotated[int, "Use every N-th of them."] = 3,
+    stride: Annotated[int, "Use every N-th of them."] = 3,
     outside: Annotated[
         str, "Regions that are not part of the face."
     ] = "ear,scalp,neck,neck_beard,other",
@@ -239,21 +243,21 @@ def main(
     points = {}
     truths = [read_truth(folder) for folder in capture]
     for folder, truth in zip(capture, truths, strict=True):
-        points[folder.name] = truth["vertices"][:shared:every].astype(np.float64)
-    region = true_regions(truths[-1])[:shared:every]
+        points[folder.name] = truth["vertices"][:shared:stride].astype(np.float64)
+    region = true_regions(truths[-1])[:shared:stride]
     face = ~np.isin(region, outside.split(","))
-    first = sorted(models)[0]
+    reference = sorted(models)[0]
     cut = cut_differently(models)
     for title, takes in {
         "Unchanged scans": models,
         "Scans that end at different places": cut,
     }.items():
         ways = {"own (u, v)": unregistered(takes), "mean of all": register(takes)}
-        ways |= {f"{first} as reference": register(takes, reference=first)}
+        ways |= {f"{reference} as reference": register(takes, reference=reference)}
         both = on_both(takes, points)
         errors = {
-            n: np.where(both, correspondence_error(takes, one, points), np.nan)
-            for n, one in ways.items()
+            n: np.where(both, correspondence_error(takes, registered, points), np.nan)
+            for n, registered in ways.items()
         }
         print(f"\n{title}:\n")
         by_region(errors, region, face)

@@ -48,10 +48,10 @@ def sky() -> Environment:
     )
 
 
-def difference(found, reference):
+def difference(picture, reference):
     """RMS difference over RMS of the reference, where both pictures show skin."""
-    seen = (found.coverage > 0.999) & (reference.coverage > 0.999)
-    square = np.mean((found.radiance - reference.radiance)[seen] ** 2) / np.mean(
+    seen = (picture.coverage > 0.999) & (reference.coverage > 0.999)
+    square = np.mean((picture.radiance - reference.radiance)[seen] ** 2) / np.mean(
         reference.radiance[seen] ** 2
     )
     return float(np.sqrt(square))
@@ -78,8 +78,13 @@ def by_samples(surface, camera, lighting, **options):
 
     reference = made(REFERENCE, 99)
     for samples in SAMPLES:
-        found = made(samples, samples)
-        yield samples, found.seconds, difference(found, reference), found.relative_error
+        picture = made(samples, samples)
+        yield (
+            samples,
+            picture.seconds,
+            difference(picture, reference),
+            picture.relative_error,
+        )
 
 
 def by_opening(surface, lighting):
@@ -94,18 +99,20 @@ def by_opening(surface, lighting):
         transmitted_irradiance(surface, lighting.lights, scene)
         @ lighting.lights.intensity
     )
-    wanted = np.zeros(len(surface.vertices), bool)
+    receivers = np.zeros(len(surface.vertices), bool)
     # all pairs of all surfels would take hours
-    wanted[:: max(len(wanted) // 2000, 1)] = True
+    receivers[:: max(len(receivers) // 2000, 1)] = True
     started = time.perf_counter()
-    exact = exitance_from_irradiance(surface, received, wanted, tolerance=0.0)[wanted]
+    exact = exitance_from_irradiance(surface, received, receivers, tolerance=0.0)[
+        receivers
+    ]
     yield 0.0, time.perf_counter() - started, 0.0
     for opening in OPENINGS:
         started = time.perf_counter()
-        found = exitance_from_irradiance(surface, received, wanted, tolerance=opening)[
-            wanted
-        ]
-        error = np.sqrt(np.mean((found - exact) ** 2) / np.mean(exact**2))
+        exitance = exitance_from_irradiance(
+            surface, received, receivers, tolerance=opening
+        )[receivers]
+        error = np.sqrt(np.mean((exitance - exact) ** 2) / np.mean(exact**2))
         yield opening, time.perf_counter() - started, float(error)
 
 
@@ -223,8 +230,8 @@ def main(db: str, *, take: str | None = None, picture: Path | None = None) -> No
     }
     curves = {}
     print(f"{camera.width} x {camera.height} pixels, {len(surface.vertices)} surfels")
-    for name, (lighting, more) in cases.items():
-        curves[name] = list(by_samples(surface, camera, lighting, **more))
+    for name, (lighting, options) in cases.items():
+        curves[name] = list(by_samples(surface, camera, lighting, **options))
         for samples, seconds, error, stated in curves[name]:
             print(
                 f"{name}: {samples} rays per pixel {seconds:.1f} s, error "

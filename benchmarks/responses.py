@@ -59,7 +59,7 @@ def photograph(radiance, seconds, form, noise, rng):
 def errors(form, seconds, noise):
     """Root mean square (octave,) of the relative error."""
     exposure = 0.98 * 2.0**-OCTAVES
-    found = []
+    results = []
     for seed in (100, 101):
         rng = np.random.default_rng(seed)
         patches = np.exp(rng.uniform(np.log(0.01), np.log(300), (40, 40)))
@@ -73,8 +73,8 @@ def errors(form, seconds, noise):
                 for c in (1, 2, 3)
             ]
         )
-        found.append(ratio / np.median(ratio[:, -5:], axis=1, keepdims=True) - 1)
-    return np.sqrt((np.concatenate(found) ** 2).mean(axis=0))
+        results.append(ratio / np.median(ratio[:, -5:], axis=1, keepdims=True) - 1)
+    return np.sqrt((np.concatenate(results) ** 2).mean(axis=0))
 
 
 def main(*, electrons: float = 20000.0, read_noise: float = 6.0) -> None:

@@ -66,7 +66,7 @@ def expose_again(
         for path in sorted((target / "dome/frames").glob(f"*/*_{camera['id']}.png")):
             values = imagecodecs.png_decode(path.read_bytes())
             expected = per_value * np.maximum(values - float(black), 0)
-            found = rng.poisson(expected) + READ_NOISE * rng.standard_normal(
+            electrons_read = rng.poisson(expected) + READ_NOISE * rng.standard_normal(
                 expected.shape
             )
             # where the frame is saturated, how much light there was is unknown: it
@@ -74,7 +74,7 @@ def expose_again(
             values = np.where(
                 values >= white,
                 white,
-                np.clip(np.rint(black + found / per_value), 0, white),
+                np.clip(np.rint(black + electrons_read / per_value), 0, white),
             )
             path.write_bytes(imagecodecs.png_encode(values.astype(np.uint16)))
     file.write_text(json.dumps(dome))
@@ -94,10 +94,10 @@ def groups(clean: xr.Dataset, noisy: xr.Dataset) -> Iterator[tuple[str, np.ndarr
     pixels = np.broadcast_to(
         noisy["effective_pixels"].values[:, None, :, None], z.shape
     )
-    known = np.isfinite(z)
-    z = z[known]
-    true = true[known]
-    pixels = pixels[known]
+    finite = np.isfinite(z)
+    z = z[finite]
+    true = true[finite]
+    pixels = pixels[finite]
     yield "all", z
     for kind, values, bounds, unit in (
         ("effective pixels", pixels, PIXELS, ""),

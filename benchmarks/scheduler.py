@@ -64,9 +64,9 @@ def counted(dask_scheduler: Any) -> int:
 def fill(db: skindb.Database, takes: int) -> None:
     """Commit small captures."""
     for number in range(takes):
-        one = about(number)
-        with db.stage("capture", one["take"]) as stage:
-            stage.commit(one)
+        attributes = about(number)
+        with db.stage("capture", attributes["take"]) as stage:
+            stage.commit(attributes)
 
 
 def fit_call(
@@ -114,11 +114,11 @@ def process(*arguments: str) -> Iterator[int]:
         [sys.executable, "-m", *arguments],
         env=os.environ | {"PYTHONPATH": here},
         **options,
-    ) as one:
+    ) as child:
         try:
-            yield one.pid
+            yield child.pid
         finally:
-            one.terminate()
+            child.terminate()
 
 
 @contextmanager
@@ -137,9 +137,9 @@ def cluster(folder: Path, workers: int) -> Iterator[tuple[str, int]]:
         ]
         number = stack.enter_context(process(*scheduler))
         wait_until(file.exists)
-        where = str(json.loads(file.read_text())["address"])
+        address = str(json.loads(file.read_text())["address"])
         worker = [
-            where,
+            address,
             *local,
             "--nworkers",
             str(workers),
@@ -149,7 +149,7 @@ def cluster(folder: Path, workers: int) -> Iterator[tuple[str, int]]:
             str(folder),
         ]
         stack.enter_context(process("distributed.cli.dask_worker", *worker))
-        yield where, number
+        yield address, number
 
 
 def wait_until(is_done: Callable[[], bool]) -> None:
@@ -201,14 +201,14 @@ def main(*, takes: int = 1000, workers: int = 2, out: Path | None = None) -> int
             workflow.connected(address) as client,
         ):
             client.wait_for_workers(workers, timeout=START_SECONDS)
-            found = run(client, scheduler, db)
-    for name, value in found.items():
+            results = run(client, scheduler, db)
+    for name, value in results.items():
         print(f"{name:36} {value:12,.1f}")
     if out:
-        out.write_text(json.dumps(found, indent=1))
+        out.write_text(json.dumps(results, indent=1))
     reached = (
-        found["tasks per take"] <= MAX_TASKS
-        and found["scheduler peak [MB]"] <= MAX_MEMORY_MB
-        and found["bytes per take"] <= MAX_BYTES
+        results["tasks per take"] <= MAX_TASKS
+        and results["scheduler peak [MB]"] <= MAX_MEMORY_MB
+        and results["bytes per take"] <= MAX_BYTES
     )
     return 0 if reached else 1

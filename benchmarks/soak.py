@@ -39,10 +39,10 @@ GIVEN = {"k": 3, "hold_out_lights": 0.1}
 def people(subjects: int) -> list[Person]:
     """Every subject in two conditions."""
     rng = np.random.default_rng(87)
-    found = []
+    persons = []
     for i in range(subjects):
         male = bool(rng.random() < 0.7)
-        one = Person(
+        person = Person(
             f"P{i:03d}",
             float(rng.integers(13, 75)),
             "male" if male else "female",
@@ -54,8 +54,8 @@ def people(subjects: int) -> list[Person]:
             blood=float(rng.normal(0, 0.4)),
             fullness=float(rng.uniform(0.3, 0.7)),
         )
-        found += [one, Person(**{**vars(one), "condition": "lotion"})]
-    return found
+        persons += [person, Person(**{**vars(person), "condition": "lotion"})]
+    return persons
 
 
 def memory_mib(process: int | str = "self") -> dict[str, float]:
@@ -146,11 +146,15 @@ class Watch:
     def _run(self) -> None:
         begin = time.monotonic()
         while not self._stop.wait(SAMPLED_SECONDS):
-            of = {"driver": memory_mib()} | {
+            memory = {"driver": memory_mib()} | {
                 str(child): memory_mib(child) for child in children(os.getpid())
             }
             self.samples.append(
-                {"seconds": time.monotonic() - begin, "stage": self.stage, "memory": of}
+                {
+                    "seconds": time.monotonic() - begin,
+                    "stage": self.stage,
+                    "memory": memory,
+                }
             )
 
 
@@ -158,10 +162,12 @@ def children(parent: int) -> Iterator[int]:
     """Ids of all descendants of a process."""
     for task in Path(f"/proc/{parent}/task").glob("*/children"):
         try:
-            own = [int(word) for word in task.read_text(encoding="ascii").split()]
+            children_ids = [
+                int(word) for word in task.read_text(encoding="ascii").split()
+            ]
         except OSError:
             continue
-        for child in own:
+        for child in children_ids:
             yield child
             yield from children(child)
 
@@ -171,12 +177,12 @@ def worked(
     call: Callable[[Any], Any],
     items: list[Any],
     watch: Watch,
-    where: dict[str, Any],
+    executor: dict[str, Any],
 ) -> dict[str, Any]:
     """Run a step over all takes; returns its wall time, tasks and failures."""
     watch.stage, begin, tasks, failures = stage, time.perf_counter(), [], []
     for number, outcome in enumerate(
-        workflow.map_takes(partial(timed, call), items, **where), 1
+        workflow.map_takes(partial(timed, call), items, **executor), 1
     ):
         if outcome.error is None:
             tasks.append(outcome.result())
@@ -215,7 +221,7 @@ def growth(tasks: list[dict[str, Any]]) -> dict[str, float]:
     """Anonymous memory of workers [MiB] at the end of their takes: medians of the
     second and of the last quarter.
     """
-    memory = [task["anonymous"] for task in sorted(tasks, key=lambda one: one["end"])]
+    memory = [task["anonymous"] for task in sorted(tasks, key=lambda item: item["end"])]
     quarter = max(1, len(memory) // 4)
     early = memory[quarter : 2 * quarter] or memory
     late = memory[-quarter:]
@@ -265,19 +271,19 @@ def main(
         Watch() as watch,
         workflow.connected(scheduler) if scheduler else nullcontext() as client,
     ):
-        where = {"client": client} if client else {"workers": workers}
+        executor = {"client": client} if client else {"workers": workers}
         stages["simulate"] = worked(
-            "simulate", partial(simulated, captures, size), persons, watch, where
+            "simulate", partial(simulated, captures, size), persons, watch, executor
         )
         folders = [task["value"] for task in stages["simulate"]["tasks"]]
         stages["ingest"] = worked(
-            "ingest", partial(ingested, db), folders, watch, where
+            "ingest", partial(ingested, db), folders, watch, executor
         )
         stages["fit"] = worked(
-            "fit", partial(fitted, db), db.takes("capture"), watch, where
+            "fit", partial(fitted, db), db.takes("capture"), watch, executor
         )
         with alone("register", watch, studies):
-            workflow.register_takes(db, **where)
+            workflow.register_takes(db, **executor)
         with alone("brdf", watch, studies):
             workflow.study(db, "brdf")
         for group in (None, "gender", "condition"):
@@ -298,10 +304,10 @@ def main(
     )
     for name, stage in stages.items():
         print(summary(name, stage))
-    for name, one in studies.items():
-        outcome = one["failure"] or f"driver {one['anonymous']:.0f} MiB"
+    for name, study in studies.items():
+        outcome = study["failure"] or f"driver {study['anonymous']:.0f} MiB"
         print(
-            f"{name:<26} wall {one['wall']:7.1f} s, CPU {one['cpu']:7.1f} s, {outcome}"
+            f"{name:<26} wall {study['wall']:7.1f} s, CPU {study['cpu']:7.1f} s, {outcome}"
         )
     driver = [sample["memory"]["driver"]["anonymous"] for sample in watch.samples]
     print(f"driver, peak anonymous memory: {max(driver):.0f} MiB")
@@ -316,10 +322,10 @@ def main(
                     if isinstance(task["value"], dict)
                     else str(task["value"])
                 )
-        whole = {
+        report = {
             "arguments": {"subjects": subjects, "workers": workers, **size},
             "stages": stages,
             "studies": studies,
             "memory": watch.samples,
         }
-        json_.write_text(json.dumps(whole, default=str))
+        json_.write_text(json.dumps(report, default=str))

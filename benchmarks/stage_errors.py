@@ -71,8 +71,8 @@ def of_scan(ingested: xr.DataTree, truth: Truth) -> Iterator[Row]:
     _, _, distance = closest_on_mesh(
         truth["vertices"].astype(float), truth["faces"].astype(int), position[chosen]
     )
-    what = f"distance of {count:,} surfels from the true surface"
-    yield "scan, subdivision", f"{quantiles(distance)} mm", what
+    meaning = f"distance of {count:,} surfels from the true surface"
+    yield "scan, subdivision", f"{quantiles(distance)} mm", meaning
 
 
 def of_lights(ingested: xr.DataTree, truth: Truth) -> Iterator[Row]:
@@ -105,10 +105,10 @@ def of_frames(
         place = lights[light], cameras[camera]
         sampled.append(of_samples(dome, ingested, intensity, image, *place))
     if merged:
-        what = f"lit pixels of {len(merged)} frames, noise-free"
-        yield "merged exposures", relative(np.concatenate(merged)), what
-        what = "the same frames at the same pixels, noise-free"
-        yield "samples", relative(np.concatenate(sampled)), what
+        meaning = f"lit pixels of {len(merged)} frames, noise-free"
+        yield "merged exposures", relative(np.concatenate(merged)), meaning
+        meaning = "the same frames at the same pixels, noise-free"
+        yield "samples", relative(np.concatenate(sampled)), meaning
 
 
 def of_model(model: xr.DataTree, truth: Truth) -> Iterator[Row]:
@@ -146,15 +146,15 @@ def of_samples(
         .isel(light=light, camera=camera)
         .values.astype(float)
     )
-    at = np.flatnonzero(np.isfinite(stored).all(axis=1))
-    position = capture["surfels/surfel_position"].values[at].astype(float)
+    sampled = np.flatnonzero(np.isfinite(stored).all(axis=1))
+    position = capture["surfels/surfel_position"].values[sampled].astype(float)
     seen = dome.cameras[camera]
     shone = dome.lights[light]
     pixels, _ = project(position, seen.K, seen.R, seen.t, seen.distortion)
     square, falloff = light_falloff(shone, position)
     true = bilinear(image, pixels) * (square / falloff)[:, None] / intensity[light]
     lit = (true > LIT * np.quantile(true, 0.999)).all(axis=1)
-    return (stored[at][lit] / true[lit] - 1).ravel()
+    return (stored[sampled][lit] / true[lit] - 1).ravel()
 
 
 def of_visibility(surfels: xr.Dataset, truth: Truth, dome: DomeRecord) -> Iterator[Row]:
@@ -173,13 +173,13 @@ def of_visibility(surfels: xr.Dataset, truth: Truth, dome: DomeRecord) -> Iterat
         pairs = 0
         for j, device in enumerate(devices):
             place = device.position if kind == "light" else -device.R.T @ device.t
-            at = np.flatnonzero(same & (true.cosine(place) > STEEP))
-            seen = fraction[nearest[at], j] > 0.5
-            right += int((seen == true.of(kind, j, place)[at]).sum())
-            pairs += len(at)
+            compared = np.flatnonzero(same & (true.cosine(place) > STEEP))
+            seen = fraction[nearest[compared], j] > 0.5
+            right += int((seen == true.of(kind, j, place)[compared]).sum())
+            pairs += len(compared)
         error = f"{100 * (1 - right / pairs):.2f} % wrong"
-        what = f"{pairs:,} pairs, cosine above {STEEP}"
-        yield f"visibility, {kind}s", error, what
+        meaning = f"{pairs:,} pairs, cosine above {STEEP}"
+        yield f"visibility, {kind}s", error, meaning
 
 
 def quantiles(x: NDArray) -> str:

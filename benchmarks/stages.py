@@ -46,23 +46,23 @@ class Stages:
     def end(self, stage: str) -> None:
         """Assign the time since the last end to this stage."""
         now = (time.monotonic(), time.process_time())
-        one = self.spent.setdefault(stage, Spent())
-        one.wall = one.wall + now[0] - self._last[0]
-        one.cpu = one.cpu + now[1] - self._last[1]
-        one.anonymous = max(one.anonymous, self._peak, anonymous())
+        spent = self.spent.setdefault(stage, Spent())
+        spent.wall = spent.wall + now[0] - self._last[0]
+        spent.cpu = spent.cpu + now[1] - self._last[1]
+        spent.anonymous = max(spent.anonymous, self._peak, anonymous())
         self._peak = 0.0
         self._last = now
 
     def table(self) -> dict[str, dict[str, float]]:
         """Resources of every stage, and of "all"."""
         parts = self.spent.values()
-        whole = Spent(
+        total = Spent(
             sum(p.wall for p in parts),
             sum(p.cpu for p in parts),
             max(p.anonymous for p in parts),
         )
         return {
-            name: asdict(spent) for name, spent in {**self.spent, "all": whole}.items()
+            name: asdict(spent) for name, spent in {**self.spent, "all": total}.items()
         }
 
     def _watch(self) -> None:
@@ -87,9 +87,9 @@ def peak() -> float:
 def stage_lines(table: Mapping[str, Mapping[str, float]]) -> list[str]:
     """One line per stage."""
     lines = []
-    for name, one in table.items():
-        peak = f"   peak {one['anonymous']:6.0f} MiB" if "anonymous" in one else ""
+    for name, spent in table.items():
+        peak = f"   peak {spent['anonymous']:6.0f} MiB" if "anonymous" in spent else ""
         lines.append(
-            f"{name:<24} cpu {one['cpu']:7.1f} s   wall {one['wall']:7.1f} s{peak}"
+            f"{name:<24} cpu {spent['cpu']:7.1f} s   wall {spent['wall']:7.1f} s{peak}"
         )
     return lines

@@ -32,11 +32,11 @@ ISOTROPIC_95 = float(np.sqrt(-np.log(0.05)))
 BROAD_AND_NARROW = (2, 4)  # indices of the lobes used by the fit of R_d
 
 
-def inside(found: Any, truth: Array, error: Any) -> str:
+def inside(values: Any, truth: Array, error: Any) -> str:
     """Percentage of values within 1.96 stated errors; mean and standard deviation of
     error over stated error.
     """
-    z = (np.asarray(found, np.float64) - truth) / np.asarray(error, np.float64)
+    z = (np.asarray(values, np.float64) - truth) / np.asarray(error, np.float64)
     z = z[np.isfinite(z)]
     return f"{100 * (np.abs(z) < 1.96).mean():.1f} ({np.mean(z):+.2f}, {np.std(z):.2f})"
 

@@ -46,7 +46,7 @@ def subdivided(groups: dict[str, xr.Dataset]) -> dict[str, xr.Dataset]:
     new = fitted.isel(surfel=edges[:, 0])
     for name in ("surfel_position", "surfel_uv", "diffuse_reflectance"):
         new[name] = (new[name] + fitted[name].isel(surfel=edges[:, 1])) / 2
-    whole = xr.concat(
+    repeated = xr.concat(
         [fitted, new],
         "surfel",
         data_vars="minimal",
@@ -54,21 +54,21 @@ def subdivided(groups: dict[str, xr.Dataset]) -> dict[str, xr.Dataset]:
         compat="override",
         join="override",
     )
-    whole["surfel_area"] = whole["surfel_area"] / 4
+    repeated["surfel_area"] = repeated["surfel_area"] / 4
     corners = (
         [triangle[:, 0], middle[:, 0], middle[:, 2]],
         [middle[:, 0], triangle[:, 1], middle[:, 1]],
     )
-    more = (
+    midpoints = (
         [middle[:, 2], middle[:, 1], triangle[:, 2]],
         [middle[:, 0], middle[:, 1], middle[:, 2]],
     )
-    finer = np.concatenate([np.stack(one, axis=1) for one in (*corners, *more)]).astype(
-        np.int32
-    )
+    finer = np.concatenate(
+        [np.stack(corner, axis=1) for corner in (*corners, *midpoints)]
+    ).astype(np.int32)
     rest = groups["mesh"].drop_dims("face")
     return groups | {
-        "fitted": whole.transpose("surfel", ...),
+        "fitted": repeated.transpose("surfel", ...),
         "mesh": rest.assign(
             triangle=(("face", "corner"), finer, groups["mesh"]["triangle"].attrs)
         ),
@@ -96,7 +96,7 @@ def grow(source: Database, target: Database, takes: int, subdivide: int) -> None
             "gender": str(rng.choice(["female", "male"])),
         }
         take = f"C{number:03d}"
-        about = {
+        attributes = {
             "subject": take,
             "condition": "normal",
             "traits": traits,
@@ -104,7 +104,7 @@ def grow(source: Database, target: Database, takes: int, subdivide: int) -> None
         }
         with target.stage("model", take) as stage:
             stage.write(groups)
-            stage.commit({**model.attrs, **about, "take": take, "inputs": []})
+            stage.commit({**model.attrs, **attributes, "take": take, "inputs": []})
 
 
 def measure(url: str, step: str, takes: int) -> None:
@@ -115,8 +115,8 @@ def measure(url: str, step: str, takes: int) -> None:
     if step == "register":
         register_takes(db, takes=names)
     else:
-        given = {"group_by": "gender"} if step in GROUPED else {}
-        study(db, step, takes=names, name=f"cost-{time.time_ns()}", **given)
+        options = {"group_by": "gender"} if step in GROUPED else {}
+        study(db, step, takes=names, name=f"cost-{time.time_ns()}", **options)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     print(json.dumps({"seconds": time.perf_counter() - start, "peak": peak}))
 
@@ -158,10 +158,12 @@ def main(
                 step,
                 str(count),
             ]
-            done = subprocess.run(command, capture_output=True, text=True, check=False)
-            if done.returncode:
-                cells.append(done.stderr.strip().splitlines()[-1][:80])
+            process = subprocess.run(
+                command, capture_output=True, text=True, check=False
+            )
+            if process.returncode:
+                cells.append(process.stderr.strip().splitlines()[-1][:80])
                 continue
-            found = json.loads(done.stdout.splitlines()[-1])
-            cells.append(f"{found['seconds']:.0f} s, {found['peak']:.0f} MiB")
+            figures = json.loads(process.stdout.splitlines()[-1])
+            cells.append(f"{figures['seconds']:.0f} s, {figures['peak']:.0f} MiB")
         print(f"| {step} | " + " | ".join(cells) + " |", flush=True)

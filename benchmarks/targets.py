@@ -58,15 +58,15 @@ def network(weights: np.ndarray) -> Target:
     max(exp(x) - 1, 0).
     """
     parts = []
-    at = 0
+    start = 0
     for a, b in LAYERS:
         parts.append(
             (
-                weights[at : at + a * b].reshape(a, b),
-                weights[at + a * b : at + a * b + b],
+                weights[start : start + a * b].reshape(a, b),
+                weights[start + a * b : start + a * b + b],
             )
         )
-        at += a * b + b
+        start += a * b + b
 
     def evaluate(wi, wo):
         h, d, phi = half_difference(wi, wo)
@@ -90,18 +90,18 @@ def network(weights: np.ndarray) -> Target:
 
 def read_targets(paths: list[Path], words: list[str]) -> dict[str, Target]:
     """Targets of all files by name; networks only if their name contains one of the words."""
-    found: dict[str, Target] = {}
+    targets: dict[str, Target] = {}
     for path in paths:
         if path.suffix == ".csv":
-            found[path.stem] = lafortune(path)
+            targets[path.stem] = lafortune(path)
             continue
         with np.load(path) as nets:
-            found |= {
+            targets |= {
                 n: network(nets[n])
                 for n in nets.files
                 if not words or any(word in n for word in words)
             }
-    return found
+    return targets
 
 
 def sampled(target: Target, *, surfels: int, noise: float, seed: int = 0) -> xr.Dataset:
@@ -133,8 +133,8 @@ def sampled(target: Target, *, surfels: int, noise: float, seed: int = 0) -> xr.
         "light_position": light,
         "camera_position": camera,
     }
-    found = dataset(ball)
-    return found.merge(estimate_diffuse_reflectance(found)[["diffuse_reflectance"]])
+    skin = dataset(ball)
+    return skin.merge(estimate_diffuse_reflectance(skin)[["diffuse_reflectance"]])
 
 
 def _spiral(count, radius, share):

@@ -69,16 +69,16 @@ def main(db: str, take: str = "") -> None:
                 nh, nd, nphi
             )
 
-        def error(found: np.ndarray, true: np.ndarray) -> float:
-            square = weight * (found - true).reshape(nh, -1) ** 2
+        def error(values: np.ndarray, true: np.ndarray) -> float:
+            square = weight * (values - true).reshape(nh, -1) ** 2
             return float(
                 np.sqrt(square.sum() / (weight * true.reshape(nh, -1) ** 2).sum())
             )
 
-        each = [error(near[..., k], tables[..., k]) for k in range(count)]
+        errors = [error(near[..., k], tables[..., k]) for k in range(count)]
         mixed = error(near @ mixture, tables @ mixture)
         size_mb = rank * (nh + nd * nphi) * 4 * groups * BYTES / 1e6
         print(
             f"{rank:4d}  {size_mb:6.3f}  {2 * rank * groups:7d}  "
-            f"{' '.join(f'{e:6.1%}' for e in each)}  {mixed:6.1%}"
+            f"{' '.join(f'{e:6.1%}' for e in errors)}  {mixed:6.1%}"
         )

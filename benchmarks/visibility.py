@@ -1,7 +1,7 @@
 """Visibility by rays and by splats: time for all lights and cameras, agreement, and
 error relative to the truth.
 
-    python -m benchmarks visibility CAPTURE [--truth] [--spacing 0.4] [--every 10]
+    python -m benchmarks visibility CAPTURE [--truth] [--spacing 0.4] [--stride 10]
     [--picture FILE.png]
 
 With `--truth`, what the lights see of the true surface in CAPTURE.truth.npz is compared
@@ -55,7 +55,7 @@ def main(
     *,
     truth: Annotated[bool, "Compare with the true surface."] = False,
     spacing: float = 0.4,
-    every: Annotated[int, "Compare every N-th light."] = 10,
+    stride: Annotated[int, "Compare every N-th light."] = 10,
     picture: Path | None = None,
 ) -> None:
     record = read_capture(capture)
@@ -65,9 +65,9 @@ def main(
     scene.occluded(surfels.position[:1], np.zeros((1, 3)))  # builds the tree
     cameras = [enlarged(camera) for camera in dome.cameras]
     timings(surfels, scene, dome.lights, cameras)
-    compare(surfels, scene, dome.lights[::every])
+    compare(surfels, scene, dome.lights[::stride])
     if truth:
-        against_truth(surfels, scene, dome.lights, every, read_truth(capture))
+        against_truth(surfels, scene, dome.lights, stride, read_truth(capture))
     if picture:
         draw(surfels, scene, dome.lights, picture)
 
@@ -85,13 +85,13 @@ def say(**figures: Any) -> None:
 
 
 @contextmanager
-def clock(what: str, **figures: Any) -> Iterator[None]:
+def clock(name: str, **figures: Any) -> Iterator[None]:
     wall = time.perf_counter()
     cpu = time.process_time()
     yield
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     say(
-        what=what,
+        what=name,
         wall=time.perf_counter() - wall,
         cpu=time.process_time() - cpu,
         peak_gib=peak,
@@ -150,17 +150,21 @@ def compare(
         shares = light_visibility(surfels, lights, scene, pool)
     for light, share in zip(lights, shares.T, strict=True):
         cosine = facing(surfels, light.position)
-        at = np.flatnonzero(cosine > 0)
+        facing_light = np.flatnonzero(cosine > 0)
         rays = np.zeros(len(cosine), bool)
         by_point = [
-            ~scene.occluded(surfels.position[at], p[None], normal=surfels.normal[at])
+            ~scene.occluded(
+                surfels.position[facing_light],
+                p[None],
+                normal=surfels.normal[facing_light],
+            )
             for p in disc_points(light)
         ]
-        rays[at] = by_point[0]
+        rays[facing_light] = by_point[0]
         expected = np.mean(by_point, axis=0).astype(np.float16)
-        differing = differing + int((share[at] != expected).sum())
-        faced = faced + len(at)
-        inside = at[(expected > 0) & (expected < 1)]
+        differing = differing + int((share[facing_light] != expected).sum())
+        faced = faced + len(facing_light)
+        inside = facing_light[(expected > 0) & (expected < 1)]
         soft += len(inside)
         errors.append(
             share[inside].astype(float) - dense_share(scene, surfels, inside, light)
@@ -197,11 +201,13 @@ def compare(
         for threshold in (THRESHOLD, 0.5):
             same = [(s >= threshold) == r for s, r in zip(share, seen, strict=True)]
             away = [a[w].mean() for a, w in zip(same, sure, strict=True)]
-            every = np.mean([a[w].mean() for a, w in zip(same, steep, strict=True)])
+            with_edges = np.mean(
+                [a[w].mean() for a, w in zip(same, steep, strict=True)]
+            )
             figures = {
                 "mean": float(np.mean(away)),
                 "worst": float(min(away)),
-                "with_edges": float(every),
+                "with_edges": float(with_edges),
             }
             say(
                 what="splats as rays",
@@ -213,7 +219,7 @@ def compare(
 
 
 def dense_share(
-    scene: RayScene, surfels: SurfelSet, at: Any, light: LightRecord
+    scene: RayScene, surfels: SurfelSet, chosen: Any, light: LightRecord
 ) -> Any:
     """Visible fraction of the disc from DENSE points on a spiral."""
     k = np.arange(DENSE) + 0.5
@@ -228,7 +234,9 @@ def dense_share(
     )
     return np.mean(
         [
-            ~scene.occluded(surfels.position[at], p[None], normal=surfels.normal[at])
+            ~scene.occluded(
+                surfels.position[chosen], p[None], normal=surfels.normal[chosen]
+            )
             for p in points
         ],
         axis=0,
@@ -251,7 +259,7 @@ def against_truth(
     surfels: SurfelSet,
     scene: RayScene,
     lights: tuple[LightRecord, ...],
-    every: int,
+    stride: int,
     truth: Truth,
 ) -> None:
     """Compare both methods with the truth by region, at the surfels nearest to true
@@ -268,21 +276,21 @@ def against_truth(
     # errors of rays, errors of splats, differences between both, pairs
     wrong = {name: np.zeros(4) for name in masks}
     false = np.zeros((2, 2))  # method, false visible and false hidden
-    for j in range(0, len(lights), every):
+    for j in range(0, len(lights), stride):
         eye = lights[j].position
-        at = good & (true.cosine(eye) > STEEP)
+        compared = good & (true.cosine(eye) > STEEP)
         front = facing(surfels, eye)[taken] > 0
         rays = front & ~scene.occluded(
             surfels.position[taken], eye[None], normal=surfels.normal[taken]
         )
         drawn = front & (splats.visible_fraction(eye, taken) >= THRESHOLD)
-        both = np.stack([rays, drawn])[:, place[at]]
-        seen = true.of("light", j, eye)[at]
+        both = np.stack([rays, drawn])[:, place[compared]]
+        seen = true.of("light", j, eye)[compared]
         off = both != seen
         false += np.stack([(both & ~seen).sum(axis=1), (~both & seen).sum(axis=1)], 1)
         differ = both[0] != both[1]
         for name, mask in masks.items():
-            inside = mask[at]
+            inside = mask[compared]
             counts = [differ[inside].sum(), inside.sum()]
             wrong[name] += [*off[:, inside].sum(axis=1), *counts]
     total = wrong["all"][3]
@@ -315,8 +323,10 @@ def draw(
     middle = surfels.position.mean(axis=0)
     towards = np.array([light.position for light in lights]) - middle
     # from above and the side, so that nose, brow and ear cast shadows
-    wanted = np.array([0.75, 0.45, 0.5])
-    light = lights[int((towards @ wanted / np.linalg.norm(towards, axis=1)).argmax())]
+    from_side = np.array([0.75, 0.45, 0.5])
+    light = lights[
+        int((towards @ from_side / np.linalg.norm(towards, axis=1)).argmax())
+    ]
     with ThreadPoolExecutor(1) as pool:
         shares = [
             light_visibility(surfels, [light], scene, pool, method=m)[:, 0]

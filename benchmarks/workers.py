@@ -77,7 +77,9 @@ def main(
             )
             for _ in range(repeats)
         ]
-    best = [[min(run[way][what] for run in runs) for way in (0, 1)] for what in (0, 1)]
+    best = [
+        [min(run[way][clock] for run in runs) for way in (0, 1)] for clock in (0, 1)
+    ]
     for way, name in enumerate(("in sequence", "in parallel")):
         walls = ", ".join(f"{run[way][0]:.1f}" for run in runs)
         print(

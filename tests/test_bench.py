@@ -107,4 +107,4 @@ def test_transport_curves__distances_are_mean_free_paths():
             r, 0.3, 0.7, eta=1.3
         )
         # noise 8 %
-        assert point.more[f"at_{r:g}"] == pytest.approx(float(ratio) - 1, abs=0.25)
+        assert point.details[f"at_{r:g}"] == pytest.approx(float(ratio) - 1, abs=0.25)

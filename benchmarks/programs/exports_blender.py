@@ -30,7 +30,7 @@ def open_file(path: str):
         bpy.ops.import_scene.gltf(filepath=path)
     else:
         bpy.ops.wm.usd_import(filepath=path)
-    (mesh,) = [one for one in bpy.data.objects if one.type == "MESH"]
+    (mesh,) = [item for item in bpy.data.objects if item.type == "MESH"]
     return mesh
 
 
@@ -85,16 +85,16 @@ def connect(mesh, maps: Path, use: list[str]) -> None:
 
 
 def add(name: str, data):
-    made = bpy.data.objects.new(name, data)
-    bpy.context.collection.objects.link(made)
-    return made
+    item = bpy.data.objects.new(name, data)
+    bpy.context.collection.objects.link(item)
+    return item
 
 
-def add_camera(about) -> None:
+def add_camera(record) -> None:
     """A pinhole camera from its matrices in the frame of the subject."""
     data, (K, width, height) = (
         bpy.data.cameras.new("camera"),
-        (about["K"], about["width"], about["height"]),
+        (record["K"], record["width"], record["height"]),
     )
     data.sensor_fit = "HORIZONTAL"
     data.sensor_width = 36
@@ -102,22 +102,22 @@ def add_camera(about) -> None:
     data.lens = K[0][0] * data.sensor_width / width
     data.shift_x = (width / 2 - K[0][2]) / width
     data.shift_y = (K[1][2] - height / 2) / width
-    turn = UPRIGHT @ Matrix(about["R"]).transposed() @ Matrix.Diagonal((1, -1, -1))
+    turn = UPRIGHT @ Matrix(record["R"]).transposed() @ Matrix.Diagonal((1, -1, -1))
     placed = turn.to_4x4()
-    placed.translation = UPRIGHT @ Vector(about["centre"]) * MM
+    placed.translation = UPRIGHT @ Vector(record["centre"]) * MM
     camera = add("camera", data)
     camera.matrix_world = placed
     bpy.context.scene.camera = camera
 
 
-def add_light(about) -> None:
+def add_light(record) -> None:
     """A point light; Blender's watts are 4 pi times the radiant intensity."""
     data = bpy.data.lights.new("light", "POINT")
-    top = max(about["intensity"])
+    top = max(record["intensity"])
     data.shadow_soft_size = 0
     data.energy = 4 * math.pi * top * MM**2
-    data.color = [x / top for x in about["intensity"]]
-    add("light", data).location = UPRIGHT @ Vector(about["position"]) * MM
+    data.color = [x / top for x in record["intensity"]]
+    add("light", data).location = UPRIGHT @ Vector(record["position"]) * MM
 
 
 def half_lit(albedo, method: str, radius, blocked: bool) -> None:

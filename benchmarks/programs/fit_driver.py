@@ -100,12 +100,12 @@ def parts(db: Any, take: str) -> dict[str, float]:
     """CPU time per surfel [us] of the parts of a fit, on one thread and on samples in memory."""
     dask.config.set(scheduler="synchronous")
     capture = db.read("capture", take)
-    whole = lumitexels(capture)
+    samples = lumitexels(capture)
     seen = np.flatnonzero(capture["samples"]["sample_count"].values > 0)
     chosen = seen[np.linspace(0, len(seen) - 1, min(SURFELS, len(seen))).astype(int)]
-    work = whole.isel(surfel=chosen).load()
+    work = samples.isel(surfel=chosen).load()
     spent: dict[str, float] = {}
-    tables = disc_dictionary(None, disc_angle(whole))
+    tables = disc_dictionary(None, disc_angle(samples))
 
     def timed(name: str, part: Callable[[], Any]) -> Any:
         part()  # compiles
@@ -162,5 +162,5 @@ if __name__ == "__main__":
     if len(sys.argv) != 4 or sys.argv[1] not in ACTIONS:
         print(__doc__)
         sys.exit(0 if "--help" in sys.argv else 2)
-    action, folder, what = sys.argv[1:]
-    print(json.dumps(ACTIONS[action](skindb.open(folder), what)))
+    action, folder, name = sys.argv[1:]
+    print(json.dumps(ACTIONS[action](skindb.open(folder), name)))

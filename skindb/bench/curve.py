@@ -35,7 +35,7 @@ class Point:
     error: float
     failure: str = ""  # reason why the method is unsuitable, if it is
     # other results of the same run
-    more: dict[str, float] = field(default_factory=dict)
+    details: dict[str, float] = field(default_factory=dict)
 
     @property
     def name(self) -> str:

@@ -258,7 +258,7 @@ def exposures_curves(quick: bool) -> list[Curve]:
             "skindb merge_exposures", count, seconds, merged, truth, usable
         )
         z = (merged - truth)[usable] / error[usable]
-        point.more["scatter_over_claimed_error"] = float(np.sqrt((z**2).mean()))
+        point.details["scatter_over_claimed_error"] = float(np.sqrt((z**2).mean()))
         points.append(point)
         work_of_longest = partial(_longest_exposure, frames, times, sensor)
         seconds, longest = cpu_time(work_of_longest, side**2)

@@ -293,7 +293,7 @@ def _failure_of_fits(off: Array, free: bool) -> str:
         reason = FAILS_WITH_FREE_GAIN if free else FAILS_WHERE_NEAR
         return f"{largest:.0%} off in one medium: {reason}"
     if not np.isfinite(off).all():
-        return "some profiles were not fitted, see `more`"
+        return "some profiles were not fitted, see `details`"
     return ""
 
 

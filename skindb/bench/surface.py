@@ -234,7 +234,7 @@ def _both_spaces(
     for i, label in enumerate((LINEAR, ROOTS)):
         points = []
         for p, errors in results:
-            details = p.more | {"residual": errors[2]}
+            details = p.details | {"residual": errors[2]}
             point = Point(
                 p.method, p.parameter, p.seconds, errors[i], p.failure, details
             )
@@ -429,11 +429,11 @@ def _dense_disc(
     radius = np.sqrt((spiral + 0.5) / count) * np.tan(angle)
     turn = spiral * np.pi * (3 - np.sqrt(5))
     total = np.zeros((len(i), len(dictionary.names)))
-    for centre, other in ((wi, wo), (wo, wi)):
+    for centre, opposite in ((wi, wo), (wo, wi)):
         x = _unit(np.cross(centre, [0.3, 0.9, 0.1]))
         y = np.cross(centre, x)
         for u, v in zip(radius * np.cos(turn), radius * np.sin(turn), strict=True):
             moved = _unit(centre + u * x + v * y)
-            angles = half_difference(moved, other)
+            angles = half_difference(moved, opposite)
             total += lookup(dictionary.table, *angles) / (2 * count)
     return total
