@@ -14,7 +14,7 @@ sys.path.insert(0, str(Path(__file__).parent / "store"))
 from stored import commit
 
 from skindb.store import Database, Lease
-from skindb.store.location import place_at
+from skindb.store.bucket import place_at
 
 SUBJECT = "Xqz7"
 

@@ -12,23 +12,26 @@ from skindb.store.erasure import Holdings
 from skindb.store.garbage import Garbage
 from skindb.store.lease import LEASE_SECONDS, Lease, LeaseLost
 from skindb.store.log import Conflict
-from skindb.store.marker_file import MarkerFileWarning
-from skindb.store.markers import WithdrawnError
-from skindb.store.paths import (
+from skindb.store.markers import MarkerFileWarning, WithdrawnError
+from skindb.store.place import (
     CALIBRATION,
     RELEASE,
     STUDY,
     SUMMARY,
+    UnavailableError,
     require_text,
     subject_of,
 )
-from skindb.store.place import UnavailableError
-from skindb.store.record import Record
-from skindb.store.requests import Request
+from skindb.store.record import Record, seal_of
 from skindb.store.restoring import Restored, restore
-from skindb.store.sealed import seal_of
 from skindb.store.snapshot import Lookup
-from skindb.store.stale import Staleness, StaleWarning, require_fresh, stale_versions
+from skindb.store.stale import (
+    Request,
+    Staleness,
+    StaleWarning,
+    require_fresh,
+    stale_versions,
+)
 
 __all__ = [
     "CALIBRATION",

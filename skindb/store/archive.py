@@ -21,9 +21,9 @@ from functools import partial
 from typing import TypeVar
 
 from skindb.errors import Fault, InputError
+from skindb.store.bucket import place_at
 from skindb.store.erasure import remainder_of
 from skindb.store.lease import Lease
-from skindb.store.location import place_at
 from skindb.store.log import UPDATE, tombstone_content, tombstone_of
 from skindb.store.markers import (
     BACKUP,
@@ -35,22 +35,23 @@ from skindb.store.markers import (
     read_markers,
     require_secret,
 )
-from skindb.store.paths import KIND, TAKE, TIME_HEX
-from skindb.store.place import Place, UnavailableError
-from skindb.store.record import DIGEST, Record, record_from_json
-from skindb.store.requests import (
+from skindb.store.place import KIND, TAKE, TIME_HEX, Place, UnavailableError
+from skindb.store.record import (
+    DIGEST,
+    Record,
+    collect_faults,
+    damage_as_fault,
+    reason_of,
+    record_from_json,
+    seal_of,
+    sealed_object,
+)
+from skindb.store.stale import (
     REQUEST_NAME,
     REQUESTS,
     Request,
     request_content,
     request_from_json,
-)
-from skindb.store.sealed import (
-    collect_faults,
-    damage_as_fault,
-    reason_of,
-    seal_of,
-    sealed_object,
 )
 from skindb.store.verified import Manifest, manifest_from_json
 

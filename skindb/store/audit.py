@@ -24,9 +24,8 @@ from skindb import __version__
 from skindb.errors import Fault, InputError
 from skindb.store.condition import evaluate
 from skindb.store.markers import is_sealed, keyed_hash, keyed_seal, require_secret
-from skindb.store.paths import AUDIT, subject_of
-from skindb.store.place import Place, UnavailableError
-from skindb.store.sealed import collect_faults, damage_as_fault, json_object
+from skindb.store.place import AUDIT, Place, UnavailableError, subject_of
+from skindb.store.record import collect_faults, damage_as_fault, json_object
 
 FORMAT = 1
 BLOCK = 1_000  # numbers in a folder

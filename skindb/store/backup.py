@@ -37,20 +37,19 @@ from skindb.store.archive import (
 )
 from skindb.store.lease import Lease
 from skindb.store.log import read_record
-from skindb.store.marker_file import note_consents, note_withdrawals
 from skindb.store.markers import (
     BACKUP,
     SECRET,
     WITHDRAWN,
     Markers,
     marker_faults,
+    note_consents,
+    note_withdrawals,
     read_markers,
 )
-from skindb.store.paths import KINDS_OF_ONE_SUBJECT, RELEASE, TRANSIENT
-from skindb.store.place import Place
-from skindb.store.record import Record
-from skindb.store.requests import REQUESTS, read_requests
-from skindb.store.sealed import damage_as_fault
+from skindb.store.place import KINDS_OF_ONE_SUBJECT, RELEASE, TRANSIENT, Place
+from skindb.store.record import Record, damage_as_fault
+from skindb.store.stale import REQUESTS, read_requests
 from skindb.store.verified import AS_COMMITTED, CHANGED, CURE, read_manifest
 
 T = TypeVar("T")

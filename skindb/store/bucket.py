@@ -29,8 +29,8 @@ from skindb.cache import cache_folder
 from skindb.errors import Fault, InputError
 from skindb.files import make_private
 from skindb.limits import MAX_STORE_JSON_BYTES
-from skindb.store.paths import outside_fault
-from skindb.store.place import Guard, UnavailableError
+from skindb.store.folder import Folder
+from skindb.store.place import Guard, Place, UnavailableError, outside_fault
 from skindb.store.s3 import (
     RETRY_TIMEOUT,
     BrokenAnswerError,
@@ -567,3 +567,19 @@ def _copy(bucket: Bucket, key: str) -> BucketStore:
     store = BucketStore(bucket, key)
     store.is_copy = True
     return store
+
+
+def place_at(url: str) -> Place:
+    """The folder or bucket of a URL; `InputError` for other URLs and for files."""
+    if url.startswith("s3://"):
+        return Bucket(url)
+    if "://" in url:
+        scheme = url.partition("://")[0]
+        cure = "give a folder, or s3://BUCKET/PREFIX"
+        rule = "a database must be a local folder or an S3 bucket"
+        raise InputError(Fault(f"{scheme}://...", rule, "a different URL", cure))
+    if Path(url).exists() and not Path(url).is_dir():
+        raise InputError(
+            Fault(url, "a database must be a folder", "a file", "choose another folder")
+        )
+    return Folder(Path(url))

@@ -21,10 +21,9 @@ from skindb.schema.cohort import (
     take_coords,
 )
 from skindb.schema.notes import Note, note, note_lines
-from skindb.store.location import place_at
+from skindb.store.bucket import place_at
 from skindb.store.log import RESTORE
-from skindb.store.paths import SUMMARY
-from skindb.store.place import Located, Place
+from skindb.store.place import SUMMARY, Located, Place
 from skindb.store.record import AS_RECORDED, Record
 from skindb.store.snapshot import Lookup, Snapshot
 from skindb.store.stage import describe, read_tables

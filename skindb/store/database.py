@@ -16,6 +16,7 @@ from skindb.schema.consent import CONSENT
 from skindb.store.archive import Archive
 from skindb.store.audit import AuditEntry, append_entry, read_audit
 from skindb.store.backup import BackupReport, create_backup, erase_from_archive
+from skindb.store.bucket import place_at
 from skindb.store.catalogue import (
     INFO_SECTIONS,
     cached_table,
@@ -39,16 +40,27 @@ from skindb.store.erasure import (
 )
 from skindb.store.garbage import Garbage, find_garbage, remove_garbage
 from skindb.store.lease import LEASE_SECONDS, Lease
-from skindb.store.location import place_at
 from skindb.store.log import Log
-from skindb.store.marker_file import note_withdrawals
-from skindb.store.markers import Entry, Markers, last_entry, read_markers, readmit
-from skindb.store.paths import subject_of
+from skindb.store.markers import (
+    Entry,
+    Markers,
+    last_entry,
+    note_withdrawals,
+    read_markers,
+    readmit,
+)
+from skindb.store.place import subject_of
 from skindb.store.record import Record
-from skindb.store.record_cache import RecordCache
-from skindb.store.requests import Request, read_requests, remove_request
-from skindb.store.snapshot import Lookup, Snapshot, consent_of, pinned_record, pins_of
+from skindb.store.snapshot import (
+    Lookup,
+    RecordCache,
+    Snapshot,
+    consent_of,
+    pinned_record,
+    pins_of,
+)
 from skindb.store.stage import Stage, read_tables, remove_version
+from skindb.store.stale import Request, read_requests, remove_request
 from skindb.store.verified import open_group, open_version
 from skindb.store.verify import database_faults
 

@@ -7,9 +7,8 @@ from typing import Any
 
 from skindb.errors import Fault, InputError
 from skindb.schema.consent import CONSENT, SCOPES, consent_scope
-from skindb.store.marker_file import note_consents
-from skindb.store.paths import RELEASE, TAKE, require_text, subject_of
-from skindb.store.place import Place
+from skindb.store.markers import note_consents
+from skindb.store.place import RELEASE, TAKE, Place, require_text, subject_of
 from skindb.store.record import Record
 from skindb.store.snapshot import PINNED, Snapshot
 from skindb.store.stage import Stage

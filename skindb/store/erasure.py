@@ -23,9 +23,8 @@ from skindb.store.decisions import commit_release
 from skindb.store.folder import remove_tree
 from skindb.store.lease import Lease
 from skindb.store.log import Log, committed_logs, takes_below
-from skindb.store.marker_file import note_withdrawals
-from skindb.store.markers import Markers, mark_withdrawn, read_markers
-from skindb.store.paths import (
+from skindb.store.markers import Markers, mark_withdrawn, note_withdrawals, read_markers
+from skindb.store.place import (
     KINDS_OF_ONE_SUBJECT,
     KINDS_WITHOUT_SUBJECT,
     RELEASE,
@@ -34,12 +33,14 @@ from skindb.store.paths import (
     TAKE,
     TIME_HEX,
     TRANSIENT,
+    Place,
+    UnavailableError,
     subject_of,
 )
-from skindb.store.place import Place, UnavailableError
 from skindb.store.record import Record, subjects_of
-from skindb.store.record_cache import CATALOGUE, cache_names
-from skindb.store.requests import (
+from skindb.store.snapshot import CATALOGUE, cache_names
+from skindb.store.stage import read_names, remove_version
+from skindb.store.stale import (
     PINS,
     TAKES,
     Request,
@@ -47,7 +48,6 @@ from skindb.store.requests import (
     remove_request,
     write_request,
 )
-from skindb.store.stage import read_names, remove_version
 
 T = TypeVar("T")
 # folders with one entry per kind, and below it one per take

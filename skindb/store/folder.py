@@ -19,8 +19,7 @@ from zarr.storage import LocalStore
 from skindb.errors import InputError, add_filename
 from skindb.files import PRIVATE, make_private, open_regular
 from skindb.limits import MAX_STORE_JSON_BYTES
-from skindb.store.paths import STAGING, inside
-from skindb.store.place import Guard
+from skindb.store.place import STAGING, Guard, inside
 
 # below a version; zarr creates group/array/c and a folder for each dim except the last
 MAX_FOLDER_DEPTH = 16

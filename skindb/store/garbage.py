@@ -19,15 +19,15 @@ from skindb.store.erasure import SCRATCH_NAME, erase_withdrawn, holdings_of
 from skindb.store.lease import NUMBER, Lease, abandoned_holder, holder_of, storage_time
 from skindb.store.log import Log, committed_logs, takes_below
 from skindb.store.markers import Markers, read_markers
-from skindb.store.paths import (
+from skindb.store.place import (
     CALIBRATION,
     LEASE_KINDS,
     RELEASE,
     STAGING,
     TIME_HEX,
     TRANSIENT,
+    Place,
 )
-from skindb.store.place import Place
 from skindb.store.record import Record
 from skindb.store.stage import remove_version
 from skindb.store.verify import may_have_had_record, partly_removed_records, tombstones

@@ -13,16 +13,15 @@ from typing import Any
 from skindb.errors import Fault, InputError
 from skindb.schema.consent import CONSENT, consent_scope
 from skindb.store.log import Log
-from skindb.store.paths import (
+from skindb.store.place import (
     KINDS_OF_ONE_SUBJECT,
     KINDS_WITHOUT_SUBJECT,
     RELEASE,
     STUDY,
+    Place,
     subject_of,
 )
-from skindb.store.place import Place
-from skindb.store.record import Record, own_takes
-from skindb.store.sealed import intact_or_none
+from skindb.store.record import Record, intact_or_none, own_takes
 
 # kind -> scope that its subjects must consent to when it is committed; a record of
 # consent needs none

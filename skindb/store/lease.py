@@ -30,15 +30,15 @@ from typing import Any, Self
 from skindb.clock import SYSTEM_CLOCK, Clock
 from skindb.errors import Fault, InputError
 from skindb.store.markers import AdmissionGuard, WithdrawnError
-from skindb.store.paths import (
+from skindb.store.place import (
     KIND,
     KINDS_WITHOUT_SUBJECT,
     TAKE,
+    Place,
     require_text,
     subject_of,
 )
-from skindb.store.place import Place
-from skindb.store.sealed import json_object
+from skindb.store.record import json_object
 
 # without a renewal; a compilation can delay the renewing thread for some of them
 LEASE_SECONDS = 60.0

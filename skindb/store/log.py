@@ -21,21 +21,26 @@ from typing import Any
 
 from skindb.errors import Fault, InputError
 from skindb.store.markers import WithdrawnError
-from skindb.store.paths import KIND, TAKE, TRANSIENT, require_text
-from skindb.store.place import Guard, Place, UnavailableError
+from skindb.store.place import (
+    KIND,
+    TAKE,
+    TRANSIENT,
+    Guard,
+    Place,
+    UnavailableError,
+    require_text,
+)
 from skindb.store.record import (
+    DAMAGE,
     FORMAT,
     LaterError,
     Record,
-    record_from_json,
-    record_to_json,
-)
-from skindb.store.sealed import (
-    DAMAGE,
     collect_faults,
     intact_or_none,
     json_object,
     reason_of,
+    record_from_json,
+    record_to_json,
     seal_of,
 )
 

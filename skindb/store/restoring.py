@@ -24,30 +24,27 @@ from skindb.store.archive import (
     require_apart,
     surviving,
 )
+from skindb.store.bucket import place_at
 from skindb.store.lease import Lease
-from skindb.store.location import place_at
 from skindb.store.log import Log
-from skindb.store.marker_file import (
-    Notes,
-    note_consents,
-    note_withdrawals,
-    read_marker_file,
-)
 from skindb.store.markers import (
     ENTRY,
     RESTORING,
     SECRET,
     WITHDRAWN,
     Markers,
+    Notes,
     entry_numbers,
     keyed_hash,
+    note_consents,
+    note_withdrawals,
+    read_marker_file,
     require_secret,
 )
-from skindb.store.paths import RELEASE, STAGING
-from skindb.store.place import Place
+from skindb.store.place import RELEASE, STAGING, Place
 from skindb.store.record import Record, subjects_of
-from skindb.store.requests import REQUESTS
 from skindb.store.stage import Stage
+from skindb.store.stale import REQUESTS
 
 LOCK = f"{WITHDRAWN}/{RESTORING}"
 

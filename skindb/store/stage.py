@@ -32,17 +32,23 @@ from skindb.store.inputs import (
 from skindb.store.lease import Lease
 from skindb.store.log import Log
 from skindb.store.markers import AdmissionGuard, read_markers, require_secret
-from skindb.store.paths import (
+from skindb.store.place import (
     GROUP,
     KINDS_OF_ONE_SUBJECT,
     TAKE,
     TRANSIENT,
     VERSION,
+    Place,
+    UnavailableError,
     require_text,
 )
-from skindb.store.place import Place, UnavailableError
-from skindb.store.record import Record, own_takes, subjects_of
-from skindb.store.sealed import intact_or_none, json_object
+from skindb.store.record import (
+    Record,
+    intact_or_none,
+    json_object,
+    own_takes,
+    subjects_of,
+)
 from skindb.store.verified import Manifest, read_beside
 
 MIN_CHUNK_SURFELS = 256  # in a chunk, the smallest unit of reading

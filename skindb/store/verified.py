@@ -27,8 +27,7 @@ from zarr.core.buffer import Buffer, BufferPrototype
 from skindb.errors import Fault, InputError
 from skindb.schema.label import SHARD
 from skindb.store.place import Place
-from skindb.store.record import Record
-from skindb.store.sealed import json_object
+from skindb.store.record import Record, json_object
 
 CURE = "restore this file from a backup, or compute the version again"
 AS_COMMITTED = "a version must be as it was committed"

@@ -16,7 +16,7 @@ from skindb.store.erasure import holdings_of
 from skindb.store.lease import NUMBER, abandoned_holder
 from skindb.store.log import GENERATION, RESTORE, Log, committed_logs, tombstone_of
 from skindb.store.markers import SECRET, WITHDRAWN, marker_faults, read_markers
-from skindb.store.paths import (
+from skindb.store.place import (
     AUDIT,
     KIND,
     KINDS_OF_ONE_SUBJECT,
@@ -25,12 +25,12 @@ from skindb.store.paths import (
     TAKE,
     TIME_HEX,
     TRANSIENT,
+    Place,
+    UnavailableError,
 )
-from skindb.store.place import Place, UnavailableError
-from skindb.store.record import AS_RECORDED, Record
-from skindb.store.requests import REQUEST_NAME, REQUESTS, read_requests
-from skindb.store.sealed import json_object
+from skindb.store.record import AS_RECORDED, Record, json_object
 from skindb.store.stage import TABLES, describe, read_names, tables_from_json
+from skindb.store.stale import REQUEST_NAME, REQUESTS, read_requests
 from skindb.store.verified import (
     AS_COMMITTED,
     CHANGED,

@@ -20,7 +20,7 @@ from mutations import (
     zero,
 )
 
-from skindb.store.sealed import seal_of
+from skindb.store.record import seal_of
 
 TIME_HEX = "20260101T000000-01234567"
 FOREIGN = (

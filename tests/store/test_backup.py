@@ -23,8 +23,8 @@ from skindb.store import Database, LeaseLost, backup_states, restore
 from skindb.store import backup as backup_module
 from skindb.store import lease as lease_module
 from skindb.store.archive import Archive
+from skindb.store.bucket import place_at
 from skindb.store.folder import Folder
-from skindb.store.location import place_at
 
 SUBJECT = "Xqz7"
 SCOPE = {"consent_scope": ["fit", "statistics"]}

@@ -15,7 +15,7 @@ from stored import commit
 import skindb
 from skindb.errors import InputError
 from skindb.store.log import Log
-from skindb.store.sealed import seal_of
+from skindb.store.record import seal_of
 
 SCOPE = {"consent_scope": ["fit", "statistics"]}
 

@@ -17,7 +17,7 @@ from skindb.schema import dataset
 from skindb.store import Database, Request, Staleness, WithdrawnError, seal_of
 from skindb.store import erasure as erasure_module
 from skindb.store.folder import Folder
-from skindb.store.requests import write_request
+from skindb.store.stale import write_request
 
 SCOPE = {"consent_scope": ["fit", "statistics"]}
 

@@ -14,7 +14,7 @@ from skindb.errors import InputError
 from skindb.schema import dataset
 from skindb.store import Database
 from skindb.store.log import Log
-from skindb.store.sealed import seal_of
+from skindb.store.record import seal_of
 
 UNNAMED = "a record of the log must name every version that was written completely"
 

@@ -13,7 +13,7 @@ from stored import commit
 from skindb.errors import InputError
 from skindb.store import Database
 from skindb.store.folder import Folder
-from skindb.store.paths import inside
+from skindb.store.place import inside
 from skindb.store.stage import remove_version
 
 OUTSIDE = [
