@@ -25,7 +25,7 @@ import subprocess
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import OpenEXR
@@ -361,56 +361,49 @@ def main(
 ) -> None:
     """Print the differences, and write pictures and figures."""
     out = (out or Path(tempfile.mkdtemp())).absolute()
-    db = skindb.open(db)
-    model = db.read("model", take or db.takes("model")[0])
+    database = skindb.open(db)
+    model = database.read("model", take or database.takes("model")[0])
     bundle = export_bundle(model, out / "bundle", merl=False).parent
     stage = set_stage(model)
+    lights = point_lights(model, stage.view)
     figures = {}
-    for angle, light in point_lights(model, stage.view).items():
+    for angle, light in lights.items():
         print(f"light at {angle} degrees from the camera")
         true = pictures(stage, light)
-        common = described(stage.view.camera, light) | {"maps": str(bundle / "maps")}
-        jobs = [
-            common
-            | {
-                "name": name,
-                "file": str(bundle / file),
-                "use": use,
-                "true": key,
-                "out": f"{out}/{angle}_{i}.exr",
-            }
-            for i, (name, (file, use, key)) in enumerate(WAYS.items())
-        ]
-        exact = common | {
-            "name": "mitsuba/skin.py",
-            "true": "whole",
-            "out": f"{out}/{angle}_mitsuba.exr",
-        }
+        scene = described(stage.view.camera, light) | {"maps": str(bundle / "maps")}
+        jobs, exact = jobs_of(scene, bundle, f"{out}/{angle}")
+        rendered = []
         if blender:
             run(blender, "exports_blender.py", jobs, out)
+            rendered += [(job, "ViewLayer.Combined.") for job in jobs]
+            controls(stage, Path(jobs[0]["out"]))
         if mitsuba:
             run(mitsuba, "exports_mitsuba.py", [exact], out)
-        for job in [
-            *(jobs if blender else []),
-            *([exact] if mitsuba else []),
-        ]:
-            path = Path(job["out"])
-            rendered = read(path, "" if job is exact else "ViewLayer.Combined.")
-            figures[f"{angle}: {job['name']}"] = compare(
-                stage, job, true[job["true"]], rendered, path.with_suffix(".png")
-            )
-        if blender:
-            controls(stage, Path(jobs[0]["out"]))
+            rendered.append((exact, ""))
+        for job, channels in rendered:
+            values = read(Path(job["out"]), channels)
+            picture_path = Path(job["out"]).with_suffix(".png")
+            name = f"{angle}: {job['name']}"
+            figures[name] = compare(stage, job, true[job["true"]], values, picture_path)
     if blender:
         run(blender, "exports_blender.py", spread_jobs(out), out)
         report_spread(out)
         if picture:
-            angle = list(point_lights(model, stage.view))[1]
-            draw(
-                [out / f"{angle}_{list(WAYS).index(name)}.png" for name in SHOWN],
-                picture,
-            )
-    (out / "figures.json").write_text(
-        json.dumps(figures, indent=1) + "\n", encoding="utf-8"
-    )
+            angle = list(lights)[1]
+            numbers = [list(WAYS).index(name) for name in SHOWN]
+            draw([out / f"{angle}_{number}.png" for number in numbers], picture)
+    text = json.dumps(figures, indent=1) + "\n"
+    (out / "figures.json").write_text(text, encoding="utf-8")
     print(f"pictures, and the figures of each region: {out}")
+
+
+def jobs_of(
+    scene: dict[str, Any], bundle: Path, stem: str
+) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """One rendering in Blender for each file of the bundle, and the exact one in Mitsuba."""
+    jobs = []
+    for i, (name, (file, use, key)) in enumerate(WAYS.items()):
+        names = {"name": name, "file": str(bundle / file), "use": use, "true": key}
+        jobs.append(scene | names | {"out": f"{stem}_{i}.exr"})
+    names = {"name": "mitsuba/skin.py", "true": "whole", "out": f"{stem}_mitsuba.exr"}
+    return jobs, scene | names

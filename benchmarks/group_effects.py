@@ -15,6 +15,7 @@ after adjustment for age.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
@@ -78,80 +79,89 @@ def paired(n: int, seed: int) -> xr.Dataset:
     )
 
 
-def main(
-    *, cohorts: int = 200, subjects: int = 87, permutations: int = 1000, seed: int = 0
-) -> None:
-    """Compare all cohorts and print a table."""
-    n = subjects
+@dataclass(frozen=True)
+class Cohorts:
+    """Many planted cohorts of a size."""
 
-    def over(
-        cohort: Callable[[int], xr.Dataset], group_by: str, **options: tuple[str, ...]
+    count: int
+    subjects: int
+    permutations: int
+    seed: int
+
+    def contrasts(
+        self,
+        cohort: Callable[[int, int], xr.Dataset],
+        group_by: str,
+        **options: tuple[str, ...],
     ) -> xr.Dataset:
-        """First contrast of every cohort."""
+        """First contrast of every cohort, which `cohort` plants by size and seed."""
         results = []
-        for i in range(cohorts):
-            number = seed * 100_000 + i
-            rng = np.random.default_rng([4, number])
+        for i in range(self.count):
+            number = self.seed * 100_000 + i
             table = group_effects(
-                cohort(number),
+                cohort(self.subjects, number),
                 group_by=group_by,
-                permutations=permutations,
-                rng=rng,
+                permutations=self.permutations,
+                rng=np.random.default_rng([4, number]),
                 **options,
             )
             results.append(table.isel(contrast=0, drop=True))
         return xr.concat(results, "cohort", combine_attrs="override")
 
-    def covered(effects: xr.Dataset, quantity: str, truth: float) -> str:
-        effect = effects.sel(quantity=quantity)
-        inside = (effect["effect_low"] < truth) & (effect["effect_high"] > truth)
-        return f"{100 * float(inside.mean()):.1f} %"
+    def of_two_groups(self, *planted: float, spread: float) -> xr.Dataset:
+        """Contrasts of two groups with planted differences."""
 
+        def cohort(subjects: int, seed: int) -> xr.Dataset:
+            effects = planted or (0.0, 0.0)
+            return cohort_of_two(subjects, seed, *effects, spread)
+
+        return self.contrasts(cohort, "gender")
+
+
+def covered(effects: xr.Dataset, quantity: str, truth: float) -> str:
+    """Percentage of intervals that contain the truth."""
+    effect = effects.sel(quantity=quantity)
+    inside = (effect["effect_low"] < truth) & (effect["effect_high"] > truth)
+    return f"{100 * float(inside.mean()):.1f} %"
+
+
+def print_two_groups(cohorts: Cohorts, name: str, spread: float) -> None:
+    """P values, coverage and power where two groups have equal or other spreads."""
+    null = cohorts.of_two_groups(spread=spread)
+    case = f"| no difference, {name}"
+    for quantity in (R_D, SIGMA_TR):
+        p = null["effect_p"].sel(quantity=quantity).values
+        even = stats.kstest(p, "uniform").pvalue
+        print(f"{case} | {quantity} | uniformity of p: {even:.2f} |")
+    false = 100 * float((null["effect_p_adjusted"] < 0.05).any("quantity").mean())
+    print(f"{case} | any quantity | adjusted p < 0.05: {false:.1f} % |")
+    planted = dict(zip((R_D, SIGMA_TR), (-0.03, 0.05), strict=True))
+    effects = cohorts.of_two_groups(*planted.values(), spread=spread)
+    for quantity, true in planted.items():
+        inside = covered(effects, quantity, true)
+        print(f"| planted, {name} | {quantity} | covered: {inside} |")
+    detectable = float(null["effect_detectable"].sel(quantity=R_D).median())
+    effects = cohorts.of_two_groups(detectable, 0.0, spread=spread)
+    power = 100 * float((effects["effect_p"].sel(quantity=R_D) < 0.05).mean())
+    case = f"| detectable difference ({detectable:.3f}), {name}"
+    print(f"{case} | {R_D} | found: {power:.0f} % |")
+
+
+def main(
+    *, cohorts: int = 200, subjects: int = 87, permutations: int = 1000, seed: int = 0
+) -> None:
+    """Compare all cohorts and print a table."""
+    planted = Cohorts(cohorts, subjects, permutations, seed)
     for name, spread in (("equal spreads", 1.0), ("twice the spread", 2.0)):
-        null = over(
-            lambda seed, spread=spread: cohort_of_two(n, seed, spread=spread), "gender"
-        )
-        for quantity in (R_D, SIGMA_TR):
-            even = stats.kstest(
-                null["effect_p"].sel(quantity=quantity).values, "uniform"
-            ).pvalue
-            print(
-                f"| no difference, {name} | {quantity} | uniformity of p: {even:.2f} |"
-            )
-        false = float((null["effect_p_adjusted"] < 0.05).any("quantity").mean())
-        print(
-            f"| no difference, {name} | any quantity | adjusted p < 0.05: {100 * false:.1f} % |"
-        )
-        real = over(
-            lambda seed, spread=spread: cohort_of_two(n, seed, -0.03, 0.05, spread),
-            "gender",
-        )
-        print(f"| planted, {name} | {R_D} | covered: {covered(real, R_D, -0.03)} |")
-        print(
-            f"| planted, {name} | {SIGMA_TR} | covered: {covered(real, SIGMA_TR, 0.05)} |"
-        )
-        detectable = float(null["effect_detectable"].sel(quantity=R_D).median())
-        effects = over(
-            lambda seed, detectable=detectable, spread=spread: cohort_of_two(
-                n, seed, detectable, 0.0, spread
-            ),
-            "gender",
-        )
-        power = float((effects["effect_p"].sel(quantity=R_D) < 0.05).mean())
-        print(
-            f"| detectable difference ({detectable:.3f}), {name} | {R_D} "
-            f"| found: {100 * power:.0f} % |"
-        )
+        print_two_groups(planted, name, spread)
     for name, adjust in (("not adjusted", ()), ("adjusted for age", ("age",))):
-        effects = over(lambda seed: confounded(n, seed), "ancestry", adjust=adjust)[
-            "effect"
-        ].sel(quantity=R_D)
+        contrasts = planted.contrasts(confounded, "ancestry", adjust=adjust)
+        effects = contrasts["effect"].sel(quantity=R_D)
         error = float(effects.std()) / np.sqrt(cohorts)
         print(
             f"| confounded by age, {name} | {R_D} | mean effect "
             f"{float(effects.mean()):.4f}, standard error {error:.4f} |"
         )
-    both = over(lambda seed: paired(n, seed), "condition")
-    print(
-        f"| conditions within subjects | {R_D} | covered: {covered(both, R_D, 0.001)} |"
-    )
+    both = planted.contrasts(paired, "condition")
+    inside = covered(both, R_D, 0.001)
+    print(f"| conditions within subjects | {R_D} | covered: {inside} |")

@@ -217,6 +217,38 @@ def chrome_directions(folder):
     return np.array(angles)
 
 
+def print_captures(captures: Sequence[Path]) -> None:
+    """Print a row for each capture, and biases of radiance where responses are curved."""
+    print(
+        "| capture | largest error of `light_intensities` | of `fit_light` "
+        "| fitted fall-off | `calibrate_lights`: mean error, largest error, glare, rms z |"
+    )
+    print("|---" * 5 + "|")
+    curved = {}
+    for folder in captures:
+        capture = read_capture(folder)
+        truth = read_truth(folder)
+        target_errors, fit_errors, falloff = light_errors(capture, truth)
+        frames = folder.with_name(f"{folder.name}.truth")
+        if capture.dome.cameras[0].sensor.response is not None and frames.is_dir():
+            curved[folder.name] = radiance_biases(capture, frames)
+        cells = [
+            folder.name,
+            *(f"{100 * np.abs(e).max():.2f} %" for e in (target_errors, fit_errors)),
+            f"{falloff[0]:.2f} ± {falloff[1]:.2f}",
+            "{:.2f} %, {:.2f} %, {:.2f} %, {:.2f}".format(
+                *stated_errors(capture, truth)
+            ),
+        ]
+        print(f"| {' | '.join(cells)} |", flush=True)
+    for name, biases in curved.items():
+        for response, bias in zip(("given", "recovered"), biases, strict=True):
+            cells = ", ".join(
+                f"2^{o} {100 * b:+.2f} %" for o, b in zip(OCTAVES, bias, strict=True)
+            )
+            print(f"{name}, bias of radiance with the {response} response: {cells}")
+
+
 def main(
     captures: Sequence[Path] = (),
     *,
@@ -224,40 +256,7 @@ def main(
     photometric: Path | None = None,
 ) -> None:
     """Print one table for the captures and one line for each set of published data."""
-    print(
-        "| capture | largest error of `light_intensities` | of `fit_light` | fitted fall-off ",
-        end="",
-    )
-    print("| `calibrate_lights`: mean error, largest error, glare, rms z |")
-    print("|---" * 5 + "|")
-    curved = {}
-    for folder in captures:
-        capture = read_capture(folder)
-        truth = read_truth(folder)
-        target_errors, fit_errors, falloff = light_errors(capture, truth)
-        if capture.dome.cameras[0].sensor.response is not None:
-            curved[folder.name] = radiance_biases(
-                capture, folder.with_name(folder.name + ".truth")
-            )
-        largest = [
-            f"{100 * np.abs(e).max():.2f} %" for e in (target_errors, fit_errors)
-        ]
-        stated = "{:.2f} %, {:.2f} %, {:.2f} %, {:.2f}".format(
-            *stated_errors(capture, truth)
-        )
-        print(
-            (
-                f"| {folder.name} | {' | '.join(largest)} | {falloff[0]:.2f} ± "
-                f"{falloff[1]:.2f} | {stated} |"
-            ),
-            flush=True,
-        )
-    for name, biases in curved.items():
-        for response, bias in zip(("given", "recovered"), biases, strict=True):
-            cells = ", ".join(
-                f"2^{o} {100 * b:+.2f} %" for o, b in zip(OCTAVES, bias, strict=True)
-            )
-            print(f"{name}, bias of radiance with the {response} response: {cells}")
+    print_captures(captures)
     if exposures:
         print(
             "frobisher, RMS difference of ln exposure, R G B:",

@@ -13,6 +13,7 @@ from __future__ import annotations
 import tempfile
 import time
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +28,7 @@ from skindb.render.scene import Environment, Lights, from_model, lights_from_dom
 
 REFERENCE = 1024  # rays per pixel
 SAMPLES = (16, 64, 256)
+MITSUBA_SAMPLES = 256  # rays per pixel of both programs
 OPENINGS = (1.0, 0.5, 0.2, 0.1, 0.05)
 
 
@@ -116,114 +118,134 @@ def by_opening(surface, lighting):
         yield opening, time.perf_counter() - started, float(error)
 
 
-def against_mitsuba(surface, camera, lighting):
-    """Times [s] of both programs, difference of their means over skin, RMS difference,
-    and noise of skindb.
-    """
+def mitsuba_sensor(camera, transform):
+    """The camera as Mitsuba describes it."""
+    to_world = np.eye(4)
+    # Mitsuba: +x left, +y up, +z forward
+    to_world[:3, :3] = camera.R.T @ np.diag([-1.0, -1.0, 1.0])
+    to_world[:3, 3] = camera.centre
+    K = camera.K
+    width = camera.width
+    height = camera.height
+    film = {
+        "type": "hdrfilm",
+        "width": width,
+        "height": height,
+        "rfilter": {"type": "box"},
+    }
+    return {
+        "type": "perspective",
+        "fov": float(np.degrees(2 * np.arctan(width / 2 / K[0, 0]))),
+        "fov_axis": "x",
+        "principal_point_offset_x": float((width / 2 - K[0, 2]) / width),
+        "principal_point_offset_y": float((height / 2 - K[1, 2]) / height),
+        "near_clip": 1.0,
+        "far_clip": 1e5,
+        "to_world": transform(to_world),
+        "film": film,
+        "sampler": {"type": "independent", "sample_count": MITSUBA_SAMPLES},
+    }
+
+
+def mitsuba_light(lighting, folder):
+    """The environment, or else the first light, as Mitsuba describes it."""
+    if lighting.environment is not None:
+        path = f"{folder}/sky.exr"
+        # Mitsuba's columns have the opposite order
+        write_exr(path, np.float32(lighting.environment.radiance[:, ::-1]))
+        return {"type": "envmap", "filename": path}
+    intensity = lighting.lights.intensity[0].tolist()
+    return {
+        "type": "point",
+        "position": lighting.lights.position[0].tolist(),
+        "intensity": {"type": "rgb", "value": intensity},
+    }
+
+
+def mitsuba_picture(surface, camera, lighting):
+    """Radiance (h, w, 3) and time [s] of Mitsuba for a diffuse surface of reflectance 0.5."""
     import mitsuba
     import trimesh
 
     mitsuba.set_variant("scalar_rgb")
-    from mitsuba import ScalarTransform4f as T
+    with tempfile.TemporaryDirectory() as folder:
+        path = f"{folder}/mesh.ply"
+        mesh = trimesh.Trimesh(
+            surface.vertices,
+            surface.faces,
+            vertex_normals=surface.normals,
+            process=False,
+        )
+        mesh.export(path, vertex_normal=True)
+        matte = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}
+        scene = {
+            "type": "scene",
+            "integrator": {"type": "direct"},
+            "sensor": mitsuba_sensor(camera, mitsuba.ScalarTransform4f),
+            "face": {"type": "ply", "filename": path, "bsdf": matte},
+            "light": mitsuba_light(lighting, folder),
+        }
+        started = time.perf_counter()
+        radiance = np.array(mitsuba.render(mitsuba.load_dict(scene)))[..., :3]
+        return radiance, time.perf_counter() - started
 
+
+def against_mitsuba(surface, camera, lighting):
+    """Times [s] of both programs, difference of their means over skin, RMS difference,
+    and noise of skindb.
+    """
+    theirs, seconds = mitsuba_picture(surface, camera, lighting)
     matte = replace(
         surface,
         eta=1.0,
         diffuse=np.full_like(surface.diffuse, 0.5),
         parameters=0 * surface.parameters,
     )
-    straight = replace(camera, distortion=np.zeros(5))
     ours = render_monte_carlo(
         matte,
-        straight,
+        replace(camera, distortion=np.zeros(5)),
         lighting,
-        Quality(samples=256, terms=("diffuse",)),
+        Quality(samples=MITSUBA_SAMPLES, terms=("diffuse",)),
         rng=np.random.default_rng(1),
     )
-    with tempfile.TemporaryDirectory() as folder:
-        mesh = trimesh.Trimesh(
-            matte.vertices, matte.faces, vertex_normals=matte.normals, process=False
+    skin = ours.coverage > 0.999
+    theirs = theirs[skin]
+    radiance = ours.radiance[skin]
+    apart = np.abs(theirs.mean(axis=0) / radiance.mean(axis=0) - 1).max()
+    rms = np.sqrt(np.mean((theirs - radiance) ** 2) / np.mean(theirs**2))
+    return ours.seconds, seconds, float(apart), float(rms), ours.relative_error
+
+
+def print_mitsuba(surface, camera, lights):
+    """Print the comparison with Mitsuba for a point light and for an environment."""
+    point = Lights(
+        lights.position[:1],
+        lights.intensity[:1],
+        0 * lights.disc_radius[:1],
+        lights.axis[:1],
+        0 * lights.falloff[:1],
+    )
+    cases = {"point light": Lighting(point), "sky": Lighting(None, sky())}
+    for name, lighting in cases.items():
+        ours, theirs, mean, rms, noise = against_mitsuba(surface, camera, lighting)
+        print(
+            f"Mitsuba, {name}: means differ by {mean:.3%}, pixels by {rms:.2%} "
+            f"(noise of skindb {noise:.2%}); "
+            f"skindb {ours:.1f} s, Mitsuba {theirs:.1f} s"
         )
-        mesh.export(f"{folder}/mesh.ply", vertex_normal=True)
-        K = camera.K
-        width = camera.width
-        height = camera.height
-        to_world = np.eye(4)
-        # Mitsuba: +x left, +y up, +z forward
-        to_world[:3, :3] = camera.R.T @ np.diag([-1.0, -1.0, 1.0])
-        to_world[:3, 3] = camera.centre
-        sensor = {
-            "type": "perspective",
-            "fov": float(np.degrees(2 * np.arctan(width / 2 / K[0, 0]))),
-            "fov_axis": "x",
-            "principal_point_offset_x": float((width / 2 - K[0, 2]) / width),
-            "principal_point_offset_y": float((height / 2 - K[1, 2]) / height),
-            "near_clip": 1.0,
-            "far_clip": 1e5,
-            "to_world": T(to_world),
-            "film": {
-                "type": "hdrfilm",
-                "width": width,
-                "height": height,
-                "rfilter": {"type": "box"},
-            },
-            "sampler": {"type": "independent", "sample_count": 256},
-        }
-        scene = {
-            "type": "scene",
-            "integrator": {"type": "direct"},
-            "sensor": sensor,
-            "face": {
-                "type": "ply",
-                "filename": f"{folder}/mesh.ply",
-                "bsdf": {
-                    "type": "diffuse",
-                    "reflectance": {"type": "rgb", "value": 0.5},
-                },
-            },
-        }
-        if lighting.environment is not None:
-            # Mitsuba's columns have the opposite order
-            write_exr(
-                f"{folder}/sky.exr", np.float32(lighting.environment.radiance[:, ::-1])
-            )
-            scene["light"] = {"type": "envmap", "filename": f"{folder}/sky.exr"}
-        else:
-            lights = lighting.lights
-            scene["light"] = {
-                "type": "point",
-                "position": lights.position[0].tolist(),
-                "intensity": {"type": "rgb", "value": lights.intensity[0].tolist()},
-            }
-        started = time.perf_counter()
-        theirs = np.array(mitsuba.render(mitsuba.load_dict(scene)))[..., :3]
-        seconds = time.perf_counter() - started
-    seen = ours.coverage > 0.999
-    apart = theirs[seen].mean(axis=0) / ours.radiance[seen].mean(axis=0) - 1
-    rms = np.sqrt(
-        np.mean((theirs - ours.radiance)[seen] ** 2) / np.mean(theirs[seen] ** 2)
-    )
-    return (
-        ours.seconds,
-        seconds,
-        float(np.abs(apart).max()),
-        float(rms),
-        ours.relative_error,
-    )
 
 
 def main(db: str, *, take: str | None = None, picture: Path | None = None) -> None:
     """Print the results, and plot them."""
-    db = skindb.open(db)
-    model = db.read("model", take or db.takes("model")[0])
+    database = skindb.open(db)
+    model = database.read("model", take or database.takes("model")[0])
     dome = model["dome"].to_dataset().load()
-    surface, (camera, _), lights = (
-        from_model(model, fill=True),
-        chosen_camera(dome, None),
-        lights_from_dome(dome),
-    )
+    surface = from_model(model, fill=True)
+    camera, _ = chosen_camera(dome, None)
+    lights = lights_from_dome(dome)
+    one_light = Lighting(lights.select([0]))
     cases = {
-        "one light": (Lighting(lights.select([0])), {}),
+        "one light": (one_light, {}),
         f"{len(lights)} lights": (Lighting(lights), {}),
         "sky": (Lighting(None, sky()), {}),
         "sky, subsurface scattering": (Lighting(None, sky()), {"subsurface": True}),
@@ -237,37 +259,12 @@ def main(db: str, *, take: str | None = None, picture: Path | None = None) -> No
                 f"{name}: {samples} rays per pixel {seconds:.1f} s, error "
                 f"{error:.2%}, stated {stated:.2%}"
             )
-    for opening, seconds, error in by_opening(surface, cases["one light"][0]):
+    for opening, seconds, error in by_opening(surface, one_light):
         print(f"opening {opening}: {seconds:.2f} s, error {error:.3%}")
-    try:
-        point = Lights(
-            *(
-                np.asarray(x)[:1] * (1 if i != 2 else 0)
-                for i, x in enumerate(
-                    (
-                        lights.position,
-                        lights.intensity,
-                        lights.disc_radius,
-                        lights.axis,
-                        0 * lights.falloff,
-                    )
-                )
-            )
-        )
-        for name, lighting in (
-            ("point light", Lighting(point)),
-            ("sky", Lighting(None, sky())),
-        ):
-            mine, theirs, mean, rms, noise = against_mitsuba(surface, camera, lighting)
-            print(
-                f"Mitsuba, {name}: means differ by {mean:.3%}, pixels by {rms:.2%} "
-                f"(noise of skindb {noise:.2%}); "
-                f"skindb {mine:.1f} s, Mitsuba {theirs:.1f} s"
-            )
-    except ImportError:
-        print(
-            "the comparison with Mitsuba is skipped, because Mitsuba is not installed"
-        )
+    if find_spec("mitsuba"):
+        print_mitsuba(surface, camera, lights)
+    else:
+        print("The comparison with Mitsuba is skipped: pip install mitsuba")
     if picture:
         draw(curves, picture)
 

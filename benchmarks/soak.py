@@ -180,7 +180,10 @@ def worked(
     executor: dict[str, Any],
 ) -> dict[str, Any]:
     """Run a step over all takes; returns its wall time, tasks and failures."""
-    watch.stage, begin, tasks, failures = stage, time.perf_counter(), [], []
+    watch.stage = stage
+    begin = time.perf_counter()
+    tasks = []
+    failures = []
     for number, outcome in enumerate(
         workflow.map_takes(partial(timed, call), items, **executor), 1
     ):
@@ -201,7 +204,9 @@ def worked(
 @contextmanager
 def alone(name: str, watch: Watch, studies: dict[str, Any]) -> Iterator[None]:
     """Context that records times, memory and failure of a step in this process."""
-    watch.stage, begin, cpu = name, time.perf_counter(), time.process_time()
+    watch.stage = name
+    begin = time.perf_counter()
+    cpu = time.process_time()
     failure = ""
     try:
         yield
@@ -247,6 +252,45 @@ def summary(name: str, stage: dict[str, Any]) -> str:
     )
 
 
+def run_studies(
+    db: Any, watch: Watch, executor: dict[str, Any]
+) -> dict[str, dict[str, Any]]:
+    """Run registration, studies and verification, and return what each took."""
+    studies: dict[str, dict[str, Any]] = {}
+    with alone("register", watch, studies):
+        workflow.register_takes(db, **executor)
+    with alone("brdf", watch, studies):
+        workflow.study(db, "brdf")
+    for group in (None, "gender", "condition"):
+        for name in ("albedo", "translucency"):
+            with alone(f"{name} by {group}", watch, studies):
+                workflow.study(db, name, group_by=group)
+    with alone("traits", watch, studies):
+        workflow.study(db, "traits")
+    with alone("table", watch, studies):
+        db.table()
+    with alone("verify", watch, studies):
+        if faults := db.verify():
+            raise skindb.InputError(faults)
+    return studies
+
+
+def print_results(
+    stages: dict[str, dict[str, Any]], studies: dict[str, dict[str, Any]]
+) -> None:
+    """Print a row for each step over takes and for each study."""
+    print(
+        f"{'step':<10} takes fail  wall s  median   p95 s   cpu s   early    late "
+        "largest  files processes"
+    )
+    for name, stage in stages.items():
+        print(summary(name, stage))
+    for name, study in studies.items():
+        outcome = study["failure"] or f"driver {study['anonymous']:.0f} MiB"
+        times = f"wall {study['wall']:7.1f} s, CPU {study['cpu']:7.1f} s"
+        print(f"{name:<26} {times}, {outcome}")
+
+
 def main(
     out: Path,
     *,
@@ -263,69 +307,29 @@ def main(
     out.mkdir(parents=True, exist_ok=True)
     size = {"lights": lights, "cameras": cameras, "width": width, "height": height}
     db = skindb.open(str(out.absolute() / "db"))
-    persons = people(subjects)
-    studies = {}
-    stages = {}
-    captures = out.absolute() / "captures"
     with (
         Watch() as watch,
         workflow.connected(scheduler) if scheduler else nullcontext() as client,
     ):
         executor = {"client": client} if client else {"workers": workers}
-        stages["simulate"] = worked(
-            "simulate", partial(simulated, captures, size), persons, watch, executor
-        )
+        run = partial(worked, watch=watch, executor=executor)
+        simulate = partial(simulated, out.absolute() / "captures", size)
+        stages = {"simulate": run("simulate", simulate, people(subjects))}
         folders = [task["value"] for task in stages["simulate"]["tasks"]]
-        stages["ingest"] = worked(
-            "ingest", partial(ingested, db), folders, watch, executor
-        )
-        stages["fit"] = worked(
-            "fit", partial(fitted, db), db.takes("capture"), watch, executor
-        )
-        with alone("register", watch, studies):
-            workflow.register_takes(db, **executor)
-        with alone("brdf", watch, studies):
-            workflow.study(db, "brdf")
-        for group in (None, "gender", "condition"):
-            with alone(f"albedo by {group}", watch, studies):
-                workflow.study(db, "albedo", group_by=group)
-            with alone(f"translucency by {group}", watch, studies):
-                workflow.study(db, "translucency", group_by=group)
-        with alone("traits", watch, studies):
-            workflow.study(db, "traits")
-        with alone("table", watch, studies):
-            db.table()
-        with alone("verify", watch, studies):
-            if faults := db.verify():
-                raise skindb.InputError(faults)
-    print(
-        f"{'step':<10} takes fail  wall s  median   p95 s   cpu s   early    late "
-        "largest  files processes"
-    )
-    for name, stage in stages.items():
-        print(summary(name, stage))
-    for name, study in studies.items():
-        outcome = study["failure"] or f"driver {study['anonymous']:.0f} MiB"
-        print(
-            f"{name:<26} wall {study['wall']:7.1f} s, CPU {study['cpu']:7.1f} s, {outcome}"
-        )
+        stages["ingest"] = run("ingest", partial(ingested, db), folders)
+        stages["fit"] = run("fit", partial(fitted, db), db.takes("capture"))
+        studies = run_studies(db, watch, executor)
+    print_results(stages, studies)
     driver = [sample["memory"]["driver"]["anonymous"] for sample in watch.samples]
     print(f"driver, peak anonymous memory: {max(driver):.0f} MiB")
     for kind in ("capture", "model", "registration"):
         sizes = [db.record(kind, take).bytes for take in db.takes(kind)]
         print(f"{kind}: {len(sizes)} versions, {np.mean(sizes) / 1e6:.2f} MB each")
     if json_:
-        for stage in stages.values():
-            for task in stage["tasks"]:
-                task["value"] = (
-                    task["value"]
-                    if isinstance(task["value"], dict)
-                    else str(task["value"])
-                )
         report = {
             "arguments": {"subjects": subjects, "workers": workers, **size},
             "stages": stages,
             "studies": studies,
             "memory": watch.samples,
         }
-        json_.write_text(json.dumps(report, default=str))
+        json_.write_text(json.dumps(report, default=str), encoding="utf-8")

@@ -109,10 +109,6 @@ def weights(
     rng: np.random.Generator, surfels: int, domes: tuple[tuple[int, int], ...]
 ) -> None:
     """Print the coverage of the active weights of two lobes and of the surface reflectance."""
-    table, _ = surface_lobes()
-    table = np.ascontiguousarray(table[..., list(BROAD_AND_NARROW)])
-    basis = dataset({"basis_brdf": stored_brdf(table)})
-    strength = directional_albedo(table, [1.0])[0]
     print(
         "\n| dome | noise, floor | mode | known | broad lobe | narrow lobe | "
         "surface reflectance | active |"
@@ -130,38 +126,40 @@ def weights(
                 floor=floor,
                 lobes=BROAD_AND_NARROW,
             )
-            truth = skin.weight[:, list(BROAD_AND_NARROW)]
-            sets = known_normals(skin)
-            true = sets["true"].assign(
-                diffuse_reflectance=label("diffuse_reflectance", skin.diffuse)
-            )
-            cases = {"normal, R_d": true}
-            for name, key in (("normal", "true"), ("nothing", "found")):
-                cases[name] = sets[key].merge(
-                    estimate_diffuse_reflectance(sets[key], eta=ETA)
-                )
+            case = f"| {lights} x {cameras} | {noise:.1%}, {floor:g}"
+            cases = known_quantities(skin)
             for mode in ("linear", "perceptual"):
                 for name, lumitexels in cases.items():
-                    r = refit(lumitexels, basis=basis, mode=mode, eta=ETA)
-                    x = r["basis_weight"].values
-                    error = r["basis_weight_error"].values
-                    shares = [
-                        inside(x[:, k], truth[:, k], error[:, k]) for k in range(2)
-                    ]
-                    shares.append(
-                        inside(
-                            r["surface_reflectance"],
-                            truth @ strength,
-                            r["surface_reflectance_error"],
-                        )
-                    )
-                    case = f"| {lights} x {cameras} | {noise:.1%}, {floor:g} | {mode} | {name} |"
-                    print(
-                        case,
-                        " | ".join(shares),
-                        f"| {100 * np.isfinite(error).mean():.0f} % |",
-                        flush=True,
-                    )
+                    cells = weight_cells(skin, lumitexels, mode)
+                    print(f"{case} | {mode} | {name} | {cells} |", flush=True)
+
+
+def known_quantities(skin: ModelSamples) -> dict[str, xr.Dataset]:
+    """The samples with true or estimated normals and diffuse reflectance."""
+    sets = known_normals(skin)
+    diffuse = label("diffuse_reflectance", skin.diffuse)
+    cases = {"normal, R_d": sets["true"].assign(diffuse_reflectance=diffuse)}
+    for name, key in (("normal", "true"), ("nothing", "found")):
+        estimate = estimate_diffuse_reflectance(sets[key], eta=ETA)
+        cases[name] = sets[key].merge(estimate)
+    return cases
+
+
+def weight_cells(skin: ModelSamples, lumitexels: xr.Dataset, mode: str) -> str:
+    """Coverage of both weights and of the surface reflectance, and active weights."""
+    table, _ = surface_lobes()
+    table = np.ascontiguousarray(table[..., list(BROAD_AND_NARROW)])
+    basis = dataset({"basis_brdf": stored_brdf(table)})
+    strength = directional_albedo(table, [1.0])[0]
+    truth = skin.weight[:, list(BROAD_AND_NARROW)]
+    fit = refit(lumitexels, basis=basis, mode=mode, eta=ETA)
+    weight = fit["basis_weight"].values
+    error = fit["basis_weight_error"].values
+    cells = [inside(weight[:, k], truth[:, k], error[:, k]) for k in range(2)]
+    reflectance = fit["surface_reflectance"]
+    reflectance_error = fit["surface_reflectance_error"]
+    cells.append(inside(reflectance, truth @ strength, reflectance_error))
+    return " | ".join([*cells, f"{100 * np.isfinite(error).mean():.0f} %"])
 
 
 def main(

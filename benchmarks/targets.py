@@ -157,29 +157,18 @@ def _table(heads, rows):
         print("| " + " | ".join(row) + " |")
 
 
-def main(
-    path: Sequence[Path],
-    *,
-    only: Sequence[str] = (),
-    surfels: int = 60,
-    noise: float = 0.0,
-) -> None:
-    """Print two tables: residuals of the full dictionary by mode, and of reduced bases by size."""
+def print_modes(samples: dict[str, xr.Dataset]) -> dict[str, xr.Dataset]:
+    """Print residuals of the full dictionary by mode; returns the perceptual fits."""
     dictionary = embedded_dictionary()
-    samples = {
-        name: sampled(target, surfels=surfels, noise=noise)
-        for name, target in read_targets(path, only).items()
-    }
+    models = {mode: Mixture.of_dictionary(dictionary, mode=mode) for mode in MODES}
     rows = []
-    weights = {}
+    perceptual = {}
     for name, ds in samples.items():
         fits = {
-            mode: fit_surface(
-                ds, surface=Mixture.of_dictionary(dictionary, mode=mode), mode=mode
-            )
-            for mode in MODES
+            mode: fit_surface(ds, surface=model, mode=mode)
+            for mode, model in models.items()
         }
-        weights[name] = fits["perceptual"]
+        perceptual[name] = fits["perceptual"]
         rd = ds["diffuse_reflectance"].median("surfel").values
         cells = [
             _cell(fit, "dictionary_residual", "dictionary_residual_perceptual")
@@ -191,26 +180,44 @@ def main(
         "cube-root space [%]; median surfel\n"
     )
     _table(["target", "estimated R_d", *MODES], rows)
+    return perceptual
+
+
+def print_sizes(
+    samples: dict[str, xr.Dataset], perceptual: dict[str, xr.Dataset]
+) -> None:
+    """Print residuals of bases that are common to all targets, by size."""
     fitted = xr.concat(
-        [weights[name].merge(ds[["surfel_area"]]) for name, ds in samples.items()],
+        [perceptual[name].merge(ds[["surfel_area"]]) for name, ds in samples.items()],
         "surfel",
         combine_attrs="override",
     )
-    columns = {name: [] for name in samples}
+    rows = {name: [name] for name in samples}
     for k in SIZES:
         basis = reduce_basis(
             fitted,
-            dictionary=dictionary,
+            dictionary=embedded_dictionary(),
             rng=np.random.default_rng(0),
             k=k,
             in_metric=True,
         )
         for name, ds in samples.items():
-            columns[name].append(
-                _cell(refit(ds, basis=basis), "fit_residual", "fit_residual_perceptual")
-            )
+            fit = refit(ds, basis=basis)
+            rows[name].append(_cell(fit, "fit_residual", "fit_residual_perceptual"))
     print("\nThe same with k components common to all targets, mode perceptual\n")
-    _table(
-        ["target", *(f"k = {k}" for k in SIZES)],
-        [[name, *cells] for name, cells in columns.items()],
-    )
+    _table(["target", *(f"k = {k}" for k in SIZES)], list(rows.values()))
+
+
+def main(
+    path: Sequence[Path],
+    *,
+    only: Sequence[str] = (),
+    surfels: int = 60,
+    noise: float = 0.0,
+) -> None:
+    """Print two tables: residuals of the full dictionary by mode, and of reduced bases by size."""
+    samples = {
+        name: sampled(target, surfels=surfels, noise=noise)
+        for name, target in read_targets(path, only).items()
+    }
+    print_sizes(samples, print_modes(samples))

@@ -17,7 +17,7 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -46,6 +46,8 @@ UNDERSIDE = -0.5  # y of a normal that points down
 # mm and cosine between a surfel and the true vertex with which it is compared
 NEAREST = 1.0
 TURNED = 0.85
+# from above and the side, so that nose, brow and ear cast shadows
+FROM_SIDE = np.array([0.75, 0.45, 0.5])
 WIDTH = 1300
 HEIGHT = 1030
 
@@ -133,6 +135,16 @@ def facing(surfels: SurfelSet, place: Any) -> Any:
     return np.einsum("ni,ni->n", way, surfels.normal) / np.linalg.norm(way, axis=1)
 
 
+@dataclass(frozen=True)
+class SeenByRays:
+    """What a light sees by rays, and where splats should agree."""
+
+    light: LightRecord
+    visible: Any  # (n,) of the centre
+    steep: Any  # (n,) cosines above STEEP
+    certain: Any  # (n,) of these, away from the edges of shadows
+
+
 def compare(
     surfels: SurfelSet, scene: RayScene, lights: tuple[LightRecord, ...]
 ) -> None:
@@ -142,39 +154,31 @@ def compare(
     differing = 0
     faced = 0
     errors = []
-    soft = 0
-    seen = []
-    sure = []
-    steep = []
+    views = []
     with ThreadPoolExecutor(1) as pool:
-        shares = light_visibility(surfels, lights, scene, pool)
-    for light, share in zip(lights, shares.T, strict=True):
+        fractions = light_visibility(surfels, lights, scene, pool)
+    for light, fraction in zip(lights, fractions.T, strict=True):
         cosine = facing(surfels, light.position)
-        facing_light = np.flatnonzero(cosine > 0)
-        rays = np.zeros(len(cosine), bool)
+        front = np.flatnonzero(cosine > 0)
         by_point = [
             ~scene.occluded(
-                surfels.position[facing_light],
-                p[None],
-                normal=surfels.normal[facing_light],
+                surfels.position[front], p[None], normal=surfels.normal[front]
             )
             for p in disc_points(light)
         ]
-        rays[facing_light] = by_point[0]
         expected = np.mean(by_point, axis=0).astype(np.float16)
-        differing = differing + int((share[facing_light] != expected).sum())
-        faced = faced + len(facing_light)
-        inside = facing_light[(expected > 0) & (expected < 1)]
-        soft += len(inside)
-        errors.append(
-            share[inside].astype(float) - dense_share(scene, surfels, inside, light)
-        )
-        edge = mixed(surfels.faces, rays)
+        differing += int((fraction[front] != expected).sum())
+        faced += len(front)
+        penumbra = front[(expected > 0) & (expected < 1)]
+        dense = dense_fraction(scene, surfels, penumbra, light)
+        errors.append(fraction[penumbra].astype(float) - dense)
+        visible = np.zeros(len(cosine), bool)
+        visible[front] = by_point[0]
+        edge = mixed(surfels.faces, visible)
         for _ in range(RINGS):
             edge = grown(surfels.faces, edge)
-        seen.append(rays)
-        steep.append(cosine > STEEP)
-        sure.append(steep[-1] & ~edge)
+        steep = cosine > STEEP
+        views.append(SeenByRays(light, visible, steep, steep & ~edge))
     error = np.concatenate(errors)
     say(
         what="pairs that differ from five points everywhere",
@@ -186,8 +190,13 @@ def compare(
         what="five points in penumbrae",
         error=float(np.abs(error).mean()),
         bias=float(error.mean()),
-        soft=soft / faced,
+        soft=len(error) / faced,
     )
+    compare_splats(surfels, views)
+
+
+def compare_splats(surfels: SurfelSet, views: list[SeenByRays]) -> None:
+    """Agreement of splats with rays by the size of a pixel of their map."""
     for factor in (0.3, PIXEL, 0.5, 0.7):
         splats = SplatScene(
             surfels.position,
@@ -196,29 +205,27 @@ def compare(
             pixel_mm=factor * float(np.median(surfels.radius)),
         )
         begin = time.process_time()
-        share = [splats.visible_fraction(light.position) for light in lights]
-        cpu = (time.process_time() - begin) / len(lights)
+        fractions = [splats.visible_fraction(view.light.position) for view in views]
+        cpu = (time.process_time() - begin) / len(views)
         for threshold in (THRESHOLD, 0.5):
-            same = [(s >= threshold) == r for s, r in zip(share, seen, strict=True)]
-            away = [a[w].mean() for a, w in zip(same, sure, strict=True)]
-            with_edges = np.mean(
-                [a[w].mean() for a, w in zip(same, steep, strict=True)]
-            )
-            figures = {
-                "mean": float(np.mean(away)),
-                "worst": float(min(away)),
-                "with_edges": float(with_edges),
-            }
+            away = []
+            with_edges = []
+            for fraction, view in zip(fractions, views, strict=True):
+                same = (fraction >= threshold) == view.visible
+                away.append(same[view.certain].mean())
+                with_edges.append(same[view.steep].mean())
             say(
                 what="splats as rays",
                 pixel_of_radius=factor,
                 threshold=threshold,
                 cpu_a_view=cpu,
-                **figures,
+                mean=float(np.mean(away)),
+                worst=float(min(away)),
+                with_edges=float(np.mean(with_edges)),
             )
 
 
-def dense_share(
+def dense_fraction(
     scene: RayScene, surfels: SurfelSet, chosen: Any, light: LightRecord
 ) -> Any:
     """Visible fraction of the disc from DENSE points on a spiral."""
@@ -320,59 +327,23 @@ def draw(
     mpl.use("agg")
     from matplotlib import pyplot as plt
 
-    middle = surfels.position.mean(axis=0)
-    towards = np.array([light.position for light in lights]) - middle
-    # from above and the side, so that nose, brow and ear cast shadows
-    from_side = np.array([0.75, 0.45, 0.5])
-    light = lights[
-        int((towards @ from_side / np.linalg.norm(towards, axis=1)).argmax())
-    ]
+    towards = np.array([light.position for light in lights])
+    towards -= surfels.position.mean(axis=0)
+    cosine = towards @ FROM_SIDE / np.linalg.norm(towards, axis=1)
+    light = lights[int(cosine.argmax())]
     with ThreadPoolExecutor(1) as pool:
-        shares = [
-            light_visibility(surfels, [light], scene, pool, method=m)[:, 0]
+        fractions = [
+            light_visibility(surfels, [light], scene, pool, method=m)[:, 0].astype(
+                float
+            )
             for m in ("rays", "splats")
         ]
-    low = surfels.position.min(axis=0)
-    high = surfels.position.max(axis=0)
-    eye = np.array(
-        [(low[0] + high[0]) / 2 + 250, (low[1] + high[1]) / 2, high[2] + 700]
-    )
-    x, y = np.meshgrid(
-        np.linspace(low[0] - 20, high[0] + 40, 640),
-        np.linspace(high[1] + 5, low[1] - 5, 720),
-    )
-    target = np.stack([x, y, np.full(x.shape, middle[2])], axis=-1).reshape(-1, 3)
-    face, weight, _ = scene.first_hit(np.broadcast_to(eye, target.shape), target - eye)
-    corner = surfels.faces[face]
-    shade = 0.25 + 0.75 * np.maximum(facing(surfels, light.position), 0)
-    lit = [
-        (np.einsum("nk,nk->n", weight, (0.15 + 0.85 * s.astype(float) * shade)[corner]))
-        for s in shares
-    ]
-    off = np.einsum(
-        "nk,nk->n", weight, (shares[1].astype(float) - shares[0].astype(float))[corner]
-    )
-    base = 0.75 + 0.2 * np.einsum("nk,nk->n", weight, shade[corner])
-    apart = np.clip(
-        np.stack(
-            [base - np.maximum(-off, 0), base - np.abs(off), base - np.maximum(off, 0)],
-            -1,
-        ),
-        0,
-        1,
-    )
-    count = int((np.abs(shares[0].astype(float) - shares[1]) > 0).sum())
-    panels = [
-        (np.repeat(i[:, None], 3, axis=1), t)
-        for i, t in zip(lit, ("rays", "splats"), strict=True)
-    ]
-    panels.append(
-        (apart, f"difference ({100 * count / len(shares[0]):.2f} % of the surfels)")
-    )
+    differing = 100 * np.mean(fractions[0] != fractions[1])
+    titles = ("rays", "splats", f"difference ({differing:.2f} % of the surfels)")
     figure, axes = plt.subplots(1, 3, figsize=(11, 5.1))
-    for axis, (image, title) in zip(axes, panels, strict=True):
-        image[face < 0] = 1
-        axis.imshow(image.reshape(*x.shape, 3))
+    images = painted(surfels, scene, light, fractions)
+    for axis, image, title in zip(axes, images, titles, strict=True):
+        axis.imshow(image)
         axis.set_title(title, fontsize=10)
         axis.axis("off")
     axes[2].text(
@@ -385,3 +356,37 @@ def draw(
     )
     figure.tight_layout()
     figure.savefig(path, dpi=90)
+
+
+def painted(
+    surfels: SurfelSet, scene: RayScene, light: LightRecord, fractions: list[Any]
+) -> list[Any]:
+    """Images (h, w, 3) of the shaded head by both methods, and of their difference."""
+    low = surfels.position.min(axis=0)
+    high = surfels.position.max(axis=0)
+    middle = (low + high) / 2
+    eye = np.array([middle[0] + 250, middle[1], high[2] + 700])
+    x, y = np.meshgrid(
+        np.linspace(low[0] - 20, high[0] + 40, 640),
+        np.linspace(high[1] + 5, low[1] - 5, 720),
+    )
+    depth = np.full(x.shape, surfels.position[:, 2].mean())
+    target = np.stack([x, y, depth], axis=-1).reshape(-1, 3)
+    face, weight, _ = scene.first_hit(np.broadcast_to(eye, target.shape), target - eye)
+    corner = surfels.faces[face]
+
+    def at_pixels(values: Any) -> Any:
+        return np.einsum("nk,nk->n", weight, values[corner])
+
+    shade = 0.25 + 0.75 * np.maximum(facing(surfels, light.position), 0)
+    images = [
+        np.repeat(at_pixels((0.15 + 0.85 * fraction) * shade)[:, None], 3, axis=1)
+        for fraction in fractions
+    ]
+    off = at_pixels(fractions[1] - fractions[0])
+    base = 0.75 + 0.2 * at_pixels(shade)
+    lost = (np.maximum(-off, 0), np.abs(off), np.maximum(off, 0))
+    images.append(np.clip(np.stack([base - colour for colour in lost], -1), 0, 1))
+    for image in images:
+        image[face < 0] = 1
+    return [image.reshape(*x.shape, 3) for image in images]
