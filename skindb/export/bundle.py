@@ -198,56 +198,42 @@ def _edited(manifest: Mapping[str, Any]) -> str:
 
 def _error_lines(manifest: Mapping[str, Any]) -> list[str]:
     """Lines with the measured errors of the exports, and of the model itself."""
-    error = manifest["files"]["model.glb"]["approximation_error"]
-    lines = _item(
-        "maps and bases",
-        "the values of the model, in single or half precision; pictures rendered "
-        "from maps of the default size differ "
-        "from those of the model by about 1%",
-    )
-    lines += _item(
-        "model.glb",
-        "pictures of its material differ from those of the model by "
-        f"{error['relative_rms']:.1%} (relative root mean "
-        "square over lights and cameras in all directions), and in cube-root "
-        "space, which is closer to perception, by "
-        f"{error['relative_rms_perceptual']:.1%}; normals differ by "
-        f"{error['normal_error_degrees']:.2f} degrees "
-        "(median)",
-    )
+    gltf = manifest["files"]["model.glb"]["approximation_error"]
     usd = manifest["files"]["usd/face.usda"]
-    error = usd["approximation_error"]
-    preview = usd["approximation_error_of_preview"]
-    lines += _item(
-        "mitsuba/skin.py",
-        (
-            "pictures differ from those of skindb without subsurface transport by "
-            "about 1%, because of the size of texels"
-        ),
-    )
-    lines += _item(
-        "indices of refraction",
-        "refractive_index of manifest.json is that of the skin. ior in model.glb "
-        "and specular_ior in usd only scale "
-        "the fitted reflection at normal incidence, so they may be far from it",
-    )
-    lines += _item(
-        "usd/face.usda",
-        f"the same errors are {error['relative_rms']:.1%} and "
-        f"{error['relative_rms_perceptual']:.1%}, computed with "
-        "the equations of glTF and one index of refraction; implementations of "
-        "OpenPBR differ in their layering. Those "
-        f"of its UsdPreviewSurface are {preview['relative_rms']:.1%} and "
-        f"{preview['relative_rms_perceptual']:.1%}",
-    )
+    relative, perceptual = _rms_of(usd["approximation_error"])
+    preview, preview_perceptual = _rms_of(usd["approximation_error_of_preview"])
+    gltf_relative, gltf_perceptual = _rms_of(gltf)
+    items = {
+        "maps and bases": "the values of the model, in single or half precision; pictures "
+        "rendered from maps of the default size differ from those of the model by about 1%",
+        "model.glb": "pictures of its material differ from those of the model by "
+        f"{gltf_relative} (relative root mean square over lights and cameras in all "
+        "directions), and in cube-root space, which is closer to perception, by "
+        f"{gltf_perceptual}; normals differ by {gltf['normal_error_degrees']:.2f} degrees "
+        "(median)",
+        "mitsuba/skin.py": "pictures differ from those of skindb without subsurface "
+        "transport by about 1%, because of the size of texels",
+        "indices of refraction": "refractive_index of manifest.json is that of the skin. "
+        "ior in model.glb and specular_ior in usd only scale the fitted reflection at "
+        "normal incidence, so they may be far from it",
+        "usd/face.usda": f"the same errors are {relative} and {perceptual}, computed with "
+        "the equations of glTF and one index of refraction; implementations of OpenPBR "
+        f"differ in their layering. Those of its UsdPreviewSurface are {preview} and "
+        f"{preview_perceptual}",
+    }
     for name, about in manifest["error"].items():
         if isinstance(about, Mapping) and "median" in about:
-            text = (
+            items[name] = (
                 f"{about['meaning']}: median {about['median']:.3g}, 95 % below "
-                f"{about['quantile_95']:.3g}"
+                f"{about['quantile_95']:.3g} [{about['units']}]"
             )
-            lines += _item(name, f"{text} [{about['units']}]")
-    return lines
+    return [line for name, text in items.items() for line in _item(name, text)]
+
+
+def _rms_of(error: Mapping[str, float]) -> tuple[str, str]:
+    """Relative RMS error of pictures, and that in cube-root space, as texts."""
+    relative, perceptual = (error[f"relative_rms{end}"] for end in ("", "_perceptual"))
+    return f"{relative:.1%}", f"{perceptual:.1%}"
 
 
 def _paragraph(text: str) -> list[str]:

@@ -15,7 +15,7 @@ import xarray as xr
 
 from skindb import __version__
 from skindb.export.inputs import describe_edit
-from skindb.export.textures import Skin, skin_of
+from skindb.export.textures import Shape, Skin, skin_of
 from skindb.files import private_file
 from skindb.schema.consent import require_consent
 
@@ -76,51 +76,16 @@ def _document(
     textures: dict[str, bytes], extras: dict[str, Any], skin: Skin
 ) -> tuple[dict[str, Any], bytes]:
     """The JSON document of the scene, and the binary data to which it refers."""
-    shape = skin.shape
     material = _material(extras, skin)
     # in all names, because programs merge what has the same name in several files
     take = str(extras["take"])
-    position = shape.position * np.float32(MM)
-    blocks = {
-        "POSITION": (position, VERTEX_BUFFER, FLOAT, "VEC3"),
-        "NORMAL": (shape.normal.astype(np.float32), VERTEX_BUFFER, FLOAT, "VEC3"),
-        "TEXCOORD_0": (shape.uv, VERTEX_BUFFER, FLOAT, "VEC2"),
-        "TANGENT": (shape.tangent.astype(np.float32), VERTEX_BUFFER, FLOAT, "VEC4"),
-        "indices": (
-            shape.triangles.astype(np.uint32).reshape(-1),
-            INDEX_BUFFER,
-            UNSIGNED_INT,
-            "SCALAR",
-        ),
-    }
     views: list[dict[str, int]] = []
-    body = b""
-    accessors = []
-    for array, target, component, kind in blocks.values():
-        accessors.append(
-            {
-                "bufferView": len(views),
-                "componentType": component,
-                "count": len(array),
-                "type": kind,
-            }
-        )
-        body = _append(body, views, array.tobytes(), target=target)
-    accessors[0] |= {
-        "min": position.min(axis=0).tolist(),
-        "max": position.max(axis=0).tolist(),
-    }
+    body, accessors, attributes = _mesh_data(skin.shape, views)
     images = []
     for name, png in textures.items():
-        images.append(
-            {
-                "bufferView": len(views),
-                "mimeType": "image/png",
-                "name": f"{take}_{name}",
-            }
-        )
+        image = {"mimeType": "image/png", "name": f"{take}_{name}"}
+        images.append({"bufferView": len(views), **image})
         body = _append(body, views, png)
-    attributes = {name: i for i, name in enumerate(blocks) if name != "indices"}
     primitive = {
         "attributes": attributes,
         "indices": len(attributes),
@@ -145,6 +110,43 @@ def _document(
         "buffers": [{"byteLength": len(body)}],
     }
     return document, body
+
+
+def _mesh_data(
+    shape: Shape, views: list[dict[str, int]]
+) -> tuple[bytes, list[dict[str, Any]], dict[str, int]]:
+    """Binary data of the mesh, its accessors, and the accessor of each attribute; views
+    of the data are appended to `views`.
+    """
+    position = shape.position * np.float32(MM)
+    indices = shape.triangles.astype(np.uint32).reshape(-1)
+    arrays = {
+        "POSITION": (position, "VEC3"),
+        "NORMAL": (shape.normal.astype(np.float32), "VEC3"),
+        "TEXCOORD_0": (shape.uv, "VEC2"),
+        "TANGENT": (shape.tangent.astype(np.float32), "VEC4"),
+        "indices": (indices, "SCALAR"),
+    }
+    body = b""
+    accessors: list[dict[str, Any]] = []
+    for name, (array, kind) in arrays.items():
+        is_index = name == "indices"
+        accessors.append(
+            {
+                "bufferView": len(views),
+                "componentType": UNSIGNED_INT if is_index else FLOAT,
+                "count": len(array),
+                "type": kind,
+            }
+        )
+        target = INDEX_BUFFER if is_index else VERTEX_BUFFER
+        body = _append(body, views, array.tobytes(), target=target)
+    accessors[0] |= {
+        "min": position.min(axis=0).tolist(),
+        "max": position.max(axis=0).tolist(),
+    }
+    attributes = {name: i for i, name in enumerate(arrays) if name != "indices"}
+    return body, accessors, attributes
 
 
 def _material(extras: dict[str, Any], skin: Skin) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
+from string import Template
 from typing import Any
 from xml.etree import ElementTree
 
@@ -98,73 +99,62 @@ def _space(file: str) -> str:
 
 
 def _materialx(inputs: Mapping[str, tuple[str, str | float]]) -> str:
+    """The OpenPBR material as a MaterialX document."""
     root = ElementTree.Element("materialx", version="1.39", colorspace="lin_rec709")
     root.append(ElementTree.Comment(f" skindb {__version__}: skin, lengths in mm "))
     place = ElementTree.SubElement(root, "texcoord", name="st", type="vector2")
-    ElementTree.SubElement(place, "input", name="index", type="integer", value="0")
+    _add_input(place, "index", "integer", value="0")
     surface = ElementTree.Element(
         "open_pbr_surface", name="skin_surface", type="surfaceshader"
     )
     for name, (kind, value) in inputs.items():
-        node = ElementTree.SubElement(surface, "input", name=name, type=kind)
+        node = _add_input(surface, name, kind)
         if isinstance(value, float):
             node.set("value", f"{value:.6g}")
             continue
-        image = ElementTree.SubElement(root, "image", name=f"{name}_image", type=kind)
-        file = ElementTree.SubElement(
-            image, "input", name="file", type="filename", value=value
-        )
-        if kind == "color3":
-            file.set("colorspace", _space(value))
-        ElementTree.SubElement(
-            image, "input", name="texcoord", type="vector2", nodename="st"
-        )
-        for axis in "uv":
-            ElementTree.SubElement(
-                image, "input", name=f"{axis}addressmode", type="string", value="clamp"
-            )
-        source = image.get("name", "")
+        source = _add_image(root, f"{name}_image", kind, value)
         if name == "geometry_normal":
             bent = ElementTree.SubElement(
                 root, "normalmap", name="bent_normal", type="vector3"
             )
-            ElementTree.SubElement(
-                bent, "input", name="in", type="vector3", nodename=source
-            )
+            _add_input(bent, "in", "vector3", nodename=source)
             source = "bent_normal"
         elif name == RELATIVE:
             ratio = ElementTree.SubElement(
                 root, "multiply", name="relative_length", type="color3"
             )
-            ElementTree.SubElement(
-                ratio, "input", name="in1", type="color3", nodename=source
-            )
-            ElementTree.SubElement(
-                ratio,
-                "input",
-                name="in2",
-                type="float",
-                value=f"{_per_length(inputs):.6g}",
-            )
+            _add_input(ratio, "in1", "color3", nodename=source)
+            _add_input(ratio, "in2", "float", value=f"{_per_length(inputs):.6g}")
             source = "relative_length"
         node.set("nodename", source)
     root.append(surface)
     material = ElementTree.SubElement(
         root, "surfacematerial", name="skin", type="material"
     )
-    ElementTree.SubElement(
-        material,
-        "input",
-        name="surfaceshader",
-        type="surfaceshader",
-        nodename="skin_surface",
-    )
+    _add_input(material, "surfaceshader", "surfaceshader", nodename="skin_surface")
     ElementTree.indent(root)
-    return (
-        '<?xml version="1.0"?>\n'
-        + ElementTree.tostring(root, encoding="unicode")
-        + "\n"
-    )
+    text = ElementTree.tostring(root, encoding="unicode")
+    return f'<?xml version="1.0"?>\n{text}\n'
+
+
+def _add_input(
+    node: ElementTree.Element, name: str, kind: str, **attributes: str
+) -> ElementTree.Element:
+    """Add an input to a node of MaterialX."""
+    named = {"name": name, "type": kind, **attributes}
+    return ElementTree.SubElement(node, "input", named)
+
+
+def _add_image(root: ElementTree.Element, name: str, kind: str, path: str) -> str:
+    """Add a node that reads an image, and return its name."""
+    image = ElementTree.SubElement(root, "image", name=name, type=kind)
+    file = _add_input(image, "file", "filename", value=path)
+    if kind == "color3":
+        file.set("colorspace", _space(path))
+    _add_input(image, "texcoord", "vector2", nodename="st")
+    for axis in "uv":
+        _add_input(image, f"{axis}addressmode", "string", value="clamp")
+    return name
 
 
 def _usda(
@@ -176,50 +166,22 @@ def _usda(
     triangles = mesh["triangle"].values
     # v increases upwards in USD
     uv = fitted["surfel_uv"].values.astype(np.float64) * [1, -1] + [0, 1]
-    extent = _vectors(np.stack([place.min(axis=0), place.max(axis=0)]))
-    shaders = [*_openpbr(inputs), *_preview(ior)]
-    return f"""#usda 1.0
-(
-    defaultPrim = "Face"
-    doc = "skindb {__version__}: mm, +x to the left of the subject, +y up, +z out; Rec. 709, D65"
-    metersPerUnit = 0.001
-    upAxis = "Y"
-)
-
-def Xform "Face" (
-    kind = "component"
-)
-{{
-    def Mesh "Skin" (
-        prepend apiSchemas = ["MaterialBindingAPI"]
+    return _template("usd", STAGE).substitute(
+        version=__version__,
+        extent=_vectors(np.stack([place.min(axis=0), place.max(axis=0)])),
+        counts=", ".join(["3"] * len(triangles)),
+        indices=", ".join(map(str, triangles.ravel().tolist())),
+        normals=_vectors(_normals(fitted)),
+        points=_vectors(place),
+        uv=_vectors(uv),
+        shaders="\n".join([*_openpbr(inputs), *_preview(ior)]),
     )
-    {{
-        float3[] extent = {extent}
-        int[] faceVertexCounts = [{", ".join(["3"] * len(triangles))}]
-        int[] faceVertexIndices = [{", ".join(map(str, triangles.ravel().tolist()))}]
-        rel material:binding = </Face/Materials/Skin>
-        normal3f[] normals = {_vectors(_normals(fitted))} (
-            interpolation = "vertex"
-        )
-        point3f[] points = {_vectors(place)}
-        texCoord2f[] primvars:st = {_vectors(uv)} (
-            interpolation = "vertex"
-        )
-        uniform token subdivisionScheme = "none"
-    }}
 
-    def Scope "Materials"
-    {{
-        def Material "Skin"
-        {{
-            token outputs:mtlx:surface.connect = </Face/Materials/Skin/OpenPbr.outputs:out>
-            token outputs:surface.connect = </Face/Materials/Skin/Preview.outputs:surface>
 
-{chr(10).join(shaders)}
-        }}
-    }}
-}}
-"""
+def _template(folder: str, name: str) -> Template:
+    """A text of the package, with markers such as ``$version``."""
+    file = resources.files("skindb.export") / folder / f"{name}.txt"
+    return Template(file.read_text(encoding="utf-8"))
 
 
 def _openpbr(inputs: Mapping[str, tuple[str, str | float]]) -> list[str]:
@@ -334,10 +296,8 @@ def export_mitsuba(model: xr.DataTree, folder: Path) -> None:
         New folder. `skin.py` reads `../manifest.json`, `../maps` and `../bases`.
     """
     make_private(folder)
-    program = resources.files("skindb.export") / "mitsuba" / f"{PROGRAM}.txt"
-    private_file(folder / PROGRAM).write_text(
-        program.read_text(encoding="utf-8"), encoding="utf-8"
-    )
+    program = _template("mitsuba", PROGRAM).template
+    private_file(folder / PROGRAM).write_text(program, encoding="utf-8")
     fitted = model["fitted"].to_dataset()
     triangles = model["mesh"].to_dataset()["triangle"].values
     columns = [

@@ -101,6 +101,12 @@ class _Sums:
         self.square = self.square + apart * (image - self.mean)
         self.coverage = self.coverage + (coverage - self.coverage) / self.count
 
+    def reached(self, error: float | None) -> bool:
+        """Whether there are enough batches for this relative error."""
+        if error is None or self.count < MIN_BATCHES:
+            return False
+        return self.relative_error() <= error
+
     def relative_error(self) -> float:
         if self.count < 2:
             return np.inf
@@ -151,42 +157,24 @@ def render_monte_carlo(
         Radiance in the unit of the lights' intensity per mm2, or in that of the environment.
     """
     rays = RayScene(surface.vertices, surface.faces) if scene is None else scene
-    lights = lighting.lights
-    middle = surface.vertices[surface.known].mean(axis=0)
-    choice = (
-        LightChoice.of_lights(lights, middle)
-        if lights is not None and len(lights)
-        else None
-    )
-    painter = _Painter(
-        surface, rays, lighting, quality, surface.model.sampler(), choice
-    )
-    many = (
-        lighting.environment is not None
-        and quality.samples >= 2 * RAYS_PER_AXIS_ENVIRONMENT**2
-    )
-    axis = RAYS_PER_AXIS_ENVIRONMENT if many else RAYS_PER_AXIS
+    painter = _Painter.of(surface, rays, lighting, quality)
+    axis = RAYS_PER_AXIS
+    enough = quality.samples >= 2 * RAYS_PER_AXIS_ENVIRONMENT**2
+    if lighting.environment is not None and enough:
+        axis = RAYS_PER_AXIS_ENVIRONMENT
     per_batch = axis**2
-    sums = _Sums()
     # at least two batches, for the variance
-    limit = (
-        MAX_SAMPLES
-        if quality.error is not None
-        else max(quality.samples, 2 * per_batch)
-    )
-    while sums.count * per_batch < limit:
+    limit = max(quality.samples, 2 * per_batch)
+    if quality.error is not None:
+        limit = MAX_SAMPLES
+    sums = _Sums()
+    while sums.count * per_batch < limit and not sums.reached(quality.error):
         view = trace_view(
             surface, camera, samples=axis, scene=rays, rng=rng, pixels=pixels
         )
         sums.add(painter.batch(view, rng), view.coverage)
         if progress is not None:
             progress("render", min(sums.count * per_batch, limit), limit)
-        if (
-            quality.error is not None
-            and sums.count >= MIN_BATCHES
-            and sums.relative_error() <= quality.error
-        ):
-            break
     variance = sums.square / (sums.count * (sums.count - 1))
     return Rendering(
         np.asarray(sums.mean, np.float32),
@@ -207,7 +195,19 @@ class _Painter:
     lighting: Lighting
     quality: Quality
     lobes: DirectionSampler
-    choice: LightChoice | None  # without lights
+    choice: LightChoice | None  # None without lights
+
+    @classmethod
+    def of(
+        cls, surface: Surface, scene: RayScene, lighting: Lighting, quality: Quality
+    ) -> _Painter:
+        lights = lighting.lights
+        choice = None
+        if lights is not None and len(lights):
+            middle = surface.vertices[surface.known].mean(axis=0)
+            choice = LightChoice.of_lights(lights, middle)
+        lobes = surface.model.sampler()
+        return cls(surface, scene, lighting, quality, lobes, choice)
 
     def batch(self, view: View, rng: np.random.Generator) -> Image:
         """One independent estimate of the picture (h, w, 3)."""

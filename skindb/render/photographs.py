@@ -315,31 +315,21 @@ def compare_photographs(
         Rays per pixel and axis.
     """
     honour_consent(model.attrs, "export")
-    if "photographs" not in capture.children:
-        cure = "ingest the capture again with --photographs 4"
-        raise InputError(
-            Fault("capture", "must contain kept photographs", "none", cure)
-        )
-    photographs = capture["photographs"].to_dataset()
+    photographs = _kept_photographs(capture)
     dome = capture["dome"].to_dataset()
-    check(
-        photographs,
-        ("photograph_radiance", "photograph_light", "photograph_camera"),
-        where="photographs",
-    )
     surface = from_model(model)
     if subsurface:
         require_translucency(surface)
     scene = RayScene(surface.vertices, surface.faces)
     cameras = cameras_from_dome(dome)
     lights = lights_from_dome(dome)
-    dark, away = (_held_out(model, dim) for dim in ("light", "camera"))
+    unseen_lights, unseen_cameras = (_held_out(model, d) for d in ("light", "camera"))
     regions = _regions(capture)
     doubtful = 1 - surfel_confidence(model["fitted"].to_dataset()).astype(np.float64)
     results = []
-    for i in range(photographs.sizes["photograph"]):
-        at_light = int(photographs["photograph_light"][i])
-        at_camera = int(photographs["photograph_camera"][i])
+    for photograph in photographs:
+        at_light = int(photograph["photograph_light"])
+        at_camera = int(photograph["photograph_camera"])
         camera = cameras[at_camera]
         view = trace_view(surface, camera, samples=samples, scene=scene)
         lamp = lights.select(at_light)
@@ -347,49 +337,86 @@ def compare_photographs(
             view, surface, lamp, scene, subsurface=subsurface, terms=("diffuse",)
         )[0]
         gloss = shade_view(view, surface, lamp, scene, terms=("surface",))[0]
-        rendered = diffuse + gloss
-        photo = (
-            photographs["photograph_radiance"][i]
-            .values[: camera.height, : camera.width]
-            .astype(np.float32)
-        )
+        radiance = photograph["photograph_radiance"].values
+        photo = radiance[: camera.height, : camera.width].astype(np.float32)
         mask = (view.coverage >= MIN_COVERAGE) & np.isfinite(photo).all(axis=-1)
         if not mask.any():
             continue  # this camera sees no fitted surfel
         light = str(dome["light"].values[at_light])
         name = str(dome["camera"].values[at_camera])
-        error = compare_images(rendered, photo, mask=mask)
-        parts = _by_region(view, regions, rendered, photo, mask, error["exposure"])
-        doubt = view.image(view.interpolate(doubtful[:, None]))[..., 0]
-        causes = find_causes(
-            np.nan_to_num(photo), rendered, gloss, mask=mask, doubtful=doubt
-        )
-        unseen = light in dark or name in away
-        results.append(
-            Comparison(
-                light,
-                name,
-                unseen,
-                photo,
-                rendered,
-                mask,
-                error,
-                diffuse,
-                parts,
-                causes,
-            )
-        )
+        is_unseen = light in unseen_lights or name in unseen_cameras
+        taken = _Taken(photo, diffuse, gloss, mask)
+        results.append(taken.compared(light, name, is_unseen, view, regions, doubtful))
     if not results:
         rule = "at least one must show fitted surfels"
-        raise InputError(
-            Fault(
-                "photographs",
-                rule,
-                "none",
-                "ingest the capture again with more --photographs",
-            )
-        )
+        cure = "ingest the capture again with more --photographs"
+        raise InputError(Fault("photographs", rule, "none", cure))
     return results
+
+
+def _kept_photographs(capture: xr.DataTree) -> list[xr.Dataset]:
+    """The photographs of a capture, one by one.
+
+    Raises
+    ------
+    InputError
+        If ingest kept none.
+    """
+    if "photographs" not in capture.children:
+        rule = "must contain kept photographs"
+        cure = "ingest the capture again with --photographs 4"
+        raise InputError(Fault("capture", rule, "none", cure))
+    photographs = capture["photographs"].to_dataset()
+    needed = ("photograph_radiance", "photograph_light", "photograph_camera")
+    check(photographs, needed, where="photographs")
+    return [
+        photographs.isel(photograph=i) for i in range(photographs.sizes["photograph"])
+    ]
+
+
+@dataclass(frozen=True)
+class _Taken:
+    """A photograph (h, w, 3), both parts of its rendering, and the pixels compared."""
+
+    photo: NDArray[np.float32]
+    diffuse: NDArray[np.float32]
+    gloss: NDArray[np.float32]
+    mask: Mask
+
+    def compared(
+        self,
+        light: str,
+        camera: str,
+        is_unseen: bool,
+        view: View,
+        regions: dict[str, NDArray[np.float64]],
+        doubtful: NDArray[np.float64],
+    ) -> Comparison:
+        """Errors of the rendering, also by region, and their likely causes."""
+        rendered = self.diffuse + self.gloss
+        error = compare_images(rendered, self.photo, mask=self.mask)
+        by_region = _by_region(
+            view, regions, rendered, self.photo, self.mask, error["exposure"]
+        )
+        causes = find_causes(
+            np.nan_to_num(self.photo),
+            rendered,
+            self.gloss,
+            mask=self.mask,
+            doubtful=view.image(view.interpolate(doubtful[:, None]))[..., 0],
+        )
+        return Comparison(
+            light,
+            camera,
+            is_unseen,
+            self.photo,
+            rendered,
+            self.mask,
+            error,
+            self.diffuse,
+            by_region,
+            causes,
+        )
 
 
 def _regions(capture: xr.DataTree) -> dict[str, NDArray[np.float64]]:

@@ -234,17 +234,7 @@ def notable_lights(
         np.int64
     )
     light = _unshadowed(lights, surface, view, rows)
-    visible = np.stack(
-        [
-            ~scene.occluded(
-                view.position[rows],
-                lights.position[i : i + 1],
-                normal=view.normal[rows],
-            )
-            for i in range(len(lights))
-        ]
-    )
-    level = float(np.sqrt(np.mean((light * visible[..., None]).sum(axis=0) ** 2)))
+    level = _level(light, lights, view, scene, rows)
     dropped: list[int] = []
     total = np.zeros(light.shape[1:])
     entered = np.zeros((len(surface.vertices), 3))
@@ -274,6 +264,20 @@ def notable_lights(
             "pictures (root mean square)",
         ),
     )
+
+
+def _level(
+    light: Float, lights: Lights, view: View, scene: RayScene, rows: NDArray[np.int64]
+) -> float:
+    """Root mean square over chosen hits of the light (l, m, 3) that is not in shadow."""
+    position = view.position[rows]
+    normal = view.normal[rows]
+    visible = [
+        ~scene.occluded(position, lights.position[i : i + 1], normal=normal)
+        for i in range(len(lights))
+    ]
+    seen = (light * np.stack(visible)[..., None]).sum(axis=0)
+    return float(np.sqrt(np.mean(seen**2)))
 
 
 def _unshadowed(

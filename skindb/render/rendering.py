@@ -17,7 +17,7 @@ from skindb.errors import Fault, InputError
 from skindb.geometry.rays import RayScene
 from skindb.parameters import RenderParameters
 from skindb.render.image import auto_exposure, tone_map, write_exr, write_png
-from skindb.render.monte_carlo import Lighting, Quality, render_monte_carlo
+from skindb.render.monte_carlo import Lighting, Quality, Rendering, render_monte_carlo
 from skindb.render.plan import KEPT, RenderPlan, plan_render, plan_scene
 from skindb.render.scene import (
     Camera,
@@ -262,18 +262,17 @@ def render(
         subject does not consent to exports, or subsurface transport is requested and
         the model has no translucency.
     """
-    view: dict[str, Any] = {
-        "lights": lights,
-        "environment": environment,
-        "camera": camera,
-    }
-    options: dict[str, Any] = {
-        "scale": scale,
-        "spacing": spacing,
-        "error": error,
-        "terms": tuple(terms),
-    }
-    inputs = render_inputs(model, **view, **options, subsurface=subsurface)
+    inputs = render_inputs(
+        model,
+        lights,
+        environment,
+        camera,
+        subsurface=subsurface,
+        scale=scale,
+        spacing=spacing,
+        error=error,
+        terms=tuple(terms),
+    )
     quality = Quality(samples, error, subsurface, tuple(terms), tree_opening(error)[0])
     rendering = render_monte_carlo(
         inputs.surface,
@@ -285,26 +284,27 @@ def render(
         pixels=inputs.pixels,
         progress=progress,
     )
+    attrs = inputs.names | {
+        "samples": rendering.samples,
+        "relative_error": rendering.relative_error,
+        "seconds": rendering.seconds,
+        "skipped": [str(omission) for omission in inputs.omissions],
+    }
+    return _labelled(rendering).assign_attrs(attrs)
+
+
+def _labelled(rendering: Rendering) -> xr.Dataset:
+    """Radiance, variance and coverage with their dims and units."""
     space = ("image_row", "image_col")
-    attrs = {"units": UNITS, "long_name": "radiance, linear Rec. 709"}
+    colour = (*space, "channel")
+    named = {"units": UNITS, "long_name": "radiance, linear Rec. 709"}
     return xr.Dataset(
         {
-            "radiance": ((*space, "channel"), rendering.radiance, attrs),
-            "radiance_variance": (
-                (*space, "channel"),
-                rendering.variance,
-                {"units": f"{UNITS}2"},
-            ),
+            "radiance": (colour, rendering.radiance, named),
+            "radiance_variance": (colour, rendering.variance, {"units": f"{UNITS}2"}),
             "coverage": (space, rendering.coverage, {"units": "1"}),
         },
         coords={"channel": ["R", "G", "B"]},
-        attrs=inputs.names
-        | {
-            "samples": rendering.samples,
-            "relative_error": rendering.relative_error,
-            "seconds": rendering.seconds,
-            "skipped": [str(omission) for omission in inputs.omissions],
-        },
     )
 
 
@@ -325,27 +325,11 @@ def render_inputs(
     """
     honour_consent(model.attrs, "export")
     dome = model["dome"].to_dataset().load()
-    surroundings = (
-        environment
-        if isinstance(environment, Environment | None)
-        else Environment.read(environment)
-    )
-    names: dict[str, Any] = {}
-    if isinstance(lights, Lights):
-        lamps, names["lights"] = lights, [f"{len(lights)} given lights"]
-    elif surroundings is not None and not lights:
-        lamps, names["lights"] = NO_LIGHTS, []
-    else:
-        lamps, names["lights"] = chosen_lights(dome, lights)
+    lighting, names = _chosen_lighting(dome, lights, environment)
     if isinstance(camera, Camera):
         seen_by, names["camera"] = camera, "given"
     else:
         seen_by, names["camera"] = chosen_camera(dome, camera)
-    names["environment"] = (
-        ""
-        if surroundings is None
-        else str(environment if isinstance(environment, str | Path) else "given")
-    )
     surface = from_model(model, fill=True)
     if subsurface:
         require_translucency(surface)
@@ -355,7 +339,6 @@ def render_inputs(
         visible = trace_view(surface, sized, scene=scene).shown(len(surface.vertices))
         surface = subdivide_surface(surface, spacing, visible)
         scene = RayScene(surface.vertices, surface.faces)
-    lighting = Lighting(lamps if len(lamps) else None, surroundings)
     plan = plan_scene(
         surface, sized, lighting, scene, subsurface=subsurface, error=error, terms=terms
     )
@@ -369,6 +352,31 @@ def render_inputs(
         lighting,
         plan.omissions,
     )
+
+
+def _chosen_lighting(
+    dome: xr.Dataset,
+    lights: Sequence[str] | Lights,
+    environment: Environment | str | Path | None,
+) -> tuple[Lighting, dict[str, Any]]:
+    """Lights and environment, and their names; without both, all lights of the dome."""
+    if isinstance(environment, str | Path):
+        surroundings: Environment | None = Environment.read(environment)
+        name = str(environment)
+    else:
+        surroundings = environment
+        name = "given"
+    if isinstance(lights, Lights):
+        lamps, light_names = lights, [f"{len(lights)} given lights"]
+    elif surroundings is not None and not lights:
+        lamps, light_names = NO_LIGHTS, []
+    else:
+        lamps, light_names = chosen_lights(dome, lights)
+    names = {
+        "lights": light_names,
+        "environment": "" if surroundings is None else name,
+    }
+    return Lighting(lamps if len(lamps) else None, surroundings), names
 
 
 def render_picture(

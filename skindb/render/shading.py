@@ -350,15 +350,7 @@ def trace_view(
     hit = np.flatnonzero(face >= 0)
     corners = np.asarray(surface.faces)[face[hit]].astype(np.int64)
     weight = barycentric[hit]
-    normal = np.einsum("nk,nkc->nc", weight, surface.normals[corners])
-    position = np.einsum("nk,nkc->nc", weight, surface.vertices[corners])
-    with np.errstate(invalid="ignore"):
-        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-20)
-        towards = camera.centre - position
-        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-        facing = (np.einsum("nc,nc->n", normal, towards) > 0) & (
-            _facet_cosine(surface, corners, towards) > 0
-        )
+    position, normal, towards, facing = _facing_points(surface, camera, corners, weight)
     keep = facing & surface.known[corners].all(axis=1)
     pixel, ray = np.divmod(hit[keep], samples**2)
     return View(
@@ -372,6 +364,24 @@ def trace_view(
         normal[keep],
         towards[keep],
     )
+
+
+def _facing_points(
+    surface: Surface, camera: Camera, corners: NDArray[np.int64], weight: Float
+) -> tuple[Float, Float, Float, NDArray[np.bool_]]:
+    """Positions, unit normals and directions to the camera (n, 3) of hits, and whether
+    the surface and its shading normal face the camera.
+    """
+    normal = np.einsum("nk,nkc->nc", weight, surface.normals[corners])
+    position = np.einsum("nk,nkc->nc", weight, surface.vertices[corners])
+    with np.errstate(invalid="ignore"):
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-20)
+        towards = camera.centre - position
+        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+        facing = (np.einsum("nc,nc->n", normal, towards) > 0) & (
+            _facet_cosine(surface, corners, towards) > 0
+        )
+    return position, normal, towards, facing
 
 
 def shade_view(
