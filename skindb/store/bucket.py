@@ -30,7 +30,7 @@ from skindb.errors import Fault, InputError
 from skindb.files import make_private
 from skindb.limits import MAX_STORE_JSON_BYTES
 from skindb.store.folder import Folder
-from skindb.store.place import Guard, Place, UnavailableError, outside_fault
+from skindb.store.place import Guard, Place, UnavailableError, require_parts
 from skindb.store.s3 import (
     RETRY_TIMEOUT,
     BrokenAnswerError,
@@ -90,11 +90,7 @@ class Bucket:
         there is no cache.
         """
         base = cache_folder() or Path(tempfile.gettempdir()) / f"skindb-{os.getuid()}"
-        folder = (
-            base
-            / "buckets"
-            / hashlib.sha256(f"{endpoint()} {self.name}".encode()).hexdigest()[:24]
-        )
+        folder = base / "buckets" / self._address_digest()[:24]
         make_private(folder)
         status = folder.lstat()
         if (
@@ -113,9 +109,12 @@ class Bucket:
         folder = Path(
             os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share"
         )
-        digest = hashlib.sha256(f"{endpoint()} {self.name}".encode()).hexdigest()
         name = self.name.removeprefix("s3://").replace("/", "-")
-        return folder / "skindb" / f"{name}-{digest[:8]}.markers"
+        return folder / "skindb" / f"{name}-{self._address_digest()[:8]}.markers"
+
+    def _address_digest(self) -> str:
+        """Digest by which buckets of the same name at different servers differ."""
+        return hashlib.sha256(f"{endpoint()} {self.name}".encode()).hexdigest()
 
     def address(self) -> str:
         """URL by which another process finds the place."""
@@ -477,11 +476,7 @@ class Bucket:
 
     def _path(self, key: str) -> str:
         """The key; `InputError` if it leads outside the prefix."""
-        if any(
-            part in ("", ".", "..") or "\0" in part or "\\" in part
-            for part in key.split("/")
-        ):
-            raise InputError(outside_fault(self.name, key, "a path that leaves it"))
+        require_parts(self.name, key)
         return key
 
 

@@ -120,53 +120,47 @@ class _Evaluation:
             )
         match node:
             case ast.BoolOp(op=op, values=parts):
-                return _combined(
-                    [self.truth(part, depth + 1) for part in parts],
-                    decisive=isinstance(op, ast.Or),
-                )
+                rows = [self.truth(part, depth + 1) for part in parts]
+                return _combined(rows, decisive=isinstance(op, ast.Or))
             case ast.UnaryOp(op=ast.Not(), operand=operand):
-                return [
-                    None if value is None else not value
-                    for value in self.truth(operand, depth + 1)
-                ]
-            case ast.Compare(
-                left=left,
-                ops=[ast.Is() | ast.IsNot() as op],
-                comparators=[ast.Name(id="missing")],
-            ):
-                return [
-                    is_missing(value) == isinstance(op, ast.Is)
-                    for value in self.values(left)
-                ]
-            case ast.Compare(
-                left=left, ops=[ast.In() | ast.NotIn() as op], comparators=[right]
-            ):
-                return [
-                    value if value is None else value == isinstance(op, ast.In)
-                    for value in self.contained(left, right)
-                ]
-            case ast.Compare(left=left, ops=ops, comparators=comparators):
-                if not {*map(type, ops)} <= {*COMPARISONS}:
-                    rule = (
-                        "must use 'is' as in 'age is missing', and 'in' without other "
-                        "comparisons beside it"
-                    )
-                    raise self.fault(rule, "another use", EXAMPLE)
-                sides = [self.values(side) for side in (left, *comparators)]
-                links = [
-                    self.compared(op, *pair)
-                    for op, pair in zip(ops, pairwise(sides), strict=True)
-                ]
-                return _combined(links, decisive=False)
+                return _negated(self.truth(operand, depth + 1))
+            case ast.Compare():
+                return self.comparison(node)
             case ast.Name():
-                values = self.values(node)
-                if _kinds(values) - {TRUTH}:
-                    finding = f"{self.column(node.id)} alone"
-                    raise self.fault(
-                        "must compare a column of text or numbers", finding, EXAMPLE
-                    )
-                return [None if is_missing(value) else bool(value) for value in values]
+                return self.truth_of_column(node)
         raise self.refused(node)
+
+    def comparison(self, node: ast.Compare) -> Truth:
+        """Whether each row fulfils a comparison, such as ``20 < age <= 40``."""
+        match node.ops, node.comparators:
+            case [ast.Is() | ast.IsNot() as op], [ast.Name(id="missing")]:
+                missing = Truth(map(is_missing, self.values(node.left)))
+                return missing if isinstance(op, ast.Is) else _negated(missing)
+            case [ast.In() | ast.NotIn() as op], [right]:
+                contained = self.contained(node.left, right)
+                return contained if isinstance(op, ast.In) else _negated(contained)
+        if not {*map(type, node.ops)} <= {*COMPARISONS}:
+            rule = (
+                "must use 'is' as in 'age is missing', and 'in' without other "
+                "comparisons beside it"
+            )
+            raise self.fault(rule, "another use", EXAMPLE)
+        sides = [self.values(side) for side in (node.left, *node.comparators)]
+        links = [
+            self.compared(op, *pair)
+            for op, pair in zip(node.ops, pairwise(sides), strict=True)
+        ]
+        return _combined(links, decisive=False)
+
+    def truth_of_column(self, node: ast.Name) -> Truth:
+        """Values of a column of truth values."""
+        values = self.values(node)
+        if _kinds(values) - {TRUTH}:
+            finding = f"{self.column(node.id)} alone"
+            raise self.fault(
+                "must compare a column of text or numbers", finding, EXAMPLE
+            )
+        return [None if is_missing(value) else bool(value) for value in values]
 
     def values(self, node: ast.expr) -> Column:
         """Values of a column or of a literal for each row."""
@@ -340,6 +334,10 @@ def _compared(op: ast.cmpop, left: Any, right: Any) -> bool | None:
     if _kind(left) != _kind(right):  # in a column of text and numbers
         return isinstance(op, ast.NotEq)
     return bool(COMPARISONS[type(op)](left, right))
+
+
+def _negated(truth: Truth) -> Truth:
+    return [None if value is None else not value for value in truth]
 
 
 def _combined(parts: Sequence[Truth], *, decisive: bool) -> Truth:

@@ -30,7 +30,7 @@ TYPES = ((stat.S_ISDIR, "folder"), (stat.S_ISREG, "file"), (stat.S_ISLNK, "link"
 
 
 class Folder:
-    """A folder; see `place.Place`, and `paths.inside` for its keys.
+    """A folder; see `place.Place`, and `place.inside` for its keys.
 
     Parameters
     ----------

@@ -78,6 +78,12 @@ LOCKS = {
     RESTORING: ("a restore that is not complete", "run skindb restore again"),
     BACKUP: ("a backup", "run skindb restore, which makes a database of it"),
 }
+MARKER_FILE_FORMAT = 1
+MARKER_FILE_LINE = "line"  # the key in the seals of lines
+CURE_MARKER_FILE = (
+    "give the right file; or rename this one, and the next withdrawal, consent or "
+    "backup writes a new one"
+)
 
 
 class WithdrawnError(InputError):
@@ -370,14 +376,6 @@ def _read_entry(place: Place, secret: bytes, key: str) -> dict[str, Any]:
         return body
 
 
-FORMAT = 1
-LINE = "line"  # the key in the seals of lines
-CURE = (
-    "give the right file; or rename this one, and the next withdrawal, consent or "
-    "backup writes a new one"
-)
-
-
 class MarkerFileWarning(SkindbWarning):
     """A withdrawal or consent could not be noted outside the database."""
 
@@ -407,9 +405,9 @@ def _notes_from(content: bytes, location: str, secret: bytes) -> Notes:
     for number, line in enumerate(content.removesuffix(b"\n").split(b"\n"), 1):
         try:
             body = json_object(line)
-            if not is_sealed(secret, LINE, body):
+            if not is_sealed(secret, MARKER_FILE_LINE, body):
                 raise ValueError("a line that is damaged, or of another database")
-            if number == 1 and body.get("format") != FORMAT:
+            if number == 1 and body.get("format") != MARKER_FILE_FORMAT:
                 raise ValueError("a first line of another format")
             _add_line(notes, body)
         except (ValueError, TypeError, KeyError, RecursionError) as error:
@@ -417,7 +415,7 @@ def _notes_from(content: bytes, location: str, secret: bytes) -> Notes:
                 f"{location}, line {number}",
                 "a marker file must be as it was written",
                 str(error),
-                CURE,
+                CURE_MARKER_FILE,
             )
             raise InputError(fault) from None
     return notes
@@ -508,9 +506,11 @@ def _add_lines(
             # without a line whose writer was killed
             complete = content[: content.rfind(b"\n") + 1]
             notes = _notes_from(complete, str(path), secret) if complete else Notes()
-            bodies = ([] if complete else [{"format": FORMAT}]) + missing(notes, secret)
+            bodies = ([] if complete else [{"format": MARKER_FILE_FORMAT}]) + missing(
+                notes, secret
+            )
             lines = [
-                json.dumps({**body, "seal": keyed_seal(secret, LINE, body)})
+                json.dumps({**body, "seal": keyed_seal(secret, MARKER_FILE_LINE, body)})
                 for body in bodies
             ]
             _append(

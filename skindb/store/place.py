@@ -36,6 +36,7 @@ TRANSIENT = ("first",)
 # kind -> kind of the lease under which it is written, if it differs
 LEASE_KINDS = {"first": "model"}
 VERSION = rf"data/{KIND}/{TAKE}/{TIME_HEX}\.zarr"
+Guard = Callable[[], None]  # raises if a file must not be written any more
 
 
 def subject_of(take: str) -> str:
@@ -54,6 +55,14 @@ def require_text(value: str, pattern: str, label: str) -> str:
     return value
 
 
+def require_parts(root: Path | str, key: str) -> list[str]:
+    """Names along a key; `InputError` if it leads outside the database at `root`."""
+    parts = key.split("/")
+    if any(part in ("", ".", "..") or "\0" in part or "\\" in part for part in parts):
+        raise InputError(_outside_fault(root, key, "a path that leaves it"))
+    return parts
+
+
 def inside(root: Path, key: str) -> Path:
     """The path of a key below `root`.
 
@@ -69,9 +78,7 @@ def inside(root: Path, key: str) -> Path:
     InputError
         If the key is empty or absolute, contains "..", or passes through a symbolic link.
     """
-    parts = key.split("/")
-    if any(part in ("", ".", "..") or "\0" in part or "\\" in part for part in parts):
-        raise InputError(outside_fault(root, key, "a path that leaves it"))
+    parts = require_parts(root, key)
     # as text: `Path` takes four times as long, and a table of 1,000 takes needs 16,000
     # paths
     place = os.fspath(root)
@@ -79,15 +86,14 @@ def inside(root: Path, key: str) -> Path:
         place = f"{place}/{part}"
         if os.path.islink(place):  # noqa: PTH114
             raise InputError(
-                outside_fault(
+                _outside_fault(
                     root, key, f"a symbolic link at {'/'.join(parts[:number])}"
                 )
             )
     return Path(place)
 
 
-def outside_fault(root: Path | str, key: str, finding: str) -> Fault:
-    """Fault for a key that leads outside the database."""
+def _outside_fault(root: Path | str, key: str, finding: str) -> Fault:
     cure = "restore the file that names this path from a backup"
     return Fault(
         f"{root}: {key[:200]!r}",
@@ -95,9 +101,6 @@ def outside_fault(root: Path | str, key: str, finding: str) -> Fault:
         finding,
         cure,
     )
-
-
-Guard = Callable[[], None]  # raises if a file must not be written any more
 
 
 class UnavailableError(InputError):

@@ -30,6 +30,27 @@ from skindb.store.place import (
 T = TypeVar("T")
 # what reading or parsing a damaged file raises
 DAMAGE = (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError)
+FORMAT = 3
+FIELDS = {
+    "format",
+    "kind",
+    "take",
+    "generation",
+    "path",
+    "created",
+    "bytes",
+    "provenance",
+    "names",
+    "admissions",
+    "manifest",
+    "tables",
+    "contents",
+    "previous",
+}
+DIGEST = re.compile("[0-9a-f]{64}")
+AS_RECORDED = "the record must agree with the attributes of its version"
+Test = Callable[[object], bool]
+MAX_COUNT = 1 << 53  # number of bytes, or of elements along a dim
 
 
 def seal_of(body: Mapping[str, Any]) -> str:
@@ -98,29 +119,6 @@ def collect_faults(read: Callable[[], T], faults: list[Fault]) -> T | None:
     except InputError as error:
         faults.extend(error.faults)
         return None
-
-
-FORMAT = 3
-FIELDS = {
-    "format",
-    "kind",
-    "take",
-    "generation",
-    "path",
-    "created",
-    "bytes",
-    "provenance",
-    "names",
-    "admissions",
-    "manifest",
-    "tables",
-    "contents",
-    "previous",
-}
-DIGEST = re.compile("[0-9a-f]{64}")
-AS_RECORDED = "the record must agree with the attributes of its version"
-Test = Callable[[object], bool]
-MAX_COUNT = 1 << 53  # number of bytes, or of elements along a dim
 
 
 class LaterError(ValueError):

@@ -39,6 +39,39 @@ from skindb.store.record import Record, intact_or_none, sealed, sealed_object
 PINNED = ("capture", "model", "registration")
 # (kind, take) -> reference to the version in the provenance
 Pins = Mapping[tuple[str, str], Mapping[str, Any]]
+CATALOGUE = "catalogue.json"
+CACHE_FORMAT = 3
+# threads that read records; a bucket takes some 20 ms per record, whatever its size
+READER_THREADS = 32
+# parts of a provenance that the catalogue shows or uses
+CACHED_PARTS = (
+    "schema_version",
+    "subject",
+    "condition",
+    "session",
+    "traits",
+    "parameters",
+    "dictionary",
+    "dictionary_digest",
+    "status",
+    "consent_scope",
+)
+# not registrations, which name every take: those of 1,000 takes have a million inputs
+KINDS_WITH_INPUTS = ("model",)
+# kinds whose cached records contain all that `Staleness` needs
+CACHED_KINDS = ("capture", *KINDS_WITH_INPUTS, CONSENT)
+# cached fields of a record
+CACHED_FIELDS = (
+    "kind",
+    "take",
+    "generation",
+    "path",
+    "created",
+    "bytes",
+    "admissions",
+    "seal",
+)
+Key = tuple[str, str, int]
 
 
 class Records(Protocol):
@@ -314,41 +347,6 @@ def pinned_record(records: Records, pins: Pins, kind: str, take: str) -> Record:
     return record
 
 
-CATALOGUE = "catalogue.json"
-FORMAT = 3
-# threads that read records; a bucket takes some 20 ms per record, whatever its size
-READER_THREADS = 32
-# parts of a provenance that the catalogue shows or uses
-CACHED_PARTS = (
-    "schema_version",
-    "subject",
-    "condition",
-    "session",
-    "traits",
-    "parameters",
-    "dictionary",
-    "dictionary_digest",
-    "status",
-    "consent_scope",
-)
-# not registrations, which name every take: those of 1,000 takes have a million inputs
-KINDS_WITH_INPUTS = ("model",)
-# kinds whose cached records contain all that `Staleness` needs
-CACHED_KINDS = ("capture", *KINDS_WITH_INPUTS, CONSENT)
-# cached fields of a record
-CACHED_FIELDS = (
-    "kind",
-    "take",
-    "generation",
-    "path",
-    "created",
-    "bytes",
-    "admissions",
-    "seal",
-)
-Key = tuple[str, str, int]
-
-
 @dataclass(frozen=True)
 class Entry:
     """A record that was read and checked, with the identities of its files."""
@@ -467,7 +465,7 @@ class RecordCache:
             entry.record.names: number for number, entry in enumerate(rows)
         }  # takes registered together share them
         body: dict[str, Any] = {
-            "format": FORMAT,
+            "format": CACHE_FORMAT,
             "names": {str(number): those for those, number in names.items()},
         }
         body["records"] = [_row(entry, names) for entry in rows]
@@ -576,7 +574,7 @@ def _load_entries(place: Place) -> dict[Key, Entry] | None:
 
     def read() -> dict[Key, Entry] | None:
         body = sealed_object(place.read_small(CATALOGUE))
-        if body["format"] != FORMAT:
+        if body["format"] != CACHE_FORMAT:
             return None
         names = {number: tuple(takes) for number, takes in body["names"].items()}
         entries = {}

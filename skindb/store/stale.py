@@ -54,6 +54,13 @@ DERIVED = ("model", "registration", STUDY, "edit")
 KINDS_OF_MANY_SUBJECTS = ("registration", STUDY, "edit")
 CURE = "run: skindb refresh DB"
 CURE_DAMAGE = "restore the damaged records from a backup"
+REQUESTS = "requests"
+REQUEST_NAME = r"[0-9a-f]{64}\.json"
+# parameters that name takes: those that a result is limited to, one of a registration,
+# and the versions of a release
+TAKES = "takes"
+REFERENCE = "reference"
+PINS = "pins"
 
 
 class StaleWarning(SkindbWarning):
@@ -231,15 +238,6 @@ def stale_versions(db: Located) -> list[tuple[Record, tuple[Reason, ...]]]:
 
 def _is_of_release(record: Record) -> bool:
     return bool(record.provenance.get("parameters", {}).get("release"))
-
-
-REQUESTS = "requests"
-REQUEST_NAME = r"[0-9a-f]{64}\.json"
-# parameters that name takes: those that a result is limited to, one of a registration,
-# and the versions of a release
-TAKES = "takes"
-REFERENCE = "reference"
-PINS = "pins"
 
 
 @dataclass(frozen=True)
