@@ -12,7 +12,7 @@ import skindb
 from skindb.store import Database
 from skindb.store.folder import Folder
 from skindb.store.markers import subject_hash
-from skindb.workflow import audit, viewing
+from skindb.workflow import audit, pictures
 
 pytestmark = pytest.mark.slow
 
@@ -86,7 +86,7 @@ NOT_LOGGED = [
 def called(fitted_database, tmp_path, monkeypatch):
     """Function that calls a command, and returns its result and the new entries."""
     # the lights of these takes have no intensities, which a page needs
-    monkeypatch.setattr(viewing, "_faces", lambda *_, **__: iter(()))
+    monkeypatch.setattr(pictures, "_faces", lambda *_, **__: iter(()))
     out = tmp_path / "out"
     out.mkdir()
 

@@ -2,21 +2,25 @@ import typing
 
 from .administration import (
     Refreshed,
+    Withdrawal,
     backup,
     backup_states,
     clean,
     create_release,
+    erasure_report,
+    plan_withdrawal,
     record_consent,
     restore,
     stale_results,
     superseded_calibrations,
     superseded_lines,
+    withdraw,
+    write_erasure_report,
 )
 from .audit import NotLoggedWarning, acting_as, logged_action
-from .calibration import calibrate, describe_calibration
-from .cluster import computing_on, connected, dashboard_link
+from .captures import calibrate, captured_subjects, describe_calibration, ingest_take
+from .cohorts import register_takes, registered_datasets, summarise
 from .edits import basis_grid, edit, edit_grid
-from .executor import Outcome
 from .fit import (
     dictionary_at,
     fit_take,
@@ -26,34 +30,30 @@ from .fit import (
     takes_to_fit,
     takes_without_consent,
 )
-from .ingest import captured_subjects, ingest_take
 from .pictures import (
     compare_take,
+    explain_view,
     export_take,
+    landmark_page,
     render_take,
     show_take,
     translucency_grid,
-)
-from .registration import register_takes, registered_datasets
-from .session import capture_session, plan_session
-from .simulation import begin_cohort, simulate, simulate_one
-from .studies import STUDY_FUNCTIONS, study
-from .summaries import summarise
-from .takes import faults_of, map_takes, results_of
-from .upkeep import refresh, repeat_requests
-from .viewing import (
-    explain_view,
-    landmark_page,
     view_server,
     view_takes,
 )
-from .withdrawal import (
-    Withdrawal,
-    erasure_report,
-    plan_withdrawal,
-    withdraw,
-    write_erasure_report,
+from .session import capture_session, plan_session
+from .simulation import begin_cohort, simulate, simulate_one
+from .studies import STUDY_FUNCTIONS, study
+from .takes import (
+    Outcome,
+    computing_on,
+    connected,
+    dashboard_link,
+    faults_of,
+    map_takes,
+    results_of,
 )
+from .upkeep import refresh, repeat_requests
 
 __all__ = [
     "STUDY_FUNCTIONS",

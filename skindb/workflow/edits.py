@@ -23,11 +23,11 @@ from skindb.render.rendering import frontal_camera, radiance_of
 from skindb.schema.consent import require_consent
 from skindb.store import STUDY, Database, require_fresh
 from skindb.types import Progress, silent
-from skindb.workflow import study_inputs
+from skindb.workflow import studies
 from skindb.workflow.audit import logged
+from skindb.workflow.cohorts import current_registrations, registered_datasets
 from skindb.workflow.derive import Derivation, derive
 from skindb.workflow.fit import dictionary_at
-from skindb.workflow.registration import current_registrations, registered_datasets
 
 GRID_SIDE = 320.0  # pixels, the longer side of a picture in a grid
 METHOD = (apply_traits, common_maps)  # functions that compute an edit
@@ -210,7 +210,7 @@ def basis_grid(
     require_consent({**model.attrs, "take": take}, "export")
     require_mixture(model["fitted"].to_dataset(), f"model of {take}")
     names = [str(name) for name in model["fitted"].to_dataset()["dictionary"].values]
-    tables = study_inputs.dictionary_tables(
+    tables = studies.dictionary_tables(
         names, float(model["basis/disc_angular_radius"]), dictionary
     )
     cohort = db.cohort("surfels", takes=[take], surfels=SAMPLED)
@@ -287,7 +287,7 @@ def editable_model(
         vectors[name].to_dataset().compute()
         for name in ("traits", "population_basis", "albedo")
     )
-    tables = study_inputs.dictionary_tables(
+    tables = studies.dictionary_tables(
         brdfs, float(model["basis/disc_angular_radius"]), dictionary
     )
 

@@ -20,8 +20,8 @@ from skindb.store import Database, Lease, Record
 from skindb.threads import one_blas_thread
 from skindb.types import Progress
 from skindb.workflow.audit import logged
+from skindb.workflow.cohorts import model_with_summary, summary_parameters
 from skindb.workflow.derive import FIRST_PASS, Derivation, groups_of
-from skindb.workflow.summaries import model_with_summary, summary_parameters
 
 METHOD = (first_pass, second_pass)  # functions that compute a model
 

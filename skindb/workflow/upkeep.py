@@ -26,12 +26,11 @@ from skindb.workflow.administration import (
     stale_results,
 )
 from skindb.workflow.audit import logged
-from skindb.workflow.cluster import computing_on
+from skindb.workflow.cohorts import register_takes
 from skindb.workflow.edits import edit
 from skindb.workflow.fit import fit_with
-from skindb.workflow.registration import register_takes
 from skindb.workflow.studies import study
-from skindb.workflow.takes import map_takes
+from skindb.workflow.takes import computing_on, map_takes
 
 if TYPE_CHECKING:
     from distributed import Client

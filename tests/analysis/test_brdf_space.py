@@ -29,7 +29,7 @@ from skindb.optics.angles import half_difference
 from skindb.reflectance.tables import brdf_metric, lookup
 from skindb.schema import check, dataset
 from skindb.store import Database
-from skindb.workflow import study_inputs
+from skindb.workflow import studies
 from skindb.workflow.upkeep import repeat_study
 
 GLOSS = np.array([0.05, 0.0, 0.0])
@@ -324,7 +324,7 @@ def test_surface__is_stored_and_repeated(tmp_path, monkeypatch):
     """
     asked = []
     monkeypatch.setattr(
-        study_inputs,
+        studies,
         "dictionary_tables",
         lambda *given: asked.append(given[2]) or TABLES,
     )  # 8 of the 59 materials
@@ -366,7 +366,7 @@ def test_surface__is_stored_and_repeated(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_surface__refuses_a_take_without_fitted_surfels(tmp_path, monkeypatch):
-    monkeypatch.setattr(study_inputs, "dictionary_tables", lambda *_: TABLES)
+    monkeypatch.setattr(studies, "dictionary_tables", lambda *_: TABLES)
     models = dict(list(_people().items())[:4])
     fitted = models["P3"]["fitted"].to_dataset()
     fitted["dictionary_weight"][:] = np.nan

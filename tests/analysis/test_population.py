@@ -38,7 +38,7 @@ from skindb.reflectance.tables import brdf_metric, lookup
 from skindb.schema import dataset
 from skindb.schema.cohort import Part, combine
 from skindb.store import Database, StaleWarning
-from skindb.workflow import study_inputs
+from skindb.workflow import studies
 
 
 def test_population_basis__spans_the_planted_one():
@@ -489,7 +489,7 @@ def test_traits__the_basis_of_one_person_in_two_conditions_by_its_brdfs(
     tmp_path, monkeypatch
 ):
     # 8 of the 59
-    monkeypatch.setattr(study_inputs, "dictionary_tables", lambda *_: TABLES)
+    monkeypatch.setattr(studies, "dictionary_tables", lambda *_: TABLES)
     tree = workflow.traits(
         _stored(tmp_path), takes=["A", "A.lotion"], k=3, in_metric=True
     )
@@ -504,7 +504,7 @@ def test_traits__the_basis_of_one_person_in_two_conditions_by_its_brdfs(
 @pytest.mark.slow
 def test_edit__is_stored_with_its_report(tmp_path, monkeypatch):
     # 8 of the 59
-    monkeypatch.setattr(study_inputs, "dictionary_tables", lambda *_: TABLES)
+    monkeypatch.setattr(studies, "dictionary_tables", lambda *_: TABLES)
     db = _stored(tmp_path)
     workflow.traits(db, k=3)
     tree = workflow.edit(db, "B", {"lotion": 0.5})
@@ -530,7 +530,7 @@ def test_edit__is_stored_with_its_report(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_edit__warns_of_a_study_that_is_out_of_date(tmp_path, monkeypatch):
     # 8 of the 59
-    monkeypatch.setattr(study_inputs, "dictionary_tables", lambda *_: TABLES)
+    monkeypatch.setattr(studies, "dictionary_tables", lambda *_: TABLES)
     db = _stored(tmp_path)
     workflow.traits(db, k=3)
     model = _population()["C"]

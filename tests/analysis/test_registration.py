@@ -45,7 +45,7 @@ from skindb.analysis.summary import cohort_of
 from skindb.errors import InputError
 from skindb.geometry.atlas import signed_areas
 from skindb.schema.cohort import Held, combine
-from skindb.workflow.summaries import registered_parts
+from skindb.workflow.cohorts import registered_parts
 
 
 def test_register__brings_back_a_planted_warp():

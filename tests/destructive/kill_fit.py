@@ -47,8 +47,8 @@ from skindb.ingest import spool
 from skindb.jit import reported_compilation
 from skindb.store import Database
 from skindb.store.stage import Stage
+from skindb.workflow import captures as ingest_module
 from skindb.workflow import fit as fit_module
-from skindb.workflow import ingest as ingest_module
 from skindb.workflow.derive import groups_of
 
 FIT = (

@@ -47,7 +47,7 @@ import skindb
 from skindb import workflow
 from skindb.errors import InputError
 from skindb.store import Database
-from skindb.workflow import study_inputs
+from skindb.workflow import studies
 
 SUBJECT = "Xqz7"
 LEASE_S = 1.0  # so that the lease of a suspended writer expires soon
@@ -364,7 +364,7 @@ def main() -> None:
         "--bucket", action="store_true", help="In a bucket of a server on this machine."
     )
     args = parser.parse_args()
-    study_inputs.dictionary_tables = lambda *_: TABLES  # 8 of the 59
+    studies.dictionary_tables = lambda *_: TABLES  # 8 of the 59
     Database.lease = partial_lease(Database.lease)
     draw = random.Random(args.seed)
     counts = Counter[str]()

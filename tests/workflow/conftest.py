@@ -7,7 +7,7 @@ import shutil
 import pytest
 
 from skindb.analysis import texture
-from skindb.workflow import code_digest
+from skindb.workflow import derive, takes
 
 TEXELS = 128  # along each side; the least for pyramids of 7 levels
 
@@ -22,14 +22,13 @@ def small_textures(monkeypatch):
 def change_code(tmp_path, monkeypatch):
     """Function that changes a file in the copy of skindb whose digests are computed."""
     copy = tmp_path / "changed" / "skindb"
-    shutil.copytree(
-        code_digest.ROOT, copy, ignore=shutil.ignore_patterns("__pycache__")
-    )
+    shutil.copytree(derive.ROOT, copy, ignore=shutil.ignore_patterns("__pycache__"))
 
     def change(name, old, new):
         text = (copy / name).read_text()
         assert old in text
         (copy / name).write_text(text.replace(old, new))
-        monkeypatch.setattr(code_digest, "ROOT", copy)
+        for module in (derive, takes):
+            monkeypatch.setattr(module, "ROOT", copy)
 
     return change

@@ -231,7 +231,7 @@ def test_ingest__uses_the_calibrated_cameras(linear_setup, pristine, tmp_path):
     assert result.exit_code == 0
     assert "colour of 2 cameras: CIEDE2000" in result.output
     capture = skindb.ingest.read_capture(folder)
-    used = workflow.calibration.calibrated_capture(db, capture)
+    used = workflow.captures.calibrated_capture(db, capture)
     np.testing.assert_allclose(used.dome.cameras[0].vignette[0], VIGNETTE[0], atol=0.05)
     assert used.dome.cameras[1].sensor.electrons_per_dn == pytest.approx(
         FULL / (WHITE - BLACK), rel=0.05

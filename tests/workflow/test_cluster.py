@@ -20,8 +20,7 @@ from waiting import wait_until
 
 from skindb.errors import InputError
 from skindb.workflow import connected, map_takes
-from skindb.workflow.cluster import Expected, shared_token
-from skindb.workflow.code_digest import package_digest
+from skindb.workflow.takes import Expected, package_digest, shared_token
 
 pytestmark = pytest.mark.slow
 
@@ -155,15 +154,15 @@ def test_map_takes__takes_behind_a_long_one_go_to_another_worker(
 
 
 def _wait_briefly() -> None:
-    import skindb.workflow.cluster
+    import skindb.workflow.takes
 
-    skindb.workflow.cluster.WAIT_SECONDS = 0.2
+    skindb.workflow.takes.WAIT_SECONDS = 0.2
 
 
 def test_map_takes__workers_with_another_skindb_end_the_run(address, monkeypatch):
     with connected(address) as client:
         monkeypatch.setattr(
-            "skindb.workflow.cluster.package_digest", lambda: "of other files"
+            "skindb.workflow.takes.package_digest", lambda: "of other files"
         )
         with pytest.raises(
             InputError,
@@ -210,7 +209,7 @@ def test_map_takes__workers_see_the_shared_folder_while_they_work(address, tmp_p
 )
 @pytest.mark.usefixtures("distributed")
 def test_connected__what_is_no_scheduler_is_one_line(where, tmp_path, monkeypatch):
-    monkeypatch.setattr("skindb.workflow.cluster.CONNECT_SECONDS", 1)
+    monkeypatch.setattr("skindb.workflow.takes.CONNECT_SECONDS", 1)
     # it accepts the connection, and does not answer
     with socket.create_server(("127.0.0.1", 0)) as server:
         text = where.format(tmp=tmp_path).replace(

@@ -11,8 +11,9 @@ import pytest
 
 import skindb
 from skindb.fit.model import second_pass
-from skindb.workflow import code_digest as module
-from skindb.workflow.code_digest import code_digest, code_symbols, package_digest
+from skindb.workflow import derive as module
+from skindb.workflow.derive import code_digest, code_symbols
+from skindb.workflow.takes import package_digest
 
 FILES = {
     "__init__.py": '''

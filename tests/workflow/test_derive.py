@@ -10,10 +10,9 @@ import xarray as xr
 
 from skindb.schema import dataset
 from skindb.store import Database
-from skindb.workflow import edits, fit, registration, summaries
-from skindb.workflow.code_digest import code_digest
-from skindb.workflow.derive import Derivation, derive
-from skindb.workflow.summaries import summary_parameters
+from skindb.workflow import cohorts, edits, fit
+from skindb.workflow.cohorts import summary_parameters
+from skindb.workflow.derive import Derivation, code_digest, derive
 
 NNLS = ("numerics/_nnls_kernels.py", "MIN_PIVOT = 1e-11", "MIN_PIVOT = 1e-12")
 TEXTURE = ("geometry/_texture_kernels.py", "0.0", "-0.0")
@@ -40,7 +39,7 @@ def db(tmp_path):
 def _derived(db, calls, **changed):
     options = {
         "inputs": [db.record("model", take) for take in ("A", "B")],
-        "code": registration.METHOD,
+        "code": cohorts.REGISTRATION_METHOD,
         "parameters": {"reference": ""},
         "names": ["A", "B"],
     }
@@ -85,8 +84,8 @@ def test_derive__computes_again_after_a_change(db, change_code, change):
     ("method", "change"),
     [
         (fit.METHOD, NNLS),
-        (summaries.METHOD, TEXTURE),
-        (registration.METHOD, TEXTURE),
+        (cohorts.SUMMARY_METHOD, TEXTURE),
+        (cohorts.REGISTRATION_METHOD, TEXTURE),
         (edits.METHOD, NNLS),
         (edits.METHOD, TEXTURE),
     ],
@@ -99,7 +98,7 @@ def test_method__depends_on_the_kernels_that_it_uses(method, change, change_code
 
 def test_derivation__describes_only_what_was_derived_alike(db):
     models = [db.record("model", "A")]
-    options = {"inputs": models, "code": registration.METHOD, "names": ["A"]}
+    options = {"inputs": models, "code": cohorts.REGISTRATION_METHOD, "names": ["A"]}
     derivation = Derivation.of(db, "registration", "A", **options, parameters={"k": 1})
     assert derivation.current() is None
     record = derivation.commit(_version([]))

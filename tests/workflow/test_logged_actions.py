@@ -261,7 +261,7 @@ def test_withdraw__is_logged_before_anything_is_removed(db, monkeypatch):
 
 
 def test_view_server__is_logged_when_it_is_made(db, monkeypatch):
-    monkeypatch.setattr(workflow.viewing, "_faces", lambda *_, **__: iter(()))
+    monkeypatch.setattr(workflow.pictures, "_faces", lambda *_, **__: iter(()))
     with pytest.raises(ValueError, match="zip"):
         workflow.view_server(db, ["S01"])
     assert _actions(db) == [("view", 1)]

@@ -15,7 +15,7 @@ from skindb.analysis import describe_study, tabulate_study
 from skindb.analysis.studies import STUDIES
 from skindb.cli import cli
 from skindb.store import Database
-from skindb.workflow.study_inputs import open_population
+from skindb.workflow.studies import open_population
 from skindb.workflow.upkeep import repeat_study
 
 pytestmark = pytest.mark.slow

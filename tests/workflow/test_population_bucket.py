@@ -12,7 +12,7 @@ from skindb import workflow
 from skindb.cli import cli
 from skindb.errors import InputError
 from skindb.store import stale_versions
-from skindb.workflow import study_inputs
+from skindb.workflow import studies
 
 WORD = "marker-of-nobody"  # planted in the attributes of the subject
 
@@ -21,7 +21,7 @@ WORD = "marker-of-nobody"  # planted in the attributes of the subject
 def db(bucket, monkeypatch):
     """Takes A, A.lotion, B, C in a bucket."""
     # 8 of the 59
-    monkeypatch.setattr(study_inputs, "dictionary_tables", lambda *_: TABLES)
+    monkeypatch.setattr(studies, "dictionary_tables", lambda *_: TABLES)
     db = skindb.open(bucket)
     for take, model in population().items():
         with db.stage("model", take) as stage:

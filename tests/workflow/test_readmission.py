@@ -89,7 +89,7 @@ def test_ingest__that_was_killed_after_the_new_consent_continues_by_the_same_cal
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr("skindb.workflow.ingest.scratch_name", die)
+        patch.setattr("skindb.workflow.captures.scratch_name", die)
         with pytest.raises(KeyboardInterrupt):
             workflow.ingest_take(db, folder, new_consent=date.today(), **OPTIONS)
     assert db.takes() == []

@@ -14,7 +14,7 @@ from planted_population import TABLES, population
 from skindb import workflow
 from skindb.errors import InputError
 from skindb.store import Database, StaleWarning, require_fresh, stale_versions
-from skindb.workflow import edits, study_inputs
+from skindb.workflow import edits, studies
 
 pytestmark = pytest.mark.slow
 
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.slow
 def _tables():
     with pytest.MonkeyPatch.context() as patch:
         # 8 of the 59
-        patch.setattr(study_inputs, "dictionary_tables", lambda *_: TABLES)
+        patch.setattr(studies, "dictionary_tables", lambda *_: TABLES)
         yield
 
 

@@ -9,14 +9,14 @@ from planted_population import TABLES, population
 
 from skindb import workflow
 from skindb.store import Database
-from skindb.workflow import studies, study_inputs
+from skindb.workflow import studies
 
 
 @pytest.fixture(scope="module", autouse=True)
 def _tables():
     with pytest.MonkeyPatch.context() as patch:
         # 8 of the 59
-        patch.setattr(study_inputs, "dictionary_tables", lambda *_: TABLES)
+        patch.setattr(studies, "dictionary_tables", lambda *_: TABLES)
         yield
 
 
@@ -56,7 +56,7 @@ def _studies(db):
 @pytest.mark.slow
 def test_made__nothing_changed(db, monkeypatch):
     monkeypatch.setattr(
-        study_inputs, "dictionary_tables", lambda *_: pytest.fail("computed again")
+        studies, "dictionary_tables", lambda *_: pytest.fail("computed again")
     )
     assert _studies(db) == [1, 1]
 
@@ -80,7 +80,7 @@ def test_made__computed_again_after(db, change_code, change):
         db.record_consent(model.attrs["subject"], scope=["fit"])
     else:
         change_code(
-            "workflow/study_inputs.py",
+            "workflow/studies.py",
             "mixed_fits=bool(takes)",
             "mixed_fits=takes != ()",
         )

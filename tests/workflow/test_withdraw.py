@@ -27,7 +27,7 @@ from skindb.errors import InputError
 from skindb.store import Database, WithdrawnError, seal_of, stale_versions
 from skindb.store.bucket import Bucket
 from skindb.store.log import Log
-from skindb.workflow import study_inputs
+from skindb.workflow import studies
 
 MARKER = np.float32(0.12345679)  # planted in the data of the subject
 WORD = "marker-of-nobody"  # planted in its attributes
@@ -40,7 +40,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("small_textures")]
 def _tables():
     with pytest.MonkeyPatch.context() as patch:
         # 8 of the 59
-        patch.setattr(study_inputs, "dictionary_tables", lambda *_: TABLES)
+        patch.setattr(studies, "dictionary_tables", lambda *_: TABLES)
         yield
 
 
@@ -446,7 +446,7 @@ def test_withdraw__a_release_is_revised_again_with_the_new_registrations(
         raise MemoryError
 
     with monkeypatch.context() as patch:
-        patch.setattr("skindb.workflow.registration.common_frame", fail)
+        patch.setattr("skindb.workflow.cohorts.common_frame", fail)
         outcomes = _outcomes(workflow.withdraw(db, "A"))
     assert all(outcomes.values())
     assert (

@@ -22,7 +22,7 @@ from skindb.cli import cli
 from skindb.errors import InputError
 from skindb.schema.notes import note, note_lines
 from skindb.store import Database
-from skindb.workflow.registration import (
+from skindb.workflow.cohorts import (
     current_registrations,
     registered_datasets,
     takes_with_landmarks,
