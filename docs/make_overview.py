@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 import skindb
-from skindb.demo.pictures import map_pictures
+from skindb.demo.page import map_pictures
 from skindb.geometry.atlas import stretches
 from skindb.render.figures import trace_front
 from skindb.render.image import write_png

@@ -1,5 +1,5 @@
-"""A self-contained HTML page with pictures, plots and tables, which can be downloaded
-as CSV files.
+"""A self-contained HTML page with tables, which can be downloaded as CSV files, pictures of all
+subjects at one exposure and one scale, and plots in versions for light and dark pages.
 """
 
 from __future__ import annotations
@@ -7,15 +7,56 @@ from __future__ import annotations
 import base64
 import html
 import importlib.resources
-from collections.abc import Iterable, Sequence
+import io
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import imagecodecs
 import numpy as np
+import xarray as xr
 from numpy.typing import NDArray
 
+from skindb import plots
+from skindb.analysis import plot_albedo, plot_basis_size, plot_translucency
 from skindb.files import csv_text
+from skindb.geometry.rays import RayScene
+from skindb.render.image import auto_exposure, encode_srgb, tone_map
+from skindb.render.photographs import Comparison, side_by_side
+from skindb.render.rendering import frontal_camera
+from skindb.render.scene import (
+    Lights,
+    Surface,
+    cameras_from_dome,
+    from_model,
+    lights_from_dome,
+)
+from skindb.render.shading import View, shade_view, trace_view
+from skindb.schema import variables
+
+if TYPE_CHECKING:
+    import xarray as xr
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from skindb.virtual.capture import Recovery
+
+Image = NDArray[np.floating[Any]]
+Picture = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
+ERRORS = (  # maps of residuals, black where they are unknown
+    (variables.HELD_OUT_ERROR, 0.2, "error under lights the fit did not see"),
+    (variables.OUTLIER_FRACTION, 0.1, "samples the model does not explain"),
+)
+# directions of the two lights of a portrait
+KEY_LIGHTS = ((-0.5, 0.35, 0.8), (0.55, 0.25, 0.8))
+MARGIN = 6  # pixels around a face
+SIZE = (4.4, 3.3)  # inches; text is still readable at 360 px, the width of a phone
+DOTS = 160  # per inch, twice the resolution of a page of 360 px
+# background and foreground, as in report.css
+LIGHT, DARK = ("#ffffff", "#22211f"), ("#262422", "#e9e5df")
+MAX_GREY_DIFFERENCE = 0.05  # between the channels of colours that count as grey
+MAX_NORMAL_ANGLE = 15  # degrees, end of the axis
 
 
 @dataclass(frozen=True)
@@ -152,3 +193,310 @@ def page(title: str, lead: str, sections: Iterable[tuple[str, Sequence[str]]]) -
         f"<title>{html.escape(title)}</title><style>{style}</style></head><body><main><h1>{html.escape(title)}</h1>"
         f'<p class="lead">{html.escape(lead)}</p><nav>{links}</nav>{body}</main></body></html>\n'
     )
+
+
+@dataclass(frozen=True)
+class Portraits:
+    """Linear portraits of all takes, and their common exposure on the page."""
+
+    images: Mapping[str, Image]
+    exposure: float
+
+    def cut(self, images: Mapping[str, Image]) -> dict[str, Picture]:
+        """Portraits at the exposure of the page, cropped to one scale."""
+        drawn = [tone_map(image, exposure=self.exposure) for image in images.values()]
+        cut = crop_alike(drawn, [image.sum(axis=2) > 0 for image in images.values()])
+        return dict(zip(images, cut, strict=True))
+
+
+def draw_portraits(models: Mapping[str, xr.DataTree]) -> Portraits:
+    """Portraits with a common exposure that does not clip the brightest skin, so that
+    skin tones are comparable.
+    """
+    images = {take: portrait(model) for take, model in models.items()}
+    return Portraits(images, min(auto_exposure(image) for image in images.values()))
+
+
+def _frontal(
+    model: xr.DataTree, *, scale: float
+) -> tuple[Surface, View, RayScene, xr.Dataset]:
+    dome = model["dome"].to_dataset().load()
+    surface = from_model(model, fill=True)
+    scene = RayScene(surface.vertices, surface.faces)
+    camera = cameras_from_dome(dome)[frontal_camera(dome)].scaled(scale)
+    return surface, trace_view(surface, camera, samples=2, scene=scene), scene, dome
+
+
+def _key(dome: xr.Dataset) -> Lights:
+    """Two lights of the dome, one from each side."""
+    place = dome[variables.LIGHT_POSITION].values
+    place = place / np.linalg.norm(place, axis=1, keepdims=True)
+    directions = np.array(KEY_LIGHTS) / np.linalg.norm(
+        KEY_LIGHTS, axis=1, keepdims=True
+    )
+    return lights_from_dome(dome).select(np.argmax(directions @ place.T, axis=1))
+
+
+def portrait(model: xr.DataTree) -> Image:
+    """Linear radiance (h, w, 3) of the model from the front under two lights."""
+    surface, view, scene, dome = _frontal(model, scale=1.6)
+    return np.asarray(
+        shade_view(view, surface, _key(dome), scene, terms=("diffuse", "surface")).sum(
+            axis=0
+        )
+    )
+
+
+def map_pictures(
+    models: Mapping[str, xr.DataTree],
+) -> dict[str, list[tuple[Picture, str]]]:
+    """Maps of each model from the front, at one scale.
+
+    Returns
+    -------
+    dict
+        For each take normal, albedo, surface reflection, translucency and errors, each
+        with its caption.
+    """
+    drawn = {take: _maps(model) for take, model in models.items()}
+    flat = [image for maps in drawn.values() for image in maps]
+    cut = iter(
+        crop_alike([image for image, _, _ in flat], [mask for _, mask, _ in flat])
+    )
+    return {
+        take: [(next(cut), text) for _, _, text in maps] for take, maps in drawn.items()
+    }
+
+
+def _maps(model: xr.DataTree) -> list[tuple[Picture, Mask, str]]:
+    surface, view, _, _ = _frontal(model, scale=1.2)
+    shine = surface.model.normal_reflectance(view.interpolate(surface.parameters))
+    pictures = [
+        ((view.interpolate(surface.normals) + 1) / 2, "normal"),
+        (encode_srgb(view.interpolate(surface.diffuse)), "diffuse albedo"),
+        (_scaled(shine, 0.12), "surface reflection at normal incidence, 0 to 0.12"),
+    ]
+    if surface.sigma_tr is not None:
+        depth = np.clip(1 / view.interpolate(surface.sigma_tr) / 3, 0, 1)
+        pictures.append((encode_srgb(depth), "translucency 1/sigma_tr, 0 to 3 mm"))
+    fitted = model["fitted"].to_dataset()
+    for name, top, text in ERRORS:
+        if name in fitted:
+            values = view.interpolate(np.nan_to_num(fitted[name].values)[:, None])[:, 0]
+            pictures.append((_scaled(values, top), f"{text}, 0 to {100 * top:g} %"))
+    return [
+        (_byte(view.image(values)), view.coverage > 0.5, text)
+        for values, text in pictures
+    ]
+
+
+def crop_alike(
+    pictures: Sequence[Picture], masks: Sequence[Mask], margin: int = MARGIN
+) -> list[Picture]:
+    """Crop pictures to one size, so that equal widths on the page correspond to equal scale.
+
+    Parameters
+    ----------
+    pictures
+        (h, w, 3) each.
+    masks
+        (h, w) each, pixels of the face, on which the cropped picture is centred.
+    margin
+        Pixels around the largest face.
+
+    Returns
+    -------
+    list
+        (rows, cols, 3) each, black beyond the edges of the picture. Without any face,
+        pictures are not cropped.
+    """
+    boxes = [_box(mask) for mask in masks]
+    sizes = [
+        (bottom - top, right - left) for top, bottom, left, right in filter(None, boxes)
+    ]
+    if not sizes:
+        return list(pictures)
+    rows, cols = (int(size) + 2 * margin for size in np.max(sizes, axis=0))
+    return [
+        _window(image, box, rows, cols)
+        for image, box in zip(pictures, boxes, strict=True)
+    ]
+
+
+def _box(mask: Mask) -> tuple[int, int, int, int] | None:
+    """First row, end row, first column and end column of a face; the ends are exclusive."""
+    rows = np.flatnonzero(mask.any(axis=1))
+    cols = np.flatnonzero(mask.any(axis=0))
+    return (
+        (int(rows[0]), int(rows[-1]) + 1, int(cols[0]), int(cols[-1]) + 1)
+        if rows.size
+        else None
+    )
+
+
+def _window(
+    image: Picture, box: tuple[int, int, int, int] | None, rows: int, cols: int
+) -> Picture:
+    top, bottom, left, right = box or (0, image.shape[0], 0, image.shape[1])
+    padded = np.pad(image, ((rows, rows), (cols, cols), (0, 0)))
+    first_row = (top + bottom - rows) // 2 + rows
+    first_col = (left + right - cols) // 2 + cols
+    return np.ascontiguousarray(
+        padded[first_row : first_row + rows, first_col : first_col + cols]
+    )
+
+
+def half_size(image: Picture) -> Picture:
+    """A picture of half the size; an odd last row or column is discarded."""
+    rows = image.shape[0] // 2
+    cols = image.shape[1] // 2
+    mean = image[: 2 * rows, : 2 * cols].reshape(rows, 2, cols, 2, 3).mean(axis=(1, 3))
+    return np.asarray(np.round(mean), np.uint8)
+
+
+def predictions(comparisons: Sequence[Comparison], exposure: float) -> list[Picture]:
+    """Photograph, prediction and difference of each comparison side by side, all at one
+    exposure and one scale.
+    """
+    drawn = list[Picture]()
+    masks = list[Mask]()
+    for comparison in comparisons:
+        width = comparison.mask.shape[1]
+        strip = side_by_side(comparison, exposure=exposure)
+        drawn += [strip[:, i * width : (i + 1) * width] for i in range(3)]
+        masks += [comparison.mask] * 3
+    cut = crop_alike(drawn, masks)
+    return [np.concatenate(cut[i : i + 3], axis=1) for i in range(0, len(cut), 3)]
+
+
+def _scaled(values: Image, top: float) -> Image:
+    return np.repeat(np.clip(values / top, 0, 1)[:, None], 3, axis=1)
+
+
+def _byte(image: Image) -> Picture:
+    return (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
+
+
+def themed_plot(ax: Axes, alt: str) -> str:
+    """A plot for both themes with its legend below; the figure is closed."""
+    from matplotlib import pyplot
+
+    handles, _ = ax.get_legend_handles_labels()
+    if handles:
+        ax.legend(
+            fontsize=8,
+            loc="upper center",
+            bbox_to_anchor=(0.5, -0.18),
+            ncol=2 if len(handles) < 5 else 3,
+            frameon=False,
+        )
+    figure = ax.get_figure(root=True)
+    assert figure is not None
+    light, dark = (_figure_png(figure, *theme) for theme in (LIGHT, DARK))
+    pyplot.close(figure)
+    return themed(light, dark, alt)
+
+
+def _figure_png(figure: Figure, paper: str, ink: str) -> bytes:
+    """The figure on a background, with everything grey or black in the foreground colour."""
+    from matplotlib.colors import to_rgb
+
+    figure.set_facecolor(paper)
+    for ax in figure.axes:
+        ax.set_facecolor(paper)
+        ax.tick_params(colors=ink, which="both")
+        for spine in ax.spines.values():
+            spine.set_edgecolor(ink)
+        for text in (
+            ax.title,
+            ax.xaxis.label,
+            ax.yaxis.label,
+            *(ax.legend_.get_texts() if ax.legend_ else ()),
+        ):
+            text.set_color(ink)
+        for line in (*ax.lines, *(ax.legend_.get_lines() if ax.legend_ else ())):
+            channels = to_rgb(line.get_color())
+            if max(channels) - min(channels) < MAX_GREY_DIFFERENCE:
+                line.set_color(ink)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=DOTS, bbox_inches="tight", facecolor=paper)
+    return buffer.getvalue()
+
+
+def _axes() -> Axes:
+    from matplotlib import pyplot
+
+    ax: Axes = pyplot.figure(figsize=SIZE).add_subplot()
+    return ax
+
+
+def reflectance_plot(recovered: Mapping[str, Recovery]) -> str:
+    """Plot of recovered against true diffuse reflectance, for every fortieth fitted
+    surfel of all takes.
+    """
+    ax = _axes()
+    for channel, (name, colour) in enumerate(zip("RGB", plots.CHANNELS, strict=True)):
+        true = []
+        recovered_values = []
+        for recovery in recovered.values():
+            pick = np.flatnonzero(recovery.fitted)[::40]
+            true.append(recovery.true_diffuse[pick, channel])
+            recovered_values.append(
+                true[-1] * (1 + recovery.diffuse_error[pick, channel])
+            )
+        ax.plot(
+            np.concatenate(true),
+            np.concatenate(recovered_values),
+            ".",
+            ms=2,
+            color=colour,
+            alpha=0.5,
+        )
+        # the points are too small for a legend
+        ax.plot([], [], "o", ms=4, color=colour, label=name)
+    top = ax.get_xlim()[1]
+    ax.plot([0, top], [0, top], "k-", lw=0.7, label="equal")
+    ax.set_xlabel("true diffuse reflectance R_d [1]")
+    ax.set_ylabel("recovered R_d [1]")
+    return themed_plot(
+        ax, "Recovered against true diffuse reflectance, with the line of equality."
+    )
+
+
+def normal_plot(recovered: Mapping[str, Recovery]) -> str:
+    """Plot of the cumulative distribution of the error of normals, one line for each take."""
+    ax = _axes()
+    ax.set_prop_cycle(color=plots.CYCLE)
+    for i, (take, recovery) in enumerate(recovered.items()):
+        angle = recovery.normal_angle[recovery.fitted]
+        angle = np.sort(angle[np.isfinite(angle)])
+        dashes = "-" if i < len(plots.CYCLE) else "--"
+        ax.plot(angle, np.linspace(0, 100, len(angle)), dashes, label=take)
+    ax.set_xlim(0, MAX_NORMAL_ANGLE)
+    ax.set_xlabel("angle between recovered and true normal [deg]")
+    ax.set_ylabel("fitted surfels below [%]")
+    return themed_plot(
+        ax,
+        "Cumulative distribution of the angle between the recovered and the true normal, by take.",
+    )
+
+
+def translucency_plot(table: xr.Dataset) -> str:
+    """Plot of mean sigma_tr by site and channel."""
+    alt = "Mean sigma_tr with its 95 % interval, by site and channel."
+    return themed_plot(plot_translucency(table, ax=_axes()), alt)
+
+
+def basis_size_plot(curve: xr.Dataset) -> str:
+    """Plot of the error against the number of basis BRDFs."""
+    alt = (
+        "Relative error of the reflectance against the number of basis BRDFs, with its "
+        "95 % interval."
+    )
+    return themed_plot(plot_basis_size(curve, ax=_axes()), alt)
+
+
+def albedo_plot(histograms: xr.Dataset) -> str:
+    """Plot of histograms of the first decorrelated axis of the albedo."""
+    alt = "Histograms of the albedo along its first decorrelated axis, one line for each take."
+    return themed_plot(plot_albedo(histograms, ax=_axes()), alt)

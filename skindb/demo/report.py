@@ -1,32 +1,57 @@
-"""The report of the demo: subjects, populations, an edit and its distance from the data."""
+"""The report of the demo: its results with their tables, and its sections on subjects,
+populations, an edit and its distance from the data.
+"""
 
 from __future__ import annotations
 
 import html
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import xarray as xr
 
 from skindb import __version__
-from skindb.demo import page, pictures, tables
-from skindb.demo.pictures import (
+from skindb.analysis.studies import tabulate_study
+from skindb.demo import page
+from skindb.demo.page import (
     Image,
     Portraits,
+    Table,
     draw_portraits,
     half_size,
     map_pictures,
     portrait,
     predictions,
 )
-from skindb.demo.tables import Results
 from skindb.files import private_file
-from skindb.render.photographs import compare_images
+from skindb.render.photographs import Comparison, compare_images
 from skindb.schema import FitStatus, variables
 from skindb.types import Progress
+from skindb.virtual.capture import Recovery
 
+PER_TAKE = ("models", "fits", "recovered", "compared")
+ERROR_COLUMNS = ("relative_rmse", "psnr", "ssim", "delta_e_median")
+SUBJECT_HEADER = (
+    "take",
+    "age",
+    "gender",
+    "ancestry",
+    "condition",
+    "surfels",
+    "fitted_surfels",
+    "fitted_percent",
+    "normal_median_deg",
+    "normal_95_deg",
+    "diffuse_red_percent",
+    "diffuse_green_percent",
+    "diffuse_blue_percent",
+    "held_out_percent",
+)
 # largest distance of an edit inside the data, in median distances between takes
 INSIDE = 1.0
 MEASURED = "measured"
@@ -35,7 +60,177 @@ VIEWER = "viewer.html"  # beside the report
 ERROR_NAMES = ("Normal [deg]", "R_d [%]", "Held-out lights [%]")
 LEAST_PERCENT = 0.1  # smallest percentage that is written as a number
 Record = Mapping[str, Any]
-Section = Callable[[Results, Portraits], list[str]]
+Section = Callable[["Results", Portraits], list[str]]
+
+
+@dataclass
+class Results:
+    """Models, errors, studies, edits and run times of a demo."""
+
+    models: dict[str, xr.DataTree] = field(default_factory=dict)
+    fits: dict[str, dict[str, Any]] = field(default_factory=dict)
+    recovered: dict[str, Recovery] = field(default_factory=dict)
+    compared: dict[str, list[Comparison]] = field(default_factory=dict)
+    studies: dict[str, xr.DataTree] = field(default_factory=dict)
+    edits: dict[float, xr.DataTree] = field(default_factory=dict)
+    edited_take: str = ""
+    target_take: str = ""  # the measured take that the edit at amount 1 should match
+    seconds: dict[str, float] = field(default_factory=dict)
+    began: float = field(default_factory=time.monotonic)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Measure the time of a stage and add it to `seconds`."""
+        start = time.monotonic()
+        yield
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.monotonic() - start
+
+    def sort_takes(self, takes: Sequence[str]) -> None:
+        """Sort the takes, which processes may have finished in any order, into the given order."""
+        for name in PER_TAKE:
+            found = getattr(self, name)
+            setattr(self, name, {take: found[take] for take in takes if take in found})
+
+    def add(self, other: Results) -> None:
+        """Add the results of another process."""
+        for name in PER_TAKE:
+            getattr(self, name).update(getattr(other, name))
+        for name, seconds in other.seconds.items():
+            self.seconds[name] = self.seconds.get(name, 0.0) + seconds
+
+
+def status_counts(model: xr.DataTree) -> dict[FitStatus, int]:
+    """Number of surfels with each status, including zeros."""
+    counts = np.bincount(
+        model["fitted"].to_dataset()[variables.FIT_STATUS].values,
+        minlength=len(FitStatus),
+    )
+    return {status: int(counts[status]) for status in FitStatus}
+
+
+def subject_table(results: Results) -> Table:
+    """One row per take: attributes, number of fitted surfels, and median errors against
+    the truth.
+    """
+    rows = []
+    for take, model in results.models.items():
+        counts = status_counts(model)
+        traits = dict(model.attrs.get("traits", {}))
+        total = sum(counts.values())
+        attributes = [traits.get(name, "") for name in ("age", "gender", "ancestry")]
+        fitted = [
+            total,
+            counts[FitStatus.FITTED],
+            100 * counts[FitStatus.FITTED] / total,
+        ]
+        errors_of_take: Any = results.recovered[take].summary()
+        errors = [
+            errors_of_take["normal_median_deg"],
+            errors_of_take["normal_95_deg"],
+            *errors_of_take["diffuse_median_percent"],
+        ]
+        held = 100 * results.fits[take].get("held_out_error", {}).get(
+            "median", float("nan")
+        )
+        rows.append(
+            [
+                take,
+                *attributes,
+                model.attrs.get("condition", "normal"),
+                *fitted,
+                *errors,
+                held,
+            ]
+        )
+    return Table("subjects", SUBJECT_HEADER, rows)
+
+
+def status_table(results: Results) -> Table:
+    """Number of surfels by take and status."""
+    counted = {take: status_counts(model) for take, model in results.models.items()}
+    rows = [
+        [
+            take,
+            status.name.lower(),
+            count,
+            100 * count / sum(counts.values()),
+            status.explanation,
+        ]
+        for take, counts in counted.items()
+        for status, count in counts.items()
+    ]
+    return Table(
+        "surfel_statuses", ["take", "status", "surfels", "percent", "explanation"], rows
+    )
+
+
+def status_sums(results: Results) -> Table:
+    """Number of surfels of all takes by status, for statuses that occur."""
+    counted = [status_counts(model) for model in results.models.values()]
+    sums = {status: sum(counts[status] for counts in counted) for status in FitStatus}
+    total = sum(sums.values())
+    rows = [
+        [
+            status.name.lower().replace("_", " "),
+            status.explanation,
+            count,
+            100 * count / total,
+        ]
+        for status, count in sums.items()
+        if count
+    ]
+    return Table("surfel_statuses", ["status", "meaning", "surfels", "%"], rows)
+
+
+def photograph_table(results: Results) -> Table:
+    """Errors of the predicted photographs."""
+    rows = [
+        [
+            take,
+            comparison.light,
+            comparison.camera,
+            "yes" if comparison.held_out else "no",
+            *(comparison.error[name] for name in ERROR_COLUMNS),
+        ]
+        for take, comparisons in results.compared.items()
+        for comparison in comparisons
+    ]
+    return Table(
+        "photographs", ["take", "light", "camera", "held_out", *ERROR_COLUMNS], rows
+    )
+
+
+def site_table(results: Results) -> Table:
+    """Relative error of sigma_tr [%] at each probe site."""
+    rows = []
+    for take, recovery in results.recovered.items():
+        summary: Any = recovery.summary()
+        rows += [
+            [take, site, *map(float, values)]
+            for site, values in summary["sigma_tr_percent"].items()
+        ]
+    header = ["take", "site", "red_percent", "green_percent", "blue_percent"]
+    return Table("sigma_tr_errors", header, rows)
+
+
+def study_table(name: str, study: xr.DataTree) -> Table:
+    """Table of a population study."""
+    return Table(name, *tabulate_study(study))
+
+
+def time_tables(results: Results) -> tuple[Table, Table]:
+    """Wall time [s] of the stages of the demo, and of the stages of a fit as mean over takes."""
+    stages: dict[str, list[float]] = {}
+    for fit in results.fits.values():
+        for name, seconds in fit["seconds"].items():
+            stages.setdefault(name, []).append(seconds)
+    demo = [
+        [name, seconds] for name, seconds in results.seconds.items() if name != "report"
+    ]
+    inside = [[name, float(np.mean(values))] for name, values in stages.items()]
+    return Table("times_demo", ["stage", "seconds"], demo), Table(
+        "times_fit", ["stage", "seconds"], inside
+    )
 
 
 def edit_section(results: Results, portraits: Portraits) -> list[str]:
@@ -69,7 +264,7 @@ def edit_section(results: Results, portraits: Portraits) -> list[str]:
         "at most 1, the edit is inside the "
         "data."
     )
-    full = tables.study_table("traits", results.studies["traits"])
+    full = study_table("traits", results.studies["traits"])
     rows = [[_breakable(row[0]), *row[1:]] for row in full.columns(SHOWN).rows]
     named = page.Table("traits", [_breakable(name) for name in SHOWN], rows)
     note = (
@@ -151,8 +346,8 @@ def subjects_section(results: Results, portraits: Portraits) -> list[str]:
     maps = map_pictures(results.models)
     strips = _strips(results)
     bodies = []
-    for values in tables.subject_table(results).rows:
-        record = dict(zip(tables.SUBJECT_HEADER, values, strict=True))
+    for values in subject_table(results).rows:
+        record = dict(zip(SUBJECT_HEADER, values, strict=True))
         take = str(record["take"])
         pictures_of_take = [(drawn[take], "portrait"), *maps[take]]
         blocks = [
@@ -175,9 +370,7 @@ def subjects_section(results: Results, portraits: Portraits) -> list[str]:
         for name in ("Portrait", "Take", "Fitted", "Not fitted", *ERROR_NAMES)
     )
     listed = f'<table class="subjects"><thead><tr>{head}</tr></thead>{"".join(bodies)}</table>'
-    saved = page.downloads(
-        [tables.subject_table(results), tables.status_table(results)]
-    )
+    saved = page.downloads([subject_table(results), status_table(results)])
     return [viewer, page.paragraph(text), listed, saved]
 
 
@@ -197,7 +390,7 @@ def _who(record: Record) -> str:
 def _subject(record: Record, results: Results, small: str, maps: list[str]) -> str:
     """Two rows of the table: the values of a take, and its maps, which can be opened."""
     take = str(record["take"])
-    counts = tables.status_counts(results.models[take])
+    counts = status_counts(results.models[take])
     total = sum(counts.values())
     statuses = [
         f"{status.name.lower().replace('_', ' ')} {_percent(100 * count / total)} %"
@@ -290,11 +483,11 @@ def write_report(path: Path, results: Results, *, progress: Progress) -> Path:
 
 def _statuses(results: Results, _: Portraits) -> list[str]:
     text = "Every surfel has a status. Surfels without a fit have a position but no values."
-    return [page.paragraph(text), page.table(tables.status_sums(results))]
+    return [page.paragraph(text), page.table(status_sums(results))]
 
 
 def _predicted(results: Results, _: Portraits) -> list[str]:
-    full = tables.photograph_table(results)
+    full = photograph_table(results)
     columns = full.columns(
         ["take", "light", "held_out", "relative_rmse", "delta_e_median"]
     )
@@ -330,9 +523,9 @@ def _recovered(results: Results, _: Portraits) -> list[str]:
     )
     normals = page.details(
         "Distribution of the error of normals",
-        [pictures.normal_plot(results.recovered)],
+        [page.normal_plot(results.recovered)],
     )
-    full = tables.site_table(results)
+    full = site_table(results)
     table = full.renamed(["take", "site", "red [%]", "green [%]", "blue [%]"])
     sites = (
         [
@@ -345,7 +538,7 @@ def _recovered(results: Results, _: Portraits) -> list[str]:
     )
     return [
         page.paragraph(text),
-        pictures.reflectance_plot(results.recovered),
+        page.reflectance_plot(results.recovered),
         normals,
         *sites,
         page.downloads([full]),
@@ -360,11 +553,11 @@ def _population(results: Results, _: Portraits) -> list[str]:
     )
     study = results.studies["translucency"]
     plots = [
-        pictures.translucency_plot(study["translucency_table"].to_dataset().load()),
-        pictures.albedo_plot(results.studies["albedo"]["albedo"].to_dataset().load()),
+        page.translucency_plot(study["translucency_table"].to_dataset().load()),
+        page.albedo_plot(results.studies["albedo"]["albedo"].to_dataset().load()),
     ]
     saved = [
-        tables.study_table(name, results.studies[name])
+        study_table(name, results.studies[name])
         for name in ("translucency", "brdf", "albedo")
     ]
     columns = saved[0].columns(
@@ -397,12 +590,12 @@ def _basis_size(results: Results) -> str:
         f"{curve.attrs['surfels']} surfels of all takes."
     )
     return page.details(
-        "Number of basis BRDFs", [page.paragraph(text), pictures.basis_size_plot(curve)]
+        "Number of basis BRDFs", [page.paragraph(text), page.basis_size_plot(curve)]
     )
 
 
 def _run_time(results: Results, _: Portraits) -> list[str]:
-    demo, fit = tables.time_tables(results)
+    demo, fit = time_tables(results)
     text = (
         "Wall time in seconds. Takes are processed in parallel, and the times of their "
         "stages are summed."

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from skindb import workflow
-from skindb.demo.report import VIEWER, write_report
-from skindb.demo.tables import Results
+from skindb.demo.report import VIEWER, Results, write_report
 from skindb.elementwise import thread_count
 from skindb.errors import Fault, InputError
 from skindb.export.bundle import export_bundle

@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 from small_face import SIDE, small_face
 
-from skindb.demo.tables import Results
+from skindb.demo.report import Results
 from skindb.render.photographs import Causes, Comparison
 from skindb.schema import FitStatus, label
 from skindb.virtual.capture import Recovery

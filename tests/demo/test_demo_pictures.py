@@ -7,7 +7,7 @@ import pytest
 from planted_results import comparison
 from small_face import small_face
 
-from skindb.demo.pictures import crop_alike, draw_portraits, half_size, predictions
+from skindb.demo.page import crop_alike, draw_portraits, half_size, predictions
 
 
 def _disc(row, col, radius, size=60):

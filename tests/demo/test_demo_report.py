@@ -20,8 +20,7 @@ from planted_results import (
     planted_results,
 )
 
-from skindb.demo import tables
-from skindb.demo.report import write_report
+from skindb.demo.report import status_sums, write_report
 from skindb.schema import FitStatus
 
 BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
@@ -124,7 +123,7 @@ def test_write_report__without_edits_and_traits(report):
 
 
 def test_status_sums__count_every_surfel_once(results):
-    shown = tables.status_sums(results)
+    shown = status_sums(results)
     assert sum(row[2] for row in shown.rows) == len(TAKES) * SURFELS
     assert sum(row[3] for row in shown.rows) == pytest.approx(100)
 
