@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 from skindb.errors import Fault, InputError
@@ -143,7 +144,6 @@ def capture_dome(
     begin_time = 0.0  # when the first run began
     for attempt in range(1 + MAX_REPEATS):
         part = partial_schedule(schedule, remaining) if attempt else schedule
-        stage = "repeat" if attempt else "capture"
         cameras.start()
         try:
             dome.upload(part)
@@ -157,45 +157,19 @@ def capture_dome(
         begin(part)
         now = clock.monotonic()
         begin_time = begin_time or now
-        measured = list[Measured]()
-        try:
-            state = dome.run(
-                part,
-                lambda number, total, stage=stage: report(stage, number, total),  # type: ignore[misc]
-                measured,
-            )
-            if state.state == "stopped":
-                run.stopped = (
-                    f"{dome.link.name}: {STOPPED.get(state.reason, state.reason)}"
-                )
-        except (DeviceError, KeyboardInterrupt) as error:
-            run.stopped = _reason(error)
-        finished, lost_device = _read_reports(dome, part, measured)
-        run.stopped = run.stopped or lost_device
-        since = round(1e6 * (now - begin_time))
-        measured = [
-            replace(entry, on_us=entry.on_us + since, off_us=entry.off_us + since)
-            for entry in measured
-        ]
-        _collect(
-            run,
-            cameras,
-            remaining,
-            part,
-            measured,
-            finished=finished,
-            known=not lost_device,
+        reports = _run_part(
+            dome, part, partial(report, "repeat" if attempt else "capture")
         )
-        lost = run.missing(cameras.ids)
-        if run.stopped or not lost:
+        run.stopped = reports.stopped
+        reports.shift(round(1e6 * (now - begin_time)))
+        _collect(run, cameras, remaining, part, reports)
+        missing = run.missing(cameras.ids)
+        if run.stopped or not missing:
             break
-        remaining = sorted(lost)
-        run.notes.append(f"{_describe_missing(schedule, lost)}: repeated")
-    run.notes += (
-        [f"{dome.link.name}: {dome.link.damaged} damaged lines"]
-        if dome.link.damaged
-        else []
-    )
+        remaining = sorted(missing)
+        run.notes.append(f"{_describe_missing(schedule, missing)}: repeated")
+    if dome.link.damaged:
+        run.notes.append(f"{dome.link.name}: {dome.link.damaged} damaged lines")
     run.faulty_lights = _faulty_lights(run)
     return run
 
@@ -225,18 +199,9 @@ def recover_run(
     dome.stop()
     cameras.start(started)
     run = DomeRun(schedule, assess(schedule), [None] * len(schedule.steps))
-    measured = list[Measured]()
-    finished, lost_device = _read_reports(dome, schedule, measured)
-    indices = range(len(schedule.steps))
-    _collect(
-        run,
-        cameras,
-        indices,
-        schedule,
-        measured,
-        finished=finished,
-        known=not lost_device,
-    )
+    reports = StepReports()
+    reports.read(dome, schedule)
+    _collect(run, cameras, range(len(schedule.steps)), schedule, reports)
     run.faulty_lights = _faulty_lights(run)
     return run
 
@@ -250,63 +215,90 @@ def _reason(error: BaseException) -> str:
     )
 
 
-def _read_reports(
-    dome: Dome, part: Schedule, measured: list[Measured]
-) -> tuple[int, str]:
-    """Append the missing reports to `done`, including that of an interrupted step.
+@dataclass
+class StepReports:
+    """What the controller reported of the steps of a part of a schedule."""
 
-    Returns the number of finished steps, and why the reports are incomplete.
-    """
-    finished = len(measured)
+    measured: list[Measured] = field(default_factory=list)
+    finished: int = 0  # number of finished steps
+    stopped: str = ""  # reason if the part ended early
+    # otherwise the controller may have continued after its last report
+    complete: bool = True
+
+    def read(self, dome: Dome, part: Schedule) -> None:
+        """Read the missing reports, including that of an interrupted step."""
+        self.finished = len(self.measured)
+        try:
+            self.finished = dome.state(len(part.steps)).step
+            while len(self.measured) < min(self.finished + 1, len(part.steps)):
+                self.measured.append(dome.report_step(part, len(self.measured)))
+        except DeviceError as error:
+            reported = len(self.measured)
+            if isinstance(error, RefusedError) and reported == self.finished:
+                return  # the step after the last one did not begin
+            self.finished = min(self.finished, reported)
+            self.stopped = self.stopped or _reason(error)
+            self.complete = False
+
+    def shift(self, since: int) -> None:
+        """Count the times from an earlier start, by so many microseconds."""
+        self.measured = [
+            replace(step, on_us=step.on_us + since, off_us=step.off_us + since)
+            for step in self.measured
+        ]
+
+
+def _run_part(
+    dome: Dome, part: Schedule, progress: Callable[[int, int], None]
+) -> StepReports:
+    """Run the steps that were uploaded and armed, and read what the controller reports."""
+    reports = StepReports()
     try:
-        finished = dome.state(len(part.steps)).step
-        while len(measured) < min(finished + 1, len(part.steps)):
-            measured.append(dome.report_step(part, len(measured)))
-    except DeviceError as error:
-        if isinstance(error, RefusedError) and len(measured) == finished:
-            return finished, ""  # the step after the last one did not begin
-        return min(finished, len(measured)), _reason(error)
-    return finished, ""
+        state = dome.run(part, progress, reports.measured)
+        if state.state == "stopped":
+            reason = STOPPED.get(state.reason, state.reason)
+            reports.stopped = f"{dome.link.name}: {reason}"
+    except (DeviceError, KeyboardInterrupt) as error:
+        reports.stopped = _reason(error)
+    reports.read(dome, part)
+    return reports
 
 
 def _collect(
     run: DomeRun,
     cameras: Cameras,
-    wanted: Sequence[int],
+    indices: Sequence[int],
     part: Schedule,
-    done: Sequence[Measured],
-    *,
-    finished: int,
-    known: bool,
+    reports: StepReports,
 ) -> None:
-    """Assign frames to the finished steps of a part; steps without a trigger have no frame.
+    """Assign frames to the finished steps of a part, which have these indices in the
+    schedule; steps without a trigger have no frame.
 
-    `known` is whether the controller reported all of its steps. Otherwise it may have
-    continued after its last report, so frames are matched with the whole plan, and only
-    those of reported steps are kept.
+    If reports are missing, frames are matched with the whole plan, and only those of
+    reported steps are kept.
     """
+    done = reports.measured
     steps = [i for i, measured in enumerate(done) if measured.triggers > 0]
-    if not known:
+    if not reports.complete:
         steps += range(len(done), len(part.steps))
     times = [part.steps[i].on_us / 1e6 for i in steps]
-    for index, measured in zip(wanted, done[:finished], strict=False):
+    for index, measured in zip(indices, done[: reports.finished], strict=False):
         run.measured[index] = measured
     try:
-        taken = cameras.collect(
-            len(steps), FRAME_SECONDS if known else LOST_FRAME_SECONDS
-        )
+        timeout = FRAME_SECONDS if reports.complete else LOST_FRAME_SECONDS
+        taken = cameras.collect(len(steps), timeout)
     except InputError as error:  # such as a folder that is gone
         run.stopped = run.stopped or _reason(error)
         return
     for camera, shots in taken.items():
-        if known and len(shots) != len(steps):
+        if reports.complete and len(shots) != len(steps):
             run.notes.append(
                 f"camera {camera}: {len(shots)} frames for {len(steps)} triggers"
             )
         paths = match_frames(shots, times)
         for i, path in zip(steps, paths, strict=True):
-            if path is not None and i < finished:
-                run.frames[camera, wanted[i]] = path
+            if path is not None and i < reports.finished:
+                run.frames[camera, indices[i]] = path
 
 
 def forget_faulty_steps(run: DomeRun) -> None:
