@@ -155,12 +155,13 @@ def _atlas_lines(database: Database, take: str) -> list[str]:
     if "atlas" not in capture.children:  # ingested before atlases were measured
         return []
     atlas = capture["atlas"].to_dataset()
+    variables = skindb.schema.variables
     columns = {
         "atlas": "region",
-        "area log2 sd": "atlas_area_log2_sd",
-        "stretch median": "atlas_anisotropy_median",
-        "stretch 99 %": "atlas_anisotropy_p99",
-        "flips": "atlas_flips",
+        "area log2 sd": variables.ATLAS_AREA_LOG2_SD,
+        "stretch median": variables.ATLAS_ANISOTROPY_MEDIAN,
+        "stretch 99 %": variables.ATLAS_ANISOTROPY_P99,
+        "flips": variables.ATLAS_FLIPS,
     }
     rows = zip(*(atlas[name].values.tolist() for name in columns.values()), strict=True)
     heading = (

@@ -129,7 +129,7 @@ def subject_table(results: Results) -> Table:
             errors_of_take["normal_95_deg"],
             *errors_of_take["diffuse_median_percent"],
         ]
-        held = 100 * results.fits[take].get("held_out_error", {}).get(
+        held = 100 * results.fits[take].get(variables.HELD_OUT_ERROR, {}).get(
             "median", float("nan")
         )
         rows.append(

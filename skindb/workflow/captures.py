@@ -42,6 +42,7 @@ from skindb.ingest import (
 )
 from skindb.ingest.spool import remove_stale
 from skindb.parameters import CalibrationParameters
+from skindb.schema import variables
 from skindb.schema.consent import CONSENT, require_consent
 from skindb.store import (
     CALIBRATION,
@@ -318,10 +319,10 @@ def describe_calibration(db: Database, record: Record) -> dict[str, Any]:
     """
     groups = _groups(db, record, record.generation)
     lights = groups["light_calibration"]
-    intensity = lights["calibrated_intensity"]
-    relative = (lights["calibrated_intensity_error"] / intensity).max("channel")
-    position = lights["calibrated_intensity_position_error"]
-    glare = lights["glare_fraction"]
+    intensity = lights[variables.CALIBRATED_INTENSITY]
+    relative = (lights[variables.CALIBRATED_INTENSITY_ERROR] / intensity).max("channel")
+    position = lights[variables.CALIBRATED_INTENSITY_POSITION_ERROR]
+    glare = lights[variables.GLARE_FRACTION]
     total = np.sqrt(relative**2 + position**2 + glare**2)
     about: dict[str, Any] = {
         "lights": lights.sizes["light"],
@@ -333,7 +334,7 @@ def describe_calibration(db: Database, record: Record) -> dict[str, Any]:
     if record.generation > 1:
         before = _groups(db, record, record.generation - 1)["light_calibration"]
         # lights that both have
-        ratio = intensity / before["calibrated_intensity"]
+        ratio = intensity / before[variables.CALIBRATED_INTENSITY]
         change = abs(ratio - 1).max(dim="channel")
         if change.size:
             about |= {
@@ -341,10 +342,13 @@ def describe_calibration(db: Database, record: Record) -> dict[str, Any]:
                 "most_changed": str(change["light"].values[change.values.argmax()]),
             }
     if (positions := groups.get("position_calibration")) is not None:
-        errors = positions["calibrated_position_error"]
+        errors = positions[variables.CALIBRATED_POSITION_ERROR]
         about["largest_position_error_mm"] = float(errors.max())
     if (fibres := groups.get("probe_calibration")) is not None:
-        errors = fibres["calibrated_fibre_gain_error"] / fibres["calibrated_fibre_gain"]
+        errors = (
+            fibres[variables.CALIBRATED_FIBRE_GAIN_ERROR]
+            / fibres[variables.CALIBRATED_FIBRE_GAIN]
+        )
         about["probe"] = {
             "fibres": fibres.sizes["fibre"],
             "largest_relative_error": float(errors.max()),
@@ -363,13 +367,13 @@ def _groups(db: Database, record: Record, generation: int) -> dict[str, xr.Datas
 def _describe_cameras(calibration: xr.Dataset) -> dict[str, Any]:
     """How many cameras each calibration has, and the worst of each measure of it."""
     measures = {
-        "dark frames": "defect_pixels",
-        "response": "calibrated_response",
-        "noise": "noise_chi_square",
-        "vignette": "vignette_residual",
-        "colour": "chart_difference",
-        "edge": "edge_blur",
-        "known points": "reprojection_rms",
+        "dark frames": variables.DEFECT_PIXELS,
+        "response": variables.CALIBRATED_RESPONSE,
+        "noise": variables.NOISE_CHI_SQUARE,
+        "vignette": variables.VIGNETTE_RESIDUAL,
+        "colour": variables.CHART_DIFFERENCE,
+        "edge": variables.EDGE_BLUR,
+        "known points": variables.REPROJECTION_RMS,
     }
     about = dict[str, Any]()
     for name, variable in measures.items():

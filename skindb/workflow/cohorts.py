@@ -33,7 +33,7 @@ from skindb.analysis.summary import (
 )
 from skindb.errors import Fault, InputError
 from skindb.fit import prediction_table
-from skindb.schema import FitStatus, dataset
+from skindb.schema import FitStatus, dataset, variables
 from skindb.schema.consent import require_consent
 from skindb.schema.label import FACE
 from skindb.store import SUMMARY, CohortRequest, Database, Lookup, Record, lacking
@@ -143,7 +143,7 @@ def tables_of(model: xr.DataTree) -> xr.Dataset:
     prediction = prediction_table(model["fitted"].to_dataset().load())
     # a region without any surfel has no row there
     rows = prediction.reindex(
-        region=tables["region"].values, fill_value={"prediction_surfels": 0}
+        region=tables["region"].values, fill_value={variables.PREDICTION_SURFELS: 0}
     )
     return xr.merge(
         [tables, rows], combine_attrs="override", join="outer", compat="no_conflicts"
@@ -154,7 +154,9 @@ def sample_groups(
     model: xr.DataTree, *, surfels: int = SAMPLED, seed: int = 0
 ) -> dict[str, xr.Dataset]:
     """The group "sample" of a model; none if no surfel was fitted."""
-    if not bool((model["fitted"].to_dataset()["fit_status"] == FitStatus.FITTED).any()):
+    if not bool(
+        (model["fitted"].to_dataset()[variables.FIT_STATUS] == FitStatus.FITTED).any()
+    ):
         return {}
     return {"sample": sample_surfels(model, surfels=surfels, seed=seed)}
 
@@ -174,12 +176,12 @@ def registered_parts(
     masks = take_masks(model, registered)
     groups = {"maps": common_maps(model, registered, size=size)}
     if sampled := sample_groups(model, surfels=surfels, seed=seed):
-        index = sampled["sample"]["surfel_index"].values
+        index = sampled["sample"][variables.SURFEL_INDEX].values
         mask = np.array([mask[index] for mask in masks.values()]).reshape(
             len(masks), len(index)
         )
         groups["sample"] = dataset(
-            {"surfel_index": index, "region_mask": mask.T},
+            {variables.SURFEL_INDEX: index, variables.REGION_MASK: mask.T},
             coords={"region": list(masks)},
         )
     face = {FACE: np.ones(fitted.sizes["surfel"], np.bool_)}
@@ -399,7 +401,7 @@ def _register(
 
 
 def _has_landmarks(db: Database, record: Record) -> bool:
-    if record.contents and "landmark_position" not in record.contents.get(
+    if record.contents and variables.LANDMARK_POSITION not in record.contents.get(
         "mesh", {}
     ).get("variables", []):
         return False

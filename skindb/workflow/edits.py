@@ -20,6 +20,7 @@ from skindb.reflectance.dictionary import embedded_dictionary
 from skindb.reflectance.kinds import require_mixture
 from skindb.render.figures import write_grid
 from skindb.render.rendering import frontal_camera, radiance_of
+from skindb.schema import variables
 from skindb.schema.consent import require_consent
 from skindb.store import STUDY, Database, require_fresh
 from skindb.types import Progress, silent
@@ -211,14 +212,14 @@ def basis_grid(
     require_mixture(model["fitted"].to_dataset(), f"model of {take}")
     names = [str(name) for name in model["fitted"].to_dataset()["dictionary"].values]
     tables = studies.dictionary_tables(
-        names, float(model["basis/disc_angular_radius"]), dictionary
+        names, float(model[f"basis/{variables.DISC_ANGULAR_RADIUS}"]), dictionary
     )
     cohort = db.cohort("surfels", takes=[take], surfels=SAMPLED)
     columns = {}
     for k in ks:
         rng = np.random.default_rng(seed)
         reduced = population_basis(cohort, tables=tables, k=k, in_metric=True, rng=rng)
-        columns[f"k = {k}"] = reduced["population_mixture"].values
+        columns[f"k = {k}"] = reduced[variables.POPULATION_MIXTURE].values
     columns[f"all {len(names)}"] = np.eye(len(names))
     options.setdefault("scale", _grid_scale(model))
     lamps = lights or [_frontal_light(model)]
@@ -241,8 +242,8 @@ def basis_grid(
 def _frontal_light(model: xr.DataTree) -> str:
     """The light whose direction is nearest to that of the frontal camera."""
     dome = model["dome"].to_dataset().load()
-    seen_from = dome["camera_position"].values[frontal_camera(dome)]
-    place = dome["light_position"].values
+    seen_from = dome[variables.CAMERA_POSITION].values[frontal_camera(dome)]
+    place = dome[variables.LIGHT_POSITION].values
     cosine = place @ seen_from / np.linalg.norm(place, axis=1)
     return str(dome["light"].values[int(np.argmax(cosine))])
 
@@ -252,7 +253,7 @@ def _grid_scale(model: xr.DataTree) -> float:
     each costs every light.
     """
     dome = model["dome"].to_dataset()
-    return GRID_SIDE / float(dome["camera_size"].max())
+    return GRID_SIDE / float(dome[variables.CAMERA_SIZE].max())
 
 
 def _sides(edited: xr.DataTree) -> str:
@@ -288,7 +289,7 @@ def editable_model(
         for name in ("traits", "population_basis", "albedo")
     )
     tables = studies.dictionary_tables(
-        brdfs, float(model["basis/disc_angular_radius"]), dictionary
+        brdfs, float(model[f"basis/{variables.DISC_ANGULAR_RADIUS}"]), dictionary
     )
 
     def move(amounts: Mapping[str, float]) -> xr.DataTree:

@@ -21,6 +21,7 @@ from skindb.render.figures import write_field, write_grid
 from skindb.render.photographs import Comparison, compare_photographs
 from skindb.render.rendering import chosen_camera, render, render_picture
 from skindb.render.scene import Camera, Environment, Lights
+from skindb.schema import variables
 from skindb.schema.consent import require_consent
 from skindb.store import Database, UnavailableError, require_fresh
 from skindb.types import Progress, silent
@@ -276,7 +277,9 @@ def _diffusion_lengths(db: Database, site: str) -> dict[str, float]:
             continue
         sites = model["translucency"].to_dataset()
         if site in [str(name) for name in sites["site"].values]:
-            sigma = sites["site_sigma_tr"].sel(site=site).values.astype(np.float64)
+            sigma = (
+                sites[variables.SITE_SIGMA_TR].sel(site=site).values.astype(np.float64)
+            )
             if (np.isfinite(sigma) & (sigma > 0)).all():
                 lengths[take] = float((1 / sigma).mean())
     return lengths
@@ -285,14 +288,15 @@ def _diffusion_lengths(db: Database, site: str) -> dict[str, float]:
 def _nose(model: xr.DataTree) -> np.ndarray[Any, np.dtype[np.float64]]:
     """Tip of the nose (3,), or the middle of the surfels."""
     mesh = model["mesh"].to_dataset()
-    if "landmark_position" in mesh and LANDMARK in [
+    if variables.LANDMARK_POSITION in mesh and LANDMARK in [
         str(name) for name in mesh["landmark"].values
     ]:
         return np.asarray(
-            mesh["landmark_position"].sel(landmark=LANDMARK).values, np.float64
+            mesh[variables.LANDMARK_POSITION].sel(landmark=LANDMARK).values, np.float64
         )
     return np.asarray(
-        model["fitted"].to_dataset()["surfel_position"].values.mean(axis=0), np.float64
+        model["fitted"].to_dataset()[variables.SURFEL_POSITION].values.mean(axis=0),
+        np.float64,
     )
 
 
@@ -301,9 +305,9 @@ def _light(model: xr.DataTree) -> Lights:
     turn = np.radians(LIGHT_DEGREES)
     towards = np.array([np.sin(turn), 0.15, np.cos(turn)])
     towards /= np.linalg.norm(towards)
-    power = np.median(model["dome"].to_dataset()["light_intensity"].values, axis=0)[
-        None
-    ]
+    power = np.median(
+        model["dome"].to_dataset()[variables.LIGHT_INTENSITY].values, axis=0
+    )[None]
     return Lights(
         _nose(model)[None] + LIGHT_MM * towards,
         power,

@@ -29,6 +29,7 @@ from skindb.parameters import option_of, require_limits
 from skindb.reflectance.dictionary import convolve_disc, embedded_dictionary
 from skindb.reflectance.kinds import require_mixture
 from skindb.reflectance.table_file import read_dictionary
+from skindb.schema import variables
 from skindb.schema.cohort import require_same_fit
 from skindb.schema.notes import Note, note, unique_notes
 from skindb.store import STUDY, Database, Lookup, Record, Staleness, require_text
@@ -176,8 +177,10 @@ def _brdf_tables(
     other process by themselves.
     """
     take = str(cohort["take"].values[0])
-    opened = open_models("tables", takes=[take], variables=["disc_angular_radius"])
-    disc = float(opened["disc_angular_radius"][0])
+    opened = open_models(
+        "tables", takes=[take], variables=[variables.DISC_ANGULAR_RADIUS]
+    )
+    disc = float(opened[variables.DISC_ANGULAR_RADIUS][0])
     require_mixture(cohort.coords, "cohort")
     names = [str(name) for name in cohort["dictionary"].values]
     tables: Delayed = delayed(dictionary_tables, pure=False)(
