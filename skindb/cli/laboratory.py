@@ -97,12 +97,12 @@ def calibrate(db: str, setup: Path, parameters: CalibrationParameters) -> None:
     database = skindb.open(db)
     record = skindb.workflow.calibrate(database, setup, **vars(parameters))
     report = skindb.workflow.describe_calibration(database, record)
-    about = {
+    summary = {
         "calibration": record.take,
         "generation": record.generation,
         "path": record.path,
     }
-    emit(about | report, _calibration_lines(record, report))
+    emit(summary | report, _calibration_lines(record, report))
 
 
 def _calibration_lines(record: Record, report: dict[str, Any]) -> list[str]:

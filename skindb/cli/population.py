@@ -69,18 +69,22 @@ def register(
             client=client,
             progress=progress,
         )
-    left = [take for take in (takes or database.takes("model")) if take not in records]
-    why = {True: "no landmarks", False: "its consent does not cover statistics"}
-    skipped = {take: why["statistics" in database.consent(take)] for take in left}
+    remaining = [
+        take for take in (takes or database.takes("model")) if take not in records
+    ]
+    reasons = {True: "no landmarks", False: "its consent does not cover statistics"}
+    skipped = {
+        take: reasons["statistics" in database.consent(take)] for take in remaining
+    }
     registered = workflow.registered_datasets(database, records)
     header, rows = skindb.analysis.tabulate_registration(registered)
-    done = {
+    registered_takes = {
         take: {"generation": record.generation, "path": record.path}
         for take, record in records.items()
     }
     doubts = skindb.analysis.doubtful_landmarks(registered)
     report = {
-        "takes": done,
+        "takes": registered_takes,
         "header": header,
         "rows": rows,
         "doubts": doubts,
@@ -167,13 +171,13 @@ def _report_edit(record: Record, tree: xr.DataTree) -> None:
         f"  traits from the study of {len(takes)} takes: "
         f"{', '.join(takes[:8])}{', ...' if len(takes) > 8 else ''}",
     ]
-    about = {
+    summary = {
         "generation": record.generation,
         "path": record.path,
         "edit_distance": distance,
         "edit_report": dict(tree.attrs["edit_report"]),
     }
-    emit(about, [*lines, *(f"  {line}" for line in _edit_notes(tree))])
+    emit(summary, [*lines, *(f"  {line}" for line in _edit_notes(tree))])
 
 
 def _edit_notes(tree: xr.DataTree) -> list[str]:

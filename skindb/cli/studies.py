@@ -234,10 +234,10 @@ def _run_study(
     database = existing(click.get_current_context().obj)
     progress = bar()
     progress(f"analyze {study.name}", 0, 1)
-    used = takes or database.takes("model", release=release)
+    studied = takes or database.takes("model", release=release)
     arguments = {"faces": pictures.faces is not None}
     with skindb.workflow.logged_action(
-        database, "study", used, what=study.name, arguments=arguments
+        database, "study", studied, what=study.name, arguments=arguments
     ):
         with (
             client_of(scheduler, progress) as client,
@@ -319,10 +319,10 @@ def _report(
     emit(report, [*table, *notes, *lines])
 
 
-def _unit_lines(units: dict[str, str], shown: list[str]) -> list[str]:
+def _unit_lines(units: dict[str, str], columns: list[str]) -> list[str]:
     """One line for each unit of the columns other than 1."""
-    of = dict[str, list[str]]()
-    for name in shown:
+    names_by_unit = dict[str, list[str]]()
+    for name in columns:
         if units.get(name, "1") not in ("", "1"):
-            of.setdefault(units[name], []).append(name)
-    return [f"unit {unit}: {', '.join(names)}" for unit, names in of.items()]
+            names_by_unit.setdefault(units[name], []).append(name)
+    return [f"unit {unit}: {', '.join(names)}" for unit, names in names_by_unit.items()]

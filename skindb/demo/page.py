@@ -69,9 +69,9 @@ class Table:
 
     def columns(self, names: Sequence[str]) -> Table:
         """The table with only these columns."""
-        at = [list(self.header).index(name) for name in names]
+        indices = [list(self.header).index(name) for name in names]
         return Table(
-            self.name, list(names), [[row[i] for i in at] for row in self.rows]
+            self.name, list(names), [[row[i] for i in indices] for row in self.rows]
         )
 
     def renamed(self, header: Sequence[str]) -> Table:
@@ -312,7 +312,8 @@ def crop_alike(
     """
     boxes = [_box(mask) for mask in masks]
     sizes = [
-        (bottom - top, right - left) for top, bottom, left, right in filter(None, boxes)
+        (bottom - top, right - start)
+        for top, bottom, start, right in filter(None, boxes)
     ]
     if not sizes:
         return list(pictures)
@@ -337,10 +338,10 @@ def _box(mask: Mask) -> tuple[int, int, int, int] | None:
 def _window(
     image: Picture, box: tuple[int, int, int, int] | None, rows: int, cols: int
 ) -> Picture:
-    top, bottom, left, right = box or (0, image.shape[0], 0, image.shape[1])
+    top, bottom, start, right = box or (0, image.shape[0], 0, image.shape[1])
     padded = np.pad(image, ((rows, rows), (cols, cols), (0, 0)))
     first_row = (top + bottom - rows) // 2 + rows
-    first_col = (left + right - cols) // 2 + cols
+    first_col = (start + right - cols) // 2 + cols
     return np.ascontiguousarray(
         padded[first_row : first_row + rows, first_col : first_col + cols]
     )

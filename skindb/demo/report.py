@@ -88,14 +88,16 @@ class Results:
     def sort_takes(self, takes: Sequence[str]) -> None:
         """Sort the takes, which processes may have finished in any order, into the given order."""
         for name in PER_TAKE:
-            found = getattr(self, name)
-            setattr(self, name, {take: found[take] for take in takes if take in found})
+            results = getattr(self, name)
+            setattr(
+                self, name, {take: results[take] for take in takes if take in results}
+            )
 
-    def add(self, other: Results) -> None:
+    def add(self, results: Results) -> None:
         """Add the results of another process."""
         for name in PER_TAKE:
-            getattr(self, name).update(getattr(other, name))
-        for name, seconds in other.seconds.items():
+            getattr(self, name).update(getattr(results, name))
+        for name, seconds in results.seconds.items():
             self.seconds[name] = self.seconds.get(name, 0.0) + seconds
 
 

@@ -110,13 +110,13 @@ def _make_takes(
     results = Results()
     make = partial(_make_take, out=out, parameters=parameters)
     results.add(make(0, progress=progress))
-    others = range(1, parameters.takes)
-    outcomes = workflow.map_takes(make, others, workers=workers)
-    if others:
-        progress("the other takes", 0, len(others))
+    later = range(1, parameters.takes)
+    outcomes = workflow.map_takes(make, later, workers=workers)
+    if later:
+        progress("the other takes", 0, len(later))
     for i, take_results in enumerate(workflow.results_of(outcomes), 1):
         results.add(take_results)
-        progress("the other takes", i, len(others))
+        progress("the other takes", i, len(later))
     results.sort_takes([person.take for person in default_people()])
     return results
 

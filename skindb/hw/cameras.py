@@ -116,10 +116,12 @@ class FolderCameras:
         That time is compared with when a file came into the folder (`st_ctime`), not
         with the clock of the camera.
         """
-        last = np.inf if since is None else since
-        files = [one for name in self._ids for one in self._files(name)]
+        begin = np.inf if since is None else since
+        files = [file for name in self._ids for file in self._files(name)]
         self._before = {
-            path: status.st_mtime_ns for path, status in files if status.st_ctime < last
+            path: status.st_mtime_ns
+            for path, status in files
+            if status.st_ctime < begin
         }
 
     def collect(self, expected: int, seconds: float) -> dict[str, list[Shot]]:
@@ -243,11 +245,13 @@ def _assignment(
 
 
 def _nearest(
-    at: NDArray[np.float64], due: NDArray[np.float64], reach: float
+    times: NDArray[np.float64], due: NDArray[np.float64], reach: float
 ) -> NDArray[np.int64]:
     """Index of the frame nearest to each due time within reach, -1 if there is none."""
-    right = np.clip(np.searchsorted(at, due), 1, max(len(at) - 1, 1))
+    right = np.clip(np.searchsorted(times, due), 1, max(len(times) - 1, 1))
     before = right - 1
-    right = np.minimum(right, len(at) - 1)
-    index = np.where(np.abs(at[before] - due) <= np.abs(at[right] - due), before, right)
-    return np.where(np.abs(at[index] - due) < reach, index, -1)
+    right = np.minimum(right, len(times) - 1)
+    index = np.where(
+        np.abs(times[before] - due) <= np.abs(times[right] - due), before, right
+    )
+    return np.where(np.abs(times[index] - due) < reach, index, -1)

@@ -294,18 +294,18 @@ class Setup:
     @property
     def exposures(self) -> dict[str, float]:
         """Id of an exposure of the dome -> seconds."""
-        return {str(one["id"]): float(one["seconds"]) for one in self.dome["exposures"]}
+        return _seconds_by_id(self.dome)
 
     @property
     def brackets(self) -> dict[str, float]:
         """Id of an exposure of the probe -> seconds."""
-        return (
-            {}
-            if self.probe is None
-            else {
-                str(one["id"]): float(one["seconds"]) for one in self.probe["exposures"]
-            }
-        )
+        return {} if self.probe is None else _seconds_by_id(self.probe)
+
+
+def _seconds_by_id(device: Mapping[str, Any]) -> dict[str, float]:
+    """Id of an exposure of a device -> seconds."""
+    exposures = device["exposures"]
+    return {str(record["id"]): float(record["seconds"]) for record in exposures}
 
 
 def read_setup(folder: Path) -> Setup:

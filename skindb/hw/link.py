@@ -344,10 +344,10 @@ class Link:
         """Identify the device; raises `DeviceError` unless it has this kind and the
         supported protocol.
         """
-        found = self.request("HELLO")
+        reply = self.request("HELLO")
         greeting = (
-            found.values.get("kind", "an unknown device"),
-            found.values.get("protocol", "?"),
+            reply.values.get("kind", "an unknown device"),
+            reply.values.get("protocol", "?"),
         )
         if greeting != (kind, str(PROTOCOL)):
             rule = f"must be a {kind} with protocol {PROTOCOL}"
@@ -356,7 +356,7 @@ class Link:
                 f"{greeting[0]} with protocol {greeting[1]}",
                 "check which device has which address",
             )
-        return found
+        return reply
 
     def events(self) -> list[Message]:
         """Events since the last call, in order.
@@ -406,11 +406,11 @@ class Link:
 
     def close(self) -> None:
         """Close the port and the log."""
-        own = getattr(self._port, "_socket", None)
+        connection = getattr(self._port, "_socket", None)
         self._port.close()
         # pyserial leaves the socket open if the other end is closed
-        if own is not None:
-            own.close()
+        if connection is not None:
+            connection.close()
         if self._log is not None:
             self._log.close()
 
@@ -587,9 +587,9 @@ class ReplayPort:
         recorded = self._left.pop(0)[2] if self._left else b"nothing more"
         if recorded != data:
             rule = f"the next request of a replay must be {recorded!r}"
-            found = f"{data!r}"
+            finding = f"{data!r}"
             raise DeviceError(
-                Fault(str(self.path), rule, found, "replay it with the same commands")
+                Fault(str(self.path), rule, finding, "replay it with the same commands")
             )
 
     def close(self) -> None:

@@ -131,16 +131,16 @@ class Gauge:
         """Refuse a pressure that was unknown for too long, also if another reading followed."""
         if not age <= MAX_AGE_SECONDS + TIME_PRECISION_SECONDS:
             rule = f"must have a reading of the gauge in the last {MAX_AGE_SECONDS} s"
-            found = f"none for {age:.2f} s" if self.readings else f"none in {age:.2f} s"
-            raise self._link.error(rule, found, "check the gauge and its cable")
+            finding = (
+                f"none for {age:.2f} s" if self.readings else f"none in {age:.2f} s"
+            )
+            raise self._link.error(rule, finding, "check the gauge and its cable")
 
     def _require_pressure(self, t: float, kpa: float) -> None:
         """Refuse suction stronger than wanted, overpressure, which lifts the probe, and leaks."""
-        least = self._target - PRESSURE_TOLERANCE_KPA
-        if not least <= kpa <= PRESSURE_TOLERANCE_KPA:
-            rule = (
-                f"must hold a pressure from {least:g} to {PRESSURE_TOLERANCE_KPA:g} kPa"
-            )
+        lowest = self._target - PRESSURE_TOLERANCE_KPA
+        if not lowest <= kpa <= PRESSURE_TOLERANCE_KPA:
+            rule = f"must hold a pressure from {lowest:g} to {PRESSURE_TOLERANCE_KPA:g} kPa"
             raise self._link.error(
                 rule, f"{kpa:.2f} kPa", "check the pump and the gauge"
             )

@@ -218,9 +218,9 @@ class Override:
             and self.eyes_closed
         )
 
-    def recorded(self, found: Assessment) -> dict[str, Any]:
+    def recorded(self, assessment: Assessment) -> dict[str, Any]:
         """Record that is stored with the capture."""
-        return asdict(self) | {"flashes_per_second": found.flashes_per_second}
+        return asdict(self) | {"flashes_per_second": assessment.flashes_per_second}
 
 
 @dataclass(frozen=True)

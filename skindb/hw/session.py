@@ -277,12 +277,12 @@ def _collect(
     If reports are missing, frames are matched with the whole plan, and only those of
     reported steps are kept.
     """
-    done = reports.measured
-    steps = [i for i, measured in enumerate(done) if measured.triggers > 0]
+    reported = reports.measured
+    steps = [i for i, measured in enumerate(reported) if measured.triggers > 0]
     if not reports.complete:
-        steps += range(len(done), len(part.steps))
+        steps += range(len(reported), len(part.steps))
     times = [part.steps[i].on_us / 1e6 for i in steps]
-    for index, measured in zip(indices, done[: reports.finished], strict=False):
+    for index, measured in zip(indices, reported[: reports.finished], strict=False):
         run.measured[index] = measured
     try:
         timeout = FRAME_SECONDS if reports.complete else LOST_FRAME_SECONDS

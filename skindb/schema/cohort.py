@@ -97,7 +97,7 @@ def attribute_name(name: str) -> str:
 
 
 def take_coords(
-    take: str, about: Mapping[Any, Any], fit: Mapping[Any, Any] | None = None
+    take: str, attrs: Mapping[Any, Any], fit: Mapping[Any, Any] | None = None
 ) -> dict[str, Any]:
     """Coordinates of one take: subject, condition, session, attributes, and the
     parameters of its fit.
@@ -106,28 +106,28 @@ def take_coords(
     ----------
     take
         Name of the take.
-    about
+    attrs
         Attributes of a capture, or of a model.
     fit
         Attributes of its model, if there is one.
     """
-    coords: dict[str, Any] = {"subject": str(about.get("subject", take))}
+    coords: dict[str, Any] = {"subject": str(attrs.get("subject", take))}
     coords |= {
-        "condition": str(about.get("condition", "normal")),
-        "session": about.get("session"),
+        "condition": str(attrs.get("condition", "normal")),
+        "session": attrs.get("session"),
     }
-    traits = {str(name): value for name, value in dict(about.get("traits", {})).items()}
+    traits = {str(name): value for name, value in dict(attrs.get("traits", {})).items()}
     coords |= {
         attribute_name(name): value
         for name, value in traits.items()
         if not isinstance(value, dict | list)
     }
     if fit is not None:
-        used = {
+        parameters = {
             **fit.get("parameters", {}),
             **{name: fit.get(name) for name in ("dictionary", "dictionary_digest")},
         }
-        coords |= {f"fit_{name}": used.get(name) for name in PARAMETERS}
+        coords |= {f"fit_{name}": parameters.get(name) for name in PARAMETERS}
     return coords
 
 
@@ -164,26 +164,26 @@ def combine(
     InputError
         For a variable that no take has.
     """
-    known = list(dict.fromkeys(name for part in parts for name in part.variables))
-    wanted = known if variables is None else list(dict.fromkeys(variables))
-    if unknown := [name for name in wanted if name not in known]:
-        there = f"choose from {', '.join(sorted(known)) or 'none'}"
+    available = list(dict.fromkeys(name for part in parts for name in part.variables))
+    chosen = available if variables is None else list(dict.fromkeys(variables))
+    if unknown := [name for name in chosen if name not in available]:
+        cure = f"choose from {', '.join(sorted(available)) or 'none'}"
         raise InputError(
-            Fault(f"variable {name}", "a cohort has it", "no take with it", there)
+            Fault(f"variable {name}", "a cohort has it", "no take with it", cure)
             for name in unknown
         )
-    labels = _all_labels(parts, wanted)
+    labels = _all_labels(parts, chosen)
     extent = {dim: len(values) for dim, values in labels.items()}
     for part in parts:
         for dim in {
             dim
             for name in part.variables
-            if name in wanted
+            if name in chosen
             for dim in VARIABLES[name].dims
         } - set(labels):
             extent[dim] = max(extent.get(dim, 0), int(part.sizes[dim]))
     extent |= {dim: size for dim, size in (sizes or {}).items() if dim in extent}
-    arrays = {name: _lazy(name, parts, extent, labels) for name in wanted}
+    arrays = {name: _lazy(name, parts, extent, labels) for name in chosen}
     coords: dict[Hashable, Any] = {
         dim: text_labels(values) for dim, values in labels.items()
     }
@@ -199,26 +199,26 @@ def column(values: Sequence[Any]) -> NDArray[Any]:
     """Values of one attribute of takes as an array of numbers, truth values or text;
     NaN where it is missing.
     """
-    known = [value for value in values if value is not None]
-    whole = len(known) == len(values)
-    if known and all(isinstance(value, bool) for value in known):
+    numbers = [value for value in values if value is not None]
+    is_complete = len(numbers) == len(values)
+    if numbers and all(isinstance(value, bool) for value in numbers):
         return (
             np.array(values, bool)
-            if whole
+            if is_complete
             else np.array([np.nan if v is None else v for v in values], object)
         )
-    if known and all(
+    if numbers and all(
         isinstance(value, int | float) and not isinstance(value, bool)
-        for value in known
+        for value in numbers
     ):
         dtype = (
             np.int64
-            if whole and all(isinstance(value, int) for value in known)
+            if is_complete and all(isinstance(value, int) for value in numbers)
             else np.float64
         )
         return np.array([np.nan if value is None else value for value in values], dtype)
     # numbers and words: each stays what it is
-    if any(isinstance(value, int | float) for value in known):
+    if any(isinstance(value, int | float) for value in numbers):
         return np.array(
             [np.nan if value is None else value for value in values], object
         )
@@ -234,20 +234,22 @@ def one_take_each(cohort: xr.Dataset) -> xr.Dataset:
     attribute "skipped".
     """
     subjects, conditions = (
-        [str(one) for one in cohort[name].values.tolist()]
+        [str(subject) for subject in cohort[name].values.tolist()]
         for name in ("subject", "condition")
     )
-    first: dict[str, int] = {}
+    index_by_subject: dict[str, int] = {}
     for i, (subject, condition) in enumerate(zip(subjects, conditions, strict=True)):
         if condition == "normal":
-            first.setdefault(subject, i)
-    others = sorted(set(subjects) - set(first))
-    said = [
+            index_by_subject.setdefault(subject, i)
+    missing = sorted(set(subjects) - set(index_by_subject))
+    lines = [
         *cohort.attrs.get("skipped", []),
-        *(note(who, "no take in the condition normal") for who in others),
+        *(note(subject, "no take in the condition normal") for subject in missing),
     ]
-    picked = cohort.isel({TAKE: sorted(first.values())}).swap_dims({TAKE: "subject"})
-    return picked.assign_attrs(skipped=said)
+    picked = cohort.isel({TAKE: sorted(index_by_subject.values())}).swap_dims(
+        {TAKE: "subject"}
+    )
+    return picked.assign_attrs(skipped=lines)
 
 
 def require_takes(cohort: xr.Dataset, layout: str) -> None:
@@ -256,12 +258,12 @@ def require_takes(cohort: xr.Dataset, layout: str) -> None:
     """
     cure = f'use db.cohort("{layout}")'
     if TAKE not in cohort.dims:
-        found = ", ".join(map(str, cohort.dims)) or "none"
+        dims = ", ".join(map(str, cohort.dims)) or "none"
         raise InputError(
             Fault(
                 "cohort",
                 "must have the dimension take",
-                f"the dimensions {found}",
+                f"the dimensions {dims}",
                 cure,
             )
         )
@@ -293,12 +295,12 @@ def require_same_fit(cohort: xr.Dataset) -> None:
             if value is not None and value == value and value != "":
                 groups.setdefault(str(value), []).append(str(take))
         if len(groups) > 1:
-            found = "; ".join(
+            differences = "; ".join(
                 f"{value} of {few_names(takes)}" for value, takes in groups.items()
             )
             rule = "the takes of a study are fitted with the same parameters"
             cure = "refit them alike, or name the takes that the study is to use"
-            faults.append(Fault(f"parameter {name}", rule, found, cure))
+            faults.append(Fault(f"parameter {name}", rule, differences, cure))
     if faults:
         raise InputError(faults)
 
@@ -310,19 +312,21 @@ def few_names(takes: Sequence[str]) -> str:
     )
 
 
-def _all_labels(parts: Sequence[Part], wanted: Sequence[str]) -> dict[str, list[Any]]:
+def _all_labels(
+    parts: Sequence[Part], variables: Sequence[str]
+) -> dict[str, list[Any]]:
     """Dim -> the labels of all takes, in the order in which they are met."""
-    found: dict[str, dict[Any, None]] = {}
+    labels: dict[str, dict[Any, None]] = {}
     for part in parts:
         dims = {
             dim
             for name in part.variables
-            if name in wanted
+            if name in variables
             for dim in VARIABLES[name].dims
         }
         for dim in sorted(dims & part.labels.keys()):
-            found.setdefault(dim, {}).update(dict.fromkeys(part.labels[dim]))
-    return {dim: list(values) for dim, values in found.items()}
+            labels.setdefault(dim, {}).update(dict.fromkeys(part.labels[dim]))
+    return {dim: list(values) for dim, values in labels.items()}
 
 
 def _lazy(
@@ -334,7 +338,7 @@ def _lazy(
     """A variable of every take, a block for each, whose task carries its own source alone."""
     spec = VARIABLES[name]
     shape = tuple(extent[dim] for dim in spec.dims)
-    whole = _absent(name, ())
+    absent = _absent(name, ())
     places = {
         dim: {value: i for i, value in enumerate(labels[dim])}
         for dim in spec.dims
@@ -343,10 +347,10 @@ def _lazy(
     data = da.map_blocks(  # type: ignore[no-untyped-call]
         _block,
         _one_each([part.source if name in part.variables else None for part in parts]),
-        dtype=whole.dtype,
+        dtype=absent.dtype,
         chunks=((1,) * len(parts), *((size,) for size in shape)),
         new_axis=list(range(1, 1 + len(shape))),
-        meta=np.empty((0,) * (1 + len(shape)), whole.dtype),
+        meta=np.empty((0,) * (1 + len(shape)), absent.dtype),
         variable=name,
         shape=shape,
         places=places,
@@ -375,17 +379,17 @@ def _block(
     """Values (1, ...) of one take in the layout of the cohort."""
     out = _absent(variable, shape)
     if source[0] is not None:
-        found = source[0].read(variable)
-        where: list[Any] = []
-        for dim, size in zip(found.dims, shape, strict=True):
-            if dim in places and dim in found.coords:
-                where.append(
-                    [places[str(dim)][value] for value in found[dim].values.tolist()]
+        values = source[0].read(variable)
+        indices: list[Any] = []
+        for dim, size in zip(values.dims, shape, strict=True):
+            if dim in places and dim in values.coords:
+                indices.append(
+                    [places[str(dim)][value] for value in values[dim].values.tolist()]
                 )
             else:
-                where.append(range(min(found.sizes[dim], size)))
-        inside = found.values[tuple(slice(len(one)) for one in where)]
-        out[np.ix_(*where)] = inside
+                indices.append(range(min(values.sizes[dim], size)))
+        inside = values.values[tuple(slice(len(index)) for index in indices)]
+        out[np.ix_(*indices)] = inside
     return out[None]
 
 

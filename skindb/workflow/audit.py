@@ -118,17 +118,19 @@ def logged_action(
         If another action cannot be logged; it is done all the same.
     """
     running = _logged_databases.get()
-    given = {name: arguments.get(name) for name in RECORDED}
+    recorded = {name: arguments.get(name) for name in RECORDED}
     parameters |= {
-        name: value for name, value in given.items() if isinstance(value, int) and value
+        name: value
+        for name, value in recorded.items()
+        if isinstance(value, int) and value
     }
-    about = {
+    entry = {
         "takes": list(takes),
         "subjects": subjects,
         "counts": counts or {},
         "parameters": parameters,
     }
-    error = None if db in running else _log(db, action, about)
+    error = None if db in running else _log(db, action, entry)
     if error is not None and action not in ERASURES:
         _warn(db, action, error)
     token = _logged_databases.set((*running, db))
@@ -138,7 +140,7 @@ def logged_action(
         _logged_databases.reset(token)
     # which may have freed the space that an entry needs
     if error is not None and action in ERASURES:
-        error = _log(db, action, about)
+        error = _log(db, action, entry)
         if error is not None:
             _warn(db, action, error)
 
@@ -196,14 +198,14 @@ def _takes_of(arguments: Mapping[str, Any]) -> list[str]:
 
 
 def _log(
-    db: Database, action: str, about: Mapping[str, Any]
+    db: Database, action: str, entry: Mapping[str, Any]
 ) -> OSError | InputError | None:
     """Create the entry of an action, or return the error if the action is done all the same."""
     actor = _actor()
     if action not in BEGINNINGS and not {"log", "audit"} & {*(db.names() or ())}:
         return None  # there is no database, as the action itself reports
     try:
-        db.log_action(action, actor=actor, **about)
+        db.log_action(action, actor=actor, **entry)
     except (OSError, InputError) as error:
         if action in CHANGES:
             raise
@@ -236,7 +238,7 @@ def _actor() -> str:
         return f"user {os.getuid()}"
 
 
-def _checked_actor(where: str, actor: str) -> str:
+def _checked_actor(source: str, actor: str) -> str:
     is_valid = (
         actor.isprintable()
         and actor == actor.strip()
@@ -247,5 +249,5 @@ def _checked_actor(where: str, actor: str) -> str:
             f"must be 1 to {MAX_ACTOR_CHARACTERS} characters that can be printed, "
             "without spaces around them"
         )
-        raise InputError(Fault(where, rule, repr(actor)[:200], "choose another name"))
+        raise InputError(Fault(source, rule, repr(actor)[:200], "choose another name"))
     return actor

@@ -277,7 +277,7 @@ def calibrate(
         "fit_falloff": chosen.fit_falloff,
         "position_error": chosen.position_error,
     }
-    about = {
+    provenance = {
         "command": "calibrate",
         "parameters": parameters,
         "seeds": {},
@@ -285,7 +285,7 @@ def calibrate(
     }
     with logged_action(db, "calibrate"), db.stage(CALIBRATION, key) as stage:
         stage.write(groups)
-        return stage.commit(about)
+        return stage.commit(provenance)
 
 
 def calibrated_capture(db: Database, capture: Capture) -> Capture:
@@ -297,19 +297,19 @@ def calibrated_capture(db: Database, capture: Capture) -> Capture:
         return capture
     if not db.has(CALIBRATION, name):
         names = ", ".join(db.takes(CALIBRATION)) or "none"
-        where = f"{capture.folder / 'capture.json'}[calibration]"
+        source = f"{capture.folder / 'capture.json'}[calibration]"
         rule = "the database must hold the calibration that it names"
-        found = f"{name}; calibrations: {names}"
-        raise InputError(Fault(where, rule, found, "run skindb calibrate first"))
+        finding = f"{name}; calibrations: {names}"
+        raise InputError(Fault(source, rule, finding, "run skindb calibrate first"))
     record = db.record(CALIBRATION, name)
     stored = db.read(CALIBRATION, name, generation=record.generation)
     groups = {group: child.to_dataset() for group, child in stored.children.items()}
-    where = f"calibration {name}"
+    source = f"calibration {name}"
     for group, apply in APPLIED.items():
         if dome is not None and group in groups:
-            dome = apply(dome, groups[group], where=where)
+            dome = apply(dome, groups[group], where=source)
     if probe is not None and "probe_calibration" in groups:
-        probe = calibrated_probe(probe, groups["probe_calibration"], where=where)
+        probe = calibrated_probe(probe, groups["probe_calibration"], where=source)
     return replace(capture, dome=dome, probe=probe, calibrated_by=record.as_input())
 
 
@@ -324,7 +324,7 @@ def describe_calibration(db: Database, record: Record) -> dict[str, Any]:
     position = lights[variables.CALIBRATED_INTENSITY_POSITION_ERROR]
     glare = lights[variables.GLARE_FRACTION]
     total = np.sqrt(relative**2 + position**2 + glare**2)
-    about: dict[str, Any] = {
+    description: dict[str, Any] = {
         "lights": lights.sizes["light"],
         "largest_relative_error": float(relative.max()),
         "position_error": float(position.median()),
@@ -337,25 +337,25 @@ def describe_calibration(db: Database, record: Record) -> dict[str, Any]:
         ratio = intensity / before[variables.CALIBRATED_INTENSITY]
         change = abs(ratio - 1).max(dim="channel")
         if change.size:
-            about |= {
+            description |= {
                 "largest_change": float(change.max()),
                 "most_changed": str(change["light"].values[change.values.argmax()]),
             }
     if (positions := groups.get("position_calibration")) is not None:
         errors = positions[variables.CALIBRATED_POSITION_ERROR]
-        about["largest_position_error_mm"] = float(errors.max())
+        description["largest_position_error_mm"] = float(errors.max())
     if (fibres := groups.get("probe_calibration")) is not None:
         errors = (
             fibres[variables.CALIBRATED_FIBRE_GAIN_ERROR]
             / fibres[variables.CALIBRATED_FIBRE_GAIN]
         )
-        about["probe"] = {
+        description["probe"] = {
             "fibres": fibres.sizes["fibre"],
             "largest_relative_error": float(errors.max()),
         }
     if (cameras := groups.get("camera_calibration")) is not None:
-        about["cameras"] = _describe_cameras(cameras)
-    return about | {"ingest_again": takes_of_earlier(db, record)}
+        description["cameras"] = _describe_cameras(cameras)
+    return description | {"ingest_again": takes_of_earlier(db, record)}
 
 
 def _groups(db: Database, record: Record, generation: int) -> dict[str, xr.Dataset]:
@@ -375,13 +375,13 @@ def _describe_cameras(calibration: xr.Dataset) -> dict[str, Any]:
         "edge": variables.EDGE_BLUR,
         "known points": variables.REPROJECTION_RMS,
     }
-    about = dict[str, Any]()
+    description = dict[str, Any]()
     for name, variable in measures.items():
         values = calibration[variable]
         values = values.max(dim=[dim for dim in values.dims if dim != "camera"])
         if count := int(np.isfinite(values).sum()):
-            about[name] = {"cameras": count, variable: float(values.max())}
-    return about
+            description[name] = {"cameras": count, variable: float(values.max())}
+    return description
 
 
 def takes_of_earlier(db: Database, record: Record) -> list[str]:

@@ -80,15 +80,17 @@ def fit_take(
         require_consent({"consent_scope": db.consent(take), "take": take}, "fit")
         read = db.record("capture", take, capture.attrs["generation"])
         derivation = fit_derivation(db, read, requested, dictionary)
-        first = _stored_first_pass(derivation)
-        if first is None:
-            first = first_pass(
+        first_tree = _stored_first_pass(derivation)
+        if first_tree is None:
+            first_tree = first_pass(
                 capture, requested, dictionary=dictionary, progress=progress
             )
-            _store_first_pass(derivation, first, lease)
+            _store_first_pass(derivation, first_tree, lease)
         elif progress is not None:
             progress("first pass of the run before", 1, 1)
-        model = second_pass(capture, first, dictionary=dictionary, progress=progress)
+        model = second_pass(
+            capture, first_tree, dictionary=dictionary, progress=progress
+        )
         model = model_with_summary(model)
         model.attrs |= {
             "seeds": {"fit": model.attrs["parameters"]["seed"]},
@@ -137,10 +139,12 @@ def _stored_first_pass(derivation: Derivation) -> xr.DataTree | None:
     return first_pass_tree
 
 
-def _store_first_pass(derivation: Derivation, first: xr.DataTree, lease: Lease) -> None:
+def _store_first_pass(
+    derivation: Derivation, first_tree: xr.DataTree, lease: Lease
+) -> None:
     """Keep a first pass for the case that the fit is killed; it replaces that of another fit."""
     derivation.db.forget(FIRST_PASS, derivation.key)
-    replace(derivation, kind=FIRST_PASS).commit(first, lease)
+    replace(derivation, kind=FIRST_PASS).commit(first_tree, lease)
 
 
 @logged("fit")

@@ -325,9 +325,9 @@ def _cameras(model: xr.DataTree) -> tuple[Camera, Camera]:
     scale = SIDE_PX / max(frontal.width, frontal.height)
     # beside the nose, on the side away from the light
     place = _nose(model) + np.array([-14.0, -2.0, -14.0])
-    at = frontal.R @ place + frontal.t
-    pixel = (frontal.K @ at)[:2] / at[2]
-    zoom = SIDE_PX / (CLOSE_MM * frontal.K[0, 0] / at[2])
+    seen = frontal.R @ place + frontal.t
+    pixel = (frontal.K @ seen)[:2] / seen[2]
+    zoom = SIDE_PX / (CLOSE_MM * frontal.K[0, 0] / seen[2])
     K = np.diag([zoom, zoom, 1.0]) @ frontal.K
     K[:2, 2] += SIDE_PX / 2 - zoom * pixel
     far = frontal.scaled(scale)
@@ -378,16 +378,18 @@ def view_takes(
         "dictionary": dictionary,
     }
     faces = _faces(db, takes, environment=environment, progress=progress, **options)
-    about: dict[str, Any] = {"path": str(out), "takes": list(takes)}
+    description: dict[str, Any] = {"path": str(out), "takes": list(takes)}
     if out.suffix == ".html":
         [(record, still)] = faces
-        return about | {"bytes": write_page(out, record, still, surroundings=named)}
+        return description | {
+            "bytes": write_page(out, record, still, surroundings=named)
+        }
     write_folder(
         out,
         [PagedFace.of(record, still) for record, still in faces],
         surroundings=named,
     )
-    return about
+    return description
 
 
 @logged("view")
@@ -421,10 +423,10 @@ def view_server(
         If the port is taken.
     """
     named = OVERCAST if environment is None else environment.name
-    made = _faces(db, takes, environment=environment, progress=progress, **options)
+    records = _faces(db, takes, environment=environment, progress=progress, **options)
     faces = {
         take: PagedFace.of(record, still)
-        for take, (record, still) in zip(takes, made, strict=True)
+        for take, (record, still) in zip(takes, records, strict=True)
     }
 
     def index() -> bytes:
@@ -482,16 +484,20 @@ def _faces(
     """Record and still picture of each face, see `view_takes`."""
     report = progress or silent
     around = None if environment is None else Environment.read(environment)
-    for done, take in enumerate(takes):
-        report("view", done, len(takes))
+    for number, take in enumerate(takes):
+        report("view", number, len(takes))
         model = db.read("model", take)
         require_consent({**model.attrs, "take": take}, "export")
         require_fresh(db, "model", take)
-        shown, moved = _moved(db, take, model, traits, study, dictionary)
-        about = _attributes(db, take, model)
+        unedited, moved = _moved(db, take, model, traits, study, dictionary)
+        attributes = _attributes(db, take, model)
         yield (
             face_record(
-                shown, take=take, attributes=about, traits=moved, environment=around
+                unedited,
+                take=take,
+                attributes=attributes,
+                traits=moved,
+                environment=around,
             ),
             still_picture(model),
         )
@@ -537,19 +543,19 @@ def _moved(
     plain = stored_or_moved(db, take, source, dict.fromkeys(traits, 0.0))
     moved = []
     for name, amount in traits.items():
-        whole, half = (
+        full, half = (
             stored_or_moved(db, take, source, {name: part * amount})
             for part in (1.0, 0.5)
         )
-        moved.append(Trait(name, whole, half, amount))
+        moved.append(Trait(name, full, half, amount))
     return plain, tuple(moved)
 
 
 def _attributes(db: Database, take: str, model: xr.DataTree) -> dict[str, Any]:
-    found = {name: model.attrs[name] for name in SHOWN if name in model.attrs}
+    attributes = {name: model.attrs[name] for name in SHOWN if name in model.attrs}
     traits = (
         db.record("capture", take).provenance.get("traits", {})
         if db.has("capture", take)
         else {}
     )
-    return found | (dict(traits) if isinstance(traits, dict) else {})
+    return attributes | (dict(traits) if isinstance(traits, dict) else {})

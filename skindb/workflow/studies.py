@@ -61,14 +61,16 @@ def dictionary_tables(
     dictionary
         Path of the dictionary; default the embedded one.
     """
-    own = embedded_dictionary() if dictionary is None else read_dictionary(dictionary)
-    if list(own.names) != list(names):
-        where = "dictionary"
+    stored = (
+        embedded_dictionary() if dictionary is None else read_dictionary(dictionary)
+    )
+    if list(stored.names) != list(names):
+        source = "dictionary"
         rule = "must be the one the takes were fitted with"
-        found = f"{len(names)} BRDFs, {names[0]} first"
+        finding = f"{len(names)} BRDFs, {names[0]} first"
         cure = "name its folder with --dictionary"
-        raise InputError(Fault(where, rule, found, cure))
-    return convolve_disc(own, disc).table
+        raise InputError(Fault(source, rule, finding, cure))
+    return convolve_disc(stored, disc).table
 
 
 def open_population(
@@ -151,9 +153,9 @@ def _open_maps(
     """Maps of the registered takes; without a probe there is no map of sigma_tr."""
     if not registered:
         rule = "maps need registered takes"
-        found = f"none of {models.sizes['take']} takes has landmarks"
+        finding = f"none of {models.sizes['take']} takes has landmarks"
         cure = "add landmarks to the captures, then ingest and fit them"
-        raise InputError(Fault(db.url, rule, found, cure))
+        raise InputError(Fault(db.url, rule, finding, cure))
     maps = open_maps()
     skipped = [*models.attrs["skipped"], *maps.attrs["skipped"]]
     return maps.assign_attrs(skipped=unique_notes(skipped))
@@ -195,10 +197,10 @@ def require_covered(db: Database, release: str | None) -> None:
     """
     if release is None:
         return
-    known = Lookup(db, release)
+    lookup = Lookup(db, release)
     staleness = Staleness(db)
     records = [
-        known.record("registration", take) for take in known.takes("registration")
+        lookup.record("registration", take) for take in lookup.takes("registration")
     ]
     reasons = [
         reason
@@ -206,10 +208,10 @@ def require_covered(db: Database, release: str | None) -> None:
         for reason in staleness.reasons(record)
         if reason.why != "superseded"
     ]
-    if found := list(dict.fromkeys(map(str, reasons))):
+    if causes := list(dict.fromkeys(map(str, reasons))):
         rule = "the registrations of a release must be covered by consent"
         cure = "run skindb refresh, and make another release"
-        raise InputError(Fault(f"release {release}", rule, "; ".join(found), cure))
+        raise InputError(Fault(f"release {release}", rule, "; ".join(causes), cure))
 
 
 def _registrations(
@@ -220,9 +222,9 @@ def _registrations(
     """
     takes = [str(take) for take in cohort["take"].values]
     if release is not None:
-        known = Lookup(db, release)
-        names = [take for take in takes if known.has("registration", take)]
-        records = {take: known.record("registration", take) for take in names}
+        lookup = Lookup(db, release)
+        names = [take for take in takes if lookup.has("registration", take)]
+        records = {take: lookup.record("registration", take) for take in names}
         origin = "that of the release"
     else:
         able = takes_with_landmarks(db, takes)
@@ -281,8 +283,8 @@ def study(
     requested = _requested(chosen) | {"takes": [*takes], "release": release or ""}
     key = study_key(record, requested, name)
     dictionary = parameters.get("dictionary")
-    used = takes or db.takes("model", release=release)
-    with logged_action(db, "study", used, what=record.name):
+    studied = takes or db.takes("model", release=release)
+    with logged_action(db, "study", studied, what=record.name):
         population, inputs = open_population(
             db, record, takes=takes, release=release, dictionary=dictionary
         )
@@ -321,8 +323,8 @@ def study_key(record: Study, requested: Mapping[str, Any], name: str | None) -> 
         words["adjust"] = "-".join(chosen["adjust"])
     text = "_".join(f"{key}-{value}" for key, value in words.items())
     if not re.fullmatch(STUDY_NAME, text):
-        whole = json.dumps(chosen, sort_keys=True).encode()
-        text = hashlib.sha256(whole).hexdigest()[:16]
+        encoded = json.dumps(chosen, sort_keys=True).encode()
+        text = hashlib.sha256(encoded).hexdigest()[:16]
     return f"{record.name}.{text}"
 
 
@@ -376,15 +378,15 @@ def _record(what: str) -> Study:
 def _parameters(record: Study, options: Mapping[str, Any]) -> Any:
     """The parameters of a study as its record, checked."""
     specs = {spec.name: spec for spec in fields(record.parameters)}
-    where = f"study {record.name}"
+    place = f"study {record.name}"
     if unknown := sorted(options.keys() - specs.keys()):
         rule = f"its parameters are {', '.join(specs) or 'none'}"
-        raise InputError(Fault(where, rule, ", ".join(unknown), "omit the others"))
+        raise InputError(Fault(place, rule, ", ".join(unknown), "omit the others"))
     required = [name for name, spec in specs.items() if spec.default is MISSING]
     if missing := [name for name in required if options.get(name) is None]:
         names = " and ".join(missing)
         raise InputError(
-            Fault(where, f"needs {names}", "none", f"give {names}, such as 'gender'")
+            Fault(place, f"needs {names}", "none", f"give {names}, such as 'gender'")
         )
     chosen = dict(options)
     if isinstance(chosen.get("adjust"), str):
@@ -425,7 +427,9 @@ def _derivation(
     outdated = list(cohort.attrs["outdated"])
     notes = [*skipped, *outdated, *population.notes]
     names = {note["take"] for note in notes if note["take"]}
-    names.update(requested["takes"], *({used.take, *used.names} for used in inputs))
+    names.update(
+        requested["takes"], *({source.take, *source.names} for source in inputs)
+    )
     return Derivation.of(
         db,
         STUDY,

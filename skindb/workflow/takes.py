@@ -207,9 +207,9 @@ def _attempt(function: Callable[[Take], Result], take: Take) -> Outcome[Take, Re
     except InputError as error:
         return Outcome(take, error=error)
     except OSError as error:  # plain, so that it can be pickled whatever it was
-        where = error.filename if error.filename is None else str(error.filename)
+        filename = error.filename if error.filename is None else str(error.filename)
         return Outcome(
-            take, error=OSError(error.errno, error.strerror or str(error), where)
+            take, error=OSError(error.errno, error.strerror or str(error), filename)
         )
     # a defect that one take shows must not stop the others
     except (Exception, SystemExit) as error:  # noqa: BLE001

@@ -158,13 +158,13 @@ def repeat_study(
         If this version of skindb does not know the study or one of its parameters, or as the study.
     """
     options = dict(parameters)
-    what = str(options.pop("what", ""))
+    study_name = str(options.pop("what", ""))
     name = key.partition(".")[2]
     rule = "a study must be one that this version of skindb can compute"
     cure = "run skindb analyze"
-    if what not in STUDIES:
-        raise InputError(Fault(key, rule, f"the study {what!r}", cure))
-    accepted = {spec.name for spec in fields(STUDIES[what].parameters)}
+    if study_name not in STUDIES:
+        raise InputError(Fault(key, rule, f"the study {study_name!r}", cure))
+    accepted = {spec.name for spec in fields(STUDIES[study_name].parameters)}
     if unknown := sorted(options.keys() - {*accepted, "takes", "release"}):
         raise InputError(Fault(key, rule, f"the parameters {', '.join(unknown)}", cure))
     release = options.pop("release", "") or None
@@ -183,7 +183,7 @@ def repeat_study(
         options["group_by"] = options["group_by"] or None
     if "dictionary" in accepted:
         options["dictionary"] = dictionary
-    results = study(db, what, **options)
+    results = study(db, study_name, **options)
     return db.record(STUDY, key, results.attrs["generation"])
 
 
