@@ -12,6 +12,7 @@ import pytest
 import skindb
 from skindb.fit.model import second_pass
 from skindb.workflow import derive as module
+from skindb.workflow import takes
 from skindb.workflow.derive import code_digest, code_symbols
 from skindb.workflow.takes import package_digest
 
@@ -167,6 +168,7 @@ def test_code_symbols__of_a_fit_are_science_with_its_kernels():
 
 
 def test_package_digest__changes_with_every_byte(package, monkeypatch):
+    monkeypatch.setattr(takes, "ROOT", package)
     package_digest.cache_clear()
     before = package_digest()
     (package / "science/model.py").write_text(FILES["science/model.py"] + "#")
