@@ -72,7 +72,7 @@ def of_scan(ingested: xr.DataTree, truth: Truth) -> Iterator[Row]:
         truth["vertices"].astype(float), truth["faces"].astype(int), position[chosen]
     )
     meaning = f"distance of {count:,} surfels from the true surface"
-    yield "scan, subdivision", f"{quantiles(distance)} mm", meaning
+    yield "scan, subdivision", quantiles(distance, "mm"), meaning
 
 
 def of_lights(ingested: xr.DataTree, truth: Truth) -> Iterator[Row]:
@@ -122,7 +122,7 @@ def of_model(model: xr.DataTree, truth: Truth) -> Iterator[Row]:
     yield "diffuse albedo", error, "fitted surfels, R G B"
     if "held_out_error" in model["fitted"]:
         held_out = model["fitted/held_out_error"].values
-        error = f"{quantiles(100 * held_out[np.isfinite(held_out)])} %"
+        error = quantiles(100 * held_out[np.isfinite(held_out)], "%")
         yield "surface BRDF", error, "samples of held-out lights"
     if summary["sigma_tr_percent"]:
         sites = "; ".join(
@@ -182,8 +182,11 @@ def of_visibility(surfels: xr.Dataset, truth: Truth, dome: DomeRecord) -> Iterat
         yield f"visibility, {kind}s", error, meaning
 
 
-def quantiles(x: NDArray) -> str:
-    return f"{np.median(x):.3g} median, {np.quantile(x, 0.95):.3g} at 95"
+def quantiles(x: NDArray, unit: str) -> str:
+    """Median and 95 % quantile."""
+    return (
+        f"{np.median(x):.3g} {unit} median, {np.quantile(x, 0.95):.3g} {unit} at 95 %"
+    )
 
 
 def relative(off: NDArray) -> str:

@@ -169,10 +169,16 @@ def normals_curves(quick: bool) -> list[Curve]:
     scan = skin.lumitexels[variables.SURFEL_NORMAL].values
     angle = float(np.median(_angles(scan, skin.normal)))
     points.append(Point("normals of the scan", "", np.nan, angle))
-    reference = f"true normals of samples of the model, {NOISE:.0%} noise"
-    error = "median angle [degree]"
-    base = f"peak, {domes[-1][0]}"
-    return [Curve("normals", error, reference, "a surfel", base, points)]
+    return [
+        Curve(
+            kernel="normals",
+            error_of="median angle [degree]",
+            reference=f"true normals of samples of the model, {NOISE:.0%} noise",
+            seconds_of="a surfel",
+            base=f"peak, {domes[-1][0]}",
+            points=points,
+        )
+    ]
 
 
 def _normals(skin: ModelSamples, method: str, samples: str) -> Point:
@@ -208,10 +214,16 @@ def albedo_curves(quick: bool) -> list[Curve]:
     for k in (0, 8, 32) if quick else (0, 1, 4, 8, 16, 32, 64):
         rule = {"method": "minimum", "discard": k}
         points.append(_albedo(skin, "minimum by discard", f"{k} discarded", **rule))
-    reference = f"true R_d of samples of the model, {NOISE:.0%} noise, true normals"
-    error = "median relative error of R_d"
-    base = f"minimum, {samples}"
-    return [Curve("albedo", error, reference, "a surfel", base, points)]
+    return [
+        Curve(
+            kernel="albedo",
+            error_of="median relative error of R_d",
+            reference=f"true R_d of samples of the model, {NOISE:.0%} noise, true normals",
+            seconds_of="a surfel",
+            base=f"minimum, {samples}",
+            points=points,
+        )
+    ]
 
 
 def _albedo(skin: ModelSamples, name: str, samples: str, **options: Any) -> Point:
@@ -265,21 +277,37 @@ def exposures_curves(quick: bool) -> list[Curve]:
         name = "longest exposure that is not saturated"
         usable = np.asarray(np.isfinite(longest).all(-1))
         points.append(_radiance(name, count, seconds, longest, truth, usable))
-    medium = SHORTEST * STEP**2
-    frame = sensor.expose(truth * np.float32(medium), still, rng=rng)
-    single, _, flag = merge_exposures([frame], (medium,), record)
+    medium = (SHORTEST * STEP**2,)
+    frame = sensor.expose(truth * np.float32(medium[0]), still, rng=rng)
+    points.append(_one_exposure(frame, medium, record, truth))
+    return [
+        Curve(
+            kernel="exposures",
+            error_of=(
+                "median relative error of radiance from 1e-3 to 10 (white after 1 s at 1)"
+            ),
+            reference="radiance given to a virtual sensor",
+            seconds_of="a pixel",
+            base="skindb merge_exposures, 1 exposure",
+            points=points,
+        )
+    ]
+
+
+def _one_exposure(
+    frame: NDArray[np.uint16],
+    times: tuple[float, ...],
+    record: SensorRecord,
+    truth: Array,
+) -> Point:
+    radiance, _, flag = merge_exposures([frame], times, record)
+    usable = np.asarray(flag == OK)
     failure = (
-        f"{(flag != OK).mean():.0%} of the pixels are white or black: one exposure "
-        "does not cover four decades"
+        f"{1 - usable.mean():.0%} of the pixels are white or black: one exposure does "
+        "not cover four decades"
     )
     name = "one medium exposure"
-    points.append(_radiance(name, 1, np.nan, single, truth, flag == OK, failure))
-    error_of = (
-        "median relative error of radiance from 1e-3 to 10 (white after 1 s at 1)"
-    )
-    reference = "radiance given to a virtual sensor"
-    base = "skindb merge_exposures, 1 exposure"
-    return [Curve("exposures", error_of, reference, "a pixel", base, points)]
+    return _radiance(name, 1, np.nan, radiance, truth, usable, failure)
 
 
 def _longest_exposure(

@@ -47,8 +47,16 @@ def pyramid_curves(quick: bool) -> list[Curve]:
         if find_spec("pyrtools"):
             seconds, back = cpu_time(partial(_round_trip_of_pyrtools, image), size**2)
             points.append(Point("pyrtools", setting, seconds, _largest(back - image)))
-    error = "largest error of a round trip"
-    return [Curve("pyramid", error, "the image", "an entry", points[0].name, points)]
+    return [
+        Curve(
+            kernel="pyramid",
+            error_of="largest error of a round trip",
+            reference="the image",
+            seconds_of="an entry",
+            base=points[0].name,
+            points=points,
+        )
+    ]
 
 
 def _fourier_round_trip(image: Array) -> Array:
@@ -94,9 +102,16 @@ def textures_curves(quick: bool) -> list[Curve]:
         off = (_quantiles(result, levels) - goal) ** 2
         error = float(np.sqrt(off.mean() / (shift**2).mean()))
         points.append(Point("skindb", f"{iterations} iterations", seconds, error))
-    name = "RMS difference of quantiles over that of the source"
-    base = "skindb, 5 iterations"
-    return [Curve("textures", name, "a planted texture", "an entry", base, points)]
+    return [
+        Curve(
+            kernel="textures",
+            error_of="RMS difference of quantiles over that of the source",
+            reference="a planted texture",
+            seconds_of="an entry",
+            base="skindb, 5 iterations",
+            points=points,
+        )
+    ]
 
 
 def components_curves(quick: bool) -> list[Curve]:
@@ -120,9 +135,17 @@ def components_curves(quick: bool) -> list[Curve]:
         seconds, principal = cpu_time(work)
         error = _axes_off(principal.axes, exact)
         points.append(Point("skindb", setting, seconds, error))
-    label = f"largest difference of {AXES} axes of {TAKES} vectors of {length:,}"
     base = "scikit-learn, full"
-    return [Curve("components", label, base, "an analysis", base, points)]
+    return [
+        Curve(
+            kernel="components",
+            error_of=f"largest difference of {AXES} axes of {TAKES} vectors of {length:,}",
+            reference=base,
+            seconds_of="an analysis",
+            base=base,
+            points=points,
+        )
+    ]
 
 
 def permutations_curves(quick: bool) -> list[Curve]:
@@ -150,10 +173,16 @@ def permutations_curves(quick: bool) -> list[Curve]:
     name = "SciPy permutation_test of Welch's statistic, which differs from HC3's"
     setting = f"{draws} permutations"
     points.append(Point(name, setting, seconds, _largest(p - exact)))
-    error = "largest error of a p value"
-    reference = f"{exact_draws:,} permutations"
-    base = "skindb, 1000 permutations"
-    return [Curve("permutations", error, reference, "a test", base, points)]
+    return [
+        Curve(
+            kernel="permutations",
+            error_of="largest error of a p value",
+            reference=f"{exact_draws:,} permutations",
+            seconds_of="a test",
+            base="skindb, 1000 permutations",
+            points=points,
+        )
+    ]
 
 
 def _p_values_of_scipy(values: Array, group: Array, draws: int) -> Array:

@@ -103,9 +103,16 @@ def inverse_curves(quick: bool) -> list[Curve]:
             "alpha' in single precision", seconds, from_single / exact, single_fails
         ),
     ]
-    label = f"largest relative error of s over {count} R_d from 1e-6 to 1 - 1e-9"
-    reference = "mpmath, 40 digits"
-    return [Curve("inverse", label, reference, "a value", brentq_name, points)]
+    return [
+        Curve(
+            kernel="inverse",
+            error_of=f"largest relative error of s over {count} R_d from 1e-6 to 1 - 1e-9",
+            reference="mpmath, 40 digits",
+            seconds_of="a value",
+            base=brentq_name,
+            points=points,
+        )
+    ]
 
 
 def _inverse(name: str, seconds: float, ratio: Array, failure: str = "") -> Point:
@@ -181,10 +188,16 @@ def transport_curves(quick: bool) -> list[Curve]:
             name = f"moments of degree {degree}"
             points.append(_profile(name, setting, seconds, mean, walked))
     distances = ", ".join(f"{d:g}" for d in DISTANCE)
-    label = f"RMS over {distances} mean free paths of the relative error of R(r)"
-    noise = f"random walk of {walk.packets:,} photons, with the noise `walk_noise`"
-    base = "skindb dipole, albedo 0.9"
-    return [Curve("transport", label, noise, "a distance", base, points)]
+    return [
+        Curve(
+            kernel="transport",
+            error_of=f"RMS over {distances} mean free paths of the relative error of R(r)",
+            reference=f"random walk of {walk.packets:,} photons, with the noise `walk_noise`",
+            seconds_of="a distance",
+            base="skindb dipole, albedo 0.9",
+            points=points,
+        )
+    ]
 
 
 def across(middle: Array, width: float = WIDTH) -> Array:
@@ -262,12 +275,18 @@ def probe_curves(quick: bool) -> list[Curve]:
                 setting = f"{fibres} fibres"
                 error = float(np.sqrt(np.nanmean(off**2)))
                 points.append(Point(name, setting, seconds, error, failure, details))
-    label = f"RMS over {len(skin)} kinds of skin of the relative error of sigma_tr"
-    reference = (
-        f"random walk of {walk.packets:,} photons through media of known coefficients"
-    )
-    base = f"skindb dipole, gain known, {len(FIBRES)} fibres"
-    return [Curve("probe", label, reference, "a profile", base, points)]
+    return [
+        Curve(
+            kernel="probe",
+            error_of=f"RMS over {len(skin)} kinds of skin of the relative error of sigma_tr",
+            reference=(
+                f"random walk of {walk.packets:,} photons through media of known coefficients"
+            ),
+            seconds_of="a profile",
+            base=f"skindb dipole, gain known, {len(FIBRES)} fibres",
+            points=points,
+        )
+    ]
 
 
 def _fits(
@@ -327,14 +346,26 @@ def subsurface_curves(quick: bool) -> list[Curve]:
     base = f"every pair by NumPy, {spacings[0]} mm"
     scene = f"{LIGHTS} lights on a ball of {RADIUS:g} mm"
     error = "RMS error of the exitance over its RMS"
-    same = f"every pair of the same points ({RECEIVERS} receivers)"
-    finer = (
-        f"every pair of points {fine} mm apart, so that the error of the spacing is "
-        "included"
-    )
     return [
-        Curve("subsurface", error, same, scene, base, tree),
-        Curve("subsurface", error, finer, scene, base, spaced),
+        Curve(
+            kernel="subsurface",
+            error_of=error,
+            reference=f"every pair of the same points ({RECEIVERS} receivers)",
+            seconds_of=scene,
+            base=base,
+            points=tree,
+        ),
+        Curve(
+            kernel="subsurface",
+            error_of=error,
+            reference=(
+                f"every pair of points {fine} mm apart, so that the error of the spacing is "
+                "included"
+            ),
+            seconds_of=scene,
+            base=base,
+            points=spaced,
+        ),
     ]
 
 

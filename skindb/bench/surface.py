@@ -239,7 +239,16 @@ def _both_spaces(
                 p.method, p.parameter, p.seconds, errors[i], p.failure, details
             )
             points.append(point)
-        curves.append(Curve(kernel, label, reference, "a surfel", base, points))
+        curves.append(
+            Curve(
+                kernel=kernel,
+                error_of=label,
+                reference=reference,
+                seconds_of="a surfel",
+                base=base,
+                points=points,
+            )
+        )
     return curves
 
 
@@ -321,11 +330,6 @@ def nmf_curves(quick: bool) -> list[Curve]:
             seconds, factors = cpu_time(partial(_by_scikit, X, solver, steps))
             method = f"scikit-learn {solver}"
             results.append((method, f"{steps} iterations", seconds, factors))
-    reference = (
-        f"{len(X)} planted mixtures of {COMPONENTS} with 20 % scatter, so that the "
-        "error cannot be zero"
-    )
-    base = "scikit-learn cd, 200 iterations"
     curves = []
     for name, metric in (("weights", np.eye(len(gram))), ("BRDFs", gram)):
         points = [
@@ -333,7 +337,19 @@ def nmf_curves(quick: bool) -> list[Curve]:
             for method, setting, seconds, factors in results
         ]
         error = f"|X - W H| / |X| between {name}"
-        curves.append(Curve("nmf", error, reference, "a factorisation", base, points))
+        curves.append(
+            Curve(
+                kernel="nmf",
+                error_of=error,
+                reference=(
+                    f"{len(X)} planted mixtures of {COMPONENTS} with 20 % scatter, so that the "
+                    "error cannot be zero"
+                ),
+                seconds_of="a factorisation",
+                base="scikit-learn cd, 200 iterations",
+                points=points,
+            )
+        )
     return curves
 
 
@@ -393,11 +409,18 @@ def disc_curves(quick: bool) -> list[Curve]:
     failure = "a lamp is not a point, so sharp lobes become too high and too narrow"
     points.append(Point("no convolution", "", np.nan, error, failure))
     count = len(nodes[0])
-    label = f"relative RMS error at {count} nodes, worst of {len(names)} materials"
-    reference = (
-        "averages of interpolated values over a dense disc around either direction"
-    )
-    return [Curve("disc", label, reference, f"{len(names)} tables", base, points)]
+    return [
+        Curve(
+            kernel="disc",
+            error_of=f"relative RMS error at {count} nodes, worst of {len(names)} materials",
+            reference=(
+                "averages of interpolated values over a dense disc around either direction"
+            ),
+            seconds_of=f"{len(names)} tables",
+            base=base,
+            points=points,
+        )
+    ]
 
 
 def _relative_errors(values: Array, exact: Array) -> Array:
