@@ -12,7 +12,7 @@ from skindb.fit.lumitexels import disc_angle, lumitexels
 from skindb.parameters import FitParameters
 from skindb.reflectance.dictionary import Dictionary
 from skindb.reflectance.kinds import unfitted_model
-from skindb.reflectance.model import ReflectanceModel
+from skindb.reflectance.model import FitRequest, ReflectanceModel
 from skindb.schema.notes import Omission, explain
 from skindb.types import Mask
 
@@ -126,12 +126,12 @@ def surface_of(
     InputError
         If the model cannot have as many components as asked for.
     """
-    return unfitted_model(
-        parameters.surface,
-        dictionary,
+    request = FitRequest(
+        parameters.eta,
         disc_angle(lumitexels),
-        rank=parameters.rank,
-        mode=parameters.mode,
-        k=parameters.k,
-        eta=parameters.eta,
+        parameters.mode,
+        parameters.rank,
+        parameters.k,
+        dictionary,
     )
+    return unfitted_model(parameters.surface, request)

@@ -22,9 +22,20 @@ from skindb.reflectance.model import (
     SurfaceFit,
 )
 from skindb.reflectance.tables import Table
+from skindb.schema import variables
 from skindb.types import Array
 
 MODES = ("linear", "perceptual", "paper")  # in the order of `_lumitexel_kernels`
+# that any model has after a first pass, in the order of `SurfaceFit` after its parameters
+FIT_VARIABLES = (
+    variables.KKT_RESIDUAL,
+    variables.FIT_RESIDUAL,
+    variables.FIT_RESIDUAL_PERCEPTUAL,
+    variables.FIT_CONDITION,
+    variables.FIT_SAMPLES,
+    variables.FIT_ITERATIONS,
+    variables.FIT_STATUS,
+)
 NO_TABLE = np.zeros((2, 2, 1, 0), np.float32)
 
 

@@ -12,12 +12,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from skindb.errors import Fault, InputError
 from skindb.optics.fresnel import fresnel_reflectance
 from skindb.reflectance import _ggx_kernels
 from skindb.reflectance._ggx_kernels import (
@@ -28,6 +29,7 @@ from skindb.reflectance._ggx_kernels import (
 )
 from skindb.reflectance.basis import fitted_surfels
 from skindb.reflectance.block import (
+    FIT_VARIABLES,
     empty_fit,
     empty_judgement,
     kernel_block,
@@ -37,6 +39,7 @@ from skindb.reflectance.block import (
 from skindb.reflectance.model import (
     Block,
     Comparison,
+    FitRequest,
     JudgedFit,
     Judgement,
     Lamp,
@@ -45,21 +48,10 @@ from skindb.reflectance.model import (
 )
 from skindb.reflectance.sampling import COSINE_FRACTION, MIN_COSINE_HALF, tangents
 from skindb.reflectance.tables import Table, tabulate
-from skindb.schema import check, dataset
+from skindb.schema import check, dataset, variables
 from skindb.schema.notes import Omission
 from skindb.types import Array
 
-PARAMETERS = ("lobe_strength", "lobe_roughness")
-FIT_VARIABLES = (
-    *PARAMETERS,
-    "kkt_residual",
-    "fit_residual",
-    "fit_residual_perceptual",
-    "fit_condition",
-    "fit_samples",
-    "fit_iterations",
-    "fit_status",
-)
 MIN_COSINE_LOBE = (
     1e-3  # below it values continue, as tables have nodes below the horizon
 )
@@ -104,14 +96,29 @@ def _normal_albedo(index: float) -> tuple[Array, Array]:
 class GGX:
     """GGX lobes with a common refractive index of their Fresnel term."""
 
+    BASIS_VARIABLE: ClassVar[str] = variables.LOBE_INDEX
+    PARAMETERS: ClassVar[tuple[str, ...]] = (
+        variables.LOBE_STRENGTH,
+        variables.LOBE_ROUGHNESS,
+    )
     index: float = 1.3
     disc_angular_radius: float = 0.0  # rad, of the lights whose width the lobes include
 
     @classmethod
+    def unfitted(cls, request: FitRequest) -> GGX:
+        """The model before a fit; there is none in the mode "paper"."""
+        if request.mode == "paper":
+            rule = 'the surface "ggx" is fitted in the mode "perceptual" or "linear"'
+            cure = "choose another mode"
+            raise InputError(Fault("mode", rule, request.mode, cure))
+        return cls(request.eta, request.disc_angular_radius)
+
+    @classmethod
     def of_basis(cls, basis: xr.Dataset) -> GGX:
         """The model in the group "basis"."""
-        check(basis, ("lobe_index", "disc_angular_radius"), where="basis")
-        return cls(float(basis["lobe_index"]), float(basis["disc_angular_radius"]))
+        names = (variables.LOBE_INDEX, variables.DISC_ANGULAR_RADIUS)
+        check(basis, names, where="basis")
+        return cls(*(float(basis[name]) for name in names))
 
     @property
     def disc_included(self) -> bool:
@@ -121,12 +128,12 @@ class GGX:
     @property
     def parameter_variables(self) -> tuple[str, ...]:
         """Variables of strength and roughness."""
-        return PARAMETERS
+        return self.PARAMETERS
 
     @property
     def fit_variables(self) -> tuple[str, ...]:
         """Variables from `fit`."""
-        return FIT_VARIABLES
+        return (*self.PARAMETERS, *FIT_VARIABLES)
 
     @property
     def labels(self) -> dict[str, tuple[str, ...]]:
@@ -150,7 +157,7 @@ class GGX:
 
     def parameters_of(self, fitted: xr.Dataset) -> Array:
         """Strength and roughness (n, 2)."""
-        return np.column_stack([fitted[name].values for name in PARAMETERS])
+        return np.column_stack([fitted[name].values for name in self.PARAMETERS])
 
     def fit(self, block: Block, comparison: Comparison) -> SurfaceFit:
         """Strength and roughness of n surfels."""
@@ -161,7 +168,7 @@ class GGX:
 
     def fit_columns(self, fit: SurfaceFit) -> dict[str, Array]:
         """Variables of a fit."""
-        return dict(zip(FIT_VARIABLES, [*fit.parameters.T, *fit[1:]], strict=True))
+        return dict(zip(self.fit_variables, [*fit.parameters.T, *fit[1:]], strict=True))
 
     def reduced(
         self,
@@ -171,10 +178,10 @@ class GGX:
         rng: np.random.Generator,  # noqa: ARG002
     ) -> xr.Dataset:
         """The refractive index; lobes have no components."""
-        fitted_surfels(fitted, PARAMETERS)
+        fitted_surfels(fitted, self.PARAMETERS)
         shared = {
-            "lobe_index": self.index,
-            "disc_angular_radius": self.disc_angular_radius,
+            variables.LOBE_INDEX: self.index,
+            variables.DISC_ANGULAR_RADIUS: self.disc_angular_radius,
         }
         return dataset(shared)
 
@@ -206,12 +213,12 @@ class GGX:
         gradient = np.stack([self._albedo(roughness), strength * slope], axis=1)
         variance = np.einsum("nj,njk,nk->n", gradient, judged.covariance, gradient)
         return {
-            "lobe_strength": strength,
-            "lobe_roughness": roughness,
-            "lobe_strength_error": error[:, STRENGTH],
-            "lobe_roughness_error": error[:, ROUGHNESS],
-            "surface_reflectance": self.normal_reflectance(judged.parameters),
-            "surface_reflectance_error": np.sqrt(variance),
+            variables.LOBE_STRENGTH: strength,
+            variables.LOBE_ROUGHNESS: roughness,
+            variables.LOBE_STRENGTH_ERROR: error[:, STRENGTH],
+            variables.LOBE_ROUGHNESS_ERROR: error[:, ROUGHNESS],
+            variables.SURFACE_REFLECTANCE: self.normal_reflectance(judged.parameters),
+            variables.SURFACE_REFLECTANCE_ERROR: np.sqrt(variance),
         }
 
     def shade(self, points: Points, lamp: Lamp, *, eta: float) -> NDArray[np.float32]:

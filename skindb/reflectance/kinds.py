@@ -7,57 +7,25 @@ from collections.abc import Container
 import xarray as xr
 
 from skindb.errors import Fault, InputError
-from skindb.reflectance.dictionary import Dictionary, disc_dictionary
 from skindb.reflectance.ggx import GGX
-from skindb.reflectance.ggx import PARAMETERS as LOBE_VARIABLES
 from skindb.reflectance.mixture import Mixture
-from skindb.reflectance.model import ReflectanceModel
+from skindb.reflectance.model import FitRequest, ReflectanceModel, SurfaceKind
 from skindb.reflectance.tables import DEFAULT_GRID, brdf_coords, stored_brdf
-from skindb.schema import check, dataset
+from skindb.schema import check, dataset, variables
+
+# by the option `surface` of a fit
+SURFACES: dict[str, SurfaceKind] = {"mixture": Mixture, "ggx": GGX}
 
 
-def unfitted_model(
-    kind: str,
-    dictionary: Dictionary | None,
-    disc_angular_radius: float,
-    *,
-    rank: int,
-    mode: str,
-    k: int,
-    eta: float,
-) -> ReflectanceModel:
-    """The surface model of the first pass of a fit.
-
-    Parameters
-    ----------
-    kind
-        "mixture" of BRDFs of a dictionary, or "ggx": one analytic lobe.
-    dictionary
-        BRDFs for point lights; default the embedded 59.
-    disc_angular_radius
-        Of the lights as seen from the surfels [rad].
-    rank, mode
-        Rank of the reduced dictionary, and "perceptual", "linear" or "paper".
-    k
-        Components that the model is reduced to after the first pass.
-    eta
-        Refractive index of skin, also that of the lobe.
+def unfitted_model(kind: str, request: FitRequest) -> ReflectanceModel:
+    """The surface model of the first pass of a fit, by its name in `SURFACES`.
 
     Raises
     ------
     InputError
-        If the dictionary has fewer than k BRDFs.
+        If the model cannot be fitted as requested.
     """
-    if kind == "ggx":
-        if mode == "paper":
-            rule = 'the surface "ggx" is fitted in the mode "perceptual" or "linear"'
-            raise InputError(Fault("mode", rule, mode, "choose another mode"))
-        return GGX(eta, disc_angular_radius)
-    tables = disc_dictionary(dictionary, disc_angular_radius)
-    if k > len(tables.names):  # checked before the fit
-        rule = f"a reduced basis of this dictionary has 1 to {len(tables.names)} components"
-        raise InputError(Fault("k", rule, str(k), "choose a smaller k"))
-    return Mixture.of_dictionary(tables, rank=rank, mode=mode)
+    return SURFACES[kind].unfitted(request)
 
 
 def surface_model(basis: xr.Dataset) -> ReflectanceModel:
@@ -68,12 +36,18 @@ def surface_model(basis: xr.Dataset) -> ReflectanceModel:
     InputError
         If the group does not fit the schema.
     """
-    return GGX.of_basis(basis) if "lobe_index" in basis else Mixture.of_basis(basis)
+    for surface in SURFACES.values():
+        if surface.BASIS_VARIABLE in basis:
+            return surface.of_basis(basis)
+    return Mixture.of_basis(basis)  # raises the fault
 
 
 def parameter_variables(fitted: xr.Dataset) -> tuple[str, ...]:
     """Variables of the group "fitted" with the parameters of its surface model."""
-    return LOBE_VARIABLES if LOBE_VARIABLES[0] in fitted else ("basis_weight",)
+    for surface in SURFACES.values():
+        if surface.PARAMETERS[0] in fitted:
+            return surface.PARAMETERS
+    return Mixture.PARAMETERS
 
 
 def as_mixture(model: xr.DataTree) -> xr.DataTree:
@@ -91,7 +65,7 @@ def as_mixture(model: xr.DataTree) -> xr.DataTree:
     mixed = dataset({"basis_weight": weights}, coords={"component": names})
     shared = dataset(
         {
-            "basis_brdf": stored_brdf(tables),
+            variables.BASIS_BRDF: stored_brdf(tables),
             "disc_angular_radius": basis["disc_angular_radius"].values,
         },
         coords={"component": names, **brdf_coords(DEFAULT_GRID)},

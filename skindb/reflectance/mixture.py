@@ -6,12 +6,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from skindb.errors import Fault, InputError
 from skindb.reflectance._block_kernels import Tables, fit_block, judge_block
 from skindb.reflectance.basis import reduce_basis
 from skindb.reflectance.block import (
@@ -22,10 +23,11 @@ from skindb.reflectance.block import (
     kernel_options,
     shade_tables,
 )
-from skindb.reflectance.dictionary import Dictionary
+from skindb.reflectance.dictionary import Dictionary, disc_dictionary
 from skindb.reflectance.model import (
     Block,
     Comparison,
+    FitRequest,
     JudgedFit,
     Judgement,
     Lamp,
@@ -40,19 +42,19 @@ from skindb.reflectance.tables import (
     kernel_tables,
     pad_to_lanes,
 )
-from skindb.schema import FitStatus, check
+from skindb.schema import FitStatus, check, variables
 from skindb.schema.notes import Omission
 from skindb.types import Array, Float64
 
-FIT_VARIABLES = (  # in the order of `SurfaceFit`
-    "dictionary_weight",
-    "kkt_residual",
-    "dictionary_residual",
-    "dictionary_residual_perceptual",
-    "fit_condition",
-    "fit_samples",
-    "fit_iterations",
-    "fit_status",
+DICTIONARY_VARIABLES = (  # in the order of `SurfaceFit`
+    variables.DICTIONARY_WEIGHT,
+    variables.KKT_RESIDUAL,
+    variables.DICTIONARY_RESIDUAL,
+    variables.DICTIONARY_RESIDUAL_PERCEPTUAL,
+    variables.FIT_CONDITION,
+    variables.FIT_SAMPLES,
+    variables.FIT_ITERATIONS,
+    variables.FIT_STATUS,
 )
 MAX_LOG_SCALE = np.log(1e9)  # tables within this factor of 1 are used without scaling
 
@@ -65,6 +67,8 @@ class Mixture:
     cube roots of the BRDFs.
     """
 
+    BASIS_VARIABLE: ClassVar[str] = variables.BASIS_BRDF
+    PARAMETERS: ClassVar[tuple[str, ...]] = (variables.BASIS_WEIGHT,)
     table: Table  # (nh, nd, np, r) sr^-1
     lift: Array | None = None  # (r, m) from the reduced space; None: the identity
     disc_angular_radius: float = 0.0  # rad, of the lights that tables are averaged over
@@ -113,10 +117,20 @@ class Mixture:
         return cls(reduced, lift, disc, dictionary.names, dictionary, roots)
 
     @classmethod
+    def unfitted(cls, request: FitRequest) -> Mixture:
+        """Mixtures of all BRDFs of the dictionary, which must have at least k of them."""
+        tables = disc_dictionary(request.dictionary, request.disc_angular_radius)
+        count = len(tables.names)
+        if request.k > count:  # checked before the fit
+            rule = f"a reduced basis of this dictionary has 1 to {count} components"
+            raise InputError(Fault("k", rule, str(request.k), "choose a smaller k"))
+        return cls.of_dictionary(tables, rank=request.rank, mode=request.mode)
+
+    @classmethod
     def of_basis(cls, basis: xr.Dataset) -> Mixture:
         """Mixtures of a reduced basis, the group "basis" of a model."""
-        check(basis, ("basis_brdf",), where="basis")
-        disc = float(basis.get("disc_angular_radius", 0.0))
+        check(basis, (variables.BASIS_BRDF,), where="basis")
+        disc = float(basis.get(variables.DISC_ANGULAR_RADIUS, 0.0))
         names: tuple[str, ...] = ()
         if "component" in basis.coords:
             names = tuple(map(str, basis["component"].values))
@@ -130,12 +144,14 @@ class Mixture:
     @property
     def parameter_variables(self) -> tuple[str, ...]:
         """Variable of the weights."""
-        return ("basis_weight" if self.dictionary is None else "dictionary_weight",)
+        if self.dictionary is None:
+            return self.PARAMETERS
+        return (variables.DICTIONARY_WEIGHT,)
 
     @property
     def fit_variables(self) -> tuple[str, ...]:
         """Variables from `fit`."""
-        return FIT_VARIABLES
+        return DICTIONARY_VARIABLES
 
     @property
     def labels(self) -> dict[str, tuple[str, ...]]:
@@ -206,7 +222,7 @@ class Mixture:
 
     def fit_columns(self, fit: SurfaceFit) -> dict[str, Array]:
         """Variables of a fit by the dictionary."""
-        return dict(zip(FIT_VARIABLES, fit, strict=True))
+        return dict(zip(DICTIONARY_VARIABLES, fit, strict=True))
 
     def reduced(
         self, fitted: xr.Dataset, *, k: int, rng: np.random.Generator
@@ -245,10 +261,10 @@ class Mixture:
         variance = np.einsum("j,njk,k->n", albedo, covariance, albedo)
         deviation = np.sqrt(np.diagonal(judged.covariance, axis1=1, axis2=2))
         return {
-            "basis_weight": judged.parameters,
-            "basis_weight_error": deviation,
-            "surface_reflectance": self.normal_reflectance(judged.parameters),
-            "surface_reflectance_error": np.sqrt(
+            variables.BASIS_WEIGHT: judged.parameters,
+            variables.BASIS_WEIGHT_ERROR: deviation,
+            variables.SURFACE_REFLECTANCE: self.normal_reflectance(judged.parameters),
+            variables.SURFACE_REFLECTANCE_ERROR: np.sqrt(
                 np.where(variance > 0, variance, np.nan)
             ),
         }

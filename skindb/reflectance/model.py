@@ -10,6 +10,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from skindb.reflectance.dictionary import Dictionary
 from skindb.reflectance.tables import Table
 from skindb.schema.notes import Omission
 from skindb.types import Array
@@ -123,6 +124,17 @@ class Lamp(NamedTuple):
     falloff: float  # exponent n of its fall-off cos^n
 
 
+class FitRequest(NamedTuple):
+    """What a surface model is made from before the first pass of a fit."""
+
+    eta: float  # refractive index of skin
+    disc_angular_radius: float  # of the lights as seen from the surfels [rad]
+    mode: str  # see `Comparison`
+    rank: int  # of the reduced dictionary
+    k: int  # components that the model is reduced to after the first pass
+    dictionary: Dictionary | None = None  # for point lights; default the embedded 59
+
+
 class DirectionSampler(Protocol):
     """Random directions towards the light, with their probability density."""
 
@@ -225,3 +237,18 @@ class ReflectanceModel(Protocol):
 
     def sampler(self) -> DirectionSampler:
         """Sampler of directions in proportion to the surface term."""
+
+
+class SurfaceKind(Protocol):
+    """What a class that implements `ReflectanceModel` has to be listed in `kinds`."""
+
+    # variable of the group "basis" that only takes with this model have
+    BASIS_VARIABLE: str
+    # variables of the group "fitted" with the parameters of stored takes
+    PARAMETERS: tuple[str, ...]
+
+    def unfitted(self, request: FitRequest) -> ReflectanceModel:
+        """The model of the first pass; raises `InputError` if it cannot be fitted so."""
+
+    def of_basis(self, basis: xr.Dataset) -> ReflectanceModel:
+        """The model in the group "basis"."""

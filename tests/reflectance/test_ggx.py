@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+from typing import get_args, get_type_hints
+
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
 from skindb.errors import InputError
+from skindb.parameters import FitParameters
 from skindb.reflectance.ggx import GGX, evaluate_lobe
-from skindb.reflectance.kinds import surface_model, unfitted_model
+from skindb.reflectance.kinds import SURFACES, surface_model, unfitted_model
 from skindb.reflectance.mixture import Mixture
-from skindb.reflectance.model import Block, Comparison, Judgement, Lamp, Points
+from skindb.reflectance.model import (
+    Block,
+    Comparison,
+    FitRequest,
+    Judgement,
+    Lamp,
+    Points,
+)
 from skindb.schema import FitStatus, dataset
 
 INDEX = 1.4
@@ -310,10 +320,15 @@ def test_sampler__density_integrates_to_one_and_weights_have_the_albedo_as_mean(
     np.testing.assert_allclose((flat * solid.ravel()).sum(), up.mean(), atol=3e-3)
 
 
+def test_kinds__are_the_choices_of_fits():
+    hints = get_type_hints(FitParameters)
+    assert set(get_args(hints["surface"])) == set(SURFACES)
+
+
 def test_kinds__stored_and_unfitted_models():
-    model = unfitted_model("ggx", None, 0.01, rank=16, mode="linear", k=4, eta=1.4)
+    model = unfitted_model("ggx", FitRequest(1.4, 0.01, "linear", 16, 4))
     assert model == GGX(1.4, 0.01)
     stored = dataset({"lobe_index": 1.4, "disc_angular_radius": 0.01})
     assert surface_model(stored) == model
     with pytest.raises(InputError, match="perceptual"):
-        unfitted_model("ggx", None, 0.01, rank=16, mode="paper", k=4, eta=1.4)
+        unfitted_model("ggx", FitRequest(1.4, 0.01, "paper", 16, 4))
