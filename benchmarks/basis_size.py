@@ -18,9 +18,9 @@ from collections import Counter
 import numpy as np
 
 from skindb.analysis.basis_size import choose_size, size_status, surfel_errors
-from skindb.reflectance.basis import Systems, factor_reflectance, residuals
 from skindb.reflectance.dictionary import embedded_dictionary
-from skindb.reflectance.rows import basis_rows
+from skindb.reflectance.mixture import basis_rows
+from skindb.reflectance.reduction import Systems, factor_reflectance, residuals
 from skindb.reflectance.tables import TableGrid
 
 SIZES = (4, 6, 8)

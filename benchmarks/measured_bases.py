@@ -22,22 +22,22 @@ from scipy.optimize import nnls
 
 from skindb.fit import dictionary_report
 from skindb.optics.angles import directions, half_difference
-from skindb.reflectance.abc_low2012 import PARAMETERS, evaluate_abc
+from skindb.reflectance.brdf_files import SHAPE, read_dictionary, write_merl
 from skindb.reflectance.dictionary import (
     FAR_RULE,
     NEAR_RULE,
+    abc_parameters,
     average_disc,
     convolve_disc,
     embedded_dictionary,
+    evaluate_abc,
     sample_pairs,
     weighted_error,
 )
-from skindb.reflectance.merl import SHAPE, write_merl
-from skindb.reflectance.table_file import read_dictionary
 from skindb.reflectance.tables import lookup, tabulate
 
 DISC = np.radians(0.8)
-ROWS = np.array(list(PARAMETERS.values()))
+ROWS = np.array(list(abc_parameters().values()))
 GRIDS = [
     *[(90, n, 16) for n in (45, 60, 90, 120, 180, 240)],
     *[(n, 120, 16) for n in (45, 60, 180)],
@@ -155,7 +155,7 @@ def merl(folder: Path) -> None:
     networks = np.load(folder / "nbrdf_weights.npz")
     slices = np.load(folder / "merl_slices_phid90.npz")
     with tempfile.TemporaryDirectory() as scratch:
-        for name in PARAMETERS:  # 35 MB each
+        for name in abc_parameters():  # 35 MB each
             write_merl(
                 Path(scratch) / f"{name}.binary",
                 reconstruction(networks[f"merl/{name}"]),
@@ -175,7 +175,7 @@ def compare(files: Path, slices) -> None:
     )
     print("; ".join(note[:60] for note in dictionary.notes), end="\n\n")
     _summary(dictionary_report(dictionary, disc_angular_radius=DISC))
-    order = [slices["names"].tolist().index(name) for name in PARAMETERS]
+    order = [slices["names"].tolist().index(name) for name in abc_parameters()]
     # theta_d, theta_h, material
     measured = np.moveaxis(slices["f"][order].mean(-1), 0, -1)
     td, th = np.meshgrid(slices["theta_d_rad"], slices["theta_h_rad"], indexing="ij")

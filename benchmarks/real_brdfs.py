@@ -11,7 +11,7 @@ from scipy.optimize import least_squares, nnls
 from benchmarks.peers import WIDTHS
 from skindb.optics.angles import directions
 from skindb.optics.fresnel import fresnel_reflectance
-from skindb.reflectance.abc_low2012 import PARAMETERS, evaluate_abc
+from skindb.reflectance.dictionary import abc_parameters, evaluate_abc
 
 Array = NDArray[np.float64]
 
@@ -35,7 +35,7 @@ def brdf_rows(path: Path) -> list[list[str]]:
         values = archive["f"][:, ::EVERY, ::EVERY].mean(axis=3).astype(np.float64)
     wi, wo = directions(theta_h, theta_d, np.pi / 2)
     above = np.minimum(wi[..., 2], wo[..., 2]) > MIN_COSINE
-    measured = {name: values[names.index(name)][above] for name in PARAMETERS}
+    measured = {name: values[names.index(name)][above] for name in abc_parameters()}
     fits = {
         "mixture of the other 58 + Lambert": _others(wi[above], wo[above]),
         "GGX + Lambert": _one_ggx(theta_h[above], theta_d[above], wi[above], wo[above]),
@@ -77,8 +77,8 @@ def _perceptual_nnls(columns: Array, value: Array) -> Array:
 
 
 def _others(wi: Array, wo: Array):
-    lobes = evaluate_abc(np.array([*PARAMETERS.values()], np.float64), wi, wo)
-    order = list(PARAMETERS)
+    lobes = evaluate_abc(np.array([*abc_parameters().values()], np.float64), wi, wo)
+    order = list(abc_parameters())
 
     def estimate(material: str, value: Array) -> Array:
         without = np.delete(lobes, order.index(material), axis=1)

@@ -103,7 +103,7 @@ print(len(calls), sum(len(one.signatures) for one in kernels), len(kernels) > 50
 FIT = """
 import hashlib
 import numpy as np
-from skindb.reflectance.rows import fit_reflectance
+from skindb.reflectance.mixture import fit_reflectance
 rng, count, each = np.random.default_rng(0), 50, 60
 rows = rng.gamma(0.5, 1.0, (count * each, 16)).astype(np.float32)
 target, lift = rng.gamma(1.0, 1.0, (count * each, 3)), np.abs(rng.normal(size=(16, 59)))

@@ -21,9 +21,8 @@ from skindb.cli import main
 from skindb.files import private_file, private_umask
 from skindb.format.frames import write_frame
 from skindb.geometry.scan import Crop
+from skindb.reflectance.brdf_files import write_merl, write_tables
 from skindb.reflectance.dictionary import embedded_dictionary
-from skindb.reflectance.merl import write_merl
-from skindb.reflectance.table_file import write_tables
 from skindb.render.figures import write_field
 from skindb.render.image import write_exr, write_png
 from skindb.view.face import face_record

@@ -26,8 +26,8 @@ from skindb.analysis.study import (
 from skindb.numerics.statistics import bootstrap_interval
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.parameters import DICTIONARY_HELP, option, seed_option
-from skindb.reflectance.basis import Systems, factor_reflectance, residuals
-from skindb.reflectance.rows import basis_rows
+from skindb.reflectance.mixture import basis_rows
+from skindb.reflectance.reduction import Systems, factor_reflectance, residuals
 from skindb.reflectance.tables import TableGrid
 from skindb.schema import dataset
 from skindb.schema.cohort import require_same_fit

@@ -19,7 +19,7 @@ from skindb.fit import albedo, estimate_diffuse_reflectance, estimate_normals, n
 from skindb.format.frames import FrameKind
 from skindb.format.sensor import SensorRecord
 from skindb.optics.fresnel import fresnel_transmittance
-from skindb.reflectance.rows import basis_rows
+from skindb.reflectance.mixture import basis_rows
 from skindb.reflectance.separation import surface_lobes
 from skindb.schema import dataset, label, variables
 from skindb.types import Array

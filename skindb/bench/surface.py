@@ -27,10 +27,9 @@ from skindb.reflectance.dictionary import (
     convolve_disc,
     embedded_dictionary,
 )
-from skindb.reflectance.mixture import Mixture
+from skindb.reflectance.mixture import Mixture, basis_rows
 from skindb.reflectance.model import Block, Comparison, SurfaceFit
 from skindb.reflectance.reduction import reduce_dictionary
-from skindb.reflectance.rows import basis_rows
 from skindb.reflectance.tables import brdf_metric, lookup
 from skindb.types import Array
 

@@ -32,10 +32,9 @@ from skindb.export.scenes import (
 )
 from skindb.export.textures import Skin, skin_of
 from skindb.files import make_private, plain, private_file
+from skindb.reflectance.brdf_files import write_merl, write_tables
 from skindb.reflectance.dictionary import Dictionary
 from skindb.reflectance.kinds import as_mixture
-from skindb.reflectance.merl import write_merl
-from skindb.reflectance.table_file import write_tables
 from skindb.reflectance.tables import TableGrid, kernel_tables, lookup
 from skindb.render.image import write_exr
 from skindb.schema import VARIABLES, FitStatus, ProbeStatus, Use, names_of

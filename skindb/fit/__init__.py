@@ -22,9 +22,9 @@ from skindb.fit.translucency import (
     translucency_map,
 )
 from skindb.parameters import FitParameters
-from skindb.reflectance.basis import reduce_basis
+from skindb.reflectance.brdf_files import read_dictionary
 from skindb.reflectance.dictionary import dictionary_report, embedded_dictionary
-from skindb.reflectance.table_file import read_dictionary
+from skindb.reflectance.reduction import reduce_basis
 
 __all__ = [
     "FitParameters",

@@ -55,7 +55,7 @@ def fit_surface(
         dictionary.
     mode
         "perceptual" (in cube-root space), "linear" (see
-        `skindb.reflectance.rows.fit_reflectance`), or "paper": cube roots of the elements
+        `skindb.reflectance.mixture.fit_reflectance`), or "paper": cube roots of the elements
         are mixed, and the prediction is the cube of the mixture.
     eta
         Refractive index of the diffuse term that is subtracted.

@@ -1,15 +1,17 @@
 """The dictionary of measured BRDFs whose mixtures describe a surface: 59 embedded
 materials or those of a file.
 
-See `skindb.reflectance.table_file` for files.
+See `skindb.reflectance.brdf_files` for files.
 """
 
 from __future__ import annotations
 
+import csv
 import hashlib
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,8 +20,8 @@ import xarray as xr
 from skindb.cache import cached_arrays
 from skindb.errors import Fault, InputError
 from skindb.optics.angles import directions, half_difference
+from skindb.optics.fresnel import fresnel_reflectance
 from skindb.reflectance import _row_kernels
-from skindb.reflectance.abc_low2012 import PARAMETERS, evaluate_abc
 from skindb.reflectance.tables import (
     DEFAULT_GRID,
     Table,
@@ -41,12 +43,22 @@ SOURCES = (
     "skindb.reflectance.dictionary",
     "skindb.reflectance.reduction",
     "skindb.reflectance.tables",
-    "skindb.reflectance.abc_low2012",
     "skindb.reflectance._row_kernels",
     "skindb.optics.angles",
     "skindb.optics.fresnel",
     "skindb.jit",
 )
+# ABC parameters of 59 dielectrics of the MERL database: the paints, fabrics, woods,
+# plastics, rubbers and organic materials among its hundred, as Weyrich et al. 2005 do not
+# name theirs. From Loew, Kronander, Ynnerman, Unger, "BRDF models for accurate and
+# efficient rendering of glossy surfaces", ACM Transactions on Graphics 31(1), 2012.
+# Columns: kd r g b, A r g b, B, C, index of refraction
+MATERIALS = Path(__file__).with_name("abc_low2012.csv")
+# a part of the code: a change of the file changes all fits
+MATERIALS_SHA256 = "7b2eca14f9101576a8ce33be9432fea07251b44726c691bf1598615e50f31f33"
+# cosines are clamped to this, so that cells below the horizon continue the last value
+# above it
+MIN_COSINE_TABLE = 0.03
 INCIDENCE = np.radians(np.arange(0, 86, 5))
 # rings, spokes; twice as many points change the worst average of the 59 materials by
 # 0.6 %
@@ -128,9 +140,52 @@ class Dictionary:
 
 
 @cache
+def abc_parameters() -> dict[str, tuple[float, ...]]:
+    """ABC parameters (9,) of the embedded materials by name, see `MATERIALS`."""
+    content = MATERIALS.read_bytes()
+    if hashlib.sha256(content).hexdigest() != MATERIALS_SHA256:
+        rule = "must be the file that belongs to this version of skindb"
+        cure = "install skindb again"
+        raise InputError(Fault(str(MATERIALS), rule, "another content", cure))
+    _, *rows = csv.reader(content.decode().splitlines())
+    return {name: tuple(map(float, numbers)) for name, *numbers in rows}
+
+
+def evaluate_abc(parameters: Array, wi: Array, wo: Array) -> Array:
+    """ABC microfacet BRDFs (..., m) for rows (m, 9) of `abc_parameters`, as mean of RGB
+    (Loew et al. 2012).
+
+    f = kd/pi + A F(theta_d) (1 + B (1 - cos theta_h))^-C G / (pi cos_i cos_o), with G
+    for V grooves. Directions are in the local frame.
+    """
+    cos_i = np.maximum(wi[..., 2], MIN_COSINE_TABLE)
+    cos_o = np.maximum(wo[..., 2], MIN_COSINE_TABLE)
+    theta_h, theta_d, _ = half_difference(wi, wo)
+    cos_h = np.maximum(np.cos(theta_h), 1e-6)
+    cos_d = np.maximum(np.cos(theta_d), MIN_COSINE_TABLE)
+    masking = np.minimum(1.0, 2 * cos_h * np.minimum(cos_i, cos_o) / cos_d) / (
+        np.pi * cos_i * cos_o
+    )
+    out = np.empty((*cos_i.shape, len(parameters)))
+    lean = 2.0 * np.sin(theta_h / 2) ** 2  # 1 - cos theta_h without cancellation
+    for m, row in enumerate(parameters):
+        kd = row[:3].mean()
+        scale = row[3:6].mean()
+        b = row[6]
+        c = row[7]
+        index = row[8]
+        lobe = np.exp(-c * np.log1p(b * lean))
+        out[..., m] = (
+            kd / np.pi
+            + scale * fresnel_reflectance(cos_d, float(index)) * lobe * masking
+        )
+    return out
+
+
+@cache
 def embedded_dictionary() -> Dictionary:
-    """The 59 dielectrics of `abc_low2012`, analytic fits to measured BRDFs, on the default grid."""
-    rows = np.array(list(PARAMETERS.values()))
+    """The 59 materials of `abc_parameters` on the default grid."""
+    rows = np.array(list(abc_parameters().values()))
 
     def make() -> dict[str, Table]:
         return {
@@ -141,7 +196,7 @@ def embedded_dictionary() -> Dictionary:
         "embedded-dictionary", (DEFAULT_GRID,), sources=SOURCES, make=make
     )["table"]
     table.setflags(write=False)
-    return Dictionary(tuple(PARAMETERS), table, DEFAULT_GRID, EMBEDDED)
+    return Dictionary(tuple(abc_parameters()), table, DEFAULT_GRID, EMBEDDED)
 
 
 def sample_pairs(count: int = 20_000, lowest: float = 0.1) -> tuple[Array, Array]:
@@ -386,8 +441,11 @@ def dictionary_quality(
         figures["hole_fraction"] = np.array(
             [origin.hole_fraction for origin in dictionary.origins]
         )
-    elif dictionary.names == tuple(PARAMETERS) and not dictionary.disc_angular_radius:
-        exact = evaluate_abc(np.array(list(PARAMETERS.values())), wi, wo)
+    elif (
+        dictionary.names == tuple(abc_parameters())
+        and not dictionary.disc_angular_radius
+    ):
+        exact = evaluate_abc(np.array(list(abc_parameters().values())), wi, wo)
         values = lookup(dictionary.table, *half_difference(wi, wo))
         figures |= {
             "interpolation_error": weighted_error(values, exact, wi, wo),

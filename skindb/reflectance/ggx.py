@@ -27,7 +27,6 @@ from skindb.reflectance._ggx_kernels import (
     ROUGHNESS,
     STRENGTH,
 )
-from skindb.reflectance.basis import fitted_surfels
 from skindb.reflectance.block import (
     FIT_VARIABLES,
     empty_fit,
@@ -46,6 +45,7 @@ from skindb.reflectance.model import (
     Points,
     SurfaceFit,
 )
+from skindb.reflectance.reduction import fitted_surfels
 from skindb.reflectance.sampling import COSINE_FRACTION, MIN_COSINE_HALF, tangents
 from skindb.reflectance.tables import Table, tabulate
 from skindb.schema import check, dataset, variables

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from skindb.jit import sample_bits
 from skindb.reflectance._separation_kernels import separate_block
-from skindb.reflectance.abc_low2012 import PARAMETERS, evaluate_abc
+from skindb.reflectance.dictionary import abc_parameters, evaluate_abc
 from skindb.reflectance.model import Block
 from skindb.reflectance.tables import DEFAULT_GRID, TableGrid, tabulate
 from skindb.types import Array, Float64
@@ -84,7 +84,7 @@ def separate_diffuse(
 @cache
 def surface_lobes() -> tuple[NDArray[np.float32], TableGrid]:
     """Tables (nh, nd, np, 6) of `LOBES` without their diffuse part, and their grid."""
-    rows = np.array([PARAMETERS[name] for name in LOBES], np.float64)
+    rows = np.array([abc_parameters()[name] for name in LOBES], np.float64)
     rows[:, :3] = 0
     return tabulate(
         lambda wi, wo: evaluate_abc(rows, wi, wo), DEFAULT_GRID

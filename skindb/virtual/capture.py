@@ -22,8 +22,12 @@ from skindb.files import make_private, private_file
 from skindb.geometry.rays import RayScene
 from skindb.optics.diffusion import dipole_s
 from skindb.parameters import CONDITIONS, SimulationParameters
-from skindb.reflectance.abc_low2012 import PARAMETERS
-from skindb.reflectance.dictionary import Dictionary, convolve_disc, embedded_dictionary
+from skindb.reflectance.dictionary import (
+    Dictionary,
+    abc_parameters,
+    convolve_disc,
+    embedded_dictionary,
+)
 from skindb.reflectance.mixture import Mixture
 from skindb.reflectance.tables import directional_albedo
 from skindb.render.scene import Surface
@@ -380,7 +384,7 @@ def _write_truth(
         surface_names=np.array(MATERIALS),
         # includes the Lambertian albedo of the materials, which no fit can distinguish from R_d
         surface_lambertian=skin.weights
-        @ np.array([np.mean(PARAMETERS[name][:3]) for name in MATERIALS]),
+        @ np.array([np.mean(abc_parameters()[name][:3]) for name in MATERIALS]),
         sigma_tr=skin.sigma_tr,
         region_names=np.array(list(members)),
         region_membership=np.stack(list(members.values()), axis=1),

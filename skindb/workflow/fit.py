@@ -13,8 +13,8 @@ import xarray as xr
 
 from skindb.errors import Fault, InputError
 from skindb.fit import FitParameters, FitPlan, first_pass, plan_fit, second_pass
+from skindb.reflectance.brdf_files import read_dictionary
 from skindb.reflectance.dictionary import EMBEDDED, Dictionary, embedded_dictionary
-from skindb.reflectance.table_file import read_dictionary
 from skindb.schema.consent import require_consent
 from skindb.store import Database, Lease, Record
 from skindb.threads import one_blas_thread

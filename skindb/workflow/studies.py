@@ -26,9 +26,9 @@ from skindb.analysis.study import Population, Study
 from skindb.analysis.subjects import CONDITION, subjects_of, subjects_without_normal
 from skindb.errors import Fault, InputError
 from skindb.parameters import option_of, require_limits
+from skindb.reflectance.brdf_files import read_dictionary
 from skindb.reflectance.dictionary import convolve_disc, embedded_dictionary
 from skindb.reflectance.kinds import require_mixture
-from skindb.reflectance.table_file import read_dictionary
 from skindb.schema import variables
 from skindb.schema.cohort import require_same_fit
 from skindb.schema.notes import Note, note, unique_notes

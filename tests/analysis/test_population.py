@@ -33,7 +33,7 @@ from skindb.errors import InputError
 from skindb.numerics.factorise import relative_error
 from skindb.optics.angles import half_difference
 from skindb.optics.fresnel import fresnel_transmittance
-from skindb.reflectance.rows import basis_rows
+from skindb.reflectance.mixture import basis_rows
 from skindb.reflectance.tables import brdf_metric, lookup
 from skindb.schema import dataset
 from skindb.schema.cohort import Part, combine

@@ -16,9 +16,8 @@ from skindb.export.bundle import export_bundle, merl_table
 from skindb.export.gltf import export_gltf
 from skindb.export.inputs import texture_size
 from skindb.optics.angles import half_difference
+from skindb.reflectance.brdf_files import read_dictionary, read_merl
 from skindb.reflectance.dictionary import sample_pairs, weighted_error
-from skindb.reflectance.merl import read_merl
-from skindb.reflectance.table_file import read_dictionary
 from skindb.reflectance.tables import lookup
 from skindb.render.image import read_exr
 

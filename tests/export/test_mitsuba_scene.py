@@ -22,8 +22,8 @@ import xarray as xr
 from scipy.ndimage import binary_erosion, map_coordinates
 
 from skindb.export.bundle import export_bundle
+from skindb.reflectance.brdf_files import read_dictionary
 from skindb.reflectance.mixture import Mixture
-from skindb.reflectance.table_file import read_dictionary
 from skindb.render.image import read_exr, write_exr
 from skindb.render.scene import Camera, Lights, Surface, from_model
 from skindb.render.shading import render_view

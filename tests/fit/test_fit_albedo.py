@@ -23,7 +23,7 @@ from skindb.fit.albedo import (
 )
 from skindb.optics.diffusion import diffuse_reflectance
 from skindb.optics.fresnel import fresnel_transmittance
-from skindb.reflectance.rows import basis_rows
+from skindb.reflectance.mixture import basis_rows
 from skindb.reflectance.separation import surface_lobes
 from skindb.schema import dataset, label
 from skindb.schema.declaration import LARGEST_R_D, SMALLEST_R_D

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from skindb.fit import dictionary_report
+from skindb.reflectance.brdf_files import SHAPE, read_dictionary, write_merl
 from skindb.reflectance.dictionary import Dictionary, embedded_dictionary
-from skindb.reflectance.merl import SHAPE, write_merl
-from skindb.reflectance.table_file import read_dictionary
 from skindb.schema import GROUPS, check
 
 

@@ -11,7 +11,7 @@ from scipy.optimize import minimize, nnls
 from skindb.numerics import _nnls_kernels
 from skindb.numerics.nnls import solve_nnls
 from skindb.reflectance import _mixture_kernels
-from skindb.reflectance.rows import fit_reflectance
+from skindb.reflectance.mixture import fit_reflectance
 
 # normal equations square the condition number: residuals agree to the root of the
 # rounding error

@@ -12,7 +12,7 @@ from planted_skin import capture_of
 import skindb
 from skindb.errors import InputError
 from skindb.fit import FitParameters, read_dictionary
-from skindb.reflectance.table_file import write_tables
+from skindb.reflectance.brdf_files import write_tables
 from skindb.workflow.derive import groups_of
 from skindb.workflow.fit import fit_take, parameters_of, plan_take, takes_to_fit
 

@@ -1,4 +1,4 @@
-"""MERL files and a user's own tables as dictionaries."""
+"""Files of measured BRDFs: tables and MERL binaries."""
 
 from __future__ import annotations
 
@@ -12,11 +12,18 @@ from scipy.interpolate import RegularGridInterpolator
 
 from skindb.errors import InputError
 from skindb.optics.angles import half_difference
-from skindb.reflectance.abc_low2012 import PARAMETERS
-from skindb.reflectance.dictionary import Dictionary, convolve_disc
-from skindb.reflectance.merl import SHA256, SHAPE, read_merl_folder, write_merl
-from skindb.reflectance.resample import resample
-from skindb.reflectance.table_file import read_dictionary, read_tables, write_tables
+from skindb.reflectance.brdf_files import (
+    SHAPE,
+    published_digests,
+    read_dictionary,
+    read_merl,
+    read_merl_folder,
+    read_tables,
+    to_grid,
+    write_merl,
+    write_tables,
+)
+from skindb.reflectance.dictionary import Dictionary, abc_parameters, convolve_disc
 from skindb.reflectance.tables import DEFAULT_GRID, tabulate
 
 
@@ -104,8 +111,8 @@ def test_read_merl_folder__says_which_files_are_the_published_ones(
         name: hashlib.sha256((tmp_path / f"{name}.binary").read_bytes()).hexdigest()
         for name in ("teflon", "mine")
     }
-    monkeypatch.setitem(SHA256, "teflon", sums["teflon"])
-    monkeypatch.setitem(SHA256, "ipswich-pine-221", sums["mine"])
+    monkeypatch.setitem(published_digests(), "teflon", sums["teflon"])
+    monkeypatch.setitem(published_digests(), "ipswich-pine-221", sums["mine"])
     found = read_merl_folder(tmp_path)
     checks = {
         name: origin.check
@@ -125,9 +132,10 @@ def test_read_merl_folder__says_which_files_are_the_published_ones(
 
 
 def test_sha256__of_the_hundred_materials():
-    assert len(SHA256) == len(set(SHA256.values())) == 100
-    assert set(PARAMETERS) < set(SHA256)
-    assert all(re.fullmatch("[0-9a-f]{64}", value) for value in SHA256.values())
+    digests = published_digests()
+    assert len(digests) == len(set(digests.values())) == 100
+    assert set(abc_parameters()) < set(digests)
+    assert all(re.fullmatch("[0-9a-f]{64}", value) for value in digests.values())
 
 
 def test_read_merl_folder__counts_holes_above_the_horizon_only(tmp_path):
@@ -205,7 +213,7 @@ def test_resample__linear_in_the_tables_coordinates():
         indexing="ij",
     )
     want = scipy(np.stack(at, axis=-1))
-    found = resample(values, (h, d, p))
+    found = to_grid(values, (h, d, p))
     np.testing.assert_allclose(found[1:], want[1:], atol=1e-6)  # single precision
     np.testing.assert_allclose(
         found[0], np.repeat(want[0].mean(axis=1, keepdims=True), 16, axis=1), atol=1e-6
@@ -368,3 +376,74 @@ def test_read_dictionary__what_is_no_table_is_one_line(tmp_path, content):
         (tmp_path / "a.npz").write_bytes(content)
     with pytest.raises(InputError, match="npz"):
         read_dictionary(tmp_path / "a.npz")
+
+
+def _cells() -> np.ndarray:
+    return np.random.default_rng(0).uniform(0.1, 2, (*SHAPE, 3))
+
+
+def test_read_merl__round_trip(tmp_path):
+    table = _cells()
+    write_merl(tmp_path / "a.binary", table)
+    got, holes = read_merl(tmp_path / "a.binary")
+    np.testing.assert_allclose(got, table, rtol=1e-14)
+    assert holes == 0
+
+
+def test_read_merl__layout_of_the_published_reader(tmp_path):
+    """BRDFRead.cpp: ind = phi_d + theta_d * 180 + theta_h * 180 * 90; green one table
+    on, scaled by 1.15 / 1500.
+    """
+    raw = np.zeros(3 * 90 * 90 * 180)
+    raw[7 + 11 * 180 + 13 * 180 * 90 + 90 * 90 * 180] = 3000.0
+    (tmp_path / "a.binary").write_bytes(
+        np.array(SHAPE, "<i4").tobytes() + raw.tobytes()
+    )
+    table, _ = read_merl(tmp_path / "a.binary")
+    assert table[13, 11, 7, 1] == pytest.approx(2.3)
+    assert np.count_nonzero(table) == 1
+
+
+def test_read_merl__holes_are_unknown_and_counted(tmp_path):
+    write_merl(tmp_path / "a.binary", _cells())
+    raw = bytearray((tmp_path / "a.binary").read_bytes())
+    raw[12:20] = np.float64(-1.0).tobytes()
+    (tmp_path / "a.binary").write_bytes(raw)
+    got, holes = read_merl(tmp_path / "a.binary")
+    assert holes == 1
+    assert np.isnan(got[0, 0, 0]).all()  # also the channels that are not negative
+    assert np.isfinite(got[0, 0, 1]).all()
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda raw: raw[:1000], r"header \(90, 90, 180\) and 1000 bytes"),
+        (lambda raw: raw[:5], "and 5 bytes"),
+        (lambda raw: b"", "and 0 bytes"),
+        (lambda raw: raw[:4] + raw[:4] + raw[4:], r"found the header \(90, 90, 90\)"),
+        (
+            lambda raw: raw[:12] + np.float64(np.nan).tobytes() + raw[20:],
+            "values must be finite; found 1 that are not",
+        ),
+    ],
+)
+def test_read_merl__damage_is_one_line(tmp_path, damage, message):
+    write_merl(tmp_path / "a.binary", _cells())
+    (tmp_path / "a.binary").write_bytes(damage((tmp_path / "a.binary").read_bytes()))
+    with pytest.raises(InputError, match=message):
+        read_merl(tmp_path / "a.binary")
+
+
+@pytest.mark.parametrize(
+    ("shape", "value"),
+    [((*SHAPE, 3), -1.0), ((*SHAPE, 3), np.nan), ((90, 90, 180), 1.0)],
+)
+def test_write_merl__refuses_what_is_not_a_table(tmp_path, shape, value):
+    with pytest.raises(ValueError, match="a MERL table must have the shape"):
+        write_merl(tmp_path / "a.binary", np.full(shape, value))
+
+
+def test_read_merl__no_such_file(tmp_path):
+    with pytest.raises(InputError, match="must be a readable file; found No such file"):
+        read_merl(tmp_path / "a.binary")

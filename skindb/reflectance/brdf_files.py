@@ -1,29 +1,55 @@
-"""Files with measured BRDFs: .npz files of tables, or folders of MERL binaries."""
+"""Files of measured BRDFs: .npz files of tables, and folders of MERL binaries (Matusik et
+al. 2003). Their values are resampled to the default grid.
+"""
 
 from __future__ import annotations
 
+import csv
 import hashlib
 import zipfile
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import RegularGridInterpolator
 
 from skindb.errors import Fault, InputError
 from skindb.files import private_file
-from skindb.reflectance.dictionary import Dictionary
-from skindb.reflectance.merl import read_merl_folder
-from skindb.reflectance.resample import hole_fraction, to_default_grid
-from skindb.reflectance.tables import DEFAULT_GRID, directional_albedo
+from skindb.optics.angles import half_difference
+from skindb.reflectance.dictionary import (
+    Dictionary,
+    Origin,
+    sample_pairs,
+    weighted_error,
+)
+from skindb.reflectance.tables import (
+    ANGLES,
+    DEFAULT_GRID,
+    Table,
+    directional_albedo,
+    lookup,
+)
 from skindb.types import Array
 
 TABLE = "basis_brdf"
-NODES = ("theta_h", "theta_d", "phi_d")
+NODES = ANGLES
 UNITS = ("sr-1", "sr^-1", "1/sr")
 # of the nodes above the horizon, above which a table is mostly extrapolated
 MAX_HOLE_FRACTION = 0.5
+SHAPE = (90, 90, 180)  # theta_h (quadratic), theta_d, phi_d
+SCALE = np.array([1.0, 1.15, 1.66]) / 1500.0
+# SHA-256 of the hundred files of the database, version 2 of February 2006. MERL
+# publishes no checksums. These are the Git LFS object names of the complete public copy
+# in github.com/duanwenxi/Mitsuba-3-for-Photometric-Stereo-data, commit
+# 914294a081b1ef36e56f9392c2758bca24868e3a.
+DIGESTS = Path(__file__).with_name("merl_sha256.csv")
+GENUINE = "genuine"
+DIFFERS = "differs from the published file of that name"
+UNKNOWN = "not in the published set"
+Nodes = tuple[Array, Array, Array]  # theta_h, theta_d, phi_d [rad]
 
 
 def read_dictionary(path: str | Path) -> Dictionary:
@@ -134,7 +160,7 @@ def _load(path: Path) -> dict[str, NDArray[Any]]:
             )
         ) from None
     except (ValueError, TypeError, AttributeError, EOFError, zipfile.BadZipFile):
-        cure = "write it with skindb.reflectance.table_file.write_tables or numpy.savez"
+        cure = "write it with skindb.reflectance.brdf_files.write_tables or numpy.savez"
         raise InputError(
             Fault(
                 str(path), "must be an .npz file of plain arrays", "another file", cure
@@ -324,3 +350,238 @@ def _value_faults(path: Path, arrays: Mapping[str, NDArray[Any]]) -> list[Fault]
             )
         )
     return faults
+
+
+def read_merl(path: str | Path) -> tuple[Array, int]:
+    """Read one material.
+
+    Returns
+    -------
+    table, holes
+        (90, 90, 180, 3) sr^-1 over theta_h (bins quadratic), theta_d and phi_d in [0,
+        pi), and the number of cells with a negative channel. These were not measured
+        and are NaN in every channel.
+
+    Notes
+    -----
+    The reader that MERL provides takes bin floor(x). The value of bin i is thus for [i,
+    i + 1), and its centre is i + 1/2.
+    """
+    try:
+        data = Path(path).read_bytes()
+    except OSError as error:
+        fault = Fault(
+            str(path),
+            "must be a readable file",
+            str(error.strerror),
+            "choose a MERL .binary file",
+        )
+        raise InputError(fault) from None
+    dims = tuple(np.frombuffer(data[: min(len(data), 12) // 4 * 4], "<i4").tolist())
+    want = 12 + 8 * 3 * int(np.prod(SHAPE))
+    if dims != SHAPE or len(data) != want:
+        content = f"the header {dims} and {len(data)} bytes"
+        rule = f"a MERL binary must have the header {SHAPE} and {want} bytes"
+        raise InputError(Fault(str(path), rule, content, "download it again"))
+    values = np.frombuffer(data[12:], "<f8").reshape(3, *SHAPE)
+    wrong = int((~np.isfinite(values)).sum())
+    if wrong:
+        raise InputError(
+            Fault(
+                str(path),
+                "values must be finite",
+                f"{wrong} that are not",
+                "download it again",
+            )
+        )
+    table = np.moveaxis(values, 0, -1) * SCALE
+    hole = np.asarray((table < 0).any(axis=-1))
+    if hole.all():
+        rule = "some cells must be measured"
+        content = "only negative values"
+        raise InputError(Fault(str(path), rule, content, "download it again"))
+    return np.where(hole[..., None], np.nan, table), int(hole.sum())
+
+
+def write_merl(path: str | Path, table: Array) -> None:
+    """Write a table (90, 90, 180, 3) in sr^-1, whose values must be finite and non-negative."""
+    table = np.asarray(table, np.float64)
+    wrong = int((~(np.isfinite(table) & (table >= 0))).sum())
+    if table.shape != (*SHAPE, 3) or wrong:
+        content = f"the shape {table.shape} and {wrong} other values"
+        raise ValueError(
+            f"a MERL table must have the shape {(*SHAPE, 3)}, finite and "
+            f"non-negative; found {content}"
+        )
+    values = np.ascontiguousarray(np.moveaxis(table / SCALE, -1, 0))
+    private_file(path).write_bytes(
+        np.array(SHAPE, "<i4").tobytes() + values.astype("<f8").tobytes()
+    )
+
+
+def read_merl_folder(path: str | Path) -> Dictionary:
+    """Read every `*.binary` file of a folder, in the order of their names, resampled to
+    the default grid.
+
+    Cells without a measurement take the value at the next smaller theta_d.
+
+    Raises
+    ------
+    InputError
+        With the faults of all damaged files.
+    """
+    files = sorted(Path(path).glob("*.binary"))
+    if not files:
+        rule = "the folder must contain MERL .binary files"
+        cure = "choose their folder, or an .npz file of tables"
+        raise InputError(Fault(str(path), rule, "none", cure))
+    # centres of bins; theta_h is quadratic
+    h, d, p = ((np.arange(n) + 0.5) / n for n in SHAPE)
+    nodes = (h**2 * np.pi / 2, d * np.pi / 2, p * np.pi)
+    tables: list[Table] = []
+    origins: list[Origin] = []
+    faults: list[Fault] = []
+    for file in files:
+        try:
+            table, origin = to_default_grid(
+                read_merl(file)[0].mean(axis=-1), nodes, *_publication_check(file)
+            )
+        except InputError as error:
+            faults.extend(error.faults)
+        else:
+            tables.append(table)
+            origins.append(origin)
+    if faults:
+        raise InputError(faults)
+    names = tuple(file.stem for file in files)
+    return Dictionary(
+        names,
+        np.stack(tables, axis=-1),
+        DEFAULT_GRID,
+        Path(path).resolve().name,
+        origins=tuple(origins),
+    )
+
+
+@cache
+def published_digests() -> dict[str, str]:
+    """SHA-256 of the published files by material, see `DIGESTS`."""
+    with DIGESTS.open(newline="") as lines:
+        return {row["material"]: row["sha256"] for row in csv.DictReader(lines)}
+
+
+def _publication_check(file: Path) -> tuple[str, str]:
+    """Whether a file is the published one, in words, and its SHA-256."""
+    with file.open("rb") as data:
+        digest = hashlib.file_digest(data, "sha256").hexdigest()
+    published = published_digests()
+    for name, value in published.items():
+        if value == digest:
+            other = f"published under the name {name}"
+            return GENUINE if name == file.stem else other, digest
+    return DIFFERS if file.stem in published else UNKNOWN, digest
+
+
+def to_default_grid(
+    brdf: Array, nodes: Nodes, check: str, sha256: str
+) -> tuple[Table, Origin]:
+    """One material (theta_h, theta_d, phi_d) on the default grid, and its origin with
+    the error of resampling.
+    """
+    table = to_grid(fill_holes(brdf), nodes)
+    return table, Origin(
+        check, sha256, hole_fraction(brdf, nodes), _resampling_error(brdf, nodes, table)
+    )
+
+
+def hole_fraction(brdf: Array, nodes: Nodes) -> float:
+    """Fraction of NaN among the nodes with both directions above the horizon."""
+    theta_h, theta_d, phi_d = np.ix_(*nodes)
+    # cosine
+    smaller = np.cos(theta_h) * np.cos(theta_d) - np.abs(
+        np.sin(theta_h) * np.sin(theta_d) * np.cos(phi_d)
+    )
+    return float(np.isnan(brdf[smaller > 1e-9]).mean())
+
+
+def to_grid(brdf: Array, nodes: Nodes) -> Table:
+    """Interpolate values (nh, nd, np) to the default grid, linearly in sqrt(theta_h),
+    theta_d and phi_d.
+    """
+    grid = DEFAULT_GRID
+    same = zip(nodes, (grid.theta_h, grid.theta_d, grid.phi_d), strict=True)
+    if all(len(a) == len(b) and np.allclose(a, b, rtol=0, atol=1e-6) for a, b in same):
+        return brdf.astype(np.float32)
+    phi, column = _periodic_nodes(nodes[2])
+    table = np.einsum(
+        "kp,hdp->hdk", _linear_matrix(phi, grid.phi_d), brdf[:, :, column]
+    )
+    table = np.einsum("jd,hdk->hjk", _linear_matrix(nodes[1], grid.theta_d), table)
+    table = np.einsum(
+        "ih,hjk->ijk", _linear_matrix(np.sqrt(nodes[0]), np.sqrt(grid.theta_h)), table
+    )
+    # phi_d is undefined where the half vector is the normal
+    table[0] = table[0].mean(axis=-1, keepdims=True)
+    return table.astype(np.float32)
+
+
+def _periodic_nodes(phi_d: Array) -> tuple[Array, NDArray[np.int64]]:
+    """Nodes with one more on both sides of their period pi, and the column of each."""
+    n = len(phi_d)
+    return np.concatenate([[phi_d[-1] - np.pi], phi_d, [phi_d[0] + np.pi]]), np.arange(
+        -1, n + 1
+    ) % n
+
+
+def _linear_matrix(nodes: Array, at: Array) -> Array:
+    """Matrix (len(at), len(nodes)) of linear interpolation; constant beyond the ends."""
+    return np.stack(
+        [np.interp(at, nodes, column) for column in np.eye(len(nodes))], axis=1
+    )
+
+
+def _resampling_error(brdf: Array, nodes: Nodes, table: Table) -> float:
+    """Error of the table against trilinear interpolation of the measured nodes, where
+    all eight were measured.
+    """
+    wi, wo = sample_pairs()
+    th, td, pd = half_difference(wi, wo)
+    phi, column = _periodic_nodes(nodes[2])
+    axes = (np.sqrt(nodes[0]), nodes[1], phi)
+    values = RegularGridInterpolator(axes, brdf[:, :, column], bounds_error=False)(
+        np.stack([np.sqrt(th), td, pd], -1)
+    )
+    finite = np.isfinite(values)
+    if not finite.any():
+        return float("nan")
+    values_of_table = lookup(table[..., None], th[finite], td[finite], pd[finite])
+    return float(
+        weighted_error(values_of_table, values[finite, None], wi[finite], wo[finite])[0]
+    )
+
+
+def fill_holes(brdf: Array) -> Array:
+    """Fill holes of (nh, nd, np), which are NaN: below the horizon or unmeasured.
+
+    They take the value of the nearest smaller theta_d, else of the nearest larger
+    theta_d, else of the neighbour in theta_h, else in phi_d. Zeros instead would darken
+    adjacent cells by interpolation.
+    """
+    for axis, backwards in (
+        (1, False),
+        (1, True),
+        (0, False),
+        (0, True),
+        (2, False),
+        (2, True),
+    ):
+        turned = np.flip(brdf, axis) if backwards else brdf
+        place = np.arange(turned.shape[axis]).reshape(
+            [-1 if a == axis else 1 for a in range(3)]
+        )
+        nearest = np.maximum.accumulate(
+            np.where(np.isfinite(turned), place, 0), axis=axis
+        )
+        turned = np.take_along_axis(turned, nearest, axis=axis)
+        brdf = np.flip(turned, axis) if backwards else turned
+    return np.asarray(brdf)
