@@ -1,21 +1,198 @@
-"""A stored version is used as long as it would be derived in the same way."""
+"""Versions that are derived: computed again only if inputs, parameters or the code differ;
+and the digest of that code.
+"""
 
 from __future__ import annotations
 
+import shutil
 from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import xarray as xr
 
+import skindb
+from skindb.fit.model import second_pass
 from skindb.schema import dataset
 from skindb.store import Database
-from skindb.workflow import cohorts, edits, fit
+from skindb.workflow import cohorts, edits, fit, takes
+from skindb.workflow import derive as module
 from skindb.workflow.cohorts import summary_parameters
-from skindb.workflow.derive import Derivation, code_digest, derive
+from skindb.workflow.derive import Derivation, code_digest, code_symbols, derive
+from skindb.workflow.takes import package_digest
 
+FILES = {
+    "__init__.py": '''
+"""A package."""
+from typing import TYPE_CHECKING
+import lazy_loader
+if TYPE_CHECKING:
+    from skindb import science
+    from skindb.science.late import late
+__getattr__, __dir__, _ = lazy_loader.attach(__name__, submodules=["science"])
+''',
+    "science/__init__.py": "from skindb.science.model import fit\n",
+    "science/model.py": '''
+"""A model."""
+from __future__ import annotations
+import numpy as np
+from skindb import late, science, work
+from skindb.science.parameters import Parameters
+
+SCALE = 2.0
+TABLE = "table.json"
+UNUSED = 1
+
+def fit(values: np.ndarray, parameters: Parameters) -> np.ndarray:
+    """Fit values."""
+    from skindb.science._kernels import summed
+    # a comment
+    return SCALE * summed(values) + late() + science.plain.shift() + work.step() + len(TABLE)
+
+def plot(values):
+    return values
+''',
+    "science/table.json": '{"step": 1}',
+    "science/parameters.py": """
+from skindb.jit import option
+
+class Parameters:
+    k = option(4, "Number.", minimum=1)
+""",
+    "work/__init__.py": """
+import lazy_loader
+__getattr__, _, _ = lazy_loader.attach_stub(__name__, __file__)
+""",
+    "work/__init__.pyi": "from .steps import step\n",
+    "work/steps.py": "def step():\n    return 5\n",
+    "science/plain.py": "def shift():\n    return 1\n\ndef other():\n    return 2\n",
+    "science/late.py": "def late():\n    return 3\n",
+    "science/_kernels.py": """
+from skindb.jit import kernel, overload
+
+@kernel
+def summed(values):
+    total = 0.0
+    for value in values:
+        total += value
+    return total
+
+@overload(summed)
+def _plain(values):
+    return sum(values)
+""",
+    "science/unrelated.py": "raise RuntimeError('is never imported')\n",
+    "jit.py": "def kernel(function):\n    return function\n\ndef overload(_):\n    return kernel\n",
+    "store/__init__.py": "",
+}
+FIT = SimpleNamespace(__module__="skindb.science", __qualname__="fit")
 NNLS = ("numerics/_nnls_kernels.py", "MIN_PIVOT = 1e-11", "MIN_PIVOT = 1e-12")
 TEXTURE = ("geometry/_texture_kernels.py", "0.0", "-0.0")
+
+
+@pytest.fixture
+def package(tmp_path, monkeypatch):
+    root = tmp_path / "skindb"
+    for name, text in FILES.items():
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_text(text)
+    monkeypatch.setattr(module, "ROOT", root)
+    return root
+
+
+def _digest_after(package, monkeypatch, name, old, new):
+    """The digest of a second copy of the package in which something was replaced."""
+    copy = package.with_name("changed")
+    shutil.copytree(package, copy)
+    text = (copy / name).read_text()
+    assert old in text
+    (copy / name).write_text(text.replace(old, new))
+    monkeypatch.setattr(module, "ROOT", copy)
+    return code_digest(FIT)
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new"),
+    [
+        ("science/model.py", "SCALE * summed", "summed"),
+        ("science/model.py", "SCALE = 2.0", "SCALE = 2.5"),
+        ("science/_kernels.py", "total += value", "total -= value"),
+        ("science/_kernels.py", "sum(values)", "max(values)"),
+        ("science/_kernels.py", "@kernel\n", ""),
+        ("science/parameters.py", "option(4", "option(5"),
+        ("science/parameters.py", "minimum=1", "minimum=2"),
+        ("science/late.py", "return 3", "return 4"),
+        ("science/plain.py", "return 1", "return 0"),
+        ("science/table.json", "1", "2"),
+        ("work/steps.py", "return 5", "return 6"),
+        ("jit.py", "return function", "return None"),
+    ],
+)
+def test_code_digest__changes_with_everything_that_is_used(
+    package, monkeypatch, name, old, new
+):
+    before = code_digest(FIT)
+    assert _digest_after(package, monkeypatch, name, old, new) != before
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new"),
+    [
+        ("science/model.py", "Fit values.", "Fit many values."),
+        ("science/parameters.py", "Number.", "Number of bases."),
+        ("science/model.py", "    # a comment\n", "\n\n"),
+        ("science/model.py", "values: np.ndarray", "values: list[float]"),
+        ("science/model.py", "UNUSED = 1", "UNUSED = 2"),
+        ("science/model.py", "    return values\n", "    return None\n"),
+        ("science/plain.py", "return 2", "return 0"),
+        ("science/unrelated.py", "raise", "assert"),
+        ("store/__init__.py", "", "LEASE = 3\n"),
+    ],
+)
+def test_code_digest__does_not_depend_on_anything_else(
+    package, monkeypatch, name, old, new
+):
+    before = code_digest(FIT)
+    assert _digest_after(package, monkeypatch, name, old, new) == before
+
+
+def test_code_digest__takes_the_function_of_a_partial_and_around_a_nested_one(package):
+    nested = SimpleNamespace(
+        __module__="skindb.science", __qualname__="fit.<locals>.compute"
+    )
+    called = partial(lambda: None)
+    called.func.__module__ = FIT.__module__
+    called.func.__qualname__ = FIT.__qualname__
+    assert code_digest(FIT) == code_digest(nested) == code_digest(called)
+
+
+def test_code_digest__refuses_functions_of_other_packages():
+    with pytest.raises(
+        ValueError, match=r"shutil.copytree must be a function of skindb"
+    ):
+        code_digest(shutil.copytree)
+
+
+def test_code_symbols__of_a_fit_are_science_with_its_kernels():
+    symbols = code_symbols(second_pass)
+    modules = {name for name, _ in symbols}
+    assert {"skindb.numerics._nnls_kernels", "skindb.jit", "skindb.threads"} <= modules
+    top = {name.split(".")[1] for name in modules}
+    assert top.isdisjoint({"analysis", "render", "store", "workflow", "cli", "export"})
+
+
+def test_package_digest__changes_with_every_byte(package, monkeypatch):
+    monkeypatch.setattr(takes, "ROOT", package)
+    package_digest.cache_clear()
+    before = package_digest()
+    (package / "science/model.py").write_text(FILES["science/model.py"] + "#")
+    package_digest.cache_clear()
+    assert package_digest() != before
+    monkeypatch.undo()
+    package_digest.cache_clear()
+    assert Path(skindb.__file__).parent == module.ROOT
 
 
 def _version(calls, **attrs):
