@@ -318,29 +318,12 @@ def describe_calibration(db: Database, record: Record) -> dict[str, Any]:
     takes of earlier versions.
     """
     groups = _groups(db, record, record.generation)
-    lights = groups["light_calibration"]
-    intensity = lights[variables.CALIBRATED_INTENSITY]
-    relative = (lights[variables.CALIBRATED_INTENSITY_ERROR] / intensity).max("channel")
-    position = lights[variables.CALIBRATED_INTENSITY_POSITION_ERROR]
-    glare = lights[variables.GLARE_FRACTION]
-    total = np.sqrt(relative**2 + position**2 + glare**2)
-    description: dict[str, Any] = {
-        "lights": lights.sizes["light"],
-        "largest_relative_error": float(relative.max()),
-        "position_error": float(position.median()),
-        "glare": float(glare.median()),
-        "total_relative_error": float(total.max()),
-    }
+    description = _describe_lights(groups["light_calibration"])
     if record.generation > 1:
-        before = _groups(db, record, record.generation - 1)["light_calibration"]
-        # lights that both have
-        ratio = intensity / before[variables.CALIBRATED_INTENSITY]
-        change = abs(ratio - 1).max(dim="channel")
-        if change.size:
-            description |= {
-                "largest_change": float(change.max()),
-                "most_changed": str(change["light"].values[change.values.argmax()]),
-            }
+        before = _groups(db, record, record.generation - 1)
+        description |= _largest_change(
+            groups["light_calibration"], before["light_calibration"]
+        )
     if (positions := groups.get("position_calibration")) is not None:
         errors = positions[variables.CALIBRATED_POSITION_ERROR]
         description["largest_position_error_mm"] = float(errors.max())
@@ -356,6 +339,34 @@ def describe_calibration(db: Database, record: Record) -> dict[str, Any]:
     if (cameras := groups.get("camera_calibration")) is not None:
         description["cameras"] = _describe_cameras(cameras)
     return description | {"ingest_again": takes_of_earlier(db, record)}
+
+
+def _describe_lights(lights: xr.Dataset) -> dict[str, Any]:
+    """Number of the lights and errors of their intensities."""
+    error = lights[variables.CALIBRATED_INTENSITY_ERROR]
+    relative = (error / lights[variables.CALIBRATED_INTENSITY]).max("channel")
+    position = lights[variables.CALIBRATED_INTENSITY_POSITION_ERROR]
+    glare = lights[variables.GLARE_FRACTION]
+    total = np.sqrt(relative**2 + position**2 + glare**2)
+    return {
+        "lights": lights.sizes["light"],
+        "largest_relative_error": float(relative.max()),
+        "position_error": float(position.median()),
+        "glare": float(glare.median()),
+        "total_relative_error": float(total.max()),
+    }
+
+
+def _largest_change(lights: xr.Dataset, before: xr.Dataset) -> dict[str, Any]:
+    """Largest change of the intensity of a light that two versions have."""
+    name = variables.CALIBRATED_INTENSITY
+    change = abs(lights[name] / before[name] - 1).max(dim="channel")
+    if not change.size:
+        return {}
+    return {
+        "largest_change": float(change.max()),
+        "most_changed": str(change["light"].values[change.values.argmax()]),
+    }
 
 
 def _groups(db: Database, record: Record, generation: int) -> dict[str, xr.Dataset]:

@@ -4,7 +4,7 @@ which are kept as versions of kind summary if a version lacks them.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -40,7 +40,7 @@ from skindb.store import SUMMARY, CohortRequest, Database, Lookup, Record, lacki
 from skindb.types import Progress, silent
 from skindb.workflow.audit import logged
 from skindb.workflow.derive import TABLES, Derivation, code_digest, groups_of
-from skindb.workflow.takes import map_takes, results_of
+from skindb.workflow.takes import Result, map_takes, results_of
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -280,31 +280,52 @@ def register_takes(
     # small: every task gets all of them
     generations = {take: record.generation for take, record in models.items()}
     report = progress or silent
-    resources: dict[str, Any] = {"workers": workers, "client": client}
-    outlines: dict[str, Outline] = {}
-    landmarks: dict[str, tuple[str, ...]] = {}
-    report("outlines", 0, len(names))
-    for take, points, shape in results_of(
-        map_takes(partial(_outline, db, generations), names, **resources)
-    ):
-        landmarks[take] = points
-        outlines[take] = shape
-        report("outlines", len(outlines), len(names))
-    every_point = tuple(
-        dict.fromkeys(name for take in names for name in landmarks[take])
-    )
-    aligned = {
-        take: with_names(outlines[take], landmarks[take], every_point) for take in names
-    }
-    frame = common_frame(aligned, every_point, reference=reference)
-    assert frame is not None
+    outline_of = partial(_outline, db, generations)
+    map_results = partial(_map_results, workers=workers, client=client)
+    frame = _common_frame(names, reference, partial(map_results, outline_of), report)
     call = partial(_register, derivation, generations, frame)
     report("register", len(current), len(names))
     pending = [take for take in names if take not in current]
-    for record in results_of(map_takes(call, pending, **resources)):
+    for record in map_results(call, pending):
         current[record.take] = record
         report("register", len(current), len(names))
     return {take: current[take] for take in names}
+
+
+def _map_results(
+    function: Callable[[str], Result],
+    takes: Sequence[str],
+    *,
+    workers: int | None,
+    client: Client | None,
+) -> Iterator[Result]:
+    """The results of a function for every take, see `map_takes`."""
+    return results_of(map_takes(function, takes, workers=workers, client=client))
+
+
+def _common_frame(
+    takes: Sequence[str],
+    reference: str | None,
+    outlines_of: Callable[
+        [Sequence[str]], Iterator[tuple[str, tuple[str, ...], Outline]]
+    ],
+    report: Progress,
+) -> Frame:
+    """The common (u, v) of takes, from the outlines and the landmarks of all."""
+    outlines: dict[str, Outline] = {}
+    landmarks: dict[str, tuple[str, ...]] = {}
+    report("outlines", 0, len(takes))
+    for take, points, shape in outlines_of(takes):
+        landmarks[take] = points
+        outlines[take] = shape
+        report("outlines", len(outlines), len(takes))
+    names = tuple(dict.fromkeys(name for take in takes for name in landmarks[take]))
+    aligned = {
+        take: with_names(outlines[take], landmarks[take], names) for take in takes
+    }
+    frame = common_frame(aligned, names, reference=reference)
+    assert frame is not None
+    return frame
 
 
 def takes_with_landmarks(db: Database, takes: Sequence[str] | None = None) -> list[str]:

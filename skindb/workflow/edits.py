@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
 from skindb.analysis.edit import apply_traits, with_basis
 from skindb.analysis.population_basis import population_basis
@@ -22,7 +23,7 @@ from skindb.render.figures import write_grid
 from skindb.render.rendering import frontal_camera, radiance_of
 from skindb.schema import variables
 from skindb.schema.consent import require_consent
-from skindb.store import STUDY, Database, require_fresh
+from skindb.store import STUDY, Database, Record, require_fresh
 from skindb.types import Progress, silent
 from skindb.workflow import studies
 from skindb.workflow.audit import logged
@@ -215,28 +216,28 @@ def basis_grid(
         names, float(model[f"basis/{variables.DISC_ANGULAR_RADIUS}"]), dictionary
     )
     cohort = db.cohort("surfels", takes=[take], surfels=SAMPLED)
-    columns = {}
+    mixtures = {}
     for k in ks:
         rng = np.random.default_rng(seed)
         reduced = population_basis(cohort, tables=tables, k=k, in_metric=True, rng=rng)
-        columns[f"k = {k}"] = reduced[variables.POPULATION_MIXTURE].values
-    columns[f"all {len(names)}"] = np.eye(len(names))
+        mixtures[f"k = {k}"] = reduced[variables.POPULATION_MIXTURE].values
+    mixtures[f"all {len(names)}"] = np.eye(len(names))
     options.setdefault("scale", _grid_scale(model))
-    lamps = lights or [_frontal_light(model)]
-    pictures = [
-        radiance_of(
-            with_basis(model, mixture=mix, names=names, tables=tables),
-            lights=lamps,
-            **options,
-        ).radiance
-        for mix in columns.values()
-    ]
-    write_grid(out, {take: pictures}, list(columns))
-    full = float(np.sqrt((pictures[-1] ** 2).mean()))
+    options["lights"] = lights or [_frontal_light(model)]
+    pictures = {}
+    for name, mixture in mixtures.items():
+        reduced_model = with_basis(model, mixture=mixture, names=names, tables=tables)
+        pictures[name] = radiance_of(reduced_model, **options).radiance
+    write_grid(out, {take: list(pictures.values())}, list(pictures))
+    *_, full = pictures.values()
     return {
-        name: float(np.sqrt(((picture - pictures[-1]) ** 2).mean())) / full
-        for name, picture in zip(columns, pictures, strict=True)
+        name: _root_mean_square(picture - full) / _root_mean_square(full)
+        for name, picture in pictures.items()
     }
+
+
+def _root_mean_square(values: NDArray[np.float32]) -> float:
+    return float(np.sqrt((values**2).mean()))
 
 
 def _frontal_light(model: xr.DataTree) -> str:
@@ -277,13 +278,8 @@ def editable_model(
     brdfs = [str(name) for name in model["fitted"].to_dataset()["dictionary"].values]
     study_record = db.record(STUDY, study, vectors.attrs["generation"])
     inputs = [db.record("model", take, model.attrs["generation"]), study_record]
-    placed: dict[str, Any] = {}
-    if "texture" in vectors.children and (records := current_registrations(db, [take])):
-        registered = registered_datasets(db, records)[take]
-        texture = vectors["texture"].to_dataset().compute()
-        maps = common_maps(model, registered, size=texture.sizes["v"])
-        placed = {"texture": texture, "maps": maps, "registered": registered}
-        inputs.append(records[take])
+    textures, registrations = _registered_textures(db, take, model, vectors)
+    inputs += registrations
     traits, basis, albedo = (
         vectors[name].to_dataset().compute()
         for name in ("traits", "population_basis", "albedo")
@@ -300,7 +296,7 @@ def editable_model(
             basis=basis,
             albedo=albedo,
             tables=tables,
-            **placed,
+            **textures,
         )
 
     derivation = Derivation.of(
@@ -314,6 +310,24 @@ def editable_model(
         dictionary_digest=(dictionary_at(dictionary) or embedded_dictionary()).digest,
     )
     return Editable(model, study, move, derivation)
+
+
+def _registered_textures(
+    db: Database, take: str, model: xr.DataTree, vectors: xr.DataTree
+) -> tuple[dict[str, Any], list[Record]]:
+    """What moves the texture of a registered take: arguments of `apply_traits`, and the
+    record of its registration; nothing for other takes.
+    """
+    if "texture" not in vectors.children:
+        return {}, []
+    records = current_registrations(db, [take])
+    if not records:
+        return {}, []
+    registered = registered_datasets(db, records)[take]
+    texture = vectors["texture"].to_dataset().compute()
+    maps = common_maps(model, registered, size=texture.sizes["v"])
+    arguments = {"texture": texture, "maps": maps, "registered": registered}
+    return arguments, [records[take]]
 
 
 def _trait_study(db: Database, name: str | None) -> str:
