@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test test-all lint types docs clean
+.PHONY: demo test test-all commands notebooks lint types docs clean
 
 demo: $(STAMP)
 	$(BIN)/skindb demo --out demo
@@ -14,11 +14,17 @@ test: $(STAMP)
 
 # every test, then what pages state: the schema, words and commands of all pages, the README, notebooks, the site
 test-all: $(STAMP)
-	$(BIN)/python -m pytest --numprocesses auto --dist loadfile
+	$(BIN)/python -m pytest --numprocesses auto --dist loadfile --no-loadscope-reorder
 	$(BIN)/python docs/make_variables.py --check
 	$(BIN)/python .ci/check_docs.py
 	$(BIN)/python .ci/check_readme.py
+	$(MAKE) --jobs 2 --output-sync=target commands notebooks
+
+# the commands of the pages and the notebooks, each on a copy of the database of `make demo`
+commands: $(STAMP)
 	$(BIN)/python .ci/check_commands.py
+
+notebooks: $(STAMP)
 	$(BIN)/python .ci/run_notebooks.py
 	$(MAKE) docs
 

@@ -15,10 +15,14 @@ import re
 import subprocess
 import sys
 import tempfile
+from contextlib import chdir
 from pathlib import Path
 from shutil import copytree
 
 from check_docs import ROOT, commands, pages
+from click.testing import CliRunner
+
+from skindb.cli import cli
 
 # or add a study or a release
 READ_ONLY = {"info", "verify", "show", "compare", "analyze", "release", "dictionary"}
@@ -61,24 +65,32 @@ def calls() -> list[list[str]]:
     return sorted(map(list, found), key=lambda call: call[1] in LAST)
 
 
+def failure(call: list[str]) -> str:
+    """Messages of a call that fails; empty if it succeeds.
+
+    Commands run in this process, which imports skindb once; the README and the tests of
+    the command line start `skindb` as a user does.
+    """
+    if call[0] == "skindb":
+        result = CliRunner().invoke(cli, call[1:])
+        messages = f"{result.output}{result.exception or ''}"
+        return messages if result.exit_code else ""
+    done = subprocess.run(call, capture_output=True, text=True, check=False)
+    return done.stdout + done.stderr if done.returncode else ""
+
+
 def main() -> int:
     """Run the commands, and stop at the first one that fails."""
-    env = os.environ | {
-        "PATH": f"{ROOT / '.venv/bin'}{os.pathsep}{os.environ['PATH']}",
-        "MPLBACKEND": "agg",
-    }
-    with tempfile.TemporaryDirectory() as folder:
-        copytree(ROOT / "demo/db", Path(folder) / "demo/db")
-        (Path(folder) / "faces").symlink_to("demo/db")
+    os.environ["MPLBACKEND"] = "agg"
+    with tempfile.TemporaryDirectory() as folder, chdir(folder):
+        copytree(ROOT / "demo/db", "demo/db")
+        Path("faces").symlink_to("demo/db")
         found = calls()
         for call in found:
-            done = subprocess.run(
-                call, cwd=folder, env=env, capture_output=True, text=True, check=False
-            )
-            if done.returncode and TOO_FEW not in done.stderr:
+            messages = failure(call)
+            if messages and TOO_FEW not in messages:
                 sys.stderr.write(
-                    f"{' '.join(call)}\n{done.stdout}{done.stderr}this command of "
-                    "the pages failed\n"
+                    f"{' '.join(call)}\n{messages}\nthis command of the pages failed\n"
                 )
                 return 1
     sys.stdout.write(f"{len(found)} commands and Python blocks of the pages run\n")

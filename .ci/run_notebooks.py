@@ -1,4 +1,4 @@
-"""Run every notebook in its own folder with the database that `make demo` wrote.
+"""Run every notebook with a copy of the database that `make demo` wrote.
 
 The executed copies are written to `docs/_build/notebooks` and used by `make docs`, so
 that notebooks run only once.
@@ -7,7 +7,9 @@ that notebooks run only once.
 from __future__ import annotations
 
 import sys
+import tempfile
 from pathlib import Path
+from shutil import copytree
 
 import nbformat
 from nbclient import NotebookClient
@@ -22,15 +24,17 @@ def main() -> int:
     """
     EXECUTED.mkdir(parents=True, exist_ok=True)
     paths = sorted((ROOT / "notebooks").glob("*.ipynb"))
-    for path in paths:
-        notebook = nbformat.read(path, as_version=4)
-        NotebookClient(
-            notebook, timeout=600, resources={"metadata": {"path": str(path.parent)}}
-        ).execute()
-        nbformat.write(notebook, EXECUTED / path.name)
-        sys.stdout.write(
-            f"{path.name}: {sum(c.cell_type == 'code' for c in notebook.cells)} cells run\n"
-        )
+    with tempfile.TemporaryDirectory() as folder:
+        copytree(ROOT / "demo/db", Path(folder) / "demo/db")
+        work = Path(folder) / "notebooks"
+        work.mkdir()
+        for path in paths:
+            notebook = nbformat.read(path, as_version=4)
+            place = {"metadata": {"path": str(work)}}
+            NotebookClient(notebook, timeout=None, resources=place).execute()
+            nbformat.write(notebook, EXECUTED / path.name)
+            cells = sum(cell.cell_type == "code" for cell in notebook.cells)
+            sys.stdout.write(f"{path.name}: {cells} cells run\n")
     return 0 if paths else 1
 
 

@@ -24,6 +24,18 @@ settings.register_profile("same", derandomize=True, deadline=None)
 settings.register_profile("search", derandomize=False, deadline=None)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "same"))
 
+# files of more than 40 s
+LONGEST = {
+    "test_killed_runs",
+    "test_cli",
+    "test_engines",
+    "test_jit_vectors",
+    "test_erasure_of_any_name",
+    "test_suspended_writers",
+    "test_fuzz_store",
+    "test_hostile_disc",
+}
+
 
 def pytest_configure():
     """Modules and items live until the end: the collector of garbage need not look at them."""
@@ -37,10 +49,13 @@ def pytest_collection_finish():
 
 
 def pytest_collection_modifyitems(items):
-    """Tests with the server of a bucket are outside `make test`."""
+    """Tests with the server of a bucket are outside `make test`; the longest files come
+    first, so that no worker has one of them left at the end.
+    """
     for item in items:
         if "s3_address" in item.fixturenames:
             item.add_marker(pytest.mark.slow)
+    items.sort(key=lambda item: item.path.stem not in LONGEST)
 
 
 @pytest.fixture(scope="session", autouse=True)
