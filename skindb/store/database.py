@@ -61,7 +61,7 @@ from skindb.store.snapshot import (
 )
 from skindb.store.stage import Stage, read_tables, remove_version
 from skindb.store.stale import Request, read_requests, remove_request
-from skindb.store.verified import open_group, open_version
+from skindb.store.verified import open_version
 from skindb.store.verify import database_faults
 
 
@@ -306,12 +306,6 @@ class Database:
         (a capture or a record).
         """
         return consent_history(self.place, subject)
-
-    def read_group(self, record: Record, group: str) -> xr.Dataset:
-        """One group of a version, lazy and verified as in `read`, without opening the
-        other groups.
-        """
-        return open_group(self.place, record, group)
 
     def tables(self, record: Record) -> xr.Dataset:
         """The tables kept beside a version; empty if it has none."""

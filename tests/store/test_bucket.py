@@ -89,7 +89,7 @@ def test_stage__whole_shards_are_put_and_read_in_parts(home):
     np.testing.assert_array_equal(
         db.read("capture", "A1")["surfels/surfel_area"].values, area
     )
-    part = db.read_group(record, "surfels")["surfel_area"][SHARD + 5 : SHARD + 300 : 17]
+    part = db.read("capture", "A1")["surfels/surfel_area"][SHARD + 5 : SHARD + 300 : 17]
     np.testing.assert_array_equal(part.values, area[SHARD + 5 : SHARD + 300 : 17])
     assert db.verify() == []
 
