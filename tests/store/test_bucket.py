@@ -83,7 +83,7 @@ def test_stage__whole_shards_are_put_and_read_in_parts(home):
     with Database(home).stage("capture", "A1") as stage:
         stage.write({"surfels": dataset({"surfel_area": area}).chunk(surfel=1000)})
         stage.put("surfels", "surfel_area", SHARD, area[SHARD : 2 * SHARD] + 1)
-        record = stage.commit({})
+        stage.commit({})
     area[SHARD : 2 * SHARD] += 1
     db = Database(home)
     np.testing.assert_array_equal(
