@@ -24,7 +24,7 @@ from skindb.format.dome import DomeRecord
 from skindb.format.folder import read_capture
 from skindb.geometry.rays import RayScene
 from skindb.ingest.consistency import Calibration, CalibrationCheck
-from skindb.ingest.consistency_checks import calibration_faults, calibration_notes
+from skindb.ingest.faults import calibration_faults, calibration_notes
 from skindb.ingest.surfels import (
     SurfelSet,
     build_surfels,

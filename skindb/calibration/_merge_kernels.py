@@ -56,6 +56,32 @@ class ExposureModel(NamedTuple):
     matrix: Matrix32  # (3, 3) colour matrix, or (0, 3) for none
 
 
+class RowBuffers(NamedTuple):
+    """Values of the channels of a row, 3 w of each."""
+
+    signal: Matrix32  # (e, 3 w) relative exposures
+    noise: Matrix32  # (e, 3 w) their read variance, infinite at the white level
+    total: Vector32  # sum of the relative exposures, then their weighted mean
+    time: Vector32  # sum of the exposure times
+    above: Vector32  # number of exposures above the noise
+    weights: Vector32
+    black: Vector32
+
+
+@kernel
+def _row_buffers(exposures: int, size: int, zero: float) -> RowBuffers:
+    """Buffers for rows of `size` values."""
+    return RowBuffers(
+        np.empty((exposures, size), np.float32),
+        np.empty((exposures, size), np.float32),
+        np.empty(size, np.float32),
+        np.empty(size, np.float32),
+        np.empty(size, np.float32),
+        np.empty(size, np.float32),
+        np.full(size, np.float32(zero), np.float32),
+    )
+
+
 @kernel
 def develop(
     frames: tuple[Values, ...],
@@ -88,56 +114,66 @@ def develop(
     usable
         (h, w) uint8 zeros, output: see `skindb.calibration.radiance.FrameMerger.merge`; or (0, 0).
     """
-    count = len(frames)
     height, width = flag.shape
-    white = np.float32(model.white)
-    signal = np.empty((count, 3 * width), np.float32)
-    noise = np.empty((count, 3 * width), np.float32)
-    total = np.empty(3 * width, np.float32)
-    time = np.empty(3 * width, np.float32)
-    above = np.empty(3 * width, np.float32)
-    weights = np.empty(3 * width, np.float32)
-    black = np.full(3 * width, np.float32(model.zero), np.float32)
+    row = _row_buffers(len(frames), 3 * width, model.zero)
     for y in range(height):
         start = spans[y, 0]
         end = max(spans[y, 0], spans[y, 1])
         flag[y, :start] = SATURATED
         flag[y, end:] = SATURATED
-        begin = 3 * start
         size = 3 * (end - start)
         if size == 0:
             continue
-        total[:size] = ZERO
-        time[:size] = ZERO
-        above[:size] = ZERO
-        for e in range(count):
-            value = frames[e][y].reshape(3 * width)[begin : begin + size]
-            dark = (
-                model.dark[e, y].reshape(3 * width)[begin : begin + size]
-                if model.dark.shape[0]
-                else model.dark[:0, 0, 0, 0]
-            )
-            exposure = signal[e, :size]
-            spread = noise[e, :size]
-            _relative_exposure(value, dark, black, model, exposure, spread)
-            if usable.shape[0]:
-                _count(value, white, exposure, spread, usable[y, start:end])
-            _collect(
-                value,
-                white,
-                exposure,
-                spread,
-                model.seconds[e],
-                total[:size],
-                time[:size],
-                above[:size],
-            )
+        _sum_exposures(frames, y, start, end, model, row, usable)
+        total = row.total[:size]
         for k in range(size):
-            expected = total[k] / time[k]
+            expected = total[k] / row.time[k]
             positive = expected if expected > ZERO else ZERO
             total[k] = np.float32(model.photon) * positive
-        _average(signal, noise, model.seconds, total[:size], weights[:size])
-        _finish(y, start, total[:size], time, above, model, radiance, flag)
+        _average(row.signal, row.noise, model.seconds, total, row.weights[:size])
+        _finish(y, start, total, row.time, row.above, model, radiance, flag)
+
+
+@kernel
+def _sum_exposures(
+    frames: tuple[Values, ...],
+    y: int,
+    start: int,
+    end: int,
+    model: ExposureModel,
+    row: RowBuffers,
+    usable: ByteMatrix,
+) -> None:
+    """Write the relative exposures of a part of a row, and their sums."""
+    white = np.float32(model.white)
+    width = row.total.shape[0]
+    begin = 3 * start
+    size = 3 * (end - start)
+    row.total[:size] = ZERO
+    row.time[:size] = ZERO
+    row.above[:size] = ZERO
+    for e in range(len(frames)):
+        value = frames[e][y].reshape(width)[begin : begin + size]
+        dark = (
+            model.dark[e, y].reshape(width)[begin : begin + size]
+            if model.dark.shape[0]
+            else model.dark[:0, 0, 0, 0]
+        )
+        exposure = row.signal[e, :size]
+        spread = row.noise[e, :size]
+        _relative_exposure(value, dark, row.black, model, exposure, spread)
+        if usable.shape[0]:
+            _count(value, white, exposure, spread, usable[y, start:end])
+        _collect(
+            value,
+            white,
+            exposure,
+            spread,
+            model.seconds[e],
+            row.total[:size],
+            row.time[:size],
+            row.above[:size],
+        )
 
 
 @kernel
@@ -265,7 +301,6 @@ def _finish(
 ) -> None:
     """Apply vignette and colour matrix to a row, and set its flags."""
     gain = model.gain
-    matrix = model.matrix
     pixels = value.shape[0] // 3
     row = out[y, start : start + pixels].reshape(value.shape[0])
     if gain.shape[0] == 1:
@@ -277,19 +312,32 @@ def _finish(
             factor = gain[y, start + x]
             for k in range(3 * x, 3 * x + 3):
                 row[k] = value[k] * factor
-    if matrix.shape[0]:
-        for k in range(0, value.shape[0], 3):
-            r = row[k]
-            g = row[k + 1]
-            b = row[k + 2]
-            row[k] = matrix[0, 0] * r + matrix[0, 1] * g + matrix[0, 2] * b
-            row[k + 1] = matrix[1, 0] * r + matrix[1, 1] * g + matrix[1, 2] * b
-            row[k + 2] = matrix[2, 0] * r + matrix[2, 1] * g + matrix[2, 2] * b
+    if model.matrix.shape[0]:
+        _mix_channels(model.matrix, row)
     for k in range(value.shape[0]):  # sums over channels distinguish the three cases
         above[k] = NO_USABLE_EXPOSURE if time[k] == ZERO else min(above[k], ONE)
-    for x in range(pixels):
+    _set_flags(above, flag[y, start : start + pixels])
+
+
+@kernel
+def _mix_channels(matrix: Matrix32, row: Vector32) -> None:
+    """Multiply the pixels of a row by a colour matrix (3, 3)."""
+    for k in range(0, row.shape[0], 3):
+        r = row[k]
+        g = row[k + 1]
+        b = row[k + 2]
+        for c in range(3):
+            row[k + c] = matrix[c, 0] * r + matrix[c, 1] * g + matrix[c, 2] * b
+
+
+@kernel
+def _set_flags(above: Vector32, flag: ByteVector) -> None:
+    """Flags of pixels; `above` is per channel 0 in the dark, 1 above the noise, or
+    NO_USABLE_EXPOSURE.
+    """
+    for x in range(flag.shape[0]):
         state = above[3 * x] + above[3 * x + 1] + above[3 * x + 2]
         if state >= NO_USABLE_EXPOSURE:
-            flag[y, start + x] = SATURATED
+            flag[x] = SATURATED
         else:
-            flag[y, start + x] = DARK if state == ZERO else OK
+            flag[x] = DARK if state == ZERO else OK

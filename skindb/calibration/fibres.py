@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from scipy import ndimage, optimize
 
 from skindb.calibration.frame_checks import disagreement
-from skindb.calibration.radiance import merge_exposures
+from skindb.calibration.radiance import Image, merge_exposures
 from skindb.calibration.setup import MIN_FLAT_FRAMES, of_devices
 from skindb.errors import Fault, InputError, attempt, require
 from skindb.format.contact_probe import ProbeRecord
@@ -61,18 +61,27 @@ def placement_signal(
         raise InputError(replace(fault, found=finding))
     seconds = tuple(probe.exposures.values())
     radiance, error, _ = merge_exposures(strips, seconds, probe.sensor)
-    value = np.full((len(fibres), 3), np.nan)
-    spread = np.full((len(fibres), 3), np.nan)
     union = np.unique(np.concatenate(fibres))
-    for i, pixels in enumerate(fibres):
-        columns = np.searchsorted(union, pixels)
-        signal = radiance[0, columns].astype(np.float64)
-        noise = error[0, columns].astype(np.float64)
-        for c in range(3):
-            usable = np.isfinite(signal[:, c])
-            if 1 - usable.mean() <= MAX_LOST_FRACTION:
-                value[i, c] = signal[usable, c].mean()
-                spread[i, c] = np.sqrt((noise[usable, c] ** 2).sum()) / usable.sum()
+    means = [
+        _fibre_means(radiance[0, columns], error[0, columns])
+        for columns in (np.searchsorted(union, pixels) for pixels in fibres)
+    ]
+    return np.array([mean for mean, _ in means]), np.array([e for _, e in means])
+
+
+def _fibre_means(radiance: Image, error: Image) -> tuple[Float64, Float64]:
+    """Mean (3,) over the pixels (n, 3) of a fibre, and its standard error; NaN of a
+    channel with too many saturated pixels.
+    """
+    value = np.full(3, np.nan)
+    spread = np.full(3, np.nan)
+    signal = radiance.astype(np.float64)
+    noise = error.astype(np.float64)
+    for c in range(3):
+        usable = np.isfinite(signal[:, c])
+        if 1 - usable.mean() <= MAX_LOST_FRACTION:
+            value[c] = signal[usable, c].mean()
+            spread[c] = np.sqrt((noise[usable, c] ** 2).sum()) / usable.sum()
     return value, spread
 
 

@@ -316,22 +316,7 @@ def fit_light(target: TargetPixels, *, falloff: float | None = None) -> LightFit
 
 def _fit(value: Float64, slope: Float64, falloff: float | None) -> LightFit:
     """Robust fit of logarithms (n, 3) over ln cosine (n,)."""
-    inliers = np.ones(len(value), bool)
-    exponent = falloff or 0.0
-    level = np.median(value - exponent * slope[:, None], axis=0)
-    for _ in range(ROUNDS):
-        apart = (value - level - exponent * slope[:, None]).mean(axis=1)
-        spread = 1.4826 * float(np.median(np.abs(apart - np.median(apart))))
-        limit = MAX_DEVIATIONS * max(spread, 1e-9)
-        chosen = np.abs(apart - np.median(apart[inliers])) <= limit
-        centred = slope[chosen] - slope[chosen].mean()
-        square = max(float(centred @ centred), 1e-12)
-        if falloff is None:
-            exponent = float(centred @ value[chosen].mean(axis=1)) / square
-        level = value[chosen].mean(axis=0) - exponent * slope[chosen].mean()
-        if (chosen == inliers).all():
-            break
-        inliers = chosen
+    level, exponent, inliers = _robust_line(value, slope, falloff)
     inlier_fraction = float(inliers.mean())
     require(
         inlier_fraction >= MIN_USED,
@@ -359,3 +344,28 @@ def _fit(value: Float64, slope: Float64, falloff: float | None) -> LightFit:
         inlier_fraction,
         float(residual.std()),
     )
+
+
+def _robust_line(
+    value: Float64, slope: Float64, falloff: float | None
+) -> tuple[Float64, float, Mask]:
+    """Level (3,) and exponent of logarithms (n, 3) over ln cosine (n,), and the pixels
+    (n,) that are not outliers.
+    """
+    inliers = np.ones(len(value), bool)
+    exponent = falloff or 0.0
+    level = np.median(value - exponent * slope[:, None], axis=0)
+    for _ in range(ROUNDS):
+        apart = (value - level - exponent * slope[:, None]).mean(axis=1)
+        spread = 1.4826 * float(np.median(np.abs(apart - np.median(apart))))
+        limit = MAX_DEVIATIONS * max(spread, 1e-9)
+        chosen = np.abs(apart - np.median(apart[inliers])) <= limit
+        centred = slope[chosen] - slope[chosen].mean()
+        square = max(float(centred @ centred), 1e-12)
+        if falloff is None:
+            exponent = float(centred @ value[chosen].mean(axis=1)) / square
+        level = value[chosen].mean(axis=0) - exponent * slope[chosen].mean()
+        if (chosen == inliers).all():
+            break
+        inliers = chosen
+    return level, exponent, inliers

@@ -435,13 +435,10 @@ def fit_noise(
         str(frames.shape),
         "give one channel of each frame",
     )
-    clipped = (frames >= white).mean(axis=(1, 2, 3)) > SATURATION_FRACTION
-    count = frames[0, 0].size
-    difference = frames[:, 0] - frames[:, 1]
-    mean = np.where(clipped, np.nan, frames.mean(axis=(1, 2, 3)) - black)
-    variance = np.where(clipped, np.nan, difference.var(axis=(1, 2), ddof=1) / 2)
-    x = mean[~clipped]
-    y = variance[~clipped]
+    mean, variance = _transfer_curve(frames, black=black, white=white)
+    unclipped = np.isfinite(mean)
+    x = mean[unclipped]
+    y = variance[unclipped]
     require(
         len(x) >= MIN_PAIRS
         and x.max() >= MIN_RATIO * max(x.min(), 0.0)
@@ -452,7 +449,7 @@ def fit_noise(
         f"{len(x)} unsaturated pairs, {int((y > 0).sum())} of them noisy",
         "photograph them with several exposure times",
     )
-    (floor, slope), covariance, chi_square = _line(x, y, count)
+    (floor, slope), covariance, chi_square = _line(x, y, frames[0, 0].size)
     require(
         not slope <= 0,
         PAIRS,
@@ -460,24 +457,46 @@ def fit_noise(
         f"a slope of {slope:.3g}",
         "check that the frames are linear and not denoised",
     )
-    # from values to electrons; a read noise that is negative by chance becomes 0
     gain = 1 / float(slope)
-    read = floor - step**2 / 12
-    noise = gain * np.sqrt(max(read, 0.0))
-    # d noise = gain / (2 sqrt(read)) d read - noise gain d slope; near zero, the error
-    # of the square root
-    deviation = float(np.sqrt(covariance[0, 0]))
-    slopes = np.array([gain / (2 * np.sqrt(max(read, deviation))), -noise * gain])
+    noise, noise_error = _read_noise(floor - step**2 / 12, gain, covariance)
     return NoiseModel(
         electrons_per_dn=gain,
         electrons_per_dn_error=gain**2 * float(np.sqrt(covariance[1, 1])),
-        read_noise=float(noise),
-        read_noise_error=float(np.sqrt(slopes @ covariance @ slopes)),
+        read_noise=noise,
+        read_noise_error=noise_error,
         covariance=covariance,
         chi_square=chi_square,
         mean=mean,
         variance=variance,
     )
+
+
+def _transfer_curve(
+    frames: Float64, *, black: float, white: float
+) -> tuple[Float64, Float64]:
+    """Mean above black and variance (pair,) of pairs of frames (pair, 2, h, w); NaN of a
+    pair that is clipped.
+    """
+    clipped = (frames >= white).mean(axis=(1, 2, 3)) > SATURATION_FRACTION
+    difference = frames[:, 0] - frames[:, 1]
+    mean = frames.mean(axis=(1, 2, 3)) - black
+    variance = difference.var(axis=(1, 2), ddof=1) / 2
+    return np.where(clipped, np.nan, mean), np.where(clipped, np.nan, variance)
+
+
+def _read_noise(
+    variance: float, gain: float, covariance: Float64
+) -> tuple[float, float]:
+    """Read noise in electrons from its variance in values, and its standard error.
+
+    A variance that is negative by chance becomes 0.
+    """
+    noise = gain * np.sqrt(max(variance, 0.0))
+    # d noise = gain / (2 sqrt(variance)) d variance - noise gain d slope; near zero, the
+    # error of the square root
+    deviation = float(np.sqrt(covariance[0, 0]))
+    slopes = np.array([gain / (2 * np.sqrt(max(variance, deviation))), -noise * gain])
+    return float(noise), float(np.sqrt(slopes @ covariance @ slopes))
 
 
 def _line(x: Float64, y: Float64, count: int) -> tuple[Float64, Float64, float]:

@@ -8,7 +8,6 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -27,15 +26,13 @@ from skindb.fit.corrections import (
 )
 from skindb.fit.lumitexels import lumitexels
 from skindb.fit.normals import estimate_normals
-from skindb.fit.plan import plan_fit, surface_of
-from skindb.fit.quality import find_obstructed, fitted_part, hold_out, suspects
+from skindb.fit.plan import fitted_part, hold_out, plan_fit, surface_of
+from skindb.fit.quality import find_obstructed, suspects
 from skindb.fit.surface import fit_surface, refit_and_evaluate
 from skindb.fit.translucency import fit_probe, summarise_translucency, translucency_map
 from skindb.jit import reported_compilation
 from skindb.parameters import FitParameters
-from skindb.reflectance.dictionary import (
-    Dictionary,
-)
+from skindb.reflectance.dictionary import Dictionary
 from skindb.reflectance.kinds import surface_model
 from skindb.reflectance.model import ReflectanceModel
 from skindb.schema import FitStatus, Use, label, names_of
@@ -45,6 +42,13 @@ from skindb.types import Progress
 
 COMPILING = "compiling, only after an installation"
 COPIED_GROUPS = ("mesh", "dome", "probe")
+# of the first pass, that the second one uses
+ESTIMATES = (
+    "shading_normal",
+    "normal_error",
+    "diffuse_reflectance",
+    "diffuse_reflectance_error",
+)
 
 
 def fit_model(
@@ -110,57 +114,55 @@ def first_pass(
     """
     honour_consent(capture.attrs, "fit")
     parameters = parameters or FitParameters()
-    clock = Clock(progress)
-    samples_of_take = lumitexels(capture)
+    timer = StageTimer(progress)
+    samples = lumitexels(capture)
     groups: dict[str, xr.Dataset] = {}
     if parameters.light_gains:
-        chosen = np.random.default_rng([parameters.seed, 2])
-        with clock.stage("light gains"):
-            groups["light_gains"] = estimate_light_gains(
-                samples_of_take, rng=chosen, eta=parameters.eta
-            )
-        samples_of_take = divided_by_gains(
-            samples_of_take, groups["light_gains"]["light_gain"]
-        )
-    with clock.stage("dictionary"):
-        surface = surface_of(samples_of_take, parameters, dictionary)
+        with timer.stage("light gains"):
+            rng = np.random.default_rng([parameters.seed, 2])
+            gains = estimate_light_gains(samples, rng=rng, eta=parameters.eta)
+        groups["light_gains"] = gains
+        samples = divided_by_gains(samples, gains["light_gain"])
+    with timer.stage("dictionary"):
+        surface = surface_of(samples, parameters, dictionary)
         plan = plan_fit(capture, parameters, dictionary=dictionary)
     held_out = hold_out(capture, plan, parameters)
-    work = fitted_part(samples_of_take, held_out)
-    eta = parameters.eta
-    diffuse = partial(
-        estimate_diffuse_reflectance,
-        eta=eta,
-        even_reflection=parameters.even_reflection,
-    )
-
-    # one graph: every block of samples is read once
-    def fit(samples: xr.Dataset) -> xr.Dataset:
-        estimates = estimate_normals(samples, eta=eta)
-        estimates = estimates.merge(diffuse(samples.merge(estimates)))
-        shiny = fit_surface(
-            samples.merge(estimates), surface=surface, mode=parameters.mode, eta=eta
-        )
-        return estimates.merge(shiny).compute()
-
-    with clock.stage("first pass"):
-        fitted = fit(work)
+    with timer.stage("first pass"):
+        fitted = _fit_surfels(fitted_part(samples, held_out), surface, parameters)
     if parameters.inter_reflection:
-        with clock.stage("inter-reflection"):
-            direct = _direct_light(capture, samples_of_take, fitted, eta)
-        with clock.stage("first pass again"):
-            fitted = fit(fitted_part(direct, held_out))
+        with timer.stage("inter-reflection"):
+            direct = _direct_light(capture, samples, fitted, parameters.eta)
+        with timer.stage("first pass again"):
+            fitted = _fit_surfels(fitted_part(direct, held_out), surface, parameters)
     fitted["fit_status"][find_obstructed(fitted)] = FitStatus.OBSTRUCTED
-    fitted = fitted.assign(refractive_index=label("refractive_index", eta)).drop_vars(
-        [name for name in ("light", "camera") if name in fitted.coords]
-    )
+    index = label("refractive_index", parameters.eta)
+    devices = [name for name in ("light", "camera") if name in fitted.coords]
+    fitted = fitted.assign(refractive_index=index).drop_vars(devices)
     first = xr.DataTree.from_dict({"fitted": fitted, "held_out": held_out, **groups})
     first.attrs = surface.provenance | {
         "parameters": parameters.as_dict() | surface.settings,
-        "seconds": clock.seconds,
+        "seconds": timer.seconds,
         "skipped": plan.explain() if plan.omissions else [],
     }
     return first
+
+
+def _fit_surfels(
+    samples: xr.Dataset, surface: ReflectanceModel, parameters: FitParameters
+) -> xr.Dataset:
+    """Normal, diffuse reflectance and surface term of every surfel; one graph, in which
+    every block of samples is read once.
+    """
+    eta = parameters.eta
+    estimates = estimate_normals(samples, eta=eta)
+    diffuse = estimate_diffuse_reflectance(
+        samples.merge(estimates), eta=eta, even_reflection=parameters.even_reflection
+    )
+    estimates = estimates.merge(diffuse)
+    terms = fit_surface(
+        samples.merge(estimates), surface=surface, mode=parameters.mode, eta=eta
+    )
+    return estimates.merge(terms).compute()
 
 
 def second_pass(
@@ -188,80 +190,54 @@ def second_pass(
     """
     honour_consent(capture.attrs, "fit")
     parameters = FitParameters.of(first.attrs)
-    clock = Clock(progress)
-    samples_of_take = lumitexels(capture)
+    timer = StageTimer(progress)
+    samples = lumitexels(capture)
+    gains = None
     if "light_gains" in first.children:
-        samples_of_take = divided_by_gains(
-            samples_of_take, first["light_gains"].to_dataset()["light_gain"]
-        )
-    surface = surface_of(samples_of_take, parameters, dictionary)
-    _require_match(first, surface, samples_of_take)
+        gains = first["light_gains"].to_dataset()
+        samples = divided_by_gains(samples, gains["light_gain"])
+    surface = surface_of(samples, parameters, dictionary)
+    _require_match(first, surface, samples)
     fitted = first["fitted"].to_dataset()
     held_out = first["held_out"].to_dataset()
     if parameters.inter_reflection:
-        with clock.stage("inter-reflection"):
-            samples_of_take = _direct_light(
-                capture, samples_of_take, fitted, parameters.eta
-            )
-    with clock.stage("reduced basis"):
+        with timer.stage("inter-reflection"):
+            samples = _direct_light(capture, samples, fitted, parameters.eta)
+    with timer.stage("reduced basis"):
         rng = np.random.default_rng([parameters.seed, 1])
-        weighted = fitted.merge(samples_of_take[["surfel_area"]])
+        weighted = fitted.merge(samples[["surfel_area"]])
         basis = surface.reduced(weighted, k=parameters.k, rng=rng)
-    with clock.stage("second pass"):
-        # only mixtures of BRDFs can be rendered
-        mode = "perceptual" if parameters.mode == "paper" else parameters.mode
-        estimates = (
-            "shading_normal",
-            "normal_error",
-            "diffuse_reflectance",
-            "diffuse_reflectance_error",
-        )
+    with timer.stage("second pass"):
         judged, outliers = refit_and_evaluate(
-            samples_of_take.merge(fitted[list(estimates)]),
+            samples.merge(fitted[list(ESTIMATES)]),
             held_out=held_out,
             basis=basis,
-            mode=mode,
+            # only mixtures of BRDFs can be rendered
+            mode="perceptual" if parameters.mode == "paper" else parameters.mode,
             eta=parameters.eta,
         )
-    groups = _groups(capture, fitted.assign(judged), basis) | {
-        "held_out": held_out,
-        "outliers": outliers,
-    }
-    if "light_gains" in first.children:
-        groups["light_gains"] = first["light_gains"].to_dataset()
-        groups["dome"] = _with_gains(
-            groups["dome"], groups["light_gains"]["light_gain"].values
-        )
+    groups = _groups(capture, fitted.assign(judged), basis, gains)
+    groups |= {"held_out": held_out, "outliers": outliers}
     if "probe" in groups:
-        with clock.stage("translucency"):
-            sites = fit_probe(
-                groups["probe"], eta=parameters.eta, profile=parameters.profile
-            )
-            groups["translucency"] = sites.merge(groups["probe"][["site_position"]])
-            groups["fitted"] = groups["fitted"].merge(
-                translucency_map(groups["fitted"], groups["translucency"])
-            )
+        with timer.stage("translucency"):
+            groups |= _translucency(groups, parameters)
     model = xr.DataTree.from_dict(groups)
-    model.attrs = take_attrs(capture.attrs)
     # the values that were actually used
     settings = parameters.as_dict() | surface_model(basis).settings
-    model.attrs |= {"parameters": settings} | surface.provenance
-    model.attrs |= _report(groups["fitted"], held_out)
-    if "translucency" in groups:
-        model.attrs["translucency"] = summarise_translucency(groups["translucency"])
-    if "light_gains" in groups:
-        model.attrs["light_gains"] = summarise_gains(groups["light_gains"])
+    model.attrs = take_attrs(capture.attrs) | {"parameters": settings}
+    model.attrs |= surface.provenance | _summaries(groups)
     model.attrs |= {
-        "suspects": suspects(outliers, fitted_part(samples_of_take, held_out)),
+        "suspects": suspects(outliers, fitted_part(samples, held_out)),
         "skipped": first.attrs["skipped"],
+        "seconds": {**first.attrs["seconds"], **timer.seconds},
     }
-    model.attrs["seconds"] = {**first.attrs["seconds"], **clock.seconds}
     return model
 
 
 def _require_match(
-    first: xr.DataTree, surface: ReflectanceModel, whole: xr.Dataset
+    first: xr.DataTree, surface: ReflectanceModel, samples: xr.Dataset
 ) -> None:
+    """Require that a first pass used this surface model and these surfels."""
     origin = surface.provenance
     if any(first.attrs.get(name) != origin[name] for name in origin):
         rule = "both passes need the same dictionary"
@@ -269,20 +245,17 @@ def _require_match(
         source = str(next(iter(origin.values())))
         raise InputError(Fault("dictionary", rule, source, cure))
     surfels = first["fitted"].sizes["surfel"]
-    if surfels != whole.sizes["surfel"]:
+    if surfels != samples.sizes["surfel"]:
         rule = "both passes need the same capture"
-        raise InputError(
-            Fault(
-                "first pass",
-                rule,
-                f"{surfels} surfels of {whole.sizes['surfel']}",
-                "repeat the first pass",
-            )
-        )
+        finding = f"{surfels} surfels of {samples.sizes['surfel']}"
+        raise InputError(Fault("first pass", rule, finding, "repeat the first pass"))
 
 
 def _groups(
-    capture: xr.DataTree, fitted: xr.Dataset, basis: xr.Dataset
+    capture: xr.DataTree,
+    fitted: xr.Dataset,
+    basis: xr.Dataset,
+    gains: xr.Dataset | None,
 ) -> dict[str, xr.Dataset]:
     """Groups of the model: results of the fit, and groups of the capture that users of
     the model need.
@@ -296,7 +269,33 @@ def _groups(
         for name in COPIED_GROUPS
         if name in capture.children
     }
+    if gains is not None:
+        copied["dome"] = _with_gains(copied["dome"], gains["light_gain"].values)
+        copied["light_gains"] = gains
     return {"fitted": fitted, "basis": basis, **copied}
+
+
+def _translucency(
+    groups: Mapping[str, xr.Dataset], parameters: FitParameters
+) -> dict[str, xr.Dataset]:
+    """Group "translucency" with the sites of the probe, and group "fitted" with
+    sigma_tr.
+    """
+    probe = groups["probe"]
+    sites = fit_probe(probe, eta=parameters.eta, profile=parameters.profile)
+    sites = sites.merge(probe[["site_position"]])
+    fitted = groups["fitted"].merge(translucency_map(groups["fitted"], sites))
+    return {"translucency": sites, "fitted": fitted}
+
+
+def _summaries(groups: Mapping[str, xr.Dataset]) -> dict[str, Any]:
+    """Attributes of a model that summarise its groups."""
+    summaries = _report(groups["fitted"], groups["held_out"])
+    if "translucency" in groups:
+        summaries["translucency"] = summarise_translucency(groups["translucency"])
+    if "light_gains" in groups:
+        summaries["light_gains"] = summarise_gains(groups["light_gains"])
+    return summaries
 
 
 def _direct_light(
@@ -340,11 +339,10 @@ def _report(fitted: xr.Dataset, held_out: xr.Dataset) -> dict[str, Any]:
     }
     report: dict[str, Any] = {"surfels": int(status.size), "status": fractions}
     for name in names_of(Use.REPORTED):
-        finite = (
-            fitted[name].values[skin & np.isfinite(fitted[name].values)]
-            if name in fitted
-            else np.zeros(0)
-        )
+        if name not in fitted:
+            continue
+        values = fitted[name].values
+        finite = values[skin & np.isfinite(values)]
         if finite.size:
             report[name] = {
                 "median": float(np.median(finite)),
@@ -363,7 +361,7 @@ def _report(fitted: xr.Dataset, held_out: xr.Dataset) -> dict[str, Any]:
 
 
 @dataclass
-class Clock:
+class StageTimer:
     """Times stages; `progress` is called with the stage, the steps done and the total
     number of steps.
     """

@@ -331,47 +331,36 @@ def _coefficients(p: Array) -> tuple[Array, Array]:
     return third / (2 * (s + np.sqrt(s * s + third))), s
 
 
-def _report(found: Any, problem: Problem, *, rival: float, near: float) -> ProbeFit:
+def _report(minimum: Any, problem: Problem, *, rival: float, near: float) -> ProbeFit:
     """Estimates with their covariance due to the measured errors, and separately the
     effect of the model's error.
 
     Distances in log sigma_tr: `rival` to minima of similar quality; `near` to the fit
     without the nearest fibre.
     """
-    p = found.x
-    size = len(p)
+    p = minimum.x
     fibres = len(problem.log_profile)
-    # a ridge keeps undetermined directions finite; their error exceeds any bound
-    normal = np.linalg.inv(found.jac.T @ found.jac + 1e-12 * np.eye(size))
-    effect = normal @ found.jac.T  # of each weighted residual on each parameter
-    gain = effect[:, :fibres] * problem.weight(p)
     # residuals larger than both errors increase the error
-    excess = 2 * float(found.cost) / max(fibres - size, 1)
-    residual = float(np.sqrt(np.mean(problem.misfit(p) ** 2)))
-    covariance = (gain * problem.relative_error(p) ** 2) @ gain.T * max(
-        1.0, excess
-    ) + 1e-18 * np.eye(size)
-    covariance += effect[:, fibres:] @ effect[:, fibres:].T
+    excess = 2 * float(minimum.cost) / max(fibres - len(p), 1)
+    covariance, gain = _covariance(minimum, problem, excess)
     sd = np.sqrt(np.diag(covariance))
     error = float(max(sd[0], rival, near))
-    _, vectors = np.linalg.eigh(covariance[:2, :2])
-    sharp = vectors[:, 0] / np.abs(vectors[:, 0]).max()
-    sharp = sharp * np.sign(sharp[0]) if sharp[0] else sharp
     a, s = map(float, _coefficients(p))
     model_error = problem.model.bright + problem.model.dark * a / (a + s)
-    off = float(np.hypot(gain[0] @ problem.discrepancy(p), model_error))
+    off = float(np.hypot(gain @ problem.discrepancy(p), model_error))
     tr = float(np.exp(p[0]))
     unexplained, chance = _unexplained(problem, p)
-    bound = bool((p - LOWER[:size] < 1e-3).any() or (UPPER[:size] - p < 1e-3).any())
+    all_near = tr * problem.distance.max() < 1
     verdicts = {
         ProbeStatus.UNIDENTIFIED: error > 1,
-        ProbeStatus.AT_BOUND: bound,
-        ProbeStatus.NOT_CONVERGED: found.status <= 0,
-        ProbeStatus.OUT_OF_RANGE: a > RATIO_MAX * s or tr * problem.distance.max() < 1,
+        ProbeStatus.AT_BOUND: _at_bound(p),
+        ProbeStatus.NOT_CONVERGED: minimum.status <= 0,
+        ProbeStatus.OUT_OF_RANGE: a > RATIO_MAX * s or all_near,
         # before POOR_FIT, which statistics count
         ProbeStatus.AMBIGUOUS: rival > MIN_SEPARATION,
         ProbeStatus.POOR_FIT: unexplained > POOR_MISFIT and chance < RARE_CHI_SQUARED,
     }
+    broken = (verdict for verdict, applies in verdicts.items() if applies)
     return ProbeFit(
         sigma_a=a,
         sigma_s_prime=s,
@@ -380,16 +369,47 @@ def _report(found: Any, problem: Problem, *, rival: float, near: float) -> Probe
         sigma_tr_model_error=tr * off,
         sigma_tr_total_error=tr * float(np.hypot(error, off)),
         gain=float(np.exp(p[2])) if problem.free_gain else 1.0,
-        residual=residual,
+        residual=float(np.sqrt(np.mean(problem.misfit(p) ** 2))),
         misfit=unexplained,
         chi_squared=excess,
         used=fibres,
         correlation=float(covariance[0, 1] / (sd[0] * sd[1])),
-        combination=(float(sharp[0]), float(sharp[1])),
-        status=next(
-            (verdict for verdict, true in verdicts.items() if true), ProbeStatus.FITTED
-        ),
+        combination=_best_exponents(covariance),
+        status=next(broken, ProbeStatus.FITTED),
     )
+
+
+def _covariance(minimum: Any, problem: Problem, excess: float) -> tuple[Array, Array]:
+    """Covariance of the parameters due to the measured errors, which `excess` increases,
+    and the effect (f,) of the logarithm at each fibre on log sigma_tr.
+    """
+    p = minimum.x
+    size = len(p)
+    fibres = len(problem.log_profile)
+    # a ridge keeps undetermined directions finite; their error exceeds any bound
+    normal = np.linalg.inv(minimum.jac.T @ minimum.jac + 1e-12 * np.eye(size))
+    effect = normal @ minimum.jac.T  # of each weighted residual on each parameter
+    gain = effect[:, :fibres] * problem.weight(p)
+    covariance = (gain * problem.relative_error(p) ** 2) @ gain.T * max(
+        1.0, excess
+    ) + 1e-18 * np.eye(size)
+    covariance += effect[:, fibres:] @ effect[:, fibres:].T
+    return covariance, gain[0]
+
+
+def _best_exponents(covariance: Array) -> tuple[float, float]:
+    """Exponents (a, b) of the product sigma_tr^a sigma_s'^b that is determined best; the
+    larger is 1.
+    """
+    _, vectors = np.linalg.eigh(covariance[:2, :2])
+    sharp = vectors[:, 0] / np.abs(vectors[:, 0]).max()
+    sharp = sharp * np.sign(sharp[0]) if sharp[0] else sharp
+    return float(sharp[0]), float(sharp[1])
+
+
+def _at_bound(p: Array) -> bool:
+    size = len(p)
+    return bool((p - LOWER[:size] < 1e-3).any() or (UPPER[:size] - p < 1e-3).any())
 
 
 def _unexplained(problem: Problem, p: Array) -> tuple[float, float]:

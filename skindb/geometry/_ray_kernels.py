@@ -1,5 +1,5 @@
 """Compiled preparation of rays between points (`skindb.geometry.rays.RayScene.occluded`),
-and check of the pixels around a projected point (`skindb.ingest.visibility`).
+and check of the pixels around a projected point (`skindb.ingest.surfels`).
 """
 
 from __future__ import annotations

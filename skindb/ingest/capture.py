@@ -35,7 +35,13 @@ from skindb.ingest.consistency import (
     applied_rotations,
     refine_cameras,
 )
-from skindb.ingest.consistency_checks import calibration_faults, calibration_notes
+from skindb.ingest.faults import (
+    calibration_faults,
+    calibration_notes,
+    intensity_faults,
+    light_notes,
+    sample_faults,
+)
 from skindb.ingest.groups import (
     atlas_group,
     calibration_group,
@@ -56,14 +62,13 @@ from skindb.ingest.lumitexels import (
     sample_lumitexels,
 )
 from skindb.ingest.probe_profiles import fibre_profiles, isotropy_p_values, probe_notes
-from skindb.ingest.provenance import (
+from skindb.ingest.report import (
     capture_provenance,
+    describe_samples,
     frame_marks,
     require_fit_consent,
     samples_digest,
 )
-from skindb.ingest.report import describe_samples
-from skindb.ingest.sample_quality import intensity_faults, light_notes, sample_faults
 from skindb.ingest.spool import Spool
 from skindb.ingest.surfels import (
     SurfelSet,

@@ -15,9 +15,15 @@ from numpy.typing import NDArray
 from skindb.calibration._merge_kernels import OK, SATURATED
 from skindb.calibration.frame_checks import checked_view, highest_value
 from skindb.calibration.irradiance import light_falloff
-from skindb.calibration.radiance import FrameMerger, Image, radiance_floor
+from skindb.calibration.radiance import (
+    FrameMerger,
+    Image,
+    radiance_floor,
+    radiance_noise,
+    vignette_gain,
+)
 from skindb.errors import Fault, InputError, attempt
-from skindb.format.dome import CameraRecord, DomeRecord, LightRecord
+from skindb.format.dome import CameraRecord, DomeRecord
 from skindb.format.frames import Digests, Frame
 from skindb.geometry._mesh_kernels import grown
 from skindb.ingest._sample_kernels import (
@@ -29,12 +35,10 @@ from skindb.ingest._sample_kernels import (
     pixel_spans,
 )
 from skindb.ingest.consistency import Calibration, CalibrationCheck, Pair
-from skindb.ingest.consistency_checks import calibration_faults
-from skindb.ingest.sample_quality import (
-    SampleNoise,
+from skindb.ingest.faults import (
     bright_fraction,
+    calibration_faults,
     require_lit,
-    sample_noise,
     view_median,
 )
 from skindb.ingest.spool import Spool
@@ -226,22 +230,7 @@ def sample_lumitexels(
         sample(pair for pair in missing if pair not in checked)
     if faults or contradictions:
         raise InputError(faults + contradictions)
-    usable, saturated, dark, single = spool.counts
-    photographs = {pair: spool.kept(f"photograph-{pair[0]}-{pair[1]}") for pair in kept}
-    return Lumitexels(
-        sample=spool.samples(),
-        sample_count=usable,
-        saturated_count=saturated,
-        dark_count=dark,
-        single_count=single,
-        view_count=spool.views,
-        views=levels,
-        noise_floor=noise_floor(dome, intensity, views.surfels),
-        shot_noise=shot_noise(dome, intensity, views.surfels),
-        photographs={k: image for k, image in photographs.items() if image is not None},
-        calibration=calibration,
-        noise=sample_noise(dome, views.pixels, _effective_pixels(dome, shots)),
-    )
+    return sampler.lumitexels(calibration)
 
 
 @dataclass(frozen=True)
@@ -264,6 +253,31 @@ class _Sampler:
         attempt(faults, lambda: self._sample(*pair))
         return faults
 
+    def lumitexels(self, calibration: Calibration | None) -> Lumitexels:
+        """The samples and counts of all views in the spool."""
+        surfels = self.views.surfels
+        usable, saturated, dark, single = self.spool.counts
+        photographs = {}
+        for j, c in self.kept:
+            image = self.spool.kept(f"photograph-{j}-{c}")
+            if image is not None:
+                photographs[j, c] = image
+        pixels = _effective_pixels(self.dome, self.shots)
+        return Lumitexels(
+            sample=self.spool.samples(),
+            sample_count=usable,
+            saturated_count=saturated,
+            dark_count=dark,
+            single_count=single,
+            view_count=self.spool.views,
+            views=self.levels,
+            noise_floor=noise_floor(self.dome, self.intensity, surfels),
+            shot_noise=shot_noise(self.dome, self.intensity, surfels),
+            photographs=photographs,
+            calibration=calibration,
+            noise=sample_noise(self.dome, self.views.pixels, pixels),
+        )
+
     def _sample(self, j: int, c: int) -> None:
         light = self.dome.lights[j]
         merger = self.mergers[self.dome.cameras[c].id]
@@ -282,9 +296,7 @@ class _Sampler:
         if check is not None:
             reduced = check.reduce(c, _without_saturated(radiance, flag))
             self.spool.keep(f"calibration-{j}-{c}", reduced)
-        samples, outcome = _sampled(
-            merged, shot, surfels, light, self.intensity[j], self.views, j
-        )
+        samples, outcome = self._gathered(merged, shot, surfels, j)
         usable = samples[:, (outcome == OK) | (outcome == SINGLE)].view(np.float16)
         place = f"{self.dome.file}[frames], camera {merger.camera.id}, light {light.id}"
         require_lit(place, radiance[flag == OK], usable.shape[1])
@@ -294,6 +306,33 @@ class _Sampler:
         levels.highest[j, c], levels.clipped[j, c] = highest_value(merger, frames)
         names = {str(path): digest for path, digest in digests.items()}
         self.spool.put(j, c, samples, outcome, names)
+
+    def _gathered(
+        self, merged: MergedView, shot: CameraSampling, surfels: Mask, j: int
+    ) -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
+        """Bits of the samples (3, n) of a view, and outcome (n,) for each surfel."""
+        views = self.views
+        light = self.dome.lights[j]
+        out = np.empty((3, len(surfels)), np.uint16)
+        outcome = np.empty(len(surfels), np.uint8)
+        light_fraction = np.zeros(0, np.float32)
+        if views.light_fraction is not None:
+            light_fraction = views.light_fraction[:, j].astype(np.float32)
+        gather(
+            merged,
+            surfels,
+            light_fraction,
+            shot.pixels,
+            shot.spread,
+            views.surfels.position,
+            views.surfels.normal,
+            PointLight(
+                light.position, light.axis, float(light.falloff), self.intensity[j]
+            ),
+            out,
+            outcome,
+        )
+        return out, outcome
 
 
 def checked_pictures(
@@ -407,37 +446,6 @@ def _merged(
     return MergedView(radiance, flag, usable)
 
 
-def _sampled(
-    merged: MergedView,
-    shot: CameraSampling,
-    surfels: Mask,
-    light: LightRecord,
-    intensity: Float64,
-    views: Views,
-    j: int,
-) -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
-    """Bits of the samples (3, n) of a view, and outcome (n,) for each surfel."""
-    n = len(surfels)
-    out = np.empty((3, n), np.uint16)
-    outcome = np.empty(n, np.uint8)
-    light_fraction = np.zeros(0, np.float32)
-    if views.light_fraction is not None:
-        light_fraction = views.light_fraction[:, j].astype(np.float32)
-    gather(
-        merged,
-        surfels,
-        light_fraction,
-        shot.pixels,
-        shot.spread,
-        views.surfels.position,
-        views.surfels.normal,
-        PointLight(light.position, light.axis, float(light.falloff), intensity),
-        out,
-        outcome,
-    )
-    return out, outcome
-
-
 def _in_turn(pool: Executor, call: Callable[[T], R], items: Iterable[T]) -> Iterator[R]:
     """Results in order, with a limited number of pending calls; no call is still
     running at the end.
@@ -521,3 +529,56 @@ def _frontal(camera: CameraRecord, surfels: SurfelSet) -> Mask:
     cosine = np.einsum("ni,ni->n", way, surfels.normal) / np.linalg.norm(way, axis=1)
     width = camera.pixel_width(surfels.position.mean(axis=0))
     return np.asarray(cosine >= max(MIN_COSINE_CAMERA, width / MAX_SMEAR_MM))
+
+
+@dataclass(frozen=True)
+class SampleNoise:
+    """Noise model of the samples; exposures are ordered from the longest to the shortest.
+
+    Radiance up to `limit` is below the white level in an exposure and in all shorter
+    ones. The radiance of a pixel that is merged from them has the variance
+    read_variance + shot_variance * radiance, and a sample has that variance over its
+    effective pixels.
+    """
+
+    limit: Float64  # (camera, 3, exposure) radiance
+    read_variance: Float64  # (camera, 3, exposure) radiance^2
+    shot_variance: Float64  # (camera, 3, exposure) radiance
+    # (n, camera); NaN where the camera takes no sample
+    effective_pixels: NDArray[np.float32]
+
+
+def sample_noise(
+    dome: DomeRecord, pixels: NDArray[np.float32], effective_pixels: NDArray[np.float32]
+) -> SampleNoise | None:
+    """The noise of all samples from the sensors' electrons; None if those of a camera are unknown.
+
+    Parameters
+    ----------
+    dome
+        Cameras and exposures.
+    pixels
+        (n, camera, 2) projections of the surfels.
+    effective_pixels
+        (n, camera) from `pixel_counts`; NaN where no sample is taken.
+    """
+    if not all(camera.sensor.noise_known for camera in dome.cameras):
+        return None
+    seconds = np.sort(np.fromiter(dome.exposures.values(), float))[::-1]
+    parts = []
+    for c, camera in enumerate(dome.cameras):
+        seen = np.isfinite(effective_pixels[:, c])
+        parts.append(
+            radiance_noise(camera, seconds, _mean_gain(camera, pixels[seen, c]))
+        )
+    limit, read, shot = (np.stack(part) for part in zip(*parts, strict=True))
+    return SampleNoise(limit, read, shot, effective_pixels)
+
+
+def _mean_gain(camera: CameraRecord, pixels: NDArray[np.float32]) -> float:
+    """Mean vignette at projections (n, 2)."""
+    if not camera.vignette.any() or not len(pixels):
+        return 1.0
+    column = np.clip(pixels[:, 0].astype(int), 0, camera.width - 1)
+    row = np.clip(pixels[:, 1].astype(int), 0, camera.height - 1)
+    return float(vignette_gain(camera)[row, column, 0].mean())

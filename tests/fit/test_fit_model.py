@@ -26,8 +26,8 @@ from skindb.fit import (
     tabulate_translucency,
 )
 from skindb.fit.lumitexels import lumitexels as lumitexels_of
-from skindb.fit.plan import plan_fit
-from skindb.fit.quality import HELD_OUT_ERRORS, fitted_part, hold_out
+from skindb.fit.plan import fitted_part, hold_out, plan_fit
+from skindb.fit.quality import HELD_OUT_ERRORS
 from skindb.optics.diffusion import sigma_tr
 from skindb.reflectance.mixture import Mixture
 from skindb.schema import GROUPS, FitStatus, check, dataset, label

@@ -25,7 +25,7 @@ from skindb.ingest.consistency import (
     applied_rotations,
     refine_cameras,
 )
-from skindb.ingest.consistency_checks import calibration_faults, calibration_notes
+from skindb.ingest.faults import calibration_faults, calibration_notes
 from skindb.ingest.photo_offsets import (
     ReducedView,
     bilinear,

@@ -24,7 +24,7 @@ from sphere import (
 
 import skindb
 from skindb import workflow
-from skindb.calibration.radiance import frame_merger, merge_exposures
+from skindb.calibration.radiance import frame_merger, merge_exposures, radiance_noise
 from skindb.fit.lumitexels import lumitexels, noise_inputs, sample_variance
 from skindb.format.dome import CameraRecord
 from skindb.format.folder import read_capture
@@ -33,7 +33,6 @@ from skindb.format.sensor import UNKNOWN_ELECTRONS, SensorRecord
 from skindb.geometry.rays import RayScene
 from skindb.ingest.groups import dome_group, sample_group, surfel_group
 from skindb.ingest.lumitexels import Views, sample_lumitexels
-from skindb.ingest.sample_quality import radiance_noise
 from skindb.ingest.spool import Spool
 from skindb.ingest.surfels import build_surfels, camera_visibility
 

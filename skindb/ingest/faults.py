@@ -1,16 +1,38 @@
-"""Faults and warnings for calibrations that the photographs contradict."""
+"""Faults and warnings that an ingest finds: intensities and samples that no skin has, and
+calibrations that the photographs contradict.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 
 import numpy as np
+from numpy.typing import NDArray
 
-from skindb.errors import Fault
+from skindb.errors import Fault, require
 from skindb.format.dome import DomeRecord
 from skindb.ingest.consistency import MAX_OFFSET_MM, MIN_AGREEMENT, Calibration
 from skindb.types import Float64
 
+MIN_MEDIAN_SAMPLES = 50  # of a view, for a reliable median
+# of a light to the median one, in a channel: lights of a dome differ by tens of
+# percent, of two types by ten times
+MAX_INTENSITY_RATIO = 1_000.0
+NOTED_INTENSITY_RATIO = 20.0
+# sr^-1, of the median sample: black velvet has 0.002, a perfect diffuser 0.3
+MEDIAN_SAMPLES = (3e-4, 3.0)
+# of the median sample of a light to that of all lights: 0.55 to 1.3 in virtual domes,
+# less for grazing lights
+MAX_SAMPLE_RATIO = 50.0
+NOTED_SAMPLE_RATIO = 8.0
+# sr^-1, of a sample: sharp highlights of wet skin have about 50; and fraction of the
+# samples of a view that exceed it
+MAX_SAMPLE = 1_000.0
+MAX_BRIGHT_FRACTION = 0.05
+SAMPLE_CURE = (
+    "give each light its intensity in the unit of the frames, times mm^2, or a white "
+    "target; check the frames"
+)
 # Heads in domes with common errors (lights 1 mm, cameras 0.03 degrees, hair, motion)
 # have offsets of up to 1.4 mm, scales of 1.5 %, agreements of 0.93 and more, a scan
 # within 0.8 mm and 0.2 degrees: see docs/validation.md
@@ -39,6 +61,150 @@ DOUBTFUL_CAMERA_BRIGHTNESS = 1.25
 DOUBTFUL_LIGHT_BRIGHTNESS = 1.4
 RED_REFLECTANCES = (0.1, 0.9)  # of a face; skin of all tones has 0.2 to 0.75
 CHANNELS = ("red", "green", "blue")
+
+
+def intensity_faults(dome: DomeRecord, intensity: Float64) -> list[Fault]:
+    """Faults of lights whose intensities (light, 3) are far above or below those of the others."""
+    rule = (
+        f"the intensity of a light must be at most {MAX_INTENSITY_RATIO:,g} times as "
+        "large or small as the median"
+    )
+    cure = "correct it; remove a light that was not switched on, and its frames"
+    return [
+        Fault(
+            f"{dome.file}[lights][{j}][intensity]",
+            rule,
+            f"{ratio:.3g} times, of light {dome.lights[j].id}",
+            cure,
+        )
+        for j, ratio in _beyond(_relative(intensity), MAX_INTENSITY_RATIO)
+    ]
+
+
+def sample_faults(
+    dome: DomeRecord, view_median: Float64, bright: Float64
+) -> list[Fault]:
+    """Faults of samples that are too large or small for skin, by their medians and
+    bright fractions (light, camera).
+    """
+    median = _light_medians(view_median)
+    middle = _nan_median(median)
+    smallest, largest = MEDIAN_SAMPLES
+    if not np.isnan(middle) and not smallest <= middle <= largest:
+        rule = f"the median reflectance sample of a face must be {smallest:g} to {largest:g} sr^-1"
+        finding = f"{middle:.3g}"
+        if np.isinf(middle):
+            finding = "samples beyond 65504, the largest half float"
+        return [Fault(f"{dome.file}[lights]", rule, finding, SAMPLE_CURE)]
+    rule = (
+        f"the median sample of a light must be at most {MAX_SAMPLE_RATIO:g} times the "
+        "overall median, or its inverse"
+    )
+    lights = [
+        Fault(
+            f"{dome.file}[lights][{j}]",
+            rule,
+            f"{ratio:.3g} times, of light {dome.lights[j].id}",
+            SAMPLE_CURE,
+        )
+        for j, ratio in _beyond(median[:, None] / middle, MAX_SAMPLE_RATIO)
+    ]
+    return lights or _bright_faults(dome, bright)
+
+
+def _bright_faults(dome: DomeRecord, bright: Float64) -> list[Fault]:
+    """Faults of views (light, camera) in which more than a few samples are too large
+    for a surface.
+    """
+    rule = (
+        f"at most {MAX_BRIGHT_FRACTION:.0%} of the samples of a view may be above "
+        f"{MAX_SAMPLE:g} sr^-1"
+    )
+    cure = "copy the frame from the camera again, or merge its exposures again"
+    return [
+        Fault(
+            f"{dome.file}[frames]",
+            rule,
+            f"camera {dome.cameras[c].id}, light {dome.lights[j].id}: {bright[j, c]:.0%}",
+            cure,
+        )
+        for j, c in np.argwhere(bright > MAX_BRIGHT_FRACTION)
+    ]
+
+
+def light_notes(
+    dome: DomeRecord, intensity: Float64, view_median: Float64
+) -> list[str]:
+    """Warnings about lights whose intensities or samples are unusual, but not impossible."""
+    median = _light_medians(view_median)
+    return [
+        f"light {dome.lights[j].id}: its {quantity} {ratio:.3g} times the median of all lights"
+        for quantity, ratios, limit in (
+            ("intensity is", _relative(intensity), NOTED_INTENSITY_RATIO),
+            ("samples are", median[:, None] / _nan_median(median), NOTED_SAMPLE_RATIO),
+        )
+        for j, ratio in _beyond(ratios, limit)
+    ]
+
+
+def view_median(samples: NDArray[np.float16]) -> float:
+    """Median of the usable samples (3, n) of a view, whose NaN, beyond half precision,
+    count as infinite.
+    """
+    if samples.shape[1] < MIN_MEDIAN_SAMPLES:
+        return float("nan")
+    values = samples.astype(np.float64)
+    return float(np.median(np.where(np.isnan(values), np.inf, values)))
+
+
+def bright_fraction(samples: NDArray[np.float16]) -> float:
+    """Fraction of the usable samples (3, n) of a view that are too large for a surface;
+    NaN: beyond half precision.
+    """
+    if samples.shape[1] < MIN_MEDIAN_SAMPLES:
+        return 0.0
+    return float((~(samples <= MAX_SAMPLE)).any(axis=0).mean())
+
+
+def require_lit(where: str, radiance: NDArray[np.float32], count: int) -> None:
+    """Require a view whose usable pixels (n, 3), at `count` surfels, are not all zero
+    or negative.
+    """
+    require(
+        count < MIN_MEDIAN_SAMPLES or (radiance > 0).any(),
+        where,
+        "a frame must be bright where its light reaches the face",
+        f"none at {count} surfels",
+        "copy the frame from the camera again",
+    )
+
+
+def _relative(intensity: Float64) -> Float64:
+    return intensity / np.median(intensity, axis=0)
+
+
+def _light_medians(view_median: Float64) -> Float64:
+    """Median over the cameras (light,) of medians (light, camera); NaN where there is none."""
+    return np.array([_nan_median(row) for row in view_median])
+
+
+def _nan_median(values: Float64) -> float:
+    """Median of the values that are not NaN; NaN if there is none."""
+    numbers = values[~np.isnan(values)]
+    return float(np.median(numbers)) if len(numbers) else float("nan")
+
+
+def _beyond(ratios: Float64, limit: float) -> list[tuple[int, float]]:
+    """Rows of ratios (n, k) that differ from 1 by more than the limit, each with its
+    most extreme ratio.
+    """
+    out = []
+    for j, row in enumerate(ratios):
+        with np.errstate(divide="ignore"):
+            away = np.where(row > 0, np.abs(np.log(np.maximum(row, 1e-300))), np.inf)
+        if (away[~np.isnan(row)] > np.log(limit)).any():
+            out.append((j, float(row[np.nanargmax(np.where(np.isnan(row), -1, away))])))
+    return out
 
 
 def calibration_faults(dome: DomeRecord, calibration: Calibration) -> list[Fault]:
