@@ -112,9 +112,7 @@ def chart_reference() -> Float64:
     )
 
 
-def fit_colour_matrix(
-    patches: ArrayLike, reference: ArrayLike | None = None
-) -> ColourFit:
+def fit_colour_matrix(patches: ArrayLike) -> ColourFit:
     """Matrix that takes linear camera values to linear sRGB, by least squares over the
     patches (Cheung et al. 2004).
 
@@ -126,8 +124,7 @@ def fit_colour_matrix(
     patches
         (patch, 3) mean radiance of each patch over that of a white surface in its
         place, so that uneven light is divided out; NaN where a patch was saturated.
-    reference
-        (patch, 3) linear sRGB; default `chart_reference()`. The brightest patch is the white one.
+        The patches are those of `chart_reference`, of which the brightest is white.
 
     Raises
     ------
@@ -135,11 +132,9 @@ def fit_colour_matrix(
         Wrong shapes, too few usable patches, an unusable white patch, or patches of one colour.
     """
     values = np.asarray(patches, np.float64)
-    target = (
-        chart_reference() if reference is None else np.asarray(reference, np.float64)
-    )
+    target = chart_reference()
     require(
-        values.shape == target.shape and values.shape[1:] == (3,),
+        values.shape == target.shape,
         "colour chart",
         "its values must have the shape (patch, 3) of the reference",
         f"{values.shape} and {target.shape}",
@@ -158,16 +153,24 @@ def fit_colour_matrix(
     )
     scale = target[white, 1] / values[white, 1]
     camera = values[good] * scale
-    solution, *_ = np.linalg.lstsq(camera, target[good], rcond=None)
-    residual = target[good] - camera @ solution
-    variance = (residual**2).sum(axis=0) / max(len(camera) - 3, 1)
-    error = np.sqrt(variance[:, None] * np.diag(np.linalg.inv(camera.T @ camera)))
+    solution, error = _least_squares(camera, target[good])
     level = float(camera[good[:white].sum()] @ solution[:, 1]) / target[white, 1]
     before = np.full(len(values), np.nan)
     after = np.full(len(values), np.nan)
     before[good] = _difference(camera, target[good])
     after[good] = _difference(camera @ solution, target[good])
     return ColourFit(solution.T / level, error / level, before, after)
+
+
+def _least_squares(camera: Float64, target: Float64) -> tuple[Float64, Float64]:
+    """Matrix (3, 3) that takes camera values (n, 3) to colours (n, 3), and its standard
+    error.
+    """
+    solution, *_ = np.linalg.lstsq(camera, target, rcond=None)
+    residual = target - camera @ solution
+    variance = (residual**2).sum(axis=0) / max(len(camera) - 3, 1)
+    error = np.sqrt(variance[:, None] * np.diag(np.linalg.inv(camera.T @ camera)))
+    return np.asarray(solution, np.float64), error
 
 
 def _difference(measured: Float64, expected: Float64) -> Float64:

@@ -18,6 +18,7 @@ from skindb.errors import Fault, InputError, attempt, require
 from skindb.format.contact_probe import ProbeRecord
 from skindb.format.frames import Digests, Frame, read_frame, read_frames
 from skindb.limits import MAX_FIBRE_PIXELS
+from skindb.numerics.statistics import robust_deviation
 from skindb.schema import dataset
 from skindb.types import Float64, Index, Mask
 
@@ -282,7 +283,7 @@ def find_fibres(picture: ArrayLike, *, count: int) -> Spots:
         "give one channel of the merged brackets",
     )
     dark = float(np.median(grey))
-    noise = 1.4826 * float(np.median(np.abs(grey - dark)))
+    noise = float(robust_deviation(grey - dark))
     level = dark + max(MIN_CONTRAST * noise, 0.05 * (float(grey.max()) - dark))
     labels, _ = ndimage.label(grey > level)
     spots = [

@@ -23,6 +23,7 @@ from skindb.format.dome import DomeRecord
 from skindb.format.fields import MAX_MAGNITUDE
 from skindb.format.frames import Digests, Frame, read_frame
 from skindb.format.sensor import SensorRecord
+from skindb.numerics.statistics import correlation, robust_deviation
 from skindb.types import Float64, Mask
 
 Array = NDArray[np.float32]
@@ -451,21 +452,19 @@ def dark_pattern_fault(
         return None
     pattern = _pattern(mean, chosen)
 
-    def correlation(frame: Frame) -> float:
-        return _correlation(pattern, _pattern(frame, chosen))
+    def agreement(frame: Frame) -> float:
+        return correlation(pattern, _pattern(frame, chosen))
 
     # neighbouring pixels may share noise, for example by the interpolation of colours
     thinned = dark[::step]
     unrelated = [
-        correlation(np.roll(thinned, (5 * i, 7 * i), axis=(0, 1)))
+        agreement(np.roll(thinned, (5 * i, 7 * i), axis=(0, 1)))
         for i in range(1, SHIFTS + 1)
     ]
     spread = max(float(np.std(unrelated)), 1 / np.sqrt(len(pattern)))
-    minimum = max(
-        MIN_CORRELATION * spread, MIN_CORRELATION_RATIO * correlation(thinned)
-    )
+    minimum = max(MIN_CORRELATION * spread, MIN_CORRELATION_RATIO * agreement(thinned))
     for finding, frame in _alternatives(camera, mergers, shortest):
-        if correlation(frame[::step]) > minimum:
+        if agreement(frame[::step]) > minimum:
             rule = "dark frames must show the pattern of the sensor where the photographs show it"
             cure = (
                 "write them like the photographs: in the same orientation, under the "
@@ -500,12 +499,5 @@ def _pattern(frame: Frame | Array, chosen: Mask) -> Array:
     """
     values = frame.astype(np.float32)
     difference = (values[:, 1:-1] - (values[:, :-2] + values[:, 2:]) / 2)[chosen]
-    limit = MAX_PATTERN_DEVIATIONS * 1.4826 * np.median(np.abs(difference))
+    limit = MAX_PATTERN_DEVIATIONS * robust_deviation(difference)
     return np.clip(difference, -limit, limit)
-
-
-def _correlation(a: Array, b: Array) -> float:
-    """Pearson's correlation; 0 if one of the two is constant."""
-    x, y = (v.astype(np.float64) - v.mean(dtype=np.float64) for v in (a, b))
-    product = float(np.sqrt((x @ x) * (y @ y)))
-    return float(x @ y) / product if product > 0 else 0.0

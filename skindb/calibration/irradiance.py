@@ -16,6 +16,7 @@ from skindb.calibration.radiance import FrameMerger
 from skindb.errors import attempt_all, require
 from skindb.format.dome import CameraRecord, DomeRecord, LightRecord, WhiteRecord
 from skindb.format.frames import Digests
+from skindb.numerics.statistics import robust_deviation
 from skindb.types import Float64, Index, Mask
 
 # of the half size: a disc inside the square, however the square is rotated
@@ -145,9 +146,9 @@ def robust_mean(values: Float64) -> Float64:
         return np.full(values.shape[1], np.nan)
     columns = np.ascontiguousarray(usable.T)  # medians are taken along rows
     middle = np.median(columns, axis=1, keepdims=True)
-    apart = np.abs(columns - middle)
-    spread = 1.4826 * np.median(apart, axis=1, keepdims=True)
-    good = (apart <= MAX_DEVIATIONS * spread).all(axis=0)
+    apart = columns - middle
+    spread = robust_deviation(apart, axis=1)[:, None]
+    good = (np.abs(apart) <= MAX_DEVIATIONS * spread).all(axis=0)
     return columns[:, good].mean(axis=1) if good.any() else middle[:, 0]
 
 
@@ -195,7 +196,7 @@ def unevenness(values: Float64) -> float:
     groups = values[: count * PIXELS_PER_GROUP].reshape(count, PIXELS_PER_GROUP, -1)
     means = groups.mean(axis=1)
     middle = np.median(means, axis=0)
-    spread = 1.4826 * np.median(np.abs(means - middle), axis=0)
+    spread = robust_deviation(means - middle, axis=0)
     return float((spread / np.maximum(np.abs(middle), 1e-300)).max())
 
 
@@ -357,7 +358,7 @@ def _robust_line(
     level = np.median(value - exponent * slope[:, None], axis=0)
     for _ in range(ROUNDS):
         apart = (value - level - exponent * slope[:, None]).mean(axis=1)
-        spread = 1.4826 * float(np.median(np.abs(apart - np.median(apart))))
+        spread = float(robust_deviation(apart - np.median(apart)))
         limit = MAX_DEVIATIONS * max(spread, 1e-9)
         chosen = np.abs(apart - np.median(apart[inliers])) <= limit
         centred = slope[chosen] - slope[chosen].mean()

@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike
 from scipy import optimize, special
 
 from skindb.errors import require
-from skindb.types import Float64
+from skindb.numerics.statistics import robust_deviation
+from skindb.types import Float64, Mask
 
 # px from the edge that are fitted; farther away the glare is no longer even
 EDGE_REACH_PX = 12.0
@@ -74,12 +75,7 @@ def fit_edge(picture: ArrayLike) -> EdgeFit:
         "select more, without saturation",
     )
     start, slant = _locate(grey)
-    row, column = np.mgrid[: grey.shape[0], : grey.shape[1]] + 0.5
-    middle = grey.shape[0] / 2
-    near = np.abs(column - start - slant * (row - middle)) < EDGE_REACH_PX
-    row = row[near] - middle
-    column = column[near]
-    value = grey[near]
+    row, column, value = _pixels_at_edge(grey, start, slant)
     low, high = np.percentile(value, [5, 95])
     sign = 1.0 if np.corrcoef(column, value)[0, 1] > 0 else -1.0
 
@@ -161,6 +157,16 @@ def _locate(grey: Float64) -> tuple[float, float]:
     return start, slant
 
 
+def _pixels_at_edge(
+    grey: Float64, start: float, slant: float
+) -> tuple[Float64, Float64, Float64]:
+    """Row from the middle one, column and value (n,) of the pixels near an edge."""
+    row, column = np.mgrid[: grey.shape[0], : grey.shape[1]] + 0.5
+    row -= grey.shape[0] / 2
+    near = np.abs(column - start - slant * row) < EDGE_REACH_PX
+    return row[near], column[near], grey[near]
+
+
 def _require_edge(satisfied: object, finding: str) -> None:
     rule = "the picture must show one edge that is slanted by 2 to 45 degrees from the columns"
     cure = "turn the edge by about 5 degrees, and select the edge alone"
@@ -227,13 +233,7 @@ def fit_vignette(flat: ArrayLike, centre: ArrayLike) -> Vignette:
     )
     value = picture[row, column]
     design = np.stack([np.ones_like(x), x, y, r2, r2**2, r2**3], axis=1)
-    inliers = np.ones(len(value), bool)
-    for _ in range(ROUNDS):
-        solution = np.linalg.lstsq(design[inliers], value[inliers], rcond=None)[0]
-        residual = value - design @ solution
-        spread = 1.4826 * float(np.median(np.abs(residual[inliers])))
-        limit = MAX_DEVIATIONS * max(spread, 1e-12 * abs(solution[0]))
-        inliers = np.abs(residual) <= limit
+    solution, residual, inliers = _robust_fit(design, value)
     misfit = float(np.sqrt(np.mean(residual[inliers] ** 2)))
     inverse = misfit**2 * np.linalg.inv(design[inliers].T @ design[inliers])
     level = solution[0]
@@ -244,3 +244,17 @@ def fit_vignette(flat: ArrayLike, centre: ArrayLike) -> Vignette:
     covariance = slope @ inverse @ slope.T
     inlier_fraction = float(inliers.mean())
     return Vignette(coefficients, covariance, misfit / abs(level), inlier_fraction)
+
+
+def _robust_fit(design: Float64, value: Float64) -> tuple[Float64, Float64, Mask]:
+    """Coefficients of the columns (n, k) that fit values (n,), residuals (n,), and which
+    of the values are not outliers.
+    """
+    inliers = np.ones(len(value), bool)
+    for _ in range(ROUNDS):
+        solution = np.linalg.lstsq(design[inliers], value[inliers], rcond=None)[0]
+        residual = value - design @ solution
+        spread = float(robust_deviation(residual[inliers]))
+        limit = MAX_DEVIATIONS * max(spread, 1e-12 * abs(solution[0]))
+        inliers = np.abs(residual) <= limit
+    return np.asarray(solution, np.float64), residual, np.asarray(inliers)

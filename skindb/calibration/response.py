@@ -14,6 +14,7 @@ from scipy import ndimage
 
 from skindb.errors import Fault, InputError, require
 from skindb.files import private_file
+from skindb.numerics.statistics import robust_deviation
 from skindb.types import Float64, Index, Mask
 
 STACK = "the exposure stack"
@@ -268,12 +269,7 @@ def _solve(
     value = np.where(samples.usable, value, 0.5)
     hat = np.where(value < 0.5, value, np.maximum(1 - value, MIN_BRIGHT_WEIGHT))
     weight = np.where(samples.usable, hat, 0.0) ** 2
-    position = _place(value) * (knots - 1)
-    cell = np.minimum(position.astype(int), knots - 2)[..., None]
-    part = position[..., None] - cell
-    design = np.zeros((*value.shape, knots))
-    np.put_along_axis(design, cell, cell + 1 - position[..., None], axis=-1)
-    np.put_along_axis(design, cell + 1, part, axis=-1)
+    design = _knot_weights(value, knots)
     target = np.log(samples.seconds) - np.log(value)
     # subtracting the weighted mean eliminates the unknown radiance of a sample
     total = weight.sum(axis=1, keepdims=True)
@@ -290,6 +286,17 @@ def _solve(
     solution = np.linalg.solve(normal, rows.T @ (heavy[:, 0] * column) / heavy.sum())
     misfit = design @ solution - target
     return solution, np.sqrt((weight * misfit**2).sum(axis=1) / total[:, 0])
+
+
+def _knot_weights(value: Float64, knots: int) -> Float64:
+    """Weights (sample, exposure, knot) of linear interpolation between the knots."""
+    position = _place(value) * (knots - 1)
+    cell = np.minimum(position.astype(int), knots - 2)[..., None]
+    part = position[..., None] - cell
+    weights = np.zeros((*value.shape, knots))
+    np.put_along_axis(weights, cell, cell + 1 - position[..., None], axis=-1)
+    np.put_along_axis(weights, cell + 1, part, axis=-1)
+    return weights
 
 
 @dataclass(frozen=True)
@@ -338,15 +345,22 @@ def response_samples(
     usable = usable[enough]
     roughness = tiles.std(axis=-1) / np.maximum(mean, MIN_VALUE)
     rough = np.where(usable, roughness, 0).max(axis=1, initial=0)
-    bright = np.clip(mean, 0, 1).mean(axis=1)
+    order = _flattest_first(rough, np.clip(mean, 0, 1).mean(axis=1))
+    chosen = order[: options.samples]
+    return ResponseSamples(tiles[chosen], usable[chosen], times)
+
+
+def _flattest_first(rough: Float64, bright: Float64) -> Index:
+    """Order of blocks (n,): the flattest of each class of brightness, the second
+    flattest of each, and so on.
+    """
     low, high = (bright.min(), bright.max()) if len(bright) else (0.0, 1.0)
     relative = (bright - low) / max(high - low, 1e-12)
     stratum = np.minimum((relative * STRATA).astype(int), STRATA - 1)
     order = np.lexsort((rough, stratum))
     start = np.searchsorted(stratum[order], np.arange(STRATA))
     rank = np.arange(len(order)) - start[stratum[order]]
-    chosen = order[np.argsort(rank, kind="stable")[: options.samples]]
-    return ResponseSamples(tiles[chosen], usable[chosen], times)
+    return order[np.argsort(rank, kind="stable")]
 
 
 def _require_stack(
@@ -566,6 +580,6 @@ def _outliers(picture: Float64) -> Mask:
     apart = picture - ndimage.median_filter(
         picture, size=(NEIGHBOURHOOD, NEIGHBOURHOOD, 1), mode="nearest"
     )
-    spread = 1.4826 * np.median(np.abs(apart), axis=(0, 1))
+    spread = robust_deviation(apart, axis=(0, 1))
     # in a perfectly even picture every difference is an outlier
     return np.asarray((np.abs(apart) > MAX_DEVIATIONS * spread) & (apart != 0))

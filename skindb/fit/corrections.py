@@ -96,8 +96,7 @@ def estimate_light_gains(
     to_camera = directions(position, camera)
     lit = cosines(normal, to_light)
     seen = cosines(normal, to_camera)
-    for i in range(len(chosen)):
-        axes = _frame(normal[i])
+    for i, axes in enumerate(_frames(normal)):
         shading = _shading(to_light[i] @ axes.T, eta)
         for c in np.flatnonzero(seen[i] > MIN_COSINE_GAIN):
             half = (lit[i] + seen[i, c]) / np.linalg.norm(
@@ -182,11 +181,11 @@ def _gains(matrix: Array) -> Array:
     )
 
 
-def _frame(normal: Array) -> Array:
-    """Two tangents and the normal, in rows."""
-    tangent = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
-    tangent /= np.linalg.norm(tangent)
-    return np.stack([tangent, np.cross(normal, tangent), normal])
+def _frames(normal: Array) -> Array:
+    """Two tangents and the normal of each surfel, in the rows of (n, 3, 3)."""
+    tangent = np.cross(normal, np.eye(3)[np.abs(normal).argmin(axis=1)])
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    return np.stack([tangent, np.cross(normal, tangent), normal], axis=1)
 
 
 def _shading(direction: Array, eta: float) -> Array:
@@ -321,10 +320,7 @@ def _meetings(
     """Pairs of surfels (m,) of a block and the surfels (m,) that their rays hit, with
     weights (m,).
     """
-    tangent = np.cross(normal, np.eye(3)[np.abs(normal).argmin(axis=1)])
-    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
-    frame = np.stack([tangent, np.cross(normal, tangent), normal], axis=1)
-    way = np.einsum("rk,nkj->nrj", rays, frame).reshape(-1, 3)
+    way = np.einsum("rk,nkj->nrj", rays, _frames(normal)).reshape(-1, 3)
     start = np.repeat(position + RAY_OFFSET_MM * normal, len(rays), axis=0)
     face, corner, distance = scene.first_hit(start, way)
     hit = np.flatnonzero((face >= 0) & (distance < FARTHEST_MM))

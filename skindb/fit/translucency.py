@@ -4,6 +4,7 @@ one diffuse reflectance profile, and sigma_tr of the sites and of the surfels.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -85,22 +86,23 @@ class ProbeFit:
     nothing was fitted.
     """
 
-    sigma_a: float
-    sigma_s_prime: float
-    sigma_tr: float
-    sigma_tr_error: float  # standard error due to the measured errors
-    sigma_tr_model_error: float  # error due to the inaccuracy of the profile model
-    sigma_tr_total_error: float  # both in quadrature
-    gain: float
-    residual: float
-    # RMS of the relative residual of clear fibres that neither error explains
-    misfit: float
-    chi_squared: float  # for both errors, per degree of freedom
-    used: int
-    correlation: float  # of log sigma_tr and log sigma_s'
-    # exponents (a, b): sigma_tr^a sigma_s'^b is what the profile determines best
-    combination: tuple[float, float]
+    used: int  # fibres
     status: ProbeStatus
+    sigma_a: float = math.nan
+    sigma_s_prime: float = math.nan
+    sigma_tr: float = math.nan
+    sigma_tr_error: float = math.nan  # standard error due to the measured errors
+    # error due to the inaccuracy of the profile model
+    sigma_tr_model_error: float = math.nan
+    sigma_tr_total_error: float = math.nan  # both in quadrature
+    gain: float = math.nan
+    residual: float = math.nan
+    # RMS of the relative residual of clear fibres that neither error explains
+    misfit: float = math.nan
+    chi_squared: float = math.nan  # for both errors, per degree of freedom
+    correlation: float = math.nan  # of log sigma_tr and log sigma_s'
+    # exponents (a, b): sigma_tr^a sigma_s'^b is what the profile determines best
+    combination: tuple[float, float] = (math.nan, math.nan)
 
 
 @dataclass(frozen=True)
@@ -213,7 +215,7 @@ def fit_profile(
         )
     fibres = int(good.sum())
     if fibres < MIN_FIBRES + int(free_gain):
-        return _nothing(fibres)
+        return ProbeFit(fibres, ProbeStatus.TOO_FEW_FIBRES)
     problem = Problem(
         *_faces(distance[good], radius),
         np.log(profile[good]),
@@ -427,26 +429,6 @@ def _unexplained(problem: Problem, p: Array) -> tuple[float, float]:
     excess = max(0.0, float((square - variance).mean()))
     return float(np.sqrt(excess)), float(
         chdtrc(freedom, float((square / variance).sum()))
-    )
-
-
-def _nothing(used: int) -> ProbeFit:
-    nan = float("nan")
-    return ProbeFit(
-        nan,
-        nan,
-        nan,
-        nan,
-        nan,
-        nan,
-        nan,
-        nan,
-        nan,
-        nan,
-        used,
-        nan,
-        (nan, nan),
-        ProbeStatus.TOO_FEW_FIBRES,
     )
 
 

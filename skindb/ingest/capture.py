@@ -292,13 +292,9 @@ class _DomeStages:
         )
         rotations = np.zeros((len(self.dome.cameras), 3))
         if parameters.refine and not self.run.faults:
-            pictures = attempt(
-                self.run.faults,
-                lambda: checked_pictures(check, mergers, pool=self.pool),
-            )
-            if pictures is None:
+            refined = self._refined(check, mergers)
+            if refined is None:
                 return {}
-            refined = refine_cameras(check, pictures)
             rotations = applied_rotations(self.dome, refined)
             self.dome = refined
             visible, clear, pixels = sees(refined.cameras)
@@ -318,6 +314,17 @@ class _DomeStages:
             return {}
         self._note(lumitexels, mergers, intensity)
         return self._labelled(lumitexels, check, visible, rotations)
+
+    def _refined(
+        self, check: CalibrationCheck, mergers: Mapping[str, FrameMerger]
+    ) -> DomeRecord | None:
+        """The dome with rotated cameras; None, with the faults of the pictures recorded,
+        if there are any.
+        """
+        pictures = attempt(
+            self.run.faults, lambda: checked_pictures(check, mergers, pool=self.pool)
+        )
+        return None if pictures is None else refine_cameras(check, pictures)
 
     def _lumitexels(
         self, mergers: Mapping[str, FrameMerger], check: CalibrationCheck

@@ -21,7 +21,6 @@ from skindb.ingest.photo_offsets import (
     ReducedView,
     bilinear,
     camera_offset,
-    correlation,
     moved_pixels,
     reduced,
     reduction,
@@ -31,6 +30,7 @@ from skindb.ingest.photo_offsets import (
     view_factors,
 )
 from skindb.ingest.surfels import SurfelSet
+from skindb.numerics.statistics import correlation
 from skindb.types import Float64, Index, Mask
 
 Pair = tuple[int, int]  # light, camera

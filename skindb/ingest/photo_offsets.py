@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from skindb.ingest._sample_kernels import interpolate
+from skindb.numerics.statistics import correlation, robust_deviation
 from skindb.types import Float64, Mask
 
 PIXEL_MM = 2.0  # mm; about the width of an eyelid, well below the offsets to be found
@@ -113,14 +114,6 @@ def interpolated(images: Float64, pixels: Float64) -> Float64:
         out,
     )
     return out
-
-
-def correlation(a: Float64, b: Float64) -> float:
-    """Pearson's correlation; 0 if one of the two is constant."""
-    a = a - a.mean()
-    b = b - b.mean()
-    product = float(np.sqrt((a @ a) * (b @ b)))
-    return float(a @ b) / product if product > 0 else 0.0
 
 
 def camera_offset(
@@ -280,7 +273,7 @@ def _gauss_newton(
             rest.append(float(seen @ shade) / square * shade - seen)
         matrix = np.concatenate(rows)
         residual = np.concatenate(rest)
-        scale = ROBUST_SCALE * 1.4826 * float(np.median(np.abs(residual))) + FLOOR
+        scale = ROBUST_SCALE * float(robust_deviation(residual)) + FLOOR
         weight = 1 / (1 + (residual / scale) ** 2)
         weighted = (matrix * weight[:, None]).T
         step = np.linalg.lstsq(weighted @ matrix, weighted @ residual, rcond=None)[0]

@@ -262,12 +262,10 @@ def placement_variance(value: ArrayLike, error: ArrayLike) -> Repeatability:
     )
     log = np.log(profile[:, clear])
     noise = (sigma[:, clear] / profile[:, clear]) ** 2
-    placements, fibres, _ = log.shape
+    placements = len(log)
     centred = log - log.mean(axis=0)
     levels = centred.mean(axis=1)
-    rest = (centred - levels[:, None]).reshape(-1, 3)
-    rest_variance = (rest**2).sum(axis=0) / ((placements - 1) * (fibres - 1))
-    level_variance = (levels**2).sum(axis=0) / (placements - 1) - rest_variance / fibres
+    level_variance, rest_variance = _variances(centred, levels)
     mean = np.full(profile.shape[1:], np.nan)
     spread = np.full(profile.shape[1:], np.nan)
     mean[clear] = np.exp(log.mean(axis=0))
@@ -280,6 +278,17 @@ def placement_variance(value: ArrayLike, error: ArrayLike) -> Repeatability:
         mean,
         spread,
     )
+
+
+def _variances(centred: Float64, levels: Float64) -> tuple[Float64, Float64]:
+    """Variances (3,) of the levels (placement, 3) and of the residuals of logarithms
+    (placement, fibre, 3), by the method of moments.
+    """
+    placements, fibres, _ = centred.shape
+    rest = (centred - levels[:, None]).reshape(-1, 3)
+    rest_variance = (rest**2).sum(axis=0) / ((placements - 1) * (fibres - 1))
+    level_variance = (levels**2).sum(axis=0) / (placements - 1)
+    return level_variance - rest_variance / fibres, rest_variance
 
 
 def level_trend(levels: ArrayLike, covariate: ArrayLike) -> Trend:

@@ -16,7 +16,26 @@ from skindb.types import Array, float64
 
 CONFIDENCE = 0.95  # of intervals
 POWER = 0.8  # of tests, for the smallest effect that they detect
+# standard deviation over the median absolute deviation of normal noise
+NORMAL_PER_MEDIAN = 1.4826
 ROUNDING = 1e-13  # relative to the largest value
+
+
+def correlation(a: Array, b: Array) -> float:
+    """Pearson's correlation of two vectors; 0 if one of them is constant."""
+    x = float64(a) - float64(a).mean()
+    y = float64(b) - float64(b).mean()
+    product = float(np.sqrt((x @ x) * (y @ y)))
+    return float(x @ y) / product if product > 0 else 0.0
+
+
+def robust_deviation(
+    deviation: Array, axis: int | tuple[int, ...] | None = None
+) -> Any:
+    """Standard deviation of normal noise, from the median of its absolute deviations;
+    outliers hardly change it.
+    """
+    return NORMAL_PER_MEDIAN * np.median(np.abs(deviation), axis=axis)
 
 
 @dataclass(frozen=True)
