@@ -208,16 +208,14 @@ def _first_on_plateau(ratios: Array, sizes: int, tolerance: float) -> int:
     return int(np.argmax((ratios[:sizes] <= 1 + tolerance) & (steepest <= 1 + STEP)))
 
 
-def size_status(fewest: int, most: int) -> str:
+def size_status(fewest: int, largest: int) -> str:
     """The result of `choose_size` as a sentence."""
-    if not most:
+    if not largest:
         return f"at least {fewest}: the error has no plateau within the sizes tried"
     beyond = f"no further basis reduces the error by more than {STEP:.1%}"
-    if fewest < most:
-        return (
-            f"{fewest} to {most}: the sample does not distinguish these sizes; {beyond}"
-        )
-    return f"{most}: smaller sizes are significantly worse; {beyond}"
+    if fewest < largest:
+        return f"{fewest} to {largest}: the sample does not distinguish these sizes; {beyond}"
+    return f"{largest}: smaller sizes are significantly worse; {beyond}"
 
 
 def tabulate_basis_size(curve: xr.Dataset) -> tuple[list[str], list[list[Any]]]:
@@ -241,7 +239,7 @@ def tabulate_basis_size(curve: xr.Dataset) -> tuple[list[str], list[list[Any]]]:
     ratio = error[:-1] / error[1:]
     digits = _digits_to_differ(error)
     ratio_digits = _digits_to_differ(ratio, min_digits=4)
-    steps = [*(f"{one:.{ratio_digits}f}" for one in ratio), "-"]
+    steps = [*(f"{step:.{ratio_digits}f}" for step in ratio), "-"]
     rows = [
         [
             int(k),
@@ -271,34 +269,34 @@ def describe_basis_size(curve: xr.Dataset) -> str:
     ks = curve["k"].values
     tolerance = f"{100 * float(curve['plateau_tolerance']):.3g} %"
     fewest = int(curve["smallest_size"])
-    most = int(curve["sufficient_size"])
+    sufficient = int(curve["sufficient_size"])
     largest = int(ks[-1])
     final_error = float(curve["relative_error"][-1])
-    if not most and final_error > 1 + float(curve["plateau_tolerance"]):
+    if not sufficient and final_error > 1 + float(curve["plateau_tolerance"]):
         return (
             f"At least {fewest} bases: with {largest}, the largest size tried, the error is still "
             f"{100 * (final_error - 1):.3g} % above that with the whole dictionary. "
             "Try larger sizes."
         )
-    if not most:
+    if not sufficient:
         return (
             f"At least {fewest} bases: no size below {largest}, the largest one "
             "tried, is significantly on a plateau "
             "of the error. Try larger sizes or draw more surfels."
         )
     reason = (
-        f"With {most} the error is significantly within {tolerance} of that with "
+        f"With {sufficient} the error is significantly within {tolerance} of that with "
         f"{largest}, the largest size tried, "
         f"and no further basis reduces it by more than {100 * STEP:.3g} %"
     )
-    if fewest < most:
+    if fewest < sufficient:
         open_question = (
-            f"this sample does not show whether {_sizes(fewest, most - 1)} would "
+            f"this sample does not show whether {_sizes(fewest, sufficient - 1)} would "
             "suffice"
         )
-        return f"{fewest} to {most} bases. {reason}; {open_question}."
-    return f"{most} {'basis' if most == 1 else 'bases'}. {reason}" + (
-        "; smaller sizes are significantly worse." if most > ks[0] else "."
+        return f"{fewest} to {sufficient} bases. {reason}; {open_question}."
+    return f"{sufficient} {'basis' if sufficient == 1 else 'bases'}. {reason}" + (
+        "; smaller sizes are significantly worse." if sufficient > ks[0] else "."
     )
 
 
@@ -388,12 +386,14 @@ def plot_basis_size(curve: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     )
     ax.plot(k, curve["relative_error"], "o-", label="error")
     fewest = int(curve["smallest_size"])
-    most = int(curve["sufficient_size"])
-    if most:
-        chosen = str(most) if fewest == most else f"{fewest} to {most}"
+    sufficient = int(curve["sufficient_size"])
+    if sufficient:
+        chosen = (
+            str(sufficient) if fewest == sufficient else f"{fewest} to {sufficient}"
+        )
         ax.axvspan(
             fewest - 0.05,
-            most + 0.05,
+            sufficient + 0.05,
             color="0.4",
             alpha=0.4,
             lw=0,

@@ -355,8 +355,8 @@ class _Pair:
     def flags(self) -> list[str]:
         """Warnings about few subjects."""
         if min(self.count) < 2:
-            where = "in both groups" if self.within else "per group"
-            return [f"{self.name}: no p value with fewer than two subjects {where}"]
+            side = "in both groups" if self.within else "per group"
+            return [f"{self.name}: no p value with fewer than two subjects {side}"]
         if min(self.count) < FEW:
             subjects = f"{self.count[0]} and {self.count[1]} subjects"
             warning = f"p values are approximate with fewer than {FEW}"

@@ -53,7 +53,7 @@ LEAST_KNOWN = 0.5
 
 
 def mean_face(
-    cohort: xr.Dataset, *, least: int = LEAST_SUBJECTS, mixed_fits: bool = False
+    cohort: xr.Dataset, *, min_subjects: int = LEAST_SUBJECTS, mixed_fits: bool = False
 ) -> xr.Dataset:
     """Mean and standard deviation over subjects of albedo, sigma_tr and surface
     reflectance, texel by texel.
@@ -69,7 +69,7 @@ def mean_face(
     ----------
     cohort
         ``db.cohort("maps")``; the result omits maps that the cohort lacks.
-    least
+    min_subjects
         Minimum number of subjects of a texel; texels with fewer are NaN.
     mixed_fits
         Accept takes that were fitted with different parameters.
@@ -102,7 +102,7 @@ def mean_face(
     variables: dict[str, Array] = {}
     for name, moments in sums.items():
         short, is_log = AVERAGED[name]
-        enough = moments.count >= max(least, 1)
+        enough = moments.count >= max(min_subjects, 1)
         mean = np.exp(moments.mean) if is_log else moments.mean
         deviation = f"{short}_log_deviation" if is_log else f"{short}_deviation"
         variables[short] = np.where(enough, mean, np.nan).astype(np.float32)
@@ -112,7 +112,7 @@ def mean_face(
         count = moments.count.min(axis=-1) if moments.count.ndim == 3 else moments.count
         variables[f"{short}_count"] = count.astype(np.int32)
     if not any(np.isfinite(variables[AVERAGED[name][0]]).any() for name in names):
-        rule = f"at least one texel must be measured in {least} subjects"
+        rule = f"at least one texel must be measured in {min_subjects} subjects"
         cure = "fit or register more subjects"
         raise InputError(
             Fault("mean face", rule, f"none among {len(subjects.names)} subjects", cure)
@@ -122,7 +122,7 @@ def mean_face(
         coords={"channel": ["R", "G", "B"]},
         attrs={
             "subjects": len(subjects.names),
-            "least_subjects": least,
+            "least_subjects": min_subjects,
             "takes": sorted(map(str, takes["take"].values)),
             "skipped": skipped_takes(cohort),
         },
@@ -165,7 +165,7 @@ def plot_mean_face(face: xr.Dataset, *, ax: Axes | None = None) -> Axes:
 
 
 def principal_components(
-    values: xr.DataArray, *, most: int = 10, least_known: float = LEAST_KNOWN
+    values: xr.DataArray, *, max_components: int = 10, least_known: float = LEAST_KNOWN
 ) -> xr.Dataset:
     """Mean, principal axes and scores of the takes of a cohort.
 
@@ -177,7 +177,7 @@ def principal_components(
     values
         Variable of a cohort with the dimension ``take`` and any others: histograms,
         maps in the common (u, v), or colours.
-    most
+    max_components
         Maximum number of components; it is also at most the number of takes minus one.
     least_known
         Takes with a smaller fraction of known entries are excluded. Only entries that
@@ -201,17 +201,18 @@ def principal_components(
     Examples
     --------
     >>> faces = db.cohort("maps").texel_diffuse_reflectance  # doctest: +SKIP
-    >>> principal_components(faces, most=5).axis.sel(component=0).plot.imshow()  # doctest: +SKIP
+    >>> found = principal_components(faces, max_components=5)  # doctest: +SKIP
+    >>> found.axis.sel(component=0).plot.imshow()  # doctest: +SKIP
     """
     dims = [str(dim) for dim in values.dims if dim != "take"]
     cohort = values.transpose("take", *dims).rename("values").to_dataset()
     rows, is_used, skipped = _usable_entries(cohort, least_known)
     once = shared_once(is_used)
     # the mean uses up one dimension: one more axis would be rounding error
-    most = min(most, max(len(rows) - 1, 1))
+    max_components = min(max_components, max(len(rows) - 1, 1))
     axes = principal_axes(
         np.stack(each_take(_used_entries, cohort.isel(take=rows), ["values"], once)),
-        most,
+        max_components,
     )
     ratio = axes.variance / (axes.total or 1.0)
     shape = tuple(cohort.sizes[dim] for dim in dims)
@@ -298,7 +299,7 @@ def _expand(
 
 
 def face_components(
-    cohort: xr.Dataset, *, most: int = 5, mixed_fits: bool = False
+    cohort: xr.Dataset, *, max_components: int = 5, mixed_fits: bool = False
 ) -> xr.Dataset:
     """Principal components of the albedo maps of a cohort, with the variable names of the store.
 
@@ -306,7 +307,7 @@ def face_components(
     ----------
     cohort
         ``db.cohort("maps")``; texels that a take did not measure count as unknown.
-    most
+    max_components
         Maximum number of components.
     mixed_fits
         Accept takes that were fitted with different parameters.
@@ -321,7 +322,7 @@ def face_components(
     if not mixed_fits:
         require_same_fit(cohort)
     albedo = cohort["texel_diffuse_reflectance"]
-    components = principal_components(albedo, most=most)
+    components = principal_components(albedo, max_components=max_components)
     return dataset(
         {
             "principal_mean": components["mean"].values,
@@ -372,11 +373,11 @@ def describe_components(table: xr.Dataset) -> list[str]:
     ]
 
 
-def plot_components(table: xr.Dataset, *, most: int = 3) -> Figure:
+def plot_components(table: xr.Dataset, *, max_components: int = 3) -> Figure:
     """Plot the first axes as faces: the mean, and one standard deviation in both directions."""
     from matplotlib import pyplot
 
-    count = min(most, table.sizes["component"])
+    count = min(max_components, table.sizes["component"])
     mean = table["principal_mean"].values
     deviation = table["principal_score"].values.std(axis=0, ddof=1)
     gain = 0.9 / max(float(np.nanquantile(mean, 0.995)), 1e-6)
@@ -409,7 +410,9 @@ class Parameters:
 def compute(population: Population, parameters: Parameters) -> Results:
     """The results of the study."""
     mixed = population.mixed_fits
-    components = face_components(population.cohort, most=parameters.k, mixed_fits=mixed)
+    components = face_components(
+        population.cohort, max_components=parameters.k, mixed_fits=mixed
+    )
     return {"components": components}
 
 

@@ -317,13 +317,13 @@ def compare_groups(
     which it raises `ValueError`; arguments as of `contrasts`.
     """
     subjects = subjects_of(cohort)
-    others = other_attributes(subjects, group_by)
+    attributes = other_attributes(subjects, group_by)
     compared = []
     faults = []
     for contrast in contrasts(cohort, group_by, adjust, measure):
         try:
             result = statistics(contrast)
-            associated = associations(contrast, subjects, others)
+            associated = associations(contrast, subjects, attributes)
             flags = contrast_flags(contrast, subjects, associated, adjust)
         except ValueError as error:
             rule = "the subjects must determine the effect"
@@ -413,21 +413,21 @@ def other_attributes(subjects: Subjects, group_by: str) -> list[str]:
 
 
 def associations(
-    contrast: Contrast, subjects: Subjects, others: Sequence[str]
+    contrast: Contrast, subjects: Subjects, attributes: Sequence[str]
 ) -> dict[str, float]:
     """Multiple correlations of the compared attribute with each of the others; 0 within
     subjects, NaN where it is unknown.
     """
-    return {name: _association(contrast, subjects, name) for name in others}
+    return {name: _association(contrast, subjects, name) for name in attributes}
 
 
 def _association(contrast: Contrast, subjects: Subjects, name: str) -> float:
     if contrast.is_paired:
         return 0.0
-    other = subjects.by_subject(name, contrast.quantities.subject)
-    if other.odd_words:
+    attribute = subjects.by_subject(name, contrast.quantities.subject)
+    if attribute.odd_words:
         return float("nan")
-    columns = other.columns
+    columns = attribute.columns
     is_known = np.isfinite(columns).all(axis=1)
     if not is_known.any():
         return float("nan")
@@ -486,10 +486,10 @@ def _few_subjects(contrast: Contrast) -> list[str]:
 
 def _extrapolations(contrast: Contrast, subjects: Subjects, name: str) -> list[str]:
     """Warnings about values of an adjusted attribute that only one side has."""
-    other = subjects.by_subject(name, contrast.quantities.subject)
-    if other.is_numeric or contrast.is_number:
+    attribute = subjects.by_subject(name, contrast.quantities.subject)
+    if attribute.is_numeric or contrast.is_number:
         return []
-    words = np.array([word_of(value) for value in other.values])
+    words = np.array([word_of(value) for value in attribute.values])
     flags = []
     for word in sorted(set(words.tolist())):
         for value, side in ((1, "with"), (0, "without")):

@@ -299,9 +299,9 @@ def _moved_skin(
     if mapped is None or TEXTURE_SHIFT not in traits:
         shift = np.tensordot(amount, traits["trait_quantile_shift"].values, 1)
         return _moved_albedo(fitted, shift, albedo)
-    used = amount != 0
-    shifts = traits[TEXTURE_SHIFT].values[used].astype(np.float64)
-    shift = np.tensordot(amount[used], shifts, 1)
+    is_used = amount != 0
+    shifts = traits[TEXTURE_SHIFT].values[is_used].astype(np.float64)
+    shift = np.tensordot(amount[is_used], shifts, 1)
     rng = np.random.default_rng(0) if rng is None else rng
     return _moved_texture(fitted, shift, mapped, albedo, rng)
 
@@ -319,8 +319,8 @@ def _moved_texture(
     texture = mapped.texture
     edit = edit_texture(mapped.maps, shift, texture, rng=rng)
     colour = fitted["diffuse_reflectance"].values.astype(np.float64)
-    wanted = colour * np.exp(at_surfels(edit.change, mapped.uv))
-    fitted, report, move = _with_albedo(fitted, wanted, albedo)
+    target = colour * np.exp(at_surfels(edit.change, mapped.uv))
+    fitted, report, move = _with_albedo(fitted, target, albedo)
     report["distance"] = ONE_SUBJECT if edit.distance is None else edit.distance
     report |= {
         "how": "texture",
@@ -351,10 +351,10 @@ def with_albedo(fitted: xr.Dataset, albedo: Array) -> xr.Dataset:
 
 
 def _with_albedo(
-    fitted: xr.Dataset, wanted: Array, albedo: xr.Dataset
+    fitted: xr.Dataset, target: Array, albedo: xr.Dataset
 ) -> tuple[xr.Dataset, Report, float]:
     """The fitted surface with new albedos (n, 3), the report of the change, and its distance."""
-    moved = with_albedo(fitted, wanted)
+    moved = with_albedo(fitted, target)
     colour, out = (
         version["diffuse_reflectance"].values.astype(np.float64)
         for version in (fitted, moved)
@@ -369,7 +369,7 @@ def _with_albedo(
     distance, move = _distances(
         now, before, takes, [str(t) for t in albedo["take"].values], axes.T @ axes
     )
-    cut = (np.clip(wanted, DARKEST, BRIGHTEST) != wanted)[good] & (wanted != colour)[
+    cut = (np.clip(target, DARKEST, BRIGHTEST) != target)[good] & (target != colour)[
         good
     ]
     report = _report(now - before, now - before, cut.any(axis=1), area, distance)
@@ -390,8 +390,8 @@ def _moved_albedo(
     here = histogram(np.clip(values, edges[:, 0], edges[:, -1]), area, edges)
     face = [str(r) for r in albedo["region"].values].index(FACE)
     source = quantiles(here, edges)
-    wanted = source + shift[face]
-    target = valid_quantiles(wanted)
+    shifted = source + shift[face]
+    target = valid_quantiles(shifted)
     matched = np.stack(
         [
             shift_quantiles(values[:, a], here[a], target[a] - source[a], edges[a])
@@ -404,7 +404,7 @@ def _moved_albedo(
     edited[good] = matched @ back + mean
     fitted, report, move = _with_albedo(fitted, edited, albedo)
     report["requested"] = [float(v) for v in shift[face].mean(axis=1) @ back]
-    report |= {"how": "colours", "projected": float(np.abs(target - wanted).mean())}
+    report |= {"how": "colours", "projected": float(np.abs(target - shifted).mean())}
     return fitted, report, move
 
 
@@ -494,10 +494,10 @@ def _report(
 
 
 def _distances(
-    now: Array, own: Array, takes: Array, names: list[str], metric: Array
+    now: Array, before: Array, takes: Array, names: list[str], metric: Array
 ) -> tuple[float | str, float]:
     """Distances of a mean `now` (d,) from the mean of the takes (t, d), and from the
-    nearest take or its `own` mean.
+    nearest take or the mean `before`.
 
     The first is in standard deviations of the takes over all directions, or a text if
     these are unknown. The second is relative to the median distance between two takes,
@@ -505,7 +505,7 @@ def _distances(
     """
     i, j = np.triu_indices(len(takes), 1)
     typical = float(np.median(_length(takes[i] - takes[j], metric))) if len(i) else 0.0
-    near = float(_length(now - np.vstack([takes, own]), metric).min())
+    near = float(_length(now - np.vstack([takes, before]), metric).min())
     far = near / typical if typical > 0 else float("inf") if near > 0 else 0.0
     if len({name.partition(".")[0] for name in names}) < 2:
         return ONE_SUBJECT if names else NO_SUBJECT, far

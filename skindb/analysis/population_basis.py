@@ -106,7 +106,7 @@ def population_basis(
             "nmf_start_error": float(errors[0]),
             "nmf_spread": start.spread,
             "nmf_passes": len(errors),
-            "nmf_surfels": int(sum(own.count for own in sums)),
+            "nmf_surfels": int(sum(part_sums.count for part_sums in sums)),
             "nmf_metric": "brdf" if in_metric else "coefficient",
             "skipped": skipped_takes(cohort),
         },

@@ -130,12 +130,12 @@ def take_masks(
     return landmark_masks(registered) | own_masks(model["fitted"].to_dataset())
 
 
-def mask_agreement(mask: Mask, other: Mask, area: Array) -> float:
+def mask_agreement(mask: Mask, reference: Mask, area: Array) -> float:
     """Area of the intersection of two masks divided by the area of their union; NaN if
     both are empty.
     """
-    either = float(area[mask | other].sum())
-    return float(area[mask & other].sum()) / either if either else float("nan")
+    either = float(area[mask | reference].sum())
+    return float(area[mask & reference].sum()) / either if either else float("nan")
 
 
 @cache
@@ -159,12 +159,12 @@ def _region_mask(name: str, uv: Array, landmarks: Mapping[str, Array]) -> Mask |
     outline = middle or _outlines()["side"][name]
     try:
         right = _corners(outline, landmarks, mirror=False)
-        left = _corners(outline, landmarks, mirror=True)
+        left_side = _corners(outline, landmarks, mirror=True)
     except KeyError:
         return None
     if middle:
-        return inside_outline(uv, np.concatenate([right, left[::-1]]))
-    return inside_outline(uv, right) | inside_outline(uv, left)
+        return inside_outline(uv, np.concatenate([right, left_side[::-1]]))
+    return inside_outline(uv, right) | inside_outline(uv, left_side)
 
 
 def _corners(
@@ -176,13 +176,13 @@ def _corners(
     if mirror:
         across = -across
         outline = [
-            (name.replace("_right", "_left"), left, below)
-            for name, left, below in outline
+            (name.replace("_right", "_left"), sideways, below)
+            for name, sideways, below in outline
         ]
     return np.array(
         [
-            landmarks[name] + left * across + below * down
-            for name, left, below in outline
+            landmarks[name] + sideways * across + below * down
+            for name, sideways, below in outline
         ]
     )
 

@@ -142,15 +142,15 @@ def outline(model: xr.DataTree, names: Sequence[str]) -> Outline:
     )
 
 
-def with_names(one: Outline, own: Sequence[str], names: Sequence[str]) -> Outline:
-    """An outline with the landmarks `own`, extended to and sorted by the names of the
+def with_names(shape: Outline, labels: Sequence[str], names: Sequence[str]) -> Outline:
+    """An outline with the landmarks `labels`, extended to and sorted by the names of the
     landmarks of all takes.
     """
     landmark = np.full((len(names), 3), np.nan)
     uv = np.full((len(names), 2), np.nan)
-    rows = [list(names).index(name) for name in own]
-    landmark[rows], uv[rows] = one.landmark, one.landmark_uv
-    return Outline(landmark, uv, one.area, one.alignable)
+    rows = [list(names).index(name) for name in labels]
+    landmark[rows], uv[rows] = shape.landmark, shape.landmark_uv
+    return Outline(landmark, uv, shape.area, shape.alignable)
 
 
 def common_frame(
@@ -172,23 +172,29 @@ def common_frame(
         See `register`.
     """
     if reference is not None and reference not in outlines:
-        there = ", ".join(outlines) or "none"
+        choices = ", ".join(outlines) or "none"
         rule = "must be a take with landmarks"
-        found = "another name"
+        finding = "another name"
         raise InputError(
             Fault(
                 f"reference {reference}",
                 rule,
-                found,
-                f"choose from takes with landmarks: {there}",
+                finding,
+                f"choose from takes with landmarks: {choices}",
             )
         )
     if not outlines:
         return None
-    at = {take: one.landmark_uv for take, one in outlines.items()}
-    target = at[reference] if reference else mean_shape(np.stack([*at.values()]))
+    landmark_uv = {take: shape.landmark_uv for take, shape in outlines.items()}
+    target = (
+        landmark_uv[reference]
+        if reference
+        else mean_shape(np.stack([*landmark_uv.values()]))
+    )
     template = reference or _template_take(outlines, target)
-    return Frame(tuple(names), at, target, template, reference or MEAN, smoothing)
+    return Frame(
+        tuple(names), landmark_uv, target, template, reference or MEAN, smoothing
+    )
 
 
 def register_one(
@@ -196,24 +202,24 @@ def register_one(
 ) -> xr.Dataset:
     """Common texture coordinates of one take; see `register`."""
     names = list(frame.names)
-    at = frame.at
+    landmark_uv = frame.at
     target = frame.target
     smoothing = frame.smoothing
     sheet = _sheet(model, names)
-    warp = fit_warp(at[frame.template], target, smoothing=smoothing)
+    warp = fit_warp(landmark_uv[frame.template], target, smoothing=smoothing)
     if take != frame.template:
-        other = _sheet(template, names)
-        chosen = anchor_vertices(other)
+        template_sheet = _sheet(template, names)
+        chosen = anchor_vertices(template_sheet)
         weak = (
-            corresponding_uv(other, chosen, sheet),
-            apply_warp(warp, other.uv[chosen]),
+            corresponding_uv(template_sheet, chosen, sheet),
+            apply_warp(warp, template_sheet.uv[chosen]),
         )
-        warp = fit_warp(at[take], target, smoothing=smoothing, weak=weak)
-    about = {"reference": frame.reference, "template": frame.template}
+        warp = fit_warp(landmark_uv[take], target, smoothing=smoothing, weak=weak)
+    frame_attrs = {"reference": frame.reference, "template": frame.template}
     return (
-        _registration_dataset(sheet, at[take], target, warp)
+        _registration_dataset(sheet, landmark_uv[take], target, warp)
         .assign_coords(landmark=names)
-        .assign_attrs(about)
+        .assign_attrs(frame_attrs)
     )
 
 
@@ -485,10 +491,12 @@ def doubtful_landmarks(registered: Registered) -> list[Note]:
                     f"no map without folds fits its {count} landmarks; {reason_of_map}",
                 )
             )
-        others = [e for other, e in errors.items() if other != take]
-        if not others or not np.isfinite(error).any():
+        other_errors = [e for name, e in errors.items() if name != take]
+        if not other_errors or not np.isfinite(error).any():
             continue
-        usual_errors = [column[np.isfinite(column)] for column in np.transpose(others)]
+        usual_errors = [
+            column[np.isfinite(column)] for column in np.transpose(other_errors)
+        ]
         # a landmark that no other take has is compared with the other landmarks of its take
         usual = np.array(
             [
@@ -498,7 +506,7 @@ def doubtful_landmarks(registered: Registered) -> list[Note]:
         )
         # a gross error bends the mean and appears in all takes: only the take with the
         # largest error is reported
-        worst = np.nanmax([error, *others], axis=0, initial=0.0)
+        worst = np.nanmax([error, *other_errors], axis=0, initial=0.0)
         unlike = (error > DOUBTFUL_RATIO * usual) | (
             (error > IMPOSSIBLE_ERROR) & (error >= worst)
         )
@@ -570,9 +578,11 @@ def _surface(
 
 
 def _interpolate(
-    values: Array, at: NDArray[np.int64], corner: Array
+    values: Array, corners: NDArray[np.int64], corner: Array
 ) -> NDArray[np.float64]:
     """Values (n, c) at barycentric coordinates `corner` (n, 3) of triangles with the
     vertices `at` (n, 3).
     """
-    return np.asarray(np.einsum("nk,nkc->nc", corner, values[at].astype(np.float64)))
+    return np.asarray(
+        np.einsum("nk,nkc->nc", corner, values[corners].astype(np.float64))
+    )

@@ -259,7 +259,7 @@ def trait_of(subjects: Subjects, name: str) -> str:
         raise InputError(Fault(f"group by {name}", rule, finding, cure)) from None
 
 
-def trait_name(name: str, known: Iterable[str]) -> str:
+def trait_name(name: str, candidates: Iterable[str]) -> str:
     """Full name of the trait that a name refers to: a full name, or a value that only
     one trait has.
 
@@ -268,7 +268,7 @@ def trait_name(name: str, known: Iterable[str]) -> str:
     InputError
         If the name refers to no trait, or to more than one.
     """
-    traits = list(known)
+    traits = list(candidates)
     if name in traits:
         return name
     meant = [trait for trait in traits if trait.partition(":")[2] == name]

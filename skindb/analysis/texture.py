@@ -303,13 +303,13 @@ def edit_texture(
     texture: xr.Dataset,
     *,
     iterations: int = ITERATIONS,
-    whole: bool = False,
+    as_one_region: bool = False,
     rng: np.random.Generator,
 ) -> TextureEdit:
     """Shift the distributions of a take's albedo in the common (u, v).
 
     The beard region is matched to its own distributions, the rest of the face to those
-    of the region without a beard. If the population has no such regions, or if `whole`
+    of the region without a beard. If the population has no such regions, or if `as_one_region`
     is set, the face is matched as one region.
 
     Parameters
@@ -323,7 +323,7 @@ def edit_texture(
         From `texture_statistics`.
     iterations
         See `skindb.numerics.texture.synthesise`.
-    whole
+    as_one_region
         Match the face as one region.
     rng
         Random generator of the noise.
@@ -333,40 +333,44 @@ def edit_texture(
     axes = texture["texture_colour_axis"].values
     drawn = texture["texture_region"].values.astype(np.float32)
     log, measured = log_albedo(maps)
-    halves = not whole and {BEARD, REST} <= set(names)
+    halves = not as_one_region and {BEARD, REST} <= set(names)
     halves = halves and bool(
         np.isfinite(shift[[names.index(BEARD), names.index(REST)], :, 0]).all()
     )
     if halves:
-        at = [names.index(BEARD), names.index(REST)]
-        beard = gaussian_filter(drawn[at[0]], BLEND * len(drawn[0]))
+        matched = [names.index(BEARD), names.index(REST)]
+        beard = gaussian_filter(drawn[matched[0]], BLEND * len(drawn[0]))
         regions = [beard, 1 - beard]
     else:
-        at = [names.index(FACE)]
+        matched = [names.index(FACE)]
         regions = [np.ones(measured.shape, np.float32)]
-    counted = [drawn[i] * measured for i in at]
+    counted = [drawn[i] * measured for i in matched]
     images = decorrelated(log, mean, axes)
 
-    def synthesised(axis: int, own: np.random.Generator) -> Synthesis:
-        wanted = shift[at, axis].astype(np.float64)
+    def synthesised(axis: int, result: np.random.Generator) -> Synthesis:
+        target = shift[matched, axis].astype(np.float64)
         return synthesise(
             images[axis],
             regions,
-            wanted,
+            target,
             measured=counted,
             iterations=iterations,
-            rng=own,
+            rng=result,
         )
 
     with ThreadPoolExecutor(thread_count()) as pool:
-        found = list(pool.map(synthesised, range(len(images)), rng.spawn(len(images))))
-    moved = [own.image - image for own, image in zip(found, images, strict=True)]
+        syntheses = list(
+            pool.map(synthesised, range(len(images)), rng.spawn(len(images)))
+        )
+    moved = [
+        result.image - image for result, image in zip(syntheses, images, strict=True)
+    ]
     change = np.moveaxis(np.stack(moved), 0, -1) @ np.linalg.inv(axes).T
     after = [image + step for image, step in zip(images, moved, strict=True)]
     distances = _distances(
-        texture, at, [_quantiles(one, counted) for one in (images, after)]
+        texture, matched, [_quantiles(taken, counted) for taken in (images, after)]
     )
-    return TextureEdit(change, tuple(own.trace for own in found), *distances)
+    return TextureEdit(change, tuple(result.trace for result in syntheses), *distances)
 
 
 def at_surfels(change: Array, uv: Array) -> Array:
@@ -393,7 +397,7 @@ def _quantiles(images: Array | list[Array], counted: list[Array]) -> Array:
 
 
 def _distances(
-    texture: xr.Dataset, at: list[int], quantiles: list[Array]
+    texture: xr.Dataset, matched: list[int], quantiles: list[Array]
 ) -> tuple[float | None, float | None]:
     """Distances of the edited and the unedited take from the mean of the takes.
 
@@ -401,7 +405,9 @@ def _distances(
     distributions; the distance is the root mean square over the axes, which is about 1
     for takes of the population. None if there are too few takes.
     """
-    quantiles_of_takes = texture["texture_quantile"].values[:, at].astype(np.float64)
+    quantiles_of_takes = (
+        texture["texture_quantile"].values[:, matched].astype(np.float64)
+    )
     quantiles_of_takes = quantiles_of_takes.reshape(len(quantiles_of_takes), -1)
     rows = quantiles_of_takes[
         np.isfinite(quantiles_of_takes).all(axis=1)

@@ -174,14 +174,14 @@ def _split_takes(
     InputError
         If a trait is unknown, or no take is on one of its sides.
     """
-    known = trait_names(subjects)
-    names = [*known, *numbers]
+    comparable = trait_names(subjects)
+    names = [*comparable, *numbers]
     if traits is not None:
         valid = sorted({*known_traits(subjects), *numbers})
         names = [trait_name(name, valid) for name in traits]
     split = {name: _sides(subjects, name, numbers) for name in names}
     rule = "there must be takes with and without it"
-    cure = f"choose from: {', '.join(known) or 'none'}"
+    cure = f"choose from: {', '.join(comparable) or 'none'}"
     faults = [
         Fault(f"trait {n}", rule, f"{w.sum()} with, {o.sum()} without", cure)
         for n, (w, o) in split.items()

@@ -171,9 +171,9 @@ def readme(manifest: Mapping[str, Any]) -> str:
         *_paragraph(f"Written by {manifest['written_by']}. {_edited(manifest)}"),
     ]
     parts += ["", "Files", "-----", ""]
-    for name, about in manifest["files"].items():
+    for name, file in manifest["files"].items():
         parts += _item(
-            name, f"{about['holds']} [{about['units']}], {_size(about['bytes'])}"
+            name, f"{file['holds']} [{file['units']}], {_size(file['bytes'])}"
         )
     parts += ["", "Units, frames and colours", "-------------------------", ""]
     for name, text in manifest["conventions"].items():
@@ -220,11 +220,11 @@ def _error_lines(manifest: Mapping[str, Any]) -> list[str]:
         f"differ in their layering. Those of its UsdPreviewSurface are {preview} and "
         f"{preview_perceptual}",
     }
-    for name, about in manifest["error"].items():
-        if isinstance(about, Mapping) and "median" in about:
+    for name, measure in manifest["error"].items():
+        if isinstance(measure, Mapping) and "median" in measure:
             items[name] = (
-                f"{about['meaning']}: median {about['median']:.3g}, 95 % below "
-                f"{about['quantile_95']:.3g} [{about['units']}]"
+                f"{measure['meaning']}: median {measure['median']:.3g}, 95 % below "
+                f"{measure['quantile_95']:.3g} [{measure['units']}]"
             )
     return [line for name, text in items.items() for line in _item(name, text)]
 
@@ -323,10 +323,10 @@ def merl_table(table: NDArray[np.float32]) -> NDArray[np.float64]:
 
 
 def _write_parts(
-    model: xr.DataTree, folder: Path, size: int | None, merl: bool, tell: Progress
+    model: xr.DataTree, folder: Path, size: int | None, merl: bool, report: Progress
 ) -> dict[str, dict[str, Any]]:
     """Write all files except the manifest; returns a description of each by its path."""
-    tell("maps", 0, 3)
+    report("maps", 0, 3)
     maps = texture_maps(model, size=size)
     described = _write_maps(maps, folder / "maps")
     path = maps.get("mean_free_path")
@@ -336,9 +336,9 @@ def _write_parts(
         else 0.0
     )
     del path, maps  # large, and the textures need as much memory again
-    tell("bases", 1, 3)
+    report("bases", 1, 3)
     described |= _write_bases(model["basis"].to_dataset(), folder / "bases", merl)
-    tell("glTF", 2, 3)
+    report("glTF", 2, 3)
     skin = skin_of(model, size=size)
     error = export_gltf(model, folder / "model.glb", skin=skin)
     text = (
@@ -360,7 +360,7 @@ def _write_parts(
         "picture.exr renders"
     )
     described[f"mitsuba/{PROGRAM}"] = {"holds": text, "units": "mm"}
-    tell("done", 3, 3)
+    report("done", 3, 3)
     return described
 
 
@@ -461,7 +461,7 @@ def _manifest(
 ) -> dict[str, Any]:
     attrs = model.attrs
     files = {
-        name: about | _fingerprint(folder / name) for name, about in described.items()
+        name: file | _fingerprint(folder / name) for name, file in described.items()
     }
     return {
         "format": "skindb-bundle",

@@ -125,8 +125,8 @@ def _fit_lobe(
         )[0]
         gloss = lobe[:, None] * matt * np.pi
         squares = [
-            left.T @ (use[:, None] * right)
-            for left, right in ((gloss, gloss), (gloss, matt), (matt, matt))
+            a.T @ (use[:, None] * b)
+            for a, b in ((gloss, gloss), (gloss, matt), (matt, matt))
         ]
         of_gloss = parts.T @ (use[:, None] * gloss)
         flat_gloss = (matt[:, 0] * use) @ gloss
@@ -477,18 +477,18 @@ def _shape(fitted: xr.Dataset, triangles: NDArray[Any]) -> Shape:
 
 
 def _through(
-    fitted: xr.Dataset, shape: Shape, known: NDArray[np.int64], eta: float
+    fitted: xr.Dataset, shape: Shape, surfels: NDArray[np.int64], eta: float
 ) -> NDArray[np.float64]:
     """Fraction of the diffuse light (n, 3) at the known surfels that comes through the
     skin from the other side.
     """
     if "sigma_tr" not in fitted:
-        return np.zeros((len(known), 3))
+        return np.zeros((len(surfels), 3))
     diffuse, sigma_tr = (
-        fitted[name].values[known] for name in ("diffuse_reflectance", "sigma_tr")
+        fitted[name].values[surfels] for name in ("diffuse_reflectance", "sigma_tr")
     )
     deep = thickness(shape.position.astype(np.float64), shape.normal, shape.triangles)[
-        known
+        surfels
     ]
     return np.asarray(
         transmitted_fraction(deep, diffuse, sigma_tr, eta=eta), np.float64
@@ -497,7 +497,7 @@ def _through(
 
 def _columns(
     skin: Material,
-    known: NDArray[np.int64],
+    surfels: NDArray[np.int64],
     shape: Shape,
     top: float,
     through: NDArray[np.float64],
@@ -506,7 +506,7 @@ def _columns(
 
     def spread(values: NDArray[np.floating[Any]]) -> NDArray[np.float32]:
         out = np.zeros((len(shape.position), values.shape[1]), np.float32)
-        out[known] = values
+        out[surfels] = values
         return out
 
     bent = to_tangent_space(shape.shading, shape.normal, shape.tangent)
@@ -515,7 +515,7 @@ def _columns(
         "roughness": spread(skin.roughness[:, None]),
         "specular": spread(skin.specular[:, None]),
         "f0": spread(np.minimum(skin.f0 / top, 1.0)[:, None]),
-        "bent": spread(bent[known]),
+        "bent": spread(bent[surfels]),
     }
     # strength times colour is `through` times the base colour
     if through.max() >= MIN_TRANSMITTED:
@@ -556,11 +556,11 @@ def _eight_bits(values: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 def _normal_error(
-    picture: NDArray[np.uint8], shape: Shape, known: NDArray[np.int64]
+    picture: NDArray[np.uint8], shape: Shape, surfels: NDArray[np.int64]
 ) -> float:
     """Median angle [degree] between the shading normals and those of the texture at the surfels."""
     size = len(picture)
-    places = (shape.uv[known].astype(np.float64) * size - 0.5)[:, ::-1].T
+    places = (shape.uv[surfels].astype(np.float64) * size - 0.5)[:, ::-1].T
     bent = np.stack(
         [
             ndimage.map_coordinates(
@@ -570,14 +570,14 @@ def _normal_error(
         ],
         1,
     )
-    normal = shape.normal[known]
-    tangent = shape.tangent[known]
+    normal = shape.normal[surfels]
+    tangent = shape.tangent[surfels]
     bitangent = np.cross(normal, tangent[:, :3]) * tangent[:, 3:]
     normals = (
         bent[:, :1] * tangent[:, :3] + bent[:, 1:2] * bitangent + bent[:, 2:] * normal
     )
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
-    cosine = np.clip((normals * shape.shading[known]).sum(axis=1), -1, 1)
+    cosine = np.clip((normals * shape.shading[surfels]).sum(axis=1), -1, 1)
     return float(np.degrees(np.median(np.arccos(cosine))))
 
 

@@ -116,8 +116,8 @@ def disc_atlas(
             fewest_flips = min(fewest_flips, flips)
     rule = "no triangle may be turned over in the atlas"
     cure = "remove the smallest triangles from the scan, or choose a wider spacing"
-    found = f"{fewest_flips} of {len(fine)}"
-    raise InputError(Fault("mesh", rule, found, cure))
+    finding = f"{fewest_flips} of {len(fine)}"
+    raise InputError(Fault("mesh", rule, finding, cure))
 
 
 @dataclass(frozen=True)
@@ -154,8 +154,8 @@ def _check(n: int, faces: Index, loops: list[Index]) -> None:
         raise InputError(Fault("mesh", rule, "a closed surface", cure))
     if len(np.unique(faces)) != n or face_components(faces).max() > 0:
         rule = "a surface must be connected to be flattened"
-        found = "several components or unused vertices"
-        raise InputError(Fault("mesh", rule, found, "clean it"))
+        finding = "several components or unused vertices"
+        raise InputError(Fault("mesh", rule, finding, "clean it"))
     handles = (2 - len(loops) - (n - len(edge_table(faces).edges) + len(faces))) // 2
     if handles:
         rule = "a surface must not have handles to be flattened"
@@ -228,16 +228,16 @@ def _mean_value_weights(points: Array, faces: Index) -> sp.csr_matrix:
     weights = sp.csr_matrix((n, n))
     tiny = 1e-9 * float(np.ptp(points, axis=0).max())
     for k in range(3):
-        here, left, right = np.roll(faces, -k, axis=1).T
-        to_left = points[left] - points[here]
-        to_right = points[right] - points[here]
+        here, after, before = np.roll(faces, -k, axis=1).T
+        to_left = points[after] - points[here]
+        to_right = points[before] - points[here]
         a = np.maximum(np.linalg.norm(to_left, axis=1), tiny)
         b = np.maximum(np.linalg.norm(to_right, axis=1), tiny)
         cosine = np.einsum("ni,ni->n", to_left, to_right) / (a * b)
         # at least 1e-6 and at most 1e6, so that coinciding or opposite sides have
         # positive, finite weights
         half = np.sqrt(np.clip(1 - cosine, 1e-12, 2) / np.clip(1 + cosine, 1e-12, 2))
-        beside = _matrix(n, (here, left, half / a), (here, right, half / b))
+        beside = _matrix(n, (here, after, half / a), (here, before, half / b))
         weights = weights + beside
     return weights
 

@@ -150,8 +150,8 @@ def clean_mesh(
     current = _largest_component(points, current, report)
     if not len(current):
         rule = "a scan must have a surface"
-        found = "no non-degenerate face"
-        raise InputError(Fault("mesh", rule, found, "export it again"))
+        finding = "no non-degenerate face"
+        raise InputError(Fault("mesh", rule, finding, "export it again"))
     current = _fill_small_holes(points, current, hole_edges, report)
     current, source = _split_bow_ties(current, len(points))
     report.add("bow_ties", points, source[len(points) :, None])

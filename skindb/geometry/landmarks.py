@@ -69,14 +69,14 @@ def similarity(source: Array, target: Array) -> tuple[Float64, Float64]:
     y = float64(target)
     a = x - x.mean(axis=0)
     b = y - y.mean(axis=0)
-    left, value, right = np.linalg.svd(a.T @ b)
+    u, value, v = np.linalg.svd(a.T @ b)
     sign = np.ones(len(value))
-    sign[-1] = np.sign(np.linalg.det(left @ right))
+    sign[-1] = np.sign(np.linalg.det(u @ v))
     length = float((a**2).sum())
     along = float(value @ sign)
     matrix = np.eye(len(value))
     if along > 0 and length > 0:
-        matrix = along / length * (left * sign) @ right
+        matrix = along / length * (u * sign) @ v
     return matrix, y.mean(axis=0) - x.mean(axis=0) @ matrix
 
 

@@ -136,11 +136,11 @@ def fans(faces: Faces) -> Index:
     A vertex with more than one fan is a bow-tie.
     """
     vertex = np.asarray(faces, np.int64).ravel()
-    start, other = _shared_sides(faces)
-    end, other_end = (side // 3 * 3 + (side + 1) % 3 for side in (start, other))
-    opposite = vertex[start] != vertex[other]
-    at_start = np.where(opposite, other_end, other)
-    at_end = np.where(opposite, other, other_end)
+    start, opposite_side = _shared_sides(faces)
+    end, other_end = (side // 3 * 3 + (side + 1) % 3 for side in (start, opposite_side))
+    opposite = vertex[start] != vertex[opposite_side]
+    at_start = np.where(opposite, other_end, opposite_side)
+    at_end = np.where(opposite, opposite_side, other_end)
     rows = np.concatenate([start, end])
     columns = np.concatenate([at_start, at_end])
     return pair_components(rows, columns, len(vertex)).reshape(-1, 3)
@@ -158,9 +158,9 @@ def _pairs(faces: Faces) -> tuple[Index, Index, Mask]:
     """Pairs of faces that share an edge, and whether they traverse it in opposite
     directions, as they should.
     """
-    side, other = _shared_sides(faces)
+    side, opposite_side = _shared_sides(faces)
     start = np.asarray(faces, np.int64).ravel()
-    return side // 3, other // 3, start[side] != start[other]
+    return side // 3, opposite_side // 3, start[side] != start[opposite_side]
 
 
 def _groups(labels: Index) -> list[Index]:

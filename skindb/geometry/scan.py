@@ -90,8 +90,8 @@ def read_scan(path: str | Path) -> Scan:
     except InputError:
         raise
     except OSError as error:
-        found = error.strerror or str(error)
-        raise _fault(file, "the scan must be readable", found) from error
+        finding = error.strerror or str(error)
+        raise _fault(file, "the scan must be readable", finding) from error
     except DAMAGE as error:
         rule = "the scan must be a complete mesh file"
         raise _fault(file, rule, _damage(error)) from error
@@ -129,24 +129,24 @@ def _damage(error: Exception) -> str:
     return "one that is cut off or damaged"
 
 
-def _fault(file: Path, rule: str, found: str) -> InputError:
-    return InputError(Fault(str(file), rule, found, CURE))
+def _fault(file: Path, rule: str, finding: str) -> InputError:
+    return InputError(Fault(str(file), rule, finding, CURE))
 
 
-def _faults(where: str, vertices: Array, faces: Index) -> list[Fault]:
+def _faults(file: str, vertices: Array, faces: Index) -> list[Fault]:
     faults = []
     if len(faces) == 0:
-        found = f"{len(vertices)} vertices and no face"
-        faults.append(Fault(where, "a scan must have triangles", found, CURE))
+        finding = f"{len(vertices)} vertices and no face"
+        faults.append(Fault(file, "a scan must have triangles", finding, CURE))
     bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
     if len(bad):
-        found = f"{len(bad)} that are not finite, first vertex {bad[0]}"
-        faults.append(Fault(where, "vertices must be finite numbers", found, CURE))
+        finding = f"{len(bad)} that are not finite, first vertex {bad[0]}"
+        faults.append(Fault(file, "vertices must be finite numbers", finding, CURE))
     wrong = np.flatnonzero(((faces < 0) | (faces >= len(vertices))).any(axis=1))
     if len(wrong):
         rule = "faces must refer to vertices of the file"
-        found = f"{len(wrong)} other faces, first face {wrong[0]}, for {len(vertices)} vertices"
-        faults.append(Fault(where, rule, found, CURE))
+        finding = f"{len(wrong)} other faces, first face {wrong[0]}, for {len(vertices)} vertices"
+        faults.append(Fault(file, rule, finding, CURE))
     return faults
 
 
@@ -273,9 +273,9 @@ class Crop:
         """Check that the limits are not empty."""
         is_box = self.low is not None and self.high is not None
         if is_box and not np.less(np.array(self.low), np.array(self.high)).all():
-            found = f"{self.low} and {self.high}"
+            finding = f"{self.low} and {self.high}"
             rule = "its lower corner must lie below the higher one, in mm"
-            raise InputError(Fault("crop", rule, found, "exchange them"))
+            raise InputError(Fault("crop", rule, finding, "exchange them"))
         if self.reach_mm is not None and not self.reach_mm > 0:
             rule = "its reach must be positive, in mm"
             cure = "give a positive one"

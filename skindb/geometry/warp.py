@@ -114,16 +114,16 @@ def fit_warp(
         determine an affine map.
     """
     x, y = (float64(points).reshape(-1, 2) for points in (source, target))
-    a, b, used = _merged(x, y)
+    a, b, is_used = _merged(x, y)
     if not len(a):
-        return _plain("identity", used, np.zeros(2), 1.0, np.eye(2), np.zeros(2))
+        return _plain("identity", is_used, np.zeros(2), 1.0, np.eye(2), np.zeros(2))
     if len(a) == 1:
-        return _plain("shift", used, np.zeros(2), 1.0, np.eye(2), b[0] - a[0])
+        return _plain("shift", is_used, np.zeros(2), 1.0, np.eye(2), b[0] - a[0])
     origin = a.mean(axis=0)
     scale = _spread(a)
     a = (a - origin) / scale
     matrix, shift = similarity(a, b)
-    fallback = _plain("similarity", used, origin, scale, matrix, shift)
+    fallback = _plain("similarity", is_used, origin, scale, matrix, shift)
     if len(a) < 3 or width(a) < MIN_WIDTH_RATIO or width(b) < MIN_WIDTH_RATIO:
         return fallback
     min_area = MIN_AREA_RATIO * np.linalg.det(matrix)
@@ -270,8 +270,8 @@ class _System:
 
 def _merged(source: Array, target: Array) -> tuple[Float64, Float64, Mask]:
     """Distinct points of both, and mask of the points that represent them."""
-    used: Mask = np.isfinite(np.hstack([source, target])).all(axis=1)
-    finite = np.flatnonzero(used)
+    is_used: Mask = np.isfinite(np.hstack([source, target])).all(axis=1)
+    finite = np.flatnonzero(is_used)
     group = np.arange(len(source))
     for points in (source, target):
         near = SAME_POINT_FRACTION * _spread(points[finite])
@@ -281,14 +281,14 @@ def _merged(source: Array, target: Array) -> tuple[Float64, Float64, Mask]:
                     group[group == group[i]] = group[j]
     _, places = np.unique(group[finite], return_index=True)
     leaders = finite[np.sort(places)]
-    used[:] = False
-    used[leaders] = True
+    is_used[:] = False
+    is_used[leaders] = True
     members = [finite[group[finite] == group[i]] for i in leaders]
     a, b = (
         np.array([points[rows].mean(axis=0) for rows in members]).reshape(-1, 2)
         for points in (source, target)
     )
-    return a, b, used
+    return a, b, is_used
 
 
 def _spread(points: Array) -> float:
@@ -304,7 +304,7 @@ def _finite(source: Array, target: Array) -> tuple[Float64, Float64]:
 
 def _plain(
     kind: str,
-    used: Mask,
+    is_used: Mask,
     origin: Array,
     scale: float,
     matrix: Array,
@@ -320,7 +320,7 @@ def _plain(
         condition=1.0,
         smoothing=0.0,
         loose=np.zeros(0),
-        used=used,
+        used=is_used,
     )
 
 
@@ -468,11 +468,13 @@ def _aligned(
     kernel = DEFORMATION_SD_MM**2 * _matern(distances / DEFORMATION_LENGTH_MM)
     pull = np.concatenate([take.landmark[shared] - points[:n], np.zeros_like(start)])
     error = np.tile(CLICK_SD_MM**2 * np.eye(3), (len(points), 1, 1))
-    used = np.arange(len(points)) < n
+    is_used = np.arange(len(points)) < n
     same_outline = False
     for i in range(ALIGNMENT_ROUNDS + 1):
-        weights = _weights(kernel[np.ix_(used, used)], pull[used], error[used])
-        aligned = start + kernel[n:, used] @ weights
+        weights = _weights(
+            kernel[np.ix_(is_used, is_used)], pull[is_used], error[is_used]
+        )
+        aligned = start + kernel[n:, is_used] @ weights
         distance, near = tree.query(aligned)
         target_normal = take.normal[near]
         across = target_normal[:, :, None] * target_normal[:, None]
@@ -482,13 +484,13 @@ def _aligned(
         pull[n:] = aligned + step - start
         facing = np.einsum("ni,ni->n", normal, target_normal) > MIN_COSINE_NORMALS
         close = distance < MAX_ALIGNING_DISTANCE_MM
-        used[n:] = close & facing & ~take.rim[near] & ~on_rim
+        is_used[n:] = close & facing & ~take.rim[near] & ~on_rim
         if i == OUTLINE_ROUND:
             gap = np.linalg.norm(take.position[outline] - aligned[on_rim], axis=1)
             same_outline = bool(np.quantile(gap, 0.9) < MAX_OUTLINE_DISTANCE_MM)
         if same_outline:
             ends = n + np.flatnonzero(on_rim)
-            used[ends] = True
+            is_used[ends] = True
             error[ends] = OUTLINE_SD_MM**2 * np.eye(3)
             pull[ends] = take.position[outline] - start[on_rim]
     return aligned, on_rim, same_outline

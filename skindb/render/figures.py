@@ -161,23 +161,23 @@ def _colour_images(
     return images, scale
 
 
-def _white(shown: Float) -> float:
+def _white(values: Float) -> float:
     """The value of the largest channel that is drawn white, of values (n, 3); 1 if none
     is above zero.
     """
-    peak = shown.max(axis=-1)
+    peak = values.max(axis=-1)
     peak = peak[np.isfinite(peak) & (peak > 0)]
     return float(np.percentile(peak, RANGE[1])) if len(peak) else 1.0
 
 
-def _colour_dim(found: xr.DataArray, at: Mapping[str, str]) -> str | None:
+def _colour_dim(values: xr.DataArray, at: Mapping[str, str]) -> str | None:
     """The dimension that is drawn as a colour: the only one besides "surfel" that is
     not in `at`, if it fits.
     """
-    free = [str(dim) for dim in found.dims if dim != "surfel" and dim not in at]
-    if len(free) != 1 or found.sizes[free[0]] != 3 or "flag_values" in found.attrs:
+    free = [str(dim) for dim in values.dims if dim != "surfel" and dim not in at]
+    if len(free) != 1 or values.sizes[free[0]] != 3 or "flag_values" in values.attrs:
         return None
-    unit_vectors = free[0] == "xyz" and str(found.attrs.get("units", "1")) in ("1", "")
+    unit_vectors = free[0] == "xyz" and str(values.attrs.get("units", "1")) in ("1", "")
     return free[0] if free[0] == "channel" or unit_vectors else None
 
 
@@ -261,15 +261,15 @@ def trace_front(
     back = np.array([s, 0, c])
     vertices = position[np.unique(triangle)].astype(np.float64)
     place = np.column_stack([vertices @ right, vertices[:, 1], vertices @ back])
-    (left, bottom, _), (end, top, front) = place.min(axis=0), place.max(axis=0)
+    (low_x, bottom, _), (high_x, top, front) = place.min(axis=0), place.max(axis=0)
     width, height = (
-        max(extent, MIN_ASPECT * max(end - left, top - bottom))
-        for extent in (end - left, top - bottom)
+        max(extent, MIN_ASPECT * max(high_x - low_x, top - bottom))
+        for extent in (high_x - low_x, top - bottom)
     )
     edge = MARGIN * max(width, height)
     step = (max(width, height) + 2 * edge) / size
     x = (
-        (left + end - width) / 2
+        (low_x + high_x - width) / 2
         - edge
         + (np.arange(np.ceil((width + 2 * edge) / step)) + 0.5) * step
     )
@@ -339,14 +339,14 @@ def _drawable(take: xr.DataTree) -> set[str]:
 
 
 def _chosen(
-    found: xr.DataArray, at: dict[str, str], *, keep: str | None = None
+    values: xr.DataArray, at: dict[str, str], *, keep: str | None = None
 ) -> xr.DataArray:
     """The variable at one label of each dimension other than "surfel" and the one to keep."""
-    for dim in (str(d) for d in found.dims if d not in ("surfel", keep)):
+    for dim in (str(d) for d in values.dims if d not in ("surfel", keep)):
         labels = (
-            [str(x) for x in found[dim].values]
-            if dim in found.coords
-            else [str(i) for i in range(found.sizes[dim])]
+            [str(x) for x in values[dim].values]
+            if dim in values.coords
+            else [str(i) for i in range(values.sizes[dim])]
         )
         if at.get(dim) not in labels:
             choice = f"{dim}={at[dim]}" if dim in at else f"no {dim}"
@@ -356,14 +356,15 @@ def _chosen(
                 + (", ..." if len(labels) > 12 else "")
             )
             raise InputError(
-                Fault("at", f"must select one {dim} of {found.name}", choice, cure)
+                Fault("at", f"must select one {dim} of {values.name}", choice, cure)
             )
-        found = found.isel({dim: labels.index(at.pop(dim))})
+        values = values.isel({dim: labels.index(at.pop(dim))})
     if at:
-        rule = f"must name dimensions of {found.name}, which has {', '.join(map(str, found.dims))}"
+        dims = ", ".join(map(str, values.dims))
+        rule = f"must name dimensions of {values.name}, which has {dims}"
         cure = "remove the others"
         raise InputError(Fault("at", rule, ", ".join(at), cure))
-    return found
+    return values
 
 
 def _shades(chosen: xr.DataArray) -> tuple[NDArray[np.float64], list[str]]:
@@ -382,20 +383,20 @@ def _shades(chosen: xr.DataArray) -> tuple[NDArray[np.float64], list[str]]:
     return values.astype(np.float64), []
 
 
-def _span(shown: NDArray[np.float64]) -> tuple[float, float]:
+def _span(values: NDArray[np.float64]) -> tuple[float, float]:
     low, high = (
-        (float(v) for v in np.percentile(shown, RANGE)) if len(shown) else (0.0, 1.0)
+        (float(v) for v in np.percentile(values, RANGE)) if len(values) else (0.0, 1.0)
     )
     return (low, high) if high > low else (low - 0.5, low + 0.5)
 
 
-def _units(found: xr.DataArray) -> str:
-    units = _plain_units(found).strip()
+def _units(values: xr.DataArray) -> str:
+    units = _plain_units(values).strip()
     return f" [{units}]" if units else ""
 
 
-def _plain_units(found: xr.DataArray) -> str:
-    units = str(found.attrs.get("units", "1"))
+def _plain_units(values: xr.DataArray) -> str:
+    units = str(values.attrs.get("units", "1"))
     return "" if units in ("1", "") else f" {units}"
 
 

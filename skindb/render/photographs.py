@@ -102,14 +102,14 @@ def compare_images(
     }
 
 
-def delta_e(first: ArrayLike, second: ArrayLike) -> Float:
+def delta_e(colours: ArrayLike, references: ArrayLike) -> Float:
     """CIEDE2000 differences of display-referred linear Rec. 709 colours (..., 3),
     clipped to [0, 1] (CIE 142-2001).
     """
     import colour  # takes longer to import than most commands of the package to run
 
     lab = []
-    for values in (first, second):
+    for values in (colours, references):
         xyz = colour.RGB_to_XYZ(np.clip(np.asarray(values, np.float64), 0, 1), "sRGB")
         lab.append(colour.XYZ_to_Lab(xyz))
     return np.asarray(colour.delta_E(lab[0], lab[1], method="CIE 2000"), np.float64)
@@ -137,14 +137,19 @@ def _prepared(
     )
 
 
-def _ssim(first: Float, second: Float, inside: Mask) -> float:
+def _ssim(rendered: Float, photographed: Float, inside: Mask) -> float:
     if min(inside.shape) < SSIM_WINDOW:
         return float("nan")
     centres = binary_erosion(inside, np.ones((SSIM_WINDOW, SSIM_WINDOW), bool))
     if not centres.any():
         return float("nan")
     _, local = structural_similarity(
-        first, second, win_size=SSIM_WINDOW, data_range=1.0, channel_axis=-1, full=True
+        rendered,
+        photographed,
+        win_size=SSIM_WINDOW,
+        data_range=1.0,
+        channel_axis=-1,
+        full=True,
     )
     return float(local[centres].mean())
 
@@ -479,7 +484,7 @@ def write_comparisons(comparisons: Sequence[Comparison], folder: Path) -> list[P
 
 
 def side_by_side(
-    one: Comparison, *, components: bool = False, exposure: float | None = None
+    comparison: Comparison, *, components: bool = False, exposure: float | None = None
 ) -> NDArray[np.uint8]:
     """Photograph, rendering and difference (h, 3 w, 3) at one exposure, by default that
     of the photograph.
@@ -487,16 +492,20 @@ def side_by_side(
     With `components`, the diffuse and the surface part of the rendering stand before
     the difference (h, 5 w, 3).
     """
-    exposure = one.error["exposure"] if exposure is None else exposure
+    exposure = comparison.error["exposure"] if exposure is None else exposure
     images = [
-        one.photographed,
-        one.rendered,
-        *((one.diffuse, one.rendered - one.diffuse) if components else ()),
+        comparison.photographed,
+        comparison.rendered,
+        *(
+            (comparison.diffuse, comparison.rendered - comparison.diffuse)
+            if components
+            else ()
+        ),
     ]
     panels = [tone_map(np.nan_to_num(image), exposure=exposure) for image in images]
     gap = np.where(
-        one.mask[..., None],
-        (one.rendered - np.nan_to_num(one.photographed)) * exposure,
+        comparison.mask[..., None],
+        (comparison.rendered - np.nan_to_num(comparison.photographed)) * exposure,
         0.0,
     )
     difference = np.clip(127.5 + 10 * 127.5 * gap, 0, 255).astype(np.uint8)

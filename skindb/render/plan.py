@@ -47,7 +47,7 @@ class RenderPlan:
     omissions: Omissions
 
 
-def plan_render(shown: Mask, *, subsurface: bool) -> RenderPlan:
+def plan_render(visible: Mask, *, subsurface: bool) -> RenderPlan:
     """Plan a picture in which the triangles of some surfels (surfel,) are visible.
 
     Subsurface light is computed at these surfels only. It comes from all surfels, and
@@ -57,17 +57,17 @@ def plan_render(shown: Mask, *, subsurface: bool) -> RenderPlan:
     a surfel is ten times larger.
     """
     skipped: Omissions = ()
-    if subsurface and not shown.all():
-        hidden = int((~shown).sum())
+    if subsurface and not visible.all():
+        hidden = int((~visible).sum())
         skipped = (
             Omission(
                 "surfels that receive subsurface light",
                 hidden,
-                shown.size,
+                visible.size,
                 "they are not visible",
             ),
         )
-    return RenderPlan(shown, subsurface, skipped)
+    return RenderPlan(visible, subsurface, skipped)
 
 
 @dataclass(frozen=True)

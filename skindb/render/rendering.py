@@ -156,7 +156,7 @@ def picture(shot: Shot) -> NDArray[np.float32]:
         direct += glow_image(
             shot.view,
             surface,
-            total_exitance(surface, lamps, shot.scene, wanted=plan.surfels),
+            total_exitance(surface, lamps, shot.scene, receivers=plan.surfels),
         )
     return np.asarray(direct, np.float32)
 
@@ -167,12 +167,15 @@ def frontal_camera(dome: xr.Dataset) -> int:
     return int(np.argmax(place[:, 2] / np.linalg.norm(place, axis=1)))
 
 
-def _index(names: list[str], name: str, what: str) -> int:
+def _index(names: list[str], name: str, device: str) -> int:
     if name not in names:
         cure = f"choose {', '.join(names)}"
         raise InputError(
             Fault(
-                f"{what} {name}", f"must be a {what} of the dome", "no such name", cure
+                f"{device} {name}",
+                f"must be a {device} of the dome",
+                "no such name",
+                cure,
             )
         )
     return names.index(name)

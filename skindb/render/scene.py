@@ -229,13 +229,13 @@ def usable_surfels(values: dict[str, NDArray[Any]]) -> NDArray[np.bool_]:
     return good
 
 
-def _nearest(position: Float, known: NDArray[np.bool_]) -> NDArray[np.int64]:
-    _, index = cKDTree(position[known]).query(position)
-    return np.asarray(np.flatnonzero(known)[index], np.int64)
+def _nearest(position: Float, usable: NDArray[np.bool_]) -> NDArray[np.int64]:
+    _, index = cKDTree(position[usable]).query(position)
+    return np.asarray(np.flatnonzero(usable)[index], np.int64)
 
 
 def subdivide_surface(
-    surface: Surface, spacing: float, shown: NDArray[np.bool_]
+    surface: Surface, spacing: float, visible: NDArray[np.bool_]
 ) -> Surface:
     """Subdivide the visible triangles of a surface until their edges have at most a given length.
 
@@ -250,7 +250,7 @@ def subdivide_surface(
         Surface.
     spacing
         Maximum length of edges [mm].
-    shown
+    visible
         (v,) visible vertices; triangles without a visible vertex are not divided.
 
     Raises
@@ -264,7 +264,7 @@ def subdivide_surface(
         if getattr(surface, name) is not None
     ]
     values = {name: np.asarray(getattr(surface, name), np.float64) for name in names}
-    values["shown"] = shown.astype(np.float64)[:, None]
+    values["shown"] = visible.astype(np.float64)[:, None]
     vertices = np.asarray(surface.vertices, np.float64)
     faces = np.asarray(surface.faces, np.int64)
     for _ in range(MAX_LEVELS):

@@ -89,7 +89,7 @@ def exitances(
     lights: Lights,
     scene: RayScene,
     *,
-    wanted: NDArray[np.bool_] | None = None,
+    receivers: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.float32]:
     """Radiant exitance under the boundary for each light, by the dipole octree (eq. 9;
     Jensen and Buhler 2002).
@@ -103,7 +103,7 @@ def exitances(
         Lights, which are all computed in one traversal of the octree.
     scene
         Ray tracer of the surface.
-    wanted
+    receivers
         (v,) vertices whose exitance is needed; default all. It is 0 at the others.
 
     Returns
@@ -113,7 +113,7 @@ def exitances(
         uniform light gives exactly R_d.
     """
     out = _exitances_from_irradiance(
-        surface, transmitted_irradiance(surface, lights, scene), wanted
+        surface, transmitted_irradiance(surface, lights, scene), receivers
     )
     out *= lights.intensity[:, None].astype(np.float32)
     return out
@@ -124,7 +124,7 @@ def total_exitance(
     lights: Lights,
     scene: RayScene,
     *,
-    wanted: NDArray[np.bool_] | None = None,
+    receivers: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.float32]:
     """Sum (v, 3) of `exitances` over the lights; as it is linear, irradiances are
     summed before the traversal.
@@ -132,7 +132,7 @@ def total_exitance(
     return exitance_from_irradiance(
         surface,
         transmitted_irradiance(surface, lights, scene) @ lights.intensity,
-        wanted,
+        receivers,
     )
 
 
@@ -154,15 +154,15 @@ def tree_opening(error: float | None) -> tuple[float, float]:
 def exitance_from_irradiance(
     surface: Surface,
     received: Float,
-    wanted: NDArray[np.bool_] | None = None,
+    receivers: NDArray[np.bool_] | None = None,
     *,
     tolerance: float = DEFAULT_OPENING,
 ) -> NDArray[np.float32]:
-    """Radiant exitance (v, 3) under the boundary at the wanted vertices, from
+    """Radiant exitance (v, 3) under the boundary at the receivers, from
     irradiance (v, 3) under the boundary.
     """
     exitance = _exitances_from_irradiance(
-        surface, received, wanted, tolerance=tolerance
+        surface, received, receivers, tolerance=tolerance
     )
     # each column is the light of one channel, so only this channel of its result is used
     return np.stack([exitance[c, :, c] for c in range(3)], axis=-1)
@@ -171,11 +171,11 @@ def exitance_from_irradiance(
 def _exitances_from_irradiance(
     surface: Surface,
     irradiance: Float,
-    wanted: NDArray[np.bool_] | None,
+    receivers: NDArray[np.bool_] | None,
     *,
     tolerance: float = DEFAULT_OPENING,
 ) -> NDArray[np.float32]:
-    """Exitance (l, v, 3) at the wanted vertices, 0 at the others, from irradiance (v, l)."""
+    """Exitance (l, v, 3) at the receivers, 0 at the others, from irradiance (v, l)."""
     if surface.s is None or surface.sigma_tr is None:
         raise ValueError(
             "the surface must have s and sigma_tr for subsurface transport, found None"
@@ -194,7 +194,7 @@ def _exitances_from_irradiance(
         surface.sigma_tr[finite],
         eta=surface.eta,
         tolerance=tolerance,
-        receivers=None if wanted is None else wanted[finite],
+        receivers=None if receivers is None else receivers[finite],
     )
     return out
 
@@ -407,7 +407,7 @@ def shade_view(
     )
     if escape is not None and glow is None:
         glow = exitances(
-            surface, lights, scene, wanted=view.shown(len(surface.vertices))
+            surface, lights, scene, receivers=view.shown(len(surface.vertices))
         )
     images = np.empty(
         (len(lights), view.camera.height, view.camera.width, 3), np.float32

@@ -334,19 +334,19 @@ def _trait(trait: Trait, plain: Mapping[str, Float]) -> dict[str, Any]:
     diffusion length.
     """
     edited = (from_model(tree, fill=True) for tree in (trait.whole, trait.half))
-    whole, half = (
+    full, half = (
         _values(surface, surface.model.resample(surface.parameters)[1])
         for surface in edited
     )
     ratio = {
         name: np.log(
-            np.maximum(whole[name], MIN_ALBEDO) / np.maximum(plain[name], MIN_ALBEDO)
+            np.maximum(full[name], MIN_ALBEDO) / np.maximum(plain[name], MIN_ALBEDO)
         )
         for name in ("albedo", "diffusion")
     }
     between = plain["albedo"] * np.exp(0.5 * ratio["albedo"])
     error = float(np.median(np.abs(between / half["albedo"] - 1)))
-    moves = ratio | {name: whole[name] - plain[name] for name in ("weightA", "weightB")}
+    moves = ratio | {name: full[name] - plain[name] for name in ("weightA", "weightB")}
     return {
         "name": trait.name,
         "amount": trait.amount,

@@ -126,7 +126,7 @@ def _existing(path: Path) -> Any:
     return stored
 
 
-def parsed_points(value: Any, where: str) -> dict[str, NDArray[np.float64]]:
+def parsed_points(value: Any, file: str) -> dict[str, NDArray[np.float64]]:
     """Positions (3,) [mm] by name from JSON.
 
     Raises
@@ -137,7 +137,7 @@ def parsed_points(value: Any, where: str) -> dict[str, NDArray[np.float64]]:
     if not isinstance(value, dict):
         raise InputError(
             Fault(
-                where,
+                file,
                 "must be a JSON object {name: [x, y, z]}",
                 type(value).__name__,
                 "correct it",
@@ -146,7 +146,7 @@ def parsed_points(value: Any, where: str) -> dict[str, NDArray[np.float64]]:
     rule = "a landmark must be [x, y, z] in mm"
     cure = "correct it, or remove it"
     wrong = [
-        Fault(f"{where}[{name}]", rule, str(p), cure)
+        Fault(f"{file}[{name}]", rule, str(p), cure)
         for name, p in value.items()
         if not is_point(p)
     ]
@@ -161,11 +161,11 @@ def landmark_mistakes(
     """Faults of landmarks: unknown names, positions off the surface, and everything
     that ingest would refuse.
     """
-    where = str(task.out)
+    file = str(task.out)
     if not points:
         return [
             Fault(
-                where,
+                file,
                 "at least one landmark must be set",
                 "none",
                 "click a point on the scan",
@@ -175,30 +175,30 @@ def landmark_mistakes(
     if unknown:
         rule = "the name of a landmark must be in the list"
         return [
-            Fault(f"{where}[{name}]", rule, "another name", "choose a name of the list")
+            Fault(f"{file}[{name}]", rule, "another name", "choose a name of the list")
             for name in unknown
         ]
     place = np.array([*points.values()])
     distance = closest_on_mesh(task.scan.vertices, task.scan.faces, place)[2]
     rule = f"a landmark must be within {MAX_OFF_SURFACE_MM:g} mm of the scan"
     faults = [
-        Fault(f"{where}[{name}]", rule, f"a distance of {d:.1f} mm", "set it again")
+        Fault(f"{file}[{name}]", rule, f"a distance of {d:.1f} mm", "set it again")
         for name, d in zip(points, distance, strict=True)
         if d > MAX_OFF_SURFACE_MM
-    ] + _outside(where, points, crop)
+    ] + _outside(file, points, crop)
     faults = (
         faults
-        or discarded_piece_faults(where, points, task.surface)
-        or coincidence_faults(where, points)
+        or discarded_piece_faults(file, points, task.surface)
+        or coincidence_faults(file, points)
     )
     return (
         faults
-        or [*face_faults(where, points), *order_faults(where, points)]
-        or swapped_faults(where, points, task.surface)
+        or [*face_faults(file, points), *order_faults(file, points)]
+        or swapped_faults(file, points, task.surface)
     )
 
 
-def _outside(where: str, points: Points, crop: Crop | None) -> list[Fault]:
+def _outside(file: str, points: Points, crop: Crop | None) -> list[Fault]:
     if crop is None or crop.low is None or crop.high is None:
         return []
     out = [
@@ -208,7 +208,7 @@ def _outside(where: str, points: Points, crop: Crop | None) -> list[Fault]:
     ]
     rule = "a landmark must be inside the crop box"
     cure = "enlarge the box, or move the point"
-    return [Fault(f"{where}[{name}]", rule, "a point outside", cure) for name in out]
+    return [Fault(f"{file}[{name}]", rule, "a point outside", cure) for name in out]
 
 
 def open_questions(task: LandmarkTask, points: Points, *, seen: str) -> list[str]:

@@ -219,7 +219,7 @@ class EmulatedDome(Emulated):
             }
         if verb in ("CLEAR", "STEP", "ARM") and self.state == "running":
             raise RefusedError("a sequence is running")
-        known = {
+        actions = {
             "CLEAR": self._clear,
             "STEP": self._add,
             "PLAN": self._plan,
@@ -230,9 +230,9 @@ class EmulatedDome(Emulated):
             "STOP": lambda _: self._halt("stop"),
             "REPORT": self._report,
         }
-        if verb not in known:
+        if verb not in actions:
             raise RefusedError(f"unknown verb {verb}")
-        return known[verb](values)
+        return actions[verb](values)
 
     def act(self) -> bytes:
         """Switch lights and trigger cameras according to the plan; the watchdog

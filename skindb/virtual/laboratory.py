@@ -153,7 +153,9 @@ class Laboratory:
                 self._required("frames", camera, exposure, next(iter(factors))), target
             )
             return
-        record = next(one for one in self._record["cameras"] if one["id"] == camera)
+        record = next(
+            entry for entry in self._record["cameras"] if entry["id"] == camera
+        )
         black = float(record.get("black_level", 0.0))
         white = float(record.get("white_level", 2 ** record.get("bit_depth", 16) - 1))
         value = (
@@ -175,9 +177,11 @@ class Laboratory:
 
     def _brightest_light(self, camera: str) -> str:
         """The light that looks brightest in a camera; it is one of those nearest to it."""
-        record = next(one for one in self._record["cameras"] if one["id"] == camera)
+        record = next(
+            entry for entry in self._record["cameras"] if entry["id"] == camera
+        )
         exposure = min(
-            self._record["exposures"], key=lambda one: float(one["seconds"])
+            self._record["exposures"], key=lambda entry: float(entry["seconds"])
         )["id"]
         centre = -np.array(record["R"]).T @ np.array(record["t"])
         places = np.array(
@@ -221,13 +225,13 @@ class Laboratory:
         record = json.loads(
             (self.subject / "contact/probe.json").read_text(encoding="utf-8")
         )
-        own = record.get("placements", {}).get(self.site) or [""]
+        placements = record.get("placements", {}).get(self.site) or [""]
         name = (
             record["frames"]
             .replace("{site}", self.site)
             .replace("{exposure}", exposure)
         )
-        name = name.replace("{placement}", str(own[0]))
+        name = name.replace("{placement}", str(placements[0]))
         shutil.copyfile(
             self.subject / name, self.watched / "probe" / f"IMG_{number:05d}.png"
         )

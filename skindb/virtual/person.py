@@ -47,14 +47,14 @@ class Person:
     head_file: Path | None = None  # a head model file instead of the parametric face
 
     def __post_init__(self) -> None:
-        for value, allowed, what in (
+        for value, allowed, name in (
             (self.gender, ("female", "male"), "gender"),
             (self.ancestry, ANCESTRIES, "ancestry"),
             (self.condition, CONDITIONS, "condition"),
         ):
             if value not in allowed:
                 raise ValueError(
-                    f"{what} must be one of {', '.join(allowed)}; found {value!r}"
+                    f"{name} must be one of {', '.join(allowed)}; found {value!r}"
                 )
 
     @property

@@ -34,7 +34,7 @@ def _planted(takes=12, seed=3):
 
 def test_principal_components__find_planted_patterns_and_rebuild_the_takes():
     values = _planted()
-    found = principal_components(values.chunk(take=1), most=2)
+    found = principal_components(values.chunk(take=1), max_components=2)
     assert found["explained_variance_ratio"].sum() > 0.99999
     rebuilt = found["mean"] + (found["score"] * found["axis"]).sum("component")
     # ten times the noise
@@ -52,7 +52,7 @@ def test_principal_components__use_what_every_take_has():
     values[0, 0] = np.nan  # a take that lacks a fifth of the map
     values[5] = np.nan
     values[5, 0, 0] = 1.0  # a take with hardly any measured texels
-    found = principal_components(values, most=3)
+    found = principal_components(values, max_components=3)
     assert found.attrs["skipped"] == [
         {"take": "T5", "reason": "only 5% of its entries are known"}
     ]
@@ -94,7 +94,7 @@ def test_face_components__of_a_cohort_with_table_and_plot(tmp_path):
         .to_dataset()
         .assign_attrs(skipped=["X: no consent"])
     )
-    found = face_components(cohort, most=2)
+    found = face_components(cohort, max_components=2)
     rebuilt = found["principal_mean"].values + np.einsum(
         "tc,cvuk->tvuk", found["principal_score"].values, found["principal_axis"].values
     )

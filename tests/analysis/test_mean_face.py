@@ -100,7 +100,7 @@ def test_mean_face__texels_of_few_are_nan(cohort):
     )
     assert np.isnan(found["face_diffuse_reflectance"].values[[1, 7]]).all()
     assert np.isfinite(
-        mean_face(cohort, least=2)["face_diffuse_reflectance"].values[1]
+        mean_face(cohort, min_subjects=2)["face_diffuse_reflectance"].values[1]
     ).all()
     assert found.attrs["subjects"] == 4
     assert found.attrs["takes"] == ["T0", "T1", "T2", "T3", "T4"]
