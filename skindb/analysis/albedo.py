@@ -27,7 +27,7 @@ from skindb.analysis.summary import SAMPLED
 from skindb.errors import Fault, InputError
 from skindb.numerics.statistics import Moments
 from skindb.parameters import group_option
-from skindb.schema import dataset
+from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_same_fit
 from skindb.schema.label import FACE
 from skindb.types import Array, Mask
@@ -36,10 +36,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 COLOUR_VARIABLES = (
-    "diffuse_reflectance",
-    "surfel_area",
-    "region_mask",
-    "surfel_index",
+    variables.DIFFUSE_REFLECTANCE,
+    variables.SURFEL_AREA,
+    variables.REGION_MASK,
+    variables.SURFEL_INDEX,
     "take",
     "region",
 )
@@ -125,11 +125,11 @@ def albedo_histograms(
                 by_landmarks.setdefault(region, []).append(takes[t])
     return dataset(
         {
-            "colour_mean": mean,
-            "colour_axis": axes,
-            "histogram_edge": edges,
-            "albedo_histogram": counted,
-            "albedo_mean": means,
+            variables.COLOUR_MEAN: mean,
+            variables.COLOUR_AXIS: axes,
+            variables.HISTOGRAM_EDGE: edges,
+            variables.ALBEDO_HISTOGRAM: counted,
+            variables.ALBEDO_MEAN: means,
         },
         coords={"take": takes, "region": list(regions), "channel": ["R", "G", "B"]},
         attrs={
@@ -143,8 +143,8 @@ def _colours(take: xr.Dataset, drawn: xr.Dataset | None) -> Colours:
     """Sampled surfels of one take of a cohort, with the regions of its capture or those
     defined by landmarks.
     """
-    good = np.isfinite(take["diffuse_reflectance"].values).all(axis=-1) & (
-        take["surfel_area"].values > 0
+    good = np.isfinite(take[variables.DIFFUSE_REFLECTANCE].values).all(axis=-1) & (
+        take[variables.SURFEL_AREA].values > 0
     )
     if not good.any():
         name_of_take = str(take["take"].values)
@@ -163,8 +163,8 @@ def _colours(take: xr.Dataset, drawn: xr.Dataset | None) -> Colours:
     if drawn is not None and name in drawn["take"].values:
         registered = drawn.sel(take=name)
         same = np.array_equal(
-            registered["surfel_index"].values[: len(good)][good],
-            take["surfel_index"].values[good],
+            registered[variables.SURFEL_INDEX].values[: len(good)][good],
+            take[variables.SURFEL_INDEX].values[good],
         )
         if not same:
             rule = "regions by landmarks must belong to the sampled surfels"
@@ -172,10 +172,10 @@ def _colours(take: xr.Dataset, drawn: xr.Dataset | None) -> Colours:
             raise InputError(Fault(str(name), rule, "a different sample", cure))
         by_landmark = _masks(registered, good)
     by_landmarks = frozenset(region for region in by_landmark if region not in stored)
-    colour = take["diffuse_reflectance"].values[good].astype(np.float64)
+    colour = take[variables.DIFFUSE_REFLECTANCE].values[good].astype(np.float64)
     return Colours(
         colour,
-        take["surfel_area"].values[good].astype(np.float64),
+        take[variables.SURFEL_AREA].values[good].astype(np.float64),
         by_landmark | stored,
         by_landmarks,
     )
@@ -183,10 +183,13 @@ def _colours(take: xr.Dataset, drawn: xr.Dataset | None) -> Colours:
 
 def _masks(take: xr.Dataset, good: Mask) -> dict[str, Mask]:
     """Masks of the sampled surfels by region, for the regions that contain any."""
-    if "region_mask" not in take:
+    if variables.REGION_MASK not in take:
         return {}
     mask = (
-        take["region_mask"].transpose("surfel", "region").values[: len(good)][good] > 0
+        take[variables.REGION_MASK]
+        .transpose("surfel", "region")
+        .values[: len(good)][good]
+        > 0
     )
     return {
         str(name): mask[:, i]
@@ -256,13 +259,14 @@ def albedo_table(
         for name in names
     ]
     stacked = Moments.stacked(
-        Moments.of(albedo["albedo_mean"].sel(take=group).values) for group in members
+        Moments.of(albedo[variables.ALBEDO_MEAN].sel(take=group).values)
+        for group in members
     )
     low, high = stacked.mean_interval()
     is_known = stacked.count > 0
     limits = np.array([max(even[take] for take in group) for group in members])
     histograms = [
-        Moments.of(albedo["albedo_histogram"].sel(take=group).values)
+        Moments.of(albedo[variables.ALBEDO_HISTOGRAM].sel(take=group).values)
         for group in members
     ]
     mean_histograms = np.stack(
@@ -270,14 +274,14 @@ def albedo_table(
     )
     return dataset(
         {
-            "group_albedo_count": stacked.count,
-            "group_albedo_mean": np.where(is_known, stacked.mean, np.nan),
-            "group_albedo_mean_low": low,
-            "group_albedo_mean_high": high,
-            "group_albedo_level_low": _level_low(stacked.mean, low, limits),
-            "group_even_reflection_limit": limits,
-            "group_albedo_standard_deviation": stacked.standard_deviation,
-            "group_histogram": mean_histograms,
+            variables.GROUP_ALBEDO_COUNT: stacked.count,
+            variables.GROUP_ALBEDO_MEAN: np.where(is_known, stacked.mean, np.nan),
+            variables.GROUP_ALBEDO_MEAN_LOW: low,
+            variables.GROUP_ALBEDO_MEAN_HIGH: high,
+            variables.GROUP_ALBEDO_LEVEL_LOW: _level_low(stacked.mean, low, limits),
+            variables.GROUP_EVEN_REFLECTION_LIMIT: limits,
+            variables.GROUP_ALBEDO_STANDARD_DEVIATION: stacked.standard_deviation,
+            variables.GROUP_HISTOGRAM: mean_histograms,
         },
         coords={
             "group": names,
@@ -365,13 +369,13 @@ def plot_albedo(
     `table` (from `albedo_table`).
     """
     ax = ax or plots.new_axes(6, 3.6)
-    edges = histograms["histogram_edge"].isel(axis=axis).values
+    edges = histograms[variables.HISTOGRAM_EDGE].isel(axis=axis).values
     # bins that are joined for the plot; the full number is needed only for matching
     width = 8
     centres = edges[:-1].reshape(-1, width).mean(axis=1)
     if table is not None and table.attrs["group_by"]:
         counts = (
-            table["group_albedo_count"]
+            table[variables.GROUP_ALBEDO_COUNT]
             .sel(region=region)
             .max("channel")
             .values.tolist()
@@ -380,10 +384,17 @@ def plot_albedo(
             f"{name} (n = {n})"
             for name, n in zip(table["group"].values.tolist(), counts, strict=True)
         ]
-        lines = table["group_histogram"].sel(region=region).isel(axis=axis).values
+        lines = (
+            table[variables.GROUP_HISTOGRAM].sel(region=region).isel(axis=axis).values
+        )
     else:
         names = [str(take) for take in histograms["take"].values]
-        lines = histograms["albedo_histogram"].sel(region=region).isel(axis=axis).values
+        lines = (
+            histograms[variables.ALBEDO_HISTOGRAM]
+            .sel(region=region)
+            .isel(axis=axis)
+            .values
+        )
     ax.set_prop_cycle(color=plots.CYCLE)
     for i, (name, fractions) in enumerate(zip(names, lines, strict=True)):
         style: dict[str, Any] = (
@@ -412,7 +423,9 @@ def tabulate_albedo(table: xr.Dataset, histograms: xr.Dataset) -> Table:
     they are not grouped.
     """
     if not table.attrs["group_by"]:
-        return table_of(histograms, ["albedo_mean"], ("take", "region", "channel"))
+        return table_of(
+            histograms, [variables.ALBEDO_MEAN], ("take", "region", "channel")
+        )
     columns = ("count", "mean", "mean_low", "mean_high", "standard_deviation")
     names = [f"group_albedo_{column}" for column in columns]
     return table_of(table, names, ("group", "region", "channel"))
@@ -436,7 +449,7 @@ def albedo_and_texture(population: Population) -> Results:
         "surfels",
         kind="registration",
         surfels=SAMPLED,
-        variables=["region_mask", "surfel_index"],
+        variables=[variables.REGION_MASK, variables.SURFEL_INDEX],
     )
     maps = population.open_cohort("maps", size=texture.SIZE, variables=texture.MAPPED)
     distributions = texture.texture_statistics(

@@ -29,7 +29,7 @@ from skindb.parameters import DICTIONARY_HELP, option, seed_option
 from skindb.reflectance.mixture import basis_rows
 from skindb.reflectance.reduction import Systems, factor_reflectance, residuals
 from skindb.reflectance.tables import TableGrid
-from skindb.schema import dataset
+from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_same_fit
 
 if TYPE_CHECKING:
@@ -37,12 +37,12 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.floating[Any]]
 BASIS_SIZE_VARIABLES = (
-    "surfel_position",
-    "shading_normal",
-    "diffuse_reflectance",
-    "reflectance_sample",
-    "light_position",
-    "camera_position",
+    variables.SURFEL_POSITION,
+    variables.SHADING_NORMAL,
+    variables.DIFFUSE_REFLECTANCE,
+    variables.REFLECTANCE_SAMPLE,
+    variables.LIGHT_POSITION,
+    variables.CAMERA_POSITION,
 )
 NEEDED = (*BASIS_SIZE_VARIABLES, "fit_eta")
 DEFAULT_ETA = 1.3  # refractive index of models without parameters of the fit
@@ -127,20 +127,20 @@ def basis_size_curve(
     error, low, high, (fewest, upper) = choose_size(
         errors, ks, tolerance=tolerance, rng=rng
     )
-    variables = {
-        "relative_error": error,
-        "relative_error_low": low,
-        "relative_error_high": high,
-        "smallest_size": fewest,
-        "sufficient_size": upper,
-        "plateau_tolerance": tolerance,
-        "dictionary_error": float(
+    values = {
+        variables.RELATIVE_ERROR: error,
+        variables.RELATIVE_ERROR_LOW: low,
+        variables.RELATIVE_ERROR_HIGH: high,
+        variables.SMALLEST_SIZE: fewest,
+        variables.SUFFICIENT_SIZE: upper,
+        variables.PLATEAU_TOLERANCE: tolerance,
+        variables.DICTIONARY_ERROR: float(
             np.sqrt(errors[:, 0, -1].sum() / errors[:, 2, -1].sum())
         ),
     }
     attrs = {"size_status": size_status(fewest, upper), "surfels": len(errors)}
     attrs["skipped"] = skipped_takes(cohort)
-    return dataset(variables, coords={"k": ks}, attrs=attrs)
+    return dataset(values, coords={"k": ks}, attrs=attrs)
 
 
 def surfel_errors(systems: Systems, bases: Sequence[Array]) -> Array:
@@ -267,12 +267,12 @@ def _digits_to_differ(values: Array, *, min_digits: int = 2) -> int:
 def describe_basis_size(curve: xr.Dataset) -> str:
     """Number of bases that are needed by `choose_size`, and the reason, in one or two sentences."""
     ks = curve["k"].values
-    tolerance = f"{100 * float(curve['plateau_tolerance']):.3g} %"
-    fewest = int(curve["smallest_size"])
-    sufficient = int(curve["sufficient_size"])
+    tolerance = f"{100 * float(curve[variables.PLATEAU_TOLERANCE]):.3g} %"
+    fewest = int(curve[variables.SMALLEST_SIZE])
+    sufficient = int(curve[variables.SUFFICIENT_SIZE])
     largest = int(ks[-1])
-    final_error = float(curve["relative_error"][-1])
-    if not sufficient and final_error > 1 + float(curve["plateau_tolerance"]):
+    final_error = float(curve[variables.RELATIVE_ERROR][-1])
+    if not sufficient and final_error > 1 + float(curve[variables.PLATEAU_TOLERANCE]):
         return (
             f"At least {fewest} bases: with {largest}, the largest size tried, the error is still "
             f"{100 * (final_error - 1):.3g} % above that with the whole dictionary. "
@@ -311,7 +311,7 @@ def _take_errors(take: xr.Dataset, tables: Array, bases: Sequence[Array]) -> Arr
 
 def _systems(take: xr.Dataset, tables: Array, part: slice) -> Systems:
     """Normal equations of the selected surfels of one take."""
-    is_fitted = np.isfinite(take["diffuse_reflectance"].values).all(axis=1)
+    is_fitted = np.isfinite(take[variables.DIFFUSE_REFLECTANCE].values).all(axis=1)
     surfels = take.isel(surfel=np.flatnonzero(is_fitted)[part])
     eta = float(take["fit_eta"]) if "fit_eta" in take else np.nan
     # for models that do not state the parameters of their fit
@@ -320,7 +320,7 @@ def _systems(take: xr.Dataset, tables: Array, part: slice) -> Systems:
     for start in range(0, max(surfels.sizes["surfel"], 1), BLOCK):
         block = surfels.isel(surfel=slice(start, start + BLOCK))
         (rows, offsets), target = _surface_rows(
-            block["reflectance_sample"].values, block, block, tables, eta
+            block[variables.REFLECTANCE_SAMPLE].values, block, block, tables, eta
         )
         parts.append(Systems.of(rows, offsets, target))
     return Systems.joined(parts)
@@ -338,10 +338,10 @@ def _surface_rows(
     """
     position, normal = (
         fitted[n].values.astype(np.float64)
-        for n in ("surfel_position", "shading_normal")
+        for n in (variables.SURFEL_POSITION, variables.SHADING_NORMAL)
     )
-    to_light = _directions(dome["light_position"].values, position)
-    to_camera = _directions(dome["camera_position"].values, position)
+    to_light = _directions(dome[variables.LIGHT_POSITION].values, position)
+    to_camera = _directions(dome[variables.CAMERA_POSITION].values, position)
     values = samples.astype(np.float64)
     rows, offsets, index = basis_rows(
         tables,
@@ -361,7 +361,7 @@ def _surface_rows(
         / np.pi
     )
     diffuse = (
-        fitted["diffuse_reflectance"].values.astype(np.float64)[surfel]
+        fitted[variables.DIFFUSE_REFLECTANCE].values.astype(np.float64)[surfel]
         * passed[:, None]
     )
     return (rows, offsets), values[surfel, index[:, 0], index[:, 1]] - diffuse
@@ -379,14 +379,14 @@ def plot_basis_size(curve: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     k = curve["k"].values
     ax.fill_between(
         k,
-        curve["relative_error_low"],
-        curve["relative_error_high"],
+        curve[variables.RELATIVE_ERROR_LOW],
+        curve[variables.RELATIVE_ERROR_HIGH],
         alpha=0.25,
         label="95 % interval",
     )
-    ax.plot(k, curve["relative_error"], "o-", label="error")
-    fewest = int(curve["smallest_size"])
-    sufficient = int(curve["sufficient_size"])
+    ax.plot(k, curve[variables.RELATIVE_ERROR], "o-", label="error")
+    fewest = int(curve[variables.SMALLEST_SIZE])
+    sufficient = int(curve[variables.SUFFICIENT_SIZE])
     if sufficient:
         chosen = (
             str(sufficient) if fewest == sufficient else f"{fewest} to {sufficient}"
@@ -437,6 +437,6 @@ STUDY = Study(
     # the labels of the weights name the BRDFs of the fits
     cohort_options={
         "surfels": STUDY_SURFELS,
-        "variables": (*BASIS_SIZE_VARIABLES, "dictionary_weight"),
+        "variables": (*BASIS_SIZE_VARIABLES, variables.DICTIONARY_WEIGHT),
     },
 )

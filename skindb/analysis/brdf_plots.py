@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from skindb import plots
 from skindb.optics.angles import half_difference
 from skindb.reflectance.tables import lookup
+from skindb.schema import variables
 from skindb.types import Array
 
 if TYPE_CHECKING:
@@ -44,9 +45,13 @@ def plot_brdf_space(space: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     """
     ax = ax or plots.new_axes(5, 4.4)
     named = np.array(space.attrs["groups_of_takes"])
-    place = space["take_place"].values
+    place = space[variables.TAKE_PLACE].values
     for i, (group, count) in enumerate(
-        zip(space["group"].values, space["group_subject_count"].values, strict=True)
+        zip(
+            space["group"].values,
+            space[variables.GROUP_SUBJECT_COUNT].values,
+            strict=True,
+        )
     ):
         points = place[named == str(group)]
         takes = int((named == str(group)).sum())
@@ -60,11 +65,11 @@ def plot_brdf_space(space: xr.Dataset, *, ax: Axes | None = None) -> Axes:
             label=f"{group} ({subjects})",
         )
     horizontal, second = (
-        f"{fraction:.1%}" for fraction in space["explained_fraction"].values
+        f"{fraction:.1%}" for fraction in space[variables.EXPLAINED_FRACTION].values
     )
     ax.set_xlabel(f"axis 1, {horizontal} of the scatter [length of the mean BRDF]")
     ax.set_ylabel(
-        f"axis 2, {second}; relative error of the map {float(space['map_error']):.1%}"
+        f"axis 2, {second}; relative error of the map {float(space[variables.MAP_ERROR]):.1%}"
     )
     ax.set_aspect("equal", adjustable="datalim")
     ax.set_box_aspect(1)
@@ -106,7 +111,7 @@ def plot_group_spheres(space: xr.Dataset, *, ax: Axes | None = None) -> Axes:
             extent=(x - 0.5, x + 0.5, y - 0.5, y + 0.5),
             interpolation="antialiased",
         )
-        label = f"{name}\n(n = {int(space['group_subject_count'][i])})"
+        label = f"{name}\n(n = {int(space[variables.GROUP_SUBJECT_COUNT][i])})"
         ax.text(x, y - 0.53, label, ha="center", va="top", fontsize=8)
     ax.set_xlim(-0.6, step_x * (columns - 1) + 0.6)
     ax.set_ylim(-step_y * (rows - 1) - 0.9, 0.6)
@@ -139,7 +144,11 @@ def plot_group_lobes(space: xr.Dataset, *, ax: PolarAxes | None = None) -> Polar
     angle = np.radians(np.linspace(-MAX_EXITANCE, MAX_EXITANCE, 321))
     tables = _tables(space)
     groups = list(
-        zip(space["group"].values, space["group_subject_count"].values, strict=True)
+        zip(
+            space["group"].values,
+            space[variables.GROUP_SUBJECT_COUNT].values,
+            strict=True,
+        )
     )
     for incidence, line in zip(INCIDENCES, LINES, strict=True):
         for i, (group, count) in enumerate(groups):
@@ -246,7 +255,9 @@ def _tables(space: xr.Dataset) -> NDArray[np.float32]:
     repeats the first.
     """
     stored = (
-        space["group_brdf"].transpose("theta_h", "theta_d", "phi_d", "group").values
+        space[variables.GROUP_BRDF]
+        .transpose("theta_h", "theta_d", "phi_d", "group")
+        .values
     )
     return np.ascontiguousarray(stored[:, :, :-1])
 

@@ -46,7 +46,7 @@ from skindb.parameters import (
     seed_option,
 )
 from skindb.reflectance.tables import TableGrid, brdf_coords, brdf_metric, stored_brdf
-from skindb.schema import dataset
+from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_same_fit
 from skindb.threads import c_contiguous
 from skindb.types import Array
@@ -62,10 +62,10 @@ INDEPENDENT = 1e-5
 ONE_PAIR = "one pair"
 SIDES = ("first", "second")
 COLUMNS = (
-    "group_distance",
-    "group_distance_noise",
-    "group_distance_p",
-    "group_distance_p_adjusted",
+    variables.GROUP_DISTANCE,
+    variables.GROUP_DISTANCE_NOISE,
+    variables.GROUP_DISTANCE_P,
+    variables.GROUP_DISTANCE_P_ADJUSTED,
 )
 
 
@@ -151,7 +151,9 @@ def brdf_space(
     takes, named, flags = grouped_takes(cohort, group_by)
     coefficient = _coefficients(takes.take, basis)
     [(metric, brdf)] = each_item(
-        _metric_and_basis(basis["population_mixture"].values.astype(np.float64)),
+        _metric_and_basis(
+            basis[variables.POPULATION_MIXTURE].values.astype(np.float64)
+        ),
         [tables],
     )
     place = coefficient @ _metric_root(metric)
@@ -171,15 +173,15 @@ def brdf_space(
     labels = list(takes.take)
     return dataset(
         {
-            "group_subject_count": subjects.measured.sum(axis=0),
-            "group_coefficient": means,
-            "group_brdf": stored_brdf(averaged),
-            "take_distance": distance,
-            "take_place": mapped,
-            "explained_fraction": explained,
-            "map_error": error,
+            variables.GROUP_SUBJECT_COUNT: subjects.measured.sum(axis=0),
+            variables.GROUP_COEFFICIENT: means,
+            variables.GROUP_BRDF: stored_brdf(averaged),
+            variables.TAKE_DISTANCE: distance,
+            variables.TAKE_PLACE: mapped,
+            variables.EXPLAINED_FRACTION: explained,
+            variables.MAP_ERROR: error,
             **_distances(pairs, length),
-            "group_distance_p_adjusted": adjusted,
+            variables.GROUP_DISTANCE_P_ADJUSTED: adjusted,
         },
         coords={
             "group": list(subjects.groups),
@@ -268,7 +270,7 @@ def _coefficients(names: Sequence[str], basis: xr.Dataset) -> Array:
     """Coefficients (take, component) of the takes; raises `InputError` for missing ones
     and for a dependent basis.
     """
-    mixture = basis["population_mixture"].values.astype(np.float64)
+    mixture = basis[variables.POPULATION_MIXTURE].values.astype(np.float64)
     lengths = np.linalg.norm(mixture, axis=1, keepdims=True)
     values = np.linalg.svd(
         mixture / np.where(lengths > 0, lengths, 1.0), compute_uv=False
@@ -285,7 +287,7 @@ def _coefficients(names: Sequence[str], basis: xr.Dataset) -> Array:
             )
         )
     row_of = {str(take): i for i, take in enumerate(basis["take"].values)}
-    stored = basis["take_coefficient"].values.astype(np.float64)
+    stored = basis[variables.TAKE_COEFFICIENT].values.astype(np.float64)
     bad = [
         name
         for name in names
@@ -403,11 +405,12 @@ def _compared_pair(
 def _distances(pairs: Sequence[_Pair], length: float) -> dict[str, Array]:
     """Variables of the pairs; distances in units of `length`."""
     return {
-        "group_distance": np.array([pair.distance for pair in pairs]) / length,
-        "group_distance_noise": np.array([pair.noise for pair in pairs]) / length,
-        "group_distance_p": np.array([pair.p for pair in pairs]),
-        "pair_subject_count": np.array([pair.count for pair in pairs]),
-        "pair_permutations": np.array([pair.permutations for pair in pairs]),
+        variables.GROUP_DISTANCE: np.array([pair.distance for pair in pairs]) / length,
+        variables.GROUP_DISTANCE_NOISE: np.array([pair.noise for pair in pairs])
+        / length,
+        variables.GROUP_DISTANCE_P: np.array([pair.p for pair in pairs]),
+        variables.PAIR_SUBJECT_COUNT: np.array([pair.count for pair in pairs]),
+        variables.PAIR_PERMUTATIONS: np.array([pair.permutations for pair in pairs]),
     }
 
 
@@ -438,7 +441,7 @@ def _adjusted(
 
 def tabulate_brdf_space(space: xr.Dataset) -> tuple[list[str], list[list[Any]]]:
     """Header and rows of the table of `brdf_space`, one row per pair of groups."""
-    counts = space["pair_subject_count"].values.tolist()
+    counts = space[variables.PAIR_SUBJECT_COUNT].values.tolist()
     columns = [space[name].values.tolist() for name in COLUMNS]
     rows = [
         [str(pair), *counts[i], *(c[i] for c in columns)]
@@ -449,13 +452,13 @@ def tabulate_brdf_space(space: xr.Dataset) -> tuple[list[str], list[list[Any]]]:
 
 def describe_brdf_space(space: xr.Dataset) -> list[str]:
     """Results of a study of the space of BRDFs and its flags, one line each."""
-    p = space["group_distance_p_adjusted"].values
+    p = space[variables.GROUP_DISTANCE_P_ADJUSTED].values
     compared = int(np.isfinite(p).sum())
     differ = int((p < SIGNIFICANT).sum())
     how = space.attrs["adjusted_by"]
     how = how if how == ONE_PAIR else f"adjusted for all pairs: {how}"
     fractions = ", ".join(
-        f"{fraction:.0%}" for fraction in space["explained_fraction"].values
+        f"{fraction:.0%}" for fraction in space[variables.EXPLAINED_FRACTION].values
     )
     return [
         f"{differ} of {compared} pairs of groups differ (p < {SIGNIFICANT:g}; {how})",
@@ -463,7 +466,7 @@ def describe_brdf_space(space: xr.Dataset) -> list[str]:
         "group_distance_noise is the distance expected from the "
         "scatter of subjects alone",
         f"map of {space.sizes['take']} takes: its axes explain {fractions} of the scatter; "
-        f"the RMS error of its distances is {float(space['map_error']):.1%}",
+        f"the RMS error of its distances is {float(space[variables.MAP_ERROR]):.1%}",
         *space.attrs["flags"],
     ]
 

@@ -38,7 +38,7 @@ from skindb.analysis.texture import COVERED, DARKEST, LEAST_COVERED, MAPPED
 from skindb.errors import Fault, InputError
 from skindb.numerics.statistics import Moments, known_mean
 from skindb.parameters import group_option, seed_option
-from skindb.schema import dataset
+from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_same_fit
 from skindb.schema.label import FACE
 from skindb.schema.notes import note
@@ -50,11 +50,11 @@ if TYPE_CHECKING:
 CHROMOPHORES = ("melanin", "haemoglobin")
 CHANNELS = ("R", "G", "B")
 COLUMNS = (
-    "group_chromophore_count",
-    "group_chromophore_mean",
-    "group_chromophore_mean_low",
-    "group_chromophore_mean_high",
-    "group_chromophore_standard_deviation",
+    variables.GROUP_CHROMOPHORE_COUNT,
+    variables.GROUP_CHROMOPHORE_MEAN,
+    variables.GROUP_CHROMOPHORE_MEAN_LOW,
+    variables.GROUP_CHROMOPHORE_MEAN_HIGH,
+    variables.GROUP_CHROMOPHORE_STANDARD_DEVIATION,
 )
 # absorption in Gaussian bands (standard deviation 30 nm) at 600, 540 and 450 nm
 # relative to that at 540 nm: eumelanin (Sarna and Swartz 1988), haemoglobin with 75 %
@@ -179,12 +179,14 @@ def chromophore_axes(
         )
     return dataset(
         {
-            "chromophore_axis": axes,
-            "chromophore_offset": np.mean([sample.mean for sample in samples], axis=0),
-            "chromophore_table_axis": TABLE_AXES,
-            "chromophore_table_angle": _angle(axes, TABLE_AXES),
-            "chromophore_axis_spread": spread,
-            "density_variance": plane.variance,
+            variables.CHROMOPHORE_AXIS: axes,
+            variables.CHROMOPHORE_OFFSET: np.mean(
+                [sample.mean for sample in samples], axis=0
+            ),
+            variables.CHROMOPHORE_TABLE_AXIS: TABLE_AXES,
+            variables.CHROMOPHORE_TABLE_ANGLE: _angle(axes, TABLE_AXES),
+            variables.CHROMOPHORE_AXIS_SPREAD: spread,
+            variables.DENSITY_VARIANCE: plane.variance,
         },
         coords={"chromophore": list(CHROMOPHORES), "channel": list(CHANNELS)},
         attrs={
@@ -240,16 +242,18 @@ def chromophore_maps(maps: xr.Dataset, axes: xr.Dataset) -> xr.Dataset:
     """
     density, measured = _density(maps)
     amounts, residual = _unmixed(
-        density, axes["chromophore_axis"].values, axes["chromophore_offset"].values
+        density,
+        axes[variables.CHROMOPHORE_AXIS].values,
+        axes[variables.CHROMOPHORE_OFFSET].values,
     )
     return dataset(
         {
-            "texel_chromophore": np.where(measured[..., None], amounts, np.nan).astype(
-                np.float32
-            ),
-            "texel_chromophore_residual": np.where(measured, residual, np.nan).astype(
-                np.float32
-            ),
+            variables.TEXEL_CHROMOPHORE: np.where(
+                measured[..., None], amounts, np.nan
+            ).astype(np.float32),
+            variables.TEXEL_CHROMOPHORE_RESIDUAL: np.where(
+                measured, residual, np.nan
+            ).astype(np.float32),
         },
         coords={"chromophore": list(CHROMOPHORES)},
     )
@@ -280,18 +284,18 @@ def chromophore_statistics(
     """
     drawn = map_regions(landmarks or {}, cohort.sizes["v"])
     masks = np.stack(list(drawn.values()))
-    vectors = axes["chromophore_axis"].values
-    offset = axes["chromophore_offset"].values
+    vectors = axes[variables.CHROMOPHORE_AXIS].values
+    offset = axes[variables.CHROMOPHORE_OFFSET].values
     rows = each_take(_statistics, cohort, MAPPED, masks, vectors, offset)
     mean, deviation, residual, covered = (
         np.stack(column) for column in zip(*rows, strict=True)
     )
     return dataset(
         {
-            "take_chromophore": mean,
-            "take_chromophore_deviation": deviation,
-            "take_chromophore_residual": residual,
-            "take_chromophore_coverage": covered,
+            variables.TAKE_CHROMOPHORE: mean,
+            variables.TAKE_CHROMOPHORE_DEVIATION: deviation,
+            variables.TAKE_CHROMOPHORE_RESIDUAL: residual,
+            variables.TAKE_CHROMOPHORE_COVERAGE: covered,
         },
         coords={
             "take": [str(take) for take in cohort["take"].values],
@@ -327,7 +331,7 @@ def chromophore_table(
     groups = groups_by(people, group_by)
     names = sorted(set(groups))
     values = (
-        statistics["take_chromophore"]
+        statistics[variables.TAKE_CHROMOPHORE]
         .sel(take=[str(take) for take in takes["take"].values])
         .values
     )
@@ -350,11 +354,13 @@ def chromophore_table(
     )
     return dataset(
         {
-            "group_chromophore_count": stacked.count,
-            "group_chromophore_mean": np.where(stacked.count > 0, stacked.mean, np.nan),
-            "group_chromophore_mean_low": low,
-            "group_chromophore_mean_high": high,
-            "group_chromophore_standard_deviation": stacked.standard_deviation,
+            variables.GROUP_CHROMOPHORE_COUNT: stacked.count,
+            variables.GROUP_CHROMOPHORE_MEAN: np.where(
+                stacked.count > 0, stacked.mean, np.nan
+            ),
+            variables.GROUP_CHROMOPHORE_MEAN_LOW: low,
+            variables.GROUP_CHROMOPHORE_MEAN_HIGH: high,
+            variables.GROUP_CHROMOPHORE_STANDARD_DEVIATION: stacked.standard_deviation,
         },
         coords={
             "group": names,
@@ -371,10 +377,10 @@ def chromophore_table(
 
 def _density(maps: xr.Dataset) -> tuple[Array, Mask]:
     """-ln R_d (v, u, 3), 0 where nothing was measured, and the mask (v, u) of measured texels."""
-    albedo = maps["texel_diffuse_reflectance"].values.astype(np.float64)
-    measured = (maps["texel_coverage"].values > COVERED) & np.isfinite(albedo).all(
-        axis=-1
-    )
+    albedo = maps[variables.TEXEL_DIFFUSE_REFLECTANCE].values.astype(np.float64)
+    measured = (maps[variables.TEXEL_COVERAGE].values > COVERED) & np.isfinite(
+        albedo
+    ).all(axis=-1)
     return -np.log(
         np.maximum(np.where(measured[..., None], albedo, 1.0), DARKEST)
     ), measured
@@ -553,12 +559,14 @@ def describe_chromophores(axes: xr.Dataset) -> list[str]:
     lines = [f"axes: {axes.attrs['axes_origin']}"]
     for name in CHROMOPHORES:
         axis = axes.sel(chromophore=name)
-        vector = ", ".join(f"{value:.2f}" for value in axis["chromophore_axis"].values)
+        vector = ", ".join(
+            f"{value:.2f}" for value in axis[variables.CHROMOPHORE_AXIS].values
+        )
         lines.append(
             f"{name}: absorbs R, G, B as {vector}; "
-            f"{float(axis['chromophore_table_angle']):.0f} degrees from "
+            f"{float(axis[variables.CHROMOPHORE_TABLE_ANGLE]):.0f} degrees from "
             f"published absorption; independent components rotate by "
-            f"{float(axis['chromophore_axis_spread']):.1f} degrees "
+            f"{float(axis[variables.CHROMOPHORE_AXIS_SPREAD]):.1f} degrees "
             "between samples"
         )
     lines.append(
@@ -587,7 +595,7 @@ def plot_chromophores(
         mean, low, high = (
             part[f"group_chromophore_mean{end}"].values for end in ("", "_low", "_high")
         )
-        count = int(part["group_chromophore_count"].max())
+        count = int(part[variables.GROUP_CHROMOPHORE_COUNT].max())
         ax.errorbar(
             mean,
             np.arange(len(regions)) + 0.7 * ((i + 0.5) / len(lines) - 0.5),

@@ -27,7 +27,7 @@ from skindb.numerics.factorise import principal_axes
 from skindb.numerics.statistics import Moments, known_mean
 from skindb.parameters import option
 from skindb.render.image import tone_map
-from skindb.schema import dataset
+from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_same_fit
 from skindb.schema.notes import Note, note
 from skindb.types import Array, Mask
@@ -39,12 +39,12 @@ if TYPE_CHECKING:
 
 # the spread of fewer is unknown, and their mean would show the face of a single subject
 LEAST_SUBJECTS = 3
-COVERAGE = "texel_coverage"
+COVERAGE = variables.TEXEL_COVERAGE
 # map -> (name, whether it is averaged on the log scale)
 AVERAGED = {
-    "texel_diffuse_reflectance": ("face_diffuse_reflectance", True),
-    "texel_sigma_tr": ("face_sigma_tr", True),
-    "texel_surface_reflectance": ("face_surface_reflectance", False),
+    variables.TEXEL_DIFFUSE_REFLECTANCE: (variables.FACE_DIFFUSE_REFLECTANCE, True),
+    variables.TEXEL_SIGMA_TR: (variables.FACE_SIGMA_TR, True),
+    variables.TEXEL_SURFACE_REFLECTANCE: (variables.FACE_SURFACE_REFLECTANCE, False),
 }
 UNIT = {"units": "1", "long_name": "unit vector"}
 # minimum fraction of known entries of a take; an entry unknown in one take is dropped
@@ -99,26 +99,26 @@ def mean_face(
                 if name in sums
                 else Moments.of(values[None])
             )
-    variables: dict[str, Array] = {}
+    maps: dict[str, Array] = {}
     for name, moments in sums.items():
         short, is_log = AVERAGED[name]
         enough = moments.count >= max(min_subjects, 1)
         mean = np.exp(moments.mean) if is_log else moments.mean
         deviation = f"{short}_log_deviation" if is_log else f"{short}_deviation"
-        variables[short] = np.where(enough, mean, np.nan).astype(np.float32)
-        variables[deviation] = np.where(
-            enough, moments.standard_deviation, np.nan
-        ).astype(np.float32)
+        maps[short] = np.where(enough, mean, np.nan).astype(np.float32)
+        maps[deviation] = np.where(enough, moments.standard_deviation, np.nan).astype(
+            np.float32
+        )
         count = moments.count.min(axis=-1) if moments.count.ndim == 3 else moments.count
-        variables[f"{short}_count"] = count.astype(np.int32)
-    if not any(np.isfinite(variables[AVERAGED[name][0]]).any() for name in names):
+        maps[f"{short}_count"] = count.astype(np.int32)
+    if not any(np.isfinite(maps[AVERAGED[name][0]]).any() for name in names):
         rule = f"at least one texel must be measured in {min_subjects} subjects"
         cure = "fit or register more subjects"
         raise InputError(
             Fault("mean face", rule, f"none among {len(subjects.names)} subjects", cure)
         )
     return dataset(
-        variables,
+        maps,
         coords={"channel": ["R", "G", "B"]},
         attrs={
             "subjects": len(subjects.names),
@@ -152,7 +152,7 @@ def _subject_maps(takes: xr.Dataset, names: list[str]) -> dict[str, Array]:
 def plot_mean_face(face: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     """Plot the mean albedo in sRGB; texels with too few subjects are white."""
     ax = ax or plots.new_axes(4, 4)
-    linear = face["face_diffuse_reflectance"].values
+    linear = face[variables.FACE_DIFFUSE_REFLECTANCE].values
     clipped = np.clip(np.nan_to_num(linear, nan=1.0), 0.0, 1.0)
     encoded = np.where(
         clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055
@@ -321,15 +321,17 @@ def face_components(
     """
     if not mixed_fits:
         require_same_fit(cohort)
-    albedo = cohort["texel_diffuse_reflectance"]
+    albedo = cohort[variables.TEXEL_DIFFUSE_REFLECTANCE]
     components = principal_components(albedo, max_components=max_components)
     return dataset(
         {
-            "principal_mean": components["mean"].values,
-            "principal_axis": components["axis"].values,
-            "principal_score": components["score"].values,
-            "principal_variance_ratio": components["explained_variance_ratio"].values,
-            "principal_residual": components["residual"].values,
+            variables.PRINCIPAL_MEAN: components["mean"].values,
+            variables.PRINCIPAL_AXIS: components["axis"].values,
+            variables.PRINCIPAL_SCORE: components["score"].values,
+            variables.PRINCIPAL_VARIANCE_RATIO: components[
+                "explained_variance_ratio"
+            ].values,
+            variables.PRINCIPAL_RESIDUAL: components["residual"].values,
         },
         coords={
             "take": [str(take) for take in components["take"].values],
@@ -345,8 +347,8 @@ def face_components(
 def tabulate_components(table: xr.Dataset) -> tuple[list[str], list[list[Any]]]:
     """Header and one row per take with its scores and its residual."""
     names = [f"score_{i + 1}" for i in range(table.sizes["component"])]
-    scores = table["principal_score"].values
-    residuals = table["principal_residual"].values
+    scores = table[variables.PRINCIPAL_SCORE].values
+    residuals = table[variables.PRINCIPAL_RESIDUAL].values
     takes = table["take"].values.tolist()
     rows = [
         [take, *row, rest]
@@ -354,13 +356,13 @@ def tabulate_components(table: xr.Dataset) -> tuple[list[str], list[list[Any]]]:
             takes, scores.tolist(), residuals.tolist(), strict=True
         )
     ]
-    return ["take", *names, "principal_residual"], rows
+    return ["take", *names, variables.PRINCIPAL_RESIDUAL], rows
 
 
 def describe_components(table: xr.Dataset) -> list[str]:
     """Fractions of the variance that the components explain, and what counts, one line each."""
     ratios = ", ".join(
-        f"{ratio:.0%}" for ratio in table["principal_variance_ratio"].values
+        f"{ratio:.0%}" for ratio in table[variables.PRINCIPAL_VARIANCE_RATIO].values
     )
     fraction = f"{table.attrs['used_fraction']:.0%} of the texels, which all takes have"
     lines = [
@@ -378,22 +380,22 @@ def plot_components(table: xr.Dataset, *, max_components: int = 3) -> Figure:
     from matplotlib import pyplot
 
     count = min(max_components, table.sizes["component"])
-    mean = table["principal_mean"].values
-    deviation = table["principal_score"].values.std(axis=0, ddof=1)
+    mean = table[variables.PRINCIPAL_MEAN].values
+    deviation = table[variables.PRINCIPAL_SCORE].values.std(axis=0, ddof=1)
     gain = 0.9 / max(float(np.nanquantile(mean, 0.995)), 1e-6)
     figure: Figure
     figure, axes = pyplot.subplots(count, 3, figsize=(6, 2.2 * count), squeeze=False)
     for i, line in enumerate(axes):
         for ax, by in zip(line, (-1, 0, 1), strict=True):
             face = np.nan_to_num(
-                mean + by * deviation[i] * table["principal_axis"].values[i]
+                mean + by * deviation[i] * table[variables.PRINCIPAL_AXIS].values[i]
             )
             ax.imshow(tone_map(np.clip(face, 0, None), exposure=gain))
             ax.set(xticks=[], yticks=[])
             ax.set_title(
                 {-1: "mean - 1 sd", 0: "mean", 1: "mean + 1 sd"}[by], fontsize=8
             )
-        ratio = float(table["principal_variance_ratio"][i])
+        ratio = float(table[variables.PRINCIPAL_VARIANCE_RATIO][i])
         line[0].set_ylabel(f"axis {i + 1}\n{ratio:.0%} of the variance", fontsize=8)
     figure.suptitle(f"albedo of {table.sizes['take']} takes", fontsize=9)
     figure.tight_layout()

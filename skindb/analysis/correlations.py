@@ -24,7 +24,7 @@ from skindb.analysis.subjects import takes_to_compare
 from skindb.errors import Fault, InputError
 from skindb.numerics.statistics import benjamini_hochberg, known_mean
 from skindb.parameters import permutations_option, seed_option
-from skindb.schema import dataset
+from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_same_fit, require_takes
 from skindb.schema.label import FACE
 from skindb.types import Array
@@ -43,12 +43,12 @@ COMPONENTS = (
 )
 
 COLUMNS = (
-    "correlation_count",
-    "component_correlation",
-    "component_correlation_low",
-    "component_correlation_high",
-    "correlation_p",
-    "correlation_p_false_discovery",
+    variables.CORRELATION_COUNT,
+    variables.COMPONENT_CORRELATION,
+    variables.COMPONENT_CORRELATION_LOW,
+    variables.COMPONENT_CORRELATION_HIGH,
+    variables.CORRELATION_P,
+    variables.CORRELATION_P_FALSE_DISCOVERY,
 )
 
 
@@ -120,12 +120,12 @@ def component_correlations(
     )
     return dataset(
         {
-            "component_correlation": values_of_pairs,
-            "component_correlation_low": low,
-            "component_correlation_high": high,
-            "correlation_p": p,
-            "correlation_p_false_discovery": benjamini_hochberg(p),
-            "correlation_count": count,
+            variables.COMPONENT_CORRELATION: values_of_pairs,
+            variables.COMPONENT_CORRELATION_LOW: low,
+            variables.COMPONENT_CORRELATION_HIGH: high,
+            variables.CORRELATION_P: p,
+            variables.CORRELATION_P_FALSE_DISCOVERY: benjamini_hochberg(p),
+            variables.CORRELATION_COUNT: count,
         },
         coords={"pair": [f"{COMPONENTS[i]} with {COMPONENTS[j]}" for i, j in pairs]},
         attrs={
@@ -215,7 +215,7 @@ def _pearson(x: Array, y: Array, axis: int = -1) -> Array:
 
 def describe_correlations(table: xr.Dataset) -> list[str]:
     """Notes on the table, one line each."""
-    differ = int((table["correlation_p_false_discovery"] < 0.05).sum())
+    differ = int((table[variables.CORRELATION_P_FALSE_DISCOVERY] < 0.05).sum())
     line = f"{differ} of {table.sizes['pair']} pairs are correlated (false discovery rate 5 %)"
     return [f"{line} in the region {table.attrs['region']}", *table.attrs["flags"]]
 
@@ -225,25 +225,25 @@ def plot_correlations(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     names: list[Any] = table["pair"].values.tolist()
     ax = ax or plots.new_axes(6.5, 1.0 + 0.24 * len(names))
     ax.axvline(0, color="0.6", linewidth=1)
-    correlations = table["component_correlation"].values
+    correlations = table[variables.COMPONENT_CORRELATION].values
     place = np.arange(float(len(names)))[::-1]
     bars = np.stack(
         [
-            correlations - table["component_correlation_low"].values,
-            table["component_correlation_high"].values - correlations,
+            correlations - table[variables.COMPONENT_CORRELATION_LOW].values,
+            table[variables.COMPONENT_CORRELATION_HIGH].values - correlations,
         ]
     )
     bars = np.maximum(np.nan_to_num(bars), 0.0)
-    significant = table["correlation_p_false_discovery"].values < 0.05
+    significant = table[variables.CORRELATION_P_FALSE_DISCOVERY].values < 0.05
     plots.significance_bars(
         ax, correlations, place, bars, significant, colour=plots.CYCLE[0]
     )
     ax.set_yticks(place, names, fontsize=7)
     ax.set_xlim(-1, 1)
-    count = int(table["correlation_count"].max())
+    count = int(table[variables.CORRELATION_COUNT].max())
     interval = (
         ", 95 % CI"
-        if np.isfinite(table["component_correlation_low"].values).any()
+        if np.isfinite(table[variables.COMPONENT_CORRELATION_LOW].values).any()
         else ""
     )
     ax.set_xlabel(

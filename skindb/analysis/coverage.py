@@ -25,7 +25,7 @@ from skindb.analysis.subjects import (
     subjects_of,
 )
 from skindb.errors import Fault, InputError
-from skindb.schema import IDENTIFIED, dataset
+from skindb.schema import IDENTIFIED, dataset, variables
 from skindb.schema.cohort import require_takes
 from skindb.types import Array
 
@@ -106,9 +106,9 @@ def coverage_report(cohort: xr.Dataset) -> xr.Dataset:
     }
     return dataset(
         {
-            "coverage_count": np.array(list(counts.values()), np.int32),
-            "coverage_association": between,
-            "coverage_unknown": np.array(
+            variables.COVERAGE_COUNT: np.array(list(counts.values()), np.int32),
+            variables.COVERAGE_ASSOCIATION: between,
+            variables.COVERAGE_UNKNOWN: np.array(
                 [stated[name].values.count(None) for name in names], np.int32
             ),
         },
@@ -152,9 +152,12 @@ def _factors(
         )
         for rows_of_subject in rows
     ]
-    if "site_status" in cohort:
+    if variables.SITE_STATUS in cohort:
         good = (
-            cohort["site_status"].isin(IDENTIFIED).transpose("take", "site", ...).values
+            cohort[variables.SITE_STATUS]
+            .isin(IDENTIFIED)
+            .transpose("take", "site", ...)
+            .values
         )
         measured = np.any(good.reshape(*good.shape[:2], -1), axis=-1)
         measured = np.asarray(measured & takes.is_normal[:, None])
@@ -373,7 +376,7 @@ def plot_coverage(report: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     cells = {
         tuple(str(name).split(AND)): int(count)
         for name, count in zip(
-            report["cell"].values, report["coverage_count"].values, strict=True
+            report["cell"].values, report[variables.COVERAGE_COUNT].values, strict=True
         )
     }
     rows, columns, counts = _plot_table(cells)
@@ -468,7 +471,7 @@ STUDY = Study(
     parameters=Parameters,
     compute=compute,
     shown=("coverage",),
-    tabulate=lambda report: table_of(report, ["coverage_count"], ["cell"]),
+    tabulate=lambda report: table_of(report, [variables.COVERAGE_COUNT], ["cell"]),
     plot=plot_coverage,
     describe=describe_coverage,
 )

@@ -16,6 +16,7 @@ from skindb.analysis.summary import common_maps
 from skindb.analysis.texture import SIZE, at_surfels, log_albedo
 from skindb.errors import Fault, InputError
 from skindb.numerics.texture import Image, build, level_fractions, reconstruct
+from skindb.schema import variables
 from skindb.schema.consent import honour_consent
 from skindb.schema.label import FACE, take_attrs
 from skindb.types import Array, Mask
@@ -72,7 +73,7 @@ def transfer_detail(
     for take in (model, source):
         honour_consent(take.attrs, "statistics")
     _require_same_landmarks(registered, source_registered)
-    per_texel = float(registered["mm_per_uv"]) / size
+    per_texel = float(registered[variables.MM_PER_UV]) / size
     levels = _transferred_levels(coarsest, per_texel, size)
     maps, source_maps = (
         common_maps(take, placed, size=size)
@@ -92,9 +93,10 @@ def transfer_detail(
         axis=-1,
     )
     fitted = model["fitted"].to_dataset().load()
-    colour = fitted["diffuse_reflectance"].values.astype(np.float64)
+    colour = fitted[variables.DIFFUSE_REFLECTANCE].values.astype(np.float64)
     moved = with_albedo(
-        fitted, colour * np.exp(at_surfels(change, registered["common_uv"].values))
+        fitted,
+        colour * np.exp(at_surfels(change, registered[variables.COMMON_UV].values)),
     )
     tree = model.copy()
     tree["fitted"] = xr.DataTree(surviving(moved))

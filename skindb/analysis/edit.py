@@ -18,7 +18,7 @@ from skindb.errors import Fault, InputError
 from skindb.numerics.texture import valid_quantiles
 from skindb.optics.diffusion import dipole_s
 from skindb.reflectance.tables import TableGrid, brdf_coords, brdf_metric, stored_brdf
-from skindb.schema import GROUPS, Use, check, dataset, label, names_of
+from skindb.schema import GROUPS, Use, check, dataset, label, names_of, variables
 from skindb.schema.consent import honour_consent
 from skindb.schema.label import FACE, take_attrs
 
@@ -33,7 +33,7 @@ SIGMA_TR_RANGE = (1e-2, 1e2)
 MAX_AMOUNT = 100.0
 PROBED = "probe"  # measurements of the unedited skin
 MIN_REPORTED = 1e-3  # fraction of a change above which an omission is reported
-TEXTURE_SHIFT = "trait_texture_shift"  # only where takes are registered
+TEXTURE_SHIFT = variables.TRAIT_TEXTURE_SHIFT  # only where takes are registered
 ONE_SUBJECT = "unknown: only one subject"
 NO_SUBJECT = "unknown: no subject was measured"
 
@@ -119,7 +119,7 @@ def apply_traits(
     reports: dict[str, Report] = {}
     moves = []
     if "brdf" in parts:
-        shift = amount @ traits["trait_brdf_shift"].values
+        shift = amount @ traits[variables.TRAIT_BRDF_SHIFT].values
         metric = brdf_metric(tables)
         fitted, reports["brdf"], move = _moved_surface(fitted, shift, basis, metric)
         tree["basis"] = xr.DataTree(_common_basis(model, basis, tables))
@@ -127,12 +127,12 @@ def apply_traits(
     if "albedo" in parts:
         mapped = None
         if texture is not None and maps is not None and registered is not None:
-            mapped = _MappedSkin(texture, maps, registered["common_uv"].values)
+            mapped = _MappedSkin(texture, maps, registered[variables.COMMON_UV].values)
         fitted, reports["albedo"], move = _moved_skin(
             fitted, amount, traits, albedo, mapped, rng
         )
         moves.append(move)
-    if "translucency" in parts and "sigma_tr" in fitted:
+    if "translucency" in parts and variables.SIGMA_TR in fitted:
         fitted, reports["translucency"], move = _moved_sigma_tr(fitted, amount, traits)
         moves.append(move)
         tree = _with_moved_sites(tree, amount, traits)
@@ -151,7 +151,7 @@ def _notes(traits: xr.Dataset, names: list[str]) -> list[str]:
     """A line for each trait: its number of takes, or the warning of the study about it."""
     flagged = {flag.partition(": ")[0]: flag for flag in traits.attrs.get("flags", [])}
     counts = {
-        str(t): traits["trait_count"].sel(trait=t).values.tolist()
+        str(t): traits[variables.TRAIT_COUNT].sel(trait=t).values.tolist()
         for t in traits["trait"].values
     }
     # for a numeric attribute, all takes are counted on one side
@@ -199,10 +199,10 @@ def _moved_surface(
     """Refit the surface to the basis of the population, and move its mean coefficients
     (component,) by the shift.
     """
-    weights = fitted["dictionary_weight"].values.astype(np.float64)
+    weights = fitted[variables.DICTIONARY_WEIGHT].values.astype(np.float64)
     good = np.isfinite(weights).all(axis=1)
-    area = fitted["surfel_area"].values[good].astype(np.float64)
-    H = basis["population_mixture"].values.astype(np.float64)
+    area = fitted[variables.SURFEL_AREA].values[good].astype(np.float64)
+    H = basis[variables.POPULATION_MIXTURE].values.astype(np.float64)
     here = project(weights[good], H, metric)
     moved = np.full((len(weights), len(H)), np.nan)
     mean = np.average(here, axis=0, weights=area)
@@ -215,14 +215,14 @@ def _moved_surface(
     takes = [str(t) for t in basis["take"].values]
     gram = H @ metric @ H.T
     distance, move = _distances(
-        target, mean, basis["take_coefficient"].values, takes, gram
+        target, mean, basis[variables.TAKE_COEFFICIENT].values, takes, gram
     )
     report = _report(shift, step, np.zeros(len(area), np.bool_), area, distance)
     report["clipped"] = float(_length(step - shift, gram)) / max(
         float(_length(shift, gram)), 1e-300
     )
     rest = fitted.drop_dims("component")  # the components of another basis differ
-    return rest.assign(basis_weight=label("basis_weight", moved)), report, move
+    return rest.assign(basis_weight=label(variables.BASIS_WEIGHT, moved)), report, move
 
 
 def with_basis(
@@ -245,16 +245,16 @@ def with_basis(
     """
     fitted = model["fitted"].to_dataset().load()
     tree = model.copy()
-    weights = fitted["dictionary_weight"].values.astype(np.float64)
+    weights = fitted[variables.DICTIONARY_WEIGHT].values.astype(np.float64)
     good = np.isfinite(weights).all(axis=1)
     coefficients = np.full((len(weights), len(mixture)), np.nan)
     coefficients[good] = project(
         weights[good], np.asarray(mixture, np.float64), brdf_metric(tables)
     )
     rest = fitted.drop_dims("component")  # the components of another basis differ
-    fitted = rest.assign(basis_weight=label("basis_weight", coefficients))
+    fitted = rest.assign(basis_weight=label(variables.BASIS_WEIGHT, coefficients))
     basis = xr.Dataset(
-        {"population_mixture": (("component", "dictionary"), mixture)},
+        {variables.POPULATION_MIXTURE: (("component", "dictionary"), mixture)},
         {"dictionary": list(names)},
     )
     tree["basis"] = xr.DataTree(_common_basis(model, basis, tables))
@@ -264,12 +264,16 @@ def with_basis(
 
 
 def _common_basis(model: xr.DataTree, basis: xr.Dataset, tables: Array) -> xr.Dataset:
-    H = basis["population_mixture"].values
+    H = basis[variables.POPULATION_MIXTURE].values
     brdf = stored_brdf(tables @ H.T.astype(np.float32))
     disc = model["basis/disc_angular_radius"].values
     source = model["basis"].attrs.get("dictionary")
     return dataset(
-        {"basis_mixture": H, "basis_brdf": brdf, "disc_angular_radius": disc},
+        {
+            variables.BASIS_MIXTURE: H,
+            variables.BASIS_BRDF: brdf,
+            variables.DISC_ANGULAR_RADIUS: disc,
+        },
         coords={
             "dictionary": basis["dictionary"].values,
             **brdf_coords(TableGrid(*tables.shape[:3])),
@@ -297,7 +301,7 @@ def _moved_skin(
 ) -> tuple[xr.Dataset, Report, float]:
     """Move the albedo: with a map at every scale, otherwise only its colours."""
     if mapped is None or TEXTURE_SHIFT not in traits:
-        shift = np.tensordot(amount, traits["trait_quantile_shift"].values, 1)
+        shift = np.tensordot(amount, traits[variables.TRAIT_QUANTILE_SHIFT].values, 1)
         return _moved_albedo(fitted, shift, albedo)
     is_used = amount != 0
     shifts = traits[TEXTURE_SHIFT].values[is_used].astype(np.float64)
@@ -318,7 +322,7 @@ def _moved_texture(
     """
     texture = mapped.texture
     edit = edit_texture(mapped.maps, shift, texture, rng=rng)
-    colour = fitted["diffuse_reflectance"].values.astype(np.float64)
+    colour = fitted[variables.DIFFUSE_REFLECTANCE].values.astype(np.float64)
     target = colour * np.exp(at_surfels(edit.change, mapped.uv))
     fitted, report, move = _with_albedo(fitted, target, albedo)
     report["distance"] = ONE_SUBJECT if edit.distance is None else edit.distance
@@ -331,22 +335,24 @@ def _moved_texture(
     region = [str(name) for name in texture["region"].values].index(FACE)
     step = (
         np.nan_to_num(shift[region, :, 0]).mean(axis=-1)
-        @ np.linalg.inv(texture["texture_colour_axis"].values).T
+        @ np.linalg.inv(texture[variables.TEXTURE_COLOUR_AXIS].values).T
     )
     good = np.isfinite(colour).all(axis=1)
-    mean = np.average(colour[good], axis=0, weights=fitted["surfel_area"].values[good])
+    mean = np.average(
+        colour[good], axis=0, weights=fitted[variables.SURFEL_AREA].values[good]
+    )
     report["requested"] = [float(v) for v in mean * np.expm1(step)]
     return fitted, report, move
 
 
 def with_albedo(fitted: xr.Dataset, albedo: Array) -> xr.Dataset:
     """A fitted surface with new albedos (n, 3), limited to physical values."""
-    colour = fitted["diffuse_reflectance"].values.astype(np.float64)
+    colour = fitted[variables.DIFFUSE_REFLECTANCE].values.astype(np.float64)
     out = np.where(albedo == colour, colour, np.clip(albedo, DARKEST, BRIGHTEST))
-    s, _ = dipole_s(out, eta=float(fitted["refractive_index"]))
+    s, _ = dipole_s(out, eta=float(fitted[variables.REFRACTIVE_INDEX]))
     return fitted.assign(
-        diffuse_reflectance=label("diffuse_reflectance", out),
-        dipole_s=label("dipole_s", s),
+        diffuse_reflectance=label(variables.DIFFUSE_REFLECTANCE, out),
+        dipole_s=label(variables.DIPOLE_S, s),
     )
 
 
@@ -356,15 +362,15 @@ def _with_albedo(
     """The fitted surface with new albedos (n, 3), the report of the change, and its distance."""
     moved = with_albedo(fitted, target)
     colour, out = (
-        version["diffuse_reflectance"].values.astype(np.float64)
+        version[variables.DIFFUSE_REFLECTANCE].values.astype(np.float64)
         for version in (fitted, moved)
     )
     good = np.isfinite(colour).all(axis=1)
-    area = fitted["surfel_area"].values[good].astype(np.float64)
+    area = fitted[variables.SURFEL_AREA].values[good].astype(np.float64)
     before, now = (np.average(x[good], axis=0, weights=area) for x in (colour, out))
     face = [str(r) for r in albedo["region"].values].index(FACE)
-    takes = albedo["albedo_mean"].values[:, face]
-    axes = albedo["colour_axis"].values
+    takes = albedo[variables.ALBEDO_MEAN].values[:, face]
+    axes = albedo[variables.COLOUR_AXIS].values
     # on the decorrelated axes, the unit is the standard deviation of skin in that direction
     distance, move = _distances(
         now, before, takes, [str(t) for t in albedo["take"].values], axes.T @ axes
@@ -380,12 +386,17 @@ def _moved_albedo(
     fitted: xr.Dataset, shift: Array, albedo: xr.Dataset
 ) -> tuple[xr.Dataset, Report, float]:
     """Shift the quantiles of albedo by the shift of the whole face."""
-    colour = fitted["diffuse_reflectance"].values.astype(np.float64)
+    colour = fitted[variables.DIFFUSE_REFLECTANCE].values.astype(np.float64)
     good = np.isfinite(colour).all(axis=1)
     mean, axes, edges = (
-        albedo[n].values for n in ("colour_mean", "colour_axis", "histogram_edge")
+        albedo[n].values
+        for n in (
+            variables.COLOUR_MEAN,
+            variables.COLOUR_AXIS,
+            variables.HISTOGRAM_EDGE,
+        )
     )
-    area = fitted["surfel_area"].values[good].astype(np.float64)
+    area = fitted[variables.SURFEL_AREA].values[good].astype(np.float64)
     values = decorrelate(colour[good], mean, axes)
     here = histogram(np.clip(values, edges[:, 0], edges[:, -1]), area, edges)
     face = [str(r) for r in albedo["region"].values].index(FACE)
@@ -415,12 +426,12 @@ def _moved_sigma_tr(
     names them.
     """
     log, is_measured = _log_shift(amount, traits)
-    before = np.log(fitted["sigma_tr"].values.astype(np.float64))
+    before = np.log(fitted[variables.SIGMA_TR].values.astype(np.float64))
     after = np.clip(before + log, *np.log(SIGMA_TR_RANGE))
     good = np.isfinite(before).all(axis=1)
-    area = fitted["surfel_area"].values[good].astype(np.float64)
+    area = fitted[variables.SURFEL_AREA].values[good].astype(np.float64)
     mean, now = (np.average(x[good], axis=0, weights=area) for x in (before, after))
-    population = traits["take_log_sigma_tr"]
+    population = traits[variables.TAKE_LOG_SIGMA_TR]
     measured = np.isfinite(population.values).all(axis=1)
     names = [str(t) for t in population["take"].values[measured]]
     distance, move = _distances(
@@ -436,7 +447,11 @@ def _moved_sigma_tr(
     report["unknown"] = [
         str(t) for t in traits["trait"].values[~is_measured & (amount != 0)]
     ]
-    return fitted.assign(sigma_tr=label("sigma_tr", np.exp(after))), report, move
+    return (
+        fitted.assign(sigma_tr=label(variables.SIGMA_TR, np.exp(after))),
+        report,
+        move,
+    )
 
 
 def surviving(ds: xr.Dataset) -> xr.Dataset:
@@ -463,17 +478,18 @@ def _moved_sites(sites: xr.Dataset, amount: Array, traits: xr.Dataset) -> xr.Dat
     """
     log, _ = _log_shift(amount, traits)
     moved = np.clip(
-        sites["site_sigma_tr"].values.astype(np.float64) * np.exp(log), *SIGMA_TR_RANGE
+        sites[variables.SITE_SIGMA_TR].values.astype(np.float64) * np.exp(log),
+        *SIGMA_TR_RANGE,
     )
     moved_sites = surviving(sites).drop_attrs(deep=False)
-    return moved_sites.assign(site_sigma_tr=label("site_sigma_tr", moved))
+    return moved_sites.assign(site_sigma_tr=label(variables.SITE_SIGMA_TR, moved))
 
 
 def _log_shift(amount: Array, traits: xr.Dataset) -> tuple[Array, NDArray[np.bool_]]:
     """Shift of log sigma_tr (channel,), and the mask (trait,) of the traits with a
     measured shift.
     """
-    shifts = traits["trait_log_sigma_tr_shift"].values
+    shifts = traits[variables.TRAIT_LOG_SIGMA_TR_SHIFT].values
     is_measured = np.isfinite(shifts).all(axis=1)
     return np.asarray(amount[is_measured] @ shifts[is_measured]), is_measured
 

@@ -32,7 +32,7 @@ from skindb.analysis.study import (
 from skindb.analysis.subjects import notes_on_attributes, subjects_of
 from skindb.errors import Fault, InputError
 from skindb.parameters import ContrastParameters, permutations_option
-from skindb.schema import dataset
+from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_same_fit, require_takes
 from skindb.types import Array
 
@@ -46,15 +46,15 @@ SIZE = 256
 # minimum fraction of the compared subjects that must have a value at a texel
 MIN_FRACTION = 0.8
 COVERED = 0.5  # minimum fraction of a texel that must be measured
+LOGARITHMIC = "sigma_tr"
 # variable of the maps -> name of the quantity; p values are adjusted for all texels and
 # channels of a variable
 MAPPED = {
-    "texel_diffuse_reflectance": "R_d",
-    "texel_surface_reflectance": SURFACE,
-    "texel_sigma_tr": "sigma_tr",
+    variables.TEXEL_DIFFUSE_REFLECTANCE: "R_d",
+    variables.TEXEL_SURFACE_REFLECTANCE: SURFACE,
+    variables.TEXEL_SIGMA_TR: LOGARITHMIC,
 }
 PERMUTATIONS = 1000  # of each of 65,536 texels
-LOGARITHMIC = "sigma_tr"
 SHOWN_FRACTION = 0.995  # fraction of the texels within the range of a colour scale
 SHOWN = ("R_d G", SURFACE, "sigma_tr G")
 
@@ -207,7 +207,9 @@ def _require_divisor(size: int, texels: int) -> None:
 def _texel_quantities(takes: xr.Dataset, *, variable: str, size: int) -> Quantities:
     """Values of a variable at every texel (and channel) of every take, as quantities."""
     values = np.stack(
-        each_take(_block_means, takes, [variable, "texel_coverage"], variable, size)
+        each_take(
+            _block_means, takes, [variable, variables.TEXEL_COVERAGE], variable, size
+        )
     )
     count = values.shape[1]
     return Quantities(
@@ -228,7 +230,7 @@ def _block_means(take: xr.Dataset, variable: str, size: int) -> Array:
     if variable.endswith(LOGARITHMIC):
         values = np.log(np.where(values > 0, values, np.nan))
     is_known = np.isfinite(values).all(axis=-1)
-    weight = np.where(is_known, take["texel_coverage"].values, 0.0)[..., None]
+    weight = np.where(is_known, take[variables.TEXEL_COVERAGE].values, 0.0)[..., None]
     block = len(values) // size
     shape = (size, block, size, block, -1)
     total = weight.reshape(shape).sum(axis=(1, 3))
@@ -257,15 +259,15 @@ def _texel_statistics(
         )
     test = contrast_test(contrast, values[:, able].astype(np.float64), max_draws, rng)
     statistics = {
-        "map_effect": test.effects.slope,
-        "map_effect_half_width": (test.effects.high - test.effects.low) / 2,
-        "map_effect_p": test.p,
-        "map_effect_p_adjusted": test.p_adjusted,
+        variables.MAP_EFFECT: test.effects.slope,
+        variables.MAP_EFFECT_HALF_WIDTH: (test.effects.high - test.effects.low) / 2,
+        variables.MAP_EFFECT_P: test.p,
+        variables.MAP_EFFECT_P_ADJUSTED: test.p_adjusted,
     }
     placed = {name: np.full(len(count), np.nan, np.float32) for name in statistics}
     for name, part in statistics.items():
         placed[name][able] = part
-    return placed | {"map_effect_count": count}, test.permutations
+    return placed | {variables.MAP_EFFECT_COUNT: count}, test.permutations
 
 
 def tabulate_effect_maps(maps: xr.Dataset) -> Table:
@@ -285,15 +287,17 @@ def tabulate_effect_maps(maps: xr.Dataset) -> Table:
     for contrast in maps["contrast"].values.tolist():
         for quantity in maps["quantity"].values.tolist():
             part = maps.sel(contrast=contrast, quantity=quantity)
-            effect = part["map_effect"].values
-            is_known = np.isfinite(part["map_effect_p"].values)
+            effect = part[variables.MAP_EFFECT].values
+            is_known = np.isfinite(part[variables.MAP_EFFECT_P].values)
             if not is_known.any():
                 rows.append([contrast, quantity, 0, 0, *[float("nan")] * 3])
                 continue
-            differ = part["map_effect_p_adjusted"].values[is_known] < SIGNIFICANT
+            differ = (
+                part[variables.MAP_EFFECT_P_ADJUSTED].values[is_known] < SIGNIFICANT
+            )
             largest = effect[is_known][np.abs(effect[is_known]).argmax()]
             numbers = (differ.mean(), effect[is_known].mean(), largest)
-            subjects = int(part["map_effect_count"].values[is_known].max())
+            subjects = int(part[variables.MAP_EFFECT_COUNT].values[is_known].max())
             texels = int(is_known.sum())
             rows.append([contrast, quantity, subjects, texels, *map(float, numbers)])
     return header, rows
@@ -334,7 +338,9 @@ def plot_effect_maps(maps: xr.Dataset, *, contrast: str | None = None) -> Figure
     figure, axes = pyplot.subplots(
         len(quantities), 3, figsize=(9, 2.9 * len(quantities)), squeeze=False
     )
-    rows, columns = _finite_extent(part["map_effect_p"].sel(quantity=quantities).values)
+    rows, columns = _finite_extent(
+        part[variables.MAP_EFFECT_P].sel(quantity=quantities).values
+    )
     for line, quantity in zip(axes, quantities, strict=True):
         _plot_quantity(line, part.sel(quantity=quantity).isel(v=rows, u=columns))
     adjusted = ", ".join(maps.attrs["adjust"])
@@ -349,15 +355,15 @@ def _plot_quantity(line: Sequence[Axes], maps: xr.Dataset) -> None:
     quantity = str(maps["quantity"].values)
     is_logarithm = quantity in maps.attrs["logarithmic"]
     unit = "change of the logarithm" if is_logarithm else "difference"
-    effect = maps["map_effect"].values
-    half_width = maps["map_effect_half_width"].values
-    is_known = np.isfinite(maps["map_effect_p"].values)
+    effect = maps[variables.MAP_EFFECT].values
+    half_width = maps[variables.MAP_EFFECT_HALF_WIDTH].values
+    is_known = np.isfinite(maps[variables.MAP_EFFECT_P].values)
     largest, widest = (
         float(np.quantile(values[is_known], SHOWN_FRACTION))
         for values in (np.abs(effect), half_width)
     )
     largest = max(largest, 1e-12)
-    count = np.where(is_known, maps["map_effect_count"].values, np.nan)
+    count = np.where(is_known, maps[variables.MAP_EFFECT_COUNT].values, np.nan)
     diverging = {"cmap": "RdBu_r", "vmin": -largest, "vmax": largest}
     from_zero = {"cmap": "cividis", "vmin": 0.0, "vmax": widest}
     images: list[tuple[Array, dict[str, Any], str, str]] = [
@@ -370,7 +376,7 @@ def _plot_quantity(line: Sequence[Axes], maps: xr.Dataset) -> None:
         ax.figure.colorbar(image, ax=ax, shrink=0.8, label=label)
         ax.set(title=title, xticks=[], yticks=[])
         ax.title.set_fontsize(8)
-    p = np.nan_to_num(maps["map_effect_p_adjusted"].values, nan=1.0)
+    p = np.nan_to_num(maps[variables.MAP_EFFECT_P_ADJUSTED].values, nan=1.0)
     differ = p < SIGNIFICANT
     if differ.any() and not differ.all():
         line[0].contour(differ, levels=[0.5], colors="black", linewidths=0.6)

@@ -43,7 +43,7 @@ from skindb.numerics.statistics import (
 from skindb.parameters import (
     ContrastParameters,
 )
-from skindb.schema import dataset
+from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_same_fit, require_takes
 from skindb.types import Array
 
@@ -54,16 +54,16 @@ SIGNIFICANT = 0.05  # of adjusted p values
 MAX_LISTED = 6  # detectable differences that are named in a line
 SIDES = ("with", "without")
 COLUMNS = (
-    "effect",
-    "effect_low",
-    "effect_high",
-    "effect_percent",
-    "effect_percent_low",
-    "effect_percent_high",
-    "effect_p",
-    "effect_p_adjusted",
-    "effect_p_false_discovery",
-    "effect_detectable",
+    variables.EFFECT,
+    variables.EFFECT_LOW,
+    variables.EFFECT_HIGH,
+    variables.EFFECT_PERCENT,
+    variables.EFFECT_PERCENT_LOW,
+    variables.EFFECT_PERCENT_HIGH,
+    variables.EFFECT_P,
+    variables.EFFECT_P_ADJUSTED,
+    variables.EFFECT_P_FALSE_DISCOVERY,
+    variables.EFFECT_DETECTABLE,
 )
 
 
@@ -131,18 +131,18 @@ def group_effects(
     compared, faults = compare_groups(cohort, group_by, adjust, quantities_of, test)
     if not compared:
         raise InputError(faults)
-    variables = [_statistics(comparison) for comparison in compared]
+    statistics = [_statistics(comparison) for comparison in compared]
     quantities = compared[0].contrast.quantities
     flags = [
         flag
-        for comparison, values in zip(compared, variables, strict=True)
+        for comparison, values in zip(compared, statistics, strict=True)
         for flag in _flags(comparison, values)
     ]
     flags += [f"{fault.where}: excluded, {fault.found}" for fault in faults]
     return dataset(
         {
-            name: np.stack([values[name] for values in variables])
-            for name in variables[0]
+            name: np.stack([values[name] for values in statistics])
+            for name in statistics[0]
         },
         coords={
             "contrast": [comparison.contrast.name for comparison in compared],
@@ -178,19 +178,19 @@ def _statistics(comparison: Comparison[ContrastTest]) -> dict[str, Array]:
     if _smallest_p(comparison) < SIGNIFICANT:
         detectable = detectable_difference(fit.error, fit.free)
     return {
-        "effect_count": contrast_counts(contrast),
-        "effect": fit.slope,
-        "effect_low": fit.low,
-        "effect_high": fit.high,
-        "effect_percent": percent,
-        "effect_percent_low": low,
-        "effect_percent_high": high,
-        "effect_standardised": standardised,
-        "effect_p": p,
-        "effect_p_adjusted": test.p_adjusted,
-        "effect_p_false_discovery": discovered,
-        "effect_detectable": detectable,
-        "attribute_association": np.array(list(comparison.associated.values())),
+        variables.EFFECT_COUNT: contrast_counts(contrast),
+        variables.EFFECT: fit.slope,
+        variables.EFFECT_LOW: fit.low,
+        variables.EFFECT_HIGH: fit.high,
+        variables.EFFECT_PERCENT: percent,
+        variables.EFFECT_PERCENT_LOW: low,
+        variables.EFFECT_PERCENT_HIGH: high,
+        variables.EFFECT_STANDARDISED: standardised,
+        variables.EFFECT_P: p,
+        variables.EFFECT_P_ADJUSTED: test.p_adjusted,
+        variables.EFFECT_P_FALSE_DISCOVERY: discovered,
+        variables.EFFECT_DETECTABLE: detectable,
+        variables.ATTRIBUTE_ASSOCIATION: np.array(list(comparison.associated.values())),
     }
 
 
@@ -250,11 +250,11 @@ def _percent(
 
 
 def _flags(
-    comparison: Comparison[ContrastTest], variables: dict[str, Array]
+    comparison: Comparison[ContrastTest], statistics: dict[str, Array]
 ) -> list[str]:
     """Warnings about a comparison and the significance that it can reach."""
     contrast = comparison.contrast
-    flags = comparison.flags + _surface_flag(contrast, variables)
+    flags = comparison.flags + _surface_flag(contrast, statistics)
     smallest = _smallest_p(comparison)
     if smallest >= SIGNIFICANT:
         flags.append(
@@ -264,11 +264,11 @@ def _flags(
     return flags
 
 
-def _surface_flag(contrast: Contrast, variables: dict[str, Array]) -> list[str]:
+def _surface_flag(contrast: Contrast, statistics: dict[str, Array]) -> list[str]:
     """Warning if surface reflectance differs, because its diffuse part is counted as albedo."""
     names = np.array(contrast.quantities.names)
-    differ = variables["effect_p_adjusted"] < SIGNIFICANT
-    small = differ & (np.abs(variables["effect"]) < contrast.quantities.common)
+    differ = statistics[variables.EFFECT_P_ADJUSTED] < SIGNIFICANT
+    small = differ & (np.abs(statistics[variables.EFFECT]) < contrast.quantities.common)
     if not (differ & np.char.startswith(names, SURFACE)).any() or not small.any():
         return []
     limit = float(contrast.quantities.common.max())
@@ -285,8 +285,8 @@ def describe_group_effects(table: xr.Dataset) -> list[str]:
     contrasts = zip(table["contrast"].values, *permutations, strict=True)
     for name, count, smallest_p in contrasts:
         part = table.sel(contrast=name)
-        compared = np.isfinite(part["effect_p"].values)
-        differ = part["effect_p_adjusted"].values < SIGNIFICANT
+        compared = np.isfinite(part[variables.EFFECT_P].values)
+        differ = part[variables.EFFECT_P_ADJUSTED].values < SIGNIFICANT
         lines.append(
             f"{name}: {differ.sum()} of {compared.sum()} quantities differ "
             + _test_summary(part, count, smallest_p)
@@ -306,7 +306,7 @@ def describe_group_effects(table: xr.Dataset) -> list[str]:
 def _test_summary(part: xr.Dataset, count: int, smallest_p: float) -> str:
     """Adjustment, permutations and subjects of a comparison."""
     held = ", ".join(part.attrs["adjust"])
-    subjects = int(part["effect_count"].sum("side").max())
+    subjects = int(part[variables.EFFECT_COUNT].sum("side").max())
     limit = ""
     if smallest_p > 1.5 / (count + 1):
         limit = f", the smallest possible p is {smallest_p:.2g}"
@@ -321,7 +321,9 @@ def _detectable_line(name: str, part: xr.Dataset) -> list[str]:
     detectable = [
         f"{quantity} {_amount(value, quantity in part.attrs['logarithmic'])}"
         for quantity, value in zip(
-            part["quantity"].values, part["effect_detectable"].values, strict=True
+            part["quantity"].values,
+            part[variables.EFFECT_DETECTABLE].values,
+            strict=True,
         )
         if np.isfinite(value)
     ]
@@ -350,12 +352,17 @@ def plot_group_effects(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
         part = table.sel(contrast=contrast)
         effect, low, high, standardised = (
             part[name].values
-            for name in ("effect", "effect_low", "effect_high", "effect_standardised")
+            for name in (
+                variables.EFFECT,
+                variables.EFFECT_LOW,
+                variables.EFFECT_HIGH,
+                variables.EFFECT_STANDARDISED,
+            )
         )
         scale = effect / standardised
         colour = plots.CYCLE[i % len(plots.CYCLE)]
         marker = "osD^v"[i % 5]
-        count = int(part["effect_count"].sum("side").max())
+        count = int(part[variables.EFFECT_COUNT].sum("side").max())
         label = f"{contrast} (n = {count})"
         ax.plot([], [], marker, color=colour, markersize=4, label=label)
         plots.significance_bars(
@@ -363,7 +370,7 @@ def plot_group_effects(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
             effect / scale,
             places + 0.6 * ((i + 0.5) / len(contrasts) - 0.5),
             np.abs(np.stack([effect - low, high - effect]) / scale),
-            part["effect_p_adjusted"].values < SIGNIFICANT,
+            part[variables.EFFECT_P_ADJUSTED].values < SIGNIFICANT,
             colour=colour,
             marker=marker,
         )
@@ -381,7 +388,7 @@ def plot_group_effects(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
 def tabulate_group_effects(table: xr.Dataset) -> Table:
     """Header and one row per comparison and quantity."""
     counts = {
-        f"subjects_{side}": table["effect_count"].sel(side=side, drop=True)
+        f"subjects_{side}": table[variables.EFFECT_COUNT].sel(side=side, drop=True)
         for side in SIDES
     }
     names = [*counts, *COLUMNS]
@@ -408,10 +415,10 @@ STUDY = Study(
     plot=plot_group_effects,
     describe=describe_group_effects,
     columns_of_files=(
-        "effect_percent_low",
-        "effect_percent_high",
-        "effect_p_false_discovery",
-        "effect_detectable",
+        variables.EFFECT_PERCENT_LOW,
+        variables.EFFECT_PERCENT_HIGH,
+        variables.EFFECT_P_FALSE_DISCOVERY,
+        variables.EFFECT_DETECTABLE,
     ),
     compares_normal=True,
 )

@@ -13,7 +13,7 @@ from skindb.errors import Fault, InputError
 from skindb.numerics.factorise import Sums, nmf, refine
 from skindb.numerics.nnls import solve_nnls
 from skindb.reflectance.tables import brdf_metric
-from skindb.schema import dataset
+from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_same_fit
 from skindb.types import Array
 
@@ -74,7 +74,9 @@ def population_basis(
     takes = [str(take) for take in cohort["take"].values]
     part = max(1, MAX_START_SURFELS // len(takes))
     starts = each_take(
-        _fitted_weights, cohort.isel(surfel=slice(2 * part)), ["dictionary_weight"]
+        _fitted_weights,
+        cohort.isel(surfel=slice(2 * part)),
+        [variables.DICTIONARY_WEIGHT],
     )
     if lost := [
         take for take, weights in zip(takes, starts, strict=True) if not len(weights)
@@ -94,12 +96,17 @@ def population_basis(
     A = metric if in_metric else np.eye(X.shape[1])
 
     def sums_of_takes(H: Array) -> list[Sums]:
-        return each_take(_sums, cohort, ["dictionary_weight"], H, A)
+        return each_take(_sums, cohort, [variables.DICTIONARY_WEIGHT], H, A)
 
     H, sums, errors = refine(start.H, sums_of_takes, A)
-    means = np.stack(each_take(_mean, cohort, ["dictionary_weight", "surfel_area"]))
+    means = np.stack(
+        each_take(_mean, cohort, [variables.DICTIONARY_WEIGHT, variables.SURFEL_AREA])
+    )
     return dataset(
-        {"population_mixture": H, "take_coefficient": project(means, H, metric)},
+        {
+            variables.POPULATION_MIXTURE: H,
+            variables.TAKE_COEFFICIENT: project(means, H, metric),
+        },
         coords={"dictionary": names, "take": takes},
         attrs={
             "nmf_error": float(errors[-1]),
@@ -115,8 +122,8 @@ def population_basis(
 
 def _mean(take: xr.Dataset) -> Array:
     """Area-weighted mean (m,) of the weights (n, m) of one take."""
-    weights = take["dictionary_weight"].values
-    area = take["surfel_area"].values
+    weights = take[variables.DICTIONARY_WEIGHT].values
+    area = take[variables.SURFEL_AREA].values
     good = np.isfinite(weights).all(axis=1)
     return np.asarray(
         np.average(
@@ -136,7 +143,7 @@ def _fitted_weights(take: xr.Dataset) -> Array:
     """Weights (n, m) of the fitted surfels; a sample with fewer surfels than requested
     is padded with NaN.
     """
-    weights = take["dictionary_weight"].values
+    weights = take[variables.DICTIONARY_WEIGHT].values
     return np.asarray(weights[np.isfinite(weights).all(axis=1)].astype(np.float64))
 
 

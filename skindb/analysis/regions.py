@@ -14,6 +14,7 @@ import numpy as np
 import xarray as xr
 
 from skindb.files import package_json
+from skindb.schema import variables
 from skindb.schema.label import FACE
 from skindb.types import Array, Mask
 
@@ -92,7 +93,9 @@ def common_landmarks(registered: Mapping[str, xr.Dataset]) -> dict[str, Array]:
     places: dict[str, list[Array]] = {}
     for take in registered.values():
         names = map(str, take["landmark"].values)
-        for name, place in zip(names, take["common_landmark"].values, strict=True):
+        for name, place in zip(
+            names, take[variables.COMMON_LANDMARK].values, strict=True
+        ):
             if np.isfinite(place).all():
                 places.setdefault(name, []).append(place)
     return {name: np.mean(points, axis=0) for name, points in places.items()}
@@ -100,10 +103,10 @@ def common_landmarks(registered: Mapping[str, xr.Dataset]) -> dict[str, Array]:
 
 def own_masks(fitted: xr.Dataset) -> dict[str, Mask]:
     """Masks (n,) of the regions that were stored with the capture."""
-    if "region_mask" not in fitted:
+    if variables.REGION_MASK not in fitted:
         return {}
     # read once: the store keeps all regions of a surfel together
-    mask = fitted["region_mask"].values.astype(bool)
+    mask = fitted[variables.REGION_MASK].values.astype(bool)
     return {str(name): mask[:, i] for i, name in enumerate(fitted["region"].values)}
 
 
@@ -113,12 +116,12 @@ def landmark_masks(registered: xr.Dataset | None) -> dict[str, Mask]:
     """
     if registered is None:
         return {}
-    points = registered["common_landmark"]
+    points = registered[variables.COMMON_LANDMARK]
     named = {
         str(name): points.sel(landmark=name).values
         for name in points["landmark"].values
     }
-    return region_masks(registered["common_uv"].values, named)
+    return region_masks(registered[variables.COMMON_UV].values, named)
 
 
 def take_masks(

@@ -27,7 +27,7 @@ from skindb.geometry.warp import (
     fit_warp,
     left_out_error,
 )
-from skindb.schema import dataset
+from skindb.schema import dataset, variables
 from skindb.schema.consent import honour_consent
 from skindb.schema.notes import Note, note
 
@@ -282,7 +282,7 @@ def _landmark_uv(sheet: Sheet) -> NDArray[np.float64]:
 
 def _landmarks_mm(model: xr.DataTree) -> NDArray[np.float64]:
     return np.asarray(
-        model["mesh"].to_dataset()["landmark_position"].values, np.float64
+        model["mesh"].to_dataset()[variables.LANDMARK_POSITION].values, np.float64
     )
 
 
@@ -304,7 +304,7 @@ def has_landmarks(model: xr.DataTree) -> bool:
     """Whether a take has at least one landmark."""
     if (
         "mesh" not in model.children
-        or "landmark_position" not in model["mesh"].data_vars
+        or variables.LANDMARK_POSITION not in model["mesh"].data_vars
     ):
         return False
     return bool(np.isfinite(_landmarks_mm(model)).all(axis=1).any())
@@ -322,14 +322,14 @@ def _registration_dataset(
     alone = fit_warp(source, target, smoothing=warp.smoothing)
     return dataset(
         {
-            "common_uv": common,
-            "common_landmark": target,
-            "landmark_residual": np.linalg.norm(
+            variables.COMMON_UV: common,
+            variables.COMMON_LANDMARK: target,
+            variables.LANDMARK_RESIDUAL: np.linalg.norm(
                 apply_warp(warp, source) - target, axis=1
             ),
-            "landmark_prediction_error": left_out_error(alone),
-            "landmark_used": warp.used.astype(np.int8),
-            "mm_per_uv": _mm_per_uv(sheet.landmark, target),
+            variables.LANDMARK_PREDICTION_ERROR: left_out_error(alone),
+            variables.LANDMARK_USED: warp.used.astype(np.int8),
+            variables.MM_PER_UV: _mm_per_uv(sheet.landmark, target),
         },
         attrs={
             "warp_kind": warp.kind,
@@ -351,7 +351,9 @@ def corresponding_points(
     # the map has no folds: a ray perpendicular to the plane meets the only triangle
     # that contains the point
     flat = RayScene(
-        np.pad(registered["common_uv"].values.astype(np.float64), ((0, 0), (0, 1))),
+        np.pad(
+            registered[variables.COMMON_UV].values.astype(np.float64), ((0, 0), (0, 1))
+        ),
         faces,
     )
     start = np.pad(
@@ -394,7 +396,7 @@ def correspondence_error(
         face, corner, _ = closest_on_mesh(position, faces, positions)
         true[take] = _interpolate(position, faces[face], corner)
         common[take] = _interpolate(
-            registered[take]["common_uv"].values, faces[face], corner
+            registered[take][variables.COMMON_UV].values, faces[face], corner
         )
     error = []
     # all others at once, because every call builds a ray tracing scene
@@ -412,7 +414,7 @@ def unregistered(models: Takes) -> dict[str, xr.Dataset]:
     errors of a registration.
     """
     return {
-        take: dataset({"common_uv": _surface(model)[1]})
+        take: dataset({variables.COMMON_UV: _surface(model)[1]})
         for take, model in models.items()
     }
 
@@ -427,7 +429,7 @@ def tabulate_registration(registered: Registered) -> tuple[list[str], list[list[
     ).split()
     rows: list[list[Any]] = []
     for take, registration in registered.items():
-        scale = float(registration["mm_per_uv"])
+        scale = float(registration[variables.MM_PER_UV])
         misfit, error = (
             scale * registration[f"landmark_{name}"].values
             for name in ("residual", "prediction_error")
@@ -435,7 +437,7 @@ def tabulate_registration(registered: Registered) -> tuple[list[str], list[list[
         row = [
             take,
             registration.attrs["warp_kind"],
-            int(registration["landmark_used"].sum()),
+            int(registration[variables.LANDMARK_USED].sum()),
         ]
         row += [
             float(registration.attrs["warp_condition"]),
@@ -476,13 +478,13 @@ def doubtful_landmarks(registered: Registered) -> list[Note]:
     neighbours that a misplaced landmark causes are not reported.
     """
     errors = {
-        take: float(registration["mm_per_uv"])
-        * registration["landmark_prediction_error"].values
+        take: float(registration[variables.MM_PER_UV])
+        * registration[variables.LANDMARK_PREDICTION_ERROR].values
         for take, registration in registered.items()
     }
     notes = []
     for take, error in errors.items():
-        count = int(registered[take]["landmark_used"].sum())
+        count = int(registered[take][variables.LANDMARK_USED].sum())
         if count > 3 and registered[take].attrs["warp_kind"] != "thin plate":
             reason_of_map = "left and right may be swapped, or they may lie on a line"
             notes.append(
@@ -569,10 +571,10 @@ def _surface(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
     """Positions (n, 3) in mm, texture coordinates (n, 2) and triangles (f, 3) of a take."""
     fitted = model["fitted"].to_dataset()
-    faces = model["mesh"].to_dataset()["triangle"].values
+    faces = model["mesh"].to_dataset()[variables.TRIANGLE].values
     position, uv = (
         fitted[name].values.astype(np.float64)
-        for name in ("surfel_position", "surfel_uv")
+        for name in (variables.SURFEL_POSITION, variables.SURFEL_UV)
     )
     return position, uv, faces.astype(np.int64)
 

@@ -15,7 +15,7 @@ from skindb.analysis.regions import own_masks
 from skindb.errors import Fault, InputError
 from skindb.geometry.atlas import atlas_values, push_pull, rasterise_atlas
 from skindb.render.surfels import surfel_texels, texel_codes
-from skindb.schema import FitStatus, TexelStatus, Use, dataset, names_of
+from skindb.schema import FitStatus, TexelStatus, Use, dataset, names_of, variables
 from skindb.schema.cohort import Held, combine, take_coords
 from skindb.schema.consent import consent_scope
 from skindb.schema.declaration import MAX_CONDITION_TRUSTED, MIN_SAMPLES_TRUSTED
@@ -57,7 +57,7 @@ def sample_surfels(
         If no surfel was fitted.
     """
     fitted = model["fitted"].to_dataset()
-    good = np.flatnonzero(fitted["fit_status"].values == FitStatus.FITTED)
+    good = np.flatnonzero(fitted[variables.FIT_STATUS].values == FitStatus.FITTED)
     if not good.size:
         raise no_surfels_error(model)
     drawn = np.random.default_rng([seed, STREAM]).permutation(good)[:surfels]
@@ -72,7 +72,7 @@ def sample_surfels(
     back[order] = np.arange(len(order))
     return (
         sample.isel(surfel=back)
-        .merge(dataset({"surfel_index": drawn}))
+        .merge(dataset({variables.SURFEL_INDEX: drawn}))
         .drop_attrs(deep=False)
     )
 
@@ -127,15 +127,15 @@ def region_tables(fitted: xr.Dataset, masks: Mapping[str, Mask]) -> xr.Dataset:
         for a region without trusted surfels.
     """
     trusted = trusted_surfels(fitted)
-    area = fitted["surfel_area"].values.astype(np.float64)
-    colour = fitted["diffuse_reflectance"].values.astype(np.float64)
+    area = fitted[variables.SURFEL_AREA].values.astype(np.float64)
+    colour = fitted[variables.DIFFUSE_REFLECTANCE].values.astype(np.float64)
     noise, total = (
         _values(fitted, f"diffuse_reflectance_{name}", (3,))
         for name in ("error", "total_error")
     )
     shine, shine_error = (
         _values(fitted, name, ())
-        for name in ("surface_reflectance", "surface_reflectance_error")
+        for name in (variables.SURFACE_REFLECTANCE, variables.SURFACE_REFLECTANCE_ERROR)
     )
     rows = []
     for mask in masks.values():
@@ -147,28 +147,34 @@ def region_tables(fitted: xr.Dataset, masks: Mapping[str, Mask]) -> xr.Dataset:
         common = _weighted_mean(model_error, model_error, weight)[0]
         rows.append(
             {
-                "region_surfels": int(inside.sum()),
-                "region_area": float(weight.sum()),
-                "region_diffuse_reflectance": mean,
-                "region_diffuse_reflectance_error": error,
-                "region_diffuse_reflectance_total_error": np.hypot(error, common),
-                "region_diffuse_covariance": _covariance(colour[inside], weight),
-                "region_surface_reflectance": _weighted_mean(
+                variables.REGION_SURFELS: int(inside.sum()),
+                variables.REGION_AREA: float(weight.sum()),
+                variables.REGION_DIFFUSE_REFLECTANCE: mean,
+                variables.REGION_DIFFUSE_REFLECTANCE_ERROR: error,
+                variables.REGION_DIFFUSE_REFLECTANCE_TOTAL_ERROR: np.hypot(
+                    error, common
+                ),
+                variables.REGION_DIFFUSE_COVARIANCE: _covariance(
+                    colour[inside], weight
+                ),
+                variables.REGION_SURFACE_REFLECTANCE: _weighted_mean(
                     shine[inside], shine[inside], weight
                 )[0],
-                "region_surface_reflectance_error": _weighted_mean(
+                variables.REGION_SURFACE_REFLECTANCE_ERROR: _weighted_mean(
                     shine[inside], shine_error[inside], weight
                 )[1],
             }
         )
-    variables = {
+    tables = {
         name: np.stack([np.asarray(row[name]) for row in rows]) for name in rows[0]
     }
-    if "even_reflection_limit" in fitted:
-        variables["even_reflection_limit"] = fitted["even_reflection_limit"].values
+    if variables.EVEN_REFLECTION_LIMIT in fitted:
+        tables[variables.EVEN_REFLECTION_LIMIT] = fitted[
+            variables.EVEN_REFLECTION_LIMIT
+        ].values
     channels = ["R", "G", "B"]
     return dataset(
-        variables,
+        tables,
         coords={"region": list(masks), "channel": channels, "channel_2": channels},
     )
 
@@ -177,13 +183,13 @@ def trusted_surfels(fitted: xr.Dataset) -> Mask:
     """Mask (surfel,) of surfels that are fitted, well-conditioned and have enough
     samples; see `TexelStatus`.
     """
-    good = fitted["fit_status"].values == FitStatus.FITTED
-    if "fit_condition" in fitted:
-        good &= ~(fitted["fit_condition"].values > MAX_CONDITION_TRUSTED)
-    if "fit_samples" in fitted:
-        good &= fitted["fit_samples"].values >= MIN_SAMPLES_TRUSTED
+    good = fitted[variables.FIT_STATUS].values == FitStatus.FITTED
+    if variables.FIT_CONDITION in fitted:
+        good &= ~(fitted[variables.FIT_CONDITION].values > MAX_CONDITION_TRUSTED)
+    if variables.FIT_SAMPLES in fitted:
+        good &= fitted[variables.FIT_SAMPLES].values >= MIN_SAMPLES_TRUSTED
     return np.asarray(
-        good & np.isfinite(fitted["diffuse_reflectance"].values).all(axis=1)
+        good & np.isfinite(fitted[variables.DIFFUSE_REFLECTANCE].values).all(axis=1)
     )
 
 
@@ -203,17 +209,25 @@ def no_surfels_error(model: xr.DataTree) -> InputError:
 def _basis_tables(model: xr.DataTree, fitted: xr.Dataset) -> xr.Dataset:
     """Coefficients of the reduced basis, its mixtures, and the mean weights of the dictionary."""
     basis = model["basis"].to_dataset()
-    names = ("basis_mixture", "mean_dictionary_weight", "disc_angular_radius")
-    tables = basis[[name for name in names if name in basis]].load()
-    eta = fitted[["refractive_index"]] if "refractive_index" in fitted else xr.Dataset()
-    eta = eta.reset_coords(drop=True)
-    if "basis_weight" not in fitted:
-        return xr.merge([tables, eta])
-    good = np.isfinite(fitted["basis_weight"].values).all(axis=1) & (
-        fitted["fit_status"].values == FitStatus.FITTED
+    names = (
+        variables.BASIS_MIXTURE,
+        variables.MEAN_DICTIONARY_WEIGHT,
+        variables.DISC_ANGULAR_RADIUS,
     )
-    area = fitted["surfel_area"].values[good].astype(np.float64)
-    weights = fitted["basis_weight"].values[good].astype(np.float64)
+    tables = basis[[name for name in names if name in basis]].load()
+    eta = (
+        fitted[[variables.REFRACTIVE_INDEX]]
+        if variables.REFRACTIVE_INDEX in fitted
+        else xr.Dataset()
+    )
+    eta = eta.reset_coords(drop=True)
+    if variables.BASIS_WEIGHT not in fitted:
+        return xr.merge([tables, eta])
+    good = np.isfinite(fitted[variables.BASIS_WEIGHT].values).all(axis=1) & (
+        fitted[variables.FIT_STATUS].values == FitStatus.FITTED
+    )
+    area = fitted[variables.SURFEL_AREA].values[good].astype(np.float64)
+    weights = fitted[variables.BASIS_WEIGHT].values[good].astype(np.float64)
     mean = (
         np.average(weights, axis=0, weights=area)
         if good.any()
@@ -225,7 +239,7 @@ def _basis_tables(model: xr.DataTree, fitted: xr.Dataset) -> xr.Dataset:
         else {}
     )
     # a cohort needs the labels of the dictionary even if the model stores no mixtures
-    weights_table = dataset({"mean_basis_weight": mean}, coords=coords)
+    weights_table = dataset({variables.MEAN_BASIS_WEIGHT: mean}, coords=coords)
     return xr.merge(
         [tables, weights_table, eta],
         combine_attrs="override",
@@ -241,7 +255,8 @@ def _median_errors(fitted: xr.Dataset) -> xr.Dataset:
         finite = values[np.isfinite(values)]
         medians[name] = float(np.median(finite)) if finite.size else np.nan
     return dataset(
-        {"median_error": list(medians.values())}, coords={"measure": list(medians)}
+        {variables.MEDIAN_ERROR: list(medians.values())},
+        coords={"measure": list(medians)},
     )
 
 
@@ -341,7 +356,9 @@ def cohort_of(
         else:
             ds = sample_surfels(model, surfels=surfels, seed=seed)
             if captures is not None:
-                ds = ds.merge(_samples_of(captures[take], ds["surfel_index"].values))
+                ds = ds.merge(
+                    _samples_of(captures[take], ds[variables.SURFEL_INDEX].values)
+                )
         parts.append(Held.part(take, take_coords(take, model.attrs, model.attrs), ds))
     sizes = {"surfel": surfels} if layout == "surfels" else {}
     return combine(
@@ -355,10 +372,14 @@ def _samples_of(capture: xr.DataTree, index: NDArray[np.int64]) -> xr.Dataset:
     """Reflectance samples of the selected surfels, and the positions of the lights and
     cameras of the dome.
     """
-    dome = capture["dome"].to_dataset()[["light_position", "camera_position"]].load()
+    dome = (
+        capture["dome"]
+        .to_dataset()[[variables.LIGHT_POSITION, variables.CAMERA_POSITION]]
+        .load()
+    )
     samples = (
         capture["samples"]
-        .to_dataset()[["reflectance_sample"]]
+        .to_dataset()[[variables.REFLECTANCE_SAMPLE]]
         .isel(surfel=index)
         .load()
     )
@@ -389,8 +410,8 @@ def common_maps(
         not measured are interpolated from the surrounding texels; outside they are NaN.
     """
     fitted = model["fitted"].to_dataset().load()
-    triangles = model["mesh"].to_dataset()["triangle"].values
-    uv = registered["common_uv"].values
+    triangles = model["mesh"].to_dataset()[variables.TRIANGLE].values
+    uv = registered[variables.COMMON_UV].values
     codes = surfel_texels(fitted)
     raster = rasterise_atlas(uv, triangles, size)
     status = texel_codes(codes, triangles, *raster)
@@ -412,11 +433,13 @@ def common_maps(
         )
         filled = np.where(outside[..., None], np.float32(np.nan), filled)
         maps[f"texel_{name}"] = filled if fitted[name].ndim == 2 else filled[..., 0]
-        if name == "diffuse_reflectance":
+        if name == variables.DIFFUSE_REFLECTANCE:
             coverage = np.where(outside, np.float32(0), weight)
-    if "even_reflection_limit" in fitted:
-        maps["even_reflection_limit"] = fitted["even_reflection_limit"].values
+    if variables.EVEN_REFLECTION_LIMIT in fitted:
+        maps[variables.EVEN_REFLECTION_LIMIT] = fitted[
+            variables.EVEN_REFLECTION_LIMIT
+        ].values
     return dataset(
-        maps | {"texel_status": status, "texel_coverage": coverage},
+        maps | {variables.TEXEL_STATUS: status, variables.TEXEL_COVERAGE: coverage},
         coords={"channel": ["R", "G", "B"]},
     )

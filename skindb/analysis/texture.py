@@ -29,7 +29,7 @@ from skindb.numerics.texture import (
     part_quantiles,
     synthesise,
 )
-from skindb.schema import dataset
+from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_same_fit
 from skindb.schema.label import FACE
 from skindb.types import Array, Mask
@@ -37,7 +37,7 @@ from skindb.types import Array, Mask
 SIZE = 1024  # texels along each side
 REGIONS = (FACE, "beard", "no_beard")
 BINS = 256
-MAPPED = ("texel_diffuse_reflectance", "texel_coverage")
+MAPPED = (variables.TEXEL_DIFFUSE_REFLECTANCE, variables.TEXEL_COVERAGE)
 LEAST_COVERED = 0.5  # fraction of the texels of a region that a take must have measured
 COVERED = 0.5  # coverage above which a texel counts as measured
 DARKEST = 1e-3  # lower limit of R_d; the logarithm of smaller values is mostly noise
@@ -125,13 +125,13 @@ def texture_statistics(
     histograms = each_take(_histograms, cohort, MAPPED, drawn, mean, axes, edges)
     return dataset(
         {
-            "texture_colour_mean": mean,
-            "texture_colour_axis": axes,
-            "texture_edge": edges,
-            "texture_histogram": np.stack(histograms),
-            "texture_quantile": quantiles,
-            "texture_coverage": covered,
-            "texture_region": drawn,
+            variables.TEXTURE_COLOUR_MEAN: mean,
+            variables.TEXTURE_COLOUR_AXIS: axes,
+            variables.TEXTURE_EDGE: edges,
+            variables.TEXTURE_HISTOGRAM: np.stack(histograms),
+            variables.TEXTURE_QUANTILE: quantiles,
+            variables.TEXTURE_COVERAGE: covered,
+            variables.TEXTURE_REGION: drawn,
         },
         coords={
             "take": [str(take) for take in cohort["take"].values],
@@ -147,10 +147,10 @@ def log_albedo(maps: xr.Dataset) -> tuple[Array, Mask]:
     """Log R_d (v, u, 3) of a map, extrapolated to texels without measurements, and the
     mask (v, u) of measured ones.
     """
-    albedo = maps["texel_diffuse_reflectance"].values
-    measured = (maps["texel_coverage"].values > COVERED) & np.isfinite(albedo).all(
-        axis=-1
-    )
+    albedo = maps[variables.TEXEL_DIFFUSE_REFLECTANCE].values
+    measured = (maps[variables.TEXEL_COVERAGE].values > COVERED) & np.isfinite(
+        albedo
+    ).all(axis=-1)
     log = np.log(np.maximum(np.nan_to_num(albedo, nan=1.0), DARKEST))
     if not measured.any():
         return np.zeros_like(log), measured
@@ -329,9 +329,9 @@ def edit_texture(
         Random generator of the noise.
     """
     names = [str(name) for name in texture["region"].values]
-    mean = texture["texture_colour_mean"].values
-    axes = texture["texture_colour_axis"].values
-    drawn = texture["texture_region"].values.astype(np.float32)
+    mean = texture[variables.TEXTURE_COLOUR_MEAN].values
+    axes = texture[variables.TEXTURE_COLOUR_AXIS].values
+    drawn = texture[variables.TEXTURE_REGION].values.astype(np.float32)
     log, measured = log_albedo(maps)
     halves = not as_one_region and {BEARD, REST} <= set(names)
     halves = halves and bool(
@@ -406,7 +406,7 @@ def _distances(
     for takes of the population. None if there are too few takes.
     """
     quantiles_of_takes = (
-        texture["texture_quantile"].values[:, matched].astype(np.float64)
+        texture[variables.TEXTURE_QUANTILE].values[:, matched].astype(np.float64)
     )
     quantiles_of_takes = quantiles_of_takes.reshape(len(quantiles_of_takes), -1)
     rows = quantiles_of_takes[

@@ -39,7 +39,7 @@ from skindb.errors import Fault, InputError
 from skindb.numerics.inference import missing_patterns
 from skindb.numerics.statistics import known_mean
 from skindb.parameters import DICTIONARY_HELP, adjust_option, option, seed_option
-from skindb.schema import IDENTIFIED, dataset
+from skindb.schema import IDENTIFIED, dataset, variables
 from skindb.schema.cohort import require_same_fit
 from skindb.schema.label import FACE
 from skindb.types import Array, Mask
@@ -51,8 +51,8 @@ SIDES = ("with", "without")
 # subjects with or without a trait, below which individual differences dominate its
 # vector
 FEW = 10
-LOG_SIGMA_TR = "trait_log_sigma_tr_shift"
-WITHOUT_ERRORS = {"trait_histogram_shift", "trait_texture_shift"}
+LOG_SIGMA_TR = variables.TRAIT_LOG_SIGMA_TR_SHIFT
+WITHOUT_ERRORS = {variables.TRAIT_HISTOGRAM_SHIFT, variables.TRAIT_TEXTURE_SHIFT}
 MIN_VECTOR_TO_ERROR = 3.0  # recommended ratio of the length of a vector to its error
 RESAMPLES = 200  # of subjects in the bootstrap, which gives standard errors to 5 %
 
@@ -144,8 +144,8 @@ def trait_vectors(
     part = {} if texture is None else {"part": texture["part"].values}
     return dataset(
         {
-            "trait_count": counts,
-            "take_log_sigma_tr": _mean_over_sites(log_tr),
+            variables.TRAIT_COUNT: counts,
+            variables.TAKE_LOG_SIGMA_TR: _mean_over_sites(log_tr),
             **_shifts(list(units.values()), values, rng),
         },
         coords={
@@ -224,16 +224,22 @@ def _compared_values(
 ) -> dict[str, Array]:
     """Variable of the vectors -> values (take, ...) of which it is the difference."""
     takes = cohort["take"].values
-    histograms = albedo["albedo_histogram"].sel(take=takes).values
+    histograms = albedo[variables.ALBEDO_HISTOGRAM].sel(take=takes).values
     values = {
-        "trait_brdf_shift": basis["take_coefficient"].sel(take=takes).values,
-        "trait_histogram_shift": histograms,
-        "trait_quantile_shift": quantiles(histograms, albedo["histogram_edge"].values),
+        variables.TRAIT_BRDF_SHIFT: basis[variables.TAKE_COEFFICIENT]
+        .sel(take=takes)
+        .values,
+        variables.TRAIT_HISTOGRAM_SHIFT: histograms,
+        variables.TRAIT_QUANTILE_SHIFT: quantiles(
+            histograms, albedo[variables.HISTOGRAM_EDGE].values
+        ),
         LOG_SIGMA_TR: log_tr,
     }
     if texture is not None:
         regions = albedo["region"].values
-        values["trait_texture_shift"] = _texture_quantiles(texture, takes, regions)
+        values[variables.TRAIT_TEXTURE_SHIFT] = _texture_quantiles(
+            texture, takes, regions
+        )
     return values
 
 
@@ -402,7 +408,7 @@ def _texture_quantiles(texture: xr.Dataset, takes: Array, regions: Array) -> Arr
     """Quantiles (take, region, axis, part, level) of takes and regions; NaN where
     `texture` has none.
     """
-    values = texture["texture_quantile"].values
+    values = texture[variables.TEXTURE_QUANTILE].values
     rows, columns = (
         [str(label) for label in texture[dim].values] for dim in ("take", "region")
     )
@@ -420,11 +426,13 @@ def _mean_over_sites(log_tr: Array) -> Array:
 
 def _log_sigma_tr(cohort: xr.Dataset) -> Array:
     """Log sigma_tr (take, site, channel) of all sites; NaN where a take has no trusted value."""
-    if "site_sigma_tr" not in cohort:
+    if variables.SITE_SIGMA_TR not in cohort:
         return np.full((cohort.sizes["take"], 1, 3), np.nan)
-    node = cohort[["site_sigma_tr", "site_status"]].load()
-    good = node["site_status"].isin(IDENTIFIED)
-    return np.log(np.asarray(node["site_sigma_tr"].where(good).values, np.float64))
+    node = cohort[[variables.SITE_SIGMA_TR, variables.SITE_STATUS]].load()
+    good = node[variables.SITE_STATUS].isin(IDENTIFIED)
+    return np.log(
+        np.asarray(node[variables.SITE_SIGMA_TR].where(good).values, np.float64)
+    )
 
 
 def describe_traits(traits: xr.Dataset) -> list[str]:
@@ -437,16 +445,20 @@ def describe_traits(traits: xr.Dataset) -> list[str]:
     """
     lines = list(traits.attrs.get("flags", []))
     if (
-        "trait_quantile_shift_error" not in traits
+        variables.TRAIT_QUANTILE_SHIFT_ERROR not in traits
         or FACE not in traits["region"].values
     ):
         return lines
     face = traits.sel(region=FACE)
     for name in traits["trait"].values.tolist():
         part = face.sel(trait=name)
-        error = float((part["trait_quantile_shift_error"] ** 2).sum(skipna=False))
-        true = float((part["trait_quantile_shift"] ** 2).sum(skipna=False)) - error
-        takes = int(part["trait_count"].sum())
+        error = float(
+            (part[variables.TRAIT_QUANTILE_SHIFT_ERROR] ** 2).sum(skipna=False)
+        )
+        true = (
+            float((part[variables.TRAIT_QUANTILE_SHIFT] ** 2).sum(skipna=False)) - error
+        )
+        takes = int(part[variables.TRAIT_COUNT].sum())
         if not np.isfinite(error):
             continue
         if true <= error / takes:
@@ -476,13 +488,13 @@ def plot_traits(traits: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     are components of the basis.
     """
     ax = ax or plots.new_axes(6, 3.6)
-    shift = traits["trait_brdf_shift"].values
+    shift = traits[variables.TRAIT_BRDF_SHIFT].values
     largest = max(float(np.abs(shift).max(initial=0.0)), 1e-12)
     image = ax.imshow(shift, cmap="RdBu_r", vmin=-largest, vmax=largest, aspect="auto")
     counts = [
         f"{t} ({w}/{o})"
         for t, (w, o) in zip(
-            traits["trait"].values, traits["trait_count"].values, strict=True
+            traits["trait"].values, traits[variables.TRAIT_COUNT].values, strict=True
         )
     ]
     ax.set_yticks(range(len(counts)), counts)
@@ -503,12 +515,12 @@ def tabulate_traits(traits: xr.Dataset) -> Table:
         else traits.isel(region=0, drop=True)
     )
     parts = {
-        "brdf": (traits, "trait_brdf_shift", ["component"]),
-        "colour": (face, "trait_quantile_shift", ["axis", "level"]),
-        "log_sigma_tr": (traits, "trait_log_sigma_tr_shift", ["channel"]),
+        "brdf": (traits, variables.TRAIT_BRDF_SHIFT, ["component"]),
+        "colour": (face, variables.TRAIT_QUANTILE_SHIFT, ["axis", "level"]),
+        "log_sigma_tr": (traits, variables.TRAIT_LOG_SIGMA_TR_SHIFT, ["channel"]),
     }
     columns = {
-        f"takes_{side}": traits["trait_count"].sel(side=side, drop=True)
+        f"takes_{side}": traits[variables.TRAIT_COUNT].sel(side=side, drop=True)
         for side in SIDES
     }
     for name, (vectors, variable, dims) in parts.items():

@@ -22,24 +22,24 @@ from skindb.analysis.study import (
 from skindb.analysis.subjects import groups_by, takes_to_compare
 from skindb.numerics.statistics import Moments, variance_components
 from skindb.parameters import group_option
-from skindb.schema import IDENTIFIED, ProbeStatus, dataset
+from skindb.schema import IDENTIFIED, ProbeStatus, dataset, variables
 from skindb.schema.cohort import require_same_fit, require_takes
 from skindb.types import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-PROBED = "site_sigma_tr"
+PROBED = variables.SITE_SIGMA_TR
 COLUMNS = (
-    "sigma_tr_count",
-    "sigma_tr_mean",
-    "sigma_tr_mean_low",
-    "sigma_tr_mean_high",
-    "sigma_tr_standard_deviation",
-    "sigma_tr_measurement_error",
-    "sigma_tr_total_error",
-    "sigma_tr_people_fraction",
-    "sigma_tr_repeat_deviation",
+    variables.SIGMA_TR_COUNT,
+    variables.SIGMA_TR_MEAN,
+    variables.SIGMA_TR_MEAN_LOW,
+    variables.SIGMA_TR_MEAN_HIGH,
+    variables.SIGMA_TR_STANDARD_DEVIATION,
+    variables.SIGMA_TR_MEASUREMENT_ERROR,
+    variables.SIGMA_TR_TOTAL_ERROR,
+    variables.SIGMA_TR_PEOPLE_FRACTION,
+    variables.SIGMA_TR_REPEAT_DEVIATION,
 )
 
 
@@ -102,13 +102,15 @@ def translucency_table(
     subjects = np.array(people.subject)
     sigma_tr = measured.get(PROBED, empty)
     repeats = [_repeat_deviation(sigma_tr[rows], subjects[rows]) for rows in members]
-    noise = moments("site_sigma_tr_error")
+    noise = moments(variables.SITE_SIGMA_TR_ERROR)
     return dataset(
         {
             **_distribution(moments(PROBED), noise),
-            "sigma_tr_measurement_error": _rms(noise),
-            "sigma_tr_total_error": _rms(moments("site_sigma_tr_total_error")),
-            "sigma_tr_repeat_deviation": np.stack(repeats),
+            variables.SIGMA_TR_MEASUREMENT_ERROR: _rms(noise),
+            variables.SIGMA_TR_TOTAL_ERROR: _rms(
+                moments(variables.SITE_SIGMA_TR_TOTAL_ERROR)
+            ),
+            variables.SIGMA_TR_REPEAT_DEVIATION: np.stack(repeats),
         },
         coords={"group": names, "site": sites, "channel": ["R", "G", "B"]},
         attrs={
@@ -125,15 +127,15 @@ def _distribution(values: Moments, noise: Moments) -> dict[str, Array]:
     low, high = values.mean_interval()
     deviation_low, deviation_high = values.deviation_interval()
     return {
-        "sigma_tr_count": values.count,
-        "sigma_tr_mean": np.where(values.count > 0, values.mean, np.nan),
-        "sigma_tr_mean_low": low,
-        "sigma_tr_mean_high": high,
-        "sigma_tr_standard_deviation": values.standard_deviation,
-        "sigma_tr_deviation_low": deviation_low,
-        "sigma_tr_deviation_high": deviation_high,
-        "sigma_tr_variance": values.variance,
-        "sigma_tr_people_fraction": _people_fraction(values.variance, noise),
+        variables.SIGMA_TR_COUNT: values.count,
+        variables.SIGMA_TR_MEAN: np.where(values.count > 0, values.mean, np.nan),
+        variables.SIGMA_TR_MEAN_LOW: low,
+        variables.SIGMA_TR_MEAN_HIGH: high,
+        variables.SIGMA_TR_STANDARD_DEVIATION: values.standard_deviation,
+        variables.SIGMA_TR_DEVIATION_LOW: deviation_low,
+        variables.SIGMA_TR_DEVIATION_HIGH: deviation_high,
+        variables.SIGMA_TR_VARIANCE: values.variance,
+        variables.SIGMA_TR_PEOPLE_FRACTION: _people_fraction(values.variance, noise),
     }
 
 
@@ -150,9 +152,9 @@ def describe_translucency(table: xr.Dataset) -> list[str]:
         else []
     )
     for group in map(str, table["group"].values):
-        count = table["sigma_tr_count"].sel(group=group).values
+        count = table[variables.SIGMA_TR_COUNT].sel(group=group).values
         if count.size and 0 < (largest := int(count.max())) < FEW:
-            low = (table["sigma_tr_mean_low"].sel(group=group) < 0).any()
+            low = (table[variables.SIGMA_TR_MEAN_LOW].sel(group=group) < 0).any()
             ends = "; some reach below 0, where sigma_tr cannot be" if low else ""
             takes = f"{largest} take{'s' if largest > 1 else ''}"
             lines.append(
@@ -169,12 +171,12 @@ def _trusted(takes: xr.Dataset) -> dict[str, Array]:
         return {}
     names = (
         PROBED,
-        "site_sigma_tr_error",
-        "site_sigma_tr_total_error",
-        "site_status",
+        variables.SITE_SIGMA_TR_ERROR,
+        variables.SITE_SIGMA_TR_TOTAL_ERROR,
+        variables.SITE_STATUS,
     )
     node = takes[[name for name in names if name in takes]].load()
-    good = node["site_status"].isin(IDENTIFIED)
+    good = node[variables.SITE_STATUS].isin(IDENTIFIED)
     return {
         str(name): np.asarray(node[name].where(good).values, np.float64)
         for name in node
@@ -184,9 +186,9 @@ def _trusted(takes: xr.Dataset) -> dict[str, Array]:
 
 def _statuses(takes: xr.Dataset) -> dict[str, int]:
     """Number of profiles of each status."""
-    if "site_status" not in takes:
+    if variables.SITE_STATUS not in takes:
         return {}
-    statuses = takes["site_status"].values
+    statuses = takes[variables.SITE_STATUS].values
     counts = {
         member.name.lower(): int((statuses == member).sum()) for member in ProbeStatus
     }
@@ -239,11 +241,13 @@ def plot_translucency(table: xr.Dataset, *, ax: Axes | None = None) -> Axes:
         for c, colour in enumerate(plots.CHANNELS):
             part = table.isel(group=g, channel=c)
             x = np.arange(len(sites)) + 0.12 * (c - 1) + 0.03 * g
-            mean = part["sigma_tr_mean"].values
+            mean = part[variables.SIGMA_TR_MEAN].values
             # sigma_tr is never negative
-            low = np.maximum(part["sigma_tr_mean_low"].values, 0.0)
-            bars = np.nan_to_num([mean - low, part["sigma_tr_mean_high"].values - mean])
-            count = int(part["sigma_tr_count"].max())
+            low = np.maximum(part[variables.SIGMA_TR_MEAN_LOW].values, 0.0)
+            bars = np.nan_to_num(
+                [mean - low, part[variables.SIGMA_TR_MEAN_HIGH].values - mean]
+            )
+            count = int(part[variables.SIGMA_TR_COUNT].max())
             name = f"{table['channel'].values[c]}" + (
                 f", {group}" if table.sizes["group"] > 1 else ""
             )
@@ -297,6 +301,9 @@ STUDY = Study(
     tabulate=tabulate_translucency,
     plot=plot_translucency,
     describe=describe_translucency,
-    columns_of_files=("sigma_tr_total_error", "sigma_tr_repeat_deviation"),
+    columns_of_files=(
+        variables.SIGMA_TR_TOTAL_ERROR,
+        variables.SIGMA_TR_REPEAT_DEVIATION,
+    ),
     compares_normal=True,
 )

@@ -37,7 +37,7 @@ from skindb.reflectance.dictionary import Dictionary
 from skindb.reflectance.kinds import as_mixture
 from skindb.reflectance.tables import TableGrid, kernel_tables, lookup
 from skindb.render.image import write_exr
-from skindb.schema import VARIABLES, FitStatus, ProbeStatus, Use, names_of
+from skindb.schema import VARIABLES, FitStatus, ProbeStatus, Use, names_of, variables
 from skindb.schema.consent import require_consent
 from skindb.types import Progress, silent
 
@@ -123,9 +123,9 @@ PROVENANCE = (
 # standard_error is from the errors of the fibres; total_error includes the error of the
 # model of the profile
 SITE_FIGURES = {
-    "sigma_tr": "site_sigma_tr",
-    "standard_error": "site_sigma_tr_error",
-    "total_error": "site_sigma_tr_total_error",
+    "sigma_tr": variables.SITE_SIGMA_TR,
+    "standard_error": variables.SITE_SIGMA_TR_ERROR,
+    "total_error": variables.SITE_SIGMA_TR_TOTAL_ERROR,
 }
 CONVENTIONS = {
     "length": "mm in maps and tables, metres in model.glb",
@@ -425,13 +425,13 @@ def _write_bases(
         if "component" in basis.coords
         else [f"component{k}" for k in range(count)]
     )
-    disc = float(basis["disc_angular_radius"])
+    disc = float(basis[variables.DISC_ANGULAR_RADIUS])
     dictionary = Dictionary(
         tuple(map(str, names)), tables, TableGrid(*tables.shape[:3]), "basis", disc
     )
     arrays = (
-        {"basis_mixture": basis["basis_mixture"].values}
-        if "basis_mixture" in basis
+        {variables.BASIS_MIXTURE: basis[variables.BASIS_MIXTURE].values}
+        if variables.BASIS_MIXTURE in basis
         else {}
     )
     if "dictionary" in basis.coords:
@@ -503,7 +503,7 @@ def _errors(fitted: xr.Dataset) -> dict[str, Any]:
     """Median and 95 % quantile over fitted surfels of every quality measure, and the
     fraction of each status.
     """
-    status = fitted["fit_status"].values
+    status = fitted[variables.FIT_STATUS].values
     report: dict[str, Any] = {"surfels": int(status.size)}
     report["status_fraction"] = {
         member.name.lower(): {
@@ -534,7 +534,7 @@ def _sites(model: xr.DataTree) -> dict[str, Any]:
     without a probe.
     """
     for group in (node.to_dataset() for node in model.subtree):
-        if "site_sigma_tr" in group.data_vars:
+        if variables.SITE_SIGMA_TR in group.data_vars:
             sites = (
                 group["site"].values
                 if "site" in group.coords
@@ -545,10 +545,10 @@ def _sites(model: xr.DataTree) -> dict[str, Any]:
                 for key, name in SITE_FIGURES.items()
                 if name in group.data_vars
             }
-            if "site_status" in group.data_vars:
+            if variables.SITE_STATUS in group.data_vars:
                 named = {int(status): status.name.lower() for status in ProbeStatus}
                 have["status"] = np.vectorize(named.__getitem__)(
-                    group["site_status"].values
+                    group[variables.SITE_STATUS].values
                 )
             return {
                 str(site): {key: have[key][i] for key in have}

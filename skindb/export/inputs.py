@@ -20,17 +20,17 @@ from skindb.optics.diffusion import (
     dipole_s,
     scattering_coefficients,
 )
-from skindb.schema import check
+from skindb.schema import check, variables
 
 REQUIRED = (
-    "surfel_position",
-    "surfel_normal",
-    "surfel_uv",
-    "shading_normal",
-    "diffuse_reflectance",
-    "basis_weight",
-    "fit_status",
-    "refractive_index",
+    variables.SURFEL_POSITION,
+    variables.SURFEL_NORMAL,
+    variables.SURFEL_UV,
+    variables.SHADING_NORMAL,
+    variables.DIFFUSE_REFLECTANCE,
+    variables.BASIS_WEIGHT,
+    variables.FIT_STATUS,
+    variables.REFRACTIVE_INDEX,
 )
 # texels per spacing of surfels; more would only show interpolation, less would lose
 # detail
@@ -52,8 +52,8 @@ def texture_size(model: xr.DataTree) -> int:
     """Texels along each side of maps without loss: 1.5 per spacing of the surfels,
     rounded up to a power of two.
     """
-    uv = model["fitted"].to_dataset()["surfel_uv"].values
-    triangles = model["mesh"].to_dataset()["triangle"].values
+    uv = model["fitted"].to_dataset()[variables.SURFEL_UV].values
+    triangles = model["mesh"].to_dataset()[variables.TRIANGLE].values
     corners = uv.astype(np.float64)[triangles]
     edge = np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1))
     texels = TEXELS_PER_SPACING / max(float(edge), 1e-6)
@@ -112,8 +112,8 @@ def required(model: xr.DataTree) -> xr.Dataset:
     fitted = model["fitted"].to_dataset()
     check(fitted, REQUIRED, where="fitted")
     corner = (
-        fitted["surfel_uv"]
-        .values[model["mesh"].to_dataset()["triangle"].values]
+        fitted[variables.SURFEL_UV]
+        .values[model["mesh"].to_dataset()[variables.TRIANGLE].values]
         .astype(np.float64)
     )
     if not np.isfinite(corner).all() or not np.ptp(corner, axis=1).any():

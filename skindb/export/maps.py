@@ -14,14 +14,14 @@ from skindb.export.inputs import chosen_size, mean_free_path, required
 from skindb.geometry.atlas import atlas_values, push_pull, rasterise_atlas
 from skindb.reflectance.kinds import as_mixture
 from skindb.render.surfels import surfel_confidence, surfel_texels, texel_codes
-from skindb.schema import VARIABLES, TexelStatus
+from skindb.schema import VARIABLES, TexelStatus, variables
 
 Image = NDArray[np.float32]
 MEASURED = {  # map: variable of the model; edited models have none of these
-    "albedo_error": "diffuse_reflectance_total_error",
-    "normal_error": "normal_total_error",
-    "surface_reflectance": "surface_reflectance",
-    "surface_reflectance_error": "surface_reflectance_error",
+    "albedo_error": variables.DIFFUSE_REFLECTANCE_TOTAL_ERROR,
+    "normal_error": variables.NORMAL_TOTAL_ERROR,
+    "surface_reflectance": variables.SURFACE_REFLECTANCE,
+    "surface_reflectance_error": variables.SURFACE_REFLECTANCE_ERROR,
 }
 CONFIDENCE = (
     "1 between fitted surfels, less towards doubtful ones, 0 where values are filled "
@@ -66,8 +66,8 @@ def atlas_images(
     """Texels (size, size, c) of concatenated values (n, c) at the surfels, and the
     number of channels of each name.
     """
-    uv = model["fitted"].to_dataset()["surfel_uv"].values
-    triangles = model["mesh"].to_dataset()["triangle"].values
+    uv = model["fitted"].to_dataset()[variables.SURFEL_UV].values
+    triangles = model["mesh"].to_dataset()[variables.TRIANGLE].values
     atlas = Atlas(uv, triangles, rasterise_atlas(uv, triangles, size))
     image, _ = _spread(np.concatenate(list(columns.values()), axis=1), trust, atlas)
     return image, {name: values.shape[1] for name, values in columns.items()}
@@ -107,8 +107,8 @@ def texture_maps(
     model = as_mixture(model)
     fitted = required(model)
     trust = surfel_confidence(fitted)
-    uv = fitted["surfel_uv"].values
-    triangles = model["mesh"].to_dataset()["triangle"].values
+    uv = fitted[variables.SURFEL_UV].values
+    triangles = model["mesh"].to_dataset()[variables.TRIANGLE].values
     atlas = Atlas(
         uv, triangles, rasterise_atlas(uv, triangles, chosen_size(model, size))
     )
@@ -152,14 +152,20 @@ def _columns(
     """
     parts = {
         name: fitted[name].values
-        for name in ("diffuse_reflectance", "shading_normal", "basis_weight")
+        for name in (
+            variables.DIFFUSE_REFLECTANCE,
+            variables.SHADING_NORMAL,
+            variables.BASIS_WEIGHT,
+        )
     }
-    mesh = fitted["surfel_normal"].values.astype(np.float64)
-    uv = fitted["surfel_uv"].values
-    frames = tangent_frames(fitted["surfel_position"].values, mesh, uv, triangles)
-    parts["tangent"] = to_tangent_space(parts["shading_normal"], mesh, frames).astype(
-        np.float32
+    mesh = fitted[variables.SURFEL_NORMAL].values.astype(np.float64)
+    uv = fitted[variables.SURFEL_UV].values
+    frames = tangent_frames(
+        fitted[variables.SURFEL_POSITION].values, mesh, uv, triangles
     )
+    parts["tangent"] = to_tangent_space(
+        parts[variables.SHADING_NORMAL], mesh, frames
+    ).astype(np.float32)
     layout = {}
     start = 0
     for name, part in parts.items():
@@ -174,13 +180,13 @@ def _translucency(
     """Maps of the channels that are known at any trusted surfel, each filled
     separately; empty if there are none.
     """
-    if "sigma_tr" not in fitted:
+    if variables.SIGMA_TR not in fitted:
         return {}
-    sigma_tr = fitted["sigma_tr"].values
-    diffuse = fitted["diffuse_reflectance"].values
+    sigma_tr = fitted[variables.SIGMA_TR].values
+    diffuse = fitted[variables.DIFFUSE_REFLECTANCE].values
     sigma_tr = np.where(sigma_tr > 0, sigma_tr, np.nan)
     path = mean_free_path(
-        diffuse, sigma_tr, eta=float(fitted["refractive_index"])
+        diffuse, sigma_tr, eta=float(fitted[variables.REFRACTIVE_INDEX])
     ).astype(np.float32)
     values: dict[str, NDArray[Any]] = {
         "translucency": 1 / sigma_tr,
@@ -260,11 +266,11 @@ def _single_channel(values: NDArray[Any], doc: str) -> TextureMap:
 
 def _fitted_maps(image: Image, layout: dict[str, slice]) -> dict[str, TextureMap]:
     rgb = ("R", "G", "B")
-    normal = image[..., layout["shading_normal"]]
+    normal = image[..., layout[variables.SHADING_NORMAL]]
     normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
     maps = {
         "albedo": TextureMap(
-            image[..., layout["diffuse_reflectance"]],
+            image[..., layout[variables.DIFFUSE_REFLECTANCE]],
             rgb,
             "1",
             "diffuse reflectance R_d",
@@ -283,7 +289,7 @@ def _fitted_maps(image: Image, layout: dict[str, slice]) -> dict[str, TextureMap
         "and normal in R, G, B"
     )
     maps["normal_tangent"] = TextureMap(bent, rgb, "1", doc)
-    weights = image[..., layout["basis_weight"]]
+    weights = image[..., layout[variables.BASIS_WEIGHT]]
     for k in range(weights.shape[-1]):
         maps[f"weight_{k}"] = TextureMap(
             weights[..., k : k + 1], ("Y",), "1", f"weight of component {k}"

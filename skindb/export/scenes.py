@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from skindb import __version__
 from skindb.export.textures import Skin, shading_normals
 from skindb.files import make_private, private_file
+from skindb.schema import variables
 
 STAGE = "face.usda"
 MATERIAL = "face.mtlx"
@@ -162,10 +163,10 @@ def _usda(
 ) -> str:
     fitted = model["fitted"].to_dataset()
     mesh = model["mesh"].to_dataset()
-    place = fitted["surfel_position"].values.astype(np.float32)
-    triangles = mesh["triangle"].values
+    place = fitted[variables.SURFEL_POSITION].values.astype(np.float32)
+    triangles = mesh[variables.TRIANGLE].values
     # v increases upwards in USD
-    uv = fitted["surfel_uv"].values.astype(np.float64) * [1, -1] + [0, 1]
+    uv = fitted[variables.SURFEL_UV].values.astype(np.float64) * [1, -1] + [0, 1]
     return _template("usd", STAGE).substitute(
         version=__version__,
         extent=_vectors(np.stack([place.min(axis=0), place.max(axis=0)])),
@@ -279,7 +280,7 @@ def _vectors(values: NDArray[np.floating[Any]]) -> str:
 
 
 def _normals(fitted: xr.Dataset) -> NDArray[np.float64]:
-    normal = fitted["surfel_normal"].values.astype(np.float64)
+    normal = fitted[variables.SURFEL_NORMAL].values.astype(np.float64)
     return np.asarray(
         normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-9)
     )
@@ -299,11 +300,11 @@ def export_mitsuba(model: xr.DataTree, folder: Path) -> None:
     program = _template("mitsuba", PROGRAM).template
     private_file(folder / PROGRAM).write_text(program, encoding="utf-8")
     fitted = model["fitted"].to_dataset()
-    triangles = model["mesh"].to_dataset()["triangle"].values
+    triangles = model["mesh"].to_dataset()[variables.TRIANGLE].values
     columns = [
-        fitted["surfel_position"].values,
+        fitted[variables.SURFEL_POSITION].values,
         shading_normals(fitted),
-        fitted["surfel_uv"].values,
+        fitted[variables.SURFEL_UV].values,
     ]
     vertices = np.concatenate(columns, axis=1).astype("<f4")
     names = ("x", "y", "z", "nx", "ny", "nz", "u", "v")

@@ -21,6 +21,7 @@ from skindb.reflectance.kinds import as_mixture
 from skindb.reflectance.tables import kernel_tables, lookup
 from skindb.render.image import encode_srgb
 from skindb.render.surfels import surfel_confidence
+from skindb.schema import variables
 
 Float = NDArray[np.floating]
 # values of perceptual roughness that are tried for each point
@@ -396,13 +397,14 @@ def skin_of(model: xr.DataTree, *, size: int | None = None) -> Skin:
     """
     model = as_mixture(model)
     fitted = required(model)
-    eta = float(fitted["refractive_index"])
+    eta = float(fitted[variables.REFRACTIVE_INDEX])
     mesh = model["mesh"].to_dataset()
     trust = surfel_confidence(fitted)
     tables = kernel_tables(model["basis"].to_dataset())
     trusted = np.flatnonzero(trust > 0)
     diffuse, weights = (
-        fitted[name].values[trusted] for name in ("diffuse_reflectance", "basis_weight")
+        fitted[name].values[trusted]
+        for name in (variables.DIFFUSE_REFLECTANCE, variables.BASIS_WEIGHT)
     )
     skin = fit_material(tables, diffuse, weights, eta=eta)
     mean_f0 = (
@@ -418,7 +420,7 @@ def skin_of(model: xr.DataTree, *, size: int | None = None) -> Skin:
     error, of_one_index, of_preview = _errors(
         tables, diffuse, weights, (skin, one_index, preview), eta=eta
     )
-    shape = _shape(fitted, mesh["triangle"].values)
+    shape = _shape(fitted, mesh[variables.TRIANGLE].values)
     top = float(max(skin.f0.max(), MIN_F0))
     through = _through(fitted, shape, trusted, eta)
     columns = _columns(skin, trusted, shape, top, through)
@@ -467,10 +469,11 @@ class Shape:
 
 
 def _shape(fitted: xr.Dataset, triangles: NDArray[Any]) -> Shape:
-    place = fitted["surfel_position"].values
-    uv = fitted["surfel_uv"].values.astype(np.float32)
+    place = fitted[variables.SURFEL_POSITION].values
+    uv = fitted[variables.SURFEL_UV].values.astype(np.float32)
     normal, shading = (
-        _unit(fitted, name) for name in ("surfel_normal", "shading_normal")
+        _unit(fitted, name)
+        for name in (variables.SURFEL_NORMAL, variables.SHADING_NORMAL)
     )
     tangent = tangent_frames(place, normal, uv, triangles)
     return Shape(place.astype(np.float32), normal, shading, tangent, uv, triangles)
@@ -482,10 +485,11 @@ def _through(
     """Fraction of the diffuse light (n, 3) at the known surfels that comes through the
     skin from the other side.
     """
-    if "sigma_tr" not in fitted:
+    if variables.SIGMA_TR not in fitted:
         return np.zeros((len(surfels), 3))
     diffuse, sigma_tr = (
-        fitted[name].values[surfels] for name in ("diffuse_reflectance", "sigma_tr")
+        fitted[name].values[surfels]
+        for name in (variables.DIFFUSE_REFLECTANCE, variables.SIGMA_TR)
     )
     deep = thickness(shape.position.astype(np.float64), shape.normal, shape.triangles)[
         surfels
@@ -587,7 +591,7 @@ def _unit(fitted: xr.Dataset, name: str) -> NDArray[np.float64]:
     normal = np.where(
         np.isfinite(normal).all(axis=1, keepdims=True),
         normal,
-        fitted["surfel_normal"].values,
+        fitted[variables.SURFEL_NORMAL].values,
     )
     length = np.linalg.norm(normal, axis=1, keepdims=True)
     return np.where(length > 1e-6, normal / np.maximum(length, 1e-6), [0.0, 0.0, 1.0])
@@ -595,4 +599,4 @@ def _unit(fitted: xr.Dataset, name: str) -> NDArray[np.float64]:
 
 def shading_normals(fitted: xr.Dataset) -> NDArray[np.float64]:
     """Unit shading normals (n, 3) of the surfels; those of the scan where they are unknown."""
-    return _unit(fitted, "shading_normal")
+    return _unit(fitted, variables.SHADING_NORMAL)

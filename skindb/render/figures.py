@@ -14,6 +14,7 @@ from skindb.errors import Fault, InputError
 from skindb.files import private_file
 from skindb.geometry.rays import RayScene
 from skindb.render.image import encode_srgb
+from skindb.schema import variables
 from skindb.schema.consent import honour_consent
 
 if TYPE_CHECKING:
@@ -73,8 +74,8 @@ def field_figure(
     at = dict(at or {})
     colour = _colour_dim(values, at)
     chosen = _chosen(values, dict(at), keep=colour)
-    position = group["surfel_position"].values
-    triangle = take["mesh"].to_dataset()["triangle"].values
+    position = group[variables.SURFEL_POSITION].values
+    triangle = take["mesh"].to_dataset()[variables.TRIANGLE].values
     views = [trace_front(position, triangle, turn) for turn in turns]
     who = f"{take.attrs.get('subject') or ''} {take.attrs.get('condition', '')}".strip()
     title = ", ".join(
@@ -210,13 +211,13 @@ def write_field(
         honour_consent(version.attrs, "export")
     having = [kind for kind, tree in trees.items() if variable in _drawable(tree)]
     if not having:
-        variables = ", ".join(sorted(set().union(*map(_drawable, trees.values()))))
+        names = ", ".join(sorted(set().union(*map(_drawable, trees.values()))))
         raise InputError(
             Fault(
                 "variable",
                 "must be a variable of the surfels",
                 variable,
-                f"choose {variables}",
+                f"choose {names}",
             )
         )
     tree = trees[having[0]]
@@ -322,7 +323,9 @@ def _find(take: xr.DataTree, variable: str) -> tuple[xr.Dataset, xr.DataArray]:
     groups = list(_groups(take))
     for group in groups:
         if variable in group and "surfel" in group[variable].dims:
-            return next(g for g in groups if "surfel_position" in g), group[variable]
+            return next(g for g in groups if variables.SURFEL_POSITION in g), group[
+                variable
+            ]
     cure = "choose " + ", ".join(sorted(_drawable(take)))
     raise InputError(
         Fault("variable", "must be a variable of the surfels", variable, cure)

@@ -23,7 +23,7 @@ from skindb.render.image import auto_exposure, encode_srgb, tone_map, write_png
 from skindb.render.scene import cameras_from_dome, from_model, lights_from_dome
 from skindb.render.shading import View, require_translucency, shade_view, trace_view
 from skindb.render.surfels import surfel_confidence
-from skindb.schema import check
+from skindb.schema import check, variables
 from skindb.schema.consent import honour_consent
 from skindb.types import Mask
 
@@ -333,8 +333,8 @@ def compare_photographs(
     doubtful = 1 - surfel_confidence(model["fitted"].to_dataset()).astype(np.float64)
     results = []
     for photograph in photographs:
-        at_light = int(photograph["photograph_light"])
-        at_camera = int(photograph["photograph_camera"])
+        at_light = int(photograph[variables.PHOTOGRAPH_LIGHT])
+        at_camera = int(photograph[variables.PHOTOGRAPH_CAMERA])
         camera = cameras[at_camera]
         view = trace_view(surface, camera, samples=samples, scene=scene)
         lamp = lights.select(at_light)
@@ -342,7 +342,7 @@ def compare_photographs(
             view, surface, lamp, scene, subsurface=subsurface, terms=("diffuse",)
         )[0]
         gloss = shade_view(view, surface, lamp, scene, terms=("surface",))[0]
-        radiance = photograph["photograph_radiance"].values
+        radiance = photograph[variables.PHOTOGRAPH_RADIANCE].values
         photo = radiance[: camera.height, : camera.width].astype(np.float32)
         mask = (view.coverage >= MIN_COVERAGE) & np.isfinite(photo).all(axis=-1)
         if not mask.any():
@@ -372,7 +372,11 @@ def _kept_photographs(capture: xr.DataTree) -> list[xr.Dataset]:
         cure = "ingest the capture again with --photographs 4"
         raise InputError(Fault("capture", rule, "none", cure))
     photographs = capture["photographs"].to_dataset()
-    needed = ("photograph_radiance", "photograph_light", "photograph_camera")
+    needed = (
+        variables.PHOTOGRAPH_RADIANCE,
+        variables.PHOTOGRAPH_LIGHT,
+        variables.PHOTOGRAPH_CAMERA,
+    )
     check(photographs, needed, where="photographs")
     return [
         photographs.isel(photograph=i) for i in range(photographs.sizes["photograph"])
@@ -431,10 +435,12 @@ def _regions(capture: xr.DataTree) -> dict[str, NDArray[np.float64]]:
         if "surfels" in capture.children
         else xr.Dataset()
     )
-    if "region_mask" not in surfels:
+    if variables.REGION_MASK not in surfels:
         return {}
     mask = (
-        surfels["region_mask"].transpose("surfel", "region").values.astype(np.float64)
+        surfels[variables.REGION_MASK]
+        .transpose("surfel", "region")
+        .values.astype(np.float64)
     )
     return {str(name): mask[:, i] for i, name in enumerate(surfels["region"].values)}
 

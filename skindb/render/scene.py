@@ -20,15 +20,15 @@ from skindb.limits import MAX_PICTURE_PIXELS
 from skindb.reflectance.kinds import surface_model
 from skindb.reflectance.model import ReflectanceModel
 from skindb.render.image import read_exr
-from skindb.schema import FitStatus, check
+from skindb.schema import FitStatus, check, variables
 
 Float = NDArray[np.floating[Any]]
 NEEDED = (
-    "surfel_position",
-    "shading_normal",
-    "diffuse_reflectance",
-    "dipole_s",
-    "fit_status",
+    variables.SURFEL_POSITION,
+    variables.SHADING_NORMAL,
+    variables.DIFFUSE_REFLECTANCE,
+    variables.DIPOLE_S,
+    variables.FIT_STATUS,
 )
 MAX_LEVELS = 6  # of subdivision of a triangle into four
 MAX_VERTICES = 2_000_000  # of the finer mesh: about 1 GB with the octree
@@ -125,11 +125,11 @@ class Lights:
 def cameras_from_dome(dome: xr.Dataset) -> list[Camera]:
     """Cameras of a stored dome, in its order."""
     names = (
-        "camera_matrix",
-        "camera_rotation",
-        "camera_translation",
-        "camera_distortion",
-        "camera_size",
+        variables.CAMERA_MATRIX,
+        variables.CAMERA_ROTATION,
+        variables.CAMERA_TRANSLATION,
+        variables.CAMERA_DISTORTION,
+        variables.CAMERA_SIZE,
     )
     check(dome, names, where="dome")
     K, R, t, distortion, size = (dome[name].values for name in names)
@@ -142,11 +142,11 @@ def cameras_from_dome(dome: xr.Dataset) -> list[Camera]:
 def lights_from_dome(dome: xr.Dataset) -> Lights:
     """Lights of a stored dome, in its order."""
     names = (
-        "light_position",
-        "light_intensity",
-        "light_disc_radius",
-        "light_axis",
-        "light_falloff",
+        variables.LIGHT_POSITION,
+        variables.LIGHT_INTENSITY,
+        variables.LIGHT_DISC_RADIUS,
+        variables.LIGHT_AXIS,
+        variables.LIGHT_FALLOFF,
     )
     check(dome, names, where="dome")
     return Lights(*(dome[name].values.astype(np.float64) for name in names))
@@ -172,20 +172,20 @@ def from_model(model: xr.DataTree, *, fill: bool = False) -> Surface:
     fitted = model["fitted"].to_dataset()
     basis = model["basis"].to_dataset()
     reflectance = surface_model(basis)
-    names = (*NEEDED, *reflectance.parameter_variables, "refractive_index")
+    names = (*NEEDED, *reflectance.parameter_variables, variables.REFRACTIVE_INDEX)
     check(fitted, names, where="fitted")
     values = {name: np.asarray(fitted[name].values) for name in NEEDED}
     values["parameters"] = reflectance.parameters_of(fitted)
-    if "sigma_tr" in fitted:
-        values["sigma_tr"] = np.asarray(fitted["sigma_tr"].values)
-    position = values.pop("surfel_position")
+    if variables.SIGMA_TR in fitted:
+        values[variables.SIGMA_TR] = np.asarray(fitted[variables.SIGMA_TR].values)
+    position = values.pop(variables.SURFEL_POSITION)
     usable = usable_surfels(values)
     if not usable.any():
         rule = "at least one surfel must be fitted for a picture"
         raise InputError(
             Fault("fitted[fit_status]", rule, "none", "see the report of the fit")
         )
-    del values["fit_status"]
+    del values[variables.FIT_STATUS]
     if fill:
         nearest = _nearest(position, usable)
         values = {name: value[nearest] for name, value in values.items()}
@@ -194,19 +194,19 @@ def from_model(model: xr.DataTree, *, fill: bool = False) -> Surface:
             name: np.where(usable[:, None], value, np.nan)
             for name, value in values.items()
         }
-    sigma_tr = values.get("sigma_tr")
+    sigma_tr = values.get(variables.SIGMA_TR)
     return Surface(
         vertices=position.astype(np.float64),
-        faces=model["mesh"].to_dataset()["triangle"].values,
-        normals=values["shading_normal"],
-        diffuse=values["diffuse_reflectance"],
+        faces=model["mesh"].to_dataset()[variables.TRIANGLE].values,
+        normals=values[variables.SHADING_NORMAL],
+        diffuse=values[variables.DIFFUSE_REFLECTANCE],
         parameters=values["parameters"],
         model=reflectance,
-        s=values["dipole_s"],
+        s=values[variables.DIPOLE_S],
         sigma_tr=sigma_tr
         if sigma_tr is not None and np.isfinite(sigma_tr).any()
         else None,
-        eta=float(fitted["refractive_index"]),
+        eta=float(fitted[variables.REFRACTIVE_INDEX]),
     )
 
 
@@ -214,7 +214,7 @@ def usable_surfels(values: dict[str, NDArray[Any]]) -> NDArray[np.bool_]:
     """(n,) whether a surfel can be rendered: it is fitted, even if doubtfully, and its
     values are finite.
     """
-    status = values["fit_status"]
+    status = values[variables.FIT_STATUS]
     good = np.isin(
         status,
         [
@@ -224,7 +224,7 @@ def usable_surfels(values: dict[str, NDArray[Any]]) -> NDArray[np.bool_]:
             FitStatus.OBSTRUCTED,
         ],
     )
-    for name in ("shading_normal", "diffuse_reflectance", "parameters"):
+    for name in (variables.SHADING_NORMAL, variables.DIFFUSE_REFLECTANCE, "parameters"):
         good &= np.isfinite(values[name]).all(axis=1)
     return good
 

@@ -11,7 +11,7 @@ from skindb.errors import Fault, InputError
 from skindb.reflectance.kinds import parameter_variables, surface_model
 from skindb.reflectance.model import Lamp, Points, ReflectanceModel
 from skindb.render.scene import usable_surfels
-from skindb.schema import FitStatus, TexelStatus, check
+from skindb.schema import FitStatus, TexelStatus, check, variables
 from skindb.schema.declaration import MAX_CONDITION_TRUSTED, MIN_SAMPLES_TRUSTED
 from skindb.types import Array
 
@@ -22,7 +22,7 @@ STATUS = {FitStatus.FITTED: TexelStatus.MEASURED} | dict.fromkeys(
 )
 # confidence by `TexelStatus`
 TRUST = np.array([1.0, 0.5, 0.5, 0.5, 0.0, 0.0, 0.0], np.float32)
-NEEDED = ("shading_normal", "diffuse_reflectance", "fit_status")
+NEEDED = (variables.SHADING_NORMAL, variables.DIFFUSE_REFLECTANCE, variables.FIT_STATUS)
 MAX_LENGTH_ERROR = 1e-3  # of a unit direction; directions in half precision have 5e-4
 
 
@@ -32,23 +32,27 @@ def surfel_texels(fitted: xr.Dataset) -> Codes:
 
     Edited models do not store them.
     """
-    status = fitted["fit_status"].values
+    status = fitted[variables.FIT_STATUS].values
     code = np.full(status.shape, TexelStatus.FILLED, np.uint8)
     for member, value in STATUS.items():
         code[status == member] = value
     for name, doubt in (
-        ("fit_samples", TexelStatus.FEW_SAMPLES),
-        ("fit_condition", TexelStatus.ILL_CONDITIONED),
+        (variables.FIT_SAMPLES, TexelStatus.FEW_SAMPLES),
+        (variables.FIT_CONDITION, TexelStatus.ILL_CONDITIONED),
     ):
         if name in fitted:
             values = fitted[name].values
             wrong = (
                 values < MIN_SAMPLES_TRUSTED
-                if name == "fit_samples"
+                if name == variables.FIT_SAMPLES
                 else values > MAX_CONDITION_TRUSTED
             )
             code[wrong & (code < TexelStatus.FILLED)] = doubt
-    needed = ("shading_normal", "diffuse_reflectance", *parameter_variables(fitted))
+    needed = (
+        variables.SHADING_NORMAL,
+        variables.DIFFUSE_REFLECTANCE,
+        *parameter_variables(fitted),
+    )
     for name in needed:
         finite = np.isfinite(fitted[name].values.reshape(len(code), -1)).all(axis=1)
         code[~finite] = TexelStatus.FILLED
@@ -139,7 +143,7 @@ def evaluate(
     fitted = model["fitted"].to_dataset()
     basis = model["basis"].to_dataset()
     reflectance = surface_model(basis)
-    names = (*NEEDED, *reflectance.parameter_variables, "refractive_index")
+    names = (*NEEDED, *reflectance.parameter_variables, variables.REFRACTIVE_INDEX)
     check(fitted, names, where="fitted")
     values = _values_of(fitted, surfel, reflectance)
     to_light, to_camera = np.broadcast_arrays(_unit("wi", wi), _unit("wo", wo))
@@ -148,12 +152,18 @@ def evaluate(
     to_camera = to_camera.reshape(-1, 3)
     normal, diffuse, parameters = (
         np.broadcast_to(values[name], (len(to_light), values[name].shape[1]))
-        for name in ("shading_normal", "diffuse_reflectance", "parameters")
+        for name in (
+            variables.SHADING_NORMAL,
+            variables.DIFFUSE_REFLECTANCE,
+            "parameters",
+        )
     )
     points = Points(np.zeros_like(to_light), normal, to_camera, diffuse, parameters)
     lit = np.ones((len(to_light), 1), np.float32)
     lamp = Lamp(to_light[:, None], lit, np.zeros(3), 0.0)
-    radiance = reflectance.shade(points, lamp, eta=float(fitted["refractive_index"]))
+    radiance = reflectance.shade(
+        points, lamp, eta=float(fitted[variables.REFRACTIVE_INDEX])
+    )
     # for a lamp at a distance of 1 mm, radiance per radiant intensity is f_r cos(theta_i) per mm2
     cosine = np.einsum("nc,nc->n", normal, to_light)[:, None]
     above = (cosine > 0) & (np.einsum("nc,nc->n", normal, to_camera)[:, None] > 0)
@@ -178,7 +188,7 @@ def _values_of(
     values = {name: np.asarray(row[name].values) for name in NEEDED}
     values["parameters"] = reflectance.parameters_of(row)
     if not usable_surfels(values)[0]:
-        status = FitStatus(int(values["fit_status"][0]))
+        status = FitStatus(int(values[variables.FIT_STATUS][0]))
         reason = f"the status {status.name} ({status.explanation})"
         cure = "choose a surfel whose fit_status is FITTED"
         raise InputError(
