@@ -3,11 +3,12 @@ and the common (u, v).
 """
 
 from skindb.analysis.albedo import albedo_histograms, albedo_table, plot_albedo
-from skindb.analysis.basis_size import (
+from skindb.analysis.basis import (
     BASIS_SIZE_VARIABLES,
     basis_size_curve,
     describe_basis_size,
     plot_basis_size,
+    population_basis,
     tabulate_basis_size,
 )
 from skindb.analysis.brdf_plots import (
@@ -53,7 +54,6 @@ from skindb.analysis.group_effects import (
     group_effects,
     plot_group_effects,
 )
-from skindb.analysis.population_basis import population_basis
 from skindb.analysis.regions import mask_agreement, region_masks, take_masks
 from skindb.analysis.registration import (
     correspondence_error,

@@ -7,7 +7,7 @@ from pathlib import Path
 import xarray as xr
 
 from skindb.analysis.albedo import STUDY as ALBEDO
-from skindb.analysis.basis_size import STUDY as BRDF
+from skindb.analysis.basis import STUDY as BRDF
 from skindb.analysis.brdf_space import STUDY as SURFACE
 from skindb.analysis.chromophores import STUDY as CHROMOPHORES
 from skindb.analysis.components import STUDY as COMPONENTS

@@ -12,8 +12,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from skindb.analysis.basis import population_basis
 from skindb.analysis.edit import apply_traits, with_basis
-from skindb.analysis.population_basis import population_basis
 from skindb.analysis.summary import SAMPLED, common_maps
 from skindb.errors import Fault, InputError
 from skindb.files import plain

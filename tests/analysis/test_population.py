@@ -17,7 +17,7 @@ from planted_population import unit as _unit
 
 from skindb import workflow
 from skindb.analysis import (
-    basis_size,
+    basis,
     basis_size_curve,
     cohort_of,
     describe_basis_size,
@@ -27,8 +27,12 @@ from skindb.analysis import (
     tabulate_basis_size,
     tabulate_study,
 )
-from skindb.analysis.basis_size import choose_size, size_status, surfel_errors
-from skindb.analysis.population_basis import project
+from skindb.analysis.basis import (
+    choose_size,
+    project,
+    size_status,
+    surfel_errors,
+)
 from skindb.errors import InputError
 from skindb.numerics.factorise import relative_error
 from skindb.optics.angles import half_difference
@@ -216,8 +220,8 @@ def test_basis_size_curve__streams_what_it_does_not_factor(monkeypatch):
     cohort = cohort_of(models, "surfels", captures=captures, surfels=40)
     call = {"tables": TABLES, "ks": (1, 2, 3, 4, 5, 99)}
     whole = basis_size_curve(cohort, rng=np.random.default_rng(0), **call)
-    monkeypatch.setattr(basis_size, "MAX_FACTORED", 40)
-    monkeypatch.setattr(basis_size, "BLOCK", 7)
+    monkeypatch.setattr(basis, "MAX_FACTORED", 40)
+    monkeypatch.setattr(basis, "BLOCK", 7)
     part = basis_size_curve(cohort, rng=np.random.default_rng(0), **call)
     assert list(part["k"].values) == [1, 2, 3, 4, 5]  # there are 8 bases, not 99
     assert part.attrs["surfels"] == whole.attrs["surfels"] == 80
@@ -293,7 +297,7 @@ def test_choose_size__is_a_range_if_the_sample_is_ambiguous():
     error, low, _, sizes = choose_size(
         errors, (1, 2, 3, 4), tolerance=0.01, rng=np.random.default_rng(0)
     )
-    assert error[1] < 1 + basis_size.STEP
+    assert error[1] < 1 + basis.STEP
     assert low[1] == 1.0
     assert sizes == (2, 3)
     assert size_status(*sizes).startswith("2 to 3: the sample does not distinguish")
