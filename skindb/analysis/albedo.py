@@ -374,27 +374,15 @@ def plot_albedo(
     width = 8
     centres = edges[:-1].reshape(-1, width).mean(axis=1)
     if table is not None and table.attrs["group_by"]:
-        counts = (
-            table[variables.GROUP_ALBEDO_COUNT]
-            .sel(region=region)
-            .max("channel")
-            .values.tolist()
-        )
-        names = [
-            f"{name} (n = {n})"
-            for name, n in zip(table["group"].values.tolist(), counts, strict=True)
-        ]
-        lines = (
-            table[variables.GROUP_HISTOGRAM].sel(region=region).isel(axis=axis).values
-        )
+        part = table.sel(region=region)
+        counts = part[variables.GROUP_ALBEDO_COUNT].max("channel").values
+        groups = zip(part["group"].values.tolist(), counts.tolist(), strict=True)
+        names = [f"{name} (n = {n})" for name, n in groups]
+        lines = part[variables.GROUP_HISTOGRAM].isel(axis=axis).values
     else:
-        names = [str(take) for take in histograms["take"].values]
-        lines = (
-            histograms[variables.ALBEDO_HISTOGRAM]
-            .sel(region=region)
-            .isel(axis=axis)
-            .values
-        )
+        part = histograms.sel(region=region)
+        names = [str(take) for take in part["take"].values]
+        lines = part[variables.ALBEDO_HISTOGRAM].isel(axis=axis).values
     ax.set_prop_cycle(color=plots.CYCLE)
     for i, (name, fractions) in enumerate(zip(names, lines, strict=True)):
         style: dict[str, Any] = (

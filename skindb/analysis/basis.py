@@ -123,19 +123,7 @@ def population_basis(
         require_same_fit(cohort)
     names = same_dictionary(cohort)
     takes = [str(take) for take in cohort["take"].values]
-    part = max(1, MAX_START_SURFELS // len(takes))
-    starts = each_take(
-        _fitted_weights,
-        cohort.isel(surfel=slice(2 * part)),
-        [variables.DICTIONARY_WEIGHT],
-    )
-    if lost := [
-        take for take, weights in zip(takes, starts, strict=True) if not len(weights)
-    ]:
-        rule = "a take must have fitted surfels"
-        cure = "fit it again, or exclude it"
-        raise InputError(Fault(f"take {take}", rule, "none", cure) for take in lost)
-    X = np.concatenate([rng.permutation(weights)[:part] for weights in starts])
+    X = _start_weights(cohort, takes, rng)
     [metric] = each_item(brdf_metric, [tables])
     start = nmf(
         X,
@@ -169,6 +157,27 @@ def population_basis(
             "skipped": skipped_takes(cohort),
         },
     )
+
+
+def _start_weights(
+    cohort: xr.Dataset, takes: Sequence[str], rng: np.random.Generator
+) -> Array:
+    """Weights (n, m) of some surfels of every take; raises `InputError` for takes without
+    fitted surfels.
+    """
+    part = max(1, MAX_START_SURFELS // len(takes))
+    sample = cohort.isel(surfel=slice(2 * part))
+    starts = each_take(_fitted_weights, sample, [variables.DICTIONARY_WEIGHT])
+    rule = "a take must have fitted surfels"
+    cure = "fit it again, or exclude it"
+    faults = [
+        Fault(f"take {take}", rule, "none", cure)
+        for take, weights in zip(takes, starts, strict=True)
+        if not len(weights)
+    ]
+    if faults:
+        raise InputError(faults)
+    return np.concatenate([rng.permutation(weights)[:part] for weights in starts])
 
 
 def _mean(take: xr.Dataset) -> Array:

@@ -145,6 +145,9 @@ def region_tables(fitted: xr.Dataset, masks: Mapping[str, Mask]) -> xr.Dataset:
         # model errors of neighbouring surfels are correlated: averaging does not reduce them
         model_error = np.sqrt(np.maximum(total[inside] ** 2 - noise[inside] ** 2, 0))
         common = _weighted_mean(model_error, model_error, weight)[0]
+        gloss = shine[inside]
+        gloss_mean, _ = _weighted_mean(gloss, gloss, weight)
+        _, gloss_error = _weighted_mean(gloss, shine_error[inside], weight)
         rows.append(
             {
                 variables.REGION_SURFELS: int(inside.sum()),
@@ -157,12 +160,8 @@ def region_tables(fitted: xr.Dataset, masks: Mapping[str, Mask]) -> xr.Dataset:
                 variables.REGION_DIFFUSE_COVARIANCE: _covariance(
                     colour[inside], weight
                 ),
-                variables.REGION_SURFACE_REFLECTANCE: _weighted_mean(
-                    shine[inside], shine[inside], weight
-                )[0],
-                variables.REGION_SURFACE_REFLECTANCE_ERROR: _weighted_mean(
-                    shine[inside], shine_error[inside], weight
-                )[1],
+                variables.REGION_SURFACE_REFLECTANCE: gloss_mean,
+                variables.REGION_SURFACE_REFLECTANCE_ERROR: gloss_error,
             }
         )
     tables = {

@@ -264,7 +264,9 @@ def test_edit_texture__whole_spreads_the_beard(studied):
     _, texture = studied
     shift = shift_of(texture, ["M1", "M3", "M5", "M7"], ["F0", "F2", "F4", "F6"])
     maps = maps_of({"X": face(50)}).isel(take=0)
-    edit = edit_texture(maps, shift, texture, whole=True, rng=np.random.default_rng(0))
+    edit = edit_texture(
+        maps, shift, texture, as_one_region=True, rng=np.random.default_rng(0)
+    )
     assert np.abs(edit.change[BEARD].mean()) < 0.5 * np.abs(
         np.log(1 - stubble(50, 0.7))[BEARD].mean()
     )
