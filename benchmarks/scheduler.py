@@ -76,7 +76,7 @@ def fit_call(
     return partial(
         workflow.fit_with,
         db,
-        given=GIVEN,
+        changes=GIVEN,
         refit=False,
         dictionary=dictionary,
         explain=False,

@@ -101,7 +101,7 @@ def ingested(db: Any, folder: Path) -> Any:
 
 def fitted(db: Any, take: str) -> dict[str, Any]:
     """Fit a take; returns the bytes read (twice the capture) and written."""
-    record = workflow.fit_with(db, take, given=GIVEN)
+    record = workflow.fit_with(db, take, changes=GIVEN)
     return {
         "take": take,
         "read": 2 * db.record("capture", take).bytes,

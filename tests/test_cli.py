@@ -679,11 +679,11 @@ def test_fault_lines__many_of_one_rule_are_folded():
     faults = [Fault(f"frame {i}", "must exist", "nothing") for i in range(30)] + [
         Fault("mesh", "is closed", "open")
     ]
-    lines = fault_lines(faults, every=False)
+    lines = fault_lines(faults, unlimited=False)
     assert len(lines) == 12
     assert "is closed" in lines[-2]
     assert lines[-1] == "and 20 more: must exist (-v lists them)"
-    assert len(fault_lines(faults, every=True)) == 31
+    assert len(fault_lines(faults, unlimited=True)) == 31
 
 
 @pytest.mark.slow

@@ -76,13 +76,13 @@ def test_options_of__calls_with_the_record_or_with_what_was_given():
         calls.append(parameters)
 
     @click.command()
-    @options_of(FitParameters, only_given=True)
-    def given(given):
-        calls.append(given)
+    @options_of(FitParameters, only_set=True)
+    def changed(changes):
+        calls.append(changes)
 
     assert CliRunner().invoke(record, ["--lights", "20", "--subsurface"]).exit_code == 0
-    assert CliRunner().invoke(given, ["--eta", "1.4", "--light-gains"]).exit_code == 0
-    assert CliRunner().invoke(given, ["--eta", "2.5"]).exit_code == 2
+    assert CliRunner().invoke(changed, ["--eta", "1.4", "--light-gains"]).exit_code == 0
+    assert CliRunner().invoke(changed, ["--eta", "2.5"]).exit_code == 2
     assert calls == [
         SimulationParameters(lights=20, subsurface=True),
         {"eta": 1.4, "light_gains": True},

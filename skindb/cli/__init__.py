@@ -153,7 +153,10 @@ def main() -> None:
             cli.main(standalone_mode=False)
     except InputError as error:
         echo(
-            *(f"skindb: {line}" for line in fault_lines(error.faults, every=verbose)),
+            *(
+                f"skindb: {line}"
+                for line in fault_lines(error.faults, unlimited=verbose)
+            ),
             err=True,
         )
         _give_up(1, error.faults, getattr(error, "done", None))

@@ -47,7 +47,7 @@ MIN_FITTED_FRACTION = 0.5
 @click.command()
 @DB
 @click.argument("takes", metavar="[TAKE...]", nargs=-1)
-@options_of(FitParameters, only_given=True)
+@options_of(FitParameters, only_set=True)
 @DICTIONARY
 @click.option(
     "--refit",
@@ -71,7 +71,7 @@ def fit(
     wait: float,
     workers: int,
     scheduler: str | None,
-    given: dict[str, Any],
+    changes: dict[str, Any],
 ) -> None:
     """Fit the named takes, or all without a current model.
 
@@ -85,13 +85,13 @@ def fit(
     # its faults are reported once, before the fits start
     workflow.dictionary_at(dictionary)
     chosen = takes or workflow.takes_to_fit(
-        database, refit=refit, given=given, dictionary=dictionary
+        database, refit=refit, changes=changes, dictionary=dictionary
     )
     for take in [] if takes else workflow.takes_without_consent(database, "fit"):
         echo(f"skipped: {take}: its consent does not cover fits", err=True)
     how = partial(
         workflow.fit_with,
-        given=given,
+        changes=changes,
         refit=refit,
         dictionary=dictionary,
         explain=explain,

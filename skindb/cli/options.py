@@ -105,12 +105,12 @@ Command = Callable[..., Any]
 
 
 def options_of(
-    record: type[Any], *, only_given: bool = False
+    record: type[Any], *, only_set: bool = False
 ) -> Callable[[Command], Command]:
     """Add the options of the fields of a parameter record to a command.
 
-    The command is called with `parameters`, a record; or, if `only_given`, with `given`,
-    a dictionary of the options that the user gave.
+    The command is called with `parameters`, a record; or, if `only_set`, with `changes`,
+    a dictionary of those that the user set.
     """
     hints = get_type_hints(record)
     specs = fields(record)
@@ -119,15 +119,15 @@ def options_of(
         @wraps(command)
         def with_record(**values: Any) -> Any:
             chosen = {spec.name: values.pop(spec.name) for spec in specs}
-            if only_given:
-                given = {k: value for k, value in chosen.items() if value is not None}
-                return command(given=given, **values)
+            if only_set:
+                changes = {k: value for k, value in chosen.items() if value is not None}
+                return command(changes=changes, **values)
             return command(parameters=record(**chosen), **values)
 
         decorated: Command = with_record
         for spec in reversed(specs):
             limits = option_of(record, spec.name)
-            add = _click_option(spec, hints[spec.name], limits, unset=only_given)
+            add = _click_option(spec, hints[spec.name], limits, unset=only_set)
             decorated = add(decorated)
         return decorated
 

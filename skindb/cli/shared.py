@@ -176,7 +176,7 @@ def each_take(
     # so that the running take is known
     in_turn = scheduler is None and (workers == 1 or len(takes) == 1)
     following = iter([*map(str, takes[1:]), ""]) if in_turn else repeat("")
-    progress.begin_takes(len(takes), first=str(takes[0]) if takes and in_turn else "")
+    progress.begin_takes(len(takes), take=str(takes[0]) if takes and in_turn else "")
     try:
         for outcome in _outcomes(function, takes, workers, scheduler, shared, progress):
             name = str(outcome.take)
@@ -226,17 +226,21 @@ def _placed(fault: Fault, item: str) -> Fault:
     )
 
 
-def fault_lines(faults: Iterable[Fault], *, every: bool, most: int = 10) -> list[str]:
-    """One line for each fault; if more than `most` break the same rule, the others are
-    only counted unless `every`.
+def fault_lines(
+    faults: Iterable[Fault], *, unlimited: bool, limit: int = 10
+) -> list[str]:
+    """One line for each fault; if more than `limit` break the same rule, the others are
+    only counted unless `unlimited`.
     """
     lines = []
     count = Counter[str]()
     for fault in faults:
         count[fault.rule] += 1
-        if every or count[fault.rule] <= most:
+        if unlimited or count[fault.rule] <= limit:
             lines.append(str(fault))
-    folded = {rule: n - most for rule, n in count.items() if n > most and not every}
+    folded = {
+        rule: n - limit for rule, n in count.items() if n > limit and not unlimited
+    }
     return lines + [
         f"and {n} more: {rule} (-v lists them)" for rule, n in folded.items()
     ]

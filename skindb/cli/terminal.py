@@ -27,9 +27,9 @@ def echo(*lines: str, err: bool = False) -> None:
         click.echo(escaped(line), err=err)
 
 
-def redraw(text: str, *, last: bool) -> None:
-    """Print over the present line of standard error; `last` begins a new one afterwards."""
-    click.echo(f"\r{escaped(text)}", nl=last, err=True)
+def redraw(text: str, *, ends_line: bool) -> None:
+    """Print over the present line of standard error; `ends_line` begins a new one afterwards."""
+    click.echo(f"\r{escaped(text)}", nl=ends_line, err=True)
 
 
 def confirm(question: str) -> bool:
@@ -90,14 +90,14 @@ class Progress:
             self.last = now
             self._bar(stage, done, total)
 
-    def begin_takes(self, count: int, *, first: str = "") -> None:
-        """Start to count finished takes; `first` is the take that is processed now, if
+    def begin_takes(self, count: int, *, take: str = "") -> None:
+        """Start to count finished takes; `take` is the one that is processed now, if
         it is known.
         """
         self.begin = time.monotonic()
         self.takes_done = 0
         self.takes_total = count
-        self.take = first
+        self.take = take
 
     def end_take(self, take: str, *, failed: bool, following: str = "") -> None:
         """Report that a take is finished; `following` is the take that is processed
@@ -135,7 +135,7 @@ class Progress:
         )
         redraw(
             f"{prefix + stage:<44.44} [{bar:<24}] {done}/{total} {seconds_left or 0:4.0f} s left",
-            last=done >= total,
+            ends_line=done >= total,
         )
 
     def _line(self, stage: str, done: int, total: int) -> None:

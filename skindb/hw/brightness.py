@@ -135,7 +135,7 @@ def failed_lights(
         light: picture for light, picture in pictures.items() if levels.has(picture)
     }
     lit = dict(zip(taken, levels.of(list(taken.values())), strict=True))
-    failed = _darker_lights(lit, dome, least=0.0 if levels.linear else MIN_LEVEL)
+    failed = _darker_lights(lit, dome, lowest=0.0 if levels.linear else MIN_LEVEL)
     readable = [level for level in lit.values() if not np.isnan(level)]
     last_step = len(schedule.steps) - 1
     witness = Picture(str(dome["cameras"][0]["id"]), last_step)
@@ -222,7 +222,7 @@ def _light_pictures(
 
 
 def _darker_lights(
-    lit: Mapping[str, float], dome: Mapping[str, Any], *, least: float
+    lit: Mapping[str, float], dome: Mapping[str, Any], *, lowest: float
 ) -> dict[str, str]:
     """Lights whose pictures are black or much darker than those of their neighbours."""
     failed = {
@@ -231,7 +231,7 @@ def _darker_lights(
         if np.isnan(level)
     }
     level = {name: value for name, value in lit.items() if name not in failed}
-    if level and not np.median(list(level.values())) > least:
+    if level and not np.median(list(level.values())) > lowest:
         return failed | dict.fromkeys(
             level, "its picture is black, like those of most lights"
         )

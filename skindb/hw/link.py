@@ -148,39 +148,39 @@ class Lines:
 
 @dataclass(frozen=True)
 class Range:
-    """Numbers from `least` to `most`."""
+    """Numbers from `lowest` to `highest`."""
 
-    least: float
-    most: float
+    lowest: float
+    highest: float
     unit: str = ""
 
     def __str__(self) -> str:
         """Describe the range in words."""
-        return f"a number from {self.least:,.12g} to {self.most:,.12g} {self.unit}".rstrip()
+        return f"a number from {self.lowest:,.12g} to {self.highest:,.12g} {self.unit}".rstrip()
 
     def parse(self, text: str) -> float:
         """The number; raises ValueError if the text is not a finite number in this range."""
         number = float(text) if NUMBER.fullmatch(text) else math.nan
-        if not self.least <= number <= self.most:
+        if not self.lowest <= number <= self.highest:
             raise ValueError(text)
         return number
 
 
 @dataclass(frozen=True)
 class Count:
-    """Whole numbers from `least` to `most`."""
+    """Whole numbers from `lowest` to `highest`."""
 
-    least: int
-    most: int
+    lowest: int
+    highest: int
 
     def __str__(self) -> str:
         """Describe the numbers in words."""
-        return f"a whole number from {self.least} to {self.most}"
+        return f"a whole number from {self.lowest} to {self.highest}"
 
     def parse(self, text: str) -> int:
         """The number; raises ValueError if the text is not one of these numbers."""
-        number = int(text) if INTEGER.fullmatch(text) else self.least - 1
-        if not self.least <= number <= self.most:
+        number = int(text) if INTEGER.fullmatch(text) else self.lowest - 1
+        if not self.lowest <= number <= self.highest:
             raise ValueError(text)
         return number
 

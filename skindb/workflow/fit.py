@@ -152,7 +152,7 @@ def fit_with(
     db: Database,
     take: str,
     *,
-    given: Mapping[str, Any],
+    changes: Mapping[str, Any],
     refit: bool = False,
     dictionary: Path | None = None,
     explain: bool = False,
@@ -165,12 +165,12 @@ def fit_with(
     ----------
     db, take, wait, progress
         See `fit_take`.
-    given, refit, dictionary
+    changes, refit, dictionary
         See `parameters_of`.
     explain
         Only return the take and what its fit would skip.
     """
-    parameters = parameters_of(db, take, given, refit=refit, dictionary=dictionary)
+    parameters = parameters_of(db, take, changes, refit=refit, dictionary=dictionary)
     brdfs = dictionary_at(dictionary)
     if explain:
         return take, plan_take(db, take, parameters, dictionary=brdfs).explain()
@@ -200,7 +200,7 @@ def takes_to_fit(
     db: Database,
     *,
     refit: bool = False,
-    given: Mapping[str, Any] | None = None,
+    changes: Mapping[str, Any] | None = None,
     dictionary: Path | None = None,
 ) -> list[str]:
     """The takes whose model is missing or out of date.
@@ -212,10 +212,10 @@ def takes_to_fit(
     refit
         Without it: takes without a model of their newest capture. With it also takes
         whose model would change: it was made by other code, with other parameters than
-        its own with `given` put in, or with another dictionary. An interrupted refit
+        its own with `changes` put in, or with another dictionary. An interrupted refit
         therefore continues with the takes that are not done. Takes whose consent does
         not cover fits are skipped, see `takes_without_consent`.
-    given, dictionary
+    changes, dictionary
         As in `parameters_of`.
     """
     takes = []
@@ -225,7 +225,7 @@ def takes_to_fit(
                 continue
             record = current_model(db, take)
             if record is None or (
-                refit and not _up_to_date(db, record, given or {}, dictionary)
+                refit and not _up_to_date(db, record, changes or {}, dictionary)
             ):
                 takes.append(take)
         except InputError:  # its fit reports the reason, and other takes continue
@@ -247,7 +247,7 @@ def takes_without_consent(db: Database, scope: str) -> list[str]:
 def parameters_of(
     db: Database,
     take: str,
-    given: Mapping[str, Any],
+    changes: Mapping[str, Any],
     *,
     refit: bool,
     dictionary: Path | None = None,
@@ -258,7 +258,7 @@ def parameters_of(
     ----------
     db, take
         Which take.
-    given
+    changes
         Parameters of `FitParameters` that the user gave.
     refit
         The others are those of the take's newest model if it has one, and the default otherwise.
@@ -271,14 +271,14 @@ def parameters_of(
         In a refit of a model that was made with a dictionary from files, if none is given.
     """
     if not refit or not db.has("model", take):
-        return FitParameters(**given)
+        return FitParameters(**changes)
     model = db.record("model", take).provenance
     if dictionary is None and model.get("dictionary", EMBEDDED) != EMBEDDED:
         rule = "a refit uses the dictionary of the model"
         finding = f"no dictionary for a model made with {model['dictionary']!r}"
         cure = "name it with --dictionary, or fit without --refit"
         raise InputError(Fault(take, rule, finding, cure))
-    return replace(FitParameters.of({"parameters": model["requested"]}), **given)
+    return replace(FitParameters.of({"parameters": model["requested"]}), **changes)
 
 
 def current_model(db: Database, take: str) -> Record | None:
@@ -307,11 +307,11 @@ def _read(path: Path, _: tuple[tuple[str, int], ...]) -> Dictionary:
 
 
 def _up_to_date(
-    db: Database, record: Record, given: Mapping[str, Any], dictionary: Path | None
+    db: Database, record: Record, changes: Mapping[str, Any], dictionary: Path | None
 ) -> bool:
     """Whether a fit with these parameters and this code would give the same model."""
     parameters = parameters_of(
-        db, record.take, given, refit=True, dictionary=dictionary
+        db, record.take, changes, refit=True, dictionary=dictionary
     )
     capture = db.record("capture", record.take)
     brdfs = dictionary_at(dictionary)

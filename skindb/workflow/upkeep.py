@@ -248,7 +248,9 @@ def _fit_again(
     stale: Sequence[Refreshed],
 ) -> list[Refreshed]:
     stale_models = {result.take: result for result in stale}
-    call = partial(fit_with, db, given={}, refit=True, dictionary=dictionary, wait=wait)
+    call = partial(
+        fit_with, db, changes={}, refit=True, dictionary=dictionary, wait=wait
+    )
     results = []
     for outcome in map_takes(call, list(stale_models), **resources, shared=db.folder):
         record = outcome.value if isinstance(outcome.value, Record) else None

@@ -342,7 +342,7 @@ def _filled(root, captures, **where):
         )
     )
     takes = db.takes("capture")[:: -1 if "client" in where else 1]
-    list(results_of(map_takes(partial(fit_with, db, given=GIVEN), takes, **where)))
+    list(results_of(map_takes(partial(fit_with, db, changes=GIVEN), takes, **where)))
     register_takes(db, **where)
     with computing_on(where.get("client"), db.root):
         brdf(db)

@@ -122,12 +122,12 @@ def test_takes_to_fit__a_refit_continues_with_what_is_not_done(three):
     # takes whose model would not change are not fitted again
     assert takes_to_fit(three, refit=True) == ["S3"]
     given = {"eta": 1.4}
-    assert takes_to_fit(three, refit=True, given=given) == ["S1", "S2", "S3"]
+    assert takes_to_fit(three, refit=True, changes=given) == ["S1", "S2", "S3"]
     own = parameters_of(three, "S2", given, refit=True)
     assert (own.k, own.rank, own.eta) == (3, 6, 1.4)
     assert parameters_of(three, "S3", given, refit=True) == FitParameters(eta=1.4)
     fit_take(three, "S2", own)  # and here the run is interrupted
-    assert takes_to_fit(three, refit=True, given=given) == ["S1", "S3"]
+    assert takes_to_fit(three, refit=True, changes=given) == ["S1", "S3"]
     assert parameters_of(three, "S2", {"k": 5}, refit=False) == FitParameters(k=5)
 
 
@@ -172,7 +172,7 @@ def test_takes_to_fit__a_model_that_cannot_be_refitted_stops_no_other(
     three, skin, small_dictionary
 ):
     fit_take(three, "S1", SMALL, dictionary=small_dictionary)
-    assert takes_to_fit(three, refit=True, given={"eta": 1.4}) == ["S1", "S2", "S3"]
+    assert takes_to_fit(three, refit=True, changes={"eta": 1.4}) == ["S1", "S2", "S3"]
 
 
 def test_takes_to_fit__dictionaries_are_compared_by_their_values(
