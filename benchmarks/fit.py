@@ -116,10 +116,15 @@ def _change(old: xr.Dataset, new: xr.Dataset, name: str, error: str) -> np.ndarr
     return np.asarray(np.abs(change) / old[error].values)
 
 
+def _sides(results: Mapping[str, Any]) -> str:
+    """The names of the sides, if there are two."""
+    return " " + ", ".join(results) if len(results) > 1 else ""
+
+
 def stage_table(fits: dict[str, list[dict[str, Any]]]) -> list[str]:
     """CPU and wall time of every stage of each side, and the peak of memory."""
-    sides = ", ".join(fits)
-    lines = [f"| stage | CPU {sides} [s] | wall {sides} [s] |", "|---|---|---|"]
+    sides = _sides(fits)
+    lines = [f"| stage | CPU{sides} [s] | wall{sides} [s] |", "|---|---|---|"]
     for stage in fits["after"][0]["stages"]:
         cells = [
             ", ".join(
@@ -134,7 +139,7 @@ def stage_table(fits: dict[str, list[dict[str, Any]]]) -> list[str]:
 
 def part_table(parts: dict[str, dict[str, float]]) -> list[str]:
     """CPU time of every part of a fit of each side."""
-    lines = [f"| part, one thread | {', '.join(parts)} [us per surfel] |", "|---|---|"]
+    lines = [f"| part, one thread | CPU{_sides(parts)} [us per surfel] |", "|---|---|"]
     for name in parts["after"]:
         times = ", ".join(f"{part[name]:.1f}" for part in parts.values())
         lines += [f"| {name} | {times} |"]

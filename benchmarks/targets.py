@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
+from skindb.bench.surface import spiral
 from skindb.fit import estimate_diffuse_reflectance, fit_surface, reduce_basis, refit
 from skindb.optics.angles import half_difference
 from skindb.reflectance.dictionary import embedded_dictionary
@@ -109,8 +110,8 @@ def sampled(target: Target, *, surfels: int, noise: float, seed: int = 0) -> xr.
     the same geometry.
     """
     rng = np.random.default_rng(seed)
-    light = _spiral(150, 1000.0, 1.0)
-    camera = _spiral(16, 1200.0, 0.8)
+    light = spiral(150, 1000.0, 1.0)
+    camera = spiral(16, 1200.0, 0.8)
     normal = rng.normal(size=(surfels, 3)) * [0.5, 0.5, 0] + [0, 0, 1]
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     sample = np.full((surfels, len(light), len(camera), 3), np.nan, np.float16)
@@ -135,13 +136,6 @@ def sampled(target: Target, *, surfels: int, noise: float, seed: int = 0) -> xr.
     }
     skin = dataset(ball)
     return skin.merge(estimate_diffuse_reflectance(skin)[["diffuse_reflectance"]])
-
-
-def _spiral(count, radius, share):
-    z = 1 - (np.arange(count) + 0.5) / count * share
-    phi = np.pi * (1 + 5**0.5) * np.arange(count)
-    s = np.sqrt(1 - z * z)
-    return radius * np.stack([s * np.cos(phi), s * np.sin(phi), z], axis=-1)
 
 
 def _cell(fitted, linear, perceptual):

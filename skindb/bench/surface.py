@@ -83,7 +83,7 @@ class Strip:
         return lookup(table, *half_difference(*(d[part] for d in self.directions)))
 
 
-def _spiral(count: int, radius: float, fraction: float) -> Array:
+def spiral(count: int, radius: float, fraction: float) -> Array:
     """Points (count, 3) spread evenly over the front `fraction` of a sphere."""
     z = 1 - (np.arange(count) + 0.5) / count * fraction
     phi = np.pi * (1 + 5**0.5) * np.arange(count)
@@ -107,8 +107,8 @@ def strip(
     samples are hidden.
     """
     rng = np.random.default_rng(seed)
-    light = _spiral(150, 1000, 1.0)
-    camera = _spiral(16, 1200, 0.8)
+    light = spiral(150, 1000, 1.0)
+    camera = spiral(16, 1200, 0.8)
     side = int(np.sqrt(surfels))
     a = 0.9 * (np.arange(surfels) // side) / side - 0.45
     b = 0.9 * (np.arange(surfels) % side) / side - 0.45
