@@ -13,6 +13,7 @@ the diffuse and the surface part are estimated with the public functions.
 from __future__ import annotations
 
 import csv
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -133,6 +134,7 @@ def sampled(target: Target, *, surfels: int, noise: float, seed: int = 0) -> xr.
         "shading_normal": normal,
         "light_position": light,
         "camera_position": camera,
+        "noise_floor": 0.0,
     }
     skin = dataset(ball)
     return skin.merge(estimate_diffuse_reflectance(skin)[["diffuse_reflectance"]])
@@ -214,4 +216,8 @@ def main(
         name: sampled(target, surfels=surfels, noise=noise)
         for name, target in read_targets(path, only).items()
     }
+    if not samples:
+        sys.exit(
+            f"no target of these files has a name that contains {' or '.join(only)}"
+        )
     print_sizes(samples, print_modes(samples))

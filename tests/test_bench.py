@@ -5,15 +5,21 @@ from __future__ import annotations
 import json
 import math
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 
 from skindb.bench import KERNELS, run
 from skindb.bench.curve import Curve, Point
+from skindb.bench.photometry import model_samples
 from skindb.bench.subsurface import transport_curves
 from skindb.cli import cli
+from skindb.fit import refit
 from skindb.optics.diffusion import dipole_profile
 from skindb.optics.transport import transport_profile
+from skindb.reflectance.separation import surface_lobes
+from skindb.reflectance.tables import stored_brdf
+from skindb.schema import dataset, label
 
 
 def test_kernels__are_those_that_are_measured():
@@ -108,3 +114,14 @@ def test_transport_curves__distances_are_mean_free_paths():
         )
         # noise 8 %
         assert point.details[f"at_{r:g}"] == pytest.approx(float(ratio) - 1, abs=0.25)
+
+
+def test_model_samples__have_what_fits_of_surfaces_read():
+    """`benchmarks/stated_errors.py` refits them."""
+    size = {"surfels": 2, "lights": 12, "cameras": 2}
+    skin = model_samples(np.random.default_rng(0), **size, noise=0.01, gloss=0.1)
+    diffuse = label("diffuse_reflectance", skin.diffuse)
+    table, _ = surface_lobes()
+    basis = dataset({"basis_brdf": stored_brdf(table[..., :1])})
+    refitted = refit(skin.with_normals.assign(diffuse_reflectance=diffuse), basis=basis)
+    assert refitted["basis_weight"].shape == (2, 1)

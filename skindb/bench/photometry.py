@@ -103,6 +103,7 @@ def model_samples(
         variables.LIGHT_POSITION: light,
         variables.LIGHT_DISC_RADIUS: np.zeros(lights),
         variables.CAMERA_POSITION: camera,
+        variables.NOISE_FLOOR: 0.0,
     }
     lumitexels = dataset(values, coords={"channel": ["R", "G", "B"]})
     return ModelSamples(lumitexels, normal, diffuse, weight)
