@@ -151,6 +151,15 @@ def fitted_database(fitted_takes, tmp_path):
     return skindb.open(str(shutil.copytree(fitted_takes, tmp_path / "db")))
 
 
+@pytest.fixture(scope="module")
+def browser():
+    """A headless browser, of one file only: until it is closed, `asyncio` is in use."""
+    from browser_page import started_browser
+
+    with started_browser() as browser:
+        yield browser
+
+
 @pytest.fixture(scope="session")
 def s3_address():
     """Function that returns the address of a kind of server, which is started at its first use."""

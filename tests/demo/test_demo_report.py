@@ -6,7 +6,6 @@ import base64
 import csv
 import io
 import re
-import shutil
 
 import numpy as np
 import pytest
@@ -23,7 +22,6 @@ from planted_results import (
 from skindb.demo.report import status_sums, write_report
 from skindb.schema import FitStatus
 
-BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
 MAX_HEIGHT = 6000  # px at a width of 400 px, as on a telephone
 
 
@@ -39,19 +37,6 @@ def report(results, tmp_path_factory):
         results,
         progress=lambda *_: None,
     )
-
-
-@pytest.fixture(scope="module")
-def browser():
-    playwright = pytest.importorskip(
-        "playwright.sync_api", reason="playwright is not installed"
-    )
-    if BROWSER is None:
-        pytest.skip("there is no Chromium")
-    with playwright.sync_playwright() as running:
-        found = running.chromium.launch(executable_path=BROWSER, args=["--no-sandbox"])
-        yield found
-        found.close()
 
 
 def saved(text, name):

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-import shutil
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import numpy as np
 import pytest
 import trimesh
+from browser_page import opened
 from page_session import Session, running
-from waiting import PATIENCE_SECONDS, wait_until
+from waiting import wait_until
 
 from skindb.format.folder import read_capture
 from skindb.geometry.scan import Crop
@@ -18,22 +18,7 @@ from skindb.view.landmarks import landmark_server, landmark_task
 from skindb.virtual.face import FaceShape
 from skindb.virtual.head import parametric_head
 
-BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
-FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 MAX_CLICK_ERROR_MM = 0.5  # about a pixel; measured: median 0.02 mm
-
-
-@pytest.fixture(scope="module")
-def browser():
-    playwright = pytest.importorskip(
-        "playwright.sync_api", reason="playwright is not installed"
-    )
-    if BROWSER is None:
-        pytest.skip("there is no Chromium")
-    with playwright.sync_playwright() as running:
-        found = running.chromium.launch(executable_path=BROWSER, args=FLAGS)
-        yield found
-        found.close()
 
 
 @pytest.fixture(scope="module")
@@ -68,21 +53,6 @@ def served(folder):
     )
 
 
-def opened(browser, address, *, width=860, height=500):
-    page = browser.new_page(viewport={"width": width, "height": height})
-    page.set_default_timeout(1000 * PATIENCE_SECONDS)
-    page.problems = []
-    page.on(
-        "console",
-        lambda said: page.problems.append(said.text) if said.type == "error" else None,
-    )
-    page.on("pageerror", lambda error: page.problems.append(str(error)))
-    page.goto(address)
-    page.evaluate("skindb.ready")
-    assert "token" not in page.url
-    return page
-
-
 def on_canvas(page, place):
     x, y = page.evaluate("(p) => skindb.project(p)", [float(c) for c in place])
     box = page.locator("#canvas").bounding_box()
@@ -102,7 +72,7 @@ def status(page, text):
 
 @pytest.mark.slow
 def test_page__a_click_sets_the_next_point_where_it_is(browser, address, head):
-    page = opened(browser, address)
+    page = opened(browser, address, width=860, height=500)
     names = page.evaluate("Object.keys(skindb.state.names)")
     assert {*names} == {*head.landmarks}
     for name in names:
@@ -144,7 +114,7 @@ def write_capture(folder):
 @pytest.mark.slow
 def test_page__saves_what_ingest_reads(browser, address, head, tmp_path):
     out = tmp_path / "landmarks.json"
-    page = opened(browser, address)
+    page = opened(browser, address, width=860, height=500)
     page.mouse.click(*on_canvas(page, head.landmarks["forehead_centre"]))
     page.get_by_role("button", name="Save", exact=True).click()
     status(page, "Nothing is saved yet")
@@ -193,7 +163,7 @@ def test_page__reads_an_existing_file_and_asks_before_it_is_replaced(
     out = tmp_path / "landmarks.json"
     out.write_text(json.dumps({name: p.tolist() for name, p in head.landmarks.items()}))
     with served(tmp_path) as again:
-        page = opened(browser, again.address)
+        page = opened(browser, again.address, width=860, height=500)
         assert page.locator("#count").inner_text() == "20 of 20 points are set."
         before = out.read_bytes()
         page.get_by_role("button", name="Remove chin").click()
@@ -209,7 +179,7 @@ def test_page__reads_an_existing_file_and_asks_before_it_is_replaced(
 
 @pytest.mark.slow
 def test_page__points_are_moved_removed_undone_and_accepted(browser, address, head):
-    page = opened(browser, address)
+    page = opened(browser, address, width=860, height=500)
     start = on_canvas(page, head.landmarks["nasion"])
     page.get_by_role("button", name="nasion", exact=True).click()
     page.mouse.click(*start)
@@ -248,7 +218,7 @@ def test_page__points_are_moved_removed_undone_and_accepted(browser, address, he
 
 @pytest.mark.slow
 def test_page__works_with_keys_and_shows_the_scans_colours(browser, address):
-    page = opened(browser, address)
+    page = opened(browser, address, width=860, height=500)
     canvas = page.locator("#canvas")
     redness = """() => {
         skindb.draw();
@@ -342,7 +312,7 @@ FOREIGN_REQUEST = """async ([address, options]) => {
 def test_landmark_server__a_page_of_another_server_in_the_same_browser_gets_nothing(
     server, browser, tmp_path
 ):
-    own = opened(browser, server.address)
+    own = opened(browser, server.address, width=860, height=500)
     cookies = own.context.cookies(
         f"http://127.0.0.1:{server.server_address[1]}{server.root}"
     )
@@ -387,7 +357,7 @@ def test_landmark_page__names_are_data(server, browser, tmp_path):
         "$script </script><script>document.title = 'x'</script> \u2028 ${out} {about}"
     )
     (tmp_path / "landmarks.json").write_text(json.dumps({name: [0, 0, 60]}))
-    page = opened(browser, server.address)
+    page = opened(browser, server.address, width=860, height=500)
     assert page.title() == "Landmarks of scan.ply"
     assert page.evaluate("Object.keys(skindb.state.points)") == [name]
     assert not page.problems

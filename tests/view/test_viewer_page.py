@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import base64
-import shutil
 from dataclasses import replace
 from functools import partial
 
 import imagecodecs
 import numpy as np
 import pytest
+from browser_page import opened
 from page_session import running
 from scipy.ndimage import binary_erosion
 from small_face import LIGHTS, small_face
-from waiting import PATIENCE_SECONDS
 
 from skindb.reflectance.tables import kernel_tables, stored_brdf
 from skindb.render.image import decode_srgb
@@ -47,23 +46,8 @@ from skindb.view.page import (
     write_page,
 )
 
-BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
-FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 WIDTH = 256  # px of the canvas that is compared
 PICTURE = "(skindb.draw(), document.getElementById('canvas').toDataURL('image/png'))"
-
-
-@pytest.fixture(scope="module")
-def browser():
-    playwright = pytest.importorskip(
-        "playwright.sync_api", reason="playwright is not installed"
-    )
-    if BROWSER is None:
-        pytest.skip("there is no Chromium")
-    with playwright.sync_playwright() as running:
-        found = running.chromium.launch(executable_path=BROWSER, args=FLAGS)
-        yield found
-        found.close()
 
 
 @pytest.fixture(scope="module")
@@ -84,20 +68,6 @@ def page_file(model, tmp_path_factory):
 
 
 # small: every pixel is computed on the CPU
-def opened(browser, address, *, width=620, height=320):
-    page = browser.new_page(viewport={"width": width, "height": height})
-    page.set_default_timeout(1000 * PATIENCE_SECONDS)
-    page.problems = []
-    page.on(
-        "console",
-        lambda said: page.problems.append(said.text) if said.type == "error" else None,
-    )
-    page.on("pageerror", lambda error: page.problems.append(str(error)))
-    page.goto(address)
-    page.evaluate("skindb.ready")
-    return page
-
-
 def pixels(page):
     """Linear values (h, w, 3) of the canvas."""
     return decoded(page.evaluate(f"(skindb.stop(), {PICTURE})"))
