@@ -158,13 +158,11 @@ def refresh(
 
 def stale_as_json(result: Refreshed) -> dict[str, Any]:
     """JSON record of a stale version and its replacement."""
-    report = {
+    return {
         "kind": result.kind,
         "take": result.take,
         "generation": result.generation,
         "reasons": list(result.reasons),
-    }
-    return report | {
         "made": result.record.generation if result.record else None,
         "fault": result.fault,
     }

@@ -8,7 +8,6 @@ import json
 import sys
 import time
 from collections.abc import Callable
-from typing import Any
 
 import click
 
@@ -16,6 +15,7 @@ from skindb.cli.options import progress_style
 from skindb.errors import escaped
 from skindb.types import silent
 
+Pace = tuple[float | None, float | None]  # steps per minute, and seconds left
 MIN_INTERVAL_S = {"bar": 0.2, "json": 1.0}  # between two reports of the same stage
 
 
@@ -57,10 +57,11 @@ class Progress:
         self.bars = style == "bar" and moving
         self.plain = style == "bar" and plain and not moving
         self.stage = ""
-        self.first = 0
-        self.last = 0.0
-        self.said = (-1, 0)
-        self.begin = self.since = time.monotonic()
+        self.steps_before = 0  # done when the stage began
+        self.last_report = 0.0
+        self.reported = (-1, 0)
+        self.begin = time.monotonic()
+        self.stage_begin = self.begin
         self.take = ""
         self.takes_done = 0
         self.takes_total = 0
@@ -73,21 +74,23 @@ class Progress:
     def __call__(self, stage: str, done: int, total: int) -> None:
         """Report that `done` of `total` steps of `stage` are finished."""
         now = time.monotonic()
-        new = stage != self.stage
-        if new:
+        is_new = stage != self.stage
+        if is_new:
             self.stage = stage
-            self.since = now
-            self.first = done
-            self.said = (-1, 0)
+            self.stage_begin = now
+            self.steps_before = done
+            self.reported = (-1, 0)
             if self.plain:
                 echo(stage, err=True)
-        soon = now - self.last < MIN_INTERVAL_S.get(self.style, 0.0) and done < total
-        if self.style == "json" and (new or not soon) and (done, total) != self.said:
-            self.last = now
-            self.said = (done, total)
-            self._line(stage, done, total)
-        elif self.bars and not soon:
-            self.last = now
+        interval = MIN_INTERVAL_S.get(self.style, 0.0)
+        is_early = now - self.last_report < interval and done < total
+        if self.style == "json":
+            if (is_new or not is_early) and (done, total) != self.reported:
+                self.last_report = now
+                self.reported = (done, total)
+                self._line(stage, done, total)
+        elif self.bars and not is_early:
+            self.last_report = now
             self._bar(stage, done, total)
 
     def begin_takes(self, count: int, *, take: str = "") -> None:
@@ -108,9 +111,7 @@ class Progress:
         if self.style == "json":
             self._line("failed" if failed else "finished", 1, 1)
         elif self.bars and self.takes_total > 1:
-            rate, seconds_left = _pace(
-                self.takes_done, self.takes_total, time.monotonic() - self.begin
-            )
+            rate, seconds_left = self._pace_of_takes()
             pace = f"{rate:.3g} takes per minute, {seconds_left:.0f} s left"
             echo(f"take {self.takes_done} of {self.takes_total}: {pace}", err=True)
         self.take = following
@@ -124,9 +125,7 @@ class Progress:
             echo(f"dashboard: {link}", err=True)
 
     def _bar(self, stage: str, done: int, total: int) -> None:
-        _, seconds_left = _pace(
-            done - self.first, total - self.first, time.monotonic() - self.since
-        )
+        _, seconds_left = self._pace_of_stage(done, total)
         bar = "#" * round(24 * done / max(total, 1))
         prefix = (
             f"take {self.takes_done + 1} of {self.takes_total}: "
@@ -142,32 +141,32 @@ class Progress:
         """Print a line of JSON; rate and remaining time refer to the takes if there are
         several, else to the stage.
         """
-        now = time.monotonic()
-        several = self.takes_total > 1
-        rate, seconds_left = (
-            _pace(self.takes_done, self.takes_total, now - self.begin)
-            if several
-            else _pace(done - self.first, total - self.first, now - self.since)
-        )
-        report: dict[str, Any] = {
+        rate, seconds_left = self._pace_of_stage(done, total)
+        if self.takes_total > 1:
+            rate, seconds_left = self._pace_of_takes()
+        report = {
             "take": self.take or None,
             "stage": stage,
             "done": done,
             "total": total,
-        }
-        report |= {
             "takes_done": self.takes_done,
             "takes_total": self.takes_total,
-            "seconds": round(now - self.begin, 2),
-        }
-        report |= {
+            "seconds": round(time.monotonic() - self.begin, 2),
             "rate_per_minute": rate and round(rate, 3),
             "seconds_left": None if seconds_left is None else round(seconds_left, 1),
         }
         echo(json.dumps(report), err=True)
 
+    def _pace_of_takes(self) -> Pace:
+        seconds = time.monotonic() - self.begin
+        return _pace(self.takes_done, self.takes_total, seconds)
 
-def _pace(done: int, total: int, seconds: float) -> tuple[float | None, float | None]:
+    def _pace_of_stage(self, done: int, total: int) -> Pace:
+        seconds = time.monotonic() - self.stage_begin
+        return _pace(done - self.steps_before, total - self.steps_before, seconds)
+
+
+def _pace(done: int, total: int, seconds: float) -> Pace:
     """Steps per minute, and seconds until all are done; None before the first step."""
     if not done:
         return None, None

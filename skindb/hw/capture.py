@@ -274,22 +274,19 @@ def _check_lamp(
 ) -> None:
     """Record the brightness of the steady lamp; if it became darker, count the flashes again."""
     after = lamp_brightness(run.schedule, Levels(run.frames, setup.dome), setup.dome)
-    lamp = {
+    is_visible = bool(np.isfinite(after))
+    session.lamp = {
         "brightness": plan.base,
         "operator": plan.operator,
         "measured": round(before, 2),
+        "measured_after": round(after, 2) if is_visible else None,
     }
-    session.lamp = lamp | {
-        "measured_after": round(after, 2) if np.isfinite(after) else None
-    }
-    beside = replace(remaining, base=round(after) if np.isfinite(after) else 0)
+    beside = replace(remaining, base=round(after) if is_visible else 0)
     flashes = assess(beside).flashes_per_second
     if flashes > assess(remaining).flashes_per_second:
-        state = (
-            f"{after:.1f} times as bright as a light"
-            if np.isfinite(after)
-            else "not visible"
-        )
+        state = "not visible"
+        if is_visible:
+            state = f"{after:.1f} times as bright as a light"
         seen = f"the subject may have seen {flashes} flashes in a second"
         run.notes.append(f"the steady lamp was {state} after the lights, so {seen}")
         session.count(flashes, None)

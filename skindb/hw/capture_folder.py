@@ -340,18 +340,12 @@ def read_setup(folder: Path) -> Setup:
                         "see docs/howto/capture.md",
                     )
                 )
-    if faults or not isinstance(dome, dict):
-        raise InputError(
-            faults
-            or [
-                Fault(
-                    str(folder),
-                    "must contain dome/dome.json",
-                    "no such file",
-                    "see docs/howto/capture.md",
-                )
-            ]
-        )
+    if not faults and not isinstance(dome, dict):
+        rule = "must contain dome/dome.json"
+        cure = "see docs/howto/capture.md"
+        faults.append(Fault(str(folder), rule, "no such file", cure))
+    if faults:
+        raise InputError(faults)
     return Setup(folder, dome, probe if isinstance(probe, dict) else None)
 
 
@@ -359,13 +353,16 @@ def identity(setup: Setup, subject: Subject, base: int) -> dict[str, Any]:
     """Record that must be the same in all sessions of a capture; `base` is the
     brightness of the steady lamp.
     """
-    return {
+    record = {
         "subject": subject.subject,
         "condition": subject.condition,
         "consent": dict(subject.consent),
         "set-up": digest(setup.dome, setup.probe),
         "steady lamp": base,
-    } | ({"virtual subject": subject.virtual} if subject.virtual else {})
+    }
+    if subject.virtual:
+        record["virtual subject"] = subject.virtual
+    return record
 
 
 def require_space(folder: Path, setup: Setup, steps: int) -> None:
@@ -448,8 +445,6 @@ def keep_site(session: Unfinished, run: SiteRun, number: int) -> None:
         "number": number,
         "suffix": suffix,
         "drift_kpa": placement.drift,
-    }
-    entry |= {
         "pressure": np.round(placement.pressure, 4).tolist(),
         "lost_readings": placement.lost_readings,
     }
@@ -466,8 +461,12 @@ def keep_failed_placement(
 ) -> None:
     """Record a failed placement of the probe with its readings of the gauge."""
     path = session.folder / FAILED_PLACEMENTS
-    entry = {"site": site, "number": number, "reason": str(error)}
-    entry |= {"pressure": np.round(readings, 4).tolist()}
+    entry = {
+        "site": site,
+        "number": number,
+        "reason": str(error),
+        "pressure": np.round(readings, 4).tolist(),
+    }
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("a", encoding="utf-8") as file:
@@ -539,9 +538,9 @@ def write_capture(
     """
     out = session.folder
     record: dict[str, Any] = capture_record(subject)
-    record |= {"dome": "dome/dome.json"} | (
-        {"override": session.override} if session.override else {}
-    )
+    record["dome"] = "dome/dome.json"
+    if session.override:
+        record["override"] = session.override
     if subject.virtual:
         flashes = session.flashes_per_second
         record["rehearsal"] = {"person_present": False, "flashes_per_second": flashes}
@@ -566,7 +565,8 @@ def write_capture(
         "sequence": session.sequence,
         "dark": dark if has_dark else None,
     }
-    dome |= {"steady_lamp": session.lamp} if session.lamp else {}
+    if session.lamp:
+        dome["steady_lamp"] = session.lamp
     _copy_white(setup, out)
     _dump(out / "dome/dome.json", dome)
     if session.sites and setup.probe is not None:
@@ -583,14 +583,15 @@ def capture_record(subject: Subject) -> dict[str, Any]:
         "version": 2,
         "subject": subject.subject,
         "session": subject.session,
-    }
-    record |= {
         "condition": subject.condition,
         "traits": dict(subject.traits),
         "consent": dict(subject.consent),
     }
-    record |= {"calibration": subject.calibration} if subject.calibration else {}
-    return record | ({"virtual": True} if subject.virtual else {})
+    if subject.calibration:
+        record["calibration"] = subject.calibration
+    if subject.virtual:
+        record["virtual"] = True
+    return record
 
 
 def _write_probe(session: Unfinished, probe: Mapping[str, Any]) -> None:
