@@ -103,16 +103,16 @@ def memory_mb(process: int, name: str = "VmRSS") -> float:
 @contextmanager
 def process(*arguments: str) -> Iterator[int]:
     """Context with the id of a process that is terminated at its end."""
-    here = os.pathsep.join(
-        [str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")]
-    )
+    root = Path(__file__).parents[1]
+    # the tests have what `benchmarks.catalogue` imports
+    folders = [str(root), str(root / "tests"), os.environ.get("PYTHONPATH", "")]
     options: dict[str, Any] = {
         "stdout": subprocess.DEVNULL,
         "stderr": subprocess.DEVNULL,
     }
     with subprocess.Popen(
         [sys.executable, "-m", *arguments],
-        env=os.environ | {"PYTHONPATH": here},
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(folders)},
         **options,
     ) as child:
         try:
