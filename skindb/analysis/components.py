@@ -26,7 +26,7 @@ from skindb.errors import Fault, InputError
 from skindb.numerics.factorise import principal_axes
 from skindb.numerics.statistics import Moments, known_mean
 from skindb.parameters import option
-from skindb.render.image import tone_map
+from skindb.render.image import encode_srgb, tone_map
 from skindb.schema import dataset, variables
 from skindb.schema.cohort import require_same_fit
 from skindb.schema.notes import Note, note
@@ -153,10 +153,7 @@ def plot_mean_face(face: xr.Dataset, *, ax: Axes | None = None) -> Axes:
     """Plot the mean albedo in sRGB; texels with too few subjects are white."""
     ax = ax or plots.new_axes(4, 4)
     linear = face[variables.FACE_DIFFUSE_REFLECTANCE].values
-    clipped = np.clip(np.nan_to_num(linear, nan=1.0), 0.0, 1.0)
-    encoded = np.where(
-        clipped <= 0.0031308, 12.92 * clipped, 1.055 * clipped ** (1 / 2.4) - 0.055
-    )
+    encoded = encode_srgb(np.nan_to_num(linear, nan=1.0))
     ax.imshow(encoded, extent=(0, 1, 1, 0), interpolation="nearest")
     ax.set_xlabel("common u")
     ax.set_ylabel("common v")

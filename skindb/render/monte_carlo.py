@@ -18,6 +18,7 @@ from skindb.reflectance.sampling import tangents
 from skindb.render.scene import Camera, Environment, Lights, Surface
 from skindb.render.shading import (
     View,
+    entering_light,
     escape_factor,
     exitance_from_irradiance,
     seen_points,
@@ -338,13 +339,10 @@ class _Painter:
                     points[front], points[front] + towards[front], normal=normals[front]
                 )
             ]
-            along = np.maximum(
-                -(towards[lit] @ lights.axis[i]) / np.sqrt(square[lit]), 0
-            ) ** float(lights.falloff[i])
-            passed = fresnel_transmittance(np.minimum(cosine[lit], 1), self.surface.eta)
-            received[lit] += (cosine[lit] / square[lit] * along * passed)[
-                :, None
-            ] * lights.intensity[i]
+            light = entering_light(
+                lights, i, towards[lit], square[lit], cosine[lit], self.surface.eta
+            )
+            received[lit] += light[:, None] * lights.intensity[i]
         return received
 
     def _received_from_environment(

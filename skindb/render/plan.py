@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 
 from skindb.geometry.camera import project
 from skindb.geometry.rays import RayScene
-from skindb.optics.fresnel import fresnel_transmittance
 from skindb.reflectance.model import Lamp, Points
 from skindb.render.monte_carlo import Lighting
 from skindb.render.scene import Camera, Lights, Surface
-from skindb.render.shading import View, trace_view, tree_opening
+from skindb.render.shading import View, entering_light, trace_view, tree_opening
 from skindb.schema.notes import Omission
 from skindb.types import Mask
 
@@ -306,8 +305,5 @@ def _irradiance(light: Lights, surface: Surface) -> Float:
     cosine = np.clip(
         np.einsum("nc,nc->n", towards, surface.normals) / np.sqrt(square), 0, 1
     )
-    along = np.maximum(-(towards @ light.axis[0]) / np.sqrt(square), 0) ** float(
-        light.falloff[0]
-    )
-    passed = cosine / square * along * fresnel_transmittance(cosine, surface.eta)
-    return np.asarray(passed[:, None] * light.intensity[0])
+    entering = entering_light(light, 0, towards, square, cosine, surface.eta)
+    return np.asarray(entering[:, None] * light.intensity[0])

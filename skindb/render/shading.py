@@ -76,12 +76,21 @@ def transmitted_irradiance(
                 points[front], lights.position[i : i + 1], normal=normals[front]
             )
         ]
-        along = np.maximum(
-            -(towards[lit] @ lights.axis[i]) / np.sqrt(square[lit]), 0
-        ) ** float(lights.falloff[i])
-        passed = fresnel_transmittance(np.minimum(cosine[lit], 1), surface.eta)
-        out[vertices[lit], i] = cosine[lit] / square[lit] * along * passed
+        out[vertices[lit], i] = entering_light(
+            lights, i, towards[lit], square[lit], cosine[lit], surface.eta
+        )
     return out
+
+
+def entering_light(
+    lights: Lights, i: int, towards: Float, square: Float, cosine: Float, eta: float
+) -> Float:
+    """Irradiance (n,) under the boundary per radiant intensity of light i [mm-2], without
+    shadows, from vectors (n, 3) to the light, their squares, and cosines to the normals.
+    """
+    along = np.maximum(-(towards @ lights.axis[i]) / np.sqrt(square), 0)
+    passed = fresnel_transmittance(np.minimum(cosine, 1), eta)
+    return np.asarray(cosine / square * along ** float(lights.falloff[i]) * passed)
 
 
 def exitances(
