@@ -22,7 +22,7 @@ from click.core import ParameterSource
 import skindb
 from skindb.cli.options import asked
 from skindb.cli.terminal import Progress, echo
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, require
 from skindb.files import plain
 
 if TYPE_CHECKING:
@@ -250,27 +250,16 @@ def existing(db: str) -> Database:
     """Open a database, which must exist."""
     database = skindb.open(db)
     names = database.names()
-    if names is None:
-        raise InputError(
-            Fault(
-                db,
-                "the database must exist",
-                "nothing",
-                "ingest a capture into it first",
-            )
-        )
+    cure = "ingest a capture into it first"
+    require(names is not None, db, "the database must exist", "nothing", cure)
+    entries = set(names or ())
     # may exist after a first ingest that was killed
     begun = {"audit", "data", "leases", "secret", "staging", "tmp"}
     # a bucket without records has no log
-    if {*names} - begun and not {"log", "tombstones", "withdrawn"} & {*names}:
-        raise InputError(
-            Fault(
-                db,
-                "a database must have a log",
-                "a folder without one",
-                "give the folder of the database",
-            )
-        )
+    has_log = bool({"log", "tombstones", "withdrawn"} & entries)
+    rule = "a database must have a log"
+    cure = "give the folder of the database"
+    require(has_log or entries <= begun, db, rule, "a folder without one", cure)
     return database
 
 
@@ -288,27 +277,23 @@ def chosen_takes(
 
 def require_one_take(out: Path, takes: Sequence[str]) -> None:
     """Check that a file gets one take."""
-    if len(takes) > 1:
-        rule = "a file must hold one take"
-        cure = "name a folder, or one take"
-        raise InputError(Fault(str(out), rule, f"{len(takes)} takes", cure))
+    rule = "a file must hold one take"
+    cure = "name a folder, or one take"
+    require(len(takes) <= 1, str(out), rule, f"{len(takes)} takes", cure)
 
 
 def writable(path: Path, *endings: str) -> None:
     """Check the name and folder of a file before the work of which it is the result."""
-    if path.suffix.lower() not in endings:
-        raise InputError(
-            Fault(
-                str(path),
-                f"must end in {' or '.join(endings)}",
-                path.suffix or "no ending",
-                "rename it",
-            )
-        )
-    if not path.parent.is_dir():
-        raise InputError(
-            Fault(str(path), "its folder must exist", "none", f"make {path.parent}")
-        )
+    rule = f"must end in {' or '.join(endings)}"
+    ending = path.suffix or "no ending"
+    require(path.suffix.lower() in endings, str(path), rule, ending, "rename it")
+    require_folder(path)
+
+
+def require_folder(path: Path) -> None:
+    """Check that the folder of a file exists."""
+    cure = f"make {path.parent}"
+    require(path.parent.is_dir(), str(path), "its folder must exist", "none", cure)
 
 
 def summary_of(record: Record) -> dict[str, Any]:
@@ -359,14 +344,8 @@ def trait_amounts(
             raise click.UsageError(
                 f"--trait needs {form}, such as lotion=0.5; found {text!r}"
             )
-        if name in amounts:
-            raise InputError(
-                Fault(
-                    "--trait",
-                    "must name each trait once",
-                    f"{name} more than once",
-                    "give one amount",
-                )
-            )
+        rule = "must name each trait once"
+        repeated = f"{name} more than once"
+        require(name not in amounts, "--trait", rule, repeated, "give one amount")
         amounts[name] = amount
     return amounts

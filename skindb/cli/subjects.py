@@ -10,7 +10,14 @@ import click
 
 import skindb
 from skindb.cli.options import DB, DICTIONARY, PATH, WAIT, WORKERS, common
-from skindb.cli.shared import SCHEDULER, client_of, emit, existing, shared_path
+from skindb.cli.shared import (
+    SCHEDULER,
+    client_of,
+    emit,
+    existing,
+    require_folder,
+    shared_path,
+)
 from skindb.cli.terminal import bar, confirm, echo
 from skindb.errors import Fault, InputError
 
@@ -228,10 +235,8 @@ def withdraw(
     database = existing(db)
     workflow = skindb.workflow
     plan = workflow.plan_withdrawal(database, subject, backups=backups)
-    if report is not None and not report.parent.is_dir():
-        raise InputError(
-            Fault(str(report), "its folder must exist", "none", f"make {report.parent}")
-        )
+    if report is not None:
+        require_folder(report)
     if dry_run:
         emit(_withdrawal_as_json(plan), _plan_lines(plan))
         return

@@ -31,7 +31,7 @@ from skindb.analysis.summary import (
     sample_surfels,
     summary_tables,
 )
-from skindb.errors import Fault, InputError
+from skindb.errors import Fault, InputError, require
 from skindb.fit import prediction_table
 from skindb.schema import FitStatus, dataset, variables
 from skindb.schema.consent import require_consent
@@ -332,16 +332,19 @@ def takes_with_landmarks(db: Database, takes: Sequence[str] | None = None) -> li
     """Takes with a model and landmarks whose newest capture consents to statistics."""
     fitted = db.takes("model")
     names = fitted if not takes else list(dict.fromkeys(takes))
-    if not names:
-        rule = "a study needs fitted takes"
-        cure = "run skindb fit first"
-        raise InputError(Fault(db.url, rule, "no model", cure))
+    require_fitted(db, names)
     return [
         take
         for take in names
         if "statistics" in db.consent(take)
         and _has_landmarks(db, db.record("model", take))
     ]
+
+
+def require_fitted(db: Database, takes: Sequence[str]) -> None:
+    """Refuse a study without takes."""
+    rule = "a study needs fitted takes"
+    require(takes, db.url, rule, "no model", "run skindb fit first")
 
 
 def current_registrations(db: Database, takes: Sequence[str]) -> dict[str, Record]:

@@ -39,6 +39,7 @@ from skindb.workflow.cohorts import (
     current_registrations,
     register_takes,
     registered_datasets,
+    require_fitted,
     summarise,
     takes_with_landmarks,
 )
@@ -138,9 +139,7 @@ def open_population(
 def _require_models(db: Database, takes: Sequence[str], release: str | None) -> None:
     """Refuse a database without models, and summarise those that cohorts cannot read."""
     models = db.takes("model", release=release)
-    if not models:
-        rule = "a study needs fitted takes"
-        raise InputError(Fault(db.url, rule, "no model", "run skindb fit first"))
+    require_fitted(db, models)
     summarise(db, [take for take in takes or models if take in models], release=release)
 
 
