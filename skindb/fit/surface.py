@@ -25,7 +25,12 @@ from skindb.fit.lumitexels import (
 )
 from skindb.fit.quality import HELD_OUT_ERRORS, misfits
 from skindb.reflectance.kinds import surface_model
-from skindb.reflectance.model import Comparison, Judgement, ReflectanceModel
+from skindb.reflectance.model import (
+    Comparison,
+    JudgedFit,
+    Judgement,
+    ReflectanceModel,
+)
 from skindb.schema import check, dataset, text_labels
 from skindb.types import Array
 
@@ -296,19 +301,8 @@ def _judged(
         judged = surface.judge(
             block_of(arrays, noise), comparison, judgement, parameters
         )
-        columns = {
-            "fit_residual": judged.residual,
-            "fit_residual_perceptual": judged.residual_perceptual,
-        }
-        if not evaluate:
-            columns |= surface.judged_columns(judged)
-        if outliers:
-            columns["outlier_fraction"] = judged.outlier
-        for i, dim in enumerate(HELD_OUT_ERRORS):
-            if held is not None and (held & (i + 1)).any():
-                error = judged.held_error[:, i].T
-                columns |= dict(zip(HELD_OUT_ERRORS[dim], error, strict=True))
-        return columns, judged.counts
+        fitted = {} if evaluate else surface.judged_columns(judged)
+        return fitted | _error_columns(judged, judgement), judged.counts
 
     inputs = lumitexels[list(names)]
     blocks = [inputs.isel(surfel=slice(a, b)) for a, b in pairwise(_cuts(lumitexels))]
@@ -316,6 +310,22 @@ def _judged(
     columns = {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
     coords = {} if evaluate else surface.labels
     return _Judged(dataset(columns, coords=coords), counts)
+
+
+def _error_columns(judged: JudgedFit, judgement: Judgement) -> dict[str, Array]:
+    """Variables of the surfels with the errors of their predictions."""
+    columns = {
+        "fit_residual": judged.residual,
+        "fit_residual_perceptual": judged.residual_perceptual,
+    }
+    if judgement.outliers:
+        columns["outlier_fraction"] = judged.outlier
+    held = judgement.held
+    for i, names in enumerate(HELD_OUT_ERRORS.values()):
+        if held is not None and (held & (i + 1)).any():
+            errors = judged.held_error[:, i].T
+            columns |= dict(zip(names, errors, strict=True))
+    return columns
 
 
 def joined_blocks(

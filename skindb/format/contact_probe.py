@@ -95,12 +95,7 @@ def read_probe(folder: Path, fields: Fields) -> ProbeRecord:
     exposures = read_exposures(fields)
     sites = fields.names("sites", maximum=MAX_SITES)
     placements = _placements(fields, sites)
-    needed = {SITE}
-    if len(exposures) > 1:
-        needed.add(EXPOSURE)
-    if any(len(names) > 1 for names in placements.values()):
-        needed.add(PLACEMENT)
-    frames = fields.template("frames", needed, {EXPOSURE, PLACEMENT})
+    frames = _template(fields, exposures, placements)
     linear = is_linear(frames)
     if linear:
         require_merged(fields, exposures)
@@ -133,6 +128,20 @@ def read_probe(folder: Path, fields: Fields) -> ProbeRecord:
         _require_even_gains(fields, probe.gain)
     _check_frames(probe, fields)
     return probe
+
+
+def _template(
+    fields: Fields,
+    exposures: Mapping[str, float],
+    placements: Mapping[str, tuple[str, ...]],
+) -> str:
+    """Template of the frames, with a placeholder for all that differs between them."""
+    needed = {SITE}
+    if len(exposures) > 1:
+        needed.add(EXPOSURE)
+    if any(len(names) > 1 for names in placements.values()):
+        needed.add(PLACEMENT)
+    return fields.template("frames", needed, {EXPOSURE, PLACEMENT})
 
 
 def _placements(fields: Fields, sites: Sequence[str]) -> dict[str, tuple[str, ...]]:

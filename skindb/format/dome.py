@@ -224,16 +224,7 @@ def read_dome(
 
 def _camera(folder: Path, item: Fields, *, linear: bool) -> CameraRecord:
     earlier = len(item.faults)
-    K = item.array("K", (3, 3), fallback=np.eye(3))
-    R = item.array("R", (3, 3), fallback=np.eye(3))
-    error = np.abs(R @ R.T - np.eye(3)).max()
-    determinant = np.linalg.det(R)
-    if error > ROTATION_TOLERANCE or determinant < 0:
-        finding = f"R R^T differs from 1 by {error:.2g}, determinant {determinant:.3g}"
-        item.fault("R", "must be a rotation", finding, "calibrate the camera again")
-    if K[0, 0] <= 0 or K[1, 1] <= 0 or K[1, 0] != 0 or (K[2] != (0, 0, 1)).any():
-        rule = "must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]] in pixels"
-        item.fault("K", rule, shown(K))
+    K, R = _matrices(item)
     colours = item.array("colour_matrix", (3, 3), default=np.eye(3).tolist())
     if not (colours.sum(axis=1) > 0).all():
         rule = "must give white a positive R, G and B: each row sums to more than 0"
@@ -258,6 +249,21 @@ def _camera(folder: Path, item: Fields, *, linear: bool) -> CameraRecord:
         colour_matrix=colours,
         vignette=vignette,
     )
+
+
+def _matrices(item: Fields) -> tuple[Float64, Float64]:
+    """K and R of a camera."""
+    K = item.array("K", (3, 3), fallback=np.eye(3))
+    R = item.array("R", (3, 3), fallback=np.eye(3))
+    error = np.abs(R @ R.T - np.eye(3)).max()
+    determinant = np.linalg.det(R)
+    if error > ROTATION_TOLERANCE or determinant < 0:
+        finding = f"R R^T differs from 1 by {error:.2g}, determinant {determinant:.3g}"
+        item.fault("R", "must be a rotation", finding, "calibrate the camera again")
+    if K[0, 0] <= 0 or K[1, 1] <= 0 or K[1, 0] != 0 or (K[2] != (0, 0, 1)).any():
+        rule = "must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]] in pixels"
+        item.fault("K", rule, shown(K))
+    return K, R
 
 
 def _size(item: Fields) -> tuple[int, int]:
