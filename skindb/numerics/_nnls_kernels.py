@@ -23,12 +23,23 @@ class ActiveSetMemory(NamedTuple):
     factor: Matrix  # (m, m) Cholesky factor of the active columns
     solution: Vector  # (m,) unconstrained minimum on the active columns
     gradient: Vector  # (m,) b - G x
+    active: IntVector  # (m,) the active columns, in the order of the factor
+    is_active: BoolVector  # (m,)
+    # (m,) columns that may not enter, as they are collinear or entered by rounding
+    barred: BoolVector
 
 
 @kernel
 def active_set_memory(m: int) -> ActiveSetMemory:
     """Memory for problems of m columns."""
-    return ActiveSetMemory(np.zeros((m, m)), np.zeros(m), np.zeros(m))
+    return ActiveSetMemory(
+        np.zeros((m, m)),
+        np.zeros(m),
+        np.zeros(m),
+        np.empty(m, np.int64),
+        np.zeros(m, np.bool_),
+        np.zeros(m, np.bool_),
+    )
 
 
 @kernel
@@ -119,6 +130,97 @@ def _drop(active: IntVector, position: int, k: int) -> int:
 
 
 @kernel
+def _first_columns(x: Vector, memory: ActiveSetMemory) -> int:
+    """Mark the columns of a warm start as active; returns their number."""
+    k = 0
+    for j in range(x.shape[0]):
+        memory.barred[j] = False
+        memory.is_active[j] = x[j] > 0.0
+        if x[j] > 0.0:
+            memory.active[k] = j
+            k += 1
+    return k
+
+
+@kernel
+def _entering_column(G: Matrix, threshold: float, memory: ActiveSetMemory) -> int:
+    """The column with the largest gradient above the threshold, or -1."""
+    w = memory.gradient
+    entering = -1
+    best = threshold
+    for j in range(w.shape[0]):
+        free = not memory.is_active[j] and not memory.barred[j]
+        if free and G[j, j] > 0.0 and w[j] > best:
+            entering = j
+            best = w[j]
+    return entering
+
+
+@kernel
+def _drop_collinear(
+    G: Matrix,
+    entering: int,
+    position: int,
+    k: int,
+    x: Vector,
+    memory: ActiveSetMemory,
+) -> tuple[int, int, int]:
+    """Remove a collinear column, or the one that it is exchanged for.
+
+    Of two similar columns, the better one stays. Returns the number of active columns,
+    of those the factor holds, and the column that was removed, -1 after an exchange.
+    """
+    active = memory.active
+    j = active[position]
+    if j == entering and position == k - 1:
+        replaced = _exchange(
+            G, entering, active, k - 1, memory.factor, x, memory.solution
+        )
+        if replaced >= 0:
+            memory.is_active[active[replaced]] = False
+            return _drop(active, replaced, k), min(position, replaced), -1
+    memory.is_active[j] = False
+    memory.barred[j] = True
+    x[j] = 0.0
+    return _drop(active, position, k), position, j
+
+
+@kernel
+def _move_to_minimum(k: int, x: Vector, memory: ActiveSetMemory) -> None:
+    """Set the active columns to their unconstrained minimum."""
+    for a in range(k):
+        j = memory.active[a]
+        if x[j] != memory.solution[a]:
+            # after progress, barred columns may enter again
+            memory.barred[:] = False
+        x[j] = memory.solution[a]
+
+
+@kernel
+def _move_to_bound(
+    entering: int, step: float, k: int, x: Vector, memory: ActiveSetMemory
+) -> tuple[int, int]:
+    """Move the active columns by a fraction of the way to their minimum, where some of
+    them reach 0 and leave; returns the number of columns left, and of those the factor
+    holds.
+    """
+    z = memory.solution
+    valid = k
+    for a in range(k - 1, -1, -1):
+        j = memory.active[a]
+        x[j] += step * (z[a] - x[j])
+        if z[a] <= 0.0 and x[j] <= 1e-15 * abs(z[a]) + 1e-300:
+            x[j] = 0.0
+            memory.is_active[j] = False
+            if j == entering and step == 0.0:
+                # it entered because of rounding and would leave at once
+                memory.barred[j] = True
+            k = _drop(memory.active, a, k)
+            valid = min(valid, a)
+    return k, valid
+
+
+@kernel
 def active_set(
     G: Matrix,
     b: Vector,
@@ -145,84 +247,45 @@ def active_set(
         return 0.0, 0, True, 1.0
     L = memory.factor
     z = memory.solution
-    w = memory.gradient
-    active = np.empty(m, np.int64)
-    passive = np.zeros(m, np.bool_)
-    barred = np.zeros(m, np.bool_)
+    active = memory.active
     # active columns, those the factor holds, iterations
-    k = 0
+    k = _first_columns(x, memory)
     valid = 0
     count = 0
-    for j in range(m):
-        if x[j] > 0.0:
-            active[k] = j
-            passive[j] = True
-            k += 1
     entering = -1
     warm = k > 0
     while count < limit:
         if not warm:
-            _gradient(G, b, x, w)
-            entering = -1
-            best = tolerance * scale
-            for j in range(m):
-                if not passive[j] and not barred[j] and G[j, j] > 0.0 and w[j] > best:
-                    entering = j
-                    best = w[j]
+            _gradient(G, b, x, memory.gradient)
+            entering = _entering_column(G, tolerance * scale, memory)
             if entering < 0:
                 break
             active[k] = entering
-            passive[entering] = True
+            memory.is_active[entering] = True
             k += 1
         warm = False
         while True:
             count += 1
             collinear = factor(G, active, valid, k, L)
             if collinear >= 0:
-                valid = collinear
-                j = active[collinear]
-                if j == entering and collinear == k - 1:
-                    replaced = _exchange(G, entering, active, k - 1, L, x, z)
-                    if replaced >= 0:  # of two similar columns, the better one stays
-                        passive[active[replaced]] = False
-                        k = _drop(active, replaced, k)
-                        valid = min(valid, replaced)
-                        if count < limit:
-                            continue
-                        break
-                passive[j] = False
-                barred[j] = True
-                x[j] = 0.0
-                k = _drop(active, collinear, k)
-                if j == entering:
+                k, valid, dropped = _drop_collinear(
+                    G, entering, collinear, k, x, memory
+                )
+                if dropped == entering or (dropped < 0 and count >= limit):
                     break
                 continue
             valid = k
             solve(L, b, active, k, z)
             step = _feasible_step(active, k, x, z)
             if step == math.inf:
-                for a in range(k):
-                    if x[active[a]] != z[a]:
-                        # after progress, barred columns may enter again
-                        barred[:] = False
-                    x[active[a]] = z[a]
+                _move_to_minimum(k, x, memory)
                 break
-            for a in range(k - 1, -1, -1):
-                j = active[a]
-                x[j] += step * (z[a] - x[j])
-                if z[a] <= 0.0 and x[j] <= 1e-15 * abs(z[a]) + 1e-300:
-                    x[j] = 0.0
-                    passive[j] = False
-                    if j == entering and step == 0.0:
-                        # it entered because of rounding and would leave at once
-                        barred[j] = True
-                    k = _drop(active, a, k)
-                    valid = min(valid, a)
+            k, valid = _move_to_bound(entering, step, k, x, memory)
             if count >= limit:
                 break
         entering = -1
-    _gradient(G, b, x, w)
-    worst = _worst_gradient(G, x, w)
+    _gradient(G, b, x, memory.gradient)
+    worst = _worst_gradient(G, x, memory.gradient)
     converged = worst <= 10.0 * max(tolerance, 1e-12) * scale and count < limit
     return worst / scale, count, converged, _pivot_ratio(L, min(valid, k))
 
