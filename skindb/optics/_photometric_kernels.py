@@ -9,7 +9,7 @@ networks and from counting, which have no branches.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,6 +31,7 @@ from skindb.types import (
     IntVector32,
     Matrix,
     Matrix32,
+    Real,
     Vector,
     Vector32,
 )
@@ -167,7 +168,7 @@ def _finite(value: float) -> bool:
 
 
 @inline_fast_kernel
-def _transmittance(cosine: Any, square: Any) -> Any:
+def _transmittance(cosine: Real, square: Real) -> Real:
     """F_t of a cosine in single or double precision; `square` is eta^2 - 1, which must
     not be negative.
     """
@@ -227,10 +228,12 @@ def _point(
     return count
 
 
-@fast_kernel
-def _shades(n_cameras: int, cameras: int, b: Buffers) -> None:
-    """For each light, low quantile over cameras of the mean channel, and median of the
-    part along the skin's colour.
+@inline_fast_kernel
+def _colour_axis(
+    n_cameras: int, cameras: int, b: Buffers
+) -> tuple[np.float32, np.float32, np.float32]:
+    """Unit vector of the colour difference of the mean sample from grey; also counts the
+    samples of each light.
     """
     lights = b.present.shape[0]
     red = 0.0
@@ -256,9 +259,16 @@ def _shades(n_cameras: int, cameras: int, b: Buffers) -> None:
     blue = blue - grey
     size = math.sqrt(red * red + green * green + blue * blue)
     scale = 1.0 / size if size > 0.0 else 0.0
-    along_red = np.float32(red * scale)
-    along_green = np.float32(green * scale)
-    along_blue = np.float32(blue * scale)
+    return np.float32(red * scale), np.float32(green * scale), np.float32(blue * scale)
+
+
+@fast_kernel
+def _shades(n_cameras: int, cameras: int, b: Buffers) -> None:
+    """For each light, low quantile over cameras of the mean channel, and median of the
+    part along the skin's colour.
+    """
+    lights = b.present.shape[0]
+    along_red, along_green, along_blue = _colour_axis(n_cameras, cameras, b)
     missing = np.float32(np.inf)
     for q in range(n_cameras):
         o = b.cameras[q]
@@ -465,29 +475,23 @@ def _photometric(
 
 
 @fast_kernel
-def _covariance(
-    signal: int,
+def _write_scores(
+    normal: Vector,
+    score: Vector,
     square: np.float32,
     spread: float,
-    hold: float,
-    size: float,
-    data: Matrix,
-    matrix: Matrix,
     b: Buffers,
-    out: NormalEstimates,
-) -> None:
-    """Covariance of the normal from the residuals (Huber's sandwich), and its
-    derivative by the scan's normal; also the scores of the lights and `turn`.
+    bent: Matrix,
+    meat: Matrix,
+) -> bool:
+    """Write the scores of the lights, the sum of their squares (3, 3), and the derivative
+    (3, 3) of their sum; returns whether the slope of the influence function is reliable.
     """
-    normal = out.normal[signal]
-    score = b.score[signal]
-    turn = b.turn[signal]
     slope = 0.0
     total = 0.0
     count = 0
-    meat = np.zeros((3, 3))
-    bent = np.zeros((3, 3))
-    inverse = np.empty((3, 3))
+    meat[:] = 0.0
+    bent[:] = 0.0
     way = np.empty(3)
     for i in range(score.shape[0]):
         score[i] = 0.0
@@ -518,9 +522,33 @@ def _covariance(
     for j in range(3):
         for k in range(3):
             meat[j, k] *= correction
-            matrix[j, k] += (
-                bent[j, k] - data[j, k] if slope > 0.5 * total else -0.5 * data[j, k]
-            )
+    return bool(slope > 0.5 * total)
+
+
+@fast_kernel
+def _covariance(
+    signal: int,
+    square: np.float32,
+    spread: float,
+    hold: float,
+    size: float,
+    data: Matrix,
+    matrix: Matrix,
+    b: Buffers,
+    out: NormalEstimates,
+) -> None:
+    """Covariance of the normal from the residuals (Huber's sandwich), and its
+    derivative by the scan's normal; also the scores of the lights and `turn`.
+    """
+    normal = out.normal[signal]
+    turn = b.turn[signal]
+    meat = np.empty((3, 3))
+    bent = np.empty((3, 3))
+    inverse = np.empty((3, 3))
+    reliable = _write_scores(normal, b.score[signal], square, spread, b, bent, meat)
+    for j in range(3):
+        for k in range(3):
+            matrix[j, k] += bent[j, k] - data[j, k] if reliable else -0.5 * data[j, k]
     _inverse(matrix, inverse)
     for j in range(3):  # only the part perpendicular to the normal rotates it
         along = (

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from skindb.jit import fast_kernel, inline_fast_kernel, kernel
-from skindb.types import Cube, Cube32, IntVector, Matrix, Vector
+from skindb.types import Cube, Cube32, IntVector, Matrix, Tensor, Vector
 
 MAX_DEPTH = 10  # levels of the octree, with three bits of the Morton code each
 # rows evaluated at a time, so that the list and its profiles stay in the first-level
@@ -50,6 +50,29 @@ class SumMemory(NamedTuple):
 
 
 @kernel
+def _bound(
+    begin: int, end: int, points: Matrix, area: Vector, box: Vector, centre: Vector
+) -> float:
+    """Write the box and the centre of the points of a node; returns their area."""
+    box[:3] = np.inf
+    box[3:] = -np.inf
+    centre[:] = 0.0
+    node_area = 0.0
+    total = 0.0
+    for j in range(begin, end):
+        w = area[j] + 1e-300
+        total += w
+        node_area += area[j]
+        for a in range(3):
+            centre[a] += w * points[j, a]
+            box[a] = min(box[a], points[j, a])
+            box[a + 3] = max(box[a + 3], points[j, a])
+    for a in range(3):
+        centre[a] /= total
+    return node_area
+
+
+@kernel
 def build(code: IntVector, points: Matrix, area: Vector, leaf: int) -> Tree:
     """Nodes over points sorted by Morton code, so that every node is a contiguous range
     of points.
@@ -67,19 +90,7 @@ def build(code: IntVector, points: Matrix, area: Vector, leaf: int) -> Tree:
     count = 1
     i = 0
     while i < count:
-        box[i, :3] = np.inf
-        box[i, 3:] = -np.inf
-        total = 0.0
-        for j in range(begin[i], end[i]):
-            w = area[j] + 1e-300
-            total += w
-            node_area[i] += area[j]
-            for a in range(3):
-                centre[i, a] += w * points[j, a]
-                box[i, a] = min(box[i, a], points[j, a])
-                box[i, a + 3] = max(box[i, a + 3], points[j, a])
-        for a in range(3):
-            centre[i, a] /= total
+        node_area[i] = _bound(begin[i], end[i], points, area, box[i], centre[i])
         if end[i] - begin[i] > leaf and level[i] < MAX_DEPTH:
             shift = 3 * (MAX_DEPTH - 1 - level[i])
             start = begin[i]
@@ -217,6 +228,15 @@ def _add(
             sums[7] += a7
 
 
+@inline_fast_kernel
+def _squared_gap(box: Vector, x: float, y: float, z: float) -> float:
+    """Squared distance from a point to a box, 0 inside."""
+    gx = max(max(box[0] - x, x - box[3]), 0.0)
+    gy = max(max(box[1] - y, y - box[4]), 0.0)
+    gz = max(max(box[2] - z, z - box[5]), 0.0)
+    return gx * gx + gy * gy + gz * gz
+
+
 @fast_kernel
 def gather(
     start: int,
@@ -228,7 +248,7 @@ def gather(
     tolerance: float,
     reach: float,
     even: Matrix,
-    out: np.ndarray[tuple[int, int, int, int], np.dtype[np.float64]],
+    out: Tensor,
 ) -> None:
     """Dipole sums at the points receivers[start:stop], with receivers (m,).
 
@@ -238,7 +258,6 @@ def gather(
     """
     points = len(parameters)
     place = sources.place
-    box = tree.box
     stack = np.empty(8 * (MAX_DEPTH + 2), np.int64)
     rows = np.empty(ROWS_PER_SUM, np.int64)
     square = np.empty(ROWS_PER_SUM)
@@ -254,10 +273,7 @@ def gather(
         while top > 0:
             top -= 1
             v = stack[top]
-            gx = max(max(box[v, 0] - x, x - box[v, 3]), 0.0)
-            gy = max(max(box[v, 1] - y, y - box[v, 4]), 0.0)
-            gz = max(max(box[v, 2] - z, z - box[v, 5]), 0.0)
-            gap = gx * gx + gy * gy + gz * gz
+            gap = _squared_gap(tree.box[v], x, y, z)
             if gap > reach * reach:
                 continue
             low = points + v

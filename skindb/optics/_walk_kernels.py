@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from skindb.jit import fast_kernel
+from skindb.jit import fast_kernel, inline_fast_kernel
 from skindb.types import Matrix32
 
 
@@ -18,6 +18,40 @@ def _escape(cosine: float, eta: float) -> float:
     a = (eta * cosine - outside) / (eta * cosine + outside)
     b = (cosine - eta * outside) / (cosine + eta * outside)
     return float(1.0 - 0.5 * (a * a + b * b))
+
+
+@inline_fast_kernel
+def _scattering_cosine(rng: np.random.Generator, g: float) -> float:
+    """Random cosine of the Henyey-Greenstein phase function."""
+    if g == 0.0:
+        return 2.0 * rng.random() - 1.0
+    q = (1.0 - g * g) / (1.0 - g + 2.0 * g * rng.random())
+    return (1.0 + g * g - q * q) / (2.0 * g)
+
+
+@inline_fast_kernel
+def _scattered(
+    rng: np.random.Generator, ct: float, dx: float, dy: float, dz: float
+) -> tuple[float, float, float]:
+    """Direction at the cosine `ct` to dx, dy, dz, with a random azimuth."""
+    st = np.sqrt(max(0.0, 1.0 - ct * ct))
+    # a uniform direction in the plane by rejection, which is faster than sine and cosine
+    a = 2.0 * rng.random() - 1.0
+    b = 2.0 * rng.random() - 1.0
+    r2 = a * a + b * b
+    while r2 > 1.0 or r2 < 1e-12:
+        a = 2.0 * rng.random() - 1.0
+        b = 2.0 * rng.random() - 1.0
+        r2 = a * a + b * b
+    f = st / np.sqrt(r2)
+    c = a * f
+    s = b * f
+    if abs(dz) > 0.99999:
+        return c, s, ct * np.sign(dz)
+    h = np.sqrt(1.0 - dz * dz)
+    x_turned = c * dx * dz / h - s * dy / h + dx * ct
+    y_turned = c * dy * dz / h + s * dx / h + dy * ct
+    return x_turned, y_turned, -c * h + dz * ct
 
 
 @fast_kernel
@@ -72,34 +106,8 @@ def walk(
                 if rng.random() > 0.25:
                     break
                 weight *= 4.0
-            if g == 0.0:
-                ct = 2.0 * rng.random() - 1.0
-            else:
-                q = (1.0 - g * g) / (1.0 - g + 2.0 * g * rng.random())
-                ct = (1.0 + g * g - q * q) / (2.0 * g)
-            st = np.sqrt(max(0.0, 1.0 - ct * ct))
-            # a uniform direction in the plane by rejection, which is faster than sine and cosine
-            a = 2.0 * rng.random() - 1.0
-            b = 2.0 * rng.random() - 1.0
-            r2 = a * a + b * b
-            while r2 > 1.0 or r2 < 1e-12:
-                a = 2.0 * rng.random() - 1.0
-                b = 2.0 * rng.random() - 1.0
-                r2 = a * a + b * b
-            f = st / np.sqrt(r2)
-            c = a * f
-            s = b * f
-            if abs(dz) > 0.99999:
-                dx = c
-                dy = s
-                dz = ct * np.sign(dz)
-            else:
-                h = np.sqrt(1.0 - dz * dz)
-                x_turned = c * dx * dz / h - s * dy / h + dx * ct
-                y_turned = c * dy * dz / h + s * dx / h + dy * ct
-                dx = x_turned
-                dy = y_turned
-                dz = -c * h + dz * ct
+            ct = _scattering_cosine(rng, g)
+            dx, dy, dz = _scattered(rng, ct, dx, dy, dz)
             n = 1.0 / np.sqrt(dx * dx + dy * dy + dz * dz)
             dx = dx * n
             dy = dy * n

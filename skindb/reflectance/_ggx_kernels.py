@@ -40,7 +40,7 @@ from skindb.reflectance._lumitexel_kernels import (
     write_cosines,
     write_samples,
 )
-from skindb.reflectance._shade_kernels import transmittance
+from skindb.reflectance._shade_kernels import fall_off, to_lamp, transmittance
 from skindb.reflectance.model import Block, JudgedFit, SurfaceFit
 from skindb.types import Cube, Matrix, Matrix32, Vector
 
@@ -458,23 +458,13 @@ def shade_ggx(
             continue
         gloss = 0.0
         for p in range(points):
-            square = 0.0
-            for k in range(3):
-                square += (place[i, p, k] - position[i, k]) ** 2
-            scale = 1.0 / math.sqrt(square)
-            cos_i = 0.0
-            both = 0.0
-            along = 0.0
-            for k in range(3):
-                towards = (place[i, p, k] - position[i, k]) * scale
-                cos_i += towards * normal[i, k]
-                both += towards * view[i, k]
-                along -= towards * axis[k]
+            x, y, z, square = to_lamp(position[i], place[i, p])
+            cos_i = x * normal[i, 0] + y * normal[i, 1] + z * normal[i, 2]
+            both = x * view[i, 0] + y * view[i, 1] + z * view[i, 2]
             if lit[i, p] <= 0.0 or cos_i <= 0.0:
                 continue
             received = lit[i, p] * cos_i / square
-            if falloff != 0.0:
-                received *= max(along, 0.0) ** falloff
+            received *= fall_off(axis, x, y, z, falloff)
             half = min((cos_i + cos_o) ** 2 / max(2.0 + 2.0 * both, 1e-12), 1.0)
             value, _ = lobe_value(cos_i, cos_o, half, parameters[i, ROUGHNESS])
             apart = min(math.sqrt(max((1.0 + both) / 2.0, 0.0)), 1.0)

@@ -465,6 +465,13 @@ def fit_many(
 
 
 @kernel
+def _is_valid(rows: Matrix32, target: Matrix, weight: Vector) -> bool:
+    """Whether all numbers are finite and the weights not negative."""
+    finite = np.isfinite(rows).all() and np.isfinite(target).all()
+    return bool(finite and np.isfinite(weight).all() and weight.min() >= 0.0)
+
+
+@kernel
 def _fit_scaled(
     s: int,
     lo: int,
@@ -480,12 +487,7 @@ def _fit_scaled(
     rows = samples.rows[lo:hi]
     target = samples.target[lo:hi]
     weight = samples.weight[lo:hi]
-    if not (
-        np.isfinite(rows).all()
-        and np.isfinite(target).all()
-        and np.isfinite(weight).all()
-        and weight.min() >= 0.0
-    ):
+    if not _is_valid(rows, target, weight):
         return NOT_FINITE
     lift = problem.lift
     square = lift.shape[0] == lift.shape[1]

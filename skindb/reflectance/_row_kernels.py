@@ -1,4 +1,6 @@
-"""Compiled computation of basis rows; see `skindb.reflectance.rows` for shapes and sources."""
+"""Compiled computation of basis rows; see
+`skindb.reflectance.mixture` for shapes and sources.
+"""
 
 from __future__ import annotations
 

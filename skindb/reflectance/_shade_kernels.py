@@ -56,6 +56,28 @@ def _surface(
     return total
 
 
+@inline_fast_kernel
+def to_lamp(position: Vector, place: Vector) -> tuple[float, float, float, float]:
+    """Unit direction from a position to a place, and their squared distance."""
+    x = place[0] - position[0]
+    y = place[1] - position[1]
+    z = place[2] - position[2]
+    square = x * x + y * y + z * z
+    inverse = 1.0 / math.sqrt(square)
+    return x * inverse, y * inverse, z * inverse, square
+
+
+@inline_fast_kernel
+def fall_off(axis: Vector, x: float, y: float, z: float, exponent: float) -> float:
+    """Radiant intensity of a lamp opposite to the direction x, y, z, over that along its
+    axis.
+    """
+    if exponent == 0.0:
+        return 1.0
+    along = -(axis[0] * x + axis[1] * y + axis[2] * z)
+    return float(max(along, 0.0) ** exponent)
+
+
 @fast_kernel
 def shade(
     position: Matrix,
@@ -89,22 +111,13 @@ def shade(
             for p in range(points):
                 if lit[i, p] <= 0.0:
                     continue
-                dx = lamp[i, p, 0] - position[i, 0]
-                dy = lamp[i, p, 1] - position[i, 1]
-                dz = lamp[i, p, 2] - position[i, 2]
-                square = dx * dx + dy * dy + dz * dz
-                inverse = 1.0 / math.sqrt(square)
-                dx = dx * inverse
-                dy = dy * inverse
-                dz = dz * inverse
+                dx, dy, dz, square = to_lamp(position[i], lamp[i, p])
                 cos_i = dx * nx + dy * ny + dz * nz
                 if cos_i <= 0.0:
                     continue
                 # irradiance of the surface per unit of radiant intensity
                 received = lit[i, p] * cos_i / square
-                if falloff != 0.0:
-                    along = -(axis[0] * dx + axis[1] * dy + axis[2] * dz)
-                    received *= max(along, 0.0) ** falloff
+                received *= fall_off(axis, dx, dy, dz, falloff)
                 matte += (
                     received
                     * transmittance(min(cos_i, 1.0), eta)
