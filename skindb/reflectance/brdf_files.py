@@ -4,7 +4,6 @@ al. 2003). Their values are resampled to the default grid.
 
 from __future__ import annotations
 
-import csv
 import hashlib
 import zipfile
 from collections.abc import Mapping
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import RegularGridInterpolator
 
 from skindb.errors import Fault, InputError
-from skindb.files import private_file
+from skindb.files import package_json, private_file
 from skindb.optics.angles import half_difference
 from skindb.reflectance.dictionary import (
     Dictionary,
@@ -41,11 +40,6 @@ UNITS = ("sr-1", "sr^-1", "1/sr")
 MAX_HOLE_FRACTION = 0.5
 SHAPE = (90, 90, 180)  # theta_h (quadratic), theta_d, phi_d
 SCALE = np.array([1.0, 1.15, 1.66]) / 1500.0
-# SHA-256 of the hundred files of the database, version 2 of February 2006. MERL
-# publishes no checksums. These are the Git LFS object names of the complete public copy
-# in github.com/duanwenxi/Mitsuba-3-for-Photometric-Stereo-data, commit
-# 914294a081b1ef36e56f9392c2758bca24868e3a.
-DIGESTS = Path(__file__).with_name("merl_sha256.csv")
 GENUINE = "genuine"
 DIFFERS = "differs from the published file of that name"
 UNKNOWN = "not in the published set"
@@ -183,13 +177,13 @@ def _load(path: Path) -> dict[str, NDArray[Any]]:
     return arrays | {name: arrays[name].astype(np.float64) for name in NODES}
 
 
-def _channel_mean(one: NDArray[Any]) -> Array:
+def _channel_mean(brdf: NDArray[Any]) -> Array:
     """Mean over channels of one material (theta_h, theta_d, phi_d) [, RGB]; NaN where
     any channel is NaN.
 
     Materials are processed one at a time, as all of them take gigabytes.
     """
-    grey = one.astype(np.float64)
+    grey = brdf.astype(np.float64)
     return np.asarray(grey.mean(axis=-1) if grey.ndim == 4 else grey)
 
 
@@ -465,9 +459,13 @@ def read_merl_folder(path: str | Path) -> Dictionary:
 
 @cache
 def published_digests() -> dict[str, str]:
-    """SHA-256 of the published files by material, see `DIGESTS`."""
-    with DIGESTS.open(newline="") as lines:
-        return {row["material"]: row["sha256"] for row in csv.DictReader(lines)}
+    """SHA-256 of the hundred files of the database, version 2 of February 2006, by material.
+
+    MERL publishes no checksums. These are the Git LFS object names of the complete public
+    copy in github.com/duanwenxi/Mitsuba-3-for-Photometric-Stereo-data, commit
+    914294a081b1ef36e56f9392c2758bca24868e3a.
+    """
+    return dict(package_json("skindb.reflectance", "merl_sha256.json"))
 
 
 def _publication_check(file: Path) -> tuple[str, str]:

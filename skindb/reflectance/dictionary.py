@@ -6,12 +6,10 @@ See `skindb.reflectance.brdf_files` for files.
 
 from __future__ import annotations
 
-import csv
 import hashlib
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +17,7 @@ import xarray as xr
 
 from skindb.cache import cached_arrays
 from skindb.errors import Fault, InputError
+from skindb.files import package_json
 from skindb.optics.angles import directions, half_difference
 from skindb.optics.fresnel import fresnel_reflectance
 from skindb.reflectance import _row_kernels
@@ -48,14 +47,6 @@ SOURCES = (
     "skindb.optics.fresnel",
     "skindb.jit",
 )
-# ABC parameters of 59 dielectrics of the MERL database: the paints, fabrics, woods,
-# plastics, rubbers and organic materials among its hundred, as Weyrich et al. 2005 do not
-# name theirs. From Loew, Kronander, Ynnerman, Unger, "BRDF models for accurate and
-# efficient rendering of glossy surfaces", ACM Transactions on Graphics 31(1), 2012.
-# Columns: kd r g b, A r g b, B, C, index of refraction
-MATERIALS = Path(__file__).with_name("abc_low2012.csv")
-# a part of the code: a change of the file changes all fits
-MATERIALS_SHA256 = "7b2eca14f9101576a8ce33be9432fea07251b44726c691bf1598615e50f31f33"
 # cosines are clamped to this, so that cells below the horizon continue the last value
 # above it
 MIN_COSINE_TABLE = 0.03
@@ -141,14 +132,16 @@ class Dictionary:
 
 @cache
 def abc_parameters() -> dict[str, tuple[float, ...]]:
-    """ABC parameters (9,) of the embedded materials by name, see `MATERIALS`."""
-    content = MATERIALS.read_bytes()
-    if hashlib.sha256(content).hexdigest() != MATERIALS_SHA256:
-        rule = "must be the file that belongs to this version of skindb"
-        cure = "install skindb again"
-        raise InputError(Fault(str(MATERIALS), rule, "another content", cure))
-    _, *rows = csv.reader(content.decode().splitlines())
-    return {name: tuple(map(float, numbers)) for name, *numbers in rows}
+    """Parameters (9,) of 59 dielectrics of the MERL database by name: kd r g b, A r g b,
+    B, C, index of refraction.
+
+    These are the paints, fabrics, woods, plastics, rubbers and organic materials among
+    its hundred, as Weyrich et al. 2005 do not name theirs. From Loew, Kronander,
+    Ynnerman, Unger, "BRDF models for accurate and efficient rendering of glossy
+    surfaces", ACM Transactions on Graphics 31(1), 2012.
+    """
+    table = package_json("skindb.reflectance", "abc_low2012.json")
+    return {name: tuple(map(float, numbers)) for name, numbers in table.items()}
 
 
 def evaluate_abc(parameters: Array, wi: Array, wo: Array) -> Array:
@@ -193,7 +186,10 @@ def embedded_dictionary() -> Dictionary:
         }
 
     table = cached_arrays(
-        "embedded-dictionary", (DEFAULT_GRID,), sources=SOURCES, make=make
+        "embedded-dictionary",
+        (DEFAULT_GRID, abc_parameters()),
+        sources=SOURCES,
+        make=make,
     )["table"]
     table.setflags(write=False)
     return Dictionary(tuple(abc_parameters()), table, DEFAULT_GRID, EMBEDDED)

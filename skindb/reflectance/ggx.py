@@ -46,7 +46,12 @@ from skindb.reflectance.model import (
     SurfaceFit,
 )
 from skindb.reflectance.reduction import fitted_surfels
-from skindb.reflectance.sampling import COSINE_FRACTION, MIN_COSINE_HALF, tangents
+from skindb.reflectance.sampling import (
+    COSINE_FRACTION,
+    MIN_COSINE_HALF,
+    by_half_vector,
+    half_vectors,
+)
 from skindb.reflectance.tables import Table, tabulate
 from skindb.schema import check, dataset, variables
 from skindb.schema.notes import Omission
@@ -298,19 +303,13 @@ class LobeSampler:
         # of the half vector (Walter et al. 2007, eq. 35), or of a direction by its cosine
         half = 1 / (1 + square * draw[:, 1] / (1 - draw[:, 1]))
         cosine = np.sqrt(np.where(lobe, half, 1 - draw[:, 1]))
-        sine = np.sqrt(np.maximum(1 - cosine**2, 0.0))
-        tangent, second = tangents(normal)
-        drawn = (sine * np.cos(turn))[:, None] * tangent + cosine[:, None] * normal
-        drawn = drawn + (sine * np.sin(turn))[:, None] * second
-        mirrored = 2 * np.einsum("nc,nc->n", view, drawn)[:, None] * drawn - view
-        return np.asarray(np.where(lobe[:, None], mirrored, drawn))
+        return by_half_vector(normal, view, cosine, turn, lobe)
 
     def pdf(self, mix: Array, normal: Array, view: Array, towards: Array) -> Array:
         """Density (n,) per steradian of `sample`; 0 below the surface."""
         probability, roughness = mix.T
         cosine = np.einsum("nc,nc->n", normal, towards)
-        half = towards + view
-        half = half / np.maximum(np.linalg.norm(half, axis=1, keepdims=True), 1e-12)
+        half = half_vectors(view, towards)
         cos_h = np.maximum(np.einsum("nc,nc->n", half, normal), 0.0)
         cos_d = np.einsum("nc,nc->n", half, view)
         square = roughness**2

@@ -39,7 +39,7 @@ from skindb.reflectance.reduction import (
     reduce_basis,
     reduced_dictionary,
 )
-from skindb.reflectance.sampling import LobeSampler
+from skindb.reflectance.sampling import TableSampler
 from skindb.reflectance.tables import (
     Table,
     TableGrid,
@@ -313,9 +313,9 @@ class Mixture:
         """The tables and the weights as they are."""
         return self.table, parameters
 
-    def sampler(self) -> LobeSampler:
+    def sampler(self) -> TableSampler:
         """Sampler of directions by the half vectors of the tables."""
-        return LobeSampler.of_tables(self.table)
+        return TableSampler.of_tables(self.table)
 
     @property
     def _tables(self) -> Tables:

@@ -319,18 +319,13 @@ def reduce_basis(
     factors = nmf(
         weight[chosen].astype(np.float64), k, metric=metric, seeds=SEEDS, rng=rng
     )
-    # in parts: a million surfels in double precision would take half a gigabyte
-    parts = (good[i : i + PART] for i in range(0, len(good), PART))
-    total = np.sum(
-        [area[part] @ weight[part].astype(np.float64) for part in parts], axis=0
-    )
     tables = dictionary.table @ factors.H.T.astype(np.float32)
     names = [f"component{i}" for i in range(k)]
     return dataset(
         {
             "basis_mixture": factors.H,
             "basis_brdf": stored_brdf(tables),
-            "mean_dictionary_weight": total / area[good].sum(),
+            "mean_dictionary_weight": _mean_weight(weight, area, good),
             "disc_angular_radius": dictionary.disc_angular_radius,
         },
         coords={
@@ -346,6 +341,14 @@ def reduce_basis(
             "dictionary": dictionary.source,
         },
     )
+
+
+def _mean_weight(weight: Array, area: Array, good: NDArray[np.int64]) -> Array:
+    """Mean (m,) of the weights (n, m) of some surfels, weighted by area (n,)."""
+    # in parts: a million surfels in double precision would take half a gigabyte
+    parts = (good[i : i + PART] for i in range(0, len(good), PART))
+    sums = [area[part] @ weight[part].astype(np.float64) for part in parts]
+    return np.asarray(np.sum(sums, axis=0) / area[good].sum())
 
 
 def fitted_surfels(fitted: xr.Dataset, names: Sequence[str]) -> NDArray[np.int64]:

@@ -21,7 +21,7 @@ MIN_COSINE_HALF = 1e-4
 
 
 @dataclass(frozen=True)
-class LobeSampler:
+class TableSampler:
     """Probability densities of half vectors, one for each basis.
 
     `density` (k, nh - 1) is the density of u = sqrt(theta_h / (pi/2)) in equal cells of
@@ -33,7 +33,7 @@ class LobeSampler:
     albedo: Array
 
     @classmethod
-    def of_tables(cls, tables: NDArray[np.float32]) -> LobeSampler:
+    def of_tables(cls, tables: NDArray[np.float32]) -> TableSampler:
         """Densities in proportion to the mean of each table (nh, nd, np, k) over its
         other angles, times the cosine.
         """
@@ -94,23 +94,14 @@ class LobeSampler:
             which = chosen[lobe] - 1
             cell = np.minimum((draw[lobe, 1:2] > rising[which]).sum(axis=1), cells - 1)
             cosine[lobe] = np.cos(((cell + draw[lobe, 2]) / cells) ** 2 * np.pi / 2)
-        sine = np.sqrt(np.maximum(1 - cosine**2, 0.0))
-        tangent, second = tangents(normal)
-        drawn = (
-            (sine * np.cos(turn))[:, None] * tangent
-            + (sine * np.sin(turn))[:, None] * second
-            + cosine[:, None] * normal
-        )
-        mirrored = 2 * np.einsum("nc,nc->n", view, drawn)[:, None] * drawn - view
-        return np.asarray(np.where(lobe[:, None], mirrored, drawn))
+        return by_half_vector(normal, view, cosine, turn, lobe)
 
     def pdf(self, mix: Array, normal: Array, view: Array, towards: Array) -> Array:
         """Density (n,) per steradian with which `sample` draws the directions `towards`
         (n, 3); 0 below the surface.
         """
         cosine = np.einsum("nc,nc->n", normal, towards)
-        half = towards + view
-        half = half / np.maximum(np.linalg.norm(half, axis=1, keepdims=True), 1e-12)
+        half = half_vectors(view, towards)
         cos_h = np.clip(np.einsum("nc,nc->n", half, normal), -1.0, 1.0)
         cos_d = np.einsum("nc,nc->n", half, view)
         # from the sine, because an arc cosine is too inaccurate for narrow lobes
@@ -132,6 +123,35 @@ class LobeSampler:
                 0.0,
             )
         )
+
+
+def by_half_vector(
+    normal: Array,
+    view: Array,
+    cosine: Array,
+    turn: Array,
+    mirrored: NDArray[np.bool_],
+) -> Array:
+    """Directions (n, 3) at a cosine (n,) to the normal and an azimuth `turn` (n,); where
+    `mirrored`, the view mirrored at this direction instead.
+    """
+    sine = np.sqrt(np.maximum(1 - cosine**2, 0.0))
+    tangent, second = tangents(normal)
+    drawn = (
+        (sine * np.cos(turn))[:, None] * tangent
+        + (sine * np.sin(turn))[:, None] * second
+        + cosine[:, None] * normal
+    )
+    mirror = 2 * np.einsum("nc,nc->n", view, drawn)[:, None] * drawn - view
+    return np.asarray(np.where(mirrored[:, None], mirror, drawn))
+
+
+def half_vectors(view: Array, towards: Array) -> Array:
+    """Unit vectors (n, 3) half way between two directions."""
+    half = towards + view
+    return np.asarray(
+        half / np.maximum(np.linalg.norm(half, axis=1, keepdims=True), 1e-12)
+    )
 
 
 def tangents(normal: Array) -> tuple[Array, Array]:

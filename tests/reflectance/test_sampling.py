@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from skindb.reflectance.sampling import LobeSampler, tangents
+from skindb.reflectance.sampling import TableSampler, tangents
 from skindb.reflectance.tables import TableGrid, tabulate
 
 GRID = TableGrid(60, 40, 8)
@@ -32,7 +32,7 @@ def _tables():
 )
 @pytest.mark.parametrize("tilt", [0.0, 50.0, 80.0])
 def test_sample__has_the_stated_density(weights, tilt):
-    sampler = LobeSampler.of_tables(_tables())
+    sampler = TableSampler.of_tables(_tables())
     rng = np.random.default_rng(3)
     count = 200_000
     normal = np.broadcast_to([0.0, 0.0, 1.0], (count, 3))
@@ -89,7 +89,7 @@ def test_sample__weights_integrate_the_brdf():
     and finite variance.
     """
     tables = _tables()
-    sampler = LobeSampler.of_tables(tables)
+    sampler = TableSampler.of_tables(tables)
     rng = np.random.default_rng(5)
     count = 100_000
     normal = np.broadcast_to([0.0, 0.0, 1.0], (count, 3))
