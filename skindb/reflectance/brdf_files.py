@@ -125,9 +125,9 @@ def read_tables(path: str | Path) -> Dictionary:
 
 
 def write_tables(
-    path: str | Path, dictionary: Dictionary, **more: NDArray[Any]
+    path: str | Path, dictionary: Dictionary, **extra: NDArray[Any]
 ) -> None:
-    """Write a file for `read_tables`, with `more` arrays."""
+    """Write a file for `read_tables`, with `extra` arrays."""
     grid = dictionary.grid
     arrays: dict[str, Any] = {
         "names": np.array(dictionary.names, dtype=str),
@@ -139,7 +139,7 @@ def write_tables(
         "disc_angular_radius": np.array(dictionary.disc_angular_radius),
     }
     with private_file(path).open("wb") as stream:
-        np.savez_compressed(stream, **(arrays | more))
+        np.savez_compressed(stream, **(arrays | extra))
 
 
 def _load(path: Path) -> dict[str, NDArray[Any]]:
@@ -244,7 +244,7 @@ def _shape_faults(path: Path, arrays: Mapping[str, NDArray[Any]]) -> list[Fault]
     return []
 
 
-def _range_faults(name: str, nodes: Array, where: str) -> list[Fault]:
+def _range_faults(name: str, nodes: Array, place: str) -> list[Fault]:
     """Faults of nodes that are not in rad or do not span their axis; the outermost
     value is used beyond them.
     """
@@ -253,7 +253,7 @@ def _range_faults(name: str, nodes: Array, where: str) -> list[Fault]:
     if high > 2 * np.pi:
         return [
             Fault(
-                where,
+                place,
                 "angles must be in rad",
                 f"{high:g}",
                 "convert them with numpy.radians",
@@ -267,19 +267,19 @@ def _range_faults(name: str, nodes: Array, where: str) -> list[Fault]:
                 "and omit the end"
             )
             return [
-                Fault(where, "nodes must lie in [0, pi)", f"[{low:g}, {high:g}]", cure)
+                Fault(place, "nodes must lie in [0, pi)", f"[{low:g}, {high:g}]", cure)
             ]
         if gap > np.pi / 2 + 1e-9 and len(nodes) > 1:
             rule = (
                 "neighbouring nodes must be at most pi/2 apart, also across the end of "
                 "the period"
             )
-            return [Fault(where, rule, f"a gap of {gap:.3g}", "add nodes")]
+            return [Fault(place, rule, f"a gap of {gap:.3g}", "add nodes")]
     elif low < 0 or high > np.pi / 2 + 1e-6 or low > 0.2 or high < np.pi / 2 - 0.2:
         rule = "nodes must extend from 0 to pi/2 rad, with at most 0.2 missing at either end"
         return [
             Fault(
-                where,
+                place,
                 rule,
                 f"[{low:g}, {high:g}]",
                 "add nodes, with NaN where nothing was measured",
@@ -475,8 +475,8 @@ def _publication_check(file: Path) -> tuple[str, str]:
     published = published_digests()
     for name, value in published.items():
         if value == digest:
-            other = f"published under the name {name}"
-            return GENUINE if name == file.stem else other, digest
+            renamed = f"published under the name {name}"
+            return GENUINE if name == file.stem else renamed, digest
     return DIFFERS if file.stem in published else UNKNOWN, digest
 
 
@@ -531,10 +531,10 @@ def _periodic_nodes(phi_d: Array) -> tuple[Array, NDArray[np.int64]]:
     ) % n
 
 
-def _linear_matrix(nodes: Array, at: Array) -> Array:
-    """Matrix (len(at), len(nodes)) of linear interpolation; constant beyond the ends."""
+def _linear_matrix(nodes: Array, points: Array) -> Array:
+    """Matrix (len(points), len(nodes)) of linear interpolation; constant beyond the ends."""
     return np.stack(
-        [np.interp(at, nodes, column) for column in np.eye(len(nodes))], axis=1
+        [np.interp(points, nodes, column) for column in np.eye(len(nodes))], axis=1
     )
 
 

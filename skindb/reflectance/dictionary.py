@@ -96,17 +96,17 @@ class Dictionary:
         """Source and digest, which is the same for lights of all sizes; for dictionaries
         from files also notes, and the digests of the files.
         """
-        about: dict[str, Any] = {
+        provenance: dict[str, Any] = {
             "dictionary": self.source,
             "dictionary_digest": self.point_digest or self.digest,
         }
         if self.origins:
-            about["dictionary_notes"] = list(self.notes)
-            about["dictionary_sha256"] = {
+            provenance["dictionary_notes"] = list(self.notes)
+            provenance["dictionary_sha256"] = {
                 name: origin.sha256
                 for name, origin in zip(self.names, self.origins, strict=True)
             }
-        return about
+        return provenance
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -212,11 +212,11 @@ def sample_pairs(count: int = 20_000, lowest: float = 0.1) -> tuple[Array, Array
     return wi[up], wo[up]
 
 
-def weighted_error(found: Array, exact: Array, wi: Array, wo: Array) -> Array:
+def weighted_error(values: Array, exact: Array, wi: Array, wo: Array) -> Array:
     """Relative rms error (m,) of values (n, m), weighted by both cosines."""
     weight = (wi[:, 2] * wo[:, 2])[:, None]
     total = np.maximum((weight * exact**2).sum(axis=0), 1e-300)
-    return np.asarray(np.sqrt((weight * (found - exact) ** 2).sum(axis=0) / total))
+    return np.asarray(np.sqrt((weight * (values - exact) ** 2).sum(axis=0) / total))
 
 
 @cache
@@ -451,9 +451,9 @@ def dictionary_quality(
 
 
 def _disc_errors(
-    dictionary: Dictionary, angular_radius: float, found: Array, wi: Array, wo: Array
+    dictionary: Dictionary, angular_radius: float, values: Array, wi: Array, wo: Array
 ) -> dict[str, Array]:
-    """Errors of averaging over the disc; `found` are interpolated values of the tables
+    """Errors of averaging over the disc; `values` are those of the tables
     from `convolve_disc`.
     """
     pairs = (wi, wo), (wo, wi)
@@ -468,7 +468,7 @@ def _disc_errors(
     return {
         "one_sided_error": weighted_error(mean + forward - backward, mean, wi, wo),
         "disc_quadrature_error": weighted_error(averages, mean, wi, wo),
-        "disc_table_error": weighted_error(found, mean, wi, wo),
+        "disc_table_error": weighted_error(values, mean, wi, wo),
     }
 
 

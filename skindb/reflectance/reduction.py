@@ -488,12 +488,12 @@ def _best(systems: Systems, lift: Array, bases: list[Array]) -> Array:
 
 
 def _grown(
-    systems: Systems, lift: Array, H: Array, weights: Array, least: Array
+    systems: Systems, lift: Array, H: Array, weights: Array, squares: Array
 ) -> Array:
     """H with one more row: the mean weights of the surfels with the largest excess over
     a fit of all BRDFs.
     """
-    excess = residuals(systems, H @ lift)[1] - least
+    excess = residuals(systems, H @ lift)[1] - squares
     worst = np.argsort(excess)[-max(1, round(WORST * len(excess))) :]
     return np.concatenate([H, weights[worst].mean(axis=0, keepdims=True)])
 
