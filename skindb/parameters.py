@@ -207,7 +207,7 @@ class FitParameters(Limited):
         With every parameter that is out of range.
     """
 
-    k: int = option(4, "Number of basis BRDFs.", minimum=1)
+    k: int = option(4, "Number of basis BRDFs of a mixture.", minimum=1)
     profile: Literal["transport", "dipole"] = option(
         "transport", "Model of the probe profiles; dipole is that of the paper."
     )
@@ -218,7 +218,9 @@ class FitParameters(Limited):
         "perceptual",
         "Space of the least squares: cube-root space, linear, or that of the paper.",
     )
-    rank: int = option(16, "Rank of the reduced dictionary (59 is exact).", minimum=1)
+    rank: int = option(
+        16, "Rank of the reduced dictionary of a mixture (59 is exact).", minimum=1
+    )
     eta: float = option(1.3, "Refractive index of skin.", minimum=1.0, maximum=2.0)
     even_reflection: float = option(
         EVEN_REFLECTION,
@@ -248,6 +250,19 @@ class FitParameters(Limited):
         minimum=0,
         maximum=MAX_SEED,
     )
+
+    def __post_init__(self) -> None:
+        """Check the limits, and that mixtures alone have `k` and `rank`."""
+        super().__post_init__()
+        if self.surface == "mixture":
+            return
+        faults = [
+            Fault(spec.name, "mixtures alone have it", self.surface, "omit it")
+            for spec in fields(self)
+            if spec.name in ("k", "rank") and getattr(self, spec.name) != spec.default
+        ]
+        if faults:
+            raise InputError(faults)
 
     @classmethod
     def of(cls, attrs: Mapping[Any, Any]) -> Self:

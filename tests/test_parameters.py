@@ -119,3 +119,12 @@ def test_parameters__limits_hold_for_callers_in_python(record, options, rule):
 def test_parameters__an_exposure_is_a_word_or_a_number():
     for exposure in ("fixed", "auto", 1e-9, 2.5, 1e9):
         assert RenderParameters(exposure=exposure).exposure == exposure
+
+
+def test_fit_parameters__mixtures_alone_have_components_and_rank():
+    FitParameters(surface="mixture", k=8, rank=59)
+    FitParameters(surface="ggx", seed=1)
+    with pytest.raises(InputError) as error:
+        FitParameters(surface="ggx", k=8, rank=59)
+    lines = str(error.value).splitlines()
+    assert [line.partition(":")[0] for line in lines] == ["k", "rank"]

@@ -439,10 +439,10 @@ def _write_bases(
             list(map(str, basis["dictionary"].values))
         )
     write_tables(folder / "bases.npz", dictionary, **arrays)
+    mixed = "mixtures of the measured BRDFs; " if arrays else ""
     text = (
         "basis_brdf (component, theta_h, theta_d, phi_d), its nodes [rad], "
-        "mixtures of the measured BRDFs; "
-        "skindb fit --dictionary reads it"
+        f"{mixed}skindb fit --dictionary reads it"
     )
     described: dict[str, dict[str, Any]] = {
         "bases/bases.npz": {"holds": text, "units": "sr-1"}

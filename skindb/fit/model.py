@@ -240,7 +240,7 @@ def _require_match(
     """Require that a first pass used this surface model and these surfels."""
     origin = surface.provenance
     if any(first.attrs.get(name) != origin[name] for name in origin):
-        rule = "both passes need the same dictionary"
+        rule = "both passes need the same surface model and dictionary"
         cure = "give that of the first pass, or repeat it"
         source = str(next(iter(origin.values())))
         raise InputError(Fault("dictionary", rule, source, cure))

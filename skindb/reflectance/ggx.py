@@ -36,6 +36,7 @@ from skindb.reflectance.block import (
     shade_diffuse,
 )
 from skindb.reflectance.model import (
+    MAX_TABLES,
     Block,
     Comparison,
     FitRequest,
@@ -63,7 +64,7 @@ MIN_COSINE_LOBE = (
 ALBEDO_NODES = 24  # roughnesses at which the reflectance of a lobe is integrated
 # tables that stand for all lobes of a take, between which weights are interpolated; with a
 # ratio of 1.3 between neighbours, values differ by up to 2 % of the peak
-TABLES = 8
+TABLES = MAX_TABLES
 # of the roughnesses of a take, between which tables are placed
 TABLE_QUANTILES = (0.01, 0.99)
 
@@ -111,11 +112,15 @@ class GGX:
 
     @classmethod
     def unfitted(cls, request: FitRequest) -> GGX:
-        """The model before a fit; there is none in the mode "paper"."""
+        """The model before a fit; there is none in the mode "paper" or of a dictionary."""
         if request.mode == "paper":
             rule = 'the surface "ggx" is fitted in the mode "perceptual" or "linear"'
             cure = "choose another mode"
             raise InputError(Fault("mode", rule, request.mode, cure))
+        if request.dictionary is not None:
+            rule = "mixtures alone are of a dictionary"
+            cure = "omit it, or fit a mixture"
+            raise InputError(Fault("dictionary", rule, "ggx", cure))
         return cls(request.eta, request.disc_angular_radius)
 
     @classmethod

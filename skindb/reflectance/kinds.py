@@ -42,14 +42,6 @@ def surface_model(basis: xr.Dataset) -> ReflectanceModel:
     return Mixture.of_basis(basis)  # raises the fault
 
 
-def parameter_variables(fitted: xr.Dataset) -> tuple[str, ...]:
-    """Variables of the group "fitted" with the parameters of its surface model."""
-    for surface in SURFACES.values():
-        if surface.PARAMETERS[0] in fitted:
-            return surface.PARAMETERS
-    return Mixture.PARAMETERS
-
-
 def as_mixture(model: xr.DataTree) -> xr.DataTree:
     """The model with its surface as a mixture of tables, for programs that read tables; a
     mixture is returned as it is.

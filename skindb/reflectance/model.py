@@ -15,6 +15,8 @@ from skindb.reflectance.tables import Table
 from skindb.schema.notes import Omission
 from skindb.types import Array
 
+MAX_TABLES = 8  # that the viewer shows: two textures of four channels each
+
 
 class Noise(NamedTuple):
     """Noise model of the samples of n surfels, mean over the channels.
@@ -64,9 +66,13 @@ class SurfaceFit(NamedTuple):
     """Results of a fit of n surfels; NaN where the status says that nothing was fitted."""
 
     parameters: Array  # (n, p)
-    kkt: Array  # (n,), as are the following arrays
+    # (n,), as are the following arrays: gradient by the free parameters, relative; 0 at
+    # the minimum
+    kkt: Array
     residual: Array  # RMS error over RMS of the samples, diffuse light included
     residual_perceptual: Array  # the same in cube-root space
+    # lower bound of the condition number of the parameters; surfels above
+    # `MAX_CONDITION_TRUSTED` are doubtful
     condition: Array
     samples: NDArray[Any]
     iterations: NDArray[Any]
@@ -192,7 +198,9 @@ class ReflectanceModel(Protocol):
         """Fit the surface term to the samples minus their diffuse part."""
 
     def fit_columns(self, fit: SurfaceFit) -> dict[str, Array]:
-        """Variables of the surfels from `fit`."""
+        """Variables of the surfels from `fit`: its parameters, and the other fields of
+        `SurfaceFit` under the names of `skindb.reflectance.block.FIT_VARIABLES`.
+        """
 
     def reduced(
         self, fitted: xr.Dataset, *, k: int, rng: np.random.Generator
@@ -211,8 +219,8 @@ class ReflectanceModel(Protocol):
         """Fit, or only evaluate given parameters (n, p), and judge the prediction."""
 
     def judged_columns(self, judged: JudgedFit) -> dict[str, Array]:
-        """Variables of the surfels from `judge`: parameters, their errors, and the
-        reflectance of the surface.
+        """Variables of the surfels from `judge`: parameters, their errors,
+        `surface_reflectance` and `surface_reflectance_error`.
         """
 
     def shade(self, points: Points, lamp: Lamp, *, eta: float) -> NDArray[np.float32]:
@@ -232,7 +240,7 @@ class ReflectanceModel(Protocol):
 
     def resample(self, parameters: Array) -> tuple[Table, Array]:
         """Tables (nh, nd, np, k) and weights (n, k) whose mixtures are the surface term,
-        for programs that read tables.
+        for programs that read tables; the viewer shows at most `MAX_TABLES`.
         """
 
     def sampler(self) -> DirectionSampler:

@@ -8,10 +8,10 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
 from skindb.errors import Fault, InputError
-from skindb.reflectance.kinds import parameter_variables, surface_model
+from skindb.reflectance.kinds import surface_model
 from skindb.reflectance.model import Lamp, Points, ReflectanceModel
 from skindb.render.scene import usable_surfels
-from skindb.schema import FitStatus, TexelStatus, check, variables
+from skindb.schema import FitStatus, TexelStatus, Use, check, names_of, variables
 from skindb.schema.declaration import MAX_CONDITION_TRUSTED, MIN_SAMPLES_TRUSTED
 from skindb.types import Array
 
@@ -48,11 +48,8 @@ def surfel_texels(fitted: xr.Dataset) -> Codes:
                 else values > MAX_CONDITION_TRUSTED
             )
             code[wrong & (code < TexelStatus.FILLED)] = doubt
-    needed = (
-        variables.SHADING_NORMAL,
-        variables.DIFFUSE_REFLECTANCE,
-        *parameter_variables(fitted),
-    )
+    surface = [name for name in names_of(Use.SURFACE) if name in fitted]
+    needed = (variables.SHADING_NORMAL, variables.DIFFUSE_REFLECTANCE, *surface)
     for name in needed:
         finite = np.isfinite(fitted[name].values.reshape(len(code), -1)).all(axis=1)
         code[~finite] = TexelStatus.FILLED

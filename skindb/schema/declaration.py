@@ -146,6 +146,7 @@ class Use(Flag):
     MEDIAN = auto()  # median stands in the tables that cohorts read
     MAPPED = auto()  # as texel_<name> in the maps of a registered take
     SURVIVES_EDIT = auto()  # an edited model has it; others describe the unedited one
+    SURFACE = auto()  # parameter of a surface model; where it is NaN nothing was fitted
 
 
 @dataclass(frozen=True)

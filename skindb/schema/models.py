@@ -78,7 +78,7 @@ BASIS_WEIGHT = declare(
     "float32 fitted/basis_weight(surfel, component) [1]",
     "non-negative weights of the reduced basis",
     f"{PAPER}, section 7",
-    Use.SAMPLED | Use.SURVIVES_EDIT,
+    Use.SAMPLED | Use.SURVIVES_EDIT | Use.SURFACE,
 )
 BASIS_WEIGHT_ERROR = declare(
     "float32 fitted/basis_weight_error(surfel, component) [1]",
@@ -89,13 +89,13 @@ BASIS_WEIGHT_ERROR = declare(
 LOBE_STRENGTH = declare(
     "float32 fitted/lobe_strength(surfel) [1]",
     "factor on the GGX lobe of a surfel, which reflects by the Fresnel equations at 1",
-    uses=Use.SAMPLED | Use.SURVIVES_EDIT,
+    uses=Use.SAMPLED | Use.SURVIVES_EDIT | Use.SURFACE,
 )
 LOBE_ROUGHNESS = declare(
     "float32 fitted/lobe_roughness(surfel) [1]",
     "width alpha of the GGX lobe, which includes that of the lights",
     "Walter et al. 2007",
-    Use.SAMPLED | Use.SURVIVES_EDIT,
+    Use.SAMPLED | Use.SURVIVES_EDIT | Use.SURFACE,
 )
 LOBE_STRENGTH_ERROR = declare(
     "float32 fitted/lobe_strength_error(surfel) [1]",
@@ -110,7 +110,7 @@ LOBE_ROUGHNESS_ERROR = declare(
 )
 SURFACE_REFLECTANCE = declare(
     "float32 fitted/surface_reflectance(surfel) [1]",
-    "fraction of light along the normal that the surface reflects, by the reduced basis",
+    "fraction of light along the normal that the surface reflects, by its fitted model",
     uses=Use.SAMPLED | Use.MAPPED,
 )
 SURFACE_REFLECTANCE_ERROR = declare(

@@ -19,6 +19,7 @@ from skindb.errors import Fault, InputError
 from skindb.geometry.mesh import vertex_areas
 from skindb.optics.diffusion import S_FLOOR
 from skindb.optics.fresnel import boundary_factor
+from skindb.reflectance.model import MAX_TABLES
 from skindb.render.image import tone_map
 from skindb.render.monte_carlo import Lighting
 from skindb.render.rendering import chosen_camera, chosen_lights, fixed_exposure, render
@@ -32,7 +33,6 @@ Float = NDArray[np.floating[Any]]
 COUNT = 256  # lights, in 64 passes of four
 SKY_ROWS = 32  # rows of the image of the default sky
 GROUND = 0.2  # radiance below the horizon, relative to that of the zenith
-MAX_BASES = 8  # two textures of four channels each
 STILL_SAMPLES = 16  # rays per pixel of the picture that is shown without WebGL
 MIN_ALBEDO = 1e-4  # below it, ratios of albedos are meaningless
 MEASURED = (  # differences from skindb render (docs/howto/view.md)
@@ -213,9 +213,9 @@ def face_record(
     honour_consent(model.attrs, "export")
     surface = _surface(model, edited=bool(traits))[0]
     resampled, weights = surface.model.resample(surface.parameters)
-    if (count := weights.shape[1]) > MAX_BASES:
-        rule = f"the viewer needs at most {MAX_BASES} bases"
-        cure = f"fit again with --k {MAX_BASES} or less"
+    if (count := weights.shape[1]) > MAX_TABLES:
+        rule = f"the viewer needs at most {MAX_TABLES} bases"
+        cure = f"fit again with --k {MAX_TABLES} or less"
         raise InputError(Fault(take, rule, str(count), cure))
     values = _values(surface, weights)
     uv = model["fitted"].to_dataset()[variables.SURFEL_UV].values.astype(np.float32)
@@ -314,7 +314,7 @@ def _values(surface: Surface, mixed: Float) -> dict[str, Float]:
     """Values that traits change: albedo (n, 3), weights (n, 4) twice, diffusion length
     (n, 3) [mm].
     """
-    weights = np.zeros((len(surface.vertices), MAX_BASES))
+    weights = np.zeros((len(surface.vertices), MAX_TABLES))
     weights[:, : mixed.shape[1]] = mixed
     diffusion = np.zeros((len(surface.vertices), 3))
     if surface.sigma_tr is not None:
@@ -361,7 +361,7 @@ def _tables(tables: NDArray[np.float32]) -> list[NDArray[np.float16]]:
     """Tables (nh, nd, np, k) as arrays (np, nh, nd, 4), one for every four bases."""
     count = tables.shape[-1]
     padded = np.zeros(
-        (*tables.shape[:3], MAX_BASES if count > MAX_BASES // 2 else MAX_BASES // 2),
+        (*tables.shape[:3], MAX_TABLES if count > MAX_TABLES // 2 else MAX_TABLES // 2),
         np.float32,
     )
     padded[..., :count] = np.clip(tables, -60000, 60000)

@@ -234,7 +234,7 @@ def _averaged(dictionary, whole):
 def test_second_pass__refuses_another_first_pass(planted, small_dictionary, skin):
     first = first_pass(planted, HELD_OUT, dictionary=small_dictionary)
     with pytest.raises(
-        InputError, match="dictionary: both passes need the same dictionary"
+        InputError, match="dictionary: both passes need the same surface model"
     ):
         second_pass(planted, first)
     fewer = first.copy()

@@ -332,3 +332,5 @@ def test_kinds__stored_and_unfitted_models():
     assert surface_model(stored) == model
     with pytest.raises(InputError, match="perceptual"):
         unfitted_model("ggx", FitRequest(1.4, 0.01, "paper", 16, 4))
+    with pytest.raises(InputError, match="mixtures alone are of a dictionary"):
+        unfitted_model("ggx", FitRequest(1.4, 0.01, "linear", 16, 4, object()))
