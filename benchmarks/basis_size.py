@@ -17,7 +17,7 @@ from collections import Counter
 
 import numpy as np
 
-from skindb.analysis.basis import choose_size, size_status, surfel_errors
+from skindb.analysis.brdf import choose_size, size_status, surfel_errors
 from skindb.reflectance.dictionary import embedded_dictionary
 from skindb.reflectance.mixture import basis_rows
 from skindb.reflectance.reduction import Systems, factor_reflectance, residuals

@@ -11,7 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from skindb.analysis.albedo import cumulative, decorrelate, histogram, levels, quantiles
-from skindb.analysis.basis import project
+from skindb.analysis.brdf import project
 from skindb.analysis.subjects import trait_name
 from skindb.analysis.texture import at_surfels, edit_texture
 from skindb.errors import Fault, InputError

@@ -7,15 +7,15 @@ from pathlib import Path
 import xarray as xr
 
 from skindb.analysis.albedo import STUDY as ALBEDO
-from skindb.analysis.basis import STUDY as BRDF
-from skindb.analysis.brdf_space import STUDY as SURFACE
+from skindb.analysis.brdf import STUDY as BRDF
 from skindb.analysis.chromophores import STUDY as CHROMOPHORES
 from skindb.analysis.components import STUDY as COMPONENTS
 from skindb.analysis.correlations import STUDY as CORRELATIONS
 from skindb.analysis.coverage import STUDY as COVERAGE
-from skindb.analysis.effect_maps import STUDY as MAPS
-from skindb.analysis.group_effects import STUDY as GROUPS
+from skindb.analysis.groups import STUDY as GROUPS
+from skindb.analysis.maps import STUDY as MAPS
 from skindb.analysis.study import Study, Table
+from skindb.analysis.surface import STUDY as SURFACE
 from skindb.analysis.traits import STUDY as TRAITS
 from skindb.analysis.translucency import STUDY as TRANSLUCENCY
 from skindb.files import private_file

@@ -14,7 +14,7 @@ import xarray as xr
 
 from skindb import plots
 from skindb.analysis.albedo import albedo_and_texture, quantiles
-from skindb.analysis.basis import population_basis
+from skindb.analysis.brdf import population_basis
 from skindb.analysis.study import (
     Population,
     Results,

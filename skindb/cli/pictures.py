@@ -104,7 +104,7 @@ def render(
 def _rendered(
     report: dict[str, Any], *, explain: bool, error: float | None
 ) -> tuple[str, Any, list[str]]:
-    skipped = report["skipped"] or [skindb.render.NOTHING]
+    skipped = report["skipped"] or ["nothing is skipped"]
     if explain:
         return report["take"], report, [*skipped, *report["kept"]]
     relative_error = report["relative_error"]

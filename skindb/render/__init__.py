@@ -1,26 +1,6 @@
 """Rendering of fitted models, comparison with photographs, and the BRDF of a surfel."""
 
-from skindb.render.figures import field_figure
-from skindb.render.photographs import (
-    compare_images,
-    compare_photographs,
-    write_comparisons,
-)
-from skindb.render.rendering import render, render_picture
-from skindb.render.scene import Camera, Environment, Lights
-from skindb.render.surfels import evaluate
-from skindb.schema.notes import NOTHING
+import lazy_loader
 
-__all__ = [
-    "NOTHING",
-    "Camera",
-    "Environment",
-    "Lights",
-    "compare_images",
-    "compare_photographs",
-    "evaluate",
-    "field_figure",
-    "render",
-    "render_picture",
-    "write_comparisons",
-]
+# the names are listed in __init__.pyi (SPEC 1): a fit uses the texels and no picture
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

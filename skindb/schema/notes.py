@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import Any
 
 Note = dict[str, Any]  # "take", which may be empty or a subject, and "reason"
-NOTHING = "nothing is skipped"
 
 
 def note(take: str, reason: str) -> Note:
@@ -56,4 +55,4 @@ class Omission:
 
 def explain(omissions: tuple[Omission, ...]) -> list[str]:
     """One line per thing that is skipped, for `--explain`."""
-    return [str(omission) for omission in omissions] or [NOTHING]
+    return [str(omission) for omission in omissions] or ["nothing is skipped"]

@@ -12,7 +12,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from skindb.analysis.basis import population_basis
+from skindb.analysis.brdf import population_basis
 from skindb.analysis.edit import apply_traits, with_basis
 from skindb.analysis.summary import SAMPLED, common_maps
 from skindb.errors import Fault, InputError

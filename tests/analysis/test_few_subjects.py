@@ -13,7 +13,7 @@ from skindb.analysis import (
     group_effects,
     translucency_table,
 )
-from skindb.analysis.group_effects import describe_group_effects
+from skindb.analysis.groups import describe_group_effects
 from skindb.analysis.subjects import subjects_of, subjects_without_normal
 from skindb.analysis.translucency import describe_translucency
 from skindb.errors import InputError

@@ -17,8 +17,8 @@ from planted_population import unit as _unit
 
 from skindb import workflow
 from skindb.analysis import (
-    basis,
     basis_size_curve,
+    brdf,
     cohort_of,
     describe_basis_size,
     plot_basis_size,
@@ -27,7 +27,7 @@ from skindb.analysis import (
     tabulate_basis_size,
     tabulate_study,
 )
-from skindb.analysis.basis import (
+from skindb.analysis.brdf import (
     choose_size,
     project,
     size_status,
@@ -220,8 +220,8 @@ def test_basis_size_curve__streams_what_it_does_not_factor(monkeypatch):
     cohort = cohort_of(models, "surfels", captures=captures, surfels=40)
     call = {"tables": TABLES, "ks": (1, 2, 3, 4, 5, 99)}
     whole = basis_size_curve(cohort, rng=np.random.default_rng(0), **call)
-    monkeypatch.setattr(basis, "MAX_FACTORED", 40)
-    monkeypatch.setattr(basis, "BLOCK", 7)
+    monkeypatch.setattr(brdf, "MAX_FACTORED", 40)
+    monkeypatch.setattr(brdf, "BLOCK", 7)
     part = basis_size_curve(cohort, rng=np.random.default_rng(0), **call)
     assert list(part["k"].values) == [1, 2, 3, 4, 5]  # there are 8 bases, not 99
     assert part.attrs["surfels"] == whole.attrs["surfels"] == 80
@@ -297,7 +297,7 @@ def test_choose_size__is_a_range_if_the_sample_is_ambiguous():
     error, low, _, sizes = choose_size(
         errors, (1, 2, 3, 4), tolerance=0.01, rng=np.random.default_rng(0)
     )
-    assert error[1] < 1 + basis.STEP
+    assert error[1] < 1 + brdf.STEP
     assert low[1] == 1.0
     assert sizes == (2, 3)
     assert size_status(*sizes).startswith("2 to 3: the sample does not distinguish")

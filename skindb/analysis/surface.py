@@ -17,7 +17,7 @@ import xarray as xr
 from dask.delayed import Delayed
 from numpy.typing import NDArray
 
-from skindb.analysis.basis import population_basis
+from skindb.analysis.brdf import population_basis
 from skindb.analysis.brdf_plots import plot_space
 from skindb.analysis.study import Population, Results, Study, each_item, skipped_takes
 from skindb.analysis.subjects import (

@@ -20,7 +20,7 @@ from skindb.analysis.contrasts import (
     contrast_arguments,
     contrast_test,
 )
-from skindb.analysis.group_effects import SIGNIFICANT
+from skindb.analysis.groups import SIGNIFICANT
 from skindb.analysis.study import (
     Population,
     Results,

@@ -1,0 +1,22 @@
+from .figures import field_figure
+from .photographs import (
+    compare_images,
+    compare_photographs,
+    write_comparisons,
+)
+from .rendering import render, render_picture
+from .scene import Camera, Environment, Lights
+from .surfels import evaluate
+
+__all__ = [
+    "Camera",
+    "Environment",
+    "Lights",
+    "compare_images",
+    "compare_photographs",
+    "evaluate",
+    "field_figure",
+    "render",
+    "render_picture",
+    "write_comparisons",
+]
