@@ -236,10 +236,7 @@ def _colour_axis(
     samples of each light.
     """
     lights = b.present.shape[0]
-    red = 0.0
-    green = 0.0
-    blue = 0.0
-    count = 0.0
+    red = green = blue = count = 0.0
     for i in range(lights):
         b.samples[i] = 0
         for q in range(n_cameras):
@@ -289,8 +286,7 @@ def _shades(n_cameras: int, cameras: int, b: Buffers) -> None:
     for i in range(lights):
         n = b.samples[i]
         b.present[i] = ONE if n > 0 else ZERO
-        b.shade[0, i] = ZERO
-        b.shade[1, i] = ZERO
+        b.shade[0, i] = b.shade[1, i] = ZERO
         if n > 0:
             b.shade[0, i] = b.white[int(np.rint(SHADE_QUANTILE * (n - 1))), i]
             b.shade[1, i] = HALF * (b.tinted[(n - 1) // 2, i] + b.tinted[n // 2, i])
@@ -315,15 +311,8 @@ def _normal_equations(
     y = b.light[1]
     z = b.light[2]
     weight = b.weight
-    xx = ZERO
-    xy = ZERO
-    xz = ZERO
-    yy = ZERO
-    yz = ZERO
-    zz = ZERO
-    rx = ZERO
-    ry = ZERO
-    rz = ZERO
+    xx = xy = xz = yy = yz = zz = ZERO
+    rx = ry = rz = ZERO
     count = ZERO
     for i in range(x.shape[0]):
         cosine = nx * x[i] + ny * y[i] + nz * z[i]
