@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import shutil
 import uuid
 from collections.abc import Callable, Mapping
@@ -15,22 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skindb.files import make_private, private_file
+from skindb.files import cache_folder, make_private, private_file
 from skindb.threads import one_blas_thread
 
 Arrays = dict[str, NDArray[Any]]
 MAX_ENTRIES = 8  # per name; the oldest are removed
 SUMS = "sums.json"  # digests of the files of an entry
-
-
-def cache_folder() -> Path | None:
-    """Folder SKINDB_CACHE, or `skindb` in the user's cache folder; None if SKINDB_CACHE
-    is empty.
-    """
-    named = os.environ.get("SKINDB_CACHE")
-    if named is not None:
-        return Path(named) if named else None
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "skindb"
 
 
 def cached_arrays(

@@ -148,6 +148,16 @@ def private_umask() -> Iterator[None]:
         os.umask(before)
 
 
+def cache_folder() -> Path | None:
+    """Folder SKINDB_CACHE, or `skindb` in the user's cache folder; None if SKINDB_CACHE
+    is empty.
+    """
+    named = os.environ.get("SKINDB_CACHE")
+    if named is not None:
+        return Path(named) if named else None
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "skindb"
+
+
 def make_private(folder: Path, mode: int = PRIVATE) -> None:
     """Create a folder and its missing parents with these permissions, independent of the umask."""
     missing = []

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from skindb.cache import cache_folder
+from skindb.files import cache_folder
 
 # the servers accept any
 KEY = "planted-key"

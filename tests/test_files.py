@@ -13,8 +13,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skindb.cache import MAX_ENTRIES, cache_folder, cached_arrays
-from skindb.files import csv_text
+from skindb.cache import MAX_ENTRIES, cached_arrays
+from skindb.files import cache_folder, csv_text
 
 FORMULAS = [
     "=1+1",

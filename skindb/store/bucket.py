@@ -25,9 +25,8 @@ from typing import Any, TypeVar
 from zarr.abc.store import ByteRequest, Store
 from zarr.core.buffer import Buffer, BufferPrototype
 
-from skindb.cache import cache_folder
 from skindb.errors import Fault, InputError
-from skindb.files import make_private
+from skindb.files import cache_folder, make_private
 from skindb.limits import MAX_STORE_JSON_BYTES
 from skindb.store.folder import Folder
 from skindb.store.place import Guard, Place, UnavailableError, require_parts
