@@ -34,16 +34,6 @@ from skindb.ingest.spool import Spool
 from skindb.ingest.surfels import SurfelSet, build_surfels, camera_visibility
 
 
-@pytest.fixture(scope="module")
-def capture(pristine):
-    return read_capture(pristine)
-
-
-@pytest.fixture(scope="module")
-def surfels(capture):
-    return build_surfels(capture, spacing_mm=4.0)
-
-
 def test_fully_lit__leaves_out_the_neighbours_of_a_shadow(surfels, capture):
     """A pixel of these cameras is 2.5 mm wide and the spacing 3 mm or more: one ring."""
     share = np.ones((len(surfels.position), 1), np.float16)

@@ -9,14 +9,12 @@ import pytest
 from sphere import RADIUS, look_at
 
 from skindb.errors import InputError
-from skindb.format.folder import read_capture
 from skindb.geometry._mesh_kernels import grown
 from skindb.geometry.camera import camera_centre, pixel_rays, project
 from skindb.geometry.mesh import morton_order, splat_radius, subdivide, vertex_normals
 from skindb.geometry.rays import RayScene
 from skindb.ingest.surfels import (
     SurfelSet,
-    build_surfels,
     camera_visibility,
     disc_points,
     light_visibility,
@@ -24,16 +22,6 @@ from skindb.ingest.surfels import (
 )
 from skindb.virtual.face import FaceShape
 from skindb.virtual.head import parametric_head
-
-
-@pytest.fixture(scope="module")
-def capture(pristine):
-    return read_capture(pristine)
-
-
-@pytest.fixture(scope="module")
-def surfels(capture):
-    return build_surfels(capture, spacing_mm=4.0)
 
 
 def plate_with_wall(spacing=1.0):
