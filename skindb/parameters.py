@@ -380,6 +380,9 @@ class SimulationParameters(Limited):
     subsurface
         Transport diffuse light through the skin by the dipole instead of reflecting it
         where it enters.
+    polarised
+        Circular polarisers before the lights and cameras, see
+        `skindb.virtual.dome.build_dome`.
     seed
         Random seed of the noise; shapes and skins depend on the people alone.
     """
@@ -400,6 +403,10 @@ class SimulationParameters(Limited):
         None, "File of a head model to use instead of the parametric face."
     )
     subsurface: bool = option(False, "Simulate subsurface transport by the dipole.")
+    polarised: bool = option(
+        False,
+        "Circular polarisers, crossed in every other camera and parallel in the rest.",
+    )
     seed: int = option(VIRTUAL_SEED, "Noise seed.", minimum=0, maximum=MAX_SEED)
 
     def __post_init__(self) -> None:

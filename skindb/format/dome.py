@@ -49,6 +49,10 @@ MAX_VIGNETTE_GAIN = 4.0
 # distortion at the farthest corner; fisheyes have 0.5 and 0.01
 RADIAL_FACTORS = (0.1, 10.0)
 MAX_TANGENTIAL = 0.5
+HANDS = {"left": -1.0, "right": 1.0}  # of circular polarisers
+# light of the other handedness over all that passes; films for photography have 0.001 to
+# 0.05, and one half does not polarise
+MAX_LEAK = 0.25
 MAX_SECONDS = 1e6  # of a session; more indicates inconsistent clocks
 SEQUENCE_CURE = "write what the controller acknowledged, or remove the sequence"
 # radii from the centre to a corner at which the gain of a lens is checked
@@ -93,6 +97,8 @@ class CameraRecord(Pinhole):
     sensor: SensorRecord
     colour_matrix: Float64
     vignette: Float64  # a2 a4 a6
+    # degree of circular polarisation of the light that it sees: 1 right, -1 left, 0 any
+    polarisation: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -105,6 +111,7 @@ class LightRecord:
     intensity: Float64 | None
     axis: Float64
     falloff: float
+    polarisation: float = 0.0  # as of a camera, of the light that it sends
 
 
 @dataclass(frozen=True)
@@ -248,6 +255,7 @@ def _camera(folder: Path, item: Fields, *, linear: bool) -> CameraRecord:
         sensor=read_sensor(folder, item, FrameKind(width, height, 0), linear=linear),
         colour_matrix=colours,
         vignette=vignette,
+        polarisation=_polarisation(item),
     )
 
 
@@ -313,7 +321,22 @@ def _light(item: Fields) -> LightRecord:
         intensity=intensity,
         axis=_direction(item, "axis", default=(-position).tolist()),
         falloff=item.number("falloff", minimum=0.0, maximum=MAX_FALLOFF, default=0.0),
+        polarisation=_polarisation(item),
     )
+
+
+def _polarisation(item: Fields) -> float:
+    """Degree of circular polarisation by the polariser of a light or camera."""
+    hand = item.get("polariser", None)
+    if hand is None:
+        return 0.0
+    if not isinstance(hand, str) or hand not in HANDS:
+        rule = "must be left or right, of circular polarisers, or null"
+        cure = "remove linear polarisers: they cross towards one camera only"
+        item.fault("polariser", rule, shown(hand), cure)
+        return 0.0
+    leak = item.number("leak", minimum=0.0, maximum=MAX_LEAK, default=0.0)
+    return HANDS[hand] * (1.0 - 2.0 * leak)
 
 
 def _direction(item: Fields, key: str, default: Any = REQUIRED) -> Float64:

@@ -89,7 +89,7 @@ def dome_group(dome: DomeRecord, intensity: Float64) -> xr.Dataset:
     """Group "dome"."""
     cameras = dome.cameras
     lights = dome.lights
-    variables = {
+    variables: dict[str, Any] = {
         "light_position": [light.position for light in lights],
         "light_axis": [light.axis for light in lights],
         "light_disc_radius": [light.disc_radius for light in lights],
@@ -102,6 +102,10 @@ def dome_group(dome: DomeRecord, intensity: Float64) -> xr.Dataset:
         "camera_distortion": [camera.distortion for camera in cameras],
         "camera_size": [(camera.width, camera.height) for camera in cameras],
     }
+    by_light = [light.polarisation for light in lights]
+    by_camera = [camera.polarisation for camera in cameras]
+    if any(by_light) and any(by_camera):
+        variables |= {"light_polarisation": by_light, "camera_polarisation": by_camera}
     return dataset(variables, coords=_dome_names(dome) | CHANNELS)
 
 

@@ -39,6 +39,19 @@ def fresnel_transmittance(cos_i: ArrayLike, eta: float) -> Array:
     return np.asarray(1.0 - fresnel_reflectance(cos_i, eta))
 
 
+def circular_reversal(cos_i: ArrayLike, eta: float) -> Array:
+    """Degree to which the reflection reverses the handedness of circularly polarised light:
+    -2 r_s r_p / (r_s^2 + r_p^2) of the amplitudes.
+
+    It is 1 along the normal, 0 at the angle of Brewster, where the reflected light is
+    linearly polarised, and -1 at grazing incidence. Parameters as in `fresnel_reflectance`.
+    """
+    c = np.clip(np.abs(float64(cos_i)), 0.0, 1.0)
+    g = np.sqrt(np.maximum(eta * eta - 1.0 + c * c, 0.0))
+    ratio = (c * (g + c) - 1.0) / (c * (g - c) + 1.0)  # r_p / -r_s
+    return np.asarray(2.0 * ratio / (1.0 + ratio * ratio))
+
+
 @lru_cache(maxsize=32)
 def internal_diffuse_reflectance(eta: float) -> float:
     """F_dr, the cosine-weighted mean of F_r from inside, by quadrature (relative error

@@ -163,6 +163,18 @@ LIGHT_INTENSITY = declare(
     "radiant intensity in the units of the frames' radiance times mm2",
     f"{PAPER}, section 5",
 )
+LIGHT_POLARISATION = declare(
+    "float32 dome/light_polarisation(light) [1]",
+    "degree of circular polarisation, 1 right-handed, -1 left-handed, 0 without "
+    "polariser; in domes with polarisers alone",
+    "Ghosh et al. 2011",
+)
+CAMERA_POLARISATION = declare(
+    "float32 dome/camera_polarisation(camera) [1]",
+    "the same of the light that a camera sees; handedness is that along the path of the "
+    "light",
+    "Ghosh et al. 2011",
+)
 CAMERA_POSITION = declare(
     "float32 dome/camera_position(camera, xyz) [mm]",
     "centre of projection",

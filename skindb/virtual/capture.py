@@ -39,6 +39,7 @@ from skindb.virtual.dome import (
     DISC_RADIUS,
     EXPOSURES,
     FRAMES,
+    LEAK,
     LIGHT_RADIUS,
     SECONDS,
     TARGET_HALF_SIZE,
@@ -46,6 +47,8 @@ from skindb.virtual.dome import (
     TARGET_REFLECTANCE,
     WHITE,
     Dome,
+    DomeCamera,
+    DomeLight,
     Sensor,
     build_dome,
     frontal_camera,
@@ -131,6 +134,7 @@ def dome_record(dome: Dome, sensor: Sensor, start: datetime) -> dict[str, Any]:
             "colour_matrix": np.eye(3).tolist(),
             "vignette": c.vignette.tolist(),
         }
+        | _polariser(c)
         for c in dome.cameras
     ]
     lights = [
@@ -142,6 +146,7 @@ def dome_record(dome: Dome, sensor: Sensor, start: datetime) -> dict[str, Any]:
             "axis": light.axis.tolist(),
             "falloff": 0.0,
         }
+        | _polariser(light)
         for light in dome.lights
     ]
     return {
@@ -162,6 +167,13 @@ def dome_record(dome: Dome, sensor: Sensor, start: datetime) -> dict[str, Any]:
         },
         "sequence": _sequence(dome, start),
     }
+
+
+def _polariser(device: DomeCamera | DomeLight) -> dict[str, Any]:
+    """Keys of a light or camera with a polariser."""
+    if device.polariser is None:
+        return {}
+    return {"polariser": device.polariser, "leak": LEAK}
 
 
 def _sequence(dome: Dome, start: datetime) -> list[dict[str, Any]]:
@@ -441,6 +453,7 @@ def simulate_takes(
         settings.cameras,
         width=settings.width,
         height=settings.height,
+        polarised=settings.polarised,
         rng=np.random.default_rng(DEVICE_SEED),
     )
     folders = []

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import imagecodecs
@@ -17,9 +18,10 @@ from numpy.typing import NDArray
 from skindb.files import make_private, private_file
 from skindb.geometry.camera import pixel_rays
 from skindb.geometry.rays import RayScene
+from skindb.optics.fresnel import circular_reversal
 from skindb.parameters import require_sizes
 from skindb.render.scene import Camera, Lights, Surface
-from skindb.render.shading import exitances, render_view
+from skindb.render.shading import View, exitances, shade_view, trace_view
 
 Array = NDArray[np.float64]
 CENTRE = np.array([0.0, -8.0, 45.0])  # of the dome in the subject frame, mm
@@ -27,6 +29,7 @@ CENTRE = np.array([0.0, -8.0, 45.0])  # of the dome in the subject frame, mm
 LIGHT_RADIUS = 880.0
 CAMERA_RADIUS = 830.0
 DISC_RADIUS = 12.5  # mm
+LEAK = 0.005  # of the polarisers: light of the other handedness over all that passes
 INTENSITY = 6.0e7  # radiance mm2
 # half axes of the ellipsoid that every camera frames, mm
 HEAD = np.array([96.0, 138.0, 92.0])
@@ -55,6 +58,7 @@ class DomeCamera:
     translation: Array  # (3,) mm
     distortion: Array  # (5,) k1 k2 p1 p2 k3
     vignette: Array  # (3,) a2 a4 a6
+    polariser: str | None = None  # "left" or "right", circular
 
     @property
     def position(self) -> Array:
@@ -71,6 +75,7 @@ class DomeLight:
     axis: Array  # (3,) unit, the direction it shines along
     intensity: Array  # (3,) radiance mm2
     disc_radius: float = DISC_RADIUS
+    polariser: str | None = None
 
 
 @dataclass(frozen=True)
@@ -87,6 +92,7 @@ def build_dome(
     *,
     width: int = 160,
     height: int = 200,
+    polarised: bool = False,
     rng: np.random.Generator,
 ) -> Dome:
     """A dome of any size with small individual deviations; the same `rng` state gives
@@ -98,6 +104,9 @@ def build_dome(
         Numbers of devices; lights cover the front up to 78 degrees, cameras up to 60 degrees.
     width, height
         Image size in pixels.
+    polarised
+        Circular polarisers: left before all lights and every other camera, which sees no
+        highlights, right before the other cameras, which see twice as bright ones.
     rng
         Deviations of positions, intensities and lenses.
 
@@ -111,11 +120,20 @@ def build_dome(
     eyes = _spiral(cameras, np.radians(60.0), turn=0.7)
     eyes[:, 1] *= 0.7  # concentrated around the head rather than above and below it
     eyes /= np.linalg.norm(eyes, axis=1, keepdims=True)
-    return Dome(
+    dome = Dome(
         tuple(
             _camera(i, e, width, height, rng) for i, e in enumerate(_apart(eyes, lamps))
         ),
         tuple(_light(i, d, rng) for i, d in enumerate(lamps)),
+    )
+    if not polarised:
+        return dome
+    return Dome(
+        tuple(
+            replace(camera, polariser=("left", "right")[i % 2])
+            for i, camera in enumerate(dome.cameras)
+        ),
+        tuple(replace(light, polariser="left") for light in dome.lights),
     )
 
 
@@ -314,16 +332,15 @@ def photograph(
         camera: DomeCamera, camera_rng: np.random.Generator, stream: np.random.Generator
     ) -> None:
         pattern = sensor.pattern((camera.height, camera.width, 3), rng=camera_rng)
-        images = render_view(
-            surface,
-            _render_camera(camera),
-            lights,
-            samples=1,
-            disc_samples=1,
-            subsurface=subsurface,
-            scene=scene,
-            glow=glow,
-        )
+        view = trace_view(surface, _render_camera(camera), scene=scene)
+        terms = partial(shade_view, view, surface, lights, scene, disc_samples=1)
+        if camera.polariser is None:
+            images = terms(subsurface=subsurface, glow=glow)
+        else:
+            images = terms(subsurface=subsurface, glow=glow, terms=["diffuse"])
+            gloss = terms(terms=["surface"])
+            for i, light in enumerate(dome.lights):
+                images[i] += gloss[i] * _passed_gloss(view, camera, light, surface.eta)
         writer = _FrameWriter(folder, camera, sensor, pattern, stream)
         for light, image in zip(dome.lights, images, strict=True):
             writer.write(FRAMES, light.name, image)
@@ -340,6 +357,23 @@ def photograph(
         streams = device_rng.spawn(len(dome.cameras)), rng.spawn(len(dome.cameras))
         for _ in pool.map(shoot, dome.cameras, *streams):
             step()
+
+
+def _passed_gloss(
+    view: View, camera: DomeCamera, light: DomeLight, eta: float
+) -> Image:
+    """Factor (h, w, 1) of the light from the surface by the polarisers, relative to
+    depolarised light.
+    """
+    towards = light.position - view.position
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    cosine = np.linalg.norm(towards + view.towards, axis=1) / 2  # of theta_d
+    same = 0.0
+    if light.polariser is not None:
+        same = (1 - 2 * LEAK) ** 2 * (
+            1.0 if light.polariser == camera.polariser else -1.0
+        )
+    return view.image(1 - same * circular_reversal(cosine, eta)[:, None])
 
 
 class _FrameWriter:

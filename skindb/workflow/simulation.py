@@ -53,7 +53,7 @@ def simulate(
         in this process.
     **options
         Of `skindb.parameters.SimulationParameters`: cameras, lights, width, height, head,
-        subsurface, seed.
+        subsurface, polarised, seed.
 
     Returns
     -------

@@ -42,6 +42,14 @@ HOSTILE = {
         put(D, "lights", 0, "falloff", value=1e4),
         r"\[lights\]\[0\]\[falloff\]: must be at most 2,000",
     ),
+    "linear polariser": (
+        put(D, "lights", 0, "polariser", value=[0, 1, 0]),
+        r"\[lights\]\[0\]\[polariser\]: must be left or right, of circular polarisers",
+    ),
+    "polariser that does not polarise": (
+        edited(D, lambda dome: dome["cameras"][0].update(polariser="left", leak=0.5)),
+        r"\[cameras\]\[0\]\[leak\]: must be at most 0\.25",
+    ),
     "target in metres": (
         put(D, "white", "half_size", value=0.06),
         r"\[white\]\[half_size\]: must be at least 1",
@@ -199,3 +207,15 @@ def test_fibre_profiles__more_light_than_went_in(capture_folder, factor, refused
         assert np.isfinite(fibre_profiles(probe).value).all()
     put(P, "scale", value=None)(capture_folder)
     assert not fibre_profiles(read_capture(capture_folder).probe).scale_known
+
+
+def test_read_capture__degree_of_polarisation(capture_folder):
+    put(D, "lights", 1, "polariser", value="left")(capture_folder)
+    put(D, "lights", 1, "leak", value=0.01)(capture_folder)
+    put(D, "cameras", 0, "polariser", value="right")(capture_folder)
+    dome = read_capture(capture_folder).dome
+    assert [light.polarisation for light in dome.lights[:2]] == [
+        0,
+        pytest.approx(-0.98),
+    ]
+    assert [camera.polarisation for camera in dome.cameras[:2]] == [1, 0]

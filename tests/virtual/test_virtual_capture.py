@@ -13,7 +13,7 @@ from skindb.render import shading
 from skindb.render.shading import exitances
 from skindb.virtual import dome as virtual_dome
 from skindb.virtual.capture import simulate_take
-from skindb.virtual.dome import Sensor, build_dome, frontal_camera
+from skindb.virtual.dome import Dome, Sensor, build_dome, frontal_camera
 from skindb.virtual.face import field
 from skindb.virtual.person import Person, face_shape
 
@@ -24,8 +24,9 @@ DOME = build_dome(4, 3, width=64, height=80, rng=np.random.default_rng(1))
 def _simulate(out, **options):
     person = options.pop("person", PERSON)
     seed = options.pop("seed", 7)
+    dome = options.pop("dome", DOME)
     simulate_take(
-        out, person, DOME, rng=np.random.default_rng(seed), spacing_mm=4.0, **options
+        out, person, dome, rng=np.random.default_rng(seed), spacing_mm=4.0, **options
     )
     return out
 
@@ -277,3 +278,33 @@ def test_simulate_take__computes_subsurface_light_once_for_all_cameras(
         assert spread[dark, 0].sum() >= spread[dark, 2].sum()
     with np.load(str(soft) + ".truth.npz") as truth:
         assert truth["subsurface"]
+
+
+@pytest.mark.slow
+def test_simulate_take__polarisers_split_highlights_between_cameras(tmp_path, capture):
+    """Rationale: both states of a camera together are the camera without polariser, and
+    highlights are white and only in one of them.
+    """
+    left = replace(DOME.lights[0], polariser="left")
+    states = {}
+    for hand in ("left", "right"):
+        cameras = tuple(replace(camera, polariser=hand) for camera in DOME.cameras)
+        dome = Dome(cameras, (left, *DOME.lights[1:]))
+        states[hand] = _simulate(tmp_path / hand, dome=dome, sensor=Sensor(noisy=False))
+    record = json.loads((states["left"] / "dome" / "dome.json").read_text())
+    assert (
+        record["lights"][0]["polariser"] == record["cameras"][2]["polariser"] == "left"
+    )
+    assert "polariser" not in record["lights"][1]
+    plain, crossed, parallel = (
+        _read(folder, "dome/frames/e1/l000_c00.png").astype(float) - Sensor().black
+        for folder in (capture, states["left"], states["right"])
+    )
+    usable = (parallel < Sensor().white - Sensor().black).all(axis=-1)
+    error = (crossed + parallel)[usable] / 2 - plain[usable]
+    assert np.abs(error).max() <= Sensor().step
+    gloss = (parallel - crossed)[usable] / left.intensity * left.intensity.mean()
+    assert gloss.max() > 40 * Sensor().step
+    assert np.abs(gloss - gloss.mean(axis=1, keepdims=True)).max() <= 2 * Sensor().step
+    unpolarised = "dome/frames/e1/l001_c00.png"
+    assert (_read(states["left"], unpolarised) == _read(capture, unpolarised)).all()
