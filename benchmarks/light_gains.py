@@ -5,7 +5,7 @@ gains, and effect on the errors.
 
 Each capture folder has its truth beside it as <folder>.truth.npz (keys of
 skindb.virtual.capture). The captures are ingested into DB; their samples are multiplied
-by random gains and fitted without and with `light_gains`, a tenth of the lights held
+by random gains and fitted without and with `light_gains`, a tenth of the cameras held
 out. The Markdown table has one row for each capture and size of the gains.
 """
 
@@ -29,7 +29,7 @@ COLUMNS = (
     "gains",
     "residual [%]",
     "normals, without, with [deg]",
-    "held-out lights, without, with [%]",
+    "held-out cameras, without, with [%]",
 )
 SPREADS = (0.0, 0.05, 0.15)
 
@@ -66,7 +66,7 @@ def main(db: str, captures: Sequence[Path]) -> None:
             models = [
                 fit_model(
                     planted(capture, gain),
-                    FitParameters(hold_out_lights=0.1, light_gains=on),
+                    FitParameters(hold_out_cameras=0.1, light_gains=on),
                 )
                 for on in (False, True)
             ]
@@ -74,7 +74,9 @@ def main(db: str, captures: Sequence[Path]) -> None:
                 recovered_against_true(model, truth).summary()["normal_median_deg"]
                 for model in models
             ]
-            errors = [100 * model.attrs["held_out_error"]["median"] for model in models]
+            errors = [
+                100 * model.attrs["held_out_camera_error"]["median"] for model in models
+            ]
             residual = (
                 100 * np.log(models[1]["light_gains/light_gain"].values / gain).std()
             )

@@ -191,7 +191,8 @@ class FitParameters(Limited):
         Largest fraction of light (95 %) that the surface of skin is assumed to reflect
         evenly and without colour, see `estimate_diffuse_reflectance`.
     light_gains
-        Whether samples are first divided by the gain of their light, see `estimate_light_gains`.
+        Whether samples are first divided by the gain of their light, see
+        `estimate_light_gains`. Lights that are held out have gain 1.
     inter_reflection
         Whether light from other parts of the face after one diffuse bounce is
         subtracted, see `bounced_light`; the first pass is then repeated.

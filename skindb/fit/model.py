@@ -35,7 +35,7 @@ from skindb.parameters import FitParameters
 from skindb.reflectance.dictionary import Dictionary
 from skindb.reflectance.kinds import surface_model
 from skindb.reflectance.model import ReflectanceModel
-from skindb.schema import FitStatus, Use, label, names_of
+from skindb.schema import FitStatus, Use, dataset, label, names_of
 from skindb.schema.consent import honour_consent
 from skindb.schema.label import take_attrs
 from skindb.types import Progress
@@ -117,16 +117,15 @@ def first_pass(
     timer = StageTimer(progress)
     samples = lumitexels(capture)
     groups: dict[str, xr.Dataset] = {}
-    if parameters.light_gains:
-        with timer.stage("light gains"):
-            rng = np.random.default_rng([parameters.seed, 2])
-            gains = estimate_light_gains(samples, rng=rng, eta=parameters.eta)
-        groups["light_gains"] = gains
-        samples = divided_by_gains(samples, gains["light_gain"])
     with timer.stage("dictionary"):
         surface = surface_of(samples, parameters, dictionary)
         plan = plan_fit(capture, parameters, dictionary=dictionary)
     held_out = hold_out(capture, plan, parameters)
+    if parameters.light_gains:
+        with timer.stage("light gains"):
+            gains = _training_gains(samples, held_out, parameters)
+        groups["light_gains"] = gains
+        samples = divided_by_gains(samples, gains["light_gain"])
     with timer.stage("first pass"):
         fitted = _fit_surfels(fitted_part(samples, held_out), surface, parameters)
     if parameters.inter_reflection:
@@ -145,6 +144,24 @@ def first_pass(
         "skipped": plan.explain() if plan.omissions else [],
     }
     return first
+
+
+def _training_gains(
+    samples: xr.Dataset, held_out: xr.Dataset, parameters: FitParameters
+) -> xr.Dataset:
+    """Gains of the lights from the samples that are fitted. Lights that are held out have
+    gain 1, so that no held-out sample contributes to its own prediction.
+    """
+    training = held_out["light_held_out"].values == 0
+    estimated = estimate_light_gains(
+        fitted_part(samples, held_out),
+        rng=np.random.default_rng([parameters.seed, 2]),
+        eta=parameters.eta,
+    )
+    gain = np.ones(training.size)
+    gain[training] = estimated["light_gain"].values
+    coords = {"light": samples["light"].values} if "light" in samples.coords else None
+    return dataset({"light_gain": gain}, coords=coords)
 
 
 def _fit_surfels(

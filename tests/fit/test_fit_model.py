@@ -400,41 +400,72 @@ def test_fit_model__basis_brdf_is_interpolated_over_the_closed_period(fitted):
     )
 
 
-def test_fit_model__light_gains_lower_the_held_out_error(planted, small_dictionary):
+@pytest.fixture
+def unequal(planted):
+    """The planted capture under lights 15 % brighter or darker than their intensity."""
     gain = 1 + 0.15 * np.clip(
         np.random.default_rng(3).normal(size=planted["samples"].sizes["light"]), -2, 2
     )
-    wrong = planted.copy()
+    capture = planted.copy()
     one = np.ones((gain.size, 3))
-    wrong["dome"] = (
-        wrong["dome"].to_dataset().assign(light_intensity=label("light_intensity", one))
+    capture["dome"] = (
+        planted["dome"]
+        .to_dataset()
+        .assign(light_intensity=label("light_intensity", one))
     )
-    samples = planted["samples"].to_dataset()
-    brighter = (
-        samples["reflectance_sample"].values.astype(np.float32) * gain[:, None, None]
-    ).astype(np.float16)
-    wrong["samples"] = samples.assign(
-        reflectance_sample=label("reflectance_sample", brighter)
+    return _multiplied(capture, gain[:, None])
+
+
+def _multiplied(capture, factor):
+    """The capture with samples times a factor (light, camera)."""
+    samples = capture["samples"].to_dataset()
+    product = (
+        samples["reflectance_sample"].values.astype(np.float32) * factor[..., None]
     )
+    changed = capture.copy()
+    changed["samples"] = samples.assign(
+        reflectance_sample=label("reflectance_sample", product.astype(np.float16))
+    )
+    return changed
+
+
+def test_fit_model__light_gains_lower_the_residual(unequal, small_dictionary):
     plain, mended = (
         fit_model(
-            wrong,
+            unequal,
             FitParameters(k=2, hold_out_lights=0.2, light_gains=on),
             dictionary=small_dictionary,
         )
         for on in (False, True)
     )
     assert (
-        mended.attrs["held_out_error"]["median"]
-        < 0.5 * plain.attrs["held_out_error"]["median"]
+        mended.attrs["fit_residual"]["median"]
+        < 0.5 * plain.attrs["fit_residual"]["median"]
     )
     assert "light_gains" not in plain.children
     found = mended["light_gains/light_gain"].values
+    assert (found[mended["held_out/light_held_out"].values > 0] == 1).all()
+    intensity = plain["dome/light_intensity"].values
+    np.testing.assert_array_equal(intensity, np.ones_like(intensity))
     np.testing.assert_allclose(
-        mended["dome/light_intensity"].values, one * found[:, None]
+        mended["dome/light_intensity"].values, intensity * found[:, None]
     )
-    np.testing.assert_array_equal(plain["dome/light_intensity"].values, one)
     assert mended.attrs["light_gains"]["spread"] == pytest.approx(found.std())
+
+
+def test_first_pass__uses_no_held_out_sample(unequal, small_dictionary):
+    parameters = FitParameters(
+        k=2, hold_out_lights=0.2, hold_out_cameras=0.2, light_gains=True
+    )
+    before = first_pass(unequal, parameters, dictionary=small_dictionary)
+    flags = before["held_out"]
+    away = (flags["light_held_out"].values[:, None] > 0) | (
+        flags["camera_held_out"].values > 0
+    )
+    changed = _multiplied(unequal, np.where(away, 0.3, 1.0))
+    after = first_pass(changed, parameters, dictionary=small_dictionary)
+    for group in ("light_gains", "fitted"):
+        assert before[group].to_dataset().identical(after[group].to_dataset())
 
 
 def test_fit_model__inter_reflection_of_a_convex_face_is_nothing(
