@@ -25,7 +25,7 @@ import skindb
 from benchmarks.truth import read_truth
 from benchmarks.validate import header
 from skindb.errors import InputError
-from skindb.fit import FitParameters, reflectance_interval
+from skindb.fit import FitParameters
 from skindb.store import Database
 from skindb.virtual.capture import recovered_against_true
 from skindb.workflow import ingest_take
@@ -35,7 +35,7 @@ COLUMNS = (
     "normal median, 95 % [deg]",
     "R_d error R G B [%]",
     "R_d bias R G B [%]",
-    "in the 95 % interval of R_d, in the one-sided interval [%]",
+    "in the 95 % interval of R_d [%]",
     "half-width of the interval R G B [%]",
     "held out, median, 95 % [%]",
     "obstructed [% of the scan]",
@@ -58,17 +58,10 @@ def measure(db: Database, folder: Path, *, corrected: bool) -> dict[str, Any]:
     error = model["fitted/diffuse_reflectance_total_error"].values[fitted].astype(float)
     off = diffuse - recovered.true_diffuse[fitted]
     finite = np.isfinite(off).all(axis=1)
-    low, high = (
-        end.values[fitted] for end in reflectance_interval(model["fitted"].to_dataset())
-    )
-    true = recovered.true_diffuse[fitted]
     return {
         "capture": folder.name,
         **recovered.summary(),
         "coverage": (np.abs(off[finite]) < 1.96 * error[finite]).mean(axis=0).tolist(),
-        "one_sided_coverage": ((true > low) & (true < high))[finite]
-        .mean(axis=0)
-        .tolist(),
         "half_width": np.median(
             1.96 * error[finite] / diffuse[finite], axis=0
         ).tolist(),
@@ -86,15 +79,12 @@ def row(r: dict[str, Any]) -> str:
         return f"| {r['capture']} | refused: {r['refused']} |" + " |" * (
             len(COLUMNS) - 1
         )
-    share, lower = (
-        100 * np.mean(r[name]) for name in ("coverage", "one_sided_coverage")
-    )
     light = r["held_out"]
     cells = (
         f"{r['normal_median_deg']:.1f}, {r['normal_95_deg']:.1f}",
         numbers(r["diffuse_median_percent"]),
         numbers(r["diffuse_bias_percent"], "+.1f"),
-        f"{share:.0f}, {lower:.0f}",
+        f"{100 * np.mean(r['coverage']):.0f}",
         numbers(100 * np.array(r["half_width"]), ".0f"),
         f"{100 * light['median']:.1f}, {100 * light['p95']:.0f}" if light else "none",
         f"{100 * r['status'].get('obstructed', 0):.0f}",

@@ -30,10 +30,25 @@ from skindb.limits import (
     MAX_VIRTUAL_PIXELS,
 )
 
-# The surface of skin reflects 4 to 7 % of the light (Anderson and Parrish 1981, J.
-# Invest. Dermatol. 77, 13-19). How evenly is not known: the prior is half a normal
-# distribution, and at its 95 % limit all of the mean of both is even.
-EVEN_REFLECTION = 0.055
+# Mean and standard deviation, over people, of the fraction of light along the normal that
+# the surface of skin reflects in total, by condition (benchmarks/surface_energy.py). Bare
+# skin: the part of 13,109 spectra that is white and independent of pigment is 0.044 (0.029
+# to 0.057 in nine of ten laboratories; Lu et al. 2025, International Skin Spectra Archive);
+# cheeks have indices of 1.51 to 1.53 (Yoshida et al. 2013, J. Biomed. Opt. 18, 037002),
+# of which a smooth surface reflects 0.041 to 0.044, and a rough one 0.029 to 0.043.
+BARE_SKIN = (0.040, 0.010)
+SURFACE_ENERGY = {
+    "normal": BARE_SKIN,
+    "hot": BARE_SKIN,
+    "cold": BARE_SKIN,
+    "tan": BARE_SKIN,
+    # a film of water on skin reflects 0.024; it need not be closed
+    "sweat": (0.032, 0.012),
+    # a film of oil, index 1.45 to 1.47, reflects 0.034 to 0.037
+    "lotion": (0.038, 0.012),
+}
+# powder, makeup, and conditions without a source
+SURFACE_ENERGY_ELSEWHERE = (0.040, 0.015)
 VIRTUAL_SEED = 2005
 VIRTUAL_EXPOSURES = 2  # of every view of the virtual dome
 CONDITIONS = ("normal", "lotion", "powder", "sweat", "hot", "cold", "makeup", "tan")
@@ -187,9 +202,10 @@ class FitParameters(Limited):
         refit uses "perceptual".
     eta
         Refractive index of skin.
-    even_reflection
-        Largest fraction of light (95 %) that the surface of skin is assumed to reflect
-        evenly and without colour, see `estimate_diffuse_reflectance`.
+    surface_energy, surface_energy_error
+        Mean and standard deviation of the prior for the fraction of light that the
+        surface reflects in total, see `skindb.fit.energy.even_reflection`; "condition"
+        takes those of `SURFACE_ENERGY`, and with "unknown" nothing is subtracted from R_d.
     light_gains
         Whether samples are first divided by the gain of their light, see
         `estimate_light_gains`. Lights that are held out have gain 1.
@@ -223,10 +239,16 @@ class FitParameters(Limited):
         16, "Rank of the reduced dictionary of a mixture (59 is exact).", minimum=1
     )
     eta: float = option(1.3, "Refractive index of skin.", minimum=1.0, maximum=2.0)
-    even_reflection: float = option(
-        EVEN_REFLECTION,
-        "Fraction of light that the surface may reflect diffusely; it widens the error "
-        "of R_d.",
+    surface_energy: float | Literal["condition", "unknown"] = option(
+        "condition",
+        "Fraction of light that the surface reflects in total; what highlights do not "
+        "show of it is subtracted from R_d.",
+        minimum=0,
+        maximum=0.5,
+    )
+    surface_energy_error: float | Literal["condition"] = option(
+        "condition",
+        "Standard deviation of this fraction between people.",
         minimum=0,
         maximum=0.5,
     )

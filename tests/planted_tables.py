@@ -16,7 +16,7 @@ def planted_tables(
     log_tr=0.0,
     seed=0,
     spread=0.03,
-    limit=0.055,
+    level_error=0.02,
     **coords,
 ):
     """A cohort of tables; `albedo` and `log_tr` (take,) are added to the values of all subjects."""
@@ -55,7 +55,7 @@ def planted_tables(
         "subject": ("take", list(subjects)),
         "condition": ("take", list(conditions)),
     }
-    along |= {"fit_even_reflection": ("take", np.full(n, limit))}
+    along |= {"fit_even_reflection_error": ("take", np.full(n, level_error))}
     return xr.Dataset(
         variables, {**labels, "region": ["face", "beard"], "site": ["cheek"], **along}
     )

@@ -22,7 +22,7 @@ from skindb.analysis.study import (
     skipped_takes,
     table_of,
 )
-from skindb.analysis.subjects import groups_by, takes_to_compare
+from skindb.analysis.subjects import groups_by, level_error, takes_to_compare
 from skindb.analysis.summary import SAMPLED
 from skindb.errors import Fault, InputError
 from skindb.numerics.statistics import Moments
@@ -243,16 +243,13 @@ def albedo_table(
         few takes with such a region. The noise of surfels averages out over a region.
         Errors of whole takes (light, white target) differ between takes, so that the
         standard deviation and the interval include them. They do not include the error
-        that is common to all takes: even reflection of the surface is counted as
-        albedo, up to `group_even_reflection_limit`; `group_albedo_level_low` is the
-        lower end of the interval including it. This error shifts all groups equally, so
-        that it cancels in differences of groups but not in ratios, and it matters most
-        for dark skin.
+        that is common to all takes, `group_even_reflection_error`: the even reflection of
+        the surface is known by a prior. It shifts all groups equally, so that it cancels
+        in differences of groups but not in ratios, and it matters most for dark skin.
     """
     takes, people = takes_to_compare(cohort, group_by)
     groups = groups_by(people, group_by)
     names = sorted(set(groups))
-    even = _even_reflection(takes)
     labels = [str(take) for take in takes["take"].values]
     members = [
         [take for take, group in zip(labels, groups, strict=True) if group == name]
@@ -264,7 +261,7 @@ def albedo_table(
     )
     low, high = stacked.mean_interval()
     is_known = stacked.count > 0
-    limits = np.array([max(even[take] for take in group) for group in members])
+    errors = [level_error(takes.sel(take=group)) for group in members]
     histograms = [
         Moments.of(albedo[variables.ALBEDO_HISTOGRAM].sel(take=group).values)
         for group in members
@@ -278,8 +275,7 @@ def albedo_table(
             variables.GROUP_ALBEDO_MEAN: np.where(is_known, stacked.mean, np.nan),
             variables.GROUP_ALBEDO_MEAN_LOW: low,
             variables.GROUP_ALBEDO_MEAN_HIGH: high,
-            variables.GROUP_ALBEDO_LEVEL_LOW: _level_low(stacked.mean, low, limits),
-            variables.GROUP_EVEN_REFLECTION_LIMIT: limits,
+            variables.GROUP_EVEN_REFLECTION_ERROR: errors,
             variables.GROUP_ALBEDO_STANDARD_DEVIATION: stacked.standard_deviation,
             variables.GROUP_HISTOGRAM: mean_histograms,
         },
@@ -294,27 +290,6 @@ def albedo_table(
             "skipped": skipped_takes(cohort),
         },
     )
-
-
-def _even_reflection(takes: xr.Dataset) -> dict[str, float]:
-    """Limit of the excess of R_d due to even reflection, for every take; NaN for models
-    fitted before it was stored.
-    """
-    stated = "fit_even_reflection" in takes.coords
-    values = (
-        takes["fit_even_reflection"].values.astype(float)
-        if stated
-        else np.full(takes.sizes["take"], np.nan)
-    )
-    return dict(zip(map(str, takes["take"].values), values, strict=True))
-
-
-def _level_low(mean: Array, low: Array, limits: Array) -> Array:
-    """Lower ends of the intervals, with the error that is common to all takes added in
-    quadrature.
-    """
-    down = mean - low
-    return np.asarray(mean - np.hypot(down, limits.reshape(-1, *[1] * (down.ndim - 1))))
 
 
 def decorrelate(colour: Array, mean: Array, axes: Array) -> Array:

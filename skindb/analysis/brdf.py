@@ -31,6 +31,7 @@ from skindb.numerics.nnls import solve_nnls
 from skindb.numerics.statistics import bootstrap_interval
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.parameters import DICTIONARY_HELP, option, seed_option
+from skindb.reflectance.kinds import even_diffuse
 from skindb.reflectance.mixture import basis_rows
 from skindb.reflectance.reduction import Systems, factor_reflectance, residuals
 from skindb.reflectance.tables import TableGrid, brdf_metric
@@ -52,7 +53,7 @@ BASIS_SIZE_VARIABLES = (
     variables.LIGHT_POSITION,
     variables.CAMERA_POSITION,
 )
-NEEDED = (*BASIS_SIZE_VARIABLES, "fit_eta")
+NEEDED = (*BASIS_SIZE_VARIABLES, "fit_eta", "fit_even_reflection")
 DEFAULT_ETA = 1.3  # refractive index of models without parameters of the fit
 BLOCK = 128  # surfels at a time: rows of 2,400 samples and 59 bases take 72 MB
 # see `choose_size`; tuned on planted problems, where 0.2 % and 0.4 % distinguish fewer
@@ -490,6 +491,9 @@ def _systems(take: xr.Dataset, tables: Array, part: slice) -> Systems:
     eta = float(take["fit_eta"]) if "fit_eta" in take else np.nan
     # for models that do not state the parameters of their fit
     eta = eta if np.isfinite(eta) else DEFAULT_ETA
+    if "fit_even_reflection" in take:
+        even = float(np.nan_to_num(float(take["fit_even_reflection"])))
+        surfels = surfels.assign({variables.EVEN_REFLECTION: even})
     parts = []
     for start in range(0, max(surfels.sizes["surfel"], 1), BLOCK):
         block = surfels.isel(surfel=slice(start, start + BLOCK))
@@ -534,10 +538,7 @@ def _surface_rows(
         * fresnel_transmittance(cos_o, eta)
         / np.pi
     )
-    diffuse = (
-        fitted[variables.DIFFUSE_REFLECTANCE].values.astype(np.float64)[surfel]
-        * passed[:, None]
-    )
+    diffuse = even_diffuse(fitted).astype(np.float64)[surfel] * passed[:, None]
     return (rows, offsets), values[surfel, index[:, 0], index[:, 1]] - diffuse
 
 

@@ -23,6 +23,7 @@ from skindb.analysis.subjects import (
     comparable_takes,
     has_attribute,
     has_trait,
+    level_error,
     multiple_correlation,
     require_adjustable,
     subjects_of,
@@ -46,6 +47,7 @@ from skindb.types import Array, Mask
 Result = TypeVar("Result")
 CHANNELS = ("R", "G", "B")
 SURFACE = "surface reflectance"
+NORMAL_95 = 1.96
 # subjects of a group, below which intervals depend on the assumption of normal values
 FEW = 10
 # multiple correlation from which an attribute counts as confounder: a quarter of the
@@ -84,8 +86,7 @@ class Quantities:
     values: Array  # (n, q) NaN where there is no value; logarithms where `is_log`
     # (q,) whether logarithms are compared, so that intervals stay positive
     is_log: Mask
-    # (q,) limit of a bias to higher values that all takes have in common; 0 where there
-    # is none
+    # (q,) half-width of the 95 % interval of an error that all takes have in common
     common: Array
     subject: tuple[str, ...]  # (n,) names of the subjects
 
@@ -131,7 +132,7 @@ def quantities_of(cohort: xr.Dataset) -> Quantities:
     """
     prefixes = ("region_", "site_")
     tables = cohort[[name for name in cohort if str(name).startswith(prefixes)]].load()
-    limit = _even_reflection_limit(cohort)
+    half_width = NORMAL_95 * float(np.nan_to_num(level_error(cohort)))
     names: list[str] = []
     columns: list[Array] = []
     is_log: list[bool] = []
@@ -140,14 +141,14 @@ def quantities_of(cohort: xr.Dataset) -> Quantities:
         if variable not in tables:
             continue
         values = _table_values(tables, variable, dims, logarithmic=logarithmic)
-        bias = limit if variable == variables.REGION_DIFFUSE_REFLECTANCE else 0.0
+        is_albedo = variable == variables.REGION_DIFFUSE_REFLECTANCE
         labels = [CHANNELS if dim == "channel" else tables[dim].values for dim in dims]
         for words, column in zip(itertools.product(*labels), values.T, strict=True):
             if np.isfinite(column).any():
                 names.append(" ".join([prefix, *map(str, words)]))
                 columns.append(column)
                 is_log.append(logarithmic)
-                common.append(bias)
+                common.append(half_width if is_albedo else 0.0)
     if not names:
         rule = "some take must have albedo, surface reflectance or sigma_tr"
         raise InputError(
@@ -158,14 +159,6 @@ def quantities_of(cohort: xr.Dataset) -> Quantities:
     return Quantities(
         tuple(names), stacked, np.array(is_log), np.array(common), subject
     )
-
-
-def _even_reflection_limit(cohort: xr.Dataset) -> float:
-    """Largest limit of the excess of R_d by even reflection; 0 if no take states one."""
-    if "fit_even_reflection" not in cohort.coords:
-        return 0.0
-    limits = cohort["fit_even_reflection"].values.astype(float)
-    return float(np.nanmax(limits)) if np.isfinite(limits).any() else 0.0
 
 
 def _table_values(

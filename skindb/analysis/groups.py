@@ -105,9 +105,9 @@ def group_effects(
         interval, also in per cent and in standard deviations; p values (unadjusted,
         adjusted by the largest statistic, and by the false discovery rate); and the
         smallest detectable effect. sigma_tr is compared by its logarithm. NaN where too
-        few subjects have a quantity. R_d may be too high by the same amount in all
-        takes (even reflection): this cancels in differences, and the outer ends of the
-        intervals in per cent include it. Attribute "flags": small or missing groups,
+        few subjects have a quantity. R_d may be wrong by the same amount in all takes
+        (even reflection): this cancels in differences, and the intervals in per cent
+        include it. Attribute "flags": small or missing groups,
         and confounded attributes.
 
     Raises
@@ -229,16 +229,17 @@ def _smallest_p(comparison: Comparison[ContrastTest]) -> float:
 def _percent(
     fit: Effects, reference: Array, quantities: Quantities
 ) -> tuple[Array, ...]:
-    """Effects and ends of intervals in per cent; the outer ends include the bias that
+    """Effects and ends of intervals in per cent, including the error of the level that
     all takes have in common.
 
     A decrease is at most 100 %; the upper end is NaN where the true level may be 0.
     """
     lowest = np.maximum(reference - quantities.common, 0.0)
+    highest = reference + quantities.common
     with np.errstate(divide="ignore", invalid="ignore"):
         slope = fit.slope / reference
-        low = np.maximum(fit.low / np.where(fit.low < 0, lowest, reference), -1.0)
-        high = fit.high / np.where(fit.high > 0, lowest, reference)
+        low = np.maximum(fit.low / np.where(fit.low < 0, lowest, highest), -1.0)
+        high = fit.high / np.where(fit.high > 0, lowest, highest)
     ratios = zip((slope, low, high), (fit.slope, fit.low, fit.high), strict=True)
     percent = [
         100 * np.where(quantities.is_log, np.expm1(logs), ratio)
@@ -265,14 +266,14 @@ def _flags(
 
 
 def _surface_flag(contrast: Contrast, statistics: dict[str, Array]) -> list[str]:
-    """Warning if surface reflectance differs, because its diffuse part is counted as albedo."""
+    """Warning if surface reflectance differs, because its even part is known by a prior alone."""
     names = np.array(contrast.quantities.names)
     differ = statistics[variables.EFFECT_P_ADJUSTED] < SIGNIFICANT
     small = differ & (np.abs(statistics[variables.EFFECT]) < contrast.quantities.common)
     if not (differ & np.char.startswith(names, SURFACE)).any() or not small.any():
         return []
     limit = float(contrast.quantities.common.max())
-    note = f"differences of R_d up to {limit:g} may be due to its even reflection"
+    note = f"differences of R_d up to {limit:.2g} may be due to its even reflection"
     return [f"{contrast.name}: the surface reflectance differs as well; {note}"]
 
 

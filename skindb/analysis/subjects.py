@@ -208,6 +208,16 @@ def takes_to_compare(
     return cohort.isel(take=rows), subjects.select(rows)
 
 
+def level_error(takes: xr.Dataset) -> float:
+    """Largest standard error of R_d that the takes have in common by the prior of their
+    surface's reflection; NaN if no take states one.
+    """
+    if "fit_even_reflection_error" not in takes.coords:
+        return math.nan
+    errors = takes["fit_even_reflection_error"].values.astype(float)
+    return float(np.nanmax(errors)) if np.isfinite(errors).any() else math.nan
+
+
 def groups_by(subjects: Subjects, name: str | None) -> list[str]:
     """Name of the group of every take, by an attribute or a trait; None puts all takes
     into one group.

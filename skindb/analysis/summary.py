@@ -167,10 +167,6 @@ def region_tables(fitted: xr.Dataset, masks: Mapping[str, Mask]) -> xr.Dataset:
     tables = {
         name: np.stack([np.asarray(row[name]) for row in rows]) for name in rows[0]
     }
-    if variables.EVEN_REFLECTION_LIMIT in fitted:
-        tables[variables.EVEN_REFLECTION_LIMIT] = fitted[
-            variables.EVEN_REFLECTION_LIMIT
-        ].values
     channels = ["R", "G", "B"]
     return dataset(
         tables,
@@ -434,10 +430,6 @@ def common_maps(
         maps[f"texel_{name}"] = filled if fitted[name].ndim == 2 else filled[..., 0]
         if name == variables.DIFFUSE_REFLECTANCE:
             coverage = np.where(outside, np.float32(0), weight)
-    if variables.EVEN_REFLECTION_LIMIT in fitted:
-        maps[variables.EVEN_REFLECTION_LIMIT] = fitted[
-            variables.EVEN_REFLECTION_LIMIT
-        ].values
     return dataset(
         maps | {variables.TEXEL_STATUS: status, variables.TEXEL_COVERAGE: coverage},
         coords={"channel": ["R", "G", "B"]},

@@ -178,6 +178,7 @@ def _fit_lines(take: str, report: dict[str, Any]) -> list[str]:
         for site, entry in report.get("translucency", {}).items()
     ]
     lines += [_suspect_line(entry) for entry in report["suspects"]]
+    lines += _energy_lines(report.get("surface_energy", {}))
     if gains := report.get("light_gains"):
         lines.append(
             f"  gains of the lights: standard deviation {gains['spread']:.1%}; "
@@ -194,6 +195,18 @@ def _fit_lines(take: str, report: dict[str, Any]) -> list[str]:
             for stage, seconds in report["seconds"].items()
         ]
     return lines
+
+
+def _energy_lines(energy: dict[str, Any]) -> list[str]:
+    """A line if the highlights reflect more than the prior of the surface allows."""
+    if not energy.get("contradicted"):
+        return []
+    return [
+        f"  the highlights reflect {energy['highlights']:.3f} of the light, but the surface "
+        f"should reflect {energy['mean']:.3f} with a standard deviation of "
+        f"{energy['error']:.3f} in this condition: even reflection stays in R_d; if "
+        "you know more, state --surface-energy"
+    ]
 
 
 def _site_line(site: str, result: dict[str, Any]) -> str:

@@ -137,7 +137,8 @@ CONVENTIONS = {
     ),
     "reflectance": (
         "f_r = F_t(i) F_t(o) albedo / pi + sum over k of weight_k b_k(theta_h, "
-        "theta_d, phi_d)"
+        "theta_d, phi_d); albedo is R_d plus even_reflection, the fraction that the "
+        "surface reflects evenly and without colour"
     ),
     "fresnel": "exact, unpolarised, refractive index eta; the bases contain their own Fresnel term",
     "angles": (
@@ -473,6 +474,9 @@ def _manifest(
         "conventions": CONVENTIONS,
         "refractive_index": float(model["fitted/refractive_index"]),
         "disc_angular_radius": float(model["basis/disc_angular_radius"]),
+        variables.EVEN_REFLECTION: float(
+            model["fitted"].to_dataset().get(variables.EVEN_REFLECTION, 0.0)
+        ),
         "provenance": {name: attrs[name] for name in PROVENANCE if name in attrs},
         "error": _errors(model["fitted"].to_dataset()),
         "missing": _missing(model, described),

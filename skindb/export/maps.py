@@ -12,7 +12,7 @@ from scipy import ndimage
 
 from skindb.export.inputs import chosen_size, mean_free_path, required
 from skindb.geometry.atlas import atlas_values, push_pull, rasterise_atlas
-from skindb.reflectance.kinds import as_mixture
+from skindb.reflectance.kinds import as_mixture, even_diffuse
 from skindb.render.surfels import surfel_confidence, surfel_texels, texel_codes
 from skindb.schema import VARIABLES, TexelStatus, variables
 
@@ -151,12 +151,9 @@ def _columns(
     variable.
     """
     parts = {
-        name: fitted[name].values
-        for name in (
-            variables.DIFFUSE_REFLECTANCE,
-            variables.SHADING_NORMAL,
-            variables.BASIS_WEIGHT,
-        )
+        variables.DIFFUSE_REFLECTANCE: even_diffuse(fitted),
+        variables.SHADING_NORMAL: fitted[variables.SHADING_NORMAL].values,
+        variables.BASIS_WEIGHT: fitted[variables.BASIS_WEIGHT].values,
     }
     mesh = fitted[variables.SURFEL_NORMAL].values.astype(np.float64)
     uv = fitted[variables.SURFEL_UV].values
@@ -273,7 +270,7 @@ def _fitted_maps(image: Image, layout: dict[str, slice]) -> dict[str, TextureMap
             image[..., layout[variables.DIFFUSE_REFLECTANCE]],
             rgb,
             "1",
-            "diffuse reflectance R_d",
+            "diffuse reflectance R_d plus even_reflection of the surface",
         ),
         "normal": TextureMap(
             normal,

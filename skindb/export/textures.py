@@ -17,7 +17,7 @@ from skindb.export.inputs import chosen_size, required, thickness, transmitted_f
 from skindb.export.maps import atlas_images, tangent_frames, to_tangent_space
 from skindb.optics.angles import directions
 from skindb.optics.fresnel import fresnel_transmittance
-from skindb.reflectance.kinds import as_mixture
+from skindb.reflectance.kinds import as_mixture, even_diffuse
 from skindb.reflectance.tables import kernel_tables, lookup
 from skindb.render.image import encode_srgb
 from skindb.render.surfels import surfel_confidence
@@ -402,10 +402,8 @@ def skin_of(model: xr.DataTree, *, size: int | None = None) -> Skin:
     trust = surfel_confidence(fitted)
     tables = kernel_tables(model["basis"].to_dataset())
     trusted = np.flatnonzero(trust > 0)
-    diffuse, weights = (
-        fitted[name].values[trusted]
-        for name in (variables.DIFFUSE_REFLECTANCE, variables.BASIS_WEIGHT)
-    )
+    diffuse = even_diffuse(fitted)[trusted]
+    weights = fitted[variables.BASIS_WEIGHT].values[trusted]
     skin = fit_material(tables, diffuse, weights, eta=eta)
     mean_f0 = (
         float(np.average(skin.f0, weights=skin.specular))

@@ -2,7 +2,7 @@
 translucency.
 """
 
-from skindb.fit.albedo import estimate_diffuse_reflectance, reflectance_interval
+from skindb.fit.albedo import estimate_diffuse_reflectance
 from skindb.fit.corrections import estimate_light_gains
 from skindb.fit.lumitexels import lumitexels, sample_variance
 from skindb.fit.model import first_pass, fit_model, second_pass
@@ -48,7 +48,6 @@ __all__ = [
     "read_dictionary",
     "reduce_basis",
     "refit",
-    "reflectance_interval",
     "sample_variance",
     "second_pass",
     "summarise_translucency",

@@ -17,14 +17,13 @@ from skindb.fit.lumitexels import (
 )
 from skindb.optics.diffusion import dipole_s
 from skindb.optics.fresnel import fresnel_transmittance
-from skindb.parameters import EVEN_REFLECTION
 from skindb.reflectance._separation_kernels import (
     MIN_COSINE_ALBEDO,
     MIN_SAMPLES_ALBEDO,
 )
 from skindb.reflectance.model import typical_noise
 from skindb.reflectance.separation import separate_diffuse
-from skindb.schema import check, label
+from skindb.schema import check
 from skindb.schema.declaration import LARGEST_R_D, SMALLEST_R_D
 from skindb.types import Array, Float64
 
@@ -35,7 +34,6 @@ LARGEST_TURN = 0.25
 # Coloured highlights, which eq. 7 excludes: under Lafortune's of skin, R_d of five
 # captures was 0.004 to 0.016 too low.
 MODEL_ERROR_ALBEDO = 0.01
-NORMAL_95 = 1.96
 NORMAL_ERRORS = ("normal_error", "normal_total_error")
 # surfels processed at once by the other rules: 15 MB of samples of a full dome
 BATCH = 512
@@ -52,7 +50,6 @@ def estimate_diffuse_reflectance(
     eta: float = 1.3,
     method: str = "separated",
     discard: int = 2,
-    even_reflection: float = EVEN_REFLECTION,
 ) -> xr.Dataset:
     """R_d, its standard error and the dipole's s per surfel and channel.
 
@@ -71,27 +68,22 @@ def estimate_diffuse_reflectance(
         non-negative least squares, see `skindb.reflectance.separation`.
     discard
         Number of smallest ratios that "minimum" ignores.
-    even_reflection
-        Largest fraction of light (95 %) that the surface may reflect evenly and without
-        colour. Such light cannot be distinguished from diffuse light, so that R_d of
-        the entire take may be too high by up to this value.
 
     Returns
     -------
     Dataset
         `diffuse_reflectance` within [1e-4, 0.9999], `diffuse_reflectance_error`,
         `diffuse_reflectance_total_error`, `dipole_s`; NaN where fewer than ten samples
-        lie above the grazing limit; and `even_reflection_limit`. The error of
+        lie above the grazing limit. R_d includes what the surface reflects evenly and
+        without colour, see `skindb.fit.energy`. The error of
         "separated" is that of the samples' noise and, at first order, of the normal: 93
         to 97 % of the true values lie within 1.96 of it where the model holds, with
         given and with estimated normals. It ignores that both use the same samples: an
         efficient estimate of the normal is uncorrelated with that of R_d at a fixed
-        normal. The total error ("separated" alone) has three parts in quadrature: the
+        normal. The total error ("separated" alone) has two parts in quadrature: the
         error of the samples, as residuals that samples of one light or of one camera
-        have in common show it, and of the normal by `normal_total_error`; 0.01; and
-        `even_reflection` / 1.96, which is common to the take and acts to one side
-        (`reflectance_interval`). The errors of the other two methods do not include
-        their bias.
+        have in common show it, and of the normal by `normal_total_error`; and 0.01. The
+        errors of the other two methods do not include their bias.
 
     Notes
     -----
@@ -118,7 +110,7 @@ def estimate_diffuse_reflectance(
             (*GEOMETRY, "shading_normal", *noise_inputs(lumitexels), *normal_errors)
         )
     )
-    fitted = elementwise(
+    return elementwise(
         by_name(block_reflectance, names),
         lumitexels,
         over="surfel",
@@ -132,35 +124,7 @@ def estimate_diffuse_reflectance(
         method=method,
         eta=eta,
         discard=discard,
-        even_reflection=even_reflection,
     )
-    return fitted.assign(
-        even_reflection_limit=label("even_reflection_limit", even_reflection)
-    )
-
-
-def reflectance_interval(fitted: xr.Dataset) -> tuple[xr.DataArray, xr.DataArray]:
-    """Lower and upper ends of the 95 % interval of R_d, with even reflection to the
-    lower side alone.
-
-    Parameters
-    ----------
-    fitted
-        `diffuse_reflectance`, `diffuse_reflectance_total_error` and `even_reflection_limit`.
-
-    Returns
-    -------
-    low, high
-        As `diffuse_reflectance`.
-
-    Examples
-    --------
-    >>> low, high = reflectance_interval(model["fitted"].to_dataset())  # doctest: +SKIP
-    """
-    value = fitted["diffuse_reflectance"]
-    limit = fitted["even_reflection_limit"]
-    both = (NORMAL_95 * fitted["diffuse_reflectance_total_error"]) ** 2
-    return value - both**0.5, value + (both - limit**2).clip(min=0) ** 0.5
 
 
 def block_reflectance(
@@ -169,7 +133,6 @@ def block_reflectance(
     method: str,
     eta: float,
     discard: int = 2,
-    even_reflection: float = EVEN_REFLECTION,
 ) -> tuple[Array, Array, Array, Array]:
     """(n, 3) R_d within SMALLEST_R_D and LARGEST_R_D, its standard error and total
     error, and dipole s.
@@ -179,7 +142,7 @@ def block_reflectance(
     else:
         value, error, shared = _by_rule(arrays, eta=eta, method=method, discard=discard)
     clamped = np.clip(value, SMALLEST_R_D, LARGEST_R_D)
-    total = np.hypot(np.hypot(shared, MODEL_ERROR_ALBEDO), even_reflection / NORMAL_95)
+    total = np.hypot(shared, MODEL_ERROR_ALBEDO)
     return clamped, error, total, dipole_s(clamped, eta=eta)[0]
 
 

@@ -24,6 +24,7 @@ from skindb.fit.corrections import (
     summarise_gains,
     without_bounce,
 )
+from skindb.fit.energy import energy_prior, without_even_reflection
 from skindb.fit.lumitexels import lumitexels
 from skindb.fit.normals import estimate_normals
 from skindb.fit.plan import fitted_part, hold_out, plan_fit, surface_of
@@ -36,6 +37,7 @@ from skindb.reflectance.dictionary import Dictionary
 from skindb.reflectance.kinds import surface_model
 from skindb.reflectance.model import ReflectanceModel
 from skindb.schema import FitStatus, Use, dataset, label, names_of
+from skindb.schema.cohort import EVEN
 from skindb.schema.consent import honour_consent
 from skindb.schema.label import take_attrs
 from skindb.types import Progress
@@ -172,9 +174,7 @@ def _fit_surfels(
     """
     eta = parameters.eta
     estimates = estimate_normals(samples, eta=eta)
-    diffuse = estimate_diffuse_reflectance(
-        samples.merge(estimates), eta=eta, even_reflection=parameters.even_reflection
-    )
+    diffuse = estimate_diffuse_reflectance(samples.merge(estimates), eta=eta)
     estimates = estimates.merge(diffuse)
     terms = fit_surface(
         samples.merge(estimates), surface=surface, mode=parameters.mode, eta=eta
@@ -234,6 +234,8 @@ def second_pass(
             eta=parameters.eta,
         )
     groups = _groups(capture, fitted.assign(judged), basis, gains)
+    prior = energy_prior(str(capture.attrs.get("condition", "normal")), parameters)
+    groups["fitted"], energy = without_even_reflection(groups["fitted"], prior)
     groups |= {"held_out": held_out, "outliers": outliers}
     if "probe" in groups:
         with timer.stage("translucency"):
@@ -244,6 +246,8 @@ def second_pass(
     model.attrs = take_attrs(capture.attrs) | {"parameters": settings}
     model.attrs |= surface.provenance | _summaries(groups)
     model.attrs |= {
+        "surface_energy": energy,
+        **{name: float(groups["fitted"][name]) for name in EVEN},
         "suspects": suspects(outliers, fitted_part(samples, held_out)),
         "skipped": first.attrs["skipped"],
         "seconds": {**first.attrs["seconds"], **timer.seconds},

@@ -31,7 +31,7 @@ from skindb.reflectance.model import (
     Judgement,
     ReflectanceModel,
 )
-from skindb.schema import check, dataset, text_labels
+from skindb.schema import check, dataset, text_labels, variables
 from skindb.types import Array
 
 NEEDED = (*GEOMETRY, "shading_normal", "diffuse_reflectance")
@@ -304,6 +304,10 @@ def _judged(
         fitted = {} if evaluate else surface.judged_columns(judged)
         return fitted | _error_columns(judged, judgement), judged.counts
 
+    if variables.EVEN_REFLECTION in lumitexels:  # of a stored model
+        even = lumitexels[variables.EVEN_REFLECTION]
+        diffuse = lumitexels[variables.DIFFUSE_REFLECTANCE] + even
+        lumitexels = lumitexels.assign({variables.DIFFUSE_REFLECTANCE: diffuse})
     inputs = lumitexels[list(names)]
     blocks = [inputs.isel(surfel=slice(a, b)) for a, b in pairwise(_cuts(lumitexels))]
     parts, counts = joined_blocks(judge, blocks)

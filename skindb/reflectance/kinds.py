@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Container
 
+import numpy as np
 import xarray as xr
 
 from skindb.errors import Fault, InputError
@@ -12,6 +13,7 @@ from skindb.reflectance.mixture import Mixture
 from skindb.reflectance.model import FitRequest, ReflectanceModel, SurfaceKind
 from skindb.reflectance.tables import DEFAULT_GRID, brdf_coords, stored_brdf
 from skindb.schema import check, dataset, variables
+from skindb.types import Array
 
 # by the option `surface` of a fit
 SURFACES: dict[str, SurfaceKind] = {"mixture": Mixture, "ggx": GGX}
@@ -40,6 +42,14 @@ def surface_model(basis: xr.Dataset) -> ReflectanceModel:
         if surface.BASIS_VARIABLE in basis:
             return surface.of_basis(basis)
     return Mixture.of_basis(basis)  # raises the fault
+
+
+def even_diffuse(fitted: xr.Dataset) -> Array:
+    """Albedo (n, 3) of the light that leaves by F_t(i) F_t(o) / pi: R_d, and what the
+    surface reflects evenly.
+    """
+    even = np.float32(fitted.get(variables.EVEN_REFLECTION, 0.0))
+    return np.asarray(fitted[variables.DIFFUSE_REFLECTANCE].values + even)
 
 
 def as_mixture(model: xr.DataTree) -> xr.DataTree:

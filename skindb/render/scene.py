@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from skindb.errors import Fault, InputError
 from skindb.limits import MAX_PICTURE_PIXELS
-from skindb.reflectance.kinds import surface_model
+from skindb.reflectance.kinds import even_diffuse, surface_model
 from skindb.reflectance.model import ReflectanceModel
 from skindb.render.image import read_exr
 from skindb.schema import FitStatus, check, variables
@@ -42,7 +42,7 @@ class Surface:
     vertices: Float  # (v, 3) mm
     faces: NDArray[np.integer[Any]]  # (f, 3)
     normals: Float  # (v, 3) unit shading normals
-    diffuse: Float  # (v, 3) diffuse reflectance R_d
+    diffuse: Float  # (v, 3) R_d and the even reflection of the surface
     parameters: Float  # (v, p) of the surface model
     model: ReflectanceModel
     s: Float | None = None  # (v, 3) dipole s, for subsurface transport
@@ -175,6 +175,7 @@ def from_model(model: xr.DataTree, *, fill: bool = False) -> Surface:
     names = (*NEEDED, *reflectance.parameter_variables, variables.REFRACTIVE_INDEX)
     check(fitted, names, where="fitted")
     values = {name: np.asarray(fitted[name].values) for name in NEEDED}
+    values[variables.DIFFUSE_REFLECTANCE] = even_diffuse(fitted)
     values["parameters"] = reflectance.parameters_of(fitted)
     if variables.SIGMA_TR in fitted:
         values[variables.SIGMA_TR] = np.asarray(fitted[variables.SIGMA_TR].values)

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
 from skindb.errors import Fault, InputError
-from skindb.reflectance.kinds import surface_model
+from skindb.reflectance.kinds import even_diffuse, surface_model
 from skindb.reflectance.model import Lamp, Points, ReflectanceModel
 from skindb.render.scene import usable_surfels
 from skindb.schema import FitStatus, TexelStatus, Use, check, names_of, variables
@@ -97,9 +97,9 @@ def evaluate(
         f_r(wi, wo) = F_t(wi) F_t(wo) R_d / pi + sum_k w_k b_k(theta_h, theta_d, phi_d)
 
     F_t is the Fresnel transmittance at the model's refractive index, R_d the surfel's
-    diffuse reflectance per channel, and w_k its weights of the reduced basis b_k, which
-    is the same for all channels. The angles are those of Rusinkiewicz about the
-    surfel's shading normal.
+    diffuse reflectance per channel plus `even_reflection`, and w_k its weights of the
+    reduced basis b_k, which is the same for all channels. The angles are those of
+    Rusinkiewicz about the surfel's shading normal.
 
     Parameters
     ----------
@@ -181,8 +181,10 @@ def _values_of(
             Fault("surfel", rule, str(surfel), "choose a surfel of this model")
         )
     names = [*NEEDED, *reflectance.parameter_variables]
+    names += [variables.EVEN_REFLECTION] * (variables.EVEN_REFLECTION in fitted)
     row = fitted[names].isel(surfel=[surfel]).compute()
     values = {name: np.asarray(row[name].values) for name in NEEDED}
+    values[variables.DIFFUSE_REFLECTANCE] = even_diffuse(row)
     values["parameters"] = reflectance.parameters_of(row)
     if not usable_surfels(values)[0]:
         status = FitStatus(int(values[variables.FIT_STATUS][0]))

@@ -26,12 +26,16 @@ COMPARED = (
     "rank",
     "eta",
     "profile",
+    "surface_energy",
+    "surface_energy_error",
     "hold_out_lights",
     "hold_out_cameras",
     "dictionary",
     "dictionary_digest",
 )
-PARAMETERS = (*COMPARED, "even_reflection")  # the last changes errors alone
+EVEN = ("even_reflection", "even_reflection_error")
+# attributes of models that cohorts name beside the parameters of the fit
+OF_MODEL = ("dictionary", "dictionary_digest", *EVEN)
 # columns of the catalogue and coordinates of cohorts that are no attributes
 COLUMN = re.compile(
     r"take|subject|condition|session|consent|outdated|(fit|status|attribute)_.*|(.*_)?(generation|created)",
@@ -125,9 +129,10 @@ def take_coords(
     if fit is not None:
         parameters = {
             **fit.get("parameters", {}),
-            **{name: fit.get(name) for name in ("dictionary", "dictionary_digest")},
+            **{name: fit.get(name) for name in OF_MODEL},
         }
-        coords |= {f"fit_{name}": parameters.get(name) for name in PARAMETERS}
+        names = (*COMPARED, *EVEN)
+        coords |= {f"fit_{name}": parameters.get(name) for name in names}
     return coords
 
 

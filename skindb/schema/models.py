@@ -52,14 +52,20 @@ DIFFUSE_REFLECTANCE_ERROR = declare(
 DIFFUSE_REFLECTANCE_TOTAL_ERROR = declare(
     "float32 fitted/diffuse_reflectance_total_error(surfel, channel) [1]",
     "standard error of R_d with errors of lights, cameras, normal and model, and "
-    "even_reflection_limit / 1.96",
+    "even_reflection_error",
     uses=Use.EXPORTED | Use.SAMPLED | Use.MAPPED,
 )
-EVEN_REFLECTION_LIMIT = declare(
-    "float64 fitted/even_reflection_limit() [1]",
-    "R_d of the take may be too high by up to this (95 %): the surface reflects it "
-    "evenly, without colour",
-    "prior: surface reflection of skin of 4 to 7 %, Anderson and Parrish 1981",
+EVEN_REFLECTION = declare(
+    "float64 fitted/even_reflection() [1]",
+    "fraction of light that the surface reflects as if it were diffuse, without colour, "
+    "at all surfels; it is not part of R_d, and pictures add it",
+    "prior by condition: measured spectra and refractive indices of skin",
+    Use.SURVIVES_EDIT,
+)
+EVEN_REFLECTION_ERROR = declare(
+    "float64 fitted/even_reflection_error() [1]",
+    "standard error of even_reflection, which R_d has in common in all surfels and "
+    "channels of the take",
 )
 DIPOLE_S = declare(
     "float32 fitted/dipole_s(surfel, channel) [1]",

@@ -273,14 +273,10 @@ GROUP_ALBEDO_MEAN_HIGH = declare(
     "float64 albedo_table/group_albedo_mean_high(group, region, channel) [1]",
     "upper end of the mean's 95 % interval",
 )
-GROUP_ALBEDO_LEVEL_LOW = declare(
-    "float64 albedo_table/group_albedo_level_low(group, region, channel) [1]",
-    "lower end of the mean's 95 % interval with group_even_reflection_limit, which "
-    "groups have in common",
-)
-GROUP_EVEN_REFLECTION_LIMIT = declare(
-    "float64 albedo_table/group_even_reflection_limit(group) [1]",
-    "largest even_reflection_limit of the group's takes",
+GROUP_EVEN_REFLECTION_ERROR = declare(
+    "float64 albedo_table/group_even_reflection_error(group) [1]",
+    "largest even_reflection_error of the group's takes: error of its level that no "
+    "number of takes reduces, as their prior is the same",
 )
 GROUP_ALBEDO_STANDARD_DEVIATION = declare(
     "float64 albedo_table/group_albedo_standard_deviation(group, region, channel) [1]",

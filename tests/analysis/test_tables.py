@@ -329,24 +329,17 @@ def test_albedo_table__numbers_by_hand():
     assert albedo_table(tables(models), albedo=albedo).sizes["group"] == 1
 
 
-def test_albedo_table__even_reflection_moves_levels_down():
+def test_albedo_table__states_the_error_that_groups_have_in_common():
     models = population()
     albedo = albedo_histograms(surfels(models))
     unstated = albedo_table(tables(models), albedo=albedo)
-    assert np.isnan(unstated["group_even_reflection_limit"]).all()
-    for model in models.values():
-        model.attrs["parameters"] = {"even_reflection": 0.05}
-    table = albedo_table(tables(models), albedo=albedo).sel(region="face", group="all")
-    down = table["group_albedo_mean"] - table["group_albedo_mean_low"]
-    limit = table["group_even_reflection_limit"]
-    assert limit == 0.05
-    np.testing.assert_allclose(
-        table["group_albedo_level_low"],
-        table["group_albedo_mean"] - np.hypot(down, 0.05),
-    )
-    np.testing.assert_array_equal(
-        table["group_albedo_mean_low"],
-        unstated["group_albedo_mean_low"].sel(region="face", group="all"),
+    assert np.isnan(unstated["group_even_reflection_error"]).all()
+    for i, model in enumerate(models.values()):
+        model.attrs["even_reflection_error"] = 0.01 + 0.001 * i
+    table = albedo_table(tables(models), albedo=albedo)
+    np.testing.assert_allclose(table["group_even_reflection_error"], 0.013)
+    xr.testing.assert_identical(
+        table["group_albedo_mean_low"], unstated["group_albedo_mean_low"]
     )
 
 

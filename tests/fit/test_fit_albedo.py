@@ -13,7 +13,6 @@ from three_surfels import MATTE, surfels
 from skindb.fit import (
     estimate_diffuse_reflectance,
     estimate_normals,
-    reflectance_interval,
 )
 from skindb.fit.albedo import (
     METHODS,
@@ -25,7 +24,7 @@ from skindb.optics.diffusion import diffuse_reflectance
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.reflectance.mixture import basis_rows
 from skindb.reflectance.separation import surface_lobes
-from skindb.schema import dataset, label
+from skindb.schema import label
 from skindb.schema.declaration import LARGEST_R_D, SMALLEST_R_D
 
 
@@ -87,7 +86,7 @@ def test_estimate_diffuse_reflectance__interval_covers_95_percent_of_noise(
         for name in ("error", "total_error")
     )
     # errors common to a device, here none
-    own = np.sqrt(total**2 - 0.01**2 - (0.055 / 1.96) ** 2)
+    own = np.sqrt(total**2 - 0.01**2)
     assert (own > 0.99 * error).all()
     assert np.median(own / error) < 1.4
 
@@ -105,7 +104,7 @@ def test_estimate_diffuse_reflectance__total_error_counts_what_lights_and_camera
     )
     seen = (ds["reflectance_sample"].values * gain).astype(np.float16)
     wrong = ds.assign(reflectance_sample=label("reflectance_sample", seen))
-    found = estimate_diffuse_reflectance(wrong, even_reflection=0.0)
+    found = estimate_diffuse_reflectance(wrong)
     error, total = (
         found[f"diffuse_reflectance_{name}"].values.astype(float)
         for name in ("error", "total_error")
@@ -113,25 +112,6 @@ def test_estimate_diffuse_reflectance__total_error_counts_what_lights_and_camera
     off = np.abs(found["diffuse_reflectance"].values - diffuse)
     assert (off < 1.96 * error).mean() < 0.75
     assert 0.85 < (off < 1.96 * np.sqrt(total**2 - 0.01**2)).mean() < 0.97
-
-
-def test_reflectance_interval__even_reflection_acts_downwards():
-    fitted = dataset(
-        {
-            "diffuse_reflectance": np.array([[0.4, 0.2, 0.1]], np.float32),
-            "diffuse_reflectance_total_error": np.hypot(
-                np.array([[0.01, 0.0, 0.02]], np.float32), 0.055 / 1.96
-            ),
-            "even_reflection_limit": 0.055,
-        }
-    )
-    low, high = reflectance_interval(fitted)
-    np.testing.assert_allclose(high, [[0.4196, 0.2, 0.1392]], atol=1e-5)
-    np.testing.assert_allclose(
-        low,
-        [[0.4 - np.hypot(0.0196, 0.055), 0.145, 0.1 - np.hypot(0.0392, 0.055)]],
-        atol=1e-5,
-    )
 
 
 @pytest.mark.parametrize("gloss", [0.0, 0.3])
@@ -311,8 +291,7 @@ def _of_surfels(skin, method, *, eta=1.3):
         "camera_position": skin.camera,
         "shading_normal": skin.normal,
     }
-    options = {"method": method, "eta": eta, "even_reflection": 0.0}
-    return block_reflectance(arrays, **options)[:2]
+    return block_reflectance(arrays, method=method, eta=eta)[:2]
 
 
 @each_method

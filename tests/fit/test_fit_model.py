@@ -25,15 +25,24 @@ from skindb.fit import (
     summarise_translucency,
     tabulate_translucency,
 )
+from skindb.fit.energy import Energy, without_even_reflection
 from skindb.fit.lumitexels import lumitexels as lumitexels_of
 from skindb.fit.plan import fitted_part, hold_out, plan_fit
 from skindb.fit.quality import HELD_OUT_ERRORS
 from skindb.optics.diffusion import sigma_tr
 from skindb.reflectance.mixture import Mixture
+from skindb.render.scene import from_model
 from skindb.schema import GROUPS, FitStatus, check, dataset, label
 
 STAGES = {"dictionary", "first pass", "reduced basis", "second pass", "translucency"}
-HELD_OUT = FitParameters(k=3, rank=6, hold_out_lights=0.1, hold_out_cameras=0.1, seed=5)
+HELD_OUT = FitParameters(
+    k=3,
+    rank=6,
+    surface_energy="unknown",
+    hold_out_lights=0.1,
+    hold_out_cameras=0.1,
+    seed=5,
+)
 
 
 @pytest.fixture(scope="module")
@@ -198,6 +207,8 @@ def test_fit_model__passes_are_their_separate_methods(
         index[other] = np.flatnonzero(held_out[f"{other}_held_out"].values == 0)
         samples = whole.isel(index)
         alone = alone.merge(held_out_error(samples.merge(known), basis=basis, of=dim))
+    shared = found[["surfel_area", "refractive_index"]]
+    alone, _ = without_even_reflection(alone.merge(shared), None)
     names = [name for name in found.data_vars if name in alone]
     assert {
         *HELD_OUT_ERRORS["light"],
@@ -221,6 +232,27 @@ def test_fit_model__passes_are_their_separate_methods(
             rtol=1e-6,
             err_msg=str(name),
         )
+
+
+def test_without_even_reflection__changes_no_prediction_and_no_picture(fitted, planted):
+    """The even part leaves R_d, and predictions and pictures add it."""
+    model = fitted[0]
+    plain = model["fitted"].to_dataset()
+    seen = plain["surface_reflectance"].values[plain["fit_status"] == FitStatus.FITTED]
+    prior = Energy(float(seen.mean()) + 0.05, 1e-3)
+    moved, _ = without_even_reflection(plain, prior)
+    assert moved["even_reflection"] > 0.02
+    basis = model["basis"].to_dataset()
+    samples = lumitexels_of(planted)
+    errors = [
+        held_out_error(samples.merge(surfels), basis=basis)["held_out_error"]
+        for surfels in (plain, moved)
+    ]
+    np.testing.assert_allclose(*errors, rtol=1e-5)
+    other = model.copy()
+    other["fitted"] = xr.DataTree(moved)
+    pictures = [from_model(tree).diffuse for tree in (model, other)]
+    np.testing.assert_allclose(*pictures, rtol=1e-6)
 
 
 def _averaged(dictionary, whole):

@@ -1,0 +1,123 @@
+"""Energy of the surface: the part of its reflection that looks like diffuse light.
+
+Highlights show one part of what the surface of skin reflects. The rest is even and white,
+so that no photograph distinguishes it from diffuse light, and estimates of R_d include it.
+What the surface reflects in total is known from measured skin: what highlights do not show
+of it is subtracted from R_d, and stored as `even_reflection`.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+
+from skindb.optics.diffusion import dipole_s
+from skindb.parameters import (
+    SURFACE_ENERGY,
+    SURFACE_ENERGY_ELSEWHERE,
+    FitParameters,
+)
+from skindb.schema import FitStatus, dataset, variables
+from skindb.schema.declaration import LARGEST_R_D, SMALLEST_R_D
+
+# Quantile of R_d in blue over the surfels, which bounds even reflection: moles and brows
+# reflect little else. The darkest hundredth may be wrong by noise and shadows.
+DARKEST = 0.01
+# standard deviations by which the highlights may exceed the prior of the total
+MAX_DEVIATIONS = 2.0
+NODES = 2000  # of the posterior; its moments have a relative error of 1e-6
+
+
+# error of what highlights do not show without a prior of the total: highlights of bare
+# skin show the half of it, more or less
+UNKNOWN_ERROR = SURFACE_ENERGY["normal"][0] / 2
+
+
+class Energy(NamedTuple):
+    """Fraction of light that the surface reflects in total, over people."""
+
+    mean: float
+    error: float
+
+
+def energy_prior(condition: str, parameters: FitParameters) -> Energy | None:
+    """The prior for a take in this condition; None if it is unknown."""
+    mean, error = SURFACE_ENERGY.get(condition, SURFACE_ENERGY_ELSEWHERE)
+    if parameters.surface_energy == "unknown":
+        return None
+    if parameters.surface_energy != "condition":
+        mean = parameters.surface_energy
+    if parameters.surface_energy_error != "condition":
+        error = parameters.surface_energy_error
+    return Energy(mean, error)
+
+
+def without_even_reflection(
+    fitted: xr.Dataset, prior: Energy | None
+) -> tuple[xr.Dataset, dict[str, Any]]:
+    """Subtract from R_d what the surface reflects evenly and without colour.
+
+    Parameters
+    ----------
+    fitted
+        Variables of the surfels after the fit of the surface, with `surfel_area`.
+    prior
+        From `energy_prior`.
+
+    Returns
+    -------
+    fitted
+        With `even_reflection` and its standard error: mean and standard deviation of
+        the prior of the total minus the mean `surface_reflectance` of the fitted
+        surfels, given that the difference is neither negative nor above what the
+        darkest surfels reflect in blue. It is subtracted from R_d, `dipole_s` follows,
+        and its error is added to the total error of R_d, in quadrature. Without a
+        prior, or if the highlights contradict it, nothing is subtracted.
+    summary
+        Attribute `surface_energy` of the model: prior, what the highlights show, and
+        whether they contradict it, which they do above two standard deviations.
+    """
+    good = fitted[variables.FIT_STATUS].values == FitStatus.FITTED
+    good &= np.isfinite(fitted[variables.SURFACE_REFLECTANCE].values)
+    area = fitted[variables.SURFEL_AREA].values[good]
+    diffuse = fitted[variables.DIFFUSE_REFLECTANCE].values
+    eta = float(fitted[variables.REFRACTIVE_INDEX])
+    seen = float(
+        np.average(fitted[variables.SURFACE_REFLECTANCE].values[good], weights=area)
+    )
+    summary: dict[str, Any] = {"highlights": seen}
+    even, error = 0.0, UNKNOWN_ERROR
+    if prior is not None:
+        contradicted = seen > prior.mean + MAX_DEVIATIONS * prior.error
+        summary |= prior._asdict() | {"contradicted": contradicted}
+        if not contradicted:
+            largest = float(np.quantile(diffuse[good, 2], DARKEST))
+            even, error = truncated_normal(prior.mean - seen, prior.error, largest)
+    lower = np.clip(diffuse - even, SMALLEST_R_D, LARGEST_R_D)
+    total = fitted[variables.DIFFUSE_REFLECTANCE_TOTAL_ERROR].values
+    moved = dataset(
+        {
+            variables.DIFFUSE_REFLECTANCE: lower,
+            variables.DIFFUSE_REFLECTANCE_TOTAL_ERROR: np.hypot(total, error),
+            variables.DIPOLE_S: dipole_s(lower, eta=eta)[0],
+            variables.EVEN_REFLECTION: even,
+            variables.EVEN_REFLECTION_ERROR: error,
+        }
+    )
+    return fitted.assign(moved), summary
+
+
+def truncated_normal(mean: float, error: float, largest: float) -> tuple[float, float]:
+    """Mean and standard deviation of a normal distribution within [0, largest]."""
+    if error == 0.0:
+        return float(np.clip(mean, 0.0, largest)), 0.0
+    value = (np.arange(NODES) + 0.5) / NODES * largest
+    # relative to the largest exponent: the weights do not all vanish
+    exponent = -0.5 * ((value - mean) / error) ** 2
+    weight = np.exp(exponent - exponent.max())
+    centre = np.average(value, weights=weight)
+    return float(centre), float(
+        np.sqrt(np.average((value - centre) ** 2, weights=weight))
+    )
