@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,7 +33,7 @@ from skindb.cli.shared import (
     summary_of,
 )
 from skindb.cli.terminal import bar, echo
-from skindb.errors import Fault
+from skindb.errors import Fault, InputError
 from skindb.parameters import FitParameters
 
 if TYPE_CHECKING:
@@ -53,8 +55,8 @@ MIN_FITTED_FRACTION = 0.5
     "--refit",
     is_flag=True,
     help=(
-        "Fit again the takes whose model would change, each with its own parameters "
-        "except those given here."
+        "Fit again the takes whose model would change, each with the parameters of its "
+        "model except those given here."
     ),
 )
 @click.option("--explain", is_flag=True, help="Only report what the fits would skip.")
@@ -75,8 +77,9 @@ def fit(
 ) -> None:
     """Fit the named takes, or all without a current model.
 
-    A model is current if it was made from the newest capture of its take. A take that
-    fails does not stop the others. The same command resumes an interrupted run.
+    A model is current if it was made from the newest capture of its take. A take with a
+    model keeps the parameters of this model, except those given here. A take that fails
+    does not stop the others. The same command resumes an interrupted run.
     """
     database = existing(db)
     progress = bar()
@@ -89,10 +92,10 @@ def fit(
     )
     for take in [] if takes else workflow.takes_without_consent(database, "fit"):
         echo(f"skipped: {take}: its consent does not cover fits", err=True)
+    _report_kept(database, chosen, changes)
     how = partial(
         workflow.fit_with,
         changes=changes,
-        refit=refit,
         dictionary=dictionary,
         explain=explain,
         wait=wait,
@@ -116,6 +119,17 @@ def fit(
     else:
         echo(_nothing_to_fit(database, refit=refit), err=True)
     emit(results, [], faults)
+
+
+def _report_kept(
+    database: Database, takes: Sequence[str], changes: dict[str, Any]
+) -> None:
+    """One line for each take whose fit keeps parameters that are not the defaults."""
+    for take in takes:
+        with suppress(InputError):  # the fit of the take reports it
+            kept = skindb.workflow.kept_parameters(database, take, changes)
+            if kept:
+                echo(f"{take}: kept from its model: {', '.join(kept)}", err=True)
 
 
 def _nothing_to_fit(database: Database, *, refit: bool) -> str:

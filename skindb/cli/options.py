@@ -153,6 +153,8 @@ def _click_option(
     if not limits.show_default:
         settings["show_default"] = False
     name = limits.name or spec.name.replace("_", "-")
+    if unset and default is False:  # a stored parameter may be on
+        name += f"/--no-{name}"
     return click.option(
         f"--{name}", spec.name, **settings, **_kind(hint, limits, default)
     )

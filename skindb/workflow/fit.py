@@ -23,6 +23,7 @@ from skindb.workflow.audit import logged
 from skindb.workflow.cohorts import model_with_summary, summary_parameters
 from skindb.workflow.derive import FIRST_PASS, Derivation, groups_of
 
+EMBEDDED_NAME = "embedded"  # in place of a path
 METHOD = (first_pass, second_pass)  # functions that compute a model
 
 
@@ -153,7 +154,6 @@ def fit_with(
     take: str,
     *,
     changes: Mapping[str, Any],
-    refit: bool = False,
     dictionary: Path | None = None,
     explain: bool = False,
     wait: float = 0.0,
@@ -165,12 +165,12 @@ def fit_with(
     ----------
     db, take, wait, progress
         See `fit_take`.
-    changes, refit, dictionary
+    changes, dictionary
         See `parameters_of`.
     explain
         Only return the take and what its fit would skip.
     """
-    parameters = parameters_of(db, take, changes, refit=refit, dictionary=dictionary)
+    parameters = parameters_of(db, take, changes, dictionary=dictionary)
     brdfs = dictionary_at(dictionary)
     if explain:
         return take, plan_take(db, take, parameters, dictionary=brdfs).explain()
@@ -249,10 +249,9 @@ def parameters_of(
     take: str,
     changes: Mapping[str, Any],
     *,
-    refit: bool,
     dictionary: Path | None = None,
 ) -> FitParameters:
-    """The parameters to fit a take with.
+    """The parameters to fit a take with: those of its newest model, or the defaults.
 
     Parameters
     ----------
@@ -260,25 +259,51 @@ def parameters_of(
         Which take.
     changes
         Parameters of `FitParameters` that the user gave.
-    refit
-        The others are those of the take's newest model if it has one, and the default otherwise.
     dictionary
         Path of the dictionary of the fit; None for the embedded one.
 
     Raises
     ------
     InputError
-        In a refit of a model that was made with a dictionary from files, if none is given.
+        If the newest model was made with a dictionary from files, and none is given.
     """
-    if not refit or not db.has("model", take):
+    if not db.has("model", take):
         return FitParameters(**changes)
     model = db.record("model", take).provenance
     if dictionary is None and model.get("dictionary", EMBEDDED) != EMBEDDED:
-        rule = "a refit uses the dictionary of the model"
+        rule = "a fit keeps the dictionary of the take's model"
         finding = f"no dictionary for a model made with {model['dictionary']!r}"
-        cure = "name it with --dictionary, or fit without --refit"
+        cure = f"name it with --dictionary, or give --dictionary {EMBEDDED_NAME}"
         raise InputError(Fault(take, rule, finding, cure))
-    return replace(FitParameters.of({"parameters": model["requested"]}), **changes)
+    return FitParameters(**{**_values_of_model(model, changes), **changes})
+
+
+def kept_parameters(db: Database, take: str, changes: Mapping[str, Any]) -> list[str]:
+    """Parameters that a fit keeps from the take's newest model and that are not the
+    defaults, as "k 6".
+    """
+    if not db.has("model", take):
+        return []
+    values = _values_of_model(db.record("model", take).provenance, changes)
+    default = FitParameters().as_dict()
+    return [
+        f"{name} {value}"
+        for name, value in values.items()
+        if name not in changes and value != default[name]
+    ]
+
+
+def _values_of_model(
+    model: Mapping[str, Any], changes: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Values that the parameters of a model had when it was requested; without those
+    that only its surface model has, if that changes.
+    """
+    values = FitParameters.of({"parameters": model["requested"]}).as_dict()
+    if changes.get("surface", values["surface"]) != values["surface"]:
+        for name in ("k", "rank"):
+            del values[name]
+    return values
 
 
 def current_model(db: Database, take: str) -> Record | None:
@@ -291,8 +316,10 @@ def current_model(db: Database, take: str) -> Record | None:
 
 
 def dictionary_at(path: Path | None) -> Dictionary | None:
-    """The dictionary of a path, read once in each process as long as its files stay the same."""
-    if path is None:
+    """The dictionary of a path, read once in each process as long as its files stay the
+    same; None for the embedded one.
+    """
+    if path is None or (path.name == EMBEDDED_NAME and not path.exists()):
         return None
     files = sorted(path.iterdir()) if path.is_dir() else [path]
     return _read(
@@ -310,9 +337,7 @@ def _up_to_date(
     db: Database, record: Record, changes: Mapping[str, Any], dictionary: Path | None
 ) -> bool:
     """Whether a fit with these parameters and this code would give the same model."""
-    parameters = parameters_of(
-        db, record.take, changes, refit=True, dictionary=dictionary
-    )
+    parameters = parameters_of(db, record.take, changes, dictionary=dictionary)
     capture = db.record("capture", record.take)
     brdfs = dictionary_at(dictionary)
     return fit_derivation(db, capture, parameters, brdfs).describes(record)

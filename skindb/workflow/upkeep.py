@@ -248,9 +248,7 @@ def _fit_again(
     stale: Sequence[Refreshed],
 ) -> list[Refreshed]:
     stale_models = {result.take: result for result in stale}
-    call = partial(
-        fit_with, db, changes={}, refit=True, dictionary=dictionary, wait=wait
-    )
+    call = partial(fit_with, db, changes={}, dictionary=dictionary, wait=wait)
     results = []
     for outcome in map_takes(call, list(stale_models), **resources, shared=db.folder):
         record = outcome.value if isinstance(outcome.value, Record) else None

@@ -36,6 +36,7 @@ LOG_THEMSELVES = {
 # data of subjects
 NOT_LOGGED = {
     "describe_calibration",
+    "kept_parameters",
     "parameters_of",
     "plan_withdrawal",
     "registered_datasets",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +15,14 @@ from skindb.errors import InputError
 from skindb.fit import FitParameters, read_dictionary
 from skindb.reflectance.brdf_files import write_tables
 from skindb.workflow.derive import groups_of
-from skindb.workflow.fit import fit_take, parameters_of, plan_take, takes_to_fit
+from skindb.workflow.fit import (
+    dictionary_at,
+    fit_take,
+    kept_parameters,
+    parameters_of,
+    plan_take,
+    takes_to_fit,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -123,12 +131,18 @@ def test_takes_to_fit__a_refit_continues_with_what_is_not_done(three):
     assert takes_to_fit(three, refit=True) == ["S3"]
     given = {"eta": 1.4}
     assert takes_to_fit(three, refit=True, changes=given) == ["S1", "S2", "S3"]
-    own = parameters_of(three, "S2", given, refit=True)
+    own = parameters_of(three, "S2", given)
     assert (own.k, own.rank, own.eta) == (3, 6, 1.4)
-    assert parameters_of(three, "S3", given, refit=True) == FitParameters(eta=1.4)
+    assert parameters_of(three, "S3", given) == FitParameters(eta=1.4)
     fit_take(three, "S2", own)  # and here the run is interrupted
     assert takes_to_fit(three, refit=True, changes=given) == ["S1", "S3"]
-    assert parameters_of(three, "S2", {"k": 5}, refit=False) == FitParameters(k=5)
+
+
+def test_parameters_of__another_surface_drops_what_mixtures_have(three):
+    ggx = FitParameters(surface="ggx", eta=1.35)
+    assert parameters_of(three, "S2", {"surface": "ggx"}) == ggx
+    assert kept_parameters(three, "S2", {"surface": "ggx"}) == ["eta 1.35"]
+    assert kept_parameters(three, "S3", {}) == []
 
 
 def test_takes_to_fit__a_changed_kernel_or_capture_is_a_reason_to_refit(
@@ -154,18 +168,21 @@ def test_takes_to_fit__fewer_components_than_asked_for_are_no_reason(
     db = _commit(tmp_path / "db", capture_of(skin, probe=False))
     fit_take(db, "S1", FitParameters(k=2, rank=40), dictionary=small_dictionary)
     assert db.record("model", "S1").provenance["parameters"]["rank"] == 6
-    assert parameters_of(db, "S1", {}, refit=True, dictionary=tmp_path).rank == 40
+    assert parameters_of(db, "S1", {}, dictionary=tmp_path).rank == 40
 
 
-def test_parameters_of__a_refit_needs_the_dictionary_of_the_model(
+def test_parameters_of__needs_the_dictionary_of_the_model(
     tmp_path, skin, small_dictionary
 ):
     db = _commit(tmp_path / "db", capture_of(skin, probe=False))
     fit_take(db, "S1", SMALL, dictionary=small_dictionary)
     with pytest.raises(
-        InputError, match=r"a refit uses the dictionary of the model.*'six of them'"
+        InputError,
+        match=r"a fit keeps the dictionary of the take's model.*'six of them'",
     ):
-        parameters_of(db, "S1", {}, refit=True)
+        parameters_of(db, "S1", {})
+    assert parameters_of(db, "S1", {}, dictionary=Path("embedded")) == SMALL
+    assert dictionary_at(Path("embedded")) is None
 
 
 def test_takes_to_fit__a_model_that_cannot_be_refitted_stops_no_other(
