@@ -27,7 +27,6 @@ from skindb.schema.declaration import LARGEST_R_D, SMALLEST_R_D
 DARKEST = 0.01
 # standard deviations by which the highlights may exceed the prior of the total
 MAX_DEVIATIONS = 2.0
-NODES = 2000  # of the posterior; its moments have a relative error of 1e-6
 
 
 # error of what highlights do not show without a prior of the total: highlights of bare
@@ -69,12 +68,13 @@ def without_even_reflection(
     Returns
     -------
     fitted
-        With `even_reflection` and its standard error: mean and standard deviation of
-        the prior of the total minus the mean `surface_reflectance` of the fitted
-        surfels, given that the difference is neither negative nor above what the
-        darkest surfels reflect in blue. It is subtracted from R_d, `dipole_s` follows,
-        and its error is added to the total error of R_d, in quadrature. Without a
-        prior, or if the highlights contradict it, nothing is subtracted.
+        With `even_reflection`, the mean of the prior minus the mean
+        `surface_reflectance` of the fitted surfels, but at most what the darkest
+        surfels reflect in blue, and with the standard deviation of the prior as its
+        error. It is negative if the fitted lobes reflect too much, which R_d then
+        lacks. It is subtracted from R_d, `dipole_s` follows, and its error is added to
+        the total error of R_d, in quadrature. Without a prior, or if the highlights
+        contradict it, nothing is subtracted.
     summary
         Attribute `surface_energy` of the model: prior, what the highlights show, and
         whether they contradict it, which they do above two standard deviations.
@@ -94,7 +94,7 @@ def without_even_reflection(
         summary |= prior._asdict() | {"contradicted": contradicted}
         if not contradicted:
             largest = float(np.quantile(diffuse[good, 2], DARKEST))
-            even, error = truncated_normal(prior.mean - seen, prior.error, largest)
+            even, error = min(prior.mean - seen, largest), prior.error
     lower = np.clip(diffuse - even, SMALLEST_R_D, LARGEST_R_D)
     total = fitted[variables.DIFFUSE_REFLECTANCE_TOTAL_ERROR].values
     moved = dataset(
@@ -107,17 +107,3 @@ def without_even_reflection(
         }
     )
     return fitted.assign(moved), summary
-
-
-def truncated_normal(mean: float, error: float, largest: float) -> tuple[float, float]:
-    """Mean and standard deviation of a normal distribution within [0, largest]."""
-    if error == 0.0:
-        return float(np.clip(mean, 0.0, largest)), 0.0
-    value = (np.arange(NODES) + 0.5) / NODES * largest
-    # relative to the largest exponent: the weights do not all vanish
-    exponent = -0.5 * ((value - mean) / error) ** 2
-    weight = np.exp(exponent - exponent.max())
-    centre = np.average(value, weights=weight)
-    return float(centre), float(
-        np.sqrt(np.average((value - centre) ** 2, weights=weight))
-    )
