@@ -333,6 +333,9 @@ def small_database(tmp_path_factory):
     )
     said = _run("info", db, "-v").stdout
     assert "unseen cameras" in said
+    assert re.search(
+        r"R_d \+- error +trusted .*\n +face +\d+( +0\.\d+ \+- 0\.\d+){3}", said
+    )
     assert re.search(r"samples of +mean +p5 +p50 +p95 +max +seen\n +all ", said)
     assert "stretch 99 %" in said
     assert re.search(r"atlas by (intrinsic|mean-value) weights \(", said)

@@ -153,9 +153,14 @@ def _finished(
     if isinstance(result, tuple):
         take, plan = result
         return take, plan, [f"{take}: {line}" for line in plan]
-    prediction = skindb.fit.describe_prediction(database.tables(result))
+    tables = database.tables(result)
+    prediction = skindb.fit.describe_prediction(tables)
     report = {**result.provenance, **summary_of(result), "prediction": prediction}
-    return result.take, report, _fit_lines(result.take, report)
+    lines = _fit_lines(result.take, report)
+    if asked("verbose"):
+        diffuse = aligned(skindb.fit.tabulate_diffuse(tables))
+        lines += [f"  {line}" for line in diffuse]
+    return result.take, report, lines
 
 
 def _fit_lines(take: str, report: dict[str, Any]) -> list[str]:

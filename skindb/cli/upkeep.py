@@ -145,7 +145,10 @@ def _prediction_lines(database: Database, take: str) -> list[str]:
         table = fit.prediction_table(
             database.read("model", take)["fitted"].to_dataset()
         )
-    lines = aligned(fit.tabulate_prediction(fit.describe_prediction(table)))
+    lines = [
+        *aligned(fit.tabulate_prediction(fit.describe_prediction(table))),
+        *aligned(fit.tabulate_diffuse(table)),
+    ]
     header, sites = fit.tabulate_translucency(record.provenance)
     return [*lines, *aligned([header, *sites])] if sites else lines
 

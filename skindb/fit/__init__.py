@@ -12,6 +12,7 @@ from skindb.fit.quality import (
     describe_prediction,
     find_obstructed,
     prediction_table,
+    tabulate_diffuse,
     tabulate_prediction,
 )
 from skindb.fit.surface import find_outliers, fit_surface, held_out_error, refit
@@ -51,6 +52,7 @@ __all__ = [
     "sample_variance",
     "second_pass",
     "summarise_translucency",
+    "tabulate_diffuse",
     "tabulate_prediction",
     "tabulate_translucency",
     "translucency_map",

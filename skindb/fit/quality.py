@@ -11,7 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from skindb.reflectance._lumitexel_kernels import BINS_PER_SCALE
-from skindb.schema import FitStatus, check, dataset
+from skindb.schema import FitStatus, check, dataset, variables
 from skindb.schema.label import FACE
 
 HELD_OUT_ERRORS = {
@@ -138,6 +138,23 @@ def tabulate_prediction(described: dict[str, Any]) -> list[list[str]]:
             ]
         )
     return lines
+
+
+def tabulate_diffuse(tables: xr.Dataset) -> list[list[str]]:
+    """Header and rows of R_d by region for a terminal: mean over the trusted surfels and
+    its stated total error; no row for a region without them.
+    """
+    rows = [["R_d +- error", "trusted surfels", *"RGB"]]
+    if variables.REGION_SURFELS not in tables:
+        return rows
+    for name in tables["region"].values:
+        one = tables.sel(region=name)
+        surfels = int(one[variables.REGION_SURFELS])
+        mean = one[variables.REGION_DIFFUSE_REFLECTANCE].values
+        error = one[variables.REGION_DIFFUSE_REFLECTANCE_TOTAL_ERROR].values
+        cells = [f"{m:.3f} +- {e:.3f}" for m, e in zip(mean, error, strict=True)]
+        rows += [[str(name), str(surfels), *cells]] if surfels else []
+    return rows
 
 
 def _row(one: xr.Dataset) -> dict[str, Any]:

@@ -7,7 +7,11 @@ import pytest
 
 from skindb.errors import InputError
 from skindb.fit import prediction_table
-from skindb.fit.quality import describe_prediction, tabulate_prediction
+from skindb.fit.quality import (
+    describe_prediction,
+    tabulate_diffuse,
+    tabulate_prediction,
+)
 from skindb.schema import FitStatus, dataset
 
 FITTED = FitStatus.FITTED
@@ -146,3 +150,20 @@ def test_tabulate_prediction__shows_only_what_there_is():
         "diffuse_clamped",
     ]
     assert rows[-2][2:] == ["-"] * 5
+
+
+def test_tabulate_diffuse__regions_with_trusted_surfels():
+    colour = [[0.5, 0.4, 0.3], [0.25, 0.2, 0.15], [np.nan] * 3]
+    tables = dataset(
+        {
+            "region_surfels": [9, 2, 0],
+            "region_diffuse_reflectance": colour,
+            "region_diffuse_reflectance_total_error": np.array(colour) / 10,
+        },
+        coords={"region": ["face", "nose", "ear"]},
+    )
+    assert tabulate_diffuse(tables)[1:] == [
+        ["face", "9", "0.500 +- 0.050", "0.400 +- 0.040", "0.300 +- 0.030"],
+        ["nose", "2", "0.250 +- 0.025", "0.200 +- 0.020", "0.150 +- 0.015"],
+    ]
+    assert len(tabulate_diffuse(prediction_table(_fitted()))) == 1
