@@ -203,6 +203,7 @@ def bounced_light(
     triangles: NDArray[Any],
     *,
     eta: float = 1.3,
+    receivers: NDArray[np.intp] | slice = slice(None),
 ) -> NDArray[np.float32]:
     """Light that reaches each surfel after one diffuse reflection elsewhere, relative
     to the direct light facing it.
@@ -224,11 +225,13 @@ def bounced_light(
         (f, 3) of the surfels.
     eta
         Refractive index of F_t.
+    receivers
+        Indices of the surfels that are wanted; default all.
 
     Returns
     -------
     ndarray
-        (surfel, light, channel): transmitted irradiance over that of a surface that
+        (receiver, light, channel): transmitted irradiance over that of a surface that
         faces the light.
     """
     check(lumitexels, NEEDED, where="lumitexels")
@@ -255,15 +258,16 @@ def bounced_light(
     )
     # transmitted light of each lamp over its intensity
     sent = (enters / square).astype(np.float32)
-    out = np.zeros((len(position), len(light), reflectance.shape[1]), np.float32)
-    for begin in range(0, len(position), SURFELS_PER_BLOCK):
-        part = slice(begin, begin + SURFELS_PER_BLOCK)
+    wanted = np.arange(len(position))[receivers]
+    out = np.zeros((len(wanted), len(light), reflectance.shape[1]), np.float32)
+    for begin in range(0, len(wanted), SURFELS_PER_BLOCK):
+        part = wanted[begin : begin + SURFELS_PER_BLOCK]
         receiver, met, weight = _meetings(
             scene, position[part], normal[part], rays, triangles, normal, eta
         )
         for c in range(reflectance.shape[1]):
-            shape = (len(position[part]), len(position))
-            out[part, :, c] = (
+            shape = (len(part), len(position))
+            out[begin : begin + len(part), :, c] = (
                 csr_array((weight * reflectance[met, c], (receiver, met)), shape=shape)
                 @ sent
                 * square[part]

@@ -28,7 +28,7 @@ from skindb.fit.energy import energy_prior, without_even_reflection
 from skindb.fit.lumitexels import lumitexels
 from skindb.fit.normals import estimate_normals
 from skindb.fit.plan import fitted_part, hold_out, plan_fit, surface_of
-from skindb.fit.quality import find_obstructed, suspects
+from skindb.fit.quality import error_of_misfit, find_obstructed, suspects
 from skindb.fit.surface import fit_surface, refit_and_evaluate
 from skindb.fit.translucency import fit_probe, summarise_translucency, translucency_map
 from skindb.jit import reported_compilation
@@ -135,6 +135,8 @@ def first_pass(
             direct = _direct_light(capture, samples, fitted, parameters.eta)
         with timer.stage("first pass again"):
             fitted = _fit_surfels(fitted_part(direct, held_out), surface, parameters)
+    total = fitted["diffuse_reflectance_total_error"]
+    total[:] = np.hypot(total.values, np.nan_to_num(error_of_misfit(fitted)))
     fitted["fit_status"][find_obstructed(fitted)] = FitStatus.OBSTRUCTED
     index = label("refractive_index", parameters.eta)
     devices = [name for name in ("light", "camera") if name in fitted.coords]

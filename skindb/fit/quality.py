@@ -379,9 +379,47 @@ def find_obstructed(fitted: xr.Dataset) -> NDArray[np.bool_]:
     good = fitted["fit_status"].values == FitStatus.FITTED
     if not good.any():
         return np.asarray(good)
-    name = "dictionary_residual" if "dictionary_residual" in fitted else "fit_residual"
-    residual = fitted[name].values
+    residual = _dictionary_residual(fitted)
     brightness = fitted["diffuse_reflectance"].values.mean(axis=1)
     limit = max(TIMES_MEDIAN_RESIDUAL * float(np.median(residual[good])), MIN_RESIDUAL)
     dark = brightness < MAX_RELATIVE_R_D * float(np.median(brightness[good]))
     return np.asarray(good & (residual > limit) & dark)
+
+
+# Chosen on a capture with hair, motion and errors of calibration: of the surfels within
+# 3 mm of a strand 84 to 93 % have R_d within 1.96 errors, and without this part 30 to 60 %.
+# The error of R_d relative to the unexplained residual,
+ERROR_PER_RESIDUAL = 1.5
+# and the residual of a surface without hair relative to the median of the take
+TIMES_EXPLAINED_RESIDUAL = 1.5
+
+
+def error_of_misfit(fitted: xr.Dataset) -> NDArray[np.float64]:
+    """Standard error of R_d where the residual is larger than a surface explains, as
+    beside hair, whose strands and shadows are no reflectance.
+
+    Parameters
+    ----------
+    fitted
+        As for `find_obstructed`.
+
+    Returns
+    -------
+    ndarray
+        (surfel, channel), a part of the total error; 0 for usual residuals, NaN where
+        nothing was fitted.
+    """
+    colour = fitted["diffuse_reflectance"].values.astype(np.float64)
+    good = fitted["fit_status"].values == FitStatus.FITTED
+    if not good.any():
+        return np.zeros_like(colour)
+    residual = _dictionary_residual(fitted)
+    explained = TIMES_EXPLAINED_RESIDUAL * float(np.median(residual[good]))
+    unexplained = np.sqrt(np.maximum(residual**2 - explained**2, 0.0))
+    return np.asarray(ERROR_PER_RESIDUAL * unexplained[:, None] * colour)
+
+
+def _dictionary_residual(fitted: xr.Dataset) -> NDArray[np.float64]:
+    """Relative residual of the fit by the dictionary, or else of the fit."""
+    name = "dictionary_residual" if "dictionary_residual" in fitted else "fit_residual"
+    return np.asarray(fitted[name].values, np.float64)

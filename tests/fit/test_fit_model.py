@@ -28,7 +28,7 @@ from skindb.fit import (
 from skindb.fit.energy import Energy, without_even_reflection
 from skindb.fit.lumitexels import lumitexels as lumitexels_of
 from skindb.fit.plan import fitted_part, hold_out, plan_fit
-from skindb.fit.quality import HELD_OUT_ERRORS
+from skindb.fit.quality import HELD_OUT_ERRORS, error_of_misfit
 from skindb.optics.diffusion import sigma_tr
 from skindb.reflectance.mixture import Mixture
 from skindb.render.scene import from_model
@@ -197,6 +197,8 @@ def test_fit_model__passes_are_their_separate_methods(
             surface=Mixture.of_dictionary(_averaged(small_dictionary, whole), rank=6),
         )
     )
+    total = alone["diffuse_reflectance_total_error"]
+    total[:] = np.hypot(total.values, error_of_misfit(alone))
     basis = model["basis"].to_dataset()
     alone = alone.merge(refit(work.merge(alone), basis=basis))
     known = alone[["shading_normal", "diffuse_reflectance", "basis_weight"]]

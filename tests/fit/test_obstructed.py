@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from skindb.fit import find_obstructed
+from skindb.fit.quality import error_of_misfit
 from skindb.schema import FitStatus, dataset
 
 
@@ -48,3 +49,14 @@ def test_find_obstructed__only_fitted_surfels():
     nothing = _face([], [])
     nothing["fit_status"][:] = FitStatus.UNSEEN
     assert not find_obstructed(nothing).any()
+
+
+def test_error_of_misfit__grows_with_the_unexplained_residual():
+    """The residual of usual surfels is 0.03, so that 0.045 is explained."""
+    error = error_of_misfit(_face(residual=[0.04, 0.06, 0.3], brightness=[0.2] * 3))
+    assert (error[:21] == 0).all()
+    by_hand = 1.5 * np.sqrt(np.array([0.06, 0.3]) ** 2 - 0.045**2) * 0.2
+    np.testing.assert_allclose(error[21:], by_hand[:, None].repeat(3, 1), rtol=1e-5)
+    nothing = _face([], [])
+    nothing["fit_status"][:] = FitStatus.UNSEEN
+    assert (error_of_misfit(nothing) == 0).all()
