@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 
 from skindb.optics.angles import half_difference
-from skindb.optics.fresnel import fresnel_transmittance
+from skindb.optics.fresnel import circular_reversal, fresnel_transmittance
 from skindb.reflectance.dictionary import embedded_dictionary
 from skindb.reflectance.mixture import Mixture
 from skindb.reflectance.model import Block
@@ -137,3 +137,13 @@ def rows_and_targets(skin, s):
     )
     target = skin.sample[s].astype(np.float64) - shape[..., None] * skin.diffuse[s]
     return M.reshape(-1, M.shape[-1]), target.reshape(-1, 3)
+
+
+def polariser_factors(position, light, camera, polarisation, eta=ETA):
+    """Factors (n, lights, cameras) of the surface term by circular polarisers, for products
+    (lights, cameras) of the degrees of polarisation.
+    """
+    wi = unit(light - position[:, None])[:, :, None]
+    wo = unit(camera - position[:, None])[:, None]
+    cosine = np.linalg.norm(wi + wo, axis=-1) / 2
+    return 1 - polarisation * circular_reversal(cosine, eta)

@@ -6,8 +6,10 @@ import numpy as np
 import xarray as xr
 
 from skindb.elementwise import elementwise
+from skindb.fit.energy import UNKNOWN_ERROR
 from skindb.fit.lumitexels import (
     GEOMETRY,
+    POLARISATION,
     Arrays,
     block_of,
     by_name,
@@ -18,6 +20,7 @@ from skindb.fit.lumitexels import (
 from skindb.optics.diffusion import dipole_s
 from skindb.optics.fresnel import fresnel_transmittance
 from skindb.reflectance._separation_kernels import (
+    MAX_GLOSS_CROSSED,
     MIN_COSINE_ALBEDO,
     MIN_SAMPLES_ALBEDO,
 )
@@ -83,7 +86,9 @@ def estimate_diffuse_reflectance(
         normal. The total error ("separated" alone) has two parts in quadrature: the
         error of the samples, as residuals that samples of one light or of one camera
         have in common show it, and of the normal by `normal_total_error`; and 0.01. The
-        errors of the other two methods do not include their bias.
+        errors of the other two methods do not include their bias. If ten or more samples
+        are behind crossed polarisers, "separated" uses these alone, and 0.01 is scaled by
+        the part of the surface's light that they pass.
 
     Notes
     -----
@@ -138,16 +143,23 @@ def block_reflectance(
     error, and dipole s.
     """
     if method == "separated":
-        value, error, shared = _separated(arrays, eta=eta)
+        value, error, shared, gloss = _separated(arrays, eta=eta)
     else:
+        gloss = np.ones(len(arrays["surfel_position"]))
         value, error, shared = _by_rule(arrays, eta=eta, method=method, discard=discard)
     clamped = np.clip(value, SMALLEST_R_D, LARGEST_R_D)
-    total = np.hypot(shared, MODEL_ERROR_ALBEDO)
+    model_error = MODEL_ERROR_ALBEDO * gloss
+    if POLARISATION[0] in arrays:
+        even = np.where(gloss > MAX_GLOSS_CROSSED, gloss * UNKNOWN_ERROR, 0.0)
+        model_error = np.hypot(model_error, even)
+    total = np.hypot(shared, model_error[:, None])
     return clamped, error, total, dipole_s(clamped, eta=eta)[0]
 
 
-def _separated(arrays: Arrays, *, eta: float) -> tuple[Array, Array, Array]:
-    """R_d (n, 3) by the separation, its standard error, and that for errors by device."""
+def _separated(arrays: Arrays, *, eta: float) -> tuple[Array, Array, Array, Array]:
+    """R_d (n, 3) by the separation, its standard error, that for errors by device, and
+    the factor (n,) of the surface by polarisers.
+    """
     n = len(arrays["surfel_position"])
     turns = [_turn(arrays.get(name), n) for name in NORMAL_ERRORS]
     if "normal_total_error" not in arrays:

@@ -13,12 +13,15 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 
+from skindb.fit.lumitexels import POLARISATION, directions
 from skindb.optics.diffusion import dipole_s
+from skindb.optics.fresnel import circular_reversal
 from skindb.parameters import (
     SURFACE_ENERGY,
     SURFACE_ENERGY_ELSEWHERE,
     FitParameters,
 )
+from skindb.reflectance._separation_kernels import MAX_GLOSS_CROSSED
 from skindb.schema import FitStatus, dataset, variables
 from skindb.schema.declaration import LARGEST_R_D, SMALLEST_R_D
 
@@ -53,8 +56,26 @@ def energy_prior(condition: str, parameters: FitParameters) -> Energy | None:
     return Energy(mean, error)
 
 
+def crossed_gloss(lumitexels: xr.Dataset, eta: float) -> float | None:
+    """Mean fraction of the light from the surface that crossed polarisers pass, seen from
+    the middle of the surfels; None if no light and camera are crossed.
+    """
+    if not all(name in lumitexels for name in POLARISATION):
+        return None
+    middle = lumitexels["surfel_position"].values.mean(axis=0, keepdims=True)
+    lights, cameras = (
+        directions(middle, lumitexels[f"{device}_position"].values)[0]
+        for device in ("light", "camera")
+    )
+    cosine = np.linalg.norm(lights[:, None] + cameras, axis=-1) / 2  # of theta_d
+    both = np.outer(*(lumitexels[name].values for name in POLARISATION))
+    gloss = 1 - both * circular_reversal(cosine, eta)
+    crossed = gloss[gloss <= MAX_GLOSS_CROSSED]
+    return float(crossed.mean()) if crossed.size else None
+
+
 def without_even_reflection(
-    fitted: xr.Dataset, prior: Energy | None
+    fitted: xr.Dataset, prior: Energy | None, leak: float | None = None
 ) -> tuple[xr.Dataset, dict[str, Any]]:
     """Subtract from R_d what the surface reflects evenly and without colour.
 
@@ -64,6 +85,9 @@ def without_even_reflection(
         Variables of the surfels after the fit of the surface, with `surfel_area`.
     prior
         From `energy_prior`.
+    leak
+        From `crossed_gloss`; if it is given, R_d contains only this fraction of the even
+        reflection, and nothing is subtracted.
 
     Returns
     -------
@@ -89,7 +113,9 @@ def without_even_reflection(
     )
     summary: dict[str, Any] = {"highlights": seen}
     even, error = 0.0, UNKNOWN_ERROR
-    if prior is not None:
+    if leak is not None:
+        error *= leak
+    elif prior is not None:
         contradicted = seen > prior.mean + MAX_DEVIATIONS * prior.error
         summary |= prior._asdict() | {"contradicted": contradicted}
         if not contradicted:

@@ -35,12 +35,17 @@ NOISE_INPUTS = (
     *NOISE_LIGHTS,
     *RADIANCE,
 )
+POLARISATION = ("light_polarisation", "camera_polarisation")
 REQUIRED = {
     "samples": ("reflectance_sample", "noise_floor"),
     "surfels": ("surfel_position", "surfel_normal", "surfel_area"),
     "dome": ("light_position", "light_disc_radius", "camera_position"),
 }
-OPTIONAL = {"samples": (SHOT, *NOISE_SAMPLES), "dome": NOISE_LIGHTS, "surfels": ()}
+OPTIONAL = {
+    "samples": (SHOT, *NOISE_SAMPLES),
+    "dome": (*NOISE_LIGHTS, *POLARISATION),
+    "surfels": (),
+}
 
 
 def lumitexels(capture: xr.DataTree) -> xr.Dataset:
@@ -122,14 +127,28 @@ def block_of(arrays: Arrays, typical: Noise) -> Block:
         normal=normal,
         diffuse=arrays.get("diffuse_reflectance", np.full_like(normal, np.nan)),
         noise=noise_of(arrays, typical),
+        polarisation=_polarisation(arrays),
     )
 
 
+def _polarisation(arrays: Arrays) -> Array:
+    """Products (lights, cameras) of the degrees of polarisation; (0, 0) without polarisers."""
+    if not all(name in arrays for name in POLARISATION):
+        return np.zeros((0, 0))
+    by_light, by_camera = (arrays[name].astype(np.float64) for name in POLARISATION)
+    return np.outer(by_light, by_camera)
+
+
 def noise_inputs(lumitexels: xr.Dataset) -> tuple[str, ...]:
-    """Names of the variables that `noise_of` takes; empty if the noise of the samples
-    is unknown.
+    """Names of the variables that `block_of` takes where they are known: those of
+    `noise_of`, and the polarisers.
     """
-    return NOISE_INPUTS if all(name in lumitexels for name in NOISE_INPUTS) else ()
+    return tuple(
+        name
+        for group in (NOISE_INPUTS, POLARISATION)
+        if all(name in lumitexels for name in group)
+        for name in group
+    )
 
 
 def take_noise(lumitexels: xr.Dataset) -> Noise:

@@ -24,7 +24,7 @@ from skindb.fit.corrections import (
     summarise_gains,
     without_bounce,
 )
-from skindb.fit.energy import energy_prior, without_even_reflection
+from skindb.fit.energy import crossed_gloss, energy_prior, without_even_reflection
 from skindb.fit.lumitexels import lumitexels
 from skindb.fit.normals import estimate_normals
 from skindb.fit.plan import fitted_part, hold_out, plan_fit, surface_of
@@ -237,7 +237,9 @@ def second_pass(
         )
     groups = _groups(capture, fitted.assign(judged), basis, gains)
     prior = energy_prior(str(capture.attrs.get("condition", "normal")), parameters)
-    groups["fitted"], energy = without_even_reflection(groups["fitted"], prior)
+    groups["fitted"], energy = without_even_reflection(
+        groups["fitted"], prior, crossed_gloss(samples, parameters.eta)
+    )
     groups |= {"held_out": held_out, "outliers": outliers}
     if "probe" in groups:
         with timer.stage("translucency"):

@@ -23,14 +23,16 @@ from skindb.reflectance._lumitexel_kernels import (
     Options,
     add_scatter,
     add_surface,
+    block_memory,
     choose_kind,
     fitted_status,
     held_kinds,
-    lumitexel_memory,
     outliers,
+    polarise_rows,
     prepare,
     relative_drift,
     split_diffuse,
+    surface_factor,
     turned_normals,
     weigh,
     write_cosines,
@@ -66,7 +68,8 @@ def _cube_roots(count: int, b: Lumitexel) -> None:
     only the cosine is converted.
     """
     for r in range(count):
-        scale = np.float32(b.lit[b.pairs[r, 0]] ** (-2.0 / 3.0))
+        cosine = b.lit[b.pairs[r, 0]] * surface_factor(r, b)
+        scale = np.float32(cosine ** (-2.0 / 3.0))
         for q in range(b.rows.shape[1]):
             b.rows[r, q] *= scale
         for c in range(3):
@@ -99,7 +102,7 @@ def _fit_rows(
 def fit_block(block: Block, tables: Tables, options: Options, out: SurfaceFit) -> None:
     """Fit, or only evaluate, every surfel of a block by the dictionary."""
     table, lift = tables
-    b = lumitexel_memory(block.light.shape[0], block.camera.shape[0], table.shape[3])
+    b = block_memory(block, table.shape[3])
     work = fit_memory(b.pairs.shape[0], table.shape[3], lift.shape[1])
     for s in range(block.position.shape[0]):
         out.status[s] = prepare(s, block, options, b)
@@ -187,6 +190,7 @@ def _add_turned(
             b.row_memory,
             b.rows,
         )
+        polarise_rows(count, b)
         for j in range(x.shape[0]):
             moved[j] = x[j]
         fit_weighted(_problem(count, tables.lift, options, b), moved, work)
@@ -224,7 +228,7 @@ def judge_block(
     The lift (m, m) is the identity. Every block of samples is read only once.
     """
     table, lift = tables
-    b = lumitexel_memory(block.light.shape[0], block.camera.shape[0], table.shape[3])
+    b = block_memory(block, table.shape[3])
     work = fit_memory(b.pairs.shape[0], table.shape[3], lift.shape[1])
     kinds = held_kinds(errors.held)
     for s in range(block.position.shape[0]):

@@ -26,15 +26,16 @@ from skindb.reflectance._lumitexel_kernels import (
     RootMemory,
     add_scatter,
     add_surface,
+    block_memory,
     choose_kind,
     fitted_status,
-    lumitexel_memory,
     outliers,
     prepare,
     relative_drift,
     relative_errors,
     root_memory,
     split_diffuse,
+    surface_factor,
     turned_normals,
     weigh,
     write_cosines,
@@ -123,7 +124,7 @@ def _write_angles(r: int, index: float, b: Lumitexel, lobe: Lobe) -> None:
     lobe.camera[r] = camera if above else 1.0
     lobe.half[r] = min((light + camera) ** 2 / max(2.0 + 2.0 * both, 1e-12), 1.0)
     apart = math.sqrt(max((1.0 + both) / 2.0, 0.0))
-    fresnel = 1.0 - transmittance(min(apart, 1.0), index)
+    fresnel = (1.0 - transmittance(min(apart, 1.0), index)) * surface_factor(r, b)
     lobe.fresnel[r] = fresnel * light if above else 0.0
 
 
@@ -296,7 +297,7 @@ def _lobe_errors(
 @kernel
 def fit_ggx(block: Block, index: float, options: Options, out: SurfaceFit) -> None:
     """Fit every surfel of a block."""
-    b = lumitexel_memory(block.light.shape[0], block.camera.shape[0], 0)
+    b = block_memory(block, 0)
     root = root_memory(b.pairs.shape[0])
     lobe = lobe_memory(b.pairs.shape[0])
     for s in range(block.position.shape[0]):
@@ -391,7 +392,7 @@ def judge_ggx(
     """Fit, or only evaluate, every surfel of a block; its errors, held-out samples and
     outliers.
     """
-    b = lumitexel_memory(block.light.shape[0], block.camera.shape[0], 0)
+    b = block_memory(block, 0)
     root = root_memory(b.pairs.shape[0])
     lobe = lobe_memory(b.pairs.shape[0])
     drift = np.empty(3)

@@ -11,7 +11,7 @@ import numpy as np
 
 from skindb.jit import fast_kernel, kernel, median_of, unpack
 from skindb.reflectance._row_kernels import RowMemory, form_rows, row_memory
-from skindb.reflectance._shade_kernels import transmittance
+from skindb.reflectance._shade_kernels import circular_reversal, transmittance
 from skindb.reflectance.model import Block, Noise
 from skindb.schema import FitStatus
 from skindb.schema.declaration import LARGEST_R_D, SMALLEST_R_D
@@ -41,6 +41,8 @@ MODEL_ERROR = 0.05
 MIN_COSINE_SURFACE = 0.1
 # below it an error of the normal has a larger effect than a motion of the face
 MIN_COSINE_OUTLIER = 0.2
+# factor of the surface term behind the best polarisers; cube roots need a positive one
+MIN_GLOSS = 1e-4
 NO_FLOOR = 1e-9  # sr^-1; floor of the cube roots for residuals
 LINEAR, PERCEPTUAL, PAPER = range(3)
 # scales of the residuals of the surfel: exceeded by normal noise once in two million,
@@ -112,6 +114,8 @@ class Lumitexel(NamedTuple):
     noise: Matrix32  # (2, rows) variance of one channel at reflectance 0, and its slope
     weight: Vector32  # (rows,) weights of the samples
     surface: Vector32  # (rows,) predicted surface part
+    # (lights, cameras) factor of the surface part by polarisers; (0, cameras) without
+    gloss: Matrix32
 
 
 @kernel
@@ -124,7 +128,9 @@ def root_memory(size: int) -> RootMemory:
 
 
 @kernel
-def lumitexel_memory(lights: int, cameras: int, width: int) -> Lumitexel:
+def lumitexel_memory(
+    lights: int, cameras: int, width: int, polarised: bool = False
+) -> Lumitexel:
     """Buffers for up to `width` columns of rows."""
     size = lights * cameras
     channels = np.zeros((9, size), np.float32)
@@ -147,7 +153,16 @@ def lumitexel_memory(lights: int, cameras: int, width: int) -> Lumitexel:
         np.zeros((2, size), np.float32),
         np.ones(size, np.float32),
         np.empty(size, np.float32),
+        np.ones((lights if polarised else 0, cameras), np.float32),
     )
+
+
+@kernel
+def block_memory(block: Block, width: int) -> Lumitexel:
+    """Buffers for the surfels of a block."""
+    lights = block.light.shape[0]
+    polarised = block.polarisation.shape[0] > 0
+    return lumitexel_memory(lights, block.camera.shape[0], width, polarised)
 
 
 @fast_kernel
@@ -217,6 +232,40 @@ def _towards(target: Matrix, p: Vector, out: Matrix) -> None:
         z = target[i, 2] - p[2]
         scale = 1.0 / np.sqrt(x * x + y * y + z * z)
         out[i, 0], out[i, 1], out[i, 2] = x * scale, y * scale, z * scale
+
+
+@kernel
+def write_gloss(polarisation: Matrix, eta: float, b: Lumitexel) -> None:
+    """Write the factor of the surface part of every light and camera: polarisers of the
+    same handedness are crossed, as the reflection reverses it.
+    """
+    for i in range(polarisation.shape[0]):
+        for o in range(polarisation.shape[1]):
+            both = 0.0
+            for k in range(3):
+                both += b.to_light[i, k] * b.to_camera[o, k]
+            apart = math.sqrt(min(max((1.0 + both) / 2.0, 0.0), 1.0))
+            crossed = polarisation[i, o] * circular_reversal(apart, eta)
+            b.gloss[i, o] = max(1.0 - crossed, MIN_GLOSS)
+
+
+@kernel
+def surface_factor(r: int, b: Lumitexel) -> float:
+    """Factor of the surface part of sample r by polarisers."""
+    if b.gloss.shape[0] == 0:
+        return 1.0
+    return float(b.gloss[b.pairs[r, 0], b.pairs[r, 1]])
+
+
+@kernel
+def polarise_rows(count: int, b: Lumitexel) -> None:
+    """Multiply rows by the factor of their samples."""
+    if b.gloss.shape[0] == 0:
+        return
+    for r in range(count):
+        factor = np.float32(surface_factor(r, b))
+        for k in range(b.rows.shape[1]):
+            b.rows[r, k] *= factor
 
 
 @kernel
@@ -293,6 +342,7 @@ def write_rows(n: Vector, table: Tensor32, b: Lumitexel) -> int:
         at = 3 * (b.pairs[r, 0] * cameras + b.pairs[r, 1])
         for c in range(3):
             b.sample[c, r] = b.values[at + c]
+    polarise_rows(count, b)
     return int(count)
 
 
@@ -364,6 +414,7 @@ def prepare(surfel: int, block: Block, options: Options, b: Lumitexel) -> int:
     if not np.isfinite(position).all():
         return NOT_FINITE
     write_directions(position, block.light, block.camera, b)
+    write_gloss(block.polarisation, options.eta, b)
     write_cosines(n, options.eta, MIN_COSINE_SURFACE, b)
     if not np.isfinite(n).all():
         return FEW  # no normal: it needs light that is not grazing

@@ -37,8 +37,10 @@ from skindb.reflectance._lumitexel_kernels import (
     choose,
     lumitexel_memory,
     sample_status,
+    surface_factor,
     write_cosines,
     write_directions,
+    write_gloss,
     write_noise,
     write_rows,
 )
@@ -58,6 +60,8 @@ from skindb.types import (
 MIN_COSINE_ALBEDO = 0.25
 # of a surfel, above the minimum cosine; fewer cannot separate eight columns
 MIN_SAMPLES_ALBEDO = 10
+# of crossed polarisers, relative to depolarised light: theta_d up to 39 degrees
+MAX_GLOSS_CROSSED = 0.3
 TUKEY = 4.685  # 95 % efficiency for normal noise
 # standard deviation over mean absolute deviation of normal noise
 MEAN_TO_SIGMA = 1.2533
@@ -523,6 +527,20 @@ def _separate_channels(
 
 
 @kernel
+def _choose_crossed(b: Lumitexel) -> None:
+    """Keep only the chosen samples behind crossed polarisers, if they are enough."""
+    count = 0
+    for i in range(b.gloss.shape[0]):
+        for o in range(b.gloss.shape[1]):
+            b.usable[i, o] = b.finite[i, o] and b.gloss[i, o] <= MAX_GLOSS_CROSSED
+            count += int(b.usable[i, o])
+    if count < MIN_SAMPLES_ALBEDO:
+        for i in range(b.gloss.shape[0]):
+            for o in range(b.gloss.shape[1]):
+                b.usable[i, o] = b.finite[i, o]
+
+
+@kernel
 def separate(
     n: Vector,
     turn: Vector,
@@ -535,21 +553,23 @@ def separate(
     estimate: Vector,
     error: Vector,
     total: Vector,
-) -> None:
+) -> float:
     """R_d (3,), its standard error for independent samples, and that for errors by
     device; NaN for too few samples.
 
     `turn` (2,) is the error of the normal [rad] for either standard error. An error of
     a light or camera affects all of its samples, so that the variance follows from sums
     of their residuals: variance by lights + variance by cameras - variance by samples,
-    and not less than the last (Cameron, Gelbach and Miller 2011).
+    and not less than the last (Cameron, Gelbach and Miller 2011). Crossed samples alone
+    are used if there are enough. Returns the mean factor of the surface part.
     """
     estimate[:] = np.nan
     error[:] = np.nan
     total[:] = np.nan
     write_cosines(n, eta, MIN_COSINE_ALBEDO, b)
     if choose(b) < MIN_SAMPLES_ALBEDO:
-        return
+        return 1.0
+    _choose_crossed(b)
     count = write_rows(n, table, b)
     write_noise(surfel, count, noise, b)
     for r in range(count):
@@ -567,6 +587,10 @@ def separate(
     for c in range(3):
         error[c] = math.sqrt(variance[c])
         total[c] = math.sqrt(shared[c])
+    gloss = 0.0
+    for r in range(count):
+        gloss += surface_factor(r, b)
+    return gloss / count
 
 
 @kernel
@@ -579,13 +603,16 @@ def separate_block(
     turn: Matrix,
     table: Tensor32,
     noise: Noise,
+    polarisation: Matrix,
     eta: float,
     estimate: Matrix,
     error: Matrix,
     total: Matrix,
+    gloss: Vector,
 ) -> None:
     """`separate` of every surfel of a block."""
-    b = lumitexel_memory(light.shape[0], camera.shape[0], 2 * COLUMNS)
+    polarised = polarisation.shape[0] > 0
+    b = lumitexel_memory(light.shape[0], camera.shape[0], 2 * COLUMNS, polarised)
     s = separation_memory(light.shape[0] * camera.shape[0])
     for i in range(position.shape[0]):
         unpack(sample[i], b.values)
@@ -597,7 +624,8 @@ def separate_block(
         # squares of values far outside the range of reflectance would overflow
         power = scale_to_one(b.values) if largest_finite(b.values) > MAX_SAMPLE else 1.0
         write_directions(position[i], light, camera, b)
-        separate(
+        write_gloss(polarisation, eta, b)
+        gloss[i] = separate(
             normal[i],
             turn[i],
             eta,

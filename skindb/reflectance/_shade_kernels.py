@@ -21,6 +21,14 @@ def transmittance(cosine: float, eta: float) -> float:
 
 
 @inline_fast_kernel
+def circular_reversal(cosine: float, eta: float) -> float:
+    """As in `skindb.optics.fresnel`."""
+    g = math.sqrt(eta * eta - 1.0 + cosine * cosine)
+    ratio = (cosine * (g + cosine) - 1.0) / (cosine * (g - cosine) + 1.0)
+    return 2.0 * ratio / (1.0 + ratio * ratio)
+
+
+@inline_fast_kernel
 def _surface(
     table: Tensor32, weight: Vector32, n: Triple, wi: Triple, wo: Triple
 ) -> float:

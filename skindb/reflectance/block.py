@@ -43,7 +43,7 @@ def kernel_block(block: Block) -> Block:
     """The block in the types for which the kernels are compiled."""
     doubles: dict[str, Any] = {
         name: np.ascontiguousarray(getattr(block, name), np.float64)
-        for name in ("position", "light", "camera", "normal", "diffuse")
+        for name in ("position", "light", "camera", "normal", "diffuse", "polarisation")
     }
     return block._replace(sample=sample_bits(block.sample), **doubles)
 

@@ -51,6 +51,9 @@ class Block(NamedTuple):
     normal: NDArray[Any]  # (n, 3) unit shading normals
     diffuse: NDArray[Any]  # (n, 3) R_d
     noise: Noise = typical_noise()
+    # (lights, cameras) product of their degrees of circular polarisation; (0, 0) without
+    # polarisers
+    polarisation: NDArray[Any] = np.zeros((0, 0))
 
 
 class Comparison(NamedTuple):

@@ -37,7 +37,7 @@ LOBES = (
 
 def separate_diffuse(
     block: Block, turns: Float64, *, eta: float
-) -> tuple[Array, Array, Array]:
+) -> tuple[Array, Array, Array, Array]:
     """R_d of every surfel, and its errors.
 
     Parameters
@@ -55,11 +55,15 @@ def separate_diffuse(
     reflectance, error, shared
         (n, 3) R_d, its standard error for independent samples, and that for errors that
         the samples of a light or of a camera have in common; NaN for too few samples.
+    gloss
+        (n,) mean factor by which polarisers changed the surface term of the samples that
+        were used, 1 without polarisers: where there are enough, those behind crossed ones.
     """
     n = len(block.position)
     reflectance = np.empty((n, 3))
     error = np.empty((n, 3))
     shared = np.empty((n, 3))
+    gloss = np.ones(n)
     position, light, camera, normal = (
         np.ascontiguousarray(places, np.float64)
         for places in (block.position, block.light, block.camera, block.normal)
@@ -73,12 +77,14 @@ def separate_diffuse(
         turns,
         _lobe_table(),
         block.noise,
+        np.ascontiguousarray(block.polarisation, np.float64),
         float(eta),
         reflectance,
         error,
         shared,
+        gloss,
     )
-    return reflectance, error, shared
+    return reflectance, error, shared, gloss
 
 
 @cache

@@ -7,6 +7,7 @@ from typing import get_args, get_type_hints
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
+from three_surfels import polariser_factors
 
 from skindb.errors import InputError
 from skindb.parameters import FitParameters
@@ -100,6 +101,22 @@ def test_fit__recovers_planted_lobes(mode):
     np.testing.assert_allclose(fit.parameters[:, 1], ROUGHNESS, rtol=2e-4)
     assert fit.residual.max() < 1e-4
     assert fit.kkt.max() < 1e-3
+
+
+def test_fit__recovers_lobes_behind_polarisers():
+    block = planted(STRENGTH, ROUGHNESS)
+    matte = planted(0 * STRENGTH, ROUGHNESS).sample
+    polarisation = np.outer(np.ones(60), np.linspace(-1, 0.99, 9))
+    factor = polariser_factors(
+        block.position, block.light, block.camera, polarisation, eta=INDEX
+    )
+    sample = np.float32(matte + factor[..., None] * (block.sample - matte))
+    polarised = block._replace(sample=sample, polarisation=polarisation)
+    fit = GGX(INDEX).fit(polarised, EXACT)
+    np.testing.assert_allclose(fit.parameters[:, 0], STRENGTH, rtol=1e-3)
+    np.testing.assert_allclose(fit.parameters[:, 1], ROUGHNESS, rtol=1e-3)
+    judged = GGX(INDEX).judge(polarised, EXACT, Judgement(), fit.parameters)
+    assert max(fit.residual.max(), judged.residual.max()) < 1e-3
 
 
 def test_fit__noisy_samples_as_least_squares_of_scipy():

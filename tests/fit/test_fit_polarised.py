@@ -1,0 +1,86 @@
+"""Samples behind circular polarisers: the surface term is scaled, the diffuse one is not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from three_surfels import (
+    ETA,
+    MATTE,
+    WEIGHT,
+    polariser_factors,
+    six_materials,
+    six_tables,
+    surfels,
+)
+
+from skindb.fit.albedo import block_reflectance
+from skindb.reflectance.mixture import Mixture
+from skindb.reflectance.model import Comparison, Judgement
+from skindb.schema import FitStatus
+
+LIGHT = np.full(40, -0.99)
+CAMERA = np.array([-1, 1, -0.98, 0, -1, 1])  # crossed, parallel and without polariser
+EVEN = 0.04  # of the light, without colour
+
+
+def polarised(weight, even=0.0, light=LIGHT):
+    """Three surfels, their samples behind polarisers, and what the polarisers pass."""
+    skin = surfels(weight=weight, dtype=np.float32)
+    matte = surfels(weight=MATTE, dtype=np.float32).sample
+    cosine = np.einsum(
+        "nk,ntk->nt", skin.normal, skin.light - skin.position[:, None]
+    ) / np.linalg.norm(skin.light - skin.position[:, None], axis=-1)
+    gloss = skin.sample - matte + even / np.pi * cosine[:, :, None, None]
+    factor = polariser_factors(
+        skin.position, skin.light, skin.camera, np.outer(light, CAMERA)
+    )
+    return skin, (matte + factor[..., None] * gloss).astype(np.float16), factor
+
+
+@pytest.mark.parametrize("mode", ["linear", "perceptual", "paper"])
+def test_fit__mixtures_behind_polarisers(mode):
+    # one material, of which "paper" is a mixture too
+    weight = np.where(np.arange(6) == 4, 0.3, 0) if mode == "paper" else WEIGHT
+    skin, sample, _ = polarised(weight)
+    block = skin.block._replace(sample=sample, polarisation=np.outer(LIGHT, CAMERA))
+    comparison = Comparison(mode, ETA, 2e-3, 10)
+    surface = six_materials()
+    if mode == "paper":
+        surface = Mixture(np.cbrt(six_tables()))
+    fit = surface.fit(block, comparison)
+    assert (fit.status == FitStatus.FITTED).all()
+    assert fit.residual.max() < (1e-2 if mode == "paper" else 1e-3)
+    ignored = block._replace(polarisation=np.zeros((0, 0)))
+    assert surface.fit(ignored, comparison).residual.min() > 0.05
+    if mode == "paper":
+        return
+    held = np.zeros((40, 6), np.int64)
+    held[::5] = 1
+    errors = Judgement(np.zeros((3, 3)), np.full(3, 0.5), held)
+    judged = surface.judge(block, comparison, errors)
+    assert judged.held_error[:, 0].max() < 2e-3
+
+
+def test_block_reflectance__crossed_samples_show_even_reflection():
+    """Rationale: without polarisers, even reflection is counted as R_d."""
+    arrays = {"light_polarisation": LIGHT, "camera_polarisation": CAMERA}
+    for light, low, high in ((LIGHT, 0, 0.15), (0 * LIGHT, 0.9, 2)):
+        skin, sample, factor = polarised(WEIGHT, EVEN, light)
+        arrays |= {
+            "reflectance_sample": sample,
+            "surfel_position": skin.position,
+            "light_position": skin.light,
+            "camera_position": skin.camera,
+            "shading_normal": skin.normal,
+            "light_polarisation": light,
+        }
+        value, _, total, _ = block_reflectance(arrays, method="separated", eta=ETA)
+        excess = (value - skin.diffuse) / EVEN
+        assert excess.min() > low - 0.05
+        assert excess.max() < high
+        crossed = factor[factor < 0.3]
+        expected = crossed.mean() if len(crossed) else 1
+        np.testing.assert_allclose(
+            total, expected * np.hypot(0.01, 0.055 / 1.96), rtol=0.15
+        )
