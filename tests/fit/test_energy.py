@@ -10,6 +10,7 @@ import pytest
 from skindb.fit import FitParameters
 from skindb.fit.energy import (
     Energy,
+    crossed_gloss,
     energy_prior,
     without_even_reflection,
 )
@@ -100,3 +101,33 @@ def test_without_even_reflection__lobes_that_reflect_too_much_return_it(diffuse)
     fitted, summary = without_even_reflection(planted, Energy(0.015, 0.006))
     assert not summary["contradicted"]
     np.testing.assert_allclose(fitted["diffuse_reflectance"], diffuse, atol=1e-5)
+
+
+def test_without_even_reflection__crossed_polarisers_leave_little_of_it(diffuse):
+    fitted, summary = without_even_reflection(_planted(diffuse), KNOWN, 0.1)
+    assert fitted["even_reflection"] == 0
+    np.testing.assert_allclose(
+        fitted["diffuse_reflectance"], diffuse + 0.015, atol=1e-6
+    )
+    assert fitted["even_reflection_error"] == pytest.approx(0.002)
+    assert "contradicted" not in summary
+
+
+def test_crossed_gloss__is_the_mean_of_crossed_pairs():
+    """Light that returns is stopped except for the leaks; other pairs do not count."""
+    towards = np.array([[0, 0, 900.0], [0, 0, 900], [0, 900, 0]])
+    samples = dataset(
+        {
+            "surfel_position": [[-1.0, 0, 0], [1, 0, 0]],
+            "light_position": towards,
+            "camera_position": towards[:2],
+            "light_polarisation": [0.98, -1, 0.98],
+            "camera_polarisation": [0.99, 0],
+        }
+    )
+    assert crossed_gloss(samples, 1.3) == pytest.approx(1 - 0.98 * 0.99, rel=1e-4)
+    mirrored = samples.assign(
+        light_polarisation=-samples["light_polarisation"] * [1, 0, 1]
+    )
+    assert crossed_gloss(mirrored, 1.3) is None
+    assert crossed_gloss(samples.drop_vars("camera_polarisation"), 1.3) is None
