@@ -2,7 +2,11 @@
 
 `skindb simulate` writes vertices, faces, normals and the membership of each vertex in
 regions. Another generator may write `region`, the index of a region for each vertex, and
-`visible_light` and `visible_camera`, bits for each vertex and device.
+`visible_light` and `visible_camera`, bits for each vertex and device. Its BRDFs are sums
+of bases with the weights `surface_weights`; `surface_kind` is "table" (`surface_tables`,
+nodes of `skindb.reflectance.tables.TableGrid`, but with phi_d = pi), "lafortune"
+(`surface_lobes`: C_xy, C_z and n of each lobe and channel) or "abc" (`surface_abc`: A, B,
+C and index of refraction of Low et al. 2012).
 """
 
 from __future__ import annotations
@@ -14,6 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skindb.geometry.rays import RayScene
+from skindb.optics.fresnel import fresnel_reflectance
+from skindb.reflectance.tables import lookup
 
 Truth = dict[str, NDArray[Any]]
 
@@ -31,6 +37,24 @@ def regions(truth: Truth) -> NDArray[Any]:
     membership = truth["region_membership"]
     names = truth["region_names"].astype("U16")[membership.argmax(axis=1)]
     return np.where(membership.max(axis=1) > 0, names, "other")
+
+
+def mirror_bases(truth: Truth, theta: float) -> NDArray[np.float64]:
+    """Bases (k,) of the true BRDFs [sr^-1], mean over the channels, where the half vector
+    is the normal, theta [rad] from both directions.
+    """
+    kind = str(truth["surface_kind"])
+    square = np.cos(theta) ** 2
+    if kind == "table":
+        tables = np.moveaxis(truth["surface_tables"][..., :-1], 0, -1)
+        return lookup(tables, 0.0, theta, 0.0)
+    if kind == "lafortune":
+        across, along, power = np.moveaxis(truth["surface_lobes"], 1, 0)
+        lobe = np.maximum(along * square - across * (1 - square), 0) ** power
+        return np.array([lobe.sum(axis=0).mean()])
+    height, _, _, index = truth["surface_abc"]
+    fresnel = fresnel_reflectance(np.cos(theta), index)
+    return np.array([height * fresnel / (np.pi * square)])
 
 
 class TrueVisibility:

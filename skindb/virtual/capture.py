@@ -515,16 +515,16 @@ def recovered_against_true(model: xr.DataTree, truth: Mapping[str, Array]) -> Re
         3), and where the probe touched site_names (s,) and site_sigma_tr (s, 3) mm^-1.
     """
     fitted = model["fitted"].to_dataset()
-    face, corner = _foot_points(fitted, truth)
+    face, corner = foot_points(fitted, truth)
     corners = truth["faces"][np.maximum(face, 0)]
-    normal = _mix(truth["normals"][corners], corner)
+    normal = at_foot_points(truth["normals"][corners], corner)
     length = np.linalg.norm(normal, axis=1, keepdims=True)
     normal = np.divide(
         normal, length, out=np.full_like(normal, np.nan), where=length > 0
     )
     diffuse = np.where(
         (face >= 0)[:, None],
-        _mix(truth["diffuse_reflectance"][corners], corner),
+        at_foot_points(truth["diffuse_reflectance"][corners], corner),
         np.nan,
     )
     cosine = np.clip((normal * fitted[variables.SHADING_NORMAL].values).sum(1), -1, 1)
@@ -537,9 +537,12 @@ def recovered_against_true(model: xr.DataTree, truth: Mapping[str, Array]) -> Re
     )
 
 
-def _foot_points(
+def foot_points(
     fitted: xr.Dataset, truth: Mapping[str, Array]
 ) -> tuple[NDArray[np.integer], Array]:
+    """Nearest points of the true surface along the normals of the surfels: face (n,), -1
+    where there is none, and barycentric coordinates (n, 3).
+    """
     position, normal = (
         fitted[name].values.astype(np.float64)
         for name in (variables.SURFEL_POSITION, variables.SURFEL_NORMAL)
@@ -549,7 +552,8 @@ def _foot_points(
     return np.where(distance <= 2 * SEARCH, face, -1), corner
 
 
-def _mix(values: Array, corner: Array) -> Array:
+def at_foot_points(values: Array, corner: Array) -> Array:
+    """Values (n, 3, c) of the corners, interpolated (n, c)."""
     return np.asarray(np.einsum("nkc,nk->nc", values.astype(np.float64), corner))
 
 

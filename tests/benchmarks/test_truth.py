@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from benchmarks.truth import TrueVisibility, read_truth, regions
+from benchmarks.truth import TrueVisibility, mirror_bases, read_truth, regions
 
 
 def _plates():
@@ -45,3 +45,16 @@ def test_regions__of_membership_or_of_an_index():
 def test_read_truth__is_beside_the_capture(tmp_path):
     np.savez(tmp_path / "V001.truth.npz", eta=1.3)
     assert read_truth(tmp_path / "V001")["eta"] == 1.3
+
+
+def test_mirror_bases__of_the_three_kinds_of_brdfs():
+    theta = np.radians(25.0)
+    # of theta_d alone, so that its node at 22.5 and 45 degrees are interpolated
+    table = np.broadcast_to(np.array([0.0, 1.0, 2.0, 3.0, 4.0])[:, None], (1, 3, 5, 4))
+    truth = {"surface_kind": "table", "surface_tables": table}
+    assert np.allclose(mirror_bases(truth, theta), [25.0 / 22.5])
+    lobe = np.array([[[-1.0] * 3, [1.0] * 3, [7.0] * 3]])  # of the mirror direction
+    truth = {"surface_kind": "lafortune", "surface_lobes": lobe}
+    assert np.allclose(mirror_bases(truth, theta), [1.0])
+    truth = {"surface_kind": "abc", "surface_abc": np.array([3.0, 9.0, 2.0, 1.5])}
+    assert np.allclose(mirror_bases(truth, 0.0), [3.0 * 0.2**2 / np.pi])
