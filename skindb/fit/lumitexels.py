@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from skindb.errors import Fault, InputError
 from skindb.reflectance.model import Block, Noise, typical_noise
-from skindb.schema import check, label
+from skindb.schema import check, label, variables
 from skindb.types import Array
 
 Arrays = Mapping[str, NDArray[Any]]  # of a block of surfels, by variable
@@ -35,7 +35,7 @@ NOISE_INPUTS = (
     *NOISE_LIGHTS,
     *RADIANCE,
 )
-POLARISATION = ("light_polarisation", "camera_polarisation")
+POLARISATION = (variables.LIGHT_POLARISATION, variables.CAMERA_POLARISATION)
 REQUIRED = {
     "samples": ("reflectance_sample", "noise_floor"),
     "surfels": ("surfel_position", "surfel_normal", "surfel_area"),

@@ -21,7 +21,13 @@ from skindb.files import make_private
 from skindb.geometry.rays import RayScene
 from skindb.render.image import auto_exposure, encode_srgb, tone_map, write_png
 from skindb.render.scene import cameras_from_dome, from_model, lights_from_dome
-from skindb.render.shading import View, require_translucency, shade_view, trace_view
+from skindb.render.shading import (
+    View,
+    polariser_factor,
+    require_translucency,
+    shade_view,
+    trace_view,
+)
 from skindb.render.surfels import surfel_confidence
 from skindb.schema import check, variables
 from skindb.schema.consent import honour_consent
@@ -342,6 +348,12 @@ def compare_photographs(
             view, surface, lamp, scene, subsurface=subsurface, terms=("diffuse",)
         )[0]
         gloss = shade_view(view, surface, lamp, scene, terms=("surface",))[0]
+        if variables.LIGHT_POLARISATION in dome:
+            both = float(
+                dome[variables.LIGHT_POLARISATION][at_light]
+                * dome[variables.CAMERA_POLARISATION][at_camera]
+            )
+            gloss *= polariser_factor(view, lamp.position[0], both, surface.eta)
         radiance = photograph[variables.PHOTOGRAPH_RADIANCE].values
         photo = radiance[: camera.height, : camera.width].astype(np.float32)
         mask = (view.coverage >= MIN_COVERAGE) & np.isfinite(photo).all(axis=-1)

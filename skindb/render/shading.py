@@ -16,7 +16,7 @@ from skindb.geometry.camera import pixel_rays
 from skindb.geometry.mesh import vertex_areas
 from skindb.geometry.rays import RayScene
 from skindb.optics.dipole_tree import subsurface_exitance
-from skindb.optics.fresnel import fresnel_transmittance
+from skindb.optics.fresnel import circular_reversal, fresnel_transmittance
 from skindb.reflectance.model import Lamp, Points
 from skindb.render.scene import Camera, Lights, Surface
 
@@ -446,6 +446,18 @@ def seen_points(
     if with_surface:
         parameters = view.interpolate(surface.parameters)
     return Points(view.position, view.normal, view.towards, diffuse, parameters)
+
+
+def polariser_factor(
+    view: View, light: Float, polarisation: float, eta: float
+) -> Image:
+    """Factor (h, w, 1) of the surface term by circular polarisers of a light at (3,) and of
+    the camera, whose degrees of polarisation have this product.
+    """
+    towards = light - view.position
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    cosine = np.linalg.norm(towards + view.towards, axis=1) / 2  # of theta_d
+    return view.image(1 - polarisation * circular_reversal(cosine, eta)[:, None])
 
 
 def glow_image(view: View, surface: Surface, glow: Image) -> Image:

@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 from skindb.files import make_private, private_file
 from skindb.geometry.camera import pixel_rays
 from skindb.geometry.rays import RayScene
-from skindb.optics.fresnel import circular_reversal
 from skindb.parameters import require_sizes
 from skindb.render.scene import Camera, Lights, Surface
-from skindb.render.shading import View, exitances, shade_view, trace_view
+from skindb.render.shading import exitances, polariser_factor, shade_view, trace_view
 
 Array = NDArray[np.float64]
 CENTRE = np.array([0.0, -8.0, 45.0])  # of the dome in the subject frame, mm
@@ -31,6 +30,7 @@ CAMERA_RADIUS = 830.0
 DISC_RADIUS = 12.5  # mm
 LEAK = 0.005  # of the polarisers: light of the other handedness over all that passes
 INTENSITY = 6.0e7  # radiance mm2
+DEGREES = {None: 0.0, "left": 2 * LEAK - 1, "right": 1 - 2 * LEAK}
 # half axes of the ellipsoid that every camera frames, mm
 HEAD = np.array([96.0, 138.0, 92.0])
 EXPOSURES = ("e0", "e1")  # of every view
@@ -61,6 +61,11 @@ class DomeCamera:
     polariser: str | None = None  # "left" or "right", circular
 
     @property
+    def polarisation(self) -> float:
+        """Degree of circular polarisation of the light that it sees, 1 right-handed."""
+        return DEGREES[self.polariser]
+
+    @property
     def position(self) -> Array:
         """Centre of projection (3,) mm."""
         return np.asarray(-self.rotation.T @ self.translation)
@@ -76,6 +81,11 @@ class DomeLight:
     intensity: Array  # (3,) radiance mm2
     disc_radius: float = DISC_RADIUS
     polariser: str | None = None
+
+    @property
+    def polarisation(self) -> float:
+        """As of a camera, of the light that it sends."""
+        return DEGREES[self.polariser]
 
 
 @dataclass(frozen=True)
@@ -340,7 +350,10 @@ def photograph(
             images = terms(subsurface=subsurface, glow=glow, terms=["diffuse"])
             gloss = terms(terms=["surface"])
             for i, light in enumerate(dome.lights):
-                images[i] += gloss[i] * _passed_gloss(view, camera, light, surface.eta)
+                both = camera.polarisation * light.polarisation
+                images[i] += gloss[i] * polariser_factor(
+                    view, light.position, both, surface.eta
+                )
         writer = _FrameWriter(folder, camera, sensor, pattern, stream)
         for light, image in zip(dome.lights, images, strict=True):
             writer.write(FRAMES, light.name, image)
@@ -357,23 +370,6 @@ def photograph(
         streams = device_rng.spawn(len(dome.cameras)), rng.spawn(len(dome.cameras))
         for _ in pool.map(shoot, dome.cameras, *streams):
             step()
-
-
-def _passed_gloss(
-    view: View, camera: DomeCamera, light: DomeLight, eta: float
-) -> Image:
-    """Factor (h, w, 1) of the light from the surface by the polarisers, relative to
-    depolarised light.
-    """
-    towards = light.position - view.position
-    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-    cosine = np.linalg.norm(towards + view.towards, axis=1) / 2  # of theta_d
-    same = 0.0
-    if light.polariser is not None:
-        same = (1 - 2 * LEAK) ** 2 * (
-            1.0 if light.polariser == camera.polariser else -1.0
-        )
-    return view.image(1 - same * circular_reversal(cosine, eta)[:, None])
 
 
 class _FrameWriter:

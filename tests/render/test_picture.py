@@ -9,6 +9,7 @@ import xarray as xr
 
 from skindb.errors import InputError
 from skindb.optics.diffusion import dipole_s
+from skindb.optics.fresnel import circular_reversal
 from skindb.reflectance.tables import stored_brdf
 from skindb.render import shading
 from skindb.render.image import decode_srgb, read_exr, read_png, write_exr
@@ -211,6 +212,42 @@ def test_compare_photographs__reads_the_half_floats_of_older_stores(
         np.testing.assert_array_equal(one.photographed, radiance[0])
         found.append(one.error)
     assert found[0] == found[1]
+
+
+def test_compare_photographs__polarisers_scale_the_surface_alone(
+    model: xr.DataTree,
+) -> None:
+    kept = dataset(
+        {
+            "photograph_radiance": np.ones((1, 24, 32, 3)),
+            "photograph_light": [0],
+            "photograph_camera": [0],
+        }
+    )
+    dome = model["dome"].to_dataset()
+    found = []
+    for hand in (0.0, 0.9, -0.9):
+        lights = np.full(dome.sizes["light"], -1.0)
+        polarisers = {"light_polarisation": lights, "camera_polarisation": [hand]}
+        groups = {"photographs": kept, "dome": dome.merge(dataset(polarisers))}
+        (one,) = compare_photographs(model, xr.DataTree.from_dict(groups))
+        found.append(one)
+    plain, parallel, crossed = (one.rendered - one.diffuse for one in found)
+    inside = found[0].mask & (plain.min(axis=-1) > 0)
+    assert inside.sum() > 20
+    for one in found[1:]:
+        np.testing.assert_array_equal(one.diffuse, found[0].diffuse)
+    middle = model["fitted"]["surfel_position"].values.mean(axis=0)
+    light, camera = (
+        dome[f"{device}_position"].values[0] - middle for device in ("light", "camera")
+    )
+    cosine = light @ camera / np.linalg.norm(light) / np.linalg.norm(camera)
+    reversal = circular_reversal(np.sqrt((1 + cosine) / 2), 1.3)
+    ratio = crossed[inside] / plain[inside]
+    np.testing.assert_allclose(ratio, 1 - 0.9 * reversal, atol=0.1)
+    np.testing.assert_allclose(
+        (crossed + parallel)[inside], 2 * plain[inside], rtol=1e-3
+    )
 
 
 @pytest.mark.slow
