@@ -19,6 +19,7 @@ from skindb.fit.lumitexels import (
 )
 from skindb.optics.diffusion import dipole_s
 from skindb.optics.fresnel import fresnel_transmittance
+from skindb.parameters import BARE_SKIN
 from skindb.reflectance._separation_kernels import (
     MAX_GLOSS_CROSSED,
     MIN_COSINE_ALBEDO,
@@ -34,9 +35,10 @@ METHODS = ("separated", "quantile", "minimum")
 # rad; largest error of a normal: no sample above the grazing limit falls below the
 # horizon
 LARGEST_TURN = 0.25
-# Coloured highlights, which eq. 7 excludes: under Lafortune's of skin, R_d of five
-# captures was 0.004 to 0.016 too low.
-MODEL_ERROR_ALBEDO = 0.01
+# Coloured highlights, which eq. 7 excludes: under the lobes of Marschner et al. (1999),
+# whose channels differ by 12 to 23 % from their mean, R_d was wrong by a tenth of what
+# the surface reflects (RMS over the channels).
+MODEL_ERROR_ALBEDO = 0.1 * BARE_SKIN[0]
 NORMAL_ERRORS = ("normal_error", "normal_total_error")
 # surfels processed at once by the other rules: 15 MB of samples of a full dome
 BATCH = 512
@@ -85,9 +87,9 @@ def estimate_diffuse_reflectance(
         efficient estimate of the normal is uncorrelated with that of R_d at a fixed
         normal. The total error ("separated" alone) has two parts in quadrature: the
         error of the samples, as residuals that samples of one light or of one camera
-        have in common show it, and of the normal by `normal_total_error`; and 0.01. The
+        have in common show it, and of the normal by `normal_total_error`; and 0.004. The
         errors of the other two methods do not include their bias. If ten or more samples
-        are behind crossed polarisers, "separated" uses these alone, and 0.01 is scaled by
+        are behind crossed polarisers, "separated" uses these alone, and 0.004 is scaled by
         the part of the surface's light that they pass.
 
     Notes

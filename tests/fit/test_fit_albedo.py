@@ -86,7 +86,7 @@ def test_estimate_diffuse_reflectance__interval_covers_95_percent_of_noise(
         for name in ("error", "total_error")
     )
     # errors common to a device, here none
-    own = np.sqrt(total**2 - 0.01**2)
+    own = np.sqrt(total**2 - 0.004**2)
     assert (own > 0.99 * error).all()
     assert np.median(own / error) < 1.4
 
@@ -111,7 +111,7 @@ def test_estimate_diffuse_reflectance__total_error_counts_what_lights_and_camera
     )
     off = np.abs(found["diffuse_reflectance"].values - diffuse)
     assert (off < 1.96 * error).mean() < 0.75
-    assert 0.85 < (off < 1.96 * np.sqrt(total**2 - 0.01**2)).mean() < 0.97
+    assert 0.85 < (off < 1.96 * np.sqrt(total**2 - 0.004**2)).mean() < 0.97
 
 
 @pytest.mark.parametrize("gloss", [0.0, 0.3])
